@@ -1,0 +1,134 @@
+"""Records: frozen dataclasses that are JAX pytrees, and the checks that their fields declare.
+
+A record's type says what it is; its leaves are numbers that may be traced, batched and
+differentiated. Fields declare unit, bounds and meaning once, and the case-file reader, the
+template and `validate` all read them from there.
+"""
+
+import dataclasses
+import math
+from typing import Any, TypeVar, dataclass_transform
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+T = TypeVar("T")
+
+# A real number, or an array of them: one member's scalar, traced or not.
+Scalar = Any
+
+
+def leaf(
+    default: Any = dataclasses.MISSING,
+    *,
+    unit: str = "",
+    doc: str = "",
+    above: float | None = None,
+    at_least: float | None = None,
+    infinite: bool = False,
+    optional: bool = False,
+) -> Any:
+    """A numeric field: its unit, its bounds and what it means.
+
+    `above` and `at_least` bound it from below; `infinite` admits +inf; `optional` admits None.
+    """
+    metadata = {
+        "unit": unit,
+        "doc": doc,
+        "above": above,
+        "at_least": at_least,
+        "infinite": infinite,
+        "optional": optional,
+        "leaf": True,
+    }
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def static(default: Any = dataclasses.MISSING, *, doc: str = "") -> Any:
+    """A field that is part of the structure (hashable, never traced)."""
+    return dataclasses.field(default=default, metadata={"static": True, "doc": doc})
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(leaf, static, dataclasses.field))
+def record(cls: type[T]) -> type[T]:
+    """Make `cls` a frozen dataclass and register it as a pytree."""
+    return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
+
+
+def is_traced(x: Any) -> bool:
+    """Whether x has no concrete value, because some JAX transformation is looking at it."""
+    return isinstance(x, Tracer)
+
+
+def numbers(field: dataclasses.Field) -> str:
+    """What a field allows, in words."""
+    meta = field.metadata
+    kind = "a number" if meta["infinite"] else "a finite number"
+    unit = f" ({meta['unit']})" if meta["unit"] else ""
+    if meta["above"] is not None:
+        return f"{kind} above {meta['above']:g}{unit}"
+    if meta["at_least"] is not None:
+        return f"{kind} of at least {meta['at_least']:g}{unit}"
+    return f"{kind}{unit}"
+
+
+def _within(meta: Any, value: np.ndarray) -> bool:
+    finite = ~np.isnan(value) if meta["infinite"] else np.isfinite(value)
+    ok = bool(np.all(finite))
+    if meta["above"] is not None:
+        ok = ok and bool(np.all(value > meta["above"]))
+    if meta["at_least"] is not None:
+        ok = ok and bool(np.all(value >= meta["at_least"]))
+    return ok
+
+
+def _example(field: dataclasses.Field) -> str:
+    default = field.default
+    usable = isinstance(default, (int, float)) and math.isfinite(default)
+    return f" Use {default:g}, for example." if usable else ""
+
+
+def validate(node: Any, path: str = "") -> None:
+    """Check every concrete leaf under `node` against its field; traced leaves pass unseen.
+
+    Raises ValueError with the dotted path, the value, what is allowed and an example.
+    """
+    if isinstance(node, (tuple, list)):
+        for index, item in enumerate(node):
+            validate(item, f"{path}[{index}]")
+        return
+    if not dataclasses.is_dataclass(node):
+        return
+    for field in dataclasses.fields(node):
+        value, name = getattr(node, field.name), f"{path}.{field.name}".lstrip(".")
+        if not field.metadata.get("leaf"):
+            validate(value, name)
+        elif not (is_traced(value) or (value is None and field.metadata["optional"])):
+            _check(field, name, value)
+
+
+def _check(field: dataclasses.Field, name: str, value: Any) -> None:
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        array = np.asarray(np.nan)
+    if not _within(field.metadata, array):
+        shown = f"{float(array):g}" if array.ndim == 0 and isinstance(value, (int, float)) else repr(value)
+        raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.{_example(field)}")
+
+
+def canonical(node: T) -> T:
+    """The same pytree with every number an array of the working precision, integers kept.
+
+    Python floats, NumPy scalars and arrays then trace alike, so that a change of a value, or of
+    the type that carries it, never recompiles.
+    """
+
+    def one(x: Any) -> Any:
+        x = jnp.asarray(x)
+        kind = x.dtype if jnp.issubdtype(x.dtype, jnp.integer) else jnp.result_type(float)
+        return jax.lax.convert_element_type(x, kind)
+
+    return jax.tree.map(one, node)

@@ -1,0 +1,1 @@
+"""The controller: laws by stage, and the cascade that composes them."""

@@ -1,0 +1,112 @@
+"""The cascade: observer, position, inversion and current law in a row, around a nominal plant.
+
+Its modularity is the paper's first contribution: any law of a stage may stand with any of the others.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax._pytree import Scalar, record
+from ambjax.control import current, inversion, observer, position
+from ambjax.control.laws import (
+    CurrentInputs,
+    CurrentLaw,
+    ForceDemand,
+    InversionLaw,
+    Measurement,
+    Observer,
+    PositionLaw,
+    State,
+)
+from ambjax.plant import Plant
+from ambjax.signals import Signal, reference_at
+
+
+class CascadeState(NamedTuple):
+    """The state of each law, or its rate."""
+
+    observer: State
+    position: State
+    inversion: State
+    current: State
+
+
+class Command(NamedTuple):
+    """What the cascade decides, stage by stage: A^2/m^2, A^2/m^2, A, V (before the supply's limit)."""
+
+    v_star: Array
+    v_tilde: Array
+    i_ref: Array
+    u: Array
+
+
+@record
+class Cascade:
+    """The controller. `model` is the plant it believes in; the true one lives in the Scenario."""
+
+    observer: Observer = observer.Direct()
+    position: PositionLaw = position.SlidingMode()
+    inversion: InversionLaw = inversion.Adaptive()
+    current: CurrentLaw = current.SlidingMode()
+    model: Plant = Plant()
+
+    def init(self, measured: Measurement) -> CascadeState:
+        """States of all laws at t = 0."""
+        return CascadeState(
+            self.observer.init(self.model, measured),
+            self.position.init(self.model),
+            self.inversion.init(self.model),
+            self.current.init(self.model),
+        )
+
+    def scale(self) -> CascadeState:
+        """Size of each state that still matters."""
+        return CascadeState(*(law.scale(self.model) for law in self.laws))
+
+    def slopes(self) -> dict[str, Scalar]:
+        """The steepest rate of each law by stage, 1/s."""
+        return {stage: law.slope(self.model) for stage, law in zip(CascadeState._fields, self.laws, strict=True)}
+
+    @property
+    def laws(self) -> tuple[Observer, PositionLaw, InversionLaw, CurrentLaw]:
+        """The four laws in order."""
+        return self.observer, self.position, self.inversion, self.current
+
+    def demand(
+        self, t: Scalar, measured: Measurement, state: CascadeState, reference: Signal
+    ) -> tuple[ForceDemand, CascadeState]:
+        """The force wanted and its rate as the nominal plant predicts it, and the rates of observer and position law.
+
+        v_star_dot is the derivative of v_star along (z_dot, nominal z_ddot, law states, t): what a
+        law that inverts statically needs for i_ref'. Unused, it is never computed.
+        """
+        t = jnp.asarray(t, jnp.result_type(float))
+
+        def v_star_at(s: Array, z: Array, z_dot: Array, observed: State, positioned: State):
+            estimate, observed_rate = self.observer(self.model, Measurement(z, z_dot, measured.i), observed)
+            inputs = (estimate, reference_at(reference, s))
+            v_star, positioned_rate = self.position(self.model, inputs, positioned)
+            return v_star, (estimate, observed_rate, positioned_rate)
+
+        point = (t, measured.z, measured.z_dot, state.observer, state.position)
+        v_star, (estimate, observed_rate, positioned_rate) = v_star_at(*point)
+        z_ddot = self.model.z_ddot(estimate.z, estimate.i)
+        along = (jnp.ones_like(t), measured.z_dot, z_ddot, observed_rate, positioned_rate)
+        v_star_dot = jax.jvp(lambda *x: v_star_at(*x)[0], point, along)[1]
+        rates = CascadeState(observed_rate, positioned_rate, (), ())
+        return ForceDemand(estimate.z, estimate.z_dot, v_star, v_star_dot), rates
+
+    def __call__(
+        self, t: Scalar, measured: Measurement, state: CascadeState, reference: Signal, u_max: Scalar
+    ) -> tuple[Command, CascadeState]:
+        """Command and rate of every law's state at time t. `u_max` is the supply's limit in V (inf: none)."""
+        force, rates = self.demand(t, measured, state, reference)
+        wanted, inversion_rate = self.inversion(self.model, force, state.inversion)
+        seen = Measurement(force.z, force.z_dot, measured.i)
+        u, current_rate = self.current(self.model, CurrentInputs(seen, wanted, u_max), state.current)
+        v_tilde = force.v_star - self.model.v(force.z, wanted.i_ref)
+        command = Command(force.v_star, v_tilde, wanted.i_ref, u)
+        return command, rates._replace(inversion=inversion_rate, current=current_rate)

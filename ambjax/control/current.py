@@ -1,0 +1,62 @@
+"""Current laws: which voltage drives the current to its reference."""
+
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax._pytree import Scalar, leaf, record
+from ambjax.control.laws import CurrentInputs
+from ambjax.plant import Plant
+from ambjax.smooth import TWO_OVER_PI, smooth_sign
+
+
+@record
+class SlidingMode:
+    """u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - k_i sgn(i - i_ref)) + R i. Eq. (11), sgn smoothed."""
+
+    k_i: Scalar = leaf(default=152.0, unit="A/s", above=0, doc="switching gain; above the disturbance bound Q_i")
+    p: Scalar = leaf(default=25.0, unit="1/A", above=0, doc="steepness of the smoothed sign of the current error")
+
+    def init(self, model: Plant) -> tuple[()]:
+        return ()
+
+    def scale(self, model: Plant) -> tuple[()]:
+        return ()
+
+    def slope(self, model: Plant) -> Scalar:
+        return TWO_OVER_PI * self.k_i * self.p
+
+    def __call__(self, model: Plant, inputs: CurrentInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
+        measured, demand = inputs.measured, inputs.demand
+        lower = model.gaps(measured.z)[1]
+        robust = -self.k_i * smooth_sign(measured.i - demand.i_ref, self.p)
+        wanted = -2 * measured.z_dot / lower * measured.i + demand.i_ref_dot + robust
+        return model.kappa / (2 * lower) * wanted + model.R * measured.i, ()
+
+
+@record
+class ProportionalIntegral:
+    """u = k_p (i_ref - i) + L i_ref' + x, x' = k_int (i_ref - i) + k_aw (clip(u) - u): x in V.
+
+    The linear baseline: inductance taken at z = 0, no motional term. While the supply limits u the
+    integral is led back at rate k_aw (back-calculation; Astrom and Murray, Feedback Systems, 2008, 10.4).
+    The defaults hold the paper's tracking scenario; without the motional term, gains much lower do not.
+    """
+
+    k_p: Scalar = leaf(default=3e5, unit="V/A", above=0, doc="proportional gain")
+    k_int: Scalar = leaf(default=1e8, unit="V/A/s", above=0, doc="integral gain")
+    k_aw: Scalar = leaf(default=200.0, unit="1/s", above=0, doc="anti-windup rate")
+
+    def init(self, model: Plant) -> Array:
+        return jnp.zeros(())
+
+    def scale(self, model: Plant) -> Scalar:
+        return model.R * model.i_0 / 10 + 1e-3
+
+    def slope(self, model: Plant) -> Scalar:
+        return jnp.maximum(self.k_p / model.L, self.k_aw)
+
+    def __call__(self, model: Plant, inputs: CurrentInputs, state: Array) -> tuple[Array, Array]:
+        error = inputs.demand.i_ref - inputs.measured.i
+        u = self.k_p * error + model.L * inputs.demand.i_ref_dot + state
+        excess = jnp.clip(u, -inputs.u_max, inputs.u_max) - u
+        return u, self.k_int * error + self.k_aw * excess

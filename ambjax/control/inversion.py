@@ -1,0 +1,64 @@
+"""Inversion laws: which current gives the force."""
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax._pytree import Scalar, leaf, record
+from ambjax.control.laws import CurrentDemand, ForceDemand
+from ambjax.plant import Plant
+from ambjax.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
+
+# |dv/di| is held at this share of its value at the origin, so that crossing the singular curve C,
+# where Eq. (6) divides by zero, gives a large finite rate; the crossing itself is reported.
+GRADIENT_FLOOR = 1e-4
+
+
+@record
+class Adaptive:
+    """i_ref' = gamma sgn(v_star - v(z, i_ref)) / (dv/di)(z, i_ref), with i_ref as its state. Eq. (6), sgn smoothed.
+
+    Deviation: the default gamma is 7.5e4; the printed 1000 violates the paper's own Eq. (7).
+    """
+
+    gamma: Scalar = leaf(default=7.5e4, unit="A^2/m^2/s", above=0, doc="adaptation gain; above Delta_1 of Eq. (7)")
+    p: Scalar = leaf(default=25.0, unit="m^2/A^2", above=0, doc="steepness of the smoothed sign of v_tilde")
+    i_ref: Scalar = leaf(default=0.0, unit="A", doc="initial value of the current reference")
+
+    def init(self, model: Plant) -> Array:
+        return jnp.asarray(self.i_ref)
+
+    def scale(self, model: Plant) -> Scalar:
+        return model.i_0 / 25
+
+    def slope(self, model: Plant) -> Scalar:
+        return TWO_OVER_PI * self.gamma * self.p
+
+    def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:
+        floor = GRADIENT_FLOOR * 4 * model.i_0 / model.s_0**2
+        gradient = away_from_zero(model.dv_di(inputs.z, state), floor)
+        v_tilde = inputs.v_star - model.v(inputs.z, state)
+        rate = self.gamma * smooth_sign(v_tilde, self.p) / gradient
+        return CurrentDemand(state, rate), rate
+
+
+@record
+class ClosedForm:
+    """i_ref = the root of v(z, i_ref) = v_star that is continuous at i = 0, and its exact rate. No state.
+
+    This is the static inversion that the paper argues against (Mouille and Lottin 1992): exact on a
+    known plant, and it passes every jump of v_star (noise) straight to i_ref.
+    """
+
+    def init(self, model: Plant) -> tuple[()]:
+        return ()
+
+    def scale(self, model: Plant) -> tuple[()]:
+        return ()
+
+    def slope(self, model: Plant) -> Scalar:
+        return 0.0
+
+    def __call__(self, model: Plant, inputs: ForceDemand, state: tuple[()]) -> tuple[CurrentDemand, tuple[()]]:
+        at, along = (inputs.z, inputs.v_star), (inputs.z_dot, inputs.v_star_dot)
+        return CurrentDemand(*jax.jvp(model.current_for, at, along)), ()

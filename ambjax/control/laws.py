@@ -1,0 +1,88 @@
+"""What a law is: the inputs, the output and the protocol of each stage.
+
+A law is a frozen record: its type is the algorithm, its leaves are the gains. `init` gives its
+state at t = 0 and a call gives (output, state_rate); a law without state uses (). `scale` gives,
+for each state, the size that still matters (an integrator's error is measured against it), and
+`slope` the steepest rate of the law in 1/s, from which a step is chosen. `model` is the nominal
+plant: what the controller believes. To add a law: one record in the file of its stage, one row in
+`KINDS` of the case-file reader, one row in the conformance test.
+"""
+
+from typing import Any, NamedTuple, Protocol
+
+from jax import Array
+
+from ambjax._pytree import Scalar
+from ambjax.plant import Plant
+from ambjax.signals import Reference
+
+State = Any
+
+
+class Measurement(NamedTuple):
+    """What a sensor, or an observer behind it, reports: m, m/s, A."""
+
+    z: Array
+    z_dot: Array
+    i: Array
+
+
+class ForceDemand(NamedTuple):
+    """Input of an inversion law: where the rotor is (m, m/s) and the force wanted there (A^2/m^2, and per s)."""
+
+    z: Array
+    z_dot: Array
+    v_star: Array
+    v_star_dot: Array
+
+
+class CurrentDemand(NamedTuple):
+    """Output of an inversion law: the current wanted, in A, and its rate, in A/s."""
+
+    i_ref: Array
+    i_ref_dot: Array
+
+
+class CurrentInputs(NamedTuple):
+    """Input of a current law: the measurement, the demand, and the supply's limit in V."""
+
+    measured: Measurement
+    demand: CurrentDemand
+    u_max: Scalar
+
+
+class Observer(Protocol):
+    """Measurement in, estimate out."""
+
+    def init(self, model: Plant, measured: Measurement) -> State: ...
+    def scale(self, model: Plant) -> State: ...
+    def slope(self, model: Plant) -> Scalar: ...
+    def __call__(self, model: Plant, inputs: Measurement, state: State, /) -> tuple[Measurement, State]: ...
+
+
+class PositionLaw(Protocol):
+    """Estimate and reference in, scaled force v_star (A^2/m^2) out."""
+
+    def init(self, model: Plant) -> State: ...
+    def scale(self, model: Plant) -> State: ...
+    def slope(self, model: Plant) -> Scalar: ...
+    def sigma(self, motion: Measurement, reference: Reference) -> Array: ...
+    def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: State, /) -> tuple[Array, State]: ...
+
+
+class InversionLaw(Protocol):
+    """Force demand in, current demand out."""
+
+    def init(self, model: Plant) -> State: ...
+    def scale(self, model: Plant) -> State: ...
+    def slope(self, model: Plant) -> Scalar: ...
+    def __call__(self, model: Plant, inputs: ForceDemand, state: State, /) -> tuple[CurrentDemand, State]: ...
+
+
+class CurrentLaw(Protocol):
+    """Current demand in, voltage u (V) out."""
+
+    def init(self, model: Plant) -> State: ...
+    def scale(self, model: Plant) -> State: ...
+    def slope(self, model: Plant) -> Scalar: ...
+    def __call__(self, model: Plant, inputs: CurrentInputs, state: State, /) -> tuple[Array, State]: ...

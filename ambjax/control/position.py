@@ -1,0 +1,85 @@
+"""Position laws: which scaled force moves the rotor onto the reference."""
+
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax._pytree import Scalar, leaf, record
+from ambjax.control.laws import Measurement
+from ambjax.plant import Plant
+from ambjax.signals import Reference
+from ambjax.smooth import TWO_OVER_PI, smooth_root, smooth_sign
+
+
+def sliding_variable(c: Scalar, motion: Measurement, reference: Reference) -> Array:
+    """sigma = e_z_dot + c e_z, in m/s, with e_z = z - r (Section 3.2)."""
+    return motion.z_dot - reference.r_dot + c * (motion.z - reference.r)
+
+
+def force_for(c: Scalar, model: Plant, motion: Measurement, reference: Reference, robust: Scalar) -> Array:
+    """Scaled force that makes sigma_dot = `robust` (m/s^2) on the nominal plant, undisturbed. Eqs. (4), (5)."""
+    wanted = -2 * model.k_z / model.m * motion.z - c * (motion.z_dot - reference.r_dot)
+    return (wanted + reference.r_ddot + model.g + robust) / model.a
+
+
+@record
+class SlidingMode:
+    """v_star = (-2 k_z z/m - c (z_dot - r_dot) + r_ddot + g - k sgn(sigma)) / a. Eq. (5), sgn smoothed."""
+
+    c: Scalar = leaf(default=17.0, unit="1/s", above=0, doc="decay rate on the sliding manifold")
+    k: Scalar = leaf(default=25.0, unit="m/s^2", above=0, doc="switching gain; above the disturbance bound Q_z")
+    p: Scalar = leaf(default=25.0, unit="s/m", above=0, doc="steepness of the smoothed sign of sigma")
+
+    def init(self, model: Plant) -> tuple[()]:
+        return ()
+
+    def scale(self, model: Plant) -> tuple[()]:
+        return ()
+
+    def slope(self, model: Plant) -> Scalar:
+        return jnp.maximum(TWO_OVER_PI * self.k * self.p, self.c)
+
+    def sigma(self, motion: Measurement, reference: Reference) -> Array:
+        return sliding_variable(self.c, motion, reference)
+
+    def __call__(
+        self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()]
+    ) -> tuple[Array, tuple[()]]:
+        motion, reference = inputs
+        robust = -self.k * smooth_sign(self.sigma(motion, reference), self.p)
+        return force_for(self.c, model, motion, reference, robust), ()
+
+
+@record
+class SuperTwisting:
+    """sigma_dot = -k_1 sqrt|sigma| sgn(sigma) + w, w' = -k_2 sgn(sigma): the paper's future work.
+
+    Levant, Int. J. Control 58 (1993) 1247-1263. Both terms are smoothed with p: the root as
+    sigma / (sigma^2 + 1/p^2)^(1/4), whose slope at zero is sqrt(p). The state w (m/s^2) integrates, so
+    a constant disturbance leaves no offset. Default slope at zero: k_1 sqrt(p) = 400 1/s, as SlidingMode has.
+    """
+
+    c: Scalar = leaf(default=17.0, unit="1/s", above=0, doc="decay rate on the sliding manifold")
+    k_1: Scalar = leaf(default=40.0, unit="m^0.5/s^1.5", above=0, doc="gain of the root term")
+    k_2: Scalar = leaf(default=50.0, unit="m/s^3", above=0, doc="gain of the integral; above the bound on dq_z/dt")
+    p: Scalar = leaf(default=100.0, unit="s/m", above=0, doc="steepness of the smoothed root and sign of sigma")
+
+    def init(self, model: Plant) -> Array:
+        return jnp.zeros(())
+
+    def scale(self, model: Plant) -> Scalar:
+        return jnp.abs(model.g) / 50 + 1e-3
+
+    def slope(self, model: Plant) -> Scalar:
+        root, integral = self.k_1 * jnp.sqrt(self.p), TWO_OVER_PI * self.k_2 * self.p
+        # sigma'' + root sigma' + integral sigma = 0 at the origin: the faster of the two modes.
+        pole = (root + jnp.sqrt(jnp.maximum(root**2 - 4 * integral, 0.0))) / 2
+        return jnp.maximum(jnp.maximum(pole, jnp.sqrt(integral)), self.c)
+
+    def sigma(self, motion: Measurement, reference: Reference) -> Array:
+        return sliding_variable(self.c, motion, reference)
+
+    def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: Array) -> tuple[Array, Array]:
+        motion, reference = inputs
+        sigma = self.sigma(motion, reference)
+        robust = state - self.k_1 * smooth_root(sigma, self.p)
+        return force_for(self.c, model, motion, reference, robust), -self.k_2 * smooth_sign(sigma, self.p)

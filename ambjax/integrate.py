@@ -1,0 +1,246 @@
+"""Integrators: one signature, `advance`, over one sample period in which the inputs are held.
+
+    advance(problem, t, span, state, memory) -> Advanced(state, code, t, memory)
+
+A `Problem` is a right-hand side on any pytree of scalars, the size of each component that still
+matters, and the fate of a state: 0 while all is well. An integrator stops at the first state whose
+code is not 0 and returns the last good one. `memory` is what the method carries from one sample to
+the next (`start(span)` makes the first).
+
+Stage times are moved inside the step by a few units in the last place, so that a jump that falls on
+a step's edge is seen by the steps after it and not by those before: otherwise the last stage sees
+it early and the method falls to first order there.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ambjax import _linear
+from ambjax._pytree import Scalar, leaf, record, static
+from ambjax.trajectory import ALIVE, STALLED
+
+State = TypeVar("State")
+Rates = Callable[[Array, Any], Any]
+Fate = Callable[[Any], Array]
+
+
+class Problem(NamedTuple):
+    """What is integrated: rates(t, state), scale (a state) and fate(state) -> code."""
+
+    rates: Rates
+    scale: Any
+    fate: Fate
+
+
+class Advanced(NamedTuple):
+    """The end of one sample period: last good state, fate's code, the time it refers to, memory."""
+
+    state: Any
+    code: Array
+    t: Array
+    memory: Any
+
+
+class Integrator(Protocol):
+    """What `rollout` needs of a method."""
+
+    @property
+    def limit(self) -> float | None:
+        """Largest stable step times slope on the negative real axis; None if there is none."""
+        ...
+
+    def step_size(self, span: float) -> float | None:
+        """The step in s, or None if the method chooses it as it goes."""
+        ...
+
+    def start(self, span: Scalar) -> Any: ...
+
+    def advance(self, problem: Problem, t: Scalar, span: Scalar, state: Any, memory: Any) -> Advanced: ...
+
+
+def axpy(state: State, *terms: tuple[Scalar, State]) -> State:
+    """state + sum of factor * direction over the terms, leaf by leaf."""
+    for factor, direction in terms:
+        state = jax.tree.map(lambda x, d, factor=factor: x + factor * d, state, direction)
+    return state
+
+
+def choose(condition: Array, yes: State, no: State) -> State:
+    """jnp.where over whole states."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+def _inside(t: Scalar, h: Scalar) -> Callable[[float], Array]:
+    """Stage times t + share h, kept strictly inside the step."""
+    eps = jnp.finfo(jnp.result_type(float)).eps
+    inset = 4 * eps * (jnp.abs(jnp.asarray(t)) + h)
+    return lambda share: t + inset + share * (h - 2 * inset)
+
+
+@record
+class _Fixed:
+    """Equal substeps of `_step`, by a loop of fixed length: forward and reverse mode both work."""
+
+    substeps: int = static(default=1, doc="steps per sample period")
+
+    def step_size(self, span: float) -> float | None:
+        return span / self.substeps
+
+    def start(self, span: Scalar) -> Any:
+        return ()
+
+    def _step(self, rates: Rates, t: Array, h: Scalar, state: Any) -> Any:
+        raise NotImplementedError
+
+    def advance(self, problem: Problem, t: Scalar, span: Scalar, state: Any, memory: Any) -> Advanced:
+        h = jnp.asarray(span) / self.substeps
+
+        def body(index: Array, carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
+            x, code, reached = carry
+            new = self._step(problem.rates, t + index * h, h, x)
+            verdict = problem.fate(new)
+            alive = code == ALIVE
+            good = alive & (verdict == ALIVE)
+            return (
+                choose(good, new, x),
+                jnp.where(alive, verdict, code),
+                jnp.where(alive, t + (index + 1) * h, reached),
+            )
+
+        begin = (state, jnp.zeros((), jnp.int32), jnp.asarray(t, h.dtype))
+        x, code, reached = lax.fori_loop(0, self.substeps, body, begin)
+        return Advanced(x, code, reached, memory)
+
+
+@record
+class Euler(_Fixed):
+    """Explicit Euler, order 1."""
+
+    limit = 2.0
+
+    def _step(self, rates: Rates, t: Array, h: Scalar, state: Any) -> Any:
+        return axpy(state, (h, rates(_inside(t, h)(0.0), state)))
+
+    def __str__(self) -> str:
+        return f"explicit Euler, {self.substeps} substeps"
+
+
+@record
+class RK4(_Fixed):
+    """The classical explicit Runge-Kutta method, order 4."""
+
+    limit = 2.785
+
+    def _step(self, rates: Rates, t: Array, h: Scalar, state: Any) -> Any:
+        at = _inside(t, h)
+        k_1 = rates(at(0.0), state)
+        k_2 = rates(at(0.5), axpy(state, (h / 2, k_1)))
+        k_3 = rates(at(0.5), axpy(state, (h / 2, k_2)))
+        k_4 = rates(at(1.0), axpy(state, (h, k_3)))
+        return axpy(state, (h / 6, k_1), (h / 3, k_2), (h / 3, k_3), (h / 6, k_4))
+
+    def __str__(self) -> str:
+        return f"RK4, {self.substeps} substeps"
+
+
+def rodas3_step(rates: Rates, t: Scalar, h: Scalar, state: Any) -> tuple[Any, Any]:
+    """One step of RODAS3 and its error estimate: Rosenbrock, order 3(2), L-stable, stiffly accurate.
+
+    Sandu et al., Atmospheric Environment 31 (1997) 3459-3472. One Jacobian, one factorisation of
+    I - h J / 2 and three evaluations a step. Stages are scaled by h, so h = 0 is the identity.
+    """
+    at = _inside(t, h)
+    t_0 = at(0.0)
+    factors = _linear.factor(_linear.jacobian(lambda x: rates(t_0, x), state), h / 2)
+    f_0, f_t = jax.jvp(lambda s: rates(s, state), (t_0,), (jnp.ones_like(t_0),))
+
+    def stage(f: Any, *couplings: tuple[Scalar, Any]) -> Any:
+        scaled = jax.tree.map(lambda q: h / 2 * q, f)
+        return _linear.solve(factors, axpy(scaled, *((c / 2, u) for c, u in couplings)))
+
+    u_1 = stage(axpy(f_0, (h / 2, f_t)))
+    u_2 = stage(axpy(f_0, (1.5 * h, f_t)), (4.0, u_1))
+    y_3 = axpy(state, (2.0, u_1))
+    u_3 = stage(rates(at(1.0), y_3), (1.0, u_1), (-1.0, u_2))
+    y_4 = axpy(y_3, (1.0, u_3))
+    u_4 = stage(rates(at(1.0), y_4), (1.0, u_1), (-1.0, u_2), (-8.0 / 3.0, u_3))
+    return axpy(y_4, (1.0, u_4)), u_4
+
+
+@record
+class Rodas3(_Fixed):
+    """RODAS3 with equal substeps: for stiff loops when a loop of fixed length is wanted (reverse mode)."""
+
+    limit = None
+
+    def _step(self, rates: Rates, t: Array, h: Scalar, state: Any) -> Any:
+        return rodas3_step(rates, t, h, state)[0]
+
+    def __str__(self) -> str:
+        return f"RODAS3 (L-stable Rosenbrock), {self.substeps} substeps"
+
+
+@record
+class Adaptive:
+    """RODAS3 whose steps keep the estimated error of each step below `tolerance` (scale + |state|).
+
+    The corner where a stiff smoothed sign leaves saturation lasts microseconds and comes rarely: steps shrink
+    there and grow again. The step carries over from one sample to the next. A while loop: forward
+    mode and vmap work, reverse mode does not (JAX cannot reverse a loop of unknown length).
+    """
+
+    tolerance: Scalar = leaf(default=1e-6, unit="1", above=0, doc="relative error allowed per step")
+    most_steps: int = static(default=10_000, doc="trial steps per sample period after which the run stalls")
+
+    limit = None
+
+    def step_size(self, span: float) -> float | None:
+        return None
+
+    def start(self, span: Scalar) -> Any:
+        return jnp.asarray(span) * 1e-3
+
+    def advance(self, problem: Problem, t: Scalar, span: Scalar, state: Any, memory: Any) -> Advanced:
+        span = jnp.asarray(span)
+
+        def unfinished(carry: Any) -> Array:
+            _, _, done, code, trials = carry
+            return (done < span) & (code == ALIVE) & (trials < self.most_steps)
+
+        def trial(carry: Any) -> Any:
+            x, h, done, _, trials = carry
+            left = span - done
+            last = h * 1.0001 >= left
+            taken = jnp.where(last, left, h)
+            new, error = rodas3_step(problem.rates, t + done, taken, x)
+            size = self._size(error, x, new, problem.scale)
+            accept = size <= 1
+            suggested = taken * jnp.clip(0.9 * jnp.maximum(size, 1e-9) ** (-1 / 3), 0.2, 5.0)
+            # A step cut short by the sample's end says little about the next one.
+            h = jnp.where(last & accept, jnp.maximum(h, suggested), suggested)
+            verdict = jnp.where(accept, problem.fate(new), ALIVE)
+            done = jnp.where(accept, jnp.where(last, span, done + taken), done)
+            return choose(accept & (verdict == ALIVE), new, x), h, done, verdict, trials + 1
+
+        zero = jnp.zeros((), jnp.int32)
+        begin = (state, lax.stop_gradient(memory), jnp.zeros_like(span), zero, zero)
+        x, h, done, code, _ = lax.while_loop(unfinished, trial, begin)
+        stalled = (code == ALIVE) & (done < span)
+        return Advanced(x, jnp.where(stalled, STALLED, code), t + done, h)
+
+    def _size(self, error: Any, x: Any, new: Any, scale: Any) -> Array:
+        """Root mean square of the error against what is allowed; huge if anything is not finite."""
+
+        def ratio(e: Array, a: Array, b: Array, s: Array) -> Array:
+            return (e / (self.tolerance * (s + jnp.maximum(jnp.abs(a), jnp.abs(b))))) ** 2
+
+        ratios = jax.tree.leaves(jax.tree.map(ratio, error, x, new, scale))
+        size = lax.stop_gradient(jnp.sqrt(sum(ratios) / len(ratios)))
+        return jnp.where(jnp.isfinite(size), size, 1e9)
+
+    def __str__(self) -> str:
+        return f"RODAS3 (L-stable Rosenbrock), adaptive, tolerance {float(self.tolerance):g}"

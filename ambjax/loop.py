@@ -1,0 +1,120 @@
+"""The closed loop as one system of ordinary differential equations: plant and cascade together."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax._pytree import Scalar, record
+from ambjax.control.cascade import Cascade, CascadeState, Command
+from ambjax.control.laws import Measurement
+from ambjax.integrate import Problem
+from ambjax.scenario import Scenario
+from ambjax.signals import Reference, reference_at
+from ambjax.trajectory import ALIVE, DIVERGED, TOUCHED, Row
+
+# A state this many times its scale has left the model's meaning, long before numbers overflow.
+DIVERGENCE = 1e6
+
+
+class LoopState(NamedTuple):
+    """State of the plant (z, z_dot, i), then of the cascade. The order matters to `_linear.factor`."""
+
+    plant: Measurement
+    control: CascadeState
+
+
+@record
+class ClosedLoop:
+    """A cascade in a scenario. `hold` below is the measurement error held over the sample, Measurement-shaped."""
+
+    cascade: Cascade
+    scenario: Scenario
+
+    def hold(self, sample: Scalar) -> Measurement:
+        """Errors of all sensors during sample number `sample`; zeros without a sensor model."""
+        if self.scenario.sensor is None:
+            return Measurement(*[jnp.zeros(())] * 3)
+        return self.scenario.sensor.noise(self.scenario.key(), sample)
+
+    def start(self) -> LoopState:
+        """The state at t = 0."""
+        initial = self.scenario.initial
+        plant = Measurement(*(jnp.asarray(x) for x in (initial.z, initial.z_dot, initial.i)))
+        return LoopState(plant, self.cascade.init(add(plant, self.hold(0))))
+
+    def scale(self) -> LoopState:
+        """Size of each component that still matters: 2 % of the gap, that in 0.1 s, 4 % of the bias current."""
+        plant = self.scenario.plant
+        moved = plant.s_0 / 50
+        scale = LoopState(Measurement(moved, 10 * moved, plant.i_0 / 25), self.cascade.scale())
+        return jax.tree.map(jnp.asarray, scale)
+
+    def command(self, t: Scalar, state: LoopState, hold: Measurement) -> tuple[Command, CascadeState, Array]:
+        """What the cascade decides from the measured state, the rates of its states, and the applied voltage."""
+        u_max = jnp.asarray(self.scenario.u_max)
+        seen = add(state.plant, hold)
+        command, rates = self.cascade(t, seen, state.control, self.scenario.reference, u_max)
+        return command, rates, jnp.clip(command.u, -u_max, u_max)
+
+    def rates(self, t: Scalar, state: LoopState, hold: Measurement) -> LoopState:
+        """Time derivative of the state: Eqs. (1), (2) and the laws."""
+        plant, (z, z_dot, i) = self.scenario.plant, state.plant
+        _, control, u = self.command(t, state, hold)
+        z_ddot = plant.z_ddot(z, i, self.scenario.acceleration(t))
+        return LoopState(Measurement(z_dot, z_ddot, plant.i_dot(z, z_dot, i, u, self.scenario.q_i(t))), control)
+
+    def fate(self, state: LoopState) -> Array:
+        """0 while the rotor is levitated, else the code of what became of it."""
+        sane = [jnp.abs(x) <= DIVERGENCE * s for x, s in zip(*map(jax.tree.leaves, (state, self.scale())), strict=True)]
+        touched = jnp.abs(state.plant.z) >= self.scenario.touchdown
+        return jnp.where(jnp.stack(sane).all(), jnp.where(touched, TOUCHED, ALIVE), DIVERGED).astype(jnp.int32)
+
+    def rest(self, state: LoopState, code: Array) -> LoopState:
+        """The state in which a lost rotor is frozen: at rest, against the stop it touched; controller as it was."""
+        z = state.plant.z
+        stop = jnp.where(z < 0, -1.0, 1.0) * self.scenario.touchdown
+        still = Measurement(jnp.where(code == TOUCHED, stop, z), jnp.zeros_like(z), state.plant.i)
+        return state._replace(plant=still)
+
+    def problem(self, hold: Measurement) -> Problem:
+        """What an integrator is given for one sample."""
+        return Problem(lambda t, x: self.rates(t, x, hold), self.scale(), self.fate)
+
+    def row(self, t: Scalar, state: LoopState, hold: Measurement, alive: Array) -> Row:
+        """All signals at one instant. The drive of a lost rotor is off: u = 0."""
+        plant, (z, z_dot, i) = self.scenario.plant, state.plant
+        command, _, u = self.command(t, state, hold)
+        motion, reference = state.plant, self.reference(t)
+        return Row(
+            t=jnp.asarray(t),
+            z=z,
+            z_dot=z_dot,
+            i=i,
+            i_ref=command.i_ref,
+            u=jnp.where(alive, u, 0.0),
+            v=plant.v(z, i),
+            v_star=command.v_star,
+            v_tilde=command.v_tilde,
+            sigma=self.cascade.position.sigma(motion, reference),
+            r=reference.r,
+            q_z=self.scenario.acceleration(t),
+            q_i=self.scenario.q_i(t),
+            z_measured=z + hold.z,
+            heat=jnp.where(alive, plant.copper_loss(i), 0.0),
+            alive=alive,
+        )
+
+    def singularity(self, row: Row) -> Array:
+        """Positive while (z, i_ref) is on the good side of the singular curve C, 0 on it. Eq. (9)."""
+        return self.scenario.plant.singularity(row.z, row.i_ref)
+
+    def reference(self, t: Scalar) -> Reference:
+        """r, r_dot, r_ddot at t."""
+        return reference_at(self.scenario.reference, t)
+
+
+def add(x: Measurement, y: Measurement) -> Measurement:
+    """Component by component."""
+    return Measurement(x.z + y.z, x.z_dot + y.z_dot, x.i + y.i)

@@ -1,0 +1,76 @@
+"""Which integrator, with how many substeps: read off the loop's own slopes."""
+
+import dataclasses
+import math
+
+import jax
+import numpy as np
+
+from ambjax._pytree import is_traced
+from ambjax.control.cascade import Cascade
+from ambjax.integrate import RK4, Adaptive, Integrator, Rodas3
+from ambjax.scenario import Clock, Scenario
+
+# RK4 at this step times slope is accurate to about 1e-9 m on smooth gains (benchmarks/work_precision.py)
+ACCURATE = 1.0
+# More RK4 substeps per sample than this cost more than the L-stable method's larger steps.
+MOST_SUBSTEPS = 4
+# Fixed L-stable steps: the corner of a smoothed sign costs an impulse that grows as slope h^2.
+CORNER = 3e-5
+
+
+def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
+    """Steepest rate of each law and of the unstable plant, 1/s; the largest over an ensemble.
+
+    Raises ValueError where a gain is traced: a step can be chosen only from numbers.
+    """
+    plant = scenario.plant
+    named = dict(cascade.slopes()) | {"plant": (abs(plant.k_s) / plant.m) ** 0.5}
+    if any(is_traced(x) for x in named.values()):
+        raise ValueError(
+            "clock.method is None (dt = 'auto'), but inside jit, grad or vmap the gains are traced and no "
+            "step can be read off them. Choose it outside: clock = with_method(clock, cascade, scenario)."
+        )
+    return {name: float(np.max(np.asarray(x))) for name, x in named.items()}
+
+
+def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *, reverse: bool = False) -> Integrator:
+    """RK4 while a few substeps resolve the steepest slope, else the L-stable RODAS3.
+
+    RODAS3 is adaptive, unless `reverse` asks for a loop of fixed length that reverse mode can run.
+    """
+    slope = max(slopes(cascade, scenario).values())
+    substeps = math.ceil(sample_period * slope / ACCURATE)
+    if substeps <= MOST_SUBSTEPS:
+        return RK4(max(substeps, 1))
+    if reverse:
+        return Rodas3(math.ceil(sample_period / math.sqrt(CORNER / slope)))
+    return Adaptive()
+
+
+def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: bool = False) -> Clock:
+    """`clock` with its method chosen if it had none, and checked against its stability limit if it had.
+
+    Raises ValueError for an explicit step beyond the limit, naming both and the fix.
+    """
+    if clock.method is None:
+        method = choose_method(cascade, scenario, float(clock.sample_period), reverse=reverse)
+        return dataclasses.replace(clock, method=method)
+    if clock.method.limit is not None:
+        _check_limit(clock, cascade, scenario)
+    return clock
+
+
+def _check_limit(clock: Clock, cascade: Cascade, scenario: Scenario) -> None:
+    try:
+        named = slopes(cascade, scenario)
+        step = clock.method.step_size(float(np.max(np.asarray(clock.sample_period))))
+    except (ValueError, jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
+        return  # traced: the caller checked the concrete values, or takes the risk
+    law = max(named, key=lambda name: named[name])
+    limit = clock.method.limit / named[law]
+    if step > limit:
+        raise ValueError(
+            f"clock.dt = {step:g} s: {clock.method} is stable only up to {limit:.3g} s, because the "
+            f"{law} law has slope {named[law]:.3g} 1/s. Use dt = 'auto', method = 'rodas3', or a smaller dt."
+        )

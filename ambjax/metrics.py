@@ -1,0 +1,216 @@
+"""Metrics as folds: they see one row at a time and keep a few numbers, whatever the length of the run.
+
+A fold is a record with `init() -> carry`, `update(carry, row) -> carry` and
+`result(carry, ending) -> numbers`. Errors count every sample, a lost rotor's too (frozen where it was
+lost); effort and chatter count only the samples in which the drive was on.
+"""
+
+from typing import Any, NamedTuple, Protocol
+
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax._pytree import Scalar, leaf, record, static
+from ambjax.smooth import safe_sqrt
+from ambjax.trajectory import ALIVE, first_time
+
+
+class Ending(NamedTuple):
+    """How a rollout ended: code and time (s, +inf: never) of the loss, first crossing of C, horizon in s."""
+
+    lost_code: Array
+    lost_at: Array
+    singular_at: Array
+    duration: Array
+
+
+class Fold(Protocol):
+    """A streaming metric."""
+
+    def init(self) -> Any: ...
+    def update(self, carry: Any, row: Any) -> Any: ...
+    def result(self, carry: Any, ending: Ending) -> Any: ...
+
+
+def _zero() -> Array:
+    return jnp.zeros((), jnp.result_type(float))
+
+
+@record
+class Peak:
+    """Largest |row.`of`| from `after` on, and when."""
+
+    of: str = static()
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0)
+    timed: bool = static(default=False)
+
+    def init(self) -> tuple[Array, Array]:
+        return _zero(), _zero()
+
+    def update(self, carry: tuple[Array, Array], row: Any) -> tuple[Array, Array]:
+        peak, when = carry
+        value = jnp.abs(getattr(row, self.of))
+        larger = (value > peak) & (row.t >= self.after)
+        return jnp.where(larger, value, peak), jnp.where(larger, row.t, when)
+
+    def result(self, carry: tuple[Array, Array], ending: Ending) -> Any:
+        return carry if self.timed else carry[0]
+
+
+@record
+class Lowest:
+    """Smallest row.`of` and when: (value, time)."""
+
+    of: str = static()
+
+    def init(self) -> tuple[Array, Array]:
+        return _zero() + jnp.inf, _zero()
+
+    def update(self, carry: tuple[Array, Array], row: Any) -> tuple[Array, Array]:
+        least, when = carry
+        value = getattr(row, self.of)
+        smaller = (value < least) & row.alive
+        return jnp.where(smaller, value, least), jnp.where(smaller, row.t, when)
+
+    def result(self, carry: tuple[Array, Array], ending: Ending) -> tuple[Array, Array]:
+        return carry
+
+
+@record
+class Rms:
+    """Root mean square of row.`of` from `after` on; over the samples with the drive on if `driven`."""
+
+    of: str = static()
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0)
+    driven: bool = static(default=False)
+
+    def init(self) -> tuple[Array, Array]:
+        return _zero(), _zero()
+
+    def update(self, carry: tuple[Array, Array], row: Any) -> tuple[Array, Array]:
+        total, count = carry
+        counts = (row.t >= self.after) & (row.alive | (not self.driven))
+        return total + jnp.where(counts, getattr(row, self.of) ** 2, 0.0), count + counts
+
+    def result(self, carry: tuple[Array, Array], ending: Ending) -> Array:
+        return safe_sqrt(carry[0] / jnp.maximum(carry[1], 1))
+
+
+@record
+class Mean:
+    """Mean of row.`of` over the samples with the drive on."""
+
+    of: str = static()
+
+    def init(self) -> tuple[Array, Array]:
+        return _zero(), _zero()
+
+    def update(self, carry: tuple[Array, Array], row: Any) -> tuple[Array, Array]:
+        return carry[0] + jnp.where(row.alive, getattr(row, self.of), 0.0), carry[1] + row.alive
+
+    def result(self, carry: tuple[Array, Array], ending: Ending) -> Array:
+        return carry[0] / jnp.maximum(carry[1], 1)
+
+
+@record
+class Variation:
+    """Total variation of row.`of` from sample to sample from `after` on, drive on: chatter."""
+
+    of: str = static()
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0)
+
+    def init(self) -> tuple[Array, Array, Array]:
+        return _zero(), _zero(), jnp.asarray(False)
+
+    def update(self, carry: tuple[Array, Array, Array], row: Any) -> tuple[Array, Array, Array]:
+        total, before, counting = carry
+        value, counts = getattr(row, self.of), row.alive & (row.t >= self.after)
+        return total + jnp.where(counts & counting, jnp.abs(value - before), 0.0), value, counts
+
+    def result(self, carry: tuple[Array, Array, Array], ending: Ending) -> Array:
+        return carry[0]
+
+
+@record
+class Reaching:
+    """Time at which |row.`of`| first comes within `band`, s; +inf if it never does."""
+
+    of: str = static()
+    band: Scalar = leaf(above=0)
+
+    def init(self) -> Array:
+        return _zero() + jnp.inf
+
+    def update(self, carry: Array, row: Any) -> Array:
+        return first_time((jnp.abs(getattr(row, self.of)) <= self.band) & row.alive, row.t, carry)
+
+    def result(self, carry: Array, ending: Ending) -> Array:
+        return carry
+
+
+@record
+class Named:
+    """Several folds at once, by name."""
+
+    folds: dict[str, Fold]
+
+    def init(self) -> dict[str, Any]:
+        return {name: fold.init() for name, fold in self.folds.items()}
+
+    def update(self, carry: dict[str, Any], row: Any) -> dict[str, Any]:
+        return {name: fold.update(carry[name], row) for name, fold in self.folds.items()}
+
+    def result(self, carry: dict[str, Any], ending: Ending) -> dict[str, Any]:
+        return {name: fold.result(carry[name], ending) for name, fold in self.folds.items()}
+
+
+@record
+class Standard:
+    """The metrics of metrics.json: a dict of numbers named with their units.
+
+    `settle` (s) is when "settled" begins. Reaching bands: |v_tilde| within 0.1 A^2/m^2, |e| within
+    1 mA, |sigma| within 1 mm/s. `touchdown` (m) is what "clearance used" is a share of.
+    """
+
+    settle: Scalar = leaf(default=0.5, unit="s", at_least=0, doc="time from which metrics count as settled")
+    touchdown: Scalar = leaf(default=4.5e-3, unit="m", above=0)
+
+    def _folds(self) -> Named:
+        late = self.settle
+        return Named(
+            {
+                "max_abs_error_m": Peak("e_z"),
+                "rms_error_m": Rms("e_z"),
+                "settled_max_abs_error_m": Peak("e_z", late),
+                "settled_rms_error_m": Rms("e_z", late),
+                "settled_max_abs_sigma_m_per_s": Peak("sigma", late),
+                "settled_max_abs_v_tilde_A2_per_m2": Peak("v_tilde", late),
+                "settled_max_abs_current_error_A": Peak("e", late),
+                "sigma_reached_s": Reaching("sigma", 1e-3),
+                "v_tilde_reached_s": Reaching("v_tilde", 0.1),
+                "current_error_reached_s": Reaching("e", 1e-3),
+                "max_abs_u_V": Peak("u"),
+                "rms_u_V": Rms("u", driven=True),
+                "settled_rms_u_V": Rms("u", late, driven=True),
+                "chatter_V": Variation("u", late),
+                "max_abs_i_A": Peak("i"),
+                "copper_loss_W": Mean("heat"),
+                "clearance_used": Peak("z"),
+            }
+        )
+
+    def init(self) -> dict[str, Any]:
+        return self._folds().init()
+
+    def update(self, carry: dict[str, Any], row: Any) -> dict[str, Any]:
+        return self._folds().update(carry, row)
+
+    def result(self, carry: dict[str, Any], ending: Ending) -> dict[str, Any]:
+        numbers = self._folds().result(carry, ending)
+        numbers["clearance_used"] = numbers["clearance_used"] / self.touchdown
+        fate = {
+            "lost": ending.lost_code != ALIVE,
+            "lost_at_s": ending.lost_at,
+            "singular_at_s": ending.singular_at,
+        }
+        return numbers | fate

@@ -1,0 +1,89 @@
+"""The world that a cascade meets: true plant, start, reference, disturbances, realism; and the clock."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax._pytree import Scalar, leaf, record, static
+from ambjax.control.laws import Measurement
+from ambjax.integrate import Integrator
+from ambjax.plant import Plant
+from ambjax.signals import Constant, Signal
+
+
+@record
+class Sensor:
+    """Gaussian noise on each measurement, drawn once per sample period and held."""
+
+    std: Scalar = leaf(default=0.0, unit="m", at_least=0, doc="standard deviation on z")
+    std_z_dot: Scalar = leaf(default=0.0, unit="m/s", at_least=0, doc="standard deviation on z_dot")
+    std_i: Scalar = leaf(default=0.0, unit="A", at_least=0, doc="standard deviation on i")
+
+    def noise(self, key: Array, sample: Scalar) -> Measurement:
+        """The errors of sample number `sample` for one member's key."""
+        w = jax.random.normal(jax.random.fold_in(key, sample), (3,))
+        return Measurement(self.std * w[0], self.std_z_dot * w[1], self.std_i * w[2])
+
+
+@record
+class Initial:
+    """State of the plant at t = 0."""
+
+    z: Scalar = leaf(default=0.0, unit="m", doc="displacement; within the clearance")
+    z_dot: Scalar = leaf(default=0.0, unit="m/s", doc="its rate")
+    i: Scalar = leaf(default=0.0, unit="A", doc="current deviation")
+
+
+@record
+class Scenario:
+    """Everything that happens to a cascade. Member k of seed s always draws the same noise."""
+
+    plant: Plant = Plant()
+    reference: Signal = Constant()
+    q_z: Signal = Constant()
+    """disturbance acceleration, m/s^2"""
+    q_v: Signal = Constant()
+    """disturbance as scaled force, A^2/m^2: adds a q_v to q_z, with the true plant's a"""
+    q_i: Signal = Constant()
+    """disturbance of the current's rate, A/s"""
+    sensor: Sensor | None = None
+    initial: Initial = Initial()
+    u_max: Scalar = leaf(default=jnp.inf, unit="V", above=0, infinite=True, doc="limit of the supply; inf: none")
+    clearance: Scalar | None = leaf(
+        default=None, unit="m", above=0, optional=True, doc="|z| of touch-down; none: 0.9 s_0"
+    )
+    seed: Scalar = leaf(default=0, at_least=0, doc="seed of the noise")
+    member: Scalar = leaf(default=0, at_least=0, doc="member of an ensemble")
+
+    @property
+    def touchdown(self) -> Scalar:
+        """|z| at which the rotor touches down, m."""
+        return 0.9 * self.plant.s_0 if self.clearance is None else self.clearance
+
+    def acceleration(self, t: Scalar) -> Array:
+        """The whole disturbance of Eq. (1) at time t: q_z + a q_v, m/s^2."""
+        return self.q_z(t) + self.plant.a * self.q_v(t)
+
+    def key(self) -> Array:
+        """The member's random key: fold_in(key(seed), member)."""
+        return jax.random.fold_in(jax.random.key(self.seed), self.member)
+
+
+@record
+class Clock:
+    """Samples, their period, and the method that integrates between them. `method` None: choose (see `auto`)."""
+
+    samples: int = static(default=20_000, doc="number of sample periods")
+    sample_period: Scalar = leaf(default=1e-4, unit="s", above=0, doc="time for which a measurement is held")
+    method: Any = None
+
+    @property
+    def duration(self) -> Scalar:
+        """Simulated time, s."""
+        return self.samples * self.sample_period
+
+    def with_method(self, method: Integrator) -> "Clock":
+        """This clock with another integrator."""
+        return Clock(self.samples, self.sample_period, method)
