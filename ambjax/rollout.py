@@ -60,7 +60,7 @@ def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | 
     check_inputs(cascade, scenario, clock)
     clock = with_method(clock, cascade, scenario)
     loop, clock, fold = canonical((ClosedLoop(cascade, scenario), clock, fold))
-    return _whole(loop, clock, fold, every=every)
+    return roll(loop, clock, fold, every=every)
 
 
 def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
@@ -77,7 +77,7 @@ def _run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome
     return finish(progress, rows, fold)
 
 
-_whole = one_kernel(_run, static_argnames=("every",))
+roll = one_kernel(_run, static_argnames=("every",))
 
 
 def begin(system: System, clock: Clock, fold: Fold | None) -> Progress:
