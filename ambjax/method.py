@@ -4,6 +4,7 @@ import dataclasses
 import math
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ambjax._pytree import is_traced
@@ -17,6 +18,7 @@ ACCURATE = 1.0
 MOST_SUBSTEPS = 4
 # Fixed L-stable steps: the corner of a smoothed sign costs an impulse that grows as slope h^2.
 CORNER = 3e-5
+TOLERANCE = 1e-6
 
 
 def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
@@ -45,7 +47,8 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
         return RK4(max(substeps, 1))
     if reverse:
         return Rodas3(math.ceil(sample_period / math.sqrt(CORNER / slope)))
-    return Adaptive()
+    # Rounding must stay well below the tolerance, or steps are rejected for noise: in float32, 1.2e-4.
+    return Adaptive(max(TOLERANCE, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps)))
 
 
 def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: bool = False) -> Clock:

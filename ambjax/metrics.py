@@ -5,6 +5,7 @@ A fold is a record with `init() -> carry`, `update(carry, row) -> carry` and
 lost); effort and chatter count only the samples in which the drive was on.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
@@ -152,7 +153,7 @@ class Reaching:
 class Named:
     """Several folds at once, by name."""
 
-    folds: dict[str, Fold]
+    folds: Mapping[str, Fold]
 
     def init(self) -> dict[str, Any]:
         return {name: fold.init() for name, fold in self.folds.items()}

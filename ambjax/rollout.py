@@ -116,6 +116,10 @@ def segment(
     return progress, rows
 
 
+begin_jit = one_kernel(begin)
+segment_jit = one_kernel(segment, static_argnames=("count", "every"))
+
+
 def finish(progress: Progress, rows: Any, fold: Fold | None) -> Outcome:
     """After the last sample."""
     lost_code, lost_at, singular_at, _ = progress.ending

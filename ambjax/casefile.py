@@ -1,0 +1,290 @@
+"""Case files: TOML in, cascade, scenario and clock out; strict, and with errors for people.
+
+An unknown key, a wrong type, a number out of bounds or two settings that contradict each other is a
+ValueError whose one line names the dotted path, the value, what is allowed and the fix.
+"""
+
+import dataclasses
+import difflib
+import math
+import pathlib
+import tomllib
+from typing import Any
+
+from ambjax import signals
+from ambjax._pytree import numbers, validate
+from ambjax.control import current, inversion, observer, position
+from ambjax.control.cascade import Cascade
+from ambjax.integrate import RK4, Adaptive, Euler, Integrator, Rodas3
+from ambjax.method import with_method
+from ambjax.plant import Plant
+from ambjax.scenario import Clock, Initial, Scenario, Sensor
+
+# The laws by stage and kind; the first of a stage is the default. A new law is one row here.
+KINDS: dict[str, dict[str, type]] = {
+    "observer": {"direct": observer.Direct, "complementary": observer.Complementary},
+    "position": {"sliding-mode": position.SlidingMode, "super-twisting": position.SuperTwisting},
+    "inversion": {"adaptive": inversion.Adaptive, "closed-form": inversion.ClosedForm},
+    "current": {"sliding-mode": current.SlidingMode, "pi": current.ProportionalIntegral},
+}
+SIGNALS: dict[str, type] = {
+    "constant": signals.Constant,
+    "step": signals.Step,
+    "pulse": signals.Pulse,
+    "sine": signals.Sine,
+    "smoothstep": signals.SmoothStep,
+    "chirp": signals.Chirp,
+    "sum": signals.Sum,
+}
+METHODS: dict[str, type] = {"rk4": RK4, "euler": Euler, "rodas3": Rodas3}
+UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
+# Rows that a run may record: 16 numbers each, so this is about 2.5 GB.
+MOST_SAMPLES = 20_000_000
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """What a case file says. `settle` in s; `method` as chosen or asked for is in the clock."""
+
+    name: str
+    cascade: Cascade
+    scenario: Scenario
+    clock: Clock
+    settle: float
+
+
+class Table:
+    """One TOML table being read: every key must be taken, and each complaint knows its dotted path."""
+
+    def __init__(self, raw: Any, path: str = ""):
+        if not isinstance(raw, dict):
+            raise ValueError(f"{path} = {show(raw)}: it must be a table. Write [{path}] and its keys below it.")
+        self.raw, self.path = raw, path
+
+    def at(self, key: str) -> str:
+        """Dotted path of a key."""
+        return f"{self.path}.{key}" if self.path else key
+
+    def only(self, allowed: list[str]) -> None:
+        """Refuse keys that mean nothing here, with a guess at what was meant."""
+        for key in self.raw:
+            if key not in allowed:
+                close = difflib.get_close_matches(key, allowed, n=1)
+                hint = f" Did you mean '{close[0]}'?" if close else ""
+                names = ", ".join(allowed) if allowed else "none"
+                raise ValueError(
+                    f"{self.at(key)} = {show(self.raw[key])}: unknown key.{hint} Keys allowed here: {names}."
+                )
+
+    def table(self, key: str) -> "Table":
+        """A table within this one; empty if left out."""
+        return Table(self.raw.get(key, {}), self.at(key))
+
+    def number(self, key: str, default: Any, allowed: str = "a number") -> Any:
+        """A number, or the default if left out."""
+        value = self.raw.get(key, default)
+        if value is default:
+            return default
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ValueError(f"{self.at(key)} = {show(value)}: it must be {allowed}, without quotes.")
+        return float(value)
+
+    def choice(self, key: str, allowed: list[str], default: str | None = None) -> str:
+        """One of several words."""
+        value = self.raw.get(key, default)
+        if value is None:
+            raise ValueError(f"{self.at(key)} is missing: it must be one of {quoted(allowed)}.")
+        if value not in allowed:
+            close = difflib.get_close_matches(str(value), allowed, n=1)
+            hint = f" Did you mean '{close[0]}'?" if close else ""
+            raise ValueError(f"{self.at(key)} = {show(value)}: it must be one of {quoted(allowed)}.{hint}")
+        return value
+
+    def record(self, kind: type, extra: tuple[str, ...] = (), base: Any = None) -> Any:
+        """A record whose leaves are this table's keys, defaults from `base` or from the record itself."""
+        fields = dataclasses.fields(kind)
+        self.only([*extra, *(f.name for f in fields)])
+        values: dict[str, Any] = {}
+        for field in fields:
+            inherited = field.default if base is None else getattr(base, field.name)
+            if field.name not in self.raw and inherited is dataclasses.MISSING:
+                raise ValueError(f"{self.at(field.name)} is missing: give {numbers(field)}; {field.metadata['doc']}.")
+            values[field.name] = self.number(field.name, inherited, numbers(field))
+        made = kind(**values)
+        validate(made, self.path)
+        return made
+
+
+def show(value: Any) -> str:
+    """A value as it would stand in the file, cut if it is long."""
+    text = f'"{value}"' if isinstance(value, str) else str(value)
+    text = text.lower() if isinstance(value, bool) else text
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def quoted(words: list[str]) -> str:
+    """'a', 'b' or 'c'."""
+    names = [f"'{w}'" for w in words]
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
+
+
+def read_case(path: str | pathlib.Path) -> Case:
+    """Read and check a case file.
+
+    Raises ValueError, one line, for anything wrong with the file or in it.
+    """
+    path = pathlib.Path(path)
+    try:
+        raw = tomllib.loads(path.read_bytes().decode("utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror}). Check the path and its permissions.") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: not a text file in UTF-8. A case file is TOML; see 'ambjax template'.") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path}: not valid TOML: {error}. See 'ambjax template' for a file to start from.") from None
+    try:
+        return case_from(raw, path.stem)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def case_from(raw: dict[str, Any], name: str = "case") -> Case:
+    """A case from a parsed TOML document. Raises ValueError as `read_case` does."""
+    top = Table(raw)
+    top.only(["plant", "controller", "reference", "disturbance", "sensor", "actuator", "initial", "clock", "run"])
+    plant = top.table("plant").record(Plant)
+    cascade = _cascade(top.table("controller"), plant)
+    scenario, settle = _scenario(top, plant)
+    clock, duration = _clock(top.table("clock"))
+    _check_start(scenario)
+    if settle is None:
+        settle = duration / 4
+    elif settle >= duration:
+        raise ValueError(f"run.settle = {settle:g} s: it must be less than clock.duration = {duration:g} s.")
+    return Case(name, cascade, scenario, with_method(clock, cascade, scenario), settle)
+
+
+def _cascade(table: Table, plant: Plant) -> Cascade:
+    table.only(["model", *KINDS])
+    model = table.table("model").record(Plant, base=plant)
+    laws = {}
+    for stage, kinds in KINDS.items():
+        law = table.table(stage)
+        kind = law.choice("kind", list(kinds), next(iter(kinds)))
+        laws[stage] = law.record(kinds[kind], extra=("kind",))
+    return Cascade(model=model, **laws)
+
+
+def _signal(table: Table, extra: tuple[str, ...] = ()) -> Any:
+    kind = table.choice("kind", list(SIGNALS))
+    if kind == "sum":
+        table.only(["kind", "terms", *extra])
+        terms = table.raw.get("terms")
+        if not isinstance(terms, list) or not terms:
+            raise ValueError(f"{table.at('terms')} = {show(terms)}: give a list of at least one signal table.")
+        return signals.Sum(tuple(_signal(Table(t, f"{table.at('terms')}[{n}]")) for n, t in enumerate(terms)))
+    made = table.record(SIGNALS[kind], extra=("kind", *extra))
+    if isinstance(made, signals.Pulse) and not made.stop > made.start:
+        raise ValueError(
+            f"{table.at('stop')} = {made.stop:g} s: the pulse must end after it starts; start = {made.start:g} s."
+        )
+    return made
+
+
+def _disturbances(table: Table) -> dict[str, Any]:
+    table.only(list(UNITS))
+    made = {}
+    for name in table.raw:
+        one, units = table.table(name), list(UNITS[name])
+        unit = one.choice("unit", units, units[0])
+        made["q_v" if unit == "A^2/m^2" else name] = _signal(one, extra=("unit",))
+    return made
+
+
+def _scenario(top: Table, plant: Plant) -> tuple[Scenario, float | None]:
+    actuator, run = top.table("actuator"), top.table("run")
+    actuator.only(["u_max"])
+    run.only(["seed", "settle", "clearance"])
+    settle = run.number("settle", None, "a number of seconds, 0 or more")
+    if settle is not None and not settle >= 0:
+        raise ValueError(f"{run.at('settle')} = {settle:g}: it must be a number of seconds, 0 or more.")
+    scenario = Scenario(
+        plant=plant,
+        reference=_signal(top.table("reference")) if "reference" in top.raw else signals.Constant(),
+        sensor=top.table("sensor").record(Sensor) if "sensor" in top.raw else None,
+        initial=top.table("initial").record(Initial),
+        u_max=actuator.number("u_max", math.inf),
+        clearance=run.number("clearance", None),
+        seed=_seed(run),
+        **_disturbances(top.table("disturbance")),
+    )
+    for path, part in (("actuator.u_max", scenario.u_max), ("run.clearance", scenario.clearance)):
+        if part is not None and not part > 0:
+            raise ValueError(f"{path} = {part:g}: it must be a number above 0. Leave it out for the default.")
+    return scenario, settle
+
+
+def _seed(run: Table) -> int:
+    seed = run.raw.get("seed", 0)
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
+        raise ValueError(f"{run.at('seed')} = {show(seed)}: it must be a whole number from 0 to 4294967295.")
+    return seed
+
+
+def _check_start(scenario: Scenario) -> None:
+    gap, stop, z = scenario.plant.s_0, scenario.touchdown, scenario.initial.z
+    if not stop < gap:
+        raise ValueError(f"run.clearance = {stop:g} m: it must be less than the gap plant.s_0 = {gap:g} m.")
+    if not abs(z) < stop:
+        raise ValueError(
+            f"initial.z = {z:g} m: the rotor would touch its stop at once; |z| must be below {stop:g} m "
+            "(run.clearance, by default 0.9 of plant.s_0)."
+        )
+
+
+def _clock(table: Table) -> tuple[Clock, float]:
+    table.only(["duration", "sample_period", "dt", "method"])
+    times = {}
+    for key, default in (("duration", 2.0), ("sample_period", 1e-4)):
+        times[key] = table.number(key, default, "a number of seconds above 0")
+        if not 0 < times[key] < math.inf:
+            raise ValueError(f"{table.at(key)} = {times[key]:g}: it must be a finite number of seconds above 0.")
+    duration, period = times["duration"], times["sample_period"]
+    samples = _whole(duration / period)
+    if samples is None:
+        nearest = max(round(duration / period), 1) * period
+        raise ValueError(
+            f"{table.at('sample_period')} = {period:g} s does not divide clock.duration = {duration:g} s. "
+            f"The nearest duration that it divides is {nearest:.12g} s."
+        )
+    if samples > MOST_SAMPLES:
+        raise ValueError(
+            f"{table.at('duration')} = {duration:g} s makes {samples:,} samples of {period:g} s; at most "
+            f"{MOST_SAMPLES:,} can be recorded. Shorten the run or lengthen clock.sample_period."
+        )
+    return Clock(samples, period, _method(table, period)), duration
+
+
+def _whole(ratio: float) -> int | None:
+    """The whole number of at least 1 that `ratio` is to rounding, or None."""
+    nearest = round(ratio) if math.isfinite(ratio) else 0
+    return nearest if nearest >= 1 and abs(ratio - nearest) <= 1e-9 * nearest else None
+
+
+def _method(table: Table, period: float) -> Integrator | None:
+    dt = table.raw.get("dt", "auto")
+    if dt == "auto":
+        name = table.choice("method", ["auto", "adaptive"], "auto") if "method" in table.raw else "auto"
+        return Adaptive() if name == "adaptive" else None
+    dt = table.number("dt", None, '"auto" or a number of seconds above 0')
+    if not 0 < dt < math.inf:
+        raise ValueError(f'{table.at("dt")} = {dt:g}: it must be "auto" or a finite number of seconds above 0.')
+    method = METHODS[table.choice("method", list(METHODS), "rk4")]
+    substeps = _whole(period / dt)
+    if substeps is None:
+        nearest = period / max(round(period / dt), 1)
+        raise ValueError(
+            f"{table.at('dt')} = {dt:g} s does not divide clock.sample_period = {period:g} s. "
+            f'The nearest step that does is {nearest:.12g} s; or use dt = "auto".'
+        )
+    return method(substeps)

@@ -1,0 +1,166 @@
+"""The commands behind `ambjax`: each takes parsed arguments and returns an exit code and a summary.
+
+0: done. 1: done, and the answer is no (rotor lost, a condition fails). Bad input is a ValueError, which
+`__main__` turns into one line and exit code 2.
+"""
+
+import argparse
+import dataclasses
+import time
+from typing import Any
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from ambjax import ledger, paper, plotting
+from ambjax._pytree import canonical
+from ambjax.casefile import Case, read_case
+from ambjax.evidence import NOISE_PERIODS, gather
+from ambjax.loop import ClosedLoop
+from ambjax.metrics import Standard
+from ambjax.outputs import directory, plain, say, table, write_json
+from ambjax.rollout import Outcome, begin_jit, finish, segment_jit
+from ambjax.template import template
+from ambjax.theorem import Condition, check
+
+Summary = dict[str, Any]
+# Samples simulated between two strokes of the progress bar.
+STROKE = 20_000
+
+
+def run_template(args: argparse.Namespace) -> tuple[int, Summary]:
+    """ambjax template."""
+    text = template(args.scenario)
+    if not args.json:
+        print(text, end="")
+    return 0, {"template": text}
+
+
+def run_simulate(args: argparse.Namespace) -> tuple[int, Summary]:
+    """ambjax simulate."""
+    case = read_case(args.case)
+    out = directory(args.out, f"simulate-{case.name}")
+    say(f"method: {case.clock.method}")
+    trajectory, measured = simulate(case)
+    trajectory.save(out / "trajectory.npz")
+    metrics = plain(measured) | {
+        "lost_why": trajectory.lost_why,
+        "method": str(case.clock.method),
+        "settle_s": case.settle,
+    }
+    write_json(out / "metrics.json", metrics)
+    plotting.overview(trajectory, f"{case.name}: {case.clock.method}", out / "overview.png")
+    if not args.json:
+        print(_metrics_text(metrics))
+        print(f"written: {out}/trajectory.npz, metrics.json, overview.png")
+    if metrics["lost"]:
+        say(f"The rotor is lost at {metrics['lost_at_s']:.4g} s: {trajectory.lost_why}. 'ambjax check' may say why.")
+    return int(metrics["lost"]), metrics | {"out": str(out)}
+
+
+def simulate(case: Case) -> Outcome:
+    """A rollout of a case, recorded whole, with a progress bar if it takes more than two seconds."""
+    fold = Standard(case.settle, case.scenario.touchdown)
+    loop, clock, fold = canonical((ClosedLoop(case.cascade, case.scenario), case.clock, fold))
+    progress, parts, done = begin_jit(loop, clock, fold), [], 0
+    with tqdm(total=clock.samples, unit="sample", unit_scale=True, delay=2, leave=False, desc="simulate") as bar:
+        while done < clock.samples:
+            count = min(STROKE, clock.samples - done)
+            progress, rows = segment_jit(loop, clock, fold, progress, done, count=count, every=1)
+            parts.append(jax.tree.map(np.asarray, rows))
+            done += count
+            bar.update(count)
+    rows = jax.tree.map(lambda *xs: np.concatenate(xs), *parts)
+    return jax.tree.map(np.asarray, finish(progress, rows, fold))
+
+
+def _metrics_text(metrics: Summary) -> str:
+    rows = [
+        (name, "never" if v is None else f"{v:.6g}" if isinstance(v, float) else str(v)) for name, v in metrics.items()
+    ]
+    return table(("metric", "value"), rows)
+
+
+def run_check(args: argparse.Namespace) -> tuple[int, Summary]:
+    """ambjax check."""
+    case = read_case(args.case)
+    report = check(case.cascade, case.scenario, case.clock)
+    summary = {
+        "holds": report.holds,
+        "lost_at_s": report.lost_at,
+        "lost_why": report.lost_why,
+        "method": report.method,
+        "conditions": [_condition(c) for c in report.conditions],
+        "proof": [_condition(c) for c in report.proof],
+    }
+    if not args.json:
+        _print_check(report.conditions, report.proof)
+        fate = (
+            f"The rotor is lost at {report.lost_at:.4g} s: {report.lost_why}."
+            if report.lost_why
+            else "The rotor is held."
+        )
+        print(f"\n{fate} {'Every condition holds.' if report.holds else 'The answer is no.'}")
+    return int(not report.holds), plain(summary)
+
+
+def _condition(c: Condition) -> Summary:
+    return dataclasses.asdict(c) | {"margin": c.margin}
+
+
+def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
+    verdict = {True: "holds", False: "FAILS", None: "-"}
+
+    def number(x: float | None) -> str:
+        return "-" if x is None else f"{x:.5g}"
+
+    rows = [
+        (
+            c.requires,
+            number(c.gain),
+            number(c.against),
+            number(c.margin),
+            c.unit,
+            f"{c.at_s:.5g}",
+            verdict[c.holds],
+            c.note,
+        )
+        for c in conditions
+    ]
+    print(table(("condition", "left", "right", "margin", "unit", "at (s)", "verdict", "note"), rows))
+    steps = [(c.name, c.requires, f"{c.against:.3g}", c.unit, f"{c.at_s:.5g}", c.note) for c in proof]
+    print("\n" + table(("proof", "statement", "worst", "unit", "at (s)", "what"), steps))
+
+
+def run_reproduce(args: argparse.Namespace) -> tuple[int, Summary]:
+    """ambjax reproduce."""
+    out = directory(args.out, "reproduce")
+    began = time.perf_counter()
+    stages = len(paper.READINGS) * (6 + len(NOISE_PERIODS)) + 1
+    with tqdm(
+        total=stages, unit="stage", delay=2, leave=False, bar_format="{l_bar}{bar}| {n}/{total} [{elapsed}]"
+    ) as bar:
+
+        def stage(text: str) -> None:
+            bar.set_description_str(f"{text:<34}")
+            bar.update()
+
+        evidence = {reading: gather(reading, stage) for reading in paper.READINGS}
+        stage("figures and ledger")
+        for reading, seen in evidence.items():
+            folder = out if reading == "repaired" else out / reading
+            folder.mkdir(exist_ok=True)
+            for number, (name, _) in plotting.PAPER_FIGURES.items():
+                trajectory = getattr(seen, name).trajectory
+                title = f"Figure {number}: {name}, {reading} reading, no noise"
+                plotting.paper_figure(number, trajectory, title, folder / f"figure_{number}.png")
+        claims, noise = ledger.judge(evidence), ledger.noise_table(evidence)
+        (out / "ledger.md").write_text(ledger.markdown(claims, noise), encoding="utf-8")
+        write_json(out / "ledger.json", {"claims": claims, "noise": noise})
+    if not args.json:
+        rows = [(c["says"], c["paper"], *(f["verdict"] for f in c["findings"].values())) for c in claims]
+        print(table(("claim", "paper", *paper.READINGS), rows))
+        print(f"written: {out}/figure_3.png to figure_6.png, the same under literal/, ledger.md, ledger.json")
+    say(f"done in {time.perf_counter() - began:.1f} s")
+    return 0, {"claims": plain(claims), "noise": plain(noise), "out": str(out)}

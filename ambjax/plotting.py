@@ -1,0 +1,132 @@
+"""Pictures of trajectories: the paper's Figures 3 to 6 and an overview of any run."""
+
+import pathlib
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ambjax.trajectory import Row, Trajectory
+
+# Okabe and Ito's colours: distinct in print and to colour-blind readers.
+INK, BLUE, ORANGE, GREEN, RED = "#222222", "#0072B2", "#E69F00", "#009E73", "#D55E00"
+BINS = 2000
+
+
+class Curve(NamedTuple):
+    """A signal of a Row and how to draw it."""
+
+    signal: str
+    label: str
+    colour: str = BLUE
+    style: str = "-"
+
+
+class Panel(NamedTuple):
+    """Curves that share an axis; values are multiplied by `factor` to reach `unit`."""
+
+    ylabel: str
+    unit: str
+    factor: float
+    curves: tuple[Curve, ...]
+
+
+POSITION = Panel("position", "mm", 1e3, (Curve("z", "$z$"), Curve("r", "$r$", ORANGE, "--")))
+ERROR = Panel("$z - r$", "µm", 1e6, (Curve("e_z", "$z - r$"),))
+CURRENT = Panel("current", "A", 1.0, (Curve("i", "$i$"), Curve("i_ref", "$i_{ref}$", ORANGE, "--")))
+SLIDING = Panel("sliding variable $\\sigma$", "m/s", 1.0, (Curve("sigma", "$\\sigma$"),))
+DISTURBANCE = Panel("disturbance $q_z$", "m/s²", 1.0, (Curve("q_z", "$q_z$"),))
+FORCE = Panel("scaled force", "A²/m²", 1.0, (Curve("v", "$v$"), Curve("v_star", "$v^*$", ORANGE, "--")))
+FORCE_ERROR = Panel("force error $\\tilde v$", "A²/m²", 1.0, (Curve("v_tilde", "$\\tilde v$"),))
+VOLTAGE = Panel("voltage $u$", "V", 1.0, (Curve("u", "$u$"),))
+CURRENT_DISTURBANCE = Panel("disturbance $q_i$", "A/s", 1.0, (Curve("q_i", "$q_i$"),))
+
+SIGNALS = (POSITION, CURRENT, SLIDING, DISTURBANCE)
+INPUTS = (FORCE, FORCE_ERROR, VOLTAGE)
+# The paper's Figures 3 to 6: scenario and panels, top to bottom.
+PAPER_FIGURES = {
+    3: ("regulation", SIGNALS),
+    4: ("regulation", INPUTS),
+    5: ("tracking", SIGNALS),
+    6: ("tracking", INPUTS),
+}
+
+
+def thin(t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """At most 2 * BINS points that keep every extreme: the least and the largest of each bin."""
+    if len(t) <= 4 * BINS:
+        return t, y
+    width = len(t) // BINS
+    whole = width * BINS
+    bins = y[:whole].reshape(BINS, width)
+    at = np.sort(np.stack([bins.argmin(1), bins.argmax(1)], 1), 1) + width * np.arange(BINS)[:, None]
+    at = np.append(at.ravel(), len(t) - 1)
+    return t[at], y[at]
+
+
+def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.Path) -> None:
+    """Write the paper's Figure `number` for a trajectory of its scenario."""
+    _, panels = PAPER_FIGURES[number]
+    figure = Figure(figsize=(7.0, 1.75 * len(panels) + 0.7), layout="constrained")
+    axes = figure.subplots(len(panels), 1, sharex=True)
+    for ax, panel in zip(axes, panels, strict=True):
+        _draw(ax, panel, trajectory)
+    axes[-1].set_xlabel("time (s)")
+    figure.suptitle(title, fontsize=11)
+    figure.savefig(path, dpi=150)
+
+
+def overview(trajectory: Trajectory, title: str, path: pathlib.Path) -> None:
+    """Write one page with every signal of a run."""
+    panels = (POSITION, ERROR, SLIDING, DISTURBANCE, CURRENT, FORCE, FORCE_ERROR, VOLTAGE)
+    if np.any(np.asarray(trajectory.rows.q_i)):
+        panels = (*panels[:4], *panels[4:7], VOLTAGE, CURRENT_DISTURBANCE, _measured(trajectory))
+    half = len(panels) // 2
+    figure = Figure(figsize=(12.0, 1.9 * half + 0.8), layout="constrained")
+    axes = figure.subplots(half, 2, sharex=True)
+    order = axes.T.ravel()
+    for ax, panel in zip(order, panels, strict=True):
+        _draw(ax, panel, trajectory)
+    for ax in axes[-1]:
+        ax.set_xlabel("time (s)")
+    figure.suptitle(title, fontsize=12)
+    figure.savefig(path, dpi=130)
+
+
+def _measured(trajectory: Trajectory) -> Panel:
+    return Panel("measured position", "mm", 1e3, (Curve("z_measured", "$z$ measured", GREEN), Curve("z", "$z$")))
+
+
+def _draw(ax: Axes, panel: Panel, trajectory: Trajectory) -> None:
+    rows, lost_at = trajectory.rows, float(trajectory.lost_at)
+    t = np.asarray(rows.t)
+    alive = t < lost_at
+    for curve in panel.curves:
+        x, y = thin(t[alive], panel.factor * _signal(rows, curve.signal)[alive])
+        ax.plot(x, y, curve.style, color=curve.colour, linewidth=1.2, label=curve.label)
+    ax.set_ylabel(f"{panel.ylabel}\n({panel.unit})", fontsize=9)
+    ax.set_xlim(t[0], t[-1])
+    ax.grid(alpha=0.3, linewidth=0.5)
+    ax.tick_params(labelsize=8)
+    ax.margins(y=0.12)
+    if len(panel.curves) > 1:
+        ax.legend(loc="upper right", fontsize=8, ncols=len(panel.curves), framealpha=0.9)
+    if np.isfinite(lost_at):
+        _mark_loss(ax, trajectory, first=panel in (POSITION, FORCE))
+
+
+def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:
+    """Zoom to the loss, shade what follows, and say why."""
+    lost_at, end = float(trajectory.lost_at), float(np.asarray(trajectory.rows.t)[-1])
+    ax.set_xlim(0, min(end, max(1.6 * lost_at, 1e-3)))
+    ax.axvspan(lost_at, end, color=RED, alpha=0.12, linewidth=0)
+    ax.axvline(lost_at, color=RED, linewidth=1.0)
+    if first:
+        why = trajectory.lost_why.replace(": ", ":\n")
+        words = f"lost at {lost_at:.4g} s\n{why}"
+        ax.annotate(words, (0.99, 0.06), xycoords="axes fraction", ha="right", va="bottom", fontsize=7, color=INK)
+
+
+def _signal(rows: Row, name: str) -> Any:
+    return np.asarray(getattr(rows, name), float)

@@ -1,0 +1,85 @@
+"""Annotated case files, written from the records themselves so that they cannot drift from the code."""
+
+import dataclasses
+import math
+from typing import Any
+
+from ambjax.casefile import KINDS
+from ambjax.paper import PULSE, REFERENCE, TABLE_2
+from ambjax.plant import Plant
+
+HEAD = """\
+# A case for ambjax: {title}.
+# Units are SI. A key left out takes the value shown here unless its comment says otherwise.
+# Check it with 'ambjax check', run it with 'ambjax simulate'.
+"""
+
+REST = """
+[initial]                     # state at t = 0
+z = 0.0                       # m; within the clearance
+z_dot = 0.0                   # m/s
+i = 0.0                       # A
+
+[clock]
+duration = 2.0                # s; a whole number of sample periods
+sample_period = 1e-4          # s; measurements are held for this long, one row is recorded for each
+dt = "auto"                   # s, or "auto": method and step from the loop's slopes
+# method = "rk4"              # with a number for dt: "rk4", "euler" or "rodas3" (L-stable)
+
+[run]
+seed = 0                      # of the sensor noise
+settle = 0.5                  # s; from when "settled" metrics count (left out: a quarter of the duration)
+# clearance = 4.5e-3          # m; |z| at which the rotor touches down (left out: 0.9 s_0)
+
+# [sensor]                    # Gaussian noise, held for a sample period (left out: none)
+# std = {paper_std:.4g}            # m; this is the paper's, which its printed gains do not survive
+# std_z_dot = 0.0             # m/s
+# std_i = 0.0                 # A
+
+# [actuator]
+# u_max = 200.0               # V; limit of the supply (left out: none)
+"""
+
+
+def _lines(kind: type, values: Any) -> list[str]:
+    lines = []
+    for field in dataclasses.fields(kind):
+        value = getattr(values, field.name)
+        if value is None:
+            continue
+        unit = f"{field.metadata['unit']}; " if field.metadata["unit"] else ""
+        lines.append(_noted(f"{field.name} = {_number(value)}", unit + field.metadata["doc"]))
+    return lines
+
+
+def _noted(text: str, comment: str) -> str:
+    return f"{text:<30}# {comment}"
+
+
+def _number(value: float) -> str:
+    text = repr(float(value)) if math.isfinite(value) else "inf"
+    return text if "." in text or "e" in text or text == "inf" else text + ".0"
+
+
+def template(scenario: str) -> str:
+    """The paper's tracking or regulation scenario under the repaired gains, as an annotated case file."""
+    tracking = scenario == "tracking"
+    lines = [HEAD.format(title=f"the paper's {scenario} scenario, Table 2 with gamma = 7.5e4")]
+    lines += ["[plant]                       # the true plant, Table 1", *_lines(Plant, Plant()), ""]
+    lines += [
+        "[controller]",
+        "model = {}                    # what the controller believes, where it differs: { m = 0.6 }",
+    ]
+    for stage, kinds in KINDS.items():
+        kind, law = next(iter(kinds.items()))
+        others = ", ".join(f'"{k}"' for k in list(kinds)[1:])
+        lines += ["", f"[controller.{stage}]", _noted(f'kind = "{kind}"', f"or {others}"), *_lines(law, law())]
+    lines += ["", "[reference]                   # constant, step, pulse, sine, smoothstep, chirp or sum; left out: 0"]
+    if tracking:
+        lines += ['kind = "sine"', *_lines(type(REFERENCE), REFERENCE)]
+    else:
+        lines += ['kind = "constant"', "value = 0.0                   # m"]
+    lines += ["", "[disturbance.q_z]             # likewise [disturbance.q_i], in A/s; left out: none"]
+    lines += ['kind = "pulse"', _noted('unit = "A^2/m^2"', 'scaled force; or "m/s^2", the default')]
+    lines += _lines(type(PULSE), PULSE)
+    return "\n".join(lines) + "\n" + REST.format(paper_std=TABLE_2.noise_std)
