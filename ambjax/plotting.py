@@ -68,7 +68,7 @@ def thin(t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.Path) -> None:
     """Write the paper's Figure `number` for a trajectory of its scenario."""
     _, panels = PAPER_FIGURES[number]
-    figure = Figure(figsize=(7.0, 1.75 * len(panels) + 0.7), layout="constrained")
+    figure = Figure(figsize=(7.0, 1.6 * len(panels) + 0.7), layout="constrained")
     axes = figure.subplots(len(panels), 1, sharex=True)
     for ax, panel in zip(axes, panels, strict=True):
         _draw(ax, panel, trajectory)
@@ -111,7 +111,9 @@ def _draw(ax: Axes, panel: Panel, trajectory: Trajectory) -> None:
     ax.tick_params(labelsize=8)
     ax.margins(y=0.12)
     if len(panel.curves) > 1:
-        ax.legend(loc="upper right", fontsize=8, ncols=len(panel.curves), framealpha=0.9)
+        # Above the panel: inside, it would hide a peak of some run or other.
+        above = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "frameon": False, "borderaxespad": 0.1}
+        ax.legend(fontsize=8, ncols=len(panel.curves), **above)
     if np.isfinite(lost_at):
         _mark_loss(ax, trajectory, first=panel in (POSITION, FORCE))
 

@@ -126,7 +126,7 @@ class Monitored:
         cascade, scenario = self.loop.cascade, self.loop.scenario
 
         def demanded(s: Array, x: LoopState) -> Array:
-            force, _ = cascade.demand(s, add(x.plant, hold), x.control, scenario.reference)
+            force, _, _ = cascade.demand(s, add(x.plant, hold), x.control, scenario.reference)
             return force.v_star - cascade.model.v(force.z, i_ref)
 
         return jax.jvp(demanded, (t, state), (jnp.ones_like(t), self.loop.rates(t, state, hold)))[1]
@@ -157,7 +157,7 @@ class Monitored:
 
     def _i_ref_dot(self, t: Array, state: LoopState, hold: Measurement) -> Array:
         cascade, measured = self.loop.cascade, add(state.plant, hold)
-        force, _ = cascade.demand(t, measured, state.control, self.loop.scenario.reference)
+        force, _, _ = cascade.demand(t, measured, state.control, self.loop.scenario.reference)
         return cascade.inversion(cascade.model, force, state.control.inversion)[0].i_ref_dot
 
     def _sigma_dot(self, t: Array, state: LoopState, hold: Measurement) -> Array:

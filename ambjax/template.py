@@ -32,7 +32,7 @@ settle = 0.5                  # s; from when "settled" metrics count (left out: 
 # clearance = 4.5e-3          # m; |z| at which the rotor touches down (left out: 0.9 s_0)
 
 # [sensor]                    # Gaussian noise, held for a sample period (left out: none)
-# std = {paper_std:.4g}            # m; this is the paper's, which its printed gains do not survive
+# std = {paper_std:.3e}          # m; this is the paper's, which its printed gains do not survive
 # std_z_dot = 0.0             # m/s
 # std_i = 0.0                 # A
 
@@ -74,7 +74,7 @@ def template(scenario: str) -> str:
         kind, law = next(iter(kinds.items()))
         others = ", ".join(f'"{k}"' for k in list(kinds)[1:])
         lines += ["", f"[controller.{stage}]", _noted(f'kind = "{kind}"', f"or {others}"), *_lines(law, law())]
-    lines += ["", "[reference]                   # constant, step, pulse, sine, smoothstep, chirp or sum; left out: 0"]
+    lines += ["", _noted("[reference]", "in m: constant, step, pulse, sine, smoothstep, chirp or sum; left out: 0")]
     if tracking:
         lines += ['kind = "sine"', *_lines(type(REFERENCE), REFERENCE)]
     else:

@@ -77,36 +77,35 @@ class Cascade:
 
     def demand(
         self, t: Scalar, measured: Measurement, state: CascadeState, reference: Signal
-    ) -> tuple[ForceDemand, CascadeState]:
-        """The force wanted and its rate as the nominal plant predicts it, and the rates of observer and position law.
+    ) -> tuple[ForceDemand, Measurement, CascadeState]:
+        """The force wanted, the estimate it is wanted for, and the rates of observer and position law.
 
-        v_star_dot is the derivative of v_star along (z_dot, nominal z_ddot, law states, t): what a
-        law that inverts statically needs for i_ref'. Unused, it is never computed.
+        The rates of z and v_star are derivatives along (z_dot, nominal z_ddot, law states, t): what a
+        law that inverts statically needs for i_ref'. Unused, they are never computed.
         """
         t = jnp.asarray(t, jnp.result_type(float))
 
-        def v_star_at(s: Array, z: Array, z_dot: Array, observed: State, positioned: State):
+        def wanted(s: Array, z: Array, z_dot: Array, observed: State, positioned: State):
             estimate, observed_rate = self.observer(self.model, Measurement(z, z_dot, measured.i), observed)
             inputs = (estimate, reference_at(reference, s))
             v_star, positioned_rate = self.position(self.model, inputs, positioned)
-            return v_star, (estimate, observed_rate, positioned_rate)
+            return (estimate.z, v_star), (estimate, observed_rate, positioned_rate)
 
         point = (t, measured.z, measured.z_dot, state.observer, state.position)
-        v_star, (estimate, observed_rate, positioned_rate) = v_star_at(*point)
+        (z, v_star), (estimate, observed_rate, positioned_rate) = wanted(*point)
         z_ddot = self.model.z_ddot(estimate.z, estimate.i)
         along = (jnp.ones_like(t), measured.z_dot, z_ddot, observed_rate, positioned_rate)
-        v_star_dot = jax.jvp(lambda *x: v_star_at(*x)[0], point, along)[1]
+        z_rate, v_star_rate = jax.jvp(lambda *x: wanted(*x)[0], point, along)[1]
         rates = CascadeState(observed_rate, positioned_rate, (), ())
-        return ForceDemand(estimate.z, estimate.z_dot, v_star, v_star_dot), rates
+        return ForceDemand(z, z_rate, v_star, v_star_rate), estimate, rates
 
     def __call__(
         self, t: Scalar, measured: Measurement, state: CascadeState, reference: Signal, u_max: Scalar
     ) -> tuple[Command, CascadeState]:
         """Command and rate of every law's state at time t. `u_max` is the supply's limit in V (inf: none)."""
-        force, rates = self.demand(t, measured, state, reference)
+        force, estimate, rates = self.demand(t, measured, state, reference)
         wanted, inversion_rate = self.inversion(self.model, force, state.inversion)
-        seen = Measurement(force.z, force.z_dot, measured.i)
-        u, current_rate = self.current(self.model, CurrentInputs(seen, wanted, u_max), state.current)
+        u, current_rate = self.current(self.model, CurrentInputs(estimate, wanted, u_max), state.current)
         v_tilde = force.v_star - self.model.v(force.z, wanted.i_ref)
         command = Command(force.v_star, v_tilde, wanted.i_ref, u)
         return command, rates._replace(inversion=inversion_rate, current=current_rate)

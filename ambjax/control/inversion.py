@@ -60,5 +60,5 @@ class ClosedForm:
         return 0.0
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: tuple[()]) -> tuple[CurrentDemand, tuple[()]]:
-        at, along = (inputs.z, inputs.v_star), (inputs.z_dot, inputs.v_star_dot)
+        at, along = (inputs.z, inputs.v_star), (inputs.z_rate, inputs.v_star_rate)
         return CurrentDemand(*jax.jvp(model.current_for, at, along)), ()

@@ -28,12 +28,15 @@ class Measurement(NamedTuple):
 
 
 class ForceDemand(NamedTuple):
-    """Input of an inversion law: where the rotor is (m, m/s) and the force wanted there (A^2/m^2, and per s)."""
+    """Input of an inversion law: where the rotor is (m) and the force wanted there (A^2/m^2), with their rates.
+
+    `z_rate` is the rate of the estimate z itself, which an observer may let differ from the velocity.
+    """
 
     z: Array
-    z_dot: Array
+    z_rate: Array
     v_star: Array
-    v_star_dot: Array
+    v_star_rate: Array
 
 
 class CurrentDemand(NamedTuple):

@@ -1,0 +1,177 @@
+"""One closed-loop run of 2 s, against SciPy's LSODA and Radau and diffrax, at equal accuracy.
+
+The paper's tracking scenario without noise, smooth gains (gamma = 1e9, p = 25e-6) and repaired gains
+(gamma = 7.5e4, p = 25), output every 10 ms, integration split at the pulse's edges for every peer. Of each
+solver's tolerances, the fastest whose largest error in z against a reference (LSODA, rtol 1e-12) is at
+most 1e-8 m counts. Medians of 7, compilation apart. Run: python benchmarks/single.py
+"""
+
+import dataclasses
+import importlib.util
+import itertools
+import math
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+os.environ.setdefault("JAX_ENABLE_X64", "1")
+
+import _measure
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from ambjax import Adaptive, Cascade, Clock, Plant, inversion, paper, rollout
+
+TARGET = 1e-8
+PERIOD, SAMPLES = 1e-2, 200
+TIMES = PERIOD * np.arange(SAMPLES)
+EDGES = (0.0, 0.8, 1.3, TIMES[-1])
+GAINS = {"smooth": (1e9, 25e-6), "repaired": (paper.REPAIRED_GAMMA, 25.0)}
+TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
+
+
+def right_side(gamma: float, p_v: float, xp: Any) -> Callable[..., Any]:
+    """The closed loop on (z, z_dot, i, i_ref) written out once more, for `math` or `jnp` as `xp`."""
+    atan = xp.atan
+    m, k_z, s_0, i_0, g, R = 0.588, -754.0, 5e-3, 0.25, 9.81, 41.44
+    kappa = 1.25e-6 * 1480.0**2 * 0.121
+    a, w = kappa / (4 * m), 4 * math.pi
+
+    def f(t: Any, y: Any, q: float) -> Any:
+        z, z_dot, i, i_ref = y[0], y[1], y[2], y[3]
+        sine, cosine = xp.sin(w * t), xp.cos(w * t)
+        r, r_dot, r_ddot = 2.5e-3 * sine, 2.5e-3 * w * cosine, -2.5e-3 * w * w * sine
+        sigma = z_dot - r_dot + 17.0 * (z - r)
+        robust = 25.0 * 2 / math.pi * atan(25.0 * sigma)
+        v_star = (-2 * k_z / m * z - 17.0 * (z_dot - r_dot) + r_ddot + g - robust) / a
+        up, low = s_0 - z, s_0 + z
+        v_ref = ((i_0 + i_ref) / up) ** 2 - ((i_0 - i_ref) / low) ** 2
+        v = ((i_0 + i) / up) ** 2 - ((i_0 - i) / low) ** 2
+        slope = 2 * (i_0 + i_ref) / up**2 + 2 * (i_0 - i_ref) / low**2
+        i_ref_dot = gamma * 2 / math.pi * atan(p_v * (v_star - v_ref)) / slope
+        e_law = -152.0 * 2 / math.pi * atan(25.0 * (i - i_ref))
+        u = kappa / (2 * low) * (-2 * z_dot / low * i + i_ref_dot + e_law) + R * i
+        i_dot = 2 * z_dot / low * i + 2 * low / kappa * (u - R * i)
+        return [z_dot, 2 * k_z / m * z + a * v - g + a * q, i_dot, i_ref_dot]
+
+    return f
+
+
+def scipy_run(gains: tuple[float, float], method: str, rtol: float) -> np.ndarray:
+    f, y, parts = right_side(*gains, math), [0.0] * 4, []
+    for begin, end in itertools.pairwise(EDGES):
+        q = 1.0 if begin == 0.8 else 0.0
+        inside = TIMES[(begin - 1e-12 <= TIMES) & (end - 1e-12 > TIMES)]
+        at = np.append(np.clip(inside, begin, end), end)
+        solved = solve_ivp(f, (begin, end), y, method, at, rtol=rtol, atol=rtol * 1e-3, args=(q,))
+        parts.append(solved.y[0, :-1])
+        y = solved.y[:, -1]
+    return np.append(np.concatenate(parts), y[0])
+
+
+def ours_run(gains: tuple[float, float], tolerance: float) -> Callable[[], Any]:
+    cascade = dataclasses.replace(paper.cascade("repaired"), inversion=inversion.Adaptive(*gains))
+    scenario = paper.scenario("tracking", "repaired")
+    clock = Clock(SAMPLES, PERIOD, Adaptive(tolerance))
+    return lambda: rollout(cascade, scenario, clock).trajectory.rows.z
+
+
+def diffrax_run(gains: tuple[float, float], solver: Any, rtol: float) -> Callable[[], Any]:
+    import diffrax
+
+    f = right_side(*gains, jnp)
+
+    def field(t: Any, y: Any, args: Any) -> Any:
+        return jnp.stack(f(t, y, jnp.where((t >= 0.8) & (t < 1.3), 1.0, 0.0)))
+
+    control = diffrax.PIDController(rtol=rtol, atol=rtol * 1e-3)
+    control = diffrax.ClipStepSizeController(control, jump_ts=jnp.array([0.8, 1.3]))
+
+    @jax.jit
+    def run(y0: Any) -> Any:
+        save = diffrax.SaveAt(ts=jnp.asarray(TIMES))
+        term = diffrax.ODETerm(field)
+        out = diffrax.diffeqsolve(
+            term,
+            solver,
+            0.0,
+            TIMES[-1],
+            1e-6,
+            y0,
+            saveat=save,
+            stepsize_controller=control,
+            max_steps=10**6,
+            throw=False,
+        )
+        assert out.ys is not None
+        return out.ys[:, 0]
+
+    return lambda: run(jnp.zeros(4))
+
+
+def best(make: Callable[[float], Callable[[], Any]], reference: np.ndarray) -> dict[str, Any] | None:
+    """The cheapest tolerance that reaches the target: its error, median time and first-call time."""
+    for rtol in TOLERANCES:
+        run = make(rtol)
+        began = time.perf_counter()
+        z = np.asarray(jax.block_until_ready(run()))
+        first = time.perf_counter() - began
+        error = float(np.abs(z - reference).max())
+        if error <= TARGET:
+            seconds = _measure.median_time(run)
+            return {"rtol": rtol, "error_m": error, "seconds": seconds, "compile_s": max(first - seconds, 0.0)}
+    return None
+
+
+def peers(gains: tuple[float, float]) -> dict[str, Callable[[float], Callable[[], Any]]]:
+    made: dict[str, Callable[[float], Callable[[], Any]]] = {
+        "ambjax": lambda tol: ours_run(gains, tol),
+        "SciPy LSODA": lambda tol: lambda: scipy_run(gains, "LSODA", tol),
+        "SciPy Radau": lambda tol: lambda: scipy_run(gains, "Radau", tol),
+    }
+    if importlib.util.find_spec("diffrax") is None:
+        print("diffrax is not installed: skipped (pip install -e '.[bench]')")
+        return made
+    import diffrax
+
+    made["diffrax Tsit5"] = lambda tol: diffrax_run(gains, diffrax.Tsit5(), tol)
+    made["diffrax Kvaerno3"] = lambda tol: diffrax_run(gains, diffrax.Kvaerno3(), tol)
+    made["diffrax Kvaerno5"] = lambda tol: diffrax_run(gains, diffrax.Kvaerno5(), tol)
+    return made
+
+
+def main() -> None:
+    assert Cascade().model == Plant()
+    results: dict[str, Any] = {"target_error_m": TARGET}
+    for name, gains in GAINS.items():
+        reference = scipy_run(gains, "LSODA", 1e-12)
+        check = np.asarray(ours_run(gains, 1e-10)())
+        print(f"\n{name} gains; two references agree to {np.abs(check - reference).max():.1e} m")
+        rows = {}
+        for peer, make in peers(gains).items():
+            if name == "repaired" and peer == "diffrax Tsit5":
+                continue  # explicit: hundreds of thousands of steps on a loop this stiff
+            rows[peer] = best(make, reference)
+        ours = rows["ambjax"]
+        assert ours is not None
+        print(
+            f"{'solver':<18} {'tolerance':>9} {'error (m)':>10} {'run (ms)':>9} {'ambjax is':>11} {'compile (s)':>11}"
+        )
+        for peer, row in rows.items():
+            if row is None:
+                print(f"{peer:<18} does not reach {TARGET:g} m at any tolerance tried")
+                continue
+            row["ratio"] = row["seconds"] / ours["seconds"]
+            print(
+                f"{peer:<18} {row['rtol']:9.0e} {row['error_m']:10.1e} {1e3 * row['seconds']:9.2f} "
+                f"{row['ratio']:8.1f} x  {row['compile_s']:11.2f}"
+            )
+        results[name] = rows
+    _measure.write("single", results)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,261 @@
+"""The command line as a user meets it: outputs, exit codes, and what it says to bad input."""
+
+import json
+import pathlib
+import re
+
+import numpy as np
+import pytest
+
+from ambjax import commands
+from ambjax.__main__ import main
+from ambjax.casefile import KINDS, SIGNALS, case_from, read_case
+from ambjax.paper import CLOCK, SETTLE, cascade, scenario
+from ambjax.template import template
+
+SHORT = "[clock]\nduration = 0.05\n"
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """Each test in a folder of its own, with the compilation cache in it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / "cache"))
+
+
+def write(text, name="case.toml"):
+    pathlib.Path(name).write_text(text, encoding="utf-8")
+    return name
+
+
+# What is wrong, the file, what the message must contain: the path, the value or the fix.
+BAD = {
+    "unknown table": ("[plnat]\nm = 1.0\n", ["plnat", "Did you mean 'plant'"]),
+    "unknown key": ("[plant]\nmass = 1.0\n", ["plant.mass", "unknown key", "Keys allowed"]),
+    "misspelt gain": ("[controller.inversion]\ngama = 1e3\n", ["controller.inversion.gama", "Did you mean 'gamma'"]),
+    "key at top level": ("m = 1.0\n", ["m = 1.0", "unknown key"]),
+    "word for a number": ('[plant]\nm = "heavy"\n', ["plant.m", '"heavy"', "above 0"]),
+    "bool for a number": ("[plant]\nm = true\n", ["plant.m", "true"]),
+    "list for a number": ("[plant]\nm = [1.0]\n", ["plant.m", "[1.0]"]),
+    "number for a table": ("plant = 3\n", ["plant = 3", "table"]),
+    "negative mass": ("[plant]\nm = -0.5\n", ["plant.m = -0.5", "above 0", "0.588"]),
+    "zero gap": ("[plant]\ns_0 = 0.0\n", ["plant.s_0", "above 0"]),
+    "negative resistance": ("[plant]\nR = -1.0\n", ["plant.R", "at least 0"]),
+    "NaN": ("[plant]\ng = nan\n", ["plant.g = nan", "finite"]),
+    "infinite gain": ("[controller.position]\nk = inf\n", ["controller.position.k = inf", "finite"]),
+    "p = 0": ("[controller.position]\np = 0.0\n", ["controller.position.p = 0", "above 0", "25"]),
+    "negative gain": ("[controller.current]\nk_i = -1.0\n", ["controller.current.k_i = -1"]),
+    "bad nominal model": ("[controller]\nmodel = { m = 0.0 }\n", ["controller.model.m = 0"]),
+    "unknown law": ('[controller.position]\nkind = "pid"\n', ["controller.position.kind", "sliding-mode"]),
+    "gain of another law": ('[controller.current]\nkind = "pi"\nk_i = 1.0\n', ["controller.current.k_i", "k_p"]),
+    "unknown signal": ('[reference]\nkind = "sin"\n', ["reference.kind", "Did you mean 'sine'"]),
+    "signal without kind": ("[reference]\namplitude = 1e-3\n", ["reference.kind is missing"]),
+    "signal not whole": ('[reference]\nkind = "sine"\namplitude = 1e-3\n', ["reference.frequency is missing"]),
+    "negative frequency": ('[reference]\nkind = "sine"\namplitude = 1e-3\nfrequency = -1.0\n', ["reference.frequency"]),
+    "empty sum": ('[reference]\nkind = "sum"\nterms = []\n', ["reference.terms"]),
+    "bad term": ('[reference]\nkind = "sum"\nterms = [{ kind = "step" }]\n', ["reference.terms[0].amplitude"]),
+    "pulse backwards": (
+        '[disturbance.q_z]\nkind = "pulse"\namplitude = 1.0\nstart = 0.5\nstop = 0.4\n',
+        ["disturbance.q_z.stop", "start = 0.5"],
+    ),
+    "unknown disturbance": ('[disturbance.q_x]\nkind = "constant"\n', ["disturbance.q_x", "q_z"]),
+    "wrong unit": ('[disturbance.q_z]\nkind = "constant"\nunit = "N"\n', ["disturbance.q_z.unit", "m/s^2"]),
+    "negative noise": ("[sensor]\nstd = -1e-6\n", ["sensor.std", "at least 0"]),
+    "no supply": ("[actuator]\nu_max = 0.0\n", ["actuator.u_max", "above 0"]),
+    "NaN supply": ("[actuator]\nu_max = nan\n", ["actuator.u_max", "above 0"]),
+    "z beyond the gap": ("[initial]\nz = 6e-3\n", ["initial.z = 0.006", "0.0045"]),
+    "z at the stop": ("[initial]\nz = -4.51e-3\n", ["initial.z", "below 0.0045"]),
+    "clearance beyond the gap": ("[run]\nclearance = 0.01\n", ["run.clearance", "plant.s_0"]),
+    "zero clearance": ("[run]\nclearance = 0.0\n", ["run.clearance", "above 0"]),
+    "zero duration": ("[clock]\nduration = 0.0\n", ["clock.duration", "above 0"]),
+    "indivisible duration": ("[clock]\nduration = 1.0\nsample_period = 3e-4\n", ["clock.sample_period", "nearest"]),
+    "endless run": ("[clock]\nduration = 1e9\n", ["clock.duration", "samples"]),
+    "dt that does not divide": ("[clock]\ndt = 3e-5\n", ["clock.dt = 3e-05", "does not divide", "nearest"]),
+    "dt beyond the period": ("[clock]\ndt = 1e-3\n", ["clock.dt = 0.001", "does not divide"]),
+    "dt a word": ('[clock]\ndt = "fast"\n', ["clock.dt", "auto"]),
+    "negative dt": ("[clock]\ndt = -1e-6\n", ["clock.dt"]),
+    "unstable dt": ("[clock]\ndt = 1e-5\n", ["clock.dt = 1e-05", "stable only up to", "auto", "rodas3"]),
+    "unknown method": ('[clock]\ndt = 1e-6\nmethod = "rk5"\n', ["clock.method", "Did you mean 'rk4'"]),
+    "bad seed": ("[run]\nseed = -1\n", ["run.seed", "whole number"]),
+    "fractional seed": ("[run]\nseed = 1.5\n", ["run.seed", "whole number"]),
+    "settle after the end": ("[run]\nsettle = 5.0\n", ["run.settle", "clock.duration"]),
+    "not TOML": ("[plant\nm = 1\n", ["not valid TOML", "line 1"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("command", ["simulate", "check"])
+@pytest.mark.parametrize("wrong", BAD)
+def test_bad_case_file_is_one_clear_line(wrong, command, capsys):
+    text, wanted = BAD[wrong]
+    path = write(text)
+    before = sorted(pathlib.Path().iterdir())
+    assert main([command, path]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1, err
+    assert "Traceback" not in err
+    assert path in err
+    for part in wanted:
+        assert part in err
+    assert sorted(pathlib.Path().iterdir()) == before, "something was written"
+
+
+def test_bad_files_and_folders(capsys):
+    pathlib.Path("binary.toml").write_bytes(b"\xff\xfe\x00")
+    pathlib.Path("folder.toml").mkdir()
+    write(SHORT)
+    write("", "file")
+    for argv, words in (
+        (["simulate", "missing.toml"], "cannot be read (No such file"),
+        (["simulate", "folder.toml"], "cannot be read (Is a directory"),
+        (["simulate", "binary.toml"], "not a text file"),
+        (["simulate", "case.toml", "--out", "file"], "--out file: cannot write"),
+        (["simulate", "case.toml", "--out", "file/below"], "cannot write"),
+        (["reproduce", "--out", "/proc/nowhere"], "cannot write"),
+    ):
+        assert main(argv) == 2, argv
+        err = capsys.readouterr().err
+        assert words in err
+        assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        ([], "COMMAND"),
+        (["simulat"], "invalid choice"),
+        (["simulate"], "CASE.toml"),
+        (["simulate", "case.toml", "--outt", "x"], "--outt"),
+        (["template", "levitation"], "invalid choice"),
+        (["check", "a.toml", "b.toml"], "b.toml"),
+    ],
+)
+def test_bad_flags(argv, words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(argv)
+    assert stop.value.code == 2
+    err = capsys.readouterr().err
+    assert words in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["tracking", "regulation"])
+def test_template_is_the_paper(name):
+    case = read_case(write(template(name)))
+    wanted = scenario(name, "repaired")
+    assert case.cascade == cascade("repaired")
+    assert (case.clock.samples, case.clock.sample_period, case.settle) == (CLOCK.samples, CLOCK.sample_period, SETTLE)
+    t = np.linspace(0, 2, 41)
+    assert np.allclose(case.scenario.reference(t), wanted.reference(t), rtol=0, atol=0)
+    assert np.allclose(case.scenario.acceleration(t), wanted.acceleration(t), rtol=0, atol=0)
+
+
+def test_empty_file_gives_the_documented_defaults():
+    case = case_from({})
+    assert case.cascade == cascade("repaired")
+    assert case.scenario.sensor is None
+    assert np.isinf(case.scenario.u_max)
+    assert (case.clock.samples, case.clock.sample_period) == (20_000, 1e-4)
+
+
+def test_every_kind_can_be_written():
+    for stage, kinds in KINDS.items():
+        for kind, law in kinds.items():
+            assert isinstance(getattr(case_from({"controller": {stage: {"kind": kind}}}).cascade, stage), law)
+    numbers = {
+        "amplitude": 1e-3,
+        "start": 0.1,
+        "stop": 0.2,
+        "duration": 0.1,
+        "frequency": 1.0,
+        "frequency_end": 2.0,
+        "value": 0.0,
+    }
+    for kind, signal in SIGNALS.items():
+        names = getattr(signal, "__dataclass_fields__")  # noqa: B009
+        table = {k: v for k, v in numbers.items() if k in names}
+        if kind == "sum":
+            table = {"terms": [{"kind": "constant"}]}
+        assert isinstance(case_from({"reference": {"kind": kind, **table}}).scenario.reference, signal)
+
+
+def test_simulate_writes_what_is_documented(capsys):
+    path = write(SHORT)
+    assert main(["simulate", path, "--out", "there"]) == 0
+    with np.load("there/trajectory.npz") as data:
+        names = [
+            "t",
+            "z",
+            "z_dot",
+            "i",
+            "i_ref",
+            "u",
+            "v",
+            "v_star",
+            "v_tilde",
+            "sigma",
+            "r",
+            "q_z",
+            "q_i",
+            "z_measured",
+        ]
+        for name in names:
+            assert data[name].shape == (500,)
+            assert data[name].dtype == np.float64
+            assert np.isfinite(data[name]).all()
+        assert np.isinf(data["lost_at"])
+        assert str(data["lost_why"]) == ""
+        e = data["z"] - data["r"]
+    metrics = json.loads(pathlib.Path("there/metrics.json").read_text())
+    assert metrics["max_abs_error_m"] == np.abs(e).max()
+    assert metrics["lost"] is False
+    assert metrics["lost_at_s"] is None
+    wanted = {"rms_error_m", "settled_max_abs_error_m", "max_abs_u_V", "rms_u_V", "max_abs_i_A"}
+    assert wanted <= set(metrics)
+    assert pathlib.Path("there/overview.png").read_bytes().startswith(b"\x89PNG")
+    assert "written: there/" in capsys.readouterr().out
+
+
+def test_simulate_in_strokes_is_simulate_at_once(monkeypatch, capsys):
+    """Neither the stroke of the progress bar nor --json changes a bit of the result."""
+    path = write(SHORT + "[sensor]\nstd = 1e-6\n")
+    assert main(["simulate", path, "--out", "a", "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    monkeypatch.setattr(commands, "STROKE", 200)
+    assert main(["simulate", path, "--out", "b"]) == 0
+    with np.load("a/trajectory.npz") as a, np.load("b/trajectory.npz") as b:
+        assert all(np.array_equal(a[k], b[k]) for k in a)
+    assert summary["max_abs_error_m"] == json.loads(pathlib.Path("b/metrics.json").read_text())["max_abs_error_m"]
+
+
+def test_lost_rotor_exits_1_and_says_so(capsys):
+    path = write(SHORT + "[controller.inversion]\ngamma = 1000.0\n")
+    assert main(["simulate", path]) == 1
+    assert "lost at 0.01" in capsys.readouterr().err
+    assert main(["simulate", path]) == 1
+    assert sorted(p.name for p in pathlib.Path("out").iterdir()) == ["simulate-case", "simulate-case-2"]
+    metrics = json.loads(pathlib.Path("out/simulate-case/metrics.json").read_text())
+    assert metrics["lost"] is True
+    assert 0.005 < metrics["lost_at_s"] < 0.02
+    with np.load("out/simulate-case/trajectory.npz") as data:
+        assert str(data["lost_why"]).startswith("touched down")
+
+
+def test_check_says_yes_and_no(capsys):
+    sine = SHORT + '[reference]\nkind = "sine"\namplitude = 2.5e-3\nfrequency = 2.0\n'
+    assert main(["check", write(sine), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["holds"] is True
+    assert main(["check", write(sine + "[controller.inversion]\ngamma = 1000.0\n"), "--json"]) == 1
+    summary = json.loads(capsys.readouterr().out)
+    along = next(c for c in summary["conditions"] if "along the run" in c["requires"])
+    assert along["gain"] == 1000
+    assert along["against"] >= 6.3e4  # |dv/dz z_dot| alone, 2.0e6 * 0.0314, on the printed reference
+    assert along["holds"] is False
+
+
+def test_help_names_every_command(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--help"])
+    assert stop.value.code == 0
+    out = capsys.readouterr().out
+    assert all(re.search(rf"\b{name}\b", out) for name in ("reproduce", "template", "simulate", "check"))

@@ -1,0 +1,258 @@
+"""The integrators as mathematics: order, stability, step control, and which of them is chosen."""
+
+import dataclasses
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracle import World, solve
+
+import ambjax as amb
+from ambjax import _linear
+from ambjax.integrate import Problem
+from ambjax.trajectory import ALIVE, STALLED
+
+FIXED = {"Euler": (amb.Euler, 1), "RK4": (amb.RK4, 4), "Rodas3": (amb.Rodas3, 3)}
+REPAIRED = amb.Cascade()
+SMOOTH = amb.Cascade(inversion=amb.inversion.Adaptive(gamma=1e9, p=25e-6))
+TRACKING = amb.Scenario(reference=amb.Sine(2.5e-3, 2.0), q_v=amb.Pulse(1.0, 0.01, 0.02))
+
+
+def problem(rates, scale=1.0, fate=lambda state: jnp.zeros((), jnp.int32)):
+    return Problem(rates, scale, fate)
+
+
+@functools.partial(jax.jit, static_argnames=("rates",))
+def end_of(method, rates, t, span, state):
+    scale = jax.tree.map(jnp.ones_like, state)
+    return method.advance(problem(rates, scale), t, span, state, method.start(span)).state
+
+
+def curved(t, state):
+    """p' = p q cos t, q' = -q^2 cos t: p = 1 + sin t and q = 1/p. Nonlinear and not autonomous."""
+    p, q = state
+    return p * q * jnp.cos(t), -(q**2) * jnp.cos(t)
+
+
+def curved_error(method):
+    p = 1 + math.sin(1.5)
+    end = end_of(method, curved, 0.0, 1.5, (jnp.asarray(1.0), jnp.asarray(1.0)))
+    return max(abs(float(end[0]) - p), abs(float(end[1]) - 1 / p))
+
+
+def slope(x, y):
+    return np.polyfit(np.log(x), np.log(y), 1)[0]
+
+
+every_fixed = pytest.mark.parametrize(("method", "order"), FIXED.values(), ids=FIXED)
+every_method = pytest.mark.parametrize("method", [amb.Euler(3), amb.RK4(3), amb.Rodas3(3), amb.Adaptive()], ids=str)
+
+
+@every_fixed
+def test_order_on_a_problem_with_known_solution(method, order):
+    substeps = np.array([16, 32, 64, 128])
+    errors = [curved_error(method(int(n))) for n in substeps]
+    # 128 steps are well inside the asymptotic range and far above rounding (1e-10 at order 4).
+    assert slope(1 / substeps, errors) == pytest.approx(order, abs=0.15)
+
+
+@pytest.mark.parametrize(("name", "substeps"), [("Euler", 16), ("RK4", 3), ("Rodas3", 6)])
+def test_order_on_the_closed_loop(name, substeps):
+    """Without noise a sample period is only a step: halving it halves the step, and compiles nothing."""
+    method, order = FIXED[name]
+    bump = ("pulse", {"amplitude": 1.0, "start": 0.01, "stop": 0.02})
+    smooth = ("adaptive", {"gamma": 1e9, "p": 25e-6, "i_ref": 0.0})
+    world = World(inversion=smooth, reference=("sine", {"amplitude": 2.5e-3, "frequency": 2.0}), q_v=bump)
+    z = solve(world, np.arange(300) * 1e-4, rtol=1e-11)
+    finer = np.array([1, 2, 4])
+    runs = [amb.rollout(SMOOTH, TRACKING, amb.Clock(1200, 1e-4 / n, method(substeps))).trajectory for n in finer]
+    errors = [np.abs(run.rows.z[::n][:300] - z).max() for n, run in zip(finer, runs, strict=True)]
+    # Steps of at most half of 1/slope (1.6e4 1/s), errors of 5e-8 to 8e-14, all above the oracle's; three points only.
+    assert slope(1 / finer, errors) == pytest.approx(order, abs=0.3)
+
+
+@every_fixed
+def test_a_jump_on_the_edge_of_a_step_keeps_the_order(method, order):
+    pulse = amb.Pulse(2.0, 0.3, 0.6)  # neither is a binary fraction: 3 * 0.1 > 0.3 in floating point
+
+    def pulsed(t, y):
+        return -(y**2) * jnp.cos(t) + pulse(t)
+
+    def pushed(t, y):
+        return -(y**2) * jnp.cos(t) + 2.0
+
+    def free(t, y):
+        return -(y**2) * jnp.cos(t)
+
+    def split(method, n):
+        y = end_of(method(3 * n), free, 0.0, 0.3, jnp.asarray(1.0))
+        y = end_of(method(3 * n), pushed, 0.3, 0.3, y)
+        return float(end_of(method(4 * n), free, 0.6, 0.4, y))
+
+    substeps = np.array([1, 2, 4, 8])
+    ends = [float(end_of(method(10 * int(n)), pulsed, 0.0, 1.0, jnp.asarray(1.0))) for n in substeps]
+    # The same steps, so only rounding differs (80 of them), and the inset of the stages: 1e-15 of a step.
+    assert ends == pytest.approx([split(method, int(n)) for n in substeps], rel=1e-13)
+    errors = np.abs(np.array(ends) - split(amb.RK4, 1000))
+    assert slope(1 / substeps, errors) == pytest.approx(order, abs=0.3)  # steps from 0.1 on: coarse
+
+
+def test_rodas3_damps_infinitely_fast_decay_in_one_step():
+    def decay(t, y):
+        return -1e12 * y
+
+    # R(z) falls like 1/z for a stiffly accurate method: 1e-12 times a small constant.
+    assert abs(float(end_of(amb.Rodas3(1), decay, 0.0, 1.0, jnp.asarray(1.0)))) < 1e-11
+
+
+def test_rodas3_follows_a_slow_solution_through_stiffness():
+    def prothero_robinson(t, y):
+        return -1e8 * (y - jnp.sin(t)) + jnp.cos(t)
+
+    end = float(end_of(amb.Rodas3(100), prothero_robinson, 0.0, 1.0, jnp.asarray(0.0)))
+    # Rounding of the right-hand side, 1e8 eps, and an error that stiffness cannot amplify: h^2 / 1e8 at worst.
+    assert end == pytest.approx(math.sin(1.0), abs=1e-10)
+
+
+@pytest.mark.parametrize("method", [amb.Euler, amb.RK4], ids=lambda m: m.__name__)
+@pytest.mark.parametrize(("share", "grows"), [(0.97, False), (1.03, True)])
+def test_the_stability_limit_is_where_decay_turns_to_growth(method, share, grows):
+    def decay(t, y):
+        return -y
+
+    end = abs(float(end_of(method(200), decay, 0.0, 200 * share * method.limit, jnp.asarray(1.0))))
+    assert (end > 1e2) if grows else (end < 1e-2)  # 3 % off the limit is at least 5 % a step, 200 times
+
+
+@every_method
+def test_no_time_is_no_motion(method):
+    """A lost rotor is frozen by a span of 0: the state is the same, to the bit."""
+    state = (jnp.asarray(0.3), jnp.asarray(-0.7))
+    assert end_of(method, curved, 0.2, 0.0, state) == state
+
+
+def test_adaptive_error_falls_with_the_tolerance():
+    tolerances = np.array([1e-5, 1e-6, 1e-7, 1e-8, 1e-9])
+    errors = [curved_error(amb.Adaptive(tolerance=tol)) for tol in tolerances]
+    # Error per step h^3 = tolerance and global error h^3: proportional.
+    assert slope(tolerances, errors) == pytest.approx(1.0, abs=0.15)
+    assert all(errors < 10 * tolerances)
+
+
+def test_adaptive_step_carries_over():
+    few = amb.Adaptive(most_steps=8)
+    one = (jnp.asarray(1.0), jnp.asarray(1.0))
+    p = problem(curved, one)
+    first = amb.Adaptive().advance(p, 0.0, 0.1, one, amb.Adaptive().start(0.1))
+    assert int(few.advance(p, 0.1, 0.1, first.state, first.memory).code) == ALIVE
+    assert int(few.advance(p, 0.1, 0.1, first.state, 1e-7).code) == STALLED  # a first step grows 5 times per step
+
+
+def test_adaptive_that_may_not_take_enough_steps_stalls():
+    out = amb.Adaptive(most_steps=2).advance(problem(lambda t, y: -y), 1.0, 1.0, jnp.asarray(1.0), 1e-3)
+    assert int(out.code) == STALLED
+    assert 1.0 < float(out.t) < 2.0
+    assert float(out.state) == pytest.approx(
+        math.exp(-(float(out.t) - 1.0)), rel=1e-8
+    )  # where it got to, exactly there
+
+
+def test_a_stalled_rollout_says_so_and_stays_finite():
+    clock = amb.Clock(50, 1e-4, amb.Adaptive(tolerance=1e-12, most_steps=3))
+    trajectory = amb.rollout(REPAIRED, TRACKING, clock).trajectory
+    assert trajectory.lost_why.startswith("stalled")
+    assert 0 < float(trajectory.lost_at) <= 1e-4
+    assert all(np.isfinite(x).all() for x in trajectory.rows)
+
+
+@pytest.mark.parametrize("method", [amb.Euler(10), amb.RK4(10), amb.Rodas3(10), amb.Adaptive()], ids=str)
+def test_stops_at_the_first_bad_state_and_returns_the_last_good_one(method):
+    def fate(y):
+        return jnp.where(y < 0.55, 0, 2).astype(jnp.int32)
+
+    out = method.advance(problem(lambda t, y: jnp.ones(()), fate=fate), 3.0, 1.0, jnp.asarray(0.0), method.start(1.0))
+    assert int(out.code) == 2
+    assert float(out.state) < 0.55 <= float(out.t) - 3.0  # y = t - 3: the time is that of the bad state
+    if method.step_size(1.0):
+        assert (float(out.state), float(out.t)) == pytest.approx((0.5, 3.6))
+
+
+# Not Rodas3 with three steps: a fixed implicit step may leap over the pole and never see it.
+@pytest.mark.parametrize("method", [amb.Euler(3), amb.RK4(3), amb.Adaptive()], ids=str)
+def test_blow_up_ends_in_a_code_and_a_finite_state(method):
+    def fate(y):
+        return jnp.where(jnp.abs(y) < 1e3, 0, 2).astype(jnp.int32)
+
+    p = problem(lambda t, y: jnp.exp(y), fate=fate)
+    out = method.advance(p, 0.0, 10.0, jnp.asarray(0.0), method.start(10.0))  # y = -log(1 - t)
+    assert int(out.code) in (2, STALLED)
+    assert np.isfinite(float(out.state))
+
+
+@pytest.mark.parametrize("method", [amb.Euler(1), amb.RK4(1)], ids=str)
+def test_an_explicit_step_beyond_its_limit_is_refused(method):
+    limit = method.limit / (2 / math.pi * 7.5e4 * 25.0)
+    with pytest.raises(ValueError, match=rf"stable only up to {limit:.3g} s.*inversion law has slope 1\.19e\+06"):
+        amb.rollout(REPAIRED, TRACKING, amb.Clock(10, 1e-4, method))
+    just_inside = amb.Clock(10, 0.99 * limit, method)
+    assert amb.with_method(just_inside, REPAIRED, TRACKING) is just_inside
+
+
+def test_method_choice():
+    noisy = dataclasses.replace(TRACKING, sensor=amb.Sensor(1e-6))
+    assert isinstance(amb.choose_method(SMOOTH, TRACKING, 1e-4), amb.Adaptive)
+    assert isinstance(amb.choose_method(SMOOTH, noisy, 1e-4), amb.RK4)
+    assert isinstance(amb.choose_method(REPAIRED, noisy, 1e-4), amb.Adaptive)
+    assert isinstance(amb.choose_method(REPAIRED, TRACKING, 1e-4), amb.Adaptive)
+    assert isinstance(amb.choose_method(REPAIRED, TRACKING, 1e-4, reverse=True), amb.Rodas3)
+    assert isinstance(amb.choose_method(SMOOTH, TRACKING, 1e-4, reverse=True), amb.RK4)
+    mine = amb.Clock(method=amb.Rodas3(4))
+    assert amb.with_method(mine, REPAIRED, TRACKING) is mine
+
+
+@pytest.mark.parametrize("gamma", np.geomspace(1e7, 1e11, 9))
+def test_a_chosen_explicit_step_is_within_its_limit(gamma):
+    cascade = amb.Cascade(inversion=amb.inversion.Adaptive(gamma=gamma, p=25e-6))
+    method = amb.choose_method(cascade, TRACKING, 1e-4, reverse=True)
+    steepest = max(2 / math.pi * gamma * 25e-6, 2 / math.pi * 152 * 25)
+    assert method.limit is None or method.step_size(1e-4) * steepest < method.limit
+
+
+def test_traced_gains_cannot_choose_a_method():
+    def peak(gamma, clock):
+        cascade = amb.Cascade(inversion=amb.inversion.Adaptive(gamma=gamma, p=25e-6))
+        return jnp.abs(amb.rollout(cascade, TRACKING, clock).trajectory.rows.z).max()
+
+    clock = amb.Clock(10)
+    with pytest.raises(ValueError, match=r"with_method\(clock, cascade, scenario\)"):
+        jax.eval_shape(lambda gamma: peak(gamma, clock), 1e9)
+    chosen = amb.with_method(clock, SMOOTH, TRACKING)
+    assert jax.eval_shape(lambda gamma: peak(gamma, chosen), 1e9).shape == ()
+
+
+@pytest.mark.parametrize("n", range(1, 9))
+def test_factor_and_solve_are_those_of_numpy(n):
+    rng = np.random.default_rng(n)
+    jac, right = rng.normal(size=(n, n)), rng.normal(size=n)
+    jac -= 2 * n * np.eye(n)  # decaying, as a stiff loop is: no row exchanges needed
+    found = _linear.solve(_linear.factor(jac.tolist(), 0.3), tuple(right))
+    # Backward stable where the diagonal dominates: rounding times a condition number below 10.
+    np.testing.assert_allclose(found, np.linalg.solve(np.eye(n) - 0.3 * jac, right), rtol=1e-13, atol=1e-14)
+
+
+def test_factor_survives_a_pivot_of_zero():
+    factors = _linear.factor([[0.0, 1.0], [1.0, 1.0]], 1.0)  # the last diagonal of I - J is 0
+    assert np.isfinite(_linear.solve(factors, (1.0, 2.0))).all()
+
+
+def test_jacobian_of_a_nonlinear_function_on_a_pytree():
+    def function(state):
+        x, (y, z) = state["x"], state["rest"]
+        return {"x": x * y, "rest": (jnp.sin(z), x**2 + z)}
+
+    x, y, z = 0.7, -1.3, 0.4
+    got = np.array(_linear.jacobian(function, {"x": x, "rest": (y, z)}))  # leaves in order: rest, then x
+    np.testing.assert_allclose(got, [[0, math.cos(z), 0], [0, 1, 2 * x], [x, 0, y]], rtol=1e-14)

@@ -1,0 +1,372 @@
+"""Every law of every stage against one conformance table, and the paper's identities. Eqs. (5)-(11).
+
+A new law joins by adding a row to LAWS.
+"""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ambjax import Adaptive, Cascade, Clock, Plant, Pulse, Scenario, Sine, rollout
+from ambjax._pytree import validate
+from ambjax.control import current, inversion, observer, position
+from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand, Measurement
+from ambjax.signals import Reference
+from ambjax.smooth import smooth_sign
+
+# stage, law
+LAWS = [
+    ("observer", observer.Direct()),
+    ("observer", observer.Complementary()),
+    ("observer", observer.Complementary(l=3.0, z_hat=1e-4)),
+    ("position", position.SlidingMode()),
+    ("position", position.SuperTwisting()),
+    ("inversion", inversion.Adaptive()),
+    ("inversion", inversion.Adaptive(gamma=1e9, p=25e-6, i_ref=0.01)),
+    ("inversion", inversion.ClosedForm()),
+    ("current", current.SlidingMode()),
+    ("current", current.ProportionalIntegral()),
+]
+MODEL = Plant()
+TABLE = pytest.mark.parametrize(
+    ("stage", "law"), LAWS, ids=[f"{s}-{type(x).__name__}-{i}" for i, (s, x) in enumerate(LAWS)]
+)
+
+TAME = np.array([1e-4, 2e-3, 0.01, 0.02, 0.3, 4e3])
+# finite numbers that no sane loop produces: a displacement of metres, a current of kiloamperes
+WILD = np.array(
+    [np.where(np.arange(6) == j, s * 1e4, s * x) for j in range(6) for s in (1, -1) for x in (0.0, 1e-3, 10.0)]
+)
+
+
+def inputs_of(stage, x):
+    """The stage's input from six numbers."""
+    x = jnp.asarray(x, float)
+    return {
+        "observer": Measurement(x[0], x[1], x[2]),
+        "position": (Measurement(x[0], x[1], x[2]), Reference(x[3] / 10, x[4], x[5] / 1e3)),
+        "inversion": ForceDemand(x[0], x[1], x[5], x[4] * 1e5),
+        "current": CurrentInputs(Measurement(x[0], x[1], x[2]), CurrentDemand(x[3], x[4]), jnp.abs(x[5]) + 1.0),
+    }[stage]
+
+
+def start(stage, law):
+    return law.init(MODEL, inputs_of("observer", TAME)) if stage == "observer" else law.init(MODEL)
+
+
+def call(stage, law, x=TAME, state=None):
+    return law(MODEL, inputs_of(stage, x), start(stage, law) if state is None else state)
+
+
+def has_state(law):
+    return bool(jax.tree.leaves(law.scale(MODEL)))
+
+
+def gains(law):
+    """Names of the fields that hold a number."""
+    named = [f.name for f in dataclasses.fields(law) if f.metadata.get("leaf")]
+    return [name for name in named if getattr(law, name) is not None]
+
+
+# --- conformance ---
+
+
+@TABLE
+def test_leaves_are_exactly_the_gains(stage, law):
+    leaves, tree = jax.tree.flatten(law)
+    assert leaves == [getattr(law, name) for name in gains(law)]
+    assert jax.tree.unflatten(tree, leaves) == law
+    moved = jax.tree.unflatten(tree, [x + 1 for x in leaves])
+    assert [getattr(moved, name) for name in gains(law)] == [x + 1 for x in leaves]
+    # every field is a declared number with a meaning: what the case file reads and the template prints
+    assert all(f.metadata.get("leaf") and f.metadata["doc"] for f in dataclasses.fields(law))
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        law.anything = 1.0
+
+
+@TABLE
+def test_states_rates_and_scales_have_one_structure(stage, law):
+    state, (_, rate), scale = start(stage, law), call(stage, law), law.scale(MODEL)
+    structures = {jax.tree.structure(x) for x in (state, rate, scale)}
+    assert len(structures) == 1
+    assert all(np.shape(x) == () for x in jax.tree.leaves((state, rate, scale)))
+    assert all(x > 0 for x in jax.tree.leaves(scale))
+
+
+@TABLE
+def test_slope_is_what_it_says(stage, law):
+    slope = law.slope(MODEL)
+    assert np.isfinite(slope)
+    assert slope >= 0
+    assert (slope > 0) == bool(gains(law))
+    # a traced gain gives a traced slope, so that a step can be refused with words and not with a crash
+    assert np.isfinite(jax.jit(lambda law: jnp.asarray(law.slope(MODEL)))(law))
+
+
+@TABLE
+def test_deterministic_and_the_same_under_jit_and_vmap(stage, law):
+    plain = call(stage, law)
+    for x, y in zip(jax.tree.leaves(plain), jax.tree.leaves(call(stage, law)), strict=True):
+        assert x == y
+    compiled = jax.jit(lambda law, x: call(stage, law, x))
+    batch = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x), 2 * jnp.asarray(x)]), law)
+    many = jax.jit(jax.vmap(lambda law, x: call(stage, law, x)))(batch, np.stack([TAME, TAME]))
+    # fused products round differently; errors are measured against the largest term, some 1e4
+    for x, y, z in zip(*map(jax.tree.leaves, (plain, compiled(law, TAME), many)), strict=True):
+        np.testing.assert_allclose(y, x, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(z[0], x, rtol=1e-12, atol=1e-12)
+
+
+def total(stage, law, x, state):
+    """Sum of the outputs, each of order one."""
+    out, rate = call(stage, law, x, state)
+    return sum(jnp.arctan(leaf) for leaf in jax.tree.leaves((out, rate)))
+
+
+@TABLE
+def test_derivatives_in_gains_inputs_and_state_are_finite_and_modes_agree(stage, law):
+    arguments = (jax.tree.map(jnp.asarray, law), jnp.asarray(TAME), jax.tree.map(jnp.asarray, start(stage, law)))
+    f = lambda law, x, state: total(stage, law, x, state)  # noqa: E731
+    reverse = jax.jit(jax.grad(f, (0, 1, 2)))(*arguments)
+    forward = jax.jit(jax.jacfwd(f, (0, 1, 2)))(*arguments)
+    for a, b in zip(jax.tree.leaves(reverse), jax.tree.leaves(forward), strict=True):
+        assert np.all(np.isfinite(a))
+        # the same chain rule in another order
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-14 * max(1.0, float(np.max(np.abs(b)))))
+
+
+@TABLE
+def test_output_and_derivatives_are_finite_for_wild_inputs(stage, law):
+    state = jax.tree.map(jnp.asarray, start(stage, law))
+
+    def everything(x):
+        return call(stage, law, x, state), jax.jacfwd(lambda x: call(stage, law, x, state))(x)
+
+    for leaf in jax.tree.leaves(jax.jit(jax.vmap(everything))(WILD)):
+        assert np.all(np.isfinite(leaf))
+
+
+@TABLE
+def test_output_is_finite_for_wild_states(stage, law):
+    for size in (1e-12, 1.0, 1e6):
+        state = jax.tree.map(lambda x, size=size: jnp.asarray(x) * 0 + size, start(stage, law))
+        for sign in (1, -1):
+            signed = jax.tree.map(lambda x, sign=sign: sign * x, state)
+            assert all(np.isfinite(x) for x in jax.tree.leaves(call(stage, law, TAME, signed)))
+
+
+GAINS = [(stage, law, name) for stage, law in LAWS for name in gains(law)]
+
+
+@pytest.mark.parametrize(
+    ("stage", "law", "name"), GAINS, ids=[f"{type(x).__name__}-{g}-{i}" for i, (_, x, g) in enumerate(GAINS)]
+)
+def test_validate_refuses_bad_gains_by_dotted_path(stage, law, name):
+    meta = law.__dataclass_fields__[name].metadata
+    bad = [np.nan, np.inf, "high"]
+    bad += [-1.0] if meta["above"] == 0 or meta["at_least"] == 0 else []
+    bad += [0.0, 0] if meta["above"] == 0 else []
+    bad += [np.array([1.0, x]) for x in bad if not isinstance(x, str)]
+    for value in bad:
+        cascade = Cascade(**{stage: dataclasses.replace(law, **{name: value})})
+        with pytest.raises(ValueError, match=rf"^controller\.{stage}\.{name} = .*must be"):
+            validate(cascade, "controller")
+    for value in (getattr(law, name), 1, np.float32(1.0), np.ones(3), jnp.ones(())):
+        validate(Cascade(**{stage: dataclasses.replace(law, **{name: value})}), "controller")
+    jax.jit(lambda x: validate(dataclasses.replace(law, **{name: x})))(-1.0)  # traced: not looked at
+
+
+# --- composition ---
+
+SLOW = pytest.mark.slow
+STAGES = ("observer", "position", "inversion", "current")
+KINDS = [list({type(law): law for s, law in reversed(LAWS) if s == stage}.values())[::-1] for stage in STAGES]
+# every law at least once in the fast run: the first of each stage, and the last of each
+COMBINATIONS = [
+    pytest.param(laws, id="-".join(type(x).__name__ for x in laws), marks=() if same else SLOW)
+    for laws in itertools.product(*KINDS)
+    for same in [len({kinds.index(x) for kinds, x in zip(KINDS, laws, strict=True)}) == 1]
+]
+TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.02, 0.04))
+
+
+@pytest.mark.parametrize("laws", COMBINATIONS)
+def test_any_law_of_a_stage_stands_with_any_of_the_others(laws):
+    cascade = Cascade(*laws)
+    trajectory = rollout(cascade, TRACKING, Clock(600, 1e-4, Adaptive())).trajectory
+    rows = trajectory.rows
+    assert trajectory.lost_at == np.inf, trajectory.lost_why
+    assert all(np.all(np.isfinite(x)) for x in rows)
+    # from rest the reference runs away at 31 mm/s: 0.2 mm at most is lost in reaching, 0.1 mm is left at 60 ms,
+    # when the reference is at 1.7 mm
+    assert np.max(np.abs(rows.e_z)) < 2e-4
+    assert np.max(np.abs(rows.e_z[-100:])) < 1e-4
+
+
+def test_all_combinations_are_composed():
+    assert len(COMBINATIONS) == np.prod([len(kinds) for kinds in KINDS])
+    assert {type(law) for kinds in KINDS for law in kinds} == {type(law) for _, law in LAWS}
+
+
+# --- the paper's identities, at random points ---
+
+
+def samples(n=200, seed=5):
+    """Random z, z_dot, i, i_ref, r, r_dot, r_ddot, v-state in the ranges of the paper's figures."""
+    scale = np.array([3e-3, 0.05, 0.1, 0.1, 2.5e-3, 0.03, 0.4, 1.0])
+    return np.random.default_rng(seed).uniform(-1, 1, (n, 8)) * scale
+
+
+def close(a, b, size):
+    """Equal to rounding of terms of the given size: a dozen operations, 1e-14 each at most."""
+    np.testing.assert_allclose(a, b, rtol=0, atol=1e-13 * size)
+
+
+@pytest.mark.parametrize("law", [x for s, x in LAWS if s == "position"], ids=lambda x: type(x).__name__)
+def test_equation_5_sets_the_rate_of_sigma(law):
+    # sigma_dot = z_ddot - r_ddot + c e_z_dot with v = v_star: what is left is the law's own robust term
+    for z, z_dot, i, _, r, r_dot, r_ddot, w in samples():
+        motion, reference = Measurement(z, z_dot, i), Reference(r, r_dot, r_ddot)
+        v_star, _ = law(MODEL, (motion, reference), w if has_state(law) else ())
+        z_ddot = 2 * MODEL.k_z / MODEL.m * z + MODEL.a * v_star - MODEL.g
+        sigma = (z_dot - r_dot) + law.c * (z - r)
+        np.testing.assert_allclose(law.sigma(motion, reference), sigma, rtol=1e-12, atol=1e-16)
+        rate = z_ddot - r_ddot + law.c * (z_dot - r_dot)
+        if isinstance(law, position.SlidingMode):
+            robust = -law.k * 2 / np.pi * np.arctan(law.p * sigma)
+        else:
+            robust = w - law.k_1 * sigma / (sigma**2 + 1 / law.p**2) ** 0.25
+        close(rate, robust, 100.0)
+
+
+def test_equation_6_gives_the_error_dynamics_of_equation_8():
+    # v_tilde_dot = d - gamma S(v_tilde), d = v_star_dot - dv_dz z_dot; here v_star moves at a given rate
+    law = inversion.Adaptive()
+    for z, z_dot, _, i_ref, *_, w in samples():
+        v_star, v_star_dot = 1e4 * w, 3e5 * z_dot
+        demand, rate = law(MODEL, ForceDemand(z, z_dot, v_star, v_star_dot), i_ref)
+        assert demand.i_ref == i_ref
+        assert demand.i_ref_dot == rate
+        v_tilde, v_tilde_dot = jax.jvp(
+            lambda v, z, i: v - MODEL.v(z, i), (v_star, z, i_ref), (v_star_dot, z_dot, float(rate))
+        )
+        d = v_star_dot - MODEL.dv_dz(z, i_ref) * z_dot
+        close(v_tilde_dot, d - law.gamma * smooth_sign(v_tilde, law.p), 1e6)
+
+
+def test_equation_11_gives_the_error_dynamics_of_equation_10():
+    law, q_i = current.SlidingMode(), 3.0
+    for z, z_dot, i, i_ref, *_, w in samples():
+        i_ref_dot = 10 * w
+        inputs = CurrentInputs(Measurement(z, z_dot, i), CurrentDemand(i_ref, i_ref_dot), np.inf)
+        u, _ = law(MODEL, inputs, ())
+        e_dot = MODEL.i_dot(z, z_dot, i, u, q_i) - i_ref_dot
+        close(e_dot, -law.k_i * smooth_sign(i - i_ref, law.p) + q_i, 200.0)
+
+
+def test_closed_form_inversion_leaves_no_error():
+    law = inversion.ClosedForm()
+    for z, z_dot, *_, w in samples():
+        z, v_star, v_star_dot = z / 2, 5e3 * w, 1e5 * z_dot  # at 3 mm such forces are out of reach
+        demand, state = law(MODEL, ForceDemand(z, z_dot, v_star, v_star_dot), ())
+        assert state == ()
+        close(MODEL.v(z, demand.i_ref), v_star, 1e5)
+        # and its rate keeps it so: v_star_dot = dv_dz z_dot + dv_di i_ref_dot
+        close(MODEL.dv_dz(z, demand.i_ref) * z_dot + MODEL.dv_di(z, demand.i_ref) * demand.i_ref_dot, v_star_dot, 1e6)
+
+
+@pytest.mark.parametrize("watch", [observer.Direct(), observer.Complementary()], ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize("law", [position.SlidingMode(), position.SuperTwisting()], ids=lambda x: type(x).__name__)
+def test_v_star_dot_is_the_derivative_along_the_nominal_flow(watch, law):
+    cascade, reference = Cascade(watch, law), Sine(2.5e-3, 2.0)
+
+    @jax.jit
+    def demand(s, x):
+        """At s seconds along the straight line through x: time, motion and law states move at their rates."""
+        motion = Measurement(x[0], x[1], x[2])
+        state = cascade.init(motion)._replace(
+            observer=() if not has_state(watch) else x[3],
+            position=() if not has_state(law) else x[7],
+        )
+        t = 0.1 + 30 * jnp.abs(x[4])
+        _, rates = cascade.demand(t, motion, state, reference)
+        seen = motion.z if not has_state(watch) else x[3]
+        moved = Measurement(x[0] + s * x[1], x[1] + s * MODEL.z_ddot(seen, x[2]), x[2])
+        later = jax.tree.map(
+            lambda a, b: a + s * b, state, state._replace(observer=rates.observer, position=rates.position)
+        )
+        return cascade.demand(t + s, moved, later, reference)[0]
+
+    h = 1e-8
+    for x in samples(50):
+        x[3] *= 3e-2  # the observer's estimate: millimetres
+        here, after, before = demand(0.0, x), demand(h, x), demand(-h, x)
+        difference = (after.v_star - before.v_star) / (2 * h)
+        # rounding: eps |v_star| / h = 2e-16 * 1e3 / 1e-8 = 2e-5; truncation (h p sigma_dot)^2: 3e-8 relative, measured
+        np.testing.assert_allclose(here.v_star_dot, difference, rtol=1e-6, atol=1e-3)
+
+
+def test_pi_integral_is_bounded_while_the_supply_saturates():
+    law = current.ProportionalIntegral()
+    measured, u_max, errors = Measurement(0.0, 0.0, 0.0), 100.0, np.array([-0.3, -0.01, 0.01, 0.3])
+
+    def rate(x, error):
+        return law(MODEL, CurrentInputs(measured, CurrentDemand(error, 0.0), u_max), x)[1]
+
+    for error in errors:
+        # saturated, x' = k_int error + k_aw (+-u_max - k_p error - x): a stable line with one zero
+        rest = law.k_int / law.k_aw * error + np.sign(error) * u_max - law.k_p * error
+        assert abs(rest + law.k_p * error) > u_max
+        np.testing.assert_allclose(rate(rest, error), 0, atol=1e-12 * law.k_int * abs(error))
+        np.testing.assert_allclose(jax.grad(rate)(rest, error), -law.k_aw, rtol=1e-12)
+        np.testing.assert_allclose(rate(0.0, error) / rest, law.k_aw, rtol=1e-9)
+    # unsaturated there is no leak
+    assert jax.grad(rate)(0.0, 1e-6) == 0
+    np.testing.assert_allclose(rate(0.0, 1e-6), law.k_int * 1e-6, rtol=1e-14)
+
+
+def test_complementary_observer_forgets_its_error_at_rate_l_and_integrates_velocity_noise():
+    law = observer.Complementary(l=7.0)
+    z, z_dot, i = 1e-3, 0.02, 0.05
+    for error in (-1e-3, 0.0, 2e-4):
+        estimate, rate = law(MODEL, Measurement(z, z_dot, i), jnp.asarray(z + error))
+        assert estimate == Measurement(z + error, z_dot, i)
+        np.testing.assert_allclose(rate - z_dot, -law.l * error, rtol=1e-12, atol=1e-16)
+    by = jax.jacfwd(lambda m: law(MODEL, m, jnp.asarray(0.0))[1])(Measurement(z, z_dot, i))
+    assert by == Measurement(7.0, 1.0, 0.0)
+    assert law.init(MODEL, Measurement(z, z_dot, i)) == z
+    assert observer.Complementary(z_hat=1e-4).init(MODEL, Measurement(z, z_dot, i)) == 1e-4
+
+
+def test_super_twisting_takes_up_a_constant_disturbance():
+    # at rest on the manifold under q: sigma = 0 and w = -q, where both rates vanish
+    law, q = position.SuperTwisting(), 0.7
+    v_star, w_dot = law(MODEL, (Measurement(0.0, 0.0, 0.0), Reference(0.0, 0.0, 0.0)), -q)
+    assert w_dot == 0
+    np.testing.assert_allclose(MODEL.a * v_star - MODEL.g + q, 0, atol=1e-14)
+
+
+@pytest.mark.parametrize("p", [0.01, 25.0, 1e3])
+@pytest.mark.parametrize("stage", ["position", "inversion", "current"])
+def test_slope_of_the_sliding_laws_is_their_steepest_rate(stage, p):
+    if stage == "position":
+        law = position.SlidingMode(p=p)
+        steepest = abs(jax.grad(lambda s: law.k * smooth_sign(s, p))(0.0))
+        steepest = max(steepest, law.c)
+    elif stage == "inversion":
+        law = inversion.Adaptive(p=p)
+        # d(i_ref')/d(i_ref) at v_tilde = 0
+        steepest = -jax.grad(lambda i: law(MODEL, ForceDemand(0.0, 0.0, 0.0, 0.0), i)[1])(0.0)
+    else:
+        law = current.SlidingMode(p=p)
+
+        def e_dot(i):
+            u, _ = law(MODEL, CurrentInputs(Measurement(0.0, 0.0, i), CurrentDemand(0.0, 0.0), np.inf), ())
+            return MODEL.i_dot(0.0, 0.0, i, u)
+
+        steepest = -jax.grad(e_dot)(0.0)
+    np.testing.assert_allclose(law.slope(MODEL), steepest, rtol=1e-12)

@@ -1,0 +1,74 @@
+"""The paper's study end to end: `ambjax reproduce` and the ledger."""
+
+import dataclasses
+import json
+import types
+
+import numpy as np
+import pytest
+
+from ambjax import ledger
+from ambjax.__main__ import main
+from ambjax.evidence import NOISE_STDS, Noise
+
+
+def noise(survived, radius_at_least=1e-8):
+    """A scan in which the first `survived` levels are survived and sigma grows with std."""
+    lost = np.arange(len(NOISE_STDS)) >= survived
+    return Noise(1e-4, 0.6, lost, NOISE_STDS / NOISE_STDS[0] * radius_at_least)
+
+
+def test_noise_scan_is_read_correctly():
+    scan = noise(4, radius_at_least=1e-6)
+    assert scan.survived == NOISE_STDS[3]
+    # sigma is proportional to std, so interpolation on logarithms is exact
+    assert scan.std_for(6e-6) == pytest.approx(6 * NOISE_STDS[0], rel=1e-12)
+    assert scan.std_for(1e-9) is None
+    assert noise(0).survived == 0.0
+    assert noise(0).std_for(6e-6) is None
+
+
+def test_verdicts_follow_the_evidence():
+    """Each verdict turns when its number crosses the criterion: nothing is typed in."""
+    claims = {c.says: c.judge for c in ledger.CLAIMS}
+
+    def tracking(error, lost=False):
+        metrics = {"lost": lost, "lost_at_s": 0.01, "settled_max_abs_error_m": error}
+        condition = types.SimpleNamespace(name="inversion, ideal", gain=1000.0, against=6e4)
+        run = types.SimpleNamespace(metrics=metrics, trajectory=types.SimpleNamespace(lost_why="touched down"))
+        return types.SimpleNamespace(tracking=run, check_tracking=types.SimpleNamespace(conditions=[condition]))
+
+    judge = claims["Tracking: largest error 2.3e-5 m"]
+    assert judge(tracking(2.3e-5)).verdict == ledger.HOLDS
+    assert judge(tracking(2.4e-5)).verdict == ledger.FAILS
+    lost = judge(tracking(1e-6, lost=True))
+    assert lost.verdict == ledger.FAILS
+    assert "gamma = 1000 < Delta_1 = 6e+04" in lost.cause
+
+    judge = claims["All this under sensor noise of variance 1e-7"]
+    levels = len(NOISE_STDS)
+    for scans, verdict in (([levels, levels], ledger.HOLDS), ([3, 3], ledger.FAILS), ([levels, 3], ledger.OPEN)):
+        assert judge(types.SimpleNamespace(noise=[noise(n) for n in scans])).verdict == verdict
+
+
+@pytest.mark.slow
+def test_reproduce(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    out = tmp_path / "paper"
+    assert main(["reproduce", "--out", str(out)]) == 0
+    for folder in (out, out / "literal"):
+        for number in (3, 4, 5, 6):
+            assert (folder / f"figure_{number}.png").read_bytes().startswith(b"\x89PNG")
+    written = json.loads((out / "ledger.json").read_text())
+    found = {c["says"]: c["findings"] for c in written["claims"]}
+    assert len(found) == len(ledger.CLAIMS)
+    verdicts = {f["verdict"] for both in found.values() for f in both.values()}
+    assert verdicts <= {ledger.HOLDS, ledger.FAILS, ledger.OPEN}
+    error = found["Tracking: largest error 2.3e-5 m"]["repaired"]
+    assert error["verdict"] == ledger.HOLDS
+    assert 2.2e-5 < error["value"] < 2.4e-5
+    assert found["Regulation is insensitive to the pulse"]["repaired"]["value"] == pytest.approx(2.08e-5, rel=0.01)
+    assert found["Theorem 1's conditions hold under Table 2"]["literal"]["verdict"] == ledger.FAILS
+    assert found["Tracking: largest error 2.3e-5 m"]["literal"]["value"] is None
+    page = (out / "ledger.md").read_text()
+    assert all(dataclasses.asdict(c)["says"] in page for c in ledger.CLAIMS)

@@ -1,0 +1,541 @@
+"""The rollout: rows, folds, noise, the fate of the rotor, the paper's numbers, and no recompilation."""
+
+import dataclasses
+import logging
+import os
+import pathlib
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ambjax import (
+    RK4,
+    Adaptive,
+    Cascade,
+    Clock,
+    Initial,
+    Plant,
+    Pulse,
+    Scenario,
+    Sensor,
+    Sine,
+    Standard,
+    _kernel,
+    inversion,
+    position,
+    rollout,
+)
+from ambjax.integrate import Euler
+from ambjax.metrics import Lowest, Mean, Named, Peak, Reaching, Rms, Variation
+from ambjax.trajectory import DIVERGED, TOUCHED, Row
+
+ROOT = pathlib.Path(__file__).parent.parent
+REPAIRED = Cascade()
+LITERAL = Cascade(inversion=inversion.Adaptive(gamma=1e3))
+SMOOTH = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
+TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.8, 1.3))
+NOISY = dataclasses.replace(TRACKING, sensor=Sensor(1e-6, 1e-4, 1e-4))
+# One structure, so one compiled rollout, for most of what follows: 203 samples, noise, a supply limit, all folds.
+FOLDS = Named(
+    {
+        "peak": Peak("e_z"),
+        "peak_late": Peak("u", 5.05e-3, timed=True),
+        "lowest": Lowest("z"),
+        "rms": Rms("e_z"),
+        "rms_driven": Rms("u", 5.05e-3, driven=True),
+        "mean": Mean("heat"),
+        "variation": Variation("u", 5.05e-3),
+        "reaching": Reaching("v_tilde", 0.1),
+        "standard": Standard(settle=0.01),
+    }
+)
+SHORT = Clock(203, 1e-4, Adaptive())
+
+
+@pytest.fixture(scope="module")
+def short():
+    """A noisy tracking run and its folds."""
+    return rollout(REPAIRED, NOISY, SHORT, fold=FOLDS)
+
+
+@pytest.fixture(scope="module")
+def lost():
+    """The printed gains: the same compiled rollout."""
+    return rollout(LITERAL, NOISY, SHORT, fold=FOLDS)
+
+
+@pytest.fixture(scope="module")
+def tracking():
+    """The paper's tracking scenario, gains repaired."""
+    return rollout(REPAIRED, TRACKING, Clock(20_000, 1e-4, Adaptive()), fold=Standard())
+
+
+def same(a, b):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def near(a, b, rtol, atol=0.0):
+    """Leaf by leaf, relative to the largest entry of each."""
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        x, y = np.asarray(x, float), np.asarray(y, float)
+        finite = np.isfinite(y)
+        np.testing.assert_array_equal(x[~finite], y[~finite])
+        size = np.max(np.abs(y[finite]), initial=0.0)
+        np.testing.assert_allclose(x[finite], y[finite], rtol=0, atol=rtol * size + atol)
+
+
+# --- rows ---
+
+
+def test_rows_are_samples_at_whole_multiples_of_the_period(short):
+    rows = short.trajectory.rows
+    assert isinstance(rows, Row)
+    assert all(np.shape(x) == (203,) for x in rows)
+    np.testing.assert_array_equal(rows.t, np.arange(203) * 1e-4)
+    assert rows.alive.dtype == bool
+    assert all(x.dtype == np.float64 for x in rows._replace(alive=rows.t))
+
+
+def test_a_long_clock_does_not_drift(tracking):
+    np.testing.assert_array_equal(tracking.trajectory.rows.t, np.arange(20_000) * 1e-4)
+
+
+def test_rows_are_consistent_with_the_plant_and_the_scenario(short):
+    rows, plant = short.trajectory.rows, Plant()
+    np.testing.assert_allclose(rows.v, plant.v(rows.z, rows.i), rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(rows.r, 2.5e-3 * np.sin(4 * np.pi * rows.t), rtol=1e-12, atol=1e-17)
+    np.testing.assert_allclose(rows.heat, plant.copper_loss(rows.i), rtol=1e-12)
+    np.testing.assert_array_equal(rows.e_z, rows.z - rows.r)
+    np.testing.assert_array_equal(rows.e, rows.i - rows.i_ref)
+    r_dot = 2.5e-3 * 4 * np.pi * np.cos(4 * np.pi * rows.t)
+    np.testing.assert_allclose(rows.sigma, rows.z_dot - r_dot + 17 * rows.e_z, rtol=1e-9, atol=1e-14)
+    # v_tilde is the controller's own: from the measured position
+    np.testing.assert_allclose(rows.v_tilde, rows.v_star - plant.v(rows.z_measured, rows.i_ref), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("every", [7, 10, 203, 500])
+def test_every_nth_row_is_the_row_of_that_sample(short, every):
+    # 203 = 29 * 7 divides, 10 leaves 3, 500 leaves all; the loops differ, so XLA may round differently: 1e-9
+    sparse = rollout(REPAIRED, NOISY, SHORT, fold=FOLDS, every=every)
+    near(sparse.trajectory.rows, jax.tree.map(lambda x: x[::every], short.trajectory.rows), 1e-9)
+    near(sparse.measured, short.measured, 1e-9)
+
+
+def test_no_rows_without_recording(short):
+    nothing = rollout(REPAIRED, NOISY, SHORT, fold=FOLDS, every=0)
+    assert nothing.trajectory.rows is None
+    near(nothing.measured, short.measured, 1e-9)
+    same(nothing.trajectory.lost_at, short.trajectory.lost_at)
+
+
+# --- folds ---
+
+
+def by_numpy(rows, lost_at):
+    """Every fold of FOLDS from the recorded rows."""
+    t, on = np.asarray(rows.t), np.asarray(rows.alive)
+    e_z, e, u, z = (np.asarray(x) for x in (rows.e_z, rows.e, rows.u, rows.z))
+
+    def peak(x, after=0.0):
+        return np.max(np.abs(x)[t >= after])
+
+    def rms(x, mask):
+        return np.sqrt(np.mean(x[mask] ** 2))
+
+    def variation(x, after):
+        both = (on & (t >= after))[:-1] & (on & (t >= after))[1:]
+        return np.sum(np.abs(np.diff(x))[both])
+
+    def reached(x, band):
+        hit = (np.abs(x) <= band) & on
+        return t[hit][0] if hit.any() else np.inf
+
+    late, middle = t >= 0.01, t >= 5.05e-3
+    everywhere = np.ones_like(on)
+    return {
+        "peak": peak(e_z),
+        "peak_late": (peak(u, 5.05e-3), t[middle][np.argmax(np.abs(u[middle]))]),
+        "lowest": (np.min(z[on]), t[on][np.argmin(z[on])]),
+        "rms": rms(e_z, everywhere),
+        "rms_driven": rms(u, middle & on),
+        "mean": np.mean(np.asarray(rows.heat)[on]),
+        "variation": variation(u, 5.05e-3),
+        "reaching": reached(rows.v_tilde, 0.1),
+        "standard": {
+            "max_abs_error_m": peak(e_z),
+            "rms_error_m": rms(e_z, everywhere),
+            "settled_max_abs_error_m": peak(e_z, 0.01),
+            "settled_rms_error_m": rms(e_z, late),
+            "settled_max_abs_sigma_m_per_s": peak(rows.sigma, 0.01),
+            "settled_max_abs_v_tilde_A2_per_m2": peak(rows.v_tilde, 0.01),
+            "settled_max_abs_current_error_A": peak(e, 0.01),
+            "sigma_reached_s": reached(rows.sigma, 1e-3),
+            "v_tilde_reached_s": reached(rows.v_tilde, 0.1),
+            "current_error_reached_s": reached(e, 1e-3),
+            "max_abs_u_V": peak(u),
+            "rms_u_V": rms(u, on),
+            "settled_rms_u_V": rms(u, late & on) if (late & on).any() else 0.0,
+            "chatter_V": variation(u, 0.01),
+            "max_abs_i_A": peak(rows.i),
+            "copper_loss_W": np.mean(np.asarray(rows.heat)[on]),
+            "clearance_used": peak(z) / 4.5e-3,
+            "lost": np.isfinite(lost_at),
+            "lost_at_s": lost_at,
+            "singular_at_s": None,
+        },
+    }
+
+
+@pytest.mark.parametrize("run", ["short", "lost"])
+def test_folds_equal_numpy_on_the_recorded_rows(run, request):
+    out = request.getfixturevalue(run)
+    expected = by_numpy(out.trajectory.rows, float(out.trajectory.lost_at))
+    expected["standard"]["singular_at_s"] = out.trajectory.singular_at
+    assert expected["standard"].keys() == out.measured["standard"].keys()
+    for name, value in expected.items():
+        pairs = [(name, value, out.measured[name])]
+        if name == "standard":
+            pairs = [(key, x, out.measured[name][key]) for key, x in value.items()]
+        for key, x, y in pairs:
+            # sums in another order: 203 terms
+            np.testing.assert_allclose(y, x, rtol=1e-12, err_msg=key)
+
+
+# --- noise ---
+
+
+def test_noise_is_held_per_sample_and_gaussian():
+    # long enough for statistics without a rollout: the hold of 20,000 samples of one member
+    scenario = dataclasses.replace(NOISY, seed=3, member=1)
+    w = jax.jit(jax.vmap(lambda k: scenario.sensor.noise(scenario.key(), k)))(jnp.arange(20_000))
+    for x, std in zip(w, (1e-6, 1e-4, 1e-4), strict=True):
+        x = np.asarray(x) / std
+        # five standard errors: 5/sqrt(20000) of mean and of autocorrelation, 5/sqrt(40000) of the deviation
+        assert abs(np.mean(x)) < 0.036
+        assert abs(np.std(x) - 1) < 0.025
+        assert abs(np.mean(x[1:] * x[:-1])) < 0.036
+    assert abs(np.mean(np.asarray(w.z) * np.asarray(w.i))) / 1e-10 < 0.036
+
+
+def test_rows_carry_the_noise_of_their_sample(short):
+    rows = short.trajectory.rows
+    drawn = jax.vmap(lambda k: NOISY.sensor.noise(NOISY.key(), k).z)(jnp.arange(203))
+    # z + w - z rounds at eps z = 5e-19
+    np.testing.assert_allclose(rows.z_measured - rows.z, drawn, rtol=0, atol=1e-18)
+
+
+def with_member(member, seed=0):
+    return dataclasses.replace(NOISY, seed=jnp.asarray(seed), member=jnp.asarray(member))
+
+
+def test_member_k_draws_the_same_noise_alone_and_in_a_batch():
+    def noise(scenario):
+        return jax.vmap(lambda k: scenario.sensor.noise(scenario.key(), k))(jnp.arange(50))
+
+    batch = jax.jit(jax.vmap(lambda m: noise(with_member(m, 7))))(jnp.arange(5))
+    for m in range(5):
+        same(jax.jit(lambda m: noise(with_member(m, 7)))(m), jax.tree.map(lambda x, m=m: x[m], batch))
+        same(noise(with_member(m, 7)), jax.tree.map(lambda x, m=m: x[m], batch))
+    reverse = jax.vmap(lambda m: noise(with_member(m, 7)))(jnp.array([4, 2]))
+    same(reverse, jax.tree.map(lambda x: x[jnp.array([4, 2])], batch))
+    rows = np.asarray(batch.z)
+    assert np.max(np.abs(np.corrcoef(rows) - np.eye(5))) < 0.7  # 5/sqrt(50)
+    assert len({float(x) for x in rows.ravel()}) == rows.size
+    assert not np.any(np.asarray(noise(with_member(0, 8)).z) == rows[0])
+
+
+def test_vmap_equals_the_loop_over_members(short):
+    members = jnp.arange(3)
+    batch = jax.vmap(lambda m: rollout(REPAIRED, with_member(m), SHORT, fold=FOLDS))(members)
+    for m in range(3):
+        alone = rollout(REPAIRED, with_member(m), SHORT, fold=FOLDS)
+        # noise is the same to the last bit; the rest is compiled anew for vectors, which moves the last bits, and
+        # the adaptive steps with them: an accepted step's error of 1e-6 is itself reproduced to 1e-9
+        near(jax.tree.map(lambda x, m=m: x[m], batch), alone, 1e-9, 1e-12)
+        same(batch.trajectory.rows.t[m], alone.trajectory.rows.t)
+    same(rollout(REPAIRED, with_member(0), SHORT, fold=FOLDS), short)
+
+
+# --- the fate of the rotor ---
+
+
+def test_a_lost_rotor_is_frozen_and_finite(lost):
+    rows, lost_at = lost.trajectory.rows, float(lost.trajectory.lost_at)
+    assert 0 < lost_at < 0.02
+    assert int(lost.trajectory.lost_code) == TOUCHED
+    assert "touched down" in lost.trajectory.lost_why
+    assert all(np.all(np.isfinite(x)) for x in rows)
+    before, after = rows.t < lost_at, rows.t >= lost_at
+    np.testing.assert_array_equal(rows.alive, before)
+    assert after.sum() > 50
+    for name in ("z", "z_dot", "i", "i_ref"):
+        frozen = np.asarray(getattr(rows, name))[after]
+        assert np.all(frozen == frozen[0]), name
+    np.testing.assert_allclose(np.abs(rows.z[after]), 0.9 * 5e-3, rtol=1e-15)
+    assert np.all(rows.z_dot[after] == 0)
+    assert np.all(rows.u[after] == 0)
+    assert np.all(rows.heat[after] == 0)
+    assert np.all(np.abs(rows.z[before]) < 0.9 * 5e-3)
+
+
+@pytest.mark.parametrize("scenario", [TRACKING, Scenario(q_v=Pulse(1.0, 0.0, 0.005))], ids=["tracking", "regulation"])
+def test_the_printed_gains_lose_the_rotor_within_20_ms(scenario):
+    # DESIGN.md section 6: gamma = 1000 violates the paper's own Eq. (7)
+    trajectory = rollout(LITERAL, scenario, Clock(200, 1e-4, Adaptive()), every=0).trajectory
+    assert trajectory.lost_at < 0.02
+
+
+def test_a_rotor_that_starts_against_the_stop_is_lost_at_once():
+    out = rollout(REPAIRED, dataclasses.replace(NOISY, initial=Initial(z=-4.6e-3)), SHORT, fold=FOLDS)
+    assert out.trajectory.lost_at == 0
+    assert not np.any(out.trajectory.rows.alive)
+    assert np.all(np.asarray(out.trajectory.rows.u) == 0)
+    assert all(np.all(np.isfinite(x)) for x in out.trajectory.rows)
+    assert out.measured["standard"]["lost"]
+
+
+def test_a_state_out_of_the_model_s_range_is_reported_as_such():
+    out = rollout(REPAIRED, dataclasses.replace(NOISY, initial=Initial(i=1e5)), SHORT, fold=FOLDS)
+    assert int(out.trajectory.lost_code) == DIVERGED
+    assert out.trajectory.lost_at == 0
+    assert all(np.all(np.isfinite(x)) for x in out.trajectory.rows)
+
+
+def test_the_clearance_moves_the_stop():
+    out = rollout(LITERAL, dataclasses.replace(TRACKING, clearance=1e-3), Clock(200, 1e-4, Adaptive())).trajectory
+    np.testing.assert_allclose(np.abs(out.rows.z[-1]), 1e-3, rtol=1e-15)
+
+
+# --- the paper's numbers ---
+
+
+def test_repaired_tracking_meets_the_paper_s_claims(tracking):
+    rows = tracking.trajectory.rows
+    assert tracking.trajectory.lost_at == np.inf
+    late = rows.t >= 0.5
+    assert 2.2e-5 < np.max(np.abs(rows.e_z[late])) < 2.4e-5  # paper: 2.3e-5 m
+    assert np.all(np.abs(rows.v_tilde[rows.t >= 5e-3]) < 0.1)  # paper: zero within 10 ms
+    assert 55 < tracking.measured["max_abs_u_V"] < 70  # DESIGN.md: about 60 V
+
+
+def test_repaired_regulation_offset_in_the_pulse(tracking):
+    # the same structure and numbers of the same type: the compiled tracking run is used again
+    regulation = dataclasses.replace(TRACKING, reference=Sine(0.0, 2.0))
+    out = rollout(REPAIRED, regulation, Clock(20_000, 1e-4, Adaptive()), fold=Standard()).trajectory
+    at_stop = int(np.argmin(np.abs(np.asarray(out.rows.t) - 1.2999)))
+    # at rest a q_v = k S(c z): z = tan(pi/2 a/k)/(c p) = 2.08e-5 m, up to a few time constants c
+    steady = np.tan(np.pi / 2 * Plant().a / 25.0) / (17 * 25)
+    np.testing.assert_allclose(steady, 2.08e-5, rtol=2e-3)
+    np.testing.assert_allclose(out.rows.z[at_stop], 2.08e-5, rtol=0.01)
+
+
+def test_the_supply_limits_the_voltage_that_is_applied(short):
+    limited = rollout(REPAIRED, dataclasses.replace(NOISY, u_max=40.0), SHORT, fold=FOLDS).trajectory
+    assert np.max(np.abs(short.trajectory.rows.u)) > 40
+    assert np.max(np.abs(limited.rows.u)) == 40
+
+
+# --- saving ---
+
+
+def test_save_writes_the_named_arrays_as_float64(short, lost, tmp_path):
+    names = ["t", "z", "z_dot", "i", "i_ref", "u", "v", "v_star", "v_tilde", "sigma", "r", "q_z", "q_i", "z_measured"]
+    for name, out in {"short": short, "lost": lost}.items():
+        path = tmp_path / f"{name}.npz"
+        out.trajectory.save(path)
+        with np.load(path) as saved:
+            assert set(names) <= set(saved.files)
+            for key in names:
+                assert saved[key].dtype == np.float64
+                np.testing.assert_array_equal(saved[key], getattr(out.trajectory.rows, key))
+            assert saved["lost_at"].dtype == np.float64
+            assert saved["lost_at"] == out.trajectory.lost_at
+            assert str(saved["lost_why"]) == out.trajectory.lost_why
+
+
+# --- errors at the boundary ---
+
+
+@pytest.mark.parametrize(
+    ("change", "path"),
+    [
+        ({"cascade": Cascade(position=position.SlidingMode(c=-1.0))}, r"controller\.position\.c"),
+        ({"scenario": Scenario(plant=Plant(m=0.0))}, r"scenario\.plant\.m"),
+        ({"scenario": Scenario(reference=Sine(np.nan, 2.0))}, r"scenario\.reference\.amplitude"),
+        ({"clock": Clock(0, 1e-4)}, r"clock\.samples"),
+        ({"clock": Clock(10, -1e-4)}, r"clock\.sample_period"),
+        ({"clock": Clock(10, 1e-4, RK4(1))}, r"clock\.dt"),
+        ({"clock": Clock(10, 1e-4, Euler(4))}, r"clock\.dt"),
+    ],
+)
+def test_bad_input_is_refused_with_its_path(change, path):
+    given = {"cascade": REPAIRED, "scenario": TRACKING, "clock": Clock(10, 1e-4)} | change
+    with pytest.raises(ValueError, match=path):
+        rollout(**given)
+
+
+def test_the_method_is_not_chosen_from_traced_gains():
+    with pytest.raises(ValueError, match="with_method"):
+        jax.jit(lambda c: rollout(c, TRACKING, Clock(10, 1e-4)))(REPAIRED)
+
+
+# --- compilation ---
+
+
+class Compilations(logging.Handler):
+    """Counts what JAX traces and compiles while it is attached."""
+
+    def __enter__(self):
+        self.seen = []
+        self.logger = logging.getLogger("jax._src.interpreters.pxla")
+        self.before = (self.logger.level, self.logger.propagate)
+        self.logger.addHandler(self)
+        self.logger.setLevel(logging.DEBUG)
+        self.logger.propagate = False
+        return self
+
+    def emit(self, record):
+        message = record.getMessage()
+        if message.startswith("Compiling") and ("outer" in message or "_run" in message):
+            self.seen.append(message[:80])
+
+    def __exit__(self, *_):
+        self.logger.removeHandler(self)
+        self.logger.level, self.logger.propagate = self.before
+
+
+class Counting(position.SlidingMode):
+    """The sliding-mode law, counting how often it is traced."""
+
+    traces = 0
+
+    def __call__(self, model, inputs, state):
+        Counting.traces += 1
+        return super().__call__(model, inputs, state)
+
+
+jax.tree_util.register_dataclass(Counting)
+
+
+def variations():
+    """The same structure with other numbers, and the same numbers in other types."""
+    law, world = Counting(), NOISY
+    yield "gains", Counting(c=20.0, k=26.0, p=20.0), inversion.Adaptive(gamma=8e4), world
+    yield "plant", law, inversion.Adaptive(), dataclasses.replace(world, plant=Plant(m=0.6, g=9.8))
+    yield "amplitude", law, inversion.Adaptive(), dataclasses.replace(world, reference=Sine(1e-3, 1.0))
+    yield "noise", law, inversion.Adaptive(), dataclasses.replace(world, sensor=Sensor(2e-6, 0.0, 0.0))
+    yield "seed", law, inversion.Adaptive(), dataclasses.replace(world, seed=5, member=2)
+    yield "limit", law, inversion.Adaptive(), dataclasses.replace(world, u_max=100.0)
+    yield "NumPy", Counting(np.float64(20.0), np.float32(25.0), np.asarray(25.0)), inversion.Adaptive(), world
+    yield "JAX", Counting(jnp.asarray(20.0), jnp.float32(25.0), 25.0), inversion.Adaptive(), world
+    yield "JAX seed", law, inversion.Adaptive(), dataclasses.replace(world, seed=jnp.asarray(5), member=np.int64(2))
+
+
+@pytest.fixture(scope="module")
+def warm():
+    """One rollout with the counting law, compiled."""
+    return rollout(Cascade(position=Counting()), NOISY, SHORT, every=0)
+
+
+@pytest.mark.parametrize("what", list(variations()), ids=lambda x: x[0])
+def test_other_numbers_never_recompile(what, warm):
+    _, law, invert, scenario = what
+    before = Counting.traces
+    with Compilations() as compilations:
+        rollout(Cascade(position=law, inversion=invert), scenario, SHORT, every=0)
+    assert Counting.traces == before
+    assert not compilations.seen
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        (Counting(c=20, k=26, p=20), NOISY),
+        (Counting(c=np.int32(20)), NOISY),
+        (Counting(), dataclasses.replace(NOISY, u_max=200)),
+        (Counting(), dataclasses.replace(NOISY, q_v=Pulse(1, 0.8, 1.3))),
+        (Counting(), dataclasses.replace(NOISY, seed=np.int32(4))),
+        (Counting(), dataclasses.replace(NOISY, seed=np.uint32(4))),
+    ],
+    ids=["gain", "NumPy gain", "limit", "amplitude", "NumPy seed", "unsigned seed"],
+)
+def test_integers_never_recompile(what, warm):
+    law, scenario = what
+    before = Counting.traces
+    rollout(Cascade(position=law), scenario, SHORT, every=0)
+    assert Counting.traces == before
+
+
+# --- float32 ---
+
+IN_FLOAT32 = """
+import sys
+import numpy as np
+from ambjax import *
+tracking = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.8, 1.3))
+smooth = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
+out = {}
+for name, cascade, method in (("repaired", Cascade(), Adaptive()), ("smooth", smooth, RK4(4))):
+    trajectory = rollout(cascade, tracking, Clock(20_000, 1e-4, method), every=10).trajectory
+    assert trajectory.rows.z.dtype == np.float32
+    assert trajectory.lost_at == np.inf
+    out[name] = np.asarray(trajectory.rows.z)
+np.savez(sys.argv[1], **out)
+"""
+
+
+def test_float32_is_within_20_nm_of_float64(tracking, tmp_path):
+    path = tmp_path / "single.npz"
+    subprocess.run(
+        [sys.executable, "-c", IN_FLOAT32, str(path)], cwd=ROOT, env=os.environ | {"JAX_ENABLE_X64": "0"}, check=True
+    )
+    smooth = rollout(SMOOTH, TRACKING, Clock(20_000, 1e-4, RK4(4)), every=10).trajectory
+    # measured: 0.96e-8 m repaired, 1.04e-8 m smooth, of 2.5e-3 m: t = 2 s is rounded to 6e-8 s, and r moves at 31 mm/s
+    with np.load(path) as single:
+        assert np.max(np.abs(single["repaired"] - tracking.trajectory.rows.z[::10])) < 2e-8
+        assert np.max(np.abs(single["smooth"] - smooth.rows.z)) < 2e-8
+
+
+# --- the fast path ---
+
+KERNEL_CLOCK = Clock(60, 1e-4, RK4(4))
+
+
+def end_of(c, scenario=NOISY):
+    cascade = dataclasses.replace(SMOOTH, position=position.SlidingMode(c=c))
+    return rollout(cascade, scenario, KERNEL_CLOCK, fold=Rms("e_z"), every=0).measured
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        lambda: end_of(17.0),
+        lambda: jax.jit(end_of)(17.0),
+        lambda: jax.grad(end_of)(17.0),
+        lambda: jax.jvp(end_of, (17.0,), (1.0,)),
+        lambda: jax.vmap(end_of)(jnp.array([15.0, 17.0, 20.0])),
+        lambda: jax.vmap(jax.grad(end_of))(jnp.array([15.0, 17.0])),
+    ],
+    ids=["plain", "jit", "grad", "jvp", "vmap", "vmap of grad"],
+)
+def test_the_fast_path_changes_nothing(transform, monkeypatch):
+    results = []
+    for fast in (True, False):
+        if fast and not _kernel.supported():
+            pytest.skip("the fast path is not supported here")
+        monkeypatch.setattr(_kernel, "supported", lambda fast=fast: fast)
+        results.append(transform())
+    # the same operations, fused differently: relative to the largest entry
+    near(*results, 1e-12)
+
+
+def test_the_fast_path_is_marked_in_the_compiled_code():
+    if not _kernel.supported():
+        pytest.skip("the fast path is not supported here")
+    lowered = jax.jit(end_of).lower(17.0)
+    assert "xla_cpu_small_call" in lowered.as_text()

@@ -1,0 +1,110 @@
+"""Theorem 1 monitored: conditions, margins and the identities of its proof."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ambjax import Adaptive, Cascade, Clock, Plant, Pulse, Sensor, SmoothStep, inversion, paper, position, rollout
+from ambjax.theorem import check, delta_1_on_reference
+
+CLOCK = Clock(1000, 1e-4, Adaptive(1e-8))
+
+
+def short(gamma=paper.REPAIRED_GAMMA, **changes):
+    """0.1 s of tracking with a pulse in it, one structure so that one compilation serves all."""
+    cascade = dataclasses.replace(paper.cascade("repaired"), inversion=inversion.Adaptive(gamma))
+    scenario = dataclasses.replace(paper.scenario("tracking", "repaired"), q_v=Pulse(1.0, 0.05, 0.08))
+    return cascade, dataclasses.replace(scenario, **changes)
+
+
+def lines(report):
+    return {c.name: c for c in report.conditions}
+
+
+def test_repaired_holds_and_literal_does_not():
+    repaired, literal = check(*short(), CLOCK), check(*short(gamma=1000.0), CLOCK)
+    assert repaired.holds
+    assert all(c.margin > 0 for c in repaired.conditions if c.holds)
+    assert not literal.holds
+    failing = [c for c in literal.conditions if c.holds is False]
+    assert {c.name for c in failing} == {"inversion", "inversion, ideal"}
+    # |dv/dz z_dot| alone is 2.0e6 * 0.0314 = 6.3e4 at t = 0; the diverging run exceeds it.
+    assert next(c for c in failing if c.name == "inversion").against >= 6.3e4
+    assert literal.lost_at < 0.02
+
+
+def test_suprema_and_their_times():
+    cascade, scenario = short(q_i=Pulse(0.05, 0.02, 0.03))
+    report = lines(check(cascade, scenario, CLOCK))
+    a = float(Plant().a)
+    assert report["disturbance of z"].against == pytest.approx(a, rel=1e-12)
+    assert report["disturbance of z"].at_s == pytest.approx(0.05, abs=1e-12)
+    assert report["disturbance of i"].against == 0.05
+    assert report["disturbance of i"].at_s == pytest.approx(0.02, abs=1e-12)
+
+
+def test_delta_1_is_the_derivative_seen_in_a_trajectory():
+    """d = v_star' - dv/dz z_dot, against central differences of the recorded v_star (error ~ h^2 v_star'''/6)."""
+    cascade, scenario = short()
+    fine = Clock(20_000, 5e-6, Adaptive(1e-9))
+    rows = rollout(cascade, scenario, fine).trajectory.rows
+    plant = Plant()
+    slope = np.gradient(np.asarray(rows.v_star), 5e-6, edge_order=2) - np.asarray(
+        plant.dv_dz(rows.z, rows.i_ref) * rows.z_dot
+    )
+    late = np.asarray(rows.t) > 0.01
+    away = late & (np.abs(np.asarray(rows.t) - 0.05) > 1e-4) & (np.abs(np.asarray(rows.t) - 0.08) > 1e-4)
+    report = check(cascade, scenario, CLOCK)
+    worst = next(c for c in report.conditions if c.name == "inversion")
+    at = np.abs(np.asarray(rows.t) - worst.at_s).argmin()
+    assert away[at]
+    assert abs(slope[at]) == pytest.approx(worst.against, rel=1e-5)
+
+
+def test_delta_1_on_reference_by_hand():
+    """On r = A sin(w t), at t = 0, z = 0: v_star' = -(2 k_z/m + w^2) A w / a, and dv/dz(0, i) is known."""
+    cascade, scenario = short()
+    plant, w = Plant(), 2 * np.pi * 2
+    speed = 2.5e-3 * w
+    i = float(plant.current_for(0.0, plant.g / plant.a))
+    by_hand = abs(-(2 * plant.k_z / plant.m + w**2) * speed / plant.a - float(plant.dv_dz(0.0, i)) * speed)
+    value, at = delta_1_on_reference(cascade, scenario, Clock(1, 1e-4, Adaptive()))
+    assert at == 0
+    assert value == pytest.approx(by_hand, rel=1e-12)
+
+
+def test_identities_hold_to_integration_error_and_tighten_with_tolerance():
+    cascade, scenario = short(q_i=Pulse(0.05, 0.02, 0.03))
+
+    def residuals(tolerance):
+        report = check(cascade, scenario, CLOCK.with_method(Adaptive(tolerance)))
+        return np.array([c.against for c in report.proof[:3]])
+
+    loose, tight = residuals(1e-5), residuals(1e-8)
+    # sigma is of size 0.04 m/s, v_tilde 200 A^2/m^2, e 0.05 A: eight digits and more.
+    assert (tight < [1e-9, 1e-4, 1e-11]).all()
+    assert tight[1] < 0.05 * loose[1]
+    bound = check(cascade, scenario, CLOCK).proof[3]
+    assert bound.against > -1e-9  # V' stays below its bound to rounding
+
+
+def test_identities_break_where_their_assumptions_do():
+    cascade, scenario = short()
+    wrong = dataclasses.replace(cascade, model=Plant(m=0.6))
+    assert check(wrong, scenario, CLOCK).proof[0].against > 1e-4
+    limited = dataclasses.replace(scenario, u_max=jnp.asarray(40.0))
+    assert check(cascade, limited, CLOCK).proof[2].against > 1e-6
+
+
+@pytest.mark.slow
+def test_other_laws_are_not_applicable_and_noise_is_monitored():
+    cascade = Cascade(position=position.SuperTwisting(), inversion=inversion.ClosedForm())
+    _, scenario = short(reference=SmoothStep(1e-3, 0.0, 0.05), sensor=Sensor(1e-7))
+    report = check(cascade, scenario, CLOCK)
+    judged = lines(report)
+    assert judged["disturbance of z"].holds is None
+    assert judged["inversion"].holds is None
+    assert judged["disturbance of i"].holds
+    assert report.holds
