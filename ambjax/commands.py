@@ -16,7 +16,7 @@ from tqdm import tqdm
 from ambjax import ledger, paper, plotting
 from ambjax._pytree import canonical
 from ambjax.casefile import Case, read_case
-from ambjax.evidence import NOISE_PERIODS, gather
+from ambjax.evidence import gather
 from ambjax.loop import ClosedLoop
 from ambjax.metrics import Standard
 from ambjax.outputs import directory, plain, say, table, write_json
@@ -137,7 +137,7 @@ def run_reproduce(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax reproduce."""
     out = directory(args.out, "reproduce")
     began = time.perf_counter()
-    stages = len(paper.READINGS) * (6 + len(NOISE_PERIODS)) + 1
+    stages = len(paper.READINGS) * 7 + 1
     with tqdm(
         total=stages, unit="stage", delay=2, leave=False, bar_format="{l_bar}{bar}| {n}/{total} [{elapsed}]"
     ) as bar:
@@ -155,12 +155,15 @@ def run_reproduce(args: argparse.Namespace) -> tuple[int, Summary]:
                 trajectory = getattr(seen, name).trajectory
                 title = f"Figure {number}: {name}, {reading} reading, no noise"
                 plotting.paper_figure(number, trajectory, title, folder / f"figure_{number}.png")
+        plotting.readings({name: seen.tracking.trajectory for name, seen in evidence.items()}, out / "readings.png")
         claims, noise = ledger.judge(evidence), ledger.noise_table(evidence)
         (out / "ledger.md").write_text(ledger.markdown(claims, noise), encoding="utf-8")
         write_json(out / "ledger.json", {"claims": claims, "noise": noise})
     if not args.json:
         rows = [(c["says"], c["paper"], *(f["verdict"] for f in c["findings"].values())) for c in claims]
         print(table(("claim", "paper", *paper.READINGS), rows))
-        print(f"written: {out}/figure_3.png to figure_6.png, the same under literal/, ledger.md, ledger.json")
+        print(
+            f"written: {out}/figure_3.png to figure_6.png, the same under literal/, readings.png, ledger.md, ledger.json"
+        )
     say(f"done in {time.perf_counter() - began:.1f} s")
     return 0, {"claims": plain(claims), "noise": plain(noise), "out": str(out)}

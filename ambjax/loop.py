@@ -60,8 +60,12 @@ class ClosedLoop:
 
     def rates(self, t: Scalar, state: LoopState, hold: Measurement) -> LoopState:
         """Time derivative of the state: Eqs. (1), (2) and the laws."""
-        plant, (z, z_dot, i) = self.scenario.plant, state.plant
         _, control, u = self.command(t, state, hold)
+        return self.moved(t, state, control, u)
+
+    def moved(self, t: Scalar, state: LoopState, control: CascadeState, u: Array) -> LoopState:
+        """Time derivative of the state, given that of the cascade and the applied voltage."""
+        plant, (z, z_dot, i) = self.scenario.plant, state.plant
         z_ddot = plant.z_ddot(z, i, self.scenario.acceleration(t))
         return LoopState(Measurement(z_dot, z_ddot, plant.i_dot(z, z_dot, i, u, self.scenario.q_i(t))), control)
 

@@ -94,6 +94,18 @@ def overview(trajectory: Trajectory, title: str, path: pathlib.Path) -> None:
     figure.savefig(path, dpi=130)
 
 
+def readings(trajectories: dict[str, Trajectory], path: pathlib.Path) -> None:
+    """Write one picture of the tracking scenario under each reading: position above, error below."""
+    figure = Figure(figsize=(8.0, 2.9 * len(trajectories) + 0.4), layout="constrained")
+    axes = figure.subplots(2 * len(trajectories), 1)
+    for (name, trajectory), (upper, lower) in zip(trajectories.items(), axes.reshape(-1, 2), strict=True):
+        _draw(upper, POSITION, trajectory)
+        _draw(lower, ERROR, trajectory)
+        upper.set_title(f"tracking, {name} reading", loc="left", fontsize=10)
+        lower.set_xlabel("time (s)", fontsize=9)
+    figure.savefig(path, dpi=130)
+
+
 def _measured(trajectory: Trajectory) -> Panel:
     return Panel("measured position", "mm", 1e3, (Curve("z_measured", "$z$ measured", GREEN), Curve("z", "$z$")))
 

@@ -33,8 +33,10 @@ class Identities(NamedTuple):
 class Terms(NamedTuple):
     """What the proof speaks of, at one instant."""
 
+    moving: LoopState
     values: Identities
     rates: Identities
+    i_ref_dot: Array
     q_z: Array
     q_i: Array
     d: Array
@@ -91,8 +93,8 @@ class Monitored:
         sizes = Identities(scale.plant.z_dot, plant.dv_di(0.0, 0.0) * scale.plant.i / 100, scale.plant.i)
 
         def rates(t: Array, state: Witnessed) -> Witnessed:
-            moving, proved = self.loop.rates(t, state.loop, hold), self.terms(t, state.loop, hold).rates
-            return Witnessed(moving, proved._replace(e=proved.e + self._i_ref_dot(t, state.loop, hold)))
+            terms = self.terms(t, state.loop, hold)
+            return Witnessed(terms.moving, terms.rates._replace(e=terms.rates.e + terms.i_ref_dot))
 
         return Problem(rates, Witnessed(scale, sizes), lambda state: self.loop.fate(state.loop))
 
@@ -107,11 +109,12 @@ class Monitored:
         cascade, scenario = self.loop.cascade, self.loop.scenario
         plant, (z, _, i) = scenario.plant, state.plant
         t = jnp.asarray(t, jnp.result_type(float))
-        command, _, _ = self.loop.command(t, state, hold)
+        command, control, u = self.loop.command(t, state, hold)
+        moving = self.loop.moved(t, state, control, u)
         v_tilde, e = command.v_tilde, i - command.i_ref
         sigma = cascade.position.sigma(state.plant, reference_at(scenario.reference, t))
         q_z, q_i = scenario.acceleration(t), scenario.q_i(t)
-        d = self._drift(t, state, hold, command.i_ref)
+        d = self._drift(t, state, hold, command.i_ref, moving)
         h = plant.a * (plant.v(z, i) - v_tilde - plant.v(z, command.i_ref))
         robust = Identities(_robust_z(cascade, sigma), _robust_v(cascade, v_tilde), _robust_i(cascade, e))
         rates = Identities(robust.sigma + q_z + h, robust.v_tilde + d, robust.e + q_i)
@@ -119,9 +122,9 @@ class Monitored:
         L_v = jnp.maximum(jnp.abs(plant.dv_di(z, i)), jnp.abs(plant.dv_di(z, command.i_ref)))
         room = jnp.abs(robust.sigma) - jnp.abs(q_z)
         bound = 2 * jnp.abs(sigma) * (plant.a * (L_v * jnp.abs(e) + jnp.abs(v_tilde)) - room)
-        return Terms(Identities(sigma, v_tilde, e), rates, q_z, q_i, d, h, bound)
+        return Terms(moving, Identities(sigma, v_tilde, e), rates, command.i_ref_dot, q_z, q_i, d, h, bound)
 
-    def _drift(self, t: Array, state: LoopState, hold: Measurement, i_ref: Array) -> Array:
+    def _drift(self, t: Array, state: LoopState, hold: Measurement, i_ref: Array, moving: LoopState) -> Array:
         """d = v_star' - (dv/dz) z' along the true flow, i_ref held: the left side of Eq. (7), by one jvp."""
         cascade, scenario = self.loop.cascade, self.loop.scenario
 
@@ -129,7 +132,7 @@ class Monitored:
             force, _, _ = cascade.demand(s, add(x.plant, hold), x.control, scenario.reference)
             return force.v_star - cascade.model.v(force.z, i_ref)
 
-        return jax.jvp(demanded, (t, state), (jnp.ones_like(t), self.loop.rates(t, state, hold)))[1]
+        return jax.jvp(demanded, (t, state), (jnp.ones_like(t), moving))[1]
 
     def row(self, t: Array, state: Witnessed, hold: Measurement, alive: Array) -> TheoremRow:
         terms = self.terms(t, state.loop, hold)
@@ -138,7 +141,7 @@ class Monitored:
         off = Identities(*(a - b for a, b in zip(values, state.witness, strict=True)))
         z = state.loop.plant.z
         # V' = 2 sigma sigma', with sigma' from the plant's own acceleration, not from the identity.
-        moving = self._sigma_dot(t, state.loop, hold)
+        sigma_dot = self._sigma_dot(t, state.loop, terms.moving)
         return TheoremRow(
             t=t,
             z=z,
@@ -152,22 +155,17 @@ class Monitored:
             sigma_off=jnp.where(alive, off.sigma, 0.0),
             v_tilde_off=jnp.where(alive, off.v_tilde, 0.0),
             e_off=jnp.where(alive, off.e, 0.0),
-            V_margin=terms.bound - 2 * terms.values.sigma * moving,
+            V_margin=terms.bound - 2 * terms.values.sigma * sigma_dot,
         )
 
-    def _i_ref_dot(self, t: Array, state: LoopState, hold: Measurement) -> Array:
-        cascade, measured = self.loop.cascade, add(state.plant, hold)
-        force, _, _ = cascade.demand(t, measured, state.control, self.loop.scenario.reference)
-        return cascade.inversion(cascade.model, force, state.control.inversion)[0].i_ref_dot
-
-    def _sigma_dot(self, t: Array, state: LoopState, hold: Measurement) -> Array:
+    def _sigma_dot(self, t: Array, state: LoopState, moving: LoopState) -> Array:
         position_law, reference = self.loop.cascade.position, self.loop.scenario.reference
 
         def sigma(s: Array, x: LoopState) -> Array:
             return position_law.sigma(x.plant, reference_at(reference, s))
 
         t = jnp.asarray(t, jnp.result_type(float))
-        return jax.jvp(sigma, (t, state), (jnp.ones_like(t), self.loop.rates(t, state, hold)))[1]
+        return jax.jvp(sigma, (t, state), (jnp.ones_like(t), moving))[1]
 
 
 def _robust_z(cascade: Cascade, sigma: Array) -> Array:

@@ -35,11 +35,12 @@ class CascadeState(NamedTuple):
 
 
 class Command(NamedTuple):
-    """What the cascade decides, stage by stage: A^2/m^2, A^2/m^2, A, V (before the supply's limit)."""
+    """What the cascade decides, stage by stage: A^2/m^2, A^2/m^2, A, A/s, V (before the supply's limit)."""
 
     v_star: Array
     v_tilde: Array
     i_ref: Array
+    i_ref_dot: Array
     u: Array
 
 
@@ -107,5 +108,5 @@ class Cascade:
         wanted, inversion_rate = self.inversion(self.model, force, state.inversion)
         u, current_rate = self.current(self.model, CurrentInputs(estimate, wanted, u_max), state.current)
         v_tilde = force.v_star - self.model.v(force.z, wanted.i_ref)
-        command = Command(force.v_star, v_tilde, wanted.i_ref, u)
+        command = Command(force.v_star, v_tilde, wanted.i_ref, wanted.i_ref_dot, u)
         return command, rates._replace(inversion=inversion_rate, current=current_rate)
