@@ -59,7 +59,7 @@ def _prepare_jax() -> None:
         except OSError:
             return  # a home that cannot be written costs time, not correctness
         jax.config.update("jax_compilation_cache_dir", str(cache))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -162,8 +162,7 @@ def run_reproduce(args: argparse.Namespace) -> tuple[int, Summary]:
     if not args.json:
         rows = [(c["says"], c["paper"], *(f["verdict"] for f in c["findings"].values())) for c in claims]
         print(table(("claim", "paper", *paper.READINGS), rows))
-        print(
-            f"written: {out}/figure_3.png to figure_6.png, the same under literal/, readings.png, ledger.md, ledger.json"
-        )
+        print(f"written: {out}/figure_3.png to figure_6.png, the same under literal/,")
+        print("         readings.png, ledger.md, ledger.json")
     say(f"done in {time.perf_counter() - began:.1f} s")
     return 0, {"claims": plain(claims), "noise": plain(noise), "out": str(out)}
