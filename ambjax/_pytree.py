@@ -74,14 +74,14 @@ def numbers(field: dataclasses.Field) -> str:
     return f"{kind}{unit}"
 
 
-def _within(meta: Any, value: np.ndarray) -> bool:
-    finite = ~np.isnan(value) if meta["infinite"] else np.isfinite(value)
-    ok = bool(np.all(finite))
-    if meta["above"] is not None:
-        ok = ok and bool(np.all(value > meta["above"]))
-    if meta["at_least"] is not None:
-        ok = ok and bool(np.all(value >= meta["at_least"]))
-    return ok
+def _within(meta: Any, value: Any) -> bool:
+    """Whether a number, or every number of an array, is allowed."""
+    above, at_least = meta["above"], meta["at_least"]
+    if isinstance(value, (int, float)):
+        finite = value == value if meta["infinite"] else math.isfinite(value)
+        return finite and (above is None or value > above) and (at_least is None or value >= at_least)
+    low, high = np.min(value), np.max(value)  # NaN carries through both
+    return all(_within(meta, float(x)) for x in (low, high))
 
 
 def _example(field: dataclasses.Field) -> str:
@@ -111,11 +111,11 @@ def validate(node: Any, path: str = "") -> None:
 
 def _check(field: dataclasses.Field, name: str, value: Any) -> None:
     try:
-        array = np.asarray(value, dtype=float)
+        number = value if isinstance(value, (int, float)) else np.asarray(value, dtype=float)
     except (TypeError, ValueError):
-        array = np.asarray(np.nan)
-    if not _within(field.metadata, array):
-        shown = f"{float(array):g}" if array.ndim == 0 and isinstance(value, (int, float)) else repr(value)
+        number = math.nan
+    if not _within(field.metadata, number):
+        shown = f"{value:g}" if isinstance(value, (int, float)) else repr(value)
         raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.{_example(field)}")
 
 
@@ -126,9 +126,14 @@ def canonical(node: T) -> T:
     the type that carries it, never recompiles.
     """
 
+    real = jnp.result_type(float)
+
     def one(x: Any) -> Any:
-        x = jnp.asarray(x)
-        kind = x.dtype if jnp.issubdtype(x.dtype, jnp.integer) else jnp.result_type(float)
-        return jax.lax.convert_element_type(x, kind)
+        if not isinstance(x, jax.Array):  # NumPy converts in microseconds what eager JAX takes a dispatch for
+            x = np.asarray(x)
+            whole = np.issubdtype(x.dtype, np.integer)
+            return x.astype(jnp.result_type(int) if whole else real)
+        kind = x.dtype if jnp.issubdtype(x.dtype, jnp.integer) else real
+        return x if x.dtype == kind and not x.weak_type else jax.lax.convert_element_type(x, kind)
 
     return jax.tree.map(one, node)

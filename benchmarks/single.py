@@ -103,7 +103,7 @@ def diffrax_run(gains: tuple[float, float], solver: Any, rtol: float) -> Callabl
             y0,
             saveat=save,
             stepsize_controller=control,
-            max_steps=10**6,
+            max_steps=20_000,
             throw=False,
         )
         assert out.ys is not None
