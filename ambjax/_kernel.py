@@ -15,6 +15,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ambjax._pytree import is_traced
+
 log = logging.getLogger(__name__)
 
 MARK = {"inlineable": "false", "xla_cpu_small_call": "true"}
@@ -29,18 +31,22 @@ def _mark(tree: Any) -> Any:
 def one_kernel(function: Callable[..., Any], static_argnames: tuple[str, ...] = ()) -> Callable[..., Any]:
     """jit(`function`) compiled as one kernel where that works, as usual elsewhere.
 
-    Every array must be an argument: a large constant in such a function can abort the compiler.
+    Only an outermost call is marked: inside another jit, grad or vmap the whole belongs to that
+    transformation, and reverse mode through a marked call aborts XLA's compiler. So apply this to the
+    outermost function: one_kernel(vmap(f)), one_kernel(value_and_grad(f)). Every array must be an
+    argument: a large constant in a marked function can abort the compiler too.
     """
     inner = jax.jit(function, static_argnames=static_argnames)
 
-    @functools.partial(jax.jit, static_argnames=("marked", *static_argnames))
-    def outer(*args: Any, marked: bool, **static: Any) -> Any:
-        out = inner(*args, **static)
-        return _mark(out) if marked else out
+    @functools.partial(jax.jit, static_argnames=static_argnames)
+    def outermost(*args: Any, **static: Any) -> Any:
+        return _mark(inner(*args, **static))
 
     @functools.wraps(function)
     def call(*args: Any, **static: Any) -> Any:
-        return outer(*args, marked=supported(), **static)
+        if any(is_traced(x) for x in jax.tree.leaves(args)) or not supported():
+            return inner(*args, **static)
+        return outermost(*args, **static)
 
     return call
 

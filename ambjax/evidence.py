@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax import paper
+from ambjax._kernel import one_kernel
 from ambjax._pytree import canonical
 from ambjax.control.cascade import Cascade
 from ambjax.integrate import Adaptive
@@ -123,7 +124,7 @@ def _uncertain(cascade: Cascade, reading: str) -> tuple[list[str], float]:
     return lost, max(errors)
 
 
-@jax.jit
+@one_kernel
 def _scan(cascade: Cascade, scenarios: Scenario, clock: Clock) -> dict[str, Any]:
     fold = Standard(0.4 * clock.duration)
     return jax.vmap(lambda s: rollout(cascade, s, clock, fold=fold, every=0).measured)(scenarios)
