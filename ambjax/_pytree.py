@@ -119,21 +119,22 @@ def _check(field: dataclasses.Field, name: str, value: Any) -> None:
         raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.{_example(field)}")
 
 
-def canonical(node: T) -> T:
-    """The same pytree with every number an array of the working precision, integers kept.
+# The leaves that are whole numbers; every other number is real, even where somebody wrote 17 for 17.0.
+WHOLE = ("seed", "member")
 
-    Python floats, NumPy scalars and arrays then trace alike, so that a change of a value, or of
+
+def canonical(node: T) -> T:
+    """The same pytree with every number an array of the working precision (seeds: of integers).
+
+    Python numbers, NumPy scalars and arrays then trace alike, so that a change of a value, or of
     the type that carries it, never recompiles.
     """
+    real, whole = jnp.result_type(float), jnp.result_type(int)
 
-    real = jnp.result_type(float)
-
-    def one(x: Any) -> Any:
+    def one(path: Any, x: Any) -> Any:
+        kind = whole if path and getattr(path[-1], "name", "") in WHOLE else real
         if not isinstance(x, jax.Array):  # NumPy converts in microseconds what eager JAX takes a dispatch for
-            x = np.asarray(x)
-            whole = np.issubdtype(x.dtype, np.integer)
-            return x.astype(jnp.result_type(int) if whole else real)
-        kind = x.dtype if jnp.issubdtype(x.dtype, jnp.integer) else real
+            return np.asarray(x).astype(kind)
         return x if x.dtype == kind and not x.weak_type else jax.lax.convert_element_type(x, kind)
 
-    return jax.tree.map(one, node)
+    return jax.tree_util.tree_map_with_path(one, node)

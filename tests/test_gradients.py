@@ -1,7 +1,4 @@
-"""Gradients of a rollout three ways: forward = reverse = finite differences; and finite for any gains.
-
-On the plain path throughout: see `test_the_fast_path_differentiates`.
-"""
+"""Gradients of a rollout three ways: forward = reverse = finite differences; and finite for any gains."""
 
 import dataclasses
 import os
@@ -23,13 +20,13 @@ from ambjax import (
     Scenario,
     Sensor,
     Sine,
-    _kernel,
     choose_method,
     current,
     inversion,
     position,
     rollout,
 )
+from ambjax._kernel import one_kernel
 from ambjax.metrics import Rms
 
 TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.01, 0.03), sensor=Sensor(0.0))
@@ -37,14 +34,6 @@ NOISE = np.array([0.0, 1e-6])
 NAMES = ("c", "k", "gamma", "k_i")
 REPAIRED = np.array([17.0, 25.0, 7.5e4, 152.0])
 SMOOTH = np.array([17.0, 25.0, 1e9, 152.0])
-
-
-@pytest.fixture(scope="module", autouse=True)
-def plain_path():
-    """Without the one-kernel mark: with it XLA may abort the process when a reverse derivative is compiled."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_kernel, "supported", lambda: False)
-        yield
 
 
 def run(gains, p, std, clock):
@@ -61,12 +50,12 @@ def run(gains, p, std, clock):
 def derivatives(nominal, p, clock):
     """Compiled reverse and forward derivatives in the logarithms of the gains, over a batch of (log gains, std)."""
 
-    def loss(log, std):
+    def loss(log, std, nominal):
         return run(nominal * jnp.exp(log), p, std, clock)[0]
 
-    reverse = jax.jit(jax.vmap(jax.value_and_grad(loss)))
-    forward = jax.jit(jax.vmap(jax.jacfwd(loss)))
-    return reverse, forward
+    reverse = one_kernel(jax.vmap(jax.value_and_grad(loss), (0, 0, None)))
+    forward = one_kernel(jax.vmap(jax.jacfwd(loss), (0, 0, None)))
+    return lambda *batch: reverse(*batch, nominal), lambda *batch: forward(*batch, nominal)
 
 
 # Relative steps of the differences, gain by gain. The smooth loop is smooth on the scale of 1 %. The repaired loop
@@ -149,7 +138,7 @@ def everything(clock, mode):
 
 def test_gradients_are_finite_on_a_few_random_gains():
     gains = GAINS[:48]
-    gradient, (value, lost_at, _) = jax.jit(jax.vmap(everything(CLOCK, "reverse")))(gains)
+    gradient, (value, lost_at, _) = one_kernel(jax.vmap(everything(CLOCK, "reverse")))(gains)
     assert np.mean(np.isfinite(lost_at)) > 0.4
     assert np.all(np.isfinite(value))
     assert np.all(np.isfinite(gradient))
@@ -158,7 +147,7 @@ def test_gradients_are_finite_on_a_few_random_gains():
 @pytest.fixture(scope="module", params=["reverse", "forward"])
 def at_random(request):
     """Value, gradient and fate at 1,000 gain vectors over six decades, most of which lose the rotor."""
-    gradient, rest = jax.jit(lambda x: jax.lax.map(everything(CLOCK, request.param), x, batch_size=100))(GAINS)
+    gradient, rest = one_kernel(jax.vmap(everything(CLOCK, request.param)))(GAINS)
     return request.param, np.asarray(gradient), *(np.asarray(x) for x in rest)
 
 
@@ -186,7 +175,7 @@ def test_a_gradient_overflows_only_where_steps_are_too_coarse(at_random):
     worst = Cascade(inversion=inversion.Adaptive(gamma=bad[:, 2].max()))
     fine = choose_method(worst, TRACKING, 1e-4, reverse=True)
     assert fine.substeps > 4 * CLOCK.method.substeps
-    again, _ = jax.jit(jax.vmap(everything(CLOCK.with_method(fine), mode)))(bad)
+    again, _ = one_kernel(jax.vmap(everything(CLOCK.with_method(fine), mode)))(bad)
     assert np.all(np.isfinite(again))
 
 
@@ -204,40 +193,38 @@ def test_forward_through_the_adaptive_method_is_finite_on_random_gains():
 
 # --- the fast path ---
 
-USERS_WAY = """
-import sys
+TRANSFORMS = {
+    "grad": "jax.grad(loss)",
+    "jit of grad": "jax.jit(jax.grad(loss))",
+    "jit of value and grad": "jax.jit(jax.value_and_grad(loss))",
+    "kernel of value and grad": "one_kernel(jax.value_and_grad(loss))",
+    "kernel of forward": "one_kernel(lambda x: jax.jvp(loss, (x,), (x,)))",
+}
+IN_A_PROCESS_OF_ITS_OWN = """
 import jax, numpy as np
 from ambjax import *
 from ambjax import _kernel
+from ambjax._kernel import one_kernel
+from ambjax._pytree import canonical
 from ambjax.metrics import Rms
 
-if not _kernel.supported():
-    sys.exit()
-
 def loss(cascade):
-    return rollout(cascade, Scenario(), Clock(20, 1e-4, Euler(1)), fold=Rms("e_z"), every=0).measured
+    # squared: the cotangent of the rollout is no constant
+    return rollout(cascade, Scenario(), Clock(20, 1e-4, Euler(1)), fold=Rms("e_z"), every=0).measured ** 2
 
-smooth = Cascade(inversion=inversion.Adaptive(1e9, 25e-6))
-fast = jax.tree.leaves(jax.{transform}(smooth))
+smooth = canonical(Cascade(inversion=inversion.Adaptive(1e9, 25e-6)))
+transforms = [{transforms}]
+fast = [jax.tree.leaves(f(smooth)) for f in transforms]
 _kernel.supported = lambda: False
-plain = jax.tree.leaves(jax.{transform}(smooth))
-# the same operations, fused differently
-np.testing.assert_allclose(fast, plain, rtol=1e-11, atol=1e-25)
+for f, leaves in zip(transforms, fast):
+    # the same operations, fused differently
+    np.testing.assert_allclose(leaves, jax.tree.leaves(f(smooth)), rtol=1e-11, atol=1e-28)
 """
-ABORTS = pytest.mark.xfail(strict=True, reason="the one-kernel mark makes XLA abort the process")
 
 
-@pytest.mark.parametrize(
-    "transform",
-    [
-        "jit(jax.grad(loss))",
-        pytest.param("value_and_grad(loss)", marks=pytest.mark.slow),
-        pytest.param("jit(jax.value_and_grad(loss))", marks=ABORTS),
-    ],
-)
-def test_the_fast_path_differentiates(transform):
-    # in a process of its own: an abort would take pytest with it
-    code = USERS_WAY.replace("{transform}", transform)
+def test_the_fast_path_differentiates():
+    # reverse mode through a marked call aborts XLA, and would take pytest with it
+    code = IN_A_PROCESS_OF_ITS_OWN.replace("{transforms}", ", ".join(TRANSFORMS.values()))
     environment = os.environ | {"JAX_ENABLE_X64": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[:500]

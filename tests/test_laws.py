@@ -281,7 +281,7 @@ def test_closed_form_inversion_leaves_no_error():
 
 @pytest.mark.parametrize("watch", [observer.Direct(), observer.Complementary()], ids=lambda x: type(x).__name__)
 @pytest.mark.parametrize("law", [position.SlidingMode(), position.SuperTwisting()], ids=lambda x: type(x).__name__)
-def test_v_star_dot_is_the_derivative_along_the_nominal_flow(watch, law):
+def test_the_demand_s_rates_are_derivatives_along_the_nominal_flow(watch, law):
     cascade, reference = Cascade(watch, law), Sine(2.5e-3, 2.0)
 
     @jax.jit
@@ -293,7 +293,7 @@ def test_v_star_dot_is_the_derivative_along_the_nominal_flow(watch, law):
             position=() if not has_state(law) else x[7],
         )
         t = 0.1 + 30 * jnp.abs(x[4])
-        _, rates = cascade.demand(t, motion, state, reference)
+        _, _, rates = cascade.demand(t, motion, state, reference)
         seen = motion.z if not has_state(watch) else x[3]
         moved = Measurement(x[0] + s * x[1], x[1] + s * MODEL.z_ddot(seen, x[2]), x[2])
         later = jax.tree.map(
@@ -307,7 +307,8 @@ def test_v_star_dot_is_the_derivative_along_the_nominal_flow(watch, law):
         here, after, before = demand(0.0, x), demand(h, x), demand(-h, x)
         difference = (after.v_star - before.v_star) / (2 * h)
         # rounding: eps |v_star| / h = 2e-16 * 1e3 / 1e-8 = 2e-5; truncation (h p sigma_dot)^2: 3e-8 relative, measured
-        np.testing.assert_allclose(here.v_star_dot, difference, rtol=1e-6, atol=1e-3)
+        np.testing.assert_allclose(here.v_star_rate, difference, rtol=1e-6, atol=1e-3)
+        np.testing.assert_allclose(here.z_rate, (after.z - before.z) / (2 * h), rtol=1e-6, atol=1e-8)
 
 
 def test_pi_integral_is_bounded_while_the_supply_saturates():
