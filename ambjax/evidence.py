@@ -24,7 +24,7 @@ from ambjax.trajectory import Trajectory
 # The noise scan: 10 nm to the paper's 0.316 mm; for each, the sample periods and two seeds.
 NOISE_STDS = np.logspace(-8, -3.5, 10)
 NOISE_PERIODS = (1e-5, 1e-4, 1e-3)
-NOISE_SAMPLES = 5000
+NOISE_SAMPLES = 3000
 SEEDS = 2
 BASIN = np.logspace(-7, -3, 10)
 UNCERTAIN = ("m", "k_z", "R", "A")

@@ -155,6 +155,7 @@ def rodas3_step(rates: Rates, t: Scalar, h: Scalar, state: Any) -> tuple[Any, An
     """
     at = _inside(t, h)
     t_0 = at(0.0)
+    rates = jax.jit(rates)  # traced once here, not once per column of the Jacobian
     factors = _linear.factor(_linear.jacobian(lambda x: rates(t_0, x), state), h / 2)
     f_0, f_t = jax.jvp(lambda s: rates(s, state), (t_0,), (jnp.ones_like(t_0),))
 

@@ -68,12 +68,18 @@ def thin(t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.Path) -> None:
     """Write the paper's Figure `number` for a trajectory of its scenario."""
     _, panels = PAPER_FIGURES[number]
-    figure = Figure(figsize=(7.0, 1.6 * len(panels) + 0.7), layout="constrained")
+    height = 1.6 * len(panels) + 0.9
+    figure = Figure(figsize=(7.0, height))
     axes = figure.subplots(len(panels), 1, sharex=True)
+    # Fixed margins (in inches over the height): a layout engine would draw everything twice.
+    figure.subplots_adjust(0.15, 0.5 / height, 0.97, 1 - 0.5 / height, hspace=0.2)
     for ax, panel in zip(axes, panels, strict=True):
         _draw(ax, panel, trajectory)
+        if panel is FORCE_ERROR and not np.isfinite(trajectory.lost_at):
+            _first_moments(ax, trajectory)
     axes[-1].set_xlabel("time (s)")
-    figure.suptitle(title, fontsize=11)
+    figure.align_ylabels(axes)
+    figure.suptitle(title, fontsize=11, y=1 - 0.12 / height)
     figure.savefig(path, dpi=150)
 
 
@@ -128,6 +134,16 @@ def _draw(ax: Axes, panel: Panel, trajectory: Trajectory) -> None:
         ax.legend(fontsize=8, ncols=len(panel.curves), **above)
     if np.isfinite(lost_at):
         _mark_loss(ax, trajectory, first=panel in (POSITION, FORCE))
+
+
+def _first_moments(ax: Axes, trajectory: Trajectory, until: float = 0.01) -> None:
+    """The first 10 ms, in which the paper's inversion error reaches zero, enlarged."""
+    early = np.asarray(trajectory.rows.t) <= until
+    inset = ax.inset_axes((0.32, 0.3, 0.4, 0.6))
+    inset.plot(1e3 * np.asarray(trajectory.rows.t)[early], _signal(trajectory.rows, "v_tilde")[early], color=BLUE)
+    inset.set_title("first 10 ms (time in ms)", fontsize=7, pad=2)
+    inset.tick_params(labelsize=7)
+    inset.grid(alpha=0.3, linewidth=0.5)
 
 
 def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:

@@ -26,7 +26,6 @@ from ambjax import (
     position,
     rollout,
 )
-from ambjax._kernel import one_kernel
 from ambjax.metrics import Rms
 
 TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.01, 0.03), sensor=Sensor(0.0))
@@ -53,8 +52,9 @@ def derivatives(nominal, p, clock):
     def loss(log, std, nominal):
         return run(nominal * jnp.exp(log), p, std, clock)[0]
 
-    reverse = one_kernel(jax.vmap(jax.value_and_grad(loss), (0, 0, None)))
-    forward = one_kernel(jax.vmap(jax.jacfwd(loss), (0, 0, None)))
+    # not one_kernel: reverse mode takes minutes to compile that way, and runs for seconds here
+    reverse = jax.jit(jax.vmap(jax.value_and_grad(loss), (0, 0, None)))
+    forward = jax.jit(jax.vmap(jax.jacfwd(loss), (0, 0, None)))
     return lambda *batch: reverse(*batch, nominal), lambda *batch: forward(*batch, nominal)
 
 
@@ -67,7 +67,7 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=CASES)
+@pytest.fixture(scope="module", params=["smooth", pytest.param("repaired", marks=pytest.mark.slow)])
 def three_ways(request):
     """Reverse, forward and Richardson-extrapolated central differences, without and with noise: arrays [2, 4]."""
     nominal, p, method, steps = CASES[request.param]
@@ -136,18 +136,10 @@ def everything(clock, mode):
     return lambda gains: (jax.grad if mode == "reverse" else jax.jacfwd)(loss, has_aux=True)(gains)
 
 
-def test_gradients_are_finite_on_a_few_random_gains():
-    gains = GAINS[:48]
-    gradient, (value, lost_at, _) = one_kernel(jax.vmap(everything(CLOCK, "reverse")))(gains)
-    assert np.mean(np.isfinite(lost_at)) > 0.4
-    assert np.all(np.isfinite(value))
-    assert np.all(np.isfinite(gradient))
-
-
 @pytest.fixture(scope="module", params=["reverse", "forward"])
 def at_random(request):
     """Value, gradient and fate at 1,000 gain vectors over six decades, most of which lose the rotor."""
-    gradient, rest = one_kernel(jax.vmap(everything(CLOCK, request.param)))(GAINS)
+    gradient, rest = jax.jit(jax.vmap(everything(CLOCK, request.param)))(GAINS)
     return request.param, np.asarray(gradient), *(np.asarray(x) for x in rest)
 
 
@@ -175,7 +167,7 @@ def test_a_gradient_overflows_only_where_steps_are_too_coarse(at_random):
     worst = Cascade(inversion=inversion.Adaptive(gamma=bad[:, 2].max()))
     fine = choose_method(worst, TRACKING, 1e-4, reverse=True)
     assert fine.substeps > 4 * CLOCK.method.substeps
-    again, _ = one_kernel(jax.vmap(everything(CLOCK.with_method(fine), mode)))(bad)
+    again, _ = jax.jit(jax.vmap(everything(CLOCK.with_method(fine), mode)))(bad)
     assert np.all(np.isfinite(again))
 
 
@@ -194,8 +186,6 @@ def test_forward_through_the_adaptive_method_is_finite_on_random_gains():
 # --- the fast path ---
 
 TRANSFORMS = {
-    "grad": "jax.grad(loss)",
-    "jit of grad": "jax.jit(jax.grad(loss))",
     "jit of value and grad": "jax.jit(jax.value_and_grad(loss))",
     "kernel of value and grad": "one_kernel(jax.value_and_grad(loss))",
     "kernel of forward": "one_kernel(lambda x: jax.jvp(loss, (x,), (x,)))",

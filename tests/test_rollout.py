@@ -29,6 +29,7 @@ from ambjax import (
     position,
     rollout,
 )
+from ambjax._kernel import one_kernel
 from ambjax.integrate import Euler
 from ambjax.metrics import Lowest, Mean, Named, Peak, Reaching, Rms, Variation
 from ambjax.trajectory import DIVERGED, TOUCHED, Row
@@ -54,6 +55,14 @@ FOLDS = Named(
     }
 )
 SHORT = Clock(203, 1e-4, Adaptive())
+# Another, cheap to compile, where the method does not matter: explicit steps on smooth gains.
+LIGHT_FOLDS = Named({"rms": Rms("e_z"), "variation": Variation("u", 2e-3), "lowest": Lowest("z")})
+LIGHT = Clock(203, 5e-5, Euler(1))
+
+
+def light(scenario=None, clock=None, every=1):
+    """The cheap rollout."""
+    return rollout(SMOOTH, scenario or NOISY, clock or LIGHT, fold=LIGHT_FOLDS, every=every)
 
 
 @pytest.fixture(scope="module")
@@ -118,19 +127,19 @@ def test_rows_are_consistent_with_the_plant_and_the_scenario(short):
     np.testing.assert_allclose(rows.v_tilde, rows.v_star - plant.v(rows.z_measured, rows.i_ref), rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("every", [7, 10, 203, 500])
-def test_every_nth_row_is_the_row_of_that_sample(short, every):
+@pytest.mark.parametrize("every", [7, 10, 500])
+def test_every_nth_row_is_the_row_of_that_sample(every):
     # 203 = 29 * 7 divides, 10 leaves 3, 500 leaves all; the loops differ, so XLA may round differently: 1e-9
-    sparse = rollout(REPAIRED, NOISY, SHORT, fold=FOLDS, every=every)
-    near(sparse.trajectory.rows, jax.tree.map(lambda x: x[::every], short.trajectory.rows), 1e-9)
-    near(sparse.measured, short.measured, 1e-9)
+    dense, sparse = light(), light(every=every)
+    near(sparse.trajectory.rows, jax.tree.map(lambda x: x[::every], dense.trajectory.rows), 1e-9)
+    near(sparse.measured, dense.measured, 1e-9)
 
 
-def test_no_rows_without_recording(short):
-    nothing = rollout(REPAIRED, NOISY, SHORT, fold=FOLDS, every=0)
+def test_no_rows_without_recording():
+    dense, nothing = light(), light(every=0)
     assert nothing.trajectory.rows is None
-    near(nothing.measured, short.measured, 1e-9)
-    same(nothing.trajectory.lost_at, short.trajectory.lost_at)
+    near(nothing.measured, dense.measured, 1e-9)
+    same(nothing.trajectory.lost_at, dense.trajectory.lost_at)
 
 
 # --- folds ---
@@ -234,30 +243,43 @@ def with_member(member, seed=0):
 
 
 def test_member_k_draws_the_same_noise_alone_and_in_a_batch():
-    def noise(scenario):
+    def noise(member):
+        scenario = with_member(member, 7)
         return jax.vmap(lambda k: scenario.sensor.noise(scenario.key(), k))(jnp.arange(50))
 
-    batch = jax.jit(jax.vmap(lambda m: noise(with_member(m, 7))))(jnp.arange(5))
+    alone, batch = jax.jit(noise), jax.jit(jax.vmap(noise))(jnp.arange(5))
     for m in range(5):
-        same(jax.jit(lambda m: noise(with_member(m, 7)))(m), jax.tree.map(lambda x, m=m: x[m], batch))
-        same(noise(with_member(m, 7)), jax.tree.map(lambda x, m=m: x[m], batch))
-    reverse = jax.vmap(lambda m: noise(with_member(m, 7)))(jnp.array([4, 2]))
-    same(reverse, jax.tree.map(lambda x: x[jnp.array([4, 2])], batch))
+        same(alone(m), jax.tree.map(lambda x, m=m: x[m], batch))
+    other_order = jax.jit(jax.vmap(noise))(jnp.array([4, 2]))
+    same(other_order, jax.tree.map(lambda x: x[jnp.array([4, 2])], batch))
     rows = np.asarray(batch.z)
+    assert len(set(rows.ravel())) == rows.size
     assert np.max(np.abs(np.corrcoef(rows) - np.eye(5))) < 0.7  # 5/sqrt(50)
-    assert len({float(x) for x in rows.ravel()}) == rows.size
-    assert not np.any(np.asarray(noise(with_member(0, 8)).z) == rows[0])
+    # another seed draws other noise for the same member
+    one, other = (NOISY.sensor.noise(with_member(0, seed).key(), 0).z for seed in (7, 8))
+    np.testing.assert_array_equal(one, rows[0, 0])
+    assert one != other
 
 
-def test_vmap_equals_the_loop_over_members(short):
-    members = jnp.arange(3)
-    batch = jax.vmap(lambda m: rollout(REPAIRED, with_member(m), SHORT, fold=FOLDS))(members)
+def test_vmap_equals_the_loop_over_members():
+    batch = jax.jit(jax.vmap(lambda m: light(with_member(m))))(jnp.arange(3))
     for m in range(3):
-        alone = rollout(REPAIRED, with_member(m), SHORT, fold=FOLDS)
-        # noise is the same to the last bit; the rest is compiled anew for vectors, which moves the last bits, and
-        # the adaptive steps with them: an accepted step's error of 1e-6 is itself reproduced to 1e-9
-        near(jax.tree.map(lambda x, m=m: x[m], batch), alone, 1e-9, 1e-12)
+        alone = light(with_member(m))
+        # the noise is the same to the last bit; the rest is compiled anew for vectors, which may fuse a product into
+        # a sum and move last bits: 1e-16 grows in this loop (peak sensitivity 41) to 1e-12 at most
+        near(jax.tree.map(lambda x, m=m: x[m], batch), alone, 1e-9)
         same(batch.trajectory.rows.t[m], alone.trajectory.rows.t)
+    assert len({float(x) for x in batch.measured["rms"]}) == 3
+
+
+@pytest.mark.slow
+def test_vmap_equals_the_loop_over_members_with_adaptive_steps(short):
+    batch = jax.vmap(lambda m: rollout(REPAIRED, with_member(m), SHORT, fold=FOLDS))(jnp.arange(3))
+    for m in range(3):
+        # last bits move, and the step sizes with them: far below the tolerance 1e-6 of a step
+        near(
+            jax.tree.map(lambda x, m=m: x[m], batch), rollout(REPAIRED, with_member(m), SHORT, fold=FOLDS), 1e-8, 1e-12
+        )
     same(rollout(REPAIRED, with_member(0), SHORT, fold=FOLDS), short)
 
 
@@ -283,11 +305,11 @@ def test_a_lost_rotor_is_frozen_and_finite(lost):
     assert np.all(np.abs(rows.z[before]) < 0.9 * 5e-3)
 
 
-@pytest.mark.parametrize("scenario", [TRACKING, Scenario(q_v=Pulse(1.0, 0.0, 0.005))], ids=["tracking", "regulation"])
-def test_the_printed_gains_lose_the_rotor_within_20_ms(scenario):
-    # DESIGN.md section 6: gamma = 1000 violates the paper's own Eq. (7)
-    trajectory = rollout(LITERAL, scenario, Clock(200, 1e-4, Adaptive()), every=0).trajectory
-    assert trajectory.lost_at < 0.02
+@pytest.mark.parametrize("amplitude", [2.5e-3, 0.0], ids=["tracking", "regulation"])
+def test_the_printed_gains_lose_the_rotor_within_20_ms(amplitude):
+    # DESIGN.md section 6: gamma = 1000 violates the paper's own Eq. (7); here without noise
+    quiet = dataclasses.replace(NOISY, reference=Sine(amplitude, 2.0), sensor=Sensor(0.0, 0.0, 0.0))
+    assert rollout(LITERAL, quiet, SHORT, fold=FOLDS).trajectory.lost_at < 0.02
 
 
 def test_a_rotor_that_starts_against_the_stop_is_lost_at_once():
@@ -307,8 +329,10 @@ def test_a_state_out_of_the_model_s_range_is_reported_as_such():
 
 
 def test_the_clearance_moves_the_stop():
-    out = rollout(LITERAL, dataclasses.replace(TRACKING, clearance=1e-3), Clock(200, 1e-4, Adaptive())).trajectory
-    np.testing.assert_allclose(np.abs(out.rows.z[-1]), 1e-3, rtol=1e-15)
+    # thrown at 2 m/s, it is there within a millisecond
+    out = light(dataclasses.replace(NOISY, clearance=1e-3, initial=Initial(z_dot=-2.0))).trajectory
+    assert out.lost_at < 1e-3
+    np.testing.assert_allclose(out.rows.z[-1], -1e-3, rtol=1e-15)
 
 
 # --- the paper's numbers ---
@@ -505,39 +529,43 @@ def test_float32_is_within_20_nm_of_float64(tracking, tmp_path):
 
 # --- the fast path ---
 
-KERNEL_CLOCK = Clock(60, 1e-4, RK4(4))
 
-
-def end_of(c, scenario=NOISY):
+def end_of(c):
+    """A number at the end of the cheap rollout as a function of one gain."""
     cascade = dataclasses.replace(SMOOTH, position=position.SlidingMode(c=c))
-    return rollout(cascade, scenario, KERNEL_CLOCK, fold=Rms("e_z"), every=0).measured
+    return rollout(cascade, NOISY, LIGHT, fold=LIGHT_FOLDS, every=0).measured["rms"]
 
 
 @pytest.mark.parametrize(
-    "transform",
+    ("transform", "at"),
     [
-        lambda: end_of(17.0),
-        lambda: jax.jit(end_of)(17.0),
-        lambda: jax.grad(end_of)(17.0),
-        lambda: jax.jvp(end_of, (17.0,), (1.0,)),
-        lambda: jax.vmap(end_of)(jnp.array([15.0, 17.0, 20.0])),
-        lambda: jax.vmap(jax.grad(end_of))(jnp.array([15.0, 17.0])),
+        (lambda f: f, 17.0),
+        (lambda f: jax.jvp(f, (17.0,), (1.0,)), None),
+        (one_kernel(jax.vmap(end_of)), jnp.array([15.0, 17.0, 20.0])),
     ],
-    ids=["plain", "jit", "grad", "jvp", "vmap", "vmap of grad"],
+    ids=["plain", "jvp", "kernel of vmap"],
 )
-def test_the_fast_path_changes_nothing(transform, monkeypatch):
-    results = []
-    for fast in (True, False):
-        if fast and not _kernel.supported():
-            pytest.skip("the fast path is not supported here")
-        monkeypatch.setattr(_kernel, "supported", lambda fast=fast: fast)
-        results.append(transform())
-    # the same operations, fused differently: relative to the largest entry
-    near(*results, 1e-12)
-
-
-def test_the_fast_path_is_marked_in_the_compiled_code():
+def test_the_fast_path_changes_nothing(transform, at, monkeypatch):
     if not _kernel.supported():
         pytest.skip("the fast path is not supported here")
-    marked = jax.jit(lambda c: _kernel._mark(jax.jit(end_of)(c))).lower(17.0)
-    assert "xla_cpu_small_call" in marked.as_text()
+
+    def result():
+        out = transform(end_of) if at is None or np.ndim(at) == 0 else transform(at)
+        return out(at) if callable(out) else out
+
+    fast = result()
+    monkeypatch.setattr(_kernel, "supported", lambda: False)
+    # the same operations, fused differently: relative to the largest entry
+    near(fast, result(), 1e-12)
+
+
+def test_only_an_outermost_call_is_marked(monkeypatch):
+    if not _kernel.supported():
+        pytest.skip("the fast path is not supported here")
+    marked, mark = [], _kernel._mark
+    monkeypatch.setattr(_kernel, "_mark", lambda tree: marked.append(1) or mark(tree))
+    tiny = Clock(3, 5e-5, Euler(1))
+    jax.jit(lambda k: rollout(SMOOTH, NOISY, tiny, every=k).trajectory.lost_at, static_argnums=0)(0)
+    assert not marked
+    rollout(SMOOTH, NOISY, tiny, every=0)
+    assert marked
