@@ -86,7 +86,9 @@ class Plant:
         total, difference = 1 / upper**2 + 1 / lower**2, 1 / upper**2 - 1 / lower**2
         excess = v - self.i_0**2 * difference
         discriminant = (2 * self.i_0 / (upper * lower)) ** 2 + difference * v
-        return excess / (self.i_0 * total + safe_sqrt(discriminant))
+        reachable = discriminant >= 0
+        on_C = -self.i_0 * total / jnp.where(reachable, 1.0, difference)
+        return jnp.where(reachable, excess / (self.i_0 * total + safe_sqrt(discriminant)), on_C)
 
     def z_ddot(self, z: Scalar, i: Scalar, q_z: Scalar = 0.0) -> Array:
         """Acceleration, in m/s^2: 2 k_z z/m + a v(z, i) - g + q_z. Eq. (1)."""
@@ -125,4 +127,4 @@ class Plant:
             value = 5 * x**4 + (2 * iota - 4 * zeta) * x**3 - 2 * iota * x - 1
             slope = 20 * x**3 + 3 * (2 * iota - 4 * zeta) * x**2 - 2 * iota
             x = x * (1 - jnp.clip(value / jnp.where(slope == 0, 1.0, slope) / x, -0.5, 0.5))
-        return jnp.sqrt(jnp.min((x - zeta) ** 2 + (iota + (x + 1 / x) / 2) ** 2))
+        return safe_sqrt(jnp.min((x - zeta) ** 2 + (iota + (x + 1 / x) / 2) ** 2))

@@ -104,7 +104,6 @@ def test_current_for_is_finite_where_v_is_out_of_reach():
     assert np.all(np.isfinite(np.array([PLANT.current_for(z, v), *gradients])))
 
 
-@pytest.mark.xfail(strict=True, reason="current_for runs past C, to forces of the wrong sign, out of reach")
 @pytest.mark.parametrize("share", [-0.5, -0.05, 0.05, 0.5])
 def test_out_of_reach_the_nearest_force_is_given(share):
     z = share * PLANT.s_0
@@ -197,6 +196,5 @@ def test_finite_with_finite_derivatives_at_and_beyond_the_gap(function):
     assert np.all(np.isfinite(np.stack([value, *slopes])))
 
 
-@pytest.mark.xfail(strict=True, reason="distance_to_C takes an unguarded sqrt: its derivative at distance 0 is NaN")
 def test_distance_to_C_has_a_finite_derivative_on_C():
     assert np.all(np.isfinite(jax.grad(PLANT.distance_to_C, (0, 1))(PLANT.s_0, -PLANT.i_0)))

@@ -79,7 +79,7 @@ def test_signals_are_pytrees_of_their_numbers_and_jit_vmap_grad_work(signal):
 @ALL
 def test_linear_in_the_amplitude(signal):
     if not hasattr(signal, "amplitude"):
-        pytest.skip("has no amplitude")
+        return  # Constant has a value and Sum has terms: nothing to scale
     scaled = dataclasses.replace(signal, amplitude=3 * signal.amplitude)
     np.testing.assert_allclose(scaled(T), 3 * signal(T), rtol=1e-14, atol=1e-15)
 
