@@ -55,7 +55,7 @@ def work_precision() -> list[str]:
         "## Work against precision (`work_precision.py`)",
         "",
         facts(data["machine"]),
-        "1 s simulated at 10 kHz.",
+        "0.2 s simulated at 10 kHz.",
         "",
     ]
     lines += ["![work against precision](results/work_precision.png)", ""]
