@@ -6,7 +6,9 @@
 
 import argparse
 import dataclasses
+import pathlib
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -16,7 +18,7 @@ from tqdm import tqdm
 from ambjax import ledger, paper, plotting
 from ambjax._pytree import canonical
 from ambjax.casefile import Case, read_case
-from ambjax.evidence import gather
+from ambjax.evidence import Evidence, gather
 from ambjax.loop import ClosedLoop
 from ambjax.metrics import Standard
 from ambjax.outputs import directory, plain, say, table, write_json
@@ -133,6 +135,14 @@ def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
     print("\n" + table(("proof", "statement", "worst", "unit", "at (s)", "what"), steps))
 
 
+def _paper_figures(reading: str, seen: Evidence, out: pathlib.Path) -> None:
+    folder = out if reading == "repaired" else out / reading
+    folder.mkdir(exist_ok=True)
+    for number, (name, _) in plotting.PAPER_FIGURES.items():
+        title = f"Figure {number}: {name}, {reading} reading, no noise"
+        plotting.paper_figure(number, getattr(seen, name).trajectory, title, folder / f"figure_{number}.png")
+
+
 def run_reproduce(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax reproduce."""
     out = directory(args.out, "reproduce")
@@ -146,15 +156,14 @@ def run_reproduce(args: argparse.Namespace) -> tuple[int, Summary]:
             bar.set_description_str(f"{text:<34}")
             bar.update()
 
-        evidence = {reading: gather(reading, stage) for reading in paper.READINGS}
-        stage("figures and ledger")
-        for reading, seen in evidence.items():
-            folder = out if reading == "repaired" else out / reading
-            folder.mkdir(exist_ok=True)
-            for number, (name, _) in plotting.PAPER_FIGURES.items():
-                trajectory = getattr(seen, name).trajectory
-                title = f"Figure {number}: {name}, {reading} reading, no noise"
-                plotting.paper_figure(number, trajectory, title, folder / f"figure_{number}.png")
+        evidence, drawn = {}, []
+        with ThreadPoolExecutor(1) as artist:  # draws one reading while the next is simulated
+            for reading in paper.READINGS:
+                evidence[reading] = gather(reading, stage)
+                drawn.append(artist.submit(_paper_figures, reading, evidence[reading], out))
+            stage("figures and ledger")
+            for job in drawn:
+                job.result()
         plotting.readings({name: seen.tracking.trajectory for name, seen in evidence.items()}, out / "readings.png")
         claims, noise = ledger.judge(evidence), ledger.noise_table(evidence)
         (out / "ledger.md").write_text(ledger.markdown(claims, noise), encoding="utf-8")

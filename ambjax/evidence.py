@@ -80,16 +80,18 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
     """Run everything for a reading; `say` is told what is about to run."""
     cascade = paper.cascade(reading)
     runs, checks = {}, {}
-    for name in ("regulation", "tracking"):
-        say(f"{reading}: {name}")
-        runs[name] = _run(cascade, reading, name)
-        say(f"{reading}: theorem, {name}")
-        checks[name] = check(cascade, paper.scenario(name, reading), paper.CLOCK.with_method(Adaptive()))
-    say(f"{reading}: noise")
-    # The first compiles; the others run the same program, each on a core of its own.
-    noise = [_noise(cascade, reading, NOISE_PERIODS[0])]
-    with ThreadPoolExecutor() as pool:
-        noise += pool.map(lambda period: _noise(cascade, reading, period), NOISE_PERIODS[1:])
+    with ThreadPoolExecutor() as pool:  # compiling and running leave the interpreter free
+        say(f"{reading}: noise")
+        first = pool.submit(_noise, cascade, reading, NOISE_PERIODS[0])
+        for name in ("regulation", "tracking"):
+            say(f"{reading}: theorem, {name}")
+            check_clock = paper.CLOCK.with_method(Adaptive())
+            checking = pool.submit(check, cascade, paper.scenario(name, reading), check_clock)
+            say(f"{reading}: {name}")
+            runs[name] = _run(cascade, reading, name)
+            checks[name] = checking.result()
+        # The first compiled what these run.
+        noise = [first.result(), *pool.map(lambda period: _noise(cascade, reading, period), NOISE_PERIODS[1:])]
     say(f"{reading}: basin of attraction")
     basin = _basin(cascade, reading)
     say(f"{reading}: uncertain plant")
