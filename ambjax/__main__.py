@@ -51,6 +51,13 @@ def parser() -> Parser:
     where = ensemble.add_mutually_exclusive_group()
     where.add_argument("--processes", type=int, metavar="P", help="run on P processes (default: threads of this one)")
     where.add_argument("--cluster", metavar="ADDRESS", help="run on a Dask cluster: address of its scheduler")
+    grid = command("map", "survival and error over a grid of two quantities: map.png, map.json", case=True, out=True)
+    for axis in ("--x", "--y"):
+        form = "PATH=LOW:HIGH[:COUNT][:log]"
+        grid.add_argument(axis, metavar=form, required=True, help="a quantity and its range; ends may be in per cent")
+    grid.add_argument("--members", type=int, metavar="N", default=1, help="members per cell (default: 1)")
+    grid.add_argument("--against", metavar="OTHER.toml", action="append", help="another case, beside the first")
+    _seeded(grid)
     command("check", "check Theorem 1's conditions along a case; exit code 1 if one fails", case=True)
     return top
 

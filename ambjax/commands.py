@@ -20,6 +20,7 @@ from ambjax._pytree import canonical
 from ambjax.casefile import Case, read_case
 from ambjax.evidence import Evidence, gather
 from ambjax.loop import ClosedLoop
+from ambjax.mapping import run_map
 from ambjax.metrics import Standard
 from ambjax.outputs import directory, plain, say, table, write_json
 from ambjax.rollout import Outcome, begin_jit, finish, segment_jit
@@ -27,7 +28,7 @@ from ambjax.studies import run_ensemble, study_of
 from ambjax.template import template
 from ambjax.theorem import Condition, check
 
-__all__ = ["run_check", "run_ensemble", "run_reproduce", "run_simulate", "run_template"]
+__all__ = ["run_check", "run_ensemble", "run_map", "run_reproduce", "run_simulate", "run_template"]
 
 Summary = dict[str, Any]
 # Samples simulated between two strokes of the progress bar.
