@@ -73,12 +73,13 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
         raise ValueError(f"clock.samples = {clock.samples}: there must be at least 1 sample.")
 
 
-def _run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:
+def run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:
+    """The whole rollout, unjitted and unchecked: what `rollout` compiles, and ensembles map over members."""
     progress, rows = segment(system, clock, fold, begin(system, clock, fold), 0, clock.samples, every)
     return finish(progress, rows, fold)
 
 
-roll = one_kernel(_run, static_argnames=("every",))
+roll = one_kernel(run, static_argnames=("every",))
 
 
 def begin(system: System, clock: Clock, fold: Fold | None) -> Progress:
@@ -145,14 +146,13 @@ def _sample(system: System, clock: Clock, fold: Fold | None, progress: Progress,
         # A jump at this instant belongs to this sample even if t was rounded to just before it.
         row = system.row(t * (1 + 4 * jnp.finfo(dtype).eps), state, hold, alive)._replace(t=t)
         folded = folded if fold is None else fold.update(folded, row)
-        span = jnp.where(alive, clock.sample_period, 0.0)
-        after = clock.method.advance(system.problem(hold), t, span, state, memory)
+        after = clock.method.advance(system.problem(hold), t, clock.sample_period, state, memory, ending.lost_code)
         lost_now = alive & (after.code != ALIVE)
         resting = system.rest(after.state, after.code)
         state = jax.tree.map(lambda a, b: jnp.where(lost_now, a, b), resting, after.state)
         crossed = alive & (system.singularity(row) <= 0)
         ending = Ending(
-            jnp.where(alive, after.code, ending.lost_code),
+            after.code,
             jnp.where(lost_now, after.t, ending.lost_at),
             first_time(crossed, t, ending.singular_at),
             ending.duration,
