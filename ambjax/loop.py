@@ -83,8 +83,8 @@ class ClosedLoop:
     def moved(self, inputs: Inputs, state: LoopState, control: CascadeState, u: Array) -> LoopState:
         """Time derivative of the state, given that of the cascade and the applied voltage."""
         plant, (z, z_dot, i) = self.scenario.plant, state.plant
-        z_ddot = plant.z_ddot(z, i, inputs.q_z)
-        return LoopState(Measurement(z_dot, z_ddot, plant.i_dot(z, z_dot, i, u, inputs.q_i)), control)
+        z_ddot, i_dot = plant.rates(z, z_dot, i, u, inputs.q_z, inputs.q_i)
+        return LoopState(Measurement(z_dot, z_ddot, i_dot), control)
 
     def fate(self, state: LoopState) -> Array:
         """0 while the rotor is levitated, else the code of what became of it."""
