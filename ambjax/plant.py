@@ -91,11 +91,9 @@ class Plant:
         """
         return self.v_and_dv_di(z, i)[1]
 
-    def v_and_dv_di(self, z: Scalar, i: Scalar) -> tuple[Array, Array]:
-        """v and dv/di at once."""
-        return self._force(self.gaps(z), i)
-
-    def _force(self, gaps: Gaps, i: Scalar) -> tuple[Array, Array]:
+    def v_and_dv_di(self, z: Scalar, i: Scalar, gaps: Gaps | None = None) -> tuple[Array, Array]:
+        """v and dv/di at once. `gaps` are those at z, if they are known."""
+        gaps = gaps or self.gaps(z)
         upper, lower = gaps.inverses
         above, below = (self.i_0 + i) * upper, (self.i_0 - i) * lower
         return above**2 - below**2, 2 * (above * upper + below * lower)
@@ -127,7 +125,7 @@ class Plant:
     ) -> tuple[Array, Array]:
         """`z_ddot` and `i_dot` at once."""
         gaps = self.gaps(z)
-        z_ddot = 2 * self.k_z / self.m * z + self.a * self._force(gaps, i)[0] - self.g + q_z
+        z_ddot = 2 * self.k_z / self.m * z + self.a * self.v_and_dv_di(z, i, gaps)[0] - self.g + q_z
         i_dot = 2 * z_dot * gaps.inverses[1] * i + (2 / self.kappa) * gaps.lower * (u - self.R * i) + q_i
         return z_ddot, i_dot
 
