@@ -21,6 +21,8 @@ from ambjax.worker import chunk, deaf_children, processes, work
 CHUNK = 1024
 # The fan chart is drawn from so many members and instants, whatever the size of the study.
 FAN_MEMBERS, FAN_TIMES = 256, 500
+# How long to look for the scheduler of a cluster.
+PATIENCE = "10s"
 BANDS = (0.0, 5.0, 25.0, 50.0, 75.0, 95.0, 100.0)
 GO_ON = "What is finished is kept: give the same command with --out and --resume to go on."
 SHOWN = ("settled_max_abs_error_m", "settled_rms_error_m", "max_abs_error_m", "max_abs_u_V", "rms_u_V", "max_abs_i_A")
@@ -104,14 +106,16 @@ def _executor(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]
         except ImportError:
             raise ValueError("--cluster: Dask is not installed. Run: pip install 'ambjax[cluster]'.") from None
         try:
-            client = Client(args.cluster, timeout="10s")
+            client = Client(args.cluster, timeout=PATIENCE)
         except (OSError, ValueError) as error:
             raise ValueError(f"--cluster {args.cluster}: no scheduler answers there ({error}).") from None
         try:
             with client:
                 yield client.get_executor(), 2 * max(len(client.scheduler_info()["workers"]), 1)
         except (KilledWorker, CancelledError):
-            raise ValueError(f"--cluster {args.cluster}: it was lost, or its workers died repeatedly. {GO_ON}") from None
+            raise ValueError(
+                f"--cluster {args.cluster}: it was lost, or its workers died repeatedly. {GO_ON}"
+            ) from None
     elif args.processes is not None:
         try:
             with processes(args.processes) as pool:
