@@ -25,6 +25,7 @@ def apart(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
             return function(*args)
         from jax.experimental.xla_metadata import set_xla_metadata
 
-        return set_xla_metadata(inner(*args), inlineable="false")
+        result: Any = set_xla_metadata(inner(*args), inlineable="false")
+        return result
 
     return call
