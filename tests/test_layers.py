@@ -17,7 +17,7 @@ FLOORS = {
     2: "plant signals integrate trajectory",
     3: "control control.* scenario metrics",
     4: "loop method rollout theorem proof linear paper evidence ledger plotting",
-    5: "__init__ ensemble",
+    5: "__init__ ensemble ensemble.*",
     6: "casefile template outputs commands __main__ tuning tuning.*",
 }
 # Modules that may import matplotlib: those that draw.

@@ -1,0 +1,1 @@
+"""Ensembles: many members of one closed loop at once."""
