@@ -1,7 +1,7 @@
 """Rollout: a cascade in a scenario, sample by sample, to a trajectory, to folds, or to both."""
 
 import functools
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, Self
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ class Outcome(NamedTuple):
 class System(Protocol):
     """What is rolled out: the closed loop, or the closed loop with something attached to its state."""
 
+    def realised(self) -> Self: ...
     def hold(self, sample: Scalar) -> Measurement: ...
     def start(self) -> Any: ...
     def problem(self, hold: Measurement) -> Problem: ...
@@ -72,16 +73,18 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
         raise ValueError(f"clock.samples = {clock.samples}: there must be at least 1 sample.")
 
 
-def _run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:
+def run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:
+    """The whole rollout, unjitted and unchecked: what `rollout` compiles, and ensembles map over members."""
     progress, rows = segment(system, clock, fold, begin(system, clock, fold), 0, clock.samples, every)
     return finish(progress, rows, fold)
 
 
-roll = one_kernel(_run, static_argnames=("every",))
+roll = one_kernel(run, static_argnames=("every",))
 
 
 def begin(system: System, clock: Clock, fold: Fold | None) -> Progress:
     """Before the first sample."""
+    system = system.realised()
     dtype = jnp.result_type(float)
     state = jax.tree.map(lambda x: jnp.asarray(x, dtype), system.start())
     never = jnp.asarray(jnp.inf, dtype)
@@ -95,7 +98,7 @@ def segment(
     system: System, clock: Clock, fold: Fold | None, progress: Progress, first: Scalar, count: int, every: int
 ) -> tuple[Progress, Any]:
     """`count` samples from number `first` on, and the rows recorded on the way (None if every = 0)."""
-    step = functools.partial(_sample, system, clock, fold)
+    step = functools.partial(_sample, system.realised(), clock, fold)
 
     def unrecorded(progress: Progress, first: Scalar, count: int) -> Progress:
         return lax.fori_loop(0, count, lambda n, progress: step(progress, first + n)[0], progress)
@@ -143,14 +146,13 @@ def _sample(system: System, clock: Clock, fold: Fold | None, progress: Progress,
         # A jump at this instant belongs to this sample even if t was rounded to just before it.
         row = system.row(t * (1 + 4 * jnp.finfo(dtype).eps), state, hold, alive)._replace(t=t)
         folded = folded if fold is None else fold.update(folded, row)
-        span = jnp.where(alive, clock.sample_period, 0.0)
-        after = clock.method.advance(system.problem(hold), t, span, state, memory)
+        after = clock.method.advance(system.problem(hold), t, clock.sample_period, state, memory, ending.lost_code)
         lost_now = alive & (after.code != ALIVE)
         resting = system.rest(after.state, after.code)
         state = jax.tree.map(lambda a, b: jnp.where(lost_now, a, b), resting, after.state)
         crossed = alive & (system.singularity(row) <= 0)
         ending = Ending(
-            jnp.where(alive, after.code, ending.lost_code),
+            after.code,
             jnp.where(lost_now, after.t, ending.lost_at),
             first_time(crossed, t, ending.singular_at),
             ending.duration,

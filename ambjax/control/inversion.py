@@ -36,9 +36,8 @@ class Adaptive:
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:
         floor = GRADIENT_FLOOR * 4 * model.i_0 / model.s_0**2
-        gradient = away_from_zero(model.dv_di(inputs.z, state), floor)
-        v_tilde = inputs.v_star - model.v(inputs.z, state)
-        rate = self.gamma * smooth_sign(v_tilde, self.p) / gradient
+        v, dv_di = model.v_and_dv_di(inputs.z, state)
+        rate = self.gamma * smooth_sign(inputs.v_star - v, self.p, per=away_from_zero(dv_di, floor))
         return CurrentDemand(state, rate), rate
 
 

@@ -1,1 +1,21 @@
-"""Ensembles: many members of one closed loop at once."""
+"""Ensembles: many members of one case, drawn, simulated and reduced to numbers."""
+
+from ambjax.ensemble.distributions import Choice, LogUniform, Normal, Percent, Uniform
+from ambjax.ensemble.spread import Spread, apply, draw
+from ambjax.ensemble.statistics import cvar, quantile, spearman, summary, wilson
+
+__all__ = [
+    "Choice",
+    "LogUniform",
+    "Normal",
+    "Percent",
+    "Spread",
+    "Uniform",
+    "apply",
+    "cvar",
+    "draw",
+    "quantile",
+    "spearman",
+    "summary",
+    "wilson",
+]

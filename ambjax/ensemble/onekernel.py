@@ -7,6 +7,7 @@ kernel; only the noise is written out, since kernels cannot call jax.random.
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -17,15 +18,16 @@ from jax import Array, lax
 from ambjax._pytree import Scalar, canonical, record
 from ambjax.control.cascade import Cascade
 from ambjax.control.laws import Measurement
+from ambjax.ensemble.engine import size
 from ambjax.integrate import RK4
 from ambjax.loop import ClosedLoop
 from ambjax.method import with_method
 from ambjax.metrics import Fold
-from ambjax.rollout import begin, check_inputs, finish, segment
+from ambjax.rollout import Outcome, check_inputs, run
 from ambjax.scenario import Clock, Scenario
 
 # One member per thread, 32 threads to a warp.
-WARP = 32
+WARP, MOST_WARPS = 32, 32
 BLOCK = 128
 ROTATIONS = (13, 15, 26, 6), (17, 29, 16, 24)
 
@@ -35,6 +37,10 @@ class KernelLoop(ClosedLoop):
     """The closed loop with its noise written out; `key` is the member's key as two 32-bit words."""
 
     key: tuple[Scalar, Scalar]
+
+    def realised(self) -> "KernelLoop":
+        """Itself: what is random in the signals was drawn before the kernel."""
+        return self
 
     def hold(self, sample: Scalar) -> Measurement:
         """The same numbers as ClosedLoop.hold: bit for bit where lax.erf_inv is the same."""
@@ -76,79 +82,91 @@ def normal(key: tuple[Array, Array], index: int) -> Array:
 
 
 def run_whole(
-    cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold, block: int = BLOCK, interpret: bool = False
-) -> Any:
-    """The fold's result for every member, each leaf [N] in member order, by one kernel on an accelerator.
+    cascade: Cascade,
+    scenario: Scenario,
+    clock: Clock,
+    *,
+    fold: Fold | None,
+    block: int = BLOCK,
+    interpret: bool = False,
+) -> Outcome:
+    """Simulate every member of an ensemble by one kernel on an accelerator; the contract of `run_ensemble`.
 
-    Leaves of the cascade and the scenario are scalars, shared by all members, or have a leading axis [N]. `block`
-    members share a program: a multiple of 32. `interpret` runs the kernel's program on any device, slowly: for tests.
-    The method must be RK4. Noise is that of `rollout`, but for rounding in the accelerator's own functions.
+    Leaves of `cascade`, `scenario` and `fold` are numbers, shared by all members, or arrays [N]; so are the results,
+    in member order, without rows. `block` members, a power of two of at least 32, share a program. `interpret`
+    runs the kernel's program on any device, slowly: for tests. The method must be RK4. Noise is that of `rollout`
+    but for what the accelerator's own erf_inv, log and sqrt round otherwise.
 
-    Raises ValueError as `rollout` does, and for another method, a wrong block and members that differ in number.
+    Raises ValueError as `run_ensemble` does, and for another method or a wrong block.
     """
     check_inputs(cascade, scenario, clock)
     clock = with_method(clock, cascade, scenario)
     if not isinstance(clock.method, RK4):
         raise ValueError(f"clock.method = {clock.method}: the whole-rollout kernel integrates with RK4 only.")
-    if block < WARP or block % WARP:
-        raise ValueError(f"block = {block}: it must be a positive multiple of {WARP}. Use {BLOCK}, for example.")
-    members = count_members(cascade, scenario, fold)
-    return _run_whole(*canonical((cascade, scenario, clock, fold)), members=members, block=block, interpret=interpret)
+    if block < WARP or block & (block - 1):
+        raise ValueError(f"block = {block}: it must be a power of two, at least {WARP}. Use {BLOCK}, for example.")
+    cascade, scenario, clock, fold = canonical((cascade, scenario, clock, fold))
+    members = size((cascade, scenario, clock, fold))
+    return _whole(cascade, scenario, clock, fold, members=members, block=block, interpret=interpret)
 
 
-def count_members(*nodes: Any) -> int:
-    """N, the length of every leaf that has an axis. ValueError if there is none, or if lengths differ."""
-    lengths = {np.shape(x)[0] for x in jax.tree.leaves(nodes) if np.ndim(x)}
-    if len(lengths) != 1:
-        found = f"lengths {sorted(lengths)}" if lengths else "no leaf with an axis"
-        raise ValueError(f"ensemble: {found}; at least one leaf must be an array [N], all with the same N.")
-    return lengths.pop()
-
-
-def _whole(system: KernelLoop, clock: Clock, fold: Fold) -> Any:
-    """One member from start to end."""
-    progress, _ = segment(system, clock, fold, begin(system, clock, fold), 0, clock.samples, 0)
-    return finish(progress, None, fold).measured
-
-
-def _run(
-    cascade: Cascade, scenario: Scenario, clock: Clock, fold: Fold, *, members: int, block: int, interpret: bool
-) -> Any:
-    from jax.experimental import pallas as pl
-    from jax.experimental.pallas import triton
-
-    words = jax.random.key_data(_keys(scenario, members))
-    scenario = dataclasses.replace(scenario, seed=jnp.zeros((), int), member=jnp.zeros((), int))
-    leaves, tree = jax.tree.flatten((KernelLoop(cascade, scenario, (words[:, 0], words[:, 1])), clock, fold))
+@functools.partial(jax.jit, static_argnames=("members", "block", "interpret"))
+def _whole(
+    cascade: Cascade, scenario: Scenario, clock: Clock, fold: Fold | None, *, members: int, block: int, interpret: bool
+) -> Outcome:
+    scenario, key = _drawn(scenario, members)
+    leaves, tree = jax.tree.flatten((KernelLoop(cascade, scenario, key), clock, fold))
     axes = [0 if x.ndim else None for x in leaves]
-    one = jax.vmap(lambda *leaves: _whole(*jax.tree.unflatten(tree, leaves)), in_axes=axes)
-    programs = pl.cdiv(members, block)
-    padding = programs * block - members
-    operands = [jnp.pad(x, (0, padding), mode="edge") if x.ndim else x[None] for x in leaves]
-    per_lane, shared = pl.BlockSpec((block,), lambda n: (n,)), pl.BlockSpec((1,), lambda n: (0,))
-    results, result_tree = jax.tree.flatten(jax.eval_shape(one, *leaves))
+    member = jax.vmap(lambda *leaves: run(*jax.tree.unflatten(tree, leaves), every=0), in_axes=axes)
+    results, result_tree = jax.tree.flatten(jax.eval_shape(member, *leaves))
+    programs = -(-members // block)
+    # The last program runs its last member again in the lanes that are left.
+    index = jnp.minimum(jnp.arange(programs * block), members - 1)
+    operands = [x[index] if x.ndim else x[None] for x in leaves]
 
     def kernel(*refs: Any) -> None:
-        numbers = [ref[...] if axis == 0 else ref[0] for ref, axis in zip(refs, axes, strict=False)]
-        for ref, value in zip(refs[len(axes) :], jax.tree.leaves(one(*numbers)), strict=True):
+        numbers = [ref[0] if axis is None else ref[...] for ref, axis in zip(refs, axes, strict=False)]
+        for ref, value in zip(refs[len(axes) :], jax.tree.leaves(member(*numbers)), strict=True):
             ref[...] = value
 
-    found = pl.pallas_call(
-        kernel,
-        grid=(programs,),
-        in_specs=[shared if axis is None else per_lane for axis in axes],
-        out_specs=[per_lane] * len(results),
-        out_shape=[jax.ShapeDtypeStruct((programs * block,), x.dtype) for x in results],
-        compiler_params=triton.CompilerParams(num_warps=block // WARP),
-        interpret=interpret,
-    )(*operands)
+    found = _launch(kernel, operands, axes, results, programs, block, interpret)
     return jax.tree.unflatten(result_tree, [x[:members] for x in found])
 
 
-_run_whole = jax.jit(_run, static_argnames=("members", "block", "interpret"))
+def _launch(
+    kernel: Any, operands: list[Array], axes: list[Any], results: list[Any], programs: int, block: int, interpret: bool
+) -> Any:
+    """Call the kernel on a grid of programs, each on its block of the members' numbers and on all shared ones."""
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton
+
+    def lanes(x: Any) -> pl.BlockSpec:
+        return pl.BlockSpec((block, *x.shape[1:]), lambda n: (n, *(0 for _ in x.shape[1:])))
+
+    shared = pl.BlockSpec((1,), lambda n: (0,))
+    return pl.pallas_call(
+        kernel,
+        grid=(programs,),
+        in_specs=[shared if axis is None else lanes(x) for x, axis in zip(operands, axes, strict=True)],
+        out_specs=[lanes(x) for x in results],
+        out_shape=[jax.ShapeDtypeStruct((programs * block, *x.shape[1:]), x.dtype) for x in results],
+        compiler_params=triton.CompilerParams(num_warps=min(block // WARP, MOST_WARPS)),
+        interpret=interpret,
+    )(*operands)
 
 
-def _keys(scenario: Scenario, members: int) -> Array:
-    """The members' random keys [N]."""
-    seed, member = (jnp.broadcast_to(jnp.asarray(x), (members,)) for x in (scenario.seed, scenario.member))
-    return jax.vmap(lambda s, k: dataclasses.replace(scenario, seed=s, member=k).key())(seed, member)
+def _drawn(scenario: Scenario, members: int) -> tuple[Scenario, tuple[Array, Array]]:
+    """What jax.random must draw outside the kernel: the members' random signals, and their keys as two words [N]."""
+    leaves, tree = jax.tree.flatten(scenario)
+    # vmap needs something with an axis, which need not be in the scenario
+    axes = ([0 if x.ndim else None for x in leaves], 0)
+
+    def one(leaves: list[Array], _: Array) -> tuple[Scenario | None, Array]:
+        alone = jax.tree.unflatten(tree, leaves)
+        drawn = alone.realised()
+        return None if drawn is alone else drawn, jax.random.key_data(alone.key())
+
+    drawn, words = jax.vmap(one, in_axes=axes)(leaves, jnp.arange(members))
+    scenario = drawn or scenario  # nothing random: what members share, they go on sharing
+    nobody = jnp.zeros((), jnp.result_type(int))
+    return dataclasses.replace(scenario, seed=nobody, member=nobody), (words[:, 0], words[:, 1])
