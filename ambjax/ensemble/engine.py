@@ -25,16 +25,18 @@ from ambjax.metrics import Fold
 from ambjax.rollout import Outcome, check_inputs, run
 from ambjax.scenario import Clock, Scenario
 
-# Members per block: their states and shared terms fit the first-level cache (measured: benchmarks/throughput.py).
+# A block of members has vectors of this many bytes: small enough for the first-level cache, large enough to pay for
+# what is done once per block.
 BLOCK_BYTES = 512
+MOST_CALL = 4096
 MEMBERS = "members"
 
 
 class Parts(NamedTuple):
     """A pytree split into the leaves that differ between members, [N] each, and those that all share."""
 
-    moving: tuple[Array, ...]
-    shared: tuple[Array, ...]
+    moving: Any
+    shared: Any
 
 
 def run_ensemble(
@@ -45,15 +47,16 @@ def run_ensemble(
     fold: Fold | None,
     every: int = 0,
     threads: int | None = None,
-    call: int = 4096,
+    call: int | None = None,
 ) -> Outcome:
     """Simulate every member of an ensemble; results in member order, every leaf with a leading axis [N].
 
     Leaves of `cascade`, `scenario` and `fold` are numbers, shared by all members, or arrays [N], one entry for
     each; at least one must be an array (`scenario.member`, for one). `fold` sees every sample; rows are
     recorded at every `every`-th sample (0: none), [N, rows]. Members run on all devices that there are, on a
-    CPU on `threads` cores (None: all that this process may use), up to `call` of them in one call of the
-    compiled program: memory grows with that, not with N. Results are NumPy arrays.
+    CPU on `threads` cores (None: all that this process may use). One call of the compiled program takes
+    `call` members (rounded up to whole blocks; None: an equal share for every core, 4096 at most): memory
+    grows with that, not with N, and another number compiles again. Results are NumPy arrays.
 
     Raises ValueError as `rollout` does, and where the lengths of two leaves differ.
     """
@@ -81,19 +84,19 @@ def size(tree: Any) -> int:
 class _Engine:
     """One ensemble, cut into calls of equal shape, so that it compiles once."""
 
-    def __init__(self, tree: Any, every: int, threads: int | None, call: int):
+    def __init__(self, tree: Any, every: int, threads: int | None, call: int | None):
         self.every = every
         leaves, self.tree = jax.tree.flatten(tree)
         self.members, self.kept = size(tree), tuple(bool(np.ndim(x)) for x in leaves)
         self.moving = [np.asarray(x) for x in leaves if np.ndim(x)]
         self.shared = tuple(x for x in leaves if not np.ndim(x))
         self.devices = jax.devices()
-        cores = threads or _cores()
-        self.workers = cores if len(self.devices) == 1 and self.devices[0].platform == "cpu" else 1
+        alone = len(self.devices) == 1 and self.devices[0].platform == "cpu"
+        self.workers = (threads or cores()) if alone else 1
         self.block = BLOCK_BYTES // jnp.result_type(float).itemsize
         unit = self.block * len(self.devices)
-        fair = -(-self.members // (self.workers * unit)) * unit  # an equal share for every worker, in whole blocks
-        self.call = min(max(call // unit, 1) * unit, fair)
+        fair = min(-(-self.members // self.workers), MOST_CALL)
+        self.call = -(-(call or fair) // unit) * unit
 
     def outcome(self) -> Outcome:
         """Run all calls and put the results in order."""
@@ -111,7 +114,8 @@ class _Engine:
         return jax.tree.map(np.asarray, found)
 
 
-def _cores() -> int:
+def cores() -> int:
+    """Processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
