@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ambjax import RK4, Cascade, Clock, Initial, Plant, Pulse, Scenario, Sensor, inversion, paper
+from ambjax import RK4, Cascade, Clock, Initial, Plant, Pulse, Scenario, Sensor, inversion, paper, rollout
+from ambjax.ensemble.engine import run_ensemble
 from ambjax.metrics import Peak
 
 GAMMA, P_V = 1e9, 25e-6
@@ -38,21 +39,33 @@ class Workload(NamedTuple):
     @property
     def steps(self) -> int:
         """RK4 steps of one member."""
-        return self.clock.samples * SUBSTEPS
+        return self.clock.samples * self.clock.method.substeps
 
     @property
     def pulse(self) -> tuple[int, int]:
         """First sample with the pulse and first one after it."""
-        return pulse_samples(self.clock.samples)
+        force = vars(self.scenario.q_v)
+        return round(force["start"] / PERIOD), round(force["stop"] / PERIOD)
 
+    def lasting(self, samples: int) -> "Workload":
+        """The same, pulse included, over another horizon."""
+        return self._replace(clock=dataclasses.replace(self.clock, samples=samples))
 
-def pulse_samples(samples: int) -> tuple[int, int]:
-    return round(0.4 * samples), round(0.65 * samples)
+    def stepping(self, substeps: int) -> "Workload":
+        """The same with another step."""
+        return self._replace(clock=self.clock.with_method(RK4(substeps)))
+
+    def few(self, members: int) -> "Workload":
+        """Some of its members, spread evenly."""
+        chosen = np.linspace(0, self.members - 1, members).round().astype(int)
+        initial = dataclasses.replace(self.scenario.initial, z=np.asarray(self.scenario.initial.z)[chosen])
+        member = np.asarray(self.scenario.member)[chosen]
+        return self._replace(scenario=dataclasses.replace(self.scenario, initial=initial, member=member))
 
 
 def workload(members: int, samples: int, *, noise: bool = False) -> Workload:
     cascade = dataclasses.replace(paper.cascade("repaired"), inversion=inversion.Adaptive(GAMMA, P_V))
-    start, stop = pulse_samples(samples)
+    start, stop = round(0.4 * samples), round(0.65 * samples)
     scenario = dataclasses.replace(
         paper.scenario("tracking", "repaired"),
         q_v=Pulse(1.0, start * PERIOD, stop * PERIOD),
@@ -61,6 +74,14 @@ def workload(members: int, samples: int, *, noise: bool = False) -> Workload:
         member=np.arange(members),
     )
     return Workload(cascade, scenario, Clock(samples, PERIOD, RK4(SUBSTEPS)))
+
+
+def ours(work: Workload, threads: int = 1) -> Any:
+    """The largest |z - r| of each member, by ambjax: the ensemble engine, or `rollout` where there is one member."""
+    if work.members > 1:
+        return run_ensemble(*work, fold=FOLD, threads=threads).measured
+    alone = dataclasses.replace(work.scenario, initial=Initial(z=float(work.scenario.initial.z[0])), member=0)
+    return rollout(work.cascade, alone, work.clock, fold=FOLD, every=0).measured
 
 
 def right_side(gamma: float, p_v: float, xp: Any) -> Callable[..., Any]:
