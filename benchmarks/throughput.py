@@ -1,8 +1,9 @@
 """Member-steps per second of an ensemble against the number of members, next to the machine's limit.
 
 The workload of workload.py (RK4, 10 us a step), without and with held noise, float64 and float32 (a process of
-its own for each precision), one core and two. Each of our times stands beside that of limit.c, both taken in turn in the
-same process; ratios are between their medians, compilation apart. Run: python benchmarks/throughput.py
+its own for each precision), one core and two. Each of our times stands beside that of limit.c, both taken in
+turn in the same process; ratios are between their medians, compilation apart. One member alone is a `rollout`.
+Run: python benchmarks/throughput.py
 """
 
 import argparse

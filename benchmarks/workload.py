@@ -76,10 +76,10 @@ def workload(members: int, samples: int, *, noise: bool = False) -> Workload:
     return Workload(cascade, scenario, Clock(samples, PERIOD, RK4(SUBSTEPS)))
 
 
-def ours(work: Workload, threads: int = 1) -> Any:
+def ours(work: Workload, threads: int = 1, **options: Any) -> Any:
     """The largest |z - r| of each member, by ambjax: the ensemble engine, or `rollout` where there is one member."""
     if work.members > 1:
-        return run_ensemble(*work, fold=FOLD, threads=threads).measured
+        return run_ensemble(*work, fold=FOLD, threads=threads, **options).measured
     alone = dataclasses.replace(work.scenario, initial=Initial(z=float(work.scenario.initial.z[0])), member=0)
     return rollout(work.cascade, alone, work.clock, fold=FOLD, every=0).measured
 
