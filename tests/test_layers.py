@@ -21,7 +21,13 @@ FLOORS = {
     6: "casefile tomltable spreadfile template outputs worker studies mapping commands __main__ tuning tuning.*",
 }
 # Modules that may import matplotlib: those that draw.
-DRAWING = {"ambjax.plotting", "ambjax.ensemble.pictures", "ambjax.ensemble.heatmaps", "tuning.report"}
+DRAWING = {
+    "ambjax.plotting",
+    "ambjax.ensemble.pictures",
+    "ambjax.ensemble.heatmaps",
+    "ambjax.ensemble.scales",
+    "tuning.report",
+}
 FILES = sorted([*ROOT.glob("ambjax/**/*.py"), *ROOT.glob("tuning/**/*.py")])
 
 
