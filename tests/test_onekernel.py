@@ -82,8 +82,10 @@ LAWS = {
 
 
 @pytest.mark.parametrize(("laws", "x64"), [("paper", True), ("others", False)])
-def test_lowers_for_a_gpu(laws, x64):
-    # no GPU is needed to make its program: a primitive that kernels cannot have would raise here
+def test_lowers_for_a_gpu(laws, x64, monkeypatch):
+    # No GPU is needed to make its program: a primitive that kernels cannot have would raise here. What is done for
+    # CPUs alone must be left out, as it is where JAX runs on a GPU.
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     with jax.enable_x64(x64):
         run = jax.jit(
             lambda z: run_whole(LAWS[laws], dataclasses.replace(SCENARIO, initial=z), CLOCK, fold=Standard(2e-4))
