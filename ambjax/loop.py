@@ -1,5 +1,6 @@
 """The closed loop as one system of ordinary differential equations: plant and cascade together."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -90,7 +91,9 @@ class ClosedLoop:
         """0 while the rotor is levitated, else the code of what became of it."""
         sane = [jnp.abs(x) <= DIVERGENCE * s for x, s in zip(*map(jax.tree.leaves, (state, self.scale())), strict=True)]
         touched = jnp.abs(state.plant.z) >= self.scenario.touchdown
-        return jnp.where(jnp.stack(sane).all(), jnp.where(touched, TOUCHED, ALIVE), DIVERGED).astype(jnp.int32)
+        return jnp.where(functools.reduce(jnp.logical_and, sane), jnp.where(touched, TOUCHED, ALIVE), DIVERGED).astype(
+            jnp.int32
+        )
 
     def rest(self, state: LoopState, code: Array) -> LoopState:
         """The state in which a lost rotor is frozen: at rest, against the stop it touched; controller as it was."""
