@@ -29,11 +29,15 @@ Fate = Callable[[Any], Array]
 
 
 class Problem(NamedTuple):
-    """What is integrated: rates(t, state), scale (a state) and fate(state) -> code."""
+    """What is integrated: rates(t, state), scale (a state) and fate(state) -> code.
+
+    `slide(t_0, t_1, h, state) -> state`, where there is one, is a step made for this very system.
+    """
 
     rates: Rates
     scale: Any
     fate: Fate
+    slide: Callable[[Array, Array, Scalar, Any], Any] | None = None
 
 
 class Advanced(NamedTuple):
@@ -93,7 +97,7 @@ class _Fixed:
     def start(self, span: Scalar) -> Any:
         return ()
 
-    def _step(self, rates: Rates, t: Array, h: Scalar, state: Any) -> Any:
+    def _step(self, problem: Problem, t: Array, h: Scalar, state: Any) -> Any:
         raise NotImplementedError
 
     def advance(self, problem: Problem, t: Scalar, span: Scalar, state: Any, memory: Any) -> Advanced:
@@ -101,7 +105,7 @@ class _Fixed:
 
         def body(index: Array, carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
             x, code, reached = carry
-            new = self._step(problem.rates, t + index * h, h, x)
+            new = self._step(problem, t + index * h, h, x)
             verdict = problem.fate(new)
             alive = code == ALIVE
             good = alive & (verdict == ALIVE)
@@ -122,8 +126,8 @@ class Euler(_Fixed):
 
     limit = 2.0
 
-    def _step(self, rates: Rates, t: Array, h: Scalar, state: Any) -> Any:
-        return axpy(state, (h, rates(_inside(t, h)(0.0), state)))
+    def _step(self, problem: Problem, t: Array, h: Scalar, state: Any) -> Any:
+        return axpy(state, (h, problem.rates(_inside(t, h)(0.0), state)))
 
     def __str__(self) -> str:
         return f"explicit Euler, {self.substeps} substeps"
@@ -135,8 +139,8 @@ class RK4(_Fixed):
 
     limit = 2.785
 
-    def _step(self, rates: Rates, t: Array, h: Scalar, state: Any) -> Any:
-        at = _inside(t, h)
+    def _step(self, problem: Problem, t: Array, h: Scalar, state: Any) -> Any:
+        at, rates = _inside(t, h), problem.rates
         k_1 = rates(at(0.0), state)
         k_2 = rates(at(0.5), axpy(state, (h / 2, k_1)))
         k_3 = rates(at(0.5), axpy(state, (h / 2, k_2)))
@@ -178,11 +182,30 @@ class Rodas3(_Fixed):
 
     limit = None
 
-    def _step(self, rates: Rates, t: Array, h: Scalar, state: Any) -> Any:
-        return rodas3_step(rates, t, h, state)[0]
+    def _step(self, problem: Problem, t: Array, h: Scalar, state: Any) -> Any:
+        return rodas3_step(problem.rates, t, h, state)[0]
 
     def __str__(self) -> str:
         return f"RODAS3 (L-stable Rosenbrock), {self.substeps} substeps"
+
+
+@record
+class Slide(_Fixed):
+    """Equal substeps of the loop's own step (`ambjax.sliding`): for stiff gains under held noise.
+
+    Second order in the loop's slow motion, whatever gamma p is; the inversion law must be `inversion.Adaptive`.
+    """
+
+    limit = None
+
+    def _step(self, problem: Problem, t: Array, h: Scalar, state: Any) -> Any:
+        if problem.slide is None:
+            raise ValueError("clock.method = Slide(...): it steps loops whose inversion law is 'adaptive'. Use Rodas3.")
+        at = _inside(t, h)
+        return problem.slide(at(0.0), at(1.0), h, state)
+
+    def __str__(self) -> str:
+        return f"sliding step, {self.substeps} substeps"
 
 
 @record

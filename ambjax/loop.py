@@ -1,5 +1,6 @@
 """The closed loop as one system of ordinary differential equations: plant and cascade together."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -12,6 +13,7 @@ from ambjax.control.laws import Measurement
 from ambjax.integrate import Problem
 from ambjax.scenario import Scenario
 from ambjax.signals import Reference, reference_at
+from ambjax.sliding import slide, slides
 from ambjax.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 
 # A state this many times its scale has left the model's meaning, long before numbers overflow.
@@ -84,7 +86,8 @@ class ClosedLoop:
 
     def problem(self, hold: Measurement) -> Problem:
         """What an integrator is given for one sample."""
-        return Problem(lambda t, x: self.rates(t, x, hold), self.scale(), self.fate)
+        step = functools.partial(slide, self, hold) if slides(self.cascade) else None
+        return Problem(lambda t, x: self.rates(t, x, hold), self.scale(), self.fate, step)
 
     def row(self, t: Scalar, state: LoopState, hold: Measurement, alive: Array) -> Row:
         """All signals at one instant. The drive of a lost rotor is off: u = 0."""

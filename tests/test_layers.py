@@ -16,7 +16,7 @@ FLOORS = {
     1: "_pytree _kernel smooth _linear _version",
     2: "plant signals integrate trajectory",
     3: "control control.* scenario metrics",
-    4: "loop method rollout theorem proof linear paper evidence ledger plotting",
+    4: "loop sliding method rollout theorem proof linear paper evidence ledger plotting",
     5: "__init__ ensemble",
     6: "casefile template outputs commands __main__ tuning tuning.*",
 }

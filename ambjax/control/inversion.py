@@ -14,6 +14,11 @@ from ambjax.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
 GRADIENT_FLOOR = 1e-4
 
 
+def floored_gradient(model: Plant, z: Array, i_ref: Array) -> Array:
+    """dv/di at (z, i_ref), kept away from 0."""
+    return away_from_zero(model.dv_di(z, i_ref), GRADIENT_FLOOR * 4 * model.i_0 / model.s_0**2)
+
+
 @record
 class Adaptive:
     """i_ref' = gamma sgn(v_star - v(z, i_ref)) / (dv/di)(z, i_ref), with i_ref as its state. Eq. (6), sgn smoothed.
@@ -35,8 +40,7 @@ class Adaptive:
         return TWO_OVER_PI * self.gamma * self.p
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:
-        floor = GRADIENT_FLOOR * 4 * model.i_0 / model.s_0**2
-        gradient = away_from_zero(model.dv_di(inputs.z, state), floor)
+        gradient = floored_gradient(model, inputs.z, state)
         v_tilde = inputs.v_star - model.v(inputs.z, state)
         rate = self.gamma * smooth_sign(v_tilde, self.p) / gradient
         return CurrentDemand(state, rate), rate
