@@ -74,14 +74,14 @@ def numbers(field: dataclasses.Field) -> str:
     return f"{kind}{unit}"
 
 
-def _within(meta: Any, value: Any) -> bool:
-    """Whether a number, or every number of an array, is allowed."""
+def within(meta: Any, value: Any) -> bool:
+    """Whether a number, or every number of an array, is what a field with this metadata allows."""
     above, at_least = meta["above"], meta["at_least"]
     if isinstance(value, (int, float)):
         finite = value == value if meta["infinite"] else math.isfinite(value)
         return finite and (above is None or value > above) and (at_least is None or value >= at_least)
     low, high = np.min(value), np.max(value)  # NaN carries through both
-    return all(_within(meta, float(x)) for x in (low, high))
+    return all(within(meta, float(x)) for x in (low, high))
 
 
 def _example(field: dataclasses.Field) -> str:
@@ -114,7 +114,7 @@ def _check(field: dataclasses.Field, name: str, value: Any) -> None:
         number = value if isinstance(value, (int, float)) else np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         number = math.nan
-    if not _within(field.metadata, number):
+    if not within(field.metadata, number):
         shown = f"{value:g}" if isinstance(value, (int, float)) else repr(value)
         raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.{_example(field)}")
 

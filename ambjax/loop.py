@@ -34,6 +34,10 @@ class ClosedLoop:
     cascade: Cascade
     scenario: Scenario
 
+    def realised(self) -> "ClosedLoop":
+        """The loop with its scenario's random signals drawn."""
+        return ClosedLoop(self.cascade, self.scenario.realised())
+
     def hold(self, sample: Scalar) -> Measurement:
         """Errors of all sensors during sample number `sample`; zeros without a sensor model."""
         if self.scenario.sensor is None:

@@ -80,6 +80,9 @@ class Monitored:
 
     loop: ClosedLoop
 
+    def realised(self) -> "Monitored":
+        return Monitored(self.loop.realised())
+
     def hold(self, sample: Scalar) -> Measurement:
         return self.loop.hold(sample)
 

@@ -1,7 +1,7 @@
 """Rollout: a cascade in a scenario, sample by sample, to a trajectory, to folds, or to both."""
 
 import functools
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, Self
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ class Outcome(NamedTuple):
 class System(Protocol):
     """What is rolled out: the closed loop, or the closed loop with something attached to its state."""
 
+    def realised(self) -> Self: ...
     def hold(self, sample: Scalar) -> Measurement: ...
     def start(self) -> Any: ...
     def problem(self, hold: Measurement) -> Problem: ...
@@ -82,6 +83,7 @@ roll = one_kernel(_run, static_argnames=("every",))
 
 def begin(system: System, clock: Clock, fold: Fold | None) -> Progress:
     """Before the first sample."""
+    system = system.realised()
     dtype = jnp.result_type(float)
     state = jax.tree.map(lambda x: jnp.asarray(x, dtype), system.start())
     never = jnp.asarray(jnp.inf, dtype)
@@ -95,7 +97,7 @@ def segment(
     system: System, clock: Clock, fold: Fold | None, progress: Progress, first: Scalar, count: int, every: int
 ) -> tuple[Progress, Any]:
     """`count` samples from number `first` on, and the rows recorded on the way (None if every = 0)."""
-    step = functools.partial(_sample, system, clock, fold)
+    step = functools.partial(_sample, system.realised(), clock, fold)
 
     def unrecorded(progress: Progress, k: Array) -> tuple[Progress, None]:
         return step(progress, k)[0], None

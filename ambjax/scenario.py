@@ -1,16 +1,22 @@
 """The world that a cascade meets: true plant, start, reference, disturbances, realism; and the clock."""
 
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ambjax._pytree import Scalar, leaf, record, static
 from ambjax.control.laws import Measurement
 from ambjax.integrate import Integrator
 from ambjax.plant import Plant
-from ambjax.signals import Constant, Signal
+from ambjax.signals import Constant, Signal, realised
+
+# A member's randomness beside its sensors': folded into its key where they fold the sample number, beyond any of those.
+DESIGN_STREAM, SIGNAL_STREAM = np.uint32(2**32 - 1), np.uint32(2**32 - 2)
+SIGNALS = ("reference", "q_z", "q_v", "q_i")
 
 
 @record
@@ -69,6 +75,17 @@ class Scenario:
     def key(self) -> Array:
         """The member's random key: fold_in(key(seed), member)."""
         return jax.random.fold_in(jax.random.key(self.seed), self.member)
+
+    def realised(self) -> "Scenario":
+        """This scenario with whatever is random in its signals drawn for the member."""
+        random = {slot: signal for slot in SIGNALS if hasattr(signal := getattr(self, slot), "realised")}
+        if not random:
+            return self
+        key = jax.random.fold_in(self.key(), SIGNAL_STREAM)
+        drawn = {
+            slot: realised(signal, jax.random.fold_in(key, SIGNALS.index(slot))) for slot, signal in random.items()
+        }
+        return dataclasses.replace(self, **drawn)
 
 
 @record

@@ -1,9 +1,12 @@
 """Signals: pytrees that are functions of time. References and disturbances are one concept.
 
-Call a signal with a time in seconds. A jump counts from its instant on (right-continuous).
+Call a signal with a time in seconds. A jump counts from its instant on (right-continuous). A random signal has a
+method `realised(key)`, which draws the function of time that one member of an ensemble meets.
 """
 
-from typing import NamedTuple, Protocol
+import dataclasses
+import math
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +41,10 @@ class Step:
     def __call__(self, t: Scalar) -> Array:
         return jnp.where(jnp.asarray(t) >= self.start, self.amplitude, 0.0)
 
+    def shifted(self, by: Scalar) -> "Step":
+        """The same, `by` seconds later."""
+        return dataclasses.replace(self, start=self.start + by)
+
 
 @record
 class Pulse:
@@ -46,10 +53,15 @@ class Pulse:
     amplitude: Scalar = leaf(doc="height")
     start: Scalar = leaf(unit="s", doc="when it rises")
     stop: Scalar = leaf(unit="s", doc="when it falls; later than start")
+    ordered: ClassVar = ("start", "stop")
 
     def __call__(self, t: Scalar) -> Array:
         t = jnp.asarray(t)
         return jnp.where((t >= self.start) & (t < self.stop), self.amplitude, 0.0)
+
+    def shifted(self, by: Scalar) -> "Pulse":
+        """The same, `by` seconds later: it never ends before it starts."""
+        return dataclasses.replace(self, start=self.start + by, stop=self.stop + by)
 
 
 @record
@@ -77,6 +89,10 @@ class SmoothStep:
         rising = s**3 * (10 - 15 * s + 6 * s**2)
         return self.amplitude * jnp.where(s <= 0, 0.0, jnp.where(s >= 1, 1.0, rising))
 
+    def shifted(self, by: Scalar) -> "SmoothStep":
+        """The same, `by` seconds later."""
+        return dataclasses.replace(self, start=self.start + by)
+
 
 @record
 class Chirp:
@@ -95,6 +111,49 @@ class Chirp:
         return self.amplitude * jnp.sin(2 * jnp.pi * cycles)
 
 
+# Sines in one realisation of band-limited noise. Its fourth moment falls short of a Gaussian's by 1.5/LINES of std^4.
+LINES = 32
+
+
+@record
+class Lines:
+    """std sqrt(2/n) sum of sin(2 pi frequencies t + phases), n of each: Hz and rad."""
+
+    std: Scalar
+    frequencies: Array
+    phases: Array
+
+    def __call__(self, t: Scalar) -> Array:
+        angle = 2 * jnp.pi * self.frequencies * jnp.asarray(t)[..., None] + self.phases
+        return self.std * math.sqrt(2 / self.phases.size) * jnp.sum(jnp.sin(angle), axis=-1)
+
+
+@record
+class BandNoise:
+    """Random, smooth, stationary: power spread evenly over f_low..f_high, standard deviation `std`.
+
+    A sum of sines, one at a random place in each of LINES equal parts of the band, each of random phase (after
+    Shinozuka and Deodatis, Appl. Mech. Rev. 44, 1991). Over members its autocovariance is std^2 times the mean of
+    cos(2 pi f tau) over the band, exactly; it has all derivatives, so that integrators keep their order.
+    """
+
+    std: Scalar = leaf(at_least=0, doc="standard deviation")
+    f_low: Scalar = leaf(unit="Hz", at_least=0, doc="lower end of the band")
+    f_high: Scalar = leaf(unit="Hz", above=0, doc="upper end of the band; above f_low")
+    ordered: ClassVar = ("f_low", "f_high")
+
+    def realised(self, key: Array) -> Lines:
+        """What one member meets."""
+        place, turn = jax.random.uniform(key, (2, LINES))
+        share = (jnp.arange(LINES) + place) / LINES
+        return Lines(self.std, self.f_low + (self.f_high - self.f_low) * share, 2 * jnp.pi * turn)
+
+    def __call__(self, t: Scalar) -> Array:
+        raise ValueError(
+            "band-noise is a function of time only for one member: use scenario.realised(), as a rollout does."
+        )
+
+
 @record
 class Sum:
     """The sum of several signals."""
@@ -106,6 +165,15 @@ class Sum:
         for term in self.terms:
             total = total + term(t)
         return total
+
+    def realised(self, key: Array) -> "Sum":
+        """The sum with its random terms drawn, each from a key of its own."""
+        return Sum(tuple(realised(term, jax.random.fold_in(key, n)) for n, term in enumerate(self.terms)))
+
+
+def realised(signal: Any, key: Array) -> Any:
+    """The signal with whatever is random in it drawn from `key`."""
+    return signal.realised(key) if hasattr(signal, "realised") else signal
 
 
 class Reference(NamedTuple):

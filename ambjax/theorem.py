@@ -93,7 +93,7 @@ def delta_1_on_reference(cascade: Cascade, scenario: Scenario, clock: Clock) -> 
 
     What gamma must exceed merely to follow the reference on the nominal plant, A^2/m^2/s and s.
     """
-    model, reference = cascade.model, scenario.reference
+    model, reference = cascade.model, scenario.realised().reference
 
     def demanded(t: Array) -> Array:
         r, _, r_ddot = reference_at(reference, t)

@@ -1,0 +1,6 @@
+"""Ensembles: many members of one case, drawn, simulated and reduced to numbers."""
+
+from ambjax.ensemble.distributions import Choice, LogUniform, Normal, Percent, Uniform
+from ambjax.ensemble.spread import Spread, apply, draw
+
+__all__ = ["Choice", "LogUniform", "Normal", "Percent", "Spread", "Uniform", "apply", "draw"]

@@ -1,0 +1,102 @@
+"""Dotted paths of the case file, and the numbers of a cascade and a scenario that they name."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ambjax._pytree import is_traced, leaf
+from ambjax.control.cascade import Cascade
+from ambjax.scenario import Scenario
+from ambjax.signals import Constant
+
+SHIFT = "shift"
+TIME = leaf(default=0.0, unit="s", doc="time by which start and stop move together")
+
+
+class Place(NamedTuple):
+    """One number: how to reach it in (cascade, scenario), the field that declares it, and its value."""
+
+    route: tuple[int | str, ...]
+    field: dataclasses.Field
+    value: Any
+
+
+def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
+    """Every number that this cascade and this scenario have, by dotted path.
+
+    plant.* is the true plant, controller.model.* the nominal one. disturbance.q_z.* is the scaled force if that
+    is the only disturbance of z there is, as in a case file; where there are both, it is disturbance.q_v.*. The path
+    *.shift moves a signal in time, start and stop together; it is 0.
+    """
+    found: dict[str, Place] = {}
+    for stage in ("model", "observer", "position", "inversion", "current"):
+        found |= _below(getattr(cascade, stage), f"controller.{stage}", (0, stage))
+    names = {"plant": "plant", "reference": "reference", "disturbance.q_i": "q_i", "sensor": "sensor"}
+    names |= {"initial": "initial", "disturbance.q_z": "q_z"}
+    if not _absent(scenario.q_v):
+        names["disturbance.q_z" if _absent(scenario.q_z) else "disturbance.q_v"] = "q_v"
+    for path, name in names.items():
+        found |= _below(getattr(scenario, name), path, (1, name))
+    fields = {field.name: field for field in dataclasses.fields(scenario)}
+    for path, name in (("actuator.u_max", "u_max"), ("run.clearance", "clearance")):
+        found[path] = Place((1, name), fields[name], getattr(scenario, name))
+    return found
+
+
+def _absent(signal: Any) -> bool:
+    return isinstance(signal, Constant) and not is_traced(signal.value) and not np.any(signal.value)
+
+
+def _below(node: Any, path: str, route: tuple[int | str, ...]) -> Iterator[tuple[str, Place]]:
+    if isinstance(node, tuple):
+        for index, item in enumerate(node):
+            yield from _below(item, f"{path}.{index}", (*route, index))
+    if not dataclasses.is_dataclass(node):
+        return
+    for field in dataclasses.fields(node):
+        value, at = getattr(node, field.name), (f"{path}.{field.name}", (*route, field.name))
+        if field.metadata.get("leaf"):
+            yield at[0], Place(at[1], field, value)
+        else:
+            yield from _below(value, *at)
+    if hasattr(node, "shifted"):
+        yield f"{path}.{SHIFT}", Place((*route, SHIFT), TIME, 0.0)
+
+
+def ordered(cascade: Cascade, scenario: Scenario) -> list[tuple[str, str]]:
+    """Pairs of paths of which the first must stay below the second: start and stop of a pulse, for one."""
+    pairs = []
+    known = places(cascade, scenario)
+    for path, place in known.items():
+        owner = _get((cascade, scenario), place.route[:-1])
+        low, high = getattr(owner, "ordered", (None, None))
+        if place.route[-1] == low:
+            pairs.append((path, f"{path.rpartition('.')[0]}.{high}"))
+    return pairs
+
+
+def replaced(cascade: Cascade, scenario: Scenario, values: Mapping[str, Any]) -> tuple[Cascade, Scenario]:
+    """The same cascade and scenario with the numbers at these paths replaced; shifts come last."""
+    known, world = places(cascade, scenario), (cascade, scenario)
+    for path in sorted(values, key=lambda path: known[path].route[-1] == SHIFT):
+        world = _set(world, known[path].route, values[path])
+    return world
+
+
+def _get(node: Any, route: tuple[int | str, ...]) -> Any:
+    for step in route:
+        node = node[step] if isinstance(step, int) else getattr(node, step)
+    return node
+
+
+def _set(node: Any, route: tuple[int | str, ...], value: Any) -> Any:
+    if not route:
+        return value
+    step, *rest = route
+    if step == SHIFT:
+        return node.shifted(value)
+    if isinstance(step, int):
+        return (*node[:step], _set(node[step], tuple(rest), value), *node[step + 1 :])
+    return dataclasses.replace(node, **{step: _set(getattr(node, step), tuple(rest), value)})
