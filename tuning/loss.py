@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.metrics import Ending
-from ambjax.pytree import Scalar, leaf, record
+from ambjax.extend import Scalar, leaf, record
 from ambjax.scenario import Scenario
 from ambjax.trajectory import ALIVE
 
