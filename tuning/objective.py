@@ -18,7 +18,8 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble import Spread, apply, draw
-from ambjax.extend import canonical, one_kernel
+from ambjax.control.laws import Measurement
+from ambjax.extend import canonical, leaf, one_kernel, record
 from ambjax.metrics import Named, Standard
 from ambjax.rollout import rollout
 from ambjax.scenario import Clock, Scenario
@@ -28,14 +29,36 @@ from tuning.space import Space
 # Lanes of one kernel call. Values: one register of 8 after the other in L1; gradients carry m + 1 numbers per lane.
 LANES = 64
 GRADIENT_LANES = 32
+# Choices of members kept on the device.
+KEPT = 16
+# Bytes of noise kept in memory; beyond, it is drawn anew in each rollout.
+MOST_TAPE = 1_000_000_000
 
 
 class Members(NamedTuple):
-    """Members of an ensemble: their numbers [n], their seed, and what is spread over them, by path [n]."""
+    """Members of an ensemble: their numbers [n], seed, what is spread over them by path [n], and their noise.
 
-    member: np.ndarray
-    seed: int
-    values: dict[str, np.ndarray]
+    `tape`: the errors of the sensors drawn beforehand, [samples, 3, n]; None: none, or too much to keep.
+    """
+
+    member: Any
+    seed: Any
+    values: dict[str, Any]
+    tape: Any
+
+
+@record
+class Tape:
+    """A sensor whose errors were drawn beforehand, [samples, 3] in m, m/s and A.
+
+    The search sees the same noise thousands of times, and drawing it costs twenty times what a step does.
+    """
+
+    errors: Any = leaf()
+
+    def noise(self, key: Array, sample: Array) -> Measurement:
+        """The errors of one sample."""
+        return Measurement(*jax.lax.dynamic_index_in_dim(self.errors, sample, keepdims=False))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,14 +74,30 @@ class Objective:
 
     def members(self, seed: int, count: int) -> Members:
         """The first `count` members of the ensemble with this seed."""
-        numbers = np.arange(count)
-        values = draw(self.spread, self.cascade, self.scenario, seed, numbers, count) if self.spread.entries else {}
-        return Members(numbers, seed, values)
+        return self.chosen(seed, np.arange(count), count)
+
+    def chosen(self, seed: int, numbers: np.ndarray, total: int) -> Members:
+        """Members with these numbers of an ensemble of `total`."""
+        values = draw(self.spread, self.cascade, self.scenario, seed, numbers, total) if self.spread.entries else {}
+        who = Members(numbers, np.full(len(numbers), seed), values, None)
+        samples = self.clock.samples
+        if self.scenario.sensor is None or samples * len(numbers) * 24 > MOST_TAPE:
+            return who
+        tape = jax.jit(jax.vmap(lambda who: self._tape(who), in_axes=(Members(0, 0, 0, None),), out_axes=-1))
+        return who._replace(tape=np.asarray(tape(who)))
+
+    def _tape(self, who: Members) -> Array:
+        """All errors of one member's sensors, [samples, 3]."""
+        scenario = self.world(who)[1]
+        key = scenario.key()
+        drawn = jax.vmap(lambda k: jnp.stack(scenario.sensor.noise(key, k)))  # pyright: ignore
+        return drawn(jnp.arange(self.clock.samples))
 
     def world(self, who: Members) -> tuple[Cascade, Scenario]:
         """The cascade (its gains to be replaced) and scenario of one member, whose fields are scalars."""
         scenario = dataclasses.replace(self.scenario, member=who.member, seed=who.seed)
-        return apply(self.cascade, scenario, who.values) if who.values else (self.cascade, scenario)
+        cascade, scenario = apply(self.cascade, scenario, who.values) if who.values else (self.cascade, scenario)
+        return cascade, scenario if who.tape is None else dataclasses.replace(scenario, sensor=Tape(who.tape))
 
     def run(self, x: Array, who: Members, fold: Any) -> Any:
         """The fold's result for one lane."""
@@ -73,6 +112,7 @@ class Engine:
         self.objective, self.mode, self.settle = objective, mode, settle
         self.threads = threads or os.cpu_count() or 1
         self.rollouts = 0
+        self._kept: dict[Any, Any] = {}
         traced = canonical((objective.cascade, objective.scenario, objective.clock, objective.loss))
         self._world = traced
         standard = canonical(Named({"loss": objective.loss, "metrics": Standard(settle, objective.scenario.touchdown)}))
@@ -103,7 +143,7 @@ class Engine:
             (value, found), slope = jax.value_and_grad(total, has_aux=True)(x, who, world, weights)
             return value, slope, found
 
-        axes: Any = (0, Members(0, 0, 0), None)  # pyright: ignore[reportArgumentType]
+        axes: Any = (0, Members(0, 0, 0, -1), None)  # pyright: ignore[reportArgumentType]
         self._terms = one_kernel(jax.vmap(terms, axes))
         self._standard = lambda x, who, world: measured_lanes(x, who, world, standard)
         measured_lanes = one_kernel(jax.vmap(measured, (*axes, None)))
@@ -128,6 +168,17 @@ class Engine:
         weights = jnp.asarray(weights)
         return self._lanes(lambda x, who: self._gradient(x, who, self._world, weights), GRADIENT_LANES, x, who)
 
+    def _picked(self, who: Members, member: np.ndarray) -> Members:
+        """These members, on the device; the last few choices are kept, for a search asks for the same again."""
+        key = (id(who.member), member.tobytes())
+        if key not in self._kept:
+            while len(self._kept) >= KEPT:
+                self._kept.pop(next(iter(self._kept)), None)
+            picked = jax.tree.map(lambda a: jnp.asarray(a[member]), who._replace(tape=None))
+            tape = None if who.tape is None else jnp.asarray(who.tape[..., member])
+            self._kept[key] = (who, picked._replace(tape=tape))
+        return self._kept[key][1]
+
     def _lanes(self, call: Callable[..., Any], width: int, x: np.ndarray, who: Members) -> Any:
         starts, count = len(x), len(who.member)
         lane = np.arange(starts * count)
@@ -135,12 +186,8 @@ class Engine:
 
         def one(lanes: np.ndarray) -> Any:
             start, member = np.divmod(lanes, count)
-            chosen = Members(
-                jnp.asarray(who.member[member]),
-                jnp.full(width, who.seed),  # pyright: ignore[reportArgumentType]
-                {path: jnp.asarray(v[member]) for path, v in who.values.items()},  # pyright: ignore
-            )
-            return jax.tree.map(np.asarray, call(jnp.asarray(x[start], jnp.result_type(float)), chosen))
+            at = jnp.asarray(x[start], jnp.result_type(float))
+            return jax.tree.map(np.asarray, call(at, self._picked(who, member)))
 
         parts = [one(padded[0])]  # alone: the first call compiles
         if self.threads > 1 and len(padded) > 2:
