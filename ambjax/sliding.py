@@ -37,6 +37,7 @@ def slide(loop: Any, hold: Measurement, t_0: Array, t_1: Array, h: Scalar, state
     moved = control._replace(
         observer=_axpy(control.observer, h, rates_0.observer), position=_axpy(control.position, h, rates_0.position)
     )
+    ahead, moved, force_0 = jax.lax.optimization_barrier((ahead, moved, force_0))
     force_1, seen_1, rates_1 = cascade.demand(t_1, _add(ahead, hold), moved, scenario.reference)
 
     w = force_0.v_star - model.v(force_0.z, i_ref)
@@ -44,6 +45,8 @@ def slide(loop: Any, hold: Measurement, t_0: Array, t_1: Array, h: Scalar, state
     sliding, slaved, tau = relax(w, drift, law.gamma, law.p, h)
     sliding = sliding / floored_gradient(model, force_0.z, i_ref)
     slaved = slaved / floored_gradient(model, force_1.z, i_ref)
+
+    sliding, slaved, tau, force_1 = jax.lax.optimization_barrier((sliding, slaved, tau, force_1))
 
     def current(plant: Measurement, seen: Measurement, i_ref: Array, rate: Array, inner: Any, t: Scalar, h: Array):
         """i - i_ref and the current law's state after h at constant i_ref' = rate."""
@@ -59,10 +62,12 @@ def slide(loop: Any, hold: Measurement, t_0: Array, t_1: Array, h: Scalar, state
         return e, _axpy(inner, h, inner_rate)
 
     e, inner = current(state.plant, seen_0, i_ref, sliding, control.current, t_0, tau)
+    e, inner = jax.lax.optimization_barrier((e, inner))
     middle = Measurement((z + ahead.z) / 2, (z_dot + ahead.z_dot) / 2, i_ref + tau * sliding + e)
     seen = jax.tree.map(lambda a, b: (a + b) / 2, seen_0, seen_1)
     i_ref = i_ref + tau * sliding
     e, inner = current(middle, seen, i_ref, slaved, inner, t_1, h - tau)
+    e, inner = jax.lax.optimization_barrier((e, inner))
     i_ref = i_ref + (h - tau) * slaved
 
     z_ddot_1 = scenario.plant.z_ddot(ahead.z, i_ref + e, scenario.acceleration(t_1))
@@ -103,8 +108,8 @@ def _implicit(b: Array, reach: Array, p: Scalar) -> Array:
 
 def _phi(x: Array) -> Array:
     """(exp(x) - 1) / x."""
-    small = jnp.abs(x) < 1e-4
-    return jnp.where(small, 1 + x / 2, jnp.expm1(x) / jnp.where(small, 1.0, x))
+    small = jnp.abs(x) < 1e-3
+    return jnp.where(small, 1 + x / 2 + x * x / 6, (jnp.exp(x) - 1) / jnp.where(small, 1.0, x))
 
 
 def _add(x: Measurement, y: Measurement) -> Measurement:
