@@ -5,20 +5,21 @@ ValueError whose one line names the dotted path, the value, what is allowed and 
 """
 
 import dataclasses
-import difflib
 import math
 import pathlib
 import tomllib
 from typing import Any
 
 from ambjax import signals
-from ambjax._pytree import numbers, validate
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.cascade import Cascade
+from ambjax.ensemble.spread import Spread, corners
 from ambjax.integrate import RK4, Adaptive, Euler, Integrator, Rodas3
 from ambjax.method import with_method
 from ambjax.plant import Plant
 from ambjax.scenario import Clock, Initial, Scenario, Sensor
+from ambjax.spreadfile import spread_from
+from ambjax.tomltable import Table, show
 
 # The laws by stage and kind; the first of a stage is the default. A new law is one row here.
 KINDS: dict[str, dict[str, type]] = {
@@ -34,9 +35,11 @@ SIGNALS: dict[str, type] = {
     "sine": signals.Sine,
     "smoothstep": signals.SmoothStep,
     "chirp": signals.Chirp,
+    "band-noise": signals.BandNoise,
     "sum": signals.Sum,
 }
 METHODS: dict[str, type] = {"rk4": RK4, "euler": Euler, "rodas3": Rodas3}
+TABLES = ["plant", "controller", "reference", "disturbance", "sensor", "actuator", "initial", "clock", "run", "spread"]
 UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
 # Rows that a run may record: 16 numbers each, so this is about 2.5 GB.
 MOST_SAMPLES = 20_000_000
@@ -44,88 +47,14 @@ MOST_SAMPLES = 20_000_000
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """What a case file says. `settle` in s; `method` as chosen or asked for is in the clock."""
+    """What a case file says. `settle` in s; `method` as chosen or asked for, for every spread, is in the clock."""
 
     name: str
     cascade: Cascade
     scenario: Scenario
     clock: Clock
     settle: float
-
-
-class Table:
-    """One TOML table being read: every key must be taken, and each complaint knows its dotted path."""
-
-    def __init__(self, raw: Any, path: str = ""):
-        if not isinstance(raw, dict):
-            raise ValueError(f"{path} = {show(raw)}: it must be a table. Write [{path}] and its keys below it.")
-        self.raw, self.path = raw, path
-
-    def at(self, key: str) -> str:
-        """Dotted path of a key."""
-        return f"{self.path}.{key}" if self.path else key
-
-    def only(self, allowed: list[str]) -> None:
-        """Refuse keys that mean nothing here, with a guess at what was meant."""
-        for key in self.raw:
-            if key not in allowed:
-                close = difflib.get_close_matches(key, allowed, n=1)
-                hint = f" Did you mean '{close[0]}'?" if close else ""
-                names = ", ".join(allowed) if allowed else "none"
-                raise ValueError(
-                    f"{self.at(key)} = {show(self.raw[key])}: unknown key.{hint} Keys allowed here: {names}."
-                )
-
-    def table(self, key: str) -> "Table":
-        """A table within this one; empty if left out."""
-        return Table(self.raw.get(key, {}), self.at(key))
-
-    def number(self, key: str, default: Any, allowed: str = "a number") -> Any:
-        """A number, or the default if left out."""
-        value = self.raw.get(key, default)
-        if value is default:
-            return default
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise ValueError(f"{self.at(key)} = {show(value)}: it must be {allowed}, without quotes.")
-        return float(value)
-
-    def choice(self, key: str, allowed: list[str], default: str | None = None) -> str:
-        """One of several words."""
-        value = self.raw.get(key, default)
-        if value is None:
-            raise ValueError(f"{self.at(key)} is missing: it must be one of {quoted(allowed)}.")
-        if value not in allowed:
-            close = difflib.get_close_matches(str(value), allowed, n=1)
-            hint = f" Did you mean '{close[0]}'?" if close else ""
-            raise ValueError(f"{self.at(key)} = {show(value)}: it must be one of {quoted(allowed)}.{hint}")
-        return value
-
-    def record(self, kind: type, extra: tuple[str, ...] = (), base: Any = None) -> Any:
-        """A record whose leaves are this table's keys, defaults from `base` or from the record itself."""
-        fields = dataclasses.fields(kind)
-        self.only([*extra, *(f.name for f in fields)])
-        values: dict[str, Any] = {}
-        for field in fields:
-            inherited = field.default if base is None else getattr(base, field.name)
-            if field.name not in self.raw and inherited is dataclasses.MISSING:
-                raise ValueError(f"{self.at(field.name)} is missing: give {numbers(field)}; {field.metadata['doc']}.")
-            values[field.name] = self.number(field.name, inherited, numbers(field))
-        made = kind(**values)
-        validate(made, self.path)
-        return made
-
-
-def show(value: Any) -> str:
-    """A value as it would stand in the file, cut if it is long."""
-    text = f'"{value}"' if isinstance(value, str) else str(value)
-    text = text.lower() if isinstance(value, bool) else text
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def quoted(words: list[str]) -> str:
-    """'a', 'b' or 'c'."""
-    names = [f"'{w}'" for w in words]
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
+    spread: Spread = Spread()
 
 
 def read_case(path: str | pathlib.Path) -> Case:
@@ -151,7 +80,7 @@ def read_case(path: str | pathlib.Path) -> Case:
 def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     """A case from a parsed TOML document. Raises ValueError as `read_case` does."""
     top = Table(raw)
-    top.only(["plant", "controller", "reference", "disturbance", "sensor", "actuator", "initial", "clock", "run"])
+    top.only(TABLES)
     plant = top.table("plant").record(Plant)
     cascade = _cascade(top.table("controller"), plant)
     scenario, settle = _scenario(top, plant)
@@ -161,7 +90,9 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
         settle = duration / 4
     elif settle >= duration:
         raise ValueError(f"run.settle = {settle:g} s: it must be less than clock.duration = {duration:g} s.")
-    return Case(name, cascade, scenario, with_method(clock, cascade, scenario), settle)
+    spread = spread_from(top, cascade, scenario)
+    clock = with_method(clock, *corners(spread, cascade, scenario))
+    return Case(name, cascade, scenario, clock, settle, spread)
 
 
 def _cascade(table: Table, plant: Plant) -> Cascade:
@@ -183,12 +114,7 @@ def _signal(table: Table, extra: tuple[str, ...] = ()) -> Any:
         if not isinstance(terms, list) or not terms:
             raise ValueError(f"{table.at('terms')} = {show(terms)}: give a list of at least one signal table.")
         return signals.Sum(tuple(_signal(Table(t, f"{table.at('terms')}[{n}]")) for n, t in enumerate(terms)))
-    made = table.record(SIGNALS[kind], extra=("kind", *extra))
-    if isinstance(made, signals.Pulse) and not made.stop > made.start:
-        raise ValueError(
-            f"{table.at('stop')} = {made.stop:g} s: the pulse must end after it starts; start = {made.start:g} s."
-        )
-    return made
+    return table.record(SIGNALS[kind], extra=("kind", *extra))
 
 
 def _disturbances(table: Table) -> dict[str, Any]:

@@ -20,6 +20,14 @@ from ambjax.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 DIVERGENCE = 1e6
 
 
+class Inputs(NamedTuple):
+    """What reaches the loop from outside at one instant: reference, disturbances (m/s^2, A/s)."""
+
+    reference: Reference
+    q_z: Array
+    q_i: Array
+
+
 class LoopState(NamedTuple):
     """State of the plant (z, z_dot, i), then of the cascade. The order matters to `_linear.factor`."""
 
@@ -57,23 +65,28 @@ class ClosedLoop:
         scale = LoopState(Measurement(moved, 10 * moved, plant.i_0 / 25), self.cascade.scale())
         return jax.tree.map(jnp.asarray, scale)
 
-    def command(self, t: Scalar, state: LoopState, hold: Measurement) -> tuple[Command, CascadeState, Array]:
+    def inputs(self, t: Scalar) -> Inputs:
+        """Everything that depends on time alone."""
+        scenario = self.scenario
+        return Inputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t))
+
+    def command(self, inputs: Inputs, state: LoopState, hold: Measurement) -> tuple[Command, CascadeState, Array]:
         """What the cascade decides from the measured state, the rates of its states, and the applied voltage."""
         u_max = jnp.asarray(self.scenario.u_max)
         seen = add(state.plant, hold)
-        command, rates = self.cascade(t, seen, state.control, self.scenario.reference, u_max)
+        command, rates = self.cascade(seen, state.control, inputs.reference, u_max)
         return command, rates, jnp.clip(command.u, -u_max, u_max)
 
-    def rates(self, t: Scalar, state: LoopState, hold: Measurement) -> LoopState:
+    def rates(self, inputs: Inputs, state: LoopState, hold: Measurement) -> LoopState:
         """Time derivative of the state: Eqs. (1), (2) and the laws."""
-        _, control, u = self.command(t, state, hold)
-        return self.moved(t, state, control, u)
+        _, control, u = self.command(inputs, state, hold)
+        return self.moved(inputs, state, control, u)
 
-    def moved(self, t: Scalar, state: LoopState, control: CascadeState, u: Array) -> LoopState:
+    def moved(self, inputs: Inputs, state: LoopState, control: CascadeState, u: Array) -> LoopState:
         """Time derivative of the state, given that of the cascade and the applied voltage."""
         plant, (z, z_dot, i) = self.scenario.plant, state.plant
-        z_ddot = plant.z_ddot(z, i, self.scenario.acceleration(t))
-        return LoopState(Measurement(z_dot, z_ddot, plant.i_dot(z, z_dot, i, u, self.scenario.q_i(t))), control)
+        z_ddot = plant.z_ddot(z, i, inputs.q_z)
+        return LoopState(Measurement(z_dot, z_ddot, plant.i_dot(z, z_dot, i, u, inputs.q_i)), control)
 
     def fate(self, state: LoopState) -> Array:
         """0 while the rotor is levitated, else the code of what became of it."""
@@ -91,13 +104,13 @@ class ClosedLoop:
     def problem(self, hold: Measurement) -> Problem:
         """What an integrator is given for one sample."""
         step = functools.partial(slide, self, hold) if slides(self.cascade) else None
-        return Problem(lambda t, x: self.rates(t, x, hold), self.scale(), self.fate, step)
+        return Problem(self.inputs, lambda inputs, x: self.rates(inputs, x, hold), self.scale(), self.fate, step)
 
     def row(self, t: Scalar, state: LoopState, hold: Measurement, alive: Array) -> Row:
         """All signals at one instant. The drive of a lost rotor is off: u = 0."""
         plant, (z, z_dot, i) = self.scenario.plant, state.plant
-        command, _, u = self.command(t, state, hold)
-        motion, reference = state.plant, self.reference(t)
+        inputs = self.inputs(t)
+        command, _, u = self.command(inputs, state, hold)
         return Row(
             t=jnp.asarray(t),
             z=z,
@@ -108,10 +121,10 @@ class ClosedLoop:
             v=plant.v(z, i),
             v_star=command.v_star,
             v_tilde=command.v_tilde,
-            sigma=self.cascade.position.sigma(motion, reference),
-            r=reference.r,
-            q_z=self.scenario.acceleration(t),
-            q_i=self.scenario.q_i(t),
+            sigma=self.cascade.position.sigma(state.plant, inputs.reference),
+            r=inputs.reference.r,
+            q_z=inputs.q_z,
+            q_i=inputs.q_i,
             z_measured=z + hold.z,
             heat=jnp.where(alive, plant.copper_loss(i), 0.0),
             alive=alive,
@@ -120,10 +133,6 @@ class ClosedLoop:
     def singularity(self, row: Row) -> Array:
         """Positive while (z, i_ref) is on the good side of the singular curve C, 0 on it. Eq. (9)."""
         return self.scenario.plant.singularity(row.z, row.i_ref)
-
-    def reference(self, t: Scalar) -> Reference:
-        """r, r_dot, r_ddot at t."""
-        return reference_at(self.scenario.reference, t)
 
 
 def add(x: Measurement, y: Measurement) -> Measurement:

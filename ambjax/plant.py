@@ -58,23 +58,33 @@ class Plant:
         floor = GAP_FLOOR * self.s_0
         return jnp.maximum(self.s_0 - z, floor), jnp.maximum(self.s_0 + z, floor)
 
+    def gap_inverses(self, z: Scalar) -> tuple[Array, Array]:
+        """1 / upper gap and 1 / lower gap, in 1/m, by one division: divisions are what a step's time goes into."""
+        upper, lower = self.gaps(z)
+        both = 1 / (upper * lower)
+        return lower * both, upper * both
+
     def v(self, z: Scalar, i: Scalar) -> Array:
         """Scaled magnetic force, in A^2/m^2: ((i_0+i)/(s_0-z))^2 - ((i_0-i)/(s_0+z))^2. Eq. (3)."""
-        upper, lower = self.gaps(z)
-        return ((self.i_0 + i) / upper) ** 2 - ((self.i_0 - i) / lower) ** 2
+        return self.v_and_dv_di(z, i)[0]
 
     def dv_dz(self, z: Scalar, i: Scalar) -> Array:
         """Partial derivative of v in z, in A^2/m^3: 2 (i_0+i)^2/(s_0-z)^3 + 2 (i_0-i)^2/(s_0+z)^3."""
-        upper, lower = self.gaps(z)
-        return 2 * (self.i_0 + i) ** 2 / upper**3 + 2 * (self.i_0 - i) ** 2 / lower**3
+        upper, lower = self.gap_inverses(z)
+        return 2 * (self.i_0 + i) ** 2 * upper**3 + 2 * (self.i_0 - i) ** 2 * lower**3
 
     def dv_di(self, z: Scalar, i: Scalar) -> Array:
         """Partial derivative of v in i, in A/m^2: 2 (i_0+i)/(s_0-z)^2 + 2 (i_0-i)/(s_0+z)^2.
 
         It vanishes exactly on the singular curve C, Eq. (9).
         """
-        upper, lower = self.gaps(z)
-        return 2 * (self.i_0 + i) / upper**2 + 2 * (self.i_0 - i) / lower**2
+        return self.v_and_dv_di(z, i)[1]
+
+    def v_and_dv_di(self, z: Scalar, i: Scalar) -> tuple[Array, Array]:
+        """v and dv/di at once."""
+        upper, lower = self.gap_inverses(z)
+        above, below = (self.i_0 + i) * upper, (self.i_0 - i) * lower
+        return above**2 - below**2, 2 * (above * upper + below * lower)
 
     def current_for(self, z: Scalar, v: Scalar) -> Array:
         """The current whose scaled force at z is v, in A: the root of Eq. (3) continuous at i = 0.
@@ -96,8 +106,8 @@ class Plant:
 
     def i_dot(self, z: Scalar, z_dot: Scalar, i: Scalar, u: Scalar, q_i: Scalar = 0.0) -> Array:
         """Rate of the current deviation, in A/s: 2 z_dot i/(s_0+z) + 2 (s_0+z)(u - R i)/kappa + q_i. Eq. (2)."""
-        lower = self.gaps(z)[1]
-        return 2 * z_dot / lower * i + 2 * lower / self.kappa * (u - self.R * i) + q_i
+        lower, inverse = self.gaps(z)[1], self.gap_inverses(z)[1]
+        return 2 * z_dot * inverse * i + (2 / self.kappa) * lower * (u - self.R * i) + q_i
 
     def equilibrium(self, z: Scalar = 0.0) -> tuple[Array, Array]:
         """Current (A) and voltage (V) that hold the rotor still at z: z_ddot = i_dot = 0."""

@@ -17,8 +17,8 @@ from ambjax.control import current, inversion, position
 from ambjax.control.cascade import Cascade
 from ambjax.control.laws import Measurement
 from ambjax.integrate import Problem
-from ambjax.loop import ClosedLoop, LoopState, add
-from ambjax.signals import reference_at
+from ambjax.loop import ClosedLoop, Inputs, LoopState, add
+from ambjax.signals import Reference
 from ambjax.smooth import smooth_sign
 
 
@@ -88,18 +88,19 @@ class Monitored:
 
     def start(self) -> Witnessed:
         state = self.loop.start()
-        values = self.terms(jnp.zeros(()), state, self.hold(0)).values
+        values = self.terms(self.loop.inputs(0.0), state, self.hold(0)).values
         return Witnessed(state, values._replace(e=state.plant.i))
 
     def problem(self, hold: Measurement) -> Problem:
         plant, scale = self.loop.scenario.plant, self.loop.scale()
         sizes = Identities(scale.plant.z_dot, plant.dv_di(0.0, 0.0) * scale.plant.i / 100, scale.plant.i)
 
-        def rates(t: Array, state: Witnessed) -> Witnessed:
-            terms = self.terms(t, state.loop, hold)
+        def rates(inputs: Inputs, state: Witnessed) -> Witnessed:
+            terms = self.terms(inputs, state.loop, hold)
             return Witnessed(terms.moving, terms.rates._replace(e=terms.rates.e + terms.i_ref_dot))
 
-        return Problem(rates, Witnessed(scale, sizes), lambda state: self.loop.fate(state.loop))
+        fate = lambda state: self.loop.fate(state.loop)  # noqa: E731
+        return Problem(self.loop.inputs, rates, Witnessed(scale, sizes), fate)
 
     def rest(self, state: Witnessed, code: Array) -> Witnessed:
         return Witnessed(self.loop.rest(state.loop, code), state.witness)
@@ -107,17 +108,16 @@ class Monitored:
     def singularity(self, row: TheoremRow) -> Array:
         return self.loop.scenario.plant.singularity(row.z, row.i_ref)
 
-    def terms(self, t: Array, state: LoopState, hold: Measurement) -> Terms:
+    def terms(self, inputs: Inputs, state: LoopState, hold: Measurement) -> Terms:
         """The signals of the proof. For a law without the gain in question the robust term is left out."""
         cascade, scenario = self.loop.cascade, self.loop.scenario
         plant, (z, _, i) = scenario.plant, state.plant
-        t = jnp.asarray(t, jnp.result_type(float))
-        command, control, u = self.loop.command(t, state, hold)
-        moving = self.loop.moved(t, state, control, u)
+        command, control, u = self.loop.command(inputs, state, hold)
+        moving = self.loop.moved(inputs, state, control, u)
         v_tilde, e = command.v_tilde, i - command.i_ref
-        sigma = cascade.position.sigma(state.plant, reference_at(scenario.reference, t))
-        q_z, q_i = scenario.acceleration(t), scenario.q_i(t)
-        d = self._drift(t, state, hold, command.i_ref, moving)
+        sigma = cascade.position.sigma(state.plant, inputs.reference)
+        q_z, q_i = inputs.q_z, inputs.q_i
+        d = self._drift(inputs, state, hold, command.i_ref, moving)
         h = plant.a * (plant.v(z, i) - v_tilde - plant.v(z, command.i_ref))
         robust = Identities(_robust_z(cascade, sigma), _robust_v(cascade, v_tilde), _robust_i(cascade, e))
         rates = Identities(robust.sigma + q_z + h, robust.v_tilde + d, robust.e + q_i)
@@ -127,24 +127,25 @@ class Monitored:
         bound = 2 * jnp.abs(sigma) * (plant.a * (L_v * jnp.abs(e) + jnp.abs(v_tilde)) - room)
         return Terms(moving, Identities(sigma, v_tilde, e), rates, command.i_ref_dot, q_z, q_i, d, h, bound)
 
-    def _drift(self, t: Array, state: LoopState, hold: Measurement, i_ref: Array, moving: LoopState) -> Array:
+    def _drift(self, inputs: Inputs, state: LoopState, hold: Measurement, i_ref: Array, moving: LoopState) -> Array:
         """d = v_star' - (dv/dz) z' along the true flow, i_ref held: the left side of Eq. (7), by one jvp."""
-        cascade, scenario = self.loop.cascade, self.loop.scenario
+        cascade, reference = self.loop.cascade, inputs.reference
 
-        def demanded(s: Array, x: LoopState) -> Array:
-            force, _, _ = cascade.demand(s, add(x.plant, hold), x.control, scenario.reference)
+        def demanded(reference: Reference, x: LoopState) -> Array:
+            force, _, _ = cascade.demand(add(x.plant, hold), x.control, reference)
             return force.v_star - cascade.model.v(force.z, i_ref)
 
-        return jax.jvp(demanded, (t, state), (jnp.ones_like(t), moving))[1]
+        return jax.jvp(demanded, (reference, state), (reference.rate(), moving))[1]
 
     def row(self, t: Array, state: Witnessed, hold: Measurement, alive: Array) -> TheoremRow:
-        terms = self.terms(t, state.loop, hold)
+        inputs = self.loop.inputs(t)
+        terms = self.terms(inputs, state.loop, hold)
         i_ref = state.loop.plant.i - terms.values.e
         values = terms.values._replace(e=state.loop.plant.i)
         off = Identities(*(a - b for a, b in zip(values, state.witness, strict=True)))
         z = state.loop.plant.z
         # V' = 2 sigma sigma', with sigma' from the plant's own acceleration, not from the identity.
-        sigma_dot = self._sigma_dot(t, state.loop, terms.moving)
+        sigma_dot = self._sigma_dot(inputs.reference, state.loop, terms.moving)
         return TheoremRow(
             t=t,
             z=z,
@@ -161,14 +162,9 @@ class Monitored:
             V_margin=terms.bound - 2 * terms.values.sigma * sigma_dot,
         )
 
-    def _sigma_dot(self, t: Array, state: LoopState, moving: LoopState) -> Array:
-        position_law, reference = self.loop.cascade.position, self.loop.scenario.reference
-
-        def sigma(s: Array, x: LoopState) -> Array:
-            return position_law.sigma(x.plant, reference_at(reference, s))
-
-        t = jnp.asarray(t, jnp.result_type(float))
-        return jax.jvp(sigma, (t, state), (jnp.ones_like(t), moving))[1]
+    def _sigma_dot(self, reference: Reference, state: LoopState, moving: LoopState) -> Array:
+        sigma = lambda r, x: self.loop.cascade.position.sigma(x.plant, r)  # noqa: E731
+        return jax.jvp(sigma, (reference, state), (reference.rate(), moving))[1]
 
 
 def _robust_z(cascade: Cascade, sigma: Array) -> Array:

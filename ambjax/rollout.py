@@ -145,14 +145,13 @@ def _sample(system: System, clock: Clock, fold: Fold | None, progress: Progress,
         # A jump at this instant belongs to this sample even if t was rounded to just before it.
         row = system.row(t * (1 + 4 * jnp.finfo(dtype).eps), state, hold, alive)._replace(t=t)
         folded = folded if fold is None else fold.update(folded, row)
-        span = jnp.where(alive, clock.sample_period, 0.0)
-        after = clock.method.advance(system.problem(hold), t, span, state, memory)
+        after = clock.method.advance(system.problem(hold), t, clock.sample_period, state, memory, ending.lost_code)
         lost_now = alive & (after.code != ALIVE)
         resting = system.rest(after.state, after.code)
         state = jax.tree.map(lambda a, b: jnp.where(lost_now, a, b), resting, after.state)
         crossed = alive & (system.singularity(row) <= 0)
         ending = Ending(
-            jnp.where(alive, after.code, ending.lost_code),
+            after.code,
             jnp.where(lost_now, after.t, ending.lost_at),
             first_time(crossed, t, ending.singular_at),
             ending.duration,

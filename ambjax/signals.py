@@ -177,15 +177,20 @@ def realised(signal: Any, key: Array) -> Any:
 
 
 class Reference(NamedTuple):
-    """A reference and its first two time derivatives: m, m/s, m/s^2."""
+    """A reference and its first three time derivatives: m, m/s, m/s^2, m/s^3."""
 
     r: Array
     r_dot: Array
     r_ddot: Array
+    r_dddot: Scalar = 0.0
+
+    def rate(self) -> "Reference":
+        """Its time derivative, as far as it is known: what a law's output changes by if only time passes."""
+        return Reference(self.r_dot, self.r_ddot, self.r_dddot, jnp.zeros_like(self.r))
 
 
 def reference_at(signal: Signal, t: Scalar) -> Reference:
-    """r, r_dot and r_ddot of one definition, by nested forward differentiation.
+    """r and its derivatives of one definition, by nested forward differentiation.
 
     A jump contributes nothing to a derivative.
     """
@@ -194,5 +199,9 @@ def reference_at(signal: Signal, t: Scalar) -> Reference:
     def first(s: Array) -> tuple[Array, Array]:
         return jax.jvp(signal, (s,), (jnp.ones_like(s),))
 
-    (r, r_dot), (_, r_ddot) = jax.jvp(first, (t,), (jnp.ones_like(t),))
-    return Reference(r, r_dot, r_ddot)
+    def second(s: Array) -> tuple[Array, Array, Array]:
+        (r, r_dot), (_, r_ddot) = jax.jvp(first, (s,), (jnp.ones_like(s),))
+        return r, r_dot, r_ddot
+
+    known, rates = jax.jvp(second, (t,), (jnp.ones_like(t),))
+    return Reference(*known, rates[2])

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax._pytree import Scalar
-from ambjax.control.inversion import Adaptive, floored_gradient
+from ambjax.control.inversion import Adaptive, v_and_gradient
 from ambjax.control.laws import CurrentDemand, CurrentInputs, Measurement
 from ambjax.smooth import TWO_OVER_PI, smooth_sign
 
@@ -25,52 +25,53 @@ from ambjax.smooth import TWO_OVER_PI, smooth_sign
 NEWTON = 4
 
 
-def slide(loop: Any, hold: Measurement, t_0: Array, t_1: Array, h: Scalar, state: Any) -> Any:
-    """The state of a ClosedLoop whose inversion law is `inversion.Adaptive` after a step from t_0 to t_1 = t_0 + h."""
+def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: Any) -> Any:
+    """The state of a ClosedLoop whose inversion law is `inversion.Adaptive` after h; `begin`, `end`: its inputs."""
     cascade, scenario = loop.cascade, loop.scenario
     model, law, (z, z_dot, i), control = cascade.model, cascade.inversion, state.plant, state.control
     i_ref = control.inversion
 
-    force_0, seen_0, rates_0 = cascade.demand(t_0, _add(state.plant, hold), control, scenario.reference)
-    z_ddot_0 = scenario.plant.z_ddot(z, i, scenario.acceleration(t_0))
+    force_0, seen_0, rates_0 = cascade.demand(_add(state.plant, hold), control, begin.reference)
+    z_ddot_0 = scenario.plant.z_ddot(z, i, begin.q_z)
     ahead = Measurement(z + h * z_dot + h * h / 2 * z_ddot_0, z_dot + h * z_ddot_0, i)
     moved = control._replace(
         observer=_axpy(control.observer, h, rates_0.observer), position=_axpy(control.position, h, rates_0.position)
     )
     ahead, moved, force_0 = jax.lax.optimization_barrier((ahead, moved, force_0))
-    force_1, seen_1, rates_1 = cascade.demand(t_1, _add(ahead, hold), moved, scenario.reference)
+    force_1, seen_1, rates_1 = cascade.demand(_add(ahead, hold), moved, end.reference)
 
-    w = force_0.v_star - model.v(force_0.z, i_ref)
-    drift = (force_1.v_star - model.v(force_1.z, i_ref) - w) / jnp.where(h > 0, h, 1.0)
+    v_0, gradient_0 = v_and_gradient(model, force_0.z, i_ref)
+    v_1, gradient_1 = v_and_gradient(model, force_1.z, i_ref)
+    w = force_0.v_star - v_0
+    drift = (force_1.v_star - v_1 - w) / jnp.where(h > 0, h, 1.0)
     sliding, slaved, tau = relax(w, drift, law.gamma, law.p, h)
-    sliding = sliding / floored_gradient(model, force_0.z, i_ref)
-    slaved = slaved / floored_gradient(model, force_1.z, i_ref)
+    sliding, slaved = sliding / gradient_0, slaved / gradient_1
 
     sliding, slaved, tau, force_1 = jax.lax.optimization_barrier((sliding, slaved, tau, force_1))
 
-    def current(plant: Measurement, seen: Measurement, i_ref: Array, rate: Array, inner: Any, t: Scalar, h: Array):
+    def current(plant: Measurement, seen: Measurement, i_ref: Array, rate: Array, inner: Any, q_i: Array, h: Array):
         """i - i_ref and the current law's state after h at constant i_ref' = rate."""
 
         def rate_of(i: Array) -> tuple[Array, Any]:
             inputs = CurrentInputs(seen._replace(i=i + hold.i), CurrentDemand(i_ref, rate), scenario.u_max)
             u, inner_rate = cascade.current(model, inputs, inner)
             u = jnp.clip(u, -scenario.u_max, scenario.u_max)
-            return scenario.plant.i_dot(plant.z, plant.z_dot, i, u, scenario.q_i(t)), inner_rate
+            return scenario.plant.i_dot(plant.z, plant.z_dot, i, u, q_i), inner_rate
 
         i_dot, slope, inner_rate = jax.jvp(rate_of, (plant.i,), (jnp.ones_like(plant.i),), has_aux=True)
         e = plant.i - i_ref + h * _phi(h * slope) * (i_dot - rate)
         return e, _axpy(inner, h, inner_rate)
 
-    e, inner = current(state.plant, seen_0, i_ref, sliding, control.current, t_0, tau)
+    e, inner = current(state.plant, seen_0, i_ref, sliding, control.current, begin.q_i, tau)
     e, inner = jax.lax.optimization_barrier((e, inner))
     middle = Measurement((z + ahead.z) / 2, (z_dot + ahead.z_dot) / 2, i_ref + tau * sliding + e)
     seen = jax.tree.map(lambda a, b: (a + b) / 2, seen_0, seen_1)
     i_ref = i_ref + tau * sliding
-    e, inner = current(middle, seen, i_ref, slaved, inner, t_1, h - tau)
+    e, inner = current(middle, seen, i_ref, slaved, inner, end.q_i, h - tau)
     e, inner = jax.lax.optimization_barrier((e, inner))
     i_ref = i_ref + (h - tau) * slaved
 
-    z_ddot_1 = scenario.plant.z_ddot(ahead.z, i_ref + e, scenario.acceleration(t_1))
+    z_ddot_1 = scenario.plant.z_ddot(ahead.z, i_ref + e, end.q_z)
     plant = Measurement(
         z + h * z_dot + h * h / 6 * (2 * z_ddot_0 + z_ddot_1), z_dot + h / 2 * (z_ddot_0 + z_ddot_1), i_ref + e
     )

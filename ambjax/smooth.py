@@ -1,5 +1,8 @@
 """Smooth stand-ins for functions whose derivative jumps or blows up."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -28,34 +31,63 @@ ARCTAN_Q = (
 )
 
 
+# arctan x = x R(x^2) on |x| <= 1, to 1.5e-8 relative: a weighted least-squares fit, for float32.
+ARCTAN_R = (
+    0.9999999847653734,
+    -0.33333073339931396,
+    0.19992619283325946,
+    -0.14203643594913185,
+    0.10640930585893088,
+    -0.07504287175107752,
+    0.04269143198666149,
+    -0.016068575113646982,
+    0.0028498761308979135,
+)
+
+
+def _polynomial(u: Array, coefficients: Sequence[Scalar]) -> Any:
+    total = coefficients[-1]
+    for coefficient in coefficients[-2::-1]:
+        total = total * u + coefficient
+    return total
+
+
 @jax.custom_jvp
-def arctan(x: Array) -> Array:
-    """arctan by one rational function, which vectorises; XLA's own is a scalar library call on CPUs."""
+def arctan_per(x: Array, per: Array) -> Array:
+    """arctan(x) / per with one division, which vectorises; XLA's own arctan is a scalar library call on CPUs.
+
+    For |x| > 1 it is pi/2 - arctan(1/|x|). In float64 numerator and denominator are multiplied by a power
+    of x there, which reverses their coefficients: division is what costs most in a step of the loop.
+    """
     size = jnp.abs(x)
     large = size > 1
-    y = jnp.where(large, 1 / jnp.where(large, size, 1.0), size)
-    u = y * y
-    p, q = ARCTAN_P[-1], ARCTAN_Q[-1]
-    for coefficient in ARCTAN_P[-2::-1]:
-        p = p * u + coefficient
-    for coefficient in ARCTAN_Q[-2::-1]:
-        q = q * u + coefficient
-    angle = y * (p / q)
-    return jnp.where(x < 0, -1.0, 1.0) * jnp.where(large, HALF_PI - angle, angle)
+    if x.dtype == jnp.float64:
+        size = jnp.minimum(size, 1e20)  # its 12th power must not overflow
+        u = size * size
+        top = [jnp.where(large, far, near) for near, far in zip(ARCTAN_P, reversed(ARCTAN_P), strict=True)]
+        below = [jnp.where(large, far, near) for near, far in zip(ARCTAN_Q, reversed(ARCTAN_Q), strict=True)]
+        angle, over = size * _polynomial(u, top), _polynomial(u, below)
+        angle = jnp.where(large, HALF_PI * over - angle, angle)
+        return jnp.where(x < 0, -angle, angle) / (over * per)
+    y = jnp.minimum(size, 1.0) / jnp.maximum(size, 1.0)
+    angle = y * _polynomial(y * y, ARCTAN_R)
+    angle = jnp.where(large, HALF_PI - angle, angle)
+    return jnp.where(x < 0, -angle, angle) / per
 
 
-@arctan.defjvp
-def _arctan_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    (x,), (dx,) = primals, tangents
-    return arctan(x), dx / (1 + x * x)
+@arctan_per.defjvp
+def _arctan_per_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    (x, per), (dx, d_per) = primals, tangents
+    value = arctan_per(x, per)
+    return value, (dx / (1 + x * x) - value * d_per) / per
 
 
-def smooth_sign(x: Scalar, p: Scalar) -> Array:
-    """sgn(x) as 2/pi arctan(p x); slope 2p/pi at zero. Remark 3 of the paper.
+def smooth_sign(x: Scalar, p: Scalar, per: Scalar = 1.0) -> Array:
+    """sgn(x) as 2/pi arctan(p x), divided by `per`; slope 2p/pi at zero. Remark 3 of the paper.
 
     `p` has the inverse unit of `x`.
     """
-    return TWO_OVER_PI * arctan(p * jnp.asarray(x))
+    return TWO_OVER_PI * arctan_per(p * jnp.asarray(x), jnp.asarray(per))
 
 
 def smooth_root(x: Scalar, p: Scalar) -> Array:

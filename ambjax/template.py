@@ -4,7 +4,8 @@ import dataclasses
 import math
 from typing import Any
 
-from ambjax.casefile import KINDS
+from ambjax.casefile import KINDS, SIGNALS
+from ambjax.ensemble.design import DESIGNS
 from ambjax.paper import PULSE, REFERENCE, TABLE_2
 from ambjax.plant import Plant
 
@@ -27,7 +28,7 @@ dt = "auto"                   # s, or "auto": method and step from the loop's sl
 # method = "rk4"              # with a number for dt: "rk4", "euler" or "rodas3" (L-stable)
 
 [run]
-seed = 0                      # of the sensor noise
+seed = 0                      # of whatever is random
 settle = 0.5                  # s; from when "settled" metrics count (left out: a quarter of the duration)
 # clearance = 4.5e-3          # m; |z| at which the rotor touches down (left out: 0.9 s_0)
 
@@ -38,6 +39,15 @@ settle = 0.5                  # s; from when "settled" metrics count (left out: 
 
 # [actuator]
 # u_max = 200.0               # V; limit of the supply (left out: none)
+
+# [spread]                    # what varies over an ensemble, by dotted path; 'ambjax simulate' leaves it out
+# design = "random"           # or {designs}
+# plant.m = {{ percent = 10 }}  # uniform, +-10 % of the value above; the controller's model keeps that value
+# plant.k_z = {{ percent = 10, shape = "normal" }}         # standard deviation 10 %; normal shapes end at 6 of them
+# initial.z = {{ normal = 1e-4 }}                          # standard deviation, in m
+# disturbance.q_z.amplitude = {{ log-uniform = [0.1, 2.0] }}
+# disturbance.q_z.shift = {{ uniform = [-0.1, 0.1] }}      # s; start and stop of the pulse together
+# actuator.u_max = {{ choices = [200, 500, 1000] }}        # V; equally likely
 """
 
 
@@ -74,7 +84,7 @@ def template(scenario: str) -> str:
         kind, law = next(iter(kinds.items()))
         others = ", ".join(f'"{k}"' for k in list(kinds)[1:])
         lines += ["", f"[controller.{stage}]", _noted(f'kind = "{kind}"', f"or {others}"), *_lines(law, law())]
-    lines += ["", _noted("[reference]", "in m: constant, step, pulse, sine, smoothstep, chirp or sum; left out: 0")]
+    lines += ["", _noted("[reference]", f"in m: {', '.join(SIGNALS)}; left out: 0")]
     if tracking:
         lines += ['kind = "sine"', *_lines(type(REFERENCE), REFERENCE)]
     else:
@@ -82,4 +92,5 @@ def template(scenario: str) -> str:
     lines += ["", "[disturbance.q_z]             # likewise [disturbance.q_i], in A/s; left out: none"]
     lines += ['kind = "pulse"', _noted('unit = "A^2/m^2"', 'scaled force; or "m/s^2", the default')]
     lines += _lines(type(PULSE), PULSE)
-    return "\n".join(lines) + "\n" + REST.format(paper_std=TABLE_2.noise_std)
+    designs = " or ".join(f'"{d}"' for d in list(DESIGNS)[1:])
+    return "\n".join(lines) + "\n" + REST.format(paper_std=TABLE_2.noise_std, designs=designs)

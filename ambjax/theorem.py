@@ -96,11 +96,11 @@ def delta_1_on_reference(cascade: Cascade, scenario: Scenario, clock: Clock) -> 
     model, reference = cascade.model, scenario.realised().reference
 
     def demanded(t: Array) -> Array:
-        r, _, r_ddot = reference_at(reference, t)
+        r, _, r_ddot, _ = reference_at(reference, t)
         return (-2 * model.k_z / model.m * r + r_ddot + model.g) / model.a
 
     def drift(t: Array) -> Array:
-        r, r_dot, _ = reference_at(reference, t)
+        r, r_dot, *_ = reference_at(reference, t)
         v_star, v_star_dot = jax.jvp(demanded, (t,), (jnp.ones_like(t),))
         return jnp.abs(v_star_dot - model.dv_dz(r, model.current_for(r, v_star)) * r_dot)
 

@@ -170,6 +170,9 @@ def test_every_kind_can_be_written():
         "frequency": 1.0,
         "frequency_end": 2.0,
         "value": 0.0,
+        "std": 1e-3,
+        "f_low": 1.0,
+        "f_high": 2.0,
     }
     for kind, signal in SIGNALS.items():
         names = getattr(signal, "__dataclass_fields__")  # noqa: B009

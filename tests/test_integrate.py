@@ -22,7 +22,7 @@ TRACKING = amb.Scenario(reference=amb.Sine(2.5e-3, 2.0), q_v=amb.Pulse(1.0, 0.01
 
 
 def problem(rates, scale=1.0, fate=lambda state: jnp.zeros((), jnp.int32)):
-    return Problem(rates, scale, fate)
+    return Problem(lambda t: t, rates, scale, fate)
 
 
 @functools.partial(jax.jit, static_argnames=("rates",))

@@ -15,7 +15,7 @@ from ambjax import Adaptive, Cascade, Clock, Plant, Pulse, Scenario, Sine, rollo
 from ambjax._pytree import validate
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand, Measurement
-from ambjax.signals import Reference
+from ambjax.signals import Reference, reference_at
 from ambjax.smooth import smooth_sign
 
 # stage, law
@@ -293,13 +293,13 @@ def test_the_demand_s_rates_are_derivatives_along_the_nominal_flow(watch, law):
             position=() if not has_state(law) else x[7],
         )
         t = 0.1 + 30 * jnp.abs(x[4])
-        _, _, rates = cascade.demand(t, motion, state, reference)
+        _, _, rates = cascade.demand(motion, state, reference_at(reference, t))
         seen = motion.z if not has_state(watch) else x[3]
         moved = Measurement(x[0] + s * x[1], x[1] + s * MODEL.z_ddot(seen, x[2]), x[2])
         later = jax.tree.map(
             lambda a, b: a + s * b, state, state._replace(observer=rates.observer, position=rates.position)
         )
-        return cascade.demand(t + s, moved, later, reference)[0]
+        return cascade.demand(moved, later, reference_at(reference, t + s))[0]
 
     h = 1e-8
     for x in samples(50):

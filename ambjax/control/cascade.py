@@ -6,7 +6,6 @@ Its modularity is the paper's first contribution: any law of a stage may stand w
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 from jax import Array
 
 from ambjax._pytree import Scalar, record
@@ -22,7 +21,7 @@ from ambjax.control.laws import (
     State,
 )
 from ambjax.plant import Plant
-from ambjax.signals import Signal, reference_at
+from ambjax.signals import Reference
 
 
 class CascadeState(NamedTuple):
@@ -77,34 +76,32 @@ class Cascade:
         return self.observer, self.position, self.inversion, self.current
 
     def demand(
-        self, t: Scalar, measured: Measurement, state: CascadeState, reference: Signal
+        self, measured: Measurement, state: CascadeState, reference: Reference
     ) -> tuple[ForceDemand, Measurement, CascadeState]:
         """The force wanted, the estimate it is wanted for, and the rates of observer and position law.
 
-        The rates of z and v_star are derivatives along (z_dot, nominal z_ddot, law states, t): what a
-        law that inverts statically needs for i_ref'. Unused, they are never computed.
+        The rates of z and v_star are derivatives along (reference, z_dot, nominal z_ddot, law states): what
+        a law that inverts statically needs for i_ref'. Unused, they are never computed.
         """
-        t = jnp.asarray(t, jnp.result_type(float))
 
-        def wanted(s: Array, z: Array, z_dot: Array, observed: State, positioned: State):
+        def wanted(reference: Reference, z: Array, z_dot: Array, observed: State, positioned: State):
             estimate, observed_rate = self.observer(self.model, Measurement(z, z_dot, measured.i), observed)
-            inputs = (estimate, reference_at(reference, s))
-            v_star, positioned_rate = self.position(self.model, inputs, positioned)
+            v_star, positioned_rate = self.position(self.model, (estimate, reference), positioned)
             return (estimate.z, v_star), (estimate, observed_rate, positioned_rate)
 
-        point = (t, measured.z, measured.z_dot, state.observer, state.position)
+        point = (reference, measured.z, measured.z_dot, state.observer, state.position)
         (z, v_star), (estimate, observed_rate, positioned_rate) = wanted(*point)
         z_ddot = self.model.z_ddot(estimate.z, estimate.i)
-        along = (jnp.ones_like(t), measured.z_dot, z_ddot, observed_rate, positioned_rate)
+        along = (reference.rate(), measured.z_dot, z_ddot, observed_rate, positioned_rate)
         z_rate, v_star_rate = jax.jvp(lambda *x: wanted(*x)[0], point, along)[1]
         rates = CascadeState(observed_rate, positioned_rate, (), ())
         return ForceDemand(z, z_rate, v_star, v_star_rate), estimate, rates
 
     def __call__(
-        self, t: Scalar, measured: Measurement, state: CascadeState, reference: Signal, u_max: Scalar
+        self, measured: Measurement, state: CascadeState, reference: Reference, u_max: Scalar
     ) -> tuple[Command, CascadeState]:
-        """Command and rate of every law's state at time t. `u_max` is the supply's limit in V (inf: none)."""
-        force, estimate, rates = self.demand(t, measured, state, reference)
+        """Command and rate of every law's state. `u_max` is the supply's limit in V (inf: none)."""
+        force, estimate, rates = self.demand(measured, state, reference)
         wanted, inversion_rate = self.inversion(self.model, force, state.inversion)
         u, current_rate = self.current(self.model, CurrentInputs(estimate, wanted, u_max), state.current)
         v_tilde = force.v_star - self.model.v(force.z, wanted.i_ref)

@@ -27,10 +27,10 @@ class SlidingMode:
 
     def __call__(self, model: Plant, inputs: CurrentInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
         measured, demand = inputs.measured, inputs.demand
-        lower = model.gaps(measured.z)[1]
+        inverse = model.gap_inverses(measured.z)[1]
         robust = -self.k_i * smooth_sign(measured.i - demand.i_ref, self.p)
-        wanted = -2 * measured.z_dot / lower * measured.i + demand.i_ref_dot + robust
-        return model.kappa / (2 * lower) * wanted + model.R * measured.i, ()
+        wanted = -2 * measured.z_dot * inverse * measured.i + demand.i_ref_dot + robust
+        return (model.kappa / 2) * inverse * wanted + model.R * measured.i, ()
 
 
 @record

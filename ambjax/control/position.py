@@ -18,7 +18,7 @@ def sliding_variable(c: Scalar, motion: Measurement, reference: Reference) -> Ar
 def force_for(c: Scalar, model: Plant, motion: Measurement, reference: Reference, robust: Scalar) -> Array:
     """Scaled force that makes sigma_dot = `robust` (m/s^2) on the nominal plant, undisturbed. Eqs. (4), (5)."""
     wanted = -2 * model.k_z / model.m * motion.z - c * (motion.z_dot - reference.r_dot)
-    return (wanted + reference.r_ddot + model.g + robust) / model.a
+    return (wanted + reference.r_ddot + model.g + robust) * (1 / model.a)
 
 
 @record

@@ -2,5 +2,20 @@
 
 from ambjax.ensemble.distributions import Choice, LogUniform, Normal, Percent, Uniform
 from ambjax.ensemble.spread import Spread, apply, draw
+from ambjax.ensemble.statistics import cvar, quantile, spearman, summary, wilson
 
-__all__ = ["Choice", "LogUniform", "Normal", "Percent", "Spread", "Uniform", "apply", "draw"]
+__all__ = [
+    "Choice",
+    "LogUniform",
+    "Normal",
+    "Percent",
+    "Spread",
+    "Uniform",
+    "apply",
+    "cvar",
+    "draw",
+    "quantile",
+    "spearman",
+    "summary",
+    "wilson",
+]

@@ -1,7 +1,7 @@
 """Distributions: how one number is spread.
 
-Each is a record with `quantile(u, nominal)`, its inverse cumulative distribution, so that every design of points u in the
-unit cube works with every distribution; and `support(nominal)`, the interval that it never leaves. Normal shapes are
+Each is a record with `quantile(u, nominal)`, its inverse cumulative distribution, so that every design of points u in
+the unit cube works with each; and `support(nominal)`, the interval that it never leaves. Normal shapes are
 cut at 6 standard deviations, beyond which lie 2 in 1e9: so they have bounds too.
 """
 

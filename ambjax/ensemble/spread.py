@@ -94,19 +94,24 @@ def check(spread: Spread, cascade: Cascade, scenario: Scenario) -> dict[str, Pla
     return known
 
 
-def require_path(path: str, known: Iterable[str]) -> None:
-    """Raise ValueError for a path that is not among the known ones, with those that are close to it."""
+def require_path(path: str, known: Iterable[str], value: str = "") -> None:
+    """Raise ValueError for a path that is not among the known ones, naming those that are near it.
+
+    `value` is what it was to be, for the message.
+    """
     known = list(known)
     if path in known:
         return
     close = difflib.get_close_matches(path, known, n=1)
     hint = f" Did you mean '{close[0]}'?" if close else ""
-    parts = path.split(".")
-    stems = [".".join(parts[:n]) for n in range(len(parts) - 1, 0, -1)]
-    siblings = next((some for stem in stems if (some := [p for p in known if p.startswith(stem + ".")])), known)
-    absent = " This case has no [sensor]; add it, with std = 0.0 for example." if parts[0] == "sensor" else ""
-    names = ", ".join(siblings)
-    raise ValueError(f"spread.{path}: there is no such number in this case.{hint}{absent} Numbers there are: {names}.")
+    if path.split(".")[0] == "sensor":
+        hint = " This case has no sensor noise; add the table [sensor], with std = 0.0 for example."
+    stems = [path.rsplit(".", n)[0] for n in range(path.count(".") + 1)]
+    near = next((some for stem in stems if (some := [p for p in known if p.startswith(stem + ".")])), known)
+    if len(near) > 12:
+        near = dict.fromkeys(p.rpartition(".")[0] + ".*" for p in near)
+    what = f"spread.{path} = {value}" if value else f"spread.{path}"
+    raise ValueError(f"{what}: there is no such number in this case.{hint} There are: {', '.join(near)}.")
 
 
 def _check_one(path: str, kind: Distribution, place: Place) -> None:

@@ -1,0 +1,92 @@
+"""One table of a TOML document being read strictly: what every reader of case files is built on."""
+
+import dataclasses
+import difflib
+from typing import Any
+
+from ambjax._pytree import numbers, validate
+
+
+class Table:
+    """One TOML table being read: every key must be taken, and each complaint knows its dotted path."""
+
+    def __init__(self, raw: Any, path: str = ""):
+        if not isinstance(raw, dict):
+            raise ValueError(f"{path} = {show(raw)}: it must be a table. Write [{path}] and its keys below it.")
+        self.raw, self.path = raw, path
+
+    def at(self, key: str) -> str:
+        """Dotted path of a key."""
+        return f"{self.path}.{key}" if self.path else key
+
+    def only(self, allowed: list[str]) -> None:
+        """Refuse keys that mean nothing here, with a guess at what was meant."""
+        for key in self.raw:
+            if key not in allowed:
+                close = difflib.get_close_matches(key, allowed, n=1)
+                hint = f" Did you mean '{close[0]}'?" if close else ""
+                names = ", ".join(allowed) if allowed else "none"
+                raise ValueError(
+                    f"{self.at(key)} = {show(self.raw[key])}: unknown key.{hint} Keys allowed here: {names}."
+                )
+
+    def table(self, key: str) -> "Table":
+        """A table within this one; empty if left out."""
+        return Table(self.raw.get(key, {}), self.at(key))
+
+    def number(self, key: str, default: Any, allowed: str = "a number") -> Any:
+        """A number, or the default if left out."""
+        value = self.raw.get(key, default)
+        if value is default:
+            return default
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ValueError(f"{self.at(key)} = {show(value)}: it must be {allowed}, without quotes.")
+        return float(value)
+
+    def choice(self, key: str, allowed: list[str], default: str | None = None) -> str:
+        """One of several words."""
+        value = self.raw.get(key, default)
+        if value is None:
+            raise ValueError(f"{self.at(key)} is missing: it must be one of {quoted(allowed)}.")
+        if value not in allowed:
+            close = difflib.get_close_matches(str(value), allowed, n=1)
+            hint = f" Did you mean '{close[0]}'?" if close else ""
+            raise ValueError(f"{self.at(key)} = {show(value)}: it must be one of {quoted(allowed)}.{hint}")
+        return value
+
+    def record(self, kind: type, extra: tuple[str, ...] = (), base: Any = None) -> Any:
+        """A record whose leaves are this table's keys, defaults from `base` or from the record itself."""
+        fields = [field for field in dataclasses.fields(kind) if field.metadata.get("leaf")]
+        self.only([*extra, *(f.name for f in fields)])
+        values: dict[str, Any] = {}
+        for field in fields:
+            inherited = field.default if base is None else getattr(base, field.name)
+            if field.name not in self.raw and inherited is dataclasses.MISSING:
+                raise ValueError(f"{self.at(field.name)} is missing: give {numbers(field)}; {field.metadata['doc']}.")
+            values[field.name] = self.number(field.name, inherited, numbers(field))
+        made = kind(**values)
+        validate(made, self.path)
+        self._check_order(made)
+        return made
+
+    def _check_order(self, made: Any) -> None:
+        """Refuse a pulse that ends before it starts, and its like."""
+        if pair := getattr(made, "ordered", None):
+            low, high = (getattr(made, name) for name in pair)
+            if not low < high:
+                raise ValueError(f"{self.at(pair[1])} = {high:g}: it must be more than {pair[0]} = {low:g}.")
+
+
+def show(value: Any) -> str:
+    """A value as it would stand in the file, cut if it is long."""
+    text = f'"{value}"' if isinstance(value, str) else str(value)
+    text = text.lower() if isinstance(value, bool) else text
+    if isinstance(value, dict) and value:
+        text = f"{{ {', '.join(f'{k} = {show(x)}' for k, x in value.items())} }}"
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def quoted(words: list[str]) -> str:
+    """'a', 'b' or 'c'."""
+    names = [f"'{w}'" for w in words]
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
