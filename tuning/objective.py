@@ -46,6 +46,11 @@ class Members(NamedTuple):
     values: dict[str, Any]
     tape: Any
 
+    def first(self, count: int) -> "Members":
+        """The first `count` of them."""
+        head = jax.tree.map(lambda a: a[:count], self._replace(tape=None))
+        return head._replace(tape=None if self.tape is None else self.tape[..., :count])
+
 
 @record
 class Tape:
