@@ -14,11 +14,12 @@ class Parser(argparse.ArgumentParser):
     """An argument parser whose complaints are one line, and exit with 2."""
 
     def error(self, message: str) -> NoReturn:
-        sys.exit(_complain(f"{message}. See '{self.prog} --help'."))
+        sys.exit(complain(f"{message}. See '{self.prog} --help'.", self.prog.split()[0]))
 
 
-def _complain(message: str) -> int:
-    print(f"ambjax: {message}", file=sys.stderr)
+def complain(message: str, program: str = "ambjax") -> int:
+    """Say what is wrong with the input, on one line of stderr. Returns the exit code for that."""
+    print(f"{program}: {message}", file=sys.stderr)
     return 2
 
 
@@ -45,7 +46,7 @@ def parser() -> Parser:
     return top
 
 
-def _prepare_jax() -> None:
+def prepare_jax() -> None:
     """float64 unless JAX_ENABLE_X64 says otherwise, and compilations kept between runs."""
     import jax
     import platformdirs
@@ -65,13 +66,13 @@ def _prepare_jax() -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run a command. Returns its exit code: 0 done, 1 the answer is no, 2 bad input."""
     args = parser().parse_args(argv)
-    _prepare_jax()
+    prepare_jax()
     from ambjax import commands
 
     try:
         code, summary = getattr(commands, f"run_{args.command}")(args)
     except ValueError as error:
-        return _complain(str(error))
+        return complain(str(error))
     except KeyboardInterrupt:
         print("ambjax: interrupted", file=sys.stderr)
         return 130

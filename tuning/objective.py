@@ -113,8 +113,8 @@ class Objective:
 class Engine:
     """Compiled lanes of an objective. Threads share them; a call blocks until its answer is there."""
 
-    def __init__(self, objective: Objective, *, settle: float, mode: str = "forward", threads: int | None = None):
-        self.objective, self.mode, self.settle = objective, mode, settle
+    def __init__(self, objective: Objective, *, settle: float, mode: str = "forward", threads: int | None = None, lanes: int = LANES):
+        self.objective, self.mode, self.settle, self.lanes = objective, mode, settle, lanes
         self.threads = threads or os.cpu_count() or 1
         self.rollouts = 0
         self._kept: dict[Any, Any] = {}
@@ -150,28 +150,35 @@ class Engine:
 
         axes: Any = (0, Members(0, 0, 0, -1), None)  # pyright: ignore[reportArgumentType]
         self._terms = one_kernel(jax.vmap(terms, axes))
-        self._standard = lambda x, who, world: measured_lanes(x, who, world, standard)
         measured_lanes = one_kernel(jax.vmap(measured, (*axes, None)))
+        self._standard = lambda x, who, world: measured_lanes(x, who, world, standard)
         if mode == "forward":
-            self._gradient = one_kernel(jax.vmap(forward, (*axes, None)))
+            self._gradient = one_kernel(jax.vmap(forward, (*axes, 0)))
         else:  # the fast path does not compile reverse mode
-            self._gradient = jax.jit(jax.vmap(reverse, (*axes, None)))
+            self._gradient = jax.jit(jax.vmap(reverse, (*axes, 0)))
 
     def terms(self, x: np.ndarray, who: Members) -> dict[str, np.ndarray]:
         """Terms of the loss by name, [S, N], of gain vectors x [S, m] and members [N]."""
         self.rollouts += len(x) * len(who.member)
-        return self._lanes(lambda x, who: self._terms(x, who, self._world), LANES, x, who)
+        return self._lanes(lambda x, who: self._terms(x, who, self._world), self.lanes, x, who)
 
     def metrics(self, x: np.ndarray, who: Members) -> dict[str, Any]:
         """{"loss": terms, "metrics": metrics.json names}, all [S, N]."""
         self.rollouts += len(x) * len(who.member)
-        return self._lanes(lambda x, who: self._standard(x, who, self._world), LANES, x, who)
+        return self._lanes(lambda x, who: self._standard(x, who, self._world), self.lanes, x, who)
 
     def gradient(self, x: np.ndarray, who: Members, weights: Any) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-        """Weighted losses [S, N], their derivatives [S, N, m] and the terms [S, N]."""
+        """Weighted losses [S, N], their derivatives [S, N, m] and the terms [S, N].
+
+        `weights`: of the terms, in the order of TERMS, for all starts or for each: [6] or [S, 6].
+        """
         self.rollouts += len(x) * len(who.member) * (len(self.objective.space) + 1)
-        weights = jnp.asarray(weights)
-        return self._lanes(lambda x, who: self._gradient(x, who, self._world, weights), GRADIENT_LANES, x, who)
+        # the weights travel with the coordinates, each lane with its own
+        each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS)))
+        both, m = np.concatenate([x, each], axis=1), x.shape[1]
+        return self._lanes(
+            lambda both, who: self._gradient(both[:, :m], who, self._world, both[:, m:]), GRADIENT_LANES, both, who
+        )
 
     def _picked(self, who: Members, member: np.ndarray) -> Members:
         """These members, on the device; the last few choices are kept, for a search asks for the same again."""

@@ -15,8 +15,8 @@ import numpy as np
 from jax import Array
 
 from tuning.conditions import Bound, shortfall
-from tuning.objective import Engine, Members
 from tuning.loss import TERMS
+from tuning.objective import Engine, Members
 from tuning.optimisers import optimiser
 from tuning.risk import Risk
 from tuning.screen import screen
@@ -187,11 +187,13 @@ def search(
     return kept
 
 
-def iterate(engine: Engine, goal: Goal, who: Members, kept: Search, step: Callable[..., Starts]) -> None:
-    """One iteration of all active starts, written into `kept`."""
+def iterate(
+    engine: Engine, goal: Goal, who: Members, kept: Search, step: Callable[..., Starts], weights: Any = None
+) -> None:
+    """One iteration of all active starts, written into `kept`. `weights` [S, 6]: each start its own goal, none halved."""
     starts, active = kept.starts, np.flatnonzero(kept.active)
     trial = np.asarray(starts.trial)
-    losses, slopes, terms = engine.gradient(trial[active], who, goal.weights)
+    losses, slopes, terms = engine.gradient(trial[active], who, goal.weights if weights is None else weights[active])
     full = np.full((len(trial), *losses.shape[1:]), np.nan), np.full((len(trial), *slopes.shape[1:]), np.nan)
     for whole, part in zip(full, (losses, slopes), strict=True):
         whole[active] = part
@@ -207,14 +209,14 @@ def iterate(engine: Engine, goal: Goal, who: Members, kept: Search, step: Callab
     for key, value in row.items():
         kept.history.setdefault(key, []).append(value)
     kept.starts, kept.iteration = starts, kept.iteration + 1
-    kept.active = _going_on(kept)
+    kept.active = _going_on(kept, halving=weights is None)
 
 
-def _going_on(kept: Search) -> np.ndarray:
+def _going_on(kept: Search, halving: bool) -> np.ndarray:
     """Which starts go on: not those whose steps have become tiny or whose loss stalls, nor the worse half in time."""
     value, length = np.asarray(kept.starts.value), np.asarray(kept.starts.length)
     active = kept.active & (length > SHORTEST)
-    if kept.iteration in HALVINGS:
+    if halving and kept.iteration in HALVINGS:
         order = np.argsort(np.where(active, value, np.inf), kind="stable")
         worse = order[max((int(active.sum()) + 1) // 2, 1) :]
         active[worse] = False
