@@ -17,39 +17,30 @@ from tuning.config import read_study, seeds, settings
 from tuning.loss import TERMS
 from tuning.objective import Members
 from tuning.optimise import Keeper, Search, best_of, search
-from tuning.study import Study, judge, step_error, study_of, summarise
+from tuning.study import RESOLVED, Study, judge, step_error, study_of, summarise
 from tuning.toml import dumps, with_gains
 
-CHECKPOINT = "checkpoint.npz"
+CHECKPOINT = "checkpoint"
+# A search whose steps were too coarse is continued in steps of half the length, twice at most.
+MOST_ROUNDS = 3
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """ambjax-tune. Raises ValueError for bad input, before anything is written."""
     case, tune, raw = read_study(args.case)
-    if args.resume and not (args.out and (pathlib.Path(args.out) / CHECKPOINT).exists()):
-        raise ValueError(f"--resume: there is no {CHECKPOINT} in --out {args.out}. Leave out --resume to begin.")
+    if args.resume and not (args.out and (pathlib.Path(args.out) / f"{CHECKPOINT}-1.npz").exists()):
+        raise ValueError(f"--resume: there is no {CHECKPOINT}-1.npz in --out {args.out}. Leave out --resume to begin.")
     study = study_of(case, tune)
     start = tune.space.values(case.cascade)
     tune.space.encode(start)
     out = directory(args.out, f"tune-{case.name}")
-    keeper = Keeper(out / CHECKPOINT, [raw, settings(tune)])
     seed, held_out = seeds(tune.budget)
     who = study.objective.members(seed, tune.budget.members)
     say(f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {study.objective.clock.method}")
     began = time.perf_counter()
-    kept = search(
-        study.engine, study.goal, who, start, count=tune.budget.screen, keep=tune.budget.starts,
-        iterations=tune.budget.iterations, seed=seed, name=tune.optimiser, rate=tune.learning_rate,
-        keeper=keeper, resume=args.resume, tell=_teller(study),
-    )  # fmt: skip
+    study, kept, x, error = _resolved_search(study, who, start, out, [raw, settings(tune)], args.resume)
     seconds = time.perf_counter() - began
-    x, value = best_of(kept)
-    if not np.isfinite(value):
-        raise ValueError(
-            "tune: the loss is not a finite number at any start that was tried. Look at the case with "
-            "'ambjax simulate', or widen tune.screen and tune.bounds."
-        )
-    facts = _facts(study, x, kept, who, seconds, held_out)
+    facts = _facts(study, x, kept, who, seconds, held_out, error)
     if args.gradients:
         say("gradient report ...")
         facts["gradient"] = gradient.report(study, x, who)
@@ -67,6 +58,38 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     return int(not good), summary
 
 
+def _resolved_search(
+    study: Study, who: Members, start: np.ndarray, out: pathlib.Path, told: Any, resume: bool
+) -> tuple[Study, Search, np.ndarray, dict[str, float] | None]:
+    """The search, again in finer steps where its own do not resolve the optimum that it found."""
+    tune, begin_at, error = study.tune, None, None
+    for round in range(1, MOST_ROUNDS + 1):
+        path = out / f"{CHECKPOINT}-{round}.npz"
+        kept = search(
+            study.engine, study.goal, who, start, begin_at=begin_at, count=tune.budget.screen,
+            keep=tune.budget.starts, iterations=tune.budget.iterations, seed=tune.budget.seed, name=tune.optimiser,
+            rate=tune.learning_rate, keeper=Keeper(path, [told, round]), resume=resume and path.exists(),
+            tell=_teller(study),
+        )  # fmt: skip
+        x, value = best_of(kept)
+        if not np.isfinite(value):
+            raise ValueError(
+                "tune: the loss is not a finite number at any start that was tried. Look at the case with "
+                "'ambjax simulate', or change tune.screen and tune.bounds."
+            )
+        if int(kept.history["lost"][-1][int(np.argmin(kept.history["value"][-1]))]) == len(who.member):
+            break  # nothing to hold a step against
+        error = step_error(study, x)
+        say(f"step of the search against adaptive RODAS3: settled rms error off by {100 * error['relative']:.2g} %")
+        if abs(error["relative"]) <= RESOLVED or round == MOST_ROUNDS or kept.interrupted:
+            break
+        begin_at, rollouts = np.asarray(kept.starts.best), study.engine.rollouts
+        study = study_of(study.case, tune, finer=2**round)
+        study.engine.rollouts = rollouts
+        say(f"too coarse there; the search goes on with {study.objective.clock.method}")
+    return study, kept, x, error
+
+
 def _teller(study: Study) -> Any:
     """What is said after each iteration."""
     scale = float(np.asarray(study.objective.loss.s_0))
@@ -76,7 +99,8 @@ def _teller(study: Study) -> Any:
         spent.append(seconds)
         x, value = best_of(kept)
         gains = np.asarray(study.objective.space.gains_at(jnp.asarray(x)))
-        terms, lost = kept.history["terms"][-1], int(kept.history["lost"][-1][0])
+        best = int(np.argmin(kept.history["value"][-1]))
+        terms, lost = kept.history["terms"][-1][best], int(kept.history["lost"][-1][best])
         left = (budget.iterations - kept.iteration) * float(np.median(spent)) * kept.active.sum() / len(kept.active)
         named = ", ".join(f"{g.name} {v:.4g}" for g, v in zip(study.objective.space.gains, gains, strict=True))
         say(
@@ -89,7 +113,7 @@ def _teller(study: Study) -> Any:
 
 
 def _facts(
-    study: Study, x: np.ndarray, kept: Search, who: Members, seconds: float, held_out: int
+    study: Study, x: np.ndarray, kept: Search, who: Members, seconds: float, held_out: int, error: Any
 ) -> dict[str, Any]:
     case, tune, space = study.case, study.tune, study.objective.space
     rollouts = study.engine.rollouts
@@ -110,7 +134,7 @@ def _facts(
         "held_out_seed": held_out,
         "lost_in_training": lost,
         "conditions": report.conditions(line),
-        "step_error": step_error(study, x) if lost < tune.budget.members else None,
+        "step_error": error,
         "search": settings(tune) | {"iterations": kept.iteration, "rollouts": rollouts, "seconds": seconds},
     }
     facts["gains"] = report.gains_table(space, before, after, None)

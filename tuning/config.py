@@ -182,5 +182,3 @@ def settings(tune: Tune) -> dict[str, Any]:
 def seeds(budget: Budget) -> tuple[int, int]:
     """Seeds of the training and of the held-out ensemble."""
     return budget.seed, int(np.uint32(budget.seed + 1_000_001))
-
-

@@ -35,7 +35,12 @@ def three_ways(study: Study, x: np.ndarray) -> dict[str, Any]:
     values = sum(w * v.mean(axis=1) for w, v in zip(weights, terms.values(), strict=True))
     up, down, half_up, half_down = np.reshape(values, (4, len(x)))
     differences = (4 * (half_up - half_down) / STEP - (up - down) / (2 * STEP)) / 3
-    return {"forward": by_forward, "reverse": by_reverse, "differences": differences, "samples": objective.clock.samples}
+    return {
+        "forward": by_forward,
+        "reverse": by_reverse,
+        "differences": differences,
+        "samples": objective.clock.samples,
+    }
 
 
 def against_horizon(study: Study, x: np.ndarray, who: Members) -> list[dict[str, float]]:

@@ -113,7 +113,15 @@ class Objective:
 class Engine:
     """Compiled lanes of an objective. Threads share them; a call blocks until its answer is there."""
 
-    def __init__(self, objective: Objective, *, settle: float, mode: str = "forward", threads: int | None = None, lanes: int = LANES):
+    def __init__(
+        self,
+        objective: Objective,
+        *,
+        settle: float,
+        mode: str = "forward",
+        threads: int | None = None,
+        lanes: int = LANES,
+    ):
         self.objective, self.mode, self.settle, self.lanes = objective, mode, settle, lanes
         self.threads = threads or os.cpu_count() or 1
         self.rollouts = 0

@@ -48,6 +48,7 @@ class Search:
     active: np.ndarray
     iteration: int
     history: dict[str, list[Any]]
+    interrupted: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +72,9 @@ class Goal:
     def score(self, space: Any, x: np.ndarray, terms: dict[str, np.ndarray]) -> np.ndarray:
         """The goal [S] from terms [S, N]; +inf where it is not a number."""
         losses = sum(w * terms[name] for w, name in zip(self.weights, TERMS, strict=True))
-        values = np.array([self.of(jnp.asarray(one), self.penalty(space, jnp.asarray(at))) for one, at in zip(losses, x)])
+        values = np.array(
+            [self.of(jnp.asarray(one), self.penalty(space, jnp.asarray(at))) for one, at in zip(losses, x)]
+        )
         return np.where(np.isfinite(values), values, np.inf)
 
 
@@ -127,7 +130,7 @@ class Keeper:
         np.savez(partial, **leaves, **past, **state)  # pyright: ignore[reportArgumentType]
         os.replace(partial, self.path)  # noqa: PTH105
 
-    def load(self, begin: Callable[..., Starts], shape: tuple[int, int]) -> Search | None:
+    def load(self, begin: Callable[..., Starts], m: int) -> Search | None:
         """The search so far, or None. Raises ValueError if it belongs to another study."""
         if self.path is None or not self.path.exists():
             return None
@@ -137,7 +140,7 @@ class Keeper:
                     f"--resume: {self.path} belongs to a search with another case or other settings. "
                     "Use another --out, or leave out --resume to begin anew."
                 )
-            tree = jax.tree.structure(jax.eval_shape(begin, jnp.zeros(shape)))
+            tree = jax.tree.structure(jax.eval_shape(begin, jnp.zeros((1, m))))
             count = sum(name.startswith("leaf_") for name in kept.files)
             starts = jax.tree.unflatten(tree, [jnp.asarray(kept[f"leaf_{n}"]) for n in range(count)])
             history = {n.removeprefix("history_"): list(kept[n]) for n in kept.files if n.startswith("history_")}
@@ -150,8 +153,9 @@ def search(
     who: Members,
     start: np.ndarray,
     *,
-    count: int,
-    keep: int,
+    begin_at: np.ndarray | None = None,
+    count: int = 0,
+    keep: int = 1,
     iterations: int,
     seed: int,
     name: str = "bfgs",
@@ -162,15 +166,18 @@ def search(
 ) -> Search:
     """Screen `count` points from the gains `start` [m], refine the best `keep` of them. Ctrl-C ends it early.
 
+    `begin_at`: coordinates [S, m] to refine instead of a screen's.
     `tell` is called after each iteration with the search and the seconds that it took.
     """
     space = engine.objective.space
     begin, step = stepper(engine, goal, name, rate)
     keeper = keeper or Keeper(None, None)
-    kept = keeper.load(begin, (keep if count else 1, len(space))) if resume else None
-    if kept is None:
-        first = space.encode(space.clip(start))[None]
-        if count:
+    kept = keeper.load(begin, len(space)) if resume else None
+    if kept is not None:
+        engine.rollouts = int(kept.history["rollouts"][-1])
+    else:
+        first = space.encode(space.clip(start))[None] if begin_at is None else begin_at
+        if count and begin_at is None:
             first = screen(
                 engine, who, start, goal.conditions, count=count, keep=keep, seed=seed,
                 score=lambda x, terms: goal.score(space, x, terms),
@@ -183,7 +190,7 @@ def search(
             keeper.save(kept)
             tell(kept, time.perf_counter() - began)
     except KeyboardInterrupt:
-        pass
+        kept.interrupted = True
     return kept
 
 
@@ -197,14 +204,22 @@ def iterate(
     full = np.full((len(trial), *losses.shape[1:]), np.nan), np.full((len(trial), *slopes.shape[1:]), np.nan)
     for whole, part in zip(full, (losses, slopes), strict=True):
         whole[active] = part
+    before = np.asarray(starts.value)
     starts = step(starts, *full, kept.active)
-    best = active[np.argmin(np.asarray(starts.value)[active])]
+    value = np.asarray(starts.value)
+    past = kept.history
+    lost = np.array(past["lost"][-1]) if past else np.full(len(trial), len(who.member))
+    means = np.array(past["terms"][-1]) if past else np.full((len(trial), len(TERMS)), np.nan)
+    for row, at in enumerate(active):  # what is told of a start is told of its best point
+        if value[at] < before[at]:
+            lost[at] = int((terms["survival"][row] > 0).sum())
+            means[at] = [terms[name][row].mean() for name in TERMS]
     row = {
-        "value": np.asarray(starts.value),
+        "value": value,
         "gains": np.asarray(jax.vmap(engine.objective.space.gains_at)(starts.best)),
-        "lost": np.array([int((terms["survival"][list(active).index(best)] > 0).sum())]),
-        "terms": np.array([terms[name][list(active).index(best)].mean() for name in TERMS]),
-        "rollouts": np.array([engine.rollouts]),
+        "lost": lost,
+        "terms": means,
+        "rollouts": np.array(engine.rollouts),
     }
     for key, value in row.items():
         kept.history.setdefault(key, []).append(value)

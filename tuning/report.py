@@ -52,7 +52,9 @@ def markdown(facts: Facts) -> str:
     lines += ["| gain | before | after | at a bound | off by e^0.25: risk grows by |", "|---|---|---|---|---|"]
     for row in facts["gains"]:
         grows = "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
-        lines.append(f"| {row['path']} | {row['before']:.6g} | {row['after']:.6g} | {row['at_bound'] or '-'} | {grows} |")
+        lines.append(
+            f"| {row['path']} | {row['before']:.6g} | {row['after']:.6g} | {row['at_bound'] or '-'} | {grows} |"
+        )
     lines += ["", "A large number in the last column: set this gain with care. A small one: it hardly matters.", ""]
     lines += _held_out(facts)
     lines += ["## Terms of the loss, held-out mean", "", "| term | weight | before | after |", "|---|---|---|---|"]
@@ -67,7 +69,12 @@ def markdown(facts: Facts) -> str:
         lines.append(f"| {row['requires']} | {gain} | {row['against']:.5g} | {margin} | {verdict} |")
     lines += ["", "## How the search went", "", *_how(facts), ""]
     if facts.get("pareto"):
-        lines += ["## Error against voltage", "", "On the training ensemble; u is read at the start of each sample.", ""]
+        lines += [
+            "## Error against voltage",
+            "",
+            "On the training ensemble; u is read at the start of each sample.",
+            "",
+        ]
         lines += ["| settled rms error (m) | settled rms u (V) | lost | gains |", "|---|---|---|---|"]
         for row in facts["pareto"]:
             gains = ", ".join(f"{path.rpartition('.')[2]} {value:.4g}" for path, value in row["gains"].items())

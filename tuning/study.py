@@ -19,7 +19,9 @@ from tuning.optimise import Goal
 # Members simulated at a time when an ensemble is judged: their noise is kept in memory while they are.
 CHUNK = 64
 # Members and tolerance of the accurate reference against which the steps of the search are held.
-REFERENCE_MEMBERS, REFERENCE_TOLERANCE = 4, 1e-6
+REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 2000
+# Beyond this relative error of the settled rms error the steps are refined and the search goes on.
+RESOLVED = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,9 +42,9 @@ def method_for(case: Case, substeps: int) -> Integrator:
     return choose_method(case.cascade, case.scenario, float(case.clock.sample_period), reverse=True)
 
 
-def study_of(case: Case, tune: Tune, *, threads: int | None = None) -> Study:
-    """The study of a case."""
-    clock = Clock(case.clock.samples, case.clock.sample_period, method_for(case, tune.budget.substeps))
+def study_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = None) -> Study:
+    """The study of a case, in steps `finer` times as fine as [tune] asks for."""
+    clock = Clock(case.clock.samples, case.clock.sample_period, method_for(case, finer * tune.budget.substeps))
     loss = loss_for(case.scenario, case.settle, tune.early)
     objective = Objective(tune.space, case.cascade, case.scenario, clock, loss, case.spread)
     conditions = bounds(case.cascade, case.scenario, clock)
@@ -74,8 +76,9 @@ def step_error(study: Study, x: np.ndarray) -> dict[str, float]:
     """The search's own step against adaptive RODAS3 on a few training members: settled rms error of both, and off by."""
     seed, count = seeds(study.tune.budget)[0], study.tune.budget.members
     who = study.objective.chosen(seed, np.arange(min(REFERENCE_MEMBERS, count)), count)
-    clock = dataclasses.replace(study.objective.clock, method=Adaptive(REFERENCE_TOLERANCE))
-    reference = Engine(dataclasses.replace(study.objective, clock=clock), settle=study.case.settle, lanes=len(who.member))
+    clock = dataclasses.replace(study.objective.clock, method=Adaptive(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS))
+    objective = dataclasses.replace(study.objective, clock=clock)
+    reference = Engine(objective, settle=study.case.settle, lanes=len(who.member))
     name = "settled_rms_error_m"
     ours, theirs = (e.metrics(x[None], who)["metrics"][name][0] for e in (study.engine, reference))
     off = rms(ours) / rms(theirs) - 1
@@ -100,7 +103,7 @@ def summarise(study: Study, found: dict[str, np.ndarray]) -> dict[str, Any]:
         "settled_max_abs_error_m": float(found["settled_max_abs_error_m"].max()),
     }
     for name, values in found.items():
-        if name.startswith("loss.") or values.dtype == bool:
+        if values.dtype == bool:
             continue
         finite = values[np.isfinite(values)]
         if finite.size:
