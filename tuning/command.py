@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     tune.space.encode(start)
     out = directory(args.out, f"tune-{case.name}")
     seed, held_out = seeds(tune.budget)
-    who = study.objective.members(seed, tune.budget.members)
+    who = study.objective.training(seed, tune.budget.members, tune.stress, tune.budget.stressed)
     say(f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {study.objective.clock.method}")
     began = time.perf_counter()
     study, kept, x, error = _resolved_search(study, who, start, out, [raw, settings(tune)], args.resume)
@@ -69,7 +69,7 @@ def _resolved_search(
             study.engine, study.goal, who, start, begin_at=begin_at, count=tune.budget.screen,
             keep=tune.budget.starts, iterations=tune.budget.iterations, seed=tune.budget.seed, name=tune.optimiser,
             rate=tune.learning_rate, keeper=Keeper(path, [told, round]), resume=resume and path.exists(),
-            tell=_teller(study),
+            tell=_teller(study, len(who.member)),
         )  # fmt: skip
         x, value = best_of(kept)
         if not np.isfinite(value):
@@ -90,7 +90,7 @@ def _resolved_search(
     return study, kept, x, error
 
 
-def _teller(study: Study) -> Any:
+def _teller(study: Study, count: int) -> Any:
     """What is said after each iteration."""
     scale = float(np.asarray(study.objective.loss.s_0))
     budget, spent = study.tune.budget, []
@@ -105,8 +105,8 @@ def _teller(study: Study) -> Any:
         named = ", ".join(f"{g.name} {v:.4g}" for g, v in zip(study.objective.space.gains, gains, strict=True))
         say(
             f"{kept.iteration:3d}/{budget.iterations}  loss {np.exp(value):.3e}  "
-            f"rms error {scale * np.sqrt(terms[TERMS.index('tracking')]):.2e} m  kept {budget.members - lost}"
-            f"/{budget.members}  {named}  ({kept.active.sum()} starts, at most {left:.0f} s left)"
+            f"rms error {scale * np.sqrt(terms[TERMS.index('tracking')]):.2e} m  kept {count - lost}"
+            f"/{count}  {named}  ({kept.active.sum()} starts, at most {left:.0f} s left)"
         )
 
     return tell

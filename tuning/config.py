@@ -25,6 +25,8 @@ class Budget:
 
     members: int = 32
     """members of the ensemble that is tuned on"""
+    stressed: int = 8
+    """further members whose noise is `stress` times as loud, and of whom nothing is asked but to be held"""
     held_out: int = 1000
     """members of the ensemble that judges, of another seed"""
     seed: int = 1
@@ -48,6 +50,7 @@ class Tune:
     conditions: float
     margin: float
     early: float
+    stress: float
     risk: Risk
     optimiser: str
     learning_rate: float
@@ -67,7 +70,7 @@ def read_study(path: str | pathlib.Path) -> tuple[Case, Tune, dict[str, Any]]:
 
 def tune_from(table: Table, case: Case) -> Tune:
     """[tune] of a case; whatever is left out has a default."""
-    numbers = ["conditions_margin", "early", "learning_rate"]
+    numbers = ["conditions_margin", "early", "stress", "learning_rate"]
     counts = [field.name for field in dataclasses.fields(Budget)]
     table.only([*WORDS, *numbers, *counts])
     budget = Budget(**{name: _whole(table, name, getattr(Budget, name)) for name in counts})
@@ -79,6 +82,7 @@ def tune_from(table: Table, case: Case) -> Tune:
         conditions=conditions,
         margin=_positive(table, "conditions_margin", 0.1, zero=True),
         early=_positive(table, "early", 0.0, zero=True),
+        stress=_positive(table, "stress", 1.2),
         risk=_risk(table),
         optimiser=optimiser,
         learning_rate=_positive(table, "learning_rate", 0.1),
@@ -161,7 +165,7 @@ def _positive(table: Table, key: str, default: float, zero: bool = False) -> flo
 
 
 def _whole(table: Table, key: str, default: int) -> int:
-    value, least = table.raw.get(key, default), 0 if key in ("screen", "seed", "held_out", "iterations") else 1
+    value, least = table.raw.get(key, default), 0 if key in ("screen", "seed", "held_out", "iterations", "stressed") else 1
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value < 2**31:
         raise ValueError(f"{table.at(key)} = {show(value)}: it must be a whole number of at least {least}.")
     return value
@@ -175,7 +179,7 @@ def settings(tune: Tune) -> dict[str, Any]:
         "weights": dict(zip(TERMS, tune.weights, strict=True)) | {"conditions": tune.conditions},
         "risk": str(tune.risk),
     }
-    rest = {name: getattr(tune, name) for name in ("margin", "early", "optimiser", "learning_rate")}
+    rest = {name: getattr(tune, name) for name in ("margin", "early", "stress", "optimiser", "learning_rate")}
     return told | rest | dataclasses.asdict(tune.budget)
 
 

@@ -29,6 +29,8 @@ from tuning.space import Space
 # Lanes of one kernel call. Values: one register of 8 after the other in L1; gradients carry m + 1 numbers per lane.
 LANES = 64
 GRADIENT_LANES = 32
+# Terms that say whether the rotor is held.
+HELD = ("clearance", "survival")
 # Choices of members kept on the device.
 KEPT = 16
 # Bytes of noise kept in memory; beyond, it is drawn anew in each rollout.
@@ -39,12 +41,14 @@ class Members(NamedTuple):
     """Members of an ensemble: their numbers [n], seed, what is spread over them by path [n], and their noise.
 
     `tape`: the errors of the sensors drawn beforehand, [samples, 3, n]; None: none, or too much to keep.
+    `stressed` [n]: members with louder noise, of whom nothing is asked but to be held.
     """
 
     member: Any
     seed: Any
     values: dict[str, Any]
     tape: Any
+    stressed: Any
 
     def first(self, count: int) -> "Members":
         """The first `count` of them."""
@@ -81,14 +85,24 @@ class Objective:
         """The first `count` members of the ensemble with this seed."""
         return self.chosen(seed, np.arange(count), count)
 
+    def training(self, seed: int, count: int, stress: float, extra: int) -> Members:
+        """`count` members, and `extra` more whose sensor noise is `stress` times as loud."""
+        if self.scenario.sensor is None or not extra:
+            return self.members(seed, count)
+        who = self.members(seed, count + extra)
+        if who.tape is None:
+            return self.members(seed, count)
+        stressed = who.member >= count
+        return who._replace(tape=who.tape * np.where(stressed, stress, 1.0), stressed=stressed)
+
     def chosen(self, seed: int, numbers: np.ndarray, total: int) -> Members:
         """Members with these numbers of an ensemble of `total`."""
         values = draw(self.spread, self.cascade, self.scenario, seed, numbers, total) if self.spread.entries else {}
-        who = Members(numbers, np.full(len(numbers), seed), values, None)
+        who = Members(numbers, np.full(len(numbers), seed), values, None, np.zeros(len(numbers), bool))
         samples = self.clock.samples
         if self.scenario.sensor is None or samples * len(numbers) * 24 > MOST_TAPE:
             return who
-        tape = jax.jit(jax.vmap(lambda who: self._tape(who), in_axes=(Members(0, 0, 0, None),), out_axes=-1))
+        tape = jax.jit(jax.vmap(lambda who: self._tape(who), in_axes=(Members(0, 0, 0, None, 0),), out_axes=-1))
         return who._replace(tape=np.asarray(tape(who)))
 
     def _tape(self, who: Members) -> Array:
@@ -108,6 +122,13 @@ class Objective:
         """The fold's result for one lane."""
         cascade, scenario = self.world(who)
         return rollout(self.space.decode(x, cascade), scenario, self.clock, fold=fold, every=0).measured
+
+
+def weigh(weights: Any, terms: dict[str, Any], stressed: Any) -> Any:
+    """The loss: weighted terms, for a stressed member those of HELD alone."""
+    ordinary = 1.0 - 1.0 * stressed
+    shares = [weights[k] * (1.0 if name in HELD else ordinary) for k, name in enumerate(TERMS)]
+    return sum(share * terms[name] for share, name in zip(shares, TERMS, strict=True))
 
 
 class Engine:
@@ -143,7 +164,7 @@ class Engine:
 
         def total(x: Array, who: Members, world: Any, weights: Array) -> tuple[Array, dict[str, Array]]:
             found = terms(x, who, world)
-            return sum(weights[k] * found[name] for k, name in enumerate(TERMS)), found  # pyright: ignore
+            return weigh(weights, found, who.stressed), found
 
         def forward(x: Array, who: Members, world: Any, weights: Array) -> Any:
             def along(direction: Array) -> Any:
@@ -156,7 +177,7 @@ class Engine:
             (value, found), slope = jax.value_and_grad(total, has_aux=True)(x, who, world, weights)
             return value, slope, found
 
-        axes: Any = (0, Members(0, 0, 0, -1), None)  # pyright: ignore[reportArgumentType]
+        axes: Any = (0, Members(0, 0, 0, -1, 0), None)  # pyright: ignore[reportArgumentType]
         self._terms = one_kernel(jax.vmap(terms, axes))
         measured_lanes = one_kernel(jax.vmap(measured, (*axes, None)))
         self._standard = lambda x, who, world: measured_lanes(x, who, world, standard)

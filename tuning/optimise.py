@@ -16,7 +16,7 @@ from jax import Array
 
 from tuning.conditions import Bound, shortfall
 from tuning.loss import TERMS
-from tuning.objective import Engine, Members
+from tuning.objective import Engine, Members, weigh
 from tuning.optimisers import optimiser
 from tuning.risk import Risk
 from tuning.screen import screen
@@ -24,7 +24,9 @@ from tuning.screen import screen
 # A refused step is tried again at this share of its length; below the shortest, the start has converged.
 SHORTER, SHORTEST = 0.25, 1e-3
 # After these iterations the better half of the starts goes on.
-HALVINGS = (4, 8)
+HALVINGS = (4, 10)
+# Until this iteration a quarter of the members does: it is far to go, and the direction is clear.
+WHOLE_FROM = 6
 # Finished when the loss fell by less than this over as many iterations.
 STALL, PATIENCE = 2e-4, 6
 
@@ -53,28 +55,33 @@ class Search:
 
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """What is minimised: the log of the risk of the weighted losses, plus the conditions' shortfall."""
+    """What is minimised: the log of the risk of the weighted losses, plus the conditions' shortfall.
+
+    Members from number `ordinary` on are stressed ones: their mean loss is added to the others' risk.
+    """
 
     weights: tuple[float, ...]
     risk: Risk
     conditions: tuple[Bound, ...]
     weight: float
     margin: float
+    ordinary: int
 
     def of(self, losses: Array, shortfalls: Array) -> Array:
         """The goal from the losses [N] of the members."""
-        return jnp.log(self.risk(losses) + 1e-30) + self.weight * shortfalls
+        risk = self.risk(losses[: self.ordinary])
+        stressed = losses[self.ordinary :]
+        return jnp.log(risk + (jnp.mean(stressed) if stressed.size else 0.0) + 1e-30) + self.weight * shortfalls
 
     def penalty(self, space: Any, x: Array) -> Array:
         """Shortfall of the theorem's conditions at x [m]."""
         return shortfall(dict(zip(space.paths, space.gains_at(x), strict=True)), self.conditions, self.margin)
 
-    def score(self, space: Any, x: np.ndarray, terms: dict[str, np.ndarray]) -> np.ndarray:
-        """The goal [S] from terms [S, N]; +inf where it is not a number."""
-        losses = sum(w * terms[name] for w, name in zip(self.weights, TERMS, strict=True))
-        values = np.array(
-            [self.of(jnp.asarray(one), self.penalty(space, jnp.asarray(at))) for one, at in zip(losses, x)]
-        )
+    def score(self, space: Any, x: np.ndarray, terms: dict[str, np.ndarray], stressed: np.ndarray) -> np.ndarray:
+        """The goal [S] from terms [S, N] of members [N]; +inf where it is not a number."""
+        losses = weigh(self.weights, terms, stressed)
+        each = zip(losses, x, strict=True)
+        values = np.array([self.of(jnp.asarray(one), self.penalty(space, jnp.asarray(at))) for one, at in each])
         return np.where(np.isfinite(values), values, np.inf)
 
 
@@ -180,18 +187,25 @@ def search(
         if count and begin_at is None:
             first = screen(
                 engine, who, start, goal.conditions, count=count, keep=keep, seed=seed,
-                score=lambda x, terms: goal.score(space, x, terms),
+                score=lambda x, terms, few: goal.score(space, x, terms, few.stressed),
             )  # fmt: skip
         kept = Search(begin(jnp.asarray(first)), np.ones(len(first), bool), 0, {})
     try:
         while kept.iteration < iterations and kept.active.any():
             began = time.perf_counter()
-            iterate(engine, goal, who, kept, step)
+            if kept.iteration == WHOLE_FROM:  # what was good on a few says nothing about all
+                kept.starts = kept.starts._replace(trial=kept.starts.best, value=jnp.full_like(kept.starts.value, jnp.inf))
+            iterate(engine, goal, who if kept.iteration >= WHOLE_FROM else _few(who), kept, step)
             keeper.save(kept)
             tell(kept, time.perf_counter() - began)
     except KeyboardInterrupt:
         kept.interrupted = True
     return kept
+
+
+def _few(who: Members) -> Members:
+    count = int(np.sum(~who.stressed))
+    return who.first(max(count // 4, min(8, count)))
 
 
 def iterate(
@@ -213,7 +227,7 @@ def iterate(
     for row, at in enumerate(active):  # what is told of a start is told of its best point
         if value[at] < before[at]:
             lost[at] = int((terms["survival"][row] > 0).sum())
-            means[at] = [terms[name][row].mean() for name in TERMS]
+            means[at] = [terms[name][row][: goal.ordinary].mean() for name in TERMS]
     row = {
         "value": value,
         "gains": np.asarray(jax.vmap(engine.objective.space.gains_at)(starts.best)),
@@ -235,7 +249,7 @@ def _going_on(kept: Search, halving: bool) -> np.ndarray:
         order = np.argsort(np.where(active, value, np.inf), kind="stable")
         worse = order[max((int(active.sum()) + 1) // 2, 1) :]
         active[worse] = False
-    if kept.iteration > PATIENCE:
+    if kept.iteration > WHOLE_FROM + PATIENCE:
         fell = kept.history["value"][-1 - PATIENCE] - value
         active &= ~(fell < STALL)
     return active

@@ -10,6 +10,7 @@ from ambjax.method import slopes
 from ambjax.smooth import TWO_OVER_PI
 from tuning.conditions import Bound
 from tuning.objective import Engine, Members, Objective
+from tuning.space import Space
 
 # All points on an eighth of the members; then an eighth of the points on half of them.
 EIGHTH, HALF = 8, 2
@@ -56,6 +57,19 @@ def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarra
     return found
 
 
+def bounded(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray) -> Space:
+    """The space with an upper bound for gains that have none: three times the end of their range, or of the start.
+
+    Without one, gains along which the loss is flat (gamma, above all) drift to where no step resolves them.
+    """
+    box = ranges(objective, conditions, start)
+    gains = [
+        gain if np.isfinite(gain.high) else dataclasses.replace(gain, high=3 * max(end.high, value))
+        for gain, end, value in zip(objective.space.gains, box, start, strict=True)
+    ]
+    return Space(tuple(gains))
+
+
 def screen(
     engine: Engine,
     who: Members,
@@ -65,7 +79,7 @@ def screen(
     count: int,
     keep: int,
     seed: int,
-    score: Callable[[np.ndarray, dict[str, np.ndarray]], np.ndarray],
+    score: Callable[[np.ndarray, dict[str, np.ndarray], Members], np.ndarray],
 ) -> np.ndarray:
     """Coordinates [keep, m] of the best of `count` quasi-random points, the case's gains and the middle of the ranges.
 
@@ -77,9 +91,10 @@ def screen(
     cube = points("sobol", seed, len(space), np.arange(count), count)
     gains = np.concatenate([start[None], np.exp((low + high) / 2)[None], np.exp(low + cube * (high - low))])
     x = np.stack([space.encode(space.clip(g)) for g in gains])
-    values = score(x, engine.terms(x, _first(who, EIGHTH)))
+    few, half = _first(who, EIGHTH), _first(who, HALF)
+    values = score(x, engine.terms(x, few), few)
     x = x[np.argsort(values, kind="stable")[: max(len(x) // EIGHTH, keep)]]
-    values = score(x, engine.terms(x, _first(who, HALF)))
+    values = score(x, engine.terms(x, half), half)
     return x[np.argsort(values, kind="stable")[:keep]]
 
 

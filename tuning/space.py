@@ -52,7 +52,8 @@ class Gain:
             return self.low + jnp.exp(x)
         if self.low == 0.0:
             return 1 / (jnp.exp(-x) + 1 / self.high)
-        return jnp.exp(math.log(self.low) + self._width * jax.nn.sigmoid(4 * x / self._width))
+        log = math.log(self.low) + self._width * jax.nn.sigmoid(4 * x / self._width)
+        return jnp.clip(jnp.exp(log), self.low, self.high)  # of rounding, at either end
 
     @property
     def _width(self) -> float:

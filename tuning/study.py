@@ -15,6 +15,7 @@ from tuning.config import Tune, seeds
 from tuning.loss import loss_for
 from tuning.objective import Engine, Objective
 from tuning.optimise import Goal
+from tuning.screen import bounded
 
 # Members simulated at a time when an ensemble is judged: their noise is kept in memory while they are.
 CHUNK = 64
@@ -48,7 +49,9 @@ def study_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = No
     loss = loss_for(case.scenario, case.settle, tune.early)
     objective = Objective(tune.space, case.cascade, case.scenario, clock, loss, case.spread)
     conditions = bounds(case.cascade, case.scenario, clock)
-    goal = Goal(tune.weights, tune.risk, conditions, tune.conditions, tune.margin)
+    space = bounded(objective, conditions, tune.space.values(case.cascade))
+    objective = dataclasses.replace(objective, space=space)
+    goal = Goal(tune.weights, tune.risk, conditions, tune.conditions, tune.margin, tune.budget.members)
     mode = "forward" if len(tune.space) <= MOST_FORWARD else "reverse"
     return Study(case, tune, objective, Engine(objective, settle=case.settle, mode=mode, threads=threads), goal)
 
