@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import itertools
 import pathlib
 import time
 from typing import Any
@@ -62,8 +63,8 @@ def _resolved_search(
     study: Study, who: Members, start: np.ndarray, out: pathlib.Path, told: Any, resume: bool
 ) -> tuple[Study, Search, np.ndarray, dict[str, float] | None]:
     """The search, again in finer steps where its own do not resolve the optimum that it found."""
-    tune, begin_at, error = study.tune, None, None
-    for round in range(1, MOST_ROUNDS + 1):
+    tune, begin_at = study.tune, None
+    for round in itertools.count(1):
         path = out / f"{CHECKPOINT}-{round}.npz"
         kept = search(
             study.engine, study.goal, who, start, begin_at=begin_at, count=tune.budget.screen,
@@ -78,16 +79,16 @@ def _resolved_search(
                 "'ambjax simulate', or change tune.screen and tune.bounds."
             )
         if int(kept.history["lost"][-1][int(np.argmin(kept.history["value"][-1]))]) == len(who.member):
-            break  # nothing to hold a step against
+            return study, kept, x, None  # nothing to hold a step against
         error = step_error(study, x)
         say(f"step of the search against adaptive RODAS3: settled rms error off by {100 * error['relative']:.2g} %")
         if abs(error["relative"]) <= RESOLVED or round == MOST_ROUNDS or kept.interrupted:
-            break
+            return study, kept, x, error
         begin_at, rollouts = np.asarray(kept.starts.best), study.engine.rollouts
         study = study_of(study.case, tune, finer=2**round)
         study.engine.rollouts = rollouts
         say(f"too coarse there; the search goes on with {study.objective.clock.method}")
-    return study, kept, x, error
+    raise AssertionError("unreachable: the rounds are counted")
 
 
 def _teller(study: Study, count: int) -> Any:

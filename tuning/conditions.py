@@ -25,7 +25,7 @@ class Bound:
 
 
 def bounds(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Bound, ...]:
-    """k > Q_z, k_i > Q_i, gamma > Delta_1 (Eq. 7, on the ideal motion along the reference), where the laws have them."""
+    """k > Q_z, k_i > Q_i, gamma > Delta_1 (Eq. 7, on the ideal motion z = r), where the laws have these gains."""
     t = jnp.arange(clock.samples) * clock.sample_period
     q_z = float(np.max(np.abs(np.asarray(jax.vmap(scenario.acceleration)(t)))))
     q_i = float(np.max(np.abs(np.asarray(jax.vmap(scenario.q_i)(t)))))

@@ -165,7 +165,10 @@ def _positive(table: Table, key: str, default: float, zero: bool = False) -> flo
 
 
 def _whole(table: Table, key: str, default: int) -> int:
-    value, least = table.raw.get(key, default), 0 if key in ("screen", "seed", "held_out", "iterations", "stressed") else 1
+    value, least = (
+        table.raw.get(key, default),
+        0 if key in ("screen", "seed", "held_out", "iterations", "stressed") else 1,
+    )
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value < 2**31:
         raise ValueError(f"{table.at(key)} = {show(value)}: it must be a whole number of at least {least}.")
     return value

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.metrics import Ending
 from ambjax.extend import Scalar, leaf, record
+from ambjax.metrics import Ending
 from ambjax.scenario import Scenario
 from ambjax.trajectory import ALIVE
 

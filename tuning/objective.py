@@ -17,8 +17,8 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble import Spread, apply, draw
 from ambjax.control.laws import Measurement
+from ambjax.ensemble import Spread, apply, draw
 from ambjax.extend import canonical, leaf, one_kernel, record
 from ambjax.metrics import Named, Standard
 from ambjax.rollout import rollout
@@ -102,7 +102,7 @@ class Objective:
         samples = self.clock.samples
         if self.scenario.sensor is None or samples * len(numbers) * 24 > MOST_TAPE:
             return who
-        tape = jax.jit(jax.vmap(lambda who: self._tape(who), in_axes=(Members(0, 0, 0, None, 0),), out_axes=-1))
+        tape = jax.jit(jax.vmap(lambda who: self._tape(who), in_axes=(Members(0, 0, 0, None, 0),), out_axes=-1))  # pyright: ignore[reportArgumentType]
         return who._replace(tape=np.asarray(tape(who)))
 
     def _tape(self, who: Members) -> Array:

@@ -103,6 +103,7 @@ def stepper(engine: Engine, goal: Goal, name: str, rate: float) -> tuple[Callabl
         better = finite & (value < start.value)
         accept = on & (better if monotone else finite)
         shown = jnp.where(finite, gradient, 0.0)
+        step: Any
         step, memory = method.update(shown, start.memory, start.trial)
         anew = start.trial + step
         back = start.best + SHORTER * (start.trial - start.best)
@@ -194,7 +195,9 @@ def search(
         while kept.iteration < iterations and kept.active.any():
             began = time.perf_counter()
             if kept.iteration == WHOLE_FROM:  # what was good on a few says nothing about all
-                kept.starts = kept.starts._replace(trial=kept.starts.best, value=jnp.full_like(kept.starts.value, jnp.inf))
+                kept.starts = kept.starts._replace(
+                    trial=kept.starts.best, value=jnp.full_like(kept.starts.value, jnp.inf)
+                )
             iterate(engine, goal, who if kept.iteration >= WHOLE_FROM else _few(who), kept, step)
             keeper.save(kept)
             tell(kept, time.perf_counter() - began)
@@ -211,7 +214,10 @@ def _few(who: Members) -> Members:
 def iterate(
     engine: Engine, goal: Goal, who: Members, kept: Search, step: Callable[..., Starts], weights: Any = None
 ) -> None:
-    """One iteration of all active starts, written into `kept`. `weights` [S, 6]: each start its own goal, none halved."""
+    """One iteration of all active starts, written into `kept`.
+
+    `weights` [S, 6]: each start has a goal of its own, and all go on.
+    """
     starts, active = kept.starts, np.flatnonzero(kept.active)
     trial = np.asarray(starts.trial)
     losses, slopes, terms = engine.gradient(trial[active], who, goal.weights if weights is None else weights[active])
@@ -250,8 +256,8 @@ def _going_on(kept: Search, halving: bool) -> np.ndarray:
         worse = order[max((int(active.sum()) + 1) // 2, 1) :]
         active[worse] = False
     if kept.iteration > WHOLE_FROM + PATIENCE:
-        fell = kept.history["value"][-1 - PATIENCE] - value
-        active &= ~(fell < STALL)
+        past = kept.history["value"][-1 - PATIENCE]
+        active &= ~(np.isfinite(past) & (past - np.where(np.isfinite(past), value, 0.0) < STALL))
     return active
 
 

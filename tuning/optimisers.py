@@ -13,12 +13,12 @@ FIRST = 0.3
 
 
 class Memory(NamedTuple):
-    """Inverse Hessian [m, m], the last point and gradient [m], and how many were seen."""
+    """Inverse Hessian [m, m], the last point and gradient [m], and how many of them there were."""
 
     inverse: Array
     x: Array
     gradient: Array
-    count: Array
+    seen: Array
 
 
 def bfgs() -> optax.GradientTransformation:
@@ -35,18 +35,18 @@ def bfgs() -> optax.GradientTransformation:
         gradient, x = updates, jnp.asarray(params)
         s, y = x - state.x, gradient - state.gradient
         curvature = s @ y
-        usable = (state.count > 0) & (curvature > 1e-10 * jnp.sqrt((s @ s) * (y @ y)))
+        usable = (state.seen > 0) & (curvature > 1e-10 * jnp.sqrt((s @ s) * (y @ y)))
         rho = 1 / jnp.where(usable, curvature, 1.0)
         # the first pair sets the scale
-        scaled = jnp.where(state.count == 1, curvature / jnp.where(usable, y @ y, 1.0), 1.0) * state.inverse
+        scaled = jnp.where(state.seen == 1, curvature / jnp.where(usable, y @ y, 1.0), 1.0) * state.inverse
         left = jnp.eye(x.shape[0], dtype=x.dtype) - rho * jnp.outer(s, y)
         inverse = jnp.where(usable, left @ scaled @ left.T + rho * jnp.outer(s, s), state.inverse)
         step = -inverse @ gradient
         step = jnp.where(gradient @ step < 0, step, -gradient)
         length = jnp.sqrt(step @ step)
-        most = jnp.where(state.count == 0, FIRST, LONGEST)
+        most = jnp.where(state.seen == 0, FIRST, LONGEST)
         step = step * jnp.minimum(1.0, most / jnp.where(length > 0, length, 1.0))
-        return step, Memory(inverse, x, gradient, state.count + 1)
+        return step, Memory(inverse, x, gradient, state.seen + 1)
 
     return optax.GradientTransformation(init, update)
 

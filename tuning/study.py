@@ -76,7 +76,7 @@ def rms(values: np.ndarray) -> float:
 
 
 def step_error(study: Study, x: np.ndarray) -> dict[str, float]:
-    """The search's own step against adaptive RODAS3 on a few training members: settled rms error of both, and off by."""
+    """The search's own step against adaptive RODAS3 on a few training members: settled rms error of both."""
     seed, count = seeds(study.tune.budget)[0], study.tune.budget.members
     who = study.objective.chosen(seed, np.arange(min(REFERENCE_MEMBERS, count)), count)
     clock = dataclasses.replace(study.objective.clock, method=Adaptive(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS))
@@ -89,7 +89,7 @@ def step_error(study: Study, x: np.ndarray) -> dict[str, float]:
 
 
 def summarise(study: Study, found: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Numbers of an ensemble [N] for the report: pooled rms, largest, median and 95 % quantile of the errors, survival."""
+    """Numbers of an ensemble [N] for the report: pooled rms and largest error, survival, mean and largest metrics."""
     from ambjax.ensemble.statistics import wilson
 
     lost, errors = found["lost"], found["settled_rms_error_m"]
