@@ -4,8 +4,8 @@ import argparse
 import json
 import sys
 
+from ambjax import __version__
 from ambjax.__main__ import Parser, complain, prepare_jax
-from ambjax._version import __version__
 
 
 def parser() -> argparse.ArgumentParser:
