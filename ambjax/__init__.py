@@ -9,12 +9,13 @@ from ambjax.metrics import Standard
 from ambjax.plant import Plant
 from ambjax.rollout import Outcome, rollout
 from ambjax.scenario import Clock, Initial, Scenario, Sensor
-from ambjax.signals import Chirp, Constant, Pulse, Sine, SmoothStep, Step, Sum
+from ambjax.signals import BandNoise, Chirp, Constant, Pulse, Sine, SmoothStep, Step, Sum
 from ambjax.trajectory import Row, Trajectory
 
 __all__ = [
     "RK4",
     "Adaptive",
+    "BandNoise",
     "Cascade",
     "Chirp",
     "Clock",

@@ -3,7 +3,6 @@
 import argparse
 import json
 import os
-import pathlib
 import sys
 from typing import NoReturn
 
@@ -41,43 +40,52 @@ def parser() -> Parser:
     command("reproduce", "run the paper: both scenarios, Figures 3 to 6 and the ledger of claims", out=True)
     template = command("template", "print an annotated case file")
     template.add_argument("scenario", nargs="?", default="tracking", choices=["tracking", "regulation"])
-    command("simulate", "simulate a case: trajectory.npz, metrics.json, overview.png", case=True, out=True)
+    simulate = command("simulate", "simulate a case: trajectory.npz, metrics.json, overview.png", case=True, out=True)
+    simulate.add_argument("--member", type=int, metavar="K", help="member K of the case's ensemble, its [spread] drawn")
+    _seeded(simulate)
+    simulate.add_argument("--members", type=int, metavar="N", help="size of the ensemble (for a Latin hypercube)")
+    ensemble = command("ensemble", "simulate many members: members.npz, summary.json, fan.png", case=True, out=True)
+    ensemble.add_argument("--members", type=int, metavar="N", required=True, help="how many members")
+    _seeded(ensemble)
+    ensemble.add_argument("--chunk", type=int, metavar="M", default=1024, help="members in flight (default: 1024)")
+    ensemble.add_argument("--resume", action="store_true", help="go on with a study that was interrupted in --out")
+    where = ensemble.add_mutually_exclusive_group()
+    where.add_argument("--processes", type=int, metavar="P", help="run on P processes (default: threads of this one)")
+    where.add_argument("--cluster", metavar="ADDRESS", help="run on a Dask cluster: address of its scheduler")
+    grid = command("map", "survival and error over a grid of two quantities: map.png, map.json", case=True, out=True)
+    for axis in ("--x", "--y"):
+        form = "PATH=LOW:HIGH[:COUNT][:log]"
+        grid.add_argument(axis, metavar=form, required=True, help="a quantity and its range; ends may be in per cent")
+    grid.add_argument("--members", type=int, metavar="N", default=1, help="members per cell (default: 1)")
+    grid.add_argument("--against", metavar="OTHER.toml", action="append", help="another case, beside the first")
+    _seeded(grid)
     command("check", "check Theorem 1's conditions along a case; exit code 1 if one fails", case=True)
     return top
 
 
-def prepare_jax() -> None:
-    """float64 unless JAX_ENABLE_X64 says otherwise, and compilations kept between runs."""
-    import jax
-    import platformdirs
-
-    if "JAX_ENABLE_X64" not in os.environ:  # jax has been imported by now, so setting it there would be too late
-        jax.config.update("jax_enable_x64", True)
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        cache = pathlib.Path(platformdirs.user_cache_dir("ambjax")) / "compiled"
-        try:
-            cache.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            return  # a home that cannot be written costs time, not correctness
-        jax.config.update("jax_compilation_cache_dir", str(cache))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+def _seeded(command: Parser) -> None:
+    command.add_argument("--seed", type=int, metavar="S", help="seed of noise and spread (default: the case's)")
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command. Returns its exit code: 0 done, 1 the answer is no, 2 bad input."""
     args = parser().parse_args(argv)
-    prepare_jax()
-    from ambjax import commands
-
     try:
+        from ambjax import commands, worker
+
+        worker.prepare()
         code, summary = getattr(commands, f"run_{args.command}")(args)
+        if args.json:
+            print(json.dumps(summary, indent=2))
+        sys.stdout.flush()
     except ValueError as error:
         return complain(str(error))
-    except KeyboardInterrupt:
-        print("ambjax: interrupted", file=sys.stderr)
+    except BrokenPipeError:  # whoever read the answer has seen enough of it
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
+        return 0
+    except KeyboardInterrupt as stop:
+        print(f"ambjax: interrupted{f': {stop}' if str(stop) else ''}.", file=sys.stderr)
         return 130
-    if args.json:
-        print(json.dumps(summary, indent=2))
     return code
 
 

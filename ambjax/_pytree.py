@@ -115,8 +115,13 @@ def _check(field: dataclasses.Field, name: str, value: Any) -> None:
     except (TypeError, ValueError):
         number = math.nan
     if not within(field.metadata, number):
-        shown = f"{value:g}" if isinstance(value, (int, float)) else repr(value)
+        shown = f"{value:g}" if isinstance(value, (int, float)) else _worst(value, number)
         raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.{_example(field)}")
+
+
+def _worst(value: Any, number: Any) -> str:
+    """What to show of a value that is refused: of an array, its range."""
+    return f"{np.min(number):g} to {np.max(number):g}" if np.ndim(number) else repr(value)
 
 
 # The leaves that are whole numbers; every other number is real, even where somebody wrote 17 for 17.0.

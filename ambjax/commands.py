@@ -18,13 +18,18 @@ from tqdm import tqdm
 from ambjax import ledger, paper, plotting
 from ambjax._pytree import canonical
 from ambjax.casefile import Case, read_case
+from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.evidence import Evidence, gather
 from ambjax.loop import ClosedLoop
+from ambjax.mapping import run_map
 from ambjax.metrics import Standard
 from ambjax.outputs import directory, plain, say, table, write_json
 from ambjax.rollout import Outcome, begin_jit, finish, segment_jit
+from ambjax.studies import run_ensemble, study_of
 from ambjax.template import template
 from ambjax.theorem import Condition, check
+
+__all__ = ["run_check", "run_ensemble", "run_map", "run_reproduce", "run_simulate", "run_template"]
 
 Summary = dict[str, Any]
 # Samples simulated between two strokes of the progress bar.
@@ -41,7 +46,7 @@ def run_template(args: argparse.Namespace) -> tuple[int, Summary]:
 
 def run_simulate(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax simulate."""
-    case = read_case(args.case)
+    case = _member(read_case(args.case), args)
     out = directory(args.out, f"simulate-{case.name}")
     say(f"method: {case.clock.method}")
     trajectory, measured = simulate(case)
@@ -59,6 +64,21 @@ def run_simulate(args: argparse.Namespace) -> tuple[int, Summary]:
     if metrics["lost"]:
         say(f"The rotor is lost at {metrics['lost_at_s']:.4g} s: {trajectory.lost_why}. 'ambjax check' may say why.")
     return int(metrics["lost"]), metrics | {"out": str(out)}
+
+
+def _member(case: Case, args: argparse.Namespace) -> Case:
+    """The case with one member of its ensemble drawn, if that was asked for."""
+    if args.member is None:
+        if args.seed is not None or args.members is not None:
+            raise ValueError("--seed and --members belong to --member: add it, or set run.seed in the case file.")
+        return case
+    if case.spread.design == "latin-hypercube" and args.members is None:
+        raise ValueError("--member: add --members N, the size of the ensemble; a Latin hypercube depends on it.")
+    study = study_of(case, args.seed, MOST_MEMBERS if args.members is None else args.members)
+    if not 0 <= args.member < study.members:
+        raise ValueError(f"--member {args.member}: it must be a whole number from 0 to {study.members - 1}.")
+    cascade, scenario = study.member(args.member)
+    return dataclasses.replace(case, name=f"{case.name}-{args.member}", cascade=cascade, scenario=scenario)
 
 
 def simulate(case: Case) -> Outcome:

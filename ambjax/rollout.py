@@ -73,12 +73,13 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
         raise ValueError(f"clock.samples = {clock.samples}: there must be at least 1 sample.")
 
 
-def _run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:
+def run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:
+    """The whole rollout, unjitted and unchecked: what `rollout` compiles, and ensembles map over members."""
     progress, rows = segment(system, clock, fold, begin(system, clock, fold), 0, clock.samples, every)
     return finish(progress, rows, fold)
 
 
-roll = one_kernel(_run, static_argnames=("every",))
+roll = one_kernel(run, static_argnames=("every",))
 
 
 def begin(system: System, clock: Clock, fold: Fold | None) -> Progress:

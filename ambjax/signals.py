@@ -203,5 +203,5 @@ def reference_at(signal: Signal, t: Scalar) -> Reference:
         (r, r_dot), (_, r_ddot) = jax.jvp(first, (s,), (jnp.ones_like(s),))
         return r, r_dot, r_ddot
 
-    known, rates = jax.jvp(second, (t,), (jnp.ones_like(t),))
-    return Reference(*known, rates[2])
+    (r, r_dot, r_ddot), (_, _, r_dddot) = jax.jvp(second, (t,), (jnp.ones_like(t),))
+    return Reference(r, r_dot, r_ddot, r_dddot)

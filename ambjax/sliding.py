@@ -40,8 +40,8 @@ def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: 
     ahead, moved, force_0 = jax.lax.optimization_barrier((ahead, moved, force_0))
     force_1, seen_1, rates_1 = cascade.demand(_add(ahead, hold), moved, end.reference)
 
-    v_0, gradient_0 = v_and_gradient(model, force_0.z, i_ref)
-    v_1, gradient_1 = v_and_gradient(model, force_1.z, i_ref)
+    v_0, gradient_0 = v_and_gradient(model, force_0, i_ref)
+    v_1, gradient_1 = v_and_gradient(model, force_1, i_ref)
     w = force_0.v_star - v_0
     drift = (force_1.v_star - v_1 - w) / jnp.where(h > 0, h, 1.0)
     sliding, slaved, tau = relax(w, drift, law.gamma, law.p, h)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax._apart import apart
 from ambjax._pytree import Scalar
 
 TWO_OVER_PI = 0.6366197723675814
@@ -45,6 +46,19 @@ ARCTAN_R = (
 )
 
 
+@jax.custom_jvp
+@apart
+def reciprocal(x: Array) -> Array:
+    """1/x, divided once however often it is used."""
+    return 1 / x
+
+
+@reciprocal.defjvp
+def _reciprocal_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    value = reciprocal(*primals)
+    return value, -tangents[0] * value * value
+
+
 def _polynomial(u: Array, coefficients: Sequence[Scalar]) -> Any:
     total = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
@@ -53,6 +67,7 @@ def _polynomial(u: Array, coefficients: Sequence[Scalar]) -> Any:
 
 
 @jax.custom_jvp
+@apart
 def arctan_per(x: Array, per: Array) -> Array:
     """arctan(x) / per with one division, which vectorises; XLA's own arctan is a scalar library call on CPUs.
 

@@ -18,10 +18,16 @@ FLOORS = {
     3: "control control.* scenario metrics",
     4: "loop sliding extend method rollout theorem proof linear paper evidence ledger plotting",
     5: "__init__ ensemble ensemble.*",
-    6: "casefile tomltable spreadfile template outputs commands __main__ tuning tuning.*",
+    6: "casefile tomltable spreadfile template outputs worker studies mapping commands __main__ tuning tuning.*",
 }
 # Modules that may import matplotlib: those that draw.
-DRAWING = {"ambjax.plotting", "tuning.report"}
+DRAWING = {
+    "ambjax.plotting",
+    "ambjax.ensemble.pictures",
+    "ambjax.ensemble.heatmaps",
+    "ambjax.ensemble.scales",
+    "tuning.report",
+}
 FILES = sorted([*ROOT.glob("ambjax/**/*.py"), *ROOT.glob("tuning/**/*.py")])
 
 

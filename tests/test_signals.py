@@ -1,14 +1,31 @@
 """Signals and their derivatives: against formulas by hand, and against finite differences."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import Chirp, Constant, Pulse, Sine, SmoothStep, Step, Sum
-from ambjax.signals import reference_at
+from ambjax import (
+    RK4,
+    BandNoise,
+    Cascade,
+    Chirp,
+    Clock,
+    Constant,
+    Pulse,
+    Scenario,
+    Sine,
+    SmoothStep,
+    Step,
+    Sum,
+    inversion,
+    rollout,
+)
+from ambjax.signals import LINES, reference_at
+from ambjax.theorem import check
 
 T = np.array([0.0, 0.013, 0.1, 0.2501, 0.77, 3.0])
 W = 2 * np.pi * 2.0
@@ -134,3 +151,121 @@ def test_reference_of_a_traced_or_integer_time():
     # the rollout's time is traced; a person at the prompt types 1
     np.testing.assert_allclose(jax.jit(lambda t: reference_at(Sine(1.0, 0.3), t).r)(1), np.sin(0.6 * np.pi), rtol=1e-14)
     assert reference_at(Sine(1.0, 0.3), 1).r_dot.dtype == jnp.result_type(float)
+
+
+# --- band-limited noise ---
+
+NOISE = BandNoise(0.5, 20.0, 60.0)
+
+
+def members(count, signal=NOISE, slot="q_z", seed=0):
+    """Realisations of a scenario's signal, leaves [count]."""
+    scenario = Scenario(**{slot: signal}, seed=seed)
+    return jax.vmap(lambda m: getattr(dataclasses.replace(scenario, member=m).realised(), slot))(jnp.arange(count))
+
+
+def test_band_noise_has_the_autocovariance_of_its_band():
+    # std^2 times the mean of cos(2 pi f tau) over the band, at any instant: stationary
+    lags = np.array([0.0, 2e-3, 6e-3, 1.25e-2, 3e-2, 0.2])
+    f_low, f_high = NOISE.f_low, NOISE.f_high
+    safe = np.maximum(lags, 1e-12)
+    mean = (np.sin(2 * np.pi * f_high * safe) - np.sin(2 * np.pi * f_low * safe)) / (f_high - f_low)
+    mean /= 2 * np.pi * safe
+    for start in (0.0, 0.7, 31.0):
+        x = np.asarray(jax.vmap(lambda s, start=start: s(start + lags))(members(20_000)))
+        found = np.mean(x[:, :1] * x, axis=0)
+        # five standard errors: a product of Gaussians has variance of at most 2 std^4, so 5 sqrt(2/20000) std^2
+        np.testing.assert_allclose(found, NOISE.std**2 * mean, rtol=0, atol=0.05 * NOISE.std**2)
+        assert np.all(np.abs(np.mean(x, axis=0)) < 5 * NOISE.std / 20_000**0.5)
+
+
+def test_band_noise_is_nearly_gaussian():
+    x = np.asarray(jax.vmap(lambda s: s(0.3))(members(20_000))) / NOISE.std
+    # kurtosis 3 - 1.5/32 for 32 sines; its standard error is sqrt(24/20000)
+    assert abs(np.mean(x**4) - (3 - 1.5 / LINES)) < 5 * (24 / 20_000) ** 0.5
+    assert abs(np.mean(x**3)) < 5 * (6 / 20_000) ** 0.5
+
+
+def test_band_noise_spreads_its_power_evenly_and_keeps_to_its_band():
+    # periodograms of 60 members over 4 s: 1/4 Hz apart, lines 1.25 Hz apart
+    t = np.arange(4096) / 1024
+    x = np.asarray(jax.vmap(lambda s: s(t))(members(60)))
+    window = np.hanning(len(t))
+    power = np.mean(np.abs(np.fft.rfft(x * window)) ** 2, axis=0) / np.sum(window**2) / len(t) * 2
+    f = np.fft.rfftfreq(len(t), 1 / 1024)
+    # a Hann window leaks below 1e-6 beyond some bins
+    outside = (f < NOISE.f_low - 4) | (f > NOISE.f_high + 4)
+    assert np.sum(power[outside]) < 1e-6 * NOISE.std**2
+    edges = np.linspace(NOISE.f_low, NOISE.f_high, 9)
+    for low, high in itertools.pairwise(edges):
+        # an eighth of the variance each; a line at an edge leaks half its 1/4 to the neighbour or back: 60 members
+        # average that, and the beat of neighbouring lines within the window, to a few per cent
+        np.testing.assert_allclose(np.sum(power[(f >= low) & (f < high)]), NOISE.std**2 / 8, rtol=0.1)
+
+
+def test_band_noise_is_drawn_by_seed_member_and_place():
+    batch = members(4)
+    for m in range(4):
+        alone = Scenario(q_z=NOISE, member=m).realised().q_z
+        for x, y in zip(jax.tree.leaves(alone), jax.tree.leaves(batch), strict=True):
+            np.testing.assert_allclose(x, y if np.ndim(y) == 0 else y[m], rtol=1e-15)
+    both = Scenario(q_z=NOISE, q_i=Sum((NOISE, Constant(1.0), NOISE)), reference=Sine(1.0, 2.0)).realised()
+    lines = [both.q_z, both.q_i.terms[0], both.q_i.terms[2], members(1, seed=1)]
+    phases = np.stack([np.ravel(x.phases) for x in lines])
+    assert np.unique(phases).size == phases.size
+    assert both.reference == Sine(1.0, 2.0)
+    assert both.q_i.terms[1] == Constant(1.0)
+    # what is drawn in one place does not depend on the others
+    np.testing.assert_array_equal(lines[0].phases, batch.phases[0])
+    assert Scenario().realised() == Scenario()
+
+
+def test_band_noise_has_its_derivatives():
+    lines = Scenario(q_z=NOISE, member=3).realised().q_z
+    w, size = 2 * np.pi * np.asarray(lines.frequencies), NOISE.std * (2 / LINES) ** 0.5
+    found = jax.vmap(lambda t: reference_at(lines, t))(T)
+    angle = np.multiply.outer(T, w) + np.asarray(lines.phases)
+    for got, formula in zip(found, (np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle)), strict=True):
+        # sums of 32 terms, angles of up to 1e3 rad rounded to 1e-13
+        np.testing.assert_allclose(got, size * formula.sum(axis=1), rtol=1e-10, atol=1e-12 * np.max(np.abs(formula)))
+    assert jax.grad(lambda std: Scenario(q_z=BandNoise(std, 1.0, 2.0)).realised().q_z(0.3))(0.5) != 0
+
+
+def test_band_noise_is_no_function_of_time_before_it_is_drawn():
+    with pytest.raises(ValueError, match="realised"):
+        NOISE(0.0)
+
+
+SMOOTH = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
+
+
+def test_a_rollout_meets_its_own_member_s_noise():
+    scenario = Scenario(q_z=BandNoise(0.05, 20.0, 60.0), q_i=BandNoise(0.5, 5.0, 9.0), seed=4, member=2)
+    rows = rollout(SMOOTH, scenario, Clock(50, 1e-4, RK4(2))).trajectory.rows
+    drawn = scenario.realised()
+    # the row is taken a few roundings after its instant, so that it is behind a jump
+    np.testing.assert_allclose(rows.q_z, drawn.q_z(rows.t), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(rows.q_i, drawn.q_i(rows.t), rtol=0, atol=1e-13)
+    batch = jax.vmap(lambda m: rollout(SMOOTH, dataclasses.replace(scenario, member=m), Clock(50, 1e-4, RK4(2))))(
+        jnp.arange(4)
+    )
+    np.testing.assert_allclose(batch.trajectory.rows.q_z[2], rows.q_z, rtol=1e-13, atol=1e-14)
+    assert np.all(np.std(batch.trajectory.rows.q_z, axis=0) > 0)
+
+
+def test_integrators_keep_their_order_under_band_noise():
+    scenario = Scenario(q_z=BandNoise(0.1, 200.0, 600.0))
+    first, second, reference = (
+        rollout(SMOOTH, scenario, Clock(40, 1e-3, RK4(n))).trajectory.rows.z[-1] for n in (48, 96, 384)
+    )
+    # order 4: a factor 16 as the step is halved, 4.2 found; the reference's own error is 1/256 of the second's
+    assert abs(np.log2(abs(first - reference) / abs(second - reference)) - 4) < 0.3
+
+
+def test_the_theorem_is_checked_under_band_noise():
+    clock = Clock(100, 1e-4, RK4(2))
+    noise = BandNoise(0.5, 5.0, 50.0)
+    report = check(SMOOTH, Scenario(q_z=noise, reference=BandNoise(1e-5, 1.0, 3.0)), clock)
+    found = next(c.against for c in report.conditions if c.requires == "k > Q_z")
+    drawn = Scenario(q_z=noise).realised().q_z(np.arange(100) * 1e-4)
+    np.testing.assert_allclose(found, np.max(np.abs(drawn)), rtol=1e-9)

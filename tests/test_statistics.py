@@ -86,7 +86,7 @@ def test_cvar_of_a_normal():
     # E[X | X > q] = phi(z)/(1 - alpha) = 2.0627 at 95 %
     exact = stats.norm.pdf(stats.norm.ppf(0.95)) / 0.05
     found = cvar(RNG.normal(size=200_000), 0.95, seed=1)
-    # its variance is (Var[X | X > q] + 0.95 (cvar - q)^2)/(0.05 N) = 0.304/1e4: a standard error of 5.5e-3, five of them
+    # its variance is (Var[X | X > q] + 0.95 (cvar - q)^2)/(0.05 N) = 0.304/1e4: standard error 5.5e-3, five of them
     assert abs(found.value - exact) < 0.028
     assert abs((found.high - found.low) / (2 * 1.96 * 5.5e-3) - 1) < 0.1  # 1,000 resamples know a spread to 5 %
 

@@ -14,9 +14,9 @@ from ambjax.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
 GRADIENT_FLOOR = 1e-4
 
 
-def v_and_gradient(model: Plant, z: Array, i_ref: Array) -> tuple[Array, Array]:
+def v_and_gradient(model: Plant, inputs: ForceDemand, i_ref: Array) -> tuple[Array, Array]:
     """v and dv/di at (z, i_ref), the latter kept away from 0."""
-    v, dv_di = model.v_and_dv_di(z, i_ref)
+    v, dv_di = model.v_and_dv_di(inputs.z, i_ref, inputs.gaps)
     return v, away_from_zero(dv_di, GRADIENT_FLOOR * 4 * model.i_0 / model.s_0**2)
 
 
@@ -41,7 +41,7 @@ class Adaptive:
         return TWO_OVER_PI * self.gamma * self.p
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:
-        v, gradient = v_and_gradient(model, inputs.z, state)
+        v, gradient = v_and_gradient(model, inputs, state)
         rate = self.gamma * smooth_sign(inputs.v_star - v, self.p, per=gradient)
         return CurrentDemand(state, rate), rate
 

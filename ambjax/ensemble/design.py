@@ -17,6 +17,8 @@ from ambjax.scenario import DESIGN_STREAM, Scenario
 # Bits of a coordinate; points are the centres of such cells, so never 0 or 1. More than 32 SciPy cannot fast-forward.
 BITS = 52
 SOBOL_BITS = 32
+# Random numbers are made this many at a time, so that their code is compiled once.
+BLOCK = 2**14
 # A Latin hypercube is made whole; its numbers take 8 bytes each, three times over while it is made.
 MOST_LATIN = 30_000_000
 # The member's number is a signed integer of 32 bits where JAX computes in float32.
@@ -43,20 +45,23 @@ def points(design: str, seed: int, dims: int, members: np.ndarray, total: int) -
 
 
 def _random(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
-    words = np.asarray(_words(np.uint32(seed), members.astype(np.uint32), dims), np.uint64)
-    whole = (words[..., 0] << np.uint64(32) | words[..., 1]) >> np.uint64(64 - BITS)
-    return (whole + 0.5) * 2.0**-BITS
+    pairs = np.stack([np.repeat(members, dims), np.tile(np.arange(dims), len(members))]).astype(np.uint32)
+    padded = np.pad(pairs, ((0, 0), (0, -pairs.shape[1] % BLOCK)))
+    blocks = np.split(padded, padded.shape[1] // BLOCK, axis=1)
+    words = np.concatenate([np.asarray(_words(np.uint32(seed), *block), np.uint64) for block in blocks])
+    whole = (words[:, 0] << np.uint64(32) | words[:, 1]) >> np.uint64(64 - BITS)
+    return ((whole + 0.5) * 2.0**-BITS)[: pairs.shape[1]].reshape(-1, dims)
 
 
-@functools.partial(jax.jit, static_argnames="dims")
-def _words(seed: Array, members: Array, dims: int) -> Array:
-    """Two words of 32 random bits for each coordinate: the same in either precision of JAX."""
+@jax.jit
+def _words(seed: Array, members: Array, dims: Array) -> Array:
+    """Two words of 32 random bits for each pair of a member and a dimension: the same in either precision of JAX."""
 
-    def one(member: Array) -> Array:
+    def one(member: Array, dim: Array) -> Array:
         key = jax.random.fold_in(Scenario(seed=seed, member=member).key(), DESIGN_STREAM)
-        return jax.random.bits(key, (dims, 2), jnp.uint32)
+        return jax.random.bits(jax.random.fold_in(key, dim), (2,), jnp.uint32)
 
-    return jax.vmap(one)(members)
+    return jax.vmap(one)(members, dims)
 
 
 def _sobol(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:

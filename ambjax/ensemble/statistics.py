@@ -164,6 +164,18 @@ def spearman(x: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> Correlation:
     return Correlation(rho, 2 * stdtr(degrees, -t))
 
 
+def rho_interval(rho: np.ndarray, n: int, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
+    """Interval of Spearman's rho from n members: normal in artanh(rho), variance 1.06/(n - 3).
+
+    Fieller, Hartley and Pearson, Biometrika 44 (1957) 470-481. (-1, 1) below 4 members.
+    """
+    from scipy.special import ndtri
+
+    half = ndtri((1 + confidence) / 2) * np.sqrt(1.06 / (n - 3)) if n > 3 else np.inf
+    centre = np.arctanh(np.clip(rho, -1 + 1e-15, 1 - 1e-15))
+    return np.tanh(centre - half), np.tanh(centre + half)
+
+
 def _standard_ranks(columns: Sequence[np.ndarray]) -> np.ndarray:
     from scipy.stats import rankdata
 
@@ -208,7 +220,9 @@ def summary(
         "confidence": confidence,
         "seed": int(seed),
         "metrics": _metrics(metrics, seed, confidence),
-        "drivers": _drivers({path: columns[SPREAD + path] for path in spread_names}, metrics | {"lost_at_s": lost_at}),
+        "drivers": _drivers(
+            {path: columns[SPREAD + path] for path in spread_names}, metrics | {"lost_at_s": lost_at}, confidence
+        ),
         "worst": _worst(np.asarray(columns["index"]), lost_at, deciding, metrics[deciding], worst),
     }
 
@@ -238,13 +252,16 @@ def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) ->
     return out
 
 
-def _drivers(spread: Mapping[str, np.ndarray], metrics: Mapping[str, np.ndarray]) -> dict[str, list[dict[str, Any]]]:
+def _drivers(
+    spread: Mapping[str, np.ndarray], metrics: Mapping[str, np.ndarray], confidence: float
+) -> dict[str, list[dict[str, Any]]]:
     if not spread:
         return {name: [] for name in metrics}
     rho, p = spearman(list(spread.values()), list(metrics.values()))
+    low, high = rho_interval(rho, len(next(iter(spread.values()))), confidence)
     return {
         name: [
-            {"path": path, "rho": float(rho[row, n]), "p": float(p[row, n])}
+            {"path": path, "rho": float(rho[row, n]), "low": low[row, n], "high": high[row, n], "p": float(p[row, n])}
             for row, path in sorted(enumerate(spread), key=lambda item: -abs(rho[item[0], n]))
         ]
         for n, name in enumerate(metrics)

@@ -1,0 +1,163 @@
+"""The engine: many members at once, in blocks that fit the first-level cache, on every core or device.
+
+A member is told by `scenario.member`; its noise and its result depend on nothing else: not on who runs
+beside it, in which block, thread, device or order.
+"""
+
+import functools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from ambjax._kernel import one_kernel
+from ambjax._pytree import canonical
+from ambjax.control.cascade import Cascade
+from ambjax.loop import ClosedLoop
+from ambjax.method import with_method
+from ambjax.metrics import Fold
+from ambjax.rollout import Outcome, check_inputs, run
+from ambjax.scenario import Clock, Scenario
+
+# A block of members has vectors of this many bytes: small enough for the first-level cache, large enough to pay for
+# what is done once per block.
+BLOCK_BYTES = 512
+MOST_CALL = 4096
+MEMBERS = "members"
+
+
+class Parts(NamedTuple):
+    """A pytree split into the leaves that differ between members, [N] each, and those that all share."""
+
+    moving: Any
+    shared: Any
+
+
+def run_ensemble(
+    cascade: Cascade,
+    scenario: Scenario,
+    clock: Clock,
+    *,
+    fold: Fold | None,
+    every: int = 0,
+    threads: int | None = None,
+    call: int | None = None,
+) -> Outcome:
+    """Simulate every member of an ensemble; results in member order, every leaf with a leading axis [N].
+
+    Leaves of `cascade`, `scenario` and `fold` are numbers, shared by all members, or arrays [N], one entry for
+    each; at least one must be an array (`scenario.member`, for one). `fold` sees every sample; rows are
+    recorded at every `every`-th sample (0: none), [N, rows]. Members run on all devices that there are, on a
+    CPU on `threads` cores (None: all that this process may use). One call of the compiled program takes
+    `call` members (rounded up to whole blocks; None: an equal share for every core, 4096 at most): memory
+    grows with that, not with N, and another number compiles again. Results are NumPy arrays.
+
+    Raises ValueError as `rollout` does, and where the lengths of two leaves differ.
+    """
+    check_inputs(cascade, scenario, clock)
+    clock = with_method(clock, cascade, scenario)
+    loop, clock, fold = canonical((ClosedLoop(cascade, scenario), clock, fold))
+    return _Engine((loop, clock, fold), every, threads, call).outcome()
+
+
+def size(tree: Any) -> int:
+    """Number of members: the common length of all array leaves.
+
+    Raises ValueError if there is none, or if they differ.
+    """
+    lengths = {np.shape(x)[0] for x in jax.tree.leaves(tree) if np.ndim(x)}
+    if len(lengths) != 1:
+        found = " and ".join(str(n) for n in sorted(lengths)) or "none"
+        raise ValueError(
+            f"ensemble: leaves have lengths {found}; there must be one length. Give scenario.member = np.arange(N), "
+            "and every other leaf that varies as an array of the same N."
+        )
+    return lengths.pop()
+
+
+class _Engine:
+    """One ensemble, cut into calls of equal shape, so that it compiles once."""
+
+    def __init__(self, tree: Any, every: int, threads: int | None, call: int | None):
+        self.every = every
+        leaves, self.tree = jax.tree.flatten(tree)
+        self.members, self.kept = size(tree), tuple(bool(np.ndim(x)) for x in leaves)
+        self.moving = [np.asarray(x) for x in leaves if np.ndim(x)]
+        self.shared = tuple(x for x in leaves if not np.ndim(x))
+        self.devices = jax.devices()
+        alone = len(self.devices) == 1 and self.devices[0].platform == "cpu"
+        self.workers = (threads or cores()) if alone else 1
+        self.block = BLOCK_BYTES // jnp.result_type(float).itemsize
+        unit = self.block * len(self.devices)
+        fair = min(-(-self.members // self.workers), MOST_CALL)
+        self.call = -(-(call or fair) // unit) * unit
+
+    def outcome(self) -> Outcome:
+        """Run all calls and put the results in order."""
+        starts = range(0, self.members, self.call)
+        with ThreadPoolExecutor(self.workers) as pool:
+            parts = list(pool.map(self._one, starts))
+        whole = jax.tree.map(lambda *xs: np.concatenate(xs), *parts)
+        return jax.tree.map(lambda x: x[: self.members], whole)
+
+    def _one(self, start: int) -> Outcome:
+        """One call: members from `start` on, the last one repeated where the call is longer than what is left."""
+        index = np.minimum(np.arange(start, start + self.call), self.members - 1)
+        parts = Parts(tuple(x[index] for x in self.moving), self.shared)
+        found = _program(len(self.devices))(parts, kept=self.kept, tree=self.tree, every=self.every, block=self.block)
+        return jax.tree.map(np.asarray, found)
+
+
+def cores() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _blocks(parts: Parts, *, kept: tuple[bool, ...], tree: Any, every: int, block: int) -> Outcome:
+    """All members of a call: a loop over blocks, the whole rollout of a block inside it."""
+
+    def member(moving: tuple[Array, ...]) -> Outcome:
+        differing, common = iter(moving), iter(parts.shared)
+        loop, clock, fold = jax.tree.unflatten(tree, [next(differing) if k else next(common) for k in kept])
+        return run(loop, clock, fold, every)
+
+    if jax.default_backend() != "cpu":
+        return jax.vmap(member)(parts.moving)
+    cut = jax.tree.map(lambda x: x.reshape(-1, block), parts.moving)
+    found = lax.map(jax.vmap(member), cut)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
+
+
+STATIC = ("kept", "tree", "every", "block")
+_here = one_kernel(_blocks, static_argnames=STATIC)
+_sharded: dict[int, Callable[..., Outcome]] = {}
+
+
+def _program(devices: int) -> Callable[..., Outcome]:
+    """The compiled program: for one device, or with members sharded over several."""
+    if devices == 1:
+        return _here
+    if devices not in _sharded:
+        mesh = Mesh(np.asarray(jax.devices()[:devices]), (MEMBERS,))
+        over, everywhere = PartitionSpec(MEMBERS), PartitionSpec()
+
+        def spread(parts: Parts, **static: Any) -> Outcome:
+            one = functools.partial(_blocks, **static)
+            # Members do not speak to each other: nothing to check, and constants may stay unsharded.
+            where = {"mesh": mesh, "in_specs": (Parts(over, everywhere),), "out_specs": over, "check_vma": False}
+            return jax.shard_map(one, **where)(parts)
+
+        kernel = one_kernel(spread, static_argnames=STATIC)
+
+        def placed(parts: Parts, **static: Any) -> Outcome:
+            moving = jax.device_put(parts.moving, NamedSharding(mesh, over))
+            return kernel(Parts(moving, jax.device_put(parts.shared, NamedSharding(mesh, everywhere))), **static)
+
+        _sharded[devices] = placed
+    return _sharded[devices]

@@ -1,0 +1,104 @@
+"""Maps: survival and error over a grid of two quantities, each cell a small ensemble."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from ambjax.control.cascade import Cascade
+from ambjax.ensemble.engine import run_ensemble
+from ambjax.ensemble.paths import places
+from ambjax.ensemble.spread import Spread, apply, require_path
+from ambjax.ensemble.statistics import wilson
+from ambjax.ensemble.study import Study
+from ambjax.metrics import Standard
+from ambjax.scenario import Scenario
+
+PERIOD = "clock.sample_period"
+
+
+class Axis(NamedTuple):
+    """One quantity of a map: its dotted path and its values, ascending; `log` if they are spaced so."""
+
+    path: str
+    values: np.ndarray
+    log: bool = False
+
+
+class Map(NamedTuple):
+    """Results by cell [ny, nx]: share of survivors with its 95 % interval, and the median settled |z - r|, m.
+
+    The error is NaN where no member of the cell survives.
+    """
+
+    x: Axis
+    y: Axis
+    survival: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    error: np.ndarray
+
+    def reach(self) -> tuple[float, float] | None:
+        """Ends of the stretch of x in which all members survive, on the row of y nearest the middle of its range."""
+        middle = (self.y.values[0] + self.y.values[-1]) / 2
+        row = self.survival[np.argmin(np.abs(self.y.values - middle))]
+        held = self.x.values[row == 1]
+        return (float(held[0]), float(held[-1])) if held.size else None
+
+
+def grid(study: Study, x: Axis, y: Axis) -> Map:
+    """`study.members` members in every cell, all cells in one ensemble; member k has the same noise in each.
+
+    The axes may be any numbers of the case, or clock.sample_period: its values are run one after the other, each with
+    as many samples as the case's duration has of them. The case's own spread applies to all other quantities.
+
+    Raises ValueError for a path that does not exist.
+    """
+    if x.path == PERIOD:
+        turned = grid(study, y, x)
+        return Map(x, y, *(part.T for part in turned[2:]))
+    _check(study, x, y)
+    rows = [_cells(study, x, y)] if y.path != PERIOD else [_cells(_at_period(study, p), x, None) for p in y.values]
+    lost, error = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    survival = wilson(np.sum(~lost, axis=-1), study.members)
+    held = ~lost.all(axis=-1)
+    median = np.full(held.shape, np.nan)
+    median[held] = np.nanmedian(np.where(lost, np.nan, error)[held], axis=-1)
+    return Map(x, y, survival.value, survival.low, survival.high, median)
+
+
+def _check(study: Study, x: Axis, y: Axis) -> None:
+    known = [*places(study.cascade, study.scenario), PERIOD]
+    for name, axis in (("x", x), ("y", y)):
+        if axis.path not in known:
+            try:
+                require_path(axis.path, known)
+            except ValueError as error:
+                raise ValueError(str(error).replace("spread.", f"--{name} ", 1)) from None
+    if x.path == y.path:
+        raise ValueError(f"--y {y.path}: it is the quantity of --x too. Choose another.")
+
+
+def _at_period(study: Study, period: float) -> Study:
+    samples = max(round(float(study.clock.duration) / period), 1)
+    return dataclasses.replace(study, clock=dataclasses.replace(study.clock, samples=samples, sample_period=period))
+
+
+def _cells(study: Study, x: Axis, y: Axis | None) -> tuple[np.ndarray, np.ndarray]:
+    """Whether lost, and largest settled |z - r|: [ny, nx, members]."""
+    shape = (1 if y is None else len(y.values), len(x.values), study.members)
+    member = np.broadcast_to(np.arange(study.members), shape).ravel()
+    axes = {x.path: np.broadcast_to(x.values[None, :, None], shape).ravel()}
+    if y is not None:
+        axes[y.path] = np.broadcast_to(y.values[:, None, None], shape).ravel()
+    entries = tuple(entry for entry in study.spread.entries if entry[0] not in axes)
+    drawn = dataclasses.replace(study, spread=Spread(entries, study.spread.design)).drawn(np.arange(study.members))
+    cascade, scenario = _batch(study.cascade, study.scenario, {k: v[member] for k, v in drawn.items()} | axes)
+    scenario = dataclasses.replace(scenario, seed=study.seed, member=member)
+    found = run_ensemble(cascade, scenario, study.clock, fold=Standard(study.settle, scenario.touchdown)).measured
+    return found["lost"].reshape(shape), found["settled_max_abs_error_m"].reshape(shape)
+
+
+def _batch(cascade: Cascade, scenario: Scenario, values: dict[str, np.ndarray]) -> tuple[Cascade, Scenario]:
+    return jax.tree.map(np.asarray, apply(cascade, scenario, values))

@@ -1,0 +1,86 @@
+"""A study: one case, how it is spread, a seed and a number of members; any part of it can be run anywhere."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax._version import __version__
+from ambjax.control.cascade import Cascade
+from ambjax.ensemble.engine import run_ensemble
+from ambjax.ensemble.paths import places
+from ambjax.ensemble.spread import Spread, apply, draw
+from ambjax.metrics import Standard
+from ambjax.scenario import Clock, Scenario
+
+SPREAD = "spread."
+# Columns of members.npz beside the spread quantities, at most: to estimate what a study needs on disk.
+COLUMNS = 28
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """What an ensemble is. Member k depends on (seed, k) and, in a Latin hypercube, on `members`.
+
+    `clock.method` must hold for every member (a case file's does: it is chosen for the spread's extremes).
+    """
+
+    cascade: Cascade
+    scenario: Scenario
+    clock: Clock
+    settle: float
+    spread: Spread
+    seed: int
+    members: int
+
+    def drawn(self, members: np.ndarray) -> dict[str, np.ndarray]:
+        """The spread quantities of these members (integers [n]) by dotted path, [n] each."""
+        return draw(self.spread, self.cascade, self.scenario, self.seed, members, self.members)
+
+    def batch(self, members: np.ndarray) -> tuple[Cascade, Scenario]:
+        """The cascade and scenario of these members (integers [n]), leaves that vary [n]."""
+        cascade, scenario = apply(self.cascade, self.scenario, self.drawn(members))
+        return cascade, dataclasses.replace(scenario, seed=self.seed, member=members)
+
+    def member(self, index: int) -> tuple[Cascade, Scenario]:
+        """One member alone, leaves numbers: what `ambjax simulate --member` runs."""
+        values = {path: float(x[0]) for path, x in self.drawn(np.array([index])).items()}
+        cascade, scenario = apply(self.cascade, self.scenario, values)
+        return cascade, dataclasses.replace(scenario, seed=self.seed, member=index)
+
+    def columns(self, start: int, stop: int, *, call: int | None = None, threads: int | None = None) -> dict[str, Any]:
+        """Members start <= k < stop, one row each: index, lost_at, every metric, and spread.PATH. [stop - start]."""
+        members = np.arange(start, stop)
+        cascade, scenario = self.batch(members)
+        fold = Standard(self.settle, scenario.touchdown)
+        outcome = run_ensemble(cascade, scenario, self.clock, fold=fold, threads=threads, call=call)
+        drawn = {SPREAD + path: x for path, x in self.drawn(members).items()}
+        return {"index": members, "lost_at": outcome.trajectory.lost_at, **outcome.measured, **drawn}
+
+    def bands(self, members: int, times: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Times [t], lost_at [n] and signals [n, t] of the first `members` members, at most some `times` instants.
+
+        Signals are NaN from the instant on at which a member is lost.
+        """
+        cascade, scenario = self.batch(np.arange(min(members, self.members)))
+        every = -(-self.clock.samples // times)
+        trajectory = run_ensemble(cascade, scenario, self.clock, fold=None, every=every).trajectory
+        rows, t = trajectory.rows, np.asarray(trajectory.rows.t[0])
+        seen = {"z - r": rows.z - rows.r, "u": rows.u, "sigma": rows.sigma}
+        return t, np.asarray(trajectory.lost_at), {k: np.where(rows.alive, x, np.nan) for k, x in seen.items()}
+
+    def fingerprint(self) -> dict[str, Any]:
+        """Everything that a member's numbers depend on, by name, as JSON has it."""
+        facts: dict[str, Any] = {"version": __version__, "jax": jax.__version__}
+        facts |= {"precision": str(jnp.result_type(float)), "members": self.members, "seed": self.seed}
+        for stage in ("observer", "position", "inversion", "current"):
+            facts[f"controller.{stage}.kind"] = type(getattr(self.cascade, stage)).__name__
+        for name in ("reference", "q_z", "q_v", "q_i", "sensor"):
+            facts[f"{name}.kind"] = type(getattr(self.scenario, name)).__name__
+        facts |= {path: str(place.value) for path, place in places(self.cascade, self.scenario).items()}
+        facts |= {"clock.samples": self.clock.samples, "clock.sample_period": str(self.clock.sample_period)}
+        facts |= {"clock.method": str(self.clock.method), "run.settle": self.settle}
+        facts |= {"spread.design": self.spread.design}
+        return facts | {SPREAD + path: str(kind) for path, kind in self.spread.entries}

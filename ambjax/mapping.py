@@ -1,0 +1,116 @@
+"""`ambjax map`: survival and error over a grid of two quantities, for one case or for several side by side."""
+
+import argparse
+import math
+from typing import Any
+
+import numpy as np
+
+from ambjax.casefile import Case, read_case
+from ambjax.ensemble.maps import PERIOD, Axis, Map, grid
+from ambjax.ensemble.paths import places
+from ambjax.outputs import directory, plain, say, table, write_json
+from ambjax.studies import study_of
+
+COUNT = 21
+MOST_CELLS = 1_000_000
+FORM = "PATH=LOW:HIGH[:COUNT][:log], as in initial.z=-1e-3:1e-3:41 or plant.m=-20%:20%"
+
+
+def run_map(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+    """ambjax map."""
+    cases = [read_case(path) for path in [args.case, *(args.against or [])]]
+    studies = [study_of(case, args.seed, args.members) for case in cases]
+    axes = [(_axis("--x", args.x, case), _axis("--y", args.y, case)) for case in cases]
+    cells = len(axes[0][0].values) * len(axes[0][1].values)
+    if cells * args.members > MOST_CELLS:
+        raise ValueError(f"--members {args.members}: {cells} cells of so many exceed {MOST_CELLS:,} runs. Take fewer.")
+    maps = []
+    for case, study, (x, y) in zip(cases, studies, axes, strict=True):
+        say(f"{case.name}: {cells} cells of {args.members}; method: {case.clock.method}")
+        maps.append(grid(study, x, y))
+    out = directory(args.out, f"map-{cases[0].name}")
+    _draw(cases, maps, out / "map.png")
+    summary = {"cases": [_summary(case, found) for case, found in zip(cases, maps, strict=True)], "out": str(out)}
+    write_json(out / "map.json", summary)
+    if not args.json:
+        print(_text(cases, maps))
+        print(f"written: {out}/map.png, map.json")
+    return 0, plain(summary)
+
+
+def _axis(flag: str, text: str, case: Case) -> Axis:
+    """An axis from its flag's text. Raises ValueError with the flag, the text and the form."""
+
+    def refuse(why: str) -> ValueError:
+        return ValueError(f"{flag} {text}: {why}. Write {FORM}.")
+
+    path, _, rest = text.partition("=")
+    parts = rest.split(":")
+    log = parts[-1] == "log"
+    parts = parts[:-1] if log else parts
+    if len(parts) not in (2, 3):
+        raise refuse("it must be a path and a range")
+    known = places(case.cascade, case.scenario)
+    nominal = float(case.clock.sample_period) if path == PERIOD else _nominal(known.get(path))
+    try:
+        low, high = (_value(part, nominal) for part in parts[:2])
+        count = int(parts[2]) if len(parts) == 3 else COUNT
+    except ValueError as error:
+        raise refuse(str(error)) from None
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise refuse(f"the range must rise from one finite number to another, and it is {low:g} to {high:g}")
+    if count < 2:
+        raise refuse(f"there must be at least 2 values, and there are {count}")
+    if log and low <= 0:
+        raise refuse(f"a logarithmic range must begin above 0, and it begins at {low:g}")
+    return Axis(path, np.geomspace(low, high, count) if log else np.linspace(low, high, count), log)
+
+
+def _nominal(place: Any) -> float | None:
+    return None if place is None or place.value is None else float(place.value)
+
+
+def _value(text: str, nominal: float | None) -> float:
+    if not text.endswith("%"):
+        return float(text)
+    if nominal is None or not math.isfinite(nominal) or nominal == 0:
+        raise ValueError("per cent need a number other than 0 to refer to, and the case has none there")
+    return nominal * (1 + float(text[:-1]) / 100)
+
+
+def _summary(case: Case, found: Map) -> dict[str, Any]:
+    facts: dict[str, Any] = {"case": case.name, "x": found.x._asdict(), "y": found.y._asdict()}
+    return facts | {key: getattr(found, key) for key in ("survival", "low", "high", "error")} | {"reach": found.reach()}
+
+
+def _text(cases: list[Case], maps: list[Map]) -> str:
+    x, y = maps[0].x, maps[0].y
+    middle = (y.values[0] + y.values[-1]) / 2
+    rows = []
+    for case, found in zip(cases, maps, strict=True):
+        reach = found.reach()
+        held = "nowhere" if reach is None else f"{reach[0]:.4g} to {reach[1]:.4g}"
+        rows.append(
+            (case.name, f"{100 * found.survival.mean():.1f} %", f"{100 * np.mean(found.low >= 0.95):.1f} %", held)
+        )
+    header = ("case", "runs that survive", "cells surely above 95 %", f"{x.path} survived at {y.path} = {middle:.3g}")
+    return table(header, rows)
+
+
+def _draw(cases: list[Case], maps: list[Map], path: Any) -> None:
+    from ambjax.ensemble import heatmaps
+
+    panels = [
+        {"title": case.name, "x": m.x.values, "y": m.y.values, "survival": m.survival, "low": m.low, "high": m.high}
+        | {"error": m.error}
+        for case, m in zip(cases, maps, strict=True)
+    ]
+    x, y = maps[0].x, maps[0].y
+    heatmaps.maps(panels, _label(cases[0], x), _label(cases[0], y), x.log, y.log, path)
+
+
+def _label(case: Case, axis: Axis) -> str:
+    place = places(case.cascade, case.scenario).get(axis.path)
+    unit = "s" if place is None else place.field.metadata["unit"]
+    return f"{axis.path} ({unit})" if unit else axis.path

@@ -1,0 +1,216 @@
+"""`ambjax ensemble`: a study run chunk by chunk, here or on worker processes, and what is made of it."""
+
+import argparse
+import contextlib
+import pathlib
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from ambjax.casefile import Case, read_case
+from ambjax.ensemble import statistics
+from ambjax.ensemble.design import MOST_MEMBERS
+from ambjax.ensemble.store import Store
+from ambjax.ensemble.study import COLUMNS, Study
+from ambjax.outputs import chosen, make, plain, say, table, write_json
+from ambjax.worker import chunk, deaf_children, processes, work
+
+CHUNK = 1024
+# The fan chart is drawn from so many members and instants, whatever the size of the study.
+FAN_MEMBERS, FAN_TIMES = 256, 500
+BANDS = (0.0, 5.0, 25.0, 50.0, 75.0, 95.0, 100.0)
+GO_ON = "What is finished is kept: give the same command with --out and --resume to go on."
+SHOWN = ("settled_max_abs_error_m", "settled_rms_error_m", "max_abs_error_m", "max_abs_u_V", "rms_u_V", "max_abs_i_A")
+
+
+def study_of(case: Case, seed: int | None, members: int) -> Study:
+    """The study of a case file. Raises ValueError for a member count or seed out of range."""
+    if not 1 <= members <= MOST_MEMBERS:
+        raise ValueError(f"--members {members}: it must be a whole number from 1 to {MOST_MEMBERS:,}.")
+    seed = int(case.scenario.seed) if seed is None else seed
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"--seed {seed}: it must be a whole number from 0 to 4294967295.")
+    return Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, members)
+
+
+def run_ensemble(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+    """ambjax ensemble."""
+    case = read_case(args.case)
+    study, store = _asked(case, args)
+    out = store.directory
+    try:
+        with contextlib.nullcontext() if store.finished() else _executor(args) as executor:
+            make(out)  # not before everything that was asked for is known to be possible
+            say(f"method: {case.clock.method}; writing to {out}")
+            if not store.finished():
+                store.begin()
+                _run(study, store, executor)
+        store.finish()
+        return _report(case, study, args, out)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(_kept(store)) from None
+
+
+def _asked(case: Case, args: argparse.Namespace) -> tuple[Study, Store]:
+    """The study that is asked for, and where it is kept; nothing is written. Raises ValueError for what cannot be."""
+    study = study_of(case, args.seed, args.members)
+    if args.chunk < 1:
+        raise ValueError(f"--chunk {args.chunk}: it must be a whole number of members, at least 1.")
+    if args.processes is not None and args.processes < 1:
+        raise ValueError(f"--processes {args.processes}: it must be a whole number, at least 1.")
+    if args.resume and args.out is None:
+        raise ValueError("--resume: add --out DIR, the directory of the study that was interrupted.")
+    study.drawn(np.array([0]))  # raises what the design has against so many members
+    out = chosen(args.out, f"ensemble-{case.name}")
+    store = Store(out, study.fingerprint(), study.members, min(args.chunk, study.members))
+    store.check(COLUMNS + len(study.spread.entries), args.resume)
+    return study, store
+
+
+def _kept(store: Store) -> str:
+    """What an interruption has left, and how to go on."""
+    if not store.begun():
+        return "nothing is kept"
+    kept = store.members if store.finished() else store.members - sum(b - a for a, b in store.missing())
+    again = f"give the same command with --out {store.directory} --resume"
+    return f"{kept} of {store.members} members are kept. To go on, {again}"
+
+
+def _report(case: Case, study: Study, args: argparse.Namespace, out: pathlib.Path) -> tuple[int, dict[str, Any]]:
+    """What is made of a finished study."""
+    with np.load(out / "members.npz") as kept:
+        columns = {name: kept[name] for name in kept.files}
+    summary = _summary(case, study, columns)
+    write_json(out / "summary.json", summary)
+    _pictures(case, study, columns, summary, out)
+    if not args.json:
+        print(_text(summary))
+        print(
+            f"written: {out}/members.npz, summary.json, fan.png, histograms.png"
+            + ", tornado.png" * bool(study.spread.entries)
+        )
+    return int(summary["survivors"] < study.members), plain(summary) | {"out": str(out)}
+
+
+@contextlib.contextmanager
+def _executor(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]:
+    """Where chunks run: None for this process, or an executor and the number of chunks to keep in flight."""
+    if args.cluster is not None:
+        try:
+            from distributed import Client, KilledWorker
+        except ImportError:
+            raise ValueError("--cluster: Dask is not installed. Run: pip install 'ambjax[cluster]'.") from None
+        try:
+            client = Client(args.cluster, timeout="10s")
+        except (OSError, ValueError) as error:
+            raise ValueError(f"--cluster {args.cluster}: no scheduler answers there ({error}).") from None
+        try:
+            with client:
+                yield client.get_executor(), 2 * max(len(client.scheduler_info()["workers"]), 1)
+        except (KilledWorker, CancelledError):
+            raise ValueError(f"--cluster {args.cluster}: it was lost, or its workers died repeatedly. {GO_ON}") from None
+    elif args.processes is not None:
+        try:
+            with processes(args.processes) as pool:
+                yield pool, 2 * args.processes
+        except BrokenExecutor:
+            why = "a worker process died, perhaps for want of memory"
+            raise ValueError(f"--processes {args.processes}: {why}; fewer need less. {GO_ON}") from None
+    else:
+        yield None
+
+
+def _run(study: Study, store: Store, executor: tuple[Executor, int] | None) -> None:
+    """Compute what is missing; every finished chunk is on disk at once."""
+    missing = store.missing()
+    done = study.members - sum(stop - start for start, stop in missing)
+    with tqdm(total=study.members, initial=done, unit="member", unit_scale=True, delay=2, desc="ensemble") as bar:
+        found = _here(study, store, missing) if executor is None else _elsewhere(study, store, missing, *executor)
+        for span, columns in found:
+            store.put(span, columns)
+            bar.update(span[1] - span[0])
+
+
+Found = Iterator[tuple[tuple[int, int], dict[str, Any]]]
+
+
+def _here(study: Study, store: Store, missing: list[tuple[int, int]]) -> Found:
+    for span in missing:
+        yield span, chunk(study, *span, store.chunk)
+
+
+def _elsewhere(study: Study, store: Store, missing: list[tuple[int, int]], pool: Executor, ahead: int) -> Found:
+    queue, running = list(reversed(missing)), dict[Future, tuple[int, int]]()
+    while queue or running:
+        while queue and len(running) < ahead:
+            span = queue.pop()
+            with deaf_children():
+                running[pool.submit(work, study, *span, store.chunk)] = span
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            yield running.pop(future), future.result()
+
+
+def _summary(case: Case, study: Study, columns: dict[str, np.ndarray]) -> dict[str, Any]:
+    facts = {
+        "case": case.name,
+        "method": str(case.clock.method),
+        "settle_s": case.settle,
+        "design": study.spread.design,
+    }
+    found = statistics.summary(columns, study.spread.paths, study.seed)
+    latin = f" --members {study.members}" if study.spread.design == "latin-hypercube" else ""
+    for worst in found["worst"]:
+        worst["replay"] = f"ambjax simulate {case.name}.toml --member {worst['index']} --seed {study.seed}{latin}"
+    return facts | found
+
+
+def _pictures(
+    case: Case, study: Study, columns: dict[str, np.ndarray], summary: dict[str, Any], out: pathlib.Path
+) -> None:
+    from ambjax.ensemble import pictures
+
+    t, lost_at, signals = study.bands(FAN_MEMBERS, FAN_TIMES)
+    title = f"{case.name}: {len(lost_at)} of {study.members} members"
+    limits = {"z - r": float(np.min(study.scenario.touchdown)), "u": float(np.min(study.scenario.u_max))}
+    bands = {name: _quantiles(x) for name, x in signals.items()}
+    pictures.fan(t, bands, limits, title, out / "fan.png", lost_at=lost_at)
+    pictures.histograms(columns, out / "histograms.png")
+    if study.spread.entries:
+        deciding = statistics.DECIDING
+        bars = [(d["path"], d["rho"], d["low"], d["high"]) for d in summary["drivers"][deciding]]
+        pictures.tornado(bars, deciding, out / "tornado.png")
+
+
+def _quantiles(x: np.ndarray) -> dict[float, np.ndarray]:
+    """Quantiles over the members that are left at each instant, by per cent; NaN where none is."""
+    left = np.isfinite(x).any(axis=0)
+    found = np.full((len(BANDS), x.shape[1]), np.nan)
+    found[:, left] = np.nanquantile(x[:, left], np.array(BANDS) / 100, axis=0)
+    return dict(zip(BANDS, found, strict=True))
+
+
+def _text(summary: dict[str, Any]) -> str:
+    share, low, high = (100 * summary["survival"][key] for key in ("estimate", "low", "high"))
+    sure = f"{100 * summary['confidence']:g} % interval"
+    held = f"{summary['survivors']} of {summary['members']} members survive"
+    lines = [f"{held}: {share:.4g} % ({sure} {low:.4g} to {high:.4g} %)"]
+
+    def number(x: float | None) -> str:
+        return "-" if x is None else f"{x:.4g}"
+
+    rows = []
+    for name in SHOWN:
+        found = summary["metrics"][name]
+        rows.append(
+            (name, *(number(found[key]["estimate"]) for key in ("median", "q95", "cvar_95")), number(found["max"]))
+        )
+    lines += ["", table(("metric", "median", "95 % quantile", "mean of worst 5 %", "largest"), rows)]
+    drivers = summary["drivers"][statistics.DECIDING][:5]
+    if drivers:
+        shown = [(d["path"], f"{d['rho']:+.2f}", f"{d['low']:+.2f} to {d['high']:+.2f}") for d in drivers]
+        lines += ["", f"What drives {statistics.DECIDING}:", table(("quantity", "rank correlation", sure), shown)]
+    worst = summary["worst"][0]
+    return "\n".join([*lines, "", f"The worst member alone: {worst['replay']}"])

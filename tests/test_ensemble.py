@@ -1,0 +1,227 @@
+"""The engine and the store: a member is the same whoever runs beside it; nothing finished is ever lost."""
+
+import dataclasses
+import logging
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import linalg, stats
+
+from ambjax import RK4, Adaptive, Cascade, Clock, Initial, Scenario, Sensor, Sine, Standard, _kernel, inversion, rollout
+from ambjax.ensemble import Normal, Percent, Spread
+from ambjax.ensemble.engine import run_ensemble, size
+from ambjax.ensemble.store import Store
+from ambjax.ensemble.study import COLUMNS, Study
+from ambjax.loop import ClosedLoop, LoopState
+from ambjax.metrics import Rms
+
+SMOOTH = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
+NOISY = Scenario(reference=Sine(2.5e-3, 2.0), sensor=Sensor(1e-7, 1e-5, 1e-5), seed=7)
+SHORT = Clock(40, 1e-4, RK4(2))
+FOLD = Standard(2e-3)
+
+
+def members(n, **leaves):
+    z = 1e-6 * np.sin(np.arange(n))
+    return dataclasses.replace(NOISY, member=np.arange(n), initial=Initial(z, 0.0, 0.0), **leaves)
+
+
+def same(a, b, rtol):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, rtol=rtol, atol=1e-15)
+
+
+def test_results_do_not_depend_on_calls_threads_or_who_runs_beside():
+    n = 150  # no multiple of a block
+    whole = run_ensemble(SMOOTH, members(n), SHORT, fold=FOLD, threads=1)
+    assert whole.measured["rms_error_m"].shape == (n,)
+    assert len(set(whole.measured["rms_error_m"])) == n
+    for threads, call in ((2, 64), (1, 128), (3, None)):
+        # same operations on other lanes: only where XLA fuses differently may a last digit move
+        same(run_ensemble(SMOOTH, members(n), SHORT, fold=FOLD, threads=threads, call=call), whole, 1e-12)
+    some = jax.tree.map(lambda x: x[60:70] if np.ndim(x) else x, members(n))
+    same(run_ensemble(SMOOTH, some, SHORT, fold=FOLD), jax.tree.map(lambda x: x[60:70], whole), 1e-12)
+
+
+@pytest.mark.parametrize("method", [RK4(2), Adaptive()], ids=str)
+def test_a_member_is_the_rollout_of_that_member_alone(method):
+    clock = Clock(40, 1e-4, method)
+    found = run_ensemble(SMOOTH, members(66), clock, fold=FOLD, every=10)
+    for k in (0, 33, 65):
+        alone = jax.tree.map(lambda x, k=k: x[k] if np.ndim(x) else x, members(66))
+        one = rollout(SMOOTH, alone, clock, fold=FOLD, every=10)
+        # noise is bit for bit the same; an adaptive step's length depends on rounding, within its tolerance
+        np.testing.assert_array_equal(found.trajectory.rows.z_measured[k][0], one.trajectory.rows.z_measured[0])
+        same(jax.tree.map(lambda x, k=k: x[k], found.measured), one.measured, 1e-12 if method.limit else 1e-9)
+        assert found.trajectory.rows.z[k].shape == (4,)
+
+
+def test_the_plain_path_gives_the_same_numbers_and_says_that_it_is_taken(monkeypatch, caplog):
+    if _kernel.options() is None:
+        pytest.skip("the fast path is not supported here")
+    fast = run_ensemble(SMOOTH, members(20), SHORT, fold=Rms("e_z"))
+    monkeypatch.setenv("AMBJAX_PLAIN", "1")
+    _kernel.options.cache_clear()
+    try:
+        with caplog.at_level(logging.WARNING):
+            same(run_ensemble(SMOOTH, members(20), SHORT, fold=Rms("e_z")), fast, 1e-12)
+        assert "AMBJAX_PLAIN" in caplog.text
+        assert len(caplog.records) == 1
+    finally:
+        monkeypatch.undo()
+        _kernel.options.cache_clear()
+
+
+def test_a_probe_that_finds_a_wrong_lane_turns_the_fast_path_off(monkeypatch, caplog):
+    monkeypatch.setattr(_kernel, "smooth_sign", lambda x, p: jnp.where(x > 20, 0.0, jnp.arctan(p * x) * 2 / jnp.pi))
+    _kernel.options.cache_clear()
+    try:
+        with caplog.at_level(logging.WARNING):
+            assert _kernel.options() is None
+        assert "results are off by" in caplog.text
+    finally:
+        monkeypatch.undo()
+        _kernel.options.cache_clear()
+
+
+def test_several_devices_share_an_ensemble_and_change_nothing(tmp_path):
+    code = """
+import sys, jax
+jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
+import numpy as np
+from test_ensemble import *
+assert len(jax.devices()) == int(sys.argv[1])
+np.save(sys.argv[2], run_ensemble(SMOOTH, members(70), SHORT, fold=Rms("e_z")).measured)
+"""
+    env = os.environ | {"JAX_ENABLE_X64": "1", "PYTHONPATH": os.path.dirname(__file__)}  # noqa: PTH120
+    for n in (1, 2):
+        subprocess.run([sys.executable, "-c", code, str(n), str(tmp_path / f"{n}.npy")], env=env, check=True)
+    np.testing.assert_allclose(np.load(tmp_path / "1.npy"), np.load(tmp_path / "2.npy"), rtol=1e-12)
+
+
+def test_lengths_that_differ_or_are_missing_are_named():
+    assert size(members(5)) == 5
+    for scenario, words in ((NOISY, "lengths none"), (members(3, u_max=np.full(4, 200.0)), "lengths 3 and 4")):
+        with pytest.raises(ValueError, match=words):
+            run_ensemble(SMOOTH, scenario, SHORT, fold=FOLD)
+
+
+def test_the_noise_of_a_member_is_its_own_and_white():
+    rows = run_ensemble(SMOOTH, members(200), SHORT, fold=None, every=1).trajectory.rows
+    w = (rows.z_measured - rows.z) / 1e-7
+    assert stats.kstest(w.ravel(), "norm").pvalue > 1e-3
+    # products of distinct members and of distinct samples average to 0 +- 1/sqrt(count); five of those
+    assert abs((w[:100] * w[100:]).mean()) < 5 / np.sqrt(w.size / 2)
+    assert abs((w[:, 1:] * w[:, :-1]).mean()) < 5 / np.sqrt(w.size)
+
+
+def test_settled_rms_agrees_with_the_lyapunov_equation():
+    """Held noise through the linearised loop: P = A P A' + B S B' at the samples."""
+    n, std, period = 200, 1e-8, 1e-4
+    current = float(SMOOTH.model.equilibrium(0.0)[0])
+    cascade = dataclasses.replace(SMOOTH, inversion=inversion.Adaptive(1e9, 25e-6, i_ref=current))
+    still = Scenario(initial=Initial(i=current), sensor=Sensor(std, 0.0, 0.0), member=np.arange(n))
+    loop = ClosedLoop(cascade, Scenario(initial=Initial(i=current)))
+    tree = jax.tree.structure(loop.start())
+
+    def rates(x, w):
+        state = LoopState(*jax.tree.unflatten(tree, list(x)))
+        hold = loop.hold(0)._replace(z=w)
+        return jnp.stack(jax.tree.leaves(loop.rates(loop.inputs(0.0), state, hold)))
+
+    x_0 = jnp.stack(jax.tree.leaves(loop.start()))
+    assert np.abs(rates(x_0, 0.0)[:3]).max() < 1e-9  # at rest: rounding of 9.81 m/s^2 and of currents
+    A, B = jax.jacfwd(rates, (0, 1))(x_0, 0.0)
+    held = linalg.expm(period * np.block([[A, np.asarray(B)[:, None]], [np.zeros((1, 5))]]))
+    P = linalg.solve_discrete_lyapunov(held[:4, :4], std**2 * np.outer(held[:4, 4], held[:4, 4]))
+    # 1/c = 59 ms is the slowest time constant: e^-8.5 of a start at zero is left after 0.5 s
+    clock = Clock(10_000, period, RK4(2))
+    rms = run_ensemble(cascade, still, clock, fold=Rms("e_z", 0.5)).measured
+    mean, error = np.mean(rms**2), np.std(rms**2) / np.sqrt(n)
+    assert error < 0.05 * P[0, 0]  # sharp enough to tell
+    assert abs(mean - P[0, 0]) < 3 * error
+
+
+SPREAD = Spread((("plant.m", Percent(1.0)), ("initial.z", Normal(1e-7))), "sobol")
+STUDY = Study(SMOOTH, NOISY, SHORT, 2e-3, SPREAD, 11, 150)
+
+
+def run(study, directory, chunk=64, resume=False, stop_after=None):
+    store = Store(directory, study.fingerprint(), study.members, chunk)
+    store.check(COLUMNS, resume)
+    store.begin()
+    for span in store.missing()[:stop_after]:
+        store.put(span, study.columns(*span, call=64))
+    if not store.missing():
+        store.finish()
+    return directory / "members.npz"
+
+
+def test_a_study_interrupted_and_resumed_is_the_same_file(tmp_path):
+    whole = run(STUDY, tmp_path / "whole")
+    for finished in (0, 1, 2):
+        cut = tmp_path / f"cut {finished}"
+        assert not run(STUDY, cut, stop_after=finished).exists()
+        (cut / "chunks" / "000000000128-000000000150.npz.part").write_bytes(b"torn")  # killed while writing
+        assert run(STUDY, cut, resume=True).read_bytes() == whole.read_bytes()
+        assert not (cut / "chunks").exists()
+
+
+def test_members_npz_has_a_row_per_member_and_every_metric(tmp_path):
+    with np.load(run(STUDY, tmp_path)) as kept:
+        columns = dict(kept)
+    alone = rollout(*STUDY.member(77), SHORT, fold=FOLD)
+    assert set(columns) == {"index", "lost_at", "spread.plant.m", "spread.initial.z", *alone.measured}
+    np.testing.assert_array_equal(columns["index"], np.arange(150))
+    assert len(columns) <= COLUMNS
+    assert all(len(x) == 150 for x in columns.values())
+    np.testing.assert_allclose(columns["rms_error_m"][77], alone.measured["rms_error_m"], rtol=1e-12)
+    assert STUDY.member(77)[1].plant.m == columns["spread.plant.m"][77]
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"seed": 12}, "seed"),
+        ({"members": 151}, "members"),
+        ({"settle": 1e-3}, "run.settle"),
+        ({"cascade": Cascade(inversion=inversion.Adaptive(2e9, 25e-6))}, "controller.inversion.gamma"),
+        ({"cascade": Cascade(inversion=inversion.ClosedForm())}, "controller.inversion.kind"),
+        ({"spread": Spread((("plant.m", Percent(2.0)),), "sobol")}, "spread.plant.m"),
+        ({"clock": Clock(41, 1e-4, RK4(2))}, "clock.samples"),
+    ],
+)
+def test_resuming_another_study_is_refused_by_the_key_that_differs(change, key, tmp_path):
+    run(STUDY, tmp_path, stop_after=1)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(ValueError, match=rf"another study: {key} is .* there and .* here"):
+        run(dataclasses.replace(STUDY, **change), tmp_path, resume=True)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_store_refuses_what_it_cannot_hold(tmp_path):
+    run(STUDY, tmp_path, stop_after=1)
+    with pytest.raises(ValueError, match=r"holds a study already\. Add --resume"):
+        run(STUDY, tmp_path)
+    with pytest.raises(ValueError, match="another study: chunk is 64 there and 32 here"):
+        run(STUDY, tmp_path, chunk=32, resume=True)
+    huge = Store(tmp_path / "huge", {}, 2**50, 1024)
+    with pytest.raises(ValueError, match=r"GB free. At most [\d,]+ members fit"):
+        huge.check(COLUMNS, resume=False)
+    assert not (tmp_path / "huge").exists()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "file").touch()
+    with pytest.raises(ValueError, match="there is no study in"):
+        run(STUDY, tmp_path / "other", resume=True)
+
+
+def test_another_jax_resumes_only_what_it_began(tmp_path, monkeypatch):
+    run(STUDY, tmp_path, stop_after=1)
+    monkeypatch.setattr(jax, "__version__", "0.0.0")
+    with pytest.raises(ValueError, match="another study: jax is"):
+        run(STUDY, tmp_path, resume=True)

@@ -1,0 +1,441 @@
+"""Spreads: distributions, designs, the numbers that they move, and what is refused."""
+
+import dataclasses
+import tomllib
+
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+from ambjax import (
+    Cascade,
+    Clock,
+    Constant,
+    Pulse,
+    Scenario,
+    Sensor,
+    Sine,
+    SmoothStep,
+    Step,
+    Sum,
+    inversion,
+    observer,
+    rollout,
+)
+from ambjax.casefile import case_from
+from ambjax.ensemble import Choice, LogUniform, Normal, Percent, Spread, Uniform, apply, draw
+from ambjax.ensemble.design import DESIGNS, MOST_LATIN, points
+from ambjax.ensemble.paths import places
+from ambjax.ensemble.spread import check, corners
+from ambjax.integrate import Euler
+from ambjax.template import template
+
+CASCADE = Cascade()
+SMOOTH = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
+SCENARIO = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.8, 1.3), sensor=Sensor(1e-6, 1e-4, 1e-4))
+# name: distribution, nominal, the same by SciPy (cut at 6 standard deviations where normal)
+CONTINUOUS = {
+    "normal": (Normal(2e-4), 1e-3, stats.truncnorm(-6, 6, 1e-3, 2e-4)),
+    "uniform": (Uniform(-3.0, 5.0), 7.0, stats.uniform(-3.0, 8.0)),
+    "log-uniform": (LogUniform(1e-8, 1e-3), 0.0, stats.loguniform(1e-8, 1e-3)),
+    "percent": (Percent(10.0), -754.0, stats.uniform(-829.4, 150.8)),
+    "percent normal": (Percent(10.0, "normal"), -754.0, stats.truncnorm(-6, 6, -754.0, 75.4)),
+}
+EVERY = {name: row[:2] for name, row in CONTINUOUS.items()} | {"choices": (Choice((5.0, 1.0, 2.0)), 3.0)}
+SPREAD = Spread(
+    (
+        ("plant.m", Percent(10.0)),
+        ("plant.k_z", Percent(10.0, "normal")),
+        ("initial.z", Normal(1e-4)),
+        ("sensor.std", LogUniform(1e-8, 1e-6)),
+        ("disturbance.q_z.shift", Uniform(-0.1, 0.1)),
+        ("actuator.u_max", Choice((100.0, 200.0, 500.0))),
+        ("controller.position.c", Percent(5.0)),
+    )
+)
+
+
+def drawn(design, members, total=1000, seed=3):
+    return draw(dataclasses.replace(SPREAD, design=design), CASCADE, SCENARIO, seed, np.asarray(members), total)
+
+
+# --- distributions ---
+
+
+@pytest.mark.parametrize("name", CONTINUOUS)
+def test_quantiles_are_scipy_s(name):
+    kind, nominal, theirs = CONTINUOUS[name]
+    u = np.concatenate([np.linspace(0.001, 0.999, 99), [1e-7, 1 - 1e-7]])
+    # five sizes of the spread's width times 1e-12: a few roundings, and near 1 those of u itself
+    np.testing.assert_allclose(kind.quantile(u, nominal), theirs.ppf(u), rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_quantiles_rise_and_stay_within_the_support(name):
+    kind, nominal = EVERY[name]
+    u = np.array([2.0**-53, 1e-9, 0.1, 0.5, 0.9, 1 - 1e-9, 1 - 2.0**-53])
+    x, (low, high) = kind.quantile(u, nominal), kind.support(nominal)
+    assert np.all(np.diff(x) >= 0)
+    assert low <= x[0] <= x[-1] <= high
+    # and reach its ends
+    np.testing.assert_allclose([x[0], x[-1]], [low, high], rtol=1e-6)
+
+
+def test_choices_are_equally_likely():
+    u = (np.arange(3000) + 0.5) / 3000
+    values, counts = np.unique(Choice((5.0, 1.0, 2.0)).quantile(u, 0.0), return_counts=True)
+    np.testing.assert_array_equal(values, [1, 2, 5])
+    np.testing.assert_array_equal(counts, [1000] * 3)
+
+
+# --- designs ---
+
+
+@pytest.mark.parametrize("design", DESIGNS)
+def test_member_k_is_the_same_whatever_the_chunks(design):
+    whole = drawn(design, np.arange(1000))
+    for size in (1, 7, 64, 999):
+        picked = range(0, 1000, 100) if size == 1 else range(0, 1000, size)
+        for first in picked:
+            chunk = np.arange(first, min(first + size, 1000))
+            for path, values in drawn(design, chunk).items():
+                np.testing.assert_array_equal(values, whole[path][chunk])
+    odd = np.array([999, 3, 4, 5, 3, 0, 500])  # out of order, with gaps, one twice
+    for path, values in drawn(design, odd).items():
+        np.testing.assert_array_equal(values, whole[path][odd])
+
+
+@pytest.mark.parametrize("design", ["random", "sobol"])
+def test_member_k_does_not_know_how_many_there_are(design):
+    few, many = drawn(design, np.arange(50), 50), drawn(design, np.arange(50), 10**9)
+    for path in few:
+        np.testing.assert_array_equal(few[path], many[path])
+
+
+@pytest.mark.parametrize("design", DESIGNS)
+def test_seeds_differ_and_repeat(design):
+    first = drawn(design, np.arange(20), seed=1)
+    for path, values in drawn(design, np.arange(20), seed=2).items():
+        assert not np.any(values == first[path]) or path == "actuator.u_max"
+    again = drawn(design, np.arange(20), seed=1)
+    assert all(np.array_equal(first[path], again[path]) for path in first)
+    assert drawn(design, np.arange(2), seed=2**32 - 1)
+
+
+@pytest.mark.parametrize("design", DESIGNS)
+def test_draws_are_the_same_in_float32(design):
+    double = drawn(design, np.arange(40))
+    with jax.enable_x64(False):
+        single = drawn(design, np.arange(40))
+    assert all(x.dtype == np.float64 for x in single.values())
+    assert all(np.array_equal(double[path], single[path]) for path in double)
+
+
+@pytest.mark.parametrize("design", DESIGNS)
+@pytest.mark.parametrize("name", CONTINUOUS)
+def test_marginals_by_kolmogorov_and_smirnov(design, name):
+    kind, nominal, theirs = CONTINUOUS[name]
+    x = kind.quantile(points(design, 5, 3, np.arange(1024), 1024)[:, 1], nominal)
+    found = stats.kstest(x, theirs.cdf)
+    if design == "random":
+        assert found.pvalue > 1e-3  # one seed, which passes; a wrong law of this many fails by far
+    else:
+        # one point in each of 1,024 equal cells: the empirical law is never farther off than one cell
+        assert found.statistic <= 1 / 1024 + 1e-9
+
+
+@pytest.mark.parametrize(("design", "total"), [("latin-hypercube", 1000), ("latin-hypercube", 7), ("sobol", 256)])
+def test_every_stratum_holds_exactly_one_member(design, total):
+    u = points(design, 11, 5, np.arange(total), total)
+    for column in u.T:
+        np.testing.assert_array_equal(np.sort((column * total).astype(int)), np.arange(total))
+
+
+def test_sobol_is_even_in_pairs_of_dimensions():
+    # a scrambled (t, m, s)-net: the first two dimensions have one point in each of the 16 x 16 squares
+    u = points("sobol", 2, 2, np.arange(256), 256)
+    assert len({(int(a), int(b)) for a, b in 16 * u}) == 256
+
+
+def test_random_members_are_independent_of_each_other_and_of_the_noise():
+    u = points("random", 0, 3, np.arange(4000), 4000)
+    world = dataclasses.replace(SCENARIO, seed=0)
+
+    def noise(member):
+        scenario = dataclasses.replace(world, member=member)
+        return scenario.sensor.noise(scenario.key(), 0).z
+
+    w = np.asarray(jax.jit(jax.vmap(noise))(np.arange(4000)))
+    columns = np.column_stack([u, u[:, 0] * 0 + np.roll(u[:, 0], 1), w])
+    # five standard errors of a correlation: 5/sqrt(4000)
+    assert np.max(np.abs(np.corrcoef(columns.T) - np.eye(5))) < 0.08
+
+
+@pytest.mark.parametrize("design", DESIGNS)
+def test_points_are_inside_the_open_cube(design):
+    u = points(design, 1, 2, np.arange(5000), 5000)
+    assert u.shape == (5000, 2)
+    assert u.min() > 0
+    assert u.max() < 1
+    assert points(design, 1, 2, np.arange(0), 5).shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"design": "halton"}, "design = 'halton'"),
+        ({"total": 0, "members": []}, "members = 0"),
+        ({"total": 2**31 + 1}, "members = 2147483649"),
+        ({"members": [-1]}, "member -1"),
+        ({"members": [3, 10]}, "member 10"),
+        ({"design": "latin-hypercube", "total": MOST_LATIN}, "latin-hypercube.*sobol"),
+    ],
+)
+def test_points_refuse(change, words):
+    given = {"design": "random", "seed": 0, "dims": 2, "members": [0], "total": 10} | change
+    with pytest.raises(ValueError, match=words):
+        points(**given)
+
+
+# --- what is moved ---
+
+
+def test_an_ensemble_is_the_scenario_with_arrays_for_leaves():
+    values = drawn("sobol", np.arange(32))
+    cascade, scenario = apply(CASCADE, SCENARIO, values)
+    np.testing.assert_array_equal(scenario.plant.m, values["plant.m"])
+    np.testing.assert_array_equal(scenario.u_max, values["actuator.u_max"])
+    np.testing.assert_array_equal(scenario.sensor.std, values["sensor.std"])
+    np.testing.assert_array_equal(cascade.position.c, values["controller.position.c"])
+    # nothing else moved, the nominal plant in particular
+    assert cascade.model == CASCADE.model
+    moved = [x for x in jax.tree.leaves((cascade, scenario)) if np.ndim(x)]
+    assert len(moved) == len(values) + 1  # the shift moves start and stop
+    assert all(np.shape(x) == (32,) for x in moved)
+
+
+def test_the_nominal_model_moves_by_its_own_path():
+    cascade, scenario = apply(CASCADE, SCENARIO, {"controller.model.m": np.ones(3)})
+    np.testing.assert_array_equal(cascade.model.m, np.ones(3))
+    assert scenario == SCENARIO
+
+
+@pytest.mark.parametrize("signal", [Pulse(1.0, 0.8, 1.3), Step(1.0, 0.2), SmoothStep(1.0, 0.3, 0.2)])
+def test_a_shift_moves_a_signal_in_time(signal):
+    t = np.linspace(0, 2, 41)
+    scenario = dataclasses.replace(SCENARIO, q_z=signal, q_v=Constant())
+    shifted = apply(CASCADE, scenario, {"disturbance.q_z.shift": 0.25})[1].q_z
+    np.testing.assert_allclose(shifted(t), signal(t - 0.25), atol=1e-12)
+
+
+def test_shifted_pulses_keep_their_length():
+    scenario = apply(CASCADE, SCENARIO, drawn("random", np.arange(100)))[1]
+    np.testing.assert_allclose(scenario.q_v.stop - scenario.q_v.start, 0.5, rtol=1e-12)
+    values = {"disturbance.q_z.shift": np.array([1.0]), "disturbance.q_z.start": np.array([0.5])}
+    np.testing.assert_array_equal(apply(CASCADE, SCENARIO, values)[1].q_v.start, [1.5])
+
+
+def test_disturbance_paths_follow_the_case_file():
+    # the only disturbance of z is called q_z, in whatever unit; two at once are told apart
+    acceleration = dataclasses.replace(SCENARIO, q_z=Sine(1.0, 3.0), q_v=Constant())
+    assert apply(CASCADE, acceleration, {"disturbance.q_z.phase": 0.5})[1].q_z.phase == 0.5
+    assert apply(CASCADE, SCENARIO, {"disturbance.q_z.amplitude": 5.0})[1].q_v.amplitude == 5
+    both = dataclasses.replace(SCENARIO, q_z=Constant(1.0))
+    changed = apply(CASCADE, both, {"disturbance.q_z.value": 3.0, "disturbance.q_v.amplitude": 2.0})[1]
+    assert (changed.q_z.value, changed.q_v.amplitude) == (3.0, 2.0)
+
+
+def test_terms_of_sums_and_optional_numbers_have_paths():
+    scenario = dataclasses.replace(SCENARIO, reference=Sum((Constant(1e-3), Sine(1e-3, 2.0))))
+    cascade = dataclasses.replace(CASCADE, observer=observer.Complementary())
+    values = {"reference.terms.1.phase": 1.0, "controller.observer.z_hat": 1e-4, "run.clearance": 4e-3}
+    cascade, scenario = apply(cascade, scenario, values)
+    assert scenario.reference == Sum((Constant(1e-3), Sine(1e-3, 2.0, 1.0)))
+    assert cascade.observer.z_hat == 1e-4
+    assert scenario.touchdown == 4e-3
+
+
+def test_every_number_but_seed_and_member_has_a_path():
+    numbers = {id(x) for x in jax.tree.leaves((CASCADE, SCENARIO))} | {id(None)}
+    assert {id(place.value) for path, place in places(CASCADE, SCENARIO).items() if "shift" not in path} <= numbers
+    known = places(CASCADE, SCENARIO)
+    # each number replaced by an array, there are no others left but these: q_z is absent, seed, member
+    _, scenario = world = apply(CASCADE, SCENARIO, {p: np.ones(2) for p in known if "shift" not in p})
+    assert sum(np.ndim(x) == 0 for x in jax.tree.leaves(world)) == 3
+    assert (scenario.q_z.value, scenario.seed, scenario.member) == (0.0, 0, 0)
+
+
+def test_a_member_of_an_ensemble_rolls_out_as_it_does_alone():
+    spread = Spread((("plant.m", Percent(10.0)), ("initial.z", Normal(1e-5)), ("sensor.std", LogUniform(1e-8, 1e-6))))
+    clock = Clock(40, 5e-5, Euler(1))
+    values = draw(spread, SMOOTH, SCENARIO, 0, np.arange(4), 4)
+
+    def last(values, member):
+        cascade, scenario = apply(SMOOTH, dataclasses.replace(SCENARIO, member=member), values)
+        return rollout(cascade, scenario, clock).trajectory.rows.z[-1]
+
+    batch = jax.vmap(last)(values, np.arange(4))
+    for k in range(4):
+        # compiled for one member instead of four: last bits may differ
+        np.testing.assert_allclose(batch[k], last({p: x[k] for p, x in values.items()}, k), rtol=1e-12)
+
+
+def test_corners_hold_every_combination_of_ends():
+    spread = Spread(
+        (("plant.m", Percent(10.0)), ("initial.z", Normal(1e-5)), ("controller.inversion.gamma", Percent(50)))
+    )
+    cascade, scenario = corners(spread, CASCADE, SCENARIO)
+    products = np.asarray(cascade.inversion.gamma / 7.5e4 * scenario.plant.m / 0.588)
+    np.testing.assert_allclose(np.sort(products.ravel()), np.sort(np.outer([0.5, 1.5], [0.9, 1.1]).ravel()))
+    assert np.ndim(scenario.initial.z) == 0
+
+
+# --- the case file ---
+
+CASE = """
+disturbance.q_z = { kind = "pulse", amplitude = 1.0, start = 0.8, stop = 1.3, unit = "A^2/m^2" }
+sensor.std = 1e-6
+"""
+# What is wrong, the lines of [spread], what the message must contain: path, value, what is allowed or the fix.
+BAD = {
+    "unknown number": ("plant.mass = { percent = 10 }", ["spread.plant.mass", "Did you mean 'plant.m'", "plant.k_z"]),
+    "unknown table": ("plnt.m = { percent = 10 }", ["spread.plnt.m", "{ percent = 10 }", "'plant.m'", "plant.*"]),
+    "not a number": ("plant = { percent = 10 }", ["spread.plant =", "plant.m, plant.k_z"]),
+    "a law not in use": ("controller.observer.l = { percent = 10 }", ["spread.controller.observer.l", "position.*"]),
+    "the seed": ("run.seed = { uniform = [0, 9] }", ["spread.run.seed", "run.clearance"]),
+    "the clock": ("clock.dt = { percent = 10 }", ["spread.clock.dt"]),
+    "value of a pulse": ("disturbance.q_z.value = { normal = 1 }", ["spread.disturbance.q_z.value", "q_z.shift"]),
+    "bare value": ("plant.m = 0.1", ["spread.plant.m = 0.1", "{ percent = 10 }"]),
+    "no kind": ("plant.m = {}", ["spread.plant.m = {}", "exactly one", "'log-uniform'"]),
+    "two kinds": ("plant.m = { percent = 1, normal = 1 }", ["spread.plant.m", "exactly one"]),
+    "misspelt kind": ("plant.m = { precent = 10 }", ["spread.plant.m.precent", "Did you mean 'percent'"]),
+    "shape of a normal": ('plant.m = { normal = 0.1, shape = "normal" }', ["spread.plant.m.shape", "unknown key"]),
+    "unknown shape": ('plant.m = { percent = 1, shape = "flat" }', ["spread.plant.m.shape", '"flat"', "'uniform'"]),
+    "word": ('plant.m = { normal = "wide" }', ["spread.plant.m.normal", '"wide"', "a number"]),
+    "bool": ("plant.m = { percent = true }", ["spread.plant.m.percent = true"]),
+    "negative scale": ("plant.m = { normal = -0.1 }", ["spread.plant.m = { normal = -0.1 }", "at least 0"]),
+    "negative percentage": ("plant.m = { percent = -5 }", ["spread.plant.m = { percent = -5 }", "at least 0"]),
+    "infinite scale": ("plant.k_z = { normal = inf }", ["spread.plant.k_z = { normal = inf }", "finite"]),
+    "NaN": ("plant.m = { normal = nan }", ["spread.plant.m = { normal = nan }", "finite"]),
+    "NaN among choices": ("plant.m = { choices = [1.0, nan] }", ["spread.plant.m", "choices"]),
+    "percent of zero": ("initial.z = { percent = 10 }", ["spread.initial.z", "is 0", "normal or uniform"]),
+    "percent of none": ("run.clearance = { percent = 10 }", ["spread.run.clearance", "no finite value", "uniform"]),
+    "normal around infinity": ("actuator.u_max = { normal = 10 }", ["spread.actuator.u_max", "no finite value"]),
+    "low above high": ("plant.m = { uniform = [0.7, 0.5] }", ["spread.plant.m", "[0.7, 0.5]", "low < high"]),
+    "low is high": ("plant.m = { uniform = [0.5, 0.5] }", ["low < high"]),
+    "one end": ("plant.m = { uniform = [0.5] }", ["spread.plant.m.uniform = [0.5]", "[low, high]"]),
+    "no list": ("plant.m = { uniform = 0.5 }", ["spread.plant.m.uniform = 0.5", "list"]),
+    "word in a list": ('plant.m = { uniform = [0.5, "x"] }', ["spread.plant.m.uniform.1", '"x"']),
+    "log of zero": ("sensor.std = { log-uniform = [0, 1e-6] }", ["spread.sensor.std", "0 < low"]),
+    "no choices": ("actuator.u_max = { choices = [] }", ["spread.actuator.u_max", "at least one"]),
+    "negative choice": ("actuator.u_max = { choices = [-5, 100] }", ["spread.actuator.u_max", "-5", "above 0"]),
+    "negative mass": ("plant.m = { percent = 150 }", ["spread.plant.m", "-0.294", "above 0 (kg)", "Narrow"]),
+    "mass of nothing": ("plant.m = { percent = 100 }", ["spread.plant.m", "above 0"]),
+    "normal to below zero": ('plant.m = { percent = 20, shape = "normal" }', ["spread.plant.m", "-0.1176", "Narrow"]),
+    "negative noise": ("sensor.std = { uniform = [-1e-6, 1e-6] }", ["spread.sensor.std", "at least 0"]),
+    "beyond the clearance": ("initial.z = { normal = 1e-3 }", ["spread.initial.z", "0.006", "0.0045"]),
+    "the gap narrowed": ("plant.s_0 = { percent = 50 }\ninitial.z.uniform = [0, 3e-3]", ["initial.z", "0.00225"]),
+    "clearance beyond the gap": ("run.clearance = { uniform = [1e-3, 6e-3] }", ["run.clearance", "0.006", "plant.s_0"]),
+    "start after stop": ("disturbance.q_z.start = { uniform = [0.5, 1.4] }", ["q_z.start", "1.4", "1.3", "q_z.shift"]),
+    "stop before start": ("disturbance.q_z.stop = { normal = 0.1 }", ["q_z.stop", "0.7", "0.8", "q_z.shift"]),
+    "unknown design": ('design = "halton"', ["spread.design", '"halton"', "'sobol'"]),
+    "misspelt design": ('design = "sobel"', ["spread.design", "Did you mean 'sobol'"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", BAD)
+def test_bad_spread_is_one_clear_line(wrong):
+    lines, wanted = BAD[wrong]
+    with pytest.raises(ValueError) as refused:  # noqa: PT011 (the words are in the table)
+        case_from(tomllib.loads(f"{CASE}[spread]\n{lines}\n"))
+    message = str(refused.value)
+    assert "\n" not in message
+    assert message.startswith("spread.")
+    for part in wanted:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("spread = 3", ["spread = 3", "table"]),
+        ("spread.sensor.std = { uniform = [0, 1e-6] }", ["spread.sensor.std", "add the table [sensor]"]),
+        (
+            'disturbance.q_z = { kind = "constant", unit = "A^2/m^2" }\nspread.disturbance.q_z.value = { normal = 1 }',
+            ["spread.disturbance.q_z.value", "m/s^2"],
+        ),
+        (
+            'disturbance.q_z = { kind = "band-noise", std = 1, f_low = 5, f_high = 9 }\n'
+            "spread.disturbance.q_z.f_low = { uniform = [1, 9] }",
+            ["spread.disturbance.q_z.f_low", "Narrow the spread."],
+        ),
+        (
+            # the nominal 7.5e4 allows this step, 1.5 times it does not
+            'clock = { dt = 2e-6, method = "rk4" }\nspread.controller.inversion.gamma = { percent = 50 }',
+            ["clock.dt = 2e-06", "stable only up to 1.56e-06"],
+        ),
+    ],
+    ids=["not a table", "no sensor", "nothing in two units", "band turned over", "unstable step"],
+)
+def test_spreads_that_do_not_fit_the_case(text, wanted):
+    with pytest.raises(ValueError) as refused:  # noqa: PT011
+        case_from(tomllib.loads(text))
+    for part in wanted:
+        assert part in str(refused.value)
+
+
+def test_a_case_says_how_it_is_spread():
+    text = """
+    [spread]
+    design = "sobol"
+    plant.m = { percent = 10 }
+    plant.k_z = { percent = 10, shape = "normal" }
+    initial.z = { normal = 1e-4 }
+    sensor.std = { log-uniform = [1e-8, 1e-6] }
+    disturbance.q_z.shift = { uniform = [-0.1, 0.1] }
+    actuator.u_max = { choices = [100, 200, 500] }
+    controller.position.c = { percent = 5 }
+    """
+    spread = case_from(tomllib.loads(CASE + text)).spread
+    assert spread == dataclasses.replace(SPREAD, design="sobol")
+    assert case_from({}).spread == Spread()
+
+
+def test_spreads_print_as_they_are_written():
+    for path, kind in SPREAD.entries:
+        text = f"{CASE}[spread]\n{path} = {kind}\n"
+        assert case_from(tomllib.loads(text)).spread == Spread(((path, kind),))
+
+
+@pytest.mark.parametrize("name", ["tracking", "regulation"])
+def test_the_template_s_spread_is_a_spread(name):
+    head, found, tail = template(name).partition("# [spread]")
+    lines = (found + tail).splitlines()
+    assert all(line.startswith("# ") for line in lines)
+    case = case_from(tomllib.loads(head + "\n".join(line.removeprefix("# ") for line in lines)))
+    assert len(case.spread.entries) == len(lines) - 2
+    assert case_from(tomllib.loads(template(name))).spread == Spread()
+
+
+@pytest.mark.parametrize(
+    ("entries", "words"),
+    [
+        ((("plant.m", Percent(1.0)), ("plant.m", Percent(2.0))), "spread.plant.m is given 2 times"),
+        ((("plant.m", Percent(1.0, "flat")),), "shape must be 'uniform' or 'normal'"),
+        ((("plant.mass", Percent(1.0)),), "Did you mean 'plant.m'"),
+    ],
+)
+def test_spreads_made_in_python_are_checked_too(entries, words):
+    with pytest.raises(ValueError, match=words):
+        draw(Spread(entries), CASCADE, SCENARIO, 0, np.arange(3), 3)
+
+
+def test_what_is_an_array_already_cannot_be_spread():
+    scenario = dataclasses.replace(SCENARIO, u_max=np.array([100.0, 200.0]))
+    with pytest.raises(ValueError, match="array of 2"):
+        check(Spread((("actuator.u_max", Percent(1.0)),)), CASCADE, scenario)
+
+
+def test_no_spread_draws_nothing():
+    assert draw(Spread(), CASCADE, SCENARIO, 0, np.arange(5), 5) == {}
