@@ -33,12 +33,16 @@ Times = Callable[[float], Array]
 
 
 class Problem(NamedTuple):
-    """What is integrated: rates(inputs(t), state), scale (a state) and fate(state) -> code."""
+    """What is integrated: rates(inputs(t), state), scale (a state) and fate(state) -> code.
+
+    `slide(inputs(t_0), inputs(t_1), h, state) -> state`, where there is one, is a step made for this very system.
+    """
 
     inputs: Inputs
     rates: Rates
     scale: Any
     fate: Fate
+    slide: Callable[[Any, Any, Scalar, Any], Any] | None = None
 
 
 class Advanced(NamedTuple):
@@ -202,6 +206,24 @@ class Rodas3(_Fixed):
 
     def __str__(self) -> str:
         return f"RODAS3 (L-stable Rosenbrock), {self.substeps} substeps"
+
+
+@record
+class Slide(_Fixed):
+    """Equal substeps of the loop's own step (`ambjax.sliding`): for stiff gains under held noise.
+
+    Second order in the loop's slow motion, whatever gamma p is; the inversion law must be `inversion.Adaptive`.
+    """
+
+    limit = None
+
+    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any) -> Any:
+        if problem.slide is None:
+            raise ValueError("clock.method = Slide(...): it steps loops whose inversion law is 'adaptive'. Use Rodas3.")
+        return problem.slide(problem.inputs(at(0.0)), problem.inputs(at(1.0)), h, state)
+
+    def __str__(self) -> str:
+        return f"sliding step, {self.substeps} substeps"
 
 
 @record

@@ -13,6 +13,7 @@ from ambjax.control.laws import Measurement
 from ambjax.integrate import Problem
 from ambjax.scenario import Scenario
 from ambjax.signals import Reference, reference_at
+from ambjax.sliding import slide, slides
 from ambjax.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 
 # A state this many times its scale has left the model's meaning, long before numbers overflow.
@@ -104,7 +105,8 @@ class ClosedLoop:
 
     def problem(self, hold: Measurement) -> Problem:
         """What an integrator is given for one sample."""
-        return Problem(self.inputs, lambda inputs, x: self.rates(inputs, x, hold), self.scale(), self.fate)
+        step = functools.partial(slide, self, hold) if slides(self.cascade) else None
+        return Problem(self.inputs, lambda inputs, x: self.rates(inputs, x, hold), self.scale(), self.fate, step)
 
     def row(self, t: Scalar, state: LoopState, hold: Measurement, alive: Array) -> Row:
         """All signals at one instant. The drive of a lost rotor is off: u = 0."""
