@@ -1,4 +1,4 @@
-"""Pictures of ensembles: fan charts, histograms, tornado charts and heat maps, from arrays in SI units."""
+"""Pictures of ensembles: fan charts, histograms and tornado charts, from arrays in SI units."""
 
 import math
 import pathlib
@@ -13,11 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from ambjax.ensemble.heatmaps import maps
 from ambjax.ensemble.scales import finish, log_ticks, named, prefixed, size_of
 from ambjax.plotting import BINS, BLUE, INK, ORANGE, RED, thin
-
-__all__ = ["CHIEF", "QUANTITIES", "fan", "histograms", "maps", "tornado"]
 
 # What a fan can show: label and SI unit.
 QUANTITIES = {
