@@ -181,7 +181,16 @@ def test_fan_does_not_let_one_member_hide_the_rest(tmp_path, drawn):
     pictures.fan(t, {"z - r": bands}, {}, "one went astray", tmp_path / "fan.png")
     ax = drawn[0].axes[0]
     assert ax.get_ylim()[1] < 60  # µm: the others reach 24
-    assert "reaches ±4.5e+03 µm, beyond this axis" in texts(drawn[0])
+    assert "band goes to 4500 µm, beyond this axis" in texts(drawn[0])
+
+
+def test_fan_does_not_let_a_brief_transient_hide_the_rest(tmp_path, drawn):
+    t = np.linspace(0, 1, 1001)
+    members = members_of(100, t) + 4e-3 * (t < 0.02)
+    pictures.fan(t, {"z - r": quantiles(members)}, {"z - r": 4.5e-3}, "it came down", tmp_path / "fan.png")
+    ax = drawn[0].axes[0]
+    assert ax.get_ylim()[1] < 60  # µm: settled, they reach 24
+    assert "beyond this axis" in texts(drawn[0])
 
 
 def test_fan_refuses_unknown_quantity(tmp_path):
@@ -308,10 +317,11 @@ def a_panel(survival, error=None, x=None, y=None):
     }
 
 
-def test_maps_draw_the_95_per_cent_contour_where_it_is(tmp_path, drawn):
-    # survival falls linearly in x from 1 to 0: the contour is the line x = 0.05
+def test_maps_outline_the_cells_that_survive(tmp_path, drawn):
+    # survival falls in x from 1 to 0 by 0.1 a cell; its bounds lie 0.02 to either side of it
     x, y = np.linspace(0, 1, 11), np.linspace(-1, 1, 5)
     survival = np.tile(1 - x, (5, 1))
+    survival[2] = 1.0
     error = np.where(survival > 0, 1e-6 * 10 ** (3 * x), np.nan)
     panels = [a_panel(survival, error, x, y), a_panel(survival, None, x, y)]
     heatmaps.maps(panels, "initial $z$ (m)", "speed (m/s)", False, False, tmp_path / "m.png")
@@ -320,14 +330,16 @@ def test_maps_draw_the_95_per_cent_contour_where_it_is(tmp_path, drawn):
     assert "initial $z$ (m)" in words
     assert "settled max |error| (µm)" in words
     assert "no survivor" in words
-    assert "in 5 of 55 cells" in words
-    low, high, level = drawn[0].axes[0].collections[1:4]
-    # from x = 0 to 0.1 the lower bound falls from 0.98 to 0.88, the upper one, cut off at 1, from 1 to 0.92
-    for drawing, at in ((level, 0.05), (low, 0.03), (high, 0.0625)):
-        np.testing.assert_allclose(drawing.get_paths()[0].vertices[:, 0], at, atol=1e-12)  # rounding
-    first, second = drawn[0].axes[0].collections[0], drawn[0].axes[1].collections[0]
-    assert first.norm.vmin == second.norm.vmin == 0
-    assert first.norm.vmax == second.norm.vmax == 100
+    assert "in 15 of 55 cells" in words
+    cells, *_, outline = drawn[0].axes[0].collections
+    segments = {tuple(np.round(np.ravel(segment), 9)) for segment in outline.get_segments()}
+    # rows 0, 1, 3 and 4 end right of x = 0; row 2 is full, so that it is open at the border, and bounded by its
+    # neighbours' cells 1 to 10 above and below
+    upright = {(0.05, lower, 0.05, lower + 0.5) for lower in (-1.25, -0.75, 0.25, 0.75)}
+    assert {segment for segment in segments if segment[0] == segment[2]} == upright
+    assert len(segments) == 4 + 2 * 10
+    other = drawn[0].axes[1].collections[0]
+    assert (cells.norm.vmin, cells.norm.vmax) == (other.norm.vmin, other.norm.vmax) == (0, 100)
 
 
 ALL = np.ones((3, 4))

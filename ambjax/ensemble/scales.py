@@ -68,6 +68,11 @@ def relabelled(label: str, size: float) -> tuple[float, str]:
     return factor, f"{found[1]}({unit})"
 
 
+def digits(value: float) -> str:
+    """A number with three digits, or all before the point: 12.3, 7000, 1.2e-05."""
+    return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
 def edges(centres: np.ndarray, log: bool) -> np.ndarray:
     """[n + 1] edges half way between n ascending centres, in decades if `log`.
 
