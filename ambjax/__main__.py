@@ -69,10 +69,10 @@ def _seeded(command: Parser) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run a command. Returns its exit code: 0 done, 1 the answer is no, 2 bad input."""
     args = parser().parse_args(argv)
-    from ambjax import commands, worker
-
-    worker.prepare()
     try:
+        from ambjax import commands, worker
+
+        worker.prepare()
         code, summary = getattr(commands, f"run_{args.command}")(args)
         if args.json:
             print(json.dumps(summary, indent=2))
@@ -82,8 +82,8 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read the answer has seen enough of it
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
-    except KeyboardInterrupt:
-        print("ambjax: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"ambjax: interrupted{f': {stop}' if str(stop) else ''}.", file=sys.stderr)
         return 130
     return code
 

@@ -18,6 +18,7 @@ from tqdm import tqdm
 from ambjax import ledger, paper, plotting
 from ambjax._pytree import canonical
 from ambjax.casefile import Case, read_case
+from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.evidence import Evidence, gather
 from ambjax.loop import ClosedLoop
 from ambjax.mapping import run_map
@@ -73,8 +74,7 @@ def _member(case: Case, args: argparse.Namespace) -> Case:
         return case
     if case.spread.design == "latin-hypercube" and args.members is None:
         raise ValueError("--member: add --members N, the size of the ensemble; a Latin hypercube depends on it.")
-    members = args.member + 1 if args.members is None else args.members
-    study = study_of(case, args.seed, max(members, 1))
+    study = study_of(case, args.seed, MOST_MEMBERS if args.members is None else args.members)
     if not 0 <= args.member < study.members:
         raise ValueError(f"--member {args.member}: it must be a whole number from 0 to {study.members - 1}.")
     cascade, scenario = study.member(args.member)

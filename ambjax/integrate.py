@@ -112,14 +112,9 @@ class _Fixed:
             x, code, reached = carry
             alive = code == ALIVE
             # Times do not depend on who is alive: members share them, and what is driven by them.
-            new = self._step(problem, _inside(t + index * h, h), jnp.where(alive, h, 0.0), x)
-            verdict = problem.fate(new)
-            good = alive & (verdict == ALIVE)
-            return (
-                choose(good, new, x),
-                jnp.where(alive, verdict, code),
-                jnp.where(alive, t + (index + 1) * h, reached),
-            )
+            new = self._step(problem, _inside(t + index * h, h), h, x)
+            code = jnp.where(alive, problem.fate(new), code)
+            return choose(code == ALIVE, new, x), code, jnp.where(alive, t + (index + 1) * h, reached)
 
         begin = (state, jnp.asarray(code, jnp.int32), jnp.asarray(t, h.dtype))
         x, code, reached = lax.fori_loop(0, self.substeps, body, begin)
@@ -152,13 +147,16 @@ class RK4(_Fixed):
 
     def _step(self, problem: Problem, at: Times, h: Scalar, state: Any) -> Any:
         begin, middle, end = (problem.inputs(at(share)) for share in (0.0, 0.5, 1.0))
+        real = jnp.result_type(float).type  # Pallas gives a number without a type that of the condition
 
         def stage(s: Array, carry: tuple[Any, Any]) -> tuple[Any, Any]:
             x, gained = carry
-            gained = jax.tree.map(lambda g, a, b: g + jnp.where(s == 2, 2 / 3, 1 / 3) * (a - b), gained, x, state)
+            gained = jax.tree.map(
+                lambda g, a, b: g + jnp.where(s == 2, real(2 / 3), real(1 / 3)) * (a - b), gained, x, state
+            )
             first, last = s == 0, s == 3
             inputs = choose(first, begin, choose(last, end, middle))
-            share = jnp.where(last, 1 / 6, jnp.where(s == 2, 1.0, 0.5))
+            share = jnp.where(last, real(1 / 6), jnp.where(s == 2, real(1.0), real(0.5)))
             base = jax.tree.map(lambda a, g: a + jnp.where(last, g, 0.0), state, gained)
             return axpy(base, (h * share, problem.rates(inputs, x))), gained
 

@@ -16,11 +16,21 @@ def directory(asked: str | None, name: str) -> pathlib.Path:
 
     Raises ValueError if it cannot be made or written.
     """
-    if asked is None:
-        candidates = (pathlib.Path("out") / (name if n == 1 else f"{name}-{n}") for n in itertools.count(1))
-        path = next(p for p in candidates if not p.exists())
-    else:
-        path = pathlib.Path(asked)
+    path = chosen(asked, name)
+    make(path)
+    return path
+
+
+def chosen(asked: str | None, name: str) -> pathlib.Path:
+    """The directory to write to, which need not exist yet: as asked, or a new one under ./out."""
+    if asked is not None:
+        return pathlib.Path(asked)
+    candidates = (pathlib.Path("out") / (name if n == 1 else f"{name}-{n}") for n in itertools.count(1))
+    return next(p for p in candidates if not p.exists())
+
+
+def make(path: pathlib.Path) -> None:
+    """Make a directory and see that it can be written. Raises ValueError if not."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         probe = path / ".ambjax-write-test"
@@ -28,7 +38,6 @@ def directory(asked: str | None, name: str) -> pathlib.Path:
         probe.unlink()
     except OSError as error:
         raise ValueError(f"--out {path}: cannot write there ({error.strerror}). Choose another directory.") from None
-    return path
 
 
 def plain(value: Any) -> Any:

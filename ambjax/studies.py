@@ -2,10 +2,9 @@
 
 import argparse
 import contextlib
-import multiprocessing
 import pathlib
 from collections.abc import Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from typing import Any
 
 import numpy as np
@@ -14,16 +13,18 @@ from tqdm import tqdm
 from ambjax.casefile import Case, read_case
 from ambjax.ensemble import statistics
 from ambjax.ensemble.design import MOST_MEMBERS
-from ambjax.ensemble.engine import cores
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
-from ambjax.outputs import directory, plain, say, table, write_json
-from ambjax.worker import work
+from ambjax.outputs import chosen, make, plain, say, table, write_json
+from ambjax.worker import chunk, deaf_children, processes, work
 
 CHUNK = 1024
 # The fan chart is drawn from so many members and instants, whatever the size of the study.
 FAN_MEMBERS, FAN_TIMES = 256, 500
+# How long to look for the scheduler of a cluster.
+PATIENCE = "10s"
 BANDS = (0.0, 5.0, 25.0, 50.0, 75.0, 95.0, 100.0)
+GO_ON = "What is finished is kept: give the same command with --out and --resume to go on."
 SHOWN = ("settled_max_abs_error_m", "settled_rms_error_m", "max_abs_error_m", "max_abs_u_V", "rms_u_V", "max_abs_i_A")
 
 
@@ -40,19 +41,48 @@ def study_of(case: Case, seed: int | None, members: int) -> Study:
 def run_ensemble(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """ambjax ensemble."""
     case = read_case(args.case)
+    study, store = _asked(case, args)
+    out = store.directory
+    try:
+        with contextlib.nullcontext() if store.finished() else _executor(args) as executor:
+            make(out)  # not before everything that was asked for is known to be possible
+            say(f"method: {case.clock.method}; writing to {out}")
+            if not store.finished():
+                store.begin()
+                _run(study, store, executor)
+        store.finish()
+        return _report(case, study, args, out)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(_kept(store)) from None
+
+
+def _asked(case: Case, args: argparse.Namespace) -> tuple[Study, Store]:
+    """The study that is asked for, and where it is kept; nothing is written. Raises ValueError for what cannot be."""
     study = study_of(case, args.seed, args.members)
     if args.chunk < 1:
         raise ValueError(f"--chunk {args.chunk}: it must be a whole number of members, at least 1.")
     if args.processes is not None and args.processes < 1:
         raise ValueError(f"--processes {args.processes}: it must be a whole number, at least 1.")
-    out = directory(args.out, f"ensemble-{case.name}")
+    if args.resume and args.out is None:
+        raise ValueError("--resume: add --out DIR, the directory of the study that was interrupted.")
+    study.drawn(np.array([0]))  # raises what the design has against so many members
+    out = chosen(args.out, f"ensemble-{case.name}")
     store = Store(out, study.fingerprint(), study.members, min(args.chunk, study.members))
-    store.begin(COLUMNS + len(study.spread.entries), args.resume)
-    say(f"method: {case.clock.method}; writing to {out}")
-    if not store.finished():
-        with _executor(args) as executor:
-            _run(study, store, executor)
-        store.finish()
+    store.check(COLUMNS + len(study.spread.entries), args.resume)
+    return study, store
+
+
+def _kept(store: Store) -> str:
+    """What an interruption has left, and how to go on."""
+    if not store.begun():
+        return "nothing is kept"
+    kept = store.members if store.finished() else store.members - sum(b - a for a, b in store.missing())
+    again = f"give the same command with --out {store.directory} --resume"
+    return f"{kept} of {store.members} members are kept. To go on, {again}"
+
+
+def _report(case: Case, study: Study, args: argparse.Namespace, out: pathlib.Path) -> tuple[int, dict[str, Any]]:
+    """What is made of a finished study."""
     with np.load(out / "members.npz") as kept:
         columns = {name: kept[name] for name in kept.files}
     summary = _summary(case, study, columns)
@@ -72,18 +102,27 @@ def _executor(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]
     """Where chunks run: None for this process, or an executor and the number of chunks to keep in flight."""
     if args.cluster is not None:
         try:
-            from distributed import Client
+            from distributed import Client, KilledWorker
         except ImportError:
             raise ValueError("--cluster: Dask is not installed. Run: pip install 'ambjax[cluster]'.") from None
         try:
-            client = Client(args.cluster, timeout="10s")
+            client = Client(args.cluster, timeout=PATIENCE)
         except (OSError, ValueError) as error:
             raise ValueError(f"--cluster {args.cluster}: no scheduler answers there ({error}).") from None
-        with client:
-            yield client.get_executor(), 2 * max(len(client.scheduler_info()["workers"]), 1)
+        try:
+            with client:
+                yield client.get_executor(), 2 * max(len(client.scheduler_info()["workers"]), 1)
+        except (KilledWorker, CancelledError):
+            raise ValueError(
+                f"--cluster {args.cluster}: it was lost, or its workers died repeatedly. {GO_ON}"
+            ) from None
     elif args.processes is not None:
-        with ProcessPoolExecutor(args.processes, multiprocessing.get_context("spawn")) as pool:
-            yield pool, 2 * args.processes
+        try:
+            with processes(args.processes) as pool:
+                yield pool, 2 * args.processes
+        except BrokenExecutor:
+            why = "a worker process died, perhaps for want of memory"
+            raise ValueError(f"--processes {args.processes}: {why}; fewer need less. {GO_ON}") from None
     else:
         yield None
 
@@ -103,9 +142,8 @@ Found = Iterator[tuple[tuple[int, int], dict[str, Any]]]
 
 
 def _here(study: Study, store: Store, missing: list[tuple[int, int]]) -> Found:
-    call = -(-store.chunk // cores())
     for span in missing:
-        yield span, study.columns(*span, call=call)
+        yield span, chunk(study, *span, store.chunk)
 
 
 def _elsewhere(study: Study, store: Store, missing: list[tuple[int, int]], pool: Executor, ahead: int) -> Found:
@@ -113,7 +151,8 @@ def _elsewhere(study: Study, store: Store, missing: list[tuple[int, int]], pool:
     while queue or running:
         while queue and len(running) < ahead:
             span = queue.pop()
-            running[pool.submit(work, study, *span, store.chunk)] = span
+            with deaf_children():
+                running[pool.submit(work, study, *span, store.chunk)] = span
         for future in wait(running, return_when=FIRST_COMPLETED).done:
             yield running.pop(future), future.result()
 

@@ -1,10 +1,20 @@
 """What a process must do before it simulates, and what worker processes are sent."""
 
+import contextlib
+import multiprocessing
 import os
 import pathlib
+import signal
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
 from typing import Any
 
 from ambjax.ensemble.study import Study
+
+# Members in one call of the compiled program on a CPU. Fixed, because a last digit may depend on it: a study's numbers
+# must not depend on the cores of the machine, nor on where its chunks run.
+CALL = 64
 
 
 def prepare() -> None:
@@ -24,7 +34,51 @@ def prepare() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
 
 
-def work(study: Study, start: int, stop: int, call: int) -> dict[str, Any]:
-    """Members start <= k < stop of a study, in a process of its own, on one core."""
+def chunk(study: Study, start: int, stop: int, size: int, threads: int | None = None) -> dict[str, Any]:
+    """Members start <= k < stop of a study that is cut into chunks of `size`, on so many cores (None: all)."""
+    import jax
+
+    call = min(size, CALL) if jax.default_backend() == "cpu" else size
+    return study.columns(start, stop, call=call, threads=threads)
+
+
+def work(study: Study, start: int, stop: int, size: int) -> dict[str, Any]:
+    """A chunk of a study in a process of its own, on one core."""
     prepare()
-    return study.columns(start, stop, call=call, threads=1)
+    return chunk(study, start, stop, size, threads=1)
+
+
+@contextlib.contextmanager
+def processes(count: int) -> Iterator[Executor]:
+    """Worker processes that end at once with the block if it fails, and with this process however it ends."""
+    others = set(multiprocessing.active_children())
+    with ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_end_with_parent) as pool:
+        try:
+            yield pool
+        except BaseException:
+            for process in set(multiprocessing.active_children()) - others:
+                process.terminate()
+            raise
+
+
+@contextlib.contextmanager
+def deaf_children() -> Iterator[None]:
+    """Processes that are started in this block do not hear Ctrl-C, which is then their parent's alone."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with_parent() -> None:
+    def wait() -> None:
+        parent = multiprocessing.parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()

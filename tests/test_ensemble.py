@@ -153,7 +153,8 @@ STUDY = Study(SMOOTH, NOISY, SHORT, 2e-3, SPREAD, 11, 150)
 
 def run(study, directory, chunk=64, resume=False, stop_after=None):
     store = Store(directory, study.fingerprint(), study.members, chunk)
-    store.begin(COLUMNS, resume)
+    store.check(COLUMNS, resume)
+    store.begin()
     for span in store.missing()[:stop_after]:
         store.put(span, study.columns(*span, call=64))
     if not store.missing():
@@ -211,11 +212,11 @@ def test_a_store_refuses_what_it_cannot_hold(tmp_path):
         run(STUDY, tmp_path, chunk=32, resume=True)
     huge = Store(tmp_path / "huge", {}, 2**50, 1024)
     with pytest.raises(ValueError, match=r"GB free. At most [\d,]+ members fit"):
-        huge.begin(COLUMNS, resume=False)
+        huge.check(COLUMNS, resume=False)
     assert not (tmp_path / "huge").exists()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "file").touch()
-    with pytest.raises(ValueError, match="no study in it to resume"):
+    with pytest.raises(ValueError, match="there is no study in"):
         run(STUDY, tmp_path / "other", resume=True)
 
 

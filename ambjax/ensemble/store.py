@@ -28,11 +28,11 @@ class Store:
         self.facts = facts | {"chunk": chunk}
         self.chunks = directory / "chunks"
 
-    def begin(self, columns: int, resume: bool) -> None:
-        """Make the directory ready, or make sure that what it holds is the beginning of this very study.
+    def check(self, columns: int, resume: bool) -> None:
+        """Make sure that the directory is free, or holds the beginning of this very study. Changes nothing.
 
-        Raises ValueError, and changes nothing, if it holds another study, one that nobody asked to resume, or
-        if the disk has no room for `columns` numbers per member.
+        Raises ValueError if it holds another study, one that nobody asked to resume, none where one is to be
+        resumed, or if the disk has no room for `columns` numbers per member.
         """
         kept = self.directory / MANIFEST
         if kept.exists() and not resume:
@@ -41,18 +41,26 @@ class Store:
             )
         if kept.exists():
             self._compare(kept)
-        elif resume and self.directory.exists() and any(self.directory.iterdir()):
-            raise ValueError(f"--out {self.directory}: there is no study in it to resume. Leave out --resume.")
-        self._check_room(columns)
-        self.chunks.mkdir(parents=True, exist_ok=True)
+        elif resume:
+            raise ValueError(f"--resume: there is no study in {self.directory}. Check --out, or leave out --resume.")
+        elif self.finished() or self.chunks.exists():
+            raise ValueError(f"--out {self.directory}: it holds results, but no {MANIFEST}. Choose another.")
+        if not self.finished():
+            self._check_room(columns)
+
+    def begin(self) -> None:
+        """Make the directory ready for what `check` has let pass."""
+        self.directory.mkdir(parents=True, exist_ok=True)
+        facts = json.dumps(self.facts, indent=2).encode() + b"\n"
+        _write_whole(self.directory / MANIFEST, lambda file: file.write(facts))
+        self.chunks.mkdir(exist_ok=True)
         for left in self.chunks.glob("*.part"):
             left.unlink()
-        _write_whole(kept, lambda file: file.write(json.dumps(self.facts, indent=2).encode() + b"\n"))
 
     def _compare(self, kept: pathlib.Path) -> None:
         try:
-            found = json.loads(kept.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+            found = dict(json.loads(kept.read_text(encoding="utf-8")))
+        except (OSError, TypeError, ValueError) as error:
             raise ValueError(f"{kept}: cannot be read ({error}). Choose another --out.") from None
         for key in {**found, **self.facts}:
             here, there = self.facts.get(key), found.get(key)
@@ -89,11 +97,16 @@ class Store:
     def finish(self) -> pathlib.Path:
         """Put all chunks together as members.npz, a column at a time, and remove them."""
         path = self.directory / RESULT
-        with np.load(self._path(self.spans()[0])) as first:
-            kinds = {name: first[name].dtype for name in first.files}
-        _write_whole(path, lambda file: self._merge(file, kinds))
-        shutil.rmtree(self.chunks)
+        if not path.exists():
+            with np.load(self._path(self.spans()[0])) as first:
+                kinds = {name: first[name].dtype for name in first.files}
+            _write_whole(path, lambda file: self._merge(file, kinds))
+        shutil.rmtree(self.chunks, ignore_errors=True)
         return path
+
+    def begun(self) -> bool:
+        """Whether there is anything to resume."""
+        return (self.directory / MANIFEST).exists()
 
     def finished(self) -> bool:
         """Whether members.npz is there."""
