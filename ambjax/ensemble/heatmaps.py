@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -17,6 +17,8 @@ from ambjax.ensemble.scales import edges, log_ticks, named, relabelled, size_of
 from ambjax.plotting import INK
 
 CONTOUR = 0.95
+# Widths of the contours of survival and of the bounds of its interval; the last is drawn on top.
+LINES = {"low": 0.8, "high": 0.8, "survival": 2.2}
 # Both colour maps run evenly from dark to light: in grey print, too, light is good.
 SURVIVAL, ERROR = "cividis", "viridis_r"
 NOBODY = {"facecolor": "#d4d4d4", "edgecolor": "#8a8a8a", "hatch": "////", "linewidth": 0.0}
@@ -52,8 +54,8 @@ def maps(
     if rows == 2:
         _errors(figure, axes[1], panels, error_metric, labels)
     keys: list[Any] = [
-        Line2D([], [], color=INK, linewidth=1.8, label="95 % survival"),
-        Line2D([], [], color=INK, linewidth=1.1, linestyle="--", label="bounds of its confidence interval"),
+        Line2D([], [], color=INK, linewidth=LINES["survival"], label="95 % survival"),
+        Line2D([], [], color=INK, linewidth=LINES["low"], label="the same for the bounds of its confidence interval"),
     ]
     grids = [grid for panel in panels for grid in (panel["survival"], panel["error"]) if grid is not None]
     if not all(np.isfinite(grid).all() for grid in grids):
@@ -95,8 +97,8 @@ def _cells(ax: Axes, panel: Mapping[str, Any], values: np.ndarray, norm: Normali
     ax.set_xscale("log" if x_log else "linear")
     ax.set_yscale("log" if y_log else "linear")
     ax.pcolormesh(x_edges, y_edges, np.ma.masked_invalid(values), norm=norm, cmap=colours)
-    for name, line, width in (("low", "--", 1.1), ("high", "--", 1.1), ("survival", "-", 1.8)):
-        _contour(ax, x_factor * x, y_factor * y, np.asarray(panel[name], float), line, width)
+    for name, width in LINES.items():
+        _outline(ax, x_edges, y_edges, np.asarray(panel[name], float) >= CONTOUR, width)
     ax.set_xlim(x_edges[0], x_edges[-1])
     ax.set_ylim(y_edges[0], y_edges[-1])
     for axis, ends, log in ((ax.xaxis, x_edges, x_log), (ax.yaxis, y_edges, y_log)):
@@ -107,14 +109,21 @@ def _cells(ax: Axes, panel: Mapping[str, Any], values: np.ndarray, norm: Normali
     ax.tick_params(labelsize=8)
 
 
-def _contour(ax: Axes, x: np.ndarray, y: np.ndarray, share: np.ndarray, line: str, width: float) -> None:
-    """The line on which `share` is 95 %, if it is somewhere above and somewhere below."""
-    known = share[np.isfinite(share)]
-    if min(share.shape) < 2 or not known.size or not known.min() < CONTOUR <= known.max():
-        return
-    drawn = ax.contour(x, y, np.ma.masked_invalid(share), [CONTOUR], colors=INK, linestyles=line, linewidths=width)
-    # a white seam, so that it is seen on dark cells
-    drawn.set(path_effects=[patheffects.withStroke(linewidth=width + 1.6, foreground="white")])
+def _outline(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, inside: np.ndarray, width: float) -> None:
+    """Draw the edges between cells inside and outside.
+
+    Not a line interpolated between centres: that would cut through cells where survival falls from all to nothing.
+    """
+    row, column = np.nonzero(inside[:, 1:] != inside[:, :-1])
+    at = x_edges[column + 1]
+    upright = np.stack([np.stack([at, y_edges[row]], 1), np.stack([at, y_edges[row + 1]], 1)], 1)
+    row, column = np.nonzero(inside[1:] != inside[:-1])
+    at = y_edges[row + 1]
+    level = np.stack([np.stack([x_edges[column], at], 1), np.stack([x_edges[column + 1], at], 1)], 1)
+    # a white seam below all of the line, so that it is seen on dark cells
+    for colour, stroke in (("white", width + 1.4), (INK, width)):
+        lines = LineCollection([*upright, *level], colors=colour, linewidths=stroke, capstyle="projecting")
+        ax.add_collection(lines, autolim=False)
 
 
 def _range(panel: Mapping[str, Any]) -> str:

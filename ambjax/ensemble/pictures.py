@@ -1,4 +1,4 @@
-"""Pictures of ensembles: fan charts, histograms, tornado charts and heat maps, from arrays in SI units."""
+"""Pictures of ensembles: fan charts, histograms and tornado charts, from arrays in SI units."""
 
 import math
 import pathlib
@@ -13,11 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from ambjax.ensemble.heatmaps import maps
-from ambjax.ensemble.scales import finish, log_ticks, named, prefixed, size_of
+from ambjax.ensemble.scales import digits, finish, log_ticks, named, prefixed, size_of
 from ambjax.plotting import BINS, BLUE, INK, ORANGE, RED, thin
-
-__all__ = ["CHIEF", "QUANTITIES", "fan", "histograms", "maps", "tornado"]
 
 # What a fan can show: label and SI unit.
 QUANTITIES = {
@@ -106,7 +103,9 @@ def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float,
         ax.axhline(factor * value, color=RED, linestyle="--", linewidth=1.1, label="limit")
     ax.set_ylim(factor * low, factor * high)
     if beyond > 0:
-        words = f"{percents[0]:g} to {percents[-1]:g} % band reaches ±{factor * beyond:.3g} {unit}, beyond this axis"
+        words = (
+            f"the {percents[0]:g} to {percents[-1]:g} % band goes to {digits(factor * beyond)} {unit}, beyond this axis"
+        )
         ax.set_title(words, fontsize=7, loc="right", pad=2, color=INK)
     finish(ax, f"{label}\n({unit})")
 
@@ -118,17 +117,20 @@ def _tint(k: int, pairs: int) -> Any:
 
 
 def _reach(curves: Sequence[np.ndarray]) -> tuple[float, float, float]:
-    """Lowest and highest value to show, and how far the outermost band goes if it would dwarf the rest (else 0)."""
+    """Lowest and highest value to show, and the largest size if something brief or rare would dwarf the rest (else 0).
 
-    def extent(some: Sequence[np.ndarray]) -> tuple[float, float]:
-        values = np.concatenate(some)
-        values = values[np.isfinite(values)]
-        return (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
-
-    (low, high), inner = extent(curves), extent(curves[1:-1] or curves)
-    span = inner[1] - inner[0]
+    The rest: all bands but the outermost, for nine tenths of the time.
+    """
+    values, inner = np.concatenate(curves), curves[1:-1] or curves
+    lower, upper = inner[0][np.isfinite(inner[0])], inner[-1][np.isfinite(inner[-1])]
+    values = values[np.isfinite(values)]
+    if not (lower.size and upper.size):
+        return 0.0, 0.0, 0.0
+    low, high = float(values.min()), float(values.max())
+    bottom, top = float(np.quantile(lower, 0.05)), float(np.quantile(upper, 0.95))
+    span = top - bottom
     if span > 0 and high - low > 8 * span:
-        return inner[0] - 0.5 * span, inner[1] + 0.5 * span, max(abs(low), abs(high))
+        return bottom - 0.5 * span, top + 0.5 * span, max(abs(low), abs(high))
     return low, high, 0.0
 
 
@@ -201,18 +203,19 @@ def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> Non
     if log:
         ax.set_xscale("log")
         log_ticks(ax.xaxis, bounds[0], bounds[-1])
-    notes = []
+    notes, reached = [], "reached" in name
     ranked = np.sort(values[~np.isnan(values)])
     for share, (style, words) in MARKS.items():
         value = factor * ranked[math.ceil(share * ranked.size) - 1] if ranked.size else math.nan
         if math.isfinite(value) and (value > 0 or not log):
             ax.axvline(value, color=INK, linestyle=style, linewidth=1.2)
-        notes.append(
-            f"{words.removesuffix(' quantile')}: "
-            + (f"{value:.3g} {unit}".rstrip() if math.isfinite(value) else "none")
-        )
-    for count, words in ((np.sum(~np.isfinite(values)), "not finite"), (np.sum(finite == 0) * log, "at zero")):
-        notes += [f"{count} {'never' if words == 'not finite' and 'reached' in name else words}"] if count else []
+        found = f"{digits(value)} {unit}".rstrip() if math.isfinite(value) else "never" if reached else "none"
+        notes.append(f"{words.removesuffix(' quantile')}: {found}")
+    for count, words in (
+        (np.sum(~np.isfinite(values)), "never" if reached else "not finite"),
+        (np.sum(finite == 0) * log, "at zero"),
+    ):
+        notes += [f"{count} {words}"] if count else []
     ax.set_title(", ".join(notes), fontsize=8, pad=3)
     ax.set_xlabel(f"{label} ({unit})" if unit else label, fontsize=9)
     ax.set_ylim(0, 1.08 * max((alive + dead).max(), 1))

@@ -54,12 +54,23 @@ def named(metric: str, size: float) -> tuple[float, str, str]:
 
 
 def relabelled(label: str, size: float) -> tuple[float, str]:
-    """Factor and label of an axis whose label ends in its SI unit: "initial z (m)" of 2e-5 is "initial z (µm)"."""
+    """Factor and label of an axis whose label ends in its SI unit: "initial z (m)" of 2e-5 is "initial z (µm)".
+
+    Powers are written as in print, m/s^2 as m/s²; the unit 1 is left out.
+    """
     found = re.fullmatch(r"(.*)\(([^()]*)\)\s*", label)
     if not found:
         return 1.0, label
-    factor, unit = prefixed(found[2], size)
+    if found[2] == "1":
+        return 1.0, found[1].rstrip()
+    unit = re.sub(r"\^(2|3)(?![.\d])", lambda power: "²³"[int(power[1]) - 2], found[2]).replace("ohm", "Ω")
+    factor, unit = prefixed(unit, size)
     return factor, f"{found[1]}({unit})"
+
+
+def digits(value: float) -> str:
+    """A number with three digits, or all before the point: 12.3, 7000, 1.2e-05."""
+    return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 def edges(centres: np.ndarray, log: bool) -> np.ndarray:
