@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax._pytree import is_traced
-from ambjax.smooth import smooth_root, smooth_sign
+from ambjax.smooth import sine, smooth_root, smooth_sign
 
 log = logging.getLogger(__name__)
 
@@ -91,12 +91,12 @@ def _probe(tried: dict[str, Any]) -> str:
     """
 
     def body(_: Any, y: jax.Array) -> jax.Array:
-        return y + smooth_sign(y, 3.0) + smooth_root(y, 2.0) / (1 + y * y) + jnp.sin(y)
+        return y + smooth_sign(y, 3.0) + smooth_root(y, 2.0) / (1 + y * y) + sine(y)
 
     def expected(y: np.ndarray) -> np.ndarray:
         for _ in range(3):
             root = y / np.sqrt(np.sqrt(y * y + 0.25))
-            y = y + 2 / np.pi * np.arctan(3 * y) + root / (1 + y * y) + np.sin(y)
+            y = y + 2 / np.pi * np.arctan(3 * y) + root / (1 + y * y) + np.sin(2 * np.pi * y)
         return y
 
     try:

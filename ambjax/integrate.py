@@ -112,14 +112,9 @@ class _Fixed:
             x, code, reached = carry
             alive = code == ALIVE
             # Times do not depend on who is alive: members share them, and what is driven by them.
-            new = self._step(problem, _inside(t + index * h, h), jnp.where(alive, h, 0.0), x)
-            verdict = problem.fate(new)
-            good = alive & (verdict == ALIVE)
-            return (
-                choose(good, new, x),
-                jnp.where(alive, verdict, code),
-                jnp.where(alive, t + (index + 1) * h, reached),
-            )
+            new = self._step(problem, _inside(t + index * h, h), h, x)
+            code = jnp.where(alive, problem.fate(new), code)
+            return choose(code == ALIVE, new, x), code, jnp.where(alive, t + (index + 1) * h, reached)
 
         begin = (state, jnp.asarray(code, jnp.int32), jnp.asarray(t, h.dtype))
         x, code, reached = lax.fori_loop(0, self.substeps, body, begin)

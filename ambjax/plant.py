@@ -1,14 +1,29 @@
 """The plant: a vertical rotor between two electromagnets, Eqs. (1)-(3) and Table 1."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jax import Array
 
 from ambjax._pytree import Scalar, leaf, record
-from ambjax.smooth import safe_sqrt
+from ambjax.smooth import reciprocal, safe_sqrt
 
 # A gap is never taken smaller than this share of s_0. No accepted state comes near it (the rotor has
 # touched down long before); it keeps a trial stage of an integrator, and its derivatives, finite.
 GAP_FLOOR = 0.005
+
+
+class Gaps(NamedTuple):
+    """Upper gap, lower gap, and 1 / (upper lower): m, m, 1/m^2. Divisions are what a step's time goes into."""
+
+    upper: Array
+    lower: Array
+    inverse: Array
+
+    @property
+    def inverses(self) -> tuple[Array, Array]:
+        """1 / upper gap and 1 / lower gap, in 1/m."""
+        return self.lower * self.inverse, self.upper * self.inverse
 
 
 @record
@@ -53,16 +68,12 @@ class Plant:
         """Force per current at the origin: kappa i_0 / s_0^2, in N/A."""
         return self.kappa * self.i_0 / self.s_0**2
 
-    def gaps(self, z: Scalar) -> tuple[Array, Array]:
-        """Upper gap s_0 - z and lower gap s_0 + z, in m, floored at 0.5 % of s_0."""
+    def gaps(self, z: Scalar) -> Gaps:
+        """Upper gap s_0 - z and lower gap s_0 + z, floored at 0.5 % of s_0."""
         floor = GAP_FLOOR * self.s_0
-        return jnp.maximum(self.s_0 - z, floor), jnp.maximum(self.s_0 + z, floor)
-
-    def gap_inverses(self, z: Scalar) -> tuple[Array, Array]:
-        """1 / upper gap and 1 / lower gap, in 1/m, by one division: divisions are what a step's time goes into."""
-        upper, lower = self.gaps(z)
-        both = 1 / (upper * lower)
-        return lower * both, upper * both
+        upper, lower = self.s_0 - z, self.s_0 + z
+        upper, lower = jnp.where(upper > floor, upper, floor), jnp.where(lower > floor, lower, floor)
+        return Gaps(upper, lower, reciprocal(upper * lower))
 
     def v(self, z: Scalar, i: Scalar) -> Array:
         """Scaled magnetic force, in A^2/m^2: ((i_0+i)/(s_0-z))^2 - ((i_0-i)/(s_0+z))^2. Eq. (3)."""
@@ -70,7 +81,7 @@ class Plant:
 
     def dv_dz(self, z: Scalar, i: Scalar) -> Array:
         """Partial derivative of v in z, in A^2/m^3: 2 (i_0+i)^2/(s_0-z)^3 + 2 (i_0-i)^2/(s_0+z)^3."""
-        upper, lower = self.gap_inverses(z)
+        upper, lower = self.gaps(z).inverses
         return 2 * (self.i_0 + i) ** 2 * upper**3 + 2 * (self.i_0 - i) ** 2 * lower**3
 
     def dv_di(self, z: Scalar, i: Scalar) -> Array:
@@ -80,9 +91,10 @@ class Plant:
         """
         return self.v_and_dv_di(z, i)[1]
 
-    def v_and_dv_di(self, z: Scalar, i: Scalar) -> tuple[Array, Array]:
-        """v and dv/di at once."""
-        upper, lower = self.gap_inverses(z)
+    def v_and_dv_di(self, z: Scalar, i: Scalar, gaps: Gaps | None = None) -> tuple[Array, Array]:
+        """v and dv/di at once. `gaps` are those at z, if they are known."""
+        gaps = gaps or self.gaps(z)
+        upper, lower = gaps.inverses
         above, below = (self.i_0 + i) * upper, (self.i_0 - i) * lower
         return above**2 - below**2, 2 * (above * upper + below * lower)
 
@@ -92,7 +104,7 @@ class Plant:
         Written without cancellation, so it is smooth through z = 0, where the quadratic
         degenerates. Where v has no real root it returns the point of C at that z, whose v is nearest.
         """
-        upper, lower = self.gaps(z)
+        upper, lower, _ = self.gaps(z)
         total, difference = 1 / upper**2 + 1 / lower**2, 1 / upper**2 - 1 / lower**2
         excess = v - self.i_0**2 * difference
         discriminant = (2 * self.i_0 / (upper * lower)) ** 2 + difference * v
@@ -102,12 +114,20 @@ class Plant:
 
     def z_ddot(self, z: Scalar, i: Scalar, q_z: Scalar = 0.0) -> Array:
         """Acceleration, in m/s^2: 2 k_z z/m + a v(z, i) - g + q_z. Eq. (1)."""
-        return 2 * self.k_z / self.m * z + self.a * self.v(z, i) - self.g + q_z
+        return self.rates(z, 0.0, i, 0.0, q_z)[0]
 
     def i_dot(self, z: Scalar, z_dot: Scalar, i: Scalar, u: Scalar, q_i: Scalar = 0.0) -> Array:
         """Rate of the current deviation, in A/s: 2 z_dot i/(s_0+z) + 2 (s_0+z)(u - R i)/kappa + q_i. Eq. (2)."""
-        lower, inverse = self.gaps(z)[1], self.gap_inverses(z)[1]
-        return 2 * z_dot * inverse * i + (2 / self.kappa) * lower * (u - self.R * i) + q_i
+        return self.rates(z, z_dot, i, u, 0.0, q_i)[1]
+
+    def rates(
+        self, z: Scalar, z_dot: Scalar, i: Scalar, u: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0
+    ) -> tuple[Array, Array]:
+        """`z_ddot` and `i_dot` at once."""
+        gaps = self.gaps(z)
+        z_ddot = 2 * self.k_z / self.m * z + self.a * self.v_and_dv_di(z, i, gaps)[0] - self.g + q_z
+        i_dot = 2 * z_dot * gaps.inverses[1] * i + (2 / self.kappa) * gaps.lower * (u - self.R * i) + q_i
+        return z_ddot, i_dot
 
     def equilibrium(self, z: Scalar = 0.0) -> tuple[Array, Array]:
         """Current (A) and voltage (V) that hold the rotor still at z: z_ddot = i_dot = 0."""

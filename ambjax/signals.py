@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax._pytree import Scalar, leaf, record
+from ambjax.smooth import TWO_PI, sine
 
 
 class Signal(Protocol):
@@ -73,7 +74,7 @@ class Sine:
     phase: Scalar = leaf(default=0.0, unit="rad", doc="phase at t = 0")
 
     def __call__(self, t: Scalar) -> Array:
-        return self.amplitude * jnp.sin(2 * jnp.pi * self.frequency * jnp.asarray(t) + self.phase)
+        return self.amplitude * sine(self.frequency * jnp.asarray(t) + self.phase / TWO_PI)
 
 
 @record
@@ -108,7 +109,7 @@ class Chirp:
         sweep = jnp.minimum(t, self.duration)
         gain = (self.frequency_end - self.frequency) / self.duration
         cycles = self.frequency * sweep + gain * sweep**2 / 2 + self.frequency_end * (t - sweep)
-        return self.amplitude * jnp.sin(2 * jnp.pi * cycles)
+        return self.amplitude * sine(cycles)
 
 
 # Sines in one realisation of band-limited noise. Its fourth moment falls short of a Gaussian's by 1.5/LINES of std^4.
@@ -124,8 +125,8 @@ class Lines:
     phases: Array
 
     def __call__(self, t: Scalar) -> Array:
-        angle = 2 * jnp.pi * self.frequencies * jnp.asarray(t)[..., None] + self.phases
-        return self.std * math.sqrt(2 / self.phases.size) * jnp.sum(jnp.sin(angle), axis=-1)
+        turns = self.frequencies * jnp.asarray(t)[..., None] + self.phases / TWO_PI
+        return self.std * math.sqrt(2 / self.phases.size) * jnp.sum(sine(turns), axis=-1)
 
 
 @record

@@ -7,9 +7,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax._apart import apart
 from ambjax._pytree import Scalar
 
 TWO_OVER_PI = 0.6366197723675814
+TWO_PI = 6.283185307179586
 HALF_PI = 1.5707963267948966
 # arctan x = x P(x^2) / Q(x^2) on |x| <= 1, to 2e-15 relative in float64.
 ARCTAN_P = (
@@ -44,15 +46,48 @@ ARCTAN_R = (
     0.0028498761308979135,
 )
 
-
-def _polynomial(u: Array, coefficients: Sequence[Scalar]) -> Any:
-    total = coefficients[-1]
-    for coefficient in coefficients[-2::-1]:
-        total = total * u + coefficient
-    return total
+# sin(2 pi y) = y S(y^2) on |y| <= 1/4, to 3e-19 and 7e-9 relative: interpolated at Chebyshev nodes.
+SINE_S = {
+    "float64": (
+        6.283185307179586,
+        -41.341702240399755,
+        81.60524927607362,
+        -76.70585975282492,
+        42.058693925428685,
+        -15.0946416761179,
+        3.8199280942271643,
+        -0.7177337921413454,
+        0.10089695501646812,
+    ),
+    "float32": (6.283185280154407, -41.34168061334652, 81.60247636892518, -76.58117264427872, 39.7598270853191),
+}
 
 
 @jax.custom_jvp
+@apart
+def reciprocal(x: Array) -> Array:
+    """1/x, divided once however often it is used."""
+    return 1 / x
+
+
+@reciprocal.defjvp
+def _reciprocal_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    value = reciprocal(*primals)
+    return value, -tangents[0] * value * value
+
+
+def _polynomial(u: Array, coefficients: Sequence[Scalar]) -> Any:
+    """Neighbours in pairs, then pairs in pairs (Estrin): a third of the latency of Horner's scheme."""
+    terms = list(coefficients)
+    while len(terms) > 1:
+        odd = [*terms[1::2], *[None] * (len(terms) % 2)]
+        terms = [a if b is None else a + b * u for a, b in zip(terms[::2], odd, strict=True)]
+        u = u * u
+    return terms[0]
+
+
+@jax.custom_jvp
+@apart
 def arctan_per(x: Array, per: Array) -> Array:
     """arctan(x) / per with one division, which vectorises; XLA's own arctan is a scalar library call on CPUs.
 
@@ -80,6 +115,41 @@ def _arctan_per_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array])
     (x, per), (dx, d_per) = primals, tangents
     value = arctan_per(x, per)
     return value, (dx / (1 + x * x) - value * d_per) / per
+
+
+def _turn(x: Array) -> Array:
+    """The part of x turns in -1/2..1/2, exactly."""
+    return x - jnp.floor(x + 0.5)
+
+
+def _quarter(y: Array) -> Array:
+    """sin(2 pi y) for |y| <= 1/4."""
+    return y * _polynomial(y * y, SINE_S[y.dtype.name])
+
+
+@jax.custom_jvp
+def sine(x: Array) -> Array:
+    """sin(2 pi x): an angle in turns is reduced exactly, and it vectorises; XLA's own is a library call on CPUs."""
+    y = _turn(x)
+    return _quarter(jnp.where(jnp.abs(y) > 0.25, jnp.where(y < 0, -0.5, 0.5) - y, y))
+
+
+@jax.custom_jvp
+def cosine(x: Array) -> Array:
+    """cos(2 pi x)."""
+    return _quarter(0.25 - jnp.abs(_turn(x)))
+
+
+@sine.defjvp
+def _sine_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (dx,) = primals, tangents
+    return sine(x), TWO_PI * cosine(x) * dx
+
+
+@cosine.defjvp
+def _cosine_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (dx,) = primals, tangents
+    return cosine(x), -TWO_PI * sine(x) * dx
 
 
 def smooth_sign(x: Scalar, p: Scalar, per: Scalar = 1.0) -> Array:

@@ -13,7 +13,7 @@ ROOT = pathlib.Path(__file__).parent.parent
 # Floor of every module. An import points to a lower floor, or within its own without a cycle. A new module gets
 # a row here. `control.*` stands for all modules of that package.
 FLOORS = {
-    1: "_pytree _kernel smooth _linear _version",
+    1: "_pytree _apart _kernel smooth _linear _version",
     2: "plant signals integrate trajectory",
     3: "control control.* scenario metrics",
     4: "loop method rollout theorem proof linear paper evidence ledger plotting",
@@ -21,7 +21,13 @@ FLOORS = {
     6: "casefile tomltable spreadfile template outputs worker studies mapping commands __main__ tuning tuning.*",
 }
 # Modules that may import matplotlib: those that draw.
-DRAWING = {"ambjax.plotting", "ambjax.ensemble.pictures", "ambjax.ensemble.heatmaps", "tuning.report"}
+DRAWING = {
+    "ambjax.plotting",
+    "ambjax.ensemble.pictures",
+    "ambjax.ensemble.heatmaps",
+    "ambjax.ensemble.scales",
+    "tuning.report",
+}
 FILES = sorted([*ROOT.glob("ambjax/**/*.py"), *ROOT.glob("tuning/**/*.py")])
 
 

@@ -5,7 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax.smooth import TWO_OVER_PI, away_from_zero, safe_sqrt, smooth_root, smooth_sign
+from ambjax._kernel import one_kernel
+from ambjax.smooth import (
+    TWO_OVER_PI,
+    arctan_per,
+    away_from_zero,
+    cosine,
+    reciprocal,
+    safe_sqrt,
+    sine,
+    smooth_root,
+    smooth_sign,
+)
 
 EPS = np.finfo(float).eps
 P = [0.1, 25.0, 1e4]
@@ -65,3 +76,66 @@ def test_away_from_zero_keeps_sign_and_leaves_the_rest_alone():
     np.testing.assert_array_equal(away_from_zero(x, 0.5), [-2.0, -0.5, -0.5, 0.5, 0.5, 0.5, 2.0])
     np.testing.assert_array_equal(jax.vmap(jax.grad(away_from_zero), (0, None))(x, 0.5), [1, 1, 0, 0, 0, 1, 1])
     assert np.isfinite(jax.grad(lambda x: 1 / away_from_zero(x, 1e-12))(0.0))
+
+
+# Around 0, around the points where the argument is folded, and far out.
+RATIOS = np.concatenate([np.logspace(-30, 18, 3001), 1 + np.linspace(-1e-3, 1e-3, 2000)])
+TURNS = np.concatenate([np.linspace(-3, 3, 4801), np.logspace(-15, 5, 3000), np.arange(-9, 9) / 8 + 1e-9])
+DTYPES = [np.float64, np.float32]
+
+
+def wide(function):
+    """As an ensemble compiles it: one kernel, 61 lanes at a time, so that vectors have a rest."""
+    kernel = one_kernel(lambda *blocks: jax.lax.map(lambda x: jax.vmap(function)(*x), blocks))
+
+    def run(*args):
+        padded = [np.pad(x, (0, -x.size % 61), constant_values=1).reshape(-1, 61) for x in args]
+        return np.asarray(kernel(*padded)).reshape(-1)[: args[0].size]
+
+    return run
+
+
+def exact_turns(x):
+    """sin and cos of 2 pi x, in long double from an exactly reduced angle."""
+    y = np.asarray(x, np.longdouble)
+    y = 8 * np.arctan(np.longdouble(1)) * (y - np.round(y))
+    return np.sin(y), np.cos(y)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_arctan_per_is_numpys_arctan_over_per(dtype):
+    x = np.concatenate([-RATIOS, RATIOS, [0.0]]).astype(dtype)
+    per = np.linspace(0.5, 7, x.size).astype(dtype)
+    expected = np.arctan(x.astype(np.longdouble)) / per.astype(np.longdouble)
+    # the approximation's own 2e-15 (9 eps) in float64, a few roundings in float32
+    np.testing.assert_allclose(wide(arctan_per)(x, per), expected, rtol=10 * np.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_sine_and_cosine_of_turns_are_numpys(dtype):
+    x = TURNS.astype(dtype)
+    sin, cos = exact_turns(x)
+    # relative where the sine is small, too: the reduced angle is exact; its polynomial rounds a few times.
+    # At half turns long double's pi leaves the reference 1e-19 beside 0.
+    eps = np.finfo(dtype).eps
+    np.testing.assert_allclose(wide(sine)(x), sin, rtol=4 * eps, atol=1e-18)
+    np.testing.assert_allclose(wide(cosine)(x), cos, rtol=4 * eps, atol=2 * eps)
+
+
+def test_derivatives_of_elementary_functions_are_exact():
+    x = np.linspace(-2.3, 2.3, 46)  # without 0
+    sin, cos = (np.asarray(v, float) for v in exact_turns(x))
+    turn = 2 * np.pi
+    cases = [
+        (sine, turn * cos, -(turn**2) * sin),
+        (cosine, -turn * sin, -(turn**2) * cos),
+        (reciprocal, -1 / x**2, 2 / x**3),
+        (lambda x: arctan_per(x, 2.0), 0.5 / (1 + x**2), -x / (1 + x**2) ** 2),
+        (lambda x: arctan_per(2.0, x), -np.arctan(2.0) / x**2, 2 * np.arctan(2.0) / x**3),
+    ]
+    for f, first, second in cases:
+        for derivative, expected in ((jax.grad(f), first), (jax.grad(jax.grad(f)), second)):
+            # absolute: sine and cosine cross zero, to a few units of their largest slopes
+            np.testing.assert_allclose(jax.vmap(derivative)(x), expected, rtol=20 * EPS, atol=200 * EPS)
+        forward = jax.vmap(lambda x, f=f: jax.jvp(f, (x,), (1.0,))[1])(x)
+        np.testing.assert_allclose(forward, first, rtol=20 * EPS, atol=200 * EPS)

@@ -91,11 +91,12 @@ class Cascade:
 
         point = (reference, measured.z, measured.z_dot, state.observer, state.position)
         (z, v_star), (estimate, observed_rate, positioned_rate) = wanted(*point)
+        gaps = self.model.gaps(estimate.z)
         z_ddot = self.model.z_ddot(estimate.z, estimate.i)
         along = (reference.rate(), measured.z_dot, z_ddot, observed_rate, positioned_rate)
         z_rate, v_star_rate = jax.jvp(lambda *x: wanted(*x)[0], point, along)[1]
         rates = CascadeState(observed_rate, positioned_rate, (), ())
-        return ForceDemand(z, z_rate, v_star, v_star_rate), estimate, rates
+        return ForceDemand(z, z_rate, v_star, v_star_rate, gaps), estimate, rates
 
     def __call__(
         self, measured: Measurement, state: CascadeState, reference: Reference, u_max: Scalar
@@ -103,7 +104,7 @@ class Cascade:
         """Command and rate of every law's state. `u_max` is the supply's limit in V (inf: none)."""
         force, estimate, rates = self.demand(measured, state, reference)
         wanted, inversion_rate = self.inversion(self.model, force, state.inversion)
-        u, current_rate = self.current(self.model, CurrentInputs(estimate, wanted, u_max), state.current)
-        v_tilde = force.v_star - self.model.v(force.z, wanted.i_ref)
+        u, current_rate = self.current(self.model, CurrentInputs(estimate, wanted, u_max, force.gaps), state.current)
+        v_tilde = force.v_star - self.model.v_and_dv_di(force.z, wanted.i_ref, force.gaps)[0]
         command = Command(force.v_star, v_tilde, wanted.i_ref, wanted.i_ref_dot, u)
         return command, rates._replace(inversion=inversion_rate, current=current_rate)

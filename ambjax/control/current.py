@@ -27,7 +27,7 @@ class SlidingMode:
 
     def __call__(self, model: Plant, inputs: CurrentInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
         measured, demand = inputs.measured, inputs.demand
-        inverse = model.gap_inverses(measured.z)[1]
+        inverse = (inputs.gaps or model.gaps(measured.z)).inverses[1]
         robust = -self.k_i * smooth_sign(measured.i - demand.i_ref, self.p)
         wanted = -2 * measured.z_dot * inverse * measured.i + demand.i_ref_dot + robust
         return (model.kappa / 2) * inverse * wanted + model.R * measured.i, ()

@@ -36,7 +36,7 @@ class Adaptive:
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:
         floor = GRADIENT_FLOOR * 4 * model.i_0 / model.s_0**2
-        v, dv_di = model.v_and_dv_di(inputs.z, state)
+        v, dv_di = model.v_and_dv_di(inputs.z, state, inputs.gaps)
         rate = self.gamma * smooth_sign(inputs.v_star - v, self.p, per=away_from_zero(dv_di, floor))
         return CurrentDemand(state, rate), rate
 

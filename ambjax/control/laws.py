@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 from jax import Array
 
 from ambjax._pytree import Scalar
-from ambjax.plant import Plant
+from ambjax.plant import Gaps, Plant
 from ambjax.signals import Reference
 
 State = Any
@@ -30,13 +30,15 @@ class Measurement(NamedTuple):
 class ForceDemand(NamedTuple):
     """Input of an inversion law: where the rotor is (m) and the force wanted there (A^2/m^2), with their rates.
 
-    `z_rate` is the rate of the estimate z itself, which an observer may let differ from the velocity.
+    `z_rate` is the rate of the estimate z itself, which an observer may let differ from the velocity. `gaps` are
+    the model's at z, shared between laws where they are known: None asks a law to compute them.
     """
 
     z: Array
     z_rate: Array
     v_star: Array
     v_star_rate: Array
+    gaps: Gaps | None = None
 
 
 class CurrentDemand(NamedTuple):
@@ -47,11 +49,12 @@ class CurrentDemand(NamedTuple):
 
 
 class CurrentInputs(NamedTuple):
-    """Input of a current law: the measurement, the demand, and the supply's limit in V."""
+    """Input of a current law: the measurement, the demand, the supply's limit in V, and the model's gaps, if known."""
 
     measured: Measurement
     demand: CurrentDemand
     u_max: Scalar
+    gaps: Gaps | None = None
 
 
 class Observer(Protocol):

@@ -1,0 +1,31 @@
+"""Have XLA's CPU backend compile a function as a loop of its own.
+
+XLA fuses elementwise arithmetic into large loops and repeats divisions in every fusion that uses them. An
+iteration of a loop with several divisions in a row is one long chain, of which the processor holds hardly two at
+once; shorter loops overlap. No barrier of JAX's survives to that point, but a call that XLA may not inline does.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+
+def apart(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+    """`function` of arrays, neither fused with its surroundings nor repeated in them on CPUs; elsewhere as it is.
+
+    For what lies under a custom_jvp: reverse mode through the call itself is not provided for.
+    """
+    inner = jax.jit(function)
+
+    @functools.wraps(function)
+    def call(*args: Any) -> jax.Array:
+        if jax.default_backend() != "cpu":
+            return function(*args)
+        from jax.experimental.xla_metadata import set_xla_metadata
+
+        result: Any = set_xla_metadata(inner(*args), inlineable="false")
+        return result
+
+    return call

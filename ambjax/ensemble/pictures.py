@@ -1,0 +1,265 @@
+"""Pictures of ensembles: fan charts, histograms, tornado charts and heat maps, from arrays in SI units."""
+
+import math
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from ambjax.ensemble.heatmaps import maps
+from ambjax.ensemble.scales import finish, log_ticks, named, prefixed, size_of
+from ambjax.plotting import BINS, BLUE, INK, ORANGE, RED, thin
+
+__all__ = ["CHIEF", "QUANTITIES", "fan", "histograms", "maps", "tornado"]
+
+# What a fan can show: label and SI unit.
+QUANTITIES = {
+    "z - r": ("$z - r$", "m"),
+    "z": ("position $z$", "m"),
+    "sigma": (r"sliding variable $\sigma$", "m/s"),
+    "u": ("voltage $u$", "V"),
+    "i": ("current $i$", "A"),
+    "v_tilde": (r"force error $\tilde v$", "A²/m²"),
+}
+CHIEF = (
+    "settled_max_abs_error_m",
+    "settled_rms_error_m",
+    "max_abs_error_m",
+    "rms_error_m",
+    "clearance_used",
+    "settled_max_abs_sigma_m_per_s",
+    "v_tilde_reached_s",
+    "max_abs_i_A",
+    "max_abs_u_V",
+    "rms_u_V",
+    "chatter_V",
+    "copper_loss_W",
+)
+MOST_DRIVERS = 12
+LOST = {"facecolor": RED, "edgecolor": "white", "hatch": "////", "linewidth": 0.0}
+MARKS: dict[float, tuple[Any, str]] = {0.5: ("-", "median"), 0.95: ("--", "95 % quantile")}
+
+
+def fan(
+    t: np.ndarray,
+    bands: Mapping[str, Mapping[float, np.ndarray]],
+    limits: Mapping[str, float],
+    title: str,
+    path: pathlib.Path,
+    lost_at: np.ndarray | None = None,
+) -> None:
+    """Write quantile bands over time, one panel per quantity (keys of QUANTITIES), all in SI units.
+
+    `bands[quantity][percent]` is that quantile at the times t [T] (s), best taken over the members still alive; NaN
+    where none is left. `limits[quantity]` (> 0) is drawn at plus and minus its value where the data come near it.
+    `lost_at` [N] (s, +inf: never) of all members adds a panel with the share that survives. Raises ValueError for a
+    quantity that it does not know.
+    """
+    t = np.asarray(t, float)
+    extra = [0.55] if lost_at is not None else []
+    heights = [1.0] * len(bands) + extra
+    figure = Figure(figsize=(8.0, 2.1 * sum(heights) + 0.9), layout="constrained")
+    axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    for ax, (quantity, quantiles) in zip(axes, bands.items(), strict=False):
+        _fan_panel(ax, t, quantity, quantiles, limits.get(quantity, math.inf))
+    if lost_at is not None:
+        _survivors(axes[-1], t, np.asarray(lost_at, float))
+    if t[-1] > t[0]:
+        axes[-1].set_xlim(t[0], t[-1])
+    axes[-1].set_xlabel("time (s)", fontsize=9)
+    figure.align_ylabels(axes)
+    figure.suptitle(title, fontsize=11)
+    shown = {label: h for ax in axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
+    figure.savefig(path, dpi=150)
+
+
+def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float, np.ndarray], limit: float) -> None:
+    if quantity not in QUANTITIES:
+        raise ValueError(f"fan: cannot draw {quantity!r}; it knows {', '.join(QUANTITIES)}")
+    label, unit = QUANTITIES[quantity]
+    percents = sorted(quantiles)
+    curves = [np.asarray(quantiles[percent], float) for percent in percents]
+    low, high, beyond = _reach(curves)
+    factor, unit = prefixed(unit, max(abs(low), abs(high)))
+    starts = np.arange(0, len(t), max(1, len(t) // BINS))
+    pairs = len(percents) // 2
+    for k in range(pairs):
+        # the least and the largest of each bin, more of them than the picture has pixels
+        lower, upper = np.fmin.reduceat(curves[k], starts), np.fmax.reduceat(curves[-1 - k], starts)
+        name = f"{percents[k]:g} to {percents[-1 - k]:g} %"
+        ax.fill_between(t[starts], factor * lower, factor * upper, color=_tint(k, pairs), linewidth=0, label=name)
+    if len(percents) % 2:
+        ax.plot(*thin(t, factor * curves[pairs]), color=INK, linewidth=1.0, label="median")
+    # near: the data come within a quarter of the limit
+    near = [value for value, peak in ((limit, high), (-limit, -low)) if limit <= 1.33 * peak]
+    margin = 0.08 * (high - low) or 0.1 * abs(high) or 1.0
+    low, high = min([low - margin, *(1.08 * value for value in near)]), max([high + margin, *(1.08 * v for v in near)])
+    for value in near:
+        ax.axhline(factor * value, color=RED, linestyle="--", linewidth=1.1, label="limit")
+    ax.set_ylim(factor * low, factor * high)
+    if beyond > 0:
+        words = f"{percents[0]:g} to {percents[-1]:g} % band reaches ±{factor * beyond:.3g} {unit}, beyond this axis"
+        ax.set_title(words, fontsize=7, loc="right", pad=2, color=INK)
+    finish(ax, f"{label}\n({unit})")
+
+
+def _tint(k: int, pairs: int) -> Any:
+    """Blue for the k-th of `pairs` nested bands, counted from outside: the inner, the stronger."""
+    strength = 0.2 + 0.45 * k / max(pairs - 1, 1)
+    return tuple(1 - strength * (1 - part) for part in to_rgb(BLUE))
+
+
+def _reach(curves: Sequence[np.ndarray]) -> tuple[float, float, float]:
+    """Lowest and highest value to show, and how far the outermost band goes if it would dwarf the rest (else 0)."""
+
+    def extent(some: Sequence[np.ndarray]) -> tuple[float, float]:
+        values = np.concatenate(some)
+        values = values[np.isfinite(values)]
+        return (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+
+    (low, high), inner = extent(curves), extent(curves[1:-1] or curves)
+    span = inner[1] - inner[0]
+    if span > 0 and high - low > 8 * span:
+        return inner[0] - 0.5 * span, inner[1] + 0.5 * span, max(abs(low), abs(high))
+    return low, high, 0.0
+
+
+def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray) -> None:
+    """The share of members still alive, and a tick for each one lost."""
+    lost = np.sort(lost_at[lost_at <= t[-1]])
+    at = np.linspace(t[0], t[-1], BINS)
+    dead = np.searchsorted(lost, at, side="right")
+    share = 100 * (1 - dead / max(len(lost_at), 1))
+    ax.step(at, share, where="post", color=INK, linewidth=1.2)
+    floor = max(0.0, 100 - 1.6 * max(100 - share[-1], 5.0))
+    top = 100 + 0.12 * (100 - floor)
+    ax.set_ylim(floor - 0.12 * (100 - floor), top)
+    if len(lost):
+        ticks = np.unique(at[np.clip(np.searchsorted(at, lost), 0, BINS - 1)])
+        where = ax.get_xaxis_transform()
+        ax.plot(ticks, np.full(len(ticks), 0.08), "|", color=RED, markersize=7, label="a member lost", transform=where)
+    words = f"{len(lost_at) - len(lost)} of {len(lost_at)} survive ({share[-1]:.4g} %)"
+    ax.set_title(words, fontsize=8, loc="right", pad=2, color=INK)
+    ax.yaxis.set_major_locator(MaxNLocator(3))
+    finish(ax, "survivors\n(%)")
+
+
+def histograms(columns: Mapping[str, Any], path: pathlib.Path, metrics: Sequence[str] = CHIEF) -> None:
+    """Write a grid of histograms of the `metrics` that `columns` (members.npz, each [N]) has, survivors and lost apart.
+
+    Who is lost is read from `lost`, or else from a finite `lost_at` or `lost_at_s`; without any of them all survive.
+    Raises ValueError if `columns` has none of the metrics.
+    """
+    names = [name for name in metrics if name in columns]
+    if not names:
+        raise ValueError(f"histograms: none of {', '.join(metrics)} among the columns {', '.join(columns)}")
+    lost = _lost(columns, len(columns[names[0]]))
+    across = min(3, len(names))
+    down = -(-len(names) // across)
+    figure = Figure(figsize=(max(4.0 * across, 5.5), 2.5 * down + 0.8), layout="constrained")
+    axes = figure.subplots(down, across, squeeze=False).ravel()
+    for ax, name in zip(axes, names, strict=False):
+        _histogram(ax, name, np.asarray(columns[name], float), lost)
+    for ax in axes[len(names) :]:
+        ax.set_axis_off()
+    keys = [Patch(color=BLUE, label="survivors"), Patch(label="lost members", **LOST)]
+    keys += [Line2D([], [], color=INK, linestyle=s, label=f"{n} of all members") for s, n in MARKS.values()]
+    figure.suptitle(f"{lost.size} members, {int(lost.sum())} lost", fontsize=11)
+    figure.legend(handles=keys, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    figure.savefig(path, dpi=130)
+
+
+def _lost(columns: Mapping[str, Any], members: int) -> np.ndarray:
+    if "lost" in columns:
+        return np.asarray(columns["lost"], bool)
+    for name in ("lost_at", "lost_at_s"):
+        if name in columns:
+            return np.isfinite(np.asarray(columns[name], float))
+    return np.zeros(members, bool)
+
+
+def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> None:
+    finite = values[np.isfinite(values)]
+    positive = finite[finite > 0]
+    log = positive.size > 0 and not np.any(finite < 0) and positive.max() > 30 * positive.min()
+    factor, label, unit = named(name, size_of(finite, log))
+    shown = np.isfinite(values) & ((values > 0) | (not log))
+    bounds = _bins(factor * values[shown], log)
+    alive, _ = np.histogram(factor * values[shown & ~lost], bounds)
+    dead, _ = np.histogram(factor * values[shown & lost], bounds)
+    ax.stairs(alive, bounds, fill=True, color=BLUE)
+    if dead.any():
+        ax.stairs(alive + dead, bounds, baseline=alive, fill=True, **LOST)
+    if log:
+        ax.set_xscale("log")
+        log_ticks(ax.xaxis, bounds[0], bounds[-1])
+    notes = []
+    ranked = np.sort(values[~np.isnan(values)])
+    for share, (style, words) in MARKS.items():
+        value = factor * ranked[math.ceil(share * ranked.size) - 1] if ranked.size else math.nan
+        if math.isfinite(value) and (value > 0 or not log):
+            ax.axvline(value, color=INK, linestyle=style, linewidth=1.2)
+        notes.append(
+            f"{words.removesuffix(' quantile')}: "
+            + (f"{value:.3g} {unit}".rstrip() if math.isfinite(value) else "none")
+        )
+    for count, words in ((np.sum(~np.isfinite(values)), "not finite"), (np.sum(finite == 0) * log, "at zero")):
+        notes += [f"{count} {'never' if words == 'not finite' and 'reached' in name else words}"] if count else []
+    ax.set_title(", ".join(notes), fontsize=8, pad=3)
+    ax.set_xlabel(f"{label} ({unit})" if unit else label, fontsize=9)
+    ax.set_ylim(0, 1.08 * max((alive + dead).max(), 1))
+    ax.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+    finish(ax, "members")
+
+
+def _bins(values: np.ndarray, log: bool) -> np.ndarray:
+    """Edges of 40 bins over the values; a constant gets some room around it."""
+    low, high = (values.min(), values.max()) if values.size else (0.0, 1.0)
+    if log:
+        return np.geomspace(low / 1.001, 1.001 * high, 41)
+    if high - low <= 1e-9 * max(abs(low), abs(high)):
+        room = 0.1 * abs(high) or 1.0
+        return np.linspace(low - room, high + room, 42)  # an odd number of bins: the constant is inside one
+    return np.linspace(low, high, 41)
+
+
+def tornado(drivers: Sequence[tuple[str, float, float, float]], metric: str, path: pathlib.Path) -> None:
+    """Write the rank correlation of each driver (dotted path, rho, low, high) with a metric, the greatest on top.
+
+    At most 12 bars; whiskers from low to high where these are finite. A driver whose rho is NaN (it or the metric
+    is constant) is named at the bottom without a bar. Raises ValueError without drivers.
+    """
+    if not drivers:
+        raise ValueError("tornado: no drivers; an ensemble without [spread] has none to rank")
+    ranked = sorted(drivers, key=lambda driver: math.inf if math.isnan(driver[1]) else -abs(driver[1]))
+    shown = ranked[:MOST_DRIVERS]
+    figure = Figure(figsize=(7.5, 0.36 * len(shown) + 1.7), layout="constrained")
+    ax = figure.subplots()
+    for row, (_, rho, low, high) in enumerate(shown):
+        if math.isnan(rho):
+            ax.text(0.02, row, "undefined: no variation", fontsize=8, va="center", color=INK)
+            continue
+        ax.barh(row, rho, height=0.62, color=BLUE if rho >= 0 else ORANGE)
+        if math.isfinite(low) and math.isfinite(high):
+            ax.plot([low, high], [row, row], color=INK, linewidth=1.2, marker="|", markersize=7)
+        free = np.nanmax([rho, high, 0.0]) + 0.03  # right of bar and whisker
+        ax.text(free, row, f"${rho:+.2f}$", fontsize=8, va="center", color=INK)
+    ax.axvline(0, color=INK, linewidth=0.8)
+    ax.set_yticks(range(len(shown)), [name.removeprefix("spread.") for name, *_ in shown])
+    ax.set_ylim(len(shown) - 0.4, -0.6)
+    ax.set_xlim(-1.05, 1.2)
+    ax.set_xticks(np.linspace(-1, 1, 9))
+    words = "rank correlation" + "; whiskers: its interval" * any(math.isfinite(low) for _, _, low, _ in shown)
+    more = len(ranked) - len(shown)
+    ax.set_xlabel(words + (f"; {more} weaker not shown" if more else ""), fontsize=9)
+    ax.set_title(f"What drives {named(metric, 0.0)[1]}", fontsize=11)
+    finish(ax, "")
+    figure.savefig(path, dpi=150)

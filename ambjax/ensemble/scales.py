@@ -1,0 +1,110 @@
+"""The axes of pictures: units, SI prefixes, ticks of log axes, edges of cells."""
+
+import math
+import re
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
+
+# The units that metrics' names end in, longest first: _m_per_s ends in _s too.
+SUFFIXES = {"_A2_per_m2": "A²/m²", "_m_per_s": "m/s", "_m": "m", "_V": "V", "_A": "A", "_W": "W", "_s": "s"}
+SYMBOLS = {"v tilde": r"$\tilde v$", "sigma": r"$\sigma$", "u": "$u$", "i": "$i$"}
+SMALL = {1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
+LARGE = {1e9: "G", 1e6: "M", 1e3: "k"}
+
+
+def prefixed(unit: str, size: float) -> tuple[float, str]:
+    """Factor from SI to a prefixed unit in which `size` lies in [1, 1000), and that unit: 2e-5 m is 20 µm.
+
+    Only units that begin with a plain m, s, V, A, W, N, H, T, Hz or Ω take a prefix (not A²/m², kg, 1/s), and
+    lengths and times none above 1. A size of zero, or one that is not finite, keeps the unit.
+    """
+    first = unit.split("/")[0]
+    small = first in ("m", "s", "V", "A", "W", "N", "H", "T", "Hz", "Ω")
+    if not small or not 0 < size < np.inf:
+        return 1.0, unit
+    scales = (LARGE if first not in ("m", "s") else {}) | SMALL
+    # 0.9995 prints as 1 with three digits
+    scale = next((scale for scale in scales if size >= 0.9995 * scale), 1e-9)
+    return 1 / scale, scales[scale] + unit
+
+
+def size_of(values: np.ndarray, log: bool = False) -> float:
+    """The size that decides an axis' prefix: the largest of |values|; on a log axis the middle of the decades; or 0."""
+    sizes = np.abs(np.asarray(values, float))
+    sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
+    if not sizes.size:
+        return 0.0
+    return float(np.sqrt(sizes.min()) * np.sqrt(sizes.max()) if log else sizes.max())
+
+
+def named(metric: str, size: float) -> tuple[float, str, str]:
+    """Factor, label and unit of a metric of metrics.json: rms_error_m of size 2e-5 is (1e6, "rms error", "µm")."""
+    if metric == "clearance_used":
+        return 100.0, "clearance used", "%"
+    suffix = next((suffix for suffix in SUFFIXES if metric.endswith(suffix)), "")
+    factor, unit = prefixed(SUFFIXES.get(suffix, ""), size)
+    words = metric.removesuffix(suffix).replace("_", " ")
+    words = re.sub(r"max abs (.*)", r"max |\1|", words)
+    for word, symbol in SYMBOLS.items():
+        words = re.sub(rf"\b{word}\b", lambda _, symbol=symbol: symbol, words)
+    return factor, words, unit
+
+
+def relabelled(label: str, size: float) -> tuple[float, str]:
+    """Factor and label of an axis whose label ends in its SI unit: "initial z (m)" of 2e-5 is "initial z (µm)"."""
+    found = re.fullmatch(r"(.*)\(([^()]*)\)\s*", label)
+    if not found:
+        return 1.0, label
+    factor, unit = prefixed(found[2], size)
+    return factor, f"{found[1]}({unit})"
+
+
+def edges(centres: np.ndarray, log: bool) -> np.ndarray:
+    """[n + 1] edges half way between n ascending centres, in decades if `log`.
+
+    Raises ValueError where a log axis has a centre that is not positive.
+    """
+    centres = np.asarray(centres, float)
+    if log and not np.all(centres > 0):
+        raise ValueError(f"a log axis cannot show {centres.min():g}: use positive values, or a linear axis")
+    c = np.log(centres) if log else centres
+    if len(c) == 1:
+        half = 0.5 if log else 0.1 * abs(c[0]) or 1.0
+        bounds = np.array([c[0] - half, c[0] + half])
+    else:
+        middle = (c[1:] + c[:-1]) / 2
+        bounds = np.concatenate([[2 * c[0] - middle[0]], middle, [2 * c[-1] - middle[-1]]])
+    return np.exp(bounds) if log else bounds
+
+
+def finish(ax: Axes, y_label: str) -> None:
+    """The look that all charts share."""
+    ax.set_ylabel(y_label, fontsize=9)
+    ax.tick_params(labelsize=8)
+    ax.grid(alpha=0.3, linewidth=0.5)
+    ax.set_axisbelow(True)
+
+
+def log_ticks(axis: Axis, low: float, high: float) -> None:
+    """Ticks in plain numbers for a logarithmic scale: the fewer decades, the more in each."""
+    decades = math.log10(high / low)
+    if decades < 0.8:
+        at = list(MaxNLocator(5).tick_values(low, high))
+    else:
+        steps = (1, 2, 5) if decades < 2.2 else (1, 3) if decades < 4 else (1,)
+        powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1, max(1, round(decades / 5)))
+        at = [step * 10.0**power for power in powers for step in steps]
+    axis.set_major_locator(FixedLocator([value for value in at if low <= value <= high]))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: _plain(value)))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _plain(value: float) -> str:
+    if 1e-3 <= value < 1e5:
+        return f"{value:g}"
+    power = math.floor(math.log10(value) + 1e-9)
+    front = f"{value / 10.0**power:.3g}"
+    return f"$10^{{{power}}}$" if front == "1" else rf"${front} \cdot 10^{{{power}}}$"

@@ -1,0 +1,359 @@
+"""Pictures of ensembles: what they say (numbers, units, edges) by closed forms, and that hard cases are drawn at all.
+
+Warnings are errors here, so a picture that is written was written without one.
+"""
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from ambjax.ensemble import heatmaps, pictures
+from ambjax.ensemble.scales import edges, log_ticks, named, prefixed, relabelled, size_of
+from ambjax.metrics import Standard
+
+PERCENTS = (0, 5, 25, 50, 75, 95, 100)
+
+
+@pytest.fixture(autouse=True)
+def drawn(monkeypatch):
+    """The figures saved, still open to questions; the file is written as well, coarsely: that is faster."""
+    figures, save = [], Figure.savefig
+
+    def keep(self, path, **options):
+        figures.append(self)
+        save(self, path, **options | {"dpi": 40})
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    return figures
+
+
+def is_png(path):
+    return path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def texts(figure):
+    """Every word of a figure, its legends included."""
+    return " | ".join(words.get_text() for words in figure.findobj(Text))
+
+
+# ---------------------------------------------------------------- scales
+
+
+@pytest.mark.parametrize(
+    ("unit", "size", "expected"),
+    [
+        ("m", 2.3e-5, (1e6, "µm")),
+        ("m", 4.5e-3, (1e3, "mm")),
+        ("m", 1e-3, (1e3, "mm")),
+        ("m", 2000.0, (1, "m")),  # no km on a bearing
+        ("m/s", 3e-4, (1e6, "µm/s")),
+        ("V", 1500.0, (1e-3, "kV")),
+        ("V", 200.0, (1, "V")),
+        ("A²/m²", 1e6, (1, "A²/m²")),  # a prefix would be squared with its unit
+        ("kg", 1e-3, (1, "kg")),
+        ("1/s", 1e4, (1, "1/s")),
+        ("m", 0.0, (1, "m")),
+        ("m", np.inf, (1, "m")),
+        ("s", 1e-14, (1e9, "ns")),
+    ],
+)
+def test_prefix(unit, size, expected):
+    factor, words = prefixed(unit, size)
+    assert words == expected[1]
+    assert factor == pytest.approx(expected[0], rel=1e-15)  # one rounding of a reciprocal
+
+
+def test_prefix_brings_every_size_between_1_and_1000():
+    for size in np.geomspace(1e-9, 1e11, 301):
+        # 0.9995: what prints as 1.00 may count as 1
+        assert 0.9995 <= prefixed("V", size)[0] * size < 1000
+
+
+def test_every_metric_has_its_unit():
+    names = [*Standard()._folds().folds, "lost_at_s", "singular_at_s"]
+    for name in names:
+        _, words, unit = named(name, 1.0)
+        assert unit, name
+        assert "_" not in words, name
+    assert named("settled_max_abs_sigma_m_per_s", 2e-3)[1:] == (r"settled max |$\sigma$|", "mm/s")
+    assert named("clearance_used", 0.5) == (100.0, "clearance used", "%")
+    assert set(pictures.CHIEF) <= set(names)
+
+
+def test_labels_keep_what_is_no_unit():
+    assert relabelled("noise std on $z$ (m)", 2e-5) == (pytest.approx(1e6), "noise std on $z$ (µm)")
+    assert relabelled("share", 2e-5) == (1.0, "share")
+    assert relabelled("mass (kg)", 2e-5) == (1.0, "mass (kg)")
+
+
+def test_size_ignores_what_cannot_be_shown():
+    assert size_of(np.array([np.nan, np.inf, -3.0, 0.0])) == 3.0
+    assert size_of(np.array([1e-6, 1e-2]), log=True) == pytest.approx(1e-4, rel=1e-12)  # rounding of two roots
+    assert size_of(np.array([np.nan])) == 0.0
+
+
+@pytest.mark.parametrize("log", [False, True])
+def test_edges_enclose_each_centre(log):
+    for centres in (np.geomspace(1e-6, 1e-2, 7), np.array([1.0, 2.0, 8.0]), np.array([3.0])):
+        bounds = edges(centres, log)
+        assert len(bounds) == len(centres) + 1
+        assert np.all((bounds[:-1] < centres) & (centres < bounds[1:]))
+    even = edges(np.geomspace(1e-6, 1e-2, 5), log=True)
+    np.testing.assert_allclose(even[1:] / even[:-1], 10.0, rtol=1e-12)  # rounding of logarithms
+
+
+def test_log_edges_refuse_zero():
+    with pytest.raises(ValueError, match="log axis cannot show 0"):
+        edges(np.array([0.0, 1.0]), log=True)
+
+
+@pytest.mark.parametrize(("low", "high"), [(1.0, 1.5), (3e-7, 9e-6), (0.2, 900.0), (2e-6, 3e9), (1e5, 1e9)])
+def test_log_ticks_say_their_values(low, high):
+    axis = Figure().subplots().xaxis
+    log_ticks(axis, low, high)
+    at = axis.get_majorticklocs()
+    assert 2 <= len(at) <= 12
+    assert np.all((at >= low) & (at <= high))
+    for value in at:
+        words = axis.get_major_formatter()(value).replace("$", "").replace(r" \cdot ", "*")
+        words = words.replace("10^{", "1e").replace("}", "")
+        assert np.prod([float(part) for part in words.split("*")]) == pytest.approx(value, rel=1e-3)  # three digits
+
+
+# ---------------------------------------------------------------- fan
+
+
+def quantiles(members):
+    return {percent: np.percentile(members, percent, axis=0) for percent in PERCENTS}
+
+
+def members_of(n, t, seed=0):
+    noise = np.random.default_rng(seed).normal(size=(n, len(t)))
+    return 2e-5 * np.sin(4 * np.pi * t) + 1e-6 * noise
+
+
+def test_fan_shows_bands_units_limit_and_survivors(tmp_path, drawn):
+    t = np.linspace(0, 1, 201)
+    members = members_of(50, t)
+    lost_at = np.full(50, np.inf)
+    lost_at[:5] = [0.1, 0.2, 0.3, 0.4, 2.0]  # the last one after the end: it survives this run
+    bands = {"z - r": quantiles(members), "u": quantiles(6e6 * members), "sigma": quantiles(members)}
+    pictures.fan(t, bands, {"u": 150.0, "z - r": 4.5e-3}, "a title", tmp_path / "fan.png", lost_at=lost_at)
+    assert is_png(tmp_path / "fan.png")
+    (figure,) = drawn
+    words = texts(figure)
+    assert "(µm)" in words
+    assert "(V)" in words
+    assert "(µm/s)" in words
+    assert "46 of 50 survive (92 %)" in words
+    assert "0 to 100 %" in words
+    assert "median" in words
+    error, voltage, _, survivors = figure.axes
+    # 150 V is near the data's 120 V; the clearance is nowhere near 20 µm
+    assert sorted(line.get_ydata()[0] for line in voltage.lines if line.get_linestyle() == "--") == [-150, 150]
+    assert not [line for line in error.lines if line.get_linestyle() == "--"]
+    step, rug = survivors.lines
+    assert step.get_ydata()[0] == 100
+    assert step.get_ydata()[-1] == pytest.approx(92.0)
+    # ticks stand within one point of the drawing grid
+    np.testing.assert_allclose(rug.get_xdata(), [0.1, 0.2, 0.3, 0.4], atol=1 / pictures.BINS)
+
+
+def test_fan_keeps_extremes_of_long_runs(tmp_path, drawn):
+    t = np.linspace(0, 1, 50_001)
+    low, high = np.zeros(len(t)), np.ones(len(t))
+    low[12_345], high[33_333] = -1.0, 2.0  # one sample each
+    pictures.fan(t, {"u": {0: low, 50: 0.5 * (low + high), 100: high}}, {}, "spikes", tmp_path / "fan.png")
+    heights = drawn[0].axes[0].collections[0].get_paths()[0].vertices[:, 1]
+    assert heights.min() == -1.0
+    assert heights.max() == 2.0
+
+
+def test_fan_does_not_let_one_member_hide_the_rest(tmp_path, drawn):
+    t = np.linspace(0, 1, 101)
+    bands = quantiles(members_of(100, t))
+    bands[100] = np.full(len(t), 4.5e-3)
+    pictures.fan(t, {"z - r": bands}, {}, "one went astray", tmp_path / "fan.png")
+    ax = drawn[0].axes[0]
+    assert ax.get_ylim()[1] < 60  # µm: the others reach 24
+    assert "reaches ±4.5e+03 µm, beyond this axis" in texts(drawn[0])
+
+
+def test_fan_refuses_unknown_quantity(tmp_path):
+    with pytest.raises(ValueError, match=r"'w'; it knows z - r, z, sigma"):
+        pictures.fan(np.zeros(1), {"w": {50: np.zeros(1)}}, {}, "", tmp_path / "fan.png")
+    assert not (tmp_path / "fan.png").exists()
+
+
+@pytest.mark.parametrize("lost_at", [None, np.array([np.inf]), np.array([0.0]), np.zeros(3)])
+@pytest.mark.parametrize("values", [np.zeros(9), np.full(9, -2.0), np.full(9, np.nan), np.r_[1.0, 2.0, [np.nan] * 7]])
+def test_fan_of_hard_cases(tmp_path, values, lost_at):
+    # one member: all bands alike; NaN: nobody left
+    bands = {"u": dict.fromkeys(PERCENTS, values)}
+    pictures.fan(np.linspace(0, 1, 9), bands, {"u": 2.0}, "hard", tmp_path / "fan.png", lost_at=lost_at)
+    assert is_png(tmp_path / "fan.png")
+
+
+def test_fan_of_one_instant_and_one_band(tmp_path):
+    pictures.fan(np.zeros(1), {"u": {50: np.ones(1)}}, {}, "", tmp_path / "fan.png", lost_at=np.zeros(2))
+    assert is_png(tmp_path / "fan.png")
+
+
+# ---------------------------------------------------------------- histograms
+
+
+def test_histogram_counts_every_member_once(tmp_path, drawn):
+    n = 1000
+    rng = np.random.default_rng(1)
+    lost = np.arange(n) < 40
+    error = np.where(lost, 3e-3, 2e-6) * np.exp(0.2 * rng.normal(size=n))
+    reached = np.where(lost, np.inf, 3e-3 + 1e-4 * rng.normal(size=n))
+    columns = {"lost_at": np.where(lost, 0.1, np.inf), "rms_error_m": error, "v_tilde_reached_s": reached}
+    pictures.histograms(columns, tmp_path / "h.png")
+    assert is_png(tmp_path / "h.png")
+    assert "1000 members, 40 lost" in texts(drawn[0])
+    first, second = drawn[0].axes[:2]
+    assert first.get_xscale() == "log"
+    assert second.get_xscale() == "linear"
+    alive, dead = first.patches
+    assert alive.get_data().values.sum() == 960
+    assert dead.get_data().values.sum() == 960 + 40  # stacked on the survivors
+    # the 500th and the 950th of 1000, in µm: five from the lost members' end
+    ranked = 1e6 * np.sort(error)
+    marks = [line.get_xdata()[0] for line in first.lines]
+    np.testing.assert_allclose(marks, [ranked[499], ranked[949]], rtol=1e-12)  # one product's rounding
+    assert "40 never" in second.get_title()
+    assert second.patches[0].get_data().values.sum() == 960
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.zeros(5),
+        np.full(5, 2e-6),
+        np.full(5, np.nan),
+        np.full(5, np.inf),
+        np.array([np.nan, np.inf, 1e-6, 2e-6, 3e-6]),
+        np.array([0.0, 1e-9, 1e-3, 1.0, 1e200]),
+        np.array([0.0, 0.0, 0.0, 1e-9, 1e-3]),
+        np.array([-1.0, 0.0, 1e-3, 1.0, 100.0]),
+        np.array([1.0, 1.0, 1.0, 1.0, 1.0 + 2**-52]),
+        np.ones(1),
+        np.full(1, np.nan),
+    ],
+)
+@pytest.mark.parametrize("all_lost", [False, True])
+def test_histograms_of_hard_cases(tmp_path, drawn, values, all_lost):
+    columns = {"lost": np.full(len(values), all_lost), "rms_error_m": values}
+    pictures.histograms(columns, tmp_path / "h.png")
+    assert is_png(tmp_path / "h.png")
+    shown = drawn[0].axes[0].patches[-1].get_data().values.sum()
+    in_range = np.isfinite(values) & ((values > 0) | (drawn[0].axes[0].get_xscale() == "linear"))
+    assert shown == in_range.sum()  # nobody falls out of the last bin
+
+
+def test_histograms_refuse_nothing_to_draw(tmp_path):
+    with pytest.raises(ValueError, match="none of"):
+        pictures.histograms({"index": np.arange(3)}, tmp_path / "h.png")
+
+
+# ---------------------------------------------------------------- tornado
+
+
+def test_tornado_ranks_by_strength(tmp_path, drawn):
+    drivers = [(f"plant.{k}", rho, rho - 0.1, rho + 0.1) for k, rho in enumerate(np.linspace(-0.8, 0.7, 14))]
+    drivers.append(("spread.sensor.std", np.nan, np.nan, np.nan))
+    pictures.tornado(drivers, "settled_max_abs_error_m", tmp_path / "t.png")
+    assert is_png(tmp_path / "t.png")
+    ax = drawn[0].axes[0]
+    names = [tick.get_text() for tick in ax.get_yticklabels()]
+    assert names[:3] == ["plant.0", "plant.13", "plant.1"]
+    assert len(names) == 12
+    assert "3 weaker not shown" in ax.get_xlabel()
+    assert ax.get_ylim()[0] > ax.get_ylim()[1]  # row 0 on top
+    lengths = np.abs([patch.get_width() for patch in ax.patches])
+    assert np.all(np.diff(lengths) <= 0)
+
+
+def test_tornado_of_hard_cases(tmp_path, drawn):
+    pictures.tornado([("plant.m", np.nan, np.nan, np.nan)], "rms_u_V", tmp_path / "a.png")
+    pictures.tornado(
+        [("spread.plant.m", -1.0, -1.0, -1.0), ("plant.R", 0.0, np.nan, np.nan)], "lost_at_s", tmp_path / "b.png"
+    )
+    assert "undefined" in texts(drawn[0])
+    assert drawn[1].axes[0].get_yticklabels()[0].get_text() == "plant.m"
+    with pytest.raises(ValueError, match="no drivers"):
+        pictures.tornado([], "rms_u_V", tmp_path / "c.png")
+
+
+# ---------------------------------------------------------------- maps
+
+
+def a_panel(survival, error=None, x=None, y=None):
+    survival = np.asarray(survival, float)
+    ny, nx = survival.shape
+    return {
+        "title": "repaired",
+        "x": np.geomspace(1e-6, 1e-3, nx) if x is None else x,
+        "y": np.geomspace(1e-5, 1e-3, ny) if y is None else y,
+        "survival": survival,
+        "low": np.clip(survival - 0.02, 0, 1),
+        "high": np.clip(survival + 0.02, 0, 1),
+        "error": error,
+    }
+
+
+def test_maps_draw_the_95_per_cent_contour_where_it_is(tmp_path, drawn):
+    # survival falls linearly in x from 1 to 0: the contour is the line x = 0.05
+    x, y = np.linspace(0, 1, 11), np.linspace(-1, 1, 5)
+    survival = np.tile(1 - x, (5, 1))
+    error = np.where(survival > 0, 1e-6 * 10 ** (3 * x), np.nan)
+    panels = [a_panel(survival, error, x, y), a_panel(survival, None, x, y)]
+    pictures.maps(panels, "initial $z$ (m)", "speed (m/s)", False, False, tmp_path / "m.png")
+    assert is_png(tmp_path / "m.png")
+    words = texts(drawn[0])
+    assert "initial $z$ (m)" in words
+    assert "settled max |error| (µm)" in words
+    assert "no survivor" in words
+    assert "in 5 of 55 cells" in words
+    low, high, level = drawn[0].axes[0].collections[1:4]
+    # from x = 0 to 0.1 the lower bound falls from 0.98 to 0.88, the upper one, cut off at 1, from 1 to 0.92
+    for drawing, at in ((level, 0.05), (low, 0.03), (high, 0.0625)):
+        np.testing.assert_allclose(drawing.get_paths()[0].vertices[:, 0], at, atol=1e-12)  # rounding
+    first, second = drawn[0].axes[0].collections[0], drawn[0].axes[1].collections[0]
+    assert first.norm.vmin == second.norm.vmin == 0
+    assert first.norm.vmax == second.norm.vmax == 100
+
+
+ALL = np.ones((3, 4))
+
+
+@pytest.mark.parametrize("log", [False, True])
+@pytest.mark.parametrize(
+    ("survival", "error"),
+    [
+        (ALL, None),
+        (ALL, 2e-6 * ALL),
+        (0 * ALL, np.nan * ALL),
+        (0.95 * ALL, 0 * ALL),
+        (np.nan * ALL, np.inf * ALL),
+        (np.where(np.eye(3, 4), np.nan, 0.97), None),
+        (np.ones((1, 1)), np.ones((1, 1))),
+        (np.array([[0.0, 0.5, 1.0]]), np.array([[np.nan, 1e-3, 1e-6]])),
+        (np.array([[0.0], [1.0]]), np.array([[np.nan], [1e-6]])),
+        (np.eye(2), np.array([[1e-9, 1e3], [1.0, np.nan]])),
+    ],
+)
+def test_maps_of_hard_cases(tmp_path, survival, error, log):
+    panels = [a_panel(survival, error), a_panel(0.5 * survival, None)]
+    heatmaps.maps(panels, "std (m)", "period (s)", log, log, tmp_path / "m.png", error_metric="rms_error_m")
+    assert is_png(tmp_path / "m.png")
+
+
+def test_maps_refuse(tmp_path):
+    with pytest.raises(ValueError, match="no panels"):
+        pictures.maps([], "", "", False, False, tmp_path / "m.png")
+    with pytest.raises(ValueError, match="log axis cannot show"):
+        pictures.maps([a_panel(ALL, x=np.arange(4.0))], "x", "y", True, False, tmp_path / "m.png")
+    assert not (tmp_path / "m.png").exists()
