@@ -3,7 +3,7 @@
 from ambjax._version import __version__
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.cascade import Cascade
-from ambjax.integrate import RK4, Adaptive, Euler, Rodas3
+from ambjax.integrate import RK4, Adaptive, Euler, Rodas3, Slide
 from ambjax.method import choose_method, with_method
 from ambjax.metrics import Standard
 from ambjax.plant import Plant
@@ -30,6 +30,7 @@ __all__ = [
     "Scenario",
     "Sensor",
     "Sine",
+    "Slide",
     "SmoothStep",
     "Standard",
     "Step",

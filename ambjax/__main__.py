@@ -13,11 +13,12 @@ class Parser(argparse.ArgumentParser):
     """An argument parser whose complaints are one line, and exit with 2."""
 
     def error(self, message: str) -> NoReturn:
-        sys.exit(_complain(f"{message}. See '{self.prog} --help'."))
+        sys.exit(complain(f"{message}. See '{self.prog} --help'.", self.prog.split()[0]))
 
 
-def _complain(message: str) -> int:
-    print(f"ambjax: {message}", file=sys.stderr)
+def complain(message: str, program: str = "ambjax") -> int:
+    """Say what is wrong with the input, on one line of stderr. Returns the exit code for that."""
+    print(f"{program}: {message}", file=sys.stderr)
     return 2
 
 
@@ -78,7 +79,7 @@ def main(argv: list[str] | None = None) -> int:
             print(json.dumps(summary, indent=2))
         sys.stdout.flush()
     except ValueError as error:
-        return _complain(str(error))
+        return complain(str(error))
     except BrokenPipeError:  # whoever read the answer has seen enough of it
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0

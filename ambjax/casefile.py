@@ -40,6 +40,7 @@ SIGNALS: dict[str, type] = {
 }
 METHODS: dict[str, type] = {"rk4": RK4, "euler": Euler, "rodas3": Rodas3}
 TABLES = ["plant", "controller", "reference", "disturbance", "sensor", "actuator", "initial", "clock", "run", "spread"]
+OTHERS = ["tune"]  # read by ambjax-tune; the commands here pass it by
 UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
 # Rows that a run may record: 16 numbers each, so this is about 2.5 GB.
 MOST_SAMPLES = 20_000_000
@@ -63,24 +64,30 @@ def read_case(path: str | pathlib.Path) -> Case:
     Raises ValueError, one line, for anything wrong with the file or in it.
     """
     path = pathlib.Path(path)
-    try:
-        raw = tomllib.loads(path.read_bytes().decode("utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror}). Check the path and its permissions.") from None
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: not a text file in UTF-8. A case file is TOML; see 'ambjax template'.") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path}: not valid TOML: {error}. See 'ambjax template' for a file to start from.") from None
+    raw = load(path)
     try:
         return case_from(raw, path.stem)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
+def load(path: str | pathlib.Path) -> dict[str, Any]:
+    """A case file as parsed TOML, not yet checked. Raises ValueError, one line, if it is none."""
+    path = pathlib.Path(path)
+    try:
+        return tomllib.loads(path.read_bytes().decode("utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror}). Check the path and its permissions.") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: not a text file in UTF-8. A case file is TOML; see 'ambjax template'.") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path}: not valid TOML: {error}. See 'ambjax template' for a file to start from.") from None
+
+
 def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     """A case from a parsed TOML document. Raises ValueError as `read_case` does."""
     top = Table(raw)
-    top.only(TABLES)
+    top.only([*TABLES, *OTHERS])
     plant = top.table("plant").record(Plant)
     cascade = _cascade(top.table("controller"), plant)
     scenario, settle = _scenario(top, plant)

@@ -33,12 +33,16 @@ Times = Callable[[float], Array]
 
 
 class Problem(NamedTuple):
-    """What is integrated: rates(inputs(t), state), scale (a state) and fate(state) -> code."""
+    """What is integrated: rates(inputs(t), state), scale (a state) and fate(state) -> code.
+
+    `slide(inputs(t_0), inputs(t_1), h, state) -> state`, where there is one, is a step made for this very system.
+    """
 
     inputs: Inputs
     rates: Rates
     scale: Any
     fate: Fate
+    slide: Callable[[Any, Any, Scalar, Any], Any] | None = None
 
 
 class Advanced(NamedTuple):
@@ -147,13 +151,16 @@ class RK4(_Fixed):
 
     def _step(self, problem: Problem, at: Times, h: Scalar, state: Any) -> Any:
         begin, middle, end = (problem.inputs(at(share)) for share in (0.0, 0.5, 1.0))
+        real = jnp.result_type(float).type  # Pallas gives a number without a type that of the condition
 
         def stage(s: Array, carry: tuple[Any, Any]) -> tuple[Any, Any]:
             x, gained = carry
-            gained = jax.tree.map(lambda g, a, b: g + jnp.where(s == 2, 2 / 3, 1 / 3) * (a - b), gained, x, state)
+            gained = jax.tree.map(
+                lambda g, a, b: g + jnp.where(s == 2, real(2 / 3), real(1 / 3)) * (a - b), gained, x, state
+            )
             first, last = s == 0, s == 3
             inputs = choose(first, begin, choose(last, end, middle))
-            share = jnp.where(last, 1 / 6, jnp.where(s == 2, 1.0, 0.5))
+            share = jnp.where(last, real(1 / 6), jnp.where(s == 2, real(1.0), real(0.5)))
             base = jax.tree.map(lambda a, g: a + jnp.where(last, g, 0.0), state, gained)
             return axpy(base, (h * share, problem.rates(inputs, x))), gained
 
@@ -199,6 +206,24 @@ class Rodas3(_Fixed):
 
     def __str__(self) -> str:
         return f"RODAS3 (L-stable Rosenbrock), {self.substeps} substeps"
+
+
+@record
+class Slide(_Fixed):
+    """Equal substeps of the loop's own step (`ambjax.sliding`): for stiff gains under held noise.
+
+    Second order in the loop's slow motion, whatever gamma p is; the inversion law must be `inversion.Adaptive`.
+    """
+
+    limit = None
+
+    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any) -> Any:
+        if problem.slide is None:
+            raise ValueError("clock.method = Slide(...): it steps loops whose inversion law is 'adaptive'. Use Rodas3.")
+        return problem.slide(problem.inputs(at(0.0)), problem.inputs(at(1.0)), h, state)
+
+    def __str__(self) -> str:
+        return f"sliding step, {self.substeps} substeps"
 
 
 @record

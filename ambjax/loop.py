@@ -1,5 +1,6 @@
 """The closed loop as one system of ordinary differential equations: plant and cascade together."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -12,6 +13,7 @@ from ambjax.control.laws import Measurement
 from ambjax.integrate import Problem
 from ambjax.scenario import Scenario
 from ambjax.signals import Reference, reference_at
+from ambjax.sliding import slide, slides
 from ambjax.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 
 # A state this many times its scale has left the model's meaning, long before numbers overflow.
@@ -90,7 +92,9 @@ class ClosedLoop:
         """0 while the rotor is levitated, else the code of what became of it."""
         sane = [jnp.abs(x) <= DIVERGENCE * s for x, s in zip(*map(jax.tree.leaves, (state, self.scale())), strict=True)]
         touched = jnp.abs(state.plant.z) >= self.scenario.touchdown
-        return jnp.where(jnp.stack(sane).all(), jnp.where(touched, TOUCHED, ALIVE), DIVERGED).astype(jnp.int32)
+        return jnp.where(functools.reduce(jnp.logical_and, sane), jnp.where(touched, TOUCHED, ALIVE), DIVERGED).astype(
+            jnp.int32
+        )
 
     def rest(self, state: LoopState, code: Array) -> LoopState:
         """The state in which a lost rotor is frozen: at rest, against the stop it touched; controller as it was."""
@@ -101,7 +105,8 @@ class ClosedLoop:
 
     def problem(self, hold: Measurement) -> Problem:
         """What an integrator is given for one sample."""
-        return Problem(self.inputs, lambda inputs, x: self.rates(inputs, x, hold), self.scale(), self.fate)
+        step = functools.partial(slide, self, hold) if slides(self.cascade) else None
+        return Problem(self.inputs, lambda inputs, x: self.rates(inputs, x, hold), self.scale(), self.fate, step)
 
     def row(self, t: Scalar, state: LoopState, hold: Measurement, alive: Array) -> Row:
         """All signals at one instant. The drive of a lost rotor is off: u = 0."""

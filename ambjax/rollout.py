@@ -100,17 +100,17 @@ def segment(
     """`count` samples from number `first` on, and the rows recorded on the way (None if every = 0)."""
     step = functools.partial(_sample, system.realised(), clock, fold)
 
-    def unrecorded(progress: Progress, k: Array) -> tuple[Progress, None]:
-        return step(progress, k)[0], None
+    def unrecorded(progress: Progress, first: Scalar, count: int) -> Progress:
+        return lax.fori_loop(0, count, lambda n, progress: step(progress, first + n)[0], progress)
 
     def block(progress: Progress, k: Array, length: int) -> tuple[Progress, Any]:
         progress, row = step(progress, k)
         if length > 1:
-            progress, _ = lax.scan(unrecorded, progress, k + 1 + jnp.arange(length - 1))
+            progress = unrecorded(progress, k + 1, length - 1)
         return progress, row
 
     if every == 0:
-        return lax.scan(unrecorded, progress, first + jnp.arange(count))
+        return unrecorded(progress, first, count), None
     starts = first + every * jnp.arange(count // every)
     progress, rows = lax.scan(functools.partial(block, length=every), progress, starts)
     if rest := count % every:

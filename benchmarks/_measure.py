@@ -5,6 +5,8 @@ import os
 import pathlib
 import platform
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -24,6 +26,35 @@ def median_time(run: Callable[[], Any], repeats: int = 7) -> float:
         jax.block_until_ready(run())
         times.append(time.perf_counter() - began)
     return statistics.median(times)
+
+
+def alternating(runs: dict[str, Callable[[], Any]], repeats: int = 5) -> dict[str, dict[str, float]]:
+    """Median seconds of each run, taken in turn so that all see the same machine; and what the first call added."""
+    first, times = {}, {name: [] for name in runs}
+    for name, run in runs.items():
+        began = time.perf_counter()
+        jax.block_until_ready(run())
+        first[name] = time.perf_counter() - began
+    for _ in range(repeats):
+        for name, run in runs.items():
+            began = time.perf_counter()
+            jax.block_until_ready(run())
+            times[name].append(time.perf_counter() - began)
+    medians = {name: statistics.median(found) for name, found in times.items()}
+    return {name: {"seconds": t, "compile_s": max(first[name] - t, 0.0)} for name, t in medians.items()}
+
+
+def child(script: str, *arguments: Any, **environment: str) -> Any:
+    """Run a benchmark script in a process of its own; the JSON that it prints as its last line."""
+    command = [sys.executable, script, *map(str, arguments)]
+    done = subprocess.run(command, env=os.environ | environment, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def one_core() -> None:
+    """Keep this process on one core, where the system can."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
 def machine() -> dict[str, Any]:

@@ -14,6 +14,11 @@ Ratios are within one run of one script; absolute times depend on the machine an
     .venv/bin/pip install -e '.[bench]'
     .venv/bin/python benchmarks/single.py            # one run against SciPy and diffrax
     .venv/bin/python benchmarks/work_precision.py    # the integrators among themselves
+    .venv/bin/python benchmarks/limit.py             # the C program alone, and its agreement with ambjax
+    .venv/bin/python benchmarks/throughput.py        # ensembles against that limit
+    .venv/bin/python benchmarks/peers.py             # ensembles against other libraries
+    .venv/bin/python benchmarks/scaling.py --full    # cost and memory against members and horizon
+    .venv/bin/python benchmarks/gpu.py               # the same on an accelerator, where there is one
     .venv/bin/python benchmarks/report.py
 """
 
@@ -70,8 +75,95 @@ def work_precision() -> list[str]:
     return lines
 
 
+def table(titles: str, rows: list[list[str]]) -> list[str]:
+    """A Markdown table and an empty line."""
+    return [f"| {titles} |", "|" + "---|" * (titles.count("|") + 1), *(f"| {' | '.join(row)} |" for row in rows), ""]
+
+
+def throughput() -> list[str]:
+    data = load("throughput")
+    lines = ["## Ensembles against the machine's limit (`throughput.py`)", "", facts(data["machine"])]
+    lines += [
+        f"RK4, 10 us a step, {data['samples']} samples of 10 steps; ns per member and step, compilation apart.",
+        "The limit is a C program with SIMD (`limit.c`), run in turn with ambjax. One member alone is a `rollout`.",
+        "",
+    ]
+    rows = []
+    for row in data["rows"]:
+        named = [row["dtype"], "held" if row["noise"] else "none", str(row["members"]), str(row["threads"])]
+        limit = [f"{row['C']:.2f}", f"{row['ratio']:.2f}"] if "C" in row else ["", ""]
+        rows.append([*named, f"{row['ambjax']:.2f}", *limit, f"{1e9 / row['ambjax']:.2e}"])
+    lines += table("precision | noise | members | cores | ambjax (ns) | limit (ns) | ratio | member-steps/s", rows)
+    pairs = {(r["dtype"], r["noise"], r["members"], r["threads"]): r["ambjax"] for r in data["rows"]}
+    most = max(row["members"] for row in data["rows"])
+    for (dtype, noise, members, threads), ns in pairs.items():
+        if threads == 2 and members == most:
+            gain = pairs[dtype, noise, members, 1] / ns
+            lines.append(
+                f"Two cores, {dtype}, {'held' if noise else 'no'} noise, {members} members: {gain:.2f} times one."
+            )
+    return [*lines, ""]
+
+
+def peers() -> list[str]:
+    data = load("peers")
+    lines = ["## Ensembles against other libraries (`peers.py`)", "", facts(data["machine"])]
+    lines += [
+        "One core, no noise; nanoseconds per member and 10 us simulated. Fixed-step peers take RK4 steps of 10 us and",
+        "are compared step for step; adaptive ones (tolerance 1e-6) with the coarsest ambjax step as accurate as",
+        f"they turn out to be, and with the coarsest that keeps 1e-6 of the largest z ({data['largest_z_m']:.1e} m).",
+        "",
+    ]
+    rows = []
+    for name, row in data["rows"].items():
+        wanted = f"{row['ratio_at_1e-6']:.1f}" if "ratio_at_1e-6" in row else ""
+        cells = [name, str(row["members"]), f"{row['ns']:.1f}", f"{row['error_m']:.1e}", f"{row['ratio']:.2f}"]
+        rows.append([*cells, row["against"].removeprefix("ambjax, "), wanted, f"{row['compile_s']:.1f}"])
+    titles = "| members | ns | error in z (m) | ambjax is faster by | with | at 1e-6 by | compile (s)"
+    return lines + table(titles, rows)
+
+
+def scaling() -> list[str]:
+    data = load("scaling")
+    lines = ["## Cost and memory against size (`scaling.py`)", "", facts(data["machine"])]
+    lines += ["Held noise, float64, one core; every point in a process of its own.", ""]
+    for name in ("members", "samples"):
+        rows = []
+        for row in data[name]["rows"]:
+            cells = [f"{row['members']:,}", f"{row['samples']:,}", f"{row['seconds']:.3f}", f"{row['ns']:.2f}"]
+            rows.append([*cells, f"{row['peak_bytes'] / 2**20:.0f}"])
+        lines += table("members | samples | run (s) | ns per member and step | peak memory (MiB)", rows)
+        lines += [f"Linear in {name} to within {100 * data[name]['deviation']:.0f} %.", ""]
+    return lines
+
+
+def gpu() -> list[str]:
+    data = load("gpu")
+    lines = ["## On an accelerator (`gpu.py`)", "", f"{data['device']}; {facts(data['machine'])}", ""]
+    rows = [
+        [r["dtype"], "held" if r["noise"] else "none", f"{r['members']:,}", r["run"], f"{r['steps_per_s']:.2e}"]
+        for r in data["rows"]
+    ]
+    return lines + table("precision | noise | members | run as | member-steps/s", rows)
+
+
+SECTIONS = {
+    "single": single,
+    "work_precision": work_precision,
+    "throughput": throughput,
+    "peers": peers,
+    "scaling": scaling,
+    "gpu": gpu,
+}
+
+
 def main() -> None:
-    page = "\n".join([HEAD, *single(), *work_precision()]).rstrip() + "\n"
+    """Every section whose JSON is there."""
+    lines = [HEAD]
+    for name, section in SECTIONS.items():
+        if (_measure.RESULTS / f"{name}.json").exists():
+            lines += section()
+    page = "\n".join(lines).rstrip() + "\n"
     (pathlib.Path(__file__).parent / "README.md").write_text(page)
 
 

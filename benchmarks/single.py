@@ -21,6 +21,7 @@ import _measure
 import jax
 import jax.numpy as jnp
 import numpy as np
+import workload
 from scipy.integrate import solve_ivp
 
 from ambjax import Adaptive, Cascade, Clock, Plant, inversion, paper, rollout
@@ -33,35 +34,8 @@ GAINS = {"smooth": (1e9, 25e-6), "repaired": (paper.REPAIRED_GAMMA, 25.0)}
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 
 
-def right_side(gamma: float, p_v: float, xp: Any) -> Callable[..., Any]:
-    """The closed loop on (z, z_dot, i, i_ref) written out once more, for `math` or `jnp` as `xp`."""
-    atan = xp.atan
-    m, k_z, s_0, i_0, g, R = 0.588, -754.0, 5e-3, 0.25, 9.81, 41.44
-    kappa = 1.25e-6 * 1480.0**2 * 0.121
-    a, w = kappa / (4 * m), 4 * math.pi
-
-    def f(t: Any, y: Any, q: float) -> Any:
-        z, z_dot, i, i_ref = y[0], y[1], y[2], y[3]
-        sine, cosine = xp.sin(w * t), xp.cos(w * t)
-        r, r_dot, r_ddot = 2.5e-3 * sine, 2.5e-3 * w * cosine, -2.5e-3 * w * w * sine
-        sigma = z_dot - r_dot + 17.0 * (z - r)
-        robust = 25.0 * 2 / math.pi * atan(25.0 * sigma)
-        v_star = (-2 * k_z / m * z - 17.0 * (z_dot - r_dot) + r_ddot + g - robust) / a
-        up, low = s_0 - z, s_0 + z
-        v_ref = ((i_0 + i_ref) / up) ** 2 - ((i_0 - i_ref) / low) ** 2
-        v = ((i_0 + i) / up) ** 2 - ((i_0 - i) / low) ** 2
-        slope = 2 * (i_0 + i_ref) / up**2 + 2 * (i_0 - i_ref) / low**2
-        i_ref_dot = gamma * 2 / math.pi * atan(p_v * (v_star - v_ref)) / slope
-        e_law = -152.0 * 2 / math.pi * atan(25.0 * (i - i_ref))
-        u = kappa / (2 * low) * (-2 * z_dot / low * i + i_ref_dot + e_law) + R * i
-        i_dot = 2 * z_dot / low * i + 2 * low / kappa * (u - R * i)
-        return [z_dot, 2 * k_z / m * z + a * v - g + a * q, i_dot, i_ref_dot]
-
-    return f
-
-
 def scipy_run(gains: tuple[float, float], method: str, rtol: float) -> np.ndarray:
-    f, y, parts = right_side(*gains, math), [0.0] * 4, []
+    f, y, parts = workload.right_side(*gains, math), [0.0] * 4, []
     for begin, end in itertools.pairwise(EDGES):
         q = 1.0 if begin == 0.8 else 0.0
         inside = TIMES[(begin - 1e-12 <= TIMES) & (end - 1e-12 > TIMES)]
@@ -82,7 +56,7 @@ def ours_run(gains: tuple[float, float], tolerance: float) -> Callable[[], Any]:
 def diffrax_run(gains: tuple[float, float], solver: Any, rtol: float) -> Callable[[], Any]:
     import diffrax
 
-    f = right_side(*gains, jnp)
+    f = workload.right_side(*gains, jnp)
 
     def field(t: Any, y: Any, args: Any) -> Any:
         return jnp.stack(f(t, y, jnp.where((t >= 0.8) & (t < 1.3), 1.0, 0.0)))

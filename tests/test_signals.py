@@ -225,7 +225,8 @@ def test_band_noise_has_its_derivatives():
     w, size = 2 * np.pi * np.asarray(lines.frequencies), NOISE.std * (2 / LINES) ** 0.5
     found = jax.vmap(lambda t: reference_at(lines, t))(T)
     angle = np.multiply.outer(T, w) + np.asarray(lines.phases)
-    for got, formula in zip(found, (np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle)), strict=True):
+    formulas = (np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle), -(w**3) * np.cos(angle))
+    for got, formula in zip(found, formulas, strict=True):
         # sums of 32 terms, angles of up to 1e3 rad rounded to 1e-13
         np.testing.assert_allclose(got, size * formula.sum(axis=1), rtol=1e-10, atol=1e-12 * np.max(np.abs(formula)))
     assert jax.grad(lambda std: Scenario(q_z=BandNoise(std, 1.0, 2.0)).realised().q_z(0.3))(0.5) != 0

@@ -14,6 +14,12 @@ from ambjax.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
 GRADIENT_FLOOR = 1e-4
 
 
+def v_and_gradient(model: Plant, inputs: ForceDemand, i_ref: Array) -> tuple[Array, Array]:
+    """v and dv/di at (z, i_ref), the latter kept away from 0."""
+    v, dv_di = model.v_and_dv_di(inputs.z, i_ref, inputs.gaps)
+    return v, away_from_zero(dv_di, GRADIENT_FLOOR * 4 * model.i_0 / model.s_0**2)
+
+
 @record
 class Adaptive:
     """i_ref' = gamma sgn(v_star - v(z, i_ref)) / (dv/di)(z, i_ref), with i_ref as its state. Eq. (6), sgn smoothed.
@@ -35,9 +41,8 @@ class Adaptive:
         return TWO_OVER_PI * self.gamma * self.p
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:
-        floor = GRADIENT_FLOOR * 4 * model.i_0 / model.s_0**2
-        v, dv_di = model.v_and_dv_di(inputs.z, state, inputs.gaps)
-        rate = self.gamma * smooth_sign(inputs.v_star - v, self.p, per=away_from_zero(dv_di, floor))
+        v, gradient = v_and_gradient(model, inputs, state)
+        rate = self.gamma * smooth_sign(inputs.v_star - v, self.p, per=gradient)
         return CurrentDemand(state, rate), rate
 
 

@@ -1,0 +1,128 @@
+"""One step of the closed loop that knows where its stiffness is: the adaptive inversion law.
+
+Under measurements that jump every sample, i_ref slides to its new place within microseconds and is
+slaved to it for the rest: w' = d - gamma sgn(w) for w = v_star - v(z, i_ref), Eq. (14a). A linearised
+implicit step sees no stiffness while the sign is saturated and overshoots by gamma h; an explicit one
+needs steps below 1/(gamma p). Here the step is cut where the slide ends, the slaved part is solved
+implicitly with the whole arctan (not its slope), and the supply's limit is applied to each part: while
+i_ref slides the voltage is at its limit, and the current sees an impulse, not the whole jump.
+
+The rotor's motion and the states of the other laws go by Heun's method, the current by an exponential step.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax._pytree import Scalar
+from ambjax.control.inversion import Adaptive, v_and_gradient
+from ambjax.control.laws import CurrentDemand, CurrentInputs, Measurement
+from ambjax.smooth import TWO_OVER_PI, smooth_sign
+
+# Newton steps on the slaved sign: monotone from below; they leave less than 1e-3 of the right-hand side.
+NEWTON = 6
+
+
+def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: Any) -> Any:
+    """The state of a ClosedLoop whose inversion law is `inversion.Adaptive` after h; `begin`, `end`: its inputs."""
+    cascade, scenario = loop.cascade, loop.scenario
+    model, law, (z, z_dot, i), control = cascade.model, cascade.inversion, state.plant, state.control
+    i_ref = control.inversion
+
+    force_0, seen_0, rates_0 = cascade.demand(_add(state.plant, hold), control, begin.reference)
+    z_ddot_0 = scenario.plant.z_ddot(z, i, begin.q_z)
+    ahead = Measurement(z + h * z_dot + h * h / 2 * z_ddot_0, z_dot + h * z_ddot_0, i)
+    moved = control._replace(
+        observer=_axpy(control.observer, h, rates_0.observer), position=_axpy(control.position, h, rates_0.position)
+    )
+    ahead, moved, force_0 = jax.lax.optimization_barrier((ahead, moved, force_0))
+    force_1, seen_1, rates_1 = cascade.demand(_add(ahead, hold), moved, end.reference)
+
+    v_0, gradient_0 = v_and_gradient(model, force_0, i_ref)
+    v_1, gradient_1 = v_and_gradient(model, force_1, i_ref)
+    w = force_0.v_star - v_0
+    drift = (force_1.v_star - v_1 - w) / jnp.where(h > 0, h, 1.0)
+    sliding, slaved, tau = relax(w, drift, law.gamma, law.p, h)
+    sliding, slaved = sliding / gradient_0, slaved / gradient_1
+
+    sliding, slaved, tau, force_1 = jax.lax.optimization_barrier((sliding, slaved, tau, force_1))
+
+    def current(plant: Measurement, seen: Measurement, i_ref: Array, rate: Array, inner: Any, q_i: Array, h: Array):
+        """i - i_ref and the current law's state after h at constant i_ref' = rate."""
+
+        def rate_of(i: Array) -> tuple[Array, Any]:
+            inputs = CurrentInputs(seen._replace(i=i + hold.i), CurrentDemand(i_ref, rate), scenario.u_max)
+            u, inner_rate = cascade.current(model, inputs, inner)
+            u = jnp.clip(u, -scenario.u_max, scenario.u_max)
+            return scenario.plant.i_dot(plant.z, plant.z_dot, i, u, q_i), inner_rate
+
+        i_dot, slope, inner_rate = jax.jvp(rate_of, (plant.i,), (jnp.ones_like(plant.i),), has_aux=True)
+        e = plant.i - i_ref + h * _phi(h * slope) * (i_dot - rate)
+        return e, _axpy(inner, h, inner_rate)
+
+    e, inner = current(state.plant, seen_0, i_ref, sliding, control.current, begin.q_i, tau)
+    e, inner = jax.lax.optimization_barrier((e, inner))
+    i_ref = i_ref + tau * sliding
+    middle = Measurement((z + ahead.z) / 2, (z_dot + ahead.z_dot) / 2, i_ref + e)
+    seen = jax.tree.map(lambda a, b: (a + b) / 2, seen_0, seen_1)
+    # The current moves fast while it slides: what counts at the start of the rest is where it ended.
+    z_ddot_0 += (1 - tau / jnp.where(h > 0, h, 1.0)) * (scenario.plant.z_ddot(z, middle.i, begin.q_z) - z_ddot_0)
+    e, inner = current(middle, seen, i_ref, slaved, inner, end.q_i, h - tau)
+    e, inner = jax.lax.optimization_barrier((e, inner))
+    i_ref = i_ref + (h - tau) * slaved
+
+    z_ddot_1 = scenario.plant.z_ddot(ahead.z, i_ref + e, end.q_z)
+    plant = Measurement(
+        z + h * z_dot + h * h / 6 * (2 * z_ddot_0 + z_ddot_1), z_dot + h / 2 * (z_ddot_0 + z_ddot_1), i_ref + e
+    )
+    control = control._replace(
+        observer=_axpy(_axpy(control.observer, h / 2, rates_0.observer), h / 2, rates_1.observer),
+        position=_axpy(_axpy(control.position, h / 2, rates_0.position), h / 2, rates_1.position),
+        inversion=i_ref,
+        current=inner,
+    )
+    return state._replace(plant=plant, control=control)
+
+
+def relax(w: Array, drift: Array, gain: Scalar, p: Scalar, h: Scalar) -> tuple[Array, Array, Array]:
+    """w' = drift - gain sgn(w) over h, as two constant rates of `gain sgn(w)`: (first, second, time of the first).
+
+    First it slides at its initial rate until w = 0 (or to the end); then it is slaved, one backward Euler step.
+    """
+    first = gain * smooth_sign(w, p)
+    closing = first - drift
+    safe = jnp.where(closing == 0, 1.0, closing)
+    tau = jnp.where(w * closing > 0, jnp.minimum(w / safe, h), 0.0)
+    left = h - tau
+    return first, gain * smooth_sign(_implicit(w - tau * closing + left * drift, left * gain, p), p), tau
+
+
+def _implicit(b: Array, reach: Array, p: Scalar) -> Array:
+    """The w with w + reach sgn(w) = b, by Newton's method from below: the left side is concave in |w|."""
+    size = jnp.abs(b)
+    w = jnp.maximum(size / (1 + reach * p * TWO_OVER_PI), size - reach)
+    for _ in range(NEWTON):
+        slope = 1 + reach * p * TWO_OVER_PI / (1 + (p * w) ** 2)
+        w = w + (size - w - reach * smooth_sign(w, p)) / slope
+    return jnp.where(b < 0, -w, w)
+
+
+def _phi(x: Array) -> Array:
+    """(exp(x) - 1) / x."""
+    small = jnp.abs(x) < 1e-3
+    return jnp.where(small, 1 + x / 2 + x * x / 6, (jnp.exp(x) - 1) / jnp.where(small, 1.0, x))
+
+
+def _add(x: Measurement, y: Measurement) -> Measurement:
+    return Measurement(x.z + y.z, x.z_dot + y.z_dot, x.i + y.i)
+
+
+def _axpy(x: Any, h: Scalar, rate: Any) -> Any:
+    return jax.tree.map(lambda a, b: a + h * b, x, rate)
+
+
+def slides(cascade: Any) -> bool:
+    """Whether this step is made for the cascade."""
+    return isinstance(cascade.inversion, Adaptive)

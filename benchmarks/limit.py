@@ -1,0 +1,160 @@
+"""The machine's limit: limit.c, built with the system's compiler and called on a workload.
+
+`missing()` says in words why there is no C program, if there is none. `check` holds it to our own rollout: without
+noise to 1e-9 relative in float64; with noise, whose numbers it draws by another generator, in how far it moves
+the rotor. Run: python benchmarks/limit.py
+"""
+
+import concurrent.futures
+import ctypes
+import dataclasses
+import functools
+import os
+import pathlib
+import shutil
+import subprocess
+import tempfile
+from typing import Any
+
+os.environ.setdefault("JAX_ENABLE_X64", "1")
+
+import _measure
+import jax
+import jax.numpy as jnp
+import numpy as np
+import workload
+from workload import Workload
+
+from ambjax import Clock, rollout
+
+SOURCE = pathlib.Path(__file__).with_name("limit.c")
+FLAGS = "-O3 -march=native -mprefer-vector-width=512 -fschedule-insns -fsched-pressure -std=gnu11 -fPIC -shared"
+# float gains a fifth from approximate reciprocals, each refined by one Newton step; double has none
+PRECISION = {"float64": "-fno-math-errno", "float32": "-DREAL=float -DSINGLE -ffast-math"}
+PLANT = "m k_z s_0 i_0 R g kappa a"
+DOUBLES = f"""{PLANT} touchdown c k p_sigma gamma p_v k_i p_e amplitude frequency force
+    std_z std_z_dot std_i sample_period"""
+WHOLES = "substeps samples pulse_start pulse_stop seed first_member"
+
+
+class Problem(ctypes.Structure):
+    """struct problem of limit.c."""
+
+    _fields_ = [
+        *((name, ctypes.c_double) for name in DOUBLES.split()),
+        *((name, ctypes.c_int64) for name in WHOLES.split()),
+    ]
+
+
+@functools.cache
+def missing() -> str:
+    """Why there is no C program; empty if there is one."""
+    try:
+        for dtype in PRECISION:
+            _library(dtype)
+    except (OSError, subprocess.SubprocessError) as error:
+        return f"no C program: {error}"
+    return ""
+
+
+@functools.cache
+def _library(dtype: str) -> Any:
+    compiler = shutil.which("gcc") or shutil.which("cc")
+    if compiler is None:
+        raise OSError("there is no gcc or cc on the PATH")
+    with tempfile.TemporaryDirectory() as folder:
+        path = str(pathlib.Path(folder, "limit.so"))
+        command = [compiler, *FLAGS.split(), *PRECISION[dtype].split(), str(SOURCE), "-o", path, "-lm"]
+        subprocess.run(command, check=True, capture_output=True, text=True)
+        return ctypes.CDLL(path)
+
+
+def _problem(work: Workload) -> Problem:
+    """The workload's numbers, read off its records."""
+    scenario, clock = work.scenario, work.clock
+    plant, sensor = scenario.plant, scenario.sensor
+    _, position, inversion, current = (vars(law) for law in work.cascade.laws)
+    reference, force = vars(scenario.reference), vars(scenario.q_v)
+    numbers: dict[str, Any] = {
+        name: getattr(plant, name) for name in ["m", "k_z", "s_0", "i_0", "R", "g", "kappa", "a"]
+    }
+    numbers |= {"touchdown": scenario.touchdown, "force": force["amplitude"], "sample_period": clock.sample_period}
+    numbers |= {name: reference[name] for name in ("amplitude", "frequency")}
+    numbers |= {"c": position["c"], "k": position["k"], "gamma": inversion["gamma"], "k_i": current["k_i"]}
+    numbers |= {"p_sigma": position["p"], "p_v": inversion["p"], "p_e": current["p"]}
+    if sensor is not None:
+        numbers |= {"std_z": sensor.std, "std_z_dot": sensor.std_z_dot, "std_i": sensor.std_i}
+    start, stop = work.pulse
+    return Problem(**numbers, substeps=clock.method.substeps, samples=clock.samples, pulse_start=start, pulse_stop=stop)
+
+
+def run(work: Workload, dtype: str = "float64", threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Largest |z - r| of each member and its z at the end, m. Threads share the members evenly."""
+    library, z = _library(dtype), np.asarray(work.scenario.initial.z).astype(dtype)
+    peak = np.zeros_like(z)
+
+    def part(begin: int, end: int) -> None:
+        problem = _problem(work)
+        problem.first_member = begin
+        pointers = [ctypes.c_void_p(x[begin:end].ctypes.data) for x in (z, peak)]
+        if library.run(ctypes.byref(problem), ctypes.c_long(end - begin), *pointers):
+            raise ValueError("limit.c: too many substeps")
+
+    if threads == 1:
+        part(0, len(z))
+        return peak, z
+    edges = [len(z) * n // threads for n in range(threads + 1)]
+    with concurrent.futures.ThreadPoolExecutor(threads) as pool:
+        list(pool.map(part, edges[:-1], edges[1:]))
+    return peak, z
+
+
+def ours(work: Workload) -> tuple[np.ndarray, np.ndarray]:
+    """The same by jit(vmap(rollout)); the row of one more sample tells the last z."""
+    clock = Clock(work.clock.samples + 1, work.clock.sample_period, work.clock.method)
+
+    @jax.jit
+    @jax.vmap
+    def one(z: Any, member: Any) -> Any:
+        initial = dataclasses.replace(work.scenario.initial, z=z)
+        alone = dataclasses.replace(work.scenario, initial=initial, member=member)
+        rows = rollout(work.cascade, alone, clock).trajectory.rows
+        return jnp.abs(rows.e_z[:-1]).max(), rows.z[-1]
+
+    peak, z = one(work.scenario.initial.z, work.scenario.member)
+    return np.asarray(peak), np.asarray(z)
+
+
+def check() -> dict[str, float]:
+    """Agreement of the C program with our own rollout; AssertionError beyond what it is said to be."""
+    odd, quiet, noisy = workload.workload(37, 300), workload.workload(256, 60), workload.workload(256, 60, noise=True)
+    expected, moved = ours(odd), np.std(ours(noisy)[1] - ours(quiet)[1])
+    found = {}
+    # float32: 6000 steps of rounding at 6e-8 relative to the largest state, in a z of a hundredth of that
+    for dtype, allowed in (("float64", 1e-9), ("float32", 1e-3)):
+        error = max(np.abs(a / b - 1).max() for a, b in zip(run(odd, dtype), expected, strict=True))
+        assert error <= allowed, f"limit.c in {dtype} is off by {error:.1e}"
+        ratio = np.std(run(noisy, dtype)[1] - run(quiet, dtype)[1]) / moved
+        # a standard deviation of 256 has a relative error of 1/sqrt(512) = 4.4 %, two of them 6.3 %: four times that
+        assert abs(ratio - 1) <= 0.25, f"limit.c in {dtype}: its noise moves the rotor {ratio:.2f} times as far as ours"
+        found |= {f"{dtype}_error": float(error), f"{dtype}_noise_ratio": float(ratio)}
+    return found
+
+
+def main() -> None:
+    if why := missing():
+        print(why)
+        return
+    print("agreement with rollout:", {name: f"{value:.2g}" for name, value in check().items()})
+    for noise in (False, True):
+        work = workload.workload(1024, 100, noise=noise)
+        for dtype in PRECISION:
+            for threads in (1, 2):
+                seconds = _measure.median_time(functools.partial(run, work, dtype, threads))
+                each = 1e9 * seconds / work.members / work.steps
+                named = f"{dtype}, {threads} threads, {'held' if noise else 'no'} noise"
+                print(f"{named}: {each:.2f} ns a member-step")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""Cost and peak memory of an ensemble against the number of members and the horizon.
+
+The workload of workload.py with held noise, float64, one core; each point in a process of its own, so that its peak
+memory is its own. Linear means that the time per member-step is the same everywhere: printed is the
+largest deviation from the median. Run: python benchmarks/scaling.py [--full]
+"""
+
+import argparse
+import json
+import os
+import resource
+import statistics
+import sys
+from typing import Any
+
+os.environ.setdefault("JAX_ENABLE_X64", "1")
+
+import _measure
+import workload
+
+MEMBERS, FULL = (1_000, 10_000, 100_000), 1_000_000
+SAMPLES = (20, 200, 2_000)
+# At these the other of the two is varied.
+FIXED_SAMPLES, FIXED_MEMBERS = 200, 4_096
+
+
+def point(members: int, samples: int) -> dict[str, Any]:
+    """Seconds of one run after a first one, and this process's peak memory."""
+    work = workload.workload(members, samples, noise=True)
+    found = _measure.alternating({"run": lambda: workload.ours(work)}, repeats=3)["run"]
+    unit = 1 if sys.platform == "darwin" else 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    each = 1e9 * found["seconds"] / members / work.steps
+    return {"members": members, "samples": samples, "seconds": found["seconds"], "ns": each, "peak_bytes": peak}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--full", action="store_true", help="up to a million members: minutes")
+    parser.add_argument("--point", type=int, nargs=2, help="measure N members over T samples and print JSON")
+    given = parser.parse_args()
+    if given.point:
+        print(json.dumps(point(*given.point)))
+        return
+    grids = {
+        "members": [(n, FIXED_SAMPLES) for n in (*MEMBERS, *([FULL] if given.full else []))],
+        "samples": [(FIXED_MEMBERS, t) for t in SAMPLES],
+    }
+    results: dict[str, Any] = {}
+    for name, grid in grids.items():
+        rows = [_measure.child(__file__, "--point", *pair) for pair in grid]
+        middle = statistics.median(row["ns"] for row in rows)
+        results[name] = {"rows": rows, "deviation": max(abs(row["ns"] / middle - 1) for row in rows)}
+        for row in rows:
+            named = f"{row['members']:>9} members, {row['samples']:>5} samples"
+            print(f"{named}: {row['seconds']:8.3f} s, {row['ns']:6.2f} ns/step, {row['peak_bytes'] / 2**20:6.0f} MiB")
+        print(f"against {name}: linear to within {100 * results[name]['deviation']:.1f} %", flush=True)
+    _measure.write("scaling", results)
+
+
+if __name__ == "__main__":
+    main()

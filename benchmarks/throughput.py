@@ -1,0 +1,73 @@
+"""Member-steps per second of an ensemble against the number of members, next to the machine's limit.
+
+The workload of workload.py (RK4, 10 us a step), without and with held noise, float64 and float32 (a process of
+its own for each precision), one core and two. Each of our times stands beside that of limit.c, both taken in
+turn in the same process; ratios are between their medians, compilation apart. One member alone is a `rollout`.
+Run: python benchmarks/throughput.py
+"""
+
+import argparse
+import functools
+import itertools
+import json
+import os
+from typing import Any
+
+os.environ.setdefault("JAX_ENABLE_X64", "1")
+
+import _measure
+import limit
+import workload
+
+MEMBERS = (1, 16, 64, 256, 1024, 4096)
+THREADS = (1, 2)
+SAMPLES = 500
+
+
+def measure(dtype: str, members: tuple[int, ...], samples: int) -> list[dict[str, Any]]:
+    """One row per number of members, threads and kind of noise."""
+    rows = []
+    for noise, n, threads in itertools.product((False, True), members, THREADS):
+        if threads > n:
+            continue
+        work = workload.workload(n, samples, noise=noise)
+        runs = {"ambjax": functools.partial(workload.ours, work, threads)}
+        if not limit.missing():
+            runs["C"] = functools.partial(limit.run, work, dtype, threads)
+        found = _measure.alternating(runs)
+        row: dict[str, Any] = {"dtype": dtype, "noise": noise, "members": n, "threads": threads}
+        row |= {name: 1e9 * each["seconds"] / n / work.steps for name, each in found.items()}
+        row["compile_s"] = found["ambjax"]["compile_s"]
+        if "C" in row:
+            row["ratio"] = row["ambjax"] / row["C"]
+        rows.append(row)
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--members", type=int, nargs="+", default=MEMBERS)
+    parser.add_argument("--samples", type=int, default=SAMPLES)
+    parser.add_argument("--dtype", choices=("float64", "float32"), help="measure one precision and print JSON")
+    given = parser.parse_args()
+    if given.dtype:
+        print(json.dumps(measure(given.dtype, given.members, given.samples)))
+        return
+    if why := limit.missing():
+        print(f"{why}: the limit is skipped")
+    print(f"{'dtype':<8} {'noise':<6} {'members':>7} {'cores':>5} {'ns/step':>8} {'C':>7} {'ratio':>6} {'steps/s':>9}")
+    rows = []
+    for dtype, x64 in (("float64", "1"), ("float32", "0")):
+        arguments = ("--dtype", dtype, "--samples", given.samples, "--members", *given.members)
+        found = _measure.child(__file__, *arguments, JAX_ENABLE_X64=x64)
+        rows += found
+        for row in found:
+            named = f"{dtype:<8} {'held' if row['noise'] else 'none':<6} {row['members']:>7} {row['threads']:>5}"
+            limits = f"{row.get('C', float('nan')):7.2f} {row.get('ratio', float('nan')):6.2f}"
+            print(f"{named} {row['ambjax']:8.2f} {limits} {1e9 / row['ambjax']:9.2e}", flush=True)
+    agreement = None if limit.missing() else limit.check()
+    _measure.write("throughput", {"samples": given.samples, "agreement": agreement, "rows": rows})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""What every ensemble benchmark runs, and its right-hand side written out once more for the peers.
+
+The paper's tracking scenario with the disturbance as scaled force, smooth gains (inversion gamma = 1e9,
+p = 25e-6, else the paper's), members that differ in where the rotor starts, RK4 with a step of 1e-5 s, ten
+steps a sample. The pulse acts in the middle of the horizon, whatever its length. The fold is the largest
+|z - r| of each member.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ambjax import RK4, Cascade, Clock, Initial, Plant, Pulse, Scenario, Sensor, inversion, paper, rollout
+from ambjax.ensemble.engine import run_ensemble
+from ambjax.metrics import Peak
+
+GAMMA, P_V = 1e9, 25e-6
+PERIOD, SUBSTEPS = 1e-4, 10
+NOISE = Sensor(std=1e-6, std_z_dot=1e-4, std_i=1e-4)
+# Members start at up to this distance from the middle, m.
+SPREAD = 1e-4
+FOLD = Peak("e_z")
+
+
+class Workload(NamedTuple):
+    """One ensemble: the arguments of `run_ensemble`."""
+
+    cascade: Cascade
+    scenario: Scenario
+    clock: Clock
+
+    @property
+    def members(self) -> int:
+        return len(self.scenario.initial.z)
+
+    @property
+    def steps(self) -> int:
+        """RK4 steps of one member."""
+        return self.clock.samples * self.clock.method.substeps
+
+    @property
+    def pulse(self) -> tuple[int, int]:
+        """First sample with the pulse and first one after it."""
+        force = vars(self.scenario.q_v)
+        return round(force["start"] / PERIOD), round(force["stop"] / PERIOD)
+
+    def lasting(self, samples: int) -> "Workload":
+        """The same, pulse included, over another horizon."""
+        return self._replace(clock=dataclasses.replace(self.clock, samples=samples))
+
+    def stepping(self, substeps: int) -> "Workload":
+        """The same with another step."""
+        return self._replace(clock=self.clock.with_method(RK4(substeps)))
+
+    def few(self, members: int) -> "Workload":
+        """Some of its members, spread evenly."""
+        chosen = np.linspace(0, self.members - 1, members).round().astype(int)
+        initial = dataclasses.replace(self.scenario.initial, z=np.asarray(self.scenario.initial.z)[chosen])
+        member = np.asarray(self.scenario.member)[chosen]
+        return self._replace(scenario=dataclasses.replace(self.scenario, initial=initial, member=member))
+
+
+def workload(members: int, samples: int, *, noise: bool = False) -> Workload:
+    cascade = dataclasses.replace(paper.cascade("repaired"), inversion=inversion.Adaptive(GAMMA, P_V))
+    start, stop = round(0.4 * samples), round(0.65 * samples)
+    scenario = dataclasses.replace(
+        paper.scenario("tracking", "repaired"),
+        q_v=Pulse(1.0, start * PERIOD, stop * PERIOD),
+        sensor=NOISE if noise else None,
+        initial=Initial(z=SPREAD * ((2 * np.arange(members) + 1) / members - 1)),
+        member=np.arange(members),
+    )
+    return Workload(cascade, scenario, Clock(samples, PERIOD, RK4(SUBSTEPS)))
+
+
+def ours(work: Workload, threads: int = 1, **options: Any) -> Any:
+    """The largest |z - r| of each member, by ambjax: the ensemble engine, or `rollout` where there is one member."""
+    if work.members > 1:
+        return run_ensemble(*work, fold=FOLD, threads=threads, **options).measured
+    alone = dataclasses.replace(work.scenario, initial=Initial(z=float(work.scenario.initial.z[0])), member=0)
+    return rollout(work.cascade, alone, work.clock, fold=FOLD, every=0).measured
+
+
+def right_side(gamma: float, p_v: float, xp: Any) -> Callable[..., Any]:
+    """The noise-free closed loop f(t, (z, z_dot, i, i_ref), q) -> rates, q the scaled force in A^2/m^2.
+
+    For `math`, `numpy` or `jax.numpy` as `xp`; with `math` Numba compiles it.
+    """
+    sin, cos, atan, pi = xp.sin, xp.cos, xp.atan, math.pi
+    plant = Plant()
+    m, k_z, s_0, i_0, g, R = plant.m, plant.k_z, plant.s_0, plant.i_0, plant.g, plant.R
+    kappa, a, w = plant.kappa, plant.a, 4 * math.pi
+    c, k, p, k_i = 17.0, 25.0, 25.0, 152.0
+
+    def f(t: Any, y: Any, q: Any) -> Any:
+        z, z_dot, i, i_ref = y[0], y[1], y[2], y[3]
+        sine, cosine = sin(w * t), cos(w * t)
+        r, r_dot, r_ddot = 2.5e-3 * sine, 2.5e-3 * w * cosine, -2.5e-3 * w * w * sine
+        sigma = z_dot - r_dot + c * (z - r)
+        robust = k * 2 / pi * atan(p * sigma)
+        v_star = (-2 * k_z / m * z - c * (z_dot - r_dot) + r_ddot + g - robust) / a
+        up, low = s_0 - z, s_0 + z
+        v_ref = ((i_0 + i_ref) / up) ** 2 - ((i_0 - i_ref) / low) ** 2
+        v = ((i_0 + i) / up) ** 2 - ((i_0 - i) / low) ** 2
+        slope = 2 * (i_0 + i_ref) / up**2 + 2 * (i_0 - i_ref) / low**2
+        i_ref_dot = gamma * 2 / pi * atan(p_v * (v_star - v_ref)) / slope
+        e_law = -k_i * 2 / pi * atan(p * (i - i_ref))
+        u = kappa / (2 * low) * (-2 * z_dot / low * i + i_ref_dot + e_law) + R * i
+        i_dot = 2 * z_dot / low * i + 2 * low / kappa * (u - R * i)
+        return z_dot, 2 * k_z / m * z + a * v - g + a * q, i_dot, i_ref_dot
+
+    return f

@@ -1,0 +1,110 @@
+"""The whole-rollout kernel against the rollout, in interpret mode; and its lowering for a GPU, without one."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ambjax import (
+    RK4,
+    Adaptive,
+    Cascade,
+    Clock,
+    Initial,
+    Scenario,
+    Sensor,
+    Sine,
+    Standard,
+    inversion,
+    observer,
+    position,
+)
+from ambjax.ensemble import onekernel
+from ambjax.ensemble.engine import run_ensemble
+from ambjax.ensemble.onekernel import run_whole
+from ambjax.loop import ClosedLoop
+from ambjax.metrics import Named, Peak, Variation
+from ambjax.signals import BandNoise
+
+MEMBERS, CLOCK = 37, Clock(5, 1e-4, RK4(2))
+CASCADE = Cascade(inversion=inversion.Adaptive(np.linspace(1e8, 1e9, MEMBERS), 25e-6))
+SCENARIO = Scenario(
+    reference=Sine(2.5e-3, 2.0),
+    q_z=BandNoise(1.0, 10.0, 200.0),
+    sensor=Sensor(1e-6, 1e-4, 1e-4),
+    # the last members start beside the stop, moving towards it, and are lost
+    initial=Initial(z=np.linspace(0, 4.49e-3, MEMBERS), z_dot=np.linspace(0, 1.0, MEMBERS)),
+    seed=11,
+    member=np.arange(1000, 1000 + MEMBERS),
+)
+
+
+@pytest.mark.parametrize("x64", [True, False])
+def test_noise_is_that_of_jax_random_bit_for_bit(x64):
+    with jax.enable_x64(x64):
+
+        def both(scenario, sample):
+            words = jax.random.key_data(scenario.key())
+            here = onekernel.KernelLoop(Cascade(), scenario, (words[0], words[1])).hold(sample)
+            return ClosedLoop(Cascade(), scenario).hold(sample), here
+
+        # the standard deviations are arguments, as in a rollout: XLA would fold constants into the draws, and round
+        sensor = Sensor(*np.full((3, 150), [[1e-6], [1e-4], [1e-3]]))
+        seeds = jnp.asarray([0, 1, 2**31 - 1] * 50)
+        scenario = Scenario(sensor=sensor, seed=seeds, member=jnp.arange(150) * 7919)
+        axes = jax.tree.map(lambda x: 0 if np.ndim(x) else None, scenario)
+        ours, theirs = jax.jit(jax.vmap(both, in_axes=(axes, 0)))(scenario, jnp.arange(150) ** 3)
+        for a, b in zip(ours, theirs, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_kernel_is_the_rollout():
+    fold = Named({"peak": Peak("e_z", 1e-4, timed=True), "chatter": Variation("u")})
+    found = run_whole(CASCADE, SCENARIO, CLOCK, fold=fold, block=32, interpret=True)
+    expected = run_ensemble(CASCADE, SCENARIO, CLOCK, fold=fold, threads=1)
+    assert 0 < int(jnp.isfinite(expected.trajectory.lost_at).sum()) < MEMBERS
+    for ours, theirs in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
+        assert ours.shape == (MEMBERS,)
+        # one and the same arithmetic; only the compiler's contraction of a*b + c may differ
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=0)
+
+
+LAWS = {
+    "paper": CASCADE,
+    "others": Cascade(
+        observer=observer.Complementary(np.linspace(1.0, 10.0, MEMBERS)),
+        position=position.SuperTwisting(),
+        inversion=inversion.ClosedForm(),
+    ),
+}
+
+
+@pytest.mark.parametrize(("laws", "x64"), [("paper", True), ("others", False)])
+def test_lowers_for_a_gpu(laws, x64, monkeypatch):
+    # No GPU is needed to make its program: a primitive that kernels cannot have would raise here. What is done for
+    # CPUs alone must be left out, as it is where JAX runs on a GPU.
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with jax.enable_x64(x64):
+        run = jax.jit(
+            lambda z: run_whole(LAWS[laws], dataclasses.replace(SCENARIO, initial=z), CLOCK, fold=Standard(2e-4))
+        )
+        lowered = run.trace(SCENARIO.initial).lower(lowering_platforms=("cuda",)).as_text()
+    assert lowered.count("custom_call @__gpu$xla.gpu.triton") == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"clock": Clock(6, 1e-4, Adaptive())}, "RK4 only"),
+        ({"block": 48}, "block = 48: it must be a power of two"),
+        ({"scenario": dataclasses.replace(SCENARIO, seed=np.arange(5))}, "lengths 5 and 37"),
+        ({"scenario": Scenario(), "cascade": Cascade(), "clock": Clock(6, 1e-4, RK4(50))}, "lengths none"),
+        ({"clock": Clock(0, 1e-4, RK4(1))}, "clock.samples = 0"),
+    ],
+)
+def test_bad_input_is_refused(change, message):
+    arguments = {"cascade": CASCADE, "scenario": SCENARIO, "clock": CLOCK, "fold": Peak("e_z")} | change
+    with pytest.raises(ValueError, match=message):
+        run_whole(**arguments)

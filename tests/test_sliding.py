@@ -1,0 +1,111 @@
+"""The loop's own step: against accurate references where it is meant for, its order, and the scalar it solves."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ambjax import (
+    Adaptive,
+    Cascade,
+    Clock,
+    Initial,
+    Pulse,
+    Scenario,
+    Sensor,
+    Sine,
+    Slide,
+    current,
+    inversion,
+    observer,
+    position,
+    rollout,
+)
+from ambjax.metrics import Rms
+from ambjax.sliding import _implicit, relax
+from ambjax.smooth import smooth_sign
+
+TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.01, 0.02), u_max=200.0)
+
+
+def cascade(c, k, gamma, k_i, p=25.0, **more):
+    return Cascade(
+        position=position.SlidingMode(c, k, 25.0),
+        inversion=inversion.Adaptive(gamma, p),
+        current=current.SlidingMode(k_i, 25.0),
+        **more,
+    )
+
+
+def test_the_implicit_sign_is_solved():
+    b = jnp.asarray(np.concatenate([-np.geomspace(1e-9, 1e4, 200), [0.0], np.geomspace(1e-9, 1e4, 200)]))
+    for reach in (1e-6, 1e-2, 1.0, 166.0, 1e5):
+        w = _implicit(b, reach, 25.0)
+        # Newton's last step, relative to the larger of both terms
+        assert np.max(np.abs(w + reach * smooth_sign(w, 25.0) - b) / (np.abs(b) + 1e-12)) < 1e-3
+
+
+def test_a_slide_reaches_its_end_and_no_further():
+    first, second, tau = relax(jnp.asarray(2.0), jnp.asarray(0.0), 1e6, 25.0, 1e-4)
+    assert float(tau) == pytest.approx(2e-6, rel=0.02)
+    # what is left of w after the step: it moved by exactly what there was
+    assert float(tau * first + (1e-4 - tau) * second) == pytest.approx(2.0, abs=1e-3)
+    first, _, tau = relax(jnp.asarray(2.0), jnp.asarray(0.0), 1e3, 25.0, 1e-4)
+    assert float(tau) == 1e-4
+    assert float(tau * first) == pytest.approx(0.1, rel=0.02)
+
+
+NOISY = {
+    "direct": (cascade(2190.0, 37.0, 1.66e6, 238.0), Sensor(1e-6, 1e-4, 1e-4), 200.0),
+    "behind an observer": (
+        cascade(551.0, 108.0, 2.9e5, 367.0, observer=observer.Complementary(1.0, 0.0)),
+        Sensor(3.1623e-4),
+        200.0,
+    ),
+    "fast current loop": (cascade(181.0, 202.0, 1.3e6, 3800.0), Sensor(1e-5, 1e-4, 1e-4), 500.0),
+}
+
+
+@pytest.mark.parametrize("case", NOISY)
+def test_stiff_gains_under_held_noise_agree_with_error_control(case):
+    gains, sensor, u_max = NOISY[case]
+    scenario = dataclasses.replace(TRACKING, sensor=sensor, u_max=u_max)
+    fold = Rms("e_z", 0.01)
+    found = [
+        float(rollout(gains, scenario, Clock(400, 1e-4, method), fold=fold, every=0).measured)
+        for method in (Adaptive(1e-6), Slide(4))
+    ]
+    # measured below 1 % (0.3 % for most) over longer runs
+    assert found[1] == pytest.approx(found[0], rel=0.03)
+
+
+def test_the_slow_motion_is_of_second_order():
+    gains = cascade(60.0, 1.0, 1e8, 20.0, p=1.0)
+    scenario = Scenario(reference=Sine(1e-3, 10.0), initial=Initial(1e-4), u_max=1e9)
+    reference = rollout(gains, scenario, Clock(100, 1e-3, Adaptive(1e-9)), every=1).trajectory.rows.z
+    errors = [
+        float(np.abs(rollout(gains, scenario, Clock(100, 1e-3, Slide(n)), every=1).trajectory.rows.z - reference).max())
+        for n in (2, 4, 8)
+    ]
+    order = np.polyfit(np.log([2, 4, 8]), -np.log(errors), 1)[0]
+    assert order > 1.6, (order, errors)
+
+
+def test_another_inversion_law_is_refused():
+    with pytest.raises(ValueError, match="adaptive"):
+        rollout(Cascade(inversion=inversion.ClosedForm()), Scenario(), Clock(2, 1e-4, Slide(1)))
+
+
+def test_values_and_derivatives_are_finite_over_six_decades_of_gains():
+    gains = np.array([17.0, 25.0, 7.5e4, 152.0]) * 10 ** np.random.default_rng(0).uniform(-3, 3, (200, 4))
+    scenario = dataclasses.replace(TRACKING, initial=Initial(1e-3))
+
+    def loss(gains):
+        out = rollout(cascade(*gains), scenario, Clock(100, 1e-4, Slide(2)), fold=Rms("e_z"), every=0)
+        return out.measured, out.measured
+
+    slope, value = jax.jit(jax.vmap(jax.jacfwd(loss, has_aux=True)))(jnp.asarray(gains))
+    assert np.all(np.isfinite(value))
+    assert np.all(np.isfinite(slope))

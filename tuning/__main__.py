@@ -1,0 +1,47 @@
+"""The command line of the tuner: `ambjax-tune`, or `python -m tuning`."""
+
+import argparse
+import json
+import sys
+
+from ambjax import __version__
+from ambjax.__main__ import Parser, complain
+from ambjax.worker import prepare
+
+
+def parser() -> argparse.ArgumentParser:
+    """All arguments."""
+    top = Parser(
+        prog="ambjax-tune",
+        description="Tune the gains of a case by gradients of an ensemble's loss: tuned.toml, history.npz, report.",
+    )
+    top.add_argument("case", metavar="CASE.toml", help="a case file; its table [tune] says what to tune, all optional")
+    top.add_argument("--out", metavar="DIR", help="where to write (default: a new directory under ./out)")
+    top.add_argument("--resume", action="store_true", help="go on with the search whose checkpoint is in --out")
+    top.add_argument("--gradients", action="store_true", help="report the gradient itself too: a minute more")
+    top.add_argument("--pareto", action="store_true", help="trace the front of error against voltage too")
+    top.add_argument("--json", action="store_true", help="print report.json on stdout and nothing else there")
+    top.add_argument("--version", action="version", version=f"ambjax {__version__}")
+    return top
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Tune. Returns 0 if the tuned gains keep every held-out rotor, 1 if not, 2 for bad input."""
+    args = parser().parse_args(argv)
+    prepare()
+    from tuning.command import run
+
+    try:
+        code, summary = run(args)
+    except ValueError as error:
+        return complain(str(error), "ambjax-tune")
+    except KeyboardInterrupt:
+        print("ambjax-tune: interrupted before there was anything to keep", file=sys.stderr)
+        return 130
+    if args.json:
+        print(json.dumps(summary, indent=2))
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

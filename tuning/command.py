@@ -1,0 +1,209 @@
+"""What `ambjax-tune` does: read, search, judge, write."""
+
+import argparse
+import dataclasses
+import itertools
+import pathlib
+import time
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax.casefile import case_from
+from ambjax.outputs import directory, plain, say, write_json
+from ambjax.theorem import check
+from tuning import explore, gradient, report
+from tuning.config import read_study, seeds, settings
+from tuning.loss import TERMS
+from tuning.objective import Members
+from tuning.optimise import Keeper, Search, best_of, search
+from tuning.study import RESOLVED, Study, judge, step_error, study_of, summarise
+from tuning.toml import dumps, with_gains
+
+CHECKPOINT = "checkpoint"
+# A search whose steps were too coarse is continued in steps of half the length, twice at most.
+MOST_ROUNDS = 3
+
+
+def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+    """ambjax-tune. Raises ValueError for bad input, before anything is written."""
+    case, tune, raw = read_study(args.case)
+    if args.resume and not (args.out and (pathlib.Path(args.out) / f"{CHECKPOINT}-1.npz").exists()):
+        raise ValueError(f"--resume: there is no {CHECKPOINT}-1.npz in --out {args.out}. Leave out --resume to begin.")
+    study = study_of(case, tune)
+    start = tune.space.values(case.cascade)
+    tune.space.encode(start)
+    out = directory(args.out, f"tune-{case.name}")
+    seed, held_out = seeds(tune.budget)
+    who = study.objective.training(seed, tune.budget.members, tune.stress, tune.budget.stressed)
+    say(f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {study.objective.clock.method}")
+    began = time.perf_counter()
+    study, kept, x, error = _resolved_search(study, who, start, out, [raw, settings(tune)], args.resume)
+    seconds = time.perf_counter() - began
+    facts = _facts(study, x, kept, who, seconds, held_out, error)
+    if args.gradients:
+        say("gradient report ...")
+        facts["gradient"] = gradient.report(study, x, who)
+    if args.pareto:
+        say("front of error against voltage ...")
+        facts["pareto"] = explore.pareto(study, x, who)
+    _write(out, study, raw, kept, facts, explore.slices(study, x, who))
+    summary = plain(facts) | {"out": str(out)}
+    if not args.json:
+        print(_short(facts))
+        print(f"written: {out}/tuned.toml, history.npz, report.md, report.html, report.json")
+    good = facts["after"]["lost"] == 0 if facts["after"]["members"] else facts["lost_in_training"] == 0
+    if not good:
+        say(facts["advice"])
+    return int(not good), summary
+
+
+def _resolved_search(
+    study: Study, who: Members, start: np.ndarray, out: pathlib.Path, told: Any, resume: bool
+) -> tuple[Study, Search, np.ndarray, dict[str, float] | None]:
+    """The search, again in finer steps where its own do not resolve the optimum that it found."""
+    tune, begin_at = study.tune, None
+    for round in itertools.count(1):
+        path = out / f"{CHECKPOINT}-{round}.npz"
+        kept = search(
+            study.engine, study.goal, who, start, begin_at=begin_at, count=tune.budget.screen,
+            keep=tune.budget.starts, iterations=tune.budget.iterations, seed=tune.budget.seed, name=tune.optimiser,
+            rate=tune.learning_rate, keeper=Keeper(path, [told, round]), resume=resume and path.exists(),
+            tell=_teller(study, len(who.member)),
+        )  # fmt: skip
+        x, value = best_of(kept)
+        if not np.isfinite(value):
+            raise ValueError(
+                "tune: the loss is not a finite number at any start that was tried. Look at the case with "
+                "'ambjax simulate', or change tune.screen and tune.bounds."
+            )
+        if int(kept.history["lost"][-1][int(np.argmin(kept.history["value"][-1]))]) == len(who.member):
+            return study, kept, x, None  # nothing to hold a step against
+        error = step_error(study, x)
+        say(f"step of the search against adaptive RODAS3: settled rms error off by {100 * error['relative']:.2g} %")
+        if abs(error["relative"]) <= RESOLVED or round == MOST_ROUNDS or kept.interrupted:
+            return study, kept, x, error
+        begin_at, rollouts = np.asarray(kept.starts.best), study.engine.rollouts
+        study = study_of(study.case, tune, finer=2**round)
+        study.engine.rollouts = rollouts
+        say(f"too coarse there; the search goes on with {study.objective.clock.method}")
+    raise AssertionError("unreachable: the rounds are counted")
+
+
+def _teller(study: Study, count: int) -> Any:
+    """What is said after each iteration."""
+    scale = float(np.asarray(study.objective.loss.s_0))
+    budget, spent = study.tune.budget, []
+
+    def tell(kept: Search, seconds: float) -> None:
+        spent.append(seconds)
+        x, value = best_of(kept)
+        gains = np.asarray(study.objective.space.gains_at(jnp.asarray(x)))
+        best = int(np.argmin(kept.history["value"][-1]))
+        terms, lost = kept.history["terms"][-1][best], int(kept.history["lost"][-1][best])
+        left = (budget.iterations - kept.iteration) * float(np.median(spent)) * kept.active.sum() / len(kept.active)
+        named = ", ".join(f"{g.name} {v:.4g}" for g, v in zip(study.objective.space.gains, gains, strict=True))
+        say(
+            f"{kept.iteration:3d}/{budget.iterations}  loss {np.exp(value):.3e}  "
+            f"rms error {scale * np.sqrt(terms[TERMS.index('tracking')]):.2e} m  kept {count - lost}"
+            f"/{count}  {named}  ({kept.active.sum()} starts, at most {left:.0f} s left)"
+        )
+
+    return tell
+
+
+def _facts(
+    study: Study, x: np.ndarray, kept: Search, who: Members, seconds: float, held_out: int, error: Any
+) -> dict[str, Any]:
+    case, tune, space = study.case, study.tune, study.objective.space
+    rollouts = study.engine.rollouts
+    before = space.values(case.cascade)
+    after = np.asarray(space.gains_at(jnp.asarray(x)))
+    tuned = dataclasses.replace(case, cascade=space.decode(jnp.asarray(x), case.cascade))
+    count = tune.budget.held_out
+    say(f"judging on {count} members of another seed ...")
+    none = {"members": 0, "lost": 0}
+    found = [summarise(study, judge(study, at, held_out, count)) if count else none for at in (_at(study, before), x)]
+    lost = int((study.engine.terms(x[None], who)["survival"] > 0).sum())
+    line = check(tuned.cascade, case.scenario, dataclasses.replace(case.clock, method=None))
+    facts: dict[str, Any] = {
+        "case": case.name,
+        "weights": list(tune.weights),
+        "before": found[0],
+        "after": found[1],
+        "held_out_seed": held_out,
+        "lost_in_training": lost,
+        "conditions": report.conditions(line),
+        "step_error": error,
+        "search": settings(tune) | {"iterations": kept.iteration, "rollouts": rollouts, "seconds": seconds},
+    }
+    facts["gains"] = report.gains_table(space, before, after, None)
+    facts["verdict"] = _verdict(facts)
+    facts["advice"] = _advice(study, facts, x, who)
+    return facts
+
+
+def _at(study: Study, gains: np.ndarray) -> np.ndarray:
+    return study.objective.space.encode(study.objective.space.clip(gains))
+
+
+def _verdict(facts: dict[str, Any]) -> str:
+    before, after = facts["before"], facts["after"]
+    if not after["members"]:
+        return f"{facts['lost_in_training']} members of the training ensemble are lost under the tuned gains."
+    return (
+        f"Of {after['members']} held-out members, {after['lost']} are lost under the tuned gains (before: "
+        f"{before['lost']}); settled rms error {after['settled_rms_error_m']:.3g} m (before: "
+        f"{before['settled_rms_error_m']:.3g} m), largest {after['settled_max_abs_error_m']:.3g} m."
+    )
+
+
+def _advice(study: Study, facts: dict[str, Any], x: np.ndarray, who: Members) -> str:
+    """Why rotors may still be lost, and what would help: what is tight, in the order in which it matters."""
+    if not (facts["lost_in_training"] or facts["after"]["lost"]):
+        return ""
+    words = [f"Rotors are lost: {facts['lost_in_training']} of {len(who.member)} in training."]
+    for row in facts["conditions"]:
+        if row["holds"] is False and row["gain"] is not None:
+            words.append(f"{row['requires']} fails: {row['gain']:.3g} against {row['against']:.3g} {row['unit']}.")
+    effort = study.engine.terms(x[None], who)["effort"].mean()
+    u_max = float(np.asarray(study.case.scenario.u_max))
+    if np.isfinite(u_max) and effort > 0.25:
+        words.append(
+            f"The voltage is at {100 * np.sqrt(effort):.0f} % of its limit (rms): a supply above {u_max:g} V, less "
+            "sensor noise, or an observer ([controller.observer] kind = 'complementary', its l tuned) would help."
+        )
+    bound = [row["path"] for row in facts["gains"] if row["at_bound"]]
+    if bound:
+        words.append(f"At a bound: {', '.join(bound)}; widen tune.bounds.")
+    words.append("More members (tune.members), or risk = 'cvar', asks for more margin; more screen, for other starts.")
+    return " ".join(words)
+
+
+def _write(
+    out: pathlib.Path, study: Study, raw: dict[str, Any], kept: Search, facts: dict[str, Any], found: explore.Slices
+) -> None:
+    space = study.objective.space
+    for row, grows in zip(facts["gains"], found.sensitivity(), strict=True):
+        row["sensitivity_percent"] = float(grows)
+    facts["slices"] = {"gains": found.gains, "log_risk": found.goals, "lost": found.lost}
+    document = with_gains(raw, {row["path"]: row["after"] for row in facts["gains"]})
+    head = f"Tuned by ambjax-tune from the case '{facts['case']}'.\n{facts['verdict']}"
+    case_from(document, facts["case"])  # a file that could not be read back is not written
+    (out / "tuned.toml").write_text(dumps(document, head), encoding="utf-8")
+    np.savez(out / "history.npz", **{k: np.asarray(v) for k, v in kept.history.items()})  # pyright: ignore
+    text = report.markdown(facts)
+    pictures = {"Convergence": report.convergence(kept.history, space.paths)} if kept.history else {}
+    pictures["The risk along each gain, through the optimum"] = report.landscape(found, space.paths)
+    if facts.get("pareto"):
+        pictures["Error against voltage"] = report.front(facts["pareto"])
+    (out / "report.md").write_text(text, encoding="utf-8")
+    (out / "report.html").write_text(report.page(text, pictures, f"Tuning of {facts['case']}"), encoding="utf-8")
+    write_json(out / "report.json", facts)
+
+
+def _short(facts: dict[str, Any]) -> str:
+    lines = [facts["verdict"]]
+    lines += [f"  {row['path']}: {row['before']:.6g} -> {row['after']:.6g} {row['at_bound']}" for row in facts["gains"]]
+    return "\n".join(lines)

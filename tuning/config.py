@@ -1,0 +1,191 @@
+"""The table [tune] of a case file: what to tune, what counts, and how much to spend."""
+
+import dataclasses
+import math
+import pathlib
+from typing import Any
+
+import numpy as np
+
+from ambjax.casefile import Case, case_from, load
+from ambjax.ensemble.spread import require_path
+from ambjax.tomltable import Table, show
+from tuning.loss import TERMS
+from tuning.optimisers import names
+from tuning.risk import CVaR, Mean, Risk, SoftWorst
+from tuning.space import Gain, Space, tunable
+
+WEIGHTS = {"tracking": 1.0, "peak": 0.0, "effort": 0.0, "chatter": 0.0, "clearance": 1e-3, "survival": 1.0}
+WORDS = ["gains", "bounds", "weights", "risk", "alpha", "optimiser"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """How the search is run; whole numbers, unless a unit is given."""
+
+    members: int = 32
+    """members of the ensemble that is tuned on"""
+    stressed: int = 8
+    """further members whose noise is `stress` times as loud, and of whom nothing is asked but to be held"""
+    held_out: int = 1000
+    """members of the ensemble that judges, of another seed"""
+    seed: int = 1
+    """of the training ensemble and of the screen; the held-out one has the next seed but one million"""
+    screen: int = 128
+    """points of the first screen; 0: none, start from the case's gains alone"""
+    starts: int = 4
+    """best of them that are refined"""
+    iterations: int = 40
+    """of the refinement, at most"""
+    substeps: int = 3
+    """steps per sample"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Tune:
+    """Everything that [tune] says. `weights` in the order of TERMS."""
+
+    space: Space
+    weights: tuple[float, ...]
+    conditions: float
+    margin: float
+    early: float
+    stress: float
+    risk: Risk
+    optimiser: str
+    learning_rate: float
+    budget: Budget
+
+
+def read_study(path: str | pathlib.Path) -> tuple[Case, Tune, dict[str, Any]]:
+    """Case, [tune] and the raw document of a case file. Raises ValueError, one line, for anything wrong in it."""
+    raw = load(path)
+    name = pathlib.Path(path).stem
+    try:
+        case = case_from(raw, name)
+        return case, tune_from(Table(raw).table("tune"), case), raw
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def tune_from(table: Table, case: Case) -> Tune:
+    """[tune] of a case; whatever is left out has a default."""
+    numbers = ["conditions_margin", "early", "stress", "learning_rate"]
+    counts = [field.name for field in dataclasses.fields(Budget)]
+    table.only([*WORDS, *numbers, *counts])
+    budget = Budget(**{name: _whole(table, name, getattr(Budget, name)) for name in counts})
+    weights, conditions = _weights(table.table("weights"))
+    optimiser = table.choice("optimiser", names(), "bfgs")
+    return Tune(
+        space=_space(table, case),
+        weights=weights,
+        conditions=conditions,
+        margin=_positive(table, "conditions_margin", 0.1, zero=True),
+        early=_positive(table, "early", 0.0, zero=True),
+        stress=_positive(table, "stress", 1.2),
+        risk=_risk(table),
+        optimiser=optimiser,
+        learning_rate=_positive(table, "learning_rate", 0.1),
+        budget=budget,
+    )
+
+
+def _space(table: Table, case: Case) -> Space:
+    known = tunable(case.cascade)
+    default = [path for path in known if path.rpartition(".")[2] in ("c", "k", "gamma", "k_i", "l")] or known
+    paths = table.raw.get("gains", default)
+    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
+        raise ValueError(f'{table.at("gains")} = {show(paths)}: give a list of paths, as in ["controller.position.c"].')
+    bounds = _flat(table.table("bounds").raw)
+    for path in [*paths, *bounds]:
+        try:
+            require_path(path, known)
+        except ValueError as error:
+            key = "gains" if path in paths else "bounds"
+            text = str(error).removeprefix(f"spread.{path}: ").replace("in this case", "to tune in this case")
+            raise ValueError(f"{table.at(key)}: '{path}': {text}") from None
+    for path in bounds:
+        if path not in paths:
+            raise ValueError(f"{table.at('bounds')}: {path} is not in tune.gains. Add it there or leave it out here.")
+    clash = [path for path in paths if path in case.spread.paths]
+    if clash:
+        raise ValueError(f"spread.{clash[0]} varies what tune.gains asks to tune. Remove it from one of them.")
+    return Space(tuple(Gain(path, *_bound(bounds.get(path), path, table)) for path in paths))
+
+
+def _flat(raw: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Dotted keys of nested tables: TOML reads controller.position.c = [1, 2] as three tables."""
+    found: dict[str, Any] = {}
+    for key, value in raw.items():
+        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return found
+
+
+def _bound(raw: Any, path: str, table: Table) -> tuple[float, float]:
+    if raw is None:
+        return 0.0, math.inf
+    numbers = isinstance(raw, list) and all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in raw)
+    if not numbers or len(raw) != 2 or not 0 <= raw[0] < raw[1]:
+        where = f"{table.at('bounds')}.{path}"
+        raise ValueError(f"{where} = {show(raw)}: give [low, high] with 0 <= low < high; inf means no upper bound.")
+    return float(raw[0]), float(raw[1])
+
+
+def _weights(table: Table) -> tuple[tuple[float, ...], float]:
+    table.only([*TERMS, "conditions"])
+    given = {name: _positive(table, name, WEIGHTS.get(name, 1.0), zero=True) for name in [*TERMS, "conditions"]}
+    if not any(given[name] > 0 for name in ("tracking", "peak")):
+        raise ValueError(
+            f"{table.path}.tracking = 0 and {table.path}.peak = 0: nothing asks the rotor to follow its reference, "
+            "so every gain that keeps it is as good. Give one of them a weight above 0."
+        )
+    if given["survival"] == 0:
+        raise ValueError(f"{table.path}.survival = 0: losing the rotor would cost nothing. Give it a weight above 0.")
+    return tuple(given[name] for name in TERMS), given["conditions"]
+
+
+def _risk(table: Table) -> Risk:
+    name = table.choice("risk", ["mean", "cvar", "soft-worst"], "mean")
+    if name != "cvar":
+        if "alpha" in table.raw:
+            raise ValueError(f'{table.at("alpha")} has a meaning for risk = "cvar" only; risk is "{name}". Remove one.')
+        return Mean() if name == "mean" else SoftWorst()
+    alpha = table.number("alpha", 0.9, "a number from 0 to below 1")
+    if not 0 <= alpha < 1:
+        raise ValueError(f"{table.at('alpha')} = {alpha:g}: it must be at least 0 and below 1.")
+    return CVaR(alpha)
+
+
+def _positive(table: Table, key: str, default: float, zero: bool = False) -> float:
+    words = f"a finite number {'of at least' if zero else 'above'} 0"
+    value = table.number(key, default, words)
+    if not (math.isfinite(value) and (value > 0 or (zero and value == 0))):
+        raise ValueError(f"{table.at(key)} = {value:g}: it must be {words}.")
+    return value
+
+
+def _whole(table: Table, key: str, default: int) -> int:
+    value, least = (
+        table.raw.get(key, default),
+        0 if key in ("screen", "seed", "held_out", "iterations", "stressed") else 1,
+    )
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value < 2**31:
+        raise ValueError(f"{table.at(key)} = {show(value)}: it must be a whole number of at least {least}.")
+    return value
+
+
+def settings(tune: Tune) -> dict[str, Any]:
+    """[tune] as plain data, for the report and the fingerprint of a checkpoint."""
+    told = {
+        "gains": tune.space.paths,
+        "bounds": {gain.path: [gain.low, gain.high] for gain in tune.space.gains},
+        "weights": dict(zip(TERMS, tune.weights, strict=True)) | {"conditions": tune.conditions},
+        "risk": str(tune.risk),
+    }
+    rest = {name: getattr(tune, name) for name in ("margin", "early", "stress", "optimiser", "learning_rate")}
+    return told | rest | dataclasses.asdict(tune.budget)
+
+
+def seeds(budget: Budget) -> tuple[int, int]:
+    """Seeds of the training and of the held-out ensemble."""
+    return budget.seed, int(np.uint32(budget.seed + 1_000_001))

@@ -1,0 +1,240 @@
+"""The objective: gains to one number, through an ensemble with common random numbers.
+
+The work is cut into lanes: one rollout of one member under one vector of gains. A fixed number of lanes
+is compiled once into one kernel and serves the screen, every iteration and the held-out ensemble alike, on
+as many threads as there are cores; whatever the number of starts or members, nothing is recompiled.
+"""
+
+import dataclasses
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.control.cascade import Cascade
+from ambjax.control.laws import Measurement
+from ambjax.ensemble import Spread, apply, draw
+from ambjax.extend import canonical, leaf, one_kernel, record
+from ambjax.metrics import Named, Standard
+from ambjax.rollout import rollout
+from ambjax.scenario import Clock, Scenario
+from tuning.loss import TERMS, Loss
+from tuning.space import Space
+
+# Lanes of one kernel call. Values: one register of 8 after the other in L1; gradients carry m + 1 numbers per lane.
+LANES = 64
+GRADIENT_LANES = 32
+# Terms that say whether the rotor is held.
+HELD = ("clearance", "survival")
+# Choices of members kept on the device.
+KEPT = 16
+# Bytes of noise kept in memory; beyond, it is drawn anew in each rollout.
+MOST_TAPE = 1_000_000_000
+
+
+class Members(NamedTuple):
+    """Members of an ensemble: their numbers [n], seed, what is spread over them by path [n], and their noise.
+
+    `tape`: the errors of the sensors drawn beforehand, [samples, 3, n]; None: none, or too much to keep.
+    `stressed` [n]: members with louder noise, of whom nothing is asked but to be held.
+    """
+
+    member: Any
+    seed: Any
+    values: dict[str, Any]
+    tape: Any
+    stressed: Any
+
+    def first(self, count: int) -> "Members":
+        """The first `count` of them."""
+        head = jax.tree.map(lambda a: a[:count], self._replace(tape=None))
+        return head._replace(tape=None if self.tape is None else self.tape[..., :count])
+
+
+@record
+class Tape:
+    """A sensor whose errors were drawn beforehand, [samples, 3] in m, m/s and A.
+
+    The search sees the same noise thousands of times, and drawing it costs twenty times what a step does.
+    """
+
+    errors: Any = leaf()
+
+    def noise(self, key: Array, sample: Array) -> Measurement:
+        """The errors of one sample."""
+        return Measurement(*jax.lax.dynamic_index_in_dim(self.errors, sample, keepdims=False))
+
+
+@dataclasses.dataclass(frozen=True)
+class Objective:
+    """What is tuned, in which world, and what counts: the part of a study that is compiled."""
+
+    space: Space
+    cascade: Cascade
+    scenario: Scenario
+    clock: Clock
+    loss: Loss
+    spread: Spread = Spread()
+
+    def members(self, seed: int, count: int) -> Members:
+        """The first `count` members of the ensemble with this seed."""
+        return self.chosen(seed, np.arange(count), count)
+
+    def training(self, seed: int, count: int, stress: float, extra: int) -> Members:
+        """`count` members, and `extra` more whose sensor noise is `stress` times as loud."""
+        if self.scenario.sensor is None or not extra:
+            return self.members(seed, count)
+        who = self.members(seed, count + extra)
+        if who.tape is None:
+            return self.members(seed, count)
+        stressed = who.member >= count
+        return who._replace(tape=who.tape * np.where(stressed, stress, 1.0), stressed=stressed)
+
+    def chosen(self, seed: int, numbers: np.ndarray, total: int) -> Members:
+        """Members with these numbers of an ensemble of `total`."""
+        values = draw(self.spread, self.cascade, self.scenario, seed, numbers, total) if self.spread.entries else {}
+        who = Members(numbers, np.full(len(numbers), seed), values, None, np.zeros(len(numbers), bool))
+        samples = self.clock.samples
+        if self.scenario.sensor is None or samples * len(numbers) * 24 > MOST_TAPE:
+            return who
+        tape = jax.jit(jax.vmap(lambda who: self._tape(who), in_axes=(Members(0, 0, 0, None, 0),), out_axes=-1))  # pyright: ignore[reportArgumentType]
+        return who._replace(tape=np.asarray(tape(who)))
+
+    def _tape(self, who: Members) -> Array:
+        """All errors of one member's sensors, [samples, 3]."""
+        scenario = self.world(who)[1]
+        key = scenario.key()
+        drawn = jax.vmap(lambda k: jnp.stack(scenario.sensor.noise(key, k)))  # pyright: ignore
+        return drawn(jnp.arange(self.clock.samples))
+
+    def world(self, who: Members) -> tuple[Cascade, Scenario]:
+        """The cascade (its gains to be replaced) and scenario of one member, whose fields are scalars."""
+        scenario = dataclasses.replace(self.scenario, member=who.member, seed=who.seed)
+        cascade, scenario = apply(self.cascade, scenario, who.values) if who.values else (self.cascade, scenario)
+        return cascade, scenario if who.tape is None else dataclasses.replace(scenario, sensor=Tape(who.tape))
+
+    def run(self, x: Array, who: Members, fold: Any) -> Any:
+        """The fold's result for one lane."""
+        cascade, scenario = self.world(who)
+        return rollout(self.space.decode(x, cascade), scenario, self.clock, fold=fold, every=0).measured
+
+
+def weigh(weights: Any, terms: dict[str, Any], stressed: Any) -> Any:
+    """The loss: weighted terms, for a stressed member those of HELD alone."""
+    ordinary = 1.0 - 1.0 * stressed
+    shares = [weights[k] * (1.0 if name in HELD else ordinary) for k, name in enumerate(TERMS)]
+    return sum(share * terms[name] for share, name in zip(shares, TERMS, strict=True))
+
+
+class Engine:
+    """Compiled lanes of an objective. Threads share them; a call blocks until its answer is there."""
+
+    def __init__(
+        self,
+        objective: Objective,
+        *,
+        settle: float,
+        mode: str = "forward",
+        threads: int | None = None,
+        lanes: int = LANES,
+    ):
+        self.objective, self.mode, self.settle, self.lanes = objective, mode, settle, lanes
+        self.threads = threads or os.cpu_count() or 1
+        self.rollouts = 0
+        self._kept: dict[Any, Any] = {}
+        traced = canonical((objective.cascade, objective.scenario, objective.clock, objective.loss))
+        self._world = traced
+        standard = canonical(Named({"loss": objective.loss, "metrics": Standard(settle, objective.scenario.touchdown)}))
+
+        def rebuilt(world: Any) -> Objective:
+            cascade, scenario, clock, loss = world
+            return dataclasses.replace(objective, cascade=cascade, scenario=scenario, clock=clock, loss=loss)
+
+        def terms(x: Array, who: Members, world: Any) -> dict[str, Array]:
+            problem = rebuilt(world)
+            return problem.run(x, who, problem.loss)
+
+        def measured(x: Array, who: Members, world: Any, fold: Any) -> dict[str, Array]:
+            return rebuilt(world).run(x, who, fold)
+
+        def total(x: Array, who: Members, world: Any, weights: Array) -> tuple[Array, dict[str, Array]]:
+            found = terms(x, who, world)
+            return weigh(weights, found, who.stressed), found
+
+        def forward(x: Array, who: Members, world: Any, weights: Array) -> Any:
+            def along(direction: Array) -> Any:
+                return jax.jvp(lambda x: total(x, who, world, weights), (x,), (direction,), has_aux=True)
+
+            value, slope, found = jax.vmap(along, out_axes=(None, 0, None))(jnp.eye(len(objective.space)))
+            return value, slope, found
+
+        def reverse(x: Array, who: Members, world: Any, weights: Array) -> Any:
+            (value, found), slope = jax.value_and_grad(total, has_aux=True)(x, who, world, weights)
+            return value, slope, found
+
+        axes: Any = (0, Members(0, 0, 0, -1, 0), None)  # pyright: ignore[reportArgumentType]
+        self._terms = one_kernel(jax.vmap(terms, axes))
+        measured_lanes = one_kernel(jax.vmap(measured, (*axes, None)))
+        self._standard = lambda x, who, world: measured_lanes(x, who, world, standard)
+        if mode == "forward":
+            self._gradient = one_kernel(jax.vmap(forward, (*axes, 0)))
+        else:  # the fast path does not compile reverse mode
+            self._gradient = jax.jit(jax.vmap(reverse, (*axes, 0)))
+
+    def terms(self, x: np.ndarray, who: Members) -> dict[str, np.ndarray]:
+        """Terms of the loss by name, [S, N], of gain vectors x [S, m] and members [N]."""
+        self.rollouts += len(x) * len(who.member)
+        return self._lanes(lambda x, who: self._terms(x, who, self._world), self.lanes, x, who)
+
+    def metrics(self, x: np.ndarray, who: Members) -> dict[str, Any]:
+        """{"loss": terms, "metrics": metrics.json names}, all [S, N]."""
+        self.rollouts += len(x) * len(who.member)
+        return self._lanes(lambda x, who: self._standard(x, who, self._world), self.lanes, x, who)
+
+    def gradient(self, x: np.ndarray, who: Members, weights: Any) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+        """Weighted losses [S, N], their derivatives [S, N, m] and the terms [S, N].
+
+        `weights`: of the terms, in the order of TERMS, for all starts or for each: [6] or [S, 6].
+        """
+        self.rollouts += len(x) * len(who.member) * (len(self.objective.space) + 1)
+        # the weights travel with the coordinates, each lane with its own
+        each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS)))
+        both, m = np.concatenate([x, each], axis=1), x.shape[1]
+        return self._lanes(
+            lambda both, who: self._gradient(both[:, :m], who, self._world, both[:, m:]), GRADIENT_LANES, both, who
+        )
+
+    def _picked(self, who: Members, member: np.ndarray) -> Members:
+        """These members, on the device; the last few choices are kept, for a search asks for the same again."""
+        key = (id(who.member), member.tobytes())
+        if key not in self._kept:
+            while len(self._kept) >= KEPT:
+                self._kept.pop(next(iter(self._kept)), None)
+            picked = jax.tree.map(lambda a: jnp.asarray(a[member]), who._replace(tape=None))
+            tape = None if who.tape is None else jnp.asarray(who.tape[..., member])
+            self._kept[key] = (who, picked._replace(tape=tape))
+        return self._kept[key][1]
+
+    def _lanes(self, call: Callable[..., Any], width: int, x: np.ndarray, who: Members) -> Any:
+        starts, count = len(x), len(who.member)
+        lane = np.arange(starts * count)
+        padded = np.concatenate([lane, np.zeros(-len(lane) % width, int)]).reshape(-1, width)
+
+        def one(lanes: np.ndarray) -> Any:
+            start, member = np.divmod(lanes, count)
+            at = jnp.asarray(x[start], jnp.result_type(float))
+            return jax.tree.map(np.asarray, call(at, self._picked(who, member)))
+
+        parts = [one(padded[0])]  # alone: the first call compiles
+        if self.threads > 1 and len(padded) > 2:
+            with ThreadPoolExecutor(self.threads) as pool:
+                parts += pool.map(one, padded[1:])
+        else:
+            parts += map(one, padded[1:])
+        joined = jax.tree.map(lambda *p: np.concatenate(p)[: len(lane)], *parts)
+        return jax.tree.map(lambda a: a.reshape(starts, count, *a.shape[1:]), joined)

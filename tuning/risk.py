@@ -1,0 +1,55 @@
+"""Risk: one number from the losses of an ensemble [N]."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Mean:
+    """The average."""
+
+    def __call__(self, losses: Array) -> Array:
+        return jnp.mean(losses)
+
+    def __str__(self) -> str:
+        return "mean"
+
+
+@dataclasses.dataclass(frozen=True)
+class CVaR:
+    """Average of the worst share 1 - alpha: conditional value at risk.
+
+    Rockafellar and Uryasev, J. Risk 2 (2000) 21-41: the minimum over q of q + mean(max(l - q, 0)) / (1 - alpha),
+    reached at the alpha quantile; its gradient is that of the members beyond, one of them counted in part.
+    """
+
+    alpha: float = 0.9
+
+    def __call__(self, losses: Array) -> Array:
+        count = losses.shape[0]
+        share = (1 - self.alpha) * count
+        weights = jnp.clip(share - jnp.arange(count), 0.0, 1.0) / share
+        return jnp.sum(weights * jnp.sort(losses)[::-1])
+
+    def __str__(self) -> str:
+        return f"CVaR({self.alpha:g})"
+
+
+@dataclasses.dataclass(frozen=True)
+class SoftWorst:
+    """Smooth worst case: log-mean-exp of beta times the losses over their mean. Between the mean and the maximum."""
+
+    beta: float = 5.0
+
+    def __call__(self, losses: Array) -> Array:
+        scale = jax.lax.stop_gradient(jnp.mean(losses)) / self.beta
+        return scale * (jax.scipy.special.logsumexp(losses / scale) - jnp.log(losses.shape[0]))
+
+    def __str__(self) -> str:
+        return f"soft worst case ({self.beta:g})"
+
+
+Risk = Mean | CVaR | SoftWorst

@@ -1,0 +1,103 @@
+"""Where to start: the case's own gains, informed ones, and quasi-random points over decades around them."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from ambjax.ensemble.design import points
+from ambjax.method import slopes
+from ambjax.smooth import TWO_OVER_PI
+from tuning.conditions import Bound
+from tuning.objective import Engine, Members, Objective
+from tuning.space import Space
+
+# All points on an eighth of the members; then an eighth of the points on half of them.
+EIGHTH, HALF = 8, 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Range:
+    """Where a gain is looked for."""
+
+    low: float
+    high: float
+
+
+def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray) -> list[Range]:
+    """A range for each gain of the space, log-uniform: bounds if there are two, else what the theory suggests.
+
+    With w the pole of the unstable plant, 1/s: c from w/30 to 10 w; slopes 2/pi k p and 2/pi k_i p from w/3 to
+    100 w and 200 w, and at least twice the disturbance bounded; gamma from Delta_1 to 100 times that (Eq. 7); an
+    observer's corner from w/1000 to w. Any other gain: within a factor 30 of its value.
+    """
+    w = slopes(objective.cascade, objective.scenario)["plant"]
+    floor = {bound.path: bound.value for bound in conditions}
+    found = []
+    for gain, value in zip(objective.space.gains, start, strict=True):
+        stage, name = gain.path.split(".")[1:]
+        law = getattr(objective.cascade, stage)
+        below = floor.get(gain.path, 0.0)
+        if gain.low > 0 and np.isfinite(gain.high):
+            low, high = gain.low, gain.high
+        elif name == "c":
+            low, high = w / 30, 10 * w
+        elif name in ("k", "k_i") and gain.path in floor:
+            per = TWO_OVER_PI * float(law.p)
+            low, high = w / 3 / per, (100 if name == "k" else 200) * w / per
+            low, high = max(low, 2 * below), max(high, 200 * below)
+        elif gain.path in floor:
+            low, high = below, 100 * below
+        elif name == "l":
+            low, high = w / 1000, w
+        else:
+            low, high = value / 30, value * 30
+        low, high = max(low, gain.low * 1.05), min(high, gain.high / 1.05)
+        found.append(Range(low, high) if low < high else Range(gain.low * 1.01, gain.high / 1.01))
+    return found
+
+
+def bounded(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray) -> Space:
+    """The space with an upper bound for gains that have none: three times the end of their range, or of the start.
+
+    Without one, gains along which the loss is flat (gamma, above all) drift to where no step resolves them.
+    """
+    box = ranges(objective, conditions, start)
+    gains = [
+        gain if np.isfinite(gain.high) else dataclasses.replace(gain, high=3 * max(end.high, value))
+        for gain, end, value in zip(objective.space.gains, box, start, strict=True)
+    ]
+    return Space(tuple(gains))
+
+
+def screen(
+    engine: Engine,
+    who: Members,
+    start: np.ndarray,
+    conditions: tuple[Bound, ...],
+    *,
+    count: int,
+    keep: int,
+    seed: int,
+    score: Callable[[np.ndarray, dict[str, np.ndarray], Members], np.ndarray],
+) -> np.ndarray:
+    """Coordinates [keep, m] of the best of `count` quasi-random points, the case's gains and the middle of the ranges.
+
+    Two rounds of successive halving: all on an eighth of the members, an eighth of them on half.
+    """
+    space = engine.objective.space
+    box = ranges(engine.objective, conditions, start)
+    low, high = np.log([r.low for r in box]), np.log([r.high for r in box])
+    cube = points("sobol", seed, len(space), np.arange(count), count)
+    gains = np.concatenate([start[None], np.exp((low + high) / 2)[None], np.exp(low + cube * (high - low))])
+    x = np.stack([space.encode(space.clip(g)) for g in gains])
+    few, half = _first(who, EIGHTH), _first(who, HALF)
+    values = score(x, engine.terms(x, few), few)
+    x = x[np.argsort(values, kind="stable")[: max(len(x) // EIGHTH, keep)]]
+    values = score(x, engine.terms(x, half), half)
+    return x[np.argsort(values, kind="stable")[:keep]]
+
+
+def _first(who: Members, part: int) -> Members:
+    count = len(who.member)
+    return who.first(max(count // part, min(4, count)))

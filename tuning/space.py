@@ -1,0 +1,142 @@
+"""Space: which gains may move, and within which bounds; coordinates in which they move freely.
+
+A coordinate is the logarithm of a gain, bent at its bounds: x real, one unit about a factor e. Gains that
+are not in the space are not touched: decode returns the very leaves it was given.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.control.cascade import Cascade
+
+ROOT = "controller"
+STAGES = ("observer", "position", "inversion", "current")
+
+
+@dataclasses.dataclass(frozen=True)
+class Gain:
+    """One gain: its dotted path as in the case file, and the open interval in which it may move.
+
+    low = 0 and high = inf: positive, x = log g. low > 0: above, x = log(g - low). Both: between, and then
+    log g moves over the interval as a logistic curve whose slope in the middle is 1.
+    """
+
+    path: str
+    low: float = 0.0
+    high: float = math.inf
+
+    @property
+    def name(self) -> str:
+        """The last word of the path."""
+        return self.path.rpartition(".")[2]
+
+    def encode(self, gain: Any) -> Any:
+        """Coordinate of a gain strictly within the bounds."""
+        if math.isinf(self.high):
+            return np.log(gain - self.low)
+        if self.low == 0.0:
+            return -np.log(1 / np.asarray(gain) - 1 / self.high)
+        share = (np.log(gain) - math.log(self.low)) / self._width
+        return np.log(share / (1 - share)) * self._width / 4
+
+    def decode(self, x: Array) -> Array:
+        """Gain at a coordinate."""
+        if math.isinf(self.high):
+            return self.low + jnp.exp(x)
+        if self.low == 0.0:
+            return 1 / (jnp.exp(-x) + 1 / self.high)
+        log = math.log(self.low) + self._width * jax.nn.sigmoid(4 * x / self._width)
+        return jnp.clip(jnp.exp(log), self.low, self.high)  # of rounding, at either end
+
+    @property
+    def _width(self) -> float:
+        return math.log(self.high) - math.log(self.low)
+
+    def at_bound(self, gain: float) -> str:
+        """'low' or 'high' where the gain is within 1 % of a bound, else ''."""
+        if self.low > 0 and gain <= 1.01 * self.low:
+            return "low"
+        return "high" if math.isfinite(self.high) and gain >= 0.99 * self.high else ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Space:
+    """Several gains. Raises ValueError where it is empty, a path is given twice or bounds make no interval."""
+
+    gains: tuple[Gain, ...]
+
+    def __post_init__(self) -> None:
+        if not self.gains:
+            raise ValueError('tune.gains is empty: name at least one, for example ["controller.position.c"].')
+        for gain in self.gains:
+            if not 0 <= gain.low < gain.high:
+                raise ValueError(
+                    f"tune.bounds: {gain.path} = [{gain.low:g}, {gain.high:g}]: give [low, high] with 0 <= low < high."
+                )
+            if [g.path for g in self.gains].count(gain.path) > 1:
+                raise ValueError(f"tune.gains: {gain.path} is named twice. Name each gain once.")
+
+    def __len__(self) -> int:
+        return len(self.gains)
+
+    @property
+    def paths(self) -> list[str]:
+        """Dotted paths in order."""
+        return [gain.path for gain in self.gains]
+
+    def values(self, cascade: Cascade) -> np.ndarray:
+        """The gains of a cascade in order, [m]."""
+        return np.array([float(_read(cascade, gain.path)) for gain in self.gains])
+
+    def gains_at(self, x: Array) -> Array:
+        """Gains [m] at coordinates [m]."""
+        return jnp.stack([gain.decode(x[j]) for j, gain in enumerate(self.gains)])
+
+    def encode(self, gains: Sequence[float] | np.ndarray) -> np.ndarray:
+        """Coordinates [m] of gains [m]. Raises ValueError for a gain outside its bounds."""
+        for gain, value in zip(self.gains, gains, strict=True):
+            if not gain.low < value < gain.high:
+                raise ValueError(
+                    f"{gain.path} = {value:g}: it must lie between tune.bounds {gain.low:g} and {gain.high:g} to start "
+                    "from. Change the gain or widen its bounds."
+                )
+        return np.array([gain.encode(value) for gain, value in zip(self.gains, gains, strict=True)])
+
+    def clip(self, gains: np.ndarray) -> np.ndarray:
+        """Gains moved inside their bounds by at least 2 % of the way."""
+        low, high = np.array([g.low for g in self.gains]), np.array([g.high for g in self.gains])
+        return np.clip(gains, low * 1.02 + 1e-12, high / 1.02)
+
+    def decode(self, x: Array, cascade: Cascade) -> Cascade:
+        """The cascade with the gains at coordinates x [m]; everything else the same objects as before."""
+        for j, gain in enumerate(self.gains):
+            cascade = _write(cascade, gain.path, gain.decode(x[j]))
+        return cascade
+
+
+def tunable(cascade: Cascade) -> list[str]:
+    """Dotted paths of all gains of a cascade that may be tuned: the positive leaves of its laws."""
+    found = []
+    for stage in STAGES:
+        for field in dataclasses.fields(getattr(cascade, stage)):
+            if field.metadata.get("leaf") and (field.metadata["above"] is not None):
+                found.append(f"{ROOT}.{stage}.{field.name}")
+    return found
+
+
+def _read(cascade: Cascade, path: str) -> Any:
+    _, stage, name = path.split(".")
+    return getattr(getattr(cascade, stage), name)
+
+
+def _write(cascade: Cascade, path: str, value: Any) -> Cascade:
+    _, stage, name = path.split(".")
+    law = dataclasses.replace(getattr(cascade, stage), **{name: value})
+    return dataclasses.replace(cascade, **{stage: law})

@@ -1,0 +1,115 @@
+"""A study: a case and its [tune], made into an objective, a goal and an engine; and what its answer is worth."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from ambjax.casefile import Case
+from ambjax.integrate import Adaptive, Integrator, Slide
+from ambjax.method import choose_method
+from ambjax.scenario import Clock
+from ambjax.sliding import slides
+from tuning.conditions import bounds
+from tuning.config import Tune, seeds
+from tuning.loss import loss_for
+from tuning.objective import Engine, Objective
+from tuning.optimise import Goal
+from tuning.screen import bounded
+
+# Members simulated at a time when an ensemble is judged: their noise is kept in memory while they are.
+CHUNK = 64
+# Members and tolerance of the accurate reference against which the steps of the search are held.
+REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 2000
+# Beyond this relative error of the settled rms error the steps are refined and the search goes on.
+RESOLVED = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """Case, settings and what is compiled from them."""
+
+    case: Case
+    tune: Tune
+    objective: Objective
+    engine: Engine
+    goal: Goal
+
+
+def method_for(case: Case, substeps: int) -> Integrator:
+    """The step of the search: of fixed number, so that all members take as long, and blind to gamma p."""
+    if slides(case.cascade):
+        return Slide(substeps)
+    return choose_method(case.cascade, case.scenario, float(case.clock.sample_period), reverse=True)
+
+
+def study_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = None) -> Study:
+    """The study of a case, in steps `finer` times as fine as [tune] asks for."""
+    clock = Clock(case.clock.samples, case.clock.sample_period, method_for(case, finer * tune.budget.substeps))
+    loss = loss_for(case.scenario, case.settle, tune.early)
+    objective = Objective(tune.space, case.cascade, case.scenario, clock, loss, case.spread)
+    conditions = bounds(case.cascade, case.scenario, clock)
+    space = bounded(objective, conditions, tune.space.values(case.cascade))
+    objective = dataclasses.replace(objective, space=space)
+    goal = Goal(tune.weights, tune.risk, conditions, tune.conditions, tune.margin, tune.budget.members)
+    mode = "forward" if len(tune.space) <= MOST_FORWARD else "reverse"
+    return Study(case, tune, objective, Engine(objective, settle=case.settle, mode=mode, threads=threads), goal)
+
+
+# Beyond this many gains reverse mode is the cheaper one.
+MOST_FORWARD = 8
+
+
+def judge(study: Study, x: np.ndarray, seed: int, count: int) -> dict[str, np.ndarray]:
+    """Every metric [count] of the members of an ensemble under the gains at x [m], and the loss's terms."""
+    parts = []
+    for first in range(0, count, CHUNK):
+        who = study.objective.chosen(seed, np.arange(first, min(first + CHUNK, count)), count)
+        found = study.engine.metrics(x[None], who)
+        parts.append({**found["metrics"], **{f"loss.{name}": v for name, v in found["loss"].items()}})
+    return {name: np.concatenate([part[name][0] for part in parts]) for name in parts[0]}
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square over an ensemble."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def step_error(study: Study, x: np.ndarray) -> dict[str, float]:
+    """The search's own step against adaptive RODAS3 on a few training members: settled rms error of both."""
+    seed, count = seeds(study.tune.budget)[0], study.tune.budget.members
+    who = study.objective.chosen(seed, np.arange(min(REFERENCE_MEMBERS, count)), count)
+    clock = dataclasses.replace(study.objective.clock, method=Adaptive(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS))
+    objective = dataclasses.replace(study.objective, clock=clock)
+    reference = Engine(objective, settle=study.case.settle, lanes=len(who.member))
+    name = "settled_rms_error_m"
+    ours, theirs = (e.metrics(x[None], who)["metrics"][name][0] for e in (study.engine, reference))
+    off = rms(ours) / rms(theirs) - 1
+    return {"search_m": rms(ours), "reference_m": rms(theirs), "relative": off, "members": len(ours)}
+
+
+def summarise(study: Study, found: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Numbers of an ensemble [N] for the report: pooled rms and largest error, survival, mean and largest metrics."""
+    from ambjax.ensemble.statistics import wilson
+
+    lost, errors = found["lost"], found["settled_rms_error_m"]
+    n = len(lost)
+    kept = wilson(n - int(lost.sum()), n)
+    told: dict[str, Any] = {
+        "members": n,
+        "lost": int(lost.sum()),
+        "survival": float(kept.value),
+        "survival_low": float(kept.low),
+        "survival_high": float(kept.high),
+        "settled_rms_error_m": rms(errors),
+        "settled_rms_error_worst_member_m": float(errors.max()),
+        "settled_max_abs_error_m": float(found["settled_max_abs_error_m"].max()),
+    }
+    for name, values in found.items():
+        if values.dtype == bool:
+            continue
+        finite = values[np.isfinite(values)]
+        if finite.size:
+            told[f"{name}.mean"] = float(finite.mean())
+            told[f"{name}.largest"] = float(finite.max())
+    return told
