@@ -113,9 +113,7 @@ def _executor(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]
             with client:
                 yield client.get_executor(), 2 * max(len(client.scheduler_info()["workers"]), 1)
         except (KilledWorker, CancelledError):
-            raise ValueError(
-                f"--cluster {args.cluster}: it was lost, or its workers died repeatedly. {GO_ON}"
-            ) from None
+            raise ValueError(f"--cluster {args.cluster}: it, or its workers again and again, died. {GO_ON}") from None
     elif args.processes is not None:
         try:
             with processes(args.processes) as pool:
