@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from tuning.objective import Engine, Members
+from tuning.objective import Engine, Members, weigh
 from tuning.study import Study
 
 # Samples over which the three ways are compared, members that take part, and the step of the differences.
@@ -32,7 +32,7 @@ def three_ways(study: Study, x: np.ndarray) -> dict[str, Any]:
     by_reverse = reverse.gradient(x[None], who, weights)[1][0].mean(axis=0)
     steps = np.concatenate([s * STEP * np.eye(len(x)) for s in (1, -1, 0.5, -0.5)])
     terms = forward.terms(x + steps, who)
-    values = sum(w * v.mean(axis=1) for w, v in zip(weights, terms.values(), strict=True))
+    values = weigh(weights, terms, who.stressed).mean(axis=1)
     up, down, half_up, half_down = np.reshape(values, (4, len(x)))
     differences = (4 * (half_up - half_down) / STEP - (up - down) / (2 * STEP)) / 3
     return {

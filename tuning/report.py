@@ -158,6 +158,7 @@ def convergence(history: dict[str, Any], paths: list[str]) -> bytes:
 def landscape(found: Slices, paths: list[str]) -> bytes:
     """PNG: the risk along each gain through the optimum."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
     m = len(paths)
     figure = Figure(figsize=(2.4 * m + 1, 3.2), layout="constrained")
@@ -172,6 +173,7 @@ def landscape(found: Slices, paths: list[str]) -> bytes:
             ax.plot(gains[~held], risk[~held], "C3x", ms=5, label="members lost")
         ax.axvline(gains[middle], color="0.5", lw=0.8, ls=":")
         ax.set_xlabel(path.removeprefix("controller."))
+        ax.xaxis.set_minor_formatter(NullFormatter())
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("risk / risk at the optimum")
     handles = {label: h for ax in axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
