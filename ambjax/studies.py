@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import pathlib
+import shlex
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from typing import Any
@@ -85,7 +86,7 @@ def _report(case: Case, study: Study, args: argparse.Namespace, out: pathlib.Pat
     """What is made of a finished study."""
     with np.load(out / "members.npz") as kept:
         columns = {name: kept[name] for name in kept.files}
-    summary = _summary(case, study, columns)
+    summary = _summary(case, study, columns, shlex.quote(str(args.case)))
     write_json(out / "summary.json", summary)
     _pictures(case, study, columns, summary, out)
     if not args.json:
@@ -155,7 +156,7 @@ def _elsewhere(study: Study, store: Store, missing: list[tuple[int, int]], pool:
             yield running.pop(future), future.result()
 
 
-def _summary(case: Case, study: Study, columns: dict[str, np.ndarray]) -> dict[str, Any]:
+def _summary(case: Case, study: Study, columns: dict[str, np.ndarray], path: str) -> dict[str, Any]:
     facts = {
         "case": case.name,
         "method": str(case.clock.method),
@@ -165,7 +166,7 @@ def _summary(case: Case, study: Study, columns: dict[str, np.ndarray]) -> dict[s
     found = statistics.summary(columns, study.spread.paths, study.seed)
     latin = f" --members {study.members}" if study.spread.design == "latin-hypercube" else ""
     for worst in found["worst"]:
-        worst["replay"] = f"ambjax simulate {case.name}.toml --member {worst['index']} --seed {study.seed}{latin}"
+        worst["replay"] = f"ambjax simulate {path} --member {worst['index']} --seed {study.seed}{latin}"
     return facts | found
 
 
