@@ -3,6 +3,7 @@
 from ambjax._version import __version__
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.cascade import Cascade
+from ambjax.dormand_prince import DormandPrince
 from ambjax.integrate import RK4, Adaptive, Euler, Rodas3, Slide
 from ambjax.method import choose_method, with_method
 from ambjax.metrics import Standard
@@ -20,6 +21,7 @@ __all__ = [
     "Chirp",
     "Clock",
     "Constant",
+    "DormandPrince",
     "Euler",
     "Initial",
     "Outcome",

@@ -53,8 +53,34 @@ def static(default: Any = dataclasses.MISSING, *, doc: str = "") -> Any:
 
 @dataclass_transform(frozen_default=True, field_specifiers=(leaf, static, dataclasses.field))
 def record(cls: type[T]) -> type[T]:
-    """Make `cls` a frozen dataclass and register it as a pytree."""
-    return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
+    """Make `cls` a frozen dataclass and register it as a pytree.
+
+    Not by JAX's own `register_dataclass`: there, tree structures of two types with equal static fields compare
+    equal, and one law's compiled program could be taken for another's. Here the type is part of the structure.
+    """
+    made = dataclasses.dataclass(frozen=True)(cls)
+    fields = dataclasses.fields(made)
+    fixed = [f.name for f in fields if f.metadata.get("static")]
+    names = [f.name for f in fields if not f.metadata.get("static")]
+    keys = [jax.tree_util.GetAttrKey(name) for name in names]
+
+    def structure(node: Any) -> tuple[Any, ...]:
+        return (made, *(getattr(node, name) for name in fixed))
+
+    def flatten(node: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        return tuple(getattr(node, name) for name in names), structure(node)
+
+    def with_keys(node: Any) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
+        return [(key, getattr(node, name)) for key, name in zip(keys, names, strict=True)], structure(node)
+
+    def unflatten(kept: tuple[Any, ...], leaves: Any) -> Any:
+        node = object.__new__(made)
+        node.__dict__.update(zip(fixed, kept[1:], strict=True))
+        node.__dict__.update(zip(names, leaves, strict=True))
+        return node
+
+    jax.tree_util.register_pytree_with_keys(made, with_keys, unflatten, flatten)
+    return made
 
 
 def is_traced(x: Any) -> bool:

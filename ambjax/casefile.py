@@ -13,6 +13,7 @@ from typing import Any
 from ambjax import signals
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.cascade import Cascade
+from ambjax.dormand_prince import DormandPrince
 from ambjax.ensemble.spread import Spread, corners
 from ambjax.integrate import RK4, Adaptive, Euler, Integrator, Rodas3
 from ambjax.method import with_method
@@ -38,7 +39,7 @@ SIGNALS: dict[str, type] = {
     "band-noise": signals.BandNoise,
     "sum": signals.Sum,
 }
-METHODS: dict[str, type] = {"rk4": RK4, "euler": Euler, "rodas3": Rodas3}
+METHODS: dict[str, type] = {"rk4": RK4, "dopri5": DormandPrince, "euler": Euler, "rodas3": Rodas3}
 TABLES = ["plant", "controller", "reference", "disturbance", "sensor", "actuator", "initial", "clock", "run", "spread"]
 OTHERS = ["tune"]  # read by ambjax-tune; the commands here pass it by
 UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
