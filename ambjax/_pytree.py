@@ -59,7 +59,7 @@ def record(cls: type[T]) -> type[T]:
     equal, and one law's compiled program could be taken for another's. Here the type is part of the structure.
     """
     made = dataclasses.dataclass(frozen=True)(cls)
-    fields = dataclasses.fields(made)
+    fields = dataclasses.fields(made)  # pyright: ignore[reportArgumentType]
     fixed = [f.name for f in fields if f.metadata.get("static")]
     names = [f.name for f in fields if not f.metadata.get("static")]
     keys = [jax.tree_util.GetAttrKey(name) for name in names]
