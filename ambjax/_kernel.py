@@ -40,9 +40,12 @@ def one_kernel(function: Callable[..., Any], static_argnames: tuple[str, ...] = 
     Only an outermost call is marked: inside another jit, grad or vmap the whole belongs to that
     transformation, and reverse mode through a marked call aborts XLA's compiler. So apply this to the
     outermost function: one_kernel(vmap(f)), one_kernel(value_and_grad(f)). Every array must be an
-    argument: a large constant in a marked function can abort the compiler too.
+    argument: a large constant in a marked function can abort the compiler too. Over many hundred members at
+    once XLA may split an operation over threads, which it cannot do inside one function: such a call is
+    compiled as usual, with a line in the log; jax.lax.map with a batch_size keeps the blocks small.
     """
     inner = jax.jit(function, static_argnames=static_argnames)
+    refused = set()
 
     @functools.cache
     def outermost() -> Callable[..., Any]:
@@ -55,7 +58,14 @@ def one_kernel(function: Callable[..., Any], static_argnames: tuple[str, ...] = 
     def call(*args: Any, **static: Any) -> Any:
         if any(is_traced(x) for x in jax.tree.leaves(args)) or options() is None:
             return inner(*args, **static)
-        return outermost()(*args, **static)
+        shapes = tuple(jnp.shape(x) for x in jax.tree.leaves(args))
+        if shapes not in refused:
+            try:
+                return outermost()(*args, **static)
+            except jax.errors.JaxRuntimeError as fault:
+                log.warning("compiled without the one-kernel path, which XLA refused: %s", str(fault).splitlines()[0])
+                refused.add(shapes)
+        return inner(*args, **static)
 
     return call
 

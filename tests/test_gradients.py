@@ -147,7 +147,8 @@ def test_every_gradient_is_finite_over_six_decades(mode, monkeypatch):
     """
     monkeypatch.setattr(sys.modules[__name__], "TRACKING", dataclasses.replace(TRACKING, initial=Initial(1e-3)))
     clock = Clock(120, 1e-4, Rodas3(12))
-    gradient, (value, lost_at, _) = one_kernel(jax.vmap(everything(clock, mode)))(GAINS)
+    mapped = one_kernel(lambda x: jax.lax.map(everything(clock, mode), x, batch_size=50))
+    gradient, (value, lost_at, _) = mapped(GAINS)
     assert np.mean(np.isfinite(lost_at)) > 0.5
     assert np.all(np.isfinite(value))
     assert np.all(np.isfinite(gradient))
@@ -200,3 +201,33 @@ def test_the_fast_path_differentiates():
     environment = os.environ | {"JAX_ENABLE_X64": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[:500]
+
+
+WHATEVER_ONE_CLOSES_OVER = """
+import jax, jax.numpy as jnp, numpy as np
+from ambjax._kernel import one_kernel
+
+large = np.linspace(0, 1, 3_000_000)
+functions = {
+    "constant": lambda x: jax.lax.fori_loop(0, 9, lambda i, y: y + jnp.asarray(large)[i] * jnp.sin(y), x),
+    "sort": jnp.sort,
+    "scatter": lambda x: x.at[jnp.array([1, 1])].add(1.0),
+    "LAPACK": lambda x: jnp.linalg.solve(jnp.outer(x, x) + 9 * jnp.eye(3), x),
+    "callback": lambda x: jax.pure_callback(lambda y: 2 * y, x, x),
+}
+x = jnp.array([3.0, 1.0, 2.0])
+for name, function in functions.items():
+    kernel = one_kernel(function)
+    for _ in range(2):
+        np.testing.assert_allclose(kernel(x), jax.jit(function)(x), rtol=1e-12, err_msg=name)
+"""
+
+
+def test_the_fast_path_takes_whatever_is_closed_over():
+    """What XLA cannot compile as one function runs as usual, with a line that says so, once each."""
+    environment = os.environ | {"JAX_ENABLE_X64": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", WHATEVER_ONE_CLOSES_OVER], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-500:]
+    assert done.stderr.count("without the one-kernel path") <= 4
