@@ -61,9 +61,18 @@ def write(text, name="case.toml"):
     return name
 
 
+# Ctrl-C is heard even if the tests run in the background of a shell, which has its children ignore it.
+LISTENING = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from ambjax.__main__ import main
+sys.exit(main())
+"""
+
+
 def begin(out, *flags):
     """A study in a process group of its own."""
-    argv = [sys.executable, "-m", "ambjax", *RUN, "--out", out, *flags]
+    argv = [sys.executable, "-c", LISTENING, *RUN, "--out", out, *flags]
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     return subprocess.Popen(argv, text=True, start_new_session=True, **pipes)
 

@@ -18,21 +18,25 @@ EIGHTH, HALF = 8, 2
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """Where a gain is looked for."""
+    """Where a gain is looked for first, and the largest value that it may take."""
 
     low: float
     high: float
+    most: float
 
 
 def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray) -> list[Range]:
     """A range for each gain of the space, log-uniform: bounds if there are two, else what the theory suggests.
 
-    With w the pole of the unstable plant, 1/s: c from w/30 to 10 w; slopes 2/pi k p and 2/pi k_i p from w/3 to
+    With w the pole of the unstable plant, 1/s, and T_s the sample period: c from w/30 to 10 w, and to no more than
+    1/(5 T_s), for the sampled loop cannot slide faster; slopes 2/pi k p and 2/pi k_i p from w/3 to
     100 w and 200 w, and at least twice the disturbance bounded; gamma from Delta_1 to 100 times that (Eq. 7); an
-    observer's corner from w/1000 to w. Any other gain: within a factor 30 of its value.
+    observer's corner from w/1000 to w. Any other gain: within a factor 30 of its value. A gain may end at up to
+    three times the end of its range or of where it starts, c only at these themselves.
     """
     w = slopes(objective.cascade, objective.scenario)["plant"]
     floor = {bound.path: bound.value for bound in conditions}
+    sample_period = float(objective.clock.sample_period)
     found = []
     for gain, value in zip(objective.space.gains, start, strict=True):
         stage, name = gain.path.split(".")[1:]
@@ -41,7 +45,7 @@ def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarra
         if gain.low > 0 and np.isfinite(gain.high):
             low, high = gain.low, gain.high
         elif name == "c":
-            low, high = w / 30, 10 * w
+            low, high = w / 30, min(10 * w, max(1 / (5 * sample_period), w / 10))
         elif name in ("k", "k_i") and gain.path in floor:
             per = TWO_OVER_PI * float(law.p)
             low, high = w / 3 / per, (100 if name == "k" else 200) * w / per
@@ -53,20 +57,18 @@ def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarra
         else:
             low, high = value / 30, value * 30
         low, high = max(low, gain.low * 1.05), min(high, gain.high / 1.05)
-        found.append(Range(low, high) if low < high else Range(gain.low * 1.01, gain.high / 1.01))
+        most = gain.high if np.isfinite(gain.high) else max(high, value) * (1 if name == "c" else 3)
+        found.append(Range(low, high, most) if low < high else Range(gain.low * 1.01, gain.high / 1.01, most))
     return found
 
 
 def bounded(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray) -> Space:
-    """The space with an upper bound for gains that have none: three times the end of their range, or of the start.
+    """The space with an upper bound for gains that have none.
 
     Without one, gains along which the loss is flat (gamma, above all) drift to where no step resolves them.
     """
     box = ranges(objective, conditions, start)
-    gains = [
-        gain if np.isfinite(gain.high) else dataclasses.replace(gain, high=3 * max(end.high, value))
-        for gain, end, value in zip(objective.space.gains, box, start, strict=True)
-    ]
+    gains = [dataclasses.replace(gain, high=at.most) for gain, at in zip(objective.space.gains, box, strict=True)]
     return Space(tuple(gains))
 
 
