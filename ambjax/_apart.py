@@ -7,12 +7,14 @@ once; shorter loops overlap. No barrier of JAX's survives to that point, but a c
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 
+Result = TypeVar("Result")
 
-def apart(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+
+def apart(function: Callable[..., Result]) -> Callable[..., Result]:
     """`function` of arrays, neither fused with its surroundings nor repeated in them on CPUs; elsewhere as it is.
 
     For what lies under a custom_jvp: reverse mode through the call itself is not provided for.
@@ -20,7 +22,7 @@ def apart(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
     inner = jax.jit(function)
 
     @functools.wraps(function)
-    def call(*args: Any) -> jax.Array:
+    def call(*args: Any) -> Result:
         if jax.default_backend() != "cpu":
             return function(*args)
         from jax.experimental.xla_metadata import set_xla_metadata

@@ -42,15 +42,19 @@ class ClosedLoop:
     cascade: Cascade
     scenario: Scenario
 
-    def realised(self) -> "ClosedLoop":
-        """The loop with its scenario's random signals drawn."""
-        return ClosedLoop(self.cascade, self.scenario.realised())
+    def realised(self) -> "Realised":
+        """The loop of one member: with its scenario's random signals drawn, and the key of its sensors."""
+        return Realised(self.cascade, self.scenario.realised(), self.scenario.words())
+
+    def words(self) -> tuple[Scalar, Scalar]:
+        """The member's key as two 32-bit words."""
+        return self.scenario.words()
 
     def hold(self, sample: Scalar) -> Measurement:
         """Errors of all sensors during sample number `sample`; zeros without a sensor model."""
         if self.scenario.sensor is None:
             return Measurement(*[jnp.zeros(())] * 3)
-        return self.scenario.sensor.noise(self.scenario.key(), sample)
+        return self.scenario.sensor.noise(self.words(), sample)
 
     def start(self) -> LoopState:
         """The state at t = 0."""
@@ -135,6 +139,19 @@ class ClosedLoop:
     def singularity(self, row: Row) -> Array:
         """Positive while (z, i_ref) is on the good side of the singular curve C, 0 on it. Eq. (9)."""
         return self.scenario.plant.singularity(row.z, row.i_ref)
+
+
+@record
+class Realised(ClosedLoop):
+    """The closed loop of one member; `key` is the member's key as two 32-bit words."""
+
+    key: tuple[Scalar, Scalar]
+
+    def realised(self) -> "Realised":
+        return self
+
+    def words(self) -> tuple[Scalar, Scalar]:
+        return self.key
 
 
 def _limited(u: Array, u_max: Array) -> Array:

@@ -10,6 +10,7 @@ from jax import Array
 
 from ambjax._pytree import Scalar, leaf, record, static
 from ambjax.control.laws import Measurement
+from ambjax.gaussian import normals
 from ambjax.integrate import Integrator
 from ambjax.plant import Plant
 from ambjax.signals import Constant, Signal, realised
@@ -27,9 +28,9 @@ class Sensor:
     std_z_dot: Scalar = leaf(default=0.0, unit="m/s", at_least=0, doc="standard deviation on z_dot")
     std_i: Scalar = leaf(default=0.0, unit="A", at_least=0, doc="standard deviation on i")
 
-    def noise(self, key: Array, sample: Scalar) -> Measurement:
-        """The errors of sample number `sample` for one member's key."""
-        w = jax.random.normal(jax.random.fold_in(key, sample), (3,))
+    def noise(self, key: tuple[Scalar, Scalar], sample: Scalar) -> Measurement:
+        """The errors of sample number `sample` for the member with these words (Scenario.words)."""
+        w = normals(key, sample)
         return Measurement(self.std * w[0], self.std_z_dot * w[1], self.std_i * w[2])
 
 
@@ -75,6 +76,11 @@ class Scenario:
     def key(self) -> Array:
         """The member's random key: fold_in(key(seed), member)."""
         return jax.random.fold_in(jax.random.key(self.seed), self.member)
+
+    def words(self) -> tuple[Array, Array]:
+        """The same key as two 32-bit words."""
+        high, low = jax.random.key_data(self.key())
+        return high, low
 
     def realised(self) -> "Scenario":
         """This scenario with whatever is random in its signals drawn for the member."""

@@ -99,14 +99,27 @@ def relax(w: Array, drift: Array, gain: Scalar, p: Scalar, h: Scalar) -> tuple[A
     return first, gain * smooth_sign(_implicit(w - tau * closing + left * drift, left * gain, p), p), tau
 
 
+@jax.custom_jvp
 def _implicit(b: Array, reach: Array, p: Scalar) -> Array:
-    """The w with w + reach sgn(w) = b, by Newton's method from below: the left side is concave in |w|."""
+    """The w with w + reach sgn(w) = b, by Newton's method from below: the left side is concave in |w|.
+
+    Its derivative is that of the equation, not of the iteration: a fifth of the work.
+    """
     size = jnp.abs(b)
     w = jnp.maximum(size / (1 + reach * p * TWO_OVER_PI), size - reach)
     for _ in range(NEWTON):
         slope = 1 + reach * p * TWO_OVER_PI / (1 + (p * w) ** 2)
         w = w + (size - w - reach * smooth_sign(w, p)) / slope
     return jnp.where(b < 0, -w, w)
+
+
+@_implicit.defjvp
+def _implicit_jvp(primals: tuple[Array, Array, Scalar], tangents: tuple[Any, Any, Any]) -> tuple[Array, Array]:
+    (b, reach, p), (db, d_reach, dp) = primals, tangents
+    w = _implicit(b, reach, p)
+    flat = TWO_OVER_PI / (1 + (p * w) ** 2)
+    change = db - smooth_sign(w, p) * d_reach - reach * flat * w * dp
+    return w, change / (1 + reach * p * flat)
 
 
 def _phi(x: Array) -> Array:

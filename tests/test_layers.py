@@ -13,7 +13,7 @@ ROOT = pathlib.Path(__file__).parent.parent
 # Floor of every module. An import points to a lower floor, or within its own without a cycle. A new module gets
 # a row here. `control.*` stands for all modules of that package.
 FLOORS = {
-    1: "_pytree _apart _kernel smooth _linear _version",
+    1: "_pytree _apart _kernel smooth gaussian _linear _version",
     2: "plant signals integrate dormand_prince trajectory",
     3: "control control.* scenario metrics",
     4: "loop sliding extend method rollout theorem proof linear paper evidence ledger plotting",

@@ -21,10 +21,8 @@ from ambjax import (
     observer,
     position,
 )
-from ambjax.ensemble import onekernel
 from ambjax.ensemble.engine import run_ensemble
 from ambjax.ensemble.onekernel import run_whole
-from ambjax.loop import ClosedLoop
 from ambjax.metrics import Named, Peak, Variation
 from ambjax.signals import BandNoise
 
@@ -39,25 +37,6 @@ SCENARIO = Scenario(
     seed=11,
     member=np.arange(1000, 1000 + MEMBERS),
 )
-
-
-@pytest.mark.parametrize("x64", [True, False])
-def test_noise_is_that_of_jax_random_bit_for_bit(x64):
-    with jax.enable_x64(x64):
-
-        def both(scenario, sample):
-            words = jax.random.key_data(scenario.key())
-            here = onekernel.KernelLoop(Cascade(), scenario, (words[0], words[1])).hold(sample)
-            return ClosedLoop(Cascade(), scenario).hold(sample), here
-
-        # the standard deviations are arguments, as in a rollout: XLA would fold constants into the draws, and round
-        sensor = Sensor(*np.full((3, 150), [[1e-6], [1e-4], [1e-3]]))
-        seeds = jnp.asarray([0, 1, 2**31 - 1] * 50)
-        scenario = Scenario(sensor=sensor, seed=seeds, member=jnp.arange(150) * 7919)
-        axes = jax.tree.map(lambda x: 0 if np.ndim(x) else None, scenario)
-        ours, theirs = jax.jit(jax.vmap(both, in_axes=(axes, 0)))(scenario, jnp.arange(150) ** 3)
-        for a, b in zip(ours, theirs, strict=True):
-            np.testing.assert_array_equal(a, b)
 
 
 def test_kernel_is_the_rollout():

@@ -130,7 +130,7 @@ def noise_of(case, scenario):
     """The errors that ambjax draws: data for the oracle."""
     if scenario.sensor is None:
         return None
-    errors = jax.vmap(lambda k: scenario.sensor.noise(scenario.key(), k))(np.arange(case.samples))
+    errors = jax.vmap(lambda k: scenario.sensor.noise(scenario.words(), k))(np.arange(case.samples))
     return np.stack(errors, axis=1)
 
 

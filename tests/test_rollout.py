@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from ambjax import (
     RK4,
@@ -30,6 +31,7 @@ from ambjax import (
     rollout,
 )
 from ambjax._kernel import one_kernel
+from ambjax.gaussian import normals, threefry
 from ambjax.integrate import Euler
 from ambjax.metrics import Lowest, Mean, Named, Peak, Reaching, Rms, Variation
 from ambjax.trajectory import DIVERGED, TOUCHED, Row
@@ -221,7 +223,7 @@ def test_folds_equal_numpy_on_the_recorded_rows(run, request):
 def test_noise_is_held_per_sample_and_gaussian():
     # long enough for statistics without a rollout: the hold of 20,000 samples of one member
     scenario = dataclasses.replace(NOISY, seed=3, member=1)
-    w = jax.jit(jax.vmap(lambda k: scenario.sensor.noise(scenario.key(), k)))(jnp.arange(20_000))
+    w = jax.jit(jax.vmap(lambda k: scenario.sensor.noise(scenario.words(), k)))(jnp.arange(20_000))
     for x, std in zip(w, (1e-6, 1e-4, 1e-4), strict=True):
         x = np.asarray(x) / std
         # five standard errors: 5/sqrt(20000) of mean and of autocorrelation, 5/sqrt(40000) of the deviation
@@ -231,9 +233,30 @@ def test_noise_is_held_per_sample_and_gaussian():
     assert abs(np.mean(np.asarray(w.z) * np.asarray(w.i))) / 1e-10 < 0.036
 
 
+def test_words_are_those_of_jax_random():
+    """Threefry is written out, since kernels on accelerators cannot call jax.random; fold_in shows that it is it."""
+    scenario = dataclasses.replace(NOISY, seed=5, member=2**31 + 9)
+    for number in (0, 1, 77, 2**32 - 1):
+        expected = jax.random.key_data(jax.random.fold_in(scenario.key(), np.uint32(number)))
+        np.testing.assert_array_equal(jnp.stack(threefry(scenario.words(), (0, np.uint32(number)))), expected)
+
+
+@pytest.mark.parametrize("x64", [True, False])
+def test_normal_numbers_are_normal(x64):
+    """Against the distribution itself: Kolmogorov's and Smirnov's test, and the tail beyond 4."""
+    with jax.enable_x64(x64):
+        drawn = jax.jit(jax.vmap(lambda k: normals(Scenario(seed=1).words(), k)))(jnp.arange(400_000))
+        for w in map(np.asarray, drawn):
+            assert w.dtype == (np.float64 if x64 else np.float32)
+            # one in 1,000 fails by chance, and the seed is fixed
+            assert stats.kstest(w.astype(float), "norm").pvalue > 1e-3
+            # 25 expected; Poisson's five standard deviations
+            assert 0 < np.sum(np.abs(w) > 4) < 51
+
+
 def test_rows_carry_the_noise_of_their_sample(short):
     rows = short.trajectory.rows
-    drawn = jax.jit(jax.vmap(lambda k: NOISY.sensor.noise(NOISY.key(), k).z))(jnp.arange(203))
+    drawn = jax.jit(jax.vmap(lambda k: NOISY.sensor.noise(NOISY.words(), k).z))(jnp.arange(203))
     # z + w - z rounds at eps z = 5e-19
     np.testing.assert_allclose(rows.z_measured - rows.z, drawn, rtol=0, atol=1e-18)
 
@@ -245,7 +268,7 @@ def with_member(member, seed=0):
 def test_member_k_draws_the_same_noise_alone_and_in_a_batch():
     def noise(member, seed):
         scenario = with_member(member, seed)
-        return jax.vmap(lambda k: scenario.sensor.noise(scenario.key(), k))(jnp.arange(50))
+        return jax.vmap(lambda k: scenario.sensor.noise(scenario.words(), k))(jnp.arange(50))
 
     alone, batch = jax.jit(noise), jax.jit(jax.vmap(noise, (0, None)))(jnp.arange(5), 7)
     for m in range(5):

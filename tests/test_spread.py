@@ -164,7 +164,7 @@ def test_random_members_are_independent_of_each_other_and_of_the_noise():
 
     def noise(member):
         scenario = dataclasses.replace(world, member=member)
-        return scenario.sensor.noise(scenario.key(), 0).z
+        return scenario.sensor.noise(scenario.words(), 0).z
 
     w = np.asarray(jax.jit(jax.vmap(noise))(np.arange(4000)))
     columns = np.column_stack([u, u[:, 0] * 0 + np.roll(u[:, 0], 1), w])

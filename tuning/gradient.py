@@ -51,7 +51,6 @@ def against_horizon(study: Study, x: np.ndarray, who: Members) -> list[dict[str,
         objective = _shorter(study, samples)
         engine = study.engine if share == 1.0 else Engine(objective, settle=float(objective.loss.settle))
         few = who.first(min(8, len(who.member)))
-        few = few if few.tape is None else few._replace(tape=few.tape[:samples])
         losses, slopes, terms = engine.gradient(x[None], few, study.goal.weights)
         rows.append(
             {

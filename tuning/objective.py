@@ -17,9 +17,8 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.cascade import Cascade
-from ambjax.control.laws import Measurement
 from ambjax.ensemble import Spread, apply, draw
-from ambjax.extend import canonical, leaf, one_kernel, record
+from ambjax.extend import canonical, one_kernel
 from ambjax.metrics import Named, Standard
 from ambjax.rollout import rollout
 from ambjax.scenario import Clock, Scenario
@@ -31,43 +30,24 @@ LANES = 64
 GRADIENT_LANES = 32
 # Terms that say whether the rotor is held.
 HELD = ("clearance", "survival")
-# Choices of members kept on the device.
-KEPT = 16
-# Bytes of noise kept in memory; beyond, it is drawn anew in each rollout.
-MOST_TAPE = 1_000_000_000
 
 
 class Members(NamedTuple):
     """Members of an ensemble: their numbers [n], seed, what is spread over them by path [n], and their noise.
 
-    `tape`: the errors of the sensors drawn beforehand, [samples, 3, n]; None: none, or too much to keep.
-    `stressed` [n]: members with louder noise, of whom nothing is asked but to be held.
+    `loud` [n]: factor of the sensors' standard deviations. `stressed` [n]: members of whom nothing is asked but
+    to be held.
     """
 
     member: Any
     seed: Any
     values: dict[str, Any]
-    tape: Any
+    loud: Any
     stressed: Any
 
     def first(self, count: int) -> "Members":
         """The first `count` of them."""
-        head = jax.tree.map(lambda a: a[:count], self._replace(tape=None))
-        return head._replace(tape=None if self.tape is None else self.tape[..., :count])
-
-
-@record
-class Tape:
-    """A sensor whose errors were drawn beforehand, [samples, 3] in m, m/s and A.
-
-    The search sees the same noise thousands of times, and drawing it costs twenty times what a step does.
-    """
-
-    errors: Any = leaf()
-
-    def noise(self, key: Array, sample: Array) -> Measurement:
-        """The errors of one sample."""
-        return Measurement(*jax.lax.dynamic_index_in_dim(self.errors, sample, keepdims=False))
+        return jax.tree.map(lambda a: a[:count], self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,33 +70,21 @@ class Objective:
         if self.scenario.sensor is None or not extra:
             return self.members(seed, count)
         who = self.members(seed, count + extra)
-        if who.tape is None:
-            return self.members(seed, count)
         stressed = who.member >= count
-        return who._replace(tape=who.tape * np.where(stressed, stress, 1.0), stressed=stressed)
+        return who._replace(loud=np.where(stressed, stress, 1.0), stressed=stressed)
 
     def chosen(self, seed: int, numbers: np.ndarray, total: int) -> Members:
         """Members with these numbers of an ensemble of `total`."""
         values = draw(self.spread, self.cascade, self.scenario, seed, numbers, total) if self.spread.entries else {}
-        who = Members(numbers, np.full(len(numbers), seed), values, None, np.zeros(len(numbers), bool))
-        samples = self.clock.samples
-        if self.scenario.sensor is None or samples * len(numbers) * 24 > MOST_TAPE:
-            return who
-        tape = jax.jit(jax.vmap(lambda who: self._tape(who), in_axes=(Members(0, 0, 0, None, 0),), out_axes=-1))  # pyright: ignore[reportArgumentType]
-        return who._replace(tape=np.asarray(tape(who)))
-
-    def _tape(self, who: Members) -> Array:
-        """All errors of one member's sensors, [samples, 3]."""
-        scenario = self.world(who)[1]
-        key = scenario.key()
-        drawn = jax.vmap(lambda k: jnp.stack(scenario.sensor.noise(key, k)))  # pyright: ignore
-        return drawn(jnp.arange(self.clock.samples))
+        n = len(numbers)
+        return Members(numbers, np.full(n, seed), values, np.ones(n), np.zeros(n, bool))
 
     def world(self, who: Members) -> tuple[Cascade, Scenario]:
         """The cascade (its gains to be replaced) and scenario of one member, whose fields are scalars."""
         scenario = dataclasses.replace(self.scenario, member=who.member, seed=who.seed)
         cascade, scenario = apply(self.cascade, scenario, who.values) if who.values else (self.cascade, scenario)
-        return cascade, scenario if who.tape is None else dataclasses.replace(scenario, sensor=Tape(who.tape))
+        sensor = jax.tree.map(lambda std: std * who.loud, scenario.sensor)
+        return cascade, dataclasses.replace(scenario, sensor=sensor)
 
     def run(self, x: Array, who: Members, fold: Any) -> Any:
         """The fold's result for one lane."""
@@ -146,7 +114,6 @@ class Engine:
         self.objective, self.mode, self.settle, self.lanes = objective, mode, settle, lanes
         self.threads = threads or os.cpu_count() or 1
         self.rollouts = 0
-        self._kept: dict[Any, Any] = {}
         traced = canonical((objective.cascade, objective.scenario, objective.clock, objective.loss))
         self._world = traced
         standard = canonical(Named({"loss": objective.loss, "metrics": Standard(settle, objective.scenario.touchdown)}))
@@ -166,23 +133,27 @@ class Engine:
             found = terms(x, who, world)
             return weigh(weights, found, who.stressed), found
 
-        def forward(x: Array, who: Members, world: Any, weights: Array) -> Any:
-            def along(direction: Array) -> Any:
-                return jax.jvp(lambda x: total(x, who, world, weights), (x,), (direction,), has_aux=True)
+        axes: Any = (0, Members(0, 0, 0, 0, 0), None)  # pyright: ignore[reportArgumentType]
 
-            value, slope, found = jax.vmap(along, out_axes=(None, 0, None))(jnp.eye(len(objective.space)))
-            return value, slope, found
+        def forward(x: Array, who: Members, world: Any, weights: Array) -> Any:
+            lanes = jax.vmap(total, (*axes, 0))
+
+            # Directions outside, lanes inside: what is contiguous in memory is as long as a vector.
+            def along(direction: Array) -> Any:
+                every = jnp.broadcast_to(direction, x.shape)
+                return jax.jvp(lambda x: lanes(x, who, world, weights), (x,), (every,), has_aux=True)
+
+            return jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(len(objective.space)))
 
         def reverse(x: Array, who: Members, world: Any, weights: Array) -> Any:
             (value, found), slope = jax.value_and_grad(total, has_aux=True)(x, who, world, weights)
             return value, slope, found
 
-        axes: Any = (0, Members(0, 0, 0, -1, 0), None)  # pyright: ignore[reportArgumentType]
         self._terms = one_kernel(jax.vmap(terms, axes))
         measured_lanes = one_kernel(jax.vmap(measured, (*axes, None)))
         self._standard = lambda x, who, world: measured_lanes(x, who, world, standard)
         if mode == "forward":
-            self._gradient = one_kernel(jax.vmap(forward, (*axes, 0)))
+            self._gradient = one_kernel(forward)
         else:  # the fast path does not compile reverse mode
             self._gradient = jax.jit(jax.vmap(reverse, (*axes, 0)))
 
@@ -209,17 +180,6 @@ class Engine:
             lambda both, who: self._gradient(both[:, :m], who, self._world, both[:, m:]), GRADIENT_LANES, both, who
         )
 
-    def _picked(self, who: Members, member: np.ndarray) -> Members:
-        """These members, on the device; the last few choices are kept, for a search asks for the same again."""
-        key = (id(who.member), member.tobytes())
-        if key not in self._kept:
-            while len(self._kept) >= KEPT:
-                self._kept.pop(next(iter(self._kept)), None)
-            picked = jax.tree.map(lambda a: jnp.asarray(a[member]), who._replace(tape=None))
-            tape = None if who.tape is None else jnp.asarray(who.tape[..., member])
-            self._kept[key] = (who, picked._replace(tape=tape))
-        return self._kept[key][1]
-
     def _lanes(self, call: Callable[..., Any], width: int, x: np.ndarray, who: Members) -> Any:
         starts, count = len(x), len(who.member)
         lane = np.arange(starts * count)
@@ -228,7 +188,7 @@ class Engine:
         def one(lanes: np.ndarray) -> Any:
             start, member = np.divmod(lanes, count)
             at = jnp.asarray(x[start], jnp.result_type(float))
-            return jax.tree.map(np.asarray, call(at, self._picked(who, member)))
+            return jax.tree.map(np.asarray, call(at, jax.tree.map(lambda a: a[member], who)))
 
         parts = [one(padded[0])]  # alone: the first call compiles
         if self.threads > 1 and len(padded) > 2:

@@ -17,8 +17,8 @@ from tuning.objective import Engine, Objective
 from tuning.optimise import Goal
 from tuning.screen import bounded
 
-# Members simulated at a time when an ensemble is judged: their noise is kept in memory while they are.
-CHUNK = 64
+# Members simulated at a time when an ensemble is judged.
+CHUNK = 1024
 # Members and tolerance of the accurate reference against which the steps of the search are held.
 REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 2000
 # Beyond this relative error of the settled rms error the steps are refined and the search goes on.

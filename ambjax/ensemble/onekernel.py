@@ -2,8 +2,8 @@
 
 On an accelerator a loop outside a kernel launches several kernels per step, each of which takes longer than
 the arithmetic. Here Pallas (through Triton) compiles one program that loads the members' numbers, loops over
-all samples in registers and stores the result of the fold. The physics is the rollout's own, traced inside the
-kernel; only the noise is written out, since kernels cannot call jax.random.
+all samples in registers and stores the result of the fold. What runs is the rollout's own code, traced inside the
+kernel; only what jax.random draws is drawn before.
 """
 
 import dataclasses
@@ -12,15 +12,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax import Array, lax
+from jax import Array
 
-from ambjax._pytree import Scalar, canonical, record
+from ambjax._pytree import canonical
 from ambjax.control.cascade import Cascade
-from ambjax.control.laws import Measurement
 from ambjax.ensemble.engine import size
 from ambjax.integrate import RK4
-from ambjax.loop import ClosedLoop
+from ambjax.loop import Realised
 from ambjax.method import with_method
 from ambjax.metrics import Fold
 from ambjax.rollout import Outcome, check_inputs, run
@@ -29,56 +27,6 @@ from ambjax.scenario import Clock, Scenario
 # One member per thread, 32 threads to a warp.
 WARP, MOST_WARPS = 32, 32
 BLOCK = 128
-ROTATIONS = (13, 15, 26, 6), (17, 29, 16, 24)
-
-
-@record
-class KernelLoop(ClosedLoop):
-    """The closed loop with its noise written out; `key` is the member's key as two 32-bit words."""
-
-    key: tuple[Scalar, Scalar]
-
-    def realised(self) -> "KernelLoop":
-        """Itself: what is random in the signals was drawn before the kernel."""
-        return self
-
-    def hold(self, sample: Scalar) -> Measurement:
-        """The same numbers as ClosedLoop.hold: bit for bit where lax.erf_inv is the same."""
-        sensor = self.scenario.sensor
-        if sensor is None:
-            return super().hold(sample)
-        key = threefry(self.key, (jnp.uint32(0), jnp.asarray(sample).astype(jnp.uint32)))
-        w = [normal(key, n) for n in range(3)]
-        return Measurement(sensor.std * w[0], sensor.std_z_dot * w[1], sensor.std_i * w[2])
-
-
-def threefry(key: tuple[Scalar, Scalar], count: tuple[Scalar, Scalar]) -> tuple[Array, Array]:
-    """Threefry-2x32 with 20 rounds (Salmon et al., SC 2011), the generator of jax.random."""
-    (k_0, k_1), (x, y) = key, count
-    schedule = (k_0, k_1, k_0 ^ k_1 ^ jnp.uint32(0x1BD11BDA))
-    x, y = x + k_0, y + k_1
-    for group in range(5):
-        for turn in ROTATIONS[group % 2]:
-            x = x + y
-            y = ((y << jnp.uint32(turn)) | (y >> jnp.uint32(32 - turn))) ^ x
-        x = x + schedule[(group + 1) % 3]
-        y = y + schedule[(group + 2) % 3] + jnp.uint32(group + 1)
-    return x, y
-
-
-def normal(key: tuple[Array, Array], index: int) -> Array:
-    """Element `index` of jax.random.normal(key, shape), in the working precision."""
-    dtype = jnp.result_type(float)
-    mantissa = jnp.finfo(dtype).nmant
-    high, low = threefry(key, (jnp.uint32(0), jnp.uint32(index)))
-    if dtype == jnp.float64:
-        bits = (high.astype(jnp.uint64) << jnp.uint64(32)) | low.astype(jnp.uint64)
-        unit = (bits >> jnp.uint64(64 - mantissa)) | jnp.uint64(np.float64(1).view(np.uint64))
-    else:
-        unit = ((high ^ low) >> jnp.uint32(32 - mantissa)) | jnp.uint32(np.float32(1).view(np.uint32))
-    lowest = np.nextafter(np.array(-1, dtype), np.array(0, dtype), dtype=dtype)
-    u = (lax.bitcast_convert_type(unit, dtype) - 1) * (1 - lowest) + lowest
-    return jnp.asarray(np.sqrt(2), dtype) * lax.erf_inv(jnp.maximum(lowest, u))
 
 
 def run_whole(
@@ -94,8 +42,7 @@ def run_whole(
 
     Leaves of `cascade`, `scenario` and `fold` are numbers, shared by all members, or arrays [N]; so are the results,
     in member order, without rows. `block` members, a power of two of at least 32, share a program. `interpret`
-    runs the kernel's program on any device, slowly: for tests. The method must be RK4. Noise is that of `rollout`
-    but for what the accelerator's own erf_inv, log and sqrt round otherwise.
+    runs the kernel's program on any device, slowly: for tests. The method must be RK4. Noise is that of `rollout`.
 
     Raises ValueError as `run_ensemble` does, and for another method or a wrong block.
     """
@@ -115,7 +62,7 @@ def _whole(
     cascade: Cascade, scenario: Scenario, clock: Clock, fold: Fold | None, *, members: int, block: int, interpret: bool
 ) -> Outcome:
     scenario, key = _drawn(scenario, members)
-    leaves, tree = jax.tree.flatten((KernelLoop(cascade, scenario, key), clock, fold))
+    leaves, tree = jax.tree.flatten((Realised(cascade, scenario, key), clock, fold))
     axes = [0 if x.ndim else None for x in leaves]
     member = jax.vmap(lambda *leaves: run(*jax.tree.unflatten(tree, leaves), every=0), in_axes=axes)
     results, result_tree = jax.tree.flatten(jax.eval_shape(member, *leaves))
@@ -161,12 +108,12 @@ def _drawn(scenario: Scenario, members: int) -> tuple[Scenario, tuple[Array, Arr
     # vmap needs something with an axis, which need not be in the scenario
     axes = ([0 if x.ndim else None for x in leaves], 0)
 
-    def one(leaves: list[Array], _: Array) -> tuple[Scenario | None, Array]:
+    def one(leaves: list[Array], _: Array) -> tuple[Scenario | None, tuple[Array, Array]]:
         alone = jax.tree.unflatten(tree, leaves)
         drawn = alone.realised()
-        return None if drawn is alone else drawn, jax.random.key_data(alone.key())
+        return None if drawn is alone else drawn, alone.words()
 
     drawn, words = jax.vmap(one, in_axes=axes)(leaves, jnp.arange(members))
     scenario = drawn or scenario  # nothing random: what members share, they go on sharing
     nobody = jnp.zeros((), jnp.result_type(int))
-    return dataclasses.replace(scenario, seed=nobody, member=nobody), (words[:, 0], words[:, 1])
+    return dataclasses.replace(scenario, seed=nobody, member=nobody), words
