@@ -159,7 +159,7 @@ def _paper_figures(reading: str, seen: Evidence, out: pathlib.Path) -> None:
     folder = out if reading == "repaired" else out / reading
     folder.mkdir(exist_ok=True)
     for number, (name, _) in plotting.PAPER_FIGURES.items():
-        title = f"Figure {number}: {name}, {reading} reading, no noise"
+        title = f"Figure {number}: {name}, {reading} reading, {'under' if reading == 'tuned' else 'no'} noise"
         plotting.paper_figure(number, getattr(seen, name).trajectory, title, folder / f"figure_{number}.png")
 
 
@@ -184,14 +184,18 @@ def run_reproduce(args: argparse.Namespace) -> tuple[int, Summary]:
             stage("figures and ledger")
             for job in drawn:
                 job.result()
-        plotting.readings({name: seen.tracking.trajectory for name, seen in evidence.items()}, out / "readings.png")
+        std = paper.TABLE_2.noise_std
+        words = f"Tracking under the paper's noise (std {std:.2g} m on z) and a {paper.SUPPLY:g} V supply"
+        plotting.readings(
+            {name: seen.noisy for name, seen in evidence.items()}, words, paper.SETTLE, out / "readings.png"
+        )
         claims, noise = ledger.judge(evidence), ledger.noise_table(evidence)
         (out / "ledger.md").write_text(ledger.markdown(claims, noise), encoding="utf-8")
         write_json(out / "ledger.json", {"claims": claims, "noise": noise})
     if not args.json:
         rows = [(c["says"], c["paper"], *(f["verdict"] for f in c["findings"].values())) for c in claims]
         print(table(("claim", "paper", *paper.READINGS), rows))
-        print(f"written: {out}/figure_3.png to figure_6.png, the same under literal/,")
+        print(f"written: {out}/figure_3.png to figure_6.png, the same under literal/ and tuned/,")
         print("         readings.png, ledger.md, ledger.json")
     say(f"done in {time.perf_counter() - began:.1f} s")
     return 0, {"claims": plain(claims), "noise": plain(noise), "out": str(out)}

@@ -67,6 +67,8 @@ class Evidence(NamedTuple):
 
     regulation: Run
     tracking: Run
+    noisy: Trajectory
+    """tracking under the paper's noise and supply"""
     check_regulation: Report
     check_tracking: Report
     noise: list[Noise]
@@ -90,6 +92,9 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
             say(f"{reading}: {name}")
             runs[name] = _run(cascade, reading, name)
             checks[name] = checking.result()
+        noisy = runs["tracking"].trajectory
+        if reading != "tuned":  # there it is the tracking scenario
+            noisy = _simulate(cascade, paper.noisy(paper.scenario("tracking", reading)))[0]
         # The first compiled what these run.
         noise = [first.result(), *pool.map(lambda period: _noise(cascade, reading, period), NOISE_PERIODS[1:])]
     say(f"{reading}: basin of attraction")
@@ -97,11 +102,13 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
     say(f"{reading}: uncertain plant")
     lost, error = _uncertain(cascade, reading)
     return Evidence(
-        runs["regulation"], runs["tracking"], checks["regulation"], checks["tracking"], noise, basin, lost, error
+        runs["regulation"], runs["tracking"], noisy, checks["regulation"], checks["tracking"], noise, basin, lost, error
     )
 
 
 def _simulate(cascade: Cascade, scenario: Scenario) -> tuple[Trajectory, dict[str, float]]:
+    if scenario.sensor is None:  # with one of no error: the same program as under noise
+        scenario = dataclasses.replace(scenario, sensor=Sensor())
     clock = paper.CLOCK.with_method(Adaptive())
     trajectory, measured = rollout(cascade, scenario, clock, fold=Standard(paper.SETTLE))
     return jax.tree.map(np.asarray, trajectory), {name: float(value) for name, value in measured.items()}

@@ -100,15 +100,21 @@ def overview(trajectory: Trajectory, title: str, path: pathlib.Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def readings(trajectories: dict[str, Trajectory], path: pathlib.Path) -> None:
-    """Write one picture of the tracking scenario under each reading: position above, error below."""
-    figure = Figure(figsize=(8.0, 2.9 * len(trajectories) + 0.4), layout="constrained")
-    axes = figure.subplots(2 * len(trajectories), 1)
-    for (name, trajectory), (upper, lower) in zip(trajectories.items(), axes.reshape(-1, 2), strict=True):
-        _draw(upper, POSITION, trajectory)
+def readings(trajectories: dict[str, Trajectory], title: str, settle: float, path: pathlib.Path) -> None:
+    """Write one picture of a scenario under each reading, a column each: position above, error below."""
+    figure = Figure(figsize=(4.0 * len(trajectories), 4.9), layout="constrained")
+    axes = figure.subplots(2, len(trajectories), squeeze=False)
+    position = POSITION._replace(curves=(Curve("z_measured", "$z$ measured", "#bbbbbb"), *POSITION.curves))
+    for (name, trajectory), (upper, lower) in zip(trajectories.items(), axes.T, strict=True):
+        _draw(upper, position, trajectory, first=True)
         _draw(lower, ERROR, trajectory)
-        upper.set_title(f"tracking, {name} reading", loc="left", fontsize=10)
+        upper.set_title(name, loc="left", fontsize=10, fontweight="bold")
         lower.set_xlabel("time (s)", fontsize=9)
+        if not np.isfinite(trajectory.lost_at):
+            late = np.abs(_signal(trajectory.rows, "e_z")[np.asarray(trajectory.rows.t) >= settle]).max()
+            words = f"at most {1e6 * late:.2g} µm after {settle:g} s"
+            lower.annotate(words, (0.98, 0.9), xycoords="axes fraction", ha="right", va="top", fontsize=9, color=INK)
+    figure.suptitle(title, fontsize=11)
     figure.savefig(path, dpi=130)
 
 
@@ -116,7 +122,7 @@ def _measured(trajectory: Trajectory) -> Panel:
     return Panel("measured position", "mm", 1e3, (Curve("z_measured", "$z$ measured", GREEN), Curve("z", "$z$")))
 
 
-def _draw(ax: Axes, panel: Panel, trajectory: Trajectory) -> None:
+def _draw(ax: Axes, panel: Panel, trajectory: Trajectory, first: bool = False) -> None:
     rows, lost_at = trajectory.rows, float(trajectory.lost_at)
     t = np.asarray(rows.t)
     alive = t < lost_at
@@ -133,7 +139,7 @@ def _draw(ax: Axes, panel: Panel, trajectory: Trajectory) -> None:
         above = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "frameon": False, "borderaxespad": 0.1}
         ax.legend(fontsize=8, ncols=len(panel.curves), **above)
     if np.isfinite(lost_at):
-        _mark_loss(ax, trajectory, first=panel in (POSITION, FORCE))
+        _mark_loss(ax, trajectory, first=first or panel in (POSITION, FORCE))
 
 
 def _first_moments(ax: Axes, trajectory: Trajectory, until: float = 0.01) -> None:
@@ -153,7 +159,7 @@ def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:
     ax.axvspan(lost_at, end, color=RED, alpha=0.12, linewidth=0)
     ax.axvline(lost_at, color=RED, linewidth=1.0)
     if first:
-        why = trajectory.lost_why.replace(": ", ":\n")
+        why = trajectory.lost_why.replace(": ", ":\n").replace(" reached ", "\nreached ")
         words = f"lost at {lost_at:.4g} s\n{why}"
         ax.annotate(words, (0.99, 0.06), xycoords="axes fraction", ha="right", va="bottom", fontsize=7, color=INK)
 

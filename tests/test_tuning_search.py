@@ -95,10 +95,12 @@ def test_members_do_not_depend_on_how_many_are_asked_for():
 
 def test_stressed_members_hear_more_and_count_by_being_held():
     problem = objective()
-    who = problem.training(5, 2, 1.5, 2)
+    who = problem.training(5, 2, 2, 1.5, 1.25)
     np.testing.assert_array_equal(who.loud, [1.0, 1.0, 1.5, 1.5])
     quiet, loud = (problem.world(jax.tree.map(lambda a, m=m: a[m], who))[1].sensor for m in (1, 2))
     assert float(loud.std) == 1.5 * float(quiet.std)
+    np.testing.assert_allclose(who.shift, np.log(1.25) * np.array([[0.0], [0.0], [1.0], [-1.0]]) * np.ones(4))
+    assert problem.training(5, 4, 2, 1.5, 1.25).first(2).member.tolist() == [0, 1, 4]
     terms = {name: np.ones((1, 4)) for name in TERMS}
     np.testing.assert_allclose(weigh(WEIGHTS, terms, who.stressed)[0], [sum(WEIGHTS)] * 2 + [1.001] * 2)
 
@@ -142,8 +144,8 @@ def test_every_optimiser_descends(name):
 def small():
     problem = objective(60)
     engine = Engine(problem, settle=0.002, threads=2)
-    goal = Goal((1.0, 0.0, 0.0, 0.0, 1e-3, 1.0), Mean(), bounds(CASCADE, SCENARIO, problem.clock), 1.0, 0.1, 4)
-    return engine, goal, problem.training(3, 4, 1.2, 1), SPACE.values(CASCADE)
+    goal = Goal((1.0, 0.0, 0.0, 0.0, 1e-3, 1.0), Mean(), bounds(CASCADE, SCENARIO, problem.clock), 1.0, 0.1)
+    return engine, goal, problem.training(3, 4, 1, 1.2, 1.25), SPACE.values(CASCADE)
 
 
 def run(small, **more):
@@ -157,7 +159,7 @@ def test_the_search_descends_and_keeps_the_best(small):
     value = np.asarray(found.history["value"])[optimise.WHOLE_FROM :].min(axis=1)
     assert np.all(np.diff(value) <= 0)
     x, best = best_of(found)
-    again = goal.score(SPACE, x[None], engine.terms(x[None], who), who.stressed)[0]
+    again = goal.score(SPACE, x[None], engine.terms(x[None], who), who)[0]
     assert again == pytest.approx(best, rel=1e-9)
 
 
@@ -209,8 +211,8 @@ def test_steps_that_are_no_numbers_are_skipped(small):
     engine, goal, *_ = small
     begin, step = optimise.stepper(engine, goal, "adam", 0.1)
     starts = begin(jnp.zeros((1, 4)))
-    good = step(starts, jnp.ones((1, 4)), jnp.ones((1, 4, 4)), jnp.ones(1, bool))
-    bad = step(good, jnp.full((1, 4), jnp.nan), jnp.ones((1, 4, 4)), jnp.ones(1, bool))
+    good = step(4, starts, jnp.ones((1, 4)), jnp.ones((1, 4, 4)), jnp.ones(1, bool))
+    bad = step(4, good, jnp.full((1, 4), jnp.nan), jnp.ones((1, 4, 4)), jnp.ones(1, bool))
     np.testing.assert_array_equal(bad.best, good.best)
     assert np.all(np.isfinite(bad.trial))
     for a, b in zip(jax.tree.leaves(bad.memory), jax.tree.leaves(good.memory), strict=True):

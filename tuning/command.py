@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import itertools
+import math
 import pathlib
 import time
 from typing import Any
@@ -36,7 +37,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     tune.space.encode(start)
     out = directory(args.out, f"tune-{case.name}")
     seed, held_out = seeds(tune.budget)
-    who = study.objective.training(seed, tune.budget.members, tune.stress, tune.budget.stressed)
+    who = study.objective.training(seed, tune.budget.members, tune.budget.stressed, tune.stress, tune.gain_margin)
     say(f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {study.objective.clock.method}")
     began = time.perf_counter()
     study, kept, x, error = _resolved_search(study, who, start, out, [raw, settings(tune)], args.resume)
@@ -84,7 +85,7 @@ def _resolved_search(
         say(f"step of the search against adaptive RODAS3: settled rms error off by {100 * error['relative']:.2g} %")
         if abs(error["relative"]) <= RESOLVED or round == MOST_ROUNDS or kept.interrupted:
             return study, kept, x, error
-        begin_at, rollouts = np.asarray(kept.starts.best), study.engine.rollouts
+        begin_at, rollouts = x[None], study.engine.rollouts
         study = study_of(study.case, tune, finer=2**round)
         study.engine.rollouts = rollouts
         say(f"too coarse there; the search goes on with {study.objective.clock.method}")
@@ -102,12 +103,15 @@ def _teller(study: Study, count: int) -> Any:
         gains = np.asarray(study.objective.space.gains_at(jnp.asarray(x)))
         best = int(np.argmin(kept.history["value"][-1]))
         terms, lost = kept.history["terms"][-1][best], int(kept.history["lost"][-1][best])
-        left = (budget.iterations - kept.iteration) * float(np.median(spent)) * kept.active.sum() / len(kept.active)
+        # the first iteration compiles, and says nothing about the others
+        each = float(np.median(spent[1:])) if len(spent) > 1 else math.nan
+        left = (budget.iterations - kept.iteration) * each * kept.active.sum() / len(kept.active)
+        wait = f", at most {left:.0f} s left" if math.isfinite(left) else ""
         named = ", ".join(f"{g.name} {v:.4g}" for g, v in zip(study.objective.space.gains, gains, strict=True))
         say(
             f"{kept.iteration:3d}/{budget.iterations}  loss {np.exp(value):.3e}  "
             f"rms error {scale * np.sqrt(terms[TERMS.index('tracking')]):.2e} m  kept {count - lost}"
-            f"/{count}  {named}  ({kept.active.sum()} starts, at most {left:.0f} s left)"
+            f"/{count}  {named}  ({kept.active.sum()} starts{wait})"
         )
 
     return tell

@@ -26,7 +26,8 @@ class Budget:
     members: int = 32
     """members of the ensemble that is tuned on"""
     stressed: int = 8
-    """further members whose noise is `stress` times as loud, and of whom nothing is asked but to be held"""
+    """further members of whom nothing is asked but to be held: with `stress` times the noise, and every gain off by a
+    factor of `gain_margin`, up or down"""
     held_out: int = 1000
     """members of the ensemble that judges, of another seed"""
     seed: int = 1
@@ -51,6 +52,7 @@ class Tune:
     margin: float
     early: float
     stress: float
+    gain_margin: float
     risk: Risk
     optimiser: str
     learning_rate: float
@@ -70,7 +72,7 @@ def read_study(path: str | pathlib.Path) -> tuple[Case, Tune, dict[str, Any]]:
 
 def tune_from(table: Table, case: Case) -> Tune:
     """[tune] of a case; whatever is left out has a default."""
-    numbers = ["conditions_margin", "early", "stress", "learning_rate"]
+    numbers = ["conditions_margin", "early", "stress", "gain_margin", "learning_rate"]
     counts = [field.name for field in dataclasses.fields(Budget)]
     table.only([*WORDS, *numbers, *counts])
     budget = Budget(**{name: _whole(table, name, getattr(Budget, name)) for name in counts})
@@ -83,6 +85,7 @@ def tune_from(table: Table, case: Case) -> Tune:
         margin=_positive(table, "conditions_margin", 0.1, zero=True),
         early=_positive(table, "early", 0.0, zero=True),
         stress=_positive(table, "stress", 1.2),
+        gain_margin=_positive(table, "gain_margin", 1.25),
         risk=_risk(table),
         optimiser=optimiser,
         learning_rate=_positive(table, "learning_rate", 0.1),
@@ -182,7 +185,9 @@ def settings(tune: Tune) -> dict[str, Any]:
         "weights": dict(zip(TERMS, tune.weights, strict=True)) | {"conditions": tune.conditions},
         "risk": str(tune.risk),
     }
-    rest = {name: getattr(tune, name) for name in ("margin", "early", "stress", "optimiser", "learning_rate")}
+    rest = {
+        name: getattr(tune, name) for name in ("margin", "early", "stress", "gain_margin", "optimiser", "learning_rate")
+    }
     return told | rest | dataclasses.asdict(tune.budget)
 
 

@@ -37,7 +37,7 @@ def slices(study: Study, x: np.ndarray, who: Members) -> Slices:
     for j in range(m):
         at[j * len(REACH) : (j + 1) * len(REACH), j] += REACH
     terms = study.engine.terms(at, who)
-    goals = study.goal.score(space, at, terms, who.stressed).reshape(m, -1)
+    goals = study.goal.score(space, at, terms, who).reshape(m, -1)
     gains = np.stack([np.asarray(space.gains_at(jnp.asarray(one))) for one in at])
     own = np.stack([gains[j * len(REACH) : (j + 1) * len(REACH), j] for j in range(m)])
     return Slices(own, goals, (terms["survival"] > 0).sum(axis=1).reshape(m, -1))

@@ -33,21 +33,30 @@ HELD = ("clearance", "survival")
 
 
 class Members(NamedTuple):
-    """Members of an ensemble: their numbers [n], seed, what is spread over them by path [n], and their noise.
+    """Members of an ensemble: their numbers [n], seed, and what is spread over them by path [n].
 
-    `loud` [n]: factor of the sensors' standard deviations. `stressed` [n]: members of whom nothing is asked but
-    to be held.
+    `stressed` [n], the last ones: members of whom nothing is asked but to be held, with sensors `loud` [n] times as
+    noisy, under gains that are off by `shift` [n, m], in coordinates.
     """
 
     member: Any
     seed: Any
     values: dict[str, Any]
     loud: Any
+    shift: Any
     stressed: Any
 
+    @property
+    def ordinary(self) -> int:
+        """How many are not stressed."""
+        return int(np.sum(~self.stressed))
+
     def first(self, count: int) -> "Members":
-        """The first `count` of them."""
-        return jax.tree.map(lambda a: a[:count], self)
+        """The first `count` ordinary ones, and as large a share of the stressed ones."""
+        ordinary = self.ordinary
+        extra = -(-(len(self.stressed) - ordinary) * count // ordinary)
+        index = np.concatenate([np.arange(count), ordinary + np.arange(extra)])
+        return jax.tree.map(lambda a: a[index], self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,19 +74,24 @@ class Objective:
         """The first `count` members of the ensemble with this seed."""
         return self.chosen(seed, np.arange(count), count)
 
-    def training(self, seed: int, count: int, stress: float, extra: int) -> Members:
-        """`count` members, and `extra` more whose sensor noise is `stress` times as loud."""
-        if self.scenario.sensor is None or not extra:
-            return self.members(seed, count)
+    def training(self, seed: int, count: int, extra: int, noise: float, gains: float) -> Members:
+        """`count` members, and `extra` more, stressed: noise times `noise`, every gain off by a factor of `gains`.
+
+        The first of these has all gains above, the second all below, the others a mixture drawn from the seed.
+        """
         who = self.members(seed, count + extra)
         stressed = who.member >= count
-        return who._replace(loud=np.where(stressed, stress, 1.0), stressed=stressed)
+        sign = np.random.default_rng(seed).choice([-1.0, 1.0], (count + extra, len(self.space)))
+        sign[count : count + 2] = np.array([[1.0], [-1.0]])[:extra]
+        shift = np.log(gains) * np.where(stressed[:, None], sign, 0.0)
+        return who._replace(loud=np.where(stressed, noise, 1.0), shift=shift, stressed=stressed)
 
     def chosen(self, seed: int, numbers: np.ndarray, total: int) -> Members:
         """Members with these numbers of an ensemble of `total`."""
         values = draw(self.spread, self.cascade, self.scenario, seed, numbers, total) if self.spread.entries else {}
         n = len(numbers)
-        return Members(numbers, np.full(n, seed), values, np.ones(n), np.zeros(n, bool))
+        still = np.zeros((n, len(self.space)))
+        return Members(numbers, np.full(n, seed), values, np.ones(n), still, np.zeros(n, bool))
 
     def world(self, who: Members) -> tuple[Cascade, Scenario]:
         """The cascade (its gains to be replaced) and scenario of one member, whose fields are scalars."""
@@ -89,7 +103,7 @@ class Objective:
     def run(self, x: Array, who: Members, fold: Any) -> Any:
         """The fold's result for one lane."""
         cascade, scenario = self.world(who)
-        return rollout(self.space.decode(x, cascade), scenario, self.clock, fold=fold, every=0).measured
+        return rollout(self.space.decode(x + who.shift, cascade), scenario, self.clock, fold=fold, every=0).measured
 
 
 def weigh(weights: Any, terms: dict[str, Any], stressed: Any) -> Any:
@@ -133,7 +147,7 @@ class Engine:
             found = terms(x, who, world)
             return weigh(weights, found, who.stressed), found
 
-        axes: Any = (0, Members(0, 0, 0, 0, 0), None)  # pyright: ignore[reportArgumentType]
+        axes: Any = (0, Members(0, 0, 0, 0, 0, 0), None)  # pyright: ignore[reportArgumentType]
 
         def forward(x: Array, who: Members, world: Any, weights: Array) -> Any:
             lanes = jax.vmap(total, (*axes, 0))

@@ -1,6 +1,7 @@
 """The search: a screen, then many starts refined at once; interrupted, resumed and repeated alike."""
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -57,7 +58,7 @@ class Search:
 class Goal:
     """What is minimised: the log of the risk of the weighted losses, plus the conditions' shortfall.
 
-    Members from number `ordinary` on are stressed ones: their mean loss is added to the others' risk.
+    Members after the `ordinary` first are stressed ones: their mean loss is added to the others' risk.
     """
 
     weights: tuple[float, ...]
@@ -65,28 +66,32 @@ class Goal:
     conditions: tuple[Bound, ...]
     weight: float
     margin: float
-    ordinary: int
 
-    def of(self, losses: Array, shortfalls: Array) -> Array:
+    def of(self, losses: Array, ordinary: int, shortfalls: Any) -> Array:
         """The goal from the losses [N] of the members."""
-        risk = self.risk(losses[: self.ordinary])
-        stressed = losses[self.ordinary :]
+        risk = self.risk(losses[:ordinary])
+        stressed = losses[ordinary:]
         return jnp.log(risk + (jnp.mean(stressed) if stressed.size else 0.0) + 1e-30) + self.weight * shortfalls
 
     def penalty(self, space: Any, x: Array) -> Array:
         """Shortfall of the theorem's conditions at x [m]."""
         return shortfall(dict(zip(space.paths, space.gains_at(x), strict=True)), self.conditions, self.margin)
 
-    def score(self, space: Any, x: np.ndarray, terms: dict[str, np.ndarray], stressed: np.ndarray) -> np.ndarray:
+    def score(self, space: Any, x: np.ndarray, terms: dict[str, np.ndarray], who: Members) -> np.ndarray:
         """The goal [S] from terms [S, N] of members [N]; +inf where it is not a number."""
-        losses = weigh(self.weights, terms, stressed)
+        losses, ordinary = weigh(self.weights, terms, who.stressed), who.ordinary
         each = zip(losses, x, strict=True)
-        values = np.array([self.of(jnp.asarray(one), self.penalty(space, jnp.asarray(at))) for one, at in each])
+        values = np.array(
+            [self.of(jnp.asarray(one), ordinary, self.penalty(space, jnp.asarray(at))) for one, at in each]
+        )
         return np.where(np.isfinite(values), values, np.inf)
 
 
 def stepper(engine: Engine, goal: Goal, name: str, rate: float) -> tuple[Callable[..., Starts], Callable[..., Starts]]:
-    """(begin, step): starts at coordinates [S, m], and what the losses and derivatives at their trials make of them."""
+    """(begin, step): starts at coordinates [S, m], and what the losses and derivatives at their trials make of them.
+
+    step(ordinary, starts, losses [S, N], slopes [S, N, m], on [S]); `ordinary` of the members are not stressed.
+    """
     space, method = engine.objective.space, optimiser(name, rate)
     monotone = name == "bfgs"
 
@@ -95,8 +100,8 @@ def stepper(engine: Engine, goal: Goal, name: str, rate: float) -> tuple[Callabl
         never = jnp.full(x.shape[0], jnp.inf, x.dtype)
         return Starts(x, x, never, jax.vmap(method.init)(x), never, jnp.zeros(x.shape[0], int))
 
-    def one(start: Starts, losses: Array, slopes: Array, on: Array) -> Starts:
-        value, weights = jax.value_and_grad(goal.of)(losses, 0.0)
+    def one(ordinary: int, start: Starts, losses: Array, slopes: Array, on: Array) -> Starts:
+        value, weights = jax.value_and_grad(goal.of)(losses, ordinary, 0.0)
         extra, slope = jax.value_and_grad(lambda x: goal.weight * goal.penalty(space, x))(start.trial)
         value, gradient = value + extra, weights @ slopes + slope
         finite = jnp.isfinite(value) & jnp.isfinite(gradient).all()
@@ -118,7 +123,11 @@ def stepper(engine: Engine, goal: Goal, name: str, rate: float) -> tuple[Callabl
         )
         return jax.tree.map(lambda p, q: jnp.where(on, p, q), fresh, start)
 
-    return begin, jax.jit(jax.vmap(one))
+    @functools.partial(jax.jit, static_argnums=0)
+    def step(ordinary: int, starts: Starts, losses: Array, slopes: Array, on: Array) -> Starts:
+        return jax.vmap(functools.partial(one, ordinary))(starts, losses, slopes, on)
+
+    return begin, step
 
 
 class Keeper:
@@ -188,7 +197,7 @@ def search(
         if count and begin_at is None:
             first = screen(
                 engine, who, start, goal.conditions, count=count, keep=keep, seed=seed,
-                score=lambda x, terms, few: goal.score(space, x, terms, few.stressed),
+                score=lambda x, terms, few: goal.score(space, x, terms, few),
             )  # fmt: skip
         kept = Search(begin(jnp.asarray(first)), np.ones(len(first), bool), 0, {})
     try:
@@ -207,7 +216,7 @@ def search(
 
 
 def _few(who: Members) -> Members:
-    count = int(np.sum(~who.stressed))
+    count = who.ordinary
     return who.first(max(count // 4, min(8, count)))
 
 
@@ -225,7 +234,7 @@ def iterate(
     for whole, part in zip(full, (losses, slopes), strict=True):
         whole[active] = part
     before = np.asarray(starts.value)
-    starts = step(starts, *full, kept.active)
+    starts = step(who.ordinary, starts, *full, kept.active)
     value = np.asarray(starts.value)
     past = kept.history
     lost = np.array(past["lost"][-1]) if past else np.full(len(trial), len(who.member))
@@ -233,7 +242,7 @@ def iterate(
     for row, at in enumerate(active):  # what is told of a start is told of its best point
         if value[at] < before[at]:
             lost[at] = int((terms["survival"][row] > 0).sum())
-            means[at] = [terms[name][row][: goal.ordinary].mean() for name in TERMS]
+            means[at] = [terms[name][row][: who.ordinary].mean() for name in TERMS]
     row = {
         "value": value,
         "gains": np.asarray(jax.vmap(engine.objective.space.gains_at)(starts.best)),

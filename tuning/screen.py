@@ -101,5 +101,5 @@ def screen(
 
 
 def _first(who: Members, part: int) -> Members:
-    count = len(who.member)
+    count = who.ordinary
     return who.first(max(count // part, min(4, count)))

@@ -51,7 +51,7 @@ def study_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = No
     conditions = bounds(case.cascade, case.scenario, clock)
     space = bounded(objective, conditions, tune.space.values(case.cascade))
     objective = dataclasses.replace(objective, space=space)
-    goal = Goal(tune.weights, tune.risk, conditions, tune.conditions, tune.margin, tune.budget.members)
+    goal = Goal(tune.weights, tune.risk, conditions, tune.conditions, tune.margin)
     mode = "forward" if len(tune.space) <= MOST_FORWARD else "reverse"
     return Study(case, tune, objective, Engine(objective, settle=case.settle, mode=mode, threads=threads), goal)
 
