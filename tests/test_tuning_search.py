@@ -23,6 +23,7 @@ from tuning.objective import Engine, Objective, weigh
 from tuning.optimise import Goal, Keeper, best_of, search
 from tuning.optimisers import names, optimiser
 from tuning.risk import CVaR, Mean
+from tuning.screen import REACH, around, everywhere, screen
 from tuning.space import Gain, Space
 from tuning.toml import dumps, with_gains
 
@@ -32,7 +33,7 @@ CASCADE = Cascade(inversion=inversion.Adaptive(5e5, 25.0))
 SCENARIO = Scenario(
     reference=Sine(2.5e-3, 2.0), sensor=Sensor(1e-6, 1e-4, 1e-4), u_max=300.0, initial=Initial(1e-4, 0.0, 0.0)
 )
-WEIGHTS = (1.0, 0.1, 1e-9, 1e-9, 1e-3, 1.0)
+WEIGHTS = (1.0, 0.1, 0.1, 0.2, 1e-3, 1.0)
 
 
 def objective(samples=120, spread=(), scenario=SCENARIO, method=None):
@@ -100,9 +101,9 @@ def test_stressed_members_hear_more_and_count_by_being_held():
     quiet, loud = (problem.world(jax.tree.map(lambda a, m=m: a[m], who))[1].sensor for m in (1, 2))
     assert float(loud.std) == 1.5 * float(quiet.std)
     np.testing.assert_allclose(who.shift, np.log(1.25) * np.array([[0.0], [0.0], [1.0], [-1.0]]) * np.ones(4))
-    assert problem.training(5, 4, 2, 1.5, 1.25).first(2).member.tolist() == [0, 1, 4]
+    assert problem.training(5, 4, 2, 1.5, 1.25).first(2).member.tolist() == [0, 1, 4, 5]
     terms = {name: np.ones((1, 4)) for name in TERMS}
-    np.testing.assert_allclose(weigh(WEIGHTS, terms, who.stressed)[0], [sum(WEIGHTS)] * 2 + [1.001] * 2)
+    np.testing.assert_allclose(weigh(WEIGHTS, terms, who.stressed)[0], [1.1 * 1.3 + 1.001] * 2 + [1.001] * 2)
 
 
 # --- optimisers ---
@@ -150,17 +151,51 @@ def small():
 
 def run(small, **more):
     engine, goal, who, start = small
-    return search(engine, goal, who, start, count=8, keep=2, seed=1, **{"iterations": 9, **more})
+    points = everywhere(engine.objective, goal.conditions, start, 8, seed=1)
+    return search(engine, goal, who, points, keep=2, **{"iterations": 9, **more})
 
 
 def test_the_search_descends_and_keeps_the_best(small):
     found = run(small)
     engine, goal, who, _ = small
-    value = np.asarray(found.history["value"])[optimise.WHOLE_FROM :].min(axis=1)
+    value = np.asarray(found.history["value"]).min(axis=1)
     assert np.all(np.diff(value) <= 0)
     x, best = best_of(found)
     again = goal.score(SPACE, x[None], engine.terms(x[None], who), who)[0]
     assert again == pytest.approx(best, rel=1e-9)
+
+
+def test_the_screen_keeps_the_best_of_all_that_hold(small):
+    """On so few points nothing is left out before all members are seen but what was worse on some."""
+    engine, goal, who, start = small
+    points = everywhere(engine.objective, goal.conditions, start, 8, seed=1)
+    assert points.shape == (10, 4)
+    np.testing.assert_allclose(points[0], SPACE.encode(start))
+    kept = screen(engine, who, points, 2, lambda x, terms, some: goal.score(SPACE, x, terms, some))
+    values = goal.score(SPACE, points, engine.terms(points, who), who)
+    best = goal.score(SPACE, kept, engine.terms(kept, who), who)
+    assert best[0] == pytest.approx(values.min())
+    assert best[0] <= best[1]
+
+
+def test_the_neighbourhood_is_there_and_no_larger():
+    x = np.array([1.0, -2.0, 0.5])
+    beside = around(x, 64, 3)
+    np.testing.assert_array_equal(beside[0], x)
+    # 64 points of a Sobol sequence reach beyond 9/10 of the way in every direction
+    assert np.all(np.abs(beside - x) <= REACH)
+    assert np.all(np.abs(beside - x).max(axis=0) > 0.9 * REACH)
+
+
+def test_lost_members_join_and_are_asked_only_to_be_held():
+    problem = objective()
+    who = problem.training(5, 4, 2, 1.5, 1.25).joined(problem.chosen(9, np.array([7, 3]), 10))
+    assert who.ordinary == 4
+    assert who.member.tolist() == [0, 1, 2, 3, 4, 5, 7, 3]
+    assert who.seed.tolist() == [5] * 6 + [9] * 2
+    assert who.stressed.tolist() == [False] * 4 + [True] * 4
+    assert not np.any(who.shift[6:])
+    assert who.first(2).member.tolist() == [0, 1, 4, 5, 7, 3]
 
 
 def test_nothing_is_compiled_after_the_first_iteration(small, caplog):

@@ -2,8 +2,6 @@
 
 import argparse
 import dataclasses
-import itertools
-import math
 import pathlib
 import time
 from typing import Any
@@ -16,15 +14,10 @@ from ambjax.outputs import directory, plain, say, write_json
 from ambjax.theorem import check
 from tuning import explore, gradient, report
 from tuning.config import read_study, seeds, settings
-from tuning.loss import TERMS
 from tuning.objective import Members
-from tuning.optimise import Keeper, Search, best_of, search
-from tuning.study import RESOLVED, Study, judge, step_error, study_of, summarise
+from tuning.rounds import CHECKPOINT, Answer, rounds
+from tuning.study import Study, judge, study_of, summarise
 from tuning.toml import dumps, with_gains
-
-CHECKPOINT = "checkpoint"
-# A search whose steps were too coarse is continued in steps of half the length, twice at most.
-MOST_ROUNDS = 3
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
@@ -36,20 +29,19 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     start = tune.space.values(case.cascade)
     tune.space.encode(start)
     out = directory(args.out, f"tune-{case.name}")
-    seed, held_out = seeds(tune.budget)
-    who = study.objective.training(seed, tune.budget.members, tune.budget.stressed, tune.stress, tune.gain_margin)
+    held_out = seeds(tune.budget)[2]
     say(f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {study.objective.clock.method}")
     began = time.perf_counter()
-    study, kept, x, error = _resolved_search(study, who, start, out, [raw, settings(tune)], args.resume)
-    seconds = time.perf_counter() - began
-    facts = _facts(study, x, kept, who, seconds, held_out, error)
+    answer = rounds(study, start, out, [raw, settings(tune)], args.resume)
+    study, who, x = answer.study, answer.who, answer.x
+    facts = _facts(answer, time.perf_counter() - began, held_out)
     if args.gradients:
         say("gradient report ...")
         facts["gradient"] = gradient.report(study, x, who)
     if args.pareto:
         say("front of error against voltage ...")
         facts["pareto"] = explore.pareto(study, x, who)
-    _write(out, study, raw, kept, facts, explore.slices(study, x, who))
+    _write(out, study, raw, answer.history, facts, explore.slices(study, x, who))
     summary = plain(facts) | {"out": str(out)}
     if not args.json:
         print(_short(facts))
@@ -60,66 +52,8 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     return int(not good), summary
 
 
-def _resolved_search(
-    study: Study, who: Members, start: np.ndarray, out: pathlib.Path, told: Any, resume: bool
-) -> tuple[Study, Search, np.ndarray, dict[str, float] | None]:
-    """The search, again in finer steps where its own do not resolve the optimum that it found."""
-    tune, begin_at = study.tune, None
-    for round in itertools.count(1):
-        path = out / f"{CHECKPOINT}-{round}.npz"
-        kept = search(
-            study.engine, study.goal, who, start, begin_at=begin_at, count=tune.budget.screen,
-            keep=tune.budget.starts, iterations=tune.budget.iterations, seed=tune.budget.seed, name=tune.optimiser,
-            rate=tune.learning_rate, keeper=Keeper(path, [told, round]), resume=resume and path.exists(),
-            tell=_teller(study, len(who.member)),
-        )  # fmt: skip
-        x, value = best_of(kept)
-        if not np.isfinite(value):
-            raise ValueError(
-                "tune: the loss is not a finite number at any start that was tried. Look at the case with "
-                "'ambjax simulate', or change tune.screen and tune.bounds."
-            )
-        if int(kept.history["lost"][-1][int(np.argmin(kept.history["value"][-1]))]) == len(who.member):
-            return study, kept, x, None  # nothing to hold a step against
-        error = step_error(study, x)
-        say(f"step of the search against adaptive RODAS3: settled rms error off by {100 * error['relative']:.2g} %")
-        if abs(error["relative"]) <= RESOLVED or round == MOST_ROUNDS or kept.interrupted:
-            return study, kept, x, error
-        begin_at, rollouts = x[None], study.engine.rollouts
-        study = study_of(study.case, tune, finer=2**round)
-        study.engine.rollouts = rollouts
-        say(f"too coarse there; the search goes on with {study.objective.clock.method}")
-    raise AssertionError("unreachable: the rounds are counted")
-
-
-def _teller(study: Study, count: int) -> Any:
-    """What is said after each iteration."""
-    scale = float(np.asarray(study.objective.loss.s_0))
-    budget, spent = study.tune.budget, []
-
-    def tell(kept: Search, seconds: float) -> None:
-        spent.append(seconds)
-        x, value = best_of(kept)
-        gains = np.asarray(study.objective.space.gains_at(jnp.asarray(x)))
-        best = int(np.argmin(kept.history["value"][-1]))
-        terms, lost = kept.history["terms"][-1][best], int(kept.history["lost"][-1][best])
-        # the first iteration compiles, and says nothing about the others
-        each = float(np.median(spent[1:])) if len(spent) > 1 else math.nan
-        left = (budget.iterations - kept.iteration) * each * kept.active.sum() / len(kept.active)
-        wait = f", at most {left:.0f} s left" if math.isfinite(left) else ""
-        named = ", ".join(f"{g.name} {v:.4g}" for g, v in zip(study.objective.space.gains, gains, strict=True))
-        say(
-            f"{kept.iteration:3d}/{budget.iterations}  loss {np.exp(value):.3e}  "
-            f"rms error {scale * np.sqrt(terms[TERMS.index('tracking')]):.2e} m  kept {count - lost}"
-            f"/{count}  {named}  ({kept.active.sum()} starts{wait})"
-        )
-
-    return tell
-
-
-def _facts(
-    study: Study, x: np.ndarray, kept: Search, who: Members, seconds: float, held_out: int, error: Any
-) -> dict[str, Any]:
+def _facts(answer: Answer, seconds: float, held_out: int) -> dict[str, Any]:
+    study, x, who = answer.study, answer.x, answer.who
     case, tune, space = study.case, study.tune, study.objective.space
     rollouts = study.engine.rollouts
     before = space.values(case.cascade)
@@ -139,8 +73,10 @@ def _facts(
         "held_out_seed": held_out,
         "lost_in_training": lost,
         "conditions": report.conditions(line),
-        "step_error": error,
-        "search": settings(tune) | {"iterations": kept.iteration, "rollouts": rollouts, "seconds": seconds},
+        "step_error": answer.error,
+        "lost_in_validation": answer.lost,
+        "search": settings(tune)
+        | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": seconds},
     }
     facts["gains"] = report.gains_table(space, before, after, None)
     facts["verdict"] = _verdict(facts)
@@ -186,7 +122,7 @@ def _advice(study: Study, facts: dict[str, Any], x: np.ndarray, who: Members) ->
 
 
 def _write(
-    out: pathlib.Path, study: Study, raw: dict[str, Any], kept: Search, facts: dict[str, Any], found: explore.Slices
+    out: pathlib.Path, study: Study, raw: dict[str, Any], history: Any, facts: dict[str, Any], found: explore.Slices
 ) -> None:
     space = study.objective.space
     for row, grows in zip(facts["gains"], found.sensitivity(), strict=True):
@@ -196,9 +132,9 @@ def _write(
     head = f"Tuned by ambjax-tune from the case '{facts['case']}'.\n{facts['verdict']}"
     case_from(document, facts["case"])  # a file that could not be read back is not written
     (out / "tuned.toml").write_text(dumps(document, head), encoding="utf-8")
-    np.savez(out / "history.npz", **{k: np.asarray(v) for k, v in kept.history.items()})  # pyright: ignore
+    np.savez(out / "history.npz", **history)
     text = report.markdown(facts)
-    pictures = {"Convergence": report.convergence(kept.history, space.paths)} if kept.history else {}
+    pictures = {"Convergence": report.convergence(history, space.paths)}
     pictures["The risk along each gain, through the optimum"] = report.landscape(found, space.paths)
     if facts.get("pareto"):
         pictures["Error against voltage"] = report.front(facts["pareto"])

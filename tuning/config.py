@@ -15,7 +15,7 @@ from tuning.optimisers import names
 from tuning.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.space import Gain, Space, tunable
 
-WEIGHTS = {"tracking": 1.0, "peak": 0.0, "effort": 0.0, "chatter": 0.0, "clearance": 1e-3, "survival": 1.0}
+WEIGHTS = {"tracking": 1.0, "peak": 0.0, "effort": 0.1, "chatter": 0.1, "clearance": 1e-3, "survival": 1.0}
 WORDS = ["gains", "bounds", "weights", "risk", "alpha", "optimiser"]
 
 
@@ -28,10 +28,12 @@ class Budget:
     stressed: int = 8
     """further members of whom nothing is asked but to be held: with `stress` times the noise, and every gain off by a
     factor of `gain_margin`, up or down"""
+    validation: int = 2000
+    """members of another seed at the end of a search; those that are lost join the stressed ones, and it goes on"""
     held_out: int = 1000
     """members of the ensemble that judges, of another seed"""
     seed: int = 1
-    """of the training ensemble and of the screen; the held-out one has the next seed but one million"""
+    """of the training ensemble and of the screen; the other ensembles have seeds far from it"""
     screen: int = 128
     """points of the first screen; 0: none, start from the case's gains alone"""
     starts: int = 4
@@ -170,7 +172,7 @@ def _positive(table: Table, key: str, default: float, zero: bool = False) -> flo
 def _whole(table: Table, key: str, default: int) -> int:
     value, least = (
         table.raw.get(key, default),
-        0 if key in ("screen", "seed", "held_out", "iterations", "stressed") else 1,
+        0 if key in ("screen", "seed", "held_out", "iterations", "stressed", "validation") else 1,
     )
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value < 2**31:
         raise ValueError(f"{table.at(key)} = {show(value)}: it must be a whole number of at least {least}.")
@@ -191,6 +193,6 @@ def settings(tune: Tune) -> dict[str, Any]:
     return told | rest | dataclasses.asdict(tune.budget)
 
 
-def seeds(budget: Budget) -> tuple[int, int]:
-    """Seeds of the training and of the held-out ensemble."""
-    return budget.seed, int(np.uint32(budget.seed + 1_000_001))
+def seeds(budget: Budget) -> tuple[int, int, int]:
+    """Seeds of the training, the validation and the held-out ensemble."""
+    return budget.seed, int(np.uint32(budget.seed + 2_000_003)), int(np.uint32(budget.seed + 1_000_001))

@@ -46,13 +46,11 @@ def slices(study: Study, x: np.ndarray, who: Members) -> Slices:
 def pareto(study: Study, x: np.ndarray, who: Members, *, points: int = 6, iterations: int = 8) -> list[dict[str, Any]]:
     """The front of settled tracking error against rms voltage: a family of weights of the effort, refined at once.
 
-    The weights run from none to as much as the tracking at x costs, relative to the effort there, times 30.
+    The first has the search's own; voltage at its limit is worth from as much as the error to a thousand times that.
     """
     space = study.objective.space
-    terms = study.engine.terms(x[None], who)
-    worth = float(terms["tracking"].mean() / max(terms["effort"].mean(), 1e-30))
     weights = np.tile(study.goal.weights, (points, 1))
-    weights[1:, TERMS.index("effort")] += worth * np.geomspace(0.03, 30.0, points - 1)
+    weights[1:, TERMS.index("effort")] = np.geomspace(1.0, 1000.0, points - 1)
     begin, step = stepper(study.engine, study.goal, "bfgs", 0.0)
     family = Search(begin(jnp.tile(jnp.asarray(x), (points, 1))), np.ones(points, bool), 0, {})
     for _ in range(iterations):

@@ -30,6 +30,8 @@ LANES = 64
 GRADIENT_LANES = 32
 # Terms that say whether the rotor is held.
 HELD = ("clearance", "survival")
+# Terms that are a price, not an aim.
+COSTS = ("effort", "chatter")
 
 
 class Members(NamedTuple):
@@ -51,11 +53,14 @@ class Members(NamedTuple):
         """How many are not stressed."""
         return int(np.sum(~self.stressed))
 
+    def joined(self, others: "Members") -> "Members":
+        """These and others, who are asked only to be held."""
+        more = others._replace(stressed=np.ones(len(others.stressed), bool))
+        return jax.tree.map(lambda a, b: np.concatenate([a, b]), self, more)
+
     def first(self, count: int) -> "Members":
-        """The first `count` ordinary ones, and as large a share of the stressed ones."""
-        ordinary = self.ordinary
-        extra = -(-(len(self.stressed) - ordinary) * count // ordinary)
-        index = np.concatenate([np.arange(count), ordinary + np.arange(extra)])
+        """The first `count` ordinary ones, and all that are stressed."""
+        index = np.concatenate([np.arange(count), np.arange(self.ordinary, len(self.stressed))])
         return jax.tree.map(lambda a: a[index], self)
 
 
@@ -107,10 +112,16 @@ class Objective:
 
 
 def weigh(weights: Any, terms: dict[str, Any], stressed: Any) -> Any:
-    """The loss: weighted terms, for a stressed member those of HELD alone."""
+    """The loss: errors and losses weighed and added, times 1 + weighed costs; of a stressed member, HELD alone.
+
+    Costs count relative to the error, since its size is not known before: with a weight of 0.1, voltage at
+    its limit throughout is worth a tenth of the error.
+    """
     ordinary = 1.0 - 1.0 * stressed
-    shares = [weights[k] * (1.0 if name in HELD else ordinary) for k, name in enumerate(TERMS)]
-    return sum(share * terms[name] for share, name in zip(shares, TERMS, strict=True))
+    each = dict(zip(TERMS, (weights[k] * terms[name] for k, name in enumerate(TERMS)), strict=True))
+    costs = sum(each.pop(name) for name in COSTS)
+    held = sum(each.pop(name) for name in HELD)
+    return held + ordinary * sum(each.values()) * (1 + costs)
 
 
 class Engine:

@@ -26,8 +26,6 @@ from tuning.screen import screen
 SHORTER, SHORTEST = 0.25, 1e-3
 # After these iterations the better half of the starts goes on.
 HALVINGS = (4, 10)
-# Until this iteration a quarter of the members does: it is far to go, and the direction is clear.
-WHOLE_FROM = 6
 # Finished when the loss fell by less than this over as many iterations.
 STALL, PATIENCE = 2e-4, 6
 
@@ -168,22 +166,18 @@ def search(
     engine: Engine,
     goal: Goal,
     who: Members,
-    start: np.ndarray,
+    points: np.ndarray,
     *,
-    begin_at: np.ndarray | None = None,
-    count: int = 0,
     keep: int = 1,
     iterations: int,
-    seed: int,
     name: str = "bfgs",
     rate: float = 0.1,
     keeper: Keeper | None = None,
     resume: bool = False,
     tell: Callable[[Search, float], None] = lambda search, seconds: None,
 ) -> Search:
-    """Screen `count` points from the gains `start` [m], refine the best `keep` of them. Ctrl-C ends it early.
+    """Refine the best `keep` of these points, coordinates [K, m]. Ctrl-C ends it early.
 
-    `begin_at`: coordinates [S, m] to refine instead of a screen's.
     `tell` is called after each iteration with the search and the seconds that it took.
     """
     space = engine.objective.space
@@ -193,31 +187,18 @@ def search(
     if kept is not None:
         engine.rollouts = int(kept.history["rollouts"][-1])
     else:
-        first = space.encode(space.clip(start))[None] if begin_at is None else begin_at
-        if count and begin_at is None:
-            first = screen(
-                engine, who, start, goal.conditions, count=count, keep=keep, seed=seed,
-                score=lambda x, terms, few: goal.score(space, x, terms, few),
-            )  # fmt: skip
-        kept = Search(begin(jnp.asarray(first)), np.ones(len(first), bool), 0, {})
+        if len(points) > keep:
+            points = screen(engine, who, points, keep, lambda x, terms, some: goal.score(space, x, terms, some))
+        kept = Search(begin(jnp.asarray(points)), np.ones(len(points), bool), 0, {})
     try:
         while kept.iteration < iterations and kept.active.any():
             began = time.perf_counter()
-            if kept.iteration == WHOLE_FROM:  # what was good on a few says nothing about all
-                kept.starts = kept.starts._replace(
-                    trial=kept.starts.best, value=jnp.full_like(kept.starts.value, jnp.inf)
-                )
-            iterate(engine, goal, who if kept.iteration >= WHOLE_FROM else _few(who), kept, step)
+            iterate(engine, goal, who, kept, step)
             keeper.save(kept)
             tell(kept, time.perf_counter() - began)
     except KeyboardInterrupt:
         kept.interrupted = True
     return kept
-
-
-def _few(who: Members) -> Members:
-    count = who.ordinary
-    return who.first(max(count // 4, min(8, count)))
 
 
 def iterate(
@@ -264,7 +245,7 @@ def _going_on(kept: Search, halving: bool) -> np.ndarray:
         order = np.argsort(np.where(active, value, np.inf), kind="stable")
         worse = order[max((int(active.sum()) + 1) // 2, 1) :]
         active[worse] = False
-    if kept.iteration > WHOLE_FROM + PATIENCE:
+    if kept.iteration > PATIENCE:
         past = kept.history["value"][-1 - PATIENCE]
         active &= ~(np.isfinite(past) & (past - np.where(np.isfinite(past), value, 0.0) < STALL))
     return active

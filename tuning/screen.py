@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -12,8 +13,11 @@ from tuning.conditions import Bound
 from tuning.objective import Engine, Members, Objective
 from tuning.space import Space
 
-# All points on an eighth of the members; then an eighth of the points on half of them.
-EIGHTH, HALF = 8, 2
+# Share of the members that points meet, and share of the points that goes on: 1/4 after an eighth of the members, ...
+ROUNDS = (8, 4), (2, 4), (1, 1)
+# How far from a point its neighbourhood reaches: factors of e^-1.5 to e^1.5 of each gain.
+REACH = 1.5
+Score = Callable[[np.ndarray, dict[str, np.ndarray], Members], np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,34 +76,29 @@ def bounded(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarr
     return Space(tuple(gains))
 
 
-def screen(
-    engine: Engine,
-    who: Members,
-    start: np.ndarray,
-    conditions: tuple[Bound, ...],
-    *,
-    count: int,
-    keep: int,
-    seed: int,
-    score: Callable[[np.ndarray, dict[str, np.ndarray], Members], np.ndarray],
-) -> np.ndarray:
-    """Coordinates [keep, m] of the best of `count` quasi-random points, the case's gains and the middle of the ranges.
-
-    Two rounds of successive halving: all on an eighth of the members, an eighth of them on half.
-    """
-    space = engine.objective.space
-    box = ranges(engine.objective, conditions, start)
+def everywhere(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray, count: int, seed: int) -> Any:
+    """Coordinates [count + 2, m]: the case's gains, the middle of the ranges, and quasi-random points over them."""
+    space = objective.space
+    box = ranges(objective, conditions, start)
     low, high = np.log([r.low for r in box]), np.log([r.high for r in box])
     cube = points("sobol", seed, len(space), np.arange(count), count)
     gains = np.concatenate([start[None], np.exp((low + high) / 2)[None], np.exp(low + cube * (high - low))])
-    x = np.stack([space.encode(space.clip(g)) for g in gains])
-    few, half = _first(who, EIGHTH), _first(who, HALF)
-    values = score(x, engine.terms(x, few), few)
-    x = x[np.argsort(values, kind="stable")[: max(len(x) // EIGHTH, keep)]]
-    values = score(x, engine.terms(x, half), half)
-    return x[np.argsort(values, kind="stable")[:keep]]
+    return np.stack([space.encode(space.clip(g)) for g in gains])
 
 
-def _first(who: Members, part: int) -> Members:
-    count = who.ordinary
-    return who.first(max(count // part, min(4, count)))
+def around(x: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Coordinates [count + 1, m]: x, and quasi-random points beside it, up to REACH away in each."""
+    cube = points("sobol", seed, len(x), np.arange(count), count)
+    return np.concatenate([x[None], x + REACH * (2 * cube - 1)])
+
+
+def screen(engine: Engine, who: Members, x: np.ndarray, keep: int, score: Score) -> np.ndarray:
+    """The best [keep, m] of points x [K, m], by successive halving: on few members first, on all at last.
+
+    Stressed members are there from the first: to be held is what is asked first.
+    """
+    for part, left in ROUNDS:
+        some = who.first(max(who.ordinary // part, min(4, who.ordinary)))
+        values = score(x, engine.terms(x, some), some)
+        x = x[np.argsort(values, kind="stable")[: max(len(x) // left, 2 * keep)]]
+    return x[:keep]

@@ -1,0 +1,142 @@
+"""Rounds of a study: a search; again in finer steps where its own do not resolve the optimum; again with the members
+of a validation ensemble that its gains lose, until none is."""
+
+import dataclasses
+import itertools
+import math
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax.outputs import say
+from tuning.config import seeds
+from tuning.loss import TERMS
+from tuning.objective import Members
+from tuning.optimise import Keeper, Search, best_of, search
+from tuning.screen import around, everywhere
+from tuning.study import RESOLVED, Study, step_error, study_of
+
+CHECKPOINT = "checkpoint"
+# Rounds in all, times that steps are halved, and lost members that join in one round.
+MOST_ROUNDS, MOST_HALVINGS, MOST_JOINING = 8, 2, 16
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    """What the rounds found: gains at x [m], the study and members that they were last judged by, and how it went."""
+
+    study: Study
+    who: Members
+    x: np.ndarray
+    error: dict[str, float] | None
+    history: dict[str, np.ndarray]
+    lost: int
+    """members of the validation ensemble"""
+
+
+def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume: bool) -> Answer:
+    """Tune from the gains `start` [m]. Raises ValueError where nothing can be evaluated."""
+    tune, halvings, found = study.tune, 0, []
+    points = everywhere(study.objective, study.goal.conditions, start, tune.budget.screen, tune.budget.seed)
+    points = points if tune.budget.screen else points[:1]
+    training = seeds(tune.budget)[0]
+    who = study.objective.training(training, tune.budget.members, tune.budget.stressed, tune.stress, tune.gain_margin)
+    past: list[Search] = []
+    for round in itertools.count(1):
+        path = out / f"{CHECKPOINT}-{round}.npz"
+        kept = search(
+            study.engine, study.goal, who, points, keep=tune.budget.starts, iterations=tune.budget.iterations,
+            name=tune.optimiser, rate=tune.learning_rate, keeper=Keeper(path, [told, round]),
+            resume=resume and path.exists(), tell=_teller(study, len(who.member)),
+        )  # fmt: skip
+        if kept.interrupted and not kept.history and not past:
+            raise KeyboardInterrupt
+        past.append(kept)
+        x = _best(kept)
+        if int(kept.history["lost"][-1][int(np.argmin(kept.history["value"][-1]))]) == len(who.member):
+            return Answer(study, who, x, None, _joined(past), tune.budget.validation)  # nothing to go on with
+        error = step_error(study, x)
+        say(f"step of the search against adaptive RODAS3: settled rms error off by {100 * error['relative']:.2g} %")
+        points = x[None]
+        if abs(error["relative"]) > RESOLVED and halvings < MOST_HALVINGS and not kept.interrupted:
+            halvings += 1
+            study = _finer(study, 2**halvings)
+            say(f"too coarse there; the search goes on with {study.objective.clock.method}")
+            continue
+        lost = _lost(study, x) if tune.budget.validation and not kept.interrupted else np.zeros(0, int)
+        found.append(Answer(study, who, x, error, _joined(past), len(lost)))
+        if not len(lost) or round >= MOST_ROUNDS:
+            return min(found, key=lambda answer: answer.lost)
+        who = who.joined(_members(study, lost[:MOST_JOINING]))
+        points = around(x, tune.budget.screen, tune.budget.seed + round)
+        say(f"{len(lost)} of {tune.budget.validation} members of another seed are lost: the search goes on with them")
+    raise AssertionError("unreachable: the rounds are counted")
+
+
+def _best(kept: Search) -> np.ndarray:
+    x, value = best_of(kept)
+    if not np.isfinite(value):
+        raise ValueError(
+            "tune: the loss is not a finite number at any start that was tried. Look at the case with "
+            "'ambjax simulate', or change tune.screen and tune.bounds."
+        )
+    return x
+
+
+def _finer(study: Study, finer: int) -> Study:
+    """The same study in finer steps; rollouts go on being counted."""
+    fine = study_of(study.case, study.tune, finer=finer)
+    fine.engine.rollouts = study.engine.rollouts
+    return fine
+
+
+def _members(study: Study, numbers: np.ndarray) -> Members:
+    """These members of the validation ensemble."""
+    budget = study.tune.budget
+    return study.objective.chosen(seeds(budget)[1], numbers, budget.validation)
+
+
+def _lost(study: Study, x: np.ndarray) -> np.ndarray:
+    """Numbers of the validation members that are lost at x [m], first lost first."""
+    share = study.engine.terms(x[None], _members(study, np.arange(study.tune.budget.validation)))["survival"][0]
+    return np.argsort(-share, kind="stable")[: int((share > 0).sum())]
+
+
+def _joined(past: list[Search]) -> dict[str, np.ndarray]:
+    """The histories of all rounds in a row; a round with fewer starts repeats its own."""
+    width = max(len(kept.active) for kept in past)
+
+    def wide(rows: Any) -> np.ndarray:
+        rows = np.asarray(rows)
+        return rows if rows.ndim < 2 or rows.shape[1] == width else np.repeat(rows[:, :1], width, axis=1)
+
+    names = past[0].history
+    return {name: np.concatenate([wide(kept.history[name]) for kept in past if kept.history]) for name in names}
+
+
+def _teller(study: Study, count: int) -> Callable[[Search, float], None]:
+    """What is said after each iteration."""
+    scale = float(np.asarray(study.objective.loss.s_0))
+    budget, spent = study.tune.budget, []
+
+    def tell(kept: Search, seconds: float) -> None:
+        spent.append(seconds)
+        x, value = best_of(kept)
+        gains = np.asarray(study.objective.space.gains_at(jnp.asarray(x)))
+        best = int(np.argmin(kept.history["value"][-1]))
+        terms, lost = kept.history["terms"][-1][best], int(kept.history["lost"][-1][best])
+        # the first iteration compiles, and says nothing about the others
+        each = float(np.median(spent[1:])) if len(spent) > 1 else math.nan
+        left = (budget.iterations - kept.iteration) * each * kept.active.sum() / len(kept.active)
+        wait = f", at most {left:.0f} s left" if math.isfinite(left) else ""
+        named = ", ".join(f"{g.name} {v:.4g}" for g, v in zip(study.objective.space.gains, gains, strict=True))
+        say(
+            f"{kept.iteration:3d}/{budget.iterations}  loss {np.exp(value):.3e}  "
+            f"rms error {scale * np.sqrt(terms[TERMS.index('tracking')]):.2e} m  kept {count - lost}"
+            f"/{count}  {named}  ({kept.active.sum()} starts{wait})"
+        )
+
+    return tell
