@@ -51,6 +51,20 @@ def child(script: str, *arguments: Any, **environment: str) -> Any:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def peak_memory() -> int:
+    """Largest resident memory of this process so far, in bytes.
+
+    getrusage counts a parent's memory where the child was begun by vfork, so Linux's own count comes first.
+    """
+    status = pathlib.Path("/proc/self/status")
+    if status.exists():
+        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return 1024 * int(line.split()[1])
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
 def one_core() -> None:
     """Keep this process on one core, where the system can."""
     if hasattr(os, "sched_setaffinity"):

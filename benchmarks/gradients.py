@@ -1,17 +1,17 @@
 """What a gradient costs: time over one forward run of the same engine and step, and memory against the horizon.
 
-The common workload without noise (smooth gains, RK4, 10 us a step), float64, one core. The loss is the mean
-square of e_z, differentiated in c, k, gamma and k_i. Forward mode carries one tangent for each; reverse
-mode recomputes each sample from its start. Memory is the peak of a process of its own.
-Run: python benchmarks/gradients.py
+Two loops, float64, one core: the tuner's own on task A (sliding steps, held noise, its whole loss), and the common
+workload without noise (smooth gains, RK4, 10 us a step, mean square of e_z). Differentiated in c, k, gamma and
+k_i. Forward mode carries one tangent for each; reverse mode, on the second, recomputes each sample from its start.
+Memory is the peak of a process of its own. Run: python benchmarks/gradients.py
 """
 
 import argparse
 import dataclasses
+import functools
 import json
 import os
-import resource
-import sys
+import pathlib
 from collections.abc import Callable
 from typing import Any
 
@@ -26,9 +26,15 @@ import workload
 from ambjax import Cascade, Initial, current, inversion, position, rollout
 from ambjax._kernel import one_kernel
 from ambjax.metrics import Rms
+from tuning.config import read_study
+from tuning.objective import weigh
+from tuning.study import study_of
 
 GAINS = np.array([17.0, 25.0, workload.GAMMA, 152.0])
-MEMBERS, SAMPLES = (1, 64), 2_000
+MEMBERS, SAMPLES = (1, 64), 1_000
+TASK = pathlib.Path(__file__).parent / "tasks" / "A.toml"
+# Gains that hold task A's rotor.
+HELD = np.array([500.0, 100.0, 1e6, 150.0])
 # Steps of the runs whose memory is compared: ten to a sample.
 HORIZONS = (20_000, 200_000)
 
@@ -49,35 +55,73 @@ def loss_of(work: workload.Workload) -> Callable[..., Any]:
     return loss
 
 
-def programs(work: workload.Workload) -> dict[str, Callable[..., Any]]:
+def programs(loss: Callable[..., Any], members: int, axes: Any) -> dict[str, Callable[..., Any]]:
     """The forward run and its derivatives over all members, compiled as the tuner compiles them."""
-    loss, members = loss_of(work), work.members
+    over = jax.vmap(loss, (None, axes)) if members > 1 else loss
 
-    def forward(logs: Any, z: Any) -> Any:
-        along = lambda d: jax.jvp(lambda x: loss(x, z), (logs,), (d,))  # noqa: E731
+    def forward(logs: Any, member: Any) -> Any:
+        along = lambda d: jax.jvp(lambda x: over(x, member), (logs,), (d,))  # noqa: E731
         return jax.vmap(along, out_axes=(None, 0))(jnp.eye(len(GAINS)))
 
-    def over(f: Callable[..., Any]) -> Callable[..., Any]:
-        return jax.vmap(f, (None, 0)) if members > 1 else f
-
+    reverse = jax.value_and_grad(loss)
     return {
-        "run": one_kernel(over(loss)),
-        "forward": one_kernel(over(forward)),
-        "reverse": jax.jit(over(jax.value_and_grad(loss))),
+        "run": one_kernel(over),
+        "forward": one_kernel(forward),
+        "reverse": jax.jit(jax.vmap(reverse, (None, axes)) if members > 1 else reverse),
     }
 
 
-def arguments(work: workload.Workload) -> tuple[Any, Any]:
+def rk4(members: int, samples: int) -> tuple[Callable[..., Any], Any, Any, int]:
+    """Loss, its members, their axes, and steps of one member: the common workload."""
+    work = workload.workload(members, samples)
     z = np.asarray(work.scenario.initial.z)
-    return np.zeros(len(GAINS)), z if work.members > 1 else float(z[0])
+    return loss_of(work), z if members > 1 else float(z[0]), 0, work.steps
+
+
+def tuner(members: int, samples: int) -> tuple[Callable[..., Any], Any, Any, int]:
+    """The same of the tuner's lanes, around gains that hold the rotor."""
+    case, tune, _ = read_study(TASK)
+    case = dataclasses.replace(case, clock=dataclasses.replace(case.clock, samples=samples))
+    study = study_of(case, tune)
+    problem, who = study.objective, study.objective.members(1, members)
+    x_0 = problem.space.encode(HELD)
+
+    def loss(logs: Any, member: Any) -> Any:
+        return weigh(tune.weights, problem.run(x_0 + logs, member, problem.loss), member.stressed)
+
+    one = jax.tree.map(lambda a: a[0], who)
+    return loss, who if members > 1 else one, jax.tree.map(lambda _: 0, one), samples * problem.clock.method.substeps
 
 
 def point(mode: str, steps: int) -> dict[str, Any]:
     """Peak memory of this process after one call over this many steps of one member."""
-    work = workload.workload(1, steps // workload.SUBSTEPS)
-    jax.block_until_ready(programs(work)[mode](*arguments(work)))
-    unit = 1 if sys.platform == "darwin" else 1024
-    return {"steps": steps, "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit}
+    loss, member, axes, _ = rk4(1, steps // workload.SUBSTEPS)
+    jax.block_until_ready(programs(loss, 1, axes)[mode](np.zeros(len(GAINS)), member))
+    return {"steps": steps, "peak_bytes": _measure.peak_memory()}
+
+
+def measure(name: str, build: Callable[..., Any], members: int) -> dict[str, Any]:
+    """One row: a loop and a number of members."""
+    loss, member, axes, steps = build(members, SAMPLES)
+    compiled = programs(loss, members, axes)
+    if build is tuner:
+        del compiled["reverse"]
+    runs = {mode: functools.partial(f, np.zeros(len(GAINS)), member) for mode, f in compiled.items()}
+    found = _measure.alternating(runs, repeats=9)
+    row: dict[str, Any] = {"step": name, "members": members, "steps": steps, "run_s": found["run"]["seconds"]}
+    for mode in ("forward", "reverse"):
+        row[mode] = found[mode]["seconds"] / row["run_s"] if mode in found else None
+    each = 1e9 * row["run_s"] / members / steps
+    told = f"{name}, {members} members: run {each:.0f} ns a step; gradient in forward mode "
+    if row["reverse"]:
+        slopes = [np.asarray(runs[mode]()[1]) for mode in ("forward", "reverse")]
+        slopes[0] = slopes[0].T if members > 1 else slopes[0]
+        row["modes_differ"] = float(np.max(np.abs(slopes[0] - slopes[1])) / np.max(np.abs(slopes[0])))
+        told += f"{row['forward']:.2f}, in reverse {row['reverse']:.2f} runs; they differ by {row['modes_differ']:.0e}"
+    else:
+        told += f"{row['forward']:.2f} runs"
+    print(told, flush=True)
+    return row
 
 
 def main() -> None:
@@ -88,22 +132,8 @@ def main() -> None:
     if given.point:
         print(json.dumps(point(given.point[0], int(given.point[1]))))
         return
-    rows = []
-    for n in MEMBERS:
-        work = workload.workload(n, SAMPLES)
-        given_to = arguments(work)
-        runs = {name: (lambda f=f, to=given_to: f(*to)) for name, f in programs(work).items()}
-        slopes = [np.asarray(runs[mode]()[1]) for mode in ("forward", "reverse")]
-        agree = float(np.max(np.abs(slopes[0] - slopes[1])) / np.max(np.abs(slopes[0])))
-        found = _measure.alternating(runs)
-        row = {"members": n, "modes_differ": agree, **{f"{k}_s": v["seconds"] for k, v in found.items()}}
-        row |= {mode: found[mode]["seconds"] / found["run"]["seconds"] for mode in ("forward", "reverse")}
-        rows.append(row)
-        print(
-            f"{n:>3} members: run {1e9 * row['run_s'] / n / work.steps:.1f} ns a step; gradient of {len(GAINS)} gains: "
-            f"forward {row['forward']:.2f}, reverse {row['reverse']:.2f} runs; they differ by {agree:.1e}",
-            flush=True,
-        )
+    loops = {"sliding steps, the tuner's": tuner, "RK4": rk4}
+    rows = [measure(name, build, n) for name, build in loops.items() for n in MEMBERS]
     memory: dict[str, Any] = {}
     for mode in ("run", "forward", "reverse"):
         memory[mode] = [_measure.child(__file__, "--point", mode, steps) for steps in HORIZONS]

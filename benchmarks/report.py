@@ -1,6 +1,7 @@
 """Write benchmarks/README.md from the JSON in benchmarks/results."""
 
 import json
+import math
 import pathlib
 from typing import Any
 
@@ -19,6 +20,10 @@ Ratios are within one run of one script; absolute times depend on the machine an
     .venv/bin/python benchmarks/peers.py             # ensembles against other libraries
     .venv/bin/python benchmarks/scaling.py --full    # cost and memory against members and horizon
     .venv/bin/python benchmarks/gpu.py               # the same on an accelerator, where there is one
+    .venv/bin/python benchmarks/held_noise.py        # what a higher order saves between jumps of the noise
+    .venv/bin/python benchmarks/gradients.py         # what a gradient costs, in time and memory
+    .venv/bin/python benchmarks/tasks.py             # the five tuning tasks
+    .venv/bin/python benchmarks/tuning.py            # their search against derivative-free ones
     .venv/bin/python benchmarks/report.py
 """
 
@@ -137,6 +142,78 @@ def scaling() -> list[str]:
     return lines
 
 
+def held_noise() -> list[str]:
+    data = load("held_noise")
+    lines = ["## Held noise: steps per hold (`held_noise.py`)", "", facts(data["machine"])]
+    lines += ["64 members, one core, smooth gains; errors relative to the largest |z|.", ""]
+    for case in data["cases"]:
+        lines += [f"Noise {case['noise']:g} times the workload's, 1e-6 m on z:", ""]
+        cells = [[r["method"], f"{r['relative_error']:.1e}", f"{1e3 * r['seconds']:.1f}"] for r in case["methods"]]
+        lines += table("method | relative error | time (ms)", cells)
+        if case["ratio"]:
+            best = case["best"]
+            high, low = (best[kind]["method"] for kind in ("Dormand-Prince 5", "RK4"))
+            lines += [f"At {data['target']:g}: {high} takes {case['ratio']:.2f} of the time of {low}.", ""]
+    return lines
+
+
+def gradients() -> list[str]:
+    data = load("gradients")
+    lines = ["## What a gradient of four gains costs (`gradients.py`)", "", facts(data["machine"])]
+    lines += ["One core, float64; in forward runs of the same engine and step. Forward mode is the tuner's.", ""]
+    rows = []
+    for r in data["rows"]:
+        cells = [r["step"], str(r["members"]), f"{1e9 * r['run_s'] / r['members'] / r['steps']:.0f}"]
+        rows.append([*cells, f"{r['forward']:.2f}", f"{r['reverse']:.1f}" if r["reverse"] else ""])
+    lines += table("step | members | forward run (ns per step) | gradient, forward | gradient, reverse", rows)
+    rows = [[mode, *(f"{r['peak_bytes'] / 2**20:.0f}" for r in found)] for mode, found in data["memory"].items()]
+    steps = [f"{r['steps']:,} steps (MiB)" for r in next(iter(data["memory"].values()))]
+    return lines + table("peak memory of the process | " + " | ".join(steps), rows)
+
+
+def tasks() -> list[str]:
+    data = load("tasks")
+    lines = ["## The tuning tasks (`tasks.py`)", "", facts(data["machine"])]
+    lines += [
+        "`ambjax-tune` with its defaults, from gains that lose the rotor; judged on held-out members. Steps: error of",
+        "the settled rms error in the search's own steps against adaptive RODAS3.",
+        "",
+    ]
+    rows = []
+    for row in data["tasks"].values():
+        gains = ", ".join(f"{path.rpartition('.')[2]} {value:.4g}" for path, value in row["gains"].items())
+        cells = [row["title"], f"{row['settled_rms_error_m']:.2e}", f"{row['settled_max_abs_error_m']:.1e}"]
+        cells += [f"{row['lost']} of {row['members']}", f"{row['settled_rms_u_V']:.0f}"]
+        cells += [f"{100 * row['step_error']:.1g} %", f"{row['rollouts']:,}", f"{row['seconds']:.0f}", gains]
+        rows.append(cells)
+    titles = "task | settled rms error (m) | largest (m) | lost | u rms (V) | steps | rollouts | search (s) | gains"
+    return lines + table(titles, rows)
+
+
+def tuning() -> list[str]:
+    data = load("tuning")
+    lines = ["## The search against derivative-free ones (`tuning.py`)", "", facts(data["machine"])]
+    lines += [
+        "The same loss, members and ranges; the budget of rollouts is the gradients' own. Loss: median over seeds, and best",
+        "to worst. Reached: rollouts until the gradients' median loss, median over seeds; a dash: not in the budget.",
+        "",
+    ]
+    rows = []
+    for task, found in data["tasks"].items():
+        goal = sorted(found["final"]["gradients"])[len(found["final"]["gradients"]) // 2]
+        for method, values in found["final"].items():
+            values = sorted(values)
+            low, middle, high = (math.exp(values[k]) for k in (0, len(values) // 2, -1))
+            first = sorted(
+                next((n for n, _, best in trace if best <= goal), math.inf) for trace in found["traces"][method]
+            )[len(values) // 2]
+            seconds = sorted(trace[-1][1] for trace in found["traces"][method])[len(values) // 2]
+            spent = f"{found['traces'][method][0][-1][0]:,}"
+            reached = f"{first:,}" if math.isfinite(first) else "-"
+            rows.append([task, method, f"{middle:.3e} ({low:.3e} to {high:.3e})", spent, f"{seconds:.0f}", reached])
+    return lines + table("task | method | loss | rollouts | time (s) | reached", rows)
+
+
 def gpu() -> list[str]:
     data = load("gpu")
     lines = ["## On an accelerator (`gpu.py`)", "", f"{data['device']}; {facts(data['machine'])}", ""]
@@ -153,6 +230,10 @@ SECTIONS = {
     "throughput": throughput,
     "peers": peers,
     "scaling": scaling,
+    "held_noise": held_noise,
+    "gradients": gradients,
+    "tasks": tasks,
+    "tuning": tuning,
     "gpu": gpu,
 }
 

@@ -8,9 +8,7 @@ largest deviation from the median. Run: python benchmarks/scaling.py [--full]
 import argparse
 import json
 import os
-import resource
 import statistics
-import sys
 from typing import Any
 
 os.environ.setdefault("JAX_ENABLE_X64", "1")
@@ -28,8 +26,7 @@ def point(members: int, samples: int) -> dict[str, Any]:
     """Seconds of one run after a first one, and this process's peak memory."""
     work = workload.workload(members, samples, noise=True)
     found = _measure.alternating({"run": lambda: workload.ours(work)}, repeats=3)["run"]
-    unit = 1 if sys.platform == "darwin" else 1024
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    peak = _measure.peak_memory()
     each = 1e9 * found["seconds"] / members / work.steps
     return {"members": members, "samples": samples, "seconds": found["seconds"], "ns": each, "peak_bytes": peak}
 

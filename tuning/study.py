@@ -22,7 +22,7 @@ CHUNK = 1024
 # Members and tolerance of the accurate reference against which the steps of the search are held.
 REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 2000
 # Beyond this relative error of the settled rms error the steps are refined and the search goes on.
-RESOLVED = 0.05
+RESOLVED = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
