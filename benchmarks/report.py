@@ -194,8 +194,8 @@ def tuning() -> list[str]:
     data = load("tuning")
     lines = ["## The search against derivative-free ones (`tuning.py`)", "", facts(data["machine"])]
     lines += [
-        "The same loss, members and ranges; the budget of rollouts is the gradients' own. Loss: median over seeds and best",
-        "to worst. Reached: rollouts until the gradients' median loss, median over seeds; a dash: not in the budget.",
+        "The same loss, members and ranges; the budget of rollouts is the gradients' own. Loss: median over seeds and",
+        "range. Reached: rollouts until the gradients' median loss, median over seeds; a dash: not in the budget.",
         "",
     ]
     rows = []
