@@ -18,7 +18,7 @@ import numpy as np
 import workload
 
 from ambjax import RK4, DormandPrince, Sensor
-from ambjax.ensemble.engine import run_ensemble
+from ambjax.ensemble import run_ensemble
 from ambjax.metrics import Peak
 
 TARGET = 1e-6

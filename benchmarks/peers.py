@@ -30,7 +30,7 @@ import workload
 from scipy.integrate import solve_ivp
 from workload import PERIOD, Workload
 
-from ambjax.ensemble.engine import run_ensemble
+from ambjax.ensemble import run_ensemble
 
 MEMBERS, SAMPLES, INSTANTS, CHECKED = 1024, 500, 10, 8
 TOLERANCE = 1e-6

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ambjax import RK4, Cascade, Clock, Initial, Plant, Pulse, Scenario, Sensor, inversion, paper, rollout
-from ambjax.ensemble.engine import run_ensemble
+from ambjax.ensemble import run_ensemble
 from ambjax.metrics import Peak
 
 GAMMA, P_V = 1e9, 25e-6

@@ -13,8 +13,7 @@ import pytest
 from scipy import linalg, stats
 
 from ambjax import RK4, Adaptive, Cascade, Clock, Initial, Scenario, Sensor, Sine, Standard, _kernel, inversion, rollout
-from ambjax.ensemble import Normal, Percent, Spread
-from ambjax.ensemble.engine import run_ensemble, size
+from ambjax.ensemble import Normal, Percent, Spread, run_ensemble, size
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
 from ambjax.loop import ClosedLoop, LoopState

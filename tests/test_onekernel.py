@@ -21,7 +21,7 @@ from ambjax import (
     observer,
     position,
 )
-from ambjax.ensemble.engine import run_ensemble
+from ambjax.ensemble import run_ensemble
 from ambjax.ensemble.onekernel import run_whole
 from ambjax.metrics import Named, Peak, Variation
 from ambjax.signals import BandNoise

@@ -23,7 +23,7 @@ from ambjax import (
     position,
     rollout,
 )
-from ambjax.ensemble.engine import run_ensemble
+from ambjax.ensemble import run_ensemble
 from ambjax.metrics import Rms
 from ambjax.sliding import _implicit, relax
 from ambjax.smooth import smooth_sign

@@ -14,6 +14,8 @@ from tuning.loss import TERMS
 from tuning.space import Space
 
 Facts = dict[str, Any]
+# Where the picture of the risk ends: a lost member costs a million times an error.
+HIGHEST = 30.0
 # Metrics shown before and after; all others are in report.json.
 SHOWN = (
     "settled_rms_error_m",
@@ -165,7 +167,7 @@ def landscape(found: Slices, paths: list[str]) -> bytes:
     axes = np.atleast_1d(figure.subplots(1, m, sharey=True))
     middle = found.goals.shape[1] // 2
     for ax, gains, goals, lost, path in zip(axes, found.gains, found.goals, found.lost, paths, strict=True):
-        risk = np.exp(goals - goals[middle])
+        risk = np.minimum(np.exp(goals - goals[middle]), HIGHEST)
         ax.loglog(gains, risk, "C0-", lw=1.2)
         held = lost == 0
         ax.plot(gains[held], risk[held], "C0o", ms=3.5, label="all members held")
@@ -175,7 +177,7 @@ def landscape(found: Slices, paths: list[str]) -> bytes:
         ax.set_xlabel(path.removeprefix("controller."))
         ax.xaxis.set_minor_formatter(NullFormatter())
         ax.grid(alpha=0.3)
-    axes[0].set_ylabel("risk / risk at the optimum")
+    axes[0].set_ylabel(f"risk / risk at the optimum (cut at {HIGHEST:g})")
     handles = {label: h for ax in axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     axes[0].legend(handles.values(), handles.keys(), fontsize=8)
     return _png(figure)

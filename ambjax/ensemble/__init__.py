@@ -1,6 +1,7 @@
 """Ensembles: many members of one case, drawn, simulated and reduced to numbers."""
 
 from ambjax.ensemble.distributions import Choice, LogUniform, Normal, Percent, Uniform
+from ambjax.ensemble.engine import run_ensemble
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.ensemble.statistics import cvar, quantile, spearman, summary, wilson
 
@@ -15,6 +16,7 @@ __all__ = [
     "cvar",
     "draw",
     "quantile",
+    "run_ensemble",
     "spearman",
     "summary",
     "wilson",
