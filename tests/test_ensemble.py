@@ -13,7 +13,8 @@ import pytest
 from scipy import linalg, stats
 
 from ambjax import RK4, Adaptive, Cascade, Clock, Initial, Scenario, Sensor, Sine, Standard, _kernel, inversion, rollout
-from ambjax.ensemble import Normal, Percent, Spread, run_ensemble, size
+from ambjax.ensemble import Normal, Percent, Spread, run_ensemble
+from ambjax.ensemble.engine import size
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
 from ambjax.loop import ClosedLoop, LoopState

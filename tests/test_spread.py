@@ -411,10 +411,11 @@ def test_spreads_print_as_they_are_written():
 @pytest.mark.parametrize("name", ["tracking", "regulation"])
 def test_the_template_s_spread_is_a_spread(name):
     head, found, tail = template(name).partition("# [spread]")
-    lines = (found + tail).splitlines()
+    lines = [line for line in (found + tail).splitlines() if line]
     assert all(line.startswith("# ") for line in lines)
     case = case_from(tomllib.loads(head + "\n".join(line.removeprefix("# ") for line in lines)))
-    assert len(case.spread.entries) == len(lines) - 2
+    spread = tail.partition("# [tune]")[0]
+    assert len(case.spread.entries) == len(spread.strip().splitlines()) - 2  # the heading's comment and the design
     assert case_from(tomllib.loads(template(name))).spread == Spread()
 
 

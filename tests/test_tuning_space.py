@@ -10,8 +10,10 @@ import pytest
 
 from ambjax import Cascade, Clock, Initial, Pulse, Scenario, Sine, Slide, inversion, position, rollout
 from ambjax.metrics import Rms
+from ambjax.template import template
 from ambjax.theorem import delta_1_on_reference
 from tuning.conditions import bounds, shortfall
+from tuning.config import read_study
 from tuning.loss import TERMS, Loss, loss_for
 from tuning.risk import CVaR, Mean, SoftWorst
 from tuning.space import Gain, Space, tunable
@@ -65,6 +67,17 @@ def test_tunable_gains_are_the_positive_ones():
     found = tunable(Cascade())
     assert {"controller.position.c", "controller.inversion.gamma", "controller.current.k_i"} <= set(found)
     assert "controller.inversion.i_ref" not in found
+
+
+@pytest.mark.parametrize("name", ["tracking", "regulation"])
+def test_what_the_template_says_of_tuning_can_be_uncommented(name, tmp_path):
+    head, heading, tail = template(name).partition("# [tune]")
+    path = tmp_path / "mine.toml"
+    path.write_text(head + "\n".join(line.removeprefix("# ") for line in (heading + tail).splitlines()))
+    tune = read_study(path)[1]
+    assert tune.space.paths == [C, K]
+    assert (tune.space.gains[0].low, tune.space.gains[0].high) == (1.0, 500.0)
+    assert isinstance(tune.risk, CVaR)
 
 
 # --- risk ---
