@@ -28,7 +28,7 @@ from ambjax.rollout import Outcome, begin_jit, finish, segment_jit
 from ambjax.studies import run_ensemble, study_of
 from ambjax.template import template
 from ambjax.theorem import Condition, check
-from ambjax.worker import prepare, processes
+from ambjax.worker import processes
 
 __all__ = ["run_check", "run_ensemble", "run_map", "run_reproduce", "run_simulate", "run_template"]
 
@@ -164,12 +164,6 @@ def _paper_figures(reading: str, seen: Evidence, out: pathlib.Path) -> None:
         plotting.paper_figure(number, getattr(seen, name).trajectory, title, folder / f"figure_{number}.png")
 
 
-def _gather_there(reading: str) -> Evidence:
-    """`gather` in a process of its own."""
-    prepare()
-    return gather(reading)
-
-
 def run_reproduce(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax reproduce."""
     out = directory(args.out, "reproduce")
@@ -186,7 +180,7 @@ def run_reproduce(args: argparse.Namespace) -> tuple[int, Summary]:
         # Tracing holds the interpreter, so the reading of another structure has one of its own; a thread draws.
         evidence, drawn = {}, []
         with ThreadPoolExecutor(1) as artist, processes(1) as other:
-            tuned = other.submit(_gather_there, "tuned")
+            tuned = other.submit(gather, "tuned")
             for reading in paper.READINGS:
                 evidence[reading] = tuned.result() if reading == "tuned" else gather(reading, stage)
                 drawn.append(artist.submit(_paper_figures, reading, evidence[reading], out))

@@ -177,10 +177,12 @@ def rodas3_step(problem: Problem, at: Times, h: Scalar, state: Any) -> tuple[Any
     Sandu et al., Atmospheric Environment 31 (1997) 3459-3472. One Jacobian, one factorisation of
     I - h J / 2 and three evaluations a step. Stages are scaled by h, so h = 0 is the identity.
     """
-    t_0, inputs = at(0.0), problem.inputs
+    t_0 = at(0.0)
     rates = jax.jit(problem.rates)  # traced once here, not once per column of the Jacobian
-    factors = _linear.factor(_linear.jacobian(lambda x: rates(inputs(t_0), x), state), h / 2)
-    f_0, f_t = jax.jvp(lambda s: rates(inputs(s), state), (t_0,), (jnp.ones_like(t_0),))
+    given, given_t = jax.jvp(problem.inputs, (t_0,), (jnp.ones_like(t_0),))
+    factors = _linear.factor(_linear.jacobian(lambda x: rates(given, x), state), h / 2)
+    f_0, f_t = jax.jvp(lambda s: rates(s, state), (given,), (given_t,))
+    given = problem.inputs(at(1.0))
 
     def stage(f: Any, *couplings: tuple[Scalar, Any]) -> Any:
         scaled = jax.tree.map(lambda q: h / 2 * q, f)
@@ -189,9 +191,9 @@ def rodas3_step(problem: Problem, at: Times, h: Scalar, state: Any) -> tuple[Any
     u_1 = stage(axpy(f_0, (h / 2, f_t)))
     u_2 = stage(axpy(f_0, (1.5 * h, f_t)), (4.0, u_1))
     y_3 = axpy(state, (2.0, u_1))
-    u_3 = stage(rates(inputs(at(1.0)), y_3), (1.0, u_1), (-1.0, u_2))
+    u_3 = stage(rates(given, y_3), (1.0, u_1), (-1.0, u_2))
     y_4 = axpy(y_3, (1.0, u_3))
-    u_4 = stage(rates(inputs(at(1.0)), y_4), (1.0, u_1), (-1.0, u_2), (-8.0 / 3.0, u_3))
+    u_4 = stage(rates(given, y_4), (1.0, u_1), (-1.0, u_2), (-8.0 / 3.0, u_3))
     return axpy(y_4, (1.0, u_4)), u_4
 
 

@@ -20,10 +20,11 @@ from ambjax.control.cascade import Cascade
 from ambjax.loop import ClosedLoop
 from ambjax.method import with_method
 from ambjax.metrics import Lowest, Named, Peak
+from ambjax.plant import Plant
 from ambjax.proof import Monitored
 from ambjax.rollout import check_inputs, roll
 from ambjax.scenario import Clock, Scenario
-from ambjax.signals import reference_at
+from ambjax.signals import Signal, reference_at
 from ambjax.trajectory import FATES
 
 
@@ -93,8 +94,14 @@ def delta_1_on_reference(cascade: Cascade, scenario: Scenario, clock: Clock) -> 
 
     What gamma must exceed merely to follow the reference on the nominal plant, A^2/m^2/s and s.
     """
-    model, reference = cascade.model, scenario.realised().reference
+    times = jnp.arange(min(clock.samples, 20_000)) * (clock.duration / min(clock.samples, 20_000))
+    values = np.asarray(_drift(*canonical((cascade.model, scenario.realised().reference)), times))
+    worst = int(np.argmax(values))
+    return float(values[worst]), float(times[worst])
 
+
+@jax.jit
+def _drift(model: Plant, reference: Signal, times: Array) -> Array:
     def demanded(t: Array) -> Array:
         r, _, r_ddot, _ = reference_at(reference, t)
         return (-2 * model.k_z / model.m * r + r_ddot + model.g) / model.a
@@ -104,10 +111,7 @@ def delta_1_on_reference(cascade: Cascade, scenario: Scenario, clock: Clock) -> 
         v_star, v_star_dot = jax.jvp(demanded, (t,), (jnp.ones_like(t),))
         return jnp.abs(v_star_dot - model.dv_dz(r, model.current_for(r, v_star)) * r_dot)
 
-    times = jnp.arange(min(clock.samples, 20_000)) * (clock.duration / min(clock.samples, 20_000))
-    values = np.asarray(jax.jit(jax.vmap(drift))(times))
-    worst = int(np.argmax(values))
-    return float(values[worst]), float(times[worst])
+    return jax.vmap(drift)(times)
 
 
 def _conditions(

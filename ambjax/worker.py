@@ -50,9 +50,9 @@ def work(study: Study, start: int, stop: int, size: int) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def processes(count: int) -> Iterator[Executor]:
-    """Worker processes that end at once with the block if it fails, and with this process however it ends."""
+    """Prepared worker processes that end at once with the block if it fails, and with this process however it ends."""
     others = set(multiprocessing.active_children())
-    with ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_end_with_parent) as pool:
+    with ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_begin) as pool:
         try:
             yield pool
         except BaseException:
@@ -74,7 +74,9 @@ def deaf_children() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _end_with_parent() -> None:
+def _begin() -> None:
+    prepare()
+
     def wait() -> None:
         parent = multiprocessing.parent_process()
         if parent is not None:
