@@ -113,7 +113,7 @@ def readings(trajectories: dict[str, Trajectory], title: str, settle: float, pat
         if not np.isfinite(trajectory.lost_at):
             late = np.abs(_signal(trajectory.rows, "e_z")[np.asarray(trajectory.rows.t) >= settle]).max()
             words = f"at most {1e6 * late:.2g} µm after {settle:g} s"
-            lower.annotate(words, (0.98, 0.9), xycoords="axes fraction", ha="right", va="top", fontsize=9, color=INK)
+            lower.annotate(words, (0.98, 0.06), xycoords="axes fraction", ha="right", fontsize=9, color=INK)
     figure.suptitle(title, fontsize=11)
     figure.savefig(path, dpi=130)
 
