@@ -35,6 +35,7 @@ Times = Callable[[float], Array]
 class Problem(NamedTuple):
     """What is integrated: rates(inputs(t), state), scale (a state) and fate(state) -> code.
 
+    `layer` (a state): the largest error with which a component stays where a smoothed sign turns; None: none does.
     `slide(inputs(t_0), inputs(t_1), h, state) -> state`, where there is one, is a step made for this very system.
     """
 
@@ -42,6 +43,7 @@ class Problem(NamedTuple):
     rates: Rates
     scale: Any
     fate: Fate
+    layer: Any = None
     slide: Callable[[Any, Any, Scalar, Any], Any] | None = None
 
 
@@ -232,6 +234,8 @@ class Slide(_Fixed):
 class Adaptive:
     """RODAS3 whose steps keep the estimated error of each step below `tolerance` (scale + |state|).
 
+    And within the layer of a smoothed sign, where there is one: an error beyond it lands on the sign's other side,
+    the next step back on this one, and the run chatters across in ever smaller steps until it stalls.
     The corner where a stiff smoothed sign leaves saturation lasts microseconds and comes rarely: steps shrink
     there and grow again. The step carries over from one sample to the next. A while loop: forward
     mode and vmap work, reverse mode does not (JAX cannot reverse a loop of unknown length).
@@ -263,7 +267,7 @@ class Adaptive:
             last = h * 1.0001 >= left
             taken = jnp.where(last, left, h)
             new, error = rodas3_step(problem, _inside(t + done, taken), taken, x)
-            size = self._size(error, x, new, problem.scale)
+            size = self._size(error, x, new, problem)
             accept = size <= 1
             suggested = taken * jnp.clip(0.9 * jnp.maximum(size, 1e-9) ** (-1 / 3), 0.2, 5.0)
             # A step cut short by the sample's end says little about the next one.
@@ -277,13 +281,14 @@ class Adaptive:
         stalled = (code == ALIVE) & (done < span)
         return Advanced(x, jnp.where(stalled, STALLED, code), t + done, h)
 
-    def _size(self, error: Any, x: Any, new: Any, scale: Any) -> Array:
+    def _size(self, error: Any, x: Any, new: Any, problem: Problem) -> Array:
         """Root mean square of the error against what is allowed; huge if anything is not finite."""
+        layer = jax.tree.map(lambda _: jnp.inf, problem.scale) if problem.layer is None else problem.layer
 
-        def ratio(e: Array, a: Array, b: Array, s: Array) -> Array:
-            return (e / (self.tolerance * (s + jnp.maximum(jnp.abs(a), jnp.abs(b))))) ** 2
+        def ratio(e: Array, a: Array, b: Array, s: Array, most: Array) -> Array:
+            return (e / jnp.minimum(self.tolerance * (s + jnp.maximum(jnp.abs(a), jnp.abs(b))), most)) ** 2
 
-        ratios = jax.tree.leaves(jax.tree.map(ratio, error, x, new, scale))
+        ratios = jax.tree.leaves(jax.tree.map(ratio, error, x, new, problem.scale, layer))
         size = lax.stop_gradient(jnp.sqrt(sum(ratios) / len(ratios)))
         return jnp.where(jnp.isfinite(size), size, 1e9)
 

@@ -9,6 +9,7 @@ from jax import Array
 
 from ambjax._pytree import Scalar, record
 from ambjax.control.cascade import Cascade, CascadeState, Command
+from ambjax.control.inversion import Adaptive
 from ambjax.control.laws import Measurement
 from ambjax.integrate import Problem
 from ambjax.scenario import Scenario
@@ -69,6 +70,13 @@ class ClosedLoop:
         scale = LoopState(Measurement(moved, 10 * moved, plant.i_0 / 25), self.cascade.scale())
         return jax.tree.map(jnp.asarray, scale)
 
+    def layer(self) -> LoopState:
+        """The largest error that keeps a component where its smoothed sign turns: for i_ref, that of its law, A."""
+        law, widths = self.cascade.inversion, jax.tree.map(lambda x: jnp.full_like(x, jnp.inf), self.scale())
+        if not isinstance(law, Adaptive):
+            return widths
+        return widths._replace(control=widths.control._replace(inversion=jnp.asarray(law.layer(self.cascade.model))))
+
     def inputs(self, t: Scalar) -> Inputs:
         """Everything that depends on time alone."""
         scenario = self.scenario
@@ -110,7 +118,8 @@ class ClosedLoop:
     def problem(self, hold: Measurement) -> Problem:
         """What an integrator is given for one sample."""
         step = functools.partial(slide, self, hold) if slides(self.cascade) else None
-        return Problem(self.inputs, lambda inputs, x: self.rates(inputs, x, hold), self.scale(), self.fate, step)
+        rates = lambda inputs, x: self.rates(inputs, x, hold)  # noqa: E731
+        return Problem(self.inputs, rates, self.scale(), self.fate, self.layer(), step)
 
     def row(self, t: Scalar, state: LoopState, hold: Measurement, alive: Array) -> Row:
         """All signals at one instant. The drive of a lost rotor is off: u = 0."""

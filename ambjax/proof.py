@@ -100,7 +100,8 @@ class Monitored:
             return Witnessed(terms.moving, terms.rates._replace(e=terms.rates.e + terms.i_ref_dot))
 
         fate = lambda state: self.loop.fate(state.loop)  # noqa: E731
-        return Problem(self.loop.inputs, rates, Witnessed(scale, sizes), fate)
+        layer = Witnessed(self.loop.layer(), Identities(*(jnp.asarray(jnp.inf) for _ in sizes)))
+        return Problem(self.loop.inputs, rates, Witnessed(scale, sizes), fate, layer)
 
     def rest(self, state: Witnessed, code: Array) -> Witnessed:
         return Witnessed(self.loop.rest(state.loop, code), state.witness)

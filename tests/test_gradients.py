@@ -118,7 +118,8 @@ def test_forward_through_the_adaptive_method_agrees_with_fixed_steps(case, metho
     fixed = np.asarray(derivatives(nominal, p, Clock(500, 1e-4, method))[1](*batch))
     adaptive = np.asarray(derivatives(nominal, p, Clock(500, 1e-4, Adaptive()))[1](*batch))
     size = np.max(np.abs(fixed), axis=-1, keepdims=True)
-    assert np.all(np.abs(adaptive - fixed) <= rtol * np.abs(fixed) + 1e-12 * size)
+    # an error per step of 1e-6 leaves 1e-8 of the largest; the derivative in k_i, a millionth of that, drowns in it
+    assert np.all(np.abs(adaptive - fixed) <= rtol * np.abs(fixed) + 1e-7 * size)
 
 
 # --- any gains at all ---

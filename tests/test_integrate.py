@@ -252,6 +252,18 @@ def test_a_chosen_explicit_step_is_within_its_limit(gamma):
     assert method.limit is None or method.step_size(1e-4) * steepest < method.limit
 
 
+@pytest.mark.parametrize("p", [1e3, 1e6, 1e9])
+def test_a_sign_as_steep_as_a_relay_does_not_stall_the_adaptive_method(p):
+    """The limit p -> infinity exists (the sliding mode), and the layer narrows as 1/p: from 1e-8 A to 1e-14 A."""
+    noisy = dataclasses.replace(TRACKING, sensor=amb.Sensor(1e-6))
+    cascade = amb.Cascade(inversion=amb.inversion.Adaptive(p=p))
+    found = [amb.rollout(cascade, noisy, amb.Clock(300, 1e-4, step)) for step in (amb.Adaptive(), amb.Slide(64))]
+    assert not np.isfinite(found[0].trajectory.lost_at)
+    z, expected = (np.asarray(f.trajectory.rows.z) for f in found)
+    # of a motion of 1e-3 m; both methods have errors of this size here
+    np.testing.assert_allclose(z, expected, rtol=0, atol=2e-8)
+
+
 def test_traced_gains_cannot_choose_a_method():
     def peak(gamma, clock):
         cascade = amb.Cascade(inversion=amb.inversion.Adaptive(gamma=gamma, p=25e-6))

@@ -16,7 +16,7 @@ from tuning import explore, gradient, report
 from tuning.config import read_study, seeds, settings
 from tuning.objective import Members
 from tuning.rounds import CHECKPOINT, Answer, rounds
-from tuning.study import Study, judge, study_of, summarise
+from tuning.study import RESOLVED, Study, judge, study_of, summarise
 from tuning.toml import dumps, with_gains
 
 
@@ -92,11 +92,15 @@ def _verdict(facts: dict[str, Any]) -> str:
     before, after = facts["before"], facts["after"]
     if not after["members"]:
         return f"{facts['lost_in_training']} members of the training ensemble are lost under the tuned gains."
-    return (
+    told = (
         f"Of {after['members']} held-out members, {after['lost']} are lost under the tuned gains (before: "
         f"{before['lost']}); settled rms error {after['settled_rms_error_m']:.3g} m (before: "
         f"{before['settled_rms_error_m']:.3g} m), largest {after['settled_max_abs_error_m']:.3g} m."
     )
+    off = facts["step_error"]["relative"]
+    if abs(off) > RESOLVED:
+        told += f" The search's own steps are off by {100 * off:.2g} % there: do not trust this; raise tune.substeps."
+    return told
 
 
 def _advice(study: Study, facts: dict[str, Any], x: np.ndarray, who: Members) -> str:

@@ -40,6 +40,10 @@ class Adaptive:
     def slope(self, model: Plant) -> Scalar:
         return TWO_OVER_PI * self.gamma * self.p
 
+    def layer(self, model: Plant) -> Scalar:
+        """A third of the smoothed sign's width in i_ref, A: of what v_tilde = 1/p is worth at z = 0 and i = 0."""
+        return 0.3 / (self.p * model.dv_di(0.0, 0.0))
+
     def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:
         v, gradient = v_and_gradient(model, inputs, state)
         rate = self.gamma * smooth_sign(inputs.v_star - v, self.p, per=gradient)
