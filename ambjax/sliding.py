@@ -23,6 +23,9 @@ from ambjax.smooth import TWO_OVER_PI, smooth_sign
 
 # Newton steps on the slaved sign: monotone from below; they leave less than 1e-3 of the right-hand side.
 NEWTON = 6
+# |w| p below which w is slaved at once. Within the layer it relaxes in 1/(gamma p), not at its initial rate: a slide
+# there would end anywhere in the step for a change of w by a millionth, and derivatives would be such cliffs'.
+EDGE = 1.0
 
 
 def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: Any) -> Any:
@@ -89,12 +92,13 @@ def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: 
 def relax(w: Array, drift: Array, gain: Scalar, p: Scalar, h: Scalar) -> tuple[Array, Array, Array]:
     """w' = drift - gain sgn(w) over h, as two constant rates of `gain sgn(w)`: (first, second, time of the first).
 
-    First it slides at its initial rate until w = 0 (or to the end); then it is slaved, one backward Euler step.
+    First it slides at its initial rate to the sign's layer (or to the end); then it is slaved, one backward Euler step.
     """
     first = gain * smooth_sign(w, p)
     closing = first - drift
+    outside = jnp.sign(w) * jnp.maximum(jnp.abs(w) - EDGE / p, 0.0)
     safe = jnp.where(closing == 0, 1.0, closing)
-    tau = jnp.where(w * closing > 0, jnp.minimum(w / safe, h), 0.0)
+    tau = jnp.where(outside * closing > 0, jnp.minimum(outside / safe, h), 0.0)
     left = h - tau
     return first, gain * smooth_sign(_implicit(w - tau * closing + left * drift, left * gain, p), p), tau
 

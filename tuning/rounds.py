@@ -1,5 +1,6 @@
-"""Rounds of a study: a search; again in finer steps where its own do not resolve the optimum; again with the members
-of a validation ensemble that its gains lose, until none is."""
+"""Rounds of a study: a search; a second one around its answer, for the first may end at a cliff behind which it goes
+on; again in finer steps where its own do not resolve the optimum; again with the members of a validation ensemble
+that its gains lose, until none is."""
 
 import dataclasses
 import itertools
@@ -21,7 +22,7 @@ from tuning.study import RESOLVED, Study, step_error, study_of
 
 CHECKPOINT = "checkpoint"
 # Rounds in all, times that steps are halved, and lost members that join in one round.
-MOST_ROUNDS, MOST_HALVINGS, MOST_JOINING = 8, 2, 16
+MOST_ROUNDS, MOST_HALVINGS, MOST_JOINING = 9, 2, 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +41,7 @@ class Answer:
 def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume: bool) -> Answer:
     """Tune from the gains `start` [m]. Raises ValueError where nothing can be evaluated."""
     tune, halvings, found = study.tune, 0, []
+    looked: tuple[np.ndarray, float] | None = None  # answer and goal of the first search
     points = everywhere(study.objective, study.goal.conditions, start, tune.budget.screen, tune.budget.seed)
     points = points if tune.budget.screen else points[:1]
     training = seeds(tune.budget)[0]
@@ -52,12 +54,19 @@ def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume
             name=tune.optimiser, rate=tune.learning_rate, keeper=Keeper(path, [told, round]),
             resume=resume and path.exists(), tell=_teller(study, len(who.member)),
         )  # fmt: skip
-        if kept.interrupted and not kept.history and not past:
-            raise KeyboardInterrupt
+        if kept.interrupted and not kept.history:  # before anything new was found
+            if not past:
+                raise KeyboardInterrupt
+            kept = dataclasses.replace(past.pop(), interrupted=True)
         past.append(kept)
-        x = _best(kept)
+        x, value = _best(kept)
         if int(kept.history["lost"][-1][int(np.argmin(kept.history["value"][-1]))]) == len(who.member):
             return Answer(study, who, x, None, _joined(past), tune.budget.validation)  # nothing to go on with
+        if looked is None and tune.budget.screen and not kept.interrupted:
+            looked, points = (x, value), around(x, tune.budget.screen, tune.budget.seed + round)
+            continue
+        if looked is not None and round == 2 and looked[1] < value:  # the same members, the same steps
+            x = looked[0]
         error = step_error(study, x)
         say(f"step of the search against adaptive RODAS3: settled rms error off by {100 * error['relative']:.2g} %")
         points = x[None]
@@ -70,20 +79,20 @@ def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume
         found.append(Answer(study, who, x, error, _joined(past), len(lost)))
         if not len(lost) or round >= MOST_ROUNDS:
             return min(found, key=lambda answer: answer.lost)
-        who = who.joined(_members(study, lost[:MOST_JOINING]))
+        who = who.joined(_joining(study, lost))
         points = around(x, tune.budget.screen, tune.budget.seed + round)
         say(f"{len(lost)} of {tune.budget.validation} members of another seed are lost: the search goes on with them")
     raise AssertionError("unreachable: the rounds are counted")
 
 
-def _best(kept: Search) -> np.ndarray:
+def _best(kept: Search) -> tuple[np.ndarray, float]:
     x, value = best_of(kept)
     if not np.isfinite(value):
         raise ValueError(
             "tune: the loss is not a finite number at any start that was tried. Look at the case with "
             "'ambjax simulate', or change tune.screen and tune.bounds."
         )
-    return x
+    return x, value
 
 
 def _finer(study: Study, finer: int) -> Study:
@@ -97,6 +106,12 @@ def _members(study: Study, numbers: np.ndarray) -> Members:
     """These members of the validation ensemble."""
     budget = study.tune.budget
     return study.objective.chosen(seeds(budget)[1], numbers, budget.validation)
+
+
+def _joining(study: Study, lost: np.ndarray) -> Members:
+    """The first of the lost members, under half the extra noise of the stressed ones: held, and with some margin."""
+    those = _members(study, lost[:MOST_JOINING])
+    return those._replace(loud=those.loud * (1 + study.tune.stress) / 2)
 
 
 def _lost(study: Study, x: np.ndarray) -> np.ndarray:
