@@ -16,7 +16,7 @@ from tuning import explore, gradient, report
 from tuning.config import read_study, seeds, settings
 from tuning.objective import Members
 from tuning.rounds import CHECKPOINT, Answer, rounds
-from tuning.study import RESOLVED, Study, judge, study_of, summarise
+from tuning.study import Study, judge, study_of, summarise
 from tuning.toml import dumps, with_gains
 
 
@@ -73,7 +73,7 @@ def _facts(answer: Answer, seconds: float, held_out: int) -> dict[str, Any]:
         "held_out_seed": held_out,
         "lost_in_training": lost,
         "conditions": report.conditions(line),
-        "step_error": answer.error,
+        "step_error": answer.error._asdict() | {"resolved": answer.error.resolved} if answer.error else None,
         "lost_in_validation": answer.lost,
         "search": settings(tune)
         | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": seconds},
@@ -97,9 +97,15 @@ def _verdict(facts: dict[str, Any]) -> str:
         f"{before['lost']}); settled rms error {after['settled_rms_error_m']:.3g} m (before: "
         f"{before['settled_rms_error_m']:.3g} m), largest {after['settled_max_abs_error_m']:.3g} m."
     )
-    off = facts["step_error"]["relative"]
-    if abs(off) > RESOLVED:
-        told += f" The search's own steps are off by {100 * off:.2g} % there: do not trust this; raise tune.substeps."
+    error = facts["step_error"]
+    if error and not error["resolved"]:
+        off = 100 * error["relative"]
+        told += f" The search's own steps are off by {off:.2g} % there: do not trust this; raise tune.substeps."
+    if error and error["lost"]:
+        told += (
+            f" Accurate steps lose {len(error['lost'])} of the training members tried, which the search's own hold: "
+            "raise tune.substeps or tune.stress."
+        )
     return told
 
 

@@ -11,7 +11,7 @@ from ambjax.casefile import Case, case_from, load
 from ambjax.ensemble.spread import require_path
 from ambjax.tomltable import Table, show
 from tuning.loss import TERMS
-from tuning.optimisers import names
+from tuning.optimisers import BFGS, names
 from tuning.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.space import Gain, Space, tunable
 
@@ -39,7 +39,7 @@ class Budget:
     starts: int = 4
     """best of them that are refined"""
     iterations: int = 40
-    """of the refinement, at most"""
+    """of either phase of the refinement, at most"""
     substeps: int = 3
     """steps per sample"""
 
@@ -79,7 +79,7 @@ def tune_from(table: Table, case: Case) -> Tune:
     table.only([*WORDS, *numbers, *counts])
     budget = Budget(**{name: _whole(table, name, getattr(Budget, name)) for name in counts})
     weights, conditions = _weights(table.table("weights"))
-    optimiser = table.choice("optimiser", names(), "bfgs")
+    optimiser = table.choice("optimiser", names(), BFGS)
     return Tune(
         space=_space(table, case),
         weights=weights,
@@ -172,7 +172,7 @@ def _positive(table: Table, key: str, default: float, zero: bool = False) -> flo
 def _whole(table: Table, key: str, default: int) -> int:
     value, least = (
         table.raw.get(key, default),
-        0 if key in ("screen", "seed", "held_out", "iterations", "stressed", "validation") else 1,
+        0 if key in ("screen", "seed", "held_out", "stressed", "validation") else 1,
     )
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value < 2**31:
         raise ValueError(f"{table.at(key)} = {show(value)}: it must be a whole number of at least {least}.")

@@ -6,9 +6,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from tuning.descent import Descent
 from tuning.loss import TERMS
 from tuning.objective import Members
-from tuning.optimise import Search, iterate, stepper
+from tuning.optimise import SHORTEST, Search, iterate
+from tuning.optimisers import BFGS
 from tuning.study import Study, rms
 
 # Coordinates of the slices: factors of about e^-1.5 to e^1.5 of a gain.
@@ -51,11 +53,12 @@ def pareto(study: Study, x: np.ndarray, who: Members, *, points: int = 6, iterat
     space = study.objective.space
     weights = np.tile(study.goal.weights, (points, 1))
     weights[1:, TERMS.index("effort")] = np.geomspace(1.0, 1000.0, points - 1)
-    begin, step = stepper(study.engine, study.goal, "bfgs", 0.0)
-    family = Search(begin(jnp.tile(jnp.asarray(x), (points, 1))), np.ones(points, bool), 0, {})
+    descent = Descent(space, study.goal, BFGS, 0.0)
+    family = Search(descent.begin(jnp.tile(jnp.asarray(x), (points, 1))), np.ones(points, bool))
     for _ in range(iterations):
         if family.active.any():
-            iterate(study.engine, study.goal, who, family, step, weights)
+            iterate(study.engine, study.goal, who, family, descent, weights)
+            family.active &= np.asarray(family.starts.length) > SHORTEST
     best = np.asarray(family.starts.best)
     found = study.engine.metrics(best, who)["metrics"]
     rows = [

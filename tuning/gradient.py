@@ -50,7 +50,7 @@ def against_horizon(study: Study, x: np.ndarray, who: Members) -> list[dict[str,
         samples = round(share * study.objective.clock.samples)
         objective = _shorter(study, samples)
         engine = study.engine if share == 1.0 else Engine(objective, settle=float(objective.loss.settle))
-        few = who.first(min(8, who.ordinary))
+        few = who.part(4)
         losses, slopes, terms = engine.gradient(x[None], few, study.goal.weights)
         rows.append(
             {

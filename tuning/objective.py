@@ -28,6 +28,8 @@ from tuning.space import Space
 # Lanes of one kernel call. Values: one register of 8 after the other in L1; gradients carry m + 1 numbers per lane.
 LANES = 64
 GRADIENT_LANES = 32
+# Members of a kind that say something about all of it.
+FEWEST = 4
 # Terms that say whether the rotor is held.
 HELD = ("clearance", "survival")
 # Terms that are a price, not an aim.
@@ -54,13 +56,15 @@ class Members(NamedTuple):
         return int(np.sum(~self.stressed))
 
     def joined(self, others: "Members") -> "Members":
-        """These and others, who are asked only to be held."""
-        more = others._replace(stressed=np.ones(len(others.stressed), bool))
-        return jax.tree.map(lambda a, b: np.concatenate([a, b]), self, more)
+        """These and others, who are asked only to be held and come first among such."""
+        more, n = others._replace(stressed=np.ones(len(others.stressed), bool)), self.ordinary
+        return jax.tree.map(lambda a, b: np.concatenate([a[:n], b, a[n:]]), self, more)
 
-    def first(self, count: int) -> "Members":
-        """The first `count` ordinary ones, and all that are stressed."""
-        index = np.concatenate([np.arange(count), np.arange(self.ordinary, len(self.stressed))])
+    def part(self, share: int) -> "Members":
+        """The first of either kind, one in `share`, but FEWEST at least: ordinary ones, then those asked to be held."""
+        kinds = self.ordinary, len(self.stressed) - self.ordinary
+        few, some = (max(count // share, min(FEWEST, count)) for count in kinds)
+        index = np.concatenate([np.arange(few), np.arange(self.ordinary, self.ordinary + some)])
         return jax.tree.map(lambda a: a[index], self)
 
 

@@ -140,18 +140,21 @@ def convergence(history: dict[str, Any], paths: list[str]) -> bytes:
     """PNG: the goal and the gains of the best start against iterations."""
     from matplotlib.figure import Figure
 
-    value, gains = np.asarray(history["value"]), np.asarray(history["gains"])
-    best = int(np.argmin(value[-1]))
+    value, gains, members = (np.asarray(history[name]) for name in ("value", "gains", "members"))
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    steps = np.arange(1, len(value) + 1)
+    steps, best = np.arange(1, len(value) + 1), np.argmin(value, axis=1)
     for s in range(value.shape[1]):
-        left.plot(steps, value[:, s], "C0" if s == best else "0.75", lw=1.8 if s == best else 1, zorder=2 + (s == best))
-    left.set(xlabel="iteration", ylabel="log of the risk", title="best so far; blue: the start that won")
+        left.plot(steps, value[:, s], "0.75", lw=1)
+    left.plot(steps, value.min(axis=1), "C0", lw=1.8)
+    left.set(xlabel="iteration", ylabel="log of the risk", title="blue: the best start; dotted: other members asked")
     for j, path in enumerate(paths):
-        right.plot(steps, gains[:, best, j] / gains[-1, best, j], label=path.removeprefix("controller."))
-    right.set(xlabel="iteration", ylabel="gain / its final value", yscale="log", title="gains of that start")
+        right.plot(steps, gains[steps - 1, best, j] / gains[-1, best[-1], j], label=path.removeprefix("controller."))
+    right.set(xlabel="iteration", ylabel="gain / its final value", yscale="log", title="gains of the best start")
     right.legend(fontsize=8)
+    for at in np.flatnonzero(np.diff(members)):
+        for ax in (left, right):
+            ax.axvline(at + 1.5, color="0.5", ls=":", lw=1)
     for ax in (left, right):
         ax.grid(alpha=0.3)
     return _png(figure)

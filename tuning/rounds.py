@@ -9,6 +9,7 @@ import pathlib
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -18,7 +19,7 @@ from tuning.loss import TERMS
 from tuning.objective import Members
 from tuning.optimise import Keeper, Search, best_of, search
 from tuning.screen import around, everywhere
-from tuning.study import RESOLVED, Study, step_error, study_of
+from tuning.study import REFERENCE_MEMBERS, StepError, Study, step_error, study_of
 
 CHECKPOINT = "checkpoint"
 # Rounds in all, times that steps are halved, and lost members that join in one round.
@@ -32,27 +33,26 @@ class Answer:
     study: Study
     who: Members
     x: np.ndarray
-    error: dict[str, float] | None
+    error: StepError | None
     history: dict[str, np.ndarray]
     lost: int
-    """members of the validation ensemble"""
+    """members of the validation ensemble, and those that only an accurate step loses"""
 
 
 def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume: bool) -> Answer:
     """Tune from the gains `start` [m]. Raises ValueError where nothing can be evaluated."""
     tune, halvings, found = study.tune, 0, []
-    looked: tuple[np.ndarray, float] | None = None  # answer and goal of the first search
+    first: tuple[np.ndarray, float] | None = None  # answer and goal of the first search
     points = everywhere(study.objective, study.goal.conditions, start, tune.budget.screen, tune.budget.seed)
     points = points if tune.budget.screen else points[:1]
-    training = seeds(tune.budget)[0]
-    who = study.objective.training(training, tune.budget.members, tune.budget.stressed, tune.stress, tune.gain_margin)
+    who = training(study)
     past: list[Search] = []
     for round in itertools.count(1):
         path = out / f"{CHECKPOINT}-{round}.npz"
         kept = search(
             study.engine, study.goal, who, points, keep=tune.budget.starts, iterations=tune.budget.iterations,
             name=tune.optimiser, rate=tune.learning_rate, keeper=Keeper(path, [told, round]),
-            resume=resume and path.exists(), tell=_teller(study, len(who.member)),
+            resume=resume and path.exists(), tell=_teller(study),
         )  # fmt: skip
         if kept.interrupted and not kept.history:  # before anything new was found
             if not past:
@@ -60,29 +60,39 @@ def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume
             kept = dataclasses.replace(past.pop(), interrupted=True)
         past.append(kept)
         x, value = _best(kept)
-        if int(kept.history["lost"][-1][int(np.argmin(kept.history["value"][-1]))]) == len(who.member):
+        if int(kept.history["lost"][-1][int(np.argmin(kept.history["value"][-1]))]) == kept.history["members"][-1]:
             return Answer(study, who, x, None, _joined(past), tune.budget.validation)  # nothing to go on with
-        if looked is None and tune.budget.screen and not kept.interrupted:
-            looked, points = (x, value), around(x, tune.budget.screen, tune.budget.seed + round)
+        if first is None and tune.budget.screen and not kept.interrupted:
+            first, points = (x, value), around(x, tune.budget.screen, tune.budget.seed + round)
             continue
-        if looked is not None and round == 2 and looked[1] < value:  # the same members, the same steps
-            x = looked[0]
+        if first is not None and round == 2 and first[1] < value:  # the same members, the same steps
+            x = first[0]
         error = step_error(study, x)
-        say(f"step of the search against adaptive RODAS3: settled rms error off by {100 * error['relative']:.2g} %")
-        points = x[None]
-        if abs(error["relative"]) > RESOLVED and halvings < MOST_HALVINGS and not kept.interrupted:
-            halvings += 1
+        say(f"step of the search against adaptive RODAS3: settled rms error off by {100 * error.relative:.2g} %")
+        if not error.resolved and halvings < MOST_HALVINGS and not kept.interrupted:
+            halvings, points = halvings + 1, x[None]
             study = _finer(study, 2**halvings)
             say(f"too coarse there; the search goes on with {study.objective.clock.method}")
             continue
         lost = _lost(study, x) if tune.budget.validation and not kept.interrupted else np.zeros(0, int)
-        found.append(Answer(study, who, x, error, _joined(past), len(lost)))
-        if not len(lost) or round >= MOST_ROUNDS:
+        found.append(Answer(study, who, x, error, _joined(past), len(lost) + len(error.lost)))
+        if not found[-1].lost or kept.interrupted or round >= MOST_ROUNDS:
             return min(found, key=lambda answer: answer.lost)
-        who = who.joined(_joining(study, lost))
+        who = who.joined(_joining(study, lost, error.lost))
         points = around(x, tune.budget.screen, tune.budget.seed + round)
-        say(f"{len(lost)} of {tune.budget.validation} members of another seed are lost: the search goes on with them")
+        say(
+            f"{len(lost)} of {tune.budget.validation} members of another seed are lost, and {len(error.lost)} of "
+            f"{REFERENCE_MEMBERS} under adaptive RODAS3: the search goes on with them"
+        )
     raise AssertionError("unreachable: the rounds are counted")
+
+
+def training(study: Study) -> Members:
+    """The ensemble that is tuned on: ordinary members, then stressed ones."""
+    tune = study.tune
+    return study.objective.training(
+        tune.budget.seed, tune.budget.members, tune.budget.stressed, tune.stress, tune.gain_margin
+    )
 
 
 def _best(kept: Search) -> tuple[np.ndarray, float]:
@@ -102,21 +112,24 @@ def _finer(study: Study, finer: int) -> Study:
     return fine
 
 
-def _members(study: Study, numbers: np.ndarray) -> Members:
-    """These members of the validation ensemble."""
-    budget = study.tune.budget
-    return study.objective.chosen(seeds(budget)[1], numbers, budget.validation)
+def _joining(study: Study, lost: np.ndarray, unseen: list[int]) -> Members:
+    """The first of the lost members, under half the extra noise of the stressed ones: held, and with some margin.
 
-
-def _joining(study: Study, lost: np.ndarray) -> Members:
-    """The first of the lost members, under half the extra noise of the stressed ones: held, and with some margin."""
-    those = _members(study, lost[:MOST_JOINING])
-    return those._replace(loud=those.loud * (1 + study.tune.stress) / 2)
+    `lost` are members of the validation ensemble, `unseen` of the training ensemble.
+    """
+    budget, problem = study.tune.budget, study.objective
+    those = problem.chosen(seeds(budget)[1], lost[:MOST_JOINING], budget.validation)
+    these = problem.chosen(seeds(budget)[0], np.array(unseen, int), budget.members)
+    both = jax.tree.map(lambda a, b: np.concatenate([a, b]), those, these)
+    return both._replace(loud=both.loud * (1 + study.tune.stress) / 2)
 
 
 def _lost(study: Study, x: np.ndarray) -> np.ndarray:
     """Numbers of the validation members that are lost at x [m], first lost first."""
-    share = study.engine.terms(x[None], _members(study, np.arange(study.tune.budget.validation)))["survival"][0]
+    budget = study.tune.budget
+    count = budget.validation
+    who = study.objective.chosen(seeds(budget)[1], np.arange(count), count)
+    share = study.engine.terms(x[None], who)["survival"][0]
     return np.argsort(-share, kind="stable")[: int((share > 0).sum())]
 
 
@@ -132,7 +145,7 @@ def _joined(past: list[Search]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([wide(kept.history[name]) for kept in past if kept.history]) for name in names}
 
 
-def _teller(study: Study, count: int) -> Callable[[Search, float], None]:
+def _teller(study: Study) -> Callable[[Search, float], None]:
     """What is said after each iteration."""
     scale = float(np.asarray(study.objective.loss.s_0))
     budget, spent = study.tune.budget, []
@@ -142,14 +155,15 @@ def _teller(study: Study, count: int) -> Callable[[Search, float], None]:
         x, value = best_of(kept)
         gains = np.asarray(study.objective.space.gains_at(jnp.asarray(x)))
         best = int(np.argmin(kept.history["value"][-1]))
+        count = int(kept.history["members"][-1])
         terms, lost = kept.history["terms"][-1][best], int(kept.history["lost"][-1][best])
         # the first iteration compiles, and says nothing about the others
         each = float(np.median(spent[1:])) if len(spent) > 1 else math.nan
-        left = (budget.iterations - kept.iteration) * each * kept.active.sum() / len(kept.active)
-        wait = f", at most {left:.0f} s left" if math.isfinite(left) else ""
+        left = (budget.iterations - kept.iteration + kept.since) * each * kept.active.sum() / len(kept.active)
+        wait = f", at most {left:.0f} s left in this phase" if math.isfinite(left) else ""
         named = ", ".join(f"{g.name} {v:.4g}" for g, v in zip(study.objective.space.gains, gains, strict=True))
         say(
-            f"{kept.iteration:3d}/{budget.iterations}  loss {np.exp(value):.3e}  "
+            f"{kept.iteration - kept.since:3d}/{budget.iterations}  loss {np.exp(value):.3e}  "
             f"rms error {scale * np.sqrt(terms[TERMS.index('tracking')]):.2e} m  kept {count - lost}"
             f"/{count}  {named}  ({kept.active.sum()} starts{wait})"
         )

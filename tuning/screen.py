@@ -13,8 +13,8 @@ from tuning.conditions import Bound
 from tuning.objective import Engine, Members, Objective
 from tuning.space import Space
 
-# Share of the members that points meet, and share of the points that goes on: 1/4 after an eighth of the members, ...
-ROUNDS = (8, 4), (2, 4), (1, 1)
+# Share of the members that points meet, and share of the points that goes on: 1/4 after an eighth of the members.
+ROUNDS = (8, 4), (4, 1)
 # How far from a point its neighbourhood reaches: factors of e^-1.5 to e^1.5 of each gain.
 REACH = 1.5
 Score = Callable[[np.ndarray, dict[str, np.ndarray], Members], np.ndarray]
@@ -93,12 +93,12 @@ def around(x: np.ndarray, count: int, seed: int) -> np.ndarray:
 
 
 def screen(engine: Engine, who: Members, x: np.ndarray, keep: int, score: Score) -> np.ndarray:
-    """The best [keep, m] of points x [K, m], by successive halving: on few members first, on all at last.
+    """The best [keep, m] of points x [K, m], by successive halving: on few members first, then on more.
 
-    Stressed members are there from the first: to be held is what is asked first.
+    Some of the stressed members are there from the first: to be held is what is asked first.
     """
     for part, left in ROUNDS:
-        some = who.first(max(who.ordinary // part, min(4, who.ordinary)))
+        some = who.part(part)
         values = score(x, engine.terms(x, some), some)
         x = x[np.argsort(values, kind="stable")[: max(len(x) // left, 2 * keep)]]
     return x[:keep]

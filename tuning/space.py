@@ -16,6 +16,9 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade
 
+# How sharply a coordinate bends at a bound: within 1/SHARP of it, in logarithms. A logistic curve over the whole
+# interval would put a bound at infinity: a search whose optimum lies there creeps.
+SHARP = 4.0
 ROOT = "controller"
 STAGES = ("observer", "position", "inversion", "current")
 
@@ -24,8 +27,8 @@ STAGES = ("observer", "position", "inversion", "current")
 class Gain:
     """One gain: its dotted path as in the case file, and the open interval in which it may move.
 
-    low = 0 and high = inf: positive, x = log g. low > 0: above, x = log(g - low). Both: between, and then
-    log g moves over the interval as a logistic curve whose slope in the middle is 1.
+    low = 0 and high = inf: positive, x = log g. low > 0: above, x = log(g - low). With an upper bound: log g = x well
+    within the interval, bent at its ends by softplus functions, so that an end is 1 % away 0.8 beyond it.
     """
 
     path: str
@@ -42,22 +45,22 @@ class Gain:
         if math.isinf(self.high):
             return np.log(gain - self.low)
         if self.low == 0.0:
-            return -np.log(1 / np.asarray(gain) - 1 / self.high)
-        share = (np.log(gain) - math.log(self.low)) / self._width
-        return np.log(share / (1 - share)) * self._width / 4
+            return np.log(self.high) - np.log(np.expm1(SHARP * np.log(self.high / gain))) / SHARP
+        rise, fall = SHARP * np.log(gain / self.low), SHARP * np.log(self.high / gain)
+        # expm1(rise) / (1 - exp(-fall)), whose logarithm does not overflow
+        return math.log(self.low) + (rise + np.log(-np.expm1(-rise)) - np.log(-np.expm1(-fall))) / SHARP
 
     def decode(self, x: Array) -> Array:
         """Gain at a coordinate."""
         if math.isinf(self.high):
             return self.low + jnp.exp(x)
+        high = math.log(self.high)
         if self.low == 0.0:
-            return 1 / (jnp.exp(-x) + 1 / self.high)
-        log = math.log(self.low) + self._width * jax.nn.sigmoid(4 * x / self._width)
-        return jnp.clip(jnp.exp(log), self.low, self.high)  # of rounding, at either end
-
-    @property
-    def _width(self) -> float:
-        return math.log(self.high) - math.log(self.low)
+            return jnp.exp(high - jax.nn.softplus(SHARP * (high - x)) / SHARP)
+        below = jax.nn.softplus(SHARP * (x - math.log(self.low))) / SHARP
+        above = jax.nn.softplus(SHARP * (x - high)) / SHARP
+        gain = jnp.exp(math.log(self.low) + (below - above))
+        return jnp.clip(gain, self.low, self.high)  # of rounding, at either end
 
     def at_bound(self, gain: float) -> str:
         """'low' or 'high' where the gain is within 1 % of a bound, else ''."""

@@ -1,7 +1,8 @@
 """A study: a case and its [tune], made into an objective, a goal and an engine; and what its answer is worth."""
 
 import dataclasses
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,9 +13,9 @@ from ambjax.scenario import Clock
 from ambjax.sliding import slides
 from tuning.conditions import bounds
 from tuning.config import Tune, seeds
+from tuning.goal import Goal
 from tuning.loss import loss_for
 from tuning.objective import Engine, Objective
-from tuning.optimise import Goal
 from tuning.screen import bounded
 
 # Members simulated at a time when an ensemble is judged.
@@ -75,17 +76,40 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def step_error(study: Study, x: np.ndarray) -> dict[str, float]:
-    """The search's own step against adaptive RODAS3 on a few training members: settled rms error of both."""
+class StepError(NamedTuple):
+    """The search's own step against adaptive RODAS3 on a few training members: settled rms error of both, m.
+
+    Of those members whom both hold; `relative` is NaN if there is none. `lost`: numbers of those whom the search's
+    step holds, but not the accurate one.
+    """
+
+    search_m: float
+    reference_m: float
+    relative: float
+    members: int
+    lost: list[int]
+
+    @property
+    def resolved(self) -> bool:
+        """Whether the search's steps tell the truth there."""
+        return abs(self.relative) <= RESOLVED
+
+
+def step_error(study: Study, x: np.ndarray) -> StepError:
+    """What the search's own steps are worth at x [m]."""
     seed, count = seeds(study.tune.budget)[0], study.tune.budget.members
-    who = study.objective.chosen(seed, np.arange(min(REFERENCE_MEMBERS, count)), count)
+    numbers = np.arange(min(REFERENCE_MEMBERS, count))
+    who = study.objective.chosen(seed, numbers, count)
     clock = dataclasses.replace(study.objective.clock, method=Adaptive(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS))
     objective = dataclasses.replace(study.objective, clock=clock)
     reference = Engine(objective, settle=study.case.settle, lanes=len(who.member))
-    name = "settled_rms_error_m"
-    ours, theirs = (e.metrics(x[None], who)["metrics"][name][0] for e in (study.engine, reference))
-    off = rms(ours) / rms(theirs) - 1
-    return {"search_m": rms(ours), "reference_m": rms(theirs), "relative": off, "members": len(ours)}
+    ours, theirs = (e.metrics(x[None], who)["metrics"] for e in (study.engine, reference))
+    held = ~(ours["lost"] | theirs["lost"])[0]
+    if not held.any():
+        return StepError(math.nan, math.nan, math.nan, 0, [])
+    search_m, reference_m = (rms(found["settled_rms_error_m"][0][held]) for found in (ours, theirs))
+    unseen = numbers[(theirs["lost"] & ~ours["lost"])[0]].tolist()
+    return StepError(search_m, reference_m, search_m / reference_m - 1, int(held.sum()), unseen)
 
 
 def summarise(study: Study, found: dict[str, np.ndarray]) -> dict[str, Any]:
