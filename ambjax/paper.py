@@ -52,7 +52,7 @@ SUPPLY = 200.0
 
 
 class Tuned(NamedTuple):
-    """Gains from `ambjax-tune benchmarks/tasks/C.toml`, to four digits."""
+    """Gains that `ambjax-tune` found for benchmarks/tasks/C.toml, to four digits; a search today may end at others."""
 
     c: float = 1743.0
     k: float = 291.6

@@ -22,8 +22,9 @@ import _measure
 import numpy as np
 
 from tuning.config import read_study
-from tuning.optimise import search
-from tuning.screen import everywhere, ranges
+from tuning.optimise import best_of, search
+from tuning.rounds import training
+from tuning.screen import around, everywhere, ranges
 from tuning.study import Study, study_of
 
 TASKS = pathlib.Path(__file__).parent / "tasks"
@@ -116,18 +117,22 @@ METHODS: dict[str, Callable[[Judge, int], None]] = {
 
 
 def ours(study: Study, who: Any, seed: int) -> list[tuple[int, float, float]]:
-    """Trace of the search by gradients."""
+    """Trace of the search by gradients, its second look around the first answer included, on all members."""
     study.engine.rollouts, trace, began = 0, [], time.perf_counter()
 
     def tell(kept: Any, _: float) -> None:
-        trace.append((study.engine.rollouts, time.perf_counter() - began, float(np.min(kept.history["value"][-1]))))
+        if kept.history["members"][-1] == len(who.member):  # else its goal is that of a part of them
+            best = min(float(np.min(kept.history["value"][-1])), trace[-1][2] if trace else np.inf)
+            trace.append((study.engine.rollouts, time.perf_counter() - began, best))
 
     budget, start = study.tune.budget, study.tune.space.values(study.case.cascade)
     points = everywhere(study.objective, study.goal.conditions, start, budget.screen, seed)
-    search(
-        study.engine, study.goal, who, points, keep=budget.starts, iterations=budget.iterations,
-        name=study.tune.optimiser, tell=tell,
-    )  # fmt: skip
+    for look in range(2):
+        kept = search(
+            study.engine, study.goal, who, points, keep=budget.starts, iterations=budget.iterations,
+            name=study.tune.optimiser, tell=tell,
+        )  # fmt: skip
+        points = around(best_of(kept)[0], budget.screen, seed + look)
     return trace
 
 
@@ -140,9 +145,7 @@ def task(name: str, seeds: int, times: float, methods: list[str]) -> dict[str, A
     """All traces of one task."""
     case, tune, _ = read_study(TASKS / f"{name}.toml")
     study = study_of(case, tune)
-    who = study.objective.training(
-        tune.budget.seed, tune.budget.members, tune.budget.stressed, tune.stress, tune.gain_margin
-    )
+    who = training(study)
     ours(study, who, 0)  # compiles
     found: dict[str, Any] = {"gradients": [ours(study, who, seed) for seed in range(seeds)]}
     budget = round(statistics.median(trace[-1][0] for trace in found["gradients"]))
