@@ -8,6 +8,7 @@ Run: python benchmarks/tuning.py [--tasks A B C D E] [--seeds 5] [--times 1] [--
 """
 
 import argparse
+import json
 import os
 import pathlib
 import statistics
@@ -59,8 +60,11 @@ class Judge:
         values = self.study.goal.score(space, x, self.study.engine.terms(x, self.who), self.who)
         values = np.where(np.isfinite(values), values, WORST)
         self.spent += len(x) * len(self.who.member)
-        self.best = min(self.best, float(values.min()))
-        self.trace.append((self.spent, time.perf_counter() - self.began, self.best))
+        row = (self.spent, time.perf_counter() - self.began, min(self.best, float(values.min())))
+        if len(self.trace) > 1 and self.trace[-1][2] == self.trace[-2][2] == row[2]:
+            self.trace.pop()  # of a plateau, its ends
+        self.trace.append(row)
+        self.best = row[2]
         return values
 
 
@@ -180,8 +184,12 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     given = parser.parse_args()
     warnings.simplefilter("ignore")
-    results = {name: task(name, given.seeds, given.times, given.methods) for name in given.tasks}
-    _measure.write(f"tuning{'' if given.times == 1 else f'_x{given.times:g}'}", {"tasks": results})
+    name = "tuning" if given.times == 1 else f"tuning_x{given.times:g}"
+    path = _measure.RESULTS / f"{name}.json"
+    results = json.loads(path.read_text())["tasks"] if path.exists() else {}
+    for each in given.tasks:  # hours in all: what is measured is written at once, and other tasks' results stay
+        results[each] = task(each, given.seeds, given.times, given.methods)
+        _measure.write(name, {"tasks": dict(sorted(results.items()))})
 
 
 if __name__ == "__main__":

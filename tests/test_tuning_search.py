@@ -22,7 +22,7 @@ from tuning.descent import Descent
 from tuning.goal import Goal
 from tuning.loss import TERMS, loss_for
 from tuning.objective import Engine, Objective, weigh
-from tuning.optimise import Keeper, best_of, search
+from tuning.optimise import Keeper, Search, _go_on_with_all, best_of, search
 from tuning.optimisers import names, optimiser
 from tuning.risk import CVaR, Mean
 from tuning.screen import REACH, around, everywhere, screen
@@ -257,9 +257,22 @@ def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):
     resumed = run(small, keeper=keeper, resume=True)
     for a, b in zip(jax.tree.leaves(whole.starts), jax.tree.leaves(resumed.starts), strict=True):
         np.testing.assert_array_equal(a, b)
+    assert 0 < resumed.earlier < resumed.seconds  # what it took before counts
     assert not list(tmp_path.glob("*.partial*"))
     with pytest.raises(ValueError, match="another case"):
         run(small, keeper=Keeper(tmp_path / "kept.npz", {"case": 2}), resume=True)
+
+
+def test_the_second_phase_goes_back_to_what_was_given_where_the_path_is_worse(small):
+    engine, goal, who, start = small
+    descent = Descent(SPACE, goal, "bfgs", 0.1)
+    best, x = best_of(run(small))[0], everywhere(engine.objective, goal.conditions, start, 2, seed=1)[-2:]
+    path = {"x": [x], "value": [np.zeros(2)]}
+    kept = Search(descent.begin(jnp.asarray(x)), np.ones(2, bool), path, iteration=1)
+    _go_on_with_all(engine, goal, who, kept, descent, best)
+    np.testing.assert_array_equal(kept.starts.trial[0], best)
+    assert kept.active.tolist() == [True, False]
+    assert (kept.phase, kept.since) == (1, 1)
 
 
 def test_ctrl_c_keeps_the_best(small):

@@ -3,7 +3,6 @@
 import argparse
 import dataclasses
 import pathlib
-import time
 from typing import Any
 
 import jax.numpy as jnp
@@ -31,10 +30,9 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     out = directory(args.out, f"tune-{case.name}")
     held_out = seeds(tune.budget)[2]
     say(f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {study.objective.clock.method}")
-    began = time.perf_counter()
     answer = rounds(study, start, out, [raw, settings(tune)], args.resume)
     study, who, x = answer.study, answer.who, answer.x
-    facts = _facts(answer, time.perf_counter() - began, held_out)
+    facts = _facts(answer, held_out)
     if args.gradients:
         say("gradient report ...")
         facts["gradient"] = gradient.report(study, x, who)
@@ -52,7 +50,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     return int(not good), summary
 
 
-def _facts(answer: Answer, seconds: float, held_out: int) -> dict[str, Any]:
+def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
     study, x, who = answer.study, answer.x, answer.who
     case, tune, space = study.case, study.tune, study.objective.space
     rollouts = study.engine.rollouts
@@ -76,7 +74,7 @@ def _facts(answer: Answer, seconds: float, held_out: int) -> dict[str, Any]:
         "step_error": answer.error._asdict() | {"resolved": answer.error.resolved} if answer.error else None,
         "lost_in_validation": answer.lost,
         "search": settings(tune)
-        | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": seconds},
+        | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
     }
     facts["gains"] = report.gains_table(space, before, after, None)
     facts["verdict"] = _verdict(facts)

@@ -26,6 +26,8 @@ SHORTEST = 1e-3
 HALVINGS = (4, 10)
 # Points of the first phase's path that are tried on all members.
 PATH = 12
+# What a checkpoint holds of a search beside arrays and history.
+COUNTS = ("iteration", "phase", "since", "seconds")
 
 
 class Phase(NamedTuple):
@@ -44,7 +46,7 @@ FEW, ALL = Phase(4, 0.02, 3), Phase(1, 1e-3, 4)
 class Search:
     """A search under way. `history` holds one row per iteration; everything else can be read off a checkpoint.
 
-    `since`: the iteration after which the phase began.
+    `since`: the iteration after which the phase began; `seconds` spent on it so far, `earlier` of them before a resume.
     """
 
     starts: Starts
@@ -53,6 +55,8 @@ class Search:
     iteration: int = 0
     phase: int = 0
     since: int = 0
+    seconds: float = 0.0
+    earlier: float = 0.0
     interrupted: bool = False
 
 
@@ -69,7 +73,7 @@ class Keeper:
         leaves = {f"leaf_{n}": np.asarray(leaf) for n, leaf in enumerate(jax.tree.leaves(search.starts))}
         past = {f"history_{name}": np.asarray(rows) for name, rows in search.history.items()}
         partial = self.path.with_suffix(".partial.npz")
-        counts = {"iteration": search.iteration, "phase": search.phase, "since": search.since}
+        counts = {name: getattr(search, name) for name in COUNTS}
         state = {"active": search.active, "fingerprint": self.fingerprint, **counts}
         np.savez(partial, **leaves, **past, **state)  # pyright: ignore[reportArgumentType]
         os.replace(partial, self.path)  # noqa: PTH105
@@ -88,8 +92,8 @@ class Keeper:
             count = sum(name.startswith("leaf_") for name in kept.files)
             starts = jax.tree.unflatten(tree, [jnp.asarray(kept[f"leaf_{n}"]) for n in range(count)])
             history = {n.removeprefix("history_"): list(kept[n]) for n in kept.files if n.startswith("history_")}
-            iteration, phase, since = (int(kept[name]) for name in ("iteration", "phase", "since"))
-            return Search(starts, kept["active"], history, iteration, phase, since)
+            counts = {name: kept[name].item() for name in COUNTS}
+            return Search(starts, kept["active"], history, **counts, earlier=counts["seconds"])
 
 
 def search(
@@ -109,13 +113,13 @@ def search(
     """Refine the best `keep` of these points, coordinates [K, m]. Ctrl-C ends it early.
 
     Where there are more points than that, they are screened and refined on a part of the members first; the best point
-    on the way there goes on with all. At most `iterations` in each of these phases. `tell` is called after each
-    iteration with the search and the seconds that it took.
+    on the way there, the first of `points` included, goes on with all. At most `iterations` in each of these phases.
+    `tell` is called after each iteration with the search and the seconds that it took.
     """
     descent = Descent(engine.objective.space, goal, name, rate)
     keeper = keeper or Keeper(None, None)
     phases = [FEW, ALL] if len(points) > keep else [ALL]
-    kept = keeper.load(descent, points.shape[1]) if resume else None
+    kept, given, began = keeper.load(descent, points.shape[1]) if resume else None, points[0], time.perf_counter()
     if kept is not None:
         engine.rollouts = int(kept.history["rollouts"][-1])
     else:
@@ -127,13 +131,14 @@ def search(
             if not kept.active.any() or kept.iteration - kept.since >= iterations:
                 if kept.phase + 1 == len(phases):
                     break
-                _go_on_with_all(engine, goal, who, kept, descent)
-            began = time.perf_counter()
+                _go_on_with_all(engine, goal, who, kept, descent, given)
+            before = kept.seconds
             phase = phases[kept.phase]
             iterate(engine, goal, who.part(phase.part), kept, descent)
             kept.active = _going_on(kept, phase)
+            kept.seconds = kept.earlier + time.perf_counter() - began
             keeper.save(kept)
-            tell(kept, time.perf_counter() - began)
+            tell(kept, kept.seconds - before)
     except KeyboardInterrupt:
         kept.interrupted = True
     return kept
@@ -186,8 +191,10 @@ def _going_on(kept: Search, phase: Phase) -> np.ndarray:
     return active
 
 
-def _go_on_with_all(engine: Engine, goal: Goal, who: Members, kept: Search, descent: Descent) -> None:
-    """Begin the next phase from one point: that on the paths of all starts which is best for all members.
+def _go_on_with_all(
+    engine: Engine, goal: Goal, who: Members, kept: Search, descent: Descent, given: np.ndarray
+) -> None:
+    """Begin the next phase from one point: that on the paths of all starts, or `given`, which is best for all members.
 
     The answer for a part of the members may lose others: then an earlier point is better, and on the right side of
     that cliff.
@@ -198,12 +205,13 @@ def _go_on_with_all(engine: Engine, goal: Goal, who: Members, kept: Search, desc
     _, first = np.unique(np.where(np.isfinite(value), value, np.inf), return_index=True)
     # the best ones, and fewer and fewer of the others
     chosen = first[np.unique((np.linspace(0, np.sqrt(len(first) - 1), PATH).round(6) ** 2).astype(int))]
-    values = goal.score(engine.objective.space, x[chosen], engine.terms(x[chosen], who), who)
-    best = chosen[np.argmin(values)]
+    tried = np.concatenate([x[chosen], given[None]])
+    best = int(np.argmin(goal.score(engine.objective.space, tried, engine.terms(tried, who), who)))
+    start = chosen[best] % starts if best < len(chosen) else 0
     at = np.array(kept.starts.best)
-    at[best % starts] = x[best]
+    at[start] = tried[best]
     kept.starts = descent.anew(jnp.asarray(at), kept.starts)
-    kept.active = np.arange(starts) == best % starts
+    kept.active = np.arange(starts) == start
     kept.phase, kept.since = kept.phase + 1, kept.iteration
 
 

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import math
 import pathlib
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -37,6 +38,8 @@ class Answer:
     history: dict[str, np.ndarray]
     lost: int
     """members of the validation ensemble, and those that only an accurate step loses"""
+    seconds: float
+    """in all, those before a resume included"""
 
 
 def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume: bool) -> Answer:
@@ -47,6 +50,12 @@ def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume
     points = points if tune.budget.screen else points[:1]
     who = training(study)
     past: list[Search] = []
+    began = time.perf_counter()
+
+    def answer(error: StepError | None, lost: int) -> Answer:
+        seconds = time.perf_counter() - began + sum(kept.earlier for kept in past)
+        return Answer(study, who, x, error, _joined(past), lost, seconds)
+
     for round in itertools.count(1):
         path = out / f"{CHECKPOINT}-{round}.npz"
         kept = search(
@@ -61,7 +70,7 @@ def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume
         past.append(kept)
         x, value = _best(kept)
         if int(kept.history["lost"][-1][int(np.argmin(kept.history["value"][-1]))]) == kept.history["members"][-1]:
-            return Answer(study, who, x, None, _joined(past), tune.budget.validation)  # nothing to go on with
+            return answer(None, tune.budget.validation)  # nothing to go on with
         if first is None and tune.budget.screen and not kept.interrupted:
             first, points = (x, value), around(x, tune.budget.screen, tune.budget.seed + round)
             continue
@@ -75,9 +84,9 @@ def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume
             say(f"too coarse there; the search goes on with {study.objective.clock.method}")
             continue
         lost = _lost(study, x) if tune.budget.validation and not kept.interrupted else np.zeros(0, int)
-        found.append(Answer(study, who, x, error, _joined(past), len(lost) + len(error.lost)))
+        found.append(answer(error, len(lost) + len(error.lost)))
         if not found[-1].lost or kept.interrupted or round >= MOST_ROUNDS:
-            return min(found, key=lambda answer: answer.lost)
+            return dataclasses.replace(min(found, key=lambda one: one.lost), seconds=found[-1].seconds)
         who = who.joined(_joining(study, lost, error.lost))
         points = around(x, tune.budget.screen, tune.budget.seed + round)
         say(
