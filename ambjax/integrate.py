@@ -13,14 +13,16 @@ a step's edge is seen by the steps after it and not by those before: otherwise t
 it early and the method falls to first order there.
 """
 
+import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 from ambjax import _linear
+from ambjax._apart import apart
 from ambjax._pytree import Scalar, leaf, record, static
 from ambjax.trajectory import ALIVE, STALLED
 
@@ -127,47 +129,61 @@ class _Fixed:
         return Advanced(x, code, reached, memory)
 
 
+@functools.cache
+def _combination(weights: tuple[float, ...]) -> Callable[..., Array]:
+    """x + h sum of weight * rate, in a loop of its own: what it is given and gives is stored, never computed again."""
+
+    def plain(x: Array, h: Array, rates: tuple[Array, ...]) -> Array:
+        first, *others = ((w, k) for w, k in zip(weights, rates, strict=True) if w)
+        total = first[0] * first[1]
+        for w, k in others:
+            total = total + w * k
+        return x + h * total
+
+    combined = jax.custom_jvp(apart(plain))
+    combined.defjvp(lambda primals, tangents: (combined(*primals), jax.jvp(plain, primals, tangents)[1]))
+    return combined
+
+
+class _Explicit(_Fixed):
+    """An explicit Runge-Kutta method: the times of its stages, and weights in the state after each, the new one last.
+
+    Stages are written out, and the state that each begins from is kept from XLA's fusion: fused, shared terms of the
+    right-hand side are computed again for every component of every stage.
+    """
+
+    TIMES: ClassVar[tuple[float, ...]]
+    ROWS: ClassVar[tuple[tuple[float, ...], ...]]
+
+    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any) -> Any:
+        inputs = {share: problem.inputs(at(share)) for share in self.TIMES}
+        x, stages, h = state, [], jnp.asarray(h)
+        for share, row in zip(self.TIMES, self.ROWS, strict=True):
+            stages.append(problem.rates(inputs[share], x))
+            combined = _combination(row)
+            x = jax.tree.map(lambda x, *ks, combined=combined: combined(x, h, ks), state, *stages)
+        return x
+
+
 @record
-class Euler(_Fixed):
+class Euler(_Explicit):
     """Explicit Euler, order 1."""
 
     limit = 2.0
-
-    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any) -> Any:
-        return axpy(state, (h, problem.rates(problem.inputs(at(0.0)), state)))
+    TIMES = (0.0,)
+    ROWS = ((1.0,),)
 
     def __str__(self) -> str:
         return f"explicit Euler, {self.substeps} substeps"
 
 
 @record
-class RK4(_Fixed):
-    """The classical explicit Runge-Kutta method, order 4.
-
-    Stages run in a loop, and what drives the system is evaluated before it: unrolled, XLA computes
-    shared terms of the right-hand side again for every component of every stage, and the sine of a time
-    that all members share once for each.
-    """
+class RK4(_Explicit):
+    """The classical explicit Runge-Kutta method, order 4."""
 
     limit = 2.785
-
-    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any) -> Any:
-        begin, middle, end = (problem.inputs(at(share)) for share in (0.0, 0.5, 1.0))
-        real = jnp.result_type(float).type  # Pallas gives a number without a type that of the condition
-
-        def stage(s: Array, carry: tuple[Any, Any]) -> tuple[Any, Any]:
-            x, gained = carry
-            gained = jax.tree.map(
-                lambda g, a, b: g + jnp.where(s == 2, real(2 / 3), real(1 / 3)) * (a - b), gained, x, state
-            )
-            first, last = s == 0, s == 3
-            inputs = choose(first, begin, choose(last, end, middle))
-            share = jnp.where(last, real(1 / 6), jnp.where(s == 2, real(1.0), real(0.5)))
-            base = jax.tree.map(lambda a, g: a + jnp.where(last, g, 0.0), state, gained)
-            return axpy(base, (h * share, problem.rates(inputs, x))), gained
-
-        # x_2 - x, x_3 - x and x_4 - x with weights 1/3, 2/3, 1/3, and h k_4 / 6: each k is used once.
-        return lax.fori_loop(0, 4, stage, (state, jax.tree.map(jnp.zeros_like, state)))[0]
+    TIMES = (0.0, 1 / 2, 1 / 2, 1.0)
+    ROWS = ((1 / 2,), (0.0, 1 / 2), (0.0, 0.0, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6))
 
     def __str__(self) -> str:
         return f"RK4, {self.substeps} substeps"

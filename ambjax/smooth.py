@@ -66,8 +66,16 @@ SINE_S = {
 @jax.custom_jvp
 @apart
 def reciprocal(x: Array) -> Array:
-    """1/x, divided once however often it is used."""
-    return 1 / x
+    """1/x, divided once however often it is used; for |x| between 1e-37 and 1e37.
+
+    A vector of float64 takes a CPU 16 cycles to divide by, and three times as few in float32: there a float32 quotient
+    is refined by one step of third order, to the last bit or the one before.
+    """
+    if x.dtype != jnp.float64 or jax.default_backend() != "cpu":
+        return 1 / x
+    rough = (1 / x.astype(jnp.float32)).astype(jnp.float64)
+    error = 1 - x * rough
+    return rough + rough * (error + error * error)
 
 
 @reciprocal.defjvp
@@ -128,6 +136,7 @@ def _quarter(y: Array) -> Array:
 
 
 @jax.custom_jvp
+@apart
 def sine(x: Array) -> Array:
     """sin(2 pi x): an angle in turns is reduced exactly, and it vectorises; XLA's own is a library call on CPUs."""
     y = _turn(x)
@@ -135,6 +144,7 @@ def sine(x: Array) -> Array:
 
 
 @jax.custom_jvp
+@apart
 def cosine(x: Array) -> Array:
     """cos(2 pi x)."""
     return _quarter(0.25 - jnp.abs(_turn(x)))

@@ -12,7 +12,6 @@ from oracle import World, solve
 
 import ambjax as amb
 from ambjax import _linear
-from ambjax.dormand_prince import ROWS, TIMES
 from ambjax.integrate import Problem
 from ambjax.trajectory import ALIVE, STALLED
 
@@ -77,8 +76,8 @@ def test_methods_and_laws_of_equal_fields_are_of_different_structure():
 
 def test_dormand_prince_meets_every_condition_of_order_five():
     """One condition for each rooted tree of up to five nodes (Hairer, Norsett and Wanner I, II.2)."""
-    b, c = np.array(ROWS[-1]), np.array(TIMES)
-    A = np.array([[*row, *[0.0] * (6 - len(row))] for row in [(), *ROWS[:-1]]])
+    b, c = np.array(amb.DormandPrince.ROWS[-1]), np.array(amb.DormandPrince.TIMES)
+    A = np.array([[*row, *[0.0] * (6 - len(row))] for row in [(), *amb.DormandPrince.ROWS[:-1]]])
     np.testing.assert_allclose(A.sum(1), c, atol=1e-15)
     Ac, Ac2 = A @ c, A @ c**2
     trees = {1: (b @ c**0, 1), 2: (b @ c, 2), 3: (b @ c**2, 3), 4: (b @ Ac, 6), 5: (b @ c**3, 4), 6: (b @ (c * Ac), 8)}

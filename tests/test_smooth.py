@@ -112,6 +112,18 @@ def test_arctan_per_is_numpys_arctan_over_per(dtype):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
+def test_reciprocal_is_right_to_the_last_bit_but_one(dtype):
+    """Over its whole range, and beside 1, where rounding of either operand shows most."""
+    eps = np.finfo(dtype).eps
+    near = 1 + np.linspace(-50, 50, 101) * eps
+    x = np.concatenate([np.geomspace(1e-37, 1e37, 9973), near]).astype(dtype)
+    x = np.concatenate([x, -x])
+    np.testing.assert_allclose(wide(reciprocal)(x), 1 / x.astype(np.longdouble), rtol=2 * eps)
+    # far beyond it, what is as good as 0: a trial state on its way out of the model's range
+    np.testing.assert_array_equal(wide(reciprocal)(np.array([np.sqrt(np.finfo(dtype).max)] * 8)) < 1e-18, True)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
 def test_sine_and_cosine_of_turns_are_numpys(dtype):
     x = TURNS.astype(dtype)
     sin, cos = exact_turns(x)
