@@ -141,7 +141,13 @@ def _combination(weights: tuple[float, ...]) -> Callable[..., Array]:
         return x + h * total
 
     combined = jax.custom_jvp(apart(plain))
-    combined.defjvp(lambda primals, tangents: (combined(*primals), jax.jvp(plain, primals, tangents)[1]))
+
+    @combined.defjvp
+    def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
+        (x, h, rates), (dx, dh, d_rates) = primals, tangents
+        slope = sum(w * k for w, k in zip(weights, rates, strict=True) if w)
+        return combined(x, h, rates), combined(dx, h, d_rates) + dh * slope  # tangents are kept from fusion likewise
+
     return combined
 
 

@@ -8,6 +8,7 @@ implicitly with the whole arctan (not its slope), and the supply's limit is appl
 i_ref slides the voltage is at its limit, and the current sees an impulse, not the whole jump.
 
 The rotor's motion and the states of the other laws go by Heun's method, the current by an exponential step.
+Quotients are written as products with a reciprocal, which divides once for the value and for all its derivatives.
 """
 
 from typing import Any
@@ -19,7 +20,7 @@ from jax import Array
 from ambjax._pytree import Scalar
 from ambjax.control.inversion import Adaptive, v_and_gradient
 from ambjax.control.laws import CurrentDemand, CurrentInputs, Measurement
-from ambjax.smooth import TWO_OVER_PI, smooth_sign
+from ambjax.smooth import TWO_OVER_PI, reciprocal, smooth_sign
 
 # Newton steps on the slaved sign: monotone from below; they leave less than 1e-3 of the right-hand side.
 NEWTON = 6
@@ -33,6 +34,7 @@ def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: 
     cascade, scenario = loop.cascade, loop.scenario
     model, law, (z, z_dot, i), control = cascade.model, cascade.inversion, state.plant, state.control
     i_ref = control.inversion
+    per_h = 1 / jnp.where(h > 0, h, 1.0)
 
     force_0, seen_0, rates_0 = cascade.demand(_add(state.plant, hold), control, begin.reference)
     z_ddot_0 = scenario.plant.z_ddot(z, i, begin.q_z)
@@ -46,9 +48,9 @@ def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: 
     v_0, gradient_0 = v_and_gradient(model, force_0, i_ref)
     v_1, gradient_1 = v_and_gradient(model, force_1, i_ref)
     w = force_0.v_star - v_0
-    drift = (force_1.v_star - v_1 - w) / jnp.where(h > 0, h, 1.0)
+    drift = (force_1.v_star - v_1 - w) * per_h
     sliding, slaved, tau = relax(w, drift, law.gamma, law.p, h)
-    sliding, slaved = sliding / gradient_0, slaved / gradient_1
+    sliding, slaved = sliding * reciprocal(gradient_0), slaved * reciprocal(gradient_1)
 
     sliding, slaved, tau, force_1 = jax.lax.optimization_barrier((sliding, slaved, tau, force_1))
 
@@ -71,7 +73,7 @@ def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: 
     middle = Measurement((z + ahead.z) / 2, (z_dot + ahead.z_dot) / 2, i_ref + e)
     seen = jax.tree.map(lambda a, b: (a + b) / 2, seen_0, seen_1)
     # The current moves fast while it slides: what counts at the start of the rest is where it ended.
-    z_ddot_0 += (1 - tau / jnp.where(h > 0, h, 1.0)) * (scenario.plant.z_ddot(z, middle.i, begin.q_z) - z_ddot_0)
+    z_ddot_0 += (1 - tau * per_h) * (scenario.plant.z_ddot(z, middle.i, begin.q_z) - z_ddot_0)
     e, inner = current(middle, seen, i_ref, slaved, inner, end.q_i, h - tau)
     e, inner = jax.lax.optimization_barrier((e, inner))
     i_ref = i_ref + (h - tau) * slaved
@@ -98,7 +100,7 @@ def relax(w: Array, drift: Array, gain: Scalar, p: Scalar, h: Scalar) -> tuple[A
     closing = first - drift
     outside = jnp.sign(w) * jnp.maximum(jnp.abs(w) - EDGE / p, 0.0)
     safe = jnp.where(closing == 0, 1.0, closing)
-    tau = jnp.where(outside * closing > 0, jnp.minimum(outside / safe, h), 0.0)
+    tau = jnp.where(outside * closing > 0, jnp.minimum(outside * (1 / safe), h), 0.0)
     left = h - tau
     return first, gain * smooth_sign(_implicit(w - tau * closing + left * drift, left * gain, p), p), tau
 
@@ -123,13 +125,13 @@ def _implicit_jvp(primals: tuple[Array, Array, Scalar], tangents: tuple[Any, Any
     w = _implicit(b, reach, p)
     flat = TWO_OVER_PI / (1 + (p * w) ** 2)
     change = db - smooth_sign(w, p) * d_reach - reach * flat * w * dp
-    return w, change / (1 + reach * p * flat)
+    return w, change * reciprocal(1 + reach * p * flat)
 
 
 def _phi(x: Array) -> Array:
     """(exp(x) - 1) / x."""
     small = jnp.abs(x) < 1e-3
-    return jnp.where(small, 1 + x / 2 + x * x / 6, (jnp.exp(x) - 1) / jnp.where(small, 1.0, x))
+    return jnp.where(small, 1 + x / 2 + x * x / 6, (jnp.exp(x) - 1) * (1 / jnp.where(small, 1.0, x)))
 
 
 def _add(x: Measurement, y: Measurement) -> Measurement:
