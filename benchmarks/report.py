@@ -3,6 +3,7 @@
 import json
 import math
 import pathlib
+import statistics
 from typing import Any
 
 import _measure
@@ -192,27 +193,35 @@ def tasks() -> list[str]:
 
 
 def tuning() -> list[str]:
-    data = load("tuning")
-    lines = ["## The search against derivative-free ones (`tuning.py`)", "", facts(data["machine"])]
+    """One table for each multiple of the gradients' rollouts that the others got."""
+    lines = ["## The search against derivative-free ones (`tuning.py`)", ""]
     lines += [
-        "The same loss, members and ranges; the budget of rollouts is the gradients' own. Loss: median over seeds and",
-        "range. Reached: rollouts until the gradients' median loss, median over seeds; a dash: not in the budget.",
+        "The same loss, members and ranges; the budget of rollouts is the gradients' own, or a multiple of it. Loss:",
+        "median over seeds and range. Reached: rollouts until the gradients' median loss, median over seeds; a dash:",
+        "not in the budget.",
         "",
     ]
+    for path in sorted(_measure.RESULTS.glob("tuning*.json")):
+        data = load(path.stem)
+        times = next(iter(data["tasks"].values()))["times"]
+        lines += ["The gradients' own budget." if times == 1 else f"{times:g} times it.", facts(data["machine"]), ""]
+        rows = [row for task, found in data["tasks"].items() for row in _searches(task, found)]
+        lines += table("task | method | loss | rollouts | time (s) | reached", rows)
+    return lines
+
+
+def _searches(task: str, found: dict[str, Any]) -> list[list[str]]:
+    goal = statistics.median_high(found["final"]["gradients"])
     rows = []
-    for task, found in data["tasks"].items():
-        goal = sorted(found["final"]["gradients"])[len(found["final"]["gradients"]) // 2]
-        for method, values in found["final"].items():
-            values = sorted(values)
-            low, middle, high = (math.exp(values[k]) for k in (0, len(values) // 2, -1))
-            first = sorted(
-                next((n for n, _, best in trace if best <= goal), math.inf) for trace in found["traces"][method]
-            )[len(values) // 2]
-            seconds = sorted(trace[-1][1] for trace in found["traces"][method])[len(values) // 2]
-            spent = f"{found['traces'][method][0][-1][0]:,}"
-            reached = f"{first:,}" if math.isfinite(first) else "-"
-            rows.append([task, method, f"{middle:.3e} ({low:.3e} to {high:.3e})", spent, f"{seconds:.0f}", reached])
-    return lines + table("task | method | loss | rollouts | time (s) | reached", rows)
+    for method, values in found["final"].items():
+        traces = found["traces"][method]
+        low, middle, high = (math.exp(f(values)) for f in (min, statistics.median_high, max))
+        first = statistics.median_high(next((n for n, _, best in trace if best <= goal), math.inf) for trace in traces)
+        seconds = statistics.median_high(trace[-1][1] for trace in traces)
+        spent, reached = f"{traces[0][-1][0]:,}", f"{first:,}" if math.isfinite(first) else "-"
+        loss = f"{middle:.3e} ({low:.3e} to {high:.3e}, {len(values)} seeds)"
+        rows.append([task, method, loss, spent, f"{seconds:.0f}", reached])
+    return rows
 
 
 def gpu() -> list[str]:
