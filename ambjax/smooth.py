@@ -121,10 +121,8 @@ def arctan_per(x: Array, per: Array) -> Array:
 @arctan_per.defjvp
 def _arctan_per_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
     (x, per), (dx, d_per) = primals, tangents
-    value, inverse = arctan_per(x, per), reciprocal(per)
-    size = jnp.minimum(jnp.abs(x), 1e18)  # its square must stay within the range of `reciprocal`
-    # divisions of the primal alone, and none for each tangent
-    return value, dx * (reciprocal(1 + size * size) * inverse) - d_per * (value * inverse)
+    value = arctan_per(x, per)
+    return value, (dx / (1 + x * x) - value * d_per) / per
 
 
 def _turn(x: Array) -> Array:
