@@ -3,8 +3,8 @@
 from ambjax._version import __version__
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.cascade import Cascade
-from ambjax.dormand_prince import DormandPrince
-from ambjax.integrate import RK4, Adaptive, Euler, Rodas3, Slide
+from ambjax.explicit import RK4, DormandPrince, Euler
+from ambjax.integrate import Adaptive, Rodas3, Slide
 from ambjax.method import choose_method, with_method
 from ambjax.metrics import Standard
 from ambjax.plant import Plant

@@ -17,7 +17,8 @@ Result = TypeVar("Result")
 def apart(function: Callable[..., Result]) -> Callable[..., Result]:
     """`function` of arrays, neither fused with its surroundings nor repeated in them on CPUs; elsewhere as it is.
 
-    For what lies under a custom_jvp: reverse mode through the call itself is not provided for.
+    For what lies under a custom_jvp, whose rule may apply it to tangents if it is linear in them: reverse mode then
+    transposes it.
     """
     inner = jax.jit(function)
 

@@ -13,9 +13,9 @@ from typing import Any
 from ambjax import signals
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.cascade import Cascade
-from ambjax.dormand_prince import DormandPrince
 from ambjax.ensemble.spread import Spread, corners
-from ambjax.integrate import RK4, Adaptive, Euler, Integrator, Rodas3
+from ambjax.explicit import RK4, DormandPrince, Euler
+from ambjax.integrate import Adaptive, Integrator, Rodas3
 from ambjax.method import with_method
 from ambjax.plant import Plant
 from ambjax.scenario import Clock, Initial, Scenario, Sensor

@@ -9,7 +9,8 @@ import numpy as np
 
 from ambjax._pytree import is_traced
 from ambjax.control.cascade import Cascade
-from ambjax.integrate import RK4, Adaptive, Integrator, Rodas3
+from ambjax.explicit import RK4
+from ambjax.integrate import Adaptive, Integrator, Rodas3
 from ambjax.scenario import Clock, Scenario
 
 # RK4 at this step times slope is accurate to about 1e-9 m on smooth gains (benchmarks/work_precision.py)

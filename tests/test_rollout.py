@@ -31,8 +31,8 @@ from ambjax import (
     rollout,
 )
 from ambjax._kernel import one_kernel
+from ambjax.explicit import Euler
 from ambjax.gaussian import normals, threefry
-from ambjax.integrate import Euler
 from ambjax.metrics import Lowest, Mean, Named, Peak, Reaching, Rms, Variation
 from ambjax.trajectory import DIVERGED, TOUCHED, Row
 

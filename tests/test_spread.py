@@ -28,7 +28,7 @@ from ambjax.ensemble import Choice, LogUniform, Normal, Percent, Spread, Uniform
 from ambjax.ensemble.design import DESIGNS, MOST_LATIN, points
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import check, corners
-from ambjax.integrate import Euler
+from ambjax.explicit import Euler
 from ambjax.template import template
 
 CASCADE = Cascade()

@@ -17,7 +17,7 @@ from jax import Array
 from ambjax._pytree import canonical
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.engine import size
-from ambjax.integrate import RK4
+from ambjax.explicit import RK4
 from ambjax.loop import Realised
 from ambjax.method import with_method
 from ambjax.metrics import Fold
