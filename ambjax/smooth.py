@@ -68,8 +68,8 @@ SINE_S = {
 def reciprocal(x: Array) -> Array:
     """1/x, divided once however often it is used; for |x| between 1e-37 and 1e37.
 
-    A vector of float64 takes a CPU 16 cycles to divide by, and three times as few in float32: there a float32 quotient
-    is refined by one step of third order, to the last bit or the one before.
+    CPUs divide vectors of float32 much faster than those of float64: there a float32 quotient is refined by one step
+    of third order, to the last bit or the one before.
     """
     if x.dtype != jnp.float64 or jax.default_backend() != "cpu":
         return 1 / x
