@@ -3,7 +3,7 @@
 from ambjax._version import __version__
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.cascade import Cascade
-from ambjax.explicit import RK4, DormandPrince, Euler
+from ambjax.explicit import DOP853, RK4, Euler
 from ambjax.integrate import Adaptive, Rodas3, Slide
 from ambjax.method import choose_method, with_method
 from ambjax.metrics import Standard
@@ -14,6 +14,7 @@ from ambjax.signals import BandNoise, Chirp, Constant, Pulse, Sine, SmoothStep, 
 from ambjax.trajectory import Row, Trajectory
 
 __all__ = [
+    "DOP853",
     "RK4",
     "Adaptive",
     "BandNoise",
@@ -21,7 +22,6 @@ __all__ = [
     "Chirp",
     "Clock",
     "Constant",
-    "DormandPrince",
     "Euler",
     "Initial",
     "Outcome",

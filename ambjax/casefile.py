@@ -14,7 +14,7 @@ from ambjax import signals
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, corners
-from ambjax.explicit import RK4, DormandPrince, Euler
+from ambjax.explicit import DOP853, RK4, Euler
 from ambjax.integrate import Adaptive, Integrator, Rodas3
 from ambjax.method import with_method
 from ambjax.plant import Plant
@@ -39,7 +39,7 @@ SIGNALS: dict[str, type] = {
     "band-noise": signals.BandNoise,
     "sum": signals.Sum,
 }
-METHODS: dict[str, type] = {"rk4": RK4, "dopri5": DormandPrince, "euler": Euler, "rodas3": Rodas3}
+METHODS: dict[str, type] = {"rk4": RK4, "dop853": DOP853, "euler": Euler, "rodas3": Rodas3}
 TABLES = ["plant", "controller", "reference", "disturbance", "sensor", "actuator", "initial", "clock", "run", "spread"]
 OTHERS = ["tune"]  # read by ambjax-tune; the commands here pass it by
 UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}

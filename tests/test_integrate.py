@@ -49,7 +49,7 @@ def slope(x, y):
 
 every_fixed = pytest.mark.parametrize(("method", "order"), FIXED.values(), ids=FIXED)
 every_method = pytest.mark.parametrize(
-    "method", [amb.Euler(3), amb.RK4(3), amb.DormandPrince(3), amb.Rodas3(3), amb.Adaptive()], ids=str
+    "method", [amb.Euler(3), amb.RK4(3), amb.DOP853(3), amb.Rodas3(3), amb.Adaptive()], ids=str
 )
 
 
@@ -63,7 +63,7 @@ def test_order_on_a_problem_with_known_solution(method, order):
 
 def test_methods_and_laws_of_equal_fields_are_of_different_structure():
     """Else one's compiled program would be taken for the other's: JAX looks programs up by structure."""
-    methods = [kind(2) for kind in (amb.Euler, amb.RK4, amb.DormandPrince, amb.Rodas3, amb.Slide)]
+    methods = [kind(2) for kind in (amb.Euler, amb.RK4, amb.DOP853, amb.Rodas3, amb.Slide)]
     bare = [amb.observer.Direct(), amb.inversion.ClosedForm()]
     structures = [jax.tree.structure(x) for x in (*methods, *bare)]
     assert len(set(structures)) == len(structures)
@@ -74,34 +74,68 @@ def test_methods_and_laws_of_equal_fields_are_of_different_structure():
         assert jax.tree.structure(node) == tree
 
 
-def test_dormand_prince_meets_every_condition_of_order_five():
-    """One condition for each rooted tree of up to five nodes (Hairer, Norsett and Wanner I, II.2)."""
-    b, c = np.array(amb.DormandPrince.ROWS[-1]), np.array(amb.DormandPrince.TIMES)
-    A = np.array([[*row, *[0.0] * (6 - len(row))] for row in [(), *amb.DormandPrince.ROWS[:-1]]])
-    np.testing.assert_allclose(A.sum(1), c, atol=1e-15)
-    Ac, Ac2 = A @ c, A @ c**2
-    trees = {1: (b @ c**0, 1), 2: (b @ c, 2), 3: (b @ c**2, 3), 4: (b @ Ac, 6), 5: (b @ c**3, 4), 6: (b @ (c * Ac), 8)}
-    trees |= {7: (b @ Ac2, 12), 8: (b @ A @ Ac, 24), 9: (b @ c**4, 5), 10: (b @ (c**2 * Ac), 10), 11: (b @ Ac**2, 20)}
-    trees |= {12: (b @ (c * Ac2), 15), 13: (b @ (c * (A @ Ac)), 30), 14: (b @ A @ c**3, 20), 15: (b @ A @ (c * Ac), 40)}
-    trees |= {16: (b @ A @ Ac2, 60), 17: (b @ A @ A @ Ac, 120)}
-    for weight, density in trees.values():
-        assert weight == pytest.approx(1 / density, abs=1e-14)  # cancellation of terms up to 11
+def rooted_trees(most):
+    """Every rooted tree of up to `most` nodes, by its number of nodes; a tree is the sorted tuple of its branches."""
+    trees, size = {1: [()]}, {(): 1}
+    for n in range(2, most + 1):
+        # A tree of n nodes is one of fewer with one more branch at its root.
+        grown = {tuple(sorted((*tree, b))) for m in range(1, n) for tree in trees[n - m] for b in trees[m]}
+        trees[n] = sorted(grown)
+        size |= dict.fromkeys(grown, n)
+    return trees, size
 
 
-@pytest.mark.parametrize(("name", "substeps"), [("Euler", 16), ("RK4", 3), ("Rodas3", 6), ("DormandPrince", 2)])
-def test_order_on_the_closed_loop(name, substeps):
-    """Without noise a sample period is only a step: halving it halves the step, and compiles nothing."""
-    method, order = (FIXED | {"DormandPrince": (amb.DormandPrince, 5)})[name]
+def test_dop853_meets_every_condition_of_order_eight():
+    """One condition for each rooted tree (Hairer, Norsett and Wanner I, II.2): b . weights(tree) = 1 / density."""
+    b, c = np.array(amb.DOP853.ROWS[-1]), np.array(amb.DOP853.TIMES)
+    A = np.array([[*row, *[0.0] * (12 - len(row))] for row in [(), *amb.DOP853.ROWS[:-1]]])
+    trees, size = rooted_trees(8)
+
+    def weights(tree):
+        return np.prod([A @ weights(branch) for branch in tree], axis=0, initial=1.0) * np.ones(12)
+
+    def density(tree):
+        return size[tree] * np.prod([density(branch) for branch in tree])
+
+    np.testing.assert_allclose(A.sum(1), c, atol=4e-14)  # cancellation of terms up to 43
+    assert [len(trees[n]) for n in trees] == [1, 1, 2, 4, 9, 20, 48, 115]
+    for tree in (t for same in trees.values() for t in same):
+        assert b @ weights(tree) == pytest.approx(1 / density(tree), abs=1e-13)
+
+
+def test_dop853_on_a_problem_with_known_solution():
+    # From the first steps whose error falls steadily to the last with one well above rounding (2e-13); few points.
+    substeps = np.array([3, 4, 6, 8, 12])
+    errors = [curved_error(amb.DOP853(int(n))) for n in substeps]
+    assert slope(1 / substeps, errors) == pytest.approx(8, abs=0.7)
+
+
+@functools.cache
+def closed_loop():
+    """SMOOTH through TRACKING and its pulse by SciPy, z every 100 us."""
     bump = ("pulse", {"amplitude": 1.0, "start": 0.01, "stop": 0.02})
     smooth = ("adaptive", {"gamma": 1e9, "p": 25e-6, "i_ref": 0.0})
     world = World(inversion=smooth, reference=("sine", {"amplitude": 2.5e-3, "frequency": 2.0}), q_v=bump)
-    z = solve(world, np.arange(300) * 1e-4, rtol=1e-11)
+    return solve(world, np.arange(300) * 1e-4, rtol=1e-11)
+
+
+def closed_loop_error(method, finer=1):
+    run = amb.rollout(SMOOTH, TRACKING, amb.Clock(1200, 1e-4 / finer, method)).trajectory
+    return np.abs(run.rows.z[::finer][:300] - closed_loop()).max()
+
+
+@pytest.mark.parametrize(("name", "substeps"), [("Euler", 16), ("RK4", 3), ("Rodas3", 6)])
+def test_order_on_the_closed_loop(name, substeps):
+    """Without noise a sample period is only a step: halving it halves the step, and compiles nothing."""
+    method, order = FIXED[name]
     finer = np.array([1, 2, 4])
-    runs = [amb.rollout(SMOOTH, TRACKING, amb.Clock(1200, 1e-4 / n, method(substeps))).trajectory for n in finer]
-    errors = [np.abs(run.rows.z[::n][:300] - z).max() for n, run in zip(finer, runs, strict=True)]
+    errors = [closed_loop_error(method(substeps), n) for n in finer]
     # Steps of at most half of 1/slope (1.6e4 1/s), errors of 5e-8 to 8e-14, all above the oracle's; three points only.
-    # Dormand and Prince made the leading error small: higher terms still count at these steps.
-    assert order - 0.3 < slope(1 / finer, errors) < order + (0.7 if name == "DormandPrince" else 0.3)
+    assert slope(1 / finer, errors) == pytest.approx(order, abs=0.3)
+
+
+def test_dop853_takes_one_step_where_rk4_takes_eight():
+    assert closed_loop_error(amb.DOP853(1)) < closed_loop_error(amb.RK4(8))
 
 
 @every_fixed
