@@ -116,8 +116,8 @@ def peers() -> list[str]:
     lines = ["## Ensembles against other libraries (`peers.py`)", "", facts(data["machine"])]
     lines += [
         "One core, no noise; nanoseconds per member and 10 us simulated. Fixed-step peers take RK4 steps of 10 us and",
-        "are compared step for step; adaptive ones (tolerance 1e-6) with the coarsest ambjax step as accurate as",
-        f"they turn out to be, and with the coarsest that keeps 1e-6 of the largest z ({data['largest_z_m']:.1e} m).",
+        "are compared step for step; adaptive ones (tolerance 1e-6) with the cheapest of our steps as accurate as",
+        f"they turn out to be, and with the cheapest that keeps 1e-6 of the largest z ({data['largest_z_m']:.1e} m).",
         "",
     ]
     rows = []

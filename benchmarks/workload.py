@@ -51,9 +51,10 @@ class Workload(NamedTuple):
         """The same, pulse included, over another horizon."""
         return self._replace(clock=dataclasses.replace(self.clock, samples=samples))
 
-    def stepping(self, substeps: int) -> "Workload":
-        """The same with another step."""
-        return self._replace(clock=self.clock.with_method(RK4(substeps)))
+    def stepping(self, method: Any, samples: int = 1) -> "Workload":
+        """The same by another method, which takes so many samples as one. For noise-free workloads."""
+        period = self.clock.sample_period * samples
+        return self._replace(clock=Clock(self.clock.samples // samples, period, method))
 
     def few(self, members: int) -> "Workload":
         """Some of its members, spread evenly."""
