@@ -81,7 +81,7 @@ def options() -> dict[str, Any] | None:
     if jax.default_backend() != "cpu":
         return None
     if os.environ.get("AMBJAX_PLAIN", "0") not in ("", "0"):
-        log.warning("one-kernel path is off: AMBJAX_PLAIN is set. Results are the same, about ten times slower.")
+        log.warning("one-kernel path is off: AMBJAX_PLAIN is set. Results are the same, several times slower.")
         return None
     faults = []
     for tried in [WIDE, {}] if _has_avx512() else [{}]:
@@ -89,7 +89,7 @@ def options() -> dict[str, Any] | None:
         if not fault:
             return tried
         faults.append(fault)
-    log.warning("one-kernel path is off, runs are about ten times slower: %s", "; ".join(faults))
+    log.warning("one-kernel path is off, runs are several times slower: %s", "; ".join(faults))
     return None
 
 

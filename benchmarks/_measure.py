@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -30,8 +30,28 @@ def median_time(run: Callable[[], Any], repeats: int = 7) -> float:
     return statistics.median(times)
 
 
-def alternating(runs: dict[str, Callable[[], Any]], repeats: int = 5) -> dict[str, dict[str, float]]:
-    """Median seconds of each run, taken in turn so that all see the same machine; and what the first call added."""
+class Timed(NamedTuple):
+    """Seconds of a run in each round, and what its first call took."""
+
+    times: list[float]
+    first: float
+
+    @property
+    def seconds(self) -> float:
+        return statistics.median(self.times)
+
+    @property
+    def compile_s(self) -> float:
+        """What the first call added."""
+        return max(self.first - self.seconds, 0.0)
+
+    def over(self, other: "Timed") -> float:
+        """Median over rounds of this time over the other's: spells in which the machine is slow cancel."""
+        return statistics.median(a / b for a, b in zip(self.times, other.times, strict=True))
+
+
+def alternating(runs: dict[Any, Callable[[], Any]], repeats: int = 5) -> dict[Any, Timed]:
+    """Times of each run, taken in turn, round by round, so that all see the same machine."""
     first, times = {}, {name: [] for name in runs}
     for name, run in runs.items():
         began = time.perf_counter()
@@ -42,8 +62,7 @@ def alternating(runs: dict[str, Callable[[], Any]], repeats: int = 5) -> dict[st
             began = time.perf_counter()
             jax.block_until_ready(run())
             times[name].append(time.perf_counter() - began)
-    medians = {name: statistics.median(found) for name, found in times.items()}
-    return {name: {"seconds": t, "compile_s": max(first[name] - t, 0.0)} for name, t in medians.items()}
+    return {name: Timed(times[name], first[name]) for name in runs}
 
 
 def child(script: str, *arguments: Any, **environment: str) -> Any:

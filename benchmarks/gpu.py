@@ -41,8 +41,9 @@ def measure(dtype: str, members: tuple[int, ...], samples: int) -> list[dict[str
             error = float(np.abs(np.asarray(run()) / expected - 1).max())
             assert error <= ALLOWED[dtype], f"{name} in {dtype} differs from the scan by {error:.1e}"
         for name, found in _measure.alternating(runs, repeats=3).items():
-            rate = n * work.steps / found["seconds"]
-            rows.append({"dtype": dtype, "noise": noise, "members": n, "run": name, "steps_per_s": rate, **found})
+            rate = n * work.steps / found.seconds
+            row = {"dtype": dtype, "noise": noise, "members": n, "run": name, "steps_per_s": rate}
+            rows.append(row | {"seconds": found.seconds, "compile_s": found.compile_s})
     return rows
 
 

@@ -108,9 +108,9 @@ def measure(name: str, build: Callable[..., Any], members: int) -> dict[str, Any
         del compiled["reverse"]
     runs = {mode: functools.partial(f, np.zeros(len(GAINS)), member) for mode, f in compiled.items()}
     found = _measure.alternating(runs, repeats=9)
-    row: dict[str, Any] = {"step": name, "members": members, "steps": steps, "run_s": found["run"]["seconds"]}
+    row: dict[str, Any] = {"step": name, "members": members, "steps": steps, "run_s": found["run"].seconds}
     for mode in ("forward", "reverse"):
-        row[mode] = found[mode]["seconds"] / row["run_s"] if mode in found else None
+        row[mode] = found[mode].over(found["run"]) if mode in found else None
     each = 1e9 * row["run_s"] / members / steps
     told = f"{name}, {members} members: run {each:.0f} ns a step; gradient in forward mode "
     if row["reverse"]:

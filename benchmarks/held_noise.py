@@ -45,13 +45,13 @@ def measure(noise: float) -> dict[str, Any]:
         rows.append({"method": str(method), "relative_error": float(error)})
     found = _measure.alternating({str(m): functools.partial(run, m, 0) for m in METHODS}, repeats=7)
     for row in rows:
-        row["seconds"] = found[row["method"]]["seconds"]
+        row["seconds"] = found[row["method"]].seconds
         print(f"noise x {noise:g}: {row['method']:<32} {row['relative_error']:.1e} {1e3 * row['seconds']:6.1f} ms")
     best = {}
     for kind in ("RK4", "DOP853"):
         good = [r for r in rows if r["method"].startswith(kind) and r["relative_error"] <= TARGET]
         best[kind] = min(good, key=lambda r: r["seconds"]) if good else None
-    ratio = best["DOP853"]["seconds"] / best["RK4"]["seconds"] if all(best.values()) else None
+    ratio = found[best["DOP853"]["method"]].over(found[best["RK4"]["method"]]) if all(best.values()) else None
     print(f"noise x {noise:g}, at {TARGET:g}: DOP853 takes {ratio or float('nan'):.2f} of RK4's time", flush=True)
     return {"noise": noise, "methods": rows, "best": best, "ratio": ratio}
 

@@ -16,6 +16,8 @@ import itertools
 import json
 import math
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -35,6 +37,7 @@ from ambjax.ensemble import run_ensemble
 
 MEMBERS, SAMPLES, INSTANTS, CHECKED = 1024, 500, 10, 8
 TOLERANCE = 1e-6
+PLAIN = "ambjax, plain scan"
 # Methods, and how many samples of the workload they take as one.
 OURS = ((RK4(10), 1), (RK4(5), 1), (DOP853(1), 1), (RK4(2), 1), (RK4(7), 5), (RK4(1), 1))
 # z of every member at each instant, [instants, N]
@@ -165,24 +168,39 @@ def diffrax_run(work: Workload) -> Any:
     return jnp.transpose(diffrax_program(tuple(spans(work)), times)(jnp.asarray(work.scenario.initial.z)))
 
 
-def timed(name: str, run: Callable[[], Any], work: Workload, error: float, repeats: int = 3) -> dict[str, Any]:
-    """One row: nanoseconds per member and 10 us simulated, and the first call's extra time."""
-    found = _measure.alternating({name: run}, repeats)[name]
-    each = 1e9 * found["seconds"] / work.members / (work.clock.samples * work.clock.sample_period / 1e-5)
-    return {"members": work.members, "ns": each, "error_m": error, "compile_s": found["compile_s"]}
+def per_member(work: Workload) -> float:
+    """What turns seconds of a run into nanoseconds per member and 10 us simulated."""
+    return 1e9 / work.members / (work.clock.samples * work.clock.sample_period / 1e-5)
 
 
-def plain(members: int) -> dict[str, Any]:
-    """Our own fall-back: the engine without its fast path, in this process."""
-    work = workload.workload(members, SAMPLES)
-    reference = scipy_run(work.few(CHECKED), "DOP853", 1e-12)
-    error = float(np.abs(ours(work.few(CHECKED)) - reference).max())
-    return timed("plain", lambda: workload.ours(work), work, error)
+def serve() -> None:
+    """Run our engine once for each line on standard input, and answer each with z at the instants, of few members."""
+    work = workload.workload(MEMBERS, SAMPLES)
+    z = json.dumps(ours(work.few(CHECKED)).tolist())
+    for _ in sys.stdin:
+        workload.ours(work)
+        print(z, flush=True)
+
+
+class Plain:
+    """Our own fall-back: the engine without its fast path, which a process has or has not for its whole life."""
+
+    def __init__(self) -> None:
+        command, environment = [sys.executable, __file__, "--serve"], os.environ | {"AMBJAX_PLAIN": "1"}
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, text=True)
+
+    def __call__(self, work: Workload) -> Any:
+        assert self.process.stdin
+        assert self.process.stdout
+        print(file=self.process.stdin, flush=True)
+        return np.array(json.loads(self.process.stdout.readline()))
 
 
 def peers() -> dict[str, tuple[Run, int, Run]]:
     """By name: what gives z at the instants, how many members it gets, and what is timed."""
-    found: dict[str, tuple[Run, int, Run]] = {}
+    fallback = Plain()
+    found: dict[str, tuple[Run, int, Run]] = {PLAIN: (fallback, MEMBERS, fallback)}
     if why := limit.missing():
         print(f"{why}: skipped")
     else:
@@ -208,11 +226,11 @@ def ours_named(method: Any, samples: int) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--plain", action="store_true", help="measure the fall-back alone and print JSON")
+    parser.add_argument("--serve", action="store_true", help="run our engine for each line on standard input")
     asked = parser.parse_args()
     _measure.one_core()
-    if asked.plain:
-        print(json.dumps(plain(MEMBERS)))
+    if asked.serve:
+        serve()
         return
     work = workload.workload(MEMBERS, SAMPLES)
     few = work.few(CHECKED)
@@ -221,20 +239,29 @@ def main() -> None:
     def error(run: Run, work: Workload) -> float:
         return float(np.abs(np.asarray(run(work)) - reference).max())
 
-    rows = {}
+    rows, runs, scales = {}, {}, {}
     for each in OURS:
-        run = functools.partial(workload.ours, work.stepping(*each))
-        rows[ours_named(*each)] = timed("ambjax", run, work, error(ours, few.stepping(*each)))
-    rows["ambjax, plain scan"] = _measure.child(__file__, "--plain", AMBJAX_PLAIN="1")
+        name = ours_named(*each)
+        runs[name] = functools.partial(workload.ours, work.stepping(*each))
+        scales[name] = per_member(work)
+        rows[name] = {"members": MEMBERS, "error_m": error(ours, few.stepping(*each))}
     for name, (run, members, clocked) in peers().items():
         given = work if members == work.members else work.few(members)
-        rows[name] = timed(name, functools.partial(clocked, given), given, error(run, few))
-    compare(rows, float(np.abs(reference).max()))
+        runs[name], scales[name] = functools.partial(clocked, given), per_member(given)
+        rows[name] = {"members": members, "error_m": error(run, few)}
+    found = _measure.alternating(runs, repeats=7)
+    for name, row in rows.items():
+        row |= {"ns": found[name].seconds * scales[name], "compile_s": found[name].compile_s}
+
+    def ratio(a: str, b: str) -> float:
+        return found[a].over(found[b]) * scales[a] / scales[b]
+
+    compare(rows, float(np.abs(reference).max()), ratio)
     report(rows)
     _measure.write("peers", {"samples": SAMPLES, "largest_z_m": float(np.abs(reference).max()), "rows": rows})
 
 
-def compare(rows: dict[str, dict[str, Any]], largest: float) -> None:
+def compare(rows: dict[str, dict[str, Any]], largest: float, ratio: Callable[[str, str], float]) -> None:
     """How many times faster ambjax is: at the same step, or at no larger error; and at 1e-6 for adaptive peers."""
     steps = [ours_named(*each) for each in OURS]
 
@@ -245,8 +272,8 @@ def compare(rows: dict[str, dict[str, Any]], largest: float) -> None:
         row["against"] = steps[0]
         if "1e-6" in name:
             row["against"] = fastest(1.1 * max(row["error_m"], 1e-12))
-            row["ratio_at_1e-6"] = row["ns"] / rows[fastest(1e-6 * largest)]["ns"]
-        row["ratio"] = row["ns"] / rows[row["against"]]["ns"]
+            row["ratio_at_1e-6"] = ratio(name, fastest(1e-6 * largest))
+        row["ratio"] = ratio(name, row["against"])
 
 
 def report(rows: dict[str, dict[str, Any]]) -> None:

@@ -98,17 +98,11 @@ def throughput() -> list[str]:
     for row in data["rows"]:
         named = [row["dtype"], "held" if row["noise"] else "none", str(row["members"]), str(row["threads"])]
         limit = [f"{row['C']:.2f}", f"{row['ratio']:.2f}"] if "C" in row else ["", ""]
-        rows.append([*named, f"{row['ambjax']:.2f}", *limit, f"{1e9 / row['ambjax']:.2e}"])
-    lines += table("precision | noise | members | cores | ambjax (ns) | limit (ns) | ratio | member-steps/s", rows)
-    pairs = {(r["dtype"], r["noise"], r["members"], r["threads"]): r["ambjax"] for r in data["rows"]}
-    most = max(row["members"] for row in data["rows"])
-    for (dtype, noise, members, threads), ns in pairs.items():
-        if threads == 2 and members == most:
-            gain = pairs[dtype, noise, members, 1] / ns
-            lines.append(
-                f"Two cores, {dtype}, {'held' if noise else 'no'} noise, {members} members: {gain:.2f} times one."
-            )
-    return [*lines, ""]
+        gain = f"{row['times_one_core']:.2f}"
+        rows.append([*named, f"{row['ambjax']:.2f}", *limit, gain, f"{1e9 / row['ambjax']:.2e}"])
+    titles = "precision | noise | members | cores | ambjax (ns) | limit (ns) | ratio | times one core | member-steps/s"
+    lines += table(titles, rows)
+    return lines
 
 
 def peers() -> list[str]:

@@ -27,8 +27,8 @@ def point(members: int, samples: int) -> dict[str, Any]:
     work = workload.workload(members, samples, noise=True)
     found = _measure.alternating({"run": lambda: workload.ours(work)}, repeats=3)["run"]
     peak = _measure.peak_memory()
-    each = 1e9 * found["seconds"] / members / work.steps
-    return {"members": members, "samples": samples, "seconds": found["seconds"], "ns": each, "peak_bytes": peak}
+    each = 1e9 * found.seconds / members / work.steps
+    return {"members": members, "samples": samples, "seconds": found.seconds, "ns": each, "peak_bytes": peak}
 
 
 def main() -> None:

@@ -1,8 +1,8 @@
 """Member-steps per second of an ensemble against the number of members, next to the machine's limit.
 
 The workload of workload.py (RK4, 10 us a step), without and with held noise, float64 and float32 (a process of
-its own for each precision), one core and two. Each of our times stands beside that of limit.c, both taken in
-turn in the same process; ratios are between their medians, compilation apart. One member alone is a `rollout`.
+its own for each precision), one core and two. Our times and those of limit.c, on one core and on two, are taken
+in turn in the same process; ratios are medians over the rounds, compilation apart. One member alone is a `rollout`.
 Run: python benchmarks/throughput.py
 """
 
@@ -22,25 +22,27 @@ import workload
 MEMBERS = (1, 16, 64, 256, 1024, 4096)
 THREADS = (1, 2)
 SAMPLES = 500
+REPEATS = 15
 
 
 def measure(dtype: str, members: tuple[int, ...], samples: int) -> list[dict[str, Any]]:
     """One row per number of members, threads and kind of noise."""
     rows = []
-    for noise, n, threads in itertools.product((False, True), members, THREADS):
-        if threads > n:
-            continue
-        work = workload.workload(n, samples, noise=noise)
-        runs = {"ambjax": functools.partial(workload.ours, work, threads)}
-        if not limit.missing():
-            runs["C"] = functools.partial(limit.run, work, dtype, threads)
-        found = _measure.alternating(runs)
-        row: dict[str, Any] = {"dtype": dtype, "noise": noise, "members": n, "threads": threads}
-        row |= {name: 1e9 * each["seconds"] / n / work.steps for name, each in found.items()}
-        row["compile_s"] = found["ambjax"]["compile_s"]
-        if "C" in row:
-            row["ratio"] = row["ambjax"] / row["C"]
-        rows.append(row)
+    for noise, n in itertools.product((False, True), members):
+        work, runs = workload.workload(n, samples, noise=noise), {}
+        for threads in (t for t in THREADS if t <= n):
+            runs["ambjax", threads] = functools.partial(workload.ours, work, threads)
+            if not limit.missing():
+                runs["C", threads] = functools.partial(limit.run, work, dtype, threads)
+        found = _measure.alternating(runs, REPEATS)
+        for threads in (t for t in THREADS if t <= n):
+            ours = found["ambjax", threads]
+            row: dict[str, Any] = {"dtype": dtype, "noise": noise, "members": n, "threads": threads}
+            row |= {name: 1e9 * each.seconds / n / work.steps for (name, t), each in found.items() if t == threads}
+            row |= {"compile_s": ours.compile_s, "times_one_core": found["ambjax", 1].over(ours)}
+            if "C" in row:
+                row["ratio"] = ours.over(found["C", threads])
+            rows.append(row)
     return rows
 
 
