@@ -92,13 +92,14 @@ def throughput() -> list[str]:
     lines += [
         f"RK4, 10 us a step, {data['samples']} samples of 10 steps; ns per member and step, compilation apart.",
         "The limit is a C program with SIMD (`limit.c`), run in turn with ambjax. One member alone is a `rollout`.",
+        "Times one core: how many times faster than on one; in brackets the limit.",
         "",
     ]
     rows = []
     for row in data["rows"]:
         named = [row["dtype"], "held" if row["noise"] else "none", str(row["members"]), str(row["threads"])]
         limit = [f"{row['C']:.2f}", f"{row['ratio']:.2f}"] if "C" in row else ["", ""]
-        gain = f"{row['times_one_core']:.2f}"
+        gain = f"{row['times_one_core']:.2f}" + (f" ({row['C_times_one_core']:.2f})" if "C" in row else "")
         rows.append([*named, f"{row['ambjax']:.2f}", *limit, gain, f"{1e9 / row['ambjax']:.2e}"])
     titles = "precision | noise | members | cores | ambjax (ns) | limit (ns) | ratio | times one core | member-steps/s"
     lines += table(titles, rows)

@@ -41,7 +41,8 @@ def measure(dtype: str, members: tuple[int, ...], samples: int) -> list[dict[str
             row |= {name: 1e9 * each.seconds / n / work.steps for (name, t), each in found.items() if t == threads}
             row |= {"compile_s": ours.compile_s, "times_one_core": found["ambjax", 1].over(ours)}
             if "C" in row:
-                row["ratio"] = ours.over(found["C", threads])
+                limit_s = found["C", threads]
+                row |= {"ratio": ours.over(limit_s), "C_times_one_core": found["C", 1].over(limit_s)}
             rows.append(row)
     return rows
 

@@ -71,10 +71,12 @@ class Judge:
 def cma_es(judge: Judge, seed: int) -> None:
     import cma
 
-    strategy = cma.CMAEvolutionStrategy(np.full(len(judge.low), 0.5), 0.25, {"seed": seed + 1, "verbose": -9})
+    dice, quiet = np.random.default_rng(seed), {"seed": seed + 1, "verbose": -9}
+    strategy = cma.CMAEvolutionStrategy(np.full(len(judge.low), 0.5), 0.25, quiet)
     while True:  # until the budget ends; CMA's own criteria may end it before, and then it begins again
         if strategy.stop():
-            strategy = cma.CMAEvolutionStrategy(np.random.default_rng(judge.spent).uniform(size=len(judge.low)), 0.25)
+            quiet["seed"] += 1000
+            strategy = cma.CMAEvolutionStrategy(dice.uniform(size=len(judge.low)), 0.25, quiet)
         asked = strategy.ask()
         strategy.tell(asked, judge(np.array(asked)).tolist())
 
