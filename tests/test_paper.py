@@ -7,7 +7,7 @@ import types
 import numpy as np
 import pytest
 
-from ambjax import Adaptive, ledger, paper, rollout
+from ambjax import Adaptive, claims, paper, rollout
 from ambjax.__main__ import main
 from ambjax.evidence import NOISE_STDS, STEPS, Noise
 
@@ -30,7 +30,7 @@ def test_noise_scan_is_read_correctly():
 
 def test_verdicts_follow_the_evidence():
     """Each verdict turns when its number crosses the criterion: nothing is typed in."""
-    claims = {c.says: c.judge for c in ledger.CLAIMS}
+    judges = {c.says: c.judge for c in claims.CLAIMS}
 
     def tracking(error, lost=False):
         metrics = {"lost": lost, "lost_at_s": 0.01, "settled_max_abs_error_m": error}
@@ -38,16 +38,16 @@ def test_verdicts_follow_the_evidence():
         run = types.SimpleNamespace(metrics=metrics, trajectory=types.SimpleNamespace(lost_why="touched down"))
         return types.SimpleNamespace(tracking=run, check_tracking=types.SimpleNamespace(conditions=[condition]))
 
-    judge = claims["Tracking: largest error 2.3e-5 m"]
-    assert judge(tracking(2.3e-5)).verdict == ledger.HOLDS
-    assert judge(tracking(2.4e-5)).verdict == ledger.FAILS
+    judge = judges["Tracking: largest error 2.3e-5 m"]
+    assert judge(tracking(2.3e-5)).verdict == claims.HOLDS
+    assert judge(tracking(2.4e-5)).verdict == claims.FAILS
     lost = judge(tracking(1e-6, lost=True))
-    assert lost.verdict == ledger.FAILS
+    assert lost.verdict == claims.FAILS
     assert "gamma = 1000 < Delta_1 = 6e+04" in lost.cause
 
-    judge = claims["All this under sensor noise of variance 1e-7"]
+    judge = judges["All this under sensor noise of variance 1e-7"]
     levels = len(NOISE_STDS)
-    for scans, verdict in (([levels, levels], ledger.HOLDS), ([3, 3], ledger.FAILS), ([levels, 3], ledger.OPEN)):
+    for scans, verdict in (([levels, levels], claims.HOLDS), ([3, 3], claims.FAILS), ([levels, 3], claims.OPEN)):
         assert judge(types.SimpleNamespace(noise=[noise(n) for n in scans])).verdict == verdict
 
 
@@ -61,22 +61,22 @@ def test_reproduce(tmp_path, monkeypatch):
             assert (folder / f"figure_{number}.png").read_bytes().startswith(b"\x89PNG")
     written = json.loads((out / "ledger.json").read_text())
     found = {c["says"]: c["findings"] for c in written["claims"]}
-    assert len(found) == len(ledger.CLAIMS)
+    assert len(found) == len(claims.CLAIMS)
     verdicts = {f["verdict"] for both in found.values() for f in both.values()}
-    assert verdicts <= {ledger.HOLDS, ledger.FAILS, ledger.OPEN}
+    assert verdicts <= {claims.HOLDS, claims.FAILS, claims.OPEN}
     error = found["Tracking: largest error 2.3e-5 m"]["repaired"]
-    assert error["verdict"] == ledger.HOLDS
+    assert error["verdict"] == claims.HOLDS
     assert 2.2e-5 < error["value"] < 2.4e-5
     assert found["Regulation is insensitive to the pulse"]["repaired"]["value"] == pytest.approx(2.08e-5, rel=0.01)
-    assert found["Theorem 1's conditions hold under Table 2"]["literal"]["verdict"] == ledger.FAILS
+    assert found["Theorem 1's conditions hold under Table 2"]["literal"]["verdict"] == claims.FAILS
     assert found["Tracking: largest error 2.3e-5 m"]["literal"]["value"] is None
     # the tuned gains hold the rotor in the paper's noise, at less than half the error that the paper claims
     error = found["Tracking: largest error 2.3e-5 m"]["tuned"]
-    assert error["verdict"] == ledger.HOLDS
+    assert error["verdict"] == claims.HOLDS
     assert error["value"] < 1e-5
-    assert found["All this under sensor noise of variance 1e-7"]["tuned"]["verdict"] == ledger.HOLDS
+    assert found["All this under sensor noise of variance 1e-7"]["tuned"]["verdict"] == claims.HOLDS
     page = (out / "ledger.md").read_text()
-    assert all(dataclasses.asdict(c)["says"] in page for c in ledger.CLAIMS)
+    assert all(dataclasses.asdict(c)["says"] in page for c in claims.CLAIMS)
 
 
 @pytest.mark.slow
