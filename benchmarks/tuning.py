@@ -4,6 +4,7 @@ One rollout is one member simulated once; a gradient of m gains counts m + 1. Ea
 knowledge: the case's gains and the ranges of the screen; each seed changes what is random in the method, not the
 members. The budget is what the search by gradients took in the median (the derivative-free methods get `--times`
 as much); best so far is the loss over the training members, stressed ones included, at the search's own steps.
+Results of tasks and methods that are not asked for stay in the JSON.
 Run: python benchmarks/tuning.py [--tasks A B C D E] [--seeds 5] [--times 1] [--methods CMA-ES ...]
 """
 
@@ -183,14 +184,15 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=list("ABCDE"))
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--times", type=float, default=1.0)
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
+    parser.add_argument("--methods", nargs="*", default=list(METHODS), choices=list(METHODS))
     given = parser.parse_args()
     warnings.simplefilter("ignore")
     name = "tuning" if given.times == 1 else f"tuning_x{given.times:g}"
     path = _measure.RESULTS / f"{name}.json"
     results = json.loads(path.read_text())["tasks"] if path.exists() else {}
-    for each in given.tasks:  # hours in all: what is measured is written at once, and other tasks' results stay
-        results[each] = task(each, given.seeds, given.times, given.methods)
+    for each in given.tasks:  # hours in all: what is measured is written at once; other tasks and methods stay
+        found, kept = task(each, given.seeds, given.times, given.methods), results.get(each, {})
+        results[each] = found | {name: kept.get(name, {}) | found[name] for name in ("traces", "final")}
         _measure.write(name, {"tasks": dict(sorted(results.items()))})
 
 

@@ -105,6 +105,7 @@ def test_stressed_members_hear_more_and_count_by_being_held():
     np.testing.assert_allclose(who.shift, np.log(1.25) * np.array([[0.0], [0.0], [1.0], [-1.0]]) * np.ones(4))
     # one in four of 20 and of 6, but no fewer than 4 of either
     assert problem.training(5, 20, 6, 1.5, 1.25).part(4).member.tolist() == [0, 1, 2, 3, 4, 20, 21, 22, 23]
+    assert problem.training(5, 20, 6, 1.5, 1.25).part(4, 1).member.tolist() == [0, 1, 2, 3, 4, *range(20, 26)]
     assert problem.training(5, 2, 1, 1.5, 1.25).part(4).member.tolist() == [0, 1, 2]
     terms = {name: np.ones((1, 4)) for name in TERMS}
     np.testing.assert_allclose(weigh(WEIGHTS, terms, who.stressed)[0], [1.1 * 1.3 + 1.001] * 2 + [1.001] * 2)

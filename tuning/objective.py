@@ -60,10 +60,13 @@ class Members(NamedTuple):
         more, n = others._replace(stressed=np.ones(len(others.stressed), bool)), self.ordinary
         return jax.tree.map(lambda a, b: np.concatenate([a[:n], b, a[n:]]), self, more)
 
-    def part(self, share: int) -> "Members":
-        """The first of either kind, one in `share`, but FEWEST at least: ordinary ones, then those asked to be held."""
-        kinds = self.ordinary, len(self.stressed) - self.ordinary
-        few, some = (max(count // share, min(FEWEST, count)) for count in kinds)
+    def part(self, share: int, held: int | None = None) -> "Members":
+        """The first of either kind, FEWEST at least: ordinary ones, one in `share`, then those asked to be held.
+
+        Of these one in `held`; left out: one in `share` too.
+        """
+        kinds = (self.ordinary, share), (len(self.stressed) - self.ordinary, held or share)
+        few, some = (max(count // each, min(FEWEST, count)) for count, each in kinds)
         index = np.concatenate([np.arange(few), np.arange(self.ordinary, self.ordinary + some)])
         return jax.tree.map(lambda a: a[index], self)
 

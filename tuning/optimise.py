@@ -31,14 +31,17 @@ COUNTS = ("iteration", "phase", "since", "seconds")
 
 
 class Phase(NamedTuple):
-    """One member in `part` is asked; finished when the goal fell by less than `stall` over `patience` iterations."""
+    """One ordinary member in `part` is asked, and all that are to be held: what loses them is a cliff.
+
+    Finished when the goal fell by less than `stall` over `patience` iterations.
+    """
 
     part: int
     stall: float
     patience: int
 
 
-# On few members first: what they ask is nearly what all ask, at a quarter of the cost.
+# On few members first: what they ask is nearly what all ask, at less than half of the cost.
 FEW, ALL = Phase(4, 0.02, 3), Phase(1, 1e-3, 4)
 
 
@@ -134,7 +137,7 @@ def search(
                 _go_on_with_all(engine, goal, who, kept, descent, given)
             before = kept.seconds
             phase = phases[kept.phase]
-            iterate(engine, goal, who.part(phase.part), kept, descent)
+            iterate(engine, goal, who.part(phase.part, 1), kept, descent)
             kept.active = _going_on(kept, phase)
             kept.seconds = kept.earlier + time.perf_counter() - began
             keeper.save(kept)
