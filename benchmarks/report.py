@@ -199,7 +199,8 @@ def tuning() -> list[str]:
     for path in sorted(_measure.RESULTS.glob("tuning*.json")):
         data = load(path.stem)
         times = next(iter(data["tasks"].values()))["times"]
-        lines += ["The gradients' own budget." if times == 1 else f"{times:g} times it.", facts(data["machine"]), ""]
+        told = "The gradients' own budget." if times == 1 else f"{times:g} times it, as it was when the rivals ran."
+        lines += [told, facts(data["machine"]), ""]
         rows = [row for task, found in data["tasks"].items() for row in _searches(task, found)]
         lines += table("task | method | loss | rollouts | time (s) | reached", rows)
     return lines
@@ -214,7 +215,7 @@ def _searches(task: str, found: dict[str, Any]) -> list[list[str]]:
         first = statistics.median_high(next((n for n, _, best in trace if best <= goal), math.inf) for trace in traces)
         seconds = statistics.median_high(trace[-1][1] for trace in traces)
         spent, reached = f"{traces[0][-1][0]:,}", f"{first:,}" if math.isfinite(first) else "-"
-        loss = f"{middle:.3e} ({low:.3e} to {high:.3e}, {len(values)} seeds)"
+        loss = f"{middle:.3e} ({low:.3e} to {high:.3e}, seeds: {len(values)})"
         rows.append([task, method, loss, spent, f"{seconds:.0f}", reached])
     return rows
 
