@@ -1,7 +1,6 @@
-"""The rollout: rows, folds, noise, the fate of the rotor, the paper's numbers, and no recompilation."""
+"""The rollout: rows, folds, members, the fate of the rotor, the paper's numbers, float32 and the fast path."""
 
 import dataclasses
-import logging
 import os
 import pathlib
 import subprocess
@@ -11,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
 
 from ambjax import (
     RK4,
@@ -32,7 +30,6 @@ from ambjax import (
 )
 from ambjax._kernel import one_kernel
 from ambjax.explicit import Euler
-from ambjax.gaussian import normals, threefry
 from ambjax.metrics import Lowest, Mean, Named, Peak, Reaching, Rms, Variation
 from ambjax.trajectory import DIVERGED, TOUCHED, Row
 
@@ -217,41 +214,7 @@ def test_folds_equal_numpy_on_the_recorded_rows(run, request):
             np.testing.assert_allclose(y, x, rtol=1e-12, err_msg=key)
 
 
-# --- noise ---
-
-
-def test_noise_is_held_per_sample_and_gaussian():
-    # long enough for statistics without a rollout: the hold of 20,000 samples of one member
-    scenario = dataclasses.replace(NOISY, seed=3, member=1)
-    w = jax.jit(jax.vmap(lambda k: scenario.sensor.noise(scenario.words(), k)))(jnp.arange(20_000))
-    for x, std in zip(w, (1e-6, 1e-4, 1e-4), strict=True):
-        x = np.asarray(x) / std
-        # five standard errors: 5/sqrt(20000) of mean and of autocorrelation, 5/sqrt(40000) of the deviation
-        assert abs(np.mean(x)) < 0.036
-        assert abs(np.std(x) - 1) < 0.025
-        assert abs(np.mean(x[1:] * x[:-1])) < 0.036
-    assert abs(np.mean(np.asarray(w.z) * np.asarray(w.i))) / 1e-10 < 0.036
-
-
-def test_words_are_those_of_jax_random():
-    """Threefry is written out, since kernels on accelerators cannot call jax.random; fold_in shows that it is it."""
-    scenario = dataclasses.replace(NOISY, seed=5, member=2**31 + 9)
-    for number in (0, 1, 77, 2**32 - 1):
-        expected = jax.random.key_data(jax.random.fold_in(scenario.key(), np.uint32(number)))
-        np.testing.assert_array_equal(jnp.stack(threefry(scenario.words(), (0, np.uint32(number)))), expected)
-
-
-@pytest.mark.parametrize("x64", [True, False])
-def test_normal_numbers_are_normal(x64):
-    """Against the distribution itself: Kolmogorov's and Smirnov's test, and the tail beyond 4."""
-    with jax.enable_x64(x64):
-        drawn = jax.jit(jax.vmap(lambda k: normals(Scenario(seed=1).words(), k)))(jnp.arange(400_000))
-        for w in map(np.asarray, drawn):
-            assert w.dtype == (np.float64 if x64 else np.float32)
-            # one in 1,000 fails by chance, and the seed is fixed
-            assert stats.kstest(w.astype(float), "norm").pvalue > 1e-3
-            # 25 expected; Poisson's five standard deviations
-            assert 0 < np.sum(np.abs(w) > 4) < 51
+# --- members ---
 
 
 def test_rows_carry_the_noise_of_their_sample(short):
@@ -263,21 +226,6 @@ def test_rows_carry_the_noise_of_their_sample(short):
 
 def with_member(member, seed=0):
     return dataclasses.replace(NOISY, seed=jnp.asarray(seed), member=jnp.asarray(member))
-
-
-def test_member_k_draws_the_same_noise_alone_and_in_a_batch():
-    def noise(member, seed):
-        scenario = with_member(member, seed)
-        return jax.vmap(lambda k: scenario.sensor.noise(scenario.words(), k))(jnp.arange(50))
-
-    alone, batch = jax.jit(noise), jax.jit(jax.vmap(noise, (0, None)))(jnp.arange(5), 7)
-    for m in range(5):
-        same(alone(m, 7), jax.tree.map(lambda x, m=m: x[m], batch))
-    rows = np.asarray(batch.z)
-    assert len(set(rows.ravel())) == rows.size
-    assert np.max(np.abs(np.corrcoef(rows) - np.eye(5))) < 0.7  # 5/sqrt(50)
-    # another seed draws other noise for the same member
-    assert not np.any(np.asarray(alone(0, 8).z) == rows[0])
 
 
 def test_vmap_equals_the_loop_over_members():
@@ -427,93 +375,6 @@ def test_bad_input_is_refused_with_its_path(change, path):
 def test_the_method_is_not_chosen_from_traced_gains():
     with pytest.raises(ValueError, match="with_method"):
         jax.jit(lambda c: rollout(c, TRACKING, Clock(10, 1e-4)))(REPAIRED)
-
-
-# --- compilation ---
-
-
-class Compilations(logging.Handler):
-    """Counts what JAX traces and compiles while it is attached."""
-
-    def __enter__(self):
-        self.seen = []
-        self.logger = logging.getLogger("jax._src.interpreters.pxla")
-        self.before = (self.logger.level, self.logger.propagate)
-        self.logger.addHandler(self)
-        self.logger.setLevel(logging.DEBUG)
-        self.logger.propagate = False
-        return self
-
-    def emit(self, record):
-        message = record.getMessage()
-        if message.startswith("Compiling") and ("outer" in message or "_run" in message):
-            self.seen.append(message[:80])
-
-    def __exit__(self, *_):
-        self.logger.removeHandler(self)
-        self.logger.level, self.logger.propagate = self.before
-
-
-class Counting(position.SlidingMode):
-    """The sliding-mode law, counting how often it is traced."""
-
-    traces = 0
-
-    def __call__(self, model, inputs, state):
-        Counting.traces += 1
-        return super().__call__(model, inputs, state)
-
-
-jax.tree_util.register_dataclass(Counting)
-
-
-def variations():
-    """The same structure with other numbers, and the same numbers in other types."""
-    law, world = Counting(), NOISY
-    yield "gains", Counting(c=20.0, k=26.0, p=20.0), inversion.Adaptive(gamma=8e4), world
-    yield "plant", law, inversion.Adaptive(), dataclasses.replace(world, plant=Plant(m=0.6, g=9.8))
-    yield "amplitude", law, inversion.Adaptive(), dataclasses.replace(world, reference=Sine(1e-3, 1.0))
-    yield "noise", law, inversion.Adaptive(), dataclasses.replace(world, sensor=Sensor(2e-6, 0.0, 0.0))
-    yield "seed", law, inversion.Adaptive(), dataclasses.replace(world, seed=5, member=2)
-    yield "limit", law, inversion.Adaptive(), dataclasses.replace(world, u_max=100.0)
-    yield "NumPy", Counting(np.float64(20.0), np.float32(25.0), np.asarray(25.0)), inversion.Adaptive(), world
-    yield "JAX", Counting(jnp.asarray(20.0), jnp.float32(25.0), 25.0), inversion.Adaptive(), world
-    yield "JAX seed", law, inversion.Adaptive(), dataclasses.replace(world, seed=jnp.asarray(5), member=np.int64(2))
-
-
-@pytest.fixture(scope="module")
-def warm():
-    """One rollout with the counting law, compiled."""
-    return rollout(Cascade(position=Counting()), NOISY, SHORT, every=0)
-
-
-@pytest.mark.parametrize("what", list(variations()), ids=lambda x: x[0])
-def test_other_numbers_never_recompile(what, warm):
-    _, law, invert, scenario = what
-    before = Counting.traces
-    with Compilations() as compilations:
-        rollout(Cascade(position=law, inversion=invert), scenario, SHORT, every=0)
-    assert Counting.traces == before
-    assert not compilations.seen
-
-
-@pytest.mark.parametrize(
-    "what",
-    [
-        (Counting(c=20, k=26, p=20), NOISY),
-        (Counting(c=np.int32(20)), NOISY),
-        (Counting(), dataclasses.replace(NOISY, u_max=200)),
-        (Counting(), dataclasses.replace(NOISY, q_v=Pulse(1, 0.8, 1.3))),
-        (Counting(), dataclasses.replace(NOISY, seed=np.int32(4))),
-        (Counting(), dataclasses.replace(NOISY, seed=np.uint32(4))),
-    ],
-    ids=["gain", "NumPy gain", "limit", "amplitude", "NumPy seed", "unsigned seed"],
-)
-def test_integers_never_recompile(what, warm):
-    law, scenario = what
-    before = Counting.traces
-    rollout(Cascade(position=law), scenario, SHORT, every=0)
-    assert Counting.traces == before
 
 
 # --- float32 ---

@@ -1,0 +1,91 @@
+"""Other numbers in the same structure, of whatever type, are neither traced nor compiled again."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ambjax import Adaptive, Cascade, Clock, Plant, Pulse, Scenario, Sensor, Sine, Slide, inversion, position, rollout
+
+NOISY = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.8, 1.3), sensor=Sensor(1e-6, 1e-4, 1e-4))
+SHORT = Clock(203, 1e-4, Adaptive())
+
+
+class Counting(position.SlidingMode):
+    """The sliding-mode law, counting how often it is traced."""
+
+    traces = 0
+
+    def __call__(self, model, inputs, state):
+        Counting.traces += 1
+        return super().__call__(model, inputs, state)
+
+
+jax.tree_util.register_dataclass(Counting)
+
+
+def variations():
+    """The same structure with other numbers, and the same numbers in other types."""
+    law, world = Counting(), NOISY
+    yield "gains", Counting(c=20.0, k=26.0, p=20.0), inversion.Adaptive(gamma=8e4), world
+    yield "plant", law, inversion.Adaptive(), dataclasses.replace(world, plant=Plant(m=0.6, g=9.8))
+    yield "amplitude", law, inversion.Adaptive(), dataclasses.replace(world, reference=Sine(1e-3, 1.0))
+    yield "noise", law, inversion.Adaptive(), dataclasses.replace(world, sensor=Sensor(2e-6, 0.0, 0.0))
+    yield "seed", law, inversion.Adaptive(), dataclasses.replace(world, seed=5, member=2)
+    yield "limit", law, inversion.Adaptive(), dataclasses.replace(world, u_max=100.0)
+    yield "NumPy", Counting(np.float64(20.0), np.float32(25.0), np.asarray(25.0)), inversion.Adaptive(), world
+    yield "JAX", Counting(jnp.asarray(20.0), jnp.float32(25.0), 25.0), inversion.Adaptive(), world
+    yield "JAX seed", law, inversion.Adaptive(), dataclasses.replace(world, seed=jnp.asarray(5), member=np.int64(2))
+
+
+def compiled(caplog, *case):
+    """Kernels that a rollout compiles."""
+    with jax.log_compiles(), caplog.at_level("WARNING"):
+        rollout(*case, every=0)
+    # the name of a rollout on the fast path, and without it
+    return [
+        message for message in caplog.messages if message.startswith(("Compiling jit(marked)", "Compiling jit(run)"))
+    ]
+
+
+@pytest.fixture(scope="module")
+def warm():
+    """One rollout with the counting law, compiled."""
+    return rollout(Cascade(position=Counting()), NOISY, SHORT, every=0)
+
+
+@pytest.mark.parametrize("what", list(variations()), ids=lambda x: x[0])
+def test_other_numbers_never_recompile(what, warm, caplog):
+    _, law, invert, scenario = what
+    before = Counting.traces
+    kernels = compiled(caplog, Cascade(position=law, inversion=invert), scenario, SHORT)
+    assert Counting.traces == before
+    assert not kernels, kernels
+
+
+def test_another_structure_is_seen_to_compile(caplog):
+    """What the tests around this one count is there to be counted."""
+    before = Counting.traces
+    assert compiled(caplog, Cascade(position=Counting()), NOISY, Clock(3, 1e-4, Slide(1)))
+    assert Counting.traces > before
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        (Counting(c=20, k=26, p=20), NOISY),
+        (Counting(c=np.int32(20)), NOISY),
+        (Counting(), dataclasses.replace(NOISY, u_max=200)),
+        (Counting(), dataclasses.replace(NOISY, q_v=Pulse(1, 0.8, 1.3))),
+        (Counting(), dataclasses.replace(NOISY, seed=np.int32(4))),
+        (Counting(), dataclasses.replace(NOISY, seed=np.uint32(4))),
+    ],
+    ids=["gain", "NumPy gain", "limit", "amplitude", "NumPy seed", "unsigned seed"],
+)
+def test_integers_never_recompile(what, warm):
+    law, scenario = what
+    before = Counting.traces
+    rollout(Cascade(position=law), scenario, SHORT, every=0)
+    assert Counting.traces == before

@@ -1,0 +1,64 @@
+"""Sensor noise: Gaussian, held, and the same for a member wherever it is drawn."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from ambjax import Scenario, Sensor
+from ambjax.gaussian import normals, threefry
+
+NOISY = Scenario(sensor=Sensor(1e-6, 1e-4, 1e-4))
+
+
+def test_noise_is_held_per_sample_and_gaussian():
+    # long enough for statistics without a rollout: the hold of 20,000 samples of one member
+    scenario = dataclasses.replace(NOISY, seed=3, member=1)
+    w = jax.jit(jax.vmap(lambda k: scenario.sensor.noise(scenario.words(), k)))(jnp.arange(20_000))
+    for x, std in zip(w, (1e-6, 1e-4, 1e-4), strict=True):
+        x = np.asarray(x) / std
+        # five standard errors: 5/sqrt(20000) of mean and of autocorrelation, 5/sqrt(40000) of the deviation
+        assert abs(np.mean(x)) < 0.036
+        assert abs(np.std(x) - 1) < 0.025
+        assert abs(np.mean(x[1:] * x[:-1])) < 0.036
+    assert abs(np.mean(np.asarray(w.z) * np.asarray(w.i))) / 1e-10 < 0.036
+
+
+def test_words_are_those_of_jax_random():
+    """Threefry is written out, since kernels on accelerators cannot call jax.random; fold_in shows that it is it."""
+    scenario = dataclasses.replace(NOISY, seed=5, member=2**31 + 9)
+    for number in (0, 1, 77, 2**32 - 1):
+        expected = jax.random.key_data(jax.random.fold_in(scenario.key(), np.uint32(number)))
+        np.testing.assert_array_equal(jnp.stack(threefry(scenario.words(), (0, np.uint32(number)))), expected)
+
+
+@pytest.mark.parametrize("x64", [True, False])
+def test_normal_numbers_are_normal(x64):
+    """Against the distribution itself: Kolmogorov's and Smirnov's test, and the tail beyond 4."""
+    with jax.enable_x64(x64):
+        drawn = jax.jit(jax.vmap(lambda k: normals(Scenario(seed=1).words(), k)))(jnp.arange(400_000))
+        for w in map(np.asarray, drawn):
+            assert w.dtype == (np.float64 if x64 else np.float32)
+            # one in 1,000 fails by chance, and the seed is fixed
+            assert stats.kstest(w.astype(float), "norm").pvalue > 1e-3
+            # 25 expected; Poisson's five standard deviations
+            assert 0 < np.sum(np.abs(w) > 4) < 51
+
+
+def test_member_k_draws_the_same_noise_alone_and_in_a_batch():
+    def noise(member, seed):
+        scenario = dataclasses.replace(NOISY, seed=seed, member=member)
+        return jax.vmap(lambda k: scenario.sensor.noise(scenario.words(), k))(jnp.arange(50))
+
+    alone, batch = jax.jit(noise), jax.jit(jax.vmap(noise, (0, None)))(jnp.arange(5), 7)
+    for m in range(5):
+        for x, y in zip(alone(m, 7), batch, strict=True):
+            np.testing.assert_array_equal(x, y[m])
+    rows = np.asarray(batch.z)
+    assert len(set(rows.ravel())) == rows.size
+    assert np.max(np.abs(np.corrcoef(rows) - np.eye(5))) < 0.7  # 5/sqrt(50)
+    # another seed draws other noise for the same member
+    assert not np.any(np.asarray(alone(0, 8).z) == rows[0])
