@@ -25,7 +25,7 @@ import numpy as np
 
 from tuning.config import read_study
 from tuning.optimise import best_of, search
-from tuning.rounds import training
+from tuning.rounds import look_again, training
 from tuning.screen import around, everywhere, ranges
 from tuning.study import Study, study_of
 
@@ -124,7 +124,7 @@ METHODS: dict[str, Callable[[Judge, int], None]] = {
 
 
 def ours(study: Study, who: Any, seed: int) -> list[tuple[int, float, float]]:
-    """Trace of the search by gradients, its second look around the first answer included, on all members."""
+    """Trace of the search by gradients, its looks around its own answer included, on all members."""
     study.engine.rollouts, trace, began = 0, [], time.perf_counter()
 
     def tell(kept: Any, _: float) -> None:
@@ -134,13 +134,17 @@ def ours(study: Study, who: Any, seed: int) -> list[tuple[int, float, float]]:
 
     budget, start = study.tune.budget, study.tune.space.values(study.case.cascade)
     points = everywhere(study.objective, study.goal.conditions, start, budget.screen, seed)
-    for look in range(2):
+    looks: list[tuple[float, np.ndarray]] = []
+    while True:
         kept = search(
             study.engine, study.goal, who, points, keep=budget.starts, iterations=budget.iterations,
             name=study.tune.optimiser, tell=tell,
         )  # fmt: skip
-        points = around(best_of(kept)[0], budget.screen, seed + look)
-    return trace
+        x, value = best_of(kept)
+        looks.append((value, x))
+        if not look_again([value for value, _ in looks]):
+            return trace
+        points = around(min(looks, key=lambda look: look[0])[1], budget.screen, seed + len(looks))
 
 
 def first_at(trace: list[Any], value: float) -> float:

@@ -25,7 +25,8 @@ from tuning.objective import Engine, Objective, weigh
 from tuning.optimise import Keeper, Search, _go_on_with_all, best_of, search
 from tuning.optimisers import names, optimiser
 from tuning.risk import CVaR, Mean
-from tuning.screen import REACH, around, everywhere, screen
+from tuning.rounds import GAIN, MOST_LOOKS, look_again
+from tuning.screen import FAR, NEAR, around, everywhere, screen
 from tuning.space import Gain, Space
 from tuning.toml import dumps, with_gains
 
@@ -210,13 +211,26 @@ def test_the_screen_keeps_the_best_of_all_that_hold(small):
     assert best[0] <= best[1]
 
 
-def test_the_neighbourhood_is_there_and_no_larger():
+def test_the_neighbourhoods_are_there_and_no_larger():
     x = np.array([1.0, -2.0, 0.5])
-    beside = around(x, 64, 3)
+    beside = around(x, 128, 3)
     np.testing.assert_array_equal(beside[0], x)
     # 64 points of a Sobol sequence reach beyond 9/10 of the way in every direction
-    assert np.all(np.abs(beside - x) <= REACH)
-    assert np.all(np.abs(beside - x).max(axis=0) > 0.9 * REACH)
+    for reach, points in ((NEAR, beside[1::2]), (FAR, beside[2::2])):
+        away = np.abs(points - x)
+        assert np.all(away <= reach)
+        assert np.all(away.max(axis=0) > 0.9 * reach)
+
+
+def test_looks_end_when_one_gains_little_or_at_their_number():
+    assert look_again([0.0])
+    assert not look_again([0.0, -0.5 * GAIN])
+    assert look_again([0.0, -2 * GAIN])
+    assert not look_again([0.0, 1.0])  # worse than what there was
+    assert not look_again([0.0, -1.0, -1.0 - 0.5 * GAIN])
+    gaining = [-float(n) for n in range(MOST_LOOKS)]
+    assert look_again(gaining[:-1])
+    assert not look_again(gaining)
 
 
 def test_lost_members_join_and_are_asked_only_to_be_held():
@@ -232,13 +246,21 @@ def test_lost_members_join_and_are_asked_only_to_be_held():
 
 def test_nothing_is_compiled_after_the_first_iteration(small, caplog):
     run(small)
+    engine, goal, who, start = small
+    x = SPACE.encode(start * 1.3)[None]
+
+    def kernels():
+        names = ("jit(marked)", "jit(forward)", "jit(terms)")  # on the fast path, and without it
+        return [message for message in caplog.messages if message.startswith(tuple(f"Compiling {n}" for n in names))]
+
     with jax.log_compiles(), caplog.at_level("WARNING"):
-        engine, goal, who, start = small
-        x = SPACE.encode(start * 1.3)[None]
         engine.gradient(np.repeat(x, 2, axis=0), who, goal.weights)
         engine.terms(x, who)
-    kernels = [r for r in caplog.messages if "Compiling" in r and ("outermost" in r or "forward" in r or "terms" in r)]
-    assert not kernels, kernels
+        assert not kernels()
+        # what is not seen above is there to be seen
+        other = Engine(objective(7), settle=0.0, threads=1)
+        other.terms(x, who)
+        assert kernels()
 
 
 def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):

@@ -1,13 +1,13 @@
-"""Rounds of a study: a search; a second one around its answer, for the first may end at a cliff behind which it goes
-on; again in finer steps where its own do not resolve the optimum; again with the members of a validation ensemble
-that its gains lose, until none is."""
+"""Rounds of a study: looks, each a search around the answer of those before it, for one may end at a cliff behind which
+it goes on; again in finer steps where their own do not resolve the optimum; again with the members of a validation
+ensemble that its gains lose, until none is."""
 
 import dataclasses
 import itertools
 import math
 import pathlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -23,8 +23,10 @@ from tuning.screen import around, everywhere
 from tuning.study import REFERENCE_MEMBERS, StepError, Study, step_error, study_of
 
 CHECKPOINT = "checkpoint"
-# Rounds in all, times that steps are halved, and lost members that join in one round.
-MOST_ROUNDS, MOST_HALVINGS, MOST_JOINING = 9, 2, 16
+# Rounds in all, looks among them, times that steps are halved, and lost members that join in one round.
+MOST_ROUNDS, MOST_LOOKS, MOST_HALVINGS, MOST_JOINING = 11, 4, 2, 16
+# A look that gains less than this share of the loss is the last.
+GAIN = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +47,8 @@ class Answer:
 def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume: bool) -> Answer:
     """Tune from the gains `start` [m]. Raises ValueError where nothing can be evaluated."""
     tune, halvings, found = study.tune, 0, []
-    first: tuple[np.ndarray, float] | None = None  # answer and goal of the first search
+    looks: list[tuple[float, np.ndarray]] = []  # goals and answers, on the same members, in the same steps
+    looking = tune.budget.screen > 0
     points = everywhere(study.objective, study.goal.conditions, start, tune.budget.screen, tune.budget.seed)
     points = points if tune.budget.screen else points[:1]
     who = training(study)
@@ -71,11 +74,13 @@ def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume
         x, value = _best(kept)
         if int(kept.history["lost"][-1][int(np.argmin(kept.history["value"][-1]))]) == kept.history["members"][-1]:
             return answer(None, tune.budget.validation)  # nothing to go on with
-        if first is None and tune.budget.screen and not kept.interrupted:
-            first, points = (x, value), around(x, tune.budget.screen, tune.budget.seed + round)
+        if looking:
+            looks.append((value, x))
+            x = min(looks, key=lambda look: look[0])[1]
+            looking = look_again([value for value, _ in looks]) and not kept.interrupted
+        if looking:
+            points = around(x, tune.budget.screen, tune.budget.seed + round)
             continue
-        if first is not None and round == 2 and first[1] < value:  # the same members, the same steps
-            x = first[0]
         error = step_error(study, x)
         say(f"step of the search against adaptive RODAS3: settled rms error off by {100 * error.relative:.2g} %")
         if not error.resolved and halvings < MOST_HALVINGS and not kept.interrupted:
@@ -94,6 +99,11 @@ def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume
             f"{REFERENCE_MEMBERS} under adaptive RODAS3: the search goes on with them"
         )
     raise AssertionError("unreachable: the rounds are counted")
+
+
+def look_again(goals: Sequence[float]) -> bool:
+    """Whether another look is worth its rollouts after looks that ended at these goals, logarithms."""
+    return len(goals) < MOST_LOOKS and min(goals[:-1], default=math.inf) - goals[-1] > GAIN
 
 
 def training(study: Study) -> Members:

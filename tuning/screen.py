@@ -15,8 +15,8 @@ from tuning.space import Space
 
 # Share of the members that points meet, and share of the points that goes on: 1/4 after an eighth of the members.
 ROUNDS = (8, 4), (4, 1)
-# How far from a point its neighbourhood reaches: factors of e^-1.5 to e^1.5 of each gain.
-REACH = 1.5
+# How far from a point its neighbourhoods reach, in coordinates: factors of e^1.5 up or down of each gain, and of e^3.
+NEAR, FAR = 1.5, 3.0
 Score = Callable[[np.ndarray, dict[str, np.ndarray], Members], np.ndarray]
 
 
@@ -87,9 +87,10 @@ def everywhere(objective: Objective, conditions: tuple[Bound, ...], start: np.nd
 
 
 def around(x: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Coordinates [count + 1, m]: x, and quasi-random points beside it, up to REACH away in each."""
+    """Coordinates [count + 1, m]: x, and quasi-random points around it, NEAR and FAR by turns."""
     cube = points("sobol", seed, len(x), np.arange(count), count)
-    return np.concatenate([x[None], x + REACH * (2 * cube - 1)])
+    reach = np.where(np.arange(count) % 2, FAR, NEAR)[:, None]
+    return np.concatenate([x[None], x + reach * (2 * cube - 1)])
 
 
 def screen(engine: Engine, who: Members, x: np.ndarray, keep: int, score: Score) -> np.ndarray:
