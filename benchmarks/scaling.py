@@ -1,8 +1,9 @@
 """Cost and peak memory of an ensemble against the number of members and the horizon.
 
 The workload of workload.py with held noise, float64, one core; each point in a process of its own, so that its peak
-memory is its own. Linear means that the time per member-step is the same everywhere: printed is the
-largest deviation from the median. Run: python benchmarks/scaling.py [--full]
+memory is its own. Linear means that the time per member-step is the same everywhere. The machine's is not: slow spells
+last longer than a point. So each point is run in turn with one reference ensemble, the median of their ratios is what
+is compared, and printed is its largest deviation from the median point. Run: python benchmarks/scaling.py [--full]
 """
 
 import argparse
@@ -20,15 +21,31 @@ MEMBERS, FULL = (1_000, 10_000, 100_000), 1_000_000
 SAMPLES = (20, 200, 2_000)
 # At these the other of the two is varied.
 FIXED_SAMPLES, FIXED_MEMBERS = 200, 4_096
+# The reference, short enough to see the same machine as the shortest point; beside a long one it is run for a tenth
+# of its time.
+REFERENCE, SHARE = (1_024, 200), 10
+# Rounds of a point: as many as run this many member-samples, but 3 at least and this many at most.
+WORK, MOST_ROUNDS = 60_000_000, 45
 
 
 def point(members: int, samples: int) -> dict[str, Any]:
-    """Seconds of one run after a first one, and this process's peak memory."""
+    """Seconds of one run after a first one, per member-step also relative to the reference; peak memory."""
     work = workload.workload(members, samples, noise=True)
-    found = _measure.alternating({"run": lambda: workload.ours(work)}, repeats=3)["run"]
-    peak = _measure.peak_memory()
-    each = 1e9 * found.seconds / members / work.steps
-    return {"members": members, "samples": samples, "seconds": found.seconds, "ns": each, "peak_bytes": peak}
+    reference = workload.workload(*REFERENCE, noise=True)
+    rounds = min(max(3, WORK // (members * samples)), MOST_ROUNDS)
+    steps, reference_steps = (w.members * w.steps for w in (work, reference))
+    calls = max(steps // reference_steps // SHARE, 1)
+    runs = {"point": lambda: workload.ours(work), "reference": lambda: [workload.ours(reference) for _ in range(calls)]}
+    found = _measure.alternating(runs, rounds)
+    return {
+        "members": members,
+        "samples": samples,
+        "seconds": found["point"].seconds,
+        "ns": 1e9 * found["point"].seconds / steps,
+        "relative": found["point"].over(found["reference"]) * calls * reference_steps / steps,
+        "rounds": rounds,
+        "peak_bytes": _measure.peak_memory(),
+    }
 
 
 def main() -> None:
@@ -46,11 +63,12 @@ def main() -> None:
     results: dict[str, Any] = {}
     for name, grid in grids.items():
         rows = [_measure.child(__file__, "--point", *pair) for pair in grid]
-        middle = statistics.median(row["ns"] for row in rows)
-        results[name] = {"rows": rows, "deviation": max(abs(row["ns"] / middle - 1) for row in rows)}
+        middle = statistics.median(row["relative"] for row in rows)
+        results[name] = {"rows": rows, "deviation": max(abs(row["relative"] / middle - 1) for row in rows)}
         for row in rows:
             named = f"{row['members']:>9} members, {row['samples']:>5} samples"
-            print(f"{named}: {row['seconds']:8.3f} s, {row['ns']:6.2f} ns/step, {row['peak_bytes'] / 2**20:6.0f} MiB")
+            cost = f"{row['seconds']:8.3f} s, {row['ns']:6.2f} ns/step, {row['relative']:.3f} of the reference's"
+            print(f"{named}: {cost}, {row['peak_bytes'] / 2**20:6.0f} MiB")
         print(f"against {name}: linear to within {100 * results[name]['deviation']:.1f} %", flush=True)
     _measure.write("scaling", results)
 
