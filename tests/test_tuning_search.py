@@ -298,6 +298,32 @@ def test_the_second_phase_goes_back_to_what_was_given_where_the_path_is_worse(sm
     assert (kept.phase, kept.since) == (1, 1)
 
 
+@pytest.mark.parametrize("phase", [0, 1])
+def test_a_phase_begins_elsewhere_where_derivatives_are_no_numbers(small, phase):
+    """As where a loop chatters: losses are finite, derivatives overflow."""
+    engine, goal, who, start = small
+    whole = run(small)
+    first = [0, whole.since][phase]
+
+    class Chattering:
+        objective, rollouts, calls = engine.objective, 0, -1
+
+        def terms(self, x, who):
+            return engine.terms(x, who)
+
+        def gradient(self, x, who, weights):
+            losses, slopes, terms = engine.gradient(x, who, weights)
+            self.calls += 1
+            return losses, np.nan * slopes if self.calls == first else slopes, terms
+
+    found = run((Chattering(), goal, who, start))
+    values = np.array(found.history["value"])
+    assert np.isfinite(values[first]).any()
+    assert np.isfinite(best_of(found)[1])
+    assert len(values) == found.iteration
+    assert found.phase == 1
+
+
 def test_ctrl_c_keeps_the_best(small):
     def stop(kept, seconds):
         if kept.iteration == 3:

@@ -123,21 +123,28 @@ def search(
     keeper = keeper or Keeper(None, None)
     phases = [FEW, ALL] if len(points) > keep else [ALL]
     kept, given, began = keeper.load(descent, points.shape[1]) if resume else None, points[0], time.perf_counter()
+    reserve: list[np.ndarray] = []  # [S, m] each, best first: where else this phase may begin
     if kept is not None:
         engine.rollouts = int(kept.history["rollouts"][-1])
     else:
         if len(points) > keep:
             points = screen(engine, who, points, keep, lambda x, terms, some: goal.score(descent.space, x, terms, some))
+        reserve = [points[n : n + keep] for n in range(keep, len(points) - keep + 1, keep)]
+        points = points[:keep]
         kept = Search(descent.begin(jnp.asarray(points)), np.ones(len(points), bool))
     try:
         while True:
             if not kept.active.any() or kept.iteration - kept.since >= iterations:
                 if kept.phase + 1 == len(phases):
                     break
-                _go_on_with_all(engine, goal, who, kept, descent, given)
+                reserve = _go_on_with_all(engine, goal, who, kept, descent, given)
             before = kept.seconds
             phase = phases[kept.phase]
             iterate(engine, goal, who.part(phase.part, 1), kept, descent)
+            while reserve and not np.isfinite(np.asarray(kept.starts.value)[kept.active]).any():
+                _begin_elsewhere(kept, descent, reserve.pop(0))
+                iterate(engine, goal, who.part(phase.part, 1), kept, descent)
+            reserve = []
             kept.active = _going_on(kept, phase)
             kept.seconds = kept.earlier + time.perf_counter() - began
             keeper.save(kept)
@@ -194,13 +201,24 @@ def _going_on(kept: Search, phase: Phase) -> np.ndarray:
     return active
 
 
+def _begin_elsewhere(kept: Search, descent: Descent, at: np.ndarray) -> None:
+    """Take the first iteration of a phase back and begin at `at` [S, m].
+
+    Where a loop chatters, derivatives grow from sample to sample until they are no numbers, though the loss is one.
+    """
+    for rows in kept.history.values():
+        rows.pop()
+    kept.iteration -= 1
+    kept.starts = descent.begin(jnp.asarray(at))
+
+
 def _go_on_with_all(
     engine: Engine, goal: Goal, who: Members, kept: Search, descent: Descent, given: np.ndarray
-) -> None:
+) -> list[np.ndarray]:
     """Begin the next phase from one point: that on the paths of all starts, or `given`, which is best for all members.
 
     The answer for a part of the members may lose others: then an earlier point is better, and on the right side of
-    that cliff.
+    that cliff. Returns where else it may begin [S, m], best first.
     """
     x, value = (np.array(kept.history[name][kept.since :]) for name in ("x", "value"))
     starts = value.shape[1]
@@ -209,13 +227,14 @@ def _go_on_with_all(
     # the best ones, and fewer and fewer of the others
     chosen = first[np.unique((np.linspace(0, np.sqrt(len(first) - 1), PATH).round(6) ** 2).astype(int))]
     tried = np.concatenate([x[chosen], given[None]])
-    best = int(np.argmin(goal.score(engine.objective.space, tried, engine.terms(tried, who), who)))
+    best, *others = np.argsort(goal.score(engine.objective.space, tried, engine.terms(tried, who), who), kind="stable")
     start = chosen[best] % starts if best < len(chosen) else 0
     at = np.array(kept.starts.best)
     at[start] = tried[best]
     kept.starts = descent.anew(jnp.asarray(at), kept.starts)
     kept.active = np.arange(starts) == start
     kept.phase, kept.since = kept.phase + 1, kept.iteration
+    return [np.repeat(tried[other][None], starts, axis=0) for other in others]
 
 
 def best_of(kept: Search) -> tuple[np.ndarray, float]:

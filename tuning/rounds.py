@@ -118,8 +118,8 @@ def _best(kept: Search) -> tuple[np.ndarray, float]:
     x, value = best_of(kept)
     if not np.isfinite(value):
         raise ValueError(
-            "tune: the loss is not a finite number at any start that was tried. Look at the case with "
-            "'ambjax simulate', or change tune.screen and tune.bounds."
+            "tune: the loss or its derivative is not a finite number at any start that was tried. Look at the case "
+            "with 'ambjax simulate' (does u chatter?), or change tune.screen and tune.bounds."
         )
     return x, value
 

@@ -94,7 +94,7 @@ def around(x: np.ndarray, count: int, seed: int) -> np.ndarray:
 
 
 def screen(engine: Engine, who: Members, x: np.ndarray, keep: int, score: Score) -> np.ndarray:
-    """The best [keep, m] of points x [K, m], by successive halving: on few members first, then on more.
+    """The best of points x [K, m], at least `keep`, best first, by successive halving: on few members, then on more.
 
     Some of the stressed members are there from the first: to be held is what is asked first.
     """
@@ -102,4 +102,4 @@ def screen(engine: Engine, who: Members, x: np.ndarray, keep: int, score: Score)
         some = who.part(part)
         values = score(x, engine.terms(x, some), some)
         x = x[np.argsort(values, kind="stable")[: max(len(x) // left, 2 * keep)]]
-    return x[:keep]
+    return x
