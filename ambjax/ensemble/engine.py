@@ -95,8 +95,9 @@ class _Engine:
         self.workers = (threads or cores()) if alone else 1
         self.block = BLOCK_BYTES // jnp.result_type(float).itemsize
         unit = self.block * len(self.devices)
-        fair = min(-(-self.members // self.workers), MOST_CALL)
-        self.call = -(-(call or fair) // unit) * unit
+        # equal calls: the last one is as long as the others, whatever is left for it
+        calls = max(-(-self.members // (MOST_CALL * self.workers)), 1) * self.workers
+        self.call = -(-(call or -(-self.members // calls)) // unit) * unit
 
     def outcome(self) -> Outcome:
         """Run all calls and put the results in order."""
