@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
+from jax import Array
 
 Result = TypeVar("Result")
 
@@ -32,3 +33,22 @@ def apart(function: Callable[..., Result]) -> Callable[..., Result]:
         return result
 
     return call
+
+
+@jax.custom_jvp
+@apart
+def _kept(x: Array) -> Array:
+    return x
+
+
+@_kept.defjvp
+def _kept_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    return _kept(*primals), _kept(*tangents)
+
+
+def stored(tree: Result) -> Result:
+    """The same values, and the same derivatives, stored: whoever uses them reads memory.
+
+    Else XLA computes an intermediate again in every loop that uses it, and its derivatives once more for each.
+    """
+    return jax.tree.map(_kept, tree)

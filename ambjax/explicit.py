@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax._apart import apart
+from ambjax._apart import apart, stored
 from ambjax._pytree import Scalar, record
 from ambjax.integrate import Problem, Times, _Fixed
 
@@ -49,7 +49,7 @@ class _Explicit(_Fixed):
         inputs = {share: problem.inputs(at(share)) for share in self.TIMES}
         x, stages, h = state, [], jnp.asarray(h)
         for share, row in zip(self.TIMES, self.ROWS, strict=True):
-            stages.append(problem.rates(inputs[share], x))
+            stages.append(stored(problem.rates(inputs[share], x)))
             combined = _combination(row)
             x = jax.tree.map(lambda x, *ks, combined=combined: combined(x, h, ks), state, *stages)
         return x

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ambjax import _linear
+from ambjax._apart import stored
 from ambjax._pytree import Scalar, leaf, record, static
 from ambjax.trajectory import ALIVE, STALLED
 
@@ -142,7 +143,7 @@ def rodas3_step(problem: Problem, at: Times, h: Scalar, state: Any) -> tuple[Any
 
     def stage(f: Any, *couplings: tuple[Scalar, Any]) -> Any:
         scaled = jax.tree.map(lambda q: h / 2 * q, f)
-        return _linear.solve(factors, axpy(scaled, *((c / 2, u) for c, u in couplings)))
+        return stored(_linear.solve(factors, axpy(scaled, *((c / 2, u) for c, u in couplings))))
 
     u_1 = stage(axpy(f_0, (h / 2, f_t)))
     u_2 = stage(axpy(f_0, (1.5 * h, f_t)), (4.0, u_1))

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax._apart import apart, stored
 from ambjax._pytree import Scalar
 from ambjax.control.inversion import Adaptive, v_and_gradient
 from ambjax.control.laws import CurrentDemand, CurrentInputs, Measurement
@@ -42,17 +43,18 @@ def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: 
     moved = control._replace(
         observer=_axpy(control.observer, h, rates_0.observer), position=_axpy(control.position, h, rates_0.position)
     )
-    ahead, moved, force_0 = jax.lax.optimization_barrier((ahead, moved, force_0))
+    ahead, moved, force_0 = stored((ahead, moved, force_0))
     force_1, seen_1, rates_1 = cascade.demand(_add(ahead, hold), moved, end.reference)
 
     v_0, gradient_0 = v_and_gradient(model, force_0, i_ref)
     v_1, gradient_1 = v_and_gradient(model, force_1, i_ref)
     w = force_0.v_star - v_0
     drift = (force_1.v_star - v_1 - w) * per_h
+    w, drift = stored((w, drift))
     sliding, slaved, tau = relax(w, drift, law.gamma, law.p, h)
     sliding, slaved = sliding * reciprocal(gradient_0), slaved * reciprocal(gradient_1)
 
-    sliding, slaved, tau, force_1 = jax.lax.optimization_barrier((sliding, slaved, tau, force_1))
+    sliding, slaved, tau, force_1 = stored((sliding, slaved, tau, force_1))
 
     def current(plant: Measurement, seen: Measurement, i_ref: Array, rate: Array, inner: Any, q_i: Array, h: Array):
         """i - i_ref and the current law's state after h at constant i_ref' = rate."""
@@ -68,14 +70,14 @@ def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: 
         return e, _axpy(inner, h, inner_rate)
 
     e, inner = current(state.plant, seen_0, i_ref, sliding, control.current, begin.q_i, tau)
-    e, inner = jax.lax.optimization_barrier((e, inner))
+    e, inner = stored((e, inner))
     i_ref = i_ref + tau * sliding
     middle = Measurement((z + ahead.z) / 2, (z_dot + ahead.z_dot) / 2, i_ref + e)
     seen = jax.tree.map(lambda a, b: (a + b) / 2, seen_0, seen_1)
     # The current moves fast while it slides: what counts at the start of the rest is where it ended.
     z_ddot_0 += (1 - tau * per_h) * (scenario.plant.z_ddot(z, middle.i, begin.q_z) - z_ddot_0)
     e, inner = current(middle, seen, i_ref, slaved, inner, end.q_i, h - tau)
-    e, inner = jax.lax.optimization_barrier((e, inner))
+    e, inner = stored((e, inner))
     i_ref = i_ref + (h - tau) * slaved
 
     z_ddot_1 = scenario.plant.z_ddot(ahead.z, i_ref + e, end.q_z)
@@ -128,10 +130,20 @@ def _implicit_jvp(primals: tuple[Array, Array, Scalar], tangents: tuple[Any, Any
     return w, change * reciprocal(1 + reach * p * flat)
 
 
+@jax.custom_jvp
+@apart
 def _phi(x: Array) -> Array:
     """(exp(x) - 1) / x."""
     small = jnp.abs(x) < 1e-3
     return jnp.where(small, 1 + x / 2 + x * x / 6, (jnp.exp(x) - 1) * (1 / jnp.where(small, 1.0, x)))
+
+
+@_phi.defjvp
+def _phi_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (dx,) = primals, tangents
+    y, small = _phi(x), jnp.abs(x) < 1e-3
+    slope = jnp.where(small, 1 / 2 + x / 3 + x * x / 8, (1 + (x - 1) * y) * (1 / jnp.where(small, 1.0, x)))
+    return y, slope * dx
 
 
 def _add(x: Measurement, y: Measurement) -> Measurement:

@@ -25,9 +25,8 @@ from ambjax.scenario import Clock, Scenario
 from tuning.loss import TERMS, Loss
 from tuning.space import Space
 
-# Lanes of one kernel call. Values: one register of 8 after the other in L1; gradients carry m + 1 numbers per lane.
+# Lanes of one kernel call. Loops over half as many are unrolled into scalar code by XLA's compiler.
 LANES = 64
-GRADIENT_LANES = 32
 # Members of a kind that say something about all of it.
 FEWEST = 4
 # Terms that say whether the rotor is held.
@@ -146,6 +145,7 @@ class Engine:
         self.objective, self.mode, self.settle, self.lanes = objective, mode, settle, lanes
         self.threads = threads or os.cpu_count() or 1
         self.rollouts = 0
+        self._compiled: set[str] = set()
         traced = canonical((objective.cascade, objective.scenario, objective.clock, objective.loss))
         self._world = traced
         standard = canonical(Named({"loss": objective.loss, "metrics": Standard(settle, objective.scenario.touchdown)}))
@@ -192,12 +192,12 @@ class Engine:
     def terms(self, x: np.ndarray, who: Members) -> dict[str, np.ndarray]:
         """Terms of the loss by name, [S, N], of gain vectors x [S, m] and members [N]."""
         self.rollouts += len(x) * len(who.member)
-        return self._lanes(lambda x, who: self._terms(x, who, self._world), self.lanes, x, who)
+        return self._lanes("terms", lambda x, who: self._terms(x, who, self._world), x, who)
 
     def metrics(self, x: np.ndarray, who: Members) -> dict[str, Any]:
         """{"loss": terms, "metrics": metrics.json names}, all [S, N]."""
         self.rollouts += len(x) * len(who.member)
-        return self._lanes(lambda x, who: self._standard(x, who, self._world), self.lanes, x, who)
+        return self._lanes("metrics", lambda x, who: self._standard(x, who, self._world), x, who)
 
     def gradient(self, x: np.ndarray, who: Members, weights: Any) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
         """Weighted losses [S, N], their derivatives [S, N, m] and the terms [S, N].
@@ -209,24 +209,26 @@ class Engine:
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS)))
         both, m = np.concatenate([x, each], axis=1), x.shape[1]
         return self._lanes(
-            lambda both, who: self._gradient(both[:, :m], who, self._world, both[:, m:]), GRADIENT_LANES, both, who
+            "gradient", lambda both, who: self._gradient(both[:, :m], who, self._world, both[:, m:]), both, who
         )
 
-    def _lanes(self, call: Callable[..., Any], width: int, x: np.ndarray, who: Members) -> Any:
+    def _lanes(self, kind: str, call: Callable[..., Any], x: np.ndarray, who: Members) -> Any:
         starts, count = len(x), len(who.member)
         lane = np.arange(starts * count)
-        padded = np.concatenate([lane, np.zeros(-len(lane) % width, int)]).reshape(-1, width)
+        padded = np.concatenate([lane, np.zeros(-len(lane) % self.lanes, int)]).reshape(-1, self.lanes)
 
         def one(lanes: np.ndarray) -> Any:
             start, member = np.divmod(lanes, count)
             at = jnp.asarray(x[start], jnp.result_type(float))
             return jax.tree.map(np.asarray, call(at, jax.tree.map(lambda a: a[member], who)))
 
-        parts = [one(padded[0])]  # alone: the first call compiles
-        if self.threads > 1 and len(padded) > 2:
+        alone = 0 if kind in self._compiled else 1  # the first call of its kind compiles
+        parts = [one(lanes) for lanes in padded[:alone]]
+        self._compiled.add(kind)
+        if self.threads > 1 and len(padded) > alone + 1:
             with ThreadPoolExecutor(self.threads) as pool:
-                parts += pool.map(one, padded[1:])
+                parts += pool.map(one, padded[alone:])
         else:
-            parts += map(one, padded[1:])
+            parts += map(one, padded[alone:])
         joined = jax.tree.map(lambda *p: np.concatenate(p)[: len(lane)], *parts)
         return jax.tree.map(lambda a: a.reshape(starts, count, *a.shape[1:]), joined)

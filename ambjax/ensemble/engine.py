@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from ambjax._kernel import one_kernel
+from ambjax._kernel import block_bytes, one_kernel
 from ambjax._pytree import canonical
 from ambjax.control.cascade import Cascade
 from ambjax.loop import ClosedLoop
@@ -25,9 +25,6 @@ from ambjax.metrics import Fold
 from ambjax.rollout import Outcome, check_inputs, run
 from ambjax.scenario import Clock, Scenario
 
-# A block of members has vectors of this many bytes: small enough for the first-level cache, large enough to pay for
-# what is done once per block.
-BLOCK_BYTES = 512
 MOST_CALL = 4096
 MEMBERS = "members"
 
@@ -93,11 +90,12 @@ class _Engine:
         self.devices = jax.devices()
         alone = len(self.devices) == 1 and self.devices[0].platform == "cpu"
         self.workers = (threads or cores()) if alone else 1
-        self.block = BLOCK_BYTES // jnp.result_type(float).itemsize
-        unit = self.block * len(self.devices)
         # equal calls: the last one is as long as the others, whatever is left for it
         calls = max(-(-self.members // (MOST_CALL * self.workers)), 1) * self.workers
-        self.call = -(-(call or -(-self.members // calls)) // unit) * unit
+        share = call or -(-self.members // calls)
+        self.block = block_bytes(share) // jnp.result_type(float).itemsize
+        unit = self.block * len(self.devices)
+        self.call = -(-share // unit) * unit
 
     def outcome(self) -> Outcome:
         """Run all calls and put the results in order."""
