@@ -26,7 +26,7 @@ from ambjax import (
 from ambjax._kernel import one_kernel
 from ambjax.ensemble import run_ensemble
 from ambjax.metrics import Rms
-from ambjax.sliding import _implicit, relax
+from ambjax.sliding import _implicit, _phi, relax
 from ambjax.smooth import smooth_sign
 
 TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.01, 0.02), u_max=200.0)
@@ -47,6 +47,19 @@ def test_the_implicit_sign_is_solved():
         w = _implicit(b, reach, 25.0)
         # Newton's last step, relative to the larger of both terms
         assert np.max(np.abs(w + reach * smooth_sign(w, 25.0) - b) / (np.abs(b) + 1e-12)) < 1e-3
+
+
+def test_the_exponential_step_and_its_derivative():
+    x = jnp.asarray([-300.0, -1.0, -1.001e-3, -0.999e-3, -1e-9, 0.0, 1e-9, 0.999e-3, 1.001e-3, 1.0])
+    value, slope = jax.jvp(_phi, (x,), (jnp.ones_like(x),))
+    # the series is cut where the next term is 4e-11 of the first
+    np.testing.assert_allclose(value, np.where(x == 0, 1, np.expm1(x) / np.where(x == 0, 1, x)), rtol=5e-11)
+    # the mean of s exp(s x) over s in 0..1, by Gauss's rule: exact to rounding for |x| <= 1
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    s = (nodes + 1) / 2
+    mean = (weights / 2 * s * np.exp(s * np.asarray(x)[:, None])).sum(axis=1)
+    np.testing.assert_allclose(slope[1:], mean[1:], rtol=5e-10)
+    assert float(slope[0]) == pytest.approx(1 / 300.0**2, rel=1e-12)  # exp(-300) is nothing beside it
 
 
 def test_a_slide_reaches_its_end_and_no_further():
