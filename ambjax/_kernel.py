@@ -45,7 +45,8 @@ def one_kernel(function: Callable[..., Any], static_argnames: tuple[str, ...] = 
     compiled as usual, with a line in the log; jax.lax.map with a batch_size keeps the blocks small.
     """
     inner = jax.jit(function, static_argnames=static_argnames)
-    refused = set()
+    refused: set[tuple[Any, ...]] = set()
+    shapes_of = lambda leaves: tuple(map(jnp.shape, leaves))  # noqa: E731
 
     @functools.cache
     def outermost() -> Callable[..., Any]:
@@ -56,15 +57,15 @@ def one_kernel(function: Callable[..., Any], static_argnames: tuple[str, ...] = 
 
     @functools.wraps(function)
     def call(*args: Any, **static: Any) -> Any:
-        if any(is_traced(x) for x in jax.tree.leaves(args)) or options() is None:
+        leaves = jax.tree.leaves(args)
+        if any(map(is_traced, leaves)) or options() is None:
             return inner(*args, **static)
-        shapes = tuple(jnp.shape(x) for x in jax.tree.leaves(args))
-        if shapes not in refused:
+        if not refused or shapes_of(leaves) not in refused:
             try:
                 return outermost()(*args, **static)
             except jax.errors.JaxRuntimeError as fault:
                 log.warning("compiled without the one-kernel path, which XLA refused: %s", str(fault).splitlines()[0])
-                refused.add(shapes)
+                refused.add(shapes_of(leaves))
         return inner(*args, **static)
 
     return call

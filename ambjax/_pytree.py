@@ -6,7 +6,10 @@ template and `validate` all read them from there.
 """
 
 import dataclasses
+import functools
 import math
+import operator
+from collections.abc import Callable
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -64,14 +67,17 @@ def record(cls: type[T]) -> type[T]:
     names = [f.name for f in fields if not f.metadata.get("static")]
     keys = [jax.tree_util.GetAttrKey(name) for name in names]
 
+    values = _getter(names)
+    fixed_values = _getter(fixed)
+
     def structure(node: Any) -> tuple[Any, ...]:
-        return (made, *(getattr(node, name) for name in fixed))
+        return (made, *fixed_values(node))
 
     def flatten(node: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        return tuple(getattr(node, name) for name in names), structure(node)
+        return values(node), structure(node)
 
     def with_keys(node: Any) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
-        return [(key, getattr(node, name)) for key, name in zip(keys, names, strict=True)], structure(node)
+        return list(zip(keys, values(node), strict=True)), structure(node)
 
     def unflatten(kept: tuple[Any, ...], leaves: Any) -> Any:
         node = object.__new__(made)
@@ -81,6 +87,13 @@ def record(cls: type[T]) -> type[T]:
 
     jax.tree_util.register_pytree_with_keys(made, with_keys, unflatten, flatten)
     return made
+
+
+def _getter(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
+    """A function from an object to its attributes of these names: every rollout flattens some twenty records thrice."""
+    if len(names) > 1:
+        return operator.attrgetter(*names)
+    return lambda node: tuple(getattr(node, name) for name in names)
 
 
 def is_traced(x: Any) -> bool:
@@ -125,22 +138,28 @@ def validate(node: Any, path: str = "") -> None:
         for index, item in enumerate(node):
             validate(item, f"{path}[{index}]")
         return
-    if not dataclasses.is_dataclass(node):
-        return
-    for field in dataclasses.fields(node):
-        value, name = getattr(node, field.name), f"{path}.{field.name}".lstrip(".")
-        if not field.metadata.get("leaf"):
-            validate(value, name)
+    for field, is_leaf in _fields(type(node)):
+        value = getattr(node, field.name)
+        if not is_leaf:
+            validate(value, f"{path}.{field.name}".lstrip("."))
         elif not (is_traced(value) or (value is None and field.metadata["optional"])):
-            _check(field, name, value)
+            _check(field, path, value)
 
 
-def _check(field: dataclasses.Field, name: str, value: Any) -> None:
+@functools.cache
+def _fields(kind: type) -> tuple[tuple[dataclasses.Field, bool], ...]:
+    """Fields of a record, and whether each is a number; none of any other type. Every rollout asks for them."""
+    fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
+    return tuple((field, bool(field.metadata.get("leaf"))) for field in fields)
+
+
+def _check(field: dataclasses.Field, path: str, value: Any) -> None:
     try:
         number = value if isinstance(value, (int, float)) else np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         number = math.nan
     if not within(field.metadata, number):
+        name = f"{path}.{field.name}".lstrip(".")
         shown = f"{value:g}" if isinstance(value, (int, float)) else _worst(value, number)
         raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.{_example(field)}")
 
@@ -160,12 +179,20 @@ def canonical(node: T) -> T:
     Python numbers, NumPy scalars and arrays then trace alike, so that a change of a value, or of
     the type that carries it, never recompiles.
     """
-    real, whole = jnp.result_type(float), jnp.result_type(int)
+    leaves, tree = jax.tree.flatten(node)
+    kinds = jnp.result_type(float), jnp.result_type(int)
+    return jax.tree.unflatten(tree, [_converted(x, kinds[w]) for x, w in zip(leaves, _whole(tree), strict=True)])
 
-    def one(path: Any, x: Any) -> Any:
-        kind = whole if path and getattr(path[-1], "name", "") in WHOLE else real
-        if not isinstance(x, jax.Array):  # NumPy converts in microseconds what eager JAX takes a dispatch for
-            return np.asarray(x).astype(kind)
-        return x if x.dtype == kind and not x.weak_type else jax.lax.convert_element_type(x, kind)
 
-    return jax.tree_util.tree_map_with_path(one, node)
+def _converted(x: Any, kind: Any) -> Any:
+    if not isinstance(x, jax.Array):  # NumPy converts in microseconds what eager JAX takes a dispatch for
+        return np.asarray(x, kind)
+    return x if x.dtype == kind and not x.weak_type else jax.lax.convert_element_type(x, kind)
+
+
+@functools.cache
+def _whole(tree: Any) -> tuple[bool, ...]:
+    """Of each leaf of a tree of this structure, whether it is one of WHOLE."""
+    numbered = jax.tree.unflatten(tree, range(tree.num_leaves))
+    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(numbered)]
+    return tuple(bool(path) and getattr(path[-1], "name", "") in WHOLE for path in paths)

@@ -144,7 +144,7 @@ def held_noise() -> list[str]:
     lines = ["## Held noise: steps per hold (`held_noise.py`)", "", facts(data["machine"])]
     lines += ["64 members, one core, smooth gains; errors relative to the largest |z|.", ""]
     for case in data["cases"]:
-        lines += [f"Noise {case['noise']:g} times the workload's, 1e-6 m on z:", ""]
+        lines += [f"Noise: {case['noise']}.", ""]
         cells = [[r["method"], f"{r['relative_error']:.1e}", f"{1e3 * r['seconds']:.1f}"] for r in case["methods"]]
         lines += table("method | relative error | time (ms)", cells)
         if case["ratio"]:

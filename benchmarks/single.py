@@ -31,7 +31,7 @@ PERIOD, SAMPLES = 1e-2, 200
 TIMES = PERIOD * np.arange(SAMPLES)
 EDGES = (0.0, 0.8, 1.3, TIMES[-1])
 GAINS = {"smooth": (1e9, 25e-6), "repaired": (paper.REPAIRED_GAMMA, 25.0)}
-TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
+TOLERANCES = tuple(share * 10.0**-digit for digit in range(4, 11) for share in (1.0, 0.5, 0.2))
 
 
 def scipy_run(gains: tuple[float, float], method: str, rtol: float) -> np.ndarray:
