@@ -1,6 +1,7 @@
 """What the benchmarks share: timing, machine facts, JSON."""
 
 import json
+import math
 import os
 import pathlib
 import platform
@@ -50,18 +51,26 @@ class Timed(NamedTuple):
         return statistics.median(a / b for a, b in zip(self.times, other.times, strict=True))
 
 
-def alternating(runs: dict[Any, Callable[[], Any]], repeats: int = 5) -> dict[Any, Timed]:
-    """Times of each run, taken in turn, round by round, so that all see the same machine."""
-    first, times = {}, {name: [] for name in runs}
-    for name, run in runs.items():
+def alternating(runs: dict[Any, Callable[[], Any]], repeats: int = 5, least: float = 0.02) -> dict[Any, Timed]:
+    """Times of each run, taken in turn, round by round, so that all see the same machine.
+
+    What takes less than `least` seconds is repeated within its turn until that is filled, as Python's timeit does:
+    a call among others pays for caches that they emptied.
+    """
+    first, times, counts = {}, {name: [] for name in runs}, {}
+
+    def clocked(run: Callable[[], Any], count: int = 1) -> float:
         began = time.perf_counter()
-        jax.block_until_ready(run())
-        first[name] = time.perf_counter() - began
+        for _ in range(count):
+            jax.block_until_ready(run())
+        return (time.perf_counter() - began) / count
+
+    for name, run in runs.items():
+        first[name] = clocked(run)
+        counts[name] = max(1, math.ceil(least / clocked(run)))
     for _ in range(repeats):
         for name, run in runs.items():
-            began = time.perf_counter()
-            jax.block_until_ready(run())
-            times[name].append(time.perf_counter() - began)
+            times[name].append(clocked(run, counts[name]))
     return {name: Timed(times[name], first[name]) for name in runs}
 
 
