@@ -41,7 +41,7 @@ PLAIN = "ambjax, plain scan"
 # Methods, and how many samples of the workload they take as one.
 OURS = (
     (RK4(10), 1), (RK4(5), 1), (DOP853(1), 1), (RK4(2), 1), (DOP853(16), 25), (RK4(7), 5), (DOP853(2), 5), (RK4(1), 1),
-    (DOP853(8), 25),
+    (DOP853(8), 25), (DOP853(7), 25),
 )  # fmt: skip
 # z of every member at each instant, [instants, N]
 Run = Callable[[Workload], Any]
