@@ -48,6 +48,15 @@ def test_results_do_not_depend_on_calls_threads_or_who_runs_beside():
     same(run_ensemble(SMOOTH, some, SHORT, fold=FOLD), jax.tree.map(lambda x: x[60:70], whole), 1e-12)
 
 
+@pytest.mark.parametrize("cpu", ["GenuineIntel avx512f", "AuthenticAMD avx512f", "AuthenticAMD avx2"])
+def test_results_do_not_depend_on_how_long_blocks_are_on_this_machine(cpu, monkeypatch):
+    expected = {"AuthenticAMD avx512f": 1024}.get(cpu, 512)
+    here = run_ensemble(SMOOTH, members(300), SHORT, fold=FOLD, threads=1)
+    monkeypatch.setattr(_kernel, "_cpuinfo", lambda: cpu)
+    assert [_kernel.block_bytes(n) for n in (1, 255, 256, 4096)] == [512, 512, expected, expected]
+    same(run_ensemble(SMOOTH, members(300), SHORT, fold=FOLD, threads=1), here, 1e-12)
+
+
 @pytest.mark.parametrize("method", [RK4(2), Adaptive()], ids=str)
 def test_a_member_is_the_rollout_of_that_member_alone(method):
     clock = Clock(40, 1e-4, method)
