@@ -24,8 +24,9 @@ from tuning.study import REFERENCE_MEMBERS, StepError, Study, step_error, study_
 
 CHECKPOINT = "checkpoint"
 # Rounds in all, looks among them, times that steps are halved, and lost members that join in one round.
-MOST_ROUNDS, MOST_LOOKS, MOST_HALVINGS, MOST_JOINING = 11, 4, 2, 16
-# A look that gains less than this share of the loss is the last.
+MOST_ROUNDS, MOST_LOOKS, MOST_HALVINGS, MOST_JOINING = 12, 5, 2, 16
+# A look must gain this share of the loss; two in a row that do not are the last. One alone is chance: what it draws of
+# the neighbourhood may miss the better optimum.
 GAIN = 0.01
 
 
@@ -103,7 +104,9 @@ def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume
 
 def look_again(goals: Sequence[float]) -> bool:
     """Whether another look is worth its rollouts after looks that ended at these goals, logarithms."""
-    return len(goals) < MOST_LOOKS and min(goals[:-1], default=math.inf) - goals[-1] > GAIN
+    best = [math.inf, *itertools.accumulate(goals, min)]
+    gained = [before - after > GAIN for before, after in itertools.pairwise(best)]
+    return len(goals) < MOST_LOOKS and any(gained[-2:])
 
 
 def training(study: Study) -> Members:
