@@ -222,7 +222,7 @@ def test_the_neighbourhoods_are_there_and_no_larger():
         assert np.all(away.max(axis=0) > 0.9 * reach)
 
 
-def test_looks_end_when_one_gains_little_or_at_their_number():
+def test_looks_end_when_two_in_a_row_gain_little_or_at_their_number():
     assert look_again([0.0])
     assert look_again([0.0, -0.5 * GAIN])  # one that gains nothing may be chance
     assert not look_again([0.0, -0.5 * GAIN, -0.8 * GAIN])
