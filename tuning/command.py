@@ -16,6 +16,7 @@ from tuning.config import read_study, seeds, settings
 from tuning.objective import Members
 from tuning.rounds import CHECKPOINT, Answer, rounds
 from tuning.study import Study, judge, study_of, summarise
+from tuning.study import told as step_told
 from tuning.toml import dumps, with_gains
 
 
@@ -97,8 +98,8 @@ def _verdict(facts: dict[str, Any]) -> str:
     )
     error = facts["step_error"]
     if error and not error["resolved"]:
-        off = 100 * error["relative"]
-        told += f" The search's own steps are off by {off:.2g} % there: do not trust this; raise tune.substeps."
+        told += f" The search's own steps against accurate ones: {step_told(error['relative'])}. Do not trust this; "
+        told += "raise tune.substeps."
     if error and error["lost"]:
         told += (
             f" Accurate steps lose {len(error['lost'])} of the training members tried, which the search's own hold: "

@@ -12,6 +12,7 @@ from ambjax.theorem import Report as Check
 from tuning.explore import Slices
 from tuning.loss import TERMS
 from tuning.space import Space
+from tuning.study import told as step_told
 
 Facts = dict[str, Any]
 # Where the picture of the risk ends: a lost member costs a million times an error.
@@ -116,7 +117,7 @@ def _how(facts: Facts) -> list[str]:
     if error := facts.get("step_error"):
         told.append(
             f"- step of the search at the optimum: settled rms error {error['search_m']:.4e} m, adaptive RODAS3 "
-            f"{error['reference_m']:.4e} m on {error['members']} members: off by {100 * error['relative']:.2g} %"
+            f"{error['reference_m']:.4e} m on {error['members']} members: {step_told(error['relative'])}"
         )
     return told
 

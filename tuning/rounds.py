@@ -21,6 +21,7 @@ from tuning.objective import Members
 from tuning.optimise import Keeper, Search, best_of, search
 from tuning.screen import around, everywhere
 from tuning.study import REFERENCE_MEMBERS, StepError, Study, step_error, study_of
+from tuning.study import told as step_told
 
 CHECKPOINT = "checkpoint"
 # Rounds in all, looks among them, times that steps are halved, and lost members that join in one round.
@@ -83,7 +84,7 @@ def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume
             points = around(x, tune.budget.screen, tune.budget.seed + round)
             continue
         error = step_error(study, x)
-        say(f"step of the search against adaptive RODAS3: settled rms error off by {100 * error.relative:.2g} %")
+        say(f"step of the search against adaptive RODAS3: {step_told(error.relative)}")
         if not error.resolved and halvings < MOST_HALVINGS and not kept.interrupted:
             halvings, points = halvings + 1, x[None]
             study = _finer(study, 2**halvings)

@@ -95,6 +95,13 @@ class StepError(NamedTuple):
         return abs(self.relative) <= RESOLVED
 
 
+def told(relative: float) -> str:
+    """The error of the search's own steps, relative to accurate ones, in words; NaN where none was held by both."""
+    if math.isnan(relative):
+        return "no member compared is held by both"
+    return f"settled rms error off by {100 * relative:.2g} %"
+
+
 def step_error(study: Study, x: np.ndarray) -> StepError:
     """What the search's own steps are worth at x [m]."""
     seed, count = seeds(study.tune.budget)[0], study.tune.budget.members
