@@ -21,7 +21,7 @@ from tuning.screen import bounded
 # Members simulated at a time when an ensemble is judged.
 CHUNK = 1024
 # Members and tolerance of the accurate reference against which the steps of the search are held.
-REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 2000
+REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 10_000
 # Beyond this relative error of the settled rms error the steps are refined and the search goes on.
 RESOLVED = 0.1
 
