@@ -5,6 +5,7 @@ verdict is typed in: all are computed from the runs in `ambjax.evidence`.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -59,7 +60,7 @@ def _found(ours: str, value: float, condition: bool, cause: str) -> Finding:
 
 def _lost(run: Run, evidence: Evidence) -> Finding | None:
     """The finding for a claim about a run in which the rotor was lost, or None."""
-    if not run.metrics["lost"]:
+    if math.isinf(run.metrics["lost_at_s"]):
         return None
     inversion = next(c for c in evidence.check_tracking.conditions if c.name == "inversion, ideal")
     words = f"rotor lost at {run.metrics['lost_at_s'] * 1e3:.1f} ms"

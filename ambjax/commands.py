@@ -62,9 +62,12 @@ def run_simulate(args: argparse.Namespace) -> tuple[int, Summary]:
     if not args.json:
         print(_metrics_text(metrics))
         print(f"written: {out}/trajectory.npz, metrics.json, overview.png")
+    ended = metrics["lost_at_s"] is not None
     if metrics["lost"]:
         say(f"The rotor is lost at {metrics['lost_at_s']:.4g} s: {trajectory.lost_why}. 'ambjax check' may say why.")
-    return int(metrics["lost"]), metrics | {"out": str(out)}
+    elif ended:
+        say(f"Whether the rotor is held is not known: at {metrics['lost_at_s']:.4g} s the run {trajectory.lost_why}.")
+    return int(ended), metrics | {"out": str(out)}
 
 
 def _member(case: Case, args: argparse.Namespace) -> Case:

@@ -1,6 +1,7 @@
 """The runs behind the claims ledger: for one reading, everything that its verdicts are computed from."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -133,7 +134,7 @@ def _uncertain(cascade: Cascade, reading: str) -> tuple[list[str], float]:
     with ThreadPoolExecutor() as pool:
         metrics = list(pool.map(one, cases))
     named = [f"{name} {100 * (factor - 1):+.0f} %" for name, factor in cases]
-    lost = [name for name, m in zip(named, metrics, strict=True) if m["lost"]]
+    lost = [name for name, m in zip(named, metrics, strict=True) if math.isfinite(m["lost_at_s"])]
     return lost, max(m["settled_max_abs_error_m"] for m in metrics)
 
 
@@ -159,7 +160,7 @@ def _noise(cascade: Cascade, reading: str, period: float) -> Noise:
     # This tolerance agrees with 1e-6 to 1 % of sigma's radius at all of these levels, at half the cost.
     clock = Clock(NOISE_SAMPLES, period, Adaptive(1e-4))
     seen = _scan(*canonical((cascade, scenarios, clock)))
-    lost = np.any(np.asarray(seen["lost"]).reshape(-1, SEEDS), axis=1)
+    lost = np.any(np.isfinite(seen["lost_at_s"]).reshape(-1, SEEDS), axis=1)
     sigma = np.asarray(seen["settled_max_abs_sigma_m_per_s"]).reshape(-1, SEEDS).mean(axis=1)
     return Noise(period, NOISE_SAMPLES * period, lost, sigma)
 
@@ -175,6 +176,6 @@ def _basin(cascade: Cascade, reading: str) -> float:
     initial = Initial(jnp.asarray(offsets), zeros, zeros + current)
     scenarios = _batch(dataclasses.replace(quiet, sensor=Sensor()), size, initial=initial)
     seen = _scan(*canonical((started, scenarios, Clock(NOISE_SAMPLES, 1e-4, Adaptive(1e-4)))))
-    lost = np.asarray(seen["lost"]).reshape(2, -1).any(axis=0)
+    lost = np.isfinite(seen["lost_at_s"]).reshape(2, -1).any(axis=0)
     first = np.flatnonzero(lost)[0] if lost.any() else len(BASIN)
     return float(BASIN[first - 1]) if first else 0.0

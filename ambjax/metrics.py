@@ -13,7 +13,7 @@ from jax import Array
 
 from ambjax._pytree import Scalar, leaf, record, static
 from ambjax.smooth import safe_sqrt
-from ambjax.trajectory import ALIVE, first_time
+from ambjax.trajectory import ALIVE, STALLED, first_time
 
 
 class Ending(NamedTuple):
@@ -210,7 +210,8 @@ class Standard:
         numbers = self._folds().result(carry, ending)
         numbers["clearance_used"] = numbers["clearance_used"] / self.touchdown
         fate = {
-            "lost": ending.lost_code != ALIVE,
+            "lost": (ending.lost_code != ALIVE) & (ending.lost_code != STALLED),
+            "stalled": ending.lost_code == STALLED,
             "lost_at_s": ending.lost_at,
             "singular_at_s": ending.singular_at,
         }

@@ -33,7 +33,7 @@ def test_verdicts_follow_the_evidence():
     judges = {c.says: c.judge for c in claims.CLAIMS}
 
     def tracking(error, lost=False):
-        metrics = {"lost": lost, "lost_at_s": 0.01, "settled_max_abs_error_m": error}
+        metrics = {"lost_at_s": 0.01 if lost else np.inf, "settled_max_abs_error_m": error}
         condition = types.SimpleNamespace(name="inversion, ideal", gain=1000.0, against=6e4)
         run = types.SimpleNamespace(metrics=metrics, trajectory=types.SimpleNamespace(lost_why="touched down"))
         return types.SimpleNamespace(tracking=run, check_tracking=types.SimpleNamespace(conditions=[condition]))

@@ -258,7 +258,7 @@ def test_histogram_counts_every_member_once(tmp_path, drawn):
 )
 @pytest.mark.parametrize("all_lost", [False, True])
 def test_histograms_of_hard_cases(tmp_path, drawn, values, all_lost):
-    columns = {"lost": np.full(len(values), all_lost), "rms_error_m": values}
+    columns = {"lost_at": np.full(len(values), 0.1 if all_lost else np.inf), "rms_error_m": values}
     pictures.histograms(columns, tmp_path / "h.png")
     assert is_png(tmp_path / "h.png")
     shown = drawn[0].axes[0].patches[-1].get_data().values.sum()

@@ -111,11 +111,12 @@ def step_error(study: Study, x: np.ndarray) -> StepError:
     objective = dataclasses.replace(study.objective, clock=clock)
     reference = Engine(objective, settle=study.case.settle, lanes=len(who.member))
     ours, theirs = (e.metrics(x[None], who)["metrics"] for e in (study.engine, reference))
-    held = ~(ours["lost"] | theirs["lost"])[0]
+    ended = [np.isfinite(found["lost_at_s"])[0] for found in (ours, theirs)]
+    held = ~(ended[0] | ended[1])
     if not held.any():
         return StepError(math.nan, math.nan, math.nan, 0, [])
     search_m, reference_m = (rms(found["settled_rms_error_m"][0][held]) for found in (ours, theirs))
-    unseen = numbers[(theirs["lost"] & ~ours["lost"])[0]].tolist()
+    unseen = numbers[ended[1] & ~ended[0]].tolist()
     return StepError(search_m, reference_m, search_m / reference_m - 1, int(held.sum()), unseen)
 
 
@@ -123,7 +124,7 @@ def summarise(study: Study, found: dict[str, np.ndarray]) -> dict[str, Any]:
     """Numbers of an ensemble [N] for the report: pooled rms and largest error, survival, mean and largest metrics."""
     from ambjax.ensemble.statistics import wilson
 
-    lost, errors = found["lost"], found["settled_rms_error_m"]
+    lost, errors = np.isfinite(found["lost_at_s"]), found["settled_rms_error_m"]
     n = len(lost)
     kept = wilson(n - int(lost.sum()), n)
     told: dict[str, Any] = {

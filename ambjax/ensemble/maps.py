@@ -97,7 +97,7 @@ def _cells(study: Study, x: Axis, y: Axis | None) -> tuple[np.ndarray, np.ndarra
     cascade, scenario = _batch(study.cascade, study.scenario, {k: v[member] for k, v in drawn.items()} | axes)
     scenario = dataclasses.replace(scenario, seed=study.seed, member=member)
     found = run_ensemble(cascade, scenario, study.clock, fold=Standard(study.settle, scenario.touchdown)).measured
-    return found["lost"].reshape(shape), found["settled_max_abs_error_m"].reshape(shape)
+    return np.isfinite(found["lost_at_s"]).reshape(shape), found["settled_max_abs_error_m"].reshape(shape)
 
 
 def _batch(cascade: Cascade, scenario: Scenario, values: dict[str, np.ndarray]) -> tuple[Cascade, Scenario]:

@@ -180,8 +180,6 @@ def histograms(columns: Mapping[str, Any], path: pathlib.Path, metrics: Sequence
 
 
 def _lost(columns: Mapping[str, Any], members: int) -> np.ndarray:
-    if "lost" in columns:
-        return np.asarray(columns["lost"], bool)
     for name in ("lost_at", "lost_at_s"):
         if name in columns:
             return np.isfinite(np.asarray(columns[name], float))

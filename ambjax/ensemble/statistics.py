@@ -23,7 +23,7 @@ MOST_COUNTS = 2_000_000
 # The metric by which members are ranked once all lost ones are named.
 DECIDING = "settled_max_abs_error_m"
 # Columns that are no metrics.
-FATE = ("index", "lost_at", "lost", "lost_at_s")
+FATE = ("index", "lost_at", "lost", "stalled", "lost_at_s")
 SPREAD = "spread."
 
 
