@@ -11,6 +11,7 @@ from jax import Array
 from ambjax._apart import apart, stored
 from ambjax._pytree import Scalar, record
 from ambjax.integrate import Problem, Times, _Fixed
+from ambjax.span import Span
 
 
 @functools.cache
@@ -45,14 +46,17 @@ class _Explicit(_Fixed):
     TIMES: ClassVar[tuple[float, ...]]
     ROWS: ClassVar[tuple[tuple[float, ...], ...]]
 
-    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any) -> Any:
+    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         inputs = {share: problem.inputs(at(share)) for share in self.TIMES}
         x, stages, h = state, [], jnp.asarray(h)
-        for share, row in zip(self.TIMES, self.ROWS, strict=True):
-            stages.append(stored(problem.rates(inputs[share], x)))
+        for share, row, weight in zip(self.TIMES, self.ROWS, self.ROWS[-1], strict=True):
+            rates, shown = problem.watched(inputs[share], x)
+            stages.append(stored(rates))
             combined = _combination(row)
             x = jax.tree.map(lambda x, *ks, combined=combined: combined(x, h, ks), state, *stages)
-        return x
+            # Integrals by the method's own rule; other stages are trial states, and no extremes.
+            span = span.seen(shown, weight * h, h) if len(stages) == 1 else span.weighed(shown, weight * h)
+        return x, span
 
 
 @record

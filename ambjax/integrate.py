@@ -1,12 +1,12 @@
 """Integrators: one signature, `advance`, over one sample period in which the inputs are held.
 
-    advance(problem, t, span, state, memory, code=0) -> Advanced(state, code, t, memory)
+    advance(problem, t, period, state, memory, code=0) -> Advanced(state, code, t, memory, span)
 
 A `Problem` is a right-hand side on any pytree of scalars, what drives it as a function of time, the
 size of each component that still matters, and the fate of a state: 0 while all is well. An integrator
 stops at the first state whose code is not 0 and returns the last good one; begun with such a code, it
-moves nothing. `memory` is what the method carries from one sample to the next (`start(span)` makes the
-first).
+moves nothing. `memory` is what the method carries from one sample to the next (`start(period)` makes the
+first), `span` what was seen on the way (`ambjax.span`).
 
 Stage times are moved inside the step by a few units in the last place, so that a jump that falls on
 a step's edge is seen by the steps after it and not by those before: otherwise the last stage sees
@@ -23,6 +23,7 @@ from jax import Array, lax
 from ambjax import _linear
 from ambjax._apart import stored
 from ambjax._pytree import Scalar, leaf, record, static
+from ambjax.span import NOTHING, Instant, Span, blank
 from ambjax.trajectory import ALIVE, STALLED
 
 State = TypeVar("State")
@@ -37,7 +38,10 @@ class Problem(NamedTuple):
     """What is integrated: rates(inputs(t), state), scale (a state) and fate(state) -> code.
 
     `layer` (a state): the largest error with which a component stays where a smoothed sign turns; None: none does.
-    `slide(inputs(t_0), inputs(t_1), h, state) -> state`, where there is one, is a step made for this very system.
+    `observed(inputs(t), state) -> (rates, Instant)`: the rates and what is to be seen; None: nothing is. `shown`: any
+    such instant, for its structure. `jumps`: whether the rates jump at the start of a sample.
+    `slide(inputs(t_0), inputs(t_1), h, state, span) -> (state, span)`, where there is one, is a step made for this
+    very system.
     """
 
     inputs: Inputs
@@ -45,16 +49,24 @@ class Problem(NamedTuple):
     scale: Any
     fate: Fate
     layer: Any = None
-    slide: Callable[[Any, Any, Scalar, Any], Any] | None = None
+    observed: Callable[[Any, Any], tuple[Any, Instant]] | None = None
+    shown: Instant = NOTHING
+    jumps: bool = False
+    slide: Callable[[Any, Any, Scalar, Any, Span], tuple[Any, Span]] | None = None
+
+    def watched(self, inputs: Any, state: Any) -> tuple[Any, Instant]:
+        """Rates, and what is to be seen."""
+        return (self.rates(inputs, state), NOTHING) if self.observed is None else self.observed(inputs, state)
 
 
 class Advanced(NamedTuple):
-    """The end of one sample period: last good state, fate's code, the time it refers to, memory."""
+    """The end of one sample period: last good state, fate's code, the time it refers to, memory, what was seen."""
 
     state: Any
     code: Array
     t: Array
     memory: Any
+    span: Span
 
 
 class Integrator(Protocol):
@@ -65,14 +77,14 @@ class Integrator(Protocol):
         """Largest stable step times slope on the negative real axis; None if there is none."""
         ...
 
-    def step_size(self, span: float) -> float | None:
+    def step_size(self, period: float) -> float | None:
         """The step in s, or None if the method chooses it as it goes."""
         ...
 
-    def start(self, span: Scalar) -> Any: ...
+    def start(self, period: Scalar) -> Any: ...
 
     def advance(
-        self, problem: Problem, t: Scalar, span: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
+        self, problem: Problem, t: Scalar, period: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
     ) -> Advanced: ...
 
 
@@ -101,35 +113,36 @@ class _Fixed:
 
     substeps: int = static(default=1, doc="steps per sample period")
 
-    def step_size(self, span: float) -> float | None:
-        return span / self.substeps
+    def step_size(self, period: float) -> float | None:
+        return period / self.substeps
 
-    def start(self, span: Scalar) -> Any:
+    def start(self, period: Scalar) -> Any:
         return ()
 
-    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any) -> Any:
+    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         raise NotImplementedError
 
     def advance(
-        self, problem: Problem, t: Scalar, span: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
+        self, problem: Problem, t: Scalar, period: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
     ) -> Advanced:
-        h = jnp.asarray(span) / self.substeps
+        h = jnp.asarray(period) / self.substeps
 
-        def body(index: Array, carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
-            x, code, reached = carry
+        def body(index: Array, carry: tuple[Any, Array, Array, Span]) -> tuple[Any, Array, Array, Span]:
+            x, code, reached, span = carry
             alive = code == ALIVE
             # Times do not depend on who is alive: members share them, and what is driven by them.
-            new = self._step(problem, _inside(t + index * h, h), h, x)
+            new, seen = self._step(problem, _inside(t + index * h, h), h, x, span)
             code = jnp.where(alive, problem.fate(new), code)
-            return choose(code == ALIVE, new, x), code, jnp.where(alive, t + (index + 1) * h, reached)
+            x = choose(code == ALIVE, new, x)
+            return x, code, jnp.where(alive, t + (index + 1) * h, reached), choose(alive, seen, span)
 
-        begin = (state, jnp.asarray(code, jnp.int32), jnp.asarray(t, h.dtype))
-        x, code, reached = lax.fori_loop(0, self.substeps, body, begin)
-        return Advanced(x, code, reached, memory)
+        begin = (state, jnp.asarray(code, jnp.int32), jnp.asarray(t, h.dtype), blank(problem.shown))
+        x, code, reached, span = lax.fori_loop(0, self.substeps, body, begin)
+        return Advanced(x, code, reached, memory, span)
 
 
-def rodas3_step(problem: Problem, at: Times, h: Scalar, state: Any) -> tuple[Any, Any]:
-    """One step of RODAS3 and its error estimate: Rosenbrock, order 3(2), L-stable, stiffly accurate.
+def rodas3_step(problem: Problem, at: Times, h: Scalar, state: Any) -> tuple[Any, Any, Instant]:
+    """One step of RODAS3, its error estimate and what is seen at its start: order 3(2), L-stable, stiffly accurate.
 
     Sandu et al., Atmospheric Environment 31 (1997) 3459-3472. One Jacobian, one factorisation of
     I - h J / 2 and three evaluations a step. Stages are scaled by h, so h = 0 is the identity.
@@ -138,7 +151,7 @@ def rodas3_step(problem: Problem, at: Times, h: Scalar, state: Any) -> tuple[Any
     rates = jax.jit(problem.rates)  # traced once here, not once per column of the Jacobian
     given, given_t = jax.jvp(problem.inputs, (t_0,), (jnp.ones_like(t_0),))
     factors = _linear.factor(_linear.jacobian(lambda x: rates(given, x), state), h / 2)
-    f_0, f_t = jax.jvp(lambda s: rates(s, state), (given,), (given_t,))
+    f_0, f_t, here = jax.jvp(lambda s: problem.watched(s, state), (given,), (given_t,), has_aux=True)
     given = problem.inputs(at(1.0))
 
     def stage(f: Any, *couplings: tuple[Scalar, Any]) -> Any:
@@ -151,7 +164,7 @@ def rodas3_step(problem: Problem, at: Times, h: Scalar, state: Any) -> tuple[Any
     u_3 = stage(rates(given, y_3), (1.0, u_1), (-1.0, u_2))
     y_4 = axpy(y_3, (1.0, u_3))
     u_4 = stage(rates(given, y_4), (1.0, u_1), (-1.0, u_2), (-8.0 / 3.0, u_3))
-    return axpy(y_4, (1.0, u_4)), u_4
+    return axpy(y_4, (1.0, u_4)), u_4, here
 
 
 @record
@@ -160,8 +173,10 @@ class Rodas3(_Fixed):
 
     limit = None
 
-    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any) -> Any:
-        return rodas3_step(problem, at, h, state)[0]
+    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
+        new, _, here = rodas3_step(problem, at, h, state)
+        there = problem.watched(problem.inputs(at(1.0)), new)[1]
+        return new, span.seen(here, h / 2, h).seen(there, h / 2)
 
     def __str__(self) -> str:
         return f"RODAS3 (L-stable Rosenbrock), {self.substeps} substeps"
@@ -176,10 +191,10 @@ class Slide(_Fixed):
 
     limit = None
 
-    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any) -> Any:
+    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         if problem.slide is None:
             raise ValueError("clock.method = Slide(...): it steps loops whose inversion law is 'adaptive'. Use Rodas3.")
-        return problem.slide(problem.inputs(at(0.0)), problem.inputs(at(1.0)), h, state)
+        return problem.slide(problem.inputs(at(0.0)), problem.inputs(at(1.0)), h, state, span)
 
     def __str__(self) -> str:
         return f"sliding step, {self.substeps} substeps"
@@ -201,40 +216,48 @@ class Adaptive:
 
     limit = None
 
-    def step_size(self, span: float) -> float | None:
+    def step_size(self, period: float) -> float | None:
         return None
 
-    def start(self, span: Scalar) -> Any:
-        return jnp.asarray(span) * 1e-3
+    def start(self, period: Scalar) -> Any:
+        return jnp.asarray(period) * 1e-3
 
     def advance(
-        self, problem: Problem, t: Scalar, span: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
+        self, problem: Problem, t: Scalar, period: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
     ) -> Advanced:
-        span = jnp.asarray(span)
+        period = jnp.asarray(period)
 
         def unfinished(carry: Any) -> Array:
-            _, _, done, code, trials = carry
-            return (done < span) & (code == ALIVE) & (trials < self.most_steps)
+            done, code, trials = carry[2:5]
+            return (done < period) & (code == ALIVE) & (trials < self.most_steps)
 
         def trial(carry: Any) -> Any:
-            x, h, done, _, trials = carry
-            left = span - done
+            x, h, done, _, trials, before, span = carry
+            left = period - done
             last = h * 1.0001 >= left
             taken = jnp.where(last, left, h)
-            new, error = rodas3_step(problem, _inside(t + done, taken), taken, x)
+            new, error, here = rodas3_step(problem, _inside(t + done, taken), taken, x)
             size = self._size(error, x, new, problem)
             accept = size <= 1
             suggested = taken * jnp.clip(0.9 * jnp.maximum(size, 1e-9) ** (-1 / 3), 0.2, 5.0)
             # A step cut short by the sample's end says little about the next one.
             h = jnp.where(last & accept, jnp.maximum(h, suggested), suggested)
             verdict = jnp.where(accept, problem.fate(new), ALIVE)
-            done = jnp.where(accept, jnp.where(last, span, done + taken), done)
-            return choose(accept & (verdict == ALIVE), new, x), h, done, verdict, trials + 1
+            # By the trapezoidal rule, in which this state ends one step and begins the next. Not so the first step
+            # after a jump, by the rule of its end alone: slaved states leave what the jump found within nanoseconds.
+            first = problem.jumps & (done == 0)
+            span = choose(accept, span.seen(here, (before + jnp.where(first, 0.0, taken)) / 2, taken), span)
+            before = jnp.where(accept, jnp.where(first, 2 * taken, taken), before)
+            done = jnp.where(accept, jnp.where(last, period, done + taken), done)
+            return choose(accept & (verdict == ALIVE), new, x), h, done, verdict, trials + 1, before, span
 
-        begin = (state, lax.stop_gradient(memory), jnp.zeros_like(span), jnp.asarray(code, jnp.int32), jnp.int32(0))
-        x, h, done, code, _ = lax.while_loop(unfinished, trial, begin)
-        stalled = (code == ALIVE) & (done < span)
-        return Advanced(x, jnp.where(stalled, STALLED, code), t + done, h)
+        zero, code = jnp.zeros_like(period), jnp.asarray(code, jnp.int32)
+        begin = (state, lax.stop_gradient(memory), zero, code, jnp.int32(0), zero, blank(problem.shown))
+        x, h, done, code, _, before, span = lax.while_loop(unfinished, trial, begin)
+        end = problem.watched(problem.inputs(_inside(t, done)(1.0)), x)[1]
+        span = choose(done > 0, span.seen(end, before / 2), span)
+        stalled = (code == ALIVE) & (done < period)
+        return Advanced(x, jnp.where(stalled, STALLED, code), t + done, h, span)
 
     def _size(self, error: Any, x: Any, new: Any, problem: Problem) -> Array:
         """Root mean square of the error against what is allowed; huge if anything is not finite."""

@@ -15,6 +15,7 @@ from ambjax.integrate import Problem
 from ambjax.scenario import Scenario
 from ambjax.signals import Reference, reference_at
 from ambjax.sliding import slide, slides
+from ambjax.span import Instant
 from ambjax.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 
 # A state this many times its scale has left the model's meaning, long before numbers overflow.
@@ -27,6 +28,30 @@ class Inputs(NamedTuple):
     reference: Reference
     q_z: Array
     q_i: Array
+
+
+class Sizes(NamedTuple):
+    """Signals whose extremes between samples matter: as in a Row. m, m, m/s, V, A, A, A^2/m^2."""
+
+    z: Array
+    e_z: Array
+    sigma: Array
+    u: Array
+    i: Array
+    e: Array
+    v_tilde: Array
+
+
+class Densities(NamedTuple):
+    """What is integrated over time: u (V), u^2 (V^2), and the copper loss in both coils (W)."""
+
+    u: Array
+    u_squared: Array
+    heat: Array
+
+
+# For its structure only.
+SHOWN = Instant(Sizes(*[0.0] * 7), Densities(*[0.0] * 3))  # pyright: ignore[reportArgumentType]
 
 
 class LoopState(NamedTuple):
@@ -94,6 +119,18 @@ class ClosedLoop:
         _, control, u = self.command(inputs, state, hold)
         return self.moved(inputs, state, control, u)
 
+    def observed(self, inputs: Inputs, state: LoopState, hold: Measurement) -> tuple[LoopState, Instant]:
+        """The rates, and what is seen of the loop at one instant."""
+        command, control, u = self.command(inputs, state, hold)
+        shown = self.shown(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
+        return self.moved(inputs, state, control, u), shown
+
+    def shown(self, reference: Reference, plant: Measurement, i_ref: Array, v_tilde: Array, u: Array) -> Instant:
+        """What is seen of the loop with this motion and current, their references, input error and voltage."""
+        sigma, heat = self.cascade.position.sigma(plant, reference), self.scenario.plant.copper_loss(plant.i)
+        sizes = Sizes(plant.z, plant.z - reference.r, sigma, u, plant.i, plant.i - i_ref, v_tilde)
+        return Instant(sizes, Densities(u, u * u, heat))
+
     def moved(self, inputs: Inputs, state: LoopState, control: CascadeState, u: Array) -> LoopState:
         """Time derivative of the state, given that of the cascade and the applied voltage."""
         plant, (z, z_dot, i) = self.scenario.plant, state.plant
@@ -119,7 +156,9 @@ class ClosedLoop:
         """What an integrator is given for one sample."""
         step = functools.partial(slide, self, hold) if slides(self.cascade) else None
         rates = lambda inputs, x: self.rates(inputs, x, hold)  # noqa: E731
-        return Problem(self.inputs, rates, self.scale(), self.fate, self.layer(), step)
+        observed = lambda inputs, x: self.observed(inputs, x, hold)  # noqa: E731
+        jumps = self.scenario.sensor is not None
+        return Problem(self.inputs, rates, self.scale(), self.fate, self.layer(), observed, SHOWN, jumps, step)
 
     def row(self, t: Scalar, state: LoopState, hold: Measurement, alive: Array) -> Row:
         """All signals at one instant. The drive of a lost rotor is off: u = 0."""

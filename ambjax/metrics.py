@@ -1,8 +1,11 @@
 """Metrics as folds: they see one row at a time and keep a few numbers, whatever the length of the run.
 
-A fold is a record with `init() -> carry`, `update(carry, row) -> carry` and
-`result(carry, ending) -> numbers`. Errors count every sample, a lost rotor's too (frozen where it was
-lost); effort and chatter count only the samples in which the drive was on.
+A fold is a record with `init() -> carry`, `update(carry, row, span) -> carry` and
+`result(carry, ending) -> numbers`: `row` is the start of a sample, `span` what the integrator saw from there to the
+next (`ambjax.span`, `loop.Sizes`, `loop.Densities`). Errors count every sample, a lost rotor's too (frozen where it
+was lost). Under held noise u, i, e and v_tilde are not smooth, and the start of a sample is where they have just
+jumped: so extremes are taken over the integrator's substeps, and effort, chatter and copper loss over time, while the
+drive is on.
 """
 
 from collections.abc import Mapping
@@ -29,7 +32,7 @@ class Fold(Protocol):
     """A streaming metric."""
 
     def init(self) -> Any: ...
-    def update(self, carry: Any, row: Any) -> Any: ...
+    def update(self, carry: Any, row: Any, span: Any) -> Any: ...
     def result(self, carry: Any, ending: Ending) -> Any: ...
 
 
@@ -39,7 +42,10 @@ def _zero() -> Array:
 
 @record
 class Peak:
-    """Largest |row.`of`| from `after` on, and when."""
+    """Largest |row.`of`| from `after` on, and when; between samples too for the signals that a span shows the size of.
+
+    `timed`: the time is that of the sample in which it was reached.
+    """
 
     of: str = static()
     after: Scalar = leaf(default=0.0, unit="s", at_least=0)
@@ -48,9 +54,11 @@ class Peak:
     def init(self) -> tuple[Array, Array]:
         return _zero(), _zero()
 
-    def update(self, carry: tuple[Array, Array], row: Any) -> tuple[Array, Array]:
+    def update(self, carry: tuple[Array, Array], row: Any, span: Any) -> tuple[Array, Array]:
         peak, when = carry
         value = jnp.abs(getattr(row, self.of))
+        if self.of in getattr(span.most, "_fields", ()):
+            value = jnp.maximum(value, getattr(span.most, self.of))
         larger = (value > peak) & (row.t >= self.after)
         return jnp.where(larger, value, peak), jnp.where(larger, row.t, when)
 
@@ -67,7 +75,7 @@ class Lowest:
     def init(self) -> tuple[Array, Array]:
         return _zero() + jnp.inf, _zero()
 
-    def update(self, carry: tuple[Array, Array], row: Any) -> tuple[Array, Array]:
+    def update(self, carry: tuple[Array, Array], row: Any, span: Any) -> tuple[Array, Array]:
         least, when = carry
         value = getattr(row, self.of)
         smaller = (value < least) & row.alive
@@ -79,18 +87,17 @@ class Lowest:
 
 @record
 class Rms:
-    """Root mean square of row.`of` from `after` on; over the samples with the drive on if `driven`."""
+    """Root mean square of row.`of` over the samples from `after` on."""
 
     of: str = static()
     after: Scalar = leaf(default=0.0, unit="s", at_least=0)
-    driven: bool = static(default=False)
 
     def init(self) -> tuple[Array, Array]:
         return _zero(), _zero()
 
-    def update(self, carry: tuple[Array, Array], row: Any) -> tuple[Array, Array]:
+    def update(self, carry: tuple[Array, Array], row: Any, span: Any) -> tuple[Array, Array]:
         total, count = carry
-        counts = (row.t >= self.after) & (row.alive | (not self.driven))
+        counts = row.t >= self.after
         return total + jnp.where(counts, getattr(row, self.of) ** 2, 0.0), count + counts
 
     def result(self, carry: tuple[Array, Array], ending: Ending) -> Array:
@@ -98,34 +105,44 @@ class Rms:
 
 
 @record
-class Mean:
-    """Mean of row.`of` over the samples with the drive on."""
+class Driven:
+    """Mean over time of span.densities.`of` from `after` on, while the drive is on; its root if `root`."""
 
     of: str = static()
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0)
+    root: bool = static(default=False)
 
     def init(self) -> tuple[Array, Array]:
         return _zero(), _zero()
 
-    def update(self, carry: tuple[Array, Array], row: Any) -> tuple[Array, Array]:
-        return carry[0] + jnp.where(row.alive, getattr(row, self.of), 0.0), carry[1] + row.alive
+    def update(self, carry: tuple[Array, Array], row: Any, span: Any) -> tuple[Array, Array]:
+        counts = row.t >= self.after
+        more = getattr(span.densities, self.of), span.time
+        total, time = (old + jnp.where(counts, new, 0.0) for old, new in zip(carry, more, strict=True))
+        return total, time
 
     def result(self, carry: tuple[Array, Array], ending: Ending) -> Array:
-        return carry[0] / jnp.maximum(carry[1], 1)
+        total, time = carry
+        mean = total / jnp.where(time > 0, time, 1.0)
+        return safe_sqrt(mean) if self.root else mean
 
 
 @record
 class Variation:
-    """Total variation of row.`of` from sample to sample from `after` on, drive on: chatter."""
+    """Total variation from `after` on, V, of the voltage averaged over each sample, while the drive is on: chatter.
 
-    of: str = static()
+    Of the voltage itself it would count spikes of the laws' signs, shorter than any drive's rise time and, with a
+    set-valued sign, without number.
+    """
+
     after: Scalar = leaf(default=0.0, unit="s", at_least=0)
 
     def init(self) -> tuple[Array, Array, Array]:
         return _zero(), _zero(), jnp.asarray(False)
 
-    def update(self, carry: tuple[Array, Array, Array], row: Any) -> tuple[Array, Array, Array]:
+    def update(self, carry: tuple[Array, Array, Array], row: Any, span: Any) -> tuple[Array, Array, Array]:
         total, before, counting = carry
-        value, counts = getattr(row, self.of), row.alive & (row.t >= self.after)
+        value, counts = span.densities.u / jnp.where(span.time > 0, span.time, 1.0), row.alive & (row.t >= self.after)
         return total + jnp.where(counts & counting, jnp.abs(value - before), 0.0), value, counts
 
     def result(self, carry: tuple[Array, Array, Array], ending: Ending) -> Array:
@@ -134,7 +151,7 @@ class Variation:
 
 @record
 class Reaching:
-    """Time at which |row.`of`| first comes within `band`, s; +inf if it never does."""
+    """Start of the sample in which |row.`of`| first comes within `band`, s; +inf if it never does."""
 
     of: str = static()
     band: Scalar = leaf(above=0)
@@ -142,8 +159,11 @@ class Reaching:
     def init(self) -> Array:
         return _zero() + jnp.inf
 
-    def update(self, carry: Array, row: Any) -> Array:
-        return first_time((jnp.abs(getattr(row, self.of)) <= self.band) & row.alive, row.t, carry)
+    def update(self, carry: Array, row: Any, span: Any) -> Array:
+        value = jnp.abs(getattr(row, self.of))
+        if self.of in getattr(span.least, "_fields", ()):
+            value = jnp.minimum(value, getattr(span.least, self.of))
+        return first_time((value <= self.band) & row.alive, row.t, carry)
 
     def result(self, carry: Array, ending: Ending) -> Array:
         return carry
@@ -158,8 +178,8 @@ class Named:
     def init(self) -> dict[str, Any]:
         return {name: fold.init() for name, fold in self.folds.items()}
 
-    def update(self, carry: dict[str, Any], row: Any) -> dict[str, Any]:
-        return {name: fold.update(carry[name], row) for name, fold in self.folds.items()}
+    def update(self, carry: dict[str, Any], row: Any, span: Any) -> dict[str, Any]:
+        return {name: fold.update(carry[name], row, span) for name, fold in self.folds.items()}
 
     def result(self, carry: dict[str, Any], ending: Ending) -> dict[str, Any]:
         return {name: fold.result(carry[name], ending) for name, fold in self.folds.items()}
@@ -191,11 +211,11 @@ class Standard:
                 "v_tilde_reached_s": Reaching("v_tilde", 0.1),
                 "current_error_reached_s": Reaching("e", 1e-3),
                 "max_abs_u_V": Peak("u"),
-                "rms_u_V": Rms("u", driven=True),
-                "settled_rms_u_V": Rms("u", late, driven=True),
-                "chatter_V": Variation("u", late),
+                "rms_u_V": Driven("u_squared", root=True),
+                "settled_rms_u_V": Driven("u_squared", late, root=True),
+                "chatter_V": Variation(late),
                 "max_abs_i_A": Peak("i"),
-                "copper_loss_W": Mean("heat"),
+                "copper_loss_W": Driven("heat"),
                 "clearance_used": Peak("z"),
             }
         )
@@ -203,8 +223,8 @@ class Standard:
     def init(self) -> dict[str, Any]:
         return self._folds().init()
 
-    def update(self, carry: dict[str, Any], row: Any) -> dict[str, Any]:
-        return self._folds().update(carry, row)
+    def update(self, carry: dict[str, Any], row: Any, span: Any) -> dict[str, Any]:
+        return self._folds().update(carry, row, span)
 
     def result(self, carry: dict[str, Any], ending: Ending) -> dict[str, Any]:
         numbers = self._folds().result(carry, ending)

@@ -120,6 +120,10 @@ class Plant:
         """Rate of the current deviation, in A/s: 2 z_dot i/(s_0+z) + 2 (s_0+z)(u - R i)/kappa + q_i. Eq. (2)."""
         return self.rates(z, z_dot, i, u, 0.0, q_i)[1]
 
+    def u_per_i_dot(self, z: Scalar) -> Array:
+        """Voltage per rate of the current, in V s/A: kappa / (2 (s_0+z)). Eq. (2)."""
+        return (self.kappa / 2) * self.gaps(z).inverses[1]
+
     def rates(
         self, z: Scalar, z_dot: Scalar, i: Scalar, u: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0
     ) -> tuple[Array, Array]:

@@ -145,8 +145,8 @@ def _sample(system: System, clock: Clock, fold: Fold | None, progress: Progress,
         alive = ending.lost_code == ALIVE
         # A jump at this instant belongs to this sample even if t was rounded to just before it.
         row = system.row(t * (1 + 4 * jnp.finfo(dtype).eps), state, hold, alive)._replace(t=t)
-        folded = folded if fold is None else fold.update(folded, row)
         after = clock.method.advance(system.problem(hold), t, clock.sample_period, state, memory, ending.lost_code)
+        folded = folded if fold is None else fold.update(folded, row, after.span)
         lost_now = alive & (after.code != ALIVE)
         resting = system.rest(after.state, after.code)
         state = jax.tree.map(lambda a, b: jnp.where(lost_now, a, b), resting, after.state)

@@ -11,7 +11,7 @@ The rotor's motion and the states of the other laws go by Heun's method, the cur
 Quotients are written as products with a reciprocal, which divides once for the value and for all its derivatives.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from ambjax._pytree import Scalar
 from ambjax.control.inversion import Adaptive, v_and_gradient
 from ambjax.control.laws import CurrentDemand, CurrentInputs, Measurement
 from ambjax.smooth import TWO_OVER_PI, reciprocal, smooth_sign
+from ambjax.span import Instant, Span
 
 # Newton steps on the slaved sign: monotone from below; they leave less than 1e-3 of the right-hand side.
 NEWTON = 6
@@ -30,7 +31,7 @@ NEWTON = 6
 EDGE = 1.0
 
 
-def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: Any) -> Any:
+def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
     """The state of a ClosedLoop whose inversion law is `inversion.Adaptive` after h; `begin`, `end`: its inputs."""
     cascade, scenario = loop.cascade, loop.scenario
     model, law, (z, z_dot, i), control = cascade.model, cascade.inversion, state.plant, state.control
@@ -52,45 +53,85 @@ def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: 
     drift = (force_1.v_star - v_1 - w) * per_h
     w, drift = stored((w, drift))
     sliding, slaved, tau = relax(w, drift, law.gamma, law.p, h)
+    w_1 = w + tau * (drift - sliding)
+    w_2 = w_1 + (h - tau) * (drift - slaved)
     sliding, slaved = sliding * reciprocal(gradient_0), slaved * reciprocal(gradient_1)
 
     sliding, slaved, tau, force_1 = stored((sliding, slaved, tau, force_1))
 
     def current(plant: Measurement, seen: Measurement, i_ref: Array, rate: Array, inner: Any, q_i: Array, h: Array):
-        """i - i_ref and the current law's state after h at constant i_ref' = rate."""
+        """i - i_ref and the current law's state after h at constant i_ref' = rate; and what is seen on the way."""
 
         def rate_of(i: Array) -> tuple[Array, Any]:
             inputs = CurrentInputs(seen._replace(i=i + hold.i), CurrentDemand(i_ref, rate), scenario.u_max)
             u, inner_rate = cascade.current(model, inputs, inner)
             u = jnp.clip(u, -scenario.u_max, scenario.u_max)
-            return scenario.plant.i_dot(plant.z, plant.z_dot, i, u, q_i), inner_rate
+            return scenario.plant.i_dot(plant.z, plant.z_dot, i, u, q_i), (inner_rate, u)
 
-        i_dot, slope, inner_rate = jax.jvp(rate_of, (plant.i,), (jnp.ones_like(plant.i),), has_aux=True)
-        e = plant.i - i_ref + h * _phi(h * slope) * (i_dot - rate)
-        return e, _axpy(inner, h, inner_rate)
+        i_dot, slope, (inner_rate, u) = jax.jvp(rate_of, (plant.i,), (jnp.ones_like(plant.i),), has_aux=True)
+        phi, volts = _phi(h * slope), scenario.plant.u_per_i_dot(plant.z)
+        e = plant.i - i_ref + h * phi * (i_dot - rate)
+        return e, _axpy(inner, h, inner_rate), _Voltage(u, (rate - i_dot) * volts, h * slope, phi)
 
-    e, inner = current(state.plant, seen_0, i_ref, sliding, control.current, begin.q_i, tau)
+    e, inner, first = current(state.plant, seen_0, i_ref, sliding, control.current, begin.q_i, tau)
     e, inner = stored((e, inner))
-    i_ref = i_ref + tau * sliding
+    i_ref_0, i_ref = i_ref, i_ref + tau * sliding
     middle = Measurement((z + ahead.z) / 2, (z_dot + ahead.z_dot) / 2, i_ref + e)
     seen = jax.tree.map(lambda a, b: (a + b) / 2, seen_0, seen_1)
     # The current moves fast while it slides: what counts at the start of the rest is where it ended.
     z_ddot_0 += (1 - tau * per_h) * (scenario.plant.z_ddot(z, middle.i, begin.q_z) - z_ddot_0)
-    e, inner = current(middle, seen, i_ref, slaved, inner, end.q_i, h - tau)
+    e, inner, second = current(middle, seen, i_ref, slaved, inner, end.q_i, h - tau)
     e, inner = stored((e, inner))
     i_ref = i_ref + (h - tau) * slaved
-
     z_ddot_1 = scenario.plant.z_ddot(ahead.z, i_ref + e, end.q_z)
     plant = Measurement(
         z + h * z_dot + h * h / 6 * (2 * z_ddot_0 + z_ddot_1), z_dot + h / 2 * (z_ddot_0 + z_ddot_1), i_ref + e
     )
+    # a slide of no length is none: w was within the sign's layer
+    shown = (
+        loop.shown(begin.reference, state.plant, i_ref_0, w, jnp.where(tau > 0, first.u, second.u)),
+        loop.shown(begin.reference, state.plant._replace(i=middle.i), i_ref - (h - tau) * slaved, w_1, second.u),
+        loop.shown(end.reference, plant, i_ref, w_2, second.end(scenario.u_max)),
+    )
+    span = _seen(span, shown, first.u, second, tau, h - tau)
     control = control._replace(
         observer=_axpy(_axpy(control.observer, h / 2, rates_0.observer), h / 2, rates_1.observer),
         position=_axpy(_axpy(control.position, h / 2, rates_0.position), h / 2, rates_1.position),
         inversion=i_ref,
         current=inner,
     )
-    return state._replace(plant=plant, control=control)
+    return state._replace(plant=plant, control=control), span
+
+
+class _Voltage(NamedTuple):
+    """u over one part of a step, as the exponential step has it: u + off (1 - exp(x s)), s from 0 to 1."""
+
+    u: Array
+    off: Array
+    x: Array
+    phi: Array
+    """(exp(x) - 1) / x"""
+
+    def end(self, u_max: Scalar) -> Array:
+        """u at the end, V."""
+        return jnp.clip(self.u - self.off * self.x * self.phi, -u_max, u_max)
+
+    def moments(self) -> tuple[Array, Array]:
+        """Means of u, V, and of u^2, V^2."""
+        rest, once, twice = self.u + self.off, self.off * self.phi, self.phi * (1 + self.x * self.phi / 2)
+        return rest - once, rest * (rest - 2 * once) + self.off * self.off * twice
+
+
+def _seen(span: Span, shown: tuple[Instant, ...], u: Array, rest: _Voltage, tau: Array, left: Array) -> Span:
+    """The span, and a step: `u` for tau, then the rest of it, with what is shown at its start, turn and end."""
+    before = span.densities
+    for instant, weight in zip(shown, (tau / 2, (tau + left) / 2, left / 2), strict=True):
+        span = span.seen(instant, weight)
+    mean, square = stored(rest).moments()
+    densities = span.densities._replace(
+        u=before.u + tau * u + left * mean, u_squared=before.u_squared + tau * u * u + left * square
+    )
+    return span._replace(time=span.time + tau + left, densities=densities)
 
 
 def relax(w: Array, drift: Array, gain: Scalar, p: Scalar, h: Scalar) -> tuple[Array, Array, Array]:

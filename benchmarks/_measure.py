@@ -16,8 +16,6 @@ import jax
 import numpy as np
 
 RESULTS = pathlib.Path(__file__).parent / "results"
-# A script's own folder comes first on the path, where tuning.py would hide the package of that name.
-sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
 
 
 def median_time(run: Callable[[], Any], repeats: int = 7) -> float:

@@ -23,9 +23,8 @@ def main() -> None:
     rows = {}
     for name in given.tasks:
         path, out = TASKS / f"{name}.toml", given.out / name
-        # -P: beside this script lies one called tuning.py
         if not (out / "report.json").exists():
-            subprocess.run([sys.executable, "-P", "-m", "tuning", str(path), "--out", str(out)], check=False)
+            subprocess.run([sys.executable, "-m", "tuning", str(path), "--out", str(out)], check=False)
         told = json.loads((out / "report.json").read_text())
         after = told["after"]
         rows[name] = {

@@ -143,14 +143,18 @@ class Loop:
         return np.array([*self.world.initial, *(first[k] for k in self.kinds if k in first)])
 
     def rates(self, t, y):
-        return np.array(self._rates(t, *y.tolist()))
+        return np.array(self._rates(t, *y.tolist())[0])
+
+    def signals(self, t, y):
+        """u as applied, e = i - i_ref, v_tilde, and r."""
+        return self._rates(t, *y.tolist())[1]
 
     def jacobian(self, t, y):
         """By complex steps: f(y + i h e_j) has imaginary part h df/dy_j, without cancellation."""
         columns = []
         for j in range(len(y)):
             shifted = [complex(x, 1e-30 if k == j else 0.0) for k, x in enumerate(y)]
-            columns.append([x.imag * 1e30 for x in self._rates(t, *shifted)])
+            columns.append([x.imag * 1e30 for x in self._rates(t, *shifted)[0]])
         return np.array(columns).T
 
     def _rates(self, t, z, z_dot, i, *states):
@@ -207,7 +211,7 @@ class Loop:
         gap = true.s_0 + z
         z_ddot = true.stiffness * z + true.a * true.v(z, i) - true.g + q_z + true.a * q_v
         i_dot = 2 * z_dot / gap * i + 2 * gap / true.kappa * (applied - true.R * i) + q_i
-        return z_dot, z_ddot, i_dot, *more
+        return (z_dot, z_ddot, i_dot, *more), (applied, i - i_ref, v_star - model.v(x, i_ref), r)
 
     @staticmethod
     def _limited(u, limit):

@@ -14,7 +14,7 @@ ROOT = pathlib.Path(__file__).parent.parent
 # a row here. `control.*` stands for all modules of that package.
 FLOORS = {
     1: "_pytree _apart _kernel smooth gaussian _linear _version",
-    2: "plant signals integrate explicit trajectory",
+    2: "plant signals span integrate explicit trajectory",
     3: "control control.* scenario metrics",
     4: "loop sliding extend method rollout theorem proof linear paper evidence claims ledger plotting",
     5: "__init__ ensemble ensemble.*",

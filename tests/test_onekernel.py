@@ -40,7 +40,7 @@ SCENARIO = Scenario(
 
 
 def test_kernel_is_the_rollout():
-    fold = Named({"peak": Peak("e_z", 1e-4, timed=True), "chatter": Variation("u")})
+    fold = Named({"peak": Peak("e_z", 1e-4, timed=True), "chatter": Variation()})
     found = run_whole(CASCADE, SCENARIO, CLOCK, fold=fold, block=32, interpret=True)
     expected = run_ensemble(CASCADE, SCENARIO, CLOCK, fold=fold, threads=1)
     assert 0 < int(jnp.isfinite(expected.trajectory.lost_at).sum()) < MEMBERS

@@ -29,8 +29,11 @@ from ambjax import (
     rollout,
 )
 from ambjax._kernel import one_kernel
+from ambjax._pytree import record, static
 from ambjax.explicit import Euler
-from ambjax.metrics import Lowest, Mean, Named, Peak, Reaching, Rms, Variation
+from ambjax.loop import SHOWN
+from ambjax.metrics import Driven, Lowest, Named, Peak, Reaching, Rms, Variation
+from ambjax.span import blank
 from ambjax.trajectory import DIVERGED, TOUCHED, Row
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -39,6 +42,25 @@ LITERAL = Cascade(inversion=inversion.Adaptive(gamma=1e3))
 SMOOTH = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
 TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.8, 1.3))
 NOISY = dataclasses.replace(TRACKING, sensor=Sensor(1e-6, 1e-4, 1e-4))
+
+
+@record
+class Spans:
+    """A fold that keeps every span, [samples] each."""
+
+    samples: int = static()
+
+    def init(self):
+        return jnp.zeros((), int), jax.tree.map(lambda x: jnp.zeros(self.samples) + x, blank(SHOWN))
+
+    def update(self, carry, row, span):
+        n, kept = carry
+        return n + 1, jax.tree.map(lambda a, x: jax.lax.dynamic_update_index_in_dim(a, x, n, 0), kept, span)
+
+    def result(self, carry, ending):
+        return carry[1]
+
+
 # One structure, so one compiled rollout, for most of what follows: 203 samples, noise, a supply limit, all folds.
 FOLDS = Named(
     {
@@ -46,16 +68,17 @@ FOLDS = Named(
         "peak_late": Peak("u", 5.05e-3, timed=True),
         "lowest": Lowest("z"),
         "rms": Rms("e_z"),
-        "rms_driven": Rms("u", 5.05e-3, driven=True),
-        "mean": Mean("heat"),
-        "variation": Variation("u", 5.05e-3),
+        "rms_driven": Driven("u_squared", 5.05e-3, root=True),
+        "mean": Driven("heat"),
+        "variation": Variation(5.05e-3),
         "reaching": Reaching("v_tilde", 0.1),
         "standard": Standard(settle=0.01),
+        "spans": Spans(203),
     }
 )
 SHORT = Clock(203, 1e-4, Adaptive())
 # Another, cheap to compile, where the method does not matter: explicit steps on smooth gains.
-LIGHT_FOLDS = Named({"rms": Rms("e_z"), "variation": Variation("u", 2e-3), "lowest": Lowest("z")})
+LIGHT_FOLDS = Named({"rms": Rms("e_z"), "variation": Variation(2e-3), "lowest": Lowest("z")})
 LIGHT = Clock(203, 5e-5, Euler(1))
 
 
@@ -144,55 +167,59 @@ def test_no_rows_without_recording():
 # --- folds ---
 
 
-def by_numpy(rows, lost_at):
-    """Every fold of FOLDS from the recorded rows."""
+def by_numpy(rows, spans, lost_at):
+    """Every fold of FOLDS from the recorded rows and spans."""
     t, on = np.asarray(rows.t), np.asarray(rows.alive)
-    e_z, e, u, z = (np.asarray(x) for x in (rows.e_z, rows.e, rows.u, rows.z))
+    seen, time = jax.tree.map(np.asarray, spans), np.asarray(spans.time)
+    u = seen.densities.u[on] / time[on]
 
-    def peak(x, after=0.0):
-        return np.max(np.abs(x)[t >= after])
+    def peak(name, after=0.0):
+        values = np.maximum(np.abs(getattr(rows, name)), getattr(seen.most, name))[t >= after]
+        return values.max(), t[t >= after][np.argmax(values)]
 
     def rms(x, mask):
-        return np.sqrt(np.mean(x[mask] ** 2))
+        return np.sqrt(np.mean(np.asarray(x)[mask] ** 2))
 
-    def variation(x, after):
-        both = (on & (t >= after))[:-1] & (on & (t >= after))[1:]
-        return np.sum(np.abs(np.diff(x))[both])
+    def mean(x, after=0.0):
+        return x[t >= after].sum() / time[t >= after].sum() if time[t >= after].sum() else 0.0
 
-    def reached(x, band):
-        hit = (np.abs(x) <= band) & on
+    def variation(after):
+        return np.sum(np.abs(np.diff(u[t[on] >= after])))
+
+    def reached(name, band):
+        hit = (np.minimum(np.abs(getattr(rows, name)), getattr(seen.least, name)) <= band) & on
         return t[hit][0] if hit.any() else np.inf
 
-    late, middle = t >= 0.01, t >= 5.05e-3
-    everywhere = np.ones_like(on)
+    late, everywhere = t >= 0.01, np.ones_like(on)
     return {
-        "peak": peak(e_z),
-        "peak_late": (peak(u, 5.05e-3), t[middle][np.argmax(np.abs(u[middle]))]),
-        "lowest": (np.min(z[on]), t[on][np.argmin(z[on])]),
-        "rms": rms(e_z, everywhere),
-        "rms_driven": rms(u, middle & on),
-        "mean": np.mean(np.asarray(rows.heat)[on]),
-        "variation": variation(u, 5.05e-3),
-        "reaching": reached(rows.v_tilde, 0.1),
+        "peak": peak("e_z")[0],
+        "peak_late": peak("u", 5.05e-3),
+        "lowest": (np.min(rows.z[on]), t[on][np.argmin(rows.z[on])]),
+        "rms": rms(rows.e_z, everywhere),
+        "rms_driven": np.sqrt(mean(seen.densities.u_squared, 5.05e-3)),
+        "mean": mean(seen.densities.heat),
+        "variation": variation(5.05e-3),
+        "reaching": reached("v_tilde", 0.1),
         "standard": {
-            "max_abs_error_m": peak(e_z),
-            "rms_error_m": rms(e_z, everywhere),
-            "settled_max_abs_error_m": peak(e_z, 0.01),
-            "settled_rms_error_m": rms(e_z, late),
-            "settled_max_abs_sigma_m_per_s": peak(rows.sigma, 0.01),
-            "settled_max_abs_v_tilde_A2_per_m2": peak(rows.v_tilde, 0.01),
-            "settled_max_abs_current_error_A": peak(e, 0.01),
-            "sigma_reached_s": reached(rows.sigma, 1e-3),
-            "v_tilde_reached_s": reached(rows.v_tilde, 0.1),
-            "current_error_reached_s": reached(e, 1e-3),
-            "max_abs_u_V": peak(u),
-            "rms_u_V": rms(u, on),
-            "settled_rms_u_V": rms(u, late & on) if (late & on).any() else 0.0,
-            "chatter_V": variation(u, 0.01),
-            "max_abs_i_A": peak(rows.i),
-            "copper_loss_W": np.mean(np.asarray(rows.heat)[on]),
-            "clearance_used": peak(z) / 4.5e-3,
+            "max_abs_error_m": peak("e_z")[0],
+            "rms_error_m": rms(rows.e_z, everywhere),
+            "settled_max_abs_error_m": peak("e_z", 0.01)[0],
+            "settled_rms_error_m": rms(rows.e_z, late),
+            "settled_max_abs_sigma_m_per_s": peak("sigma", 0.01)[0],
+            "settled_max_abs_v_tilde_A2_per_m2": peak("v_tilde", 0.01)[0],
+            "settled_max_abs_current_error_A": peak("e", 0.01)[0],
+            "sigma_reached_s": reached("sigma", 1e-3),
+            "v_tilde_reached_s": reached("v_tilde", 0.1),
+            "current_error_reached_s": reached("e", 1e-3),
+            "max_abs_u_V": peak("u")[0],
+            "rms_u_V": np.sqrt(mean(seen.densities.u_squared)),
+            "settled_rms_u_V": np.sqrt(mean(seen.densities.u_squared, 0.01)),
+            "chatter_V": variation(0.01),
+            "max_abs_i_A": peak("i")[0],
+            "copper_loss_W": mean(seen.densities.heat),
+            "clearance_used": peak("z")[0] / 4.5e-3,
             "lost": np.isfinite(lost_at),
+            "stalled": False,
             "lost_at_s": lost_at,
             "singular_at_s": None,
         },
@@ -200,9 +227,9 @@ def by_numpy(rows, lost_at):
 
 
 @pytest.mark.parametrize("run", ["short", "lost"])
-def test_folds_equal_numpy_on_the_recorded_rows(run, request):
+def test_folds_equal_numpy_on_what_was_recorded(run, request):
     out = request.getfixturevalue(run)
-    expected = by_numpy(out.trajectory.rows, float(out.trajectory.lost_at))
+    expected = by_numpy(out.trajectory.rows, out.measured["spans"], float(out.trajectory.lost_at))
     expected["standard"]["singular_at_s"] = out.trajectory.singular_at
     assert expected["standard"].keys() == out.measured["standard"].keys()
     for name, value in expected.items():
@@ -212,6 +239,14 @@ def test_folds_equal_numpy_on_the_recorded_rows(run, request):
         for key, x, y in pairs:
             # sums in another order: 203 terms
             np.testing.assert_allclose(y, x, rtol=1e-12, err_msg=key)
+
+
+def test_a_span_lasts_as_long_as_the_drive_is_on(short, lost):
+    time = np.asarray(short.measured["spans"].time)
+    np.testing.assert_allclose(time, 1e-4, rtol=1e-12)  # a sum of some ten steps
+    lost_at = float(lost.trajectory.lost_at)
+    # of the step that loses the rotor all counts: it ends where the rotor was lost
+    np.testing.assert_allclose(np.sum(lost.measured["spans"].time), lost_at, rtol=1e-9)
 
 
 # --- members ---

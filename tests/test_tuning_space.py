@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from ambjax import Cascade, Clock, Initial, Pulse, Scenario, Sine, Slide, inversion, position, rollout
+from ambjax.loop import SHOWN, Densities
 from ambjax.metrics import Rms
+from ambjax.span import blank
 from ambjax.template import template
 from ambjax.theorem import delta_1_on_reference
 from tuning.conditions import bounds, shortfall
@@ -131,12 +133,12 @@ def test_tracking_is_the_settled_mean_square():
 
 def test_terms_have_no_dimension():
     """Lengths of another unit, with volts as they are: nothing but tracking's own ratio enters."""
-    row = rollout(SMOOTH, TRACKING, CLOCK).trajectory.rows
-    found = []
+    row, found = rollout(SMOOTH, TRACKING, CLOCK).trajectory.rows, []
+    span = blank(SHOWN)._replace(time=jnp.asarray(1e-4), densities=Densities(*map(jnp.asarray, (10.0, 400.0, 5.0))))
     for factor in (1.0, 1000.0):
         fold = Loss(0.01, 0.0, 5e-3 * factor, 200.0, 4.5e-3 * factor)
         scaled = row._replace(**{name: factor * getattr(row, name) for name in ("z", "z_dot", "r")})
-        carry, _ = jax.lax.scan(lambda c, r, fold=fold: (fold.update(c, r), None), fold.init(), scaled)
+        carry, _ = jax.lax.scan(lambda c, r, fold=fold: (fold.update(c, r, span), None), fold.init(), scaled)
         found.append([float(carry.square), float(carry.power), float(carry.effort), float(carry.clearance)])
     np.testing.assert_allclose(found[0], found[1], rtol=1e-10)  # rounding of the factor, to the 16th power
 

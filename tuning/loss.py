@@ -27,6 +27,7 @@ class Sums(NamedTuple):
     u: Array
     clearance: Array
     driven: Array
+    time: Array
     doom: Array
 
 
@@ -36,8 +37,8 @@ class Loss:
 
     tracking: mean of (e_z / s_0)^2 from `settle` on, earlier samples counted `early` times.
     peak: the square of the 16-norm of e_z / s_0 over the same samples: a smooth maximum.
-    effort: mean of (u / u_scale)^2 while the drive is on.
-    chatter: mean of ((u_k - u_{k-1}) / u_scale)^2 from sample to sample.
+    effort: mean over time of (u / u_scale)^2 while the drive is on.
+    chatter: mean over samples of ((u_k - u_{k-1}) / u_scale)^2, where u_k is the average of u over sample k.
     clearance: mean of max(0, share)^2, share of the way from halfway between |r| and the stop to the stop.
     survival: share of the horizon after the rotor was lost; its derivative is that of the time at which
     |z| reaches the stop at its last speed, so it points to gains that keep the rotor longer.
@@ -52,11 +53,11 @@ class Loss:
     def init(self) -> Sums:
         return Sums(*[jnp.zeros((), jnp.result_type(float))] * len(Sums._fields))
 
-    def update(self, carry: Sums, row: Any) -> Sums:
+    def update(self, carry: Sums, row: Any, span: Any) -> Sums:
         on = row.alive
         weight = jnp.where(row.t >= self.settle, 1.0, self.early)
         square = ((row.z - row.r) / self.s_0) ** 2
-        u = row.u / self.u_scale
+        u = span.densities.u / jnp.where(span.time > 0, span.time, 1.0)
         halfway = (jnp.abs(row.r) + self.stop) / 2
         beyond = jnp.maximum((jnp.abs(row.z) - halfway) / (self.stop - halfway), 0.0)
         outward = jnp.where(row.z < 0, -row.z_dot, row.z_dot)
@@ -66,11 +67,12 @@ class Loss:
             carry.square + weight * square,
             carry.power + weight * square ** (NORM // 2),
             carry.weight + weight,
-            carry.effort + u**2,
+            carry.effort + span.densities.u_squared,
             carry.chatter + jnp.where(on & (row.t > 0), (u - carry.u) ** 2, 0.0),
             u,
             carry.clearance + beyond**2,
             carry.driven + on,
+            carry.time + span.time,
             jnp.where(on & moving, doom, carry.doom),
         )
 
@@ -84,8 +86,8 @@ class Loss:
         return {
             "tracking": carry.square / weight,
             "peak": jnp.where(some, jnp.where(some, mean, 1.0) ** (2 / NORM), 0.0),
-            "effort": carry.effort / driven,
-            "chatter": carry.chatter / driven,
+            "effort": carry.effort / jnp.where(carry.time > 0, carry.time, 1.0) / self.u_scale**2,
+            "chatter": carry.chatter / driven / self.u_scale**2,
             "clearance": carry.clearance / driven,
             "survival": jnp.where(lost, 1 - at / ending.duration, 0.0),
         }

@@ -1,22 +1,26 @@
-"""The search by gradients against derivative-free ones, on the same loss, members, ranges and number of rollouts.
+"""The search by gradients against derivative-free ones, on the same loss, members, coordinates and number of rollouts.
 
-One rollout is one member simulated once; a gradient of m gains counts m + 1. Each method starts from the same
-knowledge: the case's gains and the ranges of the screen; each seed changes what is random in the method, not the
-members. The budget is what the search by gradients took in the median (the derivative-free methods get `--times`
-as much); best so far is the loss over the training members, stressed ones included, at the search's own steps.
-Results of tasks and methods that are not asked for stay in the JSON.
-Run: python benchmarks/tuning.py [--tasks A B C D E] [--seeds 5] [--times 1] [--methods CMA-ES ...]
+One rollout is one member simulated once; a gradient of m gains counts m + 1. Every method moves in the same
+coordinates, unbounded, in which a gain ends at its bound, and starts from the same knowledge: the case's gains and the
+ranges of the screen. Each seed changes what is random in the method, not the members. The budget is what the search
+by gradients took in the median; `--times` runs the rivals with as many times that. Best so far is the loss over the
+training members, stressed ones included, at the search's own steps. Rollouts are not cost: lanes of a call that are not
+needed are computed all the same, and a derivative costs less than a run; so seconds are told too, every search on one
+core (two at once). Results of tasks and methods that are not asked for stay in the JSON.
+Run: python benchmarks/search.py [--tasks A B C D E] [--seeds 5] [--times 1] [--methods CMA-ES ...] [--processes 2]
 """
 
 import argparse
+import concurrent.futures
 import json
+import multiprocessing
 import os
 import pathlib
 import statistics
 import time
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 os.environ.setdefault("JAX_ENABLE_X64", "1")
 
@@ -41,24 +45,22 @@ class SpentError(Exception):
 
 
 class Judge:
-    """The goal at unit coordinates in the screen's box [S, m], counted and clocked."""
+    """The goal at coordinates [S, m] in units of the screen's box, any real number; counted and clocked."""
 
     def __init__(self, study: Study, who: Any, most: int):
         self.study, self.who, self.most = study, who, most
         start = study.tune.space.values(study.case.cascade)
-        box = ranges(study.objective, study.goal.conditions, start)
-        self.low, self.high = np.log([r.low for r in box]), np.log([r.high for r in box])
+        space, box = study.objective.space, ranges(study.objective, study.goal.conditions, start)
+        ends = ([r.low for r in box], [r.high for r in box])
+        self.low, self.high = (space.encode(space.clip(np.array(gains))) for gains in ends)
         self.trace: list[tuple[int, float, float]] = []
         self.spent, self.best, self.began = 0, np.inf, time.perf_counter()
 
     def __call__(self, units: np.ndarray) -> np.ndarray:
-        """Beyond the box, half its size either way is allowed: the search by gradients may leave it too."""
         if self.spent >= self.most:
             raise SpentError
-        space = self.study.objective.space
-        gains = np.exp(self.low + np.clip(units, -0.5, 1.5) * (self.high - self.low))
-        x = np.stack([space.encode(space.clip(g)) for g in gains])
-        values = self.study.goal.score(space, x, self.study.engine.terms(x, self.who), self.who)
+        x = self.low + units * (self.high - self.low)
+        values = self.study.goal.score(self.study.objective.space, x, self.study.engine.terms(x, self.who), self.who)
         values = np.where(np.isfinite(values), values, WORST)
         self.spent += len(x) * len(self.who.member)
         row = (self.spent, time.perf_counter() - self.began, min(self.best, float(values.min())))
@@ -147,40 +149,63 @@ def ours(study: Study, who: Any, seed: int) -> list[tuple[int, float, float]]:
         points = around(min(looks, key=lambda look: look[0])[1], budget.screen, seed + len(looks))
 
 
-def first_at(trace: list[Any], value: float) -> float:
-    """Rollouts at which the trace reaches a value; inf if never."""
-    return next((float(n) for n, _, best in trace if best <= value), np.inf)
+class Told(NamedTuple):
+    """What a search came to: logarithm of the loss, rollouts, seconds, and rollouts until a goal (None: never)."""
+
+    final: float
+    rollouts: int
+    seconds: float
+    reached: int | None
 
 
-def task(name: str, seeds: int, times: float, methods: list[str]) -> dict[str, Any]:
-    """All traces of one task."""
+def told(trace: list[tuple[int, float, float]], goal: float) -> Told:
+    reached = next((n for n, _, best in trace if best <= goal), None)
+    return Told(trace[-1][2], trace[-1][0], trace[-1][1], reached)
+
+
+def prepared(name: str) -> tuple[Study, Any]:
+    """A task's study and training members, compiled, on one core."""
     case, tune, _ = read_study(TASKS / f"{name}.toml")
-    study = study_of(case, tune)
+    study = study_of(case, tune, threads=1)
     who = training(study)
-    ours(study, who, 0)  # compiles
-    found: dict[str, Any] = {"gradients": [ours(study, who, seed) for seed in range(seeds)]}
-    budget = round(statistics.median(trace[-1][0] for trace in found["gradients"]))
+    ours(study, who, 0)
+    return study, who
+
+
+def by_gradients(name: str, seeds: int) -> dict[str, Any]:
+    """The search by gradients on one task: budget, goal, and a row for each seed."""
+    study, who = prepared(name)
+    traces = [ours(study, who, seed) for seed in range(seeds)]
+    goal = statistics.median(trace[-1][2] for trace in traces)
+    budget = round(statistics.median(trace[-1][0] for trace in traces))
+    return {"budget": budget, "goal": goal, "gradients": [told(trace, goal)._asdict() for trace in traces]}
+
+
+def by_others(name: str, found: dict[str, Any], seeds: int, times: float, methods: list[str]) -> dict[str, Any]:
+    """Rows of the other methods on one task, with `times` the gradients' budget."""
+    warnings.simplefilter("ignore")
+    study, who = prepared(name)
+    rows: dict[str, Any] = {}
     for method in methods:
-        found[method] = []
+        key = method if times == 1 else f"{method}, {times:g} times"
+        rows[key] = []
         for seed in range(seeds):
-            judge = Judge(study, who, round(times * budget))
+            judge = Judge(study, who, round(times * found["budget"]))
             try:
                 METHODS[method](judge, seed)
             except SpentError:
-                found[method].append(judge.trace)
-    final = {name: [trace[-1][2] for trace in traces] for name, traces in found.items()}
-    goal = statistics.median(final["gradients"])
-    for method, values in final.items():
-        reached = statistics.median(first_at(trace, goal) for trace in found[method])
-        seconds = statistics.median(trace[-1][1] for trace in found[method])
-        spent = found[method][0][-1][0]
-        middle, low, high = (np.exp(f(values)) for f in (statistics.median, min, max))
-        print(
-            f"{name} {method:<12} loss {middle:.3e} (best {low:.3e}, worst {high:.3e}) after {spent:,} "
-            f"rollouts, {seconds:.0f} s; gradients' median after {reached:,.0f}",
-            flush=True,
-        )
-    return {"budget": budget, "times": times, "traces": found, "final": final}
+                rows[key].append(told(judge.trace, found["goal"])._asdict())
+    return rows
+
+
+def show(name: str, method: str, rows: list[dict[str, Any]]) -> None:
+    losses = [np.exp(row["final"]) for row in rows]
+    seconds, spent = (statistics.median(row[key] for row in rows) for key in ("seconds", "rollouts"))
+    print(
+        f"{name} {method:<18} loss {statistics.median(losses):.4e} (best {min(losses):.4e}, worst {max(losses):.4e}) "
+        f"after {spent:,.0f} rollouts, {seconds:.0f} s",
+        flush=True,
+    )
 
 
 def main() -> None:
@@ -189,15 +214,26 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--times", type=float, default=1.0)
     parser.add_argument("--methods", nargs="*", default=list(METHODS), choices=list(METHODS))
+    parser.add_argument("--processes", type=int, default=2)
     given = parser.parse_args()
-    warnings.simplefilter("ignore")
-    name = "tuning" if given.times == 1 else f"tuning_x{given.times:g}"
-    path = _measure.RESULTS / f"{name}.json"
-    results = json.loads(path.read_text())["tasks"] if path.exists() else {}
-    for each in given.tasks:  # hours in all: what is measured is written at once; other tasks and methods stay
-        found, kept = task(each, given.seeds, given.times, given.methods), results.get(each, {})
-        results[each] = found | {name: kept.get(name, {}) | found[name] for name in ("traces", "final")}
-        _measure.write(name, {"tasks": dict(sorted(results.items()))})
+    path = _measure.RESULTS / "search.json"
+    tasks = json.loads(path.read_text())["tasks"] if path.exists() else {}
+    spawn = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(given.processes, spawn) as pool:
+        if given.times == 1:  # else the budget and the goal are those that are there
+            for name, found in zip(given.tasks, pool.map(by_gradients, given.tasks, [given.seeds] * 5), strict=True):
+                tasks[name] = tasks.get(name, {}) | found
+                show(name, "gradients", found["gradients"])
+        jobs = {
+            pool.submit(by_others, name, tasks[name], given.seeds, given.times, [method]): name
+            for name in given.tasks
+            for method in given.methods
+        }
+        for job in concurrent.futures.as_completed(jobs):  # an hour in all: what is measured is written at once
+            tasks[jobs[job]] |= job.result()
+            for method, rows in job.result().items():
+                show(jobs[job], method, rows)
+            _measure.write("search", {"tasks": dict(sorted(tasks.items()))})
 
 
 if __name__ == "__main__":

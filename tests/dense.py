@@ -1,0 +1,117 @@
+"""Every metric of metrics.json from the oracle's solution: at all its steps, integrals as states of their own.
+
+Shares no code with ambjax. Between samples nothing is left out: the solver's steps resolve whatever is fast.
+"""
+
+import itertools
+import math
+
+import numpy as np
+from oracle import Loop, _edges, _pulse, _reference
+from scipy.integrate import solve_ivp
+
+GAUSS, WEIGHTS = np.polynomial.legendre.leggauss(3)
+
+
+class Integrals(Loop):
+    """The loop with the integrals of u, u^2 and the copper loss behind its states."""
+
+    def __init__(self, world):
+        super().__init__(world)
+        self.scale = np.append(self.scale, [1e-2, 1.0, 1e-3])
+
+    def start(self, noise):
+        return np.append(super().start(noise), [0.0, 0.0, 0.0])
+
+    def _rates(self, t, *y):
+        rates, signals = super()._rates(t, *y[:-3])
+        return (*rates, signals[0], signals[0] ** 2, 2 * self.true.R * (self.true.i_0**2 + y[2] ** 2)), signals
+
+
+def metrics(world, samples, period, settle, noise=None, rtol=1e-9):
+    """The metrics of `samples` sample periods from rest; `noise[k]`: errors of z, z_dot, i held over sample k."""
+    t = np.arange(samples + 1) * period
+    inputs = (world.q_z, world.q_v, world.q_i)
+    cuts = {edge for signal in (world.reference, *inputs) for edge in _edges(signal) if 0 < edge < t[-1]}
+    cuts = sorted(cuts | set(t))
+    noise = np.zeros((samples, 3)) if noise is None else np.asarray(noise)
+    loop = Integrals(world)
+    y, stop = loop.start(noise[0]), 0.9 * loop.true.s_0
+
+    def touched(t, y):
+        return abs(y[0]) - stop
+
+    touched.terminal = True
+    rows, squares, integrals, lost_at = [], [], {0.0: y[-3:]}, math.inf
+    for a, b in itertools.pairwise(cuts):
+        middle = (a + b) / 2
+        loop.held = noise[min(np.searchsorted(t, middle) - 1, samples - 1)].tolist()
+        loop.pushed = [_pulse(signal, middle) for signal in inputs]
+        more = {"jac": loop.jacobian, "dense_output": True, "events": touched}
+        run = solve_ivp(loop.rates, (a, b), y, "Radau", rtol=rtol, atol=1e-3 * rtol * loop.scale, **more)
+        assert run.success, run.message
+        for at, x in zip(run.t, run.y.T, strict=True):
+            u, e, v_tilde, r = loop.signals(at, x)
+            rows.append((at, x[0], x[0] - r, x[2], u, e, v_tilde, _sigma(world, at, x)))
+        for left, right in itertools.pairwise(run.t):  # z is smooth: a rule of order 6 in every step
+            nodes = (left + right) / 2 + (right - left) / 2 * GAUSS
+            r = np.array([_reference(world.reference, at)[0] for at in nodes])
+            squares.append((left, (right - left) / 2 * np.sum(WEIGHTS * (run.sol(nodes)[0] - r) ** 2)))
+        y = run.y[:, -1]
+        integrals[b] = y[-3:]
+        if run.status == 1:
+            lost_at = float(run.t[-1])
+            rest, y = math.copysign(stop, y[0]), y
+            times = np.append(t[t > lost_at], t[-1])
+            gone = np.array([rest - _reference(world.reference, at)[0] for at in times])
+            integrals = {at: x for at, x in integrals.items() if at < lost_at} | {lost_at: y[-3:]}
+            return _numbers(np.array(rows), squares, integrals, t, settle, stop, lost_at, (times, gone))
+    return _numbers(np.array(rows), squares, integrals, t, settle, stop, lost_at, None)
+
+
+def _sigma(world, t, x):
+    r, r_1, *_ = _reference(world.reference, t)
+    return x[1] - r_1 + world.position[1]["c"] * (x[0] - r)
+
+
+def _numbers(rows, squares, integrals, samples, settle, stop, lost_at, gone):
+    t, z, e_z, i, u, e, v_tilde, sigma = rows.T
+    end = samples[-1]
+    late, driven = t >= settle, min(end, lost_at)
+    # per sample: the mean of u
+    edges = np.array([at for at in samples if at < driven] + [driven])
+    means = np.diff([integrals[at][0] for at in edges]) / np.diff(edges)
+    total, settled = integrals[driven], integrals.get(settle, integrals[driven])
+    begun, square = np.array(squares).T
+
+    def peak(x, mask=None):
+        return float(np.abs(x if mask is None else x[mask]).max(initial=0.0))
+
+    def reached(x, band):
+        return float(t[np.abs(x) <= band][0]) if (np.abs(x) <= band).any() else math.inf
+
+    rest, after = np.zeros(0), 0.0
+    if gone is not None:
+        times, rest = gone
+        after = float(np.trapezoid(rest**2, times))
+    return {
+        "max_abs_error_m": max(peak(e_z), peak(rest)),
+        "rms_error_m": math.sqrt((square.sum() + after) / end),
+        "settled_max_abs_error_m": max(peak(e_z, late), peak(rest)),
+        "settled_rms_error_m": math.sqrt((square[begun >= settle].sum() + after) / (end - settle)),
+        "settled_max_abs_sigma_m_per_s": peak(sigma, late),
+        "settled_max_abs_v_tilde_A2_per_m2": peak(v_tilde, late),
+        "settled_max_abs_current_error_A": peak(e, late),
+        "sigma_reached_s": reached(sigma, 1e-3),
+        "v_tilde_reached_s": reached(v_tilde, 0.1),
+        "current_error_reached_s": reached(e, 1e-3),
+        "max_abs_u_V": peak(u),
+        "rms_u_V": math.sqrt(total[1] / driven),
+        "settled_rms_u_V": math.sqrt(max(total[1] - settled[1], 0.0) / max(driven - settle, 1e-30)),
+        "chatter_V": float(np.abs(np.diff(means[edges[:-1] >= settle])).sum()),
+        "max_abs_i_A": peak(i),
+        "copper_loss_W": total[2] / driven,
+        "clearance_used": max(peak(z), stop if gone is not None else 0.0) / stop,
+        "lost": gone is not None,
+        "lost_at_s": lost_at,
+    }
