@@ -1,5 +1,8 @@
 """The commands behind `ambjax`: each takes parsed arguments and returns an exit code and a summary.
 
+What only one of them needs is imported by it, so that none waits for what the others draw or compute.
+
+
 0: done. 1: done, and the answer is no (rotor lost, a condition fails). Bad input is a ValueError, which
 `__main__` turns into one line and exit code 2.
 """
@@ -9,26 +12,23 @@ import dataclasses
 import pathlib
 import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 from tqdm import tqdm
 
-from ambjax import ledger, paper, plotting
 from ambjax._pytree import canonical
 from ambjax.casefile import Case, read_case
 from ambjax.ensemble.design import MOST_MEMBERS
-from ambjax.evidence import Evidence, gather
 from ambjax.loop import ClosedLoop
-from ambjax.mapping import run_map
 from ambjax.metrics import Standard
 from ambjax.outputs import directory, plain, say, table, write_json
 from ambjax.rollout import Outcome, begin_jit, finish, segment_jit
-from ambjax.studies import run_ensemble, study_of
-from ambjax.template import template
-from ambjax.theorem import Condition, check
-from ambjax.worker import processes
+
+if TYPE_CHECKING:
+    from ambjax.evidence import Evidence
+    from ambjax.theorem import Condition
 
 __all__ = ["run_check", "run_ensemble", "run_map", "run_reproduce", "run_simulate", "run_template"]
 
@@ -37,8 +37,24 @@ Summary = dict[str, Any]
 STROKE = 20_000
 
 
+def run_ensemble(args: argparse.Namespace) -> tuple[int, Summary]:
+    """ambjax ensemble."""
+    from ambjax import studies
+
+    return studies.run_ensemble(args)
+
+
+def run_map(args: argparse.Namespace) -> tuple[int, Summary]:
+    """ambjax map."""
+    from ambjax import mapping
+
+    return mapping.run_map(args)
+
+
 def run_template(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax template."""
+    from ambjax.template import template
+
     text = template(args.scenario)
     if not args.json:
         print(text, end="")
@@ -58,6 +74,8 @@ def run_simulate(args: argparse.Namespace) -> tuple[int, Summary]:
         "settle_s": case.settle,
     }
     write_json(out / "metrics.json", metrics)
+    from ambjax import plotting
+
     plotting.overview(trajectory, f"{case.name}: {case.clock.method}", out / "overview.png")
     if not args.json:
         print(_metrics_text(metrics))
@@ -78,6 +96,8 @@ def _member(case: Case, args: argparse.Namespace) -> Case:
         return case
     if case.spread.design == "latin-hypercube" and args.members is None:
         raise ValueError("--member: add --members N, the size of the ensemble; a Latin hypercube depends on it.")
+    from ambjax.studies import study_of
+
     study = study_of(case, args.seed, MOST_MEMBERS if args.members is None else args.members)
     if not 0 <= args.member < study.members:
         raise ValueError(f"--member {args.member}: it must be a whole number from 0 to {study.members - 1}.")
@@ -110,6 +130,8 @@ def _metrics_text(metrics: Summary) -> str:
 
 def run_check(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax check."""
+    from ambjax.theorem import check
+
     case = read_case(args.case)
     report = check(case.cascade, case.scenario, case.clock)
     summary = {
@@ -131,11 +153,11 @@ def run_check(args: argparse.Namespace) -> tuple[int, Summary]:
     return int(not report.holds), plain(summary)
 
 
-def _condition(c: Condition) -> Summary:
+def _condition(c: "Condition") -> Summary:
     return dataclasses.asdict(c) | {"margin": c.margin}
 
 
-def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
+def _print_check(conditions: "list[Condition]", proof: "list[Condition]") -> None:
     verdict = {True: "holds", False: "FAILS", None: "-"}
 
     def number(x: float | None) -> str:
@@ -159,7 +181,9 @@ def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
     print("\n" + table(("proof", "statement", "worst", "unit", "at (s)", "what"), steps))
 
 
-def _paper_figures(reading: str, seen: Evidence, out: pathlib.Path) -> None:
+def _paper_figures(reading: str, seen: "Evidence", out: pathlib.Path) -> None:
+    from ambjax import plotting
+
     folder = out if reading == "repaired" else out / reading
     folder.mkdir(exist_ok=True)
     for number, (name, _) in plotting.PAPER_FIGURES.items():
@@ -169,6 +193,10 @@ def _paper_figures(reading: str, seen: Evidence, out: pathlib.Path) -> None:
 
 def run_reproduce(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax reproduce."""
+    from ambjax import ledger, paper, plotting
+    from ambjax.evidence import gather
+    from ambjax.worker import processes
+
     out = directory(args.out, "reproduce")
     began = time.perf_counter()
     stages = 2 * 7 + 1

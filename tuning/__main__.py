@@ -6,7 +6,6 @@ import sys
 
 from ambjax import __version__
 from ambjax.__main__ import Parser, complain
-from ambjax.worker import prepare
 
 
 def parser() -> argparse.ArgumentParser:
@@ -28,6 +27,8 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Tune. Returns 0 if the tuned gains keep every held-out rotor, 1 if not, 2 for bad input."""
     args = parser().parse_args(argv)
+    from ambjax.worker import prepare
+
     prepare()
     from tuning.command import run
 

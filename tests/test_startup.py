@@ -1,0 +1,74 @@
+"""What a command waits for before it begins: modules are counted, for times depend on who else uses the machine."""
+
+import ast
+import pathlib
+import subprocess
+import sys
+import types
+
+import pytest
+
+import ambjax
+
+ROOT = pathlib.Path(__file__).parent.parent
+SHORT = "[clock]\nduration = 0.01\n"
+
+
+def loaded(*words):
+    """Modules that a command imports, and those of them that are packages of their own."""
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", *words], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode in (0, 1), done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.startswith("import time:")]
+    assert len(lines) > 50
+    names = {line.rpartition("|")[2].strip() for line in lines}
+    return names | {name.split(".")[0] for name in names}
+
+
+@pytest.mark.parametrize("program", ["ambjax", "tuning"])
+@pytest.mark.parametrize("option", ["--version", "--help"])
+def test_a_word_about_the_program_needs_no_numerics(program, option):
+    assert not loaded(program, option) & {"jax", "numpy", "scipy", "matplotlib", "optax", "tqdm"}
+
+
+@pytest.mark.parametrize(("command", "unneeded"), [
+    ("check", {"matplotlib", "scipy", "optax", "tuning", "ambjax.studies", "ambjax.mapping", "ambjax.evidence"}),
+    ("simulate", {"scipy", "optax", "tuning", "ambjax.studies", "ambjax.mapping", "ambjax.evidence", "ambjax.theorem"}),
+])  # fmt: skip
+def test_a_command_imports_what_it_needs(tmp_path, command, unneeded):
+    case = tmp_path / "short.toml"
+    case.write_text(SHORT)
+    out = ("--out", str(tmp_path)) if command == "simulate" else ()
+    found = loaded("ambjax", command, str(case), *out)
+    assert "jax" in found
+    assert not found & unneeded
+
+
+def test_names_come_from_where_a_type_checker_is_told():
+    """The table of the package against the imports beside it, which only type checkers read."""
+    tree = ast.parse((ROOT / "ambjax" / "__init__.py").read_text())
+    told = {
+        alias.name: node.module.removeprefix("ambjax.")
+        for block in tree.body if isinstance(block, ast.If)
+        for node in block.body if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }  # fmt: skip
+    assert told == ambjax._HOME
+    assert {*told, "__version__"} == set(ambjax.__all__) <= set(dir(ambjax))
+    assert not [name for name in ambjax.__all__ if getattr(ambjax, name) is None]
+
+
+def test_a_public_name_is_never_the_module_of_that_name():
+    code = """
+import ambjax.rollout, types
+from ambjax import rollout
+assert isinstance(rollout, types.FunctionType) and ambjax.rollout is rollout
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+    assert isinstance(ambjax.rollout, types.FunctionType)
+
+
+def test_a_name_that_is_not_there():
+    with pytest.raises(AttributeError, match="module 'ambjax' has no attribute 'Rolout'"):
+        ambjax.Rolout  # noqa: B018
