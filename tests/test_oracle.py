@@ -117,8 +117,8 @@ CASES = [
         observer=("complementary", {"l": 100.0, "z_hat": 5e-5}), inversion=CLOSED, reference=sine()
     ), tight=amb.RK4(4)),
 ]  # fmt: skip
-# z, gamma, p, position law, current law, reference, u_max; gamma p from 1e4 to 2e6. All but the fifth are among the worst
-# of 10,700 held ones drawn at random.
+# z, gamma, p, position law, current law, reference, u_max; gamma p from 1e4 to 2e6. All but the fifth are among the
+# worst of 10,700 held ones drawn at random.
 DROPS = [
     (-1.15e-3, 2.5e6, 1e-2, smc(17.0, 10.0, 50.0), current(152.0, 10.0), sine(2.5e-3, 4.0)),
     (1.75e-3, 4e6, 2.5e-2, smc(60.0, 25.0, 50.0), pi()),
