@@ -2,11 +2,11 @@
 
 The work is cut into lanes: one rollout of one member under one vector of gains. A fixed number of lanes
 is compiled once into one kernel and serves the screen, every iteration and the held-out ensemble alike, on
-as many threads as there are cores; whatever the number of starts or members, nothing is recompiled.
+as many threads as there are cores; whatever the number of starts or members, nothing is recompiled. That number does
+not depend on the cores, for a last digit may depend on it.
 """
 
 import dataclasses
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -18,6 +18,7 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble import Spread, apply, draw
+from ambjax.ensemble.engine import cores
 from ambjax.extend import canonical, one_kernel
 from ambjax.metrics import Named, Standard
 from ambjax.rollout import rollout
@@ -25,8 +26,11 @@ from ambjax.scenario import Clock, Scenario
 from tuning.loss import TERMS, Loss
 from tuning.space import Space
 
-# Lanes of one kernel call. Loops over half as many are unrolled into scalar code by XLA's compiler.
+# Lanes of one kernel call. Loops over half as many are unrolled into scalar code by XLA's compiler: half again as long.
 LANES = 64
+# With derivatives, where the loops are longer, halves cost 14 % more each, and most iterations ask for 16 to 64 lanes:
+# they keep two cores busy, or are one call without padding.
+GRADIENT_LANES = 32
 # Members of a kind that say something about all of it.
 FEWEST = 4
 # Terms that say whether the rotor is held.
@@ -142,8 +146,9 @@ class Engine:
         threads: int | None = None,
         lanes: int = LANES,
     ):
-        self.objective, self.mode, self.settle, self.lanes = objective, mode, settle, lanes
-        self.threads = threads or os.cpu_count() or 1
+        self.objective, self.mode, self.settle = objective, mode, settle
+        self.lanes = {"terms": lanes, "metrics": lanes, "gradient": min(lanes, GRADIENT_LANES)}
+        self.threads = threads or cores()
         self.rollouts = 0
         self._compiled: set[str] = set()
         traced = canonical((objective.cascade, objective.scenario, objective.clock, objective.loss))
@@ -215,7 +220,8 @@ class Engine:
     def _lanes(self, kind: str, call: Callable[..., Any], x: np.ndarray, who: Members) -> Any:
         starts, count = len(x), len(who.member)
         lane = np.arange(starts * count)
-        padded = np.concatenate([lane, np.zeros(-len(lane) % self.lanes, int)]).reshape(-1, self.lanes)
+        width = self.lanes[kind]
+        padded = np.concatenate([lane, np.zeros(-len(lane) % width, int)]).reshape(-1, width)
 
         def one(lanes: np.ndarray) -> Any:
             start, member = np.divmod(lanes, count)
