@@ -7,11 +7,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ambjax.trajectory import Row, Trajectory
+from ambjax.trajectory import STALLED, Row, Trajectory
 
 # Okabe and Ito's colours: distinct in print and to colour-blind readers.
 INK, BLUE, ORANGE, GREEN, RED = "#222222", "#0072B2", "#E69F00", "#009E73", "#D55E00"
 BINS = 2000
+# Columns of a panel that are told apart.
+PIXELS = 500
+# Turns of a chattering voltage that can be followed.
+TURNS = 40
 
 
 class Curve(NamedTuple):
@@ -83,21 +87,87 @@ def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.
     figure.savefig(path, dpi=150)
 
 
-def overview(trajectory: Trajectory, title: str, path: pathlib.Path) -> None:
-    """Write one page with every signal of a run."""
+def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tuple[float, float] | None = None) -> None:
+    """Write one page with every signal of a run: the whole of it, and enlarged how it starts and how it ends.
+
+    `window` (s): that stretch of it instead.
+    """
     panels = (POSITION, ERROR, SLIDING, DISTURBANCE, CURRENT, FORCE, FORCE_ERROR, VOLTAGE)
     if np.any(np.asarray(trajectory.rows.q_i)):
-        panels = (*panels[:4], *panels[4:7], VOLTAGE, CURRENT_DISTURBANCE, _measured(trajectory))
-    half = len(panels) // 2
-    figure = Figure(figsize=(12.0, 1.9 * half + 0.8), layout="constrained")
-    axes = figure.subplots(half, 2, sharex=True)
-    order = axes.T.ravel()
-    for ax, panel in zip(order, panels, strict=True):
-        _draw(ax, panel, trajectory)
+        panels = (*panels, CURRENT_DISTURBANCE, _measured(trajectory))
+    if window is None:
+        columns, grid = _stretches(trajectory), [[panel] * 3 for panel in panels]
+    else:
+        half = len(panels) // 2
+        columns = [(_fate(trajectory), *window), ("", *window)]
+        grid = list(zip(panels[:half], panels[half:], strict=True))
+    # the whole run has as much room as the two others
+    figure = Figure(figsize=(13.0, 1.55 * len(grid) + 0.9), layout="constrained")
+    ratios = [2, 1, 1] if window is None else [1, 1]
+    axes = figure.subplots(len(grid), len(columns), sharex="col", squeeze=False, width_ratios=ratios)
+    for row, (line, drawn) in enumerate(zip(axes, grid, strict=True)):
+        for n, (ax, panel, (words, *stretch)) in enumerate(zip(line, drawn, columns, strict=True)):
+            _draw(ax, panel, trajectory, stretch=(stretch[0], stretch[1]))
+            if window is None and n:
+                ax.set_ylabel("")
+            if row == 0:
+                ax.set_title(words, fontsize=10, loc="left", pad=16)
     for ax in axes[-1]:
         ax.set_xlabel("time (s)")
+    figure.align_ylabels(axes[:, 0])
     figure.suptitle(title, fontsize=12)
     figure.savefig(path, dpi=130)
+
+
+def _stretches(trajectory: Trajectory) -> list[tuple[str, float, float]]:
+    """The whole run up to shortly after a loss, its start, and its last moments: words, from, to (s)."""
+    t, lost_at = np.asarray(trajectory.rows.t, float), float(trajectory.lost_at)
+    ended = bool(np.isfinite(lost_at))
+    begin, end = t[0], min(lost_at, t[-1])
+    least = t[1] - t[0] if len(t) > 1 else 1e-9  # a loss at the first sample leaves nothing to enlarge
+    start = max(_transient(trajectory, end, ended), least)
+    last = max(_last_moments(trajectory, end), least)
+    beyond = end + 0.15 * (end - begin) * ended
+    return [
+        (_fate(trajectory), begin, max(beyond, begin + least)),
+        (f"the first {_short(start)}", begin, begin + start),
+        (f"the last {_short(last)}", end - last, end + 0.15 * last * ended),
+    ]
+
+
+def _fate(trajectory: Trajectory) -> str:
+    lost_at = float(trajectory.lost_at)
+    if not np.isfinite(lost_at):
+        return ""
+    return (
+        f"{'not decided from' if trajectory.lost_code == STALLED else 'lost at'} {lost_at:.4g} s: {trajectory.lost_why}"
+    )
+
+
+def _short(seconds: float) -> str:
+    return f"{1e3 * seconds:.2g} ms" if seconds < 0.1 else f"{seconds:.2g} s"
+
+
+def _last_moments(trajectory: Trajectory, end: float) -> float:
+    """How much of the end to enlarge, s: 20 ms, a fifth of the run at most, and no more than some turns of the voltage."""
+    t = np.asarray(trajectory.rows.t, float)
+    longest = min(0.02, (end - t[0]) / 5)
+    late = (t >= end - longest) & (t < end)
+    turning = np.flatnonzero(np.diff(np.sign(np.diff(_signal(trajectory.rows, "u")[late]))))
+    return longest if turning.size <= TURNS else float(end - t[late][turning[-TURNS]])
+
+
+def _transient(trajectory: Trajectory, end: float, ended: bool) -> float:
+    """How much of the start to enlarge, s: thrice what the errors take to come down, at most a 20th of all (lost: a 3rd)."""
+    t = np.asarray(trajectory.rows.t, float)
+    alive = t < max(end, t[min(1, len(t) - 1)])
+    t, most = t[alive] - t[0], (end - t[0]) / (3 if ended else 20)
+    slowest = 0.0
+    for name in ("e_z", "sigma", "v_tilde", "e"):
+        size = np.abs(_signal(trajectory.rows, name)[alive])
+        down = size <= max(0.02 * size.max(), 1.5 * size[len(size) // 2 :].max())
+        slowest = max(slowest, t[np.argmax(down)])
+    return min(max(3 * slowest, 20 * (t[1] - t[0]) if len(t) > 1 else 0.0, most / 10), most)
 
 
 def readings(trajectories: dict[str, Trajectory], title: str, settle: float, path: pathlib.Path) -> None:
@@ -122,15 +192,27 @@ def _measured(trajectory: Trajectory) -> Panel:
     return Panel("measured position", "mm", 1e3, (Curve("z_measured", "$z$ measured", GREEN), Curve("z", "$z$")))
 
 
-def _draw(ax: Axes, panel: Panel, trajectory: Trajectory, first: bool = False) -> None:
+def _draw(
+    ax: Axes,
+    panel: Panel,
+    trajectory: Trajectory,
+    first: bool = False,
+    stretch: tuple[float, float] | None = None,
+) -> None:
+    """A panel of the whole run, or of a stretch of it (s): there, what is too fast to see is a band with its mean."""
     rows, lost_at = trajectory.rows, float(trajectory.lost_at)
     t = np.asarray(rows.t)
-    alive = t < lost_at
+    low, high = (t[0], t[-1]) if stretch is None else stretch
+    shown = (t < lost_at) & (t >= low) & (t <= high)
     for curve in panel.curves:
-        x, y = thin(t[alive], panel.factor * _signal(rows, curve.signal)[alive])
+        x, y = t[shown], panel.factor * _signal(rows, curve.signal)[shown]
+        if stretch is None:
+            x, y = thin(x, y)
+        else:
+            x, y = _band(ax, x, y, curve.colour)
         ax.plot(x, y, curve.style, color=curve.colour, linewidth=1.2, label=curve.label)
     ax.set_ylabel(f"{panel.ylabel}\n({panel.unit})", fontsize=9)
-    ax.set_xlim(t[0], t[-1])
+    ax.set_xlim(low, high)
     ax.grid(alpha=0.3, linewidth=0.5)
     ax.tick_params(labelsize=8)
     ax.margins(y=0.12)
@@ -139,7 +221,20 @@ def _draw(ax: Axes, panel: Panel, trajectory: Trajectory, first: bool = False) -
         above = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "frameon": False, "borderaxespad": 0.1}
         ax.legend(fontsize=8, ncols=len(panel.curves), **above)
     if np.isfinite(lost_at):
-        _mark_loss(ax, trajectory, first=first or panel in (POSITION, FORCE))
+        if stretch is None:
+            ax.set_xlim(0, min(t[-1], max(1.6 * lost_at, 1e-3)))
+        _mark_loss(ax, trajectory, first=first or (stretch is None and panel in (POSITION, FORCE)))
+
+
+def _band(ax: Axes, t: np.ndarray, y: np.ndarray, colour: str) -> tuple[np.ndarray, np.ndarray]:
+    """The curve to draw: y itself, or where samples are far more than pixels its mean, over a band of its extremes."""
+    if len(t) <= 4 * PIXELS:
+        return t, y
+    starts = np.linspace(0, len(t), PIXELS, endpoint=False).astype(int)
+    middle = np.add.reduceat(t, starts) / np.diff([*starts, len(t)])
+    ends = np.minimum.reduceat(y, starts), np.maximum.reduceat(y, starts)
+    ax.fill_between(middle, *ends, color=colour, alpha=0.35, linewidth=0)
+    return middle, np.add.reduceat(y, starts) / np.diff([*starts, len(t)])
 
 
 def _first_moments(ax: Axes, trajectory: Trajectory, until: float = 0.01) -> None:
@@ -153,10 +248,9 @@ def _first_moments(ax: Axes, trajectory: Trajectory, until: float = 0.01) -> Non
 
 
 def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:
-    """Zoom to the loss, shade what follows, and say why."""
+    """Shade what follows the loss, and say why."""
     lost_at, end = float(trajectory.lost_at), float(np.asarray(trajectory.rows.t)[-1])
-    ax.set_xlim(0, min(end, max(1.6 * lost_at, 1e-3)))
-    ax.axvspan(lost_at, end, color=RED, alpha=0.12, linewidth=0)
+    ax.axvspan(lost_at, max(end, ax.get_xlim()[1]), color=RED, alpha=0.12, linewidth=0)
     ax.axvline(lost_at, color=RED, linewidth=1.0)
     if first:
         why = trajectory.lost_why.replace(": ", ":\n").replace(" reached ", "\nreached ")
