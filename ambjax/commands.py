@@ -24,6 +24,7 @@ from ambjax.loop import ClosedLoop
 from ambjax.mapping import run_map
 from ambjax.metrics import Standard
 from ambjax.outputs import directory, plain, say, table, write_json
+from ambjax.overview import overview
 from ambjax.rollout import Outcome, begin_jit, finish, segment_jit
 from ambjax.studies import run_ensemble, study_of
 from ambjax.template import template
@@ -59,7 +60,7 @@ def run_simulate(args: argparse.Namespace) -> tuple[int, Summary]:
         "settle_s": case.settle,
     }
     write_json(out / "metrics.json", metrics)
-    plotting.overview(trajectory, f"{case.name}: {case.clock.method}", out / "overview.png", window)
+    overview(trajectory, f"{case.name}: {case.clock.method}", out / "overview.png", window)
     if not args.json:
         print(_metrics_text(metrics))
         print(f"written: {out}/trajectory.npz, metrics.json, overview.png")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.casefile import Case, read_case
-from ambjax.ensemble.maps import PERIOD, Axis, Map, grid
+from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid
 from ambjax.ensemble.paths import places
 from ambjax.outputs import directory, plain, say, table, write_json
 from ambjax.studies import study_of
@@ -83,11 +83,7 @@ def _value(text: str, nominal: float | None) -> float:
 
 def _summary(case: Case, found: Map) -> dict[str, Any]:
     facts: dict[str, Any] = {"case": case.name, "x": found.x._asdict(), "y": found.y._asdict()}
-    return (
-        facts
-        | {key: getattr(found, key) for key in ("survival", "low", "high", "error", "lost", "stalled", "drawn")}
-        | {"reach": found.reach()}
-    )
+    return facts | {key: getattr(found, key) for key in (*GRIDS, "drawn")} | {"reach": found.reach()}
 
 
 def _text(cases: list[Case], maps: list[Map]) -> str:

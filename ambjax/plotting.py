@@ -1,21 +1,21 @@
-"""Pictures of trajectories: the paper's Figures 3 to 6 and an overview of any run."""
+"""Pictures of trajectories: panels of signals, and the paper's Figures 3 to 6 and readings made of them."""
 
 import pathlib
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ambjax.trajectory import STALLED, Row, Trajectory
+from ambjax.trajectory import Row, Trajectory
 
 # Okabe and Ito's colours: distinct in print and to colour-blind readers.
 INK, BLUE, ORANGE, GREEN, RED = "#222222", "#0072B2", "#E69F00", "#009E73", "#D55E00"
 BINS = 2000
 # Columns of a panel that are told apart.
 PIXELS = 500
-# Turns of a chattering voltage that can be followed.
-TURNS = 40
+# Share of the whole run's range that an enlarged panel shows at least.
+FLAT = 0.005
 
 
 class Curve(NamedTuple):
@@ -78,7 +78,7 @@ def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.
     # Fixed margins (in inches over the height): a layout engine would draw everything twice.
     figure.subplots_adjust(0.15, 0.5 / height, 0.97, 1 - 0.5 / height, hspace=0.2)
     for ax, panel in zip(axes, panels, strict=True):
-        _draw(ax, panel, trajectory)
+        draw(ax, panel, trajectory)
         if panel is FORCE_ERROR and not np.isfinite(trajectory.lost_at):
             _first_moments(ax, trajectory)
     axes[-1].set_xlabel("time (s)")
@@ -87,112 +87,25 @@ def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.
     figure.savefig(path, dpi=150)
 
 
-def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tuple[float, float] | None = None) -> None:
-    """Write one page with every signal of a run: the whole of it, and enlarged how it starts and how it ends.
-
-    `window` (s): that stretch of it instead.
-    """
-    panels = (POSITION, ERROR, SLIDING, DISTURBANCE, CURRENT, FORCE, FORCE_ERROR, VOLTAGE)
-    if np.any(np.asarray(trajectory.rows.q_i)):
-        panels = (*panels, CURRENT_DISTURBANCE, _measured(trajectory))
-    if window is None:
-        columns, grid = _stretches(trajectory), [[panel] * 3 for panel in panels]
-    else:
-        half = len(panels) // 2
-        columns = [(_fate(trajectory), *window), ("", *window)]
-        grid = list(zip(panels[:half], panels[half:], strict=True))
-    # the whole run has as much room as the two others
-    figure = Figure(figsize=(13.0, 1.55 * len(grid) + 0.9), layout="constrained")
-    ratios = [2, 1, 1] if window is None else [1, 1]
-    axes = figure.subplots(len(grid), len(columns), sharex="col", squeeze=False, width_ratios=ratios)
-    for row, (line, drawn) in enumerate(zip(axes, grid, strict=True)):
-        for n, (ax, panel, (words, *stretch)) in enumerate(zip(line, drawn, columns, strict=True)):
-            _draw(ax, panel, trajectory, stretch=(stretch[0], stretch[1]))
-            if window is None and n:
-                ax.set_ylabel("")
-            if row == 0:
-                ax.set_title(words, fontsize=10, loc="left", pad=16)
-    for ax in axes[-1]:
-        ax.set_xlabel("time (s)")
-    figure.align_ylabels(axes[:, 0])
-    figure.suptitle(title, fontsize=12)
-    figure.savefig(path, dpi=130)
-
-
-def _stretches(trajectory: Trajectory) -> list[tuple[str, float, float]]:
-    """The whole run up to shortly after a loss, its start, and its last moments: words, from, to (s)."""
-    t, lost_at = np.asarray(trajectory.rows.t, float), float(trajectory.lost_at)
-    ended = bool(np.isfinite(lost_at))
-    begin, end = t[0], min(lost_at, t[-1])
-    least = t[1] - t[0] if len(t) > 1 else 1e-9  # a loss at the first sample leaves nothing to enlarge
-    start = max(_transient(trajectory, end, ended), least)
-    last = max(_last_moments(trajectory, end), least)
-    beyond = end + 0.15 * (end - begin) * ended
-    return [
-        (_fate(trajectory), begin, max(beyond, begin + least)),
-        (f"the first {_short(start)}", begin, begin + start),
-        (f"the last {_short(last)}", end - last, end + 0.15 * last * ended),
-    ]
-
-
-def _fate(trajectory: Trajectory) -> str:
-    lost_at = float(trajectory.lost_at)
-    if not np.isfinite(lost_at):
-        return ""
-    return (
-        f"{'not decided from' if trajectory.lost_code == STALLED else 'lost at'} {lost_at:.4g} s: {trajectory.lost_why}"
-    )
-
-
-def _short(seconds: float) -> str:
-    return f"{1e3 * seconds:.2g} ms" if seconds < 0.1 else f"{seconds:.2g} s"
-
-
-def _last_moments(trajectory: Trajectory, end: float) -> float:
-    """How much of the end to enlarge, s: 20 ms, a fifth of the run at most, and no more than some turns of the voltage."""
-    t = np.asarray(trajectory.rows.t, float)
-    longest = min(0.02, (end - t[0]) / 5)
-    late = (t >= end - longest) & (t < end)
-    turning = np.flatnonzero(np.diff(np.sign(np.diff(_signal(trajectory.rows, "u")[late]))))
-    return longest if turning.size <= TURNS else float(end - t[late][turning[-TURNS]])
-
-
-def _transient(trajectory: Trajectory, end: float, ended: bool) -> float:
-    """How much of the start to enlarge, s: thrice what the errors take to come down, at most a 20th of all (lost: a 3rd)."""
-    t = np.asarray(trajectory.rows.t, float)
-    alive = t < max(end, t[min(1, len(t) - 1)])
-    t, most = t[alive] - t[0], (end - t[0]) / (3 if ended else 20)
-    slowest = 0.0
-    for name in ("e_z", "sigma", "v_tilde", "e"):
-        size = np.abs(_signal(trajectory.rows, name)[alive])
-        down = size <= max(0.02 * size.max(), 1.5 * size[len(size) // 2 :].max())
-        slowest = max(slowest, t[np.argmax(down)])
-    return min(max(3 * slowest, 20 * (t[1] - t[0]) if len(t) > 1 else 0.0, most / 10), most)
-
-
 def readings(trajectories: dict[str, Trajectory], title: str, settle: float, path: pathlib.Path) -> None:
     """Write one picture of a scenario under each reading, a column each: position above, error below."""
     figure = Figure(figsize=(4.0 * len(trajectories), 4.9), layout="constrained")
     axes = figure.subplots(2, len(trajectories), squeeze=False)
     position = POSITION._replace(curves=(Curve("z_measured", "$z$ measured", "#bbbbbb"), *POSITION.curves))
     for (name, trajectory), (upper, lower) in zip(trajectories.items(), axes.T, strict=True):
-        _draw(upper, position, trajectory, first=True)
-        _draw(lower, ERROR, trajectory)
+        draw(upper, position, trajectory, first=True)
+        draw(lower, ERROR, trajectory)
         upper.set_title(name, loc="left", fontsize=10, fontweight="bold")
         lower.set_xlabel("time (s)", fontsize=9)
         if not np.isfinite(trajectory.lost_at):
-            late = np.abs(_signal(trajectory.rows, "e_z")[np.asarray(trajectory.rows.t) >= settle]).max()
+            late = np.abs(signal_of(trajectory.rows, "e_z")[np.asarray(trajectory.rows.t) >= settle]).max()
             words = f"at most {1e6 * late:.2g} µm after {settle:g} s"
             lower.annotate(words, (0.98, 0.06), xycoords="axes fraction", ha="right", fontsize=9, color=INK)
     figure.suptitle(title, fontsize=11)
     figure.savefig(path, dpi=130)
 
 
-def _measured(trajectory: Trajectory) -> Panel:
-    return Panel("measured position", "mm", 1e3, (Curve("z_measured", "$z$ measured", GREEN), Curve("z", "$z$")))
-
-
-def _draw(
+def draw(
     ax: Axes,
     panel: Panel,
     trajectory: Trajectory,
@@ -205,7 +118,7 @@ def _draw(
     low, high = (t[0], t[-1]) if stretch is None else stretch
     shown = (t < lost_at) & (t >= low) & (t <= high)
     for curve in panel.curves:
-        x, y = t[shown], panel.factor * _signal(rows, curve.signal)[shown]
+        x, y = t[shown], panel.factor * signal_of(rows, curve.signal)[shown]
         if stretch is None:
             x, y = thin(x, y)
         else:
@@ -216,6 +129,8 @@ def _draw(
     ax.grid(alpha=0.3, linewidth=0.5)
     ax.tick_params(labelsize=8)
     ax.margins(y=0.12)
+    if stretch is not None:
+        _keep_scale(ax, [panel.factor * signal_of(rows, curve.signal)[t < lost_at] for curve in panel.curves])
     if len(panel.curves) > 1:
         # Above the panel: inside, it would hide a peak of some run or other.
         above = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "frameon": False, "borderaxespad": 0.1}
@@ -224,6 +139,15 @@ def _draw(
         if stretch is None:
             ax.set_xlim(0, min(t[-1], max(1.6 * lost_at, 1e-3)))
         _mark_loss(ax, trajectory, first=first or (stretch is None and panel in (POSITION, FORCE)))
+
+
+def _keep_scale(ax: Axes, whole: list[np.ndarray]) -> None:
+    """No stretch is enlarged so far in height that the last digits of a settled signal look like an event."""
+    ax.ticklabel_format(axis="y", useOffset=False)
+    values = np.concatenate(whole)
+    (low, high), least = ax.get_ylim(), FLAT * np.ptp(values) if values.size else 0.0
+    if high - low < least:
+        ax.set_ylim((low + high - least) / 2, (low + high + least) / 2)
 
 
 def _band(ax: Axes, t: np.ndarray, y: np.ndarray, colour: str) -> tuple[np.ndarray, np.ndarray]:
@@ -241,7 +165,7 @@ def _first_moments(ax: Axes, trajectory: Trajectory, until: float = 0.01) -> Non
     """The first 10 ms, in which the paper's inversion error reaches zero, enlarged."""
     early = np.asarray(trajectory.rows.t) <= until
     inset = ax.inset_axes((0.32, 0.3, 0.4, 0.6))
-    inset.plot(1e3 * np.asarray(trajectory.rows.t)[early], _signal(trajectory.rows, "v_tilde")[early], color=BLUE)
+    inset.plot(1e3 * np.asarray(trajectory.rows.t)[early], signal_of(trajectory.rows, "v_tilde")[early], color=BLUE)
     inset.set_title("first 10 ms (time in ms)", fontsize=7, pad=2)
     inset.tick_params(labelsize=7)
     inset.grid(alpha=0.3, linewidth=0.5)
@@ -258,5 +182,6 @@ def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:
         ax.annotate(words, (0.99, 0.06), xycoords="axes fraction", ha="right", va="bottom", fontsize=7, color=INK)
 
 
-def _signal(rows: Row, name: str) -> Any:
+def signal_of(rows: Row, name: str) -> np.ndarray:
+    """A signal of rows by its name, floats [T]."""
     return np.asarray(getattr(rows, name), float)

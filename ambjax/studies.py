@@ -174,7 +174,7 @@ def _summary(case: Case, study: Study, columns: dict[str, np.ndarray], path: str
 def _pictures(
     case: Case, study: Study, columns: dict[str, np.ndarray], summary: dict[str, Any], out: pathlib.Path
 ) -> None:
-    from ambjax.ensemble import pictures
+    from ambjax.ensemble import pictures, tornado
 
     t, trajectory, signals = study.bands(FAN_MEMBERS, FAN_TIMES)
     lost_at, stalled = np.asarray(trajectory.lost_at), np.asarray(trajectory.lost_code) == STALLED
@@ -185,8 +185,8 @@ def _pictures(
     pictures.histograms(columns, out / "histograms.png")
     if study.spread.entries:
         deciding = statistics.DECIDING
-        bars = [pictures.Bar(*(d[k] for k in pictures.Bar._fields)) for d in summary["drivers"][deciding]]
-        pictures.tornado(bars, deciding, summary["explained"][deciding]["says"], out / "tornado.png")
+        bars = [tornado.Bar(*(d[k] for k in tornado.Bar._fields)) for d in summary["drivers"][deciding]]
+        tornado.tornado(bars, deciding, summary["explained"][deciding]["says"], out / "tornado.png")
 
 
 def _quantiles(x: np.ndarray) -> dict[float, np.ndarray]:

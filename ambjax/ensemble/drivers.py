@@ -83,12 +83,12 @@ def drivers(
     """
     if not spread:
         return {name: [] for name in metrics}, {name: _said(0.0, None, "nothing is spread") for name in metrics}
-    x, ranks = list(spread.values()), _standard_ranks(list(metrics.values()))
-    found, rho, paths = shares(x, ranks, confidence), _correlation(_standard_ranks(x), ranks), list(spread)
+    x, ranks = list(spread.values()), list(_standard_ranks(list(metrics.values())))
+    found, rho, paths = shares(x, ranks, confidence), _correlation(_standard_ranks(x), np.stack(ranks)), list(spread)
     pairs = _pairs(dict(spread), ranks, confidence)
     ranked, explained = {}, {}
     for n, name in enumerate(metrics):
-        rows = [
+        rows: list[dict[str, Any]] = [
             {"path": path} | {k: float(v[row, n]) for k, v in found._asdict().items()} | {"rho": float(rho[row, n])}
             for row, path in enumerate(paths)
         ]
@@ -123,7 +123,7 @@ def _pairs(
     looked = slice(0, PAIR_MEMBERS)
     Y = np.stack([_standard(column[looked]) for column in ranks])
     waves = {path: _cosines(x[looked], PAIR_TERMS) for path, x in spread.items()}
-    enough = [PAIR_TERMS**2 * (terms >= PAIR_TERMS**2) for terms in _terms(Y, PAIR_TERMS**2)]
+    enough = [PAIR_TERMS**2 * (terms >= PAIR_TERMS**2) for terms in _terms(list(Y), PAIR_TERMS**2)]
     couples = list(itertools.combinations(spread, 2))
     best: list[dict[str, Any] | None] = [None] * len(ranks)
     for couple in couples:

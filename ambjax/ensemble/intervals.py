@@ -100,12 +100,10 @@ def bootstrap(
         places.append((centre, scale, x.std(ddof=min(n - 1, 1)), _taken(np.ones((1, n)), tail)[0] @ x / tail))
     G = np.moveaxis(np.array(powers), 0, -1)
     batches = [_moments(counts, G, n, tail) for counts in _resamples(n, sizes, seed)]
-    drawn = {
-        kind: tuple(np.concatenate(parts) for parts in zip(*(b[kind] for b in batches), strict=True)) for kind in KINDS
-    }
+    drawn = {kind: [np.concatenate([batch[kind][k] for batch in batches]) for k in (0, 1)] for kind in KINDS}
     whole = _moments(sizes[None].astype(float), G, n, tail)
     centre, scale, std, worst = np.array(places).T
-    ends = {kind: _studentised(*whole[kind], *drawn[kind], confidence) for kind in KINDS}
+    ends = {kind: _studentised(whole[kind], drawn[kind], confidence) for kind in KINDS}
     unbiased = (n / max(n - 1, 1)) ** 0.5
     return {
         "mean": Estimate(centre, *(scale * end + centre for end in ends["mean"])),
@@ -133,13 +131,14 @@ def _moments(counts: np.ndarray, G: np.ndarray, n: int, tail: float) -> dict[str
 
 
 def _studentised(
-    value: np.ndarray, error: np.ndarray, values: np.ndarray, errors: np.ndarray, confidence: float
+    whole: Sequence[np.ndarray], drawn: Sequence[np.ndarray], confidence: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the interval [columns] of a value [1, columns] from resampled ones [replicates, columns], with errors.
+    """Ends of the interval [columns] of a value [1, columns], from resampled ones [replicates, columns]; with errors.
 
     A resample without an error of its own, for all its values are alike, is infinitely far off.
     """
-    value, error = value[0], error[0]
+    (value,), (error,) = whole
+    values, errors = drawn
     with np.errstate(divide="ignore", invalid="ignore"):
         off = values - value
         far = np.where(np.abs(off) <= 1e-12 * error, 0.0, off / errors)

@@ -17,6 +17,8 @@ from ambjax.metrics import Standard
 from ambjax.scenario import Scenario
 
 PERIOD = "clock.sample_period"
+# Fields of a Map by cell.
+GRIDS = ("survival", "low", "high", "error", "lost", "stalled")
 
 
 class Axis(NamedTuple):
@@ -63,7 +65,7 @@ def grid(study: Study, x: Axis, y: Axis) -> Map:
     """
     if x.path == PERIOD:
         turned = grid(study, y, x)
-        return Map(x, y, *(part.T for part in turned[2:-1]), turned.drawn)
+        return turned._replace(x=x, y=y, **{k: getattr(turned, k).T for k in GRIDS})
     _check(study, x, y)
     rows = [_cells(study, x, y)] if y.path != PERIOD else [_cells(_at_period(study, p), x, None) for p in y.values]
     ended, stalled, error = (np.concatenate(parts) for parts in zip(*rows, strict=True))

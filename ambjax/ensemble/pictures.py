@@ -1,10 +1,9 @@
-"""Pictures of ensembles: fan charts, histograms and tornado charts, from arrays in SI units."""
+"""Pictures of ensembles: fan charts and histograms, from arrays in SI units."""
 
 import math
 import pathlib
-import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +14,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from ambjax.ensemble.scales import digits, finish, log_ticks, named, prefixed, size_of
-from ambjax.plotting import BINS, BLUE, INK, ORANGE, RED, thin
+from ambjax.plotting import BINS, BLUE, INK, RED, thin
 
 # What a fan can show: label and SI unit.
 QUANTITIES = {
@@ -41,8 +40,8 @@ CHIEF = (
     "chatter_V",
     "copper_loss_W",
 )
-MOST_DRIVERS = 12
-TRENDS = {"grows with it": BLUE, "falls with it": ORANGE, "neither: turns, or is not seen": "#8a8a8a"}
+# Parts of the run over which a chattering median is averaged.
+SMOOTHED = 50
 LOST = {"facecolor": RED, "edgecolor": "white", "hatch": "////", "linewidth": 0.0}
 MARKS: dict[float, tuple[Any, str]] = {0.5: ("-", "median"), 0.95: ("--", "95 % quantile")}
 
@@ -98,7 +97,8 @@ def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float,
         name = f"{percents[k]:g} to {percents[-1 - k]:g} %"
         ax.fill_between(t[starts], factor * lower, factor * upper, color=_tint(k, pairs), linewidth=0, label=name)
     if len(percents) % 2:
-        ax.plot(*thin(t, factor * curves[pairs]), color=INK, linewidth=1.0, label="median")
+        middle, words = _median(t, factor * curves[pairs])
+        ax.plot(*middle, color=INK, linewidth=1.0, label=words)
     # near: the data come within a quarter of the limit
     near = [value for value, peak in ((limit, high), (-limit, -low)) if limit <= 1.33 * peak]
     margin = 0.08 * (high - low) or 0.1 * abs(high) or 1.0
@@ -112,6 +112,18 @@ def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float,
         )
         ax.set_title(words, fontsize=7, loc="right", pad=2, color=INK)
     finish(ax, f"{label}\n({unit})")
+
+
+def _median(t: np.ndarray, y: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], str]:
+    """The median to draw, and its name: where it chatters from instant to instant, its means over parts of the run."""
+    steps = np.diff(y[np.isfinite(y)])
+    turns = np.count_nonzero(np.diff(np.sign(steps)))
+    if turns <= steps.size / 4 or np.abs(steps).sum() <= 20 * np.ptp(y[np.isfinite(y)]):
+        return thin(t, y), "median"
+    starts = np.arange(0, len(t), -(-len(t) // SMOOTHED))
+    parts = zip(np.split(t, starts[1:]), np.split(y, starts[1:]), strict=True)
+    means = [(x.mean(), part[np.isfinite(part)].mean() if np.isfinite(part).any() else np.nan) for x, part in parts]
+    return (np.array(means)[:, 0], np.array(means)[:, 1]), "median, smoothed where it chatters"
 
 
 def _tint(k: int, pairs: int) -> Any:
@@ -185,10 +197,8 @@ def histograms(columns: Mapping[str, Any], path: pathlib.Path, metrics: Sequence
         _histogram(ax, name, np.asarray(columns[name], float), lost)
     for ax in axes[len(names) :]:
         ax.set_axis_off()
-    keys = [
-        Patch(color=BLUE, label="survivors"),
-        Patch(label="lost members" + " and those not decided" * bool(open_), **LOST),
-    ]
+    others = "lost members" + " and those not decided" * bool(open_)
+    keys = [Patch(color=BLUE, label="survivors"), Patch(label=others, **LOST)]
     keys += [Line2D([], [], color=INK, linestyle=s, label=f"{n} of all members") for s, n in MARKS.values()]
     figure.suptitle(f"{lost.size} members, {_fates(int(lost.sum()) - open_, open_)}", fontsize=11)
     figure.legend(handles=keys, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
@@ -246,54 +256,3 @@ def _bins(values: np.ndarray, log: bool) -> np.ndarray:
         room = 0.1 * abs(high) or 1.0
         return np.linspace(low - room, high + room, 42)  # an odd number of bins: the constant is inside one
     return np.linspace(low, high, 41)
-
-
-class Bar(NamedTuple):
-    """A driver: its dotted path, the share it explains with its interval, and its rank correlation with the metric."""
-
-    path: str
-    share: float
-    low: float
-    high: float
-    rho: float
-
-
-def tornado(drivers: Sequence[Bar], metric: str, says: str, path: pathlib.Path) -> None:
-    """Write the share of a metric's variation that each driver explains, the greatest on top, and what that `says`.
-
-    At most 12 bars, coloured by the trend; whiskers from low to high. Raises ValueError without drivers.
-    """
-    if not drivers:
-        raise ValueError("tornado: no drivers; an ensemble without [spread] has none to rank")
-    ranked = sorted(drivers, key=lambda driver: -driver.share)
-    shown = ranked[:MOST_DRIVERS]
-    figure = Figure(figsize=(7.5, 0.36 * len(shown) + 2.2), layout="constrained")
-    ax = figure.subplots()
-    for row, one in enumerate(shown):
-        ax.barh(row, 100 * one.share, height=0.62, color=TRENDS[_trend(one)])
-        ax.plot([100 * one.low, 100 * one.high], [row, row], color=INK, linewidth=1.2, marker="|", markersize=7)
-        ax.text(
-            100 * max(one.share, one.high) + 1.5, row, f"{100 * one.share:.0f} %", fontsize=8, va="center", color=INK
-        )
-    ax.set_yticks(range(len(shown)), [one.path.removeprefix("spread.") for one in shown])
-    ax.set_ylim(len(shown) - 0.4, -0.6)
-    ax.set_xlim(0, 112)
-    ax.set_xticks(np.linspace(0, 100, 6))
-    more = len(ranked) - len(shown)
-    words = "explains alone, % of how members rank; whiskers: its interval"
-    ax.set_xlabel(words + (f"; {more} weaker not shown" if more else ""), fontsize=9)
-    ax.set_title(f"What drives {named(metric, 0.0)[1]}\n", fontsize=11)
-    ax.text(0.5, 1.02, textwrap.fill(says, 95), fontsize=8, ha="center", va="bottom", color=INK, transform=ax.transAxes)
-    finish(ax, "")
-    found = dict.fromkeys(_trend(one) for one in shown)
-    keys = [Patch(color=TRENDS[trend], label=trend) for trend in TRENDS if trend in found]
-    figure.legend(handles=keys, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-    figure.savefig(path, dpi=150)
-
-
-def _trend(one: Bar) -> str:
-    """Which way the metric goes: a straight trend explains at least half of what is explained, or there is none."""
-    rising, falling, neither = TRENDS
-    if one.share <= 0 or one.rho**2 < 0.5 * one.share:
-        return neither
-    return rising if one.rho > 0 else falling

@@ -68,12 +68,11 @@ def _notes(n: int, confidence: float) -> list[str]:
     if tail >= TAIL:
         return []
     sure, least = f"{100 * confidence:g} %", math.ceil(TAIL / (1 - ALPHA) - 1e-9)
-    return [
-        f"the mean of the worst 5 % rests on {tail:.3g} members: its interval is no {sure} one; take {least} members"
-    ]
+    rests = f"the mean of the worst 5 % rests on {tail:.3g} members"
+    return [f"{rests}: its {sure} interval may cover less; take {least} members"]
 
 
-def _number(x: float) -> float | None:
+def _number(x: Any) -> float | None:
     return float(x) if np.isfinite(x) else None
 
 

@@ -76,7 +76,8 @@ class Study:
         rows, t = outcome.trajectory.rows, np.asarray(outcome.trajectory.rows.t[0])
         seen = {"z - r": rows.z - rows.r, "u": rows.u, "sigma": rows.sigma}
         signals = {k: np.where(rows.alive, x, np.nan) for k, x in seen.items()}
-        left = np.stack([*outcome.measured.values(), np.zeros(len(rows.z))], axis=1)  # from each end on
+        later = [outcome.measured[str(k)] for k in range(len(ends) - 1)]
+        left = np.stack([*later, np.zeros(len(rows.z))], axis=1)  # from each end on
         rate = -np.diff(left, axis=1) / np.diff(ends)
         rate[ends[1:] > np.asarray(outcome.trajectory.lost_at)[:, None]] = np.nan
         part = np.clip(np.searchsorted(ends, t, side="right") - 1, 0, len(ends) - 2)
