@@ -104,6 +104,8 @@ def bootstrap(
     whole = _moments(sizes[None].astype(float), G, n, tail)
     centre, scale, std, worst = np.array(places).T
     ends = {kind: _studentised(whole[kind], drawn[kind], confidence) for kind in KINDS}
+    if n < 3:  # no error of an error
+        ends = {kind: (np.full(len(std), -np.inf), np.full(len(std), np.inf)) for kind in KINDS}
     unbiased = (n / max(n - 1, 1)) ** 0.5
     return {
         "mean": Estimate(centre, *(scale * end + centre for end in ends["mean"])),
@@ -135,20 +137,17 @@ def _studentised(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Ends of the interval [columns] of a value [1, columns], from resampled ones [replicates, columns]; with errors.
 
-    A resample without an error of its own, for all its values are alike, is infinitely far off.
+    A resample without an error of its own, for all its values are alike, is infinitely far off. A value without one,
+    for its tail is one value, has the percentile interval: what is resampled is all that can be said.
     """
     (value,), (error,) = whole
     values, errors = drawn
     with np.errstate(divide="ignore", invalid="ignore"):
         off = values - value
-        far = np.where(np.abs(off) <= 1e-12 * error, 0.0, off / errors)
-    far = np.sort(far, axis=0)
-    outside = math.floor((1 - confidence) / 2 * len(far))
-    known = error > 0
-    with np.errstate(invalid="ignore"):
-        return np.where(known, value - far[-1 - outside] * error, value), np.where(
-            known, value - far[outside] * error, value
-        )
+        far = np.sort(np.where(np.abs(off) <= 1e-12 * error, 0.0, off / errors), axis=0)
+        plain, outside = np.sort(values, axis=0), math.floor((1 - confidence) / 2 * (len(far) + 1)) - 1
+        low, high = (np.where(error > 0, value - far[k] * error, plain[-1 - k]) for k in (-1 - outside, outside))
+    return low, high
 
 
 def _group_edges(n: int) -> np.ndarray:
