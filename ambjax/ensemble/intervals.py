@@ -23,6 +23,8 @@ KINDS = ("mean", "std", "cvar")
 WIDTH = 512
 # Counts held at once: 16 MB an array.
 MOST_COUNTS = 2_000_000
+# Variance, in units of the largest deviation squared, below which values are taken for one.
+ROUNDING = 1e-13
 
 
 class Estimate(NamedTuple):
@@ -94,7 +96,8 @@ def bootstrap(
         x = np.sort(column_of(column))
         if not np.isfinite(x[[0, -1]]).all():
             raise ValueError("a column is not finite: there is no mean to resample.")
-        centre, scale = x.mean(), max(np.abs(x[[0, -1]]).max(), np.finfo(float).tiny)
+        centre = x.mean()
+        scale = np.abs(x[[0, -1]] - centre).max() or 1.0
         y = (x - centre) / scale
         powers.append([np.add.reduceat(y**k, edges[:-1]) / sizes for k in (1, 2, 3, 4)])
         places.append((centre, scale, x.std(ddof=min(n - 1, 1)), _taken(np.ones((1, n)), tail)[0] @ x / tail))
@@ -104,8 +107,8 @@ def bootstrap(
     whole = _moments(sizes[None].astype(float), G, n, tail)
     centre, scale, std, worst = np.array(places).T
     ends = {kind: _studentised(whole[kind], drawn[kind], confidence) for kind in KINDS}
-    if n < 3:  # no error of an error
-        ends = {kind: (np.full(len(std), -np.inf), np.full(len(std), np.inf)) for kind in KINDS}
+    nothing = np.full(len(std), -np.inf), np.full(len(std), np.inf)
+    ends |= {kind: nothing for kind in KINDS if n < 3 or (kind == "cvar" and tail <= 1)}  # one value has no error
     unbiased = (n / max(n - 1, 1)) ** 0.5
     return {
         "mean": Estimate(centre, *(scale * end + centre for end in ends["mean"])),
@@ -128,7 +131,8 @@ def _moments(counts: np.ndarray, G: np.ndarray, n: int, tail: float) -> dict[str
     taken = _taken(counts, tail)
     first, second, q = taken @ G[0], taken @ G[1], G[0][np.argmax(taken > 0, axis=1)]
     beyond, squared = (first - q * tail) / n, (second - 2 * q * first + q**2 * tail) / n
-    error = np.sqrt(np.maximum(squared - beyond**2, 0) * n) / tail
+    varying = squared - beyond**2
+    error = np.sqrt(np.where(varying > ROUNDING, varying, 0) * n) / tail
     return {"mean": (mean, np.sqrt(m2 / n)), "std": (log_std, np.nan_to_num(log_error)), "cvar": (first / tail, error)}
 
 
