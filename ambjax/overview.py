@@ -103,7 +103,7 @@ def _transient(trajectory: Trajectory, end: float, ended: bool) -> float:
     At most a twentieth of the run, or a third of it if it ended in a loss.
     """
     t = np.asarray(trajectory.rows.t, float)
-    alive = t < max(end, t[min(1, len(t) - 1)])
+    alive = t <= max(end, t[min(1, len(t) - 1)])
     t, most = t[alive] - t[0], (end - t[0]) / (3 if ended else 20)
     slowest = 0.0
     for name in ("e_z", "sigma", "v_tilde", "e"):

@@ -81,7 +81,7 @@ def test_one_member_is_the_nominal_case():
 
 def test_stalled_runs_are_counted_apart():
     # two trials a sample are too few for the transient from 10 um at these gains, and enough from the balance
-    clock = Clock(20, 1e-4, Adaptive(tolerance=1e-8, most=2))
+    clock = Clock(20, 1e-4, Adaptive(1e-8, 2))
     study = dataclasses.replace(basin("repaired"), clock=clock)
     z = Axis("initial.z", np.array([0.0, 1e-4]))
     found = grid(study, z, Axis("plant.m", np.array([0.588])))
