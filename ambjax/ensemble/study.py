@@ -70,8 +70,10 @@ class Study:
         """
         cascade, scenario = self.batch(np.arange(min(members, self.members)))
         every = -(-self.clock.samples // times)
-        ends = np.linspace(0, float(self.clock.duration), min(WINDOWS, self.clock.samples) + 1)
-        fold = Named({str(k): Variation("u", after) for k, after in enumerate(ends[:-1])})
+        # whole samples, and half a sample before each: a time may be rounded
+        samples, period = self.clock.samples, float(self.clock.sample_period)
+        ends = period * np.linspace(0, samples, min(WINDOWS, samples) + 1).round()
+        fold = Named({str(k): Variation(after) for k, after in enumerate(ends[:-1] - period / 2)})
         outcome = run_ensemble(cascade, scenario, self.clock, fold=fold, every=every)
         rows, t = outcome.trajectory.rows, np.asarray(outcome.trajectory.rows.t[0])
         seen = {"z - r": rows.z - rows.r, "u": rows.u, "sigma": rows.sigma}
@@ -80,7 +82,7 @@ class Study:
         left = np.stack([*later, np.zeros(len(rows.z))], axis=1)  # from each end on
         rate = -np.diff(left, axis=1) / np.diff(ends)
         rate[ends[1:] > np.asarray(outcome.trajectory.lost_at)[:, None]] = np.nan
-        part = np.clip(np.searchsorted(ends, t, side="right") - 1, 0, len(ends) - 2)
+        part = np.clip(np.searchsorted(ends - period / 2, t, side="right") - 1, 0, len(ends) - 2)
         return t, outcome.trajectory, signals | {"variation of u": rate[:, part]}
 
     def fingerprint(self) -> dict[str, Any]:
