@@ -44,6 +44,8 @@ def parser() -> Parser:
     simulate.add_argument("--member", type=int, metavar="K", help="member K of the case's ensemble, its [spread] drawn")
     _seeded(simulate)
     simulate.add_argument("--members", type=int, metavar="N", help="size of the ensemble (for a Latin hypercube)")
+    simulate.add_argument("--from", dest="begin", type=float, metavar="T", help="draw the run from T (s) on")
+    simulate.add_argument("--to", dest="end", type=float, metavar="T", help="draw the run up to T (s)")
     ensemble = command("ensemble", "simulate many members: members.npz, summary.json, fan.png", case=True, out=True)
     ensemble.add_argument("--members", type=int, metavar="N", required=True, help="how many members")
     _seeded(ensemble)

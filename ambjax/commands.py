@@ -64,6 +64,7 @@ def run_template(args: argparse.Namespace) -> tuple[int, Summary]:
 def run_simulate(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax simulate."""
     case = _member(read_case(args.case), args)
+    window = _window(case, args)
     out = directory(args.out, f"simulate-{case.name}")
     say(f"method: {case.clock.method}")
     trajectory, measured = simulate(case)
@@ -74,9 +75,9 @@ def run_simulate(args: argparse.Namespace) -> tuple[int, Summary]:
         "settle_s": case.settle,
     }
     write_json(out / "metrics.json", metrics)
-    from ambjax import plotting
+    from ambjax.overview import overview
 
-    plotting.overview(trajectory, f"{case.name}: {case.clock.method}", out / "overview.png")
+    overview(trajectory, f"{case.name}: {case.clock.method}", out / "overview.png", window)
     if not args.json:
         print(_metrics_text(metrics))
         print(f"written: {out}/trajectory.npz, metrics.json, overview.png")
@@ -86,6 +87,18 @@ def run_simulate(args: argparse.Namespace) -> tuple[int, Summary]:
     elif ended:
         say(f"Whether the rotor is held is not known: at {metrics['lost_at_s']:.4g} s the run {trajectory.lost_why}.")
     return int(ended), metrics | {"out": str(out)}
+
+
+def _window(case: Case, args: argparse.Namespace) -> tuple[float, float] | None:
+    """The stretch of time to draw, s; None: not asked for."""
+    if args.begin is None and args.end is None:
+        return None
+    period, last = float(case.clock.sample_period), float(case.clock.duration)
+    begin, end = 0.0 if args.begin is None else args.begin, last if args.end is None else args.end
+    if not (begin >= 0 and begin + period * (1 - 1e-9) <= end <= last * (1 + 1e-9)):
+        allowed = f"the stretch must lie within 0 to {last:g} s, clock.duration, and be at least {period:g} s long"
+        raise ValueError(f"--from {begin:g} --to {end:g}: {allowed}, clock.sample_period. Choose other times.")
+    return begin, end
 
 
 def _member(case: Case, args: argparse.Namespace) -> Case:

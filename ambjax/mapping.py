@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.casefile import Case, read_case
-from ambjax.ensemble.maps import PERIOD, Axis, Map, grid
+from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid
 from ambjax.ensemble.paths import places
 from ambjax.outputs import directory, plain, say, table, write_json
 from ambjax.studies import study_of
@@ -28,6 +28,8 @@ def run_map(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     maps = []
     for case, study, (x, y) in zip(cases, studies, axes, strict=True):
         say(f"{case.name}: {cells} cells of {args.members}; method: {case.clock.method}")
+        if args.members == 1 and case.spread.entries:
+            say(f"{case.name}: nominal, its [spread] is not drawn; --members N, N above 1, draws it.")
         maps.append(grid(study, x, y))
     out = directory(args.out, f"map-{cases[0].name}")
     _draw(cases, maps, out / "map.png")
@@ -81,7 +83,7 @@ def _value(text: str, nominal: float | None) -> float:
 
 def _summary(case: Case, found: Map) -> dict[str, Any]:
     facts: dict[str, Any] = {"case": case.name, "x": found.x._asdict(), "y": found.y._asdict()}
-    return facts | {key: getattr(found, key) for key in ("survival", "low", "high", "error")} | {"reach": found.reach()}
+    return facts | {key: getattr(found, key) for key in (*GRIDS, "drawn")} | {"reach": found.reach()}
 
 
 def _text(cases: list[Case], maps: list[Map]) -> str:
@@ -95,19 +97,46 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
             (case.name, f"{100 * found.survival.mean():.1f} %", f"{100 * np.mean(found.low >= 0.95):.1f} %", held)
         )
     header = ("case", "runs that survive", "cells surely above 95 %", f"{x.path} survived at {y.path} = {middle:.3g}")
-    return table(header, rows)
+    lines = [table(header, rows)]
+    for case, found in zip(cases, maps, strict=True):
+        lines += [f"{case.name}: {_drawn(found)}"]
+        if found.stalled.any():
+            many, lost = int(found.stalled.sum()), int(found.lost.sum())
+            where = f"in {np.count_nonzero(found.stalled)} cells"
+            lines += [f"{case.name}: {lost} runs lost, {many} not decided ({where}): the integrator gave up there"]
+    return "\n".join(lines)
+
+
+def _drawn(found: Map) -> str:
+    """What a map shows of the case's spread."""
+    return f"drawn for each member: {', '.join(found.drawn)}" if found.drawn else "nominal: nothing is spread"
 
 
 def _draw(cases: list[Case], maps: list[Map], path: Any) -> None:
     from ambjax.ensemble import heatmaps
 
     panels = [
-        {"title": case.name, "x": m.x.values, "y": m.y.values, "survival": m.survival, "low": m.low, "high": m.high}
+        {
+            "title": f"{case.name}\n{_short(m)}",
+            "x": m.x.values,
+            "y": m.y.values,
+            "survival": m.survival,
+            "low": m.low,
+            "high": m.high,
+        }
         | {"error": m.error}
         for case, m in zip(cases, maps, strict=True)
     ]
     x, y = maps[0].x, maps[0].y
     heatmaps.maps(panels, _label(cases[0], x), _label(cases[0], y), x.log, y.log, path)
+
+
+def _short(found: Map) -> str:
+    """What a map shows, for a title: spread quantities by name, or how many they are."""
+    few = len(found.drawn) <= 3
+    what = ", ".join(found.drawn) if few else f"{len(found.drawn)} quantities"
+    drawn = f"spread: {what}" if what else "nominal"
+    return drawn + f"; {int(found.stalled.sum())} runs not decided" * bool(found.stalled.any())
 
 
 def _label(case: Case, axis: Axis) -> str:

@@ -17,6 +17,7 @@ from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
 from ambjax.outputs import chosen, make, plain, say, table, write_json
+from ambjax.trajectory import STALLED
 from ambjax.worker import chunk, deaf_children, processes, work
 
 CHUNK = 1024
@@ -173,18 +174,19 @@ def _summary(case: Case, study: Study, columns: dict[str, np.ndarray], path: str
 def _pictures(
     case: Case, study: Study, columns: dict[str, np.ndarray], summary: dict[str, Any], out: pathlib.Path
 ) -> None:
-    from ambjax.ensemble import pictures
+    from ambjax.ensemble import pictures, tornado
 
-    t, lost_at, signals = study.bands(FAN_MEMBERS, FAN_TIMES)
+    t, trajectory, signals = study.bands(FAN_MEMBERS, FAN_TIMES)
+    lost_at, stalled = np.asarray(trajectory.lost_at), np.asarray(trajectory.lost_code) == STALLED
     title = f"{case.name}: {len(lost_at)} of {study.members} members"
     limits = {"z - r": float(np.min(study.scenario.touchdown)), "u": float(np.min(study.scenario.u_max))}
     bands = {name: _quantiles(x) for name, x in signals.items()}
-    pictures.fan(t, bands, limits, title, out / "fan.png", lost_at=lost_at)
+    pictures.fan(t, bands, limits, title, out / "fan.png", lost_at=lost_at, stalled=stalled)
     pictures.histograms(columns, out / "histograms.png")
     if study.spread.entries:
         deciding = statistics.DECIDING
-        bars = [(d["path"], d["rho"], d["low"], d["high"]) for d in summary["drivers"][deciding]]
-        pictures.tornado(bars, deciding, out / "tornado.png")
+        bars = [tornado.Bar(*(d[k] for k in tornado.Bar._fields)) for d in summary["drivers"][deciding]]
+        tornado.tornado(bars, deciding, summary["explained"][deciding]["says"], out / "tornado.png")
 
 
 def _quantiles(x: np.ndarray) -> dict[float, np.ndarray]:
@@ -200,6 +202,10 @@ def _text(summary: dict[str, Any]) -> str:
     sure = f"{100 * summary['confidence']:g} % interval"
     held = f"{summary['survivors']} of {summary['members']} members survive"
     lines = [f"{held}: {share:.4g} % ({sure} {low:.4g} to {high:.4g} %)"]
+    if summary["stalled"]:
+        why = "the integrator gave up, and whether the rotor is held is not known"
+        lines += [f"{summary['lost']} lost, {summary['stalled']} not decided: {why}"]
+    lines += [f"note: {note}" for note in summary["notes"]]
 
     def number(x: float | None) -> str:
         return "-" if x is None else f"{x:.4g}"
@@ -211,9 +217,19 @@ def _text(summary: dict[str, Any]) -> str:
             (name, *(number(found[key]["estimate"]) for key in ("median", "q95", "cvar_95")), number(found["max"]))
         )
     lines += ["", table(("metric", "median", "95 % quantile", "mean of worst 5 %", "largest"), rows)]
-    drivers = summary["drivers"][statistics.DECIDING][:5]
+    drivers, explained = summary["drivers"][statistics.DECIDING][:5], summary["explained"][statistics.DECIDING]
     if drivers:
-        shown = [(d["path"], f"{d['rho']:+.2f}", f"{d['low']:+.2f} to {d['high']:+.2f}") for d in drivers]
-        lines += ["", f"What drives {statistics.DECIDING}:", table(("quantity", "rank correlation", sure), shown)]
+        lines += ["", f"What drives {statistics.DECIDING}: {explained['says']}."]
+    if explained["alone"]:
+        shown = [
+            (
+                d["path"],
+                f"{100 * d['share']:.1f} %",
+                f"{100 * d['low']:.1f} to {100 * d['high']:.1f} %",
+                f"{d['rho']:+.2f}",
+            )
+            for d in drivers
+        ]
+        lines += [table(("quantity", "explains alone", sure, "rank correlation"), shown)]
     worst = summary["worst"][0]
     return "\n".join([*lines, "", f"The worst member alone: {worst['replay']}"])

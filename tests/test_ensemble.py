@@ -234,3 +234,17 @@ def test_another_jax_resumes_only_what_it_began(tmp_path, monkeypatch):
     monkeypatch.setattr(jax, "__version__", "0.0.0")
     with pytest.raises(ValueError, match="another study: jax is"):
         run(STUDY, tmp_path, resume=True)
+
+
+def test_the_variation_of_the_voltage_over_parts_of_the_run_adds_up():
+    study = Study(SMOOTH, NOISY, SHORT, 0.0, Spread((("plant.m", Percent(10.0)),)), 3, 5)
+    t, trajectory, signals = study.bands(5, 40)
+    rate = signals["variation of u"]
+    assert rate.shape == (5, len(t)) == (5, 40)
+    chatter = study.columns(0, 5)["chatter_V"]
+    # 25 parts, of one sample or two each, that each have one rate: to be counted once, at the first of their samples
+    starts = np.linspace(0, 40, 26).round().astype(int)
+    total = rate[:, starts[:-1]] @ (1e-4 * np.diff(starts))
+    np.testing.assert_allclose(total, chatter, rtol=1e-9)  # sums in another order, in another program
+    assert np.all(chatter > 0)
+    assert np.isinf(trajectory.lost_at).all()

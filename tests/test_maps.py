@@ -1,13 +1,14 @@
 """Maps: the basin's known law, cells against ensembles of their own, and refusals."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 
 from ambjax import RK4, Adaptive, Cascade, Clock, Initial, Plant, Scenario, Sensor, inversion, paper, rollout
 from ambjax.__main__ import main
-from ambjax.ensemble import Normal, Spread
+from ambjax.ensemble import Normal, Spread, maps
 from ambjax.ensemble.maps import PERIOD, Axis, grid
 from ambjax.ensemble.study import Study
 
@@ -63,6 +64,30 @@ def test_a_cell_is_the_members_of_its_case_run_alone():
     assert found.survival.shape == (2, 3)
     np.testing.assert_array_equal(found.survival, 1.0)
     np.testing.assert_allclose(found.low, 3 / (3 + 1.959964**2))  # Wilson's bound for 3 of 3
+
+
+def test_one_member_is_the_nominal_case():
+    """A map of a case with [spread] shows the case, not a member at random, unless members are asked for."""
+    x, y = Axis("plant.m", np.array([0.5, 0.6])), Axis("sensor.std", np.array([1e-8, 1e-7]))
+    wide = dataclasses.replace(SMALL, spread=Spread((("initial.z", Normal(1e-4)),)), members=1)
+    bare = dataclasses.replace(wide, spread=Spread())
+    found, nominal = grid(wide, x, y), grid(bare, x, y)
+    np.testing.assert_array_equal(found.error, nominal.error)
+    assert found.drawn == ()
+    several = grid(dataclasses.replace(wide, members=2), x, y)
+    assert several.drawn == ("initial.z",)
+    assert np.all(several.error > 10 * nominal.error)  # thrown off by 100 times what noise does
+
+
+def test_stalled_runs_are_counted_apart():
+    # two trials a sample are too few for the transient from 10 um at these gains, and enough from the balance
+    clock = Clock(20, 1e-4, Adaptive(1e-8, 2))
+    study = dataclasses.replace(basin("repaired"), clock=clock)
+    z = Axis("initial.z", np.array([0.0, 1e-4]))
+    found = grid(study, z, Axis("plant.m", np.array([0.588])))
+    np.testing.assert_array_equal(found.survival + found.lost + found.stalled, 1)  # each run has one fate
+    assert found.stalled[0, 1] == 1
+    assert found.lost.sum() == 0
 
 
 def test_the_sample_period_is_an_axis_either_way():
@@ -124,4 +149,31 @@ def test_the_command_draws_and_prints_two_cases_side_by_side(tmp_path, capsys):
     text = capsys.readouterr().out
     assert "one" in text
     assert "two" in text
+    assert "one: nominal: nothing is spread" in text
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"map.png", "map.json"}
+
+
+def test_the_command_says_what_is_drawn_and_what_is_not_decided(tmp_path, capsys, monkeypatch):
+    (tmp_path / "case.toml").write_text(CASE + "[spread]\nplant.m = { percent = 1 }\n")
+    argv = ["map", str(tmp_path / "case.toml"), "--x", X, "--y", Y, "--out", str(tmp_path / "out")]
+    assert main(argv) == 0
+    said = capsys.readouterr()
+    assert "its [spread] is not drawn; --members N" in said.err
+    assert "case: nominal: nothing is spread" in said.out
+    run = maps.run_ensemble
+
+    def stalling(*args, **options):
+        outcome = run(*args, **options)
+        first = np.arange(len(outcome.measured["lost_at_s"])) == 0
+        fate = {"lost_at_s": np.where(first, 1e-3, np.inf), "stalled": first}
+        return outcome._replace(measured=outcome.measured | fate)
+
+    monkeypatch.setattr(maps, "run_ensemble", stalling)
+    assert main([*argv, "--members", "2"]) == 0
+    text = capsys.readouterr().out
+    assert "case: drawn for each member: plant.m" in text
+    assert "case: 0 runs lost, 1 not decided (in 1 cells): the integrator gave up there" in text
+    (found,) = json.loads((tmp_path / "out" / "map.json").read_text())["cases"]
+    assert found["stalled"] == [[1, 0, 0], [0, 0, 0], [0, 0, 0]]
+    assert found["survival"][0][0] == 0.5
+    assert found["drawn"] == ["plant.m"]

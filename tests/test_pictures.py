@@ -10,6 +10,7 @@ from matplotlib.text import Text
 
 from ambjax.ensemble import heatmaps, pictures
 from ambjax.ensemble.scales import edges, log_ticks, named, prefixed, relabelled, size_of
+from ambjax.ensemble.tornado import Bar, tornado
 from ambjax.metrics import Standard
 
 PERCENTS = (0, 5, 25, 50, 75, 95, 100)
@@ -143,14 +144,15 @@ def test_fan_shows_bands_units_limit_and_survivors(tmp_path, drawn):
     lost_at = np.full(50, np.inf)
     lost_at[:5] = [0.1, 0.2, 0.3, 0.4, 2.0]  # the last one after the end: it survives this run
     bands = {"z - r": quantiles(members), "u": quantiles(6e6 * members), "sigma": quantiles(members)}
-    pictures.fan(t, bands, {"u": 150.0, "z - r": 4.5e-3}, "a title", tmp_path / "fan.png", lost_at=lost_at)
+    limits, stalled = {"u": 150.0, "z - r": 4.5e-3}, np.arange(50) == 2
+    pictures.fan(t, bands, limits, "a title", tmp_path / "fan.png", lost_at=lost_at, stalled=stalled)
     assert is_png(tmp_path / "fan.png")
     (figure,) = drawn
     words = texts(figure)
     assert "(µm)" in words
     assert "(V)" in words
     assert "(µm/s)" in words
-    assert "46 of 50 survive (92 %)" in words
+    assert "46 of 50 survive (92 %), 3 lost, 1 not decided" in words
     assert "0 to 100 %" in words
     assert "median" in words
     error, voltage, _, survivors = figure.axes
@@ -193,6 +195,20 @@ def test_fan_does_not_let_a_brief_transient_hide_the_rest(tmp_path, drawn):
     assert "beyond this axis" in texts(drawn[0])
 
 
+def test_fan_smooths_a_median_that_chatters(tmp_path, drawn):
+    t = np.linspace(0, 1, 500)
+    signs = np.sign(np.random.default_rng(0).normal(size=500))
+    slow = np.sin(2 * np.pi * 5 * t)
+    for values in (200 * signs + 20 * t, slow):
+        pictures.fan(t, {"u": {0: values - 1, 50: values, 100: values + 1}}, {}, "chatter", tmp_path / "fan.png")
+    (chattering,), (smooth,) = (figure.axes[0].lines for figure in drawn)
+    assert chattering.get_label() == "median, smoothed where it chatters"
+    # a mean of ten signs is off by 63 V; the whole height once in 1,000
+    assert np.ptp(chattering.get_ydata()) < 400
+    assert smooth.get_label() == "median"
+    np.testing.assert_array_equal(smooth.get_ydata(), slow)
+
+
 def test_fan_refuses_unknown_quantity(tmp_path):
     with pytest.raises(ValueError, match=r"'w'; it knows z - r, z, sigma"):
         pictures.fan(np.zeros(1), {"w": {50: np.zeros(1)}}, {}, "", tmp_path / "fan.png")
@@ -223,9 +239,10 @@ def test_histogram_counts_every_member_once(tmp_path, drawn):
     error = np.where(lost, 3e-3, 2e-6) * np.exp(0.2 * rng.normal(size=n))
     reached = np.where(lost, np.inf, 3e-3 + 1e-4 * rng.normal(size=n))
     columns = {"lost_at": np.where(lost, 0.1, np.inf), "rms_error_m": error, "v_tilde_reached_s": reached}
+    columns["stalled"] = np.arange(n) < 10
     pictures.histograms(columns, tmp_path / "h.png")
     assert is_png(tmp_path / "h.png")
-    assert "1000 members, 40 lost" in texts(drawn[0])
+    assert "1000 members, 30 lost, 10 not decided" in texts(drawn[0])
     first, second = drawn[0].axes[:2]
     assert first.get_xscale() == "log"
     assert second.get_xscale() == "linear"
@@ -274,30 +291,33 @@ def test_histograms_refuse_nothing_to_draw(tmp_path):
 # ---------------------------------------------------------------- tornado
 
 
-def test_tornado_ranks_by_strength(tmp_path, drawn):
-    drivers = [(f"plant.{k}", rho, rho - 0.1, rho + 0.1) for k, rho in enumerate(np.linspace(-0.8, 0.7, 14))]
-    drivers.append(("spread.sensor.std", np.nan, np.nan, np.nan))
-    pictures.tornado(drivers, "settled_max_abs_error_m", tmp_path / "t.png")
+def a_bar(path, share, rho=0.0):
+    return Bar(path, share, max(share - 0.1, 0), min(share + 0.1, 1), rho)
+
+
+def test_tornado_ranks_by_share_and_colours_by_trend(tmp_path, drawn):
+    bars = [a_bar(f"plant.{k}", share) for k, share in enumerate(np.linspace(0.0, 0.6, 13))]
+    bars += [a_bar("spread.rising", 0.9, 0.94), a_bar("falling", 0.7, -0.8), a_bar("turning", 0.8, 0.1)]
+    tornado(bars, "settled_max_abs_error_m", "what it says", tmp_path / "t.png")
     assert is_png(tmp_path / "t.png")
     ax = drawn[0].axes[0]
     names = [tick.get_text() for tick in ax.get_yticklabels()]
-    assert names[:3] == ["plant.0", "plant.13", "plant.1"]
+    assert names[:4] == ["rising", "turning", "falling", "plant.12"]
     assert len(names) == 12
-    assert "3 weaker not shown" in ax.get_xlabel()
+    assert "4 weaker not shown" in ax.get_xlabel()
+    assert "what it says" in texts(drawn[0])
     assert ax.get_ylim()[0] > ax.get_ylim()[1]  # row 0 on top
-    lengths = np.abs([patch.get_width() for patch in ax.patches])
+    lengths = [patch.get_width() for patch in ax.patches]
     assert np.all(np.diff(lengths) <= 0)
+    assert len({patch.get_facecolor() for patch in ax.patches[:3]}) == 3
 
 
 def test_tornado_of_hard_cases(tmp_path, drawn):
-    pictures.tornado([("plant.m", np.nan, np.nan, np.nan)], "rms_u_V", tmp_path / "a.png")
-    pictures.tornado(
-        [("spread.plant.m", -1.0, -1.0, -1.0), ("plant.R", 0.0, np.nan, np.nan)], "lost_at_s", tmp_path / "b.png"
-    )
-    assert "undefined" in texts(drawn[0])
-    assert drawn[1].axes[0].get_yticklabels()[0].get_text() == "plant.m"
+    tornado([Bar("plant.m", 0.0, 0.0, 1.0, 0.0)], "rms_u_V", "nothing explains it", tmp_path / "a.png")
+    tornado([Bar("plant.m", 1.0, 1.0, 1.0, -1.0)], "lost_at_s", "all", tmp_path / "b.png")
+    assert "falls with it" in texts(drawn[1])
     with pytest.raises(ValueError, match="no drivers"):
-        pictures.tornado([], "rms_u_V", tmp_path / "c.png")
+        tornado([], "rms_u_V", "", tmp_path / "c.png")
 
 
 # ---------------------------------------------------------------- maps

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ambjax.ensemble import cvar, quantile, spearman, summary, wilson
-from ambjax.ensemble.statistics import WIDTH, _group_edges, bootstrap
+from ambjax.ensemble import cvar, quantile, summary, wilson
+from ambjax.ensemble.intervals import WIDTH, _group_edges, bootstrap
 
 RNG = np.random.default_rng(5)
 
@@ -55,22 +55,34 @@ def test_quantile_is_the_value_of_its_rank(n):
     np.testing.assert_array_equal(quantile(x, q).value, np.quantile(x, q, method="inverted_cdf"))
 
 
-def test_quantile_interval_is_that_of_explicit_resampling():
-    x = np.sort(RNG.exponential(size=80))
-    picks = np.sort(x[RNG.integers(80, size=(40_000, 80))], axis=1)[:, 71]  # rank ceil(0.9 * 80)
-    ends = np.searchsorted(x, np.quantile(picks, [0.025, 0.975]))
-    # one rank apart at most: 40,000 resamples know a probability of 2.5 % to 0.08 %, a rank's is 2 to 4 %
-    found = np.searchsorted(x, quantile(x, 0.9)[1:])
-    assert np.all(np.abs(found - ends) <= 1)
+def test_quantile_interval_is_the_binomial_s():
+    # the largest rank that is above the true quantile with at most 2.5 %, and the smallest below it
+    for n, q in ((200, 0.95), (200, 0.5), (30, 0.05), (1001, 0.95)):
+        x = np.arange(1.0, n + 1)  # a value is its rank
+        _, low, high = quantile(x, q)
+        above = stats.binom(n, q).cdf  # so many values or fewer lie below the true one
+        if np.isfinite(low):
+            assert above(low - 1) <= 0.025
+        assert above(0 if np.isinf(low) else low) > 0.025
+        if np.isfinite(high):
+            assert 1 - above(high - 1) <= 0.025
+        assert 1 - above(n - 1 if np.isinf(high) else high - 2) > 0.025
 
 
-def test_quantile_coverage_is_nominal():
-    # 2,000 samples of 200 exponentials; true quantile -log(1 - q). Discreteness at rank 190 of 200 costs up to 2 %
-    for q in (0.5, 0.95):
-        hits = [
-            e.low <= -np.log(1 - q) <= e.high for e in (quantile(RNG.exponential(size=200), q) for _ in range(2000))
-        ]
-        assert abs(np.mean(hits) - 0.95) < 0.03
+def test_quantile_interval_is_open_where_the_ensemble_is_too_small():
+    # all 72 lie below the 95 % quantile with 0.95^72 = 2.49 %, all 71 with 2.62 %
+    assert quantile(np.arange(71.0), 0.95).high == np.inf
+    assert quantile(np.arange(72.0), 0.95).high == 71
+    assert quantile(np.array([3.0]), 0.5) == (3.0, -np.inf, np.inf)
+
+
+@pytest.mark.parametrize("n", [200, 1000])
+def test_quantile_coverage_is_at_least_nominal(n):
+    # 2,000 samples of exponentials; true quantile -log(1 - q). Exact intervals cover 95 % or more: ranks are whole;
+    # a share of 2,000 trials is known to 0.5 %, three of which
+    for q in (0.05, 0.5, 0.95):
+        hits = [e.low <= -np.log(1 - q) <= e.high for e in (quantile(RNG.exponential(size=n), q) for _ in range(2000))]
+        assert 0.95 - 0.015 < np.mean(hits) < 0.99
 
 
 def test_quantiles_of_what_is_never_reached():
@@ -88,46 +100,98 @@ def test_cvar_of_a_normal():
     found = cvar(RNG.normal(size=200_000), 0.95, seed=1)
     # its variance is (Var[X | X > q] + 0.95 (cvar - q)^2)/(0.05 N) = 0.304/1e4: standard error 5.5e-3, five of them
     assert abs(found.value - exact) < 0.028
-    assert abs((found.high - found.low) / (2 * 1.96 * 5.5e-3) - 1) < 0.1  # 1,000 resamples know a spread to 5 %
+    assert abs((found.high - found.low) / (2 * 1.96 * 5.5e-3) - 1) < 0.15  # 1,000 resamples know it to 5 %
 
 
 def test_cvar_counts_the_value_at_the_edge_in_part():
     assert cvar(np.array([1.0, 2.0, 3.0, 4.0]), 0.5).value == 3.5
     np.testing.assert_allclose(cvar(np.array([1.0, 2.0, 3.0, 4.0]), 0.625).value, (4 + 0.5 * 3) / 1.5)
     np.testing.assert_allclose(cvar(np.array([1.0, 2.0, 6.0]), 0.0).value, 3.0)  # of everything: the mean
-    assert cvar(np.full(7, 2.5)) == (2.5, 2.5, 2.5)
+    assert cvar(np.full(40, 2.5)) == (2.5, 2.5, 2.5)
 
 
 def test_bootstrap_is_explicit_resampling():
-    # 400 lognormals; the oracle draws indices. Limits agree within the noise of 1,000 resamples: 0.25 of a
-    # standard error (at 2.5 %, sqrt(0.025 0.975/1000)/0.0584 = 0.085 of one, times three)
-    x = RNG.lognormal(size=400)
-    picks = x[RNG.integers(400, size=(20_000, 400))]
-    oracle = {
-        "mean": picks.mean(axis=1),
-        "std": picks.std(axis=1, ddof=1),
-        "cvar": np.sort(picks, axis=1)[:, -20:].mean(axis=1),
-    }
+    # 400 exponentials; the oracle draws indices and has formulas of its own. Limits agree within the noise of
+    # 1,000 resamples: 0.6 of a standard error (at 2.5 %, sqrt(0.025 0.975/1000) over the density there, 0.02 in the
+    # long tail of t, is 0.25 of one, more than twice)
+    n, x = 400, RNG.exponential(size=400)
+
+    def measured(rows):
+        tails = np.sort(rows, axis=1)[:, -20:]
+        excess = np.zeros(rows.shape)
+        excess[:, -20:] = tails - tails[:, :1]
+        centred = rows - rows.mean(axis=1, keepdims=True)
+        m2, m4 = (centred**2).mean(axis=1), (centred**4).mean(axis=1)
+        return {
+            "mean": (rows.mean(axis=1), np.sqrt(m2 / n)),
+            "std": (np.log(np.sqrt(m2)), np.sqrt((m4 - m2**2) / n) / (2 * m2)),
+            "cvar": (tails.mean(axis=1), excess.std(axis=1) / 0.05 / np.sqrt(n)),
+        }
+
+    picks, whole = measured(x[RNG.integers(n, size=(20_000, n))]), measured(x[None])
     found = bootstrap([x], 0.95, 0.95, 3)
-    for kind, replicates in oracle.items():
-        ends = np.quantile(replicates, [0.025, 0.975])
-        np.testing.assert_allclose(
-            [found[kind].low[0], found[kind].high[0]], ends, atol=0.25 * replicates.std(), rtol=0
-        )
+    for kind, (values, errors) in picks.items():
+        (value,), (error,) = whole[kind]
+        ends = value - error * np.quantile((values - value) / errors, [0.975, 0.025])
+        if kind == "std":
+            ends, error = np.exp(ends) * np.sqrt(n / (n - 1)), error * x.std()
+        np.testing.assert_allclose([found[kind].low[0], found[kind].high[0]], ends, atol=0.6 * error, rtol=0)
     np.testing.assert_allclose(found["mean"].value[0], x.mean(), rtol=1e-13)
     np.testing.assert_allclose(found["std"].value[0], x.std(ddof=1), rtol=1e-13)
     np.testing.assert_allclose(found["cvar"].value[0], np.sort(x)[-20:].mean(), rtol=1e-13)
 
 
-def test_bootstrap_coverage_is_roughly_nominal():
-    # 1,000 samples of 500 normals, resampled alike. Percentile intervals of a tail of 25 values are known to be
-    # short: 90 to 95 % (Efron and Tibshirani, section 14); of mean and deviation 94 to 95 %
-    samples = list(RNG.normal(size=(1000, 500)))
-    found = bootstrap(samples, 0.95, 0.95, 0)
-    truth = {"mean": 0.0, "std": 1.0, "cvar": stats.norm.pdf(stats.norm.ppf(0.95)) / 0.05}
-    for kind, lowest in (("mean", 0.925), ("std", 0.915), ("cvar", 0.87)):
-        share = np.mean((found[kind].low <= truth[kind]) & (truth[kind] <= found[kind].high))
-        assert lowest < share < 0.975, kind
+TAILS = {
+    "normal": (stats.norm(), ("mean", "std", "cvar")),
+    "lognormal": (stats.lognorm(1), ("mean", "cvar")),  # its fourth moment is not seen in 200 values
+    "bounded": (stats.beta(2, 2), ("mean", "std", "cvar")),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [200, 1000])
+@pytest.mark.parametrize("tail", TAILS)
+def test_coverage_over_1000_repetitions(tail, n):
+    """95 %, to three times the binomial error of 1,000 repetitions, 0.7 %; and 1 % for what the method has left."""
+    kind, asked = TAILS[tail]
+    q = kind.ppf(0.95)
+    truth = {"mean": kind.mean(), "std": kind.std(), "cvar": kind.expect(lambda x: x, lb=q) / 0.05}
+    rng, hits = np.random.default_rng(n), {name: [] for name in asked}
+    quantiles = []
+    for seed in range(10):  # so that no set of resamples serves more than 100 samples
+        samples = kind.rvs(size=(100, n), random_state=rng)
+        found = bootstrap(list(samples), 0.95, 0.95, seed)
+        for name, hit in hits.items():
+            hit += list((found[name].low <= truth[name]) & (truth[name] <= found[name].high))
+        quantiles += [e.low <= q <= e.high for e in (quantile(x, 0.95) for x in samples)]
+    for name, hit in hits.items():
+        assert abs(np.mean(hit) - 0.95) < 0.031, (name, np.mean(hit))
+    assert 0.95 - 0.021 < np.mean(quantiles) < 0.99
+
+
+def test_the_interval_of_a_heavy_tail_s_cvar_covers():
+    # 400 samples of 200 lognormals: a share known to 1.2 %, three of which below 94 %. Percentile intervals cover 83 %
+    truth, hits = np.exp(0.5) * stats.norm.cdf(1 - stats.norm.ppf(0.95)) / 0.05, []
+    for seed in range(8):
+        found = bootstrap(list(np.random.default_rng(seed).lognormal(size=(50, 200))), 0.95, 0.95, seed)["cvar"]
+        hits += list((found.low <= truth) & (truth <= found.high))
+    assert np.mean(hits) > 0.94 - 0.036
+
+
+def test_a_tail_that_is_one_value_is_known():
+    # a tenth of the members at the clearance: so are the worst 5 % of nearly every resample
+    found = bootstrap([np.where(np.arange(500) < 50, 4.5e-3, 1e-6 * RNG.random(500))])["cvar"]
+    np.testing.assert_allclose([found.low[0], found.value[0], found.high[0]], 4.5e-3, rtol=1e-12)  # rounding of a scale
+
+
+def test_the_interval_has_no_end_where_resamples_say_nothing():
+    for moments in bootstrap([np.array([1.0, 2.0, 4.0])]).values():
+        assert np.all(moments.low <= moments.value)
+        assert moments.high[0] == np.inf  # one resample in nine is one value thrice
+    assert summary({k: x[:199] for k, x in columns().items()}, [], seed=0)["notes"] == [
+        "the mean of the worst 5 % rests on 9.95 members: its 95 % interval may cover less; take 200 members"
+    ]
+    assert summary(columns(), [], seed=0)["notes"] == []
 
 
 def test_groups_cover_every_rank_once_and_stay_few():
@@ -153,7 +217,7 @@ def test_grouped_intervals_have_the_width_of_the_central_limit_theorem():
 
 
 def test_the_same_seed_gives_the_same_interval():
-    x = RNG.normal(size=50)
+    x = RNG.normal(size=200)
     assert cvar(x, seed=4) == cvar(x[::-1], seed=4)
     assert cvar(x, seed=4) != cvar(x, seed=5)
 
@@ -169,38 +233,6 @@ def test_cvar_refuses_an_alpha_that_is_no_share():
         cvar(np.ones(3), 1.0)
 
 
-# --- rank correlation ---
-
-
-@pytest.mark.parametrize("n", [3, 10, 500])
-def test_spearman_is_scipy_s_ties_included(n):
-    x = [RNG.normal(size=n), RNG.integers(3, size=n), np.arange(n)]
-    y = [x[0] ** 3 + RNG.normal(size=n), np.exp(x[2] / n), np.where(RNG.random(n) < 0.3, np.inf, x[2])]
-    rho, p = spearman(x, y)
-    for a in range(3):
-        for b in range(3):
-            if np.ptp(x[a]) == 0:
-                continue
-            theirs = stats.spearmanr(x[a], np.where(np.isinf(y[b]), 1e9, y[b]))
-            if np.isnan(theirs.statistic):
-                continue
-            np.testing.assert_allclose(rho[a, b], theirs.statistic, rtol=0, atol=1e-12)
-            # near rho = 1 the p-value is that of a rounding error
-            np.testing.assert_allclose(p[a, b], theirs.pvalue, rtol=1e-6, atol=1e-6)
-
-
-def test_spearman_of_constants_and_of_few_members():
-    rho, p = spearman([np.ones(9), np.arange(9)], [np.arange(9.0), np.full(9, np.inf)])
-    np.testing.assert_allclose(rho, [[0, 0], [1, 0]], atol=1e-15)
-    np.testing.assert_allclose(p, [[1, 1], [0, 1]], atol=1e-12)
-    rho, p = spearman([np.array([1.0, 2.0])], [np.array([5.0, 3.0])])
-    assert p == 1
-    np.testing.assert_allclose(rho, -1)
-    rho, p = spearman([np.ones(1)], [np.ones(1)])
-    assert rho == 0
-    assert p == 1
-
-
 # --- the summary ---
 
 
@@ -212,7 +244,8 @@ def columns(n=200):
     return {
         "index": np.arange(100, 100 + n),
         "lost_at": lost_at,
-        "lost": np.isfinite(lost_at),
+        "lost": np.isfinite(lost_at) & (np.arange(n) != 7),
+        "stalled": np.arange(n) == 7,
         "lost_at_s": lost_at,
         "settled_max_abs_error_m": 1e-6 * (5 + mass + 0.1 * rng.normal(size=n)),
         "sigma_reached_s": np.where(np.arange(n) < 5, np.inf, 0.1),
@@ -226,6 +259,7 @@ def test_summary_says_what_it_promises():
     found = summary(data, names, seed=3)
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert (found["members"], found["survivors"], found["seed"]) == (200, 198, 3)
+    assert (found["lost"], found["stalled"]) == (1, 1)
     share, low, high = wilson(198, 200)
     assert found["survival"] == {"estimate": share, "low": low, "high": high}
     assert set(found["metrics"]) == {"settled_max_abs_error_m", "sigma_reached_s"}
@@ -253,12 +287,16 @@ def test_summary_names_the_drivers_and_the_worst():
     first, second = found["drivers"]["settled_max_abs_error_m"]
     assert first["path"] == "plant.m"
     assert first["rho"] > 0.95
+    assert first["low"] <= first["share"] <= first["high"]
+    assert first["share"] > 0.9
     assert first["p"] < 1e-6 < second["p"]
+    assert found["explained"]["settled_max_abs_error_m"]["alone"] > 0.9
     assert set(found["drivers"]) == {"settled_max_abs_error_m", "sigma_reached_s", "lost_at_s"}
     by_error = 100 + np.argsort(-data["settled_max_abs_error_m"])
     rest = [k for k in by_error if k not in (103, 107)]
     assert [member["index"] for member in found["worst"]] == [103, 107, *rest[:2]]
     assert [member["lost_at_s"] for member in found["worst"]] == [0.1, 0.2, None, None]
+    assert [member["fate"] for member in found["worst"]] == ["lost", "stalled", "survives", "survives"]
     assert found["worst"][2]["settled_max_abs_error_m"] == data["settled_max_abs_error_m"].max()
 
 

@@ -122,7 +122,7 @@ def step_error(study: Study, x: np.ndarray) -> StepError:
 
 def summarise(study: Study, found: dict[str, np.ndarray]) -> dict[str, Any]:
     """Numbers of an ensemble [N] for the report: pooled rms and largest error, survival, mean and largest metrics."""
-    from ambjax.ensemble.statistics import wilson
+    from ambjax.ensemble import wilson
 
     lost, errors = np.isfinite(found["lost_at_s"]), found["settled_rms_error_m"]
     n = len(lost)

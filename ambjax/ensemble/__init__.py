@@ -1,9 +1,11 @@
 """Ensembles: many members of one case, drawn, simulated and reduced to numbers."""
 
 from ambjax.ensemble.distributions import Choice, LogUniform, Normal, Percent, Uniform
+from ambjax.ensemble.drivers import shares, spearman
 from ambjax.ensemble.engine import run_ensemble
+from ambjax.ensemble.intervals import cvar, quantile, wilson
 from ambjax.ensemble.spread import Spread, apply, draw
-from ambjax.ensemble.statistics import cvar, quantile, spearman, summary, wilson
+from ambjax.ensemble.statistics import summary
 
 __all__ = [
     "Choice",
@@ -17,6 +19,7 @@ __all__ = [
     "draw",
     "quantile",
     "run_ensemble",
+    "shares",
     "spearman",
     "summary",
     "wilson",

@@ -7,15 +7,18 @@ import jax
 import numpy as np
 
 from ambjax.control.cascade import Cascade
+from ambjax.ensemble.distributions import Distribution
 from ambjax.ensemble.engine import run_ensemble
+from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import Spread, apply, require_path
-from ambjax.ensemble.statistics import wilson
 from ambjax.ensemble.study import Study
 from ambjax.metrics import Standard
 from ambjax.scenario import Scenario
 
 PERIOD = "clock.sample_period"
+# Fields of a Map by cell.
+GRIDS = ("survival", "low", "high", "error", "lost", "stalled")
 
 
 class Axis(NamedTuple):
@@ -29,7 +32,8 @@ class Axis(NamedTuple):
 class Map(NamedTuple):
     """Results by cell [ny, nx]: share of survivors with its 95 % interval, and the median settled |z - r|, m.
 
-    The error is NaN where no member of the cell survives.
+    The error is NaN where no member of the cell survives. `lost` and `stalled` count the members that do not survive:
+    of the latter the integrator gave up, and their fate is not known. `drawn`: dotted paths of what was spread.
     """
 
     x: Axis
@@ -38,6 +42,9 @@ class Map(NamedTuple):
     low: np.ndarray
     high: np.ndarray
     error: np.ndarray
+    lost: np.ndarray
+    stalled: np.ndarray
+    drawn: tuple[str, ...] = ()
 
     def reach(self) -> tuple[float, float] | None:
         """Ends of the stretch of x in which all members survive, on the row of y nearest the middle of its range."""
@@ -51,21 +58,29 @@ def grid(study: Study, x: Axis, y: Axis) -> Map:
     """`study.members` members in every cell, all cells in one ensemble; member k has the same noise in each.
 
     The axes may be any numbers of the case, or clock.sample_period: its values are run one after the other, each with
-    as many samples as the case's duration has of them. The case's own spread applies to all other quantities.
+    as many samples as the case's duration has of them. With one member the case is nominal: nothing is spread, and the
+    noise is that of member 0. With more, the case's own spread applies to all quantities that are no axis.
 
     Raises ValueError for a path that does not exist.
     """
     if x.path == PERIOD:
         turned = grid(study, y, x)
-        return Map(x, y, *(part.T for part in turned[2:]))
+        return turned._replace(x=x, y=y, **{k: getattr(turned, k).T for k in GRIDS})
     _check(study, x, y)
     rows = [_cells(study, x, y)] if y.path != PERIOD else [_cells(_at_period(study, p), x, None) for p in y.values]
-    lost, error = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    survival = wilson(np.sum(~lost, axis=-1), study.members)
-    held = ~lost.all(axis=-1)
+    ended, stalled, error = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    survival = wilson(np.sum(~ended, axis=-1), study.members)
+    held = ~ended.all(axis=-1)
     median = np.full(held.shape, np.nan)
-    median[held] = np.nanmedian(np.where(lost, np.nan, error)[held], axis=-1)
-    return Map(x, y, survival.value, survival.low, survival.high, median)
+    median[held] = np.nanmedian(np.where(ended, np.nan, error)[held], axis=-1)
+    counts = np.sum(ended & ~stalled, axis=-1), np.sum(stalled, axis=-1)
+    drawn = tuple(path for path, _ in _entries(study, (x.path, y.path)))
+    return Map(x, y, survival.value, survival.low, survival.high, median, *counts, drawn)
+
+
+def _entries(study: Study, axes: tuple[str, ...]) -> tuple[tuple[str, Distribution], ...]:
+    """What is spread: nothing for one member."""
+    return tuple(entry for entry in study.spread.entries if entry[0] not in axes) if study.members > 1 else ()
 
 
 def _check(study: Study, x: Axis, y: Axis) -> None:
@@ -85,19 +100,20 @@ def _at_period(study: Study, period: float) -> Study:
     return dataclasses.replace(study, clock=dataclasses.replace(study.clock, samples=samples, sample_period=period))
 
 
-def _cells(study: Study, x: Axis, y: Axis | None) -> tuple[np.ndarray, np.ndarray]:
-    """Whether lost, and largest settled |z - r|: [ny, nx, members]."""
+def _cells(study: Study, x: Axis, y: Axis | None) -> tuple[np.ndarray, ...]:
+    """Whether lost or stalled, whether stalled, and largest settled |z - r|: [ny, nx, members]."""
     shape = (1 if y is None else len(y.values), len(x.values), study.members)
     member = np.broadcast_to(np.arange(study.members), shape).ravel()
     axes = {x.path: np.broadcast_to(x.values[None, :, None], shape).ravel()}
     if y is not None:
         axes[y.path] = np.broadcast_to(y.values[:, None, None], shape).ravel()
-    entries = tuple(entry for entry in study.spread.entries if entry[0] not in axes)
+    entries = _entries(study, tuple(axes))
     drawn = dataclasses.replace(study, spread=Spread(entries, study.spread.design)).drawn(np.arange(study.members))
     cascade, scenario = _batch(study.cascade, study.scenario, {k: v[member] for k, v in drawn.items()} | axes)
     scenario = dataclasses.replace(scenario, seed=study.seed, member=member)
     found = run_ensemble(cascade, scenario, study.clock, fold=Standard(study.settle, scenario.touchdown)).measured
-    return np.isfinite(found["lost_at_s"]).reshape(shape), found["settled_max_abs_error_m"].reshape(shape)
+    ended, stalled, error = np.isfinite(found["lost_at_s"]), found["stalled"], found["settled_max_abs_error_m"]
+    return tuple(np.reshape(part, shape) for part in (ended, stalled, error))
 
 
 def _batch(cascade: Cascade, scenario: Scenario, values: dict[str, np.ndarray]) -> tuple[Cascade, Scenario]:

@@ -1,4 +1,4 @@
-"""Pictures of ensembles: fan charts, histograms and tornado charts, from arrays in SI units."""
+"""Pictures of ensembles: fan charts and histograms, from arrays in SI units."""
 
 import math
 import pathlib
@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from ambjax.ensemble.scales import digits, finish, log_ticks, named, prefixed, size_of
-from ambjax.plotting import BINS, BLUE, INK, ORANGE, RED, thin
+from ambjax.plotting import BINS, BLUE, INK, RED, thin
 
 # What a fan can show: label and SI unit.
 QUANTITIES = {
@@ -23,6 +23,7 @@ QUANTITIES = {
     "sigma": (r"sliding variable $\sigma$", "m/s"),
     "u": ("voltage $u$", "V"),
     "i": ("current $i$", "A"),
+    "variation of u": ("variation of $u$", "V/s"),
     "v_tilde": (r"force error $\tilde v$", "A²/m²"),
 }
 CHIEF = (
@@ -39,7 +40,8 @@ CHIEF = (
     "chatter_V",
     "copper_loss_W",
 )
-MOST_DRIVERS = 12
+# Parts of the run over which a chattering median is averaged.
+SMOOTHED = 50
 LOST = {"facecolor": RED, "edgecolor": "white", "hatch": "////", "linewidth": 0.0}
 MARKS: dict[float, tuple[Any, str]] = {0.5: ("-", "median"), 0.95: ("--", "95 % quantile")}
 
@@ -51,13 +53,14 @@ def fan(
     title: str,
     path: pathlib.Path,
     lost_at: np.ndarray | None = None,
+    stalled: np.ndarray | None = None,
 ) -> None:
     """Write quantile bands over time, one panel per quantity (keys of QUANTITIES), all in SI units.
 
     `bands[quantity][percent]` is that quantile at the times t [T] (s), best taken over the members still alive; NaN
     where none is left. `limits[quantity]` (> 0) is drawn at plus and minus its value where the data come near it.
-    `lost_at` [N] (s, +inf: never) of all members adds a panel with the share that survives. Raises ValueError for a
-    quantity that it does not know.
+    `lost_at` [N] (s, +inf: never) of all members adds a panel with the share that survives; `stalled` [N] (bool) tells
+    which of them the integrator gave up. Raises ValueError for a quantity that it does not know.
     """
     t = np.asarray(t, float)
     extra = [0.55] if lost_at is not None else []
@@ -67,7 +70,7 @@ def fan(
     for ax, (quantity, quantiles) in zip(axes, bands.items(), strict=False):
         _fan_panel(ax, t, quantity, quantiles, limits.get(quantity, math.inf))
     if lost_at is not None:
-        _survivors(axes[-1], t, np.asarray(lost_at, float))
+        _survivors(axes[-1], t, np.asarray(lost_at, float), stalled)
     if t[-1] > t[0]:
         axes[-1].set_xlim(t[0], t[-1])
     axes[-1].set_xlabel("time (s)", fontsize=9)
@@ -94,7 +97,8 @@ def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float,
         name = f"{percents[k]:g} to {percents[-1 - k]:g} %"
         ax.fill_between(t[starts], factor * lower, factor * upper, color=_tint(k, pairs), linewidth=0, label=name)
     if len(percents) % 2:
-        ax.plot(*thin(t, factor * curves[pairs]), color=INK, linewidth=1.0, label="median")
+        middle, words = _median(t, factor * curves[pairs])
+        ax.plot(*middle, color=INK, linewidth=1.0, label=words)
     # near: the data come within a quarter of the limit
     near = [value for value, peak in ((limit, high), (-limit, -low)) if limit <= 1.33 * peak]
     margin = 0.08 * (high - low) or 0.1 * abs(high) or 1.0
@@ -108,6 +112,18 @@ def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float,
         )
         ax.set_title(words, fontsize=7, loc="right", pad=2, color=INK)
     finish(ax, f"{label}\n({unit})")
+
+
+def _median(t: np.ndarray, y: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], str]:
+    """The median to draw, and its name: where it chatters from instant to instant, its means over parts of the run."""
+    steps = np.diff(y[np.isfinite(y)])
+    turns = np.count_nonzero(np.diff(np.sign(steps)))
+    if turns <= steps.size / 4 or np.abs(steps).sum() <= 20 * np.ptp(y[np.isfinite(y)]):
+        return thin(t, y), "median"
+    starts = np.arange(0, len(t), -(-len(t) // SMOOTHED))
+    parts = zip(np.split(t, starts[1:]), np.split(y, starts[1:]), strict=True)
+    means = [(x.mean(), part[np.isfinite(part)].mean() if np.isfinite(part).any() else np.nan) for x, part in parts]
+    return (np.array(means)[:, 0], np.array(means)[:, 1]), "median, smoothed where it chatters"
 
 
 def _tint(k: int, pairs: int) -> Any:
@@ -134,8 +150,8 @@ def _reach(curves: Sequence[np.ndarray]) -> tuple[float, float, float]:
     return low, high, 0.0
 
 
-def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray) -> None:
-    """The share of members still alive, and a tick for each one lost."""
+def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray | None) -> None:
+    """The share of members still alive, and a tick for each one lost or given up."""
     lost = np.sort(lost_at[lost_at <= t[-1]])
     at = np.linspace(t[0], t[-1], BINS)
     dead = np.searchsorted(lost, at, side="right")
@@ -147,23 +163,32 @@ def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray) -> None:
     if len(lost):
         ticks = np.unique(at[np.clip(np.searchsorted(at, lost), 0, BINS - 1)])
         where = ax.get_xaxis_transform()
-        ax.plot(ticks, np.full(len(ticks), 0.08), "|", color=RED, markersize=7, label="a member lost", transform=where)
+        ax.plot(ticks, np.full(len(ticks), 0.08), "|", color=RED, markersize=7, label="a member ends", transform=where)
+    open_ = 0 if stalled is None else int(np.sum(np.asarray(stalled, bool) & (lost_at <= t[-1])))
     words = f"{len(lost_at) - len(lost)} of {len(lost_at)} survive ({share[-1]:.4g} %)"
+    words += f", {_fates(len(lost) - open_, open_)}" * bool(len(lost))
     ax.set_title(words, fontsize=8, loc="right", pad=2, color=INK)
     ax.yaxis.set_major_locator(MaxNLocator(3))
     finish(ax, "survivors\n(%)")
 
 
+def _fates(lost: int, stalled: int) -> str:
+    """How many are lost, and how many the integrator gave up."""
+    return f"{lost} lost" + f", {stalled} not decided" * bool(stalled)
+
+
 def histograms(columns: Mapping[str, Any], path: pathlib.Path, metrics: Sequence[str] = CHIEF) -> None:
     """Write a grid of histograms of the `metrics` that `columns` (members.npz, each [N]) has, survivors and lost apart.
 
-    Who is lost is read from `lost`, or else from a finite `lost_at` or `lost_at_s`; without any of them all survive.
+    Who does not survive is read from a finite `lost_at` or `lost_at_s`, without them all survive; and whom of these the
+    integrator gave up from `stalled`.
     Raises ValueError if `columns` has none of the metrics.
     """
     names = [name for name in metrics if name in columns]
     if not names:
         raise ValueError(f"histograms: none of {', '.join(metrics)} among the columns {', '.join(columns)}")
     lost = _lost(columns, len(columns[names[0]]))
+    open_ = int(np.sum(lost & np.asarray(columns.get("stalled", False), bool)))
     across = min(3, len(names))
     down = -(-len(names) // across)
     figure = Figure(figsize=(max(4.0 * across, 5.5), 2.5 * down + 0.8), layout="constrained")
@@ -172,9 +197,10 @@ def histograms(columns: Mapping[str, Any], path: pathlib.Path, metrics: Sequence
         _histogram(ax, name, np.asarray(columns[name], float), lost)
     for ax in axes[len(names) :]:
         ax.set_axis_off()
-    keys = [Patch(color=BLUE, label="survivors"), Patch(label="lost members", **LOST)]
+    others = "lost members" + " and those not decided" * bool(open_)
+    keys = [Patch(color=BLUE, label="survivors"), Patch(label=others, **LOST)]
     keys += [Line2D([], [], color=INK, linestyle=s, label=f"{n} of all members") for s, n in MARKS.values()]
-    figure.suptitle(f"{lost.size} members, {int(lost.sum())} lost", fontsize=11)
+    figure.suptitle(f"{lost.size} members, {_fates(int(lost.sum()) - open_, open_)}", fontsize=11)
     figure.legend(handles=keys, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     figure.savefig(path, dpi=130)
 
@@ -230,37 +256,3 @@ def _bins(values: np.ndarray, log: bool) -> np.ndarray:
         room = 0.1 * abs(high) or 1.0
         return np.linspace(low - room, high + room, 42)  # an odd number of bins: the constant is inside one
     return np.linspace(low, high, 41)
-
-
-def tornado(drivers: Sequence[tuple[str, float, float, float]], metric: str, path: pathlib.Path) -> None:
-    """Write the rank correlation of each driver (dotted path, rho, low, high) with a metric, the greatest on top.
-
-    At most 12 bars; whiskers from low to high where these are finite. A driver whose rho is NaN (it or the metric
-    is constant) is named at the bottom without a bar. Raises ValueError without drivers.
-    """
-    if not drivers:
-        raise ValueError("tornado: no drivers; an ensemble without [spread] has none to rank")
-    ranked = sorted(drivers, key=lambda driver: math.inf if math.isnan(driver[1]) else -abs(driver[1]))
-    shown = ranked[:MOST_DRIVERS]
-    figure = Figure(figsize=(7.5, 0.36 * len(shown) + 1.7), layout="constrained")
-    ax = figure.subplots()
-    for row, (_, rho, low, high) in enumerate(shown):
-        if math.isnan(rho):
-            ax.text(0.02, row, "undefined: no variation", fontsize=8, va="center", color=INK)
-            continue
-        ax.barh(row, rho, height=0.62, color=BLUE if rho >= 0 else ORANGE)
-        if math.isfinite(low) and math.isfinite(high):
-            ax.plot([low, high], [row, row], color=INK, linewidth=1.2, marker="|", markersize=7)
-        free = np.nanmax([rho, high, 0.0]) + 0.03  # right of bar and whisker
-        ax.text(free, row, f"${rho:+.2f}$", fontsize=8, va="center", color=INK)
-    ax.axvline(0, color=INK, linewidth=0.8)
-    ax.set_yticks(range(len(shown)), [name.removeprefix("spread.") for name, *_ in shown])
-    ax.set_ylim(len(shown) - 0.4, -0.6)
-    ax.set_xlim(-1.05, 1.2)
-    ax.set_xticks(np.linspace(-1, 1, 9))
-    words = "rank correlation" + "; whiskers: its interval" * any(math.isfinite(low) for _, _, low, _ in shown)
-    more = len(ranked) - len(shown)
-    ax.set_xlabel(words + (f"; {more} weaker not shown" if more else ""), fontsize=9)
-    ax.set_title(f"What drives {named(metric, 0.0)[1]}", fontsize=11)
-    finish(ax, "")
-    figure.savefig(path, dpi=150)

@@ -12,12 +12,15 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.engine import run_ensemble
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import Spread, apply, draw
-from ambjax.metrics import Standard
+from ambjax.metrics import Named, Standard, Variation
 from ambjax.scenario import Clock, Scenario
+from ambjax.trajectory import Trajectory
 
 SPREAD = "spread."
 # Columns of members.npz beside the spread quantities, at most: to estimate what a study needs on disk.
 COLUMNS = 28
+# Parts of a run over which the chatter of the voltage is told.
+WINDOWS = 25
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,17 +62,28 @@ class Study:
         drawn = {SPREAD + path: x for path, x in self.drawn(members).items()}
         return {"index": members, "lost_at": outcome.trajectory.lost_at, **outcome.measured, **drawn}
 
-    def bands(self, members: int, times: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """Times [t], lost_at [n] and signals [n, t] of the first `members` members, at most some `times` instants.
+    def bands(self, members: int, times: int) -> tuple[np.ndarray, Trajectory, dict[str, np.ndarray]]:
+        """Times [t], trajectories and signals [n, t] of the first `members` members, at most some `times` instants.
 
-        Signals are NaN from the instant on at which a member is lost.
+        Signals are NaN from the instant on at which a member is lost. "variation of u" is its total variation per
+        second, V/s, in each of WINDOWS equal parts of the run; NaN from the part on in which a member is lost.
         """
         cascade, scenario = self.batch(np.arange(min(members, self.members)))
         every = -(-self.clock.samples // times)
-        trajectory = run_ensemble(cascade, scenario, self.clock, fold=None, every=every).trajectory
-        rows, t = trajectory.rows, np.asarray(trajectory.rows.t[0])
+        # whole samples, and half a sample before each: a time may be rounded
+        samples, period = self.clock.samples, float(self.clock.sample_period)
+        ends = period * np.linspace(0, samples, min(WINDOWS, samples) + 1).round()
+        fold = Named({str(k): Variation(after) for k, after in enumerate(ends[:-1] - period / 2)})
+        outcome = run_ensemble(cascade, scenario, self.clock, fold=fold, every=every)
+        rows, t = outcome.trajectory.rows, np.asarray(outcome.trajectory.rows.t[0])
         seen = {"z - r": rows.z - rows.r, "u": rows.u, "sigma": rows.sigma}
-        return t, np.asarray(trajectory.lost_at), {k: np.where(rows.alive, x, np.nan) for k, x in seen.items()}
+        signals = {k: np.where(rows.alive, x, np.nan) for k, x in seen.items()}
+        later = [outcome.measured[str(k)] for k in range(len(ends) - 1)]
+        left = np.stack([*later, np.zeros(len(rows.z))], axis=1)  # from each end on
+        rate = -np.diff(left, axis=1) / np.diff(ends)
+        rate[ends[1:] > np.asarray(outcome.trajectory.lost_at)[:, None]] = np.nan
+        part = np.clip(np.searchsorted(ends - period / 2, t, side="right") - 1, 0, len(ends) - 2)
+        return t, outcome.trajectory, signals | {"variation of u": rate[:, part]}
 
     def fingerprint(self) -> dict[str, Any]:
         """Everything that a member's numbers depend on, by name, as JSON has it."""

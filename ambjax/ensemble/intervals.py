@@ -1,0 +1,186 @@
+"""Numbers of an ensemble with their intervals.
+
+Intervals of a probability are Wilson's (J. Am. Stat. Assoc. 22, 1927). Those of a quantile are order statistics whose
+ranks the binomial distribution gives: exact, whatever the values' distribution, and open where the ensemble is too
+small to bound them (David and Nagaraja, Order Statistics, section 7.1). Those of mean, standard deviation and CVaR are
+studentised by the bootstrap (Efron and Tibshirani, An Introduction to the Bootstrap, section 12.5): each resample is
+measured by its own standard error, which percentile intervals do not do, and miss the far side of a heavy tail for it.
+
+The bootstrap is bounded for any N. The sorted values are put into groups, about 1/512 of their rank from the nearer
+end wide: single values up to N = 2,048, some 1,024 (2 + log(N/2,048)) groups beyond. The counts of a resample in these
+groups are multinomial, one draw serves all columns, and its sums are matrix products.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+REPLICATES = 1000
+KINDS = ("mean", "std", "cvar")
+# A group is this part of its rank, from the nearer end, wide.
+WIDTH = 512
+# Counts held at once: 16 MB an array.
+MOST_COUNTS = 2_000_000
+# Variance, in units of the largest deviation squared, below which values are taken for one.
+ROUNDING = 1e-13
+
+
+class Estimate(NamedTuple):
+    """A number, or array of numbers, and its interval."""
+
+    value: Any
+    low: Any
+    high: Any
+
+
+def wilson(successes: Any, n: Any, confidence: float = 0.95) -> Estimate:
+    """Share of `successes` out of `n`, numbers or arrays, with Wilson's interval.
+
+    Raises ValueError unless 0 <= successes <= n and n >= 1.
+    """
+    from scipy.special import ndtri
+
+    k, n = np.asarray(successes, float), np.asarray(n, float)
+    if not (np.all(n >= 1) and np.all(k >= 0) and np.all(k <= n)):
+        raise ValueError(f"successes = {successes}, n = {n}: there must be at least 1 trial and no more successes.")
+    z2, share = ndtri((1 + confidence) / 2) ** 2, k / n
+    centre = (share + z2 / (2 * n)) / (1 + z2 / n)
+    half = np.sqrt(z2 / n * (share * (1 - share) + z2 / (4 * n))) / (1 + z2 / n)
+    return Estimate(share, np.where(k == 0, 0.0, centre - half)[()], np.where(k == n, 1.0, centre + half)[()])
+
+
+def quantile(values: np.ndarray, q: Any, confidence: float = 0.95) -> Estimate:
+    """The q-quantile, q a number or an array: the value of rank ceil(q N), and values that enclose the true one.
+
+    As many values lie below the true quantile as N trials of probability q succeed, so that the ends' ranks are the
+    binomial distribution's. -inf or +inf where no rank is low or high enough; a value of +inf is one like any other.
+    """
+    from scipy.stats import binom
+
+    x = np.sort(column_of(values))
+    n, tail = len(x), (1 - confidence) / 2
+    # a product as 0.1 * 30 may round to just above a whole number
+    rank = np.clip(np.ceil(np.asarray(q) * n - 1e-9 * n), 1, n).astype(int)
+    fenced = np.concatenate([[-np.inf], x, [np.inf]])
+    low, high = binom.ppf(tail, n, q), binom.ppf(1 - tail, n, q) + 1
+    return Estimate(fenced[rank], fenced[low.astype(int)], fenced[high.astype(int)])
+
+
+def cvar(values: np.ndarray, alpha: float = 0.95, confidence: float = 0.95, seed: int = 0) -> Estimate:
+    """Conditional value at risk: the mean of the largest 1 - alpha of the values, with its bootstrap interval.
+
+    A value at the edge of that share counts in part (Rockafellar and Uryasev, J. Bank. Finance 26, 2002).
+    """
+    moments = bootstrap([column_of(values)], alpha, confidence, seed)["cvar"]
+    return Estimate(*(float(x[0]) for x in moments))
+
+
+def bootstrap(
+    columns: Sequence[np.ndarray], alpha: float = 0.95, confidence: float = 0.95, seed: int = 0
+) -> dict[str, Estimate]:
+    """Mean, standard deviation ("std") and CVaR ("cvar") of finite columns, arrays [N], as arrays over columns.
+
+    An end is infinite where the ensemble is too small to bound it. Of 95 % intervals from 200 members, 93 to 97 %
+    enclose a CVaR of normal, lognormal and bounded values, and a standard deviation of normal and bounded ones; of a
+    lognormal's, 87 %: its fourth moment is not seen in so few. Raises ValueError for a column that is empty or not
+    finite, and unless 0 <= alpha < 1.
+    """
+    if not 0 <= alpha < 1:
+        raise ValueError(f"alpha = {alpha:g}: it must be at least 0 and below 1.")
+    n = len(columns[0])
+    edges, tail = _group_edges(n), (1 - alpha) * n
+    sizes, powers, places = np.diff(edges), [], []
+    for column in columns:
+        x = np.sort(column_of(column))
+        if not np.isfinite(x[[0, -1]]).all():
+            raise ValueError("a column is not finite: there is no mean to resample.")
+        centre = x.mean()
+        scale = np.abs(x[[0, -1]] - centre).max() or 1.0
+        y = (x - centre) / scale
+        powers.append([np.add.reduceat(y**k, edges[:-1]) / sizes for k in (1, 2, 3, 4)])
+        places.append((centre, scale, x.std(ddof=min(n - 1, 1)), _taken(np.ones((1, n)), tail)[0] @ x / tail))
+    G = np.moveaxis(np.array(powers), 0, -1)
+    batches = [_moments(counts, G, n, tail) for counts in _resamples(n, sizes, seed)]
+    drawn = {kind: [np.concatenate([batch[kind][k] for batch in batches]) for k in (0, 1)] for kind in KINDS}
+    whole = _moments(sizes[None].astype(float), G, n, tail)
+    centre, scale, std, worst = np.array(places).T
+    ends = {kind: _studentised(whole[kind], drawn[kind], confidence) for kind in KINDS}
+    nothing = np.full(len(std), -np.inf), np.full(len(std), np.inf)
+    ends |= {kind: nothing for kind in KINDS if n < 3 or (kind == "cvar" and tail <= 1)}  # one value has no error
+    unbiased = (n / max(n - 1, 1)) ** 0.5
+    return {
+        "mean": Estimate(centre, *(scale * end + centre for end in ends["mean"])),
+        "std": Estimate(std, *(scale * unbiased * np.exp(end) for end in ends["std"])),
+        "cvar": Estimate(worst, *(scale * end + centre for end in ends["cvar"])),
+    }
+
+
+def _moments(counts: np.ndarray, G: np.ndarray, n: int, tail: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Mean, log of the standard deviation, and CVaR, each with its standard error: [replicates, columns].
+
+    `G` [4, groups, columns] are the groups' mean powers. Of the largest values x beyond the threshold q, CVaR's
+    influence is (x - q)/(1 - alpha); of the standard deviation it is that of the second moment.
+    """
+    mean, r2, r3, r4 = (counts @ power / n for power in G)
+    m2 = np.maximum(r2 - mean**2, 0)
+    m4 = r4 - 4 * mean * r3 + 6 * mean**2 * r2 - 3 * mean**4
+    with np.errstate(divide="ignore", invalid="ignore"):  # all alike: no deviation, and no error of it
+        log_std, log_error = 0.5 * np.log(m2), np.sqrt(np.maximum(m4 - m2**2, 0) / n) / (2 * m2)
+    taken = _taken(counts, tail)
+    first, second, q = taken @ G[0], taken @ G[1], G[0][np.argmax(taken > 0, axis=1)]
+    beyond, squared = (first - q * tail) / n, (second - 2 * q * first + q**2 * tail) / n
+    varying = squared - beyond**2
+    error = np.sqrt(np.where(varying > ROUNDING, varying, 0) * n) / tail
+    return {"mean": (mean, np.sqrt(m2 / n)), "std": (log_std, np.nan_to_num(log_error)), "cvar": (first / tail, error)}
+
+
+def _studentised(
+    whole: Sequence[np.ndarray], drawn: Sequence[np.ndarray], confidence: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the interval [columns] of a value [1, columns], from resampled ones [replicates, columns]; with errors.
+
+    A resample without an error of its own, for all its values are alike, is infinitely far off. A value without one,
+    for its tail is one value, has the percentile interval: what is resampled is all that can be said.
+    """
+    (value,), (error,) = whole
+    values, errors = drawn
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = values - value
+        far = np.sort(np.where(np.abs(off) <= 1e-12 * error, 0.0, off / errors), axis=0)
+        plain, outside = np.sort(values, axis=0), math.floor((1 - confidence) / 2 * (len(far) + 1)) - 1
+        low, high = (np.where(error > 0, value - far[k] * error, plain[-1 - k]) for k in (-1 - outside, outside))
+    return low, high
+
+
+def _group_edges(n: int) -> np.ndarray:
+    """Ranks at which groups of sorted values begin, and n."""
+    inwards, at = [0], 0
+    while at < n // 2:
+        at = min(at + max(at // WIDTH, 1), n // 2)
+        inwards.append(at)
+    return np.unique(np.concatenate([inwards, n - np.array(inwards)]))
+
+
+def _resamples(n: int, sizes: np.ndarray, seed: int) -> Iterator[np.ndarray]:
+    """Counts [replicates, groups] of resamples of n values, a batch at a time."""
+    rng, left = np.random.default_rng(seed), REPLICATES
+    while left:
+        batch = min(left, max(MOST_COUNTS // len(sizes), 1))
+        yield rng.multinomial(n, sizes / n, size=batch).astype(float)
+        left -= batch
+
+
+def _taken(counts: np.ndarray, tail: float) -> np.ndarray:
+    """How much of each count (of ascending values) belongs to the largest `tail` values."""
+    above = np.cumsum(counts[:, ::-1], axis=1)[:, ::-1] - counts
+    return np.clip(tail - above, 0.0, counts)
+
+
+def column_of(values: Any) -> np.ndarray:
+    """The values as floats [N]. Raises ValueError unless they are one for each member, none of them NaN."""
+    x = np.asarray(values, float)
+    if x.ndim != 1 or not x.size or np.isnan(x).any():
+        raise ValueError(f"a column must be numbers, one for each member, none of them NaN; this has shape {x.shape}.")
+    return x

@@ -1,0 +1,140 @@
+"""What drives a metric: functions whose indices are known, a V that a rank correlation does not see, and noise."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from ambjax.ensemble import shares, spearman
+from ambjax.ensemble.drivers import drivers
+
+RNG = np.random.default_rng(11)
+
+
+def ishigami(n, rng):
+    x = rng.uniform(-np.pi, np.pi, (3, n))
+    return list(x), np.sin(x[0]) + 7 * np.sin(x[1]) ** 2 + 0.1 * x[2] ** 4 * np.sin(x[0])
+
+
+# First-order indices: Sobol and Levitan's function of Ishigami with a = 7, b = 0.1.
+KNOWN = np.array([0.3139, 0.4424, 0.0])
+
+
+def test_indices_of_ishigami():
+    x, y = ishigami(100_000, RNG)
+    # half a per cent of the slowest wave, a full sine, is beyond the cosines; the estimate's own error is 0.3 %
+    np.testing.assert_allclose(shares(x, [y]).share[:, 0], KNOWN, atol=0.012)
+
+
+@pytest.mark.parametrize("n", [64, 1000])
+def test_intervals_cover_the_indices_of_ishigami(n):
+    samples = [ishigami(n, RNG) for _ in range(300)]
+    found = [shares(x, [y]) for x, y in samples]
+    hits = np.mean([(f.low[:, 0] <= KNOWN) & (f.high[:, 0] >= KNOWN) for f in found], axis=0)
+    # 95 % to three times the error of 300 trials; an index of 0 is at the border, and covered more often
+    assert np.all(hits > 0.95 - 0.038)
+
+
+def test_indices_of_a_sum_are_its_parts_of_the_variance():
+    weights = np.array([3.0, 2.0, 1.0, 0.0])
+    x = RNG.uniform(-1, 1, (4, 50_000))
+    found = shares(list(x), [weights @ x])
+    # the cosines miss 0.02 % of a line; the estimate's own error is 0.4 %
+    np.testing.assert_allclose(found.share[:, 0], weights**2 / np.sum(weights**2), atol=0.013)
+
+
+@pytest.mark.parametrize("n", [64, 200, 5000])
+def test_a_v_is_seen(n):
+    x, other = RNG.uniform(-1, 1, (2, n))
+    y = np.abs(x) * (1 + 0.05 * RNG.normal(size=n))
+    ranked, explained = drivers({"plant.m": x, "plant.R": other}, {"error": y})
+    first, second = ranked["error"]
+    assert first["path"] == "plant.m"
+    assert first["share"] > 0.9
+    assert abs(first["rho"]) < 0.35  # three of its errors at 64 members: what was shown before
+    assert second["high"] < 0.35
+    assert explained["error"]["says"].startswith("what is spread explains 9")
+
+
+def test_noise_is_called_noise():
+    said = []
+    for _ in range(200):
+        x = RNG.uniform(-1, 1, (5, 100))
+        _, explained = drivers({str(k): column for k, column in enumerate(x)}, {"error": RNG.lognormal(size=100)})
+        said.append(explained["error"]["says"] == "nothing that is spread explains it, alone or in pairs: noise")
+    # 95 %, and three times the error of 200 trials
+    assert np.mean(said) > 0.95 - 0.047
+
+
+def test_what_two_do_together_is_seen():
+    x = RNG.uniform(-1, 1, (3, 300))
+    _, explained = drivers(dict(zip("abc", x, strict=True)), {"error": x[0] * x[2]})
+    found = explained["error"]
+    assert found["pair"]["paths"] == ["a", "c"]
+    assert found["pair"]["share"] > 0.8
+    assert "a with c together" in found["says"]
+
+
+def test_lost_members_and_choices_and_constants():
+    n = 400
+    x, kinds = RNG.uniform(-1, 1, n), RNG.choice([1.0, 2.0], n)
+    metrics = {
+        "lost_at_s": np.where(np.abs(x) > 0.95, 0.1, np.inf),  # 20 members or so, at both ends
+        "error": kinds + 0.01 * RNG.normal(size=n),
+        "same": np.ones(n),
+        "rare": np.where(np.arange(n) < 3, 0.1, np.inf),
+    }
+    ranked, explained = drivers({"x": x, "kinds": kinds, "same": np.ones(n)}, metrics)
+    assert ranked["lost_at_s"][0]["path"] == "x"
+    assert ranked["lost_at_s"][0]["p"] < 1e-6
+    # two values: ranks within each are noise, and 3/4 of the variance of ranks lies between them
+    assert ranked["error"][0]["path"] == "kinds"
+    np.testing.assert_allclose(ranked["error"][0]["share"], 0.75, atol=0.05)
+    assert explained["same"]["says"] == "it is the same for all members"
+    assert explained["rare"]["says"] == "too few members differ to tell what drives it"
+    assert {row["share"] for row in ranked["same"]} == {0.0}
+
+
+def test_nothing_spread_and_few_members():
+    ranked, explained = drivers({}, {"error": np.ones(3)})
+    assert ranked == {"error": []}
+    assert explained["error"]["says"] == "nothing is spread"
+    for n in (1, 2, 3, 8, 20):
+        x = RNG.normal(size=n)
+        ranked, explained = drivers({"x": x, "y": RNG.normal(size=n)}, {"error": x})
+        for row in ranked["error"]:
+            assert 0 <= row["low"] <= row["share"] <= row["high"] <= 1
+            assert 0 <= row["p"] <= 1
+
+
+def test_shares_refuse_what_is_infinite():
+    with pytest.raises(ValueError, match="not finite"):
+        shares([np.arange(9.0)], [np.array([np.inf] * 9)])
+
+
+@pytest.mark.parametrize("n", [3, 10, 500])
+def test_spearman_is_scipy_s_ties_included(n):
+    x = [RNG.normal(size=n), RNG.integers(3, size=n), np.arange(n)]
+    y = [x[0] ** 3 + RNG.normal(size=n), np.exp(x[2] / n), np.where(RNG.random(n) < 0.3, np.inf, x[2])]
+    rho, p = spearman(x, y)
+    for a in range(3):
+        for b in range(3):
+            if np.ptp(x[a]) == 0:
+                continue
+            theirs = stats.spearmanr(x[a], np.where(np.isinf(y[b]), 1e9, y[b]))
+            if np.isnan(theirs.statistic):
+                continue
+            np.testing.assert_allclose(rho[a, b], theirs.statistic, rtol=0, atol=1e-12)
+            # near rho = 1 the p-value is that of a rounding error
+            np.testing.assert_allclose(p[a, b], theirs.pvalue, rtol=1e-6, atol=1e-6)
+
+
+def test_spearman_of_constants_and_of_few_members():
+    rho, p = spearman([np.ones(9), np.arange(9)], [np.arange(9.0), np.full(9, np.inf)])
+    np.testing.assert_allclose(rho, [[0, 0], [1, 0]], atol=1e-15)
+    np.testing.assert_allclose(p, [[1, 1], [0, 1]], atol=1e-12)
+    rho, p = spearman([np.array([1.0, 2.0])], [np.array([5.0, 3.0])])
+    assert p == 1
+    np.testing.assert_allclose(rho, -1)
+    rho, p = spearman([np.ones(1)], [np.ones(1)])
+    assert rho == 0
+    assert p == 1

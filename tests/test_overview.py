@@ -1,0 +1,136 @@
+"""The overview of a run: what is enlarged, that extremes stay, and that a chattering voltage does not hide its mean."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from ambjax.__main__ import main
+from ambjax.overview import TURNS, overview
+from ambjax.plotting import PIXELS
+from ambjax.trajectory import ALIVE, STALLED, TOUCHED, Row, Trajectory
+
+
+@pytest.fixture(autouse=True)
+def drawn(monkeypatch):
+    """The figures saved, still open to questions."""
+    figures, save = [], Figure.savefig
+
+    def keep(self, path, **options):
+        figures.append(self)
+        save(self, path, **options | {"dpi": 30})
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    return figures
+
+
+def a_run(samples=20_000, period=1e-4, lost_at=np.inf, code=ALIVE, **signals):
+    """A run whose errors fall with 1 ms, everything else at rest; `signals` replace some."""
+    t = period * np.arange(samples)
+    rows = {name: np.zeros(samples) for name in Row._fields} | {"t": t, "alive": t < lost_at}
+    rows |= {"z": 1e-4 * np.exp(-t / 1e-3), "v_tilde": np.exp(-t / 1e-3)} | signals
+    return Trajectory(Row(**rows), lost_at, code, np.inf)
+
+
+def columns(figure):
+    """Axes [panels, columns] in the order of the page."""
+    axes = np.array(figure.axes, dtype=object)
+    return axes.reshape(-1, 3)
+
+
+def test_a_short_transient_is_enlarged(tmp_path, drawn):
+    overview(a_run(), "a run", tmp_path / "o.png")
+    whole, start, end = columns(drawn[0])[1]
+    assert whole.get_xlim() == (0.0, pytest.approx(1.9999))
+    # down to 2 % of the peak after 3.9 ms, thrice of which is seen
+    assert start.get_xlim()[1] == pytest.approx(3 * 3.9e-3, rel=0.05)
+    assert np.diff(end.get_xlim())[0] == pytest.approx(0.02, rel=1e-9)
+    assert end.get_xlim()[1] == pytest.approx(1.9999)
+    titles = [ax.get_title(loc="left") for ax in columns(drawn[0])[0]]
+    assert titles == ["", "the first 12 ms", "the last 20 ms"]
+
+
+def test_the_start_is_a_twentieth_at_most(tmp_path, drawn):
+    t = 1e-4 * np.arange(20_000)
+    overview(a_run(z=1e-4 * np.exp(-t / 0.2)), "slow", tmp_path / "o.png")
+    assert columns(drawn[0])[0, 1].get_xlim()[1] == pytest.approx(1.9999 / 20)
+
+
+def test_chatter_is_a_band_with_its_mean_and_its_turns_can_be_followed(tmp_path, drawn):
+    t = 1e-4 * np.arange(20_000)
+    u = 200.0 * (-1) ** np.arange(20_000) + 10 * np.sin(2 * np.pi * t)
+    u[12_345] = 260.0
+    overview(a_run(u=u), "chatter", tmp_path / "o.png")
+    whole, _, end = columns(drawn[0])[-1]
+    (band,) = whole.collections
+    heights = band.get_paths()[0].vertices[:, 1]
+    assert heights.max() == 260.0
+    assert heights.min() == u.min()
+    (line,) = whole.lines
+    assert len(line.get_xdata()) == PIXELS
+    # 40 samples a column: their mean is the slow part's, and 260 V for -200 V once in a column is 11.5 V
+    np.testing.assert_allclose(line.get_ydata(), 10 * np.sin(2 * np.pi * line.get_xdata()), atol=11.6)
+    assert not end.collections
+    assert np.diff(end.get_xlim())[0] == pytest.approx(TURNS * 1e-4, rel=0.06)  # a turn a sample; two at the border
+
+
+def test_a_smooth_run_has_no_mean_in_place_of_itself(tmp_path, drawn):
+    overview(a_run(samples=4 * PIXELS), "short", tmp_path / "o.png")
+    assert not any(ax.collections for ax in drawn[0].axes)
+    assert len(columns(drawn[0])[0, 0].lines[0].get_xdata()) == 4 * PIXELS
+
+
+@pytest.mark.parametrize(
+    ("code", "words"), [(TOUCHED, "lost at 0.01 s: touched"), (STALLED, "not decided from 0.01 s")]
+)
+def test_a_loss_ends_the_picture_shortly_after(tmp_path, drawn, code, words):
+    overview(a_run(lost_at=0.01, code=code), "lost", tmp_path / "o.png")
+    whole, start, end = columns(drawn[0])[0]
+    assert whole.get_title(loc="left").startswith(words)
+    assert whole.get_xlim() == (0.0, pytest.approx(0.0115))
+    assert start.get_xlim()[1] <= 0.01 / 3
+    assert end.get_xlim() == (pytest.approx(0.008), pytest.approx(0.0103))
+
+
+@pytest.mark.parametrize("samples", [1, 2, 3, 30])
+@pytest.mark.parametrize("lost_at", [np.inf, 0.0, 1e-4, 1.5e-4])
+def test_runs_of_few_samples_are_drawn(tmp_path, samples, lost_at):
+    overview(a_run(samples=samples, lost_at=lost_at, code=TOUCHED), "tiny", tmp_path / "o.png")
+    assert (tmp_path / "o.png").stat().st_size > 1000
+
+
+def test_what_is_settled_looks_settled(tmp_path, drawn):
+    overview(a_run(i=1.0 + 1e-12 * np.arange(20_000), i_ref=np.linspace(0, 1, 20_000)), "flat", tmp_path / "o.png")
+    end = columns(drawn[0])[4, 2]
+    assert np.diff(end.get_ylim())[0] >= 0.005
+
+
+CASE = "[clock]\nduration = 0.05\n"
+
+
+@pytest.fixture
+def case(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pathlib.Path("case.toml").write_text(CASE)
+    return "case.toml"
+
+
+def test_the_command_draws_the_stretch_that_is_asked_for(case, drawn, capsys):
+    assert main(["simulate", case, "--from", "0.01", "--to", "0.05", "--out", "a", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["max_abs_error_m"] > 0
+    assert {ax.get_xlim() for ax in drawn[0].axes} == {(0.01, 0.05)}
+    with np.load("a/trajectory.npz") as whole:
+        assert len(whole["t"]) == 500
+
+
+@pytest.mark.parametrize(
+    "flags", [["--from", "0.05"], ["--to", "0.051"], ["--from", "-1"], ["--from", "nan"], ["--to", "0"]]
+)
+def test_a_stretch_outside_the_run_is_refused(case, flags, capsys):
+    assert main(["simulate", case, *flags]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "the stretch must lie within 0 to 0.05 s, clock.duration" in error
+    assert not pathlib.Path("out").exists()
