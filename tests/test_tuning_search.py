@@ -20,9 +20,10 @@ from tuning.conditions import bounds
 from tuning.config import tune_from
 from tuning.descent import Descent
 from tuning.goal import Goal
+from tuning.keeper import Keeper, Search
 from tuning.loss import TERMS, loss_for
 from tuning.objective import Engine, Objective, weigh
-from tuning.optimise import Keeper, Search, _go_on_with_all, best_of, search
+from tuning.optimise import _go_on_with_all, best_of, search
 from tuning.optimisers import names, optimiser
 from tuning.risk import CVaR, Mean
 from tuning.rounds import GAIN, MOST_LOOKS, look_again
@@ -283,8 +284,8 @@ def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):
     for a, b in zip(jax.tree.leaves(whole.starts), jax.tree.leaves(resumed.starts), strict=True):
         np.testing.assert_array_equal(a, b)
     assert 0 < resumed.earlier < resumed.seconds  # what it took before counts
-    assert not list(tmp_path.glob("*.partial*"))
-    with pytest.raises(ValueError, match="another case"):
+    assert not list(tmp_path.glob("*.part*"))
+    with pytest.raises(ValueError, match="another search: case is 1 there and 2 here"):
         run(small, keeper=Keeper(tmp_path / "kept.npz", {"case": 2}), resume=True)
 
 

@@ -216,6 +216,8 @@ def summary(
     return {
         "members": len(lost_at),
         "survivors": kept,
+        "lost": int(np.sum(columns["lost"])),
+        "stalled": int(np.sum(columns["stalled"])),
         "survival": _plain(wilson(kept, len(lost_at), confidence)),
         "confidence": confidence,
         "seed": int(seed),
