@@ -58,7 +58,7 @@ def unseal(path: pathlib.Path) -> tuple[Arrays, dict[str, Any]]:
     try:
         if not zipfile.is_zipfile(path):
             raise DamagedError("it is not a whole archive")
-        with np.load(path) as kept:
+        with path.open("rb") as file, np.load(file) as kept:  # np.load itself leaves a damaged one open
             arrays = {name: kept[name] for name in kept.files}
         told = dict(json.loads(arrays.pop(SEAL).item()))
         checksum = told.pop(CHECKSUM)

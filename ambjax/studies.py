@@ -90,9 +90,9 @@ def _begin(study: Study, store: Store, executor: tuple[Executor, int] | None) ->
     pace = Pace(first / seconds, None if executor is None else executor[1] // AHEAD)
     store.chunk = store.chunk or pace.chunk(study.members)
     say_how_long(study, pace)
-    store.begin()
-    for start, stop in store.spans():
-        if stop <= first:
+    with unbroken():
+        store.begin()
+        for start, stop in store.spans()[: first // store.chunk]:
             store.put((start, stop), {name: column[start:stop] for name, column in columns.items()})
 
 

@@ -16,6 +16,7 @@ from tuning.loss import TERMS
 
 # What a checkpoint holds of a search beside arrays and history.
 COUNTS = ("iteration", "phase", "since", "seconds")
+FACTS = {"fingerprint", "round", "counts"}
 LEAF, PAST, ACTIVE = "leaf_", "history_", "active"
 
 
@@ -68,6 +69,8 @@ class Keeper:
             return None
         try:
             arrays, told = unseal(self.path)
+            if told.keys() != FACTS or told["counts"].keys() != set(COUNTS):
+                raise DamagedError("it is no checkpoint")
             differs = difference(told["fingerprint"], self.fingerprint)
             if differs:
                 raise ValueError(

@@ -63,6 +63,7 @@ class Store:
 
     def begin(self) -> None:
         """Make the directory ready for what `check` has let pass. Raises ValueError where it cannot be written."""
+        self.directory.mkdir(parents=True, exist_ok=True)
         self._tell()
         self.chunks.mkdir(exist_ok=True)
         for left in [*self.chunks.glob("*.part"), *self.directory.glob(f"{RESULT}.part")]:
@@ -189,7 +190,7 @@ class Store:
     def _column(self, name: str, kind: Any) -> Iterator[np.ndarray]:
         for span in self.spans():
             try:
-                with np.load(self._path(span)) as chunk:
+                with self._path(span).open("rb") as file, np.load(file) as chunk:
                     part = chunk[name]
             except Exception as error:  # as in unseal
                 raise DamagedError(f"{self._path(span)} cannot be read ({error})") from None
@@ -200,7 +201,7 @@ class Store:
     def _read_back(self, kinds: dict[str, Any]) -> None:
         """Raises DamagedError unless members.npz holds these columns, one row for each member, in order."""
         try:
-            with np.load(self.path) as whole:
+            with self.path.open("rb") as file, np.load(file) as whole:
                 found = {name: shapes({name: whole[name]})[name] for name in whole.files}  # reads all, a column at once
                 index = whole["index"]
         except Exception as error:  # as in unseal
