@@ -230,10 +230,9 @@ def _text(summary: dict[str, Any]) -> str:
     held = f"{summary['survivors']} of {summary['members']} members survive"
     lines = [f"{held}: {share:.4g} % ({sure} {low:.4g} to {high:.4g} %)"]
     if summary["stalled"]:
-        lines.append(
-            f"{summary['lost']} are lost; of {summary['stalled']} it is not known, for their integration stalled "
-            "(they do not count as survivors)"
-        )
+        lost = f"{summary['lost']} {'is' if summary['lost'] == 1 else 'are'} lost"
+        stalled = f"of {summary['stalled']} it is not known, for the integration stalled"
+        lines.append(f"{lost}; {stalled}: they do not count as survivors.")
 
     def number(x: float | None) -> str:
         return "-" if x is None else f"{x:.4g}"
