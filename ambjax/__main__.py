@@ -49,7 +49,7 @@ def parser() -> Parser:
     ensemble.add_argument("--members", type=int, metavar="N", required=True, help="how many members")
     _seeded(ensemble)
     ensemble.add_argument(
-        "--chunk", type=int, metavar="M", help="members kept at a time (default: what a second takes)"
+        "--chunk", type=int, metavar="M", help="members kept at a time (default: about two seconds of work)"
     )
     ensemble.add_argument("--resume", action="store_true", help="go on with a study that was interrupted in --out")
     where = ensemble.add_mutually_exclusive_group()
