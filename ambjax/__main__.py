@@ -7,6 +7,7 @@ import sys
 from typing import NoReturn
 
 from ambjax._version import __version__
+from ambjax.interrupts import listening
 
 
 class Parser(argparse.ArgumentParser):
@@ -49,7 +50,9 @@ def parser() -> Parser:
     ensemble = command("ensemble", "simulate many members: members.npz, summary.json, fan.png", case=True, out=True)
     ensemble.add_argument("--members", type=int, metavar="N", required=True, help="how many members")
     _seeded(ensemble)
-    ensemble.add_argument("--chunk", type=int, metavar="M", default=1024, help="members in flight (default: 1024)")
+    ensemble.add_argument(
+        "--chunk", type=int, metavar="M", help="members kept at a time (default: about two seconds of work)"
+    )
     ensemble.add_argument("--resume", action="store_true", help="go on with a study that was interrupted in --out")
     where = ensemble.add_mutually_exclusive_group()
     where.add_argument("--processes", type=int, metavar="P", help="run on P processes (default: threads of this one)")
@@ -71,7 +74,11 @@ def _seeded(command: Parser) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command. Returns its exit code: 0 done, 1 the answer is no, 2 bad input."""
-    args = parser().parse_args(argv)
+    with listening("ambjax"):
+        return _run(parser().parse_args(argv))
+
+
+def _run(args: argparse.Namespace) -> int:
     try:
         from ambjax import commands, worker
 
@@ -85,9 +92,6 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read the answer has seen enough of it
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
-    except KeyboardInterrupt as stop:
-        print(f"ambjax: interrupted{f': {stop}' if str(stop) else ''}.", file=sys.stderr)
-        return 130
     return code
 
 

@@ -15,10 +15,11 @@ from ambjax.control import current, inversion, observer, position
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, corners
 from ambjax.explicit import DOP853, RK4, Euler
-from ambjax.integrate import Adaptive, Integrator, Rodas3
+from ambjax.integrate import Adaptive, Integrator, Rodas3, Slide
 from ambjax.method import with_method
 from ambjax.plant import Plant
 from ambjax.scenario import Clock, Initial, Scenario, Sensor
+from ambjax.sliding import slides
 from ambjax.spreadfile import spread_from
 from ambjax.tomltable import Table, show
 
@@ -39,7 +40,9 @@ SIGNALS: dict[str, type] = {
     "band-noise": signals.BandNoise,
     "sum": signals.Sum,
 }
-METHODS: dict[str, type] = {"rk4": RK4, "dop853": DOP853, "euler": Euler, "rodas3": Rodas3}
+METHODS: dict[str, type] = {"rk4": RK4, "dop853": DOP853, "euler": Euler, "rodas3": Rodas3, "sliding": Slide}
+# Substeps of the sliding step where dt = "auto".
+SLIDING_SUBSTEPS = 3
 TABLES = ["plant", "controller", "reference", "disturbance", "sensor", "actuator", "initial", "clock", "run", "spread"]
 OTHERS = ["tune"]  # read by ambjax-tune; the commands here pass it by
 UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
@@ -93,6 +96,10 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     cascade = _cascade(top.table("controller"), plant)
     scenario, settle = _scenario(top, plant)
     clock, duration = _clock(top.table("clock"))
+    if isinstance(clock.method, Slide) and not slides(cascade):
+        raise ValueError(
+            'clock.method = "sliding": it is made for controller.inversion.kind = "adaptive". Use method = "adaptive".'
+        )
     _check_start(scenario)
     if settle is None:
         settle = duration / 4
@@ -208,8 +215,8 @@ def _whole(ratio: float) -> int | None:
 def _method(table: Table, period: float) -> Integrator | None:
     dt = table.raw.get("dt", "auto")
     if dt == "auto":
-        name = table.choice("method", ["auto", "adaptive"], "auto") if "method" in table.raw else "auto"
-        return Adaptive() if name == "adaptive" else None
+        name = table.choice("method", ["auto", "adaptive", "sliding"], "auto") if "method" in table.raw else "auto"
+        return {"auto": None, "adaptive": Adaptive(), "sliding": Slide(SLIDING_SUBSTEPS)}[name]
     dt = table.number("dt", None, '"auto" or a number of seconds above 0')
     if not 0 < dt < math.inf:
         raise ValueError(f'{table.at("dt")} = {dt:g}: it must be "auto" or a finite number of seconds above 0.')

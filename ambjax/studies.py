@@ -16,11 +16,15 @@ from ambjax.ensemble import statistics
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
+from ambjax.integrate import Slide
+from ambjax.interrupts import keeping, unbroken
 from ambjax.outputs import chosen, make, plain, say, table, write_json
+from ambjax.pace import Pace, error_words, pilot, say_how_long, sliding_error
 from ambjax.trajectory import STALLED
 from ambjax.worker import chunk, deaf_children, processes, work
 
-CHUNK = 1024
+# Chunks in flight for each worker: one runs, one waits.
+AHEAD = 2
 # The fan chart is drawn from so many members and instants, whatever the size of the study.
 FAN_MEMBERS, FAN_TIMES = 256, 500
 # How long to look for the scheduler of a cluster.
@@ -45,23 +49,25 @@ def run_ensemble(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     case = read_case(args.case)
     study, store = _asked(case, args)
     out = store.directory
-    try:
+    with keeping(lambda: _kept(store)):
+        error = None
         with contextlib.nullcontext() if store.finished() else _executor(args) as executor:
             make(out)  # not before everything that was asked for is known to be possible
             say(f"method: {case.clock.method}; writing to {out}")
+            if isinstance(case.clock.method, Slide):
+                error = sliding_error(study)
+                say(error_words(error))
             if not store.finished():
-                store.begin()
+                _begin(study, store, executor)
                 _run(study, store, executor)
         store.finish()
-        return _report(case, study, args, out)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(_kept(store)) from None
+        return _report(case, study, args, out, error)
 
 
 def _asked(case: Case, args: argparse.Namespace) -> tuple[Study, Store]:
     """The study that is asked for, and where it is kept; nothing is written. Raises ValueError for what cannot be."""
     study = study_of(case, args.seed, args.members)
-    if args.chunk < 1:
+    if args.chunk is not None and args.chunk < 1:
         raise ValueError(f"--chunk {args.chunk}: it must be a whole number of members, at least 1.")
     if args.processes is not None and args.processes < 1:
         raise ValueError(f"--processes {args.processes}: it must be a whole number, at least 1.")
@@ -69,25 +75,45 @@ def _asked(case: Case, args: argparse.Namespace) -> tuple[Study, Store]:
         raise ValueError("--resume: add --out DIR, the directory of the study that was interrupted.")
     study.drawn(np.array([0]))  # raises what the design has against so many members
     out = chosen(args.out, f"ensemble-{case.name}")
-    store = Store(out, study.fingerprint(), study.members, min(args.chunk, study.members))
+    chunk = None if args.chunk is None else min(args.chunk, study.members)
+    store = Store(out, study.fingerprint(), study.members, chunk)
     store.check(COLUMNS + len(study.spread.entries), args.resume)
     return study, store
+
+
+def _begin(study: Study, store: Store, executor: tuple[Executor, int] | None) -> None:
+    """Choose the chunks if nobody has, say how long it may take, and keep what was computed to know it."""
+    if store.begun():
+        store.begin()
+        return
+    columns, seconds = pilot(study)
+    first = len(columns["index"])
+    pace = Pace(first / seconds, None if executor is None else executor[1] // AHEAD)
+    store.chunk = store.chunk or pace.chunk(study.members)
+    say_how_long(study, pace)
+    with unbroken():
+        store.begin()
+        for start, stop in store.spans()[: first // store.chunk]:
+            store.put((start, stop), {name: column[start:stop] for name, column in columns.items()})
 
 
 def _kept(store: Store) -> str:
     """What an interruption has left, and how to go on."""
     if not store.begun():
         return "nothing is kept"
-    kept = store.members if store.finished() else store.members - sum(b - a for a, b in store.missing())
     again = f"give the same command with --out {store.directory} --resume"
-    return f"{kept} of {store.members} members are kept. To go on, {again}"
+    return f"{store.kept()} of {store.members} members are kept. To go on, {again}"
 
 
-def _report(case: Case, study: Study, args: argparse.Namespace, out: pathlib.Path) -> tuple[int, dict[str, Any]]:
-    """What is made of a finished study."""
+def _report(
+    case: Case, study: Study, args: argparse.Namespace, out: pathlib.Path, error: dict[str, Any] | None
+) -> tuple[int, dict[str, Any]]:
+    """What is made of a finished study; `error` is that of its sliding step, if it has one."""
     with np.load(out / "members.npz") as kept:
         columns = {name: kept[name] for name in kept.files}
     summary = _summary(case, study, columns, shlex.quote(str(args.case)))
+    if error is not None:
+        summary["sliding_step_error"] = error
     write_json(out / "summary.json", summary)
     _pictures(case, study, columns, summary, out)
     if not args.json:
@@ -113,13 +139,13 @@ def _executor(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]
             raise ValueError(f"--cluster {args.cluster}: no scheduler answers there ({error}).") from None
         try:
             with client:
-                yield client.get_executor(), 2 * max(len(client.scheduler_info()["workers"]), 1)
+                yield client.get_executor(), AHEAD * max(len(client.scheduler_info()["workers"]), 1)
         except (KilledWorker, CancelledError):
             raise ValueError(f"--cluster {args.cluster}: it, or its workers again and again, died. {GO_ON}") from None
     elif args.processes is not None:
         try:
             with processes(args.processes) as pool:
-                yield pool, 2 * args.processes
+                yield pool, AHEAD * args.processes
         except BrokenExecutor:
             why = "a worker process died, perhaps for want of memory"
             raise ValueError(f"--processes {args.processes}: {why}; fewer need less. {GO_ON}") from None
@@ -129,12 +155,15 @@ def _executor(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]
 
 def _run(study: Study, store: Store, executor: tuple[Executor, int] | None) -> None:
     """Compute what is missing; every finished chunk is on disk at once."""
-    missing = store.missing()
+    missing, remarks = store.survey()
+    for remark in remarks:
+        say(remark)
     done = study.members - sum(stop - start for start, stop in missing)
     with tqdm(total=study.members, initial=done, unit="member", unit_scale=True, delay=2, desc="ensemble") as bar:
         found = _here(study, store, missing) if executor is None else _elsewhere(study, store, missing, *executor)
         for span, columns in found:
-            store.put(span, columns)
+            with unbroken():
+                store.put(span, columns)
             bar.update(span[1] - span[0])
 
 

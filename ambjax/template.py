@@ -25,7 +25,8 @@ i = 0.0                       # A
 duration = 2.0                # s; a whole number of sample periods
 sample_period = 1e-4          # s; measurements are held for this long, one row is recorded for each
 dt = "auto"                   # s, or "auto": method and step from the loop's slopes
-# method = "rk4"              # with a number for dt: "rk4", "dop853", "euler" or "rodas3" (L-stable)
+# method = "rk4"              # with a number for dt: "rk4", "dop853", "euler", "rodas3" (L-stable) or "sliding", which
+#                               is fast under noise where gamma p is large; with dt = "auto": "adaptive" or "sliding"
 
 [run]
 seed = 0                      # of whatever is random

@@ -34,12 +34,17 @@ def prepare() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
 
 
-def chunk(study: Study, start: int, stop: int, size: int, threads: int | None = None) -> dict[str, Any]:
-    """Members start <= k < stop of a study that is cut into chunks of `size`, on so many cores (None: all)."""
+def chunk(
+    study: Study, start: int, stop: int, size: int, threads: int | None = None, *, lost: bool = False
+) -> dict[str, Any]:
+    """Members start <= k < stop of a study that is cut into chunks of `size`, on so many cores (None: all).
+
+    `lost` as in `Study.columns`.
+    """
     import jax
 
     call = min(size, CALL) if jax.default_backend() == "cpu" else size
-    return study.columns(start, stop, call=call, threads=threads)
+    return study.columns(start, stop, call=call, threads=threads, lost=lost)
 
 
 def work(study: Study, start: int, stop: int, size: int) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from ambjax.__main__ import main
 from ambjax.ensemble import Normal, Spread, maps
 from ambjax.ensemble.maps import PERIOD, Axis, grid
 from ambjax.ensemble.study import Study
+from ambjax.metrics import Peak
 
 PLANT = Plant()
 CURRENT = float(PLANT.equilibrium(0.0)[0])
@@ -53,12 +54,8 @@ def test_a_cell_is_the_members_of_its_case_run_alone():
     for k in range(SMALL.members):
         cascade, scenario = SMALL.member(k)
         plant, sensor = dataclasses.replace(scenario.plant, m=0.7), Sensor(1e-7, 0.0, 0.0)
-        errors.append(
-            rollout(cascade, dataclasses.replace(scenario, plant=plant, sensor=sensor), SMALL.clock)
-            .trajectory.rows.e_z[10:]
-            .__abs__()
-            .max()
-        )
+        world = dataclasses.replace(scenario, plant=plant, sensor=sensor)
+        errors.append(float(rollout(cascade, world, SMALL.clock, fold=Peak("e_z", SMALL.settle), every=0).measured))
     # the same members in another program: rounding
     np.testing.assert_allclose(found.error[1, 2], np.median(errors), rtol=1e-11)
     assert found.survival.shape == (2, 3)

@@ -12,8 +12,11 @@ import time
 import numpy as np
 import pytest
 
-from ambjax import studies
+from ambjax import pace, studies, worker
 from ambjax.__main__ import main
+from ambjax.casefile import read_case
+from ambjax.ensemble import statistics
+from ambjax.integrate import Slide
 
 CASE = """
 [controller.inversion]
@@ -165,6 +168,44 @@ def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(flags):
             assert np.isfinite(chunk["rms_error_m"]).all()
 
 
+@pytest.mark.parametrize("program", ["ambjax", "tuning"])
+@pytest.mark.parametrize("calls", [1, 100, 3000, 20_000])
+def test_ctrl_c_before_anything_runs_is_one_line_and_130(program, calls):
+    """While JAX is on its way in, for one, which made an error of its own of it."""
+    write(LONGER)
+    argv = ["case.toml", "--out", "out"] if program == "tuning" else [*RUN, "--out", "out"]
+    code = EARLY.format(calls=calls, module=f"{program}.__main__")
+    done = subprocess.run([sys.executable, "-c", code, *argv], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 130, done.stderr
+    name = {"ambjax": "ambjax", "tuning": "ambjax-tune"}[program]
+    assert done.stderr == f"{name}: interrupted.\n"
+    assert not pathlib.Path("out").exists()
+
+
+# The signal comes at a given call of a Python function after listening began: no clock is involved.
+EARLY = """
+import importlib, os, signal, sys, threading
+signal.signal(signal.SIGINT, signal.default_int_handler)
+main = importlib.import_module("{module}").main
+calls = 0
+
+def count(frame, event, argument):
+    global calls
+    calls += event == "call"
+    if calls == {calls}:
+        sys.setprofile(None)
+        os.kill(os.getpid(), signal.SIGINT)
+
+class Listener(threading.Thread):
+    def start(self):
+        super().start()
+        sys.setprofile(count)
+
+threading.Thread = Listener
+sys.exit(main())
+"""
+
+
 @pytest.mark.slow
 def test_killed_at_any_instant_and_resumed_it_is_the_same_file(no_pictures):
     write(LONGER)
@@ -216,6 +257,142 @@ def test_a_member_alone_is_that_row_of_the_study(no_pictures, capsys):
         for name in ("max_abs_error_m", "settled_rms_error_m", "rms_u_V"):
             # the same operations, fused otherwise for one member than for many
             assert alone[name] == pytest.approx(study[name][worst["index"]], rel=1e-12)
+
+
+# --- damage ---
+
+
+def test_what_was_damaged_is_computed_again_with_a_line(no_pictures, capsys):
+    write(TINY)
+    argv = ["ensemble", "case.toml", "--members", "200", "--seed", "3"]
+    assert main([*argv, "--out", "whole"]) == 0
+    out = pathlib.Path("out")
+    assert main([*argv, "--out", "out", "--chunk", "64"]) == 0
+    assert result("out") == result("whole")
+    capsys.readouterr()
+    # the whole file is damaged: everything is computed again
+    (out / "members.npz").write_bytes(result("whole")[:-100])
+    assert main([*argv, "--out", "out", "--resume"]) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "computed again" in line]
+    assert said == ["out/members.npz: its checksum is wrong; what is not in out/chunks is computed again"]
+    assert result("out") == result("whole")
+
+
+def test_a_chunk_damaged_after_a_kill_is_computed_again(no_pictures, capsys):
+    write(LONGER)
+    assert main([*RUN, "--out", "whole"]) == 0
+    running = begin("out")
+    wait_for(lambda: finished_chunks("out") >= 6, running)
+    os.kill(running.pid, signal.SIGKILL)
+    running.communicate()
+    kept = sorted(pathlib.Path("out", "chunks").glob("*.npz"))
+    kept[1].write_bytes(kept[0].read_bytes())
+    kept[3].write_bytes(kept[3].read_bytes()[:500])
+    stamps = {path: path.stat().st_mtime_ns for path in kept}
+    capsys.readouterr()
+    seen = []
+    with pytest.MonkeyPatch.context() as watch:
+        put = studies.Store.put
+        watch.setattr(studies.Store, "put", lambda store, span, columns: (seen.append(span), put(store, span, columns)))
+        assert main([*RUN[:4], *RUN[6:], "--out", "out", "--resume"]) == 0  # the chunk is the directory's
+    err = capsys.readouterr().err
+    assert f"{kept[1]}: it belongs elsewhere: first is 0 there and 32 here; members 32 to 63 are computed again" in err
+    assert f"{kept[3]}: it is not a whole archive; members 96 to 127 are computed again" in err
+    assert {(32, 64), (96, 128)} <= set(seen)
+    assert len(seen) == CHUNKS - len(stamps) + 2
+    assert result("out") == result("whole")
+
+
+# --- how long it takes ---
+
+
+def test_chunks_take_a_beat_and_keep_every_worker_busy(monkeypatch):
+    monkeypatch.setattr(pace, "cores", lambda: 2)
+    assert pace.Pace(1000.0, None).chunk(10**6) == 2048  # 2 s of it, in whole calls of 64 on each of two cores
+    assert pace.Pace(2.6, None).chunk(2000) == 128  # no less than a call on each
+    assert pace.Pace(1e9, None).chunk(10**9) == pace.MOST_CHUNK
+    assert pace.Pace(1000.0, None).chunk(5) == 5
+    assert pace.Pace(1000.0, 4).chunk(10**6) == 1024  # as much as one core does
+    assert pace.Pace(1000.0, 4).chunk(1000) == 128  # so that there is one for each of them, and another
+    assert pace.Pace(1000.0, 4).whole == 2000
+
+
+def test_a_long_run_is_announced_and_the_faster_step_named(capsys):
+    case = read_case(write(TINY))
+    for name, words in (
+        ("adaptive", 'about 13 min for 2,000 members (2.6 a second); clock.method = "sliding" would be faster'),
+        ("sliding", "about 13 min for 2,000 members (2.6 a second)\n"),
+    ):
+        study = studies.study_of(read_case(write(TINY.replace("dt = 5e-5", f'method = "{name}"'))), 1, 2000)
+        pace.say_how_long(study, pace.Pace(2.6, None))
+        assert words in capsys.readouterr().err
+    pace.say_how_long(studies.study_of(case, 1, 2000), pace.Pace(2000.0, None))
+    assert capsys.readouterr().err == ""
+    assert [pace.duration(s) for s in (5.0, 100, 119, 770, 7000, 9000, 90000)] == [
+        "5 s", "100 s", "119 s", "13 min", "117 min", "2.5 h", "25 h",
+    ]  # fmt: skip
+
+
+def test_the_pilot_is_the_first_members(no_pictures):
+    study = studies.study_of(read_case(write(TINY)), 3, 40)
+    columns, seconds = pace.pilot(study)
+    assert seconds > 0
+    again = study.columns(0, 40, call=worker.CALL)
+    assert columns.keys() == again.keys()
+    assert all(np.array_equal(columns[name], again[name]) for name in again)
+    lost = study.columns(0, 40, call=worker.CALL, lost=True)
+    assert np.all(lost["lost_at"] == 0)
+
+
+# --- the sliding step ---
+
+# A sign so hard that explicit steps would have to be a nanosecond long.
+HARD = TINY.replace("gamma = 1e9\np = 25e-6", "gamma = 3.5e5\np = 25.0").replace("2e-3", "2e-2")
+
+
+@pytest.mark.parametrize(("dt", "substeps"), [("", 3), ("dt = 2.5e-5\n", 4)])
+def test_the_sliding_step_can_be_asked_for(dt, substeps):
+    case = read_case(write(HARD.replace("dt = 5e-5\n", f'method = "sliding"\n{dt}')))
+    assert case.clock.method == Slide(substeps)
+
+
+def test_the_error_of_the_sliding_step_is_measured_and_told(no_pictures, capsys):
+    write(HARD.replace("dt = 5e-5", 'method = "sliding"'))
+    assert main(["ensemble", "case.toml", "--members", "20", "--seed", "3", "--out", "out", "--json"]) == 0
+    out, err = capsys.readouterr()
+    error = json.loads(out)["sliding_step_error"]
+    assert error["members"] == 16
+    assert error["lost_by_one"] == 0
+    write(HARD.replace("dt = 5e-5", 'method = "adaptive"'))
+    assert main(["ensemble", "case.toml", "--members", "20", "--seed", "3", "--out", "accurate"]) == 0
+    with np.load("out/members.npz") as ours, np.load("accurate/members.npz") as theirs:
+        for name in pace.BY:
+            off = np.abs(ours[name] / theirs[name] - 1)[:16].max()
+            assert error[name] == pytest.approx(off, rel=1e-9)  # the same numbers, divided otherwise
+            assert f"{name} off by {100 * off:.2g} %" in err
+    assert "sliding step against adaptive steps, 16 members: " in err
+
+
+def test_the_sliding_step_needs_its_inversion_law(capsys):
+    text = HARD.replace("dt = 5e-5", 'method = "sliding"')
+    text = text.replace("gamma = 3.5e5\np = 25.0", 'kind = "closed-form"')
+    err = refused(["ensemble", write(text), "--members", "3"], capsys)
+    assert 'clock.method = "sliding": it is made for controller.inversion.kind = "adaptive"' in err
+
+
+def test_stalled_members_are_told_apart(capsys):
+    columns = {"index": np.arange(10), "lost_at": np.full(10, np.inf), "lost": np.zeros(10, bool)}
+    columns |= {"stalled": np.arange(10) < 2}
+    columns["lost"][5] = True
+    columns["lost_at"][[0, 1, 5]] = 0.1
+    for name in studies.SHOWN:
+        columns[name] = np.linspace(0, 1, 10)
+    summary = statistics.summary(columns, [], 1)
+    summary["worst"][0]["replay"] = "ambjax simulate"
+    assert (summary["survivors"], summary["lost"], summary["stalled"]) == (7, 1, 2)
+    lines = studies._text(summary).splitlines()
+    assert lines[0].startswith("7 of 10 members survive: ")
+    assert lines[1].startswith("1 is lost; of 2 it is not known, for the integration stalled")
 
 
 # --- bad input ---

@@ -5,6 +5,7 @@ import json
 import pathlib
 import subprocess
 import sys
+import time
 import tomllib
 
 import jax
@@ -20,9 +21,10 @@ from tuning.conditions import bounds
 from tuning.config import tune_from
 from tuning.descent import Descent
 from tuning.goal import Goal
+from tuning.keeper import Keeper, Search
 from tuning.loss import TERMS, loss_for
 from tuning.objective import Engine, Objective, weigh
-from tuning.optimise import Keeper, Search, _go_on_with_all, best_of, search
+from tuning.optimise import _go_on_with_all, best_of, search
 from tuning.optimisers import names, optimiser
 from tuning.risk import CVaR, Mean
 from tuning.rounds import GAIN, MOST_LOOKS, look_again
@@ -283,9 +285,25 @@ def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):
     for a, b in zip(jax.tree.leaves(whole.starts), jax.tree.leaves(resumed.starts), strict=True):
         np.testing.assert_array_equal(a, b)
     assert 0 < resumed.earlier < resumed.seconds  # what it took before counts
-    assert not list(tmp_path.glob("*.partial*"))
-    with pytest.raises(ValueError, match="another case"):
+    assert not list(tmp_path.glob("*.part*"))
+    with pytest.raises(ValueError, match="another search: case is 1 there and 2 here"):
         run(small, keeper=Keeper(tmp_path / "kept.npz", {"case": 2}), resume=True)
+
+
+def test_a_search_whose_checkpoint_was_damaged_is_the_uninterrupted_one(small, tmp_path, capsys):
+    whole = run(small)
+    keeper = Keeper(tmp_path / "kept.npz", {"case": 1}, 3)
+    run(small, keeper=keeper, iterations=2)
+    content = bytearray(keeper.path.read_bytes())
+    content[len(content) // 2] ^= 1
+    keeper.path.write_bytes(content)
+    again = run(small, keeper=keeper, resume=True)
+    said = capsys.readouterr().err
+    assert said.startswith(f"{keeper.path}: ")
+    assert said.endswith("; round 3 is begun again\n")
+    for a, b in zip(jax.tree.leaves(whole.starts), jax.tree.leaves(again.starts), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert run(small, keeper=keeper, resume=True).ended
 
 
 def test_the_second_phase_goes_back_to_what_was_given_where_the_path_is_worse(small):
@@ -463,6 +481,39 @@ def test_the_command_tunes_a_case_that_simulate_runs(tmp_path):
     assert subprocess.run(run, capture_output=True).returncode == 0
     again = command(path, "--out", out, "--json", "--resume")
     assert json.loads(again.stdout)["gains"] == told["gains"]
+
+
+@pytest.mark.slow
+def test_a_killed_tuning_goes_on_and_damage_is_found(tmp_path):
+    path, whole, out = tmp_path / "case.toml", tmp_path / "whole", tmp_path / "out"
+    path.write_text(CASE)
+    assert command(path, "--out", whole).returncode == 0
+    words = [sys.executable, "-m", "tuning", str(path), "--out", str(out)]
+    running = subprocess.Popen(words, cwd=pathlib.Path(__file__).parent.parent, stderr=subprocess.DEVNULL)
+    while not (out / "checkpoint-2.npz").exists():
+        assert running.poll() is None
+        time.sleep(0.01)
+    running.kill()
+    running.wait()
+    first = out / "checkpoint-1.npz"
+    first.write_bytes(first.read_bytes()[:-200])
+    done = command(path, "--out", out, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert f"{first}: it is not a whole archive; round 1 is begun again\n" in done.stderr
+    assert (out / "tuned.toml").read_bytes() == (whole / "tuned.toml").read_bytes()
+    # a finished search is judged again, in words; another one is refused by what differs
+    again = command(path, "--out", whole, "--resume")
+    assert "round 1: its search had ended; what it found is taken from" in again.stderr
+    assert (out / "tuned.toml").read_bytes() == (whole / "tuned.toml").read_bytes()
+    path.write_text(CASE.replace("u_max = 400.0", "u_max = 300.0"))
+    other = command(path, "--out", whole, "--resume")
+    assert other.returncode == 2
+    assert "belongs to another search: case.actuator.u_max is 400.0 there and 300.0 here" in other.stderr
+    # begun anew in the same directory, nothing of the old search is left to be resumed with
+    old = len(list(whole.glob("checkpoint-*.npz")))
+    fresh = command(path, "--out", whole)
+    assert f"{whole}: {old} checkpoints of an earlier search are removed\n" in fresh.stderr
+    assert command(path, "--out", whole, "--resume").returncode == fresh.returncode
 
 
 @pytest.mark.slow

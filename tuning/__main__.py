@@ -6,6 +6,7 @@ import sys
 
 from ambjax import __version__
 from ambjax.__main__ import Parser, complain
+from ambjax.interrupts import listening
 
 
 def parser() -> argparse.ArgumentParser:
@@ -25,8 +26,15 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Tune. Returns 0 if the tuned gains keep every held-out rotor, 1 if not, 2 for bad input."""
-    args = parser().parse_args(argv)
+    """Tune. Returns 0 if the tuned gains keep every held-out rotor, 1 if not, 2 for bad input.
+
+    Ctrl-C during the search ends it and what it found is judged; otherwise, or again, it ends the process with 130.
+    """
+    with listening("ambjax-tune"):
+        return _run(parser().parse_args(argv))
+
+
+def _run(args: argparse.Namespace) -> int:
     from ambjax.worker import prepare
 
     prepare()
@@ -36,9 +44,6 @@ def main(argv: list[str] | None = None) -> int:
         code, summary = run(args)
     except ValueError as error:
         return complain(str(error), "ambjax-tune")
-    except KeyboardInterrupt:
-        print("ambjax-tune: interrupted before there was anything to keep", file=sys.stderr)
-        return 130
     if args.json:
         print(json.dumps(summary, indent=2))
     return code

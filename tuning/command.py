@@ -9,10 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.casefile import case_from
+from ambjax.interrupts import keeping
 from ambjax.outputs import directory, plain, say, write_json
 from ambjax.theorem import check
 from tuning import explore, gradient, report
 from tuning.config import read_study, seeds, settings
+from tuning.keeper import remove_all
 from tuning.objective import Members
 from tuning.rounds import CHECKPOINT, Answer, rounds
 from tuning.study import Study, judge, study_of, summarise
@@ -29,9 +31,34 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     start = tune.space.values(case.cascade)
     tune.space.encode(start)
     out = directory(args.out, f"tune-{case.name}")
+    if not args.resume:
+        _clear(out)
+    with keeping(lambda: _kept(out)):
+        return _tune(args, raw, study, start, out)
+
+
+def _clear(out: pathlib.Path) -> None:
+    """Remove the checkpoints of an earlier search, lest this one is resumed with them."""
+    left = remove_all(out, f"{CHECKPOINT}-*.npz")
+    if left:
+        say(f"{out}: {left} checkpoints of an earlier search are removed")
+
+
+def _kept(out: pathlib.Path) -> str:
+    """What an interruption has left, and how to go on."""
+    if not (out / f"{CHECKPOINT}-1.npz").exists():
+        return "nothing is kept"
+    return f"the search so far is kept. To go on, give the same command with --out {out} --resume"
+
+
+def _tune(
+    args: argparse.Namespace, raw: dict[str, Any], study: Study, start: np.ndarray, out: pathlib.Path
+) -> tuple[int, dict[str, Any]]:
+    """Search, judge and write; everything has been checked."""
+    tune = study.tune
     held_out = seeds(tune.budget)[2]
     say(f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {study.objective.clock.method}")
-    answer = rounds(study, start, out, [raw, settings(tune)], args.resume)
+    answer = rounds(study, start, out, {"case": raw, "tune": settings(tune)}, args.resume)
     study, who, x = answer.study, answer.who, answer.x
     facts = _facts(answer, held_out)
     if args.gradients:

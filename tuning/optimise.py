@@ -1,20 +1,17 @@
 """The search: a screen, then many starts refined at once; interrupted, resumed and repeated alike."""
 
-import dataclasses
-import hashlib
-import json
-import os
-import pathlib
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tuning.descent import Descent, Starts
+from ambjax.interrupts import gently, heed
+from tuning.descent import Descent
 from tuning.goal import Goal
+from tuning.keeper import Keeper, Search
 from tuning.loss import TERMS
 from tuning.objective import Engine, Members
 from tuning.optimisers import BFGS
@@ -26,8 +23,6 @@ SHORTEST = 1e-3
 HALVINGS = (4, 10)
 # Points of the first phase's path that are tried on all members.
 PATH = 12
-# What a checkpoint holds of a search beside arrays and history.
-COUNTS = ("iteration", "phase", "since", "seconds")
 
 
 class Phase(NamedTuple):
@@ -43,60 +38,8 @@ class Phase(NamedTuple):
 
 # On few members first: what they ask is nearly what all ask, at less than half of the cost.
 FEW, ALL = Phase(4, 0.02, 3), Phase(1, 1e-3, 4)
-
-
-@dataclasses.dataclass
-class Search:
-    """A search under way. `history` holds one row per iteration; everything else can be read off a checkpoint.
-
-    `since`: the iteration after which the phase began; `seconds` spent on it so far, `earlier` of them before a resume.
-    """
-
-    starts: Starts
-    active: np.ndarray
-    history: dict[str, list[Any]] = dataclasses.field(default_factory=dict)
-    iteration: int = 0
-    phase: int = 0
-    since: int = 0
-    seconds: float = 0.0
-    earlier: float = 0.0
-    interrupted: bool = False
-
-
-class Keeper:
-    """The checkpoint of a search: written whole, then renamed, so that there is always a good one."""
-
-    def __init__(self, path: pathlib.Path | None, told: Any):
-        self.path = path
-        self.fingerprint = hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
-
-    def save(self, search: Search) -> None:
-        if self.path is None:
-            return
-        leaves = {f"leaf_{n}": np.asarray(leaf) for n, leaf in enumerate(jax.tree.leaves(search.starts))}
-        past = {f"history_{name}": np.asarray(rows) for name, rows in search.history.items()}
-        partial = self.path.with_suffix(".partial.npz")
-        counts = {name: getattr(search, name) for name in COUNTS}
-        state = {"active": search.active, "fingerprint": self.fingerprint, **counts}
-        np.savez(partial, **leaves, **past, **state)  # pyright: ignore[reportArgumentType]
-        os.replace(partial, self.path)  # noqa: PTH105
-
-    def load(self, descent: Descent, m: int) -> Search | None:
-        """The search so far, or None. Raises ValueError if it belongs to another study."""
-        if self.path is None or not self.path.exists():
-            return None
-        with np.load(self.path) as kept:
-            if str(kept["fingerprint"]) != self.fingerprint:
-                raise ValueError(
-                    f"--resume: {self.path} belongs to a search with another case or other settings. "
-                    "Use another --out, or leave out --resume to begin anew."
-                )
-            tree = jax.tree.structure(jax.eval_shape(descent.begin, jnp.zeros((1, m))))
-            count = sum(name.startswith("leaf_") for name in kept.files)
-            starts = jax.tree.unflatten(tree, [jnp.asarray(kept[f"leaf_{n}"]) for n in range(count)])
-            history = {n.removeprefix("history_"): list(kept[n]) for n in kept.files if n.startswith("history_")}
-            counts = {name: kept[name].item() for name in COUNTS}
-            return Search(starts, kept["active"], history, **counts, earlier=counts["seconds"])
+# What the first Ctrl-C says.
+ENDING = "the search ends after this iteration; what it found is judged and written."
 
 
 def search(
@@ -120,9 +63,10 @@ def search(
     `tell` is called after each iteration with the search and the seconds that it took.
     """
     descent = Descent(engine.objective.space, goal, name, rate)
-    keeper = keeper or Keeper(None, None)
+    keeper = keeper or Keeper(None, {})
     phases = [FEW, ALL] if len(points) > keep else [ALL]
-    kept, given, began = keeper.load(descent, points.shape[1]) if resume else None, points[0], time.perf_counter()
+    given, began = points[0], time.perf_counter()
+    kept = keeper.load(descent, min(keep, len(points)), points.shape[1]) if resume else None
     reserve: list[np.ndarray] = []  # [S, m] each, best first: where else this phase may begin
     if kept is not None:
         engine.rollouts = int(kept.history["rollouts"][-1])
@@ -134,21 +78,24 @@ def search(
         kept = Search(descent.begin(jnp.asarray(points)), np.ones(len(points), bool))
     try:
         while True:
-            if not kept.active.any() or kept.iteration - kept.since >= iterations:
-                if kept.phase + 1 == len(phases):
-                    break
-                reserve = _go_on_with_all(engine, goal, who, kept, descent, given)
-            before = kept.seconds
-            phase = phases[kept.phase]
-            iterate(engine, goal, who.part(phase.part, 1), kept, descent)
-            while reserve and not np.isfinite(np.asarray(kept.starts.value)[kept.active]).any():
-                _begin_elsewhere(kept, descent, reserve.pop(0))
+            # Before there is anything to judge, Ctrl-C ends the process as elsewhere.
+            with gently(ENDING if kept.history else ""):
+                heed()
+                if not kept.active.any() or kept.iteration - kept.since >= iterations:
+                    if kept.phase + 1 == len(phases):
+                        break
+                    reserve = _go_on_with_all(engine, goal, who, kept, descent, given)
+                before = kept.seconds
+                phase = phases[kept.phase]
                 iterate(engine, goal, who.part(phase.part, 1), kept, descent)
-            reserve = []
-            kept.active = _going_on(kept, phase)
-            kept.seconds = kept.earlier + time.perf_counter() - began
-            keeper.save(kept)
-            tell(kept, kept.seconds - before)
+                while reserve and not np.isfinite(np.asarray(kept.starts.value)[kept.active]).any():
+                    _begin_elsewhere(kept, descent, reserve.pop(0))
+                    iterate(engine, goal, who.part(phase.part, 1), kept, descent)
+                reserve = []
+                kept.active = _going_on(kept, phase)
+                kept.seconds = kept.earlier + time.perf_counter() - began
+                keeper.save(kept)
+                tell(kept, kept.seconds - before)
     except KeyboardInterrupt:
         kept.interrupted = True
     return kept

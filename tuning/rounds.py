@@ -16,9 +16,10 @@ import numpy as np
 
 from ambjax.outputs import say
 from tuning.config import seeds
+from tuning.keeper import Keeper, Search
 from tuning.loss import TERMS
 from tuning.objective import Members
-from tuning.optimise import Keeper, Search, best_of, search
+from tuning.optimise import best_of, search
 from tuning.screen import around, everywhere
 from tuning.study import REFERENCE_MEMBERS, StepError, Study, step_error, study_of
 from tuning.study import told as step_told
@@ -46,8 +47,11 @@ class Answer:
     """in all, those before a resume included"""
 
 
-def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume: bool) -> Answer:
-    """Tune from the gains `start` [m]. Raises ValueError where nothing can be evaluated."""
+def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: dict[str, Any], resume: bool) -> Answer:
+    """Tune from the gains `start` [m]; `told` is what the answer depends on, for the checkpoints in `out`.
+
+    Raises ValueError where nothing can be evaluated, and where a checkpoint to go on with is that of another search.
+    """
     tune, halvings, found = study.tune, 0, []
     looks: list[tuple[float, np.ndarray]] = []  # goals and answers, on the same members, in the same steps
     looking = tune.budget.screen > 0
@@ -65,9 +69,11 @@ def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume
         path = out / f"{CHECKPOINT}-{round}.npz"
         kept = search(
             study.engine, study.goal, who, points, keep=tune.budget.starts, iterations=tune.budget.iterations,
-            name=tune.optimiser, rate=tune.learning_rate, keeper=Keeper(path, [told, round]),
-            resume=resume and path.exists(), tell=_teller(study),
+            name=tune.optimiser, rate=tune.learning_rate, keeper=Keeper(path, told, round),
+            resume=resume, tell=_teller(study),
         )  # fmt: skip
+        if kept.ended:
+            say(f"round {round}: its search had ended; what it found is taken from {path}")
         if kept.interrupted and not kept.history:  # before anything new was found
             if not past:
                 raise KeyboardInterrupt

@@ -1,74 +1,158 @@
-"""Where a study's results are kept: one file per finished chunk, written whole or not at all.
+"""Where a study's results are kept: one sealed file per finished chunk, written whole or not at all.
 
 A run that is killed at any instant loses the chunks that were being computed and nothing else. What
-is put together at the end is, byte for byte, what an uninterrupted run writes.
+is put together at the end is, byte for byte, what an uninterrupted run writes. A file that was damaged meanwhile
+is found, and what it held is computed again: chunks go only when the whole has been read back.
 """
 
+import collections
+import hashlib
 import json
-import os
 import pathlib
 import shutil
 import zipfile
 from collections.abc import Iterator
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
+
+from ambjax.sealed import CHECKSUM, Arrays, DamagedError, checksum_of, difference, seal, shapes, unseal, write_whole
 
 MANIFEST = "study.json"
 RESULT = "members.npz"
 # Fixed, so that equal results are equal files.
 EPOCH = (1980, 1, 1, 0, 0, 0)
 
+Span = tuple[int, int]
+
+
+class Survey(NamedTuple):
+    """Chunks that must be computed, in order, and a line for each file that does not hold what it should."""
+
+    missing: list[Span]
+    remarks: list[str]
+
 
 class Store:
-    """A directory that holds a study of `members` members in chunks of `chunk`."""
+    """A directory that holds a study of `members` members in chunks of `chunk` (None: as the directory has it)."""
 
-    def __init__(self, directory: pathlib.Path, facts: dict[str, Any], members: int, chunk: int):
-        self.directory, self.members, self.chunk = directory, members, chunk
-        self.facts = facts | {"chunk": chunk}
-        self.chunks = directory / "chunks"
+    def __init__(self, directory: pathlib.Path, facts: dict[str, Any], members: int, chunk: int | None):
+        self.directory, self.members = directory, members
+        self.facts, self.chunk, self.result = facts, chunk or 0, ""
+        self.asked = chunk
+        self.chunks, self.manifest, self.path = directory / "chunks", directory / MANIFEST, directory / RESULT
 
     def check(self, columns: int, resume: bool) -> None:
-        """Make sure that the directory is free, or holds the beginning of this very study. Changes nothing.
+        """Make sure that the directory is free, or holds the beginning of this very study. Changes nothing there.
 
         Raises ValueError if it holds another study, one that nobody asked to resume, none where one is to be
         resumed, or if the disk has no room for `columns` numbers per member.
         """
-        kept = self.directory / MANIFEST
-        if kept.exists() and not resume:
+        if self.begun() and not resume:
             raise ValueError(
                 f"--out {self.directory}: it holds a study already. Add --resume to go on with it, or choose another."
             )
-        if kept.exists():
-            self._compare(kept)
+        if self.begun():
+            self._compare()
         elif resume:
             raise ValueError(f"--resume: there is no study in {self.directory}. Check --out, or leave out --resume.")
-        elif self.finished() or self.chunks.exists():
+        elif self.path.exists() or self.chunks.exists():
             raise ValueError(f"--out {self.directory}: it holds results, but no {MANIFEST}. Choose another.")
         if not self.finished():
             self._check_room(columns)
 
     def begin(self) -> None:
-        """Make the directory ready for what `check` has let pass."""
+        """Make the directory ready for what `check` has let pass. Raises ValueError where it cannot be written."""
         self.directory.mkdir(parents=True, exist_ok=True)
-        facts = json.dumps(self.facts, indent=2).encode() + b"\n"
-        _write_whole(self.directory / MANIFEST, lambda file: file.write(facts))
+        self._tell()
         self.chunks.mkdir(exist_ok=True)
-        for left in self.chunks.glob("*.part"):
+        for left in [*self.chunks.glob("*.part"), *self.directory.glob(f"{RESULT}.part")]:
             left.unlink()
 
-    def _compare(self, kept: pathlib.Path) -> None:
-        try:
-            found = dict(json.loads(kept.read_text(encoding="utf-8")))
-        except (OSError, TypeError, ValueError) as error:
-            raise ValueError(f"{kept}: cannot be read ({error}). Choose another --out.") from None
-        for key in {**found, **self.facts}:
-            here, there = self.facts.get(key), found.get(key)
-            if here != there:
-                raise ValueError(
-                    f"--resume: {self.directory} holds another study: {key} is {there} there and {here} here. "
-                    "Make them equal, or choose another --out."
+    def survey(self) -> Survey:
+        """What is not there yet; every chunk that is there is read and held against its seal."""
+        missing, remarks, found = [], list[str](), dict[Span, str]()
+        if self.result:
+            there = "its checksum is wrong" if self.path.exists() else "it is gone"
+            remarks.append(f"{self.path}: {there}; what is not in {self.chunks} is computed again")
+        for span in self.spans():
+            path = self._path(span)
+            try:
+                if path.exists():
+                    found[span] = json.dumps(kinds_of(self._read(span)))
+                    continue
+            except DamagedError as why:
+                remarks.append(f"{path}: {why}; members {span[0]} to {span[1] - 1} are computed again")
+            missing.append(span)
+        usual = collections.Counter(found.values()).most_common(1)
+        for span, kinds in found.items():
+            if kinds != usual[0][0]:
+                remarks.append(
+                    f"{self._path(span)}: its columns are not those of the others; members {span[0]} to {span[1] - 1} "
+                    "are computed again"
                 )
+                missing.append(span)
+        return Survey(sorted(missing), remarks)
+
+    def spans(self) -> list[Span]:
+        """All chunks in order: (first member, one past the last)."""
+        return [(n, min(n + self.chunk, self.members)) for n in range(0, self.members, self.chunk)]
+
+    def kept(self) -> int:
+        """Number of members that are on disk."""
+        if self.path.exists() and not self.chunks.exists():
+            return self.members
+        return sum(stop - start for start, stop in self.spans() if self._path((start, stop)).exists())
+
+    def put(self, span: Span, columns: Arrays) -> None:
+        """Keep a finished chunk. Raises ValueError where it cannot be written."""
+        seal(self._path(span), columns, self._facts(span))
+
+    def finish(self) -> pathlib.Path:
+        """Put all chunks together as members.npz, a column at a time, read it back, and only then remove them.
+
+        Raises ValueError, and leaves the chunks, if the disk gives back something else than what was written.
+        """
+        if not self.finished():
+            try:
+                kinds = kinds_of(self._read(self.spans()[0]))
+                write_whole(self.path, lambda file: self._merge(file, kinds))
+                self._read_back(kinds)
+            except (DamagedError, OSError) as why:
+                raise ValueError(
+                    f"{self.path}: not put together, {why}. The chunks are kept: give the same command with --resume."
+                ) from None
+            self.result = _digest(self.path)
+            self._tell()
+        shutil.rmtree(self.chunks, ignore_errors=True)
+        return self.path
+
+    def begun(self) -> bool:
+        """Whether there is anything to resume."""
+        return self.manifest.exists()
+
+    def finished(self) -> bool:
+        """Whether members.npz is there, and is what was put together."""
+        return bool(self.result) and self.path.is_file() and _digest(self.path) == self.result
+
+    def _tell(self) -> None:
+        told = self.facts | {"chunk": self.chunk} | ({RESULT: self.result} if self.result else {})
+        text = json.dumps(told | {CHECKSUM: checksum_of(told)}, indent=2).encode() + b"\n"
+        write_whole(self.manifest, lambda file: file.write(text))
+
+    def _compare(self) -> None:
+        try:
+            found = dict(json.loads(self.manifest.read_text(encoding="utf-8")))
+            if found.pop(CHECKSUM, None) != checksum_of(found):
+                raise ValueError("its checksum is wrong")
+            self.chunk, self.result = self.asked or int(found["chunk"]), str(found.pop(RESULT, ""))
+        except (OSError, TypeError, ValueError, KeyError, RecursionError) as error:
+            raise ValueError(f"{self.manifest}: cannot be read ({error}). Choose another --out.") from None
+        differs = difference(found, self.facts | {"chunk": self.chunk})
+        if differs:
+            raise ValueError(
+                f"--resume: {self.directory} holds another study: {differs}. Make them equal, or choose another --out."
+            )
 
     def _check_room(self, columns: int) -> None:
         # Chunks and the result exist side by side at the end.
@@ -82,59 +166,68 @@ class Store:
                 f"{free / 1e9:.3g} GB free. At most {most:,} members fit; or choose another --out."
             )
 
-    def spans(self) -> list[tuple[int, int]]:
-        """All chunks in order: (first member, one past the last)."""
-        return [(n, min(n + self.chunk, self.members)) for n in range(0, self.members, self.chunk)]
+    def _facts(self, span: Span) -> dict[str, Any]:
+        return {"study": checksum_of(self.facts), "first": span[0], "stop": span[1]}
 
-    def missing(self) -> list[tuple[int, int]]:
-        """Chunks that are not on disk yet."""
-        return [span for span in self.spans() if not self._path(span).exists()]
+    def _read(self, span: Span) -> Arrays:
+        """A chunk's columns. Raises DamagedError if they are not the whole of this chunk of this study."""
+        columns, told = unseal(self._path(span))
+        differs = difference(told, self._facts(span))
+        if differs:
+            raise DamagedError(f"it belongs elsewhere: {differs}")
+        _check_rows(columns, *span)
+        return columns
 
-    def put(self, span: tuple[int, int], columns: dict[str, np.ndarray]) -> None:
-        """Keep a finished chunk."""
-        _write_whole(self._path(span), lambda file: np.savez(file, **columns))  # pyright: ignore[reportArgumentType]
-
-    def finish(self) -> pathlib.Path:
-        """Put all chunks together as members.npz, a column at a time, and remove them."""
-        path = self.directory / RESULT
-        if not path.exists():
-            with np.load(self._path(self.spans()[0])) as first:
-                kinds = {name: first[name].dtype for name in first.files}
-            _write_whole(path, lambda file: self._merge(file, kinds))
-        shutil.rmtree(self.chunks, ignore_errors=True)
-        return path
-
-    def begun(self) -> bool:
-        """Whether there is anything to resume."""
-        return (self.directory / MANIFEST).exists()
-
-    def finished(self) -> bool:
-        """Whether members.npz is there."""
-        return (self.directory / RESULT).exists()
-
-    def _merge(self, file: IO[bytes], kinds: dict[str, np.dtype]) -> None:
+    def _merge(self, file: IO[bytes], kinds: dict[str, Any]) -> None:
         with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
             for name, kind in kinds.items():
-                head = {"descr": np.lib.format.dtype_to_descr(kind), "fortran_order": False, "shape": (self.members,)}
+                head = {"descr": kind, "fortran_order": False, "shape": (self.members,)}
                 with archive.open(zipfile.ZipInfo(f"{name}.npy", EPOCH), "w", force_zip64=True) as out:
                     np.lib.format.write_array_header_1_0(out, head)
-                    for part in self._column(name):
-                        out.write(np.ascontiguousarray(part, kind).tobytes())
+                    for part in self._column(name, kind):
+                        out.write(np.ascontiguousarray(part).tobytes())
 
-    def _column(self, name: str) -> Iterator[np.ndarray]:
+    def _column(self, name: str, kind: Any) -> Iterator[np.ndarray]:
         for span in self.spans():
-            with np.load(self._path(span)) as chunk:
-                yield chunk[name]
+            try:
+                with self._path(span).open("rb") as file, np.load(file) as chunk:
+                    part = chunk[name]
+            except Exception as error:  # as in unseal
+                raise DamagedError(f"{self._path(span)} cannot be read ({error})") from None
+            if shapes({name: part}) != {name: [kind, [span[1] - span[0]]]}:
+                raise DamagedError(f"{self._path(span)} has another column {name}")
+            yield part
 
-    def _path(self, span: tuple[int, int]) -> pathlib.Path:
+    def _read_back(self, kinds: dict[str, Any]) -> None:
+        """Raises DamagedError unless members.npz holds these columns, one row for each member, in order."""
+        try:
+            with self.path.open("rb") as file, np.load(file) as whole:
+                found = {name: shapes({name: whole[name]})[name] for name in whole.files}  # reads all, a column at once
+                index = whole["index"]
+        except Exception as error:  # as in unseal
+            raise DamagedError(f"what was written cannot be read back ({error})") from None
+        wrong = difference(found, {name: [kind, [self.members]] for name, kind in kinds.items()})
+        if wrong:
+            raise DamagedError(f"what was written reads otherwise: {wrong}")
+        _check_rows({"index": index}, 0, self.members)
+
+    def _path(self, span: Span) -> pathlib.Path:
         return self.chunks / f"{span[0]:012d}-{span[1]:012d}.npz"
 
 
-def _write_whole(path: pathlib.Path, write: Any) -> None:
-    """Write to a file beside `path`, then rename it: `path` holds everything or does not exist."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
+def kinds_of(columns: Arrays) -> dict[str, Any]:
+    """Names and dtypes of columns, in order."""
+    return {name: kind for name, (kind, _) in shapes(columns).items()}
+
+
+def _check_rows(columns: Arrays, start: int, stop: int) -> None:
+    short = [name for name, column in columns.items() if column.shape != (stop - start,)]
+    if short:
+        raise DamagedError(f"its column {short[0]} does not have {stop - start} rows")
+    if "index" not in columns or not np.array_equal(columns["index"], np.arange(start, stop)):
+        raise DamagedError(f"its rows are not members {start} to {stop - 1}")
+
+
+def _digest(path: pathlib.Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -3,17 +3,15 @@
 import dataclasses
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from ambjax._version import __version__
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.engine import run_ensemble
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.metrics import Named, Standard, Variation
 from ambjax.scenario import Clock, Scenario
+from ambjax.sealed import provenance
 from ambjax.trajectory import Trajectory
 
 SPREAD = "spread."
@@ -53,10 +51,18 @@ class Study:
         cascade, scenario = apply(self.cascade, self.scenario, values)
         return cascade, dataclasses.replace(scenario, seed=self.seed, member=index)
 
-    def columns(self, start: int, stop: int, *, call: int | None = None, threads: int | None = None) -> dict[str, Any]:
-        """Members start <= k < stop, one row each: index, lost_at, every metric, and spread.PATH. [stop - start]."""
+    def columns(
+        self, start: int, stop: int, *, call: int | None = None, threads: int | None = None, lost: bool = False
+    ) -> dict[str, Any]:
+        """Members start <= k < stop, one row each: index, lost_at, every metric, and spread.PATH. [stop - start].
+
+        `lost`: every rotor is lost where it starts; that compiles the very program, and costs little more.
+        """
         members = np.arange(start, stop)
         cascade, scenario = self.batch(members)
+        if lost:
+            far = np.full(np.shape(scenario.initial.z), 2 * np.max(np.asarray(scenario.touchdown)))
+            scenario = dataclasses.replace(scenario, initial=dataclasses.replace(scenario.initial, z=far))
         fold = Standard(self.settle, scenario.touchdown)
         outcome = run_ensemble(cascade, scenario, self.clock, fold=fold, threads=threads, call=call)
         drawn = {SPREAD + path: x for path, x in self.drawn(members).items()}
@@ -87,8 +93,7 @@ class Study:
 
     def fingerprint(self) -> dict[str, Any]:
         """Everything that a member's numbers depend on, by name, as JSON has it."""
-        facts: dict[str, Any] = {"version": __version__, "jax": jax.__version__}
-        facts |= {"precision": str(jnp.result_type(float)), "members": self.members, "seed": self.seed}
+        facts: dict[str, Any] = {**provenance(), "members": self.members, "seed": self.seed}
         for stage in ("observer", "position", "inversion", "current"):
             facts[f"controller.{stage}.kind"] = type(getattr(self.cascade, stage)).__name__
         for name in ("reference", "q_z", "q_v", "q_i", "sensor"):

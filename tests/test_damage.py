@@ -1,0 +1,472 @@
+"""Files that were damaged: every kind is found, what they held is computed again, and what is whole stays."""
+
+import json
+import pathlib
+import zipfile
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ambjax import sealed
+from ambjax.ensemble.store import Store
+from ambjax.sealed import DamagedError, difference, flat, seal, unseal, write_whole
+from tuning.descent import Descent
+from tuning.keeper import Keeper, Search, remove_all
+
+FACTS = {"seed": 3, "plant.m": "0.588"}
+MEMBERS, CHUNK = 50, 20
+
+
+def truncated(share):
+    def damage(path):
+        content = path.read_bytes()
+        path.write_bytes(content[: int(share * len(content))])
+
+    return damage
+
+
+def flipped(share):
+    """One byte changed within the data of an entry: at this share of the entries."""
+
+    def damage(path):
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+        entry = entries[int(share * (len(entries) - 1))]
+        content = bytearray(path.read_bytes())
+        content[entry.header_offset + 30 + len(entry.filename) + entry.file_size - 1] ^= 0x10
+        path.write_bytes(content)
+
+    return damage
+
+
+def rewritten(change, again=False):
+    """Another program's file: arrays and facts changed; sealed anew, if `again`, by one who means it."""
+
+    def damage(path):
+        arrays, facts = unseal(path)
+        with np.load(path) as kept:
+            mark = kept["seal"]
+        change(arrays, facts)
+        if again:
+            seal(path, arrays, facts)
+        else:
+            np.savez(path, **arrays, seal=mark)
+
+    return damage
+
+
+def first(arrays):
+    """The name of an array that has rows."""
+    return next(name for name, array in arrays.items() if array.ndim and name != "index")
+
+
+def drop(arrays, facts):
+    del arrays[first(arrays)]
+
+
+def shorten(arrays, facts):
+    arrays[first(arrays)] = arrays[first(arrays)][:-1]
+
+
+def retype(arrays, facts):
+    arrays[first(arrays)] = arrays[first(arrays)].astype(np.float32)
+
+
+def add(arrays, facts):
+    arrays["more"] = np.zeros(len(arrays[first(arrays)]))
+
+
+def alter(arrays, facts):
+    arrays[first(arrays)] = arrays[first(arrays)] + 1e-9
+
+
+# Whatever may happen to any sealed file: found though nothing is known of what it should hold.
+DAMAGE = {
+    "empty": lambda path: path.write_bytes(b""),
+    "text": lambda path: path.write_text("not an archive\n"),
+    **{f"cut at {share:g}": truncated(share) for share in (0.01, 0.3, 0.7, 0.99)},
+    **{f"flipped at {share:g}": flipped(share) for share in (0.0, 0.5, 1.0)},
+    "column missing": rewritten(drop),
+    "short array": rewritten(shorten),
+    "other dtype": rewritten(retype),
+    "column more": rewritten(add),
+    "number changed": rewritten(alter),
+    "no seal": lambda path: np.savez(path, a=np.zeros(3)),
+}
+# Whole and sealed, but not what belongs there.
+STRANGE = {
+    "column missing": rewritten(drop, again=True),
+    "short array": rewritten(shorten, again=True),
+    "other dtype": rewritten(retype, again=True),
+    "column more": rewritten(add, again=True),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_a_damaged_file_is_no_file(kind, tmp_path):
+    path = tmp_path / "a.npz"
+    arrays = {"index": np.arange(4), "x": np.linspace(0.1, 1, 4), "on": np.array([True, False, True, False])}
+    seal(path, arrays, FACTS)
+    back, facts = unseal(path)
+    assert facts == FACTS
+    assert list(back) == list(arrays)
+    assert all(np.array_equal(back[name], arrays[name]) and back[name].dtype == arrays[name].dtype for name in arrays)
+    DAMAGE[kind](path)
+    with pytest.raises(DamagedError) as raised:
+        unseal(path)
+    assert "\n" not in str(raised.value)
+
+
+def test_no_byte_of_the_arrays_can_change_unseen(tmp_path):
+    """Every byte in turn: what is read is what was written, or refused; bytes that no reader looks at may change."""
+    path = tmp_path / "a.npz"
+    seal(path, {"x": np.linspace(0.1, 1, 4)}, FACTS)
+    content, refused = path.read_bytes(), 0
+    for n in range(len(content)):
+        path.write_bytes(content[:n] + bytes([content[n] ^ 0xFF]) + content[n + 1 :])
+        try:
+            arrays, facts = unseal(path)
+        except DamagedError:
+            refused += 1
+        else:
+            assert list(arrays) == ["x"]
+            assert np.array_equal(arrays["x"], np.linspace(0.1, 1, 4))
+            assert facts == FACTS
+    assert refused > len(content) / 2  # the others are headers: times, attributes, what is told twice
+
+
+def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    write_whole(path, lambda file: file.write(b"old"))
+
+    def full(file):
+        file.write(b"ne")
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(ValueError, match=r"a: cannot be written \(No space left on device\)"):
+        write_whole(path, full)
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_fingerprints_name_what_differs():
+    there, here = ({"case": {"plant": {"m": m}, "terms": [{"a": 1}]}, "round": 1} for m in (0.5, 0.6))
+    assert difference(flat(there), flat(there)) == ""
+    assert difference(flat(there), flat(here)) == "case.plant.m is 0.5 there and 0.6 here"
+    assert difference({}, {"version": "2"}) == "version is None there and 2 here"
+    assert set(sealed.provenance()) == {"version", "jax", "precision"}
+
+
+# --- the chunks of a study ---
+
+
+def rows(start, stop):
+    index = np.arange(start, stop)
+    return {"index": index, "lost_at": np.where(index % 7, np.inf, 0.1), "lost": index % 7 == 0, "x": np.sin(index)}
+
+
+def store_in(out, resume=True, chunk=CHUNK, facts=FACTS):
+    store = Store(out, facts, MEMBERS, chunk)
+    store.check(4, resume)
+    store.begin()
+    return store
+
+
+def compute(store):
+    """What a run does: whatever is missing. Returns the spans and the remarks."""
+    missing, remarks = store.survey()
+    for span in missing:
+        store.put(span, rows(*span))
+    return missing, remarks
+
+
+@pytest.fixture
+def whole(tmp_path):
+    """members.npz of a run that nothing happened to."""
+    store = store_in(tmp_path / "whole", resume=False)
+    assert compute(store) == ([(0, 20), (20, 40), (40, 50)], [])
+    return store.finish().read_bytes()
+
+
+@pytest.fixture
+def begun(tmp_path):
+    """A study of which all chunks are there, not yet put together."""
+    store = store_in(tmp_path / "out", resume=False)
+    compute(store)
+    return tmp_path / "out"
+
+
+def chunk_file(out, number):
+    return sorted((out / "chunks").glob("*.npz"))[number]
+
+
+def rejoined(out, damaged, whole):
+    """The remarks of a run that goes on where chunk `damaged` is."""
+    store = store_in(out)
+    missing, remarks = compute(store)
+    assert missing == [store.spans()[damaged]]
+    assert store.finish().read_bytes() == whole
+    assert not store.chunks.exists()
+    return remarks
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_a_damaged_chunk_is_computed_again(kind, which, begun, whole):
+    path = chunk_file(begun, which)
+    DAMAGE[kind](path)
+    (remark,) = rejoined(begun, which, whole)
+    assert str(path) in remark
+    assert "are computed again" in remark
+    assert "\n" not in remark
+
+
+def of_another_span(path):
+    path.write_bytes(chunk_file(path.parent.parent, 0).read_bytes())
+
+
+def renumbered(arrays, facts):
+    arrays["index"] = arrays["index"] + 1
+
+
+def of_another_study(arrays, facts):
+    facts["study"] = sealed.checksum_of(FACTS | {"seed": 4})
+
+
+def unnamed(arrays, facts):
+    facts.clear()
+
+
+CHUNK_STRANGE = STRANGE | {
+    "rows of another chunk": of_another_span,
+    "other members": rewritten(renumbered, again=True),
+    "another study's": rewritten(of_another_study, again=True),
+    "no facts": rewritten(unnamed, again=True),
+}
+
+
+@pytest.mark.parametrize("kind", CHUNK_STRANGE)
+def test_a_chunk_that_does_not_belong_there_is_computed_again(kind, begun, whole):
+    path = chunk_file(begun, 1)
+    CHUNK_STRANGE[kind](path)
+    (remark,) = rejoined(begun, 1, whole)
+    assert str(path) in remark
+
+
+def test_a_chunk_that_is_gone_is_computed_without_a_word(begun, whole):
+    chunk_file(begun, 2).unlink()
+    assert rejoined(begun, 2, whole) == []
+
+
+def test_chunks_stay_until_the_whole_was_read_back(begun, whole, monkeypatch):
+    """A disk that gives back something else than what was written."""
+    spoil = [truncated(0.5), flipped(0.7), rewritten_plainly(drop), rewritten_plainly(shorten)]
+    spoil += [rewritten_plainly(renumbered)]
+    for damage in spoil:
+        store = store_in(begun)
+
+        def lying(path, write, damage=damage):
+            write_whole(path, write)
+            if path.name == "members.npz":
+                damage(path)
+
+        with monkeypatch.context() as disk:
+            disk.setattr("ambjax.ensemble.store.write_whole", lying)
+            with pytest.raises(ValueError, match=r"members.npz: not put together, .* The chunks are kept"):
+                store.finish()
+        assert len(list(store.chunks.glob("*.npz"))) == 3
+        assert not store_in(begun).finished()
+    store = store_in(begun)
+    assert compute(store) == ([], [])
+    assert store.finish().read_bytes() == whole
+    assert not store.chunks.exists()
+
+
+def rewritten_plainly(change):
+    def damage(path):
+        with np.load(path) as kept:
+            arrays = {name: kept[name] for name in kept.files}
+        change(arrays, {})
+        np.savez(path, **arrays)
+
+    return damage
+
+
+def test_a_chunk_that_goes_bad_before_the_end_stops_it(begun):
+    store = store_in(begun)
+    compute(store)
+    truncated(0.5)(chunk_file(begun, 1))
+    with pytest.raises(ValueError, match="The chunks are kept: give the same command with --resume"):
+        store.finish()
+    assert not store.path.exists()
+    assert len(list(begun.rglob("*.part"))) == 0
+
+
+@pytest.mark.parametrize("kind", ["gone", *(k for k in DAMAGE if k != "column missing")])
+def test_a_finished_study_whose_file_was_damaged_is_computed_again(kind, begun, whole):
+    store_in(begun).finish()
+    path = begun / "members.npz"
+    if kind == "gone":
+        path.unlink()
+    elif kind in ("short array", "other dtype", "column more", "number changed"):
+        rewritten_plainly({"short array": shorten, "other dtype": retype, "column more": add}.get(kind, alter))(path)
+    else:
+        DAMAGE[kind](path)
+    store = store_in(begun)
+    assert not store.finished()
+    missing, (remark,) = compute(store)
+    assert missing == store.spans()
+    assert remark.startswith(f"{path}: ")
+    assert store.finish().read_bytes() == whole
+    assert store_in(begun).finished()
+
+
+@pytest.mark.parametrize("kind", ["empty", "text", "cut at 0.3", "cut at 0.99", "a byte", "a chunk"])
+def test_a_damaged_manifest_is_refused_by_name(kind, begun):
+    path = begun / "study.json"
+    if kind == "a byte":
+        path.write_text(path.read_text().replace('"seed": 3', '"seed": 2'))
+    elif kind == "a chunk":
+        path.write_text(path.read_text().replace('"chunk": 20', '"chunk": 10'))
+    else:
+        DAMAGE[kind](path)
+    with pytest.raises(ValueError, match=r"study.json: cannot be read \(.*\)") as raised:
+        store_in(begun)
+    assert "\n" not in str(raised.value)
+    assert len(list((begun / "chunks").glob("*.npz"))) == 3
+
+
+def test_the_chunk_is_the_directorys_unless_one_is_asked_for(begun, whole):
+    store = store_in(begun, chunk=None)
+    assert store.chunk == CHUNK
+    assert compute(store) == ([], [])
+    assert store.finish().read_bytes() == whole
+    with pytest.raises(ValueError, match="another study: chunk is 20 there and 10 here"):
+        store_in(begun, chunk=10)
+    with pytest.raises(ValueError, match="another study: seed is 3 there and 5 here"):
+        store_in(begun, facts=FACTS | {"seed": 5})
+
+
+# --- the checkpoints of a search ---
+
+TOLD = {"case": {"plant": {"m": 0.5}}, "tune": {"members": 4}}
+STARTS, GAINS, ITERATIONS = 3, 4, 2
+
+
+@pytest.fixture(scope="module")
+def descent():
+    return Descent(None, None, "bfgs", 0.1)  # how it begins depends on neither space nor goal
+
+
+def search_of(descent, starts=STARTS, gains=GAINS):
+    row = {"value": (starts,), "x": (starts, gains), "gains": (starts, gains), "lost": (starts,), "members": ()}
+    row |= {"terms": (starts, 6), "rollouts": ()}
+    dice = np.random.default_rng(1)
+    past = {name: [dice.random(shape) for _ in range(ITERATIONS)] for name, shape in row.items()}
+    x = jnp.asarray(dice.random((starts, gains)))
+    return Search(descent.begin(x), np.arange(starts) > 0, past, ITERATIONS, phase=1, since=1, seconds=2.5)
+
+
+@pytest.fixture
+def checkpoint(tmp_path, descent):
+    keeper = Keeper(tmp_path / "checkpoint-2.npz", TOLD, 2)
+    keeper.save(search_of(descent))
+    return keeper
+
+
+def test_a_checkpoint_is_the_search(checkpoint, descent):
+    before, after = search_of(descent), checkpoint.load(descent, STARTS, GAINS)
+    for a, b in zip(jax.tree.leaves(before.starts), jax.tree.leaves(after.starts), strict=True):
+        np.testing.assert_array_equal(a, b)
+        assert a.dtype == b.dtype
+    assert (after.iteration, after.phase, after.since, after.earlier) == (ITERATIONS, 1, 1, 2.5)
+    assert after.ended
+    np.testing.assert_array_equal(before.active, after.active)
+    assert before.history.keys() == after.history.keys()
+    assert all(np.array_equal(before.history[name], after.history[name]) for name in before.history)
+
+
+def fewer_starts(path):
+    Keeper(path, TOLD, 2).save(search_of(Descent(None, None, "bfgs", 0.1), starts=STARTS - 1))
+
+
+def fewer_gains(path):
+    Keeper(path, TOLD, 2).save(search_of(Descent(None, None, "bfgs", 0.1), gains=GAINS - 1))
+
+
+def another_optimiser(path):
+    Keeper(path, TOLD, 2).save(search_of(Descent(None, None, "adam", 0.1)))
+
+
+def of_another_round(path):
+    Keeper(path, TOLD, 1).save(search_of(Descent(None, None, "bfgs", 0.1)))
+
+
+def no_history(arrays, facts):
+    del arrays["history_terms"]
+
+
+def short_history(arrays, facts):
+    arrays["history_value"] = arrays["history_value"][:-1]
+
+
+def no_counts(arrays, facts):
+    facts["counts"] = {}
+
+
+CHECKPOINT_STRANGE = STRANGE | {
+    "fewer starts": fewer_starts,
+    "fewer gains": fewer_gains,
+    "another optimiser's": another_optimiser,
+    "another round's": of_another_round,
+    "no history": rewritten(no_history, again=True),
+    "short history": rewritten(short_history, again=True),
+    "no counts": rewritten(no_counts, again=True),
+    "no facts": rewritten(unnamed, again=True),
+}
+
+
+@pytest.mark.parametrize(
+    "kind", [*(k for k in DAMAGE if k != "a folder"), *(f"sealed: {k}" for k in CHECKPOINT_STRANGE)]
+)
+def test_a_damaged_checkpoint_is_begun_again_with_one_line(kind, checkpoint, descent, capsys):
+    (DAMAGE | {f"sealed: {k}": damage for k, damage in CHECKPOINT_STRANGE.items()})[kind](checkpoint.path)
+    assert checkpoint.load(descent, STARTS, GAINS) is None
+    err = capsys.readouterr().err
+    assert err.startswith(f"{checkpoint.path}: ")
+    assert err.endswith("; round 2 is begun again\n")
+    assert err.count("\n") == 1
+    checkpoint.save(search_of(descent))
+    assert checkpoint.load(descent, STARTS, GAINS) is not None
+
+
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [
+        ({"case": {"plant": {"m": 0.6}}, "tune": {"members": 4}}, "case.plant.m is 0.5 there and 0.6 here"),
+        ({"case": {"plant": {"m": 0.5}}, "tune": {"members": 5}}, "tune.members is 4 there and 5 here"),
+        (TOLD | {"version": "0"}, "there and 0 here"),
+        (TOLD | {"jax": "0"}, "there and 0 here"),
+        (TOLD | {"precision": "float32"}, "precision is float64 there and float32 here"),
+    ],
+)
+def test_a_checkpoint_of_another_search_is_refused_in_words(other, words, checkpoint, descent):
+    with pytest.raises(ValueError, match=r"checkpoint-2.npz belongs to another search") as raised:
+        Keeper(checkpoint.path, other, 2).load(descent, STARTS, GAINS)
+    assert words in str(raised.value)
+    assert checkpoint.path.exists()
+
+
+def test_old_checkpoints_are_removed_and_nothing_else(checkpoint, tmp_path):
+    (tmp_path / "history.npz").touch()
+    assert remove_all(tmp_path, "checkpoint-*.npz") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["history.npz"]
+    assert remove_all(pathlib.Path(tmp_path, "nowhere"), "checkpoint-*.npz") == 0
+
+
+def test_what_is_told_of_a_study_is_plain_json(begun):
+    told = json.loads((begun / "study.json").read_text())
+    assert told["seed"] == 3
+    assert told["chunk"] == CHUNK

@@ -1,0 +1,92 @@
+"""Ctrl-C: one line and exit code 130, whatever runs; gently where there is something to end."""
+
+import subprocess
+import sys
+
+import pytest
+
+HEAD = """
+import os, signal, sys, threading, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from ambjax.interrupts import gently, heed, keeping, listening, unbroken
+
+def interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+
+def ever():
+    time.sleep(60)
+    sys.exit("nothing happened")
+"""
+# What runs when it comes, what the line says.
+CASES = {
+    "asleep": ("with listening('p'):\n interrupt()\n ever()", "p: interrupted.\n"),
+    "where exceptions are lost": (
+        "class Lost:\n def __del__(self):\n  interrupt()\n  ever()\nwith listening('p'):\n Lost()\n ever()",
+        "p: interrupted.\n",
+    ),
+    "where everything is caught": (
+        "with listening('p'):\n while True:\n  try:\n   interrupt()\n   ever()\n  except BaseException: pass",
+        "p: interrupted.\n",
+    ),
+    "in another thread": (
+        "with listening('p'):\n threading.Thread(target=interrupt).start()\n ever()",
+        "p: interrupted.\n",
+    ),
+    "something is kept": (
+        "with listening('p'), keeping(lambda: '3 are kept'):\n interrupt()\n ever()",
+        "p: interrupted: 3 are kept.\n",
+    ),
+    "while it is being kept": (
+        "n = [0]\nwith listening('p'), keeping(lambda: f'{n[0]} are kept'):\n with unbroken():\n  interrupt()\n"
+        "  time.sleep(0.2)\n  n[0] = 1\n ever()",
+        "p: interrupted: 1 are kept.\n",
+    ),
+    "again": (
+        "with listening('p'), gently('It ends.'):\n interrupt()\n time.sleep(0.2)\n interrupt()\n ever()",
+        "p: It ends. Ctrl-C again ends it at once.\np: interrupted.\n",
+    ),
+    "below a bar": (
+        "from tqdm import tqdm\nwith listening('p'), tqdm(total=9, mininterval=0) as bar:\n bar.update(3)\n"
+        " interrupt()\n ever()",
+        "\np: interrupted.\n",
+    ),
+}
+
+
+def run(code):
+    return subprocess.run([sys.executable, "-c", HEAD + code], capture_output=True, text=True, timeout=50)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_it_ends_at_once_with_one_line(case):
+    code, said = CASES[case]
+    done = run(code)
+    assert done.returncode == 130, done.stderr
+    assert done.stderr.endswith(said)
+    assert case == "below a bar" or done.stderr == said
+
+
+def test_a_gentle_one_is_heeded_once_asked():
+    code = """
+with listening("p"):
+    with gently("It ends."):
+        heed()
+        interrupt()
+        time.sleep(0.2)
+        try:
+            heed()
+        except KeyboardInterrupt:
+            print("heeded")
+with listening("p"):
+    heed()
+print("anew", signal.getsignal(signal.SIGINT) is signal.default_int_handler)
+"""
+    done = run(code)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["heeded", "anew", "True"]
+
+
+def test_where_it_is_ignored_it_stays_ignored():
+    code = "signal.signal(signal.SIGINT, signal.SIG_IGN)\nwith listening('p'):\n interrupt()\n print('on')"
+    done = run(code)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "on\n", "")
