@@ -26,7 +26,7 @@ class Signal(Protocol):
 class Constant:
     """The same value at all times."""
 
-    value: Scalar = leaf(default=0.0, doc="the value")
+    value: Scalar = leaf(default=0.0, at_least=-1e20, at_most=1e20, doc="the value")
 
     def __call__(self, t: Scalar) -> Array:
         return self.value + 0.0 * jnp.asarray(t)
@@ -36,8 +36,8 @@ class Constant:
 class Step:
     """0 before `start`, `amplitude` from then on."""
 
-    amplitude: Scalar = leaf(doc="height")
-    start: Scalar = leaf(default=0.0, unit="s", doc="when it rises")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height")
+    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="when it rises")
 
     def __call__(self, t: Scalar) -> Array:
         return jnp.where(jnp.asarray(t) >= self.start, self.amplitude, 0.0)
@@ -51,9 +51,9 @@ class Step:
 class Pulse:
     """`amplitude` in start <= t < stop, 0 elsewhere."""
 
-    amplitude: Scalar = leaf(doc="height")
-    start: Scalar = leaf(unit="s", doc="when it rises")
-    stop: Scalar = leaf(unit="s", doc="when it falls; later than start")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height")
+    start: Scalar = leaf(unit="s", at_least=-1e9, at_most=1e9, doc="when it rises")
+    stop: Scalar = leaf(unit="s", at_least=-1e9, at_most=1e9, doc="when it falls; later than start")
     ordered: ClassVar = ("start", "stop")
 
     def __call__(self, t: Scalar) -> Array:
@@ -69,9 +69,9 @@ class Pulse:
 class Sine:
     """amplitude sin(2 pi frequency t + phase)."""
 
-    amplitude: Scalar = leaf(doc="half the peak-to-peak height")
-    frequency: Scalar = leaf(unit="Hz", at_least=0, doc="frequency")
-    phase: Scalar = leaf(default=0.0, unit="rad", doc="phase at t = 0")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="half the peak-to-peak height")
+    frequency: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency")
+    phase: Scalar = leaf(default=0.0, unit="rad", at_least=-1e9, at_most=1e9, doc="phase at t = 0")
 
     def __call__(self, t: Scalar) -> Array:
         return self.amplitude * sine(self.frequency * jnp.asarray(t) + self.phase / TWO_PI)
@@ -81,9 +81,9 @@ class Sine:
 class SmoothStep:
     """0 until `start`, then 10 s^3 - 15 s^4 + 6 s^5 of the way over `duration`: twice differentiable (C2)."""
 
-    amplitude: Scalar = leaf(doc="height reached")
-    start: Scalar = leaf(default=0.0, unit="s", doc="when it begins to rise")
-    duration: Scalar = leaf(default=0.1, unit="s", above=0, doc="time it takes to rise")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height reached")
+    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="when it begins to rise")
+    duration: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="time it takes to rise")
 
     def __call__(self, t: Scalar) -> Array:
         s = (jnp.asarray(t) - self.start) / self.duration
@@ -99,10 +99,10 @@ class SmoothStep:
 class Chirp:
     """A sine whose frequency moves linearly from `frequency` to `frequency_end` over `duration`, then stays."""
 
-    amplitude: Scalar = leaf(doc="half the peak-to-peak height")
-    frequency: Scalar = leaf(unit="Hz", at_least=0, doc="frequency at t = 0")
-    frequency_end: Scalar = leaf(unit="Hz", at_least=0, doc="frequency from t = duration on")
-    duration: Scalar = leaf(unit="s", above=0, doc="time of the sweep")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="half the peak-to-peak height")
+    frequency: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency at t = 0")
+    frequency_end: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency from t = duration on")
+    duration: Scalar = leaf(unit="s", at_least=1e-9, at_most=1e9, doc="time of the sweep")
 
     def __call__(self, t: Scalar) -> Array:
         t = jnp.asarray(t)
@@ -138,9 +138,9 @@ class BandNoise:
     cos(2 pi f tau) over the band, exactly; it has all derivatives, so that integrators keep their order.
     """
 
-    std: Scalar = leaf(at_least=0, doc="standard deviation")
-    f_low: Scalar = leaf(unit="Hz", at_least=0, doc="lower end of the band")
-    f_high: Scalar = leaf(unit="Hz", above=0, doc="upper end of the band; above f_low")
+    std: Scalar = leaf(at_least=0, at_most=1e20, doc="standard deviation")
+    f_low: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="lower end of the band")
+    f_high: Scalar = leaf(unit="Hz", above=0, at_most=1e9, doc="upper end of the band; above f_low")
     ordered: ClassVar = ("f_low", "f_high")
 
     def realised(self, key: Array) -> Lines:

@@ -4,7 +4,10 @@ import dataclasses
 import difflib
 from typing import Any
 
-from ambjax._pytree import numbers, validate
+from ambjax._pytree import check_number, numbers, validate
+
+# What of a key or a value is shown; keys beyond this length are like no other.
+LONGEST = 60
 
 
 class Table:
@@ -17,13 +20,13 @@ class Table:
 
     def at(self, key: str) -> str:
         """Dotted path of a key."""
-        return f"{self.path}.{key}" if self.path else key
+        return f"{self.path}.{cut(key)}" if self.path else cut(key)
 
     def only(self, allowed: list[str]) -> None:
         """Refuse keys that mean nothing here, with a guess at what was meant."""
         for key in self.raw:
             if key not in allowed:
-                close = difflib.get_close_matches(key, allowed, n=1)
+                close = difflib.get_close_matches(key[:LONGEST], allowed, n=1)
                 hint = f" Did you mean '{close[0]}'?" if close else ""
                 names = ", ".join(allowed) if allowed else "none"
                 raise ValueError(
@@ -41,7 +44,17 @@ class Table:
             return default
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be {allowed}, without quotes.")
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:  # a whole number of hundreds of digits
+            raise ValueError(f"{self.at(key)} = {show(value)}: it must be {allowed}.") from None
+
+    def leaf(self, key: str, field: dataclasses.Field, default: Any = None) -> Any:
+        """A number that the field of a record, or one like it, allows; or the default if left out."""
+        value = self.number(key, default, numbers(field))
+        if key in self.raw:
+            check_number(field, self.at(key), value)
+        return value
 
     def choice(self, key: str, allowed: list[str], default: str | None = None) -> str:
         """One of several words."""
@@ -49,7 +62,7 @@ class Table:
         if value is None:
             raise ValueError(f"{self.at(key)} is missing: it must be one of {quoted(allowed)}.")
         if value not in allowed:
-            close = difflib.get_close_matches(str(value), allowed, n=1)
+            close = difflib.get_close_matches(show(value).strip('"'), allowed, n=1)
             hint = f" Did you mean '{close[0]}'?" if close else ""
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be one of {quoted(allowed)}.{hint}")
         return value
@@ -79,11 +92,26 @@ class Table:
 
 def show(value: Any) -> str:
     """A value as it would stand in the file, cut if it is long."""
-    text = f'"{value}"' if isinstance(value, str) else str(value)
-    text = text.lower() if isinstance(value, bool) else text
-    if isinstance(value, dict) and value:
+    if isinstance(value, int) and abs(value) >= 10**LONGEST:  # Python refuses to write thousands of digits
+        return f"a whole number of {len(hex(abs(value))) - 2} hexadecimal digits"
+    if isinstance(value, list):
+        text = f"[{', '.join(map(show, value[:LONGEST]))}]"
+    elif isinstance(value, dict) and value:
         text = f"{{ {', '.join(f'{k} = {show(x)}' for k, x in value.items())} }}"
-    return text if len(text) <= 60 else text[:57] + "..."
+    else:
+        text = f'"{value}"' if isinstance(value, str) else str(value)
+        text = text.lower() if isinstance(value, bool) else text
+    return cut(text)
+
+
+def cut(text: str) -> str:
+    """The text, or its beginning if it is long."""
+    return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
+
+
+def one_line(text: str) -> str:
+    """The text with line breaks and whatever else does not print written as escapes: a message is one line."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def quoted(words: list[str]) -> str:
