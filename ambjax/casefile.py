@@ -8,11 +8,11 @@ import dataclasses
 import math
 import pathlib
 import re
-import tomllib
 from typing import Any
 
 from ambjax import signals
 from ambjax._pytree import leaf, numbers
+from ambjax._words import one_line
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, corners
@@ -20,9 +20,10 @@ from ambjax.explicit import DOP853, RK4, Euler
 from ambjax.integrate import Adaptive, Integrator, Rodas3
 from ambjax.method import with_method
 from ambjax.plant import Plant
+from ambjax.reach import check_reference
 from ambjax.scenario import Clock, Initial, Scenario, Sensor
 from ambjax.spreadfile import spread_from
-from ambjax.tomltable import Table, one_line, show
+from ambjax.tomltable import Table, check_depth, load, show
 
 # The laws by stage and kind; the first of a stage is the default. A new law is one row here.
 KINDS: dict[str, dict[str, type]] = {
@@ -53,10 +54,6 @@ DURATION = leaf(default=2.0, unit="s", at_least=1e-9, at_most=1e6, doc="simulate
 DT = leaf(default=1e-6, unit="s", at_least=1e-15, at_most=1e6, doc="integration step")
 SETTLE = leaf(default=0.5, unit="s", at_least=0, at_most=1e6, doc='from when "settled" metrics count')
 FIELDS = {field.name: field for kind in (Scenario, Clock) for field in dataclasses.fields(kind)}
-# No case nests deeper than a sum of sums; whatever walks one may rely on it.
-DEEPEST = 32
-# No case file is larger: what is, is something else.
-MOST_BYTES = 10_000_000
 # A name enters titles, paths, tables and pages: whatever means something there is left out of it.
 UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
 
@@ -86,42 +83,6 @@ def read_case(path: str | pathlib.Path) -> Case:
         raise ValueError(one_line(f"{path}: {error}")) from None
 
 
-def load(path: str | pathlib.Path) -> dict[str, Any]:
-    """A case file as parsed TOML, not yet checked. Raises ValueError, one line, if it is none."""
-    path = pathlib.Path(path)
-
-    def refuse(why: str) -> ValueError:
-        return ValueError(one_line(f"{path}: {why}"))
-
-    try:
-        with path.open("rb") as file:
-            content = file.read(MOST_BYTES + 1)
-    except OSError as error:
-        raise refuse(f"cannot be read ({error.strerror}). Check the path and its permissions.") from None
-    if len(content) > MOST_BYTES:
-        raise refuse(f"more than {MOST_BYTES:,} bytes are no case file. See 'ambjax template' for one.")
-    try:
-        return tomllib.loads(content.decode("utf-8"))
-    except UnicodeDecodeError:
-        raise refuse("not a text file in UTF-8. A case file is TOML; see 'ambjax template'.") from None
-    except tomllib.TOMLDecodeError as error:
-        raise refuse(f"not valid TOML: {error}. See 'ambjax template' for a file to start from.") from None
-    except RecursionError:
-        raise refuse(f"tables or lists are nested deeper than {DEEPEST}, which no case is.") from None
-    except ValueError:  # Python converts no number of thousands of digits
-        raise refuse("a number has thousands of digits. Write it as in 1.5e3.") from None
-
-
-def _check_depth(raw: Any) -> None:
-    """Refuse what is nested deeper than any case, before anything walks it."""
-    level = [raw]
-    for _ in range(DEEPEST):
-        inner = (x.values() if isinstance(x, dict) else x for x in level if isinstance(x, (dict, list)))
-        level = [x for values in inner for x in values]
-    if level:
-        raise ValueError(f"tables or lists are nested deeper than {DEEPEST}, which no case is.")
-
-
 def safe_name(text: str) -> str:
     """The text without what means something in a path, a title, a table or a page, and not too long."""
     return UNSAFE.sub("_", text)[:LONGEST_NAME].strip() or "case"
@@ -129,7 +90,7 @@ def safe_name(text: str) -> str:
 
 def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     """A case from a parsed TOML document. Raises ValueError as `read_case` does."""
-    _check_depth(raw)
+    check_depth(raw)
     top = Table(raw)
     top.only([*TABLES, *OTHERS])
     plant = top.table("plant").record(Plant)
@@ -142,6 +103,7 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     elif settle >= duration:
         raise ValueError(f"run.settle = {settle:g} s: it must be less than clock.duration = {duration:g} s.")
     spread = spread_from(top, cascade, scenario)
+    check_reference(spread, cascade, scenario, clock)
     clock = with_method(clock, *corners(spread, cascade, scenario))
     return Case(safe_name(name), cascade, scenario, clock, settle, spread)
 

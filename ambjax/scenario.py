@@ -13,7 +13,7 @@ from ambjax.control.laws import Measurement
 from ambjax.gaussian import normals
 from ambjax.integrate import Integrator
 from ambjax.plant import Plant
-from ambjax.signals import Constant, Signal, realised
+from ambjax.signals import Constant, Signal, is_random, realised
 
 # A member's randomness beside its sensors': folded into its key where they fold the sample number, beyond any of those.
 DESIGN_STREAM, SIGNAL_STREAM = np.uint32(2**32 - 1), np.uint32(2**32 - 2)
@@ -70,6 +70,13 @@ class Scenario:
     def touchdown(self) -> Scalar:
         """|z| at which the rotor touches down, m."""
         return 0.9 * self.plant.s_0 if self.clearance is None else self.clearance
+
+    @property
+    def random(self) -> bool:
+        """Whether two members of this scenario meet something else: noise, or a signal that is drawn."""
+        sensor = self.sensor
+        noisy = sensor is not None and bool(np.any([sensor.std, sensor.std_z_dot, sensor.std_i]))
+        return noisy or any(is_random(getattr(self, slot)) for slot in SIGNALS)
 
     def acceleration(self, t: Scalar) -> Array:
         """The whole disturbance of Eq. (1) at time t: q_z + a q_v, m/s^2."""

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ambjax._pytree import Scalar, leaf, record
@@ -17,9 +18,23 @@ from ambjax.smooth import TWO_PI, sine
 
 
 class Signal(Protocol):
-    """Anything that maps a time in seconds to a value."""
+    """Anything that maps a time in seconds to a value. `span` gives an interval that it never leaves in 0..end (s)."""
 
     def __call__(self, t: Scalar, /) -> Array: ...
+    def span(self, end: float, /) -> tuple[float, float]: ...
+
+
+def _hull(*values: Any) -> tuple[float, float]:
+    """The least and the largest of several numbers, or arrays of them."""
+    return float(min(map(np.min, values))), float(max(map(np.max, values)))
+
+
+def _swing(amplitude: Scalar, first: Scalar, last: Scalar) -> tuple[float, float]:
+    """Least and largest amplitude sin(2 pi x) for x from first to last, turns."""
+    ends = [np.sin(TWO_PI * (x - np.floor(x))) for x in (first, last)]
+    crest, trough = (np.ceil(first - at) <= last - at for at in (0.25, 0.75))
+    high, low = np.where(crest, 1.0, np.maximum(*ends)), np.where(trough, -1.0, np.minimum(*ends))
+    return _hull(amplitude * low, amplitude * high)
 
 
 @record
@@ -31,6 +46,9 @@ class Constant:
     def __call__(self, t: Scalar) -> Array:
         return self.value + 0.0 * jnp.asarray(t)
 
+    def span(self, end: float) -> tuple[float, float]:
+        return _hull(self.value)
+
 
 @record
 class Step:
@@ -41,6 +59,10 @@ class Step:
 
     def __call__(self, t: Scalar) -> Array:
         return jnp.where(jnp.asarray(t) >= self.start, self.amplitude, 0.0)
+
+    def span(self, end: float) -> tuple[float, float]:
+        start = np.asarray(self.start)
+        return _hull(np.where(start > 0, 0.0, self.amplitude), np.where(start <= end, self.amplitude, 0.0))
 
     def shifted(self, by: Scalar) -> "Step":
         """The same, `by` seconds later."""
@@ -60,6 +82,11 @@ class Pulse:
         t = jnp.asarray(t)
         return jnp.where((t >= self.start) & (t < self.stop), self.amplitude, 0.0)
 
+    def span(self, end: float) -> tuple[float, float]:
+        start, stop = np.asarray(self.start), np.asarray(self.stop)
+        on, off = (start <= end) & (stop > 0), (start > 0) | (stop <= end)
+        return _hull(np.where(on, self.amplitude, 0.0), np.where(off, 0.0, self.amplitude))
+
     def shifted(self, by: Scalar) -> "Pulse":
         """The same, `by` seconds later: it never ends before it starts."""
         return dataclasses.replace(self, start=self.start + by, stop=self.stop + by)
@@ -76,6 +103,10 @@ class Sine:
     def __call__(self, t: Scalar) -> Array:
         return self.amplitude * sine(self.frequency * jnp.asarray(t) + self.phase / TWO_PI)
 
+    def span(self, end: float) -> tuple[float, float]:
+        first = np.asarray(self.phase) / TWO_PI
+        return _swing(self.amplitude, first, first + self.frequency * end)
+
 
 @record
 class SmoothStep:
@@ -89,6 +120,10 @@ class SmoothStep:
         s = (jnp.asarray(t) - self.start) / self.duration
         rising = s**3 * (10 - 15 * s + 6 * s**2)
         return self.amplitude * jnp.where(s <= 0, 0.0, jnp.where(s >= 1, 1.0, rising))
+
+    def span(self, end: float) -> tuple[float, float]:
+        shares = [np.clip((t - np.asarray(self.start)) / self.duration, 0.0, 1.0) for t in (0.0, end)]
+        return _hull(*(self.amplitude * s**3 * (10 - 15 * s + 6 * s**2) for s in shares))
 
     def shifted(self, by: Scalar) -> "SmoothStep":
         """The same, `by` seconds later."""
@@ -106,10 +141,15 @@ class Chirp:
 
     def __call__(self, t: Scalar) -> Array:
         t = jnp.asarray(t)
-        sweep = jnp.minimum(t, self.duration)
+        return self.amplitude * sine(self._cycles(t, jnp.minimum(t, self.duration)))
+
+    def _cycles(self, t: Any, sweep: Any) -> Any:
+        """Turns made by time t, `sweep` of which fell into the sweep."""
         gain = (self.frequency_end - self.frequency) / self.duration
-        cycles = self.frequency * sweep + gain * sweep**2 / 2 + self.frequency_end * (t - sweep)
-        return self.amplitude * sine(cycles)
+        return self.frequency * sweep + gain * sweep**2 / 2 + self.frequency_end * (t - sweep)
+
+    def span(self, end: float) -> tuple[float, float]:
+        return _swing(self.amplitude, np.zeros(()), self._cycles(end, np.minimum(end, self.duration)))
 
 
 # Sines in one realisation of band-limited noise. Its fourth moment falls short of a Gaussian's by 1.5/LINES of std^4.
@@ -154,6 +194,10 @@ class BandNoise:
             "band-noise is a function of time only for one member: use scenario.realised(), as a rollout does."
         )
 
+    def span(self, end: float) -> tuple[float, float]:
+        crest = math.sqrt(2 * LINES) * np.asarray(self.std)  # all sines at their crests at once: 8 std
+        return _hull(-crest, crest)
+
 
 @record
 class Sum:
@@ -167,9 +211,18 @@ class Sum:
             total = total + term(t)
         return total
 
+    def span(self, end: float) -> tuple[float, float]:
+        ends = [term.span(end) for term in self.terms]
+        return sum(low for low, _ in ends), sum(high for _, high in ends)
+
     def realised(self, key: Array) -> "Sum":
         """The sum with its random terms drawn, each from a key of its own."""
         return Sum(tuple(realised(term, jax.random.fold_in(key, n)) for n, term in enumerate(self.terms)))
+
+
+def is_random(signal: Any) -> bool:
+    """Whether members draw this signal, or a term of it."""
+    return any(map(is_random, signal.terms)) if isinstance(signal, Sum) else hasattr(signal, "realised")
 
 
 def realised(signal: Any, key: Array) -> Any:

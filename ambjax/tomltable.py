@@ -1,13 +1,56 @@
-"""One table of a TOML document being read strictly: what every reader of case files is built on."""
+"""TOML being read strictly, a file and one table of it: what every reader of case files is built on."""
 
 import dataclasses
 import difflib
+import pathlib
+import tomllib
 from typing import Any
 
 from ambjax._pytree import check_number, numbers, validate
+from ambjax._words import one_line
 
 # What of a key or a value is shown; keys beyond this length are like no other.
 LONGEST = 60
+# No case nests deeper than a sum of sums; whatever walks one may rely on it.
+DEEPEST = 32
+# No case file is larger: what is, is something else.
+MOST_BYTES = 10_000_000
+
+
+def load(path: str | pathlib.Path) -> dict[str, Any]:
+    """A case file as parsed TOML, not yet checked. Raises ValueError, one line, if it is none."""
+    path = pathlib.Path(path)
+
+    def refuse(why: str) -> ValueError:
+        return ValueError(one_line(f"{path}: {why}"))
+
+    try:
+        with path.open("rb") as file:
+            content = file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise refuse(f"cannot be read ({error.strerror}). Check the path and its permissions.") from None
+    if len(content) > MOST_BYTES:
+        raise refuse(f"more than {MOST_BYTES:,} bytes are no case file. See 'ambjax template' for one.")
+    try:
+        return tomllib.loads(content.decode("utf-8"))
+    except UnicodeDecodeError:
+        raise refuse("not a text file in UTF-8. A case file is TOML; see 'ambjax template'.") from None
+    except tomllib.TOMLDecodeError as error:
+        raise refuse(f"not valid TOML: {error}. See 'ambjax template' for a file to start from.") from None
+    except RecursionError:
+        raise refuse(f"tables or lists are nested deeper than {DEEPEST}, which no case is.") from None
+    except ValueError:  # Python converts no number of thousands of digits
+        raise refuse("a number has thousands of digits. Write it as in 1.5e3.") from None
+
+
+def check_depth(raw: Any) -> None:
+    """Refuse what is nested deeper than any case, before anything walks it."""
+    level = [raw]
+    for _ in range(DEEPEST):
+        inner = (x.values() if isinstance(x, dict) else x for x in level if isinstance(x, (dict, list)))
+        level = [x for values in inner for x in values]
+    if level:
+        raise ValueError(f"tables or lists are nested deeper than {DEEPEST}, which no case is.")
 
 
 class Table:
@@ -107,11 +150,6 @@ def show(value: Any) -> str:
 def cut(text: str) -> str:
     """The text, or its beginning if it is long."""
     return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
-
-
-def one_line(text: str) -> str:
-    """The text with line breaks and whatever else does not print written as escapes: a message is one line."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def quoted(words: list[str]) -> str:

@@ -1,11 +1,11 @@
 """The command line of the tuner: `ambjax-tune`, or `python -m tuning`."""
 
 import argparse
-import json
 import sys
+from typing import Any
 
 from ambjax import __version__
-from ambjax.__main__ import Parser, complain
+from ambjax.__main__ import Parser, answer, open_streams
 from ambjax.worker import prepare
 
 
@@ -27,20 +27,19 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Tune. Returns 0 if the tuned gains keep every held-out rotor, 1 if not, 2 for bad input."""
+    open_streams()
     args = parser().parse_args(argv)
-    prepare()
-    from tuning.command import run
 
-    try:
-        code, summary = run(args)
-    except ValueError as error:
-        return complain(str(error), "ambjax-tune")
-    except KeyboardInterrupt:
-        print("ambjax-tune: interrupted before there was anything to keep", file=sys.stderr)
-        return 130
-    if args.json:
-        print(json.dumps(summary, indent=2))
-    return code
+    def run() -> tuple[int, Any]:
+        prepare()
+        from tuning import command
+
+        try:
+            return command.run(args)
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(str(stop) or "before there was anything to keep") from None
+
+    return answer(run, args.json, "ambjax-tune")
 
 
 if __name__ == "__main__":
