@@ -25,7 +25,9 @@ def directory(asked: str | None, name: str) -> pathlib.Path:
     """
     path = chosen(asked, name)
     for kept in (MANIFEST, RESULT):
-        if (path / kept).exists():
+        with _told(path):
+            taken = (path / kept).exists()
+        if taken:
             raise ValueError(f"--out {path}: it holds the study of an ensemble ({kept}). Choose another directory.")
     make(path)
     return path
