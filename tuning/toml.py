@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 BARE = re.compile(r"[A-Za-z0-9_-]+")
-# What stands in no comment and no string, and is no text in UTF-8.
+# What may stand in no comment and no string; halves of characters are names of files that are not UTF-8.
 CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
 
