@@ -181,9 +181,8 @@ def texts(draw_from):
         elif wound == "rename":
             node[draw_from(st.sampled_from([key + "_", key[:-1] or "x", "a b", "\n", "", *TABLES]))] = node.pop(key)
         else:
-            node[draw_from(st.sampled_from(["kind", "unit", "value", "percent", "design", "tune", "x"]))] = draw_from(
-                HOSTILE
-            )
+            name = draw_from(st.sampled_from(["kind", "unit", "value", "percent", "design", "tune", "x"]))
+            node[name] = copy.deepcopy(draw_from(HOSTILE))
         if not spots(document, []):
             break
     return dumps(document)
