@@ -1,12 +1,15 @@
 """The command line: `ambjax`, or `python -m ambjax`."""
 
 import argparse
+import contextlib
 import json
 import os
 import sys
-from typing import NoReturn
+from collections.abc import Callable
+from typing import Any, NoReturn
 
 from ambjax._version import __version__
+from ambjax._words import one_line
 from ambjax.interrupts import listening
 
 
@@ -19,7 +22,8 @@ class Parser(argparse.ArgumentParser):
 
 def complain(message: str, program: str = "ambjax") -> int:
     """Say what is wrong with the input, on one line of stderr. Returns the exit code for that."""
-    print(f"{program}: {message}", file=sys.stderr)
+    with contextlib.suppress(OSError):
+        print(one_line(f"{program}: {message}"), file=sys.stderr)
     return 2
 
 
@@ -74,25 +78,59 @@ def _seeded(command: Parser) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command. Returns its exit code: 0 done, 1 the answer is no, 2 bad input."""
+    open_streams()
+    given = sys.argv[1:] if argv is None else argv
+    if given[:1] == ["tune"]:
+        return complain("tuning is a program of its own: write 'ambjax-tune CASE.toml'. See 'ambjax-tune --help'.")
     with listening("ambjax"):
-        return _run(parser().parse_args(argv))
+        args = parser().parse_args(given)
+        return answer(lambda: _run(args), args.json)
 
 
-def _run(args: argparse.Namespace) -> int:
+def _run(args: argparse.Namespace) -> tuple[int, Any]:
+    from ambjax import commands, worker
+
+    worker.prepare()
+    return getattr(commands, f"run_{args.command}")(args)
+
+
+def open_streams() -> None:
+    """Give streams that the caller has closed an end: print would put on stdout what is meant for a missing stderr.
+
+    In the order of their numbers, so that no file that is opened later takes the place of one.
+    """
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115, PTH123
+
+
+def answer(run: Callable[[], tuple[int, Any]], as_json: bool, program: str = "ambjax") -> int:
+    """Run a command and print its summary if that was asked for. Returns the exit code; what goes wrong is one line."""
     try:
-        from ambjax import commands, worker
-
-        worker.prepare()
-        code, summary = getattr(commands, f"run_{args.command}")(args)
-        if args.json:
+        code, summary = run()
+        if as_json:
             print(json.dumps(summary, indent=2))
         sys.stdout.flush()
     except ValueError as error:
-        return complain(str(error))
+        return complain(str(error), program)
     except BrokenPipeError:  # whoever read the answer has seen enough of it
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
+        _silence()
         return 0
+    except OSError as error:
+        _silence()
+        where = f"{error.filename}: " if error.filename else "the answer could not be written: "
+        return complain(f"{where}{error.strerror or error}. Make room, or write somewhere else.", program)
+    except MemoryError:
+        return complain("there is not enough memory for that. Ask for less at once: fewer members or samples.", program)
+    except KeyboardInterrupt as stop:
+        complain(f"interrupted{f': {stop}' if str(stop) else ''}.", program)
+        return 130
     return code
+
+
+def _silence() -> None:
+    """Let nothing more be written to a stdout that takes nothing, at the end of the program above all."""
+    sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
 
 
 if __name__ == "__main__":

@@ -30,18 +30,22 @@ def leaf(
     doc: str = "",
     above: float | None = None,
     at_least: float | None = None,
+    at_most: float | None = None,
     infinite: bool = False,
     optional: bool = False,
 ) -> Any:
     """A numeric field: its unit, its bounds and what it means.
 
-    `above` and `at_least` bound it from below; `infinite` admits +inf; `optional` admits None.
+    `above` and `at_least` bound it from below, `at_most` from above; `infinite` admits +inf beside what they
+    allow; `optional` admits None. The bounds lie decades beyond what is built, so that no product of a few numbers
+    overflows and none of two such numbers is taken for 0.
     """
     metadata = {
         "unit": unit,
         "doc": doc,
         "above": above,
         "at_least": at_least,
+        "at_most": at_most,
         "infinite": infinite,
         "optional": optional,
         "leaf": True,
@@ -49,12 +53,21 @@ def leaf(
     return dataclasses.field(default=default, metadata=metadata)
 
 
+# Ends of a gain's range: its unit, and so its size, depends on the law and the plant.
+GAINS = 1e-30, 1e30
+
+
+def gain(*, default: Any, unit: str, doc: str) -> Any:
+    """A positive numeric field over all decades, which may be tuned on a scale of logarithms."""
+    return leaf(default=default, unit=unit, doc=doc, above=GAINS[0], at_most=GAINS[1])
+
+
 def static(default: Any = dataclasses.MISSING, *, doc: str = "") -> Any:
     """A field that is part of the structure (hashable, never traced)."""
     return dataclasses.field(default=default, metadata={"static": True, "doc": doc})
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(leaf, static, dataclasses.field))
+@dataclass_transform(frozen_default=True, field_specifiers=(leaf, gain, static, dataclasses.field))
 def record(cls: type[T]) -> type[T]:
     """Make `cls` a frozen dataclass and register it as a pytree.
 
@@ -104,21 +117,29 @@ def is_traced(x: Any) -> bool:
 def numbers(field: dataclasses.Field) -> str:
     """What a field allows, in words."""
     meta = field.metadata
-    kind = "a number" if meta["infinite"] else "a finite number"
+    above, at_least, at_most = meta["above"], meta["at_least"], meta["at_most"]
     unit = f" ({meta['unit']})" if meta["unit"] else ""
-    if meta["above"] is not None:
-        return f"{kind} above {meta['above']:g}{unit}"
-    if meta["at_least"] is not None:
-        return f"{kind} of at least {meta['at_least']:g}{unit}"
-    return f"{kind}{unit}"
+    end = f"{unit}, or inf" if meta["infinite"] else unit
+    kind = "a number" if meta["infinite"] else "a finite number"
+    if above is not None:
+        return f"{kind} above {above:g}{'' if at_most is None else f' and at most {at_most:g}'}{end}"
+    if at_least is not None:
+        return f"{kind} {f'of at least {at_least:g}' if at_most is None else f'from {at_least:g} to {at_most:g}'}{end}"
+    return f"{kind}{end}"
 
 
 def within(meta: Any, value: Any) -> bool:
     """Whether a number, or every number of an array, is what a field with this metadata allows."""
-    above, at_least = meta["above"], meta["at_least"]
     if isinstance(value, (int, float)):
-        finite = value == value if meta["infinite"] else math.isfinite(value)
-        return finite and (above is None or value > above) and (at_least is None or value >= at_least)
+        if value == math.inf:
+            return meta["infinite"]
+        above, at_least, at_most = meta["above"], meta["at_least"], meta["at_most"]
+        return (  # nothing of this holds for NaN
+            -math.inf < value
+            and (above is None or value > above)
+            and (at_least is None or value >= at_least)
+            and (at_most is None or value <= at_most)
+        )
     low, high = np.min(value), np.max(value)  # NaN carries through both
     return all(within(meta, float(x)) for x in (low, high))
 
@@ -127,6 +148,17 @@ def _example(field: dataclasses.Field) -> str:
     default = field.default
     usable = isinstance(default, (int, float)) and math.isfinite(default)
     return f" Use {default:g}, for example." if usable else ""
+
+
+def check_number(field: dataclasses.Field, name: str, value: Any) -> None:
+    """Raise ValueError, with the dotted name, the value and what is allowed, for a number that its field does not."""
+    try:
+        number = value if isinstance(value, (int, float)) else np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not within(field.metadata, number):
+        shown = f"{value:g}" if isinstance(value, (int, float)) else _worst(value, number)
+        raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.{_example(field)}")
 
 
 def validate(node: Any, path: str = "") -> None:
@@ -143,7 +175,7 @@ def validate(node: Any, path: str = "") -> None:
         if not is_leaf:
             validate(value, f"{path}.{field.name}".lstrip("."))
         elif not (is_traced(value) or (value is None and field.metadata["optional"])):
-            _check(field, path, value)
+            check_number(field, f"{path}.{field.name}".lstrip("."), value)
 
 
 @functools.cache
@@ -151,17 +183,6 @@ def _fields(kind: type) -> tuple[tuple[dataclasses.Field, bool], ...]:
     """Fields of a record, and whether each is a number; none of any other type. Every rollout asks for them."""
     fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
     return tuple((field, bool(field.metadata.get("leaf"))) for field in fields)
-
-
-def _check(field: dataclasses.Field, path: str, value: Any) -> None:
-    try:
-        number = value if isinstance(value, (int, float)) else np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not within(field.metadata, number):
-        name = f"{path}.{field.name}".lstrip(".")
-        shown = f"{value:g}" if isinstance(value, (int, float)) else _worst(value, number)
-        raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.{_example(field)}")
 
 
 def _worst(value: Any, number: Any) -> str:

@@ -7,10 +7,12 @@ ValueError whose one line names the dotted path, the value, what is allowed and 
 import dataclasses
 import math
 import pathlib
-import tomllib
+import re
 from typing import Any
 
 from ambjax import signals
+from ambjax._pytree import leaf, numbers
+from ambjax._words import one_line
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, corners
@@ -18,10 +20,11 @@ from ambjax.explicit import DOP853, RK4, Euler
 from ambjax.integrate import Adaptive, Integrator, Rodas3, Slide
 from ambjax.method import with_method
 from ambjax.plant import Plant
+from ambjax.reach import check_reference
 from ambjax.scenario import Clock, Initial, Scenario, Sensor
 from ambjax.sliding import slides
 from ambjax.spreadfile import spread_from
-from ambjax.tomltable import Table, show
+from ambjax.tomltable import Table, check_depth, load, show
 
 # The laws by stage and kind; the first of a stage is the default. A new law is one row here.
 KINDS: dict[str, dict[str, type]] = {
@@ -48,6 +51,14 @@ OTHERS = ["tune"]  # read by ambjax-tune; the commands here pass it by
 UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
 # Rows that a run may record: 16 numbers each, so this is about 2.5 GB.
 MOST_SAMPLES = 20_000_000
+# Steps of a run with a given dt: hours. And terms of a sum: each is compiled.
+MOST_STEPS, MOST_TERMS = 10_000_000_000, 100
+DURATION = leaf(default=2.0, unit="s", at_least=1e-9, at_most=1e6, doc="simulated time")
+DT = leaf(default=1e-6, unit="s", at_least=1e-15, at_most=1e6, doc="integration step")
+SETTLE = leaf(default=0.5, unit="s", at_least=0, at_most=1e6, doc='from when "settled" metrics count')
+FIELDS = {field.name: field for kind in (Scenario, Clock) for field in dataclasses.fields(kind)}
+# A name enters titles, paths, tables and pages: whatever means something there is left out of it.
+UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,24 +83,17 @@ def read_case(path: str | pathlib.Path) -> Case:
     try:
         return case_from(raw, path.stem)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise ValueError(one_line(f"{path}: {error}")) from None
 
 
-def load(path: str | pathlib.Path) -> dict[str, Any]:
-    """A case file as parsed TOML, not yet checked. Raises ValueError, one line, if it is none."""
-    path = pathlib.Path(path)
-    try:
-        return tomllib.loads(path.read_bytes().decode("utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror}). Check the path and its permissions.") from None
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: not a text file in UTF-8. A case file is TOML; see 'ambjax template'.") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path}: not valid TOML: {error}. See 'ambjax template' for a file to start from.") from None
+def safe_name(text: str) -> str:
+    """The text without what means something in a path, a title, a table or a page, and not too long."""
+    return UNSAFE.sub("_", text)[:LONGEST_NAME].strip() or "case"
 
 
 def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     """A case from a parsed TOML document. Raises ValueError as `read_case` does."""
+    check_depth(raw)
     top = Table(raw)
     top.only([*TABLES, *OTHERS])
     plant = top.table("plant").record(Plant)
@@ -106,8 +110,9 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     elif settle >= duration:
         raise ValueError(f"run.settle = {settle:g} s: it must be less than clock.duration = {duration:g} s.")
     spread = spread_from(top, cascade, scenario)
+    check_reference(spread, cascade, scenario, clock)
     clock = with_method(clock, *corners(spread, cascade, scenario))
-    return Case(name, cascade, scenario, clock, settle, spread)
+    return Case(safe_name(name), cascade, scenario, clock, settle, spread)
 
 
 def _cascade(table: Table, plant: Plant) -> Cascade:
@@ -128,6 +133,8 @@ def _signal(table: Table, extra: tuple[str, ...] = ()) -> Any:
         terms = table.raw.get("terms")
         if not isinstance(terms, list) or not terms:
             raise ValueError(f"{table.at('terms')} = {show(terms)}: give a list of at least one signal table.")
+        if len(terms) > MOST_TERMS:
+            raise ValueError(f"{table.at('terms')}: {len(terms)} terms are too many; give at most {MOST_TERMS}.")
         return signals.Sum(tuple(_signal(Table(t, f"{table.at('terms')}[{n}]")) for n, t in enumerate(terms)))
     return table.record(SIGNALS[kind], extra=("kind", *extra))
 
@@ -146,22 +153,17 @@ def _scenario(top: Table, plant: Plant) -> tuple[Scenario, float | None]:
     actuator, run = top.table("actuator"), top.table("run")
     actuator.only(["u_max"])
     run.only(["seed", "settle", "clearance"])
-    settle = run.number("settle", None, "a number of seconds, 0 or more")
-    if settle is not None and not settle >= 0:
-        raise ValueError(f"{run.at('settle')} = {settle:g}: it must be a number of seconds, 0 or more.")
+    settle = run.leaf("settle", SETTLE)
     scenario = Scenario(
         plant=plant,
         reference=_signal(top.table("reference")) if "reference" in top.raw else signals.Constant(),
         sensor=top.table("sensor").record(Sensor) if "sensor" in top.raw else None,
         initial=top.table("initial").record(Initial),
-        u_max=actuator.number("u_max", math.inf),
-        clearance=run.number("clearance", None),
+        u_max=actuator.leaf("u_max", FIELDS["u_max"], math.inf),
+        clearance=run.leaf("clearance", FIELDS["clearance"]),
         seed=_seed(run),
         **_disturbances(top.table("disturbance")),
     )
-    for path, part in (("actuator.u_max", scenario.u_max), ("run.clearance", scenario.clearance)):
-        if part is not None and not part > 0:
-            raise ValueError(f"{path} = {part:g}: it must be a number above 0. Leave it out for the default.")
     return scenario, settle
 
 
@@ -185,12 +187,8 @@ def _check_start(scenario: Scenario) -> None:
 
 def _clock(table: Table) -> tuple[Clock, float]:
     table.only(["duration", "sample_period", "dt", "method"])
-    times = {}
-    for key, default in (("duration", 2.0), ("sample_period", 1e-4)):
-        times[key] = table.number(key, default, "a number of seconds above 0")
-        if not 0 < times[key] < math.inf:
-            raise ValueError(f"{table.at(key)} = {times[key]:g}: it must be a finite number of seconds above 0.")
-    duration, period = times["duration"], times["sample_period"]
+    duration = table.leaf("duration", DURATION, DURATION.default)
+    period = table.leaf("sample_period", FIELDS["sample_period"], FIELDS["sample_period"].default)
     samples = _whole(duration / period)
     if samples is None:
         nearest = max(round(duration / period), 1) * period
@@ -203,7 +201,7 @@ def _clock(table: Table) -> tuple[Clock, float]:
             f"{table.at('duration')} = {duration:g} s makes {samples:,} samples of {period:g} s; at most "
             f"{MOST_SAMPLES:,} can be recorded. Shorten the run or lengthen clock.sample_period."
         )
-    return Clock(samples, period, _method(table, period)), duration
+    return Clock(samples, period, _method(table, period, samples)), duration
 
 
 def _whole(ratio: float) -> int | None:
@@ -212,14 +210,14 @@ def _whole(ratio: float) -> int | None:
     return nearest if nearest >= 1 and abs(ratio - nearest) <= 1e-9 * nearest else None
 
 
-def _method(table: Table, period: float) -> Integrator | None:
+def _method(table: Table, period: float, samples: int) -> Integrator | None:
     dt = table.raw.get("dt", "auto")
     if dt == "auto":
         name = table.choice("method", ["auto", "adaptive", "sliding"], "auto") if "method" in table.raw else "auto"
         return {"auto": None, "adaptive": Adaptive(), "sliding": Slide(SLIDING_SUBSTEPS)}[name]
-    dt = table.number("dt", None, '"auto" or a number of seconds above 0')
-    if not 0 < dt < math.inf:
-        raise ValueError(f'{table.at("dt")} = {dt:g}: it must be "auto" or a finite number of seconds above 0.')
+    if isinstance(dt, str):
+        raise ValueError(f'{table.at("dt")} = {show(dt)}: it must be "auto" or {numbers(DT)}.')
+    dt = table.leaf("dt", DT)
     method = METHODS[table.choice("method", list(METHODS), "rk4")]
     substeps = _whole(period / dt)
     if substeps is None:
@@ -227,5 +225,10 @@ def _method(table: Table, period: float) -> Integrator | None:
         raise ValueError(
             f"{table.at('dt')} = {dt:g} s does not divide clock.sample_period = {period:g} s. "
             f'The nearest step that does is {nearest:.12g} s; or use dt = "auto".'
+        )
+    if samples * substeps > MOST_STEPS:
+        raise ValueError(
+            f"{table.at('dt')} = {dt:g} s makes {samples * substeps:.3g} steps; at most {MOST_STEPS:.0e} are taken. "
+            'Use dt = "auto", or shorten clock.duration.'
         )
     return method(substeps)

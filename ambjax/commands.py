@@ -19,11 +19,12 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax._pytree import canonical
-from ambjax.casefile import Case, read_case
+from ambjax.casefile import Case
+from ambjax.doubts import read_aloud
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.loop import ClosedLoop
 from ambjax.metrics import Standard
-from ambjax.outputs import directory, plain, say, table, write_json
+from ambjax.outputs import directory, files, plain, say, table, write_json
 from ambjax.rollout import Outcome, begin_jit, finish, segment_jit
 
 if TYPE_CHECKING:
@@ -63,21 +64,22 @@ def run_template(args: argparse.Namespace) -> tuple[int, Summary]:
 
 def run_simulate(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax simulate."""
-    case = _member(read_case(args.case), args)
+    case = _member(read_aloud(args.case), args)
     window = _window(case, args)
     out = directory(args.out, f"simulate-{case.name}")
     say(f"method: {case.clock.method}")
     trajectory, measured = simulate(case)
-    trajectory.save(out / "trajectory.npz")
     metrics = plain(measured) | {
         "lost_why": trajectory.lost_why,
         "method": str(case.clock.method),
         "settle_s": case.settle,
     }
-    write_json(out / "metrics.json", metrics)
     from ambjax.overview import overview
 
-    overview(trajectory, f"{case.name}: {case.clock.method}", out / "overview.png", window)
+    with files(out) as part:
+        trajectory.save(part / "trajectory.npz")
+        write_json(part / "metrics.json", metrics)
+        overview(trajectory, f"{case.name}: {case.clock.method}", part / "overview.png", window)
     if not args.json:
         print(_metrics_text(metrics))
         print(f"written: {out}/trajectory.npz, metrics.json, overview.png")
@@ -107,6 +109,8 @@ def _member(case: Case, args: argparse.Namespace) -> Case:
         if args.seed is not None or args.members is not None:
             raise ValueError("--seed and --members belong to --member: add it, or set run.seed in the case file.")
         return case
+    if not (case.spread.entries or case.scenario.random):
+        raise ValueError("--member: nothing in this case differs from member to member; add [spread], or leave it out.")
     if case.spread.design == "latin-hypercube" and args.members is None:
         raise ValueError("--member: add --members N, the size of the ensemble; a Latin hypercube depends on it.")
     from ambjax.studies import study_of
@@ -145,7 +149,7 @@ def run_check(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax check."""
     from ambjax.theorem import check
 
-    case = read_case(args.case)
+    case = read_aloud(args.case)
     report = check(case.cascade, case.scenario, case.clock)
     summary = {
         "holds": report.holds,
@@ -213,9 +217,12 @@ def run_reproduce(args: argparse.Namespace) -> tuple[int, Summary]:
     out = directory(args.out, "reproduce")
     began = time.perf_counter()
     stages = 2 * 7 + 1
-    with tqdm(
-        total=stages, unit="stage", delay=2, leave=False, bar_format="{l_bar}{bar}| {n}/{total} [{elapsed}]"
-    ) as bar:
+    with (
+        files(out) as part,
+        tqdm(
+            total=stages, unit="stage", delay=2, leave=False, bar_format="{l_bar}{bar}| {n}/{total} [{elapsed}]"
+        ) as bar,
+    ):
 
         def stage(text: str) -> None:
             bar.set_description_str(f"{text:<34}")
@@ -227,18 +234,18 @@ def run_reproduce(args: argparse.Namespace) -> tuple[int, Summary]:
             tuned = other.submit(gather, "tuned")
             for reading in paper.READINGS:
                 evidence[reading] = tuned.result() if reading == "tuned" else gather(reading, stage)
-                drawn.append(artist.submit(_paper_figures, reading, evidence[reading], out))
+                drawn.append(artist.submit(_paper_figures, reading, evidence[reading], part))
             stage("figures and ledger")
             for job in drawn:
                 job.result()
         std = paper.TABLE_2.noise_std
         words = f"Tracking under the paper's noise (std {std:.2g} m on z) and a {paper.SUPPLY:g} V supply"
         plotting.readings(
-            {name: seen.noisy for name, seen in evidence.items()}, words, paper.SETTLE, out / "readings.png"
+            {name: seen.noisy for name, seen in evidence.items()}, words, paper.SETTLE, part / "readings.png"
         )
         claims, noise = ledger.judge(evidence), ledger.noise_table(evidence)
-        (out / "ledger.md").write_text(ledger.markdown(claims, noise), encoding="utf-8")
-        write_json(out / "ledger.json", {"claims": claims, "noise": noise})
+        (part / "ledger.md").write_text(ledger.markdown(claims, noise), encoding="utf-8")
+        write_json(part / "ledger.json", {"claims": claims, "noise": noise})
     if not args.json:
         rows = [(c["says"], c["paper"], *(f["verdict"] for f in c["findings"].values())) for c in claims]
         print(table(("claim", "paper", *paper.READINGS), rows))

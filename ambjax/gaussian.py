@@ -1,7 +1,8 @@
 """Gaussian numbers by counter: any sample of any member at once, in a few vector operations each.
 
-jax.random.normal draws the same by the inverse error function, whose logarithm is a library call for every number
-on CPUs: twenty times what a step of the loop costs. Here Threefry's words go through Box and Muller's transform.
+jax.random.normal draws from the same distribution, other numbers, by the inverse error function, whose logarithm is a
+library call for every number on CPUs: twenty times what a step of the loop costs. Here Threefry's words go through Box
+and Muller's transform.
 """
 
 from typing import Any

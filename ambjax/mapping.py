@@ -1,30 +1,39 @@
 """`ambjax map`: survival and error over a grid of two quantities, for one case or for several side by side."""
 
 import argparse
+import dataclasses
 import math
 from typing import Any
 
 import numpy as np
 
-from ambjax.casefile import Case, read_case
+from ambjax._pytree import numbers, within
+from ambjax.casefile import MOST_SAMPLES, Case
+from ambjax.doubts import read_aloud
 from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid
 from ambjax.ensemble.paths import places
-from ambjax.outputs import directory, plain, say, table, write_json
+from ambjax.outputs import directory, files, plain, say, table, write_json
+from ambjax.scenario import Clock
 from ambjax.studies import study_of
 
 COUNT = 21
 MOST_CELLS = 1_000_000
+# Samples of all runs of a map over clock.sample_period: hours.
+MOST_TOTAL = 10_000_000_000
+SAMPLE_PERIOD = next(field for field in dataclasses.fields(Clock) if field.name == "sample_period")
 FORM = "PATH=LOW:HIGH[:COUNT][:log], as in initial.z=-1e-3:1e-3:41 or plant.m=-20%:20%"
 
 
 def run_map(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """ambjax map."""
-    cases = [read_case(path) for path in [args.case, *(args.against or [])]]
+    cases = [read_aloud(path) for path in [args.case, *(args.against or [])]]
     studies = [study_of(case, args.seed, args.members) for case in cases]
     axes = [(_axis("--x", args.x, case), _axis("--y", args.y, case)) for case in cases]
     cells = len(axes[0][0].values) * len(axes[0][1].values)
     if cells * args.members > MOST_CELLS:
         raise ValueError(f"--members {args.members}: {cells} cells of so many exceed {MOST_CELLS:,} runs. Take fewer.")
+    for case, (x, y) in zip(cases, axes, strict=True):
+        _check_samples(case, x, y, args.members)
     maps = []
     for case, study, (x, y) in zip(cases, studies, axes, strict=True):
         say(f"{case.name}: {cells} cells of {args.members}; method: {case.clock.method}")
@@ -32,9 +41,10 @@ def run_map(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
             say(f"{case.name}: nominal, its [spread] is not drawn; --members N, N above 1, draws it.")
         maps.append(grid(study, x, y))
     out = directory(args.out, f"map-{cases[0].name}")
-    _draw(cases, maps, out / "map.png")
     summary = {"cases": [_summary(case, found) for case, found in zip(cases, maps, strict=True)], "out": str(out)}
-    write_json(out / "map.json", summary)
+    with files(out) as part:
+        _draw(cases, maps, part / "map.png")
+        write_json(part / "map.json", summary)
     if not args.json:
         print(_text(cases, maps))
         print(f"written: {out}/map.png, map.json")
@@ -62,11 +72,33 @@ def _axis(flag: str, text: str, case: Case) -> Axis:
         raise refuse(str(error)) from None
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise refuse(f"the range must rise from one finite number to another, and it is {low:g} to {high:g}")
-    if count < 2:
-        raise refuse(f"there must be at least 2 values, and there are {count}")
+    if not 2 <= count <= MOST_CELLS:
+        raise refuse(f"there must be 2 to {MOST_CELLS:,} values, and there are {count}")
+    field = SAMPLE_PERIOD if path == PERIOD else known[path].field if path in known else None
+    if field is not None and not within(field.metadata, np.array([low, high])):
+        raise refuse(f"{path} must be {numbers(field)}, and the range is {low:g} to {high:g}")
     if log and low <= 0:
         raise refuse(f"a logarithmic range must begin above 0, and it begins at {low:g}")
     return Axis(path, np.geomspace(low, high, count) if log else np.linspace(low, high, count), log)
+
+
+def _check_samples(case: Case, x: Axis, y: Axis, members: int) -> None:
+    """Refuse sample periods beyond the run, and more samples than can be waited for."""
+    for flag, axis, other in (("--x", x, y), ("--y", y, x)):
+        if axis.path != PERIOD:
+            continue
+        duration, low, high = float(case.clock.duration), float(axis.values[0]), float(axis.values[-1])
+        total = np.sum(duration / axis.values) * len(other.values) * members
+        if high > duration:
+            raise ValueError(
+                f"{flag} {PERIOD}: it reaches {high:g} s, but clock.duration is {duration:g} s. End it there."
+            )
+        if duration / low > MOST_SAMPLES or total > MOST_TOTAL:
+            raise ValueError(
+                f"{flag} {PERIOD}: from {low:g} s on it makes runs of up to {duration / low:.3g} samples, {total:.3g} "
+                f"in all; at most {MOST_SAMPLES:,} and {MOST_TOTAL:.0e} are taken. Begin it higher, or shorten "
+                "clock.duration."
+            )
 
 
 def _nominal(place: Any) -> float | None:

@@ -1,29 +1,48 @@
-"""What the commands write: directories, JSON, tables."""
+"""What the commands write: directories, files, JSON, tables, and remarks on stderr.
 
+Every file goes through `files`: all that a command writes is in its directory at once, or nothing of it is.
+"""
+
+import contextlib
 import itertools
 import json
 import math
 import pathlib
 import sys
-from collections.abc import Iterable, Sequence
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+
+from ambjax.ensemble.store import MANIFEST, RESULT
 
 
 def directory(asked: str | None, name: str) -> pathlib.Path:
     """The directory to write to: as asked, or a new one under ./out. Made, and seen to be writable.
 
-    Raises ValueError if it cannot be made or written.
+    Raises ValueError if it cannot be made or written, or holds a study, whose files are not to be mixed with others.
     """
     path = chosen(asked, name)
+    for kept in (MANIFEST, RESULT):
+        with _told(path):
+            taken = (path / kept).exists()
+        if taken:
+            raise ValueError(f"--out {path}: it holds the study of an ensemble ({kept}). Choose another directory.")
     make(path)
     return path
 
 
 def chosen(asked: str | None, name: str) -> pathlib.Path:
-    """The directory to write to, which need not exist yet: as asked, or a new one under ./out."""
+    """The directory to write to, which need not exist yet: as asked, or a new one under ./out.
+
+    Raises ValueError for one without a name.
+    """
     if asked is not None:
+        if not asked.strip():
+            raise ValueError(
+                "--out: the name of the directory is empty. Give one, '.' for this folder, or leave it out."
+            )
         return pathlib.Path(asked)
     candidates = (pathlib.Path("out") / (name if n == 1 else f"{name}-{n}") for n in itertools.count(1))
     return next(p for p in candidates if not p.exists())
@@ -31,13 +50,42 @@ def chosen(asked: str | None, name: str) -> pathlib.Path:
 
 def make(path: pathlib.Path) -> None:
     """Make a directory and see that it can be written. Raises ValueError if not."""
-    try:
+    with _told(path):
         path.mkdir(parents=True, exist_ok=True)
         probe = path / ".ambjax-write-test"
         probe.touch()
         probe.unlink()
+
+
+@contextlib.contextmanager
+def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
+    """A folder to write in: what it holds at the end of the block moves into `out`, and nothing does if that fails.
+
+    A directory that is empty then goes too. Raises ValueError where the disk is full or `out` cannot be written.
+    """
+    with _told(out):
+        try:
+            with tempfile.TemporaryDirectory(prefix=".ambjax-", dir=out, ignore_cleanup_errors=True) as folder:
+                part = pathlib.Path(folder)
+                yield part
+                for file in sorted(p for p in part.rglob("*") if p.is_file()):
+                    to = out / file.relative_to(part)
+                    to.parent.mkdir(parents=True, exist_ok=True)
+                    file.replace(to)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                out.rmdir()
+            raise
+
+
+@contextlib.contextmanager
+def _told(out: pathlib.Path) -> Iterator[None]:
+    """What the system has against writing, as a ValueError that names --out."""
+    try:
+        yield
     except OSError as error:
-        raise ValueError(f"--out {path}: cannot write there ({error.strerror}). Choose another directory.") from None
+        why = error.strerror or str(error)
+        raise ValueError(f"--out {out}: cannot write there ({why}). Make room, or choose another directory.") from None
 
 
 def plain(value: Any) -> Any:
@@ -65,5 +113,6 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def say(text: str) -> None:
-    """Progress and remarks go to stderr, so that stdout is the answer alone."""
-    print(text, file=sys.stderr, flush=True)
+    """Progress and remarks go to stderr, so that stdout is the answer alone. One that cannot be said stops nothing."""
+    with contextlib.suppress(OSError, ValueError):
+        print(text, file=sys.stderr, flush=True)

@@ -13,7 +13,7 @@ from ambjax.control.laws import Measurement
 from ambjax.gaussian import normals
 from ambjax.integrate import Integrator
 from ambjax.plant import Plant
-from ambjax.signals import Constant, Signal, realised
+from ambjax.signals import Constant, Signal, is_random, realised
 
 # A member's randomness beside its sensors': folded into its key where they fold the sample number, beyond any of those.
 DESIGN_STREAM, SIGNAL_STREAM = np.uint32(2**32 - 1), np.uint32(2**32 - 2)
@@ -22,11 +22,11 @@ SIGNALS = ("reference", "q_z", "q_v", "q_i")
 
 @record
 class Sensor:
-    """Gaussian noise on each measurement, drawn once per sample period and held."""
+    """Gaussian noise on each measurement, drawn once per sample period and held; the state itself is seen at once."""
 
-    std: Scalar = leaf(default=0.0, unit="m", at_least=0, doc="standard deviation on z")
-    std_z_dot: Scalar = leaf(default=0.0, unit="m/s", at_least=0, doc="standard deviation on z_dot")
-    std_i: Scalar = leaf(default=0.0, unit="A", at_least=0, doc="standard deviation on i")
+    std: Scalar = leaf(default=0.0, unit="m", at_least=0, at_most=1.0, doc="standard deviation on z")
+    std_z_dot: Scalar = leaf(default=0.0, unit="m/s", at_least=0, at_most=1e6, doc="standard deviation on z_dot")
+    std_i: Scalar = leaf(default=0.0, unit="A", at_least=0, at_most=1e6, doc="standard deviation on i")
 
     def noise(self, key: tuple[Scalar, Scalar], sample: Scalar) -> Measurement:
         """The errors of sample number `sample` for the member with these words (Scenario.words)."""
@@ -38,9 +38,9 @@ class Sensor:
 class Initial:
     """State of the plant at t = 0."""
 
-    z: Scalar = leaf(default=0.0, unit="m", doc="displacement; within the clearance")
-    z_dot: Scalar = leaf(default=0.0, unit="m/s", doc="its rate")
-    i: Scalar = leaf(default=0.0, unit="A", doc="current deviation")
+    z: Scalar = leaf(default=0.0, unit="m", at_least=-1.0, at_most=1.0, doc="displacement; within the clearance")
+    z_dot: Scalar = leaf(default=0.0, unit="m/s", at_least=-1e6, at_most=1e6, doc="its rate")
+    i: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="current deviation")
 
 
 @record
@@ -57,17 +57,26 @@ class Scenario:
     """disturbance of the current's rate, A/s"""
     sensor: Sensor | None = None
     initial: Initial = Initial()
-    u_max: Scalar = leaf(default=jnp.inf, unit="V", above=0, infinite=True, doc="limit of the supply; inf: none")
-    clearance: Scalar | None = leaf(
-        default=None, unit="m", above=0, optional=True, doc="|z| of touch-down; none: 0.9 s_0"
+    u_max: Scalar = leaf(
+        default=jnp.inf, unit="V", at_least=1e-9, at_most=1e12, infinite=True, doc="limit of the supply; inf: none"
     )
-    seed: Scalar = leaf(default=0, at_least=0, doc="seed of the noise")
-    member: Scalar = leaf(default=0, at_least=0, doc="member of an ensemble")
+    clearance: Scalar | None = leaf(
+        default=None, unit="m", at_least=1e-9, at_most=1.0, optional=True, doc="|z| of touch-down; none: 0.9 s_0"
+    )
+    seed: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, doc="seed of the noise")
+    member: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, doc="member of an ensemble")
 
     @property
     def touchdown(self) -> Scalar:
         """|z| at which the rotor touches down, m."""
         return 0.9 * self.plant.s_0 if self.clearance is None else self.clearance
+
+    @property
+    def random(self) -> bool:
+        """Whether two members of this scenario meet something else: noise, or a signal that is drawn."""
+        sensor = self.sensor
+        noisy = sensor is not None and bool(np.any([sensor.std, sensor.std_z_dot, sensor.std_i]))
+        return noisy or any(is_random(getattr(self, slot)) for slot in SIGNALS)
 
     def acceleration(self, t: Scalar) -> Array:
         """The whole disturbance of Eq. (1) at time t: q_z + a q_v, m/s^2."""
@@ -96,10 +105,12 @@ class Scenario:
 
 @record
 class Clock:
-    """Samples, their period, and the method that integrates between them. `method` None: choose (see `auto`)."""
+    """Samples, their period, and the integrator between them. `method` None: `ambjax.with_method` chooses."""
 
     samples: int = static(default=20_000, doc="number of sample periods")
-    sample_period: Scalar = leaf(default=1e-4, unit="s", above=0, doc="time for which a measurement is held")
+    sample_period: Scalar = leaf(
+        default=1e-4, unit="s", at_least=1e-9, at_most=1e6, doc="time for which a measurement's error is held"
+    )
     method: Any = None
 
     @property

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ambjax._pytree import Scalar, leaf, record
@@ -17,30 +18,51 @@ from ambjax.smooth import TWO_PI, sine
 
 
 class Signal(Protocol):
-    """Anything that maps a time in seconds to a value."""
+    """Anything that maps a time in seconds to a value. `span` gives an interval that it never leaves in 0..end (s)."""
 
     def __call__(self, t: Scalar, /) -> Array: ...
+    def span(self, end: float, /) -> tuple[float, float]: ...
+
+
+def _hull(*values: Any) -> tuple[float, float]:
+    """The least and the largest of several numbers, or arrays of them."""
+    return float(min(map(np.min, values))), float(max(map(np.max, values)))
+
+
+def _swing(amplitude: Scalar, first: Scalar, last: Scalar) -> tuple[float, float]:
+    """Least and largest amplitude sin(2 pi x) for x from first to last, turns."""
+    ends = [np.sin(TWO_PI * (x - np.floor(x))) for x in (first, last)]
+    crest, trough = (np.ceil(first - at) <= last - at for at in (0.25, 0.75))
+    high, low = np.where(crest, 1.0, np.maximum(*ends)), np.where(trough, -1.0, np.minimum(*ends))
+    return _hull(amplitude * low, amplitude * high)
 
 
 @record
 class Constant:
     """The same value at all times."""
 
-    value: Scalar = leaf(default=0.0, doc="the value")
+    value: Scalar = leaf(default=0.0, at_least=-1e20, at_most=1e20, doc="the value")
 
     def __call__(self, t: Scalar) -> Array:
         return self.value + 0.0 * jnp.asarray(t)
+
+    def span(self, end: float) -> tuple[float, float]:
+        return _hull(self.value)
 
 
 @record
 class Step:
     """0 before `start`, `amplitude` from then on."""
 
-    amplitude: Scalar = leaf(doc="height")
-    start: Scalar = leaf(default=0.0, unit="s", doc="when it rises")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height")
+    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="when it rises")
 
     def __call__(self, t: Scalar) -> Array:
         return jnp.where(jnp.asarray(t) >= self.start, self.amplitude, 0.0)
+
+    def span(self, end: float) -> tuple[float, float]:
+        start = np.asarray(self.start)
+        return _hull(np.where(start > 0, 0.0, self.amplitude), np.where(start <= end, self.amplitude, 0.0))
 
     def shifted(self, by: Scalar) -> "Step":
         """The same, `by` seconds later."""
@@ -51,14 +73,19 @@ class Step:
 class Pulse:
     """`amplitude` in start <= t < stop, 0 elsewhere."""
 
-    amplitude: Scalar = leaf(doc="height")
-    start: Scalar = leaf(unit="s", doc="when it rises")
-    stop: Scalar = leaf(unit="s", doc="when it falls; later than start")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height")
+    start: Scalar = leaf(unit="s", at_least=-1e9, at_most=1e9, doc="when it rises")
+    stop: Scalar = leaf(unit="s", at_least=-1e9, at_most=1e9, doc="when it falls; later than start")
     ordered: ClassVar = ("start", "stop")
 
     def __call__(self, t: Scalar) -> Array:
         t = jnp.asarray(t)
         return jnp.where((t >= self.start) & (t < self.stop), self.amplitude, 0.0)
+
+    def span(self, end: float) -> tuple[float, float]:
+        start, stop = np.asarray(self.start), np.asarray(self.stop)
+        on, off = (start <= end) & (stop > 0), (start > 0) | (stop <= end)
+        return _hull(np.where(on, self.amplitude, 0.0), np.where(off, 0.0, self.amplitude))
 
     def shifted(self, by: Scalar) -> "Pulse":
         """The same, `by` seconds later: it never ends before it starts."""
@@ -69,26 +96,34 @@ class Pulse:
 class Sine:
     """amplitude sin(2 pi frequency t + phase)."""
 
-    amplitude: Scalar = leaf(doc="half the peak-to-peak height")
-    frequency: Scalar = leaf(unit="Hz", at_least=0, doc="frequency")
-    phase: Scalar = leaf(default=0.0, unit="rad", doc="phase at t = 0")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="half the peak-to-peak height")
+    frequency: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency")
+    phase: Scalar = leaf(default=0.0, unit="rad", at_least=-1e9, at_most=1e9, doc="phase at t = 0")
 
     def __call__(self, t: Scalar) -> Array:
         return self.amplitude * sine(self.frequency * jnp.asarray(t) + self.phase / TWO_PI)
+
+    def span(self, end: float) -> tuple[float, float]:
+        first = np.asarray(self.phase) / TWO_PI
+        return _swing(self.amplitude, first, first + self.frequency * end)
 
 
 @record
 class SmoothStep:
     """0 until `start`, then 10 s^3 - 15 s^4 + 6 s^5 of the way over `duration`: twice differentiable (C2)."""
 
-    amplitude: Scalar = leaf(doc="height reached")
-    start: Scalar = leaf(default=0.0, unit="s", doc="when it begins to rise")
-    duration: Scalar = leaf(default=0.1, unit="s", above=0, doc="time it takes to rise")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height reached")
+    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="when it begins to rise")
+    duration: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="time it takes to rise")
 
     def __call__(self, t: Scalar) -> Array:
         s = (jnp.asarray(t) - self.start) / self.duration
         rising = s**3 * (10 - 15 * s + 6 * s**2)
         return self.amplitude * jnp.where(s <= 0, 0.0, jnp.where(s >= 1, 1.0, rising))
+
+    def span(self, end: float) -> tuple[float, float]:
+        shares = [np.clip((t - np.asarray(self.start)) / self.duration, 0.0, 1.0) for t in (0.0, end)]
+        return _hull(*(self.amplitude * s**3 * (10 - 15 * s + 6 * s**2) for s in shares))
 
     def shifted(self, by: Scalar) -> "SmoothStep":
         """The same, `by` seconds later."""
@@ -99,17 +134,22 @@ class SmoothStep:
 class Chirp:
     """A sine whose frequency moves linearly from `frequency` to `frequency_end` over `duration`, then stays."""
 
-    amplitude: Scalar = leaf(doc="half the peak-to-peak height")
-    frequency: Scalar = leaf(unit="Hz", at_least=0, doc="frequency at t = 0")
-    frequency_end: Scalar = leaf(unit="Hz", at_least=0, doc="frequency from t = duration on")
-    duration: Scalar = leaf(unit="s", above=0, doc="time of the sweep")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="half the peak-to-peak height")
+    frequency: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency at t = 0")
+    frequency_end: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency from t = duration on")
+    duration: Scalar = leaf(unit="s", at_least=1e-9, at_most=1e9, doc="time of the sweep")
 
     def __call__(self, t: Scalar) -> Array:
         t = jnp.asarray(t)
-        sweep = jnp.minimum(t, self.duration)
+        return self.amplitude * sine(self._cycles(t, jnp.minimum(t, self.duration)))
+
+    def _cycles(self, t: Any, sweep: Any) -> Any:
+        """Turns made by time t, `sweep` of which fell into the sweep."""
         gain = (self.frequency_end - self.frequency) / self.duration
-        cycles = self.frequency * sweep + gain * sweep**2 / 2 + self.frequency_end * (t - sweep)
-        return self.amplitude * sine(cycles)
+        return self.frequency * sweep + gain * sweep**2 / 2 + self.frequency_end * (t - sweep)
+
+    def span(self, end: float) -> tuple[float, float]:
+        return _swing(self.amplitude, np.zeros(()), self._cycles(end, np.minimum(end, self.duration)))
 
 
 # Sines in one realisation of band-limited noise. Its fourth moment falls short of a Gaussian's by 1.5/LINES of std^4.
@@ -138,9 +178,9 @@ class BandNoise:
     cos(2 pi f tau) over the band, exactly; it has all derivatives, so that integrators keep their order.
     """
 
-    std: Scalar = leaf(at_least=0, doc="standard deviation")
-    f_low: Scalar = leaf(unit="Hz", at_least=0, doc="lower end of the band")
-    f_high: Scalar = leaf(unit="Hz", above=0, doc="upper end of the band; above f_low")
+    std: Scalar = leaf(at_least=0, at_most=1e20, doc="standard deviation")
+    f_low: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="lower end of the band")
+    f_high: Scalar = leaf(unit="Hz", above=0, at_most=1e9, doc="upper end of the band; above f_low")
     ordered: ClassVar = ("f_low", "f_high")
 
     def realised(self, key: Array) -> Lines:
@@ -153,6 +193,10 @@ class BandNoise:
         raise ValueError(
             "band-noise is a function of time only for one member: use scenario.realised(), as a rollout does."
         )
+
+    def span(self, end: float) -> tuple[float, float]:
+        crest = math.sqrt(2 * LINES) * np.asarray(self.std)  # all sines at their crests at once: 8 std
+        return _hull(-crest, crest)
 
 
 @record
@@ -167,9 +211,18 @@ class Sum:
             total = total + term(t)
         return total
 
+    def span(self, end: float) -> tuple[float, float]:
+        ends = [term.span(end) for term in self.terms]
+        return sum(low for low, _ in ends), sum(high for _, high in ends)
+
     def realised(self, key: Array) -> "Sum":
         """The sum with its random terms drawn, each from a key of its own."""
         return Sum(tuple(realised(term, jax.random.fold_in(key, n)) for n, term in enumerate(self.terms)))
+
+
+def is_random(signal: Any) -> bool:
+    """Whether members draw this signal, or a term of it."""
+    return any(map(is_random, signal.terms)) if isinstance(signal, Sum) else hasattr(signal, "realised")
 
 
 def realised(signal: Any, key: Array) -> Any:

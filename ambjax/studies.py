@@ -11,20 +11,23 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from ambjax.casefile import Case, read_case
+from ambjax.casefile import Case
+from ambjax.doubts import read_aloud
 from ambjax.ensemble import statistics
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
 from ambjax.integrate import Slide
 from ambjax.interrupts import keeping, unbroken
-from ambjax.outputs import chosen, make, plain, say, table, write_json
+from ambjax.outputs import chosen, files, make, plain, say, table, write_json
 from ambjax.pace import Pace, error_words, pilot, say_how_long, sliding_error
 from ambjax.trajectory import STALLED
 from ambjax.worker import chunk, deaf_children, processes, work
 
 # Chunks in flight for each worker: one runs, one waits.
 AHEAD = 2
+# More than any machine has cores; each takes memory of its own.
+MOST_PROCESSES = 1024
 # The fan chart is drawn from so many members and instants, whatever the size of the study.
 FAN_MEMBERS, FAN_TIMES = 256, 500
 # How long to look for the scheduler of a cluster.
@@ -46,7 +49,7 @@ def study_of(case: Case, seed: int | None, members: int) -> Study:
 
 def run_ensemble(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """ambjax ensemble."""
-    case = read_case(args.case)
+    case = read_aloud(args.case)
     study, store = _asked(case, args)
     out = store.directory
     with keeping(lambda: _kept(store)):
@@ -69,8 +72,8 @@ def _asked(case: Case, args: argparse.Namespace) -> tuple[Study, Store]:
     study = study_of(case, args.seed, args.members)
     if args.chunk is not None and args.chunk < 1:
         raise ValueError(f"--chunk {args.chunk}: it must be a whole number of members, at least 1.")
-    if args.processes is not None and args.processes < 1:
-        raise ValueError(f"--processes {args.processes}: it must be a whole number, at least 1.")
+    if args.processes is not None and not 1 <= args.processes <= MOST_PROCESSES:
+        raise ValueError(f"--processes {args.processes}: it must be a whole number from 1 to {MOST_PROCESSES}.")
     if args.resume and args.out is None:
         raise ValueError("--resume: add --out DIR, the directory of the study that was interrupted.")
     study.drawn(np.array([0]))  # raises what the design has against so many members
@@ -114,8 +117,9 @@ def _report(
     summary = _summary(case, study, columns, shlex.quote(str(args.case)))
     if error is not None:
         summary["sliding_step_error"] = error
-    write_json(out / "summary.json", summary)
-    _pictures(case, study, columns, summary, out)
+    with files(out) as part:
+        write_json(part / "summary.json", summary)
+        _pictures(case, study, columns, summary, part)
     if not args.json:
         print(_text(summary))
         print(

@@ -23,7 +23,7 @@ i = 0.0                       # A
 
 [clock]
 duration = 2.0                # s; a whole number of sample periods
-sample_period = 1e-4          # s; measurements are held for this long, one row is recorded for each
+sample_period = 1e-4          # s; a measurement's error is held for this long, and one row is recorded for each
 dt = "auto"                   # s, or "auto": method and step from the loop's slopes
 # method = "rk4"              # with a number for dt: "rk4", "dop853", "euler", "rodas3" (L-stable) or "sliding", which
 #                               is fast under noise where gamma p is large; with dt = "auto": "adaptive" or "sliding"
@@ -33,7 +33,7 @@ seed = 0                      # of whatever is random
 settle = 0.5                  # s; from when "settled" metrics count (left out: a quarter of the duration)
 # clearance = 4.5e-3          # m; |z| at which the rotor touches down (left out: 0.9 s_0)
 
-# [sensor]                    # Gaussian noise, held for a sample period (left out: none)
+# [sensor]                    # Gaussian noise, held for a sample period; the state is seen at once (left out: none)
 # std = {paper_std:.3e}          # m; this is the paper's, which its printed gains do not survive
 # std_z_dot = 0.0             # m/s
 # std_i = 0.0                 # A
@@ -50,13 +50,33 @@ settle = 0.5                  # s; from when "settled" metrics count (left out: 
 # disturbance.q_z.shift = {{ uniform = [-0.1, 0.1] }}      # s; start and stop of the pulse together
 # actuator.u_max = {{ choices = [200, 500, 1000] }}        # V; equally likely
 
-# [tune]                      # for 'ambjax-tune': from the gains above to better ones; all of it may be left out
-# gains = ["controller.position.c", "controller.position.k"]   # left out: c, k, gamma, k_i and l, whichever are there
-# bounds.controller.position.c = [1.0, 500.0]              # left out: above 0
-# weights.peak = 0.5          # beside tracking (1), effort and chatter (0.1 each), clearance, survival, conditions
-# risk = "cvar"               # what is made of the members' losses: "mean", "cvar" (with alpha = 0.9), "soft-worst"
+# [tune]                      # for 'ambjax-tune': from the gains above to better ones. Each key with its default
+# gains = ["controller.position.c", "controller.position.k"]   # left out: the gains of the case's laws, but p
+# bounds.controller.position.c = [1.0, 500.0]              # left out: what plant and theory suggest, see the report
+# weights.tracking = 1.0      # what counts, as weights of dimensionless terms: mean square error after run.settle
+# weights.peak = 0.0          # largest error after run.settle
+# weights.effort = 0.1        # mean square voltage
+# weights.chatter = 0.1       # mean square step of the voltage
+# weights.clearance = 1e-3    # nearness to the stop
+# weights.survival = 1.0      # being lost, and how early
+# weights.conditions = 1.0    # conditions of Theorem 1 that fail, or hold by less than the margin
+# conditions_margin = 0.1     # share by which a gain is to exceed its condition
+# early = 0.0                 # weight of errors before run.settle, against 1 after it
+# risk = "cvar"               # what is made of the members' losses: "cvar", "soft-worst" or "mean"; left out: "mean"
+# alpha = 0.9                 # for "cvar" alone, the mean of the worst 1 - alpha; left out: 0.9
 # members = 32                # rotors that are tuned on, each with its own noise and [spread]
+# stressed = 8                # further ones, asked only to be held, with more noise and with other gains
+# stress = 1.2                # factor of their noise
+# gain_margin = 1.25          # factor by which each of their gains is off, up or down
+# validation = 2000           # others; those whom the answer loses join the stressed, and the search goes on
 # held_out = 1000             # others, on which the answer is judged
+# seed = 1                    # of the members and of the screen; the others' seeds are far from it
+# screen = 128                # points at which the search begins; 0: at the gains above alone
+# starts = 4                  # the best of these, which are refined
+# iterations = 40             # of either phase of the refinement, at most
+# substeps = 3                # integration steps per sample
+# optimiser = "bfgs"          # or one of optax, as "adam"
+# learning_rate = 0.1         # of an optimiser of optax
 """
 
 

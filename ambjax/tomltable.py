@@ -1,10 +1,56 @@
-"""One table of a TOML document being read strictly: what every reader of case files is built on."""
+"""TOML being read strictly, a file and one table of it: what every reader of case files is built on."""
 
 import dataclasses
 import difflib
+import pathlib
+import tomllib
 from typing import Any
 
-from ambjax._pytree import numbers, validate
+from ambjax._pytree import check_number, numbers, validate
+from ambjax._words import one_line
+
+# What of a key or a value is shown; keys beyond this length are like no other.
+LONGEST = 60
+# No case nests deeper than a sum of sums; whatever walks one may rely on it.
+DEEPEST = 32
+# No case file is larger: what is, is something else.
+MOST_BYTES = 10_000_000
+
+
+def load(path: str | pathlib.Path) -> dict[str, Any]:
+    """A case file as parsed TOML, not yet checked. Raises ValueError, one line, if it is none."""
+    path = pathlib.Path(path)
+
+    def refuse(why: str) -> ValueError:
+        return ValueError(one_line(f"{path}: {why}"))
+
+    try:
+        with path.open("rb") as file:
+            content = file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise refuse(f"cannot be read ({error.strerror}). Check the path and its permissions.") from None
+    if len(content) > MOST_BYTES:
+        raise refuse(f"more than {MOST_BYTES:,} bytes are no case file. See 'ambjax template' for one.")
+    try:
+        return tomllib.loads(content.decode("utf-8"))
+    except UnicodeDecodeError:
+        raise refuse("not a text file in UTF-8. A case file is TOML; see 'ambjax template'.") from None
+    except tomllib.TOMLDecodeError as error:
+        raise refuse(f"not valid TOML: {error}. See 'ambjax template' for a file to start from.") from None
+    except RecursionError:
+        raise refuse(f"tables or lists are nested deeper than {DEEPEST}, which no case is.") from None
+    except ValueError:  # Python converts no number of thousands of digits
+        raise refuse("a number has thousands of digits. Write it as in 1.5e3.") from None
+
+
+def check_depth(raw: Any) -> None:
+    """Refuse what is nested deeper than any case, before anything walks it."""
+    level = [raw]
+    for _ in range(DEEPEST):
+        inner = (x.values() if isinstance(x, dict) else x for x in level if isinstance(x, (dict, list)))
+        level = [x for values in inner for x in values]
+    if level:
+        raise ValueError(f"tables or lists are nested deeper than {DEEPEST}, which no case is.")
 
 
 class Table:
@@ -17,13 +63,13 @@ class Table:
 
     def at(self, key: str) -> str:
         """Dotted path of a key."""
-        return f"{self.path}.{key}" if self.path else key
+        return f"{self.path}.{cut(key)}" if self.path else cut(key)
 
     def only(self, allowed: list[str]) -> None:
         """Refuse keys that mean nothing here, with a guess at what was meant."""
         for key in self.raw:
             if key not in allowed:
-                close = difflib.get_close_matches(key, allowed, n=1)
+                close = difflib.get_close_matches(key[:LONGEST], allowed, n=1)
                 hint = f" Did you mean '{close[0]}'?" if close else ""
                 names = ", ".join(allowed) if allowed else "none"
                 raise ValueError(
@@ -41,7 +87,17 @@ class Table:
             return default
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be {allowed}, without quotes.")
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:  # a whole number of hundreds of digits
+            raise ValueError(f"{self.at(key)} = {show(value)}: it must be {allowed}.") from None
+
+    def leaf(self, key: str, field: dataclasses.Field, default: Any = None) -> Any:
+        """A number that the field of a record, or one like it, allows; or the default if left out."""
+        value = self.number(key, default, numbers(field))
+        if key in self.raw:
+            check_number(field, self.at(key), value)
+        return value
 
     def choice(self, key: str, allowed: list[str], default: str | None = None) -> str:
         """One of several words."""
@@ -49,7 +105,7 @@ class Table:
         if value is None:
             raise ValueError(f"{self.at(key)} is missing: it must be one of {quoted(allowed)}.")
         if value not in allowed:
-            close = difflib.get_close_matches(str(value), allowed, n=1)
+            close = difflib.get_close_matches(show(value).strip('"'), allowed, n=1)
             hint = f" Did you mean '{close[0]}'?" if close else ""
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be one of {quoted(allowed)}.{hint}")
         return value
@@ -79,11 +135,21 @@ class Table:
 
 def show(value: Any) -> str:
     """A value as it would stand in the file, cut if it is long."""
-    text = f'"{value}"' if isinstance(value, str) else str(value)
-    text = text.lower() if isinstance(value, bool) else text
-    if isinstance(value, dict) and value:
+    if isinstance(value, int) and abs(value) >= 10**LONGEST:  # Python refuses to write thousands of digits
+        return f"a whole number of {len(hex(abs(value))) - 2} hexadecimal digits"
+    if isinstance(value, list):
+        text = f"[{', '.join(map(show, value[:LONGEST]))}]"
+    elif isinstance(value, dict) and value:
         text = f"{{ {', '.join(f'{k} = {show(x)}' for k, x in value.items())} }}"
-    return text if len(text) <= 60 else text[:57] + "..."
+    else:
+        text = f'"{value}"' if isinstance(value, str) else str(value)
+        text = text.lower() if isinstance(value, bool) else text
+    return cut(text)
+
+
+def cut(text: str) -> str:
+    """The text, or its beginning if it is long."""
+    return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
 
 
 def quoted(words: list[str]) -> str:

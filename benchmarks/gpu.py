@@ -23,7 +23,7 @@ from ambjax.ensemble.onekernel import run_whole
 MEMBERS = (4_096, 65_536, 262_144, 1_048_576)
 BLOCKS = (32, 64, 128, 256)
 SAMPLES = 100
-# Rounding over 1000 steps in z, a hundredth of the largest state; noise by another erf_inv
+# Rounding over 1000 steps in z, a hundredth of the largest state; the noise's logarithms are rounded otherwise too
 ALLOWED = {"float64": 1e-9, "float32": 1e-2}
 
 

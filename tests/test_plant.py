@@ -18,7 +18,7 @@ def points(plant, n=400, reach=0.95, seed=0):
 
 
 def test_derived_constants_of_table_1():
-    # the numbers of DESIGN.md section 6, to the digits printed there
+    # derived by hand from Table 1, to the digits given here
     np.testing.assert_allclose(PLANT.kappa, 0.3313, atol=5e-5)
     np.testing.assert_allclose(PLANT.a, 0.14086, atol=5e-6)
     np.testing.assert_allclose(PLANT.L, 33.1, atol=0.05)

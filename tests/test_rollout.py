@@ -309,7 +309,7 @@ def test_a_lost_rotor_is_frozen_and_finite(lost):
 
 @pytest.mark.parametrize("amplitude", [2.5e-3, 0.0], ids=["tracking", "regulation"])
 def test_the_printed_gains_lose_the_rotor_within_20_ms(amplitude):
-    # DESIGN.md section 6: gamma = 1000 violates the paper's own Eq. (7); here without noise
+    # gamma = 1000 violates the paper's own Eq. (7); here without noise
     quiet = dataclasses.replace(NOISY, reference=Sine(amplitude, 2.0), sensor=Sensor(0.0, 0.0, 0.0))
     assert rollout(LITERAL, quiet, SHORT, fold=FOLDS).trajectory.lost_at < 0.02
 

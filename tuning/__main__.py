@@ -1,11 +1,11 @@
 """The command line of the tuner: `ambjax-tune`, or `python -m tuning`."""
 
 import argparse
-import json
 import sys
+from typing import Any
 
 from ambjax import __version__
-from ambjax.__main__ import Parser, complain
+from ambjax.__main__ import Parser, answer, open_streams
 from ambjax.interrupts import listening
 
 
@@ -30,23 +30,22 @@ def main(argv: list[str] | None = None) -> int:
 
     Ctrl-C during the search ends it and what it found is judged; otherwise, or again, it ends the process with 130.
     """
+    open_streams()
     with listening("ambjax-tune"):
-        return _run(parser().parse_args(argv))
+        args = parser().parse_args(argv)
+        return answer(lambda: _run(args), args.json, "ambjax-tune")
 
 
-def _run(args: argparse.Namespace) -> int:
+def _run(args: argparse.Namespace) -> tuple[int, Any]:
     from ambjax.worker import prepare
 
     prepare()
-    from tuning.command import run
+    from tuning import command
 
     try:
-        code, summary = run(args)
-    except ValueError as error:
-        return complain(str(error), "ambjax-tune")
-    if args.json:
-        print(json.dumps(summary, indent=2))
-    return code
+        return command.run(args)
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt(str(stop) or "before there was anything to keep") from None
 
 
 if __name__ == "__main__":

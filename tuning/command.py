@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.casefile import case_from
+from ambjax.doubts import say_doubts
 from ambjax.interrupts import keeping
-from ambjax.outputs import directory, plain, say, write_json
+from ambjax.outputs import directory, files, plain, say, write_json
 from ambjax.theorem import check
 from tuning import explore, gradient, report
 from tuning.config import read_study, seeds, settings
@@ -27,6 +28,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     case, tune, raw = read_study(args.case)
     if args.resume and not (args.out and (pathlib.Path(args.out) / f"{CHECKPOINT}-1.npz").exists()):
         raise ValueError(f"--resume: there is no {CHECKPOINT}-1.npz in --out {args.out}. Leave out --resume to begin.")
+    say_doubts(case, args.case)
     study = study_of(case, tune)
     start = tune.space.values(case.cascade)
     tune.space.encode(start)
@@ -67,7 +69,9 @@ def _tune(
     if args.pareto:
         say("front of error against voltage ...")
         facts["pareto"] = explore.pareto(study, x, who)
-    _write(out, study, raw, answer.history, facts, explore.slices(study, x, who))
+    found = explore.slices(study, x, who)
+    with files(out) as part:
+        _write(part, study, raw, answer.history, facts, found)
     summary = plain(facts) | {"out": str(out)}
     if not args.json:
         print(_short(facts))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ambjax.casefile import Case, case_from, load
 from ambjax.ensemble.spread import require_path
-from ambjax.tomltable import Table, show
+from ambjax.tomltable import Table, one_line, show
 from tuning.loss import TERMS
 from tuning.optimisers import BFGS, names
 from tuning.risk import CVaR, Mean, Risk, SoftWorst
@@ -69,7 +69,7 @@ def read_study(path: str | pathlib.Path) -> tuple[Case, Tune, dict[str, Any]]:
         case = case_from(raw, name)
         return case, tune_from(Table(raw).table("tune"), case), raw
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise ValueError(one_line(f"{path}: {error}")) from None
 
 
 def tune_from(table: Table, case: Case) -> Tune:

@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from typing import Any
 
 BARE = re.compile(r"[A-Za-z0-9_-]+")
+# What may stand in no comment and no string; halves of characters are names of files that are not UTF-8.
+CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
 
 def dumps(document: Mapping[str, Any], head: str = "") -> str:
     """The document as TOML; `head` goes first, as a comment."""
-    lines = [f"# {line}" for line in head.splitlines()]
+    lines = [f"# {CONTROL.sub(_escaped, line)}" for line in head.split("\n")] if head else []
     _table(document, "", lines)
     return "\n".join(lines).strip() + "\n"
 
@@ -23,6 +25,10 @@ def _table(table: Mapping[str, Any], path: str, lines: list[str]) -> None:
     lines += [f"{_key(key)} = {_value(value)}" for key, value in own.items()]
     for key, value in inner.items():
         _table(value, f"{path}.{_key(key)}" if path else _key(key), lines)
+
+
+def _escaped(found: re.Match[str]) -> str:
+    return f"\\u{ord(found[0]):04x}"
 
 
 def _key(key: str) -> str:
@@ -38,7 +44,7 @@ def _value(value: Any) -> str:
         return repr(value) if math.isfinite(value) else str(value)
     if isinstance(value, str):
         escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return '"' + "".join(c if c >= " " else f"\\u{ord(c):04x}" for c in escaped) + '"'
+        return f'"{CONTROL.sub(_escaped, escaped)}"'
     if isinstance(value, list):
         return f"[{', '.join(map(_value, value))}]"
     if isinstance(value, Mapping):

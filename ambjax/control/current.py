@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax._pytree import Scalar, leaf, record
+from ambjax._pytree import Scalar, gain, record
 from ambjax.control.laws import CurrentInputs
 from ambjax.plant import Plant
 from ambjax.smooth import TWO_OVER_PI, smooth_sign
@@ -13,8 +13,8 @@ from ambjax.smooth import TWO_OVER_PI, smooth_sign
 class SlidingMode:
     """u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - k_i sgn(i - i_ref)) + R i. Eq. (11), sgn smoothed."""
 
-    k_i: Scalar = leaf(default=152.0, unit="A/s", above=0, doc="switching gain; above the disturbance bound Q_i")
-    p: Scalar = leaf(default=25.0, unit="1/A", above=0, doc="steepness of the smoothed sign of the current error")
+    k_i: Scalar = gain(default=152.0, unit="A/s", doc="switching gain; above the disturbance bound Q_i")
+    p: Scalar = gain(default=25.0, unit="1/A", doc="steepness of the smoothed sign of the current error")
 
     def init(self, model: Plant) -> tuple[()]:
         return ()
@@ -42,9 +42,9 @@ class ProportionalIntegral:
     The defaults hold the paper's tracking scenario; without the motional term, gains much lower do not.
     """
 
-    k_p: Scalar = leaf(default=3e5, unit="V/A", above=0, doc="proportional gain")
-    k_int: Scalar = leaf(default=1e8, unit="V/A/s", above=0, doc="integral gain")
-    k_aw: Scalar = leaf(default=200.0, unit="1/s", above=0, doc="anti-windup rate")
+    k_p: Scalar = gain(default=3e5, unit="V/A", doc="proportional gain")
+    k_int: Scalar = gain(default=1e8, unit="V/A/s", doc="integral gain")
+    k_aw: Scalar = gain(default=200.0, unit="1/s", doc="anti-windup rate")
 
     def init(self, model: Plant) -> Array:
         return jnp.zeros(())

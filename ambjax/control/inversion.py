@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax._pytree import Scalar, leaf, record
+from ambjax._pytree import Scalar, gain, leaf, record
 from ambjax.control.laws import CurrentDemand, ForceDemand
 from ambjax.plant import Plant
 from ambjax.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
@@ -27,9 +27,9 @@ class Adaptive:
     Deviation: the default gamma is 7.5e4; the printed 1000 violates the paper's own Eq. (7).
     """
 
-    gamma: Scalar = leaf(default=7.5e4, unit="A^2/m^2/s", above=0, doc="adaptation gain; above Delta_1 of Eq. (7)")
-    p: Scalar = leaf(default=25.0, unit="m^2/A^2", above=0, doc="steepness of the smoothed sign of v_tilde")
-    i_ref: Scalar = leaf(default=0.0, unit="A", doc="initial value of the current reference")
+    gamma: Scalar = gain(default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above Delta_1 of Eq. (7)")
+    p: Scalar = gain(default=25.0, unit="m^2/A^2", doc="steepness of the smoothed sign of v_tilde")
+    i_ref: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="initial current reference")
 
     def init(self, model: Plant) -> Array:
         return jnp.asarray(self.i_ref)

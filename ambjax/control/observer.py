@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax._pytree import Scalar, leaf, record
+from ambjax._pytree import Scalar, gain, leaf, record
 from ambjax.control.laws import Measurement
 from ambjax.plant import Plant
 
@@ -32,8 +32,15 @@ class Complementary:
     Noise of the position sensor is low-passed at l; noise of the velocity is integrated, with memory 1/l.
     """
 
-    l: Scalar = leaf(default=10.0, unit="1/s", above=0, doc="corner between velocity and position sensor")
-    z_hat: Scalar | None = leaf(default=None, unit="m", optional=True, doc="initial estimate; none: first measurement")
+    l: Scalar = gain(default=10.0, unit="1/s", doc="corner between velocity and position sensor")
+    z_hat: Scalar | None = leaf(
+        default=None,
+        unit="m",
+        at_least=-1.0,
+        at_most=1.0,
+        optional=True,
+        doc="initial estimate; none: first measurement",
+    )
 
     def init(self, model: Plant, measured: Measurement) -> Array:
         return jnp.asarray(measured.z if self.z_hat is None else self.z_hat)

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax._pytree import Scalar, leaf, record
+from ambjax._pytree import Scalar, gain, record
 from ambjax.control.laws import Measurement
 from ambjax.plant import Plant
 from ambjax.signals import Reference
@@ -25,9 +25,9 @@ def force_for(c: Scalar, model: Plant, motion: Measurement, reference: Reference
 class SlidingMode:
     """v_star = (-2 k_z z/m - c (z_dot - r_dot) + r_ddot + g - k sgn(sigma)) / a. Eq. (5), sgn smoothed."""
 
-    c: Scalar = leaf(default=17.0, unit="1/s", above=0, doc="decay rate on the sliding manifold")
-    k: Scalar = leaf(default=25.0, unit="m/s^2", above=0, doc="switching gain; above the disturbance bound Q_z")
-    p: Scalar = leaf(default=25.0, unit="s/m", above=0, doc="steepness of the smoothed sign of sigma")
+    c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold")
+    k: Scalar = gain(default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z")
+    p: Scalar = gain(default=25.0, unit="s/m", doc="steepness of the smoothed sign of sigma")
 
     def init(self, model: Plant) -> tuple[()]:
         return ()
@@ -58,10 +58,10 @@ class SuperTwisting:
     a constant disturbance leaves no offset. Default slope at zero: k_1 sqrt(p) = 400 1/s, as SlidingMode has.
     """
 
-    c: Scalar = leaf(default=17.0, unit="1/s", above=0, doc="decay rate on the sliding manifold")
-    k_1: Scalar = leaf(default=40.0, unit="m^0.5/s^1.5", above=0, doc="gain of the root term")
-    k_2: Scalar = leaf(default=50.0, unit="m/s^3", above=0, doc="gain of the integral; above the bound on dq_z/dt")
-    p: Scalar = leaf(default=100.0, unit="s/m", above=0, doc="steepness of the smoothed root and sign of sigma")
+    c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold")
+    k_1: Scalar = gain(default=40.0, unit="m^0.5/s^1.5", doc="gain of the root term")
+    k_2: Scalar = gain(default=50.0, unit="m/s^3", doc="gain of the integral; above the bound on dq_z/dt")
+    p: Scalar = gain(default=100.0, unit="s/m", doc="steepness of the smoothed root and sign of sigma")
 
     def init(self, model: Plant) -> Array:
         return jnp.zeros(())

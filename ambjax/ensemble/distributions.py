@@ -125,8 +125,8 @@ class LogUniform:
         return self.low, self.high
 
     def quantile(self, u: np.ndarray, nominal: float) -> np.ndarray:
-        values = self.low * (self.high / self.low) ** np.asarray(u)
-        return np.clip(values, self.low, self.high)  # a power may round beyond its ends
+        low, high = math.log(self.low), math.log(self.high)  # their ratio may overflow
+        return np.clip(np.exp(low + (high - low) * np.asarray(u)), self.low, self.high)  # exp may round beyond its ends
 
 
 @record

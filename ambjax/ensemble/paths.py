@@ -12,7 +12,7 @@ from ambjax.scenario import Scenario
 from ambjax.signals import Constant
 
 SHIFT = "shift"
-TIME = leaf(default=0.0, unit="s", doc="time by which start and stop move together")
+TIME = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time by which start and stop move together")
 
 
 class Place(NamedTuple):

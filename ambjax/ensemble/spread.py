@@ -66,10 +66,16 @@ def corners(spread: Spread, cascade: Cascade, scenario: Scenario) -> tuple[Casca
 
     What is read off an ensemble by its largest slope, the integrator, then holds for every member.
     """
-    known = check(spread, cascade, scenario)
-    ends = [(p, d.support(_nominal(known[p]))) for p, d in spread.entries if p.startswith(("plant.", "controller."))]
-    shape = [1] * len(ends)
-    values = {p: np.reshape(x, [*shape[:n], 2, *shape[n + 1 :]]) for n, (p, x) in enumerate(ends)}
+    check(spread, cascade, scenario)
+    return ends(spread, cascade, scenario, ("plant.", "controller."))
+
+
+def ends(spread: Spread, cascade: Cascade, scenario: Scenario, under: tuple[str, ...]) -> tuple[Cascade, Scenario]:
+    """The numbers whose paths begin so replaced by both ends of their spreads, each on an axis of its own."""
+    known = places(cascade, scenario)
+    found = [(p, d.support(_nominal(known[p]))) for p, d in spread.entries if p.startswith(under)]
+    shape = [1] * len(found)
+    values = {p: np.reshape(x, [*shape[:n], 2, *shape[n + 1 :]]) for n, (p, x) in enumerate(found)}
     return replaced(cascade, scenario, values)
 
 
@@ -138,7 +144,7 @@ def _check_together(
 ) -> None:
     """What two numbers ask of each other: the order of start and stop, the rotor's place within its stops."""
 
-    def ends(path: str) -> tuple[float, float]:
+    def reach(path: str) -> tuple[float, float]:
         nominal = _nominal(known[path])
         return kinds[path].support(nominal) if path in kinds else (nominal, nominal)
 
@@ -148,17 +154,17 @@ def _check_together(
             raise ValueError(f"spread.{path} = {kinds[path]}: {text}")
 
     for low, high in ordered(cascade, scenario):
-        if not ends(low)[1] < ends(high)[0]:
+        if not reach(low)[1] < reach(high)[0]:
             move = f", or use {low.rpartition('.')[0]}.shift, which moves both" if low.endswith(".start") else ""
-            reach = f"{low} reaches {ends(low)[1]:g} and {high} comes down to {ends(high)[0]:g}"
-            refuse((low, high), f"{reach}, but the first must stay below the second. Narrow the spread{move}.")
+            crossed = f"{low} reaches {reach(low)[1]:g} and {high} comes down to {reach(high)[0]:g}"
+            refuse((low, high), f"{crossed}, but the first must stay below the second. Narrow the spread{move}.")
     gap, given = "plant.s_0", known["run.clearance"].value is not None or "run.clearance" in kinds
-    stops = ends("run.clearance") if given else tuple(0.9 * x for x in ends(gap))
-    if not stops[1] < ends(gap)[0] and given:
+    stops = reach("run.clearance") if given else tuple(0.9 * x for x in reach(gap))
+    if not stops[1] < reach(gap)[0] and given:
         refuse(
             ("run.clearance", gap), f"run.clearance reaches {stops[1]:g} m, but must stay below plant.s_0. Narrow it."
         )
-    reach = max(map(abs, ends("initial.z")))
-    if not reach < stops[0]:
-        text = f"|initial.z| reaches {reach:g} m, but must stay below the clearance, {stops[0]:g} m. Narrow the spread."
+    far = max(map(abs, reach("initial.z")))
+    if not far < stops[0]:
+        text = f"|initial.z| reaches {far:g} m, but must stay below the clearance, {stops[0]:g} m. Narrow the spread."
         refuse(("initial.z", "run.clearance", gap), text)

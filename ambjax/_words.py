@@ -1,0 +1,6 @@
+"""Text for messages."""
+
+
+def one_line(text: str) -> str:
+    """The text with line breaks and whatever else does not print written as escapes: a message is one line."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -1,0 +1,471 @@
+"""Hostile case files, arguments, folders and streams: one line that says what is wrong, and nothing half done."""
+
+import dataclasses
+import errno
+import json
+import math
+import os
+import pathlib
+import subprocess
+import sys
+import tomllib
+
+import numpy as np
+import pytest
+
+from ambjax import plotting
+from ambjax.__main__ import main
+from ambjax._pytree import validate, within
+from ambjax.casefile import KINDS, SIGNALS, case_from, read_case
+from ambjax.doubts import doubts
+from ambjax.ensemble import LogUniform
+from ambjax.outputs import files
+from ambjax.plant import Plant
+from ambjax.scenario import Clock, Initial, Scenario, Sensor
+from ambjax.signals import LINES, BandNoise, Chirp, Pulse, Sine, SmoothStep, Step, Sum
+from ambjax.template import template
+from tuning.__main__ import main as tune
+from tuning.config import Budget, read_study, settings
+from tuning.toml import dumps
+
+SHORT = "[clock]\nduration = 0.01\n"
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """Each test in a folder of its own, with the compilation cache in it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / "cache"))
+
+
+def write(text, name="case.toml"):
+    pathlib.Path(name).write_text(text, encoding="utf-8")
+    return name
+
+
+def refusal(text, name="case.toml"):
+    """The message with which a file of this text is refused; it is one line and names the file."""
+    with pytest.raises(ValueError, match=r"^case\.toml: ") as refused:
+        read_case(write(text, name))
+    assert str(refused.value).isprintable()
+    return str(refused.value)
+
+
+# What is wrong, the file, and what the message must contain.
+HOSTILE = {
+    "nested 2,000 deep": ("a = " + "[" * 2000 + "]" * 2000, ["nested deeper"]),
+    "nested 60 deep": ("a = " + "[" * 60 + "]" * 60, ["nested deeper than 32"]),
+    "tables nested 400 deep": (".".join("a" * 400) + " = 1", ["nested deeper"]),
+    "400 digits": ("[plant]\nm = " + "9" * 400, ["plant.m", "digits", "from 1e-06 to 1e+06 (kg)"]),
+    "5,000 digits": ("[plant]\nm = " + "9" * 5000, ["thousands of digits"]),
+    "5,000 digits in hexadecimal": ("[plant]\nm = 0x" + "f" * 5000, ["plant.m", "digits"]),
+    "5,000 digits in a list": ("[plant]\nm = [0x" + "f" * 5000 + "]", ["plant.m", "digits"]),
+    "seed of 5,000 digits": ("[run]\nseed = 0x" + "f" * 5000, ["run.seed", "digits", "4294967295"]),
+    "gap of an underflow": ("[plant]\ns_0 = 1e-110", ["plant.s_0 = 1e-110", "from 1e-06 to 1 (m)"]),
+    "gap of an overflow": ("[plant]\ns_0 = 1e200", ["plant.s_0 = 1e+200"]),
+    "windings of an overflow": ("[plant]\nn = 1e200", ["plant.n = 1e+200"]),
+    "least mass": ("[plant]\nm = 5e-324", ["plant.m = 4.94066e-324", "from 1e-06"]),
+    "slope of an overflow": (
+        "[controller.position]\nk = 1e308\np = 1e300",
+        ["controller.position.k = 1e+308", "1e+30"],
+    ),
+    "duration": ("[clock]\nduration = 1e308", ["clock.duration = 1e+308", "1e+06 (s)"]),
+    "sample period": ("[clock]\nsample_period = 5e-324", ["clock.sample_period", "from 1e-09"]),
+    "dt": ("[clock]\ndt = 5e-324", ["clock.dt", "from 1e-15"]),
+    "steps for years": ('[clock]\ndt = 1e-14\nmethod = "rodas3"', ["clock.dt", "2e+14 steps", '"auto"']),
+    "supply": ("[actuator]\nu_max = 1e200", ["actuator.u_max = 1e+200", "or inf"]),
+    "settle": ("[run]\nsettle = nan", ["run.settle = nan"]),
+    "spread of an overflow": (
+        "[spread]\nplant.m = { log-uniform = [1e-200, 1e200] }",
+        ["spread.plant.m", "1e+06 (kg)"],
+    ),
+    "percentage of an overflow": ("[spread]\nplant.k_z = { percent = 1e308 }", ["spread.plant.k_z", "inf"]),
+    "key of two lines": ('"a\\nb" = 1', ["a\\nb = 1", "unknown key"]),
+    "endless key": ('[plant]\n"' + "m" * 5000 + '" = 1', ["plant.mmm", "..."]),
+    "sum of a thousand": (
+        '[reference]\nkind = "sum"\nterms = [' + '{ kind = "constant" }, ' * 1000 + "]",
+        ["reference.terms", "at most 100"],
+    ),
+    "11 MB": ("# " + "x" * 11_000_000, ["10,000,000 bytes"]),
+}
+
+
+@pytest.mark.parametrize("wrong", HOSTILE)
+def test_hostile_files_are_refused_in_one_line(wrong):
+    text, wanted = HOSTILE[wrong]
+    message = refusal(text)
+    assert len(message) < 1000
+    for part in wanted:
+        assert part in message
+
+
+def test_steep_but_possible_gains_run(capsys):
+    # 2/pi k p = 6e59 1/s: no step resolves it, which is no fault of the file; the run says what came of it
+    path = write(SHORT + "[controller.position]\nk = 1e30\np = 1e30\n")
+    assert main(["simulate", path, "--out", "steep", "--json"]) in (0, 1)
+    assert "NaN" not in capsys.readouterr().out
+    with np.load("steep/trajectory.npz") as kept:
+        assert not any(np.isnan(kept[name]).any() for name in kept if kept[name].dtype == float)
+
+
+RECORDS = [Plant, Sensor, Initial, Scenario, Clock, *(kind for kinds in KINDS.values() for kind in kinds.values())]
+RECORDS += [kind for kind in SIGNALS.values() if kind is not Sum]
+
+
+@pytest.mark.parametrize("kind", RECORDS, ids=lambda kind: f"{kind.__module__.split('.')[-1]}.{kind.__name__}")
+def test_every_number_has_both_ends(kind):
+    for field in dataclasses.fields(kind):
+        if not field.metadata.get("leaf"):
+            continue
+        low = field.metadata["above"] if field.metadata["at_least"] is None else field.metadata["at_least"]
+        high = field.metadata["at_most"]
+        assert -math.inf < low < high < math.inf, field.name
+        assert within(field.metadata, high)
+        assert not within(field.metadata, np.nextafter(high, np.inf))
+        assert not within(field.metadata, np.nextafter(low, -np.inf))
+        assert within(field.metadata, math.inf) is field.metadata["infinite"]
+        assert not within(field.metadata, math.nan)
+        assert not within(field.metadata, -math.inf)
+
+
+def test_products_at_the_ends_of_the_plant_s_ranges_are_finite():
+    ends = [[field.metadata[end] for end in ("at_least", "at_most")] for field in dataclasses.fields(Plant)]
+    plant = Plant(*(np.reshape(x, [2 if n == m else 1 for m in range(len(ends))]) for n, x in enumerate(ends)))
+    validate(plant)
+    for name in ("kappa", "a", "L", "k_s", "k_i"):
+        # squares of them are formed, and 1/x: within the square root of what float64 holds
+        assert np.all((np.abs(getattr(plant, name)) > 1e-150) & (np.abs(getattr(plant, name)) < 1e150)), name
+
+
+# --- references ---
+
+SINE = '[reference]\nkind = "sine"\nfrequency = 2.0\n'
+FAR = {
+    "sine": (SINE + "amplitude = 20e-3", ["reference reaches 0.02 m", "0.0045 m", "SI"]),
+    "step": ('[reference]\nkind = "step"\namplitude = -5e-3\nstart = 1.0', ["reaches 0.005 m"]),
+    "constant": ('[reference]\nkind = "constant"\nvalue = 2.5', ["reaches 2.5 m"]),
+    "sum": (
+        '[reference]\nkind = "sum"\nterms = [{ kind = "step", amplitude = 3e-3 }, '
+        '{ kind = "sine", amplitude = 3e-3, frequency = 7 }]',
+        ["reaches 0.006 m"],
+    ),
+    "noise": (
+        '[reference]\nkind = "band-noise"\nstd = 3e-3\nf_low = 1\nf_high = 99',
+        ["reference reaches", "0.0045 m"],
+    ),
+    "spread": (SINE + "amplitude = 4e-3\n[spread]\nreference.amplitude = { percent = 20 }", ["spread", "0.0048 m"]),
+    "gap narrowed": (SINE + "amplitude = 4e-3\n[spread]\nplant.s_0 = { percent = 20 }", ["spread", "0.0036 m"]),
+    "clearance": (SINE + "amplitude = 4e-3\n[run]\nclearance = 3e-3", ["0.003 m", "run.clearance"]),
+}
+NEAR = {
+    "sine": SINE + "amplitude = 4.4e-3",
+    "sine that never gets there": SINE + "amplitude = 20e-3\n[clock]\nduration = 0.01",
+    "step after the end": '[reference]\nkind = "step"\namplitude = 5e-3\nstart = 3.0',
+    # the sum of its terms' bounds is 8 mm, and it never leaves 4
+    "steps up and down": '[reference]\nkind = "sum"\nterms = [{ kind = "step", amplitude = 4e-3 }, '
+    '{ kind = "step", amplitude = -4e-3, start = 0.5 }, { kind = "step", amplitude = 4e-3, start = 0.7 }]',
+}
+
+
+@pytest.mark.parametrize("case", FAR)
+def test_a_reference_beyond_the_clearance_is_refused(case):
+    text, wanted = FAR[case]
+    message = refusal(text)
+    for part in wanted:
+        assert part in message
+
+
+@pytest.mark.parametrize("case", NEAR)
+def test_a_reference_within_the_clearance_is_not(case):
+    read_case(write(NEAR[case]))
+
+
+@pytest.mark.parametrize(
+    "signal",
+    [
+        Step(2.0, 0.3),
+        Step(-2.0, -1.0),
+        Step(2.0, 5.0),
+        Pulse(3.0, 0.2, 0.4),
+        Pulse(-3.0, -1.0, 0.4),
+        Pulse(3.0, 1.5, 2.0),
+        Sine(2.0, 0.1),
+        Sine(-2.0, 0.3, 1.0),
+        Sine(2.0, 0.2, 4.0),
+        Sine(1.0, 3.0),
+        SmoothStep(-2.0, 0.5, 2.0),
+        SmoothStep(2.0, -0.5, 2.0),
+        Chirp(2.0, 0.1, 0.3, 0.5),
+        Chirp(-2.0, 0.5, 0.0, 3.0),
+    ],
+    ids=str,
+)
+def test_the_span_of_a_signal_is_what_it_takes(signal):
+    values = np.asarray(signal(np.linspace(0.0, 1.0, 200_001)))
+    low, high = signal.span(1.0)
+    # the instants are 5e-6 s apart, and no signal here moves faster than 40 1/s: 1e-4 at jumps of none
+    np.testing.assert_allclose([low, high], [values.min(), values.max()], atol=1e-4)
+    assert low <= values.min() + 1e-12
+    assert values.max() - 1e-12 <= high
+
+
+def test_the_span_of_an_ensemble_holds_every_member():
+    amplitudes = np.array([1.0, 2.0, -3.0])
+    assert Sine(amplitudes, 5.0).span(1.0) == (-3.0, 3.0)
+    assert Sum((Step(amplitudes), Step(1.0))).span(1.0) == (-2.0, 3.0)
+    # all sines of band-noise at once at their crests
+    assert BandNoise(1.0, 1.0, 2.0).span(1.0)[1] == pytest.approx(LINES * math.sqrt(2 / LINES))
+
+
+# --- doubts ---
+
+DOUBTS = {
+    "gap in millimetres": ("[plant]\ns_0 = 0.4", "plant.s_0 = 0.4 m", "millimetres"),
+    "area in cm^2": ("[plant]\nA = 4.0", "plant.A = 4 m^2", "another unit"),
+    "noise as large as the gap": ("[sensor]\nstd = 5e-3", "sensor.std = 0.005", "100 %"),
+    "initial current": ("[initial]\ni = 0.3", "initial.i = 0.3 A", "plant.i_0 = 0.25 A"),
+    "weight beyond the bias": ("[plant]\nm = 588.0", "takes 1.741 A", "plant.i_0 = 0.25 A"),
+    "supply too weak": ("[actuator]\nu_max = 0.01", "actuator.u_max = 0.01 V", "0.07215 V that carry"),
+    "stiffness the wrong way": ("[plant]\nk_z = 754.0", "plant.k_z = 754", "restores"),
+    "milliseconds": ("[sensor]\nstd = 1e-6\n[clock]\nsample_period = 0.1", "clock.sample_period = 0.1 s", "falls"),
+    "noise that may go far": (
+        '[reference]\nkind = "band-noise"\nstd = 6e-4\nf_low = 1\nf_high = 99',
+        "reference: it may reach 0.0048 m",
+        "0.0045 m",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DOUBTS)
+def test_what_is_hardly_meant_is_said(case):
+    text, *wanted = DOUBTS[case]
+    found = doubts(read_case(write(text)))
+    said = [line for line in found if wanted[0] in line]
+    assert len(said) == 1, found
+    for part in wanted:
+        assert part in said[0]
+
+
+@pytest.mark.parametrize("name", ["tracking", "regulation"])
+def test_nothing_in_the_paper_is_doubtful(name):
+    sensor = f"\n[sensor]\nstd = {math.sqrt(1e-7)}\n"
+    assert doubts(read_case(write(template(name) + sensor))) == []
+
+
+def test_doubts_are_said_on_stderr_once_and_stop_nothing(capsys):
+    path = write(SHORT + "[initial]\ni = 0.3\n")
+    assert main(["check", path, "--json"]) in (0, 1)
+    out, err = capsys.readouterr()
+    json.loads(out)
+    assert err.count("initial.i = 0.3 A") == 1
+    assert path in err
+
+
+# --- spreads ---
+
+
+def test_a_logarithmic_spread_of_400_decades_does_not_overflow():
+    u = np.array([1e-16, 0.25, 0.5, 0.75, 1 - 1e-16])
+    values = LogUniform(1e-200, 1e200).quantile(u, math.nan)
+    # the logarithm is uniform: 400 decades times u, to rounding of exp at 460
+    np.testing.assert_allclose(np.log10(values), 400 * u - 200, atol=1e-9)
+
+
+def test_as_many_spreads_as_there_are_numbers_can_be_read():
+    model, plant = (
+        [f"{where}.{field.name}" for field in dataclasses.fields(Plant)] for where in ("controller.model", "plant")
+    )
+    lines = "\n".join(f"{path} = {{ percent = 1 }}" for path in [*model, *plant])
+    gains = "".join(
+        f"\ncontroller.{path} = {{ percent = 1 }}" for path in ("position.c", "position.k", "inversion.gamma")
+    )
+    assert len(case_from(tomllib.loads(f"[spread]\n{lines}{gains}")).spread.entries) == 21
+
+
+# --- names ---
+
+
+def test_a_hostile_name_enters_nothing(capsys):
+    name = "a\n\x7f<b>|$x$&.toml"
+    case = read_case(write(SHORT, name))
+    assert case.name == "a_b_x_"
+    assert main(["simulate", write("[plant]\nm = 0", name)]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert err[:-1].isprintable()
+    assert "a\\n\\x7f<b>|$x$&.toml" in err
+    assert read_case(write(SHORT, "x" * 200 + ".toml")).name == "x" * 80
+    assert read_case(write(SHORT, "\n.toml")).name == "_"
+
+
+@pytest.mark.parametrize("code", [*range(32), 0x7F, 0x85, 0x2028, 0xDCFF])
+def test_no_control_character_makes_toml_that_cannot_be_read(code):
+    text = f"a{chr(code)}b"
+    document = {} if code > 0xD800 else {"x": text, f"k{chr(code)}": 1}  # half a character is in no document
+    written = dumps(document, head=f"first{text}\nsecond")
+    assert tomllib.loads(written.encode("utf-8").decode("utf-8")) == document
+
+
+# --- arguments ---
+
+ARGUMENTS = {
+    "no name for a folder": (["simulate", "case.toml", "--out", ""], ["--out", "empty"]),
+    "a folder of 300 characters": (["simulate", "case.toml", "--out", "x" * 300], ["--out xxx", "too long"]),
+    "ensemble without a folder": (["ensemble", "case.toml", "--members", "2", "--out", ""], ["--out", "empty"]),
+    "tune": (["tune", "case.toml"], ["ambjax-tune CASE.toml"]),
+    "member of nothing": (["simulate", "case.toml", "--member", "3"], ["--member", "[spread]"]),
+    "a million processes": (["ensemble", "case.toml", "--members", "9", "--processes", "1000000"], ["1 to 1024"]),
+    "members": (["ensemble", "case.toml", "--members", "9" * 30], ["--members", "2,147,483,648"]),
+    "seed": (["ensemble", "case.toml", "--members", "9", "--seed", "9" * 30], ["--seed", "4294967295"]),
+}
+MAPS = {
+    "count of 1e12": ("plant.m=0.5:0.6:1000000000000", ["--x", "2 to 1,000,000 values"]),
+    "count of 5,000 digits": ("plant.m=0.5:0.6:" + "9" * 5000, ["--x"]),
+    "beyond a field's range": ("plant.m=-1:1:3", ["--x", "from 1e-06 to 1e+06 (kg)"]),
+    "period of nothing": ("clock.sample_period=1e-300:1e-4:3", ["from 1e-09"]),
+    "period that takes years": ("clock.sample_period=1e-9:1e-4:3", ["2e+09 samples", "Begin it higher"]),
+    "period beyond the run": ("clock.sample_period=1e-4:5:3", ["reaches 5 s", "clock.duration is 2 s"]),
+}
+
+
+@pytest.mark.parametrize("what", ARGUMENTS)
+def test_arguments_that_cannot_be_meant(what, capsys):
+    argv, wanted = ARGUMENTS[what]
+    write(SHORT)
+    assert main(argv) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    for part in wanted:
+        assert part in err
+    assert sorted(os.listdir()) == ["case.toml"]  # noqa: PTH208 (names alone)
+
+
+@pytest.mark.parametrize("what", MAPS)
+def test_axes_that_cannot_be_meant(what, capsys):
+    axis, wanted = MAPS[what]
+    path = write("[clock]\nduration = 2.0\n")
+    for flags in (["--x", axis, "--y", "initial.z=-1e-4:1e-4:3"], ["--y", axis, "--x", "initial.z=-1e-4:1e-4:3"]):
+        assert main(["map", path, *flags]) == 2
+        err = capsys.readouterr().err
+        assert err.count("\n") == 1
+        for part in wanted:
+            assert part.replace("--x", flags[0] if flags[1] == axis else "--y") in err
+    assert not pathlib.Path("out").exists()
+
+
+def test_a_finished_study_is_not_mixed_with_a_simulation(capsys):
+    path = write(SHORT + "[sensor]\nstd = 1e-9\n")
+    for kept in ("study.json", "members.npz"):
+        folder = pathlib.Path(kept.partition(".")[0])
+        folder.mkdir()
+        (folder / kept).write_text("{}")
+        for argv in (["simulate", path], ["map", path, "--x", "plant.m=0.5:0.6:2", "--y", "plant.g=9:10:2"]):
+            assert main([*argv, "--out", str(folder)]) == 2
+            assert "study of an ensemble" in capsys.readouterr().err
+        assert [p.name for p in folder.iterdir()] == [kept]
+
+
+def test_a_member_of_noise_alone_is_a_member():
+    assert main(["simulate", write(SHORT + "[sensor]\nstd = 1e-9\n"), "--member", "3"]) == 0
+
+
+# --- disks and streams ---
+
+
+def test_a_full_disk_leaves_nothing_that_looks_finished(monkeypatch, capsys):
+    path = write(SHORT)
+
+    def full(*args, **more):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(plotting, "overview", full)  # the last of three files
+    assert main(["simulate", path, "--out", "there"]) == 2
+    err = capsys.readouterr().err
+    assert "--out there: cannot write there (No space left on device)" in err
+    assert "Traceback" not in err
+    assert not pathlib.Path("there").exists()
+
+
+def test_files_are_there_together_or_not_at_all(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "a").write_text("old")
+
+    def fail():
+        with files(out) as part:
+            (part / "a").write_text("new")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(ValueError, match="No space left"):
+        fail()
+    assert [p.name for p in out.iterdir()] == ["a"]
+    assert (out / "a").read_text() == "old"
+    with files(out) as part:
+        (part / "a").write_text("new")
+        (part / "b").mkdir()
+        (part / "b" / "c").write_text("below")
+    assert sorted(str(p.relative_to(out)) for p in out.rglob("*")) == ["a", "b", "b/c"]
+    assert (out / "a").read_text() == "new"
+
+
+def shell(command):
+    code = "import sys; from ambjax.__main__ import main; sys.exit(main())"
+    line = command.replace("AMBJAX", f"{sys.executable} -c '{code}'")
+    root = str(pathlib.Path(__file__).parent.parent)
+    return subprocess.run(["bash", "-c", line], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": root})
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device of Linux")  # noqa: PTH110
+def test_a_stdout_that_takes_nothing_is_one_line():
+    done = shell("AMBJAX template > /dev/full")
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "No space left on device" in done.stderr
+
+
+def test_closed_streams_change_nothing():
+    write(SHORT)
+    done = shell("AMBJAX simulate case.toml --out a --json 2>&-")
+    assert done.returncode == 0
+    assert json.loads(done.stdout)["lost"] is False
+    done = shell("AMBJAX simulate case.toml --out b <&- >&- 2>&-")
+    assert done.returncode == 0
+    read = [pathlib.Path(out, "trajectory.npz").read_bytes() for out in "ab"]
+    assert read[0] == read[1]
+
+
+# --- the template and [tune] ---
+
+
+def uncommented(name):
+    """The template's table [tune] with every line of it in force, as tomllib reads it."""
+    head, _, tail = template(name).partition("# [tune]")
+    lines = ("[tune]" + tail).splitlines()
+    return tomllib.loads(head + "\n".join(line.removeprefix("# ") for line in lines))
+
+
+@pytest.mark.parametrize("name", ["tracking", "regulation"])
+def test_the_template_lists_every_key_of_tune_with_its_default(name):
+    document = uncommented(name)
+    table = document["tune"]
+    with pytest.raises(ValueError, match="Keys allowed here") as refused:
+        read_study(write(dumps({"tune": {"nothing": 1}})))
+    allowed = str(refused.value).partition("Keys allowed here: ")[2].rstrip(".").split(", ")
+    assert set(table) == set(allowed)
+    with pytest.raises(ValueError, match="Keys allowed here") as refused:
+        read_study(write(dumps({"tune": {"weights": {"nothing": 1}}})))
+    assert set(table["weights"]) == set(str(refused.value).partition("Keys allowed here: ")[2].rstrip(".").split(", "))
+    assert {field.name for field in dataclasses.fields(Budget)} <= set(table)
+    # these are examples, and say so; all else is what is left out
+    for example in ("gains", "bounds", "risk", "alpha"):
+        del table[example]
+    ours, left_out = (settings(read_study(write(dumps(one)))[1]) for one in (document, document | {"tune": {}}))
+    assert ours == left_out
+
+
+def test_the_tuner_names_the_file_in_one_line(capsys):
+    assert tune([write('[tune]\n"a\\nb" = 1\n')]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("ambjax-tune: case.toml: tune.a\\nb = 1: unknown key")
+    assert err.count("\n") == 1

@@ -1,0 +1,264 @@
+"""Case files near valid ones, by the thousand: each is refused in one line that names the file, or it runs."""
+
+import copy
+import dataclasses
+import math
+import pathlib
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ambjax import commands
+from ambjax.casefile import DURATION, KINDS, METHODS, SIGNALS, TABLES, read_case
+from ambjax.doubts import doubts
+from ambjax.ensemble.design import DESIGNS
+from ambjax.ensemble.paths import places
+from ambjax.ensemble.spread import draw
+from ambjax.plant import Plant
+from ambjax.scenario import Clock, Initial, Scenario, Sensor
+from tuning.toml import dumps
+
+# Every run is of so few samples, and of so few structures, each of which is compiled once.
+SAMPLES, MOST_STRUCTURES = 4, 12
+# Of the cases that are read, one in so many is run.
+ONE_IN = 4
+FIELDS = {field.name: field for kind in (Scenario, Clock) for field in dataclasses.fields(kind)}
+DEEP = [0]
+for _ in range(40):
+    DEEP = [DEEP]
+NUMBERS = [math.nan, math.inf, -math.inf, 0, -0.0, -1, 5e-324, 1e-110, 1e-300, 1e200, 1e308, -1e308, True, False]
+WHOLE = [10**30, -(10**400), 10**400, 2**63, 2**32]
+WORDS = ["", "auto", "1.0", "a\nb", "\x7f<b>|", "x" * 300]
+NESTED = [[], [1.0], [1.0, 2.0], ["a", 1], [[[]]], DEEP, {}, {"kind": "sine"}, {"percent": 1e308}]
+SPREADS = [{"log-uniform": [1e-200, 1e200]}, {"uniform": [-1e308, 1e308]}, {"normal": 5e-324}]
+HOSTILE = st.one_of(
+    st.sampled_from([*NUMBERS, *WHOLE, *WORDS, *NESTED, *SPREADS]),
+    st.floats(),
+    st.integers(),
+    st.text(max_size=5),
+)
+
+
+def number(field):
+    """A number for a field: near its default, anywhere in its range in logarithms, at its ends or just beyond them."""
+    meta = field.metadata
+    default = field.default if isinstance(field.default, (int, float)) and np.isfinite(field.default) else 0.0
+    low = meta["above"] if meta["at_least"] is None else meta["at_least"]
+    high = meta["at_most"]
+    ends = [low, high, np.nextafter(low, -np.inf), np.nextafter(high, np.inf), np.nextafter(low, np.inf)]
+    size = st.floats(math.log(max(low, high * 1e-12)) if low >= 0 else -20.0, math.log(high)).map(math.exp)
+    signed = st.tuples(size, st.sampled_from([1, -1] if low < 0 else [1])).map(math.prod)
+    near = st.floats(0.5, 2.0).map(lambda factor: factor * default)
+    return st.one_of(near, near, near, near, signed, st.sampled_from(ends).map(float))
+
+
+def table_of(record, **more):
+    fields = [field for field in dataclasses.fields(record) if field.metadata.get("leaf")]
+    needed = {field.name: number(field) for field in fields if field.default is dataclasses.MISSING}
+    others = {field.name: number(field) for field in fields if field.name not in needed}
+    return st.fixed_dictionaries(needed | more, optional={k: v for k, v in others.items() if k not in more})
+
+
+def word(text):
+    return st.just(text)
+
+
+# Amplitudes that a gap takes, so that references are not all refused; others come by mutation.
+SMALL = {"amplitude": st.floats(-3e-3, 3e-3), "std": st.floats(0, 2e-4), "value": st.floats(-3e-3, 3e-3)}
+TIMES = {"start": st.floats(0, 0.01), "stop": st.floats(0.011, 0.02), "f_low": st.floats(0, 50)}
+
+
+def signal(small):
+    def one(name, kind):
+        names = [field.name for field in dataclasses.fields(kind)]
+        fixed = {k: v for k, v in (SMALL if small else {}).items() if k in names}
+        return table_of(kind, kind=word(name), **fixed, **{k: v for k, v in TIMES.items() if k in names})
+
+    alone = [one(name, kind) for name, kind in SIGNALS.items() if name != "sum"]
+    terms = st.lists(st.one_of(alone[:4]), min_size=1, max_size=2)
+    return st.one_of(*alone, st.fixed_dictionaries({"kind": word("sum"), "terms": terms}))
+
+
+def law(stage):
+    return st.one_of([table_of(kind, kind=word(name)) for name, kind in KINDS[stage].items()])
+
+
+SPREAD_PATHS = ["plant.m", "plant.k_z", "plant.s_0", "initial.z", "sensor.std", "reference.amplitude", "actuator.u_max"]
+SPREAD_PATHS += ["controller.inversion.gamma", "controller.position.c", "controller.model.m", "disturbance.q_z.shift"]
+SPREAD = st.one_of(
+    st.fixed_dictionaries({"percent": st.floats(0, 60)}, optional={"shape": st.sampled_from(["uniform", "normal"])}),
+    st.fixed_dictionaries({"normal": st.floats(0, 1e-3)}),
+    st.tuples(st.floats(-20, 5), st.floats(0, 10)).map(lambda x: {"uniform": [math.exp(x[0]), math.exp(x[0] + x[1])]}),
+    st.tuples(st.floats(-60, 60), st.floats(0, 60)).map(
+        lambda x: {"log-uniform": [math.exp(x[0]), math.exp(x[0] + x[1])]}
+    ),
+    st.lists(st.floats(1e-6, 1e3), min_size=1, max_size=4).map(lambda x: {"choices": x}),
+)
+CLOCK = st.one_of(
+    st.just({"duration": 0.004, "sample_period": 1e-3}),
+    st.just({"duration": 0.01}),
+    st.builds(
+        lambda dt, name: {"duration": 0.01, "dt": dt, "method": name},
+        st.sampled_from([1e-4, 5e-5, 1e-6, 1e-14]),
+        st.sampled_from(list(METHODS)),
+    ),
+    st.fixed_dictionaries(
+        {}, optional={"duration": number(DURATION), "sample_period": number(FIELDS["sample_period"])}
+    ),
+)
+DOCUMENT = st.fixed_dictionaries(
+    {"clock": CLOCK},
+    optional={
+        "plant": table_of(Plant),
+        "controller": st.fixed_dictionaries({}, optional={"model": table_of(Plant)} | {s: law(s) for s in KINDS}),
+        "reference": signal(small=True),
+        "disturbance": st.fixed_dictionaries({}, optional={"q_z": signal(small=False), "q_i": signal(small=False)}),
+        "sensor": table_of(Sensor),
+        "actuator": st.fixed_dictionaries({}, optional={"u_max": number(FIELDS["u_max"])}),
+        "initial": table_of(Initial, z=st.floats(-3e-3, 3e-3)),
+        "run": st.fixed_dictionaries(
+            {}, optional={"seed": st.integers(0, 2**32), "settle": st.floats(0, 0.01), "clearance": st.floats(0, 6e-3)}
+        ),
+        "spread": st.dictionaries(st.sampled_from(SPREAD_PATHS), SPREAD, max_size=3).flatmap(
+            lambda table: st.fixed_dictionaries(
+                {path: st.just(how) for path, how in table.items()},
+                optional={"design": st.sampled_from([*DESIGNS])},
+            )
+        ),
+    },
+)
+
+
+def nested(document):
+    """Dotted keys of [spread] as the tables that TOML makes of them."""
+    if isinstance(document.get("spread"), dict):
+        tree = {}
+        for path, how in document["spread"].items():
+            *tables, last = path.split(".")
+            at = tree
+            for name in tables:
+                at = at.setdefault(name, {})
+            at[last] = how
+        document["spread"] = tree
+    return document
+
+
+def spots(node, found):
+    """Every (table or list, key) of a document."""
+    items = node.items() if isinstance(node, dict) else enumerate(node)
+    for key, value in items:
+        found.append((node, key))
+        if isinstance(value, (dict, list)):
+            spots(value, found)
+    return found
+
+
+@st.composite
+def texts(draw_from):
+    """The text of a case file: a valid structure, in half of them with up to three wounds; now and then nonsense."""
+    if draw_from(st.integers(0, 30)) == 0:
+        return draw_from(
+            st.one_of(
+                st.text(max_size=40),
+                st.integers(1, 3000).map(lambda n: "a = " + "[" * n + "]" * n),
+                st.integers(1, 6000).map(lambda n: "[plant]\nm = " + "9" * n),
+                st.integers(1, 6000).map(lambda n: "[run]\nseed = 0x" + "f" * n),
+                st.integers(1, 600).map(lambda n: ".".join("a" * n) + " = 1"),
+            )
+        )
+    document = nested(copy.deepcopy(draw_from(DOCUMENT)))
+    for _ in range(draw_from(st.sampled_from([0, 0, 0, 1, 1, 2, 3]))):
+        places_ = spots(document, [])
+        node, key = places_[draw_from(st.integers(0, len(places_) - 1))]
+        wound = draw_from(st.sampled_from(["value", "value", "value", "delete", "rename", "add"]))
+        if wound == "value" or isinstance(node, list):
+            node[key] = copy.deepcopy(draw_from(HOSTILE))
+        elif wound == "delete":
+            del node[key]
+        elif wound == "rename":
+            node[draw_from(st.sampled_from([key + "_", key[:-1] or "x", "a b", "\n", "", *TABLES]))] = node.pop(key)
+        else:
+            name = draw_from(st.sampled_from(["kind", "unit", "value", "percent", "design", "tune", "x"]))
+            node[name] = copy.deepcopy(draw_from(HOSTILE))
+        if not spots(document, []):
+            break
+    return dumps(document)
+
+
+@dataclasses.dataclass
+class Tally:
+    """What became of the files, and the structures that have been compiled."""
+
+    refused: int = 0
+    read: int = 0
+    run: int = 0
+    structures: set = dataclasses.field(default_factory=set)
+
+
+def hold(text, path, tally, run):
+    """A file with this text is refused in one line that names it, or it is read, drawn from and, if `run`, run."""
+    path.write_text(text, encoding="utf-8", errors="surrogatepass")
+    try:
+        case = read_case(path)
+    except ValueError as error:
+        message = str(error)
+    else:
+        message = ""
+    if message:
+        tally.refused += 1
+        assert message.startswith(str(path))
+        assert message.isprintable()
+        return
+    tally.read += 1
+    assert all(line.isprintable() for line in doubts(case))
+    known = places(case.cascade, case.scenario)
+    for where, values in draw(case.spread, case.cascade, case.scenario, 0, np.arange(8), 8).items():
+        low, high = dict(case.spread.entries)[where].support(float(known[where].value or 0.0))
+        assert np.all((low <= values) & (values <= high))
+    short = dataclasses.replace(case, clock=dataclasses.replace(case.clock, samples=SAMPLES))
+    structure = jax.tree.structure((short.cascade, short.scenario, short.clock))
+    known = structure in tally.structures
+    if run and tally.read % ONE_IN == 0 and (known or len(tally.structures) < MOST_STRUCTURES):
+        tally.structures.add(structure)
+        tally.run += 1
+        outcome = commands.simulate(short)
+        for name, value in {**outcome.trajectory.rows._asdict(), **outcome.measured}.items():
+            assert not np.any(np.isnan(value)), name
+
+
+PROFILE = {"derandomize": True, "deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
+
+
+@pytest.fixture
+def path(tmp_path):
+    return pathlib.Path(tmp_path) / "case.toml"
+
+
+def test_three_hundred_files_are_read_or_refused(path):
+    tally = Tally()
+
+    @settings(max_examples=300, **PROFILE)
+    @given(texts())
+    def examine(text):
+        hold(text, path, tally, run=False)
+
+    examine()
+    assert tally.refused > 50  # or nothing was attacked
+    assert tally.read > 50  # or nothing was let through
+
+
+@pytest.mark.slow
+def test_twenty_thousand_files_run_or_are_refused(path):
+    tally = Tally()
+
+    @settings(max_examples=20_000, **PROFILE)
+    @given(texts())
+    def examine(text):
+        hold(text, path, tally, run=True)
+
+    examine()
+    assert min(tally.refused, tally.read) > 4000
+    assert tally.run > 500
