@@ -13,7 +13,7 @@ import tomllib
 import numpy as np
 import pytest
 
-from ambjax import plotting
+from ambjax import overview
 from ambjax.__main__ import main
 from ambjax._pytree import validate, within
 from ambjax.casefile import KINDS, SIGNALS, case_from, read_case
@@ -379,7 +379,7 @@ def test_a_full_disk_leaves_nothing_that_looks_finished(monkeypatch, capsys):
     def full(*args, **more):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(plotting, "overview", full)  # the last of three files
+    monkeypatch.setattr(overview, "overview", full)  # the last of three files
     assert main(["simulate", path, "--out", "there"]) == 2
     err = capsys.readouterr().err
     assert "--out there: cannot write there (No space left on device)" in err

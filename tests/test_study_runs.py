@@ -392,7 +392,7 @@ def test_stalled_members_are_told_apart(capsys):
     assert (summary["survivors"], summary["lost"], summary["stalled"]) == (7, 1, 2)
     lines = studies._text(summary).splitlines()
     assert lines[0].startswith("7 of 10 members survive: ")
-    assert lines[1].startswith("1 is lost; of 2 it is not known, for the integration stalled")
+    assert lines[1].startswith("1 lost, 2 not decided")
 
 
 # --- bad input ---
@@ -410,7 +410,7 @@ BAD = {
     "large seed": ("ensemble --members 9 --seed 4294967296", "", ["--seed 4294967296", "from 0 to"]),
     "resume what": ("ensemble --members 9 --resume", "", ["--resume", "--out DIR"]),
     "resume nothing": ("ensemble --members 9 --resume --out new", "", ["--resume", "no study in new", "--out"]),
-    "no processes": ("ensemble --members 9 --processes 0", "", ["--processes 0", "at least 1"]),
+    "no processes": ("ensemble --members 9 --processes 0", "", ["--processes 0", "from 1 to"]),
     "out a file": ("ensemble --members 9 --out case.toml", "", ["--out case.toml", "cannot write"]),
     "out below a file": ("ensemble --members 9 --out case.toml/a", "", ["--out case.toml/a", "cannot write"]),
     "resume a file": ("ensemble --members 9 --resume --out case.toml", "", ["no study in case.toml"]),
