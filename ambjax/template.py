@@ -50,8 +50,8 @@ settle = 0.5                  # s; from when "settled" metrics count (left out: 
 # actuator.u_max = {{ choices = [200, 500, 1000] }}        # V; equally likely
 
 # [tune]                      # for 'ambjax-tune': from the gains above to better ones; all of it may be left out
-# gains = ["controller.position.c", "controller.position.k"]   # left out: c, k, gamma, k_i and l, whichever are there
-# bounds.controller.position.c = [1.0, 500.0]              # left out: above 0
+# gains = ["controller.position.c", "controller.position.k"]   # left out: all gains of the laws but p
+# bounds.controller.position.c = [1.0, 500.0]              # left out: from the plant; the report lists them
 # weights.peak = 0.5          # beside tracking (1), effort and chatter (0.1 each), clearance, survival, conditions
 # risk = "cvar"               # what is made of the members' losses: "mean", "cvar" (with alpha = 0.9), "soft-worst"
 # members = 32                # rotors that are tuned on, each with its own noise and [spread]

@@ -14,6 +14,8 @@ from ambjax.casefile import case_from
 from ambjax.tomltable import Table
 from tuning.__main__ import main
 from tuning.config import tune_from
+from tuning.descent import Starts
+from tuning.optimise import Search
 from tuning.rounds import LOUDER, MOST_HALVINGS, _joining, finer, rounds
 from tuning.study import NEGLIGIBLE, REFERENCE_MEMBERS, StepError, compared, step_error, study_of, words, worst_of
 
@@ -144,13 +146,23 @@ class Verdicts:
         return self.errors.pop(0) if len(self.errors) > 1 else self.errors[0]
 
 
+def searched(engine, goal, who, points, **rest):
+    """In place of a search: the first point is the answer, the others lie on the way to it."""
+    count = min(len(points), 8)
+    x, value = np.array(points[:count]), np.arange(float(count)) / 100
+    starts = Starts(x, x, value, None, value, value)
+    rows = {"x": [x], "value": [value], "lost": [np.zeros(count)], "members": [np.array(len(who.member))]}
+    return Search(starts, np.zeros(count, bool), rows, iteration=1)
+
+
 @pytest.fixture
 def run(small, monkeypatch, tmp_path):
-    def answer(*errors, most=3):
+    def answer(*errors, most=4):
         verdicts = Verdicts(*errors)
         monkeypatch.setattr(tuning.rounds, "step_error", verdicts)
+        monkeypatch.setattr(tuning.rounds, "search", searched)
+        monkeypatch.setattr(tuning.rounds, "_lost", lambda study, x: (np.zeros(0, int), np.arange(4)))
         monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", most)
-        monkeypatch.setattr(tuning.rounds, "MOST_LOOKS", 1)
         start = small.tune.space.values(small.case.cascade)
         return rounds(small, start, tmp_path, "told", False), verdicts
 
@@ -169,7 +181,7 @@ def test_the_search_goes_on_with_members_that_are_not_confirmed(run, small):
     assert answer.good
     assert answer.who.member.size == small.tune.budget.members + small.tune.budget.stressed + 1
     assert answer.who.loud.max() == LOUDER
-    assert len(verdicts.asked) == 3
+    assert [count for _, count, _ in verdicts.asked] == [4, 4, 8]
 
 
 def test_what_nothing_confirms_is_not_taken_for_an_answer(run, small):
@@ -184,12 +196,13 @@ def test_what_nothing_confirms_is_not_taken_for_an_answer(run, small):
 
 def test_an_earlier_point_that_is_confirmed_is_an_answer(run, small):
     nothing = error_of(small, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
-    # three rounds that are refuted, one earlier point too, then one that is not, nor its worst members
-    answer, verdicts = run(nothing, nothing, nothing, nothing, error_of(small))
+    # refuted at every step size, after one more search and at the first of the points before; not at the second
+    answer, verdicts = run(*[nothing] * 5, error_of(small), most=6)
     assert answer.good
     np.testing.assert_array_equal(answer.x, verdicts.asked[-1][0])
 
 
+@pytest.mark.slow
 def test_a_refuted_answer_is_a_failure_in_every_file(small, monkeypatch, tmp_path, capsys):
     refuted = Verdicts(
         error_of(small, stalled=4, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
@@ -197,6 +210,7 @@ def test_a_refuted_answer_is_a_failure_in_every_file(small, monkeypatch, tmp_pat
     for place in (tuning.rounds, tuning.command):
         monkeypatch.setattr(place, "step_error", refuted)
     monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 1)
+    monkeypatch.setattr(tuning.rounds, "MOST_HALVINGS", 0)
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(SMALL)
     assert main([str(path), "--out", str(out)]) == 1
@@ -212,6 +226,7 @@ def test_a_refuted_answer_is_a_failure_in_every_file(small, monkeypatch, tmp_pat
     assert case_from(tomllib.loads((out / "tuned.toml").read_text())).cascade.current.p > 0
 
 
+@pytest.mark.slow
 def test_an_answer_confirmed_in_training_is_still_refuted_by_held_out_members(small, monkeypatch, tmp_path):
     right = error_of(small)
     monkeypatch.setattr(tuning.rounds, "step_error", Verdicts(right))

@@ -1,1 +1,1 @@
-"""Gain tuning by gradients: to come. It will use only the public names of `ambjax`."""
+"""Gain tuning by gradients through an ensemble. It uses only the public names of `ambjax`."""
