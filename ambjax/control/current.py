@@ -14,7 +14,11 @@ class SlidingMode:
     """u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - k_i sgn(i - i_ref)) + R i. Eq. (11), sgn smoothed."""
 
     k_i: Scalar = gain(default=152.0, unit="A/s", doc="switching gain; above the disturbance bound Q_i")
-    p: Scalar = gain(default=25.0, unit="1/A", doc="steepness of the smoothed sign of the current error")
+    p: Scalar = gain(
+        default=25.0,
+        unit="1/A",
+        doc="steepness of the smoothed sign of the current error; left out: scaled to the plant",
+    )
 
     def init(self, model: Plant) -> tuple[()]:
         return ()
@@ -24,6 +28,9 @@ class SlidingMode:
 
     def slope(self, model: Plant) -> Scalar:
         return TWO_OVER_PI * self.k_i * self.p
+
+    def size(self, model: Plant) -> Scalar:
+        return model.i_0
 
     def __call__(self, model: Plant, inputs: CurrentInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
         measured, demand = inputs.measured, inputs.demand
