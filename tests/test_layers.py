@@ -16,7 +16,7 @@ FLOORS = {
     1: "_pytree _apart _kernel smooth gaussian _linear _version",
     2: "plant signals integrate explicit trajectory",
     3: "control control.* scenario metrics",
-    4: "loop sliding extend method rollout theorem proof linear paper evidence claims ledger plotting",
+    4: "loop sliding extend method rollout theorem verdict proof linear paper evidence claims ledger plotting",
     5: "__init__ ensemble ensemble.*",
     6: "casefile tomltable spreadfile template outputs worker studies mapping commands __main__ tuning tuning.*",
 }
