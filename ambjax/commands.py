@@ -65,8 +65,9 @@ def run_simulate(args: argparse.Namespace) -> tuple[int, Summary]:
     ended = metrics["lost_at_s"] is not None
     if metrics["lost"]:
         say(
-            f"The rotor is lost at {metrics['lost_at_s']:.4g} s: {trajectory.lost_why}. 'ambjax check {args.case}' says "
-            f"which gain fails which condition of Theorem 1; 'ambjax-tune {args.case}' looks for gains that hold it."
+            f"The rotor is lost at {metrics['lost_at_s']:.4g} s: {trajectory.lost_why}. 'ambjax check {args.case}' "
+            "says which gain fails which condition of Theorem 1; "
+            f"'ambjax-tune {args.case}' looks for gains that hold it."
         )
     elif ended:
         say(verdict.undecided(metrics["lost_at_s"]))

@@ -26,7 +26,7 @@ DRAWING = {
     "ambjax.ensemble.pictures",
     "ambjax.ensemble.heatmaps",
     "ambjax.ensemble.scales",
-    "tuning.report",
+    "tuning.pictures",
 }
 FILES = sorted([*ROOT.glob("ambjax/**/*.py"), *ROOT.glob("tuning/**/*.py")])
 

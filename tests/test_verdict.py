@@ -1,4 +1,4 @@
-"""What `ambjax check` and `ambjax simulate` answer: the question, the gain to change and to what, and whether it helps."""
+"""What `ambjax check` and `ambjax simulate` answer: the gain to change, to what, and whether it helps."""
 
 import dataclasses
 import math

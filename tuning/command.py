@@ -9,11 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.casefile import case_from
+from ambjax.control.cascade import Cascade
 from ambjax.outputs import directory, plain, say, write_json
 from ambjax.theorem import check
-from tuning import explore, gradient, report
+from ambjax.verdict import advice as on_conditions
+from tuning import accurate, breakdown, explore, gradient, pictures, report
 from tuning.config import read_study, seeds, settings
 from tuning.objective import Members
+from tuning.page import page
 from tuning.rounds import CHECKPOINT, Answer, rounds
 from tuning.study import Study, judge, study_of, summarise
 from tuning.study import told as step_told
@@ -44,7 +47,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     summary = plain(facts) | {"out": str(out)}
     if not args.json:
         print(_short(facts))
-        print(f"written: {out}/tuned.toml, history.npz, report.md, report.html, report.json")
+        print(f"written: {out}/tuned.toml, history.npz, report.html, report.md, report.json, *.png")
     good = facts["after"]["lost"] == 0 if facts["after"]["members"] else facts["lost_in_training"] == 0
     if not good:
         say(facts["advice"])
@@ -61,7 +64,9 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
     count = tune.budget.held_out
     say(f"judging on {count} members of another seed ...")
     none = {"members": 0, "lost": 0}
-    found = [summarise(study, judge(study, at, held_out, count)) if count else none for at in (_at(study, before), x)]
+    judged = [judge(study, at, held_out, count) if count else {} for at in (_at(study, before), x)]
+    found = [summarise(study, one) if one else none for one in judged]
+    loss = dict(zip(("before", "after"), (breakdown.table(study.goal, one) for one in judged if one), strict=False))
     lost = int((study.engine.terms(x[None], who)["survival"] > 0).sum())
     line = check(tuned.cascade, case.scenario, dataclasses.replace(case.clock, method=None))
     facts: dict[str, Any] = {
@@ -71,12 +76,18 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
         "after": found[1],
         "held_out_seed": held_out,
         "lost_in_training": lost,
+        "loss": loss,
+        "minimised": breakdown.minimised(study, x, who),
         "conditions": report.conditions(line),
+        "advice_on_conditions": on_conditions(line),
         "step_error": answer.error._asdict() | {"resolved": answer.error.resolved} if answer.error else None,
         "lost_in_validation": answer.lost,
         "search": settings(tune)
         | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
     }
+    if count:
+        say(f"some of them again by {accurate.METHOD} ...")
+        facts["accurate"] = accurate.compared(study, x, held_out, count, report.SHOWN)
     facts["gains"] = report.gains_table(space, before, after, None)
     facts["verdict"] = _verdict(facts)
     facts["advice"] = _advice(study, facts, x, who)
@@ -136,20 +147,34 @@ def _write(
     space = study.objective.space
     for row, grows in zip(facts["gains"], found.sensitivity(), strict=True):
         row["sensitivity_percent"] = float(grows)
+    j, k, drop = found.lowest()
+    facts["beside"] = {"path": space.paths[j], "gain": found.gains[j, k], "lower": -np.expm1(-drop)}
     facts["slices"] = {"gains": found.gains, "log_risk": found.goals, "lost": found.lost}
     document = with_gains(raw, {row["path"]: row["after"] for row in facts["gains"]})
     head = f"Tuned by ambjax-tune from the case '{facts['case']}'.\n{facts['verdict']}"
-    case_from(document, facts["case"])  # a file that could not be read back is not written
+    tuned = case_from(document, facts["case"])  # a file that could not be read back is not written
     (out / "tuned.toml").write_text(dumps(document, head), encoding="utf-8")
     np.savez(out / "history.npz", **history)
     text = report.markdown(facts)
-    pictures = {"Convergence": report.convergence(history, space.paths)}
-    pictures["The risk along each gain, through the optimum"] = report.landscape(found, space.paths)
-    if facts.get("pareto"):
-        pictures["Error against voltage"] = report.front(facts["pareto"])
+    drawn = _pictures(study, tuned.cascade, history, facts, found)
+    for name, data in drawn.items():
+        (out / name).write_bytes(data)
     (out / "report.md").write_text(text, encoding="utf-8")
-    (out / "report.html").write_text(report.page(text, pictures, f"Tuning of {facts['case']}"), encoding="utf-8")
+    (out / "report.html").write_text(page(text, drawn, f"Tuning of {facts['case']}"), encoding="utf-8")
     write_json(out / "report.json", facts)
+
+
+def _pictures(
+    study: Study, tuned: Cascade, history: Any, facts: dict[str, Any], found: explore.Slices
+) -> dict[str, bytes]:
+    """PNG by file name: those that the report shows."""
+    paths, runs = study.objective.space.paths, {"before": study.case.cascade, "after": tuned}
+    drawn = {
+        "nominal.png": pictures.before_after({name: accurate.nominal(study, one) for name, one in runs.items()}),
+        "convergence.png": pictures.convergence(history, paths),
+        "slices.png": pictures.landscape(found, paths),
+    }
+    return drawn | ({"front.png": pictures.front(facts["pareto"])} if facts.get("pareto") else {})
 
 
 def _short(facts: dict[str, Any]) -> str:

@@ -1,0 +1,42 @@
+"""One HTML page of a Markdown text and its pictures, which needs nothing else."""
+
+import base64
+import html
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from markdown_it import MarkdownIt
+
+# Whatever is wider than a narrow screen scrolls in a box of its own; a picture stays legible there.
+STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
+body{overflow-wrap:anywhere}.wide{display:block;overflow-x:auto;margin:.6rem 0}
+table{border-collapse:collapse;overflow-wrap:normal}td,th{border:1px solid #ccc;padding:.2rem .6rem;text-align:left}
+th{background:#f3f3f3}img{display:block;max-width:max(100%,44rem)}"""
+PUNCTUATION = re.compile(r"([\\`*_\[\]<>|~&#!$])")
+
+
+def literal(text: str) -> str:
+    """Text that Markdown shows as it is, in a table too: neither HTML nor emphasis nor a cell's end; one line."""
+    visible = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+    return PUNCTUATION.sub(r"\\\1", visible)
+
+
+def page(text: str, pictures: Mapping[str, bytes], title: str) -> str:
+    """The page. `pictures`: PNG by file name; an image of Markdown that names one is shown from within the page."""
+    markdown = MarkdownIt("commonmark", {"html": False}).enable("table")
+    markdown.add_render_rule("table_open", lambda *_: '<div class="wide"><table>\n')
+    markdown.add_render_rule("table_close", lambda *_: "</table></div>\n")
+
+    def image(renderer: Any, tokens: Any, at: int, options: Any, environment: Any) -> str:
+        words = html.escape(renderer.renderInlineAsText(tokens[at].children, options, environment))
+        data = base64.b64encode(pictures[tokens[at].attrs["src"]]).decode()
+        return f'<span class="wide"><img alt="{words}" src="data:image/png;base64,{data}"></span>'
+
+    markdown.add_render_rule("image", image)
+    head = (
+        '<!doctype html><html lang="en"><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{html.escape(title)}</title><style>{STYLE}</style>"
+    )
+    return f"{head}\n{markdown.render(text)}</html>\n"
