@@ -9,10 +9,12 @@ from typing import Any
 from markdown_it import MarkdownIt
 
 # Whatever is wider than a narrow screen scrolls in a box of its own; a picture stays legible there.
-STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
-body{overflow-wrap:anywhere}.wide{display:block;overflow-x:auto;margin:.6rem 0}
+STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:72rem;margin:2rem auto;padding:0 1rem;color:#222}
+body{overflow-wrap:anywhere}p,li{max-width:60rem}.wide{display:block;overflow-x:auto;margin:.6rem 0}
 table{border-collapse:collapse;overflow-wrap:normal}td,th{border:1px solid #ccc;padding:.2rem .6rem;text-align:left}
-th{background:#f3f3f3}img{display:block;max-width:max(100%,44rem)}"""
+th{background:#f3f3f3}.short{white-space:nowrap}img{display:block;max-width:max(100%,44rem)}"""
+# A cell of at most this many characters is one line: a number does not break at the sign of its exponent.
+SHORT = 48
 PUNCTUATION = re.compile(r"([\\`*_\[\]<>|~&#!$])")
 
 
@@ -26,6 +28,7 @@ def page(text: str, pictures: Mapping[str, bytes], title: str) -> str:
     """The page. `pictures`: PNG by file name; an image of Markdown that names one is shown from within the page."""
     markdown = MarkdownIt("commonmark", {"html": False}).enable("table")
     markdown.add_render_rule("table_open", lambda *_: '<div class="wide"><table>\n')
+    markdown.add_render_rule("td_open", lambda _, tokens, at, *__: _cell(tokens[at + 1].content))
     markdown.add_render_rule("table_close", lambda *_: "</table></div>\n")
 
     def image(renderer: Any, tokens: Any, at: int, options: Any, environment: Any) -> str:
@@ -40,3 +43,7 @@ def page(text: str, pictures: Mapping[str, bytes], title: str) -> str:
         f"<title>{html.escape(title)}</title><style>{STYLE}</style>"
     )
     return f"{head}\n{markdown.render(text)}</html>\n"
+
+
+def _cell(text: str) -> str:
+    return '<td class="short">' if len(text) <= SHORT else "<td>"

@@ -48,7 +48,7 @@ def before_after(runs: dict[str, Trajectory]) -> bytes:
 
 
 def convergence(history: dict[str, Any], paths: list[str]) -> bytes:
-    """PNG: the goal and the gains of the best start against iterations."""
+    """PNG: what is minimised and the gains of the best start against iterations."""
     from matplotlib.figure import Figure
 
     value, gains, members = (np.asarray(history[name]) for name in ("value", "gains", "members"))
@@ -56,9 +56,10 @@ def convergence(history: dict[str, Any], paths: list[str]) -> bytes:
     left, right = figure.subplots(1, 2)
     steps, best = np.arange(1, len(value) + 1), np.argmin(value, axis=1)
     for s in range(value.shape[1]):
-        left.plot(steps, value[:, s], "0.75", lw=1)
-    left.plot(steps, value.min(axis=1), "C0", lw=1.8)
-    left.set(xlabel="iteration", ylabel="log of the risk", title="blue: the best start; dotted: other members asked")
+        left.plot(steps, np.exp(value[:, s]), "0.75", lw=1)
+    left.plot(steps, np.exp(value.min(axis=1)), "C0", lw=1.8)
+    title = "blue: the best start; dotted: other members asked"
+    left.set(xlabel="iteration", ylabel="what is minimised", yscale="log", title=title)
     for j, path in enumerate(paths):
         right.plot(steps, gains[steps - 1, best, j] / gains[-1, best[-1], j], label=path.removeprefix("controller."))
     right.set(xlabel="iteration", ylabel="gain / its final value", yscale="log", title="gains of the best start")
@@ -72,9 +73,8 @@ def convergence(history: dict[str, Any], paths: list[str]) -> bytes:
 
 
 def landscape(found: Slices, paths: list[str]) -> bytes:
-    """PNG: the risk along each gain through the optimum."""
+    """PNG: what was minimised along each gain through the answer."""
     from matplotlib.figure import Figure
-    from matplotlib.ticker import NullFormatter
 
     m = len(paths)
     figure = Figure(figsize=(2.4 * m + 1, 3.2), layout="constrained")
@@ -89,9 +89,12 @@ def landscape(found: Slices, paths: list[str]) -> bytes:
             ax.plot(gains[~held], risk[~held], "C3x", ms=5, label="members lost")
         ax.axvline(gains[middle], color="0.5", lw=0.8, ls=":")
         ax.set_xlabel(path.removeprefix("controller."))
-        ax.xaxis.set_minor_formatter(NullFormatter())
+        ax.set_xticks([], minor=True)
+        span = np.log(gains[-1] / gains[0])
+        ends = [end for end in (gains[0], gains[-1]) if abs(np.log(end / gains[middle])) > span / 4]
+        ax.set_xticks([*ends, gains[middle]], [f"{tick:.3g}" for tick in (*ends, gains[middle])], fontsize=8)
         ax.grid(alpha=0.3)
-    axes[0].set_ylabel(f"risk / risk at the optimum (cut at {HIGHEST:g})")
+    axes[0].set_ylabel(f"relative to the answer (cut at {HIGHEST:g})")
     handles = {label: h for ax in axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     axes[0].legend(handles.values(), handles.keys(), fontsize=8)
     return _png(figure)
@@ -103,7 +106,10 @@ def front(rows: list[dict[str, Any]]) -> bytes:
 
     figure = Figure(figsize=(5, 3.4), layout="constrained")
     ax = figure.subplots()
-    ax.plot([r["settled_rms_u_V"] for r in rows], [r["settled_rms_error_m"] for r in rows], "o-", ms=4)
+    errors = [r["settled_rms_error_m"] for r in rows]
+    ax.plot([r["settled_rms_u_V"] for r in rows], errors, "o-", ms=4)
+    # at least half a decade: a front of one point has no scale of its own
+    ax.set_ylim(min(min(errors) / 1.2, max(errors) / 2), max(max(errors) * 1.2, min(errors) * 2))
     ax.set(xlabel="settled rms voltage (V)", ylabel="settled rms error (m)", yscale="log")
     ax.grid(alpha=0.3, which="both")
     return _png(figure)

@@ -75,25 +75,26 @@ def _number(x: float | None, form: str = ".5g") -> str:
 
 def _gains(facts: Facts) -> list[str]:
     ranged = any(row.get("source") for row in facts["gains"])
-    looked = ["looked for from", "to", "why"] if ranged else []
+    looked = ["looked for from", "to"] if ranged else []
     head = ["gain", "before", "after", *looked, "may end from", "to", "at an end", "risk grows by"]
     rows = []
     for row in facts["gains"]:
         ends = [_number(row.get(end), ".3g") for end in ("low", "high")] if ranged else []
-        why = [literal(row.get("source") or "-")] if ranged else []
         bounds = [_number(row.get(end), ".3g") for end in ("least", "most")]
         grows = "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
         gains = f"{row['before']:.6g}", f"{row['after']:.6g}"
-        rows.append([row["path"], *gains, *ends, *why, *bounds, row["at_bound"] or "-", grows])
+        rows.append([row["path"], *gains, *ends, *bounds, row["at_bound"] or "-", grows])
     lines = ["## Gains", "", *_table(head, rows), ""]
     words = (
         "The last column: where this gain alone is off by a factor of e^0.25 = 1.28, up or down, the worse of both. A "
         "large number: set it with care. A small one: it hardly matters. `tune.bounds` sets other ends."
     )
+    sources = [f"- {row['path']}: {literal(row['source'])}" for row in facts["gains"] if row.get("source")]
     return [
         *lines,
         words,
         "",
+        *(["Where these ranges come from:", "", *sources, ""] if sources else []),
         "## One rotor before and after",
         "",
         "The case's own run, nothing spread, by accurate steps; u as each sample begins.",
@@ -224,8 +225,8 @@ def _beside(facts: Facts) -> str:
         )
     return (
         f"**The lowest point of these slices is {where}**, and loses no more members: the search ended before it went "
-        "there. Neither the validation ensemble nor accurate steps have seen that point. To go on from there set the gain in tuned.toml "
-        "and tune that file."
+        "there. Neither the validation ensemble nor accurate steps have seen that point. To go on from there set the "
+        "gain in tuned.toml and tune that file."
     )
 
 
