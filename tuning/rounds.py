@@ -52,7 +52,6 @@ def rounds(study: Study, start: np.ndarray, out: pathlib.Path, told: Any, resume
     looks: list[tuple[float, np.ndarray]] = []  # goals and answers, on the same members, in the same steps
     looking = tune.budget.screen > 0
     points = everywhere(study.objective, study.goal.conditions, start, tune.budget.screen, tune.budget.seed)
-    points = points if tune.budget.screen else points[:1]
     who = training(study)
     past: list[Search] = []
     began = time.perf_counter()

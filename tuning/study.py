@@ -16,7 +16,7 @@ from tuning.config import Tune, seeds
 from tuning.goal import Goal
 from tuning.loss import loss_for
 from tuning.objective import Engine, Objective
-from tuning.screen import bounded
+from tuning.ranges import Range, bounded
 
 # Members simulated at a time when an ensemble is judged.
 CHUNK = 1024
@@ -35,6 +35,7 @@ class Study:
     objective: Objective
     engine: Engine
     goal: Goal
+    ranges: list[Range]
 
 
 def method_for(case: Case, substeps: int) -> Integrator:
@@ -50,11 +51,11 @@ def study_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = No
     loss = loss_for(case.scenario, case.settle, tune.early)
     objective = Objective(tune.space, case.cascade, case.scenario, clock, loss, case.spread)
     conditions = bounds(case.cascade, case.scenario, clock)
-    space = bounded(objective, conditions, tune.space.values(case.cascade))
+    space, box = bounded(objective, conditions, tune.space.values(case.cascade))
     objective = dataclasses.replace(objective, space=space)
     goal = Goal(tune.weights, tune.risk, conditions, tune.conditions, tune.margin)
     mode = "forward" if len(tune.space) <= MOST_FORWARD else "reverse"
-    return Study(case, tune, objective, Engine(objective, settle=case.settle, mode=mode, threads=threads), goal)
+    return Study(case, tune, objective, Engine(objective, settle=case.settle, mode=mode, threads=threads), goal, box)
 
 
 # Beyond this many gains reverse mode is the cheaper one.

@@ -25,6 +25,9 @@ class SlidingMode:
     def slope(self, model: Plant) -> Scalar:
         return TWO_OVER_PI * self.k_i * self.p
 
+    def size(self, model: Plant) -> Scalar:
+        return model.i_0
+
     def __call__(self, model: Plant, inputs: CurrentInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
         measured, demand = inputs.measured, inputs.demand
         inverse = (inputs.gaps or model.gaps(measured.z)).inverses[1]

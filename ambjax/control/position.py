@@ -38,6 +38,9 @@ class SlidingMode:
     def slope(self, model: Plant) -> Scalar:
         return jnp.maximum(TWO_OVER_PI * self.k * self.p, self.c)
 
+    def size(self, model: Plant) -> Scalar:
+        return model.pole * model.s_0
+
     def sigma(self, motion: Measurement, reference: Reference) -> Array:
         return sliding_variable(self.c, motion, reference)
 
@@ -74,6 +77,9 @@ class SuperTwisting:
         # sigma'' + root sigma' + integral sigma = 0 at the origin: the faster of the two modes.
         pole = (root + jnp.sqrt(jnp.maximum(root**2 - 4 * integral, 0.0))) / 2
         return jnp.maximum(jnp.maximum(pole, jnp.sqrt(integral)), self.c)
+
+    def size(self, model: Plant) -> Scalar:
+        return model.pole * model.s_0
 
     def sigma(self, motion: Measurement, reference: Reference) -> Array:
         return sliding_variable(self.c, motion, reference)
