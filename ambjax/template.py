@@ -73,9 +73,10 @@ def _lines(kind: type, values: Any) -> list[str]:
 def _law(kind: type) -> list[str]:
     """The lines of a law; that of p a comment, for whoever changes the plant above it leaves p to the program."""
     scaled = hasattr(kind, "size")
+    lines = _lines(kind, kind())
     return [
-        f"# {line}; left out: scaled to the plant, this for Table 1" if scaled and line.startswith("p = ") else line
-        for line in _lines(kind, kind())
+        line.replace("p =", "# p =").replace("  #", "#", 1) if scaled and line.startswith("p = ") else line
+        for line in lines
     ]
 
 

@@ -12,7 +12,6 @@ from ambjax.theorem import Report as Check
 from tuning.explore import Slices
 from tuning.loss import TERMS
 from tuning.space import Space
-from tuning.study import told as step_told
 
 Facts = dict[str, Any]
 # Where the picture of the risk ends: a lost member costs a million times an error.
@@ -99,12 +98,15 @@ def _held_out(facts: Facts) -> list[str]:
         if name in after:
             lines.append(f"| {name} | {before.get(name, float('nan')):.4g} | {after[name]:.4g} |")
     for name, one in (("lost", "lost"), ("survival, 95 % interval", None)):
-        cells = [
-            str(x["lost"]) if one else f"{x['survival']:.4f} ({x['survival_low']:.4f} to {x['survival_high']:.4f})"
-            for x in (before, after)
-        ]
+        cells = [str(x["lost"]) if one else _survival(x) for x in (before, after)]
         lines.append(f"| {name} | {cells[0]} | {cells[1]} |")
     return [*lines, "", "Lost members count with the error at which they were frozen.", ""]
+
+
+def _survival(one: Facts) -> str:
+    if isinstance(one["survival"], str):
+        return one["survival"]
+    return f"{one['survival']:.4f} ({one['survival_low']:.4f} to {one['survival_high']:.4f})"
 
 
 def _how(facts: Facts) -> list[str]:
@@ -117,7 +119,7 @@ def _how(facts: Facts) -> list[str]:
     if error := facts.get("step_error"):
         told.append(
             f"- step of the search at the optimum: settled rms error {error['search_m']:.4e} m, adaptive RODAS3 "
-            f"{error['reference_m']:.4e} m on {error['members']} members: {step_told(error['relative'])}"
+            f"{error['reference_m']:.4e} m on {error['members']} members: {error['told']}"
         )
     return told
 

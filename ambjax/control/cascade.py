@@ -19,7 +19,7 @@ from ambjax.control.laws import (
     Observer,
     PositionLaw,
     State,
-    default,
+    default_law,
 )
 from ambjax.plant import Plant
 from ambjax.signals import Reference
@@ -59,8 +59,8 @@ USUAL = {
 class Cascade:
     """The controller. `model` is the plant it believes in; the true one lives in the Scenario.
 
-    A law left out is the paper's, with the gains of Table 2 and a p that suits the model (`laws.default`): 25 for the
-    plant of Table 1. Laws are made once: `dataclasses.replace` with another model keeps those that are there.
+    A law left out is the paper's, with the gains of Table 2 and a p that suits the model (`laws.default_law`): 25
+    for the plant of Table 1. Laws are made once: `dataclasses.replace` with another model keeps those that are there.
     """
 
     observer: Observer = _LEFT_OUT
@@ -72,7 +72,7 @@ class Cascade:
     def __post_init__(self) -> None:
         for stage, kind in USUAL.items():
             if getattr(self, stage) is _LEFT_OUT:
-                object.__setattr__(self, stage, default(kind, self.model))
+                object.__setattr__(self, stage, default_law(kind, self.model))
 
     def init(self, measured: Measurement) -> CascadeState:
         """States of all laws at t = 0."""

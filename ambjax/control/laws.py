@@ -98,7 +98,7 @@ class CurrentLaw(Protocol):
     def __call__(self, model: Plant, inputs: CurrentInputs, state: State, /) -> tuple[Array, State]: ...
 
 
-def default(kind: type[L], model: Plant) -> L:
+def default_law(kind: type[L], model: Plant) -> L:
     """The law of this kind with its default gains and, where it has a smoothed sign, the p that suits the model.
 
     A sign is soft or hard against what its argument amounts to: p = 25 m^2/A^2 is soft where v is 2500 A^2/m^2, as in
