@@ -13,6 +13,7 @@ from typing import Any
 from ambjax import signals
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.cascade import Cascade
+from ambjax.control.laws import default_law
 from ambjax.ensemble.spread import Spread, corners
 from ambjax.explicit import DOP853, RK4, Euler
 from ambjax.integrate import Adaptive, Integrator, Rodas3
@@ -110,7 +111,7 @@ def _cascade(table: Table, plant: Plant) -> Cascade:
     for stage, kinds in KINDS.items():
         law = table.table(stage)
         kind = law.choice("kind", list(kinds), next(iter(kinds)))
-        laws[stage] = law.record(kinds[kind], extra=("kind",))
+        laws[stage] = law.record(kinds[kind], extra=("kind",), base=default_law(kinds[kind], model))
     return Cascade(model=model, **laws)
 
 

@@ -68,6 +68,11 @@ class Plant:
         """Force per current at the origin: kappa i_0 / s_0^2, in N/A."""
         return self.kappa * self.i_0 / self.s_0**2
 
+    @property
+    def pole(self) -> Scalar:
+        """Unstable pole of the magnets alone, sqrt(k_s / m), in 1/s: how fast the rotor falls to a side."""
+        return (abs(self.k_s) / self.m) ** 0.5
+
     def gaps(self, z: Scalar) -> Gaps:
         """Upper gap s_0 - z and lower gap s_0 + z, floored at 0.5 % of s_0."""
         floor = GAP_FLOOR * self.s_0

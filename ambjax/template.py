@@ -70,6 +70,16 @@ def _lines(kind: type, values: Any) -> list[str]:
     return lines
 
 
+def _law(kind: type) -> list[str]:
+    """The lines of a law; that of p a comment, for whoever changes the plant above it leaves p to the program."""
+    scaled = hasattr(kind, "size")
+    lines = _lines(kind, kind())
+    return [
+        line.replace("p =", "# p =").replace("  #", "#", 1) if scaled and line.startswith("p = ") else line
+        for line in lines
+    ]
+
+
 def _noted(text: str, comment: str) -> str:
     return f"{text:<30}# {comment}"
 
@@ -91,7 +101,7 @@ def template(scenario: str) -> str:
     for stage, kinds in KINDS.items():
         kind, law = next(iter(kinds.items()))
         others = ", ".join(f'"{k}"' for k in list(kinds)[1:])
-        lines += ["", f"[controller.{stage}]", _noted(f'kind = "{kind}"', f"or {others}"), *_lines(law, law())]
+        lines += ["", f"[controller.{stage}]", _noted(f'kind = "{kind}"', f"or {others}"), *_law(law)]
     lines += ["", _noted("[reference]", f"in m: {', '.join(SIGNALS)}; left out: 0")]
     if tracking:
         lines += ['kind = "sine"', *_lines(type(REFERENCE), REFERENCE)]

@@ -203,7 +203,7 @@ def test_accurate_values_are_those_of_adaptive_rollouts():
         one = study.objective.chosen(seed, np.array([k]), 12)
         cascade, scenario = study.objective.world(type(one)(*({p: v[0] for p, v in field.items()} if isinstance(
             field, dict) else field[0] for field in one)))  # fmt: skip
-        clock = dataclasses.replace(study.case.clock, method=accurate.METHOD)
+        clock = dataclasses.replace(study.case.clock, method=study.reference.objective.clock.method)
         fold = Standard(study.case.settle, study.case.scenario.touchdown)
         cascade = study.objective.space.decode(jnp.asarray(x), cascade)
         found.append(rollout(cascade, scenario, clock, fold=fold, every=0).measured)
@@ -217,9 +217,9 @@ def test_accurate_values_are_those_of_adaptive_rollouts():
 
 
 def test_accurate_steps_against_themselves_are_off_by_nothing(study, x):
-    clock = dataclasses.replace(study.objective.clock, method=accurate.METHOD)
+    clock = dataclasses.replace(study.objective.clock, method=study.reference.objective.clock.method)
     objective = dataclasses.replace(study.objective, clock=clock)
-    engine = Engine(objective, settle=study.case.settle, lanes=accurate.AT_ONCE)
+    engine = Engine(objective, settle=study.case.settle, lanes=4)
     same = dataclasses.replace(study, objective=objective, engine=engine)
     told = accurate.compared(same, x, 5, 3, report.SHOWN)
     assert told["members"] == 3

@@ -9,17 +9,14 @@ from typing import Any
 import numpy as np
 
 from ambjax.control.cascade import Cascade
-from ambjax.integrate import Adaptive
 from ambjax.rollout import rollout
 from ambjax.trajectory import Trajectory
-from tuning.objective import Engine
-from tuning.study import MOST_TRIALS, REFERENCE_TOLERANCE, Study, summarise
+from tuning.study import Study, summarise
 
-# Held-out members that are simulated again: their number, and how many at a time.
-AGAIN, AT_ONCE = 8, 4
+# Held-out members that are simulated again.
+AGAIN = 8
 # A number that the search's own steps miss by more than this share is marked.
 MARKED = 0.05
-METHOD = Adaptive(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS)
 
 
 def compared(study: Study, x: np.ndarray, seed: int, count: int, names: tuple[str, ...]) -> dict[str, Any]:
@@ -30,11 +27,9 @@ def compared(study: Study, x: np.ndarray, seed: int, count: int, names: tuple[st
     """
     numbers = np.arange(min(AGAIN, count))
     who = study.objective.chosen(seed, numbers, count)
-    clock = dataclasses.replace(study.objective.clock, method=METHOD)
-    accurate = Engine(dataclasses.replace(study.objective, clock=clock), settle=study.case.settle, lanes=AT_ONCE)
     both = [
         {name: values[0] for name, values in engine.metrics(x[None], who)["metrics"].items()}
-        for engine in (study.engine, accurate)
+        for engine in (study.engine, study.reference)
     ]
     held = np.logical_and.reduce([~np.isfinite(found["lost_at_s"]) for found in both])
     ways = ("search", "accurate")
@@ -62,5 +57,5 @@ def _relative(ours: float, theirs: float) -> float:
 def nominal(study: Study, cascade: Cascade) -> Trajectory:
     """The case's own run, nothing spread, under this cascade, in accurate steps: a row for each sample."""
     case = study.case
-    clock = dataclasses.replace(case.clock, method=METHOD)
+    clock = dataclasses.replace(case.clock, method=study.reference.objective.clock.method)
     return rollout(cascade, case.scenario, clock).trajectory

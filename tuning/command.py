@@ -18,9 +18,13 @@ from tuning.config import read_study, seeds, settings
 from tuning.objective import Members
 from tuning.page import page
 from tuning.rounds import CHECKPOINT, Answer, rounds
-from tuning.study import Study, judge, study_of, summarise
-from tuning.study import told as step_told
+from tuning.space import Gain, Space, tunable
+from tuning.study import StepError, Study, judge, step_error, study_of, summarise, worst_of
+from tuning.study import words as step_told
 from tuning.toml import dumps, with_gains
+
+# What stands for a survival that accurate steps do not confirm.
+NOT_VERIFIED = "not verified"
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
@@ -48,7 +52,8 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     if not args.json:
         print(_short(facts))
         print(f"written: {out}/tuned.toml, history.npz, report.html, report.md, report.json, *.png")
-    good = facts["after"]["lost"] == 0 if facts["after"]["members"] else facts["lost_in_training"] == 0
+    lost = facts["after"]["lost"] if facts["after"]["members"] else facts["lost_in_training"]
+    good = lost == 0 and facts["verified"]
     if not good:
         say(facts["advice"])
     return int(not good), summary
@@ -64,9 +69,13 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
     count = tune.budget.held_out
     say(f"judging on {count} members of another seed ...")
     none = {"members": 0, "lost": 0}
-    judged = [judge(study, at, held_out, count) if count else {} for at in (_at(study, before), x)]
-    found = [summarise(study, one) if one else none for one in judged]
-    loss = dict(zip(("before", "after"), (breakdown.table(study.goal, one) for one in judged if one), strict=False))
+    judged = [judge(study, at, held_out, count) for at in (_at(study, before), x)] if count else []
+    found = [summarise(study, one) for one in judged] or [none, none]
+    loss = dict(zip(("before", "after"), (breakdown.table(study.goal, one) for one in judged), strict=False))
+    worst = _worst_checked(answer, judged[1], held_out) if judged and answer.confirmed else None
+    refuted = (worst or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
+    if refuted and judged:
+        found[1] |= dict.fromkeys(("survival", "survival_low", "survival_high"), NOT_VERIFIED)
     lost = int((study.engine.terms(x[None], who)["survival"] > 0).sum())
     line = check(tuned.cascade, case.scenario, dataclasses.replace(case.clock, method=None))
     facts: dict[str, Any] = {
@@ -80,18 +89,39 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
         "minimised": breakdown.minimised(study, x, who),
         "conditions": report.conditions(line),
         "advice_on_conditions": on_conditions(line),
-        "step_error": answer.error._asdict() | {"resolved": answer.error.resolved} if answer.error else None,
+        "step_error": answer.error.facts() if answer.error else None,
+        "worst_step_error": worst.facts() if worst else None,
+        "verified": not refuted,
+        "verified_reason": refuted or _confirmed(worst, answer.error),
         "lost_in_validation": answer.lost,
         "search": settings(tune)
         | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
     }
     if count:
-        say(f"some of them again by {accurate.METHOD} ...")
+        say(f"{min(accurate.AGAIN, count)} of them again by accurate steps ...")
         facts["accurate"] = accurate.compared(study, x, held_out, count, report.SHOWN)
-    facts["gains"] = report.gains_table(space, before, after, None)
+    facts["gains"] = [
+        row | dataclasses.asdict(where)
+        for row, where in zip(report.gains_table(space, before, after, None), study.ranges, strict=True)
+    ]
     facts["verdict"] = _verdict(facts)
     facts["advice"] = _advice(study, facts, x, who)
     return facts
+
+
+def _confirmed(*errors: StepError | None) -> str:
+    return "; ".join(f"accurate steps: {step_told(error)}" for error in errors if error)
+
+
+def _worst_checked(answer: Answer, judged: dict[str, np.ndarray], held_out: int) -> StepError | None:
+    """What accurate steps say of the worst held-out members that are held; None where none is."""
+    held = np.flatnonzero(~np.isfinite(judged["lost_at_s"]))
+    if not held.size:
+        return None
+    worst = held[worst_of(judged["settled_max_abs_error_m"][held])]
+    error = step_error(answer.study, answer.x, answer.study.objective.chosen(held_out, worst, len(judged["lost_at_s"])))
+    say(f"accurate steps on the worst of them: {step_told(error)}")
+    return error
 
 
 def _at(study: Study, gains: np.ndarray) -> np.ndarray:
@@ -107,23 +137,22 @@ def _verdict(facts: dict[str, Any]) -> str:
         f"{before['lost']}); settled rms error {after['settled_rms_error_m']:.3g} m (before: "
         f"{before['settled_rms_error_m']:.3g} m), largest {after['settled_max_abs_error_m']:.3g} m."
     )
-    error = facts["step_error"]
-    if error and not error["resolved"]:
-        told += f" The search's own steps against accurate ones: {step_told(error['relative'])}. Do not trust this; "
-        told += "raise tune.substeps."
-    if error and error["lost"]:
-        told += (
-            f" Accurate steps lose {len(error['lost'])} of the training members tried, which the search's own hold: "
-            "raise tune.substeps or tune.stress."
-        )
+    if not facts["verified"]:
+        told += f" That is NOT VERIFIED: {facts['verified_reason']}."
     return told
 
 
 def _advice(study: Study, facts: dict[str, Any], x: np.ndarray, who: Members) -> str:
     """Why rotors may still be lost, and what would help: what is tight, in the order in which it matters."""
+    words = []
+    if not facts["verified"]:
+        words.append(
+            f"Not verified: {facts['verified_reason']}. Raise tune.substeps or tune.stress, or keep gains at a bound "
+            "lower by tune.bounds."
+        )
     if not (facts["lost_in_training"] or facts["after"]["lost"]):
-        return ""
-    words = [f"Rotors are lost: {facts['lost_in_training']} of {len(who.member)} in training."]
+        return " ".join(words)
+    words.append(f"Rotors are lost: {facts['lost_in_training']} of {len(who.member)} in training.")
     for row in facts["conditions"]:
         if row["holds"] is False and row["gain"] is not None:
             words.append(f"{row['requires']} fails: {row['gain']:.3g} against {row['against']:.3g} {row['unit']}.")
@@ -150,7 +179,7 @@ def _write(
     j, k, drop = found.lowest()
     facts["beside"] = {"path": space.paths[j], "gain": found.gains[j, k], "lower": -np.expm1(-drop)}
     facts["slices"] = {"gains": found.gains, "log_risk": found.goals, "lost": found.lost}
-    document = with_gains(raw, {row["path"]: row["after"] for row in facts["gains"]})
+    document = with_gains(raw, _laws(study, {row["path"]: row["after"] for row in facts["gains"]}))
     head = f"Tuned by ambjax-tune from the case '{facts['case']}'.\n{facts['verdict']}"
     tuned = case_from(document, facts["case"])  # a file that could not be read back is not written
     (out / "tuned.toml").write_text(dumps(document, head), encoding="utf-8")
@@ -175,6 +204,12 @@ def _pictures(
         "slices.png": pictures.landscape(found, paths),
     }
     return drawn | ({"front.png": pictures.front(facts["pareto"])} if facts.get("pareto") else {})
+
+
+def _laws(study: Study, tuned: dict[str, float]) -> dict[str, float]:
+    """Every gain of the tuned laws by path, those that were not tuned too: a p left out would follow the plant."""
+    everything = Space(tuple(Gain(path) for path in tunable(study.case.cascade)))
+    return dict(zip(everything.paths, everything.values(study.case.cascade).tolist(), strict=True)) | tuned
 
 
 def _short(facts: dict[str, Any]) -> str:

@@ -12,7 +12,6 @@ from tuning.breakdown import FORMULA
 from tuning.loss import TERMS
 from tuning.page import literal
 from tuning.space import Space
-from tuning.study import told as step_told
 
 Facts = dict[str, Any]
 # Metrics shown before and after; all others are in report.json.
@@ -119,8 +118,7 @@ def _held_out(facts: Facts) -> list[str]:
     ]
     fates = [name for name in ("lost", "stalled") if name in after]
     rows += [[name, str(before[name]), str(after[name]), *_fates(again, name)] for name in fates]
-    kept = [f"{x['survival']:.4f} ({x['survival_low']:.4f} to {x['survival_high']:.4f})" for x in (before, after)]
-    rows.append(["survival, 95 % interval", *kept, *(["-"] * 3 if again else [])])
+    rows.append(["survival, 95 % interval", *map(_survival, (before, after)), *(["-"] * 3 if again else [])])
     lines = [f"## {after['members']} held-out members (seed {facts['held_out_seed']})", "", *_table(head, rows), ""]
     return [*lines, "Lost members count with the error at which they were frozen.", *_accurate(again), ""]
 
@@ -243,6 +241,12 @@ def _conditions(facts: Facts) -> list[str]:
     return lines
 
 
+def _survival(one: Facts) -> str:
+    if isinstance(one["survival"], str):
+        return one["survival"]
+    return f"{one['survival']:.4f} ({one['survival_low']:.4f} to {one['survival_high']:.4f})"
+
+
 def _how(facts: Facts) -> list[str]:
     how = facts["search"]
     told = [
@@ -253,7 +257,7 @@ def _how(facts: Facts) -> list[str]:
     if error := facts.get("step_error"):
         told.append(
             f"- step of the search at the optimum: settled rms error {error['search_m']:.4e} m, adaptive RODAS3 "
-            f"{error['reference_m']:.4e} m on {error['members']} members: {step_told(error['relative'])}"
+            f"{error['reference_m']:.4e} m on {error['members']} members: {error['told']}"
         )
     return told
 

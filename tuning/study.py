@@ -1,9 +1,11 @@
 """A study: a case and its [tune], made into an objective, a goal and an engine; and what its answer is worth."""
 
 import dataclasses
+import functools
 import math
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from ambjax.casefile import Case
@@ -15,8 +17,8 @@ from tuning.conditions import bounds
 from tuning.config import Tune, seeds
 from tuning.goal import Goal
 from tuning.loss import loss_for
-from tuning.objective import Engine, Objective
-from tuning.screen import bounded
+from tuning.objective import Engine, Members, Objective
+from tuning.ranges import Range, bounded
 
 # Members simulated at a time when an ensemble is judged.
 CHUNK = 1024
@@ -24,6 +26,8 @@ CHUNK = 1024
 REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 10_000
 # Beyond this relative error of the settled rms error the steps are refined and the search goes on.
 RESOLVED = 0.1
+# unless the two differ by less than this share of the gap: as much as the reference itself is worth.
+NEGLIGIBLE = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +39,16 @@ class Study:
     objective: Objective
     engine: Engine
     goal: Goal
+    ranges: list[Range]
+    finer: int = 1
+    """how many times as fine its steps are as [tune] asks for"""
+
+    @functools.cached_property
+    def reference(self) -> Engine:
+        """The same objective in accurate steps."""
+        clock = dataclasses.replace(self.objective.clock, method=Adaptive(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS))
+        objective = dataclasses.replace(self.objective, clock=clock)
+        return Engine(objective, settle=self.case.settle, lanes=REFERENCE_MEMBERS)
 
 
 def method_for(case: Case, substeps: int) -> Integrator:
@@ -50,11 +64,13 @@ def study_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = No
     loss = loss_for(case.scenario, case.settle, tune.early)
     objective = Objective(tune.space, case.cascade, case.scenario, clock, loss, case.spread)
     conditions = bounds(case.cascade, case.scenario, clock)
-    space = bounded(objective, conditions, tune.space.values(case.cascade))
+    space, box = bounded(objective, conditions, tune.space.values(case.cascade))
     objective = dataclasses.replace(objective, space=space)
     goal = Goal(tune.weights, tune.risk, conditions, tune.conditions, tune.margin)
     mode = "forward" if len(tune.space) <= MOST_FORWARD else "reverse"
-    return Study(case, tune, objective, Engine(objective, settle=case.settle, mode=mode, threads=threads), goal)
+    return Study(
+        case, tune, objective, Engine(objective, settle=case.settle, mode=mode, threads=threads), goal, box, finer
+    )
 
 
 # Beyond this many gains reverse mode is the cheaper one.
@@ -77,47 +93,82 @@ def rms(values: np.ndarray) -> float:
 
 
 class StepError(NamedTuple):
-    """The search's own step against adaptive RODAS3 on a few training members: settled rms error of both, m.
+    """The search's own step against adaptive RODAS3 on a few members: settled rms error of both, m.
 
-    Of those members whom both hold; `relative` is NaN if there is none. `lost`: numbers of those whom the search's
-    step holds, but not the accurate one.
+    Of those `members` whom both hold; `relative` is NaN if there is none. `lost`, `stalled`: how many of the `tried`
+    the search's step holds, but the accurate one loses, or cannot decide; `who` they are.
     """
 
     search_m: float
     reference_m: float
     relative: float
     members: int
-    lost: list[int]
+    tried: int
+    lost: int
+    stalled: int
+    who: Members
+    negligible_m: float
+    """a difference that is none"""
+
+    @property
+    def unseen(self) -> int:
+        """Members that accurate steps do not hold, though the search's own do."""
+        return self.lost + self.stalled
 
     @property
     def resolved(self) -> bool:
-        """Whether the search's steps tell the truth there."""
-        return abs(self.relative) <= RESOLVED
+        """Whether the search's steps tell the truth of the error there."""
+        return abs(self.relative) <= RESOLVED or abs(self.search_m - self.reference_m) <= self.negligible_m
+
+    @property
+    def refuted(self) -> str:
+        """Why accurate steps do not confirm that the rotor is held there, and how well; '' where they do."""
+        if self.lost:
+            return f"accurate steps lose {self.lost} of {self.tried} members tried, which the search's own hold"
+        if self.stalled:
+            return f"accurate steps cannot decide {self.stalled} of {self.tried} members tried (they stall)"
+        if not self.members:
+            return "no member compared is held by both"
+        return "" if self.resolved else f"its own steps give a settled rms error off by {100 * self.relative:.2g} %"
+
+    def facts(self) -> dict[str, Any]:
+        """All of it as plain data."""
+        told = {name: getattr(self, name) for name in self._fields if name not in ("who", "negligible_m")}
+        return told | {"resolved": self.resolved, "refuted": self.refuted, "told": words(self)}
 
 
-def told(relative: float) -> str:
-    """The error of the search's own steps, relative to accurate ones, in words; NaN where none was held by both."""
-    if math.isnan(relative):
-        return "no member compared is held by both"
-    return f"settled rms error off by {100 * relative:.2g} %"
+def words(error: StepError) -> str:
+    """What accurate steps say, in words."""
+    compared = f"settled rms error off by {100 * error.relative:.2g} % on {error.members} members"
+    return compared if error.members and not error.unseen else error.refuted
 
 
-def step_error(study: Study, x: np.ndarray) -> StepError:
-    """What the search's own steps are worth at x [m]."""
-    seed, count = seeds(study.tune.budget)[0], study.tune.budget.members
-    numbers = np.arange(min(REFERENCE_MEMBERS, count))
-    who = study.objective.chosen(seed, numbers, count)
-    clock = dataclasses.replace(study.objective.clock, method=Adaptive(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS))
-    objective = dataclasses.replace(study.objective, clock=clock)
-    reference = Engine(objective, settle=study.case.settle, lanes=len(who.member))
-    ours, theirs = (e.metrics(x[None], who)["metrics"] for e in (study.engine, reference))
+def compared(study: Study) -> Members:
+    """The members on whom steps are compared first: of the training ensemble."""
+    count = study.tune.budget.members
+    return study.objective.chosen(seeds(study.tune.budget)[0], np.arange(min(REFERENCE_MEMBERS, count)), count)
+
+
+def worst_of(values: np.ndarray) -> np.ndarray:
+    """Numbers of the members with the largest values [n], REFERENCE_MEMBERS of them, worst first."""
+    return np.argsort(-values, kind="stable")[:REFERENCE_MEMBERS]
+
+
+def step_error(study: Study, x: np.ndarray, who: Members | None = None) -> StepError:
+    """What the search's own steps are worth at x [m], on these members; left out: on the first that it is tuned on."""
+    who = compared(study) if who is None else who
+    ours, theirs = (e.metrics(x[None], who)["metrics"] for e in (study.engine, study.reference))
     ended = [np.isfinite(found["lost_at_s"])[0] for found in (ours, theirs)]
-    held = ~(ended[0] | ended[1])
-    if not held.any():
-        return StepError(math.nan, math.nan, math.nan, 0, [])
-    search_m, reference_m = (rms(found["settled_rms_error_m"][0][held]) for found in (ours, theirs))
-    unseen = numbers[ended[1] & ~ended[0]].tolist()
-    return StepError(search_m, reference_m, search_m / reference_m - 1, int(held.sum()), unseen)
+    held, unseen = ~(ended[0] | ended[1]), ended[1] & ~ended[0]
+    stalled = unseen & theirs["stalled"][0]
+    search_m, reference_m = (
+        rms(found["settled_rms_error_m"][0][held]) if held.any() else math.nan for found in (ours, theirs)
+    )
+    relative = search_m / reference_m - 1 if reference_m > 0 else math.nan
+    those: Members = jax.tree.map(lambda a: a[unseen], who)
+    negligible = NEGLIGIBLE * float(np.asarray(study.objective.loss.s_0))
+    both, lost = int(held.sum()), int((unseen & ~stalled).sum())
+    return StepError(search_m, reference_m, relative, both, len(held), lost, int(stalled.sum()), those, negligible)
 
 
 def summarise(study: Study, found: dict[str, np.ndarray]) -> dict[str, Any]:

@@ -14,7 +14,12 @@ class SlidingMode:
     """u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - k_i sgn(i - i_ref)) + R i. Eq. (11), sgn smoothed."""
 
     k_i: Scalar = leaf(default=152.0, unit="A/s", above=0, doc="switching gain; above the disturbance bound Q_i")
-    p: Scalar = leaf(default=25.0, unit="1/A", above=0, doc="steepness of the smoothed sign of the current error")
+    p: Scalar = leaf(
+        default=25.0,
+        unit="1/A",
+        above=0,
+        doc="steepness of the smoothed sign of the current error; left out: scaled to the plant",
+    )
 
     def init(self, model: Plant) -> tuple[()]:
         return ()
@@ -24,6 +29,9 @@ class SlidingMode:
 
     def slope(self, model: Plant) -> Scalar:
         return TWO_OVER_PI * self.k_i * self.p
+
+    def size(self, model: Plant) -> Scalar:
+        return model.i_0
 
     def __call__(self, model: Plant, inputs: CurrentInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
         measured, demand = inputs.measured, inputs.demand

@@ -28,7 +28,12 @@ class Adaptive:
     """
 
     gamma: Scalar = leaf(default=7.5e4, unit="A^2/m^2/s", above=0, doc="adaptation gain; above Delta_1 of Eq. (7)")
-    p: Scalar = leaf(default=25.0, unit="m^2/A^2", above=0, doc="steepness of the smoothed sign of v_tilde")
+    p: Scalar = leaf(
+        default=25.0,
+        unit="m^2/A^2",
+        above=0,
+        doc="steepness of the smoothed sign of v_tilde; left out: scaled to the plant",
+    )
     i_ref: Scalar = leaf(default=0.0, unit="A", doc="initial value of the current reference")
 
     def init(self, model: Plant) -> Array:
@@ -39,6 +44,9 @@ class Adaptive:
 
     def slope(self, model: Plant) -> Scalar:
         return TWO_OVER_PI * self.gamma * self.p
+
+    def size(self, model: Plant) -> Scalar:
+        return (model.i_0 / model.s_0) * (model.i_0 / model.s_0)
 
     def layer(self, model: Plant) -> Scalar:
         """A third of the smoothed sign's width in i_ref, A: of what v_tilde = 1/p is worth at z = 0 and i = 0."""

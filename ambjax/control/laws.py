@@ -3,12 +3,15 @@
 A law is a frozen record: its type is the algorithm, its leaves are the gains. `init` gives its
 state at t = 0 and a call gives (output, state_rate); a law without state uses (). `scale` gives,
 for each state, the size that still matters (an integrator's error is measured against it), and
-`slope` the steepest rate of the law in 1/s, from which a step is chosen. `model` is the nominal
+`slope` the steepest rate of the law in 1/s, from which a step is chosen. A law with a smoothed sign
+tells by `size` what the sign's argument amounts to on a plant: sigma = w s_0 (w the magnets' pole), v = i_0^2/s_0^2,
+i = i_0. Its default p is that of Table 1 for that plant and goes with 1/size for others. `model` is the nominal
 plant: what the controller believes. To add a law: one record in the file of its stage, one row in
 `KINDS` of the case-file reader, one row in the conformance test.
 """
 
-from typing import Any, NamedTuple, Protocol
+import dataclasses
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from jax import Array
 
@@ -17,6 +20,7 @@ from ambjax.plant import Gaps, Plant
 from ambjax.signals import Reference
 
 State = Any
+L = TypeVar("L")
 
 
 class Measurement(NamedTuple):
@@ -92,3 +96,15 @@ class CurrentLaw(Protocol):
     def scale(self, model: Plant) -> State: ...
     def slope(self, model: Plant) -> Scalar: ...
     def __call__(self, model: Plant, inputs: CurrentInputs, state: State, /) -> tuple[Array, State]: ...
+
+
+def default_law(kind: type[L], model: Plant) -> L:
+    """The law of this kind with its default gains and, where it has a smoothed sign, the p that suits the model.
+
+    A sign is soft or hard against what its argument amounts to: p = 25 m^2/A^2 is soft where v is 2500 A^2/m^2, as in
+    Table 1, and a hard sign where it is 1e7.
+    """
+    law: Any = kind()
+    if not hasattr(law, "size"):
+        return law
+    return dataclasses.replace(law, p=law.p * (law.size(Plant()) / law.size(model)))

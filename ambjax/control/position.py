@@ -27,7 +27,9 @@ class SlidingMode:
 
     c: Scalar = leaf(default=17.0, unit="1/s", above=0, doc="decay rate on the sliding manifold")
     k: Scalar = leaf(default=25.0, unit="m/s^2", above=0, doc="switching gain; above the disturbance bound Q_z")
-    p: Scalar = leaf(default=25.0, unit="s/m", above=0, doc="steepness of the smoothed sign of sigma")
+    p: Scalar = leaf(
+        default=25.0, unit="s/m", above=0, doc="steepness of the smoothed sign of sigma; left out: scaled to the plant"
+    )
 
     def init(self, model: Plant) -> tuple[()]:
         return ()
@@ -37,6 +39,9 @@ class SlidingMode:
 
     def slope(self, model: Plant) -> Scalar:
         return jnp.maximum(TWO_OVER_PI * self.k * self.p, self.c)
+
+    def size(self, model: Plant) -> Scalar:
+        return model.pole * model.s_0
 
     def sigma(self, motion: Measurement, reference: Reference) -> Array:
         return sliding_variable(self.c, motion, reference)
@@ -61,7 +66,12 @@ class SuperTwisting:
     c: Scalar = leaf(default=17.0, unit="1/s", above=0, doc="decay rate on the sliding manifold")
     k_1: Scalar = leaf(default=40.0, unit="m^0.5/s^1.5", above=0, doc="gain of the root term")
     k_2: Scalar = leaf(default=50.0, unit="m/s^3", above=0, doc="gain of the integral; above the bound on dq_z/dt")
-    p: Scalar = leaf(default=100.0, unit="s/m", above=0, doc="steepness of the smoothed root and sign of sigma")
+    p: Scalar = leaf(
+        default=100.0,
+        unit="s/m",
+        above=0,
+        doc="steepness of the smoothed root and sign of sigma; left out: scaled to the plant",
+    )
 
     def init(self, model: Plant) -> Array:
         return jnp.zeros(())
@@ -74,6 +84,9 @@ class SuperTwisting:
         # sigma'' + root sigma' + integral sigma = 0 at the origin: the faster of the two modes.
         pole = (root + jnp.sqrt(jnp.maximum(root**2 - 4 * integral, 0.0))) / 2
         return jnp.maximum(jnp.maximum(pole, jnp.sqrt(integral)), self.c)
+
+    def size(self, model: Plant) -> Scalar:
+        return model.pole * model.s_0
 
     def sigma(self, motion: Measurement, reference: Reference) -> Array:
         return sliding_variable(self.c, motion, reference)

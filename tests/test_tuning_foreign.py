@@ -1,0 +1,221 @@
+"""The tuner on other bearings than the paper's: ranges, defaults that follow the plant, complete answers, runs."""
+
+import dataclasses
+import json
+import pathlib
+import tomllib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ambjax import Cascade, Plant, position
+from ambjax.casefile import case_from
+from ambjax.control.laws import default_law
+from ambjax.template import template
+from ambjax.tomltable import Table
+from tuning.__main__ import main
+from tuning.command import _laws
+from tuning.config import tune_from
+from tuning.screen import around, everywhere
+from tuning.study import study_of
+from tuning.toml import dumps, with_gains
+
+CASES = pathlib.Path(__file__).parent / "cases"
+BEARINGS = {path.stem: path.read_text() for path in sorted(CASES.glob("*.toml"))}
+COMMON = BEARINGS | {name: template(name) for name in ("regulation", "tracking")}
+OTHER_LAWS = """
+[controller]
+observer.kind = "complementary"
+position.kind = "super-twisting"
+inversion.kind = "closed-form"
+current.kind = "pi"
+"""
+SCALES = {
+    "position": lambda plant: (
+        plant.s_0 * (plant.mu_0 * plant.n**2 * plant.A * plant.i_0**2 / plant.s_0**3 / plant.m) ** 0.5
+    ),
+    "inversion": lambda plant: (plant.i_0 / plant.s_0) ** 2,
+    "current": lambda plant: plant.i_0,
+}
+
+
+def study(text, **tune):
+    document = tomllib.loads(text)
+    case = case_from(document)
+    return study_of(case, tune_from(Table({"tune": tune}).table("tune"), case)), document
+
+
+def test_the_bearings_are_there():
+    assert set(BEARINGS) == {"rotor", "fan", "turbo"}
+
+
+@pytest.mark.parametrize("laws", ["", OTHER_LAWS], ids=["usual laws", "other laws"])
+@pytest.mark.parametrize("name", COMMON)
+def test_every_range_is_finite_and_positive(name, laws):
+    text = COMMON[name]
+    if laws and "[controller]" in text:
+        head, _, rest = text.partition("[controller]")
+        text = head + "[reference]" + rest.partition("[reference]")[2]
+    found, _ = study(text + laws)
+    names = [gain.name for gain in found.objective.space.gains]
+    assert names == (["l", "c", "k_1", "k_2", "k_p", "k_int", "k_aw"] if laws else ["c", "k", "gamma", "k_i"])
+    for where in found.ranges:
+        assert 0 < where.low < where.high <= where.most < np.inf
+        assert where.source
+    points = everywhere(found.objective, found.goal.conditions, found.tune.space.values(found.case.cascade), 16, 1)
+    assert np.all(np.isfinite(points))
+
+
+def gamma(name, **tune):
+    found, _ = study(COMMON.get(name, name), **tune)
+    return found.ranges[[gain.name for gain in found.objective.space.gains].index("gamma")], found
+
+
+def test_gamma_is_looked_for_from_what_the_motion_asks():
+    """From Delta_1 of a moving reference; at rest, from dv/dz z_dot of a rotor that falls from where it starts."""
+    moving, found = gamma("tracking")
+    assert moving.low == next(b.value for b in found.goal.conditions if b.symbol == "Delta_1") > 0
+    assert "Delta_1" in moving.source
+    resting, found = gamma("rotor")
+    plant = found.case.scenario.plant
+    w = np.sqrt(4 * plant.a * plant.i_0**2 / plant.s_0**3)  # z_ddot = a dv/dz z
+    assert resting.low == pytest.approx(float(plant.dv_dz(0.0, 0.0)) * w * 1e-4, rel=1e-12)
+    assert "initial.z" in resting.source
+    centred, _ = gamma(BEARINGS["rotor"].replace("z = 1e-4", "z = 0.0"))
+    assert centred.low == pytest.approx(resting.low * 0.01 * 0.9 * 4e-4 / 1e-4, rel=1e-12)
+    slow, _ = gamma(BEARINGS["rotor"] + '[reference]\nkind = "sine"\namplitude = 1e-9\nfrequency = 0.1\n')
+    assert slow.low == resting.low
+
+
+def test_bounds_that_miss_a_range_still_make_one():
+    where, _ = gamma("rotor", bounds={"controller": {"inversion": {"gamma": [1e20, float("inf")]}}})
+    assert 1e20 < where.low < where.high <= where.most < np.inf
+    where, _ = gamma("rotor", bounds={"controller": {"inversion": {"gamma": [0.0, 1.0]}}})
+    assert 0 < where.low < where.high < where.most == 1.0
+    where, _ = gamma("rotor", bounds={"controller": {"inversion": {"gamma": [2.0, 3.0]}}})
+    assert (where.low, where.high, where.source) == (2.0, 3.0, "tune.bounds")
+
+
+def test_sources_name_the_pole_and_the_cap():
+    found, _ = study(BEARINGS["rotor"])
+    c, k, *_ = found.ranges
+    w = float(found.case.scenario.plant.pole)
+    assert f"w = {w:.3g} 1/s: pole of the unstable plant" in c.source
+    assert "1/(5 T)" in c.source
+    assert c.high == c.most == pytest.approx(1 / (5 * 1e-4))
+    assert f"may end at up to {k.most:.3g}" in k.source
+    # where the clock is fast enough, the plant sets the end
+    c = study(BEARINGS["rotor"] + "[clock]\nsample_period = 1e-5\nduration = 0.1\n")[0].ranges[0]
+    assert c.high == pytest.approx(10 * w)
+    assert "1/(5 T)" not in c.source
+
+
+# --- defaults that follow the plant ---
+
+
+def test_the_papers_p_is_25_bit_for_bit():
+    for cascade in (Cascade(), Cascade(model=Plant())):
+        assert [cascade.position.p, cascade.inversion.p, cascade.current.p] == [25.0] * 3
+    assert default_law(position.SuperTwisting, Plant()).p == 100.0
+
+
+@pytest.mark.parametrize("name", BEARINGS)
+def test_p_follows_the_plants_own_sigma_v_and_i(name):
+    case = case_from(tomllib.loads(BEARINGS[name]))
+    plant = case.scenario.plant
+    for stage, scale in SCALES.items():
+        law = getattr(case.cascade, stage)
+        assert law.p == pytest.approx(25.0 * scale(Plant()) / scale(plant), rel=1e-12)
+        assert law == getattr(Cascade(model=plant), stage)
+    twisting = case_from(tomllib.loads(BEARINGS[name] + '[controller.position]\nkind = "super-twisting"\n')).cascade
+    assert twisting.position.p == pytest.approx(4 * case.cascade.position.p)
+    given = case_from(tomllib.loads(BEARINGS[name] + "[controller.inversion]\np = 3.0\n")).cascade
+    assert given.inversion.p == 3.0
+
+
+def test_laws_are_made_once():
+    cascade = Cascade(model=Plant(i_0=0.5))
+    assert cascade.current.p == 12.5
+    assert dataclasses.replace(cascade, model=Plant()).current.p == 12.5
+    doubled = jax.tree.map(lambda x: 2 * x, cascade)
+    assert (doubled.current.p, doubled.model.i_0) == (25.0, 1.0)
+    own = position.SlidingMode(1.0, 2.0, 3.0)
+    assert Cascade(position=own, model=Plant(i_0=0.5)).position is own
+
+
+def test_what_the_template_leaves_out_of_p_follows_an_edited_plant():
+    case = case_from(tomllib.loads(template("tracking")))
+    assert case.cascade == Cascade(position=case.cascade.position)  # all as in Python
+    assert case.cascade.inversion.p == 25.0
+    edited = case_from(tomllib.loads(template("tracking").replace("i_0 = 0.25 ", "i_0 = 0.5 ")))
+    assert edited.cascade.inversion.p == 25.0 / 4
+
+
+# --- a complete answer, and a search from the case's gains alone ---
+
+
+@pytest.mark.parametrize("laws", ["", OTHER_LAWS], ids=["usual laws", "other laws"])
+def test_reading_the_tuned_file_gives_the_tuned_cascade(laws):
+    found, document = study(BEARINGS["fan"] + laws)
+    space = found.objective.space
+    x = space.encode(space.clip(found.tune.space.values(found.case.cascade))) + 0.1
+    tuned = dict(zip(space.paths, np.asarray(space.gains_at(jnp.asarray(x))).tolist(), strict=True))
+    text = dumps(with_gains(document, _laws(found, tuned)))
+    again = case_from(tomllib.loads(text)).cascade
+    assert again == jax.tree.map(float, space.decode(jnp.asarray(x), found.case.cascade))
+    if not laws:
+        assert tomllib.loads(text)["controller"]["inversion"]["p"] == found.case.cascade.inversion.p
+
+
+def test_without_a_screen_there_is_the_case_alone():
+    found, _ = study(BEARINGS["fan"], screen=0)
+    start = found.tune.space.values(found.case.cascade)
+    points = everywhere(found.objective, found.goal.conditions, start, 0, 1)
+    assert points.shape == (1, 4)
+    np.testing.assert_allclose(found.objective.space.gains_at(points[0]), start, rtol=1e-12)
+    np.testing.assert_array_equal(around(points[0], 0, 1), points)
+
+
+def write(path, text, **tune):
+    document = tomllib.loads(text)
+    document["tune"] = {"members": 8, "held_out": 100, "validation": 100, "screen": 32} | tune
+    document["clock"] = {"duration": 0.2}
+    document["run"] = {"settle": 0.05}
+    if pulse := document.get("disturbance", {}).get("q_z"):
+        pulse |= {"start": 0.08, "stop": 0.13}
+    path.write_text(dumps(document))
+    return path
+
+
+def told(out):
+    return json.loads((out / "report.json").read_text())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMON)
+def test_common_bearings_tune_unattended(name, tmp_path):
+    out = tmp_path / "out"
+    assert main([str(write(tmp_path / "case.toml", COMMON[name])), "--out", str(out), "--json"]) == 0
+    facts = told(out)
+    assert facts["verified"] is True
+    assert facts["after"]["lost"] == 0
+    assert facts["step_error"]["tried"] == 8
+    assert facts["worst_step_error"]["tried"] == 4
+    assert facts["worst_step_error"]["members"] == 4
+    for row in facts["gains"]:
+        assert 0 < row["low"] < row["high"] <= row["most"]
+        assert row["source"]
+
+
+@pytest.mark.slow
+def test_a_search_from_the_cases_gains_alone(tmp_path):
+    """From gains that hold, as from those of an answer: with no screen it refines them."""
+    first, second = tmp_path / "first", tmp_path / "second"
+    write(tmp_path / "case.toml", BEARINGS["fan"], iterations=4)
+    assert main([str(tmp_path / "case.toml"), "--out", str(first), "--json"]) == 0
+    write(tmp_path / "again.toml", (first / "tuned.toml").read_text(), screen=0)
+    assert main([str(tmp_path / "again.toml"), "--out", str(second), "--json"]) == 0
+    before, after = (told(out)["after"]["settled_rms_error_m"] for out in (first, second))
+    assert after <= 1.01 * before  # the loss counts more than this error

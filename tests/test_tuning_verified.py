@@ -1,0 +1,238 @@
+"""An answer is what accurate steps confirm: what refutes one, what then happens, and what the command says of it."""
+
+import json
+import math
+import pathlib
+import tomllib
+
+import numpy as np
+import pytest
+
+import tuning.command
+import tuning.rounds
+from ambjax.casefile import case_from
+from ambjax.tomltable import Table
+from tuning.__main__ import main
+from tuning.config import tune_from
+from tuning.rounds import LOUDER, MOST_HALVINGS, _joining, finer, rounds
+from tuning.study import NEGLIGIBLE, REFERENCE_MEMBERS, StepError, compared, step_error, study_of, words, worst_of
+
+ROTOR = (pathlib.Path(__file__).parent / "cases" / "rotor.toml").read_text()
+# Under noise on the velocity, hard signs of these gains drive i_ref onto the singular curve within milliseconds of
+# continuous time; the sliding step, which goes where a linear v leads, does not see it at any number of substeps.
+FALSE = (
+    ROTOR.replace("std = 2e-7", "std = 2e-7\nstd_z_dot = 1e-2")
+    + """
+[controller]
+position = { c = 1999.0, k = 100.6, p = 25.0 }
+inversion = { gamma = 6.95e11, p = 25.0 }
+current = { k_i = 22.7, p = 25.0 }
+[clock]
+duration = 0.02
+"""
+)
+SMALL = (
+    ROTOR
+    + """
+[clock]
+duration = 0.02
+[run]
+settle = 0.01
+[tune]
+members = 4
+stressed = 2
+held_out = 8
+validation = 8
+screen = 16
+iterations = 2
+starts = 2
+"""
+)
+
+
+def study(text):
+    document = tomllib.loads(text)
+    case = case_from(document)
+    return study_of(case, tune_from(Table(document).table("tune"), case))
+
+
+@pytest.fixture(scope="module")
+def small():
+    return study(SMALL)
+
+
+def at(found, gains=None):
+    space = found.objective.space
+    return space.encode(space.clip(found.tune.space.values(found.case.cascade) if gains is None else gains))
+
+
+def error_of(found, **changes):
+    """A StepError of four members that are held, and agree; changed."""
+    who = compared(found)
+    none = found.objective.chosen(1, np.arange(0), 4)
+    right = StepError(1e-6, 1e-6, 0.0, len(who.member), len(who.member), 0, 0, none, 1e-10)
+    return right._replace(**changes)
+
+
+def test_what_refutes_an_answer(small):
+    right = error_of(small)
+    assert right.refuted == ""
+    assert right.resolved
+    assert "lose 1 of 4" in error_of(small, lost=1, members=3).refuted
+    stalled = error_of(small, stalled=2, members=2)
+    assert "cannot decide 2 of 4" in stalled.refuted
+    assert "lose" not in stalled.refuted
+    nothing = error_of(small, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
+    assert nothing.refuted == words(nothing) == "no member compared is held by both"
+    assert not nothing.resolved
+    coarse = error_of(small, search_m=1.2e-6, relative=0.2)
+    assert "off by 20 %" in coarse.refuted
+    # errors so small that the reference itself does not resolve them
+    tiny = error_of(small, search_m=2e-11, reference_m=1e-11, relative=1.0)
+    assert tiny.refuted == ""
+    assert json.dumps(stalled.facts())
+
+
+def test_a_negligible_error_is_that_of_the_reference_for_its_gap(small):
+    error = step_error(small, at(small))
+    assert error.negligible_m == NEGLIGIBLE * 4e-4
+    # these gains lose the rotor by either step: neither lost by accurate steps alone, nor held by both
+    assert (error.members, error.lost, error.stalled, error.tried) == (0, 0, 0, 4)
+    assert error.refuted == "no member compared is held by both"
+
+
+def test_false_survival_is_refuted():
+    """The search's own steps hold every member; accurate steps none."""
+    found = study(FALSE)
+    x = at(found)
+    who = compared(found)
+    assert not np.any(found.engine.terms(x[None], who)["survival"])
+    error = step_error(found, x, who)
+    assert error.refuted
+    assert error.unseen == error.tried == REFERENCE_MEMBERS
+    np.testing.assert_array_equal(error.who.member, who.member)
+
+
+def test_the_worst_are_the_largest():
+    assert worst_of(np.array([1.0, 5.0, 3.0, 0.0, 4.0, 2.0])).tolist() == [1, 4, 2, 5]
+
+
+def test_members_that_accurate_steps_do_not_hold_join_louder(small):
+    unseen = small.objective.chosen(1, np.array([2, 3]), 4)
+    error = error_of(small, lost=1, stalled=1, members=2, who=unseen)
+    joined = _joining(small, np.array([7, 5]), error, LOUDER**2)
+    assert joined.member.tolist() == [7, 5, 2, 3]
+    np.testing.assert_allclose(joined.loud, [1.1, 1.1, LOUDER**2, LOUDER**2])
+
+
+def test_steps_are_halved_so_often_and_no_more(small):
+    steps = []
+    while small is not None:
+        steps.append(small.objective.clock.method.substeps)
+        small = finer(small)
+    assert steps == [3 * 2**n for n in range(MOST_HALVINGS + 1)]
+
+
+class Verdicts:
+    """In place of accurate steps: the errors to be given, the last again and again; and at which points, on whom."""
+
+    def __init__(self, *errors):
+        self.errors, self.asked = list(errors), []
+
+    def __call__(self, study, x, who=None):
+        self.asked.append((x, len((compared(study) if who is None else who).member), study.finer))
+        return self.errors.pop(0) if len(self.errors) > 1 else self.errors[0]
+
+
+@pytest.fixture
+def run(small, monkeypatch, tmp_path):
+    def answer(*errors, most=3):
+        verdicts = Verdicts(*errors)
+        monkeypatch.setattr(tuning.rounds, "step_error", verdicts)
+        monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", most)
+        monkeypatch.setattr(tuning.rounds, "MOST_LOOKS", 1)
+        start = small.tune.space.values(small.case.cascade)
+        return rounds(small, start, tmp_path, "told", False), verdicts
+
+    return answer
+
+
+def test_an_answer_is_confirmed_on_the_worst_members_too(run, small):
+    answer, verdicts = run(error_of(small))
+    assert answer.good
+    assert [count for _, count, _ in verdicts.asked] == [4, 8]
+
+
+def test_the_search_goes_on_with_members_that_are_not_confirmed(run, small):
+    unseen = small.objective.chosen(1, np.array([1]), 4)
+    answer, verdicts = run(error_of(small, stalled=1, members=3, who=unseen), error_of(small))
+    assert answer.good
+    assert answer.who.member.size == small.tune.budget.members + small.tune.budget.stressed + 1
+    assert answer.who.loud.max() == LOUDER
+    assert len(verdicts.asked) == 3
+
+
+def test_what_nothing_confirms_is_not_taken_for_an_answer(run, small):
+    """Finer steps first, then earlier points of the search; then it says so."""
+    nothing = error_of(small, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
+    answer, verdicts = run(nothing)
+    assert not answer.confirmed
+    assert not answer.good
+    assert max(finer for *_, finer in verdicts.asked) == 2**MOST_HALVINGS
+    assert len({x.tobytes() for x, *_ in verdicts.asked}) > 3
+
+
+def test_an_earlier_point_that_is_confirmed_is_an_answer(run, small):
+    nothing = error_of(small, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
+    # three rounds that are refuted, one earlier point too, then one that is not, nor its worst members
+    answer, verdicts = run(nothing, nothing, nothing, nothing, error_of(small))
+    assert answer.good
+    np.testing.assert_array_equal(answer.x, verdicts.asked[-1][0])
+
+
+def test_a_refuted_answer_is_a_failure_in_every_file(small, monkeypatch, tmp_path, capsys):
+    refuted = Verdicts(
+        error_of(small, stalled=4, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
+    )
+    for place in (tuning.rounds, tuning.command):
+        monkeypatch.setattr(place, "step_error", refuted)
+    monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 1)
+    path, out = tmp_path / "case.toml", tmp_path / "out"
+    path.write_text(SMALL)
+    assert main([str(path), "--out", str(out)]) == 1
+    facts = json.loads((out / "report.json").read_text())
+    assert facts["verified"] is False
+    assert "cannot decide 4 of 4" in facts["verified_reason"]
+    assert facts["after"]["survival"] == "not verified"
+    assert isinstance(facts["before"]["survival"], float)
+    assert "| not verified |" in (out / "report.md").read_text()
+    said = capsys.readouterr()
+    assert "NOT VERIFIED" in said.out
+    assert "tune.substeps" in said.err
+    assert case_from(tomllib.loads((out / "tuned.toml").read_text())).cascade.current.p > 0
+
+
+def test_an_answer_confirmed_in_training_is_still_refuted_by_held_out_members(small, monkeypatch, tmp_path):
+    right = error_of(small)
+    monkeypatch.setattr(tuning.rounds, "step_error", Verdicts(right))
+    wrong = Verdicts(right._replace(lost=2, members=2))
+    monkeypatch.setattr(tuning.command, "step_error", wrong)
+    path, out = tmp_path / "case.toml", tmp_path / "out"
+    path.write_text(SMALL)
+    assert main([str(path), "--out", str(out), "--json"]) == 1
+    facts = json.loads((out / "report.json").read_text())
+    assert facts["step_error"]["refuted"] == ""
+    assert "lose 2 of 4" in facts["verified_reason"]
+    assert [count for _, count, _ in wrong.asked] == [4]
+
+
+@pytest.mark.slow
+def test_the_search_goes_on_to_where_it_is_confirmed(tmp_path):
+    """From the bearing whose first answers survive in the search's own steps alone, under noise on the velocity."""
+    path, out = tmp_path / "case.toml", tmp_path / "out"
+    hard = FALSE.replace("duration = 0.02", "duration = 0.2").replace("[clock]", "[run]\nsettle = 0.05\n[clock]")
+    path.write_text(hard + "[tune]\nscreen = 32\nmembers = 8\nheld_out = 100\nvalidation = 100\n")
+    assert main([str(path), "--out", str(out), "--json"]) == 0
+    facts = json.loads((out / "report.json").read_text())
+    assert facts["verified"] is True
+    assert facts["after"]["lost"] == 0
