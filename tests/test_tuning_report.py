@@ -18,7 +18,7 @@ from ambjax.casefile import case_from
 from ambjax.metrics import Standard
 from ambjax.tomltable import Table
 from ambjax.trajectory import TOUCHED
-from tuning import accurate, breakdown, pictures, report
+from tuning import accurate, breakdown, extras, pictures, report
 from tuning.__main__ import main
 from tuning.config import seeds, tune_from
 from tuning.explore import REACH, Slices, slices
@@ -354,3 +354,13 @@ def test_ranges_and_their_sources_are_in_the_table():
 
 def test_the_formula_names_every_term_once():
     assert sorted(re.findall(r"[a-z]{2,}", breakdown.FORMULA)) == sorted(TERMS)
+
+
+def test_the_section_on_gradients_is_three_whole_tables():
+    three = {"samples": 5, **{way: [1.0, 2.0] for way in ("forward", "reverse", "differences")}}
+    noise = {name: [1.0, 2.0] for name in ("gradient", "standard_error", "ratio")}
+    horizons = [{"horizon_s": 0.1, "norm": 2.0, "lost": 0.0}]
+    facts = {"gains": ["c", "k"], "three_ways": three, "noise": noise, "horizons": horizons}
+    shown = page("\n".join(extras.gradient(facts)), {}, "t")
+    assert shown.count("<table>") == 3
+    assert shown.count("<td") == 2 * 4 + 3 + 2 * 4

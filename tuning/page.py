@@ -3,7 +3,7 @@
 import base64
 import html
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from markdown_it import MarkdownIt
@@ -22,6 +22,12 @@ def literal(text: str) -> str:
     """Text that Markdown shows as it is, in a table too: neither HTML nor emphasis nor a cell's end; one line."""
     visible = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
     return PUNCTUATION.sub(r"\\\1", visible)
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """A table; cells are Markdown, of which only `|` has to be escaped."""
+    lines = [head, ["---"] * len(head), *rows]
+    return ["| " + " | ".join(cell.replace("\\|", "|").replace("|", "\\|") for cell in line) + " |" for line in lines]
 
 
 def page(text: str, pictures: Mapping[str, bytes], title: str) -> str:

@@ -2,15 +2,15 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ambjax.theorem import Report as Check
+from tuning import extras
 from tuning.breakdown import FORMULA
 from tuning.loss import TERMS
-from tuning.page import literal
+from tuning.page import literal, table
 from tuning.space import Space
 
 Facts = dict[str, Any]
@@ -56,16 +56,10 @@ def markdown(facts: Facts) -> str:
     lines += _gains(facts) + _held_out(facts) + _loss(facts) + _minimised(facts) + _conditions(facts)
     lines += ["## How the search went", "", *_how(facts), "", "![Goal and gains by iteration](convergence.png)", ""]
     if facts.get("pareto"):
-        lines += _pareto(facts["pareto"])
+        lines += extras.pareto(facts["pareto"])
     if facts.get("gradient"):
-        lines += _gradient(facts["gradient"])
+        lines += extras.gradient(facts["gradient"])
     return "\n".join(lines) + "\n"
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """A table; cells are Markdown, of which only `|` has to be escaped."""
-    lines = [head, ["---"] * len(head), *rows]
-    return ["| " + " | ".join(cell.replace("\\|", "|").replace("|", "\\|") for cell in line) + " |" for line in lines]
 
 
 def _number(x: float | None, form: str = ".5g") -> str:
@@ -83,7 +77,7 @@ def _gains(facts: Facts) -> list[str]:
         grows = "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
         gains = f"{row['before']:.6g}", f"{row['after']:.6g}"
         rows.append([row["path"], *gains, *ends, *bounds, row["at_bound"] or "-", grows])
-    lines = ["## Gains", "", *_table(head, rows), ""]
+    lines = ["## Gains", "", *table(head, rows), ""]
     words = (
         "The last column: where this gain alone is off by a factor of e^0.25 = 1.28, up or down, the worse of both. A "
         "large number: set it with care. A small one: it hardly matters. `tune.bounds` sets other ends."
@@ -119,7 +113,7 @@ def _held_out(facts: Facts) -> list[str]:
     fates = [name for name in ("lost", "stalled") if name in after]
     rows += [[name, str(before[name]), str(after[name]), *_fates(again, name)] for name in fates]
     rows.append(["survival, 95 % interval", *map(_survival, (before, after)), *(["-"] * 3 if again else [])])
-    lines = [f"## {after['members']} held-out members (seed {facts['held_out_seed']})", "", *_table(head, rows), ""]
+    lines = [f"## {after['members']} held-out members (seed {facts['held_out_seed']})", "", *table(head, rows), ""]
     return [*lines, "Lost members count with the error at which they were frozen.", *_accurate(again), ""]
 
 
@@ -176,7 +170,7 @@ def _loss(facts: Facts) -> list[str]:
         "clearance and survival add is weight x mean. Costs multiply the error member by member, so what effort and "
         "chatter add is the mean of weight x term x (tracking + peak), which is not the product of the means shown.",
         "",
-        *_table(["term", "weight", "mean before", "adds before", "mean after", "adds after"], rows),
+        *table(["term", "weight", "mean before", "adds before", "mean after", "adds after"], rows),
         "",
     ]
 
@@ -199,7 +193,7 @@ def _minimised(facts: Facts) -> list[str]:
         "validation ensemble or by accurate steps. So this is not the loss of the held-out members above, and it is "
         "this that the picture shows.",
         "",
-        *_table(["at the answer", "value"], rows),
+        *table(["at the answer", "value"], rows),
         "",
         "![What was minimised along each gain, through the answer](slices.png)",
         "",
@@ -235,7 +229,7 @@ def _conditions(facts: Facts) -> list[str]:
         verdict = {True: "holds", False: "FAILS", None: "-"}[row["holds"]]
         rows.append([row["requires"], gain, _number(row["against"]), margin, row["unit"], verdict])
     head = ["condition", "left", "right", "margin", "unit", "verdict"]
-    lines = ["## Conditions of Theorem 1 along the nominal run", "", *_table(head, rows), ""]
+    lines = ["## Conditions of Theorem 1 along the nominal run", "", *table(head, rows), ""]
     if facts.get("advice_on_conditions"):
         lines += [f"- {literal(line)}" for line in facts["advice_on_conditions"]] + [""]
     return lines
@@ -260,44 +254,3 @@ def _how(facts: Facts) -> list[str]:
             f"{error['reference_m']:.4e} m on {error['members']} members: {error['told']}"
         )
     return told
-
-
-def _pareto(rows: list[Facts]) -> list[str]:
-    cells = [
-        [
-            f"{row['effort_weight']:g}",
-            f"{row['settled_rms_error_m']:.3e}",
-            f"{row['settled_rms_u_V']:.4g}",
-            str(row["lost"]),
-            ", ".join(f"{path.rpartition('.')[2]} {value:.4g}" for path, value in row["gains"].items()),
-        ]
-        for row in rows
-    ]
-    return [
-        "## Error against voltage",
-        "",
-        "On the training ensemble; u is averaged over time. More weight on effort buys less voltage with more error.",
-        "",
-        *_table(["weights.effort", "settled rms error (m)", "settled rms u (V)", "lost", "gains"], cells),
-        "",
-        "![Error against voltage](front.png)",
-        "",
-    ]
-
-
-def _gradient(facts: Facts) -> list[str]:
-    ways, noise = facts["three_ways"], facts["noise"]
-    lines = ["## Gradients, in the logarithms of the gains", ""]
-    lines += [f"Over {ways['samples']} samples, of the mean loss:", ""]
-    rows = zip(facts["gains"], ways["forward"], ways["reverse"], ways["differences"], strict=True)
-    cells = [[path, f"{one:.10e}", f"{two:.10e}", f"{three:.8e}"] for path, one, two, three in rows]
-    lines += _table(["gain", "forward", "reverse", "central differences"], cells)
-    head = ["horizon (s)", "norm of the gradient of the log loss", "share of members lost"]
-    lines += [
-        "",
-        *_table(head, [[f"{r['horizon_s']:g}", f"{r['norm']:.3g}", f"{r['lost']:.3g}"] for r in facts["horizons"]]),
-    ]
-    rows = zip(facts["gains"], noise["gradient"], noise["standard_error"], noise["ratio"], strict=True)
-    cells = [[path, f"{slope:.3e}", f"{error:.1e}", f"{ratio:.3g}"] for path, slope, error, ratio in rows]
-    lines += ["", *_table(["gain", "gradient of the log loss", "standard error over members", "ratio"], cells)]
-    return [*lines, ""]
