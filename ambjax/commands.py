@@ -85,9 +85,15 @@ def run_simulate(args: argparse.Namespace) -> tuple[int, Summary]:
         print(f"written: {out}/trajectory.npz, metrics.json, overview.png")
     ended = metrics["lost_at_s"] is not None
     if metrics["lost"]:
-        say(f"The rotor is lost at {metrics['lost_at_s']:.4g} s: {trajectory.lost_why}. 'ambjax check' may say why.")
+        say(
+            f"The rotor is lost at {metrics['lost_at_s']:.4g} s: {trajectory.lost_why}. 'ambjax check {args.case}' "
+            "says which gain fails which condition of Theorem 1; "
+            f"'ambjax-tune {args.case}' looks for gains that hold it."
+        )
     elif ended:
-        say(f"Whether the rotor is held is not known: at {metrics['lost_at_s']:.4g} s the run {trajectory.lost_why}.")
+        from ambjax import verdict
+
+        say(verdict.undecided(metrics["lost_at_s"]))
     return int(ended), metrics | {"out": str(out)}
 
 
@@ -155,18 +161,16 @@ def run_check(args: argparse.Namespace) -> tuple[int, Summary]:
         "holds": report.holds,
         "lost_at_s": report.lost_at,
         "lost_why": report.lost_why,
+        "stalled": report.stalled,
         "method": report.method,
         "conditions": [_condition(c) for c in report.conditions],
         "proof": [_condition(c) for c in report.proof],
     }
     if not args.json:
         _print_check(report.conditions, report.proof)
-        fate = (
-            f"The rotor is lost at {report.lost_at:.4g} s: {report.lost_why}."
-            if report.lost_why
-            else "The rotor is held."
-        )
-        print(f"\n{fate} {'Every condition holds.' if report.holds else 'The answer is no.'}")
+        from ambjax import verdict
+
+        print("\n" + "\n".join(verdict.answer(report, args.case)))
     return int(not report.holds), plain(summary)
 
 

@@ -25,14 +25,15 @@ from ambjax.proof import Monitored
 from ambjax.rollout import check_inputs, roll
 from ambjax.scenario import Clock, Scenario
 from ambjax.signals import Signal, reference_at
-from ambjax.trajectory import FATES
+from ambjax.trajectory import FATES, STALLED
 
 
 @dataclasses.dataclass(frozen=True)
 class Condition:
     """One line of the check: what must hold, the two sides, the margin, and the time of its worst value (s).
 
-    `holds` is None for a line that informs without deciding, or whose gain the law does not have.
+    `holds` is None for a line that informs without deciding, or whose gain the law does not have. `path`: of the
+    gain, as in a case file, if the line is about one. `ideal`: the run has no part in `against`, only the reference.
     """
 
     name: str
@@ -43,6 +44,8 @@ class Condition:
     unit: str
     holds: bool | None
     note: str = ""
+    path: str = ""
+    ideal: bool = False
 
     @property
     def margin(self) -> float | None:
@@ -59,6 +62,12 @@ class Report:
     lost_at: float
     lost_why: str
     method: str
+    stalled: bool = False
+
+    @property
+    def lost(self) -> bool:
+        """Whether the rotor is lost: not so where the integrator gave up, which decides nothing."""
+        return math.isfinite(self.lost_at) and not self.stalled
 
     @property
     def holds(self) -> bool:
@@ -86,7 +95,7 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock) -> Report:
     on_reference = delta_1_on_reference(cascade, scenario, clock)
     conditions = _conditions(cascade, worst, on_reference)
     code = int(trajectory.lost_code)
-    return Report(conditions, _proof(worst), float(trajectory.lost_at), FATES[code], method)
+    return Report(conditions, _proof(worst), float(trajectory.lost_at), FATES[code], method, code == STALLED)
 
 
 def delta_1_on_reference(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[float, float]:
@@ -124,23 +133,25 @@ def _conditions(
     gamma = gain_of(cascade.inversion, inversion.Adaptive, "gamma")
     k_i = gain_of(cascade.current, current.SlidingMode, "k_i")
 
-    def line(name: str, requires: str, gain: float | None, key: Any, unit: str, deciding: bool = True) -> Condition:
-        against, at = worst[key] if isinstance(key, str) else key
+    def line(name: str, requires: str, gain: float | None, key: Any, unit: str, path: str) -> Condition:
+        ideal = not isinstance(key, str)
+        against, at = key if ideal else worst[key]
         if gain is None:
             return Condition(name, requires, None, against, at, unit, None, "the law in use has no such gain")
-        note = "" if deciding else "informs only"
-        return Condition(name, requires, gain, against, at, unit, gain > against if deciding else None, note)
+        return Condition(name, requires, gain, against, at, unit, gain > against, path=path, ideal=ideal)
 
     distance, at = worst["distance"]
+    paths = [f"controller.{stage}" for stage in ("position.k", "current.k_i", "inversion.gamma")]
     remark = dataclasses.replace(
-        line("remark 3", "k > sup |q_z + h|", k, "q_z_plus_h", "m/s^2", deciding=False),
+        line("remark 3", "k > sup |q_z + h|", k, "q_z_plus_h", "m/s^2", paths[0]),
+        holds=None,
         note="optional in the paper: k would dominate the inversion's transients too",
     )
     return [
-        line("disturbance of z", "k > Q_z", k, "q_z", "m/s^2"),
-        line("disturbance of i", "k_i > Q_i", k_i, "q_i", "A/s"),
-        line("inversion", "gamma > Delta_1 along the run", gamma, "d", "A^2/m^2/s"),
-        line("inversion, ideal", "gamma > Delta_1 along the reference", gamma, on_reference, "A^2/m^2/s"),
+        line("disturbance of z", "k > Q_z", k, "q_z", "m/s^2", paths[0]),
+        line("disturbance of i", "k_i > Q_i", k_i, "q_i", "A/s", paths[1]),
+        line("inversion", "gamma > Delta_1 along the run", gamma, "d", "A^2/m^2/s", paths[2]),
+        line("inversion, ideal", "gamma > Delta_1 along the reference", gamma, on_reference, "A^2/m^2/s", paths[2]),
         Condition("singular curve C", "distance of (z/s_0, i_ref/i_0) to C > 0", distance, 0.0, at, "1", distance > 0),
         remark,
     ]

@@ -16,7 +16,7 @@ FLOORS = {
     1: "_pytree _apart _kernel smooth gaussian _linear _version _words sealed interrupts",
     2: "plant signals span integrate explicit trajectory",
     3: "control control.* scenario metrics",
-    4: "loop sliding extend method rollout theorem proof linear paper evidence claims ledger plotting overview",
+    4: "loop sliding extend method rollout theorem verdict proof linear paper evidence claims ledger plotting overview",
     5: "__init__ ensemble ensemble.*",
     6: "casefile doubts reach tomltable spreadfile template outputs worker pace studies mapping commands __main__ "
     "tuning tuning.*",
@@ -29,7 +29,7 @@ DRAWING = {
     "ambjax.ensemble.tornado",
     "ambjax.ensemble.heatmaps",
     "ambjax.ensemble.scales",
-    "tuning.report",
+    "tuning.pictures",
 }
 FILES = sorted([*ROOT.glob("ambjax/**/*.py"), *ROOT.glob("tuning/**/*.py")])
 

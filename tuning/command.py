@@ -9,14 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.casefile import case_from
+from ambjax.control.cascade import Cascade
 from ambjax.doubts import say_doubts
 from ambjax.interrupts import keeping
 from ambjax.outputs import directory, files, plain, say, write_json
 from ambjax.theorem import check
-from tuning import explore, gradient, report
+from ambjax.verdict import advice as on_conditions
+from tuning import accurate, breakdown, explore, gradient, pictures, report
 from tuning.config import read_study, seeds, settings
 from tuning.keeper import remove_all
 from tuning.objective import Members
+from tuning.page import page
 from tuning.rounds import CHECKPOINT, Answer, rounds
 from tuning.space import Gain, Space, tunable
 from tuning.study import StepError, Study, judge, step_error, study_of, summarise, worst_of
@@ -79,7 +82,7 @@ def _tune(
     summary = plain(facts) | {"out": str(out)}
     if not args.json:
         print(_short(facts))
-        print(f"written: {out}/tuned.toml, history.npz, report.md, report.html, report.json")
+        print(f"written: {out}/tuned.toml, history.npz, report.html, report.md, report.json, *.png")
     lost = facts["after"]["lost"] if facts["after"]["members"] else facts["lost_in_training"]
     good = lost == 0 and facts["verified"]
     if not good:
@@ -99,6 +102,7 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
     none = {"members": 0, "lost": 0}
     judged = [judge(study, at, held_out, count) for at in (_at(study, before), x)] if count else []
     found = [summarise(study, one) for one in judged] or [none, none]
+    loss = dict(zip(("before", "after"), (breakdown.table(study.goal, one) for one in judged), strict=False))
     worst = _worst_checked(answer, judged[1], held_out) if judged and answer.confirmed else None
     refuted = (worst or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
     if refuted and judged:
@@ -112,7 +116,10 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
         "after": found[1],
         "held_out_seed": held_out,
         "lost_in_training": lost,
+        "loss": loss,
+        "minimised": breakdown.minimised(study, x, who),
         "conditions": report.conditions(line),
+        "advice_on_conditions": on_conditions(line),
         "step_error": answer.error.facts() if answer.error else None,
         "worst_step_error": worst.facts() if worst else None,
         "verified": not refuted,
@@ -121,6 +128,9 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
         "search": settings(tune)
         | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
     }
+    if count:
+        say(f"{min(accurate.AGAIN, count)} of them again by accurate steps ...")
+        facts["accurate"] = accurate.compared(study, x, held_out, count, report.SHOWN)
     facts["gains"] = [
         row | dataclasses.asdict(where)
         for row, where in zip(report.gains_table(space, before, after, None), study.ranges, strict=True)
@@ -197,20 +207,34 @@ def _write(
     space = study.objective.space
     for row, grows in zip(facts["gains"], found.sensitivity(), strict=True):
         row["sensitivity_percent"] = float(grows)
+    j, k, drop = found.lowest()
+    facts["beside"] = {"path": space.paths[j], "gain": found.gains[j, k], "lower": -np.expm1(-drop)}
     facts["slices"] = {"gains": found.gains, "log_risk": found.goals, "lost": found.lost}
     document = with_gains(raw, _laws(study, {row["path"]: row["after"] for row in facts["gains"]}))
     head = f"Tuned by ambjax-tune from the case '{facts['case']}'.\n{facts['verdict']}"
-    case_from(document, facts["case"])  # a file that could not be read back is not written
+    tuned = case_from(document, facts["case"])  # a file that could not be read back is not written
     (out / "tuned.toml").write_text(dumps(document, head), encoding="utf-8")
     np.savez(out / "history.npz", **history)
     text = report.markdown(facts)
-    pictures = {"Convergence": report.convergence(history, space.paths)}
-    pictures["The risk along each gain, through the optimum"] = report.landscape(found, space.paths)
-    if facts.get("pareto"):
-        pictures["Error against voltage"] = report.front(facts["pareto"])
+    drawn = _pictures(study, tuned.cascade, history, facts, found)
+    for name, data in drawn.items():
+        (out / name).write_bytes(data)
     (out / "report.md").write_text(text, encoding="utf-8")
-    (out / "report.html").write_text(report.page(text, pictures, f"Tuning of {facts['case']}"), encoding="utf-8")
+    (out / "report.html").write_text(page(text, drawn, f"Tuning of {facts['case']}"), encoding="utf-8")
     write_json(out / "report.json", facts)
+
+
+def _pictures(
+    study: Study, tuned: Cascade, history: Any, facts: dict[str, Any], found: explore.Slices
+) -> dict[str, bytes]:
+    """PNG by file name: those that the report shows."""
+    paths, runs = study.objective.space.paths, {"before": study.case.cascade, "after": tuned}
+    drawn = {
+        "nominal.png": pictures.before_after({name: accurate.nominal(study, one) for name, one in runs.items()}),
+        "convergence.png": pictures.convergence(history, paths),
+        "slices.png": pictures.landscape(found, paths),
+    }
+    return drawn | ({"front.png": pictures.front(facts["pareto"])} if facts.get("pareto") else {})
 
 
 def _laws(study: Study, tuned: dict[str, float]) -> dict[str, float]:

@@ -31,6 +31,16 @@ class Slices:
         beside = np.maximum(self.goals[:, middle - 1], self.goals[:, middle + 1])
         return 100 * np.expm1(beside - self.goals[:, middle])
 
+    def lowest(self) -> tuple[int, int, float]:
+        """Gain and point of its slice where the goal is lowest, and by how much, a logarithm; 0 where nothing is lower.
+
+        Points that lose more members than the answer do not count.
+        """
+        middle = len(REACH) // 2
+        drop = np.where(self.lost <= self.lost[:, [middle]], self.goals[:, [middle]] - self.goals, 0.0)
+        j, k = np.unravel_index(int(np.argmax(np.where(np.isfinite(drop), drop, 0.0))), drop.shape)
+        return int(j), int(k), max(float(drop[j, k]), 0.0)
+
 
 def slices(study: Study, x: np.ndarray, who: Members) -> Slices:
     """Slices through x [m], one gain at a time."""

@@ -1,0 +1,366 @@
+"""The tuner's report: what a reader can add up, what accurate steps say, and a page that shows it as it is."""
+
+import dataclasses
+import html
+import json
+import math
+import re
+import shutil
+import subprocess
+import tomllib
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ambjax import rollout
+from ambjax.casefile import case_from
+from ambjax.metrics import Standard
+from ambjax.tomltable import Table
+from ambjax.trajectory import TOUCHED
+from tuning import accurate, breakdown, extras, pictures, report
+from tuning.__main__ import main
+from tuning.config import seeds, tune_from
+from tuning.explore import REACH, Slices, slices
+from tuning.loss import TERMS
+from tuning.objective import Engine, weigh
+from tuning.page import literal, page
+from tuning.rounds import training
+from tuning.study import judge, study_of
+
+CASE = """
+[reference]
+kind = "sine"
+amplitude = 1e-3
+frequency = 5.0
+[controller.inversion]
+gamma = 3e5
+[sensor]
+std = 1e-6
+std_z_dot = 1e-4
+std_i = 1e-4
+[actuator]
+u_max = 200.0
+[clock]
+duration = 0.02
+[run]
+settle = 0.01
+[spread]
+plant.m = { percent = 5 }
+[tune]
+gains = ["controller.position.c", "controller.position.k"]
+screen = 4
+starts = 1
+iterations = 2
+members = 4
+stressed = 2
+validation = 4
+held_out = 12
+weights.peak = 0.5
+risk = "cvar"
+"""
+
+
+def study_from(text, **tune):
+    raw = tomllib.loads(text)
+    raw["tune"] |= tune
+    case = case_from(raw, "case")
+    return study_of(case, tune_from(Table(raw).table("tune"), case))
+
+
+@pytest.fixture(scope="module")
+def study():
+    return study_from(CASE)
+
+
+@pytest.fixture(scope="module")
+def x(study):
+    return study.objective.space.encode(study.tune.space.values(study.case.cascade))
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """The folder of a whole run of the command; the case's name is an attack on its readers."""
+    folder = tmp_path_factory.mktemp("written")
+    path = folder / "<img src=x onerror=alert(1)> a|b *c* [d](e).toml"
+    path.write_text(CASE, encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder.parent / "cache"))
+        assert main([str(path), "--out", str(folder / "out"), "--pareto"]) in (0, 1)
+    return folder / "out"
+
+
+def cells(text, heading):
+    """Rows of the first Markdown table below a heading, cells as text."""
+    below = text.partition(f"## {heading}")[2].lstrip("\n")
+    lines = [line for line in below.partition("\n## ")[0].splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines if "---" not in line]
+
+
+# --- what adds up --------------------------------------------------------------------------------------------------
+
+
+def test_what_the_terms_add_is_the_loss():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        weights = rng.uniform(0, 3, len(TERMS))
+        terms = {name: rng.lognormal(0, 2, 50) for name in TERMS}
+        whole = weigh(weights, terms, np.zeros(50, bool))
+        # the same products, added in another order: rounding only
+        np.testing.assert_allclose(sum(breakdown.contributions(weights, terms).values()), whole, rtol=1e-13)
+
+
+def test_the_loss_table_can_be_added_up_by_hand(written):
+    text = (written / "report.md").read_text()
+    facts = json.loads((written / "report.json").read_text())
+    assert breakdown.FORMULA in text
+    head, *rows = cells(text, "The loss of the held-out members")
+    terms, total, risk = rows[: len(TERMS)], rows[len(TERMS)], rows[len(TERMS) + 1]
+    assert [row[0] for row in terms] == list(TERMS)
+    for when in ("before", "after"):
+        mean, adds = (head.index(f"{word} {when}") for word in ("mean", "adds"))
+        shown = sum(float(row[adds]) for row in terms)
+        # of six numbers and their sum, each is rounded to five digits
+        assert shown == pytest.approx(float(total[adds].strip("*")), rel=7 * 0.5e-4)
+        for row in terms:
+            if row[0] not in ("effort", "chatter"):
+                assert float(row[adds]) == pytest.approx(float(row[1]) * float(row[mean]), rel=2e-4)
+        assert float(risk[adds]) == pytest.approx(facts["loss"][when]["risk"], rel=1e-4)
+        # the mean of the worst tenth is no less than the mean
+        assert facts["loss"][when]["risk"] >= facts["loss"][when]["loss"] * (1 - 1e-12)
+
+
+def test_the_table_is_of_the_members_that_were_judged(study, x):
+    found = judge(study, x, seeds(study.tune.budget)[2], 12)
+    told = breakdown.table(study.goal, found)
+    losses = weigh(study.goal.weights, {name: found[f"loss.{name}"] for name in TERMS}, np.zeros(12, bool))
+    assert told["loss"] == pytest.approx(losses.mean(), rel=1e-12)
+    assert told["risk"] == pytest.approx(float(study.goal.risk(jnp.asarray(losses))), rel=1e-12)
+    # means of products are not products of means: what effort adds is not to be had from the row alone
+    assert told["adds"]["effort"] == pytest.approx(
+        np.mean(0.1 * found["loss.effort"] * (found["loss.tracking"] + 0.5 * found["loss.peak"])), rel=1e-12
+    )
+
+
+@pytest.mark.parametrize("conditions", [0.0, 1.0])
+def test_what_was_minimised_is_the_goal(conditions):
+    # gamma far below Delta_1 of this reference, so that the conditions' penalty counts
+    few = study_from(CASE.replace("3e5", "1e3").replace('["controller.position.c", "controller.position.k"]',
+                                                        '["controller.inversion.gamma"]'),
+                     weights={"conditions": conditions, "peak": 0.5})  # fmt: skip
+    who = training(few)
+    at = few.objective.space.encode(few.tune.space.values(few.case.cascade))
+    parts = breakdown.minimised(few, at, who)
+    goal = few.goal.score(few.objective.space, at[None], few.engine.terms(at[None], who), who)[0]
+    assert math.log(parts["total"]) == pytest.approx(goal, rel=1e-9)
+    assert parts["total"] == pytest.approx((parts["risk"] + parts["held"]) * parts["penalty"], rel=1e-12)
+    assert (parts["ordinary"], parts["asked_to_be_held"]) == (4, 2)
+    assert (parts["penalty"] > 1) == (conditions > 0)
+
+
+def test_the_lowest_point_of_slices_loses_no_more():
+    middle = len(REACH) // 2
+    goals = np.zeros((2, len(REACH)))
+    goals[0, 3], goals[1, 9], goals[1, 2] = -0.5, -0.2, np.nan
+    lost = np.zeros((2, len(REACH)), int)
+    gains = np.arange(2 * len(REACH), dtype=float).reshape(2, -1)
+    assert Slices(gains, goals, lost).lowest() == (0, 3, 0.5)
+    lost[0, 3] = 1
+    assert Slices(gains, goals, lost).lowest() == (1, 9, 0.2)
+    lost[0, middle] = 1  # the answer loses one too
+    assert Slices(gains, goals, lost).lowest() == (0, 3, 0.5)
+    assert Slices(gains, np.abs(goals), lost).lowest()[2] == 0
+
+
+def test_a_lower_point_beside_the_answer_is_said():
+    facts = {"beside": {"path": "controller.position.c", "gain": 12.5, "lower": 0.2}}
+    assert "20 % lower, at controller.position.c = 12.5" in report._beside(facts)
+    assert "ended before it went there" in report._beside(facts)
+    facts["beside"]["lower"] = 0.005
+    assert "as good as the answer" in report._beside(facts)
+    facts["beside"]["lower"] = 0.0
+    assert "No point" in report._beside(facts)
+
+
+def test_the_picture_begins_at_what_the_table_says_was_minimised(study, x):
+    who = training(study)
+    found, parts = slices(study, x, who), breakdown.minimised(study, x, who)
+    np.testing.assert_allclose(np.exp(found.goals[:, len(REACH) // 2]), parts["total"], rtol=1e-9)
+
+
+# --- accurate steps ------------------------------------------------------------------------------------------------
+
+
+def test_accurate_values_are_those_of_adaptive_rollouts():
+    study = study_from(CASE, substeps=1)  # so coarse that the two differ
+    x = study.objective.space.encode(study.tune.space.values(study.case.cascade))
+    seed = seeds(study.tune.budget)[2]
+    told = accurate.compared(study, x, seed, 12, report.SHOWN)
+    assert (told["members"], told["held"]) == (accurate.AGAIN, accurate.AGAIN)
+    assert abs(told["metrics"]["settled_rms_error_m"]["relative"]) > 1e-3
+    found = []
+    for k in range(accurate.AGAIN):
+        one = study.objective.chosen(seed, np.array([k]), 12)
+        cascade, scenario = study.objective.world(type(one)(*({p: v[0] for p, v in field.items()} if isinstance(
+            field, dict) else field[0] for field in one)))  # fmt: skip
+        clock = dataclasses.replace(study.case.clock, method=study.reference.objective.clock.method)
+        fold = Standard(study.case.settle, study.case.scenario.touchdown)
+        cascade = study.objective.space.decode(jnp.asarray(x), cascade)
+        found.append(rollout(cascade, scenario, clock, fold=fold, every=0).measured)
+    error = math.sqrt(np.mean([float(m["settled_rms_error_m"]) ** 2 for m in found]))
+    chatter = np.mean([float(m["chatter_V"]) for m in found])
+    # the same adaptive steps in another program: where a step ends depends on rounding, by less than its tolerance
+    assert told["metrics"]["settled_rms_error_m"]["accurate"] == pytest.approx(error, rel=1e-5)
+    assert told["metrics"]["chatter_V.mean"]["accurate"] == pytest.approx(chatter, rel=1e-5)
+    for row in told["metrics"].values():
+        assert row["relative"] == pytest.approx(row["search"] / row["accurate"] - 1, abs=1e-12)
+
+
+def test_accurate_steps_against_themselves_are_off_by_nothing(study, x):
+    clock = dataclasses.replace(study.objective.clock, method=study.reference.objective.clock.method)
+    objective = dataclasses.replace(study.objective, clock=clock)
+    engine = Engine(objective, settle=study.case.settle, lanes=4)
+    same = dataclasses.replace(study, objective=objective, engine=engine)
+    told = accurate.compared(same, x, 5, 3, report.SHOWN)
+    assert told["members"] == 3
+    assert {row["relative"] for row in told["metrics"].values()} == {0.0}
+    assert told["lost"] == {"search": 0, "accurate": 0}
+
+
+def test_what_is_off_by_much_is_marked():
+    again = {
+        "members": 8, "held": 8, "marked_beyond": 0.05, "lost": {"search": 0, "accurate": 2},
+        "metrics": {"a": {"search": 1.04, "accurate": 1.0, "relative": 0.04},
+                    "b": {"search": 1.47, "accurate": 1.0, "relative": 0.47}},
+    }  # fmt: skip
+    assert report._again(again, "a") == ["1.04", "1", "4 %"]
+    assert report._again(again, "b") == ["1.47", "1", "**47 %**"]
+    assert report._again(again, "c") == ["-"] * 3
+    assert report._fates(again, "lost") == ["0 of 8", "2 of 8", "-"]
+    assert "In bold: off by more than 5 %" in report._accurate(again)[0]
+    del again["metrics"]["b"]
+    assert "No number is off by more than 5 %" in report._accurate(again)[0]
+    again["metrics"] = {}
+    assert "nothing in this table is confirmed" in report._accurate(again)[0]
+
+
+def test_the_columns_of_accurate_steps_are_in_the_report(written):
+    head, *rows = cells((written / "report.md").read_text(), "12 held-out members")
+    assert head[3:] == ["after, 8 of them, steps of the search", "accurate steps", "off by"]
+    facts = json.loads((written / "report.json").read_text())
+    for row in rows[: len(report.SHOWN)]:
+        told = facts["accurate"]["metrics"][row[0].strip("`")]
+        assert float(row[4]) == pytest.approx(told["accurate"], rel=1e-3)
+        assert row[5].startswith("**") == (abs(told["relative"]) > 0.05)
+
+
+# --- pages ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_bar_in_a_condition_stays_in_its_cell(written):
+    rows = cells((written / "report.md").read_text(), "Conditions of Theorem 1")
+    assert {len(row) for row in rows} == {6}
+    shown = (written / "report.html").read_text()
+    assert "k &gt; sup |q_z + h|</td>" in shown
+    table = next(part for part in shown.split("<table>") if "sup |q_z + h|" in part).partition("</table>")[0]
+    assert {row.count("</td>") + row.count("</th>") for row in table.split("<tr>")[1:]} == {6}
+
+
+def test_the_name_of_a_case_is_shown_as_it_is(written):
+    name = "<img src=x onerror=alert(1)> a|b *c* [d](e)"
+    shown = (written / "report.html").read_text()
+    assert f"<h1>Tuning of {html.escape(name)}</h1>" in shown
+    assert f"<title>Tuning of {html.escape(name)}</title>" in shown
+    assert "<img src=x" not in shown
+    # nor does another program that renders report.md see HTML in it
+    assert not re.search(r"(?<!\\)<", (written / "report.md").read_text())
+
+
+def test_text_is_literal_in_every_place():
+    text = "\\<b>x</b> & | *a* _b_ `c` ~d~ ![e](f) #g\n# h\x00"
+    for frame in ("{}", "# {}", "| a |\n|---|\n| {} |", "- {}"):
+        shown = page(frame.format(literal(text)), {}, "t").partition("</style>")[2]
+        words = re.sub(r"\s+", " ", html.unescape(re.sub(r"<[^>]*>", "", shown))).strip().removeprefix("a ")
+        assert words == "\\<b>x</b> & | *a* _b_ `c` ~d~ ![e](f) #g\ufffd# h\ufffd"
+
+
+def test_lists_are_lists(written):
+    shown = (written / "report.html").read_text()
+    assert "<li>risk: CVaR(0.9)" in shown
+    assert "<p>- " not in shown
+
+
+def test_what_is_wide_scrolls_in_its_own_box(written):
+    shown = (written / "report.html").read_text()
+    assert '<meta name="viewport" content="width=device-width,initial-scale=1">' in shown
+    assert re.search(r"\.wide\{[^}]*overflow-x:auto", shown)
+    assert shown.count("<table>") == shown.count('<div class="wide"><table>') > 4
+    assert shown.count("<img ") == shown.count('<span class="wide"><img ') == 4
+    assert 'src="data:image/png;base64,' in shown
+    assert "http" not in shown  # needs nothing else
+
+
+@pytest.mark.skipif(not shutil.which("chromium"), reason="needs a browser")
+@pytest.mark.parametrize("width", [390, 1280])
+def test_the_page_does_not_scroll_sideways(written, tmp_path, width):
+    say = "<script>parent.postMessage(document.documentElement.scrollWidth+' of '+innerWidth,'*')</script>"
+    shown = (written / "report.html").read_text()
+    (tmp_path / "page.html").write_text(shown.replace("</html>", say + "</html>"))
+    frame = (
+        f"<script>onmessage=e=>document.title=e.data</script><iframe width={width} height=900 src=page.html></iframe>"
+    )
+    (tmp_path / "frame.html").write_text(frame)
+    flags = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--virtual-time-budget=5000",
+        f"--user-data-dir={tmp_path}/u",
+    ]
+    command = ["chromium", *flags, "--dump-dom", (tmp_path / "frame.html").as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    needed, inner = map(int, re.search(r"<title>(\d+) of (\d+)", done.stdout).groups())
+    assert inner == width
+    assert needed <= inner
+
+
+def test_pictures_that_the_report_shows_lie_beside_it(written):
+    named = re.findall(r"!\[.*?\]\((.*?)\)", (written / "report.md").read_text())
+    assert sorted(named) == ["convergence.png", "front.png", "nominal.png", "slices.png"]
+    for name in named:
+        assert (written / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_picture_takes_lost_rotors(study):
+    run = accurate.nominal(study, study.case.cascade)
+    assert not math.isfinite(float(run.lost_at))
+    assert len(np.asarray(run.rows.t)) == study.case.clock.samples
+    for at in (0.0, 0.01):
+        alive = np.asarray(run.rows.t) < at
+        lost = dataclasses.replace(run, lost_at=at, lost_code=TOUCHED, rows=run.rows._replace(alive=alive))
+        assert pictures.before_after({"before": lost, "after": run}).startswith(b"\x89PNG")
+
+
+def test_ranges_and_their_sources_are_in_the_table():
+    row = {"path": "controller.position.c", "before": 1.0, "after": 2.0, "least": 0.0, "most": 30.0, "at_bound": "",
+           "sensitivity_percent": 3.0}  # fmt: skip
+    bare = report._gains({"gains": [row]})
+    assert "may end from" in bare[2]
+    assert "looked for" not in "".join(bare)
+    told = "\n".join(report._gains({"gains": [row | {"low": 0.5, "high": 20.0, "source": "w/30 to 10 w"}]}))
+    assert "| controller.position.c | 1 | 2 | 0.5 | 20 | 0 | 30 | - | 3 % |" in told
+    assert "- controller.position.c: w/30 to 10 w" in told
+
+
+def test_the_formula_names_every_term_once():
+    assert sorted(re.findall(r"[a-z]{2,}", breakdown.FORMULA)) == sorted(TERMS)
+
+
+def test_the_section_on_gradients_is_three_whole_tables():
+    three = {"samples": 5, **{way: [1.0, 2.0] for way in ("forward", "reverse", "differences")}}
+    noise = {name: [1.0, 2.0] for name in ("gradient", "standard_error", "ratio")}
+    horizons = [{"horizon_s": 0.1, "norm": 2.0, "lost": 0.0}]
+    facts = {"gains": ["c", "k"], "three_ways": three, "noise": noise, "horizons": horizons}
+    shown = page("\n".join(extras.gradient(facts)), {}, "t")
+    assert shown.count("<table>") == 3
+    assert shown.count("<td") == 2 * 4 + 3 + 2 * 4

@@ -1,0 +1,55 @@
+"""One HTML page of a Markdown text and its pictures, which needs nothing else."""
+
+import base64
+import html
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from markdown_it import MarkdownIt
+
+# Whatever is wider than a narrow screen scrolls in a box of its own; a picture stays legible there.
+STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:72rem;margin:2rem auto;padding:0 1rem;color:#222}
+body{overflow-wrap:anywhere}p,li{max-width:60rem}.wide{display:block;overflow-x:auto;margin:.6rem 0}
+table{border-collapse:collapse;overflow-wrap:normal}td,th{border:1px solid #ccc;padding:.2rem .6rem;text-align:left}
+th{background:#f3f3f3}.short{white-space:nowrap}img{display:block;max-width:max(100%,44rem)}"""
+# A cell of at most this many characters is one line: a number does not break at the sign of its exponent.
+SHORT = 48
+PUNCTUATION = re.compile(r"([\\`*_\[\]<>|~&#!$])")
+
+
+def literal(text: str) -> str:
+    """Text that Markdown shows as it is, in a table too: neither HTML nor emphasis nor a cell's end; one line."""
+    visible = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+    return PUNCTUATION.sub(r"\\\1", visible)
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """A table; cells are Markdown, of which only `|` has to be escaped."""
+    lines = [head, ["---"] * len(head), *rows]
+    return ["| " + " | ".join(cell.replace("\\|", "|").replace("|", "\\|") for cell in line) + " |" for line in lines]
+
+
+def page(text: str, pictures: Mapping[str, bytes], title: str) -> str:
+    """The page. `pictures`: PNG by file name; an image of Markdown that names one is shown from within the page."""
+    markdown = MarkdownIt("commonmark", {"html": False}).enable("table")
+    markdown.add_render_rule("table_open", lambda *_: '<div class="wide"><table>\n')
+    markdown.add_render_rule("td_open", lambda _, tokens, at, *__: _cell(tokens[at + 1].content))
+    markdown.add_render_rule("table_close", lambda *_: "</table></div>\n")
+
+    def image(renderer: Any, tokens: Any, at: int, options: Any, environment: Any) -> str:
+        words = html.escape(renderer.renderInlineAsText(tokens[at].children, options, environment))
+        data = base64.b64encode(pictures[tokens[at].attrs["src"]]).decode()
+        return f'<span class="wide"><img alt="{words}" src="data:image/png;base64,{data}"></span>'
+
+    markdown.add_render_rule("image", image)
+    head = (
+        '<!doctype html><html lang="en"><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{html.escape(title)}</title><style>{STYLE}</style>"
+    )
+    return f"{head}\n{markdown.render(text)}</html>\n"
+
+
+def _cell(text: str) -> str:
+    return '<td class="short">' if len(text) <= SHORT else "<td>"
