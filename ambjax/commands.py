@@ -23,7 +23,7 @@ from ambjax.casefile import Case
 from ambjax.doubts import read_aloud
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.loop import ClosedLoop
-from ambjax.metrics import Standard
+from ambjax.metrics import standard_for
 from ambjax.outputs import directory, files, plain, say, table, write_json
 from ambjax.rollout import Outcome, begin_jit, finish, segment_jit
 
@@ -130,7 +130,7 @@ def _member(case: Case, args: argparse.Namespace) -> Case:
 
 def simulate(case: Case) -> Outcome:
     """A rollout of a case, recorded whole, with a progress bar if it takes more than two seconds."""
-    fold = Standard(case.settle, case.scenario.touchdown)
+    fold = standard_for(case.settle, case.scenario)
     loop, clock, fold = canonical((ClosedLoop(case.cascade, case.scenario), case.clock, fold))
     progress, parts, done = begin_jit(loop, clock, fold), [], 0
     with tqdm(total=clock.samples, unit="sample", unit_scale=True, delay=2, leave=False, desc="simulate") as bar:

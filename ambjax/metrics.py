@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax._pytree import Scalar, leaf, record, static
+from ambjax.plant import Plant
 from ambjax.smooth import safe_sqrt
 from ambjax.trajectory import ALIVE, STALLED, first_time
 
@@ -189,12 +190,15 @@ class Named:
 class Standard:
     """The metrics of metrics.json: a dict of numbers named with their units.
 
-    `settle` (s) is when "settled" begins. Reaching bands: |v_tilde| within 0.1 A^2/m^2, |e| within
-    1 mA, |sigma| within 1 mm/s. `touchdown` (m) is what "clearance used" is a share of.
+    `settle` (s) is when "settled" begins, `touchdown` (m) what "clearance used" is a share of; within its band a signal
+    counts as having reached zero. The defaults are those for the plant of Table 1: see `standard_for`.
     """
 
     settle: Scalar = leaf(default=0.5, unit="s", at_least=0, doc="time from which metrics count as settled")
     touchdown: Scalar = leaf(default=4.5e-3, unit="m", above=0)
+    sigma_band: Scalar = leaf(default=1e-3, unit="m/s", above=0)
+    v_tilde_band: Scalar = leaf(default=0.1, unit="A^2/m^2", above=0)
+    e_band: Scalar = leaf(default=1e-3, unit="A", above=0)
 
     def _folds(self) -> Named:
         late = self.settle
@@ -207,9 +211,9 @@ class Standard:
                 "settled_max_abs_sigma_m_per_s": Peak("sigma", late),
                 "settled_max_abs_v_tilde_A2_per_m2": Peak("v_tilde", late),
                 "settled_max_abs_current_error_A": Peak("e", late),
-                "sigma_reached_s": Reaching("sigma", 1e-3),
-                "v_tilde_reached_s": Reaching("v_tilde", 0.1),
-                "current_error_reached_s": Reaching("e", 1e-3),
+                "sigma_reached_s": Reaching("sigma", self.sigma_band),
+                "v_tilde_reached_s": Reaching("v_tilde", self.v_tilde_band),
+                "current_error_reached_s": Reaching("e", self.e_band),
                 "max_abs_u_V": Peak("u"),
                 "rms_u_V": Driven("u_squared", root=True),
                 "settled_rms_u_V": Driven("u_squared", late, root=True),
@@ -236,3 +240,16 @@ class Standard:
             "singular_at_s": ending.singular_at,
         }
         return numbers | fate
+
+
+def standard_for(settle: Scalar, scenario: Any) -> Standard:
+    """The metrics of a scenario: its own clearance, and bands that are the same share of the plant's sizes as those
+    of Table 1's: 4e-4 of sigma's, 4e-5 of v's, 4e-3 of i_0."""
+    plant, usual, paper = scenario.plant, Standard(), Plant()
+    return Standard(
+        settle,
+        scenario.touchdown,
+        usual.sigma_band * (plant.sigma_size / paper.sigma_size),
+        usual.v_tilde_band * (plant.v_size / paper.v_size),
+        usual.e_band * (plant.i_0 / paper.i_0),
+    )

@@ -81,6 +81,16 @@ class Plant:
         """Unstable pole of the magnets alone, sqrt(k_s / m), in 1/s: how fast the rotor falls to a side."""
         return (abs(self.k_s) / self.m) ** 0.5
 
+    @property
+    def sigma_size(self) -> Scalar:
+        """What sigma amounts to here, in m/s: a gap's width at the pole."""
+        return self.pole * self.s_0
+
+    @property
+    def v_size(self) -> Scalar:
+        """What the scaled force amounts to here, in A^2/m^2: that of one magnet at the bias current."""
+        return (self.i_0 / self.s_0) * (self.i_0 / self.s_0)
+
     def gaps(self, z: Scalar) -> Gaps:
         """Upper gap s_0 - z and lower gap s_0 + z, floored at 0.5 % of s_0."""
         floor = GAP_FLOOR * self.s_0

@@ -4,7 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from ambjax import Plant
+from ambjax import Plant, Scenario
+from ambjax.metrics import Standard, standard_for
 
 PLANT = Plant()
 OTHER = Plant(m=0.7, k_z=-900.0, n=1200.0, A=0.1, s_0=4e-3, i_0=0.4, R=30.0, g=3.0)
@@ -198,3 +199,17 @@ def test_finite_with_finite_derivatives_at_and_beyond_the_gap(function):
 
 def test_distance_to_C_has_a_finite_derivative_on_C():
     assert np.all(np.isfinite(jax.grad(PLANT.distance_to_C, (0, 1))(PLANT.s_0, -PLANT.i_0)))
+
+
+def test_thresholds_follow_the_plant():
+    """Bands are the same share of what sigma, v and i amount to, whatever the plant; Table 1's are its own exactly."""
+    assert standard_for(0.5, Scenario(clearance=4.5e-3)) == Standard()
+    small = Plant(m=1.2, s_0=4e-4, i_0=1.5, n=180.0, A=4e-4, R=0.9, k_z=0.0)
+    bands = standard_for(0.5, Scenario(plant=small))
+    assert bands.touchdown == 0.9 * small.s_0
+    # gap x pole, with the pole of k_s = kappa i_0^2 / s_0^3 over m
+    kappa = small.mu_0 * 180.0**2 * 4e-4
+    pole = (kappa * 1.5**2 / 4e-4**3 / 1.2) ** 0.5
+    assert bands.sigma_band / (pole * 4e-4) == pytest.approx(Standard().sigma_band / (528.0 * 5e-3), rel=6e-3)
+    assert bands.v_tilde_band == pytest.approx(0.1 * (1.5 / 4e-4) ** 2 / (0.25 / 5e-3) ** 2)
+    assert bands.e_band == pytest.approx(1e-3 * 1.5 / 0.25)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ambjax import rollout
-from ambjax.casefile import case_from
+from ambjax.casefile import case_from, safe_name
 from ambjax.metrics import Standard
 from ambjax.tomltable import Table
 from ambjax.trajectory import TOUCHED
@@ -193,6 +193,7 @@ def test_the_picture_begins_at_what_the_table_says_was_minimised(study, x):
 
 def test_accurate_values_are_those_of_adaptive_rollouts():
     study = study_from(CASE, substeps=1)  # so coarse that the two differ
+    study.__dict__["judging"] = study.engine
     x = study.objective.space.encode(study.tune.space.values(study.case.cascade))
     seed = seeds(study.tune.budget)[2]
     told = accurate.compared(study, x, seed, 12, report.SHOWN)
@@ -213,25 +214,26 @@ def test_accurate_values_are_those_of_adaptive_rollouts():
     assert told["metrics"]["settled_rms_error_m"]["accurate"] == pytest.approx(error, rel=1e-5)
     assert told["metrics"]["chatter_V.mean"]["accurate"] == pytest.approx(chatter, rel=1e-5)
     for row in told["metrics"].values():
-        assert row["relative"] == pytest.approx(row["search"] / row["accurate"] - 1, abs=1e-12)
+        assert row["relative"] == pytest.approx(row["report"] / row["accurate"] - 1, abs=1e-12)
 
 
 def test_accurate_steps_against_themselves_are_off_by_nothing(study, x):
     clock = dataclasses.replace(study.objective.clock, method=study.reference.objective.clock.method)
     objective = dataclasses.replace(study.objective, clock=clock)
     engine = Engine(objective, settle=study.case.settle, lanes=4)
-    same = dataclasses.replace(study, objective=objective, engine=engine)
+    same = dataclasses.replace(study)
+    same.__dict__["judging"] = engine
     told = accurate.compared(same, x, 5, 3, report.SHOWN)
     assert told["members"] == 3
     assert {row["relative"] for row in told["metrics"].values()} == {0.0}
-    assert told["lost"] == {"search": 0, "accurate": 0}
+    assert told["lost"] == {"report": 0, "accurate": 0}
 
 
 def test_what_is_off_by_much_is_marked():
     again = {
-        "members": 8, "held": 8, "marked_beyond": 0.05, "lost": {"search": 0, "accurate": 2},
-        "metrics": {"a": {"search": 1.04, "accurate": 1.0, "relative": 0.04},
-                    "b": {"search": 1.47, "accurate": 1.0, "relative": 0.47}},
+        "members": 8, "held": 8, "marked_beyond": 0.05, "lost": {"report": 0, "accurate": 2},
+        "metrics": {"a": {"report": 1.04, "accurate": 1.0, "relative": 0.04},
+                    "b": {"report": 1.47, "accurate": 1.0, "relative": 0.47}},
     }  # fmt: skip
     assert report._again(again, "a") == ["1.04", "1", "4 %"]
     assert report._again(again, "b") == ["1.47", "1", "**47 %**"]
@@ -246,7 +248,7 @@ def test_what_is_off_by_much_is_marked():
 
 def test_the_columns_of_accurate_steps_are_in_the_report(written):
     head, *rows = cells((written / "report.md").read_text(), "12 held-out members")
-    assert head[3:] == ["after, 8 of them, steps of the search", "accurate steps", "off by"]
+    assert head[3:] == ["after, 8 of them", "by accurate steps", "off by"]
     facts = json.loads((written / "report.json").read_text())
     for row in rows[: len(report.SHOWN)]:
         told = facts["accurate"]["metrics"][row[0].strip("`")]
@@ -268,7 +270,7 @@ def test_a_bar_in_a_condition_stays_in_its_cell(written):
 
 def test_the_name_of_a_case_is_shown_as_it_is(written):
     name = "<img src=x onerror=alert(1)> a|b *c* [d](e)"
-    shown = (written / "report.html").read_text()
+    name, shown = safe_name(name), (written / "report.html").read_text()
     assert f"<h1>Tuning of {html.escape(name)}</h1>" in shown
     assert f"<title>Tuning of {html.escape(name)}</title>" in shown
     assert "<img src=x" not in shown

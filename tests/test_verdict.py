@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from ambjax import commands, verdict
+from ambjax import commands, theorem, verdict
 from ambjax.__main__ import main
 from ambjax.casefile import read_case
 from ambjax.template import template
@@ -126,7 +126,7 @@ def test_a_stalled_run_decides_nothing(capsys, monkeypatch):
     stalled = dataclasses.replace(report, lost_at=0.01, lost_why="stalled: ...", stalled=True)
     assert not stalled.lost
     assert not stalled.holds
-    monkeypatch.setattr(commands, "check", lambda *_: stalled)
+    monkeypatch.setattr(theorem, "check", lambda *_: stalled)
     assert main(["check", "case.toml"]) == 1
     said = capsys.readouterr().out
     assert "not decided" in said

@@ -1,6 +1,6 @@
-"""What the search's own steps are worth on each number of the report, and nominal runs for its pictures.
+"""What the report's own steps are worth on each of its numbers, and nominal runs for its pictures.
 
-The steps of the search are of fixed number, for speed; here a few members are simulated again by adaptive RODAS3.
+The steps of the report are of fixed number, for speed; here a few members are simulated again by adaptive RODAS3.
 """
 
 import dataclasses
@@ -15,24 +15,24 @@ from tuning.study import Study, summarise
 
 # Held-out members that are simulated again.
 AGAIN = 8
-# A number that the search's own steps miss by more than this share is marked.
+# A number that the report's own steps miss by more than this share is marked.
 MARKED = 0.05
 
 
 def compared(study: Study, x: np.ndarray, seed: int, count: int, names: tuple[str, ...]) -> dict[str, Any]:
-    """The first members of the ensemble of `count` with this seed at x [m], by the search's steps and by accurate ones.
+    """The first members of the ensemble of `count` with this seed at x [m], by the report's steps and by accurate ones.
 
-    `members` simulated, `held` by both; over these the summaries (`summarise`) of `names`: of the search, accurate,
+    `members` simulated, `held` by both; over these the summaries (`summarise`) of `names`: of the report, accurate,
     and the relative error of the former. `lost`, `stalled`: how many are, by either.
     """
     numbers = np.arange(min(AGAIN, count))
     who = study.objective.chosen(seed, numbers, count)
     both = [
         {name: values[0] for name, values in engine.metrics(x[None], who)["metrics"].items()}
-        for engine in (study.engine, study.reference)
+        for engine in (study.judging, study.reference)
     ]
     held = np.logical_and.reduce([~np.isfinite(found["lost_at_s"]) for found in both])
-    ways = ("search", "accurate")
+    ways = ("report", "accurate")
     told: dict[str, Any] = {"members": len(numbers), "held": int(held.sum()), "marked_beyond": MARKED}
     for fate in ("lost", "stalled"):
         told[fate] = {way: int(found[fate].sum()) for way, found in zip(ways, both, strict=True)}
@@ -41,7 +41,7 @@ def compared(study: Study, x: np.ndarray, seed: int, count: int, names: tuple[st
         ours, theirs = (summarise(study, {name: values[held] for name, values in found.items()}) for found in both)
         shown = [name for name in names if name in ours and name in theirs]
         told["metrics"] = {
-            name: {"search": ours[name], "accurate": theirs[name], "relative": _relative(ours[name], theirs[name])}
+            name: {"report": ours[name], "accurate": theirs[name], "relative": _relative(ours[name], theirs[name])}
             for name in shown
         }
     return told

@@ -20,7 +20,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble import Spread, apply, draw
 from ambjax.ensemble.engine import cores
 from ambjax.extend import canonical, one_kernel
-from ambjax.metrics import Named, Standard
+from ambjax.metrics import Named, standard_for
 from ambjax.rollout import rollout
 from ambjax.scenario import Clock, Scenario
 from tuning.loss import TERMS, Loss
@@ -153,7 +153,7 @@ class Engine:
         self._compiled: set[str] = set()
         traced = canonical((objective.cascade, objective.scenario, objective.clock, objective.loss))
         self._world = traced
-        standard = canonical(Named({"loss": objective.loss, "metrics": Standard(settle, objective.scenario.touchdown)}))
+        standard = canonical(Named({"loss": objective.loss, "metrics": standard_for(settle, objective.scenario)}))
 
         def rebuilt(world: Any) -> Objective:
             cascade, scenario, clock, loss = world

@@ -104,7 +104,7 @@ def _held_out(facts: Facts) -> list[str]:
     again = facts.get("accurate")
     head = ["", "before", "after"]
     if again:
-        head += [f"after, {again['held']} of them, steps of the search", "accurate steps", "off by"]
+        head += [f"after, {again['held']} of them", "by accurate steps", "off by"]
     rows = [
         [f"`{name}`", _number(before.get(name), ".4g"), f"{after[name]:.4g}", *_again(again, name)]
         for name in SHOWN
@@ -118,7 +118,7 @@ def _held_out(facts: Facts) -> list[str]:
 
 
 def _again(again: Facts | None, name: str) -> list[str]:
-    """The cells of a metric by either step, and how far the search's is off; bold where that is much."""
+    """The cells of a metric by either step, and how far the report's is off; bold where that is much."""
     if again is None:
         return []
     found = again["metrics"].get(name)
@@ -126,12 +126,12 @@ def _again(again: Facts | None, name: str) -> list[str]:
         return ["-"] * 3
     off = f"{100 * found['relative']:.2g} %"
     marked = abs(found["relative"]) > again["marked_beyond"]
-    return [f"{found['search']:.4g}", f"{found['accurate']:.4g}", f"**{off}**" if marked else off]
+    return [f"{found['report']:.4g}", f"{found['accurate']:.4g}", f"**{off}**" if marked else off]
 
 
 def _fates(again: Facts | None, name: str) -> list[str]:
     return (
-        [] if again is None else [f"{again[name][way]} of {again['members']}" for way in ("search", "accurate")] + ["-"]
+        [] if again is None else [f"{again[name][way]} of {again['members']}" for way in ("report", "accurate")] + ["-"]
     )
 
 

@@ -43,7 +43,7 @@ class Adaptive:
         return TWO_OVER_PI * self.gamma * self.p
 
     def size(self, model: Plant) -> Scalar:
-        return (model.i_0 / model.s_0) * (model.i_0 / model.s_0)
+        return model.v_size
 
     def layer(self, model: Plant) -> Scalar:
         """A third of the smoothed sign's width in i_ref, A: of what v_tilde = 1/p is worth at z = 0 and i = 0."""

@@ -41,7 +41,7 @@ class SlidingMode:
         return jnp.maximum(TWO_OVER_PI * self.k * self.p, self.c)
 
     def size(self, model: Plant) -> Scalar:
-        return model.pole * model.s_0
+        return model.sigma_size
 
     def sigma(self, motion: Measurement, reference: Reference) -> Array:
         return sliding_variable(self.c, motion, reference)
@@ -83,7 +83,7 @@ class SuperTwisting:
         return jnp.maximum(jnp.maximum(pole, jnp.sqrt(integral)), self.c)
 
     def size(self, model: Plant) -> Scalar:
-        return model.pole * model.s_0
+        return model.sigma_size
 
     def sigma(self, motion: Measurement, reference: Reference) -> Array:
         return sliding_variable(self.c, motion, reference)

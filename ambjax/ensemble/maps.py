@@ -13,7 +13,7 @@ from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import Spread, apply, require_path
 from ambjax.ensemble.study import Study
-from ambjax.metrics import Standard
+from ambjax.metrics import standard_for
 from ambjax.scenario import Scenario
 
 PERIOD = "clock.sample_period"
@@ -111,7 +111,7 @@ def _cells(study: Study, x: Axis, y: Axis | None) -> tuple[np.ndarray, ...]:
     drawn = dataclasses.replace(study, spread=Spread(entries, study.spread.design)).drawn(np.arange(study.members))
     cascade, scenario = _batch(study.cascade, study.scenario, {k: v[member] for k, v in drawn.items()} | axes)
     scenario = dataclasses.replace(scenario, seed=study.seed, member=member)
-    found = run_ensemble(cascade, scenario, study.clock, fold=Standard(study.settle, scenario.touchdown)).measured
+    found = run_ensemble(cascade, scenario, study.clock, fold=standard_for(study.settle, scenario)).measured
     ended, stalled, error = np.isfinite(found["lost_at_s"]), found["stalled"], found["settled_max_abs_error_m"]
     return tuple(np.reshape(part, shape) for part in (ended, stalled, error))
 

@@ -9,7 +9,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.engine import run_ensemble
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import Spread, apply, draw
-from ambjax.metrics import Named, Standard, Variation
+from ambjax.metrics import Named, Variation, standard_for
 from ambjax.scenario import Clock, Scenario
 from ambjax.sealed import provenance
 from ambjax.trajectory import Trajectory
@@ -63,7 +63,7 @@ class Study:
         if lost:
             far = np.full(np.shape(scenario.initial.z), 2 * np.max(np.asarray(scenario.touchdown)))
             scenario = dataclasses.replace(scenario, initial=dataclasses.replace(scenario.initial, z=far))
-        fold = Standard(self.settle, scenario.touchdown)
+        fold = standard_for(self.settle, scenario)
         outcome = run_ensemble(cascade, scenario, self.clock, fold=fold, threads=threads, call=call)
         drawn = {SPREAD + path: x for path, x in self.drawn(members).items()}
         return {"index": members, "lost_at": outcome.trajectory.lost_at, **outcome.measured, **drawn}
