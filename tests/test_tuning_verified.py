@@ -164,7 +164,7 @@ def run(small, monkeypatch, tmp_path):
         monkeypatch.setattr(tuning.rounds, "_lost", lambda study, x: (np.zeros(0, int), np.arange(4)))
         monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", most)
         start = small.tune.space.values(small.case.cascade)
-        return rounds(small, start, tmp_path, "told", False), verdicts
+        return rounds(small, start, tmp_path, {}, False), verdicts
 
     return answer
 
