@@ -29,8 +29,9 @@ import numpy as np
 
 from tuning.config import read_study
 from tuning.optimise import best_of, search
+from tuning.ranges import ranges
 from tuning.rounds import look_again, training
-from tuning.screen import around, everywhere, ranges
+from tuning.screen import around, everywhere
 from tuning.study import Study, study_of
 
 TASKS = pathlib.Path(__file__).parent / "tasks"
