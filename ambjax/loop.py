@@ -15,7 +15,7 @@ from ambjax.integrate import Problem
 from ambjax.scenario import Scenario
 from ambjax.signals import Reference, reference_at
 from ambjax.sliding import slide, slides
-from ambjax.span import Instant
+from ambjax.span import Instant, Span
 from ambjax.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 
 # A state this many times its scale has left the model's meaning, long before numbers overflow.
@@ -172,6 +172,7 @@ class ClosedLoop:
             i=i,
             i_ref=command.i_ref,
             u=jnp.where(alive, u, 0.0),
+            u_mean=jnp.zeros_like(u),
             v=plant.v(z, i),
             v_star=command.v_star,
             v_tilde=command.v_tilde,
@@ -183,6 +184,10 @@ class ClosedLoop:
             heat=jnp.where(alive, plant.copper_loss(i), 0.0),
             alive=alive,
         )
+
+    def noted(self, row: Row, span: Span) -> Row:
+        """The row of a sample, with what is known only at its end."""
+        return row._replace(u_mean=span.densities.u / jnp.where(span.time > 0, span.time, 1.0))
 
     def singularity(self, row: Row) -> Array:
         """Positive while (z, i_ref) is on the good side of the singular curve C, 0 on it. Eq. (9)."""

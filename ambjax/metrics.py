@@ -143,7 +143,7 @@ class Variation:
 
     def update(self, carry: tuple[Array, Array, Array], row: Any, span: Any) -> tuple[Array, Array, Array]:
         total, before, counting = carry
-        value, counts = span.densities.u / jnp.where(span.time > 0, span.time, 1.0), row.alive & (row.t >= self.after)
+        value, counts = row.u_mean, row.alive & (row.t >= self.after)
         return total + jnp.where(counts & counting, jnp.abs(value - before), 0.0), value, counts
 
     def result(self, carry: tuple[Array, Array, Array], ending: Ending) -> Array:

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ambjax.plotting import (
+    AVERAGED,
     CURRENT,
     CURRENT_DISTURBANCE,
     DISTURBANCE,
@@ -15,7 +16,6 @@ from ambjax.plotting import (
     GREEN,
     POSITION,
     SLIDING,
-    VOLTAGE,
     Curve,
     Panel,
     draw,
@@ -32,7 +32,7 @@ def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tup
 
     `window` (s): that stretch of it instead.
     """
-    panels = (POSITION, ERROR, SLIDING, DISTURBANCE, CURRENT, FORCE, FORCE_ERROR, VOLTAGE)
+    panels = (POSITION, ERROR, SLIDING, DISTURBANCE, CURRENT, FORCE, FORCE_ERROR, AVERAGED)
     if np.any(np.asarray(trajectory.rows.q_i)):
         panels = (*panels, CURRENT_DISTURBANCE, _measured(trajectory))
     if window is None:
@@ -93,7 +93,7 @@ def _last_moments(trajectory: Trajectory, end: float) -> float:
     t = np.asarray(trajectory.rows.t, float)
     longest = min(0.02, (end - t[0]) / 5)
     late = (t >= end - longest) & (t < end)
-    turning = np.flatnonzero(np.diff(np.sign(np.diff(signal_of(trajectory.rows, "u")[late]))))
+    turning = np.flatnonzero(np.diff(np.sign(np.diff(signal_of(trajectory.rows, "u_mean")[late]))))
     return longest if turning.size <= TURNS else float(end - t[late][turning[-TURNS]])
 
 

@@ -44,6 +44,8 @@ DISTURBANCE = Panel("disturbance $q_z$", "m/s²", 1.0, (Curve("q_z", "$q_z$"),))
 FORCE = Panel("scaled force", "A²/m²", 1.0, (Curve("v", "$v$"), Curve("v_star", "$v^*$", ORANGE, "--")))
 FORCE_ERROR = Panel("force error $\\tilde v$", "A²/m²", 1.0, (Curve("v_tilde", "$\\tilde v$"),))
 VOLTAGE = Panel("voltage $u$", "V", 1.0, (Curve("u", "$u$"),))
+# Under noise u jumps with each sample, and what a drive gives is near its average over the sample.
+AVERAGED = Panel("voltage $u$,\naveraged", "V", 1.0, (Curve("u_mean", "$u$"),))
 CURRENT_DISTURBANCE = Panel("disturbance $q_i$", "A/s", 1.0, (Curve("q_i", "$q_i$"),))
 
 SIGNALS = (POSITION, CURRENT, SLIDING, DISTURBANCE)

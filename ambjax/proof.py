@@ -20,6 +20,7 @@ from ambjax.integrate import Problem
 from ambjax.loop import ClosedLoop, Inputs, LoopState, add
 from ambjax.signals import Reference
 from ambjax.smooth import smooth_sign
+from ambjax.span import Span
 
 
 class Identities(NamedTuple):
@@ -105,6 +106,9 @@ class Monitored:
 
     def rest(self, state: Witnessed, code: Array) -> Witnessed:
         return Witnessed(self.loop.rest(state.loop, code), state.witness)
+
+    def noted(self, row: TheoremRow, span: Span) -> TheoremRow:
+        return row
 
     def singularity(self, row: TheoremRow) -> Array:
         return self.loop.scenario.plant.singularity(row.z, row.i_ref)

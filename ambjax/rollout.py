@@ -16,6 +16,7 @@ from ambjax.loop import ClosedLoop
 from ambjax.method import with_method
 from ambjax.metrics import Ending, Fold
 from ambjax.scenario import Clock, Scenario
+from ambjax.span import Span
 from ambjax.trajectory import ALIVE, Trajectory, first_time
 
 
@@ -35,6 +36,7 @@ class System(Protocol):
     def problem(self, hold: Measurement) -> Problem: ...
     def rest(self, state: Any, code: Array) -> Any: ...
     def row(self, t: Scalar, state: Any, hold: Measurement, alive: Array) -> Any: ...
+    def noted(self, row: Any, span: Span) -> Any: ...
     def singularity(self, row: Any) -> Array: ...
 
 
@@ -146,6 +148,7 @@ def _sample(system: System, clock: Clock, fold: Fold | None, progress: Progress,
         # A jump at this instant belongs to this sample even if t was rounded to just before it.
         row = system.row(t * (1 + 4 * jnp.finfo(dtype).eps), state, hold, alive)._replace(t=t)
         after = clock.method.advance(system.problem(hold), t, clock.sample_period, state, memory, ending.lost_code)
+        row = system.noted(row, after.span)
         folded = folded if fold is None else fold.update(folded, row, after.span)
         lost_now = alive & (after.code != ALIVE)
         resting = system.rest(after.state, after.code)

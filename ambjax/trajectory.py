@@ -34,6 +34,8 @@ class Row(NamedTuple):
     """its reference, A"""
     u: Array
     """applied voltage (after the supply's limit; 0 once lost), V"""
+    u_mean: Array
+    """the same, averaged over the sample that begins at t: what is left of spikes shorter than a sample, V"""
     v: Array
     """scaled magnetic force v(z, i), A^2/m^2. Eq. (3)"""
     v_star: Array

@@ -62,7 +62,7 @@ def test_chatter_is_a_band_with_its_mean_and_its_turns_can_be_followed(tmp_path,
     t = 1e-4 * np.arange(20_000)
     u = 200.0 * (-1) ** np.arange(20_000) + 10 * np.sin(2 * np.pi * t)
     u[12_345] = 260.0
-    overview(a_run(u=u), "chatter", tmp_path / "o.png")
+    overview(a_run(u=u, u_mean=u), "chatter", tmp_path / "o.png")
     whole, _, end = columns(drawn[0])[-1]
     (band,) = whole.collections
     heights = band.get_paths()[0].vertices[:, 1]

@@ -241,6 +241,13 @@ def test_folds_equal_numpy_on_what_was_recorded(run, request):
             np.testing.assert_allclose(y, x, rtol=1e-12, err_msg=key)
 
 
+def test_a_row_has_the_voltage_s_average_over_its_sample(short, lost):
+    for out in (short, lost):
+        span, on = out.measured["spans"], np.asarray(out.measured["spans"].time) > 0
+        np.testing.assert_allclose(out.trajectory.rows.u_mean[on], (span.densities.u / span.time)[on], rtol=1e-12)
+        assert np.all(np.asarray(out.trajectory.rows.u_mean)[~on] == 0)
+
+
 def test_a_span_lasts_as_long_as_the_drive_is_on(short, lost):
     time = np.asarray(short.measured["spans"].time)
     np.testing.assert_allclose(time, 1e-4, rtol=1e-12)  # a sum of some ten steps

@@ -57,7 +57,6 @@ class Loss:
         on = row.alive
         weight = jnp.where(row.t >= self.settle, 1.0, self.early)
         square = ((row.z - row.r) / self.s_0) ** 2
-        u = span.densities.u / jnp.where(span.time > 0, span.time, 1.0)
         halfway = (jnp.abs(row.r) + self.stop) / 2
         beyond = jnp.maximum((jnp.abs(row.z) - halfway) / (self.stop - halfway), 0.0)
         outward = jnp.where(row.z < 0, -row.z_dot, row.z_dot)
@@ -68,8 +67,8 @@ class Loss:
             carry.power + weight * square ** (NORM // 2),
             carry.weight + weight,
             carry.effort + span.densities.u_squared,
-            carry.chatter + jnp.where(on & (row.t > 0), (u - carry.u) ** 2, 0.0),
-            u,
+            carry.chatter + jnp.where(on & (row.t > 0), (row.u_mean - carry.u) ** 2, 0.0),
+            row.u_mean,
             carry.clearance + beyond**2,
             carry.driven + on,
             carry.time + span.time,

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ambjax.ensemble.scales import prefixed
 from ambjax.plotting import BLUE, ORANGE, RED, thin
 from ambjax.trajectory import Trajectory
 from tuning.explore import Slices
@@ -13,32 +14,45 @@ from tuning.explore import Slices
 HIGHEST = 30.0
 # Of a run, the start and the end are shown enlarged, for this long, in s, or for a quarter of it.
 ZOOM = 0.02
+# A run that is lost is shown until so many times as late.
+BEYOND = 1.15
+# What moves by less than this share of a signal's largest value is shown flat.
+FLAT = 1e-2
 
 
 def before_after(runs: dict[str, Trajectory]) -> bytes:
-    """PNG: z - r and u of runs by name, in rows: all of it, its start and its end, in columns."""
+    """PNG: z - r and u, averaged over each sample, of runs by name, in rows; in columns the whole, start and end."""
     from matplotlib.figure import Figure
 
-    rows = [(name, run, signal) for signal in ("z - r (µm)", "u (V)") for name, run in runs.items()]
+    rows = [(name, run, signal) for signal in ("z - r", "u") for name, run in runs.items()]
     figure = Figure(figsize=(10, 1.75 * len(rows) + 0.4), layout="constrained")
     axes = figure.subplots(len(rows), 3, squeeze=False)
     for line, (name, run, signal) in zip(axes, rows, strict=True):
         t, alive = np.asarray(run.rows.t), np.asarray(run.rows.alive)
-        values = 1e6 * np.asarray(run.rows.e_z) if signal.startswith("z") else np.asarray(run.rows.u)
-        end = t[-1] + (t[1] - t[0] if len(t) > 1 else 0.0)
+        values, unit = (run.rows.e_z, "m") if signal == "z - r" else (run.rows.u_mean, "V")
+        factor, unit = prefixed(unit, float(np.abs(np.asarray(values)[alive]).max(initial=0.0)))
+        values = factor * np.asarray(values)
+        least = FLAT * np.abs(values[alive]).max(initial=0.0)
+        ended = float(run.lost_at)
+        end = min(t[-1] + (t[1] - t[0] if len(t) > 1 else 0.0), max(BEYOND * ended, t[min(4, len(t) - 1)]))
         near = min(ZOOM, end / 4)
         for ax, (low, high) in zip(line, ((0.0, end), (0.0, near), (end - near, end)), strict=True):
             shown = alive & (t >= low) & (t <= high)
             ax.plot(*thin(t[shown], values[shown]), color=ORANGE if name == "before" else BLUE, lw=0.9)
             ax.set_xlim(low, high)
+            ax.locator_params(axis="x", nbins=5)
+            bottom, top = ax.get_ylim()
+            if top - bottom < least:  # what is smaller is rounding, or nothing to look at
+                ax.set_ylim((bottom + top - least) / 2, (bottom + top + least) / 2)
+            ax.ticklabel_format(axis="y", useOffset=False)
             ax.grid(alpha=0.3)
             ax.tick_params(labelsize=8)
-            ended = float(run.lost_at)
             if ended <= high:
                 ax.axvspan(max(ended, low), high, color=RED, alpha=0.12, lw=0)
-                word = run.lost_why.partition(":")[0]
-                ax.annotate(f"{word} at {ended:.4g} s", (0.97, 0.08), xycoords="axes fraction", ha="right", fontsize=8)
-        line[0].set_ylabel(f"{name}\n{signal}", fontsize=9)
+        if np.isfinite(ended) and signal == "z - r":
+            words = f"{run.lost_why.partition(':')[0]} at {ended:.4g} s"
+            line[0].annotate(words, (0.04, 0.06), xycoords="axes fraction", fontsize=8)
+        line[0].set_ylabel(f"{name}\n{signal} ({unit})", fontsize=9)
     for ax, words in zip(axes[0], ("whole run", "start", "end"), strict=True):
         ax.set_title(words, fontsize=10)
     for ax in axes[-1]:

@@ -90,7 +90,7 @@ def _gains(facts: Facts) -> list[str]:
         *(["Where these ranges come from:", "", *sources, ""] if sources else []),
         "## One rotor before and after",
         "",
-        "The case's own run, nothing spread, by accurate steps; u as each sample begins.",
+        "The case's own run, nothing spread, by accurate steps; u averaged over each sample.",
         "",
         "![z - r and u before and after tuning](nominal.png)",
         "",

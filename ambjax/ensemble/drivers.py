@@ -110,7 +110,11 @@ def _words(ranks: np.ndarray, alone: float, pair: dict[str, Any] | None, unknown
         return "too few members differ to tell what drives it"
     if not alone and pair is None:
         return "nothing that is spread explains it, alone or in pairs: noise"
-    together = "" if pair is None else f", and {' with '.join(pair['paths'])} together {100 * pair['share']:.0f} % more"
+    together = ""
+    if pair is not None:  # estimates, whose sum may come out above all there is
+        more = 100 * min(pair["share"], 1.0 - alone)
+        amount = f"{more:.0f} % more" if more >= 1 else "a little more"
+        together = f", and {' with '.join(pair['paths'])} together {amount}"
     left = alone + (0.0 if pair is None else pair["share"]) < 0.995
     rest = "; the rest is noise, or several acting together" * left
     return f"what is spread explains {100 * alone:.0f} % of how members rank, each quantity alone{together}{rest}"

@@ -82,7 +82,7 @@ class Study:
         fold = Named({str(k): Variation(after) for k, after in enumerate(ends[:-1] - period / 2)})
         outcome = run_ensemble(cascade, scenario, self.clock, fold=fold, every=every)
         rows, t = outcome.trajectory.rows, np.asarray(outcome.trajectory.rows.t[0])
-        seen = {"z - r": rows.z - rows.r, "u": rows.u, "sigma": rows.sigma}
+        seen = {"z - r": rows.z - rows.r, "u": rows.u_mean, "sigma": rows.sigma}
         signals = {k: np.where(rows.alive, x, np.nan) for k, x in seen.items()}
         later = [outcome.measured[str(k)] for k in range(len(ends) - 1)]
         left = np.stack([*later, np.zeros(len(rows.z))], axis=1)  # from each end on

@@ -13,7 +13,7 @@ from ambjax.ensemble.scales import finish, named
 from ambjax.plotting import BLUE, INK, ORANGE
 
 MOST_DRIVERS = 12
-TRENDS = {"grows with it": BLUE, "falls with it": ORANGE, "neither: turns, or is not seen": "#8a8a8a"}
+TRENDS = {"grows with it": BLUE, "falls with it": ORANGE, "no steady trend": "#8a8a8a"}
 
 
 class Bar(NamedTuple):
