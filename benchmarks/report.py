@@ -196,7 +196,7 @@ def search() -> list[str]:
         "The same loss, members, coordinates and ranges; the budget of rollouts is the gradients' own, or a multiple",
         "of it. Loss: median over seeds and range. Reached: rollouts until the gradients' median loss, median over",
         "seeds; a dash: not in the budget. Rollouts are not cost, since padded lanes are computed too: seconds are",
-        "those of a search on one core, with another search on the other.",
+        "processor time of a search on one core.",
         "",
     ]
     rows = []

@@ -5,8 +5,8 @@ coordinates, unbounded, in which a gain ends at its bound, and starts from the s
 ranges of the screen. Each seed changes what is random in the method, not the members. The budget is what the search
 by gradients took in the median; `--times` runs the rivals with as many times that. Best so far is the loss over the
 training members, stressed ones included, at the search's own steps. Rollouts are not cost: lanes of a call that are not
-needed are computed all the same, and a derivative costs less than a run; so seconds are told too, every search on one
-core (two at once). Results of tasks and methods that are not asked for stay in the JSON.
+needed are computed all the same, and a derivative costs less than a run; so seconds are told too: processor time of the
+search, which runs on one core, two searches at once. Results of tasks and methods that are not asked for stay.
 Run: python benchmarks/search.py [--tasks A B C D E] [--seeds 5] [--times 1] [--methods CMA-ES ...] [--processes 2]
 """
 
@@ -55,7 +55,7 @@ class Judge:
         ends = ([r.low for r in box], [r.high for r in box])
         self.low, self.high = (space.encode(space.clip(np.array(gains))) for gains in ends)
         self.trace: list[tuple[int, float, float]] = []
-        self.spent, self.best, self.began = 0, np.inf, time.perf_counter()
+        self.spent, self.best, self.began = 0, np.inf, time.process_time()
 
     def __call__(self, units: np.ndarray) -> np.ndarray:
         if self.spent >= self.most:
@@ -64,7 +64,7 @@ class Judge:
         values = self.study.goal.score(self.study.objective.space, x, self.study.engine.terms(x, self.who), self.who)
         values = np.where(np.isfinite(values), values, WORST)
         self.spent += len(x) * len(self.who.member)
-        row = (self.spent, time.perf_counter() - self.began, min(self.best, float(values.min())))
+        row = (self.spent, time.process_time() - self.began, min(self.best, float(values.min())))
         if len(self.trace) > 1 and self.trace[-1][2] == self.trace[-2][2] == row[2]:
             self.trace.pop()  # of a plateau, its ends
         self.trace.append(row)
@@ -128,12 +128,12 @@ METHODS: dict[str, Callable[[Judge, int], None]] = {
 
 def ours(study: Study, who: Any, seed: int) -> list[tuple[int, float, float]]:
     """Trace of the search by gradients, its looks around its own answer included, on all members."""
-    study.engine.rollouts, trace, began = 0, [], time.perf_counter()
+    study.engine.rollouts, trace, began = 0, [], time.process_time()
 
     def tell(kept: Any, _: float) -> None:
         if kept.history["members"][-1] == len(who.member):  # else its goal is that of a part of them
             best = min(float(np.min(kept.history["value"][-1])), trace[-1][2] if trace else np.inf)
-            trace.append((study.engine.rollouts, time.perf_counter() - began, best))
+            trace.append((study.engine.rollouts, time.process_time() - began, best))
 
     budget, start = study.tune.budget, study.tune.space.values(study.case.cascade)
     points = everywhere(study.objective, study.goal.conditions, start, budget.screen, seed)
