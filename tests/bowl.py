@@ -126,12 +126,16 @@ BUDGET = {
 }  # fmt: skip
 
 
-def document(**tune):
-    """A case file whose two gains are tuned, as read from TOML."""
-    return CASE | {"tune": {"gains": PATHS, "bounds": BOUNDS, "weights": {"effort": 0.0}, **BUDGET, **tune}}
+def document(tables=None, **tune):
+    """A case file whose two gains are tuned, as read from TOML; `tables` replace those of CASE."""
+    return (
+        CASE
+        | (tables or {})
+        | {"tune": {"gains": PATHS, "bounds": BOUNDS, "weights": {"effort": 0.0}, **BUDGET, **tune}}
+    )
 
 
-def study(monkeypatch, world, **tune):
+def study(monkeypatch, world, tables=None, **tune):
     """The study of that case in a world, every engine of it a Bowl."""
     import tuning.gradient
     import tuning.study
@@ -139,6 +143,6 @@ def study(monkeypatch, world, **tune):
     monkeypatch.setattr(Bowl, "world", world, raising=False)
     for module in (tuning.study, tuning.gradient):
         monkeypatch.setattr(module, "Engine", Bowl)
-    raw = document(**tune)
+    raw = document(tables, **tune)
     case = case_from(raw)
     return tuning.study.study_of(case, tune_from(Table(raw).table("tune"), case))
