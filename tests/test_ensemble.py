@@ -35,14 +35,13 @@ def rounding():
     """What rounding alone does to some metrics of SMOOTH over SHORT, by name, in their units.
 
     v_tilde is a difference of the two terms of Eq. (3), (i_0 / s_0)^2 each: a few roundings of their sum. The loop's
-    steepest slope makes of that i_ref', and the coil u; chatter adds up 2 |u| at every step of the run.
+    steepest slope makes of that i_ref', and the coil u; chatter adds up 2 |u| at every sample of the run.
     """
     plant = SMOOTH.model
     v_tilde = 4 * np.finfo(float).eps * 2 * (plant.i_0 / plant.s_0) ** 2
     u = plant.L * SMOOTH.slopes()["inversion"] / plant.dv_di(0.0, 0.0) * v_tilde
-    steps = SHORT.samples * SHORT.method.substeps
     voltages = dict.fromkeys(("max_abs_u_V", "rms_u_V", "settled_rms_u_V"), float(u))
-    return voltages | {"chatter_V": float(2 * steps * u), "settled_max_abs_v_tilde_A2_per_m2": v_tilde}
+    return voltages | {"chatter_V": float(2 * SHORT.samples * u), "settled_max_abs_v_tilde_A2_per_m2": v_tilde}
 
 
 def same(a, b, rtol):
