@@ -200,11 +200,15 @@ def test_the_worse_half_of_the_starts_is_left_behind(monkeypatch):
     made = study(monkeypatch, world)
     begins = np.stack([at(made, c, k) for c, k in ((3.0, 3.0), (6.0, 500.0), (900.0, 2.0), (2.0, 700.0))])
     who = made.objective.training(1, 4, 2, 1.2, 1.25)
-    search(made.engine, made.goal, who, begins, keep=4, iterations=12)
+    found = search(made.engine, made.goal, who, begins, keep=4, iterations=12)
     starts = [points for kind, *_, points in world.asked if kind == "gradient"]
     assert starts[: HALVINGS[0]] == [4] * HALVINGS[0]
     assert max(starts[HALVINGS[0] : HALVINGS[1]]) == 2
     assert max(starts[HALVINGS[1] :], default=1) == 1
+    # those that stay where they are from then on are the worse two
+    value = np.array(found.history["value"])
+    worse = np.argsort(value[HALVINGS[0] - 1])[2:]
+    np.testing.assert_array_equal(value[-1, worse], value[HALVINGS[0] - 1, worse])
 
 
 def test_bfgs_takes_the_same_way_whatever_the_unit_of_the_loss():
