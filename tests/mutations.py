@@ -277,7 +277,7 @@ ENSEMBLE = [
     ),
     M(
         "Wilson's interval forgets a term of its root",
-        "ambjax/ensemble/statistics.py",
+        "ambjax/ensemble/intervals.py",
         "(share * (1 - share) + z2 / (4 * n))",
         "(share * (1 - share))",
         "tests/test_statistics.py::test_wilson_solves_its_own_equation",
