@@ -12,13 +12,15 @@ from tuning.config import seeds
 from tuning.rounds import rounds
 
 TRAINING, VALIDATION, HELD_OUT = 0, 1, 2
+# What a checkpoint is told of the study that it belongs to.
+TOLD = {"case": "a bowl"}
 
 
 def tuned(monkeypatch, tmp_path, world, **tune):
     """The answer of the rounds, and its gains (c, k); one look is enough on a bowl."""
     monkeypatch.setattr(tuning.rounds, "look_again", lambda goals: False)
     made = study(monkeypatch, world, **tune)
-    found = rounds(made, made.tune.space.values(made.case.cascade), tmp_path, "told", False)
+    found = rounds(made, made.tune.space.values(made.case.cascade), tmp_path, TOLD, False)
     return found, np.asarray(found.study.objective.space.gains_at(found.x))
 
 
@@ -164,6 +166,6 @@ def test_an_interrupted_study_goes_on_where_it_was(monkeypatch, tmp_path):
     assert c > 40.0  # what the first round found
     stop = False
     made = study(monkeypatch, world)
-    again = rounds(made, made.tune.space.values(made.case.cascade), out[1], "told", True)
+    again = rounds(made, made.tune.space.values(made.case.cascade), out[1], TOLD, True)
     assert again.lost == 0
     np.testing.assert_array_equal(again.x, whole.x)
