@@ -50,7 +50,7 @@ class Bowl:
     world: World
 
     def __init__(self, objective, *, settle, mode="forward", threads=None, lanes=64):
-        self.objective, self.mode, self.rollouts = objective, mode, 0
+        self.objective, self.mode, self.threads, self.rollouts = objective, mode, threads, 0
         self.accurate = isinstance(objective.clock.method, Adaptive)
 
     def _note(self, kind, x, who):
@@ -122,7 +122,7 @@ CASE = {
 PATHS = ["controller.position.c", "controller.position.k"]
 BOUNDS = {"controller": {"position": {"c": [1.0, 1000.0], "k": [1.0, 1000.0]}}}
 BUDGET = {
-    "members": 4, "stressed": 2, "validation": 10, "held_out": 6, "screen": 4, "starts": 1, "iterations": 40
+    "members": 4, "stressed": 2, "validation": 10, "held_out": 6, "screen": 0, "starts": 1, "iterations": 40
 }  # fmt: skip
 
 

@@ -299,8 +299,8 @@ ENSEMBLE = [
     M(
         "a condition of the theorem holds where it fails",
         "ambjax/theorem.py",
-        "gain > against if deciding",
-        "gain < against if deciding",
+        "unit, gain > against, path",
+        "unit, gain < against, path",
         "tests/test_theorem.py::test_repaired_holds_and_literal_does_not",
     ),
 ]
@@ -329,22 +329,22 @@ SEARCH = [
     M(
         "the validation ensemble is never asked",
         "tuning/rounds.py",
-        "lost = _lost(study, x) if tune.budget.validation",
-        "lost = np.zeros(0, int) if tune.budget.validation",
+        "lost, worst = _lost(course.study, x)",
+        "lost, worst = np.zeros(0, int), np.arange(1)",
         "tests/test_tuning_rounds.py::test_members_of_another_seed_that_are_lost_join_and_are_held",
     ),
     M(
         "the answer that loses most is returned",
         "tuning/rounds.py",
-        "dataclasses.replace(min(found, key",
-        "dataclasses.replace(max(found, key",
+        "best = min(found, key",
+        "best = max(found, key",
         "tests/test_tuning_rounds.py::test_of_several_answers_that_lose_members_the_one_that_loses_least_is_returned",
     ),
     M(
         "members that accurate steps lose do not join",
         "tuning/rounds.py",
-        "who = who.joined(_joining(study, lost, error.lost))",
-        "who = who.joined(_joining(study, lost, []))",
+        "these = error.who._replace(",
+        "these = jax.tree.map(lambda a: a[:0], error.who)._replace(",
         "tests/test_tuning_rounds.py::test_members_that_only_accurate_steps_lose_join_too",
     ),
     M(
@@ -362,11 +362,25 @@ SEARCH = [
         "tests/test_tuning_study.py::test_the_judge_sees_every_member_of_its_own_ensemble_once",
     ),
     M(
+        "the judge takes the steps of the search",
+        "tuning/study.py",
+        "found = study.judging.metrics(",
+        "found = study.engine.metrics(",
+        "tests/test_tuning_study.py::test_the_judge_sees_every_member_of_its_own_ensemble_once",
+    ),
+    M(
         "the range of c forgets the sample period",
-        "tuning/screen.py",
-        "min(10 * w, max(1 / (5 * sample_period), w / 10))",
-        "10 * w",
+        "tuning/ranges.py",
+        "cap = max(1 / (5 * asked.period), asked.w / 10)",
+        "cap = 20 * asked.w",
         "tests/test_tuning_study.py::test_starts_reach_as_far_as_the_theory_suggests",
+    ),
+    M(
+        "a range comes from a zero",
+        "tuning/ranges.py",
+        "(STIR * float(scenario.touchdown),",
+        "(0.0 * float(scenario.touchdown),",
+        "tests/test_tuning_study.py::test_a_rotor_that_stands_still_has_starts_too",
     ),
     M(
         "--pareto raises",

@@ -72,11 +72,20 @@ def test_starts_reach_as_far_as_the_theory_suggests(monkeypatch):
     assert 2.0 < found["position.p"].min() < 2.5 < 80.0 < found["position.p"].max() < 90.0  # bounds that are given hold
 
 
+def test_a_rotor_that_stands_still_has_starts_too(monkeypatch):
+    """Delta_1 is 0 there, and no range comes from a zero."""
+    found, _ = begins(monkeypatch, 16, {"reference": {"kind": "constant", "value": 0.0}})
+    for name, gains in found.items():
+        assert gains.max() > 3 * gains.min(), name
+
+
 # --- the judge ---
 
 
 def test_the_judge_sees_every_member_of_its_own_ensemble_once(monkeypatch):
+    """And in finer steps than the search's, 3, whose error is not the judge's."""
     world = World(limit=lambda seed, number, *_: 40.0 if number == 5 else math.inf)
+    world.bias = lambda substeps: 0.5 if substeps == 3 else 0.0
     made = study(monkeypatch, world)
     monkeypatch.setattr(tuning.study, "CHUNK", 4)
     x = at(made, 80.0, 60.0)
@@ -87,7 +96,9 @@ def test_the_judge_sees_every_member_of_its_own_ensemble_once(monkeypatch):
         (0, 1, 2, 3), (4, 5, 6, 7), (8, 9)
     ]  # fmt: skip
     assert {f"loss.{name}" for name in TERMS} <= set(found)
-    np.testing.assert_allclose(found["loss.tracking"], FLOOR * (1 + math.log(0.8) ** 2))
+    tracking = FLOOR * (1 + math.log(0.8) ** 2)
+    np.testing.assert_allclose(found["loss.tracking"], tracking)
+    np.testing.assert_allclose(found["settled_rms_error_m"], S_0 * math.sqrt(tracking))
 
 
 def test_a_summary_is_pooled_and_counts_the_lost(monkeypatch):
@@ -115,14 +126,18 @@ def test_the_error_of_the_step_is_measured_against_accurate_ones(monkeypatch, bi
     assert error.relative == pytest.approx(bias, abs=1e-12)
     assert error.resolved == (abs(bias) <= RESOLVED)
     assert error.reference_m == pytest.approx(S_0 * math.sqrt(FLOOR))
-    assert (error.members, error.lost) == (4, [])
+    assert (error.members, error.lost) == (4, 0)
 
 
 def test_members_that_only_accurate_steps_lose_are_named(monkeypatch):
     world = World(limit=lambda seed, number, stressed, accurate: 40.0 if accurate and number in (1, 3) else math.inf)
     made = study(monkeypatch, world)
-    assert step_error(made, at(made, 80.0, 60.0)).lost == [1, 3]
-    assert step_error(made, at(made, 30.0, 60.0)).lost == []
+    error = step_error(made, at(made, 80.0, 60.0))
+    assert error.lost == 2
+    assert error.who.member.tolist() == [1, 3]
+    assert error.refuted  # whatever the error of the others
+    error = step_error(made, at(made, 30.0, 60.0))
+    assert error.lost == len(error.who.member) == 0
 
 
 def test_where_nobody_is_held_by_both_nothing_is_said_of_the_step(monkeypatch):
@@ -234,7 +249,6 @@ def test_bfgs_takes_the_same_way_whatever_the_unit_of_the_loss():
 def command(monkeypatch, tmp_path, world, *flags, **tune):
     """`ambjax-tune` in this process, its engine a Bowl: exit code, summary, output directory."""
     made = study(monkeypatch, world, **tune)
-    monkeypatch.setattr("tuning.rounds.look_again", lambda goals: False)
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(dumps(document(**tune), "a case"))
     names = ("--gradients", "--pareto")
@@ -259,7 +273,8 @@ def test_tuned_gains_are_judged_by_members_that_nothing_else_was_asked_of(everyt
     training, validation, held_out = seeds(made.tune.budget)
     assert summary["held_out_seed"] == held_out
     judged = [numbers for kind, seed, numbers, _ in world.asked if (kind, seed) == ("metrics", held_out)]
-    assert judged == [tuple(range(6))] * 2  # before and after
+    assert judged[:2] == [tuple(range(6))] * 2  # before and after; then by accurate steps
+    assert held_out not in world.seeds("terms")
     assert {seed for kind, seed, *_ in world.asked if kind == "gradient"} == {training}
     assert validation in world.seeds("terms")
     assert code == 0
