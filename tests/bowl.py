@@ -1,0 +1,148 @@
+"""An engine whose losses are formulas, in place of `tuning.objective.Engine`: what the search does can then be told
+by hand, in milliseconds.
+
+A member's tracking error is least at the gains `best`; a member is lost, the earlier the further, where c is above a
+limit of its own. The search's own step reports an error that is too large by a factor of its own.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax import Adaptive
+from ambjax.casefile import case_from
+from ambjax.tomltable import Table
+from tuning.config import tune_from
+from tuning.loss import TERMS
+from tuning.objective import weigh
+
+# Smallest tracking error, (m / s_0)^2, and the duration, s.
+FLOOR, DURATION = 1e-4, 0.02
+S_0 = 5e-3
+# Of the imaginary parts that carry derivatives, which are exact: they are never subtracted.
+TINY = 1e-30
+
+
+@dataclasses.dataclass
+class World:
+    """What is true, and what was asked: (kind, seed, numbers of the members, points) of every call of an engine."""
+
+    best: tuple[float, ...] = (100.0, 60.0)
+    limit: Callable[[int, int, bool, bool], float] = lambda seed, number, stressed, accurate: math.inf
+    """of c, 1/s, by seed and number of a member, whether it is asked only to be held, and by accurate steps"""
+    bias: Callable[[int], float] = lambda substeps: 0.0
+    """relative error of the settled error in steps of so many per sample"""
+    asked: list[tuple[str, int, tuple[int, ...], int]] = dataclasses.field(default_factory=list)
+
+    def seeds(self, kind: str) -> set[int]:
+        """Seeds of the members that were asked for this."""
+        return {seed for what, seed, *_ in self.asked if what == kind}
+
+
+class Bowl:
+    """See above; `world` is set by `study`."""
+
+    world: World
+
+    def __init__(self, objective, *, settle, mode="forward", threads=None, lanes=64):
+        self.objective, self.mode, self.threads, self.rollouts = objective, mode, threads, 0
+        self.accurate = isinstance(objective.clock.method, Adaptive)
+
+    def _note(self, kind, x, who):
+        for seed in sorted(set(np.asarray(who.seed).tolist())):
+            numbers = np.asarray(who.member)[np.asarray(who.seed) == seed]
+            self.world.asked.append((kind, seed, tuple(numbers.tolist()), len(x)))
+        self.rollouts += len(x) * len(who.member)
+
+    def _terms(self, x, who, along=None):
+        """Terms [S, N] at coordinates x [S, m]; their derivatives along coordinate `along` as imaginary parts."""
+        logs, slopes = (np.asarray(part) for part in _log_gains(self.objective.space, jnp.asarray(x) * 1.0))
+        if along is not None:
+            logs = logs + 1j * TINY * np.where(np.arange(x.shape[1]) == along, slopes, 0.0)
+        away = logs - np.log(self.world.best)
+        each = zip(*(np.asarray(one).tolist() for one in (who.seed, who.member, who.stressed)), strict=True)
+        limits = np.log([self.world.limit(*one, self.accurate) for one in each])
+        beyond = logs[:, :1] - limits
+        beyond = np.where(beyond.real > 0, beyond, 0.0)
+        nothing = 0.0 * beyond
+        # voltage grows with the last gain, and is a tenth of the limit where that is best
+        each = {"tracking": FLOOR * (1 + (away**2).sum(axis=1)), "effort": 0.01 * np.exp(2 * away[:, -1])}
+        each = {name: term[:, None] + nothing for name, term in each.items()} | {"survival": 1 - np.exp(-beyond)}
+        return {name: each.get(name, nothing) for name in TERMS}
+
+    def terms(self, x, who):
+        self._note("terms", x, who)
+        return self._terms(x, who)
+
+    def metrics(self, x, who):
+        self._note("metrics", x, who)
+        found = self._terms(x, who)
+        lost = found["survival"] > 0
+        substeps = getattr(self.objective.clock.method, "substeps", None)
+        bias = 0.0 if self.accurate else self.world.bias(substeps)
+        error = S_0 * np.sqrt(found["tracking"]) * (1 + bias)
+        numbers = np.broadcast_to(np.asarray(who.member, float), lost.shape)
+        metrics = {
+            "settled_rms_error_m": error,
+            "settled_max_abs_error_m": 2 * error,
+            "settled_rms_u_V": 200 * np.sqrt(found["effort"]),
+            "chatter_V": 1 + numbers,
+            "lost": lost,
+            "stalled": np.zeros_like(lost),
+            "lost_at_s": np.where(lost, DURATION * (1 - found["survival"]), np.inf),
+        }
+        return {"loss": found, "metrics": metrics}
+
+    def gradient(self, x, who, weights):
+        self._note("gradient", x, who)
+        self.rollouts += len(x) * len(who.member) * x.shape[1]
+        each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS))).T[:, :, None]
+        found = [weigh(each, self._terms(x, who, j), who.stressed) for j in range(x.shape[1])]
+        return found[0].real, np.stack([one.imag for one in found], axis=-1) / TINY, self._terms(x, who)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _log_gains(space, x):
+    """Logarithms of the gains at coordinates x [S, m], and the slope of each along its own coordinate."""
+    return jax.jvp(lambda x: jnp.log(jax.vmap(space.gains_at)(x)), (x,), (jnp.ones_like(x),))
+
+
+CASE = {
+    "reference": {"kind": "sine", "amplitude": 1e-3, "frequency": 2.0},
+    "sensor": {"std": 1e-6},
+    "actuator": {"u_max": 200.0},
+    "clock": {"duration": DURATION},
+    "run": {"settle": 0.01},
+}
+PATHS = ["controller.position.c", "controller.position.k"]
+BOUNDS = {"controller": {"position": {"c": [1.0, 1000.0], "k": [1.0, 1000.0]}}}
+BUDGET = {
+    "members": 4, "stressed": 2, "validation": 10, "held_out": 6, "screen": 0, "starts": 1, "iterations": 40
+}  # fmt: skip
+
+
+def document(tables=None, **tune):
+    """A case file whose two gains are tuned, as read from TOML; `tables` replace those of CASE."""
+    return (
+        CASE
+        | (tables or {})
+        | {"tune": {"gains": PATHS, "bounds": BOUNDS, "weights": {"effort": 0.0}, **BUDGET, **tune}}
+    )
+
+
+def study(monkeypatch, world, tables=None, **tune):
+    """The study of that case in a world, every engine of it a Bowl."""
+    import tuning.gradient
+    import tuning.study
+
+    monkeypatch.setattr(Bowl, "world", world, raising=False)
+    for module in (tuning.study, tuning.gradient):
+        monkeypatch.setattr(module, "Engine", Bowl)
+    raw = document(tables, **tune)
+    case = case_from(raw)
+    return tuning.study.study_of(case, tune_from(Table(raw).table("tune"), case))

@@ -1,0 +1,30 @@
+"""The runs behind the ledger: which plants are tried, on runs that are stood in for."""
+
+import numpy as np
+import pytest
+
+from ambjax import Plant, evidence, paper
+
+
+@pytest.mark.parametrize("fragile", ["m -10 %", "m +10 %", "k_z -10 %", "R +10 %", "A -10 %"])
+def test_an_uncertain_plant_is_tried_off_to_either_side(monkeypatch, fragile):
+    """Each of m, k_z, R and A, 10 % below and 10 % above, one at a time: the one that is lost is named."""
+    tried = []
+
+    def rollout(cascade, scenario, clock, *, fold):
+        own, nominal = scenario.plant, Plant()
+        off = [
+            f"{name} {100 * (getattr(own, name) / getattr(nominal, name) - 1):+.0f} %"
+            for name in nominal.__dataclass_fields__
+            if getattr(own, name) != getattr(nominal, name)
+        ]
+        assert len(off) == 1
+        tried.append(off[0])
+        measured = {"lost_at_s": 0.1 if off[0] == fragile else np.inf, "settled_max_abs_error_m": 1e-6 * len(tried)}
+        return (), measured
+
+    monkeypatch.setattr(evidence, "rollout", rollout)
+    lost, error = evidence._uncertain(paper.cascade("repaired"), "repaired")
+    assert lost == [fragile]
+    assert sorted(tried) == sorted(f"{name} {sign}10 %" for name in ("m", "k_z", "R", "A") for sign in "+-")
+    assert error == pytest.approx(8e-6)

@@ -1,0 +1,80 @@
+"""The hunt for mutants: its table fits the code, it tells the killed from the survivors, and none survives."""
+
+import pathlib
+
+import pytest
+from mutate import KILLED, SURVIVED, hunt, main, verdict
+from mutate import mutated as applied
+from mutations import MUTATIONS, Mutation
+
+ROOT = pathlib.Path(__file__).parent.parent
+
+
+@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: m.says)
+def test_every_mutation_fits_the_code(mutation):
+    applied(mutation)
+    path, _, name = mutation.test.partition("::")
+    text = (ROOT / path).read_text()
+    assert not name or f"def {name.partition('[')[0]}(" in text
+
+
+def test_the_table_is_long_and_says_each_thing_once():
+    assert len({m.says for m in MUTATIONS}) == len({(m.file, m.old, m.new) for m in MUTATIONS}) == len(MUTATIONS) >= 25
+
+
+PROGRAM = "def double(x):\n    return 2 * x  # twice\n"
+TESTS = """from program import double
+
+
+def test_zero():
+    assert double(0) == 0
+
+
+def test_one():
+    assert double(1) == 2
+"""
+BREAK = Mutation("once", "ambjax/program.py", "2 * x", "1 * x", "tests/test_it.py::test_one")
+
+
+@pytest.fixture
+def project(tmp_path):
+    """A program of one line, and two tests of it: the first does not see what the second sees."""
+    for name, text in {"ambjax/program.py": PROGRAM, "tests/test_it.py": TESTS}.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    (tmp_path / "pyproject.toml").write_text('[tool.pytest.ini_options]\npythonpath = ["ambjax"]\n')
+    return tmp_path
+
+
+def test_the_killed_are_told_from_survivors(project):
+    assert verdict(BREAK, project) == KILLED
+    assert verdict(BREAK._replace(test="tests/test_it.py::test_zero"), project) == SURVIVED
+    assert "NOT JUDGED" in verdict(BREAK._replace(test="tests/test_it.py::test_two"), project)
+    assert (project / BREAK.file).read_text() == PROGRAM  # never in place
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"old": "3 * x"}, "is found 0 times"),
+        ({"old": "x"}, "is found 2 times"),
+        ({"new": "2 * x"}, "changes nothing"),
+        ({"file": "ambjax/none.py"}, "no such file"),
+    ],
+)
+def test_a_mutation_that_no_longer_fits_is_named(project, change, says):
+    said = []
+    assert hunt([BREAK._replace(**change)], project, say=said.append) == 1
+    assert says in said[-1]
+
+
+def test_a_test_that_fails_by_itself_kills_nothing(project):
+    said = []
+    (project / "tests/test_it.py").write_text(TESTS.replace("== 2", "== 3"))
+    assert hunt([BREAK], project, jobs=1, say=said.append) == 1
+    assert "mend them first" in said[-1]
+
+
+@pytest.mark.slow
+def test_no_mutation_survives(capsys):
+    assert main([]) == 0, capsys.readouterr().out

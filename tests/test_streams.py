@@ -1,0 +1,59 @@
+"""Random streams that must not meet: of one sensor and another, of sensors and keys, of designs and signals."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ambjax import Scenario, Sensor
+from ambjax.ensemble.design import BITS, points
+from ambjax.gaussian import normals, threefry
+from ambjax.scenario import SIGNALS
+
+MEMBERS = 40
+
+
+def test_the_noise_of_one_sensor_says_nothing_of_another_s():
+    """Neither its sign nor its size: no correlation of the numbers, nor of their squares, nor of large ones."""
+    count = 40_000
+    drawn = jax.jit(jax.vmap(lambda k: jnp.stack(normals(Scenario(seed=3).words(), k))))(jnp.arange(count))
+    for n, function in enumerate((lambda w: w, np.square, lambda w: np.abs(w) > 2, np.sign)):
+        value = function(np.asarray(drawn)).astype(float)
+        correlation = np.corrcoef(value.T) - np.eye(3)
+        # five standard errors, 1/sqrt(count) each; one radius for two numbers would give 1/2 for the squares
+        assert np.abs(correlation).max() < 5 / np.sqrt(count), n
+
+
+def test_noise_is_not_made_of_the_words_that_keys_are_made_of():
+    """fold_in(key, n) is a pair of words, of which a signal's or a design's numbers are made: not those of sample n."""
+    scenario = dataclasses.replace(Scenario(sensor=Sensor(1.0, 1.0, 1.0)), seed=9, member=4)
+
+    def words(n):
+        return jnp.stack(threefry(scenario.words(), (0, n))).astype(float)
+
+    a, b = np.asarray(jax.vmap(words)(jnp.arange(200))).T
+    radius, turn = np.sqrt(-2 * np.log((a + 0.5) / 2**32)), 2 * np.pi * b / 2**32
+    own = np.asarray(jax.vmap(lambda n: jnp.stack(scenario.sensor.noise(scenario.words(), n)))(jnp.arange(200)))
+    for made in (radius * np.cos(turn), radius * np.sin(turn)):
+        assert np.abs(own - made[:, None]).min() > 1e-9  # 600 numbers of order 1; equal ones agree to 1e-15
+
+
+class Listening:
+    """A signal that keeps the key from which it is to draw."""
+
+    def realised(self, key):
+        return jax.random.key_data(key)
+
+
+@pytest.mark.parametrize("slot", SIGNALS)
+def test_designs_and_signals_share_no_random_words(slot):
+    """What a signal's key would give as a coordinate of a design is no coordinate of the design of that member."""
+    design = points("random", 5, len(SIGNALS) + 2, np.arange(MEMBERS), MEMBERS)
+    for member in range(MEMBERS):
+        scenario = Scenario(seed=5, member=member, **{slot: Listening()})
+        key = jax.random.wrap_key_data(getattr(scenario.realised(), slot))
+        high, low = (int(word) for word in jax.random.bits(key, (2,), jnp.uint32))
+        coordinate = (((high << 32 | low) >> (64 - BITS)) + 0.5) * 2.0**-BITS
+        assert np.abs(design - coordinate).min() > 1e-12

@@ -1,0 +1,170 @@
+"""The rounds of a study on losses that are formulas: whom they ask, what they go on with, and what they return."""
+
+import math
+
+import numpy as np
+import pytest
+from bowl import World, study
+
+import tuning.rounds
+from ambjax import Slide
+from tuning.config import seeds
+from tuning.rounds import rounds
+
+TRAINING, VALIDATION, HELD_OUT = 0, 1, 2
+# What a checkpoint is told of the study that it belongs to.
+TOLD = {"case": "a bowl"}
+
+
+def tuned(monkeypatch, tmp_path, world, **tune):
+    """The answer of the rounds, and its gains (c, k)."""
+    made = study(monkeypatch, world, **tune)
+    found = rounds(made, made.tune.space.values(made.case.cascade), tmp_path, TOLD, False)
+    return found, np.asarray(found.study.objective.space.gains_at(found.x))
+
+
+def seed_of(which, seed=1):
+    """The seed of one of the three ensembles."""
+    from tuning.config import Budget
+
+    return seeds(Budget(seed=seed))[which]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2**31 - 1])
+def test_the_three_ensembles_have_seeds_of_their_own(seed):
+    assert len({seed_of(which, seed) for which in (TRAINING, VALIDATION, HELD_OUT)}) == 3
+    assert seed_of(TRAINING, seed) == seed
+    # and of no other study's nearby
+    assert not {seed_of(VALIDATION, seed), seed_of(HELD_OUT, seed)} & set(range(seed, seed + 1000))
+
+
+def test_the_best_gains_are_found_and_nobody_is_lost(monkeypatch, tmp_path):
+    world = World()
+    found, gains = tuned(monkeypatch, tmp_path, world)
+    # on a bowl: as near as the search's shortest step, 1e-3, and its stall, 1e-3 of the loss, allow: sqrt(1e-3)
+    np.testing.assert_allclose(gains, world.best, rtol=0.05)
+    assert found.lost == 0
+    assert found.error is not None
+    assert found.error.resolved
+    assert world.seeds("gradient") == {seed_of(TRAINING)}  # nothing else is descended
+    assert seed_of(HELD_OUT) not in world.seeds("terms") | world.seeds("metrics")  # who judges is not asked before
+
+
+def test_members_of_another_seed_that_are_lost_join_and_are_held(monkeypatch, tmp_path):
+    fragile = {3, 7}
+
+    def limit(seed, number, stressed, accurate):
+        return 40.0 if seed == seed_of(VALIDATION) and number in fragile else math.inf
+
+    world = World(limit=limit)
+    found, (c, k) = tuned(monkeypatch, tmp_path, world)
+    assert ("terms", seed_of(VALIDATION), tuple(range(10)), 1) in world.asked
+    assert found.lost == 0
+    assert c < 40.0 < world.best[0]  # without them c = 100 is best
+    assert k == pytest.approx(world.best[1], rel=0.1)
+    joined = (found.who.seed == seed_of(VALIDATION)) & found.who.stressed
+    assert set(found.who.member[joined].tolist()) == fragile
+    # half of the extra noise of a stressed member, 1.2
+    np.testing.assert_allclose(found.who.loud[joined], 1.1)
+
+
+def test_without_validation_nobody_is_asked(monkeypatch, tmp_path):
+    world = World(limit=lambda seed, number, *_: math.inf if seed == 1 else 40.0)
+    found, gains = tuned(monkeypatch, tmp_path, world, validation=0)
+    np.testing.assert_allclose(gains, world.best, rtol=0.05)
+    assert seed_of(VALIDATION) not in world.seeds("terms") | world.seeds("metrics") | world.seeds("gradient")
+    assert found.lost == 0
+
+
+def test_of_several_answers_that_lose_members_the_one_that_loses_least_is_returned(monkeypatch, tmp_path):
+    """Three rounds, after which 3, 1 and 2 members are lost, whatever the gains."""
+    monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 3)
+    lost = iter([3, 1, 2])
+
+    class Moody(World):
+        def __init__(self):
+            super().__init__()
+            self.now = 0
+            self.limit = lambda seed, number, *_: (
+                1e-3 if self.trial and seed == seed_of(VALIDATION) and number < self.now else math.inf
+            )
+
+        @property
+        def trial(self):
+            """Whether it is the whole validation ensemble that is asked."""
+            kind, seed, numbers, _ = self.asked[-1]
+            return kind == "terms" and seed == seed_of(VALIDATION) and len(numbers) == 10
+
+    class Noticing(list):
+        def append(self, asked):
+            super().append(asked)
+            if world.trial:
+                world.now = next(lost)
+
+    world = Moody()
+    world.asked = Noticing()
+    found, _ = tuned(monkeypatch, tmp_path, world)
+    assert found.lost == 1
+    assert len(found.who.member) == 6 + 3  # the second round's: the three that the first lost have joined
+    assert next(lost, None) is None
+
+
+def test_steps_that_do_not_resolve_the_answer_are_halved(monkeypatch, tmp_path):
+    world = World(bias=lambda substeps: {3: 0.5, 6: 0.2, 12: 0.05}[substeps])
+    found, _ = tuned(monkeypatch, tmp_path, world)
+    assert found.study.objective.clock.method == Slide(12)
+    assert found.error.relative == pytest.approx(0.05)
+    assert found.error.resolved
+    # rollouts in the coarse steps count too
+    everyone = sum(len(numbers) * points for kind, _, numbers, points in world.asked if kind == "gradient")
+    assert found.study.engine.rollouts > everyone
+
+
+def test_steps_that_never_resolve_it_are_said_to_be_so(monkeypatch, tmp_path):
+    found, _ = tuned(monkeypatch, tmp_path, World(bias=lambda substeps: 0.5))
+    assert found.error.relative == pytest.approx(0.5)
+    assert not found.error.resolved
+
+
+def test_members_that_only_accurate_steps_lose_join_too(monkeypatch, tmp_path):
+    """The first four members of the training ensemble are run by accurate steps, which lose one above c = 40."""
+
+    def limit(seed, number, stressed, accurate):
+        return 40.0 if (seed, number) == (1, 2) and (stressed or accurate) else math.inf
+
+    found, (c, _) = tuned(monkeypatch, tmp_path, World(limit=limit))
+    assert c < 40.0
+    assert found.error.lost == 0
+    assert found.lost == 0
+
+
+def test_where_every_member_is_lost_there_is_nothing_to_go_on_with(monkeypatch, tmp_path):
+    found, _ = tuned(monkeypatch, tmp_path, World(limit=lambda seed, number, *_: 1e-3))
+    assert found.lost == 10  # all that would have been asked
+    assert found.error is None
+
+
+def test_an_interrupted_study_goes_on_where_it_was(monkeypatch, tmp_path):
+    """Ctrl-C in its second round; resumed, it ends at the gains of an uninterrupted one, to the bit."""
+    stop = False
+
+    def limit(seed, number, stressed, accurate):
+        fragile = seed == seed_of(VALIDATION) and number == 3
+        if stop and fragile and world.asked[-1][0] == "gradient":
+            raise KeyboardInterrupt
+        return 40.0 if fragile else math.inf
+
+    world = World(limit=limit)
+    out = [tmp_path / "whole", tmp_path / "cut"]
+    for folder in out:
+        folder.mkdir()
+    whole, (c, _) = tuned(monkeypatch, out[0], world)
+    assert c < 40.0
+    stop = True
+    _, (c, _) = tuned(monkeypatch, out[1], world)
+    assert c > 40.0  # what the first round found
+    stop = False
+    made = study(monkeypatch, world)
+    again = rounds(made, made.tune.space.values(made.case.cascade), out[1], TOLD, True)
+    assert again.lost == 0
+    np.testing.assert_array_equal(again.x, whole.x)

@@ -1,0 +1,320 @@
+"""What surrounds the search: ranges, the judge, the step's error, slices, the front, descent, and the command's flags.
+
+On losses that are formulas (`bowl.py`), so that each can be told by hand.
+"""
+
+import argparse
+import json
+import math
+import tomllib
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from bowl import FLOOR, PATHS, S_0, World, document, study
+from scipy import stats
+
+import tuning.command
+import tuning.study
+from ambjax.casefile import case_from
+from tuning import explore, optimisers
+from tuning.conditions import Bound
+from tuning.config import seeds
+from tuning.descent import Descent
+from tuning.goal import Goal
+from tuning.loss import TERMS
+from tuning.optimise import HALVINGS, search
+from tuning.risk import Mean
+from tuning.screen import everywhere
+from tuning.space import Gain, Space
+from tuning.study import RESOLVED, judge, step_error, summarise
+from tuning.toml import dumps
+
+
+def at(made, c, k):
+    """Coordinates of these gains."""
+    return made.objective.space.encode(np.array([c, k]))
+
+
+# --- where it starts ---
+
+GAINS = ("position.c", "position.k", "position.p", "inversion.gamma", "current.k_i")
+
+
+def begins(monkeypatch, count, tables=None, **tune):
+    """Gains [count + 2] by name at the points of the first screen, and the study."""
+    paths = [f"controller.{path}" for path in GAINS]
+    made = study(monkeypatch, World(), tables, **{"gains": paths, "bounds": {}} | tune)
+    start = made.tune.space.values(made.case.cascade)
+    points = everywhere(made.objective, made.goal.conditions, start, count, 1)
+    gains = np.array([made.objective.space.gains_at(jnp.asarray(x)) for x in points])
+    np.testing.assert_allclose(gains[0], start, rtol=1e-9)
+    assert np.all(np.isfinite(gains))
+    assert np.all(gains > 0)
+    return dict(zip(GAINS, gains[1:].T, strict=True)), made
+
+
+def test_starts_reach_as_far_as_the_theory_suggests(monkeypatch):
+    given = {"bounds": {"controller": {"position": {"p": [2.0, 90.0]}}}}
+    found, made = begins(monkeypatch, 64, **given)
+    for name, gains in found.items():
+        assert gains.max() > 5 * gains.min(), name
+    w = math.sqrt(made.case.scenario.plant.k_s / made.case.scenario.plant.m)
+    # the pole of the unstable plant, 528 1/s; 64 points of a Sobol sequence come within 2/64 of the ends of log c,
+    # whose range is a factor of 114: 16 %
+    assert found["position.c"].min() == pytest.approx(w / 30, rel=0.16)
+    # the sampled loop cannot slide faster than 1/(5 T), here 2000 1/s, at 1 ms 200
+    assert 0.8 * 2000 < found["position.c"].max() <= 2000
+    slow, _ = begins(monkeypatch, 64, {"clock": {"duration": 0.02, "sample_period": 1e-3}}, **given)
+    assert 0.8 * 200 < slow["position.c"].max() <= 200
+    delta_1 = next(bound.value for bound in made.goal.conditions if bound.symbol == "Delta_1")
+    assert found["inversion.gamma"].min() >= delta_1 > 0
+    assert 2.0 < found["position.p"].min() < 2.5 < 80.0 < found["position.p"].max() < 90.0  # bounds that are given hold
+
+
+def test_a_rotor_that_stands_still_has_starts_too(monkeypatch):
+    """Delta_1 is 0 there, and no range comes from a zero."""
+    found, _ = begins(monkeypatch, 16, {"reference": {"kind": "constant", "value": 0.0}})
+    for name, gains in found.items():
+        assert gains.max() > 3 * gains.min(), name
+
+
+# --- the judge ---
+
+
+def test_the_judge_sees_every_member_of_its_own_ensemble_once(monkeypatch):
+    """And in finer steps than the search's, 3, whose error is not the judge's."""
+    world = World(limit=lambda seed, number, *_: 40.0 if number == 5 else math.inf)
+    world.bias = lambda substeps: 0.5 if substeps == 3 else 0.0
+    made = study(monkeypatch, world)
+    monkeypatch.setattr(tuning.study, "CHUNK", 4)
+    x = at(made, 80.0, 60.0)
+    found = judge(made, x, 77, 10)
+    np.testing.assert_array_equal(found["chatter_V"], 1 + np.arange(10))  # a Bowl's member k chatters by 1 + k
+    assert found["lost"].tolist() == [k == 5 for k in range(10)]
+    assert [numbers for kind, seed, numbers, _ in world.asked if (kind, seed) == ("metrics", 77)] == [
+        (0, 1, 2, 3), (4, 5, 6, 7), (8, 9)
+    ]  # fmt: skip
+    assert {f"loss.{name}" for name in TERMS} <= set(found)
+    tracking = FLOOR * (1 + math.log(0.8) ** 2)
+    np.testing.assert_allclose(found["loss.tracking"], tracking)
+    np.testing.assert_allclose(found["settled_rms_error_m"], S_0 * math.sqrt(tracking))
+
+
+def test_a_summary_is_pooled_and_counts_the_lost(monkeypatch):
+    errors, lost_at = np.array([1.0, 2.0, 3.0, 6.0]) * 1e-6, np.array([np.inf, np.inf, 0.01, np.inf])
+    found = {
+        "settled_rms_error_m": errors,
+        "settled_max_abs_error_m": 2 * errors,
+        "lost_at_s": lost_at,
+        "lost": np.isfinite(lost_at),
+    }
+    told = summarise(study(monkeypatch, World()), found)
+    assert (told["members"], told["lost"], told["survival"]) == (4, 1, 0.75)
+    theirs = stats.binomtest(3, 4).proportion_ci(0.95, method="wilson")
+    assert (told["survival_low"], told["survival_high"]) == pytest.approx((theirs.low, theirs.high))
+    assert told["settled_rms_error_m"] == pytest.approx(math.sqrt(12.5) * 1e-6)
+    assert told["settled_rms_error_worst_member_m"] == 6e-6
+    assert told["settled_max_abs_error_m"] == 12e-6
+    assert (told["lost_at_s.mean"], told["lost_at_s.largest"]) == (0.01, 0.01)  # of those that are
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.06, -0.5, 0.4])
+def test_the_error_of_the_step_is_measured_against_accurate_ones(monkeypatch, bias):
+    made = study(monkeypatch, World(bias=lambda substeps: bias))
+    error = step_error(made, at(made, 100.0, 60.0))
+    assert error.relative == pytest.approx(bias, abs=1e-12)
+    assert error.resolved == (abs(bias) <= RESOLVED)
+    assert error.reference_m == pytest.approx(S_0 * math.sqrt(FLOOR))
+    assert (error.members, error.lost) == (4, 0)
+
+
+def test_members_that_only_accurate_steps_lose_are_named(monkeypatch):
+    world = World(limit=lambda seed, number, stressed, accurate: 40.0 if accurate and number in (1, 3) else math.inf)
+    made = study(monkeypatch, world)
+    error = step_error(made, at(made, 80.0, 60.0))
+    assert error.lost == 2
+    assert error.who.member.tolist() == [1, 3]
+    assert error.refuted  # whatever the error of the others
+    error = step_error(made, at(made, 30.0, 60.0))
+    assert error.lost == len(error.who.member) == 0
+
+
+def test_where_nobody_is_held_by_both_nothing_is_said_of_the_step(monkeypatch):
+    made = study(monkeypatch, World(limit=lambda *_: 1e-3))
+    error = step_error(made, at(made, 80.0, 60.0))
+    assert math.isnan(error.relative)
+    assert not error.resolved
+
+
+# --- around the optimum ---
+
+
+def test_slices_run_along_each_gain_through_the_optimum(monkeypatch):
+    world = World(limit=lambda seed, number, *_: 200.0 if number == 1 else math.inf)
+    made = study(monkeypatch, world, bounds={"controller": {"position": {"c": [1e-3, 1e9], "k": [1e-3, 1e9]}}})
+    x = at(made, *world.best)
+    who = made.objective.training(1, 4, 2, 1.2, 1.25)
+    found = explore.slices(made, x, who)
+    factors = np.exp(explore.REACH)  # far from bounds a coordinate is a logarithm
+    for j, best in enumerate(world.best):
+        np.testing.assert_allclose(found.gains[j], best * factors, rtol=1e-9)
+        held = found.lost[j] == 0
+        np.testing.assert_allclose(
+            found.goals[j][held], np.log(FLOOR * (1 + explore.REACH[held] ** 2)), rtol=0, atol=1e-9
+        )
+    np.testing.assert_array_equal(found.lost[0], factors * 100.0 > 200.0)
+    assert not found.lost[1].any()
+    # e^0.25 off, either way the same: 0.0625 of the risk
+    np.testing.assert_allclose(found.sensitivity(), [6.25, 6.25], rtol=1e-6)
+
+
+def test_the_front_trades_error_for_voltage(monkeypatch):
+    made = study(monkeypatch, World())
+    who = made.objective.training(1, 4, 2, 1.2, 1.25)
+    rows = explore.pareto(made, at(made, 100.0, 60.0), who)
+    voltage, error, k = (
+        np.array(column)
+        for column in zip(
+            *[(r["settled_rms_u_V"], r["settled_rms_error_m"], r["gains"]["controller.position.k"]) for r in rows],
+            strict=True,
+        )
+    )
+    weights = [row["effort_weight"] for row in rows]
+    assert sorted(weights, reverse=True) == weights  # the dearer, the less
+    assert weights[-1] == made.goal.weights[TERMS.index("effort")]
+    assert np.all(np.diff(voltage) > 0)
+    assert np.all(np.diff(error) < 0)
+    # each is the optimum of its own weight: d/dy of log(1 + y^2) + log(1 + w e^(2y)/100) is 0 at y = log(k / best)
+    for row_k, w in zip(k, weights, strict=True):
+        y = np.linspace(-4, 0.5, 45_001)
+        best = y[np.argmin(np.log(1 + y**2) + np.log(1 + w * 0.01 * np.exp(2 * y)))]
+        # eight iterations bring it near
+        assert math.log(row_k / 60.0) == pytest.approx(best, abs=0.1)
+    assert all(row["lost"] == 0 for row in rows)
+
+
+# --- descent ---
+
+
+def test_the_theorem_s_conditions_pull_where_the_losses_are_flat():
+    space = Space(tuple(Gain(path) for path in PATHS))
+    conditions = (Bound("controller.position.k", 50.0, "Q_z", "m/s^2"),)
+    goal = Goal((1.0,) * 6, Mean(), conditions, 2.0, 0.1)
+    descent = Descent(space, goal, "bfgs", 0.1)
+    x = jnp.asarray(np.log([[30.0, 20.0]]))
+    flat = descent.step(3, descent.begin(x), jnp.ones((1, 3)), jnp.zeros((1, 3, 2)), jnp.ones(1, bool))
+    # log of the mean loss, 1, and the weighed square of log(1.1 * 50 / 20)
+    assert float(flat.value[0]) == pytest.approx(2 * math.log(2.75) ** 2)
+    assert float(flat.trial[0, 0]) == pytest.approx(float(x[0, 0]))
+    assert float(flat.trial[0, 1]) > float(x[0, 1])
+
+
+def test_the_worse_half_of_the_starts_is_left_behind(monkeypatch):
+    world = World()
+    made = study(monkeypatch, world)
+    begins = np.stack([at(made, c, k) for c, k in ((3.0, 3.0), (6.0, 500.0), (900.0, 2.0), (2.0, 700.0))])
+    who = made.objective.training(1, 4, 2, 1.2, 1.25)
+    found = search(made.engine, made.goal, who, begins, keep=4, iterations=12)
+    starts = [points for kind, *_, points in world.asked if kind == "gradient"]
+    assert starts[: HALVINGS[0]] == [4] * HALVINGS[0]
+    assert max(starts[HALVINGS[0] : HALVINGS[1]]) == 2
+    assert max(starts[HALVINGS[1] :], default=1) == 1
+    # those that stay where they are from then on are the worse two
+    value = np.array(found.history["value"])
+    worse = np.argsort(value[HALVINGS[0] - 1])[2:]
+    np.testing.assert_array_equal(value[-1, worse], value[HALVINGS[0] - 1, worse])
+
+
+def test_bfgs_takes_the_same_way_whatever_the_unit_of_the_loss():
+    """The first pair of points tells the scale of the curvature: from then on f and 1000 f are descended alike."""
+    hessian, centre = jnp.diag(jnp.asarray([4.0, 60.0, 900.0])), jnp.asarray([0.5, -0.3, 0.2])
+
+    def way(unit):
+        x, yes, found = jnp.zeros(3), jnp.ones((), bool), []
+        memory = optimisers.begin(x)
+        for _ in range(6):
+            gradient = unit * hessian @ (x - centre)
+            x, memory = optimisers.bfgs(memory, x, gradient, yes, yes)
+            found.append(np.asarray(x))
+        return np.array(found)
+
+    # the first step is as long as allowed in either unit; the same numbers but for rounding
+    np.testing.assert_allclose(way(1e3), way(1.0), rtol=1e-9)
+
+
+# --- the command ---
+
+
+def command(monkeypatch, tmp_path, world, *flags, **tune):
+    """`ambjax-tune` in this process, its engine a Bowl: exit code, summary, output directory."""
+    made = study(monkeypatch, world, **tune)
+    path, out = tmp_path / "case.toml", tmp_path / "out"
+    path.write_text(dumps(document(**tune), "a case"))
+    names = ("--gradients", "--pareto")
+    given = {name.removeprefix("--"): name in flags for name in names}
+    args = argparse.Namespace(case=str(path), out=str(out), resume=False, json=True, **given)
+    code, summary = tuning.command.run(args)
+    assert json.loads(json.dumps(summary)) is not None
+    return code, summary, out, made
+
+
+@pytest.fixture(scope="module")
+def everything(tmp_path_factory):
+    """One run with both flags."""
+    world = World(limit=lambda seed, number, *_: 400.0)
+    with pytest.MonkeyPatch.context() as patch:
+        code, summary, out, made = command(patch, tmp_path_factory.mktemp("all"), world, "--gradients", "--pareto")
+    return world, code, summary, out, made
+
+
+def test_tuned_gains_are_judged_by_members_that_nothing_else_was_asked_of(everything):
+    world, code, summary, _, made = everything
+    training, validation, held_out = seeds(made.tune.budget)
+    assert summary["held_out_seed"] == held_out
+    judged = [numbers for kind, seed, numbers, _ in world.asked if (kind, seed) == ("metrics", held_out)]
+    assert judged[:2] == [tuple(range(6))] * 2  # before and after; then by accurate steps
+    assert held_out not in world.seeds("terms")
+    assert {seed for kind, seed, *_ in world.asked if kind == "gradient"} == {training}
+    assert validation in world.seeds("terms")
+    assert code == 0
+    assert summary["after"]["lost"] == 0
+    assert summary["after"]["settled_rms_error_m"] < summary["before"]["settled_rms_error_m"]
+
+
+def test_tuned_toml_holds_the_gains_and_can_be_read(everything):
+    world, _, summary, out, _ = everything
+    written = tomllib.loads((out / "tuned.toml").read_text())
+    tuned = [written["controller"]["position"][name] for name in ("c", "k")]
+    np.testing.assert_allclose(tuned, world.best, rtol=0.05)
+    assert tuned == [row["after"] for row in summary["gains"]]
+    case_from(written)
+
+
+def test_gradients_reports_three_ways_to_the_same_number(everything):
+    _, _, summary, out, _ = everything
+    found = summary["gradient"]
+    ways = [np.array(found["three_ways"][name]) for name in ("forward", "reverse", "differences")]
+    np.testing.assert_allclose(ways[1], ways[0], rtol=1e-12)
+    # h^4 of the extrapolated differences, of slopes that vanish at the optimum: of the size of the loss
+    np.testing.assert_allclose(ways[2], ways[0], rtol=1e-6, atol=1e-9 * FLOOR)
+    assert len(found["horizons"]) > 1
+    assert "gradient" in (out / "report.md").read_text().lower()
+
+
+def test_pareto_is_in_the_report_and_has_a_picture(everything):
+    _, _, summary, out, _ = everything
+    assert len(summary["pareto"]) > 1
+    assert "## Error against voltage" in (out / "report.md").read_text()
+    assert 'alt="Error against voltage"' in (out / "report.html").read_text()
+
+
+def test_a_rotor_that_is_lost_among_those_who_judge_is_an_answer_of_no(monkeypatch, tmp_path):
+    """One that no member of training and validation resembles."""
+    made = study(monkeypatch, World())
+    held_out = seeds(made.tune.budget)[2]
+    world = World(limit=lambda seed, number, *_: 40.0 if (seed, number) == (held_out, 2) else math.inf)
+    code, summary, *_ = command(monkeypatch, tmp_path, world)
+    assert code == 1
+    assert summary["after"]["lost"] == 1
+    assert "Rotors are lost" in summary["advice"]
