@@ -134,6 +134,7 @@ def test_members_that_only_accurate_steps_lose_join_too(monkeypatch, tmp_path):
 
     found, (c, _) = tuned(monkeypatch, tmp_path, World(limit=limit))
     assert c < 40.0
+    assert 2 in found.who.member[found.who.stressed]
     assert found.error.lost == 0
     assert found.lost == 0
 
