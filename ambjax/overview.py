@@ -42,7 +42,10 @@ def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tup
         columns = [(_fate(trajectory), *window), ("", *window)]
         grid = list(zip(panels[:half], panels[half:], strict=True))
     # the whole run has as much room as the two others
-    figure = Figure(figsize=(13.0, 1.55 * len(grid) + 0.9), layout="constrained")
+    width, height = 13.0, 1.55 * len(grid) + 1.2
+    figure = Figure(figsize=(width, height))
+    # Fixed, in inches: a layout that measures its labels takes as long as everything else.
+    figure.subplots_adjust(1.05 / width, 0.5 / height, 1 - 0.2 / width, 1 - 0.85 / height, wspace=0.24, hspace=0.24)
     ratios = [2, 1, 1] if window is None else [1, 1]
     axes = figure.subplots(len(grid), len(columns), sharex="col", squeeze=False, width_ratios=ratios)
     for row, (line, drawn) in enumerate(zip(axes, grid, strict=True)):
@@ -55,7 +58,7 @@ def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tup
     for ax in axes[-1]:
         ax.set_xlabel("time (s)")
     figure.align_ylabels(axes[:, 0])
-    figure.suptitle(title, fontsize=12)
+    figure.suptitle(title, fontsize=12, y=1 - 0.15 / height, va="top")
     figure.savefig(path, dpi=130)
 
 

@@ -165,17 +165,16 @@ def told(trace: list[tuple[int, float, float]], goal: float) -> Told:
 
 
 def prepared(name: str) -> tuple[Study, Any]:
-    """A task's study and training members, compiled, on one core."""
+    """A task's study and training members, on one core."""
     case, tune, _ = read_study(TASKS / f"{name}.toml")
     study = study_of(case, tune, threads=1)
-    who = training(study)
-    ours(study, who, 0)
-    return study, who
+    return study, training(study)
 
 
 def by_gradients(name: str, seeds: int) -> dict[str, Any]:
     """The search by gradients on one task: budget, goal, and a row for each seed."""
     study, who = prepared(name)
+    ours(study, who, 0)  # compiles
     traces = [ours(study, who, seed) for seed in range(seeds)]
     goal = statistics.median(trace[-1][2] for trace in traces)
     budget = round(statistics.median(trace[-1][0] for trace in traces))
@@ -186,6 +185,7 @@ def by_others(name: str, found: dict[str, Any], seeds: int, times: float, method
     """Rows of the other methods on one task, with `times` the gradients' budget."""
     warnings.simplefilter("ignore")
     study, who = prepared(name)
+    study.engine.terms(study.objective.space.encode(study.tune.space.values(study.case.cascade))[None], who)  # compiles
     rows: dict[str, Any] = {}
     for method in methods:
         key = method if times == 1 else f"{method}, {times:g} times"
@@ -225,10 +225,11 @@ def main() -> None:
             for name, found in zip(given.tasks, pool.map(by_gradients, given.tasks, [given.seeds] * 5), strict=True):
                 tasks[name] = tasks.get(name, {}) | found
                 show(name, "gradients", found["gradients"])
+                _measure.write("search", {"tasks": dict(sorted(tasks.items()))})
         jobs = {
             pool.submit(by_others, name, tasks[name], given.seeds, given.times, [method]): name
-            for name in given.tasks
             for method in given.methods
+            for name in given.tasks
         }
         for job in concurrent.futures.as_completed(jobs):  # an hour in all: what is measured is written at once
             tasks[jobs[job]] |= job.result()
