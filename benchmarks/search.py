@@ -185,7 +185,8 @@ def by_others(name: str, found: dict[str, Any], seeds: int, times: float, method
     """Rows of the other methods on one task, with `times` the gradients' budget."""
     warnings.simplefilter("ignore")
     study, who = prepared(name)
-    study.engine.terms(study.objective.space.encode(study.tune.space.values(study.case.cascade))[None], who)  # compiles
+    space = study.objective.space
+    study.engine.terms(space.encode(space.clip(study.tune.space.values(study.case.cascade)))[None], who)  # compiles
     rows: dict[str, Any] = {}
     for method in methods:
         key = method if times == 1 else f"{method}, {times:g} times"
