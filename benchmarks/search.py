@@ -13,7 +13,6 @@ Run: python benchmarks/search.py [--tasks A B C D E] [--seeds 5] [--times 1] [--
 import argparse
 import concurrent.futures
 import json
-import multiprocessing
 import os
 import pathlib
 import statistics
@@ -27,6 +26,7 @@ os.environ.setdefault("JAX_ENABLE_X64", "1")
 import _measure
 import numpy as np
 
+from ambjax.worker import processes
 from tuning.config import read_study
 from tuning.optimise import best_of, search
 from tuning.ranges import ranges
@@ -220,8 +220,7 @@ def main() -> None:
     given = parser.parse_args()
     path = _measure.RESULTS / "search.json"
     tasks = json.loads(path.read_text())["tasks"] if path.exists() else {}
-    spawn = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(given.processes, spawn) as pool:
+    with processes(given.processes) as pool:
         if given.times == 1:  # else the budget and the goal are those that are there
             for name, found in zip(given.tasks, pool.map(by_gradients, given.tasks, [given.seeds] * 5), strict=True):
                 tasks[name] = tasks.get(name, {}) | found
