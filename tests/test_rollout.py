@@ -285,9 +285,10 @@ def test_vmap_equals_the_loop_over_members():
 def test_vmap_equals_the_loop_over_members_with_adaptive_steps(short):
     batch = jax.vmap(lambda m: rollout(REPAIRED, with_member(m), SHORT, fold=FOLDS))(jnp.arange(3))
     for m in range(3):
-        # last bits move, and the step sizes with them: far below the tolerance 1e-6 of a step
+        # last bits move, and the step sizes with them: states by far less than the tolerance 1e-6 of a step, u, which
+        # sees rates, by about as much
         near(
-            jax.tree.map(lambda x, m=m: x[m], batch), rollout(REPAIRED, with_member(m), SHORT, fold=FOLDS), 1e-8, 1e-12
+            jax.tree.map(lambda x, m=m: x[m], batch), rollout(REPAIRED, with_member(m), SHORT, fold=FOLDS), 1e-6, 1e-12
         )
     same(rollout(REPAIRED, with_member(0), SHORT, fold=FOLDS), short)
 
