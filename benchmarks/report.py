@@ -179,7 +179,7 @@ def tasks() -> list[str]:
     rows = []
     for row in data["tasks"].values():
         gains = ", ".join(f"{path.rpartition('.')[2]} {value:.4g}" for path, value in row["gains"].items())
-        seconds = f"{row['seconds']:.0f}" if row["seconds"] else "-"  # none of a search that was resumed, or shared the machine
+        seconds = f"{row['seconds']:.0f}" if row["seconds"] else "-"  # resumed, or on a busy machine
         cells = [row["title"], f"{row['settled_rms_error_m']:.2e}", f"{row['settled_max_abs_error_m']:.1e}"]
         cells += [f"{row['lost']} of {row['members']}", f"{row['settled_rms_u_V']:.0f}"]
         cells += [f"{100 * row['step_error']:.1g} %", f"{row['rollouts']:,}", seconds, gains]
