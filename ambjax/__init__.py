@@ -4,8 +4,6 @@ Names are imported when they are first used, so that what needs none of them (`a
 """
 
 import importlib
-import sys
-import types
 from typing import TYPE_CHECKING, Any
 
 from ambjax._version import __version__
@@ -13,15 +11,17 @@ from ambjax._version import __version__
 if TYPE_CHECKING:
     from ambjax.control import current, inversion, observer, position
     from ambjax.control.cascade import Cascade
-    from ambjax.explicit import DOP853, RK4, Euler
-    from ambjax.integrate import Adaptive, Rodas3, Slide
-    from ambjax.method import choose_method, with_method
-    from ambjax.metrics import Standard
-    from ambjax.plant import Plant
-    from ambjax.rollout import Outcome, rollout
-    from ambjax.scenario import Clock, Initial, Scenario, Sensor
-    from ambjax.signals import BandNoise, Chirp, Constant, Pulse, Sine, SmoothStep, Step, Sum
-    from ambjax.trajectory import Row, Trajectory
+    from ambjax.simulation.clock import Clock
+    from ambjax.simulation.explicit import DOP853, RK4, Euler
+    from ambjax.simulation.integrate import Adaptive, Rodas3, Slide
+    from ambjax.simulation.method import choose_method, with_method
+    from ambjax.simulation.metrics import Standard
+    from ambjax.simulation.rollout import Outcome, rollout
+    from ambjax.simulation.trajectory import Row, Trajectory
+    from ambjax.world.plant import Plant
+    from ambjax.world.scenario import Initial, Scenario
+    from ambjax.world.sensor import Sensor
+    from ambjax.world.signals import BandNoise, Chirp, Constant, Pulse, Sine, SmoothStep, Step, Sum
 
 __all__ = [
     "DOP853",
@@ -62,20 +62,26 @@ __all__ = [
 _NAMES = {
     "control": "current inversion observer position",
     "control.cascade": "Cascade",
-    "explicit": "DOP853 RK4 Euler",
-    "integrate": "Adaptive Rodas3 Slide",
-    "method": "choose_method with_method",
-    "metrics": "Standard",
-    "plant": "Plant",
-    "rollout": "Outcome rollout",
-    "scenario": "Clock Initial Scenario Sensor",
-    "signals": "BandNoise Chirp Constant Pulse Sine SmoothStep Step Sum",
-    "trajectory": "Row Trajectory",
+    "simulation.clock": "Clock",
+    "simulation.explicit": "DOP853 RK4 Euler",
+    "simulation.integrate": "Adaptive Rodas3 Slide",
+    "simulation.method": "choose_method with_method",
+    "simulation.metrics": "Standard",
+    "simulation.rollout": "Outcome rollout",
+    "simulation.trajectory": "Row Trajectory",
+    "world.plant": "Plant",
+    "world.scenario": "Initial Scenario",
+    "world.sensor": "Sensor",
+    "world.signals": "BandNoise Chirp Constant Pulse Sine SmoothStep Step Sum",
 }
+# Packages that are there after `import ambjax`, imported when they are first used.
+_PACKAGES = ("ensemble", "paper")
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> Any:
+    if name in _PACKAGES:
+        return importlib.import_module(f"ambjax.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'ambjax' has no attribute '{name}'")
     home = f"ambjax.{_HOME[name]}"
@@ -85,17 +91,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
-
-
-class _Package(types.ModuleType):
-    """This package, in which `rollout` is the function and never the module of that name."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        # The import system binds every submodule to its package once it is loaded.
-        if name in _HOME and isinstance(value, types.ModuleType):
-            value = getattr(value, name)
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
+    return sorted({*globals(), *__all__, *_PACKAGES})

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import importlib
 import json
 import os
 import sys
@@ -9,8 +10,8 @@ from collections.abc import Callable
 from typing import Any, NoReturn
 
 from ambjax._version import __version__
-from ambjax._words import one_line
-from ambjax.interrupts import listening
+from ambjax.host.interrupts import listening
+from ambjax.host.words import one_line
 
 
 class Parser(argparse.ArgumentParser):
@@ -88,10 +89,10 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(args: argparse.Namespace) -> tuple[int, Any]:
-    from ambjax import commands, worker
+    from ambjax.ensemble import worker
 
     worker.prepare()
-    return getattr(commands, f"run_{args.command}")(args)
+    return importlib.import_module(f"ambjax.commands.{args.command}").run(args)
 
 
 def open_streams() -> None:

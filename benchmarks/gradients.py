@@ -24,10 +24,10 @@ import numpy as np
 import workload
 
 from ambjax import Cascade, Initial, current, inversion, position, rollout
-from ambjax._kernel import one_kernel
-from ambjax.metrics import Rms
+from ambjax.numerics.kernel import one_kernel
+from ambjax.simulation.metrics import Rms
 from tuning.config import read_study
-from tuning.objective import weigh
+from tuning.objective.problem import weigh
 from tuning.study import study_of
 
 GAINS = np.array([17.0, 25.0, workload.GAMMA, 152.0])

@@ -26,12 +26,12 @@ os.environ.setdefault("JAX_ENABLE_X64", "1")
 import _measure
 import numpy as np
 
-from ambjax.worker import processes
+from ambjax.ensemble.worker import processes
 from tuning.config import read_study
-from tuning.optimise import best_of, search
-from tuning.ranges import ranges
-from tuning.rounds import look_again, training
-from tuning.screen import around, everywhere
+from tuning.objective.ranges import ranges
+from tuning.search.optimise import best_of, search
+from tuning.search.rounds import look_again, training
+from tuning.search.screen import around, everywhere
 from tuning.study import Study, study_of
 
 TASKS = pathlib.Path(__file__).parent / "tasks"

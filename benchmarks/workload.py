@@ -15,7 +15,7 @@ import numpy as np
 
 from ambjax import RK4, Cascade, Clock, Initial, Plant, Pulse, Scenario, Sensor, inversion, paper, rollout
 from ambjax.ensemble import run_ensemble
-from ambjax.metrics import Peak
+from ambjax.simulation.metrics import Peak
 
 GAMMA, P_V = 1e9, 25e-6
 PERIOD, SUBSTEPS = 1e-4, 10

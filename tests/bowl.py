@@ -1,4 +1,4 @@
-"""An engine whose losses are formulas, in place of `tuning.objective.Engine`: what the search does can then be told
+"""An engine whose losses are formulas, in place of the compiled one: what the search does can then be told
 by hand, in milliseconds.
 
 A member's tracking error is least at the gains `best`; a member is lost, the earlier the further, where c is above a
@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax import Adaptive
-from ambjax.casefile import case_from
-from ambjax.tomltable import Table
+from ambjax.cases.reader import case_from
+from ambjax.cases.table import Table
 from tuning.config import tune_from
-from tuning.loss import TERMS
-from tuning.objective import weigh
+from tuning.objective.loss import TERMS
+from tuning.objective.problem import weigh
 
 # Smallest tracking error, (m / s_0)^2, and the duration, s.
 FLOOR, DURATION = 1e-4, 0.02
@@ -137,11 +137,11 @@ def document(tables=None, **tune):
 
 def study(monkeypatch, world, tables=None, **tune):
     """The study of that case in a world, every engine of it a Bowl."""
-    import tuning.gradient
+    import tuning.report.gradient
     import tuning.study
 
     monkeypatch.setattr(Bowl, "world", world, raising=False)
-    for module in (tuning.study, tuning.gradient):
+    for module in (tuning.study, tuning.report.gradient):
         monkeypatch.setattr(module, "Engine", Bowl)
     raw = document(tables, **tune)
     case = case_from(raw)

@@ -13,20 +13,22 @@ import tomllib
 import numpy as np
 import pytest
 
-from ambjax import overview
 from ambjax.__main__ import main
-from ambjax._pytree import validate, within
-from ambjax.casefile import KINDS, SIGNALS, case_from, read_case
-from ambjax.doubts import doubts
+from ambjax.cases.reader import KINDS, SIGNALS, case_from, read_case
+from ambjax.cases.template import template
+from ambjax.commands.doubts import doubts
+from ambjax.commands.outputs import files
 from ambjax.ensemble import LogUniform
-from ambjax.outputs import files
-from ambjax.plant import Plant
-from ambjax.scenario import Clock, Initial, Scenario, Sensor
-from ambjax.signals import LINES, BandNoise, Chirp, Pulse, Sine, SmoothStep, Step, Sum
-from ambjax.template import template
+from ambjax.numerics.records import validate, within
+from ambjax.pictures import overview
+from ambjax.simulation.clock import Clock
+from ambjax.world.plant import Plant
+from ambjax.world.scenario import Initial, Scenario
+from ambjax.world.sensor import Sensor
+from ambjax.world.signals import LINES, BandNoise, Chirp, Pulse, Sine, SmoothStep, Step, Sum
 from tuning.__main__ import main as tune
 from tuning.config import Budget, read_study, settings
-from tuning.toml import dumps
+from tuning.report.toml import dumps
 
 SHORT = "[clock]\nduration = 0.01\n"
 

@@ -11,15 +11,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ambjax import commands
-from ambjax.casefile import DURATION, KINDS, METHODS, SIGNALS, TABLES, read_case
-from ambjax.doubts import doubts
+from ambjax.cases.reader import DURATION, KINDS, METHODS, SIGNALS, TABLES, read_case
+from ambjax.commands import simulate
+from ambjax.commands.doubts import doubts
 from ambjax.ensemble.design import DESIGNS
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import draw
-from ambjax.plant import Plant
-from ambjax.scenario import Clock, Initial, Scenario, Sensor
-from tuning.toml import dumps
+from ambjax.simulation.clock import Clock
+from ambjax.world.plant import Plant
+from ambjax.world.scenario import Initial, Scenario
+from ambjax.world.sensor import Sensor
+from tuning.report.toml import dumps
 
 # Every run is of so few samples, and of so few structures, each of which is compiled once.
 SAMPLES, MOST_STRUCTURES = 4, 12
@@ -224,7 +226,7 @@ def hold(text, path, tally, run):
     if run and tally.read % ONE_IN == 0 and (known or len(tally.structures) < MOST_STRUCTURES):
         tally.structures.add(structure)
         tally.run += 1
-        outcome = commands.simulate(short)
+        outcome = simulate.simulate(short)
         for name, value in {**outcome.trajectory.rows._asdict(), **outcome.measured}.items():
             assert not np.any(np.isnan(value)), name
 

@@ -7,11 +7,11 @@ import re
 import numpy as np
 import pytest
 
-from ambjax import commands
 from ambjax.__main__ import main
-from ambjax.casefile import KINDS, SIGNALS, case_from, read_case
-from ambjax.paper import CLOCK, SETTLE, cascade, scenario
-from ambjax.template import template
+from ambjax.cases.reader import KINDS, SIGNALS, case_from, read_case
+from ambjax.cases.template import template
+from ambjax.commands import simulate
+from ambjax.paper.readings import CLOCK, SETTLE, cascade, scenario
 
 SHORT = "[clock]\nduration = 0.05\n"
 
@@ -224,7 +224,7 @@ def test_simulate_in_strokes_is_simulate_at_once(monkeypatch, capsys):
     path = write(SHORT + "[sensor]\nstd = 1e-6\n")
     assert main(["simulate", path, "--out", "a", "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
-    monkeypatch.setattr(commands, "STROKE", 200)
+    monkeypatch.setattr(simulate, "STROKE", 200)
     assert main(["simulate", path, "--out", "b"]) == 0
     with np.load("a/trajectory.npz") as a, np.load("b/trajectory.npz") as b:
         assert all(np.array_equal(a[k], b[k]) for k in a)

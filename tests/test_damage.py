@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import sealed
 from ambjax.ensemble.store import Store
-from ambjax.sealed import DamagedError, difference, flat, seal, unseal, write_whole
-from tuning.descent import Descent
-from tuning.keeper import Keeper, Search, remove_all
+from ambjax.host import sealed
+from ambjax.host.sealed import DamagedError, difference, flat, seal, unseal, write_whole
+from tuning.search.descent import Descent
+from tuning.search.keeper import Keeper, Search, remove_all
 
 FACTS = {"seed": 3, "plant.m": "0.588"}
 MEMBERS, CHUNK = 50, 20

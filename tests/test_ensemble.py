@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from scipy import linalg, stats
 
-from ambjax import RK4, Adaptive, Cascade, Clock, Initial, Scenario, Sensor, Sine, Standard, _kernel, inversion, rollout
+from ambjax import RK4, Adaptive, Cascade, Clock, Initial, Scenario, Sensor, Sine, Standard, inversion, rollout
 from ambjax.ensemble import Normal, Percent, Spread, run_ensemble
 from ambjax.ensemble.engine import size
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
-from ambjax.loop import ClosedLoop, LoopState
-from ambjax.metrics import Rms
+from ambjax.numerics import kernel
+from ambjax.simulation.loop import ClosedLoop, LoopState
+from ambjax.simulation.metrics import Rms
 
 SMOOTH = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
 NOISY = Scenario(reference=Sine(2.5e-3, 2.0), sensor=Sensor(1e-7, 1e-5, 1e-5), seed=7)
@@ -68,8 +69,8 @@ def test_results_do_not_depend_on_calls_threads_or_who_runs_beside():
 def test_results_do_not_depend_on_how_long_blocks_are_on_this_machine(cpu, monkeypatch):
     expected = {"AuthenticAMD avx512f": 1024}.get(cpu, 512)
     here = run_ensemble(SMOOTH, members(300), SHORT, fold=FOLD, threads=1)
-    monkeypatch.setattr(_kernel, "_cpuinfo", lambda: cpu)
-    assert [_kernel.block_bytes(n) for n in (1, 255, 256, 4096)] == [512, 512, expected, expected]
+    monkeypatch.setattr(kernel, "_cpuinfo", lambda: cpu)
+    assert [kernel.block_bytes(n) for n in (1, 255, 256, 4096)] == [512, 512, expected, expected]
     same(run_ensemble(SMOOTH, members(300), SHORT, fold=FOLD, threads=1), here, 1e-12)
 
 
@@ -87,11 +88,11 @@ def test_a_member_is_the_rollout_of_that_member_alone(method):
 
 
 def test_the_plain_path_gives_the_same_numbers_and_says_that_it_is_taken(monkeypatch, caplog):
-    if _kernel.options() is None:
+    if kernel.options() is None:
         pytest.skip("the fast path is not supported here")
     fast = run_ensemble(SMOOTH, members(20), SHORT, fold=Rms("e_z"))
     monkeypatch.setenv("AMBJAX_PLAIN", "1")
-    _kernel.options.cache_clear()
+    kernel.options.cache_clear()
     try:
         with caplog.at_level(logging.WARNING):
             same(run_ensemble(SMOOTH, members(20), SHORT, fold=Rms("e_z")), fast, 1e-12)
@@ -99,19 +100,19 @@ def test_the_plain_path_gives_the_same_numbers_and_says_that_it_is_taken(monkeyp
         assert len(caplog.records) == 1
     finally:
         monkeypatch.undo()
-        _kernel.options.cache_clear()
+        kernel.options.cache_clear()
 
 
 def test_a_probe_that_finds_a_wrong_lane_turns_the_fast_path_off(monkeypatch, caplog):
-    monkeypatch.setattr(_kernel, "smooth_sign", lambda x, p: jnp.where(x > 20, 0.0, jnp.arctan(p * x) * 2 / jnp.pi))
-    _kernel.options.cache_clear()
+    monkeypatch.setattr(kernel, "smooth_sign", lambda x, p: jnp.where(x > 20, 0.0, jnp.arctan(p * x) * 2 / jnp.pi))
+    kernel.options.cache_clear()
     try:
         with caplog.at_level(logging.WARNING):
-            assert _kernel.options() is None
+            assert kernel.options() is None
         assert "results are off by" in caplog.text
     finally:
         monkeypatch.undo()
-        _kernel.options.cache_clear()
+        kernel.options.cache_clear()
 
 
 def test_several_devices_share_an_ensemble_and_change_nothing(tmp_path):

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from ambjax import Plant, evidence, paper
+from ambjax import Plant, paper
+from ambjax.paper import evidence
 
 
 @pytest.mark.parametrize("fragile", ["m -10 %", "m +10 %", "k_z -10 %", "R +10 %", "A -10 %"])

@@ -26,8 +26,8 @@ from ambjax import (
     position,
     rollout,
 )
-from ambjax._kernel import one_kernel
-from ambjax.metrics import Rms
+from ambjax.numerics.kernel import one_kernel
+from ambjax.simulation.metrics import Rms
 
 TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.01, 0.03), sensor=Sensor(0.0))
 NOISE = np.array([0.0, 1e-6])
@@ -176,11 +176,11 @@ TRANSFORMS = {
 IN_A_PROCESS_OF_ITS_OWN = """
 import jax, numpy as np
 from ambjax import *
-from ambjax import _kernel
-from ambjax._kernel import one_kernel
-from ambjax._pytree import canonical
-from ambjax._kernel import one_kernel
-from ambjax.metrics import Rms
+from ambjax.numerics import kernel
+from ambjax.numerics.kernel import one_kernel
+from ambjax.numerics.records import canonical
+from ambjax.numerics.kernel import one_kernel
+from ambjax.simulation.metrics import Rms
 
 def loss(cascade):
     # squared: the cotangent of the rollout is no constant
@@ -189,7 +189,7 @@ def loss(cascade):
 smooth = canonical(Cascade(inversion=inversion.Adaptive(1e9, 25e-6)))
 transforms = [{transforms}]
 fast = [jax.tree.leaves(f(smooth)) for f in transforms]
-_kernel.options = lambda: None
+kernel.options = lambda: None
 for f, leaves in zip(transforms, fast):
     # the same operations, fused differently
     np.testing.assert_allclose(leaves, jax.tree.leaves(f(smooth)), rtol=1e-11, atol=1e-28)
@@ -206,7 +206,7 @@ def test_the_fast_path_differentiates():
 
 WHATEVER_ONE_CLOSES_OVER = """
 import jax, jax.numpy as jnp, numpy as np
-from ambjax._kernel import one_kernel
+from ambjax.numerics.kernel import one_kernel
 
 large = np.linspace(0, 1, 3_000_000)
 functions = {

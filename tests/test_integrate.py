@@ -11,9 +11,9 @@ import pytest
 from oracle import World, solve
 
 import ambjax as amb
-from ambjax import _linear
-from ambjax.integrate import Problem
-from ambjax.trajectory import ALIVE, STALLED
+from ambjax.numerics import linear
+from ambjax.simulation.integrate import Problem
+from ambjax.simulation.trajectory import ALIVE, STALLED
 
 FIXED = {"Euler": (amb.Euler, 1), "RK4": (amb.RK4, 4), "Rodas3": (amb.Rodas3, 3)}
 REPAIRED = amb.Cascade()
@@ -314,14 +314,14 @@ def test_factor_and_solve_are_those_of_numpy(n):
     rng = np.random.default_rng(n)
     jac, right = rng.normal(size=(n, n)), rng.normal(size=n)
     jac -= 2 * n * np.eye(n)  # decaying, as a stiff loop is: no row exchanges needed
-    found = _linear.solve(_linear.factor(jac.tolist(), 0.3), tuple(right))
+    found = linear.solve(linear.factor(jac.tolist(), 0.3), tuple(right))
     # Backward stable where the diagonal dominates: rounding times a condition number below 10.
     np.testing.assert_allclose(found, np.linalg.solve(np.eye(n) - 0.3 * jac, right), rtol=1e-13, atol=1e-14)
 
 
 def test_factor_survives_a_pivot_of_zero():
-    factors = _linear.factor([[0.0, 1.0], [1.0, 1.0]], 1.0)  # the last diagonal of I - J is 0
-    assert np.isfinite(_linear.solve(factors, (1.0, 2.0))).all()
+    factors = linear.factor([[0.0, 1.0], [1.0, 1.0]], 1.0)  # the last diagonal of I - J is 0
+    assert np.isfinite(linear.solve(factors, (1.0, 2.0))).all()
 
 
 def test_jacobian_of_a_nonlinear_function_on_a_pytree():
@@ -330,5 +330,5 @@ def test_jacobian_of_a_nonlinear_function_on_a_pytree():
         return {"x": x * y, "rest": (jnp.sin(z), x**2 + z)}
 
     x, y, z = 0.7, -1.3, 0.4
-    got = np.array(_linear.jacobian(function, {"x": x, "rest": (y, z)}))  # leaves in order: rest, then x
+    got = np.array(linear.jacobian(function, {"x": x, "rest": (y, z)}))  # leaves in order: rest, then x
     np.testing.assert_allclose(got, [[0, math.cos(z), 0], [0, 1, 2 * x], [x, 0, y]], rtol=1e-14)

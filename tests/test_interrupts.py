@@ -8,7 +8,7 @@ import pytest
 HEAD = """
 import os, signal, sys, threading, time
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from ambjax.interrupts import gently, heed, keeping, listening, unbroken
+from ambjax.host.interrupts import gently, heed, keeping, listening, unbroken
 
 def interrupt():
     os.kill(os.getpid(), signal.SIGINT)

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from ambjax import Adaptive, Cascade, Clock, Plant, Pulse, Scenario, Sine, rollout
-from ambjax._pytree import validate
 from ambjax.control import current, inversion, observer, position
-from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand, Measurement
-from ambjax.signals import Reference, reference_at
-from ambjax.smooth import smooth_sign
+from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand
+from ambjax.numerics.records import validate
+from ambjax.numerics.smooth import smooth_sign
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference, reference_at
 
 # stage, law
 LAWS = [

@@ -11,7 +11,7 @@ from ambjax.__main__ import main
 from ambjax.ensemble import Normal, Spread, maps
 from ambjax.ensemble.maps import PERIOD, Axis, grid
 from ambjax.ensemble.study import Study
-from ambjax.metrics import Peak
+from ambjax.simulation.metrics import Peak
 
 PLANT = Plant()
 CURRENT = float(PLANT.equilibrium(0.0)[0])

@@ -9,7 +9,7 @@ from oracle import World
 from test_oracle import BUMP, Case, adaptive, current, in_ambjax, noise_of, pulse, sine, smc
 
 from ambjax import Adaptive, Clock, Sensor, Slide, rollout
-from ambjax.metrics import Standard
+from ambjax.simulation.metrics import Standard
 
 PERIOD = 1e-4
 # Gains that the tuner found for two tasks of benchmarks/tasks: a hard sign under noise, and an observer.

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from ambjax import Scenario, Sensor
-from ambjax.gaussian import normals, threefry
+from ambjax.numerics.gaussian import normals, threefry
 
 NOISY = Scenario(sensor=Sensor(1e-6, 1e-4, 1e-4))
 

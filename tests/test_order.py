@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ambjax import Cascade, Sine, inversion, observer
-from ambjax.control.laws import Measurement
-from ambjax.signals import reference_at
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import reference_at
 
 
 @pytest.mark.parametrize("law", [inversion.Adaptive(), inversion.ClosedForm()], ids=lambda law: type(law).__name__)

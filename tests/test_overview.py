@@ -8,9 +8,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from ambjax.__main__ import main
-from ambjax.overview import TURNS, overview
-from ambjax.plotting import PIXELS
-from ambjax.trajectory import ALIVE, STALLED, TOUCHED, Row, Trajectory
+from ambjax.pictures.figures import PIXELS
+from ambjax.pictures.overview import TURNS, overview
+from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Row, Trajectory
 
 
 @pytest.fixture(autouse=True)

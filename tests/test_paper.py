@@ -7,9 +7,10 @@ import types
 import numpy as np
 import pytest
 
-from ambjax import Adaptive, claims, paper, rollout
+from ambjax import Adaptive, paper, rollout
 from ambjax.__main__ import main
-from ambjax.evidence import NOISE_STDS, STEPS, Noise
+from ambjax.paper import claims
+from ambjax.paper.evidence import NOISE_STDS, STEPS, Noise
 
 
 def noise(survived, radius_at_least=1e-8):

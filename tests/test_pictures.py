@@ -8,10 +8,11 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from ambjax.ensemble import heatmaps, pictures
-from ambjax.ensemble.scales import edges, log_ticks, named, prefixed, relabelled, size_of
-from ambjax.ensemble.tornado import Bar, tornado
-from ambjax.metrics import Standard
+from ambjax.pictures import ensembles as pictures
+from ambjax.pictures import heatmaps
+from ambjax.pictures.scales import edges, log_ticks, named, prefixed, relabelled, size_of
+from ambjax.pictures.tornado import Bar, tornado
+from ambjax.simulation.metrics import Standard
 
 PERCENTS = (0, 5, 25, 50, 75, 95, 100)
 

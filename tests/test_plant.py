@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ambjax import Plant, Scenario
-from ambjax.metrics import Standard, standard_for
+from ambjax.simulation.metrics import Standard, standard_for
 
 PLANT = Plant()
 OTHER = Plant(m=0.7, k_z=-900.0, n=1200.0, A=0.1, s_0=4e-3, i_0=0.4, R=30.0, g=3.0)

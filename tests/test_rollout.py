@@ -23,18 +23,18 @@ from ambjax import (
     Sensor,
     Sine,
     Standard,
-    _kernel,
     inversion,
     position,
     rollout,
 )
-from ambjax._kernel import one_kernel
-from ambjax._pytree import record, static
-from ambjax.explicit import Euler
-from ambjax.loop import SHOWN
-from ambjax.metrics import Driven, Lowest, Named, Peak, Reaching, Rms, Variation
-from ambjax.span import blank
-from ambjax.trajectory import DIVERGED, TOUCHED, Row
+from ambjax.numerics import kernel
+from ambjax.numerics.kernel import one_kernel
+from ambjax.numerics.records import record, static
+from ambjax.simulation.explicit import Euler
+from ambjax.simulation.loop import SHOWN
+from ambjax.simulation.metrics import Driven, Lowest, Named, Peak, Reaching, Rms, Variation
+from ambjax.simulation.span import blank
+from ambjax.simulation.trajectory import DIVERGED, TOUCHED, Row
 
 ROOT = pathlib.Path(__file__).parent.parent
 REPAIRED = Cascade()
@@ -469,7 +469,7 @@ def end_of(c):
     ids=["plain", "jvp", "kernel of vmap"],
 )
 def test_the_fast_path_changes_nothing(transform, at, monkeypatch):
-    if _kernel.options() is None:
+    if kernel.options() is None:
         pytest.skip("the fast path is not supported here")
 
     def result():
@@ -477,16 +477,16 @@ def test_the_fast_path_changes_nothing(transform, at, monkeypatch):
         return out(at) if callable(out) else out
 
     fast = result()
-    monkeypatch.setattr(_kernel, "options", lambda: None)
+    monkeypatch.setattr(kernel, "options", lambda: None)
     # the same operations, fused differently: relative to the largest entry
     near(fast, result(), 1e-12)
 
 
 def test_only_an_outermost_call_is_marked(monkeypatch):
-    if _kernel.options() is None:
+    if kernel.options() is None:
         pytest.skip("the fast path is not supported here")
-    marked, mark = [], _kernel._mark
-    monkeypatch.setattr(_kernel, "_mark", lambda tree: marked.append(1) or mark(tree))
+    marked, mark = [], kernel._mark
+    monkeypatch.setattr(kernel, "_mark", lambda tree: marked.append(1) or mark(tree))
     tiny = Clock(3, 5e-5, Euler(1))
     jax.jit(lambda cascade: rollout(cascade, NOISY, tiny, every=0).trajectory.lost_at)(SMOOTH)
     assert not marked

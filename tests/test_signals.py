@@ -24,8 +24,8 @@ from ambjax import (
     inversion,
     rollout,
 )
-from ambjax.signals import LINES, reference_at
-from ambjax.theorem import check
+from ambjax.theorem.conditions import check
+from ambjax.world.signals import LINES, reference_at
 
 T = np.array([0.0, 0.013, 0.1, 0.2501, 0.77, 3.0])
 W = 2 * np.pi * 2.0

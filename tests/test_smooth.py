@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax._kernel import one_kernel
-from ambjax.smooth import (
+from ambjax.numerics.kernel import one_kernel
+from ambjax.numerics.smooth import (
     TWO_OVER_PI,
     arctan_per,
     away_from_zero,

@@ -23,13 +23,13 @@ from ambjax import (
     observer,
     rollout,
 )
-from ambjax.casefile import case_from
+from ambjax.cases.reader import case_from
+from ambjax.cases.template import template
 from ambjax.ensemble import Choice, LogUniform, Normal, Percent, Spread, Uniform, apply, draw
 from ambjax.ensemble.design import DESIGNS, MOST_LATIN, points
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import check, corners
-from ambjax.explicit import Euler
-from ambjax.template import template
+from ambjax.simulation.explicit import Euler
 
 CASCADE = Cascade()
 SMOOTH = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))

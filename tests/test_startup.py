@@ -33,8 +33,8 @@ def test_a_word_about_the_program_needs_no_numerics(program, option):
 
 
 @pytest.mark.parametrize(("command", "unneeded"), [
-    ("check", {"matplotlib", "scipy", "optax", "tuning", "ambjax.studies", "ambjax.mapping", "ambjax.evidence"}),
-    ("simulate", {"scipy", "optax", "tuning", "ambjax.studies", "ambjax.mapping", "ambjax.evidence", "ambjax.theorem"}),
+    ("check", {"matplotlib", "scipy", "optax", "tuning", "ambjax.commands.ensemble", "ambjax.paper.evidence"}),
+    ("simulate", {"scipy", "optax", "tuning", "ambjax.commands.ensemble", "ambjax.paper", "ambjax.theorem"}),
 ])  # fmt: skip
 def test_a_command_imports_what_it_needs(tmp_path, command, unneeded):
     case = tmp_path / "short.toml"
@@ -61,7 +61,7 @@ def test_names_come_from_where_a_type_checker_is_told():
 
 def test_a_public_name_is_never_the_module_of_that_name():
     code = """
-import ambjax.rollout, types
+import ambjax.simulation.rollout, types
 from ambjax import rollout
 assert isinstance(rollout, types.FunctionType) and ambjax.rollout is rollout
 """

@@ -9,8 +9,8 @@ import pytest
 
 from ambjax import Scenario, Sensor
 from ambjax.ensemble.design import BITS, points
-from ambjax.gaussian import normals, threefry
-from ambjax.scenario import SIGNALS
+from ambjax.numerics.gaussian import normals, threefry
+from ambjax.world.scenario import SIGNALS
 
 MEMBERS = 40
 

@@ -12,11 +12,12 @@ import time
 import numpy as np
 import pytest
 
-from ambjax import pace, studies, worker
 from ambjax.__main__ import main
-from ambjax.casefile import read_case
-from ambjax.ensemble import statistics
-from ambjax.integrate import Slide
+from ambjax.cases.reader import read_case
+from ambjax.commands import ensemble as studies
+from ambjax.commands import pace
+from ambjax.ensemble import statistics, worker
+from ambjax.simulation.integrate import Slide
 
 CASE = """
 [controller.inversion]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ambjax import Adaptive, Cascade, Clock, Plant, Pulse, Sensor, SmoothStep, inversion, paper, position, rollout
-from ambjax.theorem import check, delta_1_on_reference
+from ambjax.theorem.conditions import check, delta_1_on_reference
 
 CLOCK = Clock(1000, 1e-4, Adaptive(1e-8))
 

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 from ambjax import Cascade, Plant, position
-from ambjax.casefile import case_from
+from ambjax.cases.reader import case_from
+from ambjax.cases.table import Table
+from ambjax.cases.template import template
 from ambjax.control.laws import default_law
-from ambjax.template import template
-from ambjax.tomltable import Table
 from tuning.__main__ import main
 from tuning.command import _laws
 from tuning.config import tune_from
-from tuning.screen import around, everywhere
+from tuning.report.toml import dumps, with_gains
+from tuning.search.screen import around, everywhere
 from tuning.study import study_of
-from tuning.toml import dumps, with_gains
 
 CASES = pathlib.Path(__file__).parent / "cases"
 BEARINGS = {path.stem: path.read_text() for path in sorted(CASES.glob("*.toml"))}

@@ -14,18 +14,19 @@ import numpy as np
 import pytest
 
 from ambjax import rollout
-from ambjax.casefile import case_from, safe_name
-from ambjax.metrics import Standard
-from ambjax.tomltable import Table
-from ambjax.trajectory import TOUCHED
-from tuning import accurate, breakdown, extras, pictures, report
+from ambjax.cases.reader import case_from, safe_name
+from ambjax.cases.table import Table
+from ambjax.simulation.metrics import Standard
+from ambjax.simulation.trajectory import TOUCHED
 from tuning.__main__ import main
 from tuning.config import seeds, tune_from
-from tuning.explore import REACH, Slices, slices
-from tuning.loss import TERMS
-from tuning.objective import Engine, weigh
-from tuning.page import literal, page
-from tuning.rounds import training
+from tuning.objective.loss import TERMS
+from tuning.objective.problem import Engine, weigh
+from tuning.report import accurate, breakdown, extras, pictures
+from tuning.report import document as report
+from tuning.report.page import literal, page
+from tuning.search.explore import REACH, Slices, slices
+from tuning.search.rounds import training
 from tuning.study import judge, study_of
 
 CASE = """

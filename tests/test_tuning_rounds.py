@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from bowl import World, study
 
-import tuning.rounds
+import tuning.search.rounds
 from ambjax import Slide
 from tuning.config import seeds
-from tuning.rounds import rounds
+from tuning.search.rounds import rounds
 
 TRAINING, VALIDATION, HELD_OUT = 0, 1, 2
 # What a checkpoint is told of the study that it belongs to.
@@ -78,7 +78,7 @@ def test_without_validation_nobody_is_asked(monkeypatch, tmp_path):
 
 def test_of_several_answers_that_lose_members_the_one_that_loses_least_is_returned(monkeypatch, tmp_path):
     """Three rounds, after which 3, 1 and 2 members are lost, whatever the gains."""
-    monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 3)
+    monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 3)
     lost = iter([3, 1, 2])
 
     class Moody(World):

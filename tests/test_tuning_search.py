@@ -14,23 +14,23 @@ import numpy as np
 import pytest
 
 from ambjax import Cascade, Clock, Initial, Scenario, Sensor, Sine, Slide, inversion, rollout
-from ambjax.casefile import case_from
+from ambjax.cases.reader import case_from
 from ambjax.ensemble import Percent, Spread
 from tuning import optimisers
-from tuning.conditions import bounds
 from tuning.config import tune_from
-from tuning.descent import Descent
-from tuning.goal import Goal
-from tuning.keeper import Keeper, Search
-from tuning.loss import TERMS, loss_for
-from tuning.objective import Engine, Objective, weigh
-from tuning.optimise import _go_on_with_all, best_of, search
+from tuning.objective.conditions import bounds
+from tuning.objective.goal import Goal
+from tuning.objective.loss import TERMS, loss_for
+from tuning.objective.problem import Engine, Objective, weigh
+from tuning.objective.risk import CVaR, Mean
 from tuning.optimisers import names, optimiser
-from tuning.risk import CVaR, Mean
-from tuning.rounds import GAIN, MOST_LOOKS, look_again
-from tuning.screen import FAR, NEAR, around, everywhere, screen
+from tuning.report.toml import dumps, with_gains
+from tuning.search.descent import Descent
+from tuning.search.keeper import Keeper, Search
+from tuning.search.optimise import _go_on_with_all, best_of, search
+from tuning.search.rounds import GAIN, MOST_LOOKS, look_again
+from tuning.search.screen import FAR, NEAR, around, everywhere, screen
 from tuning.space import Gain, Space
-from tuning.toml import dumps, with_gains
 
 PATHS = ("position.c", "position.k", "inversion.gamma", "current.k_i")
 SPACE = Space(tuple(Gain(f"controller.{path}", 0.0, 1e9) for path in PATHS))
@@ -373,7 +373,7 @@ def test_steps_that_are_no_numbers_are_skipped(small):
 def parsed(tune, **tables):
     document = {"sensor": {"std": 1e-6}, **tables, "tune": tune}
     case = case_from(document)
-    from ambjax.tomltable import Table
+    from ambjax.cases.table import Table
 
     return tune_from(Table(document).table("tune"), case)
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from ambjax import Cascade, Clock, Initial, Pulse, Scenario, Sine, Slide, inversion, position, rollout
-from ambjax.loop import SHOWN, Densities
-from ambjax.metrics import Rms
-from ambjax.span import blank
-from ambjax.template import template
-from ambjax.theorem import delta_1_on_reference
-from tuning.conditions import bounds, shortfall
+from ambjax.cases.template import template
+from ambjax.simulation.loop import SHOWN, Densities
+from ambjax.simulation.metrics import Rms
+from ambjax.simulation.span import blank
+from ambjax.theorem.conditions import delta_1_on_reference
 from tuning.config import read_study
-from tuning.loss import TERMS, Loss, loss_for
-from tuning.risk import CVaR, Mean, SoftWorst
+from tuning.objective.conditions import bounds, shortfall
+from tuning.objective.loss import TERMS, Loss, loss_for
+from tuning.objective.risk import CVaR, Mean, SoftWorst
 from tuning.space import Gain, Space, tunable
 
 KINDS = [Gain("controller.position.c"), Gain("controller.position.c", 3.0), Gain("controller.position.c", 2.0, 5e3)]

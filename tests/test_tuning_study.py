@@ -16,19 +16,20 @@ from scipy import stats
 
 import tuning.command
 import tuning.study
-from ambjax.casefile import case_from
-from tuning import explore, optimisers
-from tuning.conditions import Bound
+from ambjax.cases.reader import case_from
+from tuning import optimisers
 from tuning.config import seeds
-from tuning.descent import Descent
-from tuning.goal import Goal
-from tuning.loss import TERMS
-from tuning.optimise import HALVINGS, search
-from tuning.risk import Mean
-from tuning.screen import everywhere
+from tuning.objective.conditions import Bound
+from tuning.objective.goal import Goal
+from tuning.objective.loss import TERMS
+from tuning.objective.risk import Mean
+from tuning.report.toml import dumps
+from tuning.search import explore
+from tuning.search.descent import Descent
+from tuning.search.optimise import HALVINGS, search
+from tuning.search.screen import everywhere
 from tuning.space import Gain, Space
 from tuning.study import RESOLVED, judge, step_error, summarise
-from tuning.toml import dumps
 
 
 def at(made, c, k):

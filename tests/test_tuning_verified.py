@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 import tuning.command
-import tuning.rounds
-from ambjax.casefile import case_from
-from ambjax.tomltable import Table
+import tuning.search.rounds
+from ambjax.cases.reader import case_from
+from ambjax.cases.table import Table
 from tuning.__main__ import main
 from tuning.config import tune_from
-from tuning.descent import Starts
-from tuning.optimise import Search
-from tuning.rounds import LOUDER, MOST_HALVINGS, _joining, finer, rounds
+from tuning.search.descent import Starts
+from tuning.search.optimise import Search
+from tuning.search.rounds import LOUDER, MOST_HALVINGS, _joining, finer, rounds
 from tuning.study import NEGLIGIBLE, REFERENCE_MEMBERS, StepError, compared, step_error, study_of, words, worst_of
 
 ROTOR = (pathlib.Path(__file__).parent / "cases" / "rotor.toml").read_text()
@@ -159,10 +159,10 @@ def searched(engine, goal, who, points, **rest):
 def run(small, monkeypatch, tmp_path):
     def answer(*errors, most=4):
         verdicts = Verdicts(*errors)
-        monkeypatch.setattr(tuning.rounds, "step_error", verdicts)
-        monkeypatch.setattr(tuning.rounds, "search", searched)
-        monkeypatch.setattr(tuning.rounds, "_lost", lambda study, x: (np.zeros(0, int), np.arange(4)))
-        monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", most)
+        monkeypatch.setattr(tuning.search.rounds, "step_error", verdicts)
+        monkeypatch.setattr(tuning.search.rounds, "search", searched)
+        monkeypatch.setattr(tuning.search.rounds, "_lost", lambda study, x: (np.zeros(0, int), np.arange(4)))
+        monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", most)
         start = small.tune.space.values(small.case.cascade)
         return rounds(small, start, tmp_path, {"case": "small"}, False), verdicts
 
@@ -207,10 +207,10 @@ def test_a_refuted_answer_is_a_failure_in_every_file(small, monkeypatch, tmp_pat
     refuted = Verdicts(
         error_of(small, stalled=4, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
     )
-    for place in (tuning.rounds, tuning.command):
+    for place in (tuning.search.rounds, tuning.command):
         monkeypatch.setattr(place, "step_error", refuted)
-    monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 1)
-    monkeypatch.setattr(tuning.rounds, "MOST_HALVINGS", 0)
+    monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 1)
+    monkeypatch.setattr(tuning.search.rounds, "MOST_HALVINGS", 0)
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(SMALL)
     assert main([str(path), "--out", str(out)]) == 1
@@ -229,7 +229,7 @@ def test_a_refuted_answer_is_a_failure_in_every_file(small, monkeypatch, tmp_pat
 @pytest.mark.slow
 def test_an_answer_confirmed_in_training_is_still_refuted_by_held_out_members(small, monkeypatch, tmp_path):
     right = error_of(small)
-    monkeypatch.setattr(tuning.rounds, "step_error", Verdicts(right))
+    monkeypatch.setattr(tuning.search.rounds, "step_error", Verdicts(right))
     wrong = Verdicts(right._replace(lost=2, members=2))
     monkeypatch.setattr(tuning.command, "step_error", wrong)
     path, out = tmp_path / "case.toml", tmp_path / "out"

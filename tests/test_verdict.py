@@ -7,12 +7,14 @@ import re
 
 import pytest
 
-from ambjax import commands, theorem, verdict
 from ambjax.__main__ import main
-from ambjax.casefile import read_case
-from ambjax.template import template
-from ambjax.theorem import Condition, Report, check
-from ambjax.trajectory import STALLED
+from ambjax.cases.reader import read_case
+from ambjax.cases.template import template
+from ambjax.commands import check as checking
+from ambjax.commands import simulate
+from ambjax.simulation.trajectory import STALLED
+from ambjax.theorem import verdict
+from ambjax.theorem.conditions import Condition, Report, check
 
 SHORT = "[reference]\nkind = 'sine'\namplitude = 2.5e-3\nfrequency = 2.0\n[clock]\nduration = 0.05\n"
 PUSHED = """[disturbance.q_i]
@@ -126,7 +128,7 @@ def test_a_stalled_run_decides_nothing(capsys, monkeypatch):
     stalled = dataclasses.replace(report, lost_at=0.01, lost_why="stalled: ...", stalled=True)
     assert not stalled.lost
     assert not stalled.holds
-    monkeypatch.setattr(theorem, "check", lambda *_: stalled)
+    monkeypatch.setattr(checking, "check", lambda *_: stalled)
     assert main(["check", "case.toml"]) == 1
     said = capsys.readouterr().out
     assert "not decided" in said
@@ -144,14 +146,14 @@ def test_simulate_says_where_to_look(capsys):
 
 
 def test_simulate_of_a_stalled_run_does_not_say_lost(capsys, monkeypatch):
-    genuine = commands.simulate
+    genuine = simulate.simulate
 
     def stalled(case):
         trajectory, measured = genuine(case)
         trajectory = dataclasses.replace(trajectory, lost_at=0.01, lost_code=STALLED)
         return trajectory, {**measured, "lost": False, "stalled": True, "lost_at_s": 0.01}
 
-    monkeypatch.setattr(commands, "simulate", stalled)
+    monkeypatch.setattr(simulate, "simulate", stalled)
     assert main(["simulate", write(SHORT)]) == 1
     said = capsys.readouterr().err
     assert "not decided" in said

@@ -6,7 +6,7 @@ from typing import Any
 
 from ambjax import __version__
 from ambjax.__main__ import Parser, answer, open_streams
-from ambjax.interrupts import listening
+from ambjax.host.interrupts import listening
 
 
 def parser() -> argparse.ArgumentParser:
@@ -37,7 +37,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(args: argparse.Namespace) -> tuple[int, Any]:
-    from ambjax.worker import prepare
+    from ambjax.ensemble.worker import prepare
 
     prepare()
     from tuning import command

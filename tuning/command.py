@@ -8,23 +8,25 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.casefile import case_from
+from ambjax.cases.reader import case_from
+from ambjax.commands.doubts import say_doubts
+from ambjax.commands.outputs import directory, files, plain, say, write_json
 from ambjax.control.cascade import Cascade
-from ambjax.doubts import say_doubts
-from ambjax.interrupts import keeping
-from ambjax.outputs import directory, files, plain, say, write_json
-from ambjax.theorem import check
-from ambjax.verdict import advice as on_conditions
-from tuning import accurate, breakdown, explore, gradient, pictures, report
+from ambjax.host.interrupts import keeping
+from ambjax.theorem.conditions import check
+from ambjax.theorem.verdict import advice as on_conditions
 from tuning.config import read_study, seeds, settings
-from tuning.keeper import remove_all
-from tuning.objective import Members
-from tuning.page import page
-from tuning.rounds import CHECKPOINT, Answer, rounds
+from tuning.objective.problem import Members
+from tuning.report import accurate, breakdown, gradient, pictures
+from tuning.report import document as report
+from tuning.report.page import page
+from tuning.report.toml import dumps, with_gains
+from tuning.search import explore
+from tuning.search.keeper import remove_all
+from tuning.search.rounds import CHECKPOINT, Answer, rounds
 from tuning.space import Gain, Space, tunable
 from tuning.study import StepError, Study, judge, step_error, study_of, summarise, worst_of
 from tuning.study import words as step_told
-from tuning.toml import dumps, with_gains
 
 # What stands for a survival that accurate steps do not confirm.
 NOT_VERIFIED = "not verified"

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.casefile import Case, case_from, load
+from ambjax.cases.reader import Case, case_from, load
+from ambjax.cases.table import Table, one_line, show
 from ambjax.ensemble.spread import require_path
-from ambjax.tomltable import Table, one_line, show
-from tuning.loss import TERMS
+from tuning.objective.loss import TERMS
+from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.optimisers import BFGS, names
-from tuning.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.space import Gain, Space, tunable
 
 WEIGHTS = {"tracking": 1.0, "peak": 0.0, "effort": 0.1, "chatter": 0.1, "clearance": 1e-3, "survival": 1.0}

@@ -8,17 +8,17 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ambjax.casefile import Case
-from ambjax.integrate import Adaptive, Integrator, Slide
-from ambjax.method import choose_method
-from ambjax.scenario import Clock
-from ambjax.sliding import slides
-from tuning.conditions import bounds
+from ambjax.cases.reader import Case
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.integrate import Adaptive, Integrator, Slide
+from ambjax.simulation.method import choose_method
+from ambjax.simulation.sliding import slides
 from tuning.config import Tune, seeds
-from tuning.goal import Goal
-from tuning.loss import loss_for
-from tuning.objective import Engine, Members, Objective
-from tuning.ranges import Range, bounded
+from tuning.objective.conditions import bounds
+from tuning.objective.goal import Goal
+from tuning.objective.loss import loss_for
+from tuning.objective.problem import Engine, Members, Objective
+from tuning.objective.ranges import Range, bounded
 
 # Members simulated at a time when an ensemble is judged, and how many times as fine as the search's the steps are then:
 # these miss the voltage's mean square by 2 to 4 % and its chatter by 5 to 11 %, those by 0.3 and 0.4 %

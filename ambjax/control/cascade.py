@@ -8,21 +8,21 @@ from typing import Any, NamedTuple
 import jax
 from jax import Array
 
-from ambjax._pytree import Scalar, record
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.laws import (
     CurrentInputs,
     CurrentLaw,
     ForceDemand,
     InversionLaw,
-    Measurement,
     Observer,
     PositionLaw,
     State,
     default_law,
 )
-from ambjax.plant import Plant
-from ambjax.signals import Reference
+from ambjax.numerics.records import Scalar, record
+from ambjax.world.plant import Plant
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference
 
 
 class CascadeState(NamedTuple):

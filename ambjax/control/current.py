@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax._pytree import Scalar, gain, record
 from ambjax.control.laws import CurrentInputs
-from ambjax.plant import Plant
-from ambjax.smooth import TWO_OVER_PI, smooth_sign
+from ambjax.numerics.records import Scalar, gain, record
+from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
+from ambjax.world.plant import Plant
 
 
 @record

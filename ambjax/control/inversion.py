@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax._pytree import Scalar, gain, leaf, record
 from ambjax.control.laws import CurrentDemand, ForceDemand
-from ambjax.plant import Plant
-from ambjax.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
+from ambjax.numerics.records import Scalar, gain, leaf, record
+from ambjax.numerics.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
+from ambjax.world.plant import Plant
 
 # |dv/di| is held at this share of its value at the origin, so that crossing the singular curve C,
 # where Eq. (6) divides by zero, gives a large finite rate; the crossing itself is reported.

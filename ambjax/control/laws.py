@@ -15,20 +15,13 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 from jax import Array
 
-from ambjax._pytree import Scalar
-from ambjax.plant import Gaps, Plant
-from ambjax.signals import Reference
+from ambjax.numerics.records import Scalar
+from ambjax.world.plant import Gaps, Plant
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference
 
 State = Any
 L = TypeVar("L")
-
-
-class Measurement(NamedTuple):
-    """What a sensor, or an observer behind it, reports: m, m/s, A."""
-
-    z: Array
-    z_dot: Array
-    i: Array
 
 
 class ForceDemand(NamedTuple):

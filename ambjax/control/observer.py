@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax._pytree import Scalar, gain, leaf, record
-from ambjax.control.laws import Measurement
-from ambjax.plant import Plant
+from ambjax.numerics.records import Scalar, gain, leaf, record
+from ambjax.world.plant import Plant
+from ambjax.world.sensor import Measurement
 
 
 @record

@@ -3,11 +3,11 @@
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax._pytree import Scalar, gain, record
-from ambjax.control.laws import Measurement
-from ambjax.plant import Plant
-from ambjax.signals import Reference
-from ambjax.smooth import TWO_OVER_PI, smooth_root, smooth_sign
+from ambjax.numerics.records import Scalar, gain, record
+from ambjax.numerics.smooth import TWO_OVER_PI, smooth_root, smooth_sign
+from ambjax.world.plant import Plant
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference
 
 
 def sliding_variable(c: Scalar, motion: Measurement, reference: Reference) -> Array:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.scenario import DESIGN_STREAM, Scenario
+from ambjax.world.scenario import DESIGN_STREAM, Scenario
 
 # Bits of a coordinate; points are the centres of such cells, so never 0 or 1. More than 32 SciPy cannot fast-forward.
 BITS = 52

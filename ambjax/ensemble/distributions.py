@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ambjax._pytree import Scalar, leaf, record, static
+from ambjax.numerics.records import Scalar, leaf, record, static
 
 # Standard deviations at which normal shapes are cut.
 CUT = 6.0

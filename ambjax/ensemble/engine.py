@@ -16,14 +16,15 @@ import numpy as np
 from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from ambjax._kernel import block_bytes, one_kernel
-from ambjax._pytree import canonical
 from ambjax.control.cascade import Cascade
-from ambjax.loop import ClosedLoop
-from ambjax.method import with_method
-from ambjax.metrics import Fold
-from ambjax.rollout import Outcome, check_inputs, run
-from ambjax.scenario import Clock, Scenario
+from ambjax.numerics.kernel import block_bytes, one_kernel
+from ambjax.numerics.records import canonical
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.loop import ClosedLoop
+from ambjax.simulation.method import with_method
+from ambjax.simulation.metrics import Fold
+from ambjax.simulation.rollout import Outcome, check_inputs, run
+from ambjax.world.scenario import Scenario
 
 MOST_CALL = 4096
 MEMBERS = "members"

@@ -13,8 +13,8 @@ from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import Spread, apply, require_path
 from ambjax.ensemble.study import Study
-from ambjax.metrics import standard_for
-from ambjax.scenario import Scenario
+from ambjax.simulation.metrics import standard_for
+from ambjax.world.scenario import Scenario
 
 PERIOD = "clock.sample_period"
 # Fields of a Map by cell.

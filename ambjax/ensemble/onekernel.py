@@ -14,15 +14,16 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax._pytree import canonical
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.engine import size
-from ambjax.explicit import RK4
-from ambjax.loop import Realised
-from ambjax.method import with_method
-from ambjax.metrics import Fold
-from ambjax.rollout import Outcome, check_inputs, run
-from ambjax.scenario import Clock, Scenario
+from ambjax.numerics.records import canonical
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.explicit import RK4
+from ambjax.simulation.loop import Realised
+from ambjax.simulation.method import with_method
+from ambjax.simulation.metrics import Fold
+from ambjax.simulation.rollout import Outcome, check_inputs, run
+from ambjax.world.scenario import Scenario
 
 # One member per thread, 32 threads to a warp.
 WARP, MOST_WARPS = 32, 32

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ambjax._pytree import is_traced, leaf
 from ambjax.control.cascade import Cascade
-from ambjax.scenario import Scenario
-from ambjax.signals import Constant
+from ambjax.numerics.records import is_traced, leaf
+from ambjax.world.scenario import Scenario
+from ambjax.world.signals import Constant
 
 SHIFT = "shift"
 TIME = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time by which start and stop move together")

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from ambjax._pytree import numbers, within
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.design import DESIGNS, points
 from ambjax.ensemble.distributions import Distribution, Percent
 from ambjax.ensemble.paths import Place, ordered, places, replaced
-from ambjax.scenario import Scenario
+from ambjax.numerics.records import numbers, within
+from ambjax.world.scenario import Scenario
 
 
 @dataclasses.dataclass(frozen=True)

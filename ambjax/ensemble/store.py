@@ -16,7 +16,17 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from ambjax.sealed import CHECKSUM, Arrays, DamagedError, checksum_of, difference, seal, shapes, unseal, write_whole
+from ambjax.host.sealed import (
+    CHECKSUM,
+    Arrays,
+    DamagedError,
+    checksum_of,
+    difference,
+    seal,
+    shapes,
+    unseal,
+    write_whole,
+)
 
 MANIFEST = "study.json"
 RESULT = "members.npz"

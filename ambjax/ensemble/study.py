@@ -9,10 +9,11 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.engine import run_ensemble
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import Spread, apply, draw
-from ambjax.metrics import Named, Variation, standard_for
-from ambjax.scenario import Clock, Scenario
-from ambjax.sealed import provenance
-from ambjax.trajectory import Trajectory
+from ambjax.host.sealed import provenance
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.metrics import Named, Variation, standard_for
+from ambjax.simulation.trajectory import Trajectory
+from ambjax.world.scenario import Scenario
 
 SPREAD = "spread."
 # Columns of members.npz beside the spread quantities, at most: to estimate what a study needs on disk.

@@ -1,0 +1,1 @@
+"""Case files: read, checked, doubted, and written as templates."""

@@ -1,0 +1,237 @@
+"""Case files: TOML in, cascade, scenario and clock out; strict, and with errors for people.
+
+An unknown key, a wrong type, a number out of bounds or two settings that contradict each other is a
+ValueError whose one line names the dotted path, the value, what is allowed and the fix.
+"""
+
+import dataclasses
+import math
+import pathlib
+import re
+from typing import Any
+
+from ambjax.cases.reach import check_reference
+from ambjax.cases.spread import spread_from
+from ambjax.cases.table import Table, check_depth, load, show
+from ambjax.control import current, inversion, observer, position
+from ambjax.control.cascade import Cascade
+from ambjax.control.laws import default_law
+from ambjax.ensemble.spread import Spread, corners
+from ambjax.host.words import one_line
+from ambjax.numerics.records import leaf, numbers
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.explicit import DOP853, RK4, Euler
+from ambjax.simulation.integrate import Adaptive, Integrator, Rodas3, Slide
+from ambjax.simulation.method import with_method
+from ambjax.simulation.sliding import slides
+from ambjax.world import signals
+from ambjax.world.plant import Plant
+from ambjax.world.scenario import Initial, Scenario
+from ambjax.world.sensor import Sensor
+
+# The laws by stage and kind; the first of a stage is the default. A new law is one row here.
+KINDS: dict[str, dict[str, type]] = {
+    "observer": {"direct": observer.Direct, "complementary": observer.Complementary},
+    "position": {"sliding-mode": position.SlidingMode, "super-twisting": position.SuperTwisting},
+    "inversion": {"adaptive": inversion.Adaptive, "closed-form": inversion.ClosedForm},
+    "current": {"sliding-mode": current.SlidingMode, "pi": current.ProportionalIntegral},
+}
+SIGNALS: dict[str, type] = {
+    "constant": signals.Constant,
+    "step": signals.Step,
+    "pulse": signals.Pulse,
+    "sine": signals.Sine,
+    "smoothstep": signals.SmoothStep,
+    "chirp": signals.Chirp,
+    "band-noise": signals.BandNoise,
+    "sum": signals.Sum,
+}
+METHODS: dict[str, type] = {"rk4": RK4, "dop853": DOP853, "euler": Euler, "rodas3": Rodas3, "sliding": Slide}
+# Substeps of the sliding step where dt = "auto".
+SLIDING_SUBSTEPS = 3
+TABLES = ["plant", "controller", "reference", "disturbance", "sensor", "actuator", "initial", "clock", "run", "spread"]
+OTHERS = ["tune"]  # read by ambjax-tune; the commands here pass it by
+UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
+# Rows that a run may record: 16 numbers each, so this is about 2.5 GB.
+MOST_SAMPLES = 20_000_000
+# Steps of a run with a given dt: hours. And terms of a sum: each is compiled.
+MOST_STEPS, MOST_TERMS = 10_000_000_000, 100
+DURATION = leaf(default=2.0, unit="s", at_least=1e-9, at_most=1e6, doc="simulated time")
+DT = leaf(default=1e-6, unit="s", at_least=1e-15, at_most=1e6, doc="integration step")
+SETTLE = leaf(default=0.5, unit="s", at_least=0, at_most=1e6, doc='from when "settled" metrics count')
+FIELDS = {field.name: field for kind in (Scenario, Clock) for field in dataclasses.fields(kind)}
+# A name enters titles, paths, tables and pages: whatever means something there is left out of it.
+UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """What a case file says. `settle` in s; `method` as chosen or asked for, for every spread, is in the clock."""
+
+    name: str
+    cascade: Cascade
+    scenario: Scenario
+    clock: Clock
+    settle: float
+    spread: Spread = Spread()
+
+
+def read_case(path: str | pathlib.Path) -> Case:
+    """Read and check a case file.
+
+    Raises ValueError, one line, for anything wrong with the file or in it.
+    """
+    path = pathlib.Path(path)
+    raw = load(path)
+    try:
+        return case_from(raw, path.stem)
+    except ValueError as error:
+        raise ValueError(one_line(f"{path}: {error}")) from None
+
+
+def safe_name(text: str) -> str:
+    """The text without what means something in a path, a title, a table or a page, and not too long."""
+    return UNSAFE.sub("_", text)[:LONGEST_NAME].strip() or "case"
+
+
+def case_from(raw: dict[str, Any], name: str = "case") -> Case:
+    """A case from a parsed TOML document. Raises ValueError as `read_case` does."""
+    check_depth(raw)
+    top = Table(raw)
+    top.only([*TABLES, *OTHERS])
+    plant = top.table("plant").record(Plant)
+    cascade = _cascade(top.table("controller"), plant)
+    scenario, settle = _scenario(top, plant)
+    clock, duration = _clock(top.table("clock"))
+    if isinstance(clock.method, Slide) and not slides(cascade):
+        raise ValueError(
+            'clock.method = "sliding": it is made for controller.inversion.kind = "adaptive". Use method = "adaptive".'
+        )
+    _check_start(scenario)
+    if settle is None:
+        settle = duration / 4
+    elif settle >= duration:
+        raise ValueError(f"run.settle = {settle:g} s: it must be less than clock.duration = {duration:g} s.")
+    spread = spread_from(top, cascade, scenario)
+    check_reference(spread, cascade, scenario, clock)
+    clock = with_method(clock, *corners(spread, cascade, scenario))
+    return Case(safe_name(name), cascade, scenario, clock, settle, spread)
+
+
+def _cascade(table: Table, plant: Plant) -> Cascade:
+    table.only(["model", *KINDS])
+    model = table.table("model").record(Plant, base=plant)
+    laws = {}
+    for stage, kinds in KINDS.items():
+        law = table.table(stage)
+        kind = law.choice("kind", list(kinds), next(iter(kinds)))
+        laws[stage] = law.record(kinds[kind], extra=("kind",), base=default_law(kinds[kind], model))
+    return Cascade(model=model, **laws)
+
+
+def _signal(table: Table, extra: tuple[str, ...] = ()) -> Any:
+    kind = table.choice("kind", list(SIGNALS))
+    if kind == "sum":
+        table.only(["kind", "terms", *extra])
+        terms = table.raw.get("terms")
+        if not isinstance(terms, list) or not terms:
+            raise ValueError(f"{table.at('terms')} = {show(terms)}: give a list of at least one signal table.")
+        if len(terms) > MOST_TERMS:
+            raise ValueError(f"{table.at('terms')}: {len(terms)} terms are too many; give at most {MOST_TERMS}.")
+        return signals.Sum(tuple(_signal(Table(t, f"{table.at('terms')}[{n}]")) for n, t in enumerate(terms)))
+    return table.record(SIGNALS[kind], extra=("kind", *extra))
+
+
+def _disturbances(table: Table) -> dict[str, Any]:
+    table.only(list(UNITS))
+    made = {}
+    for name in table.raw:
+        one, units = table.table(name), list(UNITS[name])
+        unit = one.choice("unit", units, units[0])
+        made["q_v" if unit == "A^2/m^2" else name] = _signal(one, extra=("unit",))
+    return made
+
+
+def _scenario(top: Table, plant: Plant) -> tuple[Scenario, float | None]:
+    actuator, run = top.table("actuator"), top.table("run")
+    actuator.only(["u_max"])
+    run.only(["seed", "settle", "clearance"])
+    settle = run.leaf("settle", SETTLE)
+    scenario = Scenario(
+        plant=plant,
+        reference=_signal(top.table("reference")) if "reference" in top.raw else signals.Constant(),
+        sensor=top.table("sensor").record(Sensor) if "sensor" in top.raw else None,
+        initial=top.table("initial").record(Initial),
+        u_max=actuator.leaf("u_max", FIELDS["u_max"], math.inf),
+        clearance=run.leaf("clearance", FIELDS["clearance"]),
+        seed=_seed(run),
+        **_disturbances(top.table("disturbance")),
+    )
+    return scenario, settle
+
+
+def _seed(run: Table) -> int:
+    seed = run.raw.get("seed", 0)
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
+        raise ValueError(f"{run.at('seed')} = {show(seed)}: it must be a whole number from 0 to 4294967295.")
+    return seed
+
+
+def _check_start(scenario: Scenario) -> None:
+    gap, stop, z = scenario.plant.s_0, scenario.touchdown, scenario.initial.z
+    if not stop < gap:
+        raise ValueError(f"run.clearance = {stop:g} m: it must be less than the gap plant.s_0 = {gap:g} m.")
+    if not abs(z) < stop:
+        raise ValueError(
+            f"initial.z = {z:g} m: the rotor would touch its stop at once; |z| must be below {stop:g} m "
+            "(run.clearance, by default 0.9 of plant.s_0)."
+        )
+
+
+def _clock(table: Table) -> tuple[Clock, float]:
+    table.only(["duration", "sample_period", "dt", "method"])
+    duration = table.leaf("duration", DURATION, DURATION.default)
+    period = table.leaf("sample_period", FIELDS["sample_period"], FIELDS["sample_period"].default)
+    samples = _whole(duration / period)
+    if samples is None:
+        nearest = max(round(duration / period), 1) * period
+        raise ValueError(
+            f"{table.at('sample_period')} = {period:g} s does not divide clock.duration = {duration:g} s. "
+            f"The nearest duration that it divides is {nearest:.12g} s."
+        )
+    if samples > MOST_SAMPLES:
+        raise ValueError(
+            f"{table.at('duration')} = {duration:g} s makes {samples:,} samples of {period:g} s; at most "
+            f"{MOST_SAMPLES:,} can be recorded. Shorten the run or lengthen clock.sample_period."
+        )
+    return Clock(samples, period, _method(table, period, samples)), duration
+
+
+def _whole(ratio: float) -> int | None:
+    """The whole number of at least 1 that `ratio` is to rounding, or None."""
+    nearest = round(ratio) if math.isfinite(ratio) else 0
+    return nearest if nearest >= 1 and abs(ratio - nearest) <= 1e-9 * nearest else None
+
+
+def _method(table: Table, period: float, samples: int) -> Integrator | None:
+    dt = table.raw.get("dt", "auto")
+    if dt == "auto":
+        name = table.choice("method", ["auto", "adaptive", "sliding"], "auto") if "method" in table.raw else "auto"
+        return {"auto": None, "adaptive": Adaptive(), "sliding": Slide(SLIDING_SUBSTEPS)}[name]
+    if isinstance(dt, str):
+        raise ValueError(f'{table.at("dt")} = {show(dt)}: it must be "auto" or {numbers(DT)}.')
+    dt = table.leaf("dt", DT)
+    method = METHODS[table.choice("method", list(METHODS), "rk4")]
+    substeps = _whole(period / dt)
+    if substeps is None:
+        nearest = period / max(round(period / dt), 1)
+        raise ValueError(
+            f"{table.at('dt')} = {dt:g} s does not divide clock.sample_period = {period:g} s. "
+            f'The nearest step that does is {nearest:.12g} s; or use dt = "auto".'
+        )
+    if samples * substeps > MOST_STEPS:
+        raise ValueError(
+            f"{table.at('dt')} = {dt:g} s makes {samples * substeps:.3g} steps; at most {MOST_STEPS:.0e} are taken. "
+            'Use dt = "auto", or shorten clock.duration.'
+        )
+    return method(substeps)

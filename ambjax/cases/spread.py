@@ -1,0 +1,97 @@
+"""The table [spread] of a case file: dotted path = { how it is spread }."""
+
+from collections.abc import Callable
+from typing import Any
+
+from ambjax.cases.table import Table, quoted, show
+from ambjax.control.cascade import Cascade
+from ambjax.ensemble.design import DESIGNS
+from ambjax.ensemble.distributions import (
+    SHAPES,
+    Choice,
+    Distribution,
+    LogUniform,
+    Normal,
+    Percent,
+    Uniform,
+)
+from ambjax.ensemble.paths import places
+from ambjax.ensemble.spread import Spread, check, require_path
+from ambjax.world.scenario import Scenario
+
+
+def _pair(table: Table, key: str) -> list[float]:
+    values = _list(table, key)
+    if len(values) != 2:
+        raise ValueError(f"{table.at(key)} = {show(table.raw[key])}: it must be [low, high], two numbers.")
+    return values
+
+
+def _list(table: Table, key: str) -> list[float]:
+    values = table.raw[key]
+    if not isinstance(values, list):
+        raise ValueError(f"{table.at(key)} = {show(values)}: it must be a list of numbers, as in [1.0, 2.0].")
+    parts = Table({str(n): x for n, x in enumerate(values)}, table.at(key))
+    return [parts.number(str(n), None, "a number") for n in range(len(values))]
+
+
+def _number(table: Table, key: str) -> float:
+    return table.number(key, None)
+
+
+# How a number may be spread: the key in its table, and what it makes. A new distribution is one row here.
+KINDS: dict[str, Callable[[Table], Distribution]] = {
+    "percent": lambda t: Percent(_number(t, "percent"), t.choice("shape", list(SHAPES), SHAPES[0])),
+    "normal": lambda t: Normal(_number(t, "normal")),
+    "uniform": lambda t: Uniform(*_pair(t, "uniform")),
+    "log-uniform": lambda t: LogUniform(*_pair(t, "log-uniform")),
+    "choices": lambda t: Choice(tuple(_list(t, "choices"))),
+}
+
+
+def spread_from(top: Table, cascade: Cascade, scenario: Scenario) -> Spread:
+    """The [spread] of a case that has this cascade and scenario; empty if left out.
+
+    Raises ValueError with the dotted path, the value, what is allowed and the fix.
+    """
+    table = top.table("spread")
+    design = table.choice("design", list(DESIGNS), Spread.design)
+    known = list(places(cascade, scenario))
+    entries = _entries({key: value for key, value in table.raw.items() if key != "design"}, "", known)
+    spread = Spread(tuple(entries), design)
+    _refuse_nothing_in_two_units(spread, top)
+    check(spread, cascade, scenario)
+    return spread
+
+
+def _entries(raw: dict[str, Any], prefix: str, known: list[str]) -> list[tuple[str, Distribution]]:
+    found = []
+    for key, value in raw.items():
+        path = prefix + key
+        if path in known:
+            found.append((path, _distribution(value, path)))
+        elif isinstance(value, dict) and value and not set(value) & {*KINDS, "shape"}:
+            found += _entries(value, path + ".", known)
+        else:
+            require_path(path, known, show(value))
+    return found
+
+
+def _distribution(raw: Any, path: str) -> Distribution:
+    where = f"spread.{path}"
+    if not isinstance(raw, dict):
+        raise ValueError(f"{where} = {show(raw)}: it must say how to spread, as in {path} = {{ percent = 10 }}.")
+    table = Table(raw, where)
+    given = [kind for kind in KINDS if kind in raw]
+    table.only(["percent", "shape"] if given == ["percent"] else given or list(KINDS))
+    if len(given) != 1:
+        raise ValueError(f"{where} = {show(raw)}: give exactly one of {quoted(list(KINDS))}.")
+    return KINDS[given[0]](table)
+
+
+def _refuse_nothing_in_two_units(spread: Spread, top: Table) -> None:
+    """A scaled force that is constantly 0 looks like no disturbance at all, whose unit is another."""
+    path = "disturbance.q_z.value"
+    given = top.raw.get("disturbance", {}).get("q_z", {})
+    if path in spread.paths and given.get("unit") == "A^2/m^2" and given.get("value", 0) == 0:
+        raise ValueError(f'spread.{path}: a value of 0 with unit = "A^2/m^2" cannot be spread. Use unit = "m/s^2".')

@@ -1,0 +1,85 @@
+"""What a case says that is allowed but hardly meant: a remark for each, in words, before it is run.
+
+Units that were taken for others above all: they are SI, and bearings are described in millimetres.
+"""
+
+import math
+import pathlib
+from collections.abc import Iterator
+
+import numpy as np
+
+from ambjax.cases.reach import reach, widest
+from ambjax.cases.reader import Case, read_case
+from ambjax.commands.outputs import say
+from ambjax.host.words import one_line
+
+# Gaps, areas of a pole and permeabilities that are built, with room to spare: the paper's are 5e-3, 0.121, 1.25e-6.
+GAPS, AREAS, PERMEABILITIES = (2e-5, 2e-2), (1e-6, 1.0), (6e-7, 2.5e-6)
+# Noise beyond this share of the gap tells little of where in it the rotor is.
+MOST_NOISE = 0.1
+
+
+def read_aloud(path: str | pathlib.Path) -> Case:
+    """A case file read for a command: what is doubtful in it is said on stderr. Raises ValueError as `read_case`."""
+    case = read_case(path)
+    say_doubts(case, path)
+    return case
+
+
+def say_doubts(case: Case, path: str | pathlib.Path) -> None:
+    """Say what is doubtful in a case, a line each."""
+    for doubt in doubts(case):
+        say(one_line(f"{path}: {doubt}"))
+
+
+def doubts(case: Case) -> list[str]:
+    """One line with path, value, why and what may have been meant, for each number of a case that is hardly meant."""
+    return [*_sizes(case), *_noise(case), *_currents(case), *_motion(case)]
+
+
+def _sizes(case: Case) -> Iterator[str]:
+    plant = case.scenario.plant
+    for name, value, (low, high), usual, slip in (
+        ("s_0", plant.s_0, GAPS, "m: gaps are 0.1 mm to some mm, 1e-4 to 5e-3", "millimetres"),
+        ("A", plant.A, AREAS, "m^2: poles have some cm^2, 1e-4 and more", "another unit"),
+        ("mu_0", plant.mu_0, PERMEABILITIES, "N/A^2: that of air is 1.257e-6", "another unit"),
+    ):
+        if not low <= value <= high:
+            yield f"plant.{name} = {value:g} {usual}. Was {slip} meant?"
+    if plant.k_z > 0:
+        yield f"plant.k_z = {plant.k_z:g} N/m pushes the rotor away from z = 0; a bearing that restores has k_z < 0."
+
+
+def _noise(case: Case) -> Iterator[str]:
+    sensor, gap = case.scenario.sensor, case.scenario.plant.s_0
+    if sensor is not None and sensor.std > MOST_NOISE * gap:
+        share = 100 * sensor.std / gap
+        yield f"sensor.std = {sensor.std:g} m is {share:.3g} % of the gap, {gap:g} m. Was another unit meant?"
+
+
+def _currents(case: Case) -> Iterator[str]:
+    scenario, plant = case.scenario, case.scenario.plant
+    beyond = f"above the bias plant.i_0 = {plant.i_0:g} A: there Eq. (3) no longer describes two opposing magnets."
+    if abs(scenario.initial.i) > plant.i_0:
+        yield f"initial.i = {scenario.initial.i:g} A is {beyond}"
+    weight = plant.m * plant.g / plant.k_i  # v = 4 i_0 i / s_0^2 at z = 0
+    if abs(weight) > plant.i_0:
+        yield f"plant: to carry the rotor at z = 0 takes {abs(weight):.4g} A, {beyond} Check m, n, A, s_0 and i_0."
+    if plant.R * abs(weight) > scenario.u_max:
+        needed = plant.R * abs(weight)
+        yield f"actuator.u_max = {scenario.u_max:g} V is less than the {needed:.4g} V that carry the rotor at z = 0."
+
+
+def _motion(case: Case) -> Iterator[str]:
+    scenario, clock, plant = case.scenario, case.clock, case.scenario.plant
+    period, fall = float(clock.sample_period), 1 / math.sqrt(plant.k_s / plant.m)
+    if scenario.sensor is not None and period > fall:
+        yield (
+            f"clock.sample_period = {period:g} s, for which a measurement's error is held, is longer than the "
+            f"{fall:.3g} s in which the rotor falls to a side. Were milliseconds or microseconds meant?"
+        )
+    wide = widest(case.spread, case.cascade, scenario)
+    far, stop = reach(wide, clock), float(np.min(wide.touchdown))
+    if not far < stop:
+        yield f"reference: it may reach {far:.4g} m, and the rotor touches down at {stop:.4g} m (run.clearance)."

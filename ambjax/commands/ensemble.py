@@ -1,0 +1,269 @@
+"""`ambjax ensemble`: a study run chunk by chunk, here or on worker processes, and what is made of it."""
+
+import argparse
+import contextlib
+import pathlib
+import shlex
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from ambjax.cases.reader import Case
+from ambjax.commands.doubts import read_aloud
+from ambjax.commands.outputs import chosen, files, make, plain, say, table, write_json
+from ambjax.commands.pace import Pace, error_words, pilot, say_how_long, sliding_error
+from ambjax.ensemble import statistics
+from ambjax.ensemble.design import MOST_MEMBERS
+from ambjax.ensemble.store import Store
+from ambjax.ensemble.study import COLUMNS, Study
+from ambjax.ensemble.worker import chunk, deaf_children, processes, work
+from ambjax.host.interrupts import keeping, unbroken
+from ambjax.simulation.integrate import Slide
+from ambjax.simulation.trajectory import STALLED
+
+# Chunks in flight for each worker: one runs, one waits.
+AHEAD = 2
+# More than any machine has cores; each takes memory of its own.
+MOST_PROCESSES = 1024
+# The fan chart is drawn from so many members and instants, whatever the size of the study.
+FAN_MEMBERS, FAN_TIMES = 256, 500
+# How long to look for the scheduler of a cluster.
+PATIENCE = "10s"
+BANDS = (0.0, 5.0, 25.0, 50.0, 75.0, 95.0, 100.0)
+GO_ON = "What is finished is kept: give the same command with --out and --resume to go on."
+SHOWN = ("settled_max_abs_error_m", "settled_rms_error_m", "max_abs_error_m", "max_abs_u_V", "rms_u_V", "max_abs_i_A")
+
+
+def study_of(case: Case, seed: int | None, members: int) -> Study:
+    """The study of a case file. Raises ValueError for a member count or seed out of range."""
+    if not 1 <= members <= MOST_MEMBERS:
+        raise ValueError(f"--members {members}: it must be a whole number from 1 to {MOST_MEMBERS:,}.")
+    seed = int(case.scenario.seed) if seed is None else seed
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"--seed {seed}: it must be a whole number from 0 to 4294967295.")
+    return Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, members)
+
+
+def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+    """ambjax ensemble."""
+    case = read_aloud(args.case)
+    study, store = _asked(case, args)
+    out = store.directory
+    with keeping(lambda: _kept(store)):
+        error = None
+        with contextlib.nullcontext() if store.finished() else _executor(args) as executor:
+            make(out)  # not before everything that was asked for is known to be possible
+            say(f"method: {case.clock.method}; writing to {out}")
+            if isinstance(case.clock.method, Slide):
+                error = sliding_error(study)
+                say(error_words(error))
+            if not store.finished():
+                _begin(study, store, executor)
+                _run(study, store, executor)
+        store.finish()
+        return _report(case, study, args, out, error)
+
+
+def _asked(case: Case, args: argparse.Namespace) -> tuple[Study, Store]:
+    """The study that is asked for, and where it is kept; nothing is written. Raises ValueError for what cannot be."""
+    study = study_of(case, args.seed, args.members)
+    if args.chunk is not None and args.chunk < 1:
+        raise ValueError(f"--chunk {args.chunk}: it must be a whole number of members, at least 1.")
+    if args.processes is not None and not 1 <= args.processes <= MOST_PROCESSES:
+        raise ValueError(f"--processes {args.processes}: it must be a whole number from 1 to {MOST_PROCESSES}.")
+    if args.resume and args.out is None:
+        raise ValueError("--resume: add --out DIR, the directory of the study that was interrupted.")
+    study.drawn(np.array([0]))  # raises what the design has against so many members
+    out = chosen(args.out, f"ensemble-{case.name}")
+    chunk = None if args.chunk is None else min(args.chunk, study.members)
+    store = Store(out, study.fingerprint(), study.members, chunk)
+    store.check(COLUMNS + len(study.spread.entries), args.resume)
+    return study, store
+
+
+def _begin(study: Study, store: Store, executor: tuple[Executor, int] | None) -> None:
+    """Choose the chunks if nobody has, say how long it may take, and keep what was computed to know it."""
+    if store.begun():
+        store.begin()
+        return
+    columns, seconds = pilot(study)
+    first = len(columns["index"])
+    pace = Pace(first / seconds, None if executor is None else executor[1] // AHEAD)
+    store.chunk = store.chunk or pace.chunk(study.members)
+    say_how_long(study, pace)
+    with unbroken():
+        store.begin()
+        for start, stop in store.spans()[: first // store.chunk]:
+            store.put((start, stop), {name: column[start:stop] for name, column in columns.items()})
+
+
+def _kept(store: Store) -> str:
+    """What an interruption has left, and how to go on."""
+    if not store.begun():
+        return "nothing is kept"
+    again = f"give the same command with --out {store.directory} --resume"
+    return f"{store.kept()} of {store.members} members are kept. To go on, {again}"
+
+
+def _report(
+    case: Case, study: Study, args: argparse.Namespace, out: pathlib.Path, error: dict[str, Any] | None
+) -> tuple[int, dict[str, Any]]:
+    """What is made of a finished study; `error` is that of its sliding step, if it has one."""
+    with np.load(out / "members.npz") as kept:
+        columns = {name: kept[name] for name in kept.files}
+    summary = _summary(case, study, columns, shlex.quote(str(args.case)))
+    if error is not None:
+        summary["sliding_step_error"] = error
+    with files(out) as part:
+        write_json(part / "summary.json", summary)
+        _pictures(case, study, columns, summary, part)
+    if not args.json:
+        print(_text(summary))
+        print(
+            f"written: {out}/members.npz, summary.json, fan.png, histograms.png"
+            + ", tornado.png" * bool(study.spread.entries)
+        )
+    return int(summary["survivors"] < study.members), plain(summary) | {"out": str(out)}
+
+
+@contextlib.contextmanager
+def _executor(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]:
+    """Where chunks run: None for this process, or an executor and the number of chunks to keep in flight."""
+    if args.cluster is not None:
+        try:
+            from distributed import Client, KilledWorker
+        except ImportError:
+            raise ValueError("--cluster: Dask is not installed. Run: pip install 'ambjax[cluster]'.") from None
+        try:
+            client = Client(args.cluster, timeout=PATIENCE)
+        except (OSError, ValueError) as error:
+            raise ValueError(f"--cluster {args.cluster}: no scheduler answers there ({error}).") from None
+        try:
+            with client:
+                yield client.get_executor(), AHEAD * max(len(client.scheduler_info()["workers"]), 1)
+        except (KilledWorker, CancelledError):
+            raise ValueError(f"--cluster {args.cluster}: it, or its workers again and again, died. {GO_ON}") from None
+    elif args.processes is not None:
+        try:
+            with processes(args.processes) as pool:
+                yield pool, AHEAD * args.processes
+        except BrokenExecutor:
+            why = "a worker process died, perhaps for want of memory"
+            raise ValueError(f"--processes {args.processes}: {why}; fewer need less. {GO_ON}") from None
+    else:
+        yield None
+
+
+def _run(study: Study, store: Store, executor: tuple[Executor, int] | None) -> None:
+    """Compute what is missing; every finished chunk is on disk at once."""
+    missing, remarks = store.survey()
+    for remark in remarks:
+        say(remark)
+    done = study.members - sum(stop - start for start, stop in missing)
+    with tqdm(total=study.members, initial=done, unit="member", unit_scale=True, delay=2, desc="ensemble") as bar:
+        found = _here(study, store, missing) if executor is None else _elsewhere(study, store, missing, *executor)
+        for span, columns in found:
+            with unbroken():
+                store.put(span, columns)
+            bar.update(span[1] - span[0])
+
+
+Found = Iterator[tuple[tuple[int, int], dict[str, Any]]]
+
+
+def _here(study: Study, store: Store, missing: list[tuple[int, int]]) -> Found:
+    for span in missing:
+        yield span, chunk(study, *span, store.chunk)
+
+
+def _elsewhere(study: Study, store: Store, missing: list[tuple[int, int]], pool: Executor, ahead: int) -> Found:
+    queue, running = list(reversed(missing)), dict[Future, tuple[int, int]]()
+    while queue or running:
+        while queue and len(running) < ahead:
+            span = queue.pop()
+            with deaf_children():
+                running[pool.submit(work, study, *span, store.chunk)] = span
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            yield running.pop(future), future.result()
+
+
+def _summary(case: Case, study: Study, columns: dict[str, np.ndarray], path: str) -> dict[str, Any]:
+    facts = {
+        "case": case.name,
+        "method": str(case.clock.method),
+        "settle_s": case.settle,
+        "design": study.spread.design,
+    }
+    found = statistics.summary(columns, study.spread.paths, study.seed)
+    latin = f" --members {study.members}" if study.spread.design == "latin-hypercube" else ""
+    for worst in found["worst"]:
+        worst["replay"] = f"ambjax simulate {path} --member {worst['index']} --seed {study.seed}{latin}"
+    return facts | found
+
+
+def _pictures(
+    case: Case, study: Study, columns: dict[str, np.ndarray], summary: dict[str, Any], out: pathlib.Path
+) -> None:
+    from ambjax.pictures import ensembles as pictures
+    from ambjax.pictures import tornado
+
+    t, trajectory, signals = study.bands(FAN_MEMBERS, FAN_TIMES)
+    lost_at, stalled = np.asarray(trajectory.lost_at), np.asarray(trajectory.lost_code) == STALLED
+    title = f"{case.name}: {len(lost_at)} of {study.members} members"
+    limits = {"z - r": float(np.min(study.scenario.touchdown)), "u": float(np.min(study.scenario.u_max))}
+    bands = {name: _quantiles(x) for name, x in signals.items()}
+    pictures.fan(t, bands, limits, title, out / "fan.png", lost_at=lost_at, stalled=stalled)
+    pictures.histograms(columns, out / "histograms.png")
+    if study.spread.entries:
+        deciding = statistics.DECIDING
+        bars = [tornado.Bar(*(d[k] for k in tornado.Bar._fields)) for d in summary["drivers"][deciding]]
+        tornado.tornado(bars, deciding, summary["explained"][deciding]["says"], out / "tornado.png")
+
+
+def _quantiles(x: np.ndarray) -> dict[float, np.ndarray]:
+    """Quantiles over the members that are left at each instant, by per cent; NaN where none is."""
+    left = np.isfinite(x).any(axis=0)
+    found = np.full((len(BANDS), x.shape[1]), np.nan)
+    found[:, left] = np.nanquantile(x[:, left], np.array(BANDS) / 100, axis=0)
+    return dict(zip(BANDS, found, strict=True))
+
+
+def _text(summary: dict[str, Any]) -> str:
+    share, low, high = (100 * summary["survival"][key] for key in ("estimate", "low", "high"))
+    sure = f"{100 * summary['confidence']:g} % interval"
+    held = f"{summary['survivors']} of {summary['members']} members survive"
+    lines = [f"{held}: {share:.4g} % ({sure} {low:.4g} to {high:.4g} %)"]
+    if summary["stalled"]:
+        why = "the integrator gave up, and whether the rotor is held is not known"
+        lines += [f"{summary['lost']} lost, {summary['stalled']} not decided: {why}"]
+    lines += [f"note: {note}" for note in summary["notes"]]
+
+    def number(x: float | None) -> str:
+        return "-" if x is None else f"{x:.4g}"
+
+    rows = []
+    for name in SHOWN:
+        found = summary["metrics"][name]
+        rows.append(
+            (name, *(number(found[key]["estimate"]) for key in ("median", "q95", "cvar_95")), number(found["max"]))
+        )
+    lines += ["", table(("metric", "median", "95 % quantile", "mean of worst 5 %", "largest"), rows)]
+    drivers, explained = summary["drivers"][statistics.DECIDING][:5], summary["explained"][statistics.DECIDING]
+    if drivers:
+        lines += ["", f"What drives {statistics.DECIDING}: {explained['says']}."]
+    if explained["alone"]:
+        shown = [
+            (
+                d["path"],
+                f"{100 * d['share']:.1f} %",
+                f"{100 * d['low']:.1f} to {100 * d['high']:.1f} %",
+                f"{d['rho']:+.2f}",
+            )
+            for d in drivers
+        ]
+        lines += [table(("quantity", "explains alone", sure, "rank correlation"), shown)]
+    worst = summary["worst"][0]
+    return "\n".join([*lines, "", f"The worst member alone: {worst['replay']}"])

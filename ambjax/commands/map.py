@@ -1,0 +1,177 @@
+"""`ambjax map`: survival and error over a grid of two quantities, for one case or for several side by side."""
+
+import argparse
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from ambjax.cases.reader import MOST_SAMPLES, Case
+from ambjax.commands.doubts import read_aloud
+from ambjax.commands.ensemble import study_of
+from ambjax.commands.outputs import directory, files, plain, say, table, write_json
+from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid
+from ambjax.ensemble.paths import places
+from ambjax.numerics.records import numbers, within
+from ambjax.simulation.clock import Clock
+
+COUNT = 21
+MOST_CELLS = 1_000_000
+# Samples of all runs of a map over clock.sample_period: hours.
+MOST_TOTAL = 10_000_000_000
+SAMPLE_PERIOD = next(field for field in dataclasses.fields(Clock) if field.name == "sample_period")
+FORM = "PATH=LOW:HIGH[:COUNT][:log], as in initial.z=-1e-3:1e-3:41 or plant.m=-20%:20%"
+
+
+def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+    """ambjax map."""
+    cases = [read_aloud(path) for path in [args.case, *(args.against or [])]]
+    studies = [study_of(case, args.seed, args.members) for case in cases]
+    axes = [(_axis("--x", args.x, case), _axis("--y", args.y, case)) for case in cases]
+    cells = len(axes[0][0].values) * len(axes[0][1].values)
+    if cells * args.members > MOST_CELLS:
+        raise ValueError(f"--members {args.members}: {cells} cells of so many exceed {MOST_CELLS:,} runs. Take fewer.")
+    for case, (x, y) in zip(cases, axes, strict=True):
+        _check_samples(case, x, y, args.members)
+    maps = []
+    for case, study, (x, y) in zip(cases, studies, axes, strict=True):
+        say(f"{case.name}: {cells} cells of {args.members}; method: {case.clock.method}")
+        if args.members == 1 and case.spread.entries:
+            say(f"{case.name}: nominal, its [spread] is not drawn; --members N, N above 1, draws it.")
+        maps.append(grid(study, x, y))
+    out = directory(args.out, f"map-{cases[0].name}")
+    summary = {"cases": [_summary(case, found) for case, found in zip(cases, maps, strict=True)], "out": str(out)}
+    with files(out) as part:
+        _draw(cases, maps, part / "map.png")
+        write_json(part / "map.json", summary)
+    if not args.json:
+        print(_text(cases, maps))
+        print(f"written: {out}/map.png, map.json")
+    return 0, plain(summary)
+
+
+def _axis(flag: str, text: str, case: Case) -> Axis:
+    """An axis from its flag's text. Raises ValueError with the flag, the text and the form."""
+
+    def refuse(why: str) -> ValueError:
+        return ValueError(f"{flag} {text}: {why}. Write {FORM}.")
+
+    path, _, rest = text.partition("=")
+    parts = rest.split(":")
+    log = parts[-1] == "log"
+    parts = parts[:-1] if log else parts
+    if len(parts) not in (2, 3):
+        raise refuse("it must be a path and a range")
+    known = places(case.cascade, case.scenario)
+    nominal = float(case.clock.sample_period) if path == PERIOD else _nominal(known.get(path))
+    try:
+        low, high = (_value(part, nominal) for part in parts[:2])
+        count = int(parts[2]) if len(parts) == 3 else COUNT
+    except ValueError as error:
+        raise refuse(str(error)) from None
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise refuse(f"the range must rise from one finite number to another, and it is {low:g} to {high:g}")
+    if not 2 <= count <= MOST_CELLS:
+        raise refuse(f"there must be 2 to {MOST_CELLS:,} values, and there are {count}")
+    field = SAMPLE_PERIOD if path == PERIOD else known[path].field if path in known else None
+    if field is not None and not within(field.metadata, np.array([low, high])):
+        raise refuse(f"{path} must be {numbers(field)}, and the range is {low:g} to {high:g}")
+    if log and low <= 0:
+        raise refuse(f"a logarithmic range must begin above 0, and it begins at {low:g}")
+    return Axis(path, np.geomspace(low, high, count) if log else np.linspace(low, high, count), log)
+
+
+def _check_samples(case: Case, x: Axis, y: Axis, members: int) -> None:
+    """Refuse sample periods beyond the run, and more samples than can be waited for."""
+    for flag, axis, other in (("--x", x, y), ("--y", y, x)):
+        if axis.path != PERIOD:
+            continue
+        duration, low, high = float(case.clock.duration), float(axis.values[0]), float(axis.values[-1])
+        total = np.sum(duration / axis.values) * len(other.values) * members
+        if high > duration:
+            raise ValueError(
+                f"{flag} {PERIOD}: it reaches {high:g} s, but clock.duration is {duration:g} s. End it there."
+            )
+        if duration / low > MOST_SAMPLES or total > MOST_TOTAL:
+            raise ValueError(
+                f"{flag} {PERIOD}: from {low:g} s on it makes runs of up to {duration / low:.3g} samples, {total:.3g} "
+                f"in all; at most {MOST_SAMPLES:,} and {MOST_TOTAL:.0e} are taken. Begin it higher, or shorten "
+                "clock.duration."
+            )
+
+
+def _nominal(place: Any) -> float | None:
+    return None if place is None or place.value is None else float(place.value)
+
+
+def _value(text: str, nominal: float | None) -> float:
+    if not text.endswith("%"):
+        return float(text)
+    if nominal is None or not math.isfinite(nominal) or nominal == 0:
+        raise ValueError("per cent need a number other than 0 to refer to, and the case has none there")
+    return nominal * (1 + float(text[:-1]) / 100)
+
+
+def _summary(case: Case, found: Map) -> dict[str, Any]:
+    facts: dict[str, Any] = {"case": case.name, "x": found.x._asdict(), "y": found.y._asdict()}
+    return facts | {key: getattr(found, key) for key in (*GRIDS, "drawn")} | {"reach": found.reach()}
+
+
+def _text(cases: list[Case], maps: list[Map]) -> str:
+    x, y = maps[0].x, maps[0].y
+    middle = (y.values[0] + y.values[-1]) / 2
+    rows = []
+    for case, found in zip(cases, maps, strict=True):
+        reach = found.reach()
+        held = "nowhere" if reach is None else f"{reach[0]:.4g} to {reach[1]:.4g}"
+        rows.append(
+            (case.name, f"{100 * found.survival.mean():.1f} %", f"{100 * np.mean(found.low >= 0.95):.1f} %", held)
+        )
+    header = ("case", "runs that survive", "cells surely above 95 %", f"{x.path} survived at {y.path} = {middle:.3g}")
+    lines = [table(header, rows)]
+    for case, found in zip(cases, maps, strict=True):
+        lines += [f"{case.name}: {_drawn(found)}"]
+        if found.stalled.any():
+            many, lost = int(found.stalled.sum()), int(found.lost.sum())
+            where = f"in {np.count_nonzero(found.stalled)} cells"
+            lines += [f"{case.name}: {lost} runs lost, {many} not decided ({where}): the integrator gave up there"]
+    return "\n".join(lines)
+
+
+def _drawn(found: Map) -> str:
+    """What a map shows of the case's spread."""
+    return f"drawn for each member: {', '.join(found.drawn)}" if found.drawn else "nominal: nothing is spread"
+
+
+def _draw(cases: list[Case], maps: list[Map], path: Any) -> None:
+    from ambjax.pictures import heatmaps
+
+    panels = [
+        {
+            "title": f"{case.name}\n{_short(m)}",
+            "x": m.x.values,
+            "y": m.y.values,
+            "survival": m.survival,
+            "low": m.low,
+            "high": m.high,
+        }
+        | {"error": m.error}
+        for case, m in zip(cases, maps, strict=True)
+    ]
+    x, y = maps[0].x, maps[0].y
+    heatmaps.maps(panels, _label(cases[0], x), _label(cases[0], y), x.log, y.log, path)
+
+
+def _short(found: Map) -> str:
+    """What a map shows, for a title: spread quantities by name, or how many they are."""
+    few = len(found.drawn) <= 3
+    what = ", ".join(found.drawn) if few else f"{len(found.drawn)} quantities"
+    drawn = f"spread: {what}" if what else "nominal"
+    return drawn + f"; {int(found.stalled.sum())} runs not decided" * bool(found.stalled.any())
+
+
+def _label(case: Case, axis: Axis) -> str:
+    place = places(case.cascade, case.scenario).get(axis.path)
+    unit = "s" if place is None else place.field.metadata["unit"]
+    return f"{axis.path} ({unit})" if unit else axis.path

@@ -1,0 +1,14 @@
+"""`ambjax template`: an annotated case file."""
+
+import argparse
+from typing import Any
+
+from ambjax.cases.template import template
+
+
+def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+    """ambjax template."""
+    text = template(args.scenario)
+    if not args.json:
+        print(text, end="")
+    return 0, {"template": text}

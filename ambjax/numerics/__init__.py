@@ -1,0 +1,1 @@
+"""Records of numbers, smooth functions, random numbers, and what makes XLA compile them well."""

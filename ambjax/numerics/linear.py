@@ -1,0 +1,78 @@
+"""Linear algebra on states: pytrees of a few scalars, written out.
+
+The systems are 3x3 to 8x8 and sit in the innermost loop. Written out, each entry is one scalar
+(one vector lane per member under vmap); a library call would cost more than the arithmetic.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.numerics.records import Scalar
+from ambjax.numerics.smooth import away_from_zero
+
+
+class Factors(NamedTuple):
+    """L and U of (I - g J) in one table, eliminated from the last component to the first."""
+
+    table: list[list[Any]]
+    inverse_pivots: list[Any]
+
+
+def jacobian(function: Callable[[Any], Any], state: Any) -> list[list[Any]]:
+    """d function_i / d state_j as nested lists [i][j], by one forward derivative per component.
+
+    Each derivative sees the other components as constants, so terms that are zero by structure are
+    never computed.
+    """
+    leaves, tree = jax.tree.flatten(state)
+
+    def column(j: int) -> list[Any]:
+        def along(x: Array) -> list[Any]:
+            varied = [*leaves[:j], x, *leaves[j + 1 :]]
+            return jax.tree.leaves(function(jax.tree.unflatten(tree, varied)))
+
+        x = jnp.asarray(leaves[j])
+        return jax.jvp(along, (x,), (jnp.ones_like(x),))[1]
+
+    columns = [column(j) for j in range(len(leaves))]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def factor(jac: list[list[Any]], g: Scalar) -> Factors:
+    """Factor I - g J without row exchanges.
+
+    Controller states come last in a state and are eliminated first: their diagonal 1 + g slope is
+    large where the loop is stiff, and what is left is the slow, closed-loop motion of the rotor. A
+    pivot of 0 is moved off it, so that a hopeless trial step stays finite and is rejected.
+    """
+    n = len(jac)
+    order = range(n - 1, -1, -1)
+    m = [[(1.0 if i == j else 0.0) - g * jac[i][j] for j in order] for i in order]
+    inverses: list[Any] = []
+    for k in range(n):
+        inverses.append(1.0 / away_from_zero(m[k][k], 1e-12))
+        for i in range(k + 1, n):
+            m[i][k] = m[i][k] * inverses[k]
+            for j in range(k + 1, n):
+                m[i][j] = m[i][j] - m[i][k] * m[k][j]
+    return Factors(m, inverses)
+
+
+def solve(factors: Factors, right: Any) -> Any:
+    """The state x with (I - g J) x = right."""
+    m, inverses = factors
+    leaves, tree = jax.tree.flatten(right)
+    y = list(reversed(leaves))
+    n = len(y)
+    for i in range(n):
+        for j in range(i):
+            y[i] = y[i] - m[i][j] * y[j]
+    for i in reversed(range(n)):
+        for j in range(i + 1, n):
+            y[i] = y[i] - m[i][j] * y[j]
+        y[i] = y[i] * inverses[i]
+    return jax.tree.unflatten(tree, list(reversed(y)))

@@ -1,0 +1,190 @@
+"""Smooth stand-ins for functions whose derivative jumps or blows up."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.numerics.apart import apart
+from ambjax.numerics.records import Scalar
+
+TWO_OVER_PI = 0.6366197723675814
+TWO_PI = 6.283185307179586
+HALF_PI = 1.5707963267948966
+# arctan x = x P(x^2) / Q(x^2) on |x| <= 1, to 2e-15 relative in float64.
+ARCTAN_P = (
+    1.0,
+    2.27400010594489066,
+    1.81451283323316237,
+    0.603864314681801684,
+    7.68191381424752628e-2,
+    2.49654800699140172e-3,
+)
+ARCTAN_Q = (
+    1.0,
+    2.60733343927809713,
+    2.48362397966403936,
+    1.05312942946270827,
+    0.192502581283719859,
+    1.20469788049161978e-2,
+    1.11282795138436982e-4,
+)
+
+
+# arctan x = x R(x^2) on |x| <= 1, to 1.5e-8 relative: a weighted least-squares fit, for float32.
+ARCTAN_R = (
+    0.9999999847653734,
+    -0.33333073339931396,
+    0.19992619283325946,
+    -0.14203643594913185,
+    0.10640930585893088,
+    -0.07504287175107752,
+    0.04269143198666149,
+    -0.016068575113646982,
+    0.0028498761308979135,
+)
+
+# sin(2 pi y) = y S(y^2) on |y| <= 1/4, to 3e-19 and 7e-9 relative: interpolated at Chebyshev nodes.
+SINE_S = {
+    "float64": (
+        6.283185307179586,
+        -41.341702240399755,
+        81.60524927607362,
+        -76.70585975282492,
+        42.058693925428685,
+        -15.0946416761179,
+        3.8199280942271643,
+        -0.7177337921413454,
+        0.10089695501646812,
+    ),
+    "float32": (6.283185280154407, -41.34168061334652, 81.60247636892518, -76.58117264427872, 39.7598270853191),
+}
+
+
+@jax.custom_jvp
+@apart
+def reciprocal(x: Array) -> Array:
+    """1/x, divided once however often it is used; for |x| between 1e-37 and 1e37.
+
+    CPUs divide vectors of float32 much faster than those of float64: there a float32 quotient is refined by one step
+    of third order, to the last bit or the one before.
+    """
+    if x.dtype != jnp.float64 or jax.default_backend() != "cpu":
+        return 1 / x
+    rough = (1 / x.astype(jnp.float32)).astype(jnp.float64)
+    error = 1 - x * rough
+    return rough + rough * (error + error * error)
+
+
+@reciprocal.defjvp
+def _reciprocal_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    value = reciprocal(*primals)
+    return value, tangents[0] * -(value * value)
+
+
+def _polynomial(u: Array, coefficients: Sequence[Scalar]) -> Any:
+    """Neighbours in pairs, then pairs in pairs (Estrin): a third of the latency of Horner's scheme."""
+    terms = list(coefficients)
+    while len(terms) > 1:
+        odd = [*terms[1::2], *[None] * (len(terms) % 2)]
+        terms = [a if b is None else a + b * u for a, b in zip(terms[::2], odd, strict=True)]
+        u = u * u
+    return terms[0]
+
+
+@jax.custom_jvp
+@apart
+def arctan_per(x: Array, per: Array) -> Array:
+    """arctan(x) / per with one division, which vectorises; XLA's own arctan is a scalar library call on CPUs.
+
+    For |x| > 1 it is pi/2 - arctan(1/|x|). In float64 numerator and denominator are multiplied by a power
+    of x there, which reverses their coefficients: division is what costs most in a step of the loop.
+    """
+    size = jnp.abs(x)
+    large = size > 1
+    if x.dtype == jnp.float64:
+        size = jnp.minimum(size, 1e20)  # its 12th power must not overflow
+        u = size * size
+        top = [jnp.where(large, far, near) for near, far in zip(ARCTAN_P, reversed(ARCTAN_P), strict=True)]
+        below = [jnp.where(large, far, near) for near, far in zip(ARCTAN_Q, reversed(ARCTAN_Q), strict=True)]
+        angle, over = size * _polynomial(u, top), _polynomial(u, below)
+        angle = jnp.where(large, HALF_PI * over - angle, angle)
+        return jnp.where(x < 0, -angle, angle) / (over * per)
+    y = jnp.minimum(size, 1.0) / jnp.maximum(size, 1.0)
+    angle = y * _polynomial(y * y, ARCTAN_R)
+    angle = jnp.where(large, HALF_PI - angle, angle)
+    return jnp.where(x < 0, -angle, angle) / per
+
+
+@arctan_per.defjvp
+def _arctan_per_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    (x, per), (dx, d_per) = primals, tangents
+    value = arctan_per(x, per)
+    return value, (dx / (1 + x * x) - value * d_per) / per
+
+
+def _turn(x: Array) -> Array:
+    """The part of x turns in -1/2..1/2, exactly."""
+    return x - jnp.floor(x + 0.5)
+
+
+def _quarter(y: Array) -> Array:
+    """sin(2 pi y) for |y| <= 1/4."""
+    return y * _polynomial(y * y, SINE_S[y.dtype.name])
+
+
+@jax.custom_jvp
+@apart
+def sine(x: Array) -> Array:
+    """sin(2 pi x): an angle in turns is reduced exactly, and it vectorises; XLA's own is a library call on CPUs."""
+    y = _turn(x)
+    return _quarter(jnp.where(jnp.abs(y) > 0.25, jnp.where(y < 0, -0.5, 0.5) - y, y))
+
+
+@jax.custom_jvp
+@apart
+def cosine(x: Array) -> Array:
+    """cos(2 pi x)."""
+    return _quarter(0.25 - jnp.abs(_turn(x)))
+
+
+@sine.defjvp
+def _sine_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (dx,) = primals, tangents
+    return sine(x), TWO_PI * cosine(x) * dx
+
+
+@cosine.defjvp
+def _cosine_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (dx,) = primals, tangents
+    return cosine(x), -TWO_PI * sine(x) * dx
+
+
+def smooth_sign(x: Scalar, p: Scalar, per: Scalar = 1.0) -> Array:
+    """sgn(x) as 2/pi arctan(p x), divided by `per`; slope 2p/pi at zero. Remark 3 of the paper.
+
+    `p` has the inverse unit of `x`.
+    """
+    return TWO_OVER_PI * arctan_per(p * jnp.asarray(x), jnp.asarray(per))
+
+
+def smooth_root(x: Scalar, p: Scalar) -> Array:
+    """sqrt(|x|) sgn(x) as x / (x^2 + 1/p^2)^(1/4); slope sqrt(p) at zero instead of infinity."""
+    x = jnp.asarray(x)
+    return x / jnp.sqrt(jnp.sqrt(x * x + 1.0 / (p * jnp.asarray(p))))
+
+
+def safe_sqrt(x: Scalar) -> Array:
+    """sqrt(max(x, 0)) with derivative 0, not infinity, where x <= 0."""
+    x = jnp.asarray(x)
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def away_from_zero(x: Scalar, floor: Scalar) -> Array:
+    """x, with its magnitude held at `floor` or more and its sign kept (0 counts as positive)."""
+    x = jnp.asarray(x)
+    near = jnp.abs(x) < floor
+    return jnp.where(near, jnp.where(x < 0, -1.0, 1.0) * floor, x)

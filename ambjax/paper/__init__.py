@@ -1,0 +1,31 @@
+"""The paper's simulation study: readings of it, evidence from them, and the ledger of its claims."""
+
+from ambjax.paper.readings import (
+    CLOCK,
+    PULSE,
+    READINGS,
+    REFERENCE,
+    REPAIRED_GAMMA,
+    SETTLE,
+    SUPPLY,
+    TABLE_2,
+    TUNED,
+    cascade,
+    noisy,
+    scenario,
+)
+
+__all__ = [
+    "CLOCK",
+    "PULSE",
+    "READINGS",
+    "REFERENCE",
+    "REPAIRED_GAMMA",
+    "SETTLE",
+    "SUPPLY",
+    "TABLE_2",
+    "TUNED",
+    "cascade",
+    "noisy",
+    "scenario",
+]

@@ -1,0 +1,263 @@
+"""The paper's claims, of its Section 4 and abstract, each against what the simulation does.
+
+Each claim is one function from the evidence of a reading to a number, a verdict and its cause. No
+verdict is typed in: all are computed from the runs in `ambjax.paper.evidence`.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ambjax.paper.evidence import BASIN, NOISE_STDS, UNCERTAIN, Evidence, Run
+from ambjax.paper.readings import PULSE, SETTLE, TABLE_2
+from ambjax.world.plant import Plant
+
+HOLDS, FAILS, OPEN = "holds", "does not hold", "not determined by the paper"
+SIGMA_RADIUS, TRACKING_ERROR, INVERSION_TIME = 6e-6, 2.3e-5, 0.01
+GAP = float(Plant().s_0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """What one reading gives for a claim: in words, as a number, the verdict, and why."""
+
+    ours: str
+    value: float | None
+    verdict: str
+    cause: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Claim:
+    """A claim: what and where, the paper's number, and the criterion that decides."""
+
+    says: str
+    where: str
+    paper: str
+    criterion: str
+    judge: Callable[[Evidence], Finding]
+
+
+CLAIMS: list[Claim] = []
+
+
+def claim(says: str, where: str, paper: str, criterion: str) -> Callable[[Callable[[Evidence], Finding]], Any]:
+    """Enter the function below into the ledger."""
+
+    def enter(judge: Callable[[Evidence], Finding]) -> Callable[[Evidence], Finding]:
+        CLAIMS.append(Claim(says, where, paper, criterion, judge))
+        return judge
+
+    return enter
+
+
+def _found(ours: str, value: float, condition: bool, cause: str) -> Finding:
+    return Finding(ours, value, HOLDS if condition else FAILS, cause)
+
+
+def _lost(run: Run, evidence: Evidence) -> Finding | None:
+    """The finding for a claim about a run in which the rotor was lost, or None."""
+    if math.isinf(run.metrics["lost_at_s"]):
+        return None
+    inversion = next(c for c in evidence.check_tracking.conditions if c.name == "inversion, ideal")
+    words = f"rotor lost at {run.metrics['lost_at_s'] * 1e3:.1f} ms"
+    cause = run.trajectory.lost_why
+    if inversion.gain is not None and inversion.gain <= inversion.against:
+        cause = f"gamma = {inversion.gain:g} < Delta_1 = {inversion.against:.3g} A^2/m^2/s, Eq. (7)"
+    return Finding(words, None, FAILS, cause)
+
+
+def _worst(rows: Any, name: str, begin: float, end: float) -> float:
+    """Largest |signal| in begin <= t < end."""
+    return float(np.abs(getattr(rows, name)[(rows.t >= begin) & (rows.t < end)]).max())
+
+
+@claim("Theorem 1's conditions hold under Table 2", "3.5", "assumed", "every margin positive, both scenarios")
+def _theorem(evidence: Evidence) -> Finding:
+    lines = [c for report in (evidence.check_regulation, evidence.check_tracking) for c in report.conditions]
+    tightest = min(
+        (c for c in lines if c.holds is not None and c.gain), key=lambda c: (c.margin or 0.0) / (c.gain or 1.0)
+    )
+    share = 100 * (tightest.margin or 0.0) / (tightest.gain or 1.0)
+    failing = [c for c in lines if c.holds is False]
+    ideal = [c for c in failing if c.name == "inversion, ideal"]
+    tightest = ideal[0] if ideal else tightest
+    cause = f"{tightest.requires}: {tightest.gain:g} against {tightest.against:.3g} at t = {tightest.at_s:.4g} s"
+    words = f"{len(failing)} of {len(lines)} conditions fail" if failing else f"tightest margin {share:.0f} %"
+    return _found(words, share, not failing, cause)
+
+
+@claim(
+    "The origin is uniformly asymptotically stable", "abstract, 3.5", "proven",
+    "rotor returns from z(0) off the origin with currents in equilibrium, and from zero currents",
+)  # fmt: skip
+def _stable(evidence: Evidence) -> Finding:
+    basin = evidence.basin
+    cause = (
+        f"returns from rest at |z(0)| up to {basin:.1e} m, {100 * basin / GAP:.2g} % of the gap ({len(BASIN)} tried)"
+    )
+    if lost := _lost(evidence.regulation, evidence):
+        cause += f"; from i = i_ref = 0: {lost.ours}"
+    return _found(f"basin {basin:.1e} m", basin, basin > 0 and lost is None, cause)
+
+
+@claim(
+    "Regulation: z and i converge to their references", "4", "-",
+    "last 0.1 s: |z| < 1e-6 m and |i - i_ref| < 1e-3 A",
+)  # fmt: skip
+def _converges(evidence: Evidence) -> Finding:
+    rows = evidence.regulation.trajectory.rows
+    z, e = _worst(rows, "e_z", 1.9, 2.0), _worst(rows, "e", 1.9, 2.0)
+    cause = "over the last 0.1 s, 0.6 s after the pulse"
+    return _lost(evidence.regulation, evidence) or _found(f"{z:.1e} m, {e:.1e} A", z, z < 1e-6 and e < 1e-3, cause)
+
+
+@claim(
+    "sigma reaches a neighbourhood of 0 in finite time",
+    "4",
+    "finite",
+    "|sigma| <= 6e-6 m/s held from 0.1 s to the pulse",
+)
+def _finite_time(evidence: Evidence) -> Finding:
+    rows = evidence.regulation.trajectory.rows
+    early = rows.t < PULSE.start
+    outside = np.flatnonzero(np.abs(rows.sigma[early]) > SIGMA_RADIUS)
+    at = float(rows.t[early][outside[-1]]) if outside.size else 0.0
+    cause = "last time before the pulse that |sigma| > 6e-6 m/s"
+    return _lost(evidence.regulation, evidence) or _found(f"{at:.4g} s", at, at < 0.1, cause)
+
+
+@claim(
+    "sigma's neighbourhood has radius 6e-6",
+    "4",
+    "6e-6 m (sic: m/s)",
+    "settled |sigma| <= 6.3e-6 m/s, pulse included",
+)
+def _radius(evidence: Evidence) -> Finding:
+    rows = evidence.regulation.trajectory.rows
+    quiet, pulsed = _worst(rows, "sigma", SETTLE, PULSE.start), _worst(rows, "sigma", PULSE.start, PULSE.stop)
+    worst = max(quiet, pulsed)
+    cause = f"{quiet:.1e} m/s before the pulse, {pulsed:.1e} in it; noise apart, k 2/pi arctan(p sigma) balances q_z"
+    lost = _lost(evidence.regulation, evidence)
+    return lost or _found(f"{worst:.1e} m/s", worst, worst <= 1.05 * SIGMA_RADIUS, cause)
+
+
+@claim(
+    "That radius is due to the noise of variance 1e-7", "4", f"std {TABLE_2.noise_std:.2e} m",
+    "radius reached at a std within 25 % of the printed one, at some sample period",
+)  # fmt: skip
+def _radius_by_noise(evidence: Evidence) -> Finding:
+    known = {n.sample_period: n.std_for(SIGMA_RADIUS) for n in evidence.noise}
+    found = {period: std for period, std in known.items() if std is not None}
+    if not found:
+        lost = _lost(evidence.regulation, evidence)
+        return lost or Finding("at no std scanned", None, FAILS, "see the noise table")
+    nearest = max(found.values())
+    cause = f"the printed std is {TABLE_2.noise_std / nearest:.0f} times the largest that gives this radius"
+    words = "at std " + ", ".join(f"{std:.1e} m held {period:g} s" for period, std in found.items())
+    return _found(words, nearest, 0.8 <= nearest / TABLE_2.noise_std <= 1.25, cause)
+
+
+def _pulse_effect(evidence: Evidence, run: Run) -> Finding:
+    change = float(np.abs(run.trajectory.rows.z - run.quiet.rows.z).max())
+    cause = f"the pulse moves the rotor by {100 * change / GAP:.2g} % of the gap; without noise by q_z pi / (2 c k p)"
+    return _lost(run, evidence) or _found(f"{change:.3e} m", change, change <= TRACKING_ERROR, cause)
+
+
+@claim(
+    "Regulation is insensitive to the pulse", "4", "-", "pulse changes z by at most 2.3e-5 m, the paper's own accuracy"
+)
+def _insensitive(evidence: Evidence) -> Finding:
+    return _pulse_effect(evidence, evidence.regulation)
+
+
+def _inversion(evidence: Evidence, run: Run) -> Finding:
+    at = run.metrics["v_tilde_reached_s"]
+    late = run.metrics["settled_max_abs_v_tilde_A2_per_m2"]
+    cause = f"first |v_tilde| <= 0.1 A^2/m^2; after {SETTLE} s it stays within {late:.2g}"
+    return _lost(run, evidence) or _found(f"{at:.4g} s", at, at < INVERSION_TIME, cause)
+
+
+@claim(
+    "Regulation: inversion error zero in less than 0.01 s", "4", "< 0.01 s", "|v_tilde| <= 0.1 A^2/m^2 before 0.01 s"
+)
+def _inversion_regulation(evidence: Evidence) -> Finding:
+    return _inversion(evidence, evidence.regulation)
+
+
+@claim("Tracking: inversion error zero in less than 0.01 s", "4", "< 0.01 s", "|v_tilde| <= 0.1 A^2/m^2 before 0.01 s")
+def _inversion_tracking(evidence: Evidence) -> Finding:
+    return _inversion(evidence, evidence.tracking)
+
+
+@claim("The current tracks its reference", "4", "-", "settled |i - i_ref| < 1e-3 A, both scenarios")
+def _current(evidence: Evidence) -> Finding:
+    worst = max(r.metrics["settled_max_abs_current_error_A"] for r in (evidence.regulation, evidence.tracking))
+    cause = f"largest |i - i_ref| after {SETTLE} s, pulse included; q_i = 0, so Eq. (14) decays to 0 unless u saturates"
+    return _lost(evidence.regulation, evidence) or _found(f"{worst:.1e} A", worst, worst < 1e-3, cause)
+
+
+@claim("Tracking: largest error 2.3e-5 m", "4", "2.3e-5 m", "rounds to 2.3e-5 m or less")
+def _tracking(evidence: Evidence) -> Finding:
+    error = evidence.tracking.metrics["settled_max_abs_error_m"]
+    cause = f"largest |z - r| after {SETTLE} s, pulse included"
+    return _lost(evidence.tracking, evidence) or _found(f"{error:.3e} m", error, error < 2.35e-5, cause)
+
+
+@claim(
+    "Tracking: the disturbance is rejected", "4", "-", "pulse changes z by at most 2.3e-5 m, the paper's own accuracy"
+)
+def _rejected(evidence: Evidence) -> Finding:
+    return _pulse_effect(evidence, evidence.tracking)
+
+
+@claim(
+    "All this under sensor noise of variance 1e-7",
+    "4",
+    f"std {TABLE_2.noise_std:.2e} m",
+    "no member lost at the printed std",
+)
+def _noise(evidence: Evidence) -> Finding:
+    largest = max(n.survived for n in evidence.noise)
+    if largest == 0.0:
+        return Finding("survives none", 0.0, FAILS, "the rotor is lost at the smallest noise, and without noise")
+    words = "survives std " + ", ".join(f"{n.survived:.1e} m held {n.sample_period:g} s" for n in evidence.noise)
+    survivors = sum(n.survived >= TABLE_2.noise_std * 0.999 for n in evidence.noise)
+    cause = f"the printed std is survived at {survivors} of {len(evidence.noise)} sample periods tried"
+    undecided = 0 < survivors < len(evidence.noise)
+    return Finding(words, largest, OPEN if undecided else HOLDS if survivors else FAILS, cause)
+
+
+@claim("The noise is specified", "4", "variance only", "sigma's radius is the same to 10 % at every sample period")
+def _specified(evidence: Evidence) -> Finding:
+    if not any(n.survived for n in evidence.noise):
+        return Finding(
+            "no survivor", None, OPEN, "the rotor is lost at every noise, so the sample period cannot be told"
+        )
+    radii = [float(n.sigma[0]) for n in evidence.noise]
+    spread = max(radii) / min(radii)
+    cause = f"at std {NOISE_STDS[0]:.0e} m the radius differs {spread:.1f}-fold between sample periods; none is printed"
+    return Finding(f"radius varies {spread:.1f}-fold", spread, OPEN if spread > 1.1 else HOLDS, cause)
+
+
+@claim("The noise is about 20 % of the gap", "4", "20 %", "3 std within 18 to 22 % of s_0")
+def _share(evidence: Evidence) -> Finding:
+    share = 3 * TABLE_2.noise_std / GAP
+    cause = "arithmetic on the printed variance, its unit read as m^2"
+    return _found(f"3 std = {100 * share:.0f} % of s_0", share, abs(share - 0.2) < 0.02, cause)
+
+
+@claim(
+    "Accurate and robust positioning", "abstract", "-", "tracking error below 1 % of the gap with the plant 10 % off"
+)
+def _robust(evidence: Evidence) -> Finding:
+    lost, error = evidence.uncertain_lost, evidence.uncertain_error
+    if lost:
+        return Finding(f"lost in {len(lost)} of {2 * len(UNCERTAIN)} cases", None, FAILS, "true " + ", ".join(lost))
+    cause = (
+        f"one of {', '.join(UNCERTAIN)} off by 10 % either way, controller unaware: our choice, the paper tests none"
+    )
+    return _found(f"{error:.1e} m at worst", error, error < 0.01 * GAP, cause)

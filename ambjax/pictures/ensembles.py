@@ -1,0 +1,258 @@
+"""Pictures of ensembles: fan charts and histograms, from arrays in SI units."""
+
+import math
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from ambjax.pictures.figures import BINS, BLUE, INK, RED, thin
+from ambjax.pictures.scales import digits, finish, log_ticks, named, prefixed, size_of
+
+# What a fan can show: label and SI unit.
+QUANTITIES = {
+    "z - r": ("$z - r$", "m"),
+    "z": ("position $z$", "m"),
+    "sigma": (r"sliding variable $\sigma$", "m/s"),
+    "u": ("voltage $u$", "V"),
+    "i": ("current $i$", "A"),
+    "variation of u": ("variation of $u$", "V/s"),
+    "v_tilde": (r"force error $\tilde v$", "A²/m²"),
+}
+CHIEF = (
+    "settled_max_abs_error_m",
+    "settled_rms_error_m",
+    "max_abs_error_m",
+    "rms_error_m",
+    "clearance_used",
+    "settled_max_abs_sigma_m_per_s",
+    "v_tilde_reached_s",
+    "max_abs_i_A",
+    "max_abs_u_V",
+    "rms_u_V",
+    "chatter_V",
+    "copper_loss_W",
+)
+# Parts of the run over which a chattering median is averaged.
+SMOOTHED = 50
+LOST = {"facecolor": RED, "edgecolor": "white", "hatch": "////", "linewidth": 0.0}
+MARKS: dict[float, tuple[Any, str]] = {0.5: ("-", "median"), 0.95: ("--", "95 % quantile")}
+
+
+def fan(
+    t: np.ndarray,
+    bands: Mapping[str, Mapping[float, np.ndarray]],
+    limits: Mapping[str, float],
+    title: str,
+    path: pathlib.Path,
+    lost_at: np.ndarray | None = None,
+    stalled: np.ndarray | None = None,
+) -> None:
+    """Write quantile bands over time, one panel per quantity (keys of QUANTITIES), all in SI units.
+
+    `bands[quantity][percent]` is that quantile at the times t [T] (s), best taken over the members still alive; NaN
+    where none is left. `limits[quantity]` (> 0) is drawn at plus and minus its value where the data come near it.
+    `lost_at` [N] (s, +inf: never) of all members adds a panel with the share that survives; `stalled` [N] (bool) tells
+    which of them the integrator gave up. Raises ValueError for a quantity that it does not know.
+    """
+    t = np.asarray(t, float)
+    extra = [0.55] if lost_at is not None else []
+    heights = [1.0] * len(bands) + extra
+    figure = Figure(figsize=(8.0, 2.1 * sum(heights) + 0.9), layout="constrained")
+    axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    for ax, (quantity, quantiles) in zip(axes, bands.items(), strict=False):
+        _fan_panel(ax, t, quantity, quantiles, limits.get(quantity, math.inf))
+    if lost_at is not None:
+        _survivors(axes[-1], t, np.asarray(lost_at, float), stalled)
+    if t[-1] > t[0]:
+        axes[-1].set_xlim(t[0], t[-1])
+    axes[-1].set_xlabel("time (s)", fontsize=9)
+    figure.align_ylabels(axes)
+    figure.suptitle(title, fontsize=11)
+    shown = {label: h for ax in axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
+    figure.savefig(path, dpi=150)
+
+
+def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float, np.ndarray], limit: float) -> None:
+    if quantity not in QUANTITIES:
+        raise ValueError(f"fan: cannot draw {quantity!r}; it knows {', '.join(QUANTITIES)}")
+    label, unit = QUANTITIES[quantity]
+    percents = sorted(quantiles)
+    curves = [np.asarray(quantiles[percent], float) for percent in percents]
+    low, high, beyond = _reach(curves)
+    factor, unit = prefixed(unit, max(abs(low), abs(high)))
+    starts = np.arange(0, len(t), max(1, len(t) // BINS))
+    pairs = len(percents) // 2
+    for k in range(pairs):
+        # the least and the largest of each bin, more of them than the picture has pixels
+        lower, upper = np.fmin.reduceat(curves[k], starts), np.fmax.reduceat(curves[-1 - k], starts)
+        name = f"{percents[k]:g} to {percents[-1 - k]:g} %"
+        ax.fill_between(t[starts], factor * lower, factor * upper, color=_tint(k, pairs), linewidth=0, label=name)
+    if len(percents) % 2:
+        middle, words = _median(t, factor * curves[pairs])
+        ax.plot(*middle, color=INK, linewidth=1.0, label=words)
+    # near: the data come within a quarter of the limit
+    near = [value for value, peak in ((limit, high), (-limit, -low)) if limit <= 1.33 * peak]
+    margin = 0.08 * (high - low) or 0.1 * abs(high) or 1.0
+    low, high = min([low - margin, *(1.08 * value for value in near)]), max([high + margin, *(1.08 * v for v in near)])
+    for value in near:
+        ax.axhline(factor * value, color=RED, linestyle="--", linewidth=1.1, label="limit")
+    ax.set_ylim(factor * low, factor * high)
+    if beyond > 0:
+        words = (
+            f"the {percents[0]:g} to {percents[-1]:g} % band goes to {digits(factor * beyond)} {unit}, beyond this axis"
+        )
+        ax.set_title(words, fontsize=7, loc="right", pad=2, color=INK)
+    finish(ax, f"{label}\n({unit})")
+
+
+def _median(t: np.ndarray, y: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], str]:
+    """The median to draw, and its name: where it chatters from instant to instant, its means over parts of the run."""
+    steps = np.diff(y[np.isfinite(y)])
+    turns = np.count_nonzero(np.diff(np.sign(steps)))
+    if turns <= steps.size / 4 or np.abs(steps).sum() <= 20 * np.ptp(y[np.isfinite(y)]):
+        return thin(t, y), "median"
+    starts = np.arange(0, len(t), -(-len(t) // SMOOTHED))
+    parts = zip(np.split(t, starts[1:]), np.split(y, starts[1:]), strict=True)
+    means = [(x.mean(), part[np.isfinite(part)].mean() if np.isfinite(part).any() else np.nan) for x, part in parts]
+    return (np.array(means)[:, 0], np.array(means)[:, 1]), "median, smoothed where it chatters"
+
+
+def _tint(k: int, pairs: int) -> Any:
+    """Blue for the k-th of `pairs` nested bands, counted from outside: the inner, the stronger."""
+    strength = 0.2 + 0.45 * k / max(pairs - 1, 1)
+    return tuple(1 - strength * (1 - part) for part in to_rgb(BLUE))
+
+
+def _reach(curves: Sequence[np.ndarray]) -> tuple[float, float, float]:
+    """Lowest and highest value to show, and the largest size if something brief or rare would dwarf the rest (else 0).
+
+    The rest: all bands but the outermost, for nine tenths of the time.
+    """
+    values, inner = np.concatenate(curves), curves[1:-1] or curves
+    lower, upper = inner[0][np.isfinite(inner[0])], inner[-1][np.isfinite(inner[-1])]
+    values = values[np.isfinite(values)]
+    if not (lower.size and upper.size):
+        return 0.0, 0.0, 0.0
+    low, high = float(values.min()), float(values.max())
+    bottom, top = float(np.quantile(lower, 0.05)), float(np.quantile(upper, 0.95))
+    span = top - bottom
+    if span > 0 and high - low > 8 * span:
+        return bottom - 0.5 * span, top + 0.5 * span, max(abs(low), abs(high))
+    return low, high, 0.0
+
+
+def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray | None) -> None:
+    """The share of members still alive, and a tick for each one lost or given up."""
+    lost = np.sort(lost_at[lost_at <= t[-1]])
+    at = np.linspace(t[0], t[-1], BINS)
+    dead = np.searchsorted(lost, at, side="right")
+    share = 100 * (1 - dead / max(len(lost_at), 1))
+    ax.step(at, share, where="post", color=INK, linewidth=1.2)
+    floor = max(0.0, 100 - 1.6 * max(100 - share[-1], 5.0))
+    top = 100 + 0.12 * (100 - floor)
+    ax.set_ylim(floor - 0.12 * (100 - floor), top)
+    if len(lost):
+        ticks = np.unique(at[np.clip(np.searchsorted(at, lost), 0, BINS - 1)])
+        where = ax.get_xaxis_transform()
+        ax.plot(ticks, np.full(len(ticks), 0.08), "|", color=RED, markersize=7, label="a member ends", transform=where)
+    open_ = 0 if stalled is None else int(np.sum(np.asarray(stalled, bool) & (lost_at <= t[-1])))
+    words = f"{len(lost_at) - len(lost)} of {len(lost_at)} survive ({share[-1]:.4g} %)"
+    words += f", {_fates(len(lost) - open_, open_)}" * bool(len(lost))
+    ax.set_title(words, fontsize=8, loc="right", pad=2, color=INK)
+    ax.yaxis.set_major_locator(MaxNLocator(3))
+    finish(ax, "survivors\n(%)")
+
+
+def _fates(lost: int, stalled: int) -> str:
+    """How many are lost, and how many the integrator gave up."""
+    return f"{lost} lost" + f", {stalled} not decided" * bool(stalled)
+
+
+def histograms(columns: Mapping[str, Any], path: pathlib.Path, metrics: Sequence[str] = CHIEF) -> None:
+    """Write a grid of histograms of the `metrics` that `columns` (members.npz, each [N]) has, survivors and lost apart.
+
+    Who does not survive is read from a finite `lost_at` or `lost_at_s`, without them all survive; and whom of these the
+    integrator gave up from `stalled`.
+    Raises ValueError if `columns` has none of the metrics.
+    """
+    names = [name for name in metrics if name in columns]
+    if not names:
+        raise ValueError(f"histograms: none of {', '.join(metrics)} among the columns {', '.join(columns)}")
+    lost = _lost(columns, len(columns[names[0]]))
+    open_ = int(np.sum(lost & np.asarray(columns.get("stalled", False), bool)))
+    across = min(3, len(names))
+    down = -(-len(names) // across)
+    figure = Figure(figsize=(max(4.0 * across, 5.5), 2.5 * down + 0.8), layout="constrained")
+    axes = figure.subplots(down, across, squeeze=False).ravel()
+    for ax, name in zip(axes, names, strict=False):
+        _histogram(ax, name, np.asarray(columns[name], float), lost)
+    for ax in axes[len(names) :]:
+        ax.set_axis_off()
+    others = "lost members" + " and those not decided" * bool(open_)
+    keys = [Patch(color=BLUE, label="survivors"), Patch(label=others, **LOST)]
+    keys += [Line2D([], [], color=INK, linestyle=s, label=f"{n} of all members") for s, n in MARKS.values()]
+    figure.suptitle(f"{lost.size} members, {_fates(int(lost.sum()) - open_, open_)}", fontsize=11)
+    figure.legend(handles=keys, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    figure.savefig(path, dpi=130)
+
+
+def _lost(columns: Mapping[str, Any], members: int) -> np.ndarray:
+    for name in ("lost_at", "lost_at_s"):
+        if name in columns:
+            return np.isfinite(np.asarray(columns[name], float))
+    return np.zeros(members, bool)
+
+
+def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> None:
+    finite = values[np.isfinite(values)]
+    positive = finite[finite > 0]
+    log = positive.size > 0 and not np.any(finite < 0) and positive.max() > 30 * positive.min()
+    factor, label, unit = named(name, size_of(finite, log))
+    shown = np.isfinite(values) & ((values > 0) | (not log))
+    bounds = _bins(factor * values[shown], log)
+    alive, _ = np.histogram(factor * values[shown & ~lost], bounds)
+    dead, _ = np.histogram(factor * values[shown & lost], bounds)
+    ax.stairs(alive, bounds, fill=True, color=BLUE)
+    if dead.any():
+        ax.stairs(alive + dead, bounds, baseline=alive, fill=True, **LOST)
+    if log:
+        ax.set_xscale("log")
+        log_ticks(ax.xaxis, bounds[0], bounds[-1])
+    notes, reached = [], "reached" in name
+    ranked = np.sort(values[~np.isnan(values)])
+    for share, (style, words) in MARKS.items():
+        value = factor * ranked[math.ceil(share * ranked.size) - 1] if ranked.size else math.nan
+        if math.isfinite(value) and (value > 0 or not log):
+            ax.axvline(value, color=INK, linestyle=style, linewidth=1.2)
+        found = f"{digits(value)} {unit}".rstrip() if math.isfinite(value) else "never" if reached else "none"
+        notes.append(f"{words.removesuffix(' quantile')}: {found}")
+    for count, words in (
+        (np.sum(~np.isfinite(values)), "never" if reached else "not finite"),
+        (np.sum(finite == 0) * log, "at zero"),
+    ):
+        notes += [f"{count} {words}"] if count else []
+    ax.set_title(", ".join(notes), fontsize=8, pad=3)
+    ax.set_xlabel(f"{label} ({unit})" if unit else label, fontsize=9)
+    ax.set_ylim(0, 1.08 * max((alive + dead).max(), 1))
+    ax.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+    finish(ax, "members")
+
+
+def _bins(values: np.ndarray, log: bool) -> np.ndarray:
+    """Edges of 40 bins over the values; a constant gets some room around it."""
+    low, high = (values.min(), values.max()) if values.size else (0.0, 1.0)
+    if log:
+        return np.geomspace(low / 1.001, 1.001 * high, 41)
+    if high - low <= 1e-9 * max(abs(low), abs(high)):
+        room = 0.1 * abs(high) or 1.0
+        return np.linspace(low - room, high + room, 42)  # an odd number of bins: the constant is inside one
+    return np.linspace(low, high, 41)

@@ -1,0 +1,189 @@
+"""Pictures of trajectories: panels of signals, and the paper's Figures 3 to 6 and readings made of them."""
+
+import pathlib
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ambjax.simulation.trajectory import Row, Trajectory
+
+# Okabe and Ito's colours: distinct in print and to colour-blind readers.
+INK, BLUE, ORANGE, GREEN, RED = "#222222", "#0072B2", "#E69F00", "#009E73", "#D55E00"
+BINS = 2000
+# Columns of a panel that are told apart.
+PIXELS = 500
+# Share of the whole run's range that an enlarged panel shows at least.
+FLAT = 0.005
+
+
+class Curve(NamedTuple):
+    """A signal of a Row and how to draw it."""
+
+    signal: str
+    label: str
+    colour: str = BLUE
+    style: str = "-"
+
+
+class Panel(NamedTuple):
+    """Curves that share an axis; values are multiplied by `factor` to reach `unit`."""
+
+    ylabel: str
+    unit: str
+    factor: float
+    curves: tuple[Curve, ...]
+
+
+POSITION = Panel("position", "mm", 1e3, (Curve("z", "$z$"), Curve("r", "$r$", ORANGE, "--")))
+ERROR = Panel("$z - r$", "µm", 1e6, (Curve("e_z", "$z - r$"),))
+CURRENT = Panel("current", "A", 1.0, (Curve("i", "$i$"), Curve("i_ref", "$i_{ref}$", ORANGE, "--")))
+SLIDING = Panel("sliding variable $\\sigma$", "m/s", 1.0, (Curve("sigma", "$\\sigma$"),))
+DISTURBANCE = Panel("disturbance $q_z$", "m/s²", 1.0, (Curve("q_z", "$q_z$"),))
+FORCE = Panel("scaled force", "A²/m²", 1.0, (Curve("v", "$v$"), Curve("v_star", "$v^*$", ORANGE, "--")))
+FORCE_ERROR = Panel("force error $\\tilde v$", "A²/m²", 1.0, (Curve("v_tilde", "$\\tilde v$"),))
+VOLTAGE = Panel("voltage $u$", "V", 1.0, (Curve("u", "$u$"),))
+# Under noise u jumps with each sample, and what a drive gives is near its average over the sample.
+AVERAGED = Panel("voltage $u$,\naveraged", "V", 1.0, (Curve("u_mean", "$u$"),))
+CURRENT_DISTURBANCE = Panel("disturbance $q_i$", "A/s", 1.0, (Curve("q_i", "$q_i$"),))
+
+SIGNALS = (POSITION, CURRENT, SLIDING, DISTURBANCE)
+INPUTS = (FORCE, FORCE_ERROR, VOLTAGE)
+# The paper's Figures 3 to 6: scenario and panels, top to bottom.
+PAPER_FIGURES = {
+    3: ("regulation", SIGNALS),
+    4: ("regulation", INPUTS),
+    5: ("tracking", SIGNALS),
+    6: ("tracking", INPUTS),
+}
+
+
+def thin(t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """At most 2 * BINS points that keep every extreme: the least and the largest of each bin."""
+    if len(t) <= 4 * BINS:
+        return t, y
+    width = len(t) // BINS
+    whole = width * BINS
+    bins = y[:whole].reshape(BINS, width)
+    at = np.sort(np.stack([bins.argmin(1), bins.argmax(1)], 1), 1) + width * np.arange(BINS)[:, None]
+    at = np.append(at.ravel(), len(t) - 1)
+    return t[at], y[at]
+
+
+def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.Path) -> None:
+    """Write the paper's Figure `number` for a trajectory of its scenario."""
+    _, panels = PAPER_FIGURES[number]
+    height = 1.6 * len(panels) + 0.9
+    figure = Figure(figsize=(7.0, height))
+    axes = figure.subplots(len(panels), 1, sharex=True)
+    # Fixed margins (in inches over the height): a layout engine would draw everything twice.
+    figure.subplots_adjust(0.15, 0.5 / height, 0.97, 1 - 0.5 / height, hspace=0.2)
+    for ax, panel in zip(axes, panels, strict=True):
+        draw(ax, panel, trajectory)
+        if panel is FORCE_ERROR and not np.isfinite(trajectory.lost_at):
+            _first_moments(ax, trajectory)
+    axes[-1].set_xlabel("time (s)")
+    figure.align_ylabels(axes)
+    figure.suptitle(title, fontsize=11, y=1 - 0.12 / height)
+    figure.savefig(path, dpi=150)
+
+
+def readings(trajectories: dict[str, Trajectory], title: str, settle: float, path: pathlib.Path) -> None:
+    """Write one picture of a scenario under each reading, a column each: position above, error below."""
+    figure = Figure(figsize=(4.0 * len(trajectories), 4.9), layout="constrained")
+    axes = figure.subplots(2, len(trajectories), squeeze=False)
+    position = POSITION._replace(curves=(Curve("z_measured", "$z$ measured", "#bbbbbb"), *POSITION.curves))
+    for (name, trajectory), (upper, lower) in zip(trajectories.items(), axes.T, strict=True):
+        draw(upper, position, trajectory, first=True)
+        draw(lower, ERROR, trajectory)
+        upper.set_title(name, loc="left", fontsize=10, fontweight="bold")
+        lower.set_xlabel("time (s)", fontsize=9)
+        if not np.isfinite(trajectory.lost_at):
+            late = np.abs(signal_of(trajectory.rows, "e_z")[np.asarray(trajectory.rows.t) >= settle]).max()
+            words = f"at most {1e6 * late:.2g} µm after {settle:g} s"
+            lower.annotate(words, (0.98, 0.06), xycoords="axes fraction", ha="right", fontsize=9, color=INK)
+    figure.suptitle(title, fontsize=11)
+    figure.savefig(path, dpi=130)
+
+
+def draw(
+    ax: Axes,
+    panel: Panel,
+    trajectory: Trajectory,
+    first: bool = False,
+    stretch: tuple[float, float] | None = None,
+) -> None:
+    """A panel of the whole run, or of a stretch of it (s): there, what is too fast to see is a band with its mean."""
+    rows, lost_at = trajectory.rows, float(trajectory.lost_at)
+    t = np.asarray(rows.t)
+    low, high = (t[0], t[-1]) if stretch is None else stretch
+    shown = (t < lost_at) & (t >= low) & (t <= high)
+    for curve in panel.curves:
+        x, y = t[shown], panel.factor * signal_of(rows, curve.signal)[shown]
+        if stretch is None:
+            x, y = thin(x, y)
+        else:
+            x, y = _band(ax, x, y, curve.colour)
+        ax.plot(x, y, curve.style, color=curve.colour, linewidth=1.2, label=curve.label)
+    ax.set_ylabel(f"{panel.ylabel}\n({panel.unit})", fontsize=9)
+    ax.set_xlim(low, high)
+    ax.grid(alpha=0.3, linewidth=0.5)
+    ax.tick_params(labelsize=8)
+    ax.margins(y=0.12)
+    if stretch is not None:
+        _keep_scale(ax, [panel.factor * signal_of(rows, curve.signal)[t < lost_at] for curve in panel.curves])
+    if len(panel.curves) > 1:
+        # Above the panel: inside, it would hide a peak of some run or other.
+        above = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "frameon": False, "borderaxespad": 0.1}
+        ax.legend(fontsize=8, ncols=len(panel.curves), **above)
+    if np.isfinite(lost_at):
+        if stretch is None:
+            ax.set_xlim(0, min(t[-1], max(1.6 * lost_at, 1e-3)))
+        _mark_loss(ax, trajectory, first=first or (stretch is None and panel in (POSITION, FORCE)))
+
+
+def _keep_scale(ax: Axes, whole: list[np.ndarray]) -> None:
+    """No stretch is enlarged so far in height that the last digits of a settled signal look like an event."""
+    ax.ticklabel_format(axis="y", useOffset=False)
+    values = np.concatenate(whole)
+    (low, high), least = ax.get_ylim(), FLAT * np.ptp(values) if values.size else 0.0
+    if high - low < least:
+        ax.set_ylim((low + high - least) / 2, (low + high + least) / 2)
+
+
+def _band(ax: Axes, t: np.ndarray, y: np.ndarray, colour: str) -> tuple[np.ndarray, np.ndarray]:
+    """The curve to draw: y itself, or where samples are far more than pixels its mean, over a band of its extremes."""
+    if len(t) <= 4 * PIXELS:
+        return t, y
+    starts = np.linspace(0, len(t), PIXELS, endpoint=False).astype(int)
+    middle = np.add.reduceat(t, starts) / np.diff([*starts, len(t)])
+    ends = np.minimum.reduceat(y, starts), np.maximum.reduceat(y, starts)
+    ax.fill_between(middle, *ends, color=colour, alpha=0.35, linewidth=0)
+    return middle, np.add.reduceat(y, starts) / np.diff([*starts, len(t)])
+
+
+def _first_moments(ax: Axes, trajectory: Trajectory, until: float = 0.01) -> None:
+    """The first 10 ms, in which the paper's inversion error reaches zero, enlarged."""
+    early = np.asarray(trajectory.rows.t) <= until
+    inset = ax.inset_axes((0.32, 0.3, 0.4, 0.6))
+    inset.plot(1e3 * np.asarray(trajectory.rows.t)[early], signal_of(trajectory.rows, "v_tilde")[early], color=BLUE)
+    inset.set_title("first 10 ms (time in ms)", fontsize=7, pad=2)
+    inset.tick_params(labelsize=7)
+    inset.grid(alpha=0.3, linewidth=0.5)
+
+
+def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:
+    """Shade what follows the loss, and say why."""
+    lost_at, end = float(trajectory.lost_at), float(np.asarray(trajectory.rows.t)[-1])
+    ax.axvspan(lost_at, max(end, ax.get_xlim()[1]), color=RED, alpha=0.12, linewidth=0)
+    ax.axvline(lost_at, color=RED, linewidth=1.0)
+    if first:
+        why = trajectory.lost_why.replace(": ", ":\n").replace(" reached ", "\nreached ")
+        words = f"lost at {lost_at:.4g} s\n{why}"
+        ax.annotate(words, (0.99, 0.06), xycoords="axes fraction", ha="right", va="bottom", fontsize=7, color=INK)
+
+
+def signal_of(rows: Row, name: str) -> np.ndarray:
+    """A signal of rows by its name, floats [T]."""
+    return np.asarray(getattr(rows, name), float)

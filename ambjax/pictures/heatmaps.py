@@ -1,0 +1,135 @@
+"""Heat maps of survival and error over a grid of two quantities."""
+
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from ambjax.pictures.figures import INK
+from ambjax.pictures.scales import edges, log_ticks, named, relabelled, size_of
+
+CONTOUR = 0.95
+# Widths of the contours of survival and of the bounds of its interval; the last is drawn on top.
+LINES = {"low": 0.8, "high": 0.8, "survival": 2.2}
+# Both colour maps run evenly from dark to light: in grey print, too, light is good.
+SURVIVAL, ERROR = "cividis", "viridis_r"
+NOBODY = {"facecolor": "#d4d4d4", "edgecolor": "#8a8a8a", "hatch": "////", "linewidth": 0.0}
+
+
+def maps(
+    panels: Sequence[Mapping[str, Any]],
+    x_label: str,
+    y_label: str,
+    x_log: bool,
+    y_log: bool,
+    path: pathlib.Path,
+    error_metric: str = "settled_max_abs_error_m",
+) -> None:
+    """Write heat maps side by side: survival above and, where a panel has it, the error below.
+
+    A panel has title, x [nx] and y [ny] ascending, survival with the bounds low and high of its confidence interval
+    [ny, nx] (shares 0..1; NaN: not run), and error [ny, nx] (in the unit of `error_metric`; not finite: no survivor) or
+    None. A label that ends in an SI unit, "z (m)", gets its prefix here. Colours are shared along a row. Raises
+    ValueError without panels, and where a log axis has values that are not positive.
+    """
+    if not panels:
+        raise ValueError("maps: no panels to draw")
+    rows = 2 if any(panel["error"] is not None for panel in panels) else 1
+    figure = Figure(figsize=(max(3.9 * len(panels) + 1.4, 6.5), 3.4 * rows + 0.9), layout="constrained")
+    axes = figure.subplots(rows, len(panels), squeeze=False)
+    labels = (x_label, y_label, x_log, y_log)
+    norm = Normalize(0, 100)
+    for ax, panel in zip(axes[0], panels, strict=True):
+        _cells(ax, panel, 100 * np.asarray(panel["survival"], float), norm, SURVIVAL, labels)
+        ax.set_title(f"{panel['title']}\n{_range(panel)}", fontsize=10)
+    figure.colorbar(ScalarMappable(norm, SURVIVAL), ax=list(axes[0]), label="survival (%)", pad=0.02)
+    if rows == 2:
+        _errors(figure, axes[1], panels, error_metric, labels)
+    keys: list[Any] = [
+        Line2D([], [], color=INK, linewidth=LINES["survival"], label="95 % survival"),
+        Line2D([], [], color=INK, linewidth=LINES["low"], label="the same for the bounds of its confidence interval"),
+    ]
+    grids = [grid for panel in panels for grid in (panel["survival"], panel["error"]) if grid is not None]
+    if not all(np.isfinite(grid).all() for grid in grids):
+        keys.append(Patch(label="no survivor" if rows == 2 else "not run", **NOBODY))
+    figure.legend(handles=keys, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    figure.savefig(path, dpi=150)
+
+
+def _errors(figure: Figure, axes: Any, panels: Sequence[Mapping[str, Any]], metric: str, labels: Any) -> None:
+    """The lower row: errors on one logarithmic scale."""
+    errors = [panel["error"] for panel in panels if panel["error"] is not None]
+    values = np.concatenate([np.ravel(np.asarray(error, float)) for error in errors])
+    values = values[np.isfinite(values) & (values > 0)]
+    factor, words, unit = named(metric, size_of(values, log=True))
+    low, high = (factor * values.min(), factor * values.max()) if values.size else (1.0, 1.0)
+    if high < 2 * low:  # a constant too needs some room
+        low, high = low / 1.5, high * 1.5
+    norm = LogNorm(low, high)
+    for ax, panel in zip(axes, panels, strict=True):
+        if panel["error"] is None:
+            ax.set_axis_off()
+            continue
+        error = factor * np.asarray(panel["error"], float)
+        _cells(ax, panel, np.where(error == 0, low, error), norm, ERROR, labels)
+    if values.size:
+        bar = figure.colorbar(ScalarMappable(norm, ERROR), ax=list(axes), label=f"{words} ({unit})", pad=0.02)
+        log_ticks(bar.ax.yaxis, low, high)
+        bar.ax.minorticks_off()
+
+
+def _cells(ax: Axes, panel: Mapping[str, Any], values: np.ndarray, norm: Normalize, colours: str, labels: Any) -> None:
+    """One heat map with its axes and contours; cells that are not finite show the hatched ground."""
+    x_label, y_label, x_log, y_log = labels
+    x, y = np.asarray(panel["x"], float), np.asarray(panel["y"], float)
+    x_factor, x_label = relabelled(x_label, size_of(x, x_log))
+    y_factor, y_label = relabelled(y_label, size_of(y, y_log))
+    x_edges, y_edges = edges(x_factor * x, x_log), edges(y_factor * y, y_log)
+    ax.patch.set(**NOBODY)
+    ax.set_xscale("log" if x_log else "linear")
+    ax.set_yscale("log" if y_log else "linear")
+    ax.pcolormesh(x_edges, y_edges, np.ma.masked_invalid(values), norm=norm, cmap=colours)
+    for name, width in LINES.items():
+        _outline(ax, x_edges, y_edges, np.asarray(panel[name], float) >= CONTOUR, width)
+    ax.set_xlim(x_edges[0], x_edges[-1])
+    ax.set_ylim(y_edges[0], y_edges[-1])
+    for axis, ends, log in ((ax.xaxis, x_edges, x_log), (ax.yaxis, y_edges, y_log)):
+        if log:
+            log_ticks(axis, ends[0], ends[-1])
+    ax.set_xlabel(x_label, fontsize=9)
+    ax.set_ylabel(y_label, fontsize=9)
+    ax.tick_params(labelsize=8)
+
+
+def _outline(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, inside: np.ndarray, width: float) -> None:
+    """Draw the edges between cells inside and outside.
+
+    Not a line interpolated between centres: that would cut through cells where survival falls from all to nothing.
+    """
+    row, column = np.nonzero(inside[:, 1:] != inside[:, :-1])
+    at = x_edges[column + 1]
+    upright = np.stack([np.stack([at, y_edges[row]], 1), np.stack([at, y_edges[row + 1]], 1)], 1)
+    row, column = np.nonzero(inside[1:] != inside[:-1])
+    at = y_edges[row + 1]
+    level = np.stack([np.stack([x_edges[column], at], 1), np.stack([x_edges[column + 1], at], 1)], 1)
+    # a white seam below all of the line, so that it is seen on dark cells
+    for colour, stroke in (("white", width + 1.4), (INK, width)):
+        lines = LineCollection([*upright, *level], colors=colour, linewidths=stroke, capstyle="projecting")
+        ax.add_collection(lines, autolim=False)
+
+
+def _range(panel: Mapping[str, Any]) -> str:
+    """Words on how much of the grid survives: a contour that is absent means either of two things."""
+    share = np.asarray(panel["survival"], float)
+    known = share[np.isfinite(share)]
+    if not known.size:
+        return "no cell was run"
+    return f"95 % or more survive in {int(np.sum(known >= CONTOUR))} of {known.size} cells"

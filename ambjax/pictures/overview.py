@@ -1,0 +1,120 @@
+"""The overview of a run: every signal, the whole of it and enlarged how it starts and how it ends."""
+
+import pathlib
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ambjax.pictures.figures import (
+    AVERAGED,
+    CURRENT,
+    CURRENT_DISTURBANCE,
+    DISTURBANCE,
+    ERROR,
+    FORCE,
+    FORCE_ERROR,
+    GREEN,
+    POSITION,
+    SLIDING,
+    Curve,
+    Panel,
+    draw,
+    signal_of,
+)
+from ambjax.simulation.trajectory import STALLED, Trajectory
+
+# Turns of a chattering voltage that can be followed.
+TURNS = 40
+
+
+def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tuple[float, float] | None = None) -> None:
+    """Write one page with every signal of a run: the whole of it, and enlarged how it starts and how it ends.
+
+    `window` (s): that stretch of it instead.
+    """
+    panels = (POSITION, ERROR, SLIDING, DISTURBANCE, CURRENT, FORCE, FORCE_ERROR, AVERAGED)
+    if np.any(np.asarray(trajectory.rows.q_i)):
+        panels = (*panels, CURRENT_DISTURBANCE, _measured(trajectory))
+    if window is None:
+        columns, grid = _stretches(trajectory), [[panel] * 3 for panel in panels]
+    else:
+        half = len(panels) // 2
+        columns = [(_fate(trajectory), *window), ("", *window)]
+        grid = list(zip(panels[:half], panels[half:], strict=True))
+    # the whole run has as much room as the two others
+    width, height = 13.0, 1.55 * len(grid) + 1.2
+    figure = Figure(figsize=(width, height))
+    # Fixed, in inches: a layout that measures its labels takes as long as everything else.
+    figure.subplots_adjust(1.05 / width, 0.5 / height, 1 - 0.2 / width, 1 - 0.85 / height, wspace=0.24, hspace=0.24)
+    ratios = [2, 1, 1] if window is None else [1, 1]
+    axes = figure.subplots(len(grid), len(columns), sharex="col", squeeze=False, width_ratios=ratios)
+    for row, (line, drawn) in enumerate(zip(axes, grid, strict=True)):
+        for n, (ax, panel, (words, *stretch)) in enumerate(zip(line, drawn, columns, strict=True)):
+            draw(ax, panel, trajectory, stretch=(stretch[0], stretch[1]))
+            if window is None and n:
+                ax.set_ylabel("")
+            if row == 0:
+                ax.set_title(words, fontsize=10, loc="left", pad=16)
+    for ax in axes[-1]:
+        ax.set_xlabel("time (s)")
+    figure.align_ylabels(axes[:, 0])
+    figure.suptitle(title, fontsize=12, y=1 - 0.15 / height, va="top")
+    figure.savefig(path, dpi=130)
+
+
+def _stretches(trajectory: Trajectory) -> list[tuple[str, float, float]]:
+    """The whole run up to shortly after a loss, its start, and its last moments: words, from, to (s)."""
+    t, lost_at = np.asarray(trajectory.rows.t, float), float(trajectory.lost_at)
+    ended = bool(np.isfinite(lost_at))
+    begin, end = t[0], min(lost_at, t[-1])
+    least = t[1] - t[0] if len(t) > 1 else 1e-9  # a loss at the first sample leaves nothing to enlarge
+    start = max(_transient(trajectory, end, ended), least)
+    last = max(_last_moments(trajectory, end), least)
+    beyond = end + 0.15 * (end - begin) * ended
+    return [
+        (_fate(trajectory), begin, max(beyond, begin + least)),
+        (f"the first {_short(start)}", begin, begin + start),
+        (f"the last {_short(last)}", end - last, end + 0.15 * last * ended),
+    ]
+
+
+def _fate(trajectory: Trajectory) -> str:
+    lost_at = float(trajectory.lost_at)
+    if not np.isfinite(lost_at):
+        return ""
+    return (
+        f"{'not decided from' if trajectory.lost_code == STALLED else 'lost at'} {lost_at:.4g} s: {trajectory.lost_why}"
+    )
+
+
+def _short(seconds: float) -> str:
+    return f"{1e3 * seconds:.2g} ms" if seconds < 0.1 else f"{seconds:.2g} s"
+
+
+def _last_moments(trajectory: Trajectory, end: float) -> float:
+    """How much of the end to enlarge, s: 20 ms, a fifth of the run at most, and TURNS of the voltage."""
+    t = np.asarray(trajectory.rows.t, float)
+    longest = min(0.02, (end - t[0]) / 5)
+    late = (t >= end - longest) & (t < end)
+    turning = np.flatnonzero(np.diff(np.sign(np.diff(signal_of(trajectory.rows, "u_mean")[late]))))
+    return longest if turning.size <= TURNS else float(end - t[late][turning[-TURNS]])
+
+
+def _transient(trajectory: Trajectory, end: float, ended: bool) -> float:
+    """How much of the start to enlarge, s: thrice what the errors take to come down.
+
+    At most a twentieth of the run, or a third of it if it ended in a loss.
+    """
+    t = np.asarray(trajectory.rows.t, float)
+    alive = t <= max(end, t[min(1, len(t) - 1)])
+    t, most = t[alive] - t[0], (end - t[0]) / (3 if ended else 20)
+    slowest = 0.0
+    for name in ("e_z", "sigma", "v_tilde", "e"):
+        size = np.abs(signal_of(trajectory.rows, name)[alive])
+        down = size <= max(0.02 * size.max(), 1.5 * size[len(size) // 2 :].max())
+        slowest = max(slowest, t[np.argmax(down)])
+    return min(max(3 * slowest, 20 * (t[1] - t[0]) if len(t) > 1 else 0.0, most / 10), most)
+
+
+def _measured(trajectory: Trajectory) -> Panel:
+    return Panel("measured position", "mm", 1e3, (Curve("z_measured", "$z$ measured", GREEN), Curve("z", "$z$")))

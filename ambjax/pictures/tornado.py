@@ -1,0 +1,66 @@
+"""Tornado charts: what drives a metric."""
+
+import pathlib
+import textwrap
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from ambjax.pictures.figures import BLUE, INK, ORANGE
+from ambjax.pictures.scales import finish, named
+
+MOST_DRIVERS = 12
+TRENDS = {"grows with it": BLUE, "falls with it": ORANGE, "no steady trend": "#8a8a8a"}
+
+
+class Bar(NamedTuple):
+    """A driver: its dotted path, the share it explains with its interval, and its rank correlation with the metric."""
+
+    path: str
+    share: float
+    low: float
+    high: float
+    rho: float
+
+
+def tornado(drivers: Sequence[Bar], metric: str, says: str, path: pathlib.Path) -> None:
+    """Write the share of a metric's variation that each driver explains, the greatest on top, and what that `says`.
+
+    At most 12 bars, coloured by the trend; whiskers from low to high. Raises ValueError without drivers.
+    """
+    if not drivers:
+        raise ValueError("tornado: no drivers; an ensemble without [spread] has none to rank")
+    ranked = sorted(drivers, key=lambda driver: -driver.share)
+    shown = ranked[:MOST_DRIVERS]
+    figure = Figure(figsize=(7.5, 0.36 * len(shown) + 2.2), layout="constrained")
+    ax = figure.subplots()
+    for row, one in enumerate(shown):
+        ax.barh(row, 100 * one.share, height=0.62, color=TRENDS[_trend(one)])
+        ax.plot([100 * one.low, 100 * one.high], [row, row], color=INK, linewidth=1.2, marker="|", markersize=7)
+        words = f"{100 * one.share:.0f} %"
+        ax.text(100 * max(one.share, one.high) + 1.5, row, words, fontsize=8, va="center", color=INK)
+    ax.set_yticks(range(len(shown)), [one.path.removeprefix("spread.") for one in shown])
+    ax.set_ylim(len(shown) - 0.4, -0.6)
+    ax.set_xlim(0, 112)
+    ax.set_xticks(np.linspace(0, 100, 6))
+    more = len(ranked) - len(shown)
+    words = "explains alone, % of how members rank; whiskers: its interval"
+    ax.set_xlabel(words + (f"; {more} weaker not shown" if more else ""), fontsize=9)
+    figure.suptitle(f"What drives {named(metric, 0.0)[1]}", fontsize=11)
+    ax.set_title(textwrap.fill(says, 95), fontsize=8)
+    finish(ax, "")
+    found = dict.fromkeys(_trend(one) for one in shown)
+    keys = [Patch(color=TRENDS[trend], label=trend) for trend in TRENDS if trend in found]
+    figure.legend(handles=keys, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    figure.savefig(path, dpi=150)
+
+
+def _trend(one: Bar) -> str:
+    """Which way the metric goes: a straight trend explains at least half of what is explained, or there is none."""
+    rising, falling, neither = TRENDS
+    if one.share <= 0 or one.rho**2 < 0.5 * one.share:
+        return neither
+    return rising if one.rho > 0 else falling

@@ -1,0 +1,121 @@
+"""Explicit Runge-Kutta methods with equal substeps, for smooth gains: Euler, RK4, DOP853."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.numerics.apart import apart, stored
+from ambjax.numerics.records import Scalar, record
+from ambjax.simulation.integrate import Problem, Times, _Fixed
+from ambjax.simulation.span import Span
+
+
+@functools.cache
+def _combination(weights: tuple[float, ...]) -> Callable[..., Array]:
+    """x + h sum of weight * rate, in a loop of its own: what it is given and gives is stored, never computed again."""
+
+    def plain(x: Array, h: Array, rates: tuple[Array, ...]) -> Array:
+        first, *others = ((w, k) for w, k in zip(weights, rates, strict=True) if w)
+        total = first[0] * first[1]
+        for w, k in others:
+            total = total + w * k
+        return x + h * total
+
+    combined = jax.custom_jvp(apart(plain))
+
+    @combined.defjvp
+    def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
+        (x, h, rates), (dx, dh, d_rates) = primals, tangents
+        slope = sum(w * k for w, k in zip(weights, rates, strict=True) if w)
+        return combined(x, h, rates), combined(dx, h, d_rates) + dh * slope  # tangents are kept from fusion likewise
+
+    return combined
+
+
+class _Explicit(_Fixed):
+    """An explicit Runge-Kutta method: the times of its stages, and weights in the state after each, the new one last.
+
+    Stages are written out, and the state that each begins from is kept from XLA's fusion: fused, shared terms of the
+    right-hand side are computed again for every component of every stage.
+    """
+
+    TIMES: ClassVar[tuple[float, ...]]
+    ROWS: ClassVar[tuple[tuple[float, ...], ...]]
+
+    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
+        inputs = {share: problem.inputs(at(share)) for share in self.TIMES}
+        x, stages, h = state, [], jnp.asarray(h)
+        for share, row, weight in zip(self.TIMES, self.ROWS, self.ROWS[-1], strict=True):
+            rates, shown = problem.watched(inputs[share], x)
+            stages.append(stored(rates))
+            combined = _combination(row)
+            x = jax.tree.map(lambda x, *ks, combined=combined: combined(x, h, ks), state, *stages)
+            # Integrals by the method's own rule; other stages are trial states, and no extremes.
+            span = span.seen(shown, weight * h, h) if len(stages) == 1 else span.weighed(shown, weight * h)
+        return x, span
+
+
+@record
+class Euler(_Explicit):
+    """Explicit Euler, order 1."""
+
+    limit = 2.0
+    TIMES = (0.0,)
+    ROWS = ((1.0,),)
+
+    def __str__(self) -> str:
+        return f"explicit Euler, {self.substeps} substeps"
+
+
+@record
+class RK4(_Explicit):
+    """The classical explicit Runge-Kutta method, order 4."""
+
+    limit = 2.785
+    TIMES = (0.0, 1 / 2, 1 / 2, 1.0)
+    ROWS = ((1 / 2,), (0.0, 1 / 2), (0.0, 0.0, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6))
+
+    def __str__(self) -> str:
+        return f"RK4, {self.substeps} substeps"
+
+
+@record
+class DOP853(_Explicit):
+    """Dormand and Prince's method of order 8, in 12 stages: for held noise, at one or two steps a hold.
+
+    Coefficients: Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I (2nd ed., 1993), II.10. Their
+    error estimates serve steps of variable length only.
+    """
+
+    limit = 6.39
+    # fmt: off
+    TIMES = (0.0, 0.05260015195876773, 0.0789002279381516, 0.1183503419072274, 0.2816496580927726, 1 / 3, 1 / 4,
+             4 / 13, 127 / 195, 3 / 5, 6 / 7, 1.0)
+    ROWS = (
+        (0.05260015195876773,),
+        (0.0197250569845379, 0.0591751709536137),
+        (0.02958758547680685, 0.0, 0.08876275643042054),
+        (0.2413651341592667, 0.0, -0.8845494793282861, 0.924834003261792),
+        (1 / 27, 0.0, 0.0, 0.17082860872947386, 0.12546768756682242),
+        (19 / 512, 0.0, 0.0, 0.17025221101954405, 0.06021653898045596, -9 / 512),
+        (0.03709200011850479, 0.0, 0.0, 0.17038392571223998, 0.10726203044637328, -0.015319437748624402,
+         0.008273789163814023),
+        (0.6241109587160757, 0.0, 0.0, -3.3608926294469414, -0.868219346841726, 27.59209969944671, 20.154067550477894,
+         -43.48988418106996),
+        (0.47766253643826434, 0.0, 0.0, -2.4881146199716677, -0.590290826836843, 21.230051448181193, 15.279233632882423,
+         -33.28821096898486, -0.020331201708508627),
+        (-0.9371424300859873, 0.0, 0.0, 5.186372428844064, 1.0914373489967295, -8.149787010746927, -18.52006565999696,
+         22.739487099350505, 2.4936055526796523, -3.0467644718982196),
+        (2.273310147516538, 0.0, 0.0, -10.53449546673725, -2.0008720582248625, -17.9589318631188, 27.94888452941996,
+         -2.8589982771350235, -8.87285693353063, 12.360567175794303, 0.6433927460157636),
+        (0.054293734116568765, 0.0, 0.0, 0.0, 0.0, 4.450312892752409, 1.8915178993145003, -5.801203960010585,
+         0.3111643669578199, -0.1521609496625161, 0.20136540080403034, 0.04471061572777259),
+    )
+    # fmt: on
+
+    def __str__(self) -> str:
+        return f"DOP853, {self.substeps} substeps"

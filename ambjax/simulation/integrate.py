@@ -1,0 +1,274 @@
+"""Integrators: one signature, `advance`, over one sample period in which the inputs are held.
+
+    advance(problem, t, period, state, memory, code=0) -> Advanced(state, code, t, memory, span)
+
+A `Problem` is a right-hand side on any pytree of scalars, what drives it as a function of time, the
+size of each component that still matters, and the fate of a state: 0 while all is well. An integrator
+stops at the first state whose code is not 0 and returns the last good one; begun with such a code, it
+moves nothing. `memory` is what the method carries from one sample to the next (`start(period)` makes the
+first), `span` what was seen on the way (`ambjax.simulation.span`).
+
+Stage times are moved inside the step by a few units in the last place, so that a jump that falls on
+a step's edge is seen by the steps after it and not by those before: otherwise the last stage sees
+it early and the method falls to first order there.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ambjax.numerics import linear
+from ambjax.numerics.apart import stored
+from ambjax.numerics.records import Scalar, leaf, record, static
+from ambjax.simulation.span import NOTHING, Instant, Span, blank
+from ambjax.simulation.trajectory import ALIVE, STALLED
+
+State = TypeVar("State")
+Inputs = Callable[[Array], Any]
+Rates = Callable[[Any, Any], Any]
+Fate = Callable[[Any], Array]
+# Stage times of one step, by the share of it that has passed.
+Times = Callable[[float], Array]
+
+
+class Problem(NamedTuple):
+    """What is integrated: rates(inputs(t), state), scale (a state) and fate(state) -> code.
+
+    `layer` (a state): the largest error with which a component stays where a smoothed sign turns; None: none does.
+    `observed(inputs(t), state) -> (rates, Instant)`: the rates and what is to be seen; None: nothing is. `shown`: any
+    such instant, for its structure. `jumps`: whether the rates jump at the start of a sample.
+    `slide(inputs(t_0), inputs(t_1), h, state, span) -> (state, span)`, where there is one, is a step made for this
+    very system.
+    """
+
+    inputs: Inputs
+    rates: Rates
+    scale: Any
+    fate: Fate
+    layer: Any = None
+    observed: Callable[[Any, Any], tuple[Any, Instant]] | None = None
+    shown: Instant = NOTHING
+    jumps: bool = False
+    slide: Callable[[Any, Any, Scalar, Any, Span], tuple[Any, Span]] | None = None
+
+    def watched(self, inputs: Any, state: Any) -> tuple[Any, Instant]:
+        """Rates, and what is to be seen."""
+        return (self.rates(inputs, state), NOTHING) if self.observed is None else self.observed(inputs, state)
+
+
+class Advanced(NamedTuple):
+    """The end of one sample period: last good state, fate's code, the time it refers to, memory, what was seen."""
+
+    state: Any
+    code: Array
+    t: Array
+    memory: Any
+    span: Span
+
+
+class Integrator(Protocol):
+    """What `rollout` needs of a method."""
+
+    @property
+    def limit(self) -> float | None:
+        """Largest stable step times slope on the negative real axis; None if there is none."""
+        ...
+
+    def step_size(self, period: float) -> float | None:
+        """The step in s, or None if the method chooses it as it goes."""
+        ...
+
+    def start(self, period: Scalar) -> Any: ...
+
+    def advance(
+        self, problem: Problem, t: Scalar, period: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
+    ) -> Advanced: ...
+
+
+def axpy(state: State, *terms: tuple[Scalar, State]) -> State:
+    """state + sum of factor * direction over the terms, leaf by leaf."""
+    for factor, direction in terms:
+        state = jax.tree.map(lambda x, d, factor=factor: x + factor * d, state, direction)
+    return state
+
+
+def choose(condition: Array, yes: State, no: State) -> State:
+    """jnp.where over whole states."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+def _inside(t: Scalar, h: Scalar) -> Times:
+    """Stage times t + share h, kept strictly inside the step."""
+    eps = jnp.finfo(jnp.result_type(float)).eps
+    inset = 4 * eps * (jnp.abs(jnp.asarray(t)) + h)
+    return lambda share: t + inset + share * (h - 2 * inset)
+
+
+@record
+class _Fixed:
+    """Equal substeps of `_step`, by a loop of fixed length: forward and reverse mode both work."""
+
+    substeps: int = static(default=1, doc="steps per sample period")
+
+    def step_size(self, period: float) -> float | None:
+        return period / self.substeps
+
+    def start(self, period: Scalar) -> Any:
+        return ()
+
+    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
+        raise NotImplementedError
+
+    def advance(
+        self, problem: Problem, t: Scalar, period: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
+    ) -> Advanced:
+        h = jnp.asarray(period) / self.substeps
+
+        def body(index: Array, carry: tuple[Any, Array, Array, Span]) -> tuple[Any, Array, Array, Span]:
+            x, code, reached, span = carry
+            alive = code == ALIVE
+            # Times do not depend on who is alive: members share them, and what is driven by them.
+            new, seen = self._step(problem, _inside(t + index * h, h), h, x, span)
+            code = jnp.where(alive, problem.fate(new), code)
+            x = choose(code == ALIVE, new, x)
+            return x, code, jnp.where(alive, t + (index + 1) * h, reached), choose(alive, seen, span)
+
+        begin = (state, jnp.asarray(code, jnp.int32), jnp.asarray(t, h.dtype), blank(problem.shown))
+        x, code, reached, span = lax.fori_loop(0, self.substeps, body, begin)
+        return Advanced(x, code, reached, memory, span)
+
+
+def rodas3_step(problem: Problem, at: Times, h: Scalar, state: Any) -> tuple[Any, Any, Instant]:
+    """One step of RODAS3, its error estimate and what is seen at its start: order 3(2), L-stable, stiffly accurate.
+
+    Sandu et al., Atmospheric Environment 31 (1997) 3459-3472. One Jacobian, one factorisation of
+    I - h J / 2 and three evaluations a step. Stages are scaled by h, so h = 0 is the identity.
+    """
+    t_0 = at(0.0)
+    rates = jax.jit(problem.rates)  # traced once here, not once per column of the Jacobian
+    given, given_t = jax.jvp(problem.inputs, (t_0,), (jnp.ones_like(t_0),))
+    factors = linear.factor(linear.jacobian(lambda x: rates(given, x), state), h / 2)
+    f_0, f_t, here = jax.jvp(lambda s: problem.watched(s, state), (given,), (given_t,), has_aux=True)
+    given = problem.inputs(at(1.0))
+
+    def stage(f: Any, *couplings: tuple[Scalar, Any]) -> Any:
+        scaled = jax.tree.map(lambda q: h / 2 * q, f)
+        return stored(linear.solve(factors, axpy(scaled, *((c / 2, u) for c, u in couplings))))
+
+    u_1 = stage(axpy(f_0, (h / 2, f_t)))
+    u_2 = stage(axpy(f_0, (1.5 * h, f_t)), (4.0, u_1))
+    y_3 = axpy(state, (2.0, u_1))
+    u_3 = stage(rates(given, y_3), (1.0, u_1), (-1.0, u_2))
+    y_4 = axpy(y_3, (1.0, u_3))
+    u_4 = stage(rates(given, y_4), (1.0, u_1), (-1.0, u_2), (-8.0 / 3.0, u_3))
+    return axpy(y_4, (1.0, u_4)), u_4, here
+
+
+@record
+class Rodas3(_Fixed):
+    """RODAS3 with equal substeps: for stiff loops when a loop of fixed length is wanted (reverse mode)."""
+
+    limit = None
+
+    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
+        new, _, here = rodas3_step(problem, at, h, state)
+        there = problem.watched(problem.inputs(at(1.0)), new)[1]
+        return new, span.seen(here, h / 2, h).seen(there, h / 2)
+
+    def __str__(self) -> str:
+        return f"RODAS3 (L-stable Rosenbrock), {self.substeps} substeps"
+
+
+@record
+class Slide(_Fixed):
+    """Equal substeps of the loop's own step (`ambjax.simulation.sliding`): for stiff gains under held noise.
+
+    Second order in the loop's slow motion, whatever gamma p is; the inversion law must be `inversion.Adaptive`.
+    """
+
+    limit = None
+
+    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
+        if problem.slide is None:
+            raise ValueError("clock.method = Slide(...): it steps loops whose inversion law is 'adaptive'. Use Rodas3.")
+        return problem.slide(problem.inputs(at(0.0)), problem.inputs(at(1.0)), h, state, span)
+
+    def __str__(self) -> str:
+        return f"sliding step, {self.substeps} substeps"
+
+
+@record
+class Adaptive:
+    """RODAS3 whose steps keep the estimated error of each step below `tolerance` (scale + |state|).
+
+    And within the layer of a smoothed sign, where there is one: an error beyond it lands on the sign's other side,
+    the next step back on this one, and the run chatters across in ever smaller steps until it stalls.
+    The corner where a stiff smoothed sign leaves saturation lasts microseconds and comes rarely: steps shrink
+    there and grow again. The step carries over from one sample to the next. A while loop: forward
+    mode and vmap work, reverse mode does not (JAX cannot reverse a loop of unknown length).
+    """
+
+    tolerance: Scalar = leaf(default=1e-6, unit="1", above=0, doc="relative error allowed per step")
+    most_steps: int = static(default=10_000, doc="trial steps per sample period after which the run stalls")
+
+    limit = None
+
+    def step_size(self, period: float) -> float | None:
+        return None
+
+    def start(self, period: Scalar) -> Any:
+        return jnp.asarray(period) * 1e-3
+
+    def advance(
+        self, problem: Problem, t: Scalar, period: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
+    ) -> Advanced:
+        period = jnp.asarray(period)
+
+        def unfinished(carry: Any) -> Array:
+            done, code, trials = carry[2:5]
+            return (done < period) & (code == ALIVE) & (trials < self.most_steps)
+
+        def trial(carry: Any) -> Any:
+            x, h, done, _, trials, before, span = carry
+            left = period - done
+            last = h * 1.0001 >= left
+            taken = jnp.where(last, left, h)
+            new, error, here = rodas3_step(problem, _inside(t + done, taken), taken, x)
+            size = self._size(error, x, new, problem)
+            accept = size <= 1
+            suggested = taken * jnp.clip(0.9 * jnp.maximum(size, 1e-9) ** (-1 / 3), 0.2, 5.0)
+            # A step cut short by the sample's end says little about the next one.
+            h = jnp.where(last & accept, jnp.maximum(h, suggested), suggested)
+            verdict = jnp.where(accept, problem.fate(new), ALIVE)
+            # By the trapezoidal rule, in which this state ends one step and begins the next. Not so the first step
+            # after a jump, by the rule of its end alone: slaved states leave what the jump found within nanoseconds.
+            first = problem.jumps & (done == 0)
+            span = choose(accept, span.seen(here, (before + jnp.where(first, 0.0, taken)) / 2, taken), span)
+            before = jnp.where(accept, jnp.where(first, 2 * taken, taken), before)
+            done = jnp.where(accept, jnp.where(last, period, done + taken), done)
+            return choose(accept & (verdict == ALIVE), new, x), h, done, verdict, trials + 1, before, span
+
+        zero, code = jnp.zeros_like(period), jnp.asarray(code, jnp.int32)
+        begin = (state, lax.stop_gradient(memory), zero, code, jnp.int32(0), zero, blank(problem.shown))
+        x, h, done, code, _, before, span = lax.while_loop(unfinished, trial, begin)
+        end = problem.watched(problem.inputs(_inside(t, done)(1.0)), x)[1]
+        span = choose(done > 0, span.seen(end, before / 2), span)
+        stalled = (code == ALIVE) & (done < period)
+        return Advanced(x, jnp.where(stalled, STALLED, code), t + done, h, span)
+
+    def _size(self, error: Any, x: Any, new: Any, problem: Problem) -> Array:
+        """Root mean square of the error against what is allowed; huge if anything is not finite."""
+        layer = jax.tree.map(lambda _: jnp.inf, problem.scale) if problem.layer is None else problem.layer
+
+        def ratio(e: Array, a: Array, b: Array, s: Array, most: Array) -> Array:
+            return (e / jnp.minimum(self.tolerance * (s + jnp.maximum(jnp.abs(a), jnp.abs(b))), most)) ** 2
+
+        ratios = jax.tree.leaves(jax.tree.map(ratio, error, x, new, problem.scale, layer))
+        size = lax.stop_gradient(jnp.sqrt(sum(ratios) / len(ratios)))
+        return jnp.where(jnp.isfinite(size), size, 1e9)
+
+    def __str__(self) -> str:
+        return f"RODAS3 (L-stable Rosenbrock), adaptive, tolerance {float(self.tolerance):g}"

@@ -1,0 +1,217 @@
+"""The closed loop as one system of ordinary differential equations: plant and cascade together."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.control.cascade import Cascade, CascadeState, Command
+from ambjax.control.inversion import Adaptive
+from ambjax.numerics.records import Scalar, record
+from ambjax.simulation.integrate import Problem
+from ambjax.simulation.sliding import slide, slides
+from ambjax.simulation.span import Instant, Span
+from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
+from ambjax.world.scenario import Scenario
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference, reference_at
+
+# A state this many times its scale has left the model's meaning, long before numbers overflow.
+DIVERGENCE = 1e6
+
+
+class Inputs(NamedTuple):
+    """What reaches the loop from outside at one instant: reference, disturbances (m/s^2, A/s)."""
+
+    reference: Reference
+    q_z: Array
+    q_i: Array
+
+
+class Sizes(NamedTuple):
+    """Signals whose extremes between samples matter: as in a Row. m, m, m/s, V, A, A, A^2/m^2."""
+
+    z: Array
+    e_z: Array
+    sigma: Array
+    u: Array
+    i: Array
+    e: Array
+    v_tilde: Array
+
+
+class Densities(NamedTuple):
+    """What is integrated over time: u (V), u^2 (V^2), and the copper loss in both coils (W)."""
+
+    u: Array
+    u_squared: Array
+    heat: Array
+
+
+# For its structure only.
+SHOWN = Instant(Sizes(*[0.0] * 7), Densities(*[0.0] * 3))  # pyright: ignore[reportArgumentType]
+
+
+class LoopState(NamedTuple):
+    """State of the plant (z, z_dot, i), then of the cascade. The order matters to `linear.factor`."""
+
+    plant: Measurement
+    control: CascadeState
+
+
+@record
+class ClosedLoop:
+    """A cascade in a scenario. `hold` below is the measurement error held over the sample, Measurement-shaped."""
+
+    cascade: Cascade
+    scenario: Scenario
+
+    def realised(self) -> "Realised":
+        """The loop of one member: with its scenario's random signals drawn, and the key of its sensors."""
+        return Realised(self.cascade, self.scenario.realised(), self.scenario.words())
+
+    def words(self) -> tuple[Scalar, Scalar]:
+        """The member's key as two 32-bit words."""
+        return self.scenario.words()
+
+    def hold(self, sample: Scalar) -> Measurement:
+        """Errors of all sensors during sample number `sample`; zeros without a sensor model."""
+        if self.scenario.sensor is None:
+            return Measurement(*[jnp.zeros(())] * 3)
+        return self.scenario.sensor.noise(self.words(), sample)
+
+    def start(self) -> LoopState:
+        """The state at t = 0."""
+        initial = self.scenario.initial
+        plant = Measurement(*(jnp.asarray(x) for x in (initial.z, initial.z_dot, initial.i)))
+        return LoopState(plant, self.cascade.init(add(plant, self.hold(0))))
+
+    def scale(self) -> LoopState:
+        """Size of each component that still matters: 2 % of the gap, that in 0.1 s, 4 % of the bias current."""
+        plant = self.scenario.plant
+        moved = plant.s_0 / 50
+        scale = LoopState(Measurement(moved, 10 * moved, plant.i_0 / 25), self.cascade.scale())
+        return jax.tree.map(jnp.asarray, scale)
+
+    def layer(self) -> LoopState:
+        """The largest error that keeps a component where its smoothed sign turns: for i_ref, that of its law, A."""
+        law, widths = self.cascade.inversion, jax.tree.map(lambda x: jnp.full_like(x, jnp.inf), self.scale())
+        if not isinstance(law, Adaptive):
+            return widths
+        return widths._replace(control=widths.control._replace(inversion=jnp.asarray(law.layer(self.cascade.model))))
+
+    def inputs(self, t: Scalar) -> Inputs:
+        """Everything that depends on time alone."""
+        scenario = self.scenario
+        return Inputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t))
+
+    def command(self, inputs: Inputs, state: LoopState, hold: Measurement) -> tuple[Command, CascadeState, Array]:
+        """What the cascade decides from the measured state, the rates of its states, and the applied voltage."""
+        u_max = jnp.asarray(self.scenario.u_max)
+        seen = add(state.plant, hold)
+        command, rates = self.cascade(seen, state.control, inputs.reference, u_max)
+        return command, rates, _limited(command.u, u_max)
+
+    def rates(self, inputs: Inputs, state: LoopState, hold: Measurement) -> LoopState:
+        """Time derivative of the state: Eqs. (1), (2) and the laws."""
+        _, control, u = self.command(inputs, state, hold)
+        return self.moved(inputs, state, control, u)
+
+    def observed(self, inputs: Inputs, state: LoopState, hold: Measurement) -> tuple[LoopState, Instant]:
+        """The rates, and what is seen of the loop at one instant."""
+        command, control, u = self.command(inputs, state, hold)
+        shown = self.shown(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
+        return self.moved(inputs, state, control, u), shown
+
+    def shown(self, reference: Reference, plant: Measurement, i_ref: Array, v_tilde: Array, u: Array) -> Instant:
+        """What is seen of the loop with this motion and current, their references, input error and voltage."""
+        sigma, heat = self.cascade.position.sigma(plant, reference), self.scenario.plant.copper_loss(plant.i)
+        sizes = Sizes(plant.z, plant.z - reference.r, sigma, u, plant.i, plant.i - i_ref, v_tilde)
+        return Instant(sizes, Densities(u, u * u, heat))
+
+    def moved(self, inputs: Inputs, state: LoopState, control: CascadeState, u: Array) -> LoopState:
+        """Time derivative of the state, given that of the cascade and the applied voltage."""
+        plant, (z, z_dot, i) = self.scenario.plant, state.plant
+        z_ddot, i_dot = plant.rates(z, z_dot, i, u, inputs.q_z, inputs.q_i)
+        return LoopState(Measurement(z_dot, z_ddot, i_dot), control)
+
+    def fate(self, state: LoopState) -> Array:
+        """0 while the rotor is levitated, else the code of what became of it."""
+        sane = [jnp.abs(x) <= DIVERGENCE * s for x, s in zip(*map(jax.tree.leaves, (state, self.scale())), strict=True)]
+        touched = jnp.abs(state.plant.z) >= self.scenario.touchdown
+        return jnp.where(functools.reduce(jnp.logical_and, sane), jnp.where(touched, TOUCHED, ALIVE), DIVERGED).astype(
+            jnp.int32
+        )
+
+    def rest(self, state: LoopState, code: Array) -> LoopState:
+        """The state in which a lost rotor is frozen: at rest, against the stop it touched; controller as it was."""
+        z = state.plant.z
+        stop = jnp.where(z < 0, -1.0, 1.0) * self.scenario.touchdown
+        still = Measurement(jnp.where(code == TOUCHED, stop, z), jnp.zeros_like(z), state.plant.i)
+        return state._replace(plant=still)
+
+    def problem(self, hold: Measurement) -> Problem:
+        """What an integrator is given for one sample."""
+        step = functools.partial(slide, self, hold) if slides(self.cascade) else None
+        rates = lambda inputs, x: self.rates(inputs, x, hold)  # noqa: E731
+        observed = lambda inputs, x: self.observed(inputs, x, hold)  # noqa: E731
+        jumps = self.scenario.sensor is not None
+        return Problem(self.inputs, rates, self.scale(), self.fate, self.layer(), observed, SHOWN, jumps, step)
+
+    def row(self, t: Scalar, state: LoopState, hold: Measurement, alive: Array) -> Row:
+        """All signals at one instant. The drive of a lost rotor is off: u = 0."""
+        plant, (z, z_dot, i) = self.scenario.plant, state.plant
+        inputs = self.inputs(t)
+        command, _, u = self.command(inputs, state, hold)
+        return Row(
+            t=jnp.asarray(t),
+            z=z,
+            z_dot=z_dot,
+            i=i,
+            i_ref=command.i_ref,
+            u=jnp.where(alive, u, 0.0),
+            u_mean=jnp.zeros_like(u),
+            v=plant.v(z, i),
+            v_star=command.v_star,
+            v_tilde=command.v_tilde,
+            sigma=self.cascade.position.sigma(state.plant, inputs.reference),
+            r=inputs.reference.r,
+            q_z=inputs.q_z,
+            q_i=inputs.q_i,
+            z_measured=z + hold.z,
+            heat=jnp.where(alive, plant.copper_loss(i), 0.0),
+            alive=alive,
+        )
+
+    def noted(self, row: Row, span: Span) -> Row:
+        """The row of a sample, with what is known only at its end."""
+        return row._replace(u_mean=span.densities.u / jnp.where(span.time > 0, span.time, 1.0))
+
+    def singularity(self, row: Row) -> Array:
+        """Positive while (z, i_ref) is on the good side of the singular curve C, 0 on it. Eq. (9)."""
+        return self.scenario.plant.singularity(row.z, row.i_ref)
+
+
+@record
+class Realised(ClosedLoop):
+    """The closed loop of one member; `key` is the member's key as two 32-bit words."""
+
+    key: tuple[Scalar, Scalar]
+
+    def realised(self) -> "Realised":
+        return self
+
+    def words(self) -> tuple[Scalar, Scalar]:
+        return self.key
+
+
+def _limited(u: Array, u_max: Array) -> Array:
+    """u held within -u_max..u_max. Not jnp.clip, which looks for NaN at three times the cost."""
+    return jnp.where(u > u_max, u_max, jnp.where(u < -u_max, -u_max, u))
+
+
+def add(x: Measurement, y: Measurement) -> Measurement:
+    """Component by component."""
+    return Measurement(x.z + y.z, x.z_dot + y.z_dot, x.i + y.i)

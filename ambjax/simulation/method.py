@@ -1,0 +1,89 @@
+"""Which integrator, with how many substeps: read off the loop's own slopes."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax.control.cascade import Cascade
+from ambjax.numerics.records import is_traced
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.explicit import RK4
+from ambjax.simulation.integrate import Adaptive, Integrator, Rodas3
+from ambjax.world.scenario import Scenario
+
+# RK4 at this step times slope is accurate to about 1e-9 m on smooth gains (benchmarks/work_precision.py)
+ACCURATE = 1.0
+# More RK4 substeps per sample than this cost more than the L-stable method's larger steps.
+MOST_SUBSTEPS = 4
+# Fixed L-stable steps: the corner of a smoothed sign costs an impulse that grows as slope h^2. At this value the
+# gradient in gamma under held noise is right to 1e-3; with steps twice as long it was 12 % off.
+CORNER = 7.5e-6
+# Error per step of the adaptive method. Without noise, loops that start off centre and fall swing far out, where an
+# error is multiplied by up to 150 before the rotor is caught: at 1e-6 one in 700 of those was off by more than 1e-8 m.
+# Under noise every sample begins with a jump, and this would cost up to twice the steps of the other.
+TOLERANCE, QUIET_TOLERANCE = 1e-6, 1e-7
+
+
+def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
+    """Steepest rate of each law and of the unstable plant, 1/s; the largest over an ensemble.
+
+    Raises ValueError where a gain is traced: a step can be chosen only from numbers.
+    """
+    plant = scenario.plant
+    named = dict(cascade.slopes()) | {"plant": plant.pole}
+    if any(is_traced(x) for x in named.values()):
+        raise ValueError(
+            "clock.method is None (dt = 'auto'), but inside jit, grad or vmap the gains are traced and no "
+            "step can be read off them. Choose it outside: clock = with_method(clock, cascade, scenario)."
+        )
+    return {name: float(np.max(np.asarray(x))) for name, x in named.items()}
+
+
+def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *, reverse: bool = False) -> Integrator:
+    """Adaptive RODAS3, unless RK4 suits better: noise held over slopes that a few substeps resolve.
+
+    Without noise, steps may grow over many slopes and only error control knows how far. Under noise that
+    jumps every sample there is no such gain, and the explicit method is the cheaper one. `reverse` asks
+    for a loop of fixed length, which reverse mode can run: RK4 or RODAS3 with equal substeps. A jump of a
+    disturbance between the steps of these costs about 3e-8 m per m/s^2 on smooth gains.
+    """
+    slope = max(slopes(cascade, scenario).values())
+    substeps = math.ceil(sample_period * slope / ACCURATE)
+    if substeps <= MOST_SUBSTEPS and (reverse or scenario.sensor is not None):
+        return RK4(max(substeps, 1))
+    if reverse:
+        return Rodas3(math.ceil(sample_period / math.sqrt(CORNER / slope)))
+    # Rounding must stay well below the tolerance, or steps are rejected for noise: in float32, 1.2e-4.
+    tolerance = QUIET_TOLERANCE if scenario.sensor is None else TOLERANCE
+    return Adaptive(max(tolerance, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps)))
+
+
+def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: bool = False) -> Clock:
+    """`clock` with its method chosen if it had none, and checked against its stability limit if it had.
+
+    Raises ValueError for an explicit step beyond the limit, naming both and the fix.
+    """
+    if clock.method is None:
+        method = choose_method(cascade, scenario, float(clock.sample_period), reverse=reverse)
+        return dataclasses.replace(clock, method=method)
+    if clock.method.limit is not None:
+        _check_limit(clock, cascade, scenario)
+    return clock
+
+
+def _check_limit(clock: Clock, cascade: Cascade, scenario: Scenario) -> None:
+    try:
+        named = slopes(cascade, scenario)
+        step = clock.method.step_size(float(np.max(np.asarray(clock.sample_period))))
+    except (ValueError, jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
+        return  # traced: the caller checked the concrete values, or takes the risk
+    law = max(named, key=lambda name: named[name])
+    limit = clock.method.limit / named[law]
+    if step > limit:
+        raise ValueError(
+            f"clock.dt = {step:g} s: {clock.method} is stable only up to {limit:.3g} s, because the "
+            f"{law} law has slope {named[law]:.3g} 1/s. Use dt = 'auto', method = 'rodas3', or a smaller dt."
+        )

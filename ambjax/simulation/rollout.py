@@ -1,0 +1,166 @@
+"""Rollout: a cascade in a scenario, sample by sample, to a trajectory, to folds, or to both."""
+
+import functools
+from typing import Any, NamedTuple, Protocol, Self
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ambjax.control.cascade import Cascade
+from ambjax.numerics.kernel import one_kernel
+from ambjax.numerics.records import Scalar, canonical, validate
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.integrate import Problem
+from ambjax.simulation.loop import ClosedLoop
+from ambjax.simulation.method import with_method
+from ambjax.simulation.metrics import Ending, Fold
+from ambjax.simulation.span import Span
+from ambjax.simulation.trajectory import ALIVE, Trajectory, first_time
+from ambjax.world.scenario import Scenario
+from ambjax.world.sensor import Measurement
+
+
+class Outcome(NamedTuple):
+    """A trajectory (its rows are None if none were recorded) and the result of the fold (None without one)."""
+
+    trajectory: Trajectory
+    measured: Any
+
+
+class System(Protocol):
+    """What is rolled out: the closed loop, or the closed loop with something attached to its state."""
+
+    def realised(self) -> Self: ...
+    def hold(self, sample: Scalar) -> Measurement: ...
+    def start(self) -> Any: ...
+    def problem(self, hold: Measurement) -> Problem: ...
+    def rest(self, state: Any, code: Array) -> Any: ...
+    def row(self, t: Scalar, state: Any, hold: Measurement, alive: Array) -> Any: ...
+    def noted(self, row: Any, span: Span) -> Any: ...
+    def singularity(self, row: Any) -> Array: ...
+
+
+class Progress(NamedTuple):
+    """What travels from sample to sample."""
+
+    state: Any
+    ending: Ending
+    memory: Any
+    fold: Any
+
+
+def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | None = None, every: int = 1) -> Outcome:
+    """Simulate `scenario.plant` under `cascade` for `clock.samples` sample periods.
+
+    Rows are recorded at the start of every `every`-th sample (0: none), and `fold` sees every
+    sample, so metrics need no stored trajectory. Pure and jitted; works under vmap, jvp and grad (an
+    adaptive method: forward mode only). A rotor that touches down, or a state that leaves the
+    model's range, is frozen and reported in the trajectory; values and derivatives stay finite.
+
+    Raises ValueError for a bad gain, parameter or clock, for an explicit step beyond its stability
+    limit, and where the method is to be chosen but gains are traced (choose it outside: `with_method`).
+    """
+    check_inputs(cascade, scenario, clock)
+    clock = with_method(clock, cascade, scenario)
+    loop, clock, fold = canonical((ClosedLoop(cascade, scenario), clock, fold))
+    return roll(loop, clock, fold, every=every)
+
+
+def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
+    """Raise ValueError, with the dotted path and the fix, for whatever concrete value is not allowed."""
+    validate(cascade, "controller")
+    validate(scenario, "scenario")
+    validate(clock, "clock")
+    if clock.samples < 1:
+        raise ValueError(f"clock.samples = {clock.samples}: there must be at least 1 sample.")
+
+
+def run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:
+    """The whole rollout, unjitted and unchecked: what `rollout` compiles, and ensembles map over members."""
+    progress, rows = segment(system, clock, fold, begin(system, clock, fold), 0, clock.samples, every)
+    return finish(progress, rows, fold)
+
+
+roll = one_kernel(run, static_argnames=("every",))
+
+
+def begin(system: System, clock: Clock, fold: Fold | None) -> Progress:
+    """Before the first sample."""
+    system = system.realised()
+    dtype = jnp.result_type(float)
+    state = jax.tree.map(lambda x: jnp.asarray(x, dtype), system.start())
+    never = jnp.asarray(jnp.inf, dtype)
+    ending = Ending(system.problem(system.hold(0)).fate(state), never, never, jnp.asarray(clock.duration, dtype))
+    ending = ending._replace(lost_at=jnp.where(ending.lost_code == ALIVE, never, 0.0))
+    memory = clock.method.start(jnp.asarray(clock.sample_period, dtype))
+    return Progress(state, ending, memory, () if fold is None else fold.init())
+
+
+def segment(
+    system: System, clock: Clock, fold: Fold | None, progress: Progress, first: Scalar, count: int, every: int
+) -> tuple[Progress, Any]:
+    """`count` samples from number `first` on, and the rows recorded on the way (None if every = 0)."""
+    step = functools.partial(_sample, system.realised(), clock, fold)
+
+    def unrecorded(progress: Progress, first: Scalar, count: int) -> Progress:
+        return lax.fori_loop(0, count, lambda n, progress: step(progress, first + n)[0], progress)
+
+    def block(progress: Progress, k: Array, length: int) -> tuple[Progress, Any]:
+        progress, row = step(progress, k)
+        if length > 1:
+            progress = unrecorded(progress, k + 1, length - 1)
+        return progress, row
+
+    if every == 0:
+        return unrecorded(progress, first, count), None
+    starts = first + every * jnp.arange(count // every)
+    progress, rows = lax.scan(functools.partial(block, length=every), progress, starts)
+    if rest := count % every:
+        progress, last = block(progress, jnp.asarray(first + count - rest), rest)
+        rows = jax.tree.map(lambda many, one: jnp.concatenate([many, one[None]]), rows, last)
+    return progress, rows
+
+
+begin_jit = one_kernel(begin)
+segment_jit = one_kernel(segment, static_argnames=("count", "every"))
+
+
+def finish(progress: Progress, rows: Any, fold: Fold | None) -> Outcome:
+    """After the last sample."""
+    lost_code, lost_at, singular_at, _ = progress.ending
+    measured = None if fold is None else fold.result(progress.fold, progress.ending)
+    return Outcome(Trajectory(rows, lost_at, lost_code, singular_at), measured)
+
+
+def _sample(system: System, clock: Clock, fold: Fold | None, progress: Progress, k: Array) -> tuple[Progress, Any]:
+    """Observe at the start of sample k, then integrate to its end with its measurement error held.
+
+    Recomputed in reverse mode, so that memory there grows with samples and not with substeps.
+    """
+
+    @functools.partial(jax.checkpoint, prevent_cse=False)
+    def run(system: System, clock: Clock, fold: Fold | None, progress: Progress) -> tuple[Progress, Any]:
+        state, ending, memory, folded = progress
+        dtype = jnp.result_type(float)
+        t = k.astype(dtype) * clock.sample_period
+        hold = system.hold(k)
+        alive = ending.lost_code == ALIVE
+        # A jump at this instant belongs to this sample even if t was rounded to just before it.
+        row = system.row(t * (1 + 4 * jnp.finfo(dtype).eps), state, hold, alive)._replace(t=t)
+        after = clock.method.advance(system.problem(hold), t, clock.sample_period, state, memory, ending.lost_code)
+        row = system.noted(row, after.span)
+        folded = folded if fold is None else fold.update(folded, row, after.span)
+        lost_now = alive & (after.code != ALIVE)
+        resting = system.rest(after.state, after.code)
+        state = jax.tree.map(lambda a, b: jnp.where(lost_now, a, b), resting, after.state)
+        crossed = alive & (system.singularity(row) <= 0)
+        ending = Ending(
+            after.code,
+            jnp.where(lost_now, after.t, ending.lost_at),
+            first_time(crossed, t, ending.singular_at),
+            ending.duration,
+        )
+        return Progress(state, ending, after.memory, folded), row
+
+    return run(system, clock, fold, progress)

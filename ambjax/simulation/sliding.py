@@ -1,0 +1,201 @@
+"""One step of the closed loop that knows where its stiffness is: the adaptive inversion law.
+
+Under measurements that jump every sample, i_ref slides to its new place within microseconds and is
+slaved to it for the rest: w' = d - gamma sgn(w) for w = v_star - v(z, i_ref), Eq. (14a). A linearised
+implicit step sees no stiffness while the sign is saturated and overshoots by gamma h; an explicit one
+needs steps below 1/(gamma p). Here the step is cut where the slide ends, the slaved part is solved
+implicitly with the whole arctan (not its slope), and the supply's limit is applied to each part: while
+i_ref slides the voltage is at its limit, and the current sees an impulse, not the whole jump.
+
+The rotor's motion and the states of the other laws go by Heun's method, the current by an exponential step.
+Quotients are written as products with a reciprocal, which divides once for the value and for all its derivatives.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.control.inversion import Adaptive, v_and_gradient
+from ambjax.control.laws import CurrentDemand, CurrentInputs
+from ambjax.numerics.apart import apart, stored
+from ambjax.numerics.records import Scalar
+from ambjax.numerics.smooth import TWO_OVER_PI, reciprocal, smooth_sign
+from ambjax.simulation.span import Instant, Span
+from ambjax.world.sensor import Measurement
+
+# Newton steps on the slaved sign: monotone from below; they leave less than 1e-3 of the right-hand side.
+NEWTON = 6
+# |w| p below which w is slaved at once. Within the layer it relaxes in 1/(gamma p), not at its initial rate: a slide
+# there would end anywhere in the step for a change of w by a millionth, and derivatives would be such cliffs'.
+EDGE = 1.0
+
+
+def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
+    """The state of a ClosedLoop whose inversion law is `inversion.Adaptive` after h; `begin`, `end`: its inputs."""
+    cascade, scenario = loop.cascade, loop.scenario
+    model, law, (z, z_dot, i), control = cascade.model, cascade.inversion, state.plant, state.control
+    i_ref = control.inversion
+    per_h = 1 / jnp.where(h > 0, h, 1.0)
+
+    force_0, seen_0, rates_0 = cascade.demand(_add(state.plant, hold), control, begin.reference)
+    z_ddot_0 = scenario.plant.z_ddot(z, i, begin.q_z)
+    ahead = Measurement(z + h * z_dot + h * h / 2 * z_ddot_0, z_dot + h * z_ddot_0, i)
+    moved = control._replace(
+        observer=_axpy(control.observer, h, rates_0.observer), position=_axpy(control.position, h, rates_0.position)
+    )
+    ahead, moved, force_0 = stored((ahead, moved, force_0))
+    force_1, seen_1, rates_1 = cascade.demand(_add(ahead, hold), moved, end.reference)
+
+    v_0, gradient_0 = v_and_gradient(model, force_0, i_ref)
+    v_1, gradient_1 = v_and_gradient(model, force_1, i_ref)
+    w = force_0.v_star - v_0
+    drift = (force_1.v_star - v_1 - w) * per_h
+    w, drift = stored((w, drift))
+    sliding, slaved, tau = relax(w, drift, law.gamma, law.p, h)
+    w_1 = w + tau * (drift - sliding)
+    w_2 = w_1 + (h - tau) * (drift - slaved)
+    sliding, slaved = sliding * reciprocal(gradient_0), slaved * reciprocal(gradient_1)
+
+    sliding, slaved, tau, force_1 = stored((sliding, slaved, tau, force_1))
+
+    def current(plant: Measurement, seen: Measurement, i_ref: Array, rate: Array, inner: Any, q_i: Array, h: Array):
+        """i - i_ref and the current law's state after h at constant i_ref' = rate; and what is seen on the way."""
+
+        def rate_of(i: Array) -> tuple[Array, Any]:
+            inputs = CurrentInputs(seen._replace(i=i + hold.i), CurrentDemand(i_ref, rate), scenario.u_max)
+            u, inner_rate = cascade.current(model, inputs, inner)
+            u = jnp.clip(u, -scenario.u_max, scenario.u_max)
+            return scenario.plant.i_dot(plant.z, plant.z_dot, i, u, q_i), (inner_rate, u)
+
+        i_dot, slope, (inner_rate, u) = jax.jvp(rate_of, (plant.i,), (jnp.ones_like(plant.i),), has_aux=True)
+        phi, volts = _phi(h * slope), scenario.plant.u_per_i_dot(plant.z)
+        e = plant.i - i_ref + h * phi * (i_dot - rate)
+        return e, _axpy(inner, h, inner_rate), _Voltage(u, (rate - i_dot) * volts, h * slope, phi)
+
+    e, inner, first = current(state.plant, seen_0, i_ref, sliding, control.current, begin.q_i, tau)
+    e, inner = stored((e, inner))
+    i_ref_0, i_ref = i_ref, i_ref + tau * sliding
+    middle = Measurement((z + ahead.z) / 2, (z_dot + ahead.z_dot) / 2, i_ref + e)
+    seen = jax.tree.map(lambda a, b: (a + b) / 2, seen_0, seen_1)
+    # The current moves fast while it slides: what counts at the start of the rest is where it ended.
+    z_ddot_0 += (1 - tau * per_h) * (scenario.plant.z_ddot(z, middle.i, begin.q_z) - z_ddot_0)
+    e, inner, second = current(middle, seen, i_ref, slaved, inner, end.q_i, h - tau)
+    e, inner = stored((e, inner))
+    i_ref = i_ref + (h - tau) * slaved
+    z_ddot_1 = scenario.plant.z_ddot(ahead.z, i_ref + e, end.q_z)
+    plant = Measurement(
+        z + h * z_dot + h * h / 6 * (2 * z_ddot_0 + z_ddot_1), z_dot + h / 2 * (z_ddot_0 + z_ddot_1), i_ref + e
+    )
+    # a slide of no length is none: w was within the sign's layer
+    shown = (
+        loop.shown(begin.reference, state.plant, i_ref_0, w, jnp.where(tau > 0, first.u, second.u)),
+        loop.shown(begin.reference, state.plant._replace(i=middle.i), i_ref - (h - tau) * slaved, w_1, second.u),
+        loop.shown(end.reference, plant, i_ref, w_2, second.end(scenario.u_max)),
+    )
+    span = _seen(span, shown, first.u, second, tau, h - tau)
+    control = control._replace(
+        observer=_axpy(_axpy(control.observer, h / 2, rates_0.observer), h / 2, rates_1.observer),
+        position=_axpy(_axpy(control.position, h / 2, rates_0.position), h / 2, rates_1.position),
+        inversion=i_ref,
+        current=inner,
+    )
+    return state._replace(plant=plant, control=control), span
+
+
+class _Voltage(NamedTuple):
+    """u over one part of a step, as the exponential step has it: u + off (1 - exp(x s)), s from 0 to 1."""
+
+    u: Array
+    off: Array
+    x: Array
+    phi: Array
+    """(exp(x) - 1) / x"""
+
+    def end(self, u_max: Scalar) -> Array:
+        """u at the end, V."""
+        return jnp.clip(self.u - self.off * self.x * self.phi, -u_max, u_max)
+
+    def moments(self) -> tuple[Array, Array]:
+        """Means of u, V, and of u^2, V^2."""
+        rest, once, twice = self.u + self.off, self.off * self.phi, self.phi * (1 + self.x * self.phi / 2)
+        return rest - once, rest * (rest - 2 * once) + self.off * self.off * twice
+
+
+def _seen(span: Span, shown: tuple[Instant, ...], u: Array, rest: _Voltage, tau: Array, left: Array) -> Span:
+    """The span, and a step: `u` for tau, then the rest of it, with what is shown at its start, turn and end."""
+    before = span.densities
+    for instant, weight in zip(shown, (tau / 2, (tau + left) / 2, left / 2), strict=True):
+        span = span.seen(instant, weight)
+    mean, square = stored(rest).moments()
+    densities = span.densities._replace(
+        u=before.u + tau * u + left * mean, u_squared=before.u_squared + tau * u * u + left * square
+    )
+    return span._replace(time=span.time + tau + left, densities=densities)
+
+
+def relax(w: Array, drift: Array, gain: Scalar, p: Scalar, h: Scalar) -> tuple[Array, Array, Array]:
+    """w' = drift - gain sgn(w) over h, as two constant rates of `gain sgn(w)`: (first, second, time of the first).
+
+    First it slides at its initial rate to the sign's layer (or to the end); then it is slaved, one backward Euler step.
+    """
+    first = gain * smooth_sign(w, p)
+    closing = first - drift
+    outside = jnp.sign(w) * jnp.maximum(jnp.abs(w) - EDGE / p, 0.0)
+    safe = jnp.where(closing == 0, 1.0, closing)
+    tau = jnp.where(outside * closing > 0, jnp.minimum(outside * (1 / safe), h), 0.0)
+    left = h - tau
+    return first, gain * smooth_sign(_implicit(w - tau * closing + left * drift, left * gain, p), p), tau
+
+
+@jax.custom_jvp
+def _implicit(b: Array, reach: Array, p: Scalar) -> Array:
+    """The w with w + reach sgn(w) = b, by Newton's method from below: the left side is concave in |w|.
+
+    Its derivative is that of the equation, not of the iteration: a fifth of the work.
+    """
+    size = jnp.abs(b)
+    w = jnp.maximum(size / (1 + reach * p * TWO_OVER_PI), size - reach)
+    for _ in range(NEWTON):
+        slope = 1 + reach * p * TWO_OVER_PI / (1 + (p * w) ** 2)
+        w = w + (size - w - reach * smooth_sign(w, p)) / slope
+    return jnp.where(b < 0, -w, w)
+
+
+@_implicit.defjvp
+def _implicit_jvp(primals: tuple[Array, Array, Scalar], tangents: tuple[Any, Any, Any]) -> tuple[Array, Array]:
+    (b, reach, p), (db, d_reach, dp) = primals, tangents
+    w = _implicit(b, reach, p)
+    flat = TWO_OVER_PI / (1 + (p * w) ** 2)
+    change = db - smooth_sign(w, p) * d_reach - reach * flat * w * dp
+    return w, change * reciprocal(1 + reach * p * flat)
+
+
+@jax.custom_jvp
+@apart
+def _phi(x: Array) -> Array:
+    """(exp(x) - 1) / x."""
+    small = jnp.abs(x) < 1e-3
+    return jnp.where(small, 1 + x / 2 + x * x / 6, (jnp.exp(x) - 1) * (1 / jnp.where(small, 1.0, x)))
+
+
+@_phi.defjvp
+def _phi_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (dx,) = primals, tangents
+    y, small = _phi(x), jnp.abs(x) < 1e-3
+    slope = jnp.where(small, 1 / 2 + x / 3 + x * x / 8, (1 + (x - 1) * y) * (1 / jnp.where(small, 1.0, x)))
+    return y, slope * dx
+
+
+def _add(x: Measurement, y: Measurement) -> Measurement:
+    return Measurement(x.z + y.z, x.z_dot + y.z_dot, x.i + y.i)
+
+
+def _axpy(x: Any, h: Scalar, rate: Any) -> Any:
+    return jax.tree.map(lambda a, b: a + h * b, x, rate)
+
+
+def slides(cascade: Any) -> bool:
+    """Whether this step is made for the cascade."""
+    return isinstance(cascade.inversion, Adaptive)

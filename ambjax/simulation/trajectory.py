@@ -1,0 +1,103 @@
+"""What happened: one row per recorded sample, and the fate of the rotor."""
+
+import pathlib
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.numerics.records import Scalar, record
+
+# Why a rotor was lost. Codes travel inside compiled code; people read the words.
+ALIVE, TOUCHED, DIVERGED, STALLED = range(4)
+FATES = (
+    "",
+    "touched down: |z| reached the clearance",
+    "diverged: a state left the range in which the model means anything",
+    "stalled: the integrator could not meet its tolerance",
+)
+
+
+class Row(NamedTuple):
+    """One sample of a closed loop, SI units. In a Trajectory every field has a leading time axis."""
+
+    t: Array
+    """time, s"""
+    z: Array
+    """rotor displacement, m"""
+    z_dot: Array
+    """its rate, m/s"""
+    i: Array
+    """current deviation, A"""
+    i_ref: Array
+    """its reference, A"""
+    u: Array
+    """applied voltage (after the supply's limit; 0 once lost), V"""
+    u_mean: Array
+    """the same, averaged over the sample that begins at t: what is left of spikes shorter than a sample, V"""
+    v: Array
+    """scaled magnetic force v(z, i), A^2/m^2. Eq. (3)"""
+    v_star: Array
+    """demanded scaled force, A^2/m^2. Eq. (5)"""
+    v_tilde: Array
+    """input error v_star - v(z, i_ref) as the controller computed it, A^2/m^2"""
+    sigma: Array
+    """sliding variable of the true motion, m/s"""
+    r: Array
+    """reference, m"""
+    q_z: Array
+    """disturbance acceleration, scaled force included, m/s^2"""
+    q_i: Array
+    """disturbance of the current's rate, A/s"""
+    z_measured: Array
+    """displacement as the sensor reports it, m"""
+    heat: Array
+    """copper loss in both coils, W"""
+    alive: Array
+    """whether the rotor was still levitated, bool"""
+
+    @property
+    def e_z(self) -> Array:
+        """Tracking error z - r, m."""
+        return self.z - self.r
+
+    @property
+    def e(self) -> Array:
+        """Current tracking error i - i_ref, A. Eq. (10)."""
+        return self.i - self.i_ref
+
+
+NOT_SAVED = ("heat", "alive")
+
+
+@record
+class Trajectory:
+    """Rows, and the fate: when and why the rotor was lost, and when C was first crossed (+inf: never)."""
+
+    rows: Row
+    lost_at: Scalar
+    lost_code: Scalar
+    singular_at: Scalar
+
+    @property
+    def lost_why(self) -> str:
+        """Why the rotor was lost, in words; empty if it was not. One member only."""
+        return FATES[int(self.lost_code)]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Every saved array by name, float64, and the fate."""
+        named = {k: np.asarray(v, np.float64) for k, v in self.rows._asdict().items() if k not in NOT_SAVED}
+        named["lost_at"] = np.asarray(self.lost_at, np.float64)
+        named["lost_why"] = np.asarray(self.lost_why)
+        named["singular_at"] = np.asarray(self.singular_at, np.float64)
+        return named
+
+    def save(self, path: str | pathlib.Path) -> None:
+        """Write trajectory.npz."""
+        np.savez_compressed(path, **self.arrays())  # pyright: ignore[reportArgumentType]
+
+
+def first_time(condition: Array, t: Scalar, earlier: Scalar) -> Array:
+    """`earlier` if it is finite already, else t where `condition` holds, else +inf."""
+    return jnp.where(jnp.isfinite(earlier), earlier, jnp.where(condition, t, jnp.inf))

@@ -1,0 +1,171 @@
+"""Theorem 1, monitored: its conditions with margins along a run, each with the time of its worst value.
+
+Conditions: k > Q_z, k_i > Q_i, gamma > Delta_1 (Eq. 7) and (z, i_ref) off the singular curve C (Eq. 9).
+The steps of the proof are reported as residuals (see `ambjax.theorem.proof`). A condition on a gain that a law
+does not have is reported as not applicable.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.control import current, inversion, position
+from ambjax.control.cascade import Cascade
+from ambjax.numerics.records import canonical
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.loop import ClosedLoop
+from ambjax.simulation.method import with_method
+from ambjax.simulation.metrics import Lowest, Named, Peak
+from ambjax.simulation.rollout import check_inputs, roll
+from ambjax.simulation.trajectory import FATES, STALLED
+from ambjax.theorem.proof import Monitored
+from ambjax.world.plant import Plant
+from ambjax.world.scenario import Scenario
+from ambjax.world.signals import Signal, reference_at
+
+
+@dataclasses.dataclass(frozen=True)
+class Condition:
+    """One line of the check: what must hold, the two sides, the margin, and the time of its worst value (s).
+
+    `holds` is None for a line that informs without deciding, or whose gain the law does not have. `path`: of the
+    gain, as in a case file, if the line is about one. `ideal`: the run has no part in `against`, only the reference.
+    """
+
+    name: str
+    requires: str
+    gain: float | None
+    against: float
+    at_s: float
+    unit: str
+    holds: bool | None
+    note: str = ""
+    path: str = ""
+    ideal: bool = False
+
+    @property
+    def margin(self) -> float | None:
+        """How much is left: positive where the condition holds."""
+        return None if self.gain is None else self.gain - self.against
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """All conditions, the proof's residuals, and the fate of the run."""
+
+    conditions: list[Condition]
+    proof: list[Condition]
+    lost_at: float
+    lost_why: str
+    method: str
+    stalled: bool = False
+
+    @property
+    def lost(self) -> bool:
+        """Whether the rotor is lost: not so where the integrator gave up, which decides nothing."""
+        return math.isfinite(self.lost_at) and not self.stalled
+
+    @property
+    def holds(self) -> bool:
+        """Whether every deciding condition holds and the rotor is levitated to the end."""
+        return math.isinf(self.lost_at) and not any(c.holds is False for c in self.conditions)
+
+
+MONITORS = Named(
+    {name: Peak(name, timed=True) for name in ("q_z", "q_i", "d", "q_z_plus_h", "sigma_off", "v_tilde_off", "e_off")}
+    | {name: Lowest(name) for name in ("distance", "V_margin")}
+)
+
+
+def check(cascade: Cascade, scenario: Scenario, clock: Clock) -> Report:
+    """Run the loop once, monitored, and judge the conditions of Theorem 1 along it.
+
+    Raises ValueError as `rollout` does.
+    """
+    check_inputs(cascade, scenario, clock)
+    clock = with_method(clock, cascade, scenario)
+    method = str(clock.method)
+    system, clock, fold = canonical((Monitored(ClosedLoop(cascade, scenario)), clock, MONITORS))
+    trajectory, seen = roll(system, clock, fold, every=0)
+    worst = {name: (float(value), float(at)) for name, (value, at) in seen.items()}
+    on_reference = delta_1_on_reference(cascade, scenario, clock)
+    conditions = _conditions(cascade, worst, on_reference)
+    code = int(trajectory.lost_code)
+    return Report(conditions, _proof(worst), float(trajectory.lost_at), FATES[code], method, code == STALLED)
+
+
+def delta_1_on_reference(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[float, float]:
+    """sup |v_star' - (dv/dz) r_dot| on the ideal motion z = r, undisturbed, and when: Eq. (7) without transients.
+
+    What gamma must exceed merely to follow the reference on the nominal plant, A^2/m^2/s and s.
+    """
+    times = jnp.arange(min(clock.samples, 20_000)) * (clock.duration / min(clock.samples, 20_000))
+    values = np.asarray(_drift(*canonical((cascade.model, scenario.realised().reference)), times))
+    worst = int(np.argmax(values))
+    return float(values[worst]), float(times[worst])
+
+
+@jax.jit
+def _drift(model: Plant, reference: Signal, times: Array) -> Array:
+    def demanded(t: Array) -> Array:
+        r, _, r_ddot, _ = reference_at(reference, t)
+        return (-2 * model.k_z / model.m * r + r_ddot + model.g) / model.a
+
+    def drift(t: Array) -> Array:
+        r, r_dot, *_ = reference_at(reference, t)
+        v_star, v_star_dot = jax.jvp(demanded, (t,), (jnp.ones_like(t),))
+        return jnp.abs(v_star_dot - model.dv_dz(r, model.current_for(r, v_star)) * r_dot)
+
+    return jax.vmap(drift)(times)
+
+
+def _conditions(
+    cascade: Cascade, worst: dict[str, tuple[float, float]], on_reference: tuple[float, float]
+) -> list[Condition]:
+    def gain_of(law: Any, kind: type, name: str) -> float | None:
+        return float(getattr(law, name)) if isinstance(law, kind) else None
+
+    k = gain_of(cascade.position, position.SlidingMode, "k")
+    gamma = gain_of(cascade.inversion, inversion.Adaptive, "gamma")
+    k_i = gain_of(cascade.current, current.SlidingMode, "k_i")
+
+    def line(name: str, requires: str, gain: float | None, key: Any, unit: str, path: str) -> Condition:
+        ideal = not isinstance(key, str)
+        against, at = key if ideal else worst[key]
+        if gain is None:
+            return Condition(name, requires, None, against, at, unit, None, "the law in use has no such gain")
+        return Condition(name, requires, gain, against, at, unit, gain > against, path=path, ideal=ideal)
+
+    distance, at = worst["distance"]
+    paths = [f"controller.{stage}" for stage in ("position.k", "current.k_i", "inversion.gamma")]
+    remark = dataclasses.replace(
+        line("remark 3", "k > sup |q_z + h|", k, "q_z_plus_h", "m/s^2", paths[0]),
+        holds=None,
+        note="optional in the paper: k would dominate the inversion's transients too",
+    )
+    return [
+        line("disturbance of z", "k > Q_z", k, "q_z", "m/s^2", paths[0]),
+        line("disturbance of i", "k_i > Q_i", k_i, "q_i", "A/s", paths[1]),
+        line("inversion", "gamma > Delta_1 along the run", gamma, "d", "A^2/m^2/s", paths[2]),
+        line("inversion, ideal", "gamma > Delta_1 along the reference", gamma, on_reference, "A^2/m^2/s", paths[2]),
+        Condition("singular curve C", "distance of (z/s_0, i_ref/i_0) to C > 0", distance, 0.0, at, "1", distance > 0),
+        remark,
+    ]
+
+
+def _proof(worst: dict[str, tuple[float, float]]) -> list[Condition]:
+    lines = [
+        ("Eq. (12)", "sigma follows -k sgn(sigma) + q_z + h", "sigma_off", "m/s"),
+        ("Eq. (14a)", "v_tilde follows -gamma sgn(v_tilde) + d", "v_tilde_off", "A^2/m^2"),
+        ("Eq. (14b)", "e follows -k_i sgn(e) + q_i", "e_off", "A"),
+    ]
+    rows = [Condition(name, says, None, *worst[key], unit, None, "largest residual") for name, says, key, unit in lines]
+    margin, at = worst["V_margin"]
+    bound = "V' <= -2 (k |sgn(sigma)| - Q_z) |sigma| + 2 a |sigma| (L_v |e| + |v_tilde|)"
+    rows.append(Condition("V = sigma^2", bound, None, margin, at, "m^2/s^3", None, "smallest room below the bound"))
+    return rows

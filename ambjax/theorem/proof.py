@@ -1,0 +1,187 @@
+"""The closed loop with the steps of the stability proof beside it, Section 3.5.
+
+The proof's identities, Eqs. (12)-(14), are checked by integrating their right-hand sides beside the
+loop and comparing with sigma, v_tilde and e as the loop computes them. They differ by no more than
+integration error where the proof's assumptions hold (exact model, measured state, no limit on u), and
+by what those assumptions cost where they do not. V = sigma^2 is compared with its bound at every sample.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.control import current, inversion, position
+from ambjax.control.cascade import Cascade
+from ambjax.numerics.records import Scalar, record
+from ambjax.numerics.smooth import smooth_sign
+from ambjax.simulation.integrate import Problem
+from ambjax.simulation.loop import ClosedLoop, Inputs, LoopState, add
+from ambjax.simulation.span import Span
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference
+
+
+class Identities(NamedTuple):
+    """sigma (m/s), v_tilde (A^2/m^2) and e (A): from the loop, or integrated from Eqs. (12)-(14)."""
+
+    sigma: Array
+    v_tilde: Array
+    e: Array
+
+
+class Terms(NamedTuple):
+    """What the proof speaks of, at one instant."""
+
+    moving: LoopState
+    values: Identities
+    rates: Identities
+    i_ref_dot: Array
+    q_z: Array
+    q_i: Array
+    d: Array
+    h: Array
+    bound: Array
+    """upper bound on the derivative of V = sigma^2, m^2/s^3"""
+
+
+class TheoremRow(NamedTuple):
+    """One sample of the monitored loop; margins are positive where a condition holds."""
+
+    t: Array
+    z: Array
+    i_ref: Array
+    alive: Array
+    q_z: Array
+    q_i: Array
+    d: Array
+    q_z_plus_h: Array
+    distance: Array
+    sigma_off: Array
+    v_tilde_off: Array
+    e_off: Array
+    V_margin: Array
+
+
+class Witnessed(NamedTuple):
+    """State of the closed loop and of its witnesses, the integrals of the proof's right-hand sides.
+
+    For e the witness is i_ref + e: e alone decays below the smallest normal number, where
+    arithmetic is a hundred times slower.
+    """
+
+    loop: LoopState
+    witness: Identities
+
+
+@record
+class Monitored:
+    """The closed loop with the proof's right-hand sides integrated beside it."""
+
+    loop: ClosedLoop
+
+    def realised(self) -> "Monitored":
+        return Monitored(self.loop.realised())
+
+    def hold(self, sample: Scalar) -> Measurement:
+        return self.loop.hold(sample)
+
+    def start(self) -> Witnessed:
+        state = self.loop.start()
+        values = self.terms(self.loop.inputs(0.0), state, self.hold(0)).values
+        return Witnessed(state, values._replace(e=state.plant.i))
+
+    def problem(self, hold: Measurement) -> Problem:
+        plant, scale = self.loop.scenario.plant, self.loop.scale()
+        sizes = Identities(scale.plant.z_dot, plant.dv_di(0.0, 0.0) * scale.plant.i / 100, scale.plant.i)
+
+        def rates(inputs: Inputs, state: Witnessed) -> Witnessed:
+            terms = self.terms(inputs, state.loop, hold)
+            return Witnessed(terms.moving, terms.rates._replace(e=terms.rates.e + terms.i_ref_dot))
+
+        fate = lambda state: self.loop.fate(state.loop)  # noqa: E731
+        layer = Witnessed(self.loop.layer(), Identities(*(jnp.asarray(jnp.inf) for _ in sizes)))
+        return Problem(self.loop.inputs, rates, Witnessed(scale, sizes), fate, layer)
+
+    def rest(self, state: Witnessed, code: Array) -> Witnessed:
+        return Witnessed(self.loop.rest(state.loop, code), state.witness)
+
+    def noted(self, row: TheoremRow, span: Span) -> TheoremRow:
+        return row
+
+    def singularity(self, row: TheoremRow) -> Array:
+        return self.loop.scenario.plant.singularity(row.z, row.i_ref)
+
+    def terms(self, inputs: Inputs, state: LoopState, hold: Measurement) -> Terms:
+        """The signals of the proof. For a law without the gain in question the robust term is left out."""
+        cascade, scenario = self.loop.cascade, self.loop.scenario
+        plant, (z, _, i) = scenario.plant, state.plant
+        command, control, u = self.loop.command(inputs, state, hold)
+        moving = self.loop.moved(inputs, state, control, u)
+        v_tilde, e = command.v_tilde, i - command.i_ref
+        sigma = cascade.position.sigma(state.plant, inputs.reference)
+        q_z, q_i = inputs.q_z, inputs.q_i
+        d = self._drift(inputs, state, hold, command.i_ref, moving)
+        h = plant.a * (plant.v(z, i) - v_tilde - plant.v(z, command.i_ref))
+        robust = Identities(_robust_z(cascade, sigma), _robust_v(cascade, v_tilde), _robust_i(cascade, e))
+        rates = Identities(robust.sigma + q_z + h, robust.v_tilde + d, robust.e + q_i)
+        # |v(z, i) - v(z, i_ref)| <= L_v |e|: v is quadratic in i, so dv/di is largest at one end.
+        L_v = jnp.maximum(jnp.abs(plant.dv_di(z, i)), jnp.abs(plant.dv_di(z, command.i_ref)))
+        room = jnp.abs(robust.sigma) - jnp.abs(q_z)
+        bound = 2 * jnp.abs(sigma) * (plant.a * (L_v * jnp.abs(e) + jnp.abs(v_tilde)) - room)
+        return Terms(moving, Identities(sigma, v_tilde, e), rates, command.i_ref_dot, q_z, q_i, d, h, bound)
+
+    def _drift(self, inputs: Inputs, state: LoopState, hold: Measurement, i_ref: Array, moving: LoopState) -> Array:
+        """d = v_star' - (dv/dz) z' along the true flow, i_ref held: the left side of Eq. (7), by one jvp."""
+        cascade, reference = self.loop.cascade, inputs.reference
+
+        def demanded(reference: Reference, x: LoopState) -> Array:
+            force, _, _ = cascade.demand(add(x.plant, hold), x.control, reference)
+            return force.v_star - cascade.model.v(force.z, i_ref)
+
+        return jax.jvp(demanded, (reference, state), (reference.rate(), moving))[1]
+
+    def row(self, t: Array, state: Witnessed, hold: Measurement, alive: Array) -> TheoremRow:
+        inputs = self.loop.inputs(t)
+        terms = self.terms(inputs, state.loop, hold)
+        i_ref = state.loop.plant.i - terms.values.e
+        values = terms.values._replace(e=state.loop.plant.i)
+        off = Identities(*(a - b for a, b in zip(values, state.witness, strict=True)))
+        z = state.loop.plant.z
+        # V' = 2 sigma sigma', with sigma' from the plant's own acceleration, not from the identity.
+        sigma_dot = self._sigma_dot(inputs.reference, state.loop, terms.moving)
+        return TheoremRow(
+            t=t,
+            z=z,
+            i_ref=i_ref,
+            alive=alive,
+            q_z=jnp.where(alive, terms.q_z, 0.0),
+            q_i=jnp.where(alive, terms.q_i, 0.0),
+            d=jnp.where(alive, terms.d, 0.0),
+            q_z_plus_h=jnp.where(alive, terms.q_z + terms.h, 0.0),
+            distance=self.loop.scenario.plant.distance_to_C(z, i_ref),
+            sigma_off=jnp.where(alive, off.sigma, 0.0),
+            v_tilde_off=jnp.where(alive, off.v_tilde, 0.0),
+            e_off=jnp.where(alive, off.e, 0.0),
+            V_margin=terms.bound - 2 * terms.values.sigma * sigma_dot,
+        )
+
+    def _sigma_dot(self, reference: Reference, state: LoopState, moving: LoopState) -> Array:
+        sigma = lambda r, x: self.loop.cascade.position.sigma(x.plant, r)  # noqa: E731
+        return jax.jvp(sigma, (reference, state), (reference.rate(), moving))[1]
+
+
+def _robust_z(cascade: Cascade, sigma: Array) -> Array:
+    law = cascade.position
+    return -law.k * smooth_sign(sigma, law.p) if isinstance(law, position.SlidingMode) else 0.0 * sigma
+
+
+def _robust_v(cascade: Cascade, v_tilde: Array) -> Array:
+    law = cascade.inversion
+    return -law.gamma * smooth_sign(v_tilde, law.p) if isinstance(law, inversion.Adaptive) else 0.0 * v_tilde
+
+
+def _robust_i(cascade: Cascade, e: Array) -> Array:
+    law = cascade.current
+    return -law.k_i * smooth_sign(e, law.p) if isinstance(law, current.SlidingMode) else 0.0 * e

@@ -1,0 +1,122 @@
+"""The answer of a check in words: the question, the gains to change and to what, the fate of the rotor, what to do."""
+
+import math
+import re
+
+from ambjax.theorem.conditions import Condition, Report
+
+QUESTION = "Do the conditions of Theorem 1 hold along this run?"
+# A gain is advised this much above what it must exceed, rounded up to two digits.
+MARGIN = 1.1
+# A lost rotor falls from this share of its time on.
+FALL = 0.9
+# Above what the reference alone asks, by this factor, gamma has room for transients.
+AMPLE = 2.0
+# What can be done about a run that the integrator gave up.
+STALLED = (
+    "Try a smaller p of the laws ([controller.inversion] gamma p is how hard its sign is), "
+    'or a fixed step: [clock] dt = 1e-6 with method = "rodas3".'
+)
+
+
+def answer(report: Report, case: str) -> list[str]:
+    """The lines below the table of `ambjax check`. `case`: the name of its file, as the user gave it."""
+    deciding = [line for line in report.conditions if line.holds is not None]
+    fails = [line for line in deciding if not line.holds]
+    if not fails:
+        words = f"Yes, all {len(deciding)} that apply to these laws do."
+    else:
+        words = f"No, {len(fails)} of {len(deciding)} {'does' if len(fails) == 1 else 'do'} not:"
+    lines = [f"{QUESTION} {words}"]
+    lines += [f"- {line}" for line in advice(report)]
+    lines.append(_fate(report, bool(fails)))
+    if fails or report.lost:
+        lines.append(f"'ambjax-tune {case}' looks for gains that hold the rotor, with a margin to these conditions.")
+    return lines
+
+
+def advice(report: Report) -> list[str]:
+    """For each gain that fails a condition what it must exceed, where, and what to set it to; then what else fails.
+
+    While a rotor falls its own motion drives Delta_1 beyond all gains: what is worst in the last tenth of a lost run
+    sets no gain, and is told only where nothing else fails.
+    """
+    fails = [line for line in report.conditions if line.holds is False]
+    begun = FALL * report.lost_at if report.lost else math.inf
+    rows = [line for line in fails if line.path and (line.ideal or line.at_s < begun)]
+    found = [_raise(max((r for r in rows if r.path == p), key=_right)) for p in dict.fromkeys(r.path for r in rows)]
+    if not rows:
+        ideal = {line.path: line for line in report.conditions if line.ideal}
+        found = [_of_the_fall(line, ideal.get(line.path)) for line in fails if line.path]
+    found += [
+        f"{line.requires} fails at {line.at_s:.4g} s: keep the run off the singular curve, by a smaller reference, "
+        "or a start of i_ref ([controller.inversion] i_ref) on the right side of it."
+        for line in fails
+        if not line.path
+    ]
+    return found
+
+
+def _right(line: Condition) -> float:
+    return line.against
+
+
+def _raise(line: Condition) -> str:
+    if not math.isfinite(line.against):
+        return f"{line.requires} cannot be judged: its right side is no number along this run."
+    name, key, gain = _sides(line)
+    return (
+        f"{name} = {gain} must exceed {number(line.against)} {line.unit} ({line.requires.partition(' > ')[2]}, at "
+        f"{line.at_s:.4g} s): set {key} above {number(_up(MARGIN * line.against))}."
+    )
+
+
+def _of_the_fall(line: Condition, ideal: Condition | None) -> str:
+    name, key, gain = _sides(line)
+    words = (
+        f"{name} = {gain} is exceeded by {line.requires.partition(' > ')[2]}, {number(line.against)} {line.unit}, at "
+        f"{line.at_s:.4g} s, as the rotor falls: no gain is to be set by that. What makes it fall may be another gain, "
+        "a disturbance, noise or the supply"
+    )
+    if ideal is not None and ideal.gain is not None and ideal.gain < AMPLE * ideal.against:
+        words += (
+            f"; or {name} itself, for the reference alone asks for {number(ideal.against)}, and transients for more: "
+            f"then set {key} above {number(_up(AMPLE * ideal.against))}"
+        )
+    return f"{words}."
+
+
+def _sides(line: Condition) -> tuple[str, str, str]:
+    """Name of a gain, where it stands in a case file, and its value."""
+    _, stage, name = line.path.split(".")
+    return name, f"[controller.{stage}] {name}", number(line.gain or 0.0)
+
+
+def _fate(report: Report, fails: bool) -> str:
+    if report.stalled:
+        return undecided(report.lost_at)
+    if report.lost:
+        spared = "" if fails else " The theorem knows no noise, no limit of the voltage and no sampling: look there."
+        return f"The rotor is lost at {report.lost_at:.4g} s: {report.lost_why}.{spared}"
+    return "The rotor is held all the same: the theorem just does not promise it." if fails else "The rotor is held."
+
+
+def undecided(at: float) -> str:
+    """What is said of a run that the integrator gave up at this time, s."""
+    return (
+        f"Whether the rotor is held is not decided: at {at:.4g} s the integrator stalled, for it could not meet its "
+        f"tolerance. {STALLED}"
+    )
+
+
+def number(x: float) -> str:
+    """Plain where that is short, else three digits and a short exponent: 1000, 6.23e4."""
+    if 1e-3 <= abs(x) < 1e4:
+        return f"{x:.4g}"
+    return re.sub(r"e([+-])0*", lambda e: "e-" if e[1] == "-" else "e", f"{x:.3g}")
+
+
+def _up(x: float) -> float:
+    """x rounded up to two digits."""
+    unit = 10.0 ** (math.floor(math.log10(x)) - 1)
+    return math.ceil(x / unit - 1e-9) * unit

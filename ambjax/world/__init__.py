@@ -1,0 +1,1 @@
+"""The world that a cascade meets: plant, signals, sensors and scenario."""

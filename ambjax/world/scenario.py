@@ -1,0 +1,86 @@
+"""The world that a cascade meets: true plant, start, reference, disturbances, realism."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.world.plant import Plant
+from ambjax.world.sensor import Sensor
+from ambjax.world.signals import Constant, Signal, is_random, realised
+
+# A member's randomness beside its sensors': folded into its key where they fold the sample number, beyond any of those.
+DESIGN_STREAM, SIGNAL_STREAM = np.uint32(2**32 - 1), np.uint32(2**32 - 2)
+SIGNALS = ("reference", "q_z", "q_v", "q_i")
+
+
+@record
+class Initial:
+    """State of the plant at t = 0."""
+
+    z: Scalar = leaf(default=0.0, unit="m", at_least=-1.0, at_most=1.0, doc="displacement; within the clearance")
+    z_dot: Scalar = leaf(default=0.0, unit="m/s", at_least=-1e6, at_most=1e6, doc="its rate")
+    i: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="current deviation")
+
+
+@record
+class Scenario:
+    """Everything that happens to a cascade. Member k of seed s always draws the same noise."""
+
+    plant: Plant = Plant()
+    reference: Signal = Constant()
+    q_z: Signal = Constant()
+    """disturbance acceleration, m/s^2"""
+    q_v: Signal = Constant()
+    """disturbance as scaled force, A^2/m^2: adds a q_v to q_z, with the true plant's a"""
+    q_i: Signal = Constant()
+    """disturbance of the current's rate, A/s"""
+    sensor: Sensor | None = None
+    initial: Initial = Initial()
+    u_max: Scalar = leaf(
+        default=jnp.inf, unit="V", at_least=1e-9, at_most=1e12, infinite=True, doc="limit of the supply; inf: none"
+    )
+    clearance: Scalar | None = leaf(
+        default=None, unit="m", at_least=1e-9, at_most=1.0, optional=True, doc="|z| of touch-down; none: 0.9 s_0"
+    )
+    seed: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, doc="seed of the noise")
+    member: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, doc="member of an ensemble")
+
+    @property
+    def touchdown(self) -> Scalar:
+        """|z| at which the rotor touches down, m."""
+        return 0.9 * self.plant.s_0 if self.clearance is None else self.clearance
+
+    @property
+    def random(self) -> bool:
+        """Whether two members of this scenario meet something else: noise, or a signal that is drawn."""
+        sensor = self.sensor
+        noisy = sensor is not None and bool(np.any([sensor.std, sensor.std_z_dot, sensor.std_i]))
+        return noisy or any(is_random(getattr(self, slot)) for slot in SIGNALS)
+
+    def acceleration(self, t: Scalar) -> Array:
+        """The whole disturbance of Eq. (1) at time t: q_z + a q_v, m/s^2."""
+        return self.q_z(t) + self.plant.a * self.q_v(t)
+
+    def key(self) -> Array:
+        """The member's random key: fold_in(key(seed), member)."""
+        return jax.random.fold_in(jax.random.key(self.seed), self.member)
+
+    def words(self) -> tuple[Array, Array]:
+        """The same key as two 32-bit words."""
+        high, low = jax.random.key_data(self.key())
+        return high, low
+
+    def realised(self) -> "Scenario":
+        """This scenario with whatever is random in its signals drawn for the member."""
+        random = {slot: signal for slot in SIGNALS if hasattr(signal := getattr(self, slot), "realised")}
+        if not random:
+            return self
+        key = jax.random.fold_in(self.key(), SIGNAL_STREAM)
+        drawn = {
+            slot: realised(signal, jax.random.fold_in(key, SIGNALS.index(slot))) for slot, signal in random.items()
+        }
+        return dataclasses.replace(self, **drawn)

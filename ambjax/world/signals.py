@@ -1,0 +1,261 @@
+"""Signals: pytrees that are functions of time. References and disturbances are one concept.
+
+Call a signal with a time in seconds. A jump counts from its instant on (right-continuous). A random signal has a
+method `realised(key)`, which draws the function of time that one member of an ensemble meets.
+"""
+
+import dataclasses
+import math
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.smooth import TWO_PI, sine
+
+
+class Signal(Protocol):
+    """Anything that maps a time in seconds to a value. `span` gives an interval that it never leaves in 0..end (s)."""
+
+    def __call__(self, t: Scalar, /) -> Array: ...
+    def span(self, end: float, /) -> tuple[float, float]: ...
+
+
+def _hull(*values: Any) -> tuple[float, float]:
+    """The least and the largest of several numbers, or arrays of them."""
+    return float(min(map(np.min, values))), float(max(map(np.max, values)))
+
+
+def _swing(amplitude: Scalar, first: Scalar, last: Scalar) -> tuple[float, float]:
+    """Least and largest amplitude sin(2 pi x) for x from first to last, turns."""
+    ends = [np.sin(TWO_PI * (x - np.floor(x))) for x in (first, last)]
+    crest, trough = (np.ceil(first - at) <= last - at for at in (0.25, 0.75))
+    high, low = np.where(crest, 1.0, np.maximum(*ends)), np.where(trough, -1.0, np.minimum(*ends))
+    return _hull(amplitude * low, amplitude * high)
+
+
+@record
+class Constant:
+    """The same value at all times."""
+
+    value: Scalar = leaf(default=0.0, at_least=-1e20, at_most=1e20, doc="the value")
+
+    def __call__(self, t: Scalar) -> Array:
+        return self.value + 0.0 * jnp.asarray(t)
+
+    def span(self, end: float) -> tuple[float, float]:
+        return _hull(self.value)
+
+
+@record
+class Step:
+    """0 before `start`, `amplitude` from then on."""
+
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height")
+    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="when it rises")
+
+    def __call__(self, t: Scalar) -> Array:
+        return jnp.where(jnp.asarray(t) >= self.start, self.amplitude, 0.0)
+
+    def span(self, end: float) -> tuple[float, float]:
+        start = np.asarray(self.start)
+        return _hull(np.where(start > 0, 0.0, self.amplitude), np.where(start <= end, self.amplitude, 0.0))
+
+    def shifted(self, by: Scalar) -> "Step":
+        """The same, `by` seconds later."""
+        return dataclasses.replace(self, start=self.start + by)
+
+
+@record
+class Pulse:
+    """`amplitude` in start <= t < stop, 0 elsewhere."""
+
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height")
+    start: Scalar = leaf(unit="s", at_least=-1e9, at_most=1e9, doc="when it rises")
+    stop: Scalar = leaf(unit="s", at_least=-1e9, at_most=1e9, doc="when it falls; later than start")
+    ordered: ClassVar = ("start", "stop")
+
+    def __call__(self, t: Scalar) -> Array:
+        t = jnp.asarray(t)
+        return jnp.where((t >= self.start) & (t < self.stop), self.amplitude, 0.0)
+
+    def span(self, end: float) -> tuple[float, float]:
+        start, stop = np.asarray(self.start), np.asarray(self.stop)
+        on, off = (start <= end) & (stop > 0), (start > 0) | (stop <= end)
+        return _hull(np.where(on, self.amplitude, 0.0), np.where(off, 0.0, self.amplitude))
+
+    def shifted(self, by: Scalar) -> "Pulse":
+        """The same, `by` seconds later: it never ends before it starts."""
+        return dataclasses.replace(self, start=self.start + by, stop=self.stop + by)
+
+
+@record
+class Sine:
+    """amplitude sin(2 pi frequency t + phase)."""
+
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="half the peak-to-peak height")
+    frequency: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency")
+    phase: Scalar = leaf(default=0.0, unit="rad", at_least=-1e9, at_most=1e9, doc="phase at t = 0")
+
+    def __call__(self, t: Scalar) -> Array:
+        return self.amplitude * sine(self.frequency * jnp.asarray(t) + self.phase / TWO_PI)
+
+    def span(self, end: float) -> tuple[float, float]:
+        first = np.asarray(self.phase) / TWO_PI
+        return _swing(self.amplitude, first, first + self.frequency * end)
+
+
+@record
+class SmoothStep:
+    """0 until `start`, then 10 s^3 - 15 s^4 + 6 s^5 of the way over `duration`: twice differentiable (C2)."""
+
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height reached")
+    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="when it begins to rise")
+    duration: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="time it takes to rise")
+
+    def __call__(self, t: Scalar) -> Array:
+        s = (jnp.asarray(t) - self.start) / self.duration
+        rising = s**3 * (10 - 15 * s + 6 * s**2)
+        return self.amplitude * jnp.where(s <= 0, 0.0, jnp.where(s >= 1, 1.0, rising))
+
+    def span(self, end: float) -> tuple[float, float]:
+        shares = [np.clip((t - np.asarray(self.start)) / self.duration, 0.0, 1.0) for t in (0.0, end)]
+        return _hull(*(self.amplitude * s**3 * (10 - 15 * s + 6 * s**2) for s in shares))
+
+    def shifted(self, by: Scalar) -> "SmoothStep":
+        """The same, `by` seconds later."""
+        return dataclasses.replace(self, start=self.start + by)
+
+
+@record
+class Chirp:
+    """A sine whose frequency moves linearly from `frequency` to `frequency_end` over `duration`, then stays."""
+
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="half the peak-to-peak height")
+    frequency: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency at t = 0")
+    frequency_end: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency from t = duration on")
+    duration: Scalar = leaf(unit="s", at_least=1e-9, at_most=1e9, doc="time of the sweep")
+
+    def __call__(self, t: Scalar) -> Array:
+        t = jnp.asarray(t)
+        return self.amplitude * sine(self._cycles(t, jnp.minimum(t, self.duration)))
+
+    def _cycles(self, t: Any, sweep: Any) -> Any:
+        """Turns made by time t, `sweep` of which fell into the sweep."""
+        gain = (self.frequency_end - self.frequency) / self.duration
+        return self.frequency * sweep + gain * sweep**2 / 2 + self.frequency_end * (t - sweep)
+
+    def span(self, end: float) -> tuple[float, float]:
+        return _swing(self.amplitude, np.zeros(()), self._cycles(end, np.minimum(end, self.duration)))
+
+
+# Sines in one realisation of band-limited noise. Its fourth moment falls short of a Gaussian's by 1.5/LINES of std^4.
+LINES = 32
+
+
+@record
+class Lines:
+    """std sqrt(2/n) sum of sin(2 pi frequencies t + phases), n of each: Hz and rad."""
+
+    std: Scalar
+    frequencies: Array
+    phases: Array
+
+    def __call__(self, t: Scalar) -> Array:
+        turns = self.frequencies * jnp.asarray(t)[..., None] + self.phases / TWO_PI
+        return self.std * math.sqrt(2 / self.phases.size) * jnp.sum(sine(turns), axis=-1)
+
+
+@record
+class BandNoise:
+    """Random, smooth, stationary: power spread evenly over f_low..f_high, standard deviation `std`.
+
+    A sum of sines, one at a random place in each of LINES equal parts of the band, each of random phase (after
+    Shinozuka and Deodatis, Appl. Mech. Rev. 44, 1991). Over members its autocovariance is std^2 times the mean of
+    cos(2 pi f tau) over the band, exactly; it has all derivatives, so that integrators keep their order.
+    """
+
+    std: Scalar = leaf(at_least=0, at_most=1e20, doc="standard deviation")
+    f_low: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="lower end of the band")
+    f_high: Scalar = leaf(unit="Hz", above=0, at_most=1e9, doc="upper end of the band; above f_low")
+    ordered: ClassVar = ("f_low", "f_high")
+
+    def realised(self, key: Array) -> Lines:
+        """What one member meets."""
+        place, turn = jax.random.uniform(key, (2, LINES))
+        share = (jnp.arange(LINES) + place) / LINES
+        return Lines(self.std, self.f_low + (self.f_high - self.f_low) * share, 2 * jnp.pi * turn)
+
+    def __call__(self, t: Scalar) -> Array:
+        raise ValueError(
+            "band-noise is a function of time only for one member: use scenario.realised(), as a rollout does."
+        )
+
+    def span(self, end: float) -> tuple[float, float]:
+        crest = math.sqrt(2 * LINES) * np.asarray(self.std)  # all sines at their crests at once: 8 std
+        return _hull(-crest, crest)
+
+
+@record
+class Sum:
+    """The sum of several signals."""
+
+    terms: tuple[Signal, ...]
+
+    def __call__(self, t: Scalar) -> Array:
+        total = Constant(0.0)(t)
+        for term in self.terms:
+            total = total + term(t)
+        return total
+
+    def span(self, end: float) -> tuple[float, float]:
+        ends = [term.span(end) for term in self.terms]
+        return sum(low for low, _ in ends), sum(high for _, high in ends)
+
+    def realised(self, key: Array) -> "Sum":
+        """The sum with its random terms drawn, each from a key of its own."""
+        return Sum(tuple(realised(term, jax.random.fold_in(key, n)) for n, term in enumerate(self.terms)))
+
+
+def is_random(signal: Any) -> bool:
+    """Whether members draw this signal, or a term of it."""
+    return any(map(is_random, signal.terms)) if isinstance(signal, Sum) else hasattr(signal, "realised")
+
+
+def realised(signal: Any, key: Array) -> Any:
+    """The signal with whatever is random in it drawn from `key`."""
+    return signal.realised(key) if hasattr(signal, "realised") else signal
+
+
+class Reference(NamedTuple):
+    """A reference and its first three time derivatives: m, m/s, m/s^2, m/s^3."""
+
+    r: Array
+    r_dot: Array
+    r_ddot: Array
+    r_dddot: Scalar = 0.0
+
+    def rate(self) -> "Reference":
+        """Its time derivative, as far as it is known: what a law's output changes by if only time passes."""
+        return Reference(self.r_dot, self.r_ddot, self.r_dddot, jnp.zeros_like(self.r))
+
+
+def reference_at(signal: Signal, t: Scalar) -> Reference:
+    """r and its derivatives of one definition, by nested forward differentiation.
+
+    A jump contributes nothing to a derivative.
+    """
+    t = jnp.asarray(t, jnp.result_type(float))
+
+    def first(s: Array) -> tuple[Array, Array]:
+        return jax.jvp(signal, (s,), (jnp.ones_like(s),))
+
+    def second(s: Array) -> tuple[Array, Array, Array]:
+        (r, r_dot), (_, r_ddot) = jax.jvp(first, (s,), (jnp.ones_like(s),))
+        return r, r_dot, r_ddot
+
+    (r, r_dot, r_ddot), (_, _, r_dddot) = jax.jvp(second, (t,), (jnp.ones_like(t),))
+    return Reference(r, r_dot, r_ddot, r_dddot)

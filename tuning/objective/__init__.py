@@ -1,0 +1,1 @@
+"""What is minimised: loss, risk, conditions and ranges of gains, over many members at once."""

@@ -1,0 +1,99 @@
+"""The loss of one rollout as a fold: dimensionless terms, reported apart and weighed afterwards."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.extend import Scalar, leaf, record
+from ambjax.simulation.metrics import Ending
+from ambjax.simulation.trajectory import ALIVE
+from ambjax.world.scenario import Scenario
+
+# Exponent of the norm that stands for the maximum: 1.2 to 1.6 times below it over 1e4 samples of noise.
+NORM = 16
+TERMS = ("tracking", "peak", "effort", "chatter", "clearance", "survival")
+
+
+class Sums(NamedTuple):
+    """What the fold carries."""
+
+    square: Array
+    power: Array
+    weight: Array
+    effort: Array
+    chatter: Array
+    u: Array
+    clearance: Array
+    driven: Array
+    time: Array
+    doom: Array
+
+
+@record
+class Loss:
+    """Terms of one member, each 0 or more and dimensionless, by name (TERMS).
+
+    tracking: mean of (e_z / s_0)^2 from `settle` on, earlier samples counted `early` times.
+    peak: the square of the 16-norm of e_z / s_0 over the same samples: a smooth maximum.
+    effort: mean over time of (u / u_scale)^2 while the drive is on.
+    chatter: mean over samples of ((u_k - u_{k-1}) / u_scale)^2, where u_k is the average of u over sample k.
+    clearance: mean of max(0, share)^2, share of the way from halfway between |r| and the stop to the stop.
+    survival: share of the horizon after the rotor was lost; its derivative is that of the time at which
+    |z| reaches the stop at its last speed, so it points to gains that keep the rotor longer.
+    """
+
+    settle: Scalar = leaf(default=0.2, unit="s", at_least=0)
+    early: Scalar = leaf(default=0.0, at_least=0)
+    s_0: Scalar = leaf(default=5e-3, unit="m", above=0)
+    u_scale: Scalar = leaf(default=200.0, unit="V", above=0)
+    stop: Scalar = leaf(default=4.5e-3, unit="m", above=0)
+
+    def init(self) -> Sums:
+        return Sums(*[jnp.zeros((), jnp.result_type(float))] * len(Sums._fields))
+
+    def update(self, carry: Sums, row: Any, span: Any) -> Sums:
+        on = row.alive
+        weight = jnp.where(row.t >= self.settle, 1.0, self.early)
+        square = ((row.z - row.r) / self.s_0) ** 2
+        halfway = (jnp.abs(row.r) + self.stop) / 2
+        beyond = jnp.maximum((jnp.abs(row.z) - halfway) / (self.stop - halfway), 0.0)
+        outward = jnp.where(row.z < 0, -row.z_dot, row.z_dot)
+        moving = outward > 1e-6
+        doom = row.t + (self.stop - jnp.abs(row.z)) / jnp.where(moving, outward, 1.0)
+        return Sums(
+            carry.square + weight * square,
+            carry.power + weight * square ** (NORM // 2),
+            carry.weight + weight,
+            carry.effort + span.densities.u_squared,
+            carry.chatter + jnp.where(on & (row.t > 0), (row.u_mean - carry.u) ** 2, 0.0),
+            row.u_mean,
+            carry.clearance + beyond**2,
+            carry.driven + on,
+            carry.time + span.time,
+            jnp.where(on & moving, doom, carry.doom),
+        )
+
+    def result(self, carry: Sums, ending: Ending) -> dict[str, Array]:
+        weight, driven = jnp.maximum(carry.weight, 1e-9), jnp.maximum(carry.driven, 1.0)
+        mean = carry.power / weight
+        some = mean > 1e-280
+        lost = ending.lost_code != ALIVE
+        at = jnp.where(lost, ending.lost_at, 0.0)
+        at = jax.lax.stop_gradient(at) + (carry.doom - jax.lax.stop_gradient(carry.doom))
+        return {
+            "tracking": carry.square / weight,
+            "peak": jnp.where(some, jnp.where(some, mean, 1.0) ** (2 / NORM), 0.0),
+            "effort": carry.effort / jnp.where(carry.time > 0, carry.time, 1.0) / self.u_scale**2,
+            "chatter": carry.chatter / driven / self.u_scale**2,
+            "clearance": carry.clearance / driven,
+            "survival": jnp.where(lost, 1 - at / ending.duration, 0.0),
+        }
+
+
+def loss_for(scenario: Scenario, settle: float, early: float = 0.0) -> Loss:
+    """The loss of a scenario: u counts in units of the supply's limit, or of R i_0 without one."""
+    plant = scenario.plant
+    u_scale = jnp.where(jnp.isfinite(scenario.u_max), scenario.u_max, plant.R * plant.i_0)
+    return Loss(settle, early, plant.s_0, float(u_scale), scenario.touchdown)

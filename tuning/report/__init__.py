@@ -1,0 +1,1 @@
+"""What an answer is worth, in words, numbers and pictures."""

@@ -1,0 +1,61 @@
+"""What the report's own steps are worth on each of its numbers, and nominal runs for its pictures.
+
+The steps of the report are of fixed number, for speed; here a few members are simulated again by adaptive RODAS3.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from ambjax.control.cascade import Cascade
+from ambjax.simulation.rollout import rollout
+from ambjax.simulation.trajectory import Trajectory
+from tuning.study import Study, summarise
+
+# Held-out members that are simulated again.
+AGAIN = 8
+# A number that the report's own steps miss by more than this share is marked.
+MARKED = 0.05
+
+
+def compared(study: Study, x: np.ndarray, seed: int, count: int, names: tuple[str, ...]) -> dict[str, Any]:
+    """The first members of the ensemble of `count` with this seed at x [m], by the report's steps and by accurate ones.
+
+    `members` simulated, `held` by both; over these the summaries (`summarise`) of `names`: of the report, accurate,
+    and the relative error of the former. `lost`, `stalled`: how many are, by either.
+    """
+    numbers = np.arange(min(AGAIN, count))
+    who = study.objective.chosen(seed, numbers, count)
+    both = [
+        {name: values[0] for name, values in engine.metrics(x[None], who)["metrics"].items()}
+        for engine in (study.judging, study.reference)
+    ]
+    held = np.logical_and.reduce([~np.isfinite(found["lost_at_s"]) for found in both])
+    ways = ("report", "accurate")
+    told: dict[str, Any] = {"members": len(numbers), "held": int(held.sum()), "marked_beyond": MARKED}
+    for fate in ("lost", "stalled"):
+        told[fate] = {way: int(found[fate].sum()) for way, found in zip(ways, both, strict=True)}
+    told["metrics"] = {}
+    if held.any():
+        ours, theirs = (summarise(study, {name: values[held] for name, values in found.items()}) for found in both)
+        shown = [name for name in names if name in ours and name in theirs]
+        told["metrics"] = {
+            name: {"report": ours[name], "accurate": theirs[name], "relative": _relative(ours[name], theirs[name])}
+            for name in shown
+        }
+    return told
+
+
+def _relative(ours: float, theirs: float) -> float:
+    """How far off ours is: +inf where theirs is 0 and ours is not."""
+    if ours == theirs:
+        return 0.0
+    return ours / theirs - 1 if theirs else float("inf")
+
+
+def nominal(study: Study, cascade: Cascade) -> Trajectory:
+    """The case's own run, nothing spread, under this cascade, in accurate steps: a row for each sample."""
+    case = study.case
+    clock = dataclasses.replace(case.clock, method=study.reference.objective.clock.method)
+    return rollout(cascade, case.scenario, clock).trajectory

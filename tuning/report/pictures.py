@@ -1,0 +1,135 @@
+"""Pictures of a study, as PNG."""
+
+import io
+from typing import Any
+
+import numpy as np
+
+from ambjax.pictures.figures import BLUE, ORANGE, RED, thin
+from ambjax.pictures.scales import prefixed
+from ambjax.simulation.trajectory import Trajectory
+from tuning.search.explore import Slices
+
+# Where the picture of the risk ends: a lost member costs a million times an error.
+HIGHEST = 30.0
+# Of a run, the start and the end are shown enlarged, for this long, in s, or for a quarter of it.
+ZOOM = 0.02
+# A run that is lost is shown until so many times as late.
+BEYOND = 1.15
+# What moves by less than this share of a signal's largest value is shown flat.
+FLAT = 1e-2
+
+
+def before_after(runs: dict[str, Trajectory]) -> bytes:
+    """PNG: z - r and u, averaged over each sample, of runs by name, in rows; in columns the whole, start and end."""
+    from matplotlib.figure import Figure
+
+    rows = [(name, run, signal) for signal in ("z - r", "u") for name, run in runs.items()]
+    figure = Figure(figsize=(10, 1.75 * len(rows) + 0.4), layout="constrained")
+    axes = figure.subplots(len(rows), 3, squeeze=False)
+    for line, (name, run, signal) in zip(axes, rows, strict=True):
+        t, alive = np.asarray(run.rows.t), np.asarray(run.rows.alive)
+        values, unit = (run.rows.e_z, "m") if signal == "z - r" else (run.rows.u_mean, "V")
+        factor, unit = prefixed(unit, float(np.abs(np.asarray(values)[alive]).max(initial=0.0)))
+        values = factor * np.asarray(values)
+        least = FLAT * np.abs(values[alive]).max(initial=0.0)
+        ended = float(run.lost_at)
+        end = min(t[-1] + (t[1] - t[0] if len(t) > 1 else 0.0), max(BEYOND * ended, t[min(4, len(t) - 1)]))
+        near = min(ZOOM, end / 4)
+        for ax, (low, high) in zip(line, ((0.0, end), (0.0, near), (end - near, end)), strict=True):
+            shown = alive & (t >= low) & (t <= high)
+            ax.plot(*thin(t[shown], values[shown]), color=ORANGE if name == "before" else BLUE, lw=0.9)
+            ax.set_xlim(low, high)
+            ax.locator_params(axis="x", nbins=5)
+            bottom, top = ax.get_ylim()
+            if top - bottom < least:  # what is smaller is rounding, or nothing to look at
+                ax.set_ylim((bottom + top - least) / 2, (bottom + top + least) / 2)
+            ax.ticklabel_format(axis="y", useOffset=False)
+            ax.grid(alpha=0.3)
+            ax.tick_params(labelsize=8)
+            if ended <= high:
+                ax.axvspan(max(ended, low), high, color=RED, alpha=0.12, lw=0)
+        if np.isfinite(ended) and signal == "z - r":
+            words = f"{run.lost_why.partition(':')[0]} at {ended:.4g} s"
+            line[0].annotate(words, (0.04, 0.06), xycoords="axes fraction", fontsize=8)
+        line[0].set_ylabel(f"{name}\n{signal} ({unit})", fontsize=9)
+    for ax, words in zip(axes[0], ("whole run", "start", "end"), strict=True):
+        ax.set_title(words, fontsize=10)
+    for ax in axes[-1]:
+        ax.set_xlabel("time (s)", fontsize=9)
+    figure.align_ylabels(axes)
+    return _png(figure)
+
+
+def convergence(history: dict[str, Any], paths: list[str]) -> bytes:
+    """PNG: what is minimised and the gains of the best start against iterations."""
+    from matplotlib.figure import Figure
+
+    value, gains, members = (np.asarray(history[name]) for name in ("value", "gains", "members"))
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    steps, best = np.arange(1, len(value) + 1), np.argmin(value, axis=1)
+    for s in range(value.shape[1]):
+        left.plot(steps, np.exp(value[:, s]), "0.75", lw=1)
+    left.plot(steps, np.exp(value.min(axis=1)), "C0", lw=1.8)
+    title = "blue: the best start; dotted: other members asked"
+    left.set(xlabel="iteration", ylabel="what is minimised", yscale="log", title=title)
+    for j, path in enumerate(paths):
+        right.plot(steps, gains[steps - 1, best, j] / gains[-1, best[-1], j], label=path.removeprefix("controller."))
+    right.set(xlabel="iteration", ylabel="gain / its final value", yscale="log", title="gains of the best start")
+    right.legend(fontsize=8)
+    for at in np.flatnonzero(np.diff(members)):
+        for ax in (left, right):
+            ax.axvline(at + 1.5, color="0.5", ls=":", lw=1)
+    for ax in (left, right):
+        ax.grid(alpha=0.3)
+    return _png(figure)
+
+
+def landscape(found: Slices, paths: list[str]) -> bytes:
+    """PNG: what was minimised along each gain through the answer."""
+    from matplotlib.figure import Figure
+
+    m = len(paths)
+    figure = Figure(figsize=(2.4 * m + 1, 3.2), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(1, m, sharey=True))
+    middle = found.goals.shape[1] // 2
+    for ax, gains, goals, lost, path in zip(axes, found.gains, found.goals, found.lost, paths, strict=True):
+        risk = np.minimum(np.exp(goals - goals[middle]), HIGHEST)
+        ax.loglog(gains, risk, "C0-", lw=1.2)
+        held = lost == 0
+        ax.plot(gains[held], risk[held], "C0o", ms=3.5, label="all members held")
+        if not held.all():
+            ax.plot(gains[~held], risk[~held], "C3x", ms=5, label="members lost")
+        ax.axvline(gains[middle], color="0.5", lw=0.8, ls=":")
+        ax.set_xlabel(path.removeprefix("controller."))
+        ax.set_xticks([], minor=True)
+        span = np.log(gains[-1] / gains[0])
+        ends = [end for end in (gains[0], gains[-1]) if abs(np.log(end / gains[middle])) > span / 4]
+        ax.set_xticks([*ends, gains[middle]], [f"{tick:.3g}" for tick in (*ends, gains[middle])], fontsize=8)
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel(f"relative to the answer (cut at {HIGHEST:g})")
+    handles = {label: h for ax in axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    axes[0].legend(handles.values(), handles.keys(), fontsize=8)
+    return _png(figure)
+
+
+def front(rows: list[dict[str, Any]]) -> bytes:
+    """PNG: error against voltage."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5, 3.4), layout="constrained")
+    ax = figure.subplots()
+    errors = [r["settled_rms_error_m"] for r in rows]
+    ax.plot([r["settled_rms_u_V"] for r in rows], errors, "o-", ms=4)
+    # at least half a decade: a front of one point has no scale of its own
+    ax.set_ylim(min(min(errors) / 1.2, max(errors) / 2), max(max(errors) * 1.2, min(errors) * 2))
+    ax.set(xlabel="settled rms voltage (V)", ylabel="settled rms error (m)", yscale="log")
+    ax.grid(alpha=0.3, which="both")
+    return _png(figure)
+
+
+def _png(figure: Any) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()

@@ -1,0 +1,1 @@
+"""How it is minimised: screen, descent, rounds."""
