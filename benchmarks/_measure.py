@@ -1,5 +1,6 @@
 """What the benchmarks share: timing, machine facts, JSON."""
 
+import contextlib
 import json
 import math
 import os
@@ -9,7 +10,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -77,6 +78,27 @@ def child(script: str, *arguments: Any, **environment: str) -> Any:
     command = [sys.executable, script, *map(str, arguments)]
     done = subprocess.run(command, env=os.environ | environment, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout.splitlines()[-1])
+
+
+@contextlib.contextmanager
+def server(script: str, name: str) -> Iterator[Callable[[], Any]]:
+    """A process of `script --serve NAME`: each call of what this yields sends it a line and takes its line of JSON."""
+    command = [sys.executable, script, "--serve", name]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        line: Any = process.stdin
+        answers: Any = process.stdout
+
+        def ask() -> Any:
+            line.write("once\n")
+            line.flush()
+            return json.loads(answers.readline())
+
+        answers.readline()  # ready
+        try:
+            yield ask
+        finally:
+            line.write("\n")
+            line.close()
 
 
 def peak_memory() -> int:

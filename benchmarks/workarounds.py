@@ -1,0 +1,149 @@
+"""What each workaround of XLA's CPU compiler gains, with the version of jax that it was measured under.
+
+One is turned off at a time, in a process of its own, and the same processes run in turn with one that keeps them all,
+so that whatever else the machine does meets both. Two jobs on one core: 1,024 members of the common workload under
+held noise (RK4), and the gradient of task A's loss (sliding steps, 32 lanes). A gain is the time without the workaround
+over the time with it, a median over the rounds: where it is 1 under a newer jax, the workaround can go.
+Run: python benchmarks/workarounds.py [--rounds 5] [NAME ...]
+"""
+
+import argparse
+import json
+import os
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+os.environ.setdefault("JAX_ENABLE_X64", "1")
+
+import _measure
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax.numerics import apart
+
+MEMBERS, SAMPLES, LANES = 1024, 100, 32
+
+
+def without_mark() -> None:
+    """Loops are not compiled as one function."""
+    from ambjax.numerics import kernel
+
+    kernel._mark = lambda tree: tree
+    kernel.options = lambda: kernel.WIDE if kernel._has_avx512() else {}
+
+
+def without_width() -> None:
+    """XLA chooses the width of vectors."""
+    from ambjax.numerics import kernel
+
+    kernel.WIDE = {}
+
+
+def without_apart() -> None:
+    """Functions are fused with their surroundings."""
+    apart.apart = lambda function: function
+
+
+def without_stored() -> None:
+    """Intermediates are computed again wherever they are used."""
+    apart.stored = lambda tree: tree
+
+
+def without_arctan() -> None:
+    """XLA's own arctan."""
+    from ambjax.numerics import smooth
+
+    smooth.arctan_per = lambda x, per: jnp.arctan(x) / per
+
+
+def without_sine() -> None:
+    """XLA's own sine and cosine."""
+    from ambjax.numerics import smooth
+
+    smooth.sine = lambda x: jnp.sin(smooth.TWO_PI * x)
+    smooth.cosine = lambda x: jnp.cos(smooth.TWO_PI * x)
+
+
+def without_reciprocal() -> None:
+    """Divisions in float64."""
+    from ambjax.numerics import smooth
+
+    smooth.reciprocal = lambda x: 1 / x
+
+
+def without_blocks() -> None:
+    """All members of a call at once."""
+    from ambjax.numerics import kernel
+
+    kernel.block_bytes = lambda members: members * jnp.result_type(float).itemsize
+
+
+# What is turned off by each, before the modules that use it are imported.
+WITHOUT: dict[str, Callable[[], None]] = {
+    "none": lambda: None,
+    "mark": without_mark,
+    "width": without_width,
+    "apart": without_apart,
+    "stored": without_stored,
+    "arctan": without_arctan,
+    "sine": without_sine,
+    "reciprocal": without_reciprocal,
+    "blocks": without_blocks,
+}
+
+
+def jobs() -> dict[str, Callable[[], Any]]:
+    """The two runs that are timed."""
+    import gradients
+    import workload
+
+    work = workload.workload(MEMBERS, SAMPLES, noise=True)
+    loss, who, axes, _ = gradients.tuner(LANES, SAMPLES)
+    slope = gradients.programs(loss, LANES, axes)["forward"]
+    return {
+        "ensemble": lambda: workload.ours(work, threads=1),
+        "gradient": lambda: jax.block_until_ready(slope(np.zeros(len(gradients.GAINS)), who)),
+    }
+
+
+def serve(name: str) -> None:
+    """Time both jobs whenever a line arrives; their seconds as a line of JSON."""
+    _measure.one_core()
+    WITHOUT[name]()
+    runs = jobs()
+    for run in runs.values():
+        run()
+    print(json.dumps("ready"), flush=True)
+    while input():
+        seconds = {}
+        for job, run in runs.items():
+            began = time.process_time()
+            run()
+            seconds[job] = time.process_time() - began
+        print(json.dumps(seconds), flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", default=[name for name in WITHOUT if name != "none"])
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--serve", choices=WITHOUT, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.serve:
+        serve(given.serve)
+        return
+    rows = {}
+    for name in given.names:
+        with _measure.server(__file__, "none") as kept, _measure.server(__file__, name) as dropped:
+            pairs = [(kept(), dropped()) for _ in range(given.rounds)]
+        rows[name] = {"says": (WITHOUT[name].__doc__ or "").rstrip(".")}
+        rows[name] |= {job: statistics.median(b[job] / a[job] for a, b in pairs) for job in pairs[0][0]}
+        print(f"without {name:<11} " + ", ".join(f"{job} {rows[name][job]:.2f}" for job in pairs[0][0]), flush=True)
+    _measure.write("workarounds", {"rounds": given.rounds, "rows": rows})
+
+
+if __name__ == "__main__":
+    main()
