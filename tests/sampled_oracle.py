@@ -1,0 +1,322 @@
+"""An independent simulator of the sampled loop, in plain Python, NumPy and SciPy: shares no code with ambjax.
+
+Sample n, t_n = n T: the plant is measured (errors, converter); observer, prediction, position, inversion and
+current law step once; u_n acts from t_n + delay T until t_{n+1} + delay T, u = 0 before; the plant alone moves on.
+Readings of the rules where they leave room, so that another program can follow them:
+- a converter of b bits has steps of 2 range / 2^b, rounds half to even, and ends at -range and range - 1 step;
+  it converts z and i. The complementary observer begins at z_measured of sample 0 unless z_hat is given.
+- the closed form is the implicit adaptive law with gamma = inf, whatever the discretisation: it keeps the i_ref
+  of the sample before, so that i_ref' is that of what was measured, disturbances included, and begins without a
+  jump unless i_ref is given.
+- the super-twisting law, implicit, is set-valued: p is for the explicit form only.
+- a row's u is u_n within +-u_max; the limit is also what the PI law's anti-windup knows of the supply.
+- q_i moves the measured current: i_1' by q_i, i_2' by -q_i.
+- lost: |z| = touch s_0. The singular curve: the first sample at which dv/di(z, i_ref) <= 0 at what the laws took.
+- a scaled force beyond what any current gives: the current of the one nearest to it.
+"""
+
+import functools
+import itertools
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from oracle import QUIET, REST, TABLE_1, Body, _edges, _pulse, _reference
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+SUBSTEP = 2.5e-5  # s, at most, of the fast way: z within 1e-12 m of DOP853 over 400 samples (test_sampled_oracle.py)
+SLIVER = 1e-9  # of a period: a piece shorter than this is rounding, not a piece
+
+
+@dataclass(frozen=True)
+class World:
+    """Numbers only, SI units. A law, a reference or a disturbance is (kind, its parameters)."""
+
+    kind: str = "lumped"  # or "two-coil": of the true plant; the controller's model is always lumped
+    plant: dict = field(default_factory=dict)  # what differs from Table 1
+    model: dict = field(default_factory=dict)  # what the controller believes to differ from the true plant
+    period: float = 1e-4
+    delay: float = 1.0  # samples, 0 to 2
+    discretisation: str = "implicit"  # or "explicit"
+    predict: bool = True
+    observer: tuple = ("direct", {})  # ("complementary", {"l"[, "z_hat"]})
+    # or ("super-twisting", {"c", "k_1", "k_2", "p"})
+    position: tuple = ("sliding-mode", {"c": 17.0, "k": 25.0, "p": 25.0})
+    inversion: tuple = ("adaptive", {"gamma": 7.5e4, "p": 25.0, "i_ref": 0.0})  # ("closed-form", {"i_ref"})
+    current: tuple = ("sliding-mode", {"k_i": 152.0, "p": 25.0})  # ("pi", {"k_p", "k_int", "k_aw"})
+    reference: tuple = REST
+    q_z: tuple = QUIET  # m/s^2
+    q_v: tuple = QUIET  # A^2/m^2, times the true plant's kappa / (4 m)
+    q_i: tuple = QUIET  # A/s
+    initial: tuple = (0.0, 0.0, 0.0)  # z, z_dot, i
+    u_max: float = math.inf
+    bits: int | None = None
+    range_z: float = 5e-3
+    range_i: float = 0.5
+    touch: float = 0.9
+
+
+@dataclass(frozen=True)
+class Run:
+    """Rows [samples] at t_n, NaN after the loss; `seen` [samples, 3]: z, z_dot, i as the laws took them; times in s."""
+
+    t: np.ndarray
+    z: np.ndarray
+    z_dot: np.ndarray
+    i: np.ndarray
+    i_ref: np.ndarray
+    u: np.ndarray
+    v_star: np.ndarray
+    seen: np.ndarray
+    lost_at: float
+    singular_at: float
+
+
+def simulate(world, samples, noise=None, fast=False):
+    """Rows 0 .. samples - 1. `noise[n]`: errors of z, z_dot, i at sample n. `fast`: RK4 in place of DOP853."""
+    noise = np.zeros((samples, 3)) if noise is None else np.asarray(noise)
+    plant, controller = (TwoCoil if world.kind == "two-coil" else Lumped)(world), Controller(world)
+    y, rows, lost_at, singular_at = plant.start, np.full((samples, 9), np.nan), math.inf, math.inf
+    for n in range(samples):
+        output = plant.output(y)
+        *row, singular, seen = controller.step(n, _measurement(world, output, noise[n].tolist()))
+        rows[n] = *output, *row, *seen
+        singular_at = min(singular_at, n * world.period if singular else math.inf)
+        y, touched = _sample(world, plant, controller, n, y, fast) if n < samples - 1 else (y, None)
+        if touched is not None:
+            lost_at = n * world.period + touched
+            break
+    t, (z, z_dot, i, i_ref, u, v_star) = np.arange(samples) * world.period, rows[:, :6].T
+    return Run(t, z, z_dot, i, i_ref, u, v_star, rows[:, 6:], lost_at, singular_at)
+
+
+def _measurement(world, output, errors):
+    z, z_dot, i = (x + error for x, error in zip(output, errors, strict=True))
+    return conversion(z, world.bits, world.range_z), z_dot, conversion(i, world.bits, world.range_i)
+
+
+def conversion(x, bits, limit):
+    """What a converter of `bits` bits over +-limit gives for x; x itself without bits."""
+    if bits is None:
+        return x
+    code = round(x * 2 ** (bits - 1) / limit)
+    return min(max(code, -(2 ** (bits - 1))), 2 ** (bits - 1) - 1) * limit / 2 ** (bits - 1)
+
+
+def _spans(delay, end):
+    """Pieces (start, stop, lag) of the samples 0 to `end` after t_n, in which u_{n - lag} acts."""
+    edges = sorted({0.0, end} | {delay - k for k in range(3) if 0 < delay - k < end})
+    return [(a, b, math.ceil(delay - (a + b) / 2)) for a, b in itertools.pairwise(edges)]
+
+
+def _sample(world, plant, controller, n, y, fast):
+    """The plant at t_{n+1}, and seconds after t_n at which it touched down, or None."""
+    T, signals = world.period, (world.q_z, world.q_v, world.q_i)
+    inside = {edge - n * T for signal in signals for edge in _edges(signal)}
+    for start, stop, lag in _spans(world.delay, 1.0):
+        first, last = start * T, stop * T
+        cuts = sorted({first, last} | {x for x in inside if first + SLIVER * T < x < last - SLIVER * T})
+        for a, b in itertools.pairwise(cuts):
+            q_z, q_v, q_i = (_pulse(signal, n * T + (a + b) / 2) for signal in signals)
+            rates = functools.partial(plant.rates, u=controller.voltage(n - lag), q_z=q_z + plant.body.a * q_v, q_i=q_i)
+            y, touched = (_small_steps if fast else _accurate)(rates, y, b - a, plant)
+            if touched is not None:
+                return y, a + touched
+    return y, None
+
+
+def _accurate(rates, y, span, plant):
+    def clearance(_, y):
+        return plant.stop - abs(y[0])
+
+    clearance.terminal = True
+    run = solve_ivp(
+        lambda _, y: rates(y.tolist()), (0.0, span), y, "DOP853", events=clearance, first_step=span, rtol=1e-12,
+        atol=1e-15 * plant.scale,
+    )  # fmt: skip
+    assert run.success, run.message
+    return run.y[:, -1].tolist(), (run.t[-1] if run.status == 1 else None)
+
+
+def _small_steps(rates, y, span, plant):
+    count = math.ceil(span / SUBSTEP * (1 - SLIVER))
+    h = span / count
+    for k in range(count):
+        following = rk4(rates, y, h)
+        if abs(following[0]) >= plant.stop:
+            part = brentq(lambda x, y=y: abs(rk4(rates, y, x)[0]) - plant.stop, 0.0, h, xtol=1e-17)
+            return following, k * h + part
+        y = following
+    return y, None
+
+
+def rk4(rates, y, h):
+    """One step of the classical Runge-Kutta method."""
+    k_1 = rates(y)
+    k_2 = rates([x + h / 2 * k for x, k in zip(y, k_1, strict=True)])
+    k_3 = rates([x + h / 2 * k for x, k in zip(y, k_2, strict=True)])
+    k_4 = rates([x + h * k for x, k in zip(y, k_3, strict=True)])
+    return [x + h / 6 * (a + 2 * b + 2 * c + d) for x, a, b, c, d in zip(y, k_1, k_2, k_3, k_4, strict=True)]
+
+
+class Lumped:
+    """Eqs. (1), (2); y = z, z_dot, i."""
+
+    scale = np.array([1e-3, 1e-2, 0.1])
+
+    def __init__(self, world):
+        self.body = Body(TABLE_1 | world.plant)
+        self.start, self.stop = list(world.initial), world.touch * self.body.s_0
+
+    def output(self, y):
+        return y
+
+    def rates(self, y, u, q_z=0.0, q_i=0.0):
+        (z, z_dot, i), body = y, self.body
+        gap = body.s_0 + z
+        z_ddot = body.stiffness * z + body.a * body.v(z, i) - body.g + q_z
+        return z_dot, z_ddot, 2 * z_dot / gap * i + 2 * gap / body.kappa * (u - body.R * i) + q_i
+
+
+class TwoCoil:
+    """Each coil with its own gap, flux and voltage R i_0 +- u; y = z, z_dot, i_1 (upper), i_2 (lower)."""
+
+    scale = np.array([1e-3, 1e-2, 0.1, 0.1])
+
+    def __init__(self, world):
+        self.body = Body(TABLE_1 | world.plant)
+        (z, z_dot, i), i_0 = world.initial, self.body.i_0
+        self.start, self.stop = [z, z_dot, i_0 + i, i_0 - i], world.touch * self.body.s_0
+
+    def output(self, y):
+        z, z_dot, i_1, i_2 = y
+        return z, z_dot, (i_1 - i_2) / 2
+
+    def rates(self, y, u, q_z=0.0, q_i=0.0):
+        (z, z_dot, i_1, i_2), body = y, self.body
+        upper, lower, bias = body.s_0 - z, body.s_0 + z, body.R * body.i_0
+        v = (i_1 / upper) ** 2 - (i_2 / lower) ** 2
+        return (
+            z_dot,
+            body.stiffness * z + body.a * v - body.g + q_z,
+            2 * upper / body.kappa * (bias + u - body.R * i_1) - i_1 * z_dot / upper + q_i,
+            2 * lower / body.kappa * (bias - u - body.R * i_2) + i_2 * z_dot / lower - q_i,
+        )
+
+
+def sgn(x, p):
+    """2/pi arctan(p x); the sign of x for p = inf, 0 at 0."""
+    return (x > 0) - (x < 0) if p == math.inf else 2 / math.pi * math.atan(p * x)
+
+
+def relax(w, h, p):
+    """The w+ with w+ + h sgn_p(w+) = w, to rounding; for p = inf of the set-valued sign."""
+    y = max(abs(w) - h, 0.0)
+    if p < math.inf and h < math.inf:
+        # y + h sgn_p(y) - |w| rises and is concave: Newton's steps from the left never pass the root
+        for _ in range(200):
+            slope = 1 + h * 2 / math.pi * p / (1 + (p * y) * (p * y))
+            following = y + (abs(w) - y - h * sgn(y, p)) / slope
+            if following <= y:
+                break
+            y = following
+    return math.copysign(y, w)
+
+
+def twist(x, state, k_1, k_2, T):
+    """Proper implicit super-twisting: (u, next state) for x+ = x + T u. Seeber, Andritsch, Automatica 173 (2025)."""
+    over = abs(x) - k_2 * T * T
+    if over <= 0:
+        return state - 2 * x / T, state - x / T
+    root = 2 * over / (T * k_1 + math.sqrt(T * T * k_1 * k_1 + 4 * over))
+    following = state - math.copysign(k_2 * T, x)
+    return 2 * following - state - math.copysign(k_1 * root, x), following
+
+
+def current_for(body, z, v):
+    """The current that gives v at z, of the two the one that continues that of z = 0. Eq. (3)."""
+    upper, lower = (body.s_0 - z) ** -2, (body.s_0 + z) ** -2
+    half, curve, rest = body.i_0 * (upper + lower), upper - lower, body.i_0**2 * (upper - lower) - v
+    square = half * half - curve * rest
+    return -rest / (half + math.sqrt(square)) if square >= 0 else -half / curve
+
+
+class Controller:
+    """The cascade: states of its laws, and the voltages that it gave."""
+
+    def __init__(self, world):
+        self.world, self.model = world, Lumped(World(plant=world.plant | world.model))
+        self.z_hat = world.observer[1].get("z_hat")
+        self.i_ref, self.integral, self.twist, self.voltages = world.inversion[1].get("i_ref"), 0.0, 0.0, []
+        self.implicit = world.discretisation == "implicit"
+
+    def voltage(self, n):
+        return self.voltages[n] if n >= 0 else 0.0
+
+    def step(self, n, measured):
+        """i_ref before its step, u_n, v_star, whether the curve C is crossed, the (z, z_dot, i) that the laws took."""
+        world = self.world
+        seen = self._prediction(n, self._estimate(measured))
+        r = _reference(world.reference, (n + (world.delay if world.predict else 0)) * world.period)
+        v_star = self._position(seen, r)
+        if self.i_ref is None:
+            self.i_ref = 0.0 if world.inversion[0] == "adaptive" else current_for(self.model.body, seen[0], v_star)
+        i_ref, following = self.i_ref, self._inversion(seen[0], v_star)
+        u = self._current(seen, (following - i_ref) / world.period)
+        self.i_ref = following
+        self.voltages.append(u)
+        return i_ref, u, v_star, self.model.body.v_i(seen[0], i_ref) <= 0, seen
+
+    def _estimate(self, measured):
+        (kind, gains), (z, z_dot, i) = self.world.observer, measured
+        if kind == "direct":
+            return [z, z_dot, i]
+        z_hat = z if self.z_hat is None else self.z_hat
+        self.z_hat = z_hat + self.world.period * (z_dot + gains["l"] * (z - z_hat))
+        return [z_hat, z_dot, i]
+
+    def _prediction(self, n, y):
+        if self.world.predict and self.world.delay:
+            for a, b, lag in _spans(self.world.delay, self.world.delay):
+                y = rk4(functools.partial(self.model.rates, u=self.voltage(n - lag)), y, (b - a) * self.world.period)
+        return y
+
+    def _share(self, w, h, p):
+        """(w - relax(w, h, p)) / h without its cancellation; sgn_p(w) where explicit."""
+        if not self.implicit or h == 0:
+            return sgn(w, p)
+        return min(max(w / h, -1.0), 1.0) if p == math.inf else sgn(relax(w, h, p), p)
+
+    def _position(self, seen, reference):
+        (kind, gains), T, body = self.world.position, self.world.period, self.model.body
+        (z, z_dot, _), (r, r_dot, r_ddot, _) = seen, reference
+        sigma = z_dot - r_dot + gains["c"] * (z - r)
+        if kind == "sliding-mode":
+            robust = -gains["k"] * self._share(sigma, T * gains["k"], gains["p"])
+        elif self.implicit:
+            robust, self.twist = twist(sigma, self.twist, gains["k_1"], gains["k_2"], T)
+        else:
+            robust = self.twist - gains["k_1"] * sigma / (sigma * sigma + gains["p"] ** -2) ** 0.25
+            self.twist -= T * gains["k_2"] * sgn(sigma, gains["p"])
+        return (-body.stiffness * z - gains["c"] * (z_dot - r_dot) + r_ddot + body.g + robust) / body.a
+
+    def _inversion(self, z, v_star):
+        """i_ref of the next sample."""
+        (kind, gains), T, body = self.world.inversion, self.world.period, self.model.body
+        w, gamma, p = v_star - body.v(z, self.i_ref), gains.get("gamma", math.inf), gains.get("p", math.inf)
+        if kind == "adaptive" and not self.implicit:
+            return self.i_ref + T * gamma * sgn(w, p) / body.v_i(z, self.i_ref)
+        return current_for(body, z, v_star - relax(w, T * gamma, p))
+
+    def _current(self, seen, rate):
+        (kind, gains), T, body, (z, z_dot, i) = self.world.current, self.world.period, self.model.body, seen
+        e, limit = i - self.i_ref, self.world.u_max
+        if kind == "pi":
+            u = -gains["k_p"] * e + body.kappa / (2 * body.s_0) * rate + self.integral
+            held = min(max(u, -limit), limit)
+            self.integral += T * (-gains["k_int"] * e + gains["k_aw"] * (held - u))
+            return held
+        robust, gap = gains["k_i"] * self._share(e, T * gains["k_i"], gains["p"]), body.s_0 + z
+        u = body.kappa / (2 * gap) * (-2 * z_dot * i / gap + rate - robust) + body.R * i
+        return min(max(u, -limit), limit)
