@@ -99,6 +99,9 @@ def test_where_two_coils_depart_from_the_lumped_plant():
         motion = z_dot * ((body.i_0 + i) / (body.s_0 - z) + (body.i_0 - i) / (body.s_0 + z)) / 2
         difference = gap - motion - 2 * z_dot * i / (body.s_0 + z)
         assert (i_1 - i_2) / 2 - i_dot == pytest.approx(difference, rel=1e-10, abs=1e-10)
+    y = [1e-3, 0.1, 0.3, 0.2]
+    pushed = np.subtract(two.rates(y, 5.0, q_z=0.3, q_i=0.7), two.rates(y, 5.0))
+    assert pushed == pytest.approx([0.0, 0.3, 0.7, -0.7], abs=1e-12)
 
 
 def test_two_coils_held_still_are_the_lumped_plant():
@@ -288,6 +291,19 @@ def test_errors_are_added_and_the_observer_steps():
     assert z_hat[0] == measured[0]
     steps = 1e-4 * (run.seen[:-1, 1] + 300.0 * (measured - z_hat)[:-1])
     assert np.abs(np.diff(z_hat) - steps).max() < 1e-17
+
+
+@pytest.mark.parametrize(("delay", "predict"), [(0.0, True), (0.5, True), (1.5, True), (1.5, False)])
+def test_the_reference_is_that_of_the_instant_at_which_the_voltage_acts(delay, predict):
+    """With c = k = 0 the law asks for spring, weight and r_ddot; not predicted, for that of the sample itself."""
+    world = World(
+        delay=delay, predict=predict, reference=SINE, position=("sliding-mode", {"c": 0.0, "k": 0.0, "p": 25.0})
+    )
+    run, body = simulate(world, 30, fast=True), Lumped(world).body
+    t = (np.arange(30) + (delay if predict else 0)) * world.period
+    w = 2 * math.pi * 2.0
+    expected = (-2 * body.k_z / body.m * run.seen[:, 0] + body.g - w * w * 2.5e-3 * np.sin(w * t)) / body.a
+    assert run.v_star == pytest.approx(expected, rel=1e-13)
 
 
 @pytest.mark.parametrize("fast", [False, True])
