@@ -43,14 +43,14 @@ PLANT = [
     ),
     M(
         "the second coil does not heat",
-        "ambjax/world/plant.py",
+        "ambjax/world/bearing.py",
         "2 * self.R * (self.i_0**2 + jnp.asarray(i) ** 2)",
         "self.R * (self.i_0 + jnp.asarray(i)) ** 2",
         "tests/test_plant.py::test_rates_are_equations_1_and_2_written_out",
     ),
     M(
         "the scaled force acts on half the mass",
-        "ambjax/world/plant.py",
+        "ambjax/world/bearing.py",
         "self.kappa / (4 * self.m)",
         "self.kappa / (2 * self.m)",
         "tests/test_plant.py::test_derived_constants_of_table_1",

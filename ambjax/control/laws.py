@@ -16,7 +16,8 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 from jax import Array
 
 from ambjax.numerics.records import Scalar
-from ambjax.world.plant import Gaps, Plant
+from ambjax.world.bearing import Gaps
+from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 

@@ -1,7 +1,7 @@
 """The closed loop as one system of ordinary differential equations: plant and cascade together."""
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from ambjax.simulation.sliding import slide, slides
 from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 from ambjax.world.scenario import Scenario
-from ambjax.world.sensor import Measurement
+from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.signals import Reference, reference_at
 
 # A state this many times its scale has left the model's meaning, long before numbers overflow.
@@ -55,15 +55,15 @@ SHOWN = Instant(Sizes(*[0.0] * 7), Densities(*[0.0] * 3))  # pyright: ignore[rep
 
 
 class LoopState(NamedTuple):
-    """State of the plant (z, z_dot, i), then of the cascade. The order matters to `linear.factor`."""
+    """State of the plant, its own, then of the cascade. The order matters to `linear.factor`."""
 
-    plant: Measurement
+    plant: Any
     control: CascadeState
 
 
 @record
 class ClosedLoop:
-    """A cascade in a scenario. `hold` below is the measurement error held over the sample, Measurement-shaped."""
+    """A cascade in a scenario. `hold` below: the errors of the sensors, held over the sample."""
 
     cascade: Cascade
     scenario: Scenario
@@ -76,24 +76,24 @@ class ClosedLoop:
         """The member's key as two 32-bit words."""
         return self.scenario.words()
 
-    def hold(self, sample: Scalar) -> Measurement:
+    def hold(self, sample: Scalar) -> Errors:
         """Errors of all sensors during sample number `sample`; zeros without a sensor model."""
         if self.scenario.sensor is None:
-            return Measurement(*[jnp.zeros(())] * 3)
+            return Errors(*[jnp.zeros(())] * 3)
         return self.scenario.sensor.noise(self.words(), sample)
 
     def start(self) -> LoopState:
         """The state at t = 0."""
-        initial = self.scenario.initial
-        plant = Measurement(*(jnp.asarray(x) for x in (initial.z, initial.z_dot, initial.i)))
-        return LoopState(plant, self.cascade.init(add(plant, self.hold(0))))
+        plant = self.scenario.plant.start(self.scenario.initial.measurement())
+        return LoopState(plant, self.cascade.init(self.measured(plant, self.hold(0))))
+
+    def measured(self, plant: Any, hold: Errors) -> Measurement:
+        """What the sensors report of the plant's state."""
+        return self.scenario.plant.measurement(plant).off(hold)
 
     def scale(self) -> LoopState:
-        """Size of each component that still matters: 2 % of the gap, that in 0.1 s, 4 % of the bias current."""
-        plant = self.scenario.plant
-        moved = plant.s_0 / 50
-        scale = LoopState(Measurement(moved, 10 * moved, plant.i_0 / 25), self.cascade.scale())
-        return jax.tree.map(jnp.asarray, scale)
+        """Size of each component that still matters."""
+        return jax.tree.map(jnp.asarray, LoopState(self.scenario.plant.scale(), self.cascade.scale()))
 
     def layer(self) -> LoopState:
         """The largest error that keeps a component where its smoothed sign turns: for i_ref, that of its law, A."""
@@ -107,52 +107,51 @@ class ClosedLoop:
         scenario = self.scenario
         return Inputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t))
 
-    def command(self, inputs: Inputs, state: LoopState, hold: Measurement) -> tuple[Command, CascadeState, Array]:
+    def command(self, inputs: Inputs, state: LoopState, hold: Errors) -> tuple[Command, CascadeState, Array]:
         """What the cascade decides from the measured state, the rates of its states, and the applied voltage."""
         u_max = jnp.asarray(self.scenario.u_max)
-        seen = add(state.plant, hold)
+        seen = self.measured(state.plant, hold)
         command, rates = self.cascade(seen, state.control, inputs.reference, u_max)
         return command, rates, _limited(command.u, u_max)
 
-    def rates(self, inputs: Inputs, state: LoopState, hold: Measurement) -> LoopState:
+    def rates(self, inputs: Inputs, state: LoopState, hold: Errors) -> LoopState:
         """Time derivative of the state: Eqs. (1), (2) and the laws."""
         _, control, u = self.command(inputs, state, hold)
         return self.moved(inputs, state, control, u)
 
-    def observed(self, inputs: Inputs, state: LoopState, hold: Measurement) -> tuple[LoopState, Instant]:
+    def observed(self, inputs: Inputs, state: LoopState, hold: Errors) -> tuple[LoopState, Instant]:
         """The rates, and what is seen of the loop at one instant."""
         command, control, u = self.command(inputs, state, hold)
         shown = self.shown(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
         return self.moved(inputs, state, control, u), shown
 
-    def shown(self, reference: Reference, plant: Measurement, i_ref: Array, v_tilde: Array, u: Array) -> Instant:
-        """What is seen of the loop with this motion and current, their references, input error and voltage."""
-        sigma, heat = self.cascade.position.sigma(plant, reference), self.scenario.plant.copper_loss(plant.i)
-        sizes = Sizes(plant.z, plant.z - reference.r, sigma, u, plant.i, plant.i - i_ref, v_tilde)
+    def shown(self, reference: Reference, plant: Any, i_ref: Array, v_tilde: Array, u: Array) -> Instant:
+        """What is seen of the loop with this state of the plant, its references, input error and voltage."""
+        motion, heat = self.scenario.plant.measurement(plant), self.scenario.plant.signals(plant).heat
+        sigma = self.cascade.position.sigma(motion, reference)
+        sizes = Sizes(motion.z, motion.z - reference.r, sigma, u, motion.i, motion.i - i_ref, v_tilde)
         return Instant(sizes, Densities(u, u * u, heat))
 
     def moved(self, inputs: Inputs, state: LoopState, control: CascadeState, u: Array) -> LoopState:
         """Time derivative of the state, given that of the cascade and the applied voltage."""
-        plant, (z, z_dot, i) = self.scenario.plant, state.plant
-        z_ddot, i_dot = plant.rates(z, z_dot, i, u, inputs.q_z, inputs.q_i)
-        return LoopState(Measurement(z_dot, z_ddot, i_dot), control)
+        return LoopState(self.scenario.plant.rates(state.plant, u, inputs.q_z, inputs.q_i), control)
 
     def fate(self, state: LoopState) -> Array:
         """0 while the rotor is levitated, else the code of what became of it."""
         sane = [jnp.abs(x) <= DIVERGENCE * s for x, s in zip(*map(jax.tree.leaves, (state, self.scale())), strict=True)]
-        touched = jnp.abs(state.plant.z) >= self.scenario.touchdown
+        touched = jnp.abs(self.scenario.plant.measurement(state.plant).z) >= self.scenario.touchdown
         return jnp.where(functools.reduce(jnp.logical_and, sane), jnp.where(touched, TOUCHED, ALIVE), DIVERGED).astype(
             jnp.int32
         )
 
     def rest(self, state: LoopState, code: Array) -> LoopState:
         """The state in which a lost rotor is frozen: at rest, against the stop it touched; controller as it was."""
-        z = state.plant.z
+        plant = self.scenario.plant
+        z = plant.measurement(state.plant).z
         stop = jnp.where(z < 0, -1.0, 1.0) * self.scenario.touchdown
-        still = Measurement(jnp.where(code == TOUCHED, stop, z), jnp.zeros_like(z), state.plant.i)
-        return state._replace(plant=still)
+        return state._replace(plant=plant.rest(state.plant, jnp.where(code == TOUCHED, stop, z)))
 
-    def problem(self, hold: Measurement) -> Problem:
+    def problem(self, hold: Errors) -> Problem:
         """What an integrator is given for one sample."""
         step = functools.partial(slide, self, hold) if slides(self.cascade) else None
         rates = lambda inputs, x: self.rates(inputs, x, hold)  # noqa: E731
@@ -160,28 +159,28 @@ class ClosedLoop:
         jumps = self.scenario.sensor is not None
         return Problem(self.inputs, rates, self.scale(), self.fate, self.layer(), observed, SHOWN, jumps, step)
 
-    def row(self, t: Scalar, state: LoopState, hold: Measurement, alive: Array) -> Row:
+    def row(self, t: Scalar, state: LoopState, hold: Errors, alive: Array) -> Row:
         """All signals at one instant. The drive of a lost rotor is off: u = 0."""
-        plant, (z, z_dot, i) = self.scenario.plant, state.plant
-        inputs = self.inputs(t)
+        plant = self.scenario.plant
+        motion, signals, inputs = plant.measurement(state.plant), plant.signals(state.plant), self.inputs(t)
         command, _, u = self.command(inputs, state, hold)
         return Row(
             t=jnp.asarray(t),
-            z=z,
-            z_dot=z_dot,
-            i=i,
+            z=motion.z,
+            z_dot=motion.z_dot,
+            i=motion.i,
             i_ref=command.i_ref,
             u=jnp.where(alive, u, 0.0),
             u_mean=jnp.zeros_like(u),
-            v=plant.v(z, i),
+            v=signals.v,
             v_star=command.v_star,
             v_tilde=command.v_tilde,
-            sigma=self.cascade.position.sigma(state.plant, inputs.reference),
+            sigma=self.cascade.position.sigma(motion, inputs.reference),
             r=inputs.reference.r,
             q_z=inputs.q_z,
             q_i=inputs.q_i,
-            z_measured=z + hold.z,
-            heat=jnp.where(alive, plant.copper_loss(i), 0.0),
+            z_measured=motion.z + hold.z,
+            heat=jnp.where(alive, signals.heat, 0.0),
             alive=alive,
         )
 
@@ -210,8 +209,3 @@ class Realised(ClosedLoop):
 def _limited(u: Array, u_max: Array) -> Array:
     """u held within -u_max..u_max. Not jnp.clip, which looks for NaN at three times the cost."""
     return jnp.where(u > u_max, u_max, jnp.where(u < -u_max, -u_max, u))
-
-
-def add(x: Measurement, y: Measurement) -> Measurement:
-    """Component by component."""
-    return Measurement(x.z + y.z, x.z_dot + y.z_dot, x.i + y.i)

@@ -32,8 +32,7 @@ def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
 
     Raises ValueError where a gain is traced: a step can be chosen only from numbers.
     """
-    plant = scenario.plant
-    named = dict(cascade.slopes()) | {"plant": plant.pole}
+    named = dict(cascade.slopes()) | {"plant": scenario.plant.slope()}
     if any(is_traced(x) for x in named.values()):
         raise ValueError(
             "clock.method is None (dt = 'auto'), but inside jit, grad or vmap the gains are traced and no "

@@ -23,7 +23,8 @@ from ambjax.numerics.apart import apart, stored
 from ambjax.numerics.records import Scalar
 from ambjax.numerics.smooth import TWO_OVER_PI, reciprocal, smooth_sign
 from ambjax.simulation.span import Instant, Span
-from ambjax.world.sensor import Measurement
+from ambjax.world.plant import State
+from ambjax.world.sensor import Errors, Measurement
 
 # Newton steps on the slaved sign: monotone from below; they leave less than 1e-3 of the right-hand side.
 NEWTON = 6
@@ -32,21 +33,21 @@ NEWTON = 6
 EDGE = 1.0
 
 
-def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
+def slide(loop: Any, hold: Errors, begin: Any, end: Any, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
     """The state of a ClosedLoop whose inversion law is `inversion.Adaptive` after h; `begin`, `end`: its inputs."""
     cascade, scenario = loop.cascade, loop.scenario
     model, law, (z, z_dot, i), control = cascade.model, cascade.inversion, state.plant, state.control
     i_ref = control.inversion
     per_h = 1 / jnp.where(h > 0, h, 1.0)
 
-    force_0, seen_0, rates_0 = cascade.demand(_add(state.plant, hold), control, begin.reference)
+    force_0, seen_0, rates_0 = cascade.demand(loop.measured(state.plant, hold), control, begin.reference)
     z_ddot_0 = scenario.plant.z_ddot(z, i, begin.q_z)
-    ahead = Measurement(z + h * z_dot + h * h / 2 * z_ddot_0, z_dot + h * z_ddot_0, i)
+    ahead = State(z + h * z_dot + h * h / 2 * z_ddot_0, z_dot + h * z_ddot_0, i)
     moved = control._replace(
         observer=_axpy(control.observer, h, rates_0.observer), position=_axpy(control.position, h, rates_0.position)
     )
     ahead, moved, force_0 = stored((ahead, moved, force_0))
-    force_1, seen_1, rates_1 = cascade.demand(_add(ahead, hold), moved, end.reference)
+    force_1, seen_1, rates_1 = cascade.demand(loop.measured(ahead, hold), moved, end.reference)
 
     v_0, gradient_0 = v_and_gradient(model, force_0, i_ref)
     v_1, gradient_1 = v_and_gradient(model, force_1, i_ref)
@@ -60,7 +61,7 @@ def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: 
 
     sliding, slaved, tau, force_1 = stored((sliding, slaved, tau, force_1))
 
-    def current(plant: Measurement, seen: Measurement, i_ref: Array, rate: Array, inner: Any, q_i: Array, h: Array):
+    def current(plant: State, seen: Measurement, i_ref: Array, rate: Array, inner: Any, q_i: Array, h: Array):
         """i - i_ref and the current law's state after h at constant i_ref' = rate; and what is seen on the way."""
 
         def rate_of(i: Array) -> tuple[Array, Any]:
@@ -77,7 +78,7 @@ def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: 
     e, inner, first = current(state.plant, seen_0, i_ref, sliding, control.current, begin.q_i, tau)
     e, inner = stored((e, inner))
     i_ref_0, i_ref = i_ref, i_ref + tau * sliding
-    middle = Measurement((z + ahead.z) / 2, (z_dot + ahead.z_dot) / 2, i_ref + e)
+    middle = State((z + ahead.z) / 2, (z_dot + ahead.z_dot) / 2, i_ref + e)
     seen = jax.tree.map(lambda a, b: (a + b) / 2, seen_0, seen_1)
     # The current moves fast while it slides: what counts at the start of the rest is where it ended.
     z_ddot_0 += (1 - tau * per_h) * (scenario.plant.z_ddot(z, middle.i, begin.q_z) - z_ddot_0)
@@ -85,7 +86,7 @@ def slide(loop: Any, hold: Measurement, begin: Any, end: Any, h: Scalar, state: 
     e, inner = stored((e, inner))
     i_ref = i_ref + (h - tau) * slaved
     z_ddot_1 = scenario.plant.z_ddot(ahead.z, i_ref + e, end.q_z)
-    plant = Measurement(
+    plant = State(
         z + h * z_dot + h * h / 6 * (2 * z_ddot_0 + z_ddot_1), z_dot + h / 2 * (z_ddot_0 + z_ddot_1), i_ref + e
     )
     # a slide of no length is none: w was within the sign's layer
@@ -186,10 +187,6 @@ def _phi_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arra
     y, small = _phi(x), jnp.abs(x) < 1e-3
     slope = jnp.where(small, 1 / 2 + x / 3 + x * x / 8, (1 + (x - 1) * y) * (1 / jnp.where(small, 1.0, x)))
     return y, slope * dx
-
-
-def _add(x: Measurement, y: Measurement) -> Measurement:
-    return Measurement(x.z + y.z, x.z_dot + y.z_dot, x.i + y.i)
 
 
 def _axpy(x: Any, h: Scalar, rate: Any) -> Any:

@@ -17,9 +17,9 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import smooth_sign
 from ambjax.simulation.integrate import Problem
-from ambjax.simulation.loop import ClosedLoop, Inputs, LoopState, add
+from ambjax.simulation.loop import ClosedLoop, Inputs, LoopState
 from ambjax.simulation.span import Span
-from ambjax.world.sensor import Measurement
+from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.signals import Reference
 
 
@@ -84,17 +84,18 @@ class Monitored:
     def realised(self) -> "Monitored":
         return Monitored(self.loop.realised())
 
-    def hold(self, sample: Scalar) -> Measurement:
+    def hold(self, sample: Scalar) -> Errors:
         return self.loop.hold(sample)
 
     def start(self) -> Witnessed:
         state = self.loop.start()
         values = self.terms(self.loop.inputs(0.0), state, self.hold(0)).values
-        return Witnessed(state, values._replace(e=state.plant.i))
+        return Witnessed(state, values._replace(e=self.motion(state).i))
 
-    def problem(self, hold: Measurement) -> Problem:
-        plant, scale = self.loop.scenario.plant, self.loop.scale()
-        sizes = Identities(scale.plant.z_dot, plant.dv_di(0.0, 0.0) * scale.plant.i / 100, scale.plant.i)
+    def problem(self, hold: Errors) -> Problem:
+        plant = self.loop.scenario.plant
+        _, z_dot, i = map(jnp.asarray, plant.sizes())
+        sizes = Identities(z_dot, plant.dv_di(0.0, 0.0) * i / 100, i)
 
         def rates(inputs: Inputs, state: Witnessed) -> Witnessed:
             terms = self.terms(inputs, state.loop, hold)
@@ -102,7 +103,7 @@ class Monitored:
 
         fate = lambda state: self.loop.fate(state.loop)  # noqa: E731
         layer = Witnessed(self.loop.layer(), Identities(*(jnp.asarray(jnp.inf) for _ in sizes)))
-        return Problem(self.loop.inputs, rates, Witnessed(scale, sizes), fate, layer)
+        return Problem(self.loop.inputs, rates, Witnessed(self.loop.scale(), sizes), fate, layer)
 
     def rest(self, state: Witnessed, code: Array) -> Witnessed:
         return Witnessed(self.loop.rest(state.loop, code), state.witness)
@@ -113,17 +114,22 @@ class Monitored:
     def singularity(self, row: TheoremRow) -> Array:
         return self.loop.scenario.plant.singularity(row.z, row.i_ref)
 
-    def terms(self, inputs: Inputs, state: LoopState, hold: Measurement) -> Terms:
+    def motion(self, state: LoopState) -> Measurement:
+        """What ideal sensors see."""
+        return self.loop.scenario.plant.measurement(state.plant)
+
+    def terms(self, inputs: Inputs, state: LoopState, hold: Errors) -> Terms:
         """The signals of the proof. For a law without the gain in question the robust term is left out."""
         cascade, scenario = self.loop.cascade, self.loop.scenario
-        plant, (z, _, i) = scenario.plant, state.plant
+        plant, motion = scenario.plant, self.motion(state)
+        z, _, i = motion
         command, control, u = self.loop.command(inputs, state, hold)
         moving = self.loop.moved(inputs, state, control, u)
         v_tilde, e = command.v_tilde, i - command.i_ref
-        sigma = cascade.position.sigma(state.plant, inputs.reference)
+        sigma = cascade.position.sigma(motion, inputs.reference)
         q_z, q_i = inputs.q_z, inputs.q_i
         d = self._drift(inputs, state, hold, command.i_ref, moving)
-        h = plant.a * (plant.v(z, i) - v_tilde - plant.v(z, command.i_ref))
+        h = plant.a * (plant.signals(state.plant).v - v_tilde - plant.v(z, command.i_ref))
         robust = Identities(_robust_z(cascade, sigma), _robust_v(cascade, v_tilde), _robust_i(cascade, e))
         rates = Identities(robust.sigma + q_z + h, robust.v_tilde + d, robust.e + q_i)
         # |v(z, i) - v(z, i_ref)| <= L_v |e|: v is quadratic in i, so dv/di is largest at one end.
@@ -132,23 +138,23 @@ class Monitored:
         bound = 2 * jnp.abs(sigma) * (plant.a * (L_v * jnp.abs(e) + jnp.abs(v_tilde)) - room)
         return Terms(moving, Identities(sigma, v_tilde, e), rates, command.i_ref_dot, q_z, q_i, d, h, bound)
 
-    def _drift(self, inputs: Inputs, state: LoopState, hold: Measurement, i_ref: Array, moving: LoopState) -> Array:
+    def _drift(self, inputs: Inputs, state: LoopState, hold: Errors, i_ref: Array, moving: LoopState) -> Array:
         """d = v_star' - (dv/dz) z' along the true flow, i_ref held: the left side of Eq. (7), by one jvp."""
         cascade, reference = self.loop.cascade, inputs.reference
 
         def demanded(reference: Reference, x: LoopState) -> Array:
-            force, _, _ = cascade.demand(add(x.plant, hold), x.control, reference)
+            force, _, _ = cascade.demand(self.loop.measured(x.plant, hold), x.control, reference)
             return force.v_star - cascade.model.v(force.z, i_ref)
 
         return jax.jvp(demanded, (reference, state), (reference.rate(), moving))[1]
 
-    def row(self, t: Array, state: Witnessed, hold: Measurement, alive: Array) -> TheoremRow:
+    def row(self, t: Array, state: Witnessed, hold: Errors, alive: Array) -> TheoremRow:
         inputs = self.loop.inputs(t)
         terms = self.terms(inputs, state.loop, hold)
-        i_ref = state.loop.plant.i - terms.values.e
-        values = terms.values._replace(e=state.loop.plant.i)
+        z, _, i = self.motion(state.loop)
+        i_ref = i - terms.values.e
+        values = terms.values._replace(e=i)
         off = Identities(*(a - b for a, b in zip(values, state.witness, strict=True)))
-        z = state.loop.plant.z
         # V' = 2 sigma sigma', with sigma' from the plant's own acceleration, not from the identity.
         sigma_dot = self._sigma_dot(inputs.reference, state.loop, terms.moving)
         return TheoremRow(
@@ -168,7 +174,7 @@ class Monitored:
         )
 
     def _sigma_dot(self, reference: Reference, state: LoopState, moving: LoopState) -> Array:
-        sigma = lambda r, x: self.loop.cascade.position.sigma(x.plant, r)  # noqa: E731
+        sigma = lambda r, x: self.loop.cascade.position.sigma(self.motion(x), r)  # noqa: E731
         return jax.jvp(sigma, (reference, state), (reference.rate(), moving))[1]
 
 

@@ -1,187 +1,60 @@
-"""The plant: a vertical rotor between two electromagnets, Eqs. (1)-(3) and Table 1."""
+"""The plant of the paper: both coils under one current deviation, Eqs. (1) and (2)."""
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.numerics.smooth import reciprocal, safe_sqrt
-
-# A gap is never taken smaller than this share of s_0. No accepted state comes near it (the rotor has
-# touched down long before); it keeps a trial stage of an integrator, and its derivatives, finite.
-GAP_FLOOR = 0.005
+from ambjax.numerics.records import Scalar, record
+from ambjax.world.bearing import Bearing, Signals
+from ambjax.world.sensor import Measurement
 
 
-class Gaps(NamedTuple):
-    """Upper gap, lower gap, and 1 / (upper lower): m, m, 1/m^2. Divisions are what a step's time goes into."""
+class State(NamedTuple):
+    """Displacement (m), velocity (m/s) and current deviation (A); or their rates."""
 
-    upper: Array
-    lower: Array
-    inverse: Array
-
-    @property
-    def inverses(self) -> tuple[Array, Array]:
-        """1 / upper gap and 1 / lower gap, in 1/m."""
-        return self.lower * self.inverse, self.upper * self.inverse
+    z: Array
+    z_dot: Array
+    i: Array
 
 
 @record
-class Plant:
-    """Parameters of the rotor and its magnets, Table 1. Scalars of one member, SI units.
+class Plant(Bearing):
+    """Rotor and magnets with the parameters of Table 1, in the state (z, z_dot, i)."""
 
-    Deviation: the paper prints k_z in N m; it is a stiffness, N/m, negative (restoring).
-    """
+    lumped = True
 
-    m: Scalar = leaf(default=0.588, unit="kg", at_least=1e-6, at_most=1e6, doc="mass of rotor and axle")
-    k_z: Scalar = leaf(
-        default=-754.0,
-        unit="N/m",
-        at_least=-1e12,
-        at_most=1e12,
-        doc="axial stiffness of one passive bearing; negative restores",
-    )
-    mu_0: Scalar = leaf(
-        default=1.25e-6, unit="N/A^2", at_least=1e-8, at_most=1e-4, doc="vacuum permeability, as printed"
-    )
-    n: Scalar = leaf(default=1480.0, unit="1", at_least=1, at_most=1e6, doc="windings of each coil")
-    A: Scalar = leaf(default=0.121, unit="m^2", at_least=1e-9, at_most=100.0, doc="cross-sectional area of a coil")
-    s_0: Scalar = leaf(default=5e-3, unit="m", at_least=1e-6, at_most=1.0, doc="air gap at z = 0")
-    i_0: Scalar = leaf(default=0.25, unit="A", at_least=1e-6, at_most=1e5, doc="bias current")
-    R: Scalar = leaf(default=41.44, unit="ohm", at_least=0, at_most=1e6, doc="coil resistance")
-    g: Scalar = leaf(default=9.81, unit="m/s^2", at_least=-1e4, at_most=1e4, doc="gravitational acceleration")
+    def start(self, measurement: Measurement) -> State:
+        return State(*measurement)
 
-    @property
-    def kappa(self) -> Scalar:
-        """mu_0 n^2 A, in N m^2/A^2."""
-        return self.mu_0 * self.n**2 * self.A
+    def rates(self, state: State, u: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> State:
+        """z_dot, `z_ddot` and `i_dot`. Eqs. (1), (2)."""
+        z, z_dot, i = state
+        gaps = self.gaps(z)
+        z_ddot = 2 * self.k_z / self.m * z + self.a * self.v_and_dv_di(z, i, gaps)[0] - self.g + q_z
+        i_dot = 2 * z_dot * gaps.inverses[1] * i + (2 / self.kappa) * gaps.lower * (u - self.R * i) + q_i
+        return State(z_dot, z_ddot, i_dot)
 
-    @property
-    def a(self) -> Scalar:
-        """Acceleration per scaled magnetic force: kappa / (4 m), in (m/s^2) / (A^2/m^2)."""
-        return self.kappa / (4 * self.m)
+    def rest(self, state: State, z: Array) -> State:
+        return State(z, jnp.zeros_like(z), state.i)
 
-    @property
-    def L(self) -> Scalar:
-        """Coil inductance at z = 0: kappa / (2 s_0), in H."""
-        return self.kappa / (2 * self.s_0)
+    def scale(self) -> State:
+        return State(*self.sizes())
 
-    @property
-    def k_s(self) -> Scalar:
-        """Negative stiffness of the magnets at the origin: kappa i_0^2 / s_0^3, in N/m."""
-        return self.kappa * self.i_0**2 / self.s_0**3
+    def measurement(self, state: State) -> Measurement:
+        return Measurement(*state)
 
-    @property
-    def k_i(self) -> Scalar:
-        """Force per current at the origin: kappa i_0 / s_0^2, in N/A."""
-        return self.kappa * self.i_0 / self.s_0**2
-
-    @property
-    def pole(self) -> Scalar:
-        """Unstable pole of the magnets alone, sqrt(k_s / m), in 1/s: how fast the rotor falls to a side."""
-        return (abs(self.k_s) / self.m) ** 0.5
-
-    @property
-    def sigma_size(self) -> Scalar:
-        """What sigma amounts to here, in m/s: a gap's width at the pole."""
-        return self.pole * self.s_0
-
-    @property
-    def v_size(self) -> Scalar:
-        """What the scaled force amounts to here, in A^2/m^2: that of one magnet at the bias current."""
-        return (self.i_0 / self.s_0) * (self.i_0 / self.s_0)
-
-    def gaps(self, z: Scalar) -> Gaps:
-        """Upper gap s_0 - z and lower gap s_0 + z, floored at 0.5 % of s_0."""
-        floor = GAP_FLOOR * self.s_0
-        upper, lower = self.s_0 - z, self.s_0 + z
-        upper, lower = jnp.where(upper > floor, upper, floor), jnp.where(lower > floor, lower, floor)
-        return Gaps(upper, lower, reciprocal(upper * lower))
-
-    def v(self, z: Scalar, i: Scalar) -> Array:
-        """Scaled magnetic force, in A^2/m^2: ((i_0+i)/(s_0-z))^2 - ((i_0-i)/(s_0+z))^2. Eq. (3)."""
-        return self.v_and_dv_di(z, i)[0]
-
-    def dv_dz(self, z: Scalar, i: Scalar) -> Array:
-        """Partial derivative of v in z, in A^2/m^3: 2 (i_0+i)^2/(s_0-z)^3 + 2 (i_0-i)^2/(s_0+z)^3."""
-        upper, lower = self.gaps(z).inverses
-        return 2 * (self.i_0 + i) ** 2 * upper**3 + 2 * (self.i_0 - i) ** 2 * lower**3
-
-    def dv_di(self, z: Scalar, i: Scalar) -> Array:
-        """Partial derivative of v in i, in A/m^2: 2 (i_0+i)/(s_0-z)^2 + 2 (i_0-i)/(s_0+z)^2.
-
-        It vanishes exactly on the singular curve C, Eq. (9).
-        """
-        return self.v_and_dv_di(z, i)[1]
-
-    def v_and_dv_di(self, z: Scalar, i: Scalar, gaps: Gaps | None = None) -> tuple[Array, Array]:
-        """v and dv/di at once. `gaps` are those at z, if they are known."""
-        gaps = gaps or self.gaps(z)
-        upper, lower = gaps.inverses
-        above, below = (self.i_0 + i) * upper, (self.i_0 - i) * lower
-        return above**2 - below**2, 2 * (above * upper + below * lower)
-
-    def current_for(self, z: Scalar, v: Scalar) -> Array:
-        """The current whose scaled force at z is v, in A: the root of Eq. (3) continuous at i = 0.
-
-        Written without cancellation, so it is smooth through z = 0, where the quadratic
-        degenerates. Where v has no real root it returns the point of C at that z, whose v is nearest.
-        """
-        upper, lower, _ = self.gaps(z)
-        total, difference = 1 / upper**2 + 1 / lower**2, 1 / upper**2 - 1 / lower**2
-        excess = v - self.i_0**2 * difference
-        discriminant = (2 * self.i_0 / (upper * lower)) ** 2 + difference * v
-        reachable = discriminant >= 0
-        on_C = -self.i_0 * total / jnp.where(reachable, 1.0, difference)
-        return jnp.where(reachable, excess / (self.i_0 * total + safe_sqrt(discriminant)), on_C)
+    def signals(self, state: State) -> Signals:
+        return Signals(self.v(state.z, state.i), self.copper_loss(state.i))
 
     def z_ddot(self, z: Scalar, i: Scalar, q_z: Scalar = 0.0) -> Array:
         """Acceleration, in m/s^2: 2 k_z z/m + a v(z, i) - g + q_z. Eq. (1)."""
-        return self.rates(z, 0.0, i, 0.0, q_z)[0]
+        return self.rates(State(z, 0.0, i), 0.0, q_z).z_dot  # pyright: ignore[reportArgumentType]
 
     def i_dot(self, z: Scalar, z_dot: Scalar, i: Scalar, u: Scalar, q_i: Scalar = 0.0) -> Array:
         """Rate of the current deviation, in A/s: 2 z_dot i/(s_0+z) + 2 (s_0+z)(u - R i)/kappa + q_i. Eq. (2)."""
-        return self.rates(z, z_dot, i, u, 0.0, q_i)[1]
+        return self.rates(State(z, z_dot, i), u, 0.0, q_i).i
 
     def u_per_i_dot(self, z: Scalar) -> Array:
         """Voltage per rate of the current, in V s/A: kappa / (2 (s_0+z)). Eq. (2)."""
         return (self.kappa / 2) * self.gaps(z).inverses[1]
-
-    def rates(
-        self, z: Scalar, z_dot: Scalar, i: Scalar, u: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0
-    ) -> tuple[Array, Array]:
-        """`z_ddot` and `i_dot` at once."""
-        gaps = self.gaps(z)
-        z_ddot = 2 * self.k_z / self.m * z + self.a * self.v_and_dv_di(z, i, gaps)[0] - self.g + q_z
-        i_dot = 2 * z_dot * gaps.inverses[1] * i + (2 / self.kappa) * gaps.lower * (u - self.R * i) + q_i
-        return z_ddot, i_dot
-
-    def equilibrium(self, z: Scalar = 0.0) -> tuple[Array, Array]:
-        """Current (A) and voltage (V) that hold the rotor still at z: z_ddot = i_dot = 0."""
-        i = self.current_for(z, (self.g - 2 * self.k_z / self.m * z) / self.a)
-        return i, self.R * i
-
-    def copper_loss(self, i: Scalar) -> Array:
-        """Heat in both coils, in W: R ((i_0+i)^2 + (i_0-i)^2)."""
-        return 2 * self.R * (self.i_0**2 + jnp.asarray(i) ** 2)
-
-    def singularity(self, z: Scalar, i: Scalar) -> Array:
-        """(z^2 + 2 s_0 i z / i_0 + s_0^2) / s_0^2: 1 at the origin, 0 on C, negative beyond. Eq. (9)."""
-        zeta = jnp.asarray(z) / self.s_0
-        return zeta**2 + 2 * zeta * jnp.asarray(i) / self.i_0 + 1
-
-    def distance_to_C(self, z: Scalar, i: Scalar) -> Array:
-        """Distance from (z/s_0, i/i_0) to the singular curve C, dimensionless. Eq. (9).
-
-        C in these coordinates is i = -(z + 1/z)/2, two branches. Points are spread over both, and
-        Newton steps on the derivative of the squared distance refine each. The nearest counts.
-        """
-        zeta, iota = jnp.asarray(z) / self.s_0, jnp.asarray(i) / self.i_0
-        x = jnp.exp(jnp.linspace(-5.0, 5.0, 41))
-        x = jnp.concatenate([x, -x])
-        for _ in range(4):
-            # d(distance^2)/dx times x^3, a quartic; kept on its branch by a bounded relative step.
-            value = 5 * x**4 + (2 * iota - 4 * zeta) * x**3 - 2 * iota * x - 1
-            slope = 20 * x**3 + 3 * (2 * iota - 4 * zeta) * x**2 - 2 * iota
-            x = x * (1 - jnp.clip(value / jnp.where(slope == 0, 1.0, slope) / x, -0.5, 0.5))
-        return safe_sqrt(jnp.min((x - zeta) ** 2 + (iota + (x + 1 / x) / 2) ** 2))

@@ -8,8 +8,9 @@ import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant
-from ambjax.world.sensor import Sensor
+from ambjax.world.sensor import Measurement, Sensor
 from ambjax.world.signals import Constant, Signal, is_random, realised
 
 # A member's randomness beside its sensors': folded into its key where they fold the sample number, beyond any of those.
@@ -25,12 +26,16 @@ class Initial:
     z_dot: Scalar = leaf(default=0.0, unit="m/s", at_least=-1e6, at_most=1e6, doc="its rate")
     i: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="current deviation")
 
+    def measurement(self) -> Measurement:
+        """The same, as ideal sensors see it."""
+        return Measurement(*(jnp.asarray(x) for x in (self.z, self.z_dot, self.i)))
+
 
 @record
 class Scenario:
     """Everything that happens to a cascade. Member k of seed s always draws the same noise."""
 
-    plant: Plant = Plant()
+    plant: Bearing = Plant()
     reference: Signal = Constant()
     q_z: Signal = Constant()
     """disturbance acceleration, m/s^2"""
