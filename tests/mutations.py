@@ -88,8 +88,8 @@ LAWS = [
     M(
         "the current law switches the wrong way",
         "ambjax/control/current.py",
-        "robust = -self.k_i *",
-        "robust = self.k_i *",
+        "return -self.k_i *",
+        "return self.k_i *",
         "tests/test_laws.py::test_equation_11_gives_the_error_dynamics_of_equation_10",
     ),
     M(
@@ -299,8 +299,8 @@ ENSEMBLE = [
     M(
         "a condition of the theorem holds where it fails",
         "ambjax/theorem/conditions.py",
-        "unit, gain > against, path",
-        "unit, gain < against, path",
+        "one.unit, gain > against, path",
+        "one.unit, gain < against, path",
         "tests/test_theorem.py::test_repaired_holds_and_literal_does_not",
     ),
 ]
@@ -370,9 +370,9 @@ SEARCH = [
     ),
     M(
         "the range of c forgets the sample period",
-        "tuning/objective/ranges.py",
-        "cap = max(1 / (5 * asked.period), asked.w / 10)",
-        "cap = 20 * asked.w",
+        "ambjax/control/search.py",
+        "cap = max(1 / (5 * site.period), site.w / 10)",
+        "cap = 20 * site.w",
         "tests/test_tuning_study.py::test_starts_reach_as_far_as_the_theory_suggests",
     ),
     M(

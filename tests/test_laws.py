@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from ambjax import Adaptive, Cascade, Clock, Plant, Pulse, Scenario, Sine, rollout
-from ambjax.control import current, inversion, observer, position
+from ambjax.control import answers, current, inversion, observer, position
 from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand
+from ambjax.control.search import Site
 from ambjax.numerics.records import validate
 from ambjax.numerics.smooth import smooth_sign
 from ambjax.world.sensor import Measurement
@@ -158,6 +159,38 @@ def test_output_is_finite_for_wild_states(stage, law):
         for sign in (1, -1):
             signed = jax.tree.map(lambda x, sign=sign: sign * x, state)
             assert all(np.isfinite(x) for x in jax.tree.leaves(call(stage, law, TAME, signed)))
+
+
+SITE = Site(MODEL, 500.0, 1e-4, {"Q_z": 0.1, "Q_i": 2.0, "Delta_1": 6e4}, (6e4, "Delta_1 along the reference"))
+# sigma, v_tilde or e: the error of the stage; the last so large that any sign is saturated
+ERRORS = jnp.asarray([-1e9, -1e-3, 0.0, 1e-3, 1e9])
+
+
+@TABLE
+def test_what_a_law_answers_beside_its_output(stage, law):
+    assert jax.tree.structure(answers.layer(law, MODEL)) == jax.tree.structure(law.scale(MODEL))
+    assert all(x > 0 for x in jax.tree.leaves(answers.layer(law, MODEL)))
+    robust = np.asarray(answers.robust(law, ERRORS))
+    required = answers.requirement(law)
+    # a law of whose gain the theorem requires something has a robust term of that size at most, which opposes the error
+    assert (required is None) == (not robust.any())
+    if required:
+        assert required.gain in gains(law)
+        assert np.all(robust * ERRORS <= 0)
+        assert np.max(np.abs(robust)) == pytest.approx(getattr(law, required.gain), rel=0.02)
+    for name, interval in answers.ranges(law, SITE).items():
+        assert name in gains(law)
+        assert 0 < interval.low < interval.high < np.inf
+        assert interval.source
+    steep = [f.name for f in dataclasses.fields(law) if f.metadata.get("steepness")]
+    assert bool(steep) == hasattr(law, "size")
+    # a plant twice as wide, of the same pole: errors of twice the size meet a sign half as steep
+    wide = dataclasses.replace(MODEL, s_0=2 * MODEL.s_0, i_0=MODEL.i_0 * 8**0.5)
+    for name in steep:
+        ratio = law.size(MODEL) / law.size(wide)
+        suited = getattr(answers.default_law(type(law), wide), name)
+        assert suited == pytest.approx(ratio * getattr(type(law)(), name), rel=1e-12)
+    assert answers.slides(law) == isinstance(law, inversion.Adaptive)
 
 
 GAINS = [(stage, law, name) for stage, law in LAWS for name in gains(law)]

@@ -101,6 +101,39 @@ def test_tuning_uses_public_names_only(module):
             assert private in ([], ["__version__"]), f"{module} imports {private} from {node.module}"
 
 
+LAWS = [f"ambjax.control.{stage}" for stage in ("observer", "position", "inversion", "current")]
+# Who may know which laws there are: those who make them of names, the paper's own, and a user's imports.
+MAKERS = ("ambjax.control.", "ambjax.cases.reader", "ambjax.paper.", "ambjax")
+
+
+def own_gains():
+    """Names of the numbers of laws, less those by which anything but the paper's tables calls its own."""
+    classes = {
+        m: [node for node in ast.parse(MODULES[m].read_text()).body if isinstance(node, ast.ClassDef)] for m in MODULES
+    }
+    fields = {m: {n.target.id for c in classes[m] for n in c.body if isinstance(n, ast.AnnAssign)} for m in MODULES}
+    defined = {m: {n.name for c in classes[m] for n in c.body if isinstance(n, ast.FunctionDef)} for m in MODULES}
+    others = set().union(*(fields[m] | defined[m] for m in MODULES if m not in LAWS and not m.startswith(MAKERS[2])))
+    return set().union(*(fields[m] for m in LAWS)) - others - {"requirement"}
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if not (m in MAKERS or m.startswith(MAKERS[:3]))])
+def test_laws_answer_for_themselves(module):
+    # no isinstance of a law without its class; and nobody asks for a gain by its name
+    assert not imports(module) & set(LAWS), f"{module} knows a law: ask the law (ambjax/control/answers.py)"
+    asked = set()
+    for node in ast.walk(ast.parse(MODULES[module].read_text())):
+        if isinstance(node, ast.Attribute):
+            asked.add(node.attr)
+        elif isinstance(node, ast.Constant) and len(str(node.value)) > 1:  # a letter may be a unit's prefix
+            asked.add(node.value)
+    assert not asked & own_gains(), f"{module} asks for the gain of a law: ask the law (ambjax/control/answers.py)"
+
+
+def test_the_gains_of_laws_are_found():
+    assert {"gamma", "c", "k", "k_1", "k_2", "k_p", "k_int", "k_aw", "l"} <= own_gains()
+
+
 @pytest.mark.parametrize("module", MODULES)
 def test_matplotlib_only_where_things_are_drawn(module):
     used = any(name.split(".")[0] == "matplotlib" for name in imports(module))

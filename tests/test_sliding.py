@@ -25,9 +25,10 @@ from ambjax import (
 )
 from ambjax.ensemble import run_ensemble
 from ambjax.numerics.kernel import one_kernel
+from ambjax.numerics.relaxation import _implicit, relax
 from ambjax.numerics.smooth import smooth_sign
 from ambjax.simulation.metrics import Rms
-from ambjax.simulation.sliding import _implicit, _phi, relax
+from ambjax.simulation.sliding import _phi
 
 TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.01, 0.02), u_max=200.0)
 

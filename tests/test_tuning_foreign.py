@@ -14,7 +14,7 @@ from ambjax import Cascade, Plant, position
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
 from ambjax.cases.template import template
-from ambjax.control.laws import default_law
+from ambjax.control.answers import default_law
 from tuning.__main__ import main
 from tuning.command import _laws
 from tuning.config import tune_from

@@ -97,7 +97,7 @@ def tune_from(table: Table, case: Case) -> Tune:
 
 def _space(table: Table, case: Case) -> Space:
     known = tunable(case.cascade)
-    default = [path for path in known if not path.endswith(".p")] or known
+    default = tunable(case.cascade, steepness=False) or known
     paths = table.raw.get("gains", default)
     if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
         raise ValueError(f'{table.at("gains")} = {show(paths)}: give a list of paths, as in ["controller.position.c"].')

@@ -124,12 +124,16 @@ class Space:
         return cascade
 
 
-def tunable(cascade: Cascade) -> list[str]:
-    """Dotted paths of all gains of a cascade that may be tuned: the positive leaves of its laws."""
+def tunable(cascade: Cascade, *, steepness: bool = True) -> list[str]:
+    """Dotted paths of all gains of a cascade that may be tuned: the positive leaves of its laws.
+
+    `steepness`: those of smoothed signs too.
+    """
     found = []
     for stage in STAGES:
         for field in dataclasses.fields(getattr(cascade, stage)):
-            if field.metadata.get("leaf") and (field.metadata["above"] is not None):
+            meta = field.metadata
+            if meta.get("leaf") and meta["above"] is not None and (steepness or not meta.get("steepness")):
                 found.append(f"{ROOT}.{stage}.{field.name}")
     return found
 

@@ -63,7 +63,7 @@ class Study:
 
 def method_for(case: Case, substeps: int) -> Integrator:
     """The step of the search: of fixed number, so that all members take as long, and blind to gamma p."""
-    if slides(case.cascade):
+    if slides(case.cascade, case.scenario.plant):
         return Slide(substeps)
     return choose_method(case.cascade, case.scenario, float(case.clock.sample_period), reverse=True)
 

@@ -13,9 +13,8 @@ from typing import Any
 from ambjax.cases.reach import check_reference
 from ambjax.cases.spread import spread_from
 from ambjax.cases.table import Table, check_depth, load, show
-from ambjax.control import current, inversion, observer, position
+from ambjax.control import answers, current, inversion, observer, position
 from ambjax.control.cascade import Cascade
-from ambjax.control.laws import default_law
 from ambjax.ensemble.spread import Spread, corners
 from ambjax.host.words import one_line
 from ambjax.numerics.records import leaf, numbers
@@ -103,9 +102,10 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     cascade = _cascade(top.table("controller"), plant)
     scenario, settle = _scenario(top, plant)
     clock, duration = _clock(top.table("clock"))
-    if isinstance(clock.method, Slide) and not slides(cascade):
+    if isinstance(clock.method, Slide) and not slides(cascade, scenario.plant):
+        made = " or ".join(f'"{kind}"' for kind, law in KINDS["inversion"].items() if answers.slides(law))
         raise ValueError(
-            'clock.method = "sliding": it is made for controller.inversion.kind = "adaptive". Use method = "adaptive".'
+            f'clock.method = "sliding": it is made for controller.inversion.kind = {made}. Use method = "adaptive".'
         )
     _check_start(scenario)
     if settle is None:
@@ -125,7 +125,7 @@ def _cascade(table: Table, plant: Plant) -> Cascade:
     for stage, kinds in KINDS.items():
         law = table.table(stage)
         kind = law.choice("kind", list(kinds), next(iter(kinds)))
-        laws[stage] = law.record(kinds[kind], extra=("kind",), base=default_law(kinds[kind], model))
+        laws[stage] = law.record(kinds[kind], extra=("kind",), base=answers.default_law(kinds[kind], model))
     return Cascade(model=model, **laws)
 
 

@@ -67,7 +67,7 @@ def say_how_long(study: Study, pace: Pace) -> None:
         return
     rate = f"{pace.whole:.2g}" if pace.whole < 10 else f"{pace.whole:,.0f}"
     words = f"about {duration(seconds)} for {study.members:,} members ({rate} a second)"
-    if seconds > LONG and isinstance(study.clock.method, Adaptive) and slides(study.cascade):
+    if seconds > LONG and isinstance(study.clock.method, Adaptive) and slides(study.cascade, study.scenario.plant):
         words += '; clock.method = "sliding" would be faster: its error is measured and told'
     say(words)
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 from jax import Array
 
-from ambjax.control import current, inversion, observer, position
+from ambjax.control import answers, current, inversion, observer, position
 from ambjax.control.laws import (
     CurrentInputs,
     CurrentLaw,
@@ -17,7 +17,6 @@ from ambjax.control.laws import (
     Observer,
     PositionLaw,
     State,
-    default_law,
 )
 from ambjax.numerics.records import Scalar, record
 from ambjax.world.plant import Plant
@@ -59,7 +58,7 @@ USUAL = {
 class Cascade:
     """The controller. `model` is the plant it believes in; the true one lives in the Scenario.
 
-    A law left out is the paper's, with the gains of Table 2 and a p that suits the model (`laws.default_law`): 25
+    A law left out is the paper's, with the gains of Table 2 and a p that suits the model (`answers.default_law`): 25
     for the plant of Table 1. Laws are made once: `dataclasses.replace` with another model keeps those that are there.
     """
 
@@ -72,7 +71,7 @@ class Cascade:
     def __post_init__(self) -> None:
         for stage, kind in USUAL.items():
             if getattr(self, stage) is _LEFT_OUT:
-                object.__setattr__(self, stage, default_law(kind, self.model))
+                object.__setattr__(self, stage, answers.default_law(kind, self.model))
 
     def init(self, measured: Measurement) -> CascadeState:
         """States of all laws at t = 0."""
@@ -86,6 +85,10 @@ class Cascade:
     def scale(self) -> CascadeState:
         """Size of each state that still matters."""
         return CascadeState(*(law.scale(self.model) for law in self.laws))
+
+    def layer(self) -> CascadeState:
+        """The largest error with which each state stays where a smoothed sign turns."""
+        return CascadeState(*(answers.layer(law, self.model) for law in self.laws))
 
     def slopes(self) -> dict[str, Scalar]:
         """The steepest rate of each law by stage, 1/s."""

@@ -1,9 +1,13 @@
 """Current laws: which voltage drives the current to its reference."""
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.control.answers import Requirement
 from ambjax.control.laws import CurrentInputs
+from ambjax.control.search import Interval, Site, rate, switch
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
 from ambjax.world.plant import Plant
@@ -18,7 +22,9 @@ class SlidingMode:
         default=25.0,
         unit="1/A",
         doc="steepness of the smoothed sign of the current error; left out: scaled to the plant",
+        steepness=True,
     )
+    requirement: ClassVar = Requirement("k_i", "Q_i")
 
     def init(self, model: Plant) -> tuple[()]:
         return ()
@@ -35,9 +41,15 @@ class SlidingMode:
     def __call__(self, model: Plant, inputs: CurrentInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
         measured, demand = inputs.measured, inputs.demand
         inverse = (inputs.gaps or model.gaps(measured.z)).inverses[1]
-        robust = -self.k_i * smooth_sign(measured.i - demand.i_ref, self.p)
+        robust = self.robust(measured.i - demand.i_ref)
         wanted = -2 * measured.z_dot * inverse * measured.i + demand.i_ref_dot + robust
         return (model.kappa / 2) * inverse * wanted + model.R * measured.i, ()
+
+    def robust(self, e: Array) -> Array:
+        return -self.k_i * smooth_sign(e, self.p)
+
+    def ranges(self, site: Site) -> dict[str, Interval]:
+        return {"k_i": switch(site, "k_i", self.p, 200, "Q_i")}
 
 
 @record
@@ -67,3 +79,11 @@ class ProportionalIntegral:
         u = self.k_p * error + model.L * inputs.demand.i_ref_dot + state
         excess = jnp.clip(u, -inputs.u_max, inputs.u_max) - u
         return u, self.k_int * error + self.k_aw * excess
+
+    def ranges(self, site: Site) -> dict[str, Interval]:
+        per = 1 / float(site.model.L)
+        return {
+            "k_p": rate(site, 1 / 3, 200, "bandwidth k_p / L from w/3 to 200 w", per),
+            "k_int": rate(site, 1 / 30, 30, "corner sqrt(k_int / L) from w/30 to 30 w", per, 2),
+            "k_aw": rate(site, 1e-2, 10, "rate from w/100 to 10 w"),
+        }

@@ -1,12 +1,18 @@
 """Inversion laws: which current gives the force."""
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.laws import CurrentDemand, ForceDemand
+from ambjax.control.answers import Requirement
+from ambjax.control.laws import CurrentDemand, ForceDemand, Relaxation
+from ambjax.control.search import Interval, Site
+from ambjax.numerics.apart import stored
 from ambjax.numerics.records import Scalar, gain, leaf, record
-from ambjax.numerics.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
+from ambjax.numerics.relaxation import relax
+from ambjax.numerics.smooth import TWO_OVER_PI, away_from_zero, reciprocal, smooth_sign
 from ambjax.world.plant import Plant
 
 # |dv/di| is held at this share of its value at the origin, so that crossing the singular curve C,
@@ -29,9 +35,13 @@ class Adaptive:
 
     gamma: Scalar = gain(default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above Delta_1 of Eq. (7)")
     p: Scalar = gain(
-        default=25.0, unit="m^2/A^2", doc="steepness of the smoothed sign of v_tilde; left out: scaled to the plant"
+        default=25.0,
+        unit="m^2/A^2",
+        doc="steepness of the smoothed sign of v_tilde; left out: scaled to the plant",
+        steepness=True,
     )
     i_ref: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="initial current reference")
+    requirement: ClassVar = Requirement("gamma", "Delta_1")
 
     def init(self, model: Plant) -> Array:
         return jnp.asarray(self.i_ref)
@@ -53,6 +63,26 @@ class Adaptive:
         v, gradient = v_and_gradient(model, inputs, state)
         rate = self.gamma * smooth_sign(inputs.v_star - v, self.p, per=gradient)
         return CurrentDemand(state, rate), rate
+
+    def robust(self, v_tilde: Array) -> Array:
+        return -self.gamma * smooth_sign(v_tilde, self.p)
+
+    def ranges(self, site: Site) -> dict[str, Interval]:
+        needed, words = site.delta_1
+        name = words.partition(" ")[0]
+        return {"gamma": Interval(needed, 100 * needed, f"{name} to 100 {name}, {words}")}
+
+    def slide(self, model: Plant, begin: ForceDemand, end: ForceDemand, i_ref: Array, h: Scalar) -> Relaxation:
+        """i_ref over a step: it slides to the sign's layer, and is slaved to v_star from there on. Eq. (14a)."""
+        v_0, gradient_0 = v_and_gradient(model, begin, i_ref)
+        v_1, gradient_1 = v_and_gradient(model, end, i_ref)
+        w = begin.v_star - v_0
+        drift = (end.v_star - v_1 - w) * (1 / jnp.where(h > 0, h, 1.0))
+        w, drift = stored((w, drift))
+        sliding, slaved, turn = relax(w, drift, self.gamma, self.p, h)
+        w_1 = w + turn * (drift - sliding)
+        w_2 = w_1 + (h - turn) * (drift - slaved)
+        return Relaxation(sliding * reciprocal(gradient_0), slaved * reciprocal(gradient_1), turn, (w, w_1, w_2))
 
 
 @record

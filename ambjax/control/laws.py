@@ -3,15 +3,12 @@
 A law is a frozen record: its type is the algorithm, its leaves are the gains. `init` gives its
 state at t = 0 and a call gives (output, state_rate); a law without state uses (). `scale` gives,
 for each state, the size that still matters (an integrator's error is measured against it), and
-`slope` the steepest rate of the law in 1/s, from which a step is chosen. A law with a smoothed sign
-tells by `size` what the sign's argument amounts to on a plant: sigma = w s_0 (w the magnets' pole), v = i_0^2/s_0^2,
-i = i_0. Its default p is that of Table 1 for that plant and goes with 1/size for others. `model` is the nominal
-plant: what the controller believes. To add a law: one record in the file of its stage, one row in
-`KINDS` of the case-file reader, one row in the conformance test.
+`slope` the steepest rate of the law in 1/s, from which a step is chosen. `model` is the nominal
+plant: what the controller believes. A law may answer more: `control.answers` lists what. To add a law: one record
+in the file of its stage, one row in `KINDS` of the case-file reader, one row in the conformance test.
 """
 
-import dataclasses
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 from jax import Array
 
@@ -22,7 +19,6 @@ from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 
 State = Any
-L = TypeVar("L")
 
 
 class ForceDemand(NamedTuple):
@@ -53,6 +49,19 @@ class CurrentInputs(NamedTuple):
     demand: CurrentDemand
     u_max: Scalar
     gaps: Gaps | None = None
+
+
+class Relaxation(NamedTuple):
+    """Output of an inversion law's `slide(model, begin, end, i_ref, h)`: its one state, i_ref, over a step of h s.
+
+    Two constant rates, A/s, of which the first ends after `turn`, s; and v_tilde, A^2/m^2, at the start, then and at
+    the end. `begin`, `end`: the ForceDemand at both ends of the step.
+    """
+
+    first: Array
+    rest: Array
+    turn: Array
+    v_tilde: tuple[Array, Array, Array]
 
 
 class Observer(Protocol):
@@ -90,15 +99,3 @@ class CurrentLaw(Protocol):
     def scale(self, model: Plant) -> State: ...
     def slope(self, model: Plant) -> Scalar: ...
     def __call__(self, model: Plant, inputs: CurrentInputs, state: State, /) -> tuple[Array, State]: ...
-
-
-def default_law(kind: type[L], model: Plant) -> L:
-    """The law of this kind with its default gains and, where it has a smoothed sign, the p that suits the model.
-
-    A sign is soft or hard against what its argument amounts to: p = 25 m^2/A^2 is soft where v is 2500 A^2/m^2, as in
-    Table 1, and a hard sign where it is 1e7.
-    """
-    law: Any = kind()
-    if not hasattr(law, "size"):
-        return law
-    return dataclasses.replace(law, p=law.p * (law.size(Plant()) / law.size(model)))

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.control.search import Interval, Site, rate
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
@@ -53,3 +54,6 @@ class Complementary:
 
     def __call__(self, model: Plant, inputs: Measurement, state: Array) -> tuple[Measurement, Array]:
         return inputs._replace(z=state), inputs.z_dot + self.l * (inputs.z - state)
+
+    def ranges(self, site: Site) -> dict[str, Interval]:
+        return {"l": rate(site, 1e-3, 1, "corner from w/1000 to w")}

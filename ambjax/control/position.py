@@ -1,8 +1,12 @@
 """Position laws: which scaled force moves the rotor onto the reference."""
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.control.answers import Requirement
+from ambjax.control.search import Interval, Site, manifold, rate, switch
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_root, smooth_sign
 from ambjax.world.plant import Plant
@@ -28,8 +32,12 @@ class SlidingMode:
     c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold")
     k: Scalar = gain(default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z")
     p: Scalar = gain(
-        default=25.0, unit="s/m", doc="steepness of the smoothed sign of sigma; left out: scaled to the plant"
+        default=25.0,
+        unit="s/m",
+        doc="steepness of the smoothed sign of sigma; left out: scaled to the plant",
+        steepness=True,
     )
+    requirement: ClassVar = Requirement("k", "Q_z")
 
     def init(self, model: Plant) -> tuple[()]:
         return ()
@@ -50,8 +58,14 @@ class SlidingMode:
         self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()]
     ) -> tuple[Array, tuple[()]]:
         motion, reference = inputs
-        robust = -self.k * smooth_sign(self.sigma(motion, reference), self.p)
+        robust = self.robust(self.sigma(motion, reference))
         return force_for(self.c, model, motion, reference, robust), ()
+
+    def robust(self, sigma: Array) -> Array:
+        return -self.k * smooth_sign(sigma, self.p)
+
+    def ranges(self, site: Site) -> dict[str, Interval]:
+        return {"c": manifold(site), "k": switch(site, "k", self.p, 100, "Q_z")}
 
 
 @record
@@ -67,7 +81,10 @@ class SuperTwisting:
     k_1: Scalar = gain(default=40.0, unit="m^0.5/s^1.5", doc="gain of the root term")
     k_2: Scalar = gain(default=50.0, unit="m/s^3", doc="gain of the integral; above the bound on dq_z/dt")
     p: Scalar = gain(
-        default=100.0, unit="s/m", doc="steepness of the smoothed root and sign of sigma; left out: scaled to the plant"
+        default=100.0,
+        unit="s/m",
+        doc="steepness of the smoothed root and sign of sigma; left out: scaled to the plant",
+        steepness=True,
     )
 
     def init(self, model: Plant) -> Array:
@@ -93,3 +110,11 @@ class SuperTwisting:
         sigma = self.sigma(motion, reference)
         robust = state - self.k_1 * smooth_root(sigma, self.p)
         return force_for(self.c, model, motion, reference, robust), -self.k_2 * smooth_sign(sigma, self.p)
+
+    def ranges(self, site: Site) -> dict[str, Interval]:
+        root, integral = float(self.p) ** 0.5, TWO_OVER_PI * float(self.p)
+        return {
+            "c": manifold(site),
+            "k_1": rate(site, 1 / 3, 100, "slope k_1 sqrt(p) from w/3 to 100 w", root),
+            "k_2": rate(site, 1e-2, 10, "corner sqrt(2/pi k_2 p) from w/100 to 10 w", integral, 2),
+        }

@@ -57,9 +57,13 @@ def leaf(
 GAINS = 1e-30, 1e30
 
 
-def gain(*, default: Any, unit: str, doc: str) -> Any:
-    """A positive numeric field over all decades, which may be tuned on a scale of logarithms."""
-    return leaf(default=default, unit=unit, doc=doc, above=GAINS[0], at_most=GAINS[1])
+def gain(*, default: Any, unit: str, doc: str, steepness: bool = False) -> Any:
+    """A positive numeric field over all decades, which may be tuned on a scale of logarithms.
+
+    `steepness`: that of a smoothed sign, which is suited to the plant, and tuned only where that is asked for.
+    """
+    plain = leaf(default=default, unit=unit, doc=doc, above=GAINS[0], at_most=GAINS[1])
+    return dataclasses.field(default=default, metadata={**plain.metadata, "steepness": steepness})
 
 
 def static(default: Any = dataclasses.MISSING, *, doc: str = "") -> Any:

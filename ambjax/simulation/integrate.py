@@ -186,14 +186,17 @@ class Rodas3(_Fixed):
 class Slide(_Fixed):
     """Equal substeps of the loop's own step (`ambjax.simulation.sliding`): for stiff gains under held noise.
 
-    Second order in the loop's slow motion, whatever gamma p is; the inversion law must be `inversion.Adaptive`.
+    Second order in the loop's slow motion, however stiff the inversion law is; that must have a `slide`, as
+    `inversion.Adaptive` does, and the plant be lumped.
     """
 
     limit = None
 
     def _step(self, problem: Problem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         if problem.slide is None:
-            raise ValueError("clock.method = Slide(...): it steps loops whose inversion law is 'adaptive'. Use Rodas3.")
+            raise ValueError(
+                "clock.method = Slide(...): it steps lumped plants under an 'adaptive' inversion law. Use Rodas3."
+            )
         return problem.slide(problem.inputs(at(0.0)), problem.inputs(at(1.0)), h, state, span)
 
     def __str__(self) -> str:

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.cascade import Cascade, CascadeState, Command
-from ambjax.control.inversion import Adaptive
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.integrate import Problem
 from ambjax.simulation.sliding import slide, slides
@@ -96,11 +95,9 @@ class ClosedLoop:
         return jax.tree.map(jnp.asarray, LoopState(self.scenario.plant.scale(), self.cascade.scale()))
 
     def layer(self) -> LoopState:
-        """The largest error that keeps a component where its smoothed sign turns: for i_ref, that of its law, A."""
-        law, widths = self.cascade.inversion, jax.tree.map(lambda x: jnp.full_like(x, jnp.inf), self.scale())
-        if not isinstance(law, Adaptive):
-            return widths
-        return widths._replace(control=widths.control._replace(inversion=jnp.asarray(law.layer(self.cascade.model))))
+        """The largest error that keeps a component where its smoothed sign turns: the laws' states have such signs."""
+        plant = jax.tree.map(lambda _: jnp.inf, self.scenario.plant.scale())
+        return jax.tree.map(jnp.asarray, LoopState(plant, self.cascade.layer()))
 
     def inputs(self, t: Scalar) -> Inputs:
         """Everything that depends on time alone."""
@@ -153,7 +150,7 @@ class ClosedLoop:
 
     def problem(self, hold: Errors) -> Problem:
         """What an integrator is given for one sample."""
-        step = functools.partial(slide, self, hold) if slides(self.cascade) else None
+        step = functools.partial(slide, self, hold) if slides(self.cascade, self.scenario.plant) else None
         rates = lambda inputs, x: self.rates(inputs, x, hold)  # noqa: E731
         observed = lambda inputs, x: self.observed(inputs, x, hold)  # noqa: E731
         jumps = self.scenario.sensor is not None

@@ -1,4 +1,4 @@
-"""One step of the closed loop that knows where its stiffness is: the adaptive inversion law.
+"""One step of the closed loop that knows where its stiffness is: in an inversion law that slides, as the adaptive one.
 
 Under measurements that jump every sample, i_ref slides to its new place within microseconds and is
 slaved to it for the rest: w' = d - gamma sgn(w) for w = v_star - v(z, i_ref), Eq. (14a). A linearised
@@ -17,26 +17,21 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.inversion import Adaptive, v_and_gradient
+from ambjax.control import answers
+from ambjax.control.cascade import Cascade
 from ambjax.control.laws import CurrentDemand, CurrentInputs
 from ambjax.numerics.apart import apart, stored
 from ambjax.numerics.records import Scalar
-from ambjax.numerics.smooth import TWO_OVER_PI, reciprocal, smooth_sign
 from ambjax.simulation.span import Instant, Span
+from ambjax.world.bearing import Bearing
 from ambjax.world.plant import State
 from ambjax.world.sensor import Errors, Measurement
 
-# Newton steps on the slaved sign: monotone from below; they leave less than 1e-3 of the right-hand side.
-NEWTON = 6
-# |w| p below which w is slaved at once. Within the layer it relaxes in 1/(gamma p), not at its initial rate: a slide
-# there would end anywhere in the step for a change of w by a millionth, and derivatives would be such cliffs'.
-EDGE = 1.0
-
 
 def slide(loop: Any, hold: Errors, begin: Any, end: Any, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
-    """The state of a ClosedLoop whose inversion law is `inversion.Adaptive` after h; `begin`, `end`: its inputs."""
+    """The state after h of a ClosedLoop for which `slides` holds; `begin`, `end`: its inputs."""
     cascade, scenario = loop.cascade, loop.scenario
-    model, law, (z, z_dot, i), control = cascade.model, cascade.inversion, state.plant, state.control
+    model, (z, z_dot, i), control = cascade.model, state.plant, state.control
     i_ref = control.inversion
     per_h = 1 / jnp.where(h > 0, h, 1.0)
 
@@ -49,16 +44,8 @@ def slide(loop: Any, hold: Errors, begin: Any, end: Any, h: Scalar, state: Any, 
     ahead, moved, force_0 = stored((ahead, moved, force_0))
     force_1, seen_1, rates_1 = cascade.demand(loop.measured(ahead, hold), moved, end.reference)
 
-    v_0, gradient_0 = v_and_gradient(model, force_0, i_ref)
-    v_1, gradient_1 = v_and_gradient(model, force_1, i_ref)
-    w = force_0.v_star - v_0
-    drift = (force_1.v_star - v_1 - w) * per_h
-    w, drift = stored((w, drift))
-    sliding, slaved, tau = relax(w, drift, law.gamma, law.p, h)
-    w_1 = w + tau * (drift - sliding)
-    w_2 = w_1 + (h - tau) * (drift - slaved)
-    sliding, slaved = sliding * reciprocal(gradient_0), slaved * reciprocal(gradient_1)
-
+    inversion: Any = cascade.inversion
+    sliding, slaved, tau, (w, w_1, w_2) = inversion.slide(model, force_0, force_1, i_ref, h)
     sliding, slaved, tau, force_1 = stored((sliding, slaved, tau, force_1))
 
     def current(plant: State, seen: Measurement, i_ref: Array, rate: Array, inner: Any, q_i: Array, h: Array):
@@ -136,43 +123,6 @@ def _seen(span: Span, shown: tuple[Instant, ...], u: Array, rest: _Voltage, tau:
     return span._replace(time=span.time + tau + left, densities=densities)
 
 
-def relax(w: Array, drift: Array, gain: Scalar, p: Scalar, h: Scalar) -> tuple[Array, Array, Array]:
-    """w' = drift - gain sgn(w) over h, as two constant rates of `gain sgn(w)`: (first, second, time of the first).
-
-    First it slides at its initial rate to the sign's layer (or to the end); then it is slaved, one backward Euler step.
-    """
-    first = gain * smooth_sign(w, p)
-    closing = first - drift
-    outside = jnp.sign(w) * jnp.maximum(jnp.abs(w) - EDGE / p, 0.0)
-    safe = jnp.where(closing == 0, 1.0, closing)
-    tau = jnp.where(outside * closing > 0, jnp.minimum(outside * (1 / safe), h), 0.0)
-    left = h - tau
-    return first, gain * smooth_sign(_implicit(w - tau * closing + left * drift, left * gain, p), p), tau
-
-
-@jax.custom_jvp
-def _implicit(b: Array, reach: Array, p: Scalar) -> Array:
-    """The w with w + reach sgn(w) = b, by Newton's method from below: the left side is concave in |w|.
-
-    Its derivative is that of the equation, not of the iteration: a fifth of the work.
-    """
-    size = jnp.abs(b)
-    w = jnp.maximum(size / (1 + reach * p * TWO_OVER_PI), size - reach)
-    for _ in range(NEWTON):
-        slope = 1 + reach * p * TWO_OVER_PI / (1 + (p * w) ** 2)
-        w = w + (size - w - reach * smooth_sign(w, p)) / slope
-    return jnp.where(b < 0, -w, w)
-
-
-@_implicit.defjvp
-def _implicit_jvp(primals: tuple[Array, Array, Scalar], tangents: tuple[Any, Any, Any]) -> tuple[Array, Array]:
-    (b, reach, p), (db, d_reach, dp) = primals, tangents
-    w = _implicit(b, reach, p)
-    flat = TWO_OVER_PI / (1 + (p * w) ** 2)
-    change = db - smooth_sign(w, p) * d_reach - reach * flat * w * dp
-    return w, change * reciprocal(1 + reach * p * flat)
-
-
 @jax.custom_jvp
 @apart
 def _phi(x: Array) -> Array:
@@ -193,6 +143,6 @@ def _axpy(x: Any, h: Scalar, rate: Any) -> Any:
     return jax.tree.map(lambda a, b: a + h * b, x, rate)
 
 
-def slides(cascade: Any) -> bool:
-    """Whether this step is made for the cascade."""
-    return isinstance(cascade.inversion, Adaptive)
+def slides(cascade: Cascade, plant: Bearing) -> bool:
+    """Whether this step is made for the cascade and the plant."""
+    return answers.slides(cascade.inversion) and plant.lumped

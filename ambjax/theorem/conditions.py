@@ -1,21 +1,21 @@
 """Theorem 1, monitored: its conditions with margins along a run, each with the time of its worst value.
 
-Conditions: k > Q_z, k_i > Q_i, gamma > Delta_1 (Eq. 7) and (z, i_ref) off the singular curve C (Eq. 9).
-The steps of the proof are reported as residuals (see `ambjax.theorem.proof`). A condition on a gain that a law
-does not have is reported as not applicable.
+Conditions: k > Q_z, k_i > Q_i, gamma > Delta_1 (Eq. 7) and (z, i_ref) off the singular curve C (Eq. 9). On which of
+its gains a law tells itself. The steps of the proof are reported as residuals (see `ambjax.theorem.proof`). A condition
+on a gain that a law does not have is reported as not applicable.
 """
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.control import current, inversion, position
-from ambjax.control.cascade import Cascade
+from ambjax.control import answers
+from ambjax.control.cascade import USUAL, Cascade
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
@@ -76,6 +76,41 @@ class Report:
         return math.isinf(self.lost_at) and not any(c.holds is False for c in self.conditions)
 
 
+class Side(NamedTuple):
+    """One way to take the right side of a condition: name and words of its line, and the signal whose peak it is.
+
+    No signal: on the ideal motion.
+    """
+
+    name: str
+    signal: str | None
+    where: str = ""
+
+
+# The right sides that a law's requirement may name.
+SIDES = {
+    "Q_z": (Side("disturbance of z", "q_z"),),
+    "Q_i": (Side("disturbance of i", "q_i"),),
+    "Delta_1": (
+        Side("inversion", "d", " along the run"),
+        Side("inversion, ideal", None, " along the reference"),
+    ),
+}
+
+
+class Required(NamedTuple):
+    """What is required of one law: its gain's name, dotted path and unit, what it must exceed, and its value.
+
+    The value is None where the law is required nothing: the gain is then the one that the paper's law has.
+    """
+
+    gain: str
+    path: str
+    unit: str
+    over: str
+    value: Any
+
+
 MONITORS = Named(
     {name: Peak(name, timed=True) for name in ("q_z", "q_i", "d", "q_z_plus_h", "sigma_off", "v_tilde_off", "e_off")}
     | {name: Lowest(name) for name in ("distance", "V_margin")}
@@ -124,38 +159,52 @@ def _drift(model: Plant, reference: Signal, times: Array) -> Array:
     return jax.vmap(drift)(times)
 
 
+def required(cascade: Cascade) -> list[Required]:
+    """What Theorem 1 requires of each law, in the order of its conditions; of an observer nothing, unless it says so.
+
+    Raises ValueError for a law that names a right side which the theorem does not have.
+    """
+    found = []
+    for stage in ("position", "current", "inversion", "observer"):
+        law, paper = getattr(cascade, stage), answers.requirement(USUAL[stage])
+        own = answers.requirement(law)
+        asked, kind = (own, type(law)) if own else (paper, USUAL[stage])
+        if asked is None:
+            continue
+        if asked.over not in SIDES:
+            raise ValueError(
+                f"{kind.__name__}.requirement.over = '{asked.over}': it must be one of {', '.join(SIDES)}."
+            )
+        unit = next(field.metadata["unit"] for field in dataclasses.fields(kind) if field.name == asked.gain)
+        value = getattr(law, asked.gain) if own else None
+        found.append(Required(asked.gain, f"controller.{stage}.{asked.gain}", unit, asked.over, value))
+    return found
+
+
 def _conditions(
     cascade: Cascade, worst: dict[str, tuple[float, float]], on_reference: tuple[float, float]
 ) -> list[Condition]:
-    def gain_of(law: Any, kind: type, name: str) -> float | None:
-        return float(getattr(law, name)) if isinstance(law, kind) else None
+    def line(one: Required, name: str, over: str, side: tuple[float, float], ideal: bool = False) -> Condition:
+        requires, (against, at) = f"{one.gain} > {over}", side
+        if one.value is None:
+            return Condition(name, requires, None, against, at, one.unit, None, "the law in use has no such gain")
+        gain, path = float(one.value), one.path
+        return Condition(name, requires, gain, against, at, one.unit, gain > against, path=path, ideal=ideal)
 
-    k = gain_of(cascade.position, position.SlidingMode, "k")
-    gamma = gain_of(cascade.inversion, inversion.Adaptive, "gamma")
-    k_i = gain_of(cascade.current, current.SlidingMode, "k_i")
-
-    def line(name: str, requires: str, gain: float | None, key: Any, unit: str, path: str) -> Condition:
-        ideal = not isinstance(key, str)
-        against, at = key if ideal else worst[key]
-        if gain is None:
-            return Condition(name, requires, None, against, at, unit, None, "the law in use has no such gain")
-        return Condition(name, requires, gain, against, at, unit, gain > against, path=path, ideal=ideal)
-
+    asked, lines = required(cascade), []
+    for one in asked:
+        for side in SIDES[one.over]:
+            against = worst[side.signal] if side.signal else on_reference
+            lines.append(line(one, side.name, one.over + side.where, against, ideal=not side.signal))
     distance, at = worst["distance"]
-    paths = [f"controller.{stage}" for stage in ("position.k", "current.k_i", "inversion.gamma")]
-    remark = dataclasses.replace(
-        line("remark 3", "k > sup |q_z + h|", k, "q_z_plus_h", "m/s^2", paths[0]),
-        holds=None,
-        note="optional in the paper: k would dominate the inversion's transients too",
-    )
-    return [
-        line("disturbance of z", "k > Q_z", k, "q_z", "m/s^2", paths[0]),
-        line("disturbance of i", "k_i > Q_i", k_i, "q_i", "A/s", paths[1]),
-        line("inversion", "gamma > Delta_1 along the run", gamma, "d", "A^2/m^2/s", paths[2]),
-        line("inversion, ideal", "gamma > Delta_1 along the reference", gamma, on_reference, "A^2/m^2/s", paths[2]),
-        Condition("singular curve C", "distance of (z/s_0, i_ref/i_0) to C > 0", distance, 0.0, at, "1", distance > 0),
-        remark,
+    note = "optional in the paper: k would dominate the inversion's transients too"
+    remarks = [
+        dataclasses.replace(line(one, "remark 3", "sup |q_z + h|", worst["q_z_plus_h"]), holds=None, note=note)
+        for one in asked
+        if one.over == "Q_z"
     ]
+    curve = "distance of (z/s_0, i_ref/i_0) to C > 0"
+    return [*lines, Condition("singular curve C", curve, distance, 0.0, at, "1", distance > 0), *remarks]
 
 
 def _proof(worst: dict[str, tuple[float, float]]) -> list[Condition]:

@@ -12,10 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control import current, inversion, position
-from ambjax.control.cascade import Cascade
+from ambjax.control import answers
 from ambjax.numerics.records import Scalar, record
-from ambjax.numerics.smooth import smooth_sign
 from ambjax.simulation.integrate import Problem
 from ambjax.simulation.loop import ClosedLoop, Inputs, LoopState
 from ambjax.simulation.span import Span
@@ -119,7 +117,7 @@ class Monitored:
         return self.loop.scenario.plant.measurement(state.plant)
 
     def terms(self, inputs: Inputs, state: LoopState, hold: Errors) -> Terms:
-        """The signals of the proof. For a law without the gain in question the robust term is left out."""
+        """The signals of the proof. The robust term of a law that tells none is left out."""
         cascade, scenario = self.loop.cascade, self.loop.scenario
         plant, motion = scenario.plant, self.motion(state)
         z, _, i = motion
@@ -130,7 +128,8 @@ class Monitored:
         q_z, q_i = inputs.q_z, inputs.q_i
         d = self._drift(inputs, state, hold, command.i_ref, moving)
         h = plant.a * (plant.signals(state.plant).v - v_tilde - plant.v(z, command.i_ref))
-        robust = Identities(_robust_z(cascade, sigma), _robust_v(cascade, v_tilde), _robust_i(cascade, e))
+        laws = cascade.position, cascade.inversion, cascade.current
+        robust = Identities(*map(answers.robust, laws, (sigma, v_tilde, e)))
         rates = Identities(robust.sigma + q_z + h, robust.v_tilde + d, robust.e + q_i)
         # |v(z, i) - v(z, i_ref)| <= L_v |e|: v is quadratic in i, so dv/di is largest at one end.
         L_v = jnp.maximum(jnp.abs(plant.dv_di(z, i)), jnp.abs(plant.dv_di(z, command.i_ref)))
@@ -176,18 +175,3 @@ class Monitored:
     def _sigma_dot(self, reference: Reference, state: LoopState, moving: LoopState) -> Array:
         sigma = lambda r, x: self.loop.cascade.position.sigma(self.motion(x), r)  # noqa: E731
         return jax.jvp(sigma, (reference, state), (reference.rate(), moving))[1]
-
-
-def _robust_z(cascade: Cascade, sigma: Array) -> Array:
-    law = cascade.position
-    return -law.k * smooth_sign(sigma, law.p) if isinstance(law, position.SlidingMode) else 0.0 * sigma
-
-
-def _robust_v(cascade: Cascade, v_tilde: Array) -> Array:
-    law = cascade.inversion
-    return -law.gamma * smooth_sign(v_tilde, law.p) if isinstance(law, inversion.Adaptive) else 0.0 * v_tilde
-
-
-def _robust_i(cascade: Cascade, e: Array) -> Array:
-    law = cascade.current
-    return -law.k_i * smooth_sign(e, law.p) if isinstance(law, current.SlidingMode) else 0.0 * e

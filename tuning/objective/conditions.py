@@ -1,17 +1,16 @@
 """The conditions of Theorem 1 on the gains, as lower bounds and as margins."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.control import current, inversion, position
 from ambjax.control.cascade import Cascade
 from ambjax.simulation.clock import Clock
-from ambjax.theorem.conditions import delta_1_on_reference
+from ambjax.theorem.conditions import delta_1_on_reference, required
 from ambjax.world.scenario import Scenario
 
 
@@ -26,19 +25,19 @@ class Bound:
 
 
 def bounds(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Bound, ...]:
-    """k > Q_z, k_i > Q_i, gamma > Delta_1 (Eq. 7, on the ideal motion z = r), where the laws have these gains."""
+    """What the laws require of their gains: k > Q_z, k_i > Q_i, gamma > Delta_1 (Eq. 7, on the ideal motion z = r)."""
     t = jnp.arange(clock.samples) * clock.sample_period
-    q_z = float(np.max(np.abs(np.asarray(jax.vmap(scenario.acceleration)(t)))))
-    q_i = float(np.max(np.abs(np.asarray(jax.vmap(scenario.q_i)(t)))))
-    found = []
-    if isinstance(cascade.position, position.SlidingMode):
-        found.append(Bound("controller.position.k", q_z, "Q_z", "m/s^2"))
-    if isinstance(cascade.current, current.SlidingMode):
-        found.append(Bound("controller.current.k_i", q_i, "Q_i", "A/s"))
-    if isinstance(cascade.inversion, inversion.Adaptive):
-        delta = delta_1_on_reference(cascade, scenario, clock)[0]
-        found.append(Bound("controller.inversion.gamma", delta, "Delta_1", "A^2/m^2/s"))
-    return tuple(found)
+
+    def largest(signal: Callable[[Array], Array]) -> float:
+        return float(np.max(np.abs(np.asarray(jax.vmap(signal)(t)))))
+
+    sides = {
+        "Q_z": lambda: largest(scenario.acceleration),
+        "Q_i": lambda: largest(scenario.q_i),
+        "Delta_1": lambda: delta_1_on_reference(cascade, scenario, clock)[0],
+    }
+    asked = [one for one in required(cascade) if one.value is not None]
+    return tuple(Bound(one.path, sides[one.over](), one.over, one.unit) for one in asked)
 
 
 def shortfall(gains: Mapping[str, Array], bounds: tuple[Bound, ...], margin: float) -> Array:

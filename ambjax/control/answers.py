@@ -1,0 +1,67 @@
+"""What a law may answer beside its output, and what is taken where it does not: nobody else asks which law it is.
+
+size(model)         what the argument of its smoothed sign amounts to: its steepnesses are suited to the model by it
+layer(model)        for each state, the largest error that keeps it where a smoothed sign turns; inf
+requirement         what Theorem 1 requires of one of its gains; nothing
+robust(error)       the term that its sign adds to the rate of the error of its stage, Eqs. (12), (14); 0
+ranges(site)        where its gains are searched; about their values
+slide(...)          an inversion law's step that knows where its stiffness is (`laws.Relaxation`); there is none
+"""
+
+import dataclasses
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.control.search import Interval, Site
+from ambjax.world.plant import Plant
+
+L = TypeVar("L")
+
+
+class Requirement(NamedTuple):
+    """What Theorem 1 requires of a law: that the gain of this name exceeds Q_z, Q_i or Delta_1."""
+
+    gain: str
+    over: str
+
+
+def default_law(kind: type[L], model: Plant) -> L:
+    """The law of this kind with its default gains and, where it has a smoothed sign, a steepness that suits the model.
+
+    A sign is soft or hard against what its argument amounts to: p = 25 m^2/A^2 is soft where v is 2500 A^2/m^2, as in
+    Table 1, and a hard sign where it is 1e7.
+    """
+    law: Any = kind()
+    if not hasattr(law, "size"):
+        return law
+    steep = [field.name for field in dataclasses.fields(law) if field.metadata.get("steepness")]
+    ratio = law.size(Plant()) / law.size(model)
+    return dataclasses.replace(law, **{name: getattr(law, name) * ratio for name in steep})
+
+
+def layer(law: Any, model: Plant) -> Any:
+    """The largest error with which each state of the law stays where a smoothed sign turns."""
+    return law.layer(model) if hasattr(law, "layer") else jax.tree.map(lambda _: jnp.inf, law.scale(model))
+
+
+def requirement(law: Any) -> Requirement | None:
+    """What Theorem 1 requires of a law, or of a kind of law."""
+    return getattr(law, "requirement", None)
+
+
+def robust(law: Any, error: Array) -> Array:
+    """What the law's sign adds to the rate of the error of its stage."""
+    return law.robust(error) if hasattr(law, "robust") else 0.0 * error
+
+
+def ranges(law: Any, site: Site) -> dict[str, Interval]:
+    """Where gains of the law are searched, by name; one that is not there: about its value."""
+    return law.ranges(site) if hasattr(law, "ranges") else {}
+
+
+def slides(law: Any) -> bool:
+    """Whether an inversion law has a step of its own."""
+    return hasattr(law, "slide")

@@ -1,0 +1,64 @@
+"""Where gains are searched: what a law is told of its surroundings, and the usual ways to make a range of them."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from ambjax.numerics.records import Scalar
+from ambjax.numerics.smooth import TWO_OVER_PI
+from ambjax.world.plant import Plant
+
+
+class Site(NamedTuple):
+    """The surroundings of a search: nominal plant, pole w of the true one (1/s), sample period (s).
+
+    `bounds`: what Theorem 1 requires gains to exceed, by symbol. `delta_1`: what Eq. (7) asks of the reference or of a
+    fall, whichever is more, A^2/m^2/s, and in words.
+    """
+
+    model: Plant
+    w: float
+    period: float
+    bounds: Mapping[str, float]
+    delta_1: tuple[float, str]
+
+    @property
+    def pole(self) -> str:
+        """What w is, in words."""
+        return f"w = {self.w:.3g} 1/s: pole of the unstable plant"
+
+
+class Interval(NamedTuple):
+    """Where a gain is looked for first, log-uniform, and where that comes from, in words.
+
+    `firm`: it may not end beyond, or beyond where it starts.
+    """
+
+    low: float
+    high: float
+    source: str
+    firm: bool = False
+
+
+def manifold(site: Site) -> Interval:
+    """Decay rate on a sliding manifold, 1/s."""
+    cap = max(1 / (5 * site.period), site.w / 10)
+    if cap >= 10 * site.w:
+        return Interval(site.w / 30, 10 * site.w, f"w/30 to 10 w, {site.pole}", True)
+    words = f"w/30 to the cap 1/(5 T), T = {site.period:g} s: the sampled loop cannot slide faster; {site.pole}"
+    return Interval(site.w / 30, cap, words, True)
+
+
+def switch(site: Site, name: str, p: Scalar, times: float, over: str) -> Interval:
+    """A switching gain by the slope 2/pi gain p of its smoothed sign, at least twice the disturbance bound `over`."""
+    per, below = TWO_OVER_PI * float(p), site.bounds.get(over, 0.0)
+    low, high = site.w / 3 / per, times * site.w / per
+    words = f"slope 2/pi {name} p from w/3 to {times:g} w, {site.pole}"
+    if 2 * below > low:
+        words += f"; at least twice the disturbance, {below:.3g}"
+    return Interval(max(low, 2 * below), max(high, 200 * below), words)
+
+
+def rate(site: Site, low: float, high: float, words: str, per: Scalar = 1.0, power: int = 1) -> Interval:
+    """A gain whose rate, gain times `per` (of dimension 1/s to this power), lies from `low` to `high` times w."""
+    first, last = ((share * site.w) ** power / float(per) for share in (low, high))
+    return Interval(first, last, f"{words}, {site.pole}")
