@@ -229,6 +229,20 @@ METHODS = [
         "z_ddot_1 = z_ddot_0",
         "tests/test_sliding.py::test_the_slow_motion_is_of_second_order",
     ),
+    M(
+        "a lost controller goes on stepping",
+        "ambjax/simulation/rollout.py",
+        "choose(alive, system.jump(just_after, state, hold), state)",
+        "system.jump(just_after, state, hold)",
+        "tests/test_jump.py::test_a_lost_state_jumps_no_more",
+    ),
+    M(
+        "a rotor lost in the first part of a sample is lost in the second",
+        "ambjax/simulation/integrate.py",
+        "jnp.where(so_far.code == ALIVE, after.t, so_far.t)",
+        "after.t",
+        "tests/test_jump.py::test_the_time_of_a_loss_is_that_of_its_own_stretch",
+    ),
 ]
 NOISE = [
     M(

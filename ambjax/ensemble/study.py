@@ -95,6 +95,7 @@ class Study:
     def fingerprint(self) -> dict[str, Any]:
         """Everything that a member's numbers depend on, by name, as JSON has it."""
         facts: dict[str, Any] = {**provenance(), "members": self.members, "seed": self.seed}
+        facts["plant.kind"] = type(self.scenario.plant).__name__
         for stage in ("observer", "position", "inversion", "current"):
             facts[f"controller.{stage}.kind"] = type(getattr(self.cascade, stage)).__name__
         for name in ("reference", "q_z", "q_v", "q_i", "sensor"):

@@ -13,7 +13,7 @@ a step's edge is seen by the steps after it and not by those before: otherwise t
 it early and the method falls to first order there.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import jax
@@ -86,6 +86,25 @@ class Integrator(Protocol):
     def advance(
         self, problem: Problem, t: Scalar, period: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
     ) -> Advanced: ...
+
+
+def in_turn(
+    method: Integrator,
+    stretches: Sequence[tuple[Problem, Scalar]],
+    t: Scalar,
+    state: Any,
+    memory: Any,
+    code: Scalar = ALIVE,
+) -> Advanced:
+    """Problems one after another, each for its time (s; 0 too): a sample within which rates jump at known instants."""
+    (problem, time), *others = stretches
+    so_far = method.advance(problem, t, time, state, memory, code)
+    for problem, following in others:
+        t, time = t + time, following
+        after = method.advance(problem, t, time, so_far.state, so_far.memory, so_far.code)
+        reached = jnp.where(so_far.code == ALIVE, after.t, so_far.t)
+        so_far = after._replace(t=reached, span=so_far.span.joined(after.span))
+    return so_far
 
 
 def axpy(state: State, *terms: tuple[Scalar, State]) -> State:

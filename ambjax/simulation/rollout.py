@@ -11,7 +11,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.kernel import one_kernel
 from ambjax.numerics.records import Scalar, canonical, validate
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.integrate import Problem
+from ambjax.simulation.integrate import Advanced, Problem, choose
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import Ending, Fold
@@ -29,12 +29,25 @@ class Outcome(NamedTuple):
 
 
 class System(Protocol):
-    """What is rolled out: the closed loop, or the closed loop with something attached to its state."""
+    """What is rolled out: the closed loop, or the closed loop with something attached to its state.
+
+    A system whose state jumps at the start of a sample, as one with a controller on a processor does, also has
+
+        jump(t, state, hold) -> state
+
+    It comes first in a sample: the row shows, and the integrator starts from, the state after it. A lost rotor's state
+    does not jump. And a system that integrates a part of its state, or whose rates jump within a sample, has
+
+        advance(method, hold, t, period, state, memory, code) -> Advanced
+
+    in place of `method.advance(problem(hold), ...)`, its `problem` then being nobody's: `integrate.in_turn` helps.
+    """
 
     def realised(self) -> Self: ...
     def hold(self, sample: Scalar) -> Errors: ...
     def start(self) -> Any: ...
     def problem(self, hold: Errors) -> Problem: ...
+    def fate(self, state: Any) -> Array: ...
     def rest(self, state: Any, code: Array) -> Any: ...
     def row(self, t: Scalar, state: Any, hold: Errors, alive: Array) -> Any: ...
     def noted(self, row: Any, span: Span) -> Any: ...
@@ -91,7 +104,7 @@ def begin(system: System, clock: Clock, fold: Fold | None) -> Progress:
     dtype = jnp.result_type(float)
     state = jax.tree.map(lambda x: jnp.asarray(x, dtype), system.start())
     never = jnp.asarray(jnp.inf, dtype)
-    ending = Ending(system.problem(system.hold(0)).fate(state), never, never, jnp.asarray(clock.duration, dtype))
+    ending = Ending(system.fate(state), never, never, jnp.asarray(clock.duration, dtype))
     ending = ending._replace(lost_at=jnp.where(ending.lost_code == ALIVE, never, 0.0))
     memory = clock.method.start(jnp.asarray(clock.sample_period, dtype))
     return Progress(state, ending, memory, () if fold is None else fold.init())
@@ -133,22 +146,33 @@ def finish(progress: Progress, rows: Any, fold: Fold | None) -> Outcome:
     return Outcome(Trajectory(rows, lost_at, lost_code, singular_at), measured)
 
 
-def _sample(system: System, clock: Clock, fold: Fold | None, progress: Progress, k: Array) -> tuple[Progress, Any]:
+def _advanced(system: Any, clock: Clock, hold: Errors, t: Array, state: Any, memory: Any, code: Array) -> Advanced:
+    """The state at the end of the sample that begins at t."""
+    method, period = clock.method, clock.sample_period
+    if hasattr(system, "advance"):
+        return system.advance(method, hold, t, period, state, memory, code)
+    return method.advance(system.problem(hold), t, period, state, memory, code)
+
+
+def _sample(system: Any, clock: Clock, fold: Fold | None, progress: Progress, k: Array) -> tuple[Progress, Any]:
     """Observe at the start of sample k, then integrate to its end with its measurement error held.
 
     Recomputed in reverse mode, so that memory there grows with samples and not with substeps.
     """
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
-    def run(system: System, clock: Clock, fold: Fold | None, progress: Progress) -> tuple[Progress, Any]:
+    def run(system: Any, clock: Clock, fold: Fold | None, progress: Progress) -> tuple[Progress, Any]:
         state, ending, memory, folded = progress
         dtype = jnp.result_type(float)
         t = k.astype(dtype) * clock.sample_period
         hold = system.hold(k)
         alive = ending.lost_code == ALIVE
         # A jump at this instant belongs to this sample even if t was rounded to just before it.
-        row = system.row(t * (1 + 4 * jnp.finfo(dtype).eps), state, hold, alive)._replace(t=t)
-        after = clock.method.advance(system.problem(hold), t, clock.sample_period, state, memory, ending.lost_code)
+        just_after = t * (1 + 4 * jnp.finfo(dtype).eps)
+        if hasattr(system, "jump"):
+            state = choose(alive, system.jump(just_after, state, hold), state)
+        row = system.row(just_after, state, hold, alive)._replace(t=t)
+        after = _advanced(system, clock, hold, t, state, memory, ending.lost_code)
         row = system.noted(row, after.span)
         folded = folded if fold is None else fold.update(folded, row, after.span)
         lost_now = alive & (after.code != ALIVE)

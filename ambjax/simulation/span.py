@@ -45,6 +45,13 @@ class Span(NamedTuple):
         more = jax.tree.map(lambda total, x: total + weight * x, self.densities, instant.densities)
         return self._replace(densities=more)
 
+    def joined(self, after: "Span") -> "Span":
+        """This stretch and the one after it."""
+        most = jax.tree.map(jnp.maximum, self.most, after.most)
+        least = jax.tree.map(jnp.minimum, self.least, after.least)
+        more = jax.tree.map(lambda x, y: x + y, self.densities, after.densities)
+        return Span(self.time + after.time, most, least, more)
+
 
 def blank(like: Instant) -> Span:
     """No time at all. `like`: any instant, for its structure."""

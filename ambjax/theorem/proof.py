@@ -99,9 +99,11 @@ class Monitored:
             terms = self.terms(inputs, state.loop, hold)
             return Witnessed(terms.moving, terms.rates._replace(e=terms.rates.e + terms.i_ref_dot))
 
-        fate = lambda state: self.loop.fate(state.loop)  # noqa: E731
         layer = Witnessed(self.loop.layer(), Identities(*(jnp.asarray(jnp.inf) for _ in sizes)))
-        return Problem(self.loop.inputs, rates, Witnessed(self.loop.scale(), sizes), fate, layer)
+        return Problem(self.loop.inputs, rates, Witnessed(self.loop.scale(), sizes), self.fate, layer)
+
+    def fate(self, state: Witnessed) -> Array:
+        return self.loop.fate(state.loop)
 
     def rest(self, state: Witnessed, code: Array) -> Witnessed:
         return Witnessed(self.loop.rest(state.loop, code), state.witness)
