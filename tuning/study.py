@@ -61,16 +61,20 @@ class Study:
         return Engine(objective, settle=self.case.settle, **more)
 
 
-def method_for(case: Case, substeps: int) -> Integrator:
-    """The step of the search: of fixed number, so that all members take as long, and blind to gamma p."""
+def method_for(case: Case, substeps: int, finer: int) -> Integrator:
+    """The step of the search, `finer` times as fine: of fixed number, so that all members take as long.
+
+    Where the loop slides, `substeps` a sample, blind to the stiffness of the inversion law.
+    """
     if slides(case.cascade, case.scenario.plant):
-        return Slide(substeps)
-    return choose_method(case.cascade, case.scenario, float(case.clock.sample_period), reverse=True)
+        return Slide(finer * substeps)
+    method: Any = choose_method(case.cascade, case.scenario, float(case.clock.sample_period), reverse=True)
+    return dataclasses.replace(method, substeps=finer * method.substeps)
 
 
 def study_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = None) -> Study:
     """The study of a case, in steps `finer` times as fine as [tune] asks for."""
-    clock = Clock(case.clock.samples, case.clock.sample_period, method_for(case, finer * tune.budget.substeps))
+    clock = Clock(case.clock.samples, case.clock.sample_period, method_for(case, tune.budget.substeps, finer))
     loss = loss_for(case.scenario, case.settle, tune.early)
     objective = Objective(tune.space, case.cascade, case.scenario, clock, loss, case.spread)
     conditions = bounds(case.cascade, case.scenario, clock)

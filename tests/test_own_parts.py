@@ -1,0 +1,244 @@
+"""A plant and a law of one's own, defined here and nowhere else: simulated, checked, spread, mapped and tuned.
+
+The plant has a coil with its own current on each side; the law a boundary layer in place of a smoothed sign, and gains
+of its own names. Nothing in the package knows either.
+"""
+
+import dataclasses
+import itertools
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from ambjax import (
+    Adaptive,
+    Cascade,
+    Clock,
+    Constant,
+    Initial,
+    Pulse,
+    Scenario,
+    Sensor,
+    Sine,
+    choose_method,
+    inversion,
+    rollout,
+)
+from ambjax.cases.reader import Case
+from ambjax.cases.table import Table
+from ambjax.control.answers import Requirement
+from ambjax.control.position import force_for, sliding_variable
+from ambjax.control.search import Interval, manifold
+from ambjax.ensemble import Normal, Percent, Spread, run_ensemble
+from ambjax.ensemble.maps import Axis, grid
+from ambjax.ensemble.study import Study
+from ambjax.extend import leaf, record
+from ambjax.numerics.records import gain
+from ambjax.simulation.loop import ClosedLoop
+from ambjax.simulation.metrics import standard_for
+from ambjax.theorem.conditions import check
+from ambjax.world.bearing import Bearing, Signals
+from ambjax.world.sensor import Measurement
+from tuning.config import tune_from
+from tuning.search.rounds import rounds
+from tuning.study import study_of
+
+
+class Coils(NamedTuple):
+    """Displacement (m), velocity (m/s), and the current of the upper and the lower coil (A)."""
+
+    z: Any
+    z_dot: Any
+    i_1: Any
+    i_2: Any
+
+
+@record
+class TwoCoils(Bearing):
+    """Each coil has a circuit of its own; the lower one's resistance is larger by a share `skew`."""
+
+    skew: Any = leaf(default=0.05, unit="1", at_least=-0.5, at_most=0.5, doc="excess of the lower coil's resistance")
+
+    def start(self, measurement):
+        z, z_dot, i = measurement
+        return Coils(z, z_dot, self.i_0 + i, self.i_0 - i)
+
+    def rates(self, state, u, q_z=0.0, q_i=0.0):
+        upper, lower = self.gaps(state.z).inverses
+        z_ddot = 2 * self.k_z / self.m * state.z + self.a * self.signals(state).v - self.g + q_z
+        drop_1, drop_2 = self.R * state.i_1, self.R * (1 + self.skew) * state.i_2
+        i_1 = 2 / (upper * self.kappa) * (self.R * self.i_0 + u - drop_1) - state.i_1 * state.z_dot * upper + q_i
+        i_2 = 2 / (lower * self.kappa) * (self.R * self.i_0 - u - drop_2) + state.i_2 * state.z_dot * lower - q_i
+        return Coils(state.z_dot, z_ddot, i_1, i_2)
+
+    def rest(self, state, z):
+        return state._replace(z=z, z_dot=jnp.zeros_like(z))
+
+    def scale(self):
+        z, z_dot, i = self.sizes()
+        return Coils(z, z_dot, i, i)
+
+    def measurement(self, state):
+        return Measurement(state.z, state.z_dot, (state.i_1 - state.i_2) / 2)
+
+    def signals(self, state):
+        upper, lower = self.gaps(state.z).inverses
+        heat = self.R * (state.i_1**2 + (1 + self.skew) * state.i_2**2)
+        return Signals((state.i_1 * upper) ** 2 - (state.i_2 * lower) ** 2, heat)
+
+
+@record
+class BoundaryLayer:
+    """sigma' = -rho tanh(sigma / width): a position law with gains of its own names."""
+
+    decay: Any = gain(default=17.0, unit="1/s", doc="decay rate on the manifold")
+    rho: Any = gain(default=25.0, unit="m/s^2", doc="reaching gain; above Q_z")
+    width: Any = gain(default=0.05, unit="m/s", doc="width of the layer")
+    requirement: ClassVar = Requirement("rho", "Q_z")
+
+    def init(self, model):
+        return ()
+
+    def scale(self, model):
+        return ()
+
+    def slope(self, model):
+        return jnp.maximum(self.rho / self.width, self.decay)
+
+    def sigma(self, motion, reference):
+        return sliding_variable(self.decay, motion, reference)
+
+    def robust(self, sigma):
+        return -self.rho * jnp.tanh(sigma / self.width)
+
+    def ranges(self, site):
+        low = site.w / 3 * float(self.width)
+        return {"decay": manifold(site), "rho": Interval(low, 100 * low, "slope rho/width from w/3 to 33 w")}
+
+    def __call__(self, model, inputs, state):
+        motion, reference = inputs
+        robust = self.robust(self.sigma(motion, reference))
+        return force_for(self.decay, model, motion, reference, robust), ()
+
+
+CASCADE = Cascade(position=BoundaryLayer(), inversion=inversion.Adaptive(1e9, 25e-6))
+SCENARIO = Scenario(
+    plant=TwoCoils(), reference=Sine(1e-3, 5.0), q_v=Pulse(0.5, 0.02, 0.04), initial=Initial(2e-4), u_max=400.0
+)
+NOISY = dataclasses.replace(SCENARIO, sensor=Sensor(2e-7, 1e-5, 1e-5))
+CLOCK = Clock(600, 1e-4)
+METHOD = choose_method(CASCADE, NOISY, 1e-4, reverse=True)
+RHO, SKEW = "controller.position.rho", "plant.skew"
+
+
+def test_simulated():
+    rows = rollout(CASCADE, SCENARIO, Clock(600, 1e-4, Adaptive(1e-9))).trajectory.rows
+    assert rows.alive.all()
+    # the plant of two circuits written out once more, by another integrator, under the same laws
+    p, loop = SCENARIO.plant, ClosedLoop(CASCADE, SCENARIO)
+    start, tree = jax.tree.flatten(loop.start())
+
+    @jax.jit
+    def decided(t, x):
+        _, rates, u = loop.command(loop.inputs(t), jax.tree.unflatten(tree, list(x)), loop.hold(0))
+        return u, jnp.stack(jax.tree.leaves(rates)), loop.inputs(t).q_z
+
+    def written(t, x):
+        u, rates, q_z = map(np.asarray, decided(t, x))
+        z, z_dot, i_1, i_2, *_ = x
+        up, down, R, K = p.s_0 - z, p.s_0 + z, p.R, p.mu_0 * p.n**2 * p.A
+        force = K / 4 * ((i_1 / up) ** 2 - (i_2 / down) ** 2)
+        fall = (2 * p.k_z * z + force) / p.m - p.g + q_z
+        i_1_dot = 2 * up / K * (R * p.i_0 + u - R * i_1) - i_1 * z_dot / up
+        i_2_dot = 2 * down / K * (R * p.i_0 - u - 1.05 * R * i_2) + i_2 * z_dot / down
+        return [z_dot, fall, i_1_dot, i_2_dot, *rates]
+
+    ends = [0.0, 0.02, 0.04, 0.0599]  # the pulse jumps at these
+    x = np.array([float(leaf) for leaf in start])
+    for begin, end in itertools.pairwise(ends):
+        x = solve_ivp(written, (begin, end - 1e-12), x, "LSODA", rtol=1e-10, atol=1e-12).y[:, -1]
+        n = round(end / 1e-4)
+        # both integrators' tolerances over 1e3 steps
+        assert float(rows.z[n]) == pytest.approx(x[0], abs=2e-10)
+        assert float(rows.i[n]) == pytest.approx((x[2] - x[3]) / 2, abs=2e-7)
+        assert float(rows.v[n]) == pytest.approx((x[2] / (p.s_0 - x[0])) ** 2 - (x[3] / (p.s_0 + x[0])) ** 2, abs=1e-2)
+        assert float(rows.heat[n]) == pytest.approx(p.R * (x[2] ** 2 + 1.05 * x[3] ** 2), rel=1e-5)
+
+
+def test_a_lost_one_is_frozen():
+    weak = dataclasses.replace(CASCADE, inversion=inversion.Adaptive(1e3, 25e-6))
+    outcome = rollout(weak, SCENARIO, CLOCK.with_method(Adaptive()), fold=standard_for(0.01, SCENARIO))
+    assert bool(outcome.measured["lost"])
+    assert abs(float(outcome.trajectory.rows.z[-1])) == SCENARIO.touchdown
+    assert all(np.all(np.isfinite(x)) for x in outcome.trajectory.rows)
+
+
+def test_checked():
+    report = check(CASCADE, SCENARIO, CLOCK)
+    assert report.holds
+    line = next(line for line in report.conditions if line.path == RHO)
+    assert (line.requires, line.gain, line.unit) == ("rho > Q_z", 25.0, "m/s^2")
+    assert line.against == pytest.approx(0.5 * float(SCENARIO.plant.a))
+    # its robust term stands in Eq. (12), and the plant's own force in h: what is left is the integrator's tolerance
+    residual = next(line for line in report.proof if line.name == "Eq. (12)")
+    assert residual.against < 1e-5 * 0.031
+    weak = dataclasses.replace(CASCADE, position=BoundaryLayer(rho=0.01))
+    assert next(line for line in check(weak, SCENARIO, CLOCK).conditions if line.path == RHO).holds is False
+
+
+SPREAD = Spread(((SKEW, Normal(0.02)), (RHO, Percent(20.0)), ("plant.m", Percent(2.0))))
+
+
+def test_spread():
+    study = Study(CASCADE, NOISY, Clock(200, 1e-4, METHOD), 0.01, SPREAD, seed=3, members=12)
+    columns = study.columns(0, 12)
+    assert not columns["lost"].any()
+    assert len(set(columns["settled_rms_error_m"])) == 12
+    cascade, scenario = study.member(5)
+    assert scenario.plant.skew == columns["spread." + SKEW][5]
+    assert cascade.position.rho == columns["spread." + RHO][5]
+    alone = rollout(cascade, scenario, study.clock, fold=standard_for(0.01, scenario)).measured
+    # the same arithmetic in another order
+    assert float(alone["rms_error_m"]) == pytest.approx(columns["rms_error_m"][5], rel=1e-9)
+    assert study.fingerprint()["plant.kind"] == "TwoCoils"
+
+
+def test_mapped():
+    study = Study(CASCADE, NOISY, Clock(200, 1e-4, METHOD), 0.01, Spread(), seed=3, members=1)
+    found = grid(study, Axis(RHO, np.array([10.0, 40.0])), Axis(SKEW, np.array([-0.1, 0.0, 0.1])))
+    assert found.survival.shape == (3, 2)
+    assert np.all(found.survival == 1)
+    both = np.array([10.0, 40.0])
+    cascade = dataclasses.replace(CASCADE, position=dataclasses.replace(CASCADE.position, rho=both))
+    scenario = dataclasses.replace(NOISY, seed=3, plant=TwoCoils(skew=0.1))
+    alone = run_ensemble(cascade, scenario, study.clock, fold=standard_for(0.01, scenario)).measured
+    np.testing.assert_allclose(found.error[2], alone["settled_max_abs_error_m"], rtol=1e-9)
+
+
+def test_tuned(tmp_path):
+    scenario = dataclasses.replace(NOISY, q_v=Constant(), initial=Initial())
+    slow = dataclasses.replace(CASCADE, position=BoundaryLayer(rho=5.0))
+    case = Case("own", slow, scenario, Clock(200, 1e-4), 0.005, Spread(((SKEW, Normal(0.02)),)))
+    paths = [f"controller.{path}" for path in ("position.decay", "position.rho", "position.width")]
+    every = tune_from(Table({}), case).space.paths
+    assert every == [*paths, "controller.inversion.gamma", "controller.current.k_i"]
+    asked = {"members": 4, "stressed": 2, "validation": 8, "held_out": 8, "screen": 4, "starts": 1, "iterations": 3}
+    tune = tune_from(Table({"gains": paths, **asked}), case)
+    study = study_of(case, tune)
+    assert study_of(case, tune, finer=2).objective.clock.method.substeps == 2 * study.objective.clock.method.substeps
+    rho = study.ranges[1]
+    assert rho.source.startswith("slope rho/width from w/3")
+    width = study.ranges[2]  # of which the law says nothing
+    assert (width.low, width.high) == pytest.approx((0.05 / 30, 0.05 * 30))
+    assert next(bound for bound in study.goal.conditions if bound.path == RHO).symbol == "Q_z"
+    start = tune.space.values(case.cascade)
+    answer = rounds(study, start, tmp_path, {"case": "own parts"}, False)
+    history = answer.history["value"]
+    assert np.nanmin(history) < history[0].max()
+    gains = np.asarray(answer.study.objective.space.gains_at(answer.x))
+    assert np.all(np.isfinite(gains))
+    assert np.any(gains != start)
