@@ -455,8 +455,8 @@ SEARCH = [
     M(
         "the first pair of points does not set the scale of BFGS",
         "tuning/optimisers.py",
-        "jnp.where(memory.seen == 1, curvature",
-        "jnp.where(memory.seen == -1, curvature",
+        "jnp.where(state.seen == 1, curvature",
+        "jnp.where(state.seen == -1, curvature",
         "tests/test_tuning_study.py::test_bfgs_takes_the_same_way_whatever_the_unit_of_the_loss",
     ),
     M(

@@ -17,12 +17,12 @@ from scipy import stats
 import tuning.command
 import tuning.study
 from ambjax.cases.reader import case_from
-from tuning import optimisers
 from tuning.config import seeds
 from tuning.objective.conditions import Bound
 from tuning.objective.goal import Goal
 from tuning.objective.loss import TERMS
 from tuning.objective.risk import Mean
+from tuning.optimisers import bfgs
 from tuning.report.toml import dumps
 from tuning.search import explore
 from tuning.search.descent import Descent
@@ -232,11 +232,12 @@ def test_bfgs_takes_the_same_way_whatever_the_unit_of_the_loss():
     hessian, centre = jnp.diag(jnp.asarray([4.0, 60.0, 900.0])), jnp.asarray([0.5, -0.3, 0.2])
 
     def way(unit):
-        x, yes, found = jnp.zeros(3), jnp.ones((), bool), []
-        memory = optimisers.begin(x)
-        for _ in range(6):
+        x, method, found = jnp.zeros(3), bfgs(), []
+        state = method.init(x)
+        for n in range(6):
             gradient = unit * hessian @ (x - centre)
-            x, memory = optimisers.bfgs(memory, x, gradient, yes, yes)
+            step, state = method.update(gradient, state, x, value=jnp.asarray(-0.1 * n))  # always better
+            x = x + step
             found.append(np.asarray(x))
         return np.array(found)
 

@@ -14,6 +14,7 @@ from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
 from tuning.__main__ import main
 from tuning.config import tune_from
+from tuning.optimisers import Retreat
 from tuning.search.descent import Starts
 from tuning.search.optimise import Search
 from tuning.search.rounds import LOUDER, MOST_HALVINGS, _joining, finer, rounds
@@ -150,7 +151,7 @@ def searched(engine, goal, who, points, **rest):
     """In place of a search: the first point is the answer, the others lie on the way to it."""
     count = min(len(points), 8)
     x, value = np.array(points[:count]), np.arange(float(count)) / 100
-    starts = Starts(x, x, value, None, value, value)
+    starts = Starts(x, Retreat(x, value, None), value)
     rows = {"x": [x], "value": [value], "lost": [np.zeros(count)], "members": [np.array(len(who.member))]}
     return Search(starts, np.zeros(count, bool), rows, iteration=1)
 

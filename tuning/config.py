@@ -12,7 +12,7 @@ from ambjax.cases.table import Table, one_line, show
 from ambjax.ensemble.spread import require_path
 from tuning.objective.loss import TERMS
 from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
-from tuning.optimisers import BFGS, names
+from tuning.optimisers import BFGS, NAMES
 from tuning.space import Gain, Space, tunable
 
 WEIGHTS = {"tracking": 1.0, "peak": 0.0, "effort": 0.1, "chatter": 0.1, "clearance": 1e-3, "survival": 1.0}
@@ -79,7 +79,7 @@ def tune_from(table: Table, case: Case) -> Tune:
     table.only([*WORDS, *numbers, *counts])
     budget = Budget(**{name: _whole(table, name, getattr(Budget, name)) for name in counts})
     weights, conditions = _weights(table.table("weights"))
-    optimiser = table.choice("optimiser", names(), BFGS)
+    optimiser = table.choice("optimiser", list(NAMES), BFGS)
     return Tune(
         space=_space(table, case),
         weights=weights,
