@@ -13,7 +13,7 @@ import pytest
 from scipy import linalg, stats
 
 from ambjax import RK4, Adaptive, Cascade, Clock, Initial, Scenario, Sensor, Sine, Standard, inversion, rollout
-from ambjax.ensemble import Normal, Percent, Spread, run_ensemble
+from ambjax.ensemble import Normal, Percent, Spread, map_members, run_ensemble
 from ambjax.ensemble.engine import size
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
@@ -135,6 +135,33 @@ def test_lengths_that_differ_or_are_missing_are_named():
     for scenario, words in ((NOISY, "lengths none"), (members(3, u_max=np.full(4, 200.0)), "lengths 3 and 4")):
         with pytest.raises(ValueError, match=words):
             run_ensemble(SMOOTH, scenario, SHORT, fold=FOLD)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scaled:
+    """A function of a member, equal to another of the same power."""
+
+    power: int
+    traces = 0
+
+    def __call__(self, tree):
+        Scaled.traces += 1
+        return {"sum": tree["scale"] * jnp.sum(tree["x"]) ** self.power, "x": tree["x"]}
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_any_function_of_a_member_is_mapped_over_all_and_compiled_once(plain):
+    x = np.arange(70.0 * 3).reshape(70, 3)
+    for threads, call, block in ((1, None, None), (2, 32, 32), (3, 10, 4)):
+        cut, seen = {"threads": threads, "call": call, "block": block, "plain": plain}, []
+        for scale in (2.0, 3.0):
+            found = map_members(Scaled(2), {"x": x, "scale": np.asarray(scale)}, **cut)
+            np.testing.assert_array_equal(found["x"], x)
+            np.testing.assert_array_equal(found["sum"], scale * x.sum(axis=1) ** 2)  # whole numbers
+            seen.append(Scaled.traces)
+        assert seen[0] == seen[1]
+    with pytest.raises(ValueError, match="lengths 69 and 70"):
+        map_members(Scaled(2), {"x": x, "scale": np.arange(69.0)})
 
 
 def test_the_noise_of_a_member_is_its_own_and_white():

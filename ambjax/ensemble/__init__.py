@@ -2,7 +2,7 @@
 
 from ambjax.ensemble.distributions import Choice, LogUniform, Normal, Percent, Uniform
 from ambjax.ensemble.drivers import shares, spearman
-from ambjax.ensemble.engine import run_ensemble
+from ambjax.ensemble.engine import map_members, run_ensemble
 from ambjax.ensemble.intervals import cvar, quantile, wilson
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.ensemble.statistics import summary
@@ -17,6 +17,7 @@ __all__ = [
     "apply",
     "cvar",
     "draw",
+    "map_members",
     "quantile",
     "run_ensemble",
     "shares",

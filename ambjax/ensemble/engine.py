@@ -1,7 +1,7 @@
 """The engine: many members at once, in blocks that fit the first-level cache, on every core or device.
 
-A member is told by `scenario.member`; its noise and its result depend on nothing else: not on who runs
-beside it, in which block, thread, device or order.
+Whatever is asked of a member, its result depends on nothing else: not on who runs beside it, in which block,
+thread, device or order.
 """
 
 import functools
@@ -50,18 +50,52 @@ def run_ensemble(
     """Simulate every member of an ensemble; results in member order, every leaf with a leading axis [N].
 
     Leaves of `cascade`, `scenario` and `fold` are numbers, shared by all members, or arrays [N], one entry for
-    each; at least one must be an array (`scenario.member`, for one). `fold` sees every sample; rows are
-    recorded at every `every`-th sample (0: none), [N, rows]. Members run on all devices that there are, on a
-    CPU on `threads` cores (None: all that this process may use). One call of the compiled program takes
-    `call` members (rounded up to whole blocks; None: an equal share for every core, 4096 at most): memory
-    grows with that, not with N, and another number compiles again. Results are NumPy arrays.
+    each; at least one must be an array (`scenario.member`, for one). A member is told by that; so is its noise.
+    `fold` sees every sample; rows are recorded at every `every`-th sample (0: none), [N, rows]. `threads` and `call`
+    as in `map_members`.
 
     Raises ValueError as `rollout` does, and where the lengths of two leaves differ.
     """
     check_inputs(cascade, scenario, clock)
     clock = with_method(clock, cascade, scenario)
-    loop, clock, fold = canonical((ClosedLoop(cascade, scenario), clock, fold))
-    return _Engine((loop, clock, fold), every, threads, call).outcome()
+    tree = canonical((ClosedLoop(cascade, scenario), clock, fold))
+    return map_members(_rollout(every), tree, threads=threads, call=call)
+
+
+@functools.cache
+def _rollout(every: int) -> Callable[[Any], Outcome]:
+    """The rollout of one member; the same function each time, so that it compiles once."""
+
+    def one(tree: tuple[ClosedLoop, Clock, Fold | None]) -> Outcome:
+        loop, clock, fold = tree
+        return run(loop, clock, fold, every)
+
+    return one
+
+
+def map_members(
+    function: Callable[[Any], Any],
+    tree: Any,
+    *,
+    threads: int | None = None,
+    call: int | None = None,
+    block: int | None = None,
+    plain: bool = False,
+) -> Any:
+    """function(member) of every member of an ensemble; results in member order, every leaf with a leading axis [N].
+
+    Leaves of `tree` are numbers, shared by all members, or arrays [N, ...], one entry for each; at least one must be
+    an array. `function`, of a tree whose leaves are those of one member, is traced by JAX, and is compiled again for
+    one that is not equal (==): give it a name, or make it a frozen dataclass. Members run on all devices that
+    there are, on a CPU on `threads` cores (None: all that this process may use). One call of the compiled program
+    takes `call` members (rounded up to whole blocks; None: an equal share for every core, 4096 at most): memory
+    grows with that, not with N, and another number compiles again. `block` of them are as long as the vectors that
+    they make up (None: what fits the first-level cache). `plain`: without the fast path, which knows no reverse
+    mode. Results are NumPy arrays.
+
+    Raises ValueError where the lengths of two leaves differ, or there is none.
+    """
+    return _Engine(function, tree, threads, call, block, plain).results()
 
 
 def size(tree: Any) -> int:
@@ -82,36 +116,36 @@ def size(tree: Any) -> int:
 class _Engine:
     """One ensemble, cut into calls of equal shape, so that it compiles once."""
 
-    def __init__(self, tree: Any, every: int, threads: int | None, call: int | None):
-        self.every = every
+    def __init__(self, function: Callable[[Any], Any], tree: Any, threads: Any, call: Any, block: Any, plain: bool):
         leaves, self.tree = jax.tree.flatten(tree)
-        self.members, self.kept = size(tree), tuple(bool(np.ndim(x)) for x in leaves)
+        self.members, self.moves = size(tree), tuple(bool(np.ndim(x)) for x in leaves)
         self.moving = [np.asarray(x) for x in leaves if np.ndim(x)]
         self.shared = tuple(x for x in leaves if not np.ndim(x))
-        self.devices = jax.devices()
+        self.function, self.devices = function, jax.devices()
         alone = len(self.devices) == 1 and self.devices[0].platform == "cpu"
         self.workers = (threads or cores()) if alone else 1
         # equal calls: the last one is as long as the others, whatever is left for it
         calls = max(-(-self.members // (MOST_CALL * self.workers)), 1) * self.workers
         share = call or -(-self.members // calls)
-        self.block = block_bytes(share) // jnp.result_type(float).itemsize
+        self.block = block or block_bytes(share) // jnp.result_type(float).itemsize
         unit = self.block * len(self.devices)
         self.call = -(-share // unit) * unit
+        self.program = _program(len(self.devices), plain)
 
-    def outcome(self) -> Outcome:
+    def results(self) -> Any:
         """Run all calls and put the results in order."""
         starts = range(0, self.members, self.call)
-        with ThreadPoolExecutor(self.workers) as pool:
+        with ThreadPoolExecutor(min(self.workers, len(starts))) as pool:
             parts = list(pool.map(self._one, starts))
         whole = jax.tree.map(lambda *xs: np.concatenate(xs), *parts)
         return jax.tree.map(lambda x: x[: self.members], whole)
 
-    def _one(self, start: int) -> Outcome:
+    def _one(self, start: int) -> Any:
         """One call: members from `start` on, the last one repeated where the call is longer than what is left."""
         index = np.minimum(np.arange(start, start + self.call), self.members - 1)
         parts = Parts(tuple(x[index] for x in self.moving), self.shared)
-        found = _program(len(self.devices))(parts, kept=self.kept, tree=self.tree, every=self.every, block=self.block)
-        return jax.tree.map(np.asarray, found)
+        results = self.program(parts, function=self.function, moves=self.moves, tree=self.tree, block=self.block)
+        return jax.tree.map(np.asarray, results)
 
 
 def cores() -> int:
@@ -119,45 +153,44 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _blocks(parts: Parts, *, kept: tuple[bool, ...], tree: Any, every: int, block: int) -> Outcome:
-    """All members of a call: a loop over blocks, the whole rollout of a block inside it."""
+def _blocks(parts: Parts, *, function: Callable[[Any], Any], moves: tuple[bool, ...], tree: Any, block: int) -> Any:
+    """All members of a call: a loop over blocks, the whole function of a block inside it."""
 
-    def member(moving: tuple[Array, ...]) -> Outcome:
-        differing, common = iter(moving), iter(parts.shared)
-        loop, clock, fold = jax.tree.unflatten(tree, [next(differing) if k else next(common) for k in kept])
-        return run(loop, clock, fold, every)
+    def member(moving: tuple[Array, ...]) -> Any:
+        own, common = iter(moving), iter(parts.shared)
+        return function(jax.tree.unflatten(tree, [next(own) if its else next(common) for its in moves]))
 
     if jax.default_backend() != "cpu":
         return jax.vmap(member)(parts.moving)
-    cut = jax.tree.map(lambda x: x.reshape(-1, block), parts.moving)
-    found = lax.map(jax.vmap(member), cut)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
+    cut = jax.tree.map(lambda x: x.reshape(-1, block, *x.shape[1:]), parts.moving)
+    results = lax.map(jax.vmap(member), cut)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), results)
 
 
-STATIC = ("kept", "tree", "every", "block")
-_here = one_kernel(_blocks, static_argnames=STATIC)
-_sharded: dict[int, Callable[..., Outcome]] = {}
+STATIC = ("function", "moves", "tree", "block")
+_fast = one_kernel(_blocks, static_argnames=STATIC)
+_usual = jax.jit(_blocks, static_argnames=STATIC)
 
 
-def _program(devices: int) -> Callable[..., Outcome]:
+@functools.cache
+def _program(devices: int, plain: bool) -> Callable[..., Any]:
     """The compiled program: for one device, or with members sharded over several."""
     if devices == 1:
-        return _here
-    if devices not in _sharded:
-        mesh = Mesh(np.asarray(jax.devices()[:devices]), (MEMBERS,))
-        over, everywhere = PartitionSpec(MEMBERS), PartitionSpec()
+        return _usual if plain else _fast
+    mesh = Mesh(np.asarray(jax.devices()[:devices]), (MEMBERS,))
+    over, everywhere = PartitionSpec(MEMBERS), PartitionSpec()
 
-        def spread(parts: Parts, **static: Any) -> Outcome:
-            one = functools.partial(_blocks, **static)
-            # Members do not speak to each other: nothing to check, and constants may stay unsharded.
-            where = {"mesh": mesh, "in_specs": (Parts(over, everywhere),), "out_specs": over, "check_vma": False}
-            return jax.shard_map(one, **where)(parts)
+    def spread(parts: Parts, **static: Any) -> Any:
+        one = functools.partial(_blocks, **static)
+        # Members do not speak to each other: nothing to check, and constants may stay unsharded.
+        where = {"mesh": mesh, "in_specs": (Parts(over, everywhere),), "out_specs": over, "check_vma": False}
+        return jax.shard_map(one, **where)(parts)
 
-        kernel = one_kernel(spread, static_argnames=STATIC)
+    compiled = jax.jit if plain else one_kernel
+    kernel = compiled(spread, static_argnames=STATIC)
 
-        def placed(parts: Parts, **static: Any) -> Outcome:
-            moving = jax.device_put(parts.moving, NamedSharding(mesh, over))
-            return kernel(Parts(moving, jax.device_put(parts.shared, NamedSharding(mesh, everywhere))), **static)
+    def placed(parts: Parts, **static: Any) -> Any:
+        moving = jax.device_put(parts.moving, NamedSharding(mesh, over))
+        return kernel(Parts(moving, jax.device_put(parts.shared, NamedSharding(mesh, everywhere))), **static)
 
-        _sharded[devices] = placed
-    return _sharded[devices]
+    return placed

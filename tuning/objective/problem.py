@@ -1,14 +1,13 @@
 """The objective: gains to one number, through an ensemble with common random numbers.
 
 The work is cut into lanes: one rollout of one member under one vector of gains. A fixed number of lanes
-is compiled once into one kernel and serves the screen, every iteration and the held-out ensemble alike, on
-as many threads as there are cores; whatever the number of starts or members, nothing is recompiled. That number does
-not depend on the cores, for a last digit may depend on it.
+is compiled once into one kernel and serves the screen, every iteration and the held-out ensemble alike; whatever
+the number of starts or members, nothing is recompiled. That number does not depend on the cores, for a last digit may
+depend on it.
 """
 
 import dataclasses
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -17,9 +16,8 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble import Spread, apply, draw
-from ambjax.ensemble.engine import cores
-from ambjax.extend import canonical, one_kernel
+from ambjax.ensemble import Spread, apply, draw, map_members
+from ambjax.extend import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.metrics import Named, standard_for
 from ambjax.simulation.rollout import rollout
@@ -135,8 +133,68 @@ def weigh(weights: Any, terms: dict[str, Any], stressed: Any) -> Any:
     return held + ordinary * sum(each.values()) * (1 + costs)
 
 
+class Lane(NamedTuple):
+    """What one lane is made of: coordinates [m], member, the world that all share, weights of the terms [6], fold.
+
+    The world: cascade, scenario, clock and loss. The weights and the fold are there where they are asked for.
+    """
+
+    x: Any
+    who: Members
+    world: tuple[Cascade, Scenario, Clock, Loss]
+    weights: Any = None
+    fold: Any = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Folded:
+    """The fold's result for a lane."""
+
+    space: Space
+
+    def __call__(self, lane: Lane) -> Any:
+        return Objective(self.space, *lane.world).run(lane.x, lane.who, lane.fold)
+
+
+@dataclasses.dataclass(frozen=True)
+class Slope:
+    """The weighed loss of a lane, its derivatives [m] and the terms, in forward or reverse mode."""
+
+    space: Space
+    reverse: bool
+
+    def __call__(self, lane: Lane) -> Any:
+        if self.reverse:
+            (value, terms), slope = jax.value_and_grad(self._loss, has_aux=True)(lane.x, lane)
+            return value, slope, terms
+
+        one = jax.custom_batching.custom_vmap(lambda lane: self._along(self._loss, lane))
+
+        # Directions outside, lanes inside: what is contiguous in memory is as long as a vector.
+        @one.def_vmap
+        def every(size: int, batched: Any, lane: Lane) -> Any:
+            axes = jax.tree.map(lambda moves: 0 if moves else None, batched[0])
+            results = self._along(jax.vmap(self._loss, (0, axes)), lane)
+            return results, jax.tree.map(lambda _: True, results)
+
+        return one(lane)
+
+    def _loss(self, x: Array, lane: Lane) -> tuple[Array, dict[str, Array]]:
+        terms = Objective(self.space, *lane.world).run(x, lane.who, lane.world[-1])
+        return weigh(lane.weights, terms, lane.who.stressed), terms
+
+    def _along(self, loss: Callable[..., Any], lane: Lane) -> Any:
+        """Losses, derivatives along each coordinate and terms, of one lane or of many."""
+
+        def along(direction: Array) -> Any:
+            every = jnp.broadcast_to(direction, lane.x.shape)
+            return jax.jvp(lambda x: loss(x, lane), (lane.x,), (every,), has_aux=True)
+
+        return jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(len(self.space)))
+
+
 class Engine:
-    """Compiled lanes of an objective. Threads share them; a call blocks until its answer is there."""
+    """The lanes of an objective, compiled, on `threads` cores (None: all); a call blocks until its answer is there."""
 
     def __init__(
         self,
@@ -147,95 +205,40 @@ class Engine:
         threads: int | None = None,
         lanes: int = LANES,
     ):
-        self.objective, self.mode, self.settle = objective, mode, settle
-        self.lanes = {"terms": lanes, "metrics": lanes, "gradient": min(lanes, GRADIENT_LANES)}
-        self.threads = threads or cores()
+        self.objective, self.mode, self.settle, self.threads, self.lanes = objective, mode, settle, threads, lanes
         self.rollouts = 0
-        self._compiled: set[str] = set()
-        traced = canonical((objective.cascade, objective.scenario, objective.clock, objective.loss))
-        self._world = traced
-        standard = canonical(Named({"loss": objective.loss, "metrics": standard_for(settle, objective.scenario)}))
-
-        def rebuilt(world: Any) -> Objective:
-            cascade, scenario, clock, loss = world
-            return dataclasses.replace(objective, cascade=cascade, scenario=scenario, clock=clock, loss=loss)
-
-        def terms(x: Array, who: Members, world: Any) -> dict[str, Array]:
-            problem = rebuilt(world)
-            return problem.run(x, who, problem.loss)
-
-        def measured(x: Array, who: Members, world: Any, fold: Any) -> dict[str, Array]:
-            return rebuilt(world).run(x, who, fold)
-
-        def total(x: Array, who: Members, world: Any, weights: Array) -> tuple[Array, dict[str, Array]]:
-            found = terms(x, who, world)
-            return weigh(weights, found, who.stressed), found
-
-        axes: Any = (0, Members(0, 0, 0, 0, 0, 0), None)  # pyright: ignore[reportArgumentType]
-
-        def forward(x: Array, who: Members, world: Any, weights: Array) -> Any:
-            lanes = jax.vmap(total, (*axes, 0))
-
-            # Directions outside, lanes inside: what is contiguous in memory is as long as a vector.
-            def along(direction: Array) -> Any:
-                every = jnp.broadcast_to(direction, x.shape)
-                return jax.jvp(lambda x: lanes(x, who, world, weights), (x,), (every,), has_aux=True)
-
-            return jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(len(objective.space)))
-
-        def reverse(x: Array, who: Members, world: Any, weights: Array) -> Any:
-            (value, found), slope = jax.value_and_grad(total, has_aux=True)(x, who, world, weights)
-            return value, slope, found
-
-        self._terms = one_kernel(jax.vmap(terms, axes))
-        measured_lanes = one_kernel(jax.vmap(measured, (*axes, None)))
-        self._standard = lambda x, who, world: measured_lanes(x, who, world, standard)
-        if mode == "forward":
-            self._gradient = one_kernel(forward)
-        else:  # the fast path does not compile reverse mode
-            self._gradient = jax.jit(jax.vmap(reverse, (*axes, 0)))
+        self._world: Any = canonical((objective.cascade, objective.scenario, objective.clock, objective.loss))
+        self._standard = canonical(Named({"loss": objective.loss, "metrics": standard_for(settle, objective.scenario)}))
 
     def terms(self, x: np.ndarray, who: Members) -> dict[str, np.ndarray]:
         """Terms of the loss by name, [S, N], of gain vectors x [S, m] and members [N]."""
         self.rollouts += len(x) * len(who.member)
-        return self._lanes("terms", lambda x, who: self._terms(x, who, self._world), x, who)
+        return self._lanes(Folded(self.objective.space), x, who, self.lanes, fold=self._world[-1])
 
     def metrics(self, x: np.ndarray, who: Members) -> dict[str, Any]:
         """{"loss": terms, "metrics": metrics.json names}, all [S, N]."""
         self.rollouts += len(x) * len(who.member)
-        return self._lanes("metrics", lambda x, who: self._standard(x, who, self._world), x, who)
+        return self._lanes(Folded(self.objective.space), x, who, self.lanes, fold=self._standard)
 
     def gradient(self, x: np.ndarray, who: Members, weights: Any) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-        """Weighted losses [S, N], their derivatives [S, N, m] and the terms [S, N].
+        """Weighed losses [S, N], their derivatives [S, N, m] and the terms [S, N].
 
         `weights`: of the terms, in the order of TERMS, for all starts or for each: [6] or [S, 6].
         """
         self.rollouts += len(x) * len(who.member) * (len(self.objective.space) + 1)
-        # the weights travel with the coordinates, each lane with its own
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS)))
-        both, m = np.concatenate([x, each], axis=1), x.shape[1]
-        return self._lanes(
-            "gradient", lambda both, who: self._gradient(both[:, :m], who, self._world, both[:, m:]), both, who
+        slope = Slope(self.objective.space, self.mode == "reverse")
+        return self._lanes(slope, x, who, min(self.lanes, GRADIENT_LANES), weights=each)
+
+    def _lanes(
+        self, function: Folded | Slope, x: np.ndarray, who: Members, width: int, weights: Any = None, fold: Any = None
+    ) -> Any:
+        """The function of every start x [S, m], with weights [S, 6] of its own, and member [N]: leaves [S, N, ...]."""
+        start, member = np.divmod(np.arange(len(x) * len(who.member)), len(who.member))
+        at = np.asarray(x, jnp.result_type(float))[start]
+        those = jax.tree.map(lambda a: a[member], who)
+        lane = Lane(at, those, self._world, None if weights is None else weights[start], fold)
+        results = map_members(
+            function, lane, threads=self.threads, call=width, block=width, plain=self.mode == "reverse"
         )
-
-    def _lanes(self, kind: str, call: Callable[..., Any], x: np.ndarray, who: Members) -> Any:
-        starts, count = len(x), len(who.member)
-        lane = np.arange(starts * count)
-        width = self.lanes[kind]
-        padded = np.concatenate([lane, np.zeros(-len(lane) % width, int)]).reshape(-1, width)
-
-        def one(lanes: np.ndarray) -> Any:
-            start, member = np.divmod(lanes, count)
-            at = jnp.asarray(x[start], jnp.result_type(float))
-            return jax.tree.map(np.asarray, call(at, jax.tree.map(lambda a: a[member], who)))
-
-        alone = 0 if kind in self._compiled else 1  # the first call of its kind compiles
-        parts = [one(lanes) for lanes in padded[:alone]]
-        self._compiled.add(kind)
-        if self.threads > 1 and len(padded) > alone + 1:
-            with ThreadPoolExecutor(self.threads) as pool:
-                parts += pool.map(one, padded[alone:])
-        else:
-            parts += map(one, padded[alone:])
-        joined = jax.tree.map(lambda *p: np.concatenate(p)[: len(lane)], *parts)
-        return jax.tree.map(lambda a: a.reshape(starts, count, *a.shape[1:]), joined)
+        return jax.tree.map(lambda a: a.reshape(len(x), len(who.member), *a.shape[1:]), results)
