@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tomlkit import dumps
 
 from ambjax.cases.reader import DURATION, KINDS, METHODS, SIGNALS, TABLES, read_case
 from ambjax.commands import simulate
@@ -21,7 +22,6 @@ from ambjax.simulation.clock import Clock
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Sensor
-from tuning.report.toml import dumps
 
 # Every run is of so few samples, and of so few structures, each of which is compiled once.
 SAMPLES, MOST_STRUCTURES = 4, 12

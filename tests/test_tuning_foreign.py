@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tomlkit import dumps
 
 from ambjax import Cascade, Plant, position
 from ambjax.cases.reader import case_from
@@ -18,7 +19,7 @@ from ambjax.control.answers import default_law
 from tuning.__main__ import main
 from tuning.command import _laws
 from tuning.config import tune_from
-from tuning.report.toml import dumps, with_gains
+from tuning.report.tuned import tuned
 from tuning.search.screen import around, everywhere
 from tuning.study import study_of
 
@@ -158,11 +159,11 @@ def test_what_the_template_leaves_out_of_p_follows_an_edited_plant():
 
 @pytest.mark.parametrize("laws", ["", OTHER_LAWS], ids=["usual laws", "other laws"])
 def test_reading_the_tuned_file_gives_the_tuned_cascade(laws):
-    found, document = study(BEARINGS["fan"] + laws)
+    found, _ = study(BEARINGS["fan"] + laws)
     space = found.objective.space
     x = space.encode(space.clip(found.tune.space.values(found.case.cascade))) + 0.1
-    tuned = dict(zip(space.paths, np.asarray(space.gains_at(jnp.asarray(x))).tolist(), strict=True))
-    text = dumps(with_gains(document, _laws(found, tuned)))
+    gains = dict(zip(space.paths, np.asarray(space.gains_at(jnp.asarray(x))).tolist(), strict=True))
+    text = tuned(BEARINGS["fan"] + laws, _laws(found, gains), "fan", "held")
     again = case_from(tomllib.loads(text)).cascade
     assert again == jax.tree.map(float, space.decode(jnp.asarray(x), found.case.cascade))
     if not laws:

@@ -6,7 +6,6 @@ import pathlib
 import subprocess
 import sys
 import time
-import tomllib
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +23,6 @@ from tuning.objective.loss import TERMS, loss_for
 from tuning.objective.problem import Engine, Objective, weigh
 from tuning.objective.risk import CVaR, Mean
 from tuning.optimisers import CLIFF, NAMES, SHORTER, bfgs, optimiser
-from tuning.report.toml import dumps, with_gains
 from tuning.search.descent import Descent
 from tuning.search.keeper import Keeper, Search
 from tuning.search.optimise import _go_on_with_all, best_of, search
@@ -434,22 +432,6 @@ def test_bad_settings_are_refused_in_words(tune, says):
 def test_a_gain_is_not_both_spread_and_tuned():
     with pytest.raises(ValueError, match=r"spread\.controller\.position\.c"):
         parsed({}, spread={"controller.position.c": {"percent": 5}})
-
-
-def test_documents_survive_being_written():
-    document = {
-        "plant": {"m": 0.5},
-        "controller": {"model": {}, "position": {"kind": "sliding-mode", "c": 17.0}},
-        "reference": {"kind": "sum", "terms": [{"kind": "sine", "amplitude": 1e-3, "frequency": 2}]},
-        "actuator": {"u_max": float("inf")},
-        "tune": {"gains": ["controller.position.c"], "bounds": {"controller.position.c": [1, 2.5]}, "x": True},
-        "word": 'a "quoted" \\ word',
-    }
-    assert tomllib.loads(dumps(document, "a head\nof two lines")) == document
-    changed = with_gains(document, {"controller.position.c": 20.0, "controller.inversion.gamma": 1e5})
-    assert changed["controller"]["position"] == {"kind": "sliding-mode", "c": 20.0}
-    assert changed["controller"]["inversion"] == {"gamma": 1e5}
-    assert document["controller"]["position"]["c"] == 17.0
 
 
 CASE = """

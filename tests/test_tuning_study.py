@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from bowl import FLOOR, PATHS, S_0, World, document, study
 from scipy import stats
+from tomlkit import dumps
 
 import tuning.command
 import tuning.study
@@ -23,7 +24,6 @@ from tuning.objective.goal import Goal
 from tuning.objective.loss import TERMS
 from tuning.objective.risk import Mean
 from tuning.optimisers import bfgs
-from tuning.report.toml import dumps
 from tuning.search import explore
 from tuning.search.descent import Descent
 from tuning.search.optimise import HALVINGS, search
@@ -252,7 +252,7 @@ def command(monkeypatch, tmp_path, world, *flags, **tune):
     """`ambjax-tune` in this process, its engine a Bowl: exit code, summary, output directory."""
     made = study(monkeypatch, world, **tune)
     path, out = tmp_path / "case.toml", tmp_path / "out"
-    path.write_text(dumps(document(**tune), "a case"))
+    path.write_text(dumps(document(**tune)))
     names = ("--gradients", "--pareto")
     given = {name.removeprefix("--"): name in flags for name in names}
     args = argparse.Namespace(case=str(path), out=str(out), resume=False, json=True, **given)

@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import pathlib
+import tomllib
 from typing import Any
 
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from tuning.objective.problem import Members
 from tuning.report import accurate, breakdown, gradient, pictures
 from tuning.report import document as report
 from tuning.report.page import page
-from tuning.report.toml import dumps, with_gains
+from tuning.report.tuned import tuned as tuned_text
 from tuning.search import explore
 from tuning.search.keeper import remove_all
 from tuning.search.rounds import CHECKPOINT, Answer, rounds
@@ -41,11 +42,16 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     study = study_of(case, tune)
     start = tune.space.values(case.cascade)
     tune.space.encode(start)
+    text = pathlib.Path(args.case).read_text(encoding="utf-8")
+    try:
+        tuned_text(text, _laws(study, {}), case.name, "")
+    except ValueError as why:
+        raise ValueError(f"{args.case}: {why}") from None
     out = directory(args.out, f"tune-{case.name}")
     if not args.resume:
         _clear(out)
     with keeping(lambda: _kept(out)):
-        return _tune(args, raw, study, start, out)
+        return _tune(args, (text, raw), study, start, out)
 
 
 def _clear(out: pathlib.Path) -> None:
@@ -63,12 +69,13 @@ def _kept(out: pathlib.Path) -> str:
 
 
 def _tune(
-    args: argparse.Namespace, raw: dict[str, Any], study: Study, start: np.ndarray, out: pathlib.Path
+    args: argparse.Namespace, file: tuple[str, dict[str, Any]], study: Study, start: np.ndarray, out: pathlib.Path
 ) -> tuple[int, dict[str, Any]]:
-    """Search, judge and write; everything has been checked."""
+    """Search, judge and write; everything has been checked. `file`: the case's text, and what it holds."""
     tune = study.tune
     held_out = seeds(tune.budget)[2]
     say(f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {study.objective.clock.method}")
+    text, raw = file
     answer = rounds(study, start, out, {"case": raw, "tune": settings(tune)}, args.resume)
     study, who, x = answer.study, answer.who, answer.x
     facts = _facts(answer, held_out)
@@ -80,7 +87,7 @@ def _tune(
         facts["pareto"] = explore.pareto(study, x, who)
     found = explore.slices(study, x, who)
     with files(out) as part:
-        _write(part, study, raw, answer.history, facts, found)
+        _write(part, study, text, answer.history, facts, found)
     summary = plain(facts) | {"out": str(out)}
     if not args.json:
         print(_short(facts))
@@ -204,7 +211,7 @@ def _advice(study: Study, facts: dict[str, Any], x: np.ndarray, who: Members) ->
 
 
 def _write(
-    out: pathlib.Path, study: Study, raw: dict[str, Any], history: Any, facts: dict[str, Any], found: explore.Slices
+    out: pathlib.Path, study: Study, text: str, history: Any, facts: dict[str, Any], found: explore.Slices
 ) -> None:
     space = study.objective.space
     for row, grows in zip(facts["gains"], found.sensitivity(), strict=True):
@@ -212,17 +219,17 @@ def _write(
     j, k, drop = found.lowest()
     facts["beside"] = {"path": space.paths[j], "gain": found.gains[j, k], "lower": -np.expm1(-drop)}
     facts["slices"] = {"gains": found.gains, "log_risk": found.goals, "lost": found.lost}
-    document = with_gains(raw, _laws(study, {row["path"]: row["after"] for row in facts["gains"]}))
-    head = f"Tuned by ambjax-tune from the case '{facts['case']}'.\n{facts['verdict']}"
-    tuned = case_from(document, facts["case"])  # a file that could not be read back is not written
-    (out / "tuned.toml").write_text(dumps(document, head), encoding="utf-8")
+    gains = _laws(study, {row["path"]: row["after"] for row in facts["gains"]})
+    text = tuned_text(text, gains, facts["case"], facts["verdict"])
+    tuned = case_from(tomllib.loads(text), facts["case"])  # a file that could not be read back is not written
+    (out / "tuned.toml").write_text(text, encoding="utf-8")
     np.savez(out / "history.npz", **history)
-    text = report.markdown(facts)
+    words = report.markdown(facts)
     drawn = _pictures(study, tuned.cascade, history, facts, found)
     for name, data in drawn.items():
         (out / name).write_bytes(data)
-    (out / "report.md").write_text(text, encoding="utf-8")
-    (out / "report.html").write_text(page(text, drawn, f"Tuning of {facts['case']}"), encoding="utf-8")
+    (out / "report.md").write_text(words, encoding="utf-8")
+    (out / "report.html").write_text(page(words, drawn, f"Tuning of {facts['case']}"), encoding="utf-8")
     write_json(out / "report.json", facts)
 
 

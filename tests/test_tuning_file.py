@@ -1,0 +1,102 @@
+"""tuned.toml: the author's own text with the tuned gains in it."""
+
+import tomllib
+
+import pytest
+
+from tuning.report.tuned import tuned
+
+GIVEN = """# the fan of hall 3
+
+[controller]   # by hand, May
+model = {}
+position = { c = 17, k = 25.0 }  # c: try 30
+
+[reference]
+kind = "sine"
+amplitude = 1_0e-4  # m
+
+[controller.inversion] # Eq. (6)
+gamma = 1_000.0   # printed
+# p follows the plant
+
+# loops of hall 3
+[tune]
+gains = [
+  "controller.position.c", # alone
+]
+"""
+WRITTEN = """# Tuned by ambjax-tune from the case 'fan'.
+# None is lost.
+
+# the fan of hall 3
+
+[controller]   # by hand, May
+model = {}
+position = { c = 20.5, k = 25.0 }  # c: try 30
+
+[controller.current]
+k_i = 9.0
+
+[reference]
+kind = "sine"
+amplitude = 1_0e-4  # m
+
+[controller.inversion] # Eq. (6)
+gamma = 150000.0   # printed
+p = 3.0
+# p follows the plant
+
+# loops of hall 3
+[tune]
+gains = [
+  "controller.position.c", # alone
+]
+"""
+GAINS = {"position.c": 20.5, "position.k": 25.0, "current.k_i": 9.0, "inversion.gamma": 1.5e5, "inversion.p": 3.0}
+GAINS = {f"controller.{path}": value for path, value in GAINS.items()}
+
+
+def written(text):
+    return tuned(text, GAINS, "fan", "None is lost.")
+
+
+def test_comments_order_and_format_are_kept():
+    assert written(GIVEN) == WRITTEN
+    assert written(GIVEN.replace("\n", "\r\n")) == WRITTEN
+
+
+def test_a_tuned_file_that_is_tuned_again_says_so_once():
+    assert written(WRITTEN) == WRITTEN
+    assert tuned(WRITTEN, GAINS, "hall", "One is lost.") == WRITTEN.replace("'fan'", "'hall'").replace("None", "One")
+
+
+PLACES = {
+    "empty": "",
+    "dotted keys": "controller.position.c = 17.0 # x\n[plant]\nm = 1\n",
+    "dotted keys in a table": "[controller]\nposition.c = 1.0\nposition.k = 2.0 # k\n[plant]\nm = 1",
+    "inline all": "controller = { position = { c = 1.0 } }\n[plant]\nm = 1\n",
+    "inline and empty": "[controller]\nposition = {}\n[controller.current]\nk_i = 3\n",
+    "apart": "[controller.position]\nc = 1\n[reference]\na = 1\n[controller.inversion]\ngamma = 1\n",
+    "lists of tables": "[[reference.terms]]\nx = 1\n[[reference.terms]]\nx = 2\n[controller.position]\nc = 1",
+    "quoted": '"controller"."position".c = 3\n["spread"."plant.m"]\npercent = 5',
+}
+
+
+@pytest.mark.parametrize("text", PLACES.values(), ids=PLACES)
+def test_gains_are_written_wherever_the_laws_stand(text):
+    wanted = tomllib.loads(text)
+    for path, value in GAINS.items():
+        _, stage, name = path.split(".")
+        wanted.setdefault("controller", {}).setdefault(stage, {})[name] = value
+    assert tomllib.loads(written(text)) == wanted
+
+
+def test_comments_about_the_next_table_stay_with_it():
+    text = "[controller.position]\nc = 17.0\n\n# 2 um, measured\n[sensor]\nstd = 2e-6\n"
+    assert "\n\n# 2 um, measured\n[sensor]\nstd = 2e-6\n" in written(text)
+
+
+def test_what_cannot_be_written_is_refused():
+    with pytest.raises(ValueError, match="gains cannot be written"):
+        written("controller = 3")
