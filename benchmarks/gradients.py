@@ -26,9 +26,9 @@ import workload
 from ambjax import Cascade, Initial, current, inversion, position, rollout
 from ambjax.numerics.kernel import one_kernel
 from ambjax.simulation.metrics import Rms
-from tuning.config import read_study
-from tuning.objective.problem import weigh
-from tuning.study import study_of
+from tuning.config import read_tune
+from tuning.objective.loss import weigh
+from tuning.problem import problem_of
 
 GAINS = np.array([17.0, 25.0, workload.GAMMA, 152.0])
 MEMBERS, SAMPLES = (1, 64), 1_000
@@ -80,17 +80,16 @@ def rk4(members: int, samples: int) -> tuple[Callable[..., Any], Any, Any, int]:
 
 def tuner(members: int, samples: int) -> tuple[Callable[..., Any], Any, Any, int]:
     """The same of the tuner's lanes, around gains that hold the rotor."""
-    case, tune, _ = read_study(TASK)
+    case, tune, _ = read_tune(TASK)
     case = dataclasses.replace(case, clock=dataclasses.replace(case.clock, samples=samples))
-    study = study_of(case, tune)
-    problem, who = study.objective, study.objective.members(1, members)
-    x_0 = problem.space.encode(HELD)
+    objective = problem_of(case, tune).objective
+    who, x_0 = objective.members(1, members), objective.space.encode(HELD)
 
     def loss(logs: Any, member: Any) -> Any:
-        return weigh(tune.weights, problem.run(x_0 + logs, member, problem.loss), member.stressed)
+        return weigh(tune.weights, objective.run(x_0 + logs, member, objective.loss), member.stressed)
 
     one = jax.tree.map(lambda a: a[0], who)
-    return loss, who if members > 1 else one, jax.tree.map(lambda _: 0, one), samples * problem.clock.method.substeps
+    return loss, who if members > 1 else one, jax.tree.map(lambda _: 0, one), samples * objective.clock.method.substeps
 
 
 def point(mode: str, steps: int) -> dict[str, Any]:

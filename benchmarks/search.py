@@ -27,12 +27,11 @@ import _measure
 import numpy as np
 
 from ambjax.ensemble.worker import processes
-from tuning.config import read_study
+from tuning.config import read_tune
 from tuning.objective.ranges import ranges
-from tuning.search.optimise import best_of, search
-from tuning.search.rounds import look_again, training
-from tuning.search.screen import around, everywhere
-from tuning.study import Study, study_of
+from tuning.problem import Problem, problem_of
+from tuning.search.course import Course, looks, training
+from tuning.search.keeper import Progress
 
 TASKS = pathlib.Path(__file__).parent / "tasks"
 # Evaluations whose results are asked for at once, by methods that have no population of their own.
@@ -48,10 +47,10 @@ class SpentError(Exception):
 class Judge:
     """The goal at coordinates [S, m] in units of the screen's box, any real number; counted and clocked."""
 
-    def __init__(self, study: Study, who: Any, most: int):
-        self.study, self.who, self.most = study, who, most
-        start = study.tune.space.values(study.case.cascade)
-        space, box = study.objective.space, ranges(study.objective, study.goal.conditions, start)
+    def __init__(self, problem: Problem, who: Any, most: int):
+        self.problem, self.who, self.most = problem, who, most
+        start = problem.tune.space.values(problem.case.cascade)
+        space, box = problem.objective.space, ranges(problem.objective, problem.goal.conditions, start)
         ends = ([r.low for r in box], [r.high for r in box])
         self.low, self.high = (space.encode(space.clip(np.array(gains))) for gains in ends)
         self.trace: list[tuple[int, float, float]] = []
@@ -61,7 +60,7 @@ class Judge:
         if self.spent >= self.most:
             raise SpentError
         x = self.low + units * (self.high - self.low)
-        values = self.study.goal.score(self.study.objective.space, x, self.study.engine.terms(x, self.who), self.who)
+        values = self.problem.goal.score(x, self.problem.engine.terms(x, self.who), self.who)
         values = np.where(np.isfinite(values), values, WORST)
         self.spent += len(x) * len(self.who.member)
         row = (self.spent, time.process_time() - self.began, min(self.best, float(values.min())))
@@ -126,28 +125,17 @@ METHODS: dict[str, Callable[[Judge, int], None]] = {
 }
 
 
-def ours(study: Study, who: Any, seed: int) -> list[tuple[int, float, float]]:
+def ours(problem: Problem, who: Any, seed: int) -> list[tuple[int, float, float]]:
     """Trace of the search by gradients, its looks around its own answer included, on all members."""
-    study.engine.rollouts, trace, began = 0, [], time.process_time()
+    problem.engine.rollouts, trace, began = 0, [], time.process_time()
 
-    def tell(kept: Any, _: float) -> None:
-        if kept.history["members"][-1] == len(who.member):  # else its goal is that of a part of them
-            best = min(float(np.min(kept.history["value"][-1])), trace[-1][2] if trace else np.inf)
-            trace.append((study.engine.rollouts, time.process_time() - began, best))
+    def tell(progress: Progress, _: float) -> None:
+        if progress.history["members"][-1] == len(who.member):  # else its goal is that of a part of them
+            best = min(float(np.min(progress.history["value"][-1])), trace[-1][2] if trace else np.inf)
+            trace.append((problem.engine.rollouts, time.process_time() - began, best))
 
-    budget, start = study.tune.budget, study.tune.space.values(study.case.cascade)
-    points = everywhere(study.objective, study.goal.conditions, start, budget.screen, seed)
-    looks: list[tuple[float, np.ndarray]] = []
-    while True:
-        kept = search(
-            study.engine, study.goal, who, points, keep=budget.starts, iterations=budget.iterations,
-            name=study.tune.optimiser, tell=tell,
-        )  # fmt: skip
-        x, value = best_of(kept)
-        looks.append((value, x))
-        if not look_again([value for value, _ in looks]):
-            return trace
-        points = around(min(looks, key=lambda look: look[0])[1], budget.screen, seed + len(looks))
+    looks(Course(problem, who, seed, tell=tell), problem.tune.space.values(problem.case.cascade))
+    return trace
 
 
 class Told(NamedTuple):
@@ -164,18 +152,18 @@ def told(trace: list[tuple[int, float, float]], goal: float) -> Told:
     return Told(trace[-1][2], trace[-1][0], trace[-1][1], reached)
 
 
-def prepared(name: str) -> tuple[Study, Any]:
-    """A task's study and training members, on one core."""
-    case, tune, _ = read_study(TASKS / f"{name}.toml")
-    study = study_of(case, tune, threads=1)
-    return study, training(study)
+def prepared(name: str) -> tuple[Problem, Any]:
+    """A task's problem and training members, on one core."""
+    case, tune, _ = read_tune(TASKS / f"{name}.toml")
+    problem = problem_of(case, tune, threads=1)
+    return problem, training(problem)
 
 
 def by_gradients(name: str, seeds: int) -> dict[str, Any]:
     """The search by gradients on one task: budget, goal, and a row for each seed."""
-    study, who = prepared(name)
-    ours(study, who, 0)  # compiles
-    traces = [ours(study, who, seed) for seed in range(seeds)]
+    problem, who = prepared(name)
+    ours(problem, who, 0)  # compiles
+    traces = [ours(problem, who, seed) for seed in range(seeds)]
     goal = statistics.median(trace[-1][2] for trace in traces)
     budget = round(statistics.median(trace[-1][0] for trace in traces))
     return {"budget": budget, "goal": goal, "gradients": [told(trace, goal)._asdict() for trace in traces]}
@@ -184,15 +172,17 @@ def by_gradients(name: str, seeds: int) -> dict[str, Any]:
 def by_others(name: str, found: dict[str, Any], seeds: int, times: float, methods: list[str]) -> dict[str, Any]:
     """Rows of the other methods on one task, with `times` the gradients' budget."""
     warnings.simplefilter("ignore")
-    study, who = prepared(name)
-    space = study.objective.space
-    study.engine.terms(space.encode(space.clip(study.tune.space.values(study.case.cascade)))[None], who)  # compiles
+    problem, who = prepared(name)
+    space = problem.objective.space
+    problem.engine.terms(
+        space.encode(space.clip(problem.tune.space.values(problem.case.cascade)))[None], who
+    )  # compiles
     rows: dict[str, Any] = {}
     for method in methods:
         key = method if times == 1 else f"{method}, {times:g} times"
         rows[key] = []
         for seed in range(seeds):
-            judge = Judge(study, who, round(times * found["budget"]))
+            judge = Judge(problem, who, round(times * found["budget"]))
             try:
                 METHODS[method](judge, seed)
             except SpentError:

@@ -18,8 +18,7 @@ from ambjax import Adaptive
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
 from tuning.config import tune_from
-from tuning.objective.loss import TERMS
-from tuning.objective.problem import weigh
+from tuning.objective.loss import TERMS, weigh
 
 # Smallest tracking error, (m / s_0)^2, and the duration, s.
 FLOOR, DURATION = 1e-4, 0.02
@@ -136,13 +135,13 @@ def document(tables=None, **tune):
 
 
 def study(monkeypatch, world, tables=None, **tune):
-    """The study of that case in a world, every engine of it a Bowl."""
+    """The problem of that case in a world, every engine of it a Bowl."""
+    import tuning.problem
     import tuning.report.gradient
-    import tuning.study
 
     monkeypatch.setattr(Bowl, "world", world, raising=False)
-    for module in (tuning.study, tuning.report.gradient):
+    for module in (tuning.problem, tuning.report.gradient):
         monkeypatch.setattr(module, "Engine", Bowl)
     raw = document(tables, **tune)
     case = case_from(raw)
-    return tuning.study.study_of(case, tune_from(Table(raw).table("tune"), case))
+    return tuning.problem.problem_of(case, tune_from(Table(raw).table("tune"), case))

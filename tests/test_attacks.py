@@ -28,7 +28,7 @@ from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Sensor
 from ambjax.world.signals import LINES, BandNoise, Chirp, Pulse, Sine, SmoothStep, Step, Sum
 from tuning.__main__ import main as tune
-from tuning.config import Budget, read_study, settings
+from tuning.config import Budget, read_tune, settings
 from tuning.report.tuned import tuned
 
 SHORT = "[clock]\nduration = 0.01\n"
@@ -452,17 +452,17 @@ def test_the_template_lists_every_key_of_tune_with_its_default(name):
     document = uncommented(name)
     table = document["tune"]
     with pytest.raises(ValueError, match="Keys allowed here") as refused:
-        read_study(write(dumps({"tune": {"nothing": 1}})))
+        read_tune(write(dumps({"tune": {"nothing": 1}})))
     allowed = str(refused.value).partition("Keys allowed here: ")[2].rstrip(".").split(", ")
     assert set(table) == set(allowed)
     with pytest.raises(ValueError, match="Keys allowed here") as refused:
-        read_study(write(dumps({"tune": {"weights": {"nothing": 1}}})))
+        read_tune(write(dumps({"tune": {"weights": {"nothing": 1}}})))
     assert set(table["weights"]) == set(str(refused.value).partition("Keys allowed here: ")[2].rstrip(".").split(", "))
     assert {field.name for field in dataclasses.fields(Budget)} <= set(table)
     # these are examples, and say so; all else is what is left out
     for example in ("gains", "bounds", "risk", "alpha"):
         del table[example]
-    ours, left_out = (settings(read_study(write(dumps(one)))[1]) for one in (document, document | {"tune": {}}))
+    ours, left_out = (settings(read_tune(write(dumps(one)))[1]) for one in (document, document | {"tune": {}}))
     assert ours == left_out
 
 

@@ -13,7 +13,7 @@ from ambjax.ensemble.store import Store
 from ambjax.host import sealed
 from ambjax.host.sealed import DamagedError, difference, flat, seal, unseal, write_whole
 from tuning.search.descent import Descent
-from tuning.search.keeper import Keeper, Search, remove_all
+from tuning.search.keeper import Keeper, Progress, remove_all
 
 FACTS = {"seed": 3, "plant.m": "0.588"}
 MEMBERS, CHUNK = 50, 20
@@ -357,7 +357,7 @@ STARTS, GAINS, ITERATIONS = 3, 4, 2
 
 @pytest.fixture(scope="module")
 def descent():
-    return Descent(None, None, "bfgs", 0.1)  # how it begins depends on neither space nor goal
+    return Descent(None, "bfgs", 0.1)  # how it begins depends on neither space nor goal
 
 
 def search_of(descent, starts=STARTS, gains=GAINS):
@@ -366,7 +366,7 @@ def search_of(descent, starts=STARTS, gains=GAINS):
     dice = np.random.default_rng(1)
     past = {name: [dice.random(shape) for _ in range(ITERATIONS)] for name, shape in row.items()}
     x = jnp.asarray(dice.random((starts, gains)))
-    return Search(descent.begin(x), np.arange(starts) > 0, past, ITERATIONS, phase=1, since=1, seconds=2.5)
+    return Progress(descent.begin(x), np.arange(starts) > 0, past, ITERATIONS, phase=1, since=1, seconds=2.5)
 
 
 @pytest.fixture
@@ -389,19 +389,19 @@ def test_a_checkpoint_is_the_search(checkpoint, descent):
 
 
 def fewer_starts(path):
-    Keeper(path, TOLD, 2).save(search_of(Descent(None, None, "bfgs", 0.1), starts=STARTS - 1))
+    Keeper(path, TOLD, 2).save(search_of(Descent(None, "bfgs", 0.1), starts=STARTS - 1))
 
 
 def fewer_gains(path):
-    Keeper(path, TOLD, 2).save(search_of(Descent(None, None, "bfgs", 0.1), gains=GAINS - 1))
+    Keeper(path, TOLD, 2).save(search_of(Descent(None, "bfgs", 0.1), gains=GAINS - 1))
 
 
 def another_optimiser(path):
-    Keeper(path, TOLD, 2).save(search_of(Descent(None, None, "adam", 0.1)))
+    Keeper(path, TOLD, 2).save(search_of(Descent(None, "adam", 0.1)))
 
 
 def of_another_round(path):
-    Keeper(path, TOLD, 1).save(search_of(Descent(None, None, "bfgs", 0.1)))
+    Keeper(path, TOLD, 1).save(search_of(Descent(None, "bfgs", 0.1)))
 
 
 def no_history(arrays, facts):

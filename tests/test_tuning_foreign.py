@@ -19,9 +19,9 @@ from ambjax.control.answers import default_law
 from tuning.__main__ import main
 from tuning.command import _laws
 from tuning.config import tune_from
+from tuning.problem import problem_of
 from tuning.report.tuned import tuned
 from tuning.search.screen import around, everywhere
-from tuning.study import study_of
 
 CASES = pathlib.Path(__file__).parent / "cases"
 BEARINGS = {path.stem: path.read_text() for path in sorted(CASES.glob("*.toml"))}
@@ -45,7 +45,7 @@ SCALES = {
 def study(text, **tune):
     document = tomllib.loads(text)
     case = case_from(document)
-    return study_of(case, tune_from(Table({"tune": tune}).table("tune"), case)), document
+    return problem_of(case, tune_from(Table({"tune": tune}).table("tune"), case)), document
 
 
 def test_the_bearings_are_there():

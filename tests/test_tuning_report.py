@@ -20,14 +20,15 @@ from ambjax.simulation.metrics import Standard
 from ambjax.simulation.trajectory import TOUCHED
 from tuning.__main__ import main
 from tuning.config import seeds, tune_from
-from tuning.objective.loss import TERMS
-from tuning.objective.problem import Engine, weigh
+from tuning.judge import judge
+from tuning.objective.engine import Engine
+from tuning.objective.loss import TERMS, weigh
+from tuning.problem import problem_of
 from tuning.report import accurate, breakdown, extras, pictures
 from tuning.report import document as report
 from tuning.report.page import literal, page
 from tuning.search.explore import REACH, Slices, slices
 from tuning.search.rounds import training
-from tuning.study import judge, study_of
 
 CASE = """
 [reference]
@@ -66,7 +67,7 @@ def study_from(text, **tune):
     raw = tomllib.loads(text)
     raw["tune"] |= tune
     case = case_from(raw, "case")
-    return study_of(case, tune_from(Table(raw).table("tune"), case))
+    return problem_of(case, tune_from(Table(raw).table("tune"), case))
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +153,7 @@ def test_what_was_minimised_is_the_goal(conditions):
     who = training(few)
     at = few.objective.space.encode(few.tune.space.values(few.case.cascade))
     parts = breakdown.minimised(few, at, who)
-    goal = few.goal.score(few.objective.space, at[None], few.engine.terms(at[None], who), who)[0]
+    goal = few.goal.score(at[None], few.engine.terms(at[None], who), who)[0]
     assert math.log(parts["total"]) == pytest.approx(goal, rel=1e-9)
     assert parts["total"] == pytest.approx((parts["risk"] + parts["held"]) * parts["penalty"], rel=1e-12)
     assert (parts["ordinary"], parts["asked_to_be_held"]) == (4, 2)

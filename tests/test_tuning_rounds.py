@@ -20,7 +20,7 @@ def tuned(monkeypatch, tmp_path, world, **tune):
     """The answer of the rounds, and its gains (c, k)."""
     made = study(monkeypatch, world, **tune)
     found = rounds(made, made.tune.space.values(made.case.cascade), tmp_path, TOLD, False)
-    return found, np.asarray(found.study.objective.space.gains_at(found.x))
+    return found, np.asarray(found.problem.objective.space.gains_at(found.x))
 
 
 def seed_of(which, seed=1):
@@ -112,12 +112,12 @@ def test_of_several_answers_that_lose_members_the_one_that_loses_least_is_return
 def test_steps_that_do_not_resolve_the_answer_are_halved(monkeypatch, tmp_path):
     world = World(bias=lambda substeps: {3: 0.5, 6: 0.2, 12: 0.05}[substeps])
     found, _ = tuned(monkeypatch, tmp_path, world)
-    assert found.study.objective.clock.method == Slide(12)
+    assert found.problem.objective.clock.method == Slide(12)
     assert found.error.relative == pytest.approx(0.05)
     assert found.error.resolved
     # rollouts in the coarse steps count too
     everyone = sum(len(numbers) * points for kind, _, numbers, points in world.asked if kind == "gradient")
-    assert found.study.engine.rollouts > everyone
+    assert found.problem.engine.rollouts > everyone
 
 
 def test_steps_that_never_resolve_it_are_said_to_be_so(monkeypatch, tmp_path):

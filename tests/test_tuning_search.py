@@ -18,15 +18,16 @@ from ambjax.cases.reader import case_from
 from ambjax.ensemble import Percent, Spread
 from tuning.config import tune_from
 from tuning.objective.conditions import bounds
+from tuning.objective.engine import Engine
 from tuning.objective.goal import Goal
-from tuning.objective.loss import TERMS, loss_for
-from tuning.objective.problem import Engine, Objective, weigh
+from tuning.objective.loss import TERMS, loss_for, weigh
+from tuning.objective.members import Objective
 from tuning.objective.risk import CVaR, Mean
 from tuning.optimisers import CLIFF, NAMES, SHORTER, bfgs, optimiser
+from tuning.search.course import GAIN, MOST_LOOKS, look_again
 from tuning.search.descent import Descent
-from tuning.search.keeper import Keeper, Search
+from tuning.search.keeper import Keeper, Progress
 from tuning.search.optimise import _go_on_with_all, best_of, search
-from tuning.search.rounds import GAIN, MOST_LOOKS, look_again
 from tuning.search.screen import FAR, NEAR, around, everywhere, screen
 from tuning.space import Gain, Space
 
@@ -179,7 +180,7 @@ def test_every_optimiser_descends_and_steps_back(name):
 def small():
     problem = objective(60)
     engine = Engine(problem, settle=0.002, threads=2)
-    goal = Goal((1.0, 0.0, 0.0, 0.0, 1e-3, 1.0), Mean(), bounds(CASCADE, SCENARIO, problem.clock), 1.0, 0.1)
+    goal = Goal(SPACE, (1.0, 0.0, 0.0, 0.0, 1e-3, 1.0), Mean(), bounds(CASCADE, SCENARIO, problem.clock), 1.0, 0.1)
     return engine, goal, problem.training(3, 4, 1, 1.2, 1.25), SPACE.values(CASCADE)
 
 
@@ -199,7 +200,7 @@ def test_the_search_descends_and_keeps_the_best(small):
     assert 0 < found.since < found.iteration
     assert value[found.since] <= value[found.since - 1] * (1 - 1e-9)  # logarithms below 0
     x, best = best_of(found)
-    again = goal.score(SPACE, x[None], engine.terms(x[None], who), who)[0]
+    again = goal.score(x[None], engine.terms(x[None], who), who)[0]
     assert again == pytest.approx(best, rel=1e-9)
 
 
@@ -209,9 +210,9 @@ def test_the_screen_keeps_the_best_of_all_that_hold(small):
     points = everywhere(engine.objective, goal.conditions, start, 8, seed=1)
     assert points.shape == (10, 4)
     np.testing.assert_allclose(points[0], SPACE.encode(start))
-    kept = screen(engine, who, points, 2, lambda x, terms, some: goal.score(SPACE, x, terms, some))
-    values = goal.score(SPACE, points, engine.terms(points, who), who)
-    best = goal.score(SPACE, kept, engine.terms(kept, who), who)
+    kept = screen(engine, who, points, 2, goal)
+    values = goal.score(points, engine.terms(points, who), who)
+    best = goal.score(kept, engine.terms(kept, who), who)
     assert best[0] == pytest.approx(values.min())
     assert best[0] <= best[1]
 
@@ -321,10 +322,10 @@ def test_a_search_whose_checkpoint_was_damaged_is_the_uninterrupted_one(small, t
 
 def test_the_second_phase_goes_back_to_what_was_given_where_the_path_is_worse(small):
     engine, goal, who, start = small
-    descent = Descent(SPACE, goal, "bfgs", 0.1)
+    descent = Descent(goal, "bfgs", 0.1)
     best, x = best_of(run(small))[0], everywhere(engine.objective, goal.conditions, start, 2, seed=1)[-2:]
     path = {"x": [x], "value": [np.zeros(2)]}
-    kept = Search(descent.begin(jnp.asarray(x)), np.ones(2, bool), path, iteration=1)
+    kept = Progress(descent.begin(jnp.asarray(x)), np.ones(2, bool), path, iteration=1)
     _go_on_with_all(engine, goal, who, kept, descent, best)
     np.testing.assert_array_equal(kept.starts.trial[0], best)
     assert kept.active.tolist() == [True, False]
@@ -370,7 +371,7 @@ def test_ctrl_c_keeps_the_best(small):
 
 def test_steps_that_are_no_numbers_are_skipped(small):
     _, goal, *_ = small
-    descent = Descent(SPACE, goal, "adam", 0.1)
+    descent = Descent(goal, "adam", 0.1)
     starts = descent.begin(jnp.zeros((1, 4)))
     good = descent.step(4, starts, jnp.ones((1, 4)), jnp.ones((1, 4, 4)), jnp.ones(1, bool))
     bad = descent.step(4, good, jnp.full((1, 4), jnp.nan), jnp.ones((1, 4, 4)), jnp.ones(1, bool))

@@ -14,7 +14,7 @@ from ambjax.simulation.loop import SHOWN, Densities
 from ambjax.simulation.metrics import Rms
 from ambjax.simulation.span import blank
 from ambjax.theorem.conditions import delta_1_on_reference
-from tuning.config import read_study
+from tuning.config import read_tune
 from tuning.objective.conditions import bounds, shortfall
 from tuning.objective.loss import TERMS, Loss, loss_for
 from tuning.objective.risk import CVaR, Mean, SoftWorst
@@ -78,7 +78,7 @@ def test_what_the_template_says_of_tuning_can_be_uncommented(name, tmp_path):
     head, heading, tail = template(name).partition("# [tune]")
     path = tmp_path / "mine.toml"
     path.write_text(head + "\n".join(line.removeprefix("# ") for line in (heading + tail).splitlines()))
-    tune = read_study(path)[1]
+    tune = read_tune(path)[1]
     assert tune.space.paths == [C, K]
     assert (tune.space.gains[0].low, tune.space.gains[0].high) == (1.0, 500.0)
     assert isinstance(tune.risk, CVaR)

@@ -16,9 +16,10 @@ from scipy import stats
 from tomlkit import dumps
 
 import tuning.command
-import tuning.study
+import tuning.judge
 from ambjax.cases.reader import case_from
 from tuning.config import seeds
+from tuning.judge import RESOLVED, judge, step_error, summarise
 from tuning.objective.conditions import Bound
 from tuning.objective.goal import Goal
 from tuning.objective.loss import TERMS
@@ -29,7 +30,6 @@ from tuning.search.descent import Descent
 from tuning.search.optimise import HALVINGS, search
 from tuning.search.screen import everywhere
 from tuning.space import Gain, Space
-from tuning.study import RESOLVED, judge, step_error, summarise
 
 
 def at(made, c, k):
@@ -88,7 +88,7 @@ def test_the_judge_sees_every_member_of_its_own_ensemble_once(monkeypatch):
     world = World(limit=lambda seed, number, *_: 40.0 if number == 5 else math.inf)
     world.bias = lambda substeps: 0.5 if substeps == 3 else 0.0
     made = study(monkeypatch, world)
-    monkeypatch.setattr(tuning.study, "CHUNK", 4)
+    monkeypatch.setattr(tuning.judge, "AT_ONCE", 4)
     x = at(made, 80.0, 60.0)
     found = judge(made, x, 77, 10)
     np.testing.assert_array_equal(found["chatter_V"], 1 + np.arange(10))  # a Bowl's member k chatters by 1 + k
@@ -102,7 +102,7 @@ def test_the_judge_sees_every_member_of_its_own_ensemble_once(monkeypatch):
     np.testing.assert_allclose(found["settled_rms_error_m"], S_0 * math.sqrt(tracking))
 
 
-def test_a_summary_is_pooled_and_counts_the_lost(monkeypatch):
+def test_a_summary_is_pooled_and_counts_the_lost():
     errors, lost_at = np.array([1.0, 2.0, 3.0, 6.0]) * 1e-6, np.array([np.inf, np.inf, 0.01, np.inf])
     found = {
         "settled_rms_error_m": errors,
@@ -110,7 +110,7 @@ def test_a_summary_is_pooled_and_counts_the_lost(monkeypatch):
         "lost_at_s": lost_at,
         "lost": np.isfinite(lost_at),
     }
-    told = summarise(study(monkeypatch, World()), found)
+    told = summarise(found)
     assert (told["members"], told["lost"], told["survival"]) == (4, 1, 0.75)
     theirs = stats.binomtest(3, 4).proportion_ci(0.95, method="wilson")
     assert (told["survival_low"], told["survival_high"]) == pytest.approx((theirs.low, theirs.high))
@@ -201,8 +201,8 @@ def test_the_front_trades_error_for_voltage(monkeypatch):
 def test_the_theorem_s_conditions_pull_where_the_losses_are_flat():
     space = Space(tuple(Gain(path) for path in PATHS))
     conditions = (Bound("controller.position.k", 50.0, "Q_z", "m/s^2"),)
-    goal = Goal((1.0,) * 6, Mean(), conditions, 2.0, 0.1)
-    descent = Descent(space, goal, "bfgs", 0.1)
+    goal = Goal(space, (1.0,) * 6, Mean(), conditions, 2.0, 0.1)
+    descent = Descent(goal, "bfgs", 0.1)
     x = jnp.asarray(np.log([[30.0, 20.0]]))
     flat = descent.step(3, descent.begin(x), jnp.ones((1, 3)), jnp.zeros((1, 3, 2)), jnp.ones(1, bool))
     # log of the mean loss, 1, and the weighed square of log(1.1 * 50 / 20)

@@ -9,16 +9,18 @@ import numpy as np
 import pytest
 
 import tuning.command
+import tuning.search.course
 import tuning.search.rounds
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
 from tuning.__main__ import main
 from tuning.config import tune_from
+from tuning.judge import NEGLIGIBLE, StepError, compared, step_error, words, worst_of
 from tuning.optimisers import Retreat
+from tuning.problem import REFERENCE_MEMBERS, problem_of
 from tuning.search.descent import Starts
-from tuning.search.optimise import Search
+from tuning.search.optimise import Progress
 from tuning.search.rounds import LOUDER, MOST_HALVINGS, _joining, finer, rounds
-from tuning.study import NEGLIGIBLE, REFERENCE_MEMBERS, StepError, compared, step_error, study_of, words, worst_of
 
 ROTOR = (pathlib.Path(__file__).parent / "cases" / "rotor.toml").read_text()
 # Under noise on the velocity, hard signs of these gains drive i_ref onto the singular curve within milliseconds of
@@ -56,7 +58,7 @@ starts = 2
 def study(text):
     document = tomllib.loads(text)
     case = case_from(document)
-    return study_of(case, tune_from(Table(document).table("tune"), case))
+    return problem_of(case, tune_from(Table(document).table("tune"), case))
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +155,7 @@ def searched(engine, goal, who, points, **rest):
     x, value = np.array(points[:count]), np.arange(float(count)) / 100
     starts = Starts(x, Retreat(x, value, None), value)
     rows = {"x": [x], "value": [value], "lost": [np.zeros(count)], "members": [np.array(len(who.member))]}
-    return Search(starts, np.zeros(count, bool), rows, iteration=1)
+    return Progress(starts, np.zeros(count, bool), rows, iteration=1)
 
 
 @pytest.fixture
@@ -161,7 +163,7 @@ def run(small, monkeypatch, tmp_path):
     def answer(*errors, most=4):
         verdicts = Verdicts(*errors)
         monkeypatch.setattr(tuning.search.rounds, "step_error", verdicts)
-        monkeypatch.setattr(tuning.search.rounds, "search", searched)
+        monkeypatch.setattr(tuning.search.course, "search", searched)
         monkeypatch.setattr(tuning.search.rounds, "_lost", lambda study, x: (np.zeros(0, int), np.arange(4)))
         monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", most)
         start = small.tune.space.values(small.case.cascade)

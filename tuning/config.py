@@ -61,7 +61,7 @@ class Tune:
     budget: Budget
 
 
-def read_study(path: str | pathlib.Path) -> tuple[Case, Tune, dict[str, Any]]:
+def read_tune(path: str | pathlib.Path) -> tuple[Case, Tune, dict[str, Any]]:
     """Case, [tune] and the raw document of a case file. Raises ValueError, one line, for anything wrong in it."""
     raw = load(path)
     name = pathlib.Path(path).stem
@@ -120,10 +120,10 @@ def _space(table: Table, case: Case) -> Space:
 
 def _flat(raw: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Dotted keys of nested tables: TOML reads controller.position.c = [1, 2] as three tables."""
-    found: dict[str, Any] = {}
+    flat: dict[str, Any] = {}
     for key, value in raw.items():
-        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return found
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return flat
 
 
 def _bound(raw: Any, path: str, table: Table) -> tuple[float, float]:
@@ -181,7 +181,7 @@ def _whole(table: Table, key: str, default: int) -> int:
 
 def settings(tune: Tune) -> dict[str, Any]:
     """[tune] as plain data, for the report and the fingerprint of a checkpoint."""
-    told = {
+    facts = {
         "gains": tune.space.paths,
         "bounds": {gain.path: [gain.low, gain.high] for gain in tune.space.gains},
         "weights": dict(zip(TERMS, tune.weights, strict=True)) | {"conditions": tune.conditions},
@@ -190,7 +190,7 @@ def settings(tune: Tune) -> dict[str, Any]:
     rest = {
         name: getattr(tune, name) for name in ("margin", "early", "stress", "gain_margin", "optimiser", "learning_rate")
     }
-    return told | rest | dataclasses.asdict(tune.budget)
+    return facts | rest | dataclasses.asdict(tune.budget)
 
 
 def seeds(budget: Budget) -> tuple[int, int, int]:

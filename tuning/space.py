@@ -129,13 +129,13 @@ def tunable(cascade: Cascade, *, steepness: bool = True) -> list[str]:
 
     `steepness`: those of smoothed signs too.
     """
-    found = []
+    paths = []
     for stage in STAGES:
         for field in dataclasses.fields(getattr(cascade, stage)):
             meta = field.metadata
             if meta.get("leaf") and meta["above"] is not None and (steepness or not meta.get("steepness")):
-                found.append(f"{ROOT}.{stage}.{field.name}")
-    return found
+                paths.append(f"{ROOT}.{stage}.{field.name}")
+    return paths
 
 
 def _read(cascade: Cascade, path: str) -> Any:

@@ -14,6 +14,10 @@ from ambjax.world.scenario import Scenario
 # Exponent of the norm that stands for the maximum: 1.2 to 1.6 times below it over 1e4 samples of noise.
 NORM = 16
 TERMS = ("tracking", "peak", "effort", "chatter", "clearance", "survival")
+# Terms that say whether the rotor is held.
+HELD = ("clearance", "survival")
+# Terms that are a price, not an aim.
+COSTS = ("effort", "chatter")
 
 
 class Sums(NamedTuple):
@@ -97,3 +101,16 @@ def loss_for(scenario: Scenario, settle: float, early: float = 0.0) -> Loss:
     plant = scenario.plant
     u_scale = jnp.where(jnp.isfinite(scenario.u_max), scenario.u_max, plant.R * plant.i_0)
     return Loss(settle, early, plant.s_0, float(u_scale), scenario.touchdown)
+
+
+def weigh(weights: Any, terms: dict[str, Any], stressed: Any) -> Any:
+    """The loss: errors and losses weighed and added, times 1 + weighed costs; of a stressed member, HELD alone.
+
+    Costs count relative to the error, since its size is not known before: with a weight of 0.1, voltage at
+    its limit throughout is worth a tenth of the error.
+    """
+    ordinary = 1.0 - 1.0 * stressed
+    each = dict(zip(TERMS, (weights[k] * terms[name] for k, name in enumerate(TERMS)), strict=True))
+    costs = sum(each.pop(name) for name in COSTS)
+    held = sum(each.pop(name) for name in HELD)
+    return held + ordinary * sum(each.values()) * (1 + costs)

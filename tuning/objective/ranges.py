@@ -8,7 +8,7 @@ import numpy as np
 from ambjax.control import answers
 from ambjax.control.search import Interval, Site
 from tuning.objective.conditions import Bound
-from tuning.objective.problem import Objective
+from tuning.objective.members import Objective
 from tuning.space import Gain, Space
 
 # Displacement that a rotor at rest is at least expected to make, as a share of the clearance.

@@ -11,7 +11,8 @@ import numpy as np
 from ambjax.control.cascade import Cascade
 from ambjax.simulation.rollout import rollout
 from ambjax.simulation.trajectory import Trajectory
-from tuning.study import Study, summarise
+from tuning.judge import summarise
+from tuning.problem import Problem
 
 # Held-out members that are simulated again.
 AGAIN = 8
@@ -19,32 +20,32 @@ AGAIN = 8
 MARKED = 0.05
 
 
-def compared(study: Study, x: np.ndarray, seed: int, count: int, names: tuple[str, ...]) -> dict[str, Any]:
+def compared(problem: Problem, x: np.ndarray, seed: int, count: int, names: tuple[str, ...]) -> dict[str, Any]:
     """The first members of the ensemble of `count` with this seed at x [m], by the report's steps and by accurate ones.
 
     `members` simulated, `held` by both; over these the summaries (`summarise`) of `names`: of the report, accurate,
     and the relative error of the former. `lost`, `stalled`: how many are, by either.
     """
     numbers = np.arange(min(AGAIN, count))
-    who = study.objective.chosen(seed, numbers, count)
+    who = problem.objective.chosen(seed, numbers, count)
     both = [
         {name: values[0] for name, values in engine.metrics(x[None], who)["metrics"].items()}
-        for engine in (study.judging, study.reference)
+        for engine in (problem.judging, problem.reference)
     ]
-    held = np.logical_and.reduce([~np.isfinite(found["lost_at_s"]) for found in both])
+    held = np.logical_and.reduce([~np.isfinite(metrics["lost_at_s"]) for metrics in both])
     ways = ("report", "accurate")
-    told: dict[str, Any] = {"members": len(numbers), "held": int(held.sum()), "marked_beyond": MARKED}
+    facts: dict[str, Any] = {"members": len(numbers), "held": int(held.sum()), "marked_beyond": MARKED}
     for fate in ("lost", "stalled"):
-        told[fate] = {way: int(found[fate].sum()) for way, found in zip(ways, both, strict=True)}
-    told["metrics"] = {}
+        facts[fate] = {way: int(metrics[fate].sum()) for way, metrics in zip(ways, both, strict=True)}
+    facts["metrics"] = {}
     if held.any():
-        ours, theirs = (summarise(study, {name: values[held] for name, values in found.items()}) for found in both)
+        ours, theirs = (summarise({name: values[held] for name, values in metrics.items()}) for metrics in both)
         shown = [name for name in names if name in ours and name in theirs]
-        told["metrics"] = {
+        facts["metrics"] = {
             name: {"report": ours[name], "accurate": theirs[name], "relative": _relative(ours[name], theirs[name])}
             for name in shown
         }
-    return told
+    return facts
 
 
 def _relative(ours: float, theirs: float) -> float:
@@ -54,8 +55,8 @@ def _relative(ours: float, theirs: float) -> float:
     return ours / theirs - 1 if theirs else float("inf")
 
 
-def nominal(study: Study, cascade: Cascade) -> Trajectory:
+def nominal(problem: Problem, cascade: Cascade) -> Trajectory:
     """The case's own run, nothing spread, under this cascade, in accurate steps: a row for each sample."""
-    case = study.case
-    clock = dataclasses.replace(case.clock, method=study.reference.objective.clock.method)
+    case = problem.case
+    clock = dataclasses.replace(case.clock, method=problem.reference.objective.clock.method)
     return rollout(cascade, case.scenario, clock).trajectory

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from tuning.objective.goal import Goal
-from tuning.objective.loss import TERMS
-from tuning.objective.problem import COSTS, HELD, Members, weigh
-from tuning.study import Study
+from tuning.objective.loss import COSTS, HELD, TERMS, weigh
+from tuning.objective.members import Members
+from tuning.problem import Problem
 
 # The loss of one member in words. Costs multiply: they count relative to the error.
 FORMULA = f"{' + '.join(HELD)} + (tracking + peak) x (1 + {' + '.join(COSTS)})"
@@ -22,12 +22,12 @@ def contributions(weights: Any, terms: dict[str, np.ndarray]) -> dict[str, np.nd
     return {name: error * values if name in COSTS else values for name, values in each.items()}
 
 
-def table(goal: Goal, found: dict[str, np.ndarray]) -> Facts:
+def table(goal: Goal, columns: dict[str, np.ndarray]) -> Facts:
     """Means over an ensemble, by term: its value and what it adds to the loss; the mean loss, and its risk.
 
-    `found`: what `judge` found, the terms [N] named "loss.tracking" and so on.
+    `columns`: those of `judge`, the terms [N] named "loss.tracking" and so on.
     """
-    terms = {name: np.asarray(found[f"loss.{name}"]) for name in TERMS}
+    terms = {name: np.asarray(columns[f"loss.{name}"]) for name in TERMS}
     adds = contributions(goal.weights, terms)
     losses = weigh(goal.weights, terms, np.zeros(len(terms["survival"]), bool))
     return {
@@ -38,11 +38,11 @@ def table(goal: Goal, found: dict[str, np.ndarray]) -> Facts:
     }
 
 
-def minimised(study: Study, x: np.ndarray, who: Members) -> Facts:
+def minimised(problem: Problem, x: np.ndarray, who: Members) -> Facts:
     """What the search brought down, at x [m]: the parts of its goal, (risk + held) x penalty = total."""
-    goal, space, n = study.goal, study.objective.space, who.ordinary
-    losses = weigh(goal.weights, {k: v[0] for k, v in study.engine.terms(x[None], who).items()}, who.stressed)
-    penalty = float(goal.penalty(space, jnp.asarray(x)))
+    goal, n = problem.goal, who.ordinary
+    losses = weigh(goal.weights, {k: v[0] for k, v in problem.engine.terms(x[None], who).items()}, who.stressed)
+    penalty = float(goal.penalty(jnp.asarray(x)))
     parts = {
         "ordinary": n,
         "risk": float(goal.risk(jnp.asarray(losses[:n]))),

@@ -1,4 +1,4 @@
-"""The report of a study in Markdown, from its facts."""
+"""The report of a search in Markdown, from its facts."""
 
 import dataclasses
 import math
@@ -121,12 +121,12 @@ def _again(again: Facts | None, name: str) -> list[str]:
     """The cells of a metric by either step, and how far the report's is off; bold where that is much."""
     if again is None:
         return []
-    found = again["metrics"].get(name)
-    if found is None:
+    pair = again["metrics"].get(name)
+    if pair is None:
         return ["-"] * 3
-    off = f"{100 * found['relative']:.2g} %"
-    marked = abs(found["relative"]) > again["marked_beyond"]
-    return [f"{found['report']:.4g}", f"{found['accurate']:.4g}", f"**{off}**" if marked else off]
+    off = f"{100 * pair['relative']:.2g} %"
+    marked = abs(pair["relative"]) > again["marked_beyond"]
+    return [f"{pair['report']:.4g}", f"{pair['accurate']:.4g}", f"**{off}**" if marked else off]
 
 
 def _fates(again: Facts | None, name: str) -> list[str]:
@@ -140,7 +140,7 @@ def _accurate(again: Facts | None) -> list[str]:
         return []
     if not again["metrics"]:
         return ["No member is held by accurate steps too: nothing in this table is confirmed."]
-    marked = [name for name, found in again["metrics"].items() if abs(found["relative"]) > again["marked_beyond"]]
+    marked = [name for name, pair in again["metrics"].items() if abs(pair["relative"]) > again["marked_beyond"]]
     words = f"The last columns: {again['held']} members once more, by adaptive RODAS3. "
     if not marked:
         return [f"{words}No number is off by more than {100 * again['marked_beyond']:g} %."]
@@ -243,14 +243,14 @@ def _survival(one: Facts) -> str:
 
 def _how(facts: Facts) -> list[str]:
     how = facts["search"]
-    told = [
+    lines = [
         f"- risk: {how['risk']} over {how['members']} members (seed {how['seed']}), optimiser {how['optimiser']}",
         f"- {how['iterations']} iterations, {how['rollouts']} simulated rollouts "
         f"(a gradient of m gains counts m + 1), {how['seconds']:.0f} s",
     ]
     if error := facts.get("step_error"):
-        told.append(
+        lines.append(
             f"- step of the search at the optimum: settled rms error {error['search_m']:.4e} m, adaptive RODAS3 "
             f"{error['reference_m']:.4e} m on {error['members']} members: {error['told']}"
         )
-    return told
+    return lines

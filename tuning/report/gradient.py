@@ -5,27 +5,29 @@ from typing import Any
 
 import numpy as np
 
-from tuning.objective.problem import Engine, Members, weigh
-from tuning.study import Study
+from tuning.objective.engine import Engine
+from tuning.objective.loss import weigh
+from tuning.objective.members import Members
+from tuning.problem import Problem
 
 # Samples over which the three ways are compared, members that take part, and the step of the differences.
 SAMPLES, FEW, STEP = 500, 4, 1e-3
 HORIZONS = (0.125, 0.25, 0.5)
 
 
-def _shorter(study: Study, samples: int) -> Any:
+def _shorter(problem: Problem, samples: int) -> Any:
     """The objective over fewer samples; settled from the same share of them on."""
-    objective = study.objective
+    objective = problem.objective
     clock = dataclasses.replace(objective.clock, samples=samples)
     settle = objective.loss.settle * samples / objective.clock.samples
     return dataclasses.replace(objective, clock=clock, loss=dataclasses.replace(objective.loss, settle=settle))
 
 
-def three_ways(study: Study, x: np.ndarray) -> dict[str, Any]:
+def three_ways(problem: Problem, x: np.ndarray) -> dict[str, Any]:
     """Gradient [m] of the mean loss at x [m] by forward and reverse mode and by Richardson-extrapolated differences."""
-    objective = _shorter(study, min(SAMPLES, study.objective.clock.samples))
-    who = objective.members(study.tune.budget.seed, min(FEW, study.tune.budget.members))
-    weights = study.goal.weights
+    objective = _shorter(problem, min(SAMPLES, problem.objective.clock.samples))
+    who = objective.members(problem.tune.budget.seed, min(FEW, problem.tune.budget.members))
+    weights = problem.goal.weights
     settle = float(np.asarray(objective.loss.settle))
     forward, reverse = (Engine(objective, settle=settle, mode=mode, lanes=16) for mode in ("forward", "reverse"))
     by_forward = forward.gradient(x[None], who, weights)[1][0].mean(axis=0)
@@ -43,15 +45,15 @@ def three_ways(study: Study, x: np.ndarray) -> dict[str, Any]:
     }
 
 
-def against_horizon(study: Study, x: np.ndarray, who: Members) -> list[dict[str, float]]:
+def against_horizon(problem: Problem, x: np.ndarray, who: Members) -> list[dict[str, float]]:
     """Norm of the gradient of the log of the mean loss, and share of lost members, by horizon in s."""
     rows = []
     for share in (*HORIZONS, 1.0):
-        samples = round(share * study.objective.clock.samples)
-        objective = _shorter(study, samples)
-        engine = study.engine if share == 1.0 else Engine(objective, settle=float(objective.loss.settle))
+        samples = round(share * problem.objective.clock.samples)
+        objective = _shorter(problem, samples)
+        engine = problem.engine if share == 1.0 else Engine(objective, settle=float(objective.loss.settle))
         few = who.part(4)
-        losses, slopes, terms = engine.gradient(x[None], few, study.goal.weights)
+        losses, slopes, terms = engine.gradient(x[None], few, problem.goal.weights)
         rows.append(
             {
                 "horizon_s": float(samples * np.asarray(objective.clock.sample_period)),
@@ -62,9 +64,9 @@ def against_horizon(study: Study, x: np.ndarray, who: Members) -> list[dict[str,
     return rows
 
 
-def signal_to_noise(study: Study, x: np.ndarray, who: Members) -> dict[str, Any]:
+def signal_to_noise(problem: Problem, x: np.ndarray, who: Members) -> dict[str, Any]:
     """Mean of the members' gradients over its standard error, by gain; each member is a seed of its own."""
-    losses, slopes, terms = study.engine.gradient(x[None], who, study.goal.weights)
+    losses, slopes, terms = problem.engine.gradient(x[None], who, problem.goal.weights)
     relative = slopes[0] / losses[0].mean()
     error = relative.std(axis=0, ddof=1) / np.sqrt(len(relative)) if len(relative) > 1 else np.full(len(x), np.nan)
     return {
@@ -75,11 +77,11 @@ def signal_to_noise(study: Study, x: np.ndarray, who: Members) -> dict[str, Any]
     }
 
 
-def report(study: Study, x: np.ndarray, who: Members) -> dict[str, Any]:
+def report(problem: Problem, x: np.ndarray, who: Members) -> dict[str, Any]:
     """All of it, at coordinates x [m]."""
     return {
-        "gains": study.objective.space.paths,
-        "three_ways": three_ways(study, x),
-        "horizons": against_horizon(study, x, who),
-        "noise": signal_to_noise(study, x, who),
+        "gains": problem.objective.space.paths,
+        "three_ways": three_ways(problem, x),
+        "horizons": against_horizon(problem, x, who),
+        "noise": signal_to_noise(problem, x, who),
     }

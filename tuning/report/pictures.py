@@ -1,4 +1,4 @@
-"""Pictures of a study, as PNG."""
+"""Pictures of a search and its answer, as PNG."""
 
 import io
 from typing import Any
@@ -86,15 +86,15 @@ def convergence(history: dict[str, Any], paths: list[str]) -> bytes:
     return _png(figure)
 
 
-def landscape(found: Slices, paths: list[str]) -> bytes:
+def landscape(slices: Slices, paths: list[str]) -> bytes:
     """PNG: what was minimised along each gain through the answer."""
     from matplotlib.figure import Figure
 
     m = len(paths)
     figure = Figure(figsize=(2.4 * m + 1, 3.2), layout="constrained")
     axes = np.atleast_1d(figure.subplots(1, m, sharey=True))
-    middle = found.goals.shape[1] // 2
-    for ax, gains, goals, lost, path in zip(axes, found.gains, found.goals, found.lost, paths, strict=True):
+    middle = slices.goals.shape[1] // 2
+    for ax, gains, goals, lost, path in zip(axes, slices.gains, slices.goals, slices.lost, paths, strict=True):
         risk = np.minimum(np.exp(goals - goals[middle]), HIGHEST)
         ax.loglog(gains, risk, "C0-", lw=1.2)
         held = lost == 0

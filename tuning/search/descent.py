@@ -10,7 +10,6 @@ from jax import Array
 
 from tuning.objective.goal import Goal
 from tuning.optimisers import Curvature, Retreat, optimiser
-from tuning.space import Space
 
 
 class Starts(NamedTuple):
@@ -34,8 +33,8 @@ class Starts(NamedTuple):
 class Descent:
     """Starts that descend, each on its own, by the optimiser of this name; compiled once."""
 
-    def __init__(self, space: Space, goal: Goal, name: str, rate: float):
-        self.space, self.goal, self.method = space, goal, optimiser(name, rate)
+    def __init__(self, goal: Goal, name: str, rate: float):
+        self.goal, self.method = goal, optimiser(name, rate)
 
     @functools.partial(jax.jit, static_argnums=0)
     def begin(self, x: Array) -> Starts:
@@ -58,12 +57,9 @@ class Descent:
         return jax.vmap(functools.partial(self._one, ordinary))(starts, losses, slopes, on)
 
     def _one(self, ordinary: int, start: Starts, losses: Array, slopes: Array, on: Array) -> Starts:
-        goal = self.goal
-        value, weights = jax.value_and_grad(goal.of)(losses, ordinary, 0.0)
-        extra, slope = jax.value_and_grad(lambda x: goal.weight * goal.penalty(self.space, x))(start.trial)
-        gradient = weights @ slopes + slope
+        value, (weights, slope) = jax.value_and_grad(self.goal, (0, 1))(losses, start.trial, ordinary)
         state: Any
-        step, state = self.method.update(gradient, start.state, start.trial, value=value + extra)
+        step, state = self.method.update(weights @ slopes + slope, start.state, start.trial, value=value)
         trial: Any = optax.apply_updates(start.trial, step)
         fresh = Starts(trial, state, jnp.linalg.norm(trial - state.best))
         return jax.tree.map(lambda p, q: jnp.where(on, p, q), fresh, start)

@@ -6,12 +6,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from tuning.judge import rms
 from tuning.objective.loss import TERMS
-from tuning.objective.problem import Members
+from tuning.objective.members import Members
 from tuning.optimisers import BFGS
+from tuning.problem import Problem
 from tuning.search.descent import Descent
-from tuning.search.optimise import SHORTEST, Search, iterate
-from tuning.study import Study, rms
+from tuning.search.optimise import SHORTEST, Progress, iterate
 
 # Coordinates of the slices: factors of about e^-1.5 to e^1.5 of a gain.
 REACH = np.linspace(-1.5, 1.5, 13)
@@ -42,41 +43,43 @@ class Slices:
         return int(j), int(k), max(float(drop[j, k]), 0.0)
 
 
-def slices(study: Study, x: np.ndarray, who: Members) -> Slices:
+def slices(problem: Problem, x: np.ndarray, who: Members) -> Slices:
     """Slices through x [m], one gain at a time."""
-    m, space = len(x), study.objective.space
+    m, space = len(x), problem.objective.space
     at = np.repeat(x[None], m * len(REACH), axis=0)
     for j in range(m):
         at[j * len(REACH) : (j + 1) * len(REACH), j] += REACH
-    terms = study.engine.terms(at, who)
-    goals = study.goal.score(space, at, terms, who).reshape(m, -1)
+    terms = problem.engine.terms(at, who)
+    goals = problem.goal.score(at, terms, who).reshape(m, -1)
     gains = np.stack([np.asarray(space.gains_at(jnp.asarray(one))) for one in at])
     own = np.stack([gains[j * len(REACH) : (j + 1) * len(REACH), j] for j in range(m)])
     return Slices(own, goals, (terms["survival"] > 0).sum(axis=1).reshape(m, -1))
 
 
-def pareto(study: Study, x: np.ndarray, who: Members, *, points: int = 6, iterations: int = 8) -> list[dict[str, Any]]:
+def pareto(
+    problem: Problem, x: np.ndarray, who: Members, *, points: int = 6, iterations: int = 8
+) -> list[dict[str, Any]]:
     """The front of settled tracking error against rms voltage: a family of weights of the effort, refined at once.
 
     The first has the search's own; voltage at its limit is worth from as much as the error to a thousand times that.
     """
-    space = study.objective.space
-    weights = np.tile(study.goal.weights, (points, 1))
+    space = problem.objective.space
+    weights = np.tile(problem.goal.weights, (points, 1))
     weights[1:, TERMS.index("effort")] = np.geomspace(1.0, 1000.0, points - 1)
-    descent = Descent(space, study.goal, BFGS, 0.0)
-    family = Search(descent.begin(jnp.tile(jnp.asarray(x), (points, 1))), np.ones(points, bool))
+    descent = Descent(problem.goal, BFGS, 0.0)
+    family = Progress(descent.begin(jnp.tile(jnp.asarray(x), (points, 1))), np.ones(points, bool))
     for _ in range(iterations):
         if family.active.any():
-            iterate(study.engine, study.goal, who, family, descent, weights)
+            iterate(problem.engine, problem.goal, who, family, descent, weights)
             family.active &= np.asarray(family.starts.length) > SHORTEST
     best = np.asarray(family.starts.best)
-    found = study.engine.metrics(best, who)["metrics"]
+    metrics = problem.engine.metrics(best, who)["metrics"]
     rows = [
         {
             "effort_weight": float(w[TERMS.index("effort")]),
-            "settled_rms_error_m": rms(found["settled_rms_error_m"][n]),
-            "settled_rms_u_V": rms(found["settled_rms_u_V"][n]),
-            "lost": int(found["lost"][n].sum()),
+            "settled_rms_error_m": rms(metrics["settled_rms_error_m"][n]),
+            "settled_rms_u_V": rms(metrics["settled_rms_u_V"][n]),
+            "lost": int(metrics["lost"][n].sum()),
             "gains": dict(zip(space.paths, np.asarray(space.gains_at(jnp.asarray(best[n]))).tolist(), strict=True)),
         }
         for n, w in enumerate(weights)

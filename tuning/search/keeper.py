@@ -21,7 +21,7 @@ LEAF, PAST, ACTIVE = "leaf_", "history_", "active"
 
 
 @dataclasses.dataclass
-class Search:
+class Progress:
     """A search under way. `history` holds one row per iteration; everything else can be read off a checkpoint.
 
     `since`: the iteration after which the phase began; `seconds` spent on it so far, `earlier` of them before a resume.
@@ -44,42 +44,42 @@ class Search:
 
 
 class Keeper:
-    """The checkpoint of round number `round` of what is `told` (nested, with names): written whole or not at all."""
+    """The checkpoint of round number `round` of what `facts` tell (nested, with names): written whole or not at all."""
 
-    def __init__(self, path: pathlib.Path | None, told: dict[str, Any], round: int = 1):
+    def __init__(self, path: pathlib.Path | None, facts: dict[str, Any], round: int = 1):
         self.path, self.round = path, round
-        self.fingerprint = flat({**provenance(), **told})
+        self.fingerprint = flat({**provenance(), **facts})
 
-    def save(self, search: Search) -> None:
+    def save(self, progress: Progress) -> None:
         """Keep this state instead of the one before. Raises ValueError if it cannot be written."""
         if self.path is None:
             return
-        leaves = {f"{LEAF}{n}": np.asarray(leaf) for n, leaf in enumerate(jax.tree.leaves(search.starts))}
-        past = {f"{PAST}{name}": np.asarray(rows) for name, rows in search.history.items()}
-        counts = {name: getattr(search, name) for name in COUNTS}
+        leaves = {f"{LEAF}{n}": np.asarray(leaf) for n, leaf in enumerate(jax.tree.leaves(progress.starts))}
+        past = {f"{PAST}{name}": np.asarray(rows) for name, rows in progress.history.items()}
+        counts = {name: getattr(progress, name) for name in COUNTS}
         facts = {"fingerprint": self.fingerprint, "round": self.round, "counts": counts}
-        seal(self.path, {**leaves, **past, ACTIVE: search.active}, facts)
+        seal(self.path, {**leaves, **past, ACTIVE: progress.active}, facts)
 
-    def load(self, descent: Descent, starts: int, m: int) -> Search | None:
+    def load(self, descent: Descent, starts: int, m: int) -> Progress | None:
         """The search so far, of so many starts in m coordinates; None, with a line that says why, if it is damaged.
 
-        Raises ValueError if it belongs to another study.
+        Raises ValueError if it belongs to another problem.
         """
         if self.path is None or not self.path.exists():
             return None
         try:
-            arrays, told = unseal(self.path)
-            if told.keys() != FACTS or told["counts"].keys() != set(COUNTS):
+            arrays, facts = unseal(self.path)
+            if facts.keys() != FACTS or facts["counts"].keys() != set(COUNTS):
                 raise DamagedError("it is no checkpoint")
-            differs = difference(told["fingerprint"], self.fingerprint)
+            differs = difference(facts["fingerprint"], self.fingerprint)
             if differs:
                 raise ValueError(
                     f"--resume: {self.path} belongs to another search: {differs}. "
                     "Use another --out, or leave out --resume to begin anew."
                 )
-            if told["round"] != self.round:
-                raise DamagedError(f"it is that of round {told['round']}")
-            return _search(arrays, told["counts"], descent, starts, m)
+            if facts["round"] != self.round:
+                raise DamagedError(f"it is that of round {facts['round']}")
+            return _progress(arrays, facts["counts"], descent, starts, m)
         except DamagedError as why:
             say(f"{self.path}: {why}; round {self.round} is begun again")
             return None
@@ -93,21 +93,21 @@ def remove_all(directory: pathlib.Path, pattern: str) -> int:
     return len(left)
 
 
-def _search(arrays: dict[str, np.ndarray], counts: dict[str, Any], descent: Descent, starts: int, m: int) -> Search:
+def _progress(arrays: dict[str, np.ndarray], counts: dict[str, Any], descent: Descent, starts: int, m: int) -> Progress:
     """Raises DamagedError where these are not the arrays of such a search."""
     begun = jax.eval_shape(descent.begin, jnp.zeros((starts, m)))
     leaves, tree = jax.tree.flatten(begun)
     wanted = {f"{LEAF}{n}": [np.dtype(leaf.dtype).str, list(leaf.shape)] for n, leaf in enumerate(leaves)}
     rows = {"value": (starts,), "x": (starts, m), "gains": (starts, m), "lost": (starts,), "members": ()}
     rows |= {"terms": (starts, len(TERMS)), "rollouts": ()}
-    found = shapes(arrays)
+    there = shapes(arrays)
     for name, shape in rows.items():
-        kind = found.get(f"{PAST}{name}", [None])[0]
+        kind = there.get(f"{PAST}{name}", [None])[0]
         wanted[f"{PAST}{name}"] = [kind, [counts["iteration"], *shape]]
     wanted[ACTIVE] = ["|b1", [starts]]
-    differs = difference(found, json.loads(json.dumps(wanted)))
+    differs = difference(there, json.loads(json.dumps(wanted)))
     if differs:
         raise DamagedError(f"it does not fit this search: {differs}")
     history = {name.removeprefix(PAST): list(rows) for name, rows in arrays.items() if name.startswith(PAST)}
     state = jax.tree.unflatten(tree, [jnp.asarray(arrays[f"{LEAF}{n}"]) for n in range(len(leaves))])
-    return Search(state, arrays[ACTIVE], history, **counts, earlier=counts["seconds"])
+    return Progress(state, arrays[ACTIVE], history, **counts, earlier=counts["seconds"])

@@ -1,19 +1,18 @@
 """Where to start: the case's own gains, informed ones, and quasi-random points over decades around them."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from ambjax.ensemble.design import points
 from tuning.objective.conditions import Bound
-from tuning.objective.problem import Engine, Members, Objective
+from tuning.objective.engine import Engine
+from tuning.objective.goal import Goal
+from tuning.objective.members import Members, Objective
 from tuning.objective.ranges import ranges
 
 # Share of the members that points meet, and share of the points that goes on: 1/4 after an eighth of the members.
 ROUNDS = (8, 4), (4, 1)
 # How far from a point its neighbourhoods reach, in coordinates: factors of e^1.5 up or down of each gain, and of e^3.
 NEAR, FAR = 1.5, 3.0
-Score = Callable[[np.ndarray, dict[str, np.ndarray], Members], np.ndarray]
 
 
 def everywhere(
@@ -42,13 +41,13 @@ def around(x: np.ndarray, count: int, seed: int) -> np.ndarray:
     return np.concatenate([x[None], x + reach * (2 * cube - 1)])
 
 
-def screen(engine: Engine, who: Members, x: np.ndarray, keep: int, score: Score) -> np.ndarray:
+def screen(engine: Engine, who: Members, x: np.ndarray, keep: int, goal: Goal) -> np.ndarray:
     """The best of points x [K, m], at least `keep`, best first, by successive halving: on few members, then on more.
 
     Some of the stressed members are there from the first: to be held is what is asked first.
     """
     for part, left in ROUNDS:
         some = who.part(part)
-        values = score(x, engine.terms(x, some), some)
+        values = goal.score(x, engine.terms(x, some), some)
         x = x[np.argsort(values, kind="stable")[: max(len(x) // left, 2 * keep)]]
     return x

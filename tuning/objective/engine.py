@@ -1,4 +1,4 @@
-"""The objective: gains to one number, through an ensemble with common random numbers.
+"""The engine: an objective and its derivatives for many gains and members at once, with common random numbers.
 
 The work is cut into lanes: one rollout of one member under one vector of gains. A fixed number of lanes
 is compiled once into one kernel and serves the screen, every iteration and the held-out ensemble alike; whatever
@@ -16,13 +16,13 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble import Spread, apply, draw, map_members
+from ambjax.ensemble import map_members
 from ambjax.extend import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.metrics import Named, standard_for
-from ambjax.simulation.rollout import rollout
 from ambjax.world.scenario import Scenario
-from tuning.objective.loss import TERMS, Loss
+from tuning.objective.loss import TERMS, Loss, weigh
+from tuning.objective.members import Members, Objective
 from tuning.space import Space
 
 # Lanes of one kernel call. Loops over half as many are unrolled into scalar code by XLA's compiler: half again as long.
@@ -30,107 +30,6 @@ LANES = 64
 # With derivatives, where the loops are longer, halves cost 14 % more each, and most iterations ask for 16 to 64 lanes:
 # they keep two cores busy, or are one call without padding.
 GRADIENT_LANES = 32
-# Members of a kind that say something about all of it.
-FEWEST = 4
-# Terms that say whether the rotor is held.
-HELD = ("clearance", "survival")
-# Terms that are a price, not an aim.
-COSTS = ("effort", "chatter")
-
-
-class Members(NamedTuple):
-    """Members of an ensemble: their numbers [n], seed, and what is spread over them by path [n].
-
-    `stressed` [n], the last ones: members of whom nothing is asked but to be held, with sensors `loud` [n] times as
-    noisy, under gains that are off by `shift` [n, m], in coordinates.
-    """
-
-    member: Any
-    seed: Any
-    values: dict[str, Any]
-    loud: Any
-    shift: Any
-    stressed: Any
-
-    @property
-    def ordinary(self) -> int:
-        """How many are not stressed."""
-        return int(np.sum(~self.stressed))
-
-    def joined(self, others: "Members") -> "Members":
-        """These and others, who are asked only to be held and come first among such."""
-        more, n = others._replace(stressed=np.ones(len(others.stressed), bool)), self.ordinary
-        return jax.tree.map(lambda a, b: np.concatenate([a[:n], b, a[n:]]), self, more)
-
-    def part(self, share: int, held: int | None = None) -> "Members":
-        """The first of either kind, FEWEST at least: ordinary ones, one in `share`, then those asked to be held.
-
-        Of these one in `held`; left out: one in `share` too.
-        """
-        kinds = (self.ordinary, share), (len(self.stressed) - self.ordinary, held or share)
-        few, some = (max(count // each, min(FEWEST, count)) for count, each in kinds)
-        index = np.concatenate([np.arange(few), np.arange(self.ordinary, self.ordinary + some)])
-        return jax.tree.map(lambda a: a[index], self)
-
-
-@dataclasses.dataclass(frozen=True)
-class Objective:
-    """What is tuned, in which world, and what counts: the part of a study that is compiled."""
-
-    space: Space
-    cascade: Cascade
-    scenario: Scenario
-    clock: Clock
-    loss: Loss
-    spread: Spread = Spread()
-
-    def members(self, seed: int, count: int) -> Members:
-        """The first `count` members of the ensemble with this seed."""
-        return self.chosen(seed, np.arange(count), count)
-
-    def training(self, seed: int, count: int, extra: int, noise: float, gains: float) -> Members:
-        """`count` members, and `extra` more, stressed: noise times `noise`, every gain off by a factor of `gains`.
-
-        The first of these has all gains above, the second all below, the others a mixture drawn from the seed.
-        """
-        who = self.members(seed, count + extra)
-        stressed = who.member >= count
-        sign = np.random.default_rng(seed).choice([-1.0, 1.0], (count + extra, len(self.space)))
-        sign[count : count + 2] = np.array([[1.0], [-1.0]])[:extra]
-        shift = np.log(gains) * np.where(stressed[:, None], sign, 0.0)
-        return who._replace(loud=np.where(stressed, noise, 1.0), shift=shift, stressed=stressed)
-
-    def chosen(self, seed: int, numbers: np.ndarray, total: int) -> Members:
-        """Members with these numbers of an ensemble of `total`."""
-        values = draw(self.spread, self.cascade, self.scenario, seed, numbers, total) if self.spread.entries else {}
-        n = len(numbers)
-        still = np.zeros((n, len(self.space)))
-        return Members(numbers, np.full(n, seed), values, np.ones(n), still, np.zeros(n, bool))
-
-    def world(self, who: Members) -> tuple[Cascade, Scenario]:
-        """The cascade (its gains to be replaced) and scenario of one member, whose fields are scalars."""
-        scenario = dataclasses.replace(self.scenario, member=who.member, seed=who.seed)
-        cascade, scenario = apply(self.cascade, scenario, who.values) if who.values else (self.cascade, scenario)
-        sensor = jax.tree.map(lambda std: std * who.loud, scenario.sensor)
-        return cascade, dataclasses.replace(scenario, sensor=sensor)
-
-    def run(self, x: Array, who: Members, fold: Any) -> Any:
-        """The fold's result for one lane."""
-        cascade, scenario = self.world(who)
-        return rollout(self.space.decode(x + who.shift, cascade), scenario, self.clock, fold=fold, every=0).measured
-
-
-def weigh(weights: Any, terms: dict[str, Any], stressed: Any) -> Any:
-    """The loss: errors and losses weighed and added, times 1 + weighed costs; of a stressed member, HELD alone.
-
-    Costs count relative to the error, since its size is not known before: with a weight of 0.1, voltage at
-    its limit throughout is worth a tenth of the error.
-    """
-    ordinary = 1.0 - 1.0 * stressed
-    each = dict(zip(TERMS, (weights[k] * terms[name] for k, name in enumerate(TERMS)), strict=True))
-    costs = sum(each.pop(name) for name in COSTS)
-    held = sum(each.pop(name) for name in HELD)
-    return held + ordinary * sum(each.values()) * (1 + costs)
 
 
 class Lane(NamedTuple):

@@ -1,0 +1,138 @@
+"""What gains are worth: an ensemble that judges them, and accurate steps against the search's own."""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from ambjax.ensemble import wilson
+from tuning.config import seeds
+from tuning.objective.members import Members
+from tuning.problem import REFERENCE_MEMBERS, Problem
+
+# Members simulated at a time when an ensemble is judged.
+AT_ONCE = 1024
+# Beyond this relative error of the settled rms error the steps are refined and the search goes on.
+RESOLVED = 0.1
+# unless the two differ by less than this share of the gap: as much as the reference itself is worth.
+NEGLIGIBLE = 1e-6
+
+
+def judge(problem: Problem, x: np.ndarray, seed: int, count: int) -> dict[str, np.ndarray]:
+    """Every metric [count] of the members of an ensemble under the gains at x [m], and the loss's terms."""
+    parts = []
+    for first in range(0, count, AT_ONCE):
+        who = problem.objective.chosen(seed, np.arange(first, min(first + AT_ONCE, count)), count)
+        metrics = problem.judging.metrics(x[None], who)
+        parts.append({**metrics["metrics"], **{f"loss.{name}": v for name, v in metrics["loss"].items()}})
+    return {name: np.concatenate([part[name][0] for part in parts]) for name in parts[0]}
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square over an ensemble."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+class StepError(NamedTuple):
+    """The search's own step against adaptive RODAS3 on a few members: settled rms error of both, m.
+
+    Of those `members` whom both hold; `relative` is NaN if there is none. `lost`, `stalled`: how many of the `tried`
+    the search's step holds, but the accurate one loses, or cannot decide; `who` they are.
+    """
+
+    search_m: float
+    reference_m: float
+    relative: float
+    members: int
+    tried: int
+    lost: int
+    stalled: int
+    who: Members
+    negligible_m: float
+    """a difference that is none"""
+
+    @property
+    def unseen(self) -> int:
+        """Members that accurate steps do not hold, though the search's own do."""
+        return self.lost + self.stalled
+
+    @property
+    def resolved(self) -> bool:
+        """Whether the search's steps tell the truth of the error there."""
+        return abs(self.relative) <= RESOLVED or abs(self.search_m - self.reference_m) <= self.negligible_m
+
+    @property
+    def refuted(self) -> str:
+        """Why accurate steps do not confirm that the rotor is held there, and how well; '' where they do."""
+        if self.lost:
+            return f"accurate steps lose {self.lost} of {self.tried} members tried, which the search's own hold"
+        if self.stalled:
+            return f"accurate steps cannot decide {self.stalled} of {self.tried} members tried (they stall)"
+        if not self.members:
+            return "no member compared is held by both"
+        return "" if self.resolved else f"its own steps give a settled rms error off by {100 * self.relative:.2g} %"
+
+    def facts(self) -> dict[str, Any]:
+        """All of it as plain data."""
+        summary = {name: getattr(self, name) for name in self._fields if name not in ("who", "negligible_m")}
+        return summary | {"resolved": self.resolved, "refuted": self.refuted, "told": words(self)}
+
+
+def words(error: StepError) -> str:
+    """What accurate steps say, in words."""
+    compared = f"settled rms error off by {100 * error.relative:.2g} % on {error.members} members"
+    return compared if error.members and not error.unseen else error.refuted
+
+
+def compared(problem: Problem) -> Members:
+    """The members on whom steps are compared first: of the training ensemble."""
+    count = problem.tune.budget.members
+    return problem.objective.chosen(seeds(problem.tune.budget)[0], np.arange(min(REFERENCE_MEMBERS, count)), count)
+
+
+def worst_of(values: np.ndarray) -> np.ndarray:
+    """Numbers of the members with the largest values [n], REFERENCE_MEMBERS of them, worst first."""
+    return np.argsort(-values, kind="stable")[:REFERENCE_MEMBERS]
+
+
+def step_error(problem: Problem, x: np.ndarray, who: Members | None = None) -> StepError:
+    """What the search's own steps are worth at x [m], on these members; left out: on the first that it is tuned on."""
+    who = compared(problem) if who is None else who
+    ours, theirs = (e.metrics(x[None], who)["metrics"] for e in (problem.engine, problem.reference))
+    ended = [np.isfinite(metrics["lost_at_s"])[0] for metrics in (ours, theirs)]
+    held, unseen = ~(ended[0] | ended[1]), ended[1] & ~ended[0]
+    stalled = unseen & theirs["stalled"][0]
+    search_m, reference_m = (
+        rms(metrics["settled_rms_error_m"][0][held]) if held.any() else math.nan for metrics in (ours, theirs)
+    )
+    relative = search_m / reference_m - 1 if reference_m > 0 else math.nan
+    those: Members = jax.tree.map(lambda a: a[unseen], who)
+    negligible = NEGLIGIBLE * float(np.asarray(problem.objective.loss.s_0))
+    both, lost = int(held.sum()), int((unseen & ~stalled).sum())
+    return StepError(search_m, reference_m, relative, both, len(held), lost, int(stalled.sum()), those, negligible)
+
+
+def summarise(metrics: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Numbers of an ensemble [N] for the report: pooled rms and largest error, survival, mean and largest metrics."""
+    lost, errors = np.isfinite(metrics["lost_at_s"]), metrics["settled_rms_error_m"]
+    n = len(lost)
+    survival = wilson(n - int(lost.sum()), n)
+    summary: dict[str, Any] = {
+        "members": n,
+        "lost": int(lost.sum()),
+        "survival": float(survival.value),
+        "survival_low": float(survival.low),
+        "survival_high": float(survival.high),
+        "settled_rms_error_m": rms(errors),
+        "settled_rms_error_worst_member_m": float(errors.max()),
+        "settled_max_abs_error_m": float(metrics["settled_max_abs_error_m"].max()),
+    }
+    for name, values in metrics.items():
+        if values.dtype == bool:
+            continue
+        finite = values[np.isfinite(values)]
+        if finite.size:
+            summary[f"{name}.mean"] = float(finite.mean())
+            summary[f"{name}.largest"] = float(finite.max())
+    return summary
