@@ -242,14 +242,18 @@ SECTIONS = {
 }
 
 
-def main() -> None:
+def page() -> str:
     """Every section whose JSON is there."""
     lines = [HEAD]
     for name, section in SECTIONS.items():
         if (_measure.RESULTS / f"{name}.json").exists():
             lines += section()
-    page = "\n".join(lines).rstrip() + "\n"
-    (pathlib.Path(__file__).parent / "README.md").write_text(page)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def main() -> None:
+    """Write the page."""
+    (pathlib.Path(__file__).parent / "README.md").write_text(page())
 
 
 if __name__ == "__main__":

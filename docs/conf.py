@@ -1,0 +1,43 @@
+"""How the site is built: `sphinx-build -W docs docs/_build/html`. No network, neither to build nor to read it."""
+
+import os
+import pathlib
+import sys
+
+HERE = pathlib.Path(__file__).parent
+sys.path[:0] = [str(HERE), str(HERE / "_ext"), str(HERE.parent)]
+# The cells find the commands of the environment that builds.
+os.environ["PATH"] = os.pathsep.join([str(pathlib.Path(sys.executable).parent), os.environ["PATH"]])
+
+from ambjax import __version__  # noqa: E402
+
+project = "ambjax"
+author = copyright = "The ambjax maintainers"
+release = version = __version__
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "mathml", "docstrings", "cells", "pages"]
+exclude_patterns = ["_build", "_ext", "reference"]
+
+html_theme = "furo"
+html_title = f"ambjax {release}"
+html_static_path = ["_static"]
+html_css_files = ["ambjax.css"]
+html_copy_source = False
+html_math_renderer = "mathml"
+math_eqref_format = "Eq. ({number})"
+
+myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
+myst_update_mathjax = False
+myst_heading_anchors = 3
+nb_execution_mode = "force"
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
+nb_merge_streams = True
+
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_default_options = {"members": True}
+# A link to something of ours that is gone stops the build; types of other packages have no page here.
+nitpicky = True
+nitpick_ignore_regex = [(r"py:.*", r"(?!ambjax\.|tuning\.).*")]

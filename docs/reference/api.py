@@ -1,0 +1,78 @@
+"""The Python API: the public names, and every module floor by floor."""
+
+import inspect
+
+import ambjax
+from ambjax import ensemble, extend, paper
+
+from reference.floors import ROOT, floors
+from reference.markdown import code, escaped, first_paragraph, table
+
+PUBLIC = {
+    "ambjax": (ambjax, "Simulate: `from ambjax import ...`."),
+    "ambjax.ensemble": (ensemble, "Ensembles."),
+    "ambjax.paper": (paper, "The paper's study."),
+    "ambjax.extend": (extend, "What an extension needs."),
+}
+
+
+def pages() -> dict[str, str]:
+    """The page of public names, and one for each floor."""
+    rooms = {f"{package}.{room}": modules(package, room) for package, order in floors().items() for room in order.split()}
+    made = {f"api-{room}.rst": _floor(room, found) for room, found in rooms.items() if found}
+    return {"api.md": _public(sorted(made))} | made
+
+
+def modules(package: str, room: str) -> list[str]:
+    """Dotted names of the modules of a floor, itself first; none for a package's own files."""
+    path = ROOT / package / room
+    if room.startswith("_"):
+        return []
+    if not path.is_dir():
+        return [f"{package}.{room}"]
+    inner = sorted(file.stem for file in path.glob("*.py") if file.stem != "__init__")
+    return [f"{package}.{room}", *(f"{package}.{room}.{name}" for name in inner)]
+
+
+def _public(floor_pages: list[str]) -> str:
+    lines = [
+        "# Python API",
+        "",
+        "Shapes are those of one member: `vmap` and `ambjax.ensemble.run_ensemble` add the axis of members. "
+        "Units are SI and stand with each name.",
+        "",
+    ]
+    for name, (module, words) in PUBLIC.items():
+        rows = [
+            (_link(getattr(module, one), one), escaped(_says(getattr(module, one))))
+            for one in module.__all__
+            if not one.startswith("_")
+        ]
+        lines += [f"## `{name}`", "", words, "", *table(("name", "what it is"), rows, "keys")]
+    lines += ["## Floor by floor", "", "```{toctree}", ":maxdepth: 1", ""]
+    return "\n".join([*lines, *(page.removesuffix(".rst") for page in floor_pages), "```", ""])
+
+
+def _link(thing: object, name: str) -> str:
+    """A link to where a public name is described; plain code for what is no class, function or module."""
+    if inspect.ismodule(thing):
+        return f"{{py:mod}}`{name} <{thing.__name__}>`"
+    if getattr(thing, "__module__", "").startswith("ambjax") and hasattr(thing, "__qualname__"):
+        role = "class" if inspect.isclass(thing) else "func"
+        return f"{{py:{role}}}`{name} <{thing.__module__}.{thing.__qualname__}>`"
+    return code(name)
+
+
+def _says(thing: object) -> str:
+    """The first paragraph about a name; of a number, its value."""
+    if isinstance(thing, (int, float)):
+        return f"{thing:g}"
+    return "" if type(thing).__module__ in ("builtins", "typing") and not callable(thing) else first_paragraph(thing)
+
+
+def _floor(room: str, found: list[str]) -> str:
+    lines = [room, "=" * len(room), ""]
+    for module in found:
+        head = [] if module == room else [module, "-" * len(module), ""]
+        lines += [*head, f".. automodule:: {module}", ""]
+    return "\n".join(lines)

@@ -1,0 +1,197 @@
+"""The case file: every table and key with unit, default, range and meaning; laws, signals and spreads by kind."""
+
+import dataclasses
+import re
+import tomllib
+from typing import Any
+
+from ambjax.cases.reader import DURATION, FIELDS, KINDS, OTHERS, SETTLE, SIGNALS, TABLES, case_from
+from ambjax.cases.spread import KINDS as SPREADS
+from ambjax.cases.table import Table
+from ambjax.cases.template import template
+from ambjax.ensemble.paths import places
+from ambjax.world.plant import Plant
+from ambjax.world.scenario import Initial
+from ambjax.world.sensor import Sensor
+
+from reference.fields import Facts, facts
+from reference.markdown import code, escaped, first_paragraph, paragraphs, table
+from reference.parser import keys, remarks, rule
+
+TITLES = ("key", "unit", "default", "allowed", "meaning")
+RECORDS: dict[str, type] = {"plant": Plant, "initial": Initial, "sensor": Sensor}
+SETTINGS: dict[str, dataclasses.Field] = {
+    "actuator.u_max": FIELDS["u_max"],
+    "clock.duration": DURATION,
+    "clock.sample_period": FIELDS["sample_period"],
+    "run.clearance": FIELDS["clearance"],
+    "run.settle": SETTLE,
+}
+# What a table is for, and what stands if it is left out.
+WORDS = {
+    "plant": "The true plant. Left out, or a key of it: Table 1 of the paper.",
+    "controller": "The cascade: a nominal plant and one law per stage. See [laws](laws.md) for the kinds and their gains.",
+    "controller.model": "What the controller believes of the plant, where it differs from the truth: any key of `[plant]`.",
+    "reference": "What z is to follow, in m. Left out: 0. See [signals](signals.md).",
+    "disturbance": "What disturbs the loop: a signal each, with its unit. Left out: nothing. See [signals](signals.md).",
+    "sensor": "Errors of what is measured, drawn once per sample period and held. Left out: none.",
+    "actuator": "The supply. Left out: no limit.",
+    "initial": "The plant's state at t = 0. Left out: at rest, in the middle.",
+    "clock": "Time: how long, how often a row is recorded and noise drawn, and how it is integrated between.",
+    "run": "What belongs to a run and to no part of it.",
+    "spread": "What varies from member to member of an ensemble. See [spreads](spread.md).",
+    "tune": "What `ambjax-tune` is to do; the other commands pass it by.",
+    "tune.weights": "What counts, as weights of dimensionless terms.",
+}
+LEFT_OUT = re.compile(r"[(;]? ?left out: (?P<default>[^;)]*)\)?")
+CHOICE = re.compile(r"one of '(?P<default>[^']*)'")
+UNIT = re.compile(r"(?P<unit>1|m|s|A|V|kg|[\w^./]+/[\w^./]+)(; (?P<rest>.*))?")
+
+
+def pages() -> dict[str, str]:
+    """The pages, by file name."""
+    return {"case-file.md": _case_file(), "laws.md": _laws(), "signals.md": _signals(), "spread.md": _spread()}
+
+
+def rows_of(path: str, record: type | None = None, beside: dict[str, Any] | None = None) -> list[Facts]:
+    """What is known of each key of a table; `record` declares them, or the template says what they mean."""
+    known = {field.name: field for field in dataclasses.fields(record)} if record else {}
+    order = list(remarks())
+    paths = [f"{path}.{key}" for key in keys(path, beside)]
+    # in the order of the template, for some meanings build on others
+    paths.sort(key=lambda one: next((n for n, known in enumerate(order) if f"{known}.".startswith(f"{one}.")), -1))
+    return [_row(one, known.get(one.rpartition(".")[2]), beside) for one in paths]
+
+
+def _row(path: str, field: dataclasses.Field | None, beside: dict[str, Any] | None) -> Facts:
+    key, told = path.rpartition(".")[2], _told(path)
+    field = field or SETTINGS.get(path)
+    allowed = _allowed(path, beside)
+    if field is not None and field.metadata.get("leaf"):
+        row = facts(field)._replace(name=key)
+        if row.default == "" and told.default == "" or field.default is dataclasses.MISSING:
+            return row._replace(default="none" if field.metadata["optional"] else "required")
+        own = told.default if path in SETTINGS and told.default else row.default
+        return row._replace(default=own)
+    first = CHOICE.search(allowed)
+    return told._replace(name=key, allowed=allowed, default=first["default"] if first else told.default)
+
+
+def _allowed(path: str, beside: dict[str, Any] | None) -> str:
+    """What the reader allows; of two keys that depends on another."""
+    if path == "tune.alpha":
+        return rule(path, {"risk": "cvar"})
+    if path == "clock.method":
+        return f'with dt = "auto" {rule(path)}; with a number {rule(path, {"dt": 1e-4})}'
+    return rule(path, beside)
+
+
+def _told(path: str) -> Facts:
+    """What the template says of a key: unit, default and meaning."""
+    known = remarks()
+    below = next((one for one in known if one.startswith(f"{path}.")), path)
+    shown, meaning = ("", WORDS[path]) if path in WORDS else known.get(path, known.get(below, ("", "")))
+    unit = ""
+    if (begun := UNIT.fullmatch(meaning)) is not None:
+        unit, meaning = begun["unit"], begun["rest"] or ""
+    default = shown.strip('"')
+    if (other := LEFT_OUT.search(meaning)) is not None:
+        default = other["default"].strip('"')
+        meaning = LEFT_OUT.sub("", meaning).strip()
+    return Facts(path.rpartition(".")[2], "" if unit == "1" else unit, default, "", meaning)
+
+
+def keys_table(rows: list[Facts]) -> list[str]:
+    """Rows as a Markdown table."""
+    cells = [
+        (code(row.name), escaped(row.unit), escaped(row.default), escaped(row.allowed), escaped(row.doc)) for row in rows
+    ]
+    return table(TITLES, cells, "keys")
+
+
+def _case_file() -> str:
+    lines = [
+        "# The case file",
+        "",
+        "TOML, in SI units. An unknown key, a wrong type or a number out of range is refused in one line. "
+        "`ambjax template` prints a file with all of it. Of words, the first is the default.",
+        "",
+    ]
+    for name in [*TABLES, *OTHERS]:
+        lines += _section(name)
+        if name == "controller":
+            lines += _section("controller.model")
+        if name == "disturbance":
+            lines += _units()
+    return "\n".join([*lines, *_section("tune.weights")])
+
+
+def _section(path: str) -> list[str]:
+    lines = [f"## `[{path}]`", "", WORDS[path], ""]
+    if path in ("controller", "controller.model", "reference", "disturbance", "spread"):
+        return lines
+    return lines + keys_table(rows_of(path, RECORDS.get(path)))
+
+
+def _units() -> list[str]:
+    rows = [
+        (code(f"disturbance.{name}"), escaped(rule(f"disturbance.{name}.unit", {"kind": "constant"})))
+        for name in keys("disturbance")
+    ]
+    return table(("table", "its key `unit`; the first is the default"), rows, "keys")
+
+
+def _laws() -> str:
+    lines = ["# Laws", "", "One law per stage, chosen by `kind`; the first of each stage is the default.", ""]
+    for stage, kinds in KINDS.items():
+        lines += [f"## `[controller.{stage}]`", ""]
+        for kind, law in kinds.items():
+            lines += [f'### `kind = "{kind}"`', "", f"{{py:class}}`{law.__module__}.{law.__qualname__}`", ""]
+            lines += paragraphs(law)
+            rows = [row for row in rows_of(f"controller.{stage}", law, {"kind": kind}) if row.name != "kind"]
+            lines += keys_table(rows) if rows else ["No gains.", ""]
+    return "\n".join(lines)
+
+
+def _signals() -> str:
+    lines = [
+        "# Signals",
+        "",
+        "Functions of time: for `[reference]` (m), `[disturbance.q_z]` and `[disturbance.q_i]`. An amplitude, a value "
+        "or a standard deviation is in the unit of what the signal is for.",
+        "",
+    ]
+    for kind, signal in SIGNALS.items():
+        lines += [f'## `kind = "{kind}"`', "", f"{{py:class}}`{signal.__module__}.{signal.__qualname__}`", ""]
+        lines += paragraphs(signal)
+        lines += keys_table([r for r in rows_of("reference", signal, {"kind": kind}) if r.name != "kind"])
+    return "\n".join(lines)
+
+
+def _spread() -> str:
+    lines = [
+        "# Spreads",
+        "",
+        "`[spread]` says what varies from member to member: `path = { how }`. Where members stand is the `design`: "
+        + escaped(rule("spread.design")) + ".",
+        "",
+        "## How a number varies",
+        "",
+    ]
+    rows = []
+    for kind, make in SPREADS.items():
+        made = _example(kind, make)
+        rows.append((code(str(made)), escaped(first_paragraph(type(made)))))
+    lines += table(("form", "meaning"), rows, "keys")
+    case = case_from(tomllib.loads(template("tracking")))
+    lines += ["## What may vary", "", "In the case that `ambjax template` prints, and likewise in any other:", ""]
+    lines += [f"- {code(path)}" for path in places(case.cascade, case.scenario)]
+    return "\n".join([*lines, ""])
+
+
+def _example(kind: str, make: Any) -> Any:
+    """A distribution of this kind: of one number, or of several."""
+    try:
+        return make(Table({kind: 10.0}))
+    except ValueError:
+        return make(Table({kind: [1.0, 2.0]}))

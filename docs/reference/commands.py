@@ -1,0 +1,56 @@
+"""Every command and flag, from the parsers themselves."""
+
+import argparse
+
+from ambjax.__main__ import parser
+from tuning.__main__ import parser as tuner
+
+from reference.markdown import code, escaped, table
+
+HELP = (argparse._HelpAction, argparse._VersionAction)
+
+
+def pages() -> dict[str, str]:
+    """The page."""
+    lines = [
+        "# Commands",
+        "",
+        "Exit codes: 0 done; 1 done, and the answer is no (a rotor is lost, a condition fails); 2 the input is wrong, "
+        "and one line on stderr says how; 130 interrupted.",
+        "",
+    ]
+    for command in commands().values():
+        lines += _section(command)
+    return {"commands.md": "\n".join(lines)}
+
+
+def commands() -> dict[str, argparse.ArgumentParser]:
+    """The parsers of all commands, by what is typed."""
+    top = parser()
+    found = [choice for action in top._actions if isinstance(action, argparse._SubParsersAction) for choice in action.choices.values()]
+    return {command.prog: command for command in [*found, tuner()]}
+
+
+def _section(command: argparse.ArgumentParser) -> list[str]:
+    usage = " ".join(command.format_usage().removeprefix("usage: ").replace("[-h] ", "").split())
+    lines = [f"## `{command.prog}`", "", escaped(sentence(command.description or "")), "", "```text", usage, "```", ""]
+    rows = [(code(_written(action)), escaped(_meaning(action))) for action in command._actions if not isinstance(action, HELP)]
+    return lines + table(("argument", "meaning"), rows, "keys")
+
+
+def sentence(text: str) -> str:
+    """The text as a sentence."""
+    return text[:1].upper() + text[1:] + "." * (not text.endswith("."))
+
+
+def _written(action: argparse.Action) -> str:
+    """An argument as it is typed."""
+    named = ", ".join(action.option_strings)
+    taken = action.metavar or (action.dest if not named else "")
+    return f"{named} {taken}".strip() if action.nargs != 0 else named
+
+
+def _meaning(action: argparse.Action) -> str:
+    choices = f"one of {', '.join(map(str, action.choices))} (default: {action.default})" if action.choices else ""
+    needed = "required" if action.option_strings and action.required else ""
+    return "; ".join(filter(None, (action.help, choices, needed)))

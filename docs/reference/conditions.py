@@ -1,0 +1,29 @@
+"""What `ambjax check` prints: the conditions of Theorem 1 and the steps of its proof, from a check of the default loop."""
+
+import functools
+
+from ambjax import Cascade, Clock, Scenario
+from ambjax.theorem import conditions
+
+from reference.markdown import code, escaped, paragraphs, table
+
+
+def pages() -> dict[str, str]:
+    """The page."""
+    found = report()
+    lines = ["# Conditions of `ambjax check`", ""]
+    lines += paragraphs(conditions)
+    lines += ["## The conditions", "", "Margin: left side minus right side, in this unit, at its worst time.", ""]
+    rows = [
+        (escaped(c.name), escaped(c.requires), escaped(c.unit), code(c.path), escaped(c.note)) for c in found.conditions
+    ]
+    lines += table(("condition", "must hold", "unit", "gain", "note"), rows, "keys")
+    lines += ["## The steps of the proof", "", "Residuals: they inform, and decide nothing.", ""]
+    steps = [(escaped(c.name), escaped(c.requires), escaped(c.unit), escaped(c.note)) for c in found.proof]
+    return {"conditions.md": "\n".join(lines + table(("step", "statement", "unit", "what is shown"), steps, "keys"))}
+
+
+@functools.cache
+def report() -> conditions.Report:
+    """A check of a few samples: its lines are those of any."""
+    return conditions.check(Cascade(), Scenario(), Clock(samples=2))

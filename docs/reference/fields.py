@@ -1,0 +1,53 @@
+"""What the fields of a record declare: unit, default, bounds and meaning."""
+
+import ast
+import dataclasses
+import inspect
+import math
+import textwrap
+from typing import Any, NamedTuple
+
+from ambjax.numerics.records import numbers
+
+
+class Facts(NamedTuple):
+    """One key: each in words, '' where there is nothing to say."""
+
+    name: str
+    unit: str
+    default: str
+    allowed: str
+    doc: str
+
+
+def facts(field: dataclasses.Field, default: Any = None) -> Facts:
+    """What a numeric field says of itself; `default` where the case file's is another."""
+    meta = field.metadata
+    bounded = meta.get("leaf", False)
+    unit = meta["unit"] if bounded else ""
+    allowed = numbers(field).replace(f" ({unit})", "").removeprefix("a finite number ").removeprefix("a number ") if bounded else ""
+    shown = field.default if default is None else default
+    return Facts(field.name, "" if unit == "1" else unit, value(shown), allowed, meta["doc"])
+
+
+def value(default: Any) -> str:
+    """A default in words; '' for none."""
+    if default is dataclasses.MISSING or default is None:
+        return ""
+    number = isinstance(default, (int, float)) and not isinstance(default, bool)
+    if not number and not isinstance(default, str):
+        default = float(default)
+        number = True
+    return (f"{default:g}" if math.isfinite(default) else "inf") if number else str(default)
+
+
+def attribute_docs(kind: type) -> dict[str, str]:
+    """The docstrings that stand below the fields of a class."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
+    assert isinstance(tree, ast.ClassDef)
+    found = {}
+    for before, after in zip(tree.body, tree.body[1:], strict=False):
+        told = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+        if isinstance(before, ast.AnnAssign) and isinstance(before.target, ast.Name) and told:
+            found[before.target.id] = " ".join(str(after.value.value).split())  # pyright: ignore[reportAttributeAccessIssue]
+    return found

@@ -1,0 +1,47 @@
+"""Folders and modules with the first line of each, floor by floor: what the architecture page shows."""
+
+import ast
+import pathlib
+
+from reference.markdown import code, escaped
+
+ROOT = pathlib.Path(__file__).parents[2]
+
+
+def pages() -> dict[str, str]:
+    """The list that the architecture page takes in."""
+    lines: list[str] = []
+    for package, order in floors().items():
+        for room in reversed(order.split()):
+            if room.startswith("__"):
+                continue
+            lines += _room(ROOT / package / room)
+    return {"floors.txt": "\n".join(lines)}
+
+
+def floors() -> dict[str, str]:
+    """The table of tests/test_layers.py, from the ground up; the tuner, which stands on ambjax, first here."""
+    tree = ast.parse((ROOT / "tests" / "test_layers.py").read_text())
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "FLOORS":
+            table = ast.literal_eval(node.value)
+            return {name: table[name] for name in reversed(table)}
+    raise LookupError("tests/test_layers.py has no table FLOORS")
+
+
+def _room(path: pathlib.Path) -> list[str]:
+    if not path.is_dir():
+        return [f"**{code(_shown(path.with_suffix('.py')))}**", f": {_says(path.with_suffix('.py'))}", ""]
+    files = [file for file in sorted(path.glob("*.py")) if file.name != "__init__.py"]
+    lines = [f"**{code(_shown(path) + '/')}**", f": {_says(path / '__init__.py')}", ""]
+    return [*lines, *(f"  - {code(file.name)}: {_says(file)}" for file in files), ""]
+
+
+def _shown(path: pathlib.Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def _says(path: pathlib.Path) -> str:
+    """The first paragraph of a file's docstring."""
+    said = ast.get_docstring(ast.parse(path.read_text())) or ""
+    return escaped(" ".join(said.split("\n\n")[0].split()))
