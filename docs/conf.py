@@ -6,8 +6,9 @@ import sys
 
 HERE = pathlib.Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE / "_ext"), str(HERE.parent)]
-# The cells find the commands of the environment that builds.
-os.environ["PATH"] = os.pathsep.join([str(pathlib.Path(sys.executable).parent), os.environ["PATH"]])
+# The cells find the commands of the environment that builds, and the magic word that runs them.
+for name, folder in (("PATH", pathlib.Path(sys.executable).parent), ("PYTHONPATH", HERE / "_ext")):
+    os.environ[name] = os.pathsep.join(filter(None, [str(folder), os.environ.get(name)]))
 
 from ambjax import __version__  # noqa: E402
 
@@ -17,6 +18,8 @@ release = version = __version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "mathml", "docstrings", "cells", "pages"]
 exclude_patterns = ["_build", "_ext", "reference"]
+
+smartquotes = False
 
 html_theme = "furo"
 html_title = f"ambjax {release}"

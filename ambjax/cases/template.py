@@ -51,7 +51,7 @@ settle = 0.5                  # s; from when "settled" metrics count (left out: 
 # actuator.u_max = {{ choices = [200, 500, 1000] }}        # V; equally likely
 
 # [tune]                      # for 'ambjax-tune': from the gains above to better ones. Each key with its default
-# gains = ["controller.position.c", "controller.position.k"]  # what moves; left out: the gains of the case's laws, but p
+# gains = ["controller.position.c", "controller.position.k"]  # what moves; left out: the gains of the laws, but p
 # bounds.controller.position.c = [1.0, 500.0]  # of one; left out: what plant and theory suggest, see the report
 # weights.tracking = 1.0      # weight of a dimensionless term, as all of these: mean square error after run.settle
 # weights.peak = 0.0          # largest error after run.settle

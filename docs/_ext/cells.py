@@ -1,16 +1,33 @@
-"""Cells of shell commands shown as what a reader types: without the magic word that has them run."""
+"""Cells of shell commands: `%%shell` runs them, and the page shows what a reader types."""
+
+import subprocess
+from typing import Any
 
 from docutils import nodes
 from sphinx.application import Sphinx
 
-MAGIC = "%%bash\n"
+MAGIC = "%%shell"
+
+
+def shell(line: str, cell: str) -> None:
+    """Run a cell and print what it says. Raises RuntimeError unless it ends with the exit code in `line`, or 0."""
+    done = subprocess.run(["bash", "-c", cell], capture_output=True, text=True, check=False)
+    print(done.stdout + done.stderr, end="")
+    if done.returncode != int(line or 0):
+        raise RuntimeError(f"exit code {done.returncode}, not {line or 0}: {cell}")
+
+
+def load_ipython_extension(ipython: Any) -> None:
+    """What `%load_ext cells` on a page does."""
+    ipython.register_magic_function(shell, "cell", "shell")
 
 
 def shown(app: Sphinx, tree: nodes.document) -> None:
-    """Take the magic word off every cell that begins with it."""
-    for block in tree.findall(nodes.literal_block):
+    """Take the line of the magic word off every cell that begins with it."""
+    for block in list(tree.findall(nodes.literal_block)):
         if (text := block.astext()).startswith(MAGIC):
-            block.replace_self(nodes.literal_block(text, text.removeprefix(MAGIC), language="bash"))
+            text = text.partition("\n")[2]
+            block.replace_self(nodes.literal_block(text, text, language="bash"))
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

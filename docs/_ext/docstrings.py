@@ -2,9 +2,10 @@
 
 import dataclasses
 import re
+import sys
 from typing import Any
 
-from reference.fields import facts
+from reference.fields import Facts, facts
 from sphinx.application import Sphinx
 
 # Characters that mean something in reStructuredText but nothing in a docstring.
@@ -26,12 +27,25 @@ def process(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: li
     lines[:] = [plain(line) for line in lines]
     if what == "class" and dataclasses.is_dataclass(obj):
         rows = [facts(field) for field in dataclasses.fields(obj) if field.metadata.get("doc")]
-        told = [[row.default and f"default {row.default}", row.unit, row.allowed] for row in rows]
-        lines += ["", *(f"- ``{r.name}``: {plain(r.doc)} ({'; '.join(filter(None, t))})" for r, t in zip(rows, told, strict=True))]
+        lines += ["", *map(_item, rows)]
         lines.append("")
+
+
+def _item(row: Facts) -> str:
+    """A field as an item of a list."""
+    told = [row.default and f"default {row.default}", row.unit, row.allowed]
+    return f"- ``{row.name}``: {plain(row.doc)} ({'; '.join(filter(None, told))})"
+
+
+def unlinked(app: Sphinx, env: Any, node: Any, text: Any) -> Any:
+    """The mere text for a name of ours in a signature that exists but has no page: a type variable, an alias."""
+    module, _, name = node.get("reftarget", "").rpartition(".")
+    known = getattr(sys.modules.get(module), name, None)
+    return None if known is None or hasattr(known, "__qualname__") else text
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register it."""
     app.connect("autodoc-process-docstring", process)
+    app.connect("missing-reference", unlinked)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

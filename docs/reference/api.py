@@ -1,10 +1,10 @@
 """The Python API: the public names, and every module floor by floor."""
 
 import inspect
+from typing import Any
 
 import ambjax
 from ambjax import ensemble, extend, paper
-
 from reference.floors import ROOT, floors
 from reference.markdown import code, escaped, first_paragraph, table
 
@@ -18,7 +18,8 @@ PUBLIC = {
 
 def pages() -> dict[str, str]:
     """The page of public names, and one for each floor."""
-    rooms = {f"{package}.{room}": modules(package, room) for package, order in floors().items() for room in order.split()}
+    floor = [(package, room) for package, order in floors().items() for room in order.split()]
+    rooms = {f"{package}.{room}": modules(package, room) for package, room in floor}
     made = {f"api-{room}.rst": _floor(room, found) for room, found in rooms.items() if found}
     return {"api.md": _public(sorted(made))} | made
 
@@ -53,7 +54,7 @@ def _public(floor_pages: list[str]) -> str:
     return "\n".join([*lines, *(page.removesuffix(".rst") for page in floor_pages), "```", ""])
 
 
-def _link(thing: object, name: str) -> str:
+def _link(thing: Any, name: str) -> str:
     """A link to where a public name is described; plain code for what is no class, function or module."""
     if inspect.ismodule(thing):
         return f"{{py:mod}}`{name} <{thing.__name__}>`"
@@ -63,7 +64,7 @@ def _link(thing: object, name: str) -> str:
     return code(name)
 
 
-def _says(thing: object) -> str:
+def _says(thing: Any) -> str:
     """The first paragraph about a name; of a number, its value."""
     if isinstance(thing, (int, float)):
         return f"{thing:g}"

@@ -13,7 +13,6 @@ from ambjax.ensemble.paths import places
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial
 from ambjax.world.sensor import Sensor
-
 from reference.fields import Facts, facts
 from reference.markdown import code, escaped, first_paragraph, paragraphs, table
 from reference.parser import keys, remarks, rule
@@ -30,10 +29,10 @@ SETTINGS: dict[str, dataclasses.Field] = {
 # What a table is for, and what stands if it is left out.
 WORDS = {
     "plant": "The true plant. Left out, or a key of it: Table 1 of the paper.",
-    "controller": "The cascade: a nominal plant and one law per stage. See [laws](laws.md) for the kinds and their gains.",
-    "controller.model": "What the controller believes of the plant, where it differs from the truth: any key of `[plant]`.",
+    "controller": "The cascade: a nominal plant and one law per stage. Kinds and gains: [laws](laws.md).",
+    "controller.model": "What the controller believes of the plant, where that differs: any key of `[plant]`.",
     "reference": "What z is to follow, in m. Left out: 0. See [signals](signals.md).",
-    "disturbance": "What disturbs the loop: a signal each, with its unit. Left out: nothing. See [signals](signals.md).",
+    "disturbance": "What disturbs the loop: a signal each, and its unit. Left out: none. See [signals](signals.md).",
     "sensor": "Errors of what is measured, drawn once per sample period and held. Left out: none.",
     "actuator": "The supply. Left out: no limit.",
     "initial": "The plant's state at t = 0. Left out: at rest, in the middle.",
@@ -58,8 +57,8 @@ def rows_of(path: str, record: type | None = None, beside: dict[str, Any] | None
     known = {field.name: field for field in dataclasses.fields(record)} if record else {}
     order = list(remarks())
     paths = [f"{path}.{key}" for key in keys(path, beside)]
-    # in the order of the template, for some meanings build on others
-    paths.sort(key=lambda one: next((n for n, known in enumerate(order) if f"{known}.".startswith(f"{one}.")), -1))
+    if not record:  # in the order of the template, for some meanings build on others
+        paths.sort(key=lambda one: next((n for n, known in enumerate(order) if f"{known}.".startswith(f"{one}.")), -1))
     return [_row(one, known.get(one.rpartition(".")[2]), beside) for one in paths]
 
 
@@ -69,7 +68,7 @@ def _row(path: str, field: dataclasses.Field | None, beside: dict[str, Any] | No
     allowed = _allowed(path, beside)
     if field is not None and field.metadata.get("leaf"):
         row = facts(field)._replace(name=key)
-        if row.default == "" and told.default == "" or field.default is dataclasses.MISSING:
+        if (row.default == "" and told.default == "") or field.default is dataclasses.MISSING:
             return row._replace(default="none" if field.metadata["optional"] else "required")
         own = told.default if path in SETTINGS and told.default else row.default
         return row._replace(default=own)
@@ -103,9 +102,7 @@ def _told(path: str) -> Facts:
 
 def keys_table(rows: list[Facts]) -> list[str]:
     """Rows as a Markdown table."""
-    cells = [
-        (code(row.name), escaped(row.unit), escaped(row.default), escaped(row.allowed), escaped(row.doc)) for row in rows
-    ]
+    cells = [(code(row.name), *map(escaped, row[1:])) for row in rows]
     return table(TITLES, cells, "keys")
 
 
@@ -173,7 +170,8 @@ def _spread() -> str:
         "# Spreads",
         "",
         "`[spread]` says what varies from member to member: `path = { how }`. Where members stand is the `design`: "
-        + escaped(rule("spread.design")) + ".",
+        + escaped(rule("spread.design"))
+        + ".",
         "",
         "## How a number varies",
         "",

@@ -3,9 +3,8 @@
 import argparse
 
 from ambjax.__main__ import parser
-from tuning.__main__ import parser as tuner
-
 from reference.markdown import code, escaped, table
+from tuning.__main__ import parser as tuner
 
 HELP = (argparse._HelpAction, argparse._VersionAction)
 
@@ -26,15 +25,16 @@ def pages() -> dict[str, str]:
 
 def commands() -> dict[str, argparse.ArgumentParser]:
     """The parsers of all commands, by what is typed."""
-    top = parser()
-    found = [choice for action in top._actions if isinstance(action, argparse._SubParsersAction) for choice in action.choices.values()]
+    groups = [one for one in parser()._actions if isinstance(one, argparse._SubParsersAction)]
+    found = [choice for one in groups for choice in one.choices.values()]
     return {command.prog: command for command in [*found, tuner()]}
 
 
 def _section(command: argparse.ArgumentParser) -> list[str]:
     usage = " ".join(command.format_usage().removeprefix("usage: ").replace("[-h] ", "").split())
     lines = [f"## `{command.prog}`", "", escaped(sentence(command.description or "")), "", "```text", usage, "```", ""]
-    rows = [(code(_written(action)), escaped(_meaning(action))) for action in command._actions if not isinstance(action, HELP)]
+    told = [action for action in command._actions if not isinstance(action, HELP)]
+    rows = [(code(_written(action)), escaped(_meaning(action))) for action in told]
     return lines + table(("argument", "meaning"), rows, "keys")
 
 

@@ -1,10 +1,9 @@
-"""What `ambjax check` prints: the conditions of Theorem 1 and the steps of its proof, from a check of the default loop."""
+"""What `ambjax check` prints: the conditions of Theorem 1 and the steps of its proof, from one of the default loop."""
 
 import functools
 
 from ambjax import Cascade, Clock, Scenario
 from ambjax.theorem import conditions
-
 from reference.markdown import code, escaped, paragraphs, table
 
 

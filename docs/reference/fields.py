@@ -4,6 +4,7 @@ import ast
 import dataclasses
 import inspect
 import math
+import re
 import textwrap
 from typing import Any, NamedTuple
 
@@ -23,9 +24,10 @@ class Facts(NamedTuple):
 def facts(field: dataclasses.Field, default: Any = None) -> Facts:
     """What a numeric field says of itself; `default` where the case file's is another."""
     meta = field.metadata
-    bounded = meta.get("leaf", False)
-    unit = meta["unit"] if bounded else ""
-    allowed = numbers(field).replace(f" ({unit})", "").removeprefix("a finite number ").removeprefix("a number ") if bounded else ""
+    unit, allowed = "", ""
+    if meta.get("leaf"):
+        unit = meta["unit"]
+        allowed = re.sub(r"^a (finite )?number ", "", numbers(field).replace(f" ({unit})", ""))
     shown = field.default if default is None else default
     return Facts(field.name, "" if unit == "1" else unit, value(shown), allowed, meta["doc"])
 
@@ -34,11 +36,10 @@ def value(default: Any) -> str:
     """A default in words; '' for none."""
     if default is dataclasses.MISSING or default is None:
         return ""
-    number = isinstance(default, (int, float)) and not isinstance(default, bool)
-    if not number and not isinstance(default, str):
-        default = float(default)
-        number = True
-    return (f"{default:g}" if math.isfinite(default) else "inf") if number else str(default)
+    if isinstance(default, (str, bool)):
+        return str(default)
+    number = float(default)
+    return f"{number:g}" if math.isfinite(number) else "inf"
 
 
 def attribute_docs(kind: type) -> dict[str, str]:

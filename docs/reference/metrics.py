@@ -5,7 +5,6 @@ from typing import Any
 
 from ambjax.simulation import metrics
 from ambjax.simulation.trajectory import NOT_SAVED, Row
-
 from reference.fields import attribute_docs
 from reference.markdown import code, escaped, table
 
@@ -32,7 +31,7 @@ OTHERS = {
     "singular_at_s": "when (z, i_ref) first crossed the singular curve C, Eq. (9); null: never",
     "lost_why": "why it ended, in words; empty if it did not",
     "method": "the integrator and its step",
-    "settle_s": "when \"settled\" begins: `run.settle`",
+    "settle_s": 'when "settled" begins: `run.settle`',
 }
 SHARE = {"clearance_used": "z as a share of the clearance"}
 UNIT = re.compile(r"_(m_per_s|A2_per_m2|m|s|V|A|W)$")
@@ -44,7 +43,7 @@ def pages() -> dict[str, str]:
     lines = ["# Metrics and arrays", "", "## `metrics.json`", ""]
     lines += ["Written by `ambjax simulate`; of each member by `ambjax ensemble`.", ""]
     lines += [
-        "Errors count every sample, a lost rotor's too, which is frozen where it was lost. Under held noise u, i, e and "
+        "Errors count every sample, a lost rotor's too, frozen where it was lost. Under held noise u, i, e and "
         "v_tilde jump at the samples: so extremes are taken over the integrator's substeps, and voltage and heat over "
         "time.",
         "",

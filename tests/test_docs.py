@@ -1,0 +1,164 @@
+"""The documentation against the code: what pages say is there, and what is there they say. Sphinx is not needed."""
+
+import ast
+import importlib
+import itertools
+import json
+import math
+import pathlib
+import re
+
+import numpy as np
+import pytest
+from reference import benchmarks, case_file, commands, fields, markdown, metrics, parser
+
+from ambjax.__main__ import main
+from ambjax.cases.reader import KINDS, OTHERS, SIGNALS, TABLES, case_from
+from ambjax.cases.table import Table
+from tuning.config import tune_from
+
+ROOT = pathlib.Path(__file__).parent.parent
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+ROLE = re.compile(r"\{py:(\w+)\}`(?:[^`<]*<)?~?([\w.]+)>?`")
+# Tables of the case file whose keys are rows of a page, with what must stand beside a key for the reader to get there.
+ELSEWHERE = ("controller", "reference", "disturbance", "spread")
+ROWS = [(name, {}) for name in [*TABLES, *OTHERS, "tune.weights"] if name not in ELSEWHERE]
+ROWS += [("reference", {"kind": kind}) for kind in SIGNALS]
+ROWS += [(f"controller.{stage}", {"kind": kind}) for stage, kinds in KINDS.items() for kind in kinds]
+
+
+def found(dotted):
+    """What a dotted name stands for; raises if there is no such thing."""
+    parts = dotted.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            thing = importlib.import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for name in parts[count:]:
+            thing = getattr(thing, name)
+        return thing
+    raise AttributeError(dotted)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_link_into_the_code_leads_somewhere(page):
+    for _, target in ROLE.findall(page.read_text()):
+        assert found(target) is not None
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_path_is_there(page):
+    for path in re.findall(r"`((?:ambjax|tuning|tests|benchmarks|docs)/[\w/.]*)`", page.read_text()):
+        assert (ROOT / path).exists(), path
+
+
+def test_every_equation_of_the_paper_is_linked_to_its_code():
+    text = (ROOT / "docs" / "model.md").read_text()
+    starts = [(match.start(), match[1]) for match in re.finditer(r":label: eq-(\d+)", text)]
+    assert [int(number) for _, number in starts] == list(range(1, 15)), "the numbers are those of the paper"
+    ends = [start for start, _ in starts[1:]] + [len(text)]
+    for (start, number), end in zip(starts, ends, strict=True):
+        assert ROLE.search(text, start, end), f"Eq. ({number}) has no link to the code"
+
+
+def record_of(table, kind):
+    """The record whose fields are a table's keys, if one is."""
+    if table == "reference":
+        return SIGNALS[kind]
+    stage = table.partition(".")[2]
+    return KINDS[stage][kind] if stage in KINDS else case_file.RECORDS.get(table)
+
+
+@pytest.mark.parametrize(("table", "beside"), ROWS, ids=lambda x: x if isinstance(x, str) else x.get("kind", "-"))
+def test_no_key_is_without_range_and_meaning(table, beside):
+    rows = case_file.rows_of(table, record_of(table, beside.get("kind")), beside)
+    assert [row.name for row in rows if row.name == "kind"] == ["kind"] * ("kind" in beside)
+    for row in rows:
+        assert row.allowed, f"{table}.{row.name}: the reader does not say what it allows"
+        if row.name not in ("kind", "terms"):
+            assert row.doc, f"{table}.{row.name}: give its field a doc, or its line in the template a comment"
+
+
+@pytest.mark.parametrize("table", ["plant", "sensor", "initial", "actuator", "clock", "tune", "tune.weights"])
+def test_defaults_are_those_of_the_reader(table):
+    """A case with every number set to the default on the page is the case without: to six digits, as printed."""
+    rows = case_file.rows_of(table, case_file.RECORDS.get(table))
+    given = {row.name: number for row in rows if (number := as_number(row.default)) is not None}
+    assert given or table == "actuator"
+    outer, _, inner = table.partition(".")
+    raw = {outer: {inner: given} if inner else given}
+    assert numbers_of(raw) == pytest.approx(numbers_of({outer: {}}), rel=1e-5)
+
+
+def as_number(text):
+    """A default as the case file would have it: whole, real, or None for words."""
+    try:
+        return int(text)
+    except ValueError:
+        pass
+    try:
+        number = float(text)
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def numbers_of(raw):
+    """Every number in what a case file says."""
+    raw = {table: keys | ({"risk": "cvar"} if table == "tune" else {}) for table, keys in raw.items()}  # alpha needs it
+    case = case_from(raw)
+    told = f"{case} {tune_from(Table(raw).table('tune'), case)}"
+    return [float(x) for x in re.findall(r"-?\d+\.?\d*(?:e[+-]?\d+)?", told)]
+
+
+def test_metrics_and_arrays_are_those_of_the_files(tmp_path):
+    case = tmp_path / "short.toml"
+    case.write_text("[clock]\nduration = 0.01\n")
+    assert main(["simulate", str(case), "--out", str(tmp_path / "run")]) == 0
+    written = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert {row[0].strip("`") for row in metrics.rows()} == set(written)
+    with np.load(tmp_path / "run" / "trajectory.npz") as arrays:
+        assert set(metrics.arrays()) == set(arrays.files)
+
+
+def test_every_command_has_its_section():
+    modules = (ROOT / "ambjax" / "commands").glob("*.py")
+    runs = {path.stem for path in modules if "run" in functions(path)}
+    assert set(commands.commands()) == {f"ambjax {name}" for name in runs} | {"ambjax-tune"}
+
+
+def functions(path):
+    return {node.name for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)}
+
+
+def test_the_benchmark_pages_are_one():
+    page = benchmarks.pages()["benchmarks.md"].replace(benchmarks.FROM_HERE, benchmarks.FROM_THERE)
+    assert page == (ROOT / "benchmarks" / "README.md").read_text(), "run python benchmarks/report.py"
+
+
+def test_a_text_is_not_taken_for_markup():
+    assert markdown.escaped("|z| < s_0 [m] $ `a|b`") == r"\|z\| \< s_0 \[m\] \$ `a\|b`"
+    assert markdown.table(("a", "b"), [("1", "2")], "keys")[2:5] == ["| a | b |", "|---|---|", "| 1 | 2 |"]
+
+
+def test_the_reader_is_asked_for_what_it_refuses():
+    assert parser.rule("run.seed") == "a whole number from 0 to 4294967295"
+    assert parser.keys("initial") == ["z", "z_dot", "i"]
+    with pytest.raises(LookupError, match="allowed"):
+        parser.complaint("initial.z", 0.0)
+
+
+def test_attributes_are_told_by_the_docstrings_below_them():
+    class Told:
+        x: float = 0.0
+        """a length, m"""
+        y: float = 0.0
+
+    assert fields.attribute_docs(Told) == {"x": "a length, m"}
+    assert [fields.value(x) for x in (None, 0.5, math.inf, "auto", 1e-30)] == ["", "0.5", "inf", "auto", "1e-30"]
+
+
+def test_no_page_mentions_a_script_of_the_network():
+    for path in itertools.chain(PAGES, (ROOT / "docs").glob("_*/*.*")):
+        assert "://" not in path.read_text(), path
