@@ -11,7 +11,7 @@ MAGIC = "%%shell"
 
 def shell(line: str, cell: str) -> None:
     """Run a cell and print what it says. Raises RuntimeError unless it ends with the exit code in `line`, or 0."""
-    done = subprocess.run(["bash", "-c", cell], capture_output=True, text=True, check=False)
+    done = subprocess.run(["bash", "-o", "pipefail", "-c", cell], capture_output=True, text=True, check=False)
     print(done.stdout + done.stderr, end="")
     if done.returncode != int(line or 0):
         raise RuntimeError(f"exit code {done.returncode}, not {line or 0}: {cell}")

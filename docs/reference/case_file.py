@@ -9,6 +9,7 @@ from ambjax.cases.reader import DURATION, FIELDS, KINDS, OTHERS, SETTLE, SIGNALS
 from ambjax.cases.spread import KINDS as SPREADS
 from ambjax.cases.table import Table
 from ambjax.cases.template import template
+from ambjax.ensemble.distributions import SHAPES
 from ambjax.ensemble.paths import places
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial
@@ -179,7 +180,8 @@ def _spread() -> str:
     rows = []
     for kind, make in SPREADS.items():
         made = _example(kind, make)
-        rows.append((code(str(made)), escaped(first_paragraph(type(made)))))
+        shapes = [dataclasses.replace(made, shape=shape) for shape in SHAPES] if hasattr(made, "shape") else [made]
+        rows += [(code(str(one)), escaped(first_paragraph(type(one)))) for one in shapes]
     lines += table(("form", "meaning"), rows, "keys")
     case = case_from(tomllib.loads(template("tracking")))
     lines += ["## What may vary", "", "In the case that `ambjax template` prints, and likewise in any other:", ""]
