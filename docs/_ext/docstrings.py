@@ -1,6 +1,7 @@
 """Docstrings, which are plain text with `names` in backticks, made into what autodoc reads; and fields of records."""
 
 import dataclasses
+import operator
 import re
 import sys
 from typing import Any
@@ -37,15 +38,37 @@ def _item(row: Facts) -> str:
     return f"- ``{row.name}``: {plain(row.doc)} ({'; '.join(filter(None, told))})"
 
 
-def unlinked(app: Sphinx, env: Any, node: Any, text: Any) -> Any:
-    """The mere text for a name of ours in a signature that exists but has no page: a type variable, an alias."""
-    module, _, name = node.get("reftarget", "").rpartition(".")
-    known = getattr(sys.modules.get(module), name, None)
-    return None if known is None or hasattr(known, "__qualname__") else text
+def elsewhere(app: Sphinx, env: Any, node: Any, text: Any) -> Any:
+    """What a name of ours without a place of its own leads to: where an inherited method is written, or mere text.
+
+    Mere text for what has no page, as a type variable in a signature. None for what does not exist: the build stops.
+    """
+    thing, target = _named(node.get("reftarget", "")), node.get("reftarget")
+    if thing is None:
+        return None
+    written = getattr(thing, "fget", thing)
+    place = f"{getattr(written, '__module__', '')}.{getattr(written, '__qualname__', '')}"
+    if not hasattr(written, "__qualname__"):
+        return text
+    if place == target:
+        return None
+    return env.get_domain("py").resolve_xref(env, node["refdoc"], app.builder, node["reftype"], place, node, text)
+
+
+def _named(dotted: str) -> Any:
+    """What a dotted name stands for among the modules that are loaded, or None."""
+    module, rest = dotted, ""
+    while module and module not in sys.modules:
+        module, _, last = module.rpartition(".")
+        rest = f"{last}.{rest}".rstrip(".")
+    try:
+        return operator.attrgetter(rest)(sys.modules[module]) if module and rest else None
+    except AttributeError:
+        return None
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register it."""
     app.connect("autodoc-process-docstring", process)
-    app.connect("missing-reference", unlinked)
+    app.connect("missing-reference", elsewhere)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
