@@ -44,8 +44,8 @@ from ambjax.theorem.conditions import check
 from ambjax.world.bearing import Bearing, Signals
 from ambjax.world.sensor import Measurement
 from tuning.config import tune_from
+from tuning.problem import problem_of
 from tuning.search.rounds import rounds
-from tuning.study import study_of
 
 
 class Coils(NamedTuple):
@@ -228,17 +228,19 @@ def test_tuned(tmp_path):
     assert every == [*paths, "controller.inversion.gamma", "controller.current.k_i"]
     asked = {"members": 4, "stressed": 2, "validation": 8, "held_out": 8, "screen": 4, "starts": 1, "iterations": 3}
     tune = tune_from(Table({"gains": paths, **asked}), case)
-    study = study_of(case, tune)
-    assert study_of(case, tune, finer=2).objective.clock.method.substeps == 2 * study.objective.clock.method.substeps
-    rho = study.ranges[1]
+    problem = problem_of(case, tune)
+    assert (
+        problem_of(case, tune, finer=2).objective.clock.method.substeps == 2 * problem.objective.clock.method.substeps
+    )
+    rho = problem.ranges[1]
     assert rho.source.startswith("slope rho/width from w/3")
-    width = study.ranges[2]  # of which the law says nothing
+    width = problem.ranges[2]  # of which the law says nothing
     assert (width.low, width.high) == pytest.approx((0.05 / 30, 0.05 * 30))
-    assert next(bound for bound in study.goal.conditions if bound.path == RHO).symbol == "Q_z"
+    assert next(bound for bound in problem.goal.conditions if bound.path == RHO).symbol == "Q_z"
     start = tune.space.values(case.cascade)
-    answer = rounds(study, start, tmp_path, {"case": "own parts"}, False)
+    answer = rounds(problem, start, tmp_path, {"case": "own parts"}, False)
     history = answer.history["value"]
     assert np.nanmin(history) < history[0].max()
-    gains = np.asarray(answer.study.objective.space.gains_at(answer.x))
+    gains = np.asarray(answer.problem.objective.space.gains_at(answer.x))
     assert np.all(np.isfinite(gains))
     assert np.any(gains != start)
