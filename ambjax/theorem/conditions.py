@@ -197,9 +197,12 @@ def _conditions(
             against = worst[side.signal] if side.signal else on_reference
             lines.append(line(one, side.name, one.over + side.where, against, ideal=not side.signal))
     distance, at = worst["distance"]
-    note = "optional in the paper: k would dominate the inversion's transients too"
     remarks = [
-        dataclasses.replace(line(one, "remark 3", "sup |q_z + h|", worst["q_z_plus_h"]), holds=None, note=note)
+        dataclasses.replace(
+            line(one, "remark 3", "sup |q_z + h|", worst["q_z_plus_h"]),
+            holds=None,
+            note=f"optional in the paper: {one.gain} would dominate the inversion's transients too",
+        )
         for one in asked
         if one.over == "Q_z"
     ]
