@@ -160,8 +160,8 @@ LOOP = [
     M(
         "noise is redrawn at each evaluation",
         "ambjax/simulation/loop.py",
-        "seen = add(state.plant, hold)",
-        "seen = add(state.plant, self.hold((state.plant.z * 1e18).astype(int)))",
+        "seen = self.measured(state.plant, hold)",
+        "seen = self.measured(state.plant, self.hold((state.plant.z * 1e18).astype(int)))",
         "tests/test_ensemble.py::test_settled_rms_agrees_with_the_lyapunov_equation",
     ),
     M(
