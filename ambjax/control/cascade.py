@@ -3,6 +3,7 @@
 Its modularity is the paper's first contribution: any law of a stage may stand with any of the others.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +18,9 @@ from ambjax.control.laws import (
     Observer,
     PositionLaw,
     State,
+    stepped,
 )
+from ambjax.control.processor import Processor, carried
 from ambjax.numerics.records import Scalar, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
@@ -41,6 +44,16 @@ class Command(NamedTuple):
     i_ref: Array
     i_ref_dot: Array
     u: Array
+
+
+class Sample(NamedTuple):
+    """What a cascade on a processor meets at a sample: reference where its voltage takes effect, period in s, the
+    supply's limit and the voltages of the sample before and of the one before that, V."""
+
+    reference: Reference
+    period: Scalar
+    u_max: Scalar
+    past: tuple[Array, Array]
 
 
 # A law that is left out: made for the model once, when the cascade is.
@@ -121,6 +134,38 @@ class Cascade:
         z_rate, v_star_rate = jax.jvp(lambda *x: wanted(*x)[0], point, along)[1]
         rates = CascadeState(observed_rate, positioned_rate, (), ())
         return ForceDemand(z, z_rate, v_star, v_star_rate, gaps), estimate, rates
+
+    def step(
+        self, processor: Processor, measured: Measurement, state: CascadeState, sample: Sample
+    ) -> tuple[Command, CascadeState]:
+        """Command of one sample on a processor, and states of the laws for the next one.
+
+        With prediction all but the observer act on the estimate carried over the delay.
+        """
+        advance = functools.partial(stepped, model=self.model, period=sample.period, implicit=processor.implicit)
+
+        def wanted(reference: Reference, z: Array, z_dot: Array, observed: State, positioned: State):
+            estimate, observed = advance(self.observer, Measurement(z, z_dot, measured.i), observed)
+            if processor.predict:
+                estimate = carried(self.model, estimate, sample.past, processor.stretches(sample.period))
+            v_star, positioned = advance(self.position, (estimate, reference), positioned)
+            return (estimate.z, v_star), (estimate, observed, positioned)
+
+        point = (sample.reference, measured.z, measured.z_dot, state.observer, state.position)
+        (z, v_star), (estimate, observed, positioned) = wanted(*point)
+        # what a law that inverts statically needs for i_ref'; unused, it is never computed
+        z_ddot = self.model.z_ddot(estimate.z, estimate.i)
+        rates = jax.tree.map(
+            lambda a, b: (b - a) / sample.period, (state.observer, state.position), (observed, positioned)
+        )
+        along = (sample.reference.rate(), measured.z_dot, z_ddot, *rates)
+        z_rate, v_star_rate = jax.jvp(lambda *x: wanted(*x)[0], point, along)[1]
+        force = ForceDemand(z, z_rate, v_star, v_star_rate, self.model.gaps(z))
+        demand, inverted = advance(self.inversion, force, state.inversion)
+        u, driven = advance(self.current, CurrentInputs(estimate, demand, sample.u_max, force.gaps), state.current)
+        v_tilde = v_star - self.model.v_and_dv_di(z, demand.i_ref, force.gaps)[0]
+        after = CascadeState(observed, positioned, inverted, driven)
+        return Command(v_star, v_tilde, demand.i_ref, demand.i_ref_dot, u), after
 
     def __call__(
         self, measured: Measurement, state: CascadeState, reference: Reference, u_max: Scalar

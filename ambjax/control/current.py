@@ -9,6 +9,7 @@ from ambjax.control.answers import Requirement
 from ambjax.control.laws import CurrentInputs
 from ambjax.control.search import Interval, Site, rate, switch
 from ambjax.numerics.records import Scalar, gain, record
+from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
 from ambjax.world.plant import Plant
 
@@ -39,11 +40,18 @@ class SlidingMode:
         return model.i_0
 
     def __call__(self, model: Plant, inputs: CurrentInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
+        return self._voltage(model, inputs, smooth_sign(inputs.measured.i - inputs.demand.i_ref, self.p)), ()
+
+    def step(self, model: Plant, inputs: CurrentInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
+        """The sign is that of i - i_ref at the step's end."""
+        e = inputs.measured.i - inputs.demand.i_ref
+        return self._voltage(model, inputs, share(e, period * self.k_i, self.p)), ()
+
+    def _voltage(self, model: Plant, inputs: CurrentInputs, sign: Array) -> Array:
         measured, demand = inputs.measured, inputs.demand
         inverse = (inputs.gaps or model.gaps(measured.z)).inverses[1]
-        robust = self.robust(measured.i - demand.i_ref)
-        wanted = -2 * measured.z_dot * inverse * measured.i + demand.i_ref_dot + robust
-        return (model.kappa / 2) * inverse * wanted + model.R * measured.i, ()
+        wanted = -2 * measured.z_dot * inverse * measured.i + demand.i_ref_dot - self.k_i * sign
+        return (model.kappa / 2) * inverse * wanted + model.R * measured.i
 
     def robust(self, e: Array) -> Array:
         return -self.k_i * smooth_sign(e, self.p)

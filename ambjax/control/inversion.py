@@ -11,7 +11,8 @@ from ambjax.control.laws import CurrentDemand, ForceDemand, Relaxation
 from ambjax.control.search import Interval, Site
 from ambjax.numerics.apart import stored
 from ambjax.numerics.records import Scalar, gain, leaf, record
-from ambjax.numerics.relaxation import relax
+from ambjax.numerics.relax import relax
+from ambjax.numerics.relaxation import relaxation
 from ambjax.numerics.smooth import TWO_OVER_PI, away_from_zero, reciprocal, smooth_sign
 from ambjax.world.plant import Plant
 
@@ -79,10 +80,16 @@ class Adaptive:
         w = begin.v_star - v_0
         drift = (end.v_star - v_1 - w) * (1 / jnp.where(h > 0, h, 1.0))
         w, drift = stored((w, drift))
-        sliding, slaved, turn = relax(w, drift, self.gamma, self.p, h)
+        sliding, slaved, turn = relaxation(w, drift, self.gamma, self.p, h)
         w_1 = w + turn * (drift - sliding)
         w_2 = w_1 + (h - turn) * (drift - slaved)
         return Relaxation(sliding * reciprocal(gradient_0), slaved * reciprocal(gradient_1), turn, (w, w_1, w_2))
+
+    def step(self, model: Plant, inputs: ForceDemand, state: Array, period: Scalar) -> tuple[CurrentDemand, Array]:
+        """v(z, i_ref) moves towards v_star as the sign at the step's end has it: gamma is its slew rate at most."""
+        w = inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0]
+        after = model.current_for(inputs.z, inputs.v_star - relax(w, period * self.gamma, self.p))
+        return CurrentDemand(state, (after - state) / period), after
 
 
 @record

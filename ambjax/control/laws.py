@@ -10,6 +10,7 @@ in the file of its stage, one row in `KINDS` of the case-file reader, one row in
 
 from typing import Any, NamedTuple, Protocol
 
+import jax
 from jax import Array
 
 from ambjax.numerics.records import Scalar
@@ -99,3 +100,12 @@ class CurrentLaw(Protocol):
     def scale(self, model: Plant) -> State: ...
     def slope(self, model: Plant) -> Scalar: ...
     def __call__(self, model: Plant, inputs: CurrentInputs, state: State, /) -> tuple[Array, State]: ...
+
+
+def stepped(law: Any, inputs: Any, state: State, *, model: Plant, period: Scalar, implicit: bool) -> tuple[Any, State]:
+    """Output of a law at a sample, and its state at the next: by its own discrete `step`, else by explicit Euler."""
+    own = getattr(law, "step", None)
+    if implicit and own is not None:
+        return own(model, inputs, state, period)
+    output, rate = law(model, inputs, state)
+    return output, jax.tree.map(lambda x, d: x + period * d, state, rate)

@@ -8,6 +8,7 @@ from jax import Array
 from ambjax.control.answers import Requirement
 from ambjax.control.search import Interval, Site, manifold, rate, switch
 from ambjax.numerics.records import Scalar, gain, record
+from ambjax.numerics.relax import share, twist
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_root, smooth_sign
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
@@ -67,6 +68,14 @@ class SlidingMode:
     def ranges(self, site: Site) -> dict[str, Interval]:
         return {"c": manifold(site), "k": switch(site, "k", self.p, 100, "Q_z")}
 
+    def step(
+        self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()], period: Scalar
+    ) -> tuple[Array, tuple[()]]:
+        """The sign is that of sigma at the step's end: undisturbed sigma reaches 0 and stays, whatever k."""
+        motion, reference = inputs
+        robust = -self.k * share(self.sigma(motion, reference), period * self.k, self.p)
+        return force_for(self.c, model, motion, reference, robust), ()
+
 
 @record
 class SuperTwisting:
@@ -118,3 +127,18 @@ class SuperTwisting:
             "k_1": rate(site, 1 / 3, 100, "slope k_1 sqrt(p) from w/3 to 100 w", root),
             "k_2": rate(site, 1e-2, 10, "corner sqrt(2/pi k_2 p) from w/100 to 10 w", integral, 2),
         }
+
+    def step(
+        self, model: Plant, inputs: tuple[Measurement, Reference], state: Array, period: Scalar
+    ) -> tuple[Array, Array]:
+        """Both terms at the step's end: R. Seeber and B. Andritsch, Automatica 173 (2025) 112027.
+
+        The robust term is -k_1 root(y) + 2 w+ - w, y + T k_1 root(y) + T^2 k_2 sgn(y) = sigma.
+        """
+        motion, reference = inputs
+        sigma = self.sigma(motion, reference)
+        reach = period * period * self.k_2
+        root, sign = twist(sigma, period * self.k_1, reach, self.p)
+        after = state - period * self.k_2 * sign
+        robust = 2 * after - state - self.k_1 * root
+        return force_for(self.c, model, motion, reference, robust), after

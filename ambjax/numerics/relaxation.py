@@ -16,7 +16,7 @@ NEWTON = 6
 EDGE = 1.0
 
 
-def relax(w: Array, drift: Array, gain: Scalar, p: Scalar, h: Scalar) -> tuple[Array, Array, Array]:
+def relaxation(w: Array, drift: Array, gain: Scalar, p: Scalar, h: Scalar) -> tuple[Array, Array, Array]:
     """w' = drift - gain sgn(w) over h, as two constant rates of `gain sgn(w)`: (first, second, time of the first).
 
     First it slides at its initial rate to the sign's layer (or to the end); then it is slaved, one backward Euler step.

@@ -162,17 +162,21 @@ def _cosine_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, A
     return cosine(x), -TWO_PI * sine(x) * dx
 
 
-def smooth_sign(x: Scalar, p: Scalar, per: Scalar = 1.0) -> Array:
+def smooth_sign(x: Scalar, p: Scalar | None, per: Scalar = 1.0) -> Array:
     """sgn(x) as 2/pi arctan(p x), divided by `per`; slope 2p/pi at zero. Remark 3 of the paper.
 
-    `p` has the inverse unit of `x`.
+    `p` has the inverse unit of `x`; None: the sign itself, 0 at 0.
     """
+    if p is None:
+        return jnp.sign(jnp.asarray(x)) / per
     return TWO_OVER_PI * arctan_per(p * jnp.asarray(x), jnp.asarray(per))
 
 
-def smooth_root(x: Scalar, p: Scalar) -> Array:
-    """sqrt(|x|) sgn(x) as x / (x^2 + 1/p^2)^(1/4); slope sqrt(p) at zero instead of infinity."""
+def smooth_root(x: Scalar, p: Scalar | None) -> Array:
+    """sqrt(|x|) sgn(x) as x / (x^2 + 1/p^2)^(1/4); slope sqrt(p) at zero instead of infinity, the root's for p None."""
     x = jnp.asarray(x)
+    if p is None:
+        return jnp.sign(x) * safe_sqrt(jnp.abs(x))
     return x / jnp.sqrt(jnp.sqrt(x * x + 1.0 / (p * jnp.asarray(p))))
 
 

@@ -1,0 +1,77 @@
+"""The processor that a cascade runs on: one step of all laws a sample, its voltage held, late by a delay."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.numerics.records import Scalar, is_traced, leaf, record, static
+from ambjax.world.plant import Plant
+from ambjax.world.sensor import Measurement
+
+
+@record
+class Processor:
+    """How a cascade runs where it is sampled. The period is the clock's.
+
+    At t_n = n T the sensors are read and every law makes a step; its voltage acts from t_n + delay T until
+    t_{n+1} + delay T; before the first, u = 0. With `predict` the laws act on the estimate carried over the delay by
+    the nominal model, and on the reference of that instant.
+    """
+
+    delay: Scalar = leaf(
+        default=1.0, unit="samples", at_least=0, at_most=2, doc="from measurement to voltage, computing and output"
+    )
+    implicit: bool = static(default=True, doc="signs act on the step's end; else explicit Euler")
+    predict: bool | None = static(default=None, doc="carry the estimate over the delay; None: where there is one")
+    whole: bool | None = static(default=None, doc="every delay is a whole number of samples; None: to be seen")
+    most: int | None = static(default=None, doc="samples that the longest delay reaches into; None: to be seen")
+
+    def resolved(self) -> "Processor":
+        """This processor with everything settled that decides which program is compiled.
+
+        Raises ValueError where the delay is traced and was not settled before.
+        """
+        if self.most is not None:
+            return self
+        if is_traced(self.delay):
+            raise ValueError(
+                "processor.delay: inside jit, grad or vmap it is traced, and no program can be chosen. Call "
+                "processor.resolved() outside."
+            )
+        delay: Any = np.asarray(self.delay, float)
+        longest = float(delay.max())
+        return Processor(
+            self.delay,
+            self.implicit,
+            longest > 0 if self.predict is None else self.predict,
+            bool(np.all(delay == np.round(delay))),
+            math.ceil(longest),
+        )
+
+    def stretches(self, period: Scalar) -> tuple[Array, ...]:
+        """Lengths (s) of the parts of the delay over which one voltage acts: u_{n-1}, and before it u_{n-2}."""
+        delay = jnp.asarray(self.delay)
+        return (jnp.minimum(delay, 1.0) * period, jnp.maximum(delay - 1.0, 0.0) * period)[: self.most]
+
+
+def carried(model: Plant, estimate: Measurement, past: tuple[Array, Array], lengths: tuple[Array, ...]) -> Measurement:
+    """The estimate after these lengths (s), the last first, under past voltages: one RK4 step of the model each."""
+    for u, h in reversed(list(zip(past, lengths, strict=False))):
+
+        def rates(x: Measurement, u: Array = u) -> Measurement:
+            z_ddot, i_dot = model.rates(x.z, x.z_dot, x.i, u)
+            return Measurement(x.z_dot, z_ddot, i_dot)
+
+        def moved(h: Array, k: Measurement, x: Measurement = estimate) -> Measurement:
+            return jax.tree.map(lambda x, d: x + h * d, x, k)
+
+        k_1 = rates(estimate)
+        k_2 = rates(moved(h / 2, k_1))
+        k_3 = rates(moved(h / 2, k_2))
+        k_4 = rates(moved(h, k_3))
+        estimate = moved(h / 6, jax.tree.map(lambda a, b, c, d: a + 2 * (b + c) + d, k_1, k_2, k_3, k_4))
+    return estimate

@@ -1,0 +1,114 @@
+"""Signs on a processor: a sign that acts on where the step ends, not on where it begins.
+
+relax(w, h, p) is the w+ with w+ + h sgn_p(w+) = w, sgn_p(x) = 2/pi arctan(p x); p None: the set-valued sign, for which
+w+ = sign(w) max(|w| - h, 0). A sign that is stepped explicitly turns over from sample to sample where h p is large;
+this one never overshoots. V. Acary and B. Brogliato, Syst. Control Lett. 59 (2010) 284-293.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.numerics.apart import apart
+from ambjax.numerics.records import Scalar
+from ambjax.numerics.smooth import TWO_OVER_PI, arctan_per, safe_sqrt, smooth_root, smooth_sign
+
+# Steps of Halley's method from the root for another sign of the same slope and tail, which is 0.4 to 1 times the root:
+# 2 leave 3e-8 of the right-hand side, 3 rounding (Newton's method: 4 leave 2e-12).
+HALLEY = 3
+# Of Newton's method for a sign with a root beside it.
+NEWTON = 10
+
+
+def relax(w: Scalar, h: Scalar, p: Scalar | None) -> Array:
+    """The w+ with w+ + h sgn_p(w+) = w; h >= 0 in the unit of w, p in its inverse."""
+    w, h = jnp.asarray(w), jnp.asarray(h)
+    if p is None:
+        return jnp.sign(w) * jnp.maximum(jnp.abs(w) - h, 0.0)
+    return _relaxed(p * w, TWO_OVER_PI * p * h) / p
+
+
+def share(w: Scalar, h: Scalar, p: Scalar | None) -> Array:
+    """sgn_p of w+ = relax(w, h, p), in -1..1: what of the step h is used, (w - w+)/h."""
+    if p is None:
+        w, h = jnp.asarray(w), jnp.asarray(h)
+        hard = h > 0
+        return jnp.where(hard, jnp.clip(w / jnp.where(hard, h, 1.0), -1.0, 1.0), jnp.sign(w))
+    return smooth_sign(relax(w, h, p), p)
+
+
+@jax.custom_jvp
+@apart
+def _relaxed(x: Array, h: Array) -> Array:
+    """The y with y + h arctan(y) = x."""
+    size = jnp.abs(x)
+    # y + reach y/(y + eps) = |x|
+    reach, eps = h / TWO_OVER_PI, TWO_OVER_PI
+    b = eps + reach - size
+    root = jnp.sqrt(b * b + 4 * eps * size)
+    y = jnp.where(b > 0, 2 * eps * size / (jnp.abs(b) + root), (root - b) / 2)
+    for _ in range(HALLEY):
+        flat = 1 + y * y
+        steep = 1 / (flat + h)  # divided first: the fourth power of y would overflow in float32
+        newton = (y + h * arctan_per(y, jnp.ones_like(y)) - size) * steep
+        y = y - newton * flat / (1 + (y * steep) * (h * newton))
+    return jnp.where(x < 0, -y, y)
+
+
+@_relaxed.defjvp
+def _relaxed_jvp(primals: tuple[Array, Array], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
+    # of the equation, not of the iteration
+    (x, h), (dx, dh) = primals, tangents
+    y = _relaxed(x, h)
+    flat = 1 + y * y
+    return y, (dx - arctan_per(y, jnp.ones_like(y)) * dh) * (flat / (flat + h))
+
+
+def twist(x: Scalar, a: Scalar, b: Scalar, p: Scalar | None) -> tuple[Array, Array]:
+    """root_p(y) and sgn_p(y) of the y with y + a root_p(y) + b sgn_p(y) = x: a root beside the sign; a, b > 0.
+
+    For p None in closed form: y is 0 where |x| <= b, and there the sign takes the value x/b.
+    """
+    x, a, b = jnp.asarray(x), jnp.asarray(a), jnp.asarray(b)
+    if p is None:
+        y = _hard_twist(x, a, b)
+        return smooth_root(y, None), jnp.clip(x / b, -1.0, 1.0)
+    y = _twisted(x, a, b, jnp.asarray(p))
+    return smooth_root(y, p), smooth_sign(y, p)
+
+
+def _hard_twist(x: Array, a: Array, b: Array) -> Array:
+    excess = jnp.maximum(jnp.abs(x) - b, 0.0)
+    below = a + safe_sqrt(a * a + 4 * excess)
+    root = 2 * excess / jnp.where(below > 0, below, 1.0)
+    return jnp.sign(x) * root * root
+
+
+@jax.custom_jvp
+def _twisted(x: Array, a: Array, b: Array, p: Array) -> Array:
+    size = jnp.abs(x)
+    # The left side is concave: from below Newton's method climbs to the solution. Without the root term it is too high.
+    above = relax(size, b, p)
+    below = jnp.maximum(relax(size - a * smooth_root(above, p), b, p), _hard_twist(size, a, b))
+    y = jnp.maximum(below, size / _steep(jnp.zeros_like(size), a, b, p))
+    for _ in range(NEWTON):
+        y = y + (size - y - a * smooth_root(y, p) - b * smooth_sign(y, p)) / _steep(y, a, b, p)
+    return jnp.where(x < 0, -y, y)
+
+
+@_twisted.defjvp
+def _twisted_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+    x, a, b, p = primals
+    y = _twisted(x, a, b, p)
+    whole = lambda a, b, p: a * smooth_root(y, p) + b * smooth_sign(y, p)  # noqa: E731
+    moved = jax.jvp(whole, (a, b, p), tangents[1:])[1]
+    return y, (tangents[0] - moved) / _steep(y, a, b, p)
+
+
+def _steep(y: Array, a: Array, b: Array, p: Array) -> Array:
+    """Derivative of y + a root_p(y) + b sgn_p(y)."""
+    far = y * y + 1 / (p * p)
+    fourth = jnp.sqrt(jnp.sqrt(far))
+    return 1 + a * (1 - y * y / (2 * far)) / fourth + b * TWO_OVER_PI * p / (1 + (p * y) ** 2)

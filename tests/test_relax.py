@@ -1,0 +1,118 @@
+"""Signs on a processor: residuals of their equations, their derivatives, their limits."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ambjax.numerics.relax import relax, share, twist
+
+DECADES = st.floats(-9, 9).map(lambda x: 10.0**x)
+SIDES = st.sampled_from([-1.0, 1.0])
+
+
+def sign(x, p):
+    return 2 / np.pi * np.arctan(p * x)
+
+
+def root(x, p):
+    return x / (x * x + 1 / p**2) ** 0.25
+
+
+# Rounding of the three terms: 10 units in the last place of the largest.
+@given(DECADES, SIDES, DECADES, DECADES)
+@settings(max_examples=500, deadline=None)
+def test_relax_solves_its_equation_to_rounding(size, side, h, p):
+    w = side * size
+    y = float(relax(w, h, p))
+    assert abs(y + h * sign(y, p) - w) <= 10 * np.finfo(float).eps * size
+    assert np.sign(y) == side
+    assert abs(y) <= size
+
+
+@given(DECADES, SIDES, DECADES, DECADES, DECADES)
+@settings(max_examples=300, deadline=None)
+def test_twist_solves_its_equation_to_rounding(size, side, a, b, p):
+    x = side * size
+    above, turned = (float(value) for value in twist(x, a, b, p))
+    y = x - a * above - b * turned
+    # y is small against x here: what rounding makes of it, sgn_p and root_p see magnified by their slopes
+    slack = 30 * np.finfo(float).eps * size
+    assert abs(sign(y, p) - turned) <= 1e-12 + slack * p
+    assert abs(root(y, p) - above) <= 1e-12 * (1 + abs(above)) + slack * np.sqrt(p)
+
+
+def test_the_relay_is_the_limit_of_a_steep_sign():
+    w, h = jnp.linspace(-3.0, 3.0, 601), 1.0
+    steep, hard = relax(w, h, 1e9), relax(w, h, None)
+    np.testing.assert_allclose(hard, np.sign(w) * np.maximum(np.abs(w) - h, 0), atol=0)
+    # near |w| = h the smoothed sign is 1 up to 2/(pi p y): y is off by sqrt(2 h/(pi p)) at most
+    np.testing.assert_allclose(steep, hard, atol=np.sqrt(2 * h / (np.pi * 1e9)) * 1.01)
+    np.testing.assert_allclose(share(w, h, 1e9), np.clip(w / h, -1, 1), atol=3e-5)
+    np.testing.assert_array_equal(share(w, h, None), np.clip(w / h, -1, 1))
+
+
+def test_the_hard_twist_is_the_published_controller():
+    """Its two cases as R. Seeber and B. Andritsch print them, with x, v, T, k_1, k_2."""
+    rng = np.random.default_rng(1)
+    for x, v, T, k_1, k_2 in zip(*np.exp(rng.normal(size=(5, 200))), strict=True):
+        x = x * rng.choice([-1, 1])
+        if abs(x) <= k_2 * T**2:
+            after, u = v - x / T, v - 2 * x / T
+        else:
+            over = abs(x) - k_2 * T**2
+            r = 2 * over / (T * k_1 + np.sqrt(T**2 * k_1**2 + 4 * over))
+            after = v - k_2 * T * np.sign(x)
+            u = -k_1 * r * np.sign(x) + 2 * after - v
+        above, turned = twist(x, T * k_1, T**2 * k_2, None)
+        ours = v - T * k_2 * turned
+        np.testing.assert_allclose([ours, 2 * ours - v - k_1 * above], [after, u], rtol=1e-13, atol=1e-13)
+
+
+# Central differences with steps of 1e-6: their own error is 1e-9 or so of the value, more where the sign turns.
+@pytest.mark.parametrize(
+    "function", [share, lambda w, h, p: twist(w, h, 0.3 * h, p)[0], lambda w, h, p: relax(w, h, p)]
+)
+def test_derivatives_are_those_of_the_equation(function):
+    rng = np.random.default_rng(2)
+    for point in np.exp(rng.normal(size=(30, 3))):
+        slope = jax.grad(function, (0, 1, 2))(*point)
+        for n in range(3):
+            step = 1e-6 * np.eye(3)[n] * point
+            difference = (function(*(point + step)) - function(*(point - step))) / (2e-6 * point[n])
+            np.testing.assert_allclose(slope[n], difference, rtol=2e-7, atol=1e-9)
+    forward = jax.jacfwd(function, (0, 1, 2))(*point)
+    np.testing.assert_allclose(forward, slope, rtol=1e-12)
+
+
+@pytest.mark.parametrize("p", [25.0, None])
+def test_odd_and_finite_at_the_edges(p):
+    values = jnp.array([0.0, 1e-300, 1.0, 1e12])
+    for function in (lambda w: relax(w, 2.0, p), lambda w: share(w, 2.0, p), lambda w: twist(w, 2.0, 0.1, p)[0]):
+        np.testing.assert_array_equal(function(-values), -function(values))
+        slopes = jax.vmap(jax.grad(function))(jnp.concatenate([-values, values]))
+        assert np.isfinite(slopes).all()
+
+
+def test_float32_keeps_six_digits():
+    rng = np.random.default_rng(3)
+    w, h, p = (np.exp(rng.normal(0, 3, 1000)) for _ in range(3))
+    exact = share(w, h, p)
+    rough = share(*(x.astype(np.float32) for x in (w, h, p)))
+    assert rough.dtype == np.float32
+    np.testing.assert_allclose(rough, exact, atol=2e-6)
+
+
+def test_an_integrator_behind_the_relay_ends_at_the_disturbance():
+    """x+ = x + T (u + w), |w| < k: |x| <= T |w| after it was reached, whatever k, and u is -w of the sample before."""
+    T, k, x, past = 1e-3, 50.0, 0.7, 0.0
+    for n in range(100):
+        w = 3 * np.sin(0.05 * n)
+        u = -k * float(share(x, T * k, None))
+        x += T * (u + w)
+        if n > 40:
+            assert abs(x - T * w) < 1e-15
+            assert abs(u + past) < 1e-9
+        past = w
