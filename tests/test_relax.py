@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ambjax.numerics.relax import relax, share, twist
+from ambjax.numerics.relax import _twisted, relax, share, twist
 
 DECADES = st.floats(-9, 9).map(lambda x: 10.0**x)
 SIDES = st.sampled_from([-1.0, 1.0])
@@ -36,12 +36,9 @@ def test_relax_solves_its_equation_to_rounding(size, side, h, p):
 @settings(max_examples=300, deadline=None)
 def test_twist_solves_its_equation_to_rounding(size, side, a, b, p):
     x = side * size
-    above, turned = (float(value) for value in twist(x, a, b, p))
-    y = x - a * above - b * turned
-    # y is small against x here: what rounding makes of it, sgn_p and root_p see magnified by their slopes
-    slack = 30 * np.finfo(float).eps * size
-    assert abs(sign(y, p) - turned) <= 1e-12 + slack * p
-    assert abs(root(y, p) - above) <= 1e-12 * (1 + abs(above)) + slack * np.sqrt(p)
+    y = float(_twisted(*(jnp.asarray(number) for number in (x, a, b, p))))
+    assert abs(y + a * root(y, p) + b * sign(y, p) - x) <= 10 * np.finfo(float).eps * size
+    np.testing.assert_allclose(twist(x, a, b, p), (root(y, p), sign(y, p)), rtol=1e-14)
 
 
 def test_the_relay_is_the_limit_of_a_steep_sign():

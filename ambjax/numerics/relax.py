@@ -18,8 +18,8 @@ from ambjax.numerics.smooth import TWO_OVER_PI, arctan_per, safe_sqrt, smooth_ro
 # Steps of Halley's method from the root for another sign of the same slope and tail, which is 0.4 to 1 times the root:
 # 2 leave 3e-8 of the right-hand side, 3 rounding (Newton's method: 4 leave 2e-12).
 HALLEY = 3
-# Of Newton's method for a sign with a root beside it.
-NEWTON = 10
+# Of the same method for a sign with a root beside it.
+TWIST = 5
 
 
 def relax(w: Scalar, h: Scalar, p: Scalar | None) -> Array:
@@ -89,12 +89,14 @@ def _hard_twist(x: Array, a: Array, b: Array) -> Array:
 @jax.custom_jvp
 def _twisted(x: Array, a: Array, b: Array, p: Array) -> Array:
     size = jnp.abs(x)
-    # The left side is concave: from below Newton's method climbs to the solution. Without the root term it is too high.
+    # without the root term the solution is too high, with that of a solution too high it is too low
     above = relax(size, b, p)
     below = jnp.maximum(relax(size - a * smooth_root(above, p), b, p), _hard_twist(size, a, b))
     y = jnp.maximum(below, size / _steep(jnp.zeros_like(size), a, b, p))
-    for _ in range(NEWTON):
-        y = y + (size - y - a * smooth_root(y, p) - b * smooth_sign(y, p)) / _steep(y, a, b, p)
+    for _ in range(TWIST):
+        f, steep = y + a * smooth_root(y, p) + b * smooth_sign(y, p) - size, _steep(y, a, b, p)
+        newton = f / steep
+        y = jnp.maximum(y - newton / (1 + newton * _bend(y, a, b, p) / steep), 0.0)
     return jnp.where(x < 0, -y, y)
 
 
@@ -112,3 +114,10 @@ def _steep(y: Array, a: Array, b: Array, p: Array) -> Array:
     far = y * y + 1 / (p * p)
     fourth = jnp.sqrt(jnp.sqrt(far))
     return 1 + a * (1 - y * y / (2 * far)) / fourth + b * TWO_OVER_PI * p / (1 + (p * y) ** 2)
+
+
+def _bend(y: Array, a: Array, b: Array, p: Array) -> Array:
+    """Minus half the second derivative of y + a root_p(y) + b sgn_p(y), for y >= 0."""
+    far, flat = y * y + 1 / (p * p), 1 + (p * y) ** 2
+    root = (y * y / 4 + 1.5 / (p * p)) / (far * far * jnp.sqrt(jnp.sqrt(far)))
+    return y * (a * root / 2 + b * TWO_OVER_PI * p * (p / flat) ** 2)
