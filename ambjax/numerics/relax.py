@@ -19,7 +19,7 @@ from ambjax.numerics.smooth import TWO_OVER_PI, arctan_per, safe_sqrt, smooth_ro
 # 2 leave 3e-8 of the right-hand side, 3 rounding (Newton's method: 4 leave 2e-12).
 HALLEY = 3
 # Of the same method for a sign with a root beside it.
-TWIST = 5
+TWIST = 7
 
 
 def relax(w: Scalar, h: Scalar, p: Scalar | None) -> Array:
@@ -92,11 +92,14 @@ def _twisted(x: Array, a: Array, b: Array, p: Array) -> Array:
     # without the root term the solution is too high, with that of a solution too high it is too low
     above = relax(size, b, p)
     below = jnp.maximum(relax(size - a * smooth_root(above, p), b, p), _hard_twist(size, a, b))
-    y = jnp.maximum(below, size / _steep(jnp.zeros_like(size), a, b, p))
+    y = low = jnp.maximum(below, size / _steep(jnp.zeros_like(size), a, b, p))
+    high = above
     for _ in range(TWIST):
         f, steep = y + a * smooth_root(y, p) + b * smooth_sign(y, p) - size, _steep(y, a, b, p)
         newton = f / steep
-        y = jnp.maximum(y - newton / (1 + newton * _bend(y, a, b, p) / steep), 0.0)
+        low, high = jnp.where(f < 0, y, low), jnp.where(f < 0, high, y)
+        y = y - newton / (1 + newton * _bend(y, a, b, p) / steep)
+        y = jnp.where((y >= low) & (y <= high), y, safe_sqrt(low) * safe_sqrt(high))
     return jnp.where(x < 0, -y, y)
 
 
