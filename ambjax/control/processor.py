@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar, is_traced, leaf, record, static
-from ambjax.world.plant import Plant
+from ambjax.world.plant import Plant, State
 from ambjax.world.sensor import Measurement
 
 
@@ -60,18 +60,15 @@ class Processor:
 
 def carried(model: Plant, estimate: Measurement, past: tuple[Array, Array], lengths: tuple[Array, ...]) -> Measurement:
     """The estimate after these lengths (s), the last first, under past voltages: one RK4 step of the model each."""
+    x = model.start(estimate)
     for u, h in reversed(list(zip(past, lengths, strict=False))):
+        k_1 = model.rates(x, u)
+        k_2 = model.rates(_moved(x, h / 2, k_1), u)
+        k_3 = model.rates(_moved(x, h / 2, k_2), u)
+        k_4 = model.rates(_moved(x, h, k_3), u)
+        x = _moved(x, h / 6, jax.tree.map(lambda a, b, c, d: a + 2 * (b + c) + d, k_1, k_2, k_3, k_4))
+    return model.measurement(x)
 
-        def rates(x: Measurement, u: Array = u) -> Measurement:
-            z_ddot, i_dot = model.rates(x.z, x.z_dot, x.i, u)
-            return Measurement(x.z_dot, z_ddot, i_dot)
 
-        def moved(h: Array, k: Measurement, x: Measurement = estimate) -> Measurement:
-            return jax.tree.map(lambda x, d: x + h * d, x, k)
-
-        k_1 = rates(estimate)
-        k_2 = rates(moved(h / 2, k_1))
-        k_3 = rates(moved(h / 2, k_2))
-        k_4 = rates(moved(h, k_3))
-        estimate = moved(h / 6, jax.tree.map(lambda a, b, c, d: a + 2 * (b + c) + d, k_1, k_2, k_3, k_4))
-    return estimate
+def _moved(x: State, h: Array, rates: State) -> State:
+    return jax.tree.map(lambda a, b: a + h * b, x, rates)
