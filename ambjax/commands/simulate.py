@@ -13,9 +13,9 @@ from ambjax.commands.doubts import read_aloud
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.numerics.records import canonical
-from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.metrics import standard_for
 from ambjax.simulation.rollout import Outcome, begin_jit, finish, segment_jit
+from ambjax.simulation.sampled import system_of
 
 Summary = dict[str, Any]
 # Samples simulated between two strokes of the progress bar.
@@ -91,7 +91,7 @@ def _member(case: Case, args: argparse.Namespace) -> Case:
 def simulate(case: Case) -> Outcome:
     """A rollout of a case, recorded whole, with a progress bar if it takes more than two seconds."""
     fold = standard_for(case.settle, case.scenario)
-    loop, clock, fold = canonical((ClosedLoop(case.cascade, case.scenario), case.clock, fold))
+    loop, clock, fold = canonical((system_of(case.cascade, case.scenario, case.clock), case.clock, fold))
     progress, parts, done = begin_jit(loop, clock, fold), [], 0
     with tqdm(total=clock.samples, unit="sample", unit_scale=True, delay=2, leave=False, desc="simulate") as bar:
         while done < clock.samples:

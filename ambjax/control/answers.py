@@ -13,9 +13,11 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ambjax.control.search import Interval, Site
+from ambjax.numerics.records import is_traced
 from ambjax.world.plant import Plant
 
 L = TypeVar("L")
@@ -65,3 +67,25 @@ def ranges(law: Any, site: Site) -> dict[str, Interval]:
 def slides(law: Any) -> bool:
     """Whether an inversion law has a step of its own."""
     return hasattr(law, "slide")
+
+
+def hardened(law: L) -> L:
+    """The law with None for every steepness that is inf: the sign itself.
+
+    Raises ValueError where it is inf for some members only.
+    """
+    given: Any = law
+    hard = {}
+    for field in dataclasses.fields(given):
+        value = getattr(given, field.name)
+        if not field.metadata.get("steepness") or value is None or is_traced(value):
+            continue
+        infinite = np.isinf(np.asarray(value, float))
+        if infinite.any() and not infinite.all():
+            raise ValueError(
+                f"{field.name}: inf for some members and a number for others. A sign that is set-valued is another "
+                "program: give inf to all or to none."
+            )
+        if infinite.all():
+            hard[field.name] = None
+    return dataclasses.replace(given, **hard) if hard else law

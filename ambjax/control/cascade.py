@@ -3,6 +3,7 @@
 Its modularity is the paper's first contribution: any law of a stage may stand with any of the others.
 """
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -73,6 +74,7 @@ class Cascade:
 
     A law left out is the paper's, with the gains of Table 2 and a p that suits the model (`answers.default_law`): 25
     for the plant of Table 1. Laws are made once: `dataclasses.replace` with another model keeps those that are there.
+    `processor`: what the cascade runs on; None: continuous time, as in the paper.
     """
 
     observer: Observer = _LEFT_OUT
@@ -80,6 +82,7 @@ class Cascade:
     inversion: InversionLaw = _LEFT_OUT
     current: CurrentLaw = _LEFT_OUT
     model: Plant = Plant()
+    processor: Processor | None = None
 
     def __post_init__(self) -> None:
         for stage, kind in USUAL.items():
@@ -135,13 +138,19 @@ class Cascade:
         rates = CascadeState(observed_rate, positioned_rate, (), ())
         return ForceDemand(z, z_rate, v_star, v_star_rate, gaps), estimate, rates
 
-    def step(
-        self, processor: Processor, measured: Measurement, state: CascadeState, sample: Sample
-    ) -> tuple[Command, CascadeState]:
+    def on_processor(self) -> "Cascade":
+        """The cascade with everything settled that decides which program is compiled for it: signs whose steepness is
+        inf become set-valued, and see `Processor.resolved`."""
+        assert self.processor is not None
+        laws = {stage: answers.hardened(getattr(self, stage)) for stage in USUAL}
+        return dataclasses.replace(self, **laws, processor=self.processor.resolved())
+
+    def step(self, measured: Measurement, state: CascadeState, sample: Sample) -> tuple[Command, CascadeState]:
         """Command of one sample on a processor, and states of the laws for the next one.
 
         With prediction all but the observer act on the estimate carried over the delay.
         """
+        processor: Any = self.processor
         advance = functools.partial(stepped, model=self.model, period=sample.period, implicit=processor.implicit)
 
         def wanted(reference: Reference, z: Array, z_dot: Array, observed: State, positioned: State):

@@ -20,10 +20,10 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.kernel import block_bytes, one_kernel
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import Fold
-from ambjax.simulation.rollout import Outcome, check_inputs, run
+from ambjax.simulation.rollout import Outcome, System, check_inputs, run
+from ambjax.simulation.sampled import system_of
 from ambjax.world.scenario import Scenario
 
 MOST_CALL = 4096
@@ -58,7 +58,7 @@ def run_ensemble(
     """
     check_inputs(cascade, scenario, clock)
     clock = with_method(clock, cascade, scenario)
-    tree = canonical((ClosedLoop(cascade, scenario), clock, fold))
+    tree = canonical((system_of(cascade, scenario, clock), clock, fold))
     return map_members(_rollout(every), tree, threads=threads, call=call)
 
 
@@ -66,9 +66,9 @@ def run_ensemble(
 def _rollout(every: int) -> Callable[[Any], Outcome]:
     """The rollout of one member; the same function each time, so that it compiles once."""
 
-    def one(tree: tuple[ClosedLoop, Clock, Fold | None]) -> Outcome:
-        loop, clock, fold = tree
-        return run(loop, clock, fold, every)
+    def one(tree: tuple[System, Clock, Fold | None]) -> Outcome:
+        system, clock, fold = tree
+        return run(system, clock, fold, every)
 
     return one
 

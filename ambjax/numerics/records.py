@@ -60,9 +60,10 @@ GAINS = 1e-30, 1e30
 def gain(*, default: Any, unit: str, doc: str, steepness: bool = False) -> Any:
     """A positive numeric field over all decades, which may be tuned on a scale of logarithms.
 
-    `steepness`: that of a smoothed sign, which is suited to the plant, and tuned only where that is asked for.
+    `steepness`: that of a smoothed sign, which is suited to the plant, and tuned only where that is asked for; inf, the
+    sign itself, on a processor.
     """
-    plain = leaf(default=default, unit=unit, doc=doc, above=GAINS[0], at_most=GAINS[1])
+    plain = leaf(default=default, unit=unit, doc=doc, above=GAINS[0], at_most=GAINS[1], infinite=steepness)
     return dataclasses.field(default=default, metadata={**plain.metadata, "steepness": steepness})
 
 

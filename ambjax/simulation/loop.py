@@ -109,7 +109,7 @@ class ClosedLoop:
         u_max = jnp.asarray(self.scenario.u_max)
         seen = self.measured(state.plant, hold)
         command, rates = self.cascade(seen, state.control, inputs.reference, u_max)
-        return command, rates, _limited(command.u, u_max)
+        return command, rates, limited(command.u, u_max)
 
     def rates(self, inputs: Inputs, state: LoopState, hold: Errors) -> LoopState:
         """Time derivative of the state: Eqs. (1), (2) and the laws."""
@@ -135,8 +135,12 @@ class ClosedLoop:
 
     def fate(self, state: LoopState) -> Array:
         """0 while the rotor is levitated, else the code of what became of it."""
-        sane = [jnp.abs(x) <= DIVERGENCE * s for x, s in zip(*map(jax.tree.leaves, (state, self.scale())), strict=True)]
-        touched = jnp.abs(self.scenario.plant.measurement(state.plant).z) >= self.scenario.touchdown
+        return self.judged(state, self.scale(), state.plant)
+
+    def judged(self, state: Any, scale: Any, plant: Any) -> Array:
+        """The same of a state, or a part of one, and its scale; with the state of the plant."""
+        sane = [jnp.abs(x) <= DIVERGENCE * s for x, s in zip(*map(jax.tree.leaves, (state, scale)), strict=True)]
+        touched = jnp.abs(self.scenario.plant.measurement(plant).z) >= self.scenario.touchdown
         return jnp.where(functools.reduce(jnp.logical_and, sane), jnp.where(touched, TOUCHED, ALIVE), DIVERGED).astype(
             jnp.int32
         )
@@ -158,17 +162,22 @@ class ClosedLoop:
 
     def row(self, t: Scalar, state: LoopState, hold: Errors, alive: Array) -> Row:
         """All signals at one instant. The drive of a lost rotor is off: u = 0."""
-        plant = self.scenario.plant
-        motion, signals, inputs = plant.measurement(state.plant), plant.signals(state.plant), self.inputs(t)
+        inputs = self.inputs(t)
         command, _, u = self.command(inputs, state, hold)
+        return self.signals(t, inputs, state.plant, command._replace(u=u), hold, alive)
+
+    def signals(self, t: Scalar, inputs: Inputs, state: Any, command: Command, hold: Errors, alive: Array) -> Row:
+        """All signals of a state of the plant and what was decided there, u within the supply's limit."""
+        plant = self.scenario.plant
+        motion, signals = plant.measurement(state), plant.signals(state)
         return Row(
             t=jnp.asarray(t),
             z=motion.z,
             z_dot=motion.z_dot,
             i=motion.i,
             i_ref=command.i_ref,
-            u=jnp.where(alive, u, 0.0),
-            u_mean=jnp.zeros_like(u),
+            u=jnp.where(alive, command.u, 0.0),
+            u_mean=jnp.zeros_like(command.u),
             v=signals.v,
             v_star=command.v_star,
             v_tilde=command.v_tilde,
@@ -203,6 +212,6 @@ class Realised(ClosedLoop):
         return self.key
 
 
-def _limited(u: Array, u_max: Array) -> Array:
+def limited(u: Array, u_max: Array) -> Array:
     """u held within -u_max..u_max. Not jnp.clip, which looks for NaN at three times the cost."""
     return jnp.where(u > u_max, u_max, jnp.where(u < -u_max, -u_max, u))

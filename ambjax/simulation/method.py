@@ -16,6 +16,8 @@ from ambjax.world.scenario import Scenario
 
 # RK4 at this step times slope is accurate to about 1e-9 m on smooth gains (benchmarks/work_precision.py)
 ACCURATE = 1.0
+# The plant under a held voltage is not stiff: RK4 at this step times its pole leaves less than 1e-11 m.
+SAMPLED = 0.02
 # More RK4 substeps per sample than this cost more than the L-stable method's larger steps.
 MOST_SUBSTEPS = 4
 # Fixed L-stable steps: the corner of a smoothed sign costs an impulse that grows as slope h^2. At this value the
@@ -32,7 +34,8 @@ def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
 
     Raises ValueError where a gain is traced: a step can be chosen only from numbers.
     """
-    named = dict(cascade.slopes()) | {"plant": scenario.plant.slope()}
+    # on a processor the laws are stepped, and the plant alone is integrated
+    named = ({} if cascade.processor else dict(cascade.slopes())) | {"plant": scenario.plant.slope()}
     if any(is_traced(x) for x in named.values()):
         raise ValueError(
             "clock.method is None (dt = 'auto'), but inside jit, grad or vmap the gains are traced and no "
@@ -50,6 +53,8 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
     disturbance between the steps of these costs about 3e-8 m per m/s^2 on smooth gains.
     """
     slope = max(slopes(cascade, scenario).values())
+    if cascade.processor is not None:
+        return RK4(max(math.ceil(sample_period * slope / SAMPLED), 1))
     substeps = math.ceil(sample_period * slope / ACCURATE)
     if substeps <= MOST_SUBSTEPS and (reverse or scenario.sensor is not None):
         return RK4(max(substeps, 1))

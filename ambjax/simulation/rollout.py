@@ -1,5 +1,6 @@
 """Rollout: a cascade in a scenario, sample by sample, to a trajectory, to folds, or to both."""
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple, Protocol, Self
 
@@ -7,14 +8,15 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from ambjax.control.cascade import Cascade
+from ambjax.control import answers
+from ambjax.control.cascade import Cascade, CascadeState
 from ambjax.numerics.kernel import one_kernel
 from ambjax.numerics.records import Scalar, canonical, validate
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.integrate import Advanced, Problem, choose
-from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import Ending, Fold
+from ambjax.simulation.sampled import system_of
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import ALIVE, Trajectory, first_time
 from ambjax.world.scenario import Scenario
@@ -76,17 +78,33 @@ def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | 
     """
     check_inputs(cascade, scenario, clock)
     clock = with_method(clock, cascade, scenario)
-    loop, clock, fold = canonical((ClosedLoop(cascade, scenario), clock, fold))
+    loop, clock, fold = canonical((system_of(cascade, scenario, clock), clock, fold))
     return roll(loop, clock, fold, every=every)
 
 
 def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     """Raise ValueError, with the dotted path and the fix, for whatever concrete value is not allowed."""
-    validate(cascade, "controller")
+    validate(dataclasses.replace(cascade, processor=None), "controller")
+    if cascade.processor is None:
+        check_smooth(cascade)
+    else:
+        validate(cascade.processor, "processor")
     validate(scenario, "scenario")
     validate(clock, "clock")
     if clock.samples < 1:
         raise ValueError(f"clock.samples = {clock.samples}: there must be at least 1 sample.")
+
+
+def check_smooth(cascade: Cascade) -> None:
+    """Raise ValueError for a sign without a layer, which continuous time does not know."""
+    hard = answers.hardened
+    for stage, law in zip(CascadeState._fields, cascade.laws, strict=True):
+        for name in vars(law):
+            if getattr(hard(law), name) is None and getattr(law, name) is not None:
+                raise ValueError(
+                    f"controller.{stage}.{name} = inf: in continuous time a sign must be smoothed. Give a number, or "
+                    "a [processor], on which the sign itself is stepped."
+                )
 
 
 def run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:

@@ -1,4 +1,4 @@
-"""The loop of a cascade on a processor: sensors read, laws stepped and a voltage chosen once a sample, the plant between.
+"""The loop of a cascade on a processor: sensors read, laws stepped, a voltage held, the plant in between.
 
 At t_n, in this order: the plant is measured; the laws step; u_n, held within the supply's limit, acts from
 t_n + delay T until t_{n+1} + delay T (before the first, u = 0); the plant alone moves to t_{n+1}, under one voltage, or
@@ -12,13 +12,15 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.cascade import CascadeState, Command, Sample
+from ambjax.control.cascade import Cascade, CascadeState, Command, Sample
 from ambjax.control.processor import Processor
 from ambjax.numerics.records import Scalar, record
+from ambjax.simulation.clock import Clock
 from ambjax.simulation.integrate import Advanced, Integrator, Problem, in_turn
 from ambjax.simulation.loop import SHOWN, ClosedLoop, Densities, Inputs, LoopState, Sizes, limited
 from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import DIVERGED, Row
+from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors
 from ambjax.world.signals import reference_at
 
@@ -39,11 +41,17 @@ class Sampled:
     """The closed loop with its cascade on a processor, one step a `period` (s)."""
 
     loop: ClosedLoop
-    processor: Processor
     period: Scalar
 
+    @property
+    def processor(self) -> Processor:
+        """What the cascade runs on."""
+        processor = self.loop.cascade.processor
+        assert processor is not None
+        return processor
+
     def realised(self) -> "Sampled":
-        return Sampled(self.loop.realised(), self.processor, self.period)
+        return Sampled(self.loop.realised(), self.period)
 
     def hold(self, sample: Scalar) -> Errors:
         return self.loop.hold(sample)
@@ -60,7 +68,7 @@ class Sampled:
         past = (state.command.u, state.past[0])
         sample = Sample(reference_at(scenario.reference, t + late), self.period, jnp.asarray(scenario.u_max), past)
         measured = self.loop.measured(state.plant, hold)
-        command, control = self.loop.cascade.step(processor, measured, state.control, sample)
+        command, control = self.loop.cascade.step(measured, state.control, sample)
         command = command._replace(u=limited(command.u, sample.u_max))
         new = (control, command)
         sane = functools.reduce(jnp.logical_and, map(jnp.isfinite, jax.tree.leaves(new)))
@@ -106,7 +114,7 @@ class Sampled:
         return Problem(loop.inputs, rates, scale, self._fate, None, observed, SHOWN)
 
     def _fate(self, plant: Any) -> Array:
-        return self.loop.fate_of(plant)
+        return self.loop.judged(plant, self.loop.scenario.plant.scale(), plant)
 
     def fate(self, state: SampledState) -> Array:
         return self._fate(state.plant)
@@ -119,7 +127,7 @@ class Sampled:
 
     def row(self, t: Scalar, state: SampledState, hold: Errors, alive: Array) -> Row:
         """Sample n: the plant, u_n, and i_ref before its step."""
-        return self.loop.shown_as_row(t, state.plant, state.command, hold, alive)
+        return self.loop.signals(t, self.loop.inputs(t), state.plant, state.command, hold, alive)
 
     def noted(self, row: Row, span: Span) -> Row:
         return self.loop.noted(row, span)
@@ -132,3 +140,10 @@ def _one_of(voltages: tuple[Array, ...], lag: Array) -> Array:
     """The voltage of the sample so many before."""
     now, before, first = voltages
     return jnp.where(lag < 0.5, now, jnp.where(lag < 1.5, before, first))
+
+
+def system_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> ClosedLoop | Sampled:
+    """The loop to roll out: with the cascade in continuous time, or on its processor."""
+    if cascade.processor is None:
+        return ClosedLoop(cascade, scenario)
+    return Sampled(ClosedLoop(cascade.on_processor(), scenario), clock.sample_period)
