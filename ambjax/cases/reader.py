@@ -15,6 +15,7 @@ from ambjax.cases.spread import spread_from
 from ambjax.cases.table import Table, check_depth, load, show
 from ambjax.control import answers, current, inversion, observer, position
 from ambjax.control.cascade import Cascade
+from ambjax.control.processor import Processor
 from ambjax.ensemble.spread import Spread, corners
 from ambjax.host.words import one_line
 from ambjax.numerics.records import leaf, numbers
@@ -45,10 +46,23 @@ SIGNALS: dict[str, type] = {
     "band-noise": signals.BandNoise,
     "sum": signals.Sum,
 }
+DISCRETISATIONS = ["implicit", "explicit"]
 METHODS: dict[str, type] = {"rk4": RK4, "dop853": DOP853, "euler": Euler, "rodas3": Rodas3, "sliding": Slide}
 # Substeps of the sliding step where dt = "auto".
 SLIDING_SUBSTEPS = 3
-TABLES = ["plant", "controller", "reference", "disturbance", "sensor", "actuator", "initial", "clock", "run", "spread"]
+TABLES = [
+    "plant",
+    "controller",
+    "processor",
+    "reference",
+    "disturbance",
+    "sensor",
+    "actuator",
+    "initial",
+    "clock",
+    "run",
+    "spread",
+]
 OTHERS = ["tune"]  # read by ambjax-tune; the commands here pass it by
 UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
 # Rows that a run may record: 16 numbers each, so this is about 2.5 GB.
@@ -58,6 +72,7 @@ MOST_STEPS, MOST_TERMS = 10_000_000_000, 100
 DURATION = leaf(default=2.0, unit="s", at_least=1e-9, at_most=1e6, doc="simulated time")
 DT = leaf(default=1e-6, unit="s", at_least=1e-15, at_most=1e6, doc="integration step")
 SETTLE = leaf(default=0.5, unit="s", at_least=0, at_most=1e6, doc='from when "settled" metrics count')
+(DELAY,) = (field for field in dataclasses.fields(Processor) if field.name == "delay")
 FIELDS = {field.name: field for kind in (Scenario, Clock) for field in dataclasses.fields(kind)}
 # A name enters titles, paths, tables and pages: whatever means something there is left out of it.
 UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
@@ -99,13 +114,15 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     top = Table(raw)
     top.only([*TABLES, *OTHERS])
     plant = top.table("plant").record(Plant)
-    cascade = _cascade(top.table("controller"), plant)
+    processor = _processor(top.table("processor")) if "processor" in top.raw else None
+    cascade = _cascade(top.table("controller"), plant, processor)
     scenario, settle = _scenario(top, plant)
     clock, duration = _clock(top.table("clock"))
     if isinstance(clock.method, Slide) and not slides(cascade, scenario.plant):
         made = " or ".join(f'"{kind}"' for kind, law in KINDS["inversion"].items() if answers.slides(law))
         raise ValueError(
-            f'clock.method = "sliding": it is made for controller.inversion.kind = {made}. Use method = "adaptive".'
+            f'clock.method = "sliding": it is made for controller.inversion.kind = {made} in continuous time. Use '
+            'method = "adaptive".'
         )
     _check_start(scenario)
     if settle is None:
@@ -118,7 +135,14 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     return Case(safe_name(name), cascade, scenario, clock, settle, spread)
 
 
-def _cascade(table: Table, plant: Plant) -> Cascade:
+def _processor(table: Table) -> Processor:
+    table.only(["delay", "discretisation", "predict"])
+    delay = table.leaf("delay", DELAY, DELAY.default)
+    implicit = table.choice("discretisation", DISCRETISATIONS, DISCRETISATIONS[0]) == DISCRETISATIONS[0]
+    return Processor(delay, implicit, table.switch("predict"))
+
+
+def _cascade(table: Table, plant: Plant, processor: Processor | None) -> Cascade:
     table.only(["model", *KINDS])
     model = table.table("model").record(Plant, base=plant)
     laws = {}
@@ -126,7 +150,7 @@ def _cascade(table: Table, plant: Plant) -> Cascade:
         law = table.table(stage)
         kind = law.choice("kind", list(kinds), next(iter(kinds)))
         laws[stage] = law.record(kinds[kind], extra=("kind",), base=answers.default_law(kinds[kind], model))
-    return Cascade(model=model, **laws)
+    return Cascade(model=model, processor=processor, **laws)
 
 
 def _signal(table: Table, extra: tuple[str, ...] = ()) -> Any:

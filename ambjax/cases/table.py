@@ -99,6 +99,13 @@ class Table:
             check_number(field, self.at(key), value)
         return value
 
+    def switch(self, key: str) -> bool | None:
+        """true or false; None if left out."""
+        value = self.raw.get(key)
+        if value is not None and not isinstance(value, bool):
+            raise ValueError(f"{self.at(key)} = {show(value)}: it must be true or false, without quotes.")
+        return value
+
     def choice(self, key: str, allowed: list[str], default: str | None = None) -> str:
         """One of several words."""
         value = self.raw.get(key, default)

@@ -38,6 +38,11 @@ settle = 0.5                  # s; from when "settled" metrics count (left out: 
 # std_z_dot = 0.0             # m/s
 # std_i = 0.0                 # A
 
+# [processor]                 # the laws as they run on a processor, a step a sample (left out: in continuous time)
+# delay = 1.0                 # samples from measurement to voltage, 0 to 2, fractions too
+# discretisation = "implicit" # signs act on where the step ends, and p = inf is allowed; or "explicit"
+# predict = true              # the laws see the estimate carried over the delay (left out: where there is a delay)
+
 # [actuator]
 # u_max = 200.0               # V; limit of the supply (left out: none)
 

@@ -145,4 +145,4 @@ def _axpy(x: Any, h: Scalar, rate: Any) -> Any:
 
 def slides(cascade: Cascade, plant: Bearing) -> bool:
     """Whether this step is made for the cascade and the plant."""
-    return answers.slides(cascade.inversion) and plant.lumped
+    return cascade.processor is None and answers.slides(cascade.inversion) and plant.lumped
