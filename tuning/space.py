@@ -127,13 +127,15 @@ class Space:
 def tunable(cascade: Cascade, *, steepness: bool = True) -> list[str]:
     """Dotted paths of all gains of a cascade that may be tuned: the positive leaves of its laws.
 
-    `steepness`: those of smoothed signs too.
+    `steepness`: those of smoothed signs too, where they are smoothed.
     """
     paths = []
     for stage in STAGES:
-        for field in dataclasses.fields(getattr(cascade, stage)):
+        law = getattr(cascade, stage)
+        for field in dataclasses.fields(law):
             meta = field.metadata
-            if meta.get("leaf") and meta["above"] is not None and (steepness or not meta.get("steepness")):
+            positive = meta.get("leaf") and meta["above"] is not None and getattr(law, field.name) is not None
+            if positive and (steepness or not meta.get("steepness")):
                 paths.append(f"{ROOT}.{stage}.{field.name}")
     return paths
 

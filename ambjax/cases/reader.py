@@ -150,7 +150,8 @@ def _cascade(table: Table, plant: Plant, processor: Processor | None) -> Cascade
         law = table.table(stage)
         kind = law.choice("kind", list(kinds), next(iter(kinds)))
         laws[stage] = law.record(kinds[kind], extra=("kind",), base=answers.default_law(kinds[kind], model))
-    return Cascade(model=model, processor=processor, **laws)
+    cascade = Cascade(model=model, processor=processor, **laws)
+    return cascade if processor is None else cascade.on_processor()
 
 
 def _signal(table: Table, extra: tuple[str, ...] = ()) -> Any:

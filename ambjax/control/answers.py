@@ -89,3 +89,11 @@ def hardened(law: L) -> L:
         if infinite.all():
             hard[field.name] = None
     return dataclasses.replace(given, **hard) if hard else law
+
+
+def softened(law: L, model: Plant) -> L:
+    """The law with the steepness that suits the model for every sign that has none."""
+    given: Any = law
+    none = [f.name for f in dataclasses.fields(given) if f.metadata.get("steepness") and getattr(given, f.name) is None]
+    usual = default_law(type(law), model)
+    return dataclasses.replace(given, **{name: getattr(usual, name) for name in none}) if none else law

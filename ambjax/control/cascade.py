@@ -145,6 +145,11 @@ class Cascade:
         laws = {stage: answers.hardened(getattr(self, stage)) for stage in USUAL}
         return dataclasses.replace(self, **laws, processor=self.processor.resolved())
 
+    def in_continuous_time(self) -> "Cascade":
+        """The cascade without its processor; signs without a layer get the steepness that suits the model."""
+        laws = {stage: answers.softened(getattr(self, stage), self.model) for stage in USUAL}
+        return dataclasses.replace(self, **laws, processor=None)
+
     def step(self, measured: Measurement, state: CascadeState, sample: Sample) -> tuple[Command, CascadeState]:
         """Command of one sample on a processor, and states of the laws for the next one.
 

@@ -71,7 +71,8 @@ class Adaptive:
     def ranges(self, site: Site) -> dict[str, Interval]:
         needed, words = site.delta_1
         name = words.partition(" ")[0]
-        return {"gamma": Interval(needed, 100 * needed, f"{name} to 100 {name}, {words}")}
+        times = 1000 if site.stepped else 100
+        return {"gamma": Interval(needed, times * needed, f"{name} to {times} {name}, {words}")}
 
     def slide(self, model: Plant, begin: ForceDemand, end: ForceDemand, i_ref: Array, h: Scalar) -> Relaxation:
         """i_ref over a step: it slides to the sign's layer, and is slaved to v_star from there on. Eq. (14a)."""

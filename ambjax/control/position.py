@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.answers import Requirement
-from ambjax.control.search import Interval, Site, manifold, rate, switch
+from ambjax.control.search import Interval, Site, authority, manifold, rate, switch
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share, twist
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_root, smooth_sign
@@ -66,7 +66,12 @@ class SlidingMode:
         return -self.k * smooth_sign(sigma, self.p)
 
     def ranges(self, site: Site) -> dict[str, Interval]:
-        return {"c": manifold(site), "k": switch(site, "k", self.p, 100, "Q_z")}
+        if site.stepped:
+            most = site.w**2 * float(site.model.s_0)
+            k = authority(site, most, (1e-3, 0.3), "w^2 s_0: what the magnets accelerate the rotor by", "Q_z")
+        else:
+            k = switch(site, "k", self.p, 100, "Q_z")
+        return {"c": manifold(site), "k": k}
 
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()], period: Scalar

@@ -11,7 +11,8 @@ from ambjax.world.plant import Plant
 class Site(NamedTuple):
     """The surroundings of a search: nominal plant, pole w of the true one (1/s), sample period (s).
 
-    `bounds`: what Theorem 1 requires gains to exceed, by symbol. `delta_1`: what Eq. (7) asks of the reference or of a
+    `stepped`: on a processor, by laws whose signs act on the step's end. `bounds`: what Theorem 1 requires gains to
+    exceed, by symbol. `delta_1`: what Eq. (7) asks of the reference or of a
     fall, whichever is more, A^2/m^2/s, and in words.
     """
 
@@ -20,6 +21,7 @@ class Site(NamedTuple):
     period: float
     bounds: Mapping[str, float]
     delta_1: tuple[float, str]
+    stepped: bool = False
 
     @property
     def pole(self) -> str:
@@ -53,6 +55,16 @@ def switch(site: Site, name: str, p: Scalar, times: float, over: str) -> Interva
     per, below = TWO_OVER_PI * float(p), site.bounds.get(over, 0.0)
     low, high = site.w / 3 / per, times * site.w / per
     words = f"slope 2/pi {name} p from w/3 to {times:g} w, {site.pole}"
+    if 2 * below > low:
+        words += f"; at least twice the disturbance, {below:.3g}"
+    return Interval(max(low, 2 * below), max(high, 200 * below), words)
+
+
+def authority(site: Site, size: Scalar, share: tuple[float, float], what: str, over: str) -> Interval:
+    """A switching gain on a processor, where no slope limits it: these shares of `size`, which is `what` in words."""
+    below = site.bounds.get(over, 0.0)
+    low, high = (part * float(size) for part in share)
+    words = f"{share[0]:g} to {share[1]:g} of {float(size):.3g}, {what}"
     if 2 * below > low:
         words += f"; at least twice the disturbance, {below:.3g}"
     return Interval(max(low, 2 * below), max(high, 200 * below), words)

@@ -179,7 +179,9 @@ def validate(node: Any, path: str = "") -> None:
         value = getattr(node, field.name)
         if not is_leaf:
             validate(value, f"{path}.{field.name}".lstrip("."))
-        elif not (is_traced(value) or (value is None and field.metadata["optional"])):
+        elif not (
+            is_traced(value) or (value is None and (field.metadata["optional"] or field.metadata.get("steepness")))
+        ):
             check_number(field, f"{path}.{field.name}".lstrip("."), value)
 
 

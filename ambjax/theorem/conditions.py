@@ -118,11 +118,14 @@ MONITORS = Named(
 
 
 def check(cascade: Cascade, scenario: Scenario, clock: Clock) -> Report:
-    """Run the loop once, monitored, and judge the conditions of Theorem 1 along it.
+    """Run the loop once, monitored, and judge the conditions of Theorem 1 along it: in continuous time, whatever the
+    cascade runs on.
 
     Raises ValueError as `rollout` does.
     """
     check_inputs(cascade, scenario, clock)
+    if cascade.processor is not None:
+        cascade, clock = cascade.in_continuous_time(), dataclasses.replace(clock, method=None)
     clock = with_method(clock, cascade, scenario)
     method = str(clock.method)
     system, clock, fold = canonical((Monitored(ClosedLoop(cascade, scenario)), clock, MONITORS))

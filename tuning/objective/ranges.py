@@ -67,7 +67,9 @@ def _site(objective: Objective, conditions: tuple[Bound, ...]) -> Site:
         needed = delta, f"Delta_1 = {delta:.3g} A^2/m^2/s along the reference, Eq. (7)"
     else:
         needed = fall * z, f"D = dv/dz w z = {fall * z:.3g} A^2/m^2/s, what Eq. (7) asks of a fall from {where}"
-    return Site(model, w, float(objective.clock.sample_period), bounds, needed)
+    processor = objective.cascade.processor
+    stepped = processor is not None and processor.implicit
+    return Site(model, w, float(objective.clock.sample_period), bounds, needed, stepped)
 
 
 def _range(site: Site, cascade: Any, gain: Gain, value: float) -> Range:
