@@ -118,6 +118,14 @@ DOCUMENT = st.fixed_dictionaries(
         "controller": st.fixed_dictionaries({}, optional={"model": table_of(Plant)} | {s: law(s) for s in KINDS}),
         "reference": signal(small=True),
         "disturbance": st.fixed_dictionaries({}, optional={"q_z": signal(small=False), "q_i": signal(small=False)}),
+        "processor": st.fixed_dictionaries(
+            {},
+            optional={
+                "delay": st.floats(-0.1, 2.1),
+                "discretisation": st.sampled_from(["implicit", "explicit", "hold"]),
+                "predict": st.sampled_from([True, False, 1]),
+            },
+        ),
         "sensor": table_of(Sensor),
         "actuator": st.fixed_dictionaries({}, optional={"u_max": number(FIELDS["u_max"])}),
         "initial": table_of(Initial, z=st.floats(-3e-3, 3e-3)),

@@ -1,8 +1,11 @@
 """The loop on a processor against an independent simulator of it, which shares no code: the same world solved twice."""
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from sampled_oracle import World, simulate
@@ -10,6 +13,9 @@ from test_oracle import adaptive, current, pulse, sine, smc, smoothstep, twistin
 
 import ambjax as amb
 from ambjax.control.processor import Processor
+from ambjax.ensemble import run_ensemble
+from ambjax.simulation.sampled import system_of
+from ambjax.simulation.trajectory import DIVERGED
 
 KINDS = {
     "observer": {"direct": amb.observer.Direct, "complementary": amb.observer.Complementary},
@@ -118,3 +124,148 @@ def test_against_the_independent_simulator(case):
     np.testing.assert_allclose(rows.i_ref, run.i_ref, rtol=0, atol=1e-9)
     largest = np.abs(run.u).max()
     np.testing.assert_allclose(rows.u, run.u, rtol=0, atol=1e-6 * largest)
+
+
+def cascade_of(p=INF, **processor):
+    """Gains that hold the rotor at 10 kHz with a sample of delay, under noise and on 200 V."""
+    c, k, gamma, k_i = 1440.0, 2.3, 8e5, 870.0
+    return amb.Cascade(
+        position=amb.position.SlidingMode(c, k, p),
+        inversion=amb.inversion.Adaptive(gamma, p),
+        current=amb.current.SlidingMode(k_i, p),
+        processor=Processor(**processor),
+    )
+
+
+NOISY = amb.Scenario(reference=amb.Sine(2.5e-3, 2.0), sensor=amb.Sensor(*NOISE), u_max=200.0, seed=3)
+SHORT = amb.Clock(300, 1e-4)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.4, 1.0, 1.6])
+def test_the_voltage_of_a_sample_acts_late(delay):
+    """u as folded over time is u_n shifted by the delay, and 0 before the first."""
+    outcome = amb.rollout(cascade_of(delay=delay), NOISY, SHORT)
+    u, mean = (np.asarray(getattr(outcome.trajectory.rows, name)) for name in ("u", "u_mean"))
+    late = math.floor(delay)
+    acting = np.concatenate([np.zeros(3), u])
+    share = delay - late
+    expected = share * acting[2 - late : -1 - late] + (1 - share) * acting[3 - late : len(acting) - late]
+    # a sum of two products in another order
+    np.testing.assert_allclose(mean, expected, atol=1e-12 * 200)
+
+
+def test_a_member_is_the_rollout_of_it_whatever_the_delays_of_others():
+    delays = np.array([0.0, 0.5, 1.0, 2.0])
+    scenario = dataclasses.replace(NOISY, member=np.arange(4))
+    cascade = cascade_of(delay=delays)
+    fold = amb.simulation.metrics.Rms("e_z")
+    together = run_ensemble(cascade, scenario, SHORT, fold=fold).measured
+    for member, delay in enumerate(delays):
+        one = dataclasses.replace(NOISY, member=member)
+        alone = amb.rollout(cascade_of(delay=delay, predict=True), one, SHORT, fold=fold).measured
+        # with two stretches of a sample, of which one is empty, instead of one: rounding
+        np.testing.assert_allclose(together[member], alone, rtol=1e-9)
+
+
+def loss_of(clock, p):
+    settled = cascade_of(p).on_processor()
+
+    def loss(logs):
+        c, k, gamma, k_i = np.array([1440.0, 2.3, 8e5, 870.0]) * jnp.exp(logs)
+        cascade = dataclasses.replace(
+            settled,
+            position=dataclasses.replace(settled.position, c=c, k=k),
+            inversion=dataclasses.replace(settled.inversion, gamma=gamma),
+            current=dataclasses.replace(settled.current, k_i=k_i),
+        )
+        return 1e9 * amb.rollout(cascade, NOISY, clock, fold=amb.simulation.metrics.Rms("e_z"), every=0).measured
+
+    return loss
+
+
+@pytest.mark.parametrize("p", [2.0, INF])
+def test_gradients_three_ways(p):
+    clock = amb.Clock(100, 1e-4, amb.RK4(2))
+    loss, at = loss_of(clock, p), np.array([0.1, -0.2, 0.05, 0.1])
+    forward, reverse = jax.jacfwd(loss)(at), jax.grad(loss)(at)
+    scale = np.abs(forward).max()
+    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-10 * scale)
+    # central differences: their error is step^2 times a third derivative; where no clip switches, as here
+    step = 1e-5
+    differences = [(loss(at + d) - loss(at - d)) / (2 * step) for d in step * np.eye(4)]
+    np.testing.assert_allclose(forward, differences, rtol=0, atol=1e-6 * scale)
+
+
+@pytest.mark.parametrize("p", [25.0, INF])
+def test_gradients_are_finite_over_six_decades_of_gains(p):
+    loss = loss_of(amb.Clock(40, 1e-4, amb.RK4(1)), p)
+    points = np.random.default_rng(4).uniform(-6.9, 6.9, (500, 4))
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(loss)))(points)
+    assert np.isfinite(values).all()
+    assert np.isfinite(slopes).all()
+
+
+def test_a_lost_rotor_is_frozen_with_its_drive_off():
+    cascade = dataclasses.replace(cascade_of(25.0), inversion=amb.inversion.Adaptive(1000.0))
+    trajectory = amb.rollout(cascade, NOISY, SHORT).trajectory
+    assert 0 < trajectory.lost_at < 0.03
+    rows = trajectory.rows
+    after = np.asarray(rows.t) > trajectory.lost_at
+    for name in ("z", "i", "i_ref"):
+        signal = np.asarray(getattr(rows, name))
+        assert np.isfinite(signal).all()
+        assert np.ptp(signal[after]) == 0
+    assert not np.asarray(rows.u)[after].any()
+
+
+@pytest.mark.parametrize(
+    "law", [amb.current.SlidingMode(1e30, INF), amb.current.ProportionalIntegral(1e30, 1e30, 1e30)]
+)
+def test_a_loop_that_leaves_the_numbers_is_a_loss_and_no_nan(law):
+    scenario = dataclasses.replace(NOISY, initial=amb.Initial(1e-3), u_max=math.inf)
+    trajectory = amb.rollout(dataclasses.replace(cascade_of(), current=law), scenario, amb.Clock(20, 1e-4)).trajectory
+    assert np.isfinite(trajectory.lost_at)
+    for name, signal in trajectory.rows._asdict().items():
+        assert np.isfinite(np.asarray(signal, float)).all(), name
+
+
+def test_a_law_that_gives_no_number_keeps_what_it_had():
+    system = system_of(cascade_of(), NOISY, SHORT).realised()
+    start = system.start()
+    lost = start._replace(plant=start.plant._replace(i=jnp.asarray(jnp.inf)))
+    after = system.jump(0.0, lost, system.hold(0))
+    assert after.sane == 0
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((after.control, after.command)))
+    assert system.advance(amb.RK4(1), system.hold(0), 0.0, 1e-4, after, (), jnp.asarray(0)).code == DIVERGED
+
+
+@pytest.mark.parametrize("implicit", [True, False])
+def test_the_sampled_loop_converges_to_the_continuous_one(implicit):
+    """With order 1 in the period: no delay, no noise, mild signs."""
+    laws = {"inversion": amb.inversion.Adaptive(7.5e4, 0.5)}
+    scenario = amb.Scenario(reference=amb.Sine(1e-3, 2.0), initial=amb.Initial(1e-5))
+    exact = amb.rollout(amb.Cascade(**laws), scenario, amb.Clock(50, 1e-3, amb.Adaptive(1e-9))).trajectory.rows.z
+    errors = []
+    for divisor in (20, 40, 80):
+        cascade = amb.Cascade(**laws, processor=Processor(0.0, implicit))
+        rows = amb.rollout(cascade, scenario, amb.Clock(50 * divisor, 1e-3 / divisor)).trajectory.rows
+        errors.append(np.abs(np.asarray(rows.z)[::divisor] - exact).max())
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert ((orders > 0.8) & (orders < 1.3)).all(), (errors, orders)
+
+
+def test_the_sign_itself_is_refused_in_continuous_time():
+    hard_sign = amb.Cascade(position=amb.position.SlidingMode(17.0, 25.0, INF))
+    with pytest.raises(ValueError, match=r"controller.position.p = inf: in continuous time a sign must be smoothed"):
+        amb.rollout(hard_sign, NOISY, SHORT)
+    mixed = dataclasses.replace(cascade_of(), current=amb.current.SlidingMode(870.0, np.array([25.0, INF])))
+    with pytest.raises(ValueError, match="inf for some members"):
+        run_ensemble(mixed, dataclasses.replace(NOISY, member=np.arange(2)), SHORT, fold=None)
+
+
+def test_a_traced_delay_is_refused_where_nothing_was_settled():
+    def run(delay):
+        return amb.rollout(cascade_of(delay=delay), NOISY, amb.Clock(3, 1e-4, amb.RK4(1))).trajectory.lost_at
+
+    with pytest.raises(ValueError, match=r"processor.delay: inside jit"):
+        jax.jit(run)(0.5)

@@ -116,6 +116,8 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     plant = top.table("plant").record(Plant)
     processor = _processor(top.table("processor")) if "processor" in top.raw else None
     cascade = _cascade(top.table("controller"), plant, processor)
+    if processor is None:
+        cascade.check_smooth()
     scenario, settle = _scenario(top, plant)
     clock, duration = _clock(top.table("clock"))
     if isinstance(clock.method, Slide) and not slides(cascade, scenario.plant):
@@ -131,7 +133,10 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
         raise ValueError(f"run.settle = {settle:g} s: it must be less than clock.duration = {duration:g} s.")
     spread = spread_from(top, cascade, scenario)
     check_reference(spread, cascade, scenario, clock)
-    clock = with_method(clock, *corners(spread, cascade, scenario))
+    widest = corners(spread, cascade, scenario)
+    clock = with_method(clock, *widest)
+    if (late := widest[0].processor) is not None:
+        cascade = cascade.on_processor(late.delay)
     return Case(safe_name(name), cascade, scenario, clock, settle, spread)
 
 
@@ -150,8 +155,7 @@ def _cascade(table: Table, plant: Plant, processor: Processor | None) -> Cascade
         law = table.table(stage)
         kind = law.choice("kind", list(kinds), next(iter(kinds)))
         laws[stage] = law.record(kinds[kind], extra=("kind",), base=answers.default_law(kinds[kind], model))
-    cascade = Cascade(model=model, processor=processor, **laws)
-    return cascade if processor is None else cascade.on_processor()
+    return Cascade(model=model, processor=processor, **laws)
 
 
 def _signal(table: Table, extra: tuple[str, ...] = ()) -> Any:

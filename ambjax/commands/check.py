@@ -9,6 +9,10 @@ from ambjax.commands.outputs import plain, table
 from ambjax.theorem.conditions import Condition, check
 
 Summary = dict[str, Any]
+CONTINUOUS = (
+    "All of this is about continuous time, for which the theorem is: the case's [processor] is left out, and signs "
+    "without a layer have one. 'ambjax simulate' runs the loop on its processor."
+)
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
@@ -29,6 +33,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         from ambjax.theorem import verdict
 
         print("\n" + "\n".join(verdict.answer(report, args.case)))
+        if case.cascade.processor is not None:
+            print(CONTINUOUS)
     return int(not report.holds), plain(summary)
 
 

@@ -28,6 +28,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     window = _window(case, args)
     out = directory(args.out, f"simulate-{case.name}")
     say(f"method: {case.clock.method}")
+    if case.cascade.processor is not None:
+        say(f"on a processor: {case.cascade.processor}")
     trajectory, measured = simulate(case)
     metrics = plain(measured) | {
         "lost_why": trajectory.lost_why,

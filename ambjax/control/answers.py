@@ -69,31 +69,35 @@ def slides(law: Any) -> bool:
     return hasattr(law, "slide")
 
 
-def hardened(law: L) -> L:
-    """The law with None for every steepness that is inf: the sign itself.
+def hard_signs(law: Any) -> list[str]:
+    """Names of the steepnesses of a law that are inf or None: its sign has no layer.
 
-    Raises ValueError where it is inf for some members only.
+    Raises ValueError where one is inf for some members only.
     """
-    given: Any = law
-    hard = {}
-    for field in dataclasses.fields(given):
-        value = getattr(given, field.name)
-        if not field.metadata.get("steepness") or value is None or is_traced(value):
+    names = []
+    for field in dataclasses.fields(law):
+        value = getattr(law, field.name)
+        if not field.metadata.get("steepness") or is_traced(value):
             continue
-        infinite = np.isinf(np.asarray(value, float))
+        infinite = np.array([True]) if value is None else np.isinf(np.asarray(value, float))
         if infinite.any() and not infinite.all():
             raise ValueError(
-                f"{field.name}: inf for some members and a number for others. A sign that is set-valued is another "
+                f"{field.name}: inf for some members and a number for others. A sign without a layer is another "
                 "program: give inf to all or to none."
             )
         if infinite.all():
-            hard[field.name] = None
-    return dataclasses.replace(given, **hard) if hard else law
+            names.append(field.name)
+    return names
+
+
+def hardened(law: L) -> L:
+    """The law with None for every steepness that is inf: the sign itself. Raises ValueError as `hard_signs` does."""
+    given: Any = law
+    return dataclasses.replace(given, **dict.fromkeys(hard_signs(law)))
 
 
 def softened(law: L, model: Plant) -> L:
     """The law with the steepness that suits the model for every sign that has none."""
     given: Any = law
-    none = [f.name for f in dataclasses.fields(given) if f.metadata.get("steepness") and getattr(given, f.name) is None]
     usual = default_law(type(law), model)
-    return dataclasses.replace(given, **{name: getattr(usual, name) for name in none}) if none else law
+    return dataclasses.replace(given, **{name: getattr(usual, name) for name in hard_signs(law)})

@@ -138,12 +138,22 @@ class Cascade:
         rates = CascadeState(observed_rate, positioned_rate, (), ())
         return ForceDemand(z, z_rate, v_star, v_star_rate, gaps), estimate, rates
 
-    def on_processor(self) -> "Cascade":
+    def on_processor(self, *delays: Scalar) -> "Cascade":
         """The cascade with everything settled that decides which program is compiled for it: signs whose steepness is
-        inf become set-valued, and see `Processor.resolved`."""
+        inf become set-valued, and its processor is ready for `delays` (samples) too. Raises as `Processor.resolved`."""
         assert self.processor is not None
         laws = {stage: answers.hardened(getattr(self, stage)) for stage in USUAL}
-        return dataclasses.replace(self, **laws, processor=self.processor.resolved())
+        return dataclasses.replace(self, **laws, processor=self.processor.resolved(*delays))
+
+    def check_smooth(self) -> None:
+        """Raise ValueError for a sign without a layer, which continuous time does not know."""
+        for stage in USUAL:
+            law = getattr(self, stage)
+            for name in answers.hard_signs(law):
+                raise ValueError(
+                    f"controller.{stage}.{name} = inf: in continuous time a sign must be smoothed. Give a number, or "
+                    "add [processor], on which the sign itself is stepped."
+                )
 
     def in_continuous_time(self) -> "Cascade":
         """The cascade without its processor; signs without a layer get the steepness that suits the model."""

@@ -1,7 +1,6 @@
 """The processor that a cascade runs on: one step of all laws a sample, its voltage held, late by a delay."""
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,27 +29,26 @@ class Processor:
     whole: bool | None = static(default=None, doc="every delay is a whole number of samples; None: to be seen")
     most: int | None = static(default=None, doc="samples that the longest delay reaches into; None: to be seen")
 
-    def resolved(self) -> "Processor":
-        """This processor with everything settled that decides which program is compiled.
+    def __str__(self) -> str:
+        ahead = "with" if self.predict else "without"
+        return f"{'implicit' if self.implicit else 'explicit'} steps, a delay of {self.delay:g} T, {ahead} prediction"
 
-        Raises ValueError where the delay is traced and was not settled before.
+    def resolved(self, *others: Scalar) -> "Processor":
+        """This processor with everything settled that decides which program is compiled; for `others`, delays, too.
+
+        Raises ValueError where the delay is traced and that was not settled before.
         """
-        if self.most is not None:
-            return self
         if is_traced(self.delay):
-            raise ValueError(
-                "processor.delay: inside jit, grad or vmap it is traced, and no program can be chosen. Call "
-                "processor.resolved() outside."
-            )
-        delay: Any = np.asarray(self.delay, float)
+            if self.most is None:
+                raise ValueError(
+                    "processor.delay: inside jit, grad or vmap it is traced, and no program can be chosen. Call "
+                    "cascade.on_processor() outside."
+                )
+            return self
+        delay = np.concatenate([np.ravel(np.asarray(x, float)) for x in (self.delay, *others)])
         longest = float(delay.max())
-        return Processor(
-            self.delay,
-            self.implicit,
-            longest > 0 if self.predict is None else self.predict,
-            bool(np.all(delay == np.round(delay))),
-            math.ceil(longest),
-        )
+        predict = longest > 0 if self.predict is None else self.predict
+        return Processor(self.delay, self.implicit, predict, bool(np.all(delay == np.round(delay))), math.ceil(longest))
 
     def stretches(self, period: Scalar) -> tuple[Array, ...]:
         """Lengths (s) of the parts of the delay over which one voltage acts: u_{n-1}, and before it u_{n-2}."""

@@ -33,6 +33,7 @@ def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     found: dict[str, Place] = {}
     for stage in ("model", "observer", "position", "inversion", "current"):
         found |= _below(getattr(cascade, stage), f"controller.{stage}", (0, stage))
+    found |= _below(cascade.processor, "processor", (0, "processor"))
     names = {"plant": "plant", "reference": "reference", "disturbance.q_i": "q_i", "sensor": "sensor"}
     names |= {"initial": "initial", "disturbance.q_z": "q_z"}
     if not _absent(scenario.q_v):

@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from ambjax.control import answers
-from ambjax.control.cascade import Cascade, CascadeState
+from ambjax.control.cascade import Cascade
 from ambjax.numerics.kernel import one_kernel
 from ambjax.numerics.records import Scalar, canonical, validate
 from ambjax.simulation.clock import Clock
@@ -86,25 +85,13 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     """Raise ValueError, with the dotted path and the fix, for whatever concrete value is not allowed."""
     validate(dataclasses.replace(cascade, processor=None), "controller")
     if cascade.processor is None:
-        check_smooth(cascade)
+        cascade.check_smooth()
     else:
         validate(cascade.processor, "processor")
     validate(scenario, "scenario")
     validate(clock, "clock")
     if clock.samples < 1:
         raise ValueError(f"clock.samples = {clock.samples}: there must be at least 1 sample.")
-
-
-def check_smooth(cascade: Cascade) -> None:
-    """Raise ValueError for a sign without a layer, which continuous time does not know."""
-    hard = answers.hardened
-    for stage, law in zip(CascadeState._fields, cascade.laws, strict=True):
-        for name in vars(law):
-            if getattr(hard(law), name) is None and getattr(law, name) is not None:
-                raise ValueError(
-                    f"controller.{stage}.{name} = inf: in continuous time a sign must be smoothed. Give a number, or "
-                    "a [processor], on which the sign itself is stepped."
-                )
 
 
 def run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:

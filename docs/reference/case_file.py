@@ -9,6 +9,7 @@ from ambjax.cases.reader import DURATION, FIELDS, KINDS, OTHERS, SETTLE, SIGNALS
 from ambjax.cases.spread import KINDS as SPREADS
 from ambjax.cases.table import Table
 from ambjax.cases.template import template
+from ambjax.control.processor import Processor
 from ambjax.ensemble.distributions import SHAPES
 from ambjax.ensemble.paths import places
 from ambjax.world.plant import Plant
@@ -19,7 +20,7 @@ from reference.markdown import code, escaped, first_paragraph, paragraphs, table
 from reference.parser import keys, remarks, rule
 
 TITLES = ("key", "unit", "default", "allowed", "meaning")
-RECORDS: dict[str, type] = {"plant": Plant, "initial": Initial, "sensor": Sensor}
+RECORDS: dict[str, type] = {"plant": Plant, "processor": Processor, "initial": Initial, "sensor": Sensor}
 SETTINGS: dict[str, dataclasses.Field] = {
     "actuator.u_max": FIELDS["u_max"],
     "clock.duration": DURATION,
@@ -32,6 +33,8 @@ WORDS = {
     "plant": "The true plant. Left out, or a key of it: Table 1 of the paper.",
     "controller": "The cascade: a nominal plant and one law per stage. Kinds and gains: [laws](laws.md).",
     "controller.model": "What the controller believes of the plant, where that differs: any key of `[plant]`.",
+    "processor": "What the cascade runs on: one step of all laws a sample, its voltage held and late. Left out: "
+    "continuous time, as in the paper. See [the processor](../processor.md).",
     "reference": "What z is to follow, in m. Left out: 0. See [signals](signals.md).",
     "disturbance": "What disturbs the loop: a signal each, and its unit. Left out: none. See [signals](signals.md).",
     "sensor": "Errors of what is measured, drawn once per sample period and held. Left out: none.",
