@@ -218,15 +218,24 @@ def test_a_lost_rotor_is_frozen_with_its_drive_off():
     assert not np.asarray(rows.u)[after].any()
 
 
-@pytest.mark.parametrize(
-    "law", [amb.current.SlidingMode(1e30, INF), amb.current.ProportionalIntegral(1e30, 1e30, 1e30)]
-)
-def test_a_loop_that_leaves_the_numbers_is_a_loss_and_no_nan(law):
+def test_a_loop_that_leaves_the_numbers_is_a_loss_and_no_nan():
     scenario = dataclasses.replace(NOISY, initial=amb.Initial(1e-3), u_max=math.inf)
-    trajectory = amb.rollout(dataclasses.replace(cascade_of(), current=law), scenario, amb.Clock(20, 1e-4)).trajectory
+    wild = dataclasses.replace(cascade_of(), current=amb.current.ProportionalIntegral(1e30, 1e30, 1e30))
+    trajectory = amb.rollout(wild, scenario, amb.Clock(20, 1e-4)).trajectory
     assert np.isfinite(trajectory.lost_at)
     for name, signal in trajectory.rows._asdict().items():
         assert np.isfinite(np.asarray(signal, float)).all(), name
+
+
+def test_a_gain_of_a_sign_without_a_layer_only_bounds():
+    """Stepped implicitly it is used no further than the error asks: 1e6 or 1e30 A/s, the same run."""
+    scenario = dataclasses.replace(NOISY, u_max=math.inf)
+    runs = [
+        amb.rollout(dataclasses.replace(cascade_of(), current=amb.current.SlidingMode(k_i, INF)), scenario, SHORT)
+        for k_i in (1e6, 1e30)
+    ]
+    z = [np.asarray(run.trajectory.rows.z) for run in runs]
+    np.testing.assert_allclose(*z, rtol=0, atol=1e-15)
 
 
 def test_a_law_that_gives_no_number_keeps_what_it_had():
