@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ambjax.control.cascade import Cascade
     from ambjax.simulation.clock import Clock
     from ambjax.simulation.explicit import DOP853, RK4, Euler
-    from ambjax.simulation.integrate import Adaptive, Rodas3, Slide
+    from ambjax.simulation.integrate import AdaptiveRodas3, Rodas3, Slide
     from ambjax.simulation.method import choose_method, with_method
     from ambjax.simulation.metrics import Standard
     from ambjax.simulation.rollout import Outcome, rollout
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 __all__ = [
     "DOP853",
     "RK4",
-    "Adaptive",
+    "AdaptiveRodas3",
     "BandNoise",
     "Cascade",
     "Chirp",
@@ -64,7 +64,7 @@ _NAMES = {
     "control.cascade": "Cascade",
     "simulation.clock": "Clock",
     "simulation.explicit": "DOP853 RK4 Euler",
-    "simulation.integrate": "Adaptive Rodas3 Slide",
+    "simulation.integrate": "AdaptiveRodas3 Rodas3 Slide",
     "simulation.method": "choose_method with_method",
     "simulation.metrics": "Standard",
     "simulation.rollout": "Outcome rollout",

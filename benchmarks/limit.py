@@ -1,6 +1,6 @@
 """The machine's limit: limit.c, built with the system's compiler and called on a workload.
 
-`missing()` says in words why there is no C program, if there is none. `check` holds it to our own rollout: without
+`missing()` says in words why there is no C program, if there is none. `agreement` holds it to our own rollout: without
 noise to 1e-9 relative in float64; with noise, whose numbers it draws by another generator, in how far it moves
 the rotor. Run: python benchmarks/limit.py
 """
@@ -125,7 +125,7 @@ def ours(work: Workload) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(peak), np.asarray(z)
 
 
-def check() -> dict[str, float]:
+def agreement() -> dict[str, float]:
     """Agreement of the C program with our own rollout; AssertionError beyond what it is said to be."""
     odd, quiet, noisy = workload.workload(37, 300), workload.workload(256, 60), workload.workload(256, 60, noise=True)
     expected, moved = ours(odd), np.std(ours(noisy)[1] - ours(quiet)[1])
@@ -145,7 +145,7 @@ def main() -> None:
     if why := missing():
         print(why)
         return
-    print("agreement with rollout:", {name: f"{value:.2g}" for name, value in check().items()})
+    print("agreement with rollout:", {name: f"{value:.2g}" for name, value in agreement().items()})
     for noise in (False, True):
         work = workload.workload(1024, 100, noise=noise)
         for dtype in PRECISION:

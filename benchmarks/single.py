@@ -24,7 +24,7 @@ import numpy as np
 import workload
 from scipy.integrate import solve_ivp
 
-from ambjax import Adaptive, Cascade, Clock, Plant, inversion, paper, rollout
+from ambjax import AdaptiveRodas3, Cascade, Clock, Plant, inversion, paper, rollout
 
 TARGET = 1e-8
 PERIOD, SAMPLES = 1e-2, 200
@@ -49,7 +49,7 @@ def scipy_run(gains: tuple[float, float], method: str, rtol: float) -> np.ndarra
 def ours_run(gains: tuple[float, float], tolerance: float) -> Callable[[], Any]:
     cascade = dataclasses.replace(paper.cascade("repaired"), inversion=inversion.Adaptive(*gains))
     scenario = paper.scenario("tracking", "repaired")
-    clock = Clock(SAMPLES, PERIOD, Adaptive(tolerance))
+    clock = Clock(SAMPLES, PERIOD, AdaptiveRodas3(tolerance))
     return lambda: rollout(cascade, scenario, clock).trajectory.rows.z
 
 

@@ -2,7 +2,7 @@
 
 The repaired tracking scenario for 0.2 s at 10 kHz, on (a) smooth gains gamma = 1e9, p = 25e-6 in the inversion,
 (b) the repaired gains, (c) the repaired gains with noise of std 1e-6 m on z, held 100 us. Error: the largest
-|z - reference| over all samples; reference: Adaptive at tolerance 1e-10, compared with RK4 at 0.2 us.
+|z - reference| over all samples; reference: AdaptiveRodas3 at tolerance 1e-10, compared with RK4 at 0.2 us.
 Run: python benchmarks/work_precision.py
 """
 
@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from ambjax import RK4, Adaptive, Clock, Euler, Rodas3, Sensor, inversion, paper, rollout
+from ambjax import RK4, AdaptiveRodas3, Clock, Euler, Rodas3, Sensor, inversion, paper, rollout
 
 SAMPLES = 2_000
 CASES = {
@@ -29,7 +29,7 @@ METHODS: dict[str, list[Any]] = {
     "Euler": [Euler(n) for n in (2, 5, 20, 100, 400)],
     "RK4": [RK4(n) for n in (1, 2, 5, 10, 50, 100)],
     "Rodas3": [Rodas3(n) for n in (1, 2, 5, 10, 20, 50)],
-    "Adaptive": [Adaptive(10.0**-n) for n in (3, 4, 5, 6, 7, 8)],
+    "Adaptive": [AdaptiveRodas3(10.0**-n) for n in (3, 4, 5, 6, 7, 8)],
 }
 
 
@@ -70,7 +70,7 @@ def draw(results: dict[str, Any]) -> None:
 def main() -> None:
     results: dict[str, Any] = {}
     for case in CASES:
-        reference = np.asarray(run(case, Adaptive(1e-10)))
+        reference = np.asarray(run(case, AdaptiveRodas3(1e-10)))
         agreement = float(np.abs(np.asarray(run(case, RK4(500))) - reference).max())
         print(f"\n{case}: references agree to {agreement:.1e} m")
         rows: dict[str, list[Any]] = {}

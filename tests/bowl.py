@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax import Adaptive
+from ambjax import AdaptiveRodas3
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
 from tuning.config import tune_from
@@ -50,7 +50,7 @@ class Bowl:
 
     def __init__(self, objective, *, settle, mode="forward", threads=None, lanes=64):
         self.objective, self.mode, self.threads, self.rollouts = objective, mode, threads, 0
-        self.accurate = isinstance(objective.clock.method, Adaptive)
+        self.accurate = isinstance(objective.clock.method, AdaptiveRodas3)
 
     def _note(self, kind, x, who):
         for seed in sorted(set(np.asarray(who.seed).tolist())):

@@ -7,11 +7,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import Adaptive, Cascade, Clock, Plant, Pulse, Scenario, Sensor, Sine, Slide, inversion, position, rollout
+from ambjax import (
+    AdaptiveRodas3,
+    Cascade,
+    Clock,
+    Plant,
+    Pulse,
+    Scenario,
+    Sensor,
+    Sine,
+    Slide,
+    inversion,
+    position,
+    rollout,
+)
 from ambjax.numerics.apart import stored
 
 NOISY = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.8, 1.3), sensor=Sensor(1e-6, 1e-4, 1e-4))
-SHORT = Clock(203, 1e-4, Adaptive())
+SHORT = Clock(203, 1e-4, AdaptiveRodas3())
 
 
 class Counting(position.SlidingMode):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy import linalg, stats
 
-from ambjax import RK4, Adaptive, Cascade, Clock, Initial, Scenario, Sensor, Sine, Standard, inversion, rollout
+from ambjax import RK4, AdaptiveRodas3, Cascade, Clock, Initial, Scenario, Sensor, Sine, Standard, inversion, rollout
 from ambjax.ensemble import Normal, Percent, Spread, map_members, run_ensemble
 from ambjax.ensemble.engine import size
 from ambjax.ensemble.store import Store
@@ -74,7 +74,7 @@ def test_results_do_not_depend_on_how_long_blocks_are_on_this_machine(cpu, monke
     same(run_ensemble(SMOOTH, members(300), SHORT, fold=FOLD, threads=1), here, 1e-12)
 
 
-@pytest.mark.parametrize("method", [RK4(2), Adaptive()], ids=str)
+@pytest.mark.parametrize("method", [RK4(2), AdaptiveRodas3()], ids=str)
 def test_a_member_is_the_rollout_of_that_member_alone(method):
     clock = Clock(40, 1e-4, method)
     found = run_ensemble(SMOOTH, members(66), clock, fold=FOLD, every=10)

@@ -12,7 +12,7 @@ import pytest
 
 from ambjax import (
     RK4,
-    Adaptive,
+    AdaptiveRodas3,
     Cascade,
     Clock,
     Initial,
@@ -116,7 +116,7 @@ def test_forward_through_the_adaptive_method_agrees_with_fixed_steps(case, metho
     nominal, p, *_ = CASES[case]
     batch = np.zeros((2, 4)), NOISE
     fixed = np.asarray(derivatives(nominal, p, Clock(500, 1e-4, method))[1](*batch))
-    adaptive = np.asarray(derivatives(nominal, p, Clock(500, 1e-4, Adaptive()))[1](*batch))
+    adaptive = np.asarray(derivatives(nominal, p, Clock(500, 1e-4, AdaptiveRodas3()))[1](*batch))
     size = np.max(np.abs(fixed), axis=-1, keepdims=True)
     # an error per step of 1e-6 leaves 1e-8 of the largest; the derivative in k_i, a millionth of that, drowns in it
     assert np.all(np.abs(adaptive - fixed) <= rtol * np.abs(fixed) + 1e-7 * size)
@@ -158,7 +158,7 @@ def test_every_gradient_is_finite_over_six_decades(mode, monkeypatch):
 @pytest.mark.slow
 def test_forward_through_the_adaptive_method_is_finite_on_random_gains():
     # in small batches: a vectorised while loop runs as long as its slowest member
-    clock = Clock(200, 1e-4, Adaptive(most_steps=2000))
+    clock = Clock(200, 1e-4, AdaptiveRodas3(most_steps=2000))
     mapped = one_kernel(lambda x: jax.lax.map(everything(clock, "forward"), x, batch_size=10))
     gradient, (value, lost_at, _) = mapped(GAINS[:40])
     assert np.mean(np.isfinite(lost_at)) > 0.2

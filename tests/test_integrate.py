@@ -49,7 +49,7 @@ def slope(x, y):
 
 every_fixed = pytest.mark.parametrize(("method", "order"), FIXED.values(), ids=FIXED)
 every_method = pytest.mark.parametrize(
-    "method", [amb.Euler(3), amb.RK4(3), amb.DOP853(3), amb.Rodas3(3), amb.Adaptive()], ids=str
+    "method", [amb.Euler(3), amb.RK4(3), amb.DOP853(3), amb.Rodas3(3), amb.AdaptiveRodas3()], ids=str
 )
 
 
@@ -200,23 +200,23 @@ def test_no_time_is_no_motion(method):
 
 def test_adaptive_error_falls_with_the_tolerance():
     tolerances = np.array([1e-5, 1e-6, 1e-7, 1e-8, 1e-9])
-    errors = [curved_error(amb.Adaptive(tolerance=tol)) for tol in tolerances]
+    errors = [curved_error(amb.AdaptiveRodas3(tolerance=tol)) for tol in tolerances]
     # Error per step h^3 = tolerance and global error h^3: proportional.
     assert slope(tolerances, errors) == pytest.approx(1.0, abs=0.15)
     assert all(errors < 10 * tolerances)
 
 
 def test_adaptive_step_carries_over():
-    few = amb.Adaptive(most_steps=8)
+    few = amb.AdaptiveRodas3(most_steps=8)
     one = (jnp.asarray(1.0), jnp.asarray(1.0))
     p = problem(curved, one)
-    first = amb.Adaptive().advance(p, 0.0, 0.1, one, amb.Adaptive().start(0.1))
+    first = amb.AdaptiveRodas3().advance(p, 0.0, 0.1, one, amb.AdaptiveRodas3().start(0.1))
     assert int(few.advance(p, 0.1, 0.1, first.state, first.memory).code) == ALIVE
     assert int(few.advance(p, 0.1, 0.1, first.state, 1e-7).code) == STALLED  # a first step grows 5 times per step
 
 
 def test_adaptive_that_may_not_take_enough_steps_stalls():
-    out = amb.Adaptive(most_steps=2).advance(problem(lambda t, y: -y), 1.0, 1.0, jnp.asarray(1.0), 1e-3)
+    out = amb.AdaptiveRodas3(most_steps=2).advance(problem(lambda t, y: -y), 1.0, 1.0, jnp.asarray(1.0), 1e-3)
     assert int(out.code) == STALLED
     assert 1.0 < float(out.t) < 2.0
     assert float(out.state) == pytest.approx(
@@ -225,14 +225,14 @@ def test_adaptive_that_may_not_take_enough_steps_stalls():
 
 
 def test_a_stalled_rollout_says_so_and_stays_finite():
-    clock = amb.Clock(50, 1e-4, amb.Adaptive(tolerance=1e-12, most_steps=3))
+    clock = amb.Clock(50, 1e-4, amb.AdaptiveRodas3(tolerance=1e-12, most_steps=3))
     trajectory = amb.rollout(REPAIRED, TRACKING, clock).trajectory
     assert trajectory.lost_why.startswith("stalled")
     assert 0 < float(trajectory.lost_at) <= 1e-4
     assert all(np.isfinite(x).all() for x in trajectory.rows)
 
 
-@pytest.mark.parametrize("method", [amb.Euler(10), amb.RK4(10), amb.Rodas3(10), amb.Adaptive()], ids=str)
+@pytest.mark.parametrize("method", [amb.Euler(10), amb.RK4(10), amb.Rodas3(10), amb.AdaptiveRodas3()], ids=str)
 def test_stops_at_the_first_bad_state_and_returns_the_last_good_one(method):
     def fate(y):
         return jnp.where(y < 0.55, 0, 2).astype(jnp.int32)
@@ -245,7 +245,7 @@ def test_stops_at_the_first_bad_state_and_returns_the_last_good_one(method):
 
 
 # Not Rodas3 with three steps: a fixed implicit step may leap over the pole and never see it.
-@pytest.mark.parametrize("method", [amb.Euler(3), amb.RK4(3), amb.Adaptive()], ids=str)
+@pytest.mark.parametrize("method", [amb.Euler(3), amb.RK4(3), amb.AdaptiveRodas3()], ids=str)
 def test_blow_up_ends_in_a_code_and_a_finite_state(method):
     def fate(y):
         return jnp.where(jnp.abs(y) < 1e3, 0, 2).astype(jnp.int32)
@@ -267,10 +267,10 @@ def test_an_explicit_step_beyond_its_limit_is_refused(method):
 
 def test_method_choice():
     noisy = dataclasses.replace(TRACKING, sensor=amb.Sensor(1e-6))
-    assert isinstance(amb.choose_method(SMOOTH, TRACKING, 1e-4), amb.Adaptive)
+    assert isinstance(amb.choose_method(SMOOTH, TRACKING, 1e-4), amb.AdaptiveRodas3)
     assert isinstance(amb.choose_method(SMOOTH, noisy, 1e-4), amb.RK4)
-    assert isinstance(amb.choose_method(REPAIRED, noisy, 1e-4), amb.Adaptive)
-    assert isinstance(amb.choose_method(REPAIRED, TRACKING, 1e-4), amb.Adaptive)
+    assert isinstance(amb.choose_method(REPAIRED, noisy, 1e-4), amb.AdaptiveRodas3)
+    assert isinstance(amb.choose_method(REPAIRED, TRACKING, 1e-4), amb.AdaptiveRodas3)
     assert isinstance(amb.choose_method(REPAIRED, TRACKING, 1e-4, reverse=True), amb.Rodas3)
     assert isinstance(amb.choose_method(SMOOTH, TRACKING, 1e-4, reverse=True), amb.RK4)
     mine = amb.Clock(method=amb.Rodas3(4))
@@ -290,7 +290,7 @@ def test_a_sign_as_steep_as_a_relay_does_not_stall_the_adaptive_method(p):
     """The limit p -> infinity exists (the sliding mode), and the layer narrows as 1/p: from 1e-8 A to 1e-14 A."""
     noisy = dataclasses.replace(TRACKING, sensor=amb.Sensor(1e-6))
     cascade = amb.Cascade(inversion=amb.inversion.Adaptive(p=p))
-    found = [amb.rollout(cascade, noisy, amb.Clock(300, 1e-4, step)) for step in (amb.Adaptive(), amb.Slide(64))]
+    found = [amb.rollout(cascade, noisy, amb.Clock(300, 1e-4, step)) for step in (amb.AdaptiveRodas3(), amb.Slide(64))]
     assert not np.isfinite(found[0].trajectory.lost_at)
     z, expected = (np.asarray(f.trajectory.rows.z) for f in found)
     # of a motion of 1e-3 m; both methods have errors of this size here

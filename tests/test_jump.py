@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ambjax import RK4, Adaptive, Clock
+from ambjax import RK4, AdaptiveRodas3, Clock
 from ambjax.extend import canonical, leaf, record
 from ambjax.simulation.integrate import Problem, in_turn
 from ambjax.simulation.metrics import Driven
@@ -124,7 +124,7 @@ def run(system, method, samples=SAMPLES, fold=None):
     return roll(*canonical((system, Clock(samples, T, method), fold)), every=1)
 
 
-@pytest.mark.parametrize("method", [RK4(4), Adaptive(1e-9)], ids=str)
+@pytest.mark.parametrize("method", [RK4(4), AdaptiveRodas3(1e-9)], ids=str)
 @pytest.mark.parametrize("delay", [0.0, 0.3, 1.0, 1.7])
 def test_a_sampled_loop_is_that_of_the_matrix_exponential(delay, method):
     found = run(Sampled(delay=delay), method, fold=Driven("u"))

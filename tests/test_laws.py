@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import Adaptive, Cascade, Clock, Plant, Pulse, Scenario, Sine, rollout
+from ambjax import AdaptiveRodas3, Cascade, Clock, Plant, Pulse, Scenario, Sine, rollout
 from ambjax.control import answers, current, inversion, observer, position
 from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand
 from ambjax.control.search import Site
@@ -218,12 +218,12 @@ def test_validate_refuses_bad_gains_by_dotted_path(stage, law, name):
 
 SLOW = pytest.mark.slow
 STAGES = ("observer", "position", "inversion", "current")
-KINDS = [list({type(law): law for s, law in reversed(LAWS) if s == stage}.values())[::-1] for stage in STAGES]
+LAWS_BY_STAGE = [list({type(law): law for s, law in reversed(LAWS) if s == stage}.values())[::-1] for stage in STAGES]
 # every law at least once in the fast run: the first of each stage, and the last of each
 COMBINATIONS = [
     pytest.param(laws, id="-".join(type(x).__name__ for x in laws), marks=() if same else SLOW)
-    for laws in itertools.product(*KINDS)
-    for same in [len({kinds.index(x) for kinds, x in zip(KINDS, laws, strict=True)}) == 1]
+    for laws in itertools.product(*LAWS_BY_STAGE)
+    for same in [len({kinds.index(x) for kinds, x in zip(LAWS_BY_STAGE, laws, strict=True)}) == 1]
 ]
 TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.02, 0.04))
 
@@ -231,7 +231,7 @@ TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.02, 0.04))
 @pytest.mark.parametrize("laws", COMBINATIONS)
 def test_any_law_of_a_stage_stands_with_any_of_the_others(laws):
     cascade = Cascade(*laws)
-    trajectory = rollout(cascade, TRACKING, Clock(600, 1e-4, Adaptive())).trajectory
+    trajectory = rollout(cascade, TRACKING, Clock(600, 1e-4, AdaptiveRodas3())).trajectory
     rows = trajectory.rows
     assert trajectory.lost_at == np.inf, trajectory.lost_why
     assert all(np.all(np.isfinite(x)) for x in rows)
@@ -242,8 +242,8 @@ def test_any_law_of_a_stage_stands_with_any_of_the_others(laws):
 
 
 def test_all_combinations_are_composed():
-    assert len(COMBINATIONS) == np.prod([len(kinds) for kinds in KINDS])
-    assert {type(law) for kinds in KINDS for law in kinds} == {type(law) for _, law in LAWS}
+    assert len(COMBINATIONS) == np.prod([len(kinds) for kinds in LAWS_BY_STAGE])
+    assert {type(law) for kinds in LAWS_BY_STAGE for law in kinds} == {type(law) for _, law in LAWS}
 
 
 # --- the paper's identities, at random points ---

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from ambjax import RK4, Adaptive, Cascade, Clock, Initial, Plant, Scenario, Sensor, inversion, paper, rollout
+from ambjax import RK4, AdaptiveRodas3, Cascade, Clock, Initial, Plant, Scenario, Sensor, inversion, paper, rollout
 from ambjax.__main__ import main
 from ambjax.ensemble import Normal, Spread, maps
 from ambjax.ensemble.maps import PERIOD, Axis, grid
@@ -23,7 +23,7 @@ def basin(reading):
     cascade = paper.cascade(reading)
     cascade = dataclasses.replace(cascade, inversion=dataclasses.replace(cascade.inversion, i_ref=CURRENT))
     quiet = dataclasses.replace(paper.scenario("regulation", reading, pulse=False), initial=Initial(0.0, 0.0, CURRENT))
-    return Study(cascade, quiet, Clock(800, 1e-4, Adaptive()), 0.05, Spread(), 0, 1)
+    return Study(cascade, quiet, Clock(800, 1e-4, AdaptiveRodas3()), 0.05, Spread(), 0, 1)
 
 
 @pytest.mark.parametrize("reading", ["literal", "repaired"])
@@ -78,7 +78,7 @@ def test_one_member_is_the_nominal_case():
 
 def test_stalled_runs_are_counted_apart():
     # two trials a sample are too few for the transient from 10 um at these gains, and enough from the balance
-    clock = Clock(20, 1e-4, Adaptive(1e-8, 2))
+    clock = Clock(20, 1e-4, AdaptiveRodas3(1e-8, 2))
     study = dataclasses.replace(basin("repaired"), clock=clock)
     z = Axis("initial.z", np.array([0.0, 1e-4]))
     found = grid(study, z, Axis("plant.m", np.array([0.588])))

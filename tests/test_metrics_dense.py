@@ -8,7 +8,7 @@ from dense import metrics
 from oracle import World
 from test_oracle import BUMP, Case, adaptive, current, in_ambjax, noise_of, pulse, sine, smc
 
-from ambjax import Adaptive, Clock, Sensor, Slide, rollout
+from ambjax import AdaptiveRodas3, Clock, Sensor, Slide, rollout
 from ambjax.simulation.metrics import Standard
 
 PERIOD = 1e-4
@@ -59,7 +59,7 @@ def numbers(world, std, samples, settle, method):
 def test_every_metric_is_what_a_dense_solution_says(name):
     world, std = LOOPS[name]
     samples, settle = 200, 50 * PERIOD
-    found, noise = numbers(world, std, samples, settle, Adaptive())
+    found, noise = numbers(world, std, samples, settle, AdaptiveRodas3())
     expected = metrics(world, samples, PERIOD, settle, noise)
     assert found.keys() - expected.keys() == {"stalled", "singular_at_s"}
     assert not found["stalled"]
@@ -100,7 +100,7 @@ def test_the_start_of_a_sample_says_nothing_of_the_voltage():
     world, std = LOOPS["stiff under noise, limited supply"]
     cascade, scenario, _ = in_ambjax(Case("", world, samples=200))
     scenario = dataclasses.replace(scenario, sensor=Sensor(*std))
-    out = rollout(cascade, scenario, Clock(200, PERIOD, Adaptive()), fold=Standard(5e-3))
+    out = rollout(cascade, scenario, Clock(200, PERIOD, AdaptiveRodas3()), fold=Standard(5e-3))
     instants = np.sqrt(np.mean(np.asarray(out.trajectory.rows.u)[50:] ** 2))
     assert instants > 190
     assert out.measured["settled_rms_u_V"] < 60

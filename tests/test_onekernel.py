@@ -9,7 +9,7 @@ import pytest
 
 from ambjax import (
     RK4,
-    Adaptive,
+    AdaptiveRodas3,
     Cascade,
     Clock,
     Initial,
@@ -76,7 +76,7 @@ def test_lowers_for_a_gpu(laws, x64, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"clock": Clock(6, 1e-4, Adaptive())}, "RK4 only"),
+        ({"clock": Clock(6, 1e-4, AdaptiveRodas3())}, "RK4 only"),
         ({"block": 48}, "block = 48: it must be a power of two"),
         ({"scenario": dataclasses.replace(SCENARIO, seed=np.arange(5))}, "lengths 5 and 37"),
         ({"scenario": Scenario(), "cascade": Cascade(), "clock": Clock(6, 1e-4, RK4(50))}, "lengths none"),

@@ -28,7 +28,7 @@ class Case:
     samples: int = 3000
     std: float = 0.0  # of the position sensor, m
     solver: str = "Radau"
-    tight: Any = amb.Adaptive(tolerance=1e-9)
+    tight: Any = amb.AdaptiveRodas3(tolerance=1e-9)
 
 
 def sine(amplitude=2.5e-3, frequency=2.0):

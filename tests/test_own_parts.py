@@ -15,7 +15,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ambjax import (
-    Adaptive,
+    AdaptiveRodas3,
     Cascade,
     Clock,
     Constant,
@@ -136,7 +136,7 @@ RHO, SKEW = "controller.position.rho", "plant.skew"
 
 
 def test_simulated():
-    rows = rollout(CASCADE, SCENARIO, Clock(600, 1e-4, Adaptive(1e-9))).trajectory.rows
+    rows = rollout(CASCADE, SCENARIO, Clock(600, 1e-4, AdaptiveRodas3(1e-9))).trajectory.rows
     assert rows.alive.all()
     # the plant of two circuits written out once more, by another integrator, under the same laws
     p, loop = SCENARIO.plant, ClosedLoop(CASCADE, SCENARIO)
@@ -171,7 +171,7 @@ def test_simulated():
 
 def test_a_lost_one_is_frozen():
     weak = dataclasses.replace(CASCADE, inversion=inversion.Adaptive(1e3, 25e-6))
-    outcome = rollout(weak, SCENARIO, CLOCK.with_method(Adaptive()), fold=standard_for(0.01, SCENARIO))
+    outcome = rollout(weak, SCENARIO, CLOCK.with_method(AdaptiveRodas3()), fold=standard_for(0.01, SCENARIO))
     assert bool(outcome.measured["lost"])
     assert abs(float(outcome.trajectory.rows.z[-1])) == SCENARIO.touchdown
     assert all(np.all(np.isfinite(x)) for x in outcome.trajectory.rows)

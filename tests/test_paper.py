@@ -7,7 +7,7 @@ import types
 import numpy as np
 import pytest
 
-from ambjax import Adaptive, paper, rollout
+from ambjax import AdaptiveRodas3, paper, rollout
 from ambjax.__main__ import main
 from ambjax.paper import claims
 from ambjax.paper.evidence import NOISE_STDS, STEPS, Noise
@@ -83,7 +83,9 @@ def test_reproduce(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_the_step_of_the_tuned_reading_is_fine_enough():
     cascade, scenario = paper.cascade("tuned"), paper.scenario("tracking", "tuned")
-    runs = [rollout(cascade, scenario, paper.CLOCK.with_method(step)) for step in (STEPS["tuned"], Adaptive(1e-8))]
+    runs = [
+        rollout(cascade, scenario, paper.CLOCK.with_method(step)) for step in (STEPS["tuned"], AdaptiveRodas3(1e-8))
+    ]
     rows, exact = (np.asarray(run.trajectory.rows.z) for run in runs)
     # a thousandth of the largest error that the ledger reports of this reading
     np.testing.assert_allclose(rows, exact, rtol=0, atol=4e-9)

@@ -13,7 +13,7 @@ import pytest
 
 from ambjax import (
     RK4,
-    Adaptive,
+    AdaptiveRodas3,
     Cascade,
     Clock,
     Initial,
@@ -76,7 +76,7 @@ FOLDS = Named(
         "spans": Spans(203),
     }
 )
-SHORT = Clock(203, 1e-4, Adaptive())
+SHORT = Clock(203, 1e-4, AdaptiveRodas3())
 # Another, cheap to compile, where the method does not matter: explicit steps on smooth gains.
 LIGHT_FOLDS = Named({"rms": Rms("e_z"), "variation": Variation(2e-3), "lowest": Lowest("z")})
 LIGHT = Clock(203, 5e-5, Euler(1))
@@ -102,7 +102,7 @@ def lost():
 @pytest.fixture(scope="module")
 def tracking():
     """The paper's tracking scenario, gains repaired."""
-    return rollout(REPAIRED, TRACKING, Clock(20_000, 1e-4, Adaptive()), fold=Standard())
+    return rollout(REPAIRED, TRACKING, Clock(20_000, 1e-4, AdaptiveRodas3()), fold=Standard())
 
 
 def same(a, b):
@@ -362,7 +362,7 @@ def test_repaired_tracking_meets_the_paper_s_claims(tracking):
 def test_repaired_regulation_offset_in_the_pulse(tracking):
     # the same structure and numbers of the same type: the compiled tracking run is used again
     regulation = dataclasses.replace(TRACKING, reference=Sine(0.0, 2.0))
-    out = rollout(REPAIRED, regulation, Clock(20_000, 1e-4, Adaptive()), fold=Standard()).trajectory
+    out = rollout(REPAIRED, regulation, Clock(20_000, 1e-4, AdaptiveRodas3()), fold=Standard()).trajectory
     at_stop = int(np.argmin(np.abs(np.asarray(out.rows.t) - 1.2999)))
     # at rest a q_v = k S(c z): z = tan(pi/2 a/k)/(c p) = 2.08e-5 m, up to a few time constants c
     steady = np.tan(np.pi / 2 * Plant().a / 25.0) / (17 * 25)
@@ -429,7 +429,7 @@ from ambjax import *
 tracking = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.8, 1.3))
 smooth = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
 out = {}
-for name, cascade, method in (("repaired", Cascade(), Adaptive()), ("smooth", smooth, RK4(4))):
+for name, cascade, method in (("repaired", Cascade(), AdaptiveRodas3()), ("smooth", smooth, RK4(4))):
     trajectory = rollout(cascade, tracking, Clock(20_000, 1e-4, method), every=10).trajectory
     assert trajectory.rows.z.dtype == np.float32
     assert trajectory.lost_at == np.inf

@@ -253,7 +253,7 @@ def test_the_sampled_loop_converges_to_the_continuous_one(implicit):
     """With order 1 in the period: no delay, no noise, mild signs."""
     laws = {"inversion": amb.inversion.Adaptive(7.5e4, 0.5)}
     scenario = amb.Scenario(reference=amb.Sine(1e-3, 2.0), initial=amb.Initial(1e-5))
-    exact = amb.rollout(amb.Cascade(**laws), scenario, amb.Clock(50, 1e-3, amb.Adaptive(1e-9))).trajectory.rows.z
+    exact = amb.rollout(amb.Cascade(**laws), scenario, amb.Clock(50, 1e-3, amb.AdaptiveRodas3(1e-9))).trajectory.rows.z
     errors = []
     for divisor in (20, 40, 80):
         cascade = amb.Cascade(**laws, processor=Processor(0.0, implicit))

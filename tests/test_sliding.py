@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ambjax import (
-    Adaptive,
+    AdaptiveRodas3,
     Cascade,
     Clock,
     Initial,
@@ -91,7 +91,7 @@ def test_stiff_gains_under_held_noise_agree_with_error_control(case):
     fold = Rms("e_z", 0.01)
     found = [
         np.sqrt(np.mean(run_ensemble(gains, scenario, Clock(400, 1e-4, method), fold=fold).measured ** 2))
-        for method in (Adaptive(1e-6), Slide(4))
+        for method in (AdaptiveRodas3(1e-6), Slide(4))
     ]
     # measured 1 % and less, and a third of that over four times the horizon
     assert found[1] == pytest.approx(found[0], rel=0.03)
@@ -100,7 +100,7 @@ def test_stiff_gains_under_held_noise_agree_with_error_control(case):
 def test_the_slow_motion_is_of_second_order():
     gains = cascade(60.0, 1.0, 1e8, 20.0, p=1.0)
     scenario = Scenario(reference=Sine(1e-3, 10.0), initial=Initial(1e-4), u_max=1e9)
-    reference = rollout(gains, scenario, Clock(100, 1e-3, Adaptive(1e-9)), every=1).trajectory.rows.z
+    reference = rollout(gains, scenario, Clock(100, 1e-3, AdaptiveRodas3(1e-9)), every=1).trajectory.rows.z
     errors = [
         float(np.abs(rollout(gains, scenario, Clock(100, 1e-3, Slide(n)), every=1).trajectory.rows.z - reference).max())
         for n in (2, 4, 8)

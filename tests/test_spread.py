@@ -28,7 +28,7 @@ from ambjax.cases.template import template
 from ambjax.ensemble import Choice, LogUniform, Normal, Percent, Spread, Uniform, apply, draw
 from ambjax.ensemble.design import DESIGNS, MOST_LATIN, points
 from ambjax.ensemble.paths import places
-from ambjax.ensemble.spread import check, corners
+from ambjax.ensemble.spread import check_spread, corners
 from ambjax.simulation.explicit import Euler
 
 CASCADE = Cascade()
@@ -435,7 +435,7 @@ def test_spreads_made_in_python_are_checked_too(entries, words):
 def test_what_is_an_array_already_cannot_be_spread():
     scenario = dataclasses.replace(SCENARIO, u_max=np.array([100.0, 200.0]))
     with pytest.raises(ValueError, match="array of 2"):
-        check(Spread((("actuator.u_max", Percent(1.0)),)), CASCADE, scenario)
+        check_spread(Spread((("actuator.u_max", Percent(1.0)),)), CASCADE, scenario)
 
 
 def test_no_spread_draws_nothing():

@@ -10,7 +10,7 @@ import pytest
 from ambjax import Scenario, Sensor
 from ambjax.ensemble.design import BITS, points
 from ambjax.numerics.gaussian import normals, threefry
-from ambjax.world.scenario import SIGNALS
+from ambjax.world.scenario import SLOTS
 
 MEMBERS = 40
 
@@ -47,10 +47,10 @@ class Listening:
         return jax.random.key_data(key)
 
 
-@pytest.mark.parametrize("slot", SIGNALS)
+@pytest.mark.parametrize("slot", SLOTS)
 def test_designs_and_signals_share_no_random_words(slot):
     """What a signal's key would give as a coordinate of a design is no coordinate of the design of that member."""
-    design = points("random", 5, len(SIGNALS) + 2, np.arange(MEMBERS), MEMBERS)
+    design = points("random", 5, len(SLOTS) + 2, np.arange(MEMBERS), MEMBERS)
     for member in range(MEMBERS):
         scenario = Scenario(seed=5, member=member, **{slot: Listening()})
         key = jax.random.wrap_key_data(getattr(scenario.realised(), slot))

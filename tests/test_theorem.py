@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import Adaptive, Cascade, Clock, Plant, Pulse, Sensor, SmoothStep, inversion, paper, position, rollout
+from ambjax import AdaptiveRodas3, Cascade, Clock, Plant, Pulse, Sensor, SmoothStep, inversion, paper, position, rollout
 from ambjax.theorem.conditions import check, delta_1_on_reference
 
-CLOCK = Clock(1000, 1e-4, Adaptive(1e-8))
+CLOCK = Clock(1000, 1e-4, AdaptiveRodas3(1e-8))
 
 
 def short(gamma=paper.REPAIRED_GAMMA, **changes):
@@ -48,7 +48,7 @@ def test_suprema_and_their_times():
 def test_delta_1_is_the_derivative_seen_in_a_trajectory():
     """d = v_star' - dv/dz z_dot, against central differences of the recorded v_star (error ~ h^2 v_star'''/6)."""
     cascade, scenario = short()
-    fine = Clock(20_000, 5e-6, Adaptive(1e-9))
+    fine = Clock(20_000, 5e-6, AdaptiveRodas3(1e-9))
     rows = rollout(cascade, scenario, fine).trajectory.rows
     plant = Plant()
     slope = np.gradient(np.asarray(rows.v_star), 5e-6, edge_order=2) - np.asarray(
@@ -70,7 +70,7 @@ def test_delta_1_on_reference_by_hand():
     speed = 2.5e-3 * w
     i = float(plant.current_for(0.0, plant.g / plant.a))
     by_hand = abs(-(2 * plant.k_z / plant.m + w**2) * speed / plant.a - float(plant.dv_dz(0.0, i)) * speed)
-    value, at = delta_1_on_reference(cascade, scenario, Clock(1, 1e-4, Adaptive()))
+    value, at = delta_1_on_reference(cascade, scenario, Clock(1, 1e-4, AdaptiveRodas3()))
     assert at == 0
     assert value == pytest.approx(by_hand, rel=1e-12)
 
@@ -79,7 +79,7 @@ def test_identities_hold_to_integration_error_and_tighten_with_tolerance():
     cascade, scenario = short(q_i=Pulse(0.05, 0.02, 0.03))
 
     def residuals(tolerance):
-        report = check(cascade, scenario, CLOCK.with_method(Adaptive(tolerance)))
+        report = check(cascade, scenario, CLOCK.with_method(AdaptiveRodas3(tolerance)))
         return np.array([c.against for c in report.proof[:3]])
 
     loose, tight = residuals(1e-5), residuals(1e-8)

@@ -20,11 +20,11 @@ from tuning.objective.loss import TERMS, Loss, loss_for
 from tuning.objective.risk import CVaR, Mean, SoftWorst
 from tuning.space import Gain, Space, tunable
 
-KINDS = [Gain("controller.position.c"), Gain("controller.position.c", 3.0), Gain("controller.position.c", 2.0, 5e3)]
+GAINS = [Gain("controller.position.c"), Gain("controller.position.c", 3.0), Gain("controller.position.c", 2.0, 5e3)]
 C, K = "controller.position.c", "controller.position.k"
 
 
-@pytest.mark.parametrize("gain", [*KINDS, Gain("controller.position.c", 0.0, 5e3)])
+@pytest.mark.parametrize("gain", [*GAINS, Gain("controller.position.c", 0.0, 5e3)])
 def test_coordinates_are_a_bijection(gain):
     values = np.geomspace(max(gain.low, 1e-3) * 1.001, min(gain.high, 1e6) * 0.999, 50)
     # rounding of log and exp, magnified next to a bound by gain / (gain - bound) = 1e3
@@ -36,7 +36,7 @@ def test_coordinates_are_a_bijection(gain):
     assert np.all(np.diff(gain.decode(x)) > 0)
 
 
-@pytest.mark.parametrize("gain", KINDS)
+@pytest.mark.parametrize("gain", GAINS)
 def test_every_coordinate_is_within_the_bounds(gain):
     decoded = gain.decode(jnp.asarray([-700.0, -20.0, 20.0, 700.0]))
     assert np.all(decoded >= gain.low)

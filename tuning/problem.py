@@ -42,7 +42,9 @@ class Problem:
     @functools.cached_property
     def reference(self) -> Engine:
         """The same objective in accurate steps."""
-        return self._stepping(integrate.Adaptive(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS), lanes=REFERENCE_MEMBERS)
+        return self._stepping(
+            integrate.AdaptiveRodas3(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS), lanes=REFERENCE_MEMBERS
+        )
 
     @functools.cached_property
     def judging(self) -> Engine:

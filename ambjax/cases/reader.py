@@ -21,7 +21,7 @@ from ambjax.host.words import one_line
 from ambjax.numerics.records import leaf, numbers
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
-from ambjax.simulation.integrate import Adaptive, Integrator, Rodas3, Slide
+from ambjax.simulation.integrate import AdaptiveRodas3, Integrator, Rodas3, Slide
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sliding import slides
 from ambjax.world import signals
@@ -246,7 +246,7 @@ def _method(table: Table, period: float, samples: int) -> Integrator | None:
     dt = table.raw.get("dt", "auto")
     if dt == "auto":
         name = table.choice("method", ["auto", "adaptive", "sliding"], "auto") if "method" in table.raw else "auto"
-        return {"auto": None, "adaptive": Adaptive(), "sliding": Slide(SLIDING_SUBSTEPS)}[name]
+        return {"auto": None, "adaptive": AdaptiveRodas3(), "sliding": Slide(SLIDING_SUBSTEPS)}[name]
     if isinstance(dt, str):
         raise ValueError(f'{table.at("dt")} = {show(dt)}: it must be "auto" or {numbers(DT)}.')
     dt = table.leaf("dt", DT)

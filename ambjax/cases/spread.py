@@ -16,7 +16,7 @@ from ambjax.ensemble.distributions import (
     Uniform,
 )
 from ambjax.ensemble.paths import places
-from ambjax.ensemble.spread import Spread, check, require_path
+from ambjax.ensemble.spread import Spread, check_spread, require_path
 from ambjax.world.scenario import Scenario
 
 
@@ -40,7 +40,7 @@ def _number(table: Table, key: str) -> float:
 
 
 # How a number may be spread: the key in its table, and what it makes. A new distribution is one row here.
-KINDS: dict[str, Callable[[Table], Distribution]] = {
+DISTRIBUTIONS: dict[str, Callable[[Table], Distribution]] = {
     "percent": lambda t: Percent(_number(t, "percent"), t.choice("shape", list(SHAPES), SHAPES[0])),
     "normal": lambda t: Normal(_number(t, "normal")),
     "uniform": lambda t: Uniform(*_pair(t, "uniform")),
@@ -60,7 +60,7 @@ def spread_from(top: Table, cascade: Cascade, scenario: Scenario) -> Spread:
     entries = _entries({key: value for key, value in table.raw.items() if key != "design"}, "", known)
     spread = Spread(tuple(entries), design)
     _refuse_nothing_in_two_units(spread, top)
-    check(spread, cascade, scenario)
+    check_spread(spread, cascade, scenario)
     return spread
 
 
@@ -70,7 +70,7 @@ def _entries(raw: dict[str, Any], prefix: str, known: list[str]) -> list[tuple[s
         path = prefix + key
         if path in known:
             found.append((path, _distribution(value, path)))
-        elif isinstance(value, dict) and value and not set(value) & {*KINDS, "shape"}:
+        elif isinstance(value, dict) and value and not set(value) & {*DISTRIBUTIONS, "shape"}:
             found += _entries(value, path + ".", known)
         else:
             require_path(path, known, show(value))
@@ -82,11 +82,11 @@ def _distribution(raw: Any, path: str) -> Distribution:
     if not isinstance(raw, dict):
         raise ValueError(f"{where} = {show(raw)}: it must say how to spread, as in {path} = {{ percent = 10 }}.")
     table = Table(raw, where)
-    given = [kind for kind in KINDS if kind in raw]
-    table.only(["percent", "shape"] if given == ["percent"] else given or list(KINDS))
+    given = [kind for kind in DISTRIBUTIONS if kind in raw]
+    table.only(["percent", "shape"] if given == ["percent"] else given or list(DISTRIBUTIONS))
     if len(given) != 1:
-        raise ValueError(f"{where} = {show(raw)}: give exactly one of {quoted(list(KINDS))}.")
-    return KINDS[given[0]](table)
+        raise ValueError(f"{where} = {show(raw)}: give exactly one of {quoted(list(DISTRIBUTIONS))}.")
+    return DISTRIBUTIONS[given[0]](table)
 
 
 def _refuse_nothing_in_two_units(spread: Spread, top: Table) -> None:

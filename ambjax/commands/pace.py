@@ -12,7 +12,7 @@ from ambjax.commands.outputs import say
 from ambjax.ensemble.engine import cores
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
-from ambjax.simulation.integrate import Adaptive
+from ambjax.simulation.integrate import AdaptiveRodas3
 from ambjax.simulation.method import TOLERANCE
 from ambjax.simulation.sliding import slides
 
@@ -67,7 +67,11 @@ def say_how_long(study: Study, pace: Pace) -> None:
         return
     rate = f"{pace.whole:.2g}" if pace.whole < 10 else f"{pace.whole:,.0f}"
     words = f"about {duration(seconds)} for {study.members:,} members ({rate} a second)"
-    if seconds > LONG and isinstance(study.clock.method, Adaptive) and slides(study.cascade, study.scenario.plant):
+    if (
+        seconds > LONG
+        and isinstance(study.clock.method, AdaptiveRodas3)
+        and slides(study.cascade, study.scenario.plant)
+    ):
         words += '; clock.method = "sliding" would be faster: its error is measured and told'
     say(words)
 
@@ -87,7 +91,7 @@ def sliding_error(study: Study) -> dict[str, Any]:
     loses, or cannot decide, and not the other.
     """
     tolerance = max(TOLERANCE, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps))
-    accurate = dataclasses.replace(study, clock=dataclasses.replace(study.clock, method=Adaptive(tolerance)))
+    accurate = dataclasses.replace(study, clock=dataclasses.replace(study.clock, method=AdaptiveRodas3(tolerance)))
     count = min(COMPARED, study.members)
     ours, theirs = (chunk(one, 0, count, count) for one in (study, accurate))
     ends = [~np.isfinite(found["lost_at"]) for found in (ours, theirs)]

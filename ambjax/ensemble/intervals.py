@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 REPLICATES = 1000
-KINDS = ("mean", "std", "cvar")
+STATISTICS = ("mean", "std", "cvar")
 # A group is this part of its rank, from the nearer end, wide.
 WIDTH = 512
 # Counts held at once: 16 MB an array.
@@ -103,12 +103,12 @@ def bootstrap(
         places.append((centre, scale, x.std(ddof=min(n - 1, 1)), _taken(np.ones((1, n)), tail)[0] @ x / tail))
     G = np.moveaxis(np.array(powers), 0, -1)
     batches = [_moments(counts, G, n, tail) for counts in _resamples(n, sizes, seed)]
-    drawn = {kind: [np.concatenate([batch[kind][k] for batch in batches]) for k in (0, 1)] for kind in KINDS}
+    drawn = {kind: [np.concatenate([batch[kind][k] for batch in batches]) for k in (0, 1)] for kind in STATISTICS}
     whole = _moments(sizes[None].astype(float), G, n, tail)
     centre, scale, std, worst = np.array(places).T
-    ends = {kind: _studentised(whole[kind], drawn[kind], confidence) for kind in KINDS}
+    ends = {kind: _studentised(whole[kind], drawn[kind], confidence) for kind in STATISTICS}
     nothing = np.full(len(std), -np.inf), np.full(len(std), np.inf)
-    ends |= {kind: nothing for kind in KINDS if n < 3 or (kind == "cvar" and tail <= 1)}  # one value has no error
+    ends |= {kind: nothing for kind in STATISTICS if n < 3 or (kind == "cvar" and tail <= 1)}  # one value has no error
     unbiased = (n / max(n - 1, 1)) ** 0.5
     return {
         "mean": Estimate(centre, *(scale * end + centre for end in ends["mean"])),

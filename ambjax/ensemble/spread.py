@@ -42,9 +42,9 @@ def draw(
 ) -> dict[str, np.ndarray]:
     """Values by path, float64 [n], of the members (integers [n]) of an ensemble of `total`.
 
-    Member k's values depend on (seed, k) only, for a Latin hypercube also on the total. Raises ValueError as `check`.
+    Member k's values depend on (seed, k) only, for a Latin hypercube also on the total. Raises as `check_spread` does.
     """
-    known = check(spread, cascade, scenario)
+    known = check_spread(spread, cascade, scenario)
     u = points(spread.design, seed, len(spread.entries), members, total)
     return {path: kind.quantile(u[:, n], _nominal(known[path])) for n, (path, kind) in enumerate(spread.entries)}
 
@@ -66,7 +66,7 @@ def corners(spread: Spread, cascade: Cascade, scenario: Scenario) -> tuple[Casca
 
     What is read off an ensemble by its largest slope, the integrator, then holds for every member.
     """
-    check(spread, cascade, scenario)
+    check_spread(spread, cascade, scenario)
     return ends(spread, cascade, scenario, ("plant.", "controller."))
 
 
@@ -83,7 +83,7 @@ def _nominal(place: Place) -> float:
     return math.nan if place.value is None else float(np.asarray(place.value))
 
 
-def check(spread: Spread, cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
+def check_spread(spread: Spread, cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     """Raise ValueError, one line with path, value, what is allowed and the fix, for a spread that makes no sense here.
 
     Returns the places of all paths.

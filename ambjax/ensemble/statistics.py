@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.ensemble.drivers import drivers
-from ambjax.ensemble.intervals import KINDS, Estimate, bootstrap, column_of, quantile, wilson
+from ambjax.ensemble.intervals import STATISTICS, Estimate, bootstrap, column_of, quantile, wilson
 
 # The share of members that CVaR leaves out, and how many must be left for its interval to hold (measured).
 ALPHA, TAIL = 0.95, 10
@@ -87,7 +87,9 @@ def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) ->
     out = {}
     for name, x in metrics.items():
         at = finite.index(name) if name in finite else None
-        mean, std, worst = (nothing if at is None else Estimate(*(part[at] for part in found[kind])) for kind in KINDS)
+        mean, std, worst = (
+            nothing if at is None else Estimate(*(part[at] for part in found[kind])) for kind in STATISTICS
+        )
         q05, median, q95 = (Estimate(*row) for row in zip(*quantile(x, [0.05, 0.5, 0.95], confidence), strict=True))
         estimates = {"mean": mean, "std": std, "median": median, "q05": q05, "q95": q95, "cvar_95": worst}
         out[name] = {k: _plain(v) for k, v in estimates.items()}

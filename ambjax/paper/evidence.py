@@ -15,7 +15,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.kernel import one_kernel
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.integrate import Adaptive, Slide
+from ambjax.simulation.integrate import AdaptiveRodas3, Slide
 from ambjax.simulation.metrics import Standard
 from ambjax.simulation.rollout import rollout
 from ambjax.simulation.trajectory import Trajectory
@@ -92,7 +92,7 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
         first = pool.submit(_noise, cascade, reading, NOISE_PERIODS[0])
         for name in ("regulation", "tracking"):
             say(f"{reading}: theorem, {name}")
-            check_clock = paper.CLOCK.with_method(Adaptive())
+            check_clock = paper.CLOCK.with_method(AdaptiveRodas3())
             checking = pool.submit(check, cascade, paper.scenario(name, reading), check_clock)
             say(f"{reading}: {name}")
             runs[name] = _run(cascade, reading, name)
@@ -114,7 +114,7 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
 def _simulate(reading: str, cascade: Cascade, scenario: Scenario) -> tuple[Trajectory, dict[str, float]]:
     if scenario.sensor is None:  # with one of no error: the same program as under noise
         scenario = dataclasses.replace(scenario, sensor=Sensor())
-    clock = paper.CLOCK.with_method(STEPS.get(reading, Adaptive()))
+    clock = paper.CLOCK.with_method(STEPS.get(reading, AdaptiveRodas3()))
     trajectory, measured = rollout(cascade, scenario, clock, fold=Standard(paper.SETTLE))
     return jax.tree.map(np.asarray, trajectory), {name: float(value) for name, value in measured.items()}
 
@@ -160,7 +160,7 @@ def _noise(cascade: Cascade, reading: str, period: float) -> Noise:
     quiet = dataclasses.replace(paper.scenario("regulation", reading, pulse=False), sensor=Sensor())
     scenarios = _batch(quiet, len(stds), sensor=Sensor(jnp.asarray(stds), zeros, zeros), seed=jnp.asarray(seeds, int))
     # This tolerance agrees with 1e-6 to 1 % of sigma's radius at all of these levels, at half the cost.
-    clock = Clock(NOISE_SAMPLES, period, Adaptive(1e-4))
+    clock = Clock(NOISE_SAMPLES, period, AdaptiveRodas3(1e-4))
     seen = _scan(*canonical((cascade, scenarios, clock)))
     lost = np.any(np.isfinite(seen["lost_at_s"]).reshape(-1, SEEDS), axis=1)
     sigma = np.asarray(seen["settled_max_abs_sigma_m_per_s"]).reshape(-1, SEEDS).mean(axis=1)
@@ -177,7 +177,7 @@ def _basin(cascade: Cascade, reading: str) -> float:
     quiet = paper.scenario("regulation", reading, pulse=False)
     initial = Initial(jnp.asarray(offsets), zeros, zeros + current)
     scenarios = _batch(dataclasses.replace(quiet, sensor=Sensor()), size, initial=initial)
-    seen = _scan(*canonical((started, scenarios, Clock(NOISE_SAMPLES, 1e-4, Adaptive(1e-4)))))
+    seen = _scan(*canonical((started, scenarios, Clock(NOISE_SAMPLES, 1e-4, AdaptiveRodas3(1e-4)))))
     lost = np.isfinite(seen["lost_at_s"]).reshape(2, -1).any(axis=0)
     first = np.flatnonzero(lost)[0] if lost.any() else len(BASIN)
     return float(BASIN[first - 1]) if first else 0.0

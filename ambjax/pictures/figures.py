@@ -48,14 +48,14 @@ VOLTAGE = Panel("voltage $u$", "V", 1.0, (Curve("u", "$u$"),))
 AVERAGED = Panel("voltage $u$,\naveraged", "V", 1.0, (Curve("u_mean", "$u$"),))
 CURRENT_DISTURBANCE = Panel("disturbance $q_i$", "A/s", 1.0, (Curve("q_i", "$q_i$"),))
 
-SIGNALS = (POSITION, CURRENT, SLIDING, DISTURBANCE)
-INPUTS = (FORCE, FORCE_ERROR, VOLTAGE)
+MOTION = (POSITION, CURRENT, SLIDING, DISTURBANCE)
+FORCES = (FORCE, FORCE_ERROR, VOLTAGE)
 # The paper's Figures 3 to 6: scenario and panels, top to bottom.
 PAPER_FIGURES = {
-    3: ("regulation", SIGNALS),
-    4: ("regulation", INPUTS),
-    5: ("tracking", SIGNALS),
-    6: ("tracking", INPUTS),
+    3: ("regulation", MOTION),
+    4: ("regulation", FORCES),
+    5: ("tracking", MOTION),
+    6: ("tracking", FORCES),
 }
 
 

@@ -27,7 +27,7 @@ from ambjax.simulation.span import NOTHING, Instant, Span, blank
 from ambjax.simulation.trajectory import ALIVE, STALLED
 
 State = TypeVar("State")
-Inputs = Callable[[Array], Any]
+InputFunction = Callable[[Array], Any]
 Rates = Callable[[Any, Any], Any]
 Fate = Callable[[Any], Array]
 # Stage times of one step, by the share of it that has passed.
@@ -44,7 +44,7 @@ class Problem(NamedTuple):
     very system.
     """
 
-    inputs: Inputs
+    inputs: InputFunction
     rates: Rates
     scale: Any
     fate: Fate
@@ -223,7 +223,7 @@ class Slide(_Fixed):
 
 
 @record
-class Adaptive:
+class AdaptiveRodas3:
     """RODAS3 whose steps keep the estimated error of each step below `tolerance` (scale + |state|).
 
     And within the layer of a smoothed sign, where there is one: an error beyond it lands on the sign's other side,

@@ -11,7 +11,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import is_traced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import RK4
-from ambjax.simulation.integrate import Adaptive, Integrator, Rodas3
+from ambjax.simulation.integrate import AdaptiveRodas3, Integrator, Rodas3
 from ambjax.world.scenario import Scenario
 
 # RK4 at this step times slope is accurate to about 1e-9 m on smooth gains (benchmarks/work_precision.py)
@@ -62,7 +62,7 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
         return Rodas3(math.ceil(sample_period / math.sqrt(CORNER / slope)))
     # Rounding must stay well below the tolerance, or steps are rejected for noise: in float32, 1.2e-4.
     tolerance = QUIET_TOLERANCE if scenario.sensor is None else TOLERANCE
-    return Adaptive(max(tolerance, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps)))
+    return AdaptiveRodas3(max(tolerance, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps)))
 
 
 def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: bool = False) -> Clock:

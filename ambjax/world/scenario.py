@@ -15,7 +15,7 @@ from ambjax.world.signals import Constant, Signal, is_random, realised
 
 # A member's randomness beside its sensors': folded into its key where they fold the sample number, beyond any of those.
 DESIGN_STREAM, SIGNAL_STREAM = np.uint32(2**32 - 1), np.uint32(2**32 - 2)
-SIGNALS = ("reference", "q_z", "q_v", "q_i")
+SLOTS = ("reference", "q_z", "q_v", "q_i")
 
 
 @record
@@ -64,7 +64,7 @@ class Scenario:
         """Whether two members of this scenario meet something else: noise, or a signal that is drawn."""
         sensor = self.sensor
         noisy = sensor is not None and bool(np.any([sensor.std, sensor.std_z_dot, sensor.std_i]))
-        return noisy or any(is_random(getattr(self, slot)) for slot in SIGNALS)
+        return noisy or any(is_random(getattr(self, slot)) for slot in SLOTS)
 
     def acceleration(self, t: Scalar) -> Array:
         """The whole disturbance of Eq. (1) at time t: q_z + a q_v, m/s^2."""
@@ -81,11 +81,9 @@ class Scenario:
 
     def realised(self) -> "Scenario":
         """This scenario with whatever is random in its signals drawn for the member."""
-        random = {slot: signal for slot in SIGNALS if hasattr(signal := getattr(self, slot), "realised")}
+        random = {slot: signal for slot in SLOTS if hasattr(signal := getattr(self, slot), "realised")}
         if not random:
             return self
         key = jax.random.fold_in(self.key(), SIGNAL_STREAM)
-        drawn = {
-            slot: realised(signal, jax.random.fold_in(key, SIGNALS.index(slot))) for slot, signal in random.items()
-        }
+        drawn = {slot: realised(signal, jax.random.fold_in(key, SLOTS.index(slot))) for slot, signal in random.items()}
         return dataclasses.replace(self, **drawn)

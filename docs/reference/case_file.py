@@ -6,7 +6,7 @@ import tomllib
 from typing import Any
 
 from ambjax.cases.reader import DURATION, FIELDS, KINDS, OTHERS, SETTLE, SIGNALS, TABLES, case_from
-from ambjax.cases.spread import KINDS as SPREADS
+from ambjax.cases.spread import DISTRIBUTIONS
 from ambjax.cases.table import Table
 from ambjax.cases.template import template
 from ambjax.control.processor import Processor
@@ -181,7 +181,7 @@ def _spread() -> str:
         "",
     ]
     rows = []
-    for kind, make in SPREADS.items():
+    for kind, make in DISTRIBUTIONS.items():
         made = _example(kind, make)
         shapes = [dataclasses.replace(made, shape=shape) for shape in SHAPES] if hasattr(made, "shape") else [made]
         rows += [(code(str(one)), escaped(first_paragraph(type(one)))) for one in shapes]

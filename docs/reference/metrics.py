@@ -16,7 +16,7 @@ FOLDS = {
     metrics.Variation: "total variation",
     metrics.Driven: "mean over time, while the drive is on",
 }
-SIGNALS = {
+MEANINGS = {
     "e_z": "tracking error z - r",
     "e": "current tracking error i - i_ref",
     "u_squared": "voltage u",
@@ -68,7 +68,7 @@ def _unit(name: str) -> str:
 
 def _meaning(name: str, fold: Any) -> str:
     of = getattr(fold, "of", "u_mean")
-    signal = SHARE.get(name) or SIGNALS.get(of) or attribute_docs(Row)[of].rpartition(", ")[0]
+    signal = SHARE.get(name) or MEANINGS.get(of) or attribute_docs(Row)[of].rpartition(", ")[0]
     how = f"root of the {FOLDS[type(fold)]}, of the square" if getattr(fold, "root", False) else FOLDS[type(fold)]
     return f"{how}: {signal}{', from `run.settle` on' if getattr(fold, 'after', 0.0) else ''}"
 
