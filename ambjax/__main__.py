@@ -48,13 +48,13 @@ def parser() -> Parser:
     template.add_argument("scenario", nargs="?", default="tracking", choices=["tracking", "regulation"])
     simulate = command("simulate", "simulate a case: trajectory.npz, metrics.json, overview.png", case=True, out=True)
     simulate.add_argument("--member", type=int, metavar="K", help="member K of the case's ensemble, its [spread] drawn")
-    _seeded(simulate)
+    _seed_option(simulate)
     simulate.add_argument("--members", type=int, metavar="N", help="size of the ensemble (for a Latin hypercube)")
     simulate.add_argument("--from", dest="begin", type=float, metavar="T", help="draw the run from T (s) on")
     simulate.add_argument("--to", dest="end", type=float, metavar="T", help="draw the run up to T (s)")
     ensemble = command("ensemble", "simulate many members: members.npz, summary.json, fan.png", case=True, out=True)
     ensemble.add_argument("--members", type=int, metavar="N", required=True, help="how many members")
-    _seeded(ensemble)
+    _seed_option(ensemble)
     ensemble.add_argument(
         "--chunk", type=int, metavar="M", help="members kept at a time (default: about two seconds of work)"
     )
@@ -68,23 +68,23 @@ def parser() -> Parser:
         grid.add_argument(axis, metavar=form, required=True, help="a quantity and its range; ends may be in per cent")
     grid.add_argument("--members", type=int, metavar="N", default=1, help="members per cell (default: 1)")
     grid.add_argument("--against", metavar="OTHER.toml", action="append", help="another case, beside the first")
-    _seeded(grid)
+    _seed_option(grid)
     command("check", "check Theorem 1's conditions along a case; exit code 1 if one fails", case=True)
     return top
 
 
-def _seeded(command: Parser) -> None:
+def _seed_option(command: Parser) -> None:
     command.add_argument("--seed", type=int, metavar="S", help="seed of noise and spread (default: the case's)")
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command. Returns its exit code: 0 done, 1 the answer is no, 2 bad input."""
     open_streams()
-    given = sys.argv[1:] if argv is None else argv
-    if given[:1] == ["tune"]:
+    words = sys.argv[1:] if argv is None else argv
+    if words[:1] == ["tune"]:
         return complain("tuning is a program of its own: write 'ambjax-tune CASE.toml'. See 'ambjax-tune --help'.")
     with listening("ambjax"):
-        args = parser().parse_args(given)
+        args = parser().parse_args(words)
         return answer(lambda: _run(args), args.json)
 
 

@@ -10,7 +10,7 @@ from matplotlib.text import Text
 
 from ambjax.pictures import ensembles as pictures
 from ambjax.pictures import heatmaps
-from ambjax.pictures.scales import edges, log_ticks, named, prefixed, relabelled, size_of
+from ambjax.pictures.scales import axis_of, edges, label_of, log_ticks, prefix_of, size_of
 from ambjax.pictures.tornado import Bar, tornado
 from ambjax.simulation.metrics import Standard
 
@@ -61,7 +61,7 @@ def texts(figure):
     ],
 )
 def test_prefix(unit, size, expected):
-    factor, words = prefixed(unit, size)
+    factor, words = prefix_of(unit, size)
     assert words == expected[1]
     assert factor == pytest.approx(expected[0], rel=1e-15)  # one rounding of a reciprocal
 
@@ -69,28 +69,28 @@ def test_prefix(unit, size, expected):
 def test_prefix_brings_every_size_between_1_and_1000():
     for size in np.geomspace(1e-9, 1e11, 301):
         # 0.9995: what prints as 1.00 may count as 1
-        assert 0.9995 <= prefixed("V", size)[0] * size < 1000
+        assert 0.9995 <= prefix_of("V", size)[0] * size < 1000
 
 
 def test_every_metric_has_its_unit():
     names = [*Standard()._folds().folds, "lost_at_s", "singular_at_s"]
     for name in names:
-        _, words, unit = named(name, 1.0)
+        _, words, unit = axis_of(name, 1.0)
         assert unit, name
         assert "_" not in words, name
-    assert named("settled_max_abs_sigma_m_per_s", 2e-3)[1:] == (r"settled max |$\sigma$|", "mm/s")
-    assert named("clearance_used", 0.5) == (100.0, "clearance used", "%")
+    assert axis_of("settled_max_abs_sigma_m_per_s", 2e-3)[1:] == (r"settled max |$\sigma$|", "mm/s")
+    assert axis_of("clearance_used", 0.5) == (100.0, "clearance used", "%")
     assert set(pictures.CHIEF) <= set(names)
 
 
 def test_labels_keep_what_is_no_unit():
-    assert relabelled("noise std on $z$ (m)", 2e-5) == (pytest.approx(1e6), "noise std on $z$ (µm)")
-    assert relabelled("share", 2e-5) == (1.0, "share")
-    assert relabelled("mass (kg)", 2e-5) == (1.0, "mass (kg)")
-    assert relabelled("plant.A (m^2)", 2e-5) == (1.0, "plant.A (m²)")
-    assert relabelled("amplitude (m/s^2)", 0.1) == (1e3, "amplitude (mm/s²)")
-    assert relabelled("plant.R (ohm)", 17.0) == (1.0, "plant.R (Ω)")
-    assert relabelled("plant.n (1)", 900.0) == (1.0, "plant.n")
+    assert label_of("noise std on $z$ (m)", 2e-5) == (pytest.approx(1e6), "noise std on $z$ (µm)")
+    assert label_of("share", 2e-5) == (1.0, "share")
+    assert label_of("mass (kg)", 2e-5) == (1.0, "mass (kg)")
+    assert label_of("plant.A (m^2)", 2e-5) == (1.0, "plant.A (m²)")
+    assert label_of("amplitude (m/s^2)", 0.1) == (1e3, "amplitude (mm/s²)")
+    assert label_of("plant.R (ohm)", 17.0) == (1.0, "plant.R (Ω)")
+    assert label_of("plant.n (1)", 900.0) == (1.0, "plant.n")
 
 
 def test_size_ignores_what_cannot_be_shown():

@@ -386,7 +386,7 @@ def test_stalled_members_are_told_apart(capsys):
     columns |= {"stalled": np.arange(10) < 2}
     columns["lost"][5] = True
     columns["lost_at"][[0, 1, 5]] = 0.1
-    for name in studies.SHOWN:
+    for name in studies.METRICS:
         columns[name] = np.linspace(0, 1, 10)
     summary = statistics.summary(columns, [], 1)
     summary["worst"][0]["replay"] = "ambjax simulate"

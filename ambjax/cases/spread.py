@@ -65,16 +65,16 @@ def spread_from(top: Table, cascade: Cascade, scenario: Scenario) -> Spread:
 
 
 def _entries(raw: dict[str, Any], prefix: str, known: list[str]) -> list[tuple[str, Distribution]]:
-    found = []
+    entries = []
     for key, value in raw.items():
         path = prefix + key
         if path in known:
-            found.append((path, _distribution(value, path)))
+            entries.append((path, _distribution(value, path)))
         elif isinstance(value, dict) and value and not set(value) & {*DISTRIBUTIONS, "shape"}:
-            found += _entries(value, path + ".", known)
+            entries += _entries(value, path + ".", known)
         else:
             require_path(path, known, show(value))
-    return found
+    return entries
 
 
 def _distribution(raw: Any, path: str) -> Distribution:
@@ -82,16 +82,16 @@ def _distribution(raw: Any, path: str) -> Distribution:
     if not isinstance(raw, dict):
         raise ValueError(f"{where} = {show(raw)}: it must say how to spread, as in {path} = {{ percent = 10 }}.")
     table = Table(raw, where)
-    given = [kind for kind in DISTRIBUTIONS if kind in raw]
-    table.only(["percent", "shape"] if given == ["percent"] else given or list(DISTRIBUTIONS))
-    if len(given) != 1:
+    kinds = [kind for kind in DISTRIBUTIONS if kind in raw]
+    table.only(["percent", "shape"] if kinds == ["percent"] else kinds or list(DISTRIBUTIONS))
+    if len(kinds) != 1:
         raise ValueError(f"{where} = {show(raw)}: give exactly one of {quoted(list(DISTRIBUTIONS))}.")
-    return DISTRIBUTIONS[given[0]](table)
+    return DISTRIBUTIONS[kinds[0]](table)
 
 
 def _refuse_nothing_in_two_units(spread: Spread, top: Table) -> None:
     """A scaled force that is constantly 0 looks like no disturbance at all, whose unit is another."""
     path = "disturbance.q_z.value"
-    given = top.raw.get("disturbance", {}).get("q_z", {})
-    if path in spread.paths and given.get("unit") == "A^2/m^2" and given.get("value", 0) == 0:
+    signal = top.raw.get("disturbance", {}).get("q_z", {})
+    if path in spread.paths and signal.get("unit") == "A^2/m^2" and signal.get("value", 0) == 0:
         raise ValueError(f'spread.{path}: a value of 0 with unit = "A^2/m^2" cannot be spread. Use unit = "m/s^2".')

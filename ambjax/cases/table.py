@@ -123,19 +123,19 @@ class Table:
         self.only([*extra, *(f.name for f in fields)])
         values: dict[str, Any] = {}
         for field in fields:
-            inherited = field.default if base is None else getattr(base, field.name)
-            if field.name not in self.raw and inherited is dataclasses.MISSING:
+            default = field.default if base is None else getattr(base, field.name)
+            if field.name not in self.raw and default is dataclasses.MISSING:
                 raise ValueError(f"{self.at(field.name)} is missing: give {numbers(field)}; {field.metadata['doc']}.")
-            values[field.name] = self.number(field.name, inherited, numbers(field))
-        made = kind(**values)
-        validate(made, self.path)
-        self._check_order(made)
-        return made
+            values[field.name] = self.number(field.name, default, numbers(field))
+        one = kind(**values)
+        validate(one, self.path)
+        self._check_order(one)
+        return one
 
-    def _check_order(self, made: Any) -> None:
+    def _check_order(self, record: Any) -> None:
         """Refuse a pulse that ends before it starts, and its like."""
-        if pair := getattr(made, "ordered", None):
-            low, high = (getattr(made, name) for name in pair)
+        if pair := getattr(record, "ordered", None):
+            low, high = (getattr(record, name) for name in pair)
             if not low < high:
                 raise ValueError(f"{self.at(pair[1])} = {high:g}: it must be more than {pair[0]} = {low:g}.")
 

@@ -92,7 +92,7 @@ def _lines(kind: type, values: Any) -> list[str]:
         if value is None:
             continue
         unit = f"{field.metadata['unit']}; " if field.metadata["unit"] else ""
-        lines.append(_noted(f"{field.name} = {_number(value)}", unit + field.metadata["doc"]))
+        lines.append(_with_note(f"{field.name} = {_number(value)}", unit + field.metadata["doc"]))
     return lines
 
 
@@ -106,7 +106,7 @@ def _law(kind: type) -> list[str]:
     ]
 
 
-def _noted(text: str, comment: str) -> str:
+def _with_note(text: str, comment: str) -> str:
     return f"{text:<30}# {comment}"
 
 
@@ -127,14 +127,14 @@ def template(scenario: str) -> str:
     for stage, kinds in KINDS.items():
         kind, law = next(iter(kinds.items()))
         others = ", ".join(f'"{k}"' for k in list(kinds)[1:])
-        lines += ["", f"[controller.{stage}]", _noted(f'kind = "{kind}"', f"or {others}"), *_law(law)]
-    lines += ["", _noted("[reference]", f"in m: {', '.join(SIGNALS)}; left out: 0")]
+        lines += ["", f"[controller.{stage}]", _with_note(f'kind = "{kind}"', f"or {others}"), *_law(law)]
+    lines += ["", _with_note("[reference]", f"in m: {', '.join(SIGNALS)}; left out: 0")]
     if tracking:
         lines += ['kind = "sine"', *_lines(type(REFERENCE), REFERENCE)]
     else:
         lines += ['kind = "constant"', "value = 0.0                   # m"]
     lines += ["", "[disturbance.q_z]             # likewise [disturbance.q_i], in A/s; left out: none"]
-    lines += ['kind = "pulse"', _noted('unit = "A^2/m^2"', 'scaled force; or "m/s^2", the default')]
+    lines += ['kind = "pulse"', _with_note('unit = "A^2/m^2"', 'scaled force; or "m/s^2", the default')]
     lines += _lines(type(PULSE), PULSE)
     designs = " or ".join(f'"{d}"' for d in list(DESIGNS)[1:])
     return "\n".join(lines) + "\n" + REST.format(paper_std=TABLE_2.noise_std, designs=designs)

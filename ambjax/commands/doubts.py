@@ -67,8 +67,8 @@ def _currents(case: Case) -> Iterator[str]:
     if abs(weight) > plant.i_0:
         yield f"plant: to carry the rotor at z = 0 takes {abs(weight):.4g} A, {beyond} Check m, n, A, s_0 and i_0."
     if plant.R * abs(weight) > scenario.u_max:
-        needed = plant.R * abs(weight)
-        yield f"actuator.u_max = {scenario.u_max:g} V is less than the {needed:.4g} V that carry the rotor at z = 0."
+        least = plant.R * abs(weight)
+        yield f"actuator.u_max = {scenario.u_max:g} V is less than the {least:.4g} V that carry the rotor at z = 0."
 
 
 def _motion(case: Case) -> Iterator[str]:

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from ambjax.cases.reader import Case
 from ambjax.commands.doubts import read_aloud
-from ambjax.commands.outputs import chosen, files, make, plain, say, table, write_json
+from ambjax.commands.outputs import files, make, plain, say, table, target, write_json
 from ambjax.commands.pace import Pace, error_words, pilot, say_how_long, sliding_error
 from ambjax.ensemble import statistics
 from ambjax.ensemble.design import MOST_MEMBERS
@@ -34,7 +34,7 @@ FAN_MEMBERS, FAN_TIMES = 256, 500
 PATIENCE = "10s"
 BANDS = (0.0, 5.0, 25.0, 50.0, 75.0, 95.0, 100.0)
 GO_ON = "What is finished is kept: give the same command with --out and --resume to go on."
-SHOWN = ("settled_max_abs_error_m", "settled_rms_error_m", "max_abs_error_m", "max_abs_u_V", "rms_u_V", "max_abs_i_A")
+METRICS = ("settled_max_abs_error_m", "settled_rms_error_m", "max_abs_error_m", "max_abs_u_V", "rms_u_V", "max_abs_i_A")
 
 
 def study_of(case: Case, seed: int | None, members: int) -> Study:
@@ -50,9 +50,9 @@ def study_of(case: Case, seed: int | None, members: int) -> Study:
 def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """ambjax ensemble."""
     case = read_aloud(args.case)
-    study, store = _asked(case, args)
+    study, store = _study_and_store(case, args)
     out = store.directory
-    with keeping(lambda: _kept(store)):
+    with keeping(lambda: _state_words(store)):
         error = None
         with contextlib.nullcontext() if store.finished() else _executor(args) as executor:
             make(out)  # not before everything that was asked for is known to be possible
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         return _report(case, study, args, out, error)
 
 
-def _asked(case: Case, args: argparse.Namespace) -> tuple[Study, Store]:
+def _study_and_store(case: Case, args: argparse.Namespace) -> tuple[Study, Store]:
     """The study that is asked for, and where it is kept; nothing is written. Raises ValueError for what cannot be."""
     study = study_of(case, args.seed, args.members)
     if args.chunk is not None and args.chunk < 1:
@@ -77,7 +77,7 @@ def _asked(case: Case, args: argparse.Namespace) -> tuple[Study, Store]:
     if args.resume and args.out is None:
         raise ValueError("--resume: add --out DIR, the directory of the study that was interrupted.")
     study.drawn(np.array([0]))  # raises what the design has against so many members
-    out = chosen(args.out, f"ensemble-{case.name}")
+    out = target(args.out, f"ensemble-{case.name}")
     chunk = None if args.chunk is None else min(args.chunk, study.members)
     store = Store(out, study.fingerprint(), study.members, chunk)
     store.check(COLUMNS + len(study.spread.entries), args.resume)
@@ -100,20 +100,20 @@ def _begin(study: Study, store: Store, executor: tuple[Executor, int] | None) ->
             store.put((start, stop), {name: column[start:stop] for name, column in columns.items()})
 
 
-def _kept(store: Store) -> str:
+def _state_words(store: Store) -> str:
     """What an interruption has left, and how to go on."""
     if not store.begun():
         return "nothing is kept"
     again = f"give the same command with --out {store.directory} --resume"
-    return f"{store.kept()} of {store.members} members are kept. To go on, {again}"
+    return f"{store.count()} of {store.members} members are kept. To go on, {again}"
 
 
 def _report(
     case: Case, study: Study, args: argparse.Namespace, out: pathlib.Path, error: dict[str, Any] | None
 ) -> tuple[int, dict[str, Any]]:
     """What is made of a finished study; `error` is that of its sliding step, if it has one."""
-    with np.load(out / "members.npz") as kept:
-        columns = {name: kept[name] for name in kept.files}
+    with np.load(out / "members.npz") as file:
+        columns = {name: file[name] for name in file.files}
     summary = _summary(case, study, columns, shlex.quote(str(args.case)))
     if error is not None:
         summary["sliding_step_error"] = error
@@ -162,24 +162,24 @@ def _run(study: Study, store: Store, executor: tuple[Executor, int] | None) -> N
     missing, remarks = store.survey()
     for remark in remarks:
         say(remark)
-    done = study.members - sum(stop - start for start, stop in missing)
-    with tqdm(total=study.members, initial=done, unit="member", unit_scale=True, delay=2, desc="ensemble") as bar:
-        found = _here(study, store, missing) if executor is None else _elsewhere(study, store, missing, *executor)
-        for span, columns in found:
+    before = study.members - sum(stop - start for start, stop in missing)
+    with tqdm(total=study.members, initial=before, unit="member", unit_scale=True, delay=2, desc="ensemble") as bar:
+        results = _here(study, store, missing) if executor is None else _elsewhere(study, store, missing, *executor)
+        for span, columns in results:
             with unbroken():
                 store.put(span, columns)
             bar.update(span[1] - span[0])
 
 
-Found = Iterator[tuple[tuple[int, int], dict[str, Any]]]
+Results = Iterator[tuple[tuple[int, int], dict[str, Any]]]
 
 
-def _here(study: Study, store: Store, missing: list[tuple[int, int]]) -> Found:
+def _here(study: Study, store: Store, missing: list[tuple[int, int]]) -> Results:
     for span in missing:
         yield span, chunk(study, *span, store.chunk)
 
 
-def _elsewhere(study: Study, store: Store, missing: list[tuple[int, int]], pool: Executor, ahead: int) -> Found:
+def _elsewhere(study: Study, store: Store, missing: list[tuple[int, int]], pool: Executor, ahead: int) -> Results:
     queue, running = list(reversed(missing)), dict[Future, tuple[int, int]]()
     while queue or running:
         while queue and len(running) < ahead:
@@ -197,11 +197,11 @@ def _summary(case: Case, study: Study, columns: dict[str, np.ndarray], path: str
         "settle_s": case.settle,
         "design": study.spread.design,
     }
-    found = statistics.summary(columns, study.spread.paths, study.seed)
+    numbers = statistics.summary(columns, study.spread.paths, study.seed)
     latin = f" --members {study.members}" if study.spread.design == "latin-hypercube" else ""
-    for worst in found["worst"]:
+    for worst in numbers["worst"]:
         worst["replay"] = f"ambjax simulate {path} --member {worst['index']} --seed {study.seed}{latin}"
-    return facts | found
+    return facts | numbers
 
 
 def _pictures(
@@ -226,9 +226,9 @@ def _pictures(
 def _quantiles(x: np.ndarray) -> dict[float, np.ndarray]:
     """Quantiles over the members that are left at each instant, by per cent; NaN where none is."""
     left = np.isfinite(x).any(axis=0)
-    found = np.full((len(BANDS), x.shape[1]), np.nan)
-    found[:, left] = np.nanquantile(x[:, left], np.array(BANDS) / 100, axis=0)
-    return dict(zip(BANDS, found, strict=True))
+    quantiles = np.full((len(BANDS), x.shape[1]), np.nan)
+    quantiles[:, left] = np.nanquantile(x[:, left], np.array(BANDS) / 100, axis=0)
+    return dict(zip(BANDS, quantiles, strict=True))
 
 
 def _text(summary: dict[str, Any]) -> str:
@@ -245,17 +245,17 @@ def _text(summary: dict[str, Any]) -> str:
         return "-" if x is None else f"{x:.4g}"
 
     rows = []
-    for name in SHOWN:
-        found = summary["metrics"][name]
+    for name in METRICS:
+        metric = summary["metrics"][name]
         rows.append(
-            (name, *(number(found[key]["estimate"]) for key in ("median", "q95", "cvar_95")), number(found["max"]))
+            (name, *(number(metric[key]["estimate"]) for key in ("median", "q95", "cvar_95")), number(metric["max"]))
         )
     lines += ["", table(("metric", "median", "95 % quantile", "mean of worst 5 %", "largest"), rows)]
-    drivers, explained = summary["drivers"][statistics.DECIDING][:5], summary["explained"][statistics.DECIDING]
+    drivers, account = summary["drivers"][statistics.DECIDING][:5], summary["explained"][statistics.DECIDING]
     if drivers:
-        lines += ["", f"What drives {statistics.DECIDING}: {explained['says']}."]
-    if explained["alone"]:
-        shown = [
+        lines += ["", f"What drives {statistics.DECIDING}: {account['says']}."]
+    if account["alone"]:
+        bars = [
             (
                 d["path"],
                 f"{100 * d['share']:.1f} %",
@@ -264,6 +264,6 @@ def _text(summary: dict[str, Any]) -> str:
             )
             for d in drivers
         ]
-        lines += [table(("quantity", "explains alone", sure, "rank correlation"), shown)]
+        lines += [table(("quantity", "explains alone", sure, "rank correlation"), bars)]
     worst = summary["worst"][0]
     return "\n".join([*lines, "", f"The worst member alone: {worst['replay']}"])

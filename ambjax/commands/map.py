@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
             say(f"{case.name}: nominal, its [spread] is not drawn; --members N, N above 1, draws it.")
         maps.append(grid(study, x, y))
     out = directory(args.out, f"map-{cases[0].name}")
-    summary = {"cases": [_summary(case, found) for case, found in zip(cases, maps, strict=True)], "out": str(out)}
+    summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
     with files(out) as part:
         _draw(cases, maps, part / "map.png")
         write_json(part / "map.json", summary)
@@ -113,35 +113,33 @@ def _value(text: str, nominal: float | None) -> float:
     return nominal * (1 + float(text[:-1]) / 100)
 
 
-def _summary(case: Case, found: Map) -> dict[str, Any]:
-    facts: dict[str, Any] = {"case": case.name, "x": found.x._asdict(), "y": found.y._asdict()}
-    return facts | {key: getattr(found, key) for key in (*GRIDS, "drawn")} | {"reach": found.reach()}
+def _summary(case: Case, one: Map) -> dict[str, Any]:
+    facts: dict[str, Any] = {"case": case.name, "x": one.x._asdict(), "y": one.y._asdict()}
+    return facts | {key: getattr(one, key) for key in (*GRIDS, "drawn")} | {"reach": one.reach()}
 
 
 def _text(cases: list[Case], maps: list[Map]) -> str:
     x, y = maps[0].x, maps[0].y
     middle = (y.values[0] + y.values[-1]) / 2
     rows = []
-    for case, found in zip(cases, maps, strict=True):
-        reach = found.reach()
+    for case, one in zip(cases, maps, strict=True):
+        reach = one.reach()
         held = "nowhere" if reach is None else f"{reach[0]:.4g} to {reach[1]:.4g}"
-        rows.append(
-            (case.name, f"{100 * found.survival.mean():.1f} %", f"{100 * np.mean(found.low >= 0.95):.1f} %", held)
-        )
+        rows.append((case.name, f"{100 * one.survival.mean():.1f} %", f"{100 * np.mean(one.low >= 0.95):.1f} %", held))
     header = ("case", "runs that survive", "cells surely above 95 %", f"{x.path} survived at {y.path} = {middle:.3g}")
     lines = [table(header, rows)]
-    for case, found in zip(cases, maps, strict=True):
-        lines += [f"{case.name}: {_drawn(found)}"]
-        if found.stalled.any():
-            many, lost = int(found.stalled.sum()), int(found.lost.sum())
-            where = f"in {np.count_nonzero(found.stalled)} cells"
+    for case, one in zip(cases, maps, strict=True):
+        lines += [f"{case.name}: {_spread_words(one)}"]
+        if one.stalled.any():
+            many, lost = int(one.stalled.sum()), int(one.lost.sum())
+            where = f"in {np.count_nonzero(one.stalled)} cells"
             lines += [f"{case.name}: {lost} runs lost, {many} not decided ({where}): the integrator gave up there"]
     return "\n".join(lines)
 
 
-def _drawn(found: Map) -> str:
+def _spread_words(one: Map) -> str:
     """What a map shows of the case's spread."""
-    return f"drawn for each member: {', '.join(found.drawn)}" if found.drawn else "nominal: nothing is spread"
+    return f"drawn for each member: {', '.join(one.drawn)}" if one.drawn else "nominal: nothing is spread"
 
 
 def _draw(cases: list[Case], maps: list[Map], path: Any) -> None:
@@ -163,12 +161,12 @@ def _draw(cases: list[Case], maps: list[Map], path: Any) -> None:
     heatmaps.maps(panels, _label(cases[0], x), _label(cases[0], y), x.log, y.log, path)
 
 
-def _short(found: Map) -> str:
+def _short(one: Map) -> str:
     """What a map shows, for a title: spread quantities by name, or how many they are."""
-    few = len(found.drawn) <= 3
-    what = ", ".join(found.drawn) if few else f"{len(found.drawn)} quantities"
-    drawn = f"spread: {what}" if what else "nominal"
-    return drawn + f"; {int(found.stalled.sum())} runs not decided" * bool(found.stalled.any())
+    few = len(one.drawn) <= 3
+    what = ", ".join(one.drawn) if few else f"{len(one.drawn)} quantities"
+    words = f"spread: {what}" if what else "nominal"
+    return words + f"; {int(one.stalled.sum())} runs not decided" * bool(one.stalled.any())
 
 
 def _label(case: Case, axis: Axis) -> str:

@@ -18,39 +18,39 @@ import numpy as np
 from ambjax.ensemble.store import MANIFEST, RESULT
 
 
-def directory(asked: str | None, name: str) -> pathlib.Path:
+def directory(out: str | None, name: str) -> pathlib.Path:
     """The directory to write to: as asked, or a new one under ./out. Made, and seen to be writable.
 
     Raises ValueError if it cannot be made or written, or holds a study, whose files are not to be mixed with others.
     """
-    path = chosen(asked, name)
-    for kept in (MANIFEST, RESULT):
-        with _told(path):
-            taken = (path / kept).exists()
-        if taken:
-            raise ValueError(f"--out {path}: it holds the study of an ensemble ({kept}). Choose another directory.")
+    path = target(out, name)
+    for file in (MANIFEST, RESULT):
+        with _refusal(path):
+            there = (path / file).exists()
+        if there:
+            raise ValueError(f"--out {path}: it holds the study of an ensemble ({file}). Choose another directory.")
     make(path)
     return path
 
 
-def chosen(asked: str | None, name: str) -> pathlib.Path:
+def target(out: str | None, name: str) -> pathlib.Path:
     """The directory to write to, which need not exist yet: as asked, or a new one under ./out.
 
     Raises ValueError for one without a name.
     """
-    if asked is not None:
-        if not asked.strip():
+    if out is not None:
+        if not out.strip():
             raise ValueError(
                 "--out: the name of the directory is empty. Give one, '.' for this folder, or leave it out."
             )
-        return pathlib.Path(asked)
+        return pathlib.Path(out)
     candidates = (pathlib.Path("out") / (name if n == 1 else f"{name}-{n}") for n in itertools.count(1))
     return next(p for p in candidates if not p.exists())
 
 
 def make(path: pathlib.Path) -> None:
     """Make a directory and see that it can be written. Raises ValueError if not."""
-    with _told(path):
+    with _refusal(path):
         path.mkdir(parents=True, exist_ok=True)
         probe = path / ".ambjax-write-test"
         probe.touch()
@@ -63,7 +63,7 @@ def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
 
     A directory that is empty then goes too. Raises ValueError where the disk is full or `out` cannot be written.
     """
-    with _told(out):
+    with _refusal(out):
         try:
             with tempfile.TemporaryDirectory(prefix=".ambjax-", dir=out, ignore_cleanup_errors=True) as folder:
                 part = pathlib.Path(folder)
@@ -79,7 +79,7 @@ def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 @contextlib.contextmanager
-def _told(out: pathlib.Path) -> Iterator[None]:
+def _refusal(out: pathlib.Path) -> Iterator[None]:
     """What the system has against writing, as a ValueError that names --out."""
     try:
         yield

@@ -24,7 +24,7 @@ BESIDE_CPU = 1024
 # A shorter run is not announced; for a longer one a faster method is named, in s.
 SHORT, LONG = 3.0, 60.0
 # Members on which the sliding step is compared with adaptive ones, and by what.
-COMPARED, BY = 16, ("settled_rms_error_m", "rms_u_V", "chatter_V")
+COMPARISON, BY = 16, ("settled_rms_error_m", "rms_u_V", "chatter_V")
 
 
 class Pace(NamedTuple):
@@ -44,8 +44,8 @@ class Pace(NamedTuple):
             return min(BESIDE_CPU, members)
         unit, rate = (CALL * cores(), self.rate) if self.workers is None else (CALL, self.rate / cores())
         fair = members if self.workers is None else -(-members // (2 * self.workers))
-        wanted = min(round(BEAT * rate), fair, MOST_CHUNK)
-        return min(max(-(-wanted // unit), 1) * unit, members)
+        count = min(round(BEAT * rate), fair, MOST_CHUNK)
+        return min(max(-(-count // unit), 1) * unit, members)
 
 
 def pilot(study: Study) -> tuple[dict[str, np.ndarray], float]:
@@ -92,13 +92,13 @@ def sliding_error(study: Study) -> dict[str, Any]:
     """
     tolerance = max(TOLERANCE, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps))
     accurate = dataclasses.replace(study, clock=dataclasses.replace(study.clock, method=AdaptiveRodas3(tolerance)))
-    count = min(COMPARED, study.members)
+    count = min(COMPARISON, study.members)
     ours, theirs = (chunk(one, 0, count, count) for one in (study, accurate))
-    ends = [~np.isfinite(found["lost_at"]) for found in (ours, theirs)]
+    ends = [~np.isfinite(columns["lost_at"]) for columns in (ours, theirs)]
     both = ends[0] & ends[1]
     error: dict[str, Any] = {"members": count, "lost_by_one": int((ends[0] != ends[1]).sum())}
     for name in BY:
-        a, b = (np.asarray(found[name])[both] for found in (ours, theirs))
+        a, b = (np.asarray(columns[name])[both] for columns in (ours, theirs))
         size = np.maximum(np.abs(b), np.finfo(float).tiny)  # nothing to compare with: 0 if equal, else huge
         error[name] = float(np.max(np.abs(a - b) / size)) if both.any() else None
     return error

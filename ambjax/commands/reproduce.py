@@ -18,12 +18,12 @@ from ambjax.pictures import figures
 Summary = dict[str, Any]
 
 
-def _paper_figures(reading: str, seen: Evidence, out: pathlib.Path) -> None:
+def _paper_figures(reading: str, evidence: Evidence, out: pathlib.Path) -> None:
     folder = out if reading == "repaired" else out / reading
     folder.mkdir(exist_ok=True)
     for number, (name, _) in figures.PAPER_FIGURES.items():
         title = f"Figure {number}: {name}, {reading} reading, {'under' if reading == 'tuned' else 'no'} noise"
-        figures.paper_figure(number, getattr(seen, name).trajectory, title, folder / f"figure_{number}.png")
+        figures.paper_figure(number, getattr(evidence, name).trajectory, title, folder / f"figure_{number}.png")
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
@@ -44,19 +44,19 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
             bar.update()
 
         # Tracing holds the interpreter, so the reading of another structure has one of its own; a thread draws.
-        evidence, drawn = {}, []
+        evidence, jobs = {}, []
         with ThreadPoolExecutor(1) as artist, processes(1) as other:
             tuned = other.submit(gather, "tuned")
             for reading in paper.READINGS:
                 evidence[reading] = tuned.result() if reading == "tuned" else gather(reading, stage)
-                drawn.append(artist.submit(_paper_figures, reading, evidence[reading], part))
+                jobs.append(artist.submit(_paper_figures, reading, evidence[reading], part))
             stage("figures and ledger")
-            for job in drawn:
+            for job in jobs:
                 job.result()
         std = paper.TABLE_2.noise_std
         words = f"Tracking under the paper's noise (std {std:.2g} m on z) and a {paper.SUPPLY:g} V supply"
         figures.readings(
-            {name: seen.noisy for name, seen in evidence.items()}, words, paper.SETTLE, part / "readings.png"
+            {name: one.noisy for name, one in evidence.items()}, words, paper.SETTLE, part / "readings.png"
         )
         claims, noise = ledger.judge(evidence), ledger.noise_table(evidence)
         (part / "ledger.md").write_text(ledger.markdown(claims, noise), encoding="utf-8")

@@ -30,8 +30,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     say(f"method: {case.clock.method}")
     if case.cascade.processor is not None:
         say(f"on a processor: {case.cascade.processor}")
-    trajectory, measured = simulate(case)
-    metrics = plain(measured) | {
+    trajectory, numbers = simulate(case)
+    metrics = plain(numbers) | {
         "lost_why": trajectory.lost_why,
         "method": str(case.clock.method),
         "settle_s": case.settle,
@@ -66,8 +66,8 @@ def _window(case: Case, args: argparse.Namespace) -> tuple[float, float] | None:
     period, last = float(case.clock.sample_period), float(case.clock.duration)
     begin, end = 0.0 if args.begin is None else args.begin, last if args.end is None else args.end
     if not (begin >= 0 and begin + period * (1 - 1e-9) <= end <= last * (1 + 1e-9)):
-        allowed = f"the stretch must lie within 0 to {last:g} s, clock.duration, and be at least {period:g} s long"
-        raise ValueError(f"--from {begin:g} --to {end:g}: {allowed}, clock.sample_period. Choose other times.")
+        limits = f"the stretch must lie within 0 to {last:g} s, clock.duration, and be at least {period:g} s long"
+        raise ValueError(f"--from {begin:g} --to {end:g}: {limits}, clock.sample_period. Choose other times.")
     return begin, end
 
 
@@ -94,13 +94,13 @@ def simulate(case: Case) -> Outcome:
     """A rollout of a case, recorded whole, with a progress bar if it takes more than two seconds."""
     fold = standard_for(case.settle, case.scenario)
     loop, clock, fold = canonical((system_of(case.cascade, case.scenario, case.clock), case.clock, fold))
-    progress, parts, done = begin_jit(loop, clock, fold), [], 0
+    progress, parts, at = begin_jit(loop, clock, fold), [], 0
     with tqdm(total=clock.samples, unit="sample", unit_scale=True, delay=2, leave=False, desc="simulate") as bar:
-        while done < clock.samples:
-            count = min(STROKE, clock.samples - done)
-            progress, rows = segment_jit(loop, clock, fold, progress, done, count=count, every=1)
+        while at < clock.samples:
+            count = min(STROKE, clock.samples - at)
+            progress, rows = segment_jit(loop, clock, fold, progress, at, count=count, every=1)
             parts.append(jax.tree.map(np.asarray, rows))
-            done += count
+            at += count
             bar.update(count)
     rows = jax.tree.map(lambda *xs: np.concatenate(xs), *parts)
     return jax.tree.map(np.asarray, finish(progress, rows, fold))

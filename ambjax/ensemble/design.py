@@ -46,8 +46,8 @@ def points(design: str, seed: int, dims: int, members: np.ndarray, total: int) -
 
 def _random(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
     pairs = np.stack([np.repeat(members, dims), np.tile(np.arange(dims), len(members))]).astype(np.uint32)
-    padded = np.pad(pairs, ((0, 0), (0, -pairs.shape[1] % BLOCK)))
-    blocks = np.split(padded, padded.shape[1] // BLOCK, axis=1)
+    columns = np.pad(pairs, ((0, 0), (0, -pairs.shape[1] % BLOCK)))
+    blocks = np.split(columns, columns.shape[1] // BLOCK, axis=1)
     words = np.concatenate([np.asarray(_words(np.uint32(seed), *block), np.uint64) for block in blocks])
     whole = (words[:, 0] << np.uint64(32) | words[:, 1]) >> np.uint64(64 - BITS)
     return ((whole + 0.5) * 2.0**-BITS)[: pairs.shape[1]].reshape(-1, dims)
@@ -68,9 +68,9 @@ def _sobol(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
     from scipy.stats import qmc
 
     engine = qmc.Sobol(dims, scramble=True, bits=SOBOL_BITS, rng=np.random.default_rng([DOMAIN, seed]))
-    wanted, where = np.unique(members, return_inverse=True)
+    indices, where = np.unique(members, return_inverse=True)
     parts = []
-    for run in np.split(wanted, np.flatnonzero(np.diff(wanted) != 1) + 1):
+    for run in np.split(indices, np.flatnonzero(np.diff(indices) != 1) + 1):
         ahead = int(run[0]) - engine.num_generated
         if ahead:
             engine.fast_forward(ahead)

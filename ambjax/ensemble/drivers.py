@@ -67,8 +67,8 @@ def shares(x: Sequence[np.ndarray], y: Sequence[np.ndarray], confidence: float =
         raise ValueError("a column is not finite: there is no variation to share. Give its ranks.")
     Y = np.stack([_standard(column) for column in columns])
     terms = _terms(columns)
-    found = [_explained(_cosines(column, TERMS), Y, terms, confidence) for column in x]
-    return Shares(*(np.array(part) for part in zip(*found, strict=True)))
+    results = [_explanation(_cosines(column, TERMS), Y, terms, confidence) for column in x]
+    return Shares(*(np.array(part) for part in zip(*results, strict=True)))
 
 
 def drivers(
@@ -82,24 +82,24 @@ def drivers(
     metric taken together.
     """
     if not spread:
-        return {name: [] for name in metrics}, {name: _said(0.0, None, "nothing is spread") for name in metrics}
+        return {name: [] for name in metrics}, {name: _account(0.0, None, "nothing is spread") for name in metrics}
     x, ranks = list(spread.values()), list(_standard_ranks(list(metrics.values())))
-    found, rho, paths = shares(x, ranks, confidence), _correlation(_standard_ranks(x), np.stack(ranks)), list(spread)
+    parts, rho, paths = shares(x, ranks, confidence), _correlation(_standard_ranks(x), np.stack(ranks)), list(spread)
     pairs = _pairs(dict(spread), ranks, confidence)
-    ranked, explained = {}, {}
+    ranking, accounts = {}, {}
     for n, name in enumerate(metrics):
         rows: list[dict[str, Any]] = [
-            {"path": path} | {k: float(v[row, n]) for k, v in found._asdict().items()} | {"rho": float(rho[row, n])}
+            {"path": path} | {k: float(v[row, n]) for k, v in parts._asdict().items()} | {"rho": float(rho[row, n])}
             for row, path in enumerate(paths)
         ]
-        ranked[name] = sorted(rows, key=lambda row: -row["share"])
-        seen = 2 * len(paths) * found.p[:, n] < 1 - confidence
-        alone = float(min(found.share[seen, n].sum(), 1.0))
-        explained[name] = _said(alone, pairs[n], _words(ranks[n], alone, pairs[n], bool(np.all(found.p[:, n] == 1))))
-    return ranked, explained
+        ranking[name] = sorted(rows, key=lambda row: -row["share"])
+        clear = 2 * len(paths) * parts.p[:, n] < 1 - confidence
+        alone = float(min(parts.share[clear, n].sum(), 1.0))
+        accounts[name] = _account(alone, pairs[n], _words(ranks[n], alone, pairs[n], bool(np.all(parts.p[:, n] == 1))))
+    return ranking, accounts
 
 
-def _said(alone: float, pair: dict[str, Any] | None, says: str) -> dict[str, Any]:
+def _account(alone: float, pair: dict[str, Any] | None, says: str) -> dict[str, Any]:
     return {"alone": alone, "pair": pair, "says": says}
 
 
@@ -124,22 +124,22 @@ def _pairs(
     spread: dict[str, np.ndarray], ranks: Sequence[np.ndarray], confidence: float
 ) -> list[dict[str, Any] | None]:
     """For each column: the pair that explains most beyond what each of the two explains alone; None: none is seen."""
-    looked = slice(0, PAIR_MEMBERS)
-    Y = np.stack([_standard(column[looked]) for column in ranks])
-    waves = {path: _cosines(x[looked], PAIR_TERMS) for path, x in spread.items()}
+    sample = slice(0, PAIR_MEMBERS)
+    Y = np.stack([_standard(column[sample]) for column in ranks])
+    waves = {path: _cosines(x[sample], PAIR_TERMS) for path, x in spread.items()}
     enough = [PAIR_TERMS**2 * (terms >= PAIR_TERMS**2) for terms in _terms(list(Y), PAIR_TERMS**2)]
     couples = list(itertools.combinations(spread, 2))
     best: list[dict[str, Any] | None] = [None] * len(ranks)
     for couple in couples:
         products = (waves[couple[0]][:, None] * waves[couple[1]][None]).reshape(-1, Y.shape[1])
-        share, _, _, p = _explained(products, Y, enough, confidence)
+        share, _, _, p = _explanation(products, Y, enough, confidence)
         for n, before in enumerate(best):
             if 2 * len(couples) * p[n] < 1 - confidence and (before is None or share[n] > before["share"]):
                 best[n] = {"paths": list(couple), "share": float(share[n]), "p": float(p[n])}
     return best
 
 
-def _explained(waves: np.ndarray, Y: np.ndarray, terms: Sequence[int], confidence: float) -> tuple[np.ndarray, ...]:
+def _explanation(waves: np.ndarray, Y: np.ndarray, terms: Sequence[int], confidence: float) -> tuple[np.ndarray, ...]:
     """Share, low, high and p of each row of Y [columns, N], standard, explained by its first terms of waves [., N]."""
     from scipy.special import fdtrc, ndtri
 
@@ -149,17 +149,17 @@ def _explained(waves: np.ndarray, Y: np.ndarray, terms: Sequence[int], confidenc
     out = np.tile([[0.0], [0.0], [1.0], [1.0]], len(Y))
     for column, count in enumerate(terms):
         gain = np.linalg.pinv(gram[:count, :count], rcond=1e-9, hermitian=True) @ b[:count, column]
-        fitted, rank = float(b[:count, column] @ gain), int(np.linalg.matrix_rank(gram[:count, :count], 1e-9, True))
+        fit, rank = float(b[:count, column] @ gain), int(np.linalg.matrix_rank(gram[:count, :count], 1e-9, True))
         rest = n - 1 - rank
         if rank == 0 or rest < 1 or not Y[column].any():
             continue
-        fitted = min(fitted, 1.0)
-        share = fitted - rank / rest * (1 - fitted)
+        fit = min(fit, 1.0)
+        share = fit - rank / rest * (1 - fit)
         f, y = gain @ waves[:count], Y[column]
         # d share = (2 f y - share y^2 - fitted)/Var(y) by member; the cosines' own noise counts where nothing is fitted
-        influence = np.mean((2 * f * y - fitted * y**2 - fitted) ** 2) / n
-        half = ndtri((1 + confidence) / 2) * np.sqrt(influence + 2 * rank * (1 - fitted) ** 2 / n**2)
-        p = fdtrc(rank, rest, fitted / rank / max((1 - fitted) / rest, np.finfo(float).tiny))
+        influence = np.mean((2 * f * y - fit * y**2 - fit) ** 2) / n
+        half = ndtri((1 + confidence) / 2) * np.sqrt(influence + 2 * rank * (1 - fit) ** 2 / n**2)
+        p = fdtrc(rank, rest, fit / rank / max((1 - fit) / rest, np.finfo(float).tiny))
         out[:, column] = max(share, 0.0), max(share - half, 0.0), min(max(share, 0.0) + half, 1.0), p
     return tuple(out)
 

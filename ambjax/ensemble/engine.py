@@ -105,9 +105,9 @@ def size(tree: Any) -> int:
     """
     lengths = {np.shape(x)[0] for x in jax.tree.leaves(tree) if np.ndim(x)}
     if len(lengths) != 1:
-        found = " and ".join(str(n) for n in sorted(lengths)) or "none"
+        listing = " and ".join(str(n) for n in sorted(lengths)) or "none"
         raise ValueError(
-            f"ensemble: leaves have lengths {found}; there must be one length. Give scenario.member = np.arange(N), "
+            f"ensemble: leaves have lengths {listing}; there must be one length. Give scenario.member = np.arange(N), "
             "and every other leaf that varies as an array of the same N."
         )
     return lengths.pop()

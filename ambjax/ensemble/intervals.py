@@ -100,13 +100,13 @@ def bootstrap(
         scale = np.abs(x[[0, -1]] - centre).max() or 1.0
         y = (x - centre) / scale
         powers.append([np.add.reduceat(y**k, edges[:-1]) / sizes for k in (1, 2, 3, 4)])
-        places.append((centre, scale, x.std(ddof=min(n - 1, 1)), _taken(np.ones((1, n)), tail)[0] @ x / tail))
+        places.append((centre, scale, x.std(ddof=min(n - 1, 1)), _tail_counts(np.ones((1, n)), tail)[0] @ x / tail))
     G = np.moveaxis(np.array(powers), 0, -1)
     batches = [_moments(counts, G, n, tail) for counts in _resamples(n, sizes, seed)]
-    drawn = {kind: [np.concatenate([batch[kind][k] for batch in batches]) for k in (0, 1)] for kind in STATISTICS}
+    resamples = {kind: [np.concatenate([batch[kind][k] for batch in batches]) for k in (0, 1)] for kind in STATISTICS}
     whole = _moments(sizes[None].astype(float), G, n, tail)
     centre, scale, std, worst = np.array(places).T
-    ends = {kind: _studentised(whole[kind], drawn[kind], confidence) for kind in STATISTICS}
+    ends = {kind: _studentised_ends(whole[kind], resamples[kind], confidence) for kind in STATISTICS}
     nothing = np.full(len(std), -np.inf), np.full(len(std), np.inf)
     ends |= {kind: nothing for kind in STATISTICS if n < 3 or (kind == "cvar" and tail <= 1)}  # one value has no error
     unbiased = (n / max(n - 1, 1)) ** 0.5
@@ -128,16 +128,16 @@ def _moments(counts: np.ndarray, G: np.ndarray, n: int, tail: float) -> dict[str
     m4 = r4 - 4 * mean * r3 + 6 * mean**2 * r2 - 3 * mean**4
     with np.errstate(divide="ignore", invalid="ignore"):  # all alike: no deviation, and no error of it
         log_std, log_error = 0.5 * np.log(m2), np.sqrt(np.maximum(m4 - m2**2, 0) / n) / (2 * m2)
-    taken = _taken(counts, tail)
-    first, second, q = taken @ G[0], taken @ G[1], G[0][np.argmax(taken > 0, axis=1)]
+    tails = _tail_counts(counts, tail)
+    first, second, q = tails @ G[0], tails @ G[1], G[0][np.argmax(tails > 0, axis=1)]
     beyond, squared = (first - q * tail) / n, (second - 2 * q * first + q**2 * tail) / n
     varying = squared - beyond**2
     error = np.sqrt(np.where(varying > ROUNDING, varying, 0) * n) / tail
     return {"mean": (mean, np.sqrt(m2 / n)), "std": (log_std, np.nan_to_num(log_error)), "cvar": (first / tail, error)}
 
 
-def _studentised(
-    whole: Sequence[np.ndarray], drawn: Sequence[np.ndarray], confidence: float
+def _studentised_ends(
+    whole: Sequence[np.ndarray], resamples: Sequence[np.ndarray], confidence: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Ends of the interval [columns] of a value [1, columns], from resampled ones [replicates, columns]; with errors.
 
@@ -145,7 +145,7 @@ def _studentised(
     for its tail is one value, has the percentile interval: what is resampled is all that can be said.
     """
     (value,), (error,) = whole
-    values, errors = drawn
+    values, errors = resamples
     with np.errstate(divide="ignore", invalid="ignore"):
         off = values - value
         far = np.sort(np.where(np.abs(off) <= 1e-12 * error, 0.0, off / errors), axis=0)
@@ -172,7 +172,7 @@ def _resamples(n: int, sizes: np.ndarray, seed: int) -> Iterator[np.ndarray]:
         left -= batch
 
 
-def _taken(counts: np.ndarray, tail: float) -> np.ndarray:
+def _tail_counts(counts: np.ndarray, tail: float) -> np.ndarray:
     """How much of each count (of ascending values) belongs to the largest `tail` values."""
     above = np.cumsum(counts[:, ::-1], axis=1)[:, ::-1] - counts
     return np.clip(tail - above, 0.0, counts)

@@ -64,8 +64,8 @@ def grid(study: Study, x: Axis, y: Axis) -> Map:
     Raises ValueError for a path that does not exist.
     """
     if x.path == PERIOD:
-        turned = grid(study, y, x)
-        return turned._replace(x=x, y=y, **{k: getattr(turned, k).T for k in GRIDS})
+        transpose = grid(study, y, x)
+        return transpose._replace(x=x, y=y, **{k: getattr(transpose, k).T for k in GRIDS})
     _check(study, x, y)
     rows = [_cells(study, x, y)] if y.path != PERIOD else [_cells(_at_period(study, p), x, None) for p in y.values]
     ended, stalled, error = (np.concatenate(parts) for parts in zip(*rows, strict=True))
@@ -74,8 +74,8 @@ def grid(study: Study, x: Axis, y: Axis) -> Map:
     median = np.full(held.shape, np.nan)
     median[held] = np.nanmedian(np.where(ended, np.nan, error)[held], axis=-1)
     counts = np.sum(ended & ~stalled, axis=-1), np.sum(stalled, axis=-1)
-    drawn = tuple(path for path, _ in _entries(study, (x.path, y.path)))
-    return Map(x, y, survival.value, survival.low, survival.high, median, *counts, drawn)
+    paths = tuple(path for path, _ in _entries(study, (x.path, y.path)))
+    return Map(x, y, survival.value, survival.low, survival.high, median, *counts, paths)
 
 
 def _entries(study: Study, axes: tuple[str, ...]) -> tuple[tuple[str, Distribution], ...]:
@@ -108,11 +108,11 @@ def _cells(study: Study, x: Axis, y: Axis | None) -> tuple[np.ndarray, ...]:
     if y is not None:
         axes[y.path] = np.broadcast_to(y.values[:, None, None], shape).ravel()
     entries = _entries(study, tuple(axes))
-    drawn = dataclasses.replace(study, spread=Spread(entries, study.spread.design)).drawn(np.arange(study.members))
-    cascade, scenario = _batch(study.cascade, study.scenario, {k: v[member] for k, v in drawn.items()} | axes)
+    values = dataclasses.replace(study, spread=Spread(entries, study.spread.design)).drawn(np.arange(study.members))
+    cascade, scenario = _batch(study.cascade, study.scenario, {k: v[member] for k, v in values.items()} | axes)
     scenario = dataclasses.replace(scenario, seed=study.seed, member=member)
-    found = run_ensemble(cascade, scenario, study.clock, fold=standard_for(study.settle, scenario)).measured
-    ended, stalled, error = np.isfinite(found["lost_at_s"]), found["stalled"], found["settled_max_abs_error_m"]
+    metrics = run_ensemble(cascade, scenario, study.clock, fold=standard_for(study.settle, scenario)).measured
+    ended, stalled, error = np.isfinite(metrics["lost_at_s"]), metrics["stalled"], metrics["settled_max_abs_error_m"]
     return tuple(np.reshape(part, shape) for part in (ended, stalled, error))
 
 

@@ -62,7 +62,7 @@ def run_whole(
 def _whole(
     cascade: Cascade, scenario: Scenario, clock: Clock, fold: Fold | None, *, members: int, block: int, interpret: bool
 ) -> Outcome:
-    scenario, key = _drawn(scenario, members)
+    scenario, key = _with_draws(scenario, members)
     leaves, tree = jax.tree.flatten((Realised(cascade, scenario, key), clock, fold))
     axes = [0 if x.ndim else None for x in leaves]
     member = jax.vmap(lambda *leaves: run(*jax.tree.unflatten(tree, leaves), every=0), in_axes=axes)
@@ -77,8 +77,8 @@ def _whole(
         for ref, value in zip(refs[len(axes) :], jax.tree.leaves(member(*numbers)), strict=True):
             ref[...] = value
 
-    found = _launch(kernel, operands, axes, results, programs, block, interpret)
-    return jax.tree.unflatten(result_tree, [x[:members] for x in found])
+    outputs = _launch(kernel, operands, axes, results, programs, block, interpret)
+    return jax.tree.unflatten(result_tree, [x[:members] for x in outputs])
 
 
 def _launch(
@@ -103,7 +103,7 @@ def _launch(
     )(*operands)
 
 
-def _drawn(scenario: Scenario, members: int) -> tuple[Scenario, tuple[Array, Array]]:
+def _with_draws(scenario: Scenario, members: int) -> tuple[Scenario, tuple[Array, Array]]:
     """What jax.random must draw outside the kernel: the members' random signals, and their keys as two words [N]."""
     leaves, tree = jax.tree.flatten(scenario)
     # vmap needs something with an axis, which need not be in the scenario
@@ -111,10 +111,10 @@ def _drawn(scenario: Scenario, members: int) -> tuple[Scenario, tuple[Array, Arr
 
     def one(leaves: list[Array], _: Array) -> tuple[Scenario | None, tuple[Array, Array]]:
         alone = jax.tree.unflatten(tree, leaves)
-        drawn = alone.realised()
-        return None if drawn is alone else drawn, alone.words()
+        draws = alone.realised()
+        return None if draws is alone else draws, alone.words()
 
-    drawn, words = jax.vmap(one, in_axes=axes)(leaves, jnp.arange(members))
-    scenario = drawn or scenario  # nothing random: what members share, they go on sharing
+    draws, words = jax.vmap(one, in_axes=axes)(leaves, jnp.arange(members))
+    scenario = draws or scenario  # nothing random: what members share, they go on sharing
     nobody = jnp.zeros((), jnp.result_type(int))
     return dataclasses.replace(scenario, seed=nobody, member=nobody), words

@@ -30,20 +30,20 @@ def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     is the only disturbance of z there is, as in a case file; where there are both, it is disturbance.q_v.*. The path
     *.shift moves a signal in time, start and stop together; it is 0.
     """
-    found: dict[str, Place] = {}
+    table: dict[str, Place] = {}
     for stage in ("model", "observer", "position", "inversion", "current"):
-        found |= _below(getattr(cascade, stage), f"controller.{stage}", (0, stage))
-    found |= _below(cascade.processor, "processor", (0, "processor"))
+        table |= _below(getattr(cascade, stage), f"controller.{stage}", (0, stage))
+    table |= _below(cascade.processor, "processor", (0, "processor"))
     names = {"plant": "plant", "reference": "reference", "disturbance.q_i": "q_i", "sensor": "sensor"}
     names |= {"initial": "initial", "disturbance.q_z": "q_z"}
     if not _absent(scenario.q_v):
         names["disturbance.q_z" if _absent(scenario.q_z) else "disturbance.q_v"] = "q_v"
     for path, name in names.items():
-        found |= _below(getattr(scenario, name), path, (1, name))
+        table |= _below(getattr(scenario, name), path, (1, name))
     fields = {field.name: field for field in dataclasses.fields(scenario)}
     for path, name in (("actuator.u_max", "u_max"), ("run.clearance", "clearance")):
-        found[path] = Place((1, name), fields[name], getattr(scenario, name))
-    return found
+        table[path] = Place((1, name), fields[name], getattr(scenario, name))
+    return table
 
 
 def _absent(signal: Any) -> bool:
@@ -66,7 +66,7 @@ def _below(node: Any, path: str, route: tuple[int | str, ...]) -> Iterator[tuple
         yield f"{path}.{SHIFT}", Place((*route, SHIFT), TIME, 0.0)
 
 
-def ordered(cascade: Cascade, scenario: Scenario) -> list[tuple[str, str]]:
+def order_pairs(cascade: Cascade, scenario: Scenario) -> list[tuple[str, str]]:
     """Pairs of paths of which the first must stay below the second: start and stop of a pulse, for one."""
     pairs = []
     known = places(cascade, scenario)
@@ -78,7 +78,7 @@ def ordered(cascade: Cascade, scenario: Scenario) -> list[tuple[str, str]]:
     return pairs
 
 
-def replaced(cascade: Cascade, scenario: Scenario, values: Mapping[str, Any]) -> tuple[Cascade, Scenario]:
+def with_values(cascade: Cascade, scenario: Scenario, values: Mapping[str, Any]) -> tuple[Cascade, Scenario]:
     """The same cascade and scenario with the numbers at these paths replaced; shifts come last."""
     known, world = places(cascade, scenario), (cascade, scenario)
     for path in sorted(values, key=lambda path: known[path].route[-1] == SHIFT):

@@ -15,7 +15,7 @@ import numpy as np
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.design import DESIGNS, points
 from ambjax.ensemble.distributions import Distribution, Percent
-from ambjax.ensemble.paths import Place, ordered, places, replaced
+from ambjax.ensemble.paths import Place, order_pairs, places, with_values
 from ambjax.numerics.records import numbers, within
 from ambjax.world.scenario import Scenario
 
@@ -58,7 +58,7 @@ def apply(cascade: Cascade, scenario: Scenario, values: Mapping[str, Any]) -> tu
     known = places(cascade, scenario)
     for path in values:
         require_path(path, known)
-    return replaced(cascade, scenario, values)
+    return with_values(cascade, scenario, values)
 
 
 def corners(spread: Spread, cascade: Cascade, scenario: Scenario) -> tuple[Cascade, Scenario]:
@@ -73,10 +73,10 @@ def corners(spread: Spread, cascade: Cascade, scenario: Scenario) -> tuple[Casca
 def ends(spread: Spread, cascade: Cascade, scenario: Scenario, under: tuple[str, ...]) -> tuple[Cascade, Scenario]:
     """The numbers whose paths begin so replaced by both ends of their spreads, each on an axis of its own."""
     known = places(cascade, scenario)
-    found = [(p, d.support(_nominal(known[p]))) for p, d in spread.entries if p.startswith(under)]
-    shape = [1] * len(found)
-    values = {p: np.reshape(x, [*shape[:n], 2, *shape[n + 1 :]]) for n, (p, x) in enumerate(found)}
-    return replaced(cascade, scenario, values)
+    supports = [(p, d.support(_nominal(known[p]))) for p, d in spread.entries if p.startswith(under)]
+    shape = [1] * len(supports)
+    values = {p: np.reshape(x, [*shape[:n], 2, *shape[n + 1 :]]) for n, (p, x) in enumerate(supports)}
+    return with_values(cascade, scenario, values)
 
 
 def _nominal(place: Place) -> float:
@@ -153,14 +153,14 @@ def _check_together(
         if path is not None:
             raise ValueError(f"spread.{path} = {kinds[path]}: {text}")
 
-    for low, high in ordered(cascade, scenario):
+    for low, high in order_pairs(cascade, scenario):
         if not reach(low)[1] < reach(high)[0]:
             move = f", or use {low.rpartition('.')[0]}.shift, which moves both" if low.endswith(".start") else ""
-            crossed = f"{low} reaches {reach(low)[1]:g} and {high} comes down to {reach(high)[0]:g}"
-            refuse((low, high), f"{crossed}, but the first must stay below the second. Narrow the spread{move}.")
-    gap, given = "plant.s_0", known["run.clearance"].value is not None or "run.clearance" in kinds
-    stops = reach("run.clearance") if given else tuple(0.9 * x for x in reach(gap))
-    if not stops[1] < reach(gap)[0] and given:
+            overlap = f"{low} reaches {reach(low)[1]:g} and {high} comes down to {reach(high)[0]:g}"
+            refuse((low, high), f"{overlap}, but the first must stay below the second. Narrow the spread{move}.")
+    gap, own = "plant.s_0", known["run.clearance"].value is not None or "run.clearance" in kinds
+    stops = reach("run.clearance") if own else tuple(0.9 * x for x in reach(gap))
+    if not stops[1] < reach(gap)[0] and own:
         refuse(
             ("run.clearance", gap), f"run.clearance reaches {stops[1]:g} m, but must stay below plant.s_0. Narrow it."
         )

@@ -42,22 +42,22 @@ def summary(
         raise ValueError(f"there is no metric {deciding} to rank members by.")
     ended = np.isfinite(lost_at)
     stalled = ended & np.asarray(columns["stalled"], bool)
-    kept = int(np.sum(~ended))
-    ranked, explained = drivers(
+    survivors = int(np.sum(~ended))
+    ranking, accounts = drivers(
         {path: column_of(columns[SPREAD + path]) for path in spread_names}, metrics | {"lost_at_s": lost_at}, confidence
     )
     return {
         "members": len(lost_at),
-        "survivors": kept,
+        "survivors": survivors,
         "lost": int(np.sum(ended & ~stalled)),
         "stalled": int(np.sum(stalled)),
-        "survival": _plain(wilson(kept, len(lost_at), confidence)),
+        "survival": _plain(wilson(survivors, len(lost_at), confidence)),
         "confidence": confidence,
         "seed": int(seed),
         "notes": _notes(len(lost_at), confidence),
         "metrics": _metrics(metrics, seed, confidence),
-        "drivers": ranked,
-        "explained": explained,
+        "drivers": ranking,
+        "explained": accounts,
         "worst": _worst(np.asarray(columns["index"]), lost_at, stalled, deciding, metrics[deciding], worst),
     }
 
@@ -82,13 +82,13 @@ def _plain(estimate: Estimate) -> dict[str, float | None]:
 
 def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) -> dict[str, Any]:
     finite = [name for name, x in metrics.items() if np.isfinite(x).all()]
-    found = bootstrap([metrics[name] for name in finite], ALPHA, confidence, seed) if finite else {}
+    intervals = bootstrap([metrics[name] for name in finite], ALPHA, confidence, seed) if finite else {}
     nothing = Estimate(np.inf, np.inf, np.inf)
     out = {}
     for name, x in metrics.items():
         at = finite.index(name) if name in finite else None
         mean, std, worst = (
-            nothing if at is None else Estimate(*(part[at] for part in found[kind])) for kind in STATISTICS
+            nothing if at is None else Estimate(*(part[at] for part in intervals[kind])) for kind in STATISTICS
         )
         q05, median, q95 = (Estimate(*row) for row in zip(*quantile(x, [0.05, 0.5, 0.95], confidence), strict=True))
         estimates = {"mean": mean, "std": std, "median": median, "q05": q05, "q95": q95, "cvar_95": worst}

@@ -81,7 +81,7 @@ class Store:
 
     def survey(self) -> Survey:
         """What is not there yet; every chunk that is there is read and held against its seal."""
-        missing, remarks, found = [], list[str](), dict[Span, str]()
+        missing, remarks, layouts = [], list[str](), dict[Span, str]()
         if self.result:
             there = "its checksum is wrong" if self.path.exists() else "it is gone"
             remarks.append(f"{self.path}: {there}; what is not in {self.chunks} is computed again")
@@ -89,13 +89,13 @@ class Store:
             path = self._path(span)
             try:
                 if path.exists():
-                    found[span] = json.dumps(kinds_of(self._read(span)))
+                    layouts[span] = json.dumps(kinds_of(self._read(span)))
                     continue
             except DamagedError as why:
                 remarks.append(f"{path}: {why}; members {span[0]} to {span[1] - 1} are computed again")
             missing.append(span)
-        usual = collections.Counter(found.values()).most_common(1)
-        for span, kinds in found.items():
+        usual = collections.Counter(layouts.values()).most_common(1)
+        for span, kinds in layouts.items():
             if kinds != usual[0][0]:
                 remarks.append(
                     f"{self._path(span)}: its columns are not those of the others; members {span[0]} to {span[1] - 1} "
@@ -108,7 +108,7 @@ class Store:
         """All chunks in order: (first member, one past the last)."""
         return [(n, min(n + self.chunk, self.members)) for n in range(0, self.members, self.chunk)]
 
-    def kept(self) -> int:
+    def count(self) -> int:
         """Number of members that are on disk."""
         if self.path.exists() and not self.chunks.exists():
             return self.members
@@ -146,19 +146,19 @@ class Store:
         return bool(self.result) and self.path.is_file() and _digest(self.path) == self.result
 
     def _tell(self) -> None:
-        told = self.facts | {"chunk": self.chunk} | ({RESULT: self.result} if self.result else {})
-        text = json.dumps(told | {CHECKSUM: checksum_of(told)}, indent=2).encode() + b"\n"
+        content = self.facts | {"chunk": self.chunk} | ({RESULT: self.result} if self.result else {})
+        text = json.dumps(content | {CHECKSUM: checksum_of(content)}, indent=2).encode() + b"\n"
         write_whole(self.manifest, lambda file: file.write(text))
 
     def _compare(self) -> None:
         try:
-            found = dict(json.loads(self.manifest.read_text(encoding="utf-8")))
-            if found.pop(CHECKSUM, None) != checksum_of(found):
+            record = dict(json.loads(self.manifest.read_text(encoding="utf-8")))
+            if record.pop(CHECKSUM, None) != checksum_of(record):
                 raise ValueError("its checksum is wrong")
-            self.chunk, self.result = self.asked or int(found["chunk"]), str(found.pop(RESULT, ""))
+            self.chunk, self.result = self.asked or int(record["chunk"]), str(record.pop(RESULT, ""))
         except (OSError, TypeError, ValueError, KeyError, RecursionError) as error:
             raise ValueError(f"{self.manifest}: cannot be read ({error}). Choose another --out.") from None
-        differs = difference(found, self.facts | {"chunk": self.chunk})
+        differs = difference(record, self.facts | {"chunk": self.chunk})
         if differs:
             raise ValueError(
                 f"--resume: {self.directory} holds another study: {differs}. Make them equal, or choose another --out."
@@ -166,13 +166,13 @@ class Store:
 
     def _check_room(self, columns: int) -> None:
         # Chunks and the result exist side by side at the end.
-        needed = 2 * 8 * columns * self.members
+        need = 2 * 8 * columns * self.members
         where = next(p for p in (self.directory, *self.directory.resolve().parents) if p.exists())
         free = shutil.disk_usage(where).free
-        if needed > free:
+        if need > free:
             most = free // (2 * 8 * columns)
             raise ValueError(
-                f"--members {self.members}: their results need {needed / 1e9:.3g} GB and {where} has "
+                f"--members {self.members}: their results need {need / 1e9:.3g} GB and {where} has "
                 f"{free / 1e9:.3g} GB free. At most {most:,} members fit; or choose another --out."
             )
 
@@ -181,8 +181,8 @@ class Store:
 
     def _read(self, span: Span) -> Arrays:
         """A chunk's columns. Raises DamagedError if they are not the whole of this chunk of this study."""
-        columns, told = unseal(self._path(span))
-        differs = difference(told, self._facts(span))
+        columns, facts = unseal(self._path(span))
+        differs = difference(facts, self._facts(span))
         if differs:
             raise DamagedError(f"it belongs elsewhere: {differs}")
         _check_rows(columns, *span)
@@ -212,11 +212,11 @@ class Store:
         """Raises DamagedError unless members.npz holds these columns, one row for each member, in order."""
         try:
             with self.path.open("rb") as file, np.load(file) as whole:
-                found = {name: shapes({name: whole[name]})[name] for name in whole.files}  # reads all, a column at once
+                there = {name: shapes({name: whole[name]})[name] for name in whole.files}  # reads all, a column at once
                 index = whole["index"]
         except Exception as error:  # as in unseal
             raise DamagedError(f"what was written cannot be read back ({error})") from None
-        wrong = difference(found, {name: [kind, [self.members]] for name, kind in kinds.items()})
+        wrong = difference(there, {name: [kind, [self.members]] for name, kind in kinds.items()})
         if wrong:
             raise DamagedError(f"what was written reads otherwise: {wrong}")
         _check_rows({"index": index}, 0, self.members)

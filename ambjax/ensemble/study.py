@@ -66,8 +66,8 @@ class Study:
             scenario = dataclasses.replace(scenario, initial=dataclasses.replace(scenario.initial, z=far))
         fold = standard_for(self.settle, scenario)
         outcome = run_ensemble(cascade, scenario, self.clock, fold=fold, threads=threads, call=call)
-        drawn = {SPREAD + path: x for path, x in self.drawn(members).items()}
-        return {"index": members, "lost_at": outcome.trajectory.lost_at, **outcome.measured, **drawn}
+        values = {SPREAD + path: x for path, x in self.drawn(members).items()}
+        return {"index": members, "lost_at": outcome.trajectory.lost_at, **outcome.measured, **values}
 
     def bands(self, members: int, times: int) -> tuple[np.ndarray, Trajectory, dict[str, np.ndarray]]:
         """Times [t], trajectories and signals [n, t] of the first `members` members, at most some `times` instants.
@@ -83,8 +83,8 @@ class Study:
         fold = Named({str(k): Variation(after) for k, after in enumerate(ends[:-1] - period / 2)})
         outcome = run_ensemble(cascade, scenario, self.clock, fold=fold, every=every)
         rows, t = outcome.trajectory.rows, np.asarray(outcome.trajectory.rows.t[0])
-        seen = {"z - r": rows.z - rows.r, "u": rows.u_mean, "sigma": rows.sigma}
-        signals = {k: np.where(rows.alive, x, np.nan) for k, x in seen.items()}
+        curves = {"z - r": rows.z - rows.r, "u": rows.u_mean, "sigma": rows.sigma}
+        signals = {k: np.where(rows.alive, x, np.nan) for k, x in curves.items()}
         later = [outcome.measured[str(k)] for k in range(len(ends) - 1)]
         left = np.stack([*later, np.zeros(len(rows.z))], axis=1)  # from each end on
         rate = -np.diff(left, axis=1) / np.diff(ends)

@@ -19,7 +19,7 @@ class _Ear:
     """What is done about Ctrl-C at present: one for the process."""
 
     program = ""
-    kept: Callable[[], str] | None = None
+    report: Callable[[], str] | None = None
     gently = ""
     asked = False
 
@@ -32,7 +32,7 @@ class _Ear:
             self._say(f"{self.gently} Ctrl-C again ends it at once.")
             return
         with self.busy:
-            words = self.kept() if self.kept is not None else ""
+            words = self.report() if self.report is not None else ""
             self._say(f"interrupted{f': {words}' if words else ''}.")
             os._exit(INTERRUPTED)
 
@@ -51,31 +51,31 @@ def listening(program: str) -> Iterator[None]:
     if not main or signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None):
         yield
         return
-    heard, told = os.pipe()
+    read_end, write_end = os.pipe()
     if os.name == "posix":
-        os.set_blocking(told, False)
+        os.set_blocking(write_end, False)
     _ear.program, _ear.asked = program, False
-    before = signal.signal(signal.SIGINT, lambda *_: None), signal.set_wakeup_fd(told, warn_on_full_buffer=False)
-    thread = threading.Thread(target=_listen, args=(heard,), daemon=True)
+    before = signal.signal(signal.SIGINT, lambda *_: None), signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
+    thread = threading.Thread(target=_listen, args=(read_end,), daemon=True)
     thread.start()
     try:
         yield
     finally:
         signal.set_wakeup_fd(before[1])
         signal.signal(signal.SIGINT, before[0])
-        os.close(told)
+        os.close(write_end)
         thread.join()
-        os.close(heard)
+        os.close(read_end)
 
 
 @contextlib.contextmanager
-def keeping(kept: Callable[[], str]) -> Iterator[None]:
-    """Where Ctrl-C ends this block, its line says what `kept` returns, called in another thread."""
-    before, _ear.kept = _ear.kept, kept
+def keeping(words: Callable[[], str]) -> Iterator[None]:
+    """Where Ctrl-C ends this block, its line says what `words` returns, called in another thread."""
+    before, _ear.report = _ear.report, words
     try:
         yield
     finally:
-        _ear.kept = before
+        _ear.report = before
 
 
 @contextlib.contextmanager

@@ -48,8 +48,8 @@ def write_whole(path: pathlib.Path, write: Callable[[IO[bytes]], Any]) -> None:
 def seal(path: pathlib.Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
     """Write arrays, of any names but `seal`, with facts as JSON has them. Raises ValueError as `write_whole`."""
     arrays = {name: np.asarray(array) for name, array in arrays.items()}
-    told = dict(facts) | {ARRAYS: shapes(arrays)}
-    mark = np.array(json.dumps(told | {CHECKSUM: _checksum(told, arrays)}).encode())
+    content = dict(facts) | {ARRAYS: shapes(arrays)}
+    mark = np.array(json.dumps(content | {CHECKSUM: _checksum(content, arrays)}).encode())
     write_whole(path, lambda file: np.savez(file, **arrays, **{SEAL: mark}))  # pyright: ignore[reportArgumentType]
 
 
@@ -58,19 +58,19 @@ def unseal(path: pathlib.Path) -> tuple[Arrays, dict[str, Any]]:
     try:
         if not zipfile.is_zipfile(path):
             raise DamagedError("it is not a whole archive")
-        with path.open("rb") as file, np.load(file) as kept:  # np.load itself leaves a damaged one open
-            arrays = {name: kept[name] for name in kept.files}
-        told = dict(json.loads(arrays.pop(SEAL).item()))
-        checksum = told.pop(CHECKSUM)
+        with path.open("rb") as file, np.load(file) as archive:  # np.load itself leaves a damaged one open
+            arrays = {name: archive[name] for name in archive.files}
+        content = dict(json.loads(arrays.pop(SEAL).item()))
+        checksum = content.pop(CHECKSUM)
     except DamagedError:
         raise
     except Exception as error:  # a damaged archive raises whatever the part of it that is read first happens to raise
         raise DamagedError(f"a part of it cannot be read ({type(error).__name__})") from None
-    if checksum != _checksum(told, arrays):
+    if checksum != _checksum(content, arrays):
         raise DamagedError("its checksum is wrong")
-    if told.pop(ARRAYS) != shapes(arrays):
+    if content.pop(ARRAYS) != shapes(arrays):
         raise DamagedError("its arrays are not those that were sealed")
-    return arrays, told
+    return arrays, content
 
 
 def shapes(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -78,21 +78,21 @@ def shapes(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     return {name: [np.lib.format.dtype_to_descr(array.dtype), list(array.shape)] for name, array in arrays.items()}
 
 
-def difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """The first fact in which two fingerprints differ, in words: `found` is there, `wanted` here. Empty: none."""
-    for key in {**found, **wanted}:
-        if found.get(key) != wanted.get(key):
-            return f"{key} is {found.get(key)} there and {wanted.get(key)} here"
+def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+    """The first fact in which two fingerprints differ, in words: `there` and `here`. Empty: none."""
+    for key in {**there, **here}:
+        if there.get(key) != here.get(key):
+            return f"{key} is {there.get(key)} there and {here.get(key)} here"
     return ""
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested tables as one, keys dotted, values as JSON has them: a fingerprint whose differences have names."""
-    found: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     for key, value in tree.items():
         name = f"{prefix}{key}"
-        found |= flat(value, f"{name}.") if isinstance(value, Mapping) else {name: _plain(value)}
-    return found
+        entries |= flat(value, f"{name}.") if isinstance(value, Mapping) else {name: _plain(value)}
+    return entries
 
 
 def provenance() -> dict[str, str]:
@@ -109,10 +109,10 @@ def checksum_of(facts: Mapping[str, Any]) -> str:
 
 
 def _checksum(facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
-    found = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     for name in sorted(arrays):
-        found.update(name.encode() + b"\0" + np.ascontiguousarray(arrays[name]).tobytes())
-    return found.hexdigest()
+        digest.update(name.encode() + b"\0" + np.ascontiguousarray(arrays[name]).tobytes())
+    return digest.hexdigest()
 
 
 def _plain(value: Any) -> Any:

@@ -37,13 +37,13 @@ def apart(function: Callable[..., Result]) -> Callable[..., Result]:
 
 @jax.custom_jvp
 @apart
-def _kept(x: Array) -> Array:
+def _barrier(x: Array) -> Array:
     return x
 
 
-@_kept.defjvp
+@_barrier.defjvp
 def _kept_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    return _kept(*primals), _kept(*tangents)
+    return _barrier(*primals), _barrier(*tangents)
 
 
 def stored(tree: Result) -> Result:
@@ -51,4 +51,4 @@ def stored(tree: Result) -> Result:
 
     Else XLA computes an intermediate again in every loop that uses it, and its derivatives once more for each.
     """
-    return jax.tree.map(_kept, tree)
+    return jax.tree.map(_barrier, tree)

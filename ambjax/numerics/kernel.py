@@ -100,16 +100,16 @@ def options() -> dict[str, Any] | None:
         log.warning("one-kernel path is off: AMBJAX_PLAIN is set. Results are the same, several times slower.")
         return None
     faults = []
-    for tried in [WIDE, {}] if _has_avx512() else [{}]:
-        fault = _probe(tried)
+    for trial in [WIDE, {}] if _has_avx512() else [{}]:
+        fault = _probe(trial)
         if not fault:
-            return tried
+            return trial
         faults.append(fault)
     log.warning("one-kernel path is off, runs are several times slower: %s", "; ".join(faults))
     return None
 
 
-def _probe(tried: dict[str, Any]) -> str:
+def _probe(trial: dict[str, Any]) -> str:
     """What is wrong with the mark and these options; empty if they work and change no result.
 
     A small loop over the functions that a rollout is made of, enough lanes for vectors and a remainder,
@@ -128,13 +128,13 @@ def _probe(tried: dict[str, Any]) -> str:
     try:
         with jax.ensure_compile_time_eval():
             x = np.linspace(-30.0, 30.0, 78)  # without 0
-            given = jnp.asarray(x)
+            argument = jnp.asarray(x)
             plain = jax.jit(lambda y: jax.lax.fori_loop(0, 3, body, y))
-            compiled = jax.jit(lambda y: _mark(plain(y)), compiler_options=tried).lower(given).compile()
-            error = np.max(np.abs(np.asarray(compiled(given), float) / expected(x) - 1))
+            compiled = jax.jit(lambda y: _mark(plain(y)), compiler_options=trial).lower(argument).compile()
+            error = np.max(np.abs(np.asarray(compiled(argument), float) / expected(x) - 1))
     except Exception as fault:  # an unknown backend may fail in any way; the plain path always works
         return str(fault).splitlines()[0] if str(fault) else type(fault).__name__
     if "xla_cpu_small_call" not in (compiled.as_text() or ""):
         return "this version of XLA does not know the mark"
     # A wrong lane is wrong in the first digits; rounding grows thirtyfold in three turns of the loop.
-    return "" if error < 1e4 * jnp.finfo(given.dtype).eps else f"results are off by {error:.1e} with options {tried}"
+    return "" if error < 1e4 * jnp.finfo(argument.dtype).eps else f"results are off by {error:.1e} with options {trial}"

@@ -54,7 +54,7 @@ def claim(says: str, where: str, paper: str, criterion: str) -> Callable[[Callab
     return enter
 
 
-def _found(ours: str, value: float, condition: bool, cause: str) -> Finding:
+def _finding(ours: str, value: float, condition: bool, cause: str) -> Finding:
     return Finding(ours, value, HOLDS if condition else FAILS, cause)
 
 
@@ -87,7 +87,7 @@ def _theorem(evidence: Evidence) -> Finding:
     tightest = ideal[0] if ideal else tightest
     cause = f"{tightest.requires}: {tightest.gain:g} against {tightest.against:.3g} at t = {tightest.at_s:.4g} s"
     words = f"{len(failing)} of {len(lines)} conditions fail" if failing else f"tightest margin {share:.0f} %"
-    return _found(words, share, not failing, cause)
+    return _finding(words, share, not failing, cause)
 
 
 @claim(
@@ -101,7 +101,7 @@ def _stable(evidence: Evidence) -> Finding:
     )
     if lost := _lost(evidence.regulation, evidence):
         cause += f"; from i = i_ref = 0: {lost.ours}"
-    return _found(f"basin {basin:.1e} m", basin, basin > 0 and lost is None, cause)
+    return _finding(f"basin {basin:.1e} m", basin, basin > 0 and lost is None, cause)
 
 
 @claim(
@@ -112,7 +112,7 @@ def _converges(evidence: Evidence) -> Finding:
     rows = evidence.regulation.trajectory.rows
     z, e = _worst(rows, "e_z", 1.9, 2.0), _worst(rows, "e", 1.9, 2.0)
     cause = "over the last 0.1 s, 0.6 s after the pulse"
-    return _lost(evidence.regulation, evidence) or _found(f"{z:.1e} m, {e:.1e} A", z, z < 1e-6 and e < 1e-3, cause)
+    return _lost(evidence.regulation, evidence) or _finding(f"{z:.1e} m, {e:.1e} A", z, z < 1e-6 and e < 1e-3, cause)
 
 
 @claim(
@@ -127,7 +127,7 @@ def _finite_time(evidence: Evidence) -> Finding:
     outside = np.flatnonzero(np.abs(rows.sigma[early]) > SIGMA_RADIUS)
     at = float(rows.t[early][outside[-1]]) if outside.size else 0.0
     cause = "last time before the pulse that |sigma| > 6e-6 m/s"
-    return _lost(evidence.regulation, evidence) or _found(f"{at:.4g} s", at, at < 0.1, cause)
+    return _lost(evidence.regulation, evidence) or _finding(f"{at:.4g} s", at, at < 0.1, cause)
 
 
 @claim(
@@ -138,11 +138,11 @@ def _finite_time(evidence: Evidence) -> Finding:
 )
 def _radius(evidence: Evidence) -> Finding:
     rows = evidence.regulation.trajectory.rows
-    quiet, pulsed = _worst(rows, "sigma", SETTLE, PULSE.start), _worst(rows, "sigma", PULSE.start, PULSE.stop)
-    worst = max(quiet, pulsed)
-    cause = f"{quiet:.1e} m/s before the pulse, {pulsed:.1e} in it; noise apart, k 2/pi arctan(p sigma) balances q_z"
+    quiet, pulse = _worst(rows, "sigma", SETTLE, PULSE.start), _worst(rows, "sigma", PULSE.start, PULSE.stop)
+    worst = max(quiet, pulse)
+    cause = f"{quiet:.1e} m/s before the pulse, {pulse:.1e} in it; noise apart, k 2/pi arctan(p sigma) balances q_z"
     lost = _lost(evidence.regulation, evidence)
-    return lost or _found(f"{worst:.1e} m/s", worst, worst <= 1.05 * SIGMA_RADIUS, cause)
+    return lost or _finding(f"{worst:.1e} m/s", worst, worst <= 1.05 * SIGMA_RADIUS, cause)
 
 
 @claim(
@@ -150,21 +150,21 @@ def _radius(evidence: Evidence) -> Finding:
     "radius reached at a std within 25 % of the printed one, at some sample period",
 )  # fmt: skip
 def _radius_by_noise(evidence: Evidence) -> Finding:
-    known = {n.sample_period: n.std_for(SIGMA_RADIUS) for n in evidence.noise}
-    found = {period: std for period, std in known.items() if std is not None}
-    if not found:
+    stds = {n.sample_period: n.std_for(SIGMA_RADIUS) for n in evidence.noise}
+    hits = {period: std for period, std in stds.items() if std is not None}
+    if not hits:
         lost = _lost(evidence.regulation, evidence)
         return lost or Finding("at no std scanned", None, FAILS, "see the noise table")
-    nearest = max(found.values())
+    nearest = max(hits.values())
     cause = f"the printed std is {TABLE_2.noise_std / nearest:.0f} times the largest that gives this radius"
-    words = "at std " + ", ".join(f"{std:.1e} m held {period:g} s" for period, std in found.items())
-    return _found(words, nearest, 0.8 <= nearest / TABLE_2.noise_std <= 1.25, cause)
+    words = "at std " + ", ".join(f"{std:.1e} m held {period:g} s" for period, std in hits.items())
+    return _finding(words, nearest, 0.8 <= nearest / TABLE_2.noise_std <= 1.25, cause)
 
 
 def _pulse_effect(evidence: Evidence, run: Run) -> Finding:
     change = float(np.abs(run.trajectory.rows.z - run.quiet.rows.z).max())
     cause = f"the pulse moves the rotor by {100 * change / GAP:.2g} % of the gap; without noise by q_z pi / (2 c k p)"
-    return _lost(run, evidence) or _found(f"{change:.3e} m", change, change <= TRACKING_ERROR, cause)
+    return _lost(run, evidence) or _finding(f"{change:.3e} m", change, change <= TRACKING_ERROR, cause)
 
 
 @claim(
@@ -178,7 +178,7 @@ def _inversion(evidence: Evidence, run: Run) -> Finding:
     at = run.metrics["v_tilde_reached_s"]
     late = run.metrics["settled_max_abs_v_tilde_A2_per_m2"]
     cause = f"first |v_tilde| <= 0.1 A^2/m^2; after {SETTLE} s it stays within {late:.2g}"
-    return _lost(run, evidence) or _found(f"{at:.4g} s", at, at < INVERSION_TIME, cause)
+    return _lost(run, evidence) or _finding(f"{at:.4g} s", at, at < INVERSION_TIME, cause)
 
 
 @claim(
@@ -197,20 +197,20 @@ def _inversion_tracking(evidence: Evidence) -> Finding:
 def _current(evidence: Evidence) -> Finding:
     worst = max(r.metrics["settled_max_abs_current_error_A"] for r in (evidence.regulation, evidence.tracking))
     cause = f"largest |i - i_ref| after {SETTLE} s, pulse included; q_i = 0, so Eq. (14) decays to 0 unless u saturates"
-    return _lost(evidence.regulation, evidence) or _found(f"{worst:.1e} A", worst, worst < 1e-3, cause)
+    return _lost(evidence.regulation, evidence) or _finding(f"{worst:.1e} A", worst, worst < 1e-3, cause)
 
 
 @claim("Tracking: largest error 2.3e-5 m", "4", "2.3e-5 m", "rounds to 2.3e-5 m or less")
 def _tracking(evidence: Evidence) -> Finding:
     error = evidence.tracking.metrics["settled_max_abs_error_m"]
     cause = f"largest |z - r| after {SETTLE} s, pulse included"
-    return _lost(evidence.tracking, evidence) or _found(f"{error:.3e} m", error, error < 2.35e-5, cause)
+    return _lost(evidence.tracking, evidence) or _finding(f"{error:.3e} m", error, error < 2.35e-5, cause)
 
 
 @claim(
     "Tracking: the disturbance is rejected", "4", "-", "pulse changes z by at most 2.3e-5 m, the paper's own accuracy"
 )
-def _rejected(evidence: Evidence) -> Finding:
+def _rejection(evidence: Evidence) -> Finding:
     return _pulse_effect(evidence, evidence.tracking)
 
 
@@ -227,12 +227,12 @@ def _noise(evidence: Evidence) -> Finding:
     words = "survives std " + ", ".join(f"{n.survived:.1e} m held {n.sample_period:g} s" for n in evidence.noise)
     survivors = sum(n.survived >= TABLE_2.noise_std * 0.999 for n in evidence.noise)
     cause = f"the printed std is survived at {survivors} of {len(evidence.noise)} sample periods tried"
-    undecided = 0 < survivors < len(evidence.noise)
-    return Finding(words, largest, OPEN if undecided else HOLDS if survivors else FAILS, cause)
+    partial = 0 < survivors < len(evidence.noise)
+    return Finding(words, largest, OPEN if partial else HOLDS if survivors else FAILS, cause)
 
 
 @claim("The noise is specified", "4", "variance only", "sigma's radius is the same to 10 % at every sample period")
-def _specified(evidence: Evidence) -> Finding:
+def _specification(evidence: Evidence) -> Finding:
     if not any(n.survived for n in evidence.noise):
         return Finding(
             "no survivor", None, OPEN, "the rotor is lost at every noise, so the sample period cannot be told"
@@ -247,7 +247,7 @@ def _specified(evidence: Evidence) -> Finding:
 def _share(evidence: Evidence) -> Finding:
     share = 3 * TABLE_2.noise_std / GAP
     cause = "arithmetic on the printed variance, its unit read as m^2"
-    return _found(f"3 std = {100 * share:.0f} % of s_0", share, abs(share - 0.2) < 0.02, cause)
+    return _finding(f"3 std = {100 * share:.0f} % of s_0", share, abs(share - 0.2) < 0.02, cause)
 
 
 @claim(
@@ -260,4 +260,4 @@ def _robust(evidence: Evidence) -> Finding:
     cause = (
         f"one of {', '.join(UNCERTAIN)} off by 10 % either way, controller unaware: our choice, the paper tests none"
     )
-    return _found(f"{error:.1e} m at worst", error, error < 0.01 * GAP, cause)
+    return _finding(f"{error:.1e} m at worst", error, error < 0.01 * GAP, cause)

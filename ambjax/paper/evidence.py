@@ -115,8 +115,8 @@ def _simulate(reading: str, cascade: Cascade, scenario: Scenario) -> tuple[Traje
     if scenario.sensor is None:  # with one of no error: the same program as under noise
         scenario = dataclasses.replace(scenario, sensor=Sensor())
     clock = paper.CLOCK.with_method(STEPS.get(reading, AdaptiveRodas3()))
-    trajectory, measured = rollout(cascade, scenario, clock, fold=Standard(paper.SETTLE))
-    return jax.tree.map(np.asarray, trajectory), {name: float(value) for name, value in measured.items()}
+    trajectory, metrics = rollout(cascade, scenario, clock, fold=Standard(paper.SETTLE))
+    return jax.tree.map(np.asarray, trajectory), {name: float(value) for name, value in metrics.items()}
 
 
 def _run(cascade: Cascade, reading: str, name: str) -> Run:
@@ -135,8 +135,8 @@ def _uncertain(cascade: Cascade, reading: str) -> tuple[list[str], float]:
 
     with ThreadPoolExecutor() as pool:
         metrics = list(pool.map(one, cases))
-    named = [f"{name} {100 * (factor - 1):+.0f} %" for name, factor in cases]
-    lost = [name for name, m in zip(named, metrics, strict=True) if math.isfinite(m["lost_at_s"])]
+    names = [f"{name} {100 * (factor - 1):+.0f} %" for name, factor in cases]
+    lost = [name for name, m in zip(names, metrics, strict=True) if math.isfinite(m["lost_at_s"])]
     return lost, max(m["settled_max_abs_error_m"] for m in metrics)
 
 
@@ -149,8 +149,8 @@ def _scan(cascade: Cascade, scenarios: Scenario, clock: Clock) -> dict[str, Any]
 
 def _batch(scenario: Scenario, size: int, **leaves: Any) -> Scenario:
     """An ensemble: every leaf of `scenario` repeated, `leaves` replacing whole fields."""
-    repeated = jax.tree.map(lambda x: jnp.broadcast_to(x, (size,)), canonical(scenario))
-    return dataclasses.replace(repeated, **leaves)
+    copies = jax.tree.map(lambda x: jnp.broadcast_to(x, (size,)), canonical(scenario))
+    return dataclasses.replace(copies, **leaves)
 
 
 def _noise(cascade: Cascade, reading: str, period: float) -> Noise:
@@ -161,9 +161,9 @@ def _noise(cascade: Cascade, reading: str, period: float) -> Noise:
     scenarios = _batch(quiet, len(stds), sensor=Sensor(jnp.asarray(stds), zeros, zeros), seed=jnp.asarray(seeds, int))
     # This tolerance agrees with 1e-6 to 1 % of sigma's radius at all of these levels, at half the cost.
     clock = Clock(NOISE_SAMPLES, period, AdaptiveRodas3(1e-4))
-    seen = _scan(*canonical((cascade, scenarios, clock)))
-    lost = np.any(np.isfinite(seen["lost_at_s"]).reshape(-1, SEEDS), axis=1)
-    sigma = np.asarray(seen["settled_max_abs_sigma_m_per_s"]).reshape(-1, SEEDS).mean(axis=1)
+    metrics = _scan(*canonical((cascade, scenarios, clock)))
+    lost = np.any(np.isfinite(metrics["lost_at_s"]).reshape(-1, SEEDS), axis=1)
+    sigma = np.asarray(metrics["settled_max_abs_sigma_m_per_s"]).reshape(-1, SEEDS).mean(axis=1)
     return Noise(period, NOISE_SAMPLES * period, lost, sigma)
 
 
@@ -172,12 +172,12 @@ def _basin(cascade: Cascade, reading: str) -> float:
     offsets = np.concatenate([BASIN, -BASIN])
     size, plant = len(offsets), Plant()
     current = float(plant.equilibrium(0.0)[0])
-    started = dataclasses.replace(cascade, inversion=dataclasses.replace(cascade.inversion, i_ref=current))  # pyright: ignore
+    start = dataclasses.replace(cascade, inversion=dataclasses.replace(cascade.inversion, i_ref=current))  # pyright: ignore
     zeros = jnp.zeros(size)
     quiet = paper.scenario("regulation", reading, pulse=False)
     initial = Initial(jnp.asarray(offsets), zeros, zeros + current)
     scenarios = _batch(dataclasses.replace(quiet, sensor=Sensor()), size, initial=initial)
-    seen = _scan(*canonical((started, scenarios, Clock(NOISE_SAMPLES, 1e-4, AdaptiveRodas3(1e-4)))))
-    lost = np.isfinite(seen["lost_at_s"]).reshape(2, -1).any(axis=0)
+    metrics = _scan(*canonical((start, scenarios, Clock(NOISE_SAMPLES, 1e-4, AdaptiveRodas3(1e-4)))))
+    lost = np.isfinite(metrics["lost_at_s"]).reshape(2, -1).any(axis=0)
     first = np.flatnonzero(lost)[0] if lost.any() else len(BASIN)
     return float(BASIN[first - 1]) if first else 0.0

@@ -19,7 +19,7 @@ def judge(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
     rows = []
     for entry in CLAIMS:
         row = {name: getattr(entry, name) for name in ("says", "where", "paper", "criterion")}
-        findings = {name: dataclasses.asdict(entry.judge(seen)) for name, seen in evidence.items()}
+        findings = {name: dataclasses.asdict(entry.judge(one)) for name, one in evidence.items()}
         rows.append({**row, "findings": findings})
     return rows
 
@@ -34,8 +34,8 @@ def noise_table(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
             "largest_std_survived_m": n.survived,
             "std_for_sigma_6e-6_m": n.std_for(SIGMA_RADIUS),
         }
-        for name, seen in evidence.items()
-        for n in seen.noise
+        for name, one in evidence.items()
+        for n in one.noise
     ]
 
 

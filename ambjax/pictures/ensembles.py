@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from ambjax.pictures.figures import BINS, BLUE, INK, RED, thin
-from ambjax.pictures.scales import digits, finish, log_ticks, named, prefixed, size_of
+from ambjax.pictures.scales import axis_of, digits, finish, log_ticks, prefix_of, size_of
 
 # What a fan can show: label and SI unit.
 QUANTITIES = {
@@ -76,8 +76,8 @@ def fan(
     axes[-1].set_xlabel("time (s)", fontsize=9)
     figure.align_ylabels(axes)
     figure.suptitle(title, fontsize=11)
-    shown = {label: h for ax in axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
+    handles = {label: h for ax in axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
     figure.savefig(path, dpi=150)
 
 
@@ -88,7 +88,7 @@ def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float,
     percents = sorted(quantiles)
     curves = [np.asarray(quantiles[percent], float) for percent in percents]
     low, high, beyond = _reach(curves)
-    factor, unit = prefixed(unit, max(abs(low), abs(high)))
+    factor, unit = prefix_of(unit, max(abs(low), abs(high)))
     starts = np.arange(0, len(t), max(1, len(t) // BINS))
     pairs = len(percents) // 2
     for k in range(pairs):
@@ -216,11 +216,11 @@ def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> Non
     finite = values[np.isfinite(values)]
     positive = finite[finite > 0]
     log = positive.size > 0 and not np.any(finite < 0) and positive.max() > 30 * positive.min()
-    factor, label, unit = named(name, size_of(finite, log))
-    shown = np.isfinite(values) & ((values > 0) | (not log))
-    bounds = _bins(factor * values[shown], log)
-    alive, _ = np.histogram(factor * values[shown & ~lost], bounds)
-    dead, _ = np.histogram(factor * values[shown & lost], bounds)
+    factor, label, unit = axis_of(name, size_of(finite, log))
+    mask = np.isfinite(values) & ((values > 0) | (not log))
+    bounds = _bins(factor * values[mask], log)
+    alive, _ = np.histogram(factor * values[mask & ~lost], bounds)
+    dead, _ = np.histogram(factor * values[mask & lost], bounds)
     ax.stairs(alive, bounds, fill=True, color=BLUE)
     if dead.any():
         ax.stairs(alive + dead, bounds, baseline=alive, fill=True, **LOST)
@@ -228,13 +228,13 @@ def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> Non
         ax.set_xscale("log")
         log_ticks(ax.xaxis, bounds[0], bounds[-1])
     notes, reached = [], "reached" in name
-    ranked = np.sort(values[~np.isnan(values)])
+    order = np.sort(values[~np.isnan(values)])
     for share, (style, words) in MARKS.items():
-        value = factor * ranked[math.ceil(share * ranked.size) - 1] if ranked.size else math.nan
+        value = factor * order[math.ceil(share * order.size) - 1] if order.size else math.nan
         if math.isfinite(value) and (value > 0 or not log):
             ax.axvline(value, color=INK, linestyle=style, linewidth=1.2)
-        found = f"{digits(value)} {unit}".rstrip() if math.isfinite(value) else "never" if reached else "none"
-        notes.append(f"{words.removesuffix(' quantile')}: {found}")
+        text = f"{digits(value)} {unit}".rstrip() if math.isfinite(value) else "never" if reached else "none"
+        notes.append(f"{words.removesuffix(' quantile')}: {text}")
     for count, words in (
         (np.sum(~np.isfinite(values)), "never" if reached else "not finite"),
         (np.sum(finite == 0) * log, "at zero"),

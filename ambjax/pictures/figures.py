@@ -118,9 +118,9 @@ def draw(
     rows, lost_at = trajectory.rows, float(trajectory.lost_at)
     t = np.asarray(rows.t)
     low, high = (t[0], t[-1]) if stretch is None else stretch
-    shown = (t < lost_at) & (t >= low) & (t <= high)
+    mask = (t < lost_at) & (t >= low) & (t <= high)
     for curve in panel.curves:
-        x, y = t[shown], panel.factor * signal_of(rows, curve.signal)[shown]
+        x, y = t[mask], panel.factor * signal_of(rows, curve.signal)[mask]
         if stretch is None:
             x, y = thin(x, y)
         else:

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ambjax.pictures.figures import INK
-from ambjax.pictures.scales import edges, log_ticks, named, relabelled, size_of
+from ambjax.pictures.scales import axis_of, edges, label_of, log_ticks, size_of
 
 CONTOUR = 0.95
 # Widths of the contours of survival and of the bounds of its interval; the last is drawn on top.
@@ -69,7 +69,7 @@ def _errors(figure: Figure, axes: Any, panels: Sequence[Mapping[str, Any]], metr
     errors = [panel["error"] for panel in panels if panel["error"] is not None]
     values = np.concatenate([np.ravel(np.asarray(error, float)) for error in errors])
     values = values[np.isfinite(values) & (values > 0)]
-    factor, words, unit = named(metric, size_of(values, log=True))
+    factor, words, unit = axis_of(metric, size_of(values, log=True))
     low, high = (factor * values.min(), factor * values.max()) if values.size else (1.0, 1.0)
     if high < 2 * low:  # a constant too needs some room
         low, high = low / 1.5, high * 1.5
@@ -90,8 +90,8 @@ def _cells(ax: Axes, panel: Mapping[str, Any], values: np.ndarray, norm: Normali
     """One heat map with its axes and contours; cells that are not finite show the hatched ground."""
     x_label, y_label, x_log, y_log = labels
     x, y = np.asarray(panel["x"], float), np.asarray(panel["y"], float)
-    x_factor, x_label = relabelled(x_label, size_of(x, x_log))
-    y_factor, y_label = relabelled(y_label, size_of(y, y_log))
+    x_factor, x_label = label_of(x_label, size_of(x, x_log))
+    y_factor, y_label = label_of(y_label, size_of(y, y_log))
     x_edges, y_edges = edges(x_factor * x, x_log), edges(y_factor * y, y_log)
     ax.patch.set(**NOBODY)
     ax.set_xscale("log" if x_log else "linear")
@@ -129,7 +129,7 @@ def _outline(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, inside: np.ndar
 def _range(panel: Mapping[str, Any]) -> str:
     """Words on how much of the grid survives: a contour that is absent means either of two things."""
     share = np.asarray(panel["survival"], float)
-    known = share[np.isfinite(share)]
-    if not known.size:
+    cells = share[np.isfinite(share)]
+    if not cells.size:
         return "no cell was run"
-    return f"95 % or more survive in {int(np.sum(known >= CONTOUR))} of {known.size} cells"
+    return f"95 % or more survive in {int(np.sum(cells >= CONTOUR))} of {cells.size} cells"

@@ -34,7 +34,7 @@ def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tup
     """
     panels = (POSITION, ERROR, SLIDING, DISTURBANCE, CURRENT, FORCE, FORCE_ERROR, AVERAGED)
     if np.any(np.asarray(trajectory.rows.q_i)):
-        panels = (*panels, CURRENT_DISTURBANCE, _measured(trajectory))
+        panels = (*panels, CURRENT_DISTURBANCE, _measurement(trajectory))
     if window is None:
         columns, grid = _stretches(trajectory), [[panel] * 3 for panel in panels]
     else:
@@ -48,8 +48,8 @@ def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tup
     figure.subplots_adjust(1.05 / width, 0.5 / height, 1 - 0.2 / width, 1 - 0.85 / height, wspace=0.24, hspace=0.24)
     ratios = [2, 1, 1] if window is None else [1, 1]
     axes = figure.subplots(len(grid), len(columns), sharex="col", squeeze=False, width_ratios=ratios)
-    for row, (line, drawn) in enumerate(zip(axes, grid, strict=True)):
-        for n, (ax, panel, (words, *stretch)) in enumerate(zip(line, drawn, columns, strict=True)):
+    for row, (line, column) in enumerate(zip(axes, grid, strict=True)):
+        for n, (ax, panel, (words, *stretch)) in enumerate(zip(line, column, columns, strict=True)):
             draw(ax, panel, trajectory, stretch=(stretch[0], stretch[1]))
             if window is None and n:
                 ax.set_ylabel("")
@@ -65,16 +65,16 @@ def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tup
 def _stretches(trajectory: Trajectory) -> list[tuple[str, float, float]]:
     """The whole run up to shortly after a loss, its start, and its last moments: words, from, to (s)."""
     t, lost_at = np.asarray(trajectory.rows.t, float), float(trajectory.lost_at)
-    ended = bool(np.isfinite(lost_at))
+    loss = bool(np.isfinite(lost_at))
     begin, end = t[0], min(lost_at, t[-1])
     least = t[1] - t[0] if len(t) > 1 else 1e-9  # a loss at the first sample leaves nothing to enlarge
-    start = max(_transient(trajectory, end, ended), least)
+    start = max(_transient(trajectory, end, loss), least)
     last = max(_last_moments(trajectory, end), least)
-    beyond = end + 0.15 * (end - begin) * ended
+    beyond = end + 0.15 * (end - begin) * loss
     return [
         (_fate(trajectory), begin, max(beyond, begin + least)),
         (f"the first {_short(start)}", begin, begin + start),
-        (f"the last {_short(last)}", end - last, end + 0.15 * last * ended),
+        (f"the last {_short(last)}", end - last, end + 0.15 * last * loss),
     ]
 
 
@@ -100,14 +100,14 @@ def _last_moments(trajectory: Trajectory, end: float) -> float:
     return longest if turning.size <= TURNS else float(end - t[late][turning[-TURNS]])
 
 
-def _transient(trajectory: Trajectory, end: float, ended: bool) -> float:
+def _transient(trajectory: Trajectory, end: float, loss: bool) -> float:
     """How much of the start to enlarge, s: thrice what the errors take to come down.
 
     At most a twentieth of the run, or a third of it if it ended in a loss.
     """
     t = np.asarray(trajectory.rows.t, float)
     alive = t <= max(end, t[min(1, len(t) - 1)])
-    t, most = t[alive] - t[0], (end - t[0]) / (3 if ended else 20)
+    t, most = t[alive] - t[0], (end - t[0]) / (3 if loss else 20)
     slowest = 0.0
     for name in ("e_z", "sigma", "v_tilde", "e"):
         size = np.abs(signal_of(trajectory.rows, name)[alive])
@@ -116,5 +116,5 @@ def _transient(trajectory: Trajectory, end: float, ended: bool) -> float:
     return min(max(3 * slowest, 20 * (t[1] - t[0]) if len(t) > 1 else 0.0, most / 10), most)
 
 
-def _measured(trajectory: Trajectory) -> Panel:
+def _measurement(trajectory: Trajectory) -> Panel:
     return Panel("measured position", "mm", 1e3, (Curve("z_measured", "$z$ measured", GREEN), Curve("z", "$z$")))

@@ -15,7 +15,7 @@ SMALL = {1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
 LARGE = {1e9: "G", 1e6: "M", 1e3: "k"}
 
 
-def prefixed(unit: str, size: float) -> tuple[float, str]:
+def prefix_of(unit: str, size: float) -> tuple[float, str]:
     """Factor from SI to a prefixed unit in which `size` lies in [1, 1000), and that unit: 2e-5 m is 20 µm.
 
     Only units that begin with a plain m, s, V, A, W, N, H, T, Hz or Ω take a prefix (not A²/m², kg, 1/s), and
@@ -40,12 +40,12 @@ def size_of(values: np.ndarray, log: bool = False) -> float:
     return float(np.sqrt(sizes.min()) * np.sqrt(sizes.max()) if log else sizes.max())
 
 
-def named(metric: str, size: float) -> tuple[float, str, str]:
+def axis_of(metric: str, size: float) -> tuple[float, str, str]:
     """Factor, label and unit of a metric of metrics.json: rms_error_m of size 2e-5 is (1e6, "rms error", "µm")."""
     if metric == "clearance_used":
         return 100.0, "clearance used", "%"
     suffix = next((suffix for suffix in SUFFIXES if metric.endswith(suffix)), "")
-    factor, unit = prefixed(SUFFIXES.get(suffix, ""), size)
+    factor, unit = prefix_of(SUFFIXES.get(suffix, ""), size)
     words = metric.removesuffix(suffix).replace("_", " ")
     words = re.sub(r"max abs (.*)", r"max |\1|", words)
     for word, symbol in SYMBOLS.items():
@@ -53,19 +53,19 @@ def named(metric: str, size: float) -> tuple[float, str, str]:
     return factor, words, unit
 
 
-def relabelled(label: str, size: float) -> tuple[float, str]:
+def label_of(label: str, size: float) -> tuple[float, str]:
     """Factor and label of an axis whose label ends in its SI unit: "initial z (m)" of 2e-5 is "initial z (µm)".
 
     Powers are written as in print, m/s^2 as m/s²; the unit 1 is left out.
     """
-    found = re.fullmatch(r"(.*)\(([^()]*)\)\s*", label)
-    if not found:
+    match = re.fullmatch(r"(.*)\(([^()]*)\)\s*", label)
+    if not match:
         return 1.0, label
-    if found[2] == "1":
-        return 1.0, found[1].rstrip()
-    unit = re.sub(r"\^(2|3)(?![.\d])", lambda power: "²³"[int(power[1]) - 2], found[2]).replace("ohm", "Ω")
-    factor, unit = prefixed(unit, size)
-    return factor, f"{found[1]}({unit})"
+    if match[2] == "1":
+        return 1.0, match[1].rstrip()
+    unit = re.sub(r"\^(2|3)(?![.\d])", lambda power: "²³"[int(power[1]) - 2], match[2]).replace("ohm", "Ω")
+    factor, unit = prefix_of(unit, size)
+    return factor, f"{match[1]}({unit})"
 
 
 def digits(value: float) -> str:

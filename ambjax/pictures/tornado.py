@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from ambjax.pictures.figures import BLUE, INK, ORANGE
-from ambjax.pictures.scales import finish, named
+from ambjax.pictures.scales import axis_of, finish
 
 MOST_DRIVERS = 12
 TRENDS = {"grows with it": BLUE, "falls with it": ORANGE, "no steady trend": "#8a8a8a"}
@@ -33,27 +33,27 @@ def tornado(drivers: Sequence[Bar], metric: str, says: str, path: pathlib.Path) 
     """
     if not drivers:
         raise ValueError("tornado: no drivers; an ensemble without [spread] has none to rank")
-    ranked = sorted(drivers, key=lambda driver: -driver.share)
-    shown = ranked[:MOST_DRIVERS]
-    figure = Figure(figsize=(7.5, 0.36 * len(shown) + 2.2), layout="constrained")
+    ranking = sorted(drivers, key=lambda driver: -driver.share)
+    bars = ranking[:MOST_DRIVERS]
+    figure = Figure(figsize=(7.5, 0.36 * len(bars) + 2.2), layout="constrained")
     ax = figure.subplots()
-    for row, one in enumerate(shown):
+    for row, one in enumerate(bars):
         ax.barh(row, 100 * one.share, height=0.62, color=TRENDS[_trend(one)])
         ax.plot([100 * one.low, 100 * one.high], [row, row], color=INK, linewidth=1.2, marker="|", markersize=7)
         words = f"{100 * one.share:.0f} %"
         ax.text(100 * max(one.share, one.high) + 1.5, row, words, fontsize=8, va="center", color=INK)
-    ax.set_yticks(range(len(shown)), [one.path.removeprefix("spread.") for one in shown])
-    ax.set_ylim(len(shown) - 0.4, -0.6)
+    ax.set_yticks(range(len(bars)), [one.path.removeprefix("spread.") for one in bars])
+    ax.set_ylim(len(bars) - 0.4, -0.6)
     ax.set_xlim(0, 112)
     ax.set_xticks(np.linspace(0, 100, 6))
-    more = len(ranked) - len(shown)
+    more = len(ranking) - len(bars)
     words = "explains alone, % of how members rank; whiskers: its interval"
     ax.set_xlabel(words + (f"; {more} weaker not shown" if more else ""), fontsize=9)
-    figure.suptitle(f"What drives {named(metric, 0.0)[1]}", fontsize=11)
+    figure.suptitle(f"What drives {axis_of(metric, 0.0)[1]}", fontsize=11)
     ax.set_title(textwrap.fill(says, 95), fontsize=8)
     finish(ax, "")
-    found = dict.fromkeys(_trend(one) for one in shown)
-    keys = [Patch(color=TRENDS[trend], label=trend) for trend in TRENDS if trend in found]
+    trends = dict.fromkeys(_trend(one) for one in bars)
+    keys = [Patch(color=TRENDS[trend], label=trend) for trend in TRENDS if trend in trends]
     figure.legend(handles=keys, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     figure.savefig(path, dpi=150)
 

@@ -25,15 +25,15 @@ def _combination(weights: tuple[float, ...]) -> Callable[..., Array]:
             total = total + w * k
         return x + h * total
 
-    combined = jax.custom_jvp(apart(plain))
+    combination = jax.custom_jvp(apart(plain))
 
-    @combined.defjvp
+    @combination.defjvp
     def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
         (x, h, rates), (dx, dh, d_rates) = primals, tangents
         slope = sum(w * k for w, k in zip(weights, rates, strict=True) if w)
-        return combined(x, h, rates), combined(dx, h, d_rates) + dh * slope  # tangents are kept from fusion likewise
+        return combination(x, h, rates), combination(dx, h, d_rates) + dh * slope  # nor are tangents fused
 
-    return combined
+    return combination
 
 
 class _Explicit(_Fixed):
@@ -50,12 +50,12 @@ class _Explicit(_Fixed):
         inputs = {share: problem.inputs(at(share)) for share in self.TIMES}
         x, stages, h = state, [], jnp.asarray(h)
         for share, row, weight in zip(self.TIMES, self.ROWS, self.ROWS[-1], strict=True):
-            rates, shown = problem.watched(inputs[share], x)
+            rates, instant = problem.watched(inputs[share], x)
             stages.append(stored(rates))
-            combined = _combination(row)
-            x = jax.tree.map(lambda x, *ks, combined=combined: combined(x, h, ks), state, *stages)
+            combination = _combination(row)
+            x = jax.tree.map(lambda x, *ks, combination=combination: combination(x, h, ks), state, *stages)
             # Integrals by the method's own rule; other stages are trial states, and no extremes.
-            span = span.seen(shown, weight * h, h) if len(stages) == 1 else span.weighed(shown, weight * h)
+            span = span.seen(instant, weight * h, h) if len(stages) == 1 else span.weighed(instant, weight * h)
         return x, span
 
 

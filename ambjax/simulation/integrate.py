@@ -102,8 +102,8 @@ def in_turn(
     for problem, following in others:
         t, time = t + time, following
         after = method.advance(problem, t, time, so_far.state, so_far.memory, so_far.code)
-        reached = jnp.where(so_far.code == ALIVE, after.t, so_far.t)
-        so_far = after._replace(t=reached, span=so_far.span.joined(after.span))
+        end = jnp.where(so_far.code == ALIVE, after.t, so_far.t)
+        so_far = after._replace(t=end, span=so_far.span.joined(after.span))
     return so_far
 
 
@@ -147,17 +147,17 @@ class _Fixed:
         h = jnp.asarray(period) / self.substeps
 
         def body(index: Array, carry: tuple[Any, Array, Array, Span]) -> tuple[Any, Array, Array, Span]:
-            x, code, reached, span = carry
+            x, code, end, span = carry
             alive = code == ALIVE
             # Times do not depend on who is alive: members share them, and what is driven by them.
-            new, seen = self._step(problem, _inside(t + index * h, h), h, x, span)
+            new, after = self._step(problem, _inside(t + index * h, h), h, x, span)
             code = jnp.where(alive, problem.fate(new), code)
             x = choose(code == ALIVE, new, x)
-            return x, code, jnp.where(alive, t + (index + 1) * h, reached), choose(alive, seen, span)
+            return x, code, jnp.where(alive, t + (index + 1) * h, end), choose(alive, after, span)
 
         begin = (state, jnp.asarray(code, jnp.int32), jnp.asarray(t, h.dtype), blank(problem.shown))
-        x, code, reached, span = lax.fori_loop(0, self.substeps, body, begin)
-        return Advanced(x, code, reached, memory, span)
+        x, code, end, span = lax.fori_loop(0, self.substeps, body, begin)
+        return Advanced(x, code, end, memory, span)
 
 
 def rodas3_step(problem: Problem, at: Times, h: Scalar, state: Any) -> tuple[Any, Any, Instant]:
@@ -168,21 +168,21 @@ def rodas3_step(problem: Problem, at: Times, h: Scalar, state: Any) -> tuple[Any
     """
     t_0 = at(0.0)
     rates = jax.jit(problem.rates)  # traced once here, not once per column of the Jacobian
-    given, given_t = jax.jvp(problem.inputs, (t_0,), (jnp.ones_like(t_0),))
-    factors = linear.factor(linear.jacobian(lambda x: rates(given, x), state), h / 2)
-    f_0, f_t, here = jax.jvp(lambda s: problem.watched(s, state), (given,), (given_t,), has_aux=True)
-    given = problem.inputs(at(1.0))
+    inputs, inputs_t = jax.jvp(problem.inputs, (t_0,), (jnp.ones_like(t_0),))
+    factors = linear.factor(linear.jacobian(lambda x: rates(inputs, x), state), h / 2)
+    f_0, f_t, here = jax.jvp(lambda s: problem.watched(s, state), (inputs,), (inputs_t,), has_aux=True)
+    inputs = problem.inputs(at(1.0))
 
     def stage(f: Any, *couplings: tuple[Scalar, Any]) -> Any:
-        scaled = jax.tree.map(lambda q: h / 2 * q, f)
-        return stored(linear.solve(factors, axpy(scaled, *((c / 2, u) for c, u in couplings))))
+        increment = jax.tree.map(lambda q: h / 2 * q, f)
+        return stored(linear.solve(factors, axpy(increment, *((c / 2, u) for c, u in couplings))))
 
     u_1 = stage(axpy(f_0, (h / 2, f_t)))
     u_2 = stage(axpy(f_0, (1.5 * h, f_t)), (4.0, u_1))
     y_3 = axpy(state, (2.0, u_1))
-    u_3 = stage(rates(given, y_3), (1.0, u_1), (-1.0, u_2))
+    u_3 = stage(rates(inputs, y_3), (1.0, u_1), (-1.0, u_2))
     y_4 = axpy(y_3, (1.0, u_3))
-    u_4 = stage(rates(given, y_4), (1.0, u_1), (-1.0, u_2), (-8.0 / 3.0, u_3))
+    u_4 = stage(rates(inputs, y_4), (1.0, u_1), (-1.0, u_2), (-8.0 / 3.0, u_3))
     return axpy(y_4, (1.0, u_4)), u_4, here
 
 
@@ -250,36 +250,36 @@ class AdaptiveRodas3:
         period = jnp.asarray(period)
 
         def unfinished(carry: Any) -> Array:
-            done, code, trials = carry[2:5]
-            return (done < period) & (code == ALIVE) & (trials < self.most_steps)
+            elapsed, code, trials = carry[2:5]
+            return (elapsed < period) & (code == ALIVE) & (trials < self.most_steps)
 
         def trial(carry: Any) -> Any:
-            x, h, done, _, trials, before, span = carry
-            left = period - done
+            x, h, elapsed, _, trials, before, span = carry
+            left = period - elapsed
             last = h * 1.0001 >= left
-            taken = jnp.where(last, left, h)
-            new, error, here = rodas3_step(problem, _inside(t + done, taken), taken, x)
+            step = jnp.where(last, left, h)
+            new, error, here = rodas3_step(problem, _inside(t + elapsed, step), step, x)
             size = self._size(error, x, new, problem)
             accept = size <= 1
-            suggested = taken * jnp.clip(0.9 * jnp.maximum(size, 1e-9) ** (-1 / 3), 0.2, 5.0)
+            suggestion = step * jnp.clip(0.9 * jnp.maximum(size, 1e-9) ** (-1 / 3), 0.2, 5.0)
             # A step cut short by the sample's end says little about the next one.
-            h = jnp.where(last & accept, jnp.maximum(h, suggested), suggested)
+            h = jnp.where(last & accept, jnp.maximum(h, suggestion), suggestion)
             verdict = jnp.where(accept, problem.fate(new), ALIVE)
             # By the trapezoidal rule, in which this state ends one step and begins the next. Not so the first step
             # after a jump, by the rule of its end alone: slaved states leave what the jump found within nanoseconds.
-            first = problem.jumps & (done == 0)
-            span = choose(accept, span.seen(here, (before + jnp.where(first, 0.0, taken)) / 2, taken), span)
-            before = jnp.where(accept, jnp.where(first, 2 * taken, taken), before)
-            done = jnp.where(accept, jnp.where(last, period, done + taken), done)
-            return choose(accept & (verdict == ALIVE), new, x), h, done, verdict, trials + 1, before, span
+            first = problem.jumps & (elapsed == 0)
+            span = choose(accept, span.seen(here, (before + jnp.where(first, 0.0, step)) / 2, step), span)
+            before = jnp.where(accept, jnp.where(first, 2 * step, step), before)
+            elapsed = jnp.where(accept, jnp.where(last, period, elapsed + step), elapsed)
+            return choose(accept & (verdict == ALIVE), new, x), h, elapsed, verdict, trials + 1, before, span
 
         zero, code = jnp.zeros_like(period), jnp.asarray(code, jnp.int32)
         begin = (state, lax.stop_gradient(memory), zero, code, jnp.int32(0), zero, blank(problem.shown))
-        x, h, done, code, _, before, span = lax.while_loop(unfinished, trial, begin)
-        end = problem.watched(problem.inputs(_inside(t, done)(1.0)), x)[1]
-        span = choose(done > 0, span.seen(end, before / 2), span)
-        stalled = (code == ALIVE) & (done < period)
-        return Advanced(x, jnp.where(stalled, STALLED, code), t + done, h, span)
+        x, h, elapsed, code, _, before, span = lax.while_loop(unfinished, trial, begin)
+        end = problem.watched(problem.inputs(_inside(t, elapsed)(1.0)), x)[1]
+        span = choose(elapsed > 0, span.seen(end, before / 2), span)
+        stalled = (code == ALIVE) & (elapsed < period)
+        return Advanced(x, jnp.where(stalled, STALLED, code), t + elapsed, h, span)
 
     def _size(self, error: Any, x: Any, new: Any, problem: Problem) -> Array:
         """Root mean square of the error against what is allowed; huge if anything is not finite."""

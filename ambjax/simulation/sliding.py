@@ -35,24 +35,24 @@ def slide(loop: Any, hold: Errors, begin: Any, end: Any, h: Scalar, state: Any, 
     i_ref = control.inversion
     per_h = 1 / jnp.where(h > 0, h, 1.0)
 
-    force_0, seen_0, rates_0 = cascade.demand(loop.measured(state.plant, hold), control, begin.reference)
+    force_0, estimate_0, rates_0 = cascade.demand(loop.measured(state.plant, hold), control, begin.reference)
     z_ddot_0 = scenario.plant.z_ddot(z, i, begin.q_z)
     ahead = State(z + h * z_dot + h * h / 2 * z_ddot_0, z_dot + h * z_ddot_0, i)
-    moved = control._replace(
+    control_1 = control._replace(
         observer=_axpy(control.observer, h, rates_0.observer), position=_axpy(control.position, h, rates_0.position)
     )
-    ahead, moved, force_0 = stored((ahead, moved, force_0))
-    force_1, seen_1, rates_1 = cascade.demand(loop.measured(ahead, hold), moved, end.reference)
+    ahead, control_1, force_0 = stored((ahead, control_1, force_0))
+    force_1, estimate_1, rates_1 = cascade.demand(loop.measured(ahead, hold), control_1, end.reference)
 
     inversion: Any = cascade.inversion
     sliding, slaved, tau, (w, w_1, w_2) = inversion.slide(model, force_0, force_1, i_ref, h)
     sliding, slaved, tau, force_1 = stored((sliding, slaved, tau, force_1))
 
-    def current(plant: State, seen: Measurement, i_ref: Array, rate: Array, inner: Any, q_i: Array, h: Array):
+    def current(plant: State, estimate: Measurement, i_ref: Array, rate: Array, inner: Any, q_i: Array, h: Array):
         """i - i_ref and the current law's state after h at constant i_ref' = rate; and what is seen on the way."""
 
         def rate_of(i: Array) -> tuple[Array, Any]:
-            inputs = CurrentInputs(seen._replace(i=i + hold.i), CurrentDemand(i_ref, rate), scenario.u_max)
+            inputs = CurrentInputs(estimate._replace(i=i + hold.i), CurrentDemand(i_ref, rate), scenario.u_max)
             u, inner_rate = cascade.current(model, inputs, inner)
             u = jnp.clip(u, -scenario.u_max, scenario.u_max)
             return scenario.plant.i_dot(plant.z, plant.z_dot, i, u, q_i), (inner_rate, u)
@@ -62,14 +62,14 @@ def slide(loop: Any, hold: Errors, begin: Any, end: Any, h: Scalar, state: Any, 
         e = plant.i - i_ref + h * phi * (i_dot - rate)
         return e, _axpy(inner, h, inner_rate), _Voltage(u, (rate - i_dot) * volts, h * slope, phi)
 
-    e, inner, first = current(state.plant, seen_0, i_ref, sliding, control.current, begin.q_i, tau)
+    e, inner, first = current(state.plant, estimate_0, i_ref, sliding, control.current, begin.q_i, tau)
     e, inner = stored((e, inner))
     i_ref_0, i_ref = i_ref, i_ref + tau * sliding
     middle = State((z + ahead.z) / 2, (z_dot + ahead.z_dot) / 2, i_ref + e)
-    seen = jax.tree.map(lambda a, b: (a + b) / 2, seen_0, seen_1)
+    estimate = jax.tree.map(lambda a, b: (a + b) / 2, estimate_0, estimate_1)
     # The current moves fast while it slides: what counts at the start of the rest is where it ended.
     z_ddot_0 += (1 - tau * per_h) * (scenario.plant.z_ddot(z, middle.i, begin.q_z) - z_ddot_0)
-    e, inner, second = current(middle, seen, i_ref, slaved, inner, end.q_i, h - tau)
+    e, inner, second = current(middle, estimate, i_ref, slaved, inner, end.q_i, h - tau)
     e, inner = stored((e, inner))
     i_ref = i_ref + (h - tau) * slaved
     z_ddot_1 = scenario.plant.z_ddot(ahead.z, i_ref + e, end.q_z)
@@ -77,12 +77,12 @@ def slide(loop: Any, hold: Errors, begin: Any, end: Any, h: Scalar, state: Any, 
         z + h * z_dot + h * h / 6 * (2 * z_ddot_0 + z_ddot_1), z_dot + h / 2 * (z_ddot_0 + z_ddot_1), i_ref + e
     )
     # a slide of no length is none: w was within the sign's layer
-    shown = (
+    instants = (
         loop.shown(begin.reference, state.plant, i_ref_0, w, jnp.where(tau > 0, first.u, second.u)),
         loop.shown(begin.reference, state.plant._replace(i=middle.i), i_ref - (h - tau) * slaved, w_1, second.u),
         loop.shown(end.reference, plant, i_ref, w_2, second.end(scenario.u_max)),
     )
-    span = _seen(span, shown, first.u, second, tau, h - tau)
+    span = _with_step(span, instants, first.u, second, tau, h - tau)
     control = control._replace(
         observer=_axpy(_axpy(control.observer, h / 2, rates_0.observer), h / 2, rates_1.observer),
         position=_axpy(_axpy(control.position, h / 2, rates_0.position), h / 2, rates_1.position),
@@ -111,10 +111,10 @@ class _Voltage(NamedTuple):
         return rest - once, rest * (rest - 2 * once) + self.off * self.off * twice
 
 
-def _seen(span: Span, shown: tuple[Instant, ...], u: Array, rest: _Voltage, tau: Array, left: Array) -> Span:
+def _with_step(span: Span, instants: tuple[Instant, ...], u: Array, rest: _Voltage, tau: Array, left: Array) -> Span:
     """The span, and a step: `u` for tau, then the rest of it, with what is shown at its start, turn and end."""
     before = span.densities
-    for instant, weight in zip(shown, (tau / 2, (tau + left) / 2, left / 2), strict=True):
+    for instant, weight in zip(instants, (tau / 2, (tau + left) / 2, left / 2), strict=True):
         span = span.seen(instant, weight)
     mean, square = stored(rest).moments()
     densities = span.densities._replace(

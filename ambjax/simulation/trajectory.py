@@ -87,11 +87,11 @@ class Trajectory:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Every saved array by name, float64, and the fate."""
-        named = {k: np.asarray(v, np.float64) for k, v in self.rows._asdict().items() if k not in NOT_SAVED}
-        named["lost_at"] = np.asarray(self.lost_at, np.float64)
-        named["lost_why"] = np.asarray(self.lost_why)
-        named["singular_at"] = np.asarray(self.singular_at, np.float64)
-        return named
+        arrays = {k: np.asarray(v, np.float64) for k, v in self.rows._asdict().items() if k not in NOT_SAVED}
+        arrays["lost_at"] = np.asarray(self.lost_at, np.float64)
+        arrays["lost_why"] = np.asarray(self.lost_why)
+        arrays["singular_at"] = np.asarray(self.singular_at, np.float64)
+        return arrays
 
     def save(self, path: str | pathlib.Path) -> None:
         """Write trajectory.npz."""

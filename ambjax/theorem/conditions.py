@@ -129,8 +129,8 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock) -> Report:
     clock = with_method(clock, cascade, scenario)
     method = str(clock.method)
     system, clock, fold = canonical((Monitored(ClosedLoop(cascade, scenario)), clock, MONITORS))
-    trajectory, seen = roll(system, clock, fold, every=0)
-    worst = {name: (float(value), float(at)) for name, (value, at) in seen.items()}
+    trajectory, extremes = roll(system, clock, fold, every=0)
+    worst = {name: (float(value), float(at)) for name, (value, at) in extremes.items()}
     on_reference = delta_1_on_reference(cascade, scenario, clock)
     conditions = _conditions(cascade, worst, on_reference)
     code = int(trajectory.lost_code)
@@ -167,21 +167,21 @@ def required(cascade: Cascade) -> list[Required]:
 
     Raises ValueError for a law that names a right side which the theorem does not have.
     """
-    found = []
+    rows = []
     for stage in ("position", "current", "inversion", "observer"):
         law, paper = getattr(cascade, stage), answers.requirement(USUAL[stage])
         own = answers.requirement(law)
-        asked, kind = (own, type(law)) if own else (paper, USUAL[stage])
-        if asked is None:
+        requirement, kind = (own, type(law)) if own else (paper, USUAL[stage])
+        if requirement is None:
             continue
-        if asked.over not in SIDES:
+        if requirement.over not in SIDES:
             raise ValueError(
-                f"{kind.__name__}.requirement.over = '{asked.over}': it must be one of {', '.join(SIDES)}."
+                f"{kind.__name__}.requirement.over = '{requirement.over}': it must be one of {', '.join(SIDES)}."
             )
-        unit = next(field.metadata["unit"] for field in dataclasses.fields(kind) if field.name == asked.gain)
-        value = getattr(law, asked.gain) if own else None
-        found.append(Required(asked.gain, f"controller.{stage}.{asked.gain}", unit, asked.over, value))
-    return found
+        unit = next(field.metadata["unit"] for field in dataclasses.fields(kind) if field.name == requirement.gain)
+        value = getattr(law, requirement.gain) if own else None
+        rows.append(Required(requirement.gain, f"controller.{stage}.{requirement.gain}", unit, requirement.over, value))
+    return rows
 
 
 def _conditions(
@@ -194,8 +194,8 @@ def _conditions(
         gain, path = float(one.value), one.path
         return Condition(name, requires, gain, against, at, one.unit, gain > against, path=path, ideal=ideal)
 
-    asked, lines = required(cascade), []
-    for one in asked:
+    requirements, lines = required(cascade), []
+    for one in requirements:
         for side in SIDES[one.over]:
             against = worst[side.signal] if side.signal else on_reference
             lines.append(line(one, side.name, one.over + side.where, against, ideal=not side.signal))
@@ -206,7 +206,7 @@ def _conditions(
             holds=None,
             note=f"optional in the paper: {one.gain} would dominate the inversion's transients too",
         )
-        for one in asked
+        for one in requirements
         if one.over == "Q_z"
     ]
     curve = "distance of (z/s_0, i_ref/i_0) to C > 0"

@@ -42,19 +42,19 @@ def advice(report: Report) -> list[str]:
     sets no gain, and is told only where nothing else fails.
     """
     fails = [line for line in report.conditions if line.holds is False]
-    begun = FALL * report.lost_at if report.lost else math.inf
-    rows = [line for line in fails if line.path and (line.ideal or line.at_s < begun)]
-    found = [_raise(max((r for r in rows if r.path == p), key=_right)) for p in dict.fromkeys(r.path for r in rows)]
+    fall = FALL * report.lost_at if report.lost else math.inf
+    rows = [line for line in fails if line.path and (line.ideal or line.at_s < fall)]
+    lines = [_raise(max((r for r in rows if r.path == p), key=_right)) for p in dict.fromkeys(r.path for r in rows)]
     if not rows:
         ideal = {line.path: line for line in report.conditions if line.ideal}
-        found = [_of_the_fall(line, ideal.get(line.path)) for line in fails if line.path]
-    found += [
+        lines = [_of_the_fall(line, ideal.get(line.path)) for line in fails if line.path]
+    lines += [
         f"{line.requires} fails at {line.at_s:.4g} s: keep the run off the singular curve, by a smaller reference, "
         "or a start of i_ref ([controller.inversion] i_ref) on the right side of it."
         for line in fails
         if not line.path
     ]
-    return found
+    return lines
 
 
 def _right(line: Condition) -> float:

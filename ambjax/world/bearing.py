@@ -95,8 +95,8 @@ class Bearing:
 
     def sizes(self) -> Measurement:
         """What still matters of each measured quantity: 2 % of the gap, that in 0.1 s, 4 % of the bias current."""
-        moved = self.s_0 / 50
-        return Measurement(moved, 10 * moved, self.i_0 / 25)
+        offset = self.s_0 / 50
+        return Measurement(offset, 10 * offset, self.i_0 / 25)
 
     @property
     def kappa(self) -> Scalar:

@@ -85,5 +85,5 @@ class Scenario:
         if not random:
             return self
         key = jax.random.fold_in(self.key(), SIGNAL_STREAM)
-        drawn = {slot: realised(signal, jax.random.fold_in(key, SLOTS.index(slot))) for slot, signal in random.items()}
-        return dataclasses.replace(self, **drawn)
+        draws = {slot: realised(signal, jax.random.fold_in(key, SLOTS.index(slot))) for slot, signal in random.items()}
+        return dataclasses.replace(self, **draws)

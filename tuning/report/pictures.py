@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.pictures.figures import BLUE, ORANGE, RED, thin
-from ambjax.pictures.scales import prefixed
+from ambjax.pictures.scales import prefix_of
 from ambjax.simulation.trajectory import Trajectory
 from tuning.search.explore import Slices
 
@@ -30,7 +30,7 @@ def before_after(runs: dict[str, Trajectory]) -> bytes:
     for line, (name, run, signal) in zip(axes, rows, strict=True):
         t, alive = np.asarray(run.rows.t), np.asarray(run.rows.alive)
         values, unit = (run.rows.e_z, "m") if signal == "z - r" else (run.rows.u_mean, "V")
-        factor, unit = prefixed(unit, float(np.abs(np.asarray(values)[alive]).max(initial=0.0)))
+        factor, unit = prefix_of(unit, float(np.abs(np.asarray(values)[alive]).max(initial=0.0)))
         values = factor * np.asarray(values)
         least = FLAT * np.abs(values[alive]).max(initial=0.0)
         ended = float(run.lost_at)
