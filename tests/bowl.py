@@ -13,11 +13,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from texts import case_and_tune
 
 from ambjax import AdaptiveRodas3
-from ambjax.cases.reader import case_from
-from ambjax.cases.table import Table
-from tuning.config import tune_from
 from tuning.objective.loss import TERMS, weigh
 
 # Smallest tracking error, (m / s_0)^2, and the duration, s.
@@ -143,5 +141,4 @@ def study(monkeypatch, world, tables=None, **tune):
     for module in (tuning.problem, tuning.report.gradient):
         monkeypatch.setattr(module, "Engine", Bowl)
     raw = document(tables, **tune)
-    case = case_from(raw)
-    return tuning.problem.problem_of(case, tune_from(Table(raw).table("tune"), case))
+    return tuning.problem.problem_of(*case_and_tune(raw))

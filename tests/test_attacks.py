@@ -12,6 +12,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from texts import write
 from tomlkit import dumps
 
 from ambjax.__main__ import main
@@ -34,16 +35,7 @@ from tuning.report.tuned import tuned
 SHORT = "[clock]\nduration = 0.01\n"
 
 
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch):
-    """Each test in a folder of its own, with the compilation cache in it."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / "cache"))
-
-
-def write(text, name="case.toml"):
-    pathlib.Path(name).write_text(text, encoding="utf-8")
-    return name
+pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 def refusal(text, name="case.toml"):

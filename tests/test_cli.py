@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from texts import write
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import KINDS, SIGNALS, case_from, read_case
@@ -16,16 +17,7 @@ from ambjax.paper.readings import CLOCK, SETTLE, cascade, scenario
 SHORT = "[clock]\nduration = 0.05\n"
 
 
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch):
-    """Each test in a folder of its own, with the compilation cache in it."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / "cache"))
-
-
-def write(text, name="case.toml"):
-    pathlib.Path(name).write_text(text, encoding="utf-8")
-    return name
+pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 # What is wrong, the file, what the message must contain: the path, the value or the fix.

@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 import pytest
+from texts import write
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
@@ -47,22 +48,13 @@ LONGER, MEMBERS, CHUNKS = CASE.format(duration="0.2"), 1536, 48
 RUN = ["ensemble", "case.toml", "--members", str(MEMBERS), "--chunk", "32", "--seed", "3"]
 
 
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch):
-    """Each test in a folder of its own, with the compilation cache beside it."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / "cache"))
+pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Drawing takes longer than these studies."""
     monkeypatch.setattr(studies, "_pictures", lambda *_: None)
-
-
-def write(text, name="case.toml"):
-    pathlib.Path(name).write_text(text, encoding="utf-8")
-    return name
 
 
 # Ctrl-C is heard even if the tests run in the background of a shell, which has its children ignore it.

@@ -9,17 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from texts import problem_from
 from tomlkit import dumps
 
 from ambjax import Cascade, Plant, position
 from ambjax.cases.reader import case_from
-from ambjax.cases.table import Table
 from ambjax.cases.template import template
 from ambjax.control.answers import default_law
 from tuning.__main__ import main
 from tuning.command import _laws
-from tuning.config import tune_from
-from tuning.problem import problem_of
 from tuning.report.tuned import tuned
 from tuning.search.screen import around, everywhere
 
@@ -42,12 +40,6 @@ SCALES = {
 }
 
 
-def study(text, **tune):
-    document = tomllib.loads(text)
-    case = case_from(document)
-    return problem_of(case, tune_from(Table({"tune": tune}).table("tune"), case)), document
-
-
 def test_the_bearings_are_there():
     assert set(BEARINGS) == {"rotor", "fan", "turbo"}
 
@@ -59,7 +51,7 @@ def test_every_range_is_finite_and_positive(name, laws):
     if laws and "[controller]" in text:
         head, _, rest = text.partition("[controller]")
         text = head + "[reference]" + rest.partition("[reference]")[2]
-    found, _ = study(text + laws)
+    found = problem_from(text + laws)
     names = [gain.name for gain in found.objective.space.gains]
     assert names == (["l", "c", "k_1", "k_2", "k_p", "k_int", "k_aw"] if laws else ["c", "k", "gamma", "k_i"])
     for where in found.ranges:
@@ -70,7 +62,7 @@ def test_every_range_is_finite_and_positive(name, laws):
 
 
 def gamma(name, **tune):
-    found, _ = study(COMMON.get(name, name), **tune)
+    found = problem_from(COMMON.get(name, name), **tune)
     return found.ranges[[gain.name for gain in found.objective.space.gains].index("gamma")], found
 
 
@@ -100,7 +92,7 @@ def test_bounds_that_miss_a_range_still_make_one():
 
 
 def test_sources_name_the_pole_and_the_cap():
-    found, _ = study(BEARINGS["rotor"])
+    found = problem_from(BEARINGS["rotor"])
     c, k, *_ = found.ranges
     w = float(found.case.scenario.plant.pole)
     assert f"w = {w:.3g} 1/s: pole of the unstable plant" in c.source
@@ -108,7 +100,7 @@ def test_sources_name_the_pole_and_the_cap():
     assert c.high == c.most == pytest.approx(1 / (5 * 1e-4))
     assert f"may end at up to {k.most:.3g}" in k.source
     # where the clock is fast enough, the plant sets the end
-    c = study(BEARINGS["rotor"] + "[clock]\nsample_period = 1e-5\nduration = 0.1\n")[0].ranges[0]
+    c = problem_from(BEARINGS["rotor"] + "[clock]\nsample_period = 1e-5\nduration = 0.1\n").ranges[0]
     assert c.high == pytest.approx(10 * w)
     assert "1/(5 T)" not in c.source
 
@@ -159,7 +151,7 @@ def test_what_the_template_leaves_out_of_p_follows_an_edited_plant():
 
 @pytest.mark.parametrize("laws", ["", OTHER_LAWS], ids=["usual laws", "other laws"])
 def test_reading_the_tuned_file_gives_the_tuned_cascade(laws):
-    found, _ = study(BEARINGS["fan"] + laws)
+    found = problem_from(BEARINGS["fan"] + laws)
     space = found.objective.space
     x = space.encode(space.clip(found.tune.space.values(found.case.cascade))) + 0.1
     gains = dict(zip(space.paths, np.asarray(space.gains_at(jnp.asarray(x))).tolist(), strict=True))
@@ -171,7 +163,7 @@ def test_reading_the_tuned_file_gives_the_tuned_cascade(laws):
 
 
 def test_without_a_screen_there_is_the_case_alone():
-    found, _ = study(BEARINGS["fan"], screen=0)
+    found = problem_from(BEARINGS["fan"], screen=0)
     start = found.tune.space.values(found.case.cascade)
     points = everywhere(found.objective, found.goal.conditions, start, 0, 1)
     assert points.shape == (1, 4)

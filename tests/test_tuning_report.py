@@ -7,23 +7,21 @@ import math
 import re
 import shutil
 import subprocess
-import tomllib
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from texts import problem_from
 
 from ambjax import rollout
-from ambjax.cases.reader import case_from, safe_name
-from ambjax.cases.table import Table
+from ambjax.cases.reader import safe_name
 from ambjax.simulation.metrics import Standard
 from ambjax.simulation.trajectory import TOUCHED
 from tuning.__main__ import main
-from tuning.config import seeds, tune_from
+from tuning.config import seeds
 from tuning.judge import judge
 from tuning.objective.engine import Engine
 from tuning.objective.loss import TERMS, weigh
-from tuning.problem import problem_of
 from tuning.report import accurate, breakdown, extras, pictures
 from tuning.report import document as report
 from tuning.report.page import literal, page
@@ -63,16 +61,9 @@ risk = "cvar"
 """
 
 
-def study_from(text, **tune):
-    raw = tomllib.loads(text)
-    raw["tune"] |= tune
-    case = case_from(raw, "case")
-    return problem_of(case, tune_from(Table(raw).table("tune"), case))
-
-
 @pytest.fixture(scope="module")
 def study():
-    return study_from(CASE)
+    return problem_from(CASE)
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +138,7 @@ def test_the_table_is_of_the_members_that_were_judged(study, x):
 @pytest.mark.parametrize("conditions", [0.0, 1.0])
 def test_what_was_minimised_is_the_goal(conditions):
     # gamma far below Delta_1 of this reference, so that the conditions' penalty counts
-    few = study_from(CASE.replace("3e5", "1e3").replace('["controller.position.c", "controller.position.k"]',
+    few = problem_from(CASE.replace("3e5", "1e3").replace('["controller.position.c", "controller.position.k"]',
                                                         '["controller.inversion.gamma"]'),
                      weights={"conditions": conditions, "peak": 0.5})  # fmt: skip
     who = training(few)
@@ -194,7 +185,7 @@ def test_the_picture_begins_at_what_the_table_says_was_minimised(study, x):
 
 
 def test_accurate_values_are_those_of_adaptive_rollouts():
-    study = study_from(CASE, substeps=1)  # so coarse that the two differ
+    study = problem_from(CASE, substeps=1)  # so coarse that the two differ
     study.__dict__["judging"] = study.engine
     x = study.objective.space.encode(study.tune.space.values(study.case.cascade))
     seed = seeds(study.tune.budget)[2]

@@ -12,11 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from texts import case_and_tune
 
 from ambjax import Cascade, Clock, Initial, Scenario, Sensor, Sine, Slide, inversion, rollout
-from ambjax.cases.reader import case_from
 from ambjax.ensemble import Percent, Spread
-from tuning.config import tune_from
 from tuning.objective.conditions import bounds
 from tuning.objective.engine import Engine
 from tuning.objective.goal import Goal
@@ -386,10 +385,7 @@ def test_steps_that_are_no_numbers_are_skipped(small):
 
 def parsed(tune, **tables):
     document = {"sensor": {"std": 1e-6}, **tables, "tune": tune}
-    case = case_from(document)
-    from ambjax.cases.table import Table
-
-    return tune_from(Table(document).table("tune"), case)
+    return case_and_tune(document)[1]
 
 
 def test_everything_in_tune_has_a_default():

@@ -7,17 +7,16 @@ import tomllib
 
 import numpy as np
 import pytest
+from texts import problem_from
 
 import tuning.command
 import tuning.search.course
 import tuning.search.rounds
 from ambjax.cases.reader import case_from
-from ambjax.cases.table import Table
 from tuning.__main__ import main
-from tuning.config import tune_from
 from tuning.judge import NEGLIGIBLE, StepError, compared, step_error, words, worst_of
 from tuning.optimisers import Retreat
-from tuning.problem import REFERENCE_MEMBERS, problem_of
+from tuning.problem import REFERENCE_MEMBERS
 from tuning.search.descent import Starts
 from tuning.search.optimise import Progress
 from tuning.search.rounds import LOUDER, MOST_HALVINGS, _joining, finer, rounds
@@ -55,15 +54,9 @@ starts = 2
 )
 
 
-def study(text):
-    document = tomllib.loads(text)
-    case = case_from(document)
-    return problem_of(case, tune_from(Table(document).table("tune"), case))
-
-
 @pytest.fixture(scope="module")
 def small():
-    return study(SMALL)
+    return problem_from(SMALL)
 
 
 def at(found, gains=None):
@@ -108,7 +101,7 @@ def test_a_negligible_error_is_that_of_the_reference_for_its_gap(small):
 
 def test_false_survival_is_refuted():
     """The search's own steps hold every member; accurate steps none."""
-    found = study(FALSE)
+    found = problem_from(FALSE)
     x = at(found)
     who = compared(found)
     assert not np.any(found.engine.terms(x[None], who)["survival"])

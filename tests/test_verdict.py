@@ -2,10 +2,10 @@
 
 import dataclasses
 import math
-import pathlib
 import re
 
 import pytest
+from texts import write
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
@@ -29,15 +29,7 @@ gamma = 1e6
 """
 
 
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / "cache"))
-
-
-def write(text):
-    pathlib.Path("case.toml").write_text(text, encoding="utf-8")
-    return "case.toml"
+pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 def answered(text, capsys):

@@ -1,0 +1,26 @@
+"""The text of a case file: written where a test runs, and read with its [tune]."""
+
+import pathlib
+import tomllib
+
+from ambjax.cases.reader import case_from
+from ambjax.cases.table import Table
+from tuning.config import tune_from
+from tuning.problem import problem_of
+
+
+def write(text, name="case.toml"):
+    """The name of a file of this text, in the folder where the test runs."""
+    pathlib.Path(name).write_text(text, encoding="utf-8")
+    return name
+
+
+def case_and_tune(document, **tune):
+    """The case of a document and its [tune], some keys replaced."""
+    case = case_from(document | {"tune": document.get("tune", {}) | tune}, "case")
+    return case, tune_from(Table(document.get("tune", {}) | tune, "tune"), case)
+
+
+def problem_from(text, **tune):
+    """The tuning problem of a text, some keys of its [tune] replaced."""
+    return problem_of(*case_and_tune(tomllib.loads(text), **tune))
