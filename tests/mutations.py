@@ -81,8 +81,8 @@ LAWS = [
     M(
         "the current law does not feed i_ref' forward",
         "ambjax/control/current.py",
-        "measured.i + demand.i_ref_dot + robust",
-        "measured.i + robust",
+        "measured.i + demand.i_ref_dot - self.k_i",
+        "measured.i - self.k_i",
         "tests/test_laws.py::test_equation_11_gives_the_error_dynamics_of_equation_10",
     ),
     M(
@@ -116,8 +116,8 @@ LAWS = [
     M(
         "the inversion law stands before the observer",
         "ambjax/control/cascade.py",
-        "return (estimate.z, v_star), (estimate,",
-        "return (z, v_star), (estimate,",
+        "return (estimate.z, v_star), (estimate, observed_rate,",
+        "return (z, v_star), (estimate, observed_rate,",
         "tests/test_order.py",
     ),
 ]
@@ -125,7 +125,7 @@ LOOP = [
     M(
         "the supply's limit is ignored",
         "ambjax/simulation/loop.py",
-        "return command, rates, _limited(command.u, u_max)",
+        "return command, rates, limited(command.u, u_max)",
         "return command, rates, command.u",
         "tests/test_rollout.py::test_the_supply_limits_the_voltage_that_is_applied",
     ),
@@ -188,8 +188,8 @@ LOOP = [
     M(
         "the drive of a lost rotor stays on",
         "ambjax/simulation/loop.py",
-        "u=jnp.where(alive, u, 0.0)",
-        "u=u",
+        "u=jnp.where(alive, command.u, 0.0)",
+        "u=command.u",
         "tests/test_rollout.py::test_a_lost_rotor_is_frozen_and_finite",
     ),
 ]
@@ -488,4 +488,62 @@ SEARCH = [
         "tests/test_tuning_space.py::test_survival_points_to_gains_that_keep_the_rotor_longer",
     ),
 ]
-MUTATIONS = [*PLANT, *LAWS, *LOOP, *METHODS, *NOISE, *ENSEMBLE, *SEARCH]
+SAMPLED = [
+    M(
+        "the voltages of the two samples before change places",
+        "ambjax/simulation/sampled.py",
+        "past = (state.command.u, state.past[0])",
+        "past = (state.past[0], state.command.u)",
+        "tests/test_sampled.py::test_the_voltage_of_a_sample_acts_late",
+    ),
+    M(
+        "the second stretch of a sample is as long as the whole",
+        "ambjax/simulation/sampled.py",
+        "period - stretches[0][1]",
+        "period",
+        "tests/test_sampled.py::test_the_voltage_of_a_sample_acts_late",
+    ),
+    M(
+        "the laws act on the estimate of now, however late their voltage is",
+        "ambjax/control/cascade.py",
+        "if processor.predict:",
+        "if False:",
+        "tests/test_sampled.py::test_against_the_independent_simulator[two samples]",
+    ),
+    M(
+        "the reference is that of the sample, not of the instant at which the voltage acts",
+        "ambjax/simulation/sampled.py",
+        "late = processor.delay * self.period if processor.predict else 0.0",
+        "late = 0.0",
+        "tests/test_sampled.py::test_against_the_independent_simulator[two samples]",
+    ),
+    M(
+        "gamma bounds the change of v in a second, not in a sample",
+        "ambjax/control/inversion.py",
+        "inputs.v_star - relax(w, period * self.gamma, self.p)",
+        "inputs.v_star - relax(w, self.gamma, self.p)",
+        "tests/test_sampled.py::test_against_the_independent_simulator[half a sample]",
+    ),
+    M(
+        "the sign on a processor is that of the step's start",
+        "ambjax/numerics/relax.py",
+        "return smooth_sign(relax(w, h, p), p)",
+        "return smooth_sign(w, p)",
+        "tests/test_relax.py::test_the_relay_is_the_limit_of_a_steep_sign",
+    ),
+    M(
+        "a law that leaves the numbers takes the state with it",
+        "ambjax/simulation/sampled.py",
+        "jnp.where(sane, a, b), new",
+        "jnp.where(True, a, b), new",
+        "tests/test_sampled.py::test_a_law_that_gives_no_number_keeps_what_it_had",
+    ),
+    M(
+        "the current of the lower coil falls with its gap",
+        "ambjax/world/coils.py",
+        "+ i_2 * z_dot * below",
+        "- i_2 * z_dot * below",
+        "tests/test_sampled.py::test_against_the_independent_simulator[two coils]",
+    ),
+]
+MUTATIONS = [*PLANT, *LAWS, *LOOP, *METHODS, *NOISE, *ENSEMBLE, *SEARCH, *SAMPLED]

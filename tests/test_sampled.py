@@ -16,6 +16,7 @@ from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
 from ambjax.simulation.sampled import system_of
 from ambjax.simulation.trajectory import DIVERGED
+from ambjax.world.coils import TwoCoil
 
 KINDS = {
     "observer": {"direct": amb.observer.Direct, "complementary": amb.observer.Complementary},
@@ -79,6 +80,11 @@ CASES = [
     Case("current pulse, off centre", World(q_i=pulse(1.0, 0.05, 0.1), initial=(2e-5, 0.0, 0.0), **soft())),
     Case("PI", World(current=PI, u_max=300.0, reference=smoothstep(1e-3, 0.02, 0.1), **soft())),
     Case("super-twisting, the sign itself", World(**TRACKING, position=twisting(k_1=10.0, p=INF), **soft())),
+    Case("two coils", World(kind="two-coil", **TRACKING, **soft())),
+    Case(
+        "two coils, one and a half, wrong model", World(kind="two-coil", model=WRONG, delay=1.5, **TRACKING, **soft())
+    ),
+    Case("two coils, current pulse", World(kind="two-coil", q_i=pulse(1.0, 0.05, 0.1), **hard()), std=NOISE),
     Case("super-twisting, explicit", World(**EXPLICIT, position=twisting()), 6000),
 ]
 
@@ -91,7 +97,8 @@ def record_of(kinds, given, *more):
 def loop_of(world, samples, std):
     """The same world in the package's words."""
     laws = {stage: record_of(kinds, getattr(world, stage)) for stage, kinds in KINDS.items()}
-    plant, model = amb.Plant(**world.plant), amb.Plant(**(world.plant | world.model))
+    plant = {"lumped": amb.Plant, "two-coil": TwoCoil}[world.kind](**world.plant)
+    model = amb.Plant(**(world.plant | world.model))
     processor = Processor(world.delay, world.discretisation == "implicit", world.predict)
     signals = {name: record_of(SIGNALS, getattr(world, name)) for name in ("reference", "q_z", "q_v", "q_i")}
     scenario = amb.Scenario(

@@ -25,6 +25,8 @@ from ambjax.simulation.integrate import AdaptiveRodas3, Integrator, Rodas3, Slid
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sliding import slides
 from ambjax.world import signals
+from ambjax.world.bearing import Bearing
+from ambjax.world.coils import TwoCoil
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Sensor
@@ -46,6 +48,7 @@ SIGNALS: dict[str, type] = {
     "band-noise": signals.BandNoise,
     "sum": signals.Sum,
 }
+PLANTS: dict[str, type] = {"lumped": Plant, "two-coil": TwoCoil}
 DISCRETISATIONS = ["implicit", "explicit"]
 METHODS: dict[str, type] = {"rk4": RK4, "dop853": DOP853, "euler": Euler, "rodas3": Rodas3, "sliding": Slide}
 # Substeps of the sliding step where dt = "auto".
@@ -113,7 +116,7 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     check_depth(raw)
     top = Table(raw)
     top.only([*TABLES, *OTHERS])
-    plant = top.table("plant").record(Plant)
+    plant = _plant(top.table("plant"))
     processor = _processor(top.table("processor")) if "processor" in top.raw else None
     cascade = _cascade(top.table("controller"), plant, processor)
     if processor is None:
@@ -123,8 +126,8 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     if isinstance(clock.method, Slide) and not slides(cascade, scenario.plant):
         made = " or ".join(f'"{kind}"' for kind, law in KINDS["inversion"].items() if answers.slides(law))
         raise ValueError(
-            f'clock.method = "sliding": it is made for controller.inversion.kind = {made} in continuous time. Use '
-            'method = "adaptive".'
+            f'clock.method = "sliding": it is made for controller.inversion.kind = {made} in continuous time, on a '
+            'lumped plant. Use method = "adaptive".'
         )
     _check_start(scenario)
     if settle is None:
@@ -147,9 +150,14 @@ def _processor(table: Table) -> Processor:
     return Processor(delay, implicit, table.switch("predict"))
 
 
-def _cascade(table: Table, plant: Plant, processor: Processor | None) -> Cascade:
+def _plant(table: Table) -> Bearing:
+    kind = table.choice("kind", list(PLANTS), next(iter(PLANTS)))
+    return table.record(PLANTS[kind], extra=("kind",))
+
+
+def _cascade(table: Table, plant: Bearing, processor: Processor | None) -> Cascade:
     table.only(["model", *KINDS])
-    model = table.table("model").record(Plant, base=plant)
+    model = table.table("model").record(Plant, base=plant)  # lumped, whatever the true plant is
     laws = {}
     for stage, kinds in KINDS.items():
         law = table.table(stage)
@@ -181,7 +189,7 @@ def _disturbances(table: Table) -> dict[str, Any]:
     return made
 
 
-def _scenario(top: Table, plant: Plant) -> tuple[Scenario, float | None]:
+def _scenario(top: Table, plant: Bearing) -> tuple[Scenario, float | None]:
     actuator, run = top.table("actuator"), top.table("run")
     actuator.only(["u_max"])
     run.only(["seed", "settle", "clearance"])

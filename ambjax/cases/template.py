@@ -4,7 +4,7 @@ import dataclasses
 import math
 from typing import Any
 
-from ambjax.cases.reader import KINDS, SIGNALS
+from ambjax.cases.reader import KINDS, PLANTS, SIGNALS
 from ambjax.ensemble.design import DESIGNS
 from ambjax.paper.readings import PULSE, REFERENCE, TABLE_2
 from ambjax.world.plant import Plant
@@ -106,6 +106,10 @@ def _law(kind: type) -> list[str]:
     ]
 
 
+def _others(kinds: dict[str, type]) -> str:
+    return ", ".join(f'"{kind}"' for kind in list(kinds)[1:])
+
+
 def _with_note(text: str, comment: str) -> str:
     return f"{text:<30}# {comment}"
 
@@ -119,15 +123,15 @@ def template(scenario: str) -> str:
     """The paper's tracking or regulation scenario under the repaired gains, as an annotated case file."""
     tracking = scenario == "tracking"
     lines = [HEAD.format(title=f"the paper's {scenario} scenario, Table 2 with gamma = 7.5e4")]
-    lines += ["[plant]                       # the true plant, Table 1", *_lines(Plant, Plant()), ""]
+    kinds = _with_note('# kind = "lumped"', f"Eqs. (1), (2); or {_others(PLANTS)}: each coil's own current")
+    lines += ["[plant]                       # the true plant, Table 1", kinds, *_lines(Plant, Plant()), ""]
     lines += [
         "[controller]",
         "model = {}                    # what the controller believes, where it differs: { m = 0.6 }",
     ]
     for stage, kinds in KINDS.items():
         kind, law = next(iter(kinds.items()))
-        others = ", ".join(f'"{k}"' for k in list(kinds)[1:])
-        lines += ["", f"[controller.{stage}]", _with_note(f'kind = "{kind}"', f"or {others}"), *_law(law)]
+        lines += ["", f"[controller.{stage}]", _with_note(f'kind = "{kind}"', f"or {_others(kinds)}"), *_law(law)]
     lines += ["", _with_note("[reference]", f"in m: {', '.join(SIGNALS)}; left out: 0")]
     if tracking:
         lines += ['kind = "sine"', *_lines(type(REFERENCE), REFERENCE)]
