@@ -14,8 +14,8 @@ Written by `python benchmarks/report.py` from the JSON that the scripts left in 
 Ratios are within one run of one script; absolute times depend on the machine and its load.
 
 All but the tuning tasks and the search were measured before metrics were folded over substeps and before adaptive steps
-without noise took a tolerance of 1e-7: gradients by sliding steps, and ensembles with all metrics, cost more since. The
-tasks have no seconds: they ran beside other work.
+without noise took a tolerance of 1e-7: gradients by sliding steps, and ensembles with all metrics, cost more since. Of the
+search, CMA-ES and Nelder-Mead were run on another day than the rest, beside other work: their seconds are their own.
 
     .venv/bin/pip install -e '.[bench]'
     .venv/bin/python benchmarks/single.py            # one run against SciPy and diffrax
@@ -27,6 +27,7 @@ tasks have no seconds: they ran beside other work.
     .venv/bin/python benchmarks/gpu.py               # the same on an accelerator, where there is one
     .venv/bin/python benchmarks/held_noise.py        # what a higher order saves between jumps of the noise
     .venv/bin/python benchmarks/gradients.py         # what a gradient costs, in time and memory
+    .venv/bin/python benchmarks/workarounds.py       # what each workaround of XLA's compiler gains
     .venv/bin/python benchmarks/tasks.py             # the five tuning tasks
     .venv/bin/python benchmarks/search.py            # their search against derivative-free ones
     .venv/bin/python benchmarks/report.py
