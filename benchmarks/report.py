@@ -15,7 +15,7 @@ Ratios are within one run of one script; absolute times depend on the machine an
 
 All but the tuning tasks and the search were measured before metrics were folded over substeps and before adaptive steps
 without noise took a tolerance of 1e-7: gradients by sliding steps, and ensembles with all metrics, cost more since. In
-the search, CMA-ES and Nelder-Mead were run on another day than the rest, beside other work: their seconds are their own.
+the search, CMA-ES and Nelder-Mead were run on another day, beside other work: their seconds are their own.
 
     .venv/bin/pip install -e '.[bench]'
     .venv/bin/python benchmarks/single.py            # one run against SciPy and diffrax
