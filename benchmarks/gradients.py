@@ -89,7 +89,12 @@ def tuner(members: int, samples: int) -> tuple[Callable[..., Any], Any, Any, int
         return weigh(tune.weights, objective.run(x_0 + logs, member, objective.loss), member.stressed)
 
     one = jax.tree.map(lambda a: a[0], who)
-    return loss, who if members > 1 else one, jax.tree.map(lambda _: 0, one), samples * objective.clock.method.substeps
+    return (
+        loss,
+        who if members > 1 else one,
+        jax.tree.map(lambda _: 0, one),
+        samples * workload.substeps(objective.clock),
+    )
 
 
 def point(mode: str, steps: int) -> dict[str, Any]:

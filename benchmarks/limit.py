@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import workload
-from workload import Workload
+from workload import Workload, substeps
 
 from ambjax import Clock, rollout
 
@@ -85,7 +85,7 @@ def _problem(work: Workload) -> Problem:
     if sensor is not None:
         numbers |= {"std_z": sensor.std, "std_z_dot": sensor.std_z_dot, "std_i": sensor.std_i}
     start, stop = work.pulse
-    return Problem(**numbers, substeps=clock.method.substeps, samples=clock.samples, pulse_start=start, pulse_stop=stop)
+    return Problem(**numbers, substeps=substeps(clock), samples=clock.samples, pulse_start=start, pulse_stop=stop)
 
 
 def run(work: Workload, dtype: str = "float64", threads: int = 1) -> tuple[np.ndarray, np.ndarray]:

@@ -39,7 +39,7 @@ class Workload(NamedTuple):
     @property
     def steps(self) -> int:
         """RK4 steps of one member."""
-        return self.clock.samples * self.clock.method.substeps
+        return self.clock.samples * substeps(self.clock)
 
     @property
     def pulse(self) -> tuple[int, int]:
@@ -62,6 +62,12 @@ class Workload(NamedTuple):
         initial = dataclasses.replace(self.scenario.initial, z=np.asarray(self.scenario.initial.z)[chosen])
         member = np.asarray(self.scenario.member)[chosen]
         return self._replace(scenario=dataclasses.replace(self.scenario, initial=initial, member=member))
+
+
+def substeps(clock: Clock) -> int:
+    """Steps per sample of a method that has a number of them."""
+    method: Any = clock.method
+    return method.substeps
 
 
 def workload(members: int, samples: int, *, noise: bool = False) -> Workload:

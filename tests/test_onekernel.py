@@ -21,6 +21,7 @@ from ambjax import (
     observer,
     position,
 )
+from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
 from ambjax.ensemble.onekernel import run_whole
 from ambjax.simulation.metrics import Named, Peak, Variation
@@ -87,3 +88,9 @@ def test_bad_input_is_refused(change, message):
     arguments = {"cascade": CASCADE, "scenario": SCENARIO, "clock": CLOCK, "fold": Peak("e_z")} | change
     with pytest.raises(ValueError, match=message):
         run_whole(**arguments)
+
+
+def test_a_processor_is_refused():
+    cascade = Cascade(processor=Processor())
+    with pytest.raises(ValueError, match="the whole-rollout kernel runs cascades in continuous time only"):
+        run_whole(cascade, Scenario(member=np.arange(2)), Clock(10, 1e-4, RK4(2)), fold=None, interpret=True)

@@ -45,12 +45,14 @@ def run_whole(
     in member order, without rows. `block` members, a power of two of at least 32, share a program. `interpret`
     runs the kernel's program on any device, slowly: for tests. The method must be RK4. Noise is that of `rollout`.
 
-    Raises ValueError as `run_ensemble` does, and for another method or a wrong block.
+    Raises ValueError as `run_ensemble` does, and for another method, a processor or a wrong block.
     """
     check_inputs(cascade, scenario, clock)
     clock = with_method(clock, cascade, scenario)
     if not isinstance(clock.method, RK4):
         raise ValueError(f"clock.method = {clock.method}: the whole-rollout kernel integrates with RK4 only.")
+    if cascade.processor is not None:
+        raise ValueError("processor: the whole-rollout kernel runs cascades in continuous time only. Use run_ensemble.")
     if block < WARP or block & (block - 1):
         raise ValueError(f"block = {block}: it must be a power of two, at least {WARP}. Use {BLOCK}, for example.")
     cascade, scenario, clock, fold = canonical((cascade, scenario, clock, fold))

@@ -1,7 +1,5 @@
 """The clock: samples, their period, and the integrator between them."""
 
-from typing import Any
-
 from ambjax.numerics.records import Scalar, leaf, record, static
 from ambjax.simulation.integrate import Integrator
 
@@ -14,12 +12,21 @@ class Clock:
     sample_period: Scalar = leaf(
         default=1e-4, unit="s", at_least=1e-9, at_most=1e6, doc="time for which a measurement's error is held"
     )
-    method: Any = None
+    method: Integrator | None = None
 
     @property
     def duration(self) -> Scalar:
         """Simulated time, s."""
         return self.samples * self.sample_period
+
+    @property
+    def integrator(self) -> Integrator:
+        """The method. Raises ValueError where none was chosen."""
+        if self.method is None:
+            raise ValueError(
+                "clock.method is None (dt = 'auto'): choose it: clock = with_method(clock, cascade, scenario)."
+            )
+        return self.method
 
     def with_method(self, method: Integrator) -> "Clock":
         """This clock with another integrator."""

@@ -74,19 +74,19 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
         method = choose_method(cascade, scenario, float(clock.sample_period), reverse=reverse)
         return dataclasses.replace(clock, method=method)
     if clock.method.limit is not None:
-        _check_limit(clock, cascade, scenario)
+        _check_limit(clock, clock.method.limit, cascade, scenario)
     return clock
 
 
-def _check_limit(clock: Clock, cascade: Cascade, scenario: Scenario) -> None:
+def _check_limit(clock: Clock, limit: float, cascade: Cascade, scenario: Scenario) -> None:
     try:
         named = slopes(cascade, scenario)
-        step = clock.method.step_size(float(np.max(np.asarray(clock.sample_period))))
+        step = clock.integrator.step_size(float(np.max(np.asarray(clock.sample_period))))
     except (ValueError, jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
         return  # traced: the caller checked the concrete values, or takes the risk
     law = max(named, key=lambda name: named[name])
-    limit = clock.method.limit / named[law]
-    if step > limit:
+    limit /= named[law]
+    if step is not None and step > limit:
         raise ValueError(
             f"clock.dt = {step:g} s: {clock.method} is stable only up to {limit:.3g} s, because the "
             f"{law} law has slope {named[law]:.3g} 1/s. Use dt = 'auto', method = 'rodas3', or a smaller dt."

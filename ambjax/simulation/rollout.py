@@ -111,7 +111,7 @@ def begin(system: System, clock: Clock, fold: Fold | None) -> Progress:
     never = jnp.asarray(jnp.inf, dtype)
     ending = Ending(system.fate(state), never, never, jnp.asarray(clock.duration, dtype))
     ending = ending._replace(lost_at=jnp.where(ending.lost_code == ALIVE, never, 0.0))
-    memory = clock.method.start(jnp.asarray(clock.sample_period, dtype))
+    memory = clock.integrator.start(jnp.asarray(clock.sample_period, dtype))
     return Progress(state, ending, memory, () if fold is None else fold.init())
 
 
@@ -153,7 +153,7 @@ def finish(progress: Progress, rows: Any, fold: Fold | None) -> Outcome:
 
 def _advanced(system: Any, clock: Clock, hold: Errors, t: Array, state: Any, memory: Any, code: Array) -> Advanced:
     """The state at the end of the sample that begins at t."""
-    method, period = clock.method, clock.sample_period
+    method, period = clock.integrator, clock.sample_period
     if hasattr(system, "advance"):
         return system.advance(method, hold, t, period, state, memory, code)
     return method.advance(system.problem(hold), t, period, state, memory, code)
