@@ -81,8 +81,8 @@ LAWS = [
     M(
         "the current law does not feed i_ref' forward",
         "ambjax/control/current.py",
-        "measured.i + demand.i_ref_dot - self.k_i",
-        "measured.i - self.k_i",
+        "measured.i + demand.i_ref_dot + robust",
+        "measured.i + robust",
         "tests/test_laws.py::test_equation_11_gives_the_error_dynamics_of_equation_10",
     ),
     M(

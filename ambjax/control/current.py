@@ -40,17 +40,17 @@ class SlidingMode:
         return model.i_0
 
     def __call__(self, model: Plant, inputs: CurrentInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
-        return self._voltage(model, inputs, smooth_sign(inputs.measured.i - inputs.demand.i_ref, self.p)), ()
+        return self._voltage(model, inputs, self.robust(inputs.measured.i - inputs.demand.i_ref)), ()
 
     def step(self, model: Plant, inputs: CurrentInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
         """The sign is that of i - i_ref at the step's end."""
         e = inputs.measured.i - inputs.demand.i_ref
-        return self._voltage(model, inputs, share(e, period * self.k_i, self.p)), ()
+        return self._voltage(model, inputs, -self.k_i * share(e, period * self.k_i, self.p)), ()
 
-    def _voltage(self, model: Plant, inputs: CurrentInputs, sign: Array) -> Array:
+    def _voltage(self, model: Plant, inputs: CurrentInputs, robust: Array) -> Array:
         measured, demand = inputs.measured, inputs.demand
         inverse = (inputs.gaps or model.gaps(measured.z)).inverses[1]
-        wanted = -2 * measured.z_dot * inverse * measured.i + demand.i_ref_dot - self.k_i * sign
+        wanted = -2 * measured.z_dot * inverse * measured.i + demand.i_ref_dot + robust
         return (model.kappa / 2) * inverse * wanted + model.R * measured.i
 
     def robust(self, e: Array) -> Array:
