@@ -10,6 +10,9 @@ Readings of the rules where they leave room, so that another program can follow 
   jump unless i_ref is given.
 - the super-twisting law, implicit, is set-valued: p is for the explicit form only.
 - a row's u is u_n within +-u_max; the limit is also what the PI law's anti-windup knows of the supply.
+- the position sensor's low-pass begins at z, the amplifier at 0 V; scale and offset come after the low-pass, noise after
+  them, the converter last. The dead band is taken off the amplifier's voltage; at the current limit the voltage that
+  would push |i| on is R i.
 - q_i moves the measured current: i_1' by q_i, i_2' by -q_i.
 - lost: |z| = touch s_0. The singular curve: the first sample at which dv/di(z, i_ref) <= 0 at what the laws took.
 - a scaled force beyond what any current gives: the current of the one nearest to it.
@@ -55,6 +58,10 @@ class World:
     range_z: float = 5e-3
     range_i: float = 0.5
     touch: float = 0.9
+    offset: float = 0.0  # m
+    gain: float = 1.0
+    bandwidth: float | None = None  # Hz, of the position sensor
+    amplifier: dict = field(default_factory=dict)  # {"bandwidth" Hz, "slew" V/s, "dead_band" V, "i_max" A}
 
 
 @dataclass(frozen=True)
@@ -76,11 +83,11 @@ class Run:
 def simulate(world, samples, noise=None, fast=False):
     """Rows 0 .. samples - 1. `noise[n]`: errors of z, z_dot, i at sample n. `fast`: RK4 in place of DOP853."""
     noise = np.zeros((samples, 3)) if noise is None else np.asarray(noise)
-    plant, controller = (TwoCoil if world.kind == "two-coil" else Lumped)(world), Controller(world)
+    plant, controller = Driven(world, (TwoCoil if world.kind == "two-coil" else Lumped)(world)), Controller(world)
     y, rows, lost_at, singular_at = plant.start, np.full((samples, 9), np.nan), math.inf, math.inf
     for n in range(samples):
         output = plant.output(y)
-        *row, singular, seen = controller.step(n, _measurement(world, output, noise[n].tolist()))
+        *row, singular, seen = controller.step(n, _measurement(world, plant.sensed(y), noise[n].tolist()))
         rows[n] = *output, *row, *seen
         singular_at = min(singular_at, n * world.period if singular else math.inf)
         y, touched = _sample(world, plant, controller, n, y, fast) if n < samples - 1 else (y, None)
@@ -92,7 +99,8 @@ def simulate(world, samples, noise=None, fast=False):
 
 
 def _measurement(world, output, errors):
-    z, z_dot, i = (x + error for x, error in zip(output, errors, strict=True))
+    z, z_dot, i = output
+    z, z_dot, i = (x + error for x, error in zip((world.gain * z + world.offset, z_dot, i), errors, strict=True))
     return conversion(z, world.bits, world.range_z), z_dot, conversion(i, world.bits, world.range_i)
 
 
@@ -203,6 +211,40 @@ class TwoCoil:
             2 * upper / body.kappa * (bias + u - body.R * i_1) - i_1 * z_dot / upper + q_i,
             2 * lower / body.kappa * (bias - u - body.R * i_2) + i_2 * z_dot / lower - q_i,
         )
+
+
+class Driven:
+    """A plant behind its amplifier and its position sensor's low-pass: its y, then those that there are of theirs."""
+
+    def __init__(self, world, plant):
+        self.plant, self.body, self.stop, given = plant, plant.body, plant.stop, world.amplifier
+        self.sensor, self.follow = world.bandwidth, given.get("bandwidth")
+        self.slew, self.dead, self.i_max = (given.get(name) for name in ("slew", "dead_band", "i_max"))
+        assert self.follow or not self.slew  # else its rate would jump
+        self.start = plant.start + [plant.start[0]] * bool(self.sensor) + [0.0] * bool(self.follow)
+        more = [1e-3] * bool(self.sensor) + [100.0] * bool(self.follow)
+        self.scale = np.concatenate([plant.scale, more])
+
+    def output(self, y):
+        return self.plant.output(y[: len(self.plant.start)])
+
+    def sensed(self, y):
+        z, z_dot, i = self.output(y)
+        return (y[len(self.plant.start)] if self.sensor else z), z_dot, i
+
+    def rates(self, y, u, q_z=0.0, q_i=0.0):
+        own, more, i = y[: len(self.plant.start)], [], self.output(y)[2]
+        if self.sensor:
+            more.append(2 * math.pi * self.sensor * (y[0] - y[len(own)]))
+        if self.follow:
+            rate, most = 2 * math.pi * self.follow * (u - y[-1]), self.slew or math.inf
+            u = y[-1]
+            more.append(min(max(rate, -most), most))
+        u = math.copysign(max(abs(u) - (self.dead or 0.0), 0.0), u)
+        hold = self.body.R * i
+        if self.i_max and abs(i) >= self.i_max and (u - hold) * i > 0:
+            u = hold
+        return [*self.plant.rates(own, u, q_z, q_i), *more]
 
 
 def sgn(x, p):

@@ -84,7 +84,7 @@ class Sampled:
         voltages = jnp.stack([state.u, *state.queue])
         late, early = (jnp.interp(whole + k, jnp.arange(3), voltages) for k in (1, 0))
         stretches = [(self.driven(late), share * period), (self.driven(early), (1 - share) * period)]
-        after = in_turn(method, stretches, t, state.plant, memory, code)
+        after = in_turn(method, stretches, t, state.plant, memory, code)[-1]
         return after._replace(state=state._replace(plant=after.state))
 
     def _fate(self, plant):

@@ -16,6 +16,7 @@ from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
 from ambjax.simulation.sampled import system_of
 from ambjax.simulation.trajectory import DIVERGED
+from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
 
 KINDS = {
@@ -85,6 +86,10 @@ CASES = [
         "two coils, one and a half, wrong model", World(kind="two-coil", model=WRONG, delay=1.5, **TRACKING, **soft())
     ),
     Case("two coils, current pulse", World(kind="two-coil", q_i=pulse(1.0, 0.05, 0.1), **hard()), std=NOISE),
+    Case("converter of 14 bits", World(**TRACKING, bits=14, **hard(k_i=500.0)), std=NOISE),
+    Case("a real position sensor", World(**TRACKING, bandwidth=5e3, offset=2e-6, gain=1.01, delay=1.5, **soft())),
+    Case("a real amplifier", World(**TRACKING, amplifier={"bandwidth": 2e3, "slew": 1e5}, delay=0.5, **soft()), 600),
+    Case("dead band", World(kind="two-coil", **TRACKING, amplifier={"dead_band": 2.0}, **soft())),
     Case("super-twisting, explicit", World(**EXPLICIT, position=twisting()), 6000),
 ]
 
@@ -92,6 +97,12 @@ CASES = [
 def record_of(kinds, given, *more):
     kind, numbers = given
     return kinds[kind](*more, **numbers)
+
+
+def sensor_of(world, std):
+    names = ("offset", "gain", "bandwidth", "bits")
+    given = {name: getattr(world, name) for name in names if getattr(world, name) != getattr(World, name)}
+    return amb.Sensor(*std, **given) if any(std) or given else None
 
 
 def loop_of(world, samples, std):
@@ -104,7 +115,8 @@ def loop_of(world, samples, std):
     scenario = amb.Scenario(
         plant=plant,
         initial=amb.Initial(*world.initial),
-        sensor=amb.Sensor(*std) if any(std) else None,
+        sensor=sensor_of(world, std),
+        amplifier=Amplifier(**world.amplifier) if world.amplifier else None,
         u_max=world.u_max,
         seed=5,
         **signals,

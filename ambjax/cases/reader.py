@@ -23,8 +23,10 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
 from ambjax.simulation.integrate import AdaptiveRodas3, Integrator, Rodas3, Slide
 from ambjax.simulation.method import with_method
+from ambjax.simulation.sampled import check_parts
 from ambjax.simulation.sliding import slides
 from ambjax.world import signals
+from ambjax.world.amplifier import Amplifier
 from ambjax.world.bearing import Bearing
 from ambjax.world.coils import TwoCoil
 from ambjax.world.plant import Plant
@@ -119,9 +121,8 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     plant = _plant(top.table("plant"))
     processor = _processor(top.table("processor")) if "processor" in top.raw else None
     cascade = _cascade(top.table("controller"), plant, processor)
-    if processor is None:
-        cascade.check_smooth()
     scenario, settle = _scenario(top, plant)
+    check_parts(cascade, scenario)
     clock, duration = _clock(top.table("clock"))
     if isinstance(clock.method, Slide) and not slides(cascade, scenario.plant):
         made = " or ".join(f'"{kind}"' for kind, law in KINDS["inversion"].items() if answers.slides(law))
@@ -191,20 +192,29 @@ def _disturbances(table: Table) -> dict[str, Any]:
 
 def _scenario(top: Table, plant: Bearing) -> tuple[Scenario, float | None]:
     actuator, run = top.table("actuator"), top.table("run")
-    actuator.only(["u_max"])
+    names = [field.name for field in dataclasses.fields(Amplifier)]
+    actuator.only(["u_max", *names])
     run.only(["seed", "settle", "clearance"])
     settle = run.leaf("settle", SETTLE)
     scenario = Scenario(
         plant=plant,
         reference=_signal(top.table("reference")) if "reference" in top.raw else signals.Constant(),
-        sensor=top.table("sensor").record(Sensor) if "sensor" in top.raw else None,
+        sensor=_sensor(top.table("sensor")) if "sensor" in top.raw else None,
         initial=top.table("initial").record(Initial),
         u_max=actuator.leaf("u_max", FIELDS["u_max"], math.inf),
+        amplifier=actuator.record(Amplifier, extra=("u_max",)) if any(n in actuator.raw for n in names) else None,
         clearance=run.leaf("clearance", FIELDS["clearance"]),
         seed=_seed(run),
         **_disturbances(top.table("disturbance")),
     )
     return scenario, settle
+
+
+def _sensor(table: Table) -> Sensor:
+    sensor, velocity = table.record(Sensor, extra=("velocity",)), table.switch("velocity")
+    if sensor.bits is not None and sensor.bits % 1:
+        raise ValueError(f"{table.at('bits')} = {sensor.bits:g}: it must be a whole number of bits, 2 to 32.")
+    return sensor if velocity is None else dataclasses.replace(sensor, velocity=velocity)
 
 
 def _seed(run: Table) -> int:

@@ -37,6 +37,14 @@ settle = 0.5                  # s; from when "settled" metrics count (left out: 
 # std = {paper_std:.3e}          # m; this is the paper's, which its printed gains do not survive
 # std_z_dot = 0.0             # m/s
 # std_i = 0.0                 # A
+# offset = 0.0                # m; of the position sensor, as its gain and bandwidth
+# gain = 1.0                  # 1; what it reads of 1 m
+# velocity = true             # whether z_dot is measured too; if false, an observer must estimate it
+#                             # and with [processor]:
+# bandwidth = 1e4             # Hz; first-order low-pass (left out: none)
+# bits = 14                   # of the converter of z and i (left out: not rounded)
+# range_z = 5e-3              # m; its ends (left out: plant.s_0)
+# range_i = 0.5               # A (left out: 2 plant.i_0)
 
 # [processor]                 # the laws as they run on a processor, a step a sample (left out: in continuous time)
 # delay = 1.0                 # samples from measurement to voltage, 0 to 2, fractions too
@@ -45,6 +53,11 @@ settle = 0.5                  # s; from when "settled" metrics count (left out: 
 
 # [actuator]
 # u_max = 200.0               # V; limit of the supply (left out: none)
+#                             # and with [processor]:
+# bandwidth = 1e3             # Hz; the amplifier's, first order (left out: follows at once)
+# slew = 1e7                  # V/s; the most that its voltage changes (left out: no limit)
+# dead_band = 0.5             # V; taken off the size of its voltage (left out: none)
+# i_max = 1.0                 # A; beyond, no voltage drives |i| further (left out: no limit)
 
 # [spread]                    # what varies over an ensemble, by dotted path; 'ambjax simulate' leaves it out
 # design = "random"           # or {designs}

@@ -35,7 +35,7 @@ def say_doubts(case: Case, path: str | pathlib.Path) -> None:
 
 def doubts(case: Case) -> list[str]:
     """One line with path, value, why and what may have been meant, for each number of a case that is hardly meant."""
-    return [*_sizes(case), *_noise(case), *_currents(case), *_motion(case)]
+    return [*_sizes(case), *_noise(case), *_velocity(case), *_currents(case), *_motion(case)]
 
 
 def _sizes(case: Case) -> Iterator[str]:
@@ -56,6 +56,16 @@ def _noise(case: Case) -> Iterator[str]:
     if sensor is not None and sensor.std > MOST_NOISE * gap:
         share = 100 * sensor.std / gap
         yield f"sensor.std = {sensor.std:g} m is {share:.3g} % of the gap, {gap:g} m. Was another unit meant?"
+
+
+def _velocity(case: Case) -> Iterator[str]:
+    sensor = case.scenario.sensor
+    perfect = sensor is None or (sensor.velocity and sensor.std_z_dot == 0)
+    if perfect and not (sensor is None and case.cascade.processor is None):
+        yield (
+            "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ANY ERROR, which no bearing does. Give it an "
+            "error, or velocity = false and an observer that estimates it."
+        )
 
 
 def _currents(case: Case) -> Iterator[str]:

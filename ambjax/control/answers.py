@@ -6,6 +6,7 @@ requirement         what Theorem 1 requires of one of its gains; nothing
 robust(error)       the term that its sign adds to the rate of the error of its stage, Eqs. (12), (14); 0
 ranges(site)        where its gains are searched; about their values
 slide(...)          an inversion law's step that knows where its stiffness is (`laws.Relaxation`); there is none
+estimates_velocity  whether an observer needs no measured velocity; no
 """
 
 import dataclasses
@@ -62,6 +63,11 @@ def robust(law: Any, error: Array) -> Array:
 def ranges(law: Any, site: Site) -> dict[str, Interval]:
     """Where gains of the law are searched, by name; one that is not there: about its value."""
     return law.ranges(site) if hasattr(law, "ranges") else {}
+
+
+def estimates_velocity(law: Any) -> bool:
+    """Whether an observer needs no measured velocity."""
+    return getattr(law, "estimates_velocity", False)
 
 
 def slides(law: Any) -> bool:

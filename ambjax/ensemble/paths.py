@@ -34,7 +34,13 @@ def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     for stage in ("model", "observer", "position", "inversion", "current"):
         table |= _below(getattr(cascade, stage), f"controller.{stage}", (0, stage))
     table |= _below(cascade.processor, "processor", (0, "processor"))
-    names = {"plant": "plant", "reference": "reference", "disturbance.q_i": "q_i", "sensor": "sensor"}
+    names = {
+        "plant": "plant",
+        "reference": "reference",
+        "disturbance.q_i": "q_i",
+        "sensor": "sensor",
+        "actuator": "amplifier",
+    }
     names |= {"initial": "initial", "disturbance.q_z": "q_z"}
     if not _absent(scenario.q_v):
         names["disturbance.q_z" if _absent(scenario.q_z) else "disturbance.q_v"] = "q_v"

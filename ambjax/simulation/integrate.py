@@ -95,16 +95,19 @@ def in_turn(
     state: Any,
     memory: Any,
     code: Scalar = ALIVE,
-) -> Advanced:
-    """Problems one after another, each for its time (s; 0 too): a sample within which rates jump at known instants."""
+) -> list[Advanced]:
+    """Problems one after another, each for its time (s; 0 too): a sample within which rates jump at known instants.
+
+    What has been reached after each of them, since the first began.
+    """
     (problem, time), *others = stretches
-    so_far = method.advance(problem, t, time, state, memory, code)
+    reached = [method.advance(problem, t, time, state, memory, code)]
     for problem, following in others:
-        t, time = t + time, following
+        t, time, so_far = t + time, following, reached[-1]
         after = method.advance(problem, t, time, so_far.state, so_far.memory, so_far.code)
         end = jnp.where(so_far.code == ALIVE, after.t, so_far.t)
-        so_far = after._replace(t=end, span=so_far.span.joined(after.span))
-    return so_far
+        reached.append(after._replace(t=end, span=so_far.span.joined(after.span)))
+    return reached
 
 
 def axpy(state: State, *terms: tuple[Scalar, State]) -> State:

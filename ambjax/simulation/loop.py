@@ -88,7 +88,8 @@ class ClosedLoop:
 
     def measured(self, plant: Any, hold: Errors) -> Measurement:
         """What the sensors report of the plant's state."""
-        return self.scenario.plant.measurement(plant).off(hold)
+        motion, sensor = self.scenario.plant.measurement(plant), self.scenario.sensor
+        return motion if sensor is None else sensor.reading(motion, hold)
 
     def scale(self) -> LoopState:
         """Size of each component that still matters."""
@@ -164,10 +165,11 @@ class ClosedLoop:
         """All signals at one instant. The drive of a lost rotor is off: u = 0."""
         inputs = self.inputs(t)
         command, _, u = self.command(inputs, state, hold)
-        return self.signals(t, inputs, state.plant, command._replace(u=u), hold, alive)
+        seen = self.measured(state.plant, hold)
+        return self.signals(t, inputs, state.plant, command._replace(u=u), seen, alive)
 
-    def signals(self, t: Scalar, inputs: Inputs, state: Any, command: Command, hold: Errors, alive: Array) -> Row:
-        """All signals of a state of the plant and what was decided there, u within the supply's limit."""
+    def signals(self, t: Scalar, inputs: Inputs, state: Any, command: Command, seen: Measurement, alive: Array) -> Row:
+        """All signals of a state of the plant, what was seen and decided there, u within the supply's limit."""
         plant = self.scenario.plant
         motion, signals = plant.measurement(state), plant.signals(state)
         return Row(
@@ -185,7 +187,7 @@ class ClosedLoop:
             r=inputs.reference.r,
             q_z=inputs.q_z,
             q_i=inputs.q_i,
-            z_measured=motion.z + hold.z,
+            z_measured=seen.z,
             heat=jnp.where(alive, signals.heat, 0.0),
             alive=alive,
         )

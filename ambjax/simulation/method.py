@@ -18,6 +18,8 @@ from ambjax.world.scenario import Scenario
 ACCURATE = 1.0
 # The plant under a held voltage is not stiff: RK4 at this step times its pole leaves less than 1e-11 m.
 SAMPLED = 0.02
+# An amplifier's voltage is known as a function of time: at this step times its rate, RK4 integrates it to 1e-9 A.
+DRIVEN = 0.5
 # More RK4 substeps per sample than this cost more than the L-stable method's larger steps.
 MOST_SUBSTEPS = 4
 # Fixed L-stable steps: the corner of a smoothed sign costs an impulse that grows as slope h^2. At this value the
@@ -54,7 +56,8 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
     """
     slope = max(slopes(cascade, scenario).values())
     if cascade.processor is not None:
-        return RK4(max(math.ceil(sample_period * slope / SAMPLED), 1))
+        rate = 0.0 if (amplifier := scenario.amplifier) is None else float(np.max(np.asarray(amplifier.slope())))
+        return RK4(max(math.ceil(sample_period * max(slope / SAMPLED, rate / DRIVEN)), 1))
     substeps = math.ceil(sample_period * slope / ACCURATE)
     if substeps <= MOST_SUBSTEPS and (reverse or scenario.sensor is not None):
         return RK4(max(substeps, 1))

@@ -15,7 +15,7 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.integrate import Advanced, Problem, choose
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import Ending, Fold
-from ambjax.simulation.sampled import system_of
+from ambjax.simulation.sampled import check_parts, system_of
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import ALIVE, Trajectory, first_time
 from ambjax.world.scenario import Scenario
@@ -84,10 +84,9 @@ def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | 
 def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     """Raise ValueError, with the dotted path and the fix, for whatever concrete value is not allowed."""
     validate(dataclasses.replace(cascade, processor=None), "controller")
-    if cascade.processor is None:
-        cascade.check_smooth()
-    else:
+    if cascade.processor is not None:
         validate(cascade.processor, "processor")
+    check_parts(cascade, scenario)
     validate(scenario, "scenario")
     validate(clock, "clock")
     if clock.samples < 1:

@@ -6,12 +6,14 @@ under two where the delay is no whole number of samples.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.control import answers
 from ambjax.control.cascade import Cascade, CascadeState, Command, Sample
 from ambjax.control.processor import Processor
 from ambjax.numerics.records import Scalar, record
@@ -20,20 +22,24 @@ from ambjax.simulation.integrate import Advanced, Integrator, Problem, in_turn
 from ambjax.simulation.loop import SHOWN, ClosedLoop, Densities, Inputs, LoopState, Sizes, limited
 from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import DIVERGED, Row
+from ambjax.world.amplifier import Amplifier
 from ambjax.world.scenario import Scenario
-from ambjax.world.sensor import Errors
+from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.signals import reference_at
 
 
 class SampledState(NamedTuple):
     """State of the plant and of the laws; what they decided last, u within the supply's limit; the two voltages
-    before, V; and 1, or 0 once a law has left the numbers."""
+    before, V; 1, or 0 once a law has left the numbers; output of the sensor's low-pass (m) and the voltage of the
+    amplifier, where they have a state."""
 
     plant: Any
     control: CascadeState
     command: Command
     past: tuple[Array, Array]
     sane: Array
+    seen: Array | tuple[()]
+    u_a: Array | tuple[()]
 
 
 @record
@@ -57,9 +63,28 @@ class Sampled:
         return self.loop.hold(sample)
 
     def start(self) -> SampledState:
-        plant, control = self.loop.start()
-        zero = jnp.zeros(())
-        return SampledState(plant, control, Command(*[zero] * 5), (zero, zero), jnp.ones(()))
+        scenario, zero = self.loop.scenario, jnp.zeros(())
+        plant = scenario.plant.start(scenario.initial.measurement())
+        seen = scenario.plant.measurement(plant).z if self._lags else ()
+        slow = scenario.amplifier is not None and scenario.amplifier.slow
+        control = self.loop.cascade.init(self.measured(plant, seen, self.hold(0)))
+        command, past = Command(*[zero] * 5), (zero, zero)
+        return SampledState(plant, control, command, past, jnp.ones(()), seen, zero if slow else ())
+
+    @property
+    def _lags(self) -> bool:
+        sensor = self.loop.scenario.sensor
+        return sensor is not None and sensor.bandwidth is not None
+
+    def measured(self, plant: Any, seen: Any, hold: Errors) -> Measurement:
+        """What the sensors report of the plant's state; `seen`: output of the position sensor's low-pass, m."""
+        true, sensor = self.loop.scenario.plant, self.loop.scenario.sensor
+        motion = true.measurement(plant)
+        if sensor is None:
+            return motion
+        if self._lags:
+            motion = motion._replace(z=seen)
+        return sensor.converted(sensor.reading(motion, hold), true.s_0, true.i_0)
 
     def jump(self, t: Scalar, state: SampledState, hold: Errors) -> SampledState:
         """The laws' step: what they decide now, and their states at the next sample."""
@@ -67,13 +92,14 @@ class Sampled:
         late = processor.delay * self.period if processor.predict else 0.0
         past = (state.command.u, state.past[0])
         sample = Sample(reference_at(scenario.reference, t + late), self.period, jnp.asarray(scenario.u_max), past)
-        measured = self.loop.measured(state.plant, hold)
+        measured = self.measured(state.plant, state.seen, hold)
         command, control = self.loop.cascade.step(measured, state.control, sample)
         command = command._replace(u=limited(command.u, sample.u_max))
         new = (control, command)
         sane = functools.reduce(jnp.logical_and, map(jnp.isfinite, jax.tree.leaves(new)))
         control, command = jax.tree.map(lambda a, b: jnp.where(sane, a, b), new, (state.control, state.command))
-        return SampledState(state.plant, control, command, past, jnp.where(sane, state.sane, 0.0))
+        sane = jnp.where(sane, state.sane, 0.0)
+        return state._replace(control=control, command=command, past=past, sane=sane)
 
     def advance(
         self,
@@ -88,30 +114,53 @@ class Sampled:
         """The plant to the next sample, under the voltages that act on the way."""
         code = jnp.where((code == 0) & (state.sane == 0), DIVERGED, code)
         delay, voltages = jnp.asarray(self.processor.delay), (state.command.u, *state.past)
-        begun = jnp.ceil(delay)
-        stretches = [(self._under(state, _one_of(voltages, begun)), (delay - jnp.floor(delay)) * period)]
-        stretches += [(self._under(state, _one_of(voltages, jnp.floor(delay))), period - stretches[0][1])]
+        late = (delay - jnp.floor(delay)) * period
+        acting = [(_one_of(voltages, jnp.ceil(delay)), late), (_one_of(voltages, jnp.floor(delay)), period - late)]
         if self.processor.whole:
-            stretches = [(stretches[1][0], period)]
-        after = in_turn(method, stretches, t, state.plant, memory, code)
-        return after._replace(state=state._replace(plant=after.state))
+            acting = [(acting[1][0], period)]
+        voltages, u_a = _amplified(self.loop.scenario.amplifier, jnp.asarray(t), state.u_a, acting)
+        stretches = [(self._under(state, voltage), time) for voltage, time in voltages]
+        reached = in_turn(method, stretches, t, state.plant, memory, code)
+        seen = self._lagged(state, [after.state for after in reached], [time for _, time in stretches])
+        after = reached[-1]
+        return after._replace(state=state._replace(plant=after.state, seen=seen, u_a=u_a))
 
-    def _under(self, state: SampledState, u: Array) -> Problem:
-        """What an integrator is given while this voltage acts."""
+    def _lagged(self, state: SampledState, reached: list[Any], times: list[Scalar]) -> Any:
+        """Output of the position sensor's low-pass after the plant went through these states, m."""
+        seen: Any = state.seen
+        sensor = self.loop.scenario.sensor
+        if sensor is None or not self._lags:
+            return seen
+        motions = [self.loop.scenario.plant.measurement(plant) for plant in (state.plant, *reached)]
+        for before, after, time in zip(motions, motions[1:], times, strict=False):
+            seen = sensor.lagged(seen, before, after, time)
+        return seen
+
+    def _under(self, state: SampledState, voltage: Any) -> Problem:
+        """What an integrator is given while the coils' voltage is this function of time and of the plant's state."""
         loop, command = self.loop, state.command
         plant, e = loop.scenario.plant, loop.scenario.plant.measurement(state.plant).i - command.i_ref
 
-        def rates(inputs: Inputs, x: Any) -> Any:
-            return plant.rates(x, u, inputs.q_z, inputs.q_i)
+        def inputs(t: Scalar) -> tuple[Inputs, Array]:
+            return loop.inputs(t), voltage(t)
 
-        def observed(inputs: Inputs, x: Any) -> tuple[Any, Instant]:
-            motion, heat = plant.measurement(x), plant.signals(x).heat
-            sigma = loop.cascade.position.sigma(motion, inputs.reference)
-            sizes = Sizes(motion.z, motion.z - inputs.reference.r, sigma, u, motion.i, e, command.v_tilde)
+        def rates(inputs: tuple[Inputs, Array], x: Any) -> Any:
+            outside, u = inputs
+            return plant.rates(x, self._at_coil(u, x), outside.q_z, outside.q_i)
+
+        def observed(inputs: tuple[Inputs, Array], x: Any) -> tuple[Any, Instant]:
+            (outside, u), motion, heat = inputs, plant.measurement(x), plant.signals(x).heat
+            u = self._at_coil(u, x)
+            sigma = loop.cascade.position.sigma(motion, outside.reference)
+            sizes = Sizes(motion.z, motion.z - outside.reference.r, sigma, u, motion.i, e, command.v_tilde)
             return rates(inputs, x), Instant(sizes, Densities(u, u * u, heat))
 
         scale = jax.tree.map(jnp.asarray, plant.scale())
-        return Problem(loop.inputs, rates, scale, self._fate, None, observed, SHOWN)
+        return Problem(inputs, rates, scale, self._fate, None, observed, SHOWN)
+
+    def _at_coil(self, u: Array, x: Any) -> Array:
+        plant, amplifier = self.loop.scenario.plant, self.loop.scenario.amplifier
+        return u if amplifier is None else amplifier.at_coil(u, plant.measurement(x), plant.R)
 
     def _fate(self, plant: Any) -> Array:
         return self.loop.judged(plant, self.loop.scenario.plant.scale(), plant)
@@ -123,11 +172,14 @@ class Sampled:
         """Frozen, and the drive off."""
         zero = jnp.zeros_like(state.command.u)
         plant = self.loop.rest(LoopState(state.plant, state.control), code).plant
-        return state._replace(plant=plant, command=state.command._replace(u=zero), past=(zero, zero))
+        seen = self.loop.scenario.plant.measurement(plant).z if self._lags else ()
+        off = state._replace(command=state.command._replace(u=zero), past=(zero, zero))
+        return off._replace(plant=plant, seen=seen, u_a=jax.tree.map(jnp.zeros_like, state.u_a))
 
     def row(self, t: Scalar, state: SampledState, hold: Errors, alive: Array) -> Row:
         """Sample n: the plant, u_n, and i_ref before its step."""
-        return self.loop.signals(t, self.loop.inputs(t), state.plant, state.command, hold, alive)
+        seen = self.measured(state.plant, state.seen, hold)
+        return self.loop.signals(t, self.loop.inputs(t), state.plant, state.command, seen, alive)
 
     def noted(self, row: Row, span: Span) -> Row:
         return self.loop.noted(row, span)
@@ -140,6 +192,41 @@ def _one_of(voltages: tuple[Array, ...], lag: Array) -> Array:
     """The voltage of the sample so many before."""
     now, before, first = voltages
     return jnp.where(lag < 0.5, now, jnp.where(lag < 1.5, before, first))
+
+
+def _amplified(
+    amplifier: Amplifier | None, t: Array, u_a: Any, acting: list[tuple[Array, Scalar]]
+) -> tuple[list[tuple[Callable[[Scalar], Array], Scalar]], Any]:
+    """An amplifier's voltage as functions of time, each with how long it holds (s), and that at the end.
+
+    From t on it is commanded what is `acting`, each (V) for its time. It has a corner where a ramp ends.
+    """
+    if amplifier is None or not amplifier.slow:
+        return [(lambda _, u=u: u, time) for u, time in acting], u_a
+    given = []
+    for u, time in acting:
+        voltage = lambda now, u_a=u_a, u=u, t=t: amplifier.followed(u_a, u, now - t)  # noqa: E731
+        ramp = jnp.minimum(amplifier.ramp(u_a, u), time)
+        given += [(voltage, time)] if amplifier.slew is None else [(voltage, ramp), (voltage, time - ramp)]
+        u_a, t = amplifier.followed(u_a, u, jnp.asarray(time)), t + time
+    return given, u_a
+
+
+def check_parts(cascade: Cascade, scenario: Scenario) -> None:
+    """Raise ValueError, with the path and the fix, for parts of a loop that do not work together."""
+    if cascade.processor is None:
+        cascade.check_smooth()
+        if (path := scenario.on_processor) is not None:
+            raise ValueError(
+                f"{path} is for a controller on a processor, and this one runs in continuous time. Add [processor], or "
+                "leave it out."
+            )
+    sensor = scenario.sensor
+    if sensor is not None and not sensor.velocity and not answers.estimates_velocity(cascade.observer):
+        raise ValueError(
+            "sensor.velocity = false: the velocity is not measured, and controller.observer does not estimate it. "
+            'Choose one that does: kind = "kalman", "difference" or "ired".'
+        )
 
 
 def system_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> ClosedLoop | Sampled:

@@ -8,6 +8,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.world.amplifier import Amplifier
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement, Sensor
@@ -48,6 +49,8 @@ class Scenario:
     u_max: Scalar = leaf(
         default=jnp.inf, unit="V", at_least=1e-9, at_most=1e12, infinite=True, doc="limit of the supply; inf: none"
     )
+    amplifier: Amplifier | None = None
+    """between the voltage commanded and the coils; None: ideal"""
     clearance: Scalar | None = leaf(
         default=None, unit="m", at_least=1e-9, at_most=1.0, optional=True, doc="|z| of touch-down; none: 0.9 s_0"
     )
@@ -65,6 +68,20 @@ class Scenario:
         sensor = self.sensor
         noisy = sensor is not None and bool(np.any([sensor.std, sensor.std_z_dot, sensor.std_i]))
         return noisy or any(is_random(getattr(self, slot)) for slot in SLOTS)
+
+    @property
+    def on_processor(self) -> str | None:
+        """The dotted path of something in it that is for a processor only; None if nothing is."""
+        if self.amplifier is not None:
+            given = (field.name for field in dataclasses.fields(self.amplifier))
+            return f"actuator.{next((name for name in given if getattr(self.amplifier, name) is not None), '')}"
+        named = [name for name in ("bits", "bandwidth") if getattr(self.sensor, name, None) is not None]
+        return f"sensor.{named[0]}" if named else None
+
+    def in_continuous_time(self) -> "Scenario":
+        """The same without what is for a processor only: low-pass and converter of the sensors, amplifier."""
+        sensor = self.sensor and dataclasses.replace(self.sensor, bits=None, bandwidth=None)
+        return dataclasses.replace(self, sensor=sensor, amplifier=None)
 
     def acceleration(self, t: Scalar) -> Array:
         """The whole disturbance of Eq. (1) at time t: q_z + a q_v, m/s^2."""

@@ -2,10 +2,11 @@
 
 from typing import NamedTuple
 
-from jax import Array
+import jax.numpy as jnp
+from jax import Array, lax
 
 from ambjax.numerics.gaussian import normals
-from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.records import Scalar, leaf, record, static
 
 
 class Errors(NamedTuple):
@@ -23,20 +24,80 @@ class Measurement(NamedTuple):
     z_dot: Array
     i: Array
 
-    def off(self, errors: Errors) -> "Measurement":
-        """The same, off by these errors."""
-        return Measurement(self.z + errors.z, self.z_dot + errors.z_dot, self.i + errors.i)
-
 
 @record
 class Sensor:
-    """Gaussian noise on each measurement, drawn once per sample period and held; the state itself is seen at once."""
+    """Gaussian noise on each measurement, drawn once per sample period and held; the state itself is seen at once.
+
+    In this order: the position is low-passed (`bandwidth`), scaled and offset, noise is added, and the converter rounds
+    z and i. A low-pass and a converter are for a processor; without it, measurements are looked at all the time.
+    """
 
     std: Scalar = leaf(default=0.0, unit="m", at_least=0, at_most=1.0, doc="standard deviation on z")
     std_z_dot: Scalar = leaf(default=0.0, unit="m/s", at_least=0, at_most=1e6, doc="standard deviation on z_dot")
     std_i: Scalar = leaf(default=0.0, unit="A", at_least=0, at_most=1e6, doc="standard deviation on i")
+    offset: Scalar = leaf(default=0.0, unit="m", at_least=-1.0, at_most=1.0, doc="of the position sensor")
+    gain: Scalar = leaf(default=1.0, unit="1", at_least=0.01, at_most=100, doc="of the position sensor, ideally 1")
+    bandwidth: Scalar | None = leaf(
+        default=None,
+        unit="Hz",
+        at_least=1,
+        at_most=1e9,
+        optional=True,
+        doc="of the position sensor, first order; none: at once",
+    )
+    bits: Scalar | None = leaf(
+        default=None, at_least=2, at_most=32, optional=True, doc="of the converter of z and i; none: not rounded"
+    )
+    range_z: Scalar | None = leaf(
+        default=None, unit="m", at_least=1e-9, at_most=1.0, optional=True, doc="ends of the converter; none: s_0"
+    )
+    range_i: Scalar | None = leaf(
+        default=None, unit="A", at_least=1e-9, at_most=1e6, optional=True, doc="ends of the converter; none: 2 i_0"
+    )
+    velocity: bool = static(default=True, doc="whether z_dot is measured; else an observer must estimate it")
 
     def noise(self, key: tuple[Scalar, Scalar], sample: Scalar) -> Errors:
         """The errors of sample number `sample` for the member with these words (Scenario.words)."""
         w = normals(key, sample)
         return Errors(self.std * w[0], self.std_z_dot * w[1], self.std_i * w[2])
+
+    def reading(self, motion: Measurement, errors: Errors) -> Measurement:
+        """What is read of a motion (of z, as it left the low-pass) with these errors; z_dot = 0 if not measured."""
+        z_dot = motion.z_dot + errors.z_dot if self.velocity else jnp.zeros_like(motion.z_dot)
+        return Measurement(self.gain * motion.z + self.offset + errors.z, z_dot, motion.i + errors.i)
+
+    def converted(self, seen: Measurement, s_0: Scalar, i_0: Scalar) -> Measurement:
+        """What the converter makes of a reading; s_0 (m) and i_0 (A), those of the plant, for ranges left out."""
+        if self.bits is None:
+            return seen
+        range_z = s_0 if self.range_z is None else self.range_z
+        range_i = 2 * i_0 if self.range_i is None else self.range_i
+        return seen._replace(z=converted(seen.z, self.bits, range_z), i=converted(seen.i, self.bits, range_i))
+
+    def lagged(self, y: Array, before: Measurement, after: Measurement, h: Scalar) -> Array:
+        """Output of the low-pass h s later, y (m) before: y' = w (z - y), w = 2 pi bandwidth.
+
+        Exact for the cubic z that has the positions and velocities of both ends, whatever w h is.
+        """
+        assert self.bandwidth is not None
+        # z = z_0 + s c_1 + s^2 c_2 + s^3 c_3, 0 <= s <= 1, and y' = b (z - y) has the solution z - z'/b + z''/b^2 - ...
+        # beside the one that dies away.
+        c_1, rise, end = h * before.z_dot, after.z - before.z, h * after.z_dot
+        c_2, c_3 = 3 * rise - 2 * c_1 - end, c_1 + end - 2 * rise
+        b = 2 * jnp.pi * self.bandwidth * jnp.asarray(h)
+        b = jnp.where(b > 0, b, 1.0)  # a stretch of no length: y, below
+        first = before.z - (c_1 - (2 * c_2 - 6 * c_3 / b) / b) / b
+        last = after.z - (end - (2 * c_2 + 6 * c_3 - 6 * c_3 / b) / b) / b
+        return jnp.where(jnp.asarray(h) > 0, last + (y - first) * jnp.exp(-b), y)
+
+
+def converted(x: Array, bits: Scalar, limit: Scalar) -> Array:
+    """x as a converter of so many bits over -limit..limit gives it: rounded to its steps, held at its ends.
+
+    Steps of 2 limit / 2^bits; the last one below limit. Derivative: of what is held, as if nothing were rounded.
+    """
+    half = jnp.exp2(jnp.asarray(bits) - 1)
+    step = limit / half
+    held = jnp.where(x > limit - step, limit - step, jnp.where(x < -limit, -limit, x))
+    return held + lax.stop_gradient(step * jnp.round(held / step) - held)
