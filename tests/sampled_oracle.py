@@ -10,9 +10,9 @@ Readings of the rules where they leave room, so that another program can follow 
   jump unless i_ref is given.
 - the super-twisting law, implicit, is set-valued: p is for the explicit form only.
 - a row's u is u_n within +-u_max; the limit is also what the PI law's anti-windup knows of the supply.
-- the position sensor's low-pass begins at z, the amplifier at 0 V; scale and offset come after the low-pass, noise after
-  them, the converter last. The dead band is taken off the amplifier's voltage; at the current limit the voltage that
-  would push |i| on is R i.
+- the position sensor's low-pass begins at z, the amplifier at 0 V; scale and offset come after the low-pass, then
+  noise, the converter last. The dead band is taken off the amplifier's voltage; at the current limit the voltage that
+  would push |i| on is what keeps it.
 - q_i moves the measured current: i_1' by q_i, i_2' by -q_i.
 - lost: |z| = touch s_0. The singular curve: the first sample at which dv/di(z, i_ref) <= 0 at what the laws took.
 - a scaled force beyond what any current gives: the current of the one nearest to it.
@@ -241,7 +241,8 @@ class Driven:
             u = y[-1]
             more.append(min(max(rate, -most), most))
         u = math.copysign(max(abs(u) - (self.dead or 0.0), 0.0), u)
-        hold = self.body.R * i
+        still, driven = (self.output(self.plant.rates(own, volt, q_z, q_i))[2] for volt in (0.0, 1.0))
+        hold = still / (still - driven)
         if self.i_max and abs(i) >= self.i_max and (u - hold) * i > 0:
             u = hold
         return [*self.plant.rates(own, u, q_z, q_i), *more]

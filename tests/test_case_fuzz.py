@@ -19,6 +19,7 @@ from ambjax.ensemble.design import DESIGNS
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import draw
 from ambjax.simulation.clock import Clock
+from ambjax.world.amplifier import Amplifier
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Sensor
@@ -127,7 +128,7 @@ DOCUMENT = st.fixed_dictionaries(
             },
         ),
         "sensor": table_of(Sensor),
-        "actuator": st.fixed_dictionaries({}, optional={"u_max": number(FIELDS["u_max"])}),
+        "actuator": table_of(Amplifier, u_max=number(FIELDS["u_max"])),
         "initial": table_of(Initial, z=st.floats(-3e-3, 3e-3)),
         "run": st.fixed_dictionaries(
             {}, optional={"seed": st.integers(0, 2**32), "settle": st.floats(0, 0.01), "clearance": st.floats(0, 6e-3)}

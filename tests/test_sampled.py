@@ -86,7 +86,13 @@ CASES = [
         "two coils, one and a half, wrong model", World(kind="two-coil", model=WRONG, delay=1.5, **TRACKING, **soft())
     ),
     Case("two coils, current pulse", World(kind="two-coil", q_i=pulse(1.0, 0.05, 0.1), **hard()), std=NOISE),
-    Case("converter of 14 bits", World(**TRACKING, bits=14, **hard(k_i=500.0)), std=NOISE),
+    # Within a step of the converter nothing holds two programs together: they part at the rate of the unstable pole.
+    Case(
+        "converter of 12 bits",
+        World(**TRACKING, observer=SLOW, u_max=200.0, bits=12, **soft()),
+        250,
+        std=(3e-6, 0.0, 1e-4),
+    ),
     Case("a real position sensor", World(**TRACKING, bandwidth=5e3, offset=2e-6, gain=1.01, delay=1.5, **soft())),
     Case("a real amplifier", World(**TRACKING, amplifier={"bandwidth": 2e3, "slew": 1e5}, delay=0.5, **soft()), 600),
     Case("dead band", World(kind="two-coil", **TRACKING, amplifier={"dead_band": 2.0}, **soft())),

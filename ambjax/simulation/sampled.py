@@ -146,11 +146,11 @@ class Sampled:
 
         def rates(inputs: tuple[Inputs, Array], x: Any) -> Any:
             outside, u = inputs
-            return plant.rates(x, self._at_coil(u, x), outside.q_z, outside.q_i)
+            return plant.rates(x, self._at_coil(outside, u, x), outside.q_z, outside.q_i)
 
         def observed(inputs: tuple[Inputs, Array], x: Any) -> tuple[Any, Instant]:
             (outside, u), motion, heat = inputs, plant.measurement(x), plant.signals(x).heat
-            u = self._at_coil(u, x)
+            u = self._at_coil(outside, u, x)
             sigma = loop.cascade.position.sigma(motion, outside.reference)
             sizes = Sizes(motion.z, motion.z - outside.reference.r, sigma, u, motion.i, e, command.v_tilde)
             return rates(inputs, x), Instant(sizes, Densities(u, u * u, heat))
@@ -158,9 +158,16 @@ class Sampled:
         scale = jax.tree.map(jnp.asarray, plant.scale())
         return Problem(inputs, rates, scale, self._fate, None, observed, SHOWN)
 
-    def _at_coil(self, u: Array, x: Any) -> Array:
+    def _at_coil(self, outside: Inputs, u: Array, x: Any) -> Array:
         plant, amplifier = self.loop.scenario.plant, self.loop.scenario.amplifier
-        return u if amplifier is None else amplifier.at_coil(u, plant.measurement(x), plant.R)
+        if amplifier is None:
+            return u
+
+        def hold() -> Array:
+            still, driven = (plant.measurement(plant.rates(x, volt, outside.q_z, outside.q_i)).i for volt in (0.0, 1.0))
+            return still / (still - driven)  # i' is linear in u
+
+        return amplifier.at_coil(u, plant.measurement(x).i, hold)
 
     def _fate(self, plant: Any) -> Array:
         return self.loop.judged(plant, self.loop.scenario.plant.scale(), plant)

@@ -1,10 +1,11 @@
 """The amplifier between the commanded voltage and the coils: how fast, from where on, and up to which current."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.world.sensor import Measurement
 
 
 @record
@@ -12,7 +13,7 @@ class Amplifier:
     """What an amplifier makes of a voltage that is held: u_a' = w (u - u_a) with w = 2 pi bandwidth, at most `slew`.
 
     Then the dead band (of a bridge's dead time) is taken off its size, and at the current limit what would push the
-    current further out is cut to what holds it, R i. What is left out is ideal.
+    current further out is cut to what keeps it. What is left out is ideal.
     """
 
     bandwidth: Scalar | None = leaf(
@@ -56,13 +57,13 @@ class Amplifier:
         """How long the rate of the first order stays below the slew rate, in times of 1/w; s."""
         return 0.0 if self.bandwidth is None else 1 / self.slope()
 
-    def at_coil(self, u_a: Array, motion: Measurement, R: Scalar) -> Array:
-        """What of its voltage reaches the coils, V, while the plant moves so and has this resistance (ohm)."""
+    def at_coil(self, u_a: Array, i: Array, hold: Callable[[], Array]) -> Array:
+        """What of its voltage reaches the coils at a current of i (A), V. `hold`: what would keep that current, V."""
         if self.dead_band is not None:
             size = jnp.maximum(jnp.abs(u_a) - self.dead_band, 0.0)
             u_a = jnp.where(u_a < 0, -size, size)
         if self.i_max is None:
             return u_a
-        hold = R * motion.i
-        u_a = jnp.where((motion.i >= self.i_max) & (u_a > hold), hold, u_a)
-        return jnp.where((motion.i <= -self.i_max) & (u_a < hold), hold, u_a)
+        kept = hold()
+        u_a = jnp.where((i >= self.i_max) & (u_a > kept), kept, u_a)
+        return jnp.where((i <= -self.i_max) & (u_a < kept), kept, u_a)

@@ -97,7 +97,7 @@ def converted(x: Array, bits: Scalar, limit: Scalar) -> Array:
 
     Steps of 2 limit / 2^bits; the last one below limit. Derivative: of what is held, as if nothing were rounded.
     """
-    half = jnp.exp2(jnp.asarray(bits) - 1)
+    half = jnp.round(jnp.exp2(jnp.asarray(bits) - 1))  # XLA's is off by rounding
     step = limit / half
     held = jnp.where(x > limit - step, limit - step, jnp.where(x < -limit, -limit, x))
     return held + lax.stop_gradient(step * jnp.round(held / step) - held)

@@ -12,6 +12,7 @@ from ambjax.cases.template import template
 from ambjax.control.processor import Processor
 from ambjax.ensemble.distributions import SHAPES
 from ambjax.ensemble.paths import places
+from ambjax.world.amplifier import Amplifier
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial
 from ambjax.world.sensor import Sensor
@@ -21,6 +22,7 @@ from reference.parser import keys, remarks, rule
 
 TITLES = ("key", "unit", "default", "allowed", "meaning")
 RECORDS: dict[str, type] = {"plant": Plant, "processor": Processor, "initial": Initial, "sensor": Sensor}
+RECORDS["actuator"] = Amplifier
 SETTINGS: dict[str, dataclasses.Field] = {
     "actuator.u_max": FIELDS["u_max"],
     "clock.duration": DURATION,
@@ -37,8 +39,8 @@ WORDS = {
     "continuous time, as in the paper. See [the processor](../processor.md).",
     "reference": "What z is to follow, in m. Left out: 0. See [signals](signals.md).",
     "disturbance": "What disturbs the loop: a signal each, and its unit. Left out: none. See [signals](signals.md).",
-    "sensor": "Errors of what is measured, drawn once per sample period and held. Left out: none.",
-    "actuator": "The supply. Left out: no limit.",
+    "sensor": "What is measured; noise is drawn once per sample period and held. Left out: everything, without error.",
+    "actuator": "The supply and, on a processor, its amplifier. Left out: ideal.",
     "initial": "The plant's state at t = 0. Left out: at rest, in the middle.",
     "clock": "Time: how long, how often a row is recorded and noise drawn, and how it is integrated between.",
     "run": "What belongs to a run and to no part of it.",

@@ -1,0 +1,216 @@
+"""Sensors and amplifiers as they are: each part against what defines it, and what a case file may say of them."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from sampled_oracle import conversion
+from scipy.integrate import solve_ivp
+
+import ambjax as amb
+from ambjax.cases.reader import case_from
+from ambjax.commands.doubts import doubts
+from ambjax.control.processor import Processor
+from ambjax.simulation.method import DRIVEN, choose_method
+from ambjax.world.amplifier import Amplifier
+from ambjax.world.sensor import Errors, Measurement, Sensor, converted
+
+NONE = Errors(*np.zeros(3))
+
+
+def motion(z=1e-3, z_dot=0.2, i=0.1):
+    return Measurement(*(jnp.asarray(x) for x in (z, z_dot, i)))
+
+
+def test_a_converter_rounds_to_its_steps_and_ends_at_its_range():
+    x = np.concatenate([np.linspace(-1.3, 1.3, 997), [0.0, -0.0, 1 / 16, -1 / 16, 3 / 16, -1.0, 1.0]])
+    got = np.asarray(converted(jnp.asarray(x), 4, 1.0))
+    np.testing.assert_array_equal(got, [conversion(a, 4, 1.0) for a in x])  # powers of 2: exact
+    assert set(got) == set(np.arange(-8, 8) / 8)
+
+
+def test_its_derivative_is_that_of_what_is_held():
+    slope = jax.vmap(jax.grad(lambda x: converted(x, 6, 1.0)))
+    np.testing.assert_array_equal(slope(jnp.array([-1.5, -0.5, 0.01, 0.9, 1.5])), [0.0, 1.0, 1.0, 1.0, 0.0])
+
+
+def test_ranges_left_out_are_those_of_the_plant():
+    seen = Sensor(bits=8.0).converted(motion(z=1.0, i=1.0), 5e-3, 0.25)
+    assert (float(seen.z), float(seen.i)) == (5e-3 * 127 / 128, 0.5 * 127 / 128)
+    seen = Sensor(bits=8.0, range_z=1e-3, range_i=0.1).converted(motion(z=-1.0, i=-1.0), 5e-3, 0.25)
+    assert (float(seen.z), float(seen.i)) == (-1e-3, -0.1)
+
+
+def test_a_reading_is_scaled_offset_and_noisy_and_a_velocity_not_measured_is_zero():
+    errors = Errors(*map(jnp.asarray, (1e-6, 2e-6, 3e-6)))
+    seen = Sensor(gain=1.1, offset=1e-5).reading(motion(), errors)
+    np.testing.assert_allclose(seen, [1.1e-3 + 1e-5 + 1e-6, 0.2 + 2e-6, 0.1 + 3e-6], rtol=1e-14)
+    assert float(Sensor(velocity=False).reading(motion(), errors).z_dot) == 0.0
+
+
+@pytest.mark.parametrize("bandwidth", [1.0, 100.0, 1e4, 1e7])
+def test_the_low_pass_is_exact_for_a_cubic(bandwidth):
+    h, (c_0, c_1, c_2, c_3) = 1e-4, (1e-3, 0.1, 30.0, -4e4)
+    z, z_dot = (lambda s: ((c_3 * s + c_2) * s + c_1) * s + c_0), (lambda s: (3 * c_3 * s + 2 * c_2) * s + c_1)
+    ends = [motion(z=z(s), z_dot=z_dot(s)) for s in (0.0, h)]
+    w, y_0 = 2 * np.pi * bandwidth, 1.2e-3
+    run = solve_ivp(lambda s, y: w * (z(s) - y), (0, h), [y_0], "Radau", jac=[[-w]], rtol=1e-11, atol=1e-17)
+    got = Sensor(bandwidth=bandwidth).lagged(jnp.asarray(y_0), *ends, h)
+    # SciPy's tolerance, of 1e-3 m
+    np.testing.assert_allclose(got, run.y[0, -1], rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("bandwidth", [10.0, 1e9])
+def test_the_low_pass_stays_finite_with_its_derivative_over_no_time(bandwidth):
+    lagged = lambda h: Sensor(bandwidth=bandwidth).lagged(jnp.asarray(2e-3), motion(), motion(), h)  # noqa: E731
+    assert float(lagged(jnp.asarray(0.0))) == 2e-3
+    assert np.isfinite(jax.grad(lagged)(jnp.asarray(0.0)))
+
+
+FAST, SLOW = {"bandwidth": 5e3}, {"slew": 2e6}
+
+
+@pytest.mark.parametrize("given", [FAST, SLOW, FAST | SLOW], ids=["bandwidth", "slew", "both"])
+@pytest.mark.parametrize("ends", [(0.0, 100.0), (150.0, -30.0), (-5.0, -6.0), (7.0, 7.0)])
+def test_an_amplifier_follows_as_its_equation_says(given, ends):
+    u_a, u = ends
+    w, slew = 2 * np.pi * given.get("bandwidth", 1e9), given.get("slew", math.inf)
+    for time in (0.0, 1e-5, 1e-4):
+        got = float(Amplifier(**given).followed(jnp.asarray(u_a), jnp.asarray(u), time))
+        rate = lambda _, x: np.clip(w * (u - x), -slew, slew)  # noqa: E731
+        run = solve_ivp(rate, (0, time), [u_a], "Radau", rtol=1e-10, atol=1e-10, max_step=max(time / 200, 1e-9))
+        # SciPy's steps across the corner where the ramp ends; without a bandwidth, its 1 ns more
+        assert got == pytest.approx(run.y[0, -1], abs=1e-4 if "bandwidth" in given else 5e-3)
+
+
+def test_dead_band_and_current_limit():
+    drive = Amplifier(dead_band=2.0, i_max=0.4)
+    at = lambda u, i: float(drive.at_coil(jnp.asarray(u), jnp.asarray(i), lambda: jnp.asarray(50.0 * i)))  # noqa: E731
+    assert [at(u, 0.1) for u in (5.0, 1.0, -1.5, -9.0)] == [3.0, 0.0, 0.0, -7.0]
+    assert [at(30.0, 0.4), at(30.0, -0.5), at(-30.0, -0.5), at(10.0, 0.4)] == [20.0, 28.0, -25.0, 8.0]
+
+
+def laws(p=math.inf, **processor):
+    return amb.Cascade(
+        position=amb.position.SlidingMode(1440.0, 2.3, p),
+        inversion=amb.inversion.Adaptive(8e5, p),
+        current=amb.current.SlidingMode(870.0, p),
+        processor=Processor(**processor),
+    )
+
+
+WORLD = amb.Scenario(reference=amb.Sine(2.5e-3, 2.0), sensor=Sensor(1e-6, 1e-4, 1e-4), u_max=200.0, seed=3)
+CLOCK = amb.Clock(400, 1e-4)
+
+
+def run(sensor=None, amplifier=None, clock=CLOCK, **processor):
+    scenario = dataclasses.replace(WORLD, amplifier=amplifier)
+    if sensor:
+        scenario = dataclasses.replace(scenario, sensor=dataclasses.replace(WORLD.sensor, **sensor))
+    return amb.rollout(laws(**processor), scenario, clock).trajectory.rows
+
+
+def test_the_current_stays_within_its_limit():
+    rows = run()
+    assert np.abs(rows.i).max() > 0.055
+    held = run(amplifier=Amplifier(i_max=0.05))
+    # beyond the limit by what a step of RK4 begins below it: L di/dt = 200 V for 33 us is 2e-4 A
+    assert 0.05 <= np.abs(held.i).max() < 0.0502
+
+
+def test_more_steps_of_the_plant_change_nothing_that_matters():
+    """The corner of the slew rate lies on a step's edge, and the voltage between is known exactly."""
+    amplifier = Amplifier(bandwidth=2e3, slew=4e6)
+    steps = choose_method(laws().on_processor(), dataclasses.replace(WORLD, amplifier=amplifier), 1e-4).substeps
+    assert steps == math.ceil(2 * np.pi * 2e3 * 1e-4 / DRIVEN)
+    coarse, fine = (
+        run(amplifier=amplifier, clock=amb.Clock(30, 1e-4, amb.RK4(n)), delay=0.5) for n in (steps, 8 * steps)
+    )
+    np.testing.assert_allclose(coarse.z, fine.z, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(coarse.i, fine.i, rtol=0, atol=1e-8)
+
+
+PARTS = {
+    "converter": ({"bits": 14.0}, None),
+    "sensor": ({"bandwidth": 1e4, "offset": 1e-6, "gain": 1.01}, None),
+    "amplifier": (None, Amplifier(bandwidth=3e3, slew=5e6, dead_band=0.5, i_max=0.5)),
+}
+
+
+@pytest.mark.parametrize("name", ["sensor", "amplifier"])
+def test_gradients_forward_and_reverse(name):
+    sensor, amplifier = PARTS[name]
+    scenario = dataclasses.replace(
+        WORLD, amplifier=amplifier, sensor=dataclasses.replace(WORLD.sensor, **(sensor or {}))
+    )
+    settled = laws(delay=0.5).on_processor()
+
+    def loss(x):
+        cascade = dataclasses.replace(settled, position=dataclasses.replace(settled.position, c=1440.0 * jnp.exp(x)))
+        fold = amb.simulation.metrics.Rms("e_z")
+        return 1e9 * amb.rollout(cascade, scenario, amb.Clock(60, 1e-4, amb.RK4(2)), fold=fold, every=0).measured
+
+    forward, reverse = jax.jacfwd(loss)(0.1), jax.grad(loss)(0.1)
+    assert forward != 0
+    np.testing.assert_allclose(forward, reverse, rtol=1e-10)
+    # central differences: step^2 of a third derivative
+    np.testing.assert_allclose(forward, (loss(0.1 + 1e-5) - loss(0.1 - 1e-5)) / 2e-5, rtol=1e-6)
+
+
+CASE = {"processor": {}, "clock": {"duration": 0.01}}
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "value", "words"),
+    [
+        ("sensor", "bits", 14.5, "whole number of bits"),
+        ("sensor", "bits", 1, "from 2 to 32"),
+        ("sensor", "range_z", 0, "range_z"),
+        ("sensor", "range_i", -1, "range_i"),
+        ("sensor", "bandwidth", 0.1, "Hz"),
+        ("sensor", "gain", 0, "from 0.01 to 100"),
+        ("sensor", "offset", 2, "from -1 to 1"),
+        ("sensor", "velocity", 1, "true or false"),
+        ("sensor", "velocity", False, 'kind = "kalman"'),
+        ("sensor", "bit", 14, "Did you mean 'bits'"),
+        ("actuator", "bandwidth", 0, "Hz"),
+        ("actuator", "slew", -1, "V/s"),
+        ("actuator", "dead_band", "1", "without quotes"),
+        ("actuator", "i_max", 0, "(A)"),
+        ("actuator", "i_min", 1, "Did you mean 'i_max'"),
+    ],
+)
+def test_a_wrong_key_is_refused_with_its_path(table, key, value, words):
+    with pytest.raises(ValueError, match=rf"^{table}\.{key} = ") as told:
+        case_from(CASE | {table: {key: value}})
+    assert words in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "value"), [("sensor", "bits", 12), ("sensor", "bandwidth", 1e4), ("actuator", "slew", 1e6)]
+)
+def test_what_is_for_a_processor_is_refused_without_one(table, key, value):
+    with pytest.raises(ValueError, match=rf"^{table}\.{key} is for a controller on a processor"):
+        case_from({table: {key: value}})
+    assert case_from(CASE | {table: {key: value}}).scenario.on_processor == f"{table}.{key}"
+
+
+def test_parts_can_be_spread():
+    raw = {
+        "actuator": {"bandwidth": 1e3},
+        "sensor": {"offset": 0.0},
+        "spread": {"actuator": {"bandwidth": {"percent": 10}}},
+    }
+    assert case_from(CASE | raw).spread.paths == ("actuator.bandwidth",)
+
+
+@pytest.mark.parametrize(
+    ("table", "loud"),
+    [({"std": 1e-6}, True), ({"std_z_dot": 1e-4}, False), (None, True)],
+)
+def test_a_perfect_velocity_is_said_loudly(table, loud):
+    raw = CASE | ({} if table is None else {"sensor": table})
+    assert any("VELOCITY" in line for line in doubts(case_from(raw))) == loud
