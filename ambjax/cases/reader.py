@@ -35,7 +35,14 @@ from ambjax.world.sensor import Sensor
 
 # The laws by stage and kind; the first of a stage is the default. A new law is one row here.
 KINDS: dict[str, dict[str, type]] = {
-    "observer": {"direct": observer.Direct, "complementary": observer.Complementary},
+    "observer": {
+        "direct": observer.Direct,
+        "complementary": observer.Complementary,
+        "difference": observer.Difference,
+        "kalman": observer.Kalman,
+        "ired-1": observer.IRED1,
+        "ired-2": observer.IRED2,
+    },
     "position": {"sliding-mode": position.SlidingMode, "super-twisting": position.SuperTwisting},
     "inversion": {"adaptive": inversion.Adaptive, "closed-form": inversion.ClosedForm},
     "current": {"sliding-mode": current.SlidingMode, "pi": current.ProportionalIntegral},

@@ -66,7 +66,7 @@ def ranges(law: Any, site: Site) -> dict[str, Interval]:
 
 
 def estimates_velocity(law: Any) -> bool:
-    """Whether an observer needs no measured velocity."""
+    """Whether an observer, or a kind of observer, needs no measured velocity."""
     return getattr(law, "estimates_velocity", False)
 
 

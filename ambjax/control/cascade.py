@@ -121,7 +121,8 @@ class Cascade:
         """The force wanted, the estimate it is wanted for, and the rates of observer and position law.
 
         The rates of z and v_star are derivatives along (reference, z_dot, nominal z_ddot, law states): what
-        a law that inverts statically needs for i_ref'. Unused, they are never computed.
+        a law that inverts statically needs for i_ref'. Unused, they are never computed. Where the velocity is
+        estimated it is the estimate that moves so.
         """
 
         def wanted(reference: Reference, z: Array, z_dot: Array, observed: State, positioned: State):
@@ -133,8 +134,12 @@ class Cascade:
         (z, v_star), (estimate, observed_rate, positioned_rate) = wanted(*point)
         gaps = self.model.gaps(estimate.z)
         z_ddot = self.model.z_ddot(estimate.z, estimate.i)
-        along = (reference.rate(), measured.z_dot, z_ddot, observed_rate, positioned_rate)
-        z_rate, v_star_rate = jax.jvp(lambda *x: wanted(*x)[0], point, along)[1]
+        if answers.estimates_velocity(self.observer):
+            law = functools.partial(self.position, self.model)
+            z_rate, v_star_rate = _rates(law, estimate, z_ddot, reference, state.position, positioned_rate)
+        else:
+            along = (reference.rate(), measured.z_dot, z_ddot, observed_rate, positioned_rate)
+            z_rate, v_star_rate = jax.jvp(lambda *x: wanted(*x)[0], point, along)[1]
         rates = CascadeState(observed_rate, positioned_rate, (), ())
         return ForceDemand(z, z_rate, v_star, v_star_rate, gaps), estimate, rates
 
@@ -182,8 +187,12 @@ class Cascade:
         rates = jax.tree.map(
             lambda a, b: (b - a) / sample.period, (state.observer, state.position), (observed, positioned)
         )
-        along = (sample.reference.rate(), measured.z_dot, z_ddot, *rates)
-        z_rate, v_star_rate = jax.jvp(lambda *x: wanted(*x)[0], point, along)[1]
+        if answers.estimates_velocity(self.observer):
+            law = functools.partial(advance, self.position)
+            z_rate, v_star_rate = _rates(law, estimate, z_ddot, sample.reference, state.position, rates[1])
+        else:
+            along = (sample.reference.rate(), measured.z_dot, z_ddot, *rates)
+            z_rate, v_star_rate = jax.jvp(lambda *x: wanted(*x)[0], point, along)[1]
         force = ForceDemand(z, z_rate, v_star, v_star_rate, self.model.gaps(z))
         demand, inverted = advance(self.inversion, force, state.inversion)
         u, driven = advance(self.current, CurrentInputs(estimate, demand, sample.u_max, force.gaps), state.current)
@@ -201,3 +210,15 @@ class Cascade:
         v_tilde = force.v_star - self.model.v_and_dv_di(force.z, wanted.i_ref, force.gaps)[0]
         command = Command(force.v_star, v_tilde, wanted.i_ref, wanted.i_ref_dot, u)
         return command, rates._replace(inversion=inversion_rate, current=current_rate)
+
+
+def _rates(
+    law: Any, estimate: Measurement, z_ddot: Array, reference: Reference, state: State, rate: State
+) -> tuple[Array, Array]:
+    """Rates of z and of a position law's v_star where the estimate itself moves, by its velocity and with z_ddot."""
+
+    def v_star(reference: Reference, z: Array, z_dot: Array, state: State) -> Array:
+        return law((Measurement(z, z_dot, estimate.i), reference), state)[0]
+
+    point = (reference, estimate.z, estimate.z_dot, state)
+    return estimate.z_dot, jax.jvp(v_star, point, (reference.rate(), estimate.z_dot, z_ddot, rate))[1]

@@ -232,7 +232,7 @@ def check_parts(cascade: Cascade, scenario: Scenario) -> None:
     if sensor is not None and not sensor.velocity and not answers.estimates_velocity(cascade.observer):
         raise ValueError(
             "sensor.velocity = false: the velocity is not measured, and controller.observer does not estimate it. "
-            'Choose one that does: kind = "kalman", "difference" or "ired".'
+            'Choose one that does: kind = "kalman", for example.'
         )
 
 
