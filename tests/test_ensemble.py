@@ -179,7 +179,7 @@ def test_settled_rms_agrees_with_the_lyapunov_equation():
     current = float(SMOOTH.model.equilibrium(0.0)[0])
     cascade = dataclasses.replace(SMOOTH, inversion=inversion.Adaptive(1e9, 25e-6, i_ref=current))
     still = Scenario(initial=Initial(i=current), sensor=Sensor(std, 0.0, 0.0), member=np.arange(n))
-    loop = ClosedLoop(cascade, Scenario(initial=Initial(i=current)))
+    loop = ClosedLoop(cascade, Scenario(initial=Initial(i=current), sensor=Sensor()))
     tree = jax.tree.structure(loop.start())
 
     def rates(x, w):
