@@ -5,6 +5,8 @@ current law step once; u_n acts from t_n + delay T until t_{n+1} + delay T, u = 
 Readings of the rules where they leave room, so that another program can follow them:
 - a converter of b bits has steps of 2 range / 2^b, rounds half to even, and ends at -range and range - 1 step;
   it converts z and i. The complementary observer begins at z_measured of sample 0 unless z_hat is given.
+- observers that estimate the velocity take none: it is 0 at sample 0. z and i pass, but the Kalman filter's z. Its
+  model's acceleration, of the measured z and i, is linear between samples. Explicit: Euler on the continuous law.
 - the closed form is the implicit adaptive law with gamma = inf, whatever the discretisation: it keeps the i_ref
   of the sample before, so that i_ref' is that of what was measured, disturbances included, and begins without a
   jump unless i_ref is given.
@@ -44,6 +46,7 @@ class World:
     discretisation: str = "implicit"  # or "explicit"
     predict: bool = True
     observer: tuple = ("direct", {})  # ("complementary", {"l"[, "z_hat"]})
+    # ("difference", {"w"}), ("kalman", {"w"}), ("ired-1", {"L"}), ("ired-2", {"L"})
     # or ("super-twisting", {"c", "k_1", "k_2", "p"})
     position: tuple = ("sliding-mode", {"c": 17.0, "k": 25.0, "p": 25.0})
     inversion: tuple = ("adaptive", {"gamma": 7.5e4, "p": 25.0, "i_ref": 0.0})  # ("closed-form", {"i_ref"})
@@ -285,12 +288,78 @@ def current_for(body, z, v):
     return -rest / (half + math.sqrt(square)) if square >= 0 else -half / curve
 
 
+LAMBDA = {1: (1.5, 1.1), 2: (2.0, 2.12, 1.1)}
+
+
+def robust_differentiator(f, x, L, T):
+    """f' and the next states x_0 .. x_m: the implicit robust exact differentiator. Seeber, arXiv 2404.02770."""
+    m, lam = len(x) - 1, LAMBDA[len(x) - 1]
+    b = f - sum(T**k * one for k, one in enumerate(x))
+    B, r = abs(b) / (L * T ** (m + 1)), 0.0
+    x = list(x)
+    if lam[m] >= B:
+        x[m] += b / T**m
+    else:
+        polynomial = np.polynomial.Polynomial([lam[m] - B, *reversed(lam[:m]), 1.0])
+        r = brentq(polynomial, 0.0, 1 + B, xtol=1e-300, rtol=1e-15)
+        x[m] += lam[m] * L * T * math.copysign(1.0, b)
+    for k in reversed(range(m)):
+        x[k] += T * x[k + 1] + lam[k] * L * T ** (m - k + 1) * math.copysign(r ** (m - k), b)
+    return x[1] if m == 1 else x[1] + T / 2 * x[2], x
+
+
+class Velocity:
+    """What an observer without a measured velocity makes of the samples of z and i: z, z_dot."""
+
+    def __init__(self, world, acceleration):
+        (self.kind, gains), self.T, self.acceleration = world.observer, world.period, acceleration
+        self.gain, self.implicit, self.known = *gains.values(), world.discretisation == "implicit", None
+
+    def __call__(self, z, i):
+        form = {"difference": self._difference, "kalman": self._kalman}.get(self.kind, self._robust)
+        return form(z, self.acceleration(z, i))
+
+    def _difference(self, z, _):
+        if self.implicit:
+            before, v = self.known or (z, 0.0)
+            pole = math.exp(-self.gain * self.T)
+            self.known = z, pole * v + (1 - pole) * (z - before) / self.T
+            return self.known
+        slow = z if self.known is None else self.known
+        v = self.gain * (z - slow)
+        self.known = slow + self.T * v
+        return z, v
+
+    def _kalman(self, z, f):
+        T, w = self.T, self.gain
+        z_hat, v, d, before = self.known or (z, 0.0, 0.0, None)
+        if not self.implicit:
+            e = z - z_hat
+            self.known = z_hat + T * (v + 3 * w * e), v + T * (f + d + 3 * w * w * e), d + T * w**3 * e, f
+            return z_hat, v
+        if before is not None:
+            z_hat += T * v + T * T * (before / 3 + f / 6 + d / 2)
+            v += T * ((before + f) / 2 + d)
+        e, q = z - z_hat, math.exp(-w * T)
+        z_hat, v = z_hat + (1 - q**3) * e, v + 1.5 * (1 - q) ** 2 * (1 + q) / T * e
+        self.known = z_hat, v, d + (1 - q) ** 3 / T**2 * e, f
+        return z_hat, v
+
+    def _robust(self, z, _):
+        assert self.implicit
+        order = int(self.kind[-1])
+        v, self.known = robust_differentiator(z, self.known or [z, *[0.0] * order], self.gain, self.T)
+        return z, v
+
+
 class Controller:
     """The cascade: states of its laws, and the voltages that it gave."""
 
     def __init__(self, world):
         self.world, self.model = world, Lumped(World(plant=world.plant | world.model))
         self.z_hat = world.observer[1].get("z_hat")
+        if world.observer[0] not in ("direct", "complementary"):
+            self.velocity = Velocity(world, lambda z, i: self.model.rates((z, 0.0, i), 0.0)[1])
         self.i_ref, self.integral, self.twist, self.voltages = world.inversion[1].get("i_ref"), 0.0, 0.0, []
         self.implicit = world.discretisation == "implicit"
 
@@ -315,6 +384,8 @@ class Controller:
         (kind, gains), (z, z_dot, i) = self.world.observer, measured
         if kind == "direct":
             return [z, z_dot, i]
+        if kind != "complementary":
+            return [*self.velocity(z, i), i]
         z_hat = z if self.z_hat is None else self.z_hat
         self.z_hat = z_hat + self.world.period * (z_dot + gains["l"] * (z - z_hat))
         return [z_hat, z_dot, i]

@@ -111,9 +111,11 @@ def own_gains():
     classes = {
         m: [node for node in ast.parse(MODULES[m].read_text()).body if isinstance(node, ast.ClassDef)] for m in MODULES
     }
-    numbers = lambda c: {
-        n.target.id for n in c.body if isinstance(n, ast.AnnAssign) and "ClassVar" not in ast.unparse(n)
-    }  # noqa: E731
+
+    def numbers(kind):
+        rows = (n for n in kind.body if isinstance(n, ast.AnnAssign) and "ClassVar" not in ast.unparse(n))
+        return {n.target.id for n in rows}
+
     fields = {m: set().union(*map(numbers, classes[m])) for m in MODULES}
     defined = {m: {n.name for c in classes[m] for n in c.body if isinstance(n, ast.FunctionDef)} for m in MODULES}
     others = set().union(*(fields[m] | defined[m] for m in MODULES if m not in LAWS and not m.startswith(MAKERS[2])))

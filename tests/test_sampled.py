@@ -20,7 +20,14 @@ from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
 
 KINDS = {
-    "observer": {"direct": amb.observer.Direct, "complementary": amb.observer.Complementary},
+    "observer": {
+        "direct": amb.observer.Direct,
+        "complementary": amb.observer.Complementary,
+        "difference": amb.observer.Difference,
+        "kalman": amb.observer.Kalman,
+        "ired-1": amb.observer.IRED1,
+        "ired-2": amb.observer.IRED2,
+    },
     "position": {"sliding-mode": amb.position.SlidingMode, "super-twisting": amb.position.SuperTwisting},
     "inversion": {"adaptive": amb.inversion.Adaptive},
     "current": {"sliding-mode": amb.current.SlidingMode, "pi": amb.current.ProportionalIntegral},
@@ -58,6 +65,7 @@ EXPLICIT = {
 }
 NOISE = (1e-6, 1e-4, 1e-4)
 SLOW = ("complementary", {"l": 5.0})
+DIFFERENCE, KALMAN = ("difference", {"w": 2000.0}), ("kalman", {"w": 800.0})
 PI = ("pi", {"k_p": 3e5, "k_int": 1e8, "k_aw": 200.0})
 WRONG = {"m": 0.65, "R": 45.0, "n": 1400.0}
 CASES = [
@@ -96,6 +104,17 @@ CASES = [
     Case("a real position sensor", World(**TRACKING, bandwidth=5e3, offset=2e-6, gain=1.01, delay=1.5, **soft())),
     Case("a real amplifier", World(**TRACKING, amplifier={"bandwidth": 2e3, "slew": 1e5}, delay=0.5, **soft()), 600),
     Case("dead band", World(kind="two-coil", **TRACKING, amplifier={"dead_band": 2.0}, **soft())),
+    Case("difference", World(**TRACKING, observer=DIFFERENCE, **soft())),
+    Case("difference, explicit", World(**EXPLICIT, observer=DIFFERENCE), 6000),
+    Case("Kalman under noise", World(**TRACKING, observer=KALMAN, u_max=2e3, **hard(k_i=500.0)), std=NOISE),
+    Case("Kalman, wrong model, half a sample", World(**TRACKING, observer=KALMAN, model=WRONG, delay=0.5, **soft())),
+    Case("Kalman, two coils, one and a half", World("two-coil", observer=KALMAN, delay=1.5, **TRACKING, **soft())),
+    Case("Kalman, explicit, off centre", World(**EXPLICIT, observer=KALMAN, initial=(2e-5, 0.0, 0.0)), 6000),
+    Case("IRED of order 1", World(**TRACKING, observer=("ired-1", {"L": 50.0}), **soft())),
+    Case("IRED of order 2", World(**TRACKING, observer=("ired-2", {"L": 3e4}), **soft())),
+    Case("IRED of order 1 under noise", World(observer=("ired-1", {"L": 50.0}), u_max=300.0, **soft()), std=NOISE),
+    # short: this loop is chaotic, and rounding grows tenfold in 70 samples
+    Case("IRED of order 2 under noise", World(observer=("ired-2", {"L": 3e4}), u_max=300.0, **soft()), 100, NOISE),
     Case("super-twisting, explicit", World(**EXPLICIT, position=twisting()), 6000),
 ]
 
@@ -108,6 +127,8 @@ def record_of(kinds, given, *more):
 def sensor_of(world, std):
     names = ("offset", "gain", "bandwidth", "bits")
     given = {name: getattr(world, name) for name in names if getattr(world, name) != getattr(World, name)}
+    if world.observer[0] not in ("direct", "complementary"):
+        given["velocity"] = False
     return amb.Sensor(*std, **given) if any(std) or given else None
 
 

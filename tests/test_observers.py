@@ -1,0 +1,316 @@
+"""Observers that estimate the velocity: what each is exact for, its poles and noise, what the cascade makes of it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import solve_discrete_lyapunov
+
+from ambjax import Cascade, Plant, Sine
+from ambjax.control import answers, inversion, observer
+from ambjax.control.cascade import Sample
+from ambjax.control.observer import IRED1, IRED2, Complementary, Difference, Direct, Kalman, Predicted
+from ambjax.control.processor import Processor
+from ambjax.numerics import differentiator
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import reference_at
+
+MODEL = Plant()
+FREE = Plant(k_z=0.0, A=1e-9, g=0.0)  # a mass on its own
+T = 1e-4
+ESTIMATORS = [Difference(), Kalman(), IRED1(), IRED2()]
+EACH = pytest.mark.parametrize("law", ESTIMATORS, ids=lambda x: type(x).__name__)
+
+
+def estimates(law, z, i=None, model=MODEL, period=T, state=None):
+    """z and z_dot estimated at every sample of z, m, and i, A."""
+    z, i = jnp.asarray(z), jnp.zeros(len(z)) if i is None else jnp.asarray(i)
+    state = law.init(model, Measurement(z[0], 0.0, i[0])) if state is None else state
+
+    def step(state, sample):
+        estimate, state = law.step(model, Measurement(sample[0], 0.0, sample[1]), state, period)
+        return state, (estimate.z, estimate.z_dot)
+
+    return (np.asarray(x) for x in jax.lax.scan(step, jax.tree.map(jnp.asarray, state), (z, i))[1])
+
+
+def motion(t, m=np):
+    """A motion in the bearing, with its rates: a reference, and a quiver of 50 Hz."""
+    w, fast = 4 * np.pi, 100 * np.pi
+    z = 1e-3 * m.sin(w * t) + 2e-5 * m.sin(fast * t)
+    z_dot = 1e-3 * w * m.cos(w * t) + 2e-5 * fast * m.cos(fast * t)
+    return z, z_dot, -1e-3 * w**2 * m.sin(w * t) - 2e-5 * fast**2 * m.sin(fast * t)
+
+
+def current_of(z, z_ddot, q=0.0):
+    """The current with which the model moves so under the disturbance q, m/s^2."""
+    return MODEL.current_for(z, (z_ddot - q + MODEL.g - 2 * MODEL.k_z / MODEL.m * z) / MODEL.a)
+
+
+# --- what they are told ---
+
+
+@EACH
+def test_no_measured_velocity_reaches_the_estimate(law):
+    assert answers.estimates_velocity(law)
+    assert answers.estimates_velocity(type(law))
+    measured = Measurement(1e-4, 0.02, 0.01)
+    state = law.init(MODEL, measured)
+    for form in (lambda m: law(MODEL, m, state), lambda m: law.step(MODEL, m, state, T)):
+        for by in jax.tree.leaves(jax.jacfwd(lambda v, form=form: form(measured._replace(z_dot=v)))(0.02)):
+            assert by == 0
+    # the first estimate: where it is measured, at rest
+    first, _ = law.step(MODEL, measured, state, T)
+    assert first == Measurement(1e-4, 0.0, 0.01)
+
+
+@pytest.mark.parametrize("law", [Direct(), Complementary()])
+def test_the_others_need_it(law):
+    assert not answers.estimates_velocity(law)
+
+
+@EACH
+def test_odd_symmetry(law):
+    level = dataclasses.replace(MODEL, g=0.0)
+    rng = np.random.default_rng(1)
+    z, i = np.cumsum(rng.normal(size=300)) * 1e-6, rng.normal(size=300) * 1e-2
+    for up, down in zip(estimates(law, z, i, level), estimates(law, -z, -i, level), strict=True):
+        # -z - z' is not rounded as z + z' where a plant's two gaps change places
+        np.testing.assert_allclose(down, -up, rtol=0, atol=1e-11 * np.abs(up).max())
+
+
+# --- what they are exact for ---
+
+
+@pytest.mark.parametrize(("law", "degree"), [(Difference(), 1), (IRED1(), 1), (IRED2(), 2)])
+def test_exact_for_polynomials(law, degree):
+    """From any start: the filter after some 20 of its time constants, the differentiators after finitely many steps."""
+    t = np.arange(3000) * T
+    z, z_dot = 1e-3 - 0.02 * t + (degree - 1) * 0.3 * t**2, -0.02 + (degree - 1) * 0.6 * t
+    start = jax.tree.map(lambda x: x + 1e-4, law.init(MODEL, Measurement(1e-3, 0.0, 0.0)))
+    through, estimate = estimates(law, z, state=start)
+    assert np.array_equal(through, z)
+    late = 100 if degree == 2 else 200
+    # rounding of z, 2e-18 m, over T, a few times
+    np.testing.assert_allclose(estimate[late:], z_dot[late:], rtol=0, atol=1e-12)
+
+
+def test_difference_is_the_filtered_backward_difference():
+    z = np.cumsum(np.random.default_rng(2).normal(size=400)) * 1e-6
+    law, v, expected = Difference(1700.0), 0.0, [0.0]
+    pole = np.exp(-1700.0 * T)
+    for change in np.diff(z):
+        v = pole * v + (1 - pole) * change / T
+        expected.append(v)
+    np.testing.assert_allclose(list(estimates(law, z))[1], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(("law", "order", "bound"), [(IRED1(30.0), 1, 1.0), (IRED2(1e4), 2, 1.0)])
+def test_errors_of_the_differentiators(law, order, bound):
+    """Without noise, of f'' and f''' below L: less than T L, T^2 L, and with T^order."""
+    errors = []
+    for period in (2e-4, 1e-4):
+        t = np.arange(round(0.3 / period)) * period
+        z, z_dot, _ = motion(t)
+        _, estimate = estimates(law, z, period=period)
+        errors.append(np.abs(estimate - z_dot)[len(t) // 2 :].max())
+        assert errors[-1] < bound * law.L * period**order
+    assert errors[0] / errors[1] == pytest.approx(2**order, rel=0.1)
+
+
+def test_kalman_knows_a_constant_disturbance():
+    """Where the acceleration is linear between samples, as it is along a cubic, nothing is left of any error."""
+    t, q = np.arange(1500) * T, -0.7
+    z, z_dot, z_ddot = 1e-3 - 0.02 * t + 0.3 * t**2 - t**3, -0.02 + 0.6 * t - 3 * t**2, 0.6 - 6 * t
+    law = Kalman(800.0)
+    z_hat, v_hat = estimates(law, z, current_of(z, z_ddot, q))
+    # (1 + 120 + 120^2/2) e^-120 of what it began with; rounding of accelerations of 20 m/s^2 over 1/w
+    np.testing.assert_allclose(z_hat[-10:], z[-10:], rtol=0, atol=1e-17)
+    np.testing.assert_allclose(v_hat[-10:], z_dot[-10:], rtol=0, atol=1e-14)
+    # at rest, off centre
+    measured = Measurement(2e-3, 0.0, current_of(2e-3, 0.0, q))
+    state = law.init(MODEL, measured)
+    for _ in range(600):
+        estimate, state = law.step(MODEL, measured, state, T)
+    assert state.d == pytest.approx(q, rel=1e-12)
+    assert estimate.z == pytest.approx(2e-3, rel=1e-13)
+    assert abs(estimate.z_dot) < 1e-14
+
+
+# --- poles and noise ---
+
+
+def flat(state):
+    return jnp.stack([state.z, state.z_dot, state.d])
+
+
+@pytest.mark.parametrize("z", [-3e-3, 0.0, 2e-3])
+@pytest.mark.parametrize("w", [1.0, 800.0, 3e4])
+def test_errors_of_the_kalman_filter_have_three_equal_poles(w, z):
+    """Whatever the gap, whose negative stiffness is in the model: (x - q)^3, and (x + w)^3 in continuous time."""
+    law, measured = Kalman(w), Measurement(z, 0.0, 0.02)
+
+    def of(x, form):
+        return flat(form(MODEL, measured, Predicted(*x, 5.0))[1])
+
+    x = jnp.asarray([z + 1e-4, 0.01, -0.3])
+    sampled = jax.jacfwd(of)(x, lambda *a: law.step(*a, T))
+    # in units of T, so that rounding is measured against 1
+    units = np.diag([1.0, T, T * T])
+    q = np.exp(-w * T)
+    np.testing.assert_allclose(
+        np.poly(units @ sampled @ np.linalg.inv(units)), np.poly([q] * 3), rtol=0, atol=1e-12
+    )  # fmt: skip
+    continuous = units @ jax.jacfwd(of)(x, law) @ np.linalg.inv(units) * T
+    np.testing.assert_allclose(np.poly(continuous), np.poly([-w * T] * 3), rtol=0, atol=1e-12 * (1 + w * T) ** 3)
+
+
+def test_noise_of_the_kalman_filter_is_what_it_says():
+    """7/4 (S_r w^3 + S_q / w^3), of a mass on its own, to the order w T."""
+    w, period, std, S_q = 500.0, 1e-5, 1e-6, 1e3
+    law = Kalman(w)
+
+    def error(x, noise, walk):
+        """Error of this estimate, and of the next state, in units of 1/w: the truth is 0 and its disturbance walks."""
+        state = Predicted(x[0], x[1] * w, x[2] * w**2, 0.0)
+        estimate, after = law.step(FREE, Measurement(noise, 0.0, 0.0), state, period)
+        return estimate.z_dot, (flat(after) - jnp.stack([0.0, 0.0, walk])) / np.array([1.0, w, w**2])
+
+    (now, now_noise, _), (A, noise, walk) = jax.jacfwd(error, (0, 1, 2))(jnp.zeros(3), 0.0, 0.0)
+    for drive, direct, expected in (
+        (noise * std, now_noise * std, 7 / 4 * std**2 * period * w**3),
+        (walk * np.sqrt(S_q * period), 0.0, 7 / 4 * S_q / w**3),
+    ):
+        P = solve_discrete_lyapunov(np.asarray(A), np.outer(drive, drive))
+        assert now @ P @ now + direct**2 == pytest.approx(expected, rel=5 * w * period)
+
+
+# --- the cubic ---
+
+
+def test_the_root_of_the_cubic_and_its_derivative():
+    c = np.concatenate([[0.0], 10 ** np.linspace(-30, 30, 601)])
+    square, linear, _ = differentiator.LAM[2]
+    r = np.asarray(differentiator._root(jnp.asarray(c), 2))
+    # a few roundings of the right side
+    np.testing.assert_allclose(((r + square) * r + linear) * r, c, rtol=2e-15)
+    slope = jax.vmap(jax.grad(lambda c: differentiator._root(c, 2)))(c)
+    np.testing.assert_allclose(slope, 1 / (3 * r**2 + 2 * square * r + linear), rtol=1e-14)
+    assert np.isfinite(differentiator._root(jnp.asarray(c[c < 1e10], jnp.float32), 2)).all()
+
+
+@pytest.mark.parametrize("law", [IRED1(), IRED2()], ids=lambda x: type(x).__name__)
+def test_gradients_of_the_differentiators(law):
+    """Forward = reverse = differences away from where the sign is taken up whole; finite there, and at 0."""
+    order = len(law.init(MODEL, Measurement(0.0, 0.0, 0.0))) - 1
+    unit = law.L * T ** (order + 1)
+
+    def of(x):
+        changed = dataclasses.replace(law, L=law.L * jnp.exp(x[0]))
+        _, after = changed.step(MODEL, Measurement(x[1] * unit, 0.0, 0.0), (0.0, *[0.0] * order), T)
+        return jnp.stack([one / (unit / T**k) for k, one in enumerate(after)])
+
+    edge = differentiator.LAM[order][-1]
+    for ratio in (0.0, edge, -edge, 1e-3, 0.5, 3.0, -40.0, 1e6):
+        x = jnp.asarray([0.0, ratio])
+        forward, reverse = jax.jacfwd(of)(x), jax.jacrev(of)(x)
+        assert np.isfinite(forward).all()
+        np.testing.assert_allclose(forward, reverse, rtol=1e-12, atol=1e-12)
+        if abs(ratio) not in (0.0, edge):
+            h = 1e-6 * max(abs(ratio), 1.0)
+            steps = ([1e-6, 0.0], [0.0, h])
+            differences = [(of(x + d) - of(x - d)) / (2 * max(d)) for d in np.array(steps)]
+            np.testing.assert_allclose(forward.T, differences, rtol=1e-6, atol=1e-7)
+
+
+# --- continuous time ---
+
+
+@pytest.mark.parametrize(("law", "order"), [(Difference(), 2), (Kalman(), 1)], ids=lambda x: type(x).__name__)
+def test_order_towards_continuous_time(law, order):
+    """The difference is late by half a sample, and its low-pass early by as much."""
+    ends = np.arange(5, 21) * 1e-3
+
+    def state_of(x):
+        return Predicted(*x) if isinstance(law, Kalman) else x[0]
+
+    def of(t, x):
+        z, _, z_ddot = motion(t, jnp)
+        return law(MODEL, Measurement(z, 0.0, current_of(z, z_ddot, 0.3)), state_of(x))
+
+    def rates(t, x):
+        return jnp.stack(jax.tree.leaves(of(t, x)[1]))
+
+    z, _, z_ddot = motion(0.0)
+    start = np.ravel(law.init(MODEL, Measurement(z, 0.0, current_of(z, z_ddot, 0.3))))
+    run = solve_ivp(jax.jit(rates), (0, ends[-1]), start, "RK45", ends, rtol=1e-9, atol=1e-12)
+    expected = jax.vmap(of)(ends, run.y.T)[0].z_dot
+    errors = []
+    for period in (2e-5, 1e-5):
+        z, _, z_ddot = motion(np.arange(round(ends[-1] / period) + 1) * period)
+        _, given = estimates(law, z, current_of(z, z_ddot, 0.3), period=period)
+        errors.append(np.abs(given[np.round(ends / period).astype(int)] - expected).max())
+    assert errors[0] < 2e-3
+    assert errors[0] / errors[1] == pytest.approx(2**order, rel=0.1)
+
+
+@pytest.mark.parametrize("law", [IRED1(10.0), IRED2(1e4)], ids=lambda x: type(x).__name__)
+def test_the_differentiators_in_continuous_time(law):
+    """Exact but for the width of the smoothed sign, (width/L)^(1/(m+1)) seconds late or so."""
+    order = 1 if isinstance(law, IRED1) else 2
+    late = (observer.WIDTH * MODEL.s_0 / law.L) ** (1 / (order + 1))
+    assert law.slope(MODEL) == pytest.approx(differentiator.LAM[order][0] / late)
+
+    def rates(t, x):
+        return jnp.stack(law(MODEL, Measurement(motion(t, jnp)[0], 0.0, 0.0), tuple(x))[1])
+
+    ends = np.linspace(0.05, 0.06, 20)
+    run = solve_ivp(
+        jax.jit(rates), (0, ends[-1]), np.zeros(order + 1), "Radau", ends, rtol=1e-8, atol=1e-12,
+        jac=jax.jit(jax.jacfwd(rates, 1)),
+    )  # fmt: skip
+    # late by lam_0 / lam_1 widths for the order 1; order 2 knows the acceleration
+    assert np.abs(run.y[1] - motion(ends)[1]).max() < 2 * late * np.abs(motion(ends)[2]).max()
+
+
+# --- the cascade behind them ---
+
+
+def right(law, z, z_dot, sampled):
+    """A state with which the estimate is z and z_dot where z is measured."""
+    z, v, zero = jnp.asarray(z), jnp.asarray(z_dot), jnp.zeros(())
+    back = T * v if sampled else 0.0
+    if isinstance(law, Difference):
+        return z - (v * T / -jnp.expm1(-law.w * T) if sampled else v / law.w)
+    if isinstance(law, Kalman):
+        return Predicted(z, v, zero, MODEL.z_ddot(z, 0.02))
+    return (z - back, v, zero)[: 2 if isinstance(law, IRED1) else 3]
+
+
+@EACH
+@pytest.mark.parametrize("law_i", [inversion.Adaptive(), inversion.ClosedForm()], ids=lambda x: type(x).__name__)
+def test_an_estimate_that_is_right_gives_the_command_of_a_measured_velocity(law, law_i):
+    """i_ref' of the closed form among it: the estimate moves, not the velocity that nobody measures."""
+    z, z_dot, i, reference = 1e-3, 0.03, 0.02, reference_at(Sine(2.5e-3, 2.0), 0.11)
+    seen, blind = (Measurement(jnp.asarray(z), jnp.asarray(v), jnp.asarray(i)) for v in (z_dot, 0.0))
+
+    def commands(law, measured, sampled):
+        cascade = Cascade(law, inversion=law_i, processor=Processor(predict=False) if sampled else None)
+        cascade = cascade.on_processor() if sampled else cascade
+        state = cascade.init(measured)
+        if law != Direct():
+            state = state._replace(observer=right(law, z, z_dot, sampled))
+        if sampled:
+            past = (jnp.asarray(40.0), jnp.asarray(-20.0))
+            return cascade.step(measured, state, Sample(reference, T, jnp.asarray(200.0), past))[0]
+        return cascade(measured, state, reference, 200.0)[0]
+
+    for sampled in (False, True):
+        expected, given = commands(Direct(), seen, sampled), commands(law, blind, sampled)
+        assert abs(expected.i_ref_dot) > 1
+        for name, a, b in zip(expected._fields, given, expected, strict=True):
+            # the estimate is right to rounding of z over T: 1e-15 m/s
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=name)
