@@ -105,16 +105,14 @@ CASES = [
     Case("a real amplifier", World(**TRACKING, amplifier={"bandwidth": 2e3, "slew": 1e5}, delay=0.5, **soft()), 600),
     Case("dead band", World(kind="two-coil", **TRACKING, amplifier={"dead_band": 2.0}, **soft())),
     Case("difference", World(**TRACKING, observer=DIFFERENCE, **soft())),
-    Case("difference, explicit", World(**EXPLICIT, observer=DIFFERENCE), 6000),
+    Case("difference, explicit", World(**EXPLICIT, observer=DIFFERENCE), 2000),
     Case("Kalman under noise", World(**TRACKING, observer=KALMAN, u_max=2e3, **hard(k_i=500.0)), std=NOISE),
     Case("Kalman, wrong model, half a sample", World(**TRACKING, observer=KALMAN, model=WRONG, delay=0.5, **soft())),
     Case("Kalman, two coils, one and a half", World("two-coil", observer=KALMAN, delay=1.5, **TRACKING, **soft())),
-    Case("Kalman, explicit, off centre", World(**EXPLICIT, observer=KALMAN, initial=(2e-5, 0.0, 0.0)), 6000),
-    Case("IRED of order 1", World(**TRACKING, observer=("ired-1", {"L": 50.0}), **soft())),
-    Case("IRED of order 2", World(**TRACKING, observer=("ired-2", {"L": 3e4}), **soft())),
+    Case("Kalman, explicit, off centre", World(**EXPLICIT, observer=KALMAN, initial=(2e-5, 0.0, 0.0)), 2000),
     Case("IRED of order 1 under noise", World(observer=("ired-1", {"L": 50.0}), u_max=300.0, **soft()), std=NOISE),
-    # short: this loop is chaotic, and rounding grows tenfold in 70 samples
-    Case("IRED of order 2 under noise", World(observer=("ired-2", {"L": 3e4}), u_max=300.0, **soft()), 100, NOISE),
+    # under more noise, or on less voltage, its loop is chaotic: rounding grows tenfold in 70 samples
+    Case("IRED of order 2 under noise", World(observer=("ired-2", {"L": 3e4}), **soft()), 300, (1e-7, 0.0, 1e-4)),
     Case("super-twisting, explicit", World(**EXPLICIT, position=twisting()), 6000),
 ]
 
