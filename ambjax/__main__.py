@@ -45,7 +45,7 @@ def parser() -> Parser:
 
     command("reproduce", "run the paper: both scenarios, Figures 3 to 6 and the ledger of claims", out=True)
     template = command("template", "print an annotated case file")
-    template.add_argument("scenario", nargs="?", default="tracking", choices=["tracking", "regulation"])
+    template.add_argument("scenario", nargs="?", default="tracking", choices=["tracking", "regulation", "rig"])
     simulate = command("simulate", "simulate a case: trajectory.npz, metrics.json, overview.png", case=True, out=True)
     simulate.add_argument("--member", type=int, metavar="K", help="member K of the case's ensemble, its [spread] drawn")
     _seed_option(simulate)

@@ -244,7 +244,9 @@ def test_what_is_hardly_meant_is_said(case):
 @pytest.mark.parametrize("name", ["tracking", "regulation"])
 def test_nothing_in_the_paper_is_doubtful(name):
     sensor = f"\n[sensor]\nstd = {math.sqrt(1e-7)}\n"
-    assert doubts(read_case(write(template(name) + sensor))) == []
+    said = doubts(read_case(write(template(name) + sensor)))  # its text names no error of the velocity
+    assert [line.split(":")[0] for line in said] == ["sensor.std_z_dot = 0 m/s"]
+    assert doubts(read_case(write(template(name) + sensor + "std_z_dot = 1e-4\n"))) == []
 
 
 def test_doubts_are_said_on_stderr_once_and_stop_nothing(capsys):

@@ -5,10 +5,13 @@ import math
 from typing import Any
 
 from ambjax.cases.reader import KINDS, PLANTS, SIGNALS
+from ambjax.cases.rig import RIG
 from ambjax.ensemble.design import DESIGNS
 from ambjax.paper.readings import PULSE, REFERENCE, TABLE_2
 from ambjax.world.plant import Plant
 
+# What is printed: the paper's two scenarios, and a bearing as laboratories have them.
+SCENARIOS = ("tracking", "regulation", "rig")
 HEAD = """\
 # A case for ambjax: {title}.
 # Units are SI. A key left out takes the value shown here unless its comment says otherwise.
@@ -133,7 +136,9 @@ def _number(value: float) -> str:
 
 
 def template(scenario: str) -> str:
-    """The paper's tracking or regulation scenario under the repaired gains, as an annotated case file."""
+    """An annotated case file: the paper's tracking or regulation scenario under the repaired gains, or a rig."""
+    if scenario == "rig":
+        return RIG
     tracking = scenario == "tracking"
     lines = [HEAD.format(title=f"the paper's {scenario} scenario, Table 2 with gamma = 7.5e4")]
     kinds = _with_note('# kind = "lumped"', f"Eqs. (1), (2); or {_others(PLANTS)}: each coil's own current")
