@@ -19,22 +19,22 @@ g = 9.81                      # m/s^2
 
 [controller.observer]         # the velocity is not measured
 kind = "kalman"
-w = 2000.0                    # 1/s
+w = 1000.0                    # 1/s; this and the gains below: by 'ambjax-tune' from a rough guess, rounded
 
 [controller.position]
 kind = "sliding-mode"
-c = 300.0                     # 1/s
-k = 20.0                      # m/s^2
+c = 2900.0                    # 1/s
+k = 9.0                       # m/s^2
 p = inf                       # s/m; the sign itself, stepped implicitly
 
 [controller.inversion]
 kind = "adaptive"
-gamma = 2e10                  # A^2/m^2/s
+gamma = 7e11                  # A^2/m^2/s
 p = inf                       # m^2/A^2
 
 [controller.current]
 kind = "sliding-mode"
-k_i = 1000.0                  # A/s
+k_i = 1100.0                  # A/s
 p = inf                       # 1/A
 
 [disturbance.q_z]             # 1.6 N, a tenth of the rotor's weight

@@ -2,6 +2,7 @@
 
 from ambjax.paper.readings import (
     CLOCK,
+    NOISY,
     PULSE,
     READINGS,
     REFERENCE,
@@ -12,11 +13,13 @@ from ambjax.paper.readings import (
     TUNED,
     cascade,
     noisy,
+    on_processor,
     scenario,
 )
 
 __all__ = [
     "CLOCK",
+    "NOISY",
     "PULSE",
     "READINGS",
     "REFERENCE",
@@ -27,5 +30,6 @@ __all__ = [
     "TUNED",
     "cascade",
     "noisy",
+    "on_processor",
     "scenario",
 ]

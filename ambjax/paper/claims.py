@@ -237,6 +237,9 @@ def _specification(evidence: Evidence) -> Finding:
         return Finding(
             "no survivor", None, OPEN, "the rotor is lost at every noise, so the sample period cannot be told"
         )
+    if len(evidence.noise) == 1:
+        words = f"held {evidence.noise[0].sample_period:g} s"
+        return Finding(words, None, OPEN, "on a processor noise is held for its period; the paper has none")
     radii = [float(n.sigma[0]) for n in evidence.noise]
     spread = max(radii) / min(radii)
     cause = f"at std {NOISE_STDS[0]:.0e} m the radius differs {spread:.1f}-fold between sample periods; none is printed"

@@ -16,6 +16,7 @@ from ambjax.numerics.kernel import one_kernel
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.integrate import AdaptiveRodas3, Slide
+from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import Standard
 from ambjax.simulation.rollout import rollout
 from ambjax.simulation.trajectory import Trajectory
@@ -36,11 +37,11 @@ STEPS = {"tuned": Slide(16)}
 
 
 class Run(NamedTuple):
-    """One rollout: what was recorded, its metrics as floats, and the same rollout without the pulse."""
+    """One rollout: what was recorded, its metrics as floats, and the same rollout without the pulse, if asked for."""
 
     trajectory: Trajectory
     metrics: dict[str, float]
-    quiet: Trajectory
+    quiet: Any = None
 
 
 class Noise(NamedTuple):
@@ -74,6 +75,8 @@ class Evidence(NamedTuple):
     tracking: Run
     noisy: Trajectory
     """tracking under the paper's noise and supply"""
+    on_processor: dict[bool, Run]
+    """tracking on the processor of `sampled`: without noise, where the reading has none; under noise (True)"""
     check_regulation: Report
     check_tracking: Report
     noise: list[Noise]
@@ -89,7 +92,8 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
     runs, checks = {}, {}
     with ThreadPoolExecutor() as pool:  # compiling and running leave the interpreter free
         say(f"{reading}: noise")
-        first = pool.submit(_noise, cascade, reading, NOISE_PERIODS[0])
+        periods = (float(paper.CLOCK.sample_period),) if cascade.processor else NOISE_PERIODS
+        first = pool.submit(_noise, cascade, reading, periods[0])
         for name in ("regulation", "tracking"):
             say(f"{reading}: theorem, {name}")
             check_clock = paper.CLOCK.with_method(AdaptiveRodas3())
@@ -98,30 +102,39 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
             runs[name] = _run(cascade, reading, name)
             checks[name] = checking.result()
         noisy = runs["tracking"].trajectory
-        if reading != "tuned":  # there it is the tracking scenario
-            noisy = _simulate(reading, cascade, paper.noisy(paper.scenario("tracking", reading)))[0]
+        if reading not in paper.NOISY:  # there it is the tracking scenario
+            noisy = _simulate(reading, cascade, paper.noisy(paper.scenario("tracking", reading))).trajectory
+        say(f"{reading}: on a processor")
+        on_processor = {True: runs["tracking"]} if cascade.processor else _on_processor(reading)
         # The first compiled what these run.
-        noise = [first.result(), *pool.map(lambda period: _noise(cascade, reading, period), NOISE_PERIODS[1:])]
+        noise = [first.result(), *pool.map(lambda period: _noise(cascade, reading, period), periods[1:])]
     say(f"{reading}: basin of attraction")
     basin = _basin(cascade, reading)
     say(f"{reading}: uncertain plant")
     lost, error = _uncertain(cascade, reading)
-    return Evidence(
-        runs["regulation"], runs["tracking"], noisy, checks["regulation"], checks["tracking"], noise, basin, lost, error
-    )
+    judged = checks["regulation"], checks["tracking"]
+    return Evidence(runs["regulation"], runs["tracking"], noisy, on_processor, *judged, noise, basin, lost, error)
 
 
-def _simulate(reading: str, cascade: Cascade, scenario: Scenario) -> tuple[Trajectory, dict[str, float]]:
+def _simulate(reading: str, cascade: Cascade, scenario: Scenario) -> Run:
     if scenario.sensor is None:  # with one of no error: the same program as under noise
         scenario = dataclasses.replace(scenario, sensor=Sensor())
-    clock = paper.CLOCK.with_method(STEPS.get(reading, AdaptiveRodas3()))
+    clock = paper.CLOCK
+    if cascade.processor is None:
+        clock = clock.with_method(STEPS.get(reading, AdaptiveRodas3()))
     trajectory, metrics = rollout(cascade, scenario, clock, fold=Standard(paper.SETTLE))
-    return jax.tree.map(np.asarray, trajectory), {name: float(value) for name, value in metrics.items()}
+    return Run(jax.tree.map(np.asarray, trajectory), {name: float(value) for name, value in metrics.items()})
+
+
+def _on_processor(reading: str) -> dict[bool, Run]:
+    scenario, cascade = paper.scenario("tracking", reading), paper.on_processor(reading)
+    quiet = {} if reading in paper.NOISY else {False: _simulate(reading, cascade, scenario)}
+    return quiet | {True: _simulate(reading, cascade, paper.noisy(scenario))}
 
 
 def _run(cascade: Cascade, reading: str, name: str) -> Run:
-    trajectory, metrics = _simulate(reading, cascade, paper.scenario(name, reading))
-    return Run(trajectory, metrics, _simulate(reading, cascade, paper.scenario(name, reading, pulse=False))[0])
+    run = _simulate(reading, cascade, paper.scenario(name, reading))
+    return run._replace(quiet=_simulate(reading, cascade, paper.scenario(name, reading, pulse=False)).trajectory)
 
 
 def _uncertain(cascade: Cascade, reading: str) -> tuple[list[str], float]:
@@ -131,7 +144,9 @@ def _uncertain(cascade: Cascade, reading: str) -> tuple[list[str], float]:
     def one(case: tuple[str, float]) -> dict[str, float]:
         name, factor = case
         plant = dataclasses.replace(Plant(), **{name: getattr(Plant(), name) * factor})
-        return _simulate(reading, cascade, dataclasses.replace(paper.scenario("tracking", reading), plant=plant))[1]
+        return _simulate(
+            reading, cascade, dataclasses.replace(paper.scenario("tracking", reading), plant=plant)
+        ).metrics
 
     with ThreadPoolExecutor() as pool:
         metrics = list(pool.map(one, cases))
@@ -147,21 +162,26 @@ def _scan(cascade: Cascade, scenarios: Scenario, clock: Clock) -> dict[str, Any]
     return jax.lax.map(lambda s: rollout(cascade, s, clock, fold=fold, every=0).measured, scenarios)
 
 
-def _batch(scenario: Scenario, size: int, **leaves: Any) -> Scenario:
-    """An ensemble: every leaf of `scenario` repeated, `leaves` replacing whole fields."""
-    copies = jax.tree.map(lambda x: jnp.broadcast_to(x, (size,)), canonical(scenario))
+def _batch(one: Any, size: int, **leaves: Any) -> Any:
+    """An ensemble: every leaf of a scenario, or of a part of one, repeated; `leaves` replace whole fields."""
+    copies = jax.tree.map(lambda x: jnp.broadcast_to(x, (size,)), canonical(one))
     return dataclasses.replace(copies, **leaves)
+
+
+def _scanned(cascade: Cascade, scenarios: Scenario, period: float) -> tuple[Cascade, Scenario, Clock]:
+    if cascade.processor is not None:
+        return cascade.on_processor(), scenarios, with_method(Clock(NOISE_SAMPLES, period), cascade, scenarios)
+    # This tolerance agrees with 1e-6 to 1 % of sigma's radius at all of these levels, at half the cost.
+    return cascade, scenarios, Clock(NOISE_SAMPLES, period, AdaptiveRodas3(1e-4))
 
 
 def _noise(cascade: Cascade, reading: str, period: float) -> Noise:
     """Regulation without the pulse under held noise."""
     stds, seeds = np.repeat(NOISE_STDS, SEEDS), np.tile(np.arange(SEEDS), len(NOISE_STDS))
-    zeros = jnp.zeros(len(stds))
-    quiet = dataclasses.replace(paper.scenario("regulation", reading, pulse=False), sensor=Sensor())
-    scenarios = _batch(quiet, len(stds), sensor=Sensor(jnp.asarray(stds), zeros, zeros), seed=jnp.asarray(seeds, int))
-    # This tolerance agrees with 1e-6 to 1 % of sigma's radius at all of these levels, at half the cost.
-    clock = Clock(NOISE_SAMPLES, period, AdaptiveRodas3(1e-4))
-    metrics = _scan(*canonical((cascade, scenarios, clock)))
+    quiet, size = paper.scenario("regulation", reading, pulse=False), len(stds)
+    sensors = _batch(Sensor(), size, std=jnp.asarray(stds))
+    scenarios = _batch(quiet, size, sensor=sensors, seed=jnp.asarray(seeds, int))
+    metrics = _scan(*canonical(_scanned(cascade, scenarios, period)))
     lost = np.any(np.isfinite(metrics["lost_at_s"]).reshape(-1, SEEDS), axis=1)
     sigma = np.asarray(metrics["settled_max_abs_sigma_m_per_s"]).reshape(-1, SEEDS).mean(axis=1)
     return Noise(period, NOISE_SAMPLES * period, lost, sigma)
@@ -177,7 +197,7 @@ def _basin(cascade: Cascade, reading: str) -> float:
     quiet = paper.scenario("regulation", reading, pulse=False)
     initial = Initial(jnp.asarray(offsets), zeros, zeros + current)
     scenarios = _batch(dataclasses.replace(quiet, sensor=Sensor()), size, initial=initial)
-    metrics = _scan(*canonical((start, scenarios, Clock(NOISE_SAMPLES, 1e-4, AdaptiveRodas3(1e-4)))))
+    metrics = _scan(*canonical(_scanned(start, scenarios, float(paper.CLOCK.sample_period))))
     lost = np.isfinite(metrics["lost_at_s"]).reshape(2, -1).any(axis=0)
     first = np.flatnonzero(lost)[0] if lost.any() else len(BASIN)
     return float(BASIN[first - 1]) if first else 0.0

@@ -1,16 +1,26 @@
 """The ledger: every claim of the paper judged on each reading, and the noise scan, as data and as a page."""
 
 import dataclasses
+import math
 from typing import Any
 
 from ambjax.paper.claims import CLAIMS, SIGMA_RADIUS
 from ambjax.paper.evidence import Evidence
-from ambjax.paper.readings import CLOCK, SUPPLY, TABLE_2, TUNED
+from ambjax.paper.readings import CLOCK, PROCESSOR, SAMPLED, SUPPLY, TABLE_2, TUNED, Tuned
+
+
+def _gains(gains: Tuned) -> str:
+    return ", ".join(f"{name} = {value:g}" for name, value in gains._asdict().items())
+
 
 TUNED_WORDS = (
     f"every run under the paper's noise (std {TABLE_2.noise_std:.2e} m on z, held {float(CLOCK.sample_period):g} s) "
     f"and a supply of {SUPPLY:g} V, disturbance as scaled force, complementary observer, gains by gradients: "
-    + ", ".join(f"{name} = {value:g}" for name, value in TUNED._asdict().items())
+    + _gains(TUNED)
+)
+SAMPLED_WORDS = (
+    f"as `tuned`, on a processor of {1 / float(CLOCK.sample_period):g} Hz: {PROCESSOR.resolved()}; signs without a "
+    f"layer, gains tuned for it: {_gains(SAMPLED)}"
 )
 
 
@@ -39,14 +49,45 @@ def noise_table(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
     ]
 
 
-def markdown(rows: list[dict[str, Any]], noise: list[dict[str, Any]]) -> str:
+def processor_table(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
+    """What becomes of each reading on the processor of `sampled`, tracking, as plain data; inf: not lost."""
+    return [
+        {
+            "reading": name,
+            "noise": noisy,
+            "lost_at_s": run.metrics["lost_at_s"],
+            "settled_max_abs_error_m": run.metrics["settled_max_abs_error_m"],
+            "settled_rms_u_V": run.metrics["settled_rms_u_V"],
+        }
+        for name, one in evidence.items()
+        for noisy, run in one.on_processor.items()
+    ]
+
+
+def _processor_lines(rows: list[dict[str, Any]]) -> list[str]:
+    lines = ["", "## The readings on that processor (tracking, pulse included)", ""]
+    lines += [
+        "| reading | noise and supply | lost | largest error after settling | voltage, rms |",
+        "|---|---|---|---|---|",
+    ]
+    for row in rows:
+        under = f"the paper's, {SUPPLY:g} V" if row["noise"] else "none, no limit"
+        if math.isfinite(row["lost_at_s"]):
+            lines.append(f"| {row['reading']} | {under} | at {1e3 * row['lost_at_s']:.3g} ms | - | - |")
+        else:
+            error, u = row["settled_max_abs_error_m"], row["settled_rms_u_V"]
+            lines.append(f"| {row['reading']} | {under} | no | {error:.2e} m | {u:.3g} V |")
+    return lines
+
+
+def markdown(rows: list[dict[str, Any]], noise: list[dict[str, Any]], processor: list[dict[str, Any]]) -> str:
     """The ledger as a Markdown page."""
     readings = list(rows[0]["findings"])
     lines = ["# Ledger: the paper's claims, per reading", ""]
     lines += [
         "`literal`: Table 2 as printed. `repaired`: gamma = 7.5e4, disturbance as scaled force. Both without noise."
     ]
-    lines += [f"`tuned`: {TUNED_WORDS}.", ""]
+    lines += [f"`tuned`: {TUNED_WORDS}.", f"`sampled`: {SAMPLED_WORDS}.", ""]
     lines += ["| claim | section | paper | " + " | ".join(f"{r}: ours | {r}: verdict" for r in readings) + " |"]
     lines += ["|" + "---|" * (3 + 2 * len(readings))]
     for row in rows:
@@ -65,4 +106,4 @@ def markdown(rows: list[dict[str, Any]], noise: list[dict[str, Any]]) -> str:
         gives = f"{n['std_for_sigma_6e-6_m']:.1e} m" if n["std_for_sigma_6e-6_m"] else "none"
         survived = f"{n['largest_std_survived_m']:.1e} m" if n["largest_std_survived_m"] else "none"
         lines.append(f"| {n['reading']} | {n['sample_period_s']:g} s | {n['horizon_s']:g} s | {survived} | {gives} |")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_processor_lines(processor)]) + "\n"
