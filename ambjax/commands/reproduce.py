@@ -56,7 +56,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
             for job in jobs:
                 job.result()
         std = paper.TABLE_2.noise_std
-        words = f"Tracking on a 10 kHz processor under the paper's noise (std {std:.2g} m on z), {paper.SUPPLY:g} V"
+        words = f"the paper's noise (std {std:.2g} m on z), {paper.SUPPLY:g} V"
+        words = f"Tracking on a 10 kHz processor, a sample late, under {words}"
         shown = {str(SHOWN_AS.get(name, name)): one.on_processor[True].trajectory for name, one in evidence.items()}
         figures.readings(shown, words, paper.SETTLE, part / "readings.png")
         claims, noise = ledger.judge(evidence), ledger.noise_table(evidence)

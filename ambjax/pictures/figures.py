@@ -97,7 +97,7 @@ def readings(trajectories: dict[str, Trajectory], title: str, settle: float, pat
     for (name, trajectory), (upper, lower) in zip(trajectories.items(), axes.T, strict=True):
         draw(upper, position, trajectory, first=True)
         draw(lower, ERROR, trajectory)
-        upper.set_title(name, loc="left", fontsize=10, fontweight="bold")
+        upper.set_title(name, loc="left", fontsize=10, fontweight="bold", pad=18)  # above the legend
         lower.set_xlabel("time (s)", fontsize=9)
         if not np.isfinite(trajectory.lost_at):
             late = np.abs(signal_of(trajectory.rows, "e_z")[np.asarray(trajectory.rows.t) >= settle]).max()
