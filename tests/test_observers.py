@@ -9,7 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import solve_discrete_lyapunov
 
-from ambjax import Cascade, Plant, Sine
+from ambjax import Cascade, Clock, Plant, Scenario, Sensor, Sine, rollout
+from ambjax.cases.reader import case_from
 from ambjax.control import answers, inversion, observer
 from ambjax.control.cascade import Sample
 from ambjax.control.observer import IRED1, IRED2, Complementary, Difference, Direct, Kalman, Predicted
@@ -313,3 +314,23 @@ def test_an_estimate_that_is_right_gives_the_command_of_a_measured_velocity(law,
         for name, a, b in zip(expected._fields, given, expected, strict=True):
             # the estimate is right to rounding of z over T: 1e-15 m/s
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    "law", [pytest.param(x, id=type(x).__name__, marks=pytest.mark.slow if n else ()) for n, x in enumerate(ESTIMATORS)]
+)
+def test_in_continuous_time_behind_sensors(law):
+    """The compiler, which aborts where nothing reads a measurement, takes it; the rotor is held."""
+    world = Scenario(reference=Sine(2.5e-3, 2.0), sensor=Sensor(1e-7, 0.0, 1e-5))
+    trajectory = rollout(Cascade(law), world, Clock(300, 1e-4)).trajectory
+    assert trajectory.lost_at == np.inf
+    assert np.isfinite(np.asarray(trajectory.rows.u)).all()
+
+
+@pytest.mark.parametrize("kind", ["ired-1", "ired-2"])
+def test_no_sliding_step_behind_a_differentiator(kind):
+    """That would step it by Heun's method, far beyond its stability."""
+    case = {"controller": {"observer": {"kind": kind}}, "clock": {"method": "sliding"}}
+    with pytest.raises(ValueError, match=r"^clock.method = \"sliding\": .* behind any observer but \"ired-1\""):
+        case_from(case)
+    case_from(case | {"controller": {"observer": {"kind": "kalman"}}})

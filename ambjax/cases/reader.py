@@ -135,7 +135,7 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
         made = " or ".join(f'"{kind}"' for kind, law in KINDS["inversion"].items() if answers.slides(law))
         raise ValueError(
             f'clock.method = "sliding": it is made for controller.inversion.kind = {made} in continuous time, on a '
-            'lumped plant. Use method = "adaptive".'
+            'lumped plant, behind any observer but "ired-1" and "ired-2". Use method = "adaptive".'
         )
     _check_start(scenario)
     if settle is None:

@@ -47,7 +47,7 @@ def default_law(kind: type[L], model: Plant) -> L:
 
 def layer(law: Any, model: Plant) -> Any:
     """The largest error with which each state of the law stays where a smoothed sign turns."""
-    return law.layer(model) if hasattr(law, "layer") else jax.tree.map(lambda _: jnp.inf, law.scale(model))
+    return law.layer(model) if turns(law) else jax.tree.map(lambda _: jnp.inf, law.scale(model))
 
 
 def requirement(law: Any) -> Requirement | None:
@@ -63,6 +63,11 @@ def robust(law: Any, error: Array) -> Array:
 def ranges(law: Any, site: Site) -> dict[str, Interval]:
     """Where gains of the law are searched, by name; one that is not there: about its value."""
     return law.ranges(site) if hasattr(law, "ranges") else {}
+
+
+def turns(law: Any) -> bool:
+    """Whether a state of the law stays where a smoothed sign turns: it is stiff."""
+    return hasattr(law, "layer")
 
 
 def estimates_velocity(law: Any) -> bool:

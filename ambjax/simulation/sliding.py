@@ -145,4 +145,5 @@ def _axpy(x: Any, h: Scalar, rate: Any) -> Any:
 
 def slides(cascade: Cascade, plant: Bearing) -> bool:
     """Whether this step is made for the cascade and the plant."""
-    return cascade.processor is None and answers.slides(cascade.inversion) and plant.lumped
+    slow = not answers.turns(cascade.observer)  # it goes by Heun's method
+    return cascade.processor is None and answers.slides(cascade.inversion) and plant.lumped and slow
