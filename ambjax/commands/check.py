@@ -1,22 +1,29 @@
-"""`ambjax check`: Theorem 1's conditions along a case."""
+"""`ambjax check`: Theorem 1's conditions along a case, and beside them what decides on its processor."""
 
 import argparse
 import dataclasses
+import math
 from typing import Any
 
+from ambjax.cases.reader import Case
 from ambjax.commands.doubts import read_aloud
 from ambjax.commands.outputs import plain, table
 from ambjax.theorem.conditions import Condition, check
+from ambjax.theorem.processor import Sampled
 
 Summary = dict[str, Any]
 CONTINUOUS = (
     "All of this is about continuous time, for which the theorem is: the case's [processor] is left out, and signs "
-    "without a layer have one. 'ambjax simulate' runs the loop on its processor."
+    "without a layer have one. It decides nothing here."
 )
+
+BAND = "Band: what its law keeps the signal in from run.settle on, without noise, which comes on top of it."
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax check."""
+    from ambjax.theorem import verdict
+
     case = read_aloud(args.case)
     report = check(case.cascade, case.scenario, case.clock)
     summary = {
@@ -30,12 +37,36 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     }
     if not args.json:
         _print_check(report.conditions, report.proof)
-        from ambjax.theorem import verdict
-
         print("\n" + "\n".join(verdict.answer(report, args.case)))
-        if case.cascade.processor is not None:
+    if case.cascade.processor is not None:
+        if not args.json:
             print(CONTINUOUS)
-    return int(not report.holds), plain(summary)
+        summary |= _on_processor(case, args)
+    return int(not summary["holds"]), plain(summary)
+
+
+def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
+    """Print what decides on the case's processor. Keys of the summary, of which "holds" is the processor's."""
+    from ambjax.ensemble.delays import delay_margin
+    from ambjax.theorem import processor, verdict
+
+    sampled = processor.check(case.cascade, case.scenario, case.clock, case.settle)
+    margin = delay_margin(case.cascade, case.scenario, case.clock)
+    if not args.json:
+        print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")
+        _print_sampled(sampled)
+        print("\n" + "\n".join(verdict.on_processor(sampled, margin.held, margin.lost)))
+    slopes = [dataclasses.asdict(slope) | {"holds": slope.holds} for slope in sampled.slopes]
+    return {
+        "holds": sampled.holds,
+        "processor": {
+            "lost_at_s": sampled.lost_at,
+            "lost_why": sampled.lost_why,
+            "slopes": slopes,
+            "bands": [dataclasses.asdict(band) for band in sampled.bands],
+            "delay_margin": margin._asdict() | {"resolution": margin.resolution},
+        },
+    }
 
 
 def _condition(c: Condition) -> Summary:
@@ -64,3 +95,31 @@ def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
     print(table(("condition", "left", "right", "margin", "unit", "at (s)", "verdict", "note"), rows))
     steps = [(c.name, c.requires, f"{c.against:.3g}", c.unit, f"{c.at_s:.5g}", c.note) for c in proof]
     print("\n" + table(("proof", "statement", "worst", "unit", "at (s)", "what"), steps))
+
+
+def _print_sampled(sampled: Sampled) -> None:
+    rows = [
+        (
+            slope.stage,
+            f"{slope.slope:.4g}",
+            "implicit" if slope.implicit else "explicit",
+            f"{slope.stepped:.4g}",
+            f"{slope.limit:.4g}",
+            f"{slope.quiet:.4g}",
+            "holds" if slope.holds else "FAILS",
+        )
+        for slope in sampled.slopes
+    ]
+    head = ("law", "slope T", "its step", "as stepped", "stable below", "no oscillation below", "verdict")
+    print(table(head, rows))
+
+    def number(x: float | None) -> str:
+        return "-" if x is None else "none" if math.isinf(x) else f"{x:.4g}"
+
+    bands = [
+        (b.signal, b.unit, number(b.disturbance), number(b.band), number(b.seen), number(b.noisy), b.note)
+        for b in sampled.bands
+    ]
+    if bands:
+        head = ("signal", "unit", "disturbed by, per s", "band", "seen without noise", "seen", "note")
+        print("\n" + table(head, bands) + "\n" + BAND)

@@ -5,6 +5,9 @@ layer(model)        for each state, the largest error that keeps it where a smoo
 requirement         what Theorem 1 requires of one of its gains; nothing
 robust(error)       the term that its sign adds to the rate of the error of its stage, Eqs. (12), (14); 0
 ranges(site)        where its gains are searched; about their values
+band(W, L, sampling) the band about 0 that is left of the error of its stage where it is sampled, for a disturbance up
+                    to W whose rate is up to L; None: nothing is known
+held(model)         the steepest rate of what its implicit step leaves explicit, 1/s; 0
 slide(...)          an inversion law's step that knows where its stiffness is (`laws.Relaxation`); there is none
 estimates_velocity  whether an observer needs no measured velocity; no
 """
@@ -17,8 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, Site
-from ambjax.numerics.records import is_traced
+from ambjax.numerics.records import Scalar, is_traced
 from ambjax.world.plant import Plant
 
 L = TypeVar("L")
@@ -58,6 +62,21 @@ def requirement(law: Any) -> Requirement | None:
 def robust(law: Any, error: Array) -> Array:
     """What the law's sign adds to the rate of the error of its stage."""
     return law.robust(error) if hasattr(law, "robust") else 0.0 * error
+
+
+def band(law: Any, W: float, L: float, sampling: Sampling) -> float | None:
+    """The band of the error of its stage under a disturbance up to W, of rate up to L; inf: it has none."""
+    return law.band(W, L, sampling) if hasattr(law, "band") else None
+
+
+def steps_implicitly(law: Any, implicit: bool) -> bool:
+    """Whether the law's step on a processor with these steps is one of its own."""
+    return implicit and hasattr(law, "step")
+
+
+def held(law: Any, model: Plant) -> Scalar:
+    """The steepest rate of what its implicit step leaves explicit, 1/s."""
+    return law.held(model) if hasattr(law, "held") else 0.0
 
 
 def ranges(law: Any, site: Site) -> dict[str, Interval]:
@@ -105,6 +124,12 @@ def hardened(law: L) -> L:
     """The law with None for every steepness that is inf: the sign itself. Raises ValueError as `hard_signs` does."""
     given: Any = law
     return dataclasses.replace(given, **dict.fromkeys(hard_signs(law)))
+
+
+def unhardened(law: L) -> L:
+    """The law with inf for every steepness that is None, so that its slope is a number."""
+    given: Any = law
+    return dataclasses.replace(given, **dict.fromkeys(hard_signs(law), np.inf))
 
 
 def softened(law: L, model: Plant) -> L:

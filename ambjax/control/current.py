@@ -7,6 +7,7 @@ from jax import Array
 
 from ambjax.control.answers import Requirement
 from ambjax.control.laws import CurrentInputs
+from ambjax.control.sampling import Sampling, relay_band
 from ambjax.control.search import Interval, Site, authority, rate, switch
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
@@ -55,6 +56,9 @@ class SlidingMode:
 
     def robust(self, e: Array) -> Array:
         return -self.k_i * smooth_sign(e, self.p)
+
+    def band(self, W: float, L: float, sampling: Sampling) -> float:
+        return relay_band(float(self.k_i), float(self.p), W, sampling)
 
     def ranges(self, site: Site) -> dict[str, Interval]:
         if site.stepped:

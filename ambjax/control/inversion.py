@@ -8,6 +8,7 @@ from jax import Array
 
 from ambjax.control.answers import Requirement
 from ambjax.control.laws import CurrentDemand, ForceDemand, Relaxation
+from ambjax.control.sampling import Sampling, relay_band
 from ambjax.control.search import Interval, Site
 from ambjax.numerics.apart import stored
 from ambjax.numerics.records import Scalar, gain, leaf, record
@@ -67,6 +68,9 @@ class Adaptive:
 
     def robust(self, v_tilde: Array) -> Array:
         return -self.gamma * smooth_sign(v_tilde, self.p)
+
+    def band(self, W: float, L: float, sampling: Sampling) -> float:
+        return relay_band(float(self.gamma), float(self.p), W, sampling)
 
     def ranges(self, site: Site) -> dict[str, Interval]:
         needed, words = site.delta_1

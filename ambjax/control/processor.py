@@ -11,6 +11,9 @@ from ambjax.numerics.records import Scalar, is_traced, leaf, record, static
 from ambjax.world.plant import Plant, State
 from ambjax.world.sensor import Measurement
 
+# Samples.
+MOST_DELAY = 2.0
+
 
 @record
 class Processor:
@@ -22,7 +25,11 @@ class Processor:
     """
 
     delay: Scalar = leaf(
-        default=1.0, unit="samples", at_least=0, at_most=2, doc="from measurement to voltage, computing and output"
+        default=1.0,
+        unit="samples",
+        at_least=0,
+        at_most=MOST_DELAY,
+        doc="from measurement to voltage, computing and output",
     )
     implicit: bool = static(default=True, doc="signs act on the step's end; else explicit Euler")
     predict: bool | None = static(default=None, doc="carry the estimate over the delay; None: where there is one")

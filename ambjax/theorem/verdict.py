@@ -4,6 +4,7 @@ import math
 import re
 
 from ambjax.theorem.conditions import Condition, Report
+from ambjax.theorem.processor import Sampled
 
 QUESTION = "Do the conditions of Theorem 1 hold along this run?"
 # A gain is advised this much above what it must exceed, rounded up to two digits.
@@ -12,6 +13,7 @@ MARGIN = 1.1
 FALL = 0.9
 # Above what the reference alone asks, by this factor, gamma has room for transients.
 AMPLE = 2.0
+IMPLICIT = 'discretisation = "implicit"'
 # What can be done about a run that the integrator gave up.
 STALLED = (
     "Try a smaller p of the laws ([controller.inversion] gamma p is how hard its sign is), "
@@ -55,6 +57,27 @@ def advice(report: Report) -> list[str]:
         if not line.path
     ]
     return lines
+
+
+def on_processor(sampled: Sampled, held: float | None, lost: float | None) -> list[str]:
+    """The lines below the tables of a processor: slopes, the rotor's fate, and the delays (samples) of its margin."""
+    lines = [
+        f"- {slope.stage}: slope T as stepped, {number(slope.stepped)}, must stay below {number(slope.limit)}: a "
+        f"smaller gain or p, a shorter clock.sample_period, or {'predict = true' if slope.implicit else IMPLICIT}."
+        for slope in sampled.slopes
+        if not slope.holds
+    ]
+    words = f"No, {len(lines)} of {len(sampled.slopes)} {'is' if len(lines) == 1 else 'are'} not:" if lines else "Yes."
+    fate = f"lost at {sampled.lost_at:.4g} s: {sampled.lost_why}" if math.isfinite(sampled.lost_at) else "held"
+    return [f"Are all laws stable as they are stepped? {words}", *lines, f"The rotor is {fate}.", _margin(held, lost)]
+
+
+def _margin(held: float | None, lost: float | None) -> str:
+    if held is None:
+        return "Delay margin: none, for it is lost without a delay too."
+    if lost is None:
+        return f"Delay margin: it is held with every delay tried up to {held:g} samples, the longest there is."
+    return f"Delay margin: it is held up to {held:.3g} samples and lost at {lost:.3g}."
 
 
 def _right(line: Condition) -> float:
