@@ -57,7 +57,8 @@ class Band:
     """What a signal can reach on this processor, and its largest value in the run from `settle` on, without noise and
     with the case's own.
 
-    `disturbance`: bound W of that of its rate, per s. `band`: inf where the law's gain does not exceed W, None where nothing is known of such a law. `noisy` is None where the rotor is lost under the noise.
+    `disturbance`: bound W of that of its rate, per s. `band`: inf where the law's gain does not exceed W, None where
+    nothing is known of such a law. `noisy` is None where the rotor is lost under the noise.
     """
 
     signal: str
