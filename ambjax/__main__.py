@@ -69,7 +69,8 @@ def parser() -> Parser:
     grid.add_argument("--members", type=int, metavar="N", default=1, help="members per cell (default: 1)")
     grid.add_argument("--against", metavar="OTHER.toml", action="append", help="another case, beside the first")
     _seed_option(grid)
-    command("check", "check Theorem 1's conditions along a case; exit code 1 if one fails", case=True)
+    words = "check Theorem 1's conditions along a case, or what decides on its processor; exit code 1 if one fails"
+    command("check", words, case=True)
     return top
 
 

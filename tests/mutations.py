@@ -588,4 +588,62 @@ SAMPLED = [
         "tests/test_sampled.py::test_against_the_independent_simulator[two coils]",
     ),
 ]
-MUTATIONS = [*PLANT, *LAWS, *LOOP, *METHODS, *NOISE, *ENSEMBLE, *SEARCH, *SAMPLED]
+CHECK = [
+    M(
+        "a delay that is predicted costs no drift",
+        "ambjax/control/sampling.py",
+        "drift = sampling.delay * T * W",
+        "drift = 0.0 * T * W",
+        "tests/test_check_processor.py::test_a_sign_law_stays_in_its_band_and_fills_it[implicit-1.0-inf]",
+    ),
+    M(
+        "a smoothed sign balances a disturbance at zero",
+        "ambjax/control/sampling.py",
+        "math.tan(math.pi / 2 * W / k) / p",
+        "0.0 / p",
+        "tests/test_check_processor.py::test_a_sign_law_stays_in_its_band_and_fills_it[implicit-0.0-300.0]",
+    ),
+    M(
+        "an explicit law one sample late is stable as far as one in time",
+        "ambjax/control/sampling.py",
+        "min(1 / late if late else math.inf,",
+        "min(math.inf,",
+        "tests/test_check_processor.py::test_limits_in_round_numbers",
+    ),
+    M(
+        "an implicit step is as steep as its sign",
+        "ambjax/theorem/processor.py",
+        "relaxed = 1 / (1 + 1 / slope) if slope else 0.0",
+        "relaxed = slope",
+        "tests/test_check_processor.py::test_an_implicit_step_is_no_steeper_than_one",
+    ),
+    M(
+        "what disturbs a signal is taken with the noise",
+        "ambjax/theorem/processor.py",
+        "quiet = _without_noise(scenario)",
+        "quiet = scenario",
+        "tests/test_check_processor.py::test_noise_comes_on_top_and_the_band_is_without_it",
+    ),
+    M(
+        "what a law asks for acts without its delay",
+        "ambjax/theorem/processor.py",
+        "(math.floor(delay), math.ceil(delay))]",
+        "(0, 0)]",
+        "tests/test_check_processor.py::test_the_loop_stays_in_its_bands[smoothed]",
+    ),
+    M(
+        "a delay margin changes what is predicted",
+        "ambjax/ensemble/delays.py",
+        "predict=sampling_of(cascade, clock).predict",
+        "predict=True",
+        "tests/test_check_processor.py::test_the_margin_is_between_a_delay_that_holds_and_one_that_does_not",
+    ),
+    M(
+        "a law beyond its limit decides nothing",
+        "ambjax/theorem/processor.py",
+        "return self.stepped < self.limit",
+        "return True",
+        "tests/test_check_processor.py::test_an_implicit_step_is_no_steeper_than_one",
+    ),
+]
+MUTATIONS = [*PLANT, *LAWS, *LOOP, *METHODS, *NOISE, *ENSEMBLE, *SEARCH, *SAMPLED, *CHECK]

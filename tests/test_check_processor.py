@@ -144,6 +144,22 @@ def test_the_loop_stays_in_its_bands(name):
     assert sampled.bands[1].disturbance == pytest.approx(6.231e4, rel=0.05)
 
 
+def test_an_implicit_step_is_no_steeper_than_one():
+    """a/(1 + a): stable unless the sign itself is a sample late."""
+    hard, soft = cascade_of(*HARD, delay=1.0), cascade_of(*SOFT, delay=1.0, predict=False)
+    late = dataclasses.replace(hard, processor=Processor(1.0, predict=False))
+    assert [slope.stepped for slope in processor.slopes(hard, CLOCK)] == [1.0, 1.0, 1.0]
+    assert [slope.holds for slope in processor.slopes(hard, CLOCK)] == [True, True, True]
+    assert [slope.holds for slope in processor.slopes(late, CLOCK)] == [False, True, False]
+    for slope in processor.slopes(soft, CLOCK):
+        assert slope.holds
+        assert slope.stepped == pytest.approx(slope.slope / (1 + slope.slope))
+    # what stays explicit in the position law, c T, may be all that is steep
+    (position, *_) = processor.slopes(cascade_of(3e4, 25.0, 2e6, 2000.0, 25.0), CLOCK)
+    assert position.stepped == pytest.approx(3.0)
+    assert not position.holds
+
+
 def test_noise_comes_on_top_and_the_band_is_without_it():
     noisy = dataclasses.replace(WORLD, sensor=amb.Sensor(1e-6, 1e-4, 1e-4))
     calm, rough = (processor.check(LOOPS["predicted"][0], world, CLOCK, 0.1).bands for world in (WORLD, noisy))

@@ -1,11 +1,14 @@
 """The plant against hand-derived formulas, autodiff and brute force. Eqs. (1)-(3), (9), Table 1."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 
 from ambjax import Plant, Scenario
 from ambjax.simulation.metrics import Standard, standard_for
+from ambjax.world.coils import Currents, TwoCoil
 
 PLANT = Plant()
 OTHER = Plant(m=0.7, k_z=-900.0, n=1200.0, A=0.1, s_0=4e-3, i_0=0.4, R=30.0, g=3.0)
@@ -213,3 +216,20 @@ def test_thresholds_follow_the_plant():
     assert bands.sigma_band / (pole * 4e-4) == pytest.approx(Standard().sigma_band / (528.0 * 5e-3), rel=6e-3)
     assert bands.v_tilde_band == pytest.approx(0.1 * (1.5 / 4e-4) ** 2 / (0.25 / 5e-3) ** 2)
     assert bands.e_band == pytest.approx(1e-3 * 1.5 / 0.25)
+
+
+@PLANTS
+def test_the_two_coils_in_half_their_difference_and_half_their_sum(plant):
+    """As docs/magnet.md derives it: i = (i_1 - i_2)/2 and j = (i_1 + i_2)/2 - i_0, each with its own equation."""
+    coils = TwoCoil(**dataclasses.asdict(plant))
+    z, i = points(plant)
+    j, z_dot, u = np.random.default_rng(2).uniform(-1, 1, (3, z.size)) * [[0.1], [0.1], [200.0]]
+    rates = coils.rates(Currents(z, z_dot, plant.i_0 + j + i, plant.i_0 + j - i), u)
+    s_0, i_0, R, kappa = plant.s_0, plant.i_0, plant.R, plant.kappa
+    over = z_dot / (s_0**2 - z**2)
+    i_dot = 2 * s_0 / kappa * (u - R * i) + 2 * z / kappa * R * j - over * ((i_0 + j) * s_0 + i * z)
+    j_dot = -2 * z / kappa * (u - R * i) - 2 * s_0 / kappa * R * j - over * ((i_0 + j) * z + i * s_0)
+    # sums of terms that cancel: against the largest of them
+    size = 1e-12 * (np.abs(rates.i_1) + np.abs(rates.i_2)).max()
+    np.testing.assert_allclose((rates.i_1 - rates.i_2) / 2, i_dot, rtol=0, atol=size)
+    np.testing.assert_allclose((rates.i_1 + rates.i_2) / 2, j_dot, rtol=0, atol=size)

@@ -3,7 +3,7 @@
 import functools
 
 from ambjax import Cascade, Clock, Scenario
-from ambjax.theorem import conditions
+from ambjax.theorem import conditions, processor
 from reference.markdown import code, escaped, paragraphs, table
 
 
@@ -19,7 +19,10 @@ def pages() -> dict[str, str]:
     lines += table(("condition", "must hold", "unit", "gain", "note"), rows, "keys")
     lines += ["## The steps of the proof", "", "Residuals: they inform, and decide nothing.", ""]
     steps = [(escaped(c.name), escaped(c.requires), escaped(c.unit), escaped(c.note)) for c in found.proof]
-    return {"conditions.md": "\n".join(lines + table(("step", "statement", "unit", "what is shown"), steps, "keys"))}
+    lines += table(("step", "statement", "unit", "what is shown"), steps, "keys")
+    lines += ["## On a processor", "", *paragraphs(processor)]
+    lines += ["What it decides, and how to read it: [the processor](../processor.md).", ""]
+    return {"conditions.md": "\n".join(lines)}
 
 
 @functools.cache
