@@ -629,7 +629,7 @@ CHECK = [
         "ambjax/theorem/processor.py",
         "(math.floor(delay), math.ceil(delay))]",
         "(0, 0)]",
-        "tests/test_check_processor.py::test_the_loop_stays_in_its_bands[smoothed]",
+        "tests/test_check_processor.py::test_what_a_law_asks_for_acts_late",
     ),
     M(
         "a delay margin changes what is predicted",

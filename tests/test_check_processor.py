@@ -160,6 +160,15 @@ def test_an_implicit_step_is_no_steeper_than_one():
     assert not position.holds
 
 
+@pytest.mark.parametrize(
+    ("delay", "expected"),
+    [(0.0, [1, 2, 3, 4]), (1.0, [0, 1, 2, 3]), (1.5, [0, 0.5, 1.5, 2.5]), (0.25, [0.75, 1.75, 2.75, 3.75])],
+)
+def test_what_a_law_asks_for_acts_late(delay, expected):
+    # over a sample, for a share of it what was decided a sample before the rest
+    np.testing.assert_allclose(processor._acting(np.array([1.0, 2.0, 3.0, 4.0]), delay), expected, rtol=1e-15)
+
+
 def test_noise_comes_on_top_and_the_band_is_without_it():
     noisy = dataclasses.replace(WORLD, sensor=amb.Sensor(1e-6, 1e-4, 1e-4))
     calm, rough = (processor.check(LOOPS["predicted"][0], world, CLOCK, 0.1).bands for world in (WORLD, noisy))
