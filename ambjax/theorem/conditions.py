@@ -126,6 +126,7 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock) -> Report:
     check_inputs(cascade, scenario, clock)
     if cascade.processor is not None:
         cascade, clock = cascade.in_continuous_time(), dataclasses.replace(clock, method=None)
+        scenario = scenario.in_continuous_time()
     clock = with_method(clock, cascade, scenario)
     method = str(clock.method)
     system, clock, fold = canonical((Monitored(ClosedLoop(cascade, scenario)), clock, MONITORS))
