@@ -96,7 +96,7 @@ class Space:
 
     def values(self, cascade: Cascade) -> np.ndarray:
         """The gains of a cascade in order, [m]."""
-        return np.array([float(_read(cascade, gain.path)) for gain in self.gains])
+        return np.array([float(read(cascade, gain.path)) for gain in self.gains])
 
     def gains_at(self, x: Array) -> Array:
         """Gains [m] at coordinates [m]."""
@@ -140,7 +140,8 @@ def tunable(cascade: Cascade, *, steepness: bool = True) -> list[str]:
     return paths
 
 
-def _read(cascade: Cascade, path: str) -> Any:
+def read(cascade: Cascade, path: str) -> Any:
+    """The gain of a cascade at a dotted path."""
     _, stage, name = path.split(".")
     return getattr(getattr(cascade, stage), name)
 

@@ -8,7 +8,7 @@ from jax import Array
 from ambjax.control.answers import Requirement
 from ambjax.control.laws import CurrentInputs
 from ambjax.control.sampling import Sampling, relay_band
-from ambjax.control.search import Interval, Site, authority, rate, switch
+from ambjax.control.search import Interval, Site, authority, rate, steepness, switch
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
@@ -63,7 +63,8 @@ class SlidingMode:
     def ranges(self, site: Site) -> dict[str, Interval]:
         if site.stepped:
             fast = site.w * float(site.model.i_0)
-            return {"k_i": authority(site, fast, (0.1, 1e3), "w i_0: the bias current at the pole", "Q_i")}
+            k_i = authority(site, fast, (0.1, 1e3), "w i_0: the bias current at the pole", "Q_i")
+            return {"k_i": k_i, **steepness(site, "k_i")}
         return {"k_i": switch(site, "k_i", self.p, 200, "Q_i")}
 
 

@@ -9,7 +9,7 @@ from jax import Array
 from ambjax.control.answers import Requirement
 from ambjax.control.laws import CurrentDemand, ForceDemand, Relaxation
 from ambjax.control.sampling import Sampling, relay_band
-from ambjax.control.search import Interval, Site
+from ambjax.control.search import Interval, Site, steepness
 from ambjax.numerics.apart import stored
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.numerics.relax import relax
@@ -76,7 +76,8 @@ class Adaptive:
         needed, words = site.delta_1
         name = words.partition(" ")[0]
         times = 1000 if site.stepped else 100
-        return {"gamma": Interval(needed, times * needed, f"{name} to {times} {name}, {words}")}
+        gamma = Interval(needed, times * needed, f"{name} to {times} {name}, {words}")
+        return {"gamma": gamma, **steepness(site, "gamma")}
 
     def slide(self, model: Plant, begin: ForceDemand, end: ForceDemand, i_ref: Array, h: Scalar) -> Relaxation:
         """i_ref over a step: it slides to the sign's layer, and is slaved to v_star from there on. Eq. (14a)."""

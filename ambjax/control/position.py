@@ -7,7 +7,7 @@ from jax import Array
 
 from ambjax.control.answers import Requirement
 from ambjax.control.sampling import Sampling, relay_band, twisting_band
-from ambjax.control.search import Interval, Site, authority, manifold, rate, switch
+from ambjax.control.search import Interval, Site, authority, manifold, rate, steepness, switch
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share, twist
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_root, smooth_sign
@@ -79,7 +79,7 @@ class SlidingMode:
             k = authority(site, most, (1e-3, 0.3), "w^2 s_0: what the magnets accelerate the rotor by", "Q_z")
         else:
             k = switch(site, "k", self.p, 100, "Q_z")
-        return {"c": manifold(site), "k": k}
+        return {"c": manifold(site), "k": k, **steepness(site, "k")}
 
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()], period: Scalar

@@ -32,13 +32,15 @@ class Site(NamedTuple):
 class Interval(NamedTuple):
     """Where a gain is looked for first, log-uniform, and where that comes from, in words.
 
-    `firm`: it may not end beyond, or beyond where it starts.
+    `firm`: it may not end beyond, or beyond where it starts. `times`: another gain of the law; low to high is then that
+    of the product of both, which is what matters.
     """
 
     low: float
     high: float
     source: str
     firm: bool = False
+    times: str = ""
 
 
 def manifold(site: Site) -> Interval:
@@ -68,6 +70,15 @@ def authority(site: Site, size: Scalar, share: tuple[float, float], what: str, o
     if 2 * below > low:
         words += f"; at least twice the disturbance, {below:.3g}"
     return Interval(max(low, 2 * below), max(high, 200 * below), words)
+
+
+def steepness(site: Site, name: str) -> dict[str, Interval]:
+    """The steepness p of a sign on a processor, by its slope with the gain of this name; else nothing is said of it."""
+    if not site.stepped:
+        return {}
+    low, high = (slope / TWO_OVER_PI for slope in (site.w / 3, 10 / site.period))
+    words = f"slope 2/pi {name} p from w/3 to 10/T, hardly less than the sign itself; {site.pole}"
+    return {"p": Interval(low, high, words, times=name)}
 
 
 def rate(site: Site, low: float, high: float, words: str, per: Scalar = 1.0, power: int = 1) -> Interval:

@@ -9,7 +9,7 @@ from ambjax.control import answers
 from ambjax.control.search import Interval, Site
 from tuning.objective.conditions import Bound
 from tuning.objective.members import Objective
-from tuning.space import Gain, Space
+from tuning.space import Gain, Space, read
 
 # Displacement that a rotor at rest is at least expected to make, as a share of the clearance.
 STIR = 0.01
@@ -23,12 +23,16 @@ WIDE = 1e3
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """Where a gain is looked for first, the largest value that it may take, and where these come from, in words."""
+    """Where a gain is looked for first, the largest value that it may take, and where these come from, in words.
+
+    `product`: the path of another gain of the space, and the range of the product of both.
+    """
 
     low: float
     high: float
     most: float
     source: str
+    product: tuple[str, float, float] | None = None
 
 
 def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray) -> list[Range]:
@@ -37,8 +41,23 @@ def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarra
 
     A gain may end at up to BEYOND times the end of its range or of where it starts, a firm one only at these.
     """
-    site = _site(objective, conditions)
-    return [_range(site, objective.cascade, *one) for one in zip(objective.space.gains, start, strict=True)]
+    site, gains = _site(objective, conditions), objective.space.gains
+    asked = [_interval(site, objective.cascade, *one) for one in zip(gains, start, strict=True)]
+    found = {gain.path: _range(*one) for gain, *one in zip(gains, gains, start, asked, strict=True) if not one[2].times}
+    for gain, value, one in zip(gains, start, asked, strict=True):
+        if one.times:
+            found[gain.path] = _quotient(gain, value, one, objective.cascade, found)
+    return [found[gain.path] for gain in gains]
+
+
+def drawn(space: Space, box: list[Range], cube: np.ndarray) -> np.ndarray:
+    """Gains [n, m] at points of the unit cube [n, m] of their ranges, log-uniform."""
+    ends = np.log([one.product[1:] if one.product else (one.low, one.high) for one in box])
+    gains = np.exp(ends[:, 0] + cube * (ends[:, 1] - ends[:, 0]))
+    for j, one in enumerate(box):
+        if one.product:
+            gains[:, j] /= gains[:, space.paths.index(one.product[0])]
+    return gains
 
 
 def bounded(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray) -> tuple[Space, list[Range]]:
@@ -72,12 +91,29 @@ def _site(objective: Objective, conditions: tuple[Bound, ...]) -> Site:
     return Site(model, w, float(objective.clock.sample_period), bounds, needed, stepped)
 
 
-def _range(site: Site, cascade: Any, gain: Gain, value: float) -> Range:
+def _interval(site: Site, cascade: Any, gain: Gain, value: float) -> Interval:
     if gain.low > 0 and np.isfinite(gain.high):
-        return Range(gain.low, gain.high, gain.high, "tune.bounds")
+        return Interval(gain.low, gain.high, "tune.bounds", True)
     _, stage, name = gain.path.split(".")
     about = Interval(value / ABOUT, value * ABOUT, f"a factor of {ABOUT:g} about the case's value")
-    low, high, source, firm = answers.ranges(getattr(cascade, stage), site).get(name, about)
+    return answers.ranges(getattr(cascade, stage), site).get(name, about)
+
+
+def _quotient(gain: Gain, value: float, asked: Interval, cascade: Any, found: dict[str, Range]) -> Range:
+    """The range of a gain of which that of its product with another is asked."""
+    other = f"{gain.path.rpartition('.')[0]}.{asked.times}"
+    if other not in found:
+        size = float(read(cascade, other))
+        return _range(gain, value, asked._replace(low=asked.low / size, high=asked.high / size))
+    ends = asked.low / found[other].high, asked.high / found[other].low
+    whole = _range(gain, value, asked._replace(low=ends[0], high=ends[1]))
+    return dataclasses.replace(whole, product=(other, asked.low, asked.high))
+
+
+def _range(gain: Gain, value: float, asked: Interval) -> Range:
+    if gain.low > 0 and np.isfinite(gain.high):
+        return Range(gain.low, gain.high, gain.high, asked.source)
+    low, high, source = asked[:3]
     if gain.low > 0 or np.isfinite(gain.high):
         source += "; within tune.bounds"
     low, high = max(low, gain.low * 1.05), min(high, gain.high / 1.05)
@@ -87,5 +123,5 @@ def _range(site: Site, cascade: Any, gain: Gain, value: float) -> Range:
         low = high / WIDE
     if np.isfinite(gain.high):
         return Range(low, high, gain.high, source)
-    most = max(high, value) * (1 if firm else BEYOND)
+    most = max(high, value) * (1 if asked.firm else BEYOND)
     return Range(low, high, most, f"{source}; may end at up to {most:.3g}")

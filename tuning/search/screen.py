@@ -7,7 +7,7 @@ from tuning.objective.conditions import Bound
 from tuning.objective.engine import Engine
 from tuning.objective.goal import Goal
 from tuning.objective.members import Members, Objective
-from tuning.objective.ranges import ranges
+from tuning.objective.ranges import drawn, ranges
 
 # Share of the members that points meet, and share of the points that goes on: 1/4 after an eighth of the members.
 ROUNDS = (8, 4), (4, 1)
@@ -26,9 +26,9 @@ def everywhere(
     if not count:
         return space.encode(space.clip(start))[None]
     box = ranges(objective, conditions, start)
-    low, high = np.log([r.low for r in box]), np.log([r.high for r in box])
     cube = points("sobol", seed, len(space), np.arange(count), count)
-    gains = np.concatenate([start[None], np.exp((low + high) / 2)[None], np.exp(low + cube * (high - low))])
+    middle = np.full((1, len(space)), 0.5)
+    gains = np.concatenate([start[None], drawn(space, box, np.concatenate([middle, cube]))])
     return np.stack([space.encode(space.clip(g)) for g in gains])
 
 
