@@ -7,8 +7,10 @@ again. The numbers are those of 1,000 held-out members. Run: python benchmarks/t
 import argparse
 import json
 import pathlib
+import resource
 import subprocess
 import sys
+from typing import Any
 
 import _measure
 
@@ -17,35 +19,60 @@ TASKS = pathlib.Path(__file__).parent / "tasks"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("tasks", nargs="*", default=sorted(path.stem for path in TASKS.glob("*.toml")))
+    parser.add_argument("tasks", nargs="*", default=names(TASKS))
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out", "tasks"))
     given = parser.parse_args()
     rows = {}
     for name in given.tasks:
-        path, out = TASKS / f"{name}.toml", given.out / name
-        if not (out / "report.json").exists():
-            subprocess.run([sys.executable, "-m", "tuning", str(path), "--out", str(out)], check=False)
-        told = json.loads((out / "report.json").read_text())
-        after = told["after"]
-        rows[name] = {
-            "title": path.read_text().splitlines()[0].removeprefix("# Tuning task ").partition(". ")[0],
-            "gains": {row["path"]: row["after"] for row in told["gains"]},
-            "at_bound": [row["path"] for row in told["gains"] if row["at_bound"]],
-            "lost_before": told["before"]["lost"],
-            "step_error": told["step_error"]["relative"],
-            "conditions": {row["name"]: row["margin"] for row in told["conditions"]},
-            **{key: after[key] for key in ("members", "lost", "settled_rms_error_m", "settled_max_abs_error_m")},
-            "settled_rms_u_V": after["settled_rms_u_V.mean"],
-            **{key: told["search"][key] for key in ("rollouts", "iterations", "seconds")},
-        }
-        row = rows[name]
-        print(
-            f"{row['title']}: settled rms {row['settled_rms_error_m']:.2e} m, largest "
-            f"{row['settled_max_abs_error_m']:.2e} m, {row['lost']} of {row['members']} lost, steps off by "
-            f"{100 * row['step_error']:.1g} %, {row['seconds']:.0f} s",
-            flush=True,
-        )
+        rows[name] = row = tuned(TASKS / f"{name}.toml", given.out / name)
+        print(told(row), flush=True)
     _measure.write("tasks", {"tasks": rows})
+
+
+def names(folder: pathlib.Path) -> list[str]:
+    """Names of the tasks in a folder of case files."""
+    return sorted(path.stem for path in folder.glob("*.toml"))
+
+
+def tuned(path: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
+    """What the tuner made of a case file, whose first line is its title; its report is, or will be, in `out`."""
+    spent = out / "processor_s"
+    if not (out / "report.json").exists():
+        began = _processor_seconds()
+        subprocess.run([sys.executable, "-m", "tuning", str(path), "--out", str(out)], check=False)
+        spent.write_text(str(_processor_seconds() - began))
+    report = json.loads((out / "report.json").read_text())
+    after = report["after"]
+    return {
+        "title": path.read_text().splitlines()[0].removeprefix("# Tuning task ").partition(". ")[0],
+        "gains": {row["path"]: row["after"] for row in report["gains"]},
+        "at_bound": [row["path"] for row in report["gains"] if row["at_bound"]],
+        "lost_before": report["before"]["lost"],
+        "verified": report["verified"],
+        "step_error": report["step_error"]["relative"],
+        "conditions": {row["name"]: row["margin"] for row in report["conditions"]},
+        **{key: after[key] for key in ("members", "lost", "settled_rms_error_m", "settled_max_abs_error_m")},
+        "settled_rms_u_V": after["settled_rms_u_V.mean"],
+        "rms_u_V": after["rms_u_V.mean"],
+        "chatter_V": after["chatter_V.mean"],
+        **{key: report["search"][key] for key in ("rollouts", "iterations", "seconds")},
+        "processor_s": float(spent.read_text()) if spent.exists() else None,
+    }
+
+
+def told(row: dict[str, Any]) -> str:
+    """A row in one line."""
+    return (
+        f"{row['title']}: settled rms {row['settled_rms_error_m']:.2e} m, largest "
+        f"{row['settled_max_abs_error_m']:.2e} m, {row['lost']} of {row['members']} lost, steps off by "
+        f"{100 * row['step_error']:.1g} %, {row['seconds']:.0f} s"
+    )
+
+
+def _processor_seconds() -> float:
+    """Processor seconds of all processes that were run and ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 if __name__ == "__main__":

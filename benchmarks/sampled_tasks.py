@@ -1,0 +1,49 @@
+"""The tuning tasks on a processor, as tasks.py runs those in continuous time; beside each the bar that it is to reach.
+
+A bar is what another search, CMA-ES on an independent simulator, found for the same loop. Where a task is one of
+tasks.py on a processor, that is run too: its processor seconds stand beside.
+Run: python benchmarks/sampled_tasks.py [--out DIR] [TASK ...]
+"""
+
+import argparse
+import pathlib
+
+import _measure
+import tasks
+
+SAMPLED = tasks.TASKS / "sampled"
+# Settled rms error, m. "-signs": by signs that are not smoothed.
+BARS = {
+    "A10": 9e-7,
+    "A10-signs": 1.1e-6,
+    "A10L": 2.5e-6,
+    "C10": 1.25e-6,
+    "C10-signs": 1.3e-6,
+    "F10": 7.8e-7,
+    "F10-signs": 9.5e-7,
+    "F20": 5e-7,
+    "F20-signs": 5.3e-7,
+    "G20": 1.3e-6,
+}
+COUNTERPARTS = {"A10": "A", "C10": "C"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("tasks", nargs="*", default=tasks.names(SAMPLED))
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out", "tasks"))
+    given = parser.parse_args()
+    rows = {}
+    for name in given.tasks:
+        row = tasks.tuned(SAMPLED / f"{name}.toml", given.out / name)
+        rows[name] = row | {"bar_m": BARS[name]}
+        reached = row["settled_rms_error_m"] <= BARS[name] and row["lost"] == 0
+        print(f"{tasks.told(row)}; {'reaches' if reached else 'misses'} {BARS[name]:.3g} m", flush=True)
+        if other := COUNTERPARTS.get(name):
+            continuous = tasks.tuned(tasks.TASKS / f"{other}.toml", given.out / other)
+            rows[name]["continuous"] = {key: continuous[key] for key in ("seconds", "processor_s", "rollouts")}
+    _measure.write("sampled_tasks", {"tasks": rows})
+
+
+if __name__ == "__main__":
+    main()
