@@ -29,6 +29,7 @@ the search, CMA-ES and Nelder-Mead were run on another day, beside other work: t
     .venv/bin/python benchmarks/gradients.py         # what a gradient costs, in time and memory
     .venv/bin/python benchmarks/workarounds.py       # what each workaround of XLA's compiler gains
     .venv/bin/python benchmarks/tasks.py             # the five tuning tasks
+    .venv/bin/python benchmarks/sampled_tasks.py     # those on a processor
     .venv/bin/python benchmarks/search.py            # their search against derivative-free ones
     .venv/bin/python benchmarks/report.py
 """
@@ -193,6 +194,28 @@ def tasks() -> list[str]:
     return lines + table(titles, rows)
 
 
+def sampled_tasks() -> list[str]:
+    data = load("sampled_tasks")
+    lines = ["## The tuning tasks on a processor (`sampled_tasks.py`)", "", facts(data["machine"])]
+    lines += [
+        "As above, on a processor of 10 or 20 kHz whose voltage is a sample late. Bar: what 2 x 900 evaluations of",
+        "CMA-ES on 6 members found with an independent simulator of the same loop. Seconds: of all that `ambjax-tune`",
+        "does, on one processor; in brackets those of the same task in continuous time, in the same run.",
+        "",
+    ]
+    rows = []
+    for row in data["tasks"].values():
+        gains = ", ".join(f"{path.rpartition('.')[2]} {value:.4g}" for path, value in row["gains"].items())
+        cells = [row["title"], f"{row['bar_m']:.3g}", f"{row['settled_rms_error_m']:.2e}"]
+        cells += [f"{row['settled_max_abs_error_m']:.1e}", f"{row['lost']} of {row['members']}"]
+        cells += [f"{row['rms_u_V']:.0f}", f"{row['chatter_V']:.1e}", f"{row['rollouts']:,}"]
+        continuous = row.get("continuous", {}).get("processor_s")
+        cells += [f"{row['processor_s']:.0f}" + (f" ({continuous:.0f})" if continuous else ""), gains]
+        rows.append(cells)
+    titles = "task | bar (m) | settled rms error (m) | largest (m) | lost | u rms (V) | u moves by (V) | rollouts | "
+    return lines + table(titles + "processor (s) | gains", rows)
+
+
 def search() -> list[str]:
     """One table for each task."""
     data = load("search")
@@ -238,6 +261,7 @@ SECTIONS = {
     "held_noise": held_noise,
     "gradients": gradients,
     "tasks": tasks,
+    "sampled_tasks": sampled_tasks,
     "search": search,
     "gpu": gpu,
 }

@@ -432,6 +432,20 @@ SEARCH = [
         "tests/test_tuning_study.py::test_starts_reach_as_far_as_the_theory_suggests",
     ),
     M(
+        "the screen draws a steepness without regard to the gain beside it",
+        "tuning/objective/ranges.py",
+        "gains[:, j] /= gains[:, space.paths.index(one.product[0])]",
+        "gains[:, j] /= one.product[1]",
+        "tests/test_tuning_foreign.py::test_on_a_processor_a_steepness_is_looked_for_by_its_slope",
+    ),
+    M(
+        "a steepness whose gain is not tuned has the range of the slope itself",
+        "tuning/objective/ranges.py",
+        "asked._replace(low=asked.low / size, high=asked.high / size)",
+        "asked",
+        "tests/test_tuning_foreign.py::test_on_a_processor_a_steepness_is_looked_for_by_its_slope",
+    ),
+    M(
         "a range comes from a zero",
         "tuning/objective/ranges.py",
         "(STIR * float(scenario.touchdown),",

@@ -182,11 +182,14 @@ def test_what_a_law_answers_beside_its_output(stage, law):
         assert required.gain in gains(law)
         assert np.all(robust * ERRORS <= 0)
         assert np.max(np.abs(robust)) == pytest.approx(getattr(law, required.gain), rel=0.02)
-    for name, interval in answers.ranges(law, SITE).items():
+    steep = [f.name for f in dataclasses.fields(law) if f.metadata.get("steepness")]
+    signs = dataclasses.replace(law, **dict.fromkeys(steep, np.inf))
+    ranges = [answers.ranges(law, SITE), *(answers.ranges(one, SITE._replace(stepped=True)) for one in (law, signs))]
+    for name, interval in itertools.chain(*(found.items() for found in ranges)):
         assert name in gains(law)
+        assert not interval.times or interval.times in gains(law)
         assert 0 < interval.low < interval.high < np.inf
         assert interval.source
-    steep = [f.name for f in dataclasses.fields(law) if f.metadata.get("steepness")]
     assert bool(steep) == hasattr(law, "size")
     # a plant twice as wide, of the same pole: errors of twice the size meet a sign half as steep
     wide = dataclasses.replace(MODEL, s_0=2 * MODEL.s_0, i_0=MODEL.i_0 * 8**0.5)

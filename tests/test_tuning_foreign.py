@@ -20,6 +20,7 @@ from tuning.__main__ import main
 from tuning.command import _laws
 from tuning.report.tuned import tuned
 from tuning.search.screen import around, everywhere
+from tuning.space import read
 
 CASES = pathlib.Path(__file__).parent / "cases"
 BEARINGS = {path.stem: path.read_text() for path in sorted(CASES.glob("*.toml"))}
@@ -103,6 +104,29 @@ def test_sources_name_the_pole_and_the_cap():
     c = problem_from(BEARINGS["rotor"] + "[clock]\nsample_period = 1e-5\nduration = 0.1\n").ranges[0]
     assert c.high == pytest.approx(10 * w)
     assert "1/(5 T)" not in c.source
+
+
+@pytest.mark.parametrize("beside", [True, False], ids=["gains too", "p alone"])
+def test_on_a_processor_a_steepness_is_looked_for_by_its_slope(beside):
+    """2/pi gain p from w/3 to 10/T, whatever the gain beside it is: the screen's own draw, or the case's number."""
+    names = ["position.k", "inversion.gamma", "current.k_i"]
+    paths = [f"controller.{name}" for name in (names if beside else [])]
+    paths += [f"controller.{name.partition('.')[0]}.p" for name in names]
+    found = problem_from(COMMON["tracking"] + "\n[processor]\n", gains=paths)
+    for where in found.ranges:
+        assert 0 < where.low < where.high <= where.most < np.inf
+    space, start = found.objective.space, found.tune.space.values(found.case.cascade)
+    screen = everywhere(found.objective, found.goal.conditions, start, 64, 1)[1:]
+    gains = np.array([space.gains_at(jnp.asarray(x)) for x in screen])
+    case = np.array([read(found.case.cascade, f"controller.{name}") for name in names])
+    slopes = 2 / np.pi * gains[:, -3:] * (gains[:, :3] if beside else case)
+    low, high = found.case.scenario.plant.pole / 3, 10 / found.case.clock.sample_period
+    # 64 points of a Sobol sequence come within 2/64 of the ends, of a range of a factor of 570: 22 %; coordinates bend
+    # within a quarter of a bound, in logarithms
+    assert np.all(slopes >= 0.9 * low)
+    assert np.all(slopes <= 1.1 * high)
+    np.testing.assert_allclose(slopes.min(axis=0), low, rtol=0.25)
+    np.testing.assert_allclose(slopes.max(axis=0), high, rtol=0.25)
 
 
 # --- defaults that follow the plant ---

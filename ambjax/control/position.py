@@ -141,12 +141,19 @@ class SuperTwisting:
         return self.c
 
     def ranges(self, site: Site) -> dict[str, Interval]:
+        if site.stepped:
+            return {"c": manifold(site), **self._authorities(site)}
         root, integral = float(self.p) ** 0.5, TWO_OVER_PI * float(self.p)
         return {
             "c": manifold(site),
             "k_1": rate(site, 1 / 3, 100, "slope k_1 sqrt(p) from w/3 to 100 w", root),
             "k_2": rate(site, 1e-2, 10, "corner sqrt(2/pi k_2 p) from w/100 to 10 w", integral, 2),
         }
+
+    def _authorities(self, site: Site) -> dict[str, Interval]:
+        size = float(site.model.s_0)
+        root = authority(site, (site.w**3 * size) ** 0.5, (1e-3, 0.3), "sqrt(w^3 s_0)")
+        return {"k_1": root, "k_2": authority(site, site.w**3 * size, (1e-5, 0.1), "w^3 s_0")}
 
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: Array, period: Scalar

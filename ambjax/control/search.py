@@ -62,7 +62,7 @@ def switch(site: Site, name: str, p: Scalar, times: float, over: str) -> Interva
     return Interval(max(low, 2 * below), max(high, 200 * below), words)
 
 
-def authority(site: Site, size: Scalar, share: tuple[float, float], what: str, over: str) -> Interval:
+def authority(site: Site, size: Scalar, share: tuple[float, float], what: str, over: str = "") -> Interval:
     """A switching gain on a processor, where no slope limits it: these shares of `size`, which is `what` in words."""
     below = site.bounds.get(over, 0.0)
     low, high = (part * float(size) for part in share)
