@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("tasks", nargs="*", default=tasks.names(SAMPLED))
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out", "tasks"))
     given = parser.parse_args()
-    rows = {}
+    rows = tasks.kept("sampled_tasks")
     for name in given.tasks:
         row = tasks.tuned(SAMPLED / f"{name}.toml", given.out / name)
         rows[name] = row | {"bar_m": BARS[name]}
@@ -42,7 +42,7 @@ def main() -> None:
         if other := COUNTERPARTS.get(name):
             continuous = tasks.tuned(tasks.TASKS / f"{other}.toml", given.out / other)
             rows[name]["continuous"] = {key: continuous[key] for key in ("seconds", "processor_s", "rollouts")}
-    _measure.write("sampled_tasks", {"tasks": rows})
+    _measure.write("sampled_tasks", {"tasks": dict(sorted(rows.items()))})
 
 
 if __name__ == "__main__":
