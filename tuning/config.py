@@ -10,13 +10,16 @@ import numpy as np
 from ambjax.cases.reader import Case, case_from, load
 from ambjax.cases.table import Table, one_line, show
 from ambjax.ensemble.spread import require_path
+from tuning.objective.limits import KINDS, SHARE, Limit
 from tuning.objective.loss import TERMS
 from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.optimisers import BFGS, NAMES
 from tuning.space import Gain, Space, tunable
 
 WEIGHTS = {"tracking": 1.0, "peak": 0.0, "effort": 0.1, "chatter": 0.1, "clearance": 1e-3, "survival": 1.0}
-WORDS = ["gains", "bounds", "weights", "risk", "alpha", "optimiser"]
+WORDS = ["gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
+# Band of the settling time, left out: a share of the clearance.
+BAND = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,11 +48,26 @@ class Budget:
 
 
 @dataclasses.dataclass(frozen=True)
+class Limits:
+    """What [tune.limits] says."""
+
+    each: tuple[Limit, ...] = ()
+    """in the order of their names"""
+    survival: float = 1.0
+    """share of the held-out members that must be held"""
+    margin: float = 0.02
+    """share by which the search stays below each"""
+    band: float = 0.0
+    """of the settling time, m"""
+
+
+@dataclasses.dataclass(frozen=True)
 class Tune:
     """Everything that [tune] says. `weights` in the order of TERMS."""
 
     space: Space
     weights: tuple[float, ...]
+    limits: Limits
     conditions: float
     margin: float
     early: float
@@ -83,6 +101,7 @@ def tune_from(table: Table, case: Case) -> Tune:
     return Tune(
         space=_space(table, case),
         weights=weights,
+        limits=_limits(table.table("limits"), case),
         conditions=conditions,
         margin=_positive(table, "conditions_margin", 0.1, zero=True),
         early=_positive(table, "early", 0.0, zero=True),
@@ -149,6 +168,37 @@ def _weights(table: Table) -> tuple[tuple[float, ...], float]:
     return tuple(given[name] for name in TERMS), given["conditions"]
 
 
+def _limits(table: Table, case: Case) -> Limits:
+    table.only([*KINDS, "survival", "margin", "settling_band_m"])
+    most = {"clearance_used": 1.0}
+    asked = {name: _limit(table, name, most.get(name, math.inf)) for name in KINDS if name in table.raw}
+    u_max, source = float(np.max(np.asarray(case.scenario.u_max))), dict.fromkeys(asked, table.path)
+    if "rms_u_V" not in asked and math.isfinite(u_max):
+        asked["rms_u_V"], source["rms_u_V"] = SHARE * u_max, f"by default, {100 * SHARE:g} % of actuator.u_max"
+    if "settling_band_m" in table.raw and "settling_s" not in asked:
+        raise ValueError(f"{table.at('settling_band_m')} has a meaning beside {table.at('settling_s')} only. Give both.")
+    clearance = float(np.min(np.asarray(case.scenario.touchdown)))
+    band = _positive(table, "settling_band_m", BAND * clearance)
+    if band >= clearance:
+        raise ValueError(
+            f"{table.at('settling_band_m')} = {band:g} m: it must be below the clearance, {clearance:g} m "
+            "(run.clearance, by default 0.9 of plant.s_0)."
+        )
+    margin = _positive(table, "margin", Limits.margin, zero=True)
+    if margin >= 0.5:
+        raise ValueError(f"{table.at('margin')} = {margin:g}: it must be below 0.5, a share of each limit.")
+    each = tuple(Limit(name, asked[name], source[name]) for name in sorted(asked) if math.isfinite(asked[name]))
+    return Limits(each, _limit(table, "survival", 1.0, default=1.0), margin, band)
+
+
+def _limit(table: Table, key: str, most: float, default: float = math.nan) -> float:
+    words = "a number above 0, or inf for none" if math.isinf(most) else f"a number above 0 and at most {most:g}"
+    value = table.number(key, default, words)
+    if not 0 < value <= most:
+        raise ValueError(f"{table.at(key)} = {value:g}: it must be {words}.")
+    return value
+
+
 def _risk(table: Table) -> Risk:
     name = table.choice("risk", ["mean", "cvar", "soft-worst"], "mean")
     if name != "cvar":
@@ -185,6 +235,8 @@ def settings(tune: Tune) -> dict[str, Any]:
         "gains": tune.space.paths,
         "bounds": {gain.path: [gain.low, gain.high] for gain in tune.space.gains},
         "weights": dict(zip(TERMS, tune.weights, strict=True)) | {"conditions": tune.conditions},
+        "limits": {limit.name: limit.asked for limit in tune.limits.each}
+        | {"survival": tune.limits.survival, "margin": tune.limits.margin, "settling_band_m": tune.limits.band},
         "risk": str(tune.risk),
     }
     rest = {

@@ -13,6 +13,7 @@ from tuning.config import Tune
 from tuning.objective.conditions import bounds
 from tuning.objective.engine import Engine
 from tuning.objective.goal import Goal
+from tuning.objective.limits import Limit, measures
 from tuning.objective.loss import loss_for
 from tuning.objective.members import Objective
 from tuning.objective.ranges import Range, bounded
@@ -39,18 +40,35 @@ class Problem:
     finer: int = 1
     """how many times as fine its steps are as [tune] asks for"""
 
+    @property
+    def sampled(self) -> bool:
+        """Whether the laws run on a processor: their steps are the loop's own, and only the plant is integrated."""
+        return self.case.cascade.processor is not None
+
     @functools.cached_property
     def reference(self) -> Engine:
-        """The same objective in accurate steps."""
-        return self._stepping(
-            integrate.AdaptiveRodas3(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS), lanes=REFERENCE_MEMBERS
-        )
+        """The same objective in accurate steps; of a plant alone, which is not stiff, in steps FINE times as fine."""
+        accurate = integrate.AdaptiveRodas3(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS)
+        return self._stepping(self._fine if self.sampled else accurate, lanes=REFERENCE_MEMBERS)
 
     @functools.cached_property
     def judging(self) -> Engine:
-        """The same objective in steps FINE times as fine: what a report prints."""
+        """The same objective in steps FINE times as fine: what a report prints. On a processor the search's own."""
+        return self.engine if self.sampled else self._stepping(self._fine, threads=self.engine.threads)
+
+    @property
+    def _fine(self) -> integrate.Integrator:
         method: Any = self.objective.clock.method
-        return self._stepping(dataclasses.replace(method, substeps=FINE * method.substeps), threads=self.engine.threads)
+        return dataclasses.replace(method, substeps=FINE * method.substeps)
+
+    @property
+    def accurate(self) -> str:
+        """What the accurate steps are, in words."""
+        return f"{FINE} times as many steps of the plant" if self.sampled else "adaptive RODAS3"
+
+    def limited(self, limits: tuple[Limit, ...]) -> "Problem":
+        """With limits that have learnt something."""
+        return dataclasses.replace(self, goal=dataclasses.replace(self.goal, limits=limits))
 
     def _stepping(self, method: integrate.Integrator, **more: Any) -> Engine:
         objective = dataclasses.replace(self.objective, clock=dataclasses.replace(self.objective.clock, method=method))
@@ -71,12 +89,14 @@ def method_for(case: Case, substeps: int, finer: int) -> integrate.Integrator:
 def problem_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = None) -> Problem:
     """The problem of a case, in steps `finer` times as fine as [tune] asks for."""
     clock = Clock(case.clock.samples, case.clock.sample_period, method_for(case, tune.budget.substeps, finer))
-    loss = loss_for(case.scenario, case.settle, tune.early)
+    limits = tune.limits
+    measured = measures(limits.each, case.scenario, clock, case.settle, limits.band)
+    loss = loss_for(case.scenario, case.settle, tune.early, measured)
     objective = Objective(tune.space, case.cascade, case.scenario, clock, loss, case.spread)
     conditions = bounds(case.cascade, case.scenario, clock)
     space, box = bounded(objective, conditions, tune.space.values(case.cascade))
     objective = dataclasses.replace(objective, space=space)
-    goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin)
+    goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin, limits.each, limits.margin)
     mode = "forward" if len(tune.space) <= MOST_FORWARD else "reverse"
     return Problem(
         case, tune, objective, Engine(objective, settle=case.settle, mode=mode, threads=threads), goal, box, finer

@@ -21,7 +21,7 @@ from ambjax.extend import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.metrics import Named, standard_for
 from ambjax.world.scenario import Scenario
-from tuning.objective.loss import TERMS, Loss, weigh
+from tuning.objective.loss import TERMS, Loss, outcomes
 from tuning.objective.members import Members, Objective
 from tuning.space import Space
 
@@ -58,37 +58,39 @@ class Folded:
 
 @dataclasses.dataclass(frozen=True)
 class Slope:
-    """The weighed loss of a lane, its derivatives [m] and the terms, in forward or reverse mode."""
+    """The outcomes of a lane [1 + L], its loss and what limits hold, their derivatives [1 + L, m] and the terms, in
+    forward or reverse mode."""
 
     space: Space
     reverse: bool
 
     def __call__(self, lane: Lane) -> Any:
         if self.reverse:
-            (value, terms), slope = jax.value_and_grad(self._loss, has_aux=True)(lane.x, lane)
-            return value, slope, terms
+            values, pull, terms = jax.vjp(lambda x: self._outcomes(x, lane), lane.x, has_aux=True)
+            (slopes,) = jax.vmap(pull)(jnp.eye(len(values), dtype=values.dtype))
+            return values, slopes, terms
 
-        one = jax.custom_batching.custom_vmap(lambda lane: self._along(self._loss, lane))
+        one = jax.custom_batching.custom_vmap(lambda lane: self._along(self._outcomes, lane))
 
         # Directions outside, lanes inside: what is contiguous in memory is as long as a vector.
         @one.def_vmap
         def every(size: int, batched: Any, lane: Lane) -> Any:
             axes = jax.tree.map(lambda moves: 0 if moves else None, batched[0])
-            results = self._along(jax.vmap(self._loss, (0, axes)), lane)
+            results = self._along(jax.vmap(self._outcomes, (0, axes)), lane)
             return results, jax.tree.map(lambda _: True, results)
 
         return one(lane)
 
-    def _loss(self, x: Array, lane: Lane) -> tuple[Array, dict[str, Array]]:
+    def _outcomes(self, x: Array, lane: Lane) -> tuple[Array, dict[str, Array]]:
         terms = Objective(self.space, *lane.world).run(x, lane.who, lane.world[-1])
-        return weigh(lane.weights, terms, lane.who.stressed), terms
+        return jnp.stack(outcomes(lane.weights, terms, lane.who.stressed)), terms
 
-    def _along(self, loss: Callable[..., Any], lane: Lane) -> Any:
-        """Losses, derivatives along each coordinate and terms, of one lane or of many."""
+    def _along(self, outcomes: Callable[..., Any], lane: Lane) -> Any:
+        """Outcomes, derivatives along each coordinate and terms, of one lane or of many."""
 
         def along(direction: Array) -> Any:
             every = jnp.broadcast_to(direction, lane.x.shape)
-            return jax.jvp(lambda x: loss(x, lane), (lane.x,), (every,), has_aux=True)
+            return jax.jvp(lambda x: outcomes(x, lane), (lane.x,), (every,), has_aux=True)
 
         return jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(len(self.space)))
 
@@ -121,7 +123,8 @@ class Engine:
         return self._lanes(Folded(self.objective.space), x, who, self.lanes, fold=self._standard)
 
     def gradient(self, x: np.ndarray, who: Members, weights: Any) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-        """Weighed losses [S, N], their derivatives [S, N, m] and the terms [S, N].
+        """Outcomes [S, N, 1 + L], the weighed loss and what limits hold, their derivatives [S, N, 1 + L, m] and the
+        terms [S, N].
 
         `weights`: of the terms, in the order of TERMS, for all starts or for each: [6] or [S, 6].
         """

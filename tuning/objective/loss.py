@@ -1,5 +1,7 @@
 """The loss of one rollout as a fold: dimensionless terms, reported apart and weighed afterwards."""
 
+import dataclasses
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -7,9 +9,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.extend import Scalar, leaf, record
-from ambjax.simulation.metrics import Ending
+from ambjax.simulation.metrics import Ending, Fold, Named
 from ambjax.simulation.trajectory import ALIVE
 from ambjax.world.scenario import Scenario
+from tuning.objective.limits import PREFIX
 
 # Exponent of the norm that stands for the maximum: 1.2 to 1.6 times below it over 1e4 samples of noise.
 NORM = 16
@@ -33,6 +36,7 @@ class Sums(NamedTuple):
     driven: Array
     time: Array
     doom: Array
+    measured: Any
 
 
 @record
@@ -46,6 +50,7 @@ class Loss:
     clearance: mean of max(0, share)^2, share of the way from halfway between |r| and the stop to the stop.
     survival: share of the horizon after the rotor was lost; its derivative is that of the time at which
     |z| reaches the stop at its last speed, so it points to gains that keep the rotor longer.
+    And what each fold of `measures` says, under its name with PREFIX.
     """
 
     settle: Scalar = leaf(default=0.2, unit="s", at_least=0)
@@ -53,9 +58,11 @@ class Loss:
     s_0: Scalar = leaf(default=5e-3, unit="m", above=0)
     u_scale: Scalar = leaf(default=200.0, unit="V", above=0)
     stop: Scalar = leaf(default=4.5e-3, unit="m", above=0)
+    measures: Mapping[str, Fold] = dataclasses.field(default_factory=dict)
 
     def init(self) -> Sums:
-        return Sums(*[jnp.zeros((), jnp.result_type(float))] * len(Sums._fields))
+        zeros = [jnp.zeros((), jnp.result_type(float))] * (len(Sums._fields) - 1)
+        return Sums(*zeros, Named(self.measures).init())
 
     def update(self, carry: Sums, row: Any, span: Any) -> Sums:
         on = row.alive
@@ -77,6 +84,7 @@ class Loss:
             carry.driven + on,
             carry.time + span.time,
             jnp.where(on & moving, doom, carry.doom),
+            Named(self.measures).update(carry.measured, row, span),
         )
 
     def result(self, carry: Sums, ending: Ending) -> dict[str, Array]:
@@ -86,7 +94,8 @@ class Loss:
         lost = ending.lost_code != ALIVE
         at = jnp.where(lost, ending.lost_at, 0.0)
         at = jax.lax.stop_gradient(at) + (carry.doom - jax.lax.stop_gradient(carry.doom))
-        return {
+        measured = Named(self.measures).result(carry.measured, ending)
+        return {PREFIX + name: value for name, value in measured.items()} | {
             "tracking": carry.square / weight,
             "peak": jnp.where(some, jnp.where(some, mean, 1.0) ** (2 / NORM), 0.0),
             "effort": carry.effort / jnp.where(carry.time > 0, carry.time, 1.0) / self.u_scale**2,
@@ -96,11 +105,13 @@ class Loss:
         }
 
 
-def loss_for(scenario: Scenario, settle: float, early: float = 0.0) -> Loss:
+def loss_for(
+    scenario: Scenario, settle: float, early: float = 0.0, measures: Mapping[str, Fold] | None = None
+) -> Loss:
     """The loss of a scenario: u counts in units of the supply's limit, or of R i_0 without one."""
     plant = scenario.plant
     u_scale = jnp.where(jnp.isfinite(scenario.u_max), scenario.u_max, plant.R * plant.i_0)
-    return Loss(settle, early, plant.s_0, float(u_scale), scenario.touchdown)
+    return Loss(settle, early, plant.s_0, float(u_scale), scenario.touchdown, dict(measures or {}))
 
 
 def weigh(weights: Any, terms: dict[str, Any], stressed: Any) -> Any:
@@ -114,3 +125,8 @@ def weigh(weights: Any, terms: dict[str, Any], stressed: Any) -> Any:
     costs = sum(each.pop(name) for name in COSTS)
     held = sum(each.pop(name) for name in HELD)
     return held + ordinary * sum(each.values()) * (1 + costs)
+
+
+def outcomes(weights: Any, terms: dict[str, Any], stressed: Any) -> list[Any]:
+    """The weighed loss, and what each limit holds, in the order of their names."""
+    return [weigh(weights, terms, stressed), *(terms[name] for name in sorted(terms) if name.startswith(PREFIX))]

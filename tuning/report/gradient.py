@@ -30,8 +30,8 @@ def three_ways(problem: Problem, x: np.ndarray) -> dict[str, Any]:
     weights = problem.goal.weights
     settle = float(np.asarray(objective.loss.settle))
     forward, reverse = (Engine(objective, settle=settle, mode=mode, lanes=16) for mode in ("forward", "reverse"))
-    by_forward = forward.gradient(x[None], who, weights)[1][0].mean(axis=0)
-    by_reverse = reverse.gradient(x[None], who, weights)[1][0].mean(axis=0)
+    by_forward = forward.gradient(x[None], who, weights)[1][0, :, 0].mean(axis=0)
+    by_reverse = reverse.gradient(x[None], who, weights)[1][0, :, 0].mean(axis=0)
     steps = np.concatenate([s * STEP * np.eye(len(x)) for s in (1, -1, 0.5, -0.5)])
     terms = forward.terms(x + steps, who)
     values = weigh(weights, terms, who.stressed).mean(axis=1)
@@ -53,11 +53,11 @@ def against_horizon(problem: Problem, x: np.ndarray, who: Members) -> list[dict[
         objective = _shorter(problem, samples)
         engine = problem.engine if share == 1.0 else Engine(objective, settle=float(objective.loss.settle))
         few = who.part(4)
-        losses, slopes, terms = engine.gradient(x[None], few, problem.goal.weights)
+        outcomes, slopes, terms = engine.gradient(x[None], few, problem.goal.weights)
         rows.append(
             {
                 "horizon_s": float(samples * np.asarray(objective.clock.sample_period)),
-                "norm": float(np.linalg.norm(slopes[0].mean(axis=0) / losses[0].mean())),
+                "norm": float(np.linalg.norm(slopes[0, :, 0].mean(axis=0) / outcomes[0, :, 0].mean())),
                 "lost": float((terms["survival"] > 0).mean()),
             }
         )
@@ -66,8 +66,8 @@ def against_horizon(problem: Problem, x: np.ndarray, who: Members) -> list[dict[
 
 def signal_to_noise(problem: Problem, x: np.ndarray, who: Members) -> dict[str, Any]:
     """Mean of the members' gradients over its standard error, by gain; each member is a seed of its own."""
-    losses, slopes, terms = problem.engine.gradient(x[None], who, problem.goal.weights)
-    relative = slopes[0] / losses[0].mean()
+    outcomes, slopes, terms = problem.engine.gradient(x[None], who, problem.goal.weights)
+    relative = slopes[0, :, 0] / outcomes[0, :, 0].mean()
     error = relative.std(axis=0, ddof=1) / np.sqrt(len(relative)) if len(relative) > 1 else np.full(len(x), np.nan)
     return {
         "gradient": relative.mean(axis=0),

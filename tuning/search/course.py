@@ -72,6 +72,8 @@ class Course:
     tell: Callable[[Progress, float], None] | None = None
     """called after each iteration; left out: a line is said"""
     past: list[Progress] = dataclasses.field(default_factory=list)
+    asides: int = 0
+    """searches that limits asked for: no rounds"""
     began: float = dataclasses.field(default_factory=time.perf_counter)
 
     def search(self, points: np.ndarray) -> tuple[np.ndarray, float]:

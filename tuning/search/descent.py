@@ -49,17 +49,17 @@ class Descent:
         return begun._replace(state=jax.vmap(lambda old, fresh: old.anew(fresh))(starts.state, begun.state))
 
     @functools.partial(jax.jit, static_argnums=(0, 1))
-    def step(self, ordinary: int, starts: Starts, losses: Array, slopes: Array, on: Array) -> Starts:
-        """What losses [S, N] and slopes [S, N, m] at the trials make of the starts that are `on` [S].
+    def step(self, ordinary: int, starts: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
+        """What outcomes [S, N, 1 + L] and slopes [S, N, 1 + L, m] at the trials make of the starts that are `on` [S].
 
         The first `ordinary` of the members are not stressed.
         """
-        return jax.vmap(functools.partial(self._one, ordinary))(starts, losses, slopes, on)
+        return jax.vmap(functools.partial(self._one, ordinary))(starts, outcomes, slopes, on)
 
-    def _one(self, ordinary: int, start: Starts, losses: Array, slopes: Array, on: Array) -> Starts:
-        value, (weights, slope) = jax.value_and_grad(self.goal, (0, 1))(losses, start.trial, ordinary)
+    def _one(self, ordinary: int, start: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
+        value, (weights, slope) = jax.value_and_grad(self.goal, (0, 1))(outcomes, start.trial, ordinary)
         state: Any
-        step, state = self.method.update(weights @ slopes + slope, start.state, start.trial, value=value)
+        step, state = self.method.update(jnp.tensordot(weights, slopes, 2) + slope, start.state, start.trial, value=value)
         trial: Any = optax.apply_updates(start.trial, step)
         fresh = Starts(trial, state, jnp.linalg.norm(trial - state.best))
         return jax.tree.map(lambda p, q: jnp.where(on, p, q), fresh, start)

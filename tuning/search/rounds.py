@@ -16,6 +16,7 @@ from tuning.judge import words as step_words
 from tuning.objective.members import Members
 from tuning.problem import Problem, problem_of
 from tuning.search.course import Answer, Course, looks, points_of, training
+from tuning.search.limits import limited
 
 # Rounds in all, looks among them, times that steps are halved, and lost members that join in one round.
 MOST_ROUNDS, MOST_HALVINGS, MOST_JOINING = 12, 2, 16
@@ -36,9 +37,12 @@ def rounds(problem: Problem, start: np.ndarray, out: pathlib.Path, facts: dict[s
         if course.hopeless:  # nothing to go on with
             break
         x, error = resolved(course, x)
+        held = limited(course, x)
+        if held is not x:
+            x, error = held, step_error(course.problem, held)
         answer, error, lost = validated(course, x, error)
         answers.append(answer)
-        if answer.good or course.interrupted or len(course.past) >= MOST_ROUNDS:
+        if answer.good or course.interrupted or len(course.past) - course.asides >= MOST_ROUNDS:
             break
         course.who = course.who.joined(_joining(course.problem, lost, error, LOUDER**refuted))
         say("the search goes on with members that are lost, or that accurate steps do not hold")
@@ -55,7 +59,7 @@ def resolved(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepError]:
     """x [m], or what a search from there in finer steps finds, and what the steps are worth there."""
     while True:
         error = step_error(course.problem, x)
-        say(f"step of the search against adaptive RODAS3: {step_words(error)}")
+        say(f"step of the search against {course.problem.accurate}: {step_words(error)}")
         substeps = finer(course.problem)
         if error.resolved or substeps is None or course.interrupted:
             return x, error
@@ -95,7 +99,7 @@ def finer(problem: Problem) -> Problem | None:
     """The same problem in steps half as long, or None where they were halved often enough; rollouts are counted on."""
     if problem.finer >= 2**MOST_HALVINGS:
         return None
-    fine = problem_of(problem.case, problem.tune, finer=2 * problem.finer)
+    fine = problem_of(problem.case, problem.tune, finer=2 * problem.finer).limited(problem.goal.limits)
     fine.engine.rollouts = problem.engine.rollouts
     return fine
 

@@ -1,0 +1,223 @@
+"""Limits of what an engineer limits: how each is measured on a member and over an ensemble, and how it pulls.
+
+A search minimises the error subject to them by an augmented Lagrangian (Nocedal and Wright, Numerical Optimization,
+2006, 17.3) in logarithms: with g = log(reached / allowed), each adds (max(0, multiplier + PENALTY g)^2 - multiplier^2)
+/ (2 PENALTY) to the goal, a logarithm too. At the optimum the multiplier is minus the elasticity of what is minimised:
+1 % more of the limit buys `multiplier` % less of it.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.extend import Scalar, leaf, record, static
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.metrics import Driven, Ending, Fold, Peak, Variation
+from ambjax.simulation.response import Overshoot, Settling
+from ambjax.world.scenario import Scenario
+
+# How steeply a limit that is exceeded pulls: 10 % beyond it count as 16 % of the error where the multiplier is 0.
+PENALTY = 30.0
+# Exponent of the norms that stand for maxima.
+NORM = 16
+# Before the names of what limits hold among the terms of a loss.
+PREFIX = "limit."
+# Of what is 0 there is no logarithm.
+TINY = 1e-30
+# What a supply is worth without being asked: rms voltage as a share of its limit.
+SHARE = 0.6
+
+
+@record
+class Typical:
+    """The 16-norm over samples of the largest |row.`of`| in each, between samples too: a smooth maximum.
+
+    At its stop a voltage has no slope; the samples that are below it do.
+    """
+
+    of: str = static()
+    size: Scalar = leaf(above=0)
+
+    def init(self) -> tuple[Array, Array]:
+        zero = jnp.zeros((), jnp.result_type(float))
+        return zero, zero
+
+    def update(self, carry: tuple[Array, Array], row: Any, span: Any) -> tuple[Array, Array]:
+        total, count = carry
+        value = jnp.maximum(jnp.abs(getattr(row, self.of)), getattr(span.most, self.of))
+        return total + (value / self.size) ** NORM, count + row.alive
+
+    def result(self, carry: tuple[Array, Array], ending: Ending) -> Array:
+        total, count = carry
+        mean = total / jnp.maximum(count, 1.0)
+        some = mean > TINY
+        return self.size * jnp.where(some, jnp.where(some, mean, 1.0) ** (1 / NORM), 0.0)
+
+
+@record
+class Scaled:
+    """A fold's number, divided."""
+
+    fold: Fold
+    by: Scalar = leaf(above=0)
+
+    def init(self) -> Any:
+        return self.fold.init()
+
+    def update(self, carry: Any, row: Any, span: Any) -> Any:
+        return self.fold.update(carry, row, span)
+
+    def result(self, carry: Any, ending: Ending) -> Array:
+        return self.fold.result(carry, ending) / self.by
+
+
+@dataclasses.dataclass(frozen=True)
+class Site:
+    """What the measures of a case depend on: from when errors count (s), run's duration (s), clearance and band (m)."""
+
+    settle: float
+    duration: float
+    touchdown: float
+    band: float
+
+
+def pooled(values: Any) -> Any:
+    """Root mean square over members."""
+    return jnp.sqrt(jnp.mean(values**2) + TINY)
+
+
+def largest(values: Any) -> Any:
+    """16-norm over members: at least the largest, and smooth."""
+    top = jax.lax.stop_gradient(jnp.maximum(jnp.max(values), TINY))
+    return top * jnp.sum((values / top) ** NORM) ** (1 / NORM)
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """A quantity that may be limited: its unit; what it is of a member, and over members, in words.
+
+    `fold` measures it on a member for the search; `exact` names the column in which a judge finds it, None: the fold's
+    own number. `tuned` makes one number of all members for the search, `judged` for the judge.
+    """
+
+    unit: str
+    words: str
+    over: str
+    fold: Callable[[Site, float], Fold]
+    exact: str | None
+    tuned: Callable[[Any], Any]
+    judged: Callable[[np.ndarray], Any]
+    worst: bool = False
+    """whether one member decides"""
+
+
+_POOLED = {"over": "root mean square over members", "tuned": pooled, "judged": pooled}
+_MEAN = {"over": "mean over members", "tuned": jnp.mean, "judged": np.mean}
+_WORST = {"over": "of the worst member", "tuned": largest, "judged": np.max, "worst": True}
+
+KINDS: dict[str, Kind] = {
+    "rms_u_V": Kind(
+        "V",
+        "root mean square voltage from run.settle on",
+        fold=lambda site, asked: Driven("u_squared", site.settle, root=True),
+        exact="settled_rms_u_V",
+        **_POOLED,
+    ),
+    "max_u_V": Kind(
+        "V", "largest voltage of the run", fold=lambda site, asked: Typical("u", asked), exact="max_abs_u_V", **_WORST
+    ),
+    "max_abs_i_A": Kind(
+        "A", "largest current of the run", fold=lambda site, asked: Peak("i"), exact="max_abs_i_A", **_WORST
+    ),
+    "chatter_V_per_s": Kind(
+        "V/s",
+        "variation of the voltage, averaged over each sample, per second from run.settle on",
+        fold=lambda site, asked: Scaled(Variation(site.settle), site.duration - site.settle),
+        exact=None,
+        **_MEAN,
+    ),
+    "largest_error_m": Kind(
+        "m",
+        "largest |z - r| from run.settle on",
+        fold=lambda site, asked: Peak("e_z", site.settle),
+        exact="settled_max_abs_error_m",
+        **_WORST,
+    ),
+    "settling_s": Kind(
+        "s",
+        "time of the run from which |z - r| stays within settling_band_m",
+        fold=lambda site, asked: Settling(site.band),
+        exact=None,
+        **_WORST,
+    ),
+    "overshoot_m": Kind(
+        "m",
+        "how far z goes beyond where it began and where r has been",
+        fold=lambda site, asked: Overshoot(),
+        exact=None,
+        **_WORST,
+    ),
+    "clearance_used": Kind(
+        "",
+        "largest |z| as a share of the clearance",
+        fold=lambda site, asked: Scaled(Peak("z"), site.touchdown),
+        exact="clearance_used",
+        **_WORST,
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Limit:
+    """At most `asked` of a KIND; `source` says who asks. What a search has learnt: `multiplier`, and by how much the
+    judge's number exceeds the search's (`ratio`)."""
+
+    name: str
+    asked: float
+    source: str = "tune.limits"
+    multiplier: float = 0.0
+    ratio: float = 1.0
+
+    @property
+    def kind(self) -> Kind:
+        """How it is measured."""
+        return KINDS[self.name]
+
+    def excess(self, values: Array, margin: float) -> Array:
+        """g = log(reached / allowed), of a search's own numbers [N]; allowed is `margin` less than asked."""
+        reached = self.ratio * self.kind.tuned(values)
+        return jnp.log(jnp.maximum(reached, TINY)) - math.log((1 - margin) * self.asked)
+
+    def pull(self, values: Array, margin: float) -> Array:
+        """What it adds to the goal."""
+        force = jnp.maximum(self.multiplier + PENALTY * self.excess(values, margin), 0.0)
+        return (force**2 - self.multiplier**2) / (2 * PENALTY)
+
+    def beyond(self, reached: float, margin: float) -> float:
+        """g of a number that is reached."""
+        return math.log(max(reached, TINY) / ((1 - margin) * self.asked))
+
+    def informed(self, tuned: float, judged: float, margin: float) -> "Limit":
+        """It knows what the search's number and the judge's are at an optimum of the goal with it."""
+        force = max(self.multiplier + PENALTY * self.beyond(judged, margin), 0.0)
+        return dataclasses.replace(self, multiplier=force, ratio=max(judged, TINY) / max(tuned, TINY))
+
+    def reached(self, columns: Mapping[str, np.ndarray]) -> float:
+        """The judge's number, of every metric and term [N] of an ensemble."""
+        return float(self.kind.judged(self.of_members(columns)))
+
+    def of_members(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """What it is of each member [N]."""
+        return np.asarray(columns[self.kind.exact or f"loss.{PREFIX}{self.name}"])
+
+
+def measures(limits: tuple[Limit, ...], scenario: Scenario, clock: Clock, settle: float, band: float) -> dict[str, Any]:
+    """A fold for each limit, by its name."""
+    site = Site(settle, float(clock.duration), float(scenario.touchdown), band)
+    return {limit.name: limit.kind.fold(site, limit.asked) for limit in limits}
