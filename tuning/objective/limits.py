@@ -1,8 +1,8 @@
 """Limits of what an engineer limits: how each is measured on a member and over an ensemble, and how it pulls.
 
 A search minimises the error subject to them by an augmented Lagrangian (Nocedal and Wright, Numerical Optimization,
-2006, 17.3) in logarithms: with g = log(reached / allowed), each adds (max(0, multiplier + PENALTY g)^2 - multiplier^2)
-/ (2 PENALTY) to the goal, a logarithm too. At the optimum the multiplier is minus the elasticity of what is minimised:
+2006, 17.3) in logarithms: with g = log(reached / allowed), each adds (max(0, multiplier + penalty g)^2 - multiplier^2)
+/ (2 penalty) to the goal, a logarithm too. At the optimum the multiplier is minus the elasticity of what is minimised:
 1 % more of the limit buys `multiplier` % less of it.
 """
 
@@ -22,8 +22,9 @@ from ambjax.simulation.metrics import Driven, Ending, Fold, Peak, Variation
 from ambjax.simulation.response import Overshoot, Settling
 from ambjax.world.scenario import Scenario
 
-# How steeply a limit that is exceeded pulls: 10 % beyond it count as 16 % of the error where the multiplier is 0.
-PENALTY = 30.0
+# How steeply a limit that is exceeded pulls at first: 10 % beyond it count as 14 % of the mean square error where the
+# multiplier is 0. By how much steeper where an update leaves more than this share of the excess, and at most.
+PENALTY, STEEPER, LEFT, STEEPEST = 30.0, 4.0, 0.3, 2000.0
 # Exponent of the norms that stand for maxima.
 NORM = 16
 # Before the names of what limits hold among the terms of a loss.
@@ -175,14 +176,16 @@ KINDS: dict[str, Kind] = {
 
 @dataclasses.dataclass(frozen=True)
 class Limit:
-    """At most `asked` of a KIND; `source` says who asks. What a search has learnt: `multiplier`, and by how much the
-    judge's number exceeds the search's (`ratio`)."""
+    """At most `asked` of a KIND; `source` says who asks. What a search has learnt: `multiplier`, `penalty`, by how much
+    the judge's number exceeds the search's (`ratio`), and the last g (`missed`)."""
 
     name: str
     asked: float
     source: str = "tune.limits"
     multiplier: float = 0.0
     ratio: float = 1.0
+    penalty: float = PENALTY
+    missed: float = math.inf
 
     @property
     def kind(self) -> Kind:
@@ -196,8 +199,8 @@ class Limit:
 
     def pull(self, values: Array, margin: float) -> Array:
         """What it adds to the goal."""
-        force = jnp.maximum(self.multiplier + PENALTY * self.excess(values, margin), 0.0)
-        return (force**2 - self.multiplier**2) / (2 * PENALTY)
+        force = jnp.maximum(self.multiplier + self.penalty * self.excess(values, margin), 0.0)
+        return (force**2 - self.multiplier**2) / (2 * self.penalty)
 
     def beyond(self, reached: float, margin: float) -> float:
         """g of a number that is reached."""
@@ -205,8 +208,12 @@ class Limit:
 
     def informed(self, tuned: float, judged: float, margin: float) -> "Limit":
         """It knows what the search's number and the judge's are at an optimum of the goal with it."""
-        force = max(self.multiplier + PENALTY * self.beyond(judged, margin), 0.0)
-        return dataclasses.replace(self, multiplier=force, ratio=max(judged, TINY) / max(tuned, TINY))
+        excess = self.beyond(judged, margin)
+        force = max(self.multiplier + self.penalty * excess, 0.0)
+        slow = force > 0 and abs(excess) > LEFT * abs(self.missed)
+        penalty = min(STEEPER * self.penalty, STEEPEST) if slow else self.penalty
+        ratio = max(judged, TINY) / max(tuned, TINY)
+        return dataclasses.replace(self, multiplier=force, ratio=ratio, penalty=penalty, missed=excess)
 
     def reached(self, columns: Mapping[str, np.ndarray]) -> float:
         """The judge's number, of every metric and term [N] of an ensemble."""

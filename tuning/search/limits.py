@@ -1,6 +1,6 @@
 """Limits at an optimum: what is reached by the judge's own measure, and the search goes on until all are met.
 
-An optimum exceeds its limits by about (what the multiplier must be - what it is) / PENALTY; an update closes that gap.
+An optimum exceeds its limits by about (what the multiplier must be - what it is) / penalty; an update closes that gap.
 """
 
 import numpy as np
