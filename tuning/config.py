@@ -55,8 +55,6 @@ class Limits:
     """in the order of their names"""
     survival: float = 1.0
     """share of the held-out members that must be held"""
-    margin: float = 0.02
-    """share by which the search stays below each"""
     band: float = 0.0
     """of the settling time, m"""
 
@@ -176,7 +174,9 @@ def _limits(table: Table, case: Case) -> Limits:
     if "rms_u_V" not in asked and math.isfinite(u_max):
         asked["rms_u_V"], source["rms_u_V"] = SHARE * u_max, f"by default, {100 * SHARE:g} % of actuator.u_max"
     if "settling_band_m" in table.raw and "settling_s" not in asked:
-        raise ValueError(f"{table.at('settling_band_m')} has a meaning beside {table.at('settling_s')} only. Give both.")
+        raise ValueError(
+            f"{table.at('settling_band_m')} has a meaning beside {table.at('settling_s')} only. Give both."
+        )
     clearance = float(np.min(np.asarray(case.scenario.touchdown)))
     band = _positive(table, "settling_band_m", BAND * clearance)
     if band >= clearance:
@@ -184,11 +184,16 @@ def _limits(table: Table, case: Case) -> Limits:
             f"{table.at('settling_band_m')} = {band:g} m: it must be below the clearance, {clearance:g} m "
             "(run.clearance, by default 0.9 of plant.s_0)."
         )
-    margin = _positive(table, "margin", Limits.margin, zero=True)
-    if margin >= 0.5:
-        raise ValueError(f"{table.at('margin')} = {margin:g}: it must be below 0.5, a share of each limit.")
-    each = tuple(Limit(name, asked[name], source[name]) for name in sorted(asked) if math.isfinite(asked[name]))
-    return Limits(each, _limit(table, "survival", 1.0, default=1.0), margin, band)
+    if not 0 <= table.number("margin", 0.0, "a number from 0 to below 0.5") < 0.5:
+        raise ValueError(
+            f"{table.at('margin')} = {table.raw['margin']:g}: it must be from 0 to below 0.5, of each limit."
+        )
+    each = tuple(
+        Limit(name, asked[name], source[name], table.number("margin", KINDS[name].margin))
+        for name in sorted(asked)
+        if math.isfinite(asked[name])
+    )
+    return Limits(each, _limit(table, "survival", 1.0, default=1.0), band)
 
 
 def _limit(table: Table, key: str, most: float, default: float = math.nan) -> float:
@@ -235,8 +240,9 @@ def settings(tune: Tune) -> dict[str, Any]:
         "gains": tune.space.paths,
         "bounds": {gain.path: [gain.low, gain.high] for gain in tune.space.gains},
         "weights": dict(zip(TERMS, tune.weights, strict=True)) | {"conditions": tune.conditions},
-        "limits": {limit.name: limit.asked for limit in tune.limits.each}
-        | {"survival": tune.limits.survival, "margin": tune.limits.margin, "settling_band_m": tune.limits.band},
+        "limits": {limit.name: {"asked": limit.asked, "margin": limit.margin} for limit in tune.limits.each},
+        "survival": tune.limits.survival,
+        "settling_band_m": tune.limits.band,
         "risk": str(tune.risk),
     }
     rest = {

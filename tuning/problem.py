@@ -96,7 +96,7 @@ def problem_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = 
     conditions = bounds(case.cascade, case.scenario, clock)
     space, box = bounded(objective, conditions, tune.space.values(case.cascade))
     objective = dataclasses.replace(objective, space=space)
-    goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin, limits.each, limits.margin)
+    goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin, limits.each)
     mode = "forward" if len(tune.space) <= MOST_FORWARD else "reverse"
     return Problem(
         case, tune, objective, Engine(objective, settle=case.settle, mode=mode, threads=threads), goal, box, finer

@@ -30,8 +30,6 @@ class Goal:
     weight: float
     margin: float
     limits: tuple[Limit, ...] = ()
-    spare: float = 0.0
-    """share by which a search stays below its limits"""
 
     def __call__(self, outcomes: Array, x: Array, ordinary: int) -> Array:
         """The goal at coordinates x [m], of outcomes [N, 1 + L]: losses, and what limits hold. The first members are
@@ -47,7 +45,7 @@ class Goal:
 
     def pull(self, held: Array) -> Any:
         """What the limits add, of what members hold [N, L]."""
-        return sum(limit.pull(held[:, j], self.spare) for j, limit in enumerate(self.limits))
+        return sum(limit.pull(held[:, j]) for j, limit in enumerate(self.limits))
 
     def score(self, x: np.ndarray, terms: dict[str, np.ndarray], who: Members) -> np.ndarray:
         """The goal [S] at x [S, m] from the terms [S, N] of members [N]; +inf where it is not a number."""

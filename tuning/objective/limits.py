@@ -114,13 +114,15 @@ class Kind:
     exact: str | None
     tuned: Callable[[Any], Any]
     judged: Callable[[np.ndarray], Any]
+    margin: float
+    """share by which two ensembles differ at most: of their averages less than of their worst members"""
     worst: bool = False
     """whether one member decides"""
 
 
-_POOLED = {"over": "root mean square over members", "tuned": pooled, "judged": pooled}
-_MEAN = {"over": "mean over members", "tuned": jnp.mean, "judged": np.mean}
-_WORST = {"over": "of the worst member", "tuned": largest, "judged": np.max, "worst": True}
+_POOLED = {"over": "root mean square over members", "tuned": pooled, "judged": pooled, "margin": 0.005}
+_MEAN = {"over": "mean over members", "tuned": jnp.mean, "judged": np.mean, "margin": 0.005}
+_WORST = {"over": "of the worst member", "tuned": largest, "judged": np.max, "margin": 0.03, "worst": True}
 
 KINDS: dict[str, Kind] = {
     "rms_u_V": Kind(
@@ -182,6 +184,8 @@ class Limit:
     name: str
     asked: float
     source: str = "tune.limits"
+    margin: float = 0.0
+    """share by which a search stays below it"""
     multiplier: float = 0.0
     ratio: float = 1.0
     penalty: float = PENALTY
@@ -192,23 +196,28 @@ class Limit:
         """How it is measured."""
         return KINDS[self.name]
 
-    def excess(self, values: Array, margin: float) -> Array:
-        """g = log(reached / allowed), of a search's own numbers [N]; allowed is `margin` less than asked."""
-        reached = self.ratio * self.kind.tuned(values)
-        return jnp.log(jnp.maximum(reached, TINY)) - math.log((1 - margin) * self.asked)
+    @property
+    def allowed(self) -> float:
+        """What a search keeps to."""
+        return (1 - self.margin) * self.asked
 
-    def pull(self, values: Array, margin: float) -> Array:
+    def excess(self, values: Array) -> Array:
+        """g = log(reached / allowed), of a search's own numbers [N]."""
+        reached = self.ratio * self.kind.tuned(values)
+        return jnp.log(jnp.maximum(reached, TINY)) - math.log(self.allowed)
+
+    def pull(self, values: Array) -> Array:
         """What it adds to the goal."""
-        force = jnp.maximum(self.multiplier + self.penalty * self.excess(values, margin), 0.0)
+        force = jnp.maximum(self.multiplier + self.penalty * self.excess(values), 0.0)
         return (force**2 - self.multiplier**2) / (2 * self.penalty)
 
-    def beyond(self, reached: float, margin: float) -> float:
+    def beyond(self, reached: float) -> float:
         """g of a number that is reached."""
-        return math.log(max(reached, TINY) / ((1 - margin) * self.asked))
+        return math.log(max(reached, TINY) / self.allowed)
 
-    def informed(self, tuned: float, judged: float, margin: float) -> "Limit":
+    def informed(self, tuned: float, judged: float) -> "Limit":
         """It knows what the search's number and the judge's are at an optimum of the goal with it."""
-        excess = self.beyond(judged, margin)
+        excess = self.beyond(judged)
         force = max(self.multiplier + self.penalty * excess, 0.0)
         slow = force > 0 and abs(excess) > LEFT * abs(self.missed)
         penalty = min(STEEPER * self.penalty, STEEPEST) if slow else self.penalty

@@ -105,9 +105,7 @@ class Loss:
         }
 
 
-def loss_for(
-    scenario: Scenario, settle: float, early: float = 0.0, measures: Mapping[str, Fold] | None = None
-) -> Loss:
+def loss_for(scenario: Scenario, settle: float, early: float = 0.0, measures: Mapping[str, Fold] | None = None) -> Loss:
     """The loss of a scenario: u counts in units of the supply's limit, or of R i_0 without one."""
     plant = scenario.plant
     u_scale = jnp.where(jnp.isfinite(scenario.u_max), scenario.u_max, plant.R * plant.i_0)

@@ -59,7 +59,9 @@ class Descent:
     def _one(self, ordinary: int, start: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
         value, (weights, slope) = jax.value_and_grad(self.goal, (0, 1))(outcomes, start.trial, ordinary)
         state: Any
-        step, state = self.method.update(jnp.tensordot(weights, slopes, 2) + slope, start.state, start.trial, value=value)
+        step, state = self.method.update(
+            jnp.tensordot(weights, slopes, 2) + slope, start.state, start.trial, value=value
+        )
         trial: Any = optax.apply_updates(start.trial, step)
         fresh = Starts(trial, state, jnp.linalg.norm(trial - state.best))
         return jax.tree.map(lambda p, q: jnp.where(on, p, q), fresh, start)

@@ -26,23 +26,21 @@ def limited(course: Course, x: np.ndarray) -> np.ndarray:
     for _ in range(MOST_UPDATES):
         goal = course.problem.goal
         numbers = _numbers(course, x)
-        limits = tuple(
-            limit.informed(*found, goal.spare) for limit, found in zip(goal.limits, numbers, strict=True)
-        )
+        limits = tuple(limit.informed(*found) for limit, found in zip(goal.limits, numbers, strict=True))
         course.problem = course.problem.limited(limits)
         pulling = [(limit, judged) for limit, (_, judged) in zip(limits, numbers, strict=True) if limit.multiplier > 0]
         for limit, judged in pulling:
             say(f"limit {limit.name} = {limit.asked:g} {limit.kind.unit}: {judged:.4g} on members of another seed")
-        if course.interrupted or all(_met(limit, judged, goal.spare) for limit, judged in pulling):
+        if course.interrupted or all(_met(limit, judged) for limit, judged in pulling):
             break
         course.asides += 1
         x, _ = course.search(x[None])
     return x
 
 
-def _met(limit: Limit, judged: float, spare: float) -> bool:
+def _met(limit: Limit, judged: float) -> bool:
     """Whether a limit that pulls holds what is allowed, and not much less."""
-    return -BELOW <= limit.beyond(judged, spare) <= max(spare / 2, LEAST)
+    return -BELOW <= limit.beyond(judged) <= max(limit.margin / 2, LEAST)
 
 
 def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
@@ -54,7 +52,7 @@ def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
     terms = problem.engine.terms(x[None], course.who)
     tuned = [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in limits]
     each = zip(limits, tuned, strict=True)
-    if all(not limit.kind.worst and limit.beyond(ours, problem.goal.spare) < -FAR for limit, ours in each):
+    if all(not limit.kind.worst and limit.beyond(ours) < -FAR for limit, ours in each):
         return [(ours, ours) for ours in tuned]
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
     if not any(limit.kind.worst for limit in limits):
