@@ -16,7 +16,8 @@ import numpy as np
 from texts import case_and_tune
 
 from ambjax import AdaptiveRodas3
-from tuning.objective.loss import TERMS, weigh
+from tuning.objective.limits import PREFIX
+from tuning.objective.loss import TERMS, outcomes
 
 # Smallest tracking error, (m / s_0)^2, and the duration, s.
 FLOOR, DURATION = 1e-4, 0.02
@@ -70,7 +71,8 @@ class Bowl:
         # voltage grows with the last gain, and is a tenth of the limit where that is best
         each = {"tracking": FLOOR * (1 + (away**2).sum(axis=1)), "effort": 0.01 * np.exp(2 * away[:, -1])}
         each = {name: term[:, None] + nothing for name, term in each.items()} | {"survival": 1 - np.exp(-beyond)}
-        return {name: each.get(name, nothing) for name in TERMS}
+        terms = {name: each.get(name, nothing) for name in TERMS}
+        return terms | {PREFIX + name: 200 * each["effort"] ** 0.5 for name in self.objective.loss.measures}
 
     def terms(self, x, who):
         self._note("terms", x, who)
@@ -99,8 +101,12 @@ class Bowl:
         self._note("gradient", x, who)
         self.rollouts += len(x) * len(who.member) * x.shape[1]
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS))).T[:, :, None]
-        found = [weigh(each, self._terms(x, who, j), who.stressed) for j in range(x.shape[1])]
-        return found[0].real, np.stack([one.imag for one in found], axis=-1) / TINY, self._terms(x, who)
+        found = [outcomes(each, self._terms(x, who, j), who.stressed) for j in range(x.shape[1])]
+        return (
+            np.stack(found[0], -1).real,
+            np.stack([np.stack(one, -1).imag for one in found], -1) / TINY,
+            self._terms(x, who),
+        )
 
 
 @functools.partial(jax.jit, static_argnums=0)

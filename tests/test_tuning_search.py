@@ -56,6 +56,7 @@ def test_gradient_three_ways(engines):
     forward, reverse, who, x = engines
     value, slopes, _ = forward.gradient(x[None], who, WEIGHTS)
     other, back, _ = reverse.gradient(x[None], who, WEIGHTS)
+    assert value.shape == (1, 4, 1)  # the loss, and no limits
     np.testing.assert_allclose(value, other, rtol=1e-12)
     size = np.abs(slopes).max()
     # one chain of 240 steps multiplied from either end
@@ -66,7 +67,7 @@ def test_gradient_three_ways(engines):
     up, down, half_up, half_down = losses.reshape(4, 4, -1)
     differences = (4 * (half_up - half_down) / h - (up - down) / (2 * h)) / 3
     # h^4 truncation of the extrapolated differences: measured 2e-7
-    np.testing.assert_allclose(slopes[0], differences.T, rtol=1e-6, atol=1e-6 * size)
+    np.testing.assert_allclose(slopes[0, :, 0], differences.T, rtol=1e-6, atol=1e-6 * size)
 
 
 def test_lanes_are_rollouts(engines):

@@ -204,7 +204,7 @@ def test_the_theorem_s_conditions_pull_where_the_losses_are_flat():
     goal = Goal(space, (1.0,) * 6, Mean(), conditions, 2.0, 0.1)
     descent = Descent(goal, "bfgs", 0.1)
     x = jnp.asarray(np.log([[30.0, 20.0]]))
-    flat = descent.step(3, descent.begin(x), jnp.ones((1, 3)), jnp.zeros((1, 3, 2)), jnp.ones(1, bool))
+    flat = descent.step(3, descent.begin(x), jnp.ones((1, 3, 1)), jnp.zeros((1, 3, 1, 2)), jnp.ones(1, bool))
     # log of the mean loss, 1, and the weighed square of log(1.1 * 50 / 20)
     assert float(flat.value[0]) == pytest.approx(2 * math.log(2.75) ** 2)
     assert float(flat.trial[0, 0]) == pytest.approx(float(x[0, 0]))

@@ -20,7 +20,7 @@ from tuning.config import read_tune, seeds, settings
 from tuning.judge import StepError, judge, step_error, summarise, worst_of
 from tuning.judge import words as step_words
 from tuning.problem import Problem, problem_of
-from tuning.report import accurate, breakdown, gradient, pictures, verdict
+from tuning.report import accurate, breakdown, gradient, limits, pictures, verdict
 from tuning.report import document as report
 from tuning.report.page import page
 from tuning.report.tuned import tuned as tuned_text
@@ -95,8 +95,8 @@ def _tune(
     if not args.json:
         print(_short(facts))
         print(f"written: {out}/tuned.toml, history.npz, report.html, report.md, report.json, *.png")
-    lost = facts["after"]["lost"] if facts["after"]["members"] else facts["lost_in_training"]
-    good = lost == 0 and facts["verified"]
+    held = all(row["held"] for row in facts["limits"]) if facts["after"]["members"] else not facts["lost_in_training"]
+    good = held and facts["verified"]
     if not good:
         say(facts["advice"])
     return int(not good), summary
@@ -115,8 +115,10 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
     judged = [judge(problem, at, held_out, count) for at in (_at(problem, before), x)] if count else []
     summaries = [summarise(one) for one in judged] or [none, none]
     loss = dict(zip(("before", "after"), (breakdown.table(problem.goal, one) for one in judged), strict=False))
-    worst = _worst_checked(answer, judged[1], held_out) if judged and answer.confirmed else None
+    again = judged and answer.confirmed and not problem.sampled
+    worst = _worst_checked(answer, judged[1], held_out) if again else None
     refuted = (worst or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
+    limited = limits.facts(problem.goal.limits, tune.limits, judged[1] if judged else {}, summaries[1])
     if refuted and judged:
         summaries[1] |= dict.fromkeys(("survival", "survival_low", "survival_high"), NOT_VERIFIED)
     lost = int((problem.engine.terms(x[None], who)["survival"] > 0).sum())
@@ -128,19 +130,21 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
         "after": summaries[1],
         "held_out_seed": held_out,
         "lost_in_training": lost,
+        "limits": limited,
         "loss": loss,
         "minimised": breakdown.minimised(problem, x, who),
         "conditions": report.conditions(line),
         "advice_on_conditions": on_conditions(line),
         "step_error": answer.error.facts() if answer.error else None,
         "worst_step_error": worst.facts() if worst else None,
+        "accurate_steps": problem.accurate,
         "verified": not refuted,
         "verified_reason": refuted or _confirmed(worst, answer.error),
         "lost_in_validation": answer.lost,
         "search": settings(tune)
         | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
     }
-    if count:
+    if count and not problem.sampled:
         say(f"{min(accurate.AGAIN, count)} of them again by accurate steps ...")
         facts["accurate"] = accurate.compared(problem, x, held_out, count, report.SHOWN)
     facts["gains"] = [
@@ -201,8 +205,10 @@ def _pictures(
 ) -> dict[str, bytes]:
     """PNG by file name: those that the report shows."""
     paths, runs = problem.objective.space.paths, {"before": problem.case.cascade, "after": tuned}
+    shown = {name: accurate.nominal(problem, one) for name, one in runs.items()}
     drawn = {
-        "nominal.png": pictures.before_after({name: accurate.nominal(problem, one) for name, one in runs.items()}),
+        "nominal.png": pictures.before_after(shown),
+        "spectrum.png": pictures.spectrum(shown, problem.case.settle),
         "convergence.png": pictures.convergence(history, paths),
         "slices.png": pictures.landscape(slices, paths),
     }

@@ -62,7 +62,7 @@ class Loss:
 
     def init(self) -> Sums:
         zeros = [jnp.zeros((), jnp.result_type(float))] * (len(Sums._fields) - 1)
-        return Sums(*zeros, Named(self.measures).init())
+        return Sums._make([*zeros, Named(self.measures).init()])
 
     def update(self, carry: Sums, row: Any, span: Any) -> Sums:
         on = row.alive

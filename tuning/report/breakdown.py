@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from tuning.objective.goal import Goal
-from tuning.objective.loss import COSTS, HELD, TERMS, weigh
+from tuning.objective.loss import COSTS, HELD, TERMS, outcomes, weigh
 from tuning.objective.members import Members
 from tuning.problem import Problem
 
@@ -39,15 +39,19 @@ def table(goal: Goal, columns: dict[str, np.ndarray]) -> Facts:
 
 
 def minimised(problem: Problem, x: np.ndarray, who: Members) -> Facts:
-    """What the search brought down, at x [m]: the parts of its goal, (risk + held) x penalty = total."""
+    """What the search brought down, at x [m]: the parts of its goal, (risk + held) x penalty x limits = total."""
     goal, n = problem.goal, who.ordinary
-    losses = weigh(goal.weights, {k: v[0] for k, v in problem.engine.terms(x[None], who).items()}, who.stressed)
+    terms = {k: v[0] for k, v in problem.engine.terms(x[None], who).items()}
+    losses, *reached = outcomes(goal.weights, terms, who.stressed)
     penalty = float(goal.penalty(jnp.asarray(x)))
+    pull = float(goal.pull(jnp.stack([jnp.asarray(one[:n]) for one in reached], -1))) if reached else 0.0
     parts = {
         "ordinary": n,
         "risk": float(goal.risk(jnp.asarray(losses[:n]))),
         "asked_to_be_held": len(losses) - n,
         "held": float(losses[n:].mean()) if len(losses) > n else 0.0,
         "penalty": float(np.exp(goal.weight * penalty)),
+        "limits": float(np.exp(pull)),
     }
-    return parts | {"total": (parts["risk"] + parts["held"]) * parts["penalty"], "of": str(goal.risk)}
+    total = (parts["risk"] + parts["held"]) * parts["penalty"] * parts["limits"]
+    return parts | {"total": total, "of": str(goal.risk)}

@@ -8,7 +8,7 @@ import numpy as np
 
 from ambjax.theorem.conditions import Report as Check
 from tuning.objective.loss import TERMS
-from tuning.report import extras
+from tuning.report import extras, limits
 from tuning.report.breakdown import FORMULA
 from tuning.report.page import literal, table
 from tuning.space import Space
@@ -53,7 +53,14 @@ def gains_table(space: Space, before: np.ndarray, after: np.ndarray, sensitivity
 def markdown(facts: Facts) -> str:
     """report.md: beside it lie the pictures that it shows."""
     lines = [f"# Tuning of {literal(facts['case'])}", "", facts["verdict"], ""]
-    lines += _gains(facts) + _held_out(facts) + _loss(facts) + _minimised(facts) + _conditions(facts)
+    lines += (
+        limits.section(facts.get("limits", []))
+        + _gains(facts)
+        + _held_out(facts)
+        + _loss(facts)
+        + _minimised(facts)
+        + _conditions(facts)
+    )
     lines += ["## How the search went", "", *_how(facts), "", "![Goal and gains by iteration](convergence.png)", ""]
     if facts.get("pareto"):
         lines += extras.pareto(facts["pareto"])
@@ -93,6 +100,10 @@ def _gains(facts: Facts) -> list[str]:
         "The case's own run, nothing spread, by accurate steps; u averaged over each sample.",
         "",
         "![z - r and u before and after tuning](nominal.png)",
+        "",
+        "The voltage's amplitude spectrum (Hann window, from `run.settle` on): a sine of 1 V stands at 1 V.",
+        "",
+        "![Amplitude spectrum of u before and after tuning](spectrum.png)",
         "",
     ]
 
@@ -185,6 +196,8 @@ def _minimised(facts: Facts) -> list[str]:
         asked = f"+ mean of clearance + survival over {parts['asked_to_be_held']} members asked only to be held"
         rows.append([asked, f"{parts['held']:.4e}"])
     rows.append(["x penalty of the theorem's conditions", f"{parts['penalty']:.6g}"])
+    if parts["limits"] != 1:
+        rows.append(["x pull of the limits", f"{parts['limits']:.6g}"])
     rows.append(["**= what was minimised**", f"**{parts['total']:.4e}**"])
     return [
         "## What the search minimised",
@@ -250,7 +263,7 @@ def _how(facts: Facts) -> list[str]:
     ]
     if error := facts.get("step_error"):
         lines.append(
-            f"- step of the search at the optimum: settled rms error {error['search_m']:.4e} m, adaptive RODAS3 "
-            f"{error['reference_m']:.4e} m on {error['members']} members: {error['told']}"
+            f"- step of the search at the optimum: settled rms error {error['search_m']:.4e} m, by "
+            f"{facts['accurate_steps']} {error['reference_m']:.4e} m on {error['members']} members: {error['told']}"
         )
     return lines

@@ -18,6 +18,8 @@ ZOOM = 0.02
 BEYOND = 1.15
 # What moves by less than this share of a signal's largest value is shown flat.
 FLAT = 1e-2
+# Amplitudes below this share of the largest are cut off; and samples of which there is a spectrum.
+FAINTEST, FEWEST = 1e-6, 16
 
 
 def before_after(runs: dict[str, Trajectory]) -> bytes:
@@ -59,6 +61,36 @@ def before_after(runs: dict[str, Trajectory]) -> bytes:
         ax.set_xlabel("time (s)", fontsize=9)
     figure.align_ylabels(axes)
     return _png(figure)
+
+
+def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
+    """PNG: amplitude of u (V), averaged over each sample, over frequency, of runs by name, from `settle` (s) on."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    ax, top = figure.subplots(), 0.0
+    for name, run in runs.items():
+        t, alive = np.asarray(run.rows.t), np.asarray(run.rows.alive)
+        frequency, amplitude = amplitudes(np.asarray(run.rows.u_mean)[alive & (t >= settle)], t[1] - t[0])
+        label = f"{name}: lost before {settle:g} s" if not len(amplitude) else name
+        ax.plot(frequency, amplitude, color=ORANGE if name == "before" else BLUE, lw=0.8, label=label)
+        top = max(top, amplitude.max(initial=0.0))
+    ax.set(xlabel="frequency (Hz)", ylabel="amplitude of u (V)", xscale="log", yscale="log")
+    ax.set_ylim(FAINTEST * (top or 1.0), 2 * (top or 1.0))
+    ax.grid(alpha=0.3, which="both")
+    ax.legend(fontsize=8)
+    return _png(figure)
+
+
+def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies (Hz) above 0 and amplitudes of a signal sampled with this period, s: a sine's amplitude is its
+    peak's. Both empty where there are too few samples to tell."""
+    n = len(values)
+    if n < FEWEST:
+        return np.zeros(0), np.zeros(0)
+    window = np.hanning(n)
+    lines = np.abs(np.fft.rfft(window * (values - values.mean())))
+    return np.fft.rfftfreq(n, period)[1:], 2 * lines[1:] / window.sum()
 
 
 def convergence(history: dict[str, Any], paths: list[str]) -> bytes:

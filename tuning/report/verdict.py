@@ -6,6 +6,7 @@ import numpy as np
 
 from tuning.objective.members import Members
 from tuning.problem import Problem
+from tuning.report.limits import broken, prices
 
 
 def verdict(facts: dict[str, Any]) -> str:
@@ -20,7 +21,7 @@ def verdict(facts: dict[str, Any]) -> str:
     )
     if not facts["verified"]:
         words += f" That is NOT VERIFIED: {facts['verified_reason']}."
-    return words
+    return " ".join([words, *(f"{line}." for line in [*broken(facts["limits"]), *prices(facts["limits"])])])
 
 
 def advice(problem: Problem, facts: dict[str, Any], x: np.ndarray, who: Members) -> str:
@@ -30,6 +31,10 @@ def advice(problem: Problem, facts: dict[str, Any], x: np.ndarray, who: Members)
         words.append(
             f"Not verified: {facts['verified_reason']}. Raise tune.substeps or tune.stress, or keep gains at a bound "
             "lower by tune.bounds."
+        )
+    if lines := broken(facts["limits"]):
+        words.append(
+            f"{'. '.join(lines)}. Allow more (inf is no limit), tune more gains, steepnesses p too, or raise tune.screen."
         )
     if not (facts["lost_in_training"] or facts["after"]["lost"]):
         return " ".join(words)

@@ -52,8 +52,9 @@ class Answer:
 
     @property
     def good(self) -> bool:
-        """And no validation member is lost."""
-        return self.confirmed and self.lost == 0
+        """And no more validation members are lost than may be."""
+        budget, survival = self.problem.tune.budget, self.problem.tune.limits.survival
+        return self.confirmed and self.lost <= (1 - survival) * budget.validation
 
 
 @dataclasses.dataclass

@@ -74,7 +74,7 @@ def validated(course: Course, x: np.ndarray, error: StepError) -> tuple[Answer, 
     if course.interrupted or not budget.validation:
         return course.answer(x, error, error.unseen), error, np.zeros(0, int)
     lost, worst = _lost(course.problem, x)
-    if not lost.size and not error.refuted:
+    if not lost.size and not error.refuted and not course.problem.sampled:
         worst = course.problem.objective.chosen(seeds(budget)[1], worst, budget.validation)
         error = step_error(course.problem, x, compared(course.problem).joined(worst))
         say(f"accurate steps on the worst of {budget.validation} members of another seed too: {step_words(error)}")
