@@ -35,6 +35,8 @@ class World:
     """of c, 1/s, by seed and number of a member, whether it is asked only to be held, and by accurate steps"""
     bias: Callable[[int], float] = lambda substeps: 0.0
     """relative error of the settled error in steps of so many per sample"""
+    louder: float = 1.0
+    """by how much the judge finds more voltage than the search does"""
     asked: list[tuple[str, int, tuple[int, ...], int]] = dataclasses.field(default_factory=list)
 
     def seeds(self, kind: str) -> set[int]:
@@ -89,7 +91,7 @@ class Bowl:
         metrics = {
             "settled_rms_error_m": error,
             "settled_max_abs_error_m": 2 * error,
-            "settled_rms_u_V": 200 * np.sqrt(found["effort"]),
+            "settled_rms_u_V": 200 * np.sqrt(found["effort"]) * self.world.louder,
             "chatter_V": 1 + numbers,
             "lost": lost,
             "stalled": np.zeros_like(lost),

@@ -23,6 +23,8 @@ from ambjax.world.amplifier import Amplifier
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Sensor
+from tuning.config import read_tune
+from tuning.objective.limits import KINDS as LIMITS
 
 # Every run is of so few samples, and of so few structures, each of which is compiled once.
 SAMPLES, MOST_STRUCTURES = 4, 12
@@ -112,6 +114,7 @@ CLOCK = st.one_of(
         {}, optional={"duration": number(DURATION), "sample_period": number(FIELDS["sample_period"])}
     ),
 )
+ASKED = [*LIMITS, "survival", "margin", "settling_band_m"]
 DOCUMENT = st.fixed_dictionaries(
     {"clock": CLOCK},
     optional={
@@ -126,6 +129,9 @@ DOCUMENT = st.fixed_dictionaries(
                 "discretisation": st.sampled_from(["implicit", "explicit", "hold"]),
                 "predict": st.sampled_from([True, False, 1]),
             },
+        ),
+        "tune": st.fixed_dictionaries(
+            {"limits": st.dictionaries(st.sampled_from(ASKED), st.floats(1e-6, 1.2) | st.just(math.inf), max_size=3)}
         ),
         "sensor": table_of(Sensor),
         "actuator": table_of(Amplifier, u_max=number(FIELDS["u_max"])),
@@ -213,7 +219,7 @@ def hold(text, path, tally, run):
     """A file with this text is refused in one line that names it, or it is read, drawn from and, if `run`, run."""
     path.write_text(text, encoding="utf-8", errors="surrogatepass")
     try:
-        case = read_case(path)
+        case = read_tune(path)[0] if "[tune" in text else read_case(path)
     except ValueError as error:
         message = str(error)
     else:

@@ -146,7 +146,8 @@ def test_what_was_minimised_is_the_goal(conditions):
     parts = breakdown.minimised(few, at, who)
     goal = few.goal.score(at[None], few.engine.terms(at[None], who), who)[0]
     assert math.log(parts["total"]) == pytest.approx(goal, rel=1e-9)
-    assert parts["total"] == pytest.approx((parts["risk"] + parts["held"]) * parts["penalty"], rel=1e-12)
+    whole = (parts["risk"] + parts["held"]) * parts["penalty"] * parts["limits"]
+    assert parts["total"] == pytest.approx(whole, rel=1e-12)
     assert (parts["ordinary"], parts["asked_to_be_held"]) == (4, 2)
     assert (parts["penalty"] > 1) == (conditions > 0)
 
@@ -290,7 +291,7 @@ def test_what_is_wide_scrolls_in_its_own_box(written):
     assert '<meta name="viewport" content="width=device-width,initial-scale=1">' in shown
     assert re.search(r"\.wide\{[^}]*overflow-x:auto", shown)
     assert shown.count("<table>") == shown.count('<div class="wide"><table>') > 4
-    assert shown.count("<img ") == shown.count('<span class="wide"><img ') == 4
+    assert shown.count("<img ") == shown.count('<span class="wide"><img ') == 5
     assert 'src="data:image/png;base64,' in shown
     assert "http" not in shown  # needs nothing else
 
@@ -321,7 +322,7 @@ def test_the_page_does_not_scroll_sideways(written, tmp_path, width):
 
 def test_pictures_that_the_report_shows_lie_beside_it(written):
     named = re.findall(r"!\[.*?\]\((.*?)\)", (written / "report.md").read_text())
-    assert sorted(named) == ["convergence.png", "front.png", "nominal.png", "slices.png"]
+    assert sorted(named) == ["convergence.png", "front.png", "nominal.png", "slices.png", "spectrum.png"]
     for name in named:
         assert (written / name).read_bytes().startswith(b"\x89PNG")
 

@@ -373,8 +373,8 @@ def test_steps_that_are_no_numbers_are_skipped(small):
     _, goal, *_ = small
     descent = Descent(goal, "adam", 0.1)
     starts = descent.begin(jnp.zeros((1, 4)))
-    good = descent.step(4, starts, jnp.ones((1, 4)), jnp.ones((1, 4, 4)), jnp.ones(1, bool))
-    bad = descent.step(4, good, jnp.full((1, 4), jnp.nan), jnp.ones((1, 4, 4)), jnp.ones(1, bool))
+    good = descent.step(4, starts, jnp.ones((1, 4, 1)), jnp.ones((1, 4, 1, 4)), jnp.ones(1, bool))
+    bad = descent.step(4, good, jnp.full((1, 4, 1), jnp.nan), jnp.ones((1, 4, 1, 4)), jnp.ones(1, bool))
     np.testing.assert_array_equal(bad.best, good.best)
     assert np.all(np.isfinite(bad.trial))
     for a, b in zip(jax.tree.leaves(bad.state), jax.tree.leaves(good.state), strict=True):

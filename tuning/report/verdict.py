@@ -33,9 +33,7 @@ def advice(problem: Problem, facts: dict[str, Any], x: np.ndarray, who: Members)
             "lower by tune.bounds."
         )
     if lines := broken(facts["limits"]):
-        words.append(
-            f"{'. '.join(lines)}. Allow more (inf is no limit), tune more gains, steepnesses p too, or raise tune.screen."
-        )
+        words.append(f"{'. '.join(lines)}. Allow more (inf: none), tune more gains, each p too, or raise tune.screen.")
     if not (facts["lost_in_training"] or facts["after"]["lost"]):
         return " ".join(words)
     words.append(f"Rotors are lost: {facts['lost_in_training']} of {len(who.member)} in training.")

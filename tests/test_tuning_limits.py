@@ -1,0 +1,297 @@
+"""Limits: how they are asked for and measured, that the search keeps them, what they cost, and what is said of it."""
+
+import argparse
+import math
+import tomllib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from bowl import World, document, study
+from texts import case_and_tune, problem_from
+from tomlkit import dumps
+
+import tuning.command
+from ambjax import rollout
+from ambjax.simulation.metrics import Named, standard_for
+from tuning.config import settings
+from tuning.objective.engine import Engine
+from tuning.objective.limits import KINDS, PENALTY, Limit, largest, measures
+from tuning.problem import FINE, problem_of
+from tuning.report.limits import MORE
+from tuning.report.pictures import amplitudes
+from tuning.search.rounds import rounds
+
+# A Bowl's voltage is 20 V where k is best, at 60, and goes as k: 10 V is at k = 30.
+TEN = {"limits": {"rms_u_V": 10.0, "margin": 0.0}}
+
+
+def found(monkeypatch, folder, world=None, **tune):
+    """The answer of the rounds, and its gains (c, k)."""
+    folder.mkdir(exist_ok=True)
+    made = study(monkeypatch, world or World(), **tune)
+    answer = rounds(made, made.tune.space.values(made.case.cascade), folder, {"of": str(tune)}, False)
+    return answer, np.asarray(answer.problem.objective.space.gains_at(answer.x))
+
+
+# --- what is asked ---
+
+
+def asked(limits, **tables):
+    document = {"sensor": {"std": 1e-6}, "clock": {"duration": 0.02}, **tables, "tune": {"limits": limits}}
+    return case_and_tune(document)[1].limits
+
+
+def test_a_supply_keeps_room_unless_it_is_told_not_to():
+    supply = {"actuator": {"u_max": 200.0}}
+    assert asked({}).each == ()
+    (default,) = asked({}, **supply).each
+    assert (default.name, default.asked) == ("rms_u_V", 120.0)
+    assert "60 %" in default.source
+    assert asked({"rms_u_V": math.inf}, **supply).each == ()
+    (given,) = asked({"rms_u_V": 150}, **supply).each
+    assert (given.asked, given.source) == (150.0, "tune.limits")
+
+
+def test_limits_are_in_order_and_in_the_fingerprint():
+    each = asked({"settling_s": 0.1, "max_u_V": 50.0, "margin": 0.1}).each
+    assert [(one.name, one.margin) for one in each] == [("max_u_V", 0.1), ("settling_s", 0.1)]
+    tune = case_and_tune({"tune": {"limits": {"max_u_V": 50.0, "survival": 0.99}}})[1]
+    assert settings(tune)["limits"] == {"max_u_V": {"asked": 50.0, "margin": KINDS["max_u_V"].margin}}
+    assert settings(tune)["survival"] == 0.99
+    assert asked({"settling_s": 0.1}).band == pytest.approx(45e-6)  # 1 % of 4.5 mm
+
+
+@pytest.mark.parametrize(
+    ("limits", "path", "words"),
+    [
+        *[({name: 0.0}, name, "above 0") for name in KINDS],
+        *[({name: math.nan}, name, "above 0") for name in KINDS],
+        *[({name: "80"}, name, "without quotes") for name in KINDS],
+        ({"clearance_used": 1.5}, "clearance_used", "at most 1"),
+        ({"survival": 1.5}, "survival", "at most 1"),
+        ({"survival": 0.0}, "survival", "above 0"),
+        ({"margin": 0.5}, "margin", "below 0.5"),
+        ({"margin": -0.1}, "margin", "from 0"),
+        ({"settling_band_m": 1e-5}, "settling_band_m", "Give both"),
+        ({"settling_band_m": 1.0, "settling_s": 1.0}, "settling_band_m", "below the clearance"),
+        ({"settling_band_m": -1.0, "settling_s": 1.0}, "settling_band_m", "above 0"),
+        ({"rms_u": 80.0}, "rms_u", "Did you mean 'rms_u_V'?"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(limits, path, words):
+    with pytest.raises(ValueError, match=r".") as caught:
+        asked(limits)
+    message = str(caught.value)
+    assert message.startswith(f"tune.limits.{path}")
+    assert words in message
+    assert message.isprintable()
+
+
+def test_limits_that_are_no_table_are_refused():
+    with pytest.raises(ValueError, match=r"tune\.limits = 80: it must be a table"):
+        case_and_tune({"tune": {"limits": 80}})
+
+
+# --- how they are measured ---
+
+SAMPLED = """
+[controller]
+position = { c = 1300.0, k = 11.0, p = inf }
+inversion = { gamma = 6e6, p = inf }
+current = { k_i = 900.0, p = inf }
+[processor]
+[reference]
+kind = "sine"
+amplitude = 1e-3
+frequency = 5.0
+[sensor]
+std = 1e-6
+std_z_dot = 1e-4
+std_i = 1e-4
+[actuator]
+u_max = 200.0
+[clock]
+duration = 0.02
+[run]
+settle = 0.01
+[tune]
+members = 4
+stressed = 2
+validation = 8
+held_out = 8
+screen = 0
+[tune.limits]
+rms_u_V = 80
+max_u_V = 150
+max_abs_i_A = 3
+chatter_V_per_s = 1e5
+largest_error_m = 1e-5
+settling_s = 0.1
+overshoot_m = 1e-5
+clearance_used = 0.6
+"""
+
+
+def test_the_search_measures_what_the_judge_does():
+    made = problem_from(SAMPLED)
+    case = made.case
+    folds = measures(made.goal.limits, case.scenario, case.clock, case.settle, 45e-6)
+    fold = Named({"ours": Named(folds), "theirs": standard_for(case.settle, case.scenario)})
+    both = rollout(case.cascade, case.scenario, case.clock, fold=fold, every=0).measured
+    ours, theirs = ({name: float(value) for name, value in both[part].items()} for part in ("ours", "theirs"))
+    assert set(ours) == set(KINDS)
+    for name, kind in KINDS.items():
+        if kind.exact and name != "max_u_V":
+            assert ours[name] == pytest.approx(theirs[kind.exact], rel=1e-12), name
+    # per second of the settled half of 20 ms
+    assert ours["chatter_V_per_s"] == pytest.approx(theirs["chatter_V"] / 0.01, rel=1e-12)
+    # a 16-norm over 200 samples: at most 200^(1/16) = 1.39 times below the largest, at its stop
+    assert theirs["max_abs_u_V"] / 1.4 < ours["max_u_V"] <= theirs["max_abs_u_V"] == 200.0
+
+
+def test_a_processor_s_steps_are_its_own():
+    made = problem_from(SAMPLED)
+    assert made.sampled
+    assert made.judging is made.engine
+    assert made.reference.objective.clock.method.substeps == FINE * made.engine.objective.clock.method.substeps
+    continuous = tomllib.loads(SAMPLED.replace("[processor]", "").replace("p = inf", "p = 25.0"))
+    other = problem_of(*case_and_tune(continuous))
+    assert not other.sampled
+    assert other.judging.objective.clock.method.substeps == FINE * other.engine.objective.clock.method.substeps
+
+
+@pytest.mark.slow
+def test_slopes_of_what_limits_hold_three_ways():
+    made = problem_from(SAMPLED)
+    x, who = made.objective.space.encode(made.tune.space.values(made.case.cascade)), made.objective.members(1, 2)
+    forward, reverse = (Engine(made.objective, settle=0.01, mode=mode, threads=1) for mode in ("forward", "reverse"))
+    value, slopes, _ = forward.gradient(x[None], who, made.goal.weights)
+    other, back, _ = reverse.gradient(x[None], who, made.goal.weights)
+    assert value.shape == (1, 2, 1 + len(KINDS))
+    np.testing.assert_allclose(value, other, rtol=1e-12)
+    size = np.abs(slopes).max(axis=-1, keepdims=True)
+    np.testing.assert_allclose(slopes / size, back / size, atol=1e-9)
+
+
+def test_the_largest_over_members_is_smooth_and_no_less():
+    values = jnp.asarray([1.0, 2.0, 2.0])
+    assert float(largest(values)) == pytest.approx(2 * (2 + 2**-16) ** (1 / 16))
+    np.testing.assert_allclose(jax.grad(largest)(values).sum(), float(largest(values)) / 2, rtol=1.0)
+    assert float(largest(1e-200 * values)) >= 0.0  # neither under- nor overflow
+    assert np.isfinite(float(largest(1e200 * values)))
+
+
+def test_the_pull_is_that_of_an_augmented_lagrangian():
+    limit, values = Limit("rms_u_V", 10.0), jnp.full(3, 10.0 * math.exp(0.1))
+    assert float(limit.pull(values)) == pytest.approx(PENALTY * 0.1**2 / 2)
+    assert float(limit.pull(0.5 * values)) == 0.0
+    told = limit.informed(10.0, 10.0 * math.exp(0.1))
+    assert told.multiplier == pytest.approx(PENALTY * 0.1)
+    # the judge finds 10 % more than the search: from now on the search counts as he does
+    assert float(told.excess(jnp.full(3, 10.0))) == pytest.approx(0.1)
+    assert told.penalty == PENALTY
+    again = told.informed(10.0, 10.0 * math.exp(0.09))  # hardly less: it must be steeper
+    assert again.penalty > PENALTY
+    assert limit.informed(5.0, 5.0).multiplier == 0.0
+
+
+# --- that they are kept, and what they cost ---
+
+
+def test_a_limit_is_met_and_its_multiplier_is_the_price(monkeypatch, tmp_path):
+    answer, (c, k) = found(monkeypatch, tmp_path, **TEN)
+    assert k == pytest.approx(30.0, rel=0.012)  # as near as an active limit is met, 1 %
+    assert c == pytest.approx(100.0, rel=0.05)
+    (limit,) = answer.problem.goal.limits
+    y = math.log(0.5)  # the error goes as 1 + y^2, y = log(k / 60), and k as the limit
+    assert limit.multiplier == pytest.approx(-2 * y / (1 + y**2), rel=0.1)
+    # against a problem whose limit is 10 % looser
+    looser, _ = found(monkeypatch, tmp_path / "looser", limits={"rms_u_V": 11.0, "margin": 0.0})
+    ours, theirs = (
+        math.sqrt(1 + math.log(np.asarray(one.problem.objective.space.gains_at(one.x))[1] / 60) ** 2)
+        for one in (answer, looser)
+    )
+    bought = 1 - math.exp(-limit.multiplier / 2 * math.log1p(MORE))
+    # of first order in log 1.1, and both optima within 1 % of k
+    assert bought == pytest.approx(1 - theirs / ours, rel=0.3)
+
+
+def test_a_limit_that_is_far_costs_nothing(monkeypatch, tmp_path):
+    far, free = World(), World()
+    first, _ = found(monkeypatch, tmp_path, far, limits={"rms_u_V": 30.0})
+    second, _ = found(monkeypatch, tmp_path / "free", free, limits={"rms_u_V": math.inf})
+    np.testing.assert_array_equal(first.x, second.x)
+    assert [one for one in far.asked if one[0] != "terms"] == [one for one in free.asked if one[0] != "terms"]
+    assert len(far.asked) == len(free.asked) + 1  # the training members, once more
+
+
+def test_what_the_judge_finds_counts(monkeypatch, tmp_path):
+    _, (_, k) = found(monkeypatch, tmp_path, World(louder=1.25), **TEN)
+    assert k == pytest.approx(30.0 / 1.25, rel=0.012)
+
+
+def test_a_limited_study_that_is_resumed_ends_alike(monkeypatch, tmp_path):
+    made = study(monkeypatch, World(), **TEN)
+    start = made.tune.space.values(made.case.cascade)
+    whole = rounds(made, start, tmp_path, {"of": "ten"}, False)
+    again = rounds(study(monkeypatch, World(), **TEN), start, tmp_path, {"of": "ten"}, True)
+    np.testing.assert_array_equal(again.x, whole.x)
+    assert again.problem.goal.limits == whole.problem.goal.limits
+
+
+# --- the command ---
+
+
+def command(monkeypatch, tmp_path, world=None, **tune):
+    study(monkeypatch, world or World(), **tune)
+    path, out = tmp_path / "case.toml", tmp_path / "out"
+    path.write_text(dumps(document(**tune)))
+    flags = {"gradients": False, "pareto": False, "resume": False, "json": True}
+    code, summary = tuning.command.run(argparse.Namespace(case=str(path), out=str(out), **flags))
+    return code, summary, out
+
+
+def test_the_command_says_what_a_limit_costs(monkeypatch, tmp_path):
+    code, summary, out = command(monkeypatch, tmp_path, limits={"rms_u_V": 10.0})
+    assert code == 0
+    row, survival = summary["limits"]
+    assert (row["name"], row["asked"], row["held"], row["active"]) == ("rms_u_V", 10.0, True, True)
+    assert row["reached"] == pytest.approx(summary["after"]["settled_rms_u_V.mean"])
+    assert row["price_m"] > 0
+    assert (survival["reached"], survival["held"]) == (1.0, True)
+    assert "is at its limit, 10: 10 % more would take about" in summary["verdict"]
+    text = (out / "report.md").read_text()
+    assert "## Limits" in text
+    assert "| `rms_u_V` | at most 10 V |" in text
+    assert (out / "spectrum.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_limit_that_is_not_held_is_an_answer_of_no(monkeypatch, tmp_path):
+    """At the least k that bounds allow, 1, the voltage is 0.33 V."""
+    code, summary, out = command(monkeypatch, tmp_path, limits={"rms_u_V": 0.2})
+    assert code == 1
+    assert summary["limits"][0]["held"] is False
+    assert summary["limits"][0]["price_m"] is None
+    assert "tune.limits.rms_u_V is NOT HELD" in summary["verdict"]
+    assert "NOT HELD" in summary["advice"]
+    assert "**NOT HELD**" in (out / "report.md").read_text()
+
+
+def test_a_share_of_rotors_may_be_given_up(monkeypatch, tmp_path):
+    from tuning.config import Budget, seeds
+
+    held_out = seeds(Budget())[2]
+    world = World(limit=lambda seed, number, *_: 40.0 if (seed, number) == (held_out, 2) else math.inf)
+    assert command(monkeypatch, tmp_path, world, limits={"survival": 0.8})[0] == 0  # 5 of 6 are held
+    assert command(monkeypatch, tmp_path, world, limits={"survival": 0.9})[0] == 1
+
+
+def test_a_sine_s_amplitude_is_its_peak_s():
+    t = 1e-4 * np.arange(8000)
+    frequency, amplitude = amplitudes(3.0 + 5.0 * np.sin(2 * np.pi * 250 * t), 1e-4)
+    assert frequency[np.argmax(amplitude)] == pytest.approx(250)
+    assert amplitude.max() == pytest.approx(5.0, rel=1e-3)  # Hann's window, at the middle of a line
+    assert frequency[-1] == pytest.approx(5000)
+    assert len(amplitudes(np.zeros(3), 1e-4)[0]) == 0
