@@ -187,12 +187,15 @@ def test_the_pull_is_that_of_an_augmented_lagrangian():
     limit, values = Limit("rms_u_V", 10.0), jnp.full(3, 10.0 * math.exp(0.1))
     assert float(limit.pull(values)) == pytest.approx(PENALTY * 0.1**2 / 2)
     assert float(limit.pull(0.5 * values)) == 0.0
+    # the multiplier is the force that acted at the optimum, which the search's own number makes
+    assert limit.informed(10.0 * math.exp(0.05), 10.0 * math.exp(0.1)).multiplier == pytest.approx(PENALTY * 0.05)
     told = limit.informed(10.0, 10.0 * math.exp(0.1))
-    assert told.multiplier == pytest.approx(PENALTY * 0.1)
+    assert told.multiplier == pytest.approx(0.0)
     # the judge finds 10 % more than the search: from now on the search counts as he does
     assert float(told.excess(jnp.full(3, 10.0))) == pytest.approx(0.1)
     assert told.penalty == PENALTY
-    again = told.informed(10.0, 10.0 * math.exp(0.09))  # hardly less: it must be steeper
+    again = told.informed(9.9, 10.0 * math.exp(0.09))  # hardly less: it must be steeper
+    assert again.multiplier == pytest.approx(PENALTY * (0.1 + math.log(0.99)))
     assert again.penalty > PENALTY
     assert limit.informed(5.0, 5.0).multiplier == 0.0
 

@@ -216,9 +216,10 @@ class Limit:
         return math.log(max(reached, TINY) / self.allowed)
 
     def informed(self, tuned: float, judged: float) -> "Limit":
-        """It knows what the search's number and the judge's are at an optimum of the goal with it."""
+        """It knows what the search's number and the judge's are at an optimum of the goal with it: the multiplier is
+        the force that acted there."""
         excess = self.beyond(judged)
-        force = max(self.multiplier + self.penalty * excess, 0.0)
+        force = max(self.multiplier + self.penalty * self.beyond(self.ratio * tuned), 0.0)
         slow = force > 0 and abs(excess) > LEFT * abs(self.missed)
         penalty = min(STEEPER * self.penalty, STEEPEST) if slow else self.penalty
         ratio = max(judged, TINY) / max(tuned, TINY)

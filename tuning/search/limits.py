@@ -8,7 +8,7 @@ import numpy as np
 from ambjax.commands.outputs import say
 from tuning.config import seeds
 from tuning.judge import judge
-from tuning.objective.limits import PREFIX, Limit
+from tuning.objective.limits import PENALTY, PREFIX, Limit
 from tuning.search.course import Course
 
 # Updates of the multipliers at one place, at most.
@@ -27,19 +27,31 @@ def limited(course: Course, x: np.ndarray) -> np.ndarray:
         goal = course.problem.goal
         numbers = _numbers(course, x)
         limits = tuple(limit.informed(*found) for limit, found in zip(goal.limits, numbers, strict=True))
+        if any(_stuck(limit, judged) for limit, (_, judged) in zip(goal.limits, numbers, strict=True)):
+            say("a limit does not give way, however steep its pull: it cannot be held here")
+            break
         course.problem = course.problem.limited(limits)
-        pulling = [(limit, judged) for limit, (_, judged) in zip(limits, numbers, strict=True) if limit.multiplier > 0]
-        for limit, judged in pulling:
-            say(f"limit {limit.name} = {limit.asked:g} {limit.kind.unit}: {judged:.4g} on members of another seed")
-        if course.interrupted or all(_met(limit, judged) for limit, judged in pulling):
+        done = []
+        for before, after, (_, judged) in zip(goal.limits, limits, numbers, strict=True):
+            idle = before.multiplier == after.multiplier == 0
+            done.append(_met(after, judged) or (idle and after.beyond(judged) <= 0))
+            if not (idle and done[-1]):
+                say(f"limit {after.name} = {after.asked:g} {after.kind.unit}: {judged:.4g} on members of another seed")
+        if course.interrupted or all(done):
             break
         course.asides += 1
         x, _ = course.search(x[None])
     return x
 
 
+def _stuck(limit: Limit, judged: float) -> bool:
+    """Whether a limit is exceeded as it was before its pull became steeper."""
+    excess = limit.beyond(judged)
+    return limit.penalty > PENALTY and excess > limit.margin + LEAST and 0 < limit.missed < excess + LEAST
+
+
 def _met(limit: Limit, judged: float) -> bool:
-    """Whether a limit that pulls holds what is allowed, and not much less."""
+    """Whether what is allowed is held, and made use of."""
     return -BELOW <= limit.beyond(judged) <= max(limit.margin / 2, LEAST)
 
 
@@ -51,9 +63,9 @@ def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
         return []
     terms = problem.engine.terms(x[None], course.who)
     tuned = [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in limits]
-    each = zip(limits, tuned, strict=True)
-    if all(not limit.kind.worst and limit.beyond(ours) < -FAR for limit, ours in each):
-        return [(ours, ours) for ours in tuned]
+    known = [limit.ratio * ours for limit, ours in zip(limits, tuned, strict=True)]
+    if all(not limit.kind.worst and limit.beyond(one) < -FAR for limit, one in zip(limits, known, strict=True)):
+        return list(zip(tuned, known, strict=True))
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
     if not any(limit.kind.worst for limit in limits):
         count = min(count, FEW)
