@@ -22,7 +22,7 @@ PAGES = sorted((ROOT / "docs").glob("*.md"))
 ROLE = re.compile(r"\{py:(\w+)\}`(?:[^`<]*<)?~?([\w.]+)>?`")
 # Tables of the case file whose keys are rows of a page, with what must stand beside a key for the reader to get there.
 ELSEWHERE = ("controller", "reference", "disturbance", "spread")
-ROWS = [(name, {}) for name in [*TABLES, *OTHERS, "tune.weights"] if name not in ELSEWHERE]
+ROWS = [(name, {}) for name in [*TABLES, *OTHERS, "tune.weights", "tune.limits"] if name not in ELSEWHERE]
 ROWS += [("reference", {"kind": kind}) for kind in SIGNALS]
 ROWS += [(f"controller.{stage}", {"kind": kind}) for stage, kinds in KINDS.items() for kind in kinds]
 
@@ -80,7 +80,9 @@ def test_no_key_is_without_range_and_meaning(table, beside):
             assert row.doc, f"{table}.{row.name}: give its field a doc, or its line in the template a comment"
 
 
-@pytest.mark.parametrize("table", ["plant", "sensor", "initial", "actuator", "clock", "tune", "tune.weights"])
+@pytest.mark.parametrize(
+    "table", ["plant", "sensor", "initial", "actuator", "clock", "tune", "tune.weights", "tune.limits"]
+)
 def test_defaults_are_those_of_the_reader(table):
     """A case with every number set to the default on the page is the case without: to six digits, as printed."""
     rows = case_file.rows_of(table, case_file.RECORDS.get(table))

@@ -173,12 +173,12 @@ def _limits(table: Table, case: Case) -> Limits:
     u_max, source = float(np.max(np.asarray(case.scenario.u_max))), dict.fromkeys(asked, table.path)
     if "rms_u_V" not in asked and math.isfinite(u_max):
         asked["rms_u_V"], source["rms_u_V"] = SHARE * u_max, f"by default, {100 * SHARE:g} % of actuator.u_max"
+    clearance = float(np.min(np.asarray(case.scenario.touchdown)))
+    band = _positive(table, "settling_band_m", BAND * clearance)
     if "settling_band_m" in table.raw and "settling_s" not in asked:
         raise ValueError(
             f"{table.at('settling_band_m')} has a meaning beside {table.at('settling_s')} only. Give both."
         )
-    clearance = float(np.min(np.asarray(case.scenario.touchdown)))
-    band = _positive(table, "settling_band_m", BAND * clearance)
     if band >= clearance:
         raise ValueError(
             f"{table.at('settling_band_m')} = {band:g} m: it must be below the clearance, {clearance:g} m "

@@ -47,6 +47,7 @@ WORDS = {
     "spread": "What varies from member to member of an ensemble. See [spreads](spread.md).",
     "tune": "What `ambjax-tune` is to do; the other commands pass it by.",
     "tune.weights": "What counts, as weights of dimensionless terms.",
+    "tune.limits": "What must not be exceeded, as judged by the held-out members. See [limits](../limits.md).",
 }
 LEFT_OUT = re.compile(r"[(;]? ?left out: (?P<default>[^;)]*)\)?")
 CHOICE = re.compile(r"one of '(?P<default>[^']*)'")
@@ -126,7 +127,7 @@ def _case_file() -> str:
             lines += _section("controller.model")
         if name == "disturbance":
             lines += _units()
-    return "\n".join([*lines, *_section("tune.weights")])
+    return "\n".join([*lines, *_section("tune.weights"), *_section("tune.limits")])
 
 
 def _section(path: str) -> list[str]:

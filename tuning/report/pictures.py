@@ -19,7 +19,7 @@ BEYOND = 1.15
 # What moves by less than this share of a signal's largest value is shown flat.
 FLAT = 1e-2
 # Amplitudes below this share of the largest are cut off; and samples of which there is a spectrum.
-FAINTEST, FEWEST = 1e-6, 16
+FAINTEST, FEWEST = 1e-5, 16
 
 
 def before_after(runs: dict[str, Trajectory]) -> bytes:
