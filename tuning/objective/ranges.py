@@ -43,8 +43,9 @@ def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarra
     """
     site, gains = _site(objective, conditions), objective.space.gains
     asked = [_interval(site, objective.cascade, *one) for one in zip(gains, start, strict=True)]
-    found = {gain.path: _range(*one) for gain, *one in zip(gains, gains, start, asked, strict=True) if not one[2].times}
-    for gain, value, one in zip(gains, start, asked, strict=True):
+    rows = list(zip(gains, start, asked, strict=True))
+    found = {gain.path: _range(gain, value, one) for gain, value, one in rows if not one.times}
+    for gain, value, one in rows:
         if one.times:
             found[gain.path] = _quotient(gain, value, one, objective.cascade, found)
     return [found[gain.path] for gain in gains]
