@@ -65,7 +65,7 @@ EXPLICIT = {
 }
 NOISE = (1e-6, 1e-4, 1e-4)
 SLOW = ("complementary", {"l": 5.0})
-DIFFERENCE, KALMAN = ("difference", {"w": 2000.0}), ("kalman", {"w": 800.0})
+DIFFERENCE, KALMAN, IRED2 = ("difference", {"w": 2000.0}), ("kalman", {"w": 800.0}), ("ired-2", {"L": 3e4})
 PI = ("pi", {"k_p": 3e5, "k_int": 1e8, "k_aw": 200.0})
 WRONG = {"m": 0.65, "R": 45.0, "n": 1400.0}
 CASES = [
@@ -112,7 +112,7 @@ CASES = [
     Case("Kalman, explicit, off centre", World(**EXPLICIT, observer=KALMAN, initial=(2e-5, 0.0, 0.0)), 2000),
     Case("IRED of order 1 under noise", World(observer=("ired-1", {"L": 50.0}), u_max=300.0, **soft()), std=NOISE),
     # under more noise, or on less voltage, its loop is chaotic: rounding grows tenfold in 70 samples
-    Case("IRED of order 2 under noise", World(observer=("ired-2", {"L": 3e4}), **soft()), 300, (1e-7, 0.0, 1e-4)),
+    Case("IRED of order 2 under noise", World(**TRACKING, observer=IRED2, u_max=3e3, **soft()), 300, (1e-7, 0.0, 1e-4)),
     Case("super-twisting, explicit", World(**EXPLICIT, position=twisting()), 6000),
 ]
 
