@@ -11,6 +11,7 @@ from ambjax._version import __version__
 if TYPE_CHECKING:
     from ambjax.control import current, inversion, observer, position
     from ambjax.control.cascade import Cascade
+    from ambjax.control.processor import Processor
     from ambjax.simulation.clock import Clock
     from ambjax.simulation.explicit import DOP853, RK4, Euler
     from ambjax.simulation.integrate import AdaptiveRodas3, Rodas3, Slide
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from ambjax.simulation.metrics import Standard
     from ambjax.simulation.rollout import Outcome, rollout
     from ambjax.simulation.trajectory import Row, Trajectory
+    from ambjax.world.amplifier import Amplifier
+    from ambjax.world.coils import TwoCoil
     from ambjax.world.plant import Plant
     from ambjax.world.scenario import Initial, Scenario
     from ambjax.world.sensor import Sensor
@@ -27,6 +30,7 @@ __all__ = [
     "DOP853",
     "RK4",
     "AdaptiveRodas3",
+    "Amplifier",
     "BandNoise",
     "Cascade",
     "Chirp",
@@ -36,6 +40,7 @@ __all__ = [
     "Initial",
     "Outcome",
     "Plant",
+    "Processor",
     "Pulse",
     "Rodas3",
     "Row",
@@ -48,6 +53,7 @@ __all__ = [
     "Step",
     "Sum",
     "Trajectory",
+    "TwoCoil",
     "__version__",
     "choose_method",
     "current",
@@ -62,6 +68,7 @@ __all__ = [
 _NAMES = {
     "control": "current inversion observer position",
     "control.cascade": "Cascade",
+    "control.processor": "Processor",
     "simulation.clock": "Clock",
     "simulation.explicit": "DOP853 RK4 Euler",
     "simulation.integrate": "AdaptiveRodas3 Rodas3 Slide",
@@ -69,6 +76,8 @@ _NAMES = {
     "simulation.metrics": "Standard",
     "simulation.rollout": "Outcome rollout",
     "simulation.trajectory": "Row Trajectory",
+    "world.amplifier": "Amplifier",
+    "world.coils": "TwoCoil",
     "world.plant": "Plant",
     "world.scenario": "Initial Scenario",
     "world.sensor": "Sensor",
