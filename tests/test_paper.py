@@ -57,7 +57,7 @@ def test_reproduce(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     out = tmp_path / "paper"
     assert main(["reproduce", "--out", str(out)]) == 0
-    for folder in (out, out / "literal", out / "tuned"):
+    for folder in (out, out / "literal", out / "tuned", out / "sampled"):
         for number in (3, 4, 5, 6):
             assert (folder / f"figure_{number}.png").read_bytes().startswith(b"\x89PNG")
     written = json.loads((out / "ledger.json").read_text())
@@ -76,6 +76,19 @@ def test_reproduce(tmp_path, monkeypatch):
     assert error["verdict"] == claims.HOLDS
     assert error["value"] < 1e-5
     assert found["All this under sensor noise of variance 1e-7"]["tuned"]["verdict"] == claims.HOLDS
+    # on the processor
+    told = {(row["reading"], row["noise"]): row for row in written["processor"]}
+    assert set(told) == {(one, True) for one in paper.READINGS} | {("literal", False), ("repaired", False)}
+    assert told["literal", False]["lost_at_s"] < 0.02
+    assert told["repaired", False]["lost_at_s"] is None
+    assert told["repaired", True]["lost_at_s"] < 0.02
+    ours = found["Tracking: largest error 2.3e-5 m"]["sampled"]
+    assert ours["verdict"] == claims.HOLDS
+    assert (
+        told["sampled", True]["settled_max_abs_error_m"]
+        == ours["value"]
+        < told["tuned", True]["settled_max_abs_error_m"]
+    )
     page = (out / "ledger.md").read_text()
     assert all(dataclasses.asdict(c)["says"] in page for c in claims.CLAIMS)
 
