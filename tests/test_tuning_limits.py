@@ -216,9 +216,18 @@ def test_a_limit_is_met_and_its_multiplier_is_the_price(monkeypatch, tmp_path):
         math.sqrt(1 + math.log(np.asarray(one.problem.objective.space.gains_at(one.x))[1] / 60) ** 2)
         for one in (answer, looser)
     )
-    bought = 1 - math.exp(-limit.multiplier / 2 * math.log1p(MORE))
-    # of first order in log 1.1, and both optima within 1 % of k
-    assert bought == pytest.approx(1 - theirs / ours, rel=0.3)
+    # to first order in log 1.1 beyond the optima on the way, and both within 1 % of k
+    assert limit.bought(MORE) == pytest.approx(1 - theirs / ours, rel=0.2)
+
+
+def test_the_price_falls_as_the_multiplier_does_on_the_way():
+    """Where it is 20 at 10 V and, linear in the logarithm, 0 at 11 V, 10 % more takes off half of what 20 would."""
+    limit = Limit("rms_u_V", 10.0, multiplier=20.0, forces=((11.0, 0.0), (10.0, 20.0)))
+    # 200 stretches of a straight line
+    assert limit.bought(0.1) == pytest.approx(1 - 1.1 ** (-20 / 2 / 2), rel=1e-9)
+    alone = Limit("rms_u_V", 10.0, multiplier=2.0, forces=((10.0, 2.0),))
+    assert alone.bought(0.1) == pytest.approx(1 - 1 / 1.1, rel=1e-9)
+    assert Limit("rms_u_V", 10.0).bought(0.1) == 0.0
 
 
 def test_a_limit_that_is_far_costs_nothing(monkeypatch, tmp_path):

@@ -33,6 +33,8 @@ PREFIX = "limit."
 TINY = 1e-30
 # What a supply is worth without being asked: rms voltage as a share of its limit.
 SHARE = 0.6
+# Stretches of the integral that prices a limit.
+STRETCHES = 200
 
 
 @record
@@ -179,7 +181,8 @@ KINDS: dict[str, Kind] = {
 @dataclasses.dataclass(frozen=True)
 class Limit:
     """At most `asked` of a KIND; `source` says who asks. What a search has learnt: `multiplier`, `penalty`, by how much
-    the judge's number exceeds the search's (`ratio`), and the last g (`missed`)."""
+    the judge's number exceeds the search's (`ratio`), the last g (`missed`), and what acted at each optimum on the way:
+    (reached, multiplier) (`forces`)."""
 
     name: str
     asked: float
@@ -190,6 +193,7 @@ class Limit:
     ratio: float = 1.0
     penalty: float = PENALTY
     missed: float = math.inf
+    forces: tuple[tuple[float, float], ...] = ()
 
     @property
     def kind(self) -> Kind:
@@ -223,7 +227,21 @@ class Limit:
         slow = force > 0 and abs(excess) > LEFT * abs(self.missed)
         penalty = min(STEEPER * self.penalty, STEEPEST) if slow else self.penalty
         ratio = max(judged, TINY) / max(tuned, TINY)
-        return dataclasses.replace(self, multiplier=force, ratio=ratio, penalty=penalty, missed=excess)
+        forces = (*self.forces, (max(judged, TINY), force))
+        return dataclasses.replace(self, multiplier=force, ratio=ratio, penalty=penalty, missed=excess, forces=forces)
+
+    def bought(self, more: float) -> float:
+        """Share of the root mean square error that this share more of the limit takes off.
+
+        What is minimised falls by the multiplier, which falls on the way: each optimum that a search came by was that
+        of a looser limit. Between them it is linear in the logarithm of the limit; beyond them as at the last.
+        """
+        if not self.multiplier:
+            return 0.0
+        logs, forces = np.array(sorted((math.log(reached), force) for reached, force in self.forces)).T
+        begin = math.log(self.forces[-1][0])
+        at = np.linspace(begin, begin + math.log1p(more), STRETCHES + 1)
+        return -math.expm1(-float(np.trapezoid(np.interp(at, logs, forces), at)) / 2)
 
     def reached(self, columns: Mapping[str, np.ndarray]) -> float:
         """The judge's number, of every metric and term [N] of an ensemble."""

@@ -16,8 +16,8 @@ MORE = 0.1
 def facts(limits: tuple[Limit, ...], asked: Limits, columns: dict[str, np.ndarray], summary: Facts) -> list[Facts]:
     """A row for each limit, and one for survival, of the held-out members' columns [N] (of `judge`) and summary.
 
-    `price_m`: what a limit 10 % higher takes off the settled rms error, m, from the multiplier: what is minimised goes
-    as limit^-multiplier, and the mean square error with it. None where the limit is not held, or nobody judges.
+    `price_m`: what a limit 10 % higher takes off the settled rms error, m, from the multipliers of the optima on the way
+    (`Limit.bought`). None where the limit is not held, or nobody judges.
     """
     share = 1 - summary["lost"] / summary["members"] if summary["members"] else None
     survival = {
@@ -41,7 +41,7 @@ def _row(limit: Limit, columns: dict[str, np.ndarray], summary: Facts) -> Facts:
     reached = limit.reached(columns) if columns else None
     held = None if reached is None else bool(reached <= limit.asked)
     active = limit.multiplier > 0
-    price = summary["settled_rms_error_m"] * -np.expm1(-limit.multiplier / 2 * np.log1p(MORE)) if columns else 0.0
+    price = summary["settled_rms_error_m"] * limit.bought(MORE) if columns else 0.0
     return {
         "name": limit.name,
         "unit": limit.kind.unit,
@@ -102,7 +102,7 @@ def section(rows: list[Facts]) -> list[str]:
         *lines,
         "",
         "Reached by the held-out members. An active limit costs error: the last column is by how much the settled rms "
-        "error would fall, from the limit's multiplier.",
+        "error would fall, from the multipliers of the optima that the search came by.",
         "",
     ]
 
