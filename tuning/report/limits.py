@@ -16,7 +16,8 @@ MORE = 0.1
 def facts(limits: tuple[Limit, ...], asked: Limits, columns: dict[str, np.ndarray], summary: Facts) -> list[Facts]:
     """A row for each limit, and one for survival, of the held-out members' columns [N] (of `judge`) and summary.
 
-    `price_m`: what a limit 10 % higher takes off the settled rms error, m (`Limit.bought`). None where the limit is not held, or nobody judges.
+    `price_m`: what a limit 10 % higher takes off the settled rms error, m (`Limit.bought`). None where the limit is not
+    held, or nobody judges.
     """
     share = 1 - summary["lost"] / summary["members"] if summary["members"] else None
     survival = {
