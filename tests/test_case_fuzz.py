@@ -114,7 +114,12 @@ CLOCK = st.one_of(
         {}, optional={"duration": number(DURATION), "sample_period": number(FIELDS["sample_period"])}
     ),
 )
-ASKED = [*LIMITS, "survival", "margin", "settling_band_m"]
+LIMIT = st.floats(1e-6, 0.4) | st.just(0.4) | st.sampled_from([0.0, 1.2, math.inf])
+ASKED = st.one_of(
+    st.dictionaries(st.sampled_from([*LIMITS, "survival", "margin"]), st.floats(1e-6, 0.4), max_size=3),
+    st.dictionaries(st.sampled_from([*LIMITS, "survival"]), LIMIT, max_size=2),
+    st.fixed_dictionaries({"settling_s": st.floats(1e-3, 1.0), "settling_band_m": st.floats(1e-9, 1e-3)}),
+)
 DOCUMENT = st.fixed_dictionaries(
     {"clock": CLOCK},
     optional={
@@ -130,9 +135,7 @@ DOCUMENT = st.fixed_dictionaries(
                 "predict": st.sampled_from([True, False, 1]),
             },
         ),
-        "tune": st.fixed_dictionaries(
-            {"limits": st.dictionaries(st.sampled_from(ASKED), st.floats(1e-6, 1.2) | st.just(math.inf), max_size=3)}
-        ),
+        "tune": st.fixed_dictionaries({"limits": ASKED}),
         "sensor": table_of(Sensor),
         "actuator": table_of(Amplifier, u_max=number(FIELDS["u_max"])),
         "initial": table_of(Initial, z=st.floats(-3e-3, 3e-3)),
