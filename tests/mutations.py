@@ -425,6 +425,13 @@ SEARCH = [
         "tests/test_tuning_study.py::test_the_judge_sees_every_member_of_its_own_ensemble_once",
     ),
     M(
+        "steps are compared behind the converter",
+        "tuning/problem.py",
+        "dataclasses.replace(scenario.sensor, bits=None)",
+        "dataclasses.replace(scenario.sensor)",
+        "tests/test_tuning_verified.py::test_steps_are_compared_without_the_converter",
+    ),
+    M(
         "the range of c forgets the sample period",
         "ambjax/control/search.py",
         "cap = max(1 / (5 * site.period), site.w / 10)",

@@ -247,3 +247,13 @@ def test_the_search_goes_on_to_where_it_is_confirmed(tmp_path):
     facts = json.loads((out / "report.json").read_text())
     assert facts["verified"] is True
     assert facts["after"]["lost"] == 0
+
+
+def test_steps_are_compared_without_the_converter(small):
+    """Two runs whose converter rounds otherwise once go different ways, however fine their steps."""
+    assert small.steps == (small.engine, small.reference)
+    converted = problem_from(SMALL.replace("std = 2e-7", "std = 2e-7\nbits = 12") + "[processor]\n")
+    assert [engine.objective.scenario.sensor.bits for engine in converted.steps] == [None, None]
+    assert converted.engine.objective.scenario.sensor.bits == 12
+    ours, accurate = (engine.objective.clock.method for engine in converted.steps)
+    assert ours == converted.engine.objective.clock.method != accurate

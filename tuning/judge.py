@@ -99,7 +99,7 @@ def worst_of(values: np.ndarray) -> np.ndarray:
 def step_error(problem: Problem, x: np.ndarray, who: Members | None = None) -> StepError:
     """What the search's own steps are worth at x [m], on these members; left out: on the first that it is tuned on."""
     who = compared(problem) if who is None else who
-    ours, theirs = (e.metrics(x[None], who)["metrics"] for e in (problem.engine, problem.reference))
+    ours, theirs = (e.metrics(x[None], who)["metrics"] for e in problem.steps)
     ended = [np.isfinite(metrics["lost_at_s"])[0] for metrics in (ours, theirs)]
     held, unseen = ~(ended[0] | ended[1]), ended[1] & ~ended[0]
     stalled = unseen & theirs["stalled"][0]

@@ -74,6 +74,20 @@ class Problem:
         objective = dataclasses.replace(self.objective, clock=dataclasses.replace(self.objective.clock, method=method))
         return Engine(objective, settle=self.case.settle, **more)
 
+    @functools.cached_property
+    def steps(self) -> tuple[Engine, Engine]:
+        """The search's own steps and accurate ones, to be compared: both without the converter, if there is one.
+
+        Where it rounds otherwise for a last digit's sake, two runs go different ways, and differ by more than steps do.
+        """
+        scenario = self.objective.scenario
+        if scenario.sensor is None or scenario.sensor.bits is None:
+            return self.engine, self.reference
+        sensor = dataclasses.replace(scenario.sensor, bits=None)
+        objective = dataclasses.replace(self.objective, scenario=dataclasses.replace(scenario, sensor=sensor))
+        exact = dataclasses.replace(self, objective=objective)
+        return exact._stepping(objective.clock.integrator, lanes=REFERENCE_MEMBERS), exact.reference
+
 
 def method_for(case: Case, substeps: int, finer: int) -> integrate.Integrator:
     """The step of the search, `finer` times as fine: of fixed number, so that all members take as long.
