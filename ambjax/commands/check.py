@@ -13,8 +13,8 @@ from ambjax.theorem.processor import Sampled
 
 Summary = dict[str, Any]
 CONTINUOUS = (
-    "All of this is about continuous time, for which the theorem is: the case's [processor] is left out, its converters"
-    " and amplifier too, and signs without a layer have one. It decides nothing here."
+    "All of this is about continuous time, for which the theorem is: the case's [processor] is left out, its "
+    "converters and amplifier too, and signs without a layer have one. It decides nothing here."
 )
 
 BAND = "Band: what its law keeps the signal in from run.settle on, without noise, which comes on top of it."
