@@ -46,9 +46,11 @@ def _kept_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arr
     return _barrier(*primals), _barrier(*tangents)
 
 
-def stored(tree: Result) -> Result:
+def stored(tree: Result, beside: Any = ()) -> Result:
     """The same values, and the same derivatives, stored: whoever uses them reads memory.
 
-    Else XLA computes an intermediate again in every loop that uses it, and its derivatives once more for each.
+    Else XLA computes an intermediate again in every loop that uses it, and its derivatives once more for each. What is
+    a leaf of `beside` is there already.
     """
-    return jax.tree.map(_barrier, tree)
+    there = set(map(id, jax.tree.leaves(beside)))
+    return jax.tree.map(lambda x: x if id(x) in there else _barrier(x), tree)

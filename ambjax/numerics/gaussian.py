@@ -5,8 +5,7 @@ library call for every number on CPUs: twenty times what a step of the loop cost
 and Muller's transform.
 """
 
-from typing import Any
-
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -23,8 +22,7 @@ LN_2, ROOT_HALF = float(np.log(2.0)), float(np.sqrt(0.5))
 ATANH_TERMS = {"float64": 10, "float32": 5}
 
 
-@apart
-def _threefry(k_0: Array, k_1: Array, x: Array, y: Array) -> Any:
+def _threefry(k_0: Array, k_1: Array, x: Array, y: Array) -> tuple[Array, Array]:
     schedule = (k_0, k_1, k_0 ^ k_1 ^ jnp.uint32(0x1BD11BDA))
     x, y = x + k_0, y + k_1
     for group in range(5):
@@ -36,9 +34,20 @@ def _threefry(k_0: Array, k_1: Array, x: Array, y: Array) -> Any:
     return x, y
 
 
+@apart
+def _both(*words: Array) -> Array:
+    """Both words of `_threefry` in the bits of one complex number: of two results XLA computes each apart."""
+    return lax.complex(*[lax.bitcast_convert_type(word, jnp.float32) for word in _threefry(*words)])
+
+
 def threefry(key: tuple[Scalar, Scalar], count: tuple[Scalar, Scalar]) -> tuple[Array, Array]:
     """Threefry-2x32 with 20 rounds (Salmon et al., SC 2011), the generator of jax.random: two words from two."""
-    return _threefry(*[jnp.asarray(word).astype(jnp.uint32) for word in (*key, *count)])
+    words = [jnp.asarray(word).astype(jnp.uint32) for word in (*key, *count)]
+    if jax.default_backend() != "cpu":
+        return _threefry(*words)
+    both = _both(*words)
+    first, second = (lax.bitcast_convert_type(part, jnp.uint32) for part in (lax.real(both), lax.imag(both)))
+    return first, second
 
 
 @apart

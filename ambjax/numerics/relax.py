@@ -13,7 +13,7 @@ from jax import Array
 
 from ambjax.numerics.apart import apart
 from ambjax.numerics.records import Scalar
-from ambjax.numerics.smooth import TWO_OVER_PI, arctan_per, safe_sqrt, smooth_root, smooth_sign
+from ambjax.numerics.smooth import TWO_OVER_PI, arctan_per, limited, reciprocal, safe_sqrt, smooth_root, smooth_sign
 
 # Steps of Halley's method from the root for another sign of the same slope and tail, which is 0.4 to 1 times the root:
 # 2 leave 3e-8 of the right-hand side, 3 rounding (Newton's method: 4 leave 2e-12).
@@ -26,7 +26,7 @@ def relax(w: Scalar, h: Scalar, p: Scalar | None) -> Array:
     """The w+ with w+ + h sgn_p(w+) = w; h >= 0 in the unit of w, p in its inverse."""
     w, h = jnp.asarray(w), jnp.asarray(h)
     if p is None:
-        return jnp.sign(w) * jnp.maximum(jnp.abs(w) - h, 0.0)
+        return w - limited(w, h)
     return _relaxed(p * w, TWO_OVER_PI * p * h) / p
 
 
@@ -35,7 +35,7 @@ def share(w: Scalar, h: Scalar, p: Scalar | None) -> Array:
     if p is None:
         w, h = jnp.asarray(w), jnp.asarray(h)
         hard = h > 0
-        return jnp.where(hard, jnp.clip(w / jnp.where(hard, h, 1.0), -1.0, 1.0), jnp.sign(w))
+        return jnp.where(hard, limited(w * (1 / jnp.where(hard, h, 1.0)), 1.0), jnp.sign(w))
     return smooth_sign(relax(w, h, p), p)
 
 
@@ -48,12 +48,12 @@ def _relaxed(x: Array, h: Array) -> Array:
     reach, eps = h / TWO_OVER_PI, TWO_OVER_PI
     b = eps + reach - size
     root = jnp.sqrt(b * b + 4 * eps * size)
-    y = jnp.where(b > 0, 2 * eps * size / (jnp.abs(b) + root), (root - b) / 2)
+    y = jnp.where(b > 0, 2 * eps * size * reciprocal(jnp.abs(b) + root), (root - b) / 2)
     for _ in range(HALLEY):
         flat = 1 + y * y
-        steep = 1 / (flat + h)  # divided first: the fourth power of y would overflow in float32
+        steep = reciprocal(flat + h)  # divided first: the fourth power of y would overflow in float32
         newton = (y + h * arctan_per(y, jnp.ones_like(y)) - size) * steep
-        y = y - newton * flat / (1 + (y * steep) * (h * newton))
+        y = y - newton * flat * reciprocal(1 + (y * steep) * (h * newton))
     return jnp.where(x < 0, -y, y)
 
 

@@ -2,11 +2,13 @@
 
 from typing import Any, ClassVar, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.numerics.apart import apart
 from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.numerics.smooth import reciprocal, safe_sqrt
+from ambjax.numerics.smooth import reciprocal, refined, safe_sqrt
 from ambjax.world.sensor import Measurement
 
 # A gap is never taken smaller than this share of s_0. No accepted state comes near it (the rotor has
@@ -25,6 +27,25 @@ class Gaps(NamedTuple):
     def inverses(self) -> tuple[Array, Array]:
         """1 / upper gap and 1 / lower gap, in 1/m."""
         return self.lower * self.inverse, self.upper * self.inverse
+
+
+def _product(z: Array, s_0: Array) -> Array:
+    """Product of the gaps, never taken smaller than with GAP_FLOOR."""
+    product, least = s_0 * s_0 - z * z, 2 * GAP_FLOOR * s_0 * s_0
+    return jnp.where(product > least, product, least)
+
+
+@jax.custom_jvp
+@apart
+def _inverse(z: Array, s_0: Array) -> Array:
+    """1 / (upper gap, lower gap): from z, so that the gaps need not be stored for it."""
+    return refined(_product(z, s_0))
+
+
+@_inverse.defjvp
+def _inverse_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    value = _inverse(*primals)
+    return value, jax.jvp(_product, primals, tangents)[1] * -(value * value)
 
 
 class Signals(NamedTuple):
@@ -140,10 +161,8 @@ class Bearing:
 
     def gaps(self, z: Scalar) -> Gaps:
         """Upper gap s_0 - z and lower gap s_0 + z, floored at 0.5 % of s_0."""
-        floor = GAP_FLOOR * self.s_0
-        upper, lower = self.s_0 - z, self.s_0 + z
-        upper, lower = jnp.where(upper > floor, upper, floor), jnp.where(lower > floor, lower, floor)
-        return Gaps(upper, lower, reciprocal(upper * lower))
+        z, s_0 = jnp.asarray(z), jnp.asarray(self.s_0)
+        return Gaps(s_0 - z, s_0 + z, _inverse(z, s_0))
 
     def v(self, z: Scalar, i: Scalar) -> Array:
         """Scaled magnetic force, in A^2/m^2: ((i_0+i)/(s_0-z))^2 - ((i_0-i)/(s_0+z))^2. Eq. (3)."""
@@ -164,9 +183,9 @@ class Bearing:
     def v_and_dv_di(self, z: Scalar, i: Scalar, gaps: Gaps | None = None) -> tuple[Array, Array]:
         """v and dv/di at once. `gaps` are those at z, if they are known."""
         gaps = gaps or self.gaps(z)
-        upper, lower = gaps.inverses
-        above, below = (self.i_0 + i) * upper, (self.i_0 - i) * lower
-        return above**2 - below**2, 2 * (above * upper + below * lower)
+        along = (self.i_0 * z + self.s_0 * i) * gaps.inverse
+        across = (self.i_0 * self.s_0 + i * z) * gaps.inverse
+        return 4 * along * across, 4 * gaps.inverse * (self.s_0 * across + z * along)
 
     def current_for(self, z: Scalar, v: Scalar) -> Array:
         """The current whose scaled force at z is v, in A: the root of Eq. (3) continuous at i = 0.
@@ -174,13 +193,14 @@ class Bearing:
         Written without cancellation, so it is smooth through z = 0, where the quadratic
         degenerates. Where v has no real root it returns the point of C at that z, whose v is nearest.
         """
+        # all times the square of the gaps' product
         upper, lower, _ = self.gaps(z)
-        total, difference = 1 / upper**2 + 1 / lower**2, 1 / upper**2 - 1 / lower**2
-        excess = v - self.i_0**2 * difference
-        discriminant = (2 * self.i_0 / (upper * lower)) ** 2 + difference * v
+        product = upper * lower
+        total, difference = 2 * self.i_0 * (self.s_0 * self.s_0 + z * z), 4 * self.s_0 * z
+        discriminant = 4 * self.i_0 * self.i_0 + difference * v
         reachable = discriminant >= 0
-        on_C = -self.i_0 * total / jnp.where(reachable, 1.0, difference)
-        return jnp.where(reachable, excess / (self.i_0 * total + safe_sqrt(discriminant)), on_C)
+        above = jnp.where(reachable, product * product * v - self.i_0 * self.i_0 * difference, -total)
+        return above * reciprocal(jnp.where(reachable, total + product * safe_sqrt(discriminant), difference))
 
     def equilibrium(self, z: Scalar = 0.0) -> tuple[Array, Array]:
         """Current (A) and voltage (V) that hold the rotor still at z: z_ddot = i_dot = 0."""
@@ -193,8 +213,8 @@ class Bearing:
 
     def singularity(self, z: Scalar, i: Scalar) -> Array:
         """(z^2 + 2 s_0 i z / i_0 + s_0^2) / s_0^2: 1 at the origin, 0 on C, negative beyond. Eq. (9)."""
-        zeta = jnp.asarray(z) / self.s_0
-        return zeta**2 + 2 * zeta * jnp.asarray(i) / self.i_0 + 1
+        zeta = jnp.asarray(z) * (1 / self.s_0)
+        return zeta * (zeta + (2 / self.i_0) * i) + 1
 
     def distance_to_C(self, z: Scalar, i: Scalar) -> Array:
         """Distance from (z/s_0, i/i_0) to the singular curve C, dimensionless. Eq. (9).
