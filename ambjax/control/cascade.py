@@ -22,6 +22,7 @@ from ambjax.control.laws import (
     stepped,
 )
 from ambjax.control.processor import Processor, carried
+from ambjax.numerics.apart import stored
 from ambjax.numerics.records import Scalar, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
@@ -196,6 +197,7 @@ class Cascade:
         else:
             along = (sample.reference.rate(), measured.z_dot, z_ddot, *rates)
             z_rate, v_star_rate = jax.jvp(lambda *x: wanted(*x)[0], point, along)[1]
+        v_star = stored(v_star)
         force = ForceDemand(z, z_rate, v_star, v_star_rate, self.model.gaps(z))
         demand, inverted = advance(self.inversion, force, state.inversion)
         u, driven = advance(self.current, CurrentInputs(estimate, demand, sample.u_max, force.gaps), state.current)

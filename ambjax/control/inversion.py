@@ -93,9 +93,9 @@ class Adaptive:
 
     def step(self, model: Plant, inputs: ForceDemand, state: Array, period: Scalar) -> tuple[CurrentDemand, Array]:
         """v(z, i_ref) moves towards v_star as the sign at the step's end has it: gamma is its slew rate at most."""
-        w = inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0]
+        w = stored(inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0])
         after = model.current_for(inputs.z, inputs.v_star - relax(w, period * self.gamma, self.p))
-        return CurrentDemand(state, (after - state) / period), after
+        return CurrentDemand(state, (after - state) * (1 / period)), after
 
 
 @record
