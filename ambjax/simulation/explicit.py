@@ -51,7 +51,7 @@ class _Explicit(_Fixed):
         x, stages, h = state, [], jnp.asarray(h)
         for share, row, weight in zip(self.TIMES, self.ROWS, self.ROWS[-1], strict=True):
             rates, instant = problem.watched(inputs[share], x)
-            stages.append(stored(rates))
+            stages.append(stored(rates, x))
             combination = _combination(row)
             x = jax.tree.map(lambda x, *ks, combination=combination: combination(x, h, ks), state, *stages)
             # Integrals by the method's own rule; other stages are trial states, and no extremes.

@@ -9,6 +9,7 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade, CascadeState, Command
 from ambjax.numerics.records import Scalar, record
+from ambjax.numerics.smooth import limited
 from ambjax.simulation.integrate import Problem
 from ambjax.simulation.sliding import slide, slides
 from ambjax.simulation.span import Instant, Span
@@ -212,8 +213,3 @@ class Realised(ClosedLoop):
 
     def words(self) -> tuple[Scalar, Scalar]:
         return self.key
-
-
-def limited(u: Array, u_max: Array) -> Array:
-    """u held within -u_max..u_max. Not jnp.clip, which looks for NaN at three times the cost."""
-    return jnp.where(u > u_max, u_max, jnp.where(u < -u_max, -u_max, u))

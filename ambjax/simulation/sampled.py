@@ -5,7 +5,6 @@ t_n + delay T until t_{n+1} + delay T (before the first, u = 0); the plant alone
 under two where the delay is no whole number of samples.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -16,10 +15,12 @@ from jax import Array
 from ambjax.control import answers
 from ambjax.control.cascade import Cascade, CascadeState, Command, Sample
 from ambjax.control.processor import Processor
+from ambjax.numerics.apart import stored
 from ambjax.numerics.records import Scalar, record
+from ambjax.numerics.smooth import limited
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.integrate import Advanced, Integrator, Problem, in_turn
-from ambjax.simulation.loop import SHOWN, ClosedLoop, Densities, Inputs, LoopState, Sizes, limited
+from ambjax.simulation.loop import SHOWN, ClosedLoop, Densities, Inputs, LoopState, Sizes
 from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import DIVERGED, Row
 from ambjax.world.amplifier import Amplifier
@@ -95,8 +96,9 @@ class Sampled:
         measured = self.measured(state.plant, state.seen, hold)
         command, control = self.loop.cascade.step(measured, state.control, sample)
         command = command._replace(u=limited(command.u, sample.u_max))
-        new = (control, command)
-        sane = functools.reduce(jnp.logical_and, map(jnp.isfinite, jax.tree.leaves(new)))
+        new = stored((control, command))
+        # 0 times a number is 0, times anything else it is not
+        sane = stored(sum(0.0 * x for x in jax.tree.leaves(new))) == 0
         control, command = jax.tree.map(lambda a, b: jnp.where(sane, a, b), new, (state.control, state.command))
         sane = jnp.where(sane, state.sane, 0.0)
         return state._replace(control=control, command=command, past=past, sane=sane)

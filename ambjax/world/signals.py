@@ -44,7 +44,7 @@ class Constant:
     value: Scalar = leaf(default=0.0, at_least=-1e20, at_most=1e20, doc="the value")
 
     def __call__(self, t: Scalar) -> Array:
-        return self.value + 0.0 * jnp.asarray(t)
+        return jnp.broadcast_to(jnp.asarray(self.value, jnp.result_type(float)), jnp.shape(t))
 
     def span(self, end: float) -> tuple[float, float]:
         return _hull(self.value)
