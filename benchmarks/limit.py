@@ -51,53 +51,57 @@ def missing() -> str:
     """Why there is no C program; empty if there is one."""
     try:
         for dtype in PRECISION:
-            _library(dtype)
+            library(dtype)
     except (OSError, subprocess.SubprocessError) as error:
         return f"no C program: {error}"
     return ""
 
 
 @functools.cache
-def _library(dtype: str) -> Any:
+def library(dtype: str, source: pathlib.Path = SOURCE) -> Any:
+    """The compiled program."""
     compiler = shutil.which("gcc") or shutil.which("cc")
     if compiler is None:
         raise OSError("there is no gcc or cc on the PATH")
     with tempfile.TemporaryDirectory() as folder:
-        path = str(pathlib.Path(folder, "limit.so"))
-        command = [compiler, *FLAGS.split(), *PRECISION[dtype].split(), str(SOURCE), "-o", path, "-lm"]
+        path = str(pathlib.Path(folder, source.stem).with_suffix(".so"))
+        command = [compiler, *FLAGS.split(), *PRECISION[dtype].split(), str(source), "-o", path, "-lm"]
         subprocess.run(command, check=True, capture_output=True, text=True)
         return ctypes.CDLL(path)
 
 
-def _problem(work: Workload) -> Problem:
-    """The workload's numbers, read off its records."""
+def numbers(work: Workload) -> dict[str, Any]:
+    """The workload's numbers, read off its records: what struct problem begins with."""
     scenario, clock = work.scenario, work.clock
     plant, sensor = scenario.plant, scenario.sensor
     _, position, inversion, current = (vars(law) for law in work.cascade.laws)
     reference, force = vars(scenario.reference), vars(scenario.q_v)
-    numbers: dict[str, Any] = {
-        name: getattr(plant, name) for name in ["m", "k_z", "s_0", "i_0", "R", "g", "kappa", "a"]
-    }
-    numbers |= {"touchdown": scenario.touchdown, "force": force["amplitude"], "sample_period": clock.sample_period}
-    numbers |= {name: reference[name] for name in ("amplitude", "frequency")}
-    numbers |= {"c": position["c"], "k": position["k"], "gamma": inversion["gamma"], "k_i": current["k_i"]}
-    numbers |= {"p_sigma": position["p"], "p_v": inversion["p"], "p_e": current["p"]}
+    found: dict[str, Any] = {name: getattr(plant, name) for name in ["m", "k_z", "s_0", "i_0", "R", "g", "kappa", "a"]}
+    found |= {"touchdown": scenario.touchdown, "force": force["amplitude"], "sample_period": clock.sample_period}
+    found |= {name: reference[name] for name in ("amplitude", "frequency")}
+    found |= {"c": position["c"], "k": position["k"], "gamma": inversion["gamma"], "k_i": current["k_i"]}
+    found |= {"p_sigma": position["p"], "p_v": inversion["p"], "p_e": current["p"]}
     if sensor is not None:
-        numbers |= {"std_z": sensor.std, "std_z_dot": sensor.std_z_dot, "std_i": sensor.std_i}
+        found |= {"std_z": sensor.std, "std_z_dot": sensor.std_z_dot, "std_i": sensor.std_i}
     start, stop = work.pulse
-    return Problem(**numbers, substeps=substeps(clock), samples=clock.samples, pulse_start=start, pulse_stop=stop)
+    return found | {
+        "substeps": substeps(clock),
+        "samples": clock.samples,
+        "pulse_start": start,
+        "pulse_stop": stop,
+    }
 
 
 def run(work: Workload, dtype: str = "float64", threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Largest |z - r| of each member and its z at the end, m. Threads share the members evenly."""
-    library, z = _library(dtype), np.asarray(work.scenario.initial.z).astype(dtype)
+    program, z = library(dtype), np.asarray(work.scenario.initial.z).astype(dtype)
     peak = np.zeros_like(z)
 
     def part(begin: int, end: int) -> None:
-        problem = _problem(work)
+        problem = Problem(**numbers(work))
         problem.first_member = begin
         pointers = [ctypes.c_void_p(x[begin:end].ctypes.data) for x in (z, peak)]
-        if library.run(ctypes.byref(problem), ctypes.c_long(end - begin), *pointers):
+        if program.run(ctypes.byref(problem), ctypes.c_long(end - begin), *pointers):
             raise ValueError("limit.c: too many substeps")
 
     if threads == 1:

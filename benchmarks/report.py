@@ -22,6 +22,7 @@ the search, CMA-ES and Nelder-Mead were run on another day, beside other work: t
     .venv/bin/python benchmarks/work_precision.py    # the integrators among themselves
     .venv/bin/python benchmarks/limit.py             # the C program alone, and its agreement with ambjax
     .venv/bin/python benchmarks/throughput.py        # ensembles against that limit
+    .venv/bin/python benchmarks/sampled.py           # the cascade on a processor against its limit
     .venv/bin/python benchmarks/peers.py             # ensembles against other libraries
     .venv/bin/python benchmarks/scaling.py --full    # cost and memory against members and horizon
     .venv/bin/python benchmarks/gpu.py               # the same on an accelerator, where there is one
@@ -174,6 +175,24 @@ def gradients() -> list[str]:
     return lines + table("peak memory of the process | " + " | ".join(steps), rows)
 
 
+def sampled() -> list[str]:
+    data = load("sampled")
+    lines = ["## The cascade on a processor (`sampled.py`)", "", facts(data["machine"])]
+    first = data["rows"][0]
+    lines += [
+        f"{first['members']:,} members, float64, one core, held noise, 10 kHz, one sample of delay, predicted,",
+        f"{first['substeps']} substeps; ns per member and sample. C: `sampled.c`, relative error against our rollout",
+        f"under the same noise. Gradient of 4 gains, forward mode, {data['tangents_of']} members: in forward runs.",
+        "",
+    ]
+    rows = []
+    for r in data["rows"]:
+        cells = [r["p"], *(f"{r[name]:.1f}" if name in r else "" for name in ("ambjax", "C"))]
+        cells += [f"{r['ratio']:.2f}", f"{r['error']:.0e}"] if "ratio" in r else ["", ""]
+        rows.append([*cells, f"{r['all_metrics']:.1f}", f"{r['gradient']:.2f}"])
+    return lines + table("p | ambjax | C | ratio | error | with all metrics | gradient", rows)
+
+
 def tasks() -> list[str]:
     data = load("tasks")
     lines = ["## The tuning tasks (`tasks.py`)", "", facts(data["machine"])]
@@ -256,6 +275,7 @@ SECTIONS = {
     "single": single,
     "work_precision": work_precision,
     "throughput": throughput,
+    "sampled": sampled,
     "peers": peers,
     "scaling": scaling,
     "held_noise": held_noise,

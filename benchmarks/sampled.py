@@ -1,0 +1,151 @@
+"""An ensemble whose cascade runs on a processor, next to the machine's limit.
+
+The workload of workload.py at 10 kHz with held noise, on a processor with one sample of delay, prediction and implicit
+steps, 200 V; with the sign itself (p = inf) and with a smoothed one (p = 25). sampled.c does the same in C:
+`agreement` holds it to our rollout, under the same errors of the sensors. Then the cost of a gradient in c, k, gamma
+and k_i. One core, float64; seconds of the process, taken in turn. Run: python benchmarks/sampled.py
+"""
+
+import ctypes
+import dataclasses
+import functools
+import math
+import os
+from typing import Any
+
+os.environ.setdefault("JAX_ENABLE_X64", "1")
+
+import _measure
+import gradients
+import jax
+import jax.numpy as jnp
+import limit
+import numpy as np
+import workload
+from workload import Workload
+
+from ambjax import Cascade, Clock, Initial, current, inversion, position, rollout
+from ambjax.control.processor import Processor
+from ambjax.ensemble import run_ensemble
+from ambjax.simulation.method import with_method
+from ambjax.simulation.metrics import Rms, standard_for
+
+# c, k, gamma, k_i: they hold the rotor with either sign.
+GAINS = np.array([200.0, 25.0, 2e6, 2000.0])
+SIGNS = {"inf": math.inf, "25": 25.0}
+U_MAX = 200.0
+MEMBERS, SAMPLES, REPEATS = 1024, 2000, 15
+TANGENTS_OF = 64
+SOURCE = limit.SOURCE.with_name("sampled.c")
+
+
+class Problem(ctypes.Structure):
+    """struct problem of sampled.c."""
+
+    _fields_ = [
+        *((name, ctypes.c_double) for name in (*limit.DOUBLES.split(), "u_max")),
+        *((name, ctypes.c_int64) for name in limit.WHOLES.split()),
+    ]
+
+
+def cascade(gains: Any, p: float) -> Cascade:
+    """The paper's cascade on a processor."""
+    c, k, gamma, k_i = gains
+    return Cascade(
+        position=position.SlidingMode(c, k, p),
+        inversion=inversion.Adaptive(gamma, p),
+        current=current.SlidingMode(k_i, p),
+        processor=Processor(),
+    )
+
+
+def sampled(members: int, samples: int, p: float) -> Workload:
+    """The common workload with that cascade, and as many substeps as our rollout takes by itself."""
+    work = workload.workload(members, samples, noise=True)
+    scenario, ours = dataclasses.replace(work.scenario, u_max=U_MAX), cascade(GAINS.tolist(), p)
+    return Workload(ours, scenario, with_method(Clock(samples, workload.PERIOD), ours, scenario))
+
+
+def run(work: Workload, errors: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """By sampled.c: largest |z - r| of each member, seen at every substep, and its z at the end, m.
+
+    `errors` of the sensors [samples, 3, members]; None: C draws its own.
+    """
+    z = np.asarray(work.scenario.initial.z).astype(float)
+    peak, problem = np.zeros_like(z), Problem(**limit.numbers(work), u_max=U_MAX)
+    pointers = [None if x is None else ctypes.c_void_p(x.ctypes.data) for x in (z, peak, errors)]
+    if limit.library("float64", SOURCE).run(ctypes.byref(problem), ctypes.c_long(len(z)), *pointers):
+        raise ValueError("sampled.c: too many substeps")
+    return peak, z
+
+
+def errors_of(work: Workload) -> np.ndarray:
+    """What the sensors are off by in our rollout, [samples, 3, members]."""
+    sensor: Any = work.scenario.sensor
+
+    def words(member: Any) -> Any:
+        return dataclasses.replace(work.scenario, initial=Initial(), member=member).words()
+
+    keys = jax.vmap(words)(jnp.arange(work.members))
+    member = jax.vmap(lambda key, n: jnp.stack(sensor.noise(key, n)), (0, None), 1)
+    return np.ascontiguousarray(jax.vmap(member, (None, 0))(keys, jnp.arange(work.clock.samples)))
+
+
+def agreement(p: float) -> float:
+    """Largest relative error of sampled.c in the largest |z - r| of 37 members; AssertionError beyond 1e-10."""
+    work = sampled(37, 500, p)
+    error = float(np.max(np.abs(run(work, errors_of(work))[0] / workload.ours(work) - 1)))
+    assert error <= 1e-10, f"sampled.c is off by {error:.1e}"
+    return error
+
+
+def gradient(p: float) -> float:
+    """Forward runs that a gradient of the mean square of e_z costs."""
+    work = sampled(TANGENTS_OF, SAMPLES // 2, p)
+
+    def loss(logs: Any, who: Any) -> Any:
+        z, member = who
+        alone = dataclasses.replace(work.scenario, initial=Initial(z=z), member=member)
+        return (rollout(cascade(GAINS * jnp.exp(logs), p), alone, work.clock, fold=Rms("e_z"), every=0).measured) ** 2
+
+    who = np.asarray(work.scenario.initial.z), np.asarray(work.scenario.member)
+    compiled = gradients.programs(loss, TANGENTS_OF, (0, 0))
+    runs = {mode: functools.partial(compiled[mode], np.zeros(len(GAINS)), who) for mode in ("run", "forward")}
+    found = _measure.alternating(runs, REPEATS, clock=_measure.own_seconds)
+    return found["forward"].over(found["run"])
+
+
+def measure(name: str) -> dict[str, Any]:
+    """One row: a sign."""
+    p = SIGNS[name]
+    work = sampled(MEMBERS, SAMPLES, p)
+    row: dict[str, Any] = {"p": name, "members": MEMBERS, "samples": SAMPLES, "substeps": workload.substeps(work.clock)}
+    every = standard_for(0.05, work.scenario)
+    runs = {
+        "ambjax": functools.partial(workload.ours, work),
+        "all_metrics": lambda: run_ensemble(*work, fold=every, threads=1),
+        "C": functools.partial(run, work),
+    }
+    if limit.missing():
+        del runs["C"]
+    found = _measure.alternating(runs, REPEATS, clock=_measure.own_seconds)
+    row |= {name: 1e9 * each.seconds / MEMBERS / SAMPLES for name, each in found.items()}
+    if "C" in found:
+        row |= {"ratio": found["ambjax"].over(found["C"]), "error": agreement(p)}
+    row["gradient"] = gradient(p)
+    told = f"p = {name}: {row['ambjax']:.1f} ns a sample, with all metrics {row['all_metrics']:.1f}"
+    if "C" in row:
+        told += f"; C {row['C']:.1f}, ratio {row['ratio']:.2f}, agreement {row['error']:.0e}"
+    print(f"{told}; gradient {row['gradient']:.2f} runs", flush=True)
+    return row
+
+
+def main() -> None:
+    _measure.one_core()
+    if why := limit.missing():
+        print(f"{why}: the limit is skipped")
+    _measure.write("sampled", {"tangents_of": TANGENTS_OF, "rows": [measure(name) for name in SIGNS]})
+
+
+if __name__ == "__main__":
+    main()
