@@ -8,6 +8,7 @@ ranges(site)        where its gains are searched; about their values
 band(W, L, sampling) the band about 0 that is left of the error of its stage where it is sampled, for a disturbance up
                     to W whose rate is up to L; None: nothing is known
 held(model)         the steepest rate of what its implicit step leaves explicit, 1/s; 0
+memory              for each state, its name, unit and meaning, where its structure does not name it; x
 slide(...)          an inversion law's step that knows where its stiffness is (`laws.Relaxation`); there is none
 estimates_velocity  whether an observer needs no measured velocity; no
 """
@@ -92,6 +93,14 @@ def turns(law: Any) -> bool:
 def estimates_velocity(law: Any) -> bool:
     """Whether an observer, or a kind of observer, needs no measured velocity."""
     return getattr(law, "estimates_velocity", False)
+
+
+def memory(law: Any, state: Any) -> list[tuple[str, str, str]]:
+    """Name, unit and meaning of each leaf of a law's state, for whoever writes it down."""
+    if hasattr(law, "memory"):
+        return list(law.memory)
+    paths = [jax.tree_util.keystr(path, simple=True, separator="_") for path, _ in jax.tree_util.tree_leaves_with_path(state)]
+    return [(f"x_{path}" if path.isdigit() else path or "x", "", "") for path in paths]
 
 
 def slides(law: Any) -> bool:

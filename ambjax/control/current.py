@@ -80,6 +80,7 @@ class ProportionalIntegral:
     k_p: Scalar = gain(default=3e5, unit="V/A", doc="proportional gain")
     k_int: Scalar = gain(default=1e8, unit="V/A/s", doc="integral gain")
     k_aw: Scalar = gain(default=200.0, unit="1/s", doc="anti-windup rate")
+    memory = (("x", "V", "integral of the current error"),)
 
     def init(self, model: Plant) -> Array:
         return jnp.zeros(())

@@ -44,6 +44,7 @@ class Adaptive:
     )
     i_ref: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="initial current reference")
     requirement: ClassVar = Requirement("gamma", "Delta_1")
+    memory = (("i_ref", "A", "current reference of the next sample"),)
 
     def init(self, model: Plant) -> Array:
         return jnp.asarray(self.i_ref)

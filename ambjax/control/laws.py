@@ -105,7 +105,8 @@ class CurrentLaw(Protocol):
 def stepped(law: Any, inputs: Any, state: State, *, model: Plant, period: Scalar, implicit: bool) -> tuple[Any, State]:
     """Output of a law at a sample, and its state at the next: by its own discrete `step`, else by explicit Euler."""
     own = getattr(law, "step", None)
-    if implicit and own is not None:
-        return own(model, inputs, state, period)
-    output, rate = law(model, inputs, state)
-    return output, jax.tree.map(lambda x, d: x + period * d, state, rate)
+    with jax.named_scope(f"law:{type(law).__module__.rpartition('.')[2]}.{type(law).__qualname__}"):
+        if implicit and own is not None:
+            return own(model, inputs, state, period)
+        output, rate = law(model, inputs, state)
+        return output, jax.tree.map(lambda x, d: x + period * d, state, rate)

@@ -45,6 +45,7 @@ class Complementary:
         optional=True,
         doc="initial estimate; none: first measurement",
     )
+    memory = (("z_hat", "m", "estimate of the displacement"),)
 
     def init(self, model: Plant, measured: Measurement) -> Array:
         return jnp.asarray(measured.z if self.z_hat is None else self.z_hat)

@@ -108,6 +108,7 @@ class SuperTwisting:
         doc="steepness of the smoothed root and sign of sigma; left out: scaled to the plant",
         steepness=True,
     )
+    memory = (("w", "m/s^2", "integral of the sign of sigma"),)
 
     def init(self, model: Plant) -> Array:
         return jnp.zeros(())

@@ -26,7 +26,7 @@ from ambjax.simulation.trajectory import DIVERGED, Row
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
-from ambjax.world.signals import reference_at
+from ambjax.world.signals import Reference, reference_at
 
 
 class SampledState(NamedTuple):
@@ -89,11 +89,14 @@ class Sampled:
 
     def jump(self, t: Scalar, state: SampledState, hold: Errors) -> SampledState:
         """The laws' step: what they decide now, and their states at the next sample."""
-        scenario, processor = self.loop.scenario, self.processor
-        late = processor.delay * self.period if processor.predict else 0.0
+        late = self.processor.delay * self.period if self.processor.predict else 0.0
+        reference = reference_at(self.loop.scenario.reference, t + late)
+        return self.decided(self.measured(state.plant, state.seen, hold), reference, state)
+
+    def decided(self, measured: Measurement, reference: Reference, state: SampledState) -> SampledState:
+        """What the processor computes of a measurement, and keeps: all but the plant. The exported C is this."""
         past = (state.command.u, state.past[0])
-        sample = Sample(reference_at(scenario.reference, t + late), self.period, jnp.asarray(scenario.u_max), past)
-        measured = self.measured(state.plant, state.seen, hold)
+        sample = Sample(reference, self.period, jnp.asarray(self.loop.scenario.u_max), past)
         command, control = self.loop.cascade.step(measured, state.control, sample)
         command = command._replace(u=limited(command.u, sample.u_max))
         new = stored((control, command))

@@ -1,0 +1,263 @@
+"""A trace of JAX as straight-line scalar code: calls inlined, loops unrolled, equal expressions shared.
+
+`Program` holds one node an operation. A node that nothing reads is not written; a constant is a NumPy scalar, and what
+depends on constants alone is one. The order of operations is the trace's, so that C compiled without contraction
+rounds as JAX does operation by operation.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from ambjax.export.primitives import CALLS, OPS, SAME
+
+# Statements of a program; what has more was unrolled from a loop that belongs in no control step.
+MOST = 20_000
+LOOPS = ("scan", "while")
+
+
+class Ref(NamedTuple):
+    """Operand: the node of this number."""
+
+    node: int
+
+
+Operand = Any  # Ref, or a NumPy scalar
+
+
+class Node(NamedTuple):
+    """One operation: of OPS, or `input` with the C text that reads it; dtype and the law that it is of."""
+
+    op: str
+    args: tuple[Operand, ...]
+    dtype: np.dtype
+    law: str = ""
+    text: str = ""
+
+
+class Program:
+    """Nodes in order of computation."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Node] = []
+        self._known: dict[Any, Ref] = {}
+
+    def input(self, text: str, dtype: Any) -> Ref:
+        """A node that reads C text."""
+        self.nodes.append(Node("input", (), np.dtype(dtype), text=text))
+        return Ref(len(self.nodes) - 1)
+
+    def dtype(self, x: Operand) -> np.dtype:
+        """Dtype of an operand."""
+        return self.nodes[x.node].dtype if isinstance(x, Ref) else x.dtype
+
+    def apply(self, op: str, args: Sequence[Operand], dtype: Any, law: str) -> Operand:
+        """The value of an operation: a constant, a node that is there already, or a new one."""
+        dtype, args = np.dtype(dtype), tuple(args)
+        if (known := _simpler(op, args)) is not None:
+            return known
+        if not any(isinstance(x, Ref) for x in args):
+            with np.errstate(all="ignore"):
+                return np.asarray(OPS[op].numpy(*args)).astype(dtype)[()]
+        order = sorted(map(_key, args)) if OPS[op].commutes else list(map(_key, args))
+        key = (op, dtype, *order)
+        if key not in self._known:
+            if len(self.nodes) >= MOST:
+                raise ValueError(f"{_of(law)}the step has more than {MOST:,} operations: a loop too long to unroll.")
+            self.nodes.append(Node(op, args, dtype, law))
+            self._known[key] = Ref(len(self.nodes) - 1)
+        return self._known[key]
+
+    def needed(self, outputs: Sequence[Operand]) -> set[int]:
+        """Numbers of the nodes on which these depend."""
+        seen: set[int] = set()
+        stack = [x.node for x in outputs if isinstance(x, Ref)]
+        while stack:
+            if (node := stack.pop()) not in seen:
+                seen.add(node)
+                stack += [x.node for x in self.nodes[node].args if isinstance(x, Ref)]
+        return seen
+
+    def evaluate(self, inputs: dict[int, Any]) -> list[Any]:
+        """Value of every node by NumPy, given those of input nodes: arrays of one shape."""
+        values: list[Any] = []
+        with np.errstate(all="ignore"):
+            for number, node in enumerate(self.nodes):
+                args = [values[x.node] if isinstance(x, Ref) else x for x in node.args]
+                value = inputs[number] if node.op == "input" else OPS[node.op].numpy(*args)
+                values.append(np.asarray(value).astype(node.dtype))
+        return values
+
+
+def _key(x: Operand) -> tuple[str, str]:
+    """What makes two operands the same: the bits of a constant, -0 being another than 0."""
+    return ("node", f"{x.node:06}") if isinstance(x, Ref) else (x.dtype.str, x.tobytes().hex())
+
+
+def _is(x: Operand, value: float) -> bool:
+    return not isinstance(x, Ref) and bool(x == value)
+
+
+def _simpler(op: str, args: tuple[Operand, ...]) -> Operand | None:
+    """The operand that an operation gives back as it is, if it does."""
+    if op in ("add", "mul"):
+        neutral = 0.0 if op == "add" else 1.0
+        for one, other in (args, args[::-1]):
+            if _is(other, neutral) and isinstance(one, Ref):
+                return one
+    if (op == "sub" and _is(args[1], 0.0)) or (op == "div" and _is(args[1], 1.0)):
+        return args[0]
+    if op == "select":
+        if not isinstance(args[0], Ref):
+            return args[1] if args[0] else args[2]
+        if _key(args[1]) == _key(args[2]):
+            return args[1]
+    if op in ("and", "or"):
+        for one, other in (args, args[::-1]):
+            if not isinstance(other, Ref):
+                return one if bool(other) == (op == "and") else other
+    return None
+
+
+def _of(law: str) -> str:
+    return f"{law}: " if law else ""
+
+
+def traced(program: Program, function: Callable[..., Any], arguments: Any, operands: Sequence[Operand]) -> list[Operand]:
+    """Operands of the leaves that `function(*arguments)` gives, with these operands for the leaves of its arguments.
+
+    Raises ValueError for a primitive that is no scalar arithmetic; it names the primitive and the law that uses it.
+    """
+    closed = jax.make_jaxpr(function)(*arguments)
+    return _Reader(program).closed(closed, list(operands), "")
+
+
+class _Reader:
+    def __init__(self, program: Program):
+        self.program = program
+
+    def closed(self, closed: ClosedJaxpr, operands: list[Operand], law: str) -> list[Operand]:
+        for const in closed.consts:
+            if np.shape(const) != ():
+                raise ValueError(f"{_of(law)}a constant of shape {np.shape(const)}: only scalars can be exported.")
+        return self.jaxpr(closed.jaxpr, [np.asarray(x)[()] for x in closed.consts], operands, law)
+
+    def jaxpr(self, jaxpr: Jaxpr, consts: list[Operand], operands: list[Operand], law: str) -> list[Operand]:
+        known: dict[Any, Operand] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *operands], strict=True))
+
+        def value(x: Any) -> Operand:
+            return np.asarray(x.val, x.aval.dtype)[()] if isinstance(x, Literal) else known[x]
+
+        for eqn in jaxpr.eqns:
+            inner = _law(str(eqn.source_info.name_stack)) or law
+            if any(getattr(x.aval, "shape", None) != () for x in [*eqn.invars, *eqn.outvars]):
+                raise ValueError(refusal(eqn.primitive.name, inner, "on arrays"))
+            results = self.equation(eqn.primitive.name, eqn, [value(x) for x in eqn.invars], inner)
+            known.update(zip(eqn.outvars, results, strict=True))
+        return [value(x) for x in jaxpr.outvars]
+
+    def equation(self, name: str, eqn: Any, args: list[Operand], law: str) -> list[Operand]:
+        if name in CALLS:
+            inner = next(eqn.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in eqn.params)
+            return self.closed(inner, args, law) if isinstance(inner, ClosedJaxpr) else self.jaxpr(inner, [], args, law)
+        if name in SAME:
+            return args
+        if name in LOOPS or name == "cond":
+            return getattr(self, f"_{name}")(eqn.params, args, law)
+        return [self.scalar(name, eqn, args, law)]
+
+    def scalar(self, name: str, eqn: Any, args: list[Operand], law: str) -> Operand:
+        apply, dtype, params = self.program.apply, np.dtype(eqn.outvars[0].aval.dtype), eqn.params
+        if dtype.kind == "f" and dtype.itemsize not in (4, 8):
+            raise ValueError(refusal(name, law, f"of {dtype.name}"))
+        if name == "convert_element_type":
+            return self._converted(args[0], dtype, law)
+        if any(self.program.dtype(x).kind in "iu" and isinstance(x, Ref) for x in args):
+            raise ValueError(refusal(name, law, "of whole numbers"))
+        if name == "select_n":
+            if len(args) != 3:
+                raise ValueError(refusal(name, law, f"of {len(args) - 1} choices"))
+            return apply("select", (args[0], args[2], args[1]), dtype, law)
+        if name == "clamp":
+            return apply("min", (apply("max", (args[1], args[0]), dtype, law), args[2]), dtype, law)
+        if name in ("square", "integer_pow"):
+            return self._power(args[0], params.get("y", 2), dtype, law)
+        if name in ("rsqrt", "logistic"):
+            one = np.ones((), dtype)[()]
+            if name == "rsqrt":
+                return apply("div", (one, apply("sqrt", args, dtype, law)), dtype, law)
+            grown = apply("exp", (apply("neg", args, dtype, law),), dtype, law)
+            return apply("div", (one, apply("add", (one, grown), dtype, law)), dtype, law)
+        if name == "round":
+            name = ("round_away", "round_even")[int(params["rounding_method"])]
+        name = {"add_any": "add"}.get(name, name)
+        whole = dtype.kind in "iu"  # constants alone
+        if name not in OPS or (whole and any(isinstance(x, Ref) for x in args)):
+            raise ValueError(refusal(name, law, "of whole numbers" if whole else ""))
+        return apply(name, args, dtype, law)
+
+    def _power(self, x: Operand, y: int, dtype: Any, law: str) -> Operand:
+        """By squaring, as JAX has it."""
+        total, left = None, abs(y)
+        while left > 0:
+            if left & 1:
+                total = x if total is None else self.program.apply("mul", (total, x), dtype, law)
+            if left := left >> 1:
+                x = self.program.apply("mul", (x, x), dtype, law)
+        one = np.ones((), dtype)[()]
+        total = one if total is None else total
+        return self.program.apply("div", (one, total), dtype, law) if y < 0 else total
+
+    def _converted(self, x: Operand, dtype: np.dtype, law: str) -> Operand:
+        before = self.program.dtype(x)
+        if not isinstance(x, Ref):
+            return x.astype(dtype)
+        if before == dtype or (before.kind == "b" and dtype.kind in "iu"):  # an index of two branches
+            return x
+        if "f" not in (before.kind, dtype.kind) or {before.kind, dtype.kind} & set("iu"):
+            raise ValueError(refusal("convert_element_type", law, f"from {before.name} to {dtype.name}"))
+        if dtype.kind == "b":
+            return self.program.apply("ne", (x, np.zeros((), before)[()]), dtype, law)
+        return self.program.apply("flag" if before.kind == "b" else "real", (x,), dtype, law)
+
+    def _cond(self, params: Any, args: list[Operand], law: str) -> list[Operand]:
+        branches, (index, *rest) = params["branches"], args
+        if not isinstance(index, Ref):
+            return self.closed(branches[int(np.clip(index, 0, len(branches) - 1))], rest, law)
+        if len(branches) != 2 or self.program.dtype(index).kind != "b":
+            raise ValueError(refusal("cond", law, f"of {len(branches)} branches"))
+        no, yes = (self.closed(branch, rest, law) for branch in branches)
+        return [self.program.apply("select", (index, b, a), self.program.dtype(a), law) for a, b in zip(no, yes, strict=True)]
+
+    def _scan(self, params: Any, args: list[Operand], law: str) -> list[Operand]:
+        consts, carry = args[: params["num_consts"]], args[params["num_consts"] :]
+        for _ in range(params["length"]):
+            carry = self.closed(params["jaxpr"], consts + carry, law)
+        return carry
+
+    def _while(self, params: Any, args: list[Operand], law: str) -> list[Operand]:
+        at, to = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+        asked, consts, carry = args[:at], args[at:to], args[to:]
+        while True:
+            (more,) = self.closed(params["cond_jaxpr"], asked + carry, law)
+            if isinstance(more, Ref):
+                raise ValueError(refusal("while", law, "whose length depends on data"))
+            if not more:
+                return carry
+            carry = self.closed(params["body_jaxpr"], consts + carry, law)
+
+
+def refusal(name: str, law: str, how: str = "") -> str:
+    """Why a step is not exported."""
+    told = f"the primitive {name!r}{f' {how}' if how else ''} cannot be written as scalar C"
+    return f"{law or 'the step'}: {told}. Write the law with real scalars and loops of a fixed length."
+
+
+def _law(stack: str) -> str:
+    """The innermost law in a stack of JAX's name scopes; jvp(...) and its like wrap them."""
+    found = re.findall(r"law:([^/()]+)", stack)
+    return found[-1] if found else ""

@@ -1,0 +1,84 @@
+"""Scalar primitives: each as a C expression, as NumPy computes it, and what it costs.
+
+`{0}`, `{1}` are operands, `{f}` is the suffix of float functions. NumPy's twin folds constants and finds where a
+comparison turns; what the C is held against is JAX.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Op(NamedTuple):
+    """C text; NumPy's twin; what it is counted as; whether operands commute, and whether the result is a bool."""
+
+    c: str
+    numpy: Callable[..., Any]
+    cost: str = "call"
+    commutes: bool = False
+    boolean: bool = False
+
+
+def _erf(name: str) -> Callable[..., Any]:
+    import math
+
+    return np.vectorize(getattr(math, name), otypes=[float])
+
+
+def _function(name: str, numpy: Callable[..., Any] | None = None) -> Op:
+    return Op(f"{name}{{f}}({{0}})", numpy or getattr(np, name))
+
+
+def _compare(sign: str, numpy: Callable[..., Any]) -> Op:
+    return Op(f"{{0}} {sign} {{1}}", numpy, "comparison", sign in ("==", "!="), True)
+
+
+# For bools `&` and its like work as `&&` would, both operands being there already; `and` and `or` of C read better.
+OPS: dict[str, Op] = {
+    "add": Op("{0} + {1}", np.add, "add", True),
+    "sub": Op("{0} - {1}", np.subtract, "add"),
+    "mul": Op("{0} * {1}", np.multiply, "multiply", True),
+    "div": Op("{0} / {1}", np.divide, "divide"),
+    "neg": Op("-{0}", np.negative, "sign"),
+    "abs": Op("fabs{f}({0})", np.abs, "sign"),
+    "sign": Op("{name}_sign({0})", np.sign, "comparison"),
+    "max": Op("{name}_max({0}, {1})", np.maximum, "comparison", True),
+    "min": Op("{name}_min({0}, {1})", np.minimum, "comparison", True),
+    "select": Op("{0} ? {1} : {2}", np.where, "comparison"),
+    "sqrt": Op("sqrt{f}({0})", np.sqrt, "root"),
+    "pow": Op("pow{f}({0}, {1})", np.power),
+    "atan2": Op("atan2{f}({0}, {1})", np.arctan2),
+    "rem": Op("fmod{f}({0}, {1})", np.fmod),
+    "round_away": Op("round{f}({0})", lambda x: np.copysign(np.floor(np.abs(x) + 0.5), x)),
+    "round_even": Op("rint{f}({0})", np.rint),
+    "asin": _function("asin", np.arcsin),
+    "acos": _function("acos", np.arccos),
+    "atan": _function("atan", np.arctan),
+    "asinh": _function("asinh", np.arcsinh),
+    "acosh": _function("acosh", np.arccosh),
+    "atanh": _function("atanh", np.arctanh),
+    **{name: _function(name) for name in ("exp", "exp2", "expm1", "log", "log1p", "cbrt", "floor", "ceil")},
+    **{name: _function(name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
+    "erf": _function("erf", _erf("erf")),
+    "erfc": _function("erfc", _erf("erfc")),
+    "eq": _compare("==", np.equal),
+    "ne": _compare("!=", np.not_equal),
+    "lt": _compare("<", np.less),
+    "le": _compare("<=", np.less_equal),
+    "gt": _compare(">", np.greater),
+    "ge": _compare(">=", np.greater_equal),
+    "is_finite": Op("isfinite({0})", np.isfinite, "comparison", False, True),
+    "and": Op("{0} && {1}", np.logical_and, "logic", True, True),
+    "or": Op("{0} || {1}", np.logical_or, "logic", True, True),
+    "xor": Op("{0} != {1}", np.logical_xor, "logic", True, True),
+    "not": Op("!{0}", np.logical_not, "logic", False, True),
+    "real": Op("({to}){0}", lambda x: x, "conversion"),
+    "flag": Op("{0} ? {one} : {zero}", lambda x: np.where(x, 1.0, 0.0), "conversion"),
+}
+# What gives its operand as it is, where there are no shapes.
+SAME = ("broadcast_in_dim", "copy", "copy_p", "optimization_barrier", "reshape", "squeeze", "stop_gradient")
+SAME += ("xla_metadata_value", "pvary")
+# Calls, whose text is that of what they call: derivatives of one's own have no say in a value.
+CALLS = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat2")
+COUNTED = ("add", "multiply", "divide", "root", "call")

@@ -1,0 +1,162 @@
+"""The traced step with names: which numbers it reads, keeps and gives, and what each costs."""
+
+import contextlib
+import dataclasses
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax.control import answers
+from ambjax.control.cascade import CascadeState
+from ambjax.export.controller import BITS, INPUTS, OUTPUTS, Controller, Inputs, Number, parameters_of
+from ambjax.export.emitter import Operand, Program, Ref, traced
+from ambjax.export.primitives import COUNTED, OPS
+from ambjax.numerics.records import canonical
+
+PERIOD = "SAMPLE_PERIOD"
+PRECISIONS = {"float": "float32", "double": "float64"}
+
+
+@contextlib.contextmanager
+def precision(name: str) -> Iterator[None]:
+    """JAX in single or double precision, whatever it is set to."""
+    enabled: Any = jax.enable_x64 if hasattr(jax, "enable_x64") else None
+    if enabled is None:
+        from jax.experimental import enable_x64 as enabled
+    with enabled(name == "double"):
+        yield
+
+
+def arguments(controller: Controller) -> tuple[Any, ...]:
+    """Parameters, memory, inputs and period as JAX has them in its present precision."""
+    zero = jnp.zeros(())
+    inputs = Inputs(*[zero] * len(Inputs._fields))
+    return (*canonical((controller.parameters,)), controller.start(), inputs, jnp.asarray(controller.period))
+
+
+@dataclasses.dataclass(frozen=True)
+class Trace:
+    """The step as a program. `state` pairs each number with its next value, `outputs` and `bits` with theirs.
+
+    `keep` and `leaves`: of all leaves of the memory, the numbers of those that the C keeps, and their count.
+    """
+
+    controller: Controller
+    precision: str
+    program: Program
+    parameters: list[Number]
+    inputs: list[Number]
+    state: list[tuple[Number, Operand]]
+    started: Operand
+    outputs: list[tuple[Number, Operand]]
+    bits: list[tuple[str, Operand]]
+    read: frozenset[str]
+    keep: list[int]
+    refs: list[Ref]
+
+    def roots(self) -> list[Operand]:
+        """All that the step gives."""
+        return [x for _, x in [*self.state, *self.outputs, *self.bits]] + [self.started]
+
+    def order(self) -> list[int]:
+        """Numbers of the nodes that are written, in order."""
+        return sorted(n for n in self.program.needed(self.roots()) if self.program.nodes[n].op != "input")
+
+    def counts(self) -> Counter:
+        """How many operations of each cost a step takes; what depends on the period alone is the compiler's."""
+        nodes = self.program.nodes
+        fixed = {n for n, node in enumerate(nodes) if node.text == PERIOD}
+        found: Counter = Counter()
+        for n in self.order():
+            refs = [x.node for x in nodes[n].args if isinstance(x, Ref)]
+            if set(refs) <= fixed:
+                fixed.add(n)
+            else:
+                found[OPS[nodes[n].op].cost] += 1
+        return found
+
+    def flops(self) -> int:
+        """Additions, multiplications, divisions, roots and function calls."""
+        counts = self.counts()
+        return sum(counts[cost] for cost in COUNTED)
+
+
+def trace(controller: Controller, to: str) -> Trace:
+    """The step traced in a precision, `float` or `double`.
+
+    Raises ValueError for a law that does what scalar C cannot.
+    """
+    with precision(to):
+        first = _traced(controller, to, frozenset())
+        return _traced(controller, to, first.read)
+
+
+def _traced(controller: Controller, to: str, read: frozenset[str]) -> Trace:
+    given, program = arguments(controller), Program()
+    parameters, real = parameters_of(controller.parameters), np.dtype(PRECISIONS[to])
+    states = _states(controller)
+    texts = [f"params->{x.name}" for x in parameters] + [f"state->{x.name}" for x in states] + ["state->started"]
+    texts += [f"input->{name}" for name in Inputs._fields] + [PERIOD]
+    kinds = [real] * (len(parameters) + len(states)) + [np.dtype(bool)] + [real] * (len(Inputs._fields) + 1)
+    refs = [program.input(text, kind) for text, kind in zip(texts, kinds, strict=True)]
+    results = traced(program, lambda *x: controller.step(*x, read), given, refs)
+    for x in results:
+        if program.dtype(x).kind == "f" and program.dtype(x) != real:
+            raise ValueError(f"the step gives {program.dtype(x).name} where all is {real.name}.")
+    after, started = results[: len(states)], results[len(states)]
+    outputs, bits = results[len(states) + 1 : -len(BITS)], results[-len(BITS) :]
+    at = refs[len(parameters) :]
+    keep = _alive(program, at[: len(states)], after, [*outputs, *bits, started])
+    roots = [*outputs, *bits, started, *(after[k] for k in keep)]
+    seen = program.needed(roots)
+    told = at[len(states) + 1 : -1]
+    return Trace(
+        controller,
+        to,
+        program,
+        parameters,
+        [Number(name, unit, "", doc, 0.0) for name, (unit, doc) in INPUTS.items()],
+        [(states[k], after[k]) for k in keep],
+        started,
+        [(Number(name, *_output(name), 0.0), x) for name, x in zip(OUTPUTS, outputs, strict=True)],
+        list(zip(BITS, bits, strict=True)),
+        frozenset(name for name, ref in zip(Inputs._fields, told, strict=True) if ref.node in seen),
+        keep,
+        refs,
+    )
+
+
+def _output(name: str) -> tuple[str, str, str]:
+    unit, doc = OUTPUTS[name]
+    return unit, "", doc
+
+
+def _alive(program: Program, before: list[Ref], after: list[Operand], roots: list[Operand]) -> list[int]:
+    """Numbers of the states on which anything but they themselves depends."""
+    keep: set[int] = set()
+    while True:
+        seen = program.needed([*roots, *(after[k] for k in keep)])
+        more = {k for k, ref in enumerate(before) if ref.node in seen}
+        if more == keep:
+            return sorted(keep)
+        keep = more
+
+
+def _states(controller: Controller) -> list[Number]:
+    """Every real number of the memory, in the order of its leaves."""
+    cascade, memory = controller.parameters.controller, controller.start()
+    found = []
+    for stage, law, state in zip(CascadeState._fields, cascade.laws, memory.laws, strict=True):
+        told = answers.memory(law, state)
+        assert len(told) == len(jax.tree.leaves(state)), f"{type(law).__name__}.memory: one entry for each state"
+        if any(jnp.shape(x) != () for x in jax.tree.leaves(state)):
+            raise ValueError(f"controller.{stage}: a state of {type(law).__name__} is an array; only scalars can be exported.")
+        words = f"state of {type(law).__name__}"
+        found += [Number(f"{stage}.{name}", unit, "", doc or words, 0.0) for name, unit, doc in told]
+    commands = {**OUTPUTS, "i_ref_dot": ("A/s", "its rate")}
+    found += [Number(f"last.{name}", commands[name][0], "", f"last {commands[name][1]}", 0.0) for name in memory.last._fields]
+    return [*found, Number("before.u", "V", "", "voltage of the sample before the last", 0.0)]
