@@ -71,6 +71,10 @@ def parser() -> Parser:
     _seed_option(grid)
     words = "check Theorem 1's conditions along a case, or what decides on its processor; exit code 1 if one fails"
     command("check", words, case=True)
+    export = command("export", "the controller of a case with [processor] as C", case=True, out=True)
+    export.add_argument("--verify", action="store_true", help="hold the C to JAX; exit code 1 if it fails")
+    export.add_argument("--precision", choices=["float", "double"], default="float", help="type of its numbers")
+    export.add_argument("--prefix", metavar="NAME", help="what its names begin with (default: the case's name)")
     return top
 
 

@@ -11,6 +11,7 @@ from jax import Array
 from ambjax.control.cascade import Command
 from ambjax.export.controller import BITS, INPUTS, OUTPUTS
 from ambjax.export.machine import Compiled
+from ambjax.export.trace import PRECISIONS
 from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
@@ -81,26 +82,83 @@ class Looped(Sampled):
 
 
 class Loop(NamedTuple):
-    """One closed loop: displacement (m) over time, every metric, and how many samples ended in a fault of the C."""
+    """One closed loop: displacement (m) over time, and every metric."""
 
     z: np.ndarray
     metrics: dict[str, float]
 
 
+class Beside(NamedTuple):
+    """A loop beside that of JAX: largest |dz| (m), and the metric that is off most; each with what is allowed.
+
+    `own`: how far JAX's own loop goes from itself where the rotor starts one rounding unit of the gap higher, m.
+    """
+
+    dz: float
+    allowed: float
+    own: float
+    metric: str
+    off: float
+    off_allowed: float
+
+
+# What is allowed of dz as a share of the gap and of a metric's deviation, beside TIMES what rounding does to JAX's loop.
+BARS = {"double": (1e-9, 1e-9), "float": (1e-5, 1e-2)}
+TIMES = 10.0
 run_jit = jax.jit(run, static_argnames=("every",))
 
 
-def loops(cascade: Any, scenario: Scenario, clock: Clock, fold: Standard, machines: list[Compiled]) -> list[Loop]:
-    """The case under JAX's controller, and under each compiled one."""
-    given: Any = system_of(cascade, scenario, clock)
-    found = [_loop(given, clock, fold)]
-    host = Machines(*machines)
-    for which in range(len(machines)):
-        found.append(_loop(Looped(ClosedLoop(given.loop.cascade, scenario), given.period, which, host), clock, fold))
+class Case(NamedTuple):
+    """What is looped: a cascade on its processor in a scenario, over a clock, measured."""
+
+    cascade: Any
+    scenario: Scenario
+    clock: Clock
+    fold: Standard
+
+
+def beside(case: Case, machines: dict[str, Compiled]) -> dict[str, Beside]:
+    """The case under each compiled controller, by precision, beside the case under JAX's."""
+    given: Any = system_of(case.cascade, case.scenario, case.clock)
+    host, found = Machines(*machines.values()), {}
+    reference = _loop(given, case)
+    for which, precision in enumerate(machines):
+        scenario = case.scenario
+        gap, eps = float(scenario.plant.s_0), float(np.finfo(PRECISIONS[precision]).eps)
+        moved = dataclasses.replace(scenario.initial, z=scenario.initial.z + gap * eps)
+        nudged = dataclasses.replace(scenario, initial=moved)
+        own = _loop(system_of(case.cascade, nudged, case.clock), case)
+        looped = _loop(Looped(ClosedLoop(given.loop.cascade, scenario), given.period, which, host), case)
+        found[precision] = _compared(reference, own, looped, precision, gap, float(case.clock.sample_period))
     return found
 
 
-def _loop(system: Any, clock: Clock, fold: Standard) -> Loop:
-    system, clock, fold = canonical((system, clock, fold))
+def _compared(reference: Loop, own: Loop, looped: Loop, precision: str, gap: float, period: float) -> Beside:
+    share, metric_share = BARS[precision]
+    moved, dz = (float(np.abs(x.z - reference.z).max()) for x in (own, looped))
+    worst = max(reference.metrics, key=lambda name: _excess(name, reference, own, looped, metric_share, period))
+    is_, should, self_ = (x.metrics[worst] for x in (looped, reference, own))
+    allowed = _allowed(worst, should, self_, metric_share, period)
+    return Beside(dz, share * gap + TIMES * moved, moved, worst, _off(is_, should), allowed)
+
+
+def _off(a: float, b: float) -> float:
+    return 0.0 if a == b else abs(a - b)
+
+
+def _allowed(name: str, should: float, own: float, share: float, period: float) -> float:
+    """What a metric may be off; of a time, a sample."""
+    moved = _off(own, should)
+    return share * abs(should) * np.isfinite(should) + TIMES * moved + (period if name.endswith("_s") else 0.0)
+
+
+def _excess(name: str, reference: Loop, own: Loop, looped: Loop, share: float, period: float) -> float:
+    should = reference.metrics[name]
+    off, allowed = _off(looped.metrics[name], should), _allowed(name, should, own.metrics[name], share, period)
+    return off / allowed if allowed > 0 else (np.inf if off > 0 else 0.0)
+
+
+def _loop(system: Any, case: Case) -> Loop:
+    system, clock, fold = canonical((system, case.clock, case.fold))
     outcome = run_jit(system, clock, fold, every=1)
     return Loop(np.asarray(outcome.trajectory.rows.z), {k: float(v) for k, v in outcome.measured.items()})

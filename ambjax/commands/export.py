@@ -1,0 +1,80 @@
+"""`ambjax export`: the controller of a case as C, and the proof that it is that controller."""
+
+import argparse
+import hashlib
+import pathlib
+import re
+from typing import Any
+
+from ambjax.cases.reader import Case, read_case
+from ambjax.commands.doubts import say_doubts
+from ambjax.commands.outputs import directory, files, say, table, write_json
+from ambjax.export import loop, machine, package, verify
+from ambjax.export.controller import Controller, controller_of
+from ambjax.export.source import RESERVED, Origin
+from ambjax.export.trace import PRECISIONS
+from ambjax.simulation.metrics import standard_for
+
+Summary = dict[str, Any]
+# Names that a header of C has already.
+TAKEN = set("assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg".split())
+TAKEN |= set("stdbool stddef stdint stdio stdlib string tgmath time wchar wctype".split())
+
+
+def run(args: argparse.Namespace) -> tuple[int, Summary]:
+    """ambjax export."""
+    case = read_case(args.case)
+    controller = controller_of(case.cascade, case.scenario.u_max, float(case.clock.sample_period))
+    prefix = _prefix(args.prefix, case.name)
+    if args.verify:
+        machine.compiler()
+    say_doubts(case, args.case)
+    digest = hashlib.sha256(pathlib.Path(args.case).read_bytes()).hexdigest()
+    origin = Origin(case.name, digest, package.described(controller))
+    if not args.verify:
+        texts, checks = package.files(controller, args.precision, prefix, origin), []
+    else:
+        texts, checks = _verified(case, controller, args.precision, prefix, origin)
+    out = directory(args.out, f"export-{case.name}")
+    ok = all(x.ok for x in checks) if checks else None
+    with files(out) as part:
+        for name, text in texts.items():
+            (part / name).write_text(text, encoding="utf-8")
+        if checks:
+            (part / "verify.md").write_text(verify.table(checks, case.name), encoding="utf-8")
+            write_json(part / "verify.json", {"ok": ok, "checks": [x._asdict() for x in checks]})
+    if not args.json:
+        if checks:
+            rows = [(x.name, x.precision, x.found, x.allowed, "holds" if x.ok else "FAILS") for x in checks]
+            print(table(("check", "precision", "found", "allowed", "verdict"), rows))
+        print(f"written: {out}/{', '.join([*texts, *(['verify.md', 'verify.json'] if checks else [])])}")
+    return int(ok is False), {"ok": ok, "checks": [x._asdict() for x in checks], "out": str(out)}
+
+
+def _verified(
+    case: Case, controller: Controller, precision: str, prefix: str, origin: Origin
+) -> tuple[dict[str, str], list[verify.Check]]:
+    """The files, and the checks of them in both precisions."""
+    say("verify: one step at 10,000 points, then the closed loop, in both precisions")
+    drafts = {name: verify.draft(controller, name, prefix, origin) for name in PRECISIONS}
+    fold = standard_for(case.settle, case.scenario)
+    checks = verify.verify(drafts, loop.Case(case.cascade, case.scenario, case.clock, fold))
+    return dict(drafts[precision].files), checks
+
+
+def _prefix(asked: str | None, name: str) -> str:
+    """What all names of the C begin with. Raises ValueError for what is no name in C."""
+    if asked is None:
+        found = re.sub(r"\W", "_", name, flags=re.ASCII)
+        return found if _is_name(found) else f"amb_{found}"
+    if not _is_name(asked):
+        raise ValueError(
+            f"--prefix {asked}: it must be a name in C, letters, digits and '_', and neither one of its words nor of "
+            "its headers. Use --prefix controller, for example."
+        )
+    return asked
+
+
+def _is_name(text: str) -> bool:
+    words = RESERVED | TAKEN | {"break", "continue", "else", "for", "if", "return", "while"}
+    return re.fullmatch(r"[A-Za-z]\w{0,60}", text, flags=re.ASCII) is not None and text not in words

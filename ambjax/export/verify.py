@@ -1,0 +1,140 @@
+"""The C held to JAX: it compiles without a warning, steps as JAX does, holds the rotor as JAX does, and tests itself."""
+
+import dataclasses
+import pathlib
+import subprocess
+import tempfile
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from ambjax.export import loop
+from ambjax.export.controller import Controller
+from ambjax.export.machine import EXACT, SANITIZED, STRICT, Compiled, build
+from ambjax.export.package import SHARE, ULPS, tolerance, written
+from ambjax.export.reference import Points, Results, points, results
+from ambjax.export.source import Origin
+from ambjax.export.trace import PRECISIONS, Trace, trace
+
+# Random states and inputs of the comparison of one step, and seconds that a test program may take.
+COUNT, PATIENCE = 10_000, 60
+
+
+class Check(NamedTuple):
+    """One line of the table: what is looked at, in which precision, what was found, what is allowed, and whether it is."""
+
+    name: str
+    precision: str
+    found: str
+    allowed: str
+    ok: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Draft:
+    """A controller as files of a precision, and what JAX makes of its step."""
+
+    trace: Trace
+    prefix: str
+    files: Mapping[str, str]
+    points: Points
+    results: Results
+
+
+def draft(controller: Controller, precision: str, prefix: str, origin: Origin, count: int = COUNT) -> Draft:
+    """Files and references of a controller. Raises ValueError for a law that does what scalar C cannot."""
+    traced = trace(controller, precision)
+    at = points(traced, count)
+    return Draft(traced, prefix, written(traced, prefix, origin), at, results(traced, at))
+
+
+def verify(drafts: Mapping[str, Draft], case: loop.Case | None) -> list[Check]:
+    """Every check, in both precisions; without a case none of the closed loop. Raises ValueError without a compiler."""
+    checks, machines = [], {}
+    with tempfile.TemporaryDirectory(prefix="ambjax-") as folder:
+        for precision, one in drafts.items():
+            at = pathlib.Path(folder) / precision
+            at.mkdir()
+            for name, text in one.files.items():
+                (at / name).write_text(text, encoding="utf-8")
+            checks += _built(one, precision, at)
+            if checks[-1].ok and (library := at / "controller.so").exists():
+                machines[precision] = Compiled(library, one.trace, one.prefix)
+                checks += _stepped(one, precision, machines[precision])
+        if case is not None and len(machines) == len(drafts):
+            for precision, found in loop.beside(case, machines).items():
+                checks += _looped(precision, found)
+    return checks
+
+
+def _built(one: Draft, precision: str, at: pathlib.Path) -> Iterator[Check]:
+    """Compiled strictly; the test program plain and under sanitizers; the library."""
+    source, test = at / f"{one.prefix}.c", at / f"{one.prefix}_test.c"
+    for how, flags in (("", []), (", sanitized", SANITIZED)):
+        program = at / f"test{len(flags)}"
+        said = build([source, test], program, *flags)
+        words = "-fsanitize=address,undefined" if flags else " ".join(STRICT[2:])
+        yield Check(f"compiles{how}", precision, _short(said) or "no warning", words, not said)
+        if not said:
+            done = subprocess.run([program], capture_output=True, text=True, check=False, timeout=PATIENCE)
+            told = _short(done.stdout + done.stderr)
+            yield Check(f"test program{how}", precision, told, "exit code 0", done.returncode == 0)
+    said = build([source], at / "controller.so", "-shared", "-fPIC")
+    yield Check("library", precision, _short(said) or "no warning", EXACT, not said)
+
+
+def _short(text: str) -> str:
+    """The last line of what a program said; of a compiler, its first error."""
+    lines = [line for line in text.strip().splitlines() if line]
+    errors = [line for line in lines if "error:" in line]
+    return (errors[0].partition("error:")[2].strip() if errors else lines[-1] if lines else "")[:160]
+
+
+def _stepped(one: Draft, precision: str, machine: Compiled) -> Iterator[Check]:
+    """One step from each point."""
+    found, should, kind = machine.results(one.points), one.results, np.finfo(PRECISIONS[precision])
+    numbers = [(np.concatenate([x.state, x.outputs])) for x in (found, should)]
+    off = deviation(*numbers, float(kind.tiny))
+    worst = float(off.max(initial=0.0))
+    share = tolerance(precision)[0]
+    units, allowed = worst / share * (ULPS if precision == "double" else SHARE), f"{ULPS} ULP" if precision == "double" else f"{SHARE:g}"
+    shown = f"{units:.3g} ULP" if precision == "double" else f"{units:.3g}"
+    count = one.points.started.size
+    yield Check("one step, numbers", precision, f"{shown} at {count:,} points", allowed, worst <= share)
+    other = int(np.sum((found.bits != should.bits) | (found.started != should.started)))
+    yield Check("one step, status", precision, f"{other} of {count:,} differ", "0", other == 0)
+
+
+def deviation(found: np.ndarray, should: np.ndarray, tiny: float) -> np.ndarray:
+    """How far numbers are off, as a share of what they should be; what is no number is off by 0 or by inf."""
+    with np.errstate(all="ignore"):
+        off = np.abs(found.astype(float) - should) / np.maximum(np.abs(should.astype(float)), 1e4 * tiny)
+    same = (found == should) | (np.isnan(found) & np.isnan(should))
+    return np.where(same, 0.0, np.where(np.isnan(off), np.inf, off))
+
+
+def _looped(precision: str, found: loop.Beside) -> Iterator[Check]:
+    told = f"{found.dz:.2g} m (rounding alone moves JAX's by {found.own:.2g} m)"
+    yield Check("closed loop, |dz|", precision, told, f"{found.allowed:.2g} m", found.dz <= found.allowed)
+    told = f"{found.metric} off by {found.off:.2g}"
+    yield Check("closed loop, metrics", precision, told, f"{found.off_allowed:.2g}", found.off <= found.off_allowed)
+
+
+def table(checks: list[Check], case: str) -> str:
+    """The checks as a page of Markdown."""
+    rows = [f"| {x.name} | {x.precision} | {x.found} | {x.allowed} | {'holds' if x.ok else 'FAILS'} |" for x in checks]
+    verdict = "All of it holds." if all(x.ok for x in checks) else "It does NOT hold."
+    head = "| check | precision | found | allowed | verdict |\n|---|---|---|---|---|"
+    return f"# The controller of case '{case}' as C, held to JAX\n\n{verdict}\n\n{head}\n" + "\n".join(rows) + "\n\n" + TOLD
+
+
+TOLD = f"""One step: states and inputs at random over decades, with zeros, limits, NaN and infinities, and the points next to where
+each comparison of the step turns, on both sides. The reference is JAX in the same precision, each primitive run alone:
+compiled as a whole, XLA rounds a product and a sum once where the C ({EXACT}) rounds twice. A number is off by a share
+of its own size; what underflows counts as 0.
+
+Closed loop: JAX's plant and sensors under the compiled C, beside the whole compiled by JAX in double precision, over
+the case's horizon. Allowed is a share of the gap ({loop.BARS["double"][0]:g} in double, {loop.BARS["float"][0]:g} in float) and of each metric ({loop.BARS["double"][1]:g}, {loop.BARS["float"][1]:g}),
+a sample for a time, and {loop.TIMES:g} times what one rounding unit of the gap at the start makes of JAX's own loop.
+"""
