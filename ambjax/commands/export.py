@@ -11,14 +11,17 @@ from ambjax.commands.doubts import say_doubts
 from ambjax.commands.outputs import directory, files, say, table, write_json
 from ambjax.export import loop, machine, package, verify
 from ambjax.export.controller import Controller, controller_of
-from ambjax.export.source import RESERVED, Origin
-from ambjax.export.trace import PRECISIONS
+from ambjax.export.source import Origin
+from ambjax.export.statements import PRECISIONS, RESERVED
 from ambjax.simulation.metrics import standard_for
 
 Summary = dict[str, Any]
 # Names that a header of C has already.
-TAKEN = set("assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg".split())
-TAKEN |= set("stdbool stddef stdint stdio stdlib string tgmath time wchar wctype".split())
+TAKEN = {
+    *("assert", "complex", "ctype", "errno", "fenv", "inttypes", "iso646", "limits", "locale", "math", "setjmp"),
+    *("signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time", "wchar"),
+    "wctype",
+}
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:

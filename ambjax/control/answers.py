@@ -99,7 +99,8 @@ def memory(law: Any, state: Any) -> list[tuple[str, str, str]]:
     """Name, unit and meaning of each leaf of a law's state, for whoever writes it down."""
     if hasattr(law, "memory"):
         return list(law.memory)
-    paths = [jax.tree_util.keystr(path, simple=True, separator="_") for path, _ in jax.tree_util.tree_leaves_with_path(state)]
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    paths = [jax.tree_util.keystr(path, simple=True, separator="_") for path, _ in leaves]
     return [(f"x_{path}" if path.isdigit() else path or "x", "", "") for path in paths]
 
 

@@ -20,7 +20,7 @@ from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 
-U_MAX = next(field for field in dataclasses.fields(Scenario) if field.name == "u_max")
+(U_MAX,) = (field for field in dataclasses.fields(Scenario) if field.name == "u_max")
 # Ends of the inputs that are believed, in the model's sizes: gaps, a gap within a sample, bias currents.
 GAPS, CURRENTS = 2.0, 100.0
 NEAR = 0.1
@@ -35,6 +35,9 @@ class Limits:
     """Where the step no longer does what it is asked: the supply's end, and those of its inputs."""
 
     u_max: Scalar = dataclasses.field(metadata=U_MAX.metadata)
+    near: Scalar = leaf(
+        unit="1", at_least=-1e30, at_most=1, doc="where Eq. (9), 1 at rest and 0 on the singular curve, counts as near"
+    )
     z: Scalar = _end("z", "m")
     z_dot: Scalar = _end("z_dot", "m/s")
     i: Scalar = _end("i", "A")
@@ -42,9 +45,6 @@ class Limits:
     r_dot: Scalar = _end("r_dot", "m/s")
     r_ddot: Scalar = _end("r_ddot", "m/s^2")
     r_dddot: Scalar = _end("r_dddot", "m/s^3")
-    near: Scalar = leaf(
-        unit="1", at_least=-1e30, at_most=1, doc="where Eq. (9), 1 at rest and 0 on the singular curve, counts as near"
-    )
 
 
 class Inputs(NamedTuple):
@@ -146,15 +146,15 @@ class Controller:
         system = Sampled(ClosedLoop(cascade, Scenario(u_max=limits.u_max)), period)
         state = SampledState((), laws, memory.last, (memory.before, memory.before), jnp.ones(()))
         after = system.decided(measured, Reference(*inputs[3:]), state)
-        kept = Memory(choose(good, after.control, memory.laws), choose(good, after.command, memory.last), after.past[0], memory.started | good)
-        command = kept.last
+        last = choose(good, after.command, memory.last)
+        kept = Memory(choose(good, after.control, memory.laws), last, after.past[0], memory.started | good)
         status = Status(
-            jnp.abs(command.u) >= limits.u_max,
+            jnp.abs(last.u) >= limits.u_max,
             ~good,
             good & (after.sane == 0),
-            good & (cascade.model.singularity(measured.z, command.i_ref) <= limits.near),
+            good & (cascade.model.singularity(measured.z, last.i_ref) <= limits.near),
         )
-        return kept, Answer(command.u, command.i_ref, command.v_star, command.v_tilde), status
+        return kept, Answer(last.u, last.i_ref, last.v_star, last.v_tilde), status
 
     def start(self) -> Memory:
         """Before the first step: no voltage, laws without a state."""
@@ -179,7 +179,7 @@ def controller_of(cascade: Cascade, u_max: Scalar, period: float) -> Controller:
     model = cascade.model
     gap, current = GAPS * float(model.s_0), CURRENTS * float(model.i_0)
     rates = [gap / period**n for n in range(4)]
-    limits = Limits(u_max, gap, rates[1], current, *rates, NEAR)  # pyright: ignore[reportCallIssue]
+    limits = Limits(u_max, NEAR, gap, rates[1], current, *rates)  # pyright: ignore[reportCallIssue]
     plain = jax.tree.map(lambda x: float(x) if jnp.shape(x) == () else x, Parameters(cascade, limits))
     return Controller(plain, period)
 

@@ -18,6 +18,7 @@ from ambjax.export.primitives import CALLS, OPS, SAME
 # Statements of a program; what has more was unrolled from a loop that belongs in no control step.
 MOST = 20_000
 LOOPS = ("scan", "while")
+COMPOSED = ("rsqrt", "exp2", "logistic")
 
 
 class Ref(NamedTuple):
@@ -127,7 +128,9 @@ def _of(law: str) -> str:
     return f"{law}: " if law else ""
 
 
-def traced(program: Program, function: Callable[..., Any], arguments: Any, operands: Sequence[Operand]) -> list[Operand]:
+def traced(
+    program: Program, function: Callable[..., Any], arguments: Any, operands: Sequence[Operand]
+) -> list[Operand]:
     """Operands of the leaves that `function(*arguments)` gives, with these operands for the leaves of its arguments.
 
     Raises ValueError for a primitive that is no scalar arithmetic; it names the primitive and the law that uses it.
@@ -150,7 +153,8 @@ class _Reader:
         known: dict[Any, Operand] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *operands], strict=True))
 
         def value(x: Any) -> Operand:
-            return np.asarray(x.val, x.aval.dtype)[()] if isinstance(x, Literal) else known[x]
+            aval: Any = x.aval
+            return np.asarray(x.val, aval.dtype)[()] if isinstance(x, Literal) else known[x]
 
         for eqn in jaxpr.eqns:
             inner = _law(str(eqn.source_info.name_stack)) or law
@@ -186,12 +190,8 @@ class _Reader:
             return apply("min", (apply("max", (args[1], args[0]), dtype, law), args[2]), dtype, law)
         if name in ("square", "integer_pow"):
             return self._power(args[0], params.get("y", 2), dtype, law)
-        if name in ("rsqrt", "logistic"):
-            one = np.ones((), dtype)[()]
-            if name == "rsqrt":
-                return apply("div", (one, apply("sqrt", args, dtype, law)), dtype, law)
-            grown = apply("exp", (apply("neg", args, dtype, law),), dtype, law)
-            return apply("div", (one, apply("add", (one, grown), dtype, law)), dtype, law)
+        if name in COMPOSED:
+            return self._composed(name, args[0], dtype, law)
         if name == "round":
             name = ("round_away", "round_even")[int(params["rounding_method"])]
         name = {"add_any": "add"}.get(name, name)
@@ -199,6 +199,16 @@ class _Reader:
         if name not in OPS or (whole and any(isinstance(x, Ref) for x in args)):
             raise ValueError(refusal(name, law, "of whole numbers" if whole else ""))
         return apply(name, args, dtype, law)
+
+    def _composed(self, name: str, x: Operand, dtype: Any, law: str) -> Operand:
+        """What C has not, of what it has, as XLA has it."""
+        apply, one = self.program.apply, np.ones((), dtype)[()]
+        if name == "rsqrt":
+            return apply("div", (one, apply("sqrt", (x,), dtype, law)), dtype, law)
+        if name == "exp2":
+            return apply("exp", (apply("mul", (x, np.log(2 * one)), dtype, law),), dtype, law)
+        grown = apply("exp", (apply("neg", (x,), dtype, law),), dtype, law)
+        return apply("div", (one, apply("add", (one, grown), dtype, law)), dtype, law)
 
     def _power(self, x: Operand, y: int, dtype: Any, law: str) -> Operand:
         """By squaring, as JAX has it."""
@@ -231,7 +241,10 @@ class _Reader:
         if len(branches) != 2 or self.program.dtype(index).kind != "b":
             raise ValueError(refusal("cond", law, f"of {len(branches)} branches"))
         no, yes = (self.closed(branch, rest, law) for branch in branches)
-        return [self.program.apply("select", (index, b, a), self.program.dtype(a), law) for a, b in zip(no, yes, strict=True)]
+        return [
+            self.program.apply("select", (index, b, a), self.program.dtype(a), law)
+            for a, b in zip(no, yes, strict=True)
+        ]
 
     def _scan(self, params: Any, args: list[Operand], law: str) -> list[Operand]:
         consts, carry = args[: params["num_consts"]], args[params["num_consts"] :]

@@ -9,9 +9,9 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.cascade import Command
-from ambjax.export.controller import BITS, INPUTS, OUTPUTS
+from ambjax.export.controller import BITS, OUTPUTS
 from ambjax.export.machine import Compiled
-from ambjax.export.trace import PRECISIONS
+from ambjax.export.statements import PRECISIONS
 from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
@@ -102,7 +102,7 @@ class Beside(NamedTuple):
     off_allowed: float
 
 
-# What is allowed of dz as a share of the gap and of a metric's deviation, beside TIMES what rounding does to JAX's loop.
+# What is allowed of dz as a share of the gap, and of a metric, beside TIMES what rounding does to JAX's own loop.
 BARS = {"double": (1e-9, 1e-9), "float": (1e-5, 1e-2)}
 TIMES = 10.0
 run_jit = jax.jit(run, static_argnames=("every",))
@@ -149,7 +149,8 @@ def _off(a: float, b: float) -> float:
 def _allowed(name: str, should: float, own: float, share: float, period: float) -> float:
     """What a metric may be off; of a time, a sample."""
     moved = _off(own, should)
-    return share * abs(should) * np.isfinite(should) + TIMES * moved + (period if name.endswith("_s") else 0.0)
+    size = abs(should) if np.isfinite(should) else 0.0
+    return share * size + TIMES * moved + (period if name.endswith("_s") else 0.0)
 
 
 def _excess(name: str, reference: Loop, own: Loop, looped: Loop, share: float, period: float) -> float:

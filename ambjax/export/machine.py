@@ -11,7 +11,8 @@ import numpy as np
 
 from ambjax.export.controller import INPUTS
 from ambjax.export.reference import Points, Results
-from ambjax.export.trace import PRECISIONS, Trace
+from ambjax.export.statements import PRECISIONS
+from ambjax.export.trace import Trace
 
 STRICT = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic", "-Werror"]
 EXACT = "-ffp-contract=off"
@@ -43,20 +44,16 @@ class Compiled:
     def __init__(self, library: pathlib.Path, trace: Trace, prefix: str):
         self.trace, real = trace, np.dtype(PRECISIONS[trace.precision])
         loaded = ctypes.CDLL(str(library))
-        self._step, self._init, self._reset = (getattr(loaded, f"{prefix}_{name}") for name in ("step", "init", "reset"))
+        self._step = getattr(loaded, f"{prefix}_step")
         self._step.restype = ctypes.c_uint32
         self.memory = np.dtype([("numbers", real, (len(trace.state),)), ("started", np.uint32)], align=True)
         count = len(trace.parameters)
         default = (ctypes.c_char * (count * real.itemsize)).in_dll(loaded, f"{prefix}_default")
-        self.parameters = np.frombuffer(default, real).copy()
+        self.parameters = np.frombuffer(bytes(default), real).copy()
         self.state = np.zeros((), self.memory)
         self.inputs, self.outputs = np.zeros(len(INPUTS), real), np.zeros(len(trace.outputs), real)
         self._at = [x.ctypes.data_as(ctypes.c_void_p) for x in (self.parameters, self.state, self.inputs, self.outputs)]
         self._keeps: Any = loaded
-
-    def init(self) -> None:
-        """Before the first step."""
-        self._init(self._at[1])
 
     def step(self) -> int:
         """One sample, of `inputs`, into `state` and `outputs`."""

@@ -1,13 +1,17 @@
 """All files of an exported controller, as text: header, source, test program, its vectors, Makefile and README."""
 
+import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
 from ambjax.export.controller import INPUTS, OUTPUTS, Controller
 from ambjax.export.reference import Points, Results, points, results
-from ambjax.export.source import Origin, Writer, literal, order_of_work, word
-from ambjax.export.trace import PRECISIONS, Trace, trace
+from ambjax.export.source import Origin, Writer, order_of_work
+from ambjax.export.statements import PRECISIONS, literal, word
+from ambjax.export.texts import MAKEFILE, README, TEST
+from ambjax.export.trace import Trace, trace
 
 # Points of the test program, and the units in the last place, or the share, by which the C may be off JAX.
 VECTORS = 100
@@ -105,10 +109,9 @@ def _test(writer: Writer) -> str:
         share=literal(share, t.precision),
         small=literal(small, t.precision),
         checks="\n".join(checks),
-        nan="NAN" if t.precision == "float" else "(double)NAN",
         faults="\n".join(f"    faults += refused(&state, {k});" for k, name in enumerate(INPUTS) if name in t.read),
         fields="\n".join(
-            f"    case {k}:\n        input.{name} = {'NAN' if t.precision == 'float' else '(double)NAN'};\n        break;"
+            f"    case {k}:\n        input.{name} = {literal(np.nan, t.precision)};\n        break;"
             for k, name in enumerate(INPUTS)
         ),
         zeros="\n".join(f"    input.{name} = {literal(0, t.precision)};" for name in INPUTS),
@@ -136,143 +139,9 @@ def described(controller: Controller) -> list[str]:
 
 
 def _described(controller: Controller) -> Iterator[str]:
-    cascade = controller.parameters.controller
-    import dataclasses
-
+    cascade: Any = controller.parameters.controller
     for stage, law in zip(("observer", "position", "inversion", "current"), cascade.laws, strict=True):
         hard = [f.name for f in dataclasses.fields(law) if f.metadata.get("steepness") and getattr(law, f.name) is None]
         ends = "".join(f", {name} = inf (the sign itself)" for name in hard)
         yield f"{stage}: {type(law).__name__}{ends}"
     yield f"processor: {cascade.processor}"
-
-
-MAKEFILE = """# make: the object; make test: the test program, run
-CC ?= cc
-CFLAGS ?= -O2
-# a fused product and sum would round once where the simulator rounds twice
-WARNINGS = -std=c99 -Wall -Wextra -Wconversion -Wdouble-promotion -pedantic -ffp-contract=off
-
-{p}.o: {p}.c {p}.h
-\t$(CC) $(WARNINGS) $(CFLAGS) -c {p}.c -o $@
-
-{p}_test: {p}_test.c {p}_vectors.h {p}.o
-\t$(CC) $(WARNINGS) $(CFLAGS) {p}_test.c {p}.o -o $@ -lm
-
-test: {p}_test
-\t./{p}_test
-
-clean:
-\trm -f {p}.o {p}_test
-
-.PHONY: test clean
-"""
-
-TEST = """{banner}
-
-#include <math.h>
-#include <stdio.h>
-
-#include "{p}.h"
-#include "{p}_vectors.h"
-
-/* whether a number is off the one that JAX gives by more than rounding */
-static int differs({p}_real is, {p}_real should)
-{{
-    if (isnan(should) || isnan(is)) {{
-        return (isnan(should) != 0) != (isnan(is) != 0);
-    }}
-    if (isinf(should) || isinf(is)) {{
-        return is < should || is > should;
-    }}
-    return {abs}(is - should) > {share} * {abs}(should) + {small};
-}}
-
-/* a step with NaN in one input is refused: the voltage is held, and the laws keep their state */
-static int refused({p}_state *state, int which)
-{{
-    {p}_input input;
-    {p}_output output;
-    const {p}_real u = state->last.u;
-{zeros}
-    switch (which) {{
-{fields}
-    default:
-        break;
-    }}
-    const uint32_t status = {p}_step(&{p}_default, state, &input, &output);
-    return (status & {p}_REFUSED) == 0u || differs(output.u, u) || differs(state->last.u, u);
-}}
-
-int main(void)
-{{
-    const int count = (int)(sizeof {p}_vectors / sizeof {p}_vectors[0]);
-    int failed = 0, faults = 0;
-    {p}_state state;
-    for (int n = 0; n < count; n++) {{
-        const {p}_vector *one = &{p}_vectors[n];
-        {p}_output output;
-        int wrong = 0;
-        state = one->before;
-        const uint32_t status = {p}_step(&{p}_default, &state, &one->input, &output);
-        wrong += status != one->status;
-        wrong += state.started != one->after.started;
-{checks}
-        if (wrong > 0) {{
-            printf("step %d: %d numbers differ\\n", n, wrong);
-            failed++;
-        }}
-    }}
-    {p}_init(&state);
-    faults += state.started != 0u || differs(state.last.u, 0);
-{faults}
-    faults += state.started != 0u;
-    state.last.u = 1;
-    state.started = 1u;
-    {p}_reset(&state);
-    faults += state.started != 0u || differs(state.last.u, 1);
-    printf("%d of %d steps as JAX makes them, %d faults in start and refusal\\n", count - failed, count, faults);
-    return failed > 0 || faults > 0;
-}}
-"""
-
-README = """# {p}: the controller of case '{case}' as C99
-
-{cascade}
-
-`{p}.h`, `{p}.c`: the controller; no globals but the case's numbers, no memory of its own, `<math.h>` and `<stdint.h>` alone.
-`{p}_test.c`, `{p}_vectors.h`: a test program, steps as JAX makes them; `make test` runs it on a host or a target.
-
-{order}
-
-```c
-#include "{p}.h"
-
-static {p}_state state;
-
-void setup(void)
-{{
-    {p}_init(&state);
-}}
-
-void every_sample(void) /* {period} s */
-{{
-    {p}_input input = {{0}};
-    {p}_output output;
-    input.z = read_z();
-    input.z_dot = read_z_dot();
-    input.i = read_i();
-    input.r = reference();
-    const uint32_t status = {p}_step(&{p}_default, &state, &input, &output);
-    write_voltage(output.u);
-    if (status & ({p}_REFUSED | {p}_FAILED)) {{
-        fault(); /* the voltage is held; decide how long */
-    }}
-}}
-```
-
-The gains are `{P}_DEFAULT` in the header. To change one, copy it: `static {p}_params mine = {P}_DEFAULT; mine.position.c = ...;` and
-give `&mine` to the step. A sample period is fixed: export again for another.
-
-{flops} flops a step, in {precision}. Held to JAX operation by operation: {ulps} at 10,000 random states and inputs
-(`ambjax export --verify`). Compile with `-ffp-contract=off`, and never with `-ffast-math`.
-"""

@@ -58,7 +58,7 @@ OPS: dict[str, Op] = {
     "asinh": _function("asinh", np.arcsinh),
     "acosh": _function("acosh", np.arccosh),
     "atanh": _function("atanh", np.arctanh),
-    **{name: _function(name) for name in ("exp", "exp2", "expm1", "log", "log1p", "cbrt", "floor", "ceil")},
+    **{name: _function(name) for name in ("exp", "expm1", "log", "log1p", "cbrt", "floor", "ceil")},
     **{name: _function(name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
     "erf": _function("erf", _erf("erf")),
     "erfc": _function("erfc", _erf("erfc")),

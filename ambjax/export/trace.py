@@ -1,9 +1,7 @@
 """The traced step with names: which numbers it reads, keeps and gives, and what each costs."""
 
-import contextlib
 import dataclasses
 from collections import Counter
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -15,23 +13,19 @@ from ambjax.control.cascade import CascadeState
 from ambjax.export.controller import BITS, INPUTS, OUTPUTS, Controller, Inputs, Number, parameters_of
 from ambjax.export.emitter import Operand, Program, Ref, traced
 from ambjax.export.primitives import COUNTED, OPS
+from ambjax.export.statements import PERIOD, PRECISIONS, word
 from ambjax.numerics.records import canonical
 
-PERIOD = "SAMPLE_PERIOD"
-PRECISIONS = {"float": "float32", "double": "float64"}
+
+def precision(name: str) -> Any:
+    """JAX in single or double precision within a block, whatever it is set to."""
+    import jax.experimental
+
+    home: Any = jax if hasattr(jax, "enable_x64") else jax.experimental
+    return home.enable_x64(name == "double")
 
 
-@contextlib.contextmanager
-def precision(name: str) -> Iterator[None]:
-    """JAX in single or double precision, whatever it is set to."""
-    enabled: Any = jax.enable_x64 if hasattr(jax, "enable_x64") else None
-    if enabled is None:
-        from jax.experimental import enable_x64 as enabled
-    with enabled(name == "double"):
-        yield
-
-
-def arguments(controller: Controller) -> tuple[Any, ...]:
+def arguments(controller: Controller) -> Any:
     """Parameters, memory, inputs and period as JAX has them in its present precision."""
     zero = jnp.zeros(())
     inputs = Inputs(*[zero] * len(Inputs._fields))
@@ -99,11 +93,12 @@ def _traced(controller: Controller, to: str, read: frozenset[str]) -> Trace:
     given, program = arguments(controller), Program()
     parameters, real = parameters_of(controller.parameters), np.dtype(PRECISIONS[to])
     states = _states(controller)
-    texts = [f"params->{x.name}" for x in parameters] + [f"state->{x.name}" for x in states] + ["state->started"]
-    texts += [f"input->{name}" for name in Inputs._fields] + [PERIOD]
+    texts = [f"params->{word(x.name)}" for x in parameters] + [f"state->{word(x.name)}" for x in states]
+    texts += ["state->started", *(f"input->{name}" for name in Inputs._fields), PERIOD]
     kinds = [real] * (len(parameters) + len(states)) + [np.dtype(bool)] + [real] * (len(Inputs._fields) + 1)
     refs = [program.input(text, kind) for text, kind in zip(texts, kinds, strict=True)]
-    results = traced(program, lambda *x: controller.step(*x, read), given, refs)
+    step: Any = controller.step
+    results = traced(program, lambda *x: step(*x, read), given, refs)
     for x in results:
         if program.dtype(x).kind == "f" and program.dtype(x) != real:
             raise ValueError(f"the step gives {program.dtype(x).name} where all is {real.name}.")
@@ -154,9 +149,13 @@ def _states(controller: Controller) -> list[Number]:
         told = answers.memory(law, state)
         assert len(told) == len(jax.tree.leaves(state)), f"{type(law).__name__}.memory: one entry for each state"
         if any(jnp.shape(x) != () for x in jax.tree.leaves(state)):
-            raise ValueError(f"controller.{stage}: a state of {type(law).__name__} is an array; only scalars can be exported.")
+            raise ValueError(
+                f"controller.{stage}: a state of {type(law).__name__} is an array; only scalars can be exported."
+            )
         words = f"state of {type(law).__name__}"
         found += [Number(f"{stage}.{name}", unit, "", doc or words, 0.0) for name, unit, doc in told]
     commands = {**OUTPUTS, "i_ref_dot": ("A/s", "its rate")}
-    found += [Number(f"last.{name}", commands[name][0], "", f"last {commands[name][1]}", 0.0) for name in memory.last._fields]
+    found += [
+        Number(f"last.{name}", commands[name][0], "", f"last {commands[name][1]}", 0.0) for name in memory.last._fields
+    ]
     return [*found, Number("before.u", "V", "", "voltage of the sample before the last", 0.0)]

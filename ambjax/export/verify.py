@@ -1,4 +1,4 @@
-"""The C held to JAX: it compiles without a warning, steps as JAX does, holds the rotor as JAX does, and tests itself."""
+"""The C held to JAX: it compiles without a warning, steps and holds the rotor as JAX does, and tests itself."""
 
 import dataclasses
 import pathlib
@@ -15,14 +15,15 @@ from ambjax.export.machine import EXACT, SANITIZED, STRICT, Compiled, build
 from ambjax.export.package import SHARE, ULPS, tolerance, written
 from ambjax.export.reference import Points, Results, points, results
 from ambjax.export.source import Origin
-from ambjax.export.trace import PRECISIONS, Trace, trace
+from ambjax.export.statements import PRECISIONS
+from ambjax.export.trace import Trace, trace
 
 # Random states and inputs of the comparison of one step, and seconds that a test program may take.
 COUNT, PATIENCE = 10_000, 60
 
 
 class Check(NamedTuple):
-    """One line of the table: what is looked at, in which precision, what was found, what is allowed, and whether it is."""
+    """One line of the table: what is looked at, in which precision, what was found and is allowed, whether it holds."""
 
     name: str
     precision: str
@@ -94,12 +95,14 @@ def _short(text: str) -> str:
 def _stepped(one: Draft, precision: str, machine: Compiled) -> Iterator[Check]:
     """One step from each point."""
     found, should, kind = machine.results(one.points), one.results, np.finfo(PRECISIONS[precision])
-    numbers = [(np.concatenate([x.state, x.outputs])) for x in (found, should)]
-    off = deviation(*numbers, float(kind.tiny))
+    is_, as_ = (np.concatenate([x.state, x.outputs]) for x in (found, should))
+    off = deviation(is_, as_, float(kind.tiny))
     worst = float(off.max(initial=0.0))
     share = tolerance(precision)[0]
-    units, allowed = worst / share * (ULPS if precision == "double" else SHARE), f"{ULPS} ULP" if precision == "double" else f"{SHARE:g}"
-    shown = f"{units:.3g} ULP" if precision == "double" else f"{units:.3g}"
+    if precision == "double":
+        shown, allowed = f"{worst / share * ULPS:.3g} ULP", f"{ULPS} ULP"
+    else:
+        shown, allowed = f"{worst:.3g}", f"{SHARE:g}"
     count = one.points.started.size
     yield Check("one step, numbers", precision, f"{shown} at {count:,} points", allowed, worst <= share)
     other = int(np.sum((found.bits != should.bits) | (found.started != should.started)))
@@ -116,7 +119,7 @@ def deviation(found: np.ndarray, should: np.ndarray, tiny: float) -> np.ndarray:
 
 def _looped(precision: str, found: loop.Beside) -> Iterator[Check]:
     told = f"{found.dz:.2g} m (rounding alone moves JAX's by {found.own:.2g} m)"
-    yield Check("closed loop, |dz|", precision, told, f"{found.allowed:.2g} m", found.dz <= found.allowed)
+    yield Check("closed loop, dz", precision, told, f"{found.allowed:.2g} m", found.dz <= found.allowed)
     told = f"{found.metric} off by {found.off:.2g}"
     yield Check("closed loop, metrics", precision, told, f"{found.off_allowed:.2g}", found.off <= found.off_allowed)
 
@@ -126,15 +129,22 @@ def table(checks: list[Check], case: str) -> str:
     rows = [f"| {x.name} | {x.precision} | {x.found} | {x.allowed} | {'holds' if x.ok else 'FAILS'} |" for x in checks]
     verdict = "All of it holds." if all(x.ok for x in checks) else "It does NOT hold."
     head = "| check | precision | found | allowed | verdict |\n|---|---|---|---|---|"
-    return f"# The controller of case '{case}' as C, held to JAX\n\n{verdict}\n\n{head}\n" + "\n".join(rows) + "\n\n" + TOLD
+    return (
+        f"# The controller of case '{case}' as C, held to JAX\n\n{verdict}\n\n{head}\n"
+        + "\n".join(rows)
+        + "\n\n"
+        + TOLD
+    )
 
 
-TOLD = f"""One step: states and inputs at random over decades, with zeros, limits, NaN and infinities, and the points next to where
-each comparison of the step turns, on both sides. The reference is JAX in the same precision, each primitive run alone:
-compiled as a whole, XLA rounds a product and a sum once where the C ({EXACT}) rounds twice. A number is off by a share
-of its own size; what underflows counts as 0.
+DOUBLE, FLOAT = loop.BARS["double"], loop.BARS["float"]
+TOLD = f"""One step: states and inputs at random over decades, with zeros, limits, NaN and infinities, and the points next
+to where each comparison of the step turns, on both sides. The reference is JAX in the same precision, each primitive
+run alone, with functions of math.h from there: compiled as a whole, XLA rounds a product and a sum once where the C
+({EXACT}) rounds twice. A number is off by a share of its own size; what underflows counts as 0.
 
 Closed loop: JAX's plant and sensors under the compiled C, beside the whole compiled by JAX in double precision, over
-the case's horizon. Allowed is a share of the gap ({loop.BARS["double"][0]:g} in double, {loop.BARS["float"][0]:g} in float) and of each metric ({loop.BARS["double"][1]:g}, {loop.BARS["float"][1]:g}),
-a sample for a time, and {loop.TIMES:g} times what one rounding unit of the gap at the start makes of JAX's own loop.
+the case's horizon. Allowed is a share of the gap ({DOUBLE[0]:g} in double, {FLOAT[0]:g} in float), of each metric
+({DOUBLE[1]:g}, {FLOAT[1]:g}), a sample for a time, and {loop.TIMES:g} times what one rounding unit of the gap
+at the start makes of JAX's own loop.
 """

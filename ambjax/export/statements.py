@@ -1,0 +1,109 @@
+"""A program as C statements, one a node."""
+
+import re
+from typing import Any
+
+import numpy as np
+
+from ambjax.export.emitter import Operand, Program, Ref
+from ambjax.export.primitives import OPS
+
+# Words that C or C++ keep for themselves and Python does not.
+RESERVED = {
+    *("auto", "bool", "case", "catch", "char", "const", "constexpr", "default", "delete", "do", "double", "enum"),
+    *("explicit", "export", "extern", "float", "friend", "goto", "inline", "int", "long", "mutable", "namespace"),
+    *("new", "operator", "private", "protected", "public", "register", "restrict", "short", "signed", "sizeof"),
+    *("static", "struct", "switch", "template", "this", "throw", "typedef", "typename", "union", "unsigned", "using"),
+    *("virtual", "void", "volatile"),
+}
+HELPERS = {
+    "max": "a > b || a != a ? a : b",
+    "min": "a < b || a != a ? a : b",
+    "sign": "a > 0 ? 1 : a < 0 ? -1 : a",
+}
+PERIOD = "SAMPLE_PERIOD"
+PRECISIONS = {"float": "float32", "double": "float64"}
+
+
+def word(name: str) -> str:
+    """A dotted name as C has it: none of its keywords, ASCII."""
+    parts = [part + "_" if part in RESERVED else part for part in name.split(".")]
+    return ".".join(re.sub(r"[^\x00-\x7f]", lambda found: f"_u{ord(found[0]):04x}", part) for part in parts)
+
+
+def literal(x: Any, precision: str) -> str:
+    """A number as a C constant of a precision: the shortest that reads back as it."""
+    suffix, kind = ("f", np.float32) if precision == "float" else ("", np.float64)
+    value = kind(x)
+    if np.isinf(value):
+        return ("-" if value < 0 else "") + ("HUGE_VALF" if suffix else "HUGE_VAL")
+    if np.isnan(value):
+        return "NAN" if suffix else "(double)NAN"
+    text = str(value)
+    return text + ("" if "." in text or "e" in text else ".0") + suffix
+
+
+class Statements:
+    """A program's nodes `order` as C in a precision, all names beginning with `prefix`."""
+
+    def __init__(self, program: Program, order: list[int], precision: str, prefix: str):
+        self.program, self.order, self.precision, self.prefix = program, order, precision, prefix
+        self.number = {n: k for k, n in enumerate(order)}
+        self.real = np.dtype(PRECISIONS[precision])
+
+    def operand(self, x: Operand) -> str:
+        """An operand as C text."""
+        if isinstance(x, Ref):
+            node = self.program.nodes[x.node]
+            if node.op != "input":
+                return f"v{self.number[x.node]}"
+            if node.text == PERIOD:
+                return f"{self.prefix}_{PERIOD}"
+            return f"({node.text} != 0u)" if node.dtype.kind == "b" else node.text
+        if x.dtype.kind == "b":
+            return str(int(x))
+        text = literal(x, "float" if x.dtype == np.float32 else "double")
+        return f"({text})" if text.startswith("-") else text
+
+    def kind(self, dtype: np.dtype) -> str:
+        """C type of a dtype."""
+        if dtype.kind == "b":
+            return "int"
+        return f"{self.prefix}_real" if dtype == self.real else "float"
+
+    def statement(self, number: int) -> str:
+        """One node as a declaration."""
+        node = self.program.nodes[number]
+        single = self.precision == "float" or any(self.program.dtype(x) == np.float32 for x in node.args)
+        text = OPS[node.op].c.format(
+            *map(self.operand, node.args),
+            name=self.prefix,
+            f="f" if single else "",
+            to=self.kind(node.dtype),
+            one=literal(1, "float" if node.dtype == np.float32 else "double"),
+            zero=literal(0, "float" if node.dtype == np.float32 else "double"),
+        )
+        return f"    const {self.kind(node.dtype)} v{self.number[number]} = {text};"
+
+    def body(self) -> list[str]:
+        """All statements, those of a law below its name."""
+        lines, law = [], ""
+        for number in self.order:
+            node = self.program.nodes[number]
+            if node.law != law:
+                law = node.law
+                lines.append(f"    /* {law or 'the cascade'} */")
+            lines.append(self.statement(number))
+        return lines
+
+    def helpers(self) -> list[str]:
+        """Functions that the step uses and C has not: as JAX has them, NaN included."""
+        used = {self.program.nodes[n].op for n in self.order}
+        real, lines = f"{self.prefix}_real", []
+        for name, text in HELPERS.items():
+            if name in used:
+                taken = f"{real} a" if name == "sign" else f"{real} a, {real} b"
+                for digit in ("0", "1"):
+                    text = re.sub(rf"(?<![\w.]){digit}(?![\w.])", literal(float(digit), self.precision), text)
+                lines += [f"static {real} {self.prefix}_{name}({taken})", "{", f"    return {text};", "}", ""]
+        return lines

@@ -1,0 +1,197 @@
+"""The emitter: every scalar primitive as C against JAX, calls, loops and branches, and what is refused by name."""
+
+import ctypes
+import shutil
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax import lax
+
+from ambjax.export.emitter import Program, Ref, traced
+from ambjax.export.primitives import OPS, SAME
+from ambjax.export.statements import PRECISIONS, Statements
+from ambjax.export.trace import precision
+
+UNARY = {
+    **{name: getattr(jnp, name) for name in ("exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "floor", "ceil")},
+    **{name: getattr(jnp, name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "arctan", "arcsin")},
+    **{name: getattr(jnp, name) for name in ("arccos", "arcsinh", "arccosh", "arctanh", "abs", "sign", "negative")},
+    **{name: getattr(lax, name) for name in ("erf", "erfc", "rsqrt", "logistic", "square")},
+    "round": lambda x: lax.round(x, lax.RoundingMethod.AWAY_FROM_ZERO),
+    "rint": lambda x: lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN),
+    "is_finite": lambda x: jnp.where(jnp.isfinite(x), x, -1.0),
+    "power -3": lambda x: x**-3,
+    "power 7": lambda x: x**7,
+    "clamp": lambda x: lax.clamp(-0.5, x, 2.0),
+    "not": lambda x: jnp.where(~(x > 1), 1.0, 2.0),
+    "flag": lambda x: 3.0 * (x > 0.5),
+    "truth": lambda x: jnp.where(x.astype(bool), 1.0, x),
+    "single": lambda x: x.astype(jnp.float32).astype(x.dtype),
+}
+BINARY = {
+    **{name: getattr(lax, name) for name in ("add", "sub", "mul", "div", "max", "min", "pow", "atan2", "rem")},
+    **{
+        name: lambda x, y, f=getattr(lax, name): jnp.where(f(x, y), x, 2 * y)
+        for name in ("eq", "ne", "lt", "le", "gt", "ge")
+    },
+    "and": lambda x, y: jnp.where((x > 0) & (y > 1), x, y),
+    "or": lambda x, y: jnp.where((x > 0) | (y > 1), x, y),
+    "xor": lambda x, y: jnp.where((x > 0) ^ (y > 1), x, y),
+}
+# Units in the last place by which XLA's own functions are off those of <math.h>; all others: 4.
+LOOSE = {"log1p": 128, "arctanh": 128, "sinh": 32, "cosh": 32, "tanh": 8, "expm1": 8, "erfc": 64}
+EDGES = [0.0, -0.0, 0.5, -0.5, 1.0, -1.0, 1.5, 2.5, 2.0, -2.0, 1e-9, 1e9, -1e9, 1e-30, np.inf, -np.inf, np.nan]
+
+
+def listed():
+    """All functions of two numbers, by name."""
+    return {**{k: lambda x, y, f=f: f(x) for k, f in UNARY.items()}, **BINARY}
+
+
+def compiled(function, to, folder, count):
+    """A function of two scalars that gives a tuple, as C: of rows of points."""
+    dtype, program = np.dtype(PRECISIONS[to]), Program()
+    with precision(to):
+        refs = [program.input(text, dtype) for text in ("x[0]", "x[1]")]
+        results = traced(program, function, (jnp.ones((), dtype), jnp.ones((), dtype)), refs)
+    order = sorted(n for n in program.needed(results) if program.nodes[n].op != "input")
+    text = Statements(program, order, to, "amb")
+    lines = ["#include <math.h>", f"typedef {to} amb_real;", *text.helpers()]
+    lines += ["void amb(const amb_real *x, amb_real *y) {", *text.body()]
+    lines += [f"    y[{k}] = {text.operand(x)};" for k, x in enumerate(results)] + ["}"]
+    (folder / "amb.c").write_text("\n".join(lines))
+    flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic", "-Werror"]
+    command = ["cc", *flags, "-ffp-contract=off", "-shared", "-fPIC", "amb.c", "-o", f"{to}.so", "-lm"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    library = ctypes.CDLL(str(folder / f"{to}.so"))
+
+    def run(x):
+        found = np.empty((len(x), count), dtype)
+        for point, row in zip(np.ascontiguousarray(x, dtype), found, strict=True):
+            library.amb(point.ctypes.data_as(ctypes.c_void_p), row.ctypes.data_as(ctypes.c_void_p))
+        return found
+
+    return run
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+@pytest.mark.parametrize("to", ["double", "float"])
+def test_every_primitive_against_jax(to, tmp_path):
+    functions, dtype = listed(), np.dtype(PRECISIONS[to])
+    run = compiled(lambda x, y: tuple(f(x, y) for f in functions.values()), to, tmp_path, len(functions))
+    random = np.random.default_rng(1)
+    x = random.choice([-1.0, 1.0], (1500, 2)) * 10.0 ** random.uniform(-3, 1.5, (1500, 2))
+    x = np.concatenate([x, [(a, b) for a in EDGES for b in EDGES]]).astype(dtype)
+    found = run(x)
+    with precision(to):
+        for k, (name, f) in enumerate(functions.items()):
+            with jax.disable_jit():
+                should = np.asarray(f(jnp.asarray(x[:, 0]), jnp.asarray(x[:, 1])))
+            with np.errstate(all="ignore"):
+                off = np.abs(found[:, k].astype(float) - should) / np.maximum(np.spacing(np.abs(should)), 1e-35)
+            wrong = ~(
+                (found[:, k] == should) | (np.isnan(found[:, k]) & np.isnan(should)) | (off <= LOOSE.get(name, 4))
+            )
+            at = np.flatnonzero(wrong)[:3]
+            assert not wrong.any(), (name, x[at], found[at, k], should[at])
+
+
+def test_no_primitive_is_untested():
+    program, one = Program(), np.ones(())
+    refs = [program.input(name, float) for name in "xy"]
+    traced(program, lambda x, y: tuple(f(x, y) for f in listed().values()), (one, one), refs)
+    assert {node.op for node in program.nodes} == {*OPS, "input"}
+
+
+# Trees of operations over two inputs and constants, as hypothesis makes them.
+LEAVES = st.sampled_from(["x", "y", 0.0, 1.0, -2.5, 3.0])
+OWN = jax.custom_jvp(lambda a, b: jnp.abs(a) - b)
+OWN.defjvp(lambda primals, tangents: (OWN(*primals), tangents[0]))
+OPERATIONS = {
+    "add": lax.add,
+    "sub": lax.sub,
+    "mul": lax.mul,
+    "div": lax.div,
+    "max": lax.max,
+    "min": lax.min,
+    "less": lambda a, b: jnp.where(a < b, a, b + 1),
+    "cond": lambda a, b: lax.cond(a > 0, lambda a, b: a + b, lambda a, b: a - 2 * b, a, b),
+    "loop": lambda a, b: lax.fori_loop(0, 3, lambda n, v: v * 0.5 + n * b, a),
+    "while": lambda a, b: lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] - b), (0, a))[1],
+    "call": jax.jit(lambda a, b: a * b + b),
+    "own": OWN,
+    "remat": jax.checkpoint(lambda a, b: a * a + b),
+}
+TREES = st.recursive(LEAVES, lambda t: st.tuples(st.sampled_from(list(OPERATIONS)), t, t), max_leaves=8)
+
+
+@settings(max_examples=40, deadline=None)
+@given(tree=TREES, x=st.floats(-1e3, 1e3), y=st.floats(-1e3, 1e3))
+def test_any_expression_is_what_jax_makes_of_it(tree, x, y):
+    def value(tree, x, y):
+        if not isinstance(tree, tuple):
+            return {"x": x, "y": y}.get(tree, jnp.asarray(tree) if not isinstance(tree, str) else None)
+        return OPERATIONS[tree[0]](*(value(branch, x, y) for branch in tree[1:]))
+
+    program, one = Program(), np.ones(())
+    refs = [program.input(name, float) for name in "xy"]
+    (result,) = traced(program, lambda x, y: jnp.asarray(value(tree, x, y)), (one, one), refs)
+    values = program.evaluate({0: np.asarray(x), 1: np.asarray(y)})
+    found = values[result.node] if isinstance(result, Ref) else result
+    with jax.disable_jit():
+        np.testing.assert_array_equal(found, np.asarray(value(tree, jnp.asarray(x), jnp.asarray(y))))
+
+
+def count(function, *shapes):
+    program = Program()
+    args = [jnp.zeros(shape) for shape in shapes]
+    results = traced(program, function, args, [program.input(f"x{n}", float) for n in range(len(args))])
+    return program, results, [program.nodes[n].op for n in sorted(program.needed(results)) if program.nodes[n].args]
+
+
+def test_equal_expressions_are_shared_and_constants_folded():
+    _, _, ops = count(lambda x, y: (x + y) * (y + x) + 1 / (x * y) + 2 / (y * x) + jnp.sqrt(4.0) * x, (), ())
+    assert sorted(ops) == sorted(["add", "mul", "mul", "div", "div", "mul", "add", "add", "add"])
+
+
+def test_what_nothing_reads_is_not_written():
+    program, results, ops = count(lambda x: (jnp.exp(x), x + 1)[1], ())
+    assert ops == ["add"]
+    assert {node.op for node in program.nodes} == {"input", "exp", "add"}
+    assert isinstance(results[0], Ref)
+
+
+REFUSED = {
+    "'broadcast_in_dim' on arrays": lambda x: lax.dot(jnp.ones(2), jnp.ones(2)) + x,
+    "'while' whose length depends on data": lambda x: lax.while_loop(lambda v: v < 10, lambda v: 2 * v, x),
+    "'lgamma'": lax.lgamma,
+    "from float64 to int64": lambda x: (x.astype(int) + 1).astype(float),
+    "'pure_callback'": lambda x: jax.pure_callback(np.sin, x, x),
+}
+
+
+@pytest.mark.parametrize("says", REFUSED)
+def test_what_is_no_scalar_arithmetic_is_refused_by_name(says):
+    def step(x):
+        with jax.named_scope("law:test.Mine"):
+            return REFUSED[says](x)
+
+    with pytest.raises(ValueError, match=r"test\.Mine: the primitive .*Write the law with real scalars") as error:
+        count(step, ())
+    assert says in str(error.value)
+
+
+def test_a_loop_too_long_is_refused():
+    with pytest.raises(ValueError, match="a loop too long to unroll"):
+        count(lambda x: lax.fori_loop(0, 30_000, lambda n, v: v * x + n, x), ())
+
+
+def test_what_passes_a_scalar_on_is_no_operation():
+    assert count(lambda x: lax.optimization_barrier(lax.stop_gradient(jnp.reshape(x, ()))) + 1, ())[2] == ["add"]
+    assert not set(SAME) & set(OPS)
