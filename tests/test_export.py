@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import Cascade, Clock, Plant, Scenario, Sensor, Sine
+from ambjax import RK4, Cascade, Clock, Plant, Scenario, Sensor, Sine
 from ambjax.__main__ import main
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.position import force_for, sliding_variable
@@ -92,9 +92,8 @@ CASCADES = {
     "super-twisting, the sign itself": hard(position=position.SuperTwisting(p=INF)),
     "a law of one's own": hard(position=Layered()),
 }
-# What the fast suite looks at in one precision each: between them every law, both discretisations, every number of
-# voltages on their way.
-FAST = ["double", "float", "float", "double", "float", "double", "float", "double"]
+# What the fast suite looks at; the slow one at all, in both precisions.
+FAST = [("one and a half", "double"), ("super-twisting, the sign itself", "float"), ("a law of one's own", "double")]
 
 
 def drafts(cascade, precisions=("float", "double"), count=10_000, u_max=200.0):
@@ -108,7 +107,7 @@ def failed(checks):
 
 
 @compiled
-@pytest.mark.parametrize(("name", "to"), list(zip(CASCADES, FAST, strict=True)))
+@pytest.mark.parametrize(("name", "to"), FAST)
 def test_one_step_is_jaxs(name, to):
     made = drafts(CASCADES[name], [to], 3000)
     checks = verify(made, None)
@@ -123,7 +122,7 @@ def test_one_step_is_jaxs(name, to):
 @compiled
 def test_the_loop_of_a_case_is_jaxs():
     scenario = Scenario(reference=Sine(2.5e-3, 2.0), sensor=Sensor(1e-6, 1e-4, 1e-4), u_max=200.0)
-    cascade, clock = hard(observer=observer.Direct()), Clock(200, PERIOD)
+    cascade, clock = hard(observer=observer.Direct()), Clock(200, PERIOD, RK4(1))
     checks = verify(drafts(cascade, count=100), loop.Case(cascade, scenario, clock, standard_for(0.005, scenario)))
     assert not failed(checks)
     assert [x.precision for x in checks if x.name == "closed loop, dz"] == ["float", "double"]
@@ -162,11 +161,12 @@ def test_every_number_is_symbolic_and_declared():
     assert "/* test_export.Layered */" in source
     # nothing of the model is folded: the constants are the laws' own, and small whole numbers
     numbers = {float(x) for x in re.findall(r"(?<![\w.])(\d+\.?\d*(?:e[+-]?\d+)?)f", source)}
-    assert not numbers & {0.588, 754.0, 1480.0, 0.121, 5e-3, 41.44, 9.81}
+    assert not numbers & {0.588, 754.0, 1480.0, 0.121, 41.44, 9.81}
 
 
 def test_float_is_float_throughout():
     source = text(cascade=CASCADES["the paper's"], to="float")["amb.c"]
+    source = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
     assert not re.search(r"\b\d+\.\d+(e[+-]?\d+)?\b(?!f)", source)
     assert "double" not in source
     assert not re.search(r"\b(sqrt|fabs)\(", source)
@@ -190,7 +190,7 @@ def test_the_papers_cascade_costs_less_than_150_flops():
 @compiled
 def test_the_stack_is_within_what_the_header_says(tmp_path):
     for to in ("float", "double"):
-        made = text(cascade=CASCADES["the paper's"], to=to)
+        made = text(to=to)
         for name, content in made.items():
             (tmp_path / name).write_text(content)
         subprocess.run(["cc", "-std=c99", "-O0", "-fstack-usage", "-c", "amb.c"], cwd=tmp_path, check=True)
@@ -283,7 +283,7 @@ def test_a_law_that_is_no_scalar_code_is_named():
 def test_the_readings_cascades(reading):
     cascade = dataclasses.replace(readings.cascade(reading), processor=Processor(1.0))
     scenario = readings.scenario("tracking", reading)
-    case = loop.Case(cascade, scenario, Clock(5000, PERIOD), standard_for(0.1, scenario))
+    case = loop.Case(cascade, scenario, Clock(5000, PERIOD, RK4(3)), standard_for(0.1, scenario))
     assert not failed(verify(drafts(cascade, u_max=scenario.u_max), case))
 
 
@@ -293,7 +293,7 @@ def test_the_readings_cascades(reading):
 def test_all_of_it(name):
     cascade = CASCADES[name]
     scenario = Scenario(reference=Sine(1e-3, 2.0), sensor=Sensor(1e-6, 1e-4, 1e-4), u_max=200.0)
-    case = loop.Case(cascade, scenario, Clock(1000, PERIOD), standard_for(0.02, scenario))
+    case = loop.Case(cascade, scenario, Clock(1000, PERIOD, RK4(3)), standard_for(0.02, scenario))
     assert not failed(verify(drafts(cascade), case))
 
 

@@ -15,14 +15,15 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
 from ambjax.export.controller import BITS, INPUTS
+from ambjax.export.emitter import Ref
 from ambjax.export.primitives import CALLS, OPS, SAME
 from ambjax.export.statements import PRECISIONS
 from ambjax.export.trace import Trace, arguments, precision
 
 # Decades about what matters; the chance of an edge in a number, and that a point is a first step.
-DECADES, EDGY, FIRST = (-5.0, 0.6), 0.02, 0.05
-# Random points between which borders are sought.
-POOL = 4000
+DECADES, EDGY, FIRST = (-7.0, 0.5), 0.02, 0.05
+# Random points between which borders are sought; draws per point; share of points within the supply's limit, if found.
+POOL, DRAWS, CALM = 3000, 4, 0.4
 # Pairs of points to either side of a border that are sought for each comparison, and halvings on the way there.
 PAIRS, HALVINGS = 4, 64
 
@@ -47,15 +48,30 @@ class Results(NamedTuple):
 def points(trace: Trace, count: int, seed: int = 0) -> Points:
     """Random states and inputs over decades about what matters, edges, and both sides of every border of the step."""
     random, dtype = np.random.default_rng(seed), PRECISIONS[trace.precision]
-    begun, pool = len(trace.state), max(count, POOL)
-    x = _drawn(trace, random, pool).astype(dtype)
-    started = random.random(pool) >= FIRST
+    x = _drawn(trace, random, max(DRAWS * count, POOL)).astype(dtype)
+    started = random.random(x.shape[1]) >= FIRST
     borders = _borders(trace, x[:, started & np.isfinite(x).all(axis=0)][:, :POOL])
+    borders = borders[:, _seen(trace, borders)[1]]
     borders = borders[:, random.permutation(borders.shape[1])[: count // 2]]
-    plain = count - borders.shape[1]
-    x = np.concatenate([x[:, :plain], borders], axis=1)
-    started = np.concatenate([started[:plain], np.ones(borders.shape[1], bool)])
-    return Points(x[:begun], started, x[begun:])
+    # far states ask for more than the supply has: of those that do not, more
+    far, normal = _seen(trace, x)
+    calm = np.flatnonzero(started & normal & ~far)[: int(CALM * count)]
+    rest = np.setdiff1d(np.flatnonzero(normal), calm)[: count - calm.size - borders.shape[1]]
+    chosen = np.concatenate([calm, rest])
+    x = np.concatenate([x[:, chosen], borders], axis=1)
+    started = np.concatenate([started[chosen], np.ones(borders.shape[1], bool)])
+    return Points(x[: len(trace.state)], started, x[len(trace.state) :])
+
+
+def _seen(trace: Trace, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of started states and inputs: whether the voltage is at its limit or held, and whether no number on the way is so
+    small that it lost digits (JAX takes those for 0 on CPUs, C does not)."""
+    values, normal = evaluated(trace, x), np.ones(x.shape[1], bool)
+    for value in values:
+        if value.dtype.kind == "f":
+            normal &= (value == 0) | ~(np.abs(value) < np.finfo(value.dtype).tiny)
+    far = [values[bit.node] if isinstance(bit, Ref) else np.full(x.shape[1], bit) for _, bit in trace.bits[:2]]
+    return np.any(far, axis=0), normal
 
 
 def _drawn(trace: Trace, random: np.random.Generator, count: int) -> np.ndarray:

@@ -59,9 +59,14 @@ class Writer:
         """The step as a function."""
         p, trace = self.prefix, self.trace
         lines = [self.signature("step"), "{", "    uint32_t status = 0u;", *self.text.body()]
-        lines += [f"    state->{word(x.name)} = {self.text.operand(after)};" for x, after in trace.state]
+        given = [(f"state->{word(x.name)}", self.text.operand(after)) for x, after in trace.state]
+        given += [(f"output->{word(x.name)}", self.text.operand(value)) for x, value in trace.outputs]
+        # what is read of the state is read before it is written
+        read = dict.fromkeys(value for _, value in given if value.startswith("state->"))
+        old = {value: f"old{k}" for k, value in enumerate(read)}
+        lines += [f"    const {p}_real {name} = {value};" for value, name in old.items()]
+        lines += [f"    {name} = {old.get(value, value)};" for name, value in given]
         lines += [f"    state->started = {self.text.operand(trace.started)} ? 1u : 0u;"]
-        lines += [f"    output->{word(x.name)} = {self.text.operand(value)};" for x, value in trace.outputs]
         for name, value in trace.bits:
             lines += [f"    if ({self.text.operand(value)}) {{", f"        status |= {p}_{name.upper()};", "    }"]
         return "\n".join([*lines, "    return status;", "}"])

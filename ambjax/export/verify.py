@@ -138,10 +138,11 @@ def table(checks: list[Check], case: str) -> str:
 
 
 DOUBLE, FLOAT = loop.BARS["double"], loop.BARS["float"]
-TOLD = f"""One step: states and inputs at random over decades, with zeros, limits, NaN and infinities, and the points next
-to where each comparison of the step turns, on both sides. The reference is JAX in the same precision, each primitive
+TOLD = f"""One step: states and inputs at random over decades, with zeros, limits, NaN and infinities, and the points
+next to where each comparison of the step turns, on both sides. The reference is JAX in the same precision, each primitive
 run alone, with functions of math.h from there: compiled as a whole, XLA rounds a product and a sum once where the C
-({EXACT}) rounds twice. A number is off by a share of its own size; what underflows counts as 0.
+({EXACT}) rounds twice. A number is off by a share of its own size. Points at which a number on the way is
+subnormal are left out: XLA takes it for 0.
 
 Closed loop: JAX's plant and sensors under the compiled C, beside the whole compiled by JAX in double precision, over
 the case's horizon. Allowed is a share of the gap ({DOUBLE[0]:g} in double, {FLOAT[0]:g} in float), of each metric
