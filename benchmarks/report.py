@@ -32,6 +32,7 @@ the search, CMA-ES and Nelder-Mead were run on another day, beside other work: t
     .venv/bin/python benchmarks/tasks.py             # the five tuning tasks
     .venv/bin/python benchmarks/sampled_tasks.py     # those on a processor
     .venv/bin/python benchmarks/search.py            # their search against derivative-free ones
+    .venv/bin/python benchmarks/export.py            # a step of an exported controller, here and on a Cortex-M4F
     .venv/bin/python benchmarks/report.py
 """
 
@@ -271,6 +272,24 @@ def gpu() -> list[str]:
     return lines + table("precision | noise | members | run as | member-steps/s", rows)
 
 
+def export() -> list[str]:
+    data = load("export")
+    lines = ["## A step of the exported controller (`export.py`)", "", facts(data["machine"])]
+    lines += [
+        "Cycles of the time stamp counter, median; on a Cortex-M4F instructions that QEMU counts, code and stack.",
+        "",
+    ]
+    rows = []
+    for r in data["rows"]:
+        there = [f"{r[key]:,}" if key in r else "" for key in ("instructions", "code_bytes", "stack_bytes")]
+        work = [str(r[key]) for key in ("flops", "divisions", "roots")]
+        rows.append([r["case"], r["precision"], *work, f"{r['cycles']:.0f}", f"{r['ns']:.0f}", *there])
+    titles = (
+        "laws | precision | flops | divisions | roots | cycles | ns | instructions, M4F | code (bytes) | stack (bytes)"
+    )
+    return lines + table(titles, rows)
+
+
 SECTIONS = {
     "single": single,
     "work_precision": work_precision,
@@ -284,6 +303,7 @@ SECTIONS = {
     "sampled_tasks": sampled_tasks,
     "search": search,
     "gpu": gpu,
+    "export": export,
 }
 
 

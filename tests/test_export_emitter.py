@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax import lax
 
-from ambjax.export.emitter import Program, Ref, traced
+from ambjax.export.emitter import traced
 from ambjax.export.primitives import OPS, SAME
+from ambjax.export.program import Program, Ref
 from ambjax.export.statements import PRECISIONS, Statements
 from ambjax.export.trace import precision
 

@@ -104,6 +104,14 @@ def test_states_rates_and_scales_have_one_structure(stage, law):
 
 
 @TABLE
+def test_states_have_names(stage, law):
+    state = start(stage, law)
+    named = answers.memory(law, state)
+    assert len(named) == len(jax.tree.leaves(state))
+    assert all(name.isidentifier() and unit and meaning for name, unit, meaning in named)
+
+
+@TABLE
 def test_slope_is_what_it_says(stage, law):
     slope = law.slope(MODEL)
     assert np.isfinite(slope)

@@ -13,8 +13,8 @@ ROOT = pathlib.Path(__file__).parent.parent
 # Floors from the ground up: a folder of a package, or a module beside such folders, stands on those before it.
 # An import points to an earlier one, or stays within its own without a cycle.
 FLOORS = {
-    "ambjax": "_version numerics host world control simulation extend export theorem ensemble paper pictures cases commands "
-    "__init__ __main__",
+    "ambjax": "_version numerics host world control simulation extend export theorem ensemble paper pictures cases "
+    "commands __init__ __main__",
     "tuning": "space optimisers objective config problem judge search report command __init__ __main__",
 }
 # Folders and modules that may import matplotlib: those that draw.

@@ -1,131 +1,22 @@
-"""A trace of JAX as straight-line scalar code: calls inlined, loops unrolled, equal expressions shared.
+"""A trace of JAX as straight-line scalar code: calls inlined, loops unrolled, branches as choices.
 
-`Program` holds one node an operation. A node that nothing reads is not written; a constant is a NumPy scalar, and what
-depends on constants alone is one. The order of operations is the trace's, so that C compiled without contraction
-rounds as JAX does operation by operation.
+The order of operations is the trace's, so that C compiled without contraction rounds as JAX does operation by
+operation.
 """
 
 import re
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from ambjax.export.primitives import CALLS, OPS, SAME
+from ambjax.export.program import Operand, Program, Ref, of
 
-# Statements of a program; what has more was unrolled from a loop that belongs in no control step.
-MOST = 20_000
 LOOPS = ("scan", "while")
 COMPOSED = ("rsqrt", "exp2", "logistic")
-
-
-class Ref(NamedTuple):
-    """Operand: the node of this number."""
-
-    node: int
-
-
-Operand = Any  # Ref, or a NumPy scalar
-
-
-class Node(NamedTuple):
-    """One operation: of OPS, or `input` with the C text that reads it; dtype and the law that it is of."""
-
-    op: str
-    args: tuple[Operand, ...]
-    dtype: np.dtype
-    law: str = ""
-    text: str = ""
-
-
-class Program:
-    """Nodes in order of computation."""
-
-    def __init__(self) -> None:
-        self.nodes: list[Node] = []
-        self._known: dict[Any, Ref] = {}
-
-    def input(self, text: str, dtype: Any) -> Ref:
-        """A node that reads C text."""
-        self.nodes.append(Node("input", (), np.dtype(dtype), text=text))
-        return Ref(len(self.nodes) - 1)
-
-    def dtype(self, x: Operand) -> np.dtype:
-        """Dtype of an operand."""
-        return self.nodes[x.node].dtype if isinstance(x, Ref) else x.dtype
-
-    def apply(self, op: str, args: Sequence[Operand], dtype: Any, law: str) -> Operand:
-        """The value of an operation: a constant, a node that is there already, or a new one."""
-        dtype, args = np.dtype(dtype), tuple(args)
-        if (known := _simpler(op, args)) is not None:
-            return known
-        if not any(isinstance(x, Ref) for x in args):
-            with np.errstate(all="ignore"):
-                return np.asarray(OPS[op].numpy(*args)).astype(dtype)[()]
-        order = sorted(map(_key, args)) if OPS[op].commutes else list(map(_key, args))
-        key = (op, dtype, *order)
-        if key not in self._known:
-            if len(self.nodes) >= MOST:
-                raise ValueError(f"{_of(law)}the step has more than {MOST:,} operations: a loop too long to unroll.")
-            self.nodes.append(Node(op, args, dtype, law))
-            self._known[key] = Ref(len(self.nodes) - 1)
-        return self._known[key]
-
-    def needed(self, outputs: Sequence[Operand]) -> set[int]:
-        """Numbers of the nodes on which these depend."""
-        seen: set[int] = set()
-        stack = [x.node for x in outputs if isinstance(x, Ref)]
-        while stack:
-            if (node := stack.pop()) not in seen:
-                seen.add(node)
-                stack += [x.node for x in self.nodes[node].args if isinstance(x, Ref)]
-        return seen
-
-    def evaluate(self, inputs: dict[int, Any]) -> list[Any]:
-        """Value of every node by NumPy, given those of input nodes: arrays of one shape."""
-        values: list[Any] = []
-        with np.errstate(all="ignore"):
-            for number, node in enumerate(self.nodes):
-                args = [values[x.node] if isinstance(x, Ref) else x for x in node.args]
-                value = inputs[number] if node.op == "input" else OPS[node.op].numpy(*args)
-                values.append(np.asarray(value).astype(node.dtype))
-        return values
-
-
-def _key(x: Operand) -> tuple[str, str]:
-    """What makes two operands the same: the bits of a constant, -0 being another than 0."""
-    return ("node", f"{x.node:06}") if isinstance(x, Ref) else (x.dtype.str, x.tobytes().hex())
-
-
-def _is(x: Operand, value: float) -> bool:
-    return not isinstance(x, Ref) and bool(x == value)
-
-
-def _simpler(op: str, args: tuple[Operand, ...]) -> Operand | None:
-    """The operand that an operation gives back as it is, if it does."""
-    if op in ("add", "mul"):
-        neutral = 0.0 if op == "add" else 1.0
-        for one, other in (args, args[::-1]):
-            if _is(other, neutral) and isinstance(one, Ref):
-                return one
-    if (op == "sub" and _is(args[1], 0.0)) or (op == "div" and _is(args[1], 1.0)):
-        return args[0]
-    if op == "select":
-        if not isinstance(args[0], Ref):
-            return args[1] if args[0] else args[2]
-        if _key(args[1]) == _key(args[2]):
-            return args[1]
-    if op in ("and", "or"):
-        for one, other in (args, args[::-1]):
-            if not isinstance(other, Ref):
-                return one if bool(other) == (op == "and") else other
-    return None
-
-
-def _of(law: str) -> str:
-    return f"{law}: " if law else ""
 
 
 def traced(
@@ -146,7 +37,7 @@ class _Reader:
     def closed(self, closed: ClosedJaxpr, operands: list[Operand], law: str) -> list[Operand]:
         for const in closed.consts:
             if np.shape(const) != ():
-                raise ValueError(f"{_of(law)}a constant of shape {np.shape(const)}: only scalars can be exported.")
+                raise ValueError(f"{of(law)}a constant of shape {np.shape(const)}: only scalars can be exported.")
         return self.jaxpr(closed.jaxpr, [np.asarray(x)[()] for x in closed.consts], operands, law)
 
     def jaxpr(self, jaxpr: Jaxpr, consts: list[Operand], operands: list[Operand], law: str) -> list[Operand]:

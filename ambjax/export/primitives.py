@@ -13,7 +13,7 @@ import numpy as np
 class Op(NamedTuple):
     """C text; NumPy's twin; what it is counted as; whether operands commute, and whether the result is a bool."""
 
-    c: str
+    text: str
     numpy: Callable[..., Any]
     cost: str = "call"
     commutes: bool = False

@@ -15,8 +15,8 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
 from ambjax.export.controller import BITS, INPUTS
-from ambjax.export.emitter import Ref
 from ambjax.export.primitives import CALLS, OPS, SAME
+from ambjax.export.program import Ref
 from ambjax.export.statements import PRECISIONS
 from ambjax.export.trace import Trace, arguments, precision
 
@@ -203,7 +203,7 @@ def _one(eqn: Any, args: list[Any], count: int) -> list[Any]:
             carry = one_by_one(params["body_jaxpr"], fixed + carry, count)
         return carry
     if name in OPS and OPS[name].cost == "call":
-        return [_of_library(OPS[name].c.partition("{f}")[0], args, np.dtype(eqn.outvars[0].aval.dtype), count)]
+        return [_of_library(OPS[name].text.partition("{f}")[0], args, np.dtype(eqn.outvars[0].aval.dtype), count)]
     rows = [jnp.broadcast_to(jnp.asarray(x, v.aval.dtype), (count,)) for x, v in zip(args, eqn.invars, strict=True)]
     return [eqn.primitive.bind(*rows, **params)]
 

@@ -128,8 +128,6 @@ class Writer:
         """The header's own words: cascade, order of work, cost."""
         t, counts = self.trace, self.trace.counts()
         size = 4 if t.precision == "float" else 8
-        reals = len(t.state)
-        kept = -(-(reals * size + 4) // size) * size
         order = "\n".join(order_of_work(t)).splitlines()
         cost = ", ".join(f"{counts[name]} {words}" for name, words in COSTS.items() if counts[name])
         stack = len(self.text.order) * size + SLACK
@@ -139,7 +137,7 @@ class Writer:
             *order,
             "",
             f"A step: {t.flops()} flops. {cost}.",
-            f"State: {kept} bytes. Stack: at most {stack} bytes, were every intermediate kept.",
+            f"State: {t.state_bytes()} bytes. Stack: at most {stack} bytes, were every intermediate kept.",
             "Compile with -ffp-contract=off: a fused product rounds once where the simulator rounds twice.",
         ]
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.export.emitter import Operand, Program, Ref
 from ambjax.export.primitives import OPS
+from ambjax.export.program import Operand, Program, Ref
 
 # Words that C or C++ keep for themselves and Python does not.
 RESERVED = {
@@ -75,7 +75,7 @@ class Statements:
         """One node as a declaration."""
         node = self.program.nodes[number]
         single = self.precision == "float" or any(self.program.dtype(x) == np.float32 for x in node.args)
-        text = OPS[node.op].c.format(
+        text = OPS[node.op].text.format(
             *map(self.operand, node.args),
             name=self.prefix,
             f="f" if single else "",

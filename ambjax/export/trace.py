@@ -11,8 +11,9 @@ import numpy as np
 from ambjax.control import answers
 from ambjax.control.cascade import CascadeState
 from ambjax.export.controller import BITS, INPUTS, OUTPUTS, Controller, Inputs, Number, parameters_of
-from ambjax.export.emitter import Operand, Program, Ref, traced
+from ambjax.export.emitter import traced
 from ambjax.export.primitives import COUNTED, OPS
+from ambjax.export.program import Operand, Program, Ref
 from ambjax.export.statements import PERIOD, PRECISIONS, word
 from ambjax.numerics.records import canonical
 
@@ -72,6 +73,11 @@ class Trace:
             else:
                 found[OPS[nodes[n].op].cost] += 1
         return found
+
+    def state_bytes(self) -> int:
+        """Size of the state struct: its numbers, and whether it was started, aligned."""
+        size = np.dtype(PRECISIONS[self.precision]).itemsize
+        return (len(self.state) + 1) * size
 
     def flops(self) -> int:
         """Additions, multiplications, divisions, roots and function calls."""

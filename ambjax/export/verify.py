@@ -139,7 +139,7 @@ def table(checks: list[Check], case: str) -> str:
 
 DOUBLE, FLOAT = loop.BARS["double"], loop.BARS["float"]
 TOLD = f"""One step: states and inputs at random over decades, with zeros, limits, NaN and infinities, and the points
-next to where each comparison of the step turns, on both sides. The reference is JAX in the same precision, each primitive
+next to where each comparison of the step turns, on both sides. The reference is JAX in that precision, each primitive
 run alone, with functions of math.h from there: compiled as a whole, XLA rounds a product and a sum once where the C
 ({EXACT}) rounds twice. A number is off by a share of its own size. Points at which a number on the way is
 subnormal are left out: XLA takes it for 0.

@@ -1,0 +1,38 @@
+"""The C on a Cortex-M4F under QEMU: the test program, and code that fits a small processor."""
+
+import pathlib
+import sys
+
+import pytest
+from test_export import CASCADES, text
+
+sys.path.append(str(pathlib.Path(__file__).parents[1] / "benchmarks"))
+import cortex
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(cortex.missing()), reason=cortex.missing() or "-")]
+
+
+@pytest.mark.parametrize("name", CASCADES)
+@pytest.mark.parametrize("to", ["float", "double"])
+def test_the_vectors_on_a_small_processor(name, to, tmp_path):
+    for file, content in text(cascade=CASCADES[name], to=to).items():
+        (tmp_path / file).write_text(content)
+    code, said = cortex.run([tmp_path / "amb.c", tmp_path / "amb_test.c"], tmp_path)
+    assert "100 of 100 steps as JAX makes them, 0 faults" in said
+    assert code == 0
+
+
+def test_a_vector_that_is_off_is_seen_there(tmp_path):
+    for file, content in text(to="float").items():
+        (tmp_path / file).write_text(content.replace(".output.i_ref = ", ".output.i_ref = 1.0f + ", 3))
+    code, said = cortex.run([tmp_path / "amb.c", tmp_path / "amb_test.c"], tmp_path)
+    assert "97 of 100 steps" in said
+    assert code == 1
+
+
+def test_the_code_is_some_kilobytes(tmp_path):
+    for file, content in text(to="float").items():
+        (tmp_path / file).write_text(content)
+    code, stack = cortex.size(tmp_path / "amb.c")
+    assert code < 4096
+    assert stack < 512
