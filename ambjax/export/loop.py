@@ -104,7 +104,8 @@ class Beside(NamedTuple):
 
 # What is allowed of dz as a share of the gap, and of a metric, beside TIMES what rounding does to JAX's own loop.
 BARS = {"double": (1e-9, 1e-9), "float": (1e-5, 1e-2)}
-TIMES = 10.0
+# And rounding units of what the quantity amounts to, for a metric that is near 0.
+TIMES, ROUNDINGS = 10.0, 100.0
 run_jit = jax.jit(run, static_argnames=("every",))
 
 
@@ -129,34 +130,33 @@ def beside(case: Case, machines: dict[str, Compiled]) -> dict[str, Beside]:
         nudged = dataclasses.replace(scenario, initial=moved)
         own = _loop(system_of(case.cascade, nudged, case.clock), case)
         looped = _loop(Looped(ClosedLoop(given.loop.cascade, scenario), given.period, which, host), case)
-        found[precision] = _compared(reference, own, looped, precision, gap, float(case.clock.sample_period))
+        period = float(case.clock.sample_period)
+        found[precision] = _compared(reference, own, looped, precision, scenario.plant, period)
     return found
 
 
-def _compared(reference: Loop, own: Loop, looped: Loop, precision: str, gap: float, period: float) -> Beside:
-    share, metric_share = BARS[precision]
+def _compared(reference: Loop, own: Loop, looped: Loop, precision: str, plant: Any, period: float) -> Beside:
+    gap_share, share = BARS[precision]
     moved, dz = (float(np.abs(x.z - reference.z).max()) for x in (own, looped))
-    worst = max(reference.metrics, key=lambda name: _excess(name, reference, own, looped, metric_share, period))
-    is_, should, self_ = (x.metrics[worst] for x in (looped, reference, own))
-    allowed = _allowed(worst, should, self_, metric_share, period)
-    return Beside(dz, share * gap + TIMES * moved, moved, worst, _off(is_, should), allowed)
+    rounding = ROUNDINGS * float(np.finfo(PRECISIONS[precision]).eps)
+    off, allowed = {}, {}
+    for name, should in reference.metrics.items():
+        size = abs(should) if np.isfinite(should) else 0.0
+        free = period if name.endswith("_s") else rounding * _amount(name, plant)
+        allowed[name] = share * size + TIMES * _off(own.metrics[name], should) + free
+        off[name] = _off(looped.metrics[name], should)
+    worst = max(off, key=lambda name: off[name] / allowed[name] if allowed[name] > 0 else np.inf * bool(off[name]))
+    return Beside(dz, gap_share * float(plant.s_0) + TIMES * moved, moved, worst, off[worst], allowed[worst])
+
+
+def _amount(name: str, plant: Any) -> float:
+    """What a metric's quantity amounts to, by its unit: a metric near 0 is what rounding left of that."""
+    sizes = {"_A2_per_m2": plant.v_size, "_m_per_s": plant.sigma_size, "_m": plant.s_0, "_A": plant.i_0}
+    return next((float(size) for unit, size in sizes.items() if name.endswith(unit)), 0.0)
 
 
 def _off(a: float, b: float) -> float:
     return 0.0 if a == b else abs(a - b)
-
-
-def _allowed(name: str, should: float, own: float, share: float, period: float) -> float:
-    """What a metric may be off; of a time, a sample."""
-    moved = _off(own, should)
-    size = abs(should) if np.isfinite(should) else 0.0
-    return share * size + TIMES * moved + (period if name.endswith("_s") else 0.0)
-
-
-def _excess(name: str, reference: Loop, own: Loop, looped: Loop, share: float, period: float) -> float:
-    should = reference.metrics[name]
-    off, allowed = _off(looped.metrics[name], should), _allowed(name, should, own.metrics[name], share, period)
-    return off / allowed if allowed > 0 else (np.inf if off > 0 else 0.0)
 
 
 def _loop(system: Any, case: Case) -> Loop:
