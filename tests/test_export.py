@@ -91,9 +91,15 @@ CASCADES = {
     ),
     "super-twisting, the sign itself": hard(position=position.SuperTwisting(p=INF)),
     "a law of one's own": hard(position=Layered()),
+    "Kalman": hard(observer=observer.Kalman()),
+    "a difference": hard(observer=observer.Difference(), inversion=inversion.ClosedForm()),
+    "a differentiator": hard(observer=observer.IRED1(), processor=Processor(0.5)),
+    "a differentiator of order 2": hard(observer=observer.IRED2()),
+    "a differentiator, explicit": hard(observer=observer.IRED2(), processor=Processor(2.0, implicit=False)),
 }
 # What the fast suite looks at; the slow one at all, in both precisions.
 FAST = [("one and a half", "double"), ("super-twisting, the sign itself", "float"), ("a law of one's own", "double")]
+FAST += [("Kalman", "float")]
 
 
 def drafts(cascade, precisions=("float", "double"), count=10_000, u_max=200.0):

@@ -11,6 +11,13 @@ from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
 
+# States of a differentiator.
+DERIVATIVES = (
+    ("z", "m", "position after the last sample"),
+    ("z_dot", "m/s", "its rate"),
+    ("z_ddot", "m/s^2", "its second derivative"),
+)
+
 
 @record
 class Direct:
@@ -73,6 +80,7 @@ class Difference:
 
     w: Scalar = gain(default=2000.0, unit="1/s", doc="corner of the low-pass on the differenced position")
     estimates_velocity: ClassVar[bool] = True
+    memory = (("z_f", "m", "position through the low-pass"),)
 
     def init(self, model: Plant, measured: Measurement) -> Array:
         return jnp.asarray(measured.z)
@@ -119,6 +127,12 @@ class Kalman:
 
     w: Scalar = gain(default=800.0, unit="1/s", doc="three equal poles of the estimation error")
     estimates_velocity: ClassVar[bool] = True
+    memory = (
+        ("z", "m", "position estimated for this sample from those before"),
+        ("z_dot", "m/s", "velocity, likewise"),
+        ("d", "m/s^2", "disturbance, likewise"),
+        ("z_ddot", "m/s^2", "the model's acceleration at the last sample"),
+    )
 
     def init(self, model: Plant, measured: Measurement) -> Predicted:
         zero = jnp.zeros(())
@@ -171,6 +185,7 @@ class IRED1:
 
     L: Scalar = gain(default=50.0, unit="m/s^2", doc="bound on the acceleration")
     estimates_velocity: ClassVar[bool] = True
+    memory = DERIVATIVES[:2]
 
     def init(self, model: Plant, measured: Measurement) -> tuple[Array, ...]:
         return jnp.asarray(measured.z), jnp.zeros(())
@@ -202,6 +217,7 @@ class IRED2:
 
     L: Scalar = gain(default=3e4, unit="m/s^3", doc="bound on the rate of the acceleration")
     estimates_velocity: ClassVar[bool] = True
+    memory = DERIVATIVES
 
     def init(self, model: Plant, measured: Measurement) -> tuple[Array, ...]:
         return jnp.asarray(measured.z), jnp.zeros(()), jnp.zeros(())

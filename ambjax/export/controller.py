@@ -144,7 +144,7 @@ class Controller:
         good = functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
         laws = choose(memory.started, memory.laws, cascade.init(measured))
         system = Sampled(ClosedLoop(cascade, Scenario(u_max=limits.u_max)), period)
-        state = SampledState((), laws, memory.last, (memory.before, memory.before), jnp.ones(()))
+        state = SampledState((), laws, memory.last, (memory.before, memory.before), jnp.ones(()), (), ())
         after = system.decided(measured, Reference(*inputs[3:]), state)
         last = choose(good, after.command, memory.last)
         kept = Memory(choose(good, after.control, memory.laws), last, after.past[0], memory.started | good)

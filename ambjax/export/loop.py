@@ -77,8 +77,8 @@ class Looped(Sampled):
         command = Command(**answer, i_ref_dot=jnp.zeros(()))
         faulty = rest[1].astype(int) & sum(FAULTS) != 0
         after: Any = Kept(numbers, rest[0], kept.faults + faulty)
-        past = (state.command.u, state.past[0])
-        return SampledState(state.plant, after, command, past, jnp.where(faulty, 0.0, state.sane))
+        past, sane = (state.command.u, state.past[0]), jnp.where(faulty, 0.0, state.sane)
+        return state._replace(control=after, command=command, past=past, sane=sane)
 
 
 class Loop(NamedTuple):
