@@ -31,16 +31,16 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     prefix = _prefix(args.prefix, case.name)
     if args.verify:
         machine.compiler()
-    say_doubts(case, args.case)
     digest = hashlib.sha256(pathlib.Path(args.case).read_bytes()).hexdigest()
     origin = Origin(case.name, digest, package.described(controller))
-    if not args.verify:
-        texts, checks = package.files(controller, args.precision, prefix, origin), []
-    else:
-        texts, checks = _verified(case, controller, args.precision, prefix, origin)
     out = directory(args.out, f"export-{case.name}")
-    ok = all(x.ok for x in checks) if checks else None
+    say_doubts(case, args.case)
     with files(out) as part:
+        if args.verify:
+            texts, checks = _verified(case, controller, args.precision, prefix, origin)
+        else:
+            texts, checks = package.files(controller, args.precision, prefix, origin), []
+        ok = all(x.ok for x in checks) if checks else None
         for name, text in texts.items():
             (part / name).write_text(text, encoding="utf-8")
         if checks:

@@ -146,6 +146,7 @@ subnormal are left out: XLA takes it for 0.
 
 Closed loop: JAX's plant and sensors under the compiled C, beside the whole compiled by JAX in double precision, over
 the case's horizon. Allowed is a share of the gap ({DOUBLE[0]:g} in double, {FLOAT[0]:g} in float), of each metric
-({DOUBLE[1]:g}, {FLOAT[1]:g}), a sample for a time, {loop.ROUNDINGS:g} rounding units of the gap and
-its like, and {loop.TIMES:g} times what one rounding unit of the gap at the start makes of JAX's own loop.
+({DOUBLE[1]:g}, {FLOAT[1]:g}), a sample for a time, and {loop.TIMES:g} times what some rounding units of the gap at
+the start make of JAX's own loop: signs and converters multiply rounding. A metric near 0 may be off by
+{loop.ROUNDINGS:g} rounding units of what its quantity amounts to.
 """
