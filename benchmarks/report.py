@@ -220,7 +220,8 @@ def sampled_tasks() -> list[str]:
     lines += [
         "As above, on a processor of 10 or 20 kHz whose voltage is a sample late. Bar: what 2 x 900 evaluations of",
         "CMA-ES on 6 members found with an independent simulator of the same loop. Seconds: of all that `ambjax-tune`",
-        "does, on one processor; in brackets those of the same task in continuous time, in the same run.",
+        "does, on one processor, beside other work; in brackets those of the same task in continuous time.",
+        "p: of position, inversion and current law. In C10 l ends at the bound that its case file gives it, 0.05 1/s.",
         "",
     ]
     rows = []
