@@ -21,6 +21,13 @@ class Mutation(NamedTuple):
 M = Mutation
 PLANT = [
     M(
+        "half the force, beside the right product of the gaps",
+        "ambjax/world/bearing.py",
+        "return 4 * along * across,",
+        "return 2 * along * across,",
+        "tests/test_plant.py::test_rates_are_equations_1_and_2_written_out",
+    ),
+    M(
         "the sign of the motional term of Eq. (2) is turned",
         "ambjax/world/plant.py",
         "i_dot = 2 * z_dot * gaps.inverses[1] * i +",
