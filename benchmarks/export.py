@@ -40,6 +40,7 @@ CASES = {
     "the same, p = 25": Cascade(**OBSERVER, processor=NOW),
     "p = 25, predicted": Cascade(**OBSERVER, processor=LATER),
     "super-twisting, p = inf, predicted": Cascade(**OBSERVER | SIGN | TWISTING, processor=LATER),
+    "a Kalman filter, p = inf, predicted": Cascade(observer=observer.Kalman(), **SIGN, processor=LATER),
     "PI, closed form, p = 25": Cascade(
         **OBSERVER, inversion=inversion.ClosedForm(), current=current.ProportionalIntegral(), processor=NOW
     ),
