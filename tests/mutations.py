@@ -779,4 +779,55 @@ CHECK = [
         "tests/test_check_processor.py::test_an_implicit_step_is_no_steeper_than_one",
     ),
 ]
-MUTATIONS = [*PLANT, *LAWS, *LOOP, *METHODS, *NOISE, *ENSEMBLE, *SEARCH, *SAMPLED, *CHECK]
+EXPORT = [
+    M(
+        "a choice takes the other side",
+        "ambjax/export/emitter.py",
+        "(args[0], args[2], args[1]), dtype, law)",
+        "(args[0], args[1], args[2]), dtype, law)",
+        "tests/test_export_emitter.py::test_any_expression_is_what_jax_makes_of_it",
+    ),
+    M(
+        "differences are taken for sums: their order is lost",
+        "ambjax/export/primitives.py",
+        '"sub": Op("{0} - {1}", np.subtract, "add")',
+        '"sub": Op("{1} - {0}", np.subtract, "add")',
+        "tests/test_export_emitter.py::test_every_primitive_against_jax[double]",
+    ),
+    M(
+        "C's maximum forgets NaN",
+        "ambjax/export/statements.py",
+        '"max": "a > b || a != a ? a : b"',
+        '"max": "a > b ? a : b"',
+        "tests/test_export_emitter.py::test_every_primitive_against_jax[double]",
+    ),
+    M(
+        "the state is written before it is read",
+        "ambjax/export/source.py",
+        "{old.get(value, value)};",
+        "{value};",
+        "tests/test_export.py::test_one_step_is_jaxs[one and a half-double]",
+    ),
+    M(
+        "an input that is refused enters the laws' state",
+        "ambjax/export/controller.py",
+        "choose(good, after.control, memory.laws)",
+        "after.control",
+        "tests/test_export.py::test_an_input_that_is_none_is_refused_and_leaves_no_trace",
+    ),
+    M(
+        "a constant loses its digits",
+        "ambjax/export/statements.py",
+        "text = str(value)",
+        'text = f"{value:.6g}"',
+        "tests/test_export.py::test_one_step_is_jaxs[one and a half-double]",
+    ),
+    M(
+        "a model number is folded",
+        "ambjax/export/trace.py",
+        "keep = _alive(program",
+        "program.nodes[0] = program.nodes[0]._replace(text='1.0')\n    keep = _alive(program",
+        "tests/test_export.py::test_one_step_is_jaxs[one and a half-double]",
+    ),
+]
+MUTATIONS = [*PLANT, *LAWS, *LOOP, *METHODS, *NOISE, *ENSEMBLE, *SEARCH, *SAMPLED, *CHECK, *EXPORT]

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,10 +18,10 @@ from ambjax.control import current, inversion, observer, position
 from ambjax.control.position import force_for, sliding_variable
 from ambjax.control.processor import Processor
 from ambjax.export import loop
-from ambjax.export.controller import controller_of
+from ambjax.export.controller import Inputs, controller_of
 from ambjax.export.package import described, files
 from ambjax.export.source import Origin
-from ambjax.export.trace import trace
+from ambjax.export.trace import arguments, trace
 from ambjax.export.verify import draft, verify
 from ambjax.numerics.records import gain, record
 from ambjax.paper import readings
@@ -132,6 +133,29 @@ def test_the_loop_of_a_case_is_jaxs():
     checks = verify(drafts(cascade, count=100), loop.Case(cascade, scenario, clock, standard_for(0.005, scenario)))
     assert not failed(checks)
     assert [x.precision for x in checks if x.name == "closed loop, dz"] == ["float", "double"]
+
+
+def test_an_input_that_is_none_is_refused_and_leaves_no_trace():
+    controller = controller_of(hard(), 200.0, PERIOD)
+    parameters, memory, inputs, period = arguments(controller)
+    read = frozenset(Inputs._fields)
+    step = jax.jit(lambda memory, inputs: controller.step(parameters, memory, inputs, period, read))
+    memory, answer, status = step(memory, inputs)
+    assert not any((status.refused, status.failed, status.singular))
+    assert memory.started
+    for name in Inputs._fields:
+        limit = getattr(parameters.limits, name)
+        for wrong in (np.nan, np.inf, -np.inf, 1.001 * limit, -1.001 * limit):
+            bad = inputs._replace(**{name: jnp.asarray(wrong)})
+            after, held, told = step(memory, bad)
+            assert told.refused
+            assert (after.laws, after.last, after.started) == (memory.laws, memory.last, True)
+            assert after.before == memory.last.u  # the voltage that is held goes on acting
+            assert held == answer
+            first = step(controller.start(), bad)
+            assert (first[0].started, first[1].u) == (False, 0)
+        good = inputs._replace(**{name: jnp.asarray(0.999 * limit)})
+        assert not step(memory, good)[2].refused
 
 
 # --- what is written ---

@@ -51,10 +51,10 @@ def points(trace: Trace, count: int, seed: int = 0) -> Points:
     x = _drawn(trace, random, max(DRAWS * count, POOL)).astype(dtype)
     started = random.random(x.shape[1]) >= FIRST
     borders = _borders(trace, x[:, started & np.isfinite(x).all(axis=0)][:, :POOL])
-    borders = borders[:, _seen(trace, borders)[1]]
+    borders = borders[:, _seen(trace, borders, np.ones(borders.shape[1], bool))[1]]
     borders = borders[:, random.permutation(borders.shape[1])[: count // 2]]
     # far states ask for more than the supply has: of those that do not, more
-    far, normal = _seen(trace, x)
+    far, normal = _seen(trace, x, started)
     calm = np.flatnonzero(started & normal & ~far)[: int(CALM * count)]
     rest = np.setdiff1d(np.flatnonzero(normal), calm)[: count - calm.size - borders.shape[1]]
     chosen = np.concatenate([calm, rest])
@@ -63,10 +63,10 @@ def points(trace: Trace, count: int, seed: int = 0) -> Points:
     return Points(x[: len(trace.state)], started, x[len(trace.state) :])
 
 
-def _seen(trace: Trace, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of started states and inputs: whether the voltage is at its limit or held, and whether no number on the way is so
+def _seen(trace: Trace, x: np.ndarray, started: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of states and inputs: whether the voltage is at its limit or held, and whether no number on the way is so
     small that it lost digits (JAX takes those for 0 on CPUs, C does not)."""
-    values, normal = evaluated(trace, x), np.ones(x.shape[1], bool)
+    values, normal = evaluated(trace, x, started), np.ones(x.shape[1], bool)
     for value in values:
         if value.dtype.kind == "f":
             normal &= (value == 0) | ~(np.abs(value) < np.finfo(value.dtype).tiny)
@@ -112,7 +112,8 @@ def _sizes(trace: Trace) -> list[float]:
 def _borders(trace: Trace, x: np.ndarray) -> np.ndarray:
     """Points next to where a comparison of the step turns, on both sides of it: found between points by halving."""
     nodes = trace.program.nodes
-    outcomes, found = evaluated(trace, x), []
+    begun = np.ones(x.shape[1], bool)
+    outcomes, found = evaluated(trace, x, begun), []
     for n in (n for n in trace.order() if nodes[n].op in ("lt", "le", "gt", "ge")):
         yes, no = (np.flatnonzero(outcomes[n] == side)[:PAIRS] for side in (True, False))
         found += [(n, a, b) for a, b in zip(yes, no, strict=False)]
@@ -122,14 +123,14 @@ def _borders(trace: Trace, x: np.ndarray) -> np.ndarray:
     a, b = x[:, yes], x[:, no]
     for _ in range(HALVINGS):
         middle = (a / 2 + b / 2).astype(x.dtype)
-        values = evaluated(trace, middle)
+        values = evaluated(trace, middle, np.ones(middle.shape[1], bool))
         like = np.array([values[n][lane] for lane, n in enumerate(asked)])
         a, b = np.where(like, middle, a), np.where(like, b, middle)
     return np.concatenate([a, b], axis=1)
 
 
-def evaluated(trace: Trace, x: np.ndarray) -> list[np.ndarray]:
-    """Every node at started states and inputs, by NumPy."""
+def evaluated(trace: Trace, x: np.ndarray, started: np.ndarray) -> list[np.ndarray]:
+    """Every node at states and inputs, by NumPy."""
     count, program, dtype = x.shape[1], trace.program, PRECISIONS[trace.precision]
     rows = iter(x)
     given: dict[int, np.ndarray] = {}
@@ -138,7 +139,7 @@ def evaluated(trace: Trace, x: np.ndarray) -> list[np.ndarray]:
     memory = [np.zeros(count, dtype)] * all_states
     for k in range(states):
         memory[trace.keep[k]] = next(rows)
-    values += [*memory, np.ones(count, bool), *rows, np.full(count, trace.controller.period, dtype)]
+    values += [*memory, started, *rows, np.full(count, trace.controller.period, dtype)]
     for ref, value in zip(trace.refs, values, strict=True):
         given[ref.node] = value
     return [np.broadcast_to(v, count) for v in program.evaluate(given)]
