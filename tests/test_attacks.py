@@ -452,9 +452,12 @@ def test_the_template_lists_every_key_of_tune_with_its_default(name):
     with pytest.raises(ValueError, match="Keys allowed here") as refused:
         read_tune(write(dumps({"tune": {"weights": {"nothing": 1}}})))
     assert set(table["weights"]) == set(str(refused.value).partition("Keys allowed here: ")[2].rstrip(".").split(", "))
+    with pytest.raises(ValueError, match="Keys allowed here") as refused:
+        read_tune(write(dumps({"tune": {"limits": {"nothing": 1}}})))
+    assert set(table["limits"]) == set(str(refused.value).partition("Keys allowed here: ")[2].rstrip(".").split(", "))
     assert {field.name for field in dataclasses.fields(Budget)} <= set(table)
     # these are examples, and say so; all else is what is left out
-    for example in ("gains", "bounds", "risk", "alpha"):
+    for example in ("gains", "bounds", "risk", "alpha", "limits"):
         del table[example]
     ours, left_out = (settings(read_tune(write(dumps(one)))[1]) for one in (document, document | {"tune": {}}))
     assert ours == left_out

@@ -214,7 +214,7 @@ def test_the_papers_cascade_costs_less_than_150_flops():
     assert plain.flops() < 150
     told = text(to="float", processor=Processor(1.0, predict=False))["amb.h"]
     assert f"A step: {plain.flops()} flops." in told
-    assert trace(controller_of(hard(), 200.0, PERIOD), "float").flops() < 250
+    assert trace(controller_of(hard(), 200.0, PERIOD), "float").flops() < 280  # RK4 over the delay: 4 times the model
 
 
 @compiled

@@ -32,6 +32,7 @@ frequency = 2.0
 
 [sensor]
 std = 1e-7
+std_z_dot = 1e-7
 
 [clock]
 duration = {duration}

@@ -5,8 +5,7 @@ layer(model)        for each state, the largest error that keeps it where a smoo
 requirement         what Theorem 1 requires of one of its gains; nothing
 robust(error)       the term that its sign adds to the rate of the error of its stage, Eqs. (12), (14); 0
 ranges(site)        where its gains are searched; about their values
-band(W, L, sampling) the band about 0 that is left of the error of its stage where it is sampled, for a disturbance up
-                    to W whose rate is up to L; None: nothing is known
+band(W, L, sampling) what is left of its stage's error, sampled, for a disturbance to W of a rate to L; None: unknown
 held(model)         the steepest rate of what its implicit step leaves explicit, 1/s; 0
 memory              for each state, its name, unit and meaning, where its structure does not name it; x
 slide(...)          an inversion law's step that knows where its stiffness is (`laws.Relaxation`); there is none
