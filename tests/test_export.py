@@ -14,6 +14,7 @@ import pytest
 
 from ambjax import RK4, Cascade, Clock, Plant, Scenario, Sensor, Sine
 from ambjax.__main__ import main
+from ambjax.cases.template import template
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.position import force_for, sliding_variable
 from ambjax.control.processor import Processor
@@ -325,6 +326,17 @@ def test_all_of_it(name):
     scenario = Scenario(reference=Sine(1e-3, 2.0), sensor=Sensor(1e-6, 1e-4, 1e-4), u_max=200.0)
     case = loop.Case(cascade, scenario, Clock(1000, PERIOD, RK4(3)), standard_for(0.02, scenario))
     assert not failed(verify(drafts(cascade), case))
+
+
+@compiled
+@pytest.mark.slow
+@pytest.mark.parametrize("to", ["float", "double"])
+def test_the_rig(tmp_path, to):
+    path = tmp_path / "rig.toml"
+    path.write_text(
+        template("rig").replace("duration = 0.3 ", "duration = 0.1 ").replace("stop = 0.2 ", "stop = 0.15 ")
+    )
+    assert main(["export", str(path), "--out", str(tmp_path / "c"), "--precision", to, "--verify"]) == 0
 
 
 MUTANTS = {
