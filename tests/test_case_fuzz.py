@@ -120,6 +120,10 @@ ASKED = st.one_of(
     st.dictionaries(st.sampled_from([*LIMITS, "survival"]), LIMIT, max_size=2),
     st.fixed_dictionaries({"settling_s": st.floats(1e-3, 1.0), "settling_band_m": st.floats(1e-9, 1e-3)}),
 )
+# Sensors and supplies without what is refused where there is no processor.
+ALWAYS = ("std", "std_z_dot", "std_i", "offset", "gain")
+NOISE = st.fixed_dictionaries({}, optional={f.name: number(f) for f in dataclasses.fields(Sensor) if f.name in ALWAYS})
+SUPPLY = st.fixed_dictionaries({}, optional={"u_max": number(FIELDS["u_max"])})
 DOCUMENT = st.fixed_dictionaries(
     {"clock": CLOCK},
     optional={
@@ -136,8 +140,8 @@ DOCUMENT = st.fixed_dictionaries(
             },
         ),
         "tune": st.fixed_dictionaries({"limits": ASKED}),
-        "sensor": table_of(Sensor),
-        "actuator": table_of(Amplifier, u_max=number(FIELDS["u_max"])),
+        "sensor": st.one_of(NOISE, NOISE, table_of(Sensor, bits=st.integers(1, 33))),
+        "actuator": st.one_of(SUPPLY, SUPPLY, table_of(Amplifier, u_max=number(FIELDS["u_max"]))),
         "initial": table_of(Initial, z=st.floats(-3e-3, 3e-3)),
         "run": st.fixed_dictionaries(
             {}, optional={"seed": st.integers(0, 2**32), "settle": st.floats(0, 0.01), "clearance": st.floats(0, 6e-3)}
