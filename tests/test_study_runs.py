@@ -146,9 +146,9 @@ def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(flags):
     write(LONGER)
     many = 100_000  # so that no machine is done before it is interrupted
     running = begin("out", *flags, "--members", str(many))
-    wait_for(lambda: finished_chunks("out") >= 2, running)
+    wait_for(lambda: finished_chunks("out") >= 12, running)  # by then every worker has started
     os.killpg(running.pid, signal.SIGINT)  # as a terminal does: the whole group hears it
-    err = running.communicate(timeout=60)[1]
+    err = running.communicate(timeout=120)[1]
     assert running.returncode == 130
     assert group_ends(running.pid)
     kept = finished_chunks("out")
