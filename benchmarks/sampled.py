@@ -74,7 +74,8 @@ def run(work: Workload, errors: np.ndarray | None = None) -> tuple[np.ndarray, n
     z = np.asarray(work.scenario.initial.z).astype(float)
     peak, problem = np.zeros_like(z), Problem(**limit.numbers(work), u_max=U_MAX)
     pointers = [None if x is None else ctypes.c_void_p(x.ctypes.data) for x in (z, peak, errors)]
-    if limit.library("float64", SOURCE).run(ctypes.byref(problem), ctypes.c_long(len(z)), *pointers):
+    program = limit.library("float64", SOURCE)
+    if program.run(ctypes.byref(problem), ctypes.c_long(len(z)), *pointers):
         raise ValueError("sampled.c: too many substeps")
     return peak, z
 

@@ -200,12 +200,11 @@ class IRED1:
         return 0.3 * _width(model), jnp.inf
 
     def __call__(self, model: Plant, inputs: Measurement, state: Any) -> tuple[Measurement, Any]:
-        return inputs._replace(z_dot=state[1]), differentiator.smooth_rates(state, inputs.z, self.L, _width(model))
+        return _smooth(self.L, model, inputs, state)
 
     def step(self, model: Plant, inputs: Measurement, state: Any, period: Scalar) -> tuple[Measurement, Any]:
         """The estimate includes this sample."""
-        after = differentiator.implicit_step(state, inputs.z, self.L, period)
-        return inputs._replace(z_dot=differentiator.velocity(after, period)), after
+        return _implicit(self.L, inputs, state, period)
 
     def ranges(self, site: Site) -> dict[str, Interval]:
         return {"L": _bound(site, 2)}
@@ -232,12 +231,11 @@ class IRED2:
         return 0.3 * _width(model), jnp.inf, jnp.inf
 
     def __call__(self, model: Plant, inputs: Measurement, state: Any) -> tuple[Measurement, Any]:
-        return inputs._replace(z_dot=state[1]), differentiator.smooth_rates(state, inputs.z, self.L, _width(model))
+        return _smooth(self.L, model, inputs, state)
 
     def step(self, model: Plant, inputs: Measurement, state: Any, period: Scalar) -> tuple[Measurement, Any]:
         """The estimate includes this sample."""
-        after = differentiator.implicit_step(state, inputs.z, self.L, period)
-        return inputs._replace(z_dot=differentiator.velocity(after, period)), after
+        return _implicit(self.L, inputs, state, period)
 
     def ranges(self, site: Site) -> dict[str, Interval]:
         return {"L": _bound(site, 3)}
@@ -249,6 +247,15 @@ WIDTH = 1e-6
 
 def _width(model: Plant) -> Scalar:
     return WIDTH * model.s_0
+
+
+def _smooth(L: Scalar, model: Plant, inputs: Measurement, state: Any) -> tuple[Measurement, Any]:
+    return inputs._replace(z_dot=state[1]), differentiator.smooth_rates(state, inputs.z, L, _width(model))
+
+
+def _implicit(L: Scalar, inputs: Measurement, state: Any, period: Scalar) -> tuple[Measurement, Any]:
+    after = differentiator.implicit_step(state, inputs.z, L, period)
+    return inputs._replace(z_dot=differentiator.velocity(after, period)), after
 
 
 def differentiator_scale(model: Plant) -> tuple[Scalar, Scalar, Scalar]:
