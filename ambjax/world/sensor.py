@@ -1,5 +1,6 @@
 """Sensors: what is measured, and the errors of it."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -61,6 +62,11 @@ class Sensor:
         """The errors of sample number `sample` for the member with these words (Scenario.words)."""
         w = normals(key, sample)
         return Errors(self.std * w[0], self.std_z_dot * w[1], self.std_i * w[2])
+
+    def louder(self, factor: Scalar) -> "Sensor":
+        """The same sensor with `factor` times the noise."""
+        stds = {"std": self.std, "std_z_dot": self.std_z_dot, "std_i": self.std_i}
+        return dataclasses.replace(self, **{name: std * factor for name, std in stds.items()})
 
     def reading(self, motion: Measurement, errors: Errors) -> Measurement:
         """What is read of a motion (of z, as it left the low-pass) with these errors; z_dot = 0 if not measured."""

@@ -92,8 +92,8 @@ class Objective:
         """The cascade (its gains to be replaced) and scenario of one member, whose fields are scalars."""
         scenario = dataclasses.replace(self.scenario, member=who.member, seed=who.seed)
         cascade, scenario = apply(self.cascade, scenario, who.values) if who.values else (self.cascade, scenario)
-        sensor = jax.tree.map(lambda std: std * who.loud, scenario.sensor)
-        return cascade, dataclasses.replace(scenario, sensor=sensor)
+        sensor = scenario.sensor
+        return cascade, scenario if sensor is None else dataclasses.replace(scenario, sensor=sensor.louder(who.loud))
 
     def run(self, x: Array, who: Members, fold: Any) -> Any:
         """The fold's result for one lane."""
