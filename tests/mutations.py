@@ -602,6 +602,34 @@ SEARCH = [
 ]
 SAMPLED = [
     M(
+        "stressed members have another sensor, not more noise",
+        "tuning/objective/members.py",
+        "sensor=sensor.louder(who.loud)",
+        "sensor=jax.tree.map(lambda x: x * who.loud, sensor)",
+        "tests/test_tuning_search.py::test_stressed_members_hear_more_and_count_by_being_held",
+    ),
+    M(
+        "the program of delays that are spread is that of the nominal one",
+        "ambjax/cases/reader.py",
+        "cascade = cascade.on_processor(late.delay)",
+        "cascade = cascade.on_processor()",
+        "tests/test_tuning_search.py::test_a_lane_has_the_delay_of_its_member",
+    ),
+    M(
+        "whether a delay is predicted is settled by the first there was",
+        "ambjax/control/processor.py",
+        "return dataclasses.replace(self, whole=whole, most=most)",
+        "return dataclasses.replace(self, whole=whole, most=most, predict=self.predict if self.predict else most > 0)",
+        "tests/test_sampled.py::test_a_delay_that_is_set_later_is_predicted",
+    ),
+    M(
+        "the largest of zeros has a slope that is no number",
+        "tuning/objective/limits.py",
+        "jnp.where(total > 0, total, 1.0)",
+        "total",
+        "tests/test_tuning_limits.py::test_the_largest_over_members_is_smooth_and_no_less",
+    ),
+    M(
         "the voltages of the two samples before change places",
         "ambjax/simulation/sampled.py",
         "past = (state.command.u, state.past[0])",
@@ -681,14 +709,14 @@ SAMPLED = [
     M(
         "the laws act on the estimate of now, however late their voltage is",
         "ambjax/control/cascade.py",
-        "if processor.predict:",
+        "if processor.predicts:",
         "if False:",
         "tests/test_sampled.py::test_against_the_independent_simulator[two samples]",
     ),
     M(
         "the reference is that of the sample, not of the instant at which the voltage acts",
         "ambjax/simulation/sampled.py",
-        "late = self.processor.delay * self.period if self.processor.predict else 0.0",
+        "late = self.processor.delay * self.period if self.processor.predicts else 0.0",
         "late = 0.0",
         "tests/test_sampled.py::test_against_the_independent_simulator[two samples]",
     ),

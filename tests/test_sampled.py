@@ -211,6 +211,26 @@ def test_a_member_is_the_rollout_of_it_whatever_the_delays_of_others():
         np.testing.assert_allclose(together[member], alone, rtol=1e-9)
 
 
+def test_a_part_of_an_ensemble_runs_the_program_of_the_whole():
+    """Whether its own delays are whole or none: else a last digit would depend on how an ensemble is cut."""
+    spread = cascade_of(delay=0.0).on_processor(0.5, 2.0)
+    for delay in (0.0, 1.0, np.array([0.0, 0.7])):
+        part = dataclasses.replace(spread, processor=dataclasses.replace(spread.processor, delay=delay))
+        processor = part.on_processor().processor
+        assert (processor.whole, processor.most, processor.predicts) == (False, 2, True)
+    alone = cascade_of(delay=0.0).on_processor().processor
+    assert (alone.whole, alone.most, alone.predicts) == (True, 0, False)
+
+
+def test_a_delay_that_is_set_later_is_predicted():
+    """A map over the delay of a case that has none."""
+    none = cascade_of(delay=0.0).on_processor()
+    late = dataclasses.replace(none, processor=dataclasses.replace(none.processor, delay=1.0))
+    fold = amb.simulation.metrics.Rms("e_z")
+    found, expected = (amb.rollout(c, NOISY, SHORT, fold=fold, every=0).measured for c in (late, cascade_of(delay=1.0)))
+    assert found == expected
+
+
 def loss_of(clock, p):
     settled = cascade_of(p).on_processor()
 

@@ -23,6 +23,7 @@ from tuning.objective.loss import TERMS, loss_for, weigh
 from tuning.objective.members import Objective
 from tuning.objective.risk import CVaR, Mean
 from tuning.optimisers import CLIFF, NAMES, SHORTER, bfgs, optimiser
+from tuning.problem import problem_of
 from tuning.search.course import GAIN, MOST_LOOKS, look_again
 from tuning.search.descent import Descent
 from tuning.search.keeper import Keeper, Progress
@@ -82,6 +83,30 @@ def test_lanes_are_rollouts(engines):
     alone = rollout(CASCADE, scenario, problem.clock, fold=problem.loss, every=0).measured
     for name in TERMS:  # the same operations, fused differently
         assert terms[name][0, k] == pytest.approx(float(alone[name]), rel=1e-9)
+
+
+LATE = {
+    "controller": {"inversion": {"gamma": 7.5e4}},
+    "processor": {"delay": 1.0},
+    "clock": {"duration": 0.005},
+    "spread": {"processor": {"delay": {"uniform": [0.5, 1.5]}}},
+}
+
+
+def test_a_lane_has_the_delay_of_its_member():
+    """Delays that are spread are neither rounded to whole samples, as the nominal one is, nor cut to its length."""
+    case, tune = case_and_tune(LATE)
+    problem = problem_of(case, tune)
+    who = problem.objective.members(4, 8)
+    x = problem.objective.space.encode(problem.objective.space.values(case.cascade))
+    tracking = problem.engine.terms(x[None], who)["tracking"][0]
+    delays = who.values["processor.delay"]
+    assert delays.min() < 0.7 < 1.2 < delays.max()
+    for lane, delay in zip(tracking, delays, strict=True):
+        processor = dataclasses.replace(case.cascade.processor, delay=float(delay), whole=None, most=None)
+        cascade = dataclasses.replace(case.cascade, processor=processor)
+        alone = rollout(cascade, case.scenario, problem.objective.clock, fold=problem.objective.loss, every=0).measured
+        assert lane == pytest.approx(float(alone["tracking"]), rel=1e-9)  # the same operations, fused differently
 
 
 def test_members_do_not_depend_on_how_many_are_asked_for():

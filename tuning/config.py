@@ -10,7 +10,7 @@ import numpy as np
 from ambjax.cases.reader import Case, case_from, load
 from ambjax.cases.table import Table, one_line, show
 from ambjax.ensemble.spread import require_path
-from tuning.objective.limits import KINDS, SHARE, Limit
+from tuning.objective.limits import KINDS, LEAST_MARGIN, SHARE, Limit
 from tuning.objective.loss import TERMS
 from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.optimisers import BFGS, NAMES
@@ -57,6 +57,10 @@ class Limits:
     """share of the held-out members that must be held"""
     band: float = 0.0
     """of the settling time, m"""
+
+    def may_lose(self, members: int) -> int:
+        """How many of so many members may be lost."""
+        return math.floor((1 - self.survival) * members + 1e-9)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,10 +188,9 @@ def _limits(table: Table, case: Case) -> Limits:
             f"{table.at('settling_band_m')} = {band:g} m: it must be below the clearance, {clearance:g} m "
             "(run.clearance, by default 0.9 of plant.s_0)."
         )
-    if not 0 <= table.number("margin", 0.0, "a number from 0 to below 0.5") < 0.5:
-        raise ValueError(
-            f"{table.at('margin')} = {table.raw['margin']:g}: it must be from 0 to below 0.5, of each limit."
-        )
+    share = f"from {LEAST_MARGIN:g} to below 0.5"
+    if not LEAST_MARGIN <= table.number("margin", LEAST_MARGIN, f"a number {share}") < 0.5:
+        raise ValueError(f"{table.at('margin')} = {table.raw['margin']:g}: it must be {share}, of each limit.")
     each = tuple(
         Limit(name, asked[name], source[name], table.number("margin", KINDS[name].margin))
         for name in sorted(asked)

@@ -16,7 +16,7 @@ from ambjax.cases.table import Table, check_depth, load, show
 from ambjax.control import answers, current, inversion, observer, position
 from ambjax.control.cascade import Cascade
 from ambjax.control.processor import Processor
-from ambjax.ensemble.spread import Spread, corners
+from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.host.words import one_line
 from ambjax.numerics.records import leaf, numbers
 from ambjax.simulation.clock import Clock
@@ -144,9 +144,8 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
         raise ValueError(f"run.settle = {settle:g} s: it must be less than clock.duration = {duration:g} s.")
     spread = spread_from(top, cascade, scenario)
     check_reference(spread, cascade, scenario, clock)
-    widest = corners(spread, cascade, scenario)
-    clock = with_method(clock, *widest)
-    if (late := widest[0].processor) is not None:
+    clock = with_method(clock, *corners(spread, cascade, scenario))
+    if (late := ends(spread, cascade, scenario, ("processor.",))[0].processor) is not None:
         cascade = cascade.on_processor(late.delay)
     return Case(safe_name(name), cascade, scenario, clock, settle, spread)
 

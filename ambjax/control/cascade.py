@@ -179,7 +179,7 @@ class Cascade:
 
         def wanted(reference: Reference, z: Array, z_dot: Array, observed: State, positioned: State):
             estimate, observed = advance(self.observer, Measurement(z, z_dot, measured.i), observed)
-            if processor.predict:
+            if processor.predicts:
                 estimate = carried(self.model, estimate, sample.past, processor.stretches(sample.period))
             v_star, positioned = advance(self.position, (estimate, reference), positioned)
             return (estimate.z, v_star), (estimate, observed, positioned)

@@ -1,5 +1,6 @@
 """The processor that a cascade runs on: one step of all laws a sample, its voltage held, late by a delay."""
 
+import dataclasses
 import math
 
 import jax
@@ -38,12 +39,18 @@ class Processor:
     most: int | None = static(default=None, doc="samples that the longest delay reaches into; None: to be seen")
 
     def __str__(self) -> str:
-        ahead = "with" if self.predict else "without"
+        ahead = "with" if self.predicts else "without"
         return f"{'implicit' if self.implicit else 'explicit'} steps, a delay of {self.delay:g} T, {ahead} prediction"
+
+    @property
+    def predicts(self) -> bool:
+        """Whether the estimate is carried over the delay."""
+        return bool(self.resolved().most) if self.predict is None else self.predict
 
     def resolved(self, *others: Scalar) -> "Processor":
         """This processor with everything settled that decides which program is compiled; for `others`, delays, too.
 
+        What was settled before for longer delays stays: a part of an ensemble runs the program of the whole.
         Raises ValueError where the delay is traced and that was not settled before.
         """
         if is_traced(self.delay):
@@ -54,9 +61,9 @@ class Processor:
                 )
             return self
         delay = np.concatenate([np.ravel(np.asarray(x, float)) for x in (self.delay, *others)])
-        longest = float(delay.max())
-        predict = longest > 0 if self.predict is None else self.predict
-        return Processor(self.delay, self.implicit, predict, bool(np.all(delay == np.round(delay))), math.ceil(longest))
+        whole = self.whole is not False and bool(np.all(delay == np.round(delay)))
+        most = max(self.most or 0, math.ceil(float(delay.max())))
+        return dataclasses.replace(self, whole=whole, most=most)
 
     def stretches(self, period: Scalar) -> tuple[Array, ...]:
         """Lengths (s) of the parts of the delay over which one voltage acts: u_{n-1}, and before it u_{n-2}."""

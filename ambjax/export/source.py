@@ -164,6 +164,6 @@ def order_of_work(trace: Trace) -> list[str]:
         f"Every T = {controller.period:g} s: read the sensors, call the step at once, and let output->u act",
         f"{delay:g} T after the reading, until that of the next sample takes its place; before the first, 0 V.",
     ]
-    ahead = f"{delay:g} T after the reading" if processor.predict else "of the reading"
+    ahead = f"{delay:g} T after the reading" if processor.predicts else "of the reading"
     lines.append(f"The reference is that of the instant {ahead}.")
     return lines

@@ -89,7 +89,7 @@ class Sampled:
 
     def jump(self, t: Scalar, state: SampledState, hold: Errors) -> SampledState:
         """The laws' step: what they decide now, and their states at the next sample."""
-        late = self.processor.delay * self.period if self.processor.predict else 0.0
+        late = self.processor.delay * self.period if self.processor.predicts else 0.0
         reference = reference_at(self.loop.scenario.reference, t + late)
         return self.decided(self.measured(state.plant, state.seen, hold), reference, state)
 

@@ -140,7 +140,7 @@ def _steepest(slope: Any) -> float:
 def sampling_of(cascade: Cascade, clock: Clock) -> Sampling:
     """How the laws of a cascade with a processor are sampled."""
     processor: Any = cascade.on_processor().processor
-    return Sampling(float(clock.sample_period), float(processor.delay), processor.implicit, processor.predict)
+    return Sampling(float(clock.sample_period), float(processor.delay), processor.implicit, processor.predicts)
 
 
 def _bands(

@@ -31,6 +31,8 @@ NORM = 16
 PREFIX = "limit."
 # Of what is 0 there is no logarithm.
 TINY = 1e-30
+# Half of a margin is what a search meets a limit to: of less, a limit that was met would not be held.
+LEAST_MARGIN = 0.002
 # What a supply is worth without being asked: rms voltage as a share of its limit.
 SHARE = 0.6
 # Stretches of the integral that prices a limit.
@@ -98,7 +100,9 @@ def pooled(values: Any) -> Any:
 def largest(values: Any) -> Any:
     """16-norm over members: at least the largest, and smooth."""
     top = jax.lax.stop_gradient(jnp.maximum(jnp.max(values), TINY))
-    return top * jnp.sum((values / top) ** NORM) ** (1 / NORM)
+    total = jnp.sum((values / top) ** NORM)
+    # 0 where all are 0: a root has no slope there
+    return top * jnp.where(total > 0, total, 1.0) ** (1 / NORM)
 
 
 @dataclasses.dataclass(frozen=True)

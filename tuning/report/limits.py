@@ -32,7 +32,7 @@ def facts(limits: tuple[Limit, ...], asked: Limits, columns: dict[str, np.ndarra
         "active": False,
         "multiplier": None,
         "price_m": None,
-        "held": None if share is None else share >= asked.survival,
+        "held": None if share is None else summary["lost"] <= asked.may_lose(summary["members"]),
     }
     return [*(_row(limit, columns, summary) for limit in limits), survival]
 

@@ -53,8 +53,8 @@ class Answer:
     @property
     def good(self) -> bool:
         """And no more validation members are lost than may be."""
-        budget, survival = self.problem.tune.budget, self.problem.tune.limits.survival
-        return self.confirmed and self.lost <= (1 - survival) * budget.validation
+        tune = self.problem.tune
+        return self.confirmed and self.lost <= tune.limits.may_lose(tune.budget.validation)
 
 
 @dataclasses.dataclass

@@ -13,8 +13,10 @@ from tuning.search.course import Course
 
 # Updates of the multipliers at one place, at most.
 MOST_UPDATES = 6
-# Where it pulls, a limit is met from this share below what is allowed, to half of the margin above, or to the least.
-BELOW, LEAST = 0.01, 1e-3
+# Where it pulls, a limit is met from this share below what is allowed, to half of the margin above.
+BELOW = 0.01
+# What an excess must fall by.
+LEAST = 1e-3
 # An average that is this share below its limit is not judged: it hardly varies over members.
 FAR = 0.1
 # Members that judge averages.
@@ -52,7 +54,7 @@ def _stuck(limit: Limit, judged: float) -> bool:
 
 def _met(limit: Limit, judged: float) -> bool:
     """Whether what is allowed is held, and made use of."""
-    return -BELOW <= limit.beyond(judged) <= max(limit.margin / 2, LEAST)
+    return -BELOW <= limit.beyond(judged) <= limit.margin / 2
 
 
 def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
