@@ -29,8 +29,10 @@ the search, CMA-ES and Nelder-Mead were run on another day, beside other work: t
     .venv/bin/python benchmarks/held_noise.py        # what a higher order saves between jumps of the noise
     .venv/bin/python benchmarks/gradients.py         # what a gradient costs, in time and memory
     .venv/bin/python benchmarks/workarounds.py       # what each workaround of XLA's compiler gains
+    .venv/bin/python benchmarks/startup.py           # from the shell to the answer
     .venv/bin/python benchmarks/tasks.py             # the five tuning tasks
     .venv/bin/python benchmarks/sampled_tasks.py     # those on a processor
+    .venv/bin/python benchmarks/bearings.py          # other bearings, and the templates
     .venv/bin/python benchmarks/search.py            # their search against derivative-free ones
     .venv/bin/python benchmarks/export.py            # a step of an exported controller, here and on a Cortex-M4F
     .venv/bin/python benchmarks/report.py
@@ -199,9 +201,25 @@ def tasks() -> list[str]:
     lines = ["## The tuning tasks (`tasks.py`)", "", facts(data["machine"])]
     lines += [
         "`ambjax-tune` with its defaults, from gains that lose the rotor; judged on held-out members. Steps: error of",
-        "the settled rms error in the search's own steps against adaptive RODAS3.",
+        "the settled rms error in the search's own steps against adaptive RODAS3. u: once settled.",
         "",
     ]
+    return lines + _tasks(data)
+
+
+def bearings() -> list[str]:
+    data = load("bearings")
+    lines = ["## Other bearings and the templates (`bearings.py`)", "", facts(data["machine"])]
+    verified = sum(row["verified"] for row in data["tasks"].values())
+    lines += [
+        "As above, unattended; all but the template `tracking` stand still. Accurate steps confirm",
+        f"{verified} of {len(data['tasks'])}.",
+        "",
+    ]
+    return lines + _tasks(data)
+
+
+def _tasks(data: dict[str, Any]) -> list[str]:
     rows = []
     for row in data["tasks"].values():
         gains = ", ".join(f"{path.rpartition('.')[2]} {value:.4g}" for path, value in row["gains"].items())
@@ -211,7 +229,7 @@ def tasks() -> list[str]:
         cells += [f"{100 * row['step_error']:.1g} %", f"{row['rollouts']:,}", seconds, gains]
         rows.append(cells)
     titles = "task | settled rms error (m) | largest (m) | lost | u rms (V) | steps | rollouts | search (s) | gains"
-    return lines + table(titles, rows)
+    return table(titles, rows)
 
 
 def sampled_tasks() -> list[str]:
@@ -229,7 +247,7 @@ def sampled_tasks() -> list[str]:
         gains = ", ".join(f"{path.rpartition('.')[2]} {value:.4g}" for path, value in row["gains"].items())
         cells = [row["title"], f"{row['bar_m']:.3g}", f"{row['settled_rms_error_m']:.2e}"]
         cells += [f"{row['settled_max_abs_error_m']:.1e}", f"{row['lost']} of {row['members']}"]
-        cells += [f"{row['rms_u_V']:.0f}", f"{row['chatter_V']:.1e}", f"{row['rollouts']:,}"]
+        cells += [f"{row['settled_rms_u_V']:.0f}", f"{row['chatter_V']:.1e}", f"{row['rollouts']:,}"]
         continuous = row.get("continuous", {}).get("processor_s")
         cells += [f"{row['processor_s']:.0f}" + (f" ({continuous:.0f})" if continuous else ""), gains]
         rows.append(cells)
@@ -242,9 +260,10 @@ def search() -> list[str]:
     data = load("search")
     lines = ["## The search against derivative-free ones (`search.py`)", "", facts(data["machine"])]
     lines += [
-        "The same loss, members, coordinates and ranges; the budget of rollouts is the gradients' own, or a multiple",
-        "of it. Loss: median over seeds and range. Reached: rollouts until the gradients' median loss, median over",
-        "seeds; a dash: not in the budget. Rollouts are not cost, since padded lanes are computed too: seconds are",
+        "The same loss, members, coordinates and ranges, which TPE and random search cannot leave far; the budget",
+        "of rollouts is the gradients' own, or a multiple of it. Loss: median over seeds and range. Reached: rollouts",
+        "until the gradients' median loss, median over seeds; a dash: not in the budget. Rollouts are not cost, since",
+        "padded lanes are computed too: seconds are",
         "processor time of a search on one core.",
         "",
     ]
@@ -261,6 +280,26 @@ def _search(task: str, method: str, seeds: list[dict[str, Any]]) -> list[str]:
     spent, seconds = (statistics.median_high(row[key] for row in seeds) for key in ("rollouts", "seconds"))
     loss = f"{middle:.4e} ({low:.4e} to {high:.4e}, seeds: {len(seeds)})"
     return [task, method, loss, f"{spent:,}", f"{seconds:.0f}", f"{reached:,}" if math.isfinite(reached) else "-"]
+
+
+def startup() -> list[str]:
+    data = load("startup")
+    lines = ["## From the shell to the answer (`startup.py`)", "", facts(data["machine"])]
+    lines += [f"Fresh processes, all compiled before, on the paper's tracking case; medians of {data['runs']}.", ""]
+    rows = [
+        [f"`{name}`", *(f"{row[key]:.2f}" for key in ("wall_s", "least_wall_s", "cpu_s", "cpu_over_import_jax"))]
+        for name, row in data["rows"].items()
+    ]
+    return lines + table("command | wall (s) | least (s) | processor (s) | in those of `import jax`", rows)
+
+
+def workarounds() -> list[str]:
+    data = load("workarounds")
+    lines = ["## Workarounds of XLA's compiler (`workarounds.py`)", "", facts(data["machine"])]
+    lines += [f"Times as long without one of them, in pairs of runs; medians of {data['rounds']}.", ""]
+    jobs = [key for key in next(iter(data["rows"].values())) if key != "says"]
+    rows = [[name, row["says"], *(f"{row[job]:.2f}" for job in jobs)] for name, row in data["rows"].items()]
+    return lines + table(" | ".join(["workaround", "without it", *jobs]), rows)
 
 
 def gpu() -> list[str]:
@@ -300,7 +339,10 @@ SECTIONS = {
     "scaling": scaling,
     "held_noise": held_noise,
     "gradients": gradients,
+    "startup": startup,
+    "workarounds": workarounds,
     "tasks": tasks,
+    "bearings": bearings,
     "sampled_tasks": sampled_tasks,
     "search": search,
     "gpu": gpu,

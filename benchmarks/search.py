@@ -1,8 +1,10 @@
 """The search by gradients against derivative-free ones, on the same loss, members, coordinates and number of rollouts.
 
 One rollout is one member simulated once; a gradient of m gains counts m + 1. Every method moves in the same
-coordinates, unbounded, in which a gain ends at its bound, and starts from the same knowledge: the case's gains and the
-ranges of the screen. Each seed changes what is random in the method, not the members. The budget is what the search
+coordinates, in which a gain ends at its bound, and knows the ranges of the screen: CMA-ES, Nelder-Mead and Powell's
+method are unbounded in them and begin in their middle, TPE draws from them and half of them beyond either end, random
+search from them alone. The search by gradients begins with a screen of them, and of the case's gains, which lose the
+rotor in all these tasks. Each seed changes what is random in the method, not the members. The budget is what the search
 by gradients took in the median; `--times` runs the rivals with as many times that. Best so far is the loss over the
 training members, stressed ones included, at the search's own steps. Rollouts are not cost: lanes of a call that are not
 needed are computed all the same, and a derivative costs less than a run; so seconds are told too: processor time of the

@@ -51,7 +51,12 @@ def tuned(path: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
     report = json.loads((out / "report.json").read_text())
     after = report["after"]
     return {
-        "title": path.read_text().splitlines()[0].removeprefix("# Tuning task ").partition(". ")[0],
+        "title": path.read_text()
+        .splitlines()[0]
+        .removeprefix("# ")
+        .removeprefix("Tuning task ")
+        .partition(". ")[0]
+        .rstrip("."),
         "gains": {row["path"]: row["after"] for row in report["gains"]},
         "at_bound": [row["path"] for row in report["gains"] if row["at_bound"]],
         "lost_before": report["before"]["lost"],

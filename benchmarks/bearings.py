@@ -1,0 +1,37 @@
+"""Other bearings than the paper's, standing still, and the two templates: each by `ambjax-tune` with its defaults.
+
+As `tasks.py`, whose rows these are: unattended, judged on 1,000 held-out members, verified by accurate steps.
+Run: python benchmarks/bearings.py [--out DIR] [NAME ...]
+"""
+
+import argparse
+import pathlib
+
+import _measure
+import tasks
+
+from ambjax.cases.template import template
+
+CASES = pathlib.Path(__file__).parent.parent / "tests" / "cases"
+TEMPLATES = ("regulation", "tracking")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", default=[*tasks.names(CASES), *TEMPLATES])
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out", "bearings"))
+    given = parser.parse_args()
+    rows = tasks.kept("bearings")
+    for name in given.names:
+        path = CASES / f"{name}.toml"
+        if name in TEMPLATES:
+            given.out.mkdir(parents=True, exist_ok=True)
+            path = given.out / f"{name}.toml"
+            path.write_text(f"# The template {name}.\n{template(name)}")
+        rows[name] = row = tasks.tuned(path, given.out / name)
+        print(f"{tasks.told(row)}; {'verified' if row['verified'] else 'NOT verified'}", flush=True)
+    _measure.write("bearings", {"tasks": dict(sorted(rows.items()))})
+
+
+if __name__ == "__main__":
+    main()
