@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from bowl import FLOOR, PATHS, S_0, World, document, study
 from scipy import stats
+from texts import piped
 from tomlkit import dumps
 
 import tuning.command
@@ -320,3 +321,12 @@ def test_a_rotor_that_is_lost_among_those_who_judge_is_an_answer_of_no(monkeypat
     assert code == 1
     assert summary["after"]["lost"] == 1
     assert "Rotors are lost" in summary["advice"]
+
+
+def test_a_case_from_a_pipe_is_read_once(monkeypatch, tmp_path):
+    """The second time it is empty, and tuned.toml would be of gains alone: another case."""
+    study(monkeypatch, World())
+    monkeypatch.setattr(tuning.command, "_tune", lambda args, raw, problem, start, out: (raw, problem.case.text))
+    text = dumps(document())
+    args = argparse.Namespace(case=piped(text), out=str(tmp_path / "out"), resume=False, json=True)
+    assert tuning.command.run(args) == (tomllib.loads(text), text)

@@ -1,5 +1,6 @@
 """The text of a case file: written where a test runs, and read with its [tune]."""
 
+import os
 import pathlib
 import tomllib
 
@@ -13,6 +14,14 @@ def write(text, name="case.toml"):
     """The name of a file of this text, in the folder where the test runs."""
     pathlib.Path(name).write_text(text, encoding="utf-8")
     return name
+
+
+def piped(text):
+    """The name of a pipe that holds this text, once."""
+    there, here = os.pipe()
+    os.write(here, text.encode())
+    os.close(here)
+    return f"/dev/fd/{there}"
 
 
 def case_and_tune(document, **tune):

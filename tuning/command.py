@@ -43,16 +43,15 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     problem = problem_of(case, tune)
     start = tune.space.values(case.cascade)
     tune.space.encode(start)
-    text = pathlib.Path(args.case).read_text(encoding="utf-8")
     try:
-        tuned_text(text, _laws(problem, {}), case.name, "")
+        tuned_text(case.text, _laws(problem, {}), case.name, "")
     except ValueError as why:
         raise ValueError(f"{args.case}: {why}") from None
     out = directory(args.out, f"tune-{case.name}")
     if not args.resume:
         _clear(out)
     with keeping(lambda: _kept(out)):
-        return _tune(args, (text, raw), problem, start, out)
+        return _tune(args, raw, problem, start, out)
 
 
 def _clear(out: pathlib.Path) -> None:
@@ -70,15 +69,14 @@ def _kept(out: pathlib.Path) -> str:
 
 
 def _tune(
-    args: argparse.Namespace, file: tuple[str, dict[str, Any]], problem: Problem, start: np.ndarray, out: pathlib.Path
+    args: argparse.Namespace, raw: dict[str, Any], problem: Problem, start: np.ndarray, out: pathlib.Path
 ) -> tuple[int, dict[str, Any]]:
-    """Search, judge and write; everything has been checked. `file`: the case's text, and what it holds."""
+    """Search, judge and write; everything has been checked. `raw`: what the case file holds."""
     tune = problem.tune
     held_out = seeds(tune.budget)[2]
     say(
         f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {problem.objective.clock.method}"
     )
-    text, raw = file
     answer = rounds(problem, start, out, {"case": raw, "tune": settings(tune)}, args.resume)
     problem, who, x = answer.problem, answer.who, answer.x
     facts = _facts(answer, held_out)
@@ -90,7 +88,7 @@ def _tune(
         facts["pareto"] = explore.pareto(problem, x, who)
     slices = explore.slices(problem, x, who)
     with files(out) as part:
-        _write(part, problem, text, answer.history, facts, slices)
+        _write(part, problem, answer.history, facts, slices)
     summary = plain(facts) | {"out": str(out)}
     if not args.json:
         print(_short(facts))
@@ -177,9 +175,7 @@ def _at(problem: Problem, gains: np.ndarray) -> np.ndarray:
     return problem.objective.space.encode(problem.objective.space.clip(gains))
 
 
-def _write(
-    out: pathlib.Path, problem: Problem, text: str, history: Any, facts: dict[str, Any], slices: explore.Slices
-) -> None:
+def _write(out: pathlib.Path, problem: Problem, history: Any, facts: dict[str, Any], slices: explore.Slices) -> None:
     space = problem.objective.space
     for row, grows in zip(facts["gains"], slices.sensitivity(), strict=True):
         row["sensitivity_percent"] = float(grows)
@@ -187,7 +183,7 @@ def _write(
     facts["beside"] = {"path": space.paths[j], "gain": slices.gains[j, k], "lower": -np.expm1(-drop)}
     facts["slices"] = {"gains": slices.gains, "log_risk": slices.goals, "lost": slices.lost}
     gains = _laws(problem, {row["path"]: row["after"] for row in facts["gains"]})
-    text = tuned_text(text, gains, facts["case"], facts["verdict"])
+    text = tuned_text(problem.case.text, gains, facts["case"], facts["verdict"])
     tuned = case_from(tomllib.loads(text), facts["case"])  # a file that could not be read back is not written
     (out / "tuned.toml").write_text(text, encoding="utf-8")
     np.savez(out / "history.npz", **history)

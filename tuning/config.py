@@ -83,10 +83,10 @@ class Tune:
 
 def read_tune(path: str | pathlib.Path) -> tuple[Case, Tune, dict[str, Any]]:
     """Case, [tune] and the raw document of a case file. Raises ValueError, one line, for anything wrong in it."""
-    raw = load(path)
+    raw, text = load(path)
     name = pathlib.Path(path).stem
     try:
-        case = case_from(raw, name)
+        case = case_from(raw, name, text)
         return case, tune_from(Table(raw).table("tune"), case), raw
     except ValueError as error:
         raise ValueError(one_line(f"{path}: {error}")) from None

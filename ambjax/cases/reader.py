@@ -92,7 +92,10 @@ UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """What a case file says. `settle` in s; `method` as chosen or asked for, for every spread, is in the clock."""
+    """What a case file says. `settle` in s; `method` as chosen or asked for, for every spread, is in the clock.
+
+    `text`: the file as it was read, byte for byte in UTF-8.
+    """
 
     name: str
     cascade: Cascade
@@ -100,6 +103,7 @@ class Case:
     clock: Clock
     settle: float
     spread: Spread = Spread()
+    text: str = ""
 
 
 def read_case(path: str | pathlib.Path) -> Case:
@@ -108,9 +112,9 @@ def read_case(path: str | pathlib.Path) -> Case:
     Raises ValueError, one line, for anything wrong with the file or in it.
     """
     path = pathlib.Path(path)
-    raw = load(path)
+    raw, text = load(path)
     try:
-        return case_from(raw, path.stem)
+        return case_from(raw, path.stem, text)
     except ValueError as error:
         raise ValueError(one_line(f"{path}: {error}")) from None
 
@@ -120,8 +124,8 @@ def safe_name(text: str) -> str:
     return UNSAFE.sub("_", text)[:LONGEST_NAME].strip() or "case"
 
 
-def case_from(raw: dict[str, Any], name: str = "case") -> Case:
-    """A case from a parsed TOML document. Raises ValueError as `read_case` does."""
+def case_from(raw: dict[str, Any], name: str = "case", text: str = "") -> Case:
+    """A case from a parsed TOML document of this text. Raises ValueError as `read_case` does."""
     check_depth(raw)
     top = Table(raw)
     top.only([*TABLES, *OTHERS])
@@ -147,7 +151,7 @@ def case_from(raw: dict[str, Any], name: str = "case") -> Case:
     clock = with_method(clock, *corners(spread, cascade, scenario))
     if (late := ends(spread, cascade, scenario, ("processor.",))[0].processor) is not None:
         cascade = cascade.on_processor(late.delay)
-    return Case(safe_name(name), cascade, scenario, clock, settle, spread)
+    return Case(safe_name(name), cascade, scenario, clock, settle, spread, text)
 
 
 def _processor(table: Table) -> Processor:

@@ -17,8 +17,11 @@ DEEPEST = 32
 MOST_BYTES = 10_000_000
 
 
-def load(path: str | pathlib.Path) -> dict[str, Any]:
-    """A case file as parsed TOML, not yet checked. Raises ValueError, one line, if it is none."""
+def load(path: str | pathlib.Path) -> tuple[dict[str, Any], str]:
+    """A case file as parsed TOML, not yet checked, and its text. Raises ValueError, one line, if it is none.
+
+    Read once and no more: a pipe gives nothing the second time.
+    """
     path = pathlib.Path(path)
 
     def refuse(why: str) -> ValueError:
@@ -32,7 +35,8 @@ def load(path: str | pathlib.Path) -> dict[str, Any]:
     if len(content) > MOST_BYTES:
         raise refuse(f"more than {MOST_BYTES:,} bytes are no case file. See 'ambjax template' for one.")
     try:
-        return tomllib.loads(content.decode("utf-8"))
+        text = content.decode("utf-8")
+        return tomllib.loads(text), text
     except UnicodeDecodeError:
         raise refuse("not a text file in UTF-8. A case file is TOML; see 'ambjax template'.") from None
     except tomllib.TOMLDecodeError as error:

@@ -2,7 +2,6 @@
 
 import argparse
 import hashlib
-import pathlib
 import re
 from typing import Any
 
@@ -31,7 +30,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     prefix = _prefix(args.prefix, case.name)
     if args.verify:
         machine.compiler()
-    digest = hashlib.sha256(pathlib.Path(args.case).read_bytes()).hexdigest()
+    digest = hashlib.sha256(case.text.encode()).hexdigest()
     origin = Origin(case.name, digest, package.described(controller))
     out = directory(args.out, f"export-{case.name}")
     say_doubts(case, args.case)
