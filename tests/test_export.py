@@ -1,6 +1,7 @@
 """The controller as C: every law, one of one's own, what is refused, and what a wrong C would do to the proof."""
 
 import dataclasses
+import hashlib
 import json
 import re
 import shutil
@@ -11,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from texts import piped
 
 from ambjax import RK4, Cascade, Clock, Plant, Scenario, Sensor, Sine
 from ambjax.__main__ import main
@@ -162,8 +164,8 @@ def test_an_input_that_is_none_is_refused_and_leaves_no_trace():
 # --- what is written ---
 
 
-def text(cascade=None, to="double", **more):
-    controller = controller_of(cascade or hard(**more), 200.0, PERIOD)
+def text(cascade=None, to="double", u_max=200.0, **more):
+    controller = controller_of(cascade or hard(**more), u_max, PERIOD)
     return files(controller, to, "amb", Origin("test", "0" * 64, described(controller)))
 
 
@@ -219,6 +221,20 @@ def test_the_papers_cascade_costs_less_than_150_flops():
 
 
 @compiled
+@pytest.mark.parametrize("to", ["float", "double"])
+def test_the_header_compiles_by_itself_as_the_readme_says(tmp_path, to):
+    made = text(to=to, u_max=INF, processor=Processor(1.0, predict=False))
+    (use,) = re.findall(r"`(amb_params mine = AMB_DEFAULT;)`", made["README.md"])
+    (tmp_path / "amb.h").write_text(made["amb.h"])
+    (tmp_path / "mine.c").write_text(
+        f'#include "amb.h"\namb_real mine(void);\namb_real mine(void)\n{{ {use} return mine.limits.u_max; }}\n'
+    )
+    flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
+    done = subprocess.run(["cc", *flags, "-c", "mine.c"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@compiled
 def test_the_stack_is_within_what_the_header_says(tmp_path):
     for to in ("float", "double"):
         made = text(to=to)
@@ -260,6 +276,12 @@ def test_the_directory_compiles_and_tests_itself(case, tmp_path, capsys):
     done = subprocess.run(["make", "test"], cwd=tmp_path / "c", capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "100 of 100 steps as JAX makes them" in done.stdout
+
+
+def test_a_case_from_a_pipe_is_read_once(elsewhere, tmp_path):
+    assert main(["export", piped(CASE), "--prefix", "amb", "--out", str(tmp_path / "c"), "--json"]) == 0
+    digest = hashlib.sha256(CASE.encode()).hexdigest()
+    assert f"SHA-256 of the case: {digest} */" in (tmp_path / "c" / "amb.h").read_text()
 
 
 def refused(capsys, *arguments):

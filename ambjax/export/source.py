@@ -112,6 +112,7 @@ class Writer:
             banner=self.banner(f"{p}.h"),
             told="\n".join(f" * {line}".rstrip() for line in self.told()),
             real=t.precision,
+            maths="#include <math.h>\n" if any("HUGE_VAL" in x for x in gains) else "",
             period=literal(t.controller.period, t.precision),
             bits="\n".join(f"#define {p}_{x.upper()} {1 << k}u /* {BITS[x]} */" for k, (x, _) in enumerate(t.bits)),
             params=self.struct("params", t.parameters),

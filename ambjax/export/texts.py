@@ -9,7 +9,7 @@ HEADER = """{banner}
 #ifndef {P}_H
 #define {P}_H
 
-#include <stdint.h>
+{maths}#include <stdint.h>
 
 #ifdef __cplusplus
 extern "C" {{
