@@ -22,8 +22,9 @@ from ambjax.control.position import force_for, sliding_variable
 from ambjax.control.processor import Processor
 from ambjax.export import loop
 from ambjax.export.controller import Inputs, controller_of
+from ambjax.export.machine import Compiled, build
 from ambjax.export.package import described, files
-from ambjax.export.source import Origin
+from ambjax.export.source import Origin, Writer
 from ambjax.export.trace import arguments, trace
 from ambjax.export.verify import draft, verify
 from ambjax.numerics.records import gain, record
@@ -33,6 +34,7 @@ from ambjax.simulation.metrics import standard_for
 compiled = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 INF = np.inf
 PERIOD = 1e-4
+ORIGIN = Origin("test", "0" * 64, [])
 
 
 @record
@@ -159,6 +161,40 @@ def test_an_input_that_is_none_is_refused_and_leaves_no_trace():
             assert (first[0].started, first[1].u) == (False, 0)
         good = inputs._replace(**{name: jnp.asarray(0.999 * limit)})
         assert not step(memory, good)[2].refused
+
+
+@compiled
+def test_a_delay_beyond_the_exported_one_is_refused(tmp_path):
+    """The prediction's parts are fixed: of 1.5 samples it would carry 1 and say nothing."""
+    traced = trace(controller_of(hard(), 200.0, PERIOD), "double")
+    made = text()
+    for name in ("amb.h", "amb.c"):
+        (tmp_path / name).write_text(made[name])
+    assert not build([tmp_path / "amb.c"], tmp_path / "amb.so", "-shared", "-fPIC")
+    machine = Compiled(tmp_path / "amb.so", traced, "amb")
+    (at,) = (k for k, x in enumerate(traced.parameters) if x.name == "processor.delay")
+    for delay, bit in {1.0: 0, 0.0: 0, 0.4: 0, 1.5: 2, np.nextafter(1, 2): 2, -1e-9: 2, np.nan: 2}.items():
+        machine.parameters[at] = delay
+        assert machine.step() & 2 == bit, delay
+    told = "params->processor.delay: from 0 to 1, else every step is refused"
+    assert "amb_real delay; /* [samples, from 0 to 1] " in made["amb.h"]
+    assert all(told in made[name] for name in ("amb.h", "README.md"))
+
+
+@pytest.mark.parametrize(
+    ("processor", "told"),
+    [
+        (Processor(1.5), "from 0 to 2"),
+        (Processor(0.0, predict=True), "from 0 to 0"),
+        (Processor(0.0), "not read"),
+        (Processor(1.0, predict=False), "not read"),
+    ],
+)
+def test_the_header_says_what_delay_may_be_set(processor, told):
+    traced = trace(controller_of(hard(processor=processor), 200.0, PERIOD), "float")
+    header = Writer(traced, "amb", ORIGIN).header()
+    assert f"amb_real delay; /* [samples, {told}] " in header
+    assert (f"processor.delay: {told}" in header) == (told != "not read")
 
 
 # --- what is written ---

@@ -104,7 +104,7 @@ OUTPUTS = {
 }
 BITS = {
     "saturated": "u is at the supply's limit",
-    "refused": "an input is NaN, infinite or out of range: nothing was computed, u is held",
+    "refused": "an input or params->processor.delay is NaN or out of range: nothing was computed, u is held",
     "failed": "a law gave no finite number: its state is kept, u is held",
     "singular": "(z, i_ref) is near the singular curve of Eq. (9)",
 }
@@ -137,10 +137,13 @@ class Controller:
     def step(
         self, parameters: Parameters, memory: Memory, inputs: Inputs, period: Scalar, read: frozenset[str]
     ) -> tuple[Memory, Answer, Status]:
-        """One sample. Inputs that are not in `read` are not looked at."""
+        """One sample. Inputs that are not in `read` are not looked at, nor is the delay where nothing is predicted."""
         cascade, limits = parameters
         measured = Measurement(*inputs[:3])
         fine = [jnp.abs(getattr(inputs, name)) <= getattr(limits, name) for name in Inputs._fields if name in read]
+        processor: Any = cascade.processor
+        if processor.predict:  # the prediction's parts are those of the delay that was exported
+            fine += [processor.delay >= 0, processor.delay <= processor.most]
         good = functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
         laws = choose(memory.started, memory.laws, cascade.init(measured))
         system = Sampled(ClosedLoop(cascade, Scenario(u_max=limits.u_max)), period)
@@ -188,7 +191,9 @@ def parameters_of(parameters: Parameters) -> list[Number]:
     """Every number of the parameters, in the order of its leaves. Raises ValueError for an array."""
     found = [*_numbers(parameters.controller, ""), *_numbers(parameters.limits, "limits.")]
     assert [x.value for x in found] == [float(x) for x in jax.tree.leaves(parameters)]
-    return found
+    processor: Any = parameters.controller.processor
+    ends = {"processor.delay": f"from 0 to {processor.most}"}
+    return [x._replace(allowed=ends.get(x.name, x.allowed)) for x in found]
 
 
 def _numbers(node: Any, path: str) -> Iterator[Number]:

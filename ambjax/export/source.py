@@ -7,7 +7,7 @@ from ambjax._version import __version__
 from ambjax.export.controller import BITS, Number
 from ambjax.export.statements import Statements, literal, word
 from ambjax.export.texts import HEADER, SOURCE
-from ambjax.export.trace import Trace
+from ambjax.export.trace import UNREAD, Trace
 
 SLACK = 256  # bytes of a stack frame beside its numbers: registers saved, padding
 
@@ -104,7 +104,7 @@ class Writer:
     def header(self) -> str:
         """NAME.h."""
         p, t = self.prefix, self.trace
-        inputs = [x._replace(allowed="" if x.name in t.read else "not read") for x in t.inputs]
+        inputs = [x._replace(allowed="" if x.name in t.read else UNREAD) for x in t.inputs]
         gains = [f"    .{word(x.name)} = {literal(x.value, t.precision)}" for x in t.parameters]
         return HEADER.format(
             p=p,
@@ -167,4 +167,7 @@ def order_of_work(trace: Trace) -> list[str]:
     ]
     ahead = f"{delay:g} T after the reading" if processor.predicts else "of the reading"
     lines.append(f"The reference is that of the instant {ahead}.")
-    return lines
+    (told,) = (x.allowed for x in trace.parameters if x.name == "processor.delay")
+    if told == UNREAD:
+        return [*lines, "params->processor.delay is not read: nothing is predicted."]
+    return [*lines, f"params->processor.delay: {told}, else every step is refused; for a longer one export again."]

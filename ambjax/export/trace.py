@@ -17,6 +17,9 @@ from ambjax.export.program import Operand, Program, Ref
 from ambjax.export.statements import PERIOD, PRECISIONS, word
 from ambjax.numerics.records import canonical
 
+# Of a number that the step has no use for, in place of what is allowed.
+UNREAD = "not read"
+
 
 def precision(name: str) -> Any:
     """JAX in single or double precision within a block, whatever it is set to."""
@@ -119,7 +122,7 @@ def _traced(controller: Controller, to: str, read: frozenset[str]) -> Trace:
         controller,
         to,
         program,
-        parameters,
+        [x if ref.node in seen else x._replace(allowed=UNREAD) for x, ref in zip(parameters, refs, strict=False)],
         [Number(name, unit, "", doc, 0.0) for name, (unit, doc) in INPUTS.items()],
         [(states[k], after[k]) for k in keep],
         started,
