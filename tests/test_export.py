@@ -140,6 +140,48 @@ def test_the_loop_of_a_case_is_jaxs():
     assert [x.precision for x in checks if x.name == "closed loop, dz"] == ["float", "double"]
 
 
+SIGMA, PEAK, SEEN = "settled_max_abs_sigma_m_per_s", "max_abs_error_m", "sigma_reached_s"
+
+
+def worst(reference, looped, own=None):
+    """The metric that is off most of made-up ones, how far it is off, and how far it may be."""
+    z, scenario = np.zeros(3), Scenario()
+    case = loop.Case(None, scenario, Clock(3, PERIOD), standard_for(0.0, scenario))
+    loops = (loop.Loop(z, metrics) for metrics in (reference, own or reference, looped))
+    first, *rest, last = loops
+    found = loop._compared(first, rest, last, "double", case)
+    return found.metric, found.off, found.off_allowed
+
+
+@pytest.mark.parametrize(
+    ("should", "found", "bad"),
+    [
+        ({"lost": 0.0, PEAK: 1e-3}, {"lost": 0.0, PEAK: 2e-3}, PEAK),  # nothing allowed, nothing off: no matter
+        ({"lost": 0.0, PEAK: 1e-3}, {"lost": 1.0, PEAK: 2e-3}, "lost"),  # nothing allowed, and off: the worst
+        ({PEAK: 1e-3, "rms_u_V": 1.0}, {PEAK: 1e-3, "rms_u_V": np.nan}, "rms_u_V"),
+        ({"lost_at_s": INF, PEAK: 1e-3}, {"lost_at_s": INF, PEAK: 2e-3}, PEAK),
+        ({PEAK: 1e-3, "lost_at_s": INF}, {PEAK: 1e-3, "lost_at_s": 0.1}, "lost_at_s"),
+        ({SEEN: 0.0, PEAK: 1e-3}, {SEEN: 3 * PERIOD, PEAK: 1e-3}, SEEN),
+        ({SIGMA: 1e-3, PEAK: 1e-3}, {SIGMA: 1.05e-3, PEAK: 1e-3}, SIGMA),  # within a sample, were it a time
+    ],
+)
+def test_every_metric_of_the_loop_is_judged(should, found, bad):
+    for turn in (lambda metrics: metrics, lambda metrics: dict(reversed(metrics.items()))):
+        name, off, allowed = worst(turn(should), turn(found))
+        assert name == bad
+        assert not off <= allowed
+
+
+def test_what_a_metric_near_zero_may_be_off_is_of_its_unit():
+    plant, free = Plant(), loop.ROUNDINGS * np.finfo(float).eps
+    assert worst({SEEN: 0.0}, {SEEN: PERIOD}) == (SEEN, PERIOD, PERIOD)
+    assert worst({SIGMA: 0.0}, {SIGMA: 0.0})[2] == pytest.approx(free * plant.sigma_size, abs=0)
+    assert worst({PEAK: 0.0}, {PEAK: 0.0})[2] == pytest.approx(free * plant.s_0, abs=0)
+    # where rounding alone lets JAX's own loop lose the rotor or not, either is allowed, and the rest is judged
+    own = {"lost_at_s": 0.1, PEAK: 1e-3}
+    assert worst({"lost_at_s": INF, PEAK: 1e-3}, {"lost_at_s": 0.2, PEAK: 2e-3}, own)[0] == PEAK
+
+
 def test_an_input_that_is_none_is_refused_and_leaves_no_trace():
     controller = controller_of(hard(), 200.0, PERIOD)
     parameters, memory, inputs, period = arguments(controller)

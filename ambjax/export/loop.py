@@ -149,11 +149,23 @@ def _compared(reference: Loop, own: list[Loop], looped: Loop, precision: str, ca
     off, allowed = {}, {}
     for name, should in reference.metrics.items():
         size = abs(should) if np.isfinite(should) else 0.0
-        free = period if name.endswith("_s") else rounding * _amount(name, plant)
+        free = period if _is_time(name) else rounding * _amount(name, plant)
         allowed[name] = (share + shaken) * size + TIMES * max(_off(x.metrics[name], should) for x in own) + free
         off[name] = _off(looped.metrics[name], should)
-    worst = max(off, key=lambda name: off[name] / allowed[name] if allowed[name] > 0 else np.inf * bool(off[name]))
+    worst = max(off, key=lambda name: _share(off[name], allowed[name]))
     return Beside(dz, (gap_share + shaken) * float(plant.s_0), max(moved), worst, off[worst], allowed[worst])
+
+
+def _share(off: float, allowed: float) -> float:
+    """How much of what is allowed something is off: above 1 or inf fails, and so does what is no number."""
+    if off <= allowed:
+        return off / allowed if 0 < allowed < np.inf else 0.0
+    return off / allowed if allowed > 0 and np.isfinite(off) else np.inf
+
+
+def _is_time(name: str) -> bool:
+    """Whether a metric is a time, s, and not a rate."""
+    return name.endswith("_s") and not name.endswith("_per_s")
 
 
 def _amount(name: str, plant: Any) -> float:
