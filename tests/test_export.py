@@ -356,6 +356,40 @@ def test_the_directory_compiles_and_tests_itself(case, tmp_path, capsys):
     assert "100 of 100 steps as JAX makes them" in done.stdout
 
 
+def contents(out):
+    """What a folder holds."""
+    return {x.name: x.read_bytes() if x.is_file() else None for x in out.iterdir()}
+
+
+@compiled
+def test_only_files_of_an_earlier_export_of_the_same_prefix_are_replaced(case, tmp_path, capsys):
+    out = tmp_path / "c"
+    assert main(["export", str(case), "--out", str(out)]) == 0
+    case.write_text(CASE.replace("0.01", "0.02"))
+    before = contents(out)
+    assert main(["export", str(case), "--out", str(out), "--precision", "double"]) == 0
+    after = contents(out)
+    assert [name for name in before if before[name] != after[name]] == [x for x in before if x != "Makefile"]
+    # nor is what another prefix or a person wrote, whatever stands in the others' place
+    capsys.readouterr()
+    for prefix in ("roto", "rotor2"):
+        assert f"--out {out}: Makefile is there" in refused(capsys, case, "--out", out, "--prefix", prefix)
+    others = {
+        "README.md": lambda path: path.write_bytes(b"mine \xff"),
+        "verify.json": lambda path: path.write_text("{}"),
+        "rotor.c": lambda path: path.mkdir(),
+        "Makefile": lambda path: path.symlink_to("nowhere"),
+    }
+    for name, make in others.items():
+        (other := tmp_path / name).mkdir()
+        make(other / name)
+        held = contents(other)
+        said = refused(capsys, case, "--out", other, *(["--verify"] if name == "verify.json" else []))
+        assert f"--out {other}: {name} is there already" in said
+        assert contents(other) == held
+    assert contents(out) == after
+
+
 def test_a_case_from_a_pipe_is_read_once(elsewhere, tmp_path):
     assert main(["export", piped(CASE), "--prefix", "amb", "--out", str(tmp_path / "c"), "--json"]) == 0
     digest = hashlib.sha256(CASE.encode()).hexdigest()

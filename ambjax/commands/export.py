@@ -7,14 +7,16 @@ from typing import Any
 
 from ambjax.cases.reader import Case, read_case
 from ambjax.commands.doubts import say_doubts
-from ambjax.commands.outputs import directory, files, say, table, write_json
-from ambjax.export import loop, machine, package, verify
+from ambjax.commands.outputs import directory, files, say, spare, table, write_json
+from ambjax.export import loop, machine, package, texts, verify
 from ambjax.export.controller import Controller, controller_of
 from ambjax.export.source import Origin
 from ambjax.export.statements import PRECISIONS, RESERVED
 from ambjax.simulation.metrics import standard_for
 
 Summary = dict[str, Any]
+# What --verify writes beside the package's files.
+VERIFIED = ("verify.md", "verify.json")
 # Names that a header of C has already.
 TAKEN = {
     *("assert", "complex", "ctype", "errno", "fenv", "inttypes", "iso646", "limits", "locale", "math", "setjmp"),
@@ -33,23 +35,25 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     digest = hashlib.sha256(case.text.encode()).hexdigest()
     origin = Origin(case.name, digest, package.described(controller))
     out = directory(args.out, f"export-{case.name}")
+    mark = texts.MARK.format(p=prefix)
+    spare(out, [*(name.format(p=prefix) for name in package.NAMES), *(VERIFIED if args.verify else ())], mark)
     say_doubts(case, args.case)
     with files(out) as part:
         if args.verify:
-            texts, checks = _verified(case, controller, args.precision, prefix, origin)
+            written, checks = _verified(case, controller, args.precision, prefix, origin)
         else:
-            texts, checks = package.files(controller, args.precision, prefix, origin), []
+            written, checks = package.files(controller, args.precision, prefix, origin), []
         ok = all(x.ok for x in checks) if checks else None
-        for name, text in texts.items():
+        for name, text in written.items():
             (part / name).write_text(text, encoding="utf-8")
         if checks:
-            (part / "verify.md").write_text(verify.table(checks, case.name), encoding="utf-8")
-            write_json(part / "verify.json", {"ok": ok, "checks": [x._asdict() for x in checks]})
+            (part / VERIFIED[0]).write_text(verify.table(checks, case.name, mark), encoding="utf-8")
+            write_json(part / VERIFIED[1], {"from": mark, "ok": ok, "checks": [x._asdict() for x in checks]})
     if not args.json:
         if checks:
             rows = [(x.name, x.precision, x.found, x.allowed, "holds" if x.ok else "FAILS") for x in checks]
             print(table(("check", "precision", "found", "allowed", "verdict"), rows))
-        print(f"written: {out}/{', '.join([*texts, *(['verify.md', 'verify.json'] if checks else [])])}")
+        print(f"written: {out}/{', '.join([*written, *(VERIFIED if checks else ())])}")
     return int(ok is False), {"ok": ok, "checks": [x._asdict() for x in checks], "out": str(out)}
 
 

@@ -7,6 +7,7 @@ import contextlib
 import itertools
 import json
 import math
+import os
 import pathlib
 import sys
 import tempfile
@@ -31,6 +32,23 @@ def directory(out: str | None, name: str) -> pathlib.Path:
             raise ValueError(f"--out {path}: it holds the study of an ensemble ({file}). Choose another directory.")
     make(path)
     return path
+
+
+def spare(out: pathlib.Path, names: Iterable[str], mark: str) -> None:
+    """Raise ValueError where what has one of these names in `out` is not a file with this mark: it would be lost."""
+    for name in names:
+        if os.path.lexists(out / name) and not _holds(out / name, mark):
+            raise ValueError(
+                f"--out {out}: {name} is there already, not from an export of the same prefix, and would be lost. "
+                "Choose another directory, or move it away."
+            )
+
+
+def _holds(path: pathlib.Path, mark: str) -> bool:
+    try:
+        return path.is_file() and mark.encode() in path.read_bytes()
+    except OSError:
+        return False
 
 
 def target(out: str | None, name: str) -> pathlib.Path:

@@ -10,11 +10,13 @@ from ambjax.export.controller import INPUTS, OUTPUTS, Controller
 from ambjax.export.reference import Points, Results, points, results
 from ambjax.export.source import Origin, Writer, order_of_work
 from ambjax.export.statements import PRECISIONS, literal, word
-from ambjax.export.texts import MAKEFILE, README, TEST
+from ambjax.export.texts import MAKEFILE, MARK, README, TEST
 from ambjax.export.trace import Trace, trace
 
 # Points of the test program, and the units in the last place, or the share, by which the C may be off JAX.
 VECTORS = 100
+# Names of the files, by their prefix.
+NAMES = ("{p}.h", "{p}.c", "{p}_test.c", "{p}_vectors.h", "Makefile", "README.md")
 ULPS, SHARE = 4, 1e-5
 
 
@@ -27,14 +29,9 @@ def files(controller: Controller, precision: str, prefix: str, origin: Origin) -
 def written(traced: Trace, prefix: str, origin: Origin) -> dict[str, str]:
     """The same of a trace."""
     writer, at = Writer(traced, prefix, origin), points(traced, VECTORS, seed=1)
-    return {
-        f"{prefix}.h": writer.header(),
-        f"{prefix}.c": writer.source(),
-        f"{prefix}_test.c": _test(writer),
-        f"{prefix}_vectors.h": _vectors(writer, at, results(traced, at)),
-        "Makefile": MAKEFILE.format(p=prefix),
-        "README.md": _readme(writer),
-    }
+    vectors, makefile = _vectors(writer, at, results(traced, at)), MAKEFILE.format(p=prefix)
+    texts = (writer.header(), writer.source(), _test(writer), vectors, makefile, _readme(writer))
+    return dict(zip((name.format(p=prefix) for name in NAMES), texts, strict=True))
 
 
 def tolerance(precision: str) -> tuple[float, float]:
@@ -123,6 +120,7 @@ def _readme(writer: Writer) -> str:
     return README.format(
         p=p,
         P=p.upper(),
+        mark=MARK.format(p=p),
         case=writer.origin.case,
         cascade="\n".join(f"- {line}" for line in writer.origin.cascade),
         order="\n".join(order_of_work(t)),

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from ambjax._version import __version__
 from ambjax.export.controller import BITS, Number
 from ambjax.export.statements import Statements, literal, word
-from ambjax.export.texts import HEADER, SOURCE
+from ambjax.export.texts import HEADER, MARK, SOURCE
 from ambjax.export.trace import UNREAD, Trace
 
 SLACK = 256  # bytes of a stack frame beside its numbers: registers saved, padding
@@ -96,7 +96,7 @@ class Writer:
     def banner(self, file: str) -> str:
         """First lines of a file: what it is, and where it is from."""
         lines = [f"{file}: the controller of case '{self.origin.case}' as C99, written by ambjax {__version__}."]
-        lines += ["Generated: change the case and export it again.", f"SHA-256 of the case: {self.origin.digest}"]
+        lines += [MARK.format(p=self.prefix), f"SHA-256 of the case: {self.origin.digest}"]
         return "/* " + "\n * ".join(lines) + " */"
 
     # --- the header ---

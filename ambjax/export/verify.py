@@ -124,16 +124,15 @@ def _looped(precision: str, found: loop.Beside) -> Iterator[Check]:
     yield Check("closed loop, metrics", precision, told, f"{found.off_allowed:.2g}", found.off <= found.off_allowed)
 
 
-def table(checks: list[Check], case: str) -> str:
-    """The checks as a page of Markdown."""
+def table(checks: list[Check], case: str, mark: str) -> str:
+    """The checks as a page of Markdown, which ends with this line."""
     rows = [f"| {x.name} | {x.precision} | {x.found} | {x.allowed} | {'holds' if x.ok else 'FAILS'} |" for x in checks]
     verdict = "All of it holds." if all(x.ok for x in checks) else "It does NOT hold."
     head = "| check | precision | found | allowed | verdict |\n|---|---|---|---|---|"
     return (
         f"# The controller of case '{case}' as C, held to JAX\n\n{verdict}\n\n{head}\n"
         + "\n".join(rows)
-        + "\n\n"
-        + TOLD
+        + f"\n\n{TOLD}\n{mark}\n"
     )
 
 
