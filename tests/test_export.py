@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+import tempfile
 from typing import Any
 
 import jax
@@ -20,7 +21,7 @@ from ambjax.cases.template import template
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.position import force_for, sliding_variable
 from ambjax.control.processor import Processor
-from ambjax.export import loop
+from ambjax.export import loop, machine
 from ambjax.export.controller import Inputs, controller_of
 from ambjax.export.machine import Compiled, build
 from ambjax.export.package import described, files
@@ -213,11 +214,11 @@ def test_a_delay_beyond_the_exported_one_is_refused(tmp_path):
     for name in ("amb.h", "amb.c"):
         (tmp_path / name).write_text(made[name])
     assert not build([tmp_path / "amb.c"], tmp_path / "amb.so", "-shared", "-fPIC")
-    machine = Compiled(tmp_path / "amb.so", traced, "amb")
+    library = Compiled(tmp_path / "amb.so", traced, "amb")
     (at,) = (k for k, x in enumerate(traced.parameters) if x.name == "processor.delay")
     for delay, bit in {1.0: 0, 0.0: 0, 0.4: 0, 1.5: 2, np.nextafter(1, 2): 2, -1e-9: 2, np.nan: 2}.items():
-        machine.parameters[at] = delay
-        assert machine.step() & 2 == bit, delay
+        library.parameters[at] = delay
+        assert library.step() & 2 == bit, delay
     told = "params->processor.delay: from 0 to 1, else every step is refused"
     assert "amb_real delay; /* [samples, from 0 to 1] " in made["amb.h"]
     assert all(told in made[name] for name in ("amb.h", "README.md"))
@@ -423,6 +424,56 @@ def test_what_cannot_be_exported_is_refused_in_one_line(case, tmp_path, capsys, 
     monkeypatch.setenv("CC", "no-such-compiler")
     assert "there is no C compiler (no-such-compiler)" in refused(capsys, case, "--out", out, "--verify")
     assert not out.exists()
+
+
+LAST = 'while [ "$1" != -o ]; do shift; done; '
+# What a compiler does, as a script, and what is told of it.
+COMPILERS = {
+    "it is no program": ("\0", "the C compiler {cc} cannot be run (Exec format error)"),
+    "it compiles nothing": (
+        "#!/bin/sh\necho error: no licence >&2; exit 1",
+        "{cc} makes no program that works here (no l",
+    ),
+    "nothing that it makes may run": (
+        f'#!/bin/sh\ncc "$@" || exit 1; {LAST} chmod a-x "$2"',
+        "what {cc} made cannot be run in ",
+    ),
+    "it has no sanitizers": (
+        '#!/bin/sh\ncase "$*" in *sanitize*) echo "ld: cannot find -lasan" >&2; exit 1 ;; esac; exec cc "$@"',
+        "{cc} makes no sanitized program that works here (cannot find -lasan). Install libasan",
+    ),
+    "its sanitizers fail": (
+        f'#!/bin/sh\ncc "$@" || exit 1; case "$*" in *sanitize*) {LAST} echo "echo no ptrace; exit 1" | '
+        'sed "1i #!/bin/sh" > "$2" ;; esac',
+        "{cc} makes no sanitized program that works here (no ptrace)",
+    ),
+    "its libraries are none": (
+        f'#!/bin/sh\ncc "$@" || exit 1; case "$*" in *-shared*) {LAST} echo > "$2" ;; esac',
+        "what {cc} made cannot be loaded in ",
+    ),
+}
+
+
+@compiled
+@pytest.mark.parametrize(("does", "told"), COMPILERS.values(), ids=COMPILERS)
+def test_a_machine_that_decides_nothing_is_told_as_that(case, tmp_path, capsys, monkeypatch, does, told):
+    (cc := tmp_path / "mycc").write_text(does)
+    cc.chmod(0o755)
+    monkeypatch.setenv("CC", str(cc))
+    assert f"--verify: {told.format(cc=cc)}" in refused(capsys, case, "--out", tmp_path / "c", "--verify")
+    assert not (tmp_path / "c").exists()
+
+
+@compiled
+def test_programs_that_do_not_end_or_find_no_room_decide_nothing(case, tmp_path, capsys, monkeypatch):
+    out = ("--out", tmp_path / "c", "--verify")
+    monkeypatch.setattr(machine, "PATIENCE", 1e-9)
+    assert "did not end within 1e-09 s, and nothing is decided" in refused(capsys, case, *out)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
+    assert "cannot write to the folder for temporary files (No such file" in refused(capsys, case, *out)
+    with pytest.raises(ValueError, match="cannot write to the folder for temporary files"):
+        verify({}, None)
+    assert not (tmp_path / "c").exists()
 
 
 def test_a_law_that_is_no_scalar_code_is_named():

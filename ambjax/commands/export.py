@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     controller = controller_of(case.cascade, case.scenario.u_max, float(case.clock.sample_period))
     prefix = _prefix(args.prefix, case.name)
     if args.verify:
-        machine.compiler()
+        machine.check()
     digest = hashlib.sha256(case.text.encode()).hexdigest()
     origin = Origin(case.name, digest, package.described(controller))
     out = directory(args.out, f"export-{case.name}")

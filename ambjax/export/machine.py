@@ -1,10 +1,13 @@
 """The C compiler of this machine, and the controller that it makes as a function of Python."""
 
+import contextlib
 import ctypes
 import os
 import pathlib
 import shutil
 import subprocess
+import tempfile
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -17,6 +20,9 @@ from ambjax.export.trace import Trace
 STRICT = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic", "-Werror"]
 EXACT = "-ffp-contract=off"
 SANITIZED = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+SHARED = ["-shared", "-fPIC"]
+# Seconds that a program may take.
+PATIENCE = 60
 
 
 def compiler() -> str:
@@ -34,8 +40,93 @@ def compiler() -> str:
 def build(sources: list[pathlib.Path], target: pathlib.Path, *flags: str) -> str:
     """Compile; the compiler's complaint, empty if there is none."""
     command = [compiler(), *STRICT, EXACT, *flags, *map(str, sources), "-o", str(target), "-lm"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+    except OSError as error:
+        raise ValueError(
+            f"--verify: the C compiler {command[0]} cannot be run ({error.strerror}). Name another in CC, or leave out "
+            "--verify."
+        ) from None
     return "" if done.returncode == 0 else done.stderr.strip() or f"exit code {done.returncode}"
+
+
+def execute(program: pathlib.Path) -> tuple[int, str]:
+    """Exit code of a compiled program, and what it said. Raises ValueError where it cannot be run, or does not end."""
+    try:
+        done = subprocess.run(
+            [program], capture_output=True, text=True, errors="replace", check=False, timeout=PATIENCE
+        )
+    except subprocess.TimeoutExpired:
+        raise ValueError(
+            f"--verify: the program {program.name} did not end within {PATIENCE:g} s, and nothing is decided. Try "
+            "again when the machine is less busy, or leave out --verify."
+        ) from None
+    except OSError as error:
+        raise ValueError(_unused("run", program, error.strerror or str(error))) from None
+    return done.returncode, done.stdout + done.stderr
+
+
+def load(library: pathlib.Path) -> ctypes.CDLL:
+    """A compiled library. Raises ValueError where this machine cannot load it."""
+    try:
+        return ctypes.CDLL(str(library))
+    except OSError as error:
+        raise ValueError(_unused("loaded", library, str(error).removeprefix(f"{library}: "))) from None
+
+
+def _unused(verb: str, what: pathlib.Path, why: str) -> str:
+    return (
+        f"--verify: what {compiler()} made cannot be {verb} in {what.parent} ({why}). Name a folder that allows it in "
+        "TMPDIR, a compiler for this machine in CC, or leave out --verify."
+    )
+
+
+@contextlib.contextmanager
+def scratch() -> Iterator[pathlib.Path]:
+    """A folder for what is compiled, gone at the end. Raises ValueError where it cannot be written."""
+    try:
+        with tempfile.TemporaryDirectory(prefix="ambjax-") as folder:
+            yield pathlib.Path(folder)
+    except OSError as error:
+        raise ValueError(
+            f"--verify: cannot write to the folder for temporary files ({error.strerror or error}). Make room, name "
+            "another in TMPDIR, or leave out --verify."
+        ) from None
+
+
+def check() -> None:
+    """See that this machine makes programs, plain and sanitized, and libraries, and runs them.
+
+    Raises ValueError for what it does not: the C would not be judged, but the machine.
+    """
+    with scratch() as folder:
+        source = folder / "empty.c"
+        source.write_text("int main(void)\n{\n    return 0;\n}\n", encoding="utf-8")
+        for what, flags, fix in (
+            ("program", [], "Name another in CC"),
+            ("sanitized program", SANITIZED, "Install libasan and libubsan, name a compiler that has them in CC"),
+            ("library", SHARED, "Name another in CC"),
+        ):
+            made = folder / f"empty{len(flags)}"
+            said = build([source], made, *flags)
+            if not said and flags is SHARED:
+                load(made)
+            elif not said:
+                code, told = execute(made)
+                said = "" if code == 0 else told.strip() or f"exit code {code}"
+            if said:
+                raise ValueError(
+                    f"--verify: {compiler()} makes no {what} that works here ({short(said)}). {fix}, or leave out "
+                    "--verify."
+                )
+
+
+def short(text: str) -> str:
+    """The last line of what a program said; of a compiler, its first error, or the library that it misses."""
+    lines = [line for line in text.strip().splitlines() if line]
+    found = [line[line.index("cannot find") :] for line in lines if "cannot find" in line]
+    found += [line.partition("error:")[2].strip() for line in lines if "error:" in line]
+    return [*found, *lines[-1:], ""][0][:160]
 
 
 class Compiled:
@@ -43,7 +134,7 @@ class Compiled:
 
     def __init__(self, library: pathlib.Path, trace: Trace, prefix: str):
         self.trace, real = trace, np.dtype(PRECISIONS[trace.precision])
-        loaded = ctypes.CDLL(str(library))
+        loaded = load(library)
         self._step = getattr(loaded, f"{prefix}_step")
         self._step.restype = ctypes.c_uint32
         self.memory = np.dtype([("numbers", real, (len(trace.state),)), ("started", np.uint32)], align=True)

@@ -2,8 +2,6 @@
 
 import dataclasses
 import pathlib
-import subprocess
-import tempfile
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
@@ -11,15 +9,15 @@ import numpy as np
 
 from ambjax.export import loop
 from ambjax.export.controller import Controller
-from ambjax.export.machine import EXACT, SANITIZED, STRICT, Compiled, build
+from ambjax.export.machine import EXACT, SANITIZED, SHARED, STRICT, Compiled, build, execute, scratch, short
 from ambjax.export.package import SHARE, ULPS, tolerance, written
 from ambjax.export.reference import Points, Results, points, results
 from ambjax.export.source import Origin
 from ambjax.export.statements import PRECISIONS
 from ambjax.export.trace import Trace, trace
 
-# Random states and inputs of the comparison of one step, and seconds that a test program may take.
-COUNT, PATIENCE = 10_000, 60
+# Random states and inputs of the comparison of one step.
+COUNT = 10_000
 
 
 class Check(NamedTuple):
@@ -51,11 +49,14 @@ def draft(controller: Controller, precision: str, prefix: str, origin: Origin, c
 
 
 def verify(drafts: Mapping[str, Draft], case: loop.Case | None) -> list[Check]:
-    """Every check, in both precisions; without a case none of the closed loop. Raises ValueError without a compiler."""
+    """Every check, in both precisions; without a case none of the closed loop.
+
+    Raises ValueError where the machine decides nothing: without a compiler, or where what it makes cannot be run.
+    """
     checks, machines = [], {}
-    with tempfile.TemporaryDirectory(prefix="ambjax-") as folder:
+    with scratch() as folder:
         for precision, one in drafts.items():
-            at = pathlib.Path(folder) / precision
+            at = folder / precision
             at.mkdir()
             for name, text in one.files.items():
                 (at / name).write_text(text, encoding="utf-8")
@@ -76,20 +77,12 @@ def _built(one: Draft, precision: str, at: pathlib.Path) -> Iterator[Check]:
         program = at / f"test{len(flags)}"
         said = build([source, test], program, *flags)
         words = "-fsanitize=address,undefined" if flags else " ".join(STRICT[2:])
-        yield Check(f"compiles{how}", precision, _short(said) or "no warning", words, not said)
+        yield Check(f"compiles{how}", precision, short(said) or "no warning", words, not said)
         if not said:
-            done = subprocess.run([program], capture_output=True, text=True, check=False, timeout=PATIENCE)
-            told = _short(done.stdout + done.stderr)
-            yield Check(f"test program{how}", precision, told, "exit code 0", done.returncode == 0)
-    said = build([source], at / "controller.so", "-shared", "-fPIC")
-    yield Check("library", precision, _short(said) or "no warning", EXACT, not said)
-
-
-def _short(text: str) -> str:
-    """The last line of what a program said; of a compiler, its first error."""
-    lines = [line for line in text.strip().splitlines() if line]
-    errors = [line for line in lines if "error:" in line]
-    return (errors[0].partition("error:")[2].strip() if errors else lines[-1] if lines else "")[:160]
+            code, told = execute(program)
+            yield Check(f"test program{how}", precision, short(told), "exit code 0", code == 0)
+    said = build([source], at / "controller.so", *SHARED)
+    yield Check("library", precision, short(said) or "no warning", EXACT, not said)
 
 
 def _stepped(one: Draft, precision: str, machine: Compiled) -> Iterator[Check]:
