@@ -857,5 +857,26 @@ EXPORT = [
         "program.nodes[0] = program.nodes[0]._replace(text='1.0')\n    keep = _alive(program",
         "tests/test_export.py::test_one_step_is_jaxs[one and a half-double]",
     ),
+    M(
+        "a delay beyond the one that was exported is taken in silence",
+        "ambjax/export/controller.py",
+        ", processor.delay <= processor.most]",
+        "]",
+        "tests/test_export.py::test_a_delay_beyond_the_exported_one_is_refused",
+    ),
+    M(
+        "no metric is judged beside one of which nothing is allowed",
+        "ambjax/export/loop.py",
+        "_share(off[name], allowed[name]))",
+        "off[name] / allowed[name] if allowed[name] > 0 else np.inf * bool(off[name]))",
+        "tests/test_export.py::test_every_metric_of_the_loop_is_judged",
+    ),
+    M(
+        "an export replaces what others wrote",
+        "ambjax/commands/outputs.py",
+        "and not _holds(out / name, mark)",
+        "and False",
+        "tests/test_export.py::test_only_files_of_an_earlier_export_of_the_same_prefix_are_replaced",
+    ),
 ]
 MUTATIONS = [*PLANT, *LAWS, *LOOP, *METHODS, *NOISE, *ENSEMBLE, *SEARCH, *SAMPLED, *CHECK, *EXPORT]

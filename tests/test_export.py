@@ -431,8 +431,8 @@ LAST = 'while [ "$1" != -o ]; do shift; done; '
 COMPILERS = {
     "it is no program": ("\0", "the C compiler {cc} cannot be run (Exec format error)"),
     "it compiles nothing": (
-        "#!/bin/sh\necho error: no licence >&2; exit 1",
-        "{cc} makes no program that works here (no l",
+        "#!/bin/sh\necho error: sick >&2; exit 1",
+        "{cc} makes no program that works here (sick)",
     ),
     "nothing that it makes may run": (
         f'#!/bin/sh\ncc "$@" || exit 1; {LAST} chmod a-x "$2"',
