@@ -142,7 +142,7 @@ class Controller:
         measured = Measurement(*inputs[:3])
         fine = [jnp.abs(getattr(inputs, name)) <= getattr(limits, name) for name in Inputs._fields if name in read]
         processor: Any = cascade.processor
-        if processor.predict:  # the prediction's parts are those of the delay that was exported
+        if processor.predicts:  # the prediction's parts are those of the delay that was exported
             fine += [processor.delay >= 0, processor.delay <= processor.most]
         good = functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
         laws = choose(memory.started, memory.laws, cascade.init(measured))
