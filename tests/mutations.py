@@ -588,8 +588,8 @@ SEARCH = [
     M(
         "stressed members hear no more than the others",
         "tuning/objective/members.py",
-        "lambda std: std * who.loud",
-        "lambda std: std * 1.0",
+        "sensor.louder(who.loud)",
+        "sensor.louder(1.0)",
         "tests/test_tuning_search.py::test_stressed_members_hear_more_and_count_by_being_held",
     ),
     M(

@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     origin = Origin(case.name, digest, package.described(controller))
     out = directory(args.out, f"export-{case.name}")
     mark = texts.MARK.format(p=prefix)
-    spare(out, [*(name.format(p=prefix) for name in package.NAMES), *(VERIFIED if args.verify else ())], mark)
+    spare(out, [*(name.format(p=prefix) for name in package.NAMES), *VERIFIED], mark)
     say_doubts(case, args.case)
     with files(out) as part:
         if args.verify:
@@ -49,6 +49,9 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         if checks:
             (part / VERIFIED[0]).write_text(verify.table(checks, case.name, mark), encoding="utf-8")
             write_json(part / VERIFIED[1], {"from": mark, "ok": ok, "checks": [x._asdict() for x in checks]})
+    if not checks:  # what was verified is not there any more
+        for name in VERIFIED:
+            (out / name).unlink(missing_ok=True)
     if not args.json:
         if checks:
             rows = [(x.name, x.precision, x.found, x.allowed, "holds" if x.ok else "FAILS") for x in checks]
