@@ -1,6 +1,7 @@
 """Sensors and amplifiers as they are: each part against what defines it, and what a case file may say of them."""
 
 import dataclasses
+import decimal
 import math
 import tomllib
 
@@ -66,11 +67,47 @@ def test_the_low_pass_is_exact_for_a_cubic(bandwidth):
     np.testing.assert_allclose(got, run.y[0, -1], rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("bandwidth", [10.0, 1e9])
-def test_the_low_pass_stays_finite_with_its_derivative_over_no_time(bandwidth):
-    lagged = lambda h: Sensor(bandwidth=bandwidth).lagged(jnp.asarray(2e-3), motion(), motion(), h)  # noqa: E731
-    assert float(lagged(jnp.asarray(0.0))) == 2e-3
-    assert np.isfinite(jax.grad(lagged)(jnp.asarray(0.0)))
+SHORTNESS = np.concatenate([[0.0], np.geomspace(1e-18, 1e3, 64), [0.999, 1.001]])
+
+
+def low_pass(y, before, after, h, bandwidth):
+    """The same in decimals of 150 digits, by the moments of exp(-b (1 - s)), b = w h."""
+    exact = decimal.Context(prec=150)
+    c_1, end, rise = (exact.create_decimal(x) for x in (h * before[1], h * after[1], after[0] - before[0]))
+    b = exact.create_decimal(2 * np.pi * bandwidth * h)
+    with decimal.localcontext(exact):
+        moments = [1 - (-b).exp()]
+        for k in range(1, 4):
+            moments.append(1 - k * moments[-1] / b if b else b)
+        start = exact.create_decimal(before[0]) - exact.create_decimal(y)
+        terms = start, c_1, 3 * rise - 2 * c_1 - end, c_1 + end - 2 * rise
+        return float(exact.create_decimal(y) + sum(m * c for m, c in zip(moments, terms, strict=True)))
+
+
+@pytest.mark.parametrize("kind", ["float64", "float32"])
+def test_the_low_pass_is_exact_and_has_derivatives_over_any_time(kind):
+    """From none on: 1e-15 s is what is left of a sample after a ramp, or of a delay just below a whole number."""
+    bandwidth, y, slope = 1e4, 2e-3, 2 * np.pi * 1e4
+    with jax.enable_x64(kind == "float64"):
+        h = (SHORTNESS / slope).astype(kind).astype(float)
+        ends = [np.stack([1e-3 + 0.2 * t + 3 * t**2, 0.2 + 0.3 * np.sign(t)]) for t in (0 * h, h)]
+        ends = [end.astype(kind).astype(float) for end in ends]
+
+        def lagged(h, w, y, *ends):
+            before, after = (motion(*end) for end in ends)
+            return Sensor(bandwidth=w).lagged(jnp.asarray(y), before, after, h)
+
+        given = [jnp.asarray(x, kind) for x in (h, 0 * h + bandwidth, 0 * h + y, ends[0].T, ends[1].T)]
+        got = np.asarray(jax.vmap(lagged)(*given))
+        slopes = [np.asarray(x) for x in jax.vmap(jax.grad(lagged, argnums=range(5)))(*given)]
+    start = float(given[2][0])
+    want = [low_pass(start, a, b, t, bandwidth) for a, b, t in zip(ends[0].T, ends[1].T, h, strict=True)]
+    # some roundings of a number of 2e-3 m
+    np.testing.assert_allclose(got, want, rtol=0, atol=8 * np.finfo(kind).eps * 2e-3)
+    assert got[0] == start
+    assert all(np.isfinite(x).all() for x in slopes)
+    # at first y' = w (z - y)
+    np.testing.assert_allclose(slopes[0][:10], slope * (1e-3 - y), rtol=1e-6)
 
 
 FAST, SLOW = {"bandwidth": 5e3}, {"slew": 2e6}

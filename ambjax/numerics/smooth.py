@@ -89,7 +89,7 @@ def _reciprocal_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Arra
     return value, tangents[0] * -(value * value)
 
 
-def _polynomial(u: Array, coefficients: Sequence[Scalar]) -> Any:
+def polynomial(u: Array, coefficients: Sequence[Scalar]) -> Any:
     """Neighbours in pairs, then pairs in pairs (Estrin): a third of the latency of Horner's scheme."""
     terms = list(coefficients)
     while len(terms) > 1:
@@ -114,11 +114,11 @@ def arctan_per(x: Array, per: Array) -> Array:
         u = size * size
         top = [jnp.where(large, far, near) for near, far in zip(ARCTAN_P, reversed(ARCTAN_P), strict=True)]
         below = [jnp.where(large, far, near) for near, far in zip(ARCTAN_Q, reversed(ARCTAN_Q), strict=True)]
-        angle, over = size * _polynomial(u, top), _polynomial(u, below)
+        angle, over = size * polynomial(u, top), polynomial(u, below)
         angle = jnp.where(large, HALF_PI * over - angle, angle)
         return jnp.where(x < 0, -angle, angle) / (over * per)
     y = jnp.minimum(size, 1.0) / jnp.maximum(size, 1.0)
-    angle = y * _polynomial(y * y, ARCTAN_R)
+    angle = y * polynomial(y * y, ARCTAN_R)
     angle = jnp.where(large, HALF_PI - angle, angle)
     return jnp.where(x < 0, -angle, angle) / per
 
@@ -137,7 +137,7 @@ def _turn(x: Array) -> Array:
 
 def _quarter(y: Array) -> Array:
     """sin(2 pi y) for |y| <= 1/4."""
-    return y * _polynomial(y * y, SINE_S[y.dtype.name])
+    return y * polynomial(y * y, SINE_S[y.dtype.name])
 
 
 @jax.custom_jvp

@@ -1,6 +1,7 @@
 """Sensors: what is measured, and the errors of it."""
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -8,6 +9,10 @@ from jax import Array, lax
 
 from ambjax.numerics.gaussian import normals
 from ambjax.numerics.records import Scalar, leaf, record, static
+from ambjax.numerics.smooth import polynomial
+
+# m_3 of a low-pass over b = w h < 1 is b times the sum of 3! (-b)^j / (j + 4)!; the next term is below 1e-18.
+SERIES = tuple(math.factorial(3) * (-1) ** j / math.factorial(j + 4) for j in range(16))
 
 
 class Errors(NamedTuple):
@@ -87,15 +92,30 @@ class Sensor:
         Exact for the cubic z that has the positions and velocities of both ends, whatever w h is.
         """
         assert self.bandwidth is not None
-        # z = z_0 + s c_1 + s^2 c_2 + s^3 c_3, 0 <= s <= 1, and y' = b (z - y) has the solution z - z'/b + z''/b^2 - ...
-        # beside the one that dies away.
+        # z = z_0 + s c_1 + s^2 c_2 + s^3 c_3, 0 <= s <= 1
         c_1, rise, end = h * before.z_dot, after.z - before.z, h * after.z_dot
         c_2, c_3 = 3 * rise - 2 * c_1 - end, c_1 + end - 2 * rise
-        b = 2 * jnp.pi * self.bandwidth * jnp.asarray(h)
-        b = jnp.where(b > 0, b, 1.0)  # a stretch of no length: y, below
-        first = before.z - (c_1 - (2 * c_2 - 6 * c_3 / b) / b) / b
-        last = after.z - (end - (2 * c_2 + 6 * c_3 - 6 * c_3 / b) / b) / b
-        return jnp.where(jnp.asarray(h) > 0, last + (y - first) * jnp.exp(-b), y)
+        m_0, m_1, m_2, m_3 = _moments(2 * jnp.pi * self.bandwidth * jnp.asarray(h))
+        return y + (m_0 * (before.z - y) + m_1 * c_1 + m_2 * c_2 + m_3 * c_3)
+
+
+def _moments(b: Array) -> tuple[Array, Array, Array, Array]:
+    """What y' = b (s^k - y), y(0) = 0, reaches at s = 1, for k = 0 to 3 and b >= 0.
+
+    m_0 = 1 - exp(-b), and k m_{k-1} = b (1 - m_k): upwards it loses digits for b < 1, downwards it does not.
+    """
+    short = b < 1
+    few, many = jnp.where(short, b, 0.0), jnp.where(short, 1.0, b)  # neither may leave the numbers where it is not used
+    m_3 = few * polynomial(few, SERIES)
+    m_2 = few * (1 - m_3) / 3
+    m_1 = few * (1 - m_2) / 2
+    down = (few * (1 - m_1), m_1, m_2, m_3)
+    m_0, per = 1 - jnp.exp(-many), 1 / many
+    m_1 = 1 - per * m_0
+    m_2 = 1 - 2 * per * m_1
+    up = (m_0, m_1, m_2, 1 - 3 * per * m_2)
+    m_0, m_1, m_2, m_3 = (jnp.where(short, x, y) for x, y in zip(down, up, strict=True))
+    return m_0, m_1, m_2, m_3
 
 
 def converted(x: Array, bits: Scalar, limit: Scalar) -> Array:
