@@ -707,6 +707,20 @@ SAMPLED = [
         "tests/test_realism.py::test_the_current_stays_within_its_limit",
     ),
     M(
+        "the current limit asks for more than the supply has",
+        "ambjax/world/amplifier.py",
+        "kept = limited(hold(), u_max)",
+        "kept = hold()",
+        "tests/test_realism.py::test_dead_band_and_current_limit",
+    ),
+    M(
+        "the largest voltage is that commanded, whatever the amplifier makes of it",
+        "ambjax/simulation/sampled.py",
+        "noted if self.loop.scenario.amplifier is None else noted._replace(u_peak=span.most.u)",
+        "noted",
+        "tests/test_realism.py::test_the_largest_voltage_is_that_at_the_coils_and_within_the_supply",
+    ),
+    M(
         "a velocity that is not measured is handed on all the same",
         "ambjax/world/sensor.py",
         "if self.velocity else jnp.zeros_like(motion.z_dot)",

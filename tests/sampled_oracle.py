@@ -220,7 +220,13 @@ class Driven:
     """A plant behind its amplifier and its position sensor's low-pass: its y, then those that there are of theirs."""
 
     def __init__(self, world, plant):
-        self.plant, self.body, self.stop, given = plant, plant.body, plant.stop, world.amplifier
+        self.plant, self.body, self.stop, self.u_max, given = (
+            plant,
+            plant.body,
+            plant.stop,
+            world.u_max,
+            world.amplifier,
+        )
         self.sensor, self.follow = world.bandwidth, given.get("bandwidth")
         self.slew, self.dead, self.i_max = (given.get(name) for name in ("slew", "dead_band", "i_max"))
         assert self.follow or not self.slew  # else its rate would jump
@@ -245,7 +251,7 @@ class Driven:
             more.append(min(max(rate, -most), most))
         u = math.copysign(max(abs(u) - (self.dead or 0.0), 0.0), u)
         still, driven = (self.output(self.plant.rates(own, volt, q_z, q_i))[2] for volt in (0.0, 1.0))
-        hold = still / (still - driven)
+        hold = min(max(still / (still - driven), -self.u_max), self.u_max)
         if self.i_max and abs(i) >= self.i_max and (u - hold) * i > 0:
             u = hold
         return [*self.plant.rates(own, u, q_z, q_i), *more]

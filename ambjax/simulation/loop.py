@@ -181,6 +181,7 @@ class ClosedLoop:
             i_ref=command.i_ref,
             u=jnp.where(alive, command.u, 0.0),
             u_mean=jnp.zeros_like(command.u),
+            u_peak=jnp.zeros_like(command.u),
             v=signals.v,
             v_star=command.v_star,
             v_tilde=command.v_tilde,
@@ -195,7 +196,8 @@ class ClosedLoop:
 
     def noted(self, row: Row, span: Span) -> Row:
         """The row of a sample, with what is known only at its end."""
-        return row._replace(u_mean=span.densities.u / jnp.where(span.time > 0, span.time, 1.0))
+        mean = span.densities.u / jnp.where(span.time > 0, span.time, 1.0)
+        return row._replace(u_mean=mean, u_peak=jnp.maximum(jnp.abs(row.u), span.most.u))
 
     def singularity(self, row: Row) -> Array:
         """Positive while (z, i_ref) is on the good side of the singular curve C, 0 on it. Eq. (9)."""

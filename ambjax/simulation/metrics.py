@@ -214,7 +214,7 @@ class Standard:
                 "sigma_reached_s": Reaching("sigma", self.sigma_band),
                 "v_tilde_reached_s": Reaching("v_tilde", self.v_tilde_band),
                 "current_error_reached_s": Reaching("e", self.e_band),
-                "max_abs_u_V": Peak("u"),
+                "max_abs_u_V": Peak("u_peak"),
                 "rms_u_V": Driven("u_squared", root=True),
                 "settled_rms_u_V": Driven("u_squared", late, root=True),
                 "chatter_V": Variation(late),

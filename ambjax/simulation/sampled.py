@@ -172,7 +172,7 @@ class Sampled:
             still, driven = (plant.measurement(plant.rates(x, volt, outside.q_z, outside.q_i)).i for volt in (0.0, 1.0))
             return still / (still - driven)  # i' is linear in u
 
-        return amplifier.at_coil(u, plant.measurement(x).i, hold)
+        return amplifier.at_coil(u, plant.measurement(x).i, self.loop.scenario.u_max, hold)
 
     def _fate(self, plant: Any) -> Array:
         return self.loop.judged(plant, self.loop.scenario.plant.scale(), plant)
@@ -194,7 +194,8 @@ class Sampled:
         return self.loop.signals(t, self.loop.inputs(t), state.plant, state.command, seen, alive)
 
     def noted(self, row: Row, span: Span) -> Row:
-        return self.loop.noted(row, span)
+        noted = self.loop.noted(row, span)
+        return noted if self.loop.scenario.amplifier is None else noted._replace(u_peak=span.most.u)
 
     def singularity(self, row: Row) -> Array:
         return self.loop.singularity(row)

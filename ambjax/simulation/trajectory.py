@@ -36,6 +36,8 @@ class Row(NamedTuple):
     """applied voltage (after the supply's limit; 0 once lost), V"""
     u_mean: Array
     """the same, averaged over the sample that begins at t: what is left of spikes shorter than a sample, V"""
+    u_peak: Array
+    """largest |voltage| at the coils over the same sample, V; on a processor with an amplifier u is what it is told"""
     v: Array
     """scaled magnetic force v(z, i), A^2/m^2. Eq. (3)"""
     v_star: Array
@@ -68,7 +70,7 @@ class Row(NamedTuple):
         return self.i - self.i_ref
 
 
-NOT_SAVED = ("heat", "alive")
+NOT_SAVED = ("u_peak", "heat", "alive")
 
 
 @record

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.smooth import limited
 
 
 @record
@@ -13,7 +14,8 @@ class Amplifier:
     """What an amplifier makes of a voltage that is held: u_a' = w (u - u_a) with w = 2 pi bandwidth, at most `slew`.
 
     Then the dead band (of a bridge's dead time) is taken off its size, and at the current limit what would push the
-    current further out is cut to what keeps it. What is left out is ideal.
+    current further out is cut to what keeps it, or to the supply's end where the motion asks for more: the current then
+    leaves its limit. What is left out is ideal.
     """
 
     bandwidth: Scalar | None = leaf(
@@ -57,13 +59,16 @@ class Amplifier:
         """How long the rate of the first order stays below the slew rate, in times of 1/w; s."""
         return 0.0 if self.bandwidth is None else 1 / self.slope()
 
-    def at_coil(self, u_a: Array, i: Array, hold: Callable[[], Array]) -> Array:
-        """What of its voltage reaches the coils at a current of i (A), V. `hold`: what would keep that current, V."""
+    def at_coil(self, u_a: Array, i: Array, u_max: Scalar, hold: Callable[[], Array]) -> Array:
+        """What of its voltage reaches the coils at a current of i (A), V: never beyond the supply's u_max (V).
+
+        `hold`: what would keep that current, V.
+        """
         if self.dead_band is not None:
             size = jnp.maximum(jnp.abs(u_a) - self.dead_band, 0.0)
             u_a = jnp.where(u_a < 0, -size, size)
         if self.i_max is None:
             return u_a
-        kept = hold()
+        kept = limited(hold(), u_max)
         u_a = jnp.where((i >= self.i_max) & (u_a > kept), kept, u_a)
         return jnp.where((i <= -self.i_max) & (u_a < kept), kept, u_a)

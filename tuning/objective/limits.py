@@ -41,7 +41,7 @@ STRETCHES = 200
 
 @record
 class Typical:
-    """The 16-norm over samples of the largest |row.`of`| in each, between samples too: a smooth maximum.
+    """The 16-norm over samples of |row.`of`|: a smooth maximum.
 
     At its stop a voltage has no slope; the samples that are below it do.
     """
@@ -55,8 +55,7 @@ class Typical:
 
     def update(self, carry: tuple[Array, Array], row: Any, span: Any) -> tuple[Array, Array]:
         total, count = carry
-        value = jnp.maximum(jnp.abs(getattr(row, self.of)), getattr(span.most, self.of))
-        return total + (value / self.size) ** NORM, count + row.alive
+        return total + (jnp.abs(getattr(row, self.of)) / self.size) ** NORM, count + row.alive
 
     def result(self, carry: tuple[Array, Array], ending: Ending) -> Array:
         total, count = carry
@@ -139,7 +138,11 @@ KINDS: dict[str, Kind] = {
         **_POOLED,
     ),
     "max_u_V": Kind(
-        "V", "largest voltage of the run", fold=lambda site, asked: Typical("u", asked), exact="max_abs_u_V", **_WORST
+        "V",
+        "largest voltage of the run",
+        fold=lambda site, asked: Typical("u_peak", asked),
+        exact="max_abs_u_V",
+        **_WORST,
     ),
     "max_abs_i_A": Kind(
         "A", "largest current of the run", fold=lambda site, asked: Peak("i"), exact="max_abs_i_A", **_WORST
