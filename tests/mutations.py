@@ -721,6 +721,20 @@ SAMPLED = [
         "tests/test_realism.py::test_the_largest_voltage_is_that_at_the_coils_and_within_the_supply",
     ),
     M(
+        "a step on a processor is chosen for the motion alone, however fast the coils",
+        "ambjax/simulation/method.py",
+        "settled = math.ceil(sample_period * named[COILS] / SETTLED)",
+        "settled = 1",
+        "tests/test_integrate.py::test_coils_that_settle_within_a_sample_are_resolved[Plant]",
+    ),
+    M(
+        "the step of an ensemble is that of the nominal amplifier",
+        "ambjax/ensemble/spread.py",
+        '"actuator.bandwidth", "run.clearance"',
+        '"run.clearance"',
+        "tests/test_realism.py::test_the_step_holds_for_the_ends_of_an_amplifier_s_spread",
+    ),
+    M(
         "a velocity that is not measured is handed on all the same",
         "ambjax/world/sensor.py",
         "if self.velocity else jnp.zeros_like(motion.z_dot)",

@@ -277,6 +277,43 @@ def test_method_choice():
     assert amb.with_method(mine, REPAIRED, TRACKING) is mine
 
 
+# R / L of a wide gap times the sample is 12: two substeps, which the motion asks for, are unstable
+LIGHT = {"n": 50.0, "A": 1e-4, "mu_0": 1.2566e-6, "s_0": 5e-4, "i_0": 1.0, "m": 0.1, "R": 10.0, "k_z": 0.0}
+
+
+@pytest.mark.parametrize("kind", [amb.Plant, amb.TwoCoil])
+def test_coils_that_settle_within_a_sample_are_resolved(kind):
+    plant, period = kind(**LIGHT), 2e-4
+    sampled, world = amb.Cascade(processor=amb.Processor()), amb.Scenario(plant=plant)
+    at = lambda z: jax.jacfwd(plant.rates)(plant.start(amb.world.sensor.Measurement(z, 0.0, 0.0)), 0.0)  # noqa: E731
+    steepest = max(np.abs(np.linalg.eigvals(_matrix(at(z)))).max() for z in (-0.9 * 5e-4, 0.9 * 5e-4))
+    method = amb.choose_method(sampled, world, period)
+    assert isinstance(method, amb.RK4)
+    assert 0.4 < steepest * method.step_size(period) < 0.5
+    wide = amb.Cascade(inversion=amb.inversion.Adaptive(1e3, 25.0))
+    for cascade in (sampled, wide):
+        with pytest.raises(
+            ValueError, match=r"only up to 4.6e-05 s, because the current in the coils has slope 6.05e\+04"
+        ):
+            amb.with_method(amb.Clock(10, period, amb.RK4(2)), cascade, world)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def moved(substeps):
+        held = Problem(lambda t: (), lambda _, x: plant.rates(x, 10.0), plant.scale(), lambda x: jnp.int32(0))
+        start = plant.start(amb.world.sensor.Measurement(*map(jnp.asarray, (1e-4, 0.0, -0.2))))
+        return plant.measurement(amb.RK4(substeps).advance(held, 0.0, period, start, ()).state)
+
+    error = np.abs(np.subtract(moved(method.substeps), moved(20 * method.substeps)))
+    np.testing.assert_array_less(error, [1e-11, 1e-6, 1e-6])
+    stiff = dataclasses.replace(world, plant=dataclasses.replace(plant, R=1e4))
+    assert isinstance(amb.choose_method(sampled, stiff, period), amb.AdaptiveRodas3)
+    assert amb.choose_method(sampled, stiff, period, reverse=True) == amb.Rodas3(64)
+
+
+def _matrix(jacobian):
+    return np.array([[float(x) for x in row] for row in jacobian])
+
+
 @pytest.mark.parametrize("gamma", np.geomspace(1e7, 1e11, 9))
 def test_a_chosen_explicit_step_is_within_its_limit(gamma):
     cascade = amb.Cascade(inversion=amb.inversion.Adaptive(gamma=gamma, p=25e-6))

@@ -16,8 +16,10 @@ import ambjax as amb
 from ambjax.cases.reader import case_from
 from ambjax.cases.template import template
 from ambjax.commands.doubts import doubts
+from ambjax.commands.ensemble import study_of
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
+from ambjax.ensemble.maps import Axis, stepped
 from ambjax.simulation.method import DRIVEN, choose_method
 from ambjax.simulation.metrics import Named
 from ambjax.world.amplifier import Amplifier
@@ -283,6 +285,19 @@ def test_parts_can_be_spread():
         "spread": {"actuator": {"bandwidth": {"percent": 10}}},
     }
     assert case_from(CASE | raw).spread.paths == ("actuator.bandwidth",)
+
+
+def test_the_step_holds_for_the_ends_of_an_amplifier_s_spread():
+    raw = CASE | {"actuator": {"bandwidth": 1e3}}
+    wide = case_from(raw | {"spread": {"actuator": {"bandwidth": {"log-uniform": [500.0, 2e4]}}}}).clock.method
+    assert wide == case_from(CASE | {"actuator": {"bandwidth": 2e4}}).clock.method == amb.RK4(26)
+    case = case_from(raw)
+    study, bandwidth = study_of(case, None, 1), Axis("actuator.bandwidth", np.array([500.0, 2e4]))
+    assert case.clock.method == amb.RK4(3)
+    assert stepped(study, bandwidth, Axis("initial.z", np.zeros(2))).clock.method == wide
+    assert stepped(study, bandwidth, Axis("clock.sample_period", np.array([5e-5, 2e-4]))).clock.method == amb.RK4(51)
+    asked = case_from(CASE | raw | {"clock": {"duration": 0.01, "dt": 2e-5}})
+    assert stepped(study_of(asked, None, 1), bandwidth, Axis("initial.z", np.zeros(2))).clock.method == amb.RK4(5)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from ambjax.cases.reader import MOST_SAMPLES, Case
 from ambjax.commands.doubts import read_aloud
 from ambjax.commands.ensemble import study_of
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json
-from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid
+from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, stepped
 from ambjax.ensemble.paths import places
 from ambjax.numerics.records import numbers, within
 from ambjax.simulation.clock import Clock
@@ -36,7 +36,8 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         _check_samples(case, x, y, args.members)
     maps = []
     for case, study, (x, y) in zip(cases, studies, axes, strict=True):
-        say(f"{case.name}: {cells} cells of {args.members}; method: {case.clock.method}")
+        study = stepped(study, x, y)
+        say(f"{case.name}: {cells} cells of {args.members}; method: {study.clock.method}")
         if args.members == 1 and case.spread.entries:
             say(f"{case.name}: nominal, its [spread] is not drawn; --members N, N above 1, draws it.")
         maps.append(grid(study, x, y))

@@ -7,12 +7,13 @@ import jax
 import numpy as np
 
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble.distributions import Distribution
+from ambjax.ensemble.distributions import Distribution, Uniform
 from ambjax.ensemble.engine import run_ensemble
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.paths import places
-from ambjax.ensemble.spread import Spread, apply, require_path
+from ambjax.ensemble.spread import STEP, Spread, apply, corners, ends, require_path
 from ambjax.ensemble.study import Study
+from ambjax.simulation.method import choose_method
 from ambjax.simulation.metrics import standard_for
 from ambjax.world.scenario import Scenario
 
@@ -76,6 +77,24 @@ def grid(study: Study, x: Axis, y: Axis) -> Map:
     counts = np.sum(ended & ~stalled, axis=-1), np.sum(stalled, axis=-1)
     paths = tuple(path for path, _ in _entries(study, (x.path, y.path)))
     return Map(x, y, survival.value, survival.low, survival.high, median, *counts, paths)
+
+
+def stepped(study: Study, x: Axis, y: Axis) -> Study:
+    """On a processor, the study with its method chosen for the axes' ends too, if it was chosen for its spread's.
+
+    Raises ValueError for a path that does not exist.
+    """
+    _check(study, x, y)
+    cascade, scenario, clock = study.cascade, study.scenario, study.clock
+    usual = choose_method(*corners(study.spread, cascade, scenario), float(clock.sample_period))
+    if cascade.processor is None or clock.method != usual:
+        return study
+    axes = {axis.path: (float(axis.values[0]), float(axis.values[-1])) for axis in (x, y)}
+    period = axes.pop(PERIOD, (clock.sample_period,))[-1]
+    others = [entry for entry in study.spread.entries if entry[0] not in axes]
+    wide = Spread((*others, *((path, Uniform(*reach)) for path, reach in axes.items())))
+    method = choose_method(*ends(wide, cascade, scenario, STEP), float(period))
+    return dataclasses.replace(study, clock=dataclasses.replace(clock, method=method))
 
 
 def _entries(study: Study, axes: tuple[str, ...]) -> tuple[tuple[str, Distribution], ...]:

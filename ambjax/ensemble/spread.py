@@ -19,6 +19,9 @@ from ambjax.ensemble.paths import Place, order_pairs, places, with_values
 from ambjax.numerics.records import numbers, within
 from ambjax.world.scenario import Scenario
 
+# How the paths begin on whose values a step depends: what else an amplifier or a sensor does is solved whatever it is.
+STEP = ("plant.", "controller.", "actuator.bandwidth", "run.clearance")
+
 
 @dataclasses.dataclass(frozen=True)
 class Spread:
@@ -62,12 +65,12 @@ def apply(cascade: Cascade, scenario: Scenario, values: Mapping[str, Any]) -> tu
 
 
 def corners(spread: Spread, cascade: Cascade, scenario: Scenario) -> tuple[Cascade, Scenario]:
-    """Every combination of the ends of the spreads of plant and controller, each on an axis of its own.
+    """Every combination of the ends of the spreads on which a step depends, each on an axis of its own.
 
     What is read off an ensemble by its largest slope, the integrator, then holds for every member.
     """
     check_spread(spread, cascade, scenario)
-    return ends(spread, cascade, scenario, ("plant.", "controller."))
+    return ends(spread, cascade, scenario, STEP)
 
 
 def ends(spread: Spread, cascade: Cascade, scenario: Scenario, under: tuple[str, ...]) -> tuple[Cascade, Scenario]:

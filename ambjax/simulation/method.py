@@ -18,8 +18,13 @@ from ambjax.world.scenario import Scenario
 ACCURATE = 1.0
 # The plant under a held voltage is not stiff: RK4 at this step times its pole leaves less than 1e-11 m.
 SAMPLED = 0.02
+# Its coils may be: at this step times R / L, RK4 leaves less than 1e-11 m and 1e-6 A of a sample in which they settle.
+# Beyond so many substeps an L-stable method is cheaper.
+SETTLED, MOST_SETTLED = 0.5, 64
 # An amplifier's voltage is known as a function of time: at this step times its rate, RK4 integrates it to 1e-9 A.
 DRIVEN = 0.5
+# Names of the plant's slopes beside the laws', for messages.
+PLANT, COILS = "plant", "current in the coils"
 # More RK4 substeps per sample than this cost more than the L-stable method's larger steps.
 MOST_SUBSTEPS = 4
 # Fixed L-stable steps: the corner of a smoothed sign costs an impulse that grows as slope h^2. At this value the
@@ -32,12 +37,13 @@ TOLERANCE, QUIET_TOLERANCE = 1e-6, 1e-7
 
 
 def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
-    """Steepest rate of each law and of the unstable plant, 1/s; the largest over an ensemble.
+    """Steepest rate of each law, of the unstable plant and of its coils, 1/s; the largest over an ensemble.
 
     Raises ValueError where a gain is traced: a step can be chosen only from numbers.
     """
     # on a processor the laws are stepped, and the plant alone is integrated
-    named = ({} if cascade.processor else dict(cascade.slopes())) | {"plant": scenario.plant.slope()}
+    laws = {} if cascade.processor else {f"{stage} law": slope for stage, slope in cascade.slopes().items()}
+    named = laws | {PLANT: scenario.plant.slope(), COILS: scenario.plant.coil_slope(scenario.touchdown)}
     if any(is_traced(x) for x in named.values()):
         raise ValueError(
             "clock.method is None (dt = 'auto'), but inside jit, grad or vmap the gains are traced and no "
@@ -47,22 +53,29 @@ def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
 
 
 def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *, reverse: bool = False) -> Integrator:
-    """Adaptive RODAS3, unless RK4 suits better: noise held over slopes that a few substeps resolve.
+    """Adaptive RODAS3, unless RK4 suits better: noise held over slopes that a few substeps resolve, or a processor.
 
     Without noise, steps may grow over many slopes and only error control knows how far. Under noise that
     jumps every sample there is no such gain, and the explicit method is the cheaper one. `reverse` asks
     for a loop of fixed length, which reverse mode can run: RK4 or RODAS3 with equal substeps. A jump of a
     disturbance between the steps of these costs about 3e-8 m per m/s^2 on smooth gains.
     """
-    slope = max(slopes(cascade, scenario).values())
+    named = slopes(cascade, scenario)
+    slope = max(named.values())
     if cascade.processor is not None:
+        settled = math.ceil(sample_period * named[COILS] / SETTLED)
         rate = 0.0 if (amplifier := scenario.amplifier) is None else float(np.max(np.asarray(amplifier.slope())))
-        return RK4(max(math.ceil(sample_period * max(slope / SAMPLED, rate / DRIVEN)), 1))
-    substeps = math.ceil(sample_period * slope / ACCURATE)
-    if substeps <= MOST_SUBSTEPS and (reverse or scenario.sensor is not None):
-        return RK4(max(substeps, 1))
+        driven = math.ceil(sample_period * max(named[PLANT] / SAMPLED, rate / DRIVEN))
+        substeps, fixed = max(driven, settled, 1), max(driven, MOST_SETTLED)
+        explicit = settled <= MOST_SETTLED
+    else:
+        substeps = max(math.ceil(sample_period * slope / ACCURATE), 1)
+        explicit = substeps <= MOST_SUBSTEPS and (reverse or scenario.sensor is not None)
+        fixed = math.ceil(sample_period / math.sqrt(CORNER / slope))
+    if explicit:
+        return RK4(substeps)
     if reverse:
-        return Rodas3(math.ceil(sample_period / math.sqrt(CORNER / slope)))
+        return Rodas3(fixed)
     # Rounding must stay well below the tolerance, or steps are rejected for noise: in float32, 1.2e-4.
     tolerance = QUIET_TOLERANCE if scenario.sensor is None else TOLERANCE
     return AdaptiveRodas3(max(tolerance, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps)))
@@ -92,5 +105,5 @@ def _check_limit(clock: Clock, limit: float, cascade: Cascade, scenario: Scenari
     if step is not None and step > limit:
         raise ValueError(
             f"clock.dt = {step:g} s: {clock.method} is stable only up to {limit:.3g} s, because the "
-            f"{law} law has slope {named[law]:.3g} 1/s. Use dt = 'auto', method = 'rodas3', or a smaller dt."
+            f"{law} has slope {named[law]:.3g} 1/s. Use dt = 'auto', method = 'rodas3', or a smaller dt."
         )

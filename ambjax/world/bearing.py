@@ -111,8 +111,13 @@ class Bearing:
         raise NotImplementedError
 
     def slope(self) -> Scalar:
-        """The steepest rate of the plant, 1/s, from which a step is chosen."""
+        """The steepest rate of the plant's motion, 1/s, from which a step is chosen."""
         return self.pole
+
+    def coil_slope(self, z: Scalar) -> Scalar:
+        """The steepest rate R / L at which a coil's current settles with the rotor within +-z, 1/s: at the widest gap
+        2 R (s_0 + z) / kappa. Eq. (2)."""
+        return 2 * self.R * (self.s_0 + z) / self.kappa
 
     def sizes(self) -> Measurement:
         """What still matters of each measured quantity: 2 % of the gap, that in 0.1 s, 4 % of the bias current."""
