@@ -12,8 +12,12 @@ import ambjax as amb
 from ambjax.__main__ import main
 from ambjax.control.processor import Processor
 from ambjax.control.sampling import Sampling, limits, relay_band, twisting_band
+from ambjax.ensemble import delays as searched
 from ambjax.ensemble.delays import DELAYS, delay_margin
-from ambjax.theorem import processor
+from ambjax.simulation.rollout import Outcome
+from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Trajectory
+from ambjax.theorem import processor, verdict
+from ambjax.theorem.processor import Delays, Sampled
 
 INF = math.inf
 LATE = [0.0, 0.2, 0.25, 0.4, 0.5, 0.8, 1.0, 1.3, 1.5, 2.0]
@@ -185,7 +189,7 @@ def test_the_margin_is_between_a_delay_that_holds_and_one_that_does_not():
     # the sign itself, one sample late: an oscillation that does not decay, and the steps of the position law on top
     assert 0.5 < margin.held < margin.lost <= 1.0
     assert margin.resolution == pytest.approx(2 / (DELAYS - 1) ** 2)
-    for delay, lost in zip(margin, (False, True), strict=True):
+    for delay, lost in zip(margin[:2], (False, True), strict=True):
         late = cascade_of(*HARD, delay=delay, predict=False)
         assert np.isfinite(amb.rollout(late, WORLD, clock, every=0).trajectory.lost_at) == lost
     # a case whose own delay is lost is told what would hold
@@ -194,9 +198,49 @@ def test_the_margin_is_between_a_delay_that_holds_and_one_that_does_not():
 
 
 def test_predicted_it_holds_with_the_longest_delay():
-    assert delay_margin(cascade_of(*HARD, delay=1.0), WORLD, amb.Clock(300, 1e-4, amb.RK4(1))) == (2.0, None)
+    assert delay_margin(cascade_of(*HARD, delay=1.0), WORLD, amb.Clock(300, 1e-4, amb.RK4(1))) == (2.0, None, None)
     gone = dataclasses.replace(WORLD, initial=amb.Initial(4e-3))
     assert delay_margin(cascade_of(*HARD, delay=1.0), gone, amb.Clock(300, 1e-4, amb.RK4(1))).held is None
+
+
+def test_a_delay_whose_run_stalls_is_neither_held_nor_lost(monkeypatch):
+    """A stand-in for the loop, lost from 1.5 samples on and given up between 0.6 and 0.9: the margin says both."""
+    delays.stalled, delays.lost = (0.6, 0.9), 1.5
+
+    def margin(own):
+        monkeypatch.setattr(searched, "run_ensemble", delays)
+        return delay_margin(cascade_of(*HARD, delay=own), WORLD, amb.Clock(300, 1e-4, amb.RK4(1)))
+
+    assert margin(0.0) == (pytest.approx(0.59375), 1.5, pytest.approx(0.625))
+    assert margin(1.0) == (pytest.approx(1.484375), pytest.approx(1.5), None)
+    assert margin(0.75) == (pytest.approx(0.59375, abs=0.02), None, pytest.approx(0.6, abs=0.02))
+    delays.stalled, delays.lost = (0.0, 3.0), 3.0
+    assert margin(0.0) == (None, None, 0.0)
+    words = verdict.on_processor(Sampled([], [], math.inf, ""), margin(0.0))[-1]
+    assert words == "Delay margin: it is not decided at 0, where the integrator stalled."
+    words = verdict.on_processor(Sampled([], [], math.inf, ""), Delays(0.5, 1.5, 0.75))[-1]
+    assert words.endswith("held up to 0.5 samples, not decided at 0.75, where the integrator stalled, lost at 1.5.")
+
+
+def delays(cascade, scenario, clock, *, fold):
+    """What `run_ensemble` says of each delay of a cascade."""
+    late, (begin, end) = np.asarray(cascade.processor.delay), delays.stalled
+    code = np.where((begin <= late) & (late <= end), STALLED, np.where(late >= delays.lost, TOUCHED, ALIVE))
+    return Outcome(Trajectory(None, np.where(code == ALIVE, np.inf, 0.01), code, np.inf), None)
+
+
+def test_a_stalled_run_on_a_processor_decides_nothing():
+    sampled = Sampled([], [], 0.01, "stalled: ...", stalled=True)
+    assert not sampled.holds
+    said = " ".join(verdict.on_processor(sampled, Delays(None, None, 0.0)))
+    assert "not decided: at 0.01 s the integrator stalled" in said
+    assert "lost" not in said
+    assert "gamma" not in said  # laws that are stepped stall no integrator
+    # one trial step a sample, where the tolerance takes more
+    stalling = amb.Clock(10, 1e-4, amb.AdaptiveRodas3(1e-12, most_steps=1))
+    found = processor.check(cascade_of(*HARD, delay=1.0), WORLD, stalling, 0.0)
+    assert found.stalled
+    assert not found.bands
 
 
 CASE = """[controller.position]
@@ -237,5 +281,5 @@ def test_check_says_yes_on_a_processor(capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["holds"]
     assert [slope["stage"] for slope in told["processor"]["slopes"]] == ["position", "inversion", "current"]
-    assert set(told["processor"]) == {"lost_at_s", "lost_why", "slopes", "bands", "delay_margin"}
-    assert told["processor"]["delay_margin"] == {"held": 2.0, "lost": None, "resolution": None}
+    assert set(told["processor"]) == {"lost_at_s", "lost_why", "stalled", "slopes", "bands", "delay_margin"}
+    assert told["processor"]["delay_margin"] == {"held": 2.0, "lost": None, "undecided": None, "resolution": None}

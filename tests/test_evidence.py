@@ -21,11 +21,13 @@ def test_an_uncertain_plant_is_tried_off_to_either_side(monkeypatch, fragile):
         ]
         assert len(off) == 1
         tried.append(off[0])
-        measured = {"lost_at_s": 0.1 if off[0] == fragile else np.inf, "settled_max_abs_error_m": 1e-6 * len(tried)}
-        return (), measured
+        ended = off[0] in (fragile, stalling)
+        fate = {"lost": off[0] == fragile, "stalled": off[0] == stalling, "lost_at_s": 0.1 if ended else np.inf}
+        return (), fate | {"settled_max_abs_error_m": 1e-6 * len(tried)}
 
+    stalling = "A +10 %"
     monkeypatch.setattr(evidence, "rollout", rollout)
-    lost, error = evidence._uncertain(paper.cascade("repaired"), "repaired")
-    assert lost == [fragile]
+    lost, stalled, error = evidence._uncertain(paper.cascade("repaired"), "repaired")
+    assert (lost, stalled) == ([fragile], [stalling])
     assert sorted(tried) == sorted(f"{name} {sign}10 %" for name in ("m", "k_z", "R", "A") for sign in "+-")
     assert error == pytest.approx(8e-6)

@@ -8,6 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from ambjax.__main__ import main
+from ambjax.pictures import figures
 from ambjax.pictures.figures import PIXELS
 from ambjax.pictures.overview import TURNS, overview
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Row, Trajectory
@@ -16,14 +17,14 @@ from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Row, Trajector
 @pytest.fixture(autouse=True)
 def drawn(monkeypatch):
     """The figures saved, still open to questions."""
-    figures, save = [], Figure.savefig
+    pages, save = [], Figure.savefig
 
     def keep(self, path, **options):
-        figures.append(self)
+        pages.append(self)
         save(self, path, **options | {"dpi": 30})
 
     monkeypatch.setattr(Figure, "savefig", keep)
-    return figures
+    return pages
 
 
 def a_run(samples=20_000, period=1e-4, lost_at=np.inf, code=ALIVE, **signals):
@@ -92,6 +93,13 @@ def test_a_loss_ends_the_picture_shortly_after(tmp_path, drawn, code, words):
     assert whole.get_xlim() == (0.0, pytest.approx(0.0115))
     assert start.get_xlim()[1] <= 0.01 / 3
     assert end.get_xlim() == (pytest.approx(0.008), pytest.approx(0.0103))
+
+
+@pytest.mark.parametrize(("code", "words"), [(TOUCHED, "lost at 0.01 s"), (STALLED, "not decided from 0.01 s")])
+def test_a_figure_of_the_paper_says_which_of_both(tmp_path, drawn, code, words):
+    figures.paper_figure(3, a_run(lost_at=0.01, code=code), "regulation", tmp_path / "f.png")
+    said = [text.get_text().split("\n")[0] for ax in drawn[0].axes for text in ax.texts]
+    assert said == [words]
 
 
 @pytest.mark.parametrize("samples", [1, 2, 3, 30])

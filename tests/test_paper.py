@@ -10,13 +10,17 @@ import pytest
 from ambjax import AdaptiveRodas3, paper, rollout
 from ambjax.__main__ import main
 from ambjax.paper import claims
-from ambjax.paper.evidence import NOISE_STDS, STEPS, Noise
+from ambjax.paper.evidence import NOISE_STDS, STEPS, Evidence, Held, Noise, Run, Uncertain, held
+from ambjax.paper.ledger import judge, markdown, noise_table, processor_table
+from ambjax.simulation.trajectory import STALLED, Row, Trajectory
+from ambjax.theorem.conditions import Condition, Report
 
 
-def noise(survived, radius_at_least=1e-8):
-    """A scan in which the first `survived` levels are survived and sigma grows with std."""
-    lost = np.arange(len(NOISE_STDS)) >= survived
-    return Noise(1e-4, 0.6, lost, NOISE_STDS / NOISE_STDS[0] * radius_at_least)
+def noise(survived, radius_at_least=1e-8, stalled=False):
+    """A scan in which the first `survived` levels are survived, the rest lost, or stalled; sigma grows with std."""
+    ended = np.arange(len(NOISE_STDS)) >= survived
+    fates = ended & (not stalled), ended & stalled
+    return Noise(1e-4, 0.6, *fates, NOISE_STDS / NOISE_STDS[0] * radius_at_least)
 
 
 def test_noise_scan_is_read_correctly():
@@ -34,7 +38,7 @@ def test_verdicts_follow_the_evidence():
     judges = {c.says: c.judge for c in claims.CLAIMS}
 
     def tracking(error, lost=False):
-        metrics = {"lost_at_s": 0.01 if lost else np.inf, "settled_max_abs_error_m": error}
+        metrics = {"lost_at_s": 0.01 if lost else np.inf, "settled_max_abs_error_m": error, "stalled": 0.0}
         condition = types.SimpleNamespace(name="inversion, ideal", gain=1000.0, against=6e4)
         run = types.SimpleNamespace(metrics=metrics, trajectory=types.SimpleNamespace(lost_why="touched down"))
         return types.SimpleNamespace(tracking=run, check_tracking=types.SimpleNamespace(conditions=[condition]))
@@ -52,6 +56,43 @@ def test_verdicts_follow_the_evidence():
         assert judge(types.SimpleNamespace(noise=[noise(n) for n in scans])).verdict == verdict
 
 
+def test_a_stall_is_neither_held_nor_lost():
+    """All claims, of runs that the integrator gave up: none holds, none fails, but what is arithmetic or the proof."""
+    names = ["settled_max_abs_error_m", "settled_max_abs_v_tilde_A2_per_m2", "settled_max_abs_current_error_A"]
+    metrics = {"lost_at_s": 0.01, "lost": 0.0, "stalled": 1.0, "v_tilde_reached_s": 1e-3, "settled_rms_u_V": 1.0}
+    rows = Row(*[np.zeros(200)] * len(Row._fields))._replace(t=1e-2 * np.arange(200))
+    trajectory = Trajectory(rows, 0.01, STALLED, np.inf)
+    run = Run(trajectory, metrics | dict.fromkeys(names, 0.0), trajectory)
+    report = Report([Condition("x", "", 2.0, 1.0, 0.0, "", True)], [], 0.01, "stalled", "", True)
+    nothing = noise(0, stalled=True)
+    uncertain = Uncertain([], ["m -10 %"], 0.0)
+    evidence = Evidence(
+        run, run, trajectory, {True: run}, report, report, [nothing] * 3, Held(0.0, 1e-7), uncertain
+    )
+    (rows, scans, sampled) = judge({"x": evidence}), noise_table({"x": evidence}), processor_table({"x": evidence})
+    verdicts = {row["says"]: row["findings"]["x"]["verdict"] for row in rows}
+    others = {"The noise is about 20 % of the gap": claims.HOLDS, "The noise is specified": claims.OPEN}
+    assert verdicts == dict.fromkeys(verdicts, claims.UNDECIDED) | others
+    page = markdown(rows, scans, sampled)
+    assert "not decided: stalled at 10 ms" in page
+    assert "| none, not decided at 1.0e-08 m |" in page
+    assert "rotor lost" not in page
+    # with one lost beside them it is known
+    lost = evidence._replace(noise=[nothing, noise(3)], basin=Held(0.0, None), uncertain=Uncertain(["R"], ["m"], 0.0))
+    judges = {c.says: c.judge(lost).verdict for c in claims.CLAIMS}
+    for says in ("The origin is uniformly asymptotically stable", "Accurate and robust positioning"):
+        assert judges[says] == claims.FAILS
+
+
+def test_what_is_held_ends_where_it_is_lost_or_not_known():
+    tried, no = np.array([1.0, 2.0, 3.0]), np.zeros(3, bool)
+    assert held(tried, no, no) == (3.0, None)
+    assert held(tried, tried > 1, no) == (1.0, None)
+    assert held(tried, tried > 2, tried == 2) == (1.0, 2.0)
+    assert held(tried, tried > 1, tried == 2) == (1.0, None)  # of two seeds one is lost there
+    assert held(tried, no, tried > 0) == (0.0, 1.0)
+
+
 @pytest.mark.slow
 def test_reproduce(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -64,7 +105,7 @@ def test_reproduce(tmp_path, monkeypatch):
     found = {c["says"]: c["findings"] for c in written["claims"]}
     assert len(found) == len(claims.CLAIMS)
     verdicts = {f["verdict"] for both in found.values() for f in both.values()}
-    assert verdicts <= {claims.HOLDS, claims.FAILS, claims.OPEN}
+    assert verdicts <= {claims.HOLDS, claims.FAILS, claims.OPEN}  # nothing stalls
     error = found["Tracking: largest error 2.3e-5 m"]["repaired"]
     assert error["verdict"] == claims.HOLDS
     assert 2.2e-5 < error["value"] < 2.4e-5

@@ -55,13 +55,14 @@ def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
     if not args.json:
         print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")
         _print_sampled(sampled)
-        print("\n" + "\n".join(verdict.on_processor(sampled, margin.held, margin.lost)))
+        print("\n" + "\n".join(verdict.on_processor(sampled, margin)))
     slopes = [dataclasses.asdict(slope) | {"holds": slope.holds} for slope in sampled.slopes]
     return {
         "holds": sampled.holds,
         "processor": {
             "lost_at_s": sampled.lost_at,
             "lost_why": sampled.lost_why,
+            "stalled": sampled.stalled,
             "slopes": slopes,
             "bands": [dataclasses.asdict(band) for band in sampled.bands],
             "delay_margin": margin._asdict() | {"resolution": margin.resolution},

@@ -55,7 +55,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     elif ended:
         from ambjax.theorem import verdict
 
-        say(verdict.undecided(metrics["lost_at_s"]))
+        remedy = verdict.STALLED if case.cascade.processor is None else verdict.STALLED_PLANT
+        say(verdict.undecided(metrics["lost_at_s"], remedy))
     return int(ended), metrics | {"out": str(out)}
 
 

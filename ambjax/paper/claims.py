@@ -16,6 +16,9 @@ from ambjax.paper.readings import PULSE, SETTLE, TABLE_2
 from ambjax.world.plant import Plant
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "not determined by the paper"
+# Of a claim about runs that the integrator gave up: whether the rotor is held is not known.
+UNDECIDED = "not decided"
+STALLED = "the integrator could not meet its tolerance: whether the rotor is held is not known"
 SIGMA_RADIUS, TRACKING_ERROR, INVERSION_TIME = 6e-6, 2.3e-5, 0.01
 GAP = float(Plant().s_0)
 
@@ -58,10 +61,12 @@ def _finding(ours: str, value: float, condition: bool, cause: str) -> Finding:
     return Finding(ours, value, HOLDS if condition else FAILS, cause)
 
 
-def _lost(run: Run, evidence: Evidence) -> Finding | None:
-    """The finding for a claim about a run in which the rotor was lost, or None."""
+def _ended(run: Run, evidence: Evidence) -> Finding | None:
+    """The finding for a claim about a run that lost the rotor, or stalled, or None."""
     if math.isinf(run.metrics["lost_at_s"]):
         return None
+    if run.metrics["stalled"]:
+        return Finding(f"stalled at {run.metrics['lost_at_s'] * 1e3:.1f} ms", None, UNDECIDED, STALLED)
     inversion = next(c for c in evidence.check_tracking.conditions if c.name == "inversion, ideal")
     words = f"rotor lost at {run.metrics['lost_at_s'] * 1e3:.1f} ms"
     cause = run.trajectory.lost_why
@@ -87,6 +92,8 @@ def _theorem(evidence: Evidence) -> Finding:
     tightest = ideal[0] if ideal else tightest
     cause = f"{tightest.requires}: {tightest.gain:g} against {tightest.against:.3g} at t = {tightest.at_s:.4g} s"
     words = f"{len(failing)} of {len(lines)} conditions fail" if failing else f"tightest margin {share:.0f} %"
+    if not failing and (evidence.check_regulation.stalled or evidence.check_tracking.stalled):
+        return Finding(words, share, UNDECIDED, STALLED)
     return _finding(words, share, not failing, cause)
 
 
@@ -95,13 +102,18 @@ def _theorem(evidence: Evidence) -> Finding:
     "rotor returns from z(0) off the origin with currents in equilibrium, and from zero currents",
 )  # fmt: skip
 def _stable(evidence: Evidence) -> Finding:
-    basin = evidence.basin
+    basin, unknown = evidence.basin
     cause = (
         f"returns from rest at |z(0)| up to {basin:.1e} m, {100 * basin / GAP:.2g} % of the gap ({len(BASIN)} tried)"
     )
-    if lost := _lost(evidence.regulation, evidence):
-        cause += f"; from i = i_ref = 0: {lost.ours}"
-    return _finding(f"basin {basin:.1e} m", basin, basin > 0 and lost is None, cause)
+    if unknown is not None:
+        cause += f"; not decided at {unknown:.1e} m, where the integrator stalled"
+    if ended := _ended(evidence.regulation, evidence):
+        cause += f"; from i = i_ref = 0: {ended.ours}"
+    verdict = HOLDS if basin > 0 and ended is None else UNDECIDED
+    if (basin == 0 and unknown is None) or (ended is not None and ended.verdict == FAILS):
+        verdict = FAILS
+    return Finding(f"basin {basin:.1e} m", basin, verdict, cause)
 
 
 @claim(
@@ -112,7 +124,7 @@ def _converges(evidence: Evidence) -> Finding:
     rows = evidence.regulation.trajectory.rows
     z, e = _worst(rows, "e_z", 1.9, 2.0), _worst(rows, "e", 1.9, 2.0)
     cause = "over the last 0.1 s, 0.6 s after the pulse"
-    return _lost(evidence.regulation, evidence) or _finding(f"{z:.1e} m, {e:.1e} A", z, z < 1e-6 and e < 1e-3, cause)
+    return _ended(evidence.regulation, evidence) or _finding(f"{z:.1e} m, {e:.1e} A", z, z < 1e-6 and e < 1e-3, cause)
 
 
 @claim(
@@ -127,7 +139,7 @@ def _finite_time(evidence: Evidence) -> Finding:
     outside = np.flatnonzero(np.abs(rows.sigma[early]) > SIGMA_RADIUS)
     at = float(rows.t[early][outside[-1]]) if outside.size else 0.0
     cause = "last time before the pulse that |sigma| > 6e-6 m/s"
-    return _lost(evidence.regulation, evidence) or _finding(f"{at:.4g} s", at, at < 0.1, cause)
+    return _ended(evidence.regulation, evidence) or _finding(f"{at:.4g} s", at, at < 0.1, cause)
 
 
 @claim(
@@ -141,8 +153,8 @@ def _radius(evidence: Evidence) -> Finding:
     quiet, pulse = _worst(rows, "sigma", SETTLE, PULSE.start), _worst(rows, "sigma", PULSE.start, PULSE.stop)
     worst = max(quiet, pulse)
     cause = f"{quiet:.1e} m/s before the pulse, {pulse:.1e} in it; noise apart, k 2/pi arctan(p sigma) balances q_z"
-    lost = _lost(evidence.regulation, evidence)
-    return lost or _finding(f"{worst:.1e} m/s", worst, worst <= 1.05 * SIGMA_RADIUS, cause)
+    ended = _ended(evidence.regulation, evidence)
+    return ended or _finding(f"{worst:.1e} m/s", worst, worst <= 1.05 * SIGMA_RADIUS, cause)
 
 
 @claim(
@@ -153,8 +165,9 @@ def _radius_by_noise(evidence: Evidence) -> Finding:
     stds = {n.sample_period: n.std_for(SIGMA_RADIUS) for n in evidence.noise}
     hits = {period: std for period, std in stds.items() if std is not None}
     if not hits:
-        lost = _lost(evidence.regulation, evidence)
-        return lost or Finding("at no std scanned", None, FAILS, "see the noise table")
+        verdict = UNDECIDED if any(n.undecided for n in evidence.noise) else FAILS
+        ended = _ended(evidence.regulation, evidence)
+        return ended or Finding("at no std scanned", None, verdict, "see the noise table")
     nearest = max(hits.values())
     cause = f"the printed std is {TABLE_2.noise_std / nearest:.0f} times the largest that gives this radius"
     words = "at std " + ", ".join(f"{std:.1e} m held {period:g} s" for period, std in hits.items())
@@ -164,7 +177,7 @@ def _radius_by_noise(evidence: Evidence) -> Finding:
 def _pulse_effect(evidence: Evidence, run: Run) -> Finding:
     change = float(np.abs(run.trajectory.rows.z - run.quiet.rows.z).max())
     cause = f"the pulse moves the rotor by {100 * change / GAP:.2g} % of the gap; without noise by q_z pi / (2 c k p)"
-    return _lost(run, evidence) or _finding(f"{change:.3e} m", change, change <= TRACKING_ERROR, cause)
+    return _ended(run, evidence) or _finding(f"{change:.3e} m", change, change <= TRACKING_ERROR, cause)
 
 
 @claim(
@@ -178,7 +191,7 @@ def _inversion(evidence: Evidence, run: Run) -> Finding:
     at = run.metrics["v_tilde_reached_s"]
     late = run.metrics["settled_max_abs_v_tilde_A2_per_m2"]
     cause = f"first |v_tilde| <= 0.1 A^2/m^2; after {SETTLE} s it stays within {late:.2g}"
-    return _lost(run, evidence) or _finding(f"{at:.4g} s", at, at < INVERSION_TIME, cause)
+    return _ended(run, evidence) or _finding(f"{at:.4g} s", at, at < INVERSION_TIME, cause)
 
 
 @claim(
@@ -197,14 +210,15 @@ def _inversion_tracking(evidence: Evidence) -> Finding:
 def _current(evidence: Evidence) -> Finding:
     worst = max(r.metrics["settled_max_abs_current_error_A"] for r in (evidence.regulation, evidence.tracking))
     cause = f"largest |i - i_ref| after {SETTLE} s, pulse included; q_i = 0, so Eq. (14) decays to 0 unless u saturates"
-    return _lost(evidence.regulation, evidence) or _finding(f"{worst:.1e} A", worst, worst < 1e-3, cause)
+    ended = _ended(evidence.regulation, evidence) or _ended(evidence.tracking, evidence)
+    return ended or _finding(f"{worst:.1e} A", worst, worst < 1e-3, cause)
 
 
 @claim("Tracking: largest error 2.3e-5 m", "4", "2.3e-5 m", "rounds to 2.3e-5 m or less")
 def _tracking(evidence: Evidence) -> Finding:
     error = evidence.tracking.metrics["settled_max_abs_error_m"]
     cause = f"largest |z - r| after {SETTLE} s, pulse included"
-    return _lost(evidence.tracking, evidence) or _finding(f"{error:.3e} m", error, error < 2.35e-5, cause)
+    return _ended(evidence.tracking, evidence) or _finding(f"{error:.3e} m", error, error < 2.35e-5, cause)
 
 
 @claim(
@@ -222,11 +236,15 @@ def _rejection(evidence: Evidence) -> Finding:
 )
 def _noise(evidence: Evidence) -> Finding:
     largest = max(n.survived for n in evidence.noise)
-    if largest == 0.0:
+    unknown = sum(bool(n.stalled.any()) and not n.lost.any() for n in evidence.noise)
+    if largest == 0.0 and not unknown:
         return Finding("survives none", 0.0, FAILS, "the rotor is lost at the smallest noise, and without noise")
     words = "survives std " + ", ".join(f"{n.survived:.1e} m held {n.sample_period:g} s" for n in evidence.noise)
     survivors = sum(n.survived >= TABLE_2.noise_std * 0.999 for n in evidence.noise)
     cause = f"the printed std is survived at {survivors} of {len(evidence.noise)} sample periods tried"
+    if unknown:
+        cause += f"; not decided at {unknown}, where the integrator stalled"
+        return Finding(words, largest, UNDECIDED, cause)
     partial = 0 < survivors < len(evidence.noise)
     return Finding(words, largest, OPEN if partial else HOLDS if survivors else FAILS, cause)
 
@@ -235,7 +253,7 @@ def _noise(evidence: Evidence) -> Finding:
 def _specification(evidence: Evidence) -> Finding:
     if not any(n.survived for n in evidence.noise):
         return Finding(
-            "no survivor", None, OPEN, "the rotor is lost at every noise, so the sample period cannot be told"
+            "no survivor", None, OPEN, "the rotor is held at no noise, so the sample period cannot be told"
         )
     if len(evidence.noise) == 1:
         words = f"held {evidence.noise[0].sample_period:g} s"
@@ -257,9 +275,12 @@ def _share(evidence: Evidence) -> Finding:
     "Accurate and robust positioning", "abstract", "-", "tracking error below 1 % of the gap with the plant 10 % off"
 )
 def _robust(evidence: Evidence) -> Finding:
-    lost, error = evidence.uncertain_lost, evidence.uncertain_error
+    lost, stalled, error = evidence.uncertain
+    cases = f"{2 * len(UNCERTAIN)} cases"
     if lost:
-        return Finding(f"lost in {len(lost)} of {2 * len(UNCERTAIN)} cases", None, FAILS, "true " + ", ".join(lost))
+        return Finding(f"lost in {len(lost)} of {cases}", None, FAILS, "true " + ", ".join(lost))
+    if stalled:
+        return Finding(f"stalled in {len(stalled)} of {cases}", None, UNDECIDED, "true " + ", ".join(stalled))
     cause = (
         f"one of {', '.join(UNCERTAIN)} off by 10 % either way, controller unaware: our choice, the paper tests none"
     )

@@ -1,7 +1,6 @@
 """The runs behind the claims ledger: for one reading, everything that its verdicts are computed from."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -44,20 +43,43 @@ class Run(NamedTuple):
     quiet: Any = None
 
 
+class Held(NamedTuple):
+    """Of values tried, ascending: the largest up to which all hold (0: none does), and where that is not the end of it.
+
+    `undecided`: the next one, where none is lost there but the integrator stalled; None: one is lost there, or all hold.
+    """
+
+    upto: float
+    undecided: float | None
+
+
+def held(tried: np.ndarray, lost: np.ndarray, stalled: np.ndarray) -> Held:
+    """What is held of values [N], ascending: at which some are lost, and at which some are stalled, bool [N]."""
+    ended = np.flatnonzero(lost | stalled)
+    first = int(ended[0]) if ended.size else len(tried)
+    unknown = bool(ended.size) and not lost[first]
+    return Held(float(tried[first - 1]) if first else 0.0, float(tried[first]) if unknown else None)
+
+
 class Noise(NamedTuple):
-    """The noise scan at one sample period: per std, members lost and the mean radius of sigma (m/s) of the rest."""
+    """The noise scan at one sample period: per std, whether members are lost or stalled, and the mean radius of sigma
+    (m/s) of the rest."""
 
     sample_period: float
     horizon: float
     lost: np.ndarray
+    stalled: np.ndarray
     sigma: np.ndarray
 
     @property
     def survived(self) -> float:
-        """Largest std, in m, up to which no member was lost; 0 if even the smallest lost one."""
-        losses = np.flatnonzero(self.lost)
-        first = losses[0] if losses.size else len(NOISE_STDS)
-        return float(NOISE_STDS[first - 1]) if first else 0.0
+        """Largest std, in m, up to which every member was held; 0 if at the smallest one was not."""
+        return held(NOISE_STDS, self.lost, self.stalled).upto
+
+    @property
+    def undecided(self) -> float | None:
+        """The next std, in m, where no member is lost there but one stalled."""
+        return held(NOISE_STDS, self.lost, self.stalled).undecided
 
     def std_for(self, radius: float) -> float | None:
         """The std whose sigma neighbourhood has this radius, interpolated on logarithms; None if none does."""
@@ -66,6 +88,14 @@ class Noise(NamedTuple):
             return None
         logs = np.interp(np.log(radius), np.log(self.sigma[:count]), np.log(NOISE_STDS[:count]))
         return float(np.exp(logs))
+
+
+class Uncertain(NamedTuple):
+    """Tracking with one true parameter off: what loses the rotor, what stalls, and the largest settled error, m."""
+
+    lost: list[str]
+    stalled: list[str]
+    error: float
 
 
 class Evidence(NamedTuple):
@@ -80,10 +110,9 @@ class Evidence(NamedTuple):
     check_regulation: Report
     check_tracking: Report
     noise: list[Noise]
-    basin: float
-    """largest |z(0)| in m, of those tried, up to which the rotor returns from currents of equilibrium"""
-    uncertain_lost: list[str]
-    uncertain_error: float
+    basin: Held
+    """|z(0)| in m up to which the rotor returns from currents of equilibrium"""
+    uncertain: Uncertain
 
 
 def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evidence:
@@ -111,9 +140,9 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
     say(f"{reading}: basin of attraction")
     basin = _basin(cascade, reading)
     say(f"{reading}: uncertain plant")
-    lost, error = _uncertain(cascade, reading)
+    uncertain = _uncertain(cascade, reading)
     judged = checks["regulation"], checks["tracking"]
-    return Evidence(runs["regulation"], runs["tracking"], noisy, on_processor, *judged, noise, basin, lost, error)
+    return Evidence(runs["regulation"], runs["tracking"], noisy, on_processor, *judged, noise, basin, uncertain)
 
 
 def _simulate(reading: str, cascade: Cascade, scenario: Scenario) -> Run:
@@ -137,7 +166,7 @@ def _run(cascade: Cascade, reading: str, name: str) -> Run:
     return run._replace(quiet=_simulate(reading, cascade, paper.scenario(name, reading, pulse=False)).trajectory)
 
 
-def _uncertain(cascade: Cascade, reading: str) -> tuple[list[str], float]:
+def _uncertain(cascade: Cascade, reading: str) -> Uncertain:
     """Tracking with one true parameter at a time 10 % off what the controller believes."""
     cases = [(name, factor) for name in UNCERTAIN for factor in (0.9, 1.1)]
 
@@ -150,9 +179,9 @@ def _uncertain(cascade: Cascade, reading: str) -> tuple[list[str], float]:
 
     with ThreadPoolExecutor() as pool:
         metrics = list(pool.map(one, cases))
-    names = [f"{name} {100 * (factor - 1):+.0f} %" for name, factor in cases]
-    lost = [name for name, m in zip(names, metrics, strict=True) if math.isfinite(m["lost_at_s"])]
-    return lost, max(m["settled_max_abs_error_m"] for m in metrics)
+    named = [(f"{name} {100 * (factor - 1):+.0f} %", m) for (name, factor), m in zip(cases, metrics, strict=True)]
+    lost, stalled = ([name for name, m in named if m[fate]] for fate in ("lost", "stalled"))
+    return Uncertain(lost, stalled, max(m["settled_max_abs_error_m"] for m in metrics))
 
 
 @one_kernel
@@ -182,12 +211,12 @@ def _noise(cascade: Cascade, reading: str, period: float) -> Noise:
     sensors = _batch(Sensor(), size, std=jnp.asarray(stds))
     scenarios = _batch(quiet, size, sensor=sensors, seed=jnp.asarray(seeds, int))
     metrics = _scan(*canonical(_scanned(cascade, scenarios, period)))
-    lost = np.any(np.isfinite(metrics["lost_at_s"]).reshape(-1, SEEDS), axis=1)
+    lost, stalled = (np.any(np.reshape(metrics[fate], (-1, SEEDS)), axis=1) for fate in ("lost", "stalled"))
     sigma = np.asarray(metrics["settled_max_abs_sigma_m_per_s"]).reshape(-1, SEEDS).mean(axis=1)
-    return Noise(period, NOISE_SAMPLES * period, lost, sigma)
+    return Noise(period, NOISE_SAMPLES * period, lost, stalled, sigma)
 
 
-def _basin(cascade: Cascade, reading: str) -> float:
+def _basin(cascade: Cascade, reading: str) -> Held:
     """Regulation, undisturbed, from rest at z(0) off the origin with i = i_ref at its equilibrium for z = 0."""
     offsets = np.concatenate([BASIN, -BASIN])
     size, plant = len(offsets), Plant()
@@ -198,6 +227,4 @@ def _basin(cascade: Cascade, reading: str) -> float:
     initial = Initial(jnp.asarray(offsets), zeros, zeros + current)
     scenarios = _batch(dataclasses.replace(quiet, sensor=Sensor()), size, initial=initial)
     metrics = _scan(*canonical(_scanned(start, scenarios, float(paper.CLOCK.sample_period))))
-    lost = np.isfinite(metrics["lost_at_s"]).reshape(2, -1).any(axis=0)
-    first = np.flatnonzero(lost)[0] if lost.any() else len(BASIN)
-    return float(BASIN[first - 1]) if first else 0.0
+    return held(BASIN, *(np.reshape(metrics[fate], (2, -1)).any(axis=0) for fate in ("lost", "stalled")))

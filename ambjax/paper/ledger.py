@@ -35,13 +35,15 @@ def judge(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
 
 
 def noise_table(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
-    """The noise scan as plain data: per reading and sample period, what is survived and what gives 6e-6 m/s."""
+    """The noise scan as plain data: per reading and sample period, what is survived, where that ends in a run that
+    stalled (None: it does not), and what gives 6e-6 m/s."""
     return [
         {
             "reading": name,
             "sample_period_s": n.sample_period,
             "horizon_s": n.horizon,
             "largest_std_survived_m": n.survived,
+            "undecided_std_m": n.undecided,
             "std_for_sigma_6e-6_m": n.std_for(SIGMA_RADIUS),
         }
         for name, one in evidence.items()
@@ -50,12 +52,13 @@ def noise_table(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
 
 
 def processor_table(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
-    """What becomes of each reading on the processor of `sampled`, tracking, as plain data; inf: not lost."""
+    """What becomes of each reading on the processor of `sampled`, tracking, as plain data; inf: it ran to the end."""
     return [
         {
             "reading": name,
             "noise": noisy,
             "lost_at_s": run.metrics["lost_at_s"],
+            "stalled": bool(run.metrics["stalled"]),
             "settled_max_abs_error_m": run.metrics["settled_max_abs_error_m"],
             "settled_rms_u_V": run.metrics["settled_rms_u_V"],
         }
@@ -73,7 +76,8 @@ def _processor_lines(rows: list[dict[str, Any]]) -> list[str]:
     for row in rows:
         under = f"the paper's, {SUPPLY:g} V" if row["noise"] else "none, no limit"
         if math.isfinite(row["lost_at_s"]):
-            lines.append(f"| {row['reading']} | {under} | at {1e3 * row['lost_at_s']:.3g} ms | - | - |")
+            fate = "not decided: stalled at" if row["stalled"] else "at"
+            lines.append(f"| {row['reading']} | {under} | {fate} {1e3 * row['lost_at_s']:.3g} ms | - | - |")
         else:
             error, u = row["settled_max_abs_error_m"], row["settled_rms_u_V"]
             lines.append(f"| {row['reading']} | {under} | no | {error:.2e} m | {u:.3g} V |")
@@ -105,5 +109,7 @@ def markdown(rows: list[dict[str, Any]], noise: list[dict[str, Any]], processor:
     for n in noise:
         gives = f"{n['std_for_sigma_6e-6_m']:.1e} m" if n["std_for_sigma_6e-6_m"] else "none"
         survived = f"{n['largest_std_survived_m']:.1e} m" if n["largest_std_survived_m"] else "none"
+        if n["undecided_std_m"]:
+            survived += f", not decided at {n['undecided_std_m']:.1e} m"
         lines.append(f"| {n['reading']} | {n['sample_period_s']:g} s | {n['horizon_s']:g} s | {survived} | {gives} |")
     return "\n".join([*lines, *_processor_lines(processor)]) + "\n"

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ambjax.simulation.trajectory import Row, Trajectory
+from ambjax.simulation.trajectory import STALLED, Row, Trajectory
 
 # Okabe and Ito's colours: distinct in print and to colour-blind readers.
 INK, BLUE, ORANGE, GREEN, RED = "#222222", "#0072B2", "#E69F00", "#009E73", "#D55E00"
@@ -180,7 +180,8 @@ def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:
     ax.axvline(lost_at, color=RED, linewidth=1.0)
     if first:
         why = trajectory.lost_why.replace(": ", ":\n").replace(" reached ", "\nreached ")
-        words = f"lost at {lost_at:.4g} s\n{why}"
+        fate = "not decided from" if trajectory.lost_code == STALLED else "lost at"
+        words = f"{fate} {lost_at:.4g} s\n{why}"
         ax.annotate(words, (0.99, 0.06), xycoords="axes fraction", ha="right", va="bottom", fontsize=7, color=INK)
 
 

@@ -20,7 +20,7 @@ from ambjax.control.cascade import Cascade, CascadeState
 from ambjax.control.sampling import Sampling, limits
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import rollout
-from ambjax.simulation.trajectory import Row
+from ambjax.simulation.trajectory import STALLED, Row
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference, reference_at
@@ -74,18 +74,37 @@ class Band:
 class Sampled:
     """Slopes and bands of a cascade on its processor, and the fate of the rotor there, under the case's noise.
 
-    No bands where it is lost without noise.
+    No bands where it is lost without noise. `stalled`: the integrator gave up at `lost_at`, and nothing is decided.
     """
 
     slopes: list[Slope]
     bands: list[Band]
     lost_at: float
     lost_why: str
+    stalled: bool = False
 
     @property
     def holds(self) -> bool:
         """Whether no slope is beyond its limit, and the rotor is levitated to the end."""
         return math.isinf(self.lost_at) and all(slope.holds for slope in self.slopes)
+
+
+class Delays(NamedTuple):
+    """Of delays (samples) tried from the case's own up: every one up to `held` holds the rotor, at `lost` it is lost.
+
+    `undecided` is the least beyond `held` where that is not known, for the integrator stalled (None: all is known up to
+    `lost`). Where the case's own does not hold: from 0 up, and `held` is None where that does not either. `lost` is
+    None where no delay allowed loses it.
+    """
+
+    held: float | None
+    lost: float | None
+    undecided: float | None = None
+
+    @property
+    def resolution(self) -> float | None:
+        """How far `held` and `lost` are apart, samples."""
+        return None if self.held is None or self.lost is None else self.lost - self.held
 
 
 class Errors(NamedTuple):
@@ -107,7 +126,8 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float) -> 
     held = [bool(np.isinf(trajectory.lost_at)) for trajectory in (calm, outcome)]
     rough = outcome.rows if held[1] else None
     bands = _bands(cascade, quiet, clock, settle, calm.rows, rough) if held[0] else []
-    return Sampled(slopes(cascade, clock), bands, float(outcome.lost_at), outcome.lost_why)
+    stalled = int(outcome.lost_code) == STALLED
+    return Sampled(slopes(cascade, clock), bands, float(outcome.lost_at), outcome.lost_why, stalled)
 
 
 def _without_noise(scenario: Scenario) -> Scenario:

@@ -4,7 +4,7 @@ import math
 import re
 
 from ambjax.theorem.conditions import Condition, Report
-from ambjax.theorem.processor import Sampled
+from ambjax.theorem.processor import Delays, Sampled
 
 QUESTION = "Do the conditions of Theorem 1 hold along this run?"
 # A gain is advised this much above what it must exceed, rounded up to two digits.
@@ -19,6 +19,8 @@ STALLED = (
     "Try a smaller p of the laws ([controller.inversion] gamma p is how hard its sign is), "
     'or a fixed step: [clock] dt = 1e-6 with method = "rodas3".'
 )
+# The same on a processor, which steps the laws: the plant alone is integrated.
+STALLED_PLANT = "Leave out [clock] method: the plant is then integrated in fixed steps, which cannot stall."
 
 
 def answer(report: Report, case: str) -> list[str]:
@@ -59,7 +61,7 @@ def advice(report: Report) -> list[str]:
     return lines
 
 
-def on_processor(sampled: Sampled, held: float | None, lost: float | None) -> list[str]:
+def on_processor(sampled: Sampled, margin: Delays) -> list[str]:
     """The lines below the tables of a processor: slopes, the rotor's fate, and the delays (samples) of its margin."""
     lines = [
         f"- {slope.stage}: slope T as stepped, {number(slope.stepped)}, must stay below {number(slope.limit)}: a "
@@ -68,11 +70,21 @@ def on_processor(sampled: Sampled, held: float | None, lost: float | None) -> li
         if not slope.holds
     ]
     words = f"No, {len(lines)} of {len(sampled.slopes)} {'is' if len(lines) == 1 else 'are'} not:" if lines else "Yes."
-    fate = f"lost at {sampled.lost_at:.4g} s: {sampled.lost_why}" if math.isfinite(sampled.lost_at) else "held"
-    return [f"Are all laws stable as they are stepped? {words}", *lines, f"The rotor is {fate}.", _margin(held, lost)]
+    fate = "The rotor is held."
+    if sampled.stalled:
+        fate = undecided(sampled.lost_at, STALLED_PLANT)
+    elif math.isfinite(sampled.lost_at):
+        fate = f"The rotor is lost at {sampled.lost_at:.4g} s: {sampled.lost_why}."
+    return [f"Are all laws stable as they are stepped? {words}", *lines, fate, _margin(margin)]
 
 
-def _margin(held: float | None, lost: float | None) -> str:
+def _margin(margin: Delays) -> str:
+    held, lost, open_ = margin.held, margin.lost, margin.undecided
+    if open_ is not None:
+        rests = [] if held is None else [f"held up to {held:.3g} samples"]
+        rests += [f"not decided at {open_:.3g}, where the integrator stalled"]
+        rests += [] if lost is None else [f"lost at {lost:.3g}"]
+        return f"Delay margin: it is {', '.join(rests)}."
     if held is None:
         return "Delay margin: none, for it is lost without a delay too."
     if lost is None:
@@ -124,11 +136,11 @@ def _fate(report: Report, fails: bool) -> str:
     return "The rotor is held all the same: the theorem just does not promise it." if fails else "The rotor is held."
 
 
-def undecided(at: float) -> str:
-    """What is said of a run that the integrator gave up at this time, s."""
+def undecided(at: float, remedy: str = STALLED) -> str:
+    """What is said of a run that the integrator gave up at this time, s, and what can be done about it."""
     return (
         f"Whether the rotor is held is not decided: at {at:.4g} s the integrator stalled, for it could not meet its "
-        f"tolerance. {STALLED}"
+        f"tolerance. {remedy}"
     )
 
 
