@@ -52,7 +52,8 @@ def metrics(world, samples, period, settle, noise=None, rtol=1e-9):
         assert run.success, run.message
         for at, x in zip(run.t, run.y.T, strict=True):
             u, e, v_tilde, r = loop.signals(at, x)
-            rows.append((at, x[0], x[0] - r, x[2], u, e, v_tilde, _sigma(world, at, x)))
+            beyond = _singular(loop.true, x[0], x[2] - e)
+            rows.append((at, x[0], x[0] - r, x[2], u, e, v_tilde, _sigma(world, at, x), beyond))
         for left, right in itertools.pairwise(run.t):  # z is smooth: a rule of order 6 in every step
             nodes = (left + right) / 2 + (right - left) / 2 * GAUSS
             r = np.array([_reference(world.reference, at)[0] for at in nodes])
@@ -74,8 +75,13 @@ def _sigma(world, t, x):
     return x[1] - r_1 + world.position[1]["c"] * (x[0] - r)
 
 
+def _singular(plant, z, i_ref):
+    """What Eq. (9) says is 0 on C; positive on the side of the origin."""
+    return z * z + 2 * plant.s_0 * i_ref * z / plant.i_0 + plant.s_0 * plant.s_0
+
+
 def _numbers(rows, squares, integrals, samples, settle, stop, lost_at, gone):
-    t, z, e_z, i, u, e, v_tilde, sigma = rows.T
+    t, z, e_z, i, u, e, v_tilde, sigma, beyond = rows.T
     end = samples[-1]
     late, driven = t >= settle, min(end, lost_at)
     # per sample: the mean of u
@@ -113,5 +119,7 @@ def _numbers(rows, squares, integrals, samples, settle, stop, lost_at, gone):
         "copper_loss_W": total[2] / driven,
         "clearance_used": max(peak(z), stop if gone is not None else 0.0) / stop,
         "lost": gone is not None,
+        "stalled": False,
         "lost_at_s": lost_at,
+        "singular_at_s": float(t[beyond <= 0][0]) if (beyond <= 0).any() else math.inf,
     }

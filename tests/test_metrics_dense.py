@@ -12,7 +12,7 @@ from ambjax import AdaptiveRodas3, Clock, Sensor, Slide, rollout
 from ambjax.simulation.metrics import Standard
 
 PERIOD = 1e-4
-# Gains that the tuner found for two tasks of benchmarks/tasks: a hard sign under noise, and an observer.
+# Two sets of gains that the tuner once found: a hard sign under noise, and behind an observer.
 STIFF = {"position": smc(140.5, 1158.0), "inversion": adaptive(1.869e7), "current": current(92.3)}
 BEHIND = {"position": smc(1743.0, 291.6), "inversion": adaptive(1.467e6), "current": current(18.15)}
 OBSERVER = ("complementary", {"l": 1.02, "z_hat": 0.0})
@@ -30,6 +30,11 @@ LOOPS = {
         World(inversion=adaptive(1e9, 25e-6), initial=(2e-4, 0.0, 0.0), q_v=BUMP), (0.0, 0.0, 0.0)
     ),
     "lost": (World(inversion=adaptive(1e3), reference=sine()), (1e-6, 1e-4, 1e-4)),
+    # i_ref and i as good as constant, beside each other; the rotor drifts off, and over C
+    "lost across the singular curve": (
+        World(inversion=adaptive(1e-9, i_ref=-0.4), current=current(1e-9), initial=(5.5e-5, 0.0, 0.0), u_max=45.0),
+        (0.0, 0.0, 0.0),
+    ),
 }  # fmt: skip
 # Relative tolerances. Integrals of u: by the trapezoidal rule over adaptive steps, 5e-4 of them seen at worst. The
 # voltage's averages: steps whose slaved states are known to 1e-6 A know a derivative of these to a few per cent.
@@ -61,12 +66,13 @@ def test_every_metric_is_what_a_dense_solution_says(name):
     samples, settle = 200, 50 * PERIOD
     found, noise = numbers(world, std, samples, settle, AdaptiveRodas3())
     expected = metrics(world, samples, PERIOD, settle, noise)
-    assert found.keys() - expected.keys() == {"stalled", "singular_at_s"}
-    assert not found["stalled"]
+    assert found.keys() == expected.keys()
     for key, value in expected.items():
         ours, theirs = found[key], float(value)
         print(f"{key}: {ours:.8g} {theirs:.8g}")
-        if key in REACHED:  # to the sample in which it happens
+        if key == "singular_at_s":  # looked for at the samples
+            assert ours == theirs or theirs <= ours < theirs + PERIOD, key
+        elif key in REACHED:  # to the sample in which it happens
             assert ours == theirs or theirs - PERIOD - 1e-9 <= ours <= theirs + 1e-9, key
         elif key in ("rms_error_m", "settled_rms_error_m"):
             # errors are read at the samples: the rectangular rule, whose error is half a sample's worth of its ends

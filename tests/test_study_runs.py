@@ -44,7 +44,7 @@ plant.m = {{ percent = 10 }}
 initial.z = {{ normal = 1e-6 }}
 """
 TINY = CASE.format(duration="2e-3")
-# Some 0.1 s for each chunk, so that something can happen in the middle of a run; 24 chunks.
+# Some 0.1 s for each chunk, so that something can happen in the middle of a run.
 LONGER, MEMBERS, CHUNKS = CASE.format(duration="0.2"), 1536, 48
 RUN = ["ensemble", "case.toml", "--members", str(MEMBERS), "--chunk", "32", "--seed", "3"]
 
