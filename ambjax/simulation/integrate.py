@@ -236,7 +236,7 @@ class AdaptiveRodas3:
     mode and vmap work, reverse mode does not (JAX cannot reverse a loop of unknown length).
     """
 
-    tolerance: Scalar = leaf(default=1e-6, unit="1", above=0, doc="relative error allowed per step")
+    tolerance: Scalar = leaf(default=1e-6, unit="1", above=0, at_most=1.0, doc="relative error allowed per step")
     most_steps: int = static(default=10_000, doc="trial steps per sample period after which the run stalls")
 
     limit = None

@@ -49,7 +49,7 @@ class Peak:
     """
 
     of: str = static()
-    after: Scalar = leaf(default=0.0, unit="s", at_least=0)
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
     timed: bool = static(default=False)
 
     def init(self) -> tuple[Array, Array]:
@@ -91,7 +91,7 @@ class Rms:
     """Root mean square of row.`of` over the samples from `after` on."""
 
     of: str = static()
-    after: Scalar = leaf(default=0.0, unit="s", at_least=0)
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
 
     def init(self) -> tuple[Array, Array]:
         return _zero(), _zero()
@@ -110,7 +110,7 @@ class Driven:
     """Mean over time of span.densities.`of` from `after` on, while the drive is on; its root if `root`."""
 
     of: str = static()
-    after: Scalar = leaf(default=0.0, unit="s", at_least=0)
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
     root: bool = static(default=False)
 
     def init(self) -> tuple[Array, Array]:
@@ -136,7 +136,7 @@ class Variation:
     set-valued sign, without number.
     """
 
-    after: Scalar = leaf(default=0.0, unit="s", at_least=0)
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
 
     def init(self) -> tuple[Array, Array, Array]:
         return _zero(), _zero(), jnp.asarray(False)
@@ -155,7 +155,7 @@ class Reaching:
     """Start of the sample in which |row.`of`| first comes within `band`, s; +inf if it never does."""
 
     of: str = static()
-    band: Scalar = leaf(above=0)
+    band: Scalar = leaf(above=0, at_most=1e30)
 
     def init(self) -> Array:
         return _zero() + jnp.inf
@@ -194,11 +194,13 @@ class Standard:
     counts as having reached zero. The defaults are those for the plant of Table 1: see `standard_for`.
     """
 
-    settle: Scalar = leaf(default=0.5, unit="s", at_least=0, doc="time from which metrics count as settled")
-    touchdown: Scalar = leaf(default=4.5e-3, unit="m", above=0)
-    sigma_band: Scalar = leaf(default=1e-3, unit="m/s", above=0)
-    v_tilde_band: Scalar = leaf(default=0.1, unit="A^2/m^2", above=0)
-    e_band: Scalar = leaf(default=1e-3, unit="A", above=0)
+    settle: Scalar = leaf(
+        default=0.5, unit="s", at_least=0, at_most=1e6, doc="time from which metrics count as settled"
+    )
+    touchdown: Scalar = leaf(default=4.5e-3, unit="m", above=0, at_most=1.0)
+    sigma_band: Scalar = leaf(default=1e-3, unit="m/s", above=0, at_most=1e30)
+    v_tilde_band: Scalar = leaf(default=0.1, unit="A^2/m^2", above=0, at_most=1e30)
+    e_band: Scalar = leaf(default=1e-3, unit="A", above=0, at_most=1e6)
 
     def _folds(self) -> Named:
         late = self.settle

@@ -31,7 +31,7 @@ class Settling:
     longer than the run.
     """
 
-    band: Scalar = leaf(unit="m", above=0)
+    band: Scalar = leaf(unit="m", above=0, at_most=1.0)
 
     def init(self) -> Crossing:
         zero = jnp.zeros((), jnp.result_type(float))

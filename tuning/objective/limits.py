@@ -47,7 +47,7 @@ class Typical:
     """
 
     of: str = static()
-    size: Scalar = leaf(above=0)
+    size: Scalar = leaf(above=0, at_most=1e30)
 
     def init(self) -> tuple[Array, Array]:
         zero = jnp.zeros((), jnp.result_type(float))
@@ -69,7 +69,7 @@ class Scaled:
     """A fold's number, divided."""
 
     fold: Fold
-    by: Scalar = leaf(above=0)
+    by: Scalar = leaf(above=0, at_most=1e30)
 
     def init(self) -> Any:
         return self.fold.init()

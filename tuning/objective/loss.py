@@ -53,11 +53,11 @@ class Loss:
     And what each fold of `measures` says, under its name with PREFIX.
     """
 
-    settle: Scalar = leaf(default=0.2, unit="s", at_least=0)
-    early: Scalar = leaf(default=0.0, at_least=0)
-    s_0: Scalar = leaf(default=5e-3, unit="m", above=0)
-    u_scale: Scalar = leaf(default=200.0, unit="V", above=0)
-    stop: Scalar = leaf(default=4.5e-3, unit="m", above=0)
+    settle: Scalar = leaf(default=0.2, unit="s", at_least=0, at_most=1e6)
+    early: Scalar = leaf(default=0.0, at_least=0, at_most=1e6)
+    s_0: Scalar = leaf(default=5e-3, unit="m", above=0, at_most=1.0)
+    u_scale: Scalar = leaf(default=200.0, unit="V", above=0, at_most=1e30)
+    stop: Scalar = leaf(default=4.5e-3, unit="m", above=0, at_most=1.0)
     measures: Mapping[str, Fold] = dataclasses.field(default_factory=dict)
 
     def init(self) -> Sums:
