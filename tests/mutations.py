@@ -914,4 +914,62 @@ EXPORT = [
         "tests/test_export.py::test_only_files_of_an_earlier_export_of_the_same_prefix_are_replaced",
     ),
 ]
-MUTATIONS = [*PLANT, *LAWS, *LOOP, *METHODS, *NOISE, *ENSEMBLE, *SEARCH, *SAMPLED, *CHECK, *EXPORT]
+FATES = [
+    M(
+        "a stalled run on a processor is lost",
+        "ambjax/theorem/processor.py",
+        "stalled = int(outcome.lost_code) == STALLED",
+        "stalled = False",
+        "tests/test_check_processor.py::test_a_stalled_run_on_a_processor_decides_nothing",
+    ),
+    M(
+        "a delay whose run stalls loses the rotor",
+        "ambjax/ensemble/delays.py",
+        "delays[ended & (code != STALLED)]",
+        "delays[ended]",
+        "tests/test_check_processor.py::test_a_delay_whose_run_stalls_is_neither_held_nor_lost",
+    ),
+    M(
+        "a claim fails for a run that stalled",
+        "ambjax/paper/claims.py",
+        'if run.metrics["stalled"]:',
+        "if False:",
+        "tests/test_paper.py::test_a_stall_is_neither_held_nor_lost",
+    ),
+    M(
+        "what stalls is held",
+        "ambjax/paper/evidence.py",
+        "np.flatnonzero(lost | stalled)",
+        "np.flatnonzero(lost)",
+        "tests/test_paper.py::test_what_is_held_ends_where_it_is_lost_or_not_known",
+    ),
+    M(
+        "C is crossed where i_ref has the other sign",
+        "ambjax/world/bearing.py",
+        "zeta * (zeta + (2 / self.i_0) * i) + 1",
+        "zeta * (zeta - (2 / self.i_0) * i) + 1",
+        "tests/test_metrics_dense.py::test_every_metric_is_what_a_dense_solution_says[lost across the singular curve]",
+    ),
+    M(
+        "no tail is heavy",
+        "ambjax/ensemble/statistics.py",
+        "_kurtosis(x) > HEAVY",
+        "_kurtosis(x) < 0",
+        "tests/test_statistics.py::test_what_the_interval_of_a_heavy_tail_s_std_is_worth_is_said",
+    ),
+    M(
+        "a current beyond the bias is not said",
+        "ambjax/commands/doubts.py",
+        "most_i > case.scenario.plant.i_0",
+        "most_i > 10 * case.scenario.plant.i_0",
+        "tests/test_attacks.py::test_a_run_whose_current_exceeds_the_bias_says_so_once",
+    ),
+    M(
+        "an amplifier's slew rate has no upper end",
+        "ambjax/world/amplifier.py",
+        'unit="V/s", at_least=1e-3, at_most=1e15',
+        'unit="V/s", at_least=1e-3',
+        "tests/test_attacks.py::test_every_number_has_both_ends",
+    ),
+]
+MUTATIONS = [*PLANT, *LAWS, *LOOP, *METHODS, *NOISE, *ENSEMBLE, *SEARCH, *SAMPLED, *CHECK, *EXPORT, *FATES]

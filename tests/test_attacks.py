@@ -22,7 +22,7 @@ import tuning
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.template import template
-from ambjax.commands.doubts import doubts
+from ambjax.commands.doubts import doubts, reversal
 from ambjax.commands.outputs import files
 from ambjax.control.processor import Processor
 from ambjax.ensemble import LogUniform
@@ -261,6 +261,19 @@ def test_nothing_in_the_paper_is_doubtful(name):
     said = doubts(read_case(write(template(name) + sensor)))  # its text names no error of the velocity
     assert [line.split(":")[0] for line in said] == ["sensor.std_z_dot = 0 m/s"]
     assert doubts(read_case(write(template(name) + sensor + "std_z_dot = 1e-4\n"))) == []
+
+
+def test_a_run_whose_current_exceeds_the_bias_says_so_once(capsys):
+    over, under = (
+        write(SHORT + f"[initial]\ni = {i}\n", f"{name}.toml") for name, i in (("over", 0.26), ("under", 0.24))
+    )
+    main(["simulate", over, "--out", "over", "--json"])
+    assert capsys.readouterr().err.count("|i| reaches 0.26 A, above the bias plant.i_0 = 0.25 A") == 1
+    main(["simulate", under, "--out", "under", "--json"])
+    assert "|i| reaches" not in capsys.readouterr().err
+    # of two coils i is half a difference
+    coils = read_case(write(SHORT + "[processor]\n[plant]\nkind = 'two-coil'\n"))
+    assert not list(reversal(coils, 0.26))
 
 
 def test_doubts_are_said_on_stderr_once_and_stop_nothing(capsys):

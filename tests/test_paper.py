@@ -66,9 +66,7 @@ def test_a_stall_is_neither_held_nor_lost():
     report = Report([Condition("x", "", 2.0, 1.0, 0.0, "", True)], [], 0.01, "stalled", "", True)
     nothing = noise(0, stalled=True)
     uncertain = Uncertain([], ["m -10 %"], 0.0)
-    evidence = Evidence(
-        run, run, trajectory, {True: run}, report, report, [nothing] * 3, Held(0.0, 1e-7), uncertain
-    )
+    evidence = Evidence(run, run, trajectory, {True: run}, report, report, [nothing] * 3, Held(0.0, 1e-7), uncertain)
     (rows, scans, sampled) = judge({"x": evidence}), noise_table({"x": evidence}), processor_table({"x": evidence})
     verdicts = {row["says"]: row["findings"]["x"]["verdict"] for row in rows}
     others = {"The noise is about 20 % of the gap": claims.HOLDS, "The noise is specified": claims.OPEN}

@@ -68,9 +68,24 @@ def _velocity(case: Case) -> Iterator[str]:
         )
 
 
+def reversal(case: Case, most_i: float) -> Iterator[str]:
+    """Said of a run whose largest |i| (A) the case does not show: that it asks one coil for a current the other way.
+
+    Of the paper's plant alone: what two coils carry is not told by i, half their difference.
+    """
+    if case.scenario.plant.lumped and most_i > case.scenario.plant.i_0:
+        yield f"|i| reaches {most_i:.4g} A, {_beyond(case)} plant.kind = 'two-coil' gives each coil its own."
+
+
+def _beyond(case: Case) -> str:
+    i_0 = case.scenario.plant.i_0
+    return (
+        f"above the bias plant.i_0 = {i_0:g} A: one coil's current, i_0 - |i|, is reversed; not every drive does that."
+    )
+
+
 def _currents(case: Case) -> Iterator[str]:
-    scenario, plant = case.scenario, case.scenario.plant
-    beyond = f"above the bias plant.i_0 = {plant.i_0:g} A: there Eq. (3) no longer describes two opposing magnets."
+    scenario, plant, beyond = case.scenario, case.scenario.plant, _beyond(case)
     if abs(scenario.initial.i) > plant.i_0:
         yield f"initial.i = {scenario.initial.i:g} A is {beyond}"
     weight = plant.m * plant.g / plant.k_i  # v = 4 i_0 i / s_0^2 at z = 0

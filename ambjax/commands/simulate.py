@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.reader import Case
-from ambjax.commands.doubts import read_aloud
+from ambjax.commands.doubts import read_aloud, reversal
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.numerics.records import canonical
@@ -31,6 +31,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     if case.cascade.processor is not None:
         say(f"on a processor: {case.cascade.processor}")
     trajectory, numbers = simulate(case)
+    for doubt in reversal(case, float(numbers["max_abs_i_A"])):
+        say(doubt)
     metrics = plain(numbers) | {
         "lost_why": trajectory.lost_why,
         "method": str(case.clock.method),

@@ -4,6 +4,10 @@ The share is Sobol's first-order index Var(E[y | x])/Var(y) of the metric's rank
 line, and neither a few lost rotors nor times that are never reached (+inf) decide alone. E[y | x] is the least-squares
 fit of cosines of x's rank, as in Plischke's EASI (Reliab. Eng. Syst. Saf. 95, 2010, 354-360), freed of its bias as in
 Tissot and Prieur (Reliab. Eng. Syst. Saf. 107, 2012, 205-213). Spearman's rank correlation tells the trend's sign.
+
+Why ours: SALib's `rbd_fast` is this estimator, but takes ties in their members' order (a choice of two for a ramp, a
+constant for a cause), resamples half the members for its intervals, and has neither p nor pairs; scipy's
+`sobol_indices` calls the model at points of its own.
 """
 
 import itertools

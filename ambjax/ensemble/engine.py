@@ -89,9 +89,9 @@ def map_members(
     one that is not equal (==): give it a name, or make it a frozen dataclass. Members run on all devices that
     there are, on a CPU on `threads` cores (None: all that this process may use). One call of the compiled program
     takes `call` members, in whole blocks (None: equal shares for all cores, 4096 at most; of fewer blocks than cores,
-    some cores get none): memory grows with that, not with N, and another number compiles again. `block` of them run together, in vectors (None:
-    as many as fit the first-level cache). `plain`: without the fast path, which knows no reverse mode. Results are
-    NumPy arrays.
+    some cores get none): memory grows with that, not with N, and another number compiles again. `block` of them run
+    together, in vectors (None: as many as fit the first-level cache). `plain`: without the fast path, which knows no
+    reverse mode. Results are NumPy arrays.
 
     Raises ValueError where the lengths of two leaves differ, or there is none.
     """

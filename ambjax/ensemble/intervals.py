@@ -84,8 +84,8 @@ def bootstrap(
 
     An end is infinite where the ensemble is too small to bound it. Of 95 % intervals from 200 members, 93 to 97 %
     enclose a CVaR of normal, lognormal and bounded values, and a standard deviation of normal and bounded ones; of a
-    lognormal's, 87 %: its fourth moment is not seen in so few. Raises ValueError for a column that is empty or not
-    finite, and unless 0 <= alpha < 1.
+    lognormal's, 87 %: its fourth moment is not seen in so few, and a summary says so. Raises ValueError for a column
+    that is empty or not finite, and unless 0 <= alpha < 1.
     """
     if not 0 <= alpha < 1:
         raise ValueError(f"alpha = {alpha:g}: it must be at least 0 and below 1.")

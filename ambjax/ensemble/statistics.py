@@ -11,6 +11,9 @@ from ambjax.ensemble.intervals import STATISTICS, Estimate, bootstrap, column_of
 
 # The share of members that CVaR leaves out, and how many must be left for its interval to hold (measured).
 ALPHA, TAIL = 0.95, 10
+# From this kurtosis on, an exponential's, a tail is heavy (a normal's is 3), and how many of the 95 % intervals of a
+# lognormal's standard deviation cover it then, in per cent, by members (measured over 600 to 2,000 ensembles).
+HEAVY, COVERED = 9.0, {50: 83, 200: 87, 1000: 90, 5000: 92}
 # The metric by which members are ranked once all lost ones are named.
 DECIDING = "settled_max_abs_error_m"
 # Columns that are no metrics.
@@ -54,7 +57,7 @@ def summary(
         "survival": _plain(wilson(survivors, len(lost_at), confidence)),
         "confidence": confidence,
         "seed": int(seed),
-        "notes": _notes(len(lost_at), confidence),
+        "notes": _notes(len(lost_at), metrics, confidence),
         "metrics": _metrics(metrics, seed, confidence),
         "drivers": ranking,
         "explained": accounts,
@@ -62,14 +65,29 @@ def summary(
     }
 
 
-def _notes(n: int, confidence: float) -> list[str]:
-    """What an ensemble of n is too small for."""
-    tail = (1 - ALPHA) * n
-    if tail >= TAIL:
-        return []
-    sure, least = f"{100 * confidence:g} %", math.ceil(TAIL / (1 - ALPHA) - 1e-9)
-    rests = f"the mean of the worst 5 % rests on {tail:.3g} members"
-    return [f"{rests}: its {sure} interval may cover less; take {least} members"]
+def _notes(n: int, metrics: Mapping[str, np.ndarray], confidence: float) -> list[str]:
+    """What an ensemble of n is too small for: a CVaR's interval, and that of a standard deviation of heavy tails."""
+    notes, sure, tail = [], f"{100 * confidence:g} %", (1 - ALPHA) * n
+    if tail < TAIL:
+        least = math.ceil(TAIL / (1 - ALPHA) - 1e-9)
+        rests = f"the mean of the worst 5 % rests on {tail:.3g} members"
+        notes.append(f"{rests}: its {sure} interval may cover less; take {least} members")
+    heavy = [name for name, x in metrics.items() if np.isfinite(x).all() and _kurtosis(x) > HEAVY]
+    if heavy:
+        which = ", ".join(heavy[:3]) + f" and {len(heavy) - 3} more" * (len(heavy) > 3)
+        at = max((k for k in COVERED if k <= n), default=min(COVERED))
+        worth = f"{COVERED[at]} % instead of 95 % for a lognormal of {at:,} members"
+        notes.append(f"heavy tails ({which}): the {sure} interval of a standard deviation may cover less, {worth}")
+    return notes
+
+
+def _kurtosis(x: np.ndarray) -> float:
+    """Fourth central moment over the squared second; 0 where all values are alike."""
+    size = np.abs(x - x.mean()).max()
+    if size <= 1e-14 * np.abs(x).max():
+        return 0.0
+    d = (x - x.mean()) / size
+    return float(np.mean(d**4) / np.mean(d**2) ** 2)
 
 
 def _number(x: Any) -> float | None:

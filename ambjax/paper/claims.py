@@ -252,9 +252,7 @@ def _noise(evidence: Evidence) -> Finding:
 @claim("The noise is specified", "4", "variance only", "sigma's radius is the same to 10 % at every sample period")
 def _specification(evidence: Evidence) -> Finding:
     if not any(n.survived for n in evidence.noise):
-        return Finding(
-            "no survivor", None, OPEN, "the rotor is held at no noise, so the sample period cannot be told"
-        )
+        return Finding("no survivor", None, OPEN, "the rotor is held at no noise, so the sample period cannot be told")
     if len(evidence.noise) == 1:
         words = f"held {evidence.noise[0].sample_period:g} s"
         return Finding(words, None, OPEN, "on a processor noise is held for its period; the paper has none")

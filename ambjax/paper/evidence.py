@@ -44,9 +44,9 @@ class Run(NamedTuple):
 
 
 class Held(NamedTuple):
-    """Of values tried, ascending: the largest up to which all hold (0: none does), and where that is not the end of it.
+    """Of values tried, ascending: the largest up to which all are held (0: none is), and the next, if not decided.
 
-    `undecided`: the next one, where none is lost there but the integrator stalled; None: one is lost there, or all hold.
+    `undecided`: at it none is lost, but the integrator stalled. None: at the next one is lost, or all are held.
     """
 
     upto: float
@@ -227,4 +227,5 @@ def _basin(cascade: Cascade, reading: str) -> Held:
     initial = Initial(jnp.asarray(offsets), zeros, zeros + current)
     scenarios = _batch(dataclasses.replace(quiet, sensor=Sensor()), size, initial=initial)
     metrics = _scan(*canonical(_scanned(start, scenarios, float(paper.CLOCK.sample_period))))
-    return held(BASIN, *(np.reshape(metrics[fate], (2, -1)).any(axis=0) for fate in ("lost", "stalled")))
+    ended = [np.reshape(metrics[fate], (2, -1)) for fate in ("lost", "stalled")]
+    return held(BASIN, *(either[0] | either[1] for either in ended))
