@@ -28,8 +28,12 @@ class Integrals(Loop):
         return (*rates, signals[0], signals[0] ** 2, 2 * self.true.R * (self.true.i_0**2 + y[2] ** 2)), signals
 
 
-def metrics(world, samples, period, settle, noise=None, rtol=1e-9):
-    """The metrics of `samples` sample periods from rest; `noise[k]`: errors of z, z_dot, i held over sample k."""
+def metrics(world, samples, period, settle, noise=None, rtol=1e-9, numbers=None):
+    """The metrics of `samples` sample periods from rest; `noise[k]`: errors of z, z_dot, i held over sample k.
+
+    `numbers` makes others of the solution.
+    """
+    numbers = numbers or _numbers
     t = np.arange(samples + 1) * period
     inputs = (world.q_z, world.q_v, world.q_i)
     cuts = {edge for signal in (world.reference, *inputs) for edge in _edges(signal) if 0 < edge < t[-1]}
@@ -66,8 +70,8 @@ def metrics(world, samples, period, settle, noise=None, rtol=1e-9):
             times = np.append(t[t > lost_at], t[-1])
             gone = np.array([rest - _reference(world.reference, at)[0] for at in times])
             integrals = {at: x for at, x in integrals.items() if at < lost_at} | {lost_at: y[-3:]}
-            return _numbers(np.array(rows), squares, integrals, t, settle, stop, lost_at, (times, gone))
-    return _numbers(np.array(rows), squares, integrals, t, settle, stop, lost_at, None)
+            return numbers(np.array(rows), squares, integrals, t, settle, stop, lost_at, (times, gone))
+    return numbers(np.array(rows), squares, integrals, t, settle, stop, lost_at, None)
 
 
 def _sigma(world, t, x):
@@ -122,4 +126,32 @@ def _numbers(rows, squares, integrals, samples, settle, stop, lost_at, gone):
         "stalled": False,
         "lost_at_s": lost_at,
         "singular_at_s": float(t[beyond <= 0][0]) if (beyond <= 0).any() else math.inf,
+    }
+
+
+def costs(rows, squares, integrals, samples, settle, stop, lost_at, gone, *, s_0, u_scale, near, band):
+    """What the tuner counts and limits, of a rotor that is held; clearance to a stop at `near`, settling in `band`.
+
+    What it reads at the samples is read there; settling and overshoot, which it reads there too, at all steps.
+    """
+    assert gone is None
+    t, z, e_z = rows.T[:3]
+    end, n = samples[-1], len(samples) - 1
+    at = np.searchsorted(t, samples[:-1])  # z is continuous: either side of a sample does
+    late = samples[:-1] >= settle
+    halfway = (np.abs(z - e_z)[at] + near) / 2
+    beyond = np.maximum((np.abs(z[at]) - halfway) / (near - halfway), 0.0)
+    moves = np.diff([integrals[b][0] - integrals[a][0] for a, b in itertools.pairwise(samples)]) / (end / n)
+    r = z - e_z
+    low, high = (fold.accumulate(np.append(z[0], r))[1:] for fold in (np.minimum, np.maximum))
+    k = np.flatnonzero(np.abs(e_z) > band)[-1]
+    (t_0, t_1), (a, b) = t[k : k + 2], np.abs(e_z[k : k + 2])
+    return {
+        "effort": integrals[end][1] / end / u_scale**2,
+        "chatter": np.sum(moves**2) / n / u_scale**2,
+        "peak": np.mean((e_z[at][late] / s_0) ** 16) ** (2 / 16),
+        "clearance": np.mean(beyond**2),
+        "chatter_V_per_s": np.abs(moves[late[:-1]]).sum() / (end - settle),
+        "settling_s": t_0 + (t_1 - t_0) * (a - band) / (a - b),
+        "overshoot_m": max(np.max(z - high), np.max(low - z)),
     }

@@ -163,14 +163,14 @@ KINDS: dict[str, Kind] = {
     ),
     "settling_s": Kind(
         "s",
-        "time of the run from which |z - r| stays within settling_band_m",
+        "time of the run from which |z - r|, at the samples, stays within settling_band_m",
         fold=lambda site, asked: Settling(site.band),
         exact=None,
         **_WORST,
     ),
     "overshoot_m": Kind(
         "m",
-        "how far z goes beyond where it began and where r has been",
+        "how far z goes, at the samples, beyond where it began and where r has been",
         fold=lambda site, asked: Overshoot(),
         exact=None,
         **_WORST,

@@ -44,7 +44,7 @@ class Loss:
     """Terms of one member, each 0 or more and dimensionless, by name (TERMS).
 
     tracking: mean of (e_z / s_0)^2 from `settle` on, earlier samples counted `early` times.
-    peak: the square of the 16-norm of e_z / s_0 over the same samples: a smooth maximum.
+    peak: the square of the 16-norm of e_z / s_0 over the same samples: a smooth maximum, of the samples alone.
     effort: mean over time of (u / u_scale)^2 while the drive is on.
     chatter: mean over samples of ((u_k - u_{k-1}) / u_scale)^2, where u_k is the average of u over sample k.
     clearance: mean of max(0, share)^2, share of the way from halfway between |r| and the stop to the stop.
