@@ -23,8 +23,10 @@ from ambjax.world.amplifier import Amplifier
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Sensor
+from tuning.config import NUMBERS as TUNED
 from tuning.config import read_tune
 from tuning.objective.limits import KINDS as LIMITS
+from tuning.objective.loss import TERMS
 
 # Every run is of so few samples, and of so few structures, each of which is compiled once.
 SAMPLES, MOST_STRUCTURES = 4, 12
@@ -120,6 +122,20 @@ ASKED = st.one_of(
     st.dictionaries(st.sampled_from([*LIMITS, "survival"]), LIMIT, max_size=2),
     st.fixed_dictionaries({"settling_s": st.floats(1e-3, 1.0), "settling_band_m": st.floats(1e-9, 1e-3)}),
 )
+# Ends of c, together or decades apart, mostly about its default, 17; one number in twenty is as any field's.
+BOUNDS = st.tuples(st.floats(-3, 0.1), st.floats(-7, 3)).map(
+    lambda x: [17 * 10 ** x[0], 17 * 10 ** x[0] * (1 + 10 ** x[1])]
+)
+TUNE = st.fixed_dictionaries(
+    {"limits": ASKED},
+    optional={
+        "bounds": BOUNDS.map(lambda ends: {"controller": {"position": {"c": ends}}}),
+        "weights": st.dictionaries(st.sampled_from(TERMS), st.floats(1e-6, 1e3), max_size=2),
+        "risk": st.sampled_from(["mean", "cvar", "soft-worst"]),
+    }
+    | {name: st.one_of(*[st.floats(0.1, 2.0)] * 19, number(field)) for name, field in TUNED.items()}
+    | {name: st.integers(1, 100) for name in ("members", "held_out", "seed", "starts", "substeps")},
+)
 # Sensors and supplies without what is refused where there is no processor.
 ALWAYS = ("std", "std_z_dot", "std_i", "offset", "gain")
 NOISE = st.fixed_dictionaries({}, optional={f.name: number(f) for f in dataclasses.fields(Sensor) if f.name in ALWAYS})
@@ -139,7 +155,7 @@ DOCUMENT = st.fixed_dictionaries(
                 "predict": st.sampled_from([True, False, 1]),
             },
         ),
-        "tune": st.fixed_dictionaries({"limits": ASKED}),
+        "tune": TUNE,
         "sensor": st.one_of(NOISE, NOISE, table_of(Sensor, bits=st.integers(1, 33))),
         "actuator": st.one_of(SUPPLY, SUPPLY, table_of(Amplifier, u_max=number(FIELDS["u_max"]))),
         "initial": table_of(Initial, z=st.floats(-3e-3, 3e-3)),
@@ -226,7 +242,7 @@ def hold(text, path, tally, run):
     """A file with this text is refused in one line that names it, or it is read, drawn from and, if `run`, run."""
     path.write_text(text, encoding="utf-8", errors="surrogatepass")
     try:
-        case = read_tune(path)[0] if "[tune" in text else read_case(path)
+        case, tune, _ = read_tune(path) if "[tune" in text else (read_case(path), None, None)
     except ValueError as error:
         message = str(error)
     else:
@@ -237,6 +253,11 @@ def hold(text, path, tally, run):
         assert message.isprintable()
         return
     tally.read += 1
+    if tune is not None:
+        start = tune.space.values(case.cascade)
+        inside = tune.space.clip(start)
+        assert all(gain.low < value < gain.high for gain, value in zip(tune.space.gains, inside, strict=True))
+        assert np.all(np.isfinite(tune.space.encode(inside)))
     assert all(line.isprintable() for line in doubts(case))
     known = places(case.cascade, case.scenario)
     for where, values in draw(case.spread, case.cascade, case.scenario, 0, np.arange(8), 8).items():
@@ -284,5 +305,5 @@ def test_twenty_thousand_files_run_or_are_refused(path):
         hold(text, path, tally, run=True)
 
     examine()
-    assert min(tally.refused, tally.read) > 3500  # a sixth at least of either: 16,094 and 3,906 when last looked at
+    assert min(tally.refused, tally.read) > 3500  # a sixth at least of either: 16,212 and 3,788 when last looked at
     assert tally.run > 500

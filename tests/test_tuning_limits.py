@@ -63,11 +63,14 @@ def test_limits_are_in_order_and_in_the_fingerprint():
     assert asked({"settling_s": 0.1}).band == pytest.approx(45e-6)  # 1 % of 4.5 mm
 
 
+WRONG = [0.0, math.nan, -math.inf, 1e13]
+ENDS = {"clearance_used": "above 0 and at most 1"}
+
+
 @pytest.mark.parametrize(
     ("limits", "path", "words"),
     [
-        *[({name: 0.0}, name, "above 0") for name in KINDS],
-        *[({name: math.nan}, name, "above 0") for name in KINDS],
+        *[({name: wrong}, name, ENDS.get(name, "from 1e-12 to 1e+12, or inf")) for name in KINDS for wrong in WRONG],
         *[({name: "80"}, name, "without quotes") for name in KINDS],
         ({"clearance_used": 1.5}, "clearance_used", "at most 1"),
         ({"survival": 1.5}, "survival", "at most 1"),
@@ -77,7 +80,7 @@ def test_limits_are_in_order_and_in_the_fingerprint():
         ({"margin": 0}, "margin", "from 0.002"),
         ({"settling_band_m": 1e-5}, "settling_band_m", "Give both"),
         ({"settling_band_m": 1.0, "settling_s": 1.0}, "settling_band_m", "below the clearance"),
-        ({"settling_band_m": -1.0, "settling_s": 1.0}, "settling_band_m", "above 0"),
+        ({"settling_band_m": -1.0, "settling_s": 1.0}, "settling_band_m", "from 1e-12"),
         ({"rms_u": 80.0}, "rms_u", "Did you mean 'rms_u_V'?"),
     ],
 )

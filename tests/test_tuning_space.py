@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from ambjax import Cascade, Clock, Initial, Pulse, Scenario, Sine, Slide, inversion, position, rollout
 from ambjax.cases.template import template
@@ -18,7 +20,7 @@ from tuning.config import read_tune
 from tuning.objective.conditions import bounds, shortfall
 from tuning.objective.loss import TERMS, Loss, loss_for
 from tuning.objective.risk import CVaR, Mean, SoftWorst
-from tuning.space import Gain, Space, tunable
+from tuning.space import CLOSEST, MARGIN, Gain, Space, tunable
 
 GAINS = [Gain("controller.position.c"), Gain("controller.position.c", 3.0), Gain("controller.position.c", 2.0, 5e3)]
 C, K = "controller.position.c", "controller.position.k"
@@ -41,6 +43,27 @@ def test_every_coordinate_is_within_the_bounds(gain):
     decoded = gain.decode(jnp.asarray([-700.0, -20.0, 20.0, 700.0]))
     assert np.all(decoded >= gain.low)
     assert np.all(decoded <= gain.high)
+
+
+@settings(max_examples=300, derandomize=True, deadline=None, database=None)
+@given(
+    st.just(0.0) | st.floats(-30, 29).map(lambda x: 10**x),
+    st.just(math.inf) | st.floats(math.log10(2 * CLOSEST), 30).map(lambda x: 10**x),
+    st.floats(-0.5, 1.5),
+)
+@example(1.0, 0.01, 0.5)
+def test_every_interval_has_gains_well_within_and_their_coordinates(low, way, share):
+    gain = Gain(C, low, low + (way if low == 0 else way * low))
+    start = low * (1 + way) ** share if low > 0 and math.isfinite(way) else share
+    value = float(Space((gain,)).clip(np.array([start]))[0])
+    assert low < value < gain.high
+    if low < start < gain.high and low > 0:
+        assert abs(math.log(value / start)) <= math.log(1 + MARGIN) * (1 + 1e-12)
+        if 0.11 < share < 0.89 and math.isfinite(way):
+            assert value == start or way > 0.1
+    # the logarithms of 1e30 are 70, rounded in their last digit, and an exponential makes that a relative error
+    assert float(gain.decode(jnp.asarray(Space((gain,)).encode([value])[0]))) == pytest.approx(value, rel=1e-12, abs=0)
+    assert low <= float(gain.decode(jnp.asarray(-700.0))) <= float(gain.decode(jnp.asarray(700.0))) <= gain.high
 
 
 def test_gains_outside_the_space_are_the_same_objects():

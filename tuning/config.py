@@ -10,14 +10,28 @@ import numpy as np
 from ambjax.cases.reader import Case, case_from, load
 from ambjax.cases.table import Table, one_line, show
 from ambjax.ensemble.spread import require_path
+from ambjax.numerics.records import GAINS, leaf
 from tuning.objective.limits import KINDS, LEAST_MARGIN, SHARE, Limit
 from tuning.objective.loss import TERMS
 from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.optimisers import BFGS, NAMES
-from tuning.space import Gain, Space, tunable
+from tuning.space import CLOSEST, Gain, Space, tunable
 
 WEIGHTS = {"tracking": 1.0, "peak": 0.0, "effort": 0.1, "chatter": 0.1, "clearance": 1e-3, "survival": 1.0}
 WORDS = ["gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
+# Numbers of [tune], weights and limits, with both ends, decades beyond what is of use.
+NUMBERS: dict[str, dataclasses.Field] = {
+    "conditions_margin": leaf(0.1, at_least=0, at_most=1e3),
+    "early": leaf(0.0, at_least=0, at_most=1e6),
+    "stress": leaf(1.2, above=0, at_most=1e6),
+    "gain_margin": leaf(1.25, above=0, at_most=1e6),
+    "learning_rate": leaf(0.1, above=0, at_most=1e3),
+}
+WEIGHT: dataclasses.Field = leaf(at_least=0, at_most=1e9)
+LIMIT: dataclasses.Field = leaf(at_least=1e-12, at_most=1e12, infinite=True)
+SHARES: dict[str, dataclasses.Field] = dict.fromkeys(("clearance_used", "survival"), leaf(above=0, at_most=1))
+LENGTH: dataclasses.Field = leaf(at_least=1e-12, at_most=1.0, unit="m")
+MOST_WHOLE = 2**31 - 1
 # Band of the settling time, left out: a share of the clearance.
 BAND = 0.01
 
@@ -94,25 +108,22 @@ def read_tune(path: str | pathlib.Path) -> tuple[Case, Tune, dict[str, Any]]:
 
 def tune_from(table: Table, case: Case) -> Tune:
     """[tune] of a case; whatever is left out has a default."""
-    numbers = ["conditions_margin", "early", "stress", "gain_margin", "learning_rate"]
     counts = [field.name for field in dataclasses.fields(Budget)]
-    table.only([*WORDS, *numbers, *counts])
+    table.only([*WORDS, *NUMBERS, *counts])
     budget = Budget(**{name: _whole(table, name, getattr(Budget, name)) for name in counts})
     weights, conditions = _weights(table.table("weights"))
     optimiser = table.choice("optimiser", list(NAMES), BFGS)
+    numbers = {name: table.leaf(name, field, field.default) for name, field in NUMBERS.items()}
     return Tune(
         space=_space(table, case),
         weights=weights,
         limits=_limits(table.table("limits"), case),
         conditions=conditions,
-        margin=_positive(table, "conditions_margin", 0.1, zero=True),
-        early=_positive(table, "early", 0.0, zero=True),
-        stress=_positive(table, "stress", 1.2),
-        gain_margin=_positive(table, "gain_margin", 1.25),
+        margin=numbers.pop("conditions_margin"),
         risk=_risk(table),
         optimiser=optimiser,
-        learning_rate=_positive(table, "learning_rate", 0.1),
         budget=budget,
+        **numbers,
     )
 
 
@@ -150,16 +161,17 @@ def _flat(raw: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 def _bound(raw: Any, path: str, table: Table) -> tuple[float, float]:
     if raw is None:
         return 0.0, math.inf
-    numbers = isinstance(raw, list) and all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in raw)
-    if not numbers or len(raw) != 2 or not 0 <= raw[0] < raw[1]:
-        where = f"{table.at('bounds')}.{path}"
-        raise ValueError(f"{where} = {show(raw)}: give [low, high] with 0 <= low < high; inf means no upper bound.")
+    pair = isinstance(raw, list) and len(raw) == 2 and all(type(x) in (int, float) for x in raw)
+    ends = pair and 0 <= raw[0] <= GAINS[1] and (raw[1] <= GAINS[1] or raw[1] == math.inf)
+    if not ends or not (1 + CLOSEST) * raw[0] < raw[1]:
+        words = f"give [low, high] with 0 <= low < high <= {GAINS[1]:g}, apart by a share of {CLOSEST:g} of low or more"
+        raise ValueError(f"{table.at('bounds')}.{path} = {show(raw)}: {words}; inf means no upper bound.")
     return float(raw[0]), float(raw[1])
 
 
 def _weights(table: Table) -> tuple[tuple[float, ...], float]:
     table.only([*TERMS, "conditions"])
-    given = {name: _positive(table, name, WEIGHTS.get(name, 1.0), zero=True) for name in [*TERMS, "conditions"]}
+    given = {name: table.leaf(name, WEIGHT, WEIGHTS.get(name, 1.0)) for name in [*TERMS, "conditions"]}
     if not any(given[name] > 0 for name in ("tracking", "peak")):
         raise ValueError(
             f"{table.path}.tracking = 0 and {table.path}.peak = 0: nothing asks the rotor to follow its reference, "
@@ -172,13 +184,12 @@ def _weights(table: Table) -> tuple[tuple[float, ...], float]:
 
 def _limits(table: Table, case: Case) -> Limits:
     table.only([*KINDS, "survival", "margin", "settling_band_m"])
-    most = {"clearance_used": 1.0}
-    asked = {name: _limit(table, name, most.get(name, math.inf)) for name in KINDS if name in table.raw}
+    asked = {name: table.leaf(name, SHARES.get(name, LIMIT)) for name in KINDS if name in table.raw}
     u_max, source = float(np.max(np.asarray(case.scenario.u_max))), dict.fromkeys(asked, table.path)
     if "rms_u_V" not in asked and math.isfinite(u_max):
         asked["rms_u_V"], source["rms_u_V"] = SHARE * u_max, f"by default, {100 * SHARE:g} % of actuator.u_max"
     clearance = float(np.min(np.asarray(case.scenario.touchdown)))
-    band = _positive(table, "settling_band_m", BAND * clearance)
+    band = table.leaf("settling_band_m", LENGTH, BAND * clearance)
     if "settling_band_m" in table.raw and "settling_s" not in asked:
         raise ValueError(
             f"{table.at('settling_band_m')} has a meaning beside {table.at('settling_s')} only. Give both."
@@ -196,15 +207,7 @@ def _limits(table: Table, case: Case) -> Limits:
         for name in sorted(asked)
         if math.isfinite(asked[name])
     )
-    return Limits(each, _limit(table, "survival", 1.0, default=1.0), band)
-
-
-def _limit(table: Table, key: str, most: float, default: float = math.nan) -> float:
-    words = "a number above 0, or inf for none" if math.isinf(most) else f"a number above 0 and at most {most:g}"
-    value = table.number(key, default, words)
-    if not 0 < value <= most:
-        raise ValueError(f"{table.at(key)} = {value:g}: it must be {words}.")
-    return value
+    return Limits(each, table.leaf("survival", SHARES["survival"], 1.0), band)
 
 
 def _risk(table: Table) -> Risk:
@@ -219,21 +222,14 @@ def _risk(table: Table) -> Risk:
     return CVaR(alpha)
 
 
-def _positive(table: Table, key: str, default: float, zero: bool = False) -> float:
-    words = f"a finite number {'of at least' if zero else 'above'} 0"
-    value = table.number(key, default, words)
-    if not (math.isfinite(value) and (value > 0 or (zero and value == 0))):
-        raise ValueError(f"{table.at(key)} = {value:g}: it must be {words}.")
-    return value
-
-
 def _whole(table: Table, key: str, default: int) -> int:
     value, least = (
         table.raw.get(key, default),
         0 if key in ("screen", "seed", "held_out", "stressed", "validation") else 1,
     )
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value < 2**31:
-        raise ValueError(f"{table.at(key)} = {show(value)}: it must be a whole number of at least {least}.")
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= MOST_WHOLE:
+        words = f"a whole number from {least} to {MOST_WHOLE}"
+        raise ValueError(f"{table.at(key)} = {show(value)}: it must be {words}.")
     return value
 
 

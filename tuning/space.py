@@ -19,6 +19,10 @@ from ambjax.control.cascade import Cascade
 # How sharply a coordinate bends at a bound: within 1/SHARP of it, in logarithms. A logistic curve over the whole
 # interval would put a bound at infinity: a search whose optimum lies there creeps.
 SHARP = 4.0
+# A gain well within its bounds is away from them by this share of its size, or of the way between them in logarithms.
+MARGIN, MARGIN_OF_ZERO, SHARE = 0.02, 1e-12, 0.1
+# Bounds that lie closer together than by this share leave a search nothing but rounding.
+CLOSEST = 1e-6
 ROOT = "controller"
 STAGES = ("observer", "position", "inversion", "current")
 
@@ -56,11 +60,19 @@ class Gain:
             return self.low + jnp.exp(x)
         high = math.log(self.high)
         if self.low == 0.0:
-            return jnp.exp(high - jax.nn.softplus(SHARP * (high - x)) / SHARP)
+            return jnp.minimum(jnp.exp(high - jax.nn.softplus(SHARP * (high - x)) / SHARP), self.high)  # of rounding
         below = jax.nn.softplus(SHARP * (x - math.log(self.low))) / SHARP
         above = jax.nn.softplus(SHARP * (x - high)) / SHARP
         gain = jnp.exp(math.log(self.low) + (below - above))
         return jnp.clip(gain, self.low, self.high)  # of rounding, at either end
+
+    @property
+    def inner(self) -> tuple[float, float]:
+        """What is well within the bounds."""
+        if self.low == 0.0:
+            return MARGIN_OF_ZERO * min(self.high, 1.0), self.high / (1 + MARGIN)
+        aside = min(1 + MARGIN, (self.high / self.low) ** SHARE)
+        return self.low * aside, self.high / aside
 
     def at_bound(self, gain: float) -> str:
         """'low' or 'high' where the gain is within 1 % of a bound, else ''."""
@@ -113,9 +125,8 @@ class Space:
         return np.array([gain.encode(value) for gain, value in zip(self.gains, gains, strict=True)])
 
     def clip(self, gains: np.ndarray) -> np.ndarray:
-        """Gains moved inside their bounds by at least 2 % of the way."""
-        low, high = np.array([g.low for g in self.gains]), np.array([g.high for g in self.gains])
-        return np.clip(gains, low * 1.02 + 1e-12, high / 1.02)
+        """Gains moved inside their bounds by 2 % at least; by a tenth of the way where these lie closer together."""
+        return np.array([float(np.clip(value, *gain.inner)) for gain, value in zip(self.gains, gains, strict=True)])
 
     def decode(self, x: Array, cascade: Cascade) -> Cascade:
         """The cascade with the gains at coordinates x [m]; everything else the same objects as before."""

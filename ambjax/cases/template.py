@@ -73,7 +73,8 @@ settle = 0.5                  # s; from when "settled" metrics count (left out: 
 
 # [tune]                      # for 'ambjax-tune': from the gains above to better ones. Each key with its default
 # gains = ["controller.position.c", "controller.position.k"]  # what moves; left out: the gains of the laws, but p
-# bounds.controller.position.c = [1.0, 500.0]  # of one; left out: what plant and theory suggest, see the report
+# bounds.controller.position.c = [1.0, 500.0]  # of one; left out: what plant and theory suggest, see the report; c
+#                             # then ends at a fifth of the sample rate at most, others at 3 times their range or start
 # weights.tracking = 1.0      # weight of a dimensionless term, as all of these: mean square error after run.settle
 # weights.peak = 0.0          # largest error after run.settle
 # weights.effort = 0.1        # mean square voltage

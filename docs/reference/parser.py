@@ -53,7 +53,7 @@ def remarks(scenario: str = "tracking") -> dict[str, tuple[str, str]]:
     for line in template(scenario).splitlines():
         if named := re.match(r"(?:# )?\[([\w.]+)\]", line):
             table = named[1]
-        elif (more := re.fullmatch(r"#\s{20,}(.*)", line)) and last:
+        elif (more := re.fullmatch(r"#\s{20,}(?:# )?(.*[^:])", line)) and last:
             found[last] = (found[last][0], f"{found[last][1]} {more[1]}")
         elif key := LINE.fullmatch(line):
             last = f"{table}.{key['key']}"

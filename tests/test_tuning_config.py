@@ -1,0 +1,66 @@
+"""Numbers of [tune]: each has both ends, and says so."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from texts import case_and_tune
+
+from tuning.config import LIMIT, NUMBERS, SHARES, WEIGHT, Budget
+from tuning.objective.limits import KINDS
+from tuning.objective.loss import TERMS
+
+
+def parsed(tune):
+    return case_and_tune({"sensor": {"std": 1e-6}, "tune": tune})[1]
+
+
+ENDS = NUMBERS | {f"weights.{name}": WEIGHT for name in [*TERMS, "conditions"]}
+ENDS |= {f"limits.{name}": SHARES.get(name, LIMIT) for name in [*KINDS, "survival"]}
+
+
+@pytest.mark.parametrize("path", ENDS)
+def test_every_number_of_tune_has_both_ends(path):
+    meta = ENDS[path].metadata
+    table, _, name = path.rpartition(".")
+    low = meta["above"] if meta["at_least"] is None else meta["at_least"]
+    assert -math.inf < low < meta["at_most"] < math.inf
+
+    def read(value):
+        return parsed({table: {name: value}} if table else {name: value})
+
+    assert read(meta["at_most"])
+    beyond = np.nextafter(meta["at_most"], math.inf)
+    for wrong in (low - 1e-3, beyond, math.nan, -math.inf, *([] if meta["infinite"] else [math.inf])):
+        with pytest.raises(ValueError, match=rf"^tune\.{path} = .*: it must be ") as raised:
+            read(float(wrong))
+        assert f"{meta['at_most']:g}" in str(raised.value)
+        assert str(raised.value).isprintable()
+    if meta["infinite"]:
+        assert read(math.inf)
+
+
+def test_whole_numbers_and_bounds_of_tune_have_both_ends():
+    def bounds(*ends):
+        return {"gains": ["controller.position.c"], "bounds": {"controller": {"position": {"c": list(ends)}}}}
+
+    for field in dataclasses.fields(Budget):
+        assert getattr(parsed({field.name: 2**31 - 1}).budget, field.name) == 2**31 - 1
+        with pytest.raises(
+            ValueError, match=rf"^tune\.{field.name} = 2147483648: it must be .* from [01] to 2147483647\.$"
+        ):
+            parsed({field.name: 2**31})
+    for ends in ((0, 1e30), (1, math.inf), (1.0, 1.00001)):
+        assert parsed(bounds(*ends)).space.gains[0].high == ends[1]
+    for ends in (
+        (0, 1e31),
+        (1e31, math.inf),
+        (10**400, math.inf),
+        (math.inf, math.inf),
+        (1.0, 1 + 1e-7),
+        (1, math.nan),
+        (True, 5),
+    ):
+        with pytest.raises(ValueError, match=r"^tune\.bounds\.controller\.position\.c = .*0 <= low < high <= 1e\+30"):
+            parsed(bounds(*ends))
