@@ -33,6 +33,8 @@ class World:
     best: tuple[float, ...] = (100.0, 60.0)
     limit: Callable[[int, int, bool, bool], float] = lambda seed, number, stressed, accurate: math.inf
     """of c, 1/s, by seed and number of a member, whether it is asked only to be held, and by accurate steps"""
+    stalls: Callable[[int, int, bool], bool] = lambda seed, number, accurate: False
+    """whether the integration of a member stalls, by seed and number, and by accurate steps"""
     bias: Callable[[int], float] = lambda substeps: 0.0
     """relative error of the settled error in steps of so many per sample"""
     louder: float = 1.0
@@ -83,7 +85,9 @@ class Bowl:
     def metrics(self, x, who):
         self._note("metrics", x, who)
         found = self._terms(x, who)
-        lost = found["survival"] > 0
+        each = zip(np.asarray(who.seed).tolist(), np.asarray(who.member).tolist(), strict=True)
+        stalled = np.array([self.world.stalls(*one, self.accurate) for one in each]) & (found["survival"] > -1)
+        lost = (found["survival"] > 0) & ~stalled
         substeps = getattr(self.objective.clock.method, "substeps", None)
         bias = 0.0 if self.accurate else self.world.bias(substeps)
         error = S_0 * np.sqrt(found["tracking"]) * (1 + bias)
@@ -94,8 +98,8 @@ class Bowl:
             "settled_rms_u_V": 200 * np.sqrt(found["effort"]) * self.world.louder,
             "chatter_V": 1 + numbers,
             "lost": lost,
-            "stalled": np.zeros_like(lost),
-            "lost_at_s": np.where(lost, DURATION * (1 - found["survival"]), np.inf),
+            "stalled": stalled,
+            "lost_at_s": np.where(lost | stalled, DURATION * (1 - found["survival"]), np.inf),
         }
         return {"loss": found, "metrics": metrics}
 

@@ -495,3 +495,10 @@ def test_the_tuner_names_the_file_in_one_line(capsys):
     err = capsys.readouterr().err
     assert err.startswith("ambjax-tune: case.toml: tune.a\\nb = 1: unknown key")
     assert err.count("\n") == 1
+    # what is found only once the problem is made
+    assert (
+        tune([write('[tune]\ngains = ["controller.position.c"]\nbounds.controller.position.c = [100.0, 200.0]\n')]) == 2
+    )
+    err = capsys.readouterr().err
+    assert err.startswith("ambjax-tune: case.toml: controller.position.c = 17: it must lie between tune.bounds")
+    assert err.count("\n") == 1

@@ -16,7 +16,7 @@ from texts import problem_from
 from ambjax import rollout
 from ambjax.cases.reader import safe_name
 from ambjax.simulation.metrics import Standard
-from ambjax.simulation.trajectory import TOUCHED
+from ambjax.simulation.trajectory import STALLED, TOUCHED
 from tuning.__main__ import main
 from tuning.config import seeds
 from tuning.judge import judge
@@ -335,6 +335,26 @@ def test_the_picture_takes_lost_rotors(study):
         alive = np.asarray(run.rows.t) < at
         lost = dataclasses.replace(run, lost_at=at, lost_code=TOUCHED, rows=run.rows._replace(alive=alive))
         assert pictures.before_after({"before": lost, "after": run}).startswith(b"\x89PNG")
+
+
+def test_rows_of_the_picture_are_of_the_run_that_they_name(study, monkeypatch):
+    before = accurate.nominal(study, study.case.cascade)
+    rows = before.rows
+    other = dataclasses.replace(
+        before, rows=rows._replace(z=rows.r - 3 * (rows.z - rows.r) ** 2, u_mean=-(rows.u_mean**3))
+    )
+    monkeypatch.setattr(pictures, "_png", lambda figure: figure)
+    axes = np.reshape(pictures.before_after({"before": before, "after": other}).axes, (4, 3))
+    shown = [before.rows.e_z, other.rows.e_z, before.rows.u_mean, other.rows.u_mean]
+    for row, name, values in zip(axes, ("before", "after") * 2, shown, strict=True):
+        assert row[0].get_ylabel().startswith(name)
+        drawn, values = row[0].lines[0].get_ydata(), np.asarray(values)
+        # in another unit; 200 samples are not thinned
+        np.testing.assert_allclose(drawn / np.abs(drawn).max(), values / np.abs(values).max(), rtol=1e-12)
+    stalled = dataclasses.replace(before, lost_code=STALLED, rows=rows._replace(alive=np.asarray(rows.t) < 0.005))
+    lost = dataclasses.replace(stalled, lost_code=TOUCHED)
+    told = pictures.spectrum({"before": lost, "after": stalled}, 0.01).axes[0].get_legend().get_texts()
+    assert [one.get_text() for one in told] == ["before: lost before 0.01 s", "after: not decided before 0.01 s"]
 
 
 def test_ranges_and_their_sources_are_in_the_table():

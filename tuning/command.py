@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.reader import case_from
+from ambjax.cases.table import one_line
 from ambjax.commands.doubts import say_doubts
 from ambjax.commands.outputs import directory, files, plain, say, write_json
 from ambjax.control.cascade import Cascade
@@ -40,13 +41,13 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     if args.resume and not (args.out and (pathlib.Path(args.out) / f"{CHECKPOINT}-1.npz").exists()):
         raise ValueError(f"--resume: there is no {CHECKPOINT}-1.npz in --out {args.out}. Leave out --resume to begin.")
     say_doubts(case, args.case)
-    problem = problem_of(case, tune)
-    start = tune.space.values(case.cascade)
-    tune.space.encode(start)
     try:
+        problem = problem_of(case, tune)
+        start = tune.space.values(case.cascade)
+        tune.space.encode(start)
         tuned_text(case.text, _laws(problem, {}), case.name, "")
     except ValueError as why:
-        raise ValueError(f"{args.case}: {why}") from None
+        raise ValueError(one_line(f"{args.case}: {why}")) from None
     out = directory(args.out, f"tune-{case.name}")
     if not args.resume:
         _clear(out)
@@ -109,13 +110,11 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
     tuned = dataclasses.replace(case, cascade=space.decode(jnp.asarray(x), case.cascade))
     count = tune.budget.held_out
     say(f"judging on {count} members of another seed ...")
-    none = {"members": 0, "lost": 0}
+    none = {"members": 0, "held": 0, "lost": 0, "stalled": 0}
     judged = [judge(problem, at, held_out, count) for at in (_at(problem, before), x)] if count else []
     summaries = [summarise(one) for one in judged] or [none, none]
     loss = dict(zip(("before", "after"), (breakdown.table(problem.goal, one) for one in judged), strict=False))
-    again = judged and answer.confirmed and not problem.sampled
-    worst = _worst_checked(answer, judged[1], held_out) if again else None
-    refuted = (worst or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
+    worst, again, refuted = _checked(answer, judged[1] if judged else None, held_out)
     limited = limits.facts(problem.goal.limits, tune.limits, judged[1] if judged else {}, summaries[1])
     if refuted and judged:
         summaries[1] |= dict.fromkeys(("survival", "survival_low", "survival_high"), NOT_VERIFIED)
@@ -142,9 +141,8 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
         "search": settings(tune)
         | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
     }
-    if count and not problem.sampled:
-        say(f"{min(accurate.AGAIN, count)} of them again by accurate steps ...")
-        facts["accurate"] = accurate.compared(problem, x, held_out, count, report.SHOWN)
+    if again:
+        facts["accurate"] = again
     facts["gains"] = [
         row | dataclasses.asdict(where)
         for row, where in zip(report.gains_table(space, before, after, None), problem.ranges, strict=True)
@@ -152,6 +150,21 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
     facts["verdict"] = verdict.verdict(facts)
     facts["advice"] = verdict.advice(problem, facts, x, who)
     return facts
+
+
+def _checked(
+    answer: Answer, judged: dict[str, np.ndarray] | None, held_out: int
+) -> tuple[StepError | None, dict[str, Any] | None, str]:
+    """What accurate steps say of the worst held-out members and of the first, `judged` [N]; and why they do not
+    confirm the answer: '' where they do."""
+    problem, again, worst = answer.problem, None, None
+    if judged and not problem.sampled:
+        worst = _worst_checked(answer, judged, held_out) if answer.confirmed else None
+        count = problem.tune.budget.held_out
+        say(f"{min(accurate.AGAIN, count)} of them again by accurate steps ...")
+        again = accurate.compared(problem, answer.x, held_out, count, report.SHOWN)
+    refuted = (worst or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
+    return worst, again, refuted or (again["refuted"] if again else "")
 
 
 def _confirmed(*errors: StepError | None) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ambjax.ensemble import wilson
 from tuning.config import seeds
+from tuning.objective.engine import Engine
 from tuning.objective.members import Members
 from tuning.problem import REFERENCE_MEMBERS, Problem
 
@@ -35,10 +36,10 @@ def rms(values: np.ndarray) -> float:
 
 
 class StepError(NamedTuple):
-    """The search's own step against adaptive RODAS3 on a few members: settled rms error of both, m.
+    """Steps of the search, or finer ones of the judge, against accurate ones: settled rms error of both, m.
 
     Of those `members` whom both hold; `relative` is NaN if there is none. `lost`, `stalled`: how many of the `tried`
-    the search's step holds, but the accurate one loses, or cannot decide; `who` they are.
+    the coarser steps hold, but the accurate ones lose, or cannot decide; `who` they are.
     """
 
     search_m: float
@@ -54,19 +55,19 @@ class StepError(NamedTuple):
 
     @property
     def unseen(self) -> int:
-        """Members that accurate steps do not hold, though the search's own do."""
+        """Members that accurate steps do not hold, though the coarser ones do."""
         return self.lost + self.stalled
 
     @property
     def resolved(self) -> bool:
-        """Whether the search's steps tell the truth of the error there."""
+        """Whether the coarser steps tell the truth of the error there."""
         return abs(self.relative) <= RESOLVED or abs(self.search_m - self.reference_m) <= self.negligible_m
 
     @property
     def refuted(self) -> str:
         """Why accurate steps do not confirm that the rotor is held there, and how well; '' where they do."""
         if self.lost:
-            return f"accurate steps lose {self.lost} of {self.tried} members tried, which the search's own hold"
+            return f"accurate steps lose {self.lost} of {self.tried} members tried, which coarser ones hold"
         if self.stalled:
             return f"accurate steps cannot decide {self.stalled} of {self.tried} members tried (they stall)"
         if not self.members:
@@ -99,12 +100,22 @@ def worst_of(values: np.ndarray) -> np.ndarray:
 def step_error(problem: Problem, x: np.ndarray, who: Members | None = None) -> StepError:
     """What the search's own steps are worth at x [m], on these members; left out: on the first that it is tuned on."""
     who = compared(problem) if who is None else who
-    ours, theirs = (e.metrics(x[None], who)["metrics"] for e in problem.steps)
-    ended = [np.isfinite(metrics["lost_at_s"])[0] for metrics in (ours, theirs)]
+    ours, theirs = (metrics_of(engine, x, who) for engine in problem.steps)
+    return difference(problem, ours, theirs, who)
+
+
+def metrics_of(engine: Engine, x: np.ndarray, who: Members) -> dict[str, np.ndarray]:
+    """Every metric [n] of these members under the gains at x [m]."""
+    return {name: values[0] for name, values in engine.metrics(x[None], who)["metrics"].items()}
+
+
+def difference(problem: Problem, ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], who: Members) -> StepError:
+    """What steps are worth by which these members' metrics [n] are `ours`, and `theirs` by accurate ones."""
+    ended = [np.isfinite(metrics["lost_at_s"]) for metrics in (ours, theirs)]
     held, unseen = ~(ended[0] | ended[1]), ended[1] & ~ended[0]
-    stalled = unseen & theirs["stalled"][0]
+    stalled = unseen & theirs["stalled"]
     search_m, reference_m = (
-        rms(metrics["settled_rms_error_m"][0][held]) if held.any() else math.nan for metrics in (ours, theirs)
+        rms(metrics["settled_rms_error_m"][held]) if held.any() else math.nan for metrics in (ours, theirs)
     )
     relative = search_m / reference_m - 1 if reference_m > 0 else math.nan
     those: Members = jax.tree.map(lambda a: a[unseen], who)
@@ -114,13 +125,18 @@ def step_error(problem: Problem, x: np.ndarray, who: Members | None = None) -> S
 
 
 def summarise(metrics: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Numbers of an ensemble [N] for the report: pooled rms and largest error, survival, mean and largest metrics."""
-    lost, errors = np.isfinite(metrics["lost_at_s"]), metrics["settled_rms_error_m"]
-    n = len(lost)
-    survival = wilson(n - int(lost.sum()), n)
+    """Numbers of an ensemble [N] for the report: pooled rms and largest error, survival, mean and largest metrics.
+
+    A member whose integration stalled is not `lost`, for nobody knows; but it is not `held` either, nor survives.
+    """
+    errors = metrics["settled_rms_error_m"]
+    n, held = len(errors), int((~np.isfinite(metrics["lost_at_s"])).sum())
+    survival = wilson(held, n)
     summary: dict[str, Any] = {
         "members": n,
-        "lost": int(lost.sum()),
+        "held": held,
+        "lost": int(metrics["lost"].sum()),
+        "stalled": int(metrics["stalled"].sum()),
         "survival": float(survival.value),
         "survival_low": float(survival.low),
         "survival_high": float(survival.high),

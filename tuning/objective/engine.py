@@ -1,9 +1,9 @@
 """The engine: an objective and its derivatives for many gains and members at once, with common random numbers.
 
-The work is cut into lanes: one rollout of one member under one vector of gains. A fixed number of lanes
-is compiled once into one kernel and serves the screen, every iteration and the held-out ensemble alike; whatever
+The work is cut into lanes: one rollout of one member under one vector of gains. A kernel takes a fixed number of lanes
+and is compiled once: one for the terms of the loss, one of fewer lanes for their derivatives, one for metrics. Whatever
 the number of starts or members, nothing is recompiled. That number does not depend on the cores, for a last digit may
-depend on it.
+depend on it. Other steps, as those of the judge, are another engine.
 """
 
 import dataclasses

@@ -11,7 +11,7 @@ import numpy as np
 from ambjax.control.cascade import Cascade
 from ambjax.simulation.rollout import rollout
 from ambjax.simulation.trajectory import Trajectory
-from tuning.judge import summarise
+from tuning.judge import difference, metrics_of, summarise
 from tuning.problem import Problem
 
 # Held-out members that are simulated again.
@@ -24,17 +24,17 @@ def compared(problem: Problem, x: np.ndarray, seed: int, count: int, names: tupl
     """The first members of the ensemble of `count` with this seed at x [m], by the report's steps and by accurate ones.
 
     `members` simulated, `held` by both; over these the summaries (`summarise`) of `names`: of the report, accurate,
-    and the relative error of the former. `lost`, `stalled`: how many are, by either.
+    and the relative error of the former. `lost`, `stalled`: how many are, by either. `refuted`: why accurate steps do
+    not confirm what the report says of them; '' where they do, or the report itself holds nobody.
     """
     numbers = np.arange(min(AGAIN, count))
     who = problem.objective.chosen(seed, numbers, count)
-    both = [
-        {name: values[0] for name, values in engine.metrics(x[None], who)["metrics"].items()}
-        for engine in (problem.judging, problem.reference)
-    ]
+    both = metrics_of(problem.judging, x, who), metrics_of(problem.reference, x, who)
+    error = difference(problem, *both, who)
     held = np.logical_and.reduce([~np.isfinite(metrics["lost_at_s"]) for metrics in both])
     ways = ("report", "accurate")
     facts: dict[str, Any] = {"members": len(numbers), "held": int(held.sum()), "marked_beyond": MARKED}
+    facts["refuted"] = error.refuted if error.members + error.unseen else ""
     for fate in ("lost", "stalled"):
         facts[fate] = {way: int(metrics[fate].sum()) for way, metrics in zip(ways, both, strict=True)}
     facts["metrics"] = {}

@@ -121,11 +121,10 @@ def _held_out(facts: Facts) -> list[str]:
         for name in SHOWN
         if name in after
     ]
-    fates = [name for name in ("lost", "stalled") if name in after]
-    rows += [[name, str(before[name]), str(after[name]), *_fates(again, name)] for name in fates]
+    rows += [[name, str(before[name]), str(after[name]), *_fates(again, name)] for name in ("lost", "stalled")]
     rows.append(["survival, 95 % interval", *map(_survival, (before, after)), *(["-"] * 3 if again else [])])
     lines = [f"## {after['members']} held-out members (seed {facts['held_out_seed']})", "", *table(head, rows), ""]
-    return [*lines, "Lost members count with the error at which they were frozen.", *_accurate(again), ""]
+    return [*lines, "Lost and stalled members count with the error at which they were frozen.", *_accurate(again), ""]
 
 
 def _again(again: Facts | None, name: str) -> list[str]:
@@ -220,9 +219,7 @@ def _beside(facts: Facts) -> str:
     beside = facts.get("beside")
     if not beside or beside["lower"] == 0:
         return "No point of these slices that loses no more members is lower than the answer."
-    where = (
-        f"{100 * beside['lower']:.2g} % lower, at {beside['path']} = {beside['gain']:.4g}, with no more members lost"
-    )
+    where = f"{100 * beside['lower']:.2g} % lower, at {beside['path']} = {beside['gain']:.4g}"
     if beside["lower"] <= AS_GOOD:
         return (
             f"The lowest point of these slices is {where}, and loses no more members: as good as the answer, as far as "

@@ -19,7 +19,8 @@ def facts(limits: tuple[Limit, ...], asked: Limits, columns: dict[str, np.ndarra
     `price_m`: what a limit 10 % higher takes off the settled rms error, m (`Limit.bought`). None where the limit is not
     held, or nobody judges.
     """
-    share = 1 - summary["lost"] / summary["members"] if summary["members"] else None
+    members, held = summary["members"], summary["held"]
+    share = held / members if members else None
     survival = {
         "name": "survival",
         "unit": "",
@@ -32,7 +33,7 @@ def facts(limits: tuple[Limit, ...], asked: Limits, columns: dict[str, np.ndarra
         "active": False,
         "multiplier": None,
         "price_m": None,
-        "held": None if share is None else summary["lost"] <= asked.may_lose(summary["members"]),
+        "held": None if share is None else members - held <= asked.may_lose(members),
     }
     return [*(_row(limit, columns, summary) for limit in limits), survival]
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from ambjax.pictures.figures import BLUE, ORANGE, RED, thin
 from ambjax.pictures.scales import prefix_of
-from ambjax.simulation.trajectory import Trajectory
+from ambjax.simulation.trajectory import STALLED, Trajectory
 from tuning.search.explore import Slices
 
 # Where the picture of the risk ends: a lost member costs a million times an error.
@@ -72,7 +72,8 @@ def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
     for name, run in runs.items():
         t, alive = np.asarray(run.rows.t), np.asarray(run.rows.alive)
         frequency, amplitude = amplitudes(np.asarray(run.rows.u_mean)[alive & (t >= settle)], t[1] - t[0])
-        label = f"{name}: lost before {settle:g} s" if not len(amplitude) else name
+        fate = "not decided" if run.lost_code == STALLED else "lost"
+        label = name if len(amplitude) else f"{name}: {fate} before {settle:g} s"
         ax.plot(frequency, amplitude, color=ORANGE if name == "before" else BLUE, lw=0.8, label=label)
         top = max(top, amplitude.max(initial=0.0))
     ax.set(xlabel="frequency (Hz)", ylabel="amplitude of u (V)", xscale="log", yscale="log")

@@ -14,9 +14,10 @@ def verdict(facts: dict[str, Any]) -> str:
     before, after = facts["before"], facts["after"]
     if not after["members"]:
         return f"{facts['lost_in_training']} members of the training ensemble are lost under the tuned gains."
+    undecided = f", {after['stalled']} not decided (their integration stalls)" if after["stalled"] else ""
     words = (
         f"Of {after['members']} held-out members, {after['lost']} are lost under the tuned gains (before: "
-        f"{before['lost']}); settled rms error {after['settled_rms_error_m']:.3g} m (before: "
+        f"{before['lost']}){undecided}; settled rms error {after['settled_rms_error_m']:.3g} m (before: "
         f"{before['settled_rms_error_m']:.3g} m), largest {after['settled_max_abs_error_m']:.3g} m."
     )
     if not facts["verified"]:
@@ -34,6 +35,8 @@ def advice(problem: Problem, facts: dict[str, Any], x: np.ndarray, who: Members)
         )
     if lines := broken(facts["limits"]):
         words.append(f"{'. '.join(lines)}. Allow more (inf: none), tune more gains, each p too, or raise tune.screen.")
+    if stalled := facts["after"]["stalled"]:
+        words.append(f"Not decided: {stalled} held-out members, whose integration stalls. Raise tune.substeps.")
     if not (facts["lost_in_training"] or facts["after"]["lost"]):
         return " ".join(words)
     words.append(f"Rotors are lost: {facts['lost_in_training']} of {len(who.member)} in training.")
