@@ -10,7 +10,7 @@ import numpy as np
 from ambjax.cases.reader import Case, case_from, load
 from ambjax.cases.table import Table, one_line, show
 from ambjax.ensemble.spread import require_path
-from ambjax.numerics.records import GAINS, leaf
+from ambjax.extend import GAINS, leaf
 from tuning.objective.limits import KINDS, LEAST_MARGIN, SHARE, Limit
 from tuning.objective.loss import TERMS
 from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
