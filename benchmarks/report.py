@@ -13,9 +13,9 @@ HEAD = """# Benchmarks
 Written by `python benchmarks/report.py` from the JSON that the scripts left in `results/`; do not edit.
 Ratios are within one run of one script; absolute times depend on the machine and its load.
 
-All but the tuning tasks and the search were measured before metrics were folded over substeps and before adaptive steps
-without noise took a tolerance of 1e-7: gradients by sliding steps, and ensembles with all metrics, cost more since. In
-the search, CMA-ES and Nelder-Mead were run on another day, beside other work: their seconds are their own.
+One run, work against precision, throughput, peers, scaling, held noise and gradients were measured before metrics were
+folded over substeps and before adaptive steps without noise took a tolerance of 1e-7: gradients by sliding steps, and
+ensembles with all metrics, cost more since. What `ambjax-tune` and the search take was measured beside other work.
 
     .venv/bin/pip install -e '.[bench]'
     .venv/bin/python benchmarks/single.py            # one run against SciPy and diffrax

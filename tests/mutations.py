@@ -710,7 +710,8 @@ SAMPLED = [
         "whether a delay is predicted is settled by the first there was",
         "ambjax/control/processor.py",
         "return dataclasses.replace(self, whole=whole, most=most)",
-        "return dataclasses.replace(self, whole=whole, most=most, predict=self.predict if self.predict else most > 0)",
+        "ahead = most > 0 if self.predict is None else self.predict\n"
+        "        return dataclasses.replace(self, whole=whole, most=most, predict=ahead)",
         "tests/test_sampled.py::test_a_delay_that_is_set_later_is_predicted",
     ),
     M(

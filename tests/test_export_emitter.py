@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from jax import lax
 
@@ -137,6 +137,8 @@ NUMBERS = st.floats(-1e3, 1e3).filter(lambda x: x == 0 or abs(x) > 1e-30)
 
 @settings(max_examples=40, deadline=None)
 @given(tree=TREES, x=NUMBERS, y=NUMBERS)
+@example(tree=("less", "x", "y"), x=1.0, y=2.0)
+@example(tree=("less", "x", "y"), x=2.0, y=1.0)
 def test_any_expression_is_what_jax_makes_of_it(tree, x, y):
     def value(tree, x, y):
         if not isinstance(tree, tuple):
