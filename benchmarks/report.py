@@ -13,9 +13,8 @@ HEAD = """# Benchmarks
 Written by `python benchmarks/report.py` from the JSON that the scripts left in `results/`; do not edit.
 Ratios are within one run of one script; absolute times depend on the machine and its load.
 
-One run, work against precision, throughput, peers, scaling, held noise and gradients were measured before metrics were
-folded over substeps and before adaptive steps without noise took a tolerance of 1e-7: gradients by sliding steps, and
-ensembles with all metrics, cost more since. What `ambjax-tune` and the search take was measured beside other work.
+Peers and scaling were measured before metrics were folded over substeps: ensembles with all metrics cost more since.
+What `ambjax-tune` and the search take was measured beside other work, all else on an idle machine.
 
     .venv/bin/pip install -e '.[bench]'
     .venv/bin/python benchmarks/single.py            # one run against SciPy and diffrax

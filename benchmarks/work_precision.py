@@ -16,6 +16,7 @@ import _measure
 import jax
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from ambjax import RK4, AdaptiveRodas3, Clock, Euler, Rodas3, Sensor, inversion, paper, rollout
 
@@ -60,6 +61,9 @@ def draw(results: dict[str, Any]) -> None:
         ax.axhline(1e-8, color="0.5", lw=0.8, ls=":")
         ax.set_title(case, fontsize=10)
         ax.set_xlabel("time for 0.2 s simulated (ms)")
+        ax.xaxis.set_major_locator(LogLocator(subs=(1, 3)))  # an axis shorter than a decade, too
+        ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        ax.xaxis.set_minor_formatter(NullFormatter())
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("largest error in z (m)")
     axes[0].legend(fontsize=8)

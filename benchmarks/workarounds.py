@@ -1,14 +1,16 @@
 """What each workaround of XLA's CPU compiler gains, with the version of jax that it was measured under.
 
 One is turned off at a time, in a process of its own, and the same processes run in turn with one that keeps them all,
-so that whatever else the machine does meets both. Two jobs on one core: 1,024 members of the common workload under
-held noise (RK4), and the gradient of task A's loss (sliding steps, 32 lanes). A gain is the time without the workaround
+so that whatever else the machine does meets both. Three jobs on one core: 1,024 members of the common workload under
+held noise (RK4), the gradient of task A's loss (sliding steps, 32 lanes), and 1,024 members on a processor with signs
+(sampled.py's workload). A gain is the time without the workaround
 over the time with it, a median over the rounds: where it is 1 under a newer jax, the workaround can go.
 Run: python benchmarks/workarounds.py [--rounds 5] [NAME ...]
 """
 
 import argparse
 import json
+import math
 import os
 import statistics
 import time
@@ -49,7 +51,7 @@ def without_apart() -> None:
 
 def without_stored() -> None:
     """Intermediates are computed again wherever they are used."""
-    apart.stored = lambda tree: tree
+    apart.stored = lambda tree, beside=(): tree
 
 
 def without_arctan() -> None:
@@ -67,11 +69,11 @@ def without_sine() -> None:
     smooth.cosine = lambda x: jnp.cos(smooth.TWO_PI * x)
 
 
-def without_reciprocal() -> None:
+def without_refined() -> None:
     """Divisions in float64."""
     from ambjax.numerics import smooth
 
-    smooth.reciprocal = lambda x: 1 / x
+    smooth.refined = lambda x: 1 / x
 
 
 def without_blocks() -> None:
@@ -90,27 +92,30 @@ WITHOUT: dict[str, Callable[[], None]] = {
     "stored": without_stored,
     "arctan": without_arctan,
     "sine": without_sine,
-    "reciprocal": without_reciprocal,
+    "refined": without_refined,
     "blocks": without_blocks,
 }
 
 
 def jobs() -> dict[str, Callable[[], Any]]:
-    """The two runs that are timed."""
+    """The runs that are timed."""
     import gradients
+    import sampled
     import workload
 
+    digital = sampled.sampled(MEMBERS, SAMPLES, math.inf)
     work = workload.workload(MEMBERS, SAMPLES, noise=True)
     loss, who, axes, _ = gradients.tuner(LANES, SAMPLES)
     slope = gradients.programs(loss, LANES, axes)["forward"]
     return {
         "ensemble": lambda: workload.ours(work, threads=1),
         "gradient": lambda: jax.block_until_ready(slope(np.zeros(len(gradients.GAINS)), who)),
+        "processor": lambda: workload.ours(digital, threads=1),
     }
 
 
 def serve(name: str) -> None:
-    """Time both jobs whenever a line arrives; their seconds as a line of JSON."""
+    """Time every job whenever a line arrives; their seconds as a line of JSON."""
     _measure.one_core()
     WITHOUT[name]()
     runs = jobs()

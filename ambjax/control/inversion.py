@@ -14,7 +14,7 @@ from ambjax.numerics.apart import stored
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.numerics.relax import relax
 from ambjax.numerics.relaxation import relaxation
-from ambjax.numerics.smooth import TWO_OVER_PI, away_from_zero, reciprocal, smooth_sign
+from ambjax.numerics.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
 from ambjax.world.plant import Plant
 
 # |dv/di| is held at this share of its value at the origin, so that crossing the singular curve C,
@@ -90,7 +90,7 @@ class Adaptive:
         sliding, slaved, turn = relaxation(w, drift, self.gamma, self.p, h)
         w_1 = w + turn * (drift - sliding)
         w_2 = w_1 + (h - turn) * (drift - slaved)
-        return Relaxation(sliding * reciprocal(gradient_0), slaved * reciprocal(gradient_1), turn, (w, w_1, w_2))
+        return Relaxation(sliding / gradient_0, slaved / gradient_1, turn, (w, w_1, w_2))
 
     def step(self, model: Plant, inputs: ForceDemand, state: Array, period: Scalar) -> tuple[CurrentDemand, Array]:
         """v(z, i_ref) moves towards v_star as the sign at the step's end has it: gamma is its slew rate at most."""

@@ -13,7 +13,7 @@ from jax import Array
 
 from ambjax.numerics.apart import apart
 from ambjax.numerics.records import Scalar
-from ambjax.numerics.smooth import TWO_OVER_PI, arctan_per, limited, reciprocal, safe_sqrt, smooth_root, smooth_sign
+from ambjax.numerics.smooth import TWO_OVER_PI, arctan_per, limited, refined, safe_sqrt, smooth_root, smooth_sign
 
 # Steps of Halley's method from the root for another sign of the same slope and tail, which is 0.4 to 1 times the root:
 # 2 leave 3e-8 of the right-hand side, 3 rounding (Newton's method: 4 leave 2e-12).
@@ -48,12 +48,12 @@ def _relaxed(x: Array, h: Array) -> Array:
     reach, eps = h / TWO_OVER_PI, TWO_OVER_PI
     b = eps + reach - size
     root = jnp.sqrt(b * b + 4 * eps * size)
-    y = jnp.where(b > 0, 2 * eps * size * reciprocal(jnp.abs(b) + root), (root - b) / 2)
+    y = jnp.where(b > 0, 2 * eps * size * refined(jnp.abs(b) + root), (root - b) / 2)
     for _ in range(HALLEY):
         flat = 1 + y * y
-        steep = reciprocal(flat + h)  # divided first: the fourth power of y would overflow in float32
+        steep = refined(flat + h)  # divided first: the fourth power of y would overflow in float32
         newton = (y + h * arctan_per(y, jnp.ones_like(y)) - size) * steep
-        y = y - newton * flat * reciprocal(1 + (y * steep) * (h * newton))
+        y = y - newton * flat * refined(1 + (y * steep) * (h * newton))
     return jnp.where(x < 0, -y, y)
 
 

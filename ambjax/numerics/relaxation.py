@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.records import Scalar
-from ambjax.numerics.smooth import TWO_OVER_PI, reciprocal, smooth_sign
+from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
 
 # Newton steps on the slaved sign: monotone from below; they leave less than 1e-3 of the right-hand side.
 NEWTON = 6
@@ -50,4 +50,4 @@ def _implicit_jvp(primals: tuple[Array, Array, Scalar], tangents: tuple[Any, Any
     w = _implicit(b, reach, p)
     flat = TWO_OVER_PI / (1 + (p * w) ** 2)
     change = db - smooth_sign(w, p) * d_reach - reach * flat * w * dp
-    return w, change * reciprocal(1 + reach * p * flat)
+    return w, change / (1 + reach * p * flat)

@@ -76,19 +76,6 @@ def refined(x: Array) -> Array:
     return rough + rough * (error + error * error)
 
 
-@jax.custom_jvp
-@apart
-def reciprocal(x: Array) -> Array:
-    """The same, divided once however often it is used."""
-    return refined(x)
-
-
-@reciprocal.defjvp
-def _reciprocal_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    value = reciprocal(*primals)
-    return value, tangents[0] * -(value * value)
-
-
 def polynomial(u: Array, coefficients: Sequence[Scalar]) -> Any:
     """Neighbours in pairs, then pairs in pairs (Estrin): a third of the latency of Horner's scheme."""
     terms = list(coefficients)

@@ -8,7 +8,6 @@ implicitly with the whole arctan (not its slope), and the supply's limit is appl
 i_ref slides the voltage is at its limit, and the current sees an impulse, not the whole jump.
 
 The rotor's motion and the states of the other laws go by Heun's method, the current by an exponential step.
-Quotients are written as products with a reciprocal, which divides once for the value and for all its derivatives.
 """
 
 from typing import Any, NamedTuple

@@ -8,7 +8,7 @@ from jax import Array
 
 from ambjax.numerics.apart import apart
 from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.numerics.smooth import reciprocal, refined, safe_sqrt
+from ambjax.numerics.smooth import refined, safe_sqrt
 from ambjax.world.sensor import Measurement
 
 # A gap is never taken smaller than this share of s_0. No accepted state comes near it (the rotor has
@@ -205,7 +205,7 @@ class Bearing:
         discriminant = 4 * self.i_0 * self.i_0 + difference * v
         reachable = discriminant >= 0
         above = jnp.where(reachable, product * product * v - self.i_0 * self.i_0 * difference, -total)
-        return above * reciprocal(jnp.where(reachable, total + product * safe_sqrt(discriminant), difference))
+        return above / jnp.where(reachable, total + product * safe_sqrt(discriminant), difference)
 
     def equilibrium(self, z: Scalar = 0.0) -> tuple[Array, Array]:
         """Current (A) and voltage (V) that hold the rotor still at z: z_ddot = i_dot = 0."""
