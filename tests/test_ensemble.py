@@ -246,6 +246,8 @@ def test_members_npz_has_a_row_per_member_and_every_metric(tmp_path):
         ({"cascade": Cascade(inversion=inversion.Adaptive(2e9, 25e-6))}, "controller.inversion.gamma"),
         ({"cascade": Cascade(inversion=inversion.ClosedForm())}, "controller.inversion.kind"),
         ({"spread": Spread((("plant.m", Percent(2.0)),), "sobol")}, "spread.plant.m"),
+        ({"cascade": Cascade(processor=Processor(implicit=False))}, "controller.processor.kind"),
+        ({"scenario": dataclasses.replace(STUDY.scenario, sensor=Sensor(velocity=False))}, "sensor"),
         ({"clock": Clock(41, 1e-4, RK4(2))}, "clock.samples"),
     ],
 )

@@ -72,7 +72,7 @@ class StepError(NamedTuple):
             return f"accurate steps cannot decide {self.stalled} of {self.tried} members tried (they stall)"
         if not self.members:
             return "no member compared is held by both"
-        return "" if self.resolved else f"its own steps give a settled rms error off by {100 * self.relative:.2g} %"
+        return "" if self.resolved else f"coarser steps give a settled rms error off by {100 * self.relative:.2g} %"
 
     def facts(self) -> dict[str, Any]:
         """All of it as plain data."""

@@ -124,3 +124,5 @@ def _print_sampled(sampled: Sampled) -> None:
     if bands:
         head = ("signal", "unit", "disturbed by, per s", "band", "seen without noise", "seen", "note")
         print("\n" + table(head, bands) + "\n" + BAND)
+    else:
+        print("\nNo bands: without noise the run does not last.")

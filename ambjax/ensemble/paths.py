@@ -72,6 +72,26 @@ def _below(node: Any, path: str, route: tuple[int | str, ...]) -> Iterator[tuple
         yield f"{path}.{SHIFT}", Place((*route, SHIFT), TIME, 0.0)
 
 
+def kinds(node: Any, path: str = "") -> Iterator[tuple[str, str]]:
+    """What a record and those within it have that is no number, by dotted path: types, and fields that are static.
+
+    `path` ends with a dot.
+    """
+    if isinstance(node, tuple):
+        for index, item in enumerate(node):
+            yield from kinds(item, f"{path}{index}.")
+    if not dataclasses.is_dataclass(node):
+        return
+    yield f"{path}kind", type(node).__name__
+    for field in dataclasses.fields(node):
+        value, at = getattr(node, field.name), f"{path}{field.name}"
+        if field.metadata.get("static"):  # what has no name of its own is told by its type
+            named = isinstance(value, (str, int, float, bool, type(None)))
+            yield at, str(value) if named else getattr(value, "__qualname__", type(value).__name__)
+        elif not field.metadata.get("leaf"):
+            yield from kinds(value, f"{at}.")
+
+
 def order_pairs(cascade: Cascade, scenario: Scenario) -> list[tuple[str, str]]:
     """Pairs of paths of which the first must stay below the second: start and stop of a pulse, for one."""
     pairs = []

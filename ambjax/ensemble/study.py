@@ -7,7 +7,7 @@ import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.engine import run_ensemble
-from ambjax.ensemble.paths import places
+from ambjax.ensemble.paths import kinds, places
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.host.sealed import provenance
 from ambjax.simulation.clock import Clock
@@ -95,13 +95,9 @@ class Study:
     def fingerprint(self) -> dict[str, Any]:
         """Everything that a member's numbers depend on, by name, as JSON has it."""
         facts: dict[str, Any] = {**provenance(), "members": self.members, "seed": self.seed}
-        facts["plant.kind"] = type(self.scenario.plant).__name__
-        for stage in ("observer", "position", "inversion", "current"):
-            facts[f"controller.{stage}.kind"] = type(getattr(self.cascade, stage)).__name__
-        for name in ("reference", "q_z", "q_v", "q_i", "sensor"):
-            facts[f"{name}.kind"] = type(getattr(self.scenario, name)).__name__
+        facts |= {**dict(kinds(self.cascade, "controller.")), **dict(kinds(self.scenario))}
         facts |= {path: str(place.value) for path, place in places(self.cascade, self.scenario).items()}
         facts |= {"clock.samples": self.clock.samples, "clock.sample_period": str(self.clock.sample_period)}
         facts |= {"clock.method": str(self.clock.method), "run.settle": self.settle}
         facts |= {"spread.design": self.spread.design}
-        return facts | {SPREAD + path: str(kind) for path, kind in self.spread.entries}
+        return facts | {SPREAD + path: repr(kind) for path, kind in self.spread.entries}

@@ -20,7 +20,7 @@ STALLED = (
     'or a fixed step: [clock] dt = 1e-6 with method = "rodas3".'
 )
 # The same on a processor, which steps the laws: the plant alone is integrated.
-STALLED_PLANT = "Leave out [clock] method: the plant is then integrated in fixed steps, which cannot stall."
+STALLED_PLANT = 'Use fixed steps of the plant, which cannot stall: [clock] dt = 1e-6 with method = "rodas3".'
 
 
 def answer(report: Report, case: str) -> list[str]:

@@ -38,6 +38,11 @@ class Members(NamedTuple):
         """How many are not stressed."""
         return int(np.sum(~self.stressed))
 
+    @property
+    def unstressed(self) -> "Members":
+        """Those who are not stressed."""
+        return jax.tree.map(lambda a: a[: self.ordinary], self)
+
     def joined(self, others: "Members") -> "Members":
         """These and others, who are asked only to be held and come first among such."""
         more, n = others._replace(stressed=np.ones(len(others.stressed), bool)), self.ordinary

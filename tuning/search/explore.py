@@ -62,7 +62,7 @@ def pareto(
     """The front of settled tracking error against rms voltage: a family of weights of the effort, refined at once.
 
     The first has the search's own; voltage at its limit is worth from as much as the error to a thousand times that.
-    Each is judged as an answer is, in the finer steps.
+    Each is judged on the members of the training ensemble itself, none stressed, in the finer steps.
     """
     space = problem.objective.space
     weights = np.tile(problem.goal.weights, (points, 1))
@@ -74,7 +74,7 @@ def pareto(
             iterate(problem.engine, problem.goal, who, family, descent, weights)
             family.active &= np.asarray(family.starts.length) > SHORTEST
     best = np.asarray(family.starts.best)
-    metrics = problem.judging.metrics(best, who)["metrics"]
+    metrics = problem.judging.metrics(best, who.unstressed)["metrics"]
     rows = [
         {
             "effort_weight": float(w[TERMS.index("effort")]),
