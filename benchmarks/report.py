@@ -212,8 +212,8 @@ def bearings() -> list[str]:
     lines = ["## Other bearings and the templates (`bearings.py`)", "", facts(data["machine"])]
     verified = sum(row["verified"] for row in data["tasks"].values())
     lines += [
-        "As above, unattended, but that the templates' own gains hold the rotor; all but `tracking` stand still. Accurate",
-        "steps confirm",
+        "As above, unattended, but that the templates' own gains hold the rotor; all but `tracking` stand still.",
+        "Accurate steps confirm",
         f"{verified} of {len(data['tasks'])}.",
         "",
     ]

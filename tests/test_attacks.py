@@ -163,6 +163,11 @@ FAR = {
         ["reference reaches", "0.0045 m"],
     ),
     "spread": (SINE + "amplitude = 4e-3\n[spread]\nreference.amplitude = { percent = 20 }", ["spread", "0.0048 m"]),
+    "spread of a sum": (
+        '[reference]\nkind = "sum"\nterms = [{ kind = "step", amplitude = 2e-3 }, '
+        '{ kind = "sine", amplitude = 2e-3, frequency = 7 }]\n[spread]\nreference.terms.0.amplitude = { percent = 50 }',
+        ["spread.reference", "0.005 m"],
+    ),
     "gap narrowed": (SINE + "amplitude = 4e-3\n[spread]\nplant.s_0 = { percent = 20 }", ["spread", "0.0036 m"]),
     "clearance": (SINE + "amplitude = 4e-3\n[run]\nclearance = 3e-3", ["0.003 m", "run.clearance"]),
 }
@@ -170,6 +175,9 @@ NEAR = {
     "sine": SINE + "amplitude = 4.4e-3",
     "sine that never gets there": SINE + "amplitude = 20e-3\n[clock]\nduration = 0.01",
     "step after the end": '[reference]\nkind = "step"\namplitude = 5e-3\nstart = 3.0',
+    "spread of a sum": '[reference]\nkind = "sum"\nterms = [{ kind = "step", amplitude = 3e-3, start = 0.5 }, '
+    '{ kind = "step", amplitude = 2e-3 }, { kind = "step", amplitude = -2e-3, start = 0.4 }]\n'
+    "[spread]\nreference.terms.0.amplitude = { percent = 20 }",
     # the sum of its terms' bounds is 8 mm, and it never leaves 4
     "steps up and down": '[reference]\nkind = "sum"\nterms = [{ kind = "step", amplitude = 4e-3 }, '
     '{ kind = "step", amplitude = -4e-3, start = 0.5 }, { kind = "step", amplitude = 4e-3, start = 0.7 }]',

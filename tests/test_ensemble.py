@@ -13,10 +13,12 @@ import pytest
 from scipy import linalg, stats
 
 from ambjax import RK4, AdaptiveRodas3, Cascade, Clock, Initial, Scenario, Sensor, Sine, Standard, inversion, rollout
+from ambjax.control.processor import Processor
 from ambjax.ensemble import Normal, Percent, Spread, map_members, run_ensemble
 from ambjax.ensemble.engine import size
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
+from ambjax.host.sealed import difference
 from ambjax.numerics import kernel
 from ambjax.simulation.loop import ClosedLoop, LoopState
 from ambjax.simulation.metrics import Rms
@@ -246,8 +248,7 @@ def test_members_npz_has_a_row_per_member_and_every_metric(tmp_path):
         ({"cascade": Cascade(inversion=inversion.Adaptive(2e9, 25e-6))}, "controller.inversion.gamma"),
         ({"cascade": Cascade(inversion=inversion.ClosedForm())}, "controller.inversion.kind"),
         ({"spread": Spread((("plant.m", Percent(2.0)),), "sobol")}, "spread.plant.m"),
-        ({"cascade": Cascade(processor=Processor(implicit=False))}, "controller.processor.kind"),
-        ({"scenario": dataclasses.replace(STUDY.scenario, sensor=Sensor(velocity=False))}, "sensor"),
+        ({"scenario": dataclasses.replace(STUDY.scenario, sensor=Sensor(velocity=False))}, "sensor.velocity"),
         ({"clock": Clock(41, 1e-4, RK4(2))}, "clock.samples"),
     ],
 )
@@ -257,6 +258,13 @@ def test_resuming_another_study_is_refused_by_the_key_that_differs(change, key, 
     with pytest.raises(ValueError, match=rf"another study: {key} is .* there and .* here"):
         run(dataclasses.replace(STUDY, **change), tmp_path, resume=True)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_what_is_no_number_belongs_to_a_study():
+    """Which discretisation, whether there is prediction, what is measured: members of two kinds are no ensemble."""
+    sampled = [dataclasses.replace(STUDY.cascade, processor=Processor(implicit=x)) for x in (True, False)]
+    one, other = (dataclasses.replace(STUDY, cascade=cascade).fingerprint() for cascade in sampled)
+    assert difference(one, other) == "controller.processor.implicit is True there and False here"
 
 
 def test_a_store_refuses_what_it_cannot_hold(tmp_path):

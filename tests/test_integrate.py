@@ -346,6 +346,17 @@ def test_traced_gains_cannot_choose_a_method():
     assert jax.eval_shape(lambda gamma: peak(gamma, chosen), 1e9).shape == ()
 
 
+def test_a_traced_resistance_is_named_where_it_decides():
+    def peak(R):
+        world = dataclasses.replace(TRACKING, plant=amb.Plant(R=R))
+        return jnp.abs(
+            amb.rollout(amb.Cascade(processor=amb.Processor()), world, amb.Clock(10)).trajectory.rows.z
+        ).max()
+
+    with pytest.raises(ValueError, match="slope of the current in the coils is traced"):
+        jax.eval_shape(peak, 41.0)
+
+
 @pytest.mark.parametrize("n", range(1, 9))
 def test_factor_and_solve_are_those_of_numpy(n):
     rng = np.random.default_rng(n)

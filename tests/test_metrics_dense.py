@@ -1,6 +1,9 @@
 """Every metric against the same quantity of an independent, densely integrated solution (tests/dense.py)."""
 
 import dataclasses
+import functools
+import json
+import pathlib
 
 import numpy as np
 import pytest
@@ -10,8 +13,10 @@ from test_oracle import BUMP, Case, adaptive, current, in_ambjax, noise_of, puls
 
 from ambjax import AdaptiveRodas3, Clock, Sensor, Slide, rollout
 from ambjax.simulation.metrics import Standard
+from tuning.problem import FINE
 
 PERIOD = 1e-4
+SAMPLES, SETTLE = 200, 50 * PERIOD
 # Two sets of gains that the tuner once found: a hard sign under noise, and behind an observer.
 STIFF = {"position": smc(140.5, 1158.0), "inversion": adaptive(1.869e7), "current": current(92.3)}
 BEHIND = {"position": smc(1743.0, 291.6), "inversion": adaptive(1.467e6), "current": current(18.15)}
@@ -60,45 +65,73 @@ def numbers(world, std, samples, settle, method):
     return {name: float(x) for name, x in found.items()}, noise_of(case, scenario)
 
 
-@pytest.mark.parametrize("name", LOOPS)
-def test_every_metric_is_what_a_dense_solution_says(name):
+def assert_rectangular(ours, theirs, most, count):
+    """Errors are read at the samples: the rectangular rule, whose error is half a sample's worth of its ends."""
+    assert abs(ours**2 - theirs**2) <= float(most) ** 2 / 2 / count * 1.01 + 1e-3 * theirs**2
+
+
+@functools.cache
+def dense(name):
     world, std = LOOPS[name]
-    samples, settle = 200, 50 * PERIOD
-    found, noise = numbers(world, std, samples, settle, AdaptiveRodas3())
-    expected = metrics(world, samples, PERIOD, settle, noise)
+    return metrics(world, SAMPLES, PERIOD, SETTLE, numbers(world, std, SAMPLES, SETTLE, Slide(1))[1])
+
+
+def least_tolerance(name, method):
+    """The step in which the rotor touches down is not looked into: what diverges ends up to 1.2 % earlier. The sliding
+    step is made for steep signs: 0.4 % of sigma seen there, 1.9 % with a smooth one."""
+    if name.startswith("lost"):
+        return 0.03
+    return 0.0 if isinstance(method, AdaptiveRodas3) else 0.03 if name.startswith("smooth") else 6e-3
+
+
+# `simulate` measures in adaptive steps, what a report of the tuner prints in eight times its 3 a sample.
+@pytest.mark.parametrize("method", [AdaptiveRodas3(), Slide(3 * FINE)], ids=["adaptive", "sliding"])
+@pytest.mark.parametrize("name", LOOPS)
+def test_every_metric_is_what_a_dense_solution_says(name, method):
+    found, expected = numbers(*LOOPS[name], SAMPLES, SETTLE, method)[0], dense(name)
     assert found.keys() == expected.keys()
-    for key, value in expected.items():
-        ours, theirs = found[key], float(value)
+    # of a fall in sliding steps: that it is one, and how far it goes; a report counts it, and averages over the others
+    fallen = name.startswith("lost") and isinstance(method, Slide)
+    for key in ("lost", "rms_error_m", "max_abs_error_m") if fallen else expected:
+        ours, theirs = found[key], float(expected[key])
         print(f"{key}: {ours:.8g} {theirs:.8g}")
         if key == "singular_at_s":  # looked for at the samples
             assert ours == theirs or theirs <= ours < theirs + PERIOD, key
         elif key in REACHED:  # to the sample in which it happens
             assert ours == theirs or theirs - PERIOD - 1e-9 <= ours <= theirs + 1e-9, key
         elif key in ("rms_error_m", "settled_rms_error_m"):
-            # errors are read at the samples: the rectangular rule, whose error is half a sample's worth of its ends
-            most = (float(expected["max_abs_error_m"]) if key[0] == "r" else expected["settled_max_abs_error_m"]) ** 2
-            count = samples if key[0] == "r" else samples - 50
-            assert abs(ours**2 - theirs**2) <= most / 2 / count * 1.01 + 1e-3 * theirs**2, key
+            settled = key.startswith("settled")
+            most = expected["settled_max_abs_error_m" if settled else "max_abs_error_m"]
+            assert_rectangular(ours, theirs, most, SAMPLES - 50 * settled)
         elif key == "lost_at_s":
             assert ours == pytest.approx(theirs, abs=1e-5), key  # at the end of the step that touches down
         else:
-            # the step in which the rotor touches down is not looked into: what diverges ends up to 1.2 % earlier
-            rel = 0.03 if found["lost"] else TOLERANCES.get(key, SMOOTH)
+            rel = max(TOLERANCES.get(key, SMOOTH), least_tolerance(name, method))
             assert ours == pytest.approx(theirs, rel=rel, abs=1e-12), key
 
 
-@pytest.mark.parametrize("name", ["stiff under noise, limited supply", "behind an observer under the paper's noise"])
-def test_the_sliding_step_in_fine_steps_measures_the_same(name):
-    world, std = LOOPS[name]
-    found, noise = numbers(world, std, 200, 50 * PERIOD, Slide(12))
-    expected = metrics(world, 200, PERIOD, 50 * PERIOD, noise)
-    # What a report of the tuner prints is measured so. A corner of nanoseconds is left out of each slide; seen: 0.15 %
-    # of rms u, 0.4 % of the chatter, 0.09 % of the largest error.
-    for key, rel in (
-        ("rms_u_V", 0.005), ("settled_rms_u_V", 0.01), ("chatter_V", 0.01), ("max_abs_u_V", 1e-12),
-        ("max_abs_i_A", 1e-4), ("settled_max_abs_error_m", 2e-3), ("clearance_used", 1e-4), ("copper_loss_W", 1e-5),
-    ):  # fmt: skip
-        assert found[key] == pytest.approx(expected[key], rel=rel), key
+TASKS = pathlib.Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", "AC")
+def test_tuned_gains_of_the_benchmarks_measure_so_once_settled(name):
+    """The gains of results/tasks.json as they are, and where their tables begin to measure: from 0.2 s on."""
+    gains = json.loads((TASKS / "results" / "tasks.json").read_text())["tasks"][name]["gains"]
+    c, k, gamma, k_i, *pole = gains.values()
+    observer = ("complementary", {"l": pole[0], "z_hat": 0.0}) if pole else None
+    laws = {"position": smc(c, k), "inversion": adaptive(gamma), "current": current(k_i)} | (
+        {"observer": observer} if pole else {}
+    )
+    world = World(**laws, reference=sine(), u_max=200.0)  # the disturbance comes later
+    std = (3.1623e-4, 0.0, 0.0) if pole else (1e-6, 1e-4, 1e-4)
+    samples, first = 2200, 2000
+    found, noise = numbers(world, std, samples, first * PERIOD, Slide(3 * FINE))
+    expected = metrics(world, samples, PERIOD, first * PERIOD, noise)
+    for key in ("rms_u_V", "settled_rms_u_V"):
+        assert found[key] == pytest.approx(expected[key], rel=0.01), key  # seen: 0.8 %
+    # seen: 3e-9 m, of a drift within so short a window
+    assert found["settled_rms_error_m"] == pytest.approx(expected["settled_rms_error_m"], abs=5e-9)
 
 
 def test_the_start_of_a_sample_says_nothing_of_the_voltage():

@@ -176,10 +176,14 @@ def test_slices_run_along_each_gain_through_the_optimum(monkeypatch):
 
 
 def test_the_front_trades_error_for_voltage(monkeypatch):
-    """As the judge finds, whose steps are 12 a sample, not as the search does."""
+    """As the judge finds, whose steps are 24 a sample, not as the search does."""
     made = study(monkeypatch, World(bias=lambda substeps: 0.5 if substeps == 3 else 0.0))
     who = made.objective.training(1, 4, 2, 1.2, 1.25)
+    judged = []
+    judge = made.judging.metrics
+    monkeypatch.setattr(made.judging, "metrics", lambda x, them: judged.append(them) or judge(x, them))
     rows = explore.pareto(made, at(made, 100.0, 60.0), who)
+    assert [list(them.stressed) for them in judged] == [[False] * 4]
     voltage, error, k = (
         np.array(column)
         for column in zip(

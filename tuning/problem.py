@@ -18,10 +18,10 @@ from tuning.objective.loss import loss_for
 from tuning.objective.members import Objective
 from tuning.objective.ranges import Range, bounded
 
-# How many times as fine as the search's the steps are when an ensemble is judged. On two stiff loops of
-# tests/test_metrics_dense.py, which holds twelve a sample, those miss the settled voltage's mean square and its chatter
-# by 0.7 and 0.4 % at most, and three a sample by 8 and 11 %.
-FINE = 4
+# How many times as fine as the search's the steps are when an ensemble is judged. On the tuned loops of
+# tests/test_metrics_dense.py, which holds twenty-four a sample, these miss the settled rms voltage by 0.8 % at most;
+# twelve a sample by 4.6 %, three by 56 %.
+FINE = 8
 # Members and tolerance of the accurate reference against which the steps of the search are held.
 REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 10_000
 # Beyond this many gains reverse mode is the cheaper one.

@@ -1,5 +1,8 @@
 """How far a case asks the rotor to go: a reference beyond the clearance is refused where the case is read."""
 
+import math
+
+import jax
 import numpy as np
 
 from ambjax.control.cascade import Cascade
@@ -10,6 +13,8 @@ from ambjax.world.signals import BandNoise, Sum
 
 # Instants at which a signal is sampled at a time.
 BLOCK = 2**16
+# Members at the ends of a spread whose sums are sampled.
+MOST_CORNERS = 64
 
 
 def reach(scenario: Scenario, clock: Clock) -> float:
@@ -25,21 +30,24 @@ def widest(spread: Spread, cascade: Cascade, scenario: Scenario) -> Scenario:
 def check_reference(spread: Spread, cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     """Raise ValueError for a reference that leaves the clearance, with how far it goes and the fix.
 
-    Of a sum or of noise, whose bound may never be reached, the case's own samples decide.
+    Of a sum or of noise, whose bound may never be reached, samples decide: of the case, and of up to MOST_CORNERS
+    combinations of the ends of its spread, where there are no more.
     """
-    own, stop = reach(scenario, clock), float(scenario.touchdown)
-    if isinstance(scenario.reference, (Sum, BandNoise)):
-        own = sampled(scenario, clock) if own >= stop else own
-        _compare("reference", own, stop, clock)
-        return
-    _compare("reference", own, stop, clock)
+    _compare("reference", scenario, clock)
     wide = widest(spread, cascade, scenario)
-    _compare(
-        "spread.reference: with the ends of its [spread] it", reach(wide, clock), float(np.min(wide.touchdown)), clock
-    )
+    what = "spread.reference: with the ends of its [spread] it"
+    if not isinstance(scenario.reference, (Sum, BandNoise)):
+        _compare(what, wide, clock)
+    elif reach(wide, clock) >= np.min(wide.touchdown):
+        shape = np.broadcast_shapes(*map(np.shape, jax.tree.leaves((wide.reference, wide.touchdown))))
+        for corner in np.ndindex(shape) if math.prod(shape) <= MOST_CORNERS else ():
+            _compare(what, jax.tree.map(lambda x, at=corner: np.broadcast_to(x, shape)[at], wide), clock)
 
 
-def _compare(what: str, far: float, stop: float, clock: Clock) -> None:
+def _compare(what: str, scenario: Scenario, clock: Clock) -> None:
+    far, stop = reach(scenario, clock), float(np.min(scenario.touchdown))
+    if far >= stop and isinstance(scenario.reference, (Sum, BandNoise)):
+        far = sampled(scenario, clock)
     if not far < stop:
         raise ValueError(
             f"{what} reaches {far:.6g} m within clock.duration = {float(clock.duration):g} s, but the rotor "

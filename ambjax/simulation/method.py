@@ -39,15 +39,11 @@ TOLERANCE, QUIET_TOLERANCE = 1e-6, 1e-7
 def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
     """Steepest rate of each law, of the unstable plant and of its coils, 1/s; the largest over an ensemble.
 
-    In continuous time the coils' is left out where it is traced: the laws are steeper by decades. Raises ValueError
-    where another is traced: a step can be chosen only from numbers.
+    Raises ValueError where one is traced: a step can be chosen only from numbers.
     """
     # on a processor the laws are stepped, and the plant alone is integrated
     laws = {} if cascade.processor else {f"{stage} law": slope for stage, slope in cascade.slopes().items()}
-    coils = scenario.plant.coil_slope(scenario.touchdown)
-    named = laws | {PLANT: scenario.plant.slope()}
-    if cascade.processor is not None or not is_traced(coils):
-        named[COILS] = coils
+    named = laws | {PLANT: scenario.plant.slope(), COILS: scenario.plant.coil_slope(scenario.touchdown)}
     if traced := [name for name, slope in named.items() if is_traced(slope)]:
         raise ValueError(
             f"clock.method is None (dt = 'auto'), but inside jit, grad or vmap the slope of the {traced[0]} is traced "

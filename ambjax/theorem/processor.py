@@ -74,7 +74,8 @@ class Band:
 class Sampled:
     """Slopes and bands of a cascade on its processor, and the fate of the rotor there, under the case's noise.
 
-    No bands where the run without noise does not last. `stalled`: the integrator gave up at `lost_at`, and nothing is decided.
+    No bands where the run without noise does not last. `stalled`: the integrator gave up at `lost_at`, and nothing is
+    decided.
     """
 
     slopes: list[Slope]
