@@ -702,15 +702,15 @@ SAMPLED = [
     M(
         "the program of delays that are spread is that of the nominal one",
         "ambjax/cases/reader.py",
-        "cascade = cascade.on_processor(late.delay)",
-        "cascade = cascade.on_processor()",
+        "cascade.on_processor(late.delay, between=",
+        "cascade.on_processor(between=",
         "tests/test_tuning_search.py::test_a_lane_has_the_delay_of_its_member",
     ),
     M(
         "delays between whole ones are rounded",
-        "ambjax/cases/reader.py",
-        "processor=dataclasses.replace(cascade.processor, whole=False)",
-        "processor=cascade.processor",
+        "ambjax/control/processor.py",
+        "self.whole is not False and not between and",
+        "self.whole is not False and",
         "tests/test_tuning_search.py::test_a_lane_has_the_delay_of_its_member",
     ),
     M(

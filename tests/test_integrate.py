@@ -348,10 +348,8 @@ def test_traced_gains_cannot_choose_a_method():
 
 def test_a_traced_resistance_is_named_where_it_decides():
     def peak(R):
-        world = dataclasses.replace(TRACKING, plant=amb.Plant(R=R))
-        return jnp.abs(
-            amb.rollout(amb.Cascade(processor=amb.Processor()), world, amb.Clock(10)).trajectory.rows.z
-        ).max()
+        world, cascade = dataclasses.replace(TRACKING, plant=amb.Plant(R=R)), amb.Cascade(processor=amb.Processor())
+        return jnp.abs(amb.rollout(cascade, world, amb.Clock(10)).trajectory.rows.z).max()
 
     with pytest.raises(ValueError, match="slope of the current in the coils is traced"):
         jax.eval_shape(peak, 41.0)

@@ -150,9 +150,7 @@ def case_from(raw: dict[str, Any], name: str = "case", text: str = "") -> Case:
     check_reference(spread, cascade, scenario, clock)
     clock = with_method(clock, *corners(spread, cascade, scenario))
     if (late := ends(spread, cascade, scenario, ("processor.",))[0].processor) is not None:
-        cascade = cascade.on_processor(late.delay)
-    if "processor.delay" in spread.paths:  # whole samples at both ends say nothing of what is between
-        cascade = dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, whole=False))
+        cascade = cascade.on_processor(late.delay, between="processor.delay" in spread.paths)
     return Case(safe_name(name), cascade, scenario, clock, settle, spread, text)
 
 

@@ -147,12 +147,13 @@ class Cascade:
         rates = CascadeState(observed_rate, positioned_rate, (), ())
         return ForceDemand(z, z_rate, v_star, v_star_rate, gaps), estimate, rates
 
-    def on_processor(self, *delays: Scalar) -> "Cascade":
+    def on_processor(self, *delays: Scalar, between: bool = False) -> "Cascade":
         """The cascade with everything settled that decides which program is compiled for it: signs whose steepness is
-        inf become set-valued, and its processor is ready for `delays` (samples) too. Raises as `Processor.resolved`."""
+        inf become set-valued, and its processor is ready for `delays` (samples) too, or for all `between` them. Raises
+        as `Processor.resolved`."""
         assert self.processor is not None
         laws = {stage: answers.hardened(getattr(self, stage)) for stage in USUAL}
-        return dataclasses.replace(self, **laws, processor=self.processor.resolved(*delays))
+        return dataclasses.replace(self, **laws, processor=self.processor.resolved(*delays, between=between))
 
     def check_smooth(self) -> None:
         """Raise ValueError for a sign without a layer, which continuous time does not know."""

@@ -47,8 +47,10 @@ class Processor:
         """Whether the estimate is carried over the delay."""
         return bool(self.resolved().most) if self.predict is None else self.predict
 
-    def resolved(self, *others: Scalar) -> "Processor":
+    def resolved(self, *others: Scalar, between: bool = False) -> "Processor":
         """This processor with everything settled that decides which program is compiled; for `others`, delays, too.
+
+        `between`: for whatever lies between them as well, which need not be whole samples.
 
         What was settled before for longer delays stays: a part of an ensemble runs the program of the whole.
         Raises ValueError where the delay is traced and that was not settled before.
@@ -61,7 +63,7 @@ class Processor:
                 )
             return self
         delay = np.concatenate([np.ravel(np.asarray(x, float)) for x in (self.delay, *others)])
-        whole = self.whole is not False and bool(np.all(delay == np.round(delay)))
+        whole = self.whole is not False and not between and bool(np.all(delay == np.round(delay)))
         most = max(self.most or 0, math.ceil(float(delay.max())))
         return dataclasses.replace(self, whole=whole, most=most)
 
