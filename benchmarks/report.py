@@ -199,10 +199,10 @@ def tasks() -> list[str]:
     data = load("tasks")
     lines = ["## The tuning tasks (`tasks.py`)", "", facts(data["machine"])]
     lines += [
-        "`ambjax-tune` with its defaults, but that E minimises the mean of its worst tenth on 64 members and the pole of",
-        "the observer may go from 0.999 to 1e4; from gains that lose the rotor; judged on held-out members. Steps: error",
-        "of the settled rms error in the search's own steps against adaptive RODAS3. u: once settled. Seconds: all of",
-        "`ambjax-tune`, on one processor, beside other work.",
+        "`ambjax-tune` with its defaults, but that E minimises the mean of its worst tenth on 64 members and the",
+        "pole of the observer may go from 0.999 to 1e4; from gains that lose the rotor; judged on held-out members.",
+        "Steps: error of the settled rms error in the search's own steps against adaptive RODAS3. u: once settled.",
+        "Seconds: all of `ambjax-tune`, on one processor, beside other work.",
         "",
     ]
     return lines + _tasks(data)
@@ -224,17 +224,12 @@ def bearings() -> list[str]:
 def _tasks(data: dict[str, Any]) -> list[str]:
     rows = []
     for row in data["tasks"].values():
-        marks = {path: " (at its bound)" for path in row["at_bound"]}
-        gains = (f"{path.rpartition('.')[2]} {x:.4g}{marks.get(path, '')}" for path, x in row["gains"].items())
+        marks = dict.fromkeys(row["at_bound"], " (at its bound)")
+        gains = [f"{path.rpartition('.')[2]} {x:.4g}{marks.get(path, '')}" for path, x in row["gains"].items()]
         cells = [row["title"], f"{row['settled_rms_error_m']:.2e}", f"{row['settled_max_abs_error_m']:.1e}"]
         cells += [f"{row['lost']} of {row['members']}", f"{row['settled_rms_u_V']:.3g}"]
-        cells += [
-            f"{100 * row['step_error']:.1g} %",
-            f"{row['rollouts']:,}",
-            f"{row['processor_s']:.0f}",
-            ", ".join(gains),
-        ]
-        rows.append(cells)
+        cells += [f"{100 * row['step_error']:.1g} %", f"{row['rollouts']:,}", f"{row['processor_s']:.0f}"]
+        rows.append([*cells, ", ".join(gains)])
     titles = "task | settled rms error (m) | largest (m) | lost | u rms (V) | steps | rollouts | processor (s) | gains"
     return table(titles, rows)
 
@@ -267,11 +262,12 @@ def search() -> list[str]:
     data = load("search")
     lines = ["## The search against derivative-free ones (`search.py`)", "", facts(data["machine"])]
     lines += [
-        "The same loss, members, coordinates and ranges, which TPE and random search cannot leave far; the budget",
-        "of rollouts is the gradients' own, or a multiple of it. Loss: median over seeds and range. Reached: rollouts",
-        "until the gradients' median loss, median over seeds; a dash: not in the budget. Rollouts are not cost, since",
-        "padded lanes are computed too: seconds are",
-        "processor time of a search on one core.",
+        "The same loss, members, coordinates and ranges, which TPE can leave by half of them and random search",
+        "cannot; the budget of rollouts is what the search by gradients takes to its own end in the median over its",
+        "seeds, or a multiple of that. Loss: median over seeds and range. Seeds are what is random in a method:",
+        "Powell's has nothing, nor have Nelder-Mead and CMA-ES in where they begin. Reached: rollouts until the",
+        "median loss of the gradients at their own end, median over seeds; a dash: not in the budget. Rollouts are",
+        "not cost, since padded lanes are computed too: seconds are processor time of a search on one core.",
         "",
     ]
     rows = []
