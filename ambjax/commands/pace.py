@@ -51,10 +51,13 @@ class Pace(NamedTuple):
 def pilot(study: Study) -> tuple[dict[str, np.ndarray], float]:
     """The rows of the first members, as many as run here at once, and the seconds that they took.
 
-    The program is compiled before, by rotors that are lost when they start: they cost next to nothing.
+    The program is compiled before, by rotors that are lost when they start: they cost next to nothing. Then a line says
+    what is waited for, where there is more to come: of slow members a call takes a minute.
     """
     first = min(CALL * cores() if jax.default_backend() == "cpu" else BESIDE_CPU, study.members)
     chunk(study, 0, first, first, lost=True)
+    if first < study.members:
+        say(f"timing the first {first} members ...")
     began = time.perf_counter()
     columns = chunk(study, 0, first, first)
     return {name: np.asarray(x) for name, x in columns.items()}, time.perf_counter() - began
