@@ -4,13 +4,13 @@ import argparse
 import contextlib
 import importlib
 import json
-import os
 import sys
 from collections.abc import Callable
 from typing import Any, NoReturn
 
 from ambjax._version import __version__
 from ambjax.host.interrupts import listening
+from ambjax.host.streams import lenient, open_streams
 from ambjax.host.words import one_line
 
 
@@ -89,8 +89,7 @@ def main(argv: list[str] | None = None) -> int:
     if words[:1] == ["tune"]:
         return complain("tuning is a program of its own: write 'ambjax-tune CASE.toml'. See 'ambjax-tune --help'.")
     with listening("ambjax"):
-        args = parser().parse_args(words)
-        return answer(lambda: _run(args), args.json)
+        return answer(parser(), words, _run)
 
 
 def _run(args: argparse.Namespace) -> tuple[int, Any]:
@@ -100,43 +99,51 @@ def _run(args: argparse.Namespace) -> tuple[int, Any]:
     return importlib.import_module(f"ambjax.commands.{args.command}").run(args)
 
 
-def open_streams() -> None:
-    """Give streams that the caller has closed an end: print would put on stdout what is meant for a missing stderr.
+Run = Callable[[argparse.Namespace], tuple[int, Any]]
 
-    In the order of their numbers, so that no file that is opened later takes the place of one.
+
+def answer(parser: argparse.ArgumentParser, words: list[str] | None, run: Run) -> int:
+    """Run a command and print its summary if --json asks for that. Returns the exit code; what goes wrong is one line.
+
+    No stream that takes nothing stops it. Whoever closes stdout has seen enough of the answer; any other failure of
+    stdout is told, with 2. Raises SystemExit as the parser does.
     """
-    for name in ("stdin", "stdout", "stderr"):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115, PTH123
+    with lenient() as stdout:
+        try:
+            args = parser.parse_args(words)
+        except SystemExit as end:  # bad arguments, or an answer too: --help, --version
+            if end.code or stdout.failure() is None:
+                raise
+            code = 0
+        else:
+            code = _code(lambda: run(args), args.json, parser.prog)
+        failure = stdout.failure()
+        if failure is None or isinstance(failure, BrokenPipeError):
+            return code
+        why = getattr(failure, "strerror", None) or failure
+        return complain(f"the answer could not be written: {why}. Make room, or write somewhere else.", parser.prog)
 
 
-def answer(run: Callable[[], tuple[int, Any]], as_json: bool, program: str = "ambjax") -> int:
-    """Run a command and print its summary if that was asked for. Returns the exit code; what goes wrong is one line."""
+def _code(run: Callable[[], tuple[int, Any]], as_json: bool, program: str) -> int:
     try:
         code, summary = run()
         if as_json:
             print(json.dumps(summary, indent=2))
-        sys.stdout.flush()
     except ValueError as error:
         return complain(str(error), program)
-    except BrokenPipeError:  # whoever read the answer has seen enough of it
-        _silence()
-        return 0
     except OSError as error:
-        _silence()
-        where = f"{error.filename}: " if error.filename else "the answer could not be written: "
+        where = f"{error.filename}: " if error.filename else ""
         return complain(f"{where}{error.strerror or error}. Make room, or write somewhere else.", program)
     except MemoryError:
         return complain("there is not enough memory for that. Ask for less at once: fewer members or samples.", program)
+    except (NotImplementedError, RecursionError):  # faults of ours, RuntimeErrors too
+        raise
+    except RuntimeError as error:  # what JAX says of a device: that it is not there, or that its memory is full
+        return complain(str(error).strip().partition("\n")[0] or type(error).__name__, program)
     except KeyboardInterrupt as stop:
         complain(f"interrupted{f': {stop}' if str(stop) else ''}.", program)
         return 130
     return code
-
-
-def _silence() -> None:
-    """Let nothing more be written to a stdout that takes nothing, at the end of the program above all."""
-    sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
 
 
 if __name__ == "__main__":

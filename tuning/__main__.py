@@ -5,8 +5,9 @@ import sys
 from typing import Any
 
 from ambjax import __version__
-from ambjax.__main__ import Parser, answer, open_streams
+from ambjax.__main__ import Parser, answer
 from ambjax.host.interrupts import listening
+from ambjax.host.streams import open_streams
 
 
 def parser() -> argparse.ArgumentParser:
@@ -33,8 +34,7 @@ def main(argv: list[str] | None = None) -> int:
     """
     open_streams()
     with listening("ambjax-tune"):
-        args = parser().parse_args(argv)
-        return answer(lambda: _run(args), args.json, "ambjax-tune")
+        return answer(parser(), argv, _run)
 
 
 def _run(args: argparse.Namespace) -> tuple[int, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import one_line
 from ambjax.commands.doubts import say_doubts
-from ambjax.commands.outputs import directory, files, plain, say, write_json
+from ambjax.commands.outputs import directory, files, plain, say, write_json, written
 from ambjax.control.cascade import Cascade
 from ambjax.host.interrupts import keeping
 from ambjax.theorem.conditions import check
@@ -31,6 +31,7 @@ from tuning.search.keeper import remove_all
 from tuning.search.rounds import rounds
 from tuning.space import Gain, Space, tunable
 
+WRITTEN = ("tuned.toml", "history.npz", "report.html", "report.md", "report.json")
 # What stands for a survival that accurate steps do not confirm.
 NOT_VERIFIED = "not verified"
 
@@ -48,7 +49,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         tuned_text(case.text, _laws(problem, {}), case.name, "")
     except ValueError as why:
         raise ValueError(one_line(f"{args.case}: {why}")) from None
-    out = directory(args.out, f"tune-{case.name}")
+    out = directory(args.out, f"tune-{case.name}", WRITTEN)
     if not args.resume:
         _clear(out)
     with keeping(lambda: _kept(out)):
@@ -93,7 +94,7 @@ def _tune(
     summary = plain(facts) | {"out": str(out)}
     if not args.json:
         print(_short(facts))
-        print(f"written: {out}/tuned.toml, history.npz, report.html, report.md, report.json, *.png")
+        written(out, f"{', '.join(WRITTEN)}, *.png")
     held = all(row["held"] for row in facts["limits"]) if facts["after"]["members"] else not facts["lost_in_training"]
     good = held and facts["verified"]
     if not good:

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from ambjax.cases.reader import Case
 from ambjax.commands.doubts import read_aloud
-from ambjax.commands.outputs import files, make, plain, say, table, target, write_json
+from ambjax.commands.outputs import check_places, files, make, plain, say, table, target, write_json, written
 from ambjax.commands.pace import Pace, error_words, pilot, say_how_long, sliding_error
 from ambjax.ensemble import statistics
 from ambjax.ensemble.design import MOST_MEMBERS
@@ -21,9 +21,13 @@ from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
 from ambjax.ensemble.worker import chunk, deaf_children, processes, work
 from ambjax.host.interrupts import keeping, unbroken
+from ambjax.host.lock import alone
+from ambjax.host.words import one_line
 from ambjax.simulation.integrate import Slide
 from ambjax.simulation.trajectory import STALLED
 
+# Beside members.npz; the last where something is spread.
+WRITTEN = ("summary.json", "fan.png", "histograms.png", "tornado.png")
 # Chunks in flight for each worker: one runs, one waits.
 AHEAD = 2
 # More than any machine has cores; each takes memory of its own.
@@ -52,11 +56,13 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     case = read_aloud(args.case)
     study, store = _study_and_store(case, args)
     out = store.directory
-    with keeping(lambda: _state_words(store)):
+    with keeping(lambda: _state_words(store)), contextlib.ExitStack() as held:
         error = None
         with contextlib.nullcontext() if store.finished() else _executor(args) as executor:
             make(out)  # not before everything that was asked for is known to be possible
-            say(f"method: {case.clock.method}; writing to {out}")
+            held.enter_context(alone(out))
+            _check(study, store, args)  # again: another run may have begun, or ended, since
+            say(one_line(f"method: {case.clock.method}; writing to {out}"))
             if isinstance(case.clock.method, Slide):
                 error = sliding_error(study)
                 say(error_words(error))
@@ -80,8 +86,13 @@ def _study_and_store(case: Case, args: argparse.Namespace) -> tuple[Study, Store
     out = target(args.out, f"ensemble-{case.name}")
     chunk = None if args.chunk is None else min(args.chunk, study.members)
     store = Store(out, study.fingerprint(), study.members, chunk)
-    store.check(COLUMNS + len(study.spread.entries), args.resume)
+    _check(study, store, args)
     return study, store
+
+
+def _check(study: Study, store: Store, args: argparse.Namespace) -> None:
+    store.check(COLUMNS + len(study.spread.entries), args.resume)
+    check_places(store.directory, WRITTEN)
 
 
 def _begin(study: Study, store: Store, executor: tuple[Executor, int] | None) -> None:
@@ -122,10 +133,7 @@ def _report(
         _pictures(case, study, columns, summary, part)
     if not args.json:
         print(_text(summary))
-        print(
-            f"written: {out}/members.npz, summary.json, fan.png, histograms.png"
-            + ", tornado.png" * bool(study.spread.entries)
-        )
+        written(out, ", ".join(["members.npz", *WRITTEN[: None if study.spread.entries else -1]]))
     return int(summary["survivors"] < study.members), plain(summary) | {"out": str(out)}
 
 
@@ -266,4 +274,4 @@ def _text(summary: dict[str, Any]) -> str:
         ]
         lines += [table(("quantity", "explains alone", sure, "rank correlation"), bars)]
     worst = summary["worst"][0]
-    return "\n".join([*lines, "", f"The worst member alone: {worst['replay']}"])
+    return "\n".join([*lines, "", f"The worst member alone: {one_line(worst['replay'])}"])

@@ -7,7 +7,7 @@ from typing import Any
 
 from ambjax.cases.reader import Case, read_case
 from ambjax.commands.doubts import say_doubts
-from ambjax.commands.outputs import directory, files, say, spare, table, write_json
+from ambjax.commands.outputs import directory, files, say, spare, table, write_json, written
 from ambjax.export import loop, machine, package, texts, verify
 from ambjax.export.controller import Controller, controller_of
 from ambjax.export.source import Origin
@@ -40,11 +40,11 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     say_doubts(case, args.case)
     with files(out) as part:
         if args.verify:
-            written, checks = _verified(case, controller, args.precision, prefix, origin)
+            sources, checks = _verified(case, controller, args.precision, prefix, origin)
         else:
-            written, checks = package.files(controller, args.precision, prefix, origin), []
+            sources, checks = package.files(controller, args.precision, prefix, origin), []
         ok = all(x.ok for x in checks) if checks else None
-        for name, text in written.items():
+        for name, text in sources.items():
             (part / name).write_text(text, encoding="utf-8")
         if checks:
             (part / VERIFIED[0]).write_text(verify.table(checks, case.name, mark), encoding="utf-8")
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         if checks:
             rows = [(x.name, x.precision, x.found, x.allowed, "holds" if x.ok else "FAILS") for x in checks]
             print(table(("check", "precision", "found", "allowed", "verdict"), rows))
-        print(f"written: {out}/{', '.join([*written, *(VERIFIED if checks else ())])}")
+        written(out, ", ".join([*sources, *(VERIFIED if checks else ())]))
     return int(ok is False), {"ok": ok, "checks": [x._asdict() for x in checks], "out": str(out)}
 
 

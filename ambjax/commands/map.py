@@ -10,7 +10,7 @@ import numpy as np
 from ambjax.cases.reader import MOST_SAMPLES, Case
 from ambjax.commands.doubts import read_aloud
 from ambjax.commands.ensemble import study_of
-from ambjax.commands.outputs import directory, files, plain, say, table, write_json
+from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
 from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, stepped
 from ambjax.ensemble.paths import places
 from ambjax.numerics.records import numbers, within
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         write_json(part / "map.json", summary)
     if not args.json:
         print(_text(cases, maps))
-        print(f"written: {out}/map.png, map.json")
+        written(out, "map.png, map.json")
     return 0, plain(summary)
 
 

@@ -17,12 +17,15 @@ from typing import Any
 import numpy as np
 
 from ambjax.ensemble.store import MANIFEST, RESULT
+from ambjax.host.interrupts import unbroken
+from ambjax.host.words import one_line
 
 
-def directory(out: str | None, name: str) -> pathlib.Path:
+def directory(out: str | None, name: str, names: Iterable[str] = ()) -> pathlib.Path:
     """The directory to write to: as asked, or a new one under ./out. Made, and seen to be writable.
 
-    Raises ValueError if it cannot be made or written, or holds a study, whose files are not to be mixed with others.
+    Raises ValueError if it cannot be made or written, holds a study, whose files are not to be mixed with others, or
+    folders of these names, which files will have.
     """
     path = target(out, name)
     for file in (MANIFEST, RESULT):
@@ -31,7 +34,20 @@ def directory(out: str | None, name: str) -> pathlib.Path:
         if there:
             raise ValueError(f"--out {path}: it holds the study of an ensemble ({file}). Choose another directory.")
     make(path)
+    check_places(path, names)
     return path
+
+
+def check_places(out: pathlib.Path, names: Iterable[str | pathlib.PurePath]) -> None:
+    """Raises ValueError where files of these names, below `out`, cannot be put: a folder, or no folder, is there."""
+    for name in map(pathlib.PurePath, names):
+        there = [
+            parent for parent in name.parents[:-1] if os.path.lexists(out / parent) and not (out / parent).is_dir()
+        ]
+        if there:
+            raise ValueError(f"--out {out}: {there[0]} is no folder there. Move it away, or choose another directory.")
+        if (out / name).is_dir() and not (out / name).is_symlink():
+            raise ValueError(f"--out {out}: {name} is a folder there. Move it away, or choose another directory.")
 
 
 def spare(out: pathlib.Path, names: Iterable[str], mark: str) -> None:
@@ -63,16 +79,15 @@ def target(out: str | None, name: str) -> pathlib.Path:
             )
         return pathlib.Path(out)
     candidates = (pathlib.Path("out") / (name if n == 1 else f"{name}-{n}") for n in itertools.count(1))
-    return next(p for p in candidates if not p.exists())
+    return next(p for p in candidates if not os.path.lexists(p))
 
 
 def make(path: pathlib.Path) -> None:
     """Make a directory and see that it can be written. Raises ValueError if not."""
     with _refusal(path):
         path.mkdir(parents=True, exist_ok=True)
-        probe = path / ".ambjax-write-test"
-        probe.touch()
-        probe.unlink()
+        with tempfile.TemporaryFile(dir=path):
+            pass
 
 
 @contextlib.contextmanager
@@ -86,10 +101,12 @@ def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
             with tempfile.TemporaryDirectory(prefix=".ambjax-", dir=out, ignore_cleanup_errors=True) as folder:
                 part = pathlib.Path(folder)
                 yield part
-                for file in sorted(p for p in part.rglob("*") if p.is_file()):
-                    to = out / file.relative_to(part)
-                    to.parent.mkdir(parents=True, exist_ok=True)
-                    file.replace(to)
+                names = sorted(p.relative_to(part) for p in part.rglob("*") if p.is_file())
+                check_places(out, names)
+                with unbroken():
+                    for name in names:
+                        (out / name).parent.mkdir(parents=True, exist_ok=True)
+                        (part / name).replace(out / name)
         except BaseException:
             with contextlib.suppress(OSError):
                 out.rmdir()
@@ -128,6 +145,11 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     widths = [max(len(line[c]) for line in lines) for c in range(len(header))]
     ruled = [lines[0], ["-" * w for w in widths], *lines[1:]]
     return "\n".join("  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in ruled)
+
+
+def written(out: pathlib.Path, names: str) -> None:
+    """The last line of a command's answer: what is where."""
+    print(one_line(f"written: {out}/{names}"))
 
 
 def say(text: str) -> None:

@@ -1,15 +1,18 @@
 """`ambjax reproduce`: the paper's scenarios, figures and claims."""
 
 import argparse
+import contextlib
+import itertools
 import pathlib
 import time
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from typing import Any
 
 from tqdm import tqdm
 
 from ambjax import paper
-from ambjax.commands.outputs import directory, files, plain, say, table, write_json
+from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
 from ambjax.ensemble.worker import processes
 from ambjax.paper import ledger
 from ambjax.paper.evidence import Evidence, gather
@@ -28,10 +31,26 @@ def _paper_figures(reading: str, evidence: Evidence, out: pathlib.Path) -> None:
         figures.paper_figure(number, getattr(evidence, name).trajectory, title, folder / f"figure_{number}.png")
 
 
+def _names() -> Iterator[str]:
+    """Of all that is written."""
+    yield from ("readings.png", "ledger.md", "ledger.json")
+    for reading, number in itertools.product(paper.READINGS, figures.PAPER_FIGURES):
+        yield f"figure_{number}.png" if reading == "repaired" else f"{reading}/figure_{number}.png"
+
+
+@contextlib.contextmanager
+def _alive() -> Iterator[None]:
+    """The death of a worker process as a ValueError."""
+    try:
+        yield
+    except BrokenExecutor:
+        raise ValueError("a worker process died, perhaps for want of memory. Nothing is kept: begin again.") from None
+
+
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax reproduce."""
 
-    out = directory(args.out, "reproduce")
+    out = directory(args.out, "reproduce", _names())
     began = time.perf_counter()
     stages = 2 * 8 + 1
     with (
@@ -47,7 +66,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
         # Tracing holds the interpreter, so the reading of another structure has one of its own; a thread draws.
         evidence, jobs = {}, []
-        with ThreadPoolExecutor(1) as artist, processes(1) as other:
+        with _alive(), ThreadPoolExecutor(1) as artist, processes(1) as other:
             theirs = {reading: other.submit(gather, reading) for reading in paper.NOISY}
             for reading in paper.READINGS:
                 evidence[reading] = theirs[reading].result() if reading in theirs else gather(reading, stage)
@@ -67,7 +86,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     if not args.json:
         rows = [(c["says"], c["paper"], *(f["verdict"] for f in c["findings"].values())) for c in claims]
         print(table(("claim", "paper", *paper.READINGS), rows))
-        print(f"written: {out}/figure_3.png to figure_6.png, the same under literal/, tuned/ and sampled/,")
+        written(out, "figure_3.png to figure_6.png, the same under literal/, tuned/ and sampled/,")
         print("         readings.png, ledger.md, ledger.json")
     say(f"done in {time.perf_counter() - began:.1f} s")
     return 0, plain({"claims": claims, "noise": noise, "processor": processor, "out": str(out)})

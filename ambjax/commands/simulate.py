@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from ambjax.cases.reader import Case
 from ambjax.commands.doubts import read_aloud, reversal
-from ambjax.commands.outputs import directory, files, plain, say, table, write_json
+from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.numerics.records import canonical
 from ambjax.simulation.metrics import standard_for
@@ -18,6 +18,7 @@ from ambjax.simulation.rollout import Outcome, begin_jit, finish, segment_jit
 from ambjax.simulation.sampled import system_of
 
 Summary = dict[str, Any]
+WRITTEN = ("trajectory.npz", "metrics.json", "overview.png")
 # Samples simulated between two strokes of the progress bar.
 STROKE = 20_000
 
@@ -26,7 +27,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax simulate."""
     case = _member(read_aloud(args.case), args)
     window = _window(case, args)
-    out = directory(args.out, f"simulate-{case.name}")
+    out = directory(args.out, f"simulate-{case.name}", WRITTEN)
     say(f"method: {case.clock.method}")
     if case.cascade.processor is not None:
         say(f"on a processor: {case.cascade.processor}")
@@ -46,7 +47,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         overview(trajectory, f"{case.name}: {case.clock.method}", part / "overview.png", window)
     if not args.json:
         print(_metrics_text(metrics))
-        print(f"written: {out}/trajectory.npz, metrics.json, overview.png")
+        written(out, ", ".join(WRITTEN))
     ended = metrics["lost_at_s"] is not None
     if metrics["lost"]:
         say(

@@ -8,6 +8,7 @@ is found, and what it held is computed again: chunks go only when the whole has 
 import collections
 import hashlib
 import json
+import os
 import pathlib
 import shutil
 import zipfile
@@ -34,6 +35,13 @@ RESULT = "members.npz"
 EPOCH = (1980, 1, 1, 0, 0, 0)
 
 Span = tuple[int, int]
+
+
+class Column(NamedTuple):
+    """A column of all members: its dtype as JSON has it, and the SHA-256 of its numbers."""
+
+    kind: Any
+    digest: str
 
 
 class Survey(NamedTuple):
@@ -76,7 +84,7 @@ class Store:
         self.directory.mkdir(parents=True, exist_ok=True)
         self._tell()
         self.chunks.mkdir(exist_ok=True)
-        for left in [*self.chunks.glob("*.part"), *self.directory.glob(f"{RESULT}.part")]:
+        for left in (path for name in ("chunks/", RESULT, MANIFEST) for path in self.directory.glob(f"{name}*.part")):
             left.unlink()
 
     def survey(self) -> Survey:
@@ -125,9 +133,9 @@ class Store:
         """
         if not self.finished():
             try:
-                kinds = kinds_of(self._read(self.spans()[0]))
-                write_whole(self.path, lambda file: self._merge(file, kinds))
-                self._read_back(kinds)
+                columns = self._columns()
+                write_whole(self.path, lambda file: self._merge(file, columns))
+                self._read_back(columns)
             except (DamagedError, OSError) as why:
                 raise ValueError(
                     f"{self.path}: not put together, {why}. The chunks are kept: give the same command with --resume."
@@ -167,7 +175,8 @@ class Store:
     def _check_room(self, columns: int) -> None:
         # Chunks and the result exist side by side at the end.
         need = 2 * 8 * columns * self.members
-        where = next(p for p in (self.directory, *self.directory.resolve().parents) if p.exists())
+        real = pathlib.Path(os.path.realpath(self.directory))  # resolve raises where links lead to each other
+        where = next(p for p in (self.directory, *real.parents) if p.exists())
         free = shutil.disk_usage(where).free
         if need > free:
             most = free // (2 * 8 * columns)
@@ -188,38 +197,55 @@ class Store:
         _check_rows(columns, *span)
         return columns
 
-    def _merge(self, file: IO[bytes], kinds: dict[str, Any]) -> None:
+    def _columns(self) -> dict[str, Column]:
+        """All columns by name. Raises DamagedError unless every chunk is whole, of this study and like the first.
+
+        Whoever else writes here may have changed one since it was computed.
+        """
+        kinds, digests = dict[str, Any](), collections.defaultdict(hashlib.sha256)
+        for span in self.spans():
+            try:
+                part = self._read(span)
+            except DamagedError as why:
+                raise DamagedError(f"{self._path(span)}: {why}") from None
+            kinds = kinds or kinds_of(part)
+            if kinds != kinds_of(part):
+                raise DamagedError(f"{self._path(span)}: its columns are not those of the others")
+            for name, column in part.items():
+                digests[name].update(np.ascontiguousarray(column).data)
+        return {name: Column(kind, digests[name].hexdigest()) for name, kind in kinds.items()}
+
+    def _merge(self, file: IO[bytes], columns: dict[str, Column]) -> None:
         with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
-            for name, kind in kinds.items():
-                head = {"descr": kind, "fortran_order": False, "shape": (self.members,)}
+            for name, column in columns.items():
+                head = {"descr": column.kind, "fortran_order": False, "shape": (self.members,)}
                 with archive.open(zipfile.ZipInfo(f"{name}.npy", EPOCH), "w", force_zip64=True) as out:
                     np.lib.format.write_array_header_1_0(out, head)
-                    for part in self._column(name, kind):
+                    for part in self._column(name):
                         out.write(np.ascontiguousarray(part).tobytes())
 
-    def _column(self, name: str, kind: Any) -> Iterator[np.ndarray]:
+    def _column(self, name: str) -> Iterator[np.ndarray]:
         for span in self.spans():
             try:
                 with self._path(span).open("rb") as file, np.load(file) as chunk:
-                    part = chunk[name]
+                    yield chunk[name]
             except Exception as error:  # as in unseal
                 raise DamagedError(f"{self._path(span)} cannot be read ({error})") from None
-            if shapes({name: part}) != {name: [kind, [span[1] - span[0]]]}:
-                raise DamagedError(f"{self._path(span)} has another column {name}")
-            yield part
 
-    def _read_back(self, kinds: dict[str, Any]) -> None:
+    def _read_back(self, columns: dict[str, Column]) -> None:
         """Raises DamagedError unless members.npz holds these columns, one row for each member, in order."""
+        there = dict[str, Any]()
         try:
             with self.path.open("rb") as file, np.load(file) as whole:
-                there = {name: shapes({name: whole[name]})[name] for name in whole.files}  # reads all, a column at once
-                index = whole["index"]
+                for name in whole.files:  # a column at a time
+                    column = whole[name]
+                    kind, shape = shapes({name: column})[name]
+                    there[name] = [kind, hashlib.sha256(np.ascontiguousarray(column).data).hexdigest(), shape]
         except Exception as error:  # as in unseal
             raise DamagedError(f"what was written cannot be read back ({error})") from None
-        wrong = difference(there, {name: [kind, [self.members]] for name, kind in kinds.items()})
+        wrong = difference(there, {name: [*column, [self.members]] for name, column in columns.items()})
         if wrong:
             raise DamagedError(f"what was written reads otherwise: {wrong}")
-        _check_rows({"index": index}, 0, self.members)
 
     def _path(self, span: Span) -> pathlib.Path:
         return self.chunks / f"{span[0]:012d}-{span[1]:012d}.npz"

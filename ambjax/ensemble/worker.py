@@ -6,6 +6,7 @@ import os
 import pathlib
 import signal
 import threading
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from typing import Any
@@ -18,20 +19,29 @@ CALL = 64
 
 
 def prepare() -> None:
-    """float64 unless JAX_ENABLE_X64 says otherwise, and compilations kept between runs."""
+    """float64 unless JAX_ENABLE_X64 says otherwise, and compilations kept between runs.
+
+    Raises ValueError where JAX has no device of the kind that JAX_PLATFORMS asks for.
+    """
     import jax
     import platformdirs
 
     if "JAX_ENABLE_X64" not in os.environ:  # jax has been imported by now, so setting it there would be too late
         jax.config.update("jax_enable_x64", True)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        cache = pathlib.Path(platformdirs.user_cache_dir("ambjax")) / "compiled"
-        try:
+        # a home that is none, or that cannot be written, costs time, not correctness; nor is a full disk worth words
+        warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
+        with contextlib.suppress(OSError, RuntimeError):
+            cache = pathlib.Path(platformdirs.user_cache_dir("ambjax")) / "compiled"
             cache.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            return  # a home that cannot be written costs time, not correctness
-        jax.config.update("jax_compilation_cache_dir", str(cache))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+            jax.config.update("jax_compilation_cache_dir", str(cache))
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+    if platforms := os.environ.get("JAX_PLATFORMS"):
+        try:
+            jax.default_backend()
+        except (AssertionError, RuntimeError) as error:  # the first is all it says of a known kind without a device
+            why = str(error).partition("\n")[0] or "none of them is here"
+            raise ValueError(f"JAX_PLATFORMS={platforms}: {why}. Leave it out, or set it to cpu.") from None
 
 
 def chunk(

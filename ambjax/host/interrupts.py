@@ -32,13 +32,19 @@ class _Ear:
             self._say(f"{self.gently} Ctrl-C again ends it at once.")
             return
         with self.busy:
-            words = self.report() if self.report is not None else ""
-            self._say(f"interrupted{f': {words}' if words else ''}.")
-            os._exit(INTERRUPTED)
+            try:
+                words = self.report() if self.report is not None else ""
+                self._say(f"interrupted{f': {words}' if words else ''}.")
+            except Exception as error:  # the report's
+                self._say(f"interrupted; what is kept is not known ({type(error).__name__}).")
+            finally:
+                os._exit(INTERRUPTED)
 
     def _say(self, words: str) -> None:
-        begin = "\n" if _bar_is_open() else ""
-        os.write(2, f"{begin}{self.program}: {words}\n".encode())
+        """On stderr, if it takes it: whatever is wrong there, the thread that listens lives on."""
+        with contextlib.suppress(Exception):
+            begin = "\n" if _bar_is_open() else ""
+            os.write(2, f"{begin}{self.program}: {words}\n".encode(errors="backslashreplace"))
 
 
 _ear = _Ear()

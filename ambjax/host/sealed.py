@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import pathlib
+import secrets
 import zipfile
 from collections.abc import Callable, Mapping
 from typing import IO, Any
@@ -27,13 +28,14 @@ class DamagedError(Exception):
 
 
 def write_whole(path: pathlib.Path, write: Callable[[IO[bytes]], Any]) -> None:
-    """Write to a file beside `path`, then rename it: `path` holds everything or what it held before.
+    """Write to a new file beside `path`, *.part, then rename it: `path` holds everything or what it held before.
 
     Raises ValueError if that cannot be done (a full disk, for one).
     """
-    part = path.with_name(path.name + ".part")
+    # a name that nobody else has, and nothing that a link leads to
+    part = path.with_name(f"{path.name}-{secrets.token_hex(8)}.part")
     try:
-        with part.open("wb") as file:
+        with part.open("xb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
