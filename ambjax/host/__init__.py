@@ -1,1 +1,1 @@
-"""What the program needs of the machine it runs on: files that are sealed, Ctrl-C, one line of words."""
+"""What the program needs of the machine it runs on: sealed files, a lock, streams, Ctrl-C, one line of words."""

@@ -15,6 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ambjax.pictures.figures import BINS, BLUE, INK, RED, thin
 from ambjax.pictures.scales import axis_of, digits, finish, log_ticks, prefix_of, size_of
+from ambjax.pictures.style import own_style
 
 # What a fan can show: label and SI unit.
 QUANTITIES = {
@@ -46,6 +47,7 @@ LOST = {"facecolor": RED, "edgecolor": "white", "hatch": "////", "linewidth": 0.
 MARKS: dict[float, tuple[Any, str]] = {0.5: ("-", "median"), 0.95: ("--", "95 % quantile")}
 
 
+@own_style
 def fan(
     t: np.ndarray,
     bands: Mapping[str, Mapping[float, np.ndarray]],
@@ -177,6 +179,7 @@ def _fates(lost: int, stalled: int) -> str:
     return f"{lost} lost" + f", {stalled} not decided" * bool(stalled)
 
 
+@own_style
 def histograms(columns: Mapping[str, Any], path: pathlib.Path, metrics: Sequence[str] = CHIEF) -> None:
     """Write a grid of histograms of the `metrics` that `columns` (members.npz, each [N]) has, survivors and lost apart.
 

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ambjax.pictures.style import own_style
 from ambjax.simulation.trajectory import STALLED, Row, Trajectory
 
 # Okabe and Ito's colours: distinct in print and to colour-blind readers.
@@ -71,6 +72,7 @@ def thin(t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return t[at], y[at]
 
 
+@own_style
 def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.Path) -> None:
     """Write the paper's Figure `number` for a trajectory of its scenario."""
     _, panels = PAPER_FIGURES[number]
@@ -89,6 +91,7 @@ def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.
     figure.savefig(path, dpi=150)
 
 
+@own_style
 def readings(trajectories: dict[str, Trajectory], title: str, settle: float, path: pathlib.Path) -> None:
     """Write one picture of a scenario under each reading, a column each: position above, error below."""
     figure = Figure(figsize=(4.0 * len(trajectories), 4.9), layout="constrained")

@@ -15,6 +15,7 @@ from matplotlib.patches import Patch
 
 from ambjax.pictures.figures import INK
 from ambjax.pictures.scales import axis_of, edges, label_of, log_ticks, size_of
+from ambjax.pictures.style import own_style
 
 CONTOUR = 0.95
 # Widths of the contours of survival and of the bounds of its interval; the last is drawn on top.
@@ -24,6 +25,7 @@ SURVIVAL, ERROR = "cividis", "viridis_r"
 NOBODY = {"facecolor": "#d4d4d4", "edgecolor": "#8a8a8a", "hatch": "////", "linewidth": 0.0}
 
 
+@own_style
 def maps(
     panels: Sequence[Mapping[str, Any]],
     x_label: str,

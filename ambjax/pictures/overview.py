@@ -21,12 +21,14 @@ from ambjax.pictures.figures import (
     draw,
     signal_of,
 )
+from ambjax.pictures.style import own_style
 from ambjax.simulation.trajectory import STALLED, Trajectory
 
 # Turns of a chattering voltage that can be followed.
 TURNS = 40
 
 
+@own_style
 def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tuple[float, float] | None = None) -> None:
     """Write one page with every signal of a run: the whole of it, and enlarged how it starts and how it ends.
 

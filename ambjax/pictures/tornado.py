@@ -11,6 +11,7 @@ from matplotlib.patches import Patch
 
 from ambjax.pictures.figures import BLUE, INK, ORANGE
 from ambjax.pictures.scales import axis_of, finish
+from ambjax.pictures.style import own_style
 
 MOST_DRIVERS = 12
 TRENDS = {"grows with it": BLUE, "falls with it": ORANGE, "no steady trend": "#8a8a8a"}
@@ -26,6 +27,7 @@ class Bar(NamedTuple):
     rho: float
 
 
+@own_style
 def tornado(drivers: Sequence[Bar], metric: str, says: str, path: pathlib.Path) -> None:
     """Write the share of a metric's variation that each driver explains, the greatest on top, and what that `says`.
 

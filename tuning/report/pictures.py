@@ -7,6 +7,7 @@ import numpy as np
 
 from ambjax.pictures.figures import BLUE, ORANGE, RED, thin
 from ambjax.pictures.scales import prefix_of
+from ambjax.pictures.style import own_style
 from ambjax.simulation.trajectory import STALLED, Trajectory
 from tuning.search.explore import Slices
 
@@ -22,6 +23,7 @@ FLAT = 1e-2
 FAINTEST, FEWEST = 1e-5, 16
 
 
+@own_style
 def before_after(runs: dict[str, Trajectory]) -> bytes:
     """PNG: z - r and u, averaged over each sample, of runs by name, in rows; in columns the whole, start and end."""
     from matplotlib.figure import Figure
@@ -63,6 +65,7 @@ def before_after(runs: dict[str, Trajectory]) -> bytes:
     return _png(figure)
 
 
+@own_style
 def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
     """PNG: amplitude of u (V), averaged over each sample, over frequency, of runs by name, from `settle` (s) on."""
     from matplotlib.figure import Figure
@@ -94,6 +97,7 @@ def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarra
     return np.fft.rfftfreq(n, period)[1:], 2 * lines[1:] / window.sum()
 
 
+@own_style
 def convergence(history: dict[str, Any], paths: list[str]) -> bytes:
     """PNG: what is minimised and the gains of the best start against iterations."""
     from matplotlib.figure import Figure
@@ -119,6 +123,7 @@ def convergence(history: dict[str, Any], paths: list[str]) -> bytes:
     return _png(figure)
 
 
+@own_style
 def landscape(slices: Slices, paths: list[str]) -> bytes:
     """PNG: what was minimised along each gain through the answer."""
     from matplotlib.figure import Figure
@@ -147,6 +152,7 @@ def landscape(slices: Slices, paths: list[str]) -> bytes:
     return _png(figure)
 
 
+@own_style
 def front(rows: list[dict[str, Any]]) -> bytes:
     """PNG: error against voltage."""
     from matplotlib.figure import Figure
