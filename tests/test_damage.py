@@ -263,7 +263,7 @@ def test_a_chunk_that_is_gone_is_computed_without_a_word(begun, whole):
 def test_chunks_stay_until_the_whole_was_read_back(begun, whole, monkeypatch):
     """A disk that gives back something else than what was written."""
     spoil = [truncated(0.5), flipped(0.7), rewritten_plainly(drop), rewritten_plainly(shorten)]
-    spoil += [rewritten_plainly(renumbered)]
+    spoil += [rewritten_plainly(renumbered), rewritten_plainly(alter)]
     for damage in spoil:
         store = store_in(begun)
 
@@ -470,3 +470,18 @@ def test_what_is_told_of_a_study_is_plain_json(begun):
     told = json.loads((begun / "study.json").read_text())
     assert told["seed"] == 3
     assert told["chunk"] == CHUNK
+
+
+@pytest.mark.parametrize("kind", CHUNK_STRANGE)
+def test_a_chunk_that_was_replaced_while_the_study_ran_is_refused_by_name(kind, begun, whole):
+    """A chunk of another study above all, of the same members: whoever copies one, or runs in the same folder."""
+    store = store_in(begun)
+    assert compute(store) == ([], [])
+    path = chunk_file(begun, 1)
+    CHUNK_STRANGE[kind](path)
+    with pytest.raises(
+        ValueError, match=r"members.npz: not put together, .*/chunks/000000000020.* The chunks are kept"
+    ):
+        store.finish()
+    assert not store.path.exists()
+    assert len(rejoined(begun, 1, whole)) == 1

@@ -45,6 +45,15 @@ CASES = {
         "with listening('p'), gently('It ends.'):\n interrupt()\n time.sleep(0.2)\n interrupt()\n ever()",
         "p: It ends. Ctrl-C again ends it at once.\np: interrupted.\n",
     ),
+    "stderr takes nothing": ("with listening('p'):\n os.close(2)\n interrupt()\n ever()", ""),
+    "what is kept cannot be told": (
+        "with listening('p'), keeping(lambda: 1 / 0):\n interrupt()\n ever()",
+        "p: interrupted; what is kept is not known (ZeroDivisionError).\n",
+    ),
+    "a name of no alphabet": (
+        "with listening('p'), keeping(lambda: '\\udcff'):\n interrupt()\n ever()",
+        "p: interrupted: \\udcff.\n",
+    ),
     "below a bar": (
         "from tqdm import tqdm\nwith listening('p'), tqdm(total=9, mininterval=0) as bar:\n bar.update(3)\n"
         " interrupt()\n ever()",

@@ -44,7 +44,7 @@ def open_streams() -> None:
     """
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
-            setattr(sys, name, _nowhere("r" if name == "stdin" else "w"))
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115, PTH123
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")  # pyright: ignore[reportAttributeAccessIssue]
@@ -52,7 +52,10 @@ def open_streams() -> None:
 
 @contextlib.contextmanager
 def lenient() -> Iterator[Lenient]:
-    """stdout, which is yielded, and stderr are lenient in this block. One that failed gets an end after it."""
+    """stdout, which is yielded, and stderr are lenient in this block.
+
+    One that failed stays so: what it holds would fail once more as Python ends, and become the exit code.
+    """
     before = {name: getattr(sys, name) for name in ("stdout", "stderr")}
     now = {name: Lenient(stream) for name, stream in before.items()}
     for name, stream in now.items():
@@ -61,9 +64,5 @@ def lenient() -> Iterator[Lenient]:
         yield now["stdout"]
     finally:
         for name, stream in now.items():
-            # what a failed one holds still would fail again as Python ends, and become the exit code
-            setattr(sys, name, before[name] if stream.failure() is None else _nowhere("w"))
-
-
-def _nowhere(mode: str) -> Any:
-    return open(os.devnull, mode)  # noqa: PTH123
+            if stream.failure() is None:
+                setattr(sys, name, before[name])

@@ -1,0 +1,291 @@
+"""What surrounds a run and is none of its business: streams, links, other runs, a matplotlibrc, no home."""
+
+import argparse
+import ast
+import concurrent.futures
+import contextlib
+import errno
+import io
+import os
+import pathlib
+import sys
+import warnings
+from concurrent.futures.process import BrokenProcessPool
+
+import jax
+import matplotlib
+import platformdirs
+import pytest
+from texts import write
+from tqdm import tqdm
+
+from ambjax.__main__ import answer, main, parser
+from ambjax.commands import ensemble, outputs, reproduce, simulate
+from ambjax.ensemble import worker
+from ambjax.host import interrupts
+from ambjax.host.lock import LOCK, alone
+from ambjax.host.sealed import write_whole
+from ambjax.host.streams import lenient, open_streams
+from ambjax.pictures import tornado
+
+SHORT = "[clock]\nduration = 0.01\n"
+STUDY = SHORT + "[sensor]\nstd = 1e-9\n"
+ROOT = pathlib.Path(__file__).parent.parent
+
+pytestmark = pytest.mark.usefixtures("elsewhere")
+
+
+class Stuck(io.StringIO):
+    """A stream that takes nothing."""
+
+    def __init__(self, number):
+        super().__init__()
+        self.number = number
+
+    def write(self, text):
+        raise OSError(self.number, os.strerror(self.number))
+
+
+# --- streams ---
+
+
+def answered(words, run):
+    return answer(parser(), words, run)
+
+
+@pytest.mark.parametrize(("number", "code"), [(None, 1), (errno.EPIPE, 1), (errno.ENOSPC, 2)])
+@pytest.mark.parametrize("flags", [[], ["--json"]])
+def test_a_no_stays_a_no_for_a_reader_who_leaves(number, code, flags, monkeypatch, capsys):
+    if number is not None:
+        monkeypatch.setattr(sys, "stdout", Stuck(number))
+
+    def run(args: argparse.Namespace):
+        print("no")
+        return 1, {}
+
+    assert answered(["template", *flags], run) == code
+    assert ("No space left" in capsys.readouterr().err) == (code == 2)
+
+
+@pytest.mark.parametrize(("number", "code"), [(errno.EPIPE, 0), (errno.ENOSPC, 2)])
+@pytest.mark.parametrize("flag", ["--version", "--help"])
+def test_a_word_about_the_program_that_nobody_takes(number, code, flag, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stdout", Stuck(number))
+    assert main([flag]) == code
+    assert capsys.readouterr().err.count("\n") == (code == 2)
+
+
+def test_a_broken_pipe_of_the_work_is_no_end_of_the_answer(capsys):
+    def run(args):
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+
+    assert answered(["template"], run) == 2
+    assert "Broken pipe" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [errno.EPIPE, errno.ENOSPC])
+def test_a_stderr_that_takes_nothing_stops_no_work(number, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Stuck(number))
+    monkeypatch.setattr(simulate, "tqdm", lambda **options: tqdm(**options | {"delay": 0, "mininterval": 0}))
+    assert main(["simulate", write(SHORT), "--out", "there"]) == 0
+    assert sorted(p.name for p in pathlib.Path("there").iterdir()) == sorted(simulate.WRITTEN)
+
+
+def test_a_stream_that_failed_is_not_asked_again(monkeypatch):
+    """Not as Python ends either: what it holds would fail once more, and become the exit code."""
+    stuck = Stuck(errno.ENOSPC)
+    monkeypatch.setattr(sys, "stdout", stuck)
+    with lenient() as stdout:
+        print("lost")
+        stuck.write = stuck.flush = None
+        print("lost too")
+        assert stdout.failure().errno == errno.ENOSPC
+    sys.stdout.flush()
+
+
+def test_what_an_alphabet_lacks_is_an_escape(monkeypatch):
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
+    monkeypatch.setattr(sys, "stdout", stream)
+    open_streams()
+    outputs.written(pathlib.Path("\u03a9\n"), "a")
+    stream.flush()
+    assert stream.buffer.getvalue() == b"written: \\u03a9\\n/a\n"
+
+
+@pytest.mark.parametrize("said", ["out of memory\nmore", ""])
+def test_what_a_device_has_against_it_is_one_line(said, capsys):
+    def run(args):
+        raise RuntimeError(said)
+
+    assert answered(["template"], run) == 2
+    assert capsys.readouterr().err == f"ambjax: {said[:13] or 'RuntimeError'}\n"
+
+
+def test_a_fault_of_ours_keeps_its_traceback():
+    def run(args):
+        raise NotImplementedError
+
+    with pytest.raises(NotImplementedError):
+        answered(["template"], run)
+
+
+# --- other runs ---
+
+
+def test_one_run_at_a_time():
+    here = pathlib.Path()
+    with alone(here):
+        with pytest.raises(ValueError, match="another run is at work there"), alone(here):
+            pass
+        assert os.path.lexists(LOCK)
+    assert not os.path.lexists(LOCK)
+    pathlib.Path(LOCK).touch()  # as a kill leaves it
+    with alone(here):
+        pass
+    assert os.listdir() == []  # noqa: PTH208
+
+
+def test_a_study_whose_folder_is_at_work_is_refused(capsys):
+    argv = ["ensemble", write(STUDY), "--members", "2", "--out", "out"]
+    out = pathlib.Path("out")
+    out.mkdir()
+    with alone(out):
+        assert main(argv) == 2
+        assert "--out out: another run is at work there" in capsys.readouterr().err
+        assert os.listdir(out) == [LOCK]  # noqa: PTH208
+
+
+def test_a_study_that_another_run_began_meanwhile_is_refused(monkeypatch, capsys):
+    @contextlib.contextmanager
+    def late(out):
+        write("{}", "out/study.json")
+        yield
+
+    monkeypatch.setattr(ensemble, "alone", late)
+    assert main(["ensemble", write(STUDY), "--members", "2", "--out", "out"]) == 2
+    assert "it holds a study already" in capsys.readouterr().err
+    assert os.listdir("out") == ["study.json"]  # noqa: PTH208
+
+
+def test_the_death_of_a_worker_is_one_line(monkeypatch, capsys):
+    class Dead:
+        def submit(self, *_):
+            future = concurrent.futures.Future()
+            future.set_exception(BrokenProcessPool("gone"))
+            return future
+
+    for name, part in (
+        ("processes", lambda _: contextlib.nullcontext(Dead())),
+        ("gather", lambda *_: None),
+        ("_paper_figures", lambda *_: None),
+    ):
+        monkeypatch.setattr(reproduce, name, part)
+    assert main(["reproduce", "--out", "out"]) == 2
+    assert "a worker process died" in capsys.readouterr().err
+    assert not pathlib.Path("out").exists()
+
+
+# --- folders and links ---
+
+
+@pytest.mark.parametrize("name", simulate.WRITTEN)
+def test_a_folder_in_the_place_of_a_file_is_seen_before_the_work(name, monkeypatch, capsys):
+    monkeypatch.setattr(simulate, "simulate", None)
+    pathlib.Path("out", name).mkdir(parents=True)
+    assert main(["simulate", write(SHORT), "--out", "out"]) == 2
+    assert f"--out out: {name} is a folder there. Move it away" in capsys.readouterr().err
+
+
+def test_files_move_all_or_not_at_all(monkeypatch):
+    out, moved = pathlib.Path(), []
+    replace = pathlib.Path.replace
+    monkeypatch.setattr(
+        pathlib.Path, "replace", lambda a, b: (moved.append(interrupts._ear.busy.locked()), replace(a, b))
+    )
+
+    def put():
+        with outputs.files(out) as part:
+            for name in "ab":
+                (part / name / "c").parent.mkdir()
+                (part / name / "c").write_text("new")
+
+    for obstacle, words in (("b/c/", "b/c is a folder"), ("b", "b is no folder")):
+        if obstacle.endswith("/"):
+            pathlib.Path(obstacle).mkdir(parents=True)
+        else:
+            os.removedirs("b/c")
+            pathlib.Path(obstacle).touch()
+        with pytest.raises(ValueError, match=words):
+            put()
+        assert os.listdir() == ["b"]  # noqa: PTH208
+    pathlib.Path("b").unlink()
+    put()
+    assert moved == [True, True]  # Ctrl-C waits for the second
+
+
+def test_nothing_is_written_through_a_link():
+    inside = pathlib.Path("inside")
+    inside.mkdir()
+    for name in ("study.json.part", ".ambjax-write-test"):
+        (inside / name).symlink_to("../victim")
+    outputs.make(inside)
+    write_whole(inside / "study.json", lambda file: file.write(b"{}"))
+    assert not pathlib.Path("victim").exists()
+    assert len(list(inside.iterdir())) == 3
+
+
+def test_names_that_the_system_refuses_are_one_line(capsys):
+    pathlib.Path("loop").symlink_to("loop")
+    long = write(STUDY, chr(0x10400) * 62 + ".toml")
+    for argv in (["ensemble", write(STUDY), "--members", "2", "--out", "loop"], ["simulate", long]):
+        assert main(argv) == 2
+        err = capsys.readouterr().err
+        assert err.splitlines()[-1].startswith("ambjax: --out ")
+        assert "cannot write there" in err
+        assert "Traceback" not in err
+
+
+# --- what a process finds ---
+
+
+def test_without_a_home_nothing_is_kept_and_nothing_fails(monkeypatch):
+    def homeless(*_):
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setattr(platformdirs, "user_cache_dir", homeless)
+    worker.prepare()
+
+
+def test_a_cache_that_is_full_is_not_worth_a_word():
+    worker.prepare()
+    for act in ("reading", "writing"):
+        warnings.warn(f"Error {act} persistent compilation cache entry for 'jit_f': OSError: full", stacklevel=1)
+
+
+@pytest.mark.parametrize("error", [AssertionError(), RuntimeError("Unknown backend\nmore")])
+def test_a_device_that_is_not_there_is_one_line(error, monkeypatch, capsys):
+    def backend():
+        raise error
+
+    monkeypatch.setenv("JAX_PLATFORMS", "abacus")
+    monkeypatch.setattr(jax, "default_backend", backend)
+    assert main(["template"]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("ambjax: JAX_PLATFORMS=abacus: ")
+    assert err.count("\n") == 1
+
+
+def test_pictures_look_the_same_whatever_a_matplotlibrc_says():
+    bars = [tornado.Bar(**dict.fromkeys(tornado.Bar._fields, 0.5) | {"path": "plant.m"})]
+    with matplotlib.rc_context({"text.usetex": True, "font.size": 30, "axes.facecolor": "red"}):
+        tornado.tornado(bars, "rms_u_V", "all", pathlib.Path("theirs.png"))
+    tornado.tornado(bars, "rms_u_V", "all", pathlib.Path("ours.png"))
+    assert pathlib.Path("theirs.png").read_bytes() == pathlib.Path("ours.png").read_bytes()
+
+
+@pytest.mark.parametrize("path", [*ROOT.glob("ambjax/pictures/*.py"), ROOT / "tuning/report/pictures.py"], ids=str)
+def test_every_picture_has_its_own_style(path):
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.FunctionDef) and "Figure(" in ast.unparse(node):
+            assert [ast.unparse(one) for one in node.decorator_list] == ["own_style"], node.name
