@@ -1092,4 +1092,75 @@ FATES = [
         "tests/test_attacks.py::test_every_number_has_both_ends",
     ),
 ]
-MUTATIONS = [*PLANT, *LAWS, *LOOP, *METHODS, *NOISE, *ENSEMBLE, *SEARCH, *SAMPLED, *CHECK, *EXPORT, *FATES]
+SURROUNDINGS = [
+    M(
+        "chunks are put together whosever they are",
+        "ambjax/ensemble/store.py",
+        "part = self._read(span)",
+        "part = unseal(self._path(span))[0]",
+        "tests/test_damage.py::test_a_chunk_that_was_replaced_while_the_study_ran_is_refused_by_name",
+    ),
+    M(
+        "members.npz is read back by its columns' kinds alone",
+        "ambjax/ensemble/store.py",
+        "there[name] = [kind, hashlib.sha256(np.ascontiguousarray(column).data).hexdigest(), shape]",
+        "there[name] = [kind, columns[name].digest if name in columns else '', shape]",
+        "tests/test_damage.py::test_chunks_stay_until_the_whole_was_read_back",
+    ),
+    M(
+        "two runs share a folder",
+        "ambjax/host/lock.py",
+        "fcntl.LOCK_EX | fcntl.LOCK_NB",
+        "fcntl.LOCK_SH | fcntl.LOCK_NB",
+        "tests/test_surroundings.py::test_one_run_at_a_time",
+    ),
+    M(
+        "what another run began before the lock is not seen",
+        "ambjax/commands/ensemble.py",
+        "            _check(study, store, args)  # again",
+        "            # again",
+        "tests/test_surroundings.py::test_a_study_that_another_run_began_meanwhile_is_refused",
+    ),
+    M(
+        "a reader who leaves makes an error of a no",
+        "ambjax/__main__.py",
+        "if failure is None or isinstance(failure, BrokenPipeError):",
+        "if failure is None:",
+        "tests/test_surroundings.py::test_a_no_stays_a_no_for_a_reader_who_leaves",
+    ),
+    M(
+        "stderr is as strict as it comes",
+        "ambjax/host/streams.py",
+        'for name in ("stdout", "stderr")}',
+        'for name in ("stdout",)}',
+        "tests/test_surroundings.py::test_a_stderr_that_takes_nothing_stops_no_work",
+    ),
+    M(
+        "Ctrl-C cannot say a name of no alphabet",
+        "ambjax/host/interrupts.py",
+        'errors="backslashreplace"',
+        'errors="strict"',
+        "tests/test_interrupts.py::test_it_ends_at_once_with_one_line",
+    ),
+    M(
+        "Ctrl-C between two files leaves a mix",
+        "ambjax/commands/outputs.py",
+        "with unbroken():",
+        "with contextlib.nullcontext():",
+        "tests/test_surroundings.py::test_files_move_all_or_not_at_all",
+    ),
+]
+MUTATIONS = [
+    *PLANT,
+    *LAWS,
+    *LOOP,
+    *METHODS,
+    *NOISE,
+    *ENSEMBLE,
+    *SEARCH,
+    *SAMPLED,
+    *CHECK,
+    *EXPORT,
+    *FATES,
+    *SURROUNDINGS,
+]

@@ -46,6 +46,10 @@ CASES = {
         "p: It ends. Ctrl-C again ends it at once.\np: interrupted.\n",
     ),
     "stderr takes nothing": ("with listening('p'):\n os.close(2)\n interrupt()\n ever()", ""),
+    "gently, to nobody": (
+        "with listening('p'), gently('It ends.'):\n os.close(2)\n interrupt()\n time.sleep(0.2)\n interrupt()\n ever()",
+        "",
+    ),
     "what is kept cannot be told": (
         "with listening('p'), keeping(lambda: 1 / 0):\n interrupt()\n ever()",
         "p: interrupted; what is kept is not known (ZeroDivisionError).\n",

@@ -145,6 +145,12 @@ def test_one_run_at_a_time():
     assert os.listdir() == []  # noqa: PTH208
 
 
+def test_two_runs_without_a_folder_of_their_own_take_two(monkeypatch):
+    meant = iter([pathlib.Path("out/a"), pathlib.Path("out/a"), pathlib.Path("out/a-2")])  # both see that a is free
+    monkeypatch.setattr(outputs, "target", lambda *_: next(meant))
+    assert [outputs.directory(None, "a").name for _ in range(2)] == ["a", "a-2"]
+
+
 def test_a_study_whose_folder_is_at_work_is_refused(capsys):
     argv = ["ensemble", write(STUDY), "--members", "2", "--out", "out"]
     out = pathlib.Path("out")

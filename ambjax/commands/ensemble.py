@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
             make(out)  # not before everything that was asked for is known to be possible
             held.enter_context(alone(out))
             _check(study, store, args)  # again: another run may have begun, or ended, since
-            say(one_line(f"method: {case.clock.method}; writing to {out}"))
+            say(f"method: {case.clock.method}; writing to {out}")
             if isinstance(case.clock.method, Slide):
                 error = sliding_error(study)
                 say(error_words(error))

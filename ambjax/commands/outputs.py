@@ -28,6 +28,8 @@ def directory(out: str | None, name: str, names: Iterable[str] = ()) -> pathlib.
     folders of these names, which files will have.
     """
     path = target(out, name)
+    while out is None and not _made(path):  # another run was quicker
+        path = target(out, name)
     for file in (MANIFEST, RESULT):
         with _refusal(path):
             there = (path / file).exists()
@@ -80,6 +82,17 @@ def target(out: str | None, name: str) -> pathlib.Path:
         return pathlib.Path(out)
     candidates = (pathlib.Path("out") / (name if n == 1 else f"{name}-{n}") for n in itertools.count(1))
     return next(p for p in candidates if not os.path.lexists(p))
+
+
+def _made(path: pathlib.Path) -> bool:
+    """Make a new directory; False: it is there already. Raises ValueError if it cannot be made."""
+    with _refusal(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.mkdir()
+        except FileExistsError:
+            return False
+        return True
 
 
 def make(path: pathlib.Path) -> None:
@@ -153,6 +166,6 @@ def written(out: pathlib.Path, names: str) -> None:
 
 
 def say(text: str) -> None:
-    """Progress and remarks go to stderr, so that stdout is the answer alone. One that cannot be said stops nothing."""
+    """Progress and remarks, a line each, go to stderr: stdout is the answer alone. None of them stops anything."""
     with contextlib.suppress(OSError, ValueError):
-        print(text, file=sys.stderr, flush=True)
+        print(one_line(text), file=sys.stderr, flush=True)
