@@ -46,6 +46,11 @@ CASES = {
         "p: It ends. Ctrl-C again ends it at once.\np: interrupted.\n",
     ),
     "stderr takes nothing": ("with listening('p'):\n os.close(2)\n interrupt()\n ever()", ""),
+    "stderr is full": (
+        "w = os.pipe()[1]\nos.set_blocking(w, False)\ntry:\n while True: os.write(w, bytes(65536))\n"
+        "except BlockingIOError: os.set_blocking(w, True)\nos.dup2(w, 2)\nwith listening('p'):\n interrupt()\n ever()",
+        "",
+    ),
     "gently, to nobody": (
         "with listening('p'), gently('It ends.'):\n os.close(2)\n interrupt()\n time.sleep(0.2)\n interrupt()\n ever()",
         "",

@@ -7,12 +7,15 @@ ends the process. That loses nothing: whatever is worth keeping is on disk, whol
 
 import contextlib
 import os
+import select
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 
 INTERRUPTED = 130
+# How long a line waits for room on stderr, in s.
+PATIENCE = 1.0
 
 
 class _Ear:
@@ -44,6 +47,8 @@ class _Ear:
         """On stderr, if it takes it: whatever is wrong there, the thread that listens lives on."""
         with contextlib.suppress(Exception):
             begin = "\n" if _bar_is_open() else ""
+            if os.name == "posix" and not select.select([], [2], [], PATIENCE)[1]:
+                return  # nobody reads it, or its terminal is paused
             os.write(2, f"{begin}{self.program}: {words}\n".encode(errors="backslashreplace"))
 
 
