@@ -56,7 +56,7 @@ def parser() -> Parser:
     ensemble.add_argument("--members", type=int, metavar="N", required=True, help="how many members")
     _seed_option(ensemble)
     ensemble.add_argument(
-        "--chunk", type=int, metavar="M", help="members kept at a time (default: about two seconds of work, 64 on each core at least)"
+        "--chunk", type=int, metavar="M", help="members kept at a time (default: about 2 s of work, 64 a core at least)"
     )
     ensemble.add_argument("--resume", action="store_true", help="go on with a study that was interrupted in --out")
     where = ensemble.add_mutually_exclusive_group()

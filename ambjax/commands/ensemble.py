@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.reader import Case
-from ambjax.commands.doubts import read_aloud
+from ambjax.commands.doubts import read_aloud, reversal
 from ambjax.commands.outputs import check_places, files, make, plain, say, table, target, write_json, written
 from ambjax.commands.pace import Pace, error_words, pilot, say_how_long, sliding_error
 from ambjax.ensemble import statistics
@@ -134,6 +134,9 @@ def _report(
     if not args.json:
         print(_text(summary))
         written(out, ", ".join(["members.npz", *WRITTEN[: None if study.spread.entries else -1]]))
+    held = ~np.isfinite(columns["lost_at"])
+    for doubt in reversal(case, float(np.max(columns["max_abs_i_A"], initial=0.0, where=held))):
+        say(doubt)
     return int(summary["survivors"] < study.members), plain(summary) | {"out": str(out)}
 
 
