@@ -277,8 +277,8 @@ def test_a_run_whose_current_exceeds_the_bias_says_so_once(capsys):
     )
     main(["simulate", over, "--out", "over", "--json"])
     assert capsys.readouterr().err.count("|i| reaches 0.26 A, above the bias plant.i_0 = 0.25 A") == 1
-    steady = write(SHORT + "[initial]\ni = 0.26\n[controller.inversion]\ngamma = 1e9\np = 25e-6\n", "steady.toml")
-    main(["ensemble", steady, "--members", "2", "--out", "study", "--json"])  # of members that are held
+    still = write("[clock]\nduration = 0.001\n[initial]\ni = 0.26\n", "still.toml")
+    main(["ensemble", still, "--members", "2", "--out", "study", "--json"])  # of members that are held
     assert capsys.readouterr().err.count("|i| reaches 0.26 A") == 1
     main(["simulate", under, "--out", "under", "--json"])
     assert "|i| reaches" not in capsys.readouterr().err
