@@ -460,10 +460,13 @@ def test_a_checkpoint_of_another_search_is_refused_in_words(other, words, checkp
 
 
 def test_old_checkpoints_are_removed_and_nothing_else(checkpoint, tmp_path):
-    (tmp_path / "history.npz").touch()
-    assert remove_all(tmp_path, "checkpoint-*.npz") == 1
-    assert [p.name for p in tmp_path.iterdir()] == ["history.npz"]
-    assert remove_all(pathlib.Path(tmp_path, "nowhere"), "checkpoint-*.npz") == 0
+    others = ["checkpoint-10", "checkpoint-2b.npz", "checkpoint-my-net.npz", "history.npz"]
+    for name in others:
+        (tmp_path / name).touch()
+    (tmp_path / "checkpoint-7.npz").mkdir()
+    assert remove_all(tmp_path) == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([*others, "checkpoint-7.npz"])
+    assert remove_all(pathlib.Path(tmp_path, "nowhere")) == 0
 
 
 def test_what_is_told_of_a_study_is_plain_json(begun):

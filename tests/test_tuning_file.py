@@ -3,6 +3,7 @@
 import tomllib
 
 import pytest
+import tomlkit
 
 from tuning.report.tuned import tuned
 
@@ -75,6 +76,10 @@ PLACES = {
     "empty": "",
     "dotted keys": "controller.position.c = 17.0 # x\n[plant]\nm = 1\n",
     "dotted keys in a table": "[controller]\nposition.c = 1.0\nposition.k = 2.0 # k\n[plant]\nm = 1",
+    "keys of the root": "controller.position.c = 100.0\nclock.duration = 0.01\ntune.members = 2\n",
+    "inline among keys": "controller.position = { c = 1.0 }\nclock.duration = 0.5\n",
+    "keys apart": "controller.position.c = 1\nplant.m = 0.6\ncontroller.inversion.gamma = 2.0 # y\nx = 1\n[run]\nseed = 1",
+    "keys and tables": "controller.position.c = 1\nplant.m = 0.6\n[run]\nseed = 1\n[controller.inversion]\np = 1\n",
     "inline all": "controller = { position = { c = 1.0 } }\n[plant]\nm = 1\n",
     "inline and empty": "[controller]\nposition = {}\n[controller.current]\nk_i = 3\n",
     "apart": "[controller.position]\nc = 1\n[reference]\na = 1\n[controller.inversion]\ngamma = 1\n",
@@ -97,6 +102,10 @@ def test_comments_about_the_next_table_stay_with_it():
     assert "\n\n# 2 um, measured\n[sensor]\nstd = 2e-6\n" in written(text)
 
 
-def test_what_cannot_be_written_is_refused():
+def test_what_cannot_be_written_is_refused(monkeypatch):
     with pytest.raises(ValueError, match="gains cannot be written"):
         written("controller = 3")
+    dumps = tomlkit.dumps
+    monkeypatch.setattr(tomlkit, "dumps", lambda document: dumps(document) + "\n[plant]\nm = 1.0\n")
+    with pytest.raises(ValueError, match="would be another case"):
+        written(GIVEN)

@@ -6,6 +6,7 @@ On losses that are formulas (`bowl.py`), so that each can be told by hand.
 import argparse
 import json
 import math
+import os
 import tomllib
 
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from tomlkit import dumps
 
 import tuning.command
 import tuning.judge
+import tuning.search.rounds
 from ambjax.cases.reader import case_from
 from ambjax.cases.template import template
 from tuning.config import Budget, seeds
@@ -345,6 +347,30 @@ def test_a_case_from_a_pipe_is_read_once(monkeypatch, tmp_path):
     assert tuning.command.run(args) == (tomllib.loads(text), text)
 
 
+def test_a_file_whose_gains_could_not_be_written_is_refused_at_the_start(monkeypatch, tmp_path):
+    """Not after hours of search."""
+    broken = "[plant]\nm = 1.0\nx = 1.0\n"
+    monkeypatch.setattr(tuning.command, "tuned_text", lambda *_: broken)
+    with pytest.raises(ValueError, match=r"case.toml: plant.x = 1.0: unknown key"):
+        command(monkeypatch, tmp_path, World())
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unfinished_search_is_neither_lost_nor_gone_on_with_unasked(monkeypatch, tmp_path):
+    *_, out, _ = command(monkeypatch, tmp_path, World())
+    left = {path.name for path in out.glob("checkpoint-*.npz")}
+    mine = out / "checkpoint-my-net.npz"
+    mine.touch()
+    command(monkeypatch, tmp_path, World())  # it has ended: its checkpoints go
+    os.utime(out / "report.json", (0, 0))  # of the search before the one whose checkpoints these are
+    with pytest.raises(ValueError, match=r"holds a search that has not ended. Add --resume"):
+        command(monkeypatch, tmp_path, World())
+    (out / "report.json").unlink()
+    with pytest.raises(ValueError, match=r"holds a search that has not ended. Add --resume"):
+        command(monkeypatch, tmp_path, World())
+    assert {path.name for path in out.glob("checkpoint-*.npz")} == left | {mine.name}
+
+
 HELD_OUT = seeds(Budget())[2]
 
 
@@ -363,6 +389,17 @@ def test_a_member_that_accurate_steps_alone_do_not_hold_is_no_survivor(monkeypat
     assert summary["after"]["survival"] == "not verified"
     assert {"lost": "lose 1 of 6", "stalled": "cannot decide 1 of 6"}[fate] in summary["verified_reason"]
     assert f"| {fate} | 0 | 0 | 0 of 6 | 1 of 6 | - |" in (out / "report.md").read_text()
+
+
+def test_a_survival_that_accurate_steps_refute_says_so_where_nobody_judges(monkeypatch, tmp_path):
+    world = World(limit=lambda seed, number, _, accurate: 1e-3 if accurate else math.inf)
+    monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 1)
+    code, summary, out, _ = command(monkeypatch, tmp_path, world, held_out=0)
+    assert code == 1
+    assert "0 members of the training ensemble are lost under the tuned gains. That is NOT" in summary["verdict"]
+    assert "NOT VERIFIED: accurate steps lose 4 of 4" in (out / "tuned.toml").read_text()
+    for name in ("report.md", "report.html"):
+        assert "NOT VERIFIED" in (out / name).read_text()
 
 
 def test_a_member_that_stalls_is_not_lost_and_not_held(monkeypatch, tmp_path):

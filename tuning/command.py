@@ -26,27 +26,29 @@ from tuning.report import document as report
 from tuning.report.page import page
 from tuning.report.tuned import tuned as tuned_text
 from tuning.search import explore
-from tuning.search.course import CHECKPOINT, Answer
-from tuning.search.keeper import remove_all
+from tuning.search.course import Answer
+from tuning.search.keeper import checkpoint, remove_all, unfinished
 from tuning.search.rounds import rounds
 from tuning.space import Gain, Space, tunable
 
 WRITTEN = ("tuned.toml", "history.npz", "report.html", "report.md", "report.json")
 # What stands for a survival that accurate steps do not confirm.
 NOT_VERIFIED = "not verified"
+# Written last of all, when a search has its answer.
+REPORT = "report.json"
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """ambjax-tune. Raises ValueError for bad input, before anything is written."""
     case, tune, raw = read_tune(args.case)
-    if args.resume and not (args.out and (pathlib.Path(args.out) / f"{CHECKPOINT}-1.npz").exists()):
-        raise ValueError(f"--resume: there is no {CHECKPOINT}-1.npz in --out {args.out}. Leave out --resume to begin.")
+    if args.resume and not (args.out and (pathlib.Path(args.out) / checkpoint(1)).exists()):
+        raise ValueError(f"--resume: there is no {checkpoint(1)} in --out {args.out}. Leave out --resume to begin.")
     say_doubts(case, args.case)
     try:
         problem = problem_of(case, tune)
         start = tune.space.values(case.cascade)
         tune.space.encode(start)
-        tuned_text(case.text, _laws(problem, {}), case.name, "")
+        case_from(tomllib.loads(tuned_text(case.text, _laws(problem, {}), case.name, "")))
     except ValueError as why:
         raise ValueError(one_line(f"{args.case}: {why}")) from None
     out = directory(args.out, f"tune-{case.name}", WRITTEN)
@@ -57,15 +59,22 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
 
 
 def _clear(out: pathlib.Path) -> None:
-    """Remove the checkpoints of an earlier search, lest this one is resumed with them."""
-    left = remove_all(out, f"{CHECKPOINT}-*.npz")
+    """Remove the checkpoints of a search that has ended, lest this one is resumed with them.
+
+    Raises ValueError for those of one that has not.
+    """
+    if unfinished(out, REPORT):
+        raise ValueError(
+            f"--out {out}: it holds a search that has not ended. Add --resume to go on with it, or choose another."
+        )
+    left = remove_all(out)
     if left:
         say(f"{out}: {left} checkpoints of an earlier search are removed")
 
 
 def _kept(out: pathlib.Path) -> str:
     """What an interruption has left, and how to go on."""
-    if not (out / f"{CHECKPOINT}-1.npz").exists():
+    if not (out / checkpoint(1)).exists():
         return "nothing is kept"
     return f"the search so far is kept. To go on, give the same command with --out {out} --resume"
 
@@ -207,7 +216,7 @@ def _write(out: pathlib.Path, problem: Problem, history: Any, facts: dict[str, A
         (out / name).write_bytes(data)
     (out / "report.md").write_text(words, encoding="utf-8")
     (out / "report.html").write_text(page(words, drawn, f"Tuning of {facts['case']}"), encoding="utf-8")
-    write_json(out / "report.json", facts)
+    write_json(out / REPORT, facts)
 
 
 def _pictures(

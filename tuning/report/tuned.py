@@ -1,12 +1,13 @@
 """tuned.toml: the case file as its author wrote it, comments and all, with the tuned gains."""
 
 import re
+import tomllib
 from collections.abc import Mapping
 from typing import Any
 
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
-from tomlkit.items import InlineTable, Table
+from tomlkit.items import AoT, InlineTable, Table
 
 FIRST = "Tuned by ambjax-tune from the case"
 # What such a file begins with: it says nothing of the next search.
@@ -27,10 +28,24 @@ def tuned(text: str, gains: Mapping[str, float], case: str, verdict: str) -> str
             *tables, name = path.split(".")
             _put(_table(document, tables), name, float(value))
         body = tomlkit.dumps(document)
-    except (TOMLKitError, ValueError, TypeError) as why:
+        if tomllib.loads(body) != _wanted(text, gains):
+            raise ValueError("what is written would be another case")
+    except (TOMLKitError, ValueError, TypeError, KeyError) as why:
         raise ValueError(f"gains cannot be written into it ({why}). Give each law a table [controller.STAGE].") from why
     head = [f"# {CONTROL.sub(_escaped, line)}" for line in (f"{FIRST} '{case}'.", verdict)]
     return "\n".join([*head, "", body.strip()]) + "\n"
+
+
+def _wanted(text: str, gains: Mapping[str, float]) -> dict[str, Any]:
+    """What the changed text must say."""
+    document = tomllib.loads(text)
+    for path, value in gains.items():
+        table = document
+        *tables, name = path.split(".")
+        for word in tables:
+            table = table.setdefault(word, {})
+        table[name] = value
+    return document
 
 
 def _escaped(character: re.Match[str]) -> str:
@@ -38,13 +53,35 @@ def _escaped(character: re.Match[str]) -> str:
 
 
 def _table(table: Any, path: list[str]) -> Any:
-    """The table at this path, added where it lacks: inline in an inline one, else behind the last of its kind."""
-    for word in path:
+    """The table at this path, added where it lacks: inline in an inline one, else behind the last of its kind; at the
+    end where keys of the root come after that, which would be the new table's."""
+    document = table
+    for depth, word in enumerate(path):
         if word not in table:
-            inline = isinstance(table, InlineTable)
-            table[word] = tomlkit.inline_table() if inline else _behind(_last(table))
+            if isinstance(table, InlineTable):
+                table[word] = tomlkit.inline_table()
+            elif depth and _followed(document, path[0]):
+                _append(document, path[:depth], word)
+                return _table(document, path)
+            else:
+                table[word] = _behind(_last(table))
         table = table[word]
     return table
+
+
+def _followed(document: tomlkit.TOMLDocument, name: str) -> bool:
+    """Whether keys of the root come after the root's first item of this name."""
+    keys = [(key, item) for key, item in document.body if key is not None]
+    first = next(n for n, (key, _) in enumerate(keys) if key.key == name)
+    return any(key.is_dotted() or not isinstance(item, (Table, AoT)) for key, item in keys[first + 1 :])
+
+
+def _append(document: tomlkit.TOMLDocument, path: list[str], word: str) -> None:
+    """Add an empty table [path.word] at the end of the document."""
+    table = tomlkit.table().add(tomlkit.nl())
+    for name in [word, *reversed(path[1:])]:
+        table = tomlkit.table(is_super_table=True).add(name, table)
+    document.append(path[0], table)
 
 
 def _put(table: Any, name: str, value: float) -> None:

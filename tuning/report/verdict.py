@@ -10,19 +10,23 @@ from tuning.report.limits import broken, prices
 
 
 def verdict(facts: dict[str, Any]) -> str:
-    """What became of the held-out members, in a sentence or two."""
+    """What became of the held-out members, or of those in training where there are none, in a sentence or two."""
+    words = _fates(facts)
+    if not facts["verified"]:
+        words += f" That is NOT VERIFIED: {facts['verified_reason']}."
+    return " ".join([words, *(f"{line}." for line in [*broken(facts["limits"]), *prices(facts["limits"])])])
+
+
+def _fates(facts: dict[str, Any]) -> str:
     before, after = facts["before"], facts["after"]
     if not after["members"]:
         return f"{facts['lost_in_training']} members of the training ensemble are lost under the tuned gains."
     undecided = f", {after['stalled']} not decided (their integration stalls)" if after["stalled"] else ""
-    words = (
+    return (
         f"Of {after['members']} held-out members, {after['lost']} are lost under the tuned gains (before: "
         f"{before['lost']}){undecided}; settled rms error {after['settled_rms_error_m']:.3g} m (before: "
         f"{before['settled_rms_error_m']:.3g} m), largest {after['settled_max_abs_error_m']:.3g} m."
     )
-    if not facts["verified"]:
-        words += f" That is NOT VERIFIED: {facts['verified_reason']}."
-    return " ".join([words, *(f"{line}." for line in [*broken(facts["limits"]), *prices(facts["limits"])])])
 
 
 def advice(problem: Problem, facts: dict[str, Any], x: np.ndarray, who: Members) -> str:

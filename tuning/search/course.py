@@ -17,11 +17,10 @@ from tuning.judge import StepError
 from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
 from tuning.problem import Problem
-from tuning.search.keeper import Keeper, Progress
+from tuning.search.keeper import Keeper, Progress, checkpoint
 from tuning.search.optimise import best_of, search
 from tuning.search.screen import around, everywhere
 
-CHECKPOINT = "checkpoint"
 # Looks at most.
 MOST_LOOKS = 5
 # A look must gain this share of the loss; two in a row that do not are the last. One alone is chance: what it draws of
@@ -80,7 +79,7 @@ class Course:
     def search(self, points: np.ndarray) -> tuple[np.ndarray, float]:
         """The best point [m] that a search from these [K, m] finds, and its goal."""
         tune, number = self.problem.tune, len(self.past) + 1
-        path = self.out / f"{CHECKPOINT}-{number}.npz" if self.out else None
+        path = self.out / checkpoint(number) if self.out else None
         progress = search(
             self.problem.engine, self.problem.goal, self.who, points, keep=tune.budget.starts,
             iterations=tune.budget.iterations, name=tune.optimiser, rate=tune.learning_rate,

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import pathlib
+import re
 from typing import Any
 
 import jax
@@ -17,6 +18,7 @@ from tuning.search.descent import Descent, Starts
 # What a checkpoint holds of a search beside arrays and history.
 COUNTS = ("iteration", "phase", "since", "seconds")
 FACTS = {"fingerprint", "round", "counts"}
+NAME = re.compile(r"checkpoint-[0-9]+\.npz")
 LEAF, PAST, ACTIVE = "leaf_", "history_", "active"
 
 
@@ -85,9 +87,27 @@ class Keeper:
             return None
 
 
-def remove_all(directory: pathlib.Path, pattern: str) -> int:
+def checkpoint(number: int) -> str:
+    """Name of the checkpoint of this round."""
+    return f"checkpoint-{number}.npz"
+
+
+def checkpoints(directory: pathlib.Path) -> list[pathlib.Path]:
+    """Those of a search in this directory: files with such names, and no others."""
+    return sorted(path for path in directory.glob("checkpoint-*.npz") if NAME.fullmatch(path.name) and path.is_file())
+
+
+def unfinished(directory: pathlib.Path, report: str) -> bool:
+    """Whether a directory holds a search that may be gone on with: checkpoints, and no later file of this name."""
+    left, ended = checkpoints(directory), directory / report
+    return bool(left) and not (
+        ended.exists() and ended.stat().st_mtime_ns >= max(path.stat().st_mtime_ns for path in left)
+    )
+
+
+def remove_all(directory: pathlib.Path) -> int:
     """Remove checkpoints of a search that nobody goes on with. Returns how many there were."""
-    left = sorted(directory.glob(pattern))
+    left = checkpoints(directory)
     for path in left:
         path.unlink()
     return len(left)
