@@ -71,6 +71,8 @@ BAD = {
     "bad seed": ("[run]\nseed = -1\n", ["run.seed", "whole number"]),
     "fractional seed": ("[run]\nseed = 1.5\n", ["run.seed", "whole number"]),
     "settle after the end": ("[run]\nsettle = 5.0\n", ["run.settle", "clock.duration"]),
+    "settle behind the last sample": ("[run]\nsettle = 1.99995\n", ["run.settle = 1.99995", "at most 1.9999 s"]),
+    "one sample": ("[clock]\nduration = 1e-4\n", ["clock.duration = 0.0001", "one sample", "at least 2", "Lengthen"]),
     "not TOML": ("[plant\nm = 1\n", ["not valid TOML", "line 1"]),
 }  # fmt: skip
 

@@ -9,7 +9,8 @@ import pytest
 from ambjax import RK4, AdaptiveRodas3, Cascade, Clock, Initial, Plant, Scenario, Sensor, inversion, paper, rollout
 from ambjax.__main__ import main
 from ambjax.ensemble import Normal, Spread, maps
-from ambjax.ensemble.maps import PERIOD, Axis, grid
+from ambjax.ensemble.maps import PERIOD, Axis, grid, stepped
+from ambjax.ensemble.store import MANIFEST
 from ambjax.ensemble.study import Study
 from ambjax.simulation.metrics import Peak
 
@@ -126,16 +127,65 @@ X, Y = "initial.z=-1e-5:1e-5:3", "initial.z_dot=-1e-3:1e-3:3"
         (X, X, "it is the quantity of --x too"),
         ("plant.m=-120%:10%", Y, "from 1e-06"),
         ("sensor.std=0:1e-6", Y, "no sensor noise"),
+        ("run.clearance=1e-3:5e-2:3", Y, "--x run.clearance=0.001:0.05: run.clearance reaches 0.05 m, but must stay"),
+        (X, "plant.s_0=1e-6:1e-5", "--x initial.z=-1e-05:1e-05: |initial.z| reaches 1e-05 m, but must stay below"),
+        ("disturbance.q_z.start=0.1:0.3", Y, "--x disturbance.q_z.start=0.1:0.3: disturbance.q_z.start reaches 0.3"),
+        ("clock.sample_period=1e-4:2e-3:5", Y, "a run needs 2 samples. End it at 0.001 s"),
+        (Y, "clock.sample_period=1e-4:2e-3:5", "a run needs 2 samples. End it at 0.001 s"),
+        ("clock.sample_period=1e-4:9e-4:5", Y, "with 0.0007 s no sample is at or behind run.settle = 0.0015 s"),
     ],
 )
-def test_bad_axes_are_refused_in_one_line(x, y, words, tmp_path, capsys):
-    (tmp_path / "case.toml").write_text(CASE)
+def test_bad_axes_are_refused_in_one_line(x, y, words, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(maps, "run_ensemble", None)  # before anything is computed
+    pulse = '[disturbance.q_z]\nkind = "pulse"\namplitude = 0.1\nstart = 0.1\nstop = 0.2\n'
+    (tmp_path / "case.toml").write_text(CASE.replace("settle = 1e-3", "settle = 1.5e-3") + pulse)
     out = tmp_path / "out"
     assert main(["map", str(tmp_path / "case.toml"), "--x", x, "--y", y, "--out", str(out)]) == 2
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith("ambjax: ")
     assert words in error
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "words"),
+    [
+        ("sensor.bits=8:14:6", X, "--x sensor.bits=8:14: sensor.bits must be a whole number from 2 to 32"),
+        (X, "reference.amplitude=0:1e-4", "--y reference.amplitude: there is no such number in this case"),
+    ],
+)
+def test_every_case_must_take_the_axes_before_any_is_run(x, y, words, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(maps, "run_ensemble", None)
+    rounded = CASE + "[processor]\n[sensor]\nbits = 12\n"
+    sine = rounded + '[reference]\nkind = "sine"\namplitude = 1e-5\nfrequency = 2.0\n'
+    for name, text in (("one", sine), ("two", rounded)):
+        (tmp_path / f"{name}.toml").write_text(text)
+    one, two, out = (str(tmp_path / name) for name in ("one.toml", "two.toml", "out"))
+    assert main(["map", one, "--against", two, "--x", x, "--y", y, "--out", out]) == 2
+    assert words in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("kind", ["a file", "a study"])
+def test_a_folder_that_cannot_take_a_map_is_refused_before_anything_is_run(kind, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(maps, "run_ensemble", None)
+    (tmp_path / "case.toml").write_text(CASE)
+    out = tmp_path / "out"
+    if kind == "a file":
+        out.touch()
+    else:
+        out.mkdir()
+        (out / MANIFEST).touch()
+    assert main(["map", str(tmp_path / "case.toml"), "--x", X, "--y", Y, "--out", str(out)]) == 2
+    assert f"--out {out}: " in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_whole_number_may_be_an_axis_of_whole_numbers():
+    study = dataclasses.replace(SMALL, scenario=dataclasses.replace(NOISY, sensor=Sensor(1e-7, bits=12.0)))
+    mass = Axis("plant.m", np.array([0.588]))
+    assert stepped(study, Axis("sensor.bits", np.linspace(2, 14, 13)), mass) == study
+    with pytest.raises(ValueError, match="sensor.bits must be a whole number"):
+        stepped(study, Axis("sensor.bits", np.linspace(2, 14, 12)), mass)
 
 
 def test_the_command_draws_and_prints_two_cases_side_by_side(tmp_path, capsys):

@@ -232,8 +232,8 @@ CASE = {"processor": {}, "clock": {"duration": 0.01}}
 @pytest.mark.parametrize(
     ("table", "key", "value", "words"),
     [
-        ("sensor", "bits", 14.5, "whole number of bits"),
-        ("sensor", "bits", 1, "from 2 to 32"),
+        ("sensor", "bits", 14.5, "a whole number from 2 to 32"),
+        ("sensor", "bits", 1, "a whole number from 2 to 32"),
         ("sensor", "range_z", 0, "range_z"),
         ("sensor", "range_i", -1, "range_i"),
         ("sensor", "bandwidth", 0.1, "Hz"),

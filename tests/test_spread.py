@@ -375,14 +375,35 @@ def test_bad_spread_is_one_clear_line(wrong):
             'clock = { dt = 2e-6, method = "rk4" }\nspread.controller.inversion.gamma = { percent = 50 }',
             ["clock.dt = 2e-06", "stable only up to 1.56e-06"],
         ),
+        (
+            "processor = {}\nsensor.bits = 12\nspread.sensor.bits = { uniform = [8.0, 14.0] }",
+            ["spread.sensor.bits = { uniform = [8, 14] }", "a whole number from 2 to 32. Use choices"],
+        ),
+        (
+            "processor = {}\nsensor.bits = 12\nspread.sensor.bits = { choices = [8, 8.5, 14] }",
+            ["spread.sensor.bits = { choices = [8, 8.5, 14] }", "a whole number from 2 to 32. Use choices"],
+        ),
     ],
-    ids=["not a table", "no sensor", "nothing in two units", "band turned over", "unstable step"],
+    ids=[
+        "not a table",
+        "no sensor",
+        "nothing in two units",
+        "band turned over",
+        "unstable step",
+        "bits between",
+        "bits by choice",
+    ],
 )
 def test_spreads_that_do_not_fit_the_case(text, wanted):
     with pytest.raises(ValueError) as refused:  # noqa: PT011
         case_from(tomllib.loads(text))
     for part in wanted:
         assert part in str(refused.value)
+
+
+def test_whole_numbers_are_spread_by_choices_of_them():
+    text = "processor = {}\nsensor.bits = 12\nspread.sensor.bits = { choices = [14, 8] }"
+    assert case_from(tomllib.loads(text)).spread.paths == ("sensor.bits",)
 
 
 def test_a_case_says_how_it_is_spread():

@@ -23,7 +23,7 @@ import tuning.search.rounds
 from ambjax.cases.reader import case_from
 from ambjax.cases.template import template
 from tuning.config import Budget, seeds
-from tuning.judge import RESOLVED, judge, step_error, summarise
+from tuning.judge import RESOLVED, judge, step_error, summarise, words
 from tuning.objective.conditions import Bound
 from tuning.objective.goal import Goal
 from tuning.objective.loss import TERMS
@@ -146,6 +146,15 @@ def test_members_that_only_accurate_steps_lose_are_named(monkeypatch):
     assert error.refuted  # whatever the error of the others
     error = step_error(made, at(made, 30.0, 60.0))
     assert error.lost == len(error.who.member) == 0
+
+
+def test_an_error_of_which_no_share_is_told_is_told_in_metres(monkeypatch):
+    """Where the accurate one is 0, and where there is none."""
+    error = step_error(study(monkeypatch, World()), np.zeros(2))
+    zero = error._replace(search_m=1e-6, reference_m=0.0, relative=math.nan)
+    assert zero.refuted == "coarser steps give a settled rms error of 1e-06 m against 0 m"
+    assert words(zero._replace(search_m=0.0)) == "settled rms error of 0 m against 0 m on 4 members"
+    assert "of 1e-06 m against no number" in words(zero._replace(reference_m=math.nan))
 
 
 def test_where_nobody_is_held_by_both_nothing_is_said_of_the_step(monkeypatch):

@@ -72,7 +72,15 @@ class StepError(NamedTuple):
             return f"accurate steps cannot decide {self.stalled} of {self.tried} members tried (they stall)"
         if not self.members:
             return "no member compared is held by both"
-        return "" if self.resolved else f"coarser steps give a settled rms error off by {100 * self.relative:.2g} %"
+        return "" if self.resolved else f"coarser steps give a settled rms error {self.off}"
+
+    @property
+    def off(self) -> str:
+        """How far off the coarser steps are, in words: a share, or both where there is none."""
+        if math.isfinite(self.relative):
+            return f"off by {100 * self.relative:.2g} %"
+        found = (f"{x:.2g} m" if math.isfinite(x) else "no number" for x in (self.search_m, self.reference_m))
+        return "of {} against {}".format(*found)
 
     def facts(self) -> dict[str, Any]:
         """All of it as plain data."""
@@ -82,8 +90,8 @@ class StepError(NamedTuple):
 
 def words(error: StepError) -> str:
     """What accurate steps say, in words."""
-    compared = f"settled rms error off by {100 * error.relative:.2g} % on {error.members} members"
-    return compared if error.members and not error.unseen else error.refuted
+    told = error.members and not error.unseen
+    return f"settled rms error {error.off} on {error.members} members" if told else error.refuted
 
 
 def compared(problem: Problem) -> Members:

@@ -79,6 +79,8 @@ OTHERS = ["tune"]  # read by ambjax-tune; the commands here pass it by
 UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
 # Rows that a run may record: 16 numbers each, so this is about 2.5 GB.
 MOST_SAMPLES = 20_000_000
+# Metrics compare samples; and by how much two times that are the same may differ.
+FEWEST_SAMPLES, ROUNDING = 2, 1e-9
 # Steps of a run with a given dt: hours. And terms of a sum: each is compiled.
 MOST_STEPS, MOST_TERMS = 10_000_000_000, 100
 DURATION = leaf(default=2.0, unit="s", at_least=1e-9, at_most=1e6, doc="simulated time")
@@ -142,10 +144,7 @@ def case_from(raw: dict[str, Any], name: str = "case", text: str = "") -> Case:
             'lumped plant, behind any observer but "ired-1" and "ired-2". Use method = "adaptive".'
         )
     _check_start(scenario)
-    if settle is None:
-        settle = duration / 4
-    elif settle >= duration:
-        raise ValueError(f"run.settle = {settle:g} s: it must be less than clock.duration = {duration:g} s.")
+    settle = duration / 4 if settle is None else _settled(settle, clock)
     spread = spread_from(top, cascade, scenario)
     check_reference(spread, cascade, scenario, clock)
     clock = with_method(clock, *corners(spread, cascade, scenario))
@@ -222,8 +221,6 @@ def _scenario(top: Table, plant: Bearing) -> tuple[Scenario, float | None]:
 
 def _sensor(table: Table) -> Sensor:
     sensor, velocity = table.record(Sensor, extra=("velocity",)), table.switch("velocity")
-    if sensor.bits is not None and sensor.bits % 1:
-        raise ValueError(f"{table.at('bits')} = {sensor.bits:g}: it must be a whole number of bits, 2 to 32.")
     return sensor if velocity is None else dataclasses.replace(sensor, velocity=velocity)
 
 
@@ -261,13 +258,29 @@ def _clock(table: Table) -> tuple[Clock, float]:
             f"{table.at('duration')} = {duration:g} s makes {samples:,} samples of {period:g} s; at most "
             f"{MOST_SAMPLES:,} can be recorded. Shorten the run or lengthen clock.sample_period."
         )
+    if samples < FEWEST_SAMPLES:
+        raise ValueError(
+            f"{table.at('duration')} = {duration:g} s is one sample of {period:g} s; at least {FEWEST_SAMPLES} are "
+            "needed. Lengthen the run or shorten clock.sample_period."
+        )
     return Clock(samples, period, _method(table, period, samples)), duration
+
+
+def _settled(settle: float, clock: Clock) -> float:
+    """run.settle of a run that has a sample from then on."""
+    last = (clock.samples - 1) * clock.sample_period
+    if settle > (1 + ROUNDING) * last:
+        raise ValueError(
+            f"run.settle = {settle:g} s: it must be at most {last:.12g} s, the last sample of clock.duration = "
+            f"{clock.duration:g} s, or nothing is settled. Begin it earlier, or lengthen clock.duration."
+        )
+    return min(settle, last)
 
 
 def _whole(ratio: float) -> int | None:
     """The whole number of at least 1 that `ratio` is to rounding, or None."""
     nearest = round(ratio) if math.isfinite(ratio) else 0
-    return nearest if nearest >= 1 and abs(ratio - nearest) <= 1e-9 * nearest else None
+    return nearest if nearest >= 1 and abs(ratio - nearest) <= ROUNDING * nearest else None
 
 
 def _method(table: Table, period: float, samples: int) -> Integrator | None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.cases.reader import MOST_SAMPLES, Case
+from ambjax.cases.reader import FEWEST_SAMPLES, MOST_SAMPLES, Case
 from ambjax.commands.doubts import read_aloud
 from ambjax.commands.ensemble import study_of
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
@@ -34,16 +34,16 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         raise ValueError(f"--members {args.members}: {cells} cells of so many exceed {MOST_CELLS:,} runs. Take fewer.")
     for case, (x, y) in zip(cases, axes, strict=True):
         _check_samples(case, x, y, args.members)
-    maps = []
-    for case, study, (x, y) in zip(cases, studies, axes, strict=True):
-        study = stepped(study, x, y)
-        say(f"{case.name}: {cells} cells of {args.members}; method: {study.clock.method}")
-        if args.members == 1 and case.spread.entries:
-            say(f"{case.name}: nominal, its [spread] is not drawn; --members N, N above 1, draws it.")
-        maps.append(grid(study, x, y))
+    studies = [stepped(study, x, y) for study, (x, y) in zip(studies, axes, strict=True)]
     out = directory(args.out, f"map-{cases[0].name}")
-    summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
     with files(out) as part:
+        maps = []
+        for case, study, (x, y) in zip(cases, studies, axes, strict=True):
+            say(f"{case.name}: {cells} cells of {args.members}; method: {study.clock.method}")
+            if args.members == 1 and case.spread.entries:
+                say(f"{case.name}: nominal, its [spread] is not drawn; --members N, N above 1, draws it.")
+            maps.append(grid(study, x, y))
+        summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
         _draw(cases, maps, part / "map.png")
         write_json(part / "map.json", summary)
     if not args.json:
@@ -90,9 +90,17 @@ def _check_samples(case: Case, x: Axis, y: Axis, members: int) -> None:
             continue
         duration, low, high = float(case.clock.duration), float(axis.values[0]), float(axis.values[-1])
         total = np.sum(duration / axis.values) * len(other.values) * members
-        if high > duration:
+        samples = np.round(duration / axis.values)
+        if samples.min() < FEWEST_SAMPLES:
             raise ValueError(
-                f"{flag} {PERIOD}: it reaches {high:g} s, but clock.duration is {duration:g} s. End it there."
+                f"{flag} {PERIOD}: it reaches {high:g} s, but clock.duration is {duration:g} s, and a run needs "
+                f"{FEWEST_SAMPLES} samples. End it at {duration / FEWEST_SAMPLES:g} s."
+            )
+        unsettled = axis.values[(samples - 1) * axis.values < case.settle]
+        if unsettled.size:
+            raise ValueError(
+                f"{flag} {PERIOD}: with {unsettled[0]:g} s no sample is at or behind run.settle = {case.settle:g} s. "
+                "End it lower, or begin run.settle earlier."
             )
         if duration / low > MOST_SAMPLES or total > MOST_TOTAL:
             raise ValueError(

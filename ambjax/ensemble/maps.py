@@ -7,11 +7,11 @@ import jax
 import numpy as np
 
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble.distributions import Distribution, Uniform
+from ambjax.ensemble.distributions import Choice, Distribution, Uniform
 from ambjax.ensemble.engine import run_ensemble
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.paths import places
-from ambjax.ensemble.spread import STEP, Spread, apply, corners, ends, require_path
+from ambjax.ensemble.spread import STEP, Spread, apply, check_spread, corners, ends, require_path
 from ambjax.ensemble.study import Study
 from ambjax.simulation.method import choose_method
 from ambjax.simulation.metrics import standard_for
@@ -103,6 +103,7 @@ def _entries(study: Study, axes: tuple[str, ...]) -> tuple[tuple[str, Distributi
 
 
 def _check(study: Study, x: Axis, y: Axis) -> None:
+    """Raise ValueError for axes that the case lacks, or that as spreads it would refuse."""
     known = [*places(study.cascade, study.scenario), PERIOD]
     for name, axis in (("x", x), ("y", y)):
         if axis.path not in known:
@@ -112,6 +113,16 @@ def _check(study: Study, x: Axis, y: Axis) -> None:
                 raise ValueError(str(error).replace("spread.", f"--{name} ", 1)) from None
     if x.path == y.path:
         raise ValueError(f"--y {y.path}: it is the quantity of --x too. Choose another.")
+    axes = {axis.path: (name, Choice(tuple(axis.values))) for name, axis in (("x", x), ("y", y)) if axis.path != PERIOD}
+    entries = (*((path, values) for path, (_, values) in axes.items()), *_entries(study, (x.path, y.path)))
+    try:
+        check_spread(Spread(entries), study.cascade, study.scenario)
+    except ValueError as error:
+        words = str(error)
+        for path, (name, values) in axes.items():
+            low, high = values.support(0.0)
+            words = words.replace(f"spread.{path} = {values}", f"--{name} {path}={low:g}:{high:g}", 1)
+        raise ValueError(words.replace("Narrow the spread", "Narrow it")) from None
 
 
 def _at_period(study: Study, period: float) -> Study:

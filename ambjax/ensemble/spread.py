@@ -14,7 +14,7 @@ import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.design import DESIGNS, points
-from ambjax.ensemble.distributions import Distribution, Percent
+from ambjax.ensemble.distributions import Choice, Distribution, Percent
 from ambjax.ensemble.paths import Place, order_pairs, places, with_values
 from ambjax.numerics.records import numbers, within
 from ambjax.world.scenario import Scenario
@@ -124,22 +124,26 @@ def require_path(path: str, known: Iterable[str], value: str = "") -> None:
 
 
 def _check_one(path: str, kind: Distribution, place: Place) -> None:
-    what, fault = f"spread.{path} = {kind}", kind.fault()
-    if fault:
-        raise ValueError(f"{what}: {fault}.")
+    def refuse(text: str) -> ValueError:
+        return ValueError(f"spread.{path} = {kind}: {text}")
+
+    if fault := kind.fault():
+        raise refuse(f"{fault}.")
     if np.size(place.value) != 1:
-        raise ValueError(f"{what}: {path} is an array of {np.size(place.value)} already. Spread a single number.")
+        raise refuse(f"{path} is an array of {np.size(place.value)} already. Spread a single number.")
     nominal = _nominal(place)
     if kind.relative and not math.isfinite(nominal):
-        raise ValueError(
-            f"{what}: {path} has no finite value in this case to spread around. Give it one, or use uniform."
-        )
+        raise refuse(f"{path} has no finite value in this case to spread around. Give it one, or use uniform.")
     if isinstance(kind, Percent) and nominal == 0:
-        raise ValueError(f"{what}: {path} is 0 in this case, and a percentage of 0 is 0. Use normal or uniform.")
+        raise refuse(f"{path} is 0 in this case, and a percentage of 0 is 0. Use normal or uniform.")
     low, high = kind.support(nominal)
-    if not within(place.field.metadata, np.array([low, high])):
+    if not within(place.field.metadata | {"whole": False}, np.array([low, high])):
         limit = numbers(place.field)
-        raise ValueError(f"{what}: it reaches from {low:g} to {high:g}, but {path} must be {limit}. Narrow the spread.")
+        raise refuse(f"it reaches from {low:g} to {high:g}, but {path} must be {limit}. Narrow the spread.")
+    if place.field.metadata["whole"] and not (
+        isinstance(kind, Choice) and within(place.field.metadata, np.array(kind.values))
+    ):
+        raise refuse(f"{path} must be {numbers(place.field)}. Use choices of such numbers.")
 
 
 def _check_together(

@@ -32,12 +32,13 @@ def leaf(
     at_least: float | None = None,
     at_most: float | None = None,
     infinite: bool = False,
+    whole: bool = False,
     optional: bool = False,
 ) -> Any:
     """A numeric field: its unit, its bounds and what it means.
 
     `above` and `at_least` bound it from below, `at_most` from above; `infinite` admits +inf beside what they
-    allow; `optional` admits None. The bounds lie decades beyond what is built, so that no product of a few numbers
+    allow; `whole` admits whole numbers only; `optional` admits None. The bounds lie decades beyond what is built, so that no product of a few numbers
     overflows and none of two such numbers is taken for 0.
     """
     metadata = {
@@ -47,6 +48,7 @@ def leaf(
         "at_least": at_least,
         "at_most": at_most,
         "infinite": infinite,
+        "whole": whole,
         "optional": optional,
         "leaf": True,
     }
@@ -126,6 +128,8 @@ def numbers(field: dataclasses.Field) -> str:
     unit = f" ({meta['unit']})" if meta["unit"] else ""
     end = f"{unit}, or inf" if meta["infinite"] else unit
     kind = "a number" if meta["infinite"] else "a finite number"
+    if meta["whole"]:
+        return f"a whole number from {at_least} to {at_most}{end}"
     if above is not None:
         return f"{kind} above {above:g}{'' if at_most is None else f' and at most {at_most:g}'}{end}"
     if at_least is not None:
@@ -141,12 +145,14 @@ def within(meta: Any, value: Any) -> bool:
         above, at_least, at_most = meta["above"], meta["at_least"], meta["at_most"]
         return (  # nothing of this holds for NaN
             -math.inf < value
+            and not (meta["whole"] and value % 1)
             and (above is None or value > above)
             and (at_least is None or value >= at_least)
             and (at_most is None or value <= at_most)
         )
     low, high = np.min(value), np.max(value)  # NaN carries through both
-    return all(within(meta, float(x)) for x in (low, high))
+    whole = not meta["whole"] or not np.any(np.asarray(value) % 1)
+    return whole and all(within(meta, float(x)) for x in (low, high))
 
 
 def _example(field: dataclasses.Field) -> str:

@@ -53,7 +53,12 @@ class Sensor:
         doc="of the position sensor, first order; none: at once",
     )
     bits: Scalar | None = leaf(
-        default=None, at_least=2, at_most=32, optional=True, doc="of the converter of z and i; none: not rounded"
+        default=None,
+        at_least=2,
+        at_most=32,
+        whole=True,
+        optional=True,
+        doc="of the converter of z and i; none: not rounded",
     )
     range_z: Scalar | None = leaf(
         default=None, unit="m", at_least=1e-9, at_most=1.0, optional=True, doc="ends of the converter; none: s_0"
