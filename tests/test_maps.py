@@ -184,7 +184,7 @@ def test_a_whole_number_may_be_an_axis_of_whole_numbers():
     study = dataclasses.replace(SMALL, scenario=dataclasses.replace(NOISY, sensor=Sensor(1e-7, bits=12.0)))
     mass = Axis("plant.m", np.array([0.588]))
     assert stepped(study, Axis("sensor.bits", np.linspace(2, 14, 13)), mass) == study
-    with pytest.raises(ValueError, match="sensor.bits must be a whole number"):
+    with pytest.raises(ValueError, match=r"sensor.bits must be a whole number"):
         stepped(study, Axis("sensor.bits", np.linspace(2, 14, 12)), mass)
 
 

@@ -78,7 +78,7 @@ PLACES = {
     "dotted keys in a table": "[controller]\nposition.c = 1.0\nposition.k = 2.0 # k\n[plant]\nm = 1",
     "keys of the root": "controller.position.c = 100.0\nclock.duration = 0.01\ntune.members = 2\n",
     "inline among keys": "controller.position = { c = 1.0 }\nclock.duration = 0.5\n",
-    "keys apart": "controller.position.c = 1\nplant.m = 0.6\ncontroller.inversion.gamma = 2.0 # y\nx = 1\n[run]\nseed = 1",
+    "keys apart": "controller.position.c = 1\nplant.m = 0.6\ncontroller.inversion.gamma = 2.0 # y\nx = 1\n[run]\ns = 1",
     "keys and tables": "controller.position.c = 1\nplant.m = 0.6\n[run]\nseed = 1\n[controller.inversion]\np = 1\n",
     "inline all": "controller = { position = { c = 1.0 } }\n[plant]\nm = 1\n",
     "inline and empty": "[controller]\nposition = {}\n[controller.current]\nk_i = 3\n",

@@ -31,7 +31,8 @@ WEIGHT: dataclasses.Field = leaf(at_least=0, at_most=1e9)
 LIMIT: dataclasses.Field = leaf(at_least=1e-12, at_most=1e12, infinite=True)
 SHARES: dict[str, dataclasses.Field] = dict.fromkeys(("clearance_used", "survival"), leaf(above=0, at_most=1))
 LENGTH: dataclasses.Field = leaf(at_least=1e-12, at_most=1.0, unit="m")
-MOST_WHOLE = 2**31 - 1
+# Whole numbers; of members and points, which are made all at once in memory, fewer.
+MOST_WHOLE, MOST_MEMBERS = 2**31 - 1, 2**20
 # Band of the settling time, left out: a share of the clearance.
 BAND = 0.01
 
@@ -40,24 +41,24 @@ BAND = 0.01
 class Budget:
     """How the search is run; whole numbers, unless a unit is given."""
 
-    members: int = 32
+    members: int = leaf(32, at_least=1, at_most=MOST_MEMBERS, whole=True)
     """members of the ensemble that is tuned on"""
-    stressed: int = 8
+    stressed: int = leaf(8, at_least=0, at_most=MOST_MEMBERS, whole=True)
     """further members of whom nothing is asked but to be held: with `stress` times the noise, and every gain off by a
     factor of `gain_margin`, up or down"""
-    validation: int = 2000
+    validation: int = leaf(2000, at_least=0, at_most=MOST_MEMBERS, whole=True)
     """members of another seed at the end of a search; those that are lost join the stressed ones, and it goes on"""
-    held_out: int = 1000
+    held_out: int = leaf(1000, at_least=0, at_most=MOST_MEMBERS, whole=True)
     """members of the ensemble that judges, of another seed"""
-    seed: int = 1
+    seed: int = leaf(1, at_least=0, at_most=MOST_WHOLE, whole=True)
     """of the training ensemble and of the screen; the other ensembles have seeds far from it"""
-    screen: int = 128
+    screen: int = leaf(128, at_least=0, at_most=MOST_MEMBERS, whole=True)
     """points of the first screen; 0: none, start from the case's gains alone"""
-    starts: int = 4
+    starts: int = leaf(4, at_least=1, at_most=MOST_WHOLE, whole=True)
     """best of them that are refined"""
-    iterations: int = 40
+    iterations: int = leaf(40, at_least=1, at_most=MOST_WHOLE, whole=True)
     """of either phase of the refinement, at most"""
-    substeps: int = 3
+    substeps: int = leaf(3, at_least=1, at_most=MOST_WHOLE, whole=True)
     """steps per sample"""
 
 
@@ -108,9 +109,9 @@ def read_tune(path: str | pathlib.Path) -> tuple[Case, Tune, dict[str, Any]]:
 
 def tune_from(table: Table, case: Case) -> Tune:
     """[tune] of a case; whatever is left out has a default."""
-    counts = [field.name for field in dataclasses.fields(Budget)]
+    counts = {field.name: field for field in dataclasses.fields(Budget)}
     table.only([*WORDS, *NUMBERS, *counts])
-    budget = Budget(**{name: _whole(table, name, getattr(Budget, name)) for name in counts})
+    budget = Budget(**{name: table.whole(name, field) for name, field in counts.items()})
     weights, conditions = _weights(table.table("weights"))
     optimiser = table.choice("optimiser", list(NAMES), BFGS)
     numbers = {name: table.leaf(name, field, field.default) for name, field in NUMBERS.items()}
@@ -220,17 +221,6 @@ def _risk(table: Table) -> Risk:
     if not 0 <= alpha < 1:
         raise ValueError(f"{table.at('alpha')} = {alpha:g}: it must be at least 0 and below 1.")
     return CVaR(alpha)
-
-
-def _whole(table: Table, key: str, default: int) -> int:
-    value, least = (
-        table.raw.get(key, default),
-        0 if key in ("screen", "seed", "held_out", "stressed", "validation") else 1,
-    )
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= MOST_WHOLE:
-        words = f"a whole number from {least} to {MOST_WHOLE}"
-        raise ValueError(f"{table.at(key)} = {show(value)}: it must be {words}.")
-    return value
 
 
 def settings(tune: Tune) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import tomllib
 from typing import Any
 
 from ambjax.host.words import one_line
-from ambjax.numerics.records import check_number, numbers, validate
+from ambjax.numerics.records import check_number, numbers, validate, within
 
 # What of a key or a value is shown; keys beyond this length are like no other.
 LONGEST = 60
@@ -101,6 +101,13 @@ class Table:
         value = self.number(key, default, numbers(field))
         if key in self.raw:
             check_number(field, self.at(key), value)
+        return value
+
+    def whole(self, key: str, field: dataclasses.Field) -> int:
+        """A whole number, written as one, that the field allows; or its default if left out."""
+        value = self.raw.get(key, field.default)
+        if isinstance(value, bool) or not isinstance(value, int) or not within(field.metadata, value):
+            raise ValueError(f"{self.at(key)} = {show(value)}: it must be {numbers(field)}.")
         return value
 
     def switch(self, key: str) -> bool | None:

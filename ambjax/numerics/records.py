@@ -38,8 +38,8 @@ def leaf(
     """A numeric field: its unit, its bounds and what it means.
 
     `above` and `at_least` bound it from below, `at_most` from above; `infinite` admits +inf beside what they
-    allow; `whole` admits whole numbers only; `optional` admits None. The bounds lie decades beyond what is built, so that no product of a few numbers
-    overflows and none of two such numbers is taken for 0.
+    allow; `whole` admits whole numbers only; `optional` admits None. The bounds lie decades beyond what is built, so
+    that no product of a few numbers overflows and none of two such numbers is taken for 0.
     """
     metadata = {
         "unit": unit,
