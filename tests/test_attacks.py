@@ -22,6 +22,7 @@ import tuning
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.template import template
+from ambjax.commands import simulate
 from ambjax.commands.doubts import doubts, reversal
 from ambjax.commands.outputs import files
 from ambjax.control.processor import Processor
@@ -106,9 +107,27 @@ def test_steep_but_possible_gains_run(capsys):
     # 2/pi k p = 6e59 1/s: no step resolves it, which is no fault of the file; the run says what came of it
     path = write(SHORT + "[controller.position]\nk = 1e30\np = 1e30\n")
     assert main(["simulate", path, "--out", "steep", "--json"]) in (0, 1)
-    assert "NaN" not in capsys.readouterr().out
+    metrics = json.loads(capsys.readouterr().out)
+    told = {name: value for name, value in metrics.items() if name not in ("lost_why", "method", "out")}
+    assert len(told) > 15
+    for name, value in told.items():  # null stands for a time that never comes, and for nothing else
+        assert isinstance(value, (bool, int, float)) or (value is None and name.endswith("_s")), name
     with np.load("steep/trajectory.npz") as kept:
         assert not any(np.isnan(kept[name]).any() for name in kept if kept[name].dtype == float)
+
+
+@pytest.mark.parametrize(("name", "value"), [("rms_error_m", math.nan), ("lost_at_s", math.nan), ("rms_u_V", math.inf)])
+def test_a_metric_that_is_no_number_is_never_told_as_one(name, value, capsys, monkeypatch):
+    run = simulate.simulate
+
+    def broken(case):
+        outcome = run(case)
+        return outcome._replace(measured=outcome.measured | {name: np.float64(value)})
+
+    monkeypatch.setattr(simulate, "simulate", broken)
+    assert main(["simulate", write(SHORT), "--out", "broken"]) == 2
+    assert f"case.toml: {name}: no finite number came of this run" in capsys.readouterr().err
+    assert not pathlib.Path("broken/metrics.json").exists()
 
 
 def records():

@@ -255,6 +255,18 @@ def test_a_chunk_that_does_not_belong_there_is_computed_again(kind, begun, whole
     assert str(path) in remark
 
 
+def test_a_folder_in_place_of_a_chunk_is_told_by_name_and_left(begun):
+    path = chunk_file(begun, 1)
+    path.unlink()
+    path.mkdir()
+    store = store_in(begun)
+    (span,), (remark,) = store.survey()
+    assert str(path) in remark
+    with pytest.raises(ValueError, match=rf"{path.name}: cannot be written \(Is a directory\)"):
+        store.put(span, rows(*span))
+    assert path.is_dir()
+
+
 def test_a_chunk_that_is_gone_is_computed_without_a_word(begun, whole):
     chunk_file(begun, 2).unlink()
     assert rejoined(begun, 2, whole) == []
@@ -428,9 +440,7 @@ CHECKPOINT_STRANGE = STRANGE | {
 }
 
 
-@pytest.mark.parametrize(
-    "kind", [*(k for k in DAMAGE if k != "a folder"), *(f"sealed: {k}" for k in CHECKPOINT_STRANGE)]
-)
+@pytest.mark.parametrize("kind", [*DAMAGE, *(f"sealed: {k}" for k in CHECKPOINT_STRANGE)])
 def test_a_damaged_checkpoint_is_begun_again_with_one_line(kind, checkpoint, descent, capsys):
     (DAMAGE | {f"sealed: {k}": damage for k, damage in CHECKPOINT_STRANGE.items()})[kind](checkpoint.path)
     assert checkpoint.load(descent, STARTS, GAINS) is None
@@ -440,6 +450,16 @@ def test_a_damaged_checkpoint_is_begun_again_with_one_line(kind, checkpoint, des
     assert err.count("\n") == 1
     checkpoint.save(search_of(descent))
     assert checkpoint.load(descent, STARTS, GAINS) is not None
+
+
+def test_a_folder_in_place_of_a_checkpoint_is_told_by_name_and_left(checkpoint, descent, capsys):
+    checkpoint.path.unlink()
+    checkpoint.path.mkdir()
+    assert checkpoint.load(descent, STARTS, GAINS) is None
+    assert capsys.readouterr().err.startswith(f"{checkpoint.path}: it is not a whole archive")
+    with pytest.raises(ValueError, match=r"checkpoint-2.npz: cannot be written \(Is a directory\)"):
+        checkpoint.save(search_of(descent))
+    assert [path.name for path in checkpoint.path.parent.iterdir()] == ["checkpoint-2.npz"]
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import tomllib
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bowl import FLOOR, PATHS, S_0, World, document, study
+from bowl import Bowl, FLOOR, PATHS, REVERSE, S_0, World, document, study
 from scipy import stats
 from texts import piped
 from tomlkit import dumps
@@ -30,6 +30,7 @@ from tuning.objective.loss import TERMS
 from tuning.objective.ranges import BEYOND
 from tuning.objective.risk import Mean
 from tuning.optimisers import bfgs
+from tuning.report import gradient
 from tuning.search import explore
 from tuning.search.descent import Descent
 from tuning.search.optimise import HALVINGS, search
@@ -186,6 +187,12 @@ def test_slices_run_along_each_gain_through_the_optimum(monkeypatch):
     np.testing.assert_allclose(found.sensitivity(), [6.25, 6.25], rtol=1e-6)
 
 
+def test_the_front_counts_who_stalls_apart(monkeypatch):
+    made = study(monkeypatch, World(stalls=lambda seed, number, accurate: number == 2))
+    rows = explore.pareto(made, at(made, 100.0, 60.0), made.objective.training(1, 4, 2, 1.2, 1.25))
+    assert {(row["lost"], row["stalled"]) for row in rows} == {(0, 1)}
+
+
 def test_the_front_trades_error_for_voltage(monkeypatch):
     """As the judge finds, whose steps are 24 a sample, not as the search does."""
     made = study(monkeypatch, World(bias=lambda substeps: 0.5 if substeps == 3 else 0.0))
@@ -322,16 +329,34 @@ def test_gradients_reports_three_ways_to_the_same_number(everything):
     _, _, summary, out, _ = everything
     found = summary["gradient"]
     ways = [np.array(found["three_ways"][name]) for name in ("forward", "reverse", "differences")]
-    np.testing.assert_allclose(ways[1], ways[0], rtol=1e-12)
+    # of both modes; that those of a real engine agree: test_tuning_search.py::test_gradient_three_ways
+    np.testing.assert_allclose(ways[1], (1 + REVERSE) * ways[0], rtol=1e-12)
     # h^4 of the extrapolated differences, of slopes that vanish at the optimum: of the size of the loss
     np.testing.assert_allclose(ways[2], ways[0], rtol=1e-6, atol=1e-9 * FLOOR)
     assert len(found["horizons"]) > 1
     assert "gradient" in (out / "report.md").read_text().lower()
 
 
+@pytest.mark.parametrize(("samples", "horizons"), [(2, [1, 2]), (3, [1, 2, 3]), (40, [5, 10, 20, 40])])
+def test_horizons_have_samples_and_settled_ones_among_them(monkeypatch, samples, horizons):
+    """Each once; and where the loss is 0 there is no logarithm of it."""
+    settle = (samples - 1) * 1e-4
+    made = study(monkeypatch, World(), {"clock": {"duration": samples * 1e-4}, "run": {"settle": settle}})
+    for count in horizons:
+        short = gradient._shorter(made, count)
+        assert float(short.loss.settle) <= (count - 1) * 1e-4
+    x, who = at(made, 80.0, 40.0), made.objective.training(1, 4, 2, 1.2, 1.25)
+    rows = gradient.against_horizon(made, x, who)
+    np.testing.assert_allclose([row["horizon_s"] for row in rows], np.array(horizons) * 1e-4)
+    assert all(math.isfinite(row["norm"]) for row in rows)
+    monkeypatch.setattr(Bowl, "gradient", lambda *_: (np.zeros((1, 4, 1)), np.zeros((1, 4, 1, 2)), {}))
+    assert gradient.against_horizon(made, x, who) == []
+
+
 def test_pareto_is_in_the_report_and_has_a_picture(everything):
     _, _, summary, out, _ = everything
     assert len(summary["pareto"]) > 1
+    assert "| lost | stalled | gains |" in (out / "report.md").read_text()
     assert "## Error against voltage" in (out / "report.md").read_text()
     assert 'alt="Error against voltage"' in (out / "report.html").read_text()
 

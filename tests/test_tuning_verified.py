@@ -238,13 +238,18 @@ def test_an_answer_confirmed_in_training_is_still_refuted_by_held_out_members(sm
 
 
 @pytest.mark.slow
-def test_the_search_goes_on_to_where_it_is_confirmed(tmp_path):
+def test_the_search_goes_on_to_where_it_is_confirmed(tmp_path, capsys):
     """From the bearing whose first answers survive in the search's own steps alone, under noise on the velocity."""
     path, out = tmp_path / "case.toml", tmp_path / "out"
     hard = FALSE.replace("duration = 0.02", "duration = 0.2").replace("[clock]", "[run]\nsettle = 0.05\n[clock]")
     # the limit by default, 60 % of the supply, is not its matter: such noise asks for 1 % more
     path.write_text(hard + "[tune]\nscreen = 32\nmembers = 8\nheld_out = 100\nvalidation = 100\nlimits.rms_u_V = inf\n")
     assert main([str(path), "--out", str(out), "--json"]) == 0
+    said = capsys.readouterr().err.splitlines()
+    steps = [n for n, line in enumerate(said) if line.startswith("step of the search against")]
+    on = said.index("the search goes on with members that are lost, or that accurate steps do not hold")
+    assert steps[0] < on < steps[-1]
+    assert "accurate steps" in said[steps[0]]
     facts = json.loads((out / "report.json").read_text())
     assert facts["verified"] is True
     assert facts["after"]["lost"] == 0

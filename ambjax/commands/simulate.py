@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -32,6 +33,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     if case.cascade.processor is not None:
         say(f"on a processor: {case.cascade.processor}")
     trajectory, numbers = simulate(case)
+    _check(numbers, args.case)
     for doubt in reversal(case, float(numbers["max_abs_i_A"])):
         say(doubt)
     metrics = plain(numbers) | {
@@ -61,6 +63,16 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         remedy = verdict.STALLED if case.cascade.processor is None else verdict.STALLED_PLANT
         say(verdict.undecided(metrics["lost_at_s"], remedy))
     return int(ended), metrics | {"out": str(out)}
+
+
+def _check(numbers: dict[str, Any], path: str) -> None:
+    """Raise ValueError where a metric is no number, which no case may bring about; a time may be infinite: never."""
+    wrong = [name for name, x in numbers.items() if not (np.isfinite(x) or (name.endswith("_s") and x == math.inf))]
+    if wrong:
+        raise ValueError(
+            f"{path}: {', '.join(wrong)}: no finite number came of this run, so nothing is written. That is a fault of "
+            "ambjax, not of the case: please report it with the case file."
+        )
 
 
 def _window(case: Case, args: argparse.Namespace) -> tuple[float, float] | None:

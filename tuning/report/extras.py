@@ -15,6 +15,7 @@ def pareto(rows: list[Facts]) -> list[str]:
             f"{row['settled_rms_error_m']:.3e}",
             f"{row['settled_rms_u_V']:.4g}",
             str(row["lost"]),
+            str(row["stalled"]),
             ", ".join(f"{path.rpartition('.')[2]} {value:.4g}" for path, value in row["gains"].items()),
         ]
         for row in rows
@@ -24,7 +25,7 @@ def pareto(rows: list[Facts]) -> list[str]:
         "",
         "On the training ensemble; u is averaged over time. More weight on effort buys less voltage with more error.",
         "",
-        *table(["weights.effort", "settled rms error (m)", "settled rms u (V)", "lost", "gains"], cells),
+        *table(["weights.effort", "settled rms error (m)", "settled rms u (V)", "lost", "stalled", "gains"], cells),
         "",
         "![Error against voltage](front.png)",
         "",

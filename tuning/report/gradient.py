@@ -19,7 +19,8 @@ def _shorter(problem: Problem, samples: int) -> Any:
     """The objective over fewer samples; settled from the same share of them on."""
     objective = problem.objective
     clock = dataclasses.replace(objective.clock, samples=samples)
-    settle = objective.loss.settle * samples / objective.clock.samples
+    # and a sample at least is settled
+    settle = min(objective.loss.settle * samples / objective.clock.samples, (samples - 1) * clock.sample_period)
     return dataclasses.replace(objective, clock=clock, loss=dataclasses.replace(objective.loss, settle=settle))
 
 
@@ -46,14 +47,16 @@ def three_ways(problem: Problem, x: np.ndarray) -> dict[str, Any]:
 
 
 def against_horizon(problem: Problem, x: np.ndarray, who: Members) -> list[dict[str, float]]:
-    """Norm of the gradient of the log of the mean loss, and share of lost members, by horizon in s."""
-    rows = []
-    for share in (*HORIZONS, 1.0):
-        samples = round(share * problem.objective.clock.samples)
+    """Norm of the gradient of the log of the mean loss, and share of lost members, by horizon in s; where it is 0,
+    as it may be over a sample or two, there is no log, and no row."""
+    rows, all_ = [], problem.objective.clock.samples
+    for samples in sorted({max(round(share * all_), 1) for share in (*HORIZONS, 1.0)}):
         objective = _shorter(problem, samples)
-        engine = problem.engine if share == 1.0 else Engine(objective, settle=float(objective.loss.settle))
+        engine = problem.engine if samples == all_ else Engine(objective, settle=float(objective.loss.settle))
         few = who.part(4)
         outcomes, slopes, terms = engine.gradient(x[None], few, problem.goal.weights)
+        if not outcomes[0, :, 0].mean():
+            continue
         rows.append(
             {
                 "horizon_s": float(samples * np.asarray(objective.clock.sample_period)),

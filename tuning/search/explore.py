@@ -81,6 +81,7 @@ def pareto(
             "settled_rms_error_m": rms(metrics["settled_rms_error_m"][n]),
             "settled_rms_u_V": rms(metrics["settled_rms_u_V"][n]),
             "lost": int(metrics["lost"][n].sum()),
+            "stalled": int(metrics["stalled"][n].sum()),
             "gains": dict(zip(space.paths, np.asarray(space.gains_at(jnp.asarray(best[n]))).tolist(), strict=True)),
         }
         for n, w in enumerate(weights)
