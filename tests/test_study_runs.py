@@ -338,6 +338,29 @@ def test_the_pilot_is_the_first_members(no_pictures):
     assert np.all(lost["lost_at"] == 0)
 
 
+def test_the_command_takes_chunks_and_first_members_from_the_pilot(no_pictures, monkeypatch, capsys):
+    """128 members that took so long that there are 30 a second: 2 s of them are less than a call on both cores."""
+    computed = []
+
+    def pilot(study):
+        columns = study.columns(0, 128, call=worker.CALL)
+        return columns | {"rms_u_V": np.full(128, 7.0)}, 128 / 30
+
+    def chunk(study, start, stop, call):
+        computed.append((start, stop, call))
+        return worker.chunk(study, start, stop, call)
+
+    monkeypatch.setattr(pace, "cores", lambda: 2)
+    monkeypatch.setattr(studies, "pilot", pilot)
+    monkeypatch.setattr(studies, "chunk", chunk)
+    assert main(["ensemble", write(TINY), "--members", "300", "--out", "out"]) in (0, 1)
+    assert "about 10 s for 300 members (30 a second)" in capsys.readouterr().err
+    assert json.loads(pathlib.Path("out/study.json").read_text())["chunk"] == 128
+    assert computed == [(128, 256, 128), (256, 300, 128)]
+    with np.load("out/members.npz") as kept:
+        assert np.flatnonzero(kept["rms_u_V"] == 7.0).tolist() == list(range(128))
+
+
 # --- the sliding step ---
 
 # A sign so hard that explicit steps would have to be a nanosecond long.
