@@ -1091,6 +1091,50 @@ FATES = [
         'unit="V/s", at_least=1e-3',
         "tests/test_attacks.py::test_every_number_has_both_ends",
     ),
+    M(
+        "a new table takes the keys of the root that come after it",
+        "tuning/report/tuned.py",
+        "elif depth and _followed(document, path[0]):",
+        "elif False:",
+        "tests/test_tuning_file.py::test_gains_are_written_wherever_the_laws_stand[keys of the root]",
+    ),
+    M(
+        "a search that has not ended is removed",
+        "tuning/search/keeper.py",
+        "return bool(left) and not (",
+        "return False and not (",
+        "tests/test_tuning_study.py::test_an_unfinished_search_is_neither_lost_nor_gone_on_with_unasked",
+    ),
+    M(
+        "a refuted survival is told as one where nobody judges",
+        "tuning/report/verdict.py",
+        """if not facts["verified"]:
+        words +=""",
+        """if not facts["verified"] and facts["after"]["members"]:
+        words +=""",
+        "tests/test_tuning_study.py::test_a_survival_that_accurate_steps_refute_says_so_where_nobody_judges",
+    ),
+    M(
+        "what settles behind the last sample is read",
+        "ambjax/cases/clock.py",
+        "settle > (1 + ROUNDING) * last:",
+        "settle > clock.duration:",
+        "tests/test_cli.py::test_bad_case_file_is_one_clear_line[settle behind the last sample-check]",
+    ),
+    M(
+        "bits are spread between whole numbers",
+        "ambjax/ensemble/spread.py",
+        'if place.field.metadata["whole"] and not (',
+        "if False and not (",
+        "tests/test_spread.py::test_spreads_that_do_not_fit_the_case[bits between]",
+    ),
+    M(
+        "a map's axes are not held to what a spread is held to",
+        "ambjax/ensemble/maps.py",
+        "entries = (*((path, values) for path, (_, values) in axes.items()), *",
+        "entries = (*(), *",
+        "tests/test_maps.py::test_bad_axes_are_refused_in_one_line",
+    ),
 ]
 SURROUNDINGS = [
     M(

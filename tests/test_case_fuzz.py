@@ -12,7 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tomlkit import dumps
 
-from ambjax.cases.reader import DURATION, KINDS, METHODS, SIGNALS, TABLES, read_case
+from ambjax.cases.clock import DURATION, METHODS
+from ambjax.cases.reader import KINDS, SIGNALS, TABLES, read_case
 from ambjax.commands import simulate
 from ambjax.commands.doubts import doubts
 from ambjax.ensemble.design import DESIGNS

@@ -12,7 +12,7 @@ import tomllib
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bowl import Bowl, FLOOR, PATHS, REVERSE, S_0, World, document, study
+from bowl import FLOOR, PATHS, REVERSE, S_0, Bowl, World, document, study
 from scipy import stats
 from texts import piped
 from tomlkit import dumps

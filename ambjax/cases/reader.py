@@ -10,6 +10,7 @@ import pathlib
 import re
 from typing import Any
 
+from ambjax.cases.clock import clock_from, settled
 from ambjax.cases.reach import check_reference
 from ambjax.cases.spread import spread_from
 from ambjax.cases.table import Table, check_depth, load, show
@@ -18,10 +19,9 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.processor import Processor
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.host.words import one_line
-from ambjax.numerics.records import leaf, numbers
+from ambjax.numerics.records import leaf
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.explicit import DOP853, RK4, Euler
-from ambjax.simulation.integrate import AdaptiveRodas3, Integrator, Rodas3, Slide
+from ambjax.simulation.integrate import Slide
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sampled import check_parts
 from ambjax.simulation.sliding import slides
@@ -59,9 +59,6 @@ SIGNALS: dict[str, type] = {
 }
 PLANTS: dict[str, type] = {"lumped": Plant, "two-coil": TwoCoil}
 DISCRETISATIONS = ["implicit", "explicit"]
-METHODS: dict[str, type] = {"rk4": RK4, "dop853": DOP853, "euler": Euler, "rodas3": Rodas3, "sliding": Slide}
-# Substeps of the sliding step where dt = "auto".
-SLIDING_SUBSTEPS = 3
 TABLES = [
     "plant",
     "controller",
@@ -77,14 +74,8 @@ TABLES = [
 ]
 OTHERS = ["tune"]  # read by ambjax-tune; the commands here pass it by
 UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
-# Rows that a run may record: 16 numbers each, so this is about 2.5 GB.
-MOST_SAMPLES = 20_000_000
-# Metrics compare samples; and by how much two times that are the same may differ.
-FEWEST_SAMPLES, ROUNDING = 2, 1e-9
-# Steps of a run with a given dt: hours. And terms of a sum: each is compiled.
-MOST_STEPS, MOST_TERMS = 10_000_000_000, 100
-DURATION = leaf(default=2.0, unit="s", at_least=1e-9, at_most=1e6, doc="simulated time")
-DT = leaf(default=1e-6, unit="s", at_least=1e-15, at_most=1e6, doc="integration step")
+# Terms of a sum: each is compiled.
+MOST_TERMS = 100
 SETTLE = leaf(default=0.5, unit="s", at_least=0, at_most=1e6, doc='from when "settled" metrics count')
 (DELAY,) = (field for field in dataclasses.fields(Processor) if field.name == "delay")
 FIELDS = {field.name: field for kind in (Scenario, Clock) for field in dataclasses.fields(kind)}
@@ -136,7 +127,7 @@ def case_from(raw: dict[str, Any], name: str = "case", text: str = "") -> Case:
     cascade = _cascade(top.table("controller"), plant, processor)
     scenario, settle = _scenario(top, plant)
     check_parts(cascade, scenario)
-    clock, duration = _clock(top.table("clock"))
+    clock, duration = clock_from(top.table("clock"))
     if isinstance(clock.method, Slide) and not slides(cascade, scenario.plant):
         made = " or ".join(f'"{kind}"' for kind, law in KINDS["inversion"].items() if answers.slides(law))
         raise ValueError(
@@ -144,7 +135,7 @@ def case_from(raw: dict[str, Any], name: str = "case", text: str = "") -> Case:
             'lumped plant, behind any observer but "ired-1" and "ired-2". Use method = "adaptive".'
         )
     _check_start(scenario)
-    settle = duration / 4 if settle is None else _settled(settle, clock)
+    settle = duration / 4 if settle is None else settled(settle, clock)
     spread = spread_from(top, cascade, scenario)
     check_reference(spread, cascade, scenario, clock)
     clock = with_method(clock, *corners(spread, cascade, scenario))
@@ -240,68 +231,3 @@ def _check_start(scenario: Scenario) -> None:
             f"initial.z = {z:g} m: the rotor would touch its stop at once; |z| must be below {stop:g} m "
             "(run.clearance, by default 0.9 of plant.s_0)."
         )
-
-
-def _clock(table: Table) -> tuple[Clock, float]:
-    table.only(["duration", "sample_period", "dt", "method"])
-    duration = table.leaf("duration", DURATION, DURATION.default)
-    period = table.leaf("sample_period", FIELDS["sample_period"], FIELDS["sample_period"].default)
-    samples = _whole(duration / period)
-    if samples is None:
-        nearest = max(round(duration / period), 1) * period
-        raise ValueError(
-            f"{table.at('sample_period')} = {period:g} s does not divide clock.duration = {duration:g} s. "
-            f"The nearest duration that it divides is {nearest:.12g} s."
-        )
-    if samples > MOST_SAMPLES:
-        raise ValueError(
-            f"{table.at('duration')} = {duration:g} s makes {samples:,} samples of {period:g} s; at most "
-            f"{MOST_SAMPLES:,} can be recorded. Shorten the run or lengthen clock.sample_period."
-        )
-    if samples < FEWEST_SAMPLES:
-        raise ValueError(
-            f"{table.at('duration')} = {duration:g} s is one sample of {period:g} s; at least {FEWEST_SAMPLES} are "
-            "needed. Lengthen the run or shorten clock.sample_period."
-        )
-    return Clock(samples, period, _method(table, period, samples)), duration
-
-
-def _settled(settle: float, clock: Clock) -> float:
-    """run.settle of a run that has a sample from then on."""
-    last = (clock.samples - 1) * clock.sample_period
-    if settle > (1 + ROUNDING) * last:
-        raise ValueError(
-            f"run.settle = {settle:g} s: it must be at most {last:.12g} s, the last sample of clock.duration = "
-            f"{clock.duration:g} s, or nothing is settled. Begin it earlier, or lengthen clock.duration."
-        )
-    return min(settle, last)
-
-
-def _whole(ratio: float) -> int | None:
-    """The whole number of at least 1 that `ratio` is to rounding, or None."""
-    nearest = round(ratio) if math.isfinite(ratio) else 0
-    return nearest if nearest >= 1 and abs(ratio - nearest) <= ROUNDING * nearest else None
-
-
-def _method(table: Table, period: float, samples: int) -> Integrator | None:
-    dt = table.raw.get("dt", "auto")
-    if dt == "auto":
-        name = table.choice("method", ["auto", "adaptive", "sliding"], "auto") if "method" in table.raw else "auto"
-        return {"auto": None, "adaptive": AdaptiveRodas3(), "sliding": Slide(SLIDING_SUBSTEPS)}[name]
-    if isinstance(dt, str):
-        raise ValueError(f'{table.at("dt")} = {show(dt)}: it must be "auto" or {numbers(DT)}.')
-    dt = table.leaf("dt", DT)
-    method = METHODS[table.choice("method", list(METHODS), "rk4")]
-    substeps = _whole(period / dt)
-    if substeps is None:
-        nearest = period / max(round(period / dt), 1)
-        raise ValueError(
-            f"{table.at('dt')} = {dt:g} s does not divide clock.sample_period = {period:g} s. "
-            f'The nearest step that does is {nearest:.12g} s; or use dt = "auto".'
-        )
-    if samples * substeps > MOST_STEPS:
-        raise ValueError(
-            f"{table.at('dt')} = {dt:g} s makes {samples * substeps:.3g} steps; at most {MOST_STEPS:.0e} are taken. "
-            'Use dt = "auto", or shorten clock.duration.'
-        )
-    return method(substeps)

@@ -1,26 +1,24 @@
 """`ambjax map`: survival and error over a grid of two quantities, for one case or for several side by side."""
 
 import argparse
-import dataclasses
 import math
 from typing import Any
 
 import numpy as np
 
-from ambjax.cases.reader import FEWEST_SAMPLES, MOST_SAMPLES, Case
+from ambjax.cases.clock import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
+from ambjax.cases.reader import Case
 from ambjax.commands.doubts import read_aloud
 from ambjax.commands.ensemble import study_of
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
 from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, stepped
 from ambjax.ensemble.paths import places
 from ambjax.numerics.records import numbers, within
-from ambjax.simulation.clock import Clock
 
 COUNT = 21
 MOST_CELLS = 1_000_000
 # Samples of all runs of a map over clock.sample_period: hours.
 MOST_TOTAL = 10_000_000_000
-SAMPLE_PERIOD = next(field for field in dataclasses.fields(Clock) if field.name == "sample_period")
 FORM = "PATH=LOW:HIGH[:COUNT][:log], as in initial.z=-1e-3:1e-3:41 or plant.m=-20%:20%"
 
 

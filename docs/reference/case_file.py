@@ -5,7 +5,8 @@ import re
 import tomllib
 from typing import Any
 
-from ambjax.cases.reader import DURATION, FIELDS, KINDS, OTHERS, SETTLE, SIGNALS, TABLES, case_from
+from ambjax.cases.clock import DURATION
+from ambjax.cases.reader import FIELDS, KINDS, OTHERS, SETTLE, SIGNALS, TABLES, case_from
 from ambjax.cases.spread import DISTRIBUTIONS
 from ambjax.cases.table import Table
 from ambjax.cases.template import template
