@@ -27,6 +27,7 @@ from ambjax.host.lock import LOCK, alone
 from ambjax.host.sealed import write_whole
 from ambjax.host.streams import lenient, open_streams
 from ambjax.pictures import tornado
+from tuning.__main__ import main as tune
 
 SHORT = "[clock]\nduration = 0.01\n"
 STUDY = SHORT + "[sensor]\nstd = 1e-9\n"
@@ -159,6 +160,17 @@ def test_a_study_whose_folder_is_at_work_is_refused(capsys):
         assert main(argv) == 2
         assert "--out out: another run is at work there" in capsys.readouterr().err
         assert os.listdir(out) == [LOCK]  # noqa: PTH208
+
+
+def test_a_search_whose_folder_is_at_work_is_refused_and_touches_nothing(capsys):
+    out = pathlib.Path("out")
+    out.mkdir()
+    (out / "checkpoint-1.npz").touch()
+    (out / "report.json").touch()
+    with alone(out):
+        assert tune([write(STUDY), "--out", "out"]) == 2
+    assert "--out out: another run is at work there" in capsys.readouterr().err
+    assert (out / "checkpoint-1.npz").exists()
 
 
 def test_a_study_that_another_run_began_meanwhile_is_refused(monkeypatch, capsys):

@@ -15,6 +15,7 @@ from ambjax.commands.doubts import say_doubts
 from ambjax.commands.outputs import directory, files, plain, say, write_json, written
 from ambjax.control.cascade import Cascade
 from ambjax.host.interrupts import keeping
+from ambjax.host.lock import alone
 from ambjax.theorem.conditions import check
 from ambjax.theorem.verdict import advice as on_conditions
 from tuning.config import read_tune, seeds, settings
@@ -52,10 +53,11 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     except ValueError as why:
         raise ValueError(one_line(f"{args.case}: {why}")) from None
     out = directory(args.out, f"tune-{case.name}", WRITTEN)
-    if not args.resume:
-        _clear(out)
-    with keeping(lambda: _kept(out)):
-        return _tune(args, raw, problem, start, out)
+    with alone(out):
+        if not args.resume:
+            _clear(out)
+        with keeping(lambda: _kept(out)):
+            return _tune(args, raw, problem, start, out)
 
 
 def _clear(out: pathlib.Path) -> None:

@@ -15,6 +15,7 @@ from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, stepped
 from ambjax.ensemble.paths import places
 from ambjax.numerics.records import numbers, within
 
+WRITTEN = ("map.png", "map.json")
 COUNT = 21
 MOST_CELLS = 1_000_000
 # Samples of all runs of a map over clock.sample_period: hours.
@@ -33,7 +34,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     for case, (x, y) in zip(cases, axes, strict=True):
         _check_samples(case, x, y, args.members)
     studies = [stepped(study, x, y) for study, (x, y) in zip(studies, axes, strict=True)]
-    out = directory(args.out, f"map-{cases[0].name}")
+    out = directory(args.out, f"map-{cases[0].name}", WRITTEN)
     with files(out) as part:
         maps = []
         for case, study, (x, y) in zip(cases, studies, axes, strict=True):
@@ -46,7 +47,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         write_json(part / "map.json", summary)
     if not args.json:
         print(_text(cases, maps))
-        written(out, "map.png, map.json")
+        written(out, ", ".join(WRITTEN))
     return 0, plain(summary)
 
 
