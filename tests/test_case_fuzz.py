@@ -306,5 +306,5 @@ def test_twenty_thousand_files_run_or_are_refused(path):
         hold(text, path, tally, run=True)
 
     examine()
-    assert min(tally.refused, tally.read) > 3500  # a sixth at least of either: 16,454 and 3,546 when last looked at
+    assert min(tally.refused, tally.read) > 3500  # a sixth at least of either: 16,369 and 3,631 when last looked at
     assert tally.run > 500
