@@ -732,7 +732,7 @@ SAMPLED = [
         "ambjax/simulation/sliding.py",
         "u=before.u + tau * u + left * mean, u_squared=before.u_squared + tau * u * u + left * square",
         "u=before.u + left * u + tau * mean, u_squared=before.u_squared + left * u * u + tau * square",
-        "tests/test_metrics_dense.py",
+        "tests/test_metrics_dense.py::test_every_metric_is_what_a_dense_solution_says",
     ),
     M(
         "whether a delay is predicted is settled by the first there was",

@@ -460,6 +460,7 @@ def test_a_gain_is_not_both_spread_and_tuned():
         parsed({}, spread={"controller.position.c": {"percent": 5}})
 
 
+# Steps as fine as so short a search needs for its answer to be confirmed.
 CASE = """
 [controller.inversion]
 gamma = 1000.0
@@ -482,6 +483,7 @@ held_out = 8
 screen = 16
 iterations = 3
 starts = 2
+substeps = 6
 """
 
 
