@@ -297,14 +297,14 @@ METHODS = [
         "ambjax/simulation/metrics.py",
         "more = getattr(span.densities, self.of), span.time",
         "more = (row.u**2 * span.time if self.of == 'u_squared' else getattr(span.densities, self.of)), span.time",
-        "tests/test_metrics_dense.py::test_every_metric_is_what_a_dense_solution_says[noise without a limit]",
+        "tests/test_metrics_dense.py::test_every_metric_is_what_a_dense_solution_says[noise without a limit-adaptive]",
     ),
     M(
         "peaks between the samples are not seen",
         "ambjax/simulation/metrics.py",
         '        if self.of in getattr(span.most, "_fields", ()):',
         '        if self.of == "":',
-        "tests/test_metrics_dense.py::test_every_metric_is_what_a_dense_solution_says[noise without a limit]",
+        "tests/test_metrics_dense.py::test_every_metric_is_what_a_dense_solution_says[noise without a limit-adaptive]",
     ),
     M(
         "chatter is of the voltage at the samples",
@@ -1068,7 +1068,7 @@ FATES = [
         "ambjax/world/bearing.py",
         "zeta * (zeta + (2 / self.i_0) * i) + 1",
         "zeta * (zeta - (2 / self.i_0) * i) + 1",
-        "tests/test_metrics_dense.py::test_every_metric_is_what_a_dense_solution_says[lost across the singular curve]",
+        "tests/test_metrics_dense.py::test_every_metric_is_what_a_dense_solution_says[lost across the singular curve-adaptive]",
     ),
     M(
         "no tail is heavy",
