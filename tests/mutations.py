@@ -1068,7 +1068,7 @@ FATES = [
         "ambjax/world/bearing.py",
         "zeta * (zeta + (2 / self.i_0) * i) + 1",
         "zeta * (zeta - (2 / self.i_0) * i) + 1",
-        "tests/test_metrics_dense.py::test_every_metric_is_what_a_dense_solution_says[lost across the singular curve-adaptive]",
+        "tests/test_metrics_dense.py::test_every_metric_is_what_a_dense_solution_says[lost across C-adaptive]",
     ),
     M(
         "no tail is heavy",

@@ -36,7 +36,7 @@ LOOPS = {
     ),
     "lost": (World(inversion=adaptive(1e3), reference=sine()), (1e-6, 1e-4, 1e-4)),
     # i_ref and i as good as constant, beside each other; the rotor drifts off, and over C
-    "lost across the singular curve": (
+    "lost across C": (
         World(inversion=adaptive(1e-9, i_ref=-0.4), current=current(1e-9), initial=(5.5e-5, 0.0, 0.0), u_max=45.0),
         (0.0, 0.0, 0.0),
     ),
