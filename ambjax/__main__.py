@@ -13,6 +13,19 @@ from ambjax.host.interrupts import listening
 from ambjax.host.streams import lenient, open_streams
 from ambjax.host.words import one_line
 
+FIRST_DAY = """\
+ambjax simulates, checks, tunes and exports the controller of a rotor in an active magnetic bearing.
+
+  ambjax template rig > my.toml       print an annotated case file; put in the numbers of your bearing
+  ambjax simulate my.toml             simulate it: trajectory.npz, metrics.json, overview.png
+  ambjax check my.toml                check stability conditions, slopes and delay margin
+  ambjax tune my.toml --out tuned     tune the gains: tuned/tuned.toml, tuned/report.html
+  ambjax export tuned/tuned.toml      write the controller as C
+
+'ambjax --help' lists all commands; 'ambjax COMMAND --help' lists the options of one."""
+# The group of entry points in which a package that stands on this one, such as the tuner, declares its command.
+EXTENSIONS = "ambjax.commands"
+
 
 class Parser(argparse.ArgumentParser):
     """An argument parser whose complaints are one line, and exit with 2."""
@@ -32,7 +45,7 @@ def parser() -> Parser:
     """All commands and their arguments."""
     top = Parser(prog="ambjax", description="Simulate and check a rotor in an active magnetic bearing.")
     top.add_argument("--version", action="version", version=f"ambjax {__version__}")
-    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
+    commands = top.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
 
     def command(name: str, words: str, case: bool = False, out: bool = False) -> Parser:
         one = commands.add_parser(name, help=words, description=words)
@@ -75,6 +88,8 @@ def parser() -> Parser:
     export.add_argument("--verify", action="store_true", help="hold the C to JAX; exit code 1 if it fails")
     export.add_argument("--precision", choices=["float", "double"], default="float", help="type of its numbers")
     export.add_argument("--prefix", metavar="NAME", help="what its names begin with (default: the case's name)")
+    # Listed here, run by a parser of its own: see main.
+    command("tune", "tune the gains of a case by gradients: tuned.toml, report.html")
     return top
 
 
@@ -83,16 +98,32 @@ def _seed_option(command: Parser) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command. Returns its exit code: 0 done, 1 the answer is no, 2 bad input."""
-    open_streams()
+    """Run a command. Returns its exit code: 0 done, 1 the answer is no, 2 bad input.
+
+    Without a command, print the commands that a new user runs first.
+    """
     words = sys.argv[1:] if argv is None else argv
     if words[:1] == ["tune"]:
-        return complain("tuning is a program of its own: write 'ambjax-tune CASE.toml'. See 'ambjax-tune --help'.")
+        return _extension("tune")(words[1:], "ambjax tune")
+    open_streams()
     with listening("ambjax"):
         return answer(parser(), words, _run)
 
 
+def _extension(name: str) -> Callable[[list[str], str], int]:
+    """The command that another package declares under this name."""
+    import importlib.metadata
+
+    found = tuple(importlib.metadata.entry_points(group=EXTENSIONS, name=name))
+    if found:
+        return found[0].load()
+    return lambda *_: complain(f"{name}: this command is not installed. Install ambjax again, with pip.")
+
+
 def _run(args: argparse.Namespace) -> tuple[int, Any]:
+    if args.command is None:
+        print(FIRST_DAY)
+        return 0, None
     from ambjax.ensemble import worker
 
     worker.prepare()
@@ -116,7 +147,7 @@ def answer(parser: argparse.ArgumentParser, words: list[str] | None, run: Run) -
                 raise
             code = 0
         else:
-            code = _code(lambda: run(args), args.json, parser.prog)
+            code = _code(lambda: run(args), getattr(args, "json", False), parser.prog)
         failure = stdout.failure()
         if failure is None or isinstance(failure, BrokenPipeError):
             return code

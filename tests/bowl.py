@@ -39,6 +39,8 @@ class World:
     """whether the integration of a member stalls, by seed and number, and by accurate steps"""
     bias: Callable[[int], float] = lambda substeps: 0.0
     """relative error of the settled error in steps of so many per sample"""
+    chaos: float = 0.0
+    """size of what is added to every derivative, with a sign that changes from point to point"""
     louder: float = 1.0
     """by how much the judge finds more voltage than the search does"""
     asked: list[tuple[str, int, tuple[int, ...], int]] = dataclasses.field(default_factory=list)
@@ -111,11 +113,9 @@ class Bowl:
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS))).T[:, :, None]
         found = [outcomes(each, self._terms(x, who, j), who.stressed) for j in range(x.shape[1])]
         off = REVERSE if self.mode == "reverse" else 0.0
-        return (
-            np.stack(found[0], -1).real,
-            (1 + off) * np.stack([np.stack(one, -1).imag for one in found], -1) / TINY,
-            self._terms(x, who),
-        )
+        slopes = (1 + off) * np.stack([np.stack(one, -1).imag for one in found], -1) / TINY
+        chaos = self.world.chaos * np.sign(np.sin(1e6 * np.asarray(x)))[:, None, None, :]
+        return np.stack(found[0], -1).real, slopes + chaos, self._terms(x, who)
 
 
 @functools.partial(jax.jit, static_argnums=0)

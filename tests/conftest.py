@@ -1,8 +1,32 @@
+import gc
 import os
+import pathlib
+import shutil
 
 import pytest
 
+# One cache of compiled programs for all processes of a run, kept for the next run; removed when it is larger (bytes).
+CACHE = pathlib.Path(__file__).parent.parent / ".pytest_cache" / "programs"
+LARGEST = 512 * 2**20
+
 os.environ.setdefault("JAX_ENABLE_X64", "1")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
+
+
+def pytest_configure(config):
+    if not hasattr(config, "workerinput") and sum(file.stat().st_size for file in CACHE.glob("*")) > LARGEST:
+        shutil.rmtree(CACHE)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _release_programs():
+    """Release the compiled programs of a module when it ends: memory does not grow with the number of modules."""
+    yield
+    import jax
+
+    jax.clear_caches()
+    gc.collect()
 
 
 @pytest.fixture

@@ -122,6 +122,7 @@ def _numbers(rows, squares, integrals, samples, settle, stop, lost_at, gone):
         "max_abs_i_A": peak(i),
         "copper_loss_W": total[2] / driven,
         "clearance_used": max(peak(z), stop if gone is not None else 0.0) / stop,
+        "refused": 0,
         "lost": gone is not None,
         "stalled": False,
         "lost_at_s": lost_at,

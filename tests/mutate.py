@@ -55,7 +55,8 @@ def run(root: pathlib.Path, change: Mutation | None, *words: str) -> tuple[int, 
         if change:
             (copy / change.file).write_text(mutated(change, root), encoding="utf-8")
         command = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "", "-p", "no:cacheprovider", *words]
-        env = os.environ | {"PYTHONPATH": folder, "PYTHONDONTWRITEBYTECODE": "1"}
+        env = {"JAX_COMPILATION_CACHE_DIR": str(ROOT / ".pytest_cache" / "programs")} | dict(os.environ)
+        env |= {"PYTHONPATH": folder, "PYTHONDONTWRITEBYTECODE": "1"}
         try:
             done = subprocess.run(
                 command, cwd=copy, env=env, timeout=LIMIT_S, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT

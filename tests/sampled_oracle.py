@@ -16,6 +16,8 @@ Readings of the rules where they leave room, so that another program can follow 
   noise, the converter last. The dead band is taken off the amplifier's voltage; at the current limit the voltage that
   would push |i| on is what keeps it.
 - q_i moves the measured current: i_1' by q_i, i_2' by -q_i.
+- faults come last: `outliers[n]` is added to the converted reading of z, `dropouts[n]` takes its place. The guard is
+  that of docs/processor.md.
 - lost: |z| = touch s_0. The singular curve: the first sample at which dv/di(z, i_ref) <= 0 at what the laws took.
 - a scaled force beyond what any current gives: the current of the one nearest to it.
 """
@@ -65,6 +67,9 @@ class World:
     gain: float = 1.0
     bandwidth: float | None = None  # Hz, of the position sensor
     amplifier: dict = field(default_factory=dict)  # {"bandwidth" Hz, "slew" V/s, "dead_band" V, "i_max" A}
+    guard: dict | None = None  # {"z", "z_dot", "i", "noise", "speed", "samples"}, every number
+    outliers: dict = field(default_factory=dict)  # sample: m
+    dropouts: dict = field(default_factory=dict)  # sample: what is read, m
 
 
 @dataclass(frozen=True)
@@ -90,7 +95,9 @@ def simulate(world, samples, noise=None, fast=False):
     y, rows, lost_at, singular_at = plant.start, np.full((samples, 9), np.nan), math.inf, math.inf
     for n in range(samples):
         output = plant.output(y)
-        *row, singular, seen = controller.step(n, _measurement(world, plant.sensed(y), noise[n].tolist()))
+        z_read, *others = _measurement(world, plant.sensed(y), noise[n].tolist())
+        z_read = world.dropouts.get(n, z_read + world.outliers.get(n, 0.0))
+        *row, singular, seen = controller.sample(n, (z_read, *others))
         rows[n] = *output, *row, *seen
         singular_at = min(singular_at, n * world.period if singular else math.inf)
         y, touched = _sample(world, plant, controller, n, y, fast) if n < samples - 1 else (y, None)
@@ -368,6 +375,35 @@ class Controller:
             self.velocity = Velocity(world, lambda z, i: self.model.rates((z, 0.0, i), 0.0)[1])
         self.i_ref, self.integral, self.twist, self.voltages = world.inversion[1].get("i_ref"), 0.0, 0.0, []
         self.implicit = world.discretisation == "implicit"
+        self.expected, self.left, self.refused, self.i_ref_shown = (0.0, 0.0, 0.0), 0, 0, 0.0
+
+    def sample(self, n, measured):
+        """`step` behind the guard."""
+        guard, T, body = self.world.guard, self.world.period, self.model.body
+        if guard is None:
+            return self.step(n, measured)
+        t, (z, _, i), before = (guard["samples"] - self.left + 1) * T, self.expected, self.left
+        pull = body.a * ((body.i_0 + abs(i)) / (body.s_0 - abs(z))) ** 2
+        near = before == 0 or abs(measured[0] - z) <= guard["noise"] + t * (guard["speed"] + t / 2 * pull)
+        estimated = self.world.observer[0] not in ("direct", "complementary")
+        fine = [
+            near and abs(measured[0]) <= guard["z"],
+            estimated or abs(measured[1]) <= guard["z_dot"],
+            abs(measured[2]) <= guard["i"],
+        ]
+        taken = [x if ok else y for x, y, ok in zip(measured, self.expected, fine, strict=True)]
+        self.left = guard["samples"] if all(fine) else max(before - 1, 0)
+        self.refused += not all(fine)
+        if not all(fine) and before == 0:
+            self.voltages.append(0.0)
+            return self.i_ref_shown, 0.0, math.nan, False, (math.nan,) * 3
+        found = self.step(n, taken)
+        self.i_ref_shown = found[0]
+        velocity, spans = self.velocity_now, _spans(self.world.delay, 1.0)
+        u = sum((b - a) * self.voltage(n - lag) for a, b, lag in spans)
+        _, z_ddot, i_dot = self.model.rates((taken[0], velocity, taken[2]), u)
+        self.expected = taken[0] + T * velocity + T * T / 2 * z_ddot, velocity + T * z_ddot, taken[2] + T * i_dot
+        return found
 
     def voltage(self, n):
         return self.voltages[n] if n >= 0 else 0.0
@@ -375,7 +411,9 @@ class Controller:
     def step(self, n, measured):
         """i_ref before its step, u_n, v_star, whether the curve C is crossed, the (z, z_dot, i) that the laws took."""
         world = self.world
-        seen = self._prediction(n, self._estimate(measured))
+        estimate = self._estimate(measured)
+        self.velocity_now = estimate[1]
+        seen = self._prediction(n, estimate)
         r = _reference(world.reference, (n + (world.delay if world.predict else 0)) * world.period)
         v_star = self._position(seen, r)
         if self.i_ref is None:

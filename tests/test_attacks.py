@@ -282,6 +282,46 @@ def test_what_is_hardly_meant_is_said(case):
         assert part in said[0]
 
 
+def test_numbers_that_stay_the_paper_s_are_named():
+    given = "m = 0.4\ns_0 = 4e-4\ni_0 = 0.5\nn = 200\nk_z = -100.0\nR = 2.0\n"
+    first, *_ = doubts(read_case(write(f"[plant]\n{given}")))
+    assert first == (
+        "[plant] leaves out numbers, which keep the paper's values: mu_0 = 1.25e-06 N/A^2, A = 0.121 m^2. "
+        "Write those that differ."
+    )
+    first, *_ = doubts(read_case(write("[plant]\nkind = 'two-coil'\nA = 0.1\n")))
+    assert "n = 1480, s_0 = 0.005 m," in first
+    # all of them, all but gravity, or none: nothing is left to the paper unsaid
+    for text in (f"[plant]\n{given}mu_0 = 1.257e-6\nA = 4e-4\n", "[plant]\nkind = 'two-coil'\n", ""):
+        assert not any("the paper's values" in line for line in doubts(read_case(write(text))))
+
+
+# For each command: its arguments, and what comes after its case file is read.
+STOPS = {
+    "simulate": ([], "ambjax.commands.simulate._window"),
+    "check": ([], "ambjax.commands.check.check"),
+    "ensemble": (["--members", "2"], "ambjax.commands.ensemble.study_of"),
+    "map": (["--x", "plant.m=-1%:1%", "--y", "plant.R=-1%:1%"], "ambjax.commands.map.study_of"),
+    "export": ([], "ambjax.commands.export.package.files"),
+    "tune": ([], "tuning.command.problem_of"),
+}
+
+
+@pytest.mark.parametrize("command", STOPS)
+def test_every_command_names_what_stays_the_paper_s(command, capsys, monkeypatch):
+    argv, stop = STOPS[command]
+
+    def stopped(*_):
+        raise ValueError("stopped here")
+
+    monkeypatch.setattr(stop, stopped)
+    path = write("[plant]\nm = 0.5\n[clock]\nduration = 0.01\n" + "[processor]\n" * (command == "export"))
+    assert (tune([path]) if command == "tune" else main([command, path, *argv])) == 2
+    (said, *_, last) = capsys.readouterr().err.splitlines()
+    assert said.startswith(f"{path}: [plant] leaves out numbers, which keep the paper's values: ")
+    assert last.endswith("stopped here")
+
+
 @pytest.mark.parametrize("name", ["tracking", "regulation"])
 def test_nothing_in_the_paper_is_doubtful(name):
     sensor = f"\n[sensor]\nstd = {math.sqrt(1e-7)}\n"
@@ -365,7 +405,6 @@ ARGUMENTS = {
     "no name for a folder": (["simulate", "case.toml", "--out", ""], ["--out", "empty"]),
     "a folder of 300 characters": (["simulate", "case.toml", "--out", "x" * 300], ["--out xxx", "too long"]),
     "ensemble without a folder": (["ensemble", "case.toml", "--members", "2", "--out", ""], ["--out", "empty"]),
-    "tune": (["tune", "case.toml"], ["ambjax-tune CASE.toml"]),
     "member of nothing": (["simulate", "case.toml", "--member", "3"], ["--member", "[spread]"]),
     "a million processes": (["ensemble", "case.toml", "--members", "9", "--processes", "1000000"], ["1 to 1024"]),
     "members": (["ensemble", "case.toml", "--members", "9" * 30], ["--members", "2,147,483,648"]),

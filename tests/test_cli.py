@@ -11,7 +11,7 @@ from texts import write
 from ambjax.__main__ import main
 from ambjax.cases.reader import KINDS, SIGNALS, case_from, read_case
 from ambjax.cases.template import template
-from ambjax.commands import simulate
+from ambjax.ensemble import replay
 from ambjax.paper.readings import CLOCK, SETTLE, cascade, scenario
 
 SHORT = "[clock]\nduration = 0.05\n"
@@ -116,7 +116,6 @@ def test_bad_files_and_folders(capsys):
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
-        ([], "COMMAND"),
         (["simulat"], "invalid choice"),
         (["simulate"], "CASE.toml"),
         (["simulate", "case.toml", "--outt", "x"], "--outt"),
@@ -131,6 +130,21 @@ def test_bad_flags(argv, words, capsys):
     err = capsys.readouterr().err
     assert words in err
     assert err.count("\n") == 1
+
+
+def test_without_a_command_the_first_ones_are_listed_in_order(capsys):
+    assert main([]) == 0
+    listed = re.findall(r"^  ambjax (\w+)", capsys.readouterr().out, re.MULTILINE)
+    assert listed == ["template", "simulate", "check", "tune", "export"]
+
+
+def test_the_tuner_is_a_command_of_its_own_package(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["tune", "--help"])
+    assert stop.value.code == 0
+    assert "usage: ambjax tune" in capsys.readouterr().out
+    assert main(["tune", "nowhere.toml"]) == 2
+    assert capsys.readouterr().err.startswith("ambjax tune: nowhere.toml: cannot be read")
 
 
 @pytest.mark.parametrize("name", ["tracking", "regulation"])
@@ -218,7 +232,7 @@ def test_simulate_in_strokes_is_simulate_at_once(monkeypatch, capsys):
     path = write(SHORT + "[sensor]\nstd = 1e-6\n")
     assert main(["simulate", path, "--out", "a", "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
-    monkeypatch.setattr(simulate, "STROKE", 200)
+    monkeypatch.setattr(replay, "STRETCH", 200)
     assert main(["simulate", path, "--out", "b"]) == 0
     with np.load("a/trajectory.npz") as a, np.load("b/trajectory.npz") as b:
         assert all(np.array_equal(a[k], b[k]) for k in a)

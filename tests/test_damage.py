@@ -361,6 +361,19 @@ def test_the_chunk_is_the_directorys_unless_one_is_asked_for(begun, whole):
         store_in(begun, facts=FACTS | {"seed": 5})
 
 
+def test_a_study_that_ended_before_its_first_chunk_is_resumed(tmp_path, whole):
+    """Its directory is marked, and no chunk size recorded: any is accepted, and recorded then."""
+    for chunk in (None, CHUNK):
+        out = tmp_path / str(chunk)
+        store_in(out, resume=False, chunk=None)
+        store = store_in(out, chunk=chunk)
+        assert (store.chunk, store.count()) == (chunk or 0, 0)
+        store.cut(CHUNK)
+        assert store_in(out, chunk=None).chunk == CHUNK
+        compute(store)
+        assert store.finish().read_bytes() == whole
+
+
 # --- the checkpoints of a search ---
 
 TOLD = {"case": {"plant": {"m": 0.5}}, "tune": {"members": 4}}

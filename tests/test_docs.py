@@ -119,7 +119,7 @@ def test_metrics_and_arrays_are_those_of_the_files(tmp_path):
     case.write_text("[clock]\nduration = 0.01\n")
     assert main(["simulate", str(case), "--out", str(tmp_path / "run")]) == 0
     written = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert {row[0].strip("`") for row in metrics.rows()} == set(written)
+    assert {row[0].strip("`") for row in metrics.rows()} == {*written, "trajectory_deviation"}  # the last with --member
     with np.load(tmp_path / "run" / "trajectory.npz") as arrays:
         assert set(metrics.arrays()) == set(arrays.files)
 
@@ -127,7 +127,7 @@ def test_metrics_and_arrays_are_those_of_the_files(tmp_path):
 def test_every_command_has_its_section():
     modules = (ROOT / "ambjax" / "commands").glob("*.py")
     runs = {path.stem for path in modules if "run" in functions(path)}
-    assert set(commands.commands()) == {f"ambjax {name}" for name in runs} | {"ambjax-tune"}
+    assert set(commands.commands()) == {f"ambjax {name}" for name in runs | {"tune"}}
 
 
 def functions(path):

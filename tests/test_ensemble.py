@@ -1,6 +1,7 @@
 """The engine and the store: a member is the same whoever runs beside it; nothing finished is ever lost."""
 
 import dataclasses
+import itertools
 import logging
 import os
 import subprocess
@@ -10,11 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 from scipy import linalg, stats
 
 from ambjax import RK4, AdaptiveRodas3, Cascade, Clock, Initial, Scenario, Sensor, Sine, Standard, inversion, rollout
 from ambjax.control.processor import Processor
 from ambjax.ensemble import Normal, Percent, Spread, map_members, run_ensemble
+from ambjax.ensemble import study as ensemble_study
 from ambjax.ensemble.engine import size
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
@@ -22,6 +25,8 @@ from ambjax.host.sealed import difference
 from ambjax.numerics import kernel
 from ambjax.simulation.loop import ClosedLoop, LoopState
 from ambjax.simulation.metrics import Rms
+from ambjax.simulation.rollout import Outcome
+from ambjax.simulation.trajectory import Row, Trajectory
 
 SMOOTH = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
 NOISY = Scenario(reference=Sine(2.5e-3, 2.0), sensor=Sensor(1e-7, 1e-5, 1e-5), seed=7)
@@ -292,13 +297,53 @@ def test_another_jax_resumes_only_what_it_began(tmp_path, monkeypatch):
 
 def test_the_variation_of_the_voltage_over_parts_of_the_run_adds_up():
     study = Study(SMOOTH, NOISY, SHORT, 0.0, Spread((("plant.m", Percent(10.0)),)), 3, 5)
-    t, trajectory, signals = study.bands(5, 40)
-    rate = signals["variation of u"]
-    assert rate.shape == (5, len(t)) == (5, 40)
+    bands = study.bands(5, 40)
+    rate = bands.signals["variation of u"]
+    assert rate.shape == (5, len(bands.t)) == (5, 40)
     chatter = study.columns(0, 5)["chatter_V"]
     # 25 parts, of one sample or two each, that each have one rate: to be counted once, at the first of their samples
-    starts = np.linspace(0, 40, 26).round().astype(int)
-    total = rate[:, starts[:-1]] @ (1e-4 * np.diff(starts))
+    starts = np.arange(25) * 40 // 25
+    total = rate[:, starts] @ (1e-4 * np.diff(starts, append=40))
     np.testing.assert_allclose(total, chatter, rtol=1e-9)  # sums in another order, in another program
     assert np.all(chatter > 0)
-    assert np.isinf(trajectory.lost_at).all()
+    assert np.isinf(bands.trajectory.lost_at).all()
+
+
+def test_bands_at_few_instants_have_all_that_is_between_them(monkeypatch):
+    """Of runs that are made up, the third of which is lost in the middle of a block."""
+    n, lost_at = 41, np.array([np.inf, np.inf, 16.5e-4])
+    made = np.random.default_rng(0).normal(size=(len(Row._fields), 3, n))
+    t = 1e-4 * np.arange(n)
+    alive = t < lost_at[:, None]
+    whole = Row(*made)._replace(t=np.tile(t, (3, 1)), alive=alive)
+
+    def pretend(cascade, scenario, clock, *, fold, every):
+        rows = jax.tree.map(lambda x: x[:, : clock.samples], whole)
+
+        def one(rows):
+            carry, _ = lax.scan(lambda carry, row: (fold.update(carry, row, None), None), fold.init(), rows)
+            return fold.result(carry, None)
+
+        recorded = Trajectory(jax.tree.map(lambda x: x[:, ::every], rows), lost_at, np.zeros(3), lost_at)
+        return Outcome(recorded, jax.tree.map(np.asarray, jax.vmap(one)(rows)))
+
+    monkeypatch.setattr(ensemble_study, "run_ensemble", pretend)
+    study = Study(SMOOTH, NOISY, dataclasses.replace(SHORT, samples=n), 0.0, Spread(), 3, 3)
+    for samples, until, at in ((n, np.inf, [0, 6, 12, 18, 24, 30, 36, 40]), (18, 16.5e-4, [0, 3, 6, 9, 12, 15, 17])):
+        bands = study.bands(3, 7 if samples == n else 6, until)
+        np.testing.assert_array_equal(bands.t, t[at])
+        edges = [*at[:-1], samples]  # of the blocks
+        for name, of in ensemble_study.SHOWN.items():
+            values = np.where(alive, getattr(whole, of), np.nan)[:, :samples]
+            np.testing.assert_array_equal(bands.signals[name], values[:, at])
+            for k in range(len(at)):
+                beside = values[:, edges[max(k - 1, 0)] : edges[min(k + 1, len(edges) - 1)]]
+                low, high = bands.extremes[name]
+                assert (low[k], high[k]) == (np.nanmin(beside), np.nanmax(beside))
+        steps = np.abs(np.diff(whole.u_mean[:, :samples]))
+        for k, (begin, end) in enumerate(itertools.pairwise(edges)):
+            rate = steps[:2, begin:end].sum(1) / (1e-4 * (end - begin))
+            np.testing.assert_allclose(
+                bands.signals["variation of u"][:2, k], rate, rtol=1e-12
+            )  # sums in another order
+            assert np.isfinite(bands.signals["variation of u"][2, k]) == (1e-4 * end <= lost_at[2])

@@ -105,7 +105,8 @@ def test_states_rates_and_scales_have_one_structure(stage, law):
 
 @TABLE
 def test_states_have_names(stage, law):
-    state = start(stage, law)
+    # those of the processor, which are exported
+    state = start(stage, law) if stage == "observer" else answers.init_sampled(law, MODEL)
     named = answers.memory(law, state)
     assert len(named) == len(jax.tree.leaves(state))
     assert all(name.isidentifier() and unit and meaning for name, unit, meaning in named)
@@ -326,6 +327,20 @@ def test_closed_form_inversion_leaves_no_error():
         close(MODEL.v(z, demand.i_ref), v_star, 1e5)
         # and its rate keeps it so: v_star_dot = dv_dz z_dot + dv_di i_ref_dot
         close(MODEL.dv_dz(z, demand.i_ref) * z_dot + MODEL.dv_di(z, demand.i_ref) * demand.i_ref_dot, v_star_dot, 1e6)
+
+
+def test_closed_form_inversion_on_a_processor_commands_each_step_of_its_root_once():
+    law, T, model = inversion.ClosedForm(), 1e-4, MODEL
+    state, roots, reached = law.init_sampled(model), [], None
+    for z, z_dot, *_, w in samples(20):
+        z, v_star = z / 2, 5e3 * w
+        demand, state = law.step(model, ForceDemand(z, z_dot, v_star, 0.0), state, T)
+        roots.append(float(model.current_for(z, v_star)))
+        # the first sample begins without a jump; the rate leads to the next sample's i_ref
+        assert demand.i_ref == (roots[0] if reached is None else reached)
+        reached = state.i_ref
+        close(demand.i_ref + T * demand.i_ref_dot, roots[-1], 1.0)
+        close(reached, roots[-1], 1.0)
 
 
 @pytest.mark.parametrize("watch", [observer.Direct(), observer.Complementary()], ids=lambda x: type(x).__name__)

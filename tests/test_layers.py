@@ -1,6 +1,7 @@
 """The house: imports only point down, and heavy ones stay where they belong."""
 
 import ast
+import functools
 import graphlib
 import pathlib
 import subprocess
@@ -51,9 +52,16 @@ def targets_of(node, module):
     return [f"{base}.{alias.name}" if f"{base}.{alias.name}" in MODULES else base for alias in node.names]
 
 
+@functools.cache
+def tree_of(module):
+    """Syntax tree of a module."""
+    return ast.parse(MODULES[module].read_text())
+
+
+@functools.cache
 def imports(module, *, top_level=False):
     """Everything that a module imports, wherever in the file; or only what its import executes."""
-    tree = ast.parse(MODULES[module].read_text())
+    tree = tree_of(module)
     nodes = tree.body if top_level else ast.walk(tree)
     found = [node for node in nodes if isinstance(node, (ast.Import, ast.ImportFrom))]
     return {target for node in found for target in targets_of(node, module)}
@@ -95,7 +103,7 @@ def test_ambjax_stands_alone(module):
 def test_tuning_uses_public_names_only(module):
     for target in ours(imports(module)):
         assert not target.startswith("ambjax.numerics"), f"{module} imports {target}: what it needs is in ambjax.extend"
-    for node in ast.walk(ast.parse(MODULES[module].read_text())):
+    for node in ast.walk(tree_of(module)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("ambjax"):
             private = [alias.name for alias in node.names if alias.name.startswith("_")]
             assert private in ([], ["__version__"]), f"{module} imports {private} from {node.module}"
@@ -106,11 +114,10 @@ LAWS = [f"ambjax.control.{stage}" for stage in ("observer", "position", "inversi
 MAKERS = ("ambjax.control.", "ambjax.cases.reader", "ambjax.paper.", "ambjax")
 
 
+@functools.cache
 def own_gains():
-    """Names of the numbers of laws, less those by which anything but the paper's tables calls its own."""
-    classes = {
-        m: [node for node in ast.parse(MODULES[m].read_text()).body if isinstance(node, ast.ClassDef)] for m in MODULES
-    }
+    """Names of the numbers of laws, without those that a module other than the paper's tables defines too."""
+    classes = {m: [node for node in tree_of(m).body if isinstance(node, ast.ClassDef)] for m in MODULES}
 
     def numbers(kind):
         rows = (n for n in kind.body if isinstance(n, ast.AnnAssign) and "ClassVar" not in ast.unparse(n))
@@ -127,7 +134,7 @@ def test_laws_answer_for_themselves(module):
     # no isinstance of a law without its class; and nobody asks for a gain by its name
     assert not imports(module) & set(LAWS), f"{module} knows a law: ask the law (ambjax/control/answers.py)"
     asked = set()
-    for node in ast.walk(ast.parse(MODULES[module].read_text())):
+    for node in ast.walk(tree_of(module)):
         if isinstance(node, ast.Attribute):
             asked.add(node.attr)
         elif isinstance(node, ast.Constant) and len(str(node.value)) > 1:  # a letter may be a unit's prefix

@@ -8,7 +8,9 @@ import pytest
 
 from ambjax import RK4, AdaptiveRodas3, Cascade, Clock, Initial, Plant, Scenario, Sensor, inversion, paper, rollout
 from ambjax.__main__ import main
-from ambjax.ensemble import Normal, Spread, maps
+from ambjax.cases.reader import case_from
+from ambjax.commands import map as commands
+from ambjax.ensemble import Normal, Spread, maps, wilson
 from ambjax.ensemble.maps import PERIOD, Axis, grid, stepped
 from ambjax.ensemble.store import MANIFEST
 from ambjax.ensemble.study import Study
@@ -186,6 +188,39 @@ def test_a_whole_number_may_be_an_axis_of_whole_numbers():
     assert stepped(study, Axis("sensor.bits", np.linspace(2, 14, 13)), mass) == study
     with pytest.raises(ValueError, match=r"sensor.bits must be a whole number"):
         stepped(study, Axis("sensor.bits", np.linspace(2, 14, 12)), mass)
+
+
+def made(survival, members, **changes):
+    """A map of these survivals [ny, nx]."""
+    survival = np.asarray(survival, float)
+    _, low, high = wilson(survival * members, members)
+    y, x = (Axis(path, np.arange(float(n))) for path, n in zip(("initial.z", "plant.m"), survival.shape, strict=True))
+    lost = np.round((1 - survival) * members).astype(int)
+    return maps.Map(x, y, survival, low, high, survival, lost, 0 * lost, members, **changes)
+
+
+@pytest.mark.parametrize("members", [1, 72, 73])
+def test_confidence_is_stated_where_so_many_members_allow_it(members):
+    """Wilson's lower end for n of n is n / (n + 1.96^2): 0.95 from n = 73 on."""
+    case = case_from({}, "one")
+    one = made([[1, 1], [1, 0]], members)
+    assert one.decisive == (members >= 73)
+    said = commands._text([case], [one])
+    assert "75.0 %             75.0 %" in said
+    assert ("cells surely above 95 %" in said) == one.decisive
+    assert ("too few for a confidence statement about a cell; --members 73 or more" in said) != one.decisive
+    assert said.count("75.0 %") == 2 + one.decisive
+    # where all members are alike, many are as good as one
+    alike = one._replace(varied=False)
+    assert "surely" not in commands._text([case], [alike])
+    assert "all runs of a cell are alike" in commands._text([case], [alike])
+    assert commands._summary(case, alike)["decisive"] is False
+
+
+def test_the_stretch_that_survives_is_unbroken():
+    assert made([[1, 0, 1, 1, 1, 0]], 1).reach() == (2.0, 4.0)
+    assert made([[0, 0.9]], 10).reach() is None
+    assert made([[0, 0], [1, 1], [0, 0], [1, 1]], 1).reach() == (0.0, 1.0)  # of the two middle rows, the lower
 
 
 def test_the_command_draws_and_prints_two_cases_side_by_side(tmp_path, capsys):

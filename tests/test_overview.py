@@ -30,9 +30,9 @@ def drawn(monkeypatch):
 def a_run(samples=20_000, period=1e-4, lost_at=np.inf, code=ALIVE, **signals):
     """A run whose errors fall with 1 ms, everything else at rest; `signals` replace some."""
     t = period * np.arange(samples)
-    rows = {name: np.zeros(samples) for name in Row._fields} | {"t": t, "alive": t < lost_at}
-    rows |= {"z": 1e-4 * np.exp(-t / 1e-3), "v_tilde": np.exp(-t / 1e-3)} | signals
-    return Trajectory(Row(**rows), lost_at, code, np.inf)
+    rows = {name: np.zeros(samples) for name in Row._fields if name != "z_measured"}
+    rows |= {"t": t, "alive": t < lost_at, "z": 1e-4 * np.exp(-t / 1e-3), "v_tilde": np.exp(-t / 1e-3)} | signals
+    return Trajectory(Row(**({"z_measured": rows["z"]} | rows)), lost_at, code, np.inf)
 
 
 def columns(figure):
@@ -70,7 +70,7 @@ def test_chatter_is_a_band_with_its_mean_and_its_turns_can_be_followed(tmp_path,
     assert heights.max() == 260.0
     assert heights.min() == u.min()
     (line,) = whole.lines
-    assert len(line.get_xdata()) == PIXELS
+    assert len(line.get_xdata()) == PIXELS + 2  # and both ends
     # 40 samples a column: their mean is the slow part's, and 260 V for -200 V once in a column is 11.5 V
     np.testing.assert_allclose(line.get_ydata(), 10 * np.sin(2 * np.pi * line.get_xdata()), atol=11.6)
     assert not end.collections

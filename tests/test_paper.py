@@ -2,10 +2,12 @@
 
 import dataclasses
 import json
+import pathlib
 import types
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 from ambjax import AdaptiveRodas3, paper, rollout
 from ambjax.__main__ import main
@@ -14,6 +16,8 @@ from ambjax.paper.evidence import NOISE_STDS, STEPS, Evidence, Held, Noise, Run,
 from ambjax.paper.ledger import judge, markdown, noise_table, processor_table
 from ambjax.simulation.trajectory import STALLED, Row, Trajectory
 from ambjax.theorem.conditions import Condition, Report
+
+DOCS = pathlib.Path(__file__).parents[1] / "docs"
 
 
 def noise(survived, radius_at_least=1e-8, stalled=False):
@@ -128,6 +132,10 @@ def test_reproduce(tmp_path, monkeypatch):
         == ours["value"]
         < told["tuned", True]["settled_max_abs_error_m"]
     )
+    # The README shows this picture. A curve that moves by 1 pixel changes a square by 0.06, by 3 pixels by 0.16.
+    new, old = (coarse(imread(path)) for path in (out / "readings.png", DOCS / "readings.png"))
+    assert new.shape == old.shape, "copy readings.png of 'ambjax reproduce' to docs/"
+    assert np.abs(new - old).max() < 0.1, "copy readings.png of 'ambjax reproduce' to docs/"
     page = (out / "ledger.md").read_text()
     assert all(dataclasses.asdict(c)["says"] in page for c in claims.CLAIMS)
 
@@ -141,3 +149,9 @@ def test_the_step_of_the_tuned_reading_is_fine_enough():
     rows, exact = (np.asarray(run.trajectory.rows.z) for run in runs)
     # a thousandth of the largest error that the ledger reports of this reading
     np.testing.assert_allclose(rows, exact, rtol=0, atol=4e-9)
+
+
+def coarse(image):
+    """Means of a picture [rows, columns, colours], of 0 to 1, over squares of 10 pixels."""
+    rows, columns = (size // 10 for size in image.shape[:2])
+    return image[: 10 * rows, : 10 * columns, :3].reshape(rows, 10, columns, 10, 3).mean((1, 3))

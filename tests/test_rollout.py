@@ -128,8 +128,8 @@ def test_rows_are_samples_at_whole_multiples_of_the_period(short):
     assert isinstance(rows, Row)
     assert all(np.shape(x) == (203,) for x in rows)
     np.testing.assert_array_equal(rows.t, np.arange(203) * 1e-4)
-    assert rows.alive.dtype == bool
-    assert all(x.dtype == np.float64 for x in rows._replace(alive=rows.t))
+    assert rows.alive.dtype == rows.refused.dtype == bool
+    assert all(x.dtype == np.float64 for x in rows._replace(alive=rows.t, refused=rows.t))
 
 
 def test_a_long_clock_does_not_drift(tracking):
@@ -218,6 +218,7 @@ def by_numpy(rows, spans, lost_at):
             "max_abs_i_A": peak("i")[0],
             "copper_loss_W": mean(seen.densities.heat),
             "clearance_used": peak("z")[0] / 4.5e-3,
+            "refused": np.sum(rows.refused),
             "lost": np.isfinite(lost_at),
             "stalled": False,
             "lost_at_s": lost_at,

@@ -178,6 +178,19 @@ def test_the_interval_of_a_heavy_tail_s_cvar_covers():
     assert np.mean(hits) > 0.94 - 0.036
 
 
+@pytest.mark.parametrize("n", [50, 200])
+def test_no_cvar_ends_above_the_largest_value(n):
+    """And still covers: a share of 400 samples is known to 1.1 %, three of which. Of 50 values the end is open."""
+    samples = np.random.default_rng(n).normal(size=(400, n))
+    found, largest = bootstrap(list(samples), 0.95, 0.95, 1)["cvar"], samples.max(axis=1)
+    assert np.all((found.high <= largest) | np.isinf(found.high))
+    assert np.any(np.isinf(found.high)) == (n < 200)
+    truth = stats.norm.pdf(stats.norm.ppf(0.95)) / 0.05
+    assert np.mean((found.low <= truth) & (truth <= found.high)) > 0.95 - 0.033
+    # the end would not be true otherwise: the CVaR of 37 % of such samples of 50 lies above their largest value
+    assert abs(np.mean(truth > largest) - stats.norm.cdf(truth) ** n) < 0.075
+
+
 def test_a_tail_that_is_one_value_is_known():
     # a tenth of the members at the clearance: so are the worst 5 % of nearly every resample
     found = bootstrap([np.where(np.arange(500) < 50, 4.5e-3, 1e-6 * RNG.random(500))])["cvar"]
@@ -188,10 +201,11 @@ def test_the_interval_has_no_end_where_resamples_say_nothing():
     for moments in bootstrap([np.array([1.0, 2.0, 4.0])]).values():
         assert np.all(moments.low <= moments.value)
         assert moments.high[0] == np.inf  # one resample in nine is one value thrice
-    assert summary({k: x[:199] for k, x in columns().items()}, [], seed=0)["notes"] == [
-        "the mean of the worst 5 % rests on 9.95 members: its 95 % interval may cover less; take 200 members"
+    assert summary(columns(201), [], seed=0)["notes"] == [  # two of whom do not survive
+        "the mean of the worst 5 % rests on 9.95 survivors: its 95 % interval may cover less, or have no upper end; "
+        "it needs 200"
     ]
-    assert summary(columns(), [], seed=0)["notes"] == []
+    assert summary(columns(202), [], seed=0)["notes"] == []
 
 
 def test_what_the_interval_of_a_heavy_tail_s_std_is_worth_is_said():
@@ -291,7 +305,8 @@ def test_summary_says_what_it_promises():
     share, low, high = wilson(198, 200)
     assert found["survival"] == {"estimate": share, "low": low, "high": high}
     assert set(found["metrics"]) == {"settled_max_abs_error_m", "sigma_reached_s"}
-    error, x = found["metrics"]["settled_max_abs_error_m"], data["settled_max_abs_error_m"]
+    held = np.isinf(data["lost_at"])
+    error, x = found["metrics"]["settled_max_abs_error_m"], data["settled_max_abs_error_m"][held]
     np.testing.assert_allclose(error["mean"]["estimate"], x.mean(), rtol=1e-12)
     np.testing.assert_allclose(error["std"]["estimate"], x.std(ddof=1), rtol=1e-12)
     assert error["median"]["estimate"] == np.quantile(x, 0.5, method="inverted_cdf")
@@ -303,7 +318,7 @@ def test_summary_says_what_it_promises():
 
 def test_summary_of_a_time_that_some_never_reach():
     found = summary(columns(), ["plant.m"], seed=0)["metrics"]["sigma_reached_s"]
-    assert found["finite"] == 195
+    assert found["finite"] == 194  # of 198 survivors, 4 never reach it
     assert found["max"] is None
     assert set(found["mean"].values()) == set(found["cvar_95"].values()) == {None}
     assert found["median"] == {"estimate": 0.1, "low": 0.1, "high": 0.1}
@@ -320,12 +335,48 @@ def test_summary_names_the_drivers_and_the_worst():
     assert first["p"] < 1e-6 < second["p"]
     assert found["explained"]["settled_max_abs_error_m"]["alone"] > 0.9
     assert set(found["drivers"]) == {"settled_max_abs_error_m", "sigma_reached_s", "lost_at_s"}
+    alone = np.isinf(data["lost_at"])
+    rank = stats.spearmanr(data["spread.plant.m"][alone], data["settled_max_abs_error_m"][alone])
+    assert first["rho"] == pytest.approx(rank.statistic, rel=1e-12)
     by_error = 100 + np.argsort(-data["settled_max_abs_error_m"])
     rest = [k for k in by_error if k not in (103, 107)]
     assert [member["index"] for member in found["worst"]] == [103, 107, *rest[:2]]
     assert [member["lost_at_s"] for member in found["worst"]] == [0.1, 0.2, None, None]
     assert [member["fate"] for member in found["worst"]] == ["lost", "stalled", "survives", "survives"]
     assert found["worst"][2]["settled_max_abs_error_m"] == data["settled_max_abs_error_m"].max()
+
+
+def test_lost_members_count_in_no_metric():
+    """A lost rotor's voltage is 0 from then on: the mean over all members would be lower than that of any survivor."""
+    data = columns()
+    ended = np.isfinite(data["lost_at"])
+    data["settled_rms_u_V"] = np.where(ended, 0.0, 60.0 + data["spread.plant.m"])
+    found = summary(data, ["plant.m"], seed=3)
+    assert found["metrics_of"] == "survivors"
+    voltage = found["metrics"]["settled_rms_u_V"]
+    alone = data["settled_rms_u_V"][~ended]
+    assert voltage["mean"]["estimate"] == pytest.approx(alone.mean(), rel=1e-12)
+    assert voltage["q05"]["estimate"] == np.quantile(alone, 0.05, method="inverted_cdf")
+    assert (voltage["max"], voltage["finite"]) == (alone.max(), 198)
+    # as if the lost ones had not been simulated
+    less = summary({name: x[~ended] for name, x in data.items()}, ["plant.m"], seed=3)
+    assert less["metrics"] == found["metrics"]
+    assert {k: v for k, v in less["drivers"].items() if k != "lost_at_s"} == {
+        k: v for k, v in found["drivers"].items() if k != "lost_at_s"
+    }
+
+
+def test_nobody_survives_and_nothing_is_said_of_metrics():
+    data = columns() | {"lost_at": np.full(200, 0.1)}
+    found = summary(data, ["plant.m"], seed=0)
+    assert json.dumps(found, allow_nan=False)
+    assert found["survivors"] == 0
+    for metric in found["metrics"].values():
+        assert metric.pop("finite") == 0
+        assert metric.pop("max") is None
+        assert {x for estimate in metric.values() for x in estimate.values()} == {None}
+    assert found["explained"]["settled_max_abs_error_m"]["says"] == "no member survives"
+    assert found["notes"] == ["no member survives: there are no statistics of the metrics"]
 
 
 def test_summary_without_spreads_or_with_one_member():

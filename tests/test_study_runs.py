@@ -222,6 +222,21 @@ def test_killed_at_any_instant_and_resumed_it_is_the_same_file(no_pictures):
     assert early >= 5, "the runs were over before they could be killed"
 
 
+def test_a_study_killed_before_its_first_chunk_is_resumed(no_pictures, monkeypatch):
+    write(TINY)
+    argv = ["ensemble", "case.toml", "--members", "5", "--seed", "3", "--out", "out"]
+
+    def killed(study):
+        raise SystemExit(137)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(studies, "pilot", killed)
+        with pytest.raises(SystemExit):
+            main(argv)
+    assert main([*argv, "--resume"]) == 0
+    assert done("out")
+
+
 def done(out):
     return pathlib.Path(out, "members.npz").exists()
 
@@ -237,20 +252,6 @@ def test_a_finished_study_is_not_run_again(no_pictures, monkeypatch, capsys):
     assert json.loads(capsys.readouterr().out) == json.loads(first)
     assert result("out") == members
     assert not pathlib.Path("out", "chunks").exists()
-
-
-def test_a_member_alone_is_that_row_of_the_study(no_pictures, capsys):
-    write(TINY)
-    assert main(["ensemble", "case.toml", "--members", "40", "--seed", "8", "--out", "out", "--json"]) == 0
-    worst = json.loads(capsys.readouterr().out)["worst"][0]
-    command, *argv = worst["replay"].split()
-    assert command == "ambjax"
-    assert main([*argv, "--json", "--out", "alone"]) == 0
-    alone = json.loads(capsys.readouterr().out)
-    with np.load("out/members.npz") as study:
-        for name in ("max_abs_error_m", "settled_rms_error_m", "rms_u_V"):
-            # the same operations, fused otherwise for one member than for many
-            assert alone[name] == pytest.approx(study[name][worst["index"]], rel=1e-12)
 
 
 # --- damage ---

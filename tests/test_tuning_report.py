@@ -22,7 +22,7 @@ from tuning.config import seeds
 from tuning.judge import judge
 from tuning.objective.engine import Engine
 from tuning.objective.loss import TERMS, weigh
-from tuning.report import accurate, breakdown, extras, pictures
+from tuning.report import accurate, breakdown, extras, gradient, pictures
 from tuning.report import document as report
 from tuning.report.page import literal, page
 from tuning.search.explore import REACH, Slices, slices
@@ -374,9 +374,31 @@ def test_the_formula_names_every_term_once():
 
 def test_the_section_on_gradients_is_three_whole_tables():
     three = {"samples": 5, **{way: [1.0, 2.0] for way in ("forward", "reverse", "differences")}}
+    three["verdicts"] = [gradient.AGREED, "differences decide nothing: 1 with a step of 0.001, -1 with 0.0005"]
     noise = {name: [1.0, 2.0] for name in ("gradient", "standard_error", "ratio")}
     horizons = [{"horizon_s": 0.1, "norm": 2.0, "lost": 0.0}]
     facts = {"gains": ["c", "k"], "three_ways": three, "noise": noise, "horizons": horizons}
     shown = page("\n".join(extras.gradient(facts)), {}, "t")
     assert shown.count("<table>") == 3
-    assert shown.count("<td") == 2 * 4 + 3 + 2 * 4
+    assert shown.count("<td") == 2 * 5 + 3 + 2 * 4
+    assert "The three agree on 1 of 2 gains" in shown
+    assert "Differences compare two runs" in shown
+    three["verdicts"] = [gradient.AGREED] * 2
+    assert "Differences compare two runs" not in "".join(extras.gradient(facts))
+
+
+# Derivatives by forward and reverse mode and by differences with two steps, and what is said of them.
+WAYS = {
+    "agree": (1.0, 1.0 + 1e-9, 1.04, 1.01, gradient.AGREED),
+    "a loop that is chaotic": (2.83e-2, 2.83e-2, -2.31e-2, 0.4e-2, "differences decide nothing: -2.31e-02 with a step"),
+    "jumps": (-9.0, -9.0, -9.5, -9.5, "differences differ from both modes by 5.3 %, whatever their step"),
+    "modes apart": (1.0, 1.1, 1.0, 1.0, "forward and reverse mode differ by 9.1 %"),
+    "all as good as 0": (1e-12, -3e-12, 2e-11, -4e-11, gradient.AGREED),
+    "no number": (math.nan, 1.0, 1.0, 1.0, "no finite number"),
+}
+
+
+@pytest.mark.parametrize("kind", WAYS)
+def test_three_ways_to_a_derivative_are_judged(kind):
+    *ways, words = WAYS[kind]
+    assert gradient.verdict(*ways, floor=1e-7).startswith(words)

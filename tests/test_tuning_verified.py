@@ -146,7 +146,7 @@ def searched(engine, goal, who, points, **rest):
     """In place of a search: the first point is the answer, the others lie on the way to it."""
     count = min(len(points), 8)
     x, value = np.array(points[:count]), np.arange(float(count)) / 100
-    starts = Starts(x, Retreat(x, value, None), value)
+    starts = Starts(x, Retreat(x, value, None), value, value)
     rows = {"x": [x], "value": [value], "lost": [np.zeros(count)], "members": [np.array(len(who.member))]}
     return Progress(starts, np.zeros(count, bool), rows, iteration=1)
 

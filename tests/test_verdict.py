@@ -12,8 +12,8 @@ from ambjax.cases.reader import read_case
 from ambjax.cases.template import template
 from ambjax.commands import check as checking
 from ambjax.commands import simulate
-from ambjax.simulation.trajectory import STALLED
-from ambjax.theorem import verdict
+from ambjax.simulation.trajectory import STALLED, TOUCHED
+from ambjax.theorem import processor, verdict
 from ambjax.theorem.conditions import Condition, Report, check
 
 SHORT = "[reference]\nkind = 'sine'\namplitude = 2.5e-3\nfrequency = 2.0\n[clock]\nduration = 0.05\n"
@@ -55,7 +55,7 @@ def test_following_the_advice_ends_in_a_held_rotor_and_conditions_that_hold(caps
         assert (where, name, more) == ("controller.inversion", "gamma", [])
         gamma = float(value)
         wanted.append(gamma)
-        assert "'ambjax-tune case.toml'" in answer
+        assert "`ambjax tune case.toml`" in answer
     # a tenth above Delta_1 of this reference, 6.23e4, rounded up to two digits
     assert wanted == [6.9e4]
     assert "Yes, all 5" in answer
@@ -133,23 +133,39 @@ def test_simulate_says_where_to_look(capsys):
     lost = write(SHORT + "[controller.inversion]\ngamma = 1000.0\n")
     assert main(["simulate", lost]) == 1
     said = capsys.readouterr().err
-    assert "'ambjax check case.toml' says which gain" in said
-    assert "'ambjax-tune case.toml'" in said
+    assert "`ambjax check case.toml` compares the gains" in said
+    assert "`ambjax tune case.toml`" in said
 
 
-def test_simulate_of_a_stalled_run_does_not_say_lost(capsys, monkeypatch):
+# Of each fate: when a run ended, whether for the integrator, and what each command must say and return.
+FATES = {"held": (math.inf, False), "lost": (0.01, False), "not decided": (0.01, True)}
+WORDS = {"held": "The rotor is held.", "lost": "The rotor is lost at 0.01 s", "not decided": "held is not decided"}
+
+
+@pytest.mark.parametrize("kind", FATES)
+def test_every_command_says_the_same_of_a_rotor(kind, capsys, monkeypatch):
+    lost_at, stalled = FATES[kind]
+    others = [words for other, words in WORDS.items() if other != kind]
+    report = Report([condition(2.0, 1.0)], [], lost_at, "touched down", "", stalled)
+    sampled = processor.Sampled([], [], lost_at, "touched down", stalled)
+    assert report.holds == sampled.holds == (kind == "held")
+    told = {"check": "\n".join(verdict.answer(report, "case.toml"))}
+    told["on a processor"] = "\n".join(verdict.on_processor(sampled, processor.Delays(None, None, None, 0.1), None))
     genuine = simulate.simulate
 
-    def stalled(case):
+    def ended(case):
         trajectory, measured = genuine(case)
-        trajectory = dataclasses.replace(trajectory, lost_at=0.01, lost_code=STALLED)
-        return trajectory, {**measured, "lost": False, "stalled": True, "lost_at_s": 0.01}
+        code = STALLED if stalled else TOUCHED if kind == "lost" else 0
+        trajectory = dataclasses.replace(trajectory, lost_at=lost_at, lost_code=code)
+        return trajectory, {**measured, "lost": kind == "lost", "stalled": stalled, "lost_at_s": lost_at}
 
-    monkeypatch.setattr(simulate, "simulate", stalled)
-    assert main(["simulate", write(SHORT)]) == 1
-    said = capsys.readouterr().err
-    assert "not decided" in said
-    assert "is lost" not in said
+    monkeypatch.setattr(simulate, "simulate", ended)
+    assert main(["simulate", write(SHORT.replace("0.05", "0.002")), "--out", "out"]) == int(kind != "held")
+    if kind != "held":  # whose metrics are the answer
+        told["simulate"] = capsys.readouterr().err
+    for place, words in told.items():
+        assert words.count(WORDS[kind]) == 1, place
+        assert not [other for other in others if other in words], place
 
 
 def test_the_fall_is_the_last_tenth():

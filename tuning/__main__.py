@@ -1,4 +1,4 @@
-"""The command line of the tuner: `ambjax-tune`, or `python -m tuning`."""
+"""The command line of the tuner: `ambjax tune`, `ambjax-tune` or `python -m tuning`."""
 
 import argparse
 import sys
@@ -9,11 +9,13 @@ from ambjax.__main__ import Parser, answer
 from ambjax.host.interrupts import listening
 from ambjax.host.streams import open_streams
 
+PROGRAM = "ambjax-tune"
 
-def parser() -> argparse.ArgumentParser:
-    """All arguments."""
+
+def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
+    """All arguments, under the name by which the tuner was called."""
     top = Parser(
-        prog="ambjax-tune",
+        prog=program,
         description="Tune the gains of a case by gradients of an ensemble's loss: tuned.toml, history.npz, report.",
     )
     top.add_argument("case", metavar="CASE.toml", help="a case file; its table [tune] says what to tune, all optional")
@@ -26,15 +28,15 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str] | None = None, program: str = PROGRAM) -> int:
     """Tune. Returns 0 if the tuned gains hold the share of held-out rotors and the limits that [tune.limits] asks for,
     and accurate steps confirm it; 1 if not, 2 for bad input.
 
     Ctrl-C during the search ends it and what it found is judged; otherwise, or again, it ends the process with 130.
     """
     open_streams()
-    with listening("ambjax-tune"):
-        return answer(parser(), argv, _run)
+    with listening(program):
+        return answer(parser(program), argv, _run)
 
 
 def _run(args: argparse.Namespace) -> tuple[int, Any]:

@@ -19,7 +19,7 @@ from ambjax.host.lock import alone
 from ambjax.theorem.conditions import check
 from ambjax.theorem.verdict import advice as on_conditions
 from tuning.config import read_tune, seeds, settings
-from tuning.judge import StepError, judge, step_error, summarise, worst_of
+from tuning.judge import StepError, held, judge, step_error, summarise, worst, worst_of
 from tuning.judge import words as step_words
 from tuning.problem import Problem, problem_of
 from tuning.report import accurate, breakdown, gradient, limits, pictures, verdict
@@ -28,13 +28,11 @@ from tuning.report.page import page
 from tuning.report.tuned import tuned as tuned_text
 from tuning.search import explore
 from tuning.search.course import Answer
-from tuning.search.keeper import checkpoint, remove_all, unfinished
+from tuning.search.keeper import begin, begun, checkpoint, remove_all, unfinished
 from tuning.search.rounds import rounds
 from tuning.space import Gain, Space, tunable
 
 WRITTEN = ("tuned.toml", "history.npz", "report.html", "report.md", "report.json")
-# What stands for a survival that accurate steps do not confirm.
-NOT_VERIFIED = "not verified"
 # Written last of all, when a search has its answer.
 REPORT = "report.json"
 
@@ -42,8 +40,8 @@ REPORT = "report.json"
 def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """ambjax-tune. Raises ValueError for bad input, before anything is written."""
     case, tune, raw = read_tune(args.case)
-    if args.resume and not (args.out and (pathlib.Path(args.out) / checkpoint(1)).exists()):
-        raise ValueError(f"--resume: there is no {checkpoint(1)} in --out {args.out}. Leave out --resume to begin.")
+    if args.resume and not (args.out and begun(pathlib.Path(args.out))):
+        raise ValueError(f"--resume: there is no search in --out {args.out}. Check --out, or leave out --resume.")
     say_doubts(case, args.case)
     try:
         problem = problem_of(case, tune)
@@ -56,6 +54,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     with alone(out):
         if not args.resume:
             _clear(out)
+        begin(out)
         with keeping(lambda: _kept(out)):
             return _tune(args, raw, problem, start, out)
 
@@ -106,8 +105,7 @@ def _tune(
     if not args.json:
         print(_short(facts))
         written(out, f"{', '.join(WRITTEN)}, *.png")
-    held = all(row["held"] for row in facts["limits"]) if facts["after"]["members"] else not facts["lost_in_training"]
-    good = held and facts["verified"]
+    good = facts["outcome"]["good"]
     if not good:
         say(facts["advice"])
     return int(not good), summary
@@ -126,10 +124,10 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
     judged = [judge(problem, at, held_out, count) for at in (_at(problem, before), x)] if count else []
     summaries = [summarise(one) for one in judged] or [none, none]
     loss = dict(zip(("before", "after"), (breakdown.table(problem.goal, one) for one in judged), strict=False))
-    worst, again, refuted = _checked(answer, judged[1] if judged else None, held_out)
-    limited = limits.facts(problem.goal.limits, tune.limits, judged[1] if judged else {}, summaries[1])
+    unlucky, again, refuted = _checked(answer, judged[1] if judged else None, held_out)
+    limited = limits.facts(problem.goal.limits, tune.limits, judged[1] if judged else {}, summaries[1], refuted)
     if refuted and judged:
-        summaries[1] |= dict.fromkeys(("survival", "survival_low", "survival_high"), NOT_VERIFIED)
+        summaries[1] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limits.UNVERIFIED)
     lost = int((problem.engine.terms(x[None], who)["survival"] > 0).sum())
     line = check(tuned.cascade, case.scenario, dataclasses.replace(case.clock, method=None))
     facts: dict[str, Any] = {
@@ -138,6 +136,7 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
         "before": summaries[0],
         "after": summaries[1],
         "held_out_seed": held_out,
+        "trained_on": len(who.member),
         "lost_in_training": lost,
         "limits": limited,
         "loss": loss,
@@ -145,10 +144,13 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
         "conditions": report.conditions(line),
         "advice_on_conditions": on_conditions(line),
         "step_error": answer.error.facts() if answer.error else None,
-        "worst_step_error": worst.facts() if worst else None,
+        "worst_step_error": unlucky.facts() if unlucky else None,
+        "worst_member": worst(problem, judged[1], held_out) if judged else None,
         "accurate_steps": problem.accurate,
+        "nominal_steps": "in the steps of `ambjax simulate`" if problem.replays else "by accurate steps",
+        "refuted": refuted,
         "verified": not refuted,
-        "verified_reason": refuted or _confirmed(worst, answer.error),
+        "verified_reason": refuted or _confirmed(unlucky, answer.error),
         "lost_in_validation": answer.lost,
         "search": settings(tune)
         | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
@@ -159,8 +161,10 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
         row | dataclasses.asdict(where)
         for row, where in zip(report.gains_table(space, before, after, None), problem.ranges, strict=True)
     ]
-    facts["verdict"] = verdict.verdict(facts)
-    facts["advice"] = verdict.advice(problem, facts, x, who)
+    outcome = verdict.outcome_of(facts, tune.limits.may_lose(count))
+    facts["outcome"] = outcome.facts()
+    facts["verdict"] = verdict.verdict(facts, outcome)
+    facts["advice"] = verdict.advice(problem, facts, outcome, x, who)
     return facts
 
 
@@ -169,14 +173,14 @@ def _checked(
 ) -> tuple[StepError | None, dict[str, Any] | None, str]:
     """What accurate steps say of the worst held-out members and of the first, `judged` [N]; and why they do not
     confirm the answer: '' where they do."""
-    problem, again, worst = answer.problem, None, None
+    problem, again, error = answer.problem, None, None
     if judged and not problem.sampled:
-        worst = _worst_checked(answer, judged, held_out) if answer.confirmed else None
+        error = _worst_checked(answer, judged, held_out) if answer.confirmed else None
         count = problem.tune.budget.held_out
         say(f"{min(accurate.AGAIN, count)} of them again by accurate steps ...")
         again = accurate.compared(problem, answer.x, held_out, count, report.SHOWN)
-    refuted = (worst or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
-    return worst, again, refuted or (again["refuted"] if again else "")
+    refuted = (error or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
+    return error, again, refuted or (again["refuted"] if again else "")
 
 
 def _confirmed(*errors: StepError | None) -> str:
@@ -185,12 +189,12 @@ def _confirmed(*errors: StepError | None) -> str:
 
 def _worst_checked(answer: Answer, judged: dict[str, np.ndarray], held_out: int) -> StepError | None:
     """What accurate steps say of the worst held-out members that are held; None where none is."""
-    held = np.flatnonzero(~np.isfinite(judged["lost_at_s"]))
-    if not held.size:
+    those = np.flatnonzero(held(judged))
+    if not those.size:
         return None
-    worst = held[worst_of(judged["settled_max_abs_error_m"][held])]
+    those = those[worst_of(judged["settled_max_abs_error_m"][those])]
     error = step_error(
-        answer.problem, answer.x, answer.problem.objective.chosen(held_out, worst, len(judged["lost_at_s"]))
+        answer.problem, answer.x, answer.problem.objective.chosen(held_out, those, len(judged["lost_at_s"]))
     )
     say(f"accurate steps on the worst of them: {step_words(error)}")
     return error
@@ -202,8 +206,8 @@ def _at(problem: Problem, gains: np.ndarray) -> np.ndarray:
 
 def _write(out: pathlib.Path, problem: Problem, history: Any, facts: dict[str, Any], slices: explore.Slices) -> None:
     space = problem.objective.space
-    for row, grows in zip(facts["gains"], slices.sensitivity(), strict=True):
-        row["sensitivity_percent"] = float(grows)
+    for row, grows, lost in zip(facts["gains"], slices.sensitivity(), slices.more_lost(), strict=True):
+        row |= {"sensitivity_percent": None if lost else float(grows), "sensitivity_lost": int(lost)}
     j, k, drop = slices.lowest()
     facts["beside"] = {"path": space.paths[j], "gain": slices.gains[j, k], "lower": -np.expm1(-drop)}
     facts["slices"] = {"gains": slices.gains, "log_risk": slices.goals, "lost": slices.lost}
@@ -244,5 +248,8 @@ def _laws(problem: Problem, tuned: dict[str, float]) -> dict[str, float]:
 
 def _short(facts: dict[str, Any]) -> str:
     lines = [facts["verdict"]]
-    lines += [f"  {row['path']}: {row['before']:.6g} -> {row['after']:.6g} {row['at_bound']}" for row in facts["gains"]]
+    lines += [
+        f"  {row['path']}: {row['before']:.6g} -> {row['after']:.6g}" + f" ({row['at_bound']})" * bool(row["at_bound"])
+        for row in facts["gains"]
+    ]
     return "\n".join(lines)

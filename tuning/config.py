@@ -188,7 +188,7 @@ def _limits(table: Table, case: Case) -> Limits:
     asked = {name: table.leaf(name, SHARES.get(name, LIMIT)) for name in KINDS if name in table.raw}
     u_max, source = float(np.max(np.asarray(case.scenario.u_max))), dict.fromkeys(asked, table.path)
     if "rms_u_V" not in asked and math.isfinite(u_max):
-        asked["rms_u_V"], source["rms_u_V"] = SHARE * u_max, f"by default, {100 * SHARE:g} % of actuator.u_max"
+        asked["rms_u_V"], source["rms_u_V"] = SHARE * u_max, f"default, {100 * SHARE:g} % of actuator.u_max"
     clearance = float(np.min(np.asarray(case.scenario.touchdown)))
     band = table.leaf("settling_band_m", LENGTH, BAND * clearance)
     if "settling_band_m" in table.raw and "settling_s" not in asked:

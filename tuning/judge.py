@@ -1,12 +1,14 @@
 """What gains are worth: an ensemble that judges them, and accurate steps against the search's own."""
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from ambjax.ensemble import wilson
+from ambjax.ensemble.study import Study
 from tuning.config import seeds
 from tuning.objective.engine import Engine
 from tuning.objective.members import Members
@@ -28,6 +30,24 @@ def judge(problem: Problem, x: np.ndarray, seed: int, count: int) -> dict[str, n
         metrics = problem.judging.metrics(x[None], who)
         parts.append({**metrics["metrics"], **{f"loss.{name}": v for name, v in metrics["loss"].items()}})
     return {name: np.concatenate([part[name][0] for part in parts]) for name in parts[0]}
+
+
+def worst(problem: Problem, judged: dict[str, np.ndarray], seed: int) -> dict[str, Any]:
+    """The member of the ensemble `judged` [N] that fares worst: the first lost, else that of the largest settled error.
+
+    `replay` is the command that simulates it by itself, beside the report, and gives these numbers; None where the
+    judge's steps are not those of `ambjax simulate`.
+    """
+    error, lost_at = judged["settled_max_abs_error_m"], judged["lost_at_s"]
+    index = int(np.lexsort((-error, lost_at))[0])
+    case = problem.case
+    study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, len(error))
+    return {
+        "member": index,
+        "settled_max_abs_error_m": float(error[index]),
+        "lost_at_s": float(lost_at[index]),
+        "replay": study.command("tuned.toml", index) if problem.replays else None,
+    }
 
 
 def rms(values: np.ndarray) -> float:
@@ -132,31 +152,44 @@ def difference(problem: Problem, ours: dict[str, np.ndarray], theirs: dict[str, 
     return StepError(search_m, reference_m, relative, both, len(held), lost, int(stalled.sum()), those, negligible)
 
 
-def summarise(metrics: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Numbers of an ensemble [N] for the report: pooled rms and largest error, survival, mean and largest metrics.
+def held(metrics: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Which members [N] run to the end: neither lost nor stalled."""
+    return ~np.isfinite(metrics["lost_at_s"])
 
-    A member whose integration stalled is not `lost`, for nobody knows; but it is not `held` either, nor survives.
+
+def summarise(metrics: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Numbers of an ensemble [N] for the report: fates, survival, and pooled, mean and largest metrics.
+
+    A member whose integration stalled is not `lost`, for its fate is not known; but it is not `held` either, and does
+    not survive. Metrics are of the members that are held: a rotor that is lost is frozen, and from then on its voltage
+    and current are 0. Without such members there are none.
     """
-    errors = metrics["settled_rms_error_m"]
-    n, held = len(errors), int((~np.isfinite(metrics["lost_at_s"])).sum())
-    survival = wilson(held, n)
+    alive, n = held(metrics), len(metrics["lost_at_s"])
+    survival = wilson(int(alive.sum()), n)
+    ended = metrics["lost_at_s"][~alive]
     summary: dict[str, Any] = {
         "members": n,
-        "held": held,
+        "held": int(alive.sum()),
         "lost": int(metrics["lost"].sum()),
         "stalled": int(metrics["stalled"].sum()),
         "survival": float(survival.value),
         "survival_low": float(survival.low),
         "survival_high": float(survival.high),
+    }
+    if ended.size:
+        summary |= {"lost_at_s.mean": float(ended.mean()), "lost_at_s.largest": float(ended.max())}
+    if not alive.any():
+        return summary
+    errors = metrics["settled_rms_error_m"][alive]
+    summary |= {
         "settled_rms_error_m": rms(errors),
         "settled_rms_error_worst_member_m": float(errors.max()),
-        "settled_max_abs_error_m": float(metrics["settled_max_abs_error_m"].max()),
+        "settled_max_abs_error_m": float(metrics["settled_max_abs_error_m"][alive].max()),
     }
     for name, values in metrics.items():
-        if values.dtype == bool:
+        if values.dtype == bool or name == "lost_at_s":
             continue
-        finite = values[np.isfinite(values)]
+        finite = values[alive & np.isfinite(values)]
         if finite.size:
-            summary[f"{name}.mean"] = float(finite.mean())
-            summary[f"{name}.largest"] = float(finite.max())
+            summary |= {f"{name}.mean": float(finite.mean()), f"{name}.largest": float(finite.max())}
     return summary

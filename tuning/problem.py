@@ -6,7 +6,6 @@ from typing import Any
 
 from ambjax.cases.reader import Case
 from ambjax.simulation import integrate
-from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import choose_method
 from ambjax.simulation.sliding import slides
 from tuning.config import Tune
@@ -54,8 +53,21 @@ class Problem:
 
     @functools.cached_property
     def judging(self) -> Engine:
-        """The same objective in steps FINE times as fine: what a report prints. On a processor the search's own."""
-        return self.engine if self.sampled else self._stepping(self._fine, threads=self.engine.threads)
+        """The same objective in steps FINE times as fine: what a report prints. On a processor in the case's own."""
+        if not self.sampled:
+            return self._stepping(self._fine, threads=self.engine.threads)
+        method = self.case.clock.integrator
+        if not self.replays or method == self.engine.objective.clock.method:
+            return self.engine
+        return self._stepping(method, threads=self.engine.threads)
+
+    @property
+    def replays(self) -> bool:
+        """Whether the judge takes the steps of `ambjax ensemble` and `ambjax simulate`, so that these give its numbers.
+
+        They are the case's own: on a processor, unless the search found them too coarse.
+        """
+        return self.sampled and self.finer == 1
 
     @property
     def _fine(self) -> integrate.Integrator:
@@ -103,7 +115,7 @@ def method_for(case: Case, substeps: int, finer: int) -> integrate.Integrator:
 
 def problem_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = None) -> Problem:
     """The problem of a case, in steps `finer` times as fine as [tune] asks for."""
-    clock = Clock(case.clock.samples, case.clock.sample_period, method_for(case, tune.budget.substeps, finer))
+    clock = case.clock.with_method(method_for(case, tune.budget.substeps, finer))
     limits = tune.limits
     measured = measures(limits.each, case.scenario, clock, case.settle, limits.band)
     loss = loss_for(case.scenario, case.settle, tune.early, measured)

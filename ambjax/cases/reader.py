@@ -16,6 +16,7 @@ from ambjax.cases.spread import spread_from
 from ambjax.cases.table import Table, check_depth, load, show
 from ambjax.control import answers, current, inversion, observer, position
 from ambjax.control.cascade import Cascade
+from ambjax.control.guard import Guard
 from ambjax.control.processor import Processor
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.host.words import one_line
@@ -29,6 +30,7 @@ from ambjax.world import signals
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.bearing import Bearing
 from ambjax.world.coils import TwoCoil
+from ambjax.world.faults import VALUES, Dropouts, Outliers
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Sensor
@@ -87,7 +89,8 @@ UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
 class Case:
     """What a case file says. `settle` in s; `method` as chosen or asked for, for every spread, is in the clock.
 
-    `text`: the file as it was read, byte for byte in UTF-8.
+    `text`: the file as it was read, byte for byte in UTF-8. `assumed`: names of the plant's numbers that the file
+    leaves at the paper's values although it gives others of them; empty where it gives all or none.
     """
 
     name: str
@@ -97,6 +100,7 @@ class Case:
     settle: float
     spread: Spread = Spread()
     text: str = ""
+    assumed: tuple[str, ...] = ()
 
 
 def read_case(path: str | pathlib.Path) -> Case:
@@ -141,19 +145,28 @@ def case_from(raw: dict[str, Any], name: str = "case", text: str = "") -> Case:
     clock = with_method(clock, *corners(spread, cascade, scenario))
     if (late := ends(spread, cascade, scenario, ("processor.",))[0].processor) is not None:
         cascade = cascade.on_processor(late.delay, between="processor.delay" in spread.paths)
-    return Case(safe_name(name), cascade, scenario, clock, settle, spread, text)
+    assumed = _left_out(top.table("plant"), plant)
+    return Case(safe_name(name), cascade, scenario, clock, settle, spread, text, assumed)
 
 
 def _processor(table: Table) -> Processor:
-    table.only(["delay", "discretisation", "predict"])
+    table.only(["delay", "discretisation", "predict", "guard"])
     delay = table.leaf("delay", DELAY, DELAY.default)
     implicit = table.choice("discretisation", DISCRETISATIONS, DISCRETISATIONS[0]) == DISCRETISATIONS[0]
-    return Processor(delay, implicit, table.switch("predict"))
+    guard = None if table.raw.get("guard") is False else table.table("guard").record(Guard)
+    return Processor(delay, implicit, table.switch("predict"), guard=guard)
 
 
 def _plant(table: Table) -> Bearing:
     kind = table.choice("kind", list(PLANTS), next(iter(PLANTS)))
     return table.record(PLANTS[kind], extra=("kind",))
+
+
+def _left_out(table: Table, plant: Bearing) -> tuple[str, ...]:
+    """Names of the plant's numbers that its table leaves out; none where it gives no number at all."""
+    names = [field.name for field in dataclasses.fields(plant) if field.metadata.get("leaf")]
+    left = tuple(name for name in names if name not in table.raw)
+    return left if len(left) < len(names) else ()
 
 
 def _cascade(table: Table, plant: Bearing, processor: Processor | None) -> Cascade:
@@ -211,8 +224,17 @@ def _scenario(top: Table, plant: Bearing) -> tuple[Scenario, float | None]:
 
 
 def _sensor(table: Table) -> Sensor:
-    sensor, velocity = table.record(Sensor, extra=("velocity",)), table.switch("velocity")
-    return sensor if velocity is None else dataclasses.replace(sensor, velocity=velocity)
+    sensor, velocity = table.record(Sensor, extra=("velocity", "outliers", "dropouts")), table.switch("velocity")
+    faults = {
+        "outliers": table.table("outliers").record(Outliers) if "outliers" in table.raw else None,
+        "dropouts": _dropouts(table.table("dropouts")) if "dropouts" in table.raw else None,
+    }
+    return dataclasses.replace(sensor, velocity=velocity is not False, **faults)
+
+
+def _dropouts(table: Table) -> Dropouts:
+    value = table.choice("value", list(VALUES), VALUES[0])
+    return dataclasses.replace(table.record(Dropouts, extra=("value",)), value=value)
 
 
 def _seed(run: Table) -> int:

@@ -48,11 +48,31 @@ settle = 0.5                  # s; from when "settled" metrics count (left out: 
 # bits = 14                   # of the converter of z and i (left out: not rounded)
 # range_z = 5e-3              # m; its ends (left out: plant.s_0)
 # range_i = 0.5               # A (left out: 2 plant.i_0)
+#
+# [sensor.outliers]           # faults of the position sensor, with [processor]: single readings (left out: none)
+# rate = 1.0                  # 1/s; mean number in a second
+# size = 5e-3                 # m; by which a reading is off, up or down
+# at = 0.1                    # s; one more at this time (left out: none)
+#
+# [sensor.dropouts]           # stretches without a reading (left out: none)
+# rate = 1.0                  # 1/s; mean number in a second
+# duration = 5e-4             # s; of each
+# at = 0.1                    # s; one more at this time (left out: none)
+# value = "hold"              # what is read meanwhile: the last reading, "nan", "zero" or "full-scale"
 
 # [processor]                 # the laws as they run on a processor, a step a sample (left out: in continuous time)
 # delay = 1.0                 # samples from measurement to voltage, 0 to 2, fractions too
 # discretisation = "implicit" # signs act on where the step ends, and p = inf is allowed; or "explicit"
 # predict = true              # the laws see the estimate carried over the delay (left out: where there is a delay)
+# guard = {{}}                  # limits of the readings, below; false: every reading is believed
+#
+# [processor.guard]           # a reading beyond these is refused and predicted (left out: all derived from the case)
+# z = 4.5e-3                  # m; largest |z| (left out: the clearance times the sensor's gain, its offset and error)
+# z_dot = 100.0               # m/s; largest |z_dot| (left out: two gaps in a sample)
+# i = 25.0                    # A; largest |i| (left out: 100 i_0)
+# noise = 1.4e-5              # m; by which two readings of one z may differ (left out: the sensor's errors)
+# speed = 1e-3                # m/s; error of the predicted speed (left out: the sensor's, or what an observer may miss)
+# samples = 18                # in a row that are predicted (left out: as many as an error needs to grow e-fold)
 
 # [actuator]
 # u_max = 200.0               # V; limit of the supply (left out: none)

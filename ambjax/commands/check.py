@@ -9,7 +9,7 @@ from ambjax.cases.reader import Case
 from ambjax.commands.doubts import read_aloud
 from ambjax.commands.outputs import plain, table
 from ambjax.theorem.conditions import Condition, check
-from ambjax.theorem.processor import Sampled
+from ambjax.theorem.processor import Delays, Sampled
 
 Summary = dict[str, Any]
 CONTINUOUS = (
@@ -17,7 +17,11 @@ CONTINUOUS = (
     "converters and amplifier too, and signs without a layer have one. It decides nothing here."
 )
 
-BAND = "Band: what its law keeps the signal in from run.settle on, without noise, which comes on top of it."
+BAND = (
+    "At the samples from run.settle on. Disturbed by: the largest rate of the signal that the law acts on, beyond what "
+    "the law's sign asks for. Band: what the law keeps that signal in under such disturbances. Off by: the largest "
+    "difference between that signal and the plant's. Bound: the sum of both, for the plant's signal beside it."
+)
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
@@ -48,14 +52,18 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
     """Print what decides on the case's processor. Keys of the summary, of which "holds" is the processor's."""
     from ambjax.ensemble.delays import delay_margin
+    from ambjax.ensemble.replay import as_member, record_system
     from ambjax.theorem import processor, verdict
 
-    sampled = processor.check(case.cascade, case.scenario, case.clock, case.settle)
-    margin = delay_margin(case.cascade, case.scenario, case.clock)
+    scenario = as_member(case.scenario)
+    sampled = processor.check(case.cascade, scenario, case.clock, case.settle, record_system)
+    margin, unknown = delay_margin(case.cascade, case.scenario, case.clock), None
+    if (chosen := case.cascade.processor) is not None and chosen.predict is not False:
+        unknown = delay_margin(case.cascade, case.scenario, case.clock, known=False)
     if not args.json:
         print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")
         _print_sampled(sampled)
-        print("\n" + "\n".join(verdict.on_processor(sampled, margin)))
+        print("\n" + "\n".join(verdict.on_processor(sampled, margin, unknown)))
     slopes = [dataclasses.asdict(slope) | {"holds": slope.holds} for slope in sampled.slopes]
     return {
         "holds": sampled.holds,
@@ -64,10 +72,19 @@ def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
             "lost_why": sampled.lost_why,
             "stalled": sampled.stalled,
             "slopes": slopes,
-            "bands": [dataclasses.asdict(band) for band in sampled.bands],
-            "delay_margin": margin._asdict() | {"resolution": margin.resolution},
+            "distance_to_C": sampled.distance[0],
+            "distance_to_C_at_s": sampled.distance[1],
+            "alternating": sampled.alternating,
+            "alternates": sampled.alternates,
+            "bands": [dataclasses.asdict(band) | {"bound": band.bound} for band in sampled.bands],
+            "delay_margin": _margin(margin),
+            "delay_margin_unknown": None if unknown is None else _margin(unknown),
         },
     }
+
+
+def _margin(margin: Delays) -> Summary:
+    return margin._asdict() | {"resolution": margin.resolution}
 
 
 def _condition(c: Condition) -> Summary:
@@ -118,11 +135,17 @@ def _print_sampled(sampled: Sampled) -> None:
         return "-" if x is None else "none" if math.isinf(x) else f"{x:.4g}"
 
     bands = [
-        (b.signal, b.unit, number(b.disturbance), number(b.band), number(b.seen), number(b.noisy), b.note)
+        (
+            b.signal,
+            b.unit,
+            "the case's" if b.noise else "none",
+            *map(number, (b.gain, b.disturbance, b.band, b.off, b.bound, b.seen)),
+            b.note,
+        )
         for b in sampled.bands
     ]
     if bands:
-        head = ("signal", "unit", "disturbed by, per s", "band", "seen without noise", "seen", "note")
+        head = ("signal", "unit", "noise", "gain, per s", "disturbed by", "band", "off by", "bound", "largest", "note")
         print("\n" + table(head, bands) + "\n" + BAND)
     else:
-        print("\nNo bands: without noise the run does not last.")
+        print("\nNo bands: the run does not last, without noise neither.")

@@ -3,6 +3,7 @@
 Units that were taken for others above all: they are SI, and bearings are described in millimetres.
 """
 
+import dataclasses
 import math
 import pathlib
 from collections.abc import Iterator
@@ -16,6 +17,8 @@ from ambjax.host.words import one_line
 
 # Gaps, areas of a pole and permeabilities that are built, with room to spare: the paper's are 5e-3, 0.121, 1.25e-6.
 GAPS, AREAS, PERMEABILITIES = (2e-5, 2e-2), (1e-6, 1.0), (6e-7, 2.5e-6)
+# The number of a plant whose default holds for every machine.
+GRAVITY = "g"
 # Noise beyond this share of the gap tells little of where in it the rotor is.
 MOST_NOISE = 0.1
 
@@ -35,7 +38,17 @@ def say_doubts(case: Case, path: str | pathlib.Path) -> None:
 
 def doubts(case: Case) -> list[str]:
     """One line with path, value, why and what may have been meant, for each number of a case that is hardly meant."""
-    return [*_sizes(case), *_noise(case), *_velocity(case), *_currents(case), *_motion(case)]
+    return [*_assumed(case), *_sizes(case), *_noise(case), *_velocity(case), *_currents(case), *_motion(case)]
+
+
+def _assumed(case: Case) -> Iterator[str]:
+    plant = case.scenario.plant
+    fields = [field for field in dataclasses.fields(plant) if field.name in case.assumed and field.name != GRAVITY]
+    left = [
+        f"{field.name} = {getattr(plant, field.name):g} {field.metadata['unit']}".removesuffix(" 1") for field in fields
+    ]
+    if left:
+        yield f"[plant] leaves out numbers, which keep the paper's values: {', '.join(left)}. Write those that differ."
 
 
 def _sizes(case: Case) -> Iterator[str]:

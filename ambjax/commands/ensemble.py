@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import pathlib
-import shlex
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from typing import Any
@@ -24,7 +23,6 @@ from ambjax.host.interrupts import keeping, unbroken
 from ambjax.host.lock import alone
 from ambjax.host.words import one_line
 from ambjax.simulation.integrate import Slide
-from ambjax.simulation.trajectory import STALLED
 
 # Beside members.npz; the last where something is spread.
 WRITTEN = ("summary.json", "fan.png", "histograms.png", "tornado.png")
@@ -36,6 +34,8 @@ MOST_PROCESSES = 1024
 FAN_MEMBERS, FAN_TIMES = 256, 500
 # How long to look for the scheduler of a cluster.
 PATIENCE = "10s"
+# Where every member is lost, the fan chart ends at so many times the last loss.
+BEYOND = 1.15
 BANDS = (0.0, 5.0, 25.0, 50.0, 75.0, 95.0, 100.0)
 GO_ON = "What is finished is kept: give the same command with --out and --resume to go on."
 METRICS = ("settled_max_abs_error_m", "settled_rms_error_m", "max_abs_error_m", "max_abs_u_V", "rms_u_V", "max_abs_i_A")
@@ -62,12 +62,15 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
             make(out)  # not before everything that was asked for is known to be possible
             held.enter_context(alone(out))
             _check(study, store, args)  # again: another run may have begun, or ended, since
+            fresh = not store.begun()
+            store.begin()
             say(f"method: {case.clock.method}; writing to {out}")
             if isinstance(case.clock.method, Slide):
                 error = sliding_error(study)
                 say(error_words(error))
             if not store.finished():
-                _begin(study, store, executor)
+                if fresh or not store.chunk:
+                    _pilot(study, store, executor)
                 _run(study, store, executor)
         store.finish()
         return _report(case, study, args, out, error)
@@ -95,18 +98,15 @@ def _check(study: Study, store: Store, args: argparse.Namespace) -> None:
     check_places(store.directory, WRITTEN)
 
 
-def _begin(study: Study, store: Store, executor: tuple[Executor, int] | None) -> None:
-    """Choose the chunks if nobody has, say how long it may take, and keep what was computed to know it."""
-    if store.begun():
-        store.begin()
-        return
+def _pilot(study: Study, store: Store, executor: tuple[Executor, int] | None) -> None:
+    """Time the first members, print how long the study may take, choose the chunk size if none is set, and keep the
+    chunks that the timing has computed."""
     columns, seconds = pilot(study)
     first = len(columns["index"])
     pace = Pace(first / seconds, None if executor is None else executor[1] // AHEAD)
-    store.chunk = store.chunk or pace.chunk(study.members)
     say_how_long(study, pace)
     with unbroken():
-        store.begin()
+        store.cut(store.chunk or pace.chunk(study.members))
         for start, stop in store.spans()[: first // store.chunk]:
             store.put((start, stop), {name: column[start:stop] for name, column in columns.items()})
 
@@ -125,7 +125,7 @@ def _report(
     """What is made of a finished study; `error` is that of its sliding step, if it has one."""
     with np.load(out / "members.npz") as file:
         columns = {name: file[name] for name in file.files}
-    summary = _summary(case, study, columns, shlex.quote(str(args.case)))
+    summary = _summary(case, study, columns, str(args.case))
     if error is not None:
         summary["sliding_step_error"] = error
     with files(out) as part:
@@ -209,9 +209,8 @@ def _summary(case: Case, study: Study, columns: dict[str, np.ndarray], path: str
         "design": study.spread.design,
     }
     numbers = statistics.summary(columns, study.spread.paths, study.seed)
-    latin = f" --members {study.members}" if study.spread.design == "latin-hypercube" else ""
     for worst in numbers["worst"]:
-        worst["replay"] = f"ambjax simulate {path} --member {worst['index']} --seed {study.seed}{latin}"
+        worst["replay"] = study.command(path, worst["index"])
     return facts | numbers
 
 
@@ -221,12 +220,14 @@ def _pictures(
     from ambjax.pictures import ensembles as pictures
     from ambjax.pictures import tornado
 
-    t, trajectory, signals = study.bands(FAN_MEMBERS, FAN_TIMES)
-    lost_at, stalled = np.asarray(trajectory.lost_at), np.asarray(trajectory.lost_code) == STALLED
-    title = f"{case.name}: {len(lost_at)} of {study.members} members"
+    lost_at = columns["lost_at"]
+    # nothing is left to show long after the last member is lost
+    bands = study.bands(FAN_MEMBERS, FAN_TIMES, BEYOND * float(np.max(lost_at)))
+    shown = {name: _quantiles(x, bands.extremes.get(name)) for name, x in bands.signals.items()}
+    few = len(bands.trajectory.lost_at)
+    title = case.name if few == study.members else f"{case.name}: bands of {few} of {study.members} members"
     limits = {"z - r": float(np.min(study.scenario.touchdown)), "u": float(np.min(study.scenario.u_max))}
-    bands = {name: _quantiles(x) for name, x in signals.items()}
-    pictures.fan(t, bands, limits, title, out / "fan.png", lost_at=lost_at, stalled=stalled)
+    pictures.fan(bands.t, shown, limits, title, out / "fan.png", lost_at=lost_at, stalled=columns["stalled"])
     pictures.histograms(columns, out / "histograms.png")
     if study.spread.entries:
         deciding = statistics.DECIDING
@@ -234,11 +235,16 @@ def _pictures(
         tornado.tornado(bars, deciding, summary["explained"][deciding]["says"], out / "tornado.png")
 
 
-def _quantiles(x: np.ndarray) -> dict[float, np.ndarray]:
-    """Quantiles over the members that are left at each instant, by per cent; NaN where none is."""
+def _quantiles(x: np.ndarray, extremes: tuple[np.ndarray, np.ndarray] | None) -> dict[float, np.ndarray]:
+    """Quantiles [T] of x [members, T] over the members that are left at each instant, by per cent; NaN where none is.
+
+    The outermost are the `extremes` between the neighbouring instants, where there are any.
+    """
     left = np.isfinite(x).any(axis=0)
     quantiles = np.full((len(BANDS), x.shape[1]), np.nan)
     quantiles[:, left] = np.nanquantile(x[:, left], np.array(BANDS) / 100, axis=0)
+    if extremes is not None:
+        quantiles[[0, -1]] = extremes
     return dict(zip(BANDS, quantiles, strict=True))
 
 
@@ -261,10 +267,11 @@ def _text(summary: dict[str, Any]) -> str:
         rows.append(
             (name, *(number(metric[key]["estimate"]) for key in ("median", "q95", "cvar_95")), number(metric["max"]))
         )
-    lines += ["", table(("metric", "median", "95 % quantile", "mean of worst 5 %", "largest"), rows)]
+    head = f"metric, of the {summary['survivors']} {summary['metrics_of']}"
+    lines += ["", table((head, "median", "95 % quantile", "mean of worst 5 %", "largest"), rows)]
     drivers, account = summary["drivers"][statistics.DECIDING][:5], summary["explained"][statistics.DECIDING]
     if drivers:
-        lines += ["", f"What drives {statistics.DECIDING}: {account['says']}."]
+        lines += ["", f"What drives {statistics.DECIDING} of the {summary['metrics_of']}: {account['says']}."]
     if account["alone"]:
         bars = [
             (

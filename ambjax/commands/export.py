@@ -1,18 +1,24 @@
 """`ambjax export`: the controller of a case as C, and the proof that it is that controller."""
 
 import argparse
+import dataclasses
 import hashlib
 import re
 from typing import Any
 
+import jax
+import numpy as np
+
 from ambjax.cases.reader import Case, read_case
 from ambjax.commands.doubts import say_doubts
 from ambjax.commands.outputs import directory, files, say, spare, table, write_json, written
-from ambjax.export import loop, machine, package, texts, verify
+from ambjax.control.guard import guarded
+from ambjax.ensemble.spread import ends
+from ambjax.export import machine, package, texts, verify
 from ambjax.export.controller import Controller, controller_of
 from ambjax.export.source import Origin
 from ambjax.export.statements import PRECISIONS, RESERVED
-from ambjax.simulation.metrics import standard_for
+from ambjax.export.twins import Case as Compared
 
 Summary = dict[str, Any]
 # What --verify writes beside the package's files.
@@ -28,7 +34,7 @@ TAKEN = {
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax export."""
     case = read_case(args.case)
-    controller = controller_of(case.cascade, case.scenario.u_max, float(case.clock.sample_period))
+    controller = controller_of(guarded_for(case), case.scenario.u_max, float(case.clock.sample_period))
     prefix = _prefix(args.prefix, case.name)
     if args.verify:
         machine.check()
@@ -43,7 +49,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
             sources, checks = _verified(case, controller, args.precision, prefix, origin)
         else:
             sources, checks = package.files(controller, args.precision, prefix, origin), []
-        ok = all(x.ok for x in checks) if checks else None
+        ok = verify.holds(checks) if checks else None
         for name, text in sources.items():
             (part / name).write_text(text, encoding="utf-8")
         if checks:
@@ -54,20 +60,30 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
             (out / name).unlink(missing_ok=True)
     if not args.json:
         if checks:
-            rows = [(x.name, x.precision, x.found, x.allowed, "holds" if x.ok else "FAILS") for x in checks]
+            rows = [(x.name, x.precision, x.found, x.allowed, x.verdict) for x in checks]
             print(table(("check", "precision", "found", "allowed", "verdict"), rows))
+            print(verify.summary(checks))
         written(out, ", ".join([*sources, *(VERIFIED if checks else ())]))
     return int(ok is False), {"ok": ok, "checks": [x._asdict() for x in checks], "out": str(out)}
+
+
+def guarded_for(case: Case) -> Any:
+    """The cascade of a case with the limits of its guard, wide enough for the sensor at both ends of every spread."""
+    wide = ends(case.spread, case.cascade, case.scenario, ("sensor.", "run.clearance", "plant.s_0"))[1]
+    cascade = guarded(case.cascade, wide, float(case.clock.sample_period))
+    if cascade.processor is None or cascade.processor.guard is None:
+        return cascade
+    guard = jax.tree.map(lambda x: float(np.max(x)), cascade.processor.guard)
+    return dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=guard))
 
 
 def _verified(
     case: Case, controller: Controller, precision: str, prefix: str, origin: Origin
 ) -> tuple[dict[str, str], list[verify.Check]]:
     """The files, and the checks of them in both precisions."""
-    say("verify: one step at 10,000 points, then the closed loop, in both precisions")
+    say("verify: one step at 10,000 points and at 10,000 of other parameters, then the closed loop, in both precisions")
     drafts = {name: verify.draft(controller, name, prefix, origin) for name in PRECISIONS}
-    fold = standard_for(case.settle, case.scenario)
-    checks = verify.verify(drafts, loop.Case(case.cascade, case.scenario, case.clock, fold))
+    checks = verify.verify(drafts, Compared(case.cascade, case.scenario, case.clock, case.settle))
     return dict(drafts[precision].files), checks
 
 

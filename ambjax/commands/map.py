@@ -1,6 +1,7 @@
 """`ambjax map`: survival and error over a grid of two quantities, for one case or for several side by side."""
 
 import argparse
+import itertools
 import math
 from typing import Any
 
@@ -11,7 +12,8 @@ from ambjax.cases.reader import Case
 from ambjax.commands.doubts import read_aloud
 from ambjax.commands.ensemble import study_of
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
-from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, stepped
+from ambjax.ensemble.intervals import wilson
+from ambjax.ensemble.maps import GRIDS, PERIOD, SURE, Axis, Map, grid, stepped
 from ambjax.ensemble.paths import places
 from ambjax.numerics.records import numbers, within
 
@@ -123,26 +125,42 @@ def _value(text: str, nominal: float | None) -> float:
 
 def _summary(case: Case, one: Map) -> dict[str, Any]:
     facts: dict[str, Any] = {"case": case.name, "x": one.x._asdict(), "y": one.y._asdict()}
-    return facts | {key: getattr(one, key) for key in (*GRIDS, "drawn")} | {"reach": one.reach()}
+    return facts | {key: getattr(one, key) for key in (*GRIDS, "members", "drawn", "decisive")} | {"reach": one.reach()}
 
 
 def _text(cases: list[Case], maps: list[Map]) -> str:
-    x, y = maps[0].x, maps[0].y
-    middle = (y.values[0] + y.values[-1]) / 2
-    rows = []
+    first, sure = maps[0], any(one.decisive for one in maps)
+    rows, lines = [], []
     for case, one in zip(cases, maps, strict=True):
         reach = one.reach()
         held = "nowhere" if reach is None else f"{reach[0]:.4g} to {reach[1]:.4g}"
-        rows.append((case.name, f"{100 * one.survival.mean():.1f} %", f"{100 * np.mean(one.low >= 0.95):.1f} %", held))
-    header = ("case", "runs that survive", "cells surely above 95 %", f"{x.path} survived at {y.path} = {middle:.3g}")
-    lines = [table(header, rows)]
-    for case, one in zip(cases, maps, strict=True):
+        cells = [f"{100 * share:.1f} %" for share in (one.survival.mean(), np.mean(one.survival == 1))]
+        cells += [f"{100 * np.mean(one.low >= SURE):.1f} %" if one.decisive else "-"] * sure
+        rows.append((case.name, *cells, held))
         lines += [f"{case.name}: {_spread_words(one)}"]
+        if not one.decisive:
+            lines += [f"{case.name}: {_unsure(one)}"]
         if one.stalled.any():
             many, lost = int(one.stalled.sum()), int(one.lost.sum())
             where = f"in {np.count_nonzero(one.stalled)} cells"
             lines += [f"{case.name}: {lost} runs lost, {many} not decided ({where}): the integrator gave up there"]
-    return "\n".join(lines)
+    header = [
+        "case",
+        "runs that survive",
+        "cells in which all survive",
+        *[f"cells surely above {100 * SURE:g} %"] * sure,
+    ]
+    head = f"{first.x.path} survived at {first.y.path} = {first.y.values[first.middle]:.3g}"
+    return "\n".join([table([*header, head], rows), *lines])
+
+
+def _unsure(one: Map) -> str:
+    """Why a map says nothing about the confidence of its cells."""
+    if not one.varied:
+        return "no noise, and nothing is spread: all runs of a cell are alike, and one decides it"
+    enough = next(n for n in itertools.count(1) if wilson(n, n).low >= SURE)
+    runs = f"{one.members} run{'s' * (one.members > 1)} a cell"
+    return f"{runs}: too few for a confidence statement about a cell; --members {enough} or more allow one"
 
 
 def _spread_words(one: Map) -> str:
@@ -159,10 +177,10 @@ def _draw(cases: list[Case], maps: list[Map], path: Any) -> None:
             "x": m.x.values,
             "y": m.y.values,
             "survival": m.survival,
-            "low": m.low,
-            "high": m.high,
+            "low": m.low if m.decisive else None,
+            "high": m.high if m.decisive else None,
+            "error": m.error,
         }
-        | {"error": m.error}
         for case, m in zip(cases, maps, strict=True)
     ]
     x, y = maps[0].x, maps[0].y

@@ -5,7 +5,6 @@ import dataclasses
 import math
 from typing import Any
 
-import jax
 import numpy as np
 from tqdm import tqdm
 
@@ -13,27 +12,36 @@ from ambjax.cases.reader import Case
 from ambjax.commands.doubts import read_aloud, reversal
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
 from ambjax.ensemble.design import MOST_MEMBERS
-from ambjax.numerics.records import canonical
+from ambjax.ensemble.replay import Replay, record, replay
+from ambjax.ensemble.study import Study
+from ambjax.host.words import command
 from ambjax.simulation.metrics import standard_for
-from ambjax.simulation.rollout import Outcome, begin_jit, finish, segment_jit
-from ambjax.simulation.sampled import system_of
+from ambjax.simulation.rollout import Outcome
 
 Summary = dict[str, Any]
 WRITTEN = ("trajectory.npz", "metrics.json", "overview.png")
-# Samples simulated between two strokes of the progress bar.
-STROKE = 20_000
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax simulate."""
-    case = _member(read_aloud(args.case), args)
+    case = read_aloud(args.case)
+    study = _study(case, args)
+    if study is not None:
+        cascade, scenario = study.member(args.member)
+        case = dataclasses.replace(case, name=f"{case.name}-{args.member}", cascade=cascade, scenario=scenario)
     window = _window(case, args)
     out = directory(args.out, f"simulate-{case.name}", WRITTEN)
     say(f"method: {case.clock.method}")
     if case.cascade.processor is not None:
         say(f"on a processor: {case.cascade.processor}")
-    trajectory, numbers = simulate(case)
+    replayed = None if study is None else _replay(case, study, args.member)
+    trajectory, numbers = simulate(case) if replayed is None else (replayed.trajectory, replayed.metrics)
     _check(numbers, args.case)
+    if replayed is not None and replayed.deviation > replayed.rounding:
+        say(
+            f"trajectory.npz and overview.png are not exactly this member's: their metrics differ from those of the "
+            f"ensemble, which metrics.json holds, by up to {100 * replayed.deviation:.2g} %."
+        )
     for doubt in reversal(case, float(numbers["max_abs_i_A"])):
         say(doubt)
     metrics = plain(numbers) | {
@@ -41,6 +49,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         "method": str(case.clock.method),
         "settle_s": case.settle,
     }
+    if replayed is not None:
+        metrics["trajectory_deviation"] = replayed.deviation
     from ambjax.pictures.overview import overview
 
     with files(out) as part:
@@ -51,17 +61,17 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         print(_metrics_text(metrics))
         written(out, ", ".join(WRITTEN))
     ended = metrics["lost_at_s"] is not None
-    if metrics["lost"]:
-        say(
-            f"The rotor is lost at {metrics['lost_at_s']:.4g} s: {trajectory.lost_why}. 'ambjax check {args.case}' "
-            "says which gain fails which condition of Theorem 1; "
-            f"'ambjax-tune {args.case}' looks for gains that hold it."
-        )
-    elif ended:
+    if ended:
         from ambjax.theorem import verdict
 
         remedy = verdict.STALLED if case.cascade.processor is None else verdict.STALLED_PLANT
-        say(verdict.undecided(metrics["lost_at_s"], remedy))
+        words = verdict.fate(metrics["lost_at_s"], trajectory.lost_why, metrics["stalled"], remedy)
+        which = "" if study is None else " for the nominal case"
+        look = (
+            f" {command('ambjax', 'check', args.case)} compares the gains with the conditions of Theorem 1{which}; "
+            f"{command('ambjax', 'tune', args.case)} looks for gains that hold it."
+        )
+        say(words if metrics["stalled"] else words + look)
     return int(ended), metrics | {"out": str(out)}
 
 
@@ -87,39 +97,39 @@ def _window(case: Case, args: argparse.Namespace) -> tuple[float, float] | None:
     return begin, end
 
 
-def _member(case: Case, args: argparse.Namespace) -> Case:
-    """The case with one member of its ensemble drawn, if that was asked for."""
+def _study(case: Case, args: argparse.Namespace) -> Study | None:
+    """The study whose member --member asks for; None without that option."""
     if args.member is None:
         if args.seed is not None or args.members is not None:
             raise ValueError("--seed and --members belong to --member: add it, or set run.seed in the case file.")
-        return case
-    if not (case.spread.entries or case.scenario.random):
-        raise ValueError("--member: nothing in this case differs from member to member; add [spread], or leave it out.")
+        return None
     if case.spread.design == "latin-hypercube" and args.members is None:
         raise ValueError("--member: add --members N, the size of the ensemble; a Latin hypercube depends on it.")
     from ambjax.commands.ensemble import study_of
 
     study = study_of(case, args.seed, MOST_MEMBERS if args.members is None else args.members)
+    if not study.varies:
+        raise ValueError("--member: nothing in this case differs from member to member; add [spread], or leave it out.")
     if not 0 <= args.member < study.members:
         raise ValueError(f"--member {args.member}: it must be a whole number from 0 to {study.members - 1}.")
-    cascade, scenario = study.member(args.member)
-    return dataclasses.replace(case, name=f"{case.name}-{args.member}", cascade=cascade, scenario=scenario)
+    return study
 
 
 def simulate(case: Case) -> Outcome:
-    """A rollout of a case, recorded whole, with a progress bar if it takes more than two seconds."""
-    fold = standard_for(case.settle, case.scenario)
-    loop, clock, fold = canonical((system_of(case.cascade, case.scenario, case.clock), case.clock, fold))
-    progress, parts, at = begin_jit(loop, clock, fold), [], 0
-    with tqdm(total=clock.samples, unit="sample", unit_scale=True, delay=2, leave=False, desc="simulate") as bar:
-        while at < clock.samples:
-            count = min(STROKE, clock.samples - at)
-            progress, rows = segment_jit(loop, clock, fold, progress, at, count=count, every=1)
-            parts.append(jax.tree.map(np.asarray, rows))
-            at += count
-            bar.update(count)
-    rows = jax.tree.map(lambda *xs: np.concatenate(xs), *parts)
-    return jax.tree.map(np.asarray, finish(progress, rows, fold))
+    """A rollout of a case, every sample recorded, with a progress bar if it takes more than two seconds."""
+    with _bar(case) as bar:
+        fold = standard_for(case.settle, case.scenario)
+        return record(case.cascade, case.scenario, case.clock, fold=fold, tell=bar.update)
+
+
+def _replay(case: Case, study: Study, member: int) -> Replay:
+    """The same of a member of a study."""
+    with _bar(case) as bar:
+        return replay(study, member, bar.update)
+
+
+def _bar(case: Case) -> tqdm:
+    return tqdm(total=case.clock.samples, unit="sample", unit_scale=True, delay=2, leave=False, desc="simulate")
 
 
 def _metrics_text(metrics: Summary) -> str:

@@ -5,9 +5,11 @@ layer(model)        for each state, the largest error that keeps it where a smoo
 requirement         what Theorem 1 requires of one of its gains; nothing
 robust(error)       the term that its sign adds to the rate of the error of its stage, Eqs. (12), (14); 0
 ranges(site)        where its gains are searched; about their values
-band(W, L, sampling) what is left of its stage's error, sampled, for a disturbance to W of a rate to L; None: unknown
+relay()             gain and steepness of the sign that drives the error of its stage, if its `step` is that alone; None
 held(model)         the steepest rate of what its implicit step leaves explicit, 1/s; 0
 memory              for each state, its name, unit and meaning, where its structure does not name it; x
+init_sampled(model) its state on a processor, where explicit steps take its `step` too; `init`, and they do not
+scale_sampled(model) the size of each number of that state; `scale`
 slide(...)          an inversion law's step that knows where its stiffness is (`laws.Relaxation`); there is none
 estimates_velocity  whether an observer needs no measured velocity; no
 """
@@ -20,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.control.sampling import Sampling
+from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, Site
 from ambjax.numerics.records import Scalar, is_traced
 from ambjax.world.plant import Plant
@@ -64,14 +66,19 @@ def robust(law: Any, error: Array) -> Array:
     return law.robust(error) if hasattr(law, "robust") else 0.0 * error
 
 
-def band(law: Any, W: float, L: float, sampling: Sampling) -> float | None:
-    """The band of the error of its stage under a disturbance up to W, of rate up to L; inf: it has none."""
-    return law.band(W, L, sampling) if hasattr(law, "band") else None
+def relay(law: Any) -> Relay | None:
+    """The sign that alone drives the error of the law's stage; None: there is none, or there is more."""
+    return law.relay() if hasattr(law, "relay") else None
 
 
-def steps_implicitly(law: Any, implicit: bool) -> bool:
-    """Whether the law's step on a processor with these steps is one of its own."""
-    return implicit and hasattr(law, "step")
+def has_own_step(law: Any, implicit: bool) -> bool:
+    """Whether a processor with implicit (or explicit) steps takes the law's own `step`; else it makes an Euler step."""
+    return hasattr(law, "step") and (implicit or hasattr(law, "init_sampled"))
+
+
+def init_sampled(law: Any, model: Plant) -> Any:
+    """State at t = 0, on a processor, of a law other than an observer."""
+    return law.init_sampled(model) if hasattr(law, "init_sampled") else law.init(model)
 
 
 def held(law: Any, model: Plant) -> Scalar:
@@ -146,3 +153,8 @@ def softened(law: L, model: Plant) -> L:
     given: Any = law
     usual = default_law(type(law), model)
     return dataclasses.replace(given, **{name: getattr(usual, name) for name in hard_signs(law)})
+
+
+def scale_sampled(law: Any, model: Plant) -> Any:
+    """Size that matters of each number of a law's state on a processor."""
+    return law.scale_sampled(model) if hasattr(law, "scale_sampled") else law.scale(model)

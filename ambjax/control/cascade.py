@@ -5,6 +5,7 @@ Its modularity is the paper's first contribution: any law of a stage may stand w
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -91,17 +92,19 @@ class Cascade:
                 object.__setattr__(self, stage, answers.default_law(kind, self.model))
 
     def init(self, measured: Measurement) -> CascadeState:
-        """States of all laws at t = 0."""
-        return CascadeState(
-            self.observer.init(self.model, measured),
-            self.position.init(self.model),
-            self.inversion.init(self.model),
-            self.current.init(self.model),
-        )
+        """States of all laws at t = 0, in continuous time or on the processor."""
+        rest = self.position, self.inversion, self.current
+        if self.processor is None:
+            states = [law.init(self.model) for law in rest]
+        else:
+            states = [answers.init_sampled(law, self.model) for law in rest]
+        return CascadeState(self.observer.init(self.model, measured), *states)
 
     def scale(self) -> CascadeState:
-        """Size of each state that still matters."""
-        return CascadeState(*(law.scale(self.model) for law in self.laws))
+        """Size that matters of each number of the laws' states."""
+        if self.processor is None:
+            return CascadeState(*(law.scale(self.model) for law in self.laws))
+        return CascadeState(*(answers.scale_sampled(law, self.model) for law in self.laws))
 
     def layer(self) -> CascadeState:
         """The largest error with which each state stays where a smoothed sign turns."""
@@ -170,23 +173,37 @@ class Cascade:
         laws = {stage: answers.softened(getattr(self, stage), self.model) for stage in USUAL}
         return dataclasses.replace(self, **laws, processor=None)
 
-    def step(self, measured: Measurement, state: CascadeState, sample: Sample) -> tuple[Command, CascadeState]:
-        """Command of one sample on a processor, and states of the laws for the next one.
+    def _advance(self, sample: Sample) -> Callable[..., Any]:
+        """`stepped` on this cascade's processor."""
+        implicit = self.processor is not None and self.processor.implicit
+        return functools.partial(stepped, model=self.model, period=sample.period, implicit=implicit)
+
+    def estimate(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State, Measurement]:
+        """What the laws act on at a sample, carried over the delay if that is predicted; the observer's next state; and
+        its estimate at the sample itself. `state`: the observer's."""
+        processor: Any = self.processor
+        now, state = self._advance(sample)(self.observer, measured, state)
+        estimate = now
+        if processor.predicts:
+            estimate = carried(self.model, now, sample.past, processor.stretches(sample.period))
+        return estimate, state, now
+
+    def step(
+        self, measured: Measurement, state: CascadeState, sample: Sample
+    ) -> tuple[Command, CascadeState, Measurement]:
+        """Command of one sample on a processor, states of the laws for the next one, and the observer's estimate.
 
         With prediction all but the observer act on the estimate carried over the delay.
         """
-        processor: Any = self.processor
-        advance = functools.partial(stepped, model=self.model, period=sample.period, implicit=processor.implicit)
+        advance = self._advance(sample)
 
         def wanted(reference: Reference, z: Array, z_dot: Array, observed: State, positioned: State):
-            estimate, observed = advance(self.observer, Measurement(z, z_dot, measured.i), observed)
-            if processor.predicts:
-                estimate = carried(self.model, estimate, sample.past, processor.stretches(sample.period))
+            estimate, observed, now = self.estimate(Measurement(z, z_dot, measured.i), observed, sample)
             v_star, positioned = advance(self.position, (estimate, reference), positioned)
-            return (estimate.z, v_star), (estimate, observed, positioned)
+            return (estimate.z, v_star), (now, estimate, observed, positioned)
 
         point = (sample.reference, measured.z, measured.z_dot, state.observer, state.position)
-        (z, v_star), (estimate, observed, positioned) = wanted(*point)
+        (z, v_star), (now, estimate, observed, positioned) = wanted(*point)
         # what a law that inverts statically needs for i_ref'; unused, it is never computed
         z_ddot = self.model.z_ddot(estimate.z, estimate.i)
         rates = jax.tree.map(
@@ -204,7 +221,7 @@ class Cascade:
         u, driven = advance(self.current, CurrentInputs(estimate, demand, sample.u_max, force.gaps), state.current)
         v_tilde = v_star - self.model.v_and_dv_di(z, demand.i_ref, force.gaps)[0]
         after = CascadeState(observed, positioned, inverted, driven)
-        return Command(v_star, v_tilde, demand.i_ref, demand.i_ref_dot, u), after
+        return Command(v_star, v_tilde, demand.i_ref, demand.i_ref_dot, u), after, now
 
     def __call__(
         self, measured: Measurement, state: CascadeState, reference: Reference, u_max: Scalar

@@ -7,7 +7,7 @@ from jax import Array
 
 from ambjax.control.answers import Requirement
 from ambjax.control.laws import CurrentInputs
-from ambjax.control.sampling import Sampling, relay_band
+from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, Site, authority, rate, steepness, switch
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
@@ -57,8 +57,8 @@ class SlidingMode:
     def robust(self, e: Array) -> Array:
         return -self.k_i * smooth_sign(e, self.p)
 
-    def band(self, W: float, L: float, sampling: Sampling) -> float:
-        return relay_band(float(self.k_i), float(self.p), W, sampling)
+    def relay(self) -> Relay:
+        return Relay(self.k_i, self.p)
 
     def ranges(self, site: Site) -> dict[str, Interval]:
         if site.stepped:

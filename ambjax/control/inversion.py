@@ -1,6 +1,6 @@
 """Inversion laws: which current gives the force."""
 
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ from jax import Array
 
 from ambjax.control.answers import Requirement
 from ambjax.control.laws import CurrentDemand, ForceDemand, Relaxation
-from ambjax.control.sampling import Sampling, relay_band
+from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, Site, steepness
 from ambjax.numerics.apart import stored
 from ambjax.numerics.records import Scalar, gain, leaf, record
@@ -70,8 +70,8 @@ class Adaptive:
     def robust(self, v_tilde: Array) -> Array:
         return -self.gamma * smooth_sign(v_tilde, self.p)
 
-    def band(self, W: float, L: float, sampling: Sampling) -> float:
-        return relay_band(float(self.gamma), float(self.p), W, sampling)
+    def relay(self) -> Relay:
+        return Relay(self.gamma, self.p)
 
     def ranges(self, site: Site) -> dict[str, Interval]:
         needed, words = site.delta_1
@@ -99,19 +99,38 @@ class Adaptive:
         return CurrentDemand(state, (after - state) * (1 / period)), after
 
 
+class Held(NamedTuple):
+    """State of `ClosedForm` on a processor: the current reference (A), and 1 once a sample has set it, before 0."""
+
+    i_ref: Array
+    begun: Array
+
+
 @record
 class ClosedForm:
     """i_ref = the root of v(z, i_ref) = v_star that is continuous at i = 0, and its exact rate. No state.
 
     This is the static inversion that the paper argues against (Mouille and Lottin 1992): exact on a
     known plant, and it passes every jump of v_star (noise) straight to i_ref.
+
+    On a processor it is the adaptive law with gamma = inf: the root found at a sample is the i_ref of the next one, and
+    i_ref' is what leads there in one period. Without that state the current law would correct the step of i_ref
+    that i_ref' has already commanded.
     """
+
+    memory = (("i_ref", "A", "current reference of the next sample"), ("begun", "1", "1 after the first sample"))
 
     def init(self, model: Plant) -> tuple[()]:
         return ()
 
+    def init_sampled(self, model: Plant) -> Held:
+        return Held(jnp.zeros(()), jnp.zeros(()))
+
     def scale(self, model: Plant) -> tuple[()]:
         return ()
+
+    def scale_sampled(self, model: Plant) -> Held:
+        return Held(jnp.asarray(model.i_0 / 25), jnp.ones(()))
 
     def slope(self, model: Plant) -> Scalar:
         return 0.0
@@ -119,3 +138,9 @@ class ClosedForm:
     def __call__(self, model: Plant, inputs: ForceDemand, state: tuple[()]) -> tuple[CurrentDemand, tuple[()]]:
         at, along = (inputs.z, inputs.v_star), (inputs.z_rate, inputs.v_star_rate)
         return CurrentDemand(*jax.jvp(model.current_for, at, along)), ()
+
+    def step(self, model: Plant, inputs: ForceDemand, state: Held, period: Scalar) -> tuple[CurrentDemand, Held]:
+        """i_ref of the sample before, and the rate to the root of this one. The first sample begins at its own root."""
+        after = model.current_for(inputs.z, inputs.v_star)
+        i_ref = jnp.where(state.begun > 0.5, state.i_ref, after)
+        return CurrentDemand(i_ref, (after - i_ref) * (1 / period)), Held(after, jnp.ones(()))

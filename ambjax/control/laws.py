@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 from jax import Array
 
+from ambjax.control import answers
 from ambjax.numerics.records import Scalar
 from ambjax.world.bearing import Gaps
 from ambjax.world.plant import Plant
@@ -104,9 +105,8 @@ class CurrentLaw(Protocol):
 
 def stepped(law: Any, inputs: Any, state: State, *, model: Plant, period: Scalar, implicit: bool) -> tuple[Any, State]:
     """Output of a law at a sample, and its state at the next: by its own discrete `step`, else by explicit Euler."""
-    own = getattr(law, "step", None)
     with jax.named_scope(f"law:{type(law).__module__.rpartition('.')[2]}.{type(law).__qualname__}"):
-        if implicit and own is not None:
-            return own(model, inputs, state, period)
+        if answers.has_own_step(law, implicit):
+            return law.step(model, inputs, state, period)
         output, rate = law(model, inputs, state)
         return output, jax.tree.map(lambda x, d: x + period * d, state, rate)

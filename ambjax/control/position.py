@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.answers import Requirement
-from ambjax.control.sampling import Sampling, relay_band, twisting_band
+from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, Site, authority, manifold, rate, steepness, switch
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share, twist
@@ -66,8 +66,8 @@ class SlidingMode:
     def robust(self, sigma: Array) -> Array:
         return -self.k * smooth_sign(sigma, self.p)
 
-    def band(self, W: float, L: float, sampling: Sampling) -> float:
-        return relay_band(float(self.k), float(self.p), W, sampling)
+    def relay(self) -> Relay:
+        return Relay(self.k, self.p)
 
     def held(self, model: Plant) -> Scalar:
         """The manifold, along which the force wanted is that of the sample's start."""
@@ -133,9 +133,6 @@ class SuperTwisting:
         sigma = self.sigma(motion, reference)
         robust = state - self.k_1 * smooth_root(sigma, self.p)
         return force_for(self.c, model, motion, reference, robust), -self.k_2 * smooth_sign(sigma, self.p)
-
-    def band(self, W: float, L: float, sampling: Sampling) -> float | None:
-        return twisting_band(float(self.k_1), float(self.k_2), float(self.p), L, sampling)
 
     def held(self, model: Plant) -> Scalar:
         """The manifold, along which the force wanted is that of the sample's start."""

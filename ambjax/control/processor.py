@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.control.guard import Guard
 from ambjax.numerics.apart import stored
 from ambjax.numerics.records import Scalar, is_traced, leaf, record, static
 from ambjax.world.plant import Plant, State
@@ -23,7 +24,7 @@ class Processor:
 
     At t_n = n T the sensors are read and every law makes a step; its voltage acts from t_n + delay T until
     t_{n+1} + delay T; before the first, u = 0. With `predict` the laws act on the estimate carried over the delay by
-    the nominal model, and on the reference of that instant.
+    the nominal model, and on the reference of that instant. `assumed` is for a prediction that does not know the delay.
     """
 
     delay: Scalar = leaf(
@@ -35,12 +36,27 @@ class Processor:
     )
     implicit: bool = static(default=True, doc="signs act on the step's end; else explicit Euler")
     predict: bool | None = static(default=None, doc="carry the estimate over the delay; None: where there is one")
+    assumed: Scalar | None = leaf(
+        default=None,
+        unit="samples",
+        at_least=0,
+        at_most=MOST_DELAY,
+        optional=True,
+        doc="delay that the prediction assumes; none: the delay itself",
+    )
+    guard: Guard | None = Guard()
+    """of the readings; None: every reading is believed"""
     whole: bool | None = static(default=None, doc="every delay is a whole number of samples; None: to be seen")
-    most: int | None = static(default=None, doc="samples that the longest delay reaches into; None: to be seen")
+    most: int | None = static(default=None, doc="samples that the longest prediction reaches into; None: to be seen")
 
     def __str__(self) -> str:
         ahead = "with" if self.predicts else "without"
         return f"{'implicit' if self.implicit else 'explicit'} steps, a delay of {self.delay:g} T, {ahead} prediction"
+
+    @property
+    def ahead(self) -> Scalar:
+        """Samples over which the estimate is carried where the processor predicts."""
+        return self.delay if self.assumed is None else self.assumed
 
     @property
     def predicts(self) -> bool:
@@ -64,13 +80,14 @@ class Processor:
             return self
         delay = np.concatenate([np.ravel(np.asarray(x, float)) for x in (self.delay, *others)])
         whole = self.whole is not False and not between and bool(np.all(delay == np.round(delay)))
-        most = max(self.most or 0, math.ceil(float(delay.max())))
+        longest = float(delay.max()) if self.assumed is None else MOST_DELAY
+        most = max(self.most or 0, math.ceil(longest))
         return dataclasses.replace(self, whole=whole, most=most)
 
     def stretches(self, period: Scalar) -> tuple[Array, ...]:
-        """Lengths (s) of the parts of the delay over which one voltage acts: u_{n-1}, and before it u_{n-2}."""
-        delay = jnp.asarray(self.delay)
-        return (jnp.minimum(delay, 1.0) * period, jnp.maximum(delay - 1.0, 0.0) * period)[: self.most]
+        """Lengths (s) of the parts of the prediction over which one voltage acts: u_{n-1}, and before it u_{n-2}."""
+        ahead = jnp.asarray(self.ahead)
+        return (jnp.minimum(ahead, 1.0) * period, jnp.maximum(ahead - 1.0, 0.0) * period)[: self.most]
 
 
 def carried(model: Plant, estimate: Measurement, past: tuple[Array, Array], lengths: tuple[Array, ...]) -> Measurement:

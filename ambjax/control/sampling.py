@@ -2,7 +2,7 @@
 
 A sign law drives x' = -k sgn_p(x) + w, |w| <= W < k, in steps of T: into a band about 0, and no closer. Explicit steps
 of the sign itself leave |x| <= T (k + W); implicit ones T W (V. Acary and B. Brogliato, Syst. Control Lett. 59 (2010)
-284-293); a smoothed sign adds the x at which it balances W. A delay of d samples lets x drift for d T more.
+284-293); a smoothed sign adds the x at which it balances W.
 """
 
 import math
@@ -10,20 +10,18 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ambjax.numerics.records import Scalar
+from ambjax.numerics.relax import share
+from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
+
 
 class Sampling(NamedTuple):
-    """How a law is sampled: period T (s), delay in samples, whether its sign is implicit, whether the delay is
-    predicted."""
+    """How a law is sampled: period (s), samples by which its output acts later than on what it acts, whether signs are
+    implicit."""
 
     period: float
-    delay: float
+    late: float
     implicit: bool
-    predict: bool
-
-    @property
-    def late(self) -> float:
-        """Samples by which the law is behind what it acts on: none where the delay is predicted."""
-        return 0.0 if self.predict else self.delay
 
 
 class Limits(NamedTuple):
@@ -41,36 +39,41 @@ def limits(late: float) -> Limits:
     if late <= 1:
         stable = min(1 / late if late else math.inf, 2 / (1 - 2 * late) if late < 0.5 else math.inf)
         return Limits(stable, 1 / (1 + math.sqrt(late)) ** 2)
-    share = late - 1
-    # r is a root of r^2 (r - 1) + a ((1 - share) r + share); at the largest a of a real one it is double
+    rest = late - 1
+    # r is a root of r^2 (r - 1) + a ((1 - rest) r + rest); at the largest a of a real one it is double
     r = np.linspace(1e-6, 1.0, 20_001)
-    quiet = float(np.max(r * r * (1 - r) / ((1 - share) * r + share)))
-    # Jury: a^2 share^2 + a < 1
-    return Limits(2 / (1 + math.sqrt(1 + 4 * share**2)), quiet)
+    quiet = float(np.max(r * r * (1 - r) / ((1 - rest) * r + rest)))
+    # Jury: a^2 rest^2 + a < 1
+    return Limits(2 / (1 + math.sqrt(1 + 4 * rest**2)), quiet)
 
 
-def relay_band(k: float, p: float, W: float, sampling: Sampling) -> float:
-    """The band of x under -k sgn_p(x) and a disturbance up to W, in the unit of x; p inf: the sign itself.
+class Relay(NamedTuple):
+    """A smoothed sign that drives an error, x' = -k sgn_p(x) + w: its gain k (unit of x per s) and steepness p (inverse
+    of that unit; None: the sign itself)."""
 
-    inf where k does not exceed W. Where a delay is not predicted the law pushes on for d T: its band is that of an
-    oscillation.
+    gain: Scalar
+    steepness: Scalar | None
+
+
+def disturbance(relay: Relay, x: np.ndarray, period: float, implicit: bool) -> float:
+    """Largest |w| (unit of x per s) of x_{n+1} = x_n - T k s_n + T w_n for the samples x [N], s_n the share of its gain
+    that the relay used."""
+    k, p = relay
+    used = share(x[:-1], period * k, p) if implicit else smooth_sign(x[:-1], p)
+    return float(np.max(np.abs(np.diff(x) / period + k * np.asarray(used)), initial=0.0))
+
+
+def band(relay: Relay, W: float, period: float, implicit: bool) -> float:
+    """A b, in the unit of x, that |x| does not exceed again under a disturbance of its rate up to W; inf where k does
+    not exceed W.
+
+    The same holds of any larger b. Implicit: b = T W + x_W, k sgn_p(x_W) = W, for from |x| <= b the step ends at no
+    more than x_W. Explicit: the same where T k sgn_p is no steeper than 1, so that x does not change sign; else
+    also T (k + W).
     """
+    k, p = float(relay.gain), math.inf if relay.steepness is None else float(relay.steepness)
     if not k > W:
         return math.inf
-    T, layer = sampling.period, math.tan(math.pi / 2 * W / k) / p
-    if sampling.late:
-        return layer + (1 + sampling.late) * T * (k + W)
-    drift = sampling.delay * T * W
-    steep = not sampling.implicit and T * k * 2 / math.pi * p > 1
-    return drift + max(T * W + layer, T * (k + W) if steep else 0.0)
-
-
-def twisting_band(k_1: float, k_2: float, p: float, L: float, sampling: Sampling) -> float | None:
-    """The band of x under the super-twisting law and a disturbance whose rate is up to L: T^2 L, p inf.
-
-    R. Seeber and B. Andritsch, Automatica 173 (2025) 112027, for k_2 > L and k_1 > sqrt(k_2 + L). None where nothing is
-    proven: for smoothed signs, explicit steps and delays.
-    """
-    if sampling.delay or not sampling.implicit or math.isfinite(p):
-        return None
-    return sampling.period**2 * L if k_2 > L and k_1 > math.sqrt(k_2 + L) else math.inf
+    balanced = period * W + math.tan(math.pi / 2 * W / k) / p
+    steep = not implicit and period * k * TWO_OVER_PI * p > 1
+    return max(balanced, period * (k + W)) if steep else balanced

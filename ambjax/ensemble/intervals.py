@@ -21,6 +21,8 @@ REPLICATES = 1000
 STATISTICS = ("mean", "std", "cvar")
 # A group is this part of its rank, from the nearer end, wide.
 WIDTH = 512
+# Values in the tail from which on the largest value bounds a CVaR: see `bootstrap`.
+TAIL = 10
 # Counts held at once: 16 MB an array.
 MOST_COUNTS = 2_000_000
 # Variance, in units of the largest deviation squared, below which values are taken for one.
@@ -84,8 +86,13 @@ def bootstrap(
 
     An end is infinite where the ensemble is too small to bound it. Of 95 % intervals from 200 members, 93 to 97 %
     enclose a CVaR of normal, lognormal and bounded values, and a standard deviation of normal and bounded ones; of a
-    lognormal's, 87 %: its fourth moment is not seen in so few, and a summary says so. Raises ValueError for a column
-    that is empty or not finite, and unless 0 <= alpha < 1.
+    lognormal's, 87 %: its fourth moment is not seen in so few, and a summary says so.
+
+    The upper end of a CVaR is never a number above the column's largest value. With TAIL or more values in the tail it
+    is at most the largest value; the slow tests hold the coverage of that. With fewer the true CVaR lies above the
+    largest value too often (for 37 % of samples of 50 normal values), and such an end is infinite.
+
+    Raises ValueError for a column that is empty or not finite, and unless 0 <= alpha < 1.
     """
     if not 0 <= alpha < 1:
         raise ValueError(f"alpha = {alpha:g}: it must be at least 0 and below 1.")
@@ -100,21 +107,30 @@ def bootstrap(
         scale = np.abs(x[[0, -1]] - centre).max() or 1.0
         y = (x - centre) / scale
         powers.append([np.add.reduceat(y**k, edges[:-1]) / sizes for k in (1, 2, 3, 4)])
-        places.append((centre, scale, x.std(ddof=min(n - 1, 1)), _tail_counts(np.ones((1, n)), tail)[0] @ x / tail))
+        worst = _tail_counts(np.ones((1, n)), tail)[0] @ x / tail
+        places.append((centre, scale, x.std(ddof=min(n - 1, 1)), worst, x[-1]))
     G = np.moveaxis(np.array(powers), 0, -1)
     batches = [_moments(counts, G, n, tail) for counts in _resamples(n, sizes, seed)]
     resamples = {kind: [np.concatenate([batch[kind][k] for batch in batches]) for k in (0, 1)] for kind in STATISTICS}
     whole = _moments(sizes[None].astype(float), G, n, tail)
-    centre, scale, std, worst = np.array(places).T
+    centre, scale, std, worst, largest = np.array(places).T
     ends = {kind: _studentised_ends(whole[kind], resamples[kind], confidence) for kind in STATISTICS}
     nothing = np.full(len(std), -np.inf), np.full(len(std), np.inf)
     ends |= {kind: nothing for kind in STATISTICS if n < 3 or (kind == "cvar" and tail <= 1)}  # one value has no error
     unbiased = (n / max(n - 1, 1)) ** 0.5
+    low, high = (scale * end + centre for end in ends["cvar"])
     return {
         "mean": Estimate(centre, *(scale * end + centre for end in ends["mean"])),
         "std": Estimate(std, *(scale * unbiased * np.exp(end) for end in ends["std"])),
-        "cvar": Estimate(worst, *(scale * end + centre for end in ends["cvar"])),
+        "cvar": Estimate(worst, low, _bounded(high, largest, scale, tail)),
     }
+
+
+def _bounded(high: np.ndarray, largest: np.ndarray, scale: np.ndarray, tail: float) -> np.ndarray:
+    """Upper ends of a CVaR [columns] of so many tail values: none is a number above the largest value."""
+    beyond = high - largest > 1e-9 * scale  # more than rounding
+    unknown = np.isinf(high) | (beyond & (tail < TAIL * (1 - 1e-9)))
+    return np.where(unknown, np.inf, np.minimum(high, largest))
 
 
 def _moments(counts: np.ndarray, G: np.ndarray, n: int, tail: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:

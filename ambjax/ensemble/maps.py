@@ -18,6 +18,8 @@ from ambjax.simulation.metrics import standard_for
 from ambjax.world.scenario import Scenario
 
 PERIOD = "clock.sample_period"
+# A cell is sure of its survival where the lower end of its interval is at least this share.
+SURE = 0.95
 # Fields of a Map by cell.
 GRIDS = ("survival", "low", "high", "error", "lost", "stalled")
 
@@ -34,7 +36,8 @@ class Map(NamedTuple):
     """Results by cell [ny, nx]: share of survivors with its 95 % interval, and the median settled |z - r|, m.
 
     The error is NaN where no member of the cell survives. `lost` and `stalled` count the members that do not survive:
-    of the latter the integrator gave up, and their fate is not known. `drawn`: dotted paths of what was spread.
+    of the latter the integrator gave up, and their fate is not known. `members`: runs of each cell. `varied`: whether
+    they differ, by noise or by what was spread. `drawn`: dotted paths of the latter.
     """
 
     x: Axis
@@ -45,14 +48,28 @@ class Map(NamedTuple):
     error: np.ndarray
     lost: np.ndarray
     stalled: np.ndarray
+    members: int
+    varied: bool = True
     drawn: tuple[str, ...] = ()
 
+    @property
+    def decisive(self) -> bool:
+        """Whether members differ, and a cell has enough of them for its interval to lie above SURE if all survive."""
+        return self.varied and bool(wilson(self.members, self.members).low >= SURE)
+
+    @property
+    def middle(self) -> int:
+        """Number of the row of y nearest the middle of its range."""
+        return int(np.argmin(np.abs(self.y.values - (self.y.values[0] + self.y.values[-1]) / 2)))
+
     def reach(self) -> tuple[float, float] | None:
-        """Ends of the stretch of x in which all members survive, on the row of y nearest the middle of its range."""
-        middle = (self.y.values[0] + self.y.values[-1]) / 2
-        row = self.survival[np.argmin(np.abs(self.y.values - middle))]
-        held = self.x.values[row == 1]
-        return (float(held[0]), float(held[-1])) if held.size else None
+        """Ends of the longest unbroken stretch of x in which all members survive, on the middle row of y."""
+        held = np.concatenate([[False], self.survival[self.middle] == 1, [False]])
+        begin, end = np.flatnonzero(held[1:] & ~held[:-1]), np.flatnonzero(held[:-1] & ~held[1:]) - 1
+        if not begin.size:
+            return None
+        longest = int(np.argmax(end - begin))
+        return float(self.x.values[begin[longest]]), float(self.x.values[end[longest]])
 
 
 def grid(study: Study, x: Axis, y: Axis) -> Map:
@@ -76,7 +93,18 @@ def grid(study: Study, x: Axis, y: Axis) -> Map:
     median[held] = np.nanmedian(np.where(ended, np.nan, error)[held], axis=-1)
     counts = np.sum(ended & ~stalled, axis=-1), np.sum(stalled, axis=-1)
     paths = tuple(path for path, _ in _entries(study, (x.path, y.path)))
-    return Map(x, y, survival.value, survival.low, survival.high, median, *counts, paths)
+    return Map(
+        x,
+        y,
+        survival.value,
+        survival.low,
+        survival.high,
+        median,
+        *counts,
+        study.members,
+        bool(paths) or study.scenario.random,
+        paths,
+    )
 
 
 def stepped(study: Study, x: Axis, y: Axis) -> Study:

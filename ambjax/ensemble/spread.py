@@ -19,8 +19,9 @@ from ambjax.ensemble.paths import Place, order_pairs, places, with_values
 from ambjax.numerics.records import numbers, within
 from ambjax.world.scenario import Scenario
 
-# How the paths begin on whose values a step depends: what else an amplifier or a sensor does is solved whatever it is.
-STEP = ("plant.", "controller.", "actuator.bandwidth", "run.clearance")
+# How the paths begin on whose values a step depends: a disturbance has edges at which steps end. Whatever else an
+# amplifier or a sensor does is solved exactly.
+STEP = ("plant.", "controller.", "actuator.bandwidth", "run.clearance", "disturbance.")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,15 +7,17 @@ from typing import Any
 import numpy as np
 
 from ambjax.ensemble.drivers import drivers
-from ambjax.ensemble.intervals import STATISTICS, Estimate, bootstrap, column_of, quantile, wilson
+from ambjax.ensemble.intervals import STATISTICS, TAIL, Estimate, bootstrap, column_of, quantile, wilson
 
-# The share of members that CVaR leaves out, and how many must be left for its interval to hold (measured).
-ALPHA, TAIL = 0.95, 10
+# The share of members that CVaR leaves out.
+ALPHA = 0.95
 # From this kurtosis on, an exponential's, a tail is heavy (a normal's is 3), and how many of the 95 % intervals of a
 # lognormal's standard deviation cover it then, in per cent, by members (measured over 600 to 2,000 ensembles).
 HEAVY, COVERED = 9.0, {50: 83, 200: 87, 1000: 90, 5000: 92}
 # The metric by which members are ranked once all lost ones are named.
 DECIDING = "settled_max_abs_error_m"
+# Of whom a summary's metrics and their drivers are.
+OF = "survivors"
 # Columns that are no metrics.
 FATE = ("index", "lost_at", "lost", "stalled", "lost_at_s")
 SPREAD = "spread."
@@ -30,14 +32,20 @@ def summary(
     deciding: str = DECIDING,
     worst: int = 10,
 ) -> dict[str, Any]:
-    """What an ensemble says, ready for JSON: no arrays, and None for what is infinite.
+    """Statistics of an ensemble, ready for JSON: no arrays, and None for what is infinite or unknown.
 
     `columns` are those of members.npz, arrays [N]: index, lost_at (s, +inf: ran to the end), stalled, the metrics, and
     "spread." + path for each of `spread_names`. A member survives, is lost, or is stalled: the integrator gave up, and
-    its fate is not known. Statistics count every member, those too. Of a metric that is infinite for some (a time never
-    reached) there are quantiles, but no mean, standard deviation or CVaR; `finite` counts the others. `drivers` and
-    `explained` are those of `ensemble.drivers.drivers`, for each metric and for lost_at_s. `worst` names members: lost
-    and stalled ones by when, then by `deciding`. `notes` say what this ensemble is too small for.
+    its fate is not known.
+
+    The metrics and what drives them are statistics of the survivors (`metrics_of`): a rotor that is lost is frozen, and
+    from then on its voltage, current and chatter are 0. Lost and stalled members count in `survival`, in the drivers of
+    lost_at_s and in `worst`. Of a metric that is infinite for some survivors (a time never reached) there are
+    quantiles, but no mean, standard deviation or CVaR; `finite` counts the others. Without survivors every statistic is
+    None. `drivers` and `explained` are those of `ensemble.drivers.drivers`. `worst` lists lost and stalled members by
+    time, then survivors by `deciding`. `notes` name the statistics for which this ensemble is too small.
+
+    Raises ValueError where there is no column `deciding`, and for columns that are not one number for each member.
     """
     lost_at = column_of(columns["lost_at"])
     metrics = {k: column_of(v) for k, v in columns.items() if k not in FATE and not k.startswith(SPREAD)}
@@ -46,8 +54,9 @@ def summary(
     ended = np.isfinite(lost_at)
     stalled = ended & np.asarray(columns["stalled"], bool)
     survivors = int(np.sum(~ended))
-    ranking, accounts = drivers(
-        {path: column_of(columns[SPREAD + path]) for path in spread_names}, metrics | {"lost_at_s": lost_at}, confidence
+    held = {name: x[~ended] for name, x in metrics.items()}
+    ranking, accounts = _drivers(
+        {path: column_of(columns[SPREAD + path]) for path in spread_names}, held, lost_at, confidence
     )
     return {
         "members": len(lost_at),
@@ -57,21 +66,39 @@ def summary(
         "survival": _plain(wilson(survivors, len(lost_at), confidence)),
         "confidence": confidence,
         "seed": int(seed),
-        "notes": _notes(len(lost_at), metrics, confidence),
-        "metrics": _metrics(metrics, seed, confidence),
+        "notes": _notes(survivors, held, confidence),
+        "metrics_of": OF,
+        "metrics": _metrics(held, seed, confidence),
         "drivers": ranking,
         "explained": accounts,
         "worst": _worst(np.asarray(columns["index"]), lost_at, stalled, deciding, metrics[deciding], worst),
     }
 
 
+def _drivers(
+    spread: dict[str, np.ndarray], held: dict[str, np.ndarray], lost_at: np.ndarray, confidence: float
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What drives each metric among the survivors, and when members are lost among all, as `drivers` returns them."""
+    ended = np.isfinite(lost_at)
+    if ended.all():
+        nothing = {"alone": 0.0, "pair": None, "says": "no member survives"}
+        parts = [({name: [] for name in held}, {name: dict(nothing) for name in held})]
+    else:
+        parts = [drivers({path: x[~ended] for path, x in spread.items()}, held, confidence)]
+    parts.append(drivers(spread, {"lost_at_s": lost_at}, confidence))
+    ranking, accounts = ({name: x for part in parts for name, x in part[k].items()} for k in (0, 1))
+    return ranking, accounts
+
+
 def _notes(n: int, metrics: Mapping[str, np.ndarray], confidence: float) -> list[str]:
-    """What an ensemble of n is too small for: a CVaR's interval, and that of a standard deviation of heavy tails."""
+    """For what n survivors are too few: the interval of a CVaR, and that of a standard deviation of heavy tails."""
+    if not n:
+        return ["no member survives: there are no statistics of the metrics"]
     notes, sure, tail = [], f"{100 * confidence:g} %", (1 - ALPHA) * n
     if tail < TAIL:
         least = math.ceil(TAIL / (1 - ALPHA) - 1e-9)
-        rests = f"the mean of the worst 5 % rests on {tail:.3g} members"
-        notes.append(f"{rests}: its {sure} interval may cover less; take {least} members")
+        rests = f"the mean of the worst 5 % rests on {tail:.3g} survivors"
+        notes.append(f"{rests}: its {sure} interval may cover less, or have no upper end; it needs {least}")
     heavy = [name for name, x in metrics.items() if np.isfinite(x).all() and _kurtosis(x) > HEAVY]
     if heavy:
         which = ", ".join(heavy[:3]) + f" and {len(heavy) - 3} more" * (len(heavy) > 3)
@@ -99,7 +126,7 @@ def _plain(estimate: Estimate) -> dict[str, float | None]:
 
 
 def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) -> dict[str, Any]:
-    finite = [name for name, x in metrics.items() if np.isfinite(x).all()]
+    finite = [name for name, x in metrics.items() if x.size and np.isfinite(x).all()]
     intervals = bootstrap([metrics[name] for name in finite], ALPHA, confidence, seed) if finite else {}
     nothing = Estimate(np.inf, np.inf, np.inf)
     out = {}
@@ -108,10 +135,11 @@ def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) ->
         mean, std, worst = (
             nothing if at is None else Estimate(*(part[at] for part in intervals[kind])) for kind in STATISTICS
         )
-        q05, median, q95 = (Estimate(*row) for row in zip(*quantile(x, [0.05, 0.5, 0.95], confidence), strict=True))
+        some = quantile(x, [0.05, 0.5, 0.95], confidence) if x.size else Estimate(*np.full((3, 3), np.inf))
+        q05, median, q95 = (Estimate(*row) for row in zip(*some, strict=True))
         estimates = {"mean": mean, "std": std, "median": median, "q05": q05, "q95": q95, "cvar_95": worst}
         out[name] = {k: _plain(v) for k, v in estimates.items()}
-        out[name] |= {"max": _number(x.max()), "finite": int(np.isfinite(x).sum())}
+        out[name] |= {"max": _number(x.max(initial=-np.inf)), "finite": int(np.isfinite(x).sum())}
     return out
 
 

@@ -52,7 +52,10 @@ class Survey(NamedTuple):
 
 
 class Store:
-    """A directory that holds a study of `members` members in chunks of `chunk` (None: as the directory has it)."""
+    """A directory that holds a study of `members` members in chunks of `chunk` members.
+
+    `chunk` None: the size that the directory has recorded; 0 until `cut` chooses one.
+    """
 
     def __init__(self, directory: pathlib.Path, facts: dict[str, Any], members: int, chunk: int | None):
         self.directory, self.members = directory, members
@@ -80,12 +83,20 @@ class Store:
             self._check_room(columns)
 
     def begin(self) -> None:
-        """Make the directory ready for what `check` has let pass. Raises ValueError where it cannot be written."""
+        """Mark the directory as this study's, so that a run that is killed from here on can be resumed.
+
+        Call it after `check`. Raises ValueError where the directory cannot be written.
+        """
         self.directory.mkdir(parents=True, exist_ok=True)
         self._tell()
         self.chunks.mkdir(exist_ok=True)
         for left in (path for name in ("chunks/", RESULT, MANIFEST) for path in self.directory.glob(f"{name}*.part")):
             left.unlink()
+
+    def cut(self, chunk: int) -> None:
+        """Record the number of members of a chunk. Raises ValueError where the directory cannot be written."""
+        self.chunk = chunk
+        self._tell()
 
     def survey(self) -> Survey:
         """What is not there yet; every chunk that is there is read and held against its seal."""
@@ -113,7 +124,9 @@ class Store:
         return Survey(sorted(missing), remarks)
 
     def spans(self) -> list[Span]:
-        """All chunks in order: (first member, one past the last)."""
+        """All chunks in order: (first member, one past the last). None before `cut`."""
+        if not self.chunk:
+            return []
         return [(n, min(n + self.chunk, self.members)) for n in range(0, self.members, self.chunk)]
 
     def count(self) -> int:
@@ -154,7 +167,7 @@ class Store:
         return bool(self.result) and self.path.is_file() and _digest(self.path) == self.result
 
     def _tell(self) -> None:
-        content = self.facts | {"chunk": self.chunk} | ({RESULT: self.result} if self.result else {})
+        content = self.facts | {"chunk": self.chunk or None} | ({RESULT: self.result} if self.result else {})
         text = json.dumps(content | {CHECKSUM: checksum_of(content)}, indent=2).encode() + b"\n"
         write_whole(self.manifest, lambda file: file.write(text))
 
@@ -163,10 +176,11 @@ class Store:
             record = dict(json.loads(self.manifest.read_text(encoding="utf-8")))
             if record.pop(CHECKSUM, None) != checksum_of(record):
                 raise ValueError("its checksum is wrong")
-            self.chunk, self.result = self.asked or int(record["chunk"]), str(record.pop(RESULT, ""))
+            kept, self.result = int(record.pop("chunk") or 0), str(record.pop(RESULT, ""))
+            self.chunk = self.asked or kept
         except (OSError, TypeError, ValueError, KeyError, RecursionError) as error:
             raise ValueError(f"{self.manifest}: cannot be read ({error}). Choose another --out.") from None
-        differs = difference(record, self.facts | {"chunk": self.chunk})
+        differs = difference(record | {"chunk": kept or self.chunk}, self.facts | {"chunk": self.chunk})
         if differs:
             raise ValueError(
                 f"--resume: {self.directory} holds another study: {differs}. Make them equal, or choose another --out."

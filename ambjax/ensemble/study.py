@@ -1,25 +1,46 @@
 """A study: one case, how it is spread, a seed and a number of members; any part of it can be run anywhere."""
 
 import dataclasses
-from typing import Any
+import math
+import shlex
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ambjax.control.cascade import Cascade
+from ambjax.ensemble.blocks import Blocks
 from ambjax.ensemble.engine import run_ensemble
 from ambjax.ensemble.paths import kinds, places
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.host.sealed import provenance
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.metrics import Named, Variation, standard_for
+from ambjax.simulation.metrics import standard_for
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.scenario import Scenario
 
 SPREAD = "spread."
 # Columns of members.npz beside the spread quantities, at most: to estimate what a study needs on disk.
 COLUMNS = 28
-# Parts of a run over which the chatter of the voltage is told.
+# Parts of a run over each of which the voltage's variation is one number.
 WINDOWS = 25
+# Signals of a fan chart, and the fields of a Row that they are.
+SHOWN = {"z - r": "e_z", "u": "u_mean", "sigma": "sigma"}
+
+
+class Bands(NamedTuple):
+    """What a fan chart shows of some members: instants t [T] (s), trajectories, and signals by name [members, T].
+
+    Signals are NaN from the instant on at which a member is lost. "variation of u" is its total variation per second,
+    V/s, in each of WINDOWS equal parts of the run; NaN from the part on in which a member is lost. `extremes`: for each
+    other signal the smallest and the largest value, each [T], that any member alive has at a sample between the
+    instant before and the instant after; NaN where there is none.
+    """
+
+    t: np.ndarray
+    trajectory: Trajectory
+    signals: dict[str, np.ndarray]
+    extremes: dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +58,11 @@ class Study:
     seed: int
     members: int
 
+    @property
+    def varies(self) -> bool:
+        """Whether two members differ."""
+        return bool(self.spread.entries) or self.scenario.random
+
     def drawn(self, members: np.ndarray) -> dict[str, np.ndarray]:
         """The spread quantities of these members (integers [n]) by dotted path, [n] each."""
         return draw(self.spread, self.cascade, self.scenario, self.seed, members, self.members)
@@ -47,10 +73,19 @@ class Study:
         return cascade, dataclasses.replace(scenario, seed=self.seed, member=members)
 
     def member(self, index: int) -> tuple[Cascade, Scenario]:
-        """One member alone, leaves numbers: what `ambjax simulate --member` runs."""
+        """Cascade and scenario of one member, leaves numbers."""
         values = {path: float(x[0]) for path, x in self.drawn(np.array([index])).items()}
         cascade, scenario = apply(self.cascade, self.scenario, values)
         return cascade, dataclasses.replace(scenario, seed=self.seed, member=index)
+
+    def command(self, case: str, index: int) -> str:
+        """The command that simulates one member by itself; `case` is the path of the case file."""
+        words = ["ambjax", "simulate", case]
+        if self.varies:
+            words += ["--member", str(index), "--seed", str(self.seed)]
+        if self.spread.design == "latin-hypercube":
+            words += ["--members", str(self.members)]
+        return shlex.join(words)
 
     def columns(
         self, start: int, stop: int, *, call: int | None = None, threads: int | None = None, lost: bool = False
@@ -69,28 +104,35 @@ class Study:
         values = {SPREAD + path: x for path, x in self.drawn(members).items()}
         return {"index": members, "lost_at": outcome.trajectory.lost_at, **outcome.measured, **values}
 
-    def bands(self, members: int, times: int) -> tuple[np.ndarray, Trajectory, dict[str, np.ndarray]]:
-        """Times [t], trajectories and signals [n, t] of the first `members` members, at most some `times` instants.
+    def bands(self, members: int, times: int, until: float = math.inf) -> Bands:
+        """What a fan chart shows of the first `members` members, up to the time `until` (s) or the end of the run.
 
-        Signals are NaN from the instant on at which a member is lost. "variation of u" is its total variation per
-        second, V/s, in each of WINDOWS equal parts of the run; NaN from the part on in which a member is lost.
+        Instants: every so many samples that there are at most `times` of them, and the last sample.
         """
+        period = float(self.clock.sample_period)
+        samples = int(min(self.clock.samples, math.ceil(until / period) + 1 if math.isfinite(until) else math.inf))
+        every = -(-samples // times)
+        count = -(-samples // every)
         cascade, scenario = self.batch(np.arange(min(members, self.members)))
-        every = -(-self.clock.samples // times)
-        # whole samples, and half a sample before each: a time may be rounded
-        samples, period = self.clock.samples, float(self.clock.sample_period)
-        ends = period * np.linspace(0, samples, min(WINDOWS, samples) + 1).round()
-        fold = Named({str(k): Variation(after) for k, after in enumerate(ends[:-1] - period / 2)})
-        outcome = run_ensemble(cascade, scenario, self.clock, fold=fold, every=every)
-        rows, t = outcome.trajectory.rows, np.asarray(outcome.trajectory.rows.t[0])
-        curves = {"z - r": rows.z - rows.r, "u": rows.u_mean, "sigma": rows.sigma}
-        signals = {k: np.where(rows.alive, x, np.nan) for k, x in curves.items()}
-        later = [outcome.measured[str(k)] for k in range(len(ends) - 1)]
-        left = np.stack([*later, np.zeros(len(rows.z))], axis=1)  # from each end on
-        rate = -np.diff(left, axis=1) / np.diff(ends)
-        rate[ends[1:] > np.asarray(outcome.trajectory.lost_at)[:, None]] = np.nan
-        part = np.clip(np.searchsorted(ends - period / 2, t, side="right") - 1, 0, len(ends) - 2)
-        return t, outcome.trajectory, signals | {"variation of u": rate[:, part]}
+        fold = Blocks(tuple(SHOWN.values()), every, count, period)
+        clock = dataclasses.replace(self.clock, samples=samples)
+        outcome = run_ensemble(cascade, scenario, clock, fold=fold, every=every)
+        rows, folded = outcome.trajectory.rows, outcome.measured
+        # the last instant too, unless it is that of the last block
+        ends = [(samples - 1) * period] if (samples - 1) % every else []
+        t = np.append(np.asarray(rows.t[0]), ends)
+        signals, extremes = {}, {}
+        for name, of in SHOWN.items():
+            values = np.where(rows.alive, getattr(rows, of), np.nan)
+            signals[name] = np.concatenate([values, folded.last[of][:, None][:, : len(ends)]], axis=1)
+            low, high = folded.low[of].min(axis=0), folded.high[of].max(axis=0)
+            extremes[name] = _beside(low, np.fmin, len(t)), _beside(high, np.fmax, len(t))
+        starts = np.arange(min(WINDOWS, count)) * count // min(WINDOWS, count)
+        edges = period * np.append(every * starts, samples)
+        rate = np.add.reduceat(folded.variation, starts, axis=1) / np.diff(edges)
+        rate[edges[1:] > np.asarray(outcome.trajectory.lost_at)[:, None]] = np.nan
+        part = np.searchsorted(starts, np.minimum(np.arange(len(t)), count - 1), side="right") - 1
+        return Bands(t, outcome.trajectory, signals | {"variation of u": rate[:, part]}, extremes)
 
     def fingerprint(self) -> dict[str, Any]:
         """Everything that a member's numbers depend on, by name, as JSON has it."""
@@ -101,3 +143,10 @@ class Study:
         facts |= {"clock.method": str(self.clock.method), "run.settle": self.settle}
         facts |= {"spread.design": self.spread.design}
         return facts | {SPREAD + path: repr(kind) for path, kind in self.spread.entries}
+
+
+def _beside(blocks: np.ndarray, combine: Callable[[np.ndarray, np.ndarray], np.ndarray], instants: int) -> np.ndarray:
+    """[instants] of what each block has [count]: at an instant, of the blocks that end and begin there; NaN: none."""
+    values = np.where(np.isfinite(blocks), blocks, np.nan)
+    padded = np.concatenate([[np.nan], values, [np.nan]])
+    return combine(padded[:-1], padded[1:])[:instants]

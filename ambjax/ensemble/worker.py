@@ -16,10 +16,14 @@ from ambjax.ensemble.study import Study
 # Members in one call of the compiled program on a CPU. Fixed, because a last digit may depend on it: a study's numbers
 # must not depend on the cores of the machine, nor on where its chunks run.
 CALL = 64
+# Size of the cache of compiled programs, in bytes. JAX removes the entries that were not used for longest.
+CACHE_SIZE = 256 * 2**20
 
 
 def prepare() -> None:
-    """float64 unless JAX_ENABLE_X64 says otherwise, and compilations kept between runs.
+    """Configure JAX for a command: float64 unless JAX_ENABLE_X64 is set, and a cache of compiled programs.
+
+    The cache is bounded and can be shared by processes. JAX_COMPILATION_CACHE_DIR replaces it.
 
     Raises ValueError where JAX has no device of the kind that JAX_PLATFORMS asks for.
     """
@@ -29,12 +33,13 @@ def prepare() -> None:
     if "JAX_ENABLE_X64" not in os.environ:  # jax has been imported by now, so setting it there would be too late
         jax.config.update("jax_enable_x64", True)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        # a home that is none, or that cannot be written, costs time, not correctness; nor is a full disk worth words
+        # Without a cache, because there is no home directory or the disk is full, a run is slower and no less correct.
         warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
         with contextlib.suppress(OSError, RuntimeError):
-            cache = pathlib.Path(platformdirs.user_cache_dir("ambjax")) / "compiled"
+            cache = pathlib.Path(platformdirs.user_cache_dir("ambjax")) / "programs"
             cache.mkdir(parents=True, exist_ok=True)
             jax.config.update("jax_compilation_cache_dir", str(cache))
+            jax.config.update("jax_compilation_cache_max_size", CACHE_SIZE)
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
     if platforms := os.environ.get("JAX_PLATFORMS"):
         try:

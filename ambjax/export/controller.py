@@ -1,10 +1,11 @@
 """What is exported: the step that the simulator runs, with what it reads, keeps and gives, each by name.
 
-`Controller.step` is `Sampled.decided`, within it the check of the inputs and the start from the first good measurement.
+`Controller.step` is `Sampled.decided`, the guard of the readings in it, behind a check of all other inputs.
 """
 
 import dataclasses
 import functools
+import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.cascade import Cascade, CascadeState, Command
+from ambjax.control.guard import GAPS, Watch, guarded
 from ambjax.numerics.records import Scalar, leaf, numbers, record
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled, SampledState
@@ -21,9 +23,9 @@ from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 
 (U_MAX,) = (field for field in dataclasses.fields(Scenario) if field.name == "u_max")
-# Ends of the inputs that are believed, in the model's sizes: gaps, a gap within a sample, bias currents.
-GAPS, CURRENTS = 2.0, 100.0
 NEAR = 0.1
+# Factor by which a parameter is divided and multiplied to reach the ends at which the C is compared with JAX.
+SPAN = 100.0
 
 
 def _end(of: str, unit: str) -> Any:
@@ -32,15 +34,12 @@ def _end(of: str, unit: str) -> Any:
 
 @record
 class Limits:
-    """Where the step no longer does what it is asked: the supply's end, and those of its inputs."""
+    """The supply's limit, and those of the reference: GAPS gaps, and that in a sample for each further derivative."""
 
     u_max: Scalar = dataclasses.field(metadata=U_MAX.metadata)
     near: Scalar = leaf(
         unit="1", at_least=-1e30, at_most=1, doc="where Eq. (9), 1 at rest and 0 on the singular curve, counts as near"
     )
-    z: Scalar = _end("z", "m")
-    z_dot: Scalar = _end("z_dot", "m/s")
-    i: Scalar = _end("i", "A")
     r: Scalar = _end("r", "m")
     r_dot: Scalar = _end("r_dot", "m/s")
     r_ddot: Scalar = _end("r_ddot", "m/s^2")
@@ -66,6 +65,8 @@ class Memory(NamedTuple):
     last: Command
     before: Array
     """voltage of the sample before the last, V"""
+    watch: Watch | tuple[()]
+    """state of the guard"""
     started: Array
 
 
@@ -76,6 +77,8 @@ class Status(NamedTuple):
     refused: Array
     failed: Array
     singular: Array
+    safe: Array
+    invalid: Array
 
 
 class Answer(NamedTuple):
@@ -104,20 +107,27 @@ OUTPUTS = {
 }
 BITS = {
     "saturated": "u is at the supply's limit",
-    "refused": "an input or params->processor.delay is NaN or out of range: nothing was computed, u is held",
+    "refused": "a reading is NaN, beyond its limit or too far from the expected one, which took its place",
     "failed": "a law gave no finite number: its state is kept, u is held",
     "singular": "(z, i_ref) is near the singular curve of Eq. (9)",
+    "safe": "u is 0, the laws wait: readings are refused for more than guard.samples, or from the start",
+    "invalid": "the reference, params->processor.delay or a steepness p is NaN or out of range: u is held",
 }
 
 
 class Number(NamedTuple):
-    """A parameter or a state: dotted name, unit, what is allowed, meaning, value."""
+    """A parameter or a state: dotted name, unit, what is allowed, meaning, value.
+
+    `ends`: of a parameter, the values at which the C is compared with JAX beside the case's: the lowest and the highest
+    first, then those that are not finite or that a step must refuse.
+    """
 
     name: str
     unit: str
     allowed: str
     doc: str
     value: float
+    ends: tuple[float, ...] = ()
 
 
 class Parameters(NamedTuple):
@@ -140,30 +150,39 @@ class Controller:
         """One sample. Inputs that are not in `read` are not looked at, nor is the delay where nothing is predicted."""
         cascade, limits = parameters
         measured = Measurement(*inputs[:3])
-        fine = [jnp.abs(getattr(inputs, name)) <= getattr(limits, name) for name in Inputs._fields if name in read]
+        fine = [jnp.abs(getattr(inputs, name)) <= getattr(limits, name) for name in Inputs._fields[3:] if name in read]
         processor: Any = cascade.processor
-        if processor.predicts:  # the prediction's parts are those of the delay that was exported
+        if processor.predicts or processor.guard is not None:  # the parts of a prediction are those of this delay
             fine += [processor.delay >= 0, processor.delay <= processor.most]
-        good = functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
-        laws = choose(memory.started, memory.laws, cascade.init(measured))
-        system = Sampled(ClosedLoop(cascade, Scenario(u_max=limits.u_max)), period)
-        state = SampledState((), laws, memory.last, (memory.before, memory.before), jnp.ones(()), (), ())
+        fine += [jnp.isfinite(p) for p in _steepnesses(cascade)]  # p = inf is another program
+        valid = functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
+        system = Sampled(ClosedLoop(cascade, Scenario(u_max=limits.u_max)), period, 0)
+        past = (memory.before, memory.before)
+        state = SampledState((), memory.laws, memory.last, past, jnp.ones(()), (), (), memory.watch, memory.started, ())
         after = system.decided(measured, Reference(*inputs[3:]), state)
-        last = choose(good, after.command, memory.last)
-        kept = Memory(choose(good, after.control, memory.laws), last, after.past[0], memory.started | good)
+        last = choose(valid, after.command, memory.last)
+        watch, refused, safe = after.watch, jnp.asarray(False), jnp.asarray(False)
+        if processor.guard is not None:
+            refused, safe = processor.guard.refused(memory.watch, watch)
+        laws, started = choose(valid, (after.control, after.started), (memory.laws, memory.started))
+        # an invalid sample breaks off what is expected: the next reading within its limits is accepted
+        kept = Memory(laws, last, after.past[0], choose(valid, watch, jax.tree.map(jnp.zeros_like, watch)), started)
         status = Status(
             jnp.abs(last.u) >= limits.u_max,
-            ~good,
-            good & (after.sane == 0),
-            good & (cascade.model.singularity(measured.z, last.i_ref) <= limits.near),
+            valid & refused,
+            valid & (after.sane == 0),
+            valid & ~refused & (cascade.model.singularity(measured.z, last.i_ref) <= limits.near),
+            valid & safe,
+            ~valid,
         )
         return kept, Answer(last.u, last.i_ref, last.v_star, last.v_tilde), status
 
     def start(self) -> Memory:
-        """Before the first step: no voltage, laws without a state."""
+        """Before the first step: no voltage, laws without a state, no reading expected."""
         cascade, zero = self.parameters.controller, jnp.zeros(())
         laws = jax.tree.map(jnp.zeros_like, cascade.init(Measurement(zero, zero, zero)))
-        return Memory(laws, Command(*[zero] * 5), zero, jnp.asarray(False))
+        guard = cascade.processor.guard if cascade.processor else None
+        return Memory(laws, Command(*[zero] * 5), zero, guard.start() if guard else (), jnp.asarray(False))
 
 
 def choose(condition: Array, a: Any, b: Any) -> Any:
@@ -171,8 +190,12 @@ def choose(condition: Array, a: Any, b: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
-def controller_of(cascade: Cascade, u_max: Scalar, period: float) -> Controller:
-    """The controller of a case. Raises ValueError for one without [processor]."""
+def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scenario | None = None) -> Controller:
+    """The controller of a case. Raises ValueError for one without [processor].
+
+    `scenario`: clearance and sensors, from which limits of the guard are derived that are not given. None: the model's
+    own clearance, and sensors without error.
+    """
     if cascade.processor is None:
         raise ValueError(
             "[processor] is missing: what runs on a processor is exported, and this case is in continuous time. Add "
@@ -180,9 +203,8 @@ def controller_of(cascade: Cascade, u_max: Scalar, period: float) -> Controller:
         )
     cascade, period = cascade.on_processor(), float(period)
     model = cascade.model
-    gap, current = GAPS * float(model.s_0), CURRENTS * float(model.i_0)
-    rates = [gap / period**n for n in range(4)]
-    limits = Limits(u_max, NEAR, gap, rates[1], current, *rates)  # pyright: ignore[reportCallIssue]
+    cascade = guarded(cascade, scenario or Scenario(plant=model), period)
+    limits = Limits(u_max, NEAR, *(GAPS * float(model.s_0) / period**n for n in range(4)))
     plain = jax.tree.map(lambda x: float(x) if jnp.shape(x) == () else x, Parameters(cascade, limits))
     return Controller(plain, period)
 
@@ -192,8 +214,17 @@ def parameters_of(parameters: Parameters) -> list[Number]:
     found = [*_numbers(parameters.controller, ""), *_numbers(parameters.limits, "limits.")]
     assert [x.value for x in found] == [float(x) for x in jax.tree.leaves(parameters)]
     processor: Any = parameters.controller.processor
-    ends = {"processor.delay": f"from 0 to {processor.most}"}
-    return [x._replace(allowed=ends.get(x.name, x.allowed)) for x in found]
+    most = float(processor.most)
+    delay = {"allowed": f"from 0 to {processor.most}", "ends": (0.0, most, most + 0.5, -0.5, math.nan)}
+    return [x._replace(**delay) if x.name == "processor.delay" else x for x in found]
+
+
+def _steepnesses(cascade: Cascade) -> list[Any]:
+    """The steepnesses of the smoothed signs of all laws."""
+    laws: tuple[Any, ...] = cascade.laws
+    fields = [(law, field) for law in laws for field in dataclasses.fields(law)]
+    found = [getattr(law, field.name) for law, field in fields if field.metadata.get("steepness")]
+    return [p for p in found if p is not None]
 
 
 def _numbers(node: Any, path: str) -> Iterator[Number]:
@@ -215,4 +246,20 @@ def _number(name: str, field: dataclasses.Field, value: float) -> Number:
     allowed = numbers(field) if meta.get("leaf") else ""
     for word in (f" ({unit})", "a finite number ", "a number "):
         allowed = allowed.replace(word, "")
-    return Number(name, unit, allowed, doc, value)
+    if meta.get("steepness"):
+        allowed = allowed.replace(", or inf", ", finite: set p = inf in the case and export again")
+    return Number(name, unit, allowed, doc, value, _ends(meta, value))
+
+
+def _ends(meta: Any, value: float) -> tuple[float, ...]:
+    """The values at which a parameter is compared beside the case's: SPAN below and above it, within what is allowed.
+
+    A parameter that is 0 goes to -1 and 1 in its unit, one that is inf to 1 and 100.
+    """
+    low, high = sorted((value / SPAN, value * SPAN)) if value else (-1.0, 1.0)
+    if math.isinf(value):
+        low, high = 1.0, SPAN
+    floors = [x for x in (meta.get("above"), meta.get("at_least")) if x is not None]
+    ceiling = meta.get("at_most")
+    low, high = max([low, *floors]), high if ceiling is None else min(high, ceiling)
+    return (low, high, math.inf, math.nan) if meta.get("infinite") else (low, high, math.nan)

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from ambjax.export.primitives import CALLS, OPS, SAME
+from ambjax.export.primitives import CALLS, OPS, SAME, is_reciprocal
 from ambjax.export.program import Operand, Program, Ref, of
 
 LOOPS = ("scan", "while")
@@ -56,6 +56,9 @@ class _Reader:
         return [value(x) for x in jaxpr.outvars]
 
     def equation(self, name: str, eqn: Any, args: list[Operand], law: str) -> list[Operand]:
+        if is_reciprocal(eqn):
+            dtype = np.dtype(eqn.outvars[0].aval.dtype)
+            return [self.program.apply("div", (np.ones((), dtype)[()], args[0]), dtype, law)]
         if name in CALLS:
             inner = next(eqn.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in eqn.params)
             return self.closed(inner, args, law) if isinstance(inner, ClosedJaxpr) else self.jaxpr(inner, [], args, law)

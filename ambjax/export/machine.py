@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from ambjax.export.controller import INPUTS
-from ambjax.export.reference import Points, Results
+from ambjax.export.points import Points
+from ambjax.export.reference import Results
 from ambjax.export.statements import PRECISIONS
 from ambjax.export.trace import Trace
 
@@ -155,9 +156,12 @@ class Compiled:
         count = at.started.size
         state, started = np.empty_like(at.state), np.empty(count, bool)
         outputs, bits = np.empty((len(self.outputs), count), at.state.dtype), np.empty(count, np.int64)
+        own = self.parameters.copy()
         for n in range(count):
+            self.parameters[:] = at.parameters[:, n]
             self.state["numbers"], self.state["started"] = at.state[:, n], at.started[n]
             self.inputs[:] = at.inputs[:, n]
             bits[n] = self.step()
             state[:, n], started[n], outputs[:, n] = self.state["numbers"], self.state["started"], self.outputs
+        self.parameters[:] = own
         return Results(state, started, outputs, bits)

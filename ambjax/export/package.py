@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 
 from ambjax.export.controller import INPUTS, OUTPUTS, Controller
-from ambjax.export.reference import Points, Results, points, results
-from ambjax.export.source import Origin, Writer, order_of_work
+from ambjax.export.points import Points, points
+from ambjax.export.reference import Results, results
+from ambjax.export.source import Origin, Writer, fixed, order_of_work
 from ambjax.export.statements import PRECISIONS, literal, word
 from ambjax.export.texts import MAKEFILE, MARK, README, TEST
 from ambjax.export.trace import Trace, trace
+from ambjax.world.sensor import Measurement
 
 # Points of the test program, and the units in the last place, or the share, by which the C may be off JAX.
 VECTORS = 100
@@ -91,6 +93,10 @@ def _initialisers(writer: Writer, struct: str, names: list[str], values: np.ndar
 def _test(writer: Writer) -> str:
     p, t = writer.prefix, writer.trace
     share, small = tolerance(t.precision)
+    guard = any(x.name == "watch.left" for x, _ in t.state)
+    unseen = f"(status & {p}_REFUSED) == 0u || isnan(output.u) || ((status & {p}_SAFE) != 0u && differs(output.u, 0))"
+    if not guard:
+        unseen = f"(status & {p}_FAILED) == 0u || differs(output.u, u) || differs(state->last.u, u)"
     abs_ = "fabsf" if t.precision == "float" else "fabs"
     checks = []
     for struct, there, names in (
@@ -103,6 +109,9 @@ def _test(writer: Writer) -> str:
         p=p,
         P=p.upper(),
         abs=abs_,
+        readings=len(Measurement._fields),
+        told="refused" if guard else "believed, and a law fails",
+        unseen=unseen,
         share=literal(share, t.precision),
         small=literal(small, t.precision),
         checks="\n".join(checks),
@@ -124,11 +133,19 @@ def _readme(writer: Writer) -> str:
         case=writer.origin.case,
         cascade="\n".join(f"- {line}" for line in writer.origin.cascade),
         order="\n".join(order_of_work(t)),
+        fixed="\n".join(fixed(t)),
+        yours="\n".join(f"{p}_real {_source(name)}(void);" for name in INPUTS if name in t.read),
+        reads="\n".join(f"    input.{name} = {_source(name)}();" for name in INPUTS if name in t.read),
         flops=t.flops(),
         precision=t.precision,
         period=f"{t.controller.period:g}",
         ulps="1e-5 relative" if t.precision == "float" else f"{ULPS} units in the last place",
     )
+
+
+def _source(name: str) -> str:
+    """The function of the README's example that gives an input: read_z, reference_r_dot."""
+    return f"{'reference' if name.startswith('r') else 'read'}_{name}"
 
 
 def described(controller: Controller) -> list[str]:

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ambjax.numerics.smooth import RECIPROCAL
+
 
 class Op(NamedTuple):
     """C text; NumPy's twin; what it is counted as; whether operands commute, and whether the result is a bool."""
@@ -81,4 +83,10 @@ SAME = ("broadcast_in_dim", "copy", "copy_p", "optimization_barrier", "reshape",
 SAME += ("xla_metadata_value", "pvary")
 # Calls, whose text is that of what they call: derivatives of one's own have no say in a value.
 CALLS = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat2")
+
 COUNTED = ("add", "multiply", "divide", "root", "call")
+
+
+def is_reciprocal(eqn: Any) -> bool:
+    """Whether a call computes 1/x by refining a float32 quotient. Exported code divides once instead."""
+    return eqn.params.get("name") == RECIPROCAL and len(eqn.invars) == len(eqn.outvars) == 1

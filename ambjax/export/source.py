@@ -1,10 +1,13 @@
 """The C of a traced step: header and source."""
 
-from collections.abc import Iterable, Sequence
+import functools
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ambjax._version import __version__
-from ambjax.export.controller import BITS, Number
+from ambjax.export.controller import BITS, INPUTS, Number
 from ambjax.export.statements import Statements, literal, word
 from ambjax.export.texts import HEADER, MARK, SOURCE
 from ambjax.export.trace import UNREAD, Trace
@@ -53,6 +56,23 @@ class Writer:
         closed = ["    " * (k + 1) + f"}} {a[k]};" for k in reversed(range(same, len(a)))]
         return closed + ["    " * (k + 1) + "struct {" for k in range(same, len(b))]
 
+    def values(self, numbers: Sequence[Number]) -> str:
+        """The numbers as an initialiser of their struct, the lines of a macro: each with its name in a comment."""
+        tree: dict[str, Any] = {}
+        for x in numbers:
+            *outer, name = word(x.name).split(".")
+            functools.reduce(lambda node, key: node.setdefault(key, {}), outer, tree)[name] = x.value
+
+        def lines(node: dict[str, Any], depth: int) -> Iterator[str]:
+            yield "{"
+            for k, (name, value) in enumerate(node.items()):
+                inner = lines(value, depth + 1) if isinstance(value, dict) else [literal(value, self.trace.precision)]
+                text = f" \\\n{'    ' * depth}".join(inner)
+                yield f"    /* {name} */ {text}{',' if k < len(node) - 1 else ''}"
+            yield "}"
+
+        return " \\\n".join(lines(tree, 1))
+
     # --- the step ---
 
     def step(self) -> str:
@@ -89,6 +109,7 @@ class Writer:
             banner=self.banner(f"{self.prefix}.c"),
             helpers="".join(f"{line}\n" for line in self.text.helpers()),
             zeros="".join(f"{line}\n" for line in zeros),
+            forgotten="".join(f"{line}\n" for line in zeros if line.strip().startswith("state->watch.left")),
             body=self.step(),
             **{name: self.signature(name) for name in ("init", "reset")},
         )
@@ -105,23 +126,22 @@ class Writer:
         """NAME.h."""
         p, t = self.prefix, self.trace
         inputs = [x._replace(allowed="" if x.name in t.read else UNREAD) for x in t.inputs]
-        gains = [f"    .{word(x.name)} = {literal(x.value, t.precision)}" for x in t.parameters]
         return HEADER.format(
             p=p,
             P=p.upper(),
             banner=self.banner(f"{p}.h"),
             told="\n".join(f" * {line}".rstrip() for line in self.told()),
             real=t.precision,
-            maths="#include <math.h>\n" if any("HUGE_VAL" in x for x in gains) else "",
+            maths="#include <math.h>\n" if any(np.isinf(x.value) for x in t.parameters) else "",
             period=literal(t.controller.period, t.precision),
             bits="\n".join(f"#define {p}_{x.upper()} {1 << k}u /* {BITS[x]} */" for k, (x, _) in enumerate(t.bits)),
             params=self.struct("params", t.parameters),
             state=self.struct(
-                "state", [x for x, _ in t.state], ["uint32_t started; /* 0: the next good input begins */"]
+                "state", [x for x, _ in t.state], ["uint32_t started; /* 0: the next accepted readings begin */"]
             ),
             input=self.struct("input", inputs),
             output=self.struct("output", [x for x, _ in t.outputs]),
-            gains=", \\\n".join(gains),
+            gains=self.values(t.parameters),
             **{name: self.signature(name) for name in ("init", "step", "reset")},
         )
 
@@ -136,6 +156,8 @@ class Writer:
             *self.origin.cascade,
             "",
             *order,
+            "",
+            *fixed(t),
             "",
             f"A step: {t.flops()} flops. {cost}.",
             f"State: {t.state_bytes()} bytes. Stack: at most {stack} bytes, were every intermediate kept.",
@@ -167,7 +189,43 @@ def order_of_work(trace: Trace) -> list[str]:
     ]
     ahead = f"{delay:g} T after the reading" if processor.predicts else "of the reading"
     lines.append(f"The reference is that of the instant {ahead}.")
-    (told,) = (x.allowed for x in trace.parameters if x.name == "processor.delay")
-    if told == UNREAD:
-        return [*lines, "params->processor.delay is not read: nothing is predicted."]
-    return [*lines, f"params->processor.delay: {told}, else every step is refused; for a longer one export again."]
+    return lines
+
+
+def fixed(trace: Trace) -> list[str]:
+    """What is fixed at export, what can be set in params, what a step checks, and how long it replaces or holds."""
+    parameters = {x.name: x for x in trace.parameters}
+    u_max, delay = parameters["limits.u_max"].value, parameters["processor.delay"].allowed
+    lines = [
+        f"Fixed at export: T = {trace.controller.period:g} s, the laws, which signs are hard, whether the delay is",
+        "predicted. Export again to change one of them. All of params may be set between two steps.",
+        f"params->limits.u_max: u is {'not limited' if np.isinf(u_max) else f'limited to +-{u_max:g} V'}.",
+    ]
+    if samples := parameters.get("processor.guard.samples"):
+        time = samples.value * trace.controller.period
+        lines += [
+            f"params->processor.guard: a reading is refused beyond {_ends(trace, 'processor.guard')}, or if it",
+            "cannot follow from the last. The model's prediction takes its place for at most",
+            f"{samples.value:g} samples in a row ({time:g} s); then u = 0.",
+        ]
+    else:
+        lines += ["No guard: readings are not checked."]
+    lines += [f"params->limits: a step is invalid beyond {_ends(trace, 'limits')}."]
+    if delay == UNREAD:
+        lines += ["params->processor.delay is not read: nothing is predicted."]
+    else:
+        lines += [f"params->processor.delay: {delay}, else every step is invalid; for a longer one export again."]
+    for x in (x for x in trace.parameters if "export again" in x.allowed):
+        lines += [f"params->{word(x.name)}: finite, else every step is invalid."]
+    return [
+        *lines,
+        "No other parameter is checked. A law that gives no finite number sets the bit FAILED.",
+        "An invalid or failed step holds u, and so does the next: there is no timeout. The caller decides how long.",
+    ]
+
+
+def _ends(trace: Trace, of: str) -> str:
+    """The largest size of each input that a struct of params allows."""
+    parameters = {x.name: x for x in trace.parameters}
+    found = {name: parameters.get(f"{of}.{name}") for name in INPUTS if name in trace.read}
+    return ", ".join(f"|{name}| = {x.value:g} {x.unit}" for name, x in found.items() if x)

@@ -14,7 +14,10 @@ RESERVED = {
     *("explicit", "export", "extern", "float", "friend", "goto", "inline", "int", "long", "mutable", "namespace"),
     *("new", "operator", "private", "protected", "public", "register", "restrict", "short", "signed", "sizeof"),
     *("static", "struct", "switch", "template", "this", "throw", "typedef", "typename", "union", "unsigned", "using"),
-    *("virtual", "void", "volatile"),
+    *("virtual", "void", "volatile", "alignas", "alignof", "char8_t", "char16_t", "char32_t", "concept", "consteval"),
+    *("constexpr", "constinit", "const_cast", "co_await", "co_return", "co_yield", "decltype", "dynamic_cast"),
+    *("noexcept", "nullptr", "reinterpret_cast", "requires", "static_assert", "static_cast", "thread_local", "true"),
+    *("false", "typeid", "wchar_t", "asm", "compl", "bitand", "bitor", "and_eq", "or_eq", "xor_eq", "not_eq", "xor"),
 }
 HELPERS = {
     "max": "a > b || a != a ? a : b",

@@ -32,16 +32,16 @@ typedef {real} {p}_real;
 /* what a step keeps for the next */
 {state}
 
-/* what a step reads; each within its limit in params->limits */
+/* what a step reads: sensors, each within its limit in params->processor.guard if there is one; the reference, within
+ * params->limits */
 {input}
 
 /* what a step gives */
 {output}
 
-/* the case's numbers */
-#define {P}_DEFAULT {{ \\
-{gains} \\
-}}
+/* the case's numbers, in the order of {p}_params; in C99, and in C++ from C++11 on */
+#define {P}_DEFAULT \\
+{gains}
 
 extern const {p}_params {p}_default;
 
@@ -51,7 +51,7 @@ extern const {p}_params {p}_default;
 /* One sample. Returns the bits above. */
 {step};
 
-/* Laws begin anew with the next good input; the voltages that are on their way stay known. */
+/* Laws begin anew with the next accepted readings; the voltages that are on their way stay known. */
 {reset};
 
 #ifdef __cplusplus
@@ -67,8 +67,8 @@ SOURCE = """{banner}
 
 #include <math.h>
 
-#ifdef __FAST_MATH__
-#error "NaN must be seen: compile without -ffast-math"
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
+#error "NaN and infinity must be seen: compile without -ffast-math and -ffinite-math-only"
 #endif
 
 {helpers}const {p}_params {p}_default = {P}_DEFAULT;
@@ -80,7 +80,7 @@ SOURCE = """{banner}
 
 {reset}
 {{
-    state->started = 0u;
+{forgotten}    state->started = 0u;
 }}
 
 {body}
@@ -130,7 +130,8 @@ static int differs({p}_real is, {p}_real should)
     return {abs}(is - should) > {share} * {abs}(should) + {small};
 }}
 
-/* a step with NaN in one input is refused: the voltage is held, and the laws keep their state */
+/* whether a step with NaN in one input is not seen: a reading is {told}; of the reference, the step is
+ * invalid and u is held */
 static int refused({p}_state *state, int which)
 {{
     {p}_input input;
@@ -143,7 +144,10 @@ static int refused({p}_state *state, int which)
         break;
     }}
     const uint32_t status = {p}_step(&{p}_default, state, &input, &output);
-    return (status & {p}_REFUSED) == 0u || differs(output.u, u) || differs(state->last.u, u);
+    if (which < {readings}) {{
+        return {unseen};
+    }}
+    return (status & {p}_INVALID) == 0u || differs(output.u, u) || differs(state->last.u, u);
 }}
 
 int main(void)
@@ -190,6 +194,11 @@ README = """# {p}: the controller of case '{case}' as C99
 ```c
 #include "{p}.h"
 
+/* yours */
+{yours}
+void write_voltage({p}_real u);
+void fault(void);
+
 static {p}_state state;
 
 void setup(void)
@@ -201,23 +210,23 @@ void every_sample(void) /* {period} s */
 {{
     {p}_input input = {{0}};
     {p}_output output;
-    input.z = read_z();
-    input.z_dot = read_z_dot();
-    input.i = read_i();
-    input.r = reference();
+{reads}
     const uint32_t status = {p}_step(&{p}_default, &state, &input, &output);
     write_voltage(output.u);
-    if (status & ({p}_REFUSED | {p}_FAILED)) {{
-        fault(); /* the voltage is held; decide how long */
+    if (status & ({p}_SAFE | {p}_FAILED | {p}_INVALID)) {{
+        fault(); /* no voltage (SAFE), or the last one is held */
     }}
 }}
 ```
 
 The gains are `{P}_DEFAULT` in the header. To change one, copy it (`{p}_params mine = {P}_DEFAULT;`),
-set it, and give `&mine` to the step. The sample period is fixed: export again for another.
+set it, and give `&mine` to the step.
+
+{fixed}
 
 {flops} flops a step, in {precision}. Held to JAX operation by operation: {ulps} at 10,000 random states and inputs
-(`ambjax export --verify`). Compile with `-ffp-contract=off`, and never with `-ffast-math`.
+(`ambjax export --verify`), and at as many of other parameters. Compile with `-ffp-contract=off`, never with
+`-ffast-math` or `-ffinite-math-only`: with those the source does not compile.
 
 {mark}
 """

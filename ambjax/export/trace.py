@@ -167,4 +167,9 @@ def _states(controller: Controller) -> list[Number]:
     found += [
         Number(f"last.{name}", commands[name][0], "", f"last {commands[name][1]}", 0.0) for name in memory.last._fields
     ]
-    return [*found, Number("before.u", "V", "", "voltage of the sample before the last", 0.0)]
+    found.append(Number("before.u", "V", "", "voltage of the sample before the last", 0.0))
+    if memory.watch:
+        names = {**{f"watch.{name}": (INPUTS[name][0], "expected reading") for name in memory.watch.expected._fields}}
+        names["watch.left"] = ("samples", "for which a reading may still be replaced")
+        found += [Number(name, unit, "", doc, 0.0) for name, (unit, doc) in names.items()]
+    return found

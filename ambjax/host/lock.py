@@ -1,50 +1,37 @@
-"""One process at a time in a directory: by a lock that the system lifts when its holder ends, however that ends."""
+"""A lock on a directory: one process at a time, released by the system when its holder ends."""
 
 import contextlib
-import os
+import errno
 import pathlib
 from collections.abc import Iterator
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
+from filelock import FileLock, Timeout
 
 LOCK = ".ambjax-lock"
+# What a file system without locks answers.
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 @contextlib.contextmanager
 def alone(directory: pathlib.Path) -> Iterator[None]:
-    """Hold the directory in this block. Raises ValueError if another process does, OSError where none can.
+    """Hold the directory in this block.
 
-    Without effect where the system, or the file system, has no such locks.
+    Has no effect on a file system without locks. Raises ValueError if another process holds the directory, OSError if
+    the lock file cannot be made.
     """
-    path = directory / LOCK
-    held = _held(path)
+    lock = FileLock(directory / LOCK, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise ValueError(
+            f"--out {directory}: another run is at work there. Wait for it, or choose another directory."
+        ) from None
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
     try:
         yield
     finally:
-        if held is not None:
-            with contextlib.suppress(OSError):
-                path.unlink()
-            os.close(held)
-
-
-def _held(path: pathlib.Path) -> int | None:
-    """The lock's file, open; None: there are no locks."""
-    while fcntl is not None:
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.path.lexists(path) and os.path.samestat(os.fstat(file), path.lstat()):
-                return file  # not one that its last holder has just removed
-        except BlockingIOError:
-            os.close(file)
-            raise ValueError(
-                f"--out {path.parent}: another run is at work there. Wait for it, or choose another directory."
-            ) from None
-        except OSError:
-            os.close(file)
-            return None
-        os.close(file)
-    return None
+        with contextlib.suppress(OSError):
+            (directory / LOCK).unlink()
+        lock.release()

@@ -67,13 +67,22 @@ def refined(x: Array) -> Array:
     """1/x for |x| between 1e-37 and 1e37.
 
     CPUs divide vectors of float32 much faster than those of float64: there a float32 quotient is refined by one step
-    of third order, to the last bit or the one before.
+    of third order, to the last bit or the one before. In a trace it is a call named RECIPROCAL, so that an exporter can
+    write the plain quotient.
     """
+    return _refined_reciprocal(x)
+
+
+@jax.jit
+def _refined_reciprocal(x: Array) -> Array:
     if x.dtype != jnp.float64 or jax.default_backend() != "cpu":
         return 1 / x
     rough = (1 / x.astype(jnp.float32)).astype(jnp.float64)
     error = 1 - x * rough
     return rough + rough * (error + error * error)
+
+
+RECIPROCAL = "_refined_reciprocal"
 
 
 def polynomial(u: Array, coefficients: Sequence[Scalar]) -> Any:

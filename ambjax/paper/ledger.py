@@ -20,7 +20,7 @@ TUNED_WORDS = (
 )
 SAMPLED_WORDS = (
     f"as `tuned`, on a processor of {1 / float(CLOCK.sample_period):g} Hz: {PROCESSOR.resolved()}; signs without a "
-    f"layer, gains tuned for it: {_gains(SAMPLED)}"
+    f"layer, gains tuned for it and for plants off by up to 10 %: {_gains(SAMPLED)}"
 )
 
 

@@ -13,9 +13,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from ambjax.pictures.figures import BINS, BLUE, INK, RED, thin
+from ambjax.pictures.figures import BLUE, INK, RED
 from ambjax.pictures.scales import axis_of, digits, finish, log_ticks, prefix_of, size_of
 from ambjax.pictures.style import own_style
+from ambjax.pictures.thinning import envelope, smoothed, thin
 
 # What a fan can show: label and SI unit.
 QUANTITIES = {
@@ -59,12 +60,13 @@ def fan(
 ) -> None:
     """Write quantile bands over time, one panel per quantity (keys of QUANTITIES), all in SI units.
 
-    `bands[quantity][percent]` is that quantile at the times t [T] (s), best taken over the members still alive; NaN
-    where none is left. `limits[quantity]` (> 0) is drawn at plus and minus its value where the data come near it.
-    `lost_at` [N] (s, +inf: never) of all members adds a panel with the share that survives; `stalled` [N] (bool) tells
-    which of them the integrator gave up. Raises ValueError for a quantity that it does not know.
+    `bands[quantity][percent]` is that quantile at the times t [T] (s) over the members still alive; NaN where none is.
+    `limits[quantity]` (> 0) is drawn at plus and minus its value where the data come near it. `lost_at` [N] (s, +inf:
+    never) adds a panel with the share of these members that survives; `stalled` [N] (bool) marks those that the
+    integrator gave up. Raises ValueError for an unknown quantity.
     """
     t = np.asarray(t, float)
+    end = t[-1]
     extra = [0.55] if lost_at is not None else []
     heights = [1.0] * len(bands) + extra
     figure = Figure(figsize=(8.0, 2.1 * sum(heights) + 0.9), layout="constrained")
@@ -73,8 +75,9 @@ def fan(
         _fan_panel(ax, t, quantity, quantiles, limits.get(quantity, math.inf))
     if lost_at is not None:
         _survivors(axes[-1], t, np.asarray(lost_at, float), stalled)
+        end = max(t[-1], np.max(lost_at, initial=t[-1], where=np.isfinite(lost_at)))
     if t[-1] > t[0]:
-        axes[-1].set_xlim(t[0], t[-1])
+        axes[-1].set_xlim(t[0], end)
     axes[-1].set_xlabel("time (s)", fontsize=9)
     figure.align_ylabels(axes)
     figure.suptitle(title, fontsize=11)
@@ -91,13 +94,11 @@ def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float,
     curves = [np.asarray(quantiles[percent], float) for percent in percents]
     low, high, beyond = _reach(curves)
     factor, unit = prefix_of(unit, max(abs(low), abs(high)))
-    starts = np.arange(0, len(t), max(1, len(t) // BINS))
     pairs = len(percents) // 2
     for k in range(pairs):
-        # the least and the largest of each bin, more of them than the picture has pixels
-        lower, upper = np.fmin.reduceat(curves[k], starts), np.fmax.reduceat(curves[-1 - k], starts)
+        x, lower, upper = envelope(t, curves[k], curves[-1 - k])
         name = f"{percents[k]:g} to {percents[-1 - k]:g} %"
-        ax.fill_between(t[starts], factor * lower, factor * upper, color=_tint(k, pairs), linewidth=0, label=name)
+        ax.fill_between(x, factor * lower, factor * upper, color=_tint(k, pairs), linewidth=0, label=name)
     if len(percents) % 2:
         middle, words = _median(t, factor * curves[pairs])
         ax.plot(*middle, color=INK, linewidth=1.0, label=words)
@@ -118,14 +119,12 @@ def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float,
 
 def _median(t: np.ndarray, y: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], str]:
     """The median to draw, and its name: where it chatters from instant to instant, its means over parts of the run."""
-    steps = np.diff(y[np.isfinite(y)])
+    finite = np.isfinite(y)
+    steps = np.diff(y[finite])
     turns = np.count_nonzero(np.diff(np.sign(steps)))
-    if turns <= steps.size / 4 or np.abs(steps).sum() <= 20 * np.ptp(y[np.isfinite(y)]):
+    if turns <= steps.size / 4 or np.abs(steps).sum() <= 20 * np.ptp(y[finite]):
         return thin(t, y), "median"
-    starts = np.arange(0, len(t), -(-len(t) // SMOOTHED))
-    parts = zip(np.split(t, starts[1:]), np.split(y, starts[1:]), strict=True)
-    means = [(x.mean(), part[np.isfinite(part)].mean() if np.isfinite(part).any() else np.nan) for x, part in parts]
-    return (np.array(means)[:, 0], np.array(means)[:, 1]), "median, smoothed where it chatters"
+    return smoothed(t[finite], y[finite], min(SMOOTHED, int(finite.sum()))), "median, smoothed where it chatters"
 
 
 def _tint(k: int, pairs: int) -> Any:
@@ -148,27 +147,28 @@ def _reach(curves: Sequence[np.ndarray]) -> tuple[float, float, float]:
     bottom, top = float(np.quantile(lower, 0.05)), float(np.quantile(upper, 0.95))
     span = top - bottom
     if span > 0 and high - low > 8 * span:
-        return bottom - 0.5 * span, top + 0.5 * span, max(abs(low), abs(high))
+        return max(bottom - 0.5 * span, low), min(top + 0.5 * span, high), max(abs(low), abs(high))
     return low, high, 0.0
 
 
 def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray | None) -> None:
-    """The share of members still alive, and a tick for each one lost or given up."""
-    lost = np.sort(lost_at[lost_at <= t[-1]])
-    at = np.linspace(t[0], t[-1], BINS)
-    dead = np.searchsorted(lost, at, side="right")
+    """Draw the share of members still alive, and a tick for each time at which one is lost or given up."""
+    ended = np.isfinite(lost_at)
+    at, many = np.unique(lost_at[ended], return_counts=True)
+    dead = np.concatenate([[0], np.cumsum(many), [many.sum()]])
     share = 100 * (1 - dead / max(len(lost_at), 1))
-    ax.step(at, share, where="post", color=INK, linewidth=1.2)
+    x = np.concatenate([t[:1], at, [np.max(at, initial=t[-1])]])
+    ax.step(*thin(x, share), where="post", color=INK, linewidth=1.2)
     floor = max(0.0, 100 - 1.6 * max(100 - share[-1], 5.0))
     top = 100 + 0.12 * (100 - floor)
     ax.set_ylim(floor - 0.12 * (100 - floor), top)
-    if len(lost):
-        ticks = np.unique(at[np.clip(np.searchsorted(at, lost), 0, BINS - 1)])
+    if len(at):
+        ticks, _ = thin(at, at)
         where = ax.get_xaxis_transform()
         ax.plot(ticks, np.full(len(ticks), 0.08), "|", color=RED, markersize=7, label="a member ends", transform=where)
-    open_ = 0 if stalled is None else int(np.sum(np.asarray(stalled, bool) & (lost_at <= t[-1])))
-    words = f"{len(lost_at) - len(lost)} of {len(lost_at)} survive ({share[-1]:.4g} %)"
-    words += f", {_fates(len(lost) - open_, open_)}" * bool(len(lost))
+    lost, open_ = int(ended.sum()), 0 if stalled is None else int(np.sum(np.asarray(stalled, bool) & ended))
+    words = f"{len(lost_at) - lost} of {len(lost_at)} survive ({share[-1]:.4g} %)"
+    words += f", {_fates(lost - open_, open_)}" * bool(lost)
     ax.set_title(words, fontsize=8, loc="right", pad=2, color=INK)
     ax.yaxis.set_major_locator(MaxNLocator(3))
     finish(ax, "survivors\n(%)")
@@ -202,7 +202,7 @@ def histograms(columns: Mapping[str, Any], path: pathlib.Path, metrics: Sequence
         ax.set_axis_off()
     others = "lost members" + " and those not decided" * bool(open_)
     keys = [Patch(color=BLUE, label="survivors"), Patch(label=others, **LOST)]
-    keys += [Line2D([], [], color=INK, linestyle=s, label=f"{n} of all members") for s, n in MARKS.values()]
+    keys += [Line2D([], [], color=INK, linestyle=s, label=f"{n} of survivors") for s, n in MARKS.values()]
     figure.suptitle(f"{lost.size} members, {_fates(int(lost.sum()) - open_, open_)}", fontsize=11)
     figure.legend(handles=keys, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     figure.savefig(path, dpi=130)
@@ -231,12 +231,18 @@ def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> Non
         ax.set_xscale("log")
         log_ticks(ax.xaxis, bounds[0], bounds[-1])
     notes, reached = [], "reached" in name
-    order = np.sort(values[~np.isnan(values)])
+    order = np.sort(values[~np.isnan(values) & ~lost])
     for share, (style, words) in MARKS.items():
         value = factor * order[math.ceil(share * order.size) - 1] if order.size else math.nan
         if math.isfinite(value) and (value > 0 or not log):
             ax.axvline(value, color=INK, linestyle=style, linewidth=1.2)
-        text = f"{digits(value)} {unit}".rstrip() if math.isfinite(value) else "never" if reached else "none"
+        text = (
+            f"{digits(value)} {unit}".rstrip()
+            if math.isfinite(value)
+            else "never"
+            if reached and order.size
+            else "none"
+        )
         notes.append(f"{words.removesuffix(' quantile')}: {text}")
     for count, words in (
         (np.sum(~np.isfinite(values)), "never" if reached else "not finite"),

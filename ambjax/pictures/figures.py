@@ -8,12 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ambjax.pictures.style import own_style
+from ambjax.pictures.thinning import envelope, smoothed, stretch_of, thin
 from ambjax.simulation.trajectory import STALLED, Row, Trajectory
 
 # Okabe and Ito's colours: distinct in print and to colour-blind readers.
 INK, BLUE, ORANGE, GREEN, RED = "#222222", "#0072B2", "#E69F00", "#009E73", "#D55E00"
-BINS = 2000
-# Columns of a panel that are told apart.
+# Columns into which a panel of a stretch is divided where it has more than four times as many samples.
 PIXELS = 500
 # Share of the whole run's range that an enlarged panel shows at least.
 FLAT = 0.005
@@ -48,6 +48,7 @@ VOLTAGE = Panel("voltage $u$", "V", 1.0, (Curve("u", "$u$"),))
 # Under noise u jumps with each sample, and what a drive gives is near its average over the sample.
 AVERAGED = Panel("voltage $u$,\naveraged", "V", 1.0, (Curve("u_mean", "$u$"),))
 CURRENT_DISTURBANCE = Panel("disturbance $q_i$", "A/s", 1.0, (Curve("q_i", "$q_i$"),))
+MEASUREMENT = Panel("measured position", "mm", 1e3, (Curve("z_measured", "$z$ measured", GREEN), Curve("z", "$z$")))
 
 MOTION = (POSITION, CURRENT, SLIDING, DISTURBANCE)
 FORCES = (FORCE, FORCE_ERROR, VOLTAGE)
@@ -58,18 +59,6 @@ PAPER_FIGURES = {
     5: ("tracking", MOTION),
     6: ("tracking", FORCES),
 }
-
-
-def thin(t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At most 2 * BINS points that keep every extreme: the least and the largest of each bin."""
-    if len(t) <= 4 * BINS:
-        return t, y
-    width = len(t) // BINS
-    whole = width * BINS
-    bins = y[:whole].reshape(BINS, width)
-    at = np.sort(np.stack([bins.argmin(1), bins.argmax(1)], 1), 1) + width * np.arange(BINS)[:, None]
-    at = np.append(at.ravel(), len(t) - 1)
-    return t[at], y[at]
 
 
 @own_style
@@ -117,13 +106,17 @@ def draw(
     first: bool = False,
     stretch: tuple[float, float] | None = None,
 ) -> None:
-    """A panel of the whole run, or of a stretch of it (s): there, what is too fast to see is a band with its mean."""
+    """Draw a panel of the whole run, or of a stretch of it (s).
+
+    A stretch of more samples than pixels shows the mean of each column over a band of its extremes.
+    """
     rows, lost_at = trajectory.rows, float(trajectory.lost_at)
     t = np.asarray(rows.t)
     low, high = (t[0], t[-1]) if stretch is None else stretch
-    mask = (t < lost_at) & (t >= low) & (t <= high)
+    part = stretch_of(t, low, high)
+    held = t[part] < lost_at
     for curve in panel.curves:
-        x, y = t[mask], panel.factor * signal_of(rows, curve.signal)[mask]
+        x, y = t[part][held], panel.factor * signal_of(rows, curve.signal)[part][held]
         if stretch is None:
             x, y = thin(x, y)
         else:
@@ -142,7 +135,8 @@ def draw(
         ax.legend(fontsize=8, ncols=len(panel.curves), **above)
     if np.isfinite(lost_at):
         if stretch is None:
-            ax.set_xlim(0, min(t[-1], max(1.6 * lost_at, 1e-3)))
+            # the loss may come after the last sample
+            ax.set_xlim(0, max(lost_at, min(t[-1], max(1.6 * lost_at, 1e-3))))
         _mark_loss(ax, trajectory, first=first or (stretch is None and panel in (POSITION, FORCE)))
 
 
@@ -156,14 +150,12 @@ def _keep_scale(ax: Axes, whole: list[np.ndarray]) -> None:
 
 
 def _band(ax: Axes, t: np.ndarray, y: np.ndarray, colour: str) -> tuple[np.ndarray, np.ndarray]:
-    """The curve to draw: y itself, or where samples are far more than pixels its mean, over a band of its extremes."""
+    """The curve to draw: y itself or, of many samples, the mean of each column, over a band of its extremes."""
     if len(t) <= 4 * PIXELS:
         return t, y
-    starts = np.linspace(0, len(t), PIXELS, endpoint=False).astype(int)
-    middle = np.add.reduceat(t, starts) / np.diff([*starts, len(t)])
-    ends = np.minimum.reduceat(y, starts), np.maximum.reduceat(y, starts)
-    ax.fill_between(middle, *ends, color=colour, alpha=0.35, linewidth=0)
-    return middle, np.add.reduceat(y, starts) / np.diff([*starts, len(t)])
+    x, low, high = envelope(t, y, y, PIXELS)
+    ax.fill_between(x, low, high, color=colour, alpha=0.35, linewidth=0)
+    return smoothed(t, y, PIXELS)
 
 
 def _first_moments(ax: Axes, trajectory: Trajectory, until: float = 0.01) -> None:
@@ -185,7 +177,8 @@ def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:
         why = trajectory.lost_why.replace(": ", ":\n").replace(" reached ", "\nreached ")
         fate = "not decided from" if trajectory.lost_code == STALLED else "lost at"
         words = f"{fate} {lost_at:.4g} s\n{why}"
-        ax.annotate(words, (0.99, 0.06), xycoords="axes fraction", ha="right", va="bottom", fontsize=7, color=INK)
+        paper = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1}  # a curve may run behind the words
+        ax.text(0.99, 0.06, words, transform=ax.transAxes, ha="right", va="bottom", fontsize=7, color=INK, bbox=paper)
 
 
 def signal_of(rows: Row, name: str) -> np.ndarray:

@@ -38,9 +38,10 @@ def maps(
     """Write heat maps side by side: survival above and, where a panel has it, the error below.
 
     A panel has title, x [nx] and y [ny] ascending, survival with the bounds low and high of its confidence interval
-    [ny, nx] (shares 0..1; NaN: not run), and error [ny, nx] (in the unit of `error_metric`; not finite: no survivor) or
-    None. A label that ends in an SI unit, "z (m)", gets its prefix here. Colours are shared along a row. Raises
-    ValueError without panels, and where a log axis has values that are not positive.
+    [ny, nx] (shares 0..1; NaN: not run; bounds of None are not drawn), and error [ny, nx] (in the unit of
+    `error_metric`; not finite: no survivor) or None. A label that ends in an SI unit, "z (m)", gets its prefix here.
+    Colours are shared along a row. Raises ValueError without panels, and where a log axis has values that are not
+    positive.
     """
     if not panels:
         raise ValueError("maps: no panels to draw")
@@ -57,8 +58,10 @@ def maps(
         _errors(figure, axes[1], panels, error_metric, labels)
     keys: list[Any] = [
         Line2D([], [], color=INK, linewidth=LINES["survival"], label="95 % survival"),
-        Line2D([], [], color=INK, linewidth=LINES["low"], label="the same for the bounds of its confidence interval"),
     ]
+    if any(panel["low"] is not None for panel in panels):
+        words = "the same for the bounds of its confidence interval"
+        keys.append(Line2D([], [], color=INK, linewidth=LINES["low"], label=words))
     grids = [grid for panel in panels for grid in (panel["survival"], panel["error"]) if grid is not None]
     if not all(np.isfinite(grid).all() for grid in grids):
         keys.append(Patch(label="no survivor" if rows == 2 else "not run", **NOBODY))
@@ -100,6 +103,8 @@ def _cells(ax: Axes, panel: Mapping[str, Any], values: np.ndarray, norm: Normali
     ax.set_yscale("log" if y_log else "linear")
     ax.pcolormesh(x_edges, y_edges, np.ma.masked_invalid(values), norm=norm, cmap=colours)
     for name, width in LINES.items():
+        if panel[name] is None:
+            continue
         _outline(ax, x_edges, y_edges, np.asarray(panel[name], float) >= CONTOUR, width)
     ax.set_xlim(x_edges[0], x_edges[-1])
     ax.set_ylim(y_edges[0], y_edges[-1])
@@ -134,4 +139,6 @@ def _range(panel: Mapping[str, Any]) -> str:
     cells = share[np.isfinite(share)]
     if not cells.size:
         return "no cell was run"
+    if panel["low"] is None:
+        return f"all runs survive in {int(np.sum(cells == 1))} of {cells.size} cells"
     return f"95 % or more survive in {int(np.sum(cells >= CONTOUR))} of {cells.size} cells"

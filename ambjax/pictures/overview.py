@@ -1,5 +1,6 @@
 """The overview of a run: every signal, the whole of it and enlarged how it starts and how it ends."""
 
+import itertools
 import pathlib
 
 import numpy as np
@@ -13,10 +14,9 @@ from ambjax.pictures.figures import (
     ERROR,
     FORCE,
     FORCE_ERROR,
-    GREEN,
+    MEASUREMENT,
     POSITION,
     SLIDING,
-    Curve,
     Panel,
     draw,
     signal_of,
@@ -34,15 +34,13 @@ def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tup
 
     `window` (s): that stretch of it instead.
     """
-    panels = (POSITION, ERROR, SLIDING, DISTURBANCE, CURRENT, FORCE, FORCE_ERROR, AVERAGED)
-    if np.any(np.asarray(trajectory.rows.q_i)):
-        panels = (*panels, CURRENT_DISTURBANCE, _measurement(trajectory))
+    panels = _panels(trajectory)
     if window is None:
         columns, grid = _stretches(trajectory), [[panel] * 3 for panel in panels]
     else:
-        half = len(panels) // 2
+        half = -(-len(panels) // 2)
         columns = [(_fate(trajectory), *window), ("", *window)]
-        grid = list(zip(panels[:half], panels[half:], strict=True))
+        grid = list(itertools.zip_longest(panels[:half], panels[half:]))
     # the whole run has as much room as the two others
     width, height = 13.0, 1.55 * len(grid) + 1.2
     figure = Figure(figsize=(width, height))
@@ -52,16 +50,30 @@ def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tup
     axes = figure.subplots(len(grid), len(columns), sharex="col", squeeze=False, width_ratios=ratios)
     for row, (line, column) in enumerate(zip(axes, grid, strict=True)):
         for n, (ax, panel, (words, *stretch)) in enumerate(zip(line, column, columns, strict=True)):
+            if panel is None:
+                ax.set_axis_off()
+                continue
             draw(ax, panel, trajectory, stretch=(stretch[0], stretch[1]))
             if window is None and n:
                 ax.set_ylabel("")
             if row == 0:
                 ax.set_title(words, fontsize=10, loc="left", pad=16)
-    for ax in axes[-1]:
-        ax.set_xlabel("time (s)")
+    for line in axes.T:
+        lowest = [ax for ax in line if ax.axison][-1]
+        lowest.tick_params(labelbottom=True)
+        lowest.set_xlabel("time (s)")
     figure.align_ylabels(axes[:, 0])
     figure.suptitle(title, fontsize=12, y=1 - 0.15 / height, va="top")
     figure.savefig(path, dpi=130)
+
+
+def _panels(trajectory: Trajectory) -> tuple[Panel, ...]:
+    """The panels of every run, and those of q_i and of the measured position where there is anything to see."""
+    panels = (POSITION, ERROR, SLIDING, DISTURBANCE, CURRENT, FORCE, FORCE_ERROR, AVERAGED)
+    rows = trajectory.rows
+    if np.any(np.asarray(rows.q_i)):
+        panels = (*panels, CURRENT_DISTURBANCE)
+    return (*panels, MEASUREMENT) if np.any(np.asarray(rows.z_measured) != np.asarray(rows.z)) else panels
 
 
 def _stretches(trajectory: Trajectory) -> list[tuple[str, float, float]]:
@@ -116,7 +128,3 @@ def _transient(trajectory: Trajectory, end: float, loss: bool) -> float:
         down = size <= max(0.02 * size.max(), 1.5 * size[len(size) // 2 :].max())
         slowest = max(slowest, t[np.argmax(down)])
     return min(max(3 * slowest, 20 * (t[1] - t[0]) if len(t) > 1 else 0.0, most / 10), most)
-
-
-def _measurement(trajectory: Trajectory) -> Panel:
-    return Panel("measured position", "mm", 1e3, (Curve("z_measured", "$z$ measured", GREEN), Curve("z", "$z$")))

@@ -44,6 +44,8 @@ def axis_of(metric: str, size: float) -> tuple[float, str, str]:
     """Factor, label and unit of a metric of metrics.json: rms_error_m of size 2e-5 is (1e6, "rms error", "µm")."""
     if metric == "clearance_used":
         return 100.0, "clearance used", "%"
+    if metric == "refused":
+        return 1.0, "refused readings", "samples"
     suffix = next((suffix for suffix in SUFFIXES if metric.endswith(suffix)), "")
     factor, unit = prefix_of(SUFFIXES.get(suffix, ""), size)
     words = metric.removesuffix(suffix).replace("_", " ")

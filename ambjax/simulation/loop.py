@@ -191,6 +191,7 @@ class ClosedLoop:
             q_i=inputs.q_i,
             z_measured=seen.z,
             heat=jnp.where(alive, signals.heat, 0.0),
+            refused=jnp.zeros_like(alive),
             alive=alive,
         )
 

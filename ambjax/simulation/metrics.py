@@ -151,6 +151,22 @@ class Variation:
 
 
 @record
+class Count:
+    """Number of samples in which row.`of` holds."""
+
+    of: str = static()
+
+    def init(self) -> Array:
+        return _zero()
+
+    def update(self, carry: Array, row: Any, span: Any) -> Array:
+        return carry + getattr(row, self.of)
+
+    def result(self, carry: Array, ending: Ending) -> Array:
+        return carry
+
+
+@record
 class Reaching:
     """Start of the sample in which |row.`of`| first comes within `band`, s; +inf if it never does."""
 
@@ -223,6 +239,7 @@ class Standard:
                 "max_abs_i_A": Peak("i"),
                 "copper_loss_W": Driven("heat"),
                 "clearance_used": Peak("z"),
+                "refused": Count("refused"),
             }
         )
 

@@ -139,8 +139,20 @@ def segment(
     return progress, rows
 
 
-begin_jit = one_kernel(begin)
-segment_jit = one_kernel(segment, static_argnames=("count", "every"))
+def stretch(
+    system: System, clock: Clock, fold: Fold | None, progress: Progress, first: Scalar, count: int
+) -> tuple[Progress, Any]:
+    """Rows of `count` samples from number `first` on. Beyond the clock's last sample the progress does not change.
+
+    One compiled program therefore serves every stretch of a run.
+    """
+    step = functools.partial(_sample, system.realised(), clock, fold)
+
+    def sample(progress: Progress, k: Array) -> tuple[Progress, Any]:
+        after, row = step(progress, k)
+        return choose(k < clock.samples, after, progress), row
+
+    return lax.scan(sample, progress, first + jnp.arange(count))
 
 
 def finish(progress: Progress, rows: Any, fold: Fold | None) -> Outcome:

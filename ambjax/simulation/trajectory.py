@@ -53,9 +53,11 @@ class Row(NamedTuple):
     q_i: Array
     """disturbance of the current's rate, A/s"""
     z_measured: Array
-    """displacement as the sensor reports it, m"""
+    """displacement as the sensor reports it, m; 0 where it reports NaN"""
     heat: Array
     """copper loss in both coils, W"""
+    refused: Array
+    """whether the guard of a processor refused a reading, bool"""
     alive: Array
     """whether the rotor was still levitated, bool"""
 

@@ -1,34 +1,37 @@
-"""What decides on a processor: slopes of laws times the period, and the bands about zero that sampling leaves.
+"""What decides on a processor: slopes of laws times the period, the distance to the singular curve C, the rotor's fate.
 
-Theorem 1 is about continuous time, where sigma, v_tilde and e reach 0. Stepped once in T they reach a band: T W under
-an implicit sign, where W bounds what disturbs the signal's rate, as Q_z, Delta_1 and Q_i do in continuous time. W is
-taken from a run of the loop without sensor noise, from `settle` on: the signal's change over a sample, less what its
-law asked for. So it holds what the other laws, the held voltage and a wrong model leave, too.
+Theorem 1 is about continuous time, where sigma, v_tilde and e reach 0. Stepped once in T they reach a band, and what it
+is made of is measured along a run: W, the largest disturbance of the rate of the signal that a law acts on, and how far
+that signal is off the plant's. From W follows the band of the one (`control.sampling.band`), and with the second a
+bound of the other.
 """
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from ambjax.control import answers
 from ambjax.control.cascade import Cascade, CascadeState
-from ambjax.control.sampling import Sampling, limits
+from ambjax.control.sampling import Sampling, band, disturbance, limits
+from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.rollout import rollout
-from ambjax.simulation.trajectory import STALLED, Row
+from ambjax.simulation.method import with_method
+from ambjax.simulation.rollout import Outcome, check_inputs, roll
+from ambjax.simulation.sampled import system_of
+from ambjax.simulation.trajectory import STALLED, Trajectory
+from ambjax.theorem.watched import Watched
 from ambjax.world.scenario import Scenario
-from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference, reference_at
 
 # The stages whose output acts a delay later; an observer and an inversion law act on states of their own.
 DELAYED = ("position", "current")
 # The signal that the law of a stage drives to zero, and its unit.
 SIGNALS = {"position": ("sigma", "m/s"), "inversion": ("v_tilde", "A^2/m^2"), "current": ("e", "A")}
+# A voltage alternates where (u_{n+1} - 2 u_n + u_{n-1})/4, its part that changes sign from sample to sample, has more
+# than this share of its rms value: that of an oscillation at a sixth of the sampling rate. White noise has 0.61.
+ALTERNATING = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,28 +57,40 @@ class Slope:
 
 @dataclasses.dataclass(frozen=True)
 class Band:
-    """What a signal can reach on this processor, and its largest value in the run from `settle` on, without noise and
-    with the case's own.
+    """What is measured of a signal along a run from `settle` on, at the samples, and the bounds that follow.
 
-    `disturbance`: bound W of that of its rate, per s. `band`: inf where the law's gain does not exceed W, None where
-    nothing is known of such a law. `noisy` is None where the rotor is lost under the noise.
+    `noise`: whether the run is with the case's noise. `off`: largest difference between the plant's signal and the one
+    that the law acts on, of the estimate, carried over the delay where that is predicted. `computed`, `seen`: largest
+    magnitude of the latter and of the plant's. `gain`: of the law's sign; `disturbance`: W, per s, of the rate of the
+    signal that the law acts on. `band`: bound of `computed` for disturbances up to W; inf where the gain does not
+    exceed W. These three are None for a law that is more, or less, than a sign.
     """
 
     signal: str
     unit: str
-    disturbance: float
+    noise: bool
+    gain: float | None
+    disturbance: float | None
     band: float | None
+    computed: float
+    off: float
     seen: float
-    noisy: float | None
     note: str
+
+    @property
+    def bound(self) -> float | None:
+        """Bound of `seen`."""
+        return None if self.band is None else self.band + self.off
 
 
 @dataclasses.dataclass(frozen=True)
 class Sampled:
     """Slopes and bands of a cascade on its processor, and the fate of the rotor there, under the case's noise.
 
-    No bands where the run without noise does not last. `stalled`: the integrator gave up at `lost_at`, and nothing is
-    decided.
+    `distance`: the least of (z/s_0, i_ref/i_0) to the singular curve C at the samples of that run, and its time (s);
+    negative beyond C. `alternating`: share of the voltage's rms value that changes sign from sample to sample, without
+    noise, from `settle` on; None where that run does not last. Bands are of the runs that last. `stalled`: the
+    integrator gave up at `lost_at`, and nothing is decided.
     """
 
     slopes: list[Slope]
@@ -83,24 +98,33 @@ class Sampled:
     lost_at: float
     lost_why: str
     stalled: bool = False
+    distance: tuple[float, float] = (math.inf, 0.0)
+    alternating: float | None = None
+
+    @property
+    def alternates(self) -> bool:
+        """Whether the voltage alternates from sample to sample without noise."""
+        return self.alternating is not None and self.alternating > ALTERNATING
 
     @property
     def holds(self) -> bool:
-        """Whether no slope is beyond its limit, and the rotor is levitated to the end."""
-        return math.isinf(self.lost_at) and all(slope.holds for slope in self.slopes)
+        """Whether no slope is beyond its limit, C is not reached, and the rotor is levitated to the end."""
+        return math.isinf(self.lost_at) and self.distance[0] > 0 and all(slope.holds for slope in self.slopes)
 
 
 class Delays(NamedTuple):
-    """Of delays (samples) tried from the case's own up: every one up to `held` holds the rotor, at `lost` it is lost.
+    """Of delays (samples) tried from the case's own up, `step` apart: every one up to `held` holds the rotor, and at
+    `lost` it is lost, `resolution` further.
 
     `undecided` is the least beyond `held` where that is not known, for the integrator stalled (None: all is known up to
     `lost`). Where the case's own does not hold: from 0 up, and `held` is None where that does not either. `lost` is
-    None where no delay allowed loses it.
+    None where no delay tried loses it.
     """
 
     held: float | None
     lost: float | None
-    undecided: float | None = None
+    undecided: float | None
+    step: float
 
     @property
     def resolution(self) -> float | None:
@@ -108,42 +132,76 @@ class Delays(NamedTuple):
         return None if self.held is None or self.lost is None else self.lost - self.held
 
 
-class Errors(NamedTuple):
-    """What the laws drive to zero, or what disturbs its rate, sample by sample: m/s, A^2/m^2, A, or those per s."""
-
-    position: np.ndarray
-    inversion: np.ndarray
-    current: np.ndarray
+def rolled(system: Any, clock: Clock) -> Outcome:
+    """A rollout, every sample recorded."""
+    return roll(*canonical((system, clock)), None, every=1)
 
 
-def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float) -> Sampled:
+def check(
+    cascade: Cascade,
+    scenario: Scenario,
+    clock: Clock,
+    settle: float,
+    run: Callable[[Any, Clock], Outcome] = rolled,
+) -> Sampled:
     """Slopes and bands of a cascade with a processor. Two runs of the loop: without noise and with it.
 
-    Raises ValueError as `rollout` does.
+    `run` simulates: `ensemble.replay.record_system` has the rounding of `ambjax simulate`. Raises ValueError as
+    `rollout` does.
     """
-    outcome = rollout(cascade, scenario, clock).trajectory
+    check_inputs(cascade, scenario, clock)
+    cascade, clock = cascade.on_processor(), with_method(clock, cascade, scenario)
     quiet = _without_noise(scenario)
-    calm = outcome if quiet is scenario else rollout(cascade, quiet, clock).trajectory
-    held = [bool(np.isinf(trajectory.lost_at)) for trajectory in (calm, outcome)]
-    rough = outcome.rows if held[1] else None
-    bands = _bands(cascade, quiet, clock, settle, calm.rows, rough) if held[0] else []
+    outcome = _watched(cascade, scenario, clock, run)
+    calm = outcome if quiet is scenario else _watched(cascade, quiet, clock, run)
+    runs = [(calm, False)] if calm is outcome else [(calm, False), (outcome, True)]
+    settled = min(round(settle / float(clock.sample_period)), max(clock.samples - 2, 0))
+    lasting = [(one.rows, noise) for one, noise in runs if np.isinf(one.lost_at)]
+    bands = [line for rows, noise in lasting for line in _bands(cascade, scenario, clock, settled, rows, noise)]
+    alternating = alternation(np.asarray(calm.rows.u)[settled:]) if np.isinf(calm.lost_at) else None
     stalled = int(outcome.lost_code) == STALLED
-    return Sampled(slopes(cascade, clock), bands, float(outcome.lost_at), outcome.lost_why, stalled)
+    return Sampled(
+        slopes(cascade, clock),
+        bands,
+        float(outcome.lost_at),
+        outcome.lost_why,
+        stalled,
+        _least(outcome),
+        alternating,
+    )
+
+
+def _watched(cascade: Cascade, scenario: Scenario, clock: Clock, run: Callable[[Any, Clock], Outcome]) -> Trajectory:
+    """A run whose rows are those of `Watched`."""
+    loop: Any = system_of(cascade, scenario, clock)
+    return run(Watched(loop), clock).trajectory
+
+
+def _least(run: Trajectory) -> tuple[float, float]:
+    """The least signed distance to the singular curve C while the rotor was levitated, and its time (s)."""
+    rows: Any = run.rows
+    t, distance = np.asarray(rows.t), np.asarray(rows.distance)
+    worst = int(np.argmin(np.where(t <= float(run.lost_at), distance, np.inf)))
+    return float(distance[worst]), float(t[worst])
+
+
+def alternation(u: np.ndarray) -> float:
+    """Share of the rms value of u [N] that changes sign from sample to sample: 1 for +-U, sin(pi f T)^2 at f Hz."""
+    size = float(np.sqrt(np.mean(u * u)))
+    return float(np.sqrt(np.mean(np.diff(u, 2) ** 2))) / (4 * size) if len(u) > 2 and size else 0.0
 
 
 def _without_noise(scenario: Scenario) -> Scenario:
-    sensor = scenario.sensor
-    if sensor is None:
-        return scenario
-    none = {field.name: 0.0 for field in dataclasses.fields(sensor) if field.name.startswith("std")}
-    return dataclasses.replace(scenario, sensor=dataclasses.replace(sensor, **none))
+    """The same scenario where there is no noise."""
+    quiet = None if scenario.sensor is None else scenario.sensor.louder(0.0)
+    return scenario if quiet in (None, scenario.sensor) else dataclasses.replace(scenario, sensor=quiet)
 
 
 def slopes(cascade: Cascade, clock: Clock) -> list[Slope]:
     """Slope times T of every law that has one, against its limits. Laws and processor of one member."""
     sampling, lines = sampling_of(cascade, clock), []
     for stage, law in zip(CascadeState._fields, map(answers.unhardened, cascade.laws), strict=True):
-        implicit = answers.steps_implicitly(law, sampling.implicit)
+        implicit = answers.has_own_step(law, sampling.implicit)
         slope = stepped = _steepest(law.slope(cascade.model)) * sampling.period
         if implicit:
             relaxed = 1 / (1 + 1 / slope) if slope else 0.0
@@ -161,76 +219,33 @@ def _steepest(slope: Any) -> float:
 def sampling_of(cascade: Cascade, clock: Clock) -> Sampling:
     """How the laws of a cascade with a processor are sampled."""
     processor: Any = cascade.on_processor().processor
-    return Sampling(float(clock.sample_period), float(processor.delay), processor.implicit, processor.predicts)
+    late = float(processor.delay) - (float(processor.ahead) if processor.predicts else 0.0)
+    return Sampling(float(clock.sample_period), max(late, 0.0), processor.implicit)
 
 
-def _bands(
-    cascade: Cascade, scenario: Scenario, clock: Clock, settle: float, calm: Row, noisy: Row | None
-) -> list[Band]:
-    sampling = sampling_of(cascade, clock)
-    seen, disturbed = _errors(cascade, scenario, sampling, calm)
-    rough = None if noisy is None else _errors(cascade, scenario, sampling, noisy)[0]
-    # the last samples' voltages have not acted yet; what is seen at the first was disturbed just before
-    late = 2 + math.ceil(sampling.delay)
-    first = min(math.ceil(settle / sampling.period), max(clock.samples - 2 * late, 0))
-    settled, before = slice(first, clock.samples - late), slice(max(first - late, 0), clock.samples - late)
-    limited = float(np.max(np.abs(calm.u[settled]), initial=0.0)) >= float(scenario.u_max)
-    note = "the supply limits u: the laws have less than their gains" if limited else ""
-    lines = []
+def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, rows: Any, noise: bool) -> list[Band]:
+    """The lines of one run, from sample number `settled` on."""
+    sampling, lines = sampling_of(cascade, clock), []
+    limited = _peak(rows.u[settled:]) >= float(scenario.u_max)
     for stage, (signal, unit) in SIGNALS.items():
-        w, law = getattr(disturbed, stage)[before], answers.unhardened(getattr(cascade, stage))
-        W, L = _peak(w), _peak(np.diff(w)) / sampling.period
-        band = answers.band(law, W, L, sampling if stage in DELAYED else sampling._replace(delay=0.0))
-        values = [None if errors is None else _peak(getattr(errors, stage)[settled]) for errors in (seen, rough)]
-        lines.append(Band(signal, unit, W, band, values[0] or 0.0, values[1], note))
+        law = getattr(cascade, stage)
+        x, true = (np.asarray(getattr(part, signal))[settled:] for part in (rows.computed, rows.true))
+        relay, notes = answers.relay(law), ["the supply limits u"] * limited
+        gain = W = limit = None
+        if relay is not None:
+            implicit = answers.has_own_step(law, sampling.implicit)
+            gain, W = float(relay.gain), disturbance(relay, x, sampling.period, implicit)
+            limit = band(relay, W, sampling.period, implicit)
+            if math.isinf(limit):
+                notes.append("the disturbance exceeds the gain")
+            elif abs(x[0]) > limit:
+                notes.append("not reached at run.settle: where it is then")
+                limit = float(abs(x[0]))
+        lines.append(
+            Band(signal, unit, noise, gain, W, limit, _peak(x), _peak(true - x), _peak(true), "; ".join(notes))
+        )
     return lines
 
 
 def _peak(x: np.ndarray) -> float:
     return float(np.max(np.abs(x), initial=0.0))
-
-
-def _errors(cascade: Cascade, scenario: Scenario, sampling: Sampling, rows: Row) -> tuple[Errors, Errors]:
-    """The errors at every sample, and what disturbs their rates from there to the next one.
-
-    With prediction the laws act on what will be when their voltage begins: their output of sample n is measured against
-    the state then, and i against the i_ref of that sample, on a straight line from one to the next.
-    """
-    T, ahead = sampling.period, sampling.delay if sampling.predict else 0.0
-    n = np.arange(len(rows.t))
-    z, z_dot, i = (np.interp(n + ahead, n, np.asarray(x)) for x in (rows.z, rows.z_dot, rows.i))
-    i_ref, v_star = np.asarray(rows.i_ref), np.asarray(rows.v_star)
-    rate = np.diff(i_ref, append=i_ref[-1:]) / T
-    wanted = _wanted(cascade, scenario.realised(), jnp.asarray(rows.t) + ahead * T, z, z_dot, i, v_star, rows.u)
-    errors = Errors(
-        np.asarray(rows.sigma), np.asarray(rows.v_tilde), np.asarray(rows.i) - np.interp(n - ahead, n, i_ref)
-    )
-    # the part of v_star that no step of i_ref can follow, Eq. (8)
-    drift = np.diff(v_star) - (cascade.model.v(z[1:], i_ref[1:]) - cascade.model.v(z[:-1], i_ref[1:]))
-    sigma = np.diff(errors.position) / T - _acting(np.asarray(wanted[0]), sampling.delay)[:-1]
-    e = np.diff(errors.current) / T - _acting(np.asarray(wanted[1]) - rate, sampling.delay)[:-1]
-    return errors, Errors(sigma, np.asarray(drift) / T, e)
-
-
-def _acting(x: np.ndarray, delay: float) -> np.ndarray:
-    """The mean, over each sample, of what is decided at samples and acts `delay` samples later; 0 before the first."""
-    late = [np.concatenate([np.zeros(lag), x])[: len(x)] for lag in (math.floor(delay), math.ceil(delay))]
-    share = delay - math.floor(delay)
-    return (1 - share) * late[0] + share * late[1]
-
-
-@jax.jit
-def _wanted(
-    cascade: Cascade, scenario: Scenario, t: Array, z: Array, z_dot: Array, i: Array, v_star: Array, u: Array
-) -> tuple[Array, Array]:
-    """Rates of sigma (m/s^2) under the force v_star and of i (A/s) under u, on the nominal plant, undisturbed."""
-    model = cascade.model
-
-    def one(t: Array, z: Array, z_dot: Array, i: Array, v_star: Array, u: Array) -> tuple[Array, Array]:
-        reference: Reference = reference_at(scenario.reference, t)
-        z_ddot = 2 * model.k_z / model.m * z + model.a * v_star - model.g
-        along = (Measurement(z_dot, z_ddot, jnp.zeros_like(i)), reference.rate())
-        at = (Measurement(z, z_dot, i), reference)
-        return jax.jvp(cascade.position.sigma, at, along)[1], model.i_dot(z, z_dot, i, u)
-
-    return jax.vmap(one)(t, z, z_dot, i, v_star, u)

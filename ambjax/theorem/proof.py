@@ -167,7 +167,7 @@ class Monitored:
             q_i=jnp.where(alive, terms.q_i, 0.0),
             d=jnp.where(alive, terms.d, 0.0),
             q_z_plus_h=jnp.where(alive, terms.q_z + terms.h, 0.0),
-            distance=self.loop.scenario.plant.distance_to_C(z, i_ref),
+            distance=self.loop.scenario.plant.signed_distance_to_C(z, i_ref),
             sigma_off=jnp.where(alive, off.sigma, 0.0),
             v_tilde_off=jnp.where(alive, off.v_tilde, 0.0),
             e_off=jnp.where(alive, off.e, 0.0),

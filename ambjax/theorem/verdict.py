@@ -3,6 +3,7 @@
 import math
 import re
 
+from ambjax.host.words import command
 from ambjax.theorem.conditions import Condition, Report
 from ambjax.theorem.processor import Delays, Sampled
 
@@ -35,7 +36,8 @@ def answer(report: Report, case: str) -> list[str]:
     lines += [f"- {line}" for line in advice(report)]
     lines.append(_fate(report, bool(fails)))
     if fails or report.lost:
-        lines.append(f"'ambjax-tune {case}' looks for gains that hold the rotor, with a margin to these conditions.")
+        tune = command("ambjax", "tune", case)
+        lines.append(f"{tune} looks for gains that hold the rotor, with a margin to these conditions.")
     return lines
 
 
@@ -61,8 +63,10 @@ def advice(report: Report) -> list[str]:
     return lines
 
 
-def on_processor(sampled: Sampled, margin: Delays) -> list[str]:
-    """The lines below the tables of a processor: slopes, the rotor's fate, and the delays (samples) of its margin."""
+def on_processor(sampled: Sampled, margin: Delays, unknown: Delays | None) -> list[str]:
+    """The lines below the tables of a processor: slopes, the distance to C, the rotor's fate, an alternating voltage,
+    the margin of a delay that the prediction knows, and of one that it does not (None: nothing is predicted).
+    """
     lines = [
         f"- {slope.stage}: slope T as stepped, {number(slope.stepped)}, must stay below {number(slope.limit)}: a "
         f"smaller gain or p, a shorter clock.sample_period, or {'predict = true' if slope.implicit else IMPLICIT}."
@@ -70,26 +74,56 @@ def on_processor(sampled: Sampled, margin: Delays) -> list[str]:
         if not slope.holds
     ]
     words = f"No, {len(lines)} of {len(sampled.slopes)} {'is' if len(lines) == 1 else 'are'} not:" if lines else "Yes."
-    fate = "The rotor is held."
-    if sampled.stalled:
-        fate = undecided(sampled.lost_at, STALLED_PLANT)
-    elif math.isfinite(sampled.lost_at):
-        fate = f"The rotor is lost at {sampled.lost_at:.4g} s: {sampled.lost_why}."
-    return [f"Are all laws stable as they are stepped? {words}", *lines, fate, _margin(margin)]
+    end = fate(sampled.lost_at, sampled.lost_why, sampled.stalled, STALLED_PLANT)
+    lines = [f"Are all laws stable as they are stepped? {words}", *lines, _curve(*sampled.distance), end]
+    if sampled.alternates:
+        lines.append(_alternates(sampled.alternating or 0.0))
+    if unknown is None:
+        return [*lines, _margin("Delay margin", margin)]
+    return [
+        *lines,
+        _margin("Delay margin, the prediction knows the delay", margin),
+        _margin("Delay margin, the prediction assumes the case's delay", unknown),
+    ]
 
 
-def _margin(margin: Delays) -> str:
+def _curve(distance: float, at: float) -> str:
+    """The condition of Eq. (9) along the run on the processor."""
+    question = "Is (z/s_0, i_ref/i_0) off the singular curve C at all samples?"
+    if distance > 0:
+        return f"{question} Yes: the least distance is {number(distance)}, at {at:.4g} s."
+    return (
+        f"{question} No: it is {number(-distance)} beyond C at {at:.4g} s. Choose a smaller reference, a slower "
+        "position law (c, k), or less noise behind an observer."
+    )
+
+
+def _alternates(share: float) -> str:
+    return (
+        f"The voltage alternates: without noise, {100 * share:.0f} % of its rms value changes sign from sample to "
+        "sample. A law corrects more than its error in a sample, or acts later than it assumes: lower its gain or its "
+        f"p, set {IMPLICIT} or predict = true, or shorten clock.sample_period."
+    )
+
+
+def _margin(name: str, margin: Delays) -> str:
     held, lost, open_ = margin.held, margin.lost, margin.undecided
+    tried = f"tried every {margin.step:.2g} samples"
     if open_ is not None:
-        rests = [] if held is None else [f"held up to {held:.3g} samples"]
-        rests += [f"not decided at {open_:.3g}, where the integrator stalled"]
-        rests += [] if lost is None else [f"lost at {lost:.3g}"]
-        return f"Delay margin: it is {', '.join(rests)}."
+        rests = [] if held is None else [f"held up to {_samples(held)} samples"]
+        rests += [f"not decided at {_samples(open_)}, where the integrator stalled"]
+        rests += [] if lost is None else [f"lost at {_samples(lost)}"]
+        return f"{name}: the rotor is {', '.join(rests)} ({tried})."
     if held is None:
-        return "Delay margin: none, for it is lost without a delay too."
+        return f"{name}: none, for the rotor is lost without a delay too."
     if lost is None:
-        return f"Delay margin: it is held with every delay tried up to {held:g} samples, the longest there is."
-    return f"Delay margin: it is held up to {held:.3g} samples and lost at {lost:.3g}."
+        return f"{name}: the rotor is held up to {_samples(held)} samples, the longest delay there is ({tried})."
+    return f"{name}: the rotor is held up to {_samples(held)} samples and lost at {_samples(lost)} ({tried})."
+
+
+def _samples(delay: float) -> str:
+    """To the resolution of a margin: 1.48676, 0.5, 2."""
+    return f"{delay:.5f}".rstrip("0").rstrip(".")
 
 
 def _right(line: Condition) -> float:
@@ -128,19 +162,27 @@ def _sides(line: Condition) -> tuple[str, str, str]:
 
 
 def _fate(report: Report, fails: bool) -> str:
-    if report.stalled:
-        return undecided(report.lost_at)
-    if report.lost:
-        spared = "" if fails else " The theorem knows no noise, no limit of the voltage and no sampling: look there."
-        return f"The rotor is lost at {report.lost_at:.4g} s: {report.lost_why}.{spared}"
-    return "The rotor is held all the same: the theorem just does not promise it." if fails else "The rotor is held."
+    words = fate(report.lost_at, report.lost_why, report.stalled)
+    if report.lost and not fails:
+        return f"{words} The theorem knows no noise, no limit of the voltage and no sampling: look there."
+    if math.isinf(report.lost_at) and fails:
+        return "The rotor is held all the same: the theorem just does not promise it."
+    return words
 
 
-def undecided(at: float, remedy: str = STALLED) -> str:
-    """What is said of a run that the integrator gave up at this time, s, and what can be done about it."""
+def fate(lost_at: float, lost_why: str, stalled: bool, remedy: str = STALLED) -> str:
+    """What became of the rotor, in a sentence that every command prints: held, lost, or not decided.
+
+    `lost_at` (s): when the run ended early, +inf if it did not; `stalled`: because the integrator gave up, for which
+    `remedy` says what to do.
+    """
+    if math.isinf(lost_at):
+        return "The rotor is held."
+    if not stalled:
+        return f"The rotor is lost at {lost_at:.4g} s: {lost_why}."
     return (
-        f"Whether the rotor is held is not decided: at {at:.4g} s the integrator stalled, for it could not meet its "
-        f"tolerance. {remedy}"
+        f"Whether the rotor is held is not decided: at {lost_at:.4g} s the integrator stalled, for it could not meet "
+        f"its tolerance. {remedy}"
     )
 
 

@@ -236,3 +236,8 @@ class Bearing:
             slope = 20 * x**3 + 3 * (2 * iota - 4 * zeta) * x**2 - 2 * iota
             x = x * (1 - jnp.clip(value / jnp.where(slope == 0, 1.0, slope) / x, -0.5, 0.5))
         return safe_sqrt(jnp.min((x - zeta) ** 2 + (iota + (x + 1 / x) / 2) ** 2))
+
+    def signed_distance_to_C(self, z: Scalar, i: Scalar) -> Array:
+        """`distance_to_C`, negative beyond the curve: where `singularity` is negative."""
+        distance = self.distance_to_C(z, i)
+        return jnp.where(self.singularity(z, i) > 0, distance, -distance)

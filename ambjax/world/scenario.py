@@ -12,7 +12,7 @@ from ambjax.world.amplifier import Amplifier
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement, Sensor
-from ambjax.world.signals import Constant, Signal, is_random, realised
+from ambjax.world.signals import Constant, Signal, edges_of, is_random, realised
 
 # A member's randomness beside its sensors': folded into its key where they fold the sample number, beyond any of those.
 DESIGN_STREAM, SIGNAL_STREAM = np.uint32(2**32 - 1), np.uint32(2**32 - 2)
@@ -67,6 +67,8 @@ class Scenario:
         """Whether two members of this scenario meet something else: noise, or a signal that is drawn."""
         sensor = self.sensor
         noisy = sensor is not None and bool(np.any([sensor.std, sensor.std_z_dot, sensor.std_i]))
+        if sensor is not None:
+            noisy = noisy or any(np.any(x.rate) for x in (sensor.outliers, sensor.dropouts) if x is not None)
         return noisy or any(is_random(getattr(self, slot)) for slot in SLOTS)
 
     @property
@@ -75,17 +77,23 @@ class Scenario:
         if self.amplifier is not None:
             given = (field.name for field in dataclasses.fields(self.amplifier))
             return f"actuator.{next((name for name in given if getattr(self.amplifier, name) is not None), '')}"
-        named = [name for name in ("bits", "bandwidth") if getattr(self.sensor, name, None) is not None]
+        names = ("bits", "bandwidth", "outliers", "dropouts")
+        named = [name for name in names if getattr(self.sensor, name, None) is not None]
         return f"sensor.{named[0]}" if named else None
 
     def in_continuous_time(self) -> "Scenario":
-        """The same without what is for a processor only: low-pass and converter of the sensors, amplifier."""
-        sensor = self.sensor and dataclasses.replace(self.sensor, bits=None, bandwidth=None)
+        """The same without what is for a processor only: low-pass, converter and faults of the sensors, amplifier."""
+        none = {"bits": None, "bandwidth": None, "outliers": None, "dropouts": None}
+        sensor = self.sensor and dataclasses.replace(self.sensor, **none)
         return dataclasses.replace(self, sensor=sensor, amplifier=None)
 
     def acceleration(self, t: Scalar) -> Array:
         """The whole disturbance of Eq. (1) at time t: q_z + a q_v, m/s^2."""
         return self.q_z(t) + self.plant.a * self.q_v(t)
+
+    def edges(self) -> tuple[Scalar, ...]:
+        """When the disturbances jump, s."""
+        return tuple(edge for signal in (self.q_z, self.q_v, self.q_i) for edge in edges_of(signal))
 
     def key(self) -> Array:
         """The member's random key: fold_in(key(seed), member)."""

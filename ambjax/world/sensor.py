@@ -10,6 +10,7 @@ from jax import Array, lax
 from ambjax.numerics.gaussian import normals
 from ambjax.numerics.records import Scalar, leaf, record, static
 from ambjax.numerics.smooth import polynomial
+from ambjax.world.faults import Dropouts, Outliers, Sensed, Struck
 
 # m_3 of a low-pass over b = w h < 1 is b times the sum of 3! (-b)^j / (j + 4)!; the next term is below 1e-18.
 SERIES = tuple(math.factorial(3) * (-1) ** j / math.factorial(j + 4) for j in range(16))
@@ -21,6 +22,15 @@ class Errors(NamedTuple):
     z: Array
     z_dot: Array
     i: Array
+
+
+class FaultyErrors(NamedTuple):
+    """`Errors` of a sensor that has faults, and the faults that begin at the sample."""
+
+    z: Array
+    z_dot: Array
+    i: Array
+    struck: Struck
 
 
 class Measurement(NamedTuple):
@@ -35,8 +45,9 @@ class Measurement(NamedTuple):
 class Sensor:
     """Gaussian noise on each measurement, drawn once per sample period and held; the state itself is seen at once.
 
-    In this order: the position is low-passed (`bandwidth`), scaled and offset, noise is added, and the converter rounds
-    z and i. A low-pass and a converter are for a processor; without it, measurements are looked at all the time.
+    In this order: the position is low-passed (`bandwidth`), scaled and offset, noise is added, the converter rounds z
+    and i, and faults of the position sensor strike. A low-pass, a converter and faults are for a processor; without it,
+    measurements are looked at all the time.
     """
 
     std: Scalar = leaf(default=0.0, unit="m", at_least=0, at_most=1.0, doc="standard deviation on z")
@@ -67,18 +78,43 @@ class Sensor:
         default=None, unit="A", at_least=1e-9, at_most=1e6, optional=True, doc="ends of the converter; none: 2 i_0"
     )
     velocity: bool = static(default=True, doc="whether z_dot is measured; else an observer must estimate it")
+    outliers: Outliers | None = None
+    dropouts: Dropouts | None = None
+
+    @property
+    def faulty(self) -> bool:
+        """Whether the position sensor has faults."""
+        return self.outliers is not None or self.dropouts is not None
 
     def noise(self, key: tuple[Scalar, Scalar], sample: Scalar) -> Errors:
         """The errors of sample number `sample` for the member with these words (Scenario.words)."""
         w = normals(key, sample)
         return Errors(self.std * w[0], self.std_z_dot * w[1], self.std_i * w[2])
 
+    def struck(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Struck:
+        """The faults that begin at a sample of `period` s, for the member with these words."""
+        none = jnp.zeros(())
+        outlier = none if self.outliers is None else self.outliers.struck(key, sample, period)
+        return Struck(outlier, none > 0 if self.dropouts is None else self.dropouts.struck(key, sample, period))
+
+    def sensed(self, z: Array, before: Sensed, struck: Struck, period: Scalar, s_0: Scalar) -> Sensed:
+        """The reading of z (m, converted) once faults have struck, and what is left of a dropout."""
+        z = z + struck.outlier
+        if self.dropouts is None:
+            return Sensed(z, before.left)
+        left = jnp.where(struck.drops, self.dropouts.samples(period), jnp.maximum(before.left - 1, 0.0))
+        return Sensed(jnp.where(left > 0, self.dropouts.read(before.z, self.ends(s_0)), z), left)
+
+    def ends(self, s_0: Scalar) -> Scalar:
+        """Ends of the converter of z, m, in a plant with this gap."""
+        return s_0 if self.range_z is None else self.range_z
+
     def louder(self, factor: Scalar) -> "Sensor":
         """The same sensor with `factor` times the noise."""
         stds = {"std": self.std, "std_z_dot": self.std_z_dot, "std_i": self.std_i}
         return dataclasses.replace(self, **{name: std * factor for name, std in stds.items()})
 
-    def reading(self, motion: Measurement, errors: Errors) -> Measurement:
+    def reading(self, motion: Measurement, errors: Errors | FaultyErrors) -> Measurement:
         """What is read of a motion (of z, as it left the low-pass) with these errors; z_dot = 0 if not measured."""
         z_dot = motion.z_dot + errors.z_dot if self.velocity else jnp.zeros_like(motion.z_dot)
         return Measurement(self.gain * motion.z + self.offset + errors.z, z_dot, motion.i + errors.i)
@@ -87,9 +123,8 @@ class Sensor:
         """What the converter makes of a reading; s_0 (m) and i_0 (A), those of the plant, for ranges left out."""
         if self.bits is None:
             return seen
-        range_z = s_0 if self.range_z is None else self.range_z
         range_i = 2 * i_0 if self.range_i is None else self.range_i
-        return seen._replace(z=converted(seen.z, self.bits, range_z), i=converted(seen.i, self.bits, range_i))
+        return seen._replace(z=converted(seen.z, self.bits, self.ends(s_0)), i=converted(seen.i, self.bits, range_i))
 
     def lagged(self, y: Array, before: Measurement, after: Measurement, h: Scalar) -> Array:
         """Output of the low-pass h s later, y (m) before: y' = w (z - y), w = 2 pi bandwidth.

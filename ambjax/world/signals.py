@@ -18,7 +18,11 @@ from ambjax.numerics.smooth import TWO_PI, sine
 
 
 class Signal(Protocol):
-    """Anything that maps a time in seconds to a value. `span` gives an interval that it never leaves in 0..end (s)."""
+    """Anything that maps a time in seconds to a value. `span` gives an interval that it never leaves in 0..end (s).
+
+    A signal that jumps also has `edges() -> tuple`, the instants of its jumps (s): a loop on a processor ends a step of
+    its integrator there.
+    """
 
     def __call__(self, t: Scalar, /) -> Array: ...
     def span(self, end: float, /) -> tuple[float, float]: ...
@@ -64,6 +68,10 @@ class Step:
         start = np.asarray(self.start)
         return _hull(np.where(start > 0, 0.0, self.amplitude), np.where(start <= end, self.amplitude, 0.0))
 
+    def edges(self) -> tuple[Scalar, ...]:
+        """When it jumps, s."""
+        return (self.start,)
+
     def shifted(self, by: Scalar) -> "Step":
         """The same, `by` seconds later."""
         return dataclasses.replace(self, start=self.start + by)
@@ -86,6 +94,10 @@ class Pulse:
         start, stop = np.asarray(self.start), np.asarray(self.stop)
         on, off = (start <= end) & (stop > 0), (start > 0) | (stop <= end)
         return _hull(np.where(on, self.amplitude, 0.0), np.where(off, 0.0, self.amplitude))
+
+    def edges(self) -> tuple[Scalar, ...]:
+        """When it jumps, s."""
+        return (self.start, self.stop)
 
     def shifted(self, by: Scalar) -> "Pulse":
         """The same, `by` seconds later: it never ends before it starts."""
@@ -215,6 +227,10 @@ class Sum:
         ends = [term.span(end) for term in self.terms]
         return sum(low for low, _ in ends), sum(high for _, high in ends)
 
+    def edges(self) -> tuple[Scalar, ...]:
+        """When a term jumps, s."""
+        return tuple(edge for term in self.terms for edge in edges_of(term))
+
     def realised(self, key: Array) -> "Sum":
         """The sum with its random terms drawn, each from a key of its own."""
         return Sum(tuple(realised(term, jax.random.fold_in(key, n)) for n, term in enumerate(self.terms)))
@@ -228,6 +244,11 @@ def is_random(signal: Any) -> bool:
 def realised(signal: Any, key: Array) -> Any:
     """The signal with whatever is random in it drawn from `key`."""
     return signal.realised(key) if hasattr(signal, "realised") else signal
+
+
+def edges_of(signal: Any) -> tuple[Scalar, ...]:
+    """When the signal jumps, s; empty if it never does."""
+    return signal.edges() if hasattr(signal, "edges") else ()
 
 
 class Reference(NamedTuple):

@@ -10,10 +10,12 @@ from ambjax.cases.reader import FIELDS, KINDS, OTHERS, SETTLE, SIGNALS, TABLES, 
 from ambjax.cases.spread import DISTRIBUTIONS
 from ambjax.cases.table import Table
 from ambjax.cases.template import template
+from ambjax.control.guard import Guard
 from ambjax.control.processor import Processor
 from ambjax.ensemble.distributions import SHAPES
 from ambjax.ensemble.paths import places
 from ambjax.world.amplifier import Amplifier
+from ambjax.world.faults import Dropouts, Outliers
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial
 from ambjax.world.sensor import Sensor
@@ -23,7 +25,8 @@ from reference.parser import keys, remarks, rule
 
 TITLES = ("key", "unit", "default", "allowed", "meaning")
 RECORDS: dict[str, type] = {"plant": Plant, "processor": Processor, "initial": Initial, "sensor": Sensor}
-RECORDS["actuator"] = Amplifier
+RECORDS |= {"actuator": Amplifier, "processor.guard": Guard}
+RECORDS |= {"sensor.outliers": Outliers, "sensor.dropouts": Dropouts}
 SETTINGS: dict[str, dataclasses.Field] = {
     "actuator.u_max": FIELDS["u_max"],
     "clock.duration": DURATION,
@@ -38,9 +41,13 @@ WORDS = {
     "controller.model": "What the controller believes of the plant, where that differs: any key of `[plant]`.",
     "processor": "What the cascade runs on: one step of all laws a sample, its voltage held and late. Left out: "
     "continuous time, as in the paper. See [the processor](../processor.md).",
+    "processor.guard": "Limits of the readings: one beyond them is refused and predicted. A key left out is derived "
+    "from the case; `guard = false` in `[processor]`: none. See [the guard](../processor.md#the-guard).",
     "reference": "What z is to follow, in m. Left out: 0. See [signals](signals.md).",
     "disturbance": "What disturbs the loop: a signal each, and its unit. Left out: none. See [signals](signals.md).",
     "sensor": "What is measured; noise is drawn once per sample period and held. Left out: everything, without error.",
+    "sensor.outliers": "Single readings of the position that are far off. See [faults](../sensors.md#faults).",
+    "sensor.dropouts": "Stretches without a reading of the position. See [faults](../sensors.md#faults).",
     "actuator": "The supply and, on a processor, its amplifier. Left out: ideal.",
     "initial": "The plant's state at t = 0. Left out: at rest, in the middle.",
     "clock": "Time: how long, how often a row is recorded and noise drawn, and how it is integrated between.",
@@ -128,6 +135,8 @@ def _case_file() -> str:
             lines += _section("controller.model")
         if name == "disturbance":
             lines += _units()
+        for below in (one for one in RECORDS if one.startswith(f"{name}.")):
+            lines += _section(below)
     return "\n".join([*lines, *_section("tune.weights"), *_section("tune.limits")])
 
 

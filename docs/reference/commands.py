@@ -15,7 +15,7 @@ def pages() -> dict[str, str]:
         "# Commands",
         "",
         "Exit codes: 0 done; 1 done, and the answer is no (a rotor is lost, a condition fails); 2 the input is wrong, "
-        "and one line on stderr says how; 130 interrupted.",
+        "and one line on stderr says how; 130 interrupted. `ambjax-tune` is another name of `ambjax tune`.",
         "",
     ]
     for command in commands().values():
@@ -27,7 +27,7 @@ def commands() -> dict[str, argparse.ArgumentParser]:
     """The parsers of all commands, by what is typed."""
     groups = [one for one in parser()._actions if isinstance(one, argparse._SubParsersAction)]
     found = [choice for one in groups for choice in one.choices.values()]
-    return {command.prog: command for command in [*found, tuner()]}
+    return {command.prog: command for command in found} | {"ambjax tune": tuner("ambjax tune")}
 
 
 def _section(command: argparse.ArgumentParser) -> list[str]:

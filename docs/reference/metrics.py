@@ -14,6 +14,7 @@ FOLDS = {
     metrics.Rms: "root mean square over the samples",
     metrics.Reaching: "start of the sample in which it first comes within its band",
     metrics.Variation: "total variation",
+    metrics.Count: "number of samples for which it holds",
     metrics.Driven: "mean over time, while the drive is on",
 }
 MEANINGS = {
@@ -32,6 +33,8 @@ OTHERS = {
     "lost_why": "why it ended, in words; empty if it did not",
     "method": "the integrator and its step",
     "settle_s": 'when "settled" begins: `run.settle`',
+    "trajectory_deviation": "with --member: largest relative difference between the ensemble's metrics and those of "
+    "trajectory.npz",
 }
 SHARE = {"clearance_used": "z as a share of the clearance"}
 UNIT = re.compile(r"_(m_per_s|A2_per_m2|m|s|V|A|W)$")

@@ -20,6 +20,7 @@ from ambjax.ensemble import map_members
 from ambjax.extend import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.metrics import Named, standard_for
+from ambjax.simulation.rollout import rollout
 from ambjax.world.scenario import Scenario
 from tuning.objective.loss import TERMS, Loss, outcomes
 from tuning.objective.members import Members, Objective
@@ -54,6 +55,12 @@ class Folded:
 
     def __call__(self, lane: Lane) -> Any:
         return Objective(self.space, *lane.world).run(lane.x, lane.who, lane.fold)
+
+
+def measured(world: tuple[Cascade, Scenario, Clock, Any]) -> Any:
+    """The result of a fold over the rollout of one member."""
+    cascade, scenario, clock, fold = world
+    return rollout(cascade, scenario, clock, fold=fold, every=0).measured
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,9 +125,17 @@ class Engine:
         return self._lanes(Folded(self.objective.space), x, who, self.lanes, fold=self._world[-1])
 
     def metrics(self, x: np.ndarray, who: Members) -> dict[str, Any]:
-        """{"loss": terms, "metrics": metrics.json names}, all [S, N]."""
+        """{"loss": terms, "metrics": metrics.json names}, all [S, N].
+
+        With LANES lanes, in the steps of `ambjax ensemble` and of members as they are drawn, these are the bits of its
+        members.npz: the gains are constants of the program, as there, and not computed in it from coordinates.
+        """
         self.rollouts += len(x) * len(who.member)
-        return self._lanes(Folded(self.objective.space), x, who, self.lanes, fold=self._standard)
+        found, block = [], None if self.lanes == LANES else self.lanes
+        for one in x:
+            world = canonical((*self.objective.fixed(one, who), self.objective.clock, self._standard))
+            found.append(map_members(measured, world, threads=self.threads, call=self.lanes, block=block))
+        return jax.tree.map(lambda *parts: np.stack(parts), *found)
 
     def gradient(self, x: np.ndarray, who: Members, weights: Any) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
         """Outcomes [S, N, 1 + L], the weighed loss and what limits hold, their derivatives [S, N, 1 + L, m] and the

@@ -31,6 +31,8 @@ NORM = 16
 PREFIX = "limit."
 # Of what is 0 there is no logarithm.
 TINY = 1e-30
+# Where it pulls, a limit is met from this share below what is allowed, to half of the margin above.
+BELOW = 0.01
 # Half of a margin is what a search meets a limit to: of less, a limit that was met would not be held.
 LEAST_MARGIN = 0.002
 # What a supply is worth without being asked: rms voltage as a share of its limit.
@@ -226,6 +228,11 @@ class Limit:
         """g of a number that is reached."""
         return math.log(max(reached, TINY) / self.allowed)
 
+    def active(self, reached: float | None) -> bool:
+        """Whether it pulls and is reached, by members that judge; None: by none, and its multiplier alone decides."""
+        near = reached is None or self.beyond(reached) >= -(BELOW + self.margin)
+        return self.multiplier > 0 and near
+
     def informed(self, tuned: float, judged: float) -> "Limit":
         """It knows what the search's number and the judge's are at an optimum of the goal with it: the multiplier is
         the force that acted there."""
@@ -255,8 +262,14 @@ class Limit:
         return float(self.kind.judged(self.of_members(columns)))
 
     def of_members(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What it is of each member [N]."""
-        return np.asarray(columns[self.kind.exact or f"loss.{PREFIX}{self.name}"])
+        """The quantity of each member that is held, or of every one where none is.
+
+        `columns` [N]: every metric and term of an ensemble. A rotor that is lost counts 0 V from then on, which would
+        lower an average; whether it may be lost is decided by `survival`.
+        """
+        alive = ~np.isfinite(columns["lost_at_s"])
+        values = np.asarray(columns[self.kind.exact or f"loss.{PREFIX}{self.name}"])
+        return values[alive] if alive.any() else values
 
 
 def measures(limits: tuple[Limit, ...], scenario: Scenario, clock: Clock, settle: float, band: float) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -97,10 +98,24 @@ class Objective:
         """The cascade (its gains to be replaced) and scenario of one member, whose fields are scalars."""
         scenario = dataclasses.replace(self.scenario, member=who.member, seed=who.seed)
         cascade, scenario = apply(self.cascade, scenario, who.values) if who.values else (self.cascade, scenario)
-        sensor = scenario.sensor
-        return cascade, scenario if sensor is None else dataclasses.replace(scenario, sensor=sensor.louder(who.loud))
+        return cascade, _louder(scenario, who.loud)
+
+    def fixed(self, x: np.ndarray, who: Members) -> tuple[Cascade, Scenario]:
+        """The cascade with the gains at x [m] and the scenario of the members [n]; leaves that vary are arrays [n]."""
+        seed = who.seed if np.ptp(who.seed) else int(who.seed[0])
+        scenario = dataclasses.replace(self.scenario, member=np.asarray(who.member), seed=seed)
+        cascade, scenario = apply(self.cascade, scenario, who.values)
+        at = (x + who.shift).T if np.any(who.shift) else x  # of each gain one coordinate, or [n]
+        cascade = self.space.decode(jnp.asarray(at), cascade)
+        return cascade, _louder(scenario, who.loud) if np.any(who.loud != 1) else scenario
 
     def run(self, x: Array, who: Members, fold: Any) -> Any:
         """The fold's result for one lane."""
         cascade, scenario = self.world(who)
         return rollout(self.space.decode(x + who.shift, cascade), scenario, self.clock, fold=fold, every=0).measured
+
+
+def _louder(scenario: Scenario, loud: Any) -> Scenario:
+    """The scenario with `loud` times the sensors' noise."""
+    sensor = scenario.sensor
+    return scenario if sensor is None else dataclasses.replace(scenario, sensor=sensor.louder(loud))

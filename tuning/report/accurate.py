@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.control.cascade import Cascade
+from ambjax.ensemble.replay import record
 from ambjax.simulation.rollout import rollout
 from ambjax.simulation.trajectory import Trajectory
 from tuning.judge import difference, metrics_of, summarise
@@ -56,7 +57,12 @@ def _relative(ours: float, theirs: float) -> float:
 
 
 def nominal(problem: Problem, cascade: Cascade) -> Trajectory:
-    """The case's own run, nothing spread, under this cascade, in accurate steps: a row for each sample."""
+    """The case's own run, nothing spread, under this cascade: a row for each sample.
+
+    In accurate steps; where the judge takes those of `ambjax simulate`, that command's run.
+    """
     case = problem.case
+    if problem.replays:
+        return record(cascade, case.scenario, case.clock).trajectory
     clock = dataclasses.replace(case.clock, method=problem.reference.objective.clock.method)
     return rollout(cascade, case.scenario, clock).trajectory

@@ -45,6 +45,7 @@ def gains_table(space: Space, before: np.ndarray, after: np.ndarray, sensitivity
             "most": gain.high,
             "at_bound": gain.at_bound(float(after[j])),
             "sensitivity_percent": None if sensitivity is None else float(sensitivity[j]),
+            "sensitivity_lost": 0,
         }
         for j, gain in enumerate(space.gains)
     ]
@@ -81,13 +82,15 @@ def _gains(facts: Facts) -> list[str]:
     for row in facts["gains"]:
         ends = [_number(row.get(end), ".3g") for end in ("low", "high")] if ranged else []
         bounds = [_number(row.get(end), ".3g") for end in ("least", "most")]
-        grows = "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
         gains = f"{row['before']:.6g}", f"{row['after']:.6g}"
-        rows.append([row["path"], *gains, *ends, *bounds, row["at_bound"] or "-", grows])
+        rows.append([row["path"], *gains, *ends, *bounds, row["at_bound"] or "-", _sensitivity(row, facts)])
     lines = ["## Gains", "", *table(head, rows), ""]
     words = (
         "The last column: where this gain alone is off by a factor of e^0.25 = 1.28, up or down, the worse of both. A "
-        "large number: set it with care. A small one: it hardly matters. `tune.bounds` sets other ends."
+        "large number: set it with care. A small one: it hardly matters. Where that loses members of the training "
+        "ensemble that the answer holds, their number stands there, for the risk of a lost rotor is not that of an "
+        "error. "
+        "`tune.bounds` sets other ends."
     )
     sources = [f"- {row['path']}: {literal(row['source'])}" for row in facts["gains"] if row.get("source")]
     return [
@@ -97,7 +100,8 @@ def _gains(facts: Facts) -> list[str]:
         *(["Where these ranges come from:", "", *sources, ""] if sources else []),
         "## One rotor before and after",
         "",
-        "The case's own run, nothing spread, by accurate steps; u averaged over each sample.",
+        f"The case's own run, nothing spread, {facts.get('nominal_steps', 'by accurate steps')}; u averaged over each "
+        "sample.",
         "",
         "![z - r and u before and after tuning](nominal.png)",
         "",
@@ -106,6 +110,13 @@ def _gains(facts: Facts) -> list[str]:
         "![Amplitude spectrum of u before and after tuning](spectrum.png)",
         "",
     ]
+
+
+def _sensitivity(row: Facts, facts: Facts) -> str:
+    """By how much the risk grows where a gain is off, or how many members that loses."""
+    if row.get("sensitivity_lost"):
+        return f"**{row['sensitivity_lost']} of {facts['trained_on']} members lost**"
+    return "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
 
 
 def _held_out(facts: Facts) -> list[str]:
@@ -117,14 +128,26 @@ def _held_out(facts: Facts) -> list[str]:
     if again:
         head += [f"after, {again['held']} of them", "by accurate steps", "off by"]
     rows = [
-        [f"`{name}`", _number(before.get(name), ".4g"), f"{after[name]:.4g}", *_again(again, name)]
+        [f"`{name}`", _number(before.get(name), ".4g"), _number(after.get(name), ".4g"), *_again(again, name)]
         for name in SHOWN
-        if name in after
+        if name in after or name in before
     ]
     rows += [[name, str(before[name]), str(after[name]), *_fates(again, name)] for name in ("lost", "stalled")]
     rows.append(["survival, 95 % interval", *map(_survival, (before, after)), *(["-"] * 3 if again else [])])
     lines = [f"## {after['members']} held-out members (seed {facts['held_out_seed']})", "", *table(head, rows), ""]
-    return [*lines, "Lost and stalled members count with the error at which they were frozen.", *_accurate(again), ""]
+    words = ["Metrics are of the members that are held.", *_accurate(again), *_worst(facts.get("worst_member")), ""]
+    return [*lines, *words]
+
+
+def _worst(worst: Facts | None) -> list[str]:
+    """The member that fares worst, and the command that simulates it by itself."""
+    if worst is None:
+        return []
+    fate = f"largest settled error {worst['settled_max_abs_error_m']:.4g} m"
+    if math.isfinite(worst["lost_at_s"]):
+        fate = f"it ends at {worst['lost_at_s']:.4g} s"
+    line = f"The worst is member {worst['member']}: {fate}."
+    return ["", f"{line} In the folder of this report: `{worst['replay']}`" if worst["replay"] else line]
 
 
 def _again(again: Facts | None, name: str) -> list[str]:

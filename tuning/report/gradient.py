@@ -12,6 +12,12 @@ from tuning.problem import Problem
 
 # Samples over which the three ways are compared, members that take part, and the step of the differences.
 SAMPLES, FEW, STEP = 500, 4, 1e-3
+# By what share of the derivative two ways may differ and agree: both modes by rounding; differences of the steps STEP
+# and STEP / 2 with each other, or the step resolves no slope; and their extrapolation with the modes.
+MODES, STEADY, AGREE = 1e-6, 0.05, 1e-3
+# Shares of the largest derivative and of the loss below which two ways agree: rounding.
+NOTHING, ROUNDING = 1e-6, 1e-9
+AGREED = "agree"
 HORIZONS = (0.125, 0.25, 0.5)
 
 
@@ -25,7 +31,11 @@ def _shorter(problem: Problem, samples: int) -> Any:
 
 
 def three_ways(problem: Problem, x: np.ndarray) -> dict[str, Any]:
-    """Gradient [m] of the mean loss at x [m] by forward and reverse mode and by Richardson-extrapolated differences."""
+    """Gradient [m] of the mean loss at x [m] by forward and reverse mode and by Richardson-extrapolated differences.
+
+    `coarse`, `fine`: the central differences of the steps STEP and STEP / 2 that are extrapolated. `verdicts`: by gain,
+    whether the three agree (`verdict`); `agree`: whether they do for every gain.
+    """
     objective = _shorter(problem, min(SAMPLES, problem.objective.clock.samples))
     who = objective.members(problem.tune.budget.seed, min(FEW, problem.tune.budget.members))
     weights = problem.goal.weights
@@ -37,13 +47,47 @@ def three_ways(problem: Problem, x: np.ndarray) -> dict[str, Any]:
     terms = forward.terms(x + steps, who)
     values = weigh(weights, terms, who.stressed).mean(axis=1)
     up, down, half_up, half_down = np.reshape(values, (4, len(x)))
-    differences = (4 * (half_up - half_down) / STEP - (up - down) / (2 * STEP)) / 3
+    coarse, fine = (up - down) / (2 * STEP), (half_up - half_down) / STEP
+    floor = float(max(NOTHING * np.abs([by_forward, by_reverse]).max(), ROUNDING * np.abs(values).max()))
+    columns = zip(by_forward, by_reverse, coarse, fine, strict=True)
+    verdicts = [verdict(a, b, c, d, floor) for a, b, c, d in columns]
     return {
         "forward": by_forward,
         "reverse": by_reverse,
-        "differences": differences,
+        "differences": extrapolated(coarse, fine),
+        "coarse": coarse,
+        "fine": fine,
+        "verdicts": verdicts,
+        "agree": all(one == AGREED for one in verdicts),
         "samples": objective.clock.samples,
     }
+
+
+def extrapolated(coarse: Any, fine: Any) -> Any:
+    """Richardson's extrapolation of central differences with a step and its half."""
+    return (4 * fine - coarse) / 3
+
+
+def verdict(forward: float, reverse: float, coarse: float, fine: float, floor: float) -> str:
+    """Whether three ways to a derivative agree, in words: AGREED, or what was measured that speaks against it.
+
+    `coarse`, `fine`: central differences of the steps STEP and STEP / 2. What differs by less than `floor` agrees.
+    """
+
+    def apart(a: float, b: float) -> float:
+        """The difference beyond `floor`, as a share of the larger."""
+        return max(abs(a - b) - floor, 0.0) / max(abs(a), abs(b), floor)
+
+    if not np.isfinite([forward, reverse, coarse, fine]).all():
+        return "no finite number by every way"
+    if apart(forward, reverse) > MODES:
+        return f"forward and reverse mode differ by {100 * apart(forward, reverse):.2g} %: rounding grows along the run"
+    if apart(coarse, fine) > STEADY:
+        return f"differences decide nothing: {coarse:.2e} with a step of {STEP:g}, {fine:.2e} with {STEP / 2:g}"
+    found = extrapolated(coarse, fine)
+    if apart(found, forward) > AGREE:
+        return f"differences differ from both modes by {100 * apart(found, forward):.2g} %, whatever their step"
+    return AGREED
 
 
 def against_horizon(problem: Problem, x: np.ndarray, who: Members) -> list[dict[str, float]]:

@@ -11,13 +11,20 @@ from tuning.report.page import table
 Facts = dict[str, Any]
 # What more of a limit is priced.
 MORE = 0.1
+# What is said of a limit, in every place.
+HELD, BROKEN, UNVERIFIED, UNJUDGED = "held", "NOT HELD", "not verified", "not judged"
+LOUD = (BROKEN, UNVERIFIED)
 
 
-def facts(limits: tuple[Limit, ...], asked: Limits, columns: dict[str, np.ndarray], summary: Facts) -> list[Facts]:
+def facts(
+    limits: tuple[Limit, ...], asked: Limits, columns: dict[str, np.ndarray], summary: Facts, refuted: str = ""
+) -> list[Facts]:
     """A row for each limit, and one for survival, of the held-out members' columns [N] (of `judge`) and summary.
 
-    `price_m`: what a limit 10 % higher takes off the settled rms error, m (`Limit.bought`). None where the limit is not
-    held, or nobody judges.
+    `refuted`: why accurate steps do not confirm what these members do; '' where they do. `held` is None where no member
+    judges, and where a limit would be held but accurate steps do not confirm it; `verdict` is that in a word.
+    `price_m`: what a limit 10 % higher takes off the settled rms error, m (`Limit.bought`); None where the limit is not
+    held.
     """
     members, held = summary["members"], summary["held"]
     share = held / members if members else None
@@ -33,16 +40,25 @@ def facts(limits: tuple[Limit, ...], asked: Limits, columns: dict[str, np.ndarra
         "active": False,
         "multiplier": None,
         "price_m": None,
-        "held": None if share is None else members - held <= asked.may_lose(members),
-    }
-    return [*(_row(limit, columns, summary) for limit in limits), survival]
+    } | _verdict(None if share is None else members - held <= asked.may_lose(members), refuted)
+    return [*(_row(limit, columns, summary, refuted) for limit in limits), survival]
 
 
-def _row(limit: Limit, columns: dict[str, np.ndarray], summary: Facts) -> Facts:
-    reached = limit.reached(columns) if columns else None
-    held = None if reached is None else bool(reached <= limit.asked)
-    active = limit.multiplier > 0
-    price = summary["settled_rms_error_m"] * limit.bought(MORE) if columns else 0.0
+def _verdict(kept: bool | None, refuted: str) -> Facts:
+    """Whether a limit is held, and that in a word. `kept`: whether the members that judge keep it; None: none does."""
+    if kept is None:
+        return {"held": None, "verdict": UNJUDGED}
+    if not kept:
+        return {"held": False, "verdict": BROKEN}
+    return {"held": None, "verdict": UNVERIFIED} if refuted else {"held": True, "verdict": HELD}
+
+
+def _row(limit: Limit, columns: dict[str, np.ndarray], summary: Facts, refuted: str) -> Facts:
+    judged = summary["held"] > 0
+    reached = limit.reached(columns) if judged else None
+    kept = reached <= limit.asked if reached is not None else False if summary["members"] else None
+    active, found = limit.active(reached), _verdict(kept, refuted)
+    price = summary["settled_rms_error_m"] * limit.bought(MORE) if active and judged else 0.0
     return {
         "name": limit.name,
         "unit": limit.kind.unit,
@@ -50,22 +66,20 @@ def _row(limit: Limit, columns: dict[str, np.ndarray], summary: Facts) -> Facts:
         "source": limit.source,
         "what": f"{limit.kind.words}; {limit.kind.over}",
         "reached": reached,
-        "worst": float(np.max(limit.of_members(columns))) if columns else None,
+        "worst": float(np.max(limit.of_members(columns))) if judged else None,
         "margin": limit.margin,
         "active": active,
         "multiplier": limit.multiplier,
-        "price_m": price if active and held else (0.0 if held else None),
-        "held": held,
-    }
+        "price_m": price if found["held"] else None,
+    } | found
 
 
 def broken(rows: list[Facts]) -> list[str]:
-    """A sentence for each limit that is not held."""
+    """A sentence for each limit that is not held, survival too."""
     return [
-        f"tune.limits.{row['name']} is NOT HELD: {row['reached']:.4g}{_unit(row)}, at most {row['asked']:g} "
-        f"({row['source']})"
+        f"tune.limits.{row['name']} is {BROKEN}: {_reached(row)}, {_side(row)} {row['asked']:g} ({row['source']})"
         for row in rows
-        if row["held"] is False and row["name"] != "survival"
+        if row["verdict"] == BROKEN
     ]
 
 
@@ -83,14 +97,13 @@ def section(rows: list[Facts]) -> list[str]:
     """Limits as a part of the report."""
     if not rows:
         return []
-    verdicts = {True: "held", False: "**NOT HELD**", None: "-"}
     cells = [
         [
             f"`{row['name']}`",
-            f"{'at least' if row['name'] == 'survival' else 'at most'} {row['asked']:g}{_unit(row)}",
+            f"{_side(row)} {row['asked']:g}{_unit(row)}",
             _number(row["reached"], row),
             _number(row["worst"], row),
-            verdicts[row["held"]],
+            f"**{row['verdict']}**" if row["verdict"] in LOUD else row["verdict"],
             "active" if row["active"] else "-",
             "-" if row["price_m"] is None or row["name"] == "survival" else f"{row['price_m']:.2g} m",
         ]
@@ -102,10 +115,18 @@ def section(rows: list[Facts]) -> list[str]:
     return [
         *lines,
         "",
-        "Reached by the held-out members. An active limit costs error: the last column is by how much the settled rms "
-        "error would fall, from the multipliers of the optima that the search came by.",
+        "Reached by those held-out members that are held. An active limit costs error: the last column is by how much "
+        "the settled rms error would fall, from the multipliers of the optima that the search came by.",
         "",
     ]
+
+
+def _reached(row: Facts) -> str:
+    return "no member is held" if row["reached"] is None else _number(row["reached"], row)
+
+
+def _side(row: Facts) -> str:
+    return "at least" if row["name"] == "survival" else "at most"
 
 
 def _unit(row: Facts) -> str:

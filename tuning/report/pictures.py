@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.pictures.figures import BLUE, ORANGE, RED, thin
-from ambjax.pictures.scales import prefix_of
+from ambjax.pictures.figures import BLUE, ORANGE, RED
+from ambjax.pictures.scales import digits, prefix_of
 from ambjax.pictures.style import own_style
+from ambjax.pictures.thinning import stretch_of, thin
 from ambjax.simulation.trajectory import STALLED, Trajectory
 from tuning.search.explore import Slices
 
@@ -15,8 +16,8 @@ from tuning.search.explore import Slices
 HIGHEST = 30.0
 # Of a run, the start and the end are shown enlarged, for this long, in s, or for a quarter of it.
 ZOOM = 0.02
-# A run that is lost is shown until so many times as late.
-BEYOND = 1.15
+# What follows a loss is shown for this share of what is shown before it.
+BEYOND = 0.15
 # What moves by less than this share of a signal's largest value is shown flat.
 FLAT = 1e-2
 # Amplitudes below this share of the largest are cut off; and samples of which there is a spectrum.
@@ -25,7 +26,10 @@ FAINTEST, FEWEST = 1e-5, 16
 
 @own_style
 def before_after(runs: dict[str, Trajectory]) -> bytes:
-    """PNG: z - r and u, averaged over each sample, of runs by name, in rows; in columns the whole, start and end."""
+    """PNG: z - r and u, averaged over each sample, of runs by name, in rows; in columns the whole, start and end.
+
+    A run that is lost ends shortly after the loss, in the first and in the last column.
+    """
     from matplotlib.figure import Figure
 
     rows = [(name, run, signal) for signal in ("z - r", "u") for name, run in runs.items()]
@@ -38,11 +42,15 @@ def before_after(runs: dict[str, Trajectory]) -> bytes:
         values = factor * np.asarray(values)
         least = FLAT * np.abs(values[alive]).max(initial=0.0)
         ended = float(run.lost_at)
-        end = min(t[-1] + (t[1] - t[0] if len(t) > 1 else 0.0), max(BEYOND * ended, t[min(4, len(t) - 1)]))
-        near = min(ZOOM, end / 4)
-        for ax, (low, high) in zip(line, ((0.0, end), (0.0, near), (end - near, end)), strict=True):
-            shown = alive & (t >= low) & (t <= high)
-            ax.plot(*thin(t[shown], values[shown]), color=ORANGE if name == "before" else BLUE, lw=0.9)
+        last = min(ended, t[-1] + (t[1] - t[0] if len(t) > 1 else 0.0))
+        near = max(min(ZOOM, last / 4), t[min(4, len(t) - 1)])
+        beyond = BEYOND * np.isfinite(ended)
+        late = max(last - near, 0.0), max(last + beyond * near, near)
+        columns = (0.0, max(last + beyond * last, near)), (0.0, near), late
+        for ax, (low, high) in zip(line, columns, strict=True):
+            part = stretch_of(t, low, high)
+            held = alive[part]
+            ax.plot(*thin(t[part][held], values[part][held]), color=ORANGE if name == "before" else BLUE, lw=0.9)
             ax.set_xlim(low, high)
             ax.locator_params(axis="x", nbins=5)
             bottom, top = ax.get_ylim()
@@ -55,7 +63,13 @@ def before_after(runs: dict[str, Trajectory]) -> bytes:
                 ax.axvspan(max(ended, low), high, color=RED, alpha=0.12, lw=0)
         if np.isfinite(ended) and signal == "z - r":
             words = f"{run.lost_why.partition(':')[0]} at {ended:.4g} s"
-            line[0].annotate(words, (0.04, 0.06), xycoords="axes fraction", fontsize=8)
+            paper = {
+                "facecolor": "white",
+                "alpha": 0.7,
+                "edgecolor": "none",
+                "pad": 1,
+            }  # a curve may run behind the words
+            line[0].annotate(words, (0.04, 0.06), xycoords="axes fraction", fontsize=8, bbox=paper)
         line[0].set_ylabel(f"{name}\n{signal} ({unit})", fontsize=9)
     for ax, words in zip(axes[0], ("whole run", "start", "end"), strict=True):
         ax.set_title(words, fontsize=10)
@@ -87,14 +101,19 @@ def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
 
 
 def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies (Hz) above 0 and amplitudes of a signal sampled with this period, s: a sine's amplitude is its
-    peak's. Both empty where there are too few samples to tell."""
+    """Frequencies (Hz) above 0 and amplitudes of a signal sampled with this period, s, under a Hann window.
+
+    A sine's amplitude is that of its peak, that of half the sample rate included. Both are empty for fewer than
+    FEWEST samples.
+    """
     n = len(values)
     if n < FEWEST:
         return np.zeros(0), np.zeros(0)
     window = np.hanning(n)
-    lines = np.abs(np.fft.rfft(window * (values - values.mean())))
-    return np.fft.rfftfreq(n, period)[1:], 2 * lines[1:] / window.sum()
+    lines = 2 * np.abs(np.fft.rfft(window * (values - values.mean()))) / window.sum()
+    if n % 2 == 0:
+        lines[-1] /= 2  # half the sample rate is the only line without a mirror image
+    return np.fft.rfftfreq(n, period)[1:], lines[1:]
 
 
 @own_style
@@ -109,7 +128,7 @@ def convergence(history: dict[str, Any], paths: list[str]) -> bytes:
     for s in range(value.shape[1]):
         left.plot(steps, np.exp(value[:, s]), "0.75", lw=1)
     left.plot(steps, np.exp(value.min(axis=1)), "C0", lw=1.8)
-    title = "blue: the best start; dotted: other members asked"
+    title = "blue: the best start; dotted: the members change"
     left.set(xlabel="iteration", ylabel="what is minimised", yscale="log", title=title)
     for j, path in enumerate(paths):
         right.plot(steps, gains[steps - 1, best, j] / gains[-1, best[-1], j], label=path.removeprefix("controller."))
@@ -144,23 +163,27 @@ def landscape(slices: Slices, paths: list[str]) -> bytes:
         ax.set_xticks([], minor=True)
         span = np.log(gains[-1] / gains[0])
         ends = [end for end in (gains[0], gains[-1]) if abs(np.log(end / gains[middle])) > span / 4]
-        ax.set_xticks([*ends, gains[middle]], [f"{tick:.3g}" for tick in (*ends, gains[middle])], fontsize=8)
+        ax.set_xticks([*ends, gains[middle]], [digits(tick) for tick in (*ends, gains[middle])], fontsize=8)
         ax.grid(alpha=0.3)
     axes[0].set_ylabel(f"relative to the answer (cut at {HIGHEST:g})")
     handles = {label: h for ax in axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    axes[0].legend(handles.values(), handles.keys(), fontsize=8)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2, fontsize=8, frameon=False)
     return _png(figure)
 
 
 @own_style
 def front(rows: list[dict[str, Any]]) -> bytes:
-    """PNG: error against voltage."""
+    """PNG: settled rms error against settled rms voltage; points of gains that lose members are crossed out."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5, 3.4), layout="constrained")
     ax = figure.subplots()
     errors = [r["settled_rms_error_m"] for r in rows]
-    ax.plot([r["settled_rms_u_V"] for r in rows], errors, "o-", ms=4)
+    ax.plot([r["settled_rms_u_V"] for r in rows], errors, "C0o-", ms=4)
+    if lost := [r for r in rows if r["lost"] or r["stalled"]]:
+        voltages = [r["settled_rms_u_V"] for r in lost]
+        ax.plot(voltages, [r["settled_rms_error_m"] for r in lost], "C3x", ms=8, label="members lost or not decided")
+        ax.legend(fontsize=8)
     # at least half a decade: a front of one point has no scale of its own
     ax.set_ylim(min(min(errors) / 1.2, max(errors) / 2), max(max(errors) * 1.2, min(errors) * 2))
     ax.set(xlabel="settled rms voltage (V)", ylabel="settled rms error (m)", yscale="log")

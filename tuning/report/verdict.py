@@ -1,49 +1,141 @@
-"""What the answer is worth, and what would help, in words."""
+"""What the members that judge, and accurate steps, say of the tuned gains: one fact, from which the exit code, the log,
+the report and report.json take every word; and what would help."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 
 from tuning.objective.members import Members
 from tuning.problem import Problem
-from tuning.report.limits import broken, prices
+from tuning.report.limits import BROKEN, UNJUDGED, UNVERIFIED, broken, prices
+
+Facts = dict[str, Any]
+YES, NO = "The tuned gains hold what is asked.", "The tuned gains do NOT hold what is asked:"
+NOBODY = "No held-out member judges the tuned gains (tune.held_out = 0)."
 
 
-def verdict(facts: dict[str, Any]) -> str:
-    """What became of the held-out members, or of those in training where there are none, in a sentence or two."""
-    words = _fates(facts)
-    if not facts["verified"]:
-        words += f" That is NOT VERIFIED: {facts['verified_reason']}."
-    return " ".join([words, *(f"{line}." for line in [*broken(facts["limits"]), *prices(facts["limits"])])])
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """Of the `members` that judge, how many are lost or not decided (`stalled`), and how many may be.
+
+    `limits`: the verdict of each limit by name, as in the report's table. `refuted`: why accurate steps do not confirm
+    all this; '' where they do.
+    """
+
+    members: int
+    lost: int
+    stalled: int
+    may_lose: int
+    limits: dict[str, str]
+    refuted: str
+
+    @property
+    def rotors_held(self) -> bool:
+        """Whether no more rotors are lost or undecided than may be."""
+        return self.lost + self.stalled <= self.may_lose
+
+    @property
+    def broken(self) -> list[str]:
+        """Names of the limits that are not held, but for survival, which is `rotors_held`."""
+        return [name for name, verdict in self.limits.items() if verdict == BROKEN and name != "survival"]
+
+    @property
+    def good(self) -> bool:
+        """Whether the gains hold what is asked: exit code 0."""
+        return not self.against
+
+    @property
+    def against(self) -> list[str]:
+        """What speaks against the gains, a few words each; empty where they hold what is asked."""
+        words = []
+        if not self.rotors_held:
+            ended = f"{self.lost} lost" + f" and {self.stalled} not decided" * bool(self.stalled)
+            words.append(f"{ended} of {self.members} members, at most {self.may_lose} may be")
+        if self.broken:
+            words.append(f"{BROKEN}: {', '.join(self.broken)}")
+        if self.refuted:
+            words.append(UNVERIFIED)
+        return words
+
+    def facts(self) -> Facts:
+        """All of it as plain data."""
+        return dataclasses.asdict(self) | {"good": self.good, "rotors_held": self.rotors_held, "against": self.against}
 
 
-def _fates(facts: dict[str, Any]) -> str:
+def outcome_of(facts: Facts, may_lose: int) -> Outcome:
+    """The outcome of a search's facts: by the held-out members, or by those in training where there are none.
+
+    `may_lose`: how many of the held-out members may be lost; of the others, none.
+    """
+    after, limits = facts["after"], {row["name"]: row["verdict"] for row in facts["limits"]}
+    if not after["members"]:
+        return Outcome(facts["trained_on"], facts["lost_in_training"], 0, 0, limits, facts["refuted"])
+    return Outcome(after["members"], after["lost"], after["stalled"], may_lose, limits, facts["refuted"])
+
+
+def verdict(facts: Facts, outcome: Outcome) -> str:
+    """The answer, and what became of the members that judge, in a few sentences."""
+    unjudged = [name for name, found in outcome.limits.items() if found == UNJUDGED]
+    answer = f"{NO} {'; '.join(outcome.against)}." if not outcome.good else NOBODY if unjudged else YES
+    words = [answer, _fates(facts)]
+    if outcome.refuted:
+        words.append(f"That is {UNVERIFIED.upper()}: {outcome.refuted}.")
+    words += [f"{line}." for line in [*broken(facts["limits"]), *prices(facts["limits"])]]
+    if unjudged:
+        words.append(f"Limits {UNJUDGED}: {', '.join(unjudged)}.")
+    ends = [f"{row['path']} = {row['after']:.4g} ({row['at_bound']})" for row in facts["gains"] if row["at_bound"]]
+    if ends:
+        words.append(f"At a bound: {', '.join(ends)}.")
+    return " ".join(words)
+
+
+def _fates(facts: Facts) -> str:
     before, after = facts["before"], facts["after"]
     if not after["members"]:
         return f"{facts['lost_in_training']} members of the training ensemble are lost under the tuned gains."
     undecided = f", {after['stalled']} not decided (their integration stalls)" if after["stalled"] else ""
     return (
         f"Of {after['members']} held-out members, {after['lost']} are lost under the tuned gains (before: "
-        f"{before['lost']}){undecided}; settled rms error {after['settled_rms_error_m']:.3g} m (before: "
-        f"{before['settled_rms_error_m']:.3g} m), largest {after['settled_max_abs_error_m']:.3g} m."
+        f"{before['lost']}){undecided}; settled rms error of those that are held {_error(after)} (before: "
+        f"{_error(before)}){_largest(after)}."
     )
 
 
-def advice(problem: Problem, facts: dict[str, Any], x: np.ndarray, who: Members) -> str:
-    """Why rotors may still be lost, and what would help: what is tight, in the order in which it matters."""
+def _error(summary: Facts) -> str:
+    return f"{summary['settled_rms_error_m']:.3g} m" if summary["held"] else "none is held"
+
+
+def _largest(summary: Facts) -> str:
+    return f", largest {summary['settled_max_abs_error_m']:.3g} m" if summary["held"] else ""
+
+
+def advice(problem: Problem, facts: Facts, outcome: Outcome, x: np.ndarray, who: Members) -> str:
+    """Why the gains do not hold what is asked, and what would help, in the order in which it matters; '' if they do."""
+    if outcome.good:
+        return ""
     words = []
-    if not facts["verified"]:
+    if outcome.refuted:
         words.append(
-            f"Not verified: {facts['verified_reason']}. Raise tune.substeps or tune.stress, or keep gains at a bound "
+            f"Not verified: {outcome.refuted}. Raise tune.substeps or tune.stress, or keep gains at a bound "
             "lower by tune.bounds."
         )
-    if lines := broken(facts["limits"]):
+    if outcome.broken:
+        lines = [line for line in broken(facts["limits"]) if not line.startswith("tune.limits.survival ")]
         words.append(f"{'. '.join(lines)}. Allow more (inf: none), tune more gains, each p too, or raise tune.screen.")
-    if stalled := facts["after"]["stalled"]:
-        words.append(f"Not decided: {stalled} held-out members, whose integration stalls. Raise tune.substeps.")
-    if not (facts["lost_in_training"] or facts["after"]["lost"]):
-        return " ".join(words)
-    words.append(f"Rotors are lost: {facts['lost_in_training']} of {len(who.member)} in training.")
+    if outcome.stalled:
+        words.append(f"Not decided: {outcome.stalled} held-out members, whose integration stalls. Raise tune.substeps.")
+    return " ".join(
+        [*words, *(_of_the_lost(problem, facts, x, who) if not outcome.rotors_held and outcome.lost else [])]
+    )
+
+
+def _of_the_lost(problem: Problem, facts: Facts, x: np.ndarray, who: Members) -> list[str]:
+    """What is tight where rotors are lost."""
+    judged = f"{facts['after']['lost']} of {facts['after']['members']} held-out members, " * bool(
+        facts["after"]["members"]
+    )
+    words = [f"Rotors are lost: {judged}{facts['lost_in_training']} of {len(who.member)} in training."]
     for row in facts["conditions"]:
         if row["holds"] is False and row["gain"] is not None:
             words.append(f"{row['requires']} fails: {row['gain']:.3g} against {row['against']:.3g} {row['unit']}.")
@@ -57,5 +149,7 @@ def advice(problem: Problem, facts: dict[str, Any], x: np.ndarray, who: Members)
     bound = [row["path"] for row in facts["gains"] if row["at_bound"]]
     if bound:
         words.append(f"At a bound: {', '.join(bound)}; widen tune.bounds.")
-    words.append("More members (tune.members), or risk = 'cvar', asks for more margin; more screen, for other starts.")
-    return " ".join(words)
+    return [
+        *words,
+        "More members (tune.members), or risk = 'cvar', asks for more margin; more screen, for other starts.",
+    ]

@@ -76,13 +76,15 @@ class Course:
     """searches that limits asked for: no rounds"""
     began: float = dataclasses.field(default_factory=time.perf_counter)
 
-    def search(self, points: np.ndarray) -> tuple[np.ndarray, float]:
-        """The best point [m] that a search from these [K, m] finds, and its goal."""
+    def search(self, points: np.ndarray, *, settled: bool = False) -> tuple[np.ndarray, float]:
+        """The best point [m] that a search from these [K, m] finds, and its goal; `settled`: one has ended at the
+        first."""
         tune, number = self.problem.tune, len(self.past) + 1
         path = self.out / checkpoint(number) if self.out else None
         progress = search(
             self.problem.engine, self.problem.goal, self.who, points, keep=tune.budget.starts,
             iterations=tune.budget.iterations, name=tune.optimiser, rate=tune.learning_rate,
+            seed=self.seed + len(self.past), settled=settled,
             keeper=Keeper(path, self.facts, number), resume=self.resume, tell=self.tell or _teller(self.problem),
         )  # fmt: skip
         if progress.ended:
@@ -126,7 +128,7 @@ def looks(course: Course, start: np.ndarray) -> np.ndarray:
         return x
     seen = [(value, x)]  # on the same members, in the same steps
     while look_again([value for value, _ in seen]) and not course.interrupted:
-        x, value = course.search(course.around(x))
+        x, value = course.search(course.around(x), settled=True)
         seen.append((value, x))
         x = min(seen, key=lambda look: look[0])[1]
     return x

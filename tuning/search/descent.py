@@ -13,11 +13,13 @@ from tuning.optimisers import Curvature, Retreat, optimiser
 
 
 class Starts(NamedTuple):
-    """All starts: the point to try [S, m], the optimiser's state, and the way from the best point to the trial [S]."""
+    """All starts: the point to try [S, m], the optimiser's state, the distance from the best point to the trial [S],
+    and the norm of the goal's gradient at the best point [S]."""
 
     trial: Array
     state: Curvature | Retreat
     length: Array
+    rise: Array
 
     @property
     def best(self) -> Array:
@@ -40,7 +42,8 @@ class Descent:
     def begin(self, x: Array) -> Starts:
         """At coordinates x [S, m]."""
         state: Any = jax.vmap(self.method.init)(x)
-        return Starts(x, state, jnp.full(len(x), jnp.inf, x.dtype))
+        infinite = jnp.full(len(x), jnp.inf, x.dtype)
+        return Starts(x, state, infinite, infinite)
 
     @functools.partial(jax.jit, static_argnums=0)
     def anew(self, x: Array, starts: Starts) -> Starts:
@@ -58,10 +61,10 @@ class Descent:
 
     def _one(self, ordinary: int, start: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
         value, (weights, slope) = jax.value_and_grad(self.goal, (0, 1))(outcomes, start.trial, ordinary)
+        gradient: Any = jnp.tensordot(weights, slopes, 2) + slope
         state: Any
-        step, state = self.method.update(
-            jnp.tensordot(weights, slopes, 2) + slope, start.state, start.trial, value=value
-        )
+        step, state = self.method.update(gradient, start.state, start.trial, value=value)
         trial: Any = optax.apply_updates(start.trial, step)
-        fresh = Starts(trial, state, jnp.linalg.norm(trial - state.best))
+        rise = jnp.where(state.value < start.value, jnp.linalg.norm(gradient), start.rise)
+        fresh = Starts(trial, state, jnp.linalg.norm(trial - state.best), rise)
         return jax.tree.map(lambda p, q: jnp.where(on, p, q), fresh, start)

@@ -11,14 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.commands.outputs import say
-from ambjax.host.sealed import DamagedError, difference, flat, provenance, seal, shapes, unseal
+from ambjax.host.sealed import DamagedError, difference, flat, provenance, seal, shapes, unseal, write_whole
 from tuning.objective.loss import TERMS
 from tuning.search.descent import Descent, Starts
+from tuning.search.evolution import Cloud, clouds
 
 # What a checkpoint holds of a search beside arrays and history.
 COUNTS = ("iteration", "phase", "since", "seconds")
 FACTS = {"fingerprint", "round", "counts"}
 NAME = re.compile(r"checkpoint-[0-9]+\.npz")
+# Marks the directory of a search from its beginning on, before there is a checkpoint.
+MARK = "search.json"
 LEAF, PAST, ACTIVE = "leaf_", "history_", "active"
 
 
@@ -38,6 +41,26 @@ class Progress:
     seconds: float = 0.0
     earlier: float = 0.0
     interrupted: bool = False
+    clouds: Cloud = None  # pyright: ignore[reportAssignmentType]
+    """of the starts that go on by CMA-ES, leaves [S, ...]"""
+
+    def __post_init__(self) -> None:
+        if self.clouds is None:
+            self.clouds = clouds(*self.starts.best.shape)
+
+    @property
+    def evolving(self) -> np.ndarray:
+        """Which starts go on by CMA-ES [S]."""
+        return self.clouds.drawn >= 0
+
+    def cloud(self, at: Any) -> Cloud:
+        """The distribution of one start."""
+        return Cloud(*(leaf[at] for leaf in self.clouds))
+
+    def put(self, at: Any, cloud: Cloud) -> None:
+        """Set the distribution of one start."""
+        for whole, part in zip(self.clouds, cloud, strict=True):
+            whole[at] = part
 
     @property
     def ended(self) -> bool:
@@ -56,7 +79,9 @@ class Keeper:
         """Keep this state instead of the one before. Raises ValueError if it cannot be written."""
         if self.path is None:
             return
-        leaves = {f"{LEAF}{n}": np.asarray(leaf) for n, leaf in enumerate(jax.tree.leaves(progress.starts))}
+        leaves = {
+            f"{LEAF}{n}": np.asarray(leaf) for n, leaf in enumerate(jax.tree.leaves((progress.starts, progress.clouds)))
+        }
         past = {f"{PAST}{name}": np.asarray(rows) for name, rows in progress.history.items()}
         counts = {name: getattr(progress, name) for name in COUNTS}
         facts = {"fingerprint": self.fingerprint, "round": self.round, "counts": counts}
@@ -87,6 +112,20 @@ class Keeper:
             return None
 
 
+def begin(directory: pathlib.Path) -> None:
+    """Mark a directory as that of a search, so that a search that is killed from here on can be resumed.
+
+    Raises ValueError where it cannot be written.
+    """
+    text = json.dumps(provenance(), indent=2) + "\n"
+    write_whole(directory / MARK, lambda file: file.write(text.encode()))
+
+
+def begun(directory: pathlib.Path) -> bool:
+    """Whether a search has begun in this directory, so that --resume has something to go on with."""
+    return (directory / MARK).exists()
+
+
 def checkpoint(number: int) -> str:
     """Name of the checkpoint of this round."""
     return f"checkpoint-{number}.npz"
@@ -115,12 +154,12 @@ def remove_all(directory: pathlib.Path) -> int:
 
 def _progress(arrays: dict[str, np.ndarray], counts: dict[str, Any], descent: Descent, starts: int, m: int) -> Progress:
     """Raises DamagedError where these are not the arrays of such a search."""
-    begun = jax.eval_shape(descent.begin, jnp.zeros((starts, m)))
-    leaves, tree = jax.tree.flatten(begun)
+    there = shapes(arrays)
+    kinds = jax.eval_shape(descent.begin, jnp.zeros((starts, m))), clouds(starts, m)
+    leaves, tree = jax.tree.flatten(kinds)
     wanted = {f"{LEAF}{n}": [np.dtype(leaf.dtype).str, list(leaf.shape)] for n, leaf in enumerate(leaves)}
     rows = {"value": (starts,), "x": (starts, m), "gains": (starts, m), "lost": (starts,), "members": ()}
     rows |= {"terms": (starts, len(TERMS)), "rollouts": ()}
-    there = shapes(arrays)
     for name, shape in rows.items():
         kind = there.get(f"{PAST}{name}", [None])[0]
         wanted[f"{PAST}{name}"] = [kind, [counts["iteration"], *shape]]
@@ -129,5 +168,6 @@ def _progress(arrays: dict[str, np.ndarray], counts: dict[str, Any], descent: De
     if differs:
         raise DamagedError(f"it does not fit this search: {differs}")
     history = {name.removeprefix(PAST): list(rows) for name, rows in arrays.items() if name.startswith(PAST)}
-    state = jax.tree.unflatten(tree, [jnp.asarray(arrays[f"{LEAF}{n}"]) for n in range(len(leaves))])
-    return Progress(state, arrays[ACTIVE], history, **counts, earlier=counts["seconds"])
+    state, drawn = jax.tree.unflatten(tree, [arrays[f"{LEAF}{n}"] for n in range(len(leaves))])
+    state = jax.tree.map(jnp.asarray, state)
+    return Progress(state, arrays[ACTIVE], history, **counts, earlier=counts["seconds"], clouds=drawn)

@@ -8,13 +8,11 @@ import numpy as np
 from ambjax.commands.outputs import say
 from tuning.config import seeds
 from tuning.judge import judge
-from tuning.objective.limits import PENALTY, PREFIX, Limit
+from tuning.objective.limits import BELOW, PENALTY, PREFIX, Limit
 from tuning.search.course import Course
 
 # Updates of the multipliers at one place, at most.
 MOST_UPDATES = 6
-# Where it pulls, a limit is met from this share below what is allowed, to half of the margin above.
-BELOW = 0.01
 # What an excess must fall by.
 LEAST = 1e-3
 # An average that is this share below its limit is not judged: it hardly varies over members.
@@ -29,8 +27,10 @@ def limited(course: Course, x: np.ndarray) -> np.ndarray:
         goal = course.problem.goal
         numbers = _numbers(course, x)
         limits = tuple(limit.informed(*found) for limit, found in zip(goal.limits, numbers, strict=True))
-        if any(_stuck(limit, judged) for limit, (_, judged) in zip(goal.limits, numbers, strict=True)):
-            say("a limit does not give way, however steep its pull: it cannot be held here")
+        stuck = [limit for limit, (_, judged) in zip(goal.limits, numbers, strict=True) if _stuck(limit, judged)]
+        if stuck:
+            names = ", ".join(limit.name for limit in stuck)
+            say(f"a steeper pull has not lowered {names}: its multiplier stays, and the held-out members judge it")
             break
         course.problem = course.problem.limited(limits)
         done = []

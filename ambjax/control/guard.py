@@ -1,0 +1,153 @@
+"""The guard of a controller on a processor: it refuses readings that the machine cannot give, and predicts them.
+
+docs/processor.md states the rules, so that a second program can be written from them.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.control import answers
+from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.world.plant import Plant, State
+from ambjax.world.scenario import Scenario
+from ambjax.world.sensor import Measurement, Sensor
+
+# Bound of simulated noise in standard deviations: `numerics.gaussian.normals` gives no larger number.
+LARGEST_NORMAL = 6.8
+# Limits of the other readings: two gaps in a sample, 100 bias currents.
+GAPS, CURRENTS = 2.0, 100.0
+
+
+def _limit(unit: str, doc: str, least: float = 1e-30) -> Any:
+    return leaf(default=None, unit=unit, at_least=least, at_most=1e30, optional=True, doc=doc)
+
+
+class Watch(NamedTuple):
+    """State of a guard: the readings that it expects at the next sample, and the number of samples in a row for which
+    it may still replace a reading: 0 before the first accepted one."""
+
+    expected: Measurement
+    left: Array
+
+
+class Judged(NamedTuple):
+    """Readings as the laws take them; whether one was refused; whether the laws step, or the safe command holds; and
+    `Watch.left` of the next sample."""
+
+    reading: Measurement
+    refused: Array
+    steps: Array
+    left: Array
+
+
+@record
+class Guard:
+    """Refuses a reading that is NaN, beyond its limit, or further from the expected one than the rotor can have moved.
+
+    The nominal model's prediction from the last reading takes its place for up to `samples` samples in a row; then
+    u = 0 until a reading is within its limits. A number left out (None) is derived from the case by `settled`.
+    """
+
+    z: Scalar | None = _limit("m", "largest |z|; none: clearance times gain, plus offset and largest error")
+    z_dot: Scalar | None = _limit("m/s", "largest |z_dot|; none: two gaps in a sample, 2 s_0/T")
+    i: Scalar | None = _limit("A", "largest |i|; none: 100 i_0")
+    noise: Scalar | None = _limit(
+        "m", "by which two readings of one z may differ; none: 13.6 sensor.std and a step of the converter", 0
+    )
+    speed: Scalar | None = _limit(
+        "m/s",
+        "error of the predicted speed; none: 6.8 sensor.std_z_dot, and pole times clearance where z_dot is estimated",
+        0,
+    )
+    samples: Scalar | None = leaf(
+        default=None,
+        unit="samples",
+        at_least=1,
+        at_most=1_000_000,
+        whole=True,
+        optional=True,
+        doc="in a row that are predicted; none: 1/(pole T), in which an error grows e-fold",
+    )
+
+    @property
+    def derived(self) -> bool:
+        """Whether every number is left out: such limits admit all that a sensor without faults can read."""
+        return all(getattr(self, field.name) is None for field in dataclasses.fields(type(self)))
+
+    def settled(self, model: Plant, scenario: Scenario, period: Scalar, estimated: bool) -> "Guard":
+        """The guard with every number; those left out are derived. `estimated`: the velocity is not measured.
+
+        The clearance is that of the scenario, as a share of the gap, in the model. The pole is the model's.
+        """
+        sensor = Sensor() if scenario.sensor is None else scenario.sensor
+        touchdown, clearance = scenario.touchdown, scenario.touchdown / scenario.plant.s_0 * model.s_0
+        step = 0.0 if sensor.bits is None else 2 * sensor.ends(scenario.plant.s_0) / 2.0**sensor.bits
+        error, fall = LARGEST_NORMAL * sensor.std + step / 2, model.pole * clearance
+        off = 1.0 if estimated or sensor.bandwidth is not None else abs(sensor.gain - 1)
+        values = {
+            "z": sensor.gain * touchdown + abs(sensor.offset) + error,
+            "z_dot": GAPS * model.s_0 / period,
+            "i": CURRENTS * model.i_0,
+            "noise": 2 * error,
+            "speed": LARGEST_NORMAL * sensor.std_z_dot + off * fall,
+            "samples": jnp.maximum(1 / (model.pole * period) // 1, 1.0),
+        }
+        own = {name: getattr(self, name) for name in values}
+        return Guard(**{name: value if own[name] is None else own[name] for name, value in values.items()})
+
+    def start(self) -> Watch:
+        """Before the first reading."""
+        zero = jnp.zeros(())
+        return Watch(Measurement(zero, zero, zero), zero)
+
+    def judged(self, model: Plant, measured: Measurement, watch: Watch, period: Scalar, estimated: bool) -> Judged:
+        """What becomes of the readings of a sample."""
+        guard: Any = self  # settled
+        (z, _, i), time = watch.expected, (guard.samples - watch.left + 1) * period
+        # one magnet's whole pull at the expected place and current, m/s^2: by so much at most the model's force is off
+        share = (model.i_0 + jnp.abs(i)) / (model.s_0 - jnp.abs(z))
+        reach = guard.noise + time * (guard.speed + time / 2 * (model.a * share * share))
+        near = (jnp.abs(measured.z - z) <= reach) | (watch.left <= 0)
+        fine = Measurement(
+            near & (jnp.abs(measured.z) <= guard.z),
+            jnp.asarray(True) if estimated else jnp.abs(measured.z_dot) <= guard.z_dot,
+            jnp.abs(measured.i) <= guard.i,
+        )
+        good = fine.z & fine.z_dot & fine.i
+        left = jnp.where(good, jnp.asarray(guard.samples), jnp.maximum(watch.left - 1, 0.0))
+        reading = Measurement(*(jnp.where(ok, x, y) for ok, x, y in zip(fine, measured, watch.expected, strict=True)))
+        return Judged(reading, ~good, good | (watch.left > 0), left)
+
+    def refused(self, before: Watch, after: Watch) -> tuple[Array, Array]:
+        """Whether the sample between two states refused a reading, and whether it gave the safe command."""
+        refused = after.left < jnp.asarray(self.samples)
+        return refused, refused & (before.left <= 0)
+
+
+def expected(model: Plant, motion: Measurement, u: Array, period: Scalar) -> Measurement:
+    """Readings a sample later: of this motion (readings; the velocity as estimated), under a mean voltage u (V)."""
+    rates = model.rates(State(*motion), u)
+    z, z_dot, i = (x + period * rate for x, rate in zip(motion, rates, strict=True))
+    return Measurement(z + period * period / 2 * rates.z_dot, z_dot, i)
+
+
+def guarded(cascade: Any, scenario: Scenario, period: Scalar) -> Any:
+    """The cascade with the numbers of its guard settled for a scenario; as it is if it has no guard."""
+    processor = cascade.processor
+    if processor is None or processor.guard is None:
+        return cascade
+    estimated = answers.estimates_velocity(cascade.observer)
+    guard = processor.guard.settled(cascade.model, scenario, period, estimated)
+    return dataclasses.replace(cascade, processor=dataclasses.replace(processor, guard=guard))
+
+
+def simulated(cascade: Any, scenario: Scenario, period: Scalar) -> Any:
+    """The cascade as it is simulated: without its guard where no reading can be refused, by faults or limits given."""
+    processor = cascade.processor
+    idle = processor.guard is not None and processor.guard.derived
+    if idle and not (scenario.sensor is not None and scenario.sensor.faulty):
+        return dataclasses.replace(cascade, processor=dataclasses.replace(processor, guard=None))
+    return guarded(cascade, scenario, period)

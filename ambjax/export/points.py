@@ -1,0 +1,170 @@
+"""The points at which the exported step is compared with JAX: parameters, states and inputs.
+
+`points` keeps the case's parameters; `varied` moves each of them to the ends of its range.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from ambjax.export.controller import INPUTS
+from ambjax.export.program import Ref
+from ambjax.export.statements import PRECISIONS
+from ambjax.export.trace import UNREAD, Trace
+
+# Decades around the size that matters, to the ends of the gap; the probability that a number is an edge, and that a
+# point is a first step.
+DECADES, EDGY, FIRST = (-7.0, 1.7), 0.02, 0.05
+# Random points between which borders are sought; draws per point; share of points within the supply's limit, if found.
+POOL, DRAWS, CALM = 3000, 4, 0.4
+# Pairs of points on both sides of a border that are sought for each comparison, and bisections of each pair.
+PAIRS, HALVINGS = 4, 64
+# Share of varied points that move one parameter, the others having the case's values; the rest move all at once.
+ALONE = 0.7
+# Of the points at an end of a limit, the share whose input lies at that limit; their relative distances from it.
+AT_LIMIT, BESIDE = 0.5, (-1e-6, 1e-6)
+
+
+class Points(NamedTuple):
+    """Parameters, states and inputs, [numbers, points], and whether each point's state was started."""
+
+    parameters: np.ndarray
+    state: np.ndarray
+    started: np.ndarray
+    inputs: np.ndarray
+
+
+def points(trace: Trace, count: int, seed: int = 0) -> Points:
+    """Random states and inputs over decades, edges, and both sides of every comparison, at the case's parameters."""
+    random, dtype = np.random.default_rng(seed), PRECISIONS[trace.precision]
+    drawn = max(DRAWS * count, POOL)
+    own = np.array([x.value for x in trace.parameters])
+    parameters = np.broadcast_to(own[:, None], (own.size, drawn))
+    x = np.concatenate([parameters, _drawn(trace, random, parameters)]).astype(dtype)
+    started = random.random(drawn) >= FIRST
+    borders = _borders(trace, x[:, started & np.isfinite(x[own.size :]).all(axis=0)][:, :POOL])
+    borders = borders[:, _seen(trace, borders, np.ones(borders.shape[1], bool))[1]]
+    borders = borders[:, random.permutation(borders.shape[1])[: count // 2]]
+    # most random states demand more voltage than the supply has: add some that do not
+    far, normal = _seen(trace, x, started)
+    calm = np.flatnonzero(started & normal & ~far)[: int(CALM * count)]
+    rest = np.setdiff1d(np.flatnonzero(normal), calm)[: count - calm.size - borders.shape[1]]
+    chosen = np.concatenate([calm, rest])
+    x = np.concatenate([x[:, chosen], borders], axis=1)
+    return _split(trace, x, np.concatenate([started[chosen], np.ones(borders.shape[1], bool)]))
+
+
+def varied(trace: Trace, count: int, seed: int = 2) -> Points:
+    """Random states and inputs at other parameters: each one alone at every end of its range, then all at random ends.
+
+    The ends are `Number.ends`. They include values that a step must refuse.
+    """
+    random, dtype = np.random.default_rng(seed), PRECISIONS[trace.precision]
+    cases = [(k, end) for k, x in enumerate(trace.parameters) if x.allowed != UNREAD for end in x.ends]
+    alone = np.arange(int(ALONE * count)) % len(cases)
+    parameters = np.array([[x.value] * count for x in trace.parameters])
+    which, ends = (np.array(column)[alone] for column in zip(*cases, strict=True))
+    parameters[which, np.arange(alone.size)] = ends
+    for row, x in zip(parameters, trace.parameters, strict=True):
+        row[alone.size :] = random.choice([x.value, *x.ends[:2]], count - alone.size)
+    x = _drawn(trace, random, parameters)
+    limited = {k: INPUTS_AT[x.name] for k, x in enumerate(trace.parameters) if x.name in INPUTS_AT}
+    for n in np.flatnonzero(random.random(alone.size) < AT_LIMIT):
+        if which[n] in limited:
+            side = random.choice([-1.0, 1.0]) * (1 + random.choice(BESIDE))
+            x[len(trace.state) + limited[which[n]], n] = side * ends[n]
+    x = np.concatenate([parameters, x]).astype(dtype)
+    started = random.random(count) >= FIRST
+    normal = _seen(trace, x, started)[1]
+    return _split(trace, x[:, normal], started[normal])
+
+
+# Which input each limit is of.
+INPUTS_AT = {f"{of}.{name}": k for k, name in enumerate(INPUTS) for of in ("limits", "processor.guard")}
+
+
+def _split(trace: Trace, x: np.ndarray, started: np.ndarray) -> Points:
+    at = len(trace.parameters), len(trace.parameters) + len(trace.state)
+    parameters, state, inputs = np.split(x, at)
+    return Points(parameters, state, started, inputs)
+
+
+def _seen(trace: Trace, x: np.ndarray, started: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whether the voltage is at its limit or held, and whether no intermediate number is subnormal.
+
+    JAX takes a subnormal number for 0 on CPUs, and C does not.
+    """
+    values, normal = evaluated(trace, x, started), np.ones(x.shape[1], bool)
+    for value in values:
+        if value.dtype.kind == "f":
+            normal &= (value == 0) | ~(np.abs(value) < np.finfo(value.dtype).tiny)
+    far = [values[bit.node] if isinstance(bit, Ref) else np.full(x.shape[1], bit) for _, bit in trace.bits[:2]]
+    return np.any(far, axis=0), normal
+
+
+def _drawn(trace: Trace, random: np.random.Generator, parameters: np.ndarray) -> np.ndarray:
+    """States and inputs: of either sign, over decades, with zeros, limits and non-finite numbers among them."""
+    sizes, count = np.array(_sizes(trace)), parameters.shape[1]
+    limits = np.ones((sizes.size, count))  # without a guard a reading has none
+    for k, x in enumerate(trace.parameters):
+        if x.name in INPUTS_AT:
+            limits[len(trace.state) + INPUTS_AT[x.name]] = parameters[k]
+    shape = sizes.size, count
+    x = sizes[:, None] * 10.0 ** random.uniform(*DECADES, shape) * random.choice([-1.0, 1.0], shape)
+    x *= (np.arange(count) % 7 > 0) | (random.random(shape) < 0.5)  # in every seventh point half are 0
+    edges = [0.0 * limits, -0.0 * limits, 1e-30 * sizes[:, None] * np.ones(shape)]
+    edges += [sign * limits * (1 + off) for sign in (1, -1) for off in (0, 4e-16, -2e-16, 2e-7, -1e-7)]
+    edge = np.take_along_axis(np.array(edges), random.integers(len(edges), size=(1, *shape)), axis=0)[0]
+    x = np.where(random.random(shape) < EDGY, edge, x)
+    wild = random.choice([np.nan, np.inf, -np.inf], shape)
+    inputs = np.arange(sizes.size)[:, None] >= len(trace.state)
+    return np.where(inputs & (random.random(shape) < EDGY / 10), wild, x)
+
+
+def _sizes(trace: Trace) -> list[float]:
+    """The size that matters of each state and input."""
+    controller = trace.controller
+    cascade, limits = controller.parameters
+    model = cascade.model
+    z, z_dot, i = (float(x) for x in model.sizes())
+    pole, weight = float(model.pole), float(model.R) * float(model.i_0)
+    u = float(limits.u_max) if np.isfinite(limits.u_max) else 10 * weight + 1.0
+    laws = [float(x) for x in jax.tree.leaves(cascade.scale())]
+    v = float(model.v_size)
+    guard: Any = cascade.processor.guard if cascade.processor else None
+    states = [*laws, v, v, i, i * pole, u, u, *([z, z_dot, i, float(guard.samples)] if guard else [])]
+    return [states[k] for k in trace.keep] + [z, z_dot, i, z, z * pole, z * pole**2, z * pole**3]
+
+
+def _borders(trace: Trace, x: np.ndarray) -> np.ndarray:
+    """Points next to where a comparison of the step turns, on both sides of it, found by bisection."""
+    nodes = trace.program.nodes
+    begun = np.ones(x.shape[1], bool)
+    outcomes, found = evaluated(trace, x, begun), []
+    for n in (n for n in trace.order() if nodes[n].op in ("lt", "le", "gt", "ge")):
+        yes, no = (np.flatnonzero(outcomes[n] == side)[:PAIRS] for side in (True, False))
+        found += [(n, a, b) for a, b in zip(yes, no, strict=False)]
+    if not found:
+        return x[:, :0]
+    asked, yes, no = map(np.array, zip(*found, strict=True))
+    a, b = x[:, yes], x[:, no]
+    for _ in range(HALVINGS):
+        middle = (a / 2 + b / 2).astype(x.dtype)
+        values = evaluated(trace, middle, np.ones(middle.shape[1], bool))
+        like = np.array([values[n][lane] for lane, n in enumerate(asked)])
+        a, b = np.where(like, middle, a), np.where(like, b, middle)
+    return np.concatenate([a, b], axis=1)
+
+
+def evaluated(trace: Trace, x: np.ndarray, started: np.ndarray) -> list[np.ndarray]:
+    """Every node at parameters, states and inputs, by NumPy."""
+    count, program, dtype = x.shape[1], trace.program, PRECISIONS[trace.precision]
+    rows: Any = iter(x)
+    values: list[Any] = [next(rows) for _ in trace.parameters]
+    memory = [np.zeros(count, dtype)] * (len(trace.refs) - len(trace.parameters) - len(INPUTS) - 2)
+    for k in trace.keep:
+        memory[k] = next(rows)
+    values += [*memory, started, *rows, np.full(count, trace.controller.period, dtype)]
+    given = {ref.node: value for ref, value in zip(trace.refs, values, strict=True)}
+    return [np.broadcast_to(v, count) for v in program.evaluate(given)]

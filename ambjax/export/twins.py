@@ -1,0 +1,153 @@
+"""The horizon of a comparison of closed loops: how long rounding alone leaves them together.
+
+A closed loop with hard signs or converters amplifies rounding until two correct programs have nothing in common but
+their statistics. Twins of JAX's loop measure that: in each, every state of the plant and of the laws, and the voltage,
+is changed by one unit in the last place, up or down at random, at every sample. Until the twins part, a correct program
+stays as close to JAX's loop as they do.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.control.cascade import Cascade, Command
+from ambjax.control.guard import Watch
+from ambjax.export.statements import PRECISIONS
+from ambjax.numerics.records import Scalar, canonical, record
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.rollout import run
+from ambjax.simulation.sampled import Sampled, SampledState, system_of
+from ambjax.world.scenario import Scenario
+from ambjax.world.sensor import Errors, FaultyErrors
+
+# Twins of each precision; the share of a signal's rms at which they have parted; samples that a verdict takes at least.
+TWINS, PARTED, LEAST = 8, 1e-2, 20
+# Signals whose parting ends the horizon.
+SIGNALS = ("z", "u")
+
+
+class Case(NamedTuple):
+    """What is compared: a cascade on its processor in a scenario, over a clock; `settle`: when it has settled, s."""
+
+    cascade: Cascade
+    scenario: Scenario
+    clock: Clock
+    settle: float
+
+
+class Horizon(NamedTuple):
+    """JAX's loop, and how far the twins of one precision part from it.
+
+    `signals`: z (m) and u (V) of JAX's loop, [samples]. `parted`: the largest distance of any twin so far, likewise.
+    `sizes`: the rms of z - r and of u, after the settling time. `samples`: how many pass before a twin parts by more
+    than PARTED of a size, or the rotor is lost.
+    """
+
+    signals: dict[str, np.ndarray]
+    parted: dict[str, np.ndarray]
+    sizes: dict[str, float]
+    samples: int
+
+    @property
+    def decisive(self) -> bool:
+        """Whether the horizon is long enough for a verdict."""
+        return self.samples >= LEAST
+
+
+@record
+class Twin(Sampled):
+    """The sampled loop with every state changed by `unit` of its size at every sample; `seed` draws the signs."""
+
+    seed: Scalar
+    unit: Scalar
+
+    def jump(self, t: Scalar, state: SampledState, hold: Errors | FaultyErrors) -> SampledState:
+        """The laws' step from the changed states, and its changed command."""
+        sample = jnp.rint(t / self.period).astype(jnp.int32)
+        key = jax.random.fold_in(jax.random.key(jnp.asarray(self.seed, jnp.int32)), sample)
+        before, after = jax.random.split(key)
+        moved = self._moved(before, state, self._sizes(state))
+        # flags and counts are no states
+        watch = moved.watch._replace(left=state.watch.left) if state.watch else ()
+        state = moved._replace(sane=state.sane, watch=watch, started=state.started, sensed=state.sensed)
+        stepped = super().jump(t, state, hold)
+        return stepped._replace(command=self._moved(after, stepped.command, self._sizes(stepped).command))
+
+    def _moved(self, key: Array, state: Any, sizes: Any) -> Any:
+        """Every number one unit of its size up or down."""
+        leaves, tree = jax.tree.flatten(state)
+        signs = jax.random.rademacher(key, (len(leaves),), float)
+        steps = [jnp.maximum(jnp.abs(x), size) for x, size in zip(leaves, jax.tree.leaves(sizes), strict=True)]
+        return jax.tree.unflatten(tree, [x + self.unit * s * h for x, s, h in zip(leaves, signs, steps, strict=True)])
+
+    def _sizes(self, state: SampledState) -> SampledState:
+        """The size that matters of each state: the unit in the last place of a smaller number is that of the size.
+
+        Of a voltage, what drives the coil's current reference within a sample: laws divide a difference of two of them
+        by the period.
+        """
+        cascade, plant = self.loop.cascade, self.loop.scenario.plant
+        model = cascade.model
+        i, v = model.i_0 / 25, model.v_size
+        gap = jnp.maximum(model.s_0 - jnp.abs(plant.measurement(state.plant).z), 0.01 * model.s_0)
+        driven = model.L * model.s_0 / gap * jnp.maximum(jnp.abs(state.command.i_ref), i) / self.period
+        volt = jnp.abs(model.R * model.i_0) + driven
+        return SampledState(
+            plant=plant.scale(),
+            control=cascade.scale(),
+            command=Command(i_ref=i, i_ref_dot=i * model.pole, u=volt, v_star=v, v_tilde=v),
+            past=(volt, volt),
+            sane=jnp.zeros(()),
+            seen=jax.tree.map(lambda _: plant.s_0 / 50, state.seen),
+            u_a=jax.tree.map(lambda _: volt, state.u_a),
+            watch=state.watch and Watch(plant.sizes(), jnp.zeros(())),
+            started=state.started,
+            sensed=state.sensed,
+        )
+
+
+def horizons(case: Case, precisions: list[str]) -> dict[str, Horizon]:
+    """JAX's loop beside its twins, for each precision."""
+    given: Any = system_of(case.cascade, case.scenario, case.clock)
+    twin, clock = canonical((Twin(given.loop, given.period, given.cuts, 0.0, 0.0), case.clock))
+    units = [0.0] + [float(np.finfo(PRECISIONS[x]).eps) for x in precisions for _ in range(TWINS)]
+    signals, r, lost_at = _together(twin, clock, jnp.asarray(units), jnp.arange(len(units)))
+    z_and_u = {name: np.asarray(x) for name, x in zip(SIGNALS, signals, strict=True)}
+    period = float(clock.sample_period)
+    alive = int(np.clip(np.ceil(float(lost_at[0]) / period), 0, clock.samples))
+    settled = slice(round(case.settle / period) if case.settle < period * alive else 0, max(alive, 1))
+    plain = {name: x[0] for name, x in z_and_u.items()}
+    errors = {**plain, "z": plain["z"] - np.asarray(r[0])}
+    sizes = {name: float(np.sqrt(np.mean(x[settled] ** 2))) for name, x in errors.items()}
+    found = {}
+    for k, precision in enumerate(precisions):
+        lanes = slice(1 + k * TWINS, 1 + (k + 1) * TWINS)
+        parted = {name: farthest(x[lanes], x[0]) for name, x in z_and_u.items()}
+        found[precision] = Horizon(plain, parted, sizes, _count(parted, sizes, alive))
+    return found
+
+
+def farthest(loops: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """The largest distance so far of any of the loops, [loops, samples], from the reference."""
+    return np.maximum.accumulate(np.abs(loops - reference).max(axis=0))
+
+
+def _count(parted: dict[str, np.ndarray], sizes: dict[str, float], alive: int) -> int:
+    ends = [np.flatnonzero(~(x <= PARTED * sizes[name])) for name, x in parted.items()]
+    return min([alive, *(int(end[0]) for end in ends if end.size)])
+
+
+@jax.jit
+def _together(twin: Twin, clock: Clock, units: Array, seeds: Array) -> Any:
+    """z and u of one loop for each unit and seed, [loops, samples]; r, likewise; when each rotor is lost, s."""
+
+    def one(unit: Array, seed: Array) -> Any:
+        system: Any = dataclasses.replace(twin, unit=unit, seed=seed)
+        made = run(system, clock, None, every=1).trajectory
+        return tuple(getattr(made.rows, name) for name in SIGNALS), made.rows.r, made.lost_at
+
+    return jax.vmap(one)(units, seeds)

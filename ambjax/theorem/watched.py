@@ -1,0 +1,99 @@
+"""The loop on a processor with what its laws act on: their own sigma, v_tilde and e, sample by sample."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.control.cascade import Sample
+from ambjax.numerics.records import Scalar, record
+from ambjax.simulation.integrate import Advanced, Integrator
+from ambjax.simulation.sampled import Sampled, SampledState
+from ambjax.simulation.span import Span
+from ambjax.world.sensor import Errors
+
+
+class Signals(NamedTuple):
+    """sigma (m/s), v_tilde (A^2/m^2) and e = i - i_ref (A)."""
+
+    sigma: Array
+    v_tilde: Array
+    e: Array
+
+
+class WatchedRow(NamedTuple):
+    """One sample: time (s), voltage within the supply's limit (V), signals, and the distance of (z/s_0, i_ref/i_0) to
+    the singular curve C, negative beyond it.
+
+    `computed` are the signals that the laws act on: of the estimate, carried over the delay where that is predicted.
+    `true` are those of the plant at the sample.
+    """
+
+    t: Array
+    u: Array
+    computed: Signals
+    true: Signals
+    distance: Array
+
+
+class WatchedState(NamedTuple):
+    """State of the loop, and the signals that its laws acted on last."""
+
+    loop: SampledState
+    computed: Signals
+
+
+@record
+class Watched:
+    """A loop on a processor whose rows show the signals that its laws act on."""
+
+    loop: Sampled
+
+    def realised(self) -> "Watched":
+        return Watched(self.loop.realised())
+
+    def hold(self, sample: Scalar) -> Any:
+        return self.loop.hold(sample)
+
+    def start(self) -> WatchedState:
+        return WatchedState(self.loop.start(), Signals(*[jnp.zeros(())] * 3))
+
+    def jump(self, t: Scalar, state: WatchedState, hold: Errors) -> WatchedState:
+        """The laws' step, and the signals that it acted on."""
+        loop, before = self.loop, state.loop
+        cascade, after = loop.loop.cascade, loop.jump(t, before, hold)
+        reference = loop.reference(t)
+        sample = Sample(reference, loop.period, jnp.asarray(loop.loop.scenario.u_max), after.past)
+        measured = loop.measured(before.plant, before.seen, hold)
+        estimate, *_ = cascade.estimate(measured, before.control.observer, sample)
+        sigma, command = cascade.position.sigma(estimate, reference), after.command
+        return WatchedState(after, Signals(sigma, command.v_tilde, estimate.i - command.i_ref))
+
+    def advance(
+        self, method: Integrator, hold: Errors, t: Scalar, period: Scalar, state: WatchedState, memory: Any, code: Array
+    ) -> Advanced:
+        after = self.loop.advance(method, hold, t, period, state.loop, memory, code)
+        return after._replace(state=state._replace(loop=after.state))
+
+    def fate(self, state: WatchedState) -> Array:
+        return self.loop.fate(state.loop)
+
+    def rest(self, state: WatchedState, code: Array) -> WatchedState:
+        return state._replace(loop=self.loop.rest(state.loop, code))
+
+    def row(self, t: Scalar, state: WatchedState, hold: Errors, alive: Array) -> WatchedRow:
+        row = self.loop.row(t, state.loop, hold, alive)
+        plant = self.loop.loop.scenario.plant
+        return WatchedRow(
+            row.t,
+            row.u,
+            state.computed,
+            Signals(row.sigma, row.v_tilde, row.e),
+            plant.signed_distance_to_C(row.z, row.i_ref),
+        )
+
+    def noted(self, row: WatchedRow, span: Span) -> WatchedRow:
+        return row
+
+    def singularity(self, row: WatchedRow) -> Array:
+        return row.distance

@@ -1,0 +1,91 @@
+"""Faults of a position sensor on a processor: readings that are far off, and readings that do not come."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.numerics.gaussian import threefry
+from ambjax.numerics.records import Scalar, leaf, record, static
+
+# Streams of a member's key, beside those of `numerics.gaussian`.
+OUTLIERS, DROPOUTS = 3, 4
+VALUES = ("hold", "nan", "zero", "full-scale")
+
+
+class Struck(NamedTuple):
+    """Faults that begin at a sample: what is added to its reading, m, and whether readings stop."""
+
+    outlier: Array
+    drops: Array
+
+
+class Sensed(NamedTuple):
+    """State of a faulty sensor: its last reading of z, m, and the samples for which no reading comes any more."""
+
+    z: Array
+    left: Array
+
+
+def _rate() -> Any:
+    return leaf(default=0.0, unit="1/s", at_least=0, at_most=1e9, doc="mean number in a second, each sample alike")
+
+
+def _at() -> Any:
+    return leaf(
+        default=None, unit="s", at_least=0, at_most=1e6, optional=True, doc="one more at the nearest sample; none: none"
+    )
+
+
+@record
+class Outliers:
+    """Single readings of z that are off by `size`, up or down with equal chances, after the converter."""
+
+    rate: Scalar = _rate()
+    size: Scalar = leaf(default=1e-3, unit="m", at_least=0, at_most=1.0, doc="by which a reading is off")
+    at: Scalar | None = _at()
+
+    def struck(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Array:
+        """What is added to the reading of a sample, m."""
+        begins, sign = _begins(self, OUTLIERS, key, sample, period)
+        return jnp.where(begins, sign * self.size, 0.0)
+
+
+@record
+class Dropouts:
+    """Stretches of time without a reading of z; `value` is what is read instead.
+
+    "hold": the last reading; "nan": NaN; "zero": 0 m; "full-scale": the end of the converter.
+    """
+
+    rate: Scalar = _rate()
+    duration: Scalar = leaf(
+        default=5e-4, unit="s", at_least=0, at_most=1e6, doc="of each, to the nearest sample and at least one"
+    )
+    at: Scalar | None = _at()
+    value: str = static(default=VALUES[0], doc="what is read meanwhile")
+
+    def struck(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Array:
+        """Whether one begins at a sample."""
+        return _begins(self, DROPOUTS, key, sample, period)[0]
+
+    def samples(self, period: Scalar) -> Array:
+        """How many samples one takes."""
+        return jnp.maximum(jnp.round(self.duration / period), 1.0)
+
+    def read(self, last: Array, end: Scalar) -> Array:
+        """What is read in place of z, m; `end` is the end of the converter."""
+        values = {"hold": last, "nan": jnp.nan, "zero": 0.0, "full-scale": end}
+        return jnp.asarray(values[self.value], last.dtype)
+
+
+def _begins(
+    fault: Outliers | Dropouts, stream: int, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar
+) -> tuple[Array, Array]:
+    """Whether a fault begins at a sample, with probability rate T or where it is asked for; and a random sign."""
+    first, second = threefry(key, (stream, sample))
+    dtype = jnp.result_type(float)
+    begins = first.astype(dtype) * 2.0**-32 < fault.rate * period
+    if fault.at is not None:
+        begins = begins | (jnp.round(fault.at / period) == jnp.asarray(sample).astype(dtype))
+    return begins, jnp.where(second >> jnp.uint32(31) == 0, 1.0, -1.0)

@@ -1,0 +1,111 @@
+"""What CMA-ES finds from the tuner's answer: whether the search stopped short.
+
+Each task is tuned as tasks.py does it. From its answer CMA-ES goes on for so many evaluations, on the training ensemble
+and the 16 validation members with the least clearance, on the tuner's goal; limits are penalties on what members reach,
+without a margin for smoothing. The best point and the last mean are judged on the 1,000 held-out members of the
+tuner: a point that loses more of them, or breaks a limit, is marked. Results of tasks that are not asked for stay.
+Run: python benchmarks/from_answer.py [--out DIR] [--evaluations 300] [--size 0.2] [TASK ...]
+"""
+
+import argparse
+import dataclasses
+import os
+import pathlib
+from typing import Any
+
+os.environ.setdefault("JAX_ENABLE_X64", "1")
+
+import _measure
+import numpy as np
+import tasks
+
+from tuning.config import read_tune, seeds
+from tuning.judge import judge, summarise
+from tuning.objective.limits import PREFIX
+from tuning.objective.members import Members
+from tuning.problem import Problem, problem_of
+from tuning.search.course import training
+
+TASKS = ("limited/light", "sampled/F10-signs", "D")
+# Validation members that join, with the loudness that the tuner gives them; steepness of the penalties.
+JOINED, LOUD, PENALTY = 16, 1.1, 300.0
+
+
+def members(problem: Problem, x: np.ndarray) -> Members:
+    """The training ensemble, and the validation members with the least clearance at x [m]."""
+    count, seed = problem.tune.budget.validation, seeds(problem.tune.budget)[1]
+    terms = problem.engine.terms(x[None], problem.objective.chosen(seed, np.arange(count), count))
+    tight = np.argsort(-terms["clearance"][0] - terms["survival"][0], kind="stable")[:JOINED]
+    those = problem.objective.chosen(seed, tight, count)
+    return training(problem).joined(those._replace(loud=LOUD * those.loud))
+
+
+def goals(problem: Problem, x: np.ndarray, who: Members) -> np.ndarray:
+    """The goal [S] at x [S, m], limits as penalties on what ordinary members reach."""
+    terms, free = problem.engine.terms(x, who), dataclasses.replace(problem.goal, limits=())
+    values = free.score(x, {name: rows for name, rows in terms.items() if not name.startswith(PREFIX)}, who)
+    for limit in problem.goal.limits:
+        rows = terms[PREFIX + limit.name][:, : who.ordinary]
+        excess = [max(limit.beyond(float(limit.kind.judged(one))), 0.0) for one in rows]
+        values = values + PENALTY * np.square(excess) / 2
+    return np.where(np.isfinite(values), values, 10.0)
+
+
+def judged(problem: Problem, x: np.ndarray) -> dict[str, Any]:
+    """Errors of the held-out members at x [m], how many are lost, and which limits are not held."""
+    columns = judge(problem, x, seeds(problem.tune.budget)[2], problem.tune.budget.held_out)
+    summary = summarise(columns)
+    broken = [limit.name for limit in problem.goal.limits if limit.reached(columns) > limit.asked]
+    names = ("settled_rms_error_m", "settled_max_abs_error_m", "lost")
+    return {name: summary[name] for name in names} | {"broken": broken}
+
+
+def measured(task: str, out: pathlib.Path, evaluations: int, size: float) -> dict[str, Any]:
+    """One task: the tuner's answer, and what CMA-ES makes of it."""
+    import cma
+
+    row = tasks.tuned(tasks.TASKS / f"{task}.toml", out)
+    case, tune, _ = read_tune(out / "tuned.toml")
+    problem = problem_of(case, tune)
+    space = problem.objective.space
+    x = space.encode(space.clip(space.values(case.cascade)))
+    who = members(problem, x)
+    first = lowest = goals(problem, x[None], who)[0]
+    best, spent = x, 0
+    strategy = cma.CMAEvolutionStrategy(x, size, {"seed": 7, "verbose": -9})
+    while spent < evaluations:
+        points = np.array(strategy.ask())
+        values = goals(problem, points, who)
+        strategy.tell(list(points), values.tolist())
+        spent += len(points)
+        if values.min() < lowest:
+            lowest, best = values.min(), points[int(values.argmin())]
+    found = {"answer": judged(problem, x), "best": judged(problem, best), "mean": judged(problem, strategy.mean)}
+    gains = {name: 1 - found[name]["settled_rms_error_m"] / found["answer"]["settled_rms_error_m"] for name in found}
+    print(
+        f"{task}: rms error {found['answer']['settled_rms_error_m']:.4e} m; {spent} evaluations of CMA-ES: "
+        + ", ".join(
+            f"{name} {100 * gains[name]:+.2f} % lower, {found[name]['lost']} lost, broken: {found[name]['broken']}"
+            for name in ("best", "mean")
+        ),
+        flush=True,
+    )
+    kept = {key: row[key] for key in ("rollouts", "seconds", "processor_s")}
+    return found | {"evaluations": spent, "size": size, "of_the_goal": float(first - lowest), **kept}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("tasks", nargs="*", default=list(TASKS))
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out", "tasks"))
+    parser.add_argument("--evaluations", type=int, default=300)
+    parser.add_argument("--size", type=float, default=0.2)
+    given = parser.parse_args()
+    rows = tasks.kept("from_answer")
+    for task in given.tasks:
+        rows[task] = measured(task, given.out / pathlib.Path(task).name, given.evaluations, given.size)
+        _measure.write("from_answer", {"tasks": dict(sorted(rows.items()))})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,217 @@
+"""The guard of readings and the faults of a position sensor: what is refused, what is survived, what is drawn."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from sampled_oracle import simulate
+from test_sampled import DIFFERENCE, KALMAN, NOISE, TRACKING, World, hard, loop_of, noise_of, soft
+
+import ambjax as amb
+from ambjax.cases.reader import case_from
+from ambjax.control.guard import Guard, guarded, simulated
+from ambjax.control.processor import Processor
+from ambjax.ensemble import run_ensemble
+from ambjax.simulation.metrics import Count, Named, Rms, standard_for
+from ambjax.world.faults import VALUES, Dropouts, Outliers
+from ambjax.world.sensor import Errors, Measurement, Sensor
+
+T = 1e-4
+CLOCK = amb.Clock(160, T, amb.RK4(3))
+SHARES = np.concatenate([[0.98, 1.2, 1.5, 1.98], [-1.2, -1.5, -1.98]])
+
+
+def struck(guard=Guard(), observer=None, **faults):
+    """Gains of the page about exported C, or those behind a Kalman filter, with a faulty sensor."""
+    laws = amb.position.SlidingMode(1440.0, 2.307, math.inf), amb.inversion.Adaptive(7.97e5, math.inf)
+    cascade = amb.Cascade(
+        observer or amb.observer.Direct(),
+        *laws,
+        amb.current.SlidingMode(870.6, math.inf),
+        processor=Processor(guard=guard),
+    )
+    sensor = Sensor(*NOISE, velocity=observer is None, **faults)
+    return cascade, amb.Scenario(reference=amb.Sine(2.5e-3, 2.0), sensor=sensor, u_max=200.0, seed=3)
+
+
+@pytest.mark.parametrize("observer", [None, amb.observer.Kalman(500.0)], ids=["direct", "Kalman"])
+def test_one_impossible_reading_is_refused_and_survived(observer):
+    """At some samples each, of both signs; without a guard the same readings lose rotors."""
+    found = {}
+    for guard in (Guard(), None):
+        at = T * (60 + np.arange(SHARES.size))
+        cascade, scenario = struck(guard, observer, outliers=Outliers(0.0, np.abs(SHARES) * 5e-3, at))
+        fold = standard_for(0.0, scenario)
+        many = dataclasses.replace(scenario, member=np.arange(SHARES.size))
+        found[guard is None] = run_ensemble(cascade, many, CLOCK, fold=fold).measured
+    assert found[True]["lost"].sum() > SHARES.size / 2
+    assert not found[False]["lost"].any()
+    np.testing.assert_array_equal(found[False]["refused"], 1.0)
+    assert not found[True]["refused"].any()
+    # no further off than while it comes to its reference
+    assert found[False]["max_abs_error_m"].max() < 6e-5
+
+
+WORLDS = {
+    "delay 1": World(**TRACKING),
+    "the sign itself, one and a half, noise": World(**TRACKING, delay=1.5, u_max=2e3, **hard(k_i=500.0)),
+    "Kalman, half a sample": World(**TRACKING, observer=KALMAN, delay=0.5, **soft()),
+    "difference, no delay": World(**TRACKING, observer=DIFFERENCE, delay=0.0, **soft()),
+}
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_guard_and_faults_against_the_independent_simulator(name):
+    """An outlier, a dropout that is bridged, and one that lasts until the safe command."""
+    std = NOISE if "noise" in name else (0.0, 0.0, 0.0)
+    dropouts = {"value": "nan", "duration": 5 * T, "at": 0.012}
+    cascade, scenario, clock = loop_of(WORLDS[name], 200, std)
+    sensor = scenario.sensor or Sensor()
+    for samples, value in ((3.0, "nan"), (8.0, "full-scale")):
+        faults = {"outliers": Outliers(at=0.006, size=9.9e-3), "dropouts": Dropouts(**(dropouts | {"value": value}))}
+        world = dataclasses.replace(scenario, sensor=dataclasses.replace(sensor, **faults))
+        guard = guarded(cascade, world, T).processor.guard
+        guard = dataclasses.replace(guard, samples=samples)
+        own = dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=guard))
+        fold = Count("refused")
+        rows, measured = (lambda x: (x.trajectory.rows, x.measured))(amb.rollout(own, world, clock, fold=fold))
+        words, read = world.words(), {"nan": math.nan, "full-scale": 5e-3}[value]
+        outlier = float(world.sensor.struck(words, 60, T).outlier)
+        assert abs(outlier) == 9.9e-3
+        given = dataclasses.replace(
+            WORLDS[name], guard={f.name: float(getattr(guard, f.name)) for f in dataclasses.fields(guard)},
+            outliers={60: outlier}, dropouts=dict.fromkeys(range(120, 125), read),
+        )  # fmt: skip
+        run = simulate(given, 200, noise_of(world, 200))
+        assert np.isinf(run.lost_at)
+        assert measured == 6
+        assert np.sum(np.asarray(rows.u)[120:125] == 0) == (2 if samples == 3 else 0)
+        np.testing.assert_allclose(rows.z, run.z, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(rows.u, run.u, rtol=0, atol=1e-6 * np.abs(run.u).max())
+
+
+def test_limits_left_out_admit_all_that_a_sensor_without_faults_reads():
+    rng = np.random.default_rng(2)
+    for _ in range(200):
+        bits, std = float(rng.integers(6, 20)), 10 ** rng.uniform(-8, -4)
+        sensor = Sensor(std, gain=rng.uniform(0.8, 1.2), offset=rng.normal() * 1e-5, bits=bits, range_z=1e-2)
+        scenario = amb.Scenario(sensor=sensor)
+        guard = Guard().settled(amb.Plant(), scenario, T, False)
+        ends = [
+            float(sensor.converted(sensor.reading(Measurement(z, 0.0, 0.0), Errors(e, 0.0, 0.0)), 5e-3, 0.25).z)
+            for z in (-4.5e-3, 4.5e-3)
+            for e in (-6.8 * std, 6.8 * std)
+        ]
+        assert np.abs(ends).max() <= guard.z
+        assert max(ends[1] - ends[0], ends[3] - ends[2]) <= guard.noise * (1 + 1e-9)
+
+
+def test_a_guard_that_cannot_act_is_no_part_of_the_program():
+    for faults, guard, acts in (
+        ({}, Guard(), False),
+        ({}, None, False),
+        ({}, Guard(samples=5.0), True),
+        ({"outliers": Outliers()}, Guard(), True),
+        ({"outliers": Outliers()}, None, False),
+    ):
+        cascade, scenario = struck(guard, **faults)
+        assert (simulated(cascade, scenario, T).processor.guard is not None) == acts
+    settled = simulated(*struck(outliers=Outliers()), T).processor.guard
+    assert all(np.isfinite(x) for x in jax.tree.leaves(settled))
+    assert len(jax.tree.leaves(settled)) == len(dataclasses.fields(Guard))
+
+
+def test_a_first_reading_that_is_none_is_waited_for():
+    cascade, scenario = struck(dropouts=Dropouts(at=0.0, duration=3 * T, value="nan"))
+    scenario = dataclasses.replace(scenario, initial=amb.Initial(1e-4))
+    rows = amb.rollout(cascade, scenario, CLOCK).trajectory.rows
+    np.testing.assert_array_equal(rows.u[:3], 0.0)
+    assert rows.u[3] != 0
+    assert np.asarray(rows.refused).nonzero()[0].tolist() == [0, 1, 2]
+    assert np.asarray(rows.alive).all()
+
+
+def test_faults_are_those_of_the_member_and_the_sample():
+    """Rates within 5 standard deviations of a binomial; both signs; one at a given time; whoever runs beside."""
+    sensor = Sensor(outliers=Outliers(500.0, 1e-3, 0.0205), dropouts=Dropouts(200.0, 3e-4, 0.0305))
+    _, scenario = struck()
+    draw = jax.jit(jax.vmap(lambda n: sensor.struck(scenario.words(), n, T)))
+    outlier, drops = (np.asarray(x) for x in draw(jnp.arange(100_000)))
+    for hits, rate in ((outlier != 0, 0.05), (outlier > 0, 0.025), (drops, 0.02)):
+        assert abs(hits.mean() - rate) < 5 * math.sqrt(rate / 1e5)
+    assert outlier[205] != 0
+    assert drops[305]
+    assert not np.any(np.asarray(draw(jnp.arange(10_000)).drops) != drops[:10_000])
+    cascade, scenario = struck(outliers=Outliers(500.0, 9e-3), dropouts=Dropouts(200.0, 3e-4, value="nan"))
+    fold = Named({"refused": Count("refused"), "rms": Rms("z_measured")})
+    many = dataclasses.replace(scenario, member=np.arange(5))
+    together = run_ensemble(cascade, many, CLOCK, fold=fold, threads=1).measured
+    alone = amb.rollout(cascade, dataclasses.replace(scenario, member=3), CLOCK, fold=fold, every=0).measured
+    assert together["refused"][3] == alone["refused"] > 5
+    np.testing.assert_allclose(together["rms"][3], alone["rms"], rtol=1e-9)
+    assert len(set(together["refused"])) > 1
+
+
+@pytest.mark.parametrize("value", VALUES)
+def test_what_is_read_in_a_dropout(value):
+    cascade, scenario = struck(dropouts=Dropouts(at=5e-3, duration=4.4e-4, value=value))
+    rows = amb.rollout(cascade, scenario, CLOCK).trajectory.rows
+    seen, hold = np.asarray(rows.z_measured), np.asarray(rows.z_measured)[49]
+    read = {"hold": hold, "nan": 0.0, "zero": 0.0, "full-scale": 5e-3}[value]
+    np.testing.assert_array_equal(seen[50:54], read)
+    assert not np.any(np.delete(seen, np.s_[49:54]) == read)
+    assert np.asarray(rows.alive).all()
+    # 0 is 157 um off; what is held is what the rotor might do
+    assert np.asarray(rows.refused)[50:54].all() == (value != "hold")
+
+
+@pytest.mark.parametrize("guard", [Guard(), None], ids=["guard", "none"])
+def test_derivatives_are_finite_whatever_is_read(guard):
+    cascade, scenario = struck(guard, outliers=Outliers(at=1e-3, size=1e-3), dropouts=Dropouts(at=4e-3, value="nan"))
+    cascade, clock = cascade.on_processor(), amb.Clock(60, T, amb.RK4(1))
+
+    def loss(c):
+        made = dataclasses.replace(cascade, position=dataclasses.replace(cascade.position, c=c))
+        outcome = amb.rollout(made, scenario, clock, fold=Rms("e_z"), every=0)
+        return 1e9 * outcome.measured, outcome.trajectory.lost_at
+
+    slope, lost_at = jax.grad(loss, has_aux=True)(1440.0)
+    assert np.isfinite(slope)
+    assert slope != 0
+    assert np.isfinite(lost_at) == (guard is None)
+
+
+CASE = {"processor": {}, "clock": {"duration": 0.01}, "sensor": {"outliers": {"rate": 3.0}}}
+
+
+def test_a_case_file_has_guard_and_faults():
+    case = case_from(CASE | {"processor": {"guard": {"z": 4e-3, "samples": 7}}})
+    assert case.cascade.processor.guard == Guard(z=4e-3, samples=7.0)
+    assert case.scenario.sensor.outliers == Outliers(rate=3.0)
+    assert case.scenario.random
+    assert case_from(CASE).cascade.processor.guard == Guard()
+    assert case_from(CASE | {"processor": {"guard": False}}).cascade.processor.guard is None
+    spread = case_from(CASE | {"spread": {"sensor.outliers.size": {"uniform": [1e-3, 9e-3]}}}).spread
+    assert spread.paths == ("sensor.outliers.size",)
+    faults = {"dropouts": {"value": "nan", "at": 1e-3}}
+    assert case_from(CASE | {"sensor": faults}).scenario.sensor.dropouts == Dropouts(at=1e-3, value="nan")
+
+
+@pytest.mark.parametrize(
+    ("raw", "told"),
+    [
+        ({"sensor": {"outliers": {"rate": 1.0}}}, r"sensor\.outliers is for a controller on a processor"),
+        ({"sensor": {"dropouts": {}}}, r"sensor\.dropouts is for a controller on a processor"),
+        (CASE | {"sensor": {"dropouts": {"value": "none"}}}, r"sensor\.dropouts\.value = .*'hold', 'nan', 'zero'"),
+        (CASE | {"sensor": {"outliers": {"rate": -1.0}}}, r"sensor\.outliers\.rate = -1"),
+        (CASE | {"sensor": {"outliers": {"sise": 1.0}}}, r"Did you mean 'size'"),
+        (CASE | {"processor": {"guard": {"samples": 0}}}, r"processor\.guard\.samples = 0: it must be a whole number"),
+        (CASE | {"processor": {"guard": 3}}, r"processor\.guard = 3: it must be a table"),
+    ],
+)
+def test_what_a_case_file_may_not_say_of_them(raw, told):
+    with pytest.raises(ValueError, match=told):
+        case_from(raw)

@@ -1,0 +1,399 @@
+"""A member by itself is that of the ensemble, bit by bit, and printed commands give what they promise.
+
+The loops have converters and signs without a layer: a difference in the last bit grows until two runs have nothing in
+common. So a replay in other arithmetic, even if that is as exact, is another run.
+"""
+
+import dataclasses
+import json
+import os
+import pathlib
+import re
+import shlex
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from texts import write
+
+from ambjax.__main__ import main, parser
+from ambjax.cases.reader import case_from, read_case
+from ambjax.cases.rig import RIG
+from ambjax.commands import ensemble as studies
+from ambjax.commands import simulate as simulating
+from ambjax.ensemble import replay as replaying
+from ambjax.ensemble.engine import run_ensemble
+from ambjax.ensemble.study import Study
+from ambjax.ensemble.worker import CALL, chunk
+from ambjax.simulation.metrics import Named, Variation, standard_for
+
+# 16 kHz, converters of 14 bits, a Kalman observer, signs without a layer, a plant off by up to 10 %.
+CHANGES = {
+    "duration = 0.3 ": "duration = 0.08 ",
+    "sample_period = 5e-5": "sample_period = 6.25e-5",
+    "settle = 0.05": "settle = 0.02",
+    "bits = 12": "bits = 14",
+    "start = 0.1 ": "start = 0.04 ",
+    "stop = 0.2 ": "stop = 0.06 ",
+    "initial.z = { uniform = [-1e-4, 1e-4] }": "plant.R = { percent = 10 }",
+}
+
+
+def changed(text, changes):
+    for old, new in changes.items():
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    return text
+
+
+CASE = changed(RIG, CHANGES)
+SEED, MEMBERS = 3, 66
+pytestmark = pytest.mark.usefixtures("elsewhere")
+
+
+def study_of(text, members=MEMBERS):
+    case = read_case(write(text))
+    return Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, SEED, members)
+
+
+def no_pictures(patch):
+    """Drawing takes longer than these runs."""
+    patch.setattr(studies, "_pictures", lambda *_: None)
+    patch.setattr("ambjax.pictures.overview.overview", lambda *_: None)
+
+
+def commands(text):
+    """The commands of ours in a text: between backticks or quotes, or to the end of the line behind a colon."""
+    found = re.findall(r"`(ambjax [^`\n]*)`|'(ambjax [^'\n]*)'|: (ambjax [^\n]+)$", text, re.M)
+    return [next(filter(None, one)) for one in found]
+
+
+def run(line):
+    """Exit code of a printed command, in this process."""
+    program, *argv = shlex.split(line)
+    assert program == "ambjax"
+    return main(argv)
+
+
+@pytest.fixture(scope="module")
+def printed(tmp_path_factory):
+    """Folder of an ensemble of the case in a file whose name has a space; what it printed; its columns and summary."""
+    folder = tmp_path_factory.mktemp("printed")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("XDG_CACHE_HOME", str(folder.parent / "cache"))
+        no_pictures(patch)
+        write(CASE, "my case.toml")
+        words = ["ensemble", "my case.toml", "--members", str(MEMBERS), "--seed", str(SEED), "--out", "out"]
+        with pathlib.Path("said").open("w") as said:
+            patch.setattr(sys, "stdout", said)
+            assert main(words) == 0
+        with np.load("out/members.npz") as file:
+            columns = {name: file[name] for name in file.files}
+        return (
+            folder,
+            pathlib.Path("said").read_text(),
+            columns,
+            json.loads(pathlib.Path("out/summary.json").read_text()),
+        )
+
+
+def same_bits(metrics, columns, row):
+    """Every metric of metrics.json is that of this row, and there is a dozen of them."""
+    shared = [name for name in columns if name in metrics]
+    assert len(shared) > 12
+    for name in shared:
+        value = columns[name][row]
+        assert metrics[name] == (value if np.isfinite(value) else None), name
+
+
+def belongs(metrics, out, settle):
+    """The trajectory that was written is the one that was measured."""
+    # sums of squares in another order: a unit in the last place for each sample
+    with np.load(pathlib.Path(out, "trajectory.npz")) as rows:
+        error, late = rows["z"] - rows["r"], rows["t"] >= settle
+        assert np.sqrt(np.mean(error**2)) == pytest.approx(metrics["rms_error_m"], rel=1e-12)
+        assert np.sqrt(np.mean(error[late] ** 2)) == pytest.approx(metrics["settled_rms_error_m"], rel=1e-12)
+        assert metrics["trajectory_deviation"] <= len(error) * np.finfo(float).eps
+
+
+def test_the_printed_command_replays_the_worst_member(printed, monkeypatch, capsys):
+    folder, said, columns, summary = printed
+    monkeypatch.chdir(folder)
+    no_pictures(monkeypatch)
+    monkeypatch.setattr(replaying, "STRETCH", 300)  # four stretches, the last of which the run does not fill
+    (line,) = commands(said)
+    assert line == summary["worst"][0]["replay"]
+    assert run(f"{line} --json --out alone") == 0
+    answer = capsys.readouterr()
+    assert "trajectory.npz" not in answer.err  # no deviation to report
+    metrics = json.loads(answer.out)
+    worst = summary["worst"][0]["index"]
+    assert metrics["settled_max_abs_error_m"] == summary["metrics"]["settled_max_abs_error_m"]["max"]
+    same_bits(metrics, columns, worst)
+    belongs(metrics, "alone", 0.02)
+
+
+def test_a_last_bit_grows_in_that_loop_and_no_cut_of_the_ensemble_moves_it(printed):
+    _, _, columns, _ = printed
+    study = study_of(CASE)
+    few = np.arange(40, 60)
+    for found in (
+        chunk(study, 40, 60, 20),  # other lanes, other companions
+        chunk(study, 40, 60, 7, threads=2),
+        chunk(dataclasses.replace(study, members=1000), 40, 60, 64),
+    ):
+        for name, column in found.items():
+            np.testing.assert_array_equal(column, columns[name][few], err_msg=name)
+    cascade, scenario = study.batch(few)
+    nudged = dataclasses.replace(scenario.plant, m=np.nextafter(scenario.plant.m, np.inf))
+    fold = standard_for(study.settle, scenario)
+    near = run_ensemble(
+        cascade, dataclasses.replace(scenario, plant=nudged), study.clock, fold=fold, call=CALL
+    ).measured
+    ratio = near["settled_max_abs_error_m"] / columns["settled_max_abs_error_m"][few]
+    # from 1e-16 of the mass to per cents of the error: what is equal above is equal for a reason
+    assert np.median(np.abs(ratio - 1)) > 1e-3
+
+
+def test_a_deviation_is_reported(monkeypatch, capsys):
+    no_pictures(monkeypatch)
+    write(CASE)
+    case = read_case("case.toml")
+    rows = case.clock.samples
+    found = replaying.Replay(None, {"lost": False, "lost_at_s": np.inf, "max_abs_i_A": 0.0}, 0.125, rows * 2e-16)
+    monkeypatch.setattr(simulating, "replay", lambda *_: found._replace(trajectory=_Nothing()))
+    assert main(["simulate", "case.toml", "--member", "5", "--json", "--out", "out"]) == 0
+    answer = capsys.readouterr()
+    assert json.loads(answer.out)["trajectory_deviation"] == 0.125
+    (line,) = [line for line in answer.err.splitlines() if "trajectory.npz" in line]
+    assert "differ from those of the ensemble" in line
+    assert "12 %" in line
+
+
+class _Nothing:
+    lost_why = ""
+
+    def save(self, path):
+        path.touch()
+
+
+def test_the_deviation_is_the_largest_of_any_metric():
+    relative = replaying._relative
+    assert [relative(*pair) for pair in ((1.0, 1.0), (2.0, 1.0), (-1.0, 1.0))] == [0.0, 0.5, 2.0]
+    assert [relative(*pair) for pair in ((np.inf, np.inf), (np.inf, 1.0), (True, False))] == [0.0, 1.0, 1.0]
+    assert relative(0.0, 0.0) == 0.0
+
+
+# --- other loops ---
+
+LOOPS = {
+    "two-coil, delay of 0.6": {"[plant]\n": '[plant]\nkind = "two-coil"\n', "delay = 1.0 ": "delay = 0.6 "},
+    "amplifier": {"i_max = 2.5 ": "bandwidth = 3e3\nslew = 1e6\ndead_band = 0.2\ni_max = 2.5 "},
+    "no spread": {"[spread]\n": "[tune]\n", "plant.m = {": "# {", "plant.A = {": "# {", "plant.R = {": "# {"},
+    "differentiator": {'kind = "kalman"\nw = 1000.0 ': 'kind = "ired-2"\nL = 1e3 '},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loop", LOOPS)
+def test_members_of_other_loops_are_replayed_bit_by_bit(loop):
+    study = study_of(changed(CASE, LOOPS[loop]))
+    columns = chunk(study, 0, 64, 64)
+    for member in (5, 63):
+        found = replaying.replay(study, member)
+        same_bits({k: v if np.isfinite(v) else None for k, v in found.metrics.items()}, columns, member)
+        assert found.deviation <= found.rounding
+
+
+@pytest.mark.slow
+def test_rows_and_other_folds_leave_every_bit_of_the_loop():
+    study = study_of(CASE)
+    columns = chunk(study, 0, 64, 64)
+    cascade, scenario = study.batch(np.arange(8))
+    folds = Named({"more": Variation(0.03), "metrics": standard_for(study.settle, scenario)})
+    other = run_ensemble(cascade, scenario, study.clock, fold=folds, every=7, call=CALL).measured["metrics"]
+    for name in ("settled_max_abs_error_m", "max_abs_i_A", "lost_at_s"):
+        np.testing.assert_array_equal(other[name], columns[name][:8])
+
+
+@pytest.mark.slow
+def test_processes_and_chunks_leave_every_bit_of_such_a_loop(printed, monkeypatch):
+    folder, *_ = printed
+    no_pictures(monkeypatch)
+    write(CASE)
+    argv = ["ensemble", "case.toml", "--members", str(MEMBERS), "--seed", str(SEED)]
+    assert main([*argv, "--out", "cut", "--chunk", "20", "--processes", "2"]) == 0
+    assert pathlib.Path("cut/members.npz").read_bytes() == (folder / "out/members.npz").read_bytes()
+
+
+@pytest.mark.slow
+def test_single_precision_replays_too():
+    code = """
+import numpy as np
+from test_replay import *
+study = study_of(CASE)
+columns = chunk(study, 0, 64, 64)
+found = replaying.replay(study, 5)
+assert columns["rms_error_m"].dtype == np.float32
+for name, value in found.metrics.items():
+    assert value == columns[name][5], name
+assert found.deviation <= found.rounding < 1e-3
+"""
+    env = os.environ | {"JAX_ENABLE_X64": "0", "PYTHONPATH": str(pathlib.Path(__file__).parent)}
+    subprocess.run([sys.executable, "-c", code], env=env, check=True)
+
+
+@pytest.mark.slow
+def test_check_on_a_processor_sees_the_run_of_simulate(monkeypatch, capsys):
+    no_pictures(monkeypatch)
+    write(CASE)
+    main(["check", "case.toml", "--json"])
+    bands = json.loads(capsys.readouterr().out)["processor"]["bands"]
+    assert main(["simulate", "case.toml", "--out", "out"]) == 0
+    with np.load("out/trajectory.npz") as rows:
+        largest = np.abs(rows["sigma"][rows["t"] >= 0.02]).max()
+    (found,) = [band["seen"] for band in bands if band["signal"] == "sigma" and band["noise"]]
+    # the same state at every sample, from which sigma is computed in another program
+    assert found == pytest.approx(largest, rel=1e-12)
+
+
+TUNE = """
+[tune]
+gains = ["controller.position.c", "controller.position.k"]
+screen = 4
+starts = 1
+iterations = 2
+members = 4
+stressed = 2
+validation = 4
+held_out = 70
+"""
+
+
+@pytest.mark.slow
+def test_the_tuner_s_numbers_are_those_of_the_commands(monkeypatch, capsys):
+    no_pictures(monkeypatch)
+    write(CASE + TUNE)
+    assert main(["tune", "case.toml", "--out", "tuned"]) in (0, 1)
+    report = json.loads(pathlib.Path("tuned/report.json").read_text())
+    monkeypatch.chdir("tuned")
+    for name in ("report.md", "report.html"):
+        text = pathlib.Path(name).read_text().replace("<code>", "`").replace("</code>", "`")
+        assert report["worst_member"]["replay"] in commands(text)
+    capsys.readouterr()
+    assert run(report["worst_member"]["replay"] + " --json --out alone") in (0, 1)
+    metrics = json.loads(capsys.readouterr().out)
+    assert metrics["settled_max_abs_error_m"] == report["worst_member"]["settled_max_abs_error_m"]
+    assert metrics["settled_max_abs_error_m"] == report["after"]["settled_max_abs_error_m"]
+    belongs(metrics, "alone", 0.02)
+    members = ["--members", "70", "--seed", str(report["held_out_seed"])]
+    assert main(["ensemble", "tuned.toml", *members, "--out", "all"]) in (0, 1)
+    with np.load("all/members.npz") as columns:
+        for ours, theirs in (("max_abs_i_A", "max_abs_i_A.largest"), ("settled_rms_u_V", "settled_rms_u_V.largest")):
+            assert columns[ours].max() == report["after"][theirs]
+
+
+# --- commands in messages and files ---
+
+LOST = """
+[clock]
+duration = 0.05
+[controller.inversion]
+gamma = 1000.0
+[reference]
+kind = "sine"
+amplitude = 2.5e-3
+frequency = 2.0
+"""
+
+
+def fails(capsys):
+    """What `ambjax check` promises: gains beside what the conditions ask of them, and which of them fails."""
+    answer = capsys.readouterr().out
+    assert "condition " in answer
+    assert "FAILS" in answer
+
+
+def searches(capsys):
+    """What `ambjax tune` promises: it starts to search from that case."""
+    assert "tuning controller." in capsys.readouterr().err
+
+
+def shown(capsys):
+    """What a page of help or a case file promises: text on stdout."""
+    assert len(capsys.readouterr().out) > 200
+
+
+# Words that print commands, exit code of those words, and for each command the code it must end with and its promise.
+PRINTED = {
+    "a rotor is lost": (
+        ["simulate", "my case.toml", "--out", "lost"],
+        1,
+        {"ambjax check 'my case.toml'": (1, fails), "ambjax tune 'my case.toml'": (0, searches)},
+    ),
+    "a condition fails": (["check", "my case.toml"], 1, {"ambjax tune 'my case.toml'": (0, searches)}),
+    "an option lacks": (["ensemble", "my case.toml"], 2, {"ambjax ensemble --help": (0, shown)}),
+    "no case file": (["check", "no.toml"], 2, {"ambjax template": (0, shown)}),
+}
+
+
+@pytest.mark.parametrize("what", PRINTED)
+def test_commands_in_messages_do_what_they_promise(what, monkeypatch, capsys):
+    no_pictures(monkeypatch)
+    monkeypatch.setattr("tuning.command.rounds", _stopped)
+    words, code, promises = PRINTED[what]
+    write("{" if what == "no case file" else LOST, "no.toml" if what == "no case file" else "my case.toml")
+    assert _code(lambda: main(words)) == code
+    answer = capsys.readouterr()
+    found = [line for line in commands(answer.out + answer.err) if "CASE" not in line]
+    assert set(found) == set(promises)
+    for line, (ends, promise) in promises.items():
+        assert _code(lambda line=line: run(line)) == ends
+        promise(capsys)
+
+
+class _Searching(BaseException):
+    pass
+
+
+def _stopped(*_):
+    raise _Searching
+
+
+def _code(call):
+    """An exit code, also of what raises it; a search that begins is as good as one that ends well."""
+    try:
+        return call()
+    except SystemExit as end:
+        return end.code or 0
+    except _Searching:
+        return 0
+
+
+@pytest.mark.parametrize("words", [["template"], ["template", "rig"], ["export"]])
+def test_commands_in_files_are_commands(words, capsys):
+    """Those that name no case lack it alone."""
+    write(CASE)
+    assert main(["export", "case.toml", "--out", "c"] if words == ["export"] else words) == 0
+    text = pathlib.Path("c/README.md").read_text() if words == ["export"] else capsys.readouterr().out
+    found = [line for line in commands(text) if line.startswith("ambjax ")]
+    assert found
+    for line in found:
+        _, command, *rest = shlex.split(line)
+        case = [] if command == "template" else ["case.toml"]
+        parser().parse_args([command, *case, *(word for word in rest if word != "CASE.toml")])
+
+
+def test_a_case_in_which_nothing_differs_is_replayed_as_it_is(capsys, monkeypatch):
+    no_pictures(monkeypatch)
+    case = case_from({"clock": {"duration": 0.05}}, "case")
+    study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, 3)
+    assert not study.varies
+    assert study.command("my case.toml", 2) == "ambjax simulate 'my case.toml'"
+
+
+def test_a_latin_hypercube_is_replayed_with_its_size():
+    study = study_of(changed(CASE, {"[spread]\n": '[spread]\ndesign = "latin-hypercube"\n'}))
+    assert study.command("a.toml", 2) == "ambjax simulate a.toml --member 2 --seed 3 --members 66"

@@ -1,0 +1,156 @@
+"""One answer in every place: exit code, log, report, JSON and tuned.toml say the same of each kind of outcome."""
+
+import argparse
+import collections
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+from bowl import World, document, study
+from tomlkit import dumps
+
+import tuning.command
+import tuning.search.rounds
+from tuning.config import Budget, seeds
+from tuning.judge import summarise
+from tuning.objective.limits import Limit
+from tuning.report import document as report
+from tuning.report.limits import BROKEN, HELD, LOUD, UNJUDGED, UNVERIFIED
+from tuning.report.verdict import NO, NOBODY, YES, Outcome
+from tuning.search.explore import REACH, Slices
+
+HELD_OUT = seeds(Budget())[2]
+
+
+def losing(*numbers, accurate=False):
+    """A world in which these held-out members are lost; by accurate steps alone, if `accurate`."""
+    return World(
+        limit=lambda seed, number, _, fine: (
+            40.0 if seed == HELD_OUT and number in numbers and (fine or not accurate) else math.inf
+        )
+    )
+
+
+# Of each outcome: the world, [tune], and the verdicts that it must have: on survival, on the limit of the voltage, and
+# whether the gains hold what is asked. A Bowl's voltage is 0.33 V at the least k that its bounds allow.
+OUTCOMES = {
+    "held": (World, {}, HELD, HELD, True),
+    "lost": (lambda: losing(2), {}, BROKEN, HELD, False),
+    "lost, as may be": (lambda: losing(2), {"limits": {"survival": 0.8}}, HELD, HELD, True),
+    "not decided": (lambda: World(stalls=lambda s, n, _: (s, n) == (HELD_OUT, 2)), {}, BROKEN, HELD, False),
+    "a limit not met": (World, {"limits": {"rms_u_V": 0.2}}, HELD, BROKEN, False),
+    "not verified": (lambda: losing(5, accurate=True), {}, UNVERIFIED, UNVERIFIED, False),
+    "lost and not verified": (
+        lambda: World(limit=lambda s, n, _, f: 40.0 if s == HELD_OUT and (n == 2 or (n == 5 and f)) else math.inf),
+        {}, BROKEN, UNVERIFIED, False,
+    ),
+    "every one lost": (lambda: losing(*range(6)), {}, BROKEN, BROKEN, False),
+    "nobody judges": (World, {"held_out": 0}, UNJUDGED, UNJUDGED, True),
+}  # fmt: skip
+
+
+@pytest.fixture
+def ran(monkeypatch, tmp_path, capsys):
+    """Run the command on a Bowl without pictures: exit code, facts, stdout, stderr, folder."""
+    monkeypatch.setattr(tuning.command, "_pictures", lambda *_: collections.defaultdict(bytes))
+    monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 1)
+
+    def run(world, tune):
+        study(monkeypatch, world, **tune)
+        path, out = tmp_path / "case.toml", tmp_path / "out"
+        path.write_text(dumps(document(**tune)))
+        flags = {"gradients": False, "pareto": False, "resume": False, "json": False}
+        code, _ = tuning.command.run(argparse.Namespace(case=str(path), out=str(out), **flags))
+        said = capsys.readouterr()
+        return code, json.loads((out / "report.json").read_text()), said.out, said.err, out
+
+    return run
+
+
+@pytest.mark.parametrize("kind", OUTCOMES)
+def test_every_place_says_the_same(kind, ran):
+    world, tune, survival, limit, good = OUTCOMES[kind]
+    code, facts, out, err, folder = ran(world(), tune)
+    # the fact
+    outcome, rows = facts["outcome"], {row["name"]: row for row in facts["limits"]}
+    assert (rows["survival"]["verdict"], rows["rms_u_V"]["verdict"]) == (survival, limit)
+    assert outcome["limits"] == {name: row["verdict"] for name, row in rows.items()}
+    assert [outcome["good"], code] == [good, int(not good)]
+    for row in rows.values():
+        assert row["held"] == {HELD: True, BROKEN: False}.get(row["verdict"])
+        assert (row["price_m"] is None) or row["held"]
+    assert facts["verified"] == (not facts["refuted"])
+    # its words
+    words = facts["verdict"]
+    assert words.startswith(YES) == (good and survival == HELD)
+    assert words.startswith(NOBODY) == (survival == UNJUDGED)
+    assert words.startswith(NO) == (not good)
+    for name, row in rows.items():
+        assert (f"tune.limits.{name} is {BROKEN}" in words) == (row["verdict"] == BROKEN)
+    assert ("NOT VERIFIED" in words) == (UNVERIFIED in outcome["against"]) == bool(facts["refuted"])
+    assert (UNJUDGED in outcome["limits"].values()) == (f"Limits {UNJUDGED}: rms_u_V, survival." in words)
+    # where they stand
+    text = (folder / "report.md").read_text()
+    assert text.splitlines()[2] == words
+    assert words in (folder / "tuned.toml").read_text()
+    assert words in out
+    assert bool(facts["advice"]) == (not good)
+    assert facts["advice"] in err
+    table = dict(re.findall(r"^\| `(\w+)` \| at (?:most|least) [^|]*\|[^|]*\|[^|]*\| ([^|]*) \|", text, re.MULTILINE))
+    assert table == {name: f"**{r['verdict']}**" if r["verdict"] in LOUD else r["verdict"] for name, r in rows.items()}
+    # what it is that is wrong
+    after, advice = facts["after"], facts["advice"]
+    assert ("Rotors are lost: " in advice) == (survival == BROKEN and after["lost"] > 0)
+    assert (f"Not decided: {after['stalled']} held-out members" in advice) == (after["stalled"] > 0)
+    assert (f"{after['stalled']} not decided (their integration stalls)" in words) == (after["stalled"] > 0)
+    assert ("tune.limits.rms_u_V" in advice) == (limit == BROKEN)
+    # and nothing that is said on the way is an answer
+    assert not re.search(r"cannot be held|is held|not held", err.replace(facts["advice"], ""), re.IGNORECASE)
+
+
+def test_what_speaks_against_the_gains_decides_alone():
+    right = Outcome(10, 0, 0, 1, {"rms_u_V": HELD, "survival": HELD}, "")
+    assert right.good
+    assert Outcome(10, 1, 0, 1, right.limits, "").good
+    for lost, stalled in ((2, 0), (1, 1), (0, 2)):
+        wrong = Outcome(10, lost, stalled, 1, right.limits | {"survival": BROKEN}, "")
+        assert (wrong.good, wrong.rotors_held, wrong.broken) == (False, False, [])
+        assert len(wrong.against) == 1
+    assert Outcome(10, 0, 0, 1, {"rms_u_V": BROKEN}, "").against == ["NOT HELD: rms_u_V"]
+    assert Outcome(10, 0, 0, 1, right.limits, "steps").against == [UNVERIFIED]
+
+
+def test_a_lost_member_s_voltage_counts_in_no_limit():
+    """It is frozen, at 0 V: the mean square over all would be half of what the survivors take."""
+    columns = {"settled_rms_u_V": np.array([100.0, 0.0]), "lost_at_s": np.array([np.inf, 0.1])}
+    columns |= {"lost": np.array([False, True]), "stalled": np.zeros(2, bool)}
+    columns |= {"settled_rms_error_m": np.array([1e-6, 4e-3]), "settled_max_abs_error_m": np.array([2e-6, 5e-3])}
+    assert Limit("rms_u_V", 80.0).reached(columns) == pytest.approx(100.0)
+    told = summarise(columns)
+    assert (told["held"], told["lost"]) == (1, 1)
+    assert told["settled_rms_u_V.mean"] == 100.0
+    assert (told["settled_rms_error_m"], told["settled_max_abs_error_m"]) == (1e-6, 2e-6)
+    assert told["lost_at_s.mean"] == 0.1
+    nobody = summarise({name: x[1:] for name, x in columns.items()})
+    assert (nobody["held"], "settled_rms_error_m" in nobody) == (0, False)
+
+
+def test_a_gain_that_loses_rotors_when_it_is_off_says_how_many():
+    middle = len(REACH) // 2
+    goals, lost = np.zeros((3, len(REACH))), np.zeros((3, len(REACH)), int)
+    goals[0, middle + 1], lost[0, middle + 1] = math.log(516.0), 2
+    goals[1, middle - 1] = math.log(1.03)
+    lost[2] = 1  # of the answer too
+    found = Slices(np.ones((3, len(REACH))), goals, lost)
+    assert found.more_lost().tolist() == [2, 0, 0]
+    row = {"path": "controller.position.c", "before": 1.0, "after": 2.0, "least": 0.0, "most": 9.0, "at_bound": ""}
+    rows = [
+        row | {"sensitivity_percent": None if n else p, "sensitivity_lost": n}
+        for n, p in zip(found.more_lost().tolist(), found.sensitivity().tolist(), strict=True)
+    ]
+    text = report._gains({"gains": rows, "trained_on": 40})
+    assert [line.split("|")[-2].strip() for line in text if line.startswith("| controller")] == [
+        "**2 of 40 members lost**", "3 %", "0 %",
+    ]  # fmt: skip

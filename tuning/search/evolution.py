@@ -1,0 +1,123 @@
+"""CMA-ES: a search by values alone, for goals whose derivatives do not lead to a minimum.
+
+A population is drawn from a normal distribution; its better half moves the mean, and adapts covariance and size. The
+parameters are the defaults of N. Hansen, The CMA Evolution Strategy: A Tutorial, arXiv:1604.00772 (2023), Table 1,
+without negative weights.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+# Standard deviation of the first population in each coordinate: a factor of e^0.3 of a gain.
+SIZE = 0.3
+# A search has converged when the better half of no population is better, by this share of the goal, than those before.
+STALL, PATIENCE = 0.01, 6
+
+
+class Cloud(NamedTuple):
+    """The distribution: mean [m], size, covariance [m, m] in units of size^2, and the two paths of the mean [m]."""
+
+    mean: Any
+    size: Any
+    covariance: Any
+    path: Any
+    """of the mean in coordinates of unit covariance, by which the size is adapted"""
+    drift: Any
+    """of the mean itself, by which the covariance is"""
+    drawn: Any
+    """populations so far; -1: none will be"""
+    level: Any
+    """weighted mean of the better half of a population, the lowest so far but for less than STALL"""
+    stale: Any
+    """populations since then"""
+
+    @property
+    def reach(self) -> float:
+        """Standard deviation along the longest axis."""
+        return float(self.size * np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
+
+    @property
+    def converged(self) -> bool:
+        """Whether it stalls: by populations, of which a single point may be better by chance."""
+        return bool(self.stale >= PATIENCE)
+
+
+class Rates(NamedTuple):
+    """Of a space of m dimensions: weights of the better half [h], their effective number and the learning rates."""
+
+    weights: np.ndarray
+    effective: float
+    size: float
+    damping: float
+    drift: float
+    one: float
+    many: float
+
+
+def rates(m: int) -> Rates:
+    """The defaults for m dimensions."""
+    half = population(m) // 2
+    weights = math.log((population(m) + 1) / 2) - np.log(np.arange(1, half + 1))
+    weights = weights / weights.sum()
+    e = float(1 / (weights**2).sum())
+    size = (e + 2) / (m + e + 5)
+    damping = 1 + 2 * max(0.0, math.sqrt((e - 1) / (m + 1)) - 1) + size
+    drift = (4 + e / m) / (m + 4 + 2 * e / m)
+    one = 2 / ((m + 1.3) ** 2 + e)
+    many = min(1 - one, 2 * (0.25 + e + 1 / e - 2) / ((m + 2) ** 2 + e))
+    return Rates(weights, e, size, damping, drift, one, many)
+
+
+def population(m: int) -> int:
+    """Points that are drawn at once in m dimensions."""
+    return 4 + int(3 * math.log(m))
+
+
+def begun(mean: np.ndarray) -> Cloud:
+    """The first distribution, about a point [m]."""
+    m = len(mean)
+    return Cloud(mean, np.array(SIZE), np.eye(m), np.zeros(m), np.zeros(m), np.array(0), np.array(np.inf), np.array(0))
+
+
+def clouds(starts: int, m: int) -> Cloud:
+    """Of so many starts in m dimensions, leaves [starts, ...]: none has begun."""
+    one = begun(np.zeros(m))._replace(drawn=np.array(-1))
+    return Cloud(*(np.repeat(np.asarray(leaf)[None], starts, axis=0) for leaf in one))
+
+
+def drawn(cloud: Cloud, seed: int) -> np.ndarray:
+    """The next population [n, m]."""
+    m = len(cloud.mean)
+    normal = np.random.default_rng([seed, int(cloud.drawn)]).standard_normal((population(m), m))
+    return cloud.mean + cloud.size * normal @ _root(cloud.covariance).T
+
+
+def moved(cloud: Cloud, points: np.ndarray, values: np.ndarray) -> Cloud:
+    """The distribution that the values [n] at its last population, points [n, m], make of it."""
+    m, now = len(cloud.mean), int(cloud.drawn) + 1
+    r = rates(m)
+    order = np.argsort(values, kind="stable")[: len(r.weights)]
+    steps = (points[order] - cloud.mean) / cloud.size
+    step = r.weights @ steps
+    unit = np.linalg.solve(_root(cloud.covariance), step)
+    path = (1 - r.size) * cloud.path + math.sqrt(r.size * (2 - r.size) * r.effective) * unit
+    expected = math.sqrt(m) * (1 - 1 / (4 * m) + 1 / (21 * m**2))
+    length = float(np.linalg.norm(path))
+    steady = length / math.sqrt(1 - (1 - r.size) ** (2 * now)) < (1.4 + 2 / (m + 1)) * expected
+    drift = (1 - r.drift) * cloud.drift + steady * math.sqrt(r.drift * (2 - r.drift) * r.effective) * step
+    kept = 1 - r.one - r.many + (not steady) * r.one * r.drift * (2 - r.drift)
+    covariance = kept * cloud.covariance + r.one * np.outer(drift, drift) + r.many * (steps.T * r.weights) @ steps
+    size = cloud.size * math.exp(min(1.0, (r.size / r.damping) * (length / expected - 1)))
+    level = float(r.weights @ values[order])
+    better = level < cloud.level - STALL
+    level, stale = (level, 0) if better else (cloud.level, cloud.stale + 1)
+    mean = cloud.mean + cloud.size * step
+    return Cloud(mean, np.array(size), covariance, path, drift, np.array(now), np.array(level), np.array(stale))
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """The symmetric square root of a covariance [m, m]."""
+    squares, axes = np.linalg.eigh((covariance + covariance.T) / 2)
+    return (axes * np.sqrt(np.maximum(squares, 1e-20))) @ axes.T

@@ -1,0 +1,109 @@
+"""One iteration of a search: a step of the starts that descend, a population of those that go on by CMA-ES."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tuning.objective.engine import Engine
+from tuning.objective.goal import Goal
+from tuning.objective.loss import TERMS
+from tuning.objective.members import Members
+from tuning.search.descent import Descent
+from tuning.search.evolution import drawn, moved
+from tuning.search.keeper import Progress
+
+
+def iterate(
+    engine: Engine,
+    goal: Goal,
+    who: Members,
+    progress: Progress,
+    descent: Descent,
+    weights: np.ndarray | None = None,
+    seed: int = 0,
+) -> None:
+    """One iteration of all active starts, which `progress` then holds. `weights` [S, 6]: each start has its own."""
+    fresh = progress.iteration == progress.since
+    better = _descended(engine, goal, who, progress, descent, weights) | _evolved(engine, goal, who, progress, seed)
+    record(engine, who, progress, better, fresh=fresh)
+
+
+def _descended(
+    engine: Engine,
+    goal: Goal,
+    who: Members,
+    progress: Progress,
+    descent: Descent,
+    weights: np.ndarray | None,
+) -> dict[int, dict[str, np.ndarray]]:
+    """One step of the starts that descend. Returns the terms [N] by name of those that have a better point."""
+    starts, on = progress.starts, progress.active & ~progress.evolving
+    active = np.flatnonzero(on)
+    if not active.size:
+        return {}
+    trial = np.asarray(starts.trial)
+    losses, slopes, terms = engine.gradient(trial[active], who, goal.weights if weights is None else weights[active])
+    full = np.full((len(trial), *losses.shape[1:]), np.nan), np.full((len(trial), *slopes.shape[1:]), np.nan)
+    for whole, part in zip(full, (losses, slopes), strict=True):
+        whole[active] = part
+    progress.starts = descent.step(who.ordinary, starts, *full, on)
+    better = np.flatnonzero((np.asarray(progress.starts.value) < np.asarray(starts.value))[active])
+    return {int(active[row]): {name: terms[name][row] for name in TERMS} for row in better}
+
+
+def _evolved(
+    engine: Engine, goal: Goal, who: Members, progress: Progress, seed: int
+) -> dict[int, dict[str, np.ndarray]]:
+    """One population of each start that goes on by CMA-ES; returns what `_descended` does."""
+    active = np.flatnonzero(progress.active & progress.evolving)
+    if not active.size:
+        return {}
+    own = [progress.cloud(at) for at in active]
+    points = [drawn(cloud, seed + int(at)) for cloud, at in zip(own, active, strict=True)]
+    terms = engine.terms(np.concatenate(points), who)
+    values = goal.score(np.concatenate(points), terms, who).reshape(len(points), -1)
+    best, value, length = (np.array(x) for x in (progress.starts.best, progress.starts.value, progress.starts.length))
+    better = {}
+    for row, at in enumerate(active):
+        first = int(np.argmin(values[row]))
+        if values[row, first] < value[at]:
+            best[at], value[at] = points[row][first], values[row, first]
+            better[int(at)] = {name: terms[name][row * len(values[row]) + first] for name in TERMS}
+        cloud = moved(own[row], points[row], values[row])
+        length[at] = cloud.reach
+        progress.put(at, cloud)
+    state = progress.starts.state._replace(best=jnp.asarray(best), value=jnp.asarray(value))
+    progress.starts = progress.starts._replace(state=state, length=jnp.asarray(length))
+    return better
+
+
+def record(
+    engine: Engine,
+    who: Members,
+    progress: Progress,
+    better: dict[int, dict[str, np.ndarray]],
+    *,
+    fresh: bool = False,
+) -> None:
+    """Add a row to the history: of each start its best point; of those that are `better`, its terms [N] by name.
+
+    `fresh`: what the row before says is of other members.
+    """
+    past, count = progress.history, len(progress.active)
+    lost = np.full(count, len(who.member)) if fresh else np.array(past["lost"][-1])
+    means = np.full((count, len(TERMS)), np.nan) if fresh else np.array(past["terms"][-1])
+    for at, terms in better.items():
+        lost[at] = int((terms["survival"] > 0).sum())
+        means[at] = [terms[name][: who.ordinary].mean() for name in TERMS]
+    row = {
+        "value": np.asarray(progress.starts.value),
+        "x": np.asarray(progress.starts.best),
+        "gains": np.asarray(jax.vmap(engine.objective.space.gains_at)(progress.starts.best)),
+        "lost": lost,
+        "members": np.array(len(who.member)),
+        "terms": means,
+        "rollouts": np.array(engine.rollouts),
+    }
+    for key, value in row.items():
+        past.setdefault(key, []).append(value)
+    progress.iteration += 1
