@@ -3,7 +3,7 @@
 GAINS are the ends of a gain.
 """
 
-from ambjax.numerics.kernel import one_kernel
+from ambjax.compiler.fast_path import one_kernel
 from ambjax.numerics.records import GAINS, Scalar, canonical, leaf, record, static, validate
 from ambjax.numerics.smooth import TWO_OVER_PI
 

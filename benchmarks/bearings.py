@@ -1,4 +1,4 @@
-"""Other bearings than the paper's, standing still, and the two templates: each by `ambjax-tune` with its defaults.
+"""Other bearings than the paper's, standing still, and the two templates: each by `ambjax tune` with its defaults.
 
 As `tasks.py`, whose rows these are: unattended, judged on 1,000 held-out members, verified by accurate steps.
 Run: python benchmarks/bearings.py [--out DIR] [NAME ...]
@@ -10,7 +10,7 @@ import pathlib
 import _measure
 import tasks
 
-from ambjax.cases.template import template
+from ambjax.cases.template_text import template
 
 CASES = pathlib.Path(__file__).parent.parent / "tests" / "cases"
 TEMPLATES = ("regulation", "tracking")

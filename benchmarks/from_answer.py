@@ -23,7 +23,7 @@ from tuning.config import read_tune, seeds
 from tuning.judge import judge, summarise
 from tuning.objective.limits import PREFIX
 from tuning.objective.members import Members
-from tuning.problem import Problem, problem_of
+from tuning.problem import TuningProblem, problem_of
 from tuning.search.course import training
 
 TASKS = ("limited/light", "sampled/F10-signs", "D")
@@ -31,7 +31,7 @@ TASKS = ("limited/light", "sampled/F10-signs", "D")
 JOINED, LOUD, PENALTY = 16, 1.1, 300.0
 
 
-def members(problem: Problem, x: np.ndarray) -> Members:
+def members(problem: TuningProblem, x: np.ndarray) -> Members:
     """The training ensemble, and the validation members with the least clearance at x [m]."""
     count, seed = problem.tune.budget.validation, seeds(problem.tune.budget)[1]
     terms = problem.engine.terms(x[None], problem.objective.chosen(seed, np.arange(count), count))
@@ -40,7 +40,7 @@ def members(problem: Problem, x: np.ndarray) -> Members:
     return training(problem).joined(those._replace(loud=LOUD * those.loud))
 
 
-def goals(problem: Problem, x: np.ndarray, who: Members) -> np.ndarray:
+def goals(problem: TuningProblem, x: np.ndarray, who: Members) -> np.ndarray:
     """The goal [S] at x [S, m], limits as penalties on what ordinary members reach."""
     terms, free = problem.engine.terms(x, who), dataclasses.replace(problem.goal, limits=())
     values = free.score(x, {name: rows for name, rows in terms.items() if not name.startswith(PREFIX)}, who)
@@ -51,7 +51,7 @@ def goals(problem: Problem, x: np.ndarray, who: Members) -> np.ndarray:
     return np.where(np.isfinite(values), values, 10.0)
 
 
-def judged(problem: Problem, x: np.ndarray) -> dict[str, Any]:
+def judged(problem: TuningProblem, x: np.ndarray) -> dict[str, Any]:
     """Errors of the held-out members at x [m], how many are lost, and which limits are not held."""
     columns = judge(problem, x, seeds(problem.tune.budget)[2], problem.tune.budget.held_out)
     summary = summarise(columns)

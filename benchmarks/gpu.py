@@ -18,7 +18,7 @@ import jax
 import numpy as np
 import workload
 
-from ambjax.ensemble.onekernel import run_whole
+from ambjax.ensemble.gpu_kernel import run_whole
 
 MEMBERS = (4_096, 65_536, 262_144, 1_048_576)
 BLOCKS = (32, 64, 128, 256)

@@ -24,7 +24,7 @@ import numpy as np
 import workload
 
 from ambjax import Cascade, Initial, current, inversion, position, rollout
-from ambjax.numerics.kernel import one_kernel
+from ambjax.compiler.fast_path import one_kernel
 from ambjax.simulation.metrics import Rms
 from tuning.config import read_tune
 from tuning.objective.loss import weigh

@@ -14,7 +14,7 @@ Written by `python benchmarks/report.py` from the JSON that the scripts left in 
 Ratios are within one run of one script; absolute times depend on the machine and its load.
 
 Peers and scaling were measured before metrics were folded over substeps: ensembles with all metrics cost more since.
-What `ambjax-tune` and the search take was measured beside other work, all else on an idle machine.
+What `ambjax tune` and the search take was measured beside other work, all else on an idle machine.
 
     .venv/bin/pip install -e '.[bench]'
     .venv/bin/python benchmarks/single.py            # one run against SciPy and diffrax
@@ -200,10 +200,10 @@ def tasks() -> list[str]:
     data = load("tasks")
     lines = ["## The tuning tasks (`tasks.py`)", "", facts(data["machine"])]
     lines += [
-        "`ambjax-tune` with its defaults, but that E minimises the mean of its worst tenth on 64 members and the",
+        "`ambjax tune` with its defaults, but that E minimises the mean of its worst tenth on 64 members and the",
         "pole of the observer may go from 0.999 to 1e4; from gains that lose the rotor; judged on held-out members.",
         "Steps: error of the settled rms error in the search's own steps against adaptive RODAS3. u: once settled.",
-        "Seconds: all of `ambjax-tune`, on one processor, beside other work.",
+        "Seconds: all of `ambjax tune`, on one processor, beside other work.",
         "",
     ]
     return lines + _tasks(data)

@@ -32,9 +32,9 @@ import numpy as np
 from ambjax.ensemble.worker import processes
 from tuning.config import read_tune
 from tuning.objective.ranges import ranges
-from tuning.problem import Problem, problem_of
+from tuning.problem import TuningProblem, problem_of
 from tuning.search.course import Course, looks, training
-from tuning.search.keeper import Progress
+from tuning.search.keeper import SearchState
 
 TASKS = pathlib.Path(__file__).parent / "tasks"
 # Evaluations whose results are asked for at once, by methods that have no population of their own.
@@ -50,7 +50,7 @@ class SpentError(Exception):
 class Judge:
     """The goal at coordinates [S, m] in units of the screen's box, any real number; counted and clocked."""
 
-    def __init__(self, problem: Problem, who: Any, most: int):
+    def __init__(self, problem: TuningProblem, who: Any, most: int):
         self.problem, self.who, self.most = problem, who, most
         start = problem.tune.space.values(problem.case.cascade)
         space, box = problem.objective.space, ranges(problem.objective, problem.goal.conditions, start)
@@ -128,11 +128,11 @@ METHODS: dict[str, Callable[[Judge, int], None]] = {
 }
 
 
-def ours(problem: Problem, who: Any, seed: int) -> list[tuple[int, float, float]]:
+def ours(problem: TuningProblem, who: Any, seed: int) -> list[tuple[int, float, float]]:
     """Trace of the search by gradients, its looks around its own answer included, on all members."""
     problem.engine.rollouts, trace, began = 0, [], time.process_time()
 
-    def tell(progress: Progress, _: float) -> None:
+    def tell(progress: SearchState, _: float) -> None:
         if progress.history["members"][-1] == len(who.member):  # else its goal is that of a part of them
             best = min(float(np.min(progress.history["value"][-1])), trace[-1][2] if trace else np.inf)
             trace.append((problem.engine.rollouts, time.process_time() - began, best))
@@ -155,7 +155,7 @@ def told(trace: list[tuple[int, float, float]], goal: float) -> Told:
     return Told(trace[-1][2], trace[-1][0], trace[-1][1], reached)
 
 
-def prepared(name: str) -> tuple[Problem, Any]:
+def prepared(name: str) -> tuple[TuningProblem, Any]:
     """A task's problem and training members, on one core."""
     case, tune, _ = read_tune(TASKS / f"{name}.toml")
     problem = problem_of(case, tune, threads=1)

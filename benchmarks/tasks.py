@@ -1,4 +1,4 @@
-"""The five tuning tasks, each by `ambjax-tune` with its defaults from the gains as printed, which lose the rotor.
+"""The five tuning tasks, each by `ambjax tune` with its defaults from the gains as printed, which lose the rotor.
 
 Every task is a case file in tasks/; its report stays in DIR/TASK, and a task whose report is there is not run
 again. The numbers are those of 1,000 held-out members; those of tasks that are not asked for stay.

@@ -24,34 +24,34 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.numerics import apart
+from ambjax.compiler import barrier
 
 MEMBERS, SAMPLES, LANES = 1024, 100, 32
 
 
 def without_mark() -> None:
     """Loops are not compiled as one function."""
-    from ambjax.numerics import kernel
+    from ambjax.compiler import fast_path
 
-    kernel._mark = lambda tree: tree
-    kernel.options = lambda: kernel.WIDE if kernel._has_avx512() else {}
+    fast_path._mark = lambda tree: tree
+    fast_path.options = lambda: fast_path.WIDE if fast_path._has_avx512() else {}
 
 
 def without_width() -> None:
     """XLA chooses the width of vectors."""
-    from ambjax.numerics import kernel
+    from ambjax.compiler import fast_path
 
-    kernel.WIDE = {}
+    fast_path.WIDE = {}
 
 
 def without_apart() -> None:
     """Functions are fused with their surroundings."""
-    apart.apart = lambda function: function
+    barrier.compiled_alone = lambda function: function
 
 
 def without_stored() -> None:
     """Intermediates are computed again wherever they are used."""
-    apart.stored = lambda tree, beside=(): tree
+    barrier.materialised = lambda tree, beside=(): tree
 
 
 def without_arctan() -> None:
@@ -78,9 +78,9 @@ def without_refined() -> None:
 
 def without_blocks() -> None:
     """All members of a call at once."""
-    from ambjax.numerics import kernel
+    from ambjax.compiler import fast_path
 
-    kernel.block_bytes = lambda members: members * jnp.result_type(float).itemsize
+    fast_path.block_bytes = lambda members: members * jnp.result_type(float).itemsize
 
 
 # What is turned off by each, before the modules that use it are imported.

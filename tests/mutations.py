@@ -209,15 +209,15 @@ LOOP = [
     M(
         "noise is redrawn at each evaluation",
         "ambjax/simulation/loop.py",
-        "seen = self.measured(state.plant, hold)\n        command",
-        "seen = self.measured(state.plant, self.hold((state.plant.z * 1e18).astype(int)))\n        command",
+        "seen = self.measured(state.plant, errors)\n        command",
+        "seen = self.measured(state.plant, self.sensor_errors((state.plant.z * 1e18).astype(int)))\n        command",
         "tests/test_ensemble.py::test_settled_rms_agrees_with_the_lyapunov_equation",
     ),
     M(
         "noise is drawn once for all samples",
         "ambjax/simulation/rollout.py",
-        "hold = system.hold(k)",
-        "hold = system.hold(0)",
+        "errors = system.sensor_errors(k)",
+        "errors = system.sensor_errors(0)",
         "tests/test_ensemble.py::test_the_noise_of_a_member_is_its_own_and_white",
     ),
     M(
@@ -288,8 +288,8 @@ METHODS = [
     M(
         "a lost controller goes on stepping",
         "ambjax/simulation/rollout.py",
-        "choose(alive, system.jump(just_after, state, hold), state)",
-        "system.jump(just_after, state, hold)",
+        "choose(alive, system.jump(just_after, state, errors), state)",
+        "system.jump(just_after, state, errors)",
         "tests/test_jump.py::test_a_lost_state_jumps_no_more",
     ),
     M(
@@ -354,7 +354,7 @@ NOISE = [
 ENSEMBLE = [
     M(
         "calls of an ensemble are put together in the wrong order",
-        "ambjax/ensemble/engine.py",
+        "ambjax/ensemble/batching.py",
         "parts = list(pool.map(self._one, starts))",
         "parts = list(pool.map(self._one, reversed(starts)))",
         "tests/test_ensemble.py::test_results_do_not_depend_on_calls_threads_or_who_runs_beside",
@@ -431,7 +431,7 @@ ENSEMBLE = [
     ),
     M(
         "the judge's gains are not exactly those that are written",
-        "tuning/objective/engine.py",
+        "tuning/objective/lanes.py",
         "self.objective.fixed(one, who)",
         "self.objective.fixed(one * (1 + 1e-12), who)",
         "tests/test_replay.py::test_the_tuner_s_numbers_are_those_of_the_commands",
@@ -629,7 +629,7 @@ SEARCH = [
     ),
     M(
         "a limit that is not held is none of the answer's business",
-        "tuning/report/verdict.py",
+        "tuning/report/outcome.py",
         'if verdict == BROKEN and name != "survival"',
         'if verdict == BROKEN and name == "survival"',
         "tests/test_tuning_outcome.py::test_every_place_says_the_same",
@@ -643,14 +643,14 @@ SEARCH = [
     ),
     M(
         "a limit that accurate steps do not confirm is held in the report",
-        "tuning/report/limits.py",
+        "tuning/report/limit_table.py",
         '{"held": None, "verdict": UNVERIFIED} if refuted else',
         '{"held": None, "verdict": UNVERIFIED} if False else',
         "tests/test_tuning_outcome.py::test_every_place_says_the_same",
     ),
     M(
         "the log of the search says that a limit cannot be held",
-        "tuning/search/limits.py",
+        "tuning/search/multipliers.py",
         "a steeper pull has not lowered {names}: its multiplier stays, and the held-out members judge it",
         "a limit does not give way: it cannot be held here",
         "tests/test_tuning_outcome.py::test_every_place_says_the_same",
@@ -804,7 +804,7 @@ SEARCH = [
     ),
     M(
         "members that stall are held, as far as limits are asked",
-        "tuning/report/limits.py",
+        "tuning/report/limit_table.py",
         'members, held = summary["members"], summary["held"]',
         'members, held = summary["members"], summary["members"] - summary["lost"]',
         "tests/test_tuning_outcome.py::test_every_place_says_the_same",
@@ -1116,8 +1116,8 @@ SAMPLED = [
     M(
         "a step on a processor does not end at the edges of a disturbance",
         "ambjax/simulation/sampled.py",
-        "self._fate, None, observed, SHOWN, edges=edges)",
-        "self._fate, None, observed, SHOWN)",
+        "self._status, None, observed, SHOWN, edges=edges)",
+        "self._status, None, observed, SHOWN)",
         "tests/test_sampled.py::test_against_the_independent_simulator[edges between samples]",
     ),
     M(
@@ -1207,8 +1207,8 @@ SAMPLED = [
     M(
         "the current limit asks for more than the supply has",
         "ambjax/world/amplifier.py",
-        "kept = limited(hold(), u_max)",
-        "kept = hold()",
+        "kept = limited(holding_voltage(), u_max)",
+        "kept = holding_voltage()",
         "tests/test_realism.py::test_dead_band_and_current_limit",
     ),
     M(
@@ -1306,14 +1306,14 @@ CHECK = [
     ),
     M(
         "a voltage that alternates is not remarked on",
-        "ambjax/theorem/processor.py",
+        "ambjax/theorem/sampled_report.py",
         "self.alternating is not None and self.alternating > ALTERNATING",
         "self.alternating is not None and self.alternating > 1.0",
         "tests/test_check_processor.py::test_a_voltage_that_alternates_is_remarked_on",
     ),
     M(
         "C beyond the processor's run decides nothing",
-        "ambjax/theorem/processor.py",
+        "ambjax/theorem/sampled_report.py",
         "math.isinf(self.lost_at) and self.distance[0] > 0 and",
         "math.isinf(self.lost_at) and",
         "tests/test_check_processor.py::test_the_singular_curve_is_judged_on_the_processor_s_run",
@@ -1327,14 +1327,14 @@ CHECK = [
     ),
     M(
         "a bound leaves out what the estimate is off by",
-        "ambjax/theorem/processor.py",
+        "ambjax/theorem/sampled_report.py",
         "None if self.band is None else self.band + self.off",
         "self.band",
         "tests/test_check_processor.py::test_no_bound_is_exceeded_by_what_stands_beside_it[estimated, two coils]",
     ),
     M(
         "a signal that is outside its band at first is bounded by the band",
-        "ambjax/theorem/processor.py",
+        "ambjax/theorem/sampled_report.py",
         "limit = float(abs(x[0]))",
         "pass",
         "tests/test_check_processor.py::test_a_signal_that_has_not_reached_its_band_is_bounded_by_where_it_is",
@@ -1362,14 +1362,14 @@ CHECK = [
     ),
     M(
         "an implicit step is as steep as its sign",
-        "ambjax/theorem/processor.py",
+        "ambjax/theorem/sampled_report.py",
         "relaxed = 1 / (1 + 1 / slope) if slope else 0.0",
         "relaxed = slope",
         "tests/test_check_processor.py::test_an_implicit_step_is_no_steeper_than_one",
     ),
     M(
         "the run without noise is with it",
-        "ambjax/theorem/processor.py",
+        "ambjax/theorem/sampled_report.py",
         "quiet = _without_noise(scenario)",
         "quiet = scenario",
         "tests/test_check_processor.py::test_noise_disturbs_and_its_lines_stand_beside_those_without",
@@ -1397,7 +1397,7 @@ CHECK = [
     ),
     M(
         "a law beyond its limit decides nothing",
-        "ambjax/theorem/processor.py",
+        "ambjax/theorem/sampled_report.py",
         "return self.stepped < self.limit",
         "return True",
         "tests/test_check_processor.py::test_an_implicit_step_is_no_steeper_than_one",
@@ -1462,7 +1462,7 @@ EXPORT = [
     ),
     M(
         "a loop is judged beyond the horizon too",
-        "ambjax/export/loop.py",
+        "ambjax/export/closed_loop.py",
         "n = horizon.samples",
         "n = len(signal)",
         "tests/test_export_verify.py::test_a_loop_is_judged_against_its_twins_within_the_horizon_only",
@@ -1552,10 +1552,10 @@ EXPORT = [
         "tests/test_export.py::test_only_files_of_an_earlier_export_of_the_same_prefix_are_replaced",
     ),
 ]
-FATES = [
+STATUSES = [
     M(
         "a stalled run on a processor is lost",
-        "ambjax/theorem/processor.py",
+        "ambjax/theorem/sampled_report.py",
         "stalled = int(outcome.lost_code) == STALLED",
         "stalled = False",
         "tests/test_check_processor.py::test_a_stalled_run_on_a_processor_decides_nothing",
@@ -1611,7 +1611,7 @@ FATES = [
     ),
     M(
         "a run that the integrator gave up is told as a lost rotor",
-        "ambjax/theorem/verdict.py",
+        "ambjax/theorem/advice.py",
         '    if not stalled:\n        return f"The rotor is lost',
         '    if True:\n        return f"The rotor is lost',
         "tests/test_verdict.py::test_every_command_says_the_same_of_a_rotor",
@@ -1625,14 +1625,14 @@ FATES = [
     ),
     M(
         "numbers that a case leaves to the paper are not named",
-        "ambjax/commands/doubts.py",
+        "ambjax/commands/warnings.py",
         "return [*_assumed(case), *_sizes(case),",
         "return [*_sizes(case),",
         "tests/test_attacks.py::test_numbers_that_stay_the_paper_s_are_named",
     ),
     M(
         "a current beyond the bias is not said",
-        "ambjax/commands/doubts.py",
+        "ambjax/commands/warnings.py",
         "most_i > case.scenario.plant.i_0",
         "most_i > 10 * case.scenario.plant.i_0",
         "tests/test_attacks.py::test_a_run_whose_current_exceeds_the_bias_says_so_once",
@@ -1660,14 +1660,14 @@ FATES = [
     ),
     M(
         "a refuted survival is told as one where nobody judges",
-        "tuning/report/verdict.py",
+        "tuning/report/outcome.py",
         '    if outcome.refuted:\n        words.append(f"That',
         "    if outcome.refuted and facts['after']['members']:\n        words.append(f\"That",
         "tests/test_tuning_study.py::test_a_survival_that_accurate_steps_refute_says_so_where_nobody_judges",
     ),
     M(
         "what settles behind the last sample is read",
-        "ambjax/cases/clock.py",
+        "ambjax/cases/timing.py",
         "settle > (1 + ROUNDING) * last:",
         "settle > clock.duration:",
         "tests/test_cli.py::test_bad_case_file_is_one_clear_line[settle behind the last sample-check]",
@@ -1770,6 +1770,6 @@ MUTATIONS = [
     *SAMPLED,
     *CHECK,
     *EXPORT,
-    *FATES,
+    *STATUSES,
     *SURROUNDINGS,
 ]

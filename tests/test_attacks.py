@@ -21,10 +21,10 @@ import ambjax
 import tuning
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from, read_case
-from ambjax.cases.template import template
+from ambjax.cases.template_text import template
 from ambjax.commands import simulate
-from ambjax.commands.doubts import doubts, reversal
 from ambjax.commands.outputs import files
+from ambjax.commands.warnings import reversal, warnings_of
 from ambjax.control.processor import Processor
 from ambjax.ensemble import LogUniform
 from ambjax.numerics.records import validate, within
@@ -253,7 +253,7 @@ def test_the_span_of_an_ensemble_holds_every_member():
     assert BandNoise(1.0, 1.0, 2.0).span(1.0)[1] == pytest.approx(LINES * math.sqrt(2 / LINES))
 
 
-# --- doubts ---
+# --- warnings ---
 
 DOUBTS = {
     "gap in millimetres": ("[plant]\ns_0 = 0.4", "plant.s_0 = 0.4 m", "millimetres"),
@@ -275,7 +275,7 @@ DOUBTS = {
 @pytest.mark.parametrize("case", DOUBTS)
 def test_what_is_hardly_meant_is_said(case):
     text, *wanted = DOUBTS[case]
-    found = doubts(read_case(write(text)))
+    found = warnings_of(read_case(write(text)))
     said = [line for line in found if wanted[0] in line]
     assert len(said) == 1, found
     for part in wanted:
@@ -284,16 +284,16 @@ def test_what_is_hardly_meant_is_said(case):
 
 def test_numbers_that_stay_the_paper_s_are_named():
     given = "m = 0.4\ns_0 = 4e-4\ni_0 = 0.5\nn = 200\nk_z = -100.0\nR = 2.0\n"
-    first, *_ = doubts(read_case(write(f"[plant]\n{given}")))
+    first, *_ = warnings_of(read_case(write(f"[plant]\n{given}")))
     assert first == (
         "[plant] leaves out numbers, which keep the paper's values: mu_0 = 1.25e-06 N/A^2, A = 0.121 m^2. "
         "Write those that differ."
     )
-    first, *_ = doubts(read_case(write("[plant]\nkind = 'two-coil'\nA = 0.1\n")))
+    first, *_ = warnings_of(read_case(write("[plant]\nkind = 'two-coil'\nA = 0.1\n")))
     assert "n = 1480, s_0 = 0.005 m," in first
     # all of them, all but gravity, or none: nothing is left to the paper unsaid
     for text in (f"[plant]\n{given}mu_0 = 1.257e-6\nA = 4e-4\n", "[plant]\nkind = 'two-coil'\n", ""):
-        assert not any("the paper's values" in line for line in doubts(read_case(write(text))))
+        assert not any("the paper's values" in line for line in warnings_of(read_case(write(text))))
 
 
 # For each command: its arguments, and what comes after its case file is read.
@@ -325,9 +325,9 @@ def test_every_command_names_what_stays_the_paper_s(command, capsys, monkeypatch
 @pytest.mark.parametrize("name", ["tracking", "regulation"])
 def test_nothing_in_the_paper_is_doubtful(name):
     sensor = f"\n[sensor]\nstd = {math.sqrt(1e-7)}\n"
-    said = doubts(read_case(write(template(name) + sensor)))  # its text names no error of the velocity
+    said = warnings_of(read_case(write(template(name) + sensor)))  # its text names no error of the velocity
     assert [line.split(":")[0] for line in said] == ["sensor.std_z_dot = 0 m/s"]
-    assert doubts(read_case(write(template(name) + sensor + "std_z_dot = 1e-4\n"))) == []
+    assert warnings_of(read_case(write(template(name) + sensor + "std_z_dot = 1e-4\n"))) == []
 
 
 def test_a_run_whose_current_exceeds_the_bias_says_so_once(capsys):

@@ -12,10 +12,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tomlkit import dumps
 
-from ambjax.cases.clock import DURATION, METHODS
 from ambjax.cases.reader import KINDS, SIGNALS, TABLES, read_case
+from ambjax.cases.timing import DURATION, METHODS
 from ambjax.commands import simulate
-from ambjax.commands.doubts import doubts
+from ambjax.commands.warnings import warnings_of
 from ambjax.ensemble.design import DESIGNS
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import draw
@@ -259,7 +259,7 @@ def hold(text, path, tally, run):
         inside = tune.space.clip(start)
         assert all(gain.low < value < gain.high for gain, value in zip(tune.space.gains, inside, strict=True))
         assert np.all(np.isfinite(tune.space.encode(inside)))
-    assert all(line.isprintable() for line in doubts(case))
+    assert all(line.isprintable() for line in warnings_of(case))
     known = places(case.cascade, case.scenario)
     for where, values in draw(case.spread, case.cascade, case.scenario, 0, np.arange(8), 8).items():
         low, high = dict(case.spread.entries)[where].support(float(known[where].value or 0.0))

@@ -10,7 +10,7 @@ from texts import write
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import KINDS, SIGNALS, case_from, read_case
-from ambjax.cases.template import template
+from ambjax.cases.template_text import template
 from ambjax.ensemble import replay
 from ambjax.paper.readings import CLOCK, SETTLE, cascade, scenario
 

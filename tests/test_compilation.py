@@ -21,7 +21,7 @@ from ambjax import (
     position,
     rollout,
 )
-from ambjax.numerics.apart import stored
+from ambjax.compiler.barrier import materialised
 
 NOISY = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.8, 1.3), sensor=Sensor(1e-6, 1e-4, 1e-4))
 SHORT = Clock(203, 1e-4, AdaptiveRodas3())
@@ -110,7 +110,7 @@ def test_what_is_stored_is_computed_once():
 
     def chain(x, y):
         for _ in range(6):
-            x, y = stored((x * y - y, x + y * y))
+            x, y = materialised((x * y - y, x + y * y))
         return x, y
 
     x = jnp.linspace(0.1, 1.0, 64)
@@ -119,7 +119,7 @@ def test_what_is_stored_is_computed_once():
 
 def test_storing_changes_neither_value_nor_derivative():
     x = jnp.linspace(0.1, 1.0, 8)
-    plain, kept = (lambda x: jnp.sin(x) * x), (lambda x: stored(jnp.sin(x)) * stored(x))
+    plain, kept = (lambda x: jnp.sin(x) * x), (lambda x: materialised(jnp.sin(x)) * materialised(x))
     for way in (lambda f: f(x), lambda f: jax.vmap(f)(x), lambda f: jax.jvp(f, (x,), (x,)), lambda f: jax.jacrev(f)(x)):
         found, expected = way(kept), way(plain)
         # the last digit: products may be fused into sums

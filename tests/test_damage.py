@@ -13,7 +13,7 @@ from ambjax.ensemble.store import Store
 from ambjax.host import sealed
 from ambjax.host.sealed import DamagedError, difference, flat, seal, unseal, write_whole
 from tuning.search.descent import Descent
-from tuning.search.keeper import Keeper, Progress, remove_all
+from tuning.search.keeper import Keeper, SearchState, remove_all
 
 FACTS = {"seed": 3, "plant.m": "0.588"}
 MEMBERS, CHUNK = 50, 20
@@ -391,7 +391,7 @@ def search_of(descent, starts=STARTS, gains=GAINS):
     dice = np.random.default_rng(1)
     past = {name: [dice.random(shape) for _ in range(ITERATIONS)] for name, shape in row.items()}
     x = jnp.asarray(dice.random((starts, gains)))
-    return Progress(descent.begin(x), np.arange(starts) > 0, past, ITERATIONS, phase=1, since=1, seconds=2.5)
+    return SearchState(descent.begin(x), np.arange(starts) > 0, past, ITERATIONS, phase=1, since=1, seconds=2.5)
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import ambjax as amb
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
 from ambjax.simulation.edges import Edges, most_inside
-from ambjax.simulation.integrate import Problem
+from ambjax.simulation.integrate import InitialValueProblem
 
 T = 1e-4
 SOFT = amb.Cascade(inversion=amb.inversion.Adaptive(2e5), processor=Processor(0.5))
@@ -46,7 +46,7 @@ def test_more_edges_than_were_counted_leave_no_time_out():
 def test_an_integral_is_exact_wherever_the_rate_jumps(method):
     pulse = amb.Pulse(2.0, 1.137, 1.642)
     rates = lambda inputs, state: pulse(inputs)  # noqa: E731
-    problem = Problem(lambda t: t, rates, 1.0, lambda state: jnp.int32(0), edges=Edges(pulse.edges(), 2))
+    problem = InitialValueProblem(lambda t: t, rates, 1.0, lambda state: jnp.int32(0), edges=Edges(pulse.edges(), 2))
     end = method.advance(problem, 1.0, 1.0, jnp.zeros(()), method.start(1.0))
     # a rate that is constant over each step: rounding of some 5 steps
     assert float(end.state) == pytest.approx(2.0 * (1.642 - 1.137), rel=1e-14)
@@ -105,7 +105,7 @@ def test_derivatives_in_the_time_of_an_edge():
 
     def end(start):
         rates = lambda t, y: amb.Step(2.0, start)(t) - y  # noqa: E731
-        problem = Problem(lambda t: t, rates, 1.0, lambda state: jnp.int32(0), edges=Edges((start,), 1))
+        problem = InitialValueProblem(lambda t: t, rates, 1.0, lambda state: jnp.int32(0), edges=Edges((start,), 1))
         return amb.RK4(20).advance(problem, 1.0, 1.0, jnp.zeros(()), ()).state
 
     at = 1.337

@@ -15,14 +15,14 @@ from jax import lax
 from scipy import linalg, stats
 
 from ambjax import RK4, AdaptiveRodas3, Cascade, Clock, Initial, Scenario, Sensor, Sine, Standard, inversion, rollout
+from ambjax.compiler import fast_path
 from ambjax.control.processor import Processor
 from ambjax.ensemble import Normal, Percent, Spread, map_members, run_ensemble
 from ambjax.ensemble import study as ensemble_study
-from ambjax.ensemble.engine import size
+from ambjax.ensemble.batching import size
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
 from ambjax.host.sealed import difference
-from ambjax.numerics import kernel
 from ambjax.simulation.loop import ClosedLoop, LoopState
 from ambjax.simulation.metrics import Rms
 from ambjax.simulation.rollout import Outcome
@@ -76,8 +76,8 @@ def test_results_do_not_depend_on_calls_threads_or_who_runs_beside():
 def test_results_do_not_depend_on_how_long_blocks_are_on_this_machine(cpu, monkeypatch):
     expected = {"AuthenticAMD avx512f": 1024}.get(cpu, 512)
     here = run_ensemble(SMOOTH, members(300), SHORT, fold=FOLD, threads=1)
-    monkeypatch.setattr(kernel, "_cpuinfo", lambda: cpu)
-    assert [kernel.block_bytes(n) for n in (1, 255, 256, 4096)] == [512, 512, expected, expected]
+    monkeypatch.setattr(fast_path, "_cpuinfo", lambda: cpu)
+    assert [fast_path.block_bytes(n) for n in (1, 255, 256, 4096)] == [512, 512, expected, expected]
     same(run_ensemble(SMOOTH, members(300), SHORT, fold=FOLD, threads=1), here, 1e-12)
 
 
@@ -95,11 +95,11 @@ def test_a_member_is_the_rollout_of_that_member_alone(method):
 
 
 def test_the_plain_path_gives_the_same_numbers_and_says_that_it_is_taken(monkeypatch, caplog):
-    if kernel.options() is None:
+    if fast_path.options() is None:
         pytest.skip("the fast path is not supported here")
     fast = run_ensemble(SMOOTH, members(20), SHORT, fold=Rms("e_z"))
     monkeypatch.setenv("AMBJAX_PLAIN", "1")
-    kernel.options.cache_clear()
+    fast_path.options.cache_clear()
     try:
         with caplog.at_level(logging.WARNING):
             same(run_ensemble(SMOOTH, members(20), SHORT, fold=Rms("e_z")), fast, 1e-12)
@@ -107,19 +107,19 @@ def test_the_plain_path_gives_the_same_numbers_and_says_that_it_is_taken(monkeyp
         assert len(caplog.records) == 1
     finally:
         monkeypatch.undo()
-        kernel.options.cache_clear()
+        fast_path.options.cache_clear()
 
 
 def test_a_probe_that_finds_a_wrong_lane_turns_the_fast_path_off(monkeypatch, caplog):
-    monkeypatch.setattr(kernel, "smooth_sign", lambda x, p: jnp.where(x > 20, 0.0, jnp.arctan(p * x) * 2 / jnp.pi))
-    kernel.options.cache_clear()
+    monkeypatch.setattr(fast_path, "smooth_sign", lambda x, p: jnp.where(x > 20, 0.0, jnp.arctan(p * x) * 2 / jnp.pi))
+    fast_path.options.cache_clear()
     try:
         with caplog.at_level(logging.WARNING):
-            assert kernel.options() is None
+            assert fast_path.options() is None
         assert "results are off by" in caplog.text
     finally:
         monkeypatch.undo()
-        kernel.options.cache_clear()
+        fast_path.options.cache_clear()
 
 
 def test_several_devices_share_an_ensemble_and_change_nothing(tmp_path):
@@ -191,8 +191,8 @@ def test_settled_rms_agrees_with_the_lyapunov_equation():
 
     def rates(x, w):
         state = LoopState(*jax.tree.unflatten(tree, list(x)))
-        hold = loop.hold(0)._replace(z=w)
-        return jnp.stack(jax.tree.leaves(loop.rates(loop.inputs(0.0), state, hold)))
+        errors = loop.sensor_errors(0)._replace(z=w)
+        return jnp.stack(jax.tree.leaves(loop.rates(loop.inputs(0.0), state, errors)))
 
     x_0 = jnp.stack(jax.tree.leaves(loop.start()))
     assert np.abs(rates(x_0, 0.0)[:3]).max() < 1e-9  # at rest: rounding of 9.81 m/s^2 and of currents

@@ -22,8 +22,8 @@ def test_an_uncertain_plant_is_tried_off_to_either_side(monkeypatch, fragile):
         assert len(off) == 1
         tried.append(off[0])
         ended = off[0] in (fragile, stalling)
-        fate = {"lost": off[0] == fragile, "stalled": off[0] == stalling, "lost_at_s": 0.1 if ended else np.inf}
-        return (), fate | {"settled_max_abs_error_m": 1e-6 * len(tried)}
+        status = {"lost": off[0] == fragile, "stalled": off[0] == stalling, "lost_at_s": 0.1 if ended else np.inf}
+        return (), status | {"settled_max_abs_error_m": 1e-6 * len(tried)}
 
     stalling = "A +10 %"
     monkeypatch.setattr(evidence, "rollout", rollout)

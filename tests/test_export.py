@@ -17,20 +17,20 @@ from texts import piped
 
 from ambjax import RK4, Cascade, Clock, Plant, Scenario, Sensor, Sine
 from ambjax.__main__ import main
-from ambjax.cases.template import template
+from ambjax.cases.template_text import template
 from ambjax.commands.export import VERIFIED
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.guard import Guard
 from ambjax.control.position import force_for, sliding_variable
 from ambjax.control.processor import Processor
 from ambjax.export import machine
-from ambjax.export.controller import Inputs, controller_of
+from ambjax.export.controller import StepInputs, controller_of
 from ambjax.export.machine import Compiled, build
 from ambjax.export.package import described, files
 from ambjax.export.source import Origin, Writer
 from ambjax.export.texts import MARK
 from ambjax.export.trace import arguments, trace
-from ambjax.export.twins import Case
+from ambjax.export.twins import LoopCase
 from ambjax.export.verify import draft, verify
 from ambjax.numerics.records import gain, record
 from ambjax.paper import readings
@@ -142,7 +142,7 @@ def stepping(cascade):
     """A step of a controller of exact sensors, jitted, after one with every input 0."""
     controller = controller_of(cascade, 200.0, PERIOD)
     parameters, memory, inputs, period = arguments(controller)
-    read = frozenset(Inputs._fields)
+    read = frozenset(StepInputs._fields)
     step = jax.jit(lambda memory, inputs: controller.step(parameters, memory, inputs, period, read))
     memory, answer, status = step(memory, inputs)
     assert not any((status.refused, status.failed, status.singular, status.safe, status.invalid))
@@ -157,7 +157,7 @@ def wrong(limit):
 
 def test_an_invalid_reference_leaves_no_trace():
     controller, step, memory, inputs, answer = stepping(hard())
-    for name in Inputs._fields[3:]:
+    for name in StepInputs._fields[3:]:
         limit = getattr(controller.parameters.limits, name)
         for value in wrong(limit):
             bad = inputs._replace(**{name: jnp.asarray(value)})
@@ -581,7 +581,7 @@ def test_a_law_that_is_no_scalar_code_is_named():
 def test_the_readings_cascades(reading):
     cascade = dataclasses.replace(readings.cascade(reading), processor=Processor(1.0))
     scenario = readings.scenario("tracking", reading)
-    case = Case(cascade, scenario, Clock(5000, PERIOD, RK4(3)), 0.1)
+    case = LoopCase(cascade, scenario, Clock(5000, PERIOD, RK4(3)), 0.1)
     assert not failed(verify(drafts(cascade, u_max=scenario.u_max, scenario=scenario), case))
 
 
@@ -591,7 +591,7 @@ def test_the_readings_cascades(reading):
 def test_all_of_it(name):
     cascade = CASCADES[name]
     scenario = Scenario(reference=Sine(1e-3, 2.0), sensor=Sensor(1e-6, 1e-4, 1e-4), u_max=200.0)
-    case = Case(cascade, scenario, Clock(1000, PERIOD, RK4(3)), 0.02)
+    case = LoopCase(cascade, scenario, Clock(1000, PERIOD, RK4(3)), 0.02)
     assert not failed(verify(drafts(cascade, scenario=scenario), case))
 
 

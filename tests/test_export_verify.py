@@ -15,12 +15,12 @@ from ambjax.cases.reader import read_case
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.guard import guarded
 from ambjax.control.processor import Processor
-from ambjax.export import loop, machine
+from ambjax.export import closed_loop, machine
 from ambjax.export.controller import INPUTS
 from ambjax.export.machine import Compiled
 from ambjax.export.points import evaluated
 from ambjax.export.trace import UNREAD, arguments
-from ambjax.export.twins import LEAST, PARTED, SIGNALS, Case, Horizon, Twin, _count, farthest
+from ambjax.export.twins import LEAST, PARTED, SIGNALS, Horizon, LoopCase, Twin, _count, farthest
 from ambjax.export.verify import Check, _looped, _stepped, holds, summary, table, verify
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled
@@ -132,10 +132,10 @@ def test_a_twin_without_a_unit_is_jaxs_loop_and_one_with_it_differs_in_every_sta
 
     @jax.jit
     def jumped(seed, unit, n):
-        return Twin(system.loop, PERIOD, 0, seed, unit).jump(n * PERIOD, state, hold)
+        return Twin(system.loop, PERIOD, 0, seed, unit).jump(n * PERIOD, state, errors)
 
-    hold, state = system.hold(3), system.start()
-    plain = jax.jit(system.jump)(3 * PERIOD, state, hold)
+    errors, state = system.sensor_errors(3), system.start()
+    plain = jax.jit(system.jump)(3 * PERIOD, state, errors)
     still, moved = (jumped(1.0, unit, 3) for unit in (0.0, 1e-12))
     leaves = jax.tree.leaves
     np.testing.assert_array_equal(leaves(still), leaves(plain))
@@ -168,17 +168,17 @@ def horizon(samples, of=100):
 
 def test_a_loop_is_judged_against_its_twins_within_the_horizon_only():
     one, twins = horizon(50), np.linspace(0, 1e-6, 100)
-    assert loop._times(0.5 * twins, one) == pytest.approx(0.5, abs=1e-12)
-    assert loop._times(np.where(np.arange(100) < 50, twins, 1.0), one) == pytest.approx(1, abs=1e-12)
-    assert loop._times(np.where(np.arange(100) < 49, twins, 1.0), one) > 1e5
-    assert loop._times(np.full(100, 1e-30), one) == INF  # off where no twin is
-    assert loop._times(np.full(100, np.nan), one) == INF
-    assert np.isnan(loop._times(twins, horizon(LEAST - 1)))
+    assert closed_loop._times(0.5 * twins, one) == pytest.approx(0.5, abs=1e-12)
+    assert closed_loop._times(np.where(np.arange(100) < 50, twins, 1.0), one) == pytest.approx(1, abs=1e-12)
+    assert closed_loop._times(np.where(np.arange(100) < 49, twins, 1.0), one) > 1e5
+    assert closed_loop._times(np.full(100, 1e-30), one) == INF  # off where no twin is
+    assert closed_loop._times(np.full(100, np.nan), one) == INF
+    assert np.isnan(closed_loop._times(twins, horizon(LEAST - 1)))
 
 
 def test_a_horizon_too_short_decides_nothing():
     good, bad = Check("a", "double", "", "", True), Check("b", "double", "", "", False)
-    row = _looped("float", loop.Beside(horizon(LEAST - 1), np.nan))
+    row = _looped("float", closed_loop.Beside(horizon(LEAST - 1), np.nan))
     assert (row.ok, row.verdict) == (None, "not decisive")
     assert row.found == f"rounding alone parts JAX's loop from itself within {LEAST - 1} of 100 samples"
     assert holds([good, row])
@@ -187,9 +187,9 @@ def test_a_horizon_too_short_decides_nothing():
     assert not holds([good, row, bad])
     assert summary([good, row, bad]) == "It does NOT hold."
     assert summary([good]) == "All of it holds."
-    row = _looped("float", loop.Beside(horizon(LEAST), loop.TIMES))
+    row = _looped("float", closed_loop.Beside(horizon(LEAST), closed_loop.TIMES))
     assert (row.ok, row.verdict) == (True, "holds")
-    assert _looped("float", loop.Beside(horizon(LEAST), 1.001 * loop.TIMES)).verdict == "FAILS"
+    assert _looped("float", closed_loop.Beside(horizon(LEAST), 1.001 * closed_loop.TIMES)).verdict == "FAILS"
 
 
 @compiled
@@ -200,20 +200,20 @@ def test_a_loop_that_amplifies_rounding_is_compared_until_it_does(tmp_path):
     """
     world = dataclasses.replace(WORLD, sensor=dataclasses.replace(WORLD.sensor, **FAULTS))
     one = drafts(RESTLESS, ["double"], 100, scenario=world)["double"]
-    case = Case(RESTLESS, world, Clock(600, PERIOD, RK4(1)), 0.0)
+    case = LoopCase(RESTLESS, world, Clock(600, PERIOD, RK4(1)), 0.0)
     sources = {"correct": one.files["amb.c"]}
     sources["another"] = sources["correct"].replace("params->position.c", "((1 + 1e-9) * params->position.c)")
     rows = {}
     for name, source in sources.items():
         controller, told = library(source, one, tmp_path, name), []
         controller.step = lambda step=controller.step, told=told: told.append(step()) or told[-1]
-        rows[name] = loop.beside(case, {"double": controller})["double"]
+        rows[name] = closed_loop.beside(case, {"double": controller})["double"]
         assert sum(bits & 2 > 0 for bits in told) == 11
     found = rows["correct"].horizon
     assert LEAST < found.samples < 600
     assert found.parted["z"][-1] > 1e3 * PARTED * found.parted["z"][found.samples // 2]
-    assert rows["correct"].times <= loop.TIMES
-    assert rows["another"].times > 10 * loop.TIMES
+    assert rows["correct"].times <= closed_loop.TIMES
+    assert rows["another"].times > 10 * closed_loop.TIMES
 
 
 # --- slow: a mutant for each row, and many correct programs ---
@@ -279,7 +279,7 @@ ROWS = {
 def test_every_row_fails_for_a_program_made_for_it():
     scenario = Scenario(reference=Sine(2.5e-3, 2.0), sensor=Sensor(1e-6, 1e-4, 1e-4), u_max=200.0)
     made = drafts(hard(), ["double"], 2000, scenario=scenario)["double"]
-    case = Case(hard(), scenario, Clock(200, PERIOD, RK4(1)), 0.005)
+    case = LoopCase(hard(), scenario, Clock(200, PERIOD, RK4(1)), 0.005)
     rows = verify({"double": made}, case)
     assert [x.name for x in rows if not x.ok] == []
     assert {x.name for x in rows} == set(ROWS)
@@ -313,7 +313,9 @@ def test_correct_c_passes_whatever_the_seed(name, tmp_path):
     machines = {to: library(one.files["amb.c"], one, tmp_path, to) for to, one in made.items()}
     for seed in range(6):
         scenario = dataclasses.replace(case.scenario, seed=seed)
-        found = loop.beside(Case(case.cascade, scenario, case.clock.with_method(RK4(3)), case.settle), machines)
+        found = closed_loop.beside(
+            LoopCase(case.cascade, scenario, case.clock.with_method(RK4(3)), case.settle), machines
+        )
         for precision, one in found.items():
             assert one.horizon.decisive, (precision, seed)
             assert one.times < 1, (precision, seed, one.times)

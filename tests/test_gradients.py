@@ -26,7 +26,7 @@ from ambjax import (
     position,
     rollout,
 )
-from ambjax.numerics.kernel import one_kernel
+from ambjax.compiler.fast_path import one_kernel
 from ambjax.simulation.metrics import Rms
 
 TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.01, 0.03), sensor=Sensor(0.0))
@@ -37,7 +37,7 @@ SMOOTH = np.array([17.0, 25.0, 1e9, 152.0])
 
 
 def run(gains, p, std, clock):
-    """Mean square of e_z/s_0, and the fate, of the cascade with gains (c, k, gamma, k_i)."""
+    """Mean square of e_z/s_0, and the status, of the cascade with gains (c, k, gamma, k_i)."""
     c, k, gamma, k_i = gains
     cascade = Cascade(
         position=position.SlidingMode(c, k), inversion=inversion.Adaptive(gamma, p), current=current.SlidingMode(k_i)
@@ -177,9 +177,9 @@ IN_A_PROCESS_OF_ITS_OWN = """
 import jax, numpy as np
 from ambjax import *
 from ambjax.numerics import kernel
-from ambjax.numerics.kernel import one_kernel
+from ambjax.compiler.fast_path import one_kernel
 from ambjax.numerics.records import canonical
-from ambjax.numerics.kernel import one_kernel
+from ambjax.compiler.fast_path import one_kernel
 from ambjax.simulation.metrics import Rms
 
 def loss(cascade):
@@ -206,7 +206,7 @@ def test_the_fast_path_differentiates():
 
 WHATEVER_ONE_CLOSES_OVER = """
 import jax, jax.numpy as jnp, numpy as np
-from ambjax.numerics.kernel import one_kernel
+from ambjax.compiler.fast_path import one_kernel
 
 large = np.linspace(0, 1, 3_000_000)
 functions = {

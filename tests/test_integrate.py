@@ -12,7 +12,7 @@ from oracle import World, solve
 
 import ambjax as amb
 from ambjax.numerics import linear
-from ambjax.simulation.integrate import Problem
+from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.trajectory import ALIVE, STALLED
 
 FIXED = {"Euler": (amb.Euler, 1), "RK4": (amb.RK4, 4), "Rodas3": (amb.Rodas3, 3)}
@@ -21,8 +21,8 @@ SMOOTH = amb.Cascade(inversion=amb.inversion.Adaptive(gamma=1e9, p=25e-6))
 TRACKING = amb.Scenario(reference=amb.Sine(2.5e-3, 2.0), q_v=amb.Pulse(1.0, 0.01, 0.02))
 
 
-def problem(rates, scale=1.0, fate=lambda state: jnp.zeros((), jnp.int32)):
-    return Problem(lambda t: t, rates, scale, fate)
+def problem(rates, scale=1.0, status=lambda state: jnp.zeros((), jnp.int32)):
+    return InitialValueProblem(lambda t: t, rates, scale, status)
 
 
 @functools.partial(jax.jit, static_argnames=("rates",))
@@ -234,10 +234,12 @@ def test_a_stalled_rollout_says_so_and_stays_finite():
 
 @pytest.mark.parametrize("method", [amb.Euler(10), amb.RK4(10), amb.Rodas3(10), amb.AdaptiveRodas3()], ids=str)
 def test_stops_at_the_first_bad_state_and_returns_the_last_good_one(method):
-    def fate(y):
+    def status(y):
         return jnp.where(y < 0.55, 0, 2).astype(jnp.int32)
 
-    out = method.advance(problem(lambda t, y: jnp.ones(()), fate=fate), 3.0, 1.0, jnp.asarray(0.0), method.start(1.0))
+    out = method.advance(
+        problem(lambda t, y: jnp.ones(()), status=status), 3.0, 1.0, jnp.asarray(0.0), method.start(1.0)
+    )
     assert int(out.code) == 2
     assert float(out.state) < 0.55 <= float(out.t) - 3.0  # y = t - 3: the time is that of the bad state
     if method.step_size(1.0):
@@ -247,10 +249,10 @@ def test_stops_at_the_first_bad_state_and_returns_the_last_good_one(method):
 # Not Rodas3 with three steps: a fixed implicit step may leap over the pole and never see it.
 @pytest.mark.parametrize("method", [amb.Euler(3), amb.RK4(3), amb.AdaptiveRodas3()], ids=str)
 def test_blow_up_ends_in_a_code_and_a_finite_state(method):
-    def fate(y):
+    def status(y):
         return jnp.where(jnp.abs(y) < 1e3, 0, 2).astype(jnp.int32)
 
-    p = problem(lambda t, y: jnp.exp(y), fate=fate)
+    p = problem(lambda t, y: jnp.exp(y), status=status)
     out = method.advance(p, 0.0, 10.0, jnp.asarray(0.0), method.start(10.0))  # y = -log(1 - t)
     assert int(out.code) in (2, STALLED)
     assert np.isfinite(float(out.state))
@@ -299,7 +301,9 @@ def test_coils_that_settle_within_a_sample_are_resolved(kind):
 
     @functools.partial(jax.jit, static_argnums=0)
     def moved(substeps):
-        held = Problem(lambda t: (), lambda _, x: plant.rates(x, 10.0), plant.scale(), lambda x: jnp.int32(0))
+        held = InitialValueProblem(
+            lambda t: (), lambda _, x: plant.rates(x, 10.0), plant.scale(), lambda x: jnp.int32(0)
+        )
         start = plant.start(amb.world.sensor.Measurement(*map(jnp.asarray, (1e-4, 0.0, -0.2))))
         return plant.measurement(amb.RK4(substeps).advance(held, 0.0, period, start, ()).state)
 

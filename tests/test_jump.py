@@ -10,7 +10,7 @@ from scipy.linalg import expm
 
 from ambjax import RK4, AdaptiveRodas3, Clock
 from ambjax.extend import canonical, leaf, record
-from ambjax.simulation.integrate import Problem, in_turn
+from ambjax.simulation.integrate import InitialValueProblem, in_turn
 from ambjax.simulation.metrics import Driven
 from ambjax.simulation.rollout import roll
 from ambjax.simulation.span import Instant
@@ -59,15 +59,15 @@ class Sampled:
     def realised(self):
         return self
 
-    def hold(self, sample):
+    def sensor_errors(self, sample):
         return 1e-2 * jnp.sin(1.0 * sample)
 
     def start(self):
         zero = jnp.zeros(())
         return Held(Motion(jnp.asarray(self.start_x), zero), zero, zero, (zero, zero))
 
-    def jump(self, t, state, hold):
-        u = -(self.gains[0] * state.plant.x + self.gains[1] * state.plant.x_dot) + hold
+    def jump(self, t, state, errors):
+        u = -(self.gains[0] * state.plant.x + self.gains[1] * state.plant.x_dot) + errors
         return Held(state.plant, state.steps + 1, u, (state.u, state.queue[0]))
 
     def driven(self, u):
@@ -75,11 +75,11 @@ class Sampled:
         rates = lambda _, m: Motion(m.x_dot, W**2 * m.x + u)  # noqa: E731
         shown = lambda inputs, m: (rates(inputs, m), Instant((), Effort(u)))  # noqa: E731
         inputs = lambda t: t  # noqa: E731
-        return Problem(
-            inputs, rates, Motion(1e-3, 0.1), self._fate, observed=shown, shown=Instant((), Effort(0.0)), jumps=True
+        return InitialValueProblem(
+            inputs, rates, Motion(1e-3, 0.1), self._status, observed=shown, shown=Instant((), Effort(0.0)), jumps=True
         )
 
-    def advance(self, method, hold, t, period, state, memory, code):
+    def advance(self, method, errors, t, period, state, memory, code):
         whole, share = jnp.floor(self.delay), self.delay - jnp.floor(self.delay)
         voltages = jnp.stack([state.u, *state.queue])
         late, early = (jnp.interp(whole + k, jnp.arange(3), voltages) for k in (1, 0))
@@ -87,16 +87,16 @@ class Sampled:
         after = in_turn(method, stretches, t, state.plant, memory, code)[-1]
         return after._replace(state=state._replace(plant=after.state))
 
-    def _fate(self, plant):
+    def _status(self, plant):
         return jnp.where(jnp.abs(plant.x) < self.stop, ALIVE, TOUCHED).astype(jnp.int32)
 
-    def fate(self, state):
-        return self._fate(state.plant)
+    def status(self, state):
+        return self._status(state.plant)
 
     def rest(self, state, code):
         return state._replace(plant=Motion(state.plant.x, jnp.zeros(())))
 
-    def row(self, t, state, hold, alive):
+    def row(self, t, state, errors, alive):
         return Line(t, state.plant.x, state.u, state.steps, 0.0 * t, alive)
 
     def noted(self, row, span):

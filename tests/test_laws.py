@@ -14,7 +14,7 @@ import pytest
 from ambjax import AdaptiveRodas3, Cascade, Clock, Plant, Pulse, Scenario, Sine, rollout
 from ambjax.control import answers, current, inversion, observer, position
 from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand
-from ambjax.control.search import Site
+from ambjax.control.search import SearchContext
 from ambjax.numerics.records import validate
 from ambjax.numerics.smooth import smooth_sign
 from ambjax.world.sensor import Measurement
@@ -174,7 +174,7 @@ def test_output_is_finite_for_wild_states(stage, law):
             assert all(np.isfinite(x) for x in jax.tree.leaves(call(stage, law, TAME, signed)))
 
 
-SITE = Site(MODEL, 500.0, 1e-4, {"Q_z": 0.1, "Q_i": 2.0, "Delta_1": 6e4}, (6e4, "Delta_1 along the reference"))
+SITE = SearchContext(MODEL, 500.0, 1e-4, {"Q_z": 0.1, "Q_i": 2.0, "Delta_1": 6e4}, (6e4, "Delta_1 along the reference"))
 # sigma, v_tilde or e: the error of the stage; the last so large that any sign is saturated
 ERRORS = jnp.asarray([-1e9, -1e-3, 0.0, 1e-3, 1e9])
 

@@ -1,6 +1,7 @@
 """The house: imports only point down, and heavy ones stay where they belong."""
 
 import ast
+import collections
 import functools
 import graphlib
 import pathlib
@@ -14,8 +15,8 @@ ROOT = pathlib.Path(__file__).parent.parent
 # Floors from the ground up: a folder of a package, or a module beside such folders, stands on those before it.
 # An import points to an earlier one, or stays within its own without a cycle.
 FLOORS = {
-    "ambjax": "_version numerics host world control simulation extend export theorem ensemble paper pictures cases "
-    "commands __init__ __main__",
+    "ambjax": "_version compiler numerics host world control simulation extend export theorem ensemble paper pictures "
+    "cases commands __init__ __main__",
     "tuning": "space optimisers objective config problem judge search report command __init__ __main__",
 }
 # Folders and modules that may import matplotlib: those that draw.
@@ -170,3 +171,19 @@ assert not xla_bridge._backends, "importing ambjax started a backend"
         [sys.executable, "-c", code], cwd=ROOT, env={"PATH": "/usr/bin:/bin"}, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_no_class_name_is_defined_twice():
+    """`position.SlidingMode` and `current.SlidingMode` are one algorithm, named with its stage."""
+    homes = collections.defaultdict(list)
+    for module in MODULES:
+        for node in tree_of(module).body:
+            if isinstance(node, ast.ClassDef):
+                homes[node.name].append(module)
+    twice = {name: found for name, found in homes.items() if len(found) > 1}
+    assert twice == {"SlidingMode": ["ambjax.control.current", "ambjax.control.position"]}
+
+
+def test_no_module_name_is_used_twice():
+    names = collections.Counter(path.stem for path in MODULES.values() if not path.stem.startswith("__"))
+    assert [name for name, count in names.items() if count > 1] == []

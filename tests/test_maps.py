@@ -85,7 +85,7 @@ def test_stalled_runs_are_counted_apart():
     study = dataclasses.replace(basin("repaired"), clock=clock)
     z = Axis("initial.z", np.array([0.0, 1e-4]))
     found = grid(study, z, Axis("plant.m", np.array([0.588])))
-    np.testing.assert_array_equal(found.survival + found.lost + found.stalled, 1)  # each run has one fate
+    np.testing.assert_array_equal(found.survival + found.lost + found.stalled, 1)  # each run has one status
     assert found.stalled[0, 1] == 1
     assert found.lost.sum() == 0
 
@@ -247,8 +247,8 @@ def test_the_command_says_what_is_drawn_and_what_is_not_decided(tmp_path, capsys
     def stalling(*args, **options):
         outcome = run(*args, **options)
         first = np.arange(len(outcome.measured["lost_at_s"])) == 0
-        fate = {"lost_at_s": np.where(first, 1e-3, np.inf), "stalled": first}
-        return outcome._replace(measured=outcome.measured | fate)
+        status = {"lost_at_s": np.where(first, 1e-3, np.inf), "stalled": first}
+        return outcome._replace(measured=outcome.measured | status)
 
     monkeypatch.setattr(maps, "run_ensemble", stalling)
     assert main([*argv, "--members", "2"]) == 0

@@ -23,7 +23,7 @@ from ambjax import (
 )
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
-from ambjax.ensemble.onekernel import run_whole
+from ambjax.ensemble.gpu_kernel import run_whole
 from ambjax.simulation.metrics import Named, Peak, Variation
 from ambjax.world.signals import BandNoise
 

@@ -144,7 +144,7 @@ def test_simulated():
 
     @jax.jit
     def decided(t, x):
-        _, rates, u = loop.command(loop.inputs(t), jax.tree.unflatten(tree, list(x)), loop.hold(0))
+        _, rates, u = loop.command(loop.inputs(t), jax.tree.unflatten(tree, list(x)), loop.sensor_errors(0))
         return u, jnp.stack(jax.tree.leaves(rates)), loop.inputs(t).q_z
 
     def written(t, x):

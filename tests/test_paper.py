@@ -12,7 +12,7 @@ from matplotlib.image import imread
 from ambjax import AdaptiveRodas3, paper, rollout
 from ambjax.__main__ import main
 from ambjax.paper import claims
-from ambjax.paper.evidence import NOISE_STDS, STEPS, Evidence, Held, Noise, Run, Uncertain, held
+from ambjax.paper.evidence import NOISE_STDS, STEPS, Evidence, Noise, Run, Survival, Uncertain, held
 from ambjax.paper.ledger import judge, markdown, noise_table, processor_table
 from ambjax.simulation.trajectory import STALLED, Row, Trajectory
 from ambjax.theorem.conditions import Condition, Report
@@ -23,8 +23,8 @@ DOCS = pathlib.Path(__file__).parents[1] / "docs"
 def noise(survived, radius_at_least=1e-8, stalled=False):
     """A scan in which the first `survived` levels are survived, the rest lost, or stalled; sigma grows with std."""
     ended = np.arange(len(NOISE_STDS)) >= survived
-    fates = ended & (not stalled), ended & stalled
-    return Noise(1e-4, 0.6, *fates, NOISE_STDS / NOISE_STDS[0] * radius_at_least)
+    statuses = ended & (not stalled), ended & stalled
+    return Noise(1e-4, 0.6, *statuses, NOISE_STDS / NOISE_STDS[0] * radius_at_least)
 
 
 def test_noise_scan_is_read_correctly():
@@ -70,7 +70,9 @@ def test_a_stall_is_neither_held_nor_lost():
     report = Report([Condition("x", "", 2.0, 1.0, 0.0, "", True)], [], 0.01, "stalled", "", True)
     nothing = noise(0, stalled=True)
     uncertain = Uncertain([], ["m -10 %"], 0.0)
-    evidence = Evidence(run, run, trajectory, {True: run}, report, report, [nothing] * 3, Held(0.0, 1e-7), uncertain)
+    evidence = Evidence(
+        run, run, trajectory, {True: run}, report, report, [nothing] * 3, Survival(0.0, 1e-7), uncertain
+    )
     (rows, scans, sampled) = judge({"x": evidence}), noise_table({"x": evidence}), processor_table({"x": evidence})
     verdicts = {row["says"]: row["findings"]["x"]["verdict"] for row in rows}
     others = {"The noise is about 20 % of the gap": claims.HOLDS, "The noise is specified": claims.OPEN}
@@ -80,7 +82,9 @@ def test_a_stall_is_neither_held_nor_lost():
     assert "| none, not decided at 1.0e-08 m |" in page
     assert "rotor lost" not in page
     # with one lost beside them it is known
-    lost = evidence._replace(noise=[nothing, noise(3)], basin=Held(0.0, None), uncertain=Uncertain(["R"], ["m"], 0.0))
+    lost = evidence._replace(
+        noise=[nothing, noise(3)], basin=Survival(0.0, None), uncertain=Uncertain(["R"], ["m"], 0.0)
+    )
     judges = {c.says: c.judge(lost).verdict for c in claims.CLAIMS}
     for says in ("The origin is uniformly asymptotically stable", "Accurate and robust positioning"):
         assert judges[says] == claims.FAILS

@@ -14,9 +14,9 @@ from scipy.integrate import solve_ivp
 
 import ambjax as amb
 from ambjax.cases.reader import case_from
-from ambjax.cases.template import template
-from ambjax.commands.doubts import doubts
+from ambjax.cases.template_text import template
 from ambjax.commands.ensemble import study_of
+from ambjax.commands.warnings import warnings_of
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
 from ambjax.ensemble.maps import Axis, stepped
@@ -269,7 +269,7 @@ def test_what_is_for_a_processor_is_refused_without_one(table, key, value):
 def test_the_rig_holds_its_rotors_with_the_velocity_estimated():
     case = case_from(tomllib.loads(template("rig")))
     assert not case.scenario.sensor.velocity
-    assert doubts(case) == []
+    assert warnings_of(case) == []
     spread = dataclasses.replace(
         case.scenario, initial=amb.Initial(z=np.array([-1e-4, 0.0, 1e-4])), member=np.arange(3)
     )
@@ -308,4 +308,4 @@ def test_the_step_holds_for_the_ends_of_an_amplifier_s_spread():
 )
 def test_a_perfect_velocity_is_said_loudly(table, loud):
     raw = CASE | ({} if table is None else {"sensor": table})
-    assert any("VELOCITY" in line for line in doubts(case_from(raw))) == loud
+    assert any("VELOCITY" in line for line in warnings_of(case_from(raw))) == loud

@@ -23,7 +23,7 @@ from ambjax.cases.rig import RIG
 from ambjax.commands import ensemble as studies
 from ambjax.commands import simulate as simulating
 from ambjax.ensemble import replay as replaying
-from ambjax.ensemble.engine import run_ensemble
+from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
 from ambjax.simulation.metrics import Named, Variation, standard_for

@@ -1,4 +1,4 @@
-"""The rollout: rows, folds, members, the fate of the rotor, the paper's numbers, float32 and the fast path."""
+"""The rollout: rows, folds, members, the status of the rotor, the paper's numbers, float32 and the fast path."""
 
 import dataclasses
 import os
@@ -27,8 +27,8 @@ from ambjax import (
     position,
     rollout,
 )
-from ambjax.numerics import kernel
-from ambjax.numerics.kernel import one_kernel
+from ambjax.compiler import fast_path
+from ambjax.compiler.fast_path import one_kernel
 from ambjax.numerics.records import record, static
 from ambjax.simulation.explicit import Euler
 from ambjax.simulation.loop import SHOWN
@@ -294,7 +294,7 @@ def test_vmap_equals_the_loop_over_members_with_adaptive_steps(short):
     same(rollout(REPAIRED, with_member(0), SHORT, fold=FOLDS), short)
 
 
-# --- the fate of the rotor ---
+# --- the status of the rotor ---
 
 
 def test_a_lost_rotor_is_frozen_and_finite(lost):
@@ -470,7 +470,7 @@ def end_of(c):
     ids=["plain", "jvp", "kernel of vmap"],
 )
 def test_the_fast_path_changes_nothing(transform, at, monkeypatch):
-    if kernel.options() is None:
+    if fast_path.options() is None:
         pytest.skip("the fast path is not supported here")
 
     def result():
@@ -478,16 +478,16 @@ def test_the_fast_path_changes_nothing(transform, at, monkeypatch):
         return out(at) if callable(out) else out
 
     fast = result()
-    monkeypatch.setattr(kernel, "options", lambda: None)
+    monkeypatch.setattr(fast_path, "options", lambda: None)
     # the same operations, fused differently: relative to the largest entry
     near(fast, result(), 1e-12)
 
 
 def test_only_an_outermost_call_is_marked(monkeypatch):
-    if kernel.options() is None:
+    if fast_path.options() is None:
         pytest.skip("the fast path is not supported here")
-    marked, mark = [], kernel._mark
-    monkeypatch.setattr(kernel, "_mark", lambda tree: marked.append(1) or mark(tree))
+    marked, mark = [], fast_path._mark
+    monkeypatch.setattr(fast_path, "_mark", lambda tree: marked.append(1) or mark(tree))
     tiny = Clock(3, 5e-5, Euler(1))
     jax.jit(lambda cascade: rollout(cascade, NOISY, tiny, every=0).trajectory.lost_at)(SMOOTH)
     assert not marked

@@ -324,10 +324,10 @@ def test_a_law_that_gives_no_number_keeps_what_it_had():
     system = system_of(cascade_of(), NOISY, SHORT).realised()
     start = system.start()
     lost = start._replace(plant=start.plant._replace(i=jnp.asarray(jnp.inf)))
-    after = system.jump(0.0, lost, system.hold(0))
+    after = system.jump(0.0, lost, system.sensor_errors(0))
     assert after.sane == 0
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((after.control, after.command)))
-    assert system.advance(amb.RK4(1), system.hold(0), 0.0, 1e-4, after, (), jnp.asarray(0)).code == DIVERGED
+    assert system.advance(amb.RK4(1), system.sensor_errors(0), 0.0, 1e-4, after, (), jnp.asarray(0)).code == DIVERGED
 
 
 @pytest.mark.parametrize("implicit", [True, False])

@@ -23,8 +23,8 @@ from ambjax import (
     position,
     rollout,
 )
+from ambjax.compiler.fast_path import one_kernel
 from ambjax.ensemble import run_ensemble
-from ambjax.numerics.kernel import one_kernel
 from ambjax.numerics.relaxation import _implicit, relaxation
 from ambjax.numerics.smooth import smooth_sign
 from ambjax.simulation.metrics import Rms

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax.numerics.kernel import one_kernel
+from ambjax.compiler.fast_path import one_kernel
 from ambjax.numerics.smooth import (
     TWO_OVER_PI,
     arctan_per,

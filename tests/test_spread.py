@@ -24,7 +24,7 @@ from ambjax import (
     rollout,
 )
 from ambjax.cases.reader import case_from
-from ambjax.cases.template import template
+from ambjax.cases.template_text import template
 from ambjax.ensemble import Choice, LogUniform, Normal, Percent, Spread, Uniform, apply, draw
 from ambjax.ensemble.design import DESIGNS, MOST_LATIN, points
 from ambjax.ensemble.paths import places

@@ -342,7 +342,7 @@ def test_summary_names_the_drivers_and_the_worst():
     rest = [k for k in by_error if k not in (103, 107)]
     assert [member["index"] for member in found["worst"]] == [103, 107, *rest[:2]]
     assert [member["lost_at_s"] for member in found["worst"]] == [0.1, 0.2, None, None]
-    assert [member["fate"] for member in found["worst"]] == ["lost", "stalled", "survives", "survives"]
+    assert [member["status"] for member in found["worst"]] == ["lost", "stalled", "survives", "survives"]
     assert found["worst"][2]["settled_max_abs_error_m"] == data["settled_max_abs_error_m"].max()
 
 

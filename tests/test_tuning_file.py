@@ -27,7 +27,7 @@ gains = [
   "controller.position.c", # alone
 ]
 """
-WRITTEN = """# Tuned by ambjax-tune from the case 'fan'.
+WRITTEN = """# Tuned by ambjax tune from the case 'fan'.
 # None is lost.
 
 # the fan of hall 3

@@ -14,7 +14,7 @@ from tomlkit import dumps
 
 from ambjax import Cascade, Plant, position
 from ambjax.cases.reader import case_from
-from ambjax.cases.template import template
+from ambjax.cases.template_text import template
 from ambjax.control.answers import default_law
 from tuning.__main__ import main
 from tuning.command import _laws

@@ -15,11 +15,11 @@ from tomlkit import dumps
 import tuning.command
 from ambjax import rollout
 from ambjax.simulation.metrics import Named, standard_for
-from tuning.config import Limits, settings
-from tuning.objective.engine import Engine
+from tuning.config import LimitSettings, settings
+from tuning.objective.lanes import Engine
 from tuning.objective.limits import KINDS, PENALTY, Limit, largest, measures
 from tuning.problem import FINE, problem_of
-from tuning.report.limits import MORE
+from tuning.report.limit_table import MORE
 from tuning.report.pictures import amplitudes
 from tuning.search.rounds import rounds
 
@@ -305,5 +305,5 @@ def test_a_sine_s_amplitude_is_its_peak_s():
 
 def test_members_that_may_be_lost_are_counted_whole():
     """(1 - 0.9) 2000 is 199.99999999999997 in floating point."""
-    assert [Limits(survival=0.9).may_lose(n) for n in (2000, 1000, 19)] == [200, 100, 1]
-    assert [Limits(survival=s).may_lose(1000) for s in (1.0, 0.999, 0.9995)] == [0, 1, 0]
+    assert [LimitSettings(survival=0.9).may_lose(n) for n in (2000, 1000, 19)] == [200, 100, 1]
+    assert [LimitSettings(survival=s).may_lose(1000) for s in (1.0, 0.999, 0.9995)] == [0, 1, 0]

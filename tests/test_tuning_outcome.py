@@ -17,8 +17,8 @@ from tuning.config import Budget, seeds
 from tuning.judge import summarise
 from tuning.objective.limits import Limit
 from tuning.report import document as report
-from tuning.report.limits import BROKEN, HELD, LOUD, UNJUDGED, UNVERIFIED
-from tuning.report.verdict import NO, NOBODY, YES, Outcome
+from tuning.report.limit_table import BROKEN, HELD, LOUD, UNJUDGED, UNVERIFIED
+from tuning.report.outcome import NO, NOBODY, YES, TuningOutcome
 from tuning.search.explore import REACH, Slices
 
 HELD_OUT = seeds(Budget())[2]
@@ -111,15 +111,15 @@ def test_every_place_says_the_same(kind, ran):
 
 
 def test_what_speaks_against_the_gains_decides_alone():
-    right = Outcome(10, 0, 0, 1, {"rms_u_V": HELD, "survival": HELD}, "")
+    right = TuningOutcome(10, 0, 0, 1, {"rms_u_V": HELD, "survival": HELD}, "")
     assert right.good
-    assert Outcome(10, 1, 0, 1, right.limits, "").good
+    assert TuningOutcome(10, 1, 0, 1, right.limits, "").good
     for lost, stalled in ((2, 0), (1, 1), (0, 2)):
-        wrong = Outcome(10, lost, stalled, 1, right.limits | {"survival": BROKEN}, "")
+        wrong = TuningOutcome(10, lost, stalled, 1, right.limits | {"survival": BROKEN}, "")
         assert (wrong.good, wrong.rotors_held, wrong.broken) == (False, False, [])
         assert len(wrong.against) == 1
-    assert Outcome(10, 0, 0, 1, {"rms_u_V": BROKEN}, "").against == ["NOT HELD: rms_u_V"]
-    assert Outcome(10, 0, 0, 1, right.limits, "steps").against == [UNVERIFIED]
+    assert TuningOutcome(10, 0, 0, 1, {"rms_u_V": BROKEN}, "").against == ["NOT HELD: rms_u_V"]
+    assert TuningOutcome(10, 0, 0, 1, right.limits, "steps").against == [UNVERIFIED]
 
 
 def test_a_lost_member_s_voltage_counts_in_no_limit():

@@ -20,7 +20,7 @@ from ambjax.simulation.trajectory import STALLED, TOUCHED
 from tuning.__main__ import main
 from tuning.config import seeds
 from tuning.judge import judge
-from tuning.objective.engine import Engine
+from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS, weigh
 from tuning.report import accurate, breakdown, extras, gradient, pictures
 from tuning.report import document as report
@@ -232,7 +232,7 @@ def test_what_is_off_by_much_is_marked():
     assert report._again(again, "a") == ["1.04", "1", "4 %"]
     assert report._again(again, "b") == ["1.47", "1", "**47 %**"]
     assert report._again(again, "c") == ["-"] * 3
-    assert report._fates(again, "lost") == ["0 of 8", "2 of 8", "-"]
+    assert report._statuses(again, "lost") == ["0 of 8", "2 of 8", "-"]
     assert "In bold: off by more than 5 %" in report._accurate(again)[0]
     del again["metrics"]["b"]
     assert "No number is off by more than 5 %" in report._accurate(again)[0]

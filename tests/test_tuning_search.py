@@ -16,17 +16,17 @@ from texts import case_and_tune
 
 from ambjax import Cascade, Clock, Initial, Scenario, Sensor, Sine, Slide, inversion, rollout
 from ambjax.ensemble import Percent, Spread
-from tuning.objective.conditions import bounds
-from tuning.objective.engine import Engine
 from tuning.objective.goal import Goal
+from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS, loss_for, weigh
 from tuning.objective.members import Objective
 from tuning.objective.risk import CVaR, Mean
+from tuning.objective.shortfalls import bounds
 from tuning.optimisers import CLIFF, NAMES, SHORTER, bfgs, optimiser
 from tuning.problem import problem_of
 from tuning.search.course import GAIN, MOST_LOOKS, look_again
 from tuning.search.descent import Descent
-from tuning.search.keeper import Keeper, Progress
+from tuning.search.keeper import Keeper, SearchState
 from tuning.search.optimise import _go_on_with_all, best_of, search
 from tuning.search.screen import FAR, NEAR, around, everywhere, screen
 from tuning.space import Gain, Space
@@ -353,7 +353,7 @@ def test_the_second_phase_goes_back_to_what_was_given_where_the_path_is_worse(sm
     descent = Descent(goal, "bfgs", 0.1)
     best, x = best_of(run(small))[0], everywhere(engine.objective, goal.conditions, start, 2, seed=1)[-2:]
     path = {"x": [x], "value": [np.zeros(2)]}
-    kept = Progress(descent.begin(jnp.asarray(x)), np.ones(2, bool), path, iteration=1)
+    kept = SearchState(descent.begin(jnp.asarray(x)), np.ones(2, bool), path, iteration=1)
     _go_on_with_all(engine, goal, who, kept, descent, best)
     np.testing.assert_array_equal(kept.starts.trial[0], best)
     assert kept.active.tolist() == [True, False]

@@ -11,15 +11,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ambjax import Cascade, Clock, Initial, Pulse, Scenario, Sine, Slide, inversion, position, rollout
-from ambjax.cases.template import template
+from ambjax.cases.template_text import template
 from ambjax.simulation.loop import SHOWN, Densities
 from ambjax.simulation.metrics import Rms
 from ambjax.simulation.span import blank
 from ambjax.theorem.conditions import delta_1_on_reference
 from tuning.config import read_tune
-from tuning.objective.conditions import bounds, shortfall
 from tuning.objective.loss import TERMS, Loss, loss_for
 from tuning.objective.risk import CVaR, Mean, SoftWorst
+from tuning.objective.shortfalls import bounds, shortfall
 from tuning.space import CLOSEST, MARGIN, Gain, Space, tunable
 
 GAINS = [Gain("controller.position.c"), Gain("controller.position.c", 3.0), Gain("controller.position.c", 2.0, 5e3)]

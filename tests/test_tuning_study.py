@@ -21,14 +21,14 @@ import tuning.command
 import tuning.judge
 import tuning.search.rounds
 from ambjax.cases.reader import case_from
-from ambjax.cases.template import template
+from ambjax.cases.template_text import template
 from tuning.config import Budget, seeds
 from tuning.judge import RESOLVED, judge, step_error, summarise, words
-from tuning.objective.conditions import Bound
 from tuning.objective.goal import Goal
 from tuning.objective.loss import TERMS
 from tuning.objective.ranges import BEYOND
 from tuning.objective.risk import Mean
+from tuning.objective.shortfalls import Bound
 from tuning.optimisers import bfgs
 from tuning.report import gradient
 from tuning.search import explore
@@ -281,7 +281,7 @@ def test_bfgs_takes_the_same_way_whatever_the_unit_of_the_loss():
 
 
 def command(monkeypatch, tmp_path, world, *flags, **tune):
-    """`ambjax-tune` in this process, its engine a Bowl: exit code, summary, output directory."""
+    """`ambjax tune` in this process, its engine a Bowl: exit code, summary, output directory."""
     made = study(monkeypatch, world, **tune)
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(dumps(document(**tune)))
@@ -418,11 +418,11 @@ def test_a_search_killed_before_its_first_checkpoint_is_resumed(monkeypatch, tmp
 HELD_OUT = seeds(Budget())[2]
 
 
-@pytest.mark.parametrize("fate", ["lost", "stalled"])
-def test_a_member_that_accurate_steps_alone_do_not_hold_is_no_survivor(monkeypatch, tmp_path, fate):
+@pytest.mark.parametrize("status", ["lost", "stalled"])
+def test_a_member_that_accurate_steps_alone_do_not_hold_is_no_survivor(monkeypatch, tmp_path, status):
     """The last of those that are simulated again: the four that accurate steps try as the worst come before it."""
     mine = (HELD_OUT, 5)
-    if fate == "lost":
+    if status == "lost":
         world = World(limit=lambda seed, number, _, accurate: 40.0 if accurate and (seed, number) == mine else math.inf)
     else:
         world = World(stalls=lambda seed, number, accurate: accurate and (seed, number) == mine)
@@ -431,8 +431,8 @@ def test_a_member_that_accurate_steps_alone_do_not_hold_is_no_survivor(monkeypat
     assert summary["worst_step_error"]["refuted"] == ""
     assert summary["verified"] is False
     assert summary["after"]["survival"] == "not verified"
-    assert {"lost": "lose 1 of 6", "stalled": "cannot decide 1 of 6"}[fate] in summary["verified_reason"]
-    assert f"| {fate} | 0 | 0 | 0 of 6 | 1 of 6 | - |" in (out / "report.md").read_text()
+    assert {"lost": "lose 1 of 6", "stalled": "cannot decide 1 of 6"}[status] in summary["verified_reason"]
+    assert f"| {status} | 0 | 0 | 0 of 6 | 1 of 6 | - |" in (out / "report.md").read_text()
 
 
 def test_a_survival_that_accurate_steps_refute_says_so_where_nobody_judges(monkeypatch, tmp_path):

@@ -9,11 +9,11 @@ from texts import write
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
-from ambjax.cases.template import template
+from ambjax.cases.template_text import template
 from ambjax.commands import check as checking
 from ambjax.commands import simulate
 from ambjax.simulation.trajectory import STALLED, TOUCHED
-from ambjax.theorem import processor, verdict
+from ambjax.theorem import advice, sampled_report
 from ambjax.theorem.conditions import Condition, Report, check
 
 SHORT = "[reference]\nkind = 'sine'\namplitude = 2.5e-3\nfrequency = 2.0\n[clock]\nduration = 0.05\n"
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 def answered(text, capsys):
     """Exit code and the answer: what stands below the tables."""
     code = main(["check", write(text)])
-    return code, capsys.readouterr().out.partition(verdict.QUESTION)[2]
+    return code, capsys.readouterr().out.partition(advice.QUESTION)[2]
 
 
 def advised(answer):
@@ -93,22 +93,22 @@ def condition(gain, against, path="controller.inversion.gamma", ideal=False, at=
 
 def test_no_gain_is_set_by_what_a_falling_rotor_does():
     missed = Report([condition(1.0, 1e9), condition(1.0, 10.0, ideal=True)], [], 0.1, "touched down", "")
-    assert advised(verdict.advice(missed)[0]) == [("controller.inversion", "gamma", "11")]
+    assert advised(advice.advice(missed)[0]) == [("controller.inversion", "gamma", "11")]
     met = Report([condition(100.0, 1e9), condition(100.0, 10.0, ideal=True)], [], 0.1, "touched down", "")
-    (words,) = verdict.advice(met)
+    (words,) = advice.advice(met)
     assert "as the rotor falls" in words
     assert not advised(words)
     # with less than twice what the reference asks, gamma itself may be what is missing
     narrow = Report([condition(15.0, 1e9), condition(15.0, 10.0, ideal=True)], [], 0.1, "touched down", "")
-    assert advised(verdict.advice(narrow)[0]) == [("controller.inversion", "gamma", "20")]
+    assert advised(advice.advice(narrow)[0]) == [("controller.inversion", "gamma", "20")]
     # of a rotor that is held, the larger of both counts
     held = dataclasses.replace(narrow, conditions=[condition(15.0, 30.0), *narrow.conditions[1:]], lost_at=math.inf)
-    assert advised(verdict.advice(held)[0]) == [("controller.inversion", "gamma", "33")]
+    assert advised(advice.advice(held)[0]) == [("controller.inversion", "gamma", "33")]
 
 
 @pytest.mark.parametrize("against", [math.nan, math.inf])
 def test_what_is_no_number_is_said_to_be_none(against):
-    (words,) = verdict.advice(Report([condition(1.0, against)], [], math.inf, "", ""))
+    (words,) = advice.advice(Report([condition(1.0, against)], [], math.inf, "", ""))
     assert "no number" in words
     assert not advised(words)
 
@@ -137,20 +137,20 @@ def test_simulate_says_where_to_look(capsys):
     assert "`ambjax tune case.toml`" in said
 
 
-# Of each fate: when a run ended, whether for the integrator, and what each command must say and return.
-FATES = {"held": (math.inf, False), "lost": (0.01, False), "not decided": (0.01, True)}
+# Of each status: when a run ended, whether for the integrator, and what each command must say and return.
+STATUSES = {"held": (math.inf, False), "lost": (0.01, False), "not decided": (0.01, True)}
 WORDS = {"held": "The rotor is held.", "lost": "The rotor is lost at 0.01 s", "not decided": "held is not decided"}
 
 
-@pytest.mark.parametrize("kind", FATES)
+@pytest.mark.parametrize("kind", STATUSES)
 def test_every_command_says_the_same_of_a_rotor(kind, capsys, monkeypatch):
-    lost_at, stalled = FATES[kind]
+    lost_at, stalled = STATUSES[kind]
     others = [words for other, words in WORDS.items() if other != kind]
     report = Report([condition(2.0, 1.0)], [], lost_at, "touched down", "", stalled)
-    sampled = processor.Sampled([], [], lost_at, "touched down", stalled)
+    sampled = sampled_report.SampledReport([], [], lost_at, "touched down", stalled)
     assert report.holds == sampled.holds == (kind == "held")
-    told = {"check": "\n".join(verdict.answer(report, "case.toml"))}
-    told["on a processor"] = "\n".join(verdict.on_processor(sampled, processor.Delays(None, None, None, 0.1), None))
+    told = {"check": "\n".join(advice.answer(report, "case.toml"))}
+    told["on a processor"] = "\n".join(advice.on_processor(sampled, sampled_report.Delays(None, None, None, 0.1), None))
     genuine = simulate.simulate
 
     def ended(case):
@@ -170,11 +170,11 @@ def test_every_command_says_the_same_of_a_rotor(kind, capsys, monkeypatch):
 
 def test_the_fall_is_the_last_tenth():
     early = Report([condition(1.0, 30.0, at=0.05), condition(5.0, 4.0, ideal=True)], [], 0.1, "touched down", "")
-    assert advised(verdict.advice(early)[0]) == [("controller.inversion", "gamma", "33")]
+    assert advised(advice.advice(early)[0]) == [("controller.inversion", "gamma", "33")]
 
 
 def test_the_advised_gain_is_no_smaller_than_asked():
     # rounded up to two digits, never down, and by less than a tenth
     for x in (0.011, 9.91, 10.0, 68542.1, 1.0001e9):
-        assert x * (1 - 1e-12) <= verdict._up(x) <= 1.1 * x
-    assert [verdict.number(x) for x in (1000.0, 62311.0, 2.5e-7, 0.05)] == ["1000", "6.23e4", "2.5e-7", "0.05"]
+        assert x * (1 - 1e-12) <= advice._up(x) <= 1.1 * x
+    assert [advice.number(x) for x in (1000.0, 62311.0, 2.5e-7, 0.05)] == ["1000", "6.23e4", "2.5e-7", "0.05"]

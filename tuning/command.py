@@ -1,4 +1,4 @@
-"""What `ambjax-tune` does: read, search, judge, write."""
+"""What `ambjax tune` does: read, search, judge, write."""
 
 import argparse
 import dataclasses
@@ -11,23 +11,23 @@ import numpy as np
 
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import one_line
-from ambjax.commands.doubts import say_doubts
 from ambjax.commands.outputs import directory, files, plain, say, write_json, written
+from ambjax.commands.warnings import print_warnings
 from ambjax.control.cascade import Cascade
 from ambjax.host.interrupts import keeping
 from ambjax.host.lock import alone
+from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import check
-from ambjax.theorem.verdict import advice as on_conditions
 from tuning.config import read_tune, seeds, settings
 from tuning.judge import StepError, held, judge, step_error, summarise, worst, worst_of
 from tuning.judge import words as step_words
-from tuning.problem import Problem, problem_of
-from tuning.report import accurate, breakdown, gradient, limits, pictures, verdict
+from tuning.problem import TuningProblem, problem_of
+from tuning.report import accurate, breakdown, gradient, limit_table, outcome, pictures
 from tuning.report import document as report
 from tuning.report.page import page
 from tuning.report.tuned import tuned as tuned_text
 from tuning.search import explore
-from tuning.search.course import Answer
+from tuning.search.course import SearchResult
 from tuning.search.keeper import begin, begun, checkpoint, remove_all, unfinished
 from tuning.search.rounds import rounds
 from tuning.space import Gain, Space, tunable
@@ -38,11 +38,11 @@ REPORT = "report.json"
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """ambjax-tune. Raises ValueError for bad input, before anything is written."""
+    """ambjax tune. Raises ValueError for bad input, before anything is written."""
     case, tune, raw = read_tune(args.case)
     if args.resume and not (args.out and begun(pathlib.Path(args.out))):
         raise ValueError(f"--resume: there is no search in --out {args.out}. Check --out, or leave out --resume.")
-    say_doubts(case, args.case)
+    print_warnings(case, args.case)
     try:
         problem = problem_of(case, tune)
         start = tune.space.values(case.cascade)
@@ -81,7 +81,7 @@ def _kept(out: pathlib.Path) -> str:
 
 
 def _tune(
-    args: argparse.Namespace, raw: dict[str, Any], problem: Problem, start: np.ndarray, out: pathlib.Path
+    args: argparse.Namespace, raw: dict[str, Any], problem: TuningProblem, start: np.ndarray, out: pathlib.Path
 ) -> tuple[int, dict[str, Any]]:
     """Search, judge and write; everything has been checked. `raw`: what the case file holds."""
     tune = problem.tune
@@ -111,7 +111,7 @@ def _tune(
     return int(not good), summary
 
 
-def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
+def _facts(answer: SearchResult, held_out: int) -> dict[str, Any]:
     problem, x, who = answer.problem, answer.x, answer.who
     case, tune, space = problem.case, problem.tune, problem.objective.space
     rollouts = problem.engine.rollouts
@@ -125,9 +125,9 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
     summaries = [summarise(one) for one in judged] or [none, none]
     loss = dict(zip(("before", "after"), (breakdown.table(problem.goal, one) for one in judged), strict=False))
     unlucky, again, refuted = _checked(answer, judged[1] if judged else None, held_out)
-    limited = limits.facts(problem.goal.limits, tune.limits, judged[1] if judged else {}, summaries[1], refuted)
+    limited = limit_table.facts(problem.goal.limits, tune.limits, judged[1] if judged else {}, summaries[1], refuted)
     if refuted and judged:
-        summaries[1] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limits.UNVERIFIED)
+        summaries[1] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
     lost = int((problem.engine.terms(x[None], who)["survival"] > 0).sum())
     line = check(tuned.cascade, case.scenario, dataclasses.replace(case.clock, method=None))
     facts: dict[str, Any] = {
@@ -161,15 +161,15 @@ def _facts(answer: Answer, held_out: int) -> dict[str, Any]:
         row | dataclasses.asdict(where)
         for row, where in zip(report.gains_table(space, before, after, None), problem.ranges, strict=True)
     ]
-    outcome = verdict.outcome_of(facts, tune.limits.may_lose(count))
-    facts["outcome"] = outcome.facts()
-    facts["verdict"] = verdict.verdict(facts, outcome)
-    facts["advice"] = verdict.advice(problem, facts, outcome, x, who)
+    found = outcome.outcome_of(facts, tune.limits.may_lose(count))
+    facts["outcome"] = found.facts()
+    facts["verdict"] = outcome.verdict(facts, found)
+    facts["advice"] = outcome.advice(problem, facts, found, x, who)
     return facts
 
 
 def _checked(
-    answer: Answer, judged: dict[str, np.ndarray] | None, held_out: int
+    answer: SearchResult, judged: dict[str, np.ndarray] | None, held_out: int
 ) -> tuple[StepError | None, dict[str, Any] | None, str]:
     """What accurate steps say of the worst held-out members and of the first, `judged` [N]; and why they do not
     confirm the answer: '' where they do."""
@@ -187,7 +187,7 @@ def _confirmed(*errors: StepError | None) -> str:
     return "; ".join(f"accurate steps: {step_words(error)}" for error in errors if error)
 
 
-def _worst_checked(answer: Answer, judged: dict[str, np.ndarray], held_out: int) -> StepError | None:
+def _worst_checked(answer: SearchResult, judged: dict[str, np.ndarray], held_out: int) -> StepError | None:
     """What accurate steps say of the worst held-out members that are held; None where none is."""
     those = np.flatnonzero(held(judged))
     if not those.size:
@@ -200,11 +200,13 @@ def _worst_checked(answer: Answer, judged: dict[str, np.ndarray], held_out: int)
     return error
 
 
-def _at(problem: Problem, gains: np.ndarray) -> np.ndarray:
+def _at(problem: TuningProblem, gains: np.ndarray) -> np.ndarray:
     return problem.objective.space.encode(problem.objective.space.clip(gains))
 
 
-def _write(out: pathlib.Path, problem: Problem, history: Any, facts: dict[str, Any], slices: explore.Slices) -> None:
+def _write(
+    out: pathlib.Path, problem: TuningProblem, history: Any, facts: dict[str, Any], slices: explore.Slices
+) -> None:
     space = problem.objective.space
     for row, grows, lost in zip(facts["gains"], slices.sensitivity(), slices.more_lost(), strict=True):
         row |= {"sensitivity_percent": None if lost else float(grows), "sensitivity_lost": int(lost)}
@@ -226,7 +228,7 @@ def _write(out: pathlib.Path, problem: Problem, history: Any, facts: dict[str, A
 
 
 def _pictures(
-    problem: Problem, tuned: Cascade, history: Any, facts: dict[str, Any], slices: explore.Slices
+    problem: TuningProblem, tuned: Cascade, history: Any, facts: dict[str, Any], slices: explore.Slices
 ) -> dict[str, bytes]:
     """PNG by file name: those that the report shows."""
     paths, runs = problem.objective.space.paths, {"before": problem.case.cascade, "after": tuned}
@@ -240,7 +242,7 @@ def _pictures(
     return drawn | ({"front.png": pictures.front(facts["pareto"])} if facts.get("pareto") else {})
 
 
-def _laws(problem: Problem, tuned: dict[str, float]) -> dict[str, float]:
+def _laws(problem: TuningProblem, tuned: dict[str, float]) -> dict[str, float]:
     """Every gain of the tuned laws by path, those that were not tuned too: a p left out would follow the plant."""
     everything = Space(tuple(Gain(path) for path in tunable(problem.case.cascade)))
     return dict(zip(everything.paths, everything.values(problem.case.cascade).tolist(), strict=True)) | tuned

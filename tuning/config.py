@@ -63,7 +63,7 @@ class Budget:
 
 
 @dataclasses.dataclass(frozen=True)
-class Limits:
+class LimitSettings:
     """What [tune.limits] says."""
 
     each: tuple[Limit, ...] = ()
@@ -84,7 +84,7 @@ class Tune:
 
     space: Space
     weights: tuple[float, ...]
-    limits: Limits
+    limits: LimitSettings
     conditions: float
     margin: float
     early: float
@@ -183,7 +183,7 @@ def _weights(table: Table) -> tuple[tuple[float, ...], float]:
     return tuple(given[name] for name in TERMS), given["conditions"]
 
 
-def _limits(table: Table, case: Case) -> Limits:
+def _limits(table: Table, case: Case) -> LimitSettings:
     table.only([*KINDS, "survival", "margin", "settling_band_m"])
     asked = {name: table.leaf(name, SHARES.get(name, LIMIT)) for name in KINDS if name in table.raw}
     u_max, source = float(np.max(np.asarray(case.scenario.u_max))), dict.fromkeys(asked, table.path)
@@ -208,7 +208,7 @@ def _limits(table: Table, case: Case) -> Limits:
         for name in sorted(asked)
         if math.isfinite(asked[name])
     )
-    return Limits(each, table.leaf("survival", SHARES["survival"], 1.0), band)
+    return LimitSettings(each, table.leaf("survival", SHARES["survival"], 1.0), band)
 
 
 def _risk(table: Table) -> Risk:

@@ -10,9 +10,9 @@ import numpy as np
 from ambjax.ensemble import wilson
 from ambjax.ensemble.study import Study
 from tuning.config import seeds
-from tuning.objective.engine import Engine
+from tuning.objective.lanes import Engine
 from tuning.objective.members import Members
-from tuning.problem import REFERENCE_MEMBERS, Problem
+from tuning.problem import REFERENCE_MEMBERS, TuningProblem
 
 # Members simulated at a time when an ensemble is judged.
 AT_ONCE = 1024
@@ -22,7 +22,7 @@ RESOLVED = 0.1
 NEGLIGIBLE = 1e-6
 
 
-def judge(problem: Problem, x: np.ndarray, seed: int, count: int) -> dict[str, np.ndarray]:
+def judge(problem: TuningProblem, x: np.ndarray, seed: int, count: int) -> dict[str, np.ndarray]:
     """Every metric [count] of the members of an ensemble under the gains at x [m], and the loss's terms."""
     parts = []
     for first in range(0, count, AT_ONCE):
@@ -32,7 +32,7 @@ def judge(problem: Problem, x: np.ndarray, seed: int, count: int) -> dict[str, n
     return {name: np.concatenate([part[name][0] for part in parts]) for name in parts[0]}
 
 
-def worst(problem: Problem, judged: dict[str, np.ndarray], seed: int) -> dict[str, Any]:
+def worst(problem: TuningProblem, judged: dict[str, np.ndarray], seed: int) -> dict[str, Any]:
     """The member of the ensemble `judged` [N] that fares worst: the first lost, else that of the largest settled error.
 
     `replay` is the command that simulates it by itself, beside the report, and gives these numbers; None where the
@@ -114,7 +114,7 @@ def words(error: StepError) -> str:
     return f"settled rms error {error.off} on {error.members} members" if told else error.refuted
 
 
-def compared(problem: Problem) -> Members:
+def compared(problem: TuningProblem) -> Members:
     """The members on whom steps are compared first: of the training ensemble."""
     count = problem.tune.budget.members
     return problem.objective.chosen(seeds(problem.tune.budget)[0], np.arange(min(REFERENCE_MEMBERS, count)), count)
@@ -125,7 +125,7 @@ def worst_of(values: np.ndarray) -> np.ndarray:
     return np.argsort(-values, kind="stable")[:REFERENCE_MEMBERS]
 
 
-def step_error(problem: Problem, x: np.ndarray, who: Members | None = None) -> StepError:
+def step_error(problem: TuningProblem, x: np.ndarray, who: Members | None = None) -> StepError:
     """What the search's own steps are worth at x [m], on these members; left out: on the first that it is tuned on."""
     who = compared(problem) if who is None else who
     ours, theirs = (metrics_of(engine, x, who) for engine in problem.steps)
@@ -137,7 +137,9 @@ def metrics_of(engine: Engine, x: np.ndarray, who: Members) -> dict[str, np.ndar
     return {name: values[0] for name, values in engine.metrics(x[None], who)["metrics"].items()}
 
 
-def difference(problem: Problem, ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], who: Members) -> StepError:
+def difference(
+    problem: TuningProblem, ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], who: Members
+) -> StepError:
     """What steps are worth by which these members' metrics [n] are `ours`, and `theirs` by accurate ones."""
     ended = [np.isfinite(metrics["lost_at_s"]) for metrics in (ours, theirs)]
     held, unseen = ~(ended[0] | ended[1]), ended[1] & ~ended[0]
@@ -158,9 +160,9 @@ def held(metrics: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def summarise(metrics: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Numbers of an ensemble [N] for the report: fates, survival, and pooled, mean and largest metrics.
+    """Numbers of an ensemble [N] for the report: statuses, survival, and pooled, mean and largest metrics.
 
-    A member whose integration stalled is not `lost`, for its fate is not known; but it is not `held` either, and does
+    A member whose integration stalled is not `lost`, for its status is not known; but it is not `held` either, and does
     not survive. Metrics are of the members that are held: a rotor that is lost is frozen, and from then on its voltage
     and current are 0. Without such members there are none.
     """

@@ -9,13 +9,13 @@ from ambjax.simulation import integrate
 from ambjax.simulation.method import choose_method
 from ambjax.simulation.sliding import slides
 from tuning.config import Tune
-from tuning.objective.conditions import bounds
-from tuning.objective.engine import Engine
 from tuning.objective.goal import Goal
+from tuning.objective.lanes import Engine
 from tuning.objective.limits import Limit, measures
 from tuning.objective.loss import loss_for
 from tuning.objective.members import Objective
 from tuning.objective.ranges import Range, bounded
+from tuning.objective.shortfalls import bounds
 
 # How many times as fine as the search's the steps are when an ensemble is judged. On the tuned loops of
 # tests/test_metrics_dense.py, which holds twenty-four a sample, these miss the settled rms voltage by 0.8 % at most;
@@ -28,7 +28,7 @@ MOST_FORWARD = 8
 
 
 @dataclasses.dataclass(frozen=True)
-class Problem:
+class TuningProblem:
     """Case, settings and what is compiled from them."""
 
     case: Case
@@ -79,7 +79,7 @@ class Problem:
         """What the accurate steps are, in words."""
         return f"{FINE} times as many steps of the plant" if self.sampled else "adaptive RODAS3"
 
-    def limited(self, limits: tuple[Limit, ...]) -> "Problem":
+    def limited(self, limits: tuple[Limit, ...]) -> "TuningProblem":
         """With limits that have learnt something."""
         return dataclasses.replace(self, goal=dataclasses.replace(self.goal, limits=limits))
 
@@ -113,7 +113,7 @@ def method_for(case: Case, substeps: int, finer: int) -> integrate.Integrator:
     return dataclasses.replace(method, substeps=finer * method.substeps)
 
 
-def problem_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = None) -> Problem:
+def problem_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = None) -> TuningProblem:
     """The problem of a case, in steps `finer` times as fine as [tune] asks for."""
     clock = case.clock.with_method(method_for(case, tune.budget.substeps, finer))
     limits = tune.limits
@@ -125,6 +125,6 @@ def problem_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = 
     objective = dataclasses.replace(objective, space=space)
     goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin, limits.each)
     mode = "forward" if len(tune.space) <= MOST_FORWARD else "reverse"
-    return Problem(
+    return TuningProblem(
         case, tune, objective, Engine(objective, settle=case.settle, mode=mode, threads=threads), goal, box, finer
     )

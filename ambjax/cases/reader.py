@@ -10,10 +10,10 @@ import pathlib
 import re
 from typing import Any
 
-from ambjax.cases.clock import clock_from, settled
 from ambjax.cases.reach import check_reference
-from ambjax.cases.spread import spread_from
 from ambjax.cases.table import Table, check_depth, load, show
+from ambjax.cases.timing import clock_from, settled
+from ambjax.cases.variation import spread_from
 from ambjax.control import answers, current, inversion, observer, position
 from ambjax.control.cascade import Cascade
 from ambjax.control.guard import Guard
@@ -74,7 +74,7 @@ TABLES = [
     "run",
     "spread",
 ]
-OTHERS = ["tune"]  # read by ambjax-tune; the commands here pass it by
+OTHERS = ["tune"]  # read by ambjax tune; the commands here pass it by
 UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
 # Terms of a sum: each is compiled.
 MOST_TERMS = 100

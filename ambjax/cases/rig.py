@@ -2,7 +2,7 @@
 
 RIG = """\
 # A case for ambjax: a laboratory's radial magnetic bearing on a 20 kHz processor, its rotor standing still.
-# Units are SI. 'ambjax template' lists every other key. Run it with 'ambjax simulate', tune it with 'ambjax-tune'.
+# Units are SI. 'ambjax template' lists every other key. Run it with 'ambjax simulate', tune it with 'ambjax tune'.
 # Sources: [1] AMrotor, Technical University of Munich, the bearing of TU Darmstadt in Config_Sim_Mag1.m. [2] MALTA, ETH
 # Zurich, firmware of bearingless machines. [3] Math. Probl. Eng. 2011, 414286, Table 1: a rotor of 2.3 kg, gap 0.38 mm.
 
@@ -19,7 +19,7 @@ g = 9.81                      # m/s^2
 
 [controller.observer]         # the velocity is not measured
 kind = "kalman"
-w = 1000.0                    # 1/s; this and the gains below: by 'ambjax-tune' from a rough guess, rounded
+w = 1000.0                    # 1/s; this and the gains below: by 'ambjax tune' from a rough guess, rounded
 
 [controller.position]
 kind = "sliding-mode"

@@ -6,10 +6,10 @@ import math
 from typing import Any
 
 from ambjax.cases.reader import Case
-from ambjax.commands.doubts import read_aloud
 from ambjax.commands.outputs import plain, table
+from ambjax.commands.warnings import read_aloud
 from ambjax.theorem.conditions import Condition, check
-from ambjax.theorem.processor import Delays, Sampled
+from ambjax.theorem.sampled_report import Delays, SampledReport
 
 Summary = dict[str, Any]
 CONTINUOUS = (
@@ -26,7 +26,7 @@ BAND = (
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """ambjax check."""
-    from ambjax.theorem import verdict
+    from ambjax.theorem import advice
 
     case = read_aloud(args.case)
     report = check(case.cascade, case.scenario, case.clock)
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     }
     if not args.json:
         _print_check(report.conditions, report.proof)
-        print("\n" + "\n".join(verdict.answer(report, args.case)))
+        print("\n" + "\n".join(advice.answer(report, args.case)))
     if case.cascade.processor is not None:
         if not args.json:
             print(CONTINUOUS)
@@ -53,17 +53,17 @@ def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
     """Print what decides on the case's processor. Keys of the summary, of which "holds" is the processor's."""
     from ambjax.ensemble.delays import delay_margin
     from ambjax.ensemble.replay import as_member, record_system
-    from ambjax.theorem import processor, verdict
+    from ambjax.theorem import advice, sampled_report
 
     scenario = as_member(case.scenario)
-    sampled = processor.check(case.cascade, scenario, case.clock, case.settle, record_system)
+    sampled = sampled_report.check(case.cascade, scenario, case.clock, case.settle, record_system)
     margin, unknown = delay_margin(case.cascade, case.scenario, case.clock), None
     if (chosen := case.cascade.processor) is not None and chosen.predict is not False:
         unknown = delay_margin(case.cascade, case.scenario, case.clock, known=False)
     if not args.json:
         print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")
         _print_sampled(sampled)
-        print("\n" + "\n".join(verdict.on_processor(sampled, margin, unknown)))
+        print("\n" + "\n".join(advice.on_processor(sampled, margin, unknown)))
     slopes = [dataclasses.asdict(slope) | {"holds": slope.holds} for slope in sampled.slopes]
     return {
         "holds": sampled.holds,
@@ -92,7 +92,7 @@ def _condition(c: Condition) -> Summary:
 
 
 def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
-    verdict = {True: "holds", False: "FAILS", None: "-"}
+    advice = {True: "holds", False: "FAILS", None: "-"}
 
     def number(x: float | None) -> str:
         return "-" if x is None else f"{x:.5g}"
@@ -105,7 +105,7 @@ def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
             number(c.margin),
             c.unit,
             f"{c.at_s:.5g}",
-            verdict[c.holds],
+            advice[c.holds],
             c.note,
         )
         for c in conditions
@@ -115,7 +115,7 @@ def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
     print("\n" + table(("proof", "statement", "worst", "unit", "at (s)", "what"), steps))
 
 
-def _print_sampled(sampled: Sampled) -> None:
+def _print_sampled(sampled: SampledReport) -> None:
     rows = [
         (
             slope.stage,

@@ -11,14 +11,14 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.reader import Case
-from ambjax.commands.doubts import read_aloud, reversal
 from ambjax.commands.outputs import check_places, files, make, plain, say, table, target, write_json, written
 from ambjax.commands.pace import Pace, error_words, pilot, say_how_long, sliding_error
+from ambjax.commands.warnings import read_aloud, reversal
 from ambjax.ensemble import statistics
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
-from ambjax.ensemble.worker import chunk, deaf_children, processes, work
+from ambjax.ensemble.worker import chunk, ignore_sigint, processes, work
 from ambjax.host.interrupts import keeping, unbroken
 from ambjax.host.lock import alone
 from ambjax.host.words import one_line
@@ -135,8 +135,8 @@ def _report(
         print(_text(summary))
         written(out, ", ".join(["members.npz", *WRITTEN[: None if study.spread.entries else -1]]))
     held = ~np.isfinite(columns["lost_at"])
-    for doubt in reversal(case, float(np.max(columns["max_abs_i_A"], initial=0.0, where=held))):
-        say(doubt)
+    for warning in reversal(case, float(np.max(columns["max_abs_i_A"], initial=0.0, where=held))):
+        say(warning)
     return int(summary["survivors"] < study.members), plain(summary) | {"out": str(out)}
 
 
@@ -195,7 +195,7 @@ def _elsewhere(study: Study, store: Store, missing: list[tuple[int, int]], pool:
     while queue or running:
         while queue and len(running) < ahead:
             span = queue.pop()
-            with deaf_children():
+            with ignore_sigint():
                 running[pool.submit(work, study, *span, store.chunk)] = span
         for future in wait(running, return_when=FIRST_COMPLETED).done:
             yield running.pop(future), future.result()

@@ -10,15 +10,15 @@ import jax
 import numpy as np
 
 from ambjax.cases.reader import Case, read_case
-from ambjax.commands.doubts import say_doubts
 from ambjax.commands.outputs import directory, files, say, spare, table, write_json, written
+from ambjax.commands.warnings import print_warnings
 from ambjax.control.guard import guarded
 from ambjax.ensemble.spread import ends
 from ambjax.export import machine, package, texts, verify
 from ambjax.export.controller import Controller, controller_of
 from ambjax.export.source import Origin
 from ambjax.export.statements import PRECISIONS, RESERVED
-from ambjax.export.twins import Case as Compared
+from ambjax.export.twins import LoopCase as Compared
 
 Summary = dict[str, Any]
 # What --verify writes beside the package's files.
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     out = directory(args.out, f"export-{case.name}")
     mark = texts.MARK.format(p=prefix)
     spare(out, [*(name.format(p=prefix) for name in package.NAMES), *VERIFIED], mark)
-    say_doubts(case, args.case)
+    print_warnings(case, args.case)
     with files(out) as part:
         if args.verify:
             sources, checks = _verified(case, controller, args.precision, prefix, origin)

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.cases.clock import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
 from ambjax.cases.reader import Case
-from ambjax.commands.doubts import read_aloud
+from ambjax.cases.timing import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
 from ambjax.commands.ensemble import study_of
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
+from ambjax.commands.warnings import read_aloud
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.maps import GRIDS, PERIOD, SURE, Axis, Map, grid, stepped
 from ambjax.ensemble.paths import places

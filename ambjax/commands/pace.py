@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.commands.outputs import say
-from ambjax.ensemble.engine import cores
+from ambjax.ensemble.batching import cores
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
 from ambjax.simulation.integrate import AdaptiveRodas3

@@ -9,8 +9,8 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.reader import Case
-from ambjax.commands.doubts import read_aloud, reversal
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
+from ambjax.commands.warnings import read_aloud, reversal
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.replay import Replay, record, replay
 from ambjax.ensemble.study import Study
@@ -42,8 +42,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
             f"trajectory.npz and overview.png are not exactly this member's: their metrics differ from those of the "
             f"ensemble, which metrics.json holds, by up to {100 * replayed.deviation:.2g} %."
         )
-    for doubt in reversal(case, float(numbers["max_abs_i_A"])):
-        say(doubt)
+    for warning in reversal(case, float(numbers["max_abs_i_A"])):
+        say(warning)
     metrics = plain(numbers) | {
         "lost_why": trajectory.lost_why,
         "method": str(case.clock.method),
@@ -62,10 +62,10 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         written(out, ", ".join(WRITTEN))
     ended = metrics["lost_at_s"] is not None
     if ended:
-        from ambjax.theorem import verdict
+        from ambjax.theorem import advice
 
-        remedy = verdict.STALLED if case.cascade.processor is None else verdict.STALLED_PLANT
-        words = verdict.fate(metrics["lost_at_s"], trajectory.lost_why, metrics["stalled"], remedy)
+        remedy = advice.STALLED if case.cascade.processor is None else advice.STALLED_PLANT
+        words = advice.status(metrics["lost_at_s"], trajectory.lost_why, metrics["stalled"], remedy)
         which = "" if study is None else " for the nominal case"
         look = (
             f" {command('ambjax', 'check', args.case)} compares the gains with the conditions of Theorem 1{which}; "

@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from ambjax.cases.template import template
+from ambjax.cases.template_text import template
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:

@@ -23,7 +23,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.sampling import Relay
-from ambjax.control.search import Interval, Site
+from ambjax.control.search import Interval, SearchContext
 from ambjax.numerics.records import Scalar, is_traced
 from ambjax.world.plant import Plant
 
@@ -86,7 +86,7 @@ def held(law: Any, model: Plant) -> Scalar:
     return law.held(model) if hasattr(law, "held") else 0.0
 
 
-def ranges(law: Any, site: Site) -> dict[str, Interval]:
+def ranges(law: Any, site: SearchContext) -> dict[str, Interval]:
     """Where gains of the law are searched, by name; one that is not there: about its value."""
     return law.ranges(site) if hasattr(law, "ranges") else {}
 

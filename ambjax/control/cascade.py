@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 from jax import Array
 
+from ambjax.compiler.barrier import materialised
 from ambjax.control import answers, current, inversion, observer, position
 from ambjax.control.laws import (
     CurrentInputs,
@@ -23,7 +24,6 @@ from ambjax.control.laws import (
     stepped,
 )
 from ambjax.control.processor import Processor, carried
-from ambjax.numerics.apart import stored
 from ambjax.numerics.records import Scalar, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
@@ -215,7 +215,7 @@ class Cascade:
         else:
             along = (sample.reference.rate(), measured.z_dot, z_ddot, *rates)
             z_rate, v_star_rate = jax.jvp(lambda *x: wanted(*x)[0], point, along)[1]
-        v_star = stored(v_star)
+        v_star = materialised(v_star)
         force = ForceDemand(z, z_rate, v_star, v_star_rate, self.model.gaps(z))
         demand, inverted = advance(self.inversion, force, state.inversion)
         u, driven = advance(self.current, CurrentInputs(estimate, demand, sample.u_max, force.gaps), state.current)

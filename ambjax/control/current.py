@@ -8,7 +8,7 @@ from jax import Array
 from ambjax.control.answers import Requirement
 from ambjax.control.laws import CurrentInputs
 from ambjax.control.sampling import Relay
-from ambjax.control.search import Interval, Site, authority, rate, steepness, switch
+from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
@@ -60,7 +60,7 @@ class SlidingMode:
     def relay(self) -> Relay:
         return Relay(self.k_i, self.p)
 
-    def ranges(self, site: Site) -> dict[str, Interval]:
+    def ranges(self, site: SearchContext) -> dict[str, Interval]:
         if site.stepped:
             fast = site.w * float(site.model.i_0)
             k_i = authority(site, fast, (0.1, 1e3), "w i_0: the bias current at the pole", "Q_i")
@@ -97,7 +97,7 @@ class ProportionalIntegral:
         excess = jnp.clip(u, -inputs.u_max, inputs.u_max) - u
         return u, self.k_int * error + self.k_aw * excess
 
-    def ranges(self, site: Site) -> dict[str, Interval]:
+    def ranges(self, site: SearchContext) -> dict[str, Interval]:
         per = 1 / float(site.model.L)
         return {
             "k_p": rate(site, 1 / 3, 200, "bandwidth k_p / L from w/3 to 200 w", per),

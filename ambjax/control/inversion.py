@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.compiler.barrier import materialised
 from ambjax.control.answers import Requirement
 from ambjax.control.laws import CurrentDemand, ForceDemand, Relaxation
 from ambjax.control.sampling import Relay
-from ambjax.control.search import Interval, Site, steepness
-from ambjax.numerics.apart import stored
+from ambjax.control.search import Interval, SearchContext, steepness
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.numerics.relax import relax
 from ambjax.numerics.relaxation import relaxation
@@ -73,7 +73,7 @@ class Adaptive:
     def relay(self) -> Relay:
         return Relay(self.gamma, self.p)
 
-    def ranges(self, site: Site) -> dict[str, Interval]:
+    def ranges(self, site: SearchContext) -> dict[str, Interval]:
         needed, words = site.delta_1
         name = words.partition(" ")[0]
         times = 1000 if site.stepped else 100
@@ -86,7 +86,7 @@ class Adaptive:
         v_1, gradient_1 = v_and_gradient(model, end, i_ref)
         w = begin.v_star - v_0
         drift = (end.v_star - v_1 - w) * (1 / jnp.where(h > 0, h, 1.0))
-        w, drift = stored((w, drift))
+        w, drift = materialised((w, drift))
         sliding, slaved, turn = relaxation(w, drift, self.gamma, self.p, h)
         w_1 = w + turn * (drift - sliding)
         w_2 = w_1 + (h - turn) * (drift - slaved)
@@ -94,7 +94,7 @@ class Adaptive:
 
     def step(self, model: Plant, inputs: ForceDemand, state: Array, period: Scalar) -> tuple[CurrentDemand, Array]:
         """v(z, i_ref) moves towards v_star as the sign at the step's end has it: gamma is its slew rate at most."""
-        w = stored(inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0])
+        w = materialised(inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0])
         after = model.current_for(inputs.z, inputs.v_star - relax(w, period * self.gamma, self.p))
         return CurrentDemand(state, (after - state) * (1 / period)), after
 

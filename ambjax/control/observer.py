@@ -5,7 +5,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.search import Interval, Site, rate
+from ambjax.control.search import Interval, SearchContext, rate
 from ambjax.numerics import differentiator
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.world.plant import Plant
@@ -66,7 +66,7 @@ class Complementary:
     def __call__(self, model: Plant, inputs: Measurement, state: Array) -> tuple[Measurement, Array]:
         return inputs._replace(z=state), inputs.z_dot + self.l * (inputs.z - state)
 
-    def ranges(self, site: Site) -> dict[str, Interval]:
+    def ranges(self, site: SearchContext) -> dict[str, Interval]:
         return {"l": rate(site, 1e-3, 1, "corner from w/1000 to w")}
 
 
@@ -100,7 +100,7 @@ class Difference:
         z_dot = -jnp.expm1(-self.w * period) / period * (inputs.z - state)
         return inputs._replace(z_dot=z_dot), state + period * z_dot
 
-    def ranges(self, site: Site) -> dict[str, Interval]:
+    def ranges(self, site: SearchContext) -> dict[str, Interval]:
         return {"w": rate(site, 1, 20, "corner from w to 20 w")}
 
 
@@ -172,7 +172,7 @@ class Kalman:
         after = Predicted(z + period * z_dot + period**2 / 2 * whole, z_dot + period * whole, d, z_ddot)
         return Measurement(z, z_dot, inputs.i), after
 
-    def ranges(self, site: Site) -> dict[str, Interval]:
+    def ranges(self, site: SearchContext) -> dict[str, Interval]:
         return {"w": rate(site, 0.5, 5, "poles from w/2 to 5 w")}
 
 
@@ -206,7 +206,7 @@ class IRED1:
         """The estimate includes this sample."""
         return _implicit(self.L, inputs, state, period)
 
-    def ranges(self, site: Site) -> dict[str, Interval]:
+    def ranges(self, site: SearchContext) -> dict[str, Interval]:
         return {"L": _bound(site, 2)}
 
 
@@ -237,7 +237,7 @@ class IRED2:
         """The estimate includes this sample."""
         return _implicit(self.L, inputs, state, period)
 
-    def ranges(self, site: Site) -> dict[str, Interval]:
+    def ranges(self, site: SearchContext) -> dict[str, Interval]:
         return {"L": _bound(site, 3)}
 
 
@@ -264,6 +264,6 @@ def differentiator_scale(model: Plant) -> tuple[Scalar, Scalar, Scalar]:
     return z, z_dot, jnp.abs(model.g) / 50 + 1e-3
 
 
-def _bound(site: Site, power: int) -> Interval:
+def _bound(site: SearchContext, power: int) -> Interval:
     words = f"(x w)^{power} s_0, x from 1/10 to 1"
     return rate(site, 0.1, 1, words, 1 / float(site.model.s_0), power)

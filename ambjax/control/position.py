@@ -7,7 +7,7 @@ from jax import Array
 
 from ambjax.control.answers import Requirement
 from ambjax.control.sampling import Relay
-from ambjax.control.search import Interval, Site, authority, manifold, rate, steepness, switch
+from ambjax.control.search import Interval, SearchContext, authority, manifold, rate, steepness, switch
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share, twist
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_root, smooth_sign
@@ -73,7 +73,7 @@ class SlidingMode:
         """The manifold, along which the force wanted is that of the sample's start."""
         return self.c
 
-    def ranges(self, site: Site) -> dict[str, Interval]:
+    def ranges(self, site: SearchContext) -> dict[str, Interval]:
         if site.stepped:
             most = site.w**2 * float(site.model.s_0)
             k = authority(site, most, (1e-3, 0.3), "w^2 s_0: what the magnets accelerate the rotor by", "Q_z")
@@ -138,7 +138,7 @@ class SuperTwisting:
         """The manifold, along which the force wanted is that of the sample's start."""
         return self.c
 
-    def ranges(self, site: Site) -> dict[str, Interval]:
+    def ranges(self, site: SearchContext) -> dict[str, Interval]:
         if site.stepped:
             return {"c": manifold(site), **self._authorities(site)}
         root, integral = float(self.p) ** 0.5, TWO_OVER_PI * float(self.p)
@@ -148,7 +148,7 @@ class SuperTwisting:
             "k_2": rate(site, 1e-2, 10, "corner sqrt(2/pi k_2 p) from w/100 to 10 w", integral, 2),
         }
 
-    def _authorities(self, site: Site) -> dict[str, Interval]:
+    def _authorities(self, site: SearchContext) -> dict[str, Interval]:
         size = float(site.model.s_0)
         root = authority(site, (site.w**3 * size) ** 0.5, (1e-3, 0.3), "sqrt(w^3 s_0)")
         return {"k_1": root, "k_2": authority(site, site.w**3 * size, (1e-5, 0.1), "w^3 s_0")}

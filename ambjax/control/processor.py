@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.compiler.barrier import materialised
 from ambjax.control.guard import Guard
-from ambjax.numerics.apart import stored
 from ambjax.numerics.records import Scalar, is_traced, leaf, record, static
 from ambjax.world.plant import Plant, State
 from ambjax.world.sensor import Measurement
@@ -94,7 +94,7 @@ def carried(model: Plant, estimate: Measurement, past: tuple[Array, Array], leng
     """The estimate after these lengths (s), the last first, under past voltages: one RK4 step of the model each."""
 
     def rates(x: State, u: Array) -> State:
-        return stored(model.rates(x, u), x)
+        return materialised(model.rates(x, u), x)
 
     x = model.start(estimate)
     for u, h in reversed(list(zip(past, lengths, strict=False))):
@@ -102,7 +102,7 @@ def carried(model: Plant, estimate: Measurement, past: tuple[Array, Array], leng
         k_2 = rates(_moved(x, h / 2, k_1), u)
         k_3 = rates(_moved(x, h / 2, k_2), u)
         k_4 = rates(_moved(x, h, k_3), u)
-        x = stored(_moved(x, h / 6, jax.tree.map(lambda a, b, c, d: a + 2 * (b + c) + d, k_1, k_2, k_3, k_4)))
+        x = materialised(_moved(x, h / 6, jax.tree.map(lambda a, b, c, d: a + 2 * (b + c) + d, k_1, k_2, k_3, k_4)))
     return model.measurement(x)
 
 

@@ -24,27 +24,27 @@ class Sampling(NamedTuple):
     implicit: bool
 
 
-class Limits(NamedTuple):
+class SlopeLimits(NamedTuple):
     """Largest slope times T of a law that is stepped explicitly: for stability, and without oscillation."""
 
     stable: float
     quiet: float
 
 
-def limits(late: float) -> Limits:
+def slope_limits(late: float) -> SlopeLimits:
     """The limits of x_{n+1} = x_n - a x(n - late), 0 <= late <= 2, x between samples on the straight line: a = slope T.
 
     2 and 1 without delay, 1 and 1/4 with one sample.
     """
     if late <= 1:
         stable = min(1 / late if late else math.inf, 2 / (1 - 2 * late) if late < 0.5 else math.inf)
-        return Limits(stable, 1 / (1 + math.sqrt(late)) ** 2)
+        return SlopeLimits(stable, 1 / (1 + math.sqrt(late)) ** 2)
     rest = late - 1
     # r is a root of r^2 (r - 1) + a ((1 - rest) r + rest); at the largest a of a real one it is double
     r = np.linspace(1e-6, 1.0, 20_001)
     quiet = float(np.max(r * r * (1 - r) / ((1 - rest) * r + rest)))
     # Jury: a^2 rest^2 + a < 1
-    return Limits(2 / (1 + math.sqrt(1 + 4 * rest**2)), quiet)
+    return SlopeLimits(2 / (1 + math.sqrt(1 + 4 * rest**2)), quiet)
 
 
 class Relay(NamedTuple):

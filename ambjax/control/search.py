@@ -8,7 +8,7 @@ from ambjax.numerics.smooth import TWO_OVER_PI
 from ambjax.world.plant import Plant
 
 
-class Site(NamedTuple):
+class SearchContext(NamedTuple):
     """The surroundings of a search: nominal plant, pole w of the true one (1/s), sample period (s).
 
     `stepped`: on a processor, by laws whose signs act on the step's end. `bounds`: what Theorem 1 requires gains to
@@ -43,7 +43,7 @@ class Interval(NamedTuple):
     times: str = ""
 
 
-def manifold(site: Site) -> Interval:
+def manifold(site: SearchContext) -> Interval:
     """Decay rate on a sliding manifold, 1/s."""
     cap = max(1 / (5 * site.period), site.w / 10)
     if cap >= 10 * site.w:
@@ -52,7 +52,7 @@ def manifold(site: Site) -> Interval:
     return Interval(site.w / 30, cap, words, True)
 
 
-def switch(site: Site, name: str, p: Scalar, times: float, over: str) -> Interval:
+def switch(site: SearchContext, name: str, p: Scalar, times: float, over: str) -> Interval:
     """A switching gain by the slope 2/pi gain p of its smoothed sign, at least twice the disturbance bound `over`."""
     per, below = TWO_OVER_PI * float(p), site.bounds.get(over, 0.0)
     low, high = site.w / 3 / per, times * site.w / per
@@ -62,7 +62,7 @@ def switch(site: Site, name: str, p: Scalar, times: float, over: str) -> Interva
     return Interval(max(low, 2 * below), max(high, 200 * below), words)
 
 
-def authority(site: Site, size: Scalar, share: tuple[float, float], what: str, over: str = "") -> Interval:
+def authority(site: SearchContext, size: Scalar, share: tuple[float, float], what: str, over: str = "") -> Interval:
     """A switching gain on a processor, where no slope limits it: these shares of `size`, which is `what` in words."""
     below = site.bounds.get(over, 0.0)
     low, high = (part * float(size) for part in share)
@@ -72,7 +72,7 @@ def authority(site: Site, size: Scalar, share: tuple[float, float], what: str, o
     return Interval(max(low, 2 * below), max(high, 200 * below), words)
 
 
-def steepness(site: Site, name: str) -> dict[str, Interval]:
+def steepness(site: SearchContext, name: str) -> dict[str, Interval]:
     """The steepness p of a sign on a processor, by its slope with the gain of this name; else nothing is said of it."""
     if not site.stepped:
         return {}
@@ -81,7 +81,7 @@ def steepness(site: Site, name: str) -> dict[str, Interval]:
     return {"p": Interval(low, high, words, times=name)}
 
 
-def rate(site: Site, low: float, high: float, words: str, per: Scalar = 1.0, power: int = 1) -> Interval:
+def rate(site: SearchContext, low: float, high: float, words: str, per: Scalar = 1.0, power: int = 1) -> Interval:
     """A gain whose rate, gain times `per` (of dimension 1/s to this power), lies from `low` to `high` times w."""
     first, last = ((share * site.w) ** power / float(per) for share in (low, high))
     return Interval(first, last, f"{words}, {site.pole}")

@@ -1,8 +1,8 @@
 """Ensembles: many members of one case, drawn, simulated and reduced to numbers."""
 
+from ambjax.ensemble.batching import map_members, run_ensemble
 from ambjax.ensemble.distributions import Choice, LogUniform, Normal, Percent, Uniform
 from ambjax.ensemble.drivers import shares, spearman
-from ambjax.ensemble.engine import map_members, run_ensemble
 from ambjax.ensemble.intervals import cvar, quantile, wilson
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.ensemble.statistics import summary

@@ -16,7 +16,7 @@ from ambjax.simulation.metrics import Ending
 NEVER = jnp.inf
 
 
-class Folded(NamedTuple):
+class BlockValues(NamedTuple):
     """Blocks of one run: extremes by signal [count] (+inf and -inf where the rotor is not alive), and more.
 
     `variation` [count]: the total variation of u_mean over the steps that begin in a block, V. `last`: each signal at
@@ -32,7 +32,7 @@ class Folded(NamedTuple):
 class Carry(NamedTuple):
     """Blocks so far, and u_mean and whether the rotor was alive at the sample before."""
 
-    folded: Folded
+    folded: BlockValues
     u_mean: Array
     alive: Array
 
@@ -50,7 +50,7 @@ class Blocks:
         dtype = jnp.result_type(float)
         low, high = ({name: jnp.full(self.count, x, dtype) for name in self.of} for x in (NEVER, -NEVER))
         last = {name: jnp.asarray(jnp.nan, dtype) for name in self.of}
-        folded = Folded(low, high, jnp.zeros(self.count, dtype), last)
+        folded = BlockValues(low, high, jnp.zeros(self.count, dtype), last)
         return Carry(folded, jnp.zeros((), dtype), jnp.asarray(False))
 
     def update(self, carry: Carry, row: Any, span: Any) -> Carry:
@@ -65,10 +65,12 @@ class Blocks:
         step = jnp.where(row.alive & carry.alive, jnp.abs(row.u_mean - carry.u_mean), 0.0)
         last = {k: jnp.where(row.alive, x, jnp.nan) for k, x in values.items()}
         return Carry(
-            Folded(low, high, _with(folded.variation, before, jnp.add, step), last), row.u_mean, jnp.asarray(row.alive)
+            BlockValues(low, high, _with(folded.variation, before, jnp.add, step), last),
+            row.u_mean,
+            jnp.asarray(row.alive),
         )
 
-    def result(self, carry: Carry, ending: Ending) -> Folded:
+    def result(self, carry: Carry, ending: Ending) -> BlockValues:
         return carry.folded
 
 

@@ -7,10 +7,10 @@ import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.processor import MOST_DELAY
-from ambjax.ensemble.engine import run_ensemble
+from ambjax.ensemble.batching import run_ensemble
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.trajectory import STALLED
-from ambjax.theorem.processor import Delays
+from ambjax.theorem.sampled_report import Delays
 from ambjax.world.scenario import Scenario
 
 # Delays of a pass, which run together. The scan's are 1/128 sample apart or less: a rotor may be lost in a narrow

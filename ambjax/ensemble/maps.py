@@ -7,8 +7,8 @@ import jax
 import numpy as np
 
 from ambjax.control.cascade import Cascade
+from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.distributions import Choice, Distribution, Uniform
-from ambjax.ensemble.engine import run_ensemble
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import STEP, Spread, apply, check_spread, corners, ends, require_path
@@ -36,7 +36,7 @@ class Map(NamedTuple):
     """Results by cell [ny, nx]: share of survivors with its 95 % interval, and the median settled |z - r|, m.
 
     The error is NaN where no member of the cell survives. `lost` and `stalled` count the members that do not survive:
-    of the latter the integrator gave up, and their fate is not known. `members`: runs of each cell. `varied`: whether
+    of the latter the integrator gave up, and their status is not known. `members`: runs of each cell. `varied`: whether
     they differ, by noise or by what was spread. `drawn`: dotted paths of the latter.
     """
 

@@ -15,14 +15,14 @@ import jax
 import numpy as np
 
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble.engine import map_members
+from ambjax.ensemble.batching import map_members
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import Fold, standard_for
-from ambjax.simulation.rollout import Outcome, Progress, System, begin, check_inputs, finish, stretch
+from ambjax.simulation.rollout import Outcome, RolloutState, System, begin, check_inputs, finish, stretch
 from ambjax.simulation.sampled import system_of
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.scenario import Scenario
@@ -110,7 +110,7 @@ def _relative(a: Any, b: Any) -> float:
     return abs(a - b) / max(abs(a), abs(b)) if np.isfinite(a - b) else 1.0
 
 
-def _begun(tree: tuple[System, Clock, Fold | None]) -> Progress:
+def _begun(tree: tuple[System, Clock, Fold | None]) -> RolloutState:
     return begin(*tree)
 
 
@@ -118,7 +118,7 @@ def _begun(tree: tuple[System, Clock, Fold | None]) -> Progress:
 def _stretched(count: int) -> Callable[[Any], Any]:
     """The same function each time, so that it compiles once."""
 
-    def one(tree: tuple[System, Clock, Fold | None, Progress, Any]) -> tuple[Progress, Outcome]:
+    def one(tree: tuple[System, Clock, Fold | None, RolloutState, Any]) -> tuple[RolloutState, Outcome]:
         system, clock, fold, progress, first = tree
         progress, rows = stretch(system, clock, fold, progress, first, count)
         return progress, finish(progress, rows, fold)

@@ -1,4 +1,4 @@
-"""Statistics of an ensemble: its fate, its metrics with intervals, what drives them, and who fares worst."""
+"""Statistics of an ensemble: its status, its metrics with intervals, what drives them, and who fares worst."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -36,7 +36,7 @@ def summary(
 
     `columns` are those of members.npz, arrays [N]: index, lost_at (s, +inf: ran to the end), stalled, the metrics, and
     "spread." + path for each of `spread_names`. A member survives, is lost, or is stalled: the integrator gave up, and
-    its fate is not known.
+    its status is not known.
 
     The metrics and what drives them are statistics of the survivors (`metrics_of`): a rotor that is lost is frozen, and
     from then on its voltage, current and chatter are 0. Lost and stalled members count in `survival`, in the drivers of
@@ -146,11 +146,11 @@ def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) ->
 def _worst(
     index: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray, name: str, values: np.ndarray, count: int
 ) -> list[dict[str, Any]]:
-    def fate(k: int) -> str:
+    def status(k: int) -> str:
         return "survives" if np.isinf(lost_at[k]) else "stalled" if stalled[k] else "lost"
 
     order = np.lexsort((index, -values, lost_at))[:count]
     return [
-        {"index": int(index[k]), "fate": fate(k), name: _number(values[k]), "lost_at_s": _number(lost_at[k])}
+        {"index": int(index[k]), "status": status(k), name: _number(values[k]), "lost_at_s": _number(lost_at[k])}
         for k in order
     ]

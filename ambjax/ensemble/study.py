@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ambjax.control.cascade import Cascade
+from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.blocks import Blocks
-from ambjax.ensemble.engine import run_ensemble
 from ambjax.ensemble.paths import kinds, places
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.host.sealed import provenance

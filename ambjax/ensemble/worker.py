@@ -82,7 +82,7 @@ def processes(count: int) -> Iterator[Executor]:
 
 
 @contextlib.contextmanager
-def deaf_children() -> Iterator[None]:
+def ignore_sigint() -> Iterator[None]:
     """Processes that are started in this block do not hear Ctrl-C, which is then their parent's alone."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield

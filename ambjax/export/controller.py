@@ -33,7 +33,7 @@ def _end(of: str, unit: str) -> Any:
 
 
 @record
-class Limits:
+class StepLimits:
     """The supply's limit, and those of the reference: GAPS gaps, and that in a sample for each further derivative."""
 
     u_max: Scalar = dataclasses.field(metadata=U_MAX.metadata)
@@ -46,7 +46,7 @@ class Limits:
     r_dddot: Scalar = _end("r_dddot", "m/s^3")
 
 
-class Inputs(NamedTuple):
+class StepInputs(NamedTuple):
     """What a step reads: sensors, and the reference of the instant at which its voltage takes effect."""
 
     z: Array
@@ -81,7 +81,7 @@ class Status(NamedTuple):
     invalid: Array
 
 
-class Answer(NamedTuple):
+class StepOutputs(NamedTuple):
     """What a step gives."""
 
     u: Array
@@ -134,7 +134,7 @@ class Parameters(NamedTuple):
     """All numbers that the C may change: those of the cascade and the limits."""
 
     controller: Cascade
-    limits: Limits
+    limits: StepLimits
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,12 +145,14 @@ class Controller:
     period: float
 
     def step(
-        self, parameters: Parameters, memory: Memory, inputs: Inputs, period: Scalar, read: frozenset[str]
-    ) -> tuple[Memory, Answer, Status]:
+        self, parameters: Parameters, memory: Memory, inputs: StepInputs, period: Scalar, read: frozenset[str]
+    ) -> tuple[Memory, StepOutputs, Status]:
         """One sample. Inputs that are not in `read` are not looked at, nor is the delay where nothing is predicted."""
         cascade, limits = parameters
         measured = Measurement(*inputs[:3])
-        fine = [jnp.abs(getattr(inputs, name)) <= getattr(limits, name) for name in Inputs._fields[3:] if name in read]
+        fine = [
+            jnp.abs(getattr(inputs, name)) <= getattr(limits, name) for name in StepInputs._fields[3:] if name in read
+        ]
         processor: Any = cascade.processor
         if processor.predicts or processor.guard is not None:  # the parts of a prediction are those of this delay
             fine += [processor.delay >= 0, processor.delay <= processor.most]
@@ -175,7 +177,7 @@ class Controller:
             valid & safe,
             ~valid,
         )
-        return kept, Answer(last.u, last.i_ref, last.v_star, last.v_tilde), status
+        return kept, StepOutputs(last.u, last.i_ref, last.v_star, last.v_tilde), status
 
     def start(self) -> Memory:
         """Before the first step: no voltage, laws without a state, no reading expected."""
@@ -204,7 +206,7 @@ def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scen
     cascade, period = cascade.on_processor(), float(period)
     model = cascade.model
     cascade = guarded(cascade, scenario or Scenario(plant=model), period)
-    limits = Limits(u_max, NEAR, *(GAPS * float(model.s_0) / period**n for n in range(4)))
+    limits = StepLimits(u_max, NEAR, *(GAPS * float(model.s_0) / period**n for n in range(4)))
     plain = jax.tree.map(lambda x: float(x) if jnp.shape(x) == () else x, Parameters(cascade, limits))
     return Controller(plain, period)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ambjax.control import answers
 from ambjax.control.cascade import CascadeState
-from ambjax.export.controller import BITS, INPUTS, OUTPUTS, Controller, Inputs, Number, parameters_of
+from ambjax.export.controller import BITS, INPUTS, OUTPUTS, Controller, Number, StepInputs, parameters_of
 from ambjax.export.emitter import traced
 from ambjax.export.primitives import COUNTED, OPS
 from ambjax.export.program import Operand, Program, Ref
@@ -32,7 +32,7 @@ def precision(name: str) -> Any:
 def arguments(controller: Controller) -> Any:
     """Parameters, memory, inputs and period as JAX has them in its present precision."""
     zero = jnp.zeros(())
-    inputs = Inputs(*[zero] * len(Inputs._fields))
+    inputs = StepInputs(*[zero] * len(StepInputs._fields))
     return (*canonical((controller.parameters,)), controller.start(), inputs, jnp.asarray(controller.period))
 
 
@@ -103,8 +103,8 @@ def _traced(controller: Controller, to: str, read: frozenset[str]) -> Trace:
     parameters, real = parameters_of(controller.parameters), np.dtype(PRECISIONS[to])
     states = _states(controller)
     texts = [f"params->{word(x.name)}" for x in parameters] + [f"state->{word(x.name)}" for x in states]
-    texts += ["state->started", *(f"input->{name}" for name in Inputs._fields), PERIOD]
-    kinds = [real] * (len(parameters) + len(states)) + [np.dtype(bool)] + [real] * (len(Inputs._fields) + 1)
+    texts += ["state->started", *(f"input->{name}" for name in StepInputs._fields), PERIOD]
+    kinds = [real] * (len(parameters) + len(states)) + [np.dtype(bool)] + [real] * (len(StepInputs._fields) + 1)
     refs = [program.input(text, kind) for text, kind in zip(texts, kinds, strict=True)]
     step: Any = controller.step
     results = traced(program, lambda *x: step(*x, read), given, refs)
@@ -128,7 +128,7 @@ def _traced(controller: Controller, to: str, read: frozenset[str]) -> Trace:
         started,
         [(Number(name, *_output(name), 0.0), x) for name, x in zip(OUTPUTS, outputs, strict=True)],
         list(zip(BITS, bits, strict=True)),
-        frozenset(name for name, ref in zip(Inputs._fields, told, strict=True) if ref.node in seen),
+        frozenset(name for name, ref in zip(StepInputs._fields, told, strict=True) if ref.node in seen),
         keep,
         refs,
     )

@@ -30,7 +30,7 @@ TWINS, PARTED, LEAST = 8, 1e-2, 20
 SIGNALS = ("z", "u")
 
 
-class Case(NamedTuple):
+class LoopCase(NamedTuple):
     """What is compared: a cascade on its processor in a scenario, over a clock; `settle`: when it has settled, s."""
 
     cascade: Cascade
@@ -65,7 +65,7 @@ class Twin(Sampled):
     seed: Scalar
     unit: Scalar
 
-    def jump(self, t: Scalar, state: SampledState, hold: Errors | FaultyErrors) -> SampledState:
+    def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
         """The laws' step from the changed states, and its changed command."""
         sample = jnp.rint(t / self.period).astype(jnp.int32)
         key = jax.random.fold_in(jax.random.key(jnp.asarray(self.seed, jnp.int32)), sample)
@@ -74,7 +74,7 @@ class Twin(Sampled):
         # flags and counts are no states
         watch = moved.watch._replace(left=state.watch.left) if state.watch else ()
         state = moved._replace(sane=state.sane, watch=watch, started=state.started, sensed=state.sensed)
-        stepped = super().jump(t, state, hold)
+        stepped = super().jump(t, state, errors)
         return stepped._replace(command=self._moved(after, stepped.command, self._sizes(stepped).command))
 
     def _moved(self, key: Array, state: Any, sizes: Any) -> Any:
@@ -110,7 +110,7 @@ class Twin(Sampled):
         )
 
 
-def horizons(case: Case, precisions: list[str]) -> dict[str, Horizon]:
+def horizons(case: LoopCase, precisions: list[str]) -> dict[str, Horizon]:
     """JAX's loop beside its twins, for each precision."""
     given: Any = system_of(case.cascade, case.scenario, case.clock)
     twin, clock = canonical((Twin(given.loop, given.period, given.cuts, 0.0, 0.0), case.clock))

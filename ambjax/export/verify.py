@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ambjax.export import loop
+from ambjax.export import closed_loop
 from ambjax.export.controller import SPAN, Controller
 from ambjax.export.machine import EXACT, SANITIZED, SHARED, STRICT, Compiled, build, execute, scratch, short
 from ambjax.export.package import SHARE, ULPS, tolerance, written
@@ -16,7 +16,7 @@ from ambjax.export.reference import Results, results
 from ambjax.export.source import Origin
 from ambjax.export.statements import PRECISIONS
 from ambjax.export.trace import Trace, trace
-from ambjax.export.twins import LEAST, PARTED, TWINS, Case
+from ambjax.export.twins import LEAST, PARTED, TWINS, LoopCase
 
 # Random states and inputs of the comparison of one step.
 COUNT = 10_000
@@ -61,7 +61,7 @@ def draft(controller: Controller, precision: str, prefix: str, origin: Origin, c
     return Draft(traced, prefix, written(traced, prefix, origin), steps)
 
 
-def verify(drafts: Mapping[str, Draft], case: Case | None) -> list[Check]:
+def verify(drafts: Mapping[str, Draft], case: LoopCase | None) -> list[Check]:
     """Every check, in both precisions; without a case none of the closed loop.
 
     Raises ValueError where the machine decides nothing: without a compiler, or where what it makes cannot be run.
@@ -79,7 +79,7 @@ def verify(drafts: Mapping[str, Draft], case: Case | None) -> list[Check]:
                 for name in one.steps:
                     checks += _stepped(name, one, precision, machines[precision])
         if case is not None and len(machines) == len(drafts):
-            for precision, found in loop.beside(case, machines).items():
+            for precision, found in closed_loop.beside(case, machines).items():
                 checks.append(_looped(precision, found))
     return checks
 
@@ -125,7 +125,7 @@ def deviation(found: np.ndarray, should: np.ndarray, tiny: float) -> np.ndarray:
     return np.where(same, 0.0, np.where(np.isnan(off), np.inf, off))
 
 
-def _looped(precision: str, found: loop.Beside) -> Check:
+def _looped(precision: str, found: closed_loop.Beside) -> Check:
     """The closed loop over its horizon."""
     name, horizon = "closed loop, dz", found.horizon
     count, samples = horizon.samples, horizon.signals["z"].size
@@ -135,8 +135,8 @@ def _looped(precision: str, found: loop.Beside) -> Check:
     told = f"{found.times:.2g} times what rounding does, over {count:,} of {samples:,} samples"
     reached, size = float(horizon.parted["z"][count - 1]), horizon.sizes["z"]
     share = f", {reached / size:.1g} of the rms error" if size > 0 else ""
-    allowed = f"{loop.TIMES:g} times (rounding reaches {reached:.1g} m{share})"
-    return Check(name, precision, told, allowed, found.times <= loop.TIMES)
+    allowed = f"{closed_loop.TIMES:g} times (rounding reaches {reached:.1g} m{share})"
+    return Check(name, precision, told, allowed, found.times <= closed_loop.TIMES)
 
 
 def table(checks: list[Check], case: str, mark: str) -> str:
@@ -180,6 +180,6 @@ and converters amplify rounding, so the loops are compared only while rounding h
 loop measure that: in each, every state of plant and laws and the voltage is changed by one unit in the last place of
 the precision, up or down at random, at every sample. The horizon ends before the first sample at which a twin is off by
 more than {PARTED:g} of the rms of z - r, or of that of u, or at which the rotor is lost. Up to there, z of the C's loop
-may at no sample be off by more than {loop.TIMES:g} times what the farthest twin is off. With a horizon of fewer than
-{LEAST} samples the row is not decisive.
+may at no sample be off by more than {closed_loop.TIMES:g} times what the farthest twin is off. With a horizon of
+fewer than {LEAST} samples the row is not decisive.
 """

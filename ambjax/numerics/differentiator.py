@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.apart import apart
+from ambjax.compiler.barrier import compiled_alone
 from ambjax.numerics.records import Scalar
 
 # lam_0 .. lam_m by order: Levant's.
@@ -65,7 +65,7 @@ def _root(c: Array, m: int) -> Array:
 
 
 @jax.custom_jvp
-@apart
+@compiled_alone
 def _cubic_root(c: Array) -> Array:
     square, linear, _ = LAM[2]
     # each term alone gives a root too high, and the left side is convex: Newton's steps fall towards the root

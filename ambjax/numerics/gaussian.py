@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from ambjax.numerics.apart import apart
+from ambjax.compiler.barrier import compiled_alone
 from ambjax.numerics.records import Scalar
 from ambjax.numerics.smooth import cosine, sine
 
@@ -34,7 +34,7 @@ def _threefry(k_0: Array, k_1: Array, x: Array, y: Array) -> tuple[Array, Array]
     return x, y
 
 
-@apart
+@compiled_alone
 def _both(*words: Array) -> Array:
     """Both words of `_threefry` in the bits of one complex number: of two results XLA computes each apart."""
     return lax.complex(*[lax.bitcast_convert_type(word, jnp.float32) for word in _threefry(*words)])
@@ -50,7 +50,7 @@ def threefry(key: tuple[Scalar, Scalar], count: tuple[Scalar, Scalar]) -> tuple[
     return first, second
 
 
-@apart
+@compiled_alone
 def _radius(word: Array) -> Array:
     """sqrt(-2 ln u) for u = (word + 1/2) / 2^32."""
     dtype = jnp.result_type(float)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.apart import apart
+from ambjax.compiler.barrier import compiled_alone
 from ambjax.numerics.records import Scalar
 from ambjax.numerics.smooth import TWO_OVER_PI, arctan_per, limited, refined, safe_sqrt, smooth_root, smooth_sign
 
@@ -40,7 +40,7 @@ def share(w: Scalar, h: Scalar, p: Scalar | None) -> Array:
 
 
 @jax.custom_jvp
-@apart
+@compiled_alone
 def _relaxed(x: Array, h: Array) -> Array:
     """The y with y + h arctan(y) = x."""
     size = jnp.abs(x)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.apart import apart
+from ambjax.compiler.barrier import compiled_alone
 from ambjax.numerics.records import Scalar
 
 TWO_OVER_PI = 0.6366197723675814
@@ -96,7 +96,7 @@ def polynomial(u: Array, coefficients: Sequence[Scalar]) -> Any:
 
 
 @jax.custom_jvp
-@apart
+@compiled_alone
 def arctan_per(x: Array, per: Array) -> Array:
     """arctan(x) / per with one division, which vectorises; XLA's own arctan is a scalar library call on CPUs.
 
@@ -137,7 +137,7 @@ def _quarter(y: Array) -> Array:
 
 
 @jax.custom_jvp
-@apart
+@compiled_alone
 def sine(x: Array) -> Array:
     """sin(2 pi x): an angle in turns is reduced exactly, and it vectorises; XLA's own is a library call on CPUs."""
     y = _turn(x)
@@ -145,7 +145,7 @@ def sine(x: Array) -> Array:
 
 
 @jax.custom_jvp
-@apart
+@compiled_alone
 def cosine(x: Array) -> Array:
     """cos(2 pi x)."""
     return _quarter(0.25 - jnp.abs(_turn(x)))

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax import paper
+from ambjax.compiler.fast_path import one_kernel
 from ambjax.control.cascade import Cascade
-from ambjax.numerics.kernel import one_kernel
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.integrate import AdaptiveRodas3, Slide
@@ -43,7 +43,7 @@ class Run(NamedTuple):
     quiet: Any = None
 
 
-class Held(NamedTuple):
+class Survival(NamedTuple):
     """Of values tried, ascending: the largest up to which all are held (0: none is), and the next, if not decided.
 
     `undecided`: at it none is lost, but the integrator stalled. None: at the next one is lost, or all are held.
@@ -53,12 +53,12 @@ class Held(NamedTuple):
     undecided: float | None
 
 
-def held(tried: np.ndarray, lost: np.ndarray, stalled: np.ndarray) -> Held:
+def held(tried: np.ndarray, lost: np.ndarray, stalled: np.ndarray) -> Survival:
     """What is held of values [N], ascending: at which some are lost, and at which some are stalled, bool [N]."""
     ended = np.flatnonzero(lost | stalled)
     first = int(ended[0]) if ended.size else len(tried)
     unknown = bool(ended.size) and not lost[first]
-    return Held(float(tried[first - 1]) if first else 0.0, float(tried[first]) if unknown else None)
+    return Survival(float(tried[first - 1]) if first else 0.0, float(tried[first]) if unknown else None)
 
 
 class Noise(NamedTuple):
@@ -110,7 +110,7 @@ class Evidence(NamedTuple):
     check_regulation: Report
     check_tracking: Report
     noise: list[Noise]
-    basin: Held
+    basin: Survival
     """|z(0)| in m up to which the rotor returns from currents of equilibrium"""
     uncertain: Uncertain
 
@@ -180,7 +180,7 @@ def _uncertain(cascade: Cascade, reading: str) -> Uncertain:
     with ThreadPoolExecutor() as pool:
         metrics = list(pool.map(one, cases))
     named = [(f"{name} {100 * (factor - 1):+.0f} %", m) for (name, factor), m in zip(cases, metrics, strict=True)]
-    lost, stalled = ([name for name, m in named if m[fate]] for fate in ("lost", "stalled"))
+    lost, stalled = ([name for name, m in named if m[status]] for status in ("lost", "stalled"))
     return Uncertain(lost, stalled, max(m["settled_max_abs_error_m"] for m in metrics))
 
 
@@ -211,12 +211,12 @@ def _noise(cascade: Cascade, reading: str, period: float) -> Noise:
     sensors = _batch(Sensor(), size, std=jnp.asarray(stds))
     scenarios = _batch(quiet, size, sensor=sensors, seed=jnp.asarray(seeds, int))
     metrics = _scan(*canonical(_scanned(cascade, scenarios, period)))
-    lost, stalled = (np.any(np.reshape(metrics[fate], (-1, SEEDS)), axis=1) for fate in ("lost", "stalled"))
+    lost, stalled = (np.any(np.reshape(metrics[status], (-1, SEEDS)), axis=1) for status in ("lost", "stalled"))
     sigma = np.asarray(metrics["settled_max_abs_sigma_m_per_s"]).reshape(-1, SEEDS).mean(axis=1)
     return Noise(period, NOISE_SAMPLES * period, lost, stalled, sigma)
 
 
-def _basin(cascade: Cascade, reading: str) -> Held:
+def _basin(cascade: Cascade, reading: str) -> Survival:
     """Regulation, undisturbed, from rest at z(0) off the origin with i = i_ref at its equilibrium for z = 0."""
     offsets = np.concatenate([BASIN, -BASIN])
     size, plant = len(offsets), Plant()
@@ -227,5 +227,5 @@ def _basin(cascade: Cascade, reading: str) -> Held:
     initial = Initial(jnp.asarray(offsets), zeros, zeros + current)
     scenarios = _batch(dataclasses.replace(quiet, sensor=Sensor()), size, initial=initial)
     metrics = _scan(*canonical(_scanned(start, scenarios, float(paper.CLOCK.sample_period))))
-    ended = [np.reshape(metrics[fate], (2, -1)) for fate in ("lost", "stalled")]
+    ended = [np.reshape(metrics[status], (2, -1)) for status in ("lost", "stalled")]
     return held(BASIN, *(either[0] | either[1] for either in ended))

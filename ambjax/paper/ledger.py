@@ -76,8 +76,8 @@ def _processor_lines(rows: list[dict[str, Any]]) -> list[str]:
     for row in rows:
         under = f"the paper's, {SUPPLY:g} V" if row["noise"] else "none, no limit"
         if math.isfinite(row["lost_at_s"]):
-            fate = "not decided: stalled at" if row["stalled"] else "at"
-            lines.append(f"| {row['reading']} | {under} | {fate} {1e3 * row['lost_at_s']:.3g} ms | - | - |")
+            status = "not decided: stalled at" if row["stalled"] else "at"
+            lines.append(f"| {row['reading']} | {under} | {status} {1e3 * row['lost_at_s']:.3g} ms | - | - |")
         else:
             error, u = row["settled_max_abs_error_m"], row["settled_rms_u_V"]
             lines.append(f"| {row['reading']} | {under} | no | {error:.2e} m | {u:.3g} V |")

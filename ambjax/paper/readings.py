@@ -6,9 +6,9 @@ literal: Table 2 as printed, the disturbance an acceleration q_z = Q_z = 1 m/s^2
 repaired: gamma = 7.5e4 instead of 1000, so that Eq. (7) holds, and the disturbance a scaled magnetic
 force of 1 A^2/m^2, as the text words it, so q_z = a Q_z = 0.141 m/s^2.
 tuned: the disturbance as for `repaired`, under the paper's own noise (held 100 us, on z) and a supply of 200 V, with
-an observer and gains that `ambjax-tune benchmarks/tasks/C.toml` found; a search today may end at others.
+an observer and gains that `ambjax tune benchmarks/tasks/C.toml` found; a search today may end at others.
 sampled: as `tuned`, on a processor of 10 kHz whose voltage is a sample late, its signs without a layer, with gains
-that `ambjax-tune benchmarks/tasks/sampled/C10-robust.toml` found: its members' plants are off by up to 10 %.
+that `ambjax tune benchmarks/tasks/sampled/C10-robust.toml` found: its members' plants are off by up to 10 %.
 
 The paper does not print when the pulse acts, the initial state, or the sample time of its noise; here:
 0.8 s to 1.3 s of 2 s, all zero, and a parameter.
@@ -60,7 +60,7 @@ SUPPLY = 200.0
 
 
 class Tuned(NamedTuple):
-    """Gains that `ambjax-tune` found for benchmarks/tasks/C.toml, to four digits."""
+    """Gains that `ambjax tune` found for benchmarks/tasks/C.toml, to four digits."""
 
     c: float = 1743.0
     k: float = 291.6

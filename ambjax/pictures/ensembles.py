@@ -168,13 +168,13 @@ def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray
         ax.plot(ticks, np.full(len(ticks), 0.08), "|", color=RED, markersize=7, label="a member ends", transform=where)
     lost, open_ = int(ended.sum()), 0 if stalled is None else int(np.sum(np.asarray(stalled, bool) & ended))
     words = f"{len(lost_at) - lost} of {len(lost_at)} survive ({share[-1]:.4g} %)"
-    words += f", {_fates(lost - open_, open_)}" * bool(lost)
+    words += f", {_statuses(lost - open_, open_)}" * bool(lost)
     ax.set_title(words, fontsize=8, loc="right", pad=2, color=INK)
     ax.yaxis.set_major_locator(MaxNLocator(3))
     finish(ax, "survivors\n(%)")
 
 
-def _fates(lost: int, stalled: int) -> str:
+def _statuses(lost: int, stalled: int) -> str:
     """How many are lost, and how many the integrator gave up."""
     return f"{lost} lost" + f", {stalled} not decided" * bool(stalled)
 
@@ -203,7 +203,7 @@ def histograms(columns: Mapping[str, Any], path: pathlib.Path, metrics: Sequence
     others = "lost members" + " and those not decided" * bool(open_)
     keys = [Patch(color=BLUE, label="survivors"), Patch(label=others, **LOST)]
     keys += [Line2D([], [], color=INK, linestyle=s, label=f"{n} of survivors") for s, n in MARKS.values()]
-    figure.suptitle(f"{lost.size} members, {_fates(int(lost.sum()) - open_, open_)}", fontsize=11)
+    figure.suptitle(f"{lost.size} members, {_statuses(int(lost.sum()) - open_, open_)}", fontsize=11)
     figure.legend(handles=keys, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     figure.savefig(path, dpi=130)
 

@@ -175,8 +175,8 @@ def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:
     ax.axvline(lost_at, color=RED, linewidth=1.0)
     if first:
         why = trajectory.lost_why.replace(": ", ":\n").replace(" reached ", "\nreached ")
-        fate = "not decided from" if trajectory.lost_code == STALLED else "lost at"
-        words = f"{fate} {lost_at:.4g} s\n{why}"
+        status = "not decided from" if trajectory.lost_code == STALLED else "lost at"
+        words = f"{status} {lost_at:.4g} s\n{why}"
         paper = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1}  # a curve may run behind the words
         ax.text(0.99, 0.06, words, transform=ax.transAxes, ha="right", va="bottom", fontsize=7, color=INK, bbox=paper)
 

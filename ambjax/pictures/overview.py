@@ -39,7 +39,7 @@ def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tup
         columns, grid = _stretches(trajectory), [[panel] * 3 for panel in panels]
     else:
         half = -(-len(panels) // 2)
-        columns = [(_fate(trajectory), *window), ("", *window)]
+        columns = [(_status(trajectory), *window), ("", *window)]
         grid = list(itertools.zip_longest(panels[:half], panels[half:]))
     # the whole run has as much room as the two others
     width, height = 13.0, 1.55 * len(grid) + 1.2
@@ -86,13 +86,13 @@ def _stretches(trajectory: Trajectory) -> list[tuple[str, float, float]]:
     last = max(_last_moments(trajectory, end), least)
     beyond = end + 0.15 * (end - begin) * loss
     return [
-        (_fate(trajectory), begin, max(beyond, begin + least)),
+        (_status(trajectory), begin, max(beyond, begin + least)),
         (f"the first {_short(start)}", begin, begin + start),
         (f"the last {_short(last)}", end - last, end + 0.15 * last * loss),
     ]
 
 
-def _fate(trajectory: Trajectory) -> str:
+def _status(trajectory: Trajectory) -> str:
     lost_at = float(trajectory.lost_at)
     if not np.isfinite(lost_at):
         return ""

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.apart import apart, stored
+from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.numerics.records import Scalar, record
-from ambjax.simulation.integrate import Problem, Times, _Fixed
+from ambjax.simulation.integrate import InitialValueProblem, Times, _Fixed
 from ambjax.simulation.span import Span
 
 
@@ -25,7 +25,7 @@ def _combination(weights: tuple[float, ...]) -> Callable[..., Array]:
             total = total + w * k
         return x + h * total
 
-    combination = jax.custom_jvp(apart(plain))
+    combination = jax.custom_jvp(compiled_alone(plain))
 
     @combination.defjvp
     def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
@@ -46,12 +46,12 @@ class _Explicit(_Fixed):
     TIMES: ClassVar[tuple[float, ...]]
     ROWS: ClassVar[tuple[tuple[float, ...], ...]]
 
-    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
+    def _step(self, problem: InitialValueProblem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         inputs = {share: problem.inputs(at(share)) for share in self.TIMES}
         x, stages, h = state, [], jnp.asarray(h)
         for share, row, weight in zip(self.TIMES, self.ROWS, self.ROWS[-1], strict=True):
             rates, instant = problem.watched(inputs[share], x)
-            stages.append(stored(rates, x))
+            stages.append(materialised(rates, x))
             combination = _combination(row)
             x = jax.tree.map(lambda x, *ks, combination=combination: combination(x, h, ks), state, *stages)
             # Integrals by the method's own rule; other stages are trial states, and no extremes.

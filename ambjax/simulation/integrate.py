@@ -3,7 +3,7 @@
     advance(problem, t, period, state, memory, code=0) -> Advanced(state, code, t, memory, span)
 
 A `Problem` is a right-hand side on any pytree of scalars, what drives it as a function of time, the
-size of each component that still matters, and the fate of a state: 0 while all is well. An integrator
+size of each component that still matters, and the status of a state: 0 while all is well. An integrator
 stops at the first state whose code is not 0 and returns the last good one; begun with such a code, it
 moves nothing. `memory` is what the method carries from one sample to the next (`start(period)` makes the
 first), `span` what was seen on the way (`ambjax.simulation.span`).
@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from ambjax.compiler.barrier import materialised
 from ambjax.numerics import linear
-from ambjax.numerics.apart import stored
 from ambjax.numerics.records import Scalar, leaf, record, static
 from ambjax.simulation.edges import NO_EDGES, Edges, inset
 from ambjax.simulation.span import NOTHING, Instant, Span, blank
@@ -30,13 +30,13 @@ from ambjax.simulation.trajectory import ALIVE, STALLED
 State = TypeVar("State")
 InputFunction = Callable[[Array], Any]
 Rates = Callable[[Any, Any], Any]
-Fate = Callable[[Any], Array]
+StatusFunction = Callable[[Any], Array]
 # Stage times of one step, by the share of it that has passed.
 Times = Callable[[float], Array]
 
 
-class Problem(NamedTuple):
-    """What is integrated: rates(inputs(t), state), scale (a state) and fate(state) -> code.
+class InitialValueProblem(NamedTuple):
+    """What is integrated: rates(inputs(t), state), scale (a state) and status(state) -> code.
 
     `layer` (a state): the largest error with which a component stays where a smoothed sign turns; None: none does.
     `observed(inputs(t), state) -> (rates, Instant)`: the rates and what is to be seen; None: nothing is. `shown`: any
@@ -48,7 +48,7 @@ class Problem(NamedTuple):
     inputs: InputFunction
     rates: Rates
     scale: Any
-    fate: Fate
+    status: StatusFunction
     layer: Any = None
     observed: Callable[[Any, Any], tuple[Any, Instant]] | None = None
     shown: Instant = NOTHING
@@ -62,7 +62,7 @@ class Problem(NamedTuple):
 
 
 class Advanced(NamedTuple):
-    """The end of one sample period: last good state, fate's code, the time it refers to, memory, what was seen."""
+    """The end of one sample period: last good state, status's code, the time it refers to, memory, what was seen."""
 
     state: Any
     code: Array
@@ -86,13 +86,13 @@ class Integrator(Protocol):
     def start(self, period: Scalar) -> Any: ...
 
     def advance(
-        self, problem: Problem, t: Scalar, period: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
+        self, problem: InitialValueProblem, t: Scalar, period: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
     ) -> Advanced: ...
 
 
 def in_turn(
     method: Integrator,
-    stretches: Sequence[tuple[Problem, Scalar]],
+    stretches: Sequence[tuple[InitialValueProblem, Scalar]],
     t: Scalar,
     state: Any,
     memory: Any,
@@ -142,11 +142,11 @@ class _Fixed:
     def start(self, period: Scalar) -> Any:
         return ()
 
-    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
+    def _step(self, problem: InitialValueProblem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         raise NotImplementedError
 
     def advance(
-        self, problem: Problem, t: Scalar, period: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
+        self, problem: InitialValueProblem, t: Scalar, period: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
     ) -> Advanced:
         h = jnp.asarray(period) / self.substeps
         steps = problem.edges.steps(t, h, self.substeps)
@@ -157,7 +157,7 @@ class _Fixed:
             # Times do not depend on who is alive: members share them, and what is driven by them.
             start, stop, step = steps(number)
             new, after = self._step(problem, _inside(start, step), step, x, span)
-            code = jnp.where(alive, problem.fate(new), code)
+            code = jnp.where(alive, problem.status(new), code)
             x = choose(code == ALIVE, new, x)
             return x, code, jnp.where(alive, stop, end), choose(alive, after, span)
 
@@ -166,7 +166,7 @@ class _Fixed:
         return Advanced(x, code, end, memory, span)
 
 
-def rodas3_step(problem: Problem, at: Times, h: Scalar, state: Any) -> tuple[Any, Any, Instant]:
+def rodas3_step(problem: InitialValueProblem, at: Times, h: Scalar, state: Any) -> tuple[Any, Any, Instant]:
     """One step of RODAS3, its error estimate and what is seen at its start: order 3(2), L-stable, stiffly accurate.
 
     Sandu et al., Atmospheric Environment 31 (1997) 3459-3472. One Jacobian, one factorisation of
@@ -181,7 +181,7 @@ def rodas3_step(problem: Problem, at: Times, h: Scalar, state: Any) -> tuple[Any
 
     def stage(f: Any, *couplings: tuple[Scalar, Any]) -> Any:
         increment = jax.tree.map(lambda q: h / 2 * q, f)
-        return stored(linear.solve(factors, axpy(increment, *((c / 2, u) for c, u in couplings))))
+        return materialised(linear.solve(factors, axpy(increment, *((c / 2, u) for c, u in couplings))))
 
     u_1 = stage(axpy(f_0, (h / 2, f_t)))
     u_2 = stage(axpy(f_0, (1.5 * h, f_t)), (4.0, u_1))
@@ -198,7 +198,7 @@ class Rodas3(_Fixed):
 
     limit = None
 
-    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
+    def _step(self, problem: InitialValueProblem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         new, _, here = rodas3_step(problem, at, h, state)
         there = problem.watched(problem.inputs(at(1.0)), new)[1]
         return new, span.seen(here, h / 2, h).seen(there, h / 2)
@@ -217,7 +217,7 @@ class Slide(_Fixed):
 
     limit = None
 
-    def _step(self, problem: Problem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
+    def _step(self, problem: InitialValueProblem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         if problem.slide is None:
             raise ValueError(
                 "clock.method = Slide(...): it steps lumped plants under an 'adaptive' inversion law. Use Rodas3."
@@ -255,7 +255,7 @@ class AdaptiveRodas3:
         return jnp.asarray(period) * 1e-3
 
     def advance(
-        self, problem: Problem, t: Scalar, period: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
+        self, problem: InitialValueProblem, t: Scalar, period: Scalar, state: Any, memory: Any, code: Scalar = ALIVE
     ) -> Advanced:
         period = jnp.asarray(period)
 
@@ -275,7 +275,7 @@ class AdaptiveRodas3:
             suggestion = step * jnp.clip(0.9 * jnp.maximum(size, 1e-9) ** (-1 / 3), 0.2, 5.0)
             # A step cut short by an edge or the sample's end says little about the next one.
             h = jnp.where(last & accept, jnp.maximum(h, suggestion), suggestion)
-            verdict = jnp.where(accept, problem.fate(new), ALIVE)
+            verdict = jnp.where(accept, problem.status(new), ALIVE)
             # By the trapezoidal rule, in which this state ends one step and begins the next. Not so the first step
             # after a jump, by the rule of its end alone: slaved states leave what the jump found within nanoseconds.
             first = problem.jumps & (elapsed == 0)
@@ -292,7 +292,7 @@ class AdaptiveRodas3:
         stalled = (code == ALIVE) & (elapsed < period)
         return Advanced(x, jnp.where(stalled, STALLED, code), t + elapsed, h, span)
 
-    def _size(self, error: Any, x: Any, new: Any, problem: Problem) -> Array:
+    def _size(self, error: Any, x: Any, new: Any, problem: InitialValueProblem) -> Array:
         """Root mean square of the error against what is allowed; huge if anything is not finite."""
         layer = jax.tree.map(lambda _: jnp.inf, problem.scale) if problem.layer is None else problem.layer
 

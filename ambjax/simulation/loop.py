@@ -10,7 +10,7 @@ from jax import Array
 from ambjax.control.cascade import Cascade, CascadeState, Command
 from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import limited
-from ambjax.simulation.integrate import Problem
+from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.sliding import slide, slides
 from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
@@ -22,7 +22,7 @@ from ambjax.world.signals import Reference, reference_at
 DIVERGENCE = 1e6
 
 
-class Inputs(NamedTuple):
+class ExternalInputs(NamedTuple):
     """What reaches the loop from outside at one instant: reference, disturbances (m/s^2, A/s)."""
 
     reference: Reference
@@ -63,7 +63,7 @@ class LoopState(NamedTuple):
 
 @record
 class ClosedLoop:
-    """A cascade in a scenario. `hold` below: the errors of the sensors, held over the sample."""
+    """A cascade in a scenario. `errors` below: those of the sensors, constant over a sample."""
 
     cascade: Cascade
     scenario: Scenario
@@ -76,7 +76,7 @@ class ClosedLoop:
         """The member's key as two 32-bit words."""
         return self.scenario.words()
 
-    def hold(self, sample: Scalar) -> Errors:
+    def sensor_errors(self, sample: Scalar) -> Errors:
         """Errors of all sensors during sample number `sample`; zeros without a sensor model."""
         if self.scenario.sensor is None:
             return Errors(*[jnp.zeros(())] * 3)
@@ -85,12 +85,12 @@ class ClosedLoop:
     def start(self) -> LoopState:
         """The state at t = 0."""
         plant = self.scenario.plant.start(self.scenario.initial.measurement())
-        return LoopState(plant, self.cascade.init(self.measured(plant, self.hold(0))))
+        return LoopState(plant, self.cascade.init(self.measured(plant, self.sensor_errors(0))))
 
-    def measured(self, plant: Any, hold: Errors) -> Measurement:
+    def measured(self, plant: Any, errors: Errors) -> Measurement:
         """What the sensors report of the plant's state."""
         motion, sensor = self.scenario.plant.measurement(plant), self.scenario.sensor
-        return motion if sensor is None else sensor.reading(motion, hold)
+        return motion if sensor is None else sensor.reading(motion, errors)
 
     def scale(self) -> LoopState:
         """Size of each component that still matters."""
@@ -101,26 +101,26 @@ class ClosedLoop:
         plant = jax.tree.map(lambda _: jnp.inf, self.scenario.plant.scale())
         return jax.tree.map(jnp.asarray, LoopState(plant, self.cascade.layer()))
 
-    def inputs(self, t: Scalar) -> Inputs:
+    def inputs(self, t: Scalar) -> ExternalInputs:
         """Everything that depends on time alone."""
         scenario = self.scenario
-        return Inputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t))
+        return ExternalInputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t))
 
-    def command(self, inputs: Inputs, state: LoopState, hold: Errors) -> tuple[Command, CascadeState, Array]:
+    def command(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> tuple[Command, CascadeState, Array]:
         """What the cascade decides from the measured state, the rates of its states, and the applied voltage."""
         u_max = jnp.asarray(self.scenario.u_max)
-        seen = self.measured(state.plant, hold)
+        seen = self.measured(state.plant, errors)
         command, rates = self.cascade(seen, state.control, inputs.reference, u_max)
         return command, rates, limited(command.u, u_max)
 
-    def rates(self, inputs: Inputs, state: LoopState, hold: Errors) -> LoopState:
+    def rates(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> LoopState:
         """Time derivative of the state: Eqs. (1), (2) and the laws."""
-        _, control, u = self.command(inputs, state, hold)
+        _, control, u = self.command(inputs, state, errors)
         return self.moved(inputs, state, control, u)
 
-    def observed(self, inputs: Inputs, state: LoopState, hold: Errors) -> tuple[LoopState, Instant]:
+    def observed(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> tuple[LoopState, Instant]:
         """The rates, and what is seen of the loop at one instant."""
-        command, control, u = self.command(inputs, state, hold)
+        command, control, u = self.command(inputs, state, errors)
         shown = self.shown(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
         return self.moved(inputs, state, control, u), shown
 
@@ -131,11 +131,11 @@ class ClosedLoop:
         sizes = Sizes(motion.z, motion.z - reference.r, sigma, u, motion.i, motion.i - i_ref, v_tilde)
         return Instant(sizes, Densities(u, u * u, heat))
 
-    def moved(self, inputs: Inputs, state: LoopState, control: CascadeState, u: Array) -> LoopState:
+    def moved(self, inputs: ExternalInputs, state: LoopState, control: CascadeState, u: Array) -> LoopState:
         """Time derivative of the state, given that of the cascade and the applied voltage."""
         return LoopState(self.scenario.plant.rates(state.plant, u, inputs.q_z, inputs.q_i), control)
 
-    def fate(self, state: LoopState) -> Array:
+    def status(self, state: LoopState) -> Array:
         """0 while the rotor is levitated, else the code of what became of it."""
         return self.judged(state, self.scale(), state.plant)
 
@@ -154,22 +154,26 @@ class ClosedLoop:
         stop = jnp.where(z < 0, -1.0, 1.0) * self.scenario.touchdown
         return state._replace(plant=plant.rest(state.plant, jnp.where(code == TOUCHED, stop, z)))
 
-    def problem(self, hold: Errors) -> Problem:
+    def problem(self, errors: Errors) -> InitialValueProblem:
         """What an integrator is given for one sample."""
-        step = functools.partial(slide, self, hold) if slides(self.cascade, self.scenario.plant) else None
-        rates = lambda inputs, x: self.rates(inputs, x, hold)  # noqa: E731
-        observed = lambda inputs, x: self.observed(inputs, x, hold)  # noqa: E731
+        step = functools.partial(slide, self, errors) if slides(self.cascade, self.scenario.plant) else None
+        rates = lambda inputs, x: self.rates(inputs, x, errors)  # noqa: E731
+        observed = lambda inputs, x: self.observed(inputs, x, errors)  # noqa: E731
         jumps = self.scenario.sensor is not None
-        return Problem(self.inputs, rates, self.scale(), self.fate, self.layer(), observed, SHOWN, jumps, step)
+        return InitialValueProblem(
+            self.inputs, rates, self.scale(), self.status, self.layer(), observed, SHOWN, jumps, step
+        )
 
-    def row(self, t: Scalar, state: LoopState, hold: Errors, alive: Array) -> Row:
+    def row(self, t: Scalar, state: LoopState, errors: Errors, alive: Array) -> Row:
         """All signals at one instant. The drive of a lost rotor is off: u = 0."""
         inputs = self.inputs(t)
-        command, _, u = self.command(inputs, state, hold)
-        seen = self.measured(state.plant, hold)
+        command, _, u = self.command(inputs, state, errors)
+        seen = self.measured(state.plant, errors)
         return self.signals(t, inputs, state.plant, command._replace(u=u), seen, alive)
 
-    def signals(self, t: Scalar, inputs: Inputs, state: Any, command: Command, seen: Measurement, alive: Array) -> Row:
+    def signals(
+        self, t: Scalar, inputs: ExternalInputs, state: Any, command: Command, seen: Measurement, alive: Array
+    ) -> Row:
         """All signals of a state of the plant, what was seen and decided there, u within the supply's limit."""
         plant = self.scenario.plant
         motion, signals = plant.measurement(state), plant.signals(state)

@@ -252,13 +252,13 @@ class Standard:
     def result(self, carry: dict[str, Any], ending: Ending) -> dict[str, Any]:
         numbers = self._folds().result(carry, ending)
         numbers["clearance_used"] = numbers["clearance_used"] / self.touchdown
-        fate = {
+        status = {
             "lost": (ending.lost_code != ALIVE) & (ending.lost_code != STALLED),
             "stalled": ending.lost_code == STALLED,
             "lost_at_s": ending.lost_at,
             "singular_at_s": ending.singular_at,
         }
-        return numbers | fate
+        return numbers | status
 
 
 def standard_for(settle: Scalar, scenario: Any) -> Standard:

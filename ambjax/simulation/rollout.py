@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from ambjax.compiler.fast_path import one_kernel
 from ambjax.control.cascade import Cascade
-from ambjax.numerics.kernel import one_kernel
 from ambjax.numerics.records import Scalar, canonical, validate
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.integrate import Advanced, Problem, choose
+from ambjax.simulation.integrate import Advanced, InitialValueProblem, choose
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import Ending, Fold
 from ambjax.simulation.sampled import check_parts, system_of
@@ -34,28 +34,28 @@ class System(Protocol):
 
     A system whose state jumps at the start of a sample, as one with a controller on a processor does, also has
 
-        jump(t, state, hold) -> state
+        jump(t, state, errors) -> state
 
     It comes first in a sample: the row shows, and the integrator starts from, the state after it. A lost rotor's state
     does not jump. And a system that integrates a part of its state, or whose rates jump within a sample, has
 
-        advance(method, hold, t, period, state, memory, code) -> Advanced
+        advance(method, errors, t, period, state, memory, code) -> Advanced
 
-    in place of `method.advance(problem(hold), ...)`, its `problem` then being nobody's: `integrate.in_turn` helps.
+    in place of `method.advance(problem(errors), ...)`, its `problem` then being nobody's: `integrate.in_turn` helps.
     """
 
     def realised(self) -> Self: ...
-    def hold(self, sample: Scalar) -> Errors: ...
+    def sensor_errors(self, sample: Scalar) -> Errors: ...
     def start(self) -> Any: ...
-    def problem(self, hold: Errors) -> Problem: ...
-    def fate(self, state: Any) -> Array: ...
+    def problem(self, errors: Errors) -> InitialValueProblem: ...
+    def status(self, state: Any) -> Array: ...
     def rest(self, state: Any, code: Array) -> Any: ...
-    def row(self, t: Scalar, state: Any, hold: Errors, alive: Array) -> Any: ...
+    def row(self, t: Scalar, state: Any, errors: Errors, alive: Array) -> Any: ...
     def noted(self, row: Any, span: Span) -> Any: ...
     def singularity(self, row: Any) -> Array: ...
 
 
-class Progress(NamedTuple):
+class RolloutState(NamedTuple):
     """What travels from sample to sample."""
 
     state: Any
@@ -102,28 +102,28 @@ def run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:
 roll = one_kernel(run, static_argnames=("every",))
 
 
-def begin(system: System, clock: Clock, fold: Fold | None) -> Progress:
+def begin(system: System, clock: Clock, fold: Fold | None) -> RolloutState:
     """Before the first sample."""
     system = system.realised()
     dtype = jnp.result_type(float)
     state = jax.tree.map(lambda x: jnp.asarray(x, dtype), system.start())
     never = jnp.asarray(jnp.inf, dtype)
-    ending = Ending(system.fate(state), never, never, jnp.asarray(clock.duration, dtype))
+    ending = Ending(system.status(state), never, never, jnp.asarray(clock.duration, dtype))
     ending = ending._replace(lost_at=jnp.where(ending.lost_code == ALIVE, never, 0.0))
     memory = clock.integrator.start(jnp.asarray(clock.sample_period, dtype))
-    return Progress(state, ending, memory, () if fold is None else fold.init())
+    return RolloutState(state, ending, memory, () if fold is None else fold.init())
 
 
 def segment(
-    system: System, clock: Clock, fold: Fold | None, progress: Progress, first: Scalar, count: int, every: int
-) -> tuple[Progress, Any]:
+    system: System, clock: Clock, fold: Fold | None, progress: RolloutState, first: Scalar, count: int, every: int
+) -> tuple[RolloutState, Any]:
     """`count` samples from number `first` on, and the rows recorded on the way (None if every = 0)."""
     step = functools.partial(_sample, system.realised(), clock, fold)
 
-    def unrecorded(progress: Progress, first: Scalar, count: int) -> Progress:
+    def unrecorded(progress: RolloutState, first: Scalar, count: int) -> RolloutState:
         return lax.fori_loop(0, count, lambda n, progress: step(progress, first + n)[0], progress)
 
-    def block(progress: Progress, k: Array, length: int) -> tuple[Progress, Any]:
+    def block(progress: RolloutState, k: Array, length: int) -> tuple[RolloutState, Any]:
         progress, row = step(progress, k)
         if length > 1:
             progress = unrecorded(progress, k + 1, length - 1)
@@ -140,55 +140,55 @@ def segment(
 
 
 def stretch(
-    system: System, clock: Clock, fold: Fold | None, progress: Progress, first: Scalar, count: int
-) -> tuple[Progress, Any]:
+    system: System, clock: Clock, fold: Fold | None, progress: RolloutState, first: Scalar, count: int
+) -> tuple[RolloutState, Any]:
     """Rows of `count` samples from number `first` on. Beyond the clock's last sample the progress does not change.
 
     One compiled program therefore serves every stretch of a run.
     """
     step = functools.partial(_sample, system.realised(), clock, fold)
 
-    def sample(progress: Progress, k: Array) -> tuple[Progress, Any]:
+    def sample(progress: RolloutState, k: Array) -> tuple[RolloutState, Any]:
         after, row = step(progress, k)
         return choose(k < clock.samples, after, progress), row
 
     return lax.scan(sample, progress, first + jnp.arange(count))
 
 
-def finish(progress: Progress, rows: Any, fold: Fold | None) -> Outcome:
+def finish(progress: RolloutState, rows: Any, fold: Fold | None) -> Outcome:
     """After the last sample."""
     lost_code, lost_at, singular_at, _ = progress.ending
     measured = None if fold is None else fold.result(progress.fold, progress.ending)
     return Outcome(Trajectory(rows, lost_at, lost_code, singular_at), measured)
 
 
-def _advanced(system: Any, clock: Clock, hold: Errors, t: Array, state: Any, memory: Any, code: Array) -> Advanced:
+def _advanced(system: Any, clock: Clock, errors: Errors, t: Array, state: Any, memory: Any, code: Array) -> Advanced:
     """The state at the end of the sample that begins at t."""
     method, period = clock.integrator, clock.sample_period
     if hasattr(system, "advance"):
-        return system.advance(method, hold, t, period, state, memory, code)
-    return method.advance(system.problem(hold), t, period, state, memory, code)
+        return system.advance(method, errors, t, period, state, memory, code)
+    return method.advance(system.problem(errors), t, period, state, memory, code)
 
 
-def _sample(system: Any, clock: Clock, fold: Fold | None, progress: Progress, k: Array) -> tuple[Progress, Any]:
+def _sample(system: Any, clock: Clock, fold: Fold | None, progress: RolloutState, k: Array) -> tuple[RolloutState, Any]:
     """Observe at the start of sample k, then integrate to its end with its measurement error held.
 
     Recomputed in reverse mode, so that memory there grows with samples and not with substeps.
     """
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
-    def run(system: Any, clock: Clock, fold: Fold | None, progress: Progress) -> tuple[Progress, Any]:
+    def run(system: Any, clock: Clock, fold: Fold | None, progress: RolloutState) -> tuple[RolloutState, Any]:
         state, ending, memory, folded = progress
         dtype = jnp.result_type(float)
         t = k.astype(dtype) * clock.sample_period
-        hold = system.hold(k)
+        errors = system.sensor_errors(k)
         alive = ending.lost_code == ALIVE
         # A jump at this instant belongs to this sample even if t was rounded to just before it.
         just_after = t * (1 + 4 * jnp.finfo(dtype).eps)
         if hasattr(system, "jump"):
-            state = choose(alive, system.jump(just_after, state, hold), state)
-        row = system.row(just_after, state, hold, alive)._replace(t=t)
-        after = _advanced(system, clock, hold, t, state, memory, ending.lost_code)
+            state = choose(alive, system.jump(just_after, state, errors), state)
+        row = system.row(just_after, state, errors, alive)._replace(t=t)
+        after = _advanced(system, clock, errors, t, state, memory, ending.lost_code)
         row = system.noted(row, after.span)
         folded = folded if fold is None else fold.update(folded, row, after.span)
         lost_now = alive & (after.code != ALIVE)
@@ -201,6 +201,6 @@ def _sample(system: Any, clock: Clock, fold: Fold | None, progress: Progress, k:
             first_time(crossed, t, ending.singular_at),
             ending.duration,
         )
-        return Progress(state, ending, after.memory, folded), row
+        return RolloutState(state, ending, after.memory, folded), row
 
     return run(system, clock, fold, progress)

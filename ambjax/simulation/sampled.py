@@ -13,17 +13,17 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.compiler.barrier import materialised
 from ambjax.control import answers
 from ambjax.control.cascade import Cascade, CascadeState, Command, Sample
 from ambjax.control.guard import Judged, Watch, expected, simulated
 from ambjax.control.processor import Processor
-from ambjax.numerics.apart import stored
 from ambjax.numerics.records import Scalar, record, static
 from ambjax.numerics.smooth import limited
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.edges import NO_EDGES, Edges
-from ambjax.simulation.integrate import Advanced, Integrator, Problem, choose, in_turn
-from ambjax.simulation.loop import SHOWN, ClosedLoop, Densities, Inputs, LoopState, Sizes
+from ambjax.simulation.integrate import Advanced, InitialValueProblem, Integrator, choose, in_turn
+from ambjax.simulation.loop import SHOWN, ClosedLoop, Densities, ExternalInputs, LoopState, Sizes
 from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import DIVERGED, Row
 from ambjax.world.amplifier import Amplifier
@@ -72,18 +72,18 @@ class Sampled:
     def realised(self) -> Self:
         return dataclasses.replace(self, loop=self.loop.realised())
 
-    def hold(self, sample: Scalar) -> Errors | FaultyErrors:
-        errors, sensor = self.loop.hold(sample), self.loop.scenario.sensor
+    def sensor_errors(self, sample: Scalar) -> Errors | FaultyErrors:
+        drawn, sensor = self.loop.sensor_errors(sample), self.loop.scenario.sensor
         if sensor is None or not sensor.faulty:
-            return errors
-        return FaultyErrors(*errors, sensor.struck(self.loop.words(), sample, self.period))
+            return drawn
+        return FaultyErrors(*drawn, sensor.struck(self.loop.words(), sample, self.period))
 
     def start(self) -> SampledState:
         scenario, zero = self.loop.scenario, jnp.zeros(())
         plant = scenario.plant.start(scenario.initial.measurement())
         seen = scenario.plant.measurement(plant).z if self._lags else ()
         slow = scenario.amplifier is not None and scenario.amplifier.slow
-        measured = self.measured(plant, seen, self.hold(0))
+        measured = self.measured(plant, seen, self.sensor_errors(0))
         command, past, guard = Command(*[zero] * 5), (zero, zero), self.processor.guard
         faulty = scenario.sensor is not None and scenario.sensor.faulty
         return SampledState(
@@ -104,7 +104,7 @@ class Sampled:
         sensor = self.loop.scenario.sensor
         return sensor is not None and sensor.bandwidth is not None
 
-    def measured(self, plant: Any, seen: Any, hold: Errors | FaultyErrors) -> Measurement:
+    def measured(self, plant: Any, seen: Any, errors: Errors | FaultyErrors) -> Measurement:
         """What sensors without faults report of the plant's state; `seen`: output of the position's low-pass, m."""
         true, sensor = self.loop.scenario.plant, self.loop.scenario.sensor
         motion = true.measurement(plant)
@@ -112,11 +112,11 @@ class Sampled:
             return motion
         if self._lags:
             motion = motion._replace(z=seen)
-        return sensor.converted(sensor.reading(motion, hold), true.s_0, true.i_0)
+        return sensor.converted(sensor.reading(motion, errors), true.s_0, true.i_0)
 
-    def jump(self, t: Scalar, state: SampledState, hold: Errors | FaultyErrors) -> SampledState:
+    def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
         """The laws' step: what they decide now, and their states at the next sample."""
-        state, measured = self._struck(self.measured(state.plant, state.seen, hold), state, hold)
+        state, measured = self._struck(self.measured(state.plant, state.seen, errors), state, errors)
         return self.decided(measured, self.reference(t), state)
 
     def reference(self, t: Scalar) -> Reference:
@@ -124,12 +124,12 @@ class Sampled:
         late = self.processor.ahead * self.period if self.processor.predicts else 0.0
         return reference_at(self.loop.scenario.reference, t + late)
 
-    def _struck(self, measured: Measurement, state: SampledState, hold: Any) -> tuple[SampledState, Measurement]:
+    def _struck(self, measured: Measurement, state: SampledState, errors: Any) -> tuple[SampledState, Measurement]:
         """The state and the measurement once faults have struck the position sensor."""
         sensor, sensed = self.loop.scenario.sensor, state.sensed
-        if sensor is None or not sensed or not isinstance(hold, FaultyErrors):
+        if sensor is None or not sensed or not isinstance(errors, FaultyErrors):
             return state, measured
-        sensed = sensor.sensed(measured.z, sensed, hold.struck, self.period, self.loop.scenario.plant.s_0)
+        sensed = sensor.sensed(measured.z, sensed, errors.struck, self.period, self.loop.scenario.plant.s_0)
         z = jnp.where(jnp.isnan(sensed.z), 0.0, sensed.z)
         state = state._replace(sensed=sensed._replace(z=z))
         if self.processor.guard is None:  # NaN ends the run, and derivatives stay finite
@@ -149,9 +149,9 @@ class Sampled:
         sample = Sample(reference, self.period, jnp.asarray(self.loop.scenario.u_max), past)
         command, control, estimate = cascade.step(measured, laws, sample)
         command = command._replace(u=limited(command.u, sample.u_max))
-        new = stored((control, command, self._watched(judged, estimate, (command.u, *past))))
+        new = materialised((control, command, self._watched(judged, estimate, (command.u, *past))))
         # 0 times a number is 0, times anything else it is not
-        sane = stored(sum(0.0 * x for x in jax.tree.leaves(new))) == 0
+        sane = materialised(sum(0.0 * x for x in jax.tree.leaves(new))) == 0
         keeps = sane if judged is None else sane & judged.steps
         old = (state.control, state.command, state.watch)
         control, command, watch = jax.tree.map(lambda a, b: jnp.where(keeps, a, b), new, old)
@@ -179,7 +179,7 @@ class Sampled:
     def advance(
         self,
         method: Integrator,
-        hold: Errors | FaultyErrors,
+        errors: Errors | FaultyErrors,
         t: Scalar,
         period: Scalar,
         state: SampledState,
@@ -213,7 +213,7 @@ class Sampled:
 
     def _stretches(
         self, state: SampledState, t: Array, voltages: list[tuple[Callable[[Scalar], Array], Scalar]]
-    ) -> list[tuple[Problem, Scalar]]:
+    ) -> list[tuple[InitialValueProblem, Scalar]]:
         """What is integrated from t on, under these voltages, each for its time (s)."""
         at = self.loop.scenario.edges()
         edges = Edges(at, len(at) if self.cuts is None else min(self.cuts, len(at)))
@@ -228,19 +228,19 @@ class Sampled:
             t = t + time
         return cut
 
-    def _under(self, state: SampledState, voltage: Any, edges: Edges) -> Problem:
+    def _under(self, state: SampledState, voltage: Any, edges: Edges) -> InitialValueProblem:
         """What an integrator is given while the coils' voltage is this function of time and of the plant's state."""
         loop, command = self.loop, state.command
         plant, e = loop.scenario.plant, loop.scenario.plant.measurement(state.plant).i - command.i_ref
 
-        def inputs(t: Scalar) -> tuple[Inputs, Array]:
+        def inputs(t: Scalar) -> tuple[ExternalInputs, Array]:
             return loop.inputs(t), voltage(t)
 
-        def rates(inputs: tuple[Inputs, Array], x: Any) -> Any:
+        def rates(inputs: tuple[ExternalInputs, Array], x: Any) -> Any:
             outside, u = inputs
             return plant.rates(x, self._at_coil(outside, u, x), outside.q_z, outside.q_i)
 
-        def observed(inputs: tuple[Inputs, Array], x: Any) -> tuple[Any, Instant]:
+        def observed(inputs: tuple[ExternalInputs, Array], x: Any) -> tuple[Any, Instant]:
             (outside, u), motion, heat = inputs, plant.measurement(x), plant.signals(x).heat
             u = self._at_coil(outside, u, x)
             sigma = loop.cascade.position.sigma(motion, outside.reference)
@@ -248,24 +248,24 @@ class Sampled:
             return rates(inputs, x), Instant(sizes, Densities(u, u * u, heat))
 
         scale = jax.tree.map(jnp.asarray, plant.scale())
-        return Problem(inputs, rates, scale, self._fate, None, observed, SHOWN, edges=edges)
+        return InitialValueProblem(inputs, rates, scale, self._status, None, observed, SHOWN, edges=edges)
 
-    def _at_coil(self, outside: Inputs, u: Array, x: Any) -> Array:
+    def _at_coil(self, outside: ExternalInputs, u: Array, x: Any) -> Array:
         plant, amplifier = self.loop.scenario.plant, self.loop.scenario.amplifier
         if amplifier is None:
             return u
 
-        def hold() -> Array:
+        def holding_voltage() -> Array:
             still, driven = (plant.measurement(plant.rates(x, volt, outside.q_z, outside.q_i)).i for volt in (0.0, 1.0))
             return still / (still - driven)  # i' is linear in u
 
-        return amplifier.at_coil(u, plant.measurement(x).i, self.loop.scenario.u_max, hold)
+        return amplifier.at_coil(u, plant.measurement(x).i, self.loop.scenario.u_max, holding_voltage)
 
-    def _fate(self, plant: Any) -> Array:
+    def _status(self, plant: Any) -> Array:
         return self.loop.judged(plant, self.loop.scenario.plant.scale(), plant)
 
-    def fate(self, state: SampledState) -> Array:
-        return self._fate(state.plant)
+    def status(self, state: SampledState) -> Array:
+        return self._status(state.plant)
 
     def rest(self, state: SampledState, code: Array) -> SampledState:
         """Frozen, and the drive off."""
@@ -275,9 +275,9 @@ class Sampled:
         off = state._replace(command=state.command._replace(u=zero), past=(zero, zero))
         return off._replace(plant=plant, seen=seen, u_a=jax.tree.map(jnp.zeros_like, state.u_a))
 
-    def row(self, t: Scalar, state: SampledState, hold: Errors | FaultyErrors, alive: Array) -> Row:
+    def row(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors, alive: Array) -> Row:
         """Sample n: the plant, u_n, and i_ref before its step."""
-        seen = self.measured(state.plant, state.seen, hold)
+        seen = self.measured(state.plant, state.seen, errors)
         if state.sensed:
             seen = seen._replace(z=state.sensed.z)
         row = self.loop.signals(t, self.loop.inputs(t), state.plant, state.command, seen, alive)

@@ -16,10 +16,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.control import answers
 from ambjax.control.cascade import Cascade
 from ambjax.control.laws import CurrentDemand, CurrentInputs
-from ambjax.numerics.apart import apart, stored
 from ambjax.numerics.records import Scalar
 from ambjax.simulation.span import Instant, Span
 from ambjax.world.bearing import Bearing
@@ -27,31 +27,31 @@ from ambjax.world.plant import State
 from ambjax.world.sensor import Errors, Measurement
 
 
-def slide(loop: Any, hold: Errors, begin: Any, end: Any, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
+def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
     """The state after h of a ClosedLoop for which `slides` holds; `begin`, `end`: its inputs."""
     cascade, scenario = loop.cascade, loop.scenario
     model, (z, z_dot, i), control = cascade.model, state.plant, state.control
     i_ref = control.inversion
     per_h = 1 / jnp.where(h > 0, h, 1.0)
 
-    force_0, estimate_0, rates_0 = cascade.demand(loop.measured(state.plant, hold), control, begin.reference)
+    force_0, estimate_0, rates_0 = cascade.demand(loop.measured(state.plant, errors), control, begin.reference)
     z_ddot_0 = scenario.plant.z_ddot(z, i, begin.q_z)
     ahead = State(z + h * z_dot + h * h / 2 * z_ddot_0, z_dot + h * z_ddot_0, i)
     control_1 = control._replace(
         observer=_axpy(control.observer, h, rates_0.observer), position=_axpy(control.position, h, rates_0.position)
     )
-    ahead, control_1, force_0 = stored((ahead, control_1, force_0))
-    force_1, estimate_1, rates_1 = cascade.demand(loop.measured(ahead, hold), control_1, end.reference)
+    ahead, control_1, force_0 = materialised((ahead, control_1, force_0))
+    force_1, estimate_1, rates_1 = cascade.demand(loop.measured(ahead, errors), control_1, end.reference)
 
     inversion: Any = cascade.inversion
     sliding, slaved, tau, (w, w_1, w_2) = inversion.slide(model, force_0, force_1, i_ref, h)
-    sliding, slaved, tau, force_1 = stored((sliding, slaved, tau, force_1))
+    sliding, slaved, tau, force_1 = materialised((sliding, slaved, tau, force_1))
 
     def current(plant: State, estimate: Measurement, i_ref: Array, rate: Array, inner: Any, q_i: Array, h: Array):
         """i - i_ref and the current law's state after h at constant i_ref' = rate; and what is seen on the way."""
 
         def rate_of(i: Array) -> tuple[Array, Any]:
-            inputs = CurrentInputs(estimate._replace(i=i + hold.i), CurrentDemand(i_ref, rate), scenario.u_max)
+            inputs = CurrentInputs(estimate._replace(i=i + errors.i), CurrentDemand(i_ref, rate), scenario.u_max)
             u, inner_rate = cascade.current(model, inputs, inner)
             u = jnp.clip(u, -scenario.u_max, scenario.u_max)
             return scenario.plant.i_dot(plant.z, plant.z_dot, i, u, q_i), (inner_rate, u)
@@ -62,14 +62,14 @@ def slide(loop: Any, hold: Errors, begin: Any, end: Any, h: Scalar, state: Any, 
         return e, _axpy(inner, h, inner_rate), _Voltage(u, (rate - i_dot) * volts, h * slope, phi)
 
     e, inner, first = current(state.plant, estimate_0, i_ref, sliding, control.current, begin.q_i, tau)
-    e, inner = stored((e, inner))
+    e, inner = materialised((e, inner))
     i_ref_0, i_ref = i_ref, i_ref + tau * sliding
     middle = State((z + ahead.z) / 2, (z_dot + ahead.z_dot) / 2, i_ref + e)
     estimate = jax.tree.map(lambda a, b: (a + b) / 2, estimate_0, estimate_1)
     # The current moves fast while it slides: what counts at the start of the rest is where it ended.
     z_ddot_0 += (1 - tau * per_h) * (scenario.plant.z_ddot(z, middle.i, begin.q_z) - z_ddot_0)
     e, inner, second = current(middle, estimate, i_ref, slaved, inner, end.q_i, h - tau)
-    e, inner = stored((e, inner))
+    e, inner = materialised((e, inner))
     i_ref = i_ref + (h - tau) * slaved
     z_ddot_1 = scenario.plant.z_ddot(ahead.z, i_ref + e, end.q_z)
     plant = State(
@@ -115,7 +115,7 @@ def _with_step(span: Span, instants: tuple[Instant, ...], u: Array, rest: _Volta
     before = span.densities
     for instant, weight in zip(instants, (tau / 2, (tau + left) / 2, left / 2), strict=True):
         span = span.seen(instant, weight)
-    mean, square = stored(rest).moments()
+    mean, square = materialised(rest).moments()
     densities = span.densities._replace(
         u=before.u + tau * u + left * mean, u_squared=before.u_squared + tau * u * u + left * square
     )
@@ -123,7 +123,7 @@ def _with_step(span: Span, instants: tuple[Instant, ...], u: Array, rest: _Volta
 
 
 @jax.custom_jvp
-@apart
+@compiled_alone
 def _phi(x: Array) -> Array:
     """(exp(x) - 1) / x."""
     small = jnp.abs(x) < 1e-3

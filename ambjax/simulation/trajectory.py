@@ -1,4 +1,4 @@
-"""What happened: one row per recorded sample, and the fate of the rotor."""
+"""What happened: one row per recorded sample, and the status of the rotor."""
 
 import pathlib
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from ambjax.numerics.records import Scalar, record
 
 # Why a rotor was lost. Codes travel inside compiled code; people read the words.
 ALIVE, TOUCHED, DIVERGED, STALLED = range(4)
-FATES = (
+STATUSES = (
     "",
     "touched down: |z| reached the clearance",
     "diverged: a state left the range in which the model means anything",
@@ -77,7 +77,7 @@ NOT_SAVED = ("u_peak", "heat", "alive")
 
 @record
 class Trajectory:
-    """Rows, and the fate: when and why the rotor was lost, and when C was first crossed (+inf: never)."""
+    """Rows, and the status: when and why the rotor was lost, and when C was first crossed (+inf: never)."""
 
     rows: Row
     lost_at: Scalar
@@ -87,10 +87,10 @@ class Trajectory:
     @property
     def lost_why(self) -> str:
         """Why the rotor was lost, in words; empty if it was not. One member only."""
-        return FATES[int(self.lost_code)]
+        return STATUSES[int(self.lost_code)]
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Every saved array by name, float64, and the fate."""
+        """Every saved array by name, float64, and the status."""
         arrays = {k: np.asarray(v, np.float64) for k, v in self.rows._asdict().items() if k not in NOT_SAVED}
         arrays["lost_at"] = np.asarray(self.lost_at, np.float64)
         arrays["lost_why"] = np.asarray(self.lost_why)

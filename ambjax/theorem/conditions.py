@@ -22,7 +22,7 @@ from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import Lowest, Named, Peak
 from ambjax.simulation.rollout import check_inputs, roll
-from ambjax.simulation.trajectory import FATES, STALLED
+from ambjax.simulation.trajectory import STALLED, STATUSES
 from ambjax.theorem.proof import Monitored
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
@@ -56,7 +56,7 @@ class Condition:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """All conditions, the proof's residuals, and the fate of the run."""
+    """All conditions, the proof's residuals, and the status of the run."""
 
     conditions: list[Condition]
     proof: list[Condition]
@@ -135,7 +135,7 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock) -> Report:
     on_reference = delta_1_on_reference(cascade, scenario, clock)
     conditions = _conditions(cascade, worst, on_reference)
     code = int(trajectory.lost_code)
-    return Report(conditions, _proof(worst), float(trajectory.lost_at), FATES[code], method, code == STALLED)
+    return Report(conditions, _proof(worst), float(trajectory.lost_at), STATUSES[code], method, code == STALLED)
 
 
 def delta_1_on_reference(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[float, float]:

@@ -14,8 +14,8 @@ from jax import Array
 
 from ambjax.control import answers
 from ambjax.numerics.records import Scalar, record
-from ambjax.simulation.integrate import Problem
-from ambjax.simulation.loop import ClosedLoop, Inputs, LoopState
+from ambjax.simulation.integrate import InitialValueProblem
+from ambjax.simulation.loop import ClosedLoop, ExternalInputs, LoopState
 from ambjax.simulation.span import Span
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.signals import Reference
@@ -82,28 +82,28 @@ class Monitored:
     def realised(self) -> "Monitored":
         return Monitored(self.loop.realised())
 
-    def hold(self, sample: Scalar) -> Errors:
-        return self.loop.hold(sample)
+    def sensor_errors(self, sample: Scalar) -> Errors:
+        return self.loop.sensor_errors(sample)
 
     def start(self) -> Witnessed:
         state = self.loop.start()
-        values = self.terms(self.loop.inputs(0.0), state, self.hold(0)).values
+        values = self.terms(self.loop.inputs(0.0), state, self.sensor_errors(0)).values
         return Witnessed(state, values._replace(e=self.motion(state).i))
 
-    def problem(self, hold: Errors) -> Problem:
+    def problem(self, errors: Errors) -> InitialValueProblem:
         plant = self.loop.scenario.plant
         _, z_dot, i = map(jnp.asarray, plant.sizes())
         sizes = Identities(z_dot, plant.dv_di(0.0, 0.0) * i / 100, i)
 
-        def rates(inputs: Inputs, state: Witnessed) -> Witnessed:
-            terms = self.terms(inputs, state.loop, hold)
+        def rates(inputs: ExternalInputs, state: Witnessed) -> Witnessed:
+            terms = self.terms(inputs, state.loop, errors)
             return Witnessed(terms.moving, terms.rates._replace(e=terms.rates.e + terms.i_ref_dot))
 
         layer = Witnessed(self.loop.layer(), Identities(*(jnp.asarray(jnp.inf) for _ in sizes)))
-        return Problem(self.loop.inputs, rates, Witnessed(self.loop.scale(), sizes), self.fate, layer)
+        return InitialValueProblem(self.loop.inputs, rates, Witnessed(self.loop.scale(), sizes), self.status, layer)
 
-    def fate(self, state: Witnessed) -> Array:
-        return self.loop.fate(state.loop)
+    def status(self, state: Witnessed) -> Array:
+        return self.loop.status(state.loop)
 
     def rest(self, state: Witnessed, code: Array) -> Witnessed:
         return Witnessed(self.loop.rest(state.loop, code), state.witness)
@@ -118,17 +118,17 @@ class Monitored:
         """What ideal sensors see."""
         return self.loop.scenario.plant.measurement(state.plant)
 
-    def terms(self, inputs: Inputs, state: LoopState, hold: Errors) -> Terms:
+    def terms(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> Terms:
         """The signals of the proof. The robust term of a law that tells none is left out."""
         cascade, scenario = self.loop.cascade, self.loop.scenario
         plant, motion = scenario.plant, self.motion(state)
         z, _, i = motion
-        command, control, u = self.loop.command(inputs, state, hold)
+        command, control, u = self.loop.command(inputs, state, errors)
         moving = self.loop.moved(inputs, state, control, u)
         v_tilde, e = command.v_tilde, i - command.i_ref
         sigma = cascade.position.sigma(motion, inputs.reference)
         q_z, q_i = inputs.q_z, inputs.q_i
-        d = self._drift(inputs, state, hold, command.i_ref, moving)
+        d = self._drift(inputs, state, errors, command.i_ref, moving)
         h = plant.a * (plant.signals(state.plant).v - v_tilde - plant.v(z, command.i_ref))
         laws = cascade.position, cascade.inversion, cascade.current
         robust = Identities(*map(answers.robust, laws, (sigma, v_tilde, e)))
@@ -139,19 +139,21 @@ class Monitored:
         bound = 2 * jnp.abs(sigma) * (plant.a * (L_v * jnp.abs(e) + jnp.abs(v_tilde)) - room)
         return Terms(moving, Identities(sigma, v_tilde, e), rates, command.i_ref_dot, q_z, q_i, d, h, bound)
 
-    def _drift(self, inputs: Inputs, state: LoopState, hold: Errors, i_ref: Array, moving: LoopState) -> Array:
+    def _drift(
+        self, inputs: ExternalInputs, state: LoopState, errors: Errors, i_ref: Array, moving: LoopState
+    ) -> Array:
         """d = v_star' - (dv/dz) z' along the true flow, i_ref held: the left side of Eq. (7), by one jvp."""
         cascade, reference = self.loop.cascade, inputs.reference
 
         def demanded(reference: Reference, x: LoopState) -> Array:
-            force, _, _ = cascade.demand(self.loop.measured(x.plant, hold), x.control, reference)
+            force, _, _ = cascade.demand(self.loop.measured(x.plant, errors), x.control, reference)
             return force.v_star - cascade.model.v(force.z, i_ref)
 
         return jax.jvp(demanded, (reference, state), (reference.rate(), moving))[1]
 
-    def row(self, t: Array, state: Witnessed, hold: Errors, alive: Array) -> TheoremRow:
+    def row(self, t: Array, state: Witnessed, errors: Errors, alive: Array) -> TheoremRow:
         inputs = self.loop.inputs(t)
-        terms = self.terms(inputs, state.loop, hold)
+        terms = self.terms(inputs, state.loop, errors)
         z, _, i = self.motion(state.loop)
         i_ref = i - terms.values.e
         values = terms.values._replace(e=i)

@@ -13,7 +13,7 @@ from ambjax.simulation.span import Span
 from ambjax.world.sensor import Errors
 
 
-class Signals(NamedTuple):
+class WatchedSignals(NamedTuple):
     """sigma (m/s), v_tilde (A^2/m^2) and e = i - i_ref (A)."""
 
     sigma: Array
@@ -31,8 +31,8 @@ class WatchedRow(NamedTuple):
 
     t: Array
     u: Array
-    computed: Signals
-    true: Signals
+    computed: WatchedSignals
+    true: WatchedSignals
     distance: Array
 
 
@@ -40,7 +40,7 @@ class WatchedState(NamedTuple):
     """State of the loop, and the signals that its laws acted on last."""
 
     loop: SampledState
-    computed: Signals
+    computed: WatchedSignals
 
 
 @record
@@ -52,43 +52,50 @@ class Watched:
     def realised(self) -> "Watched":
         return Watched(self.loop.realised())
 
-    def hold(self, sample: Scalar) -> Any:
-        return self.loop.hold(sample)
+    def sensor_errors(self, sample: Scalar) -> Any:
+        return self.loop.sensor_errors(sample)
 
     def start(self) -> WatchedState:
-        return WatchedState(self.loop.start(), Signals(*[jnp.zeros(())] * 3))
+        return WatchedState(self.loop.start(), WatchedSignals(*[jnp.zeros(())] * 3))
 
-    def jump(self, t: Scalar, state: WatchedState, hold: Errors) -> WatchedState:
+    def jump(self, t: Scalar, state: WatchedState, errors: Errors) -> WatchedState:
         """The laws' step, and the signals that it acted on."""
         loop, before = self.loop, state.loop
-        cascade, after = loop.loop.cascade, loop.jump(t, before, hold)
+        cascade, after = loop.loop.cascade, loop.jump(t, before, errors)
         reference = loop.reference(t)
         sample = Sample(reference, loop.period, jnp.asarray(loop.loop.scenario.u_max), after.past)
-        measured = loop.measured(before.plant, before.seen, hold)
+        measured = loop.measured(before.plant, before.seen, errors)
         estimate, *_ = cascade.estimate(measured, before.control.observer, sample)
         sigma, command = cascade.position.sigma(estimate, reference), after.command
-        return WatchedState(after, Signals(sigma, command.v_tilde, estimate.i - command.i_ref))
+        return WatchedState(after, WatchedSignals(sigma, command.v_tilde, estimate.i - command.i_ref))
 
     def advance(
-        self, method: Integrator, hold: Errors, t: Scalar, period: Scalar, state: WatchedState, memory: Any, code: Array
+        self,
+        method: Integrator,
+        errors: Errors,
+        t: Scalar,
+        period: Scalar,
+        state: WatchedState,
+        memory: Any,
+        code: Array,
     ) -> Advanced:
-        after = self.loop.advance(method, hold, t, period, state.loop, memory, code)
+        after = self.loop.advance(method, errors, t, period, state.loop, memory, code)
         return after._replace(state=state._replace(loop=after.state))
 
-    def fate(self, state: WatchedState) -> Array:
-        return self.loop.fate(state.loop)
+    def status(self, state: WatchedState) -> Array:
+        return self.loop.status(state.loop)
 
     def rest(self, state: WatchedState, code: Array) -> WatchedState:
         return state._replace(loop=self.loop.rest(state.loop, code))
 
-    def row(self, t: Scalar, state: WatchedState, hold: Errors, alive: Array) -> WatchedRow:
-        row = self.loop.row(t, state.loop, hold, alive)
+    def row(self, t: Scalar, state: WatchedState, errors: Errors, alive: Array) -> WatchedRow:
+        row = self.loop.row(t, state.loop, errors, alive)
         plant = self.loop.loop.scenario.plant
         return WatchedRow(
             row.t,
             row.u,
             state.computed,
-            Signals(row.sigma, row.v_tilde, row.e),
+            WatchedSignals(row.sigma, row.v_tilde, row.e),
             plant.signed_distance_to_C(row.z, row.i_ref),
         )
 

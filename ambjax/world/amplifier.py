@@ -59,16 +59,16 @@ class Amplifier:
         """How long the rate of the first order stays below the slew rate, in times of 1/w; s."""
         return 0.0 if self.bandwidth is None else 1 / self.slope()
 
-    def at_coil(self, u_a: Array, i: Array, u_max: Scalar, hold: Callable[[], Array]) -> Array:
+    def at_coil(self, u_a: Array, i: Array, u_max: Scalar, holding_voltage: Callable[[], Array]) -> Array:
         """What of its voltage reaches the coils at a current of i (A), V: never beyond the supply's u_max (V).
 
-        `hold`: what would keep that current, V.
+        `holding_voltage`: what would keep that current, V.
         """
         if self.dead_band is not None:
             size = jnp.maximum(jnp.abs(u_a) - self.dead_band, 0.0)
             u_a = jnp.where(u_a < 0, -size, size)
         if self.i_max is None:
             return u_a
-        kept = limited(hold(), u_max)
+        kept = limited(holding_voltage(), u_max)
         u_a = jnp.where((i >= self.i_max) & (u_a > kept), kept, u_a)
         return jnp.where((i <= -self.i_max) & (u_a < kept), kept, u_a)

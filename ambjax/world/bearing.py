@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.apart import apart
+from ambjax.compiler.barrier import compiled_alone
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.numerics.smooth import refined, safe_sqrt
 from ambjax.world.sensor import Measurement
@@ -36,7 +36,7 @@ def _product(z: Array, s_0: Array) -> Array:
 
 
 @jax.custom_jvp
-@apart
+@compiled_alone
 def _inverse(z: Array, s_0: Array) -> Array:
     """1 / (upper gap, lower gap): from z, so that the gaps need not be stored for it."""
     return refined(_product(z, s_0))

@@ -5,11 +5,11 @@ import re
 import tomllib
 from typing import Any
 
-from ambjax.cases.clock import DURATION
 from ambjax.cases.reader import FIELDS, KINDS, OTHERS, SETTLE, SIGNALS, TABLES, case_from
-from ambjax.cases.spread import DISTRIBUTIONS
 from ambjax.cases.table import Table
-from ambjax.cases.template import template
+from ambjax.cases.template_text import template
+from ambjax.cases.timing import DURATION
+from ambjax.cases.variation import DISTRIBUTIONS
 from ambjax.control.guard import Guard
 from ambjax.control.processor import Processor
 from ambjax.ensemble.distributions import SHAPES
@@ -53,7 +53,7 @@ WORDS = {
     "clock": "Time: how long, how often a row is recorded and noise drawn, and how it is integrated between.",
     "run": "What belongs to a run and to no part of it.",
     "spread": "What varies from member to member of an ensemble. See [spreads](spread.md).",
-    "tune": "What `ambjax-tune` is to do; the other commands pass it by.",
+    "tune": "What `ambjax tune` is to do; the other commands pass it by.",
     "tune.weights": "What counts, as weights of dimensionless terms.",
     "tune.limits": "What must not be exceeded, as judged by the held-out members. See [limits](../limits.md).",
 }

@@ -3,7 +3,7 @@
 import functools
 
 from ambjax import Cascade, Clock, Scenario
-from ambjax.theorem import conditions, processor
+from ambjax.theorem import conditions, sampled_report
 from reference.markdown import code, escaped, paragraphs, table
 
 
@@ -20,7 +20,7 @@ def pages() -> dict[str, str]:
     lines += ["## The steps of the proof", "", "Residuals: they inform, and decide nothing.", ""]
     steps = [(escaped(c.name), escaped(c.requires), escaped(c.unit), escaped(c.note)) for c in found.proof]
     lines += table(("step", "statement", "unit", "what is shown"), steps, "keys")
-    lines += ["## On a processor", "", *paragraphs(processor)]
+    lines += ["## On a processor", "", *paragraphs(sampled_report)]
     lines += ["What it decides, and how to read it: [the processor](../processor.md).", ""]
     return {"conditions.md": "\n".join(lines)}
 

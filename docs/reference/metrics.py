@@ -79,9 +79,9 @@ def _meaning(name: str, fold: Any) -> str:
 def arrays() -> dict[str, str]:
     """What each array of trajectory.npz holds."""
     told = {name: text for name, text in attribute_docs(Row).items() if name not in NOT_SAVED}
-    fate = {
+    status = {
         "lost_at": "when the rotor was lost, s; inf: never. One number",
         "lost_why": "why, in words; empty if it was not",
         "singular_at": "when (z, i_ref) first crossed C, s; inf: never. One number",
     }
-    return told | fate
+    return told | status

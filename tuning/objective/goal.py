@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from tuning.objective.conditions import Bound, shortfall
 from tuning.objective.limits import Limit
 from tuning.objective.loss import outcomes
 from tuning.objective.members import Members
 from tuning.objective.risk import Risk
+from tuning.objective.shortfalls import Bound, shortfall
 from tuning.space import Space
 
 

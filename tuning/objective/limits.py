@@ -84,7 +84,7 @@ class Scaled:
 
 
 @dataclasses.dataclass(frozen=True)
-class Site:
+class LimitContext:
     """What the measures of a case depend on: from when errors count (s), run's duration (s), clearance and band (m)."""
 
     settle: float
@@ -117,7 +117,7 @@ class Kind:
     unit: str
     words: str
     over: str
-    fold: Callable[[Site, float], Fold]
+    fold: Callable[[LimitContext, float], Fold]
     exact: str | None
     tuned: Callable[[Any], Any]
     judged: Callable[[np.ndarray], Any]
@@ -274,5 +274,5 @@ class Limit:
 
 def measures(limits: tuple[Limit, ...], scenario: Scenario, clock: Clock, settle: float, band: float) -> dict[str, Any]:
     """A fold for each limit, by its name."""
-    site = Site(settle, float(clock.duration), float(scenario.touchdown), band)
+    site = LimitContext(settle, float(clock.duration), float(scenario.touchdown), band)
     return {limit.name: limit.kind.fold(site, limit.asked) for limit in limits}

@@ -35,7 +35,7 @@ class Sums(NamedTuple):
     clearance: Array
     driven: Array
     time: Array
-    doom: Array
+    contact_time: Array
     measured: Any
 
 
@@ -72,7 +72,7 @@ class Loss:
         beyond = jnp.maximum((jnp.abs(row.z) - halfway) / (self.stop - halfway), 0.0)
         outward = jnp.where(row.z < 0, -row.z_dot, row.z_dot)
         moving = outward > 1e-6
-        doom = row.t + (self.stop - jnp.abs(row.z)) / jnp.where(moving, outward, 1.0)
+        contact_time = row.t + (self.stop - jnp.abs(row.z)) / jnp.where(moving, outward, 1.0)
         return Sums(
             carry.square + weight * square,
             carry.power + weight * square ** (NORM // 2),
@@ -83,7 +83,7 @@ class Loss:
             carry.clearance + beyond**2,
             carry.driven + on,
             carry.time + span.time,
-            jnp.where(on & moving, doom, carry.doom),
+            jnp.where(on & moving, contact_time, carry.contact_time),
             Named(self.measures).update(carry.measured, row, span),
         )
 
@@ -93,7 +93,7 @@ class Loss:
         some = mean > 1e-280
         lost = ending.lost_code != ALIVE
         at = jnp.where(lost, ending.lost_at, 0.0)
-        at = jax.lax.stop_gradient(at) + (carry.doom - jax.lax.stop_gradient(carry.doom))
+        at = jax.lax.stop_gradient(at) + (carry.contact_time - jax.lax.stop_gradient(carry.contact_time))
         measured = Named(self.measures).result(carry.measured, ending)
         return {PREFIX + name: value for name, value in measured.items()} | {
             "tracking": carry.square / weight,

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from ambjax.control import answers
-from ambjax.control.search import Interval, Site
-from tuning.objective.conditions import Bound
+from ambjax.control.search import Interval, SearchContext
 from tuning.objective.members import Objective
+from tuning.objective.shortfalls import Bound
 from tuning.space import Gain, Space, read
 
 # Displacement that a rotor at rest is at least expected to make, as a share of the clearance.
@@ -70,7 +70,7 @@ def bounded(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarr
     return Space(tuple(dataclasses.replace(gain, high=at.most) for gain, at in zip(gains, box, strict=True))), box
 
 
-def _site(objective: Objective, conditions: tuple[Bound, ...]) -> Site:
+def _site(objective: Objective, conditions: tuple[Bound, ...]) -> SearchContext:
     model, scenario = objective.cascade.model, objective.scenario
     w = float(scenario.plant.pole)
     bounds = {bound.symbol: bound.value for bound in conditions}
@@ -89,10 +89,10 @@ def _site(objective: Objective, conditions: tuple[Bound, ...]) -> Site:
         needed = fall * z, f"D = dv/dz w z = {fall * z:.3g} A^2/m^2/s, what Eq. (7) asks of a fall from {where}"
     processor = objective.cascade.processor
     stepped = processor is not None and processor.implicit
-    return Site(model, w, float(objective.clock.sample_period), bounds, needed, stepped)
+    return SearchContext(model, w, float(objective.clock.sample_period), bounds, needed, stepped)
 
 
-def _interval(site: Site, cascade: Any, gain: Gain, value: float) -> Interval:
+def _interval(site: SearchContext, cascade: Any, gain: Gain, value: float) -> Interval:
     if gain.low > 0 and np.isfinite(gain.high):
         return Interval(gain.low, gain.high, "tune.bounds", True)
     _, stage, name = gain.path.split(".")

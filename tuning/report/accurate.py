@@ -13,7 +13,7 @@ from ambjax.ensemble.replay import record
 from ambjax.simulation.rollout import rollout
 from ambjax.simulation.trajectory import Trajectory
 from tuning.judge import difference, metrics_of, summarise
-from tuning.problem import Problem
+from tuning.problem import TuningProblem
 
 # Held-out members that are simulated again.
 AGAIN = 8
@@ -21,7 +21,7 @@ AGAIN = 8
 MARKED = 0.05
 
 
-def compared(problem: Problem, x: np.ndarray, seed: int, count: int, names: tuple[str, ...]) -> dict[str, Any]:
+def compared(problem: TuningProblem, x: np.ndarray, seed: int, count: int, names: tuple[str, ...]) -> dict[str, Any]:
     """The first members of the ensemble of `count` with this seed at x [m], by the report's steps and by accurate ones.
 
     `members` simulated, `held` by both; over these the summaries (`summarise`) of `names`: of the report, accurate,
@@ -36,8 +36,8 @@ def compared(problem: Problem, x: np.ndarray, seed: int, count: int, names: tupl
     ways = ("report", "accurate")
     facts: dict[str, Any] = {"members": len(numbers), "held": int(held.sum()), "marked_beyond": MARKED}
     facts["refuted"] = error.refuted if error.members + error.unseen else ""
-    for fate in ("lost", "stalled"):
-        facts[fate] = {way: int(metrics[fate].sum()) for way, metrics in zip(ways, both, strict=True)}
+    for status in ("lost", "stalled"):
+        facts[status] = {way: int(metrics[status].sum()) for way, metrics in zip(ways, both, strict=True)}
     facts["metrics"] = {}
     if held.any():
         ours, theirs = (summarise({name: values[held] for name, values in metrics.items()}) for metrics in both)
@@ -56,7 +56,7 @@ def _relative(ours: float, theirs: float) -> float:
     return ours / theirs - 1 if theirs else float("inf")
 
 
-def nominal(problem: Problem, cascade: Cascade) -> Trajectory:
+def nominal(problem: TuningProblem, cascade: Cascade) -> Trajectory:
     """The case's own run, nothing spread, under this cascade: a row for each sample.
 
     In accurate steps; where the judge takes those of `ambjax simulate`, that command's run.

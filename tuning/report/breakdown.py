@@ -8,7 +8,7 @@ import numpy as np
 from tuning.objective.goal import Goal
 from tuning.objective.loss import COSTS, HELD, TERMS, outcomes, weigh
 from tuning.objective.members import Members
-from tuning.problem import Problem
+from tuning.problem import TuningProblem
 
 # The loss of one member in words. Costs multiply: they count relative to the error.
 FORMULA = f"{' + '.join(HELD)} + (tracking + peak) x (1 + {' + '.join(COSTS)})"
@@ -38,7 +38,7 @@ def table(goal: Goal, columns: dict[str, np.ndarray]) -> Facts:
     }
 
 
-def minimised(problem: Problem, x: np.ndarray, who: Members) -> Facts:
+def minimised(problem: TuningProblem, x: np.ndarray, who: Members) -> Facts:
     """What the search brought down, at x [m]: the parts of its goal, (risk + held) x penalty x limits = total."""
     goal, n = problem.goal, who.ordinary
     terms = {k: v[0] for k, v in problem.engine.terms(x[None], who).items()}

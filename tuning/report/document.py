@@ -8,7 +8,7 @@ import numpy as np
 
 from ambjax.theorem.conditions import Report as Check
 from tuning.objective.loss import TERMS
-from tuning.report import extras, limits
+from tuning.report import extras, limit_table
 from tuning.report.breakdown import FORMULA
 from tuning.report.page import literal, table
 from tuning.space import Space
@@ -55,7 +55,7 @@ def markdown(facts: Facts) -> str:
     """report.md: beside it lie the pictures that it shows."""
     lines = [f"# Tuning of {literal(facts['case'])}", "", facts["verdict"], ""]
     lines += (
-        limits.section(facts.get("limits", []))
+        limit_table.section(facts.get("limits", []))
         + _gains(facts)
         + _held_out(facts)
         + _loss(facts)
@@ -132,7 +132,7 @@ def _held_out(facts: Facts) -> list[str]:
         for name in SHOWN
         if name in after or name in before
     ]
-    rows += [[name, str(before[name]), str(after[name]), *_fates(again, name)] for name in ("lost", "stalled")]
+    rows += [[name, str(before[name]), str(after[name]), *_statuses(again, name)] for name in ("lost", "stalled")]
     rows.append(["survival, 95 % interval", *map(_survival, (before, after)), *(["-"] * 3 if again else [])])
     lines = [f"## {after['members']} held-out members (seed {facts['held_out_seed']})", "", *table(head, rows), ""]
     words = ["Metrics are of the members that are held.", *_accurate(again), *_worst(facts.get("worst_member")), ""]
@@ -143,10 +143,10 @@ def _worst(worst: Facts | None) -> list[str]:
     """The member that fares worst, and the command that simulates it by itself."""
     if worst is None:
         return []
-    fate = f"largest settled error {worst['settled_max_abs_error_m']:.4g} m"
+    status = f"largest settled error {worst['settled_max_abs_error_m']:.4g} m"
     if math.isfinite(worst["lost_at_s"]):
-        fate = f"it ends at {worst['lost_at_s']:.4g} s"
-    line = f"The worst is member {worst['member']}: {fate}."
+        status = f"it ends at {worst['lost_at_s']:.4g} s"
+    line = f"The worst is member {worst['member']}: {status}."
     return ["", f"{line} In the folder of this report: `{worst['replay']}`" if worst["replay"] else line]
 
 
@@ -162,7 +162,7 @@ def _again(again: Facts | None, name: str) -> list[str]:
     return [f"{pair['report']:.4g}", f"{pair['accurate']:.4g}", f"**{off}**" if marked else off]
 
 
-def _fates(again: Facts | None, name: str) -> list[str]:
+def _statuses(again: Facts | None, name: str) -> list[str]:
     return (
         [] if again is None else [f"{again[name][way]} of {again['members']}" for way in ("report", "accurate")] + ["-"]
     )

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from tuning.objective.engine import Engine
+from tuning.objective.lanes import Engine
 from tuning.objective.loss import weigh
 from tuning.objective.members import Members
-from tuning.problem import Problem
+from tuning.problem import TuningProblem
 
 # Samples over which the three ways are compared, members that take part, and the step of the differences.
 SAMPLES, FEW, STEP = 500, 4, 1e-3
@@ -21,7 +21,7 @@ AGREED = "agree"
 HORIZONS = (0.125, 0.25, 0.5)
 
 
-def _shorter(problem: Problem, samples: int) -> Any:
+def _shorter(problem: TuningProblem, samples: int) -> Any:
     """The objective over fewer samples; settled from the same share of them on."""
     objective = problem.objective
     clock = dataclasses.replace(objective.clock, samples=samples)
@@ -30,7 +30,7 @@ def _shorter(problem: Problem, samples: int) -> Any:
     return dataclasses.replace(objective, clock=clock, loss=dataclasses.replace(objective.loss, settle=settle))
 
 
-def three_ways(problem: Problem, x: np.ndarray) -> dict[str, Any]:
+def three_ways(problem: TuningProblem, x: np.ndarray) -> dict[str, Any]:
     """Gradient [m] of the mean loss at x [m] by forward and reverse mode and by Richardson-extrapolated differences.
 
     `coarse`, `fine`: the central differences of the steps STEP and STEP / 2 that are extrapolated. `verdicts`: by gain,
@@ -90,7 +90,7 @@ def verdict(forward: float, reverse: float, coarse: float, fine: float, floor: f
     return AGREED
 
 
-def against_horizon(problem: Problem, x: np.ndarray, who: Members) -> list[dict[str, float]]:
+def against_horizon(problem: TuningProblem, x: np.ndarray, who: Members) -> list[dict[str, float]]:
     """Norm of the gradient of the log of the mean loss, and share of lost members, by horizon in s; where it is 0,
     as it may be over a sample or two, there is no log, and no row."""
     rows, all_ = [], problem.objective.clock.samples
@@ -111,7 +111,7 @@ def against_horizon(problem: Problem, x: np.ndarray, who: Members) -> list[dict[
     return rows
 
 
-def signal_to_noise(problem: Problem, x: np.ndarray, who: Members) -> dict[str, Any]:
+def signal_to_noise(problem: TuningProblem, x: np.ndarray, who: Members) -> dict[str, Any]:
     """Mean of the members' gradients over its standard error, by gain; each member is a seed of its own."""
     outcomes, slopes, terms = problem.engine.gradient(x[None], who, problem.goal.weights)
     relative = slopes[0, :, 0] / outcomes[0, :, 0].mean()
@@ -124,7 +124,7 @@ def signal_to_noise(problem: Problem, x: np.ndarray, who: Members) -> dict[str, 
     }
 
 
-def report(problem: Problem, x: np.ndarray, who: Members) -> dict[str, Any]:
+def report(problem: TuningProblem, x: np.ndarray, who: Members) -> dict[str, Any]:
     """All of it, at coordinates x [m]."""
     return {
         "gains": problem.objective.space.paths,

@@ -89,8 +89,8 @@ def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
     for name, run in runs.items():
         t, alive = np.asarray(run.rows.t), np.asarray(run.rows.alive)
         frequency, amplitude = amplitudes(np.asarray(run.rows.u_mean)[alive & (t >= settle)], t[1] - t[0])
-        fate = "not decided" if run.lost_code == STALLED else "lost"
-        label = name if len(amplitude) else f"{name}: {fate} before {settle:g} s"
+        status = "not decided" if run.lost_code == STALLED else "lost"
+        label = name if len(amplitude) else f"{name}: {status} before {settle:g} s"
         ax.plot(frequency, amplitude, color=ORANGE if name == "before" else BLUE, lw=0.8, label=label)
         top = max(top, amplitude.max(initial=0.0))
     ax.set(xlabel="frequency (Hz)", ylabel="amplitude of u (V)", xscale="log", yscale="log")

@@ -9,7 +9,7 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, InlineTable, Table
 
-FIRST = "Tuned by ambjax-tune from the case"
+FIRST = "Tuned by ambjax tune from the case"
 # What such a file begins with: it says nothing of the next search.
 HEAD = re.compile(rf"\A# {FIRST} [^\n]*\n(#[^\n]*\n)?\n?")
 # What may stand in no comment; halves of characters are names of files that are not UTF-8.

@@ -16,8 +16,8 @@ from ambjax.commands.outputs import say
 from tuning.judge import StepError
 from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
-from tuning.problem import Problem
-from tuning.search.keeper import Keeper, Progress, checkpoint
+from tuning.problem import TuningProblem
+from tuning.search.keeper import Keeper, SearchState, checkpoint
 from tuning.search.optimise import best_of, search
 from tuning.search.screen import around, everywhere
 
@@ -31,10 +31,10 @@ RETREATS = 12
 
 
 @dataclasses.dataclass(frozen=True)
-class Answer:
+class SearchResult:
     """What the rounds found: gains at x [m], the problem and members that they were last judged by, and how it went."""
 
-    problem: Problem
+    problem: TuningProblem
     who: Members
     x: np.ndarray
     error: StepError | None
@@ -63,15 +63,15 @@ class Course:
     Checkpoints lie in `out` (None: there are none) and hold `facts`; `resume` goes on with them.
     """
 
-    problem: Problem
+    problem: TuningProblem
     who: Members
     seed: int
     out: pathlib.Path | None = None
     facts: dict[str, Any] = dataclasses.field(default_factory=dict)
     resume: bool = False
-    tell: Callable[[Progress, float], None] | None = None
+    tell: Callable[[SearchState, float], None] | None = None
     """called after each iteration; left out: a line is said"""
-    past: list[Progress] = dataclasses.field(default_factory=list)
+    past: list[SearchState] = dataclasses.field(default_factory=list)
     asides: int = 0
     """searches that limits asked for: no rounds"""
     began: float = dataclasses.field(default_factory=time.perf_counter)
@@ -111,10 +111,10 @@ class Course:
         past = self.past[-1].history
         return int(past["lost"][-1][int(np.argmin(past["value"][-1]))]) == past["members"][-1]
 
-    def answer(self, x: np.ndarray, error: StepError | None, lost: int) -> Answer:
+    def answer(self, x: np.ndarray, error: StepError | None, lost: int) -> SearchResult:
         """What x is, as far as it is known now."""
         seconds = time.perf_counter() - self.began + sum(progress.earlier for progress in self.past)
-        return Answer(self.problem, self.who, x, error, _joined(self.past), lost, seconds)
+        return SearchResult(self.problem, self.who, x, error, _joined(self.past), lost, seconds)
 
 
 def looks(course: Course, start: np.ndarray) -> np.ndarray:
@@ -141,7 +141,7 @@ def look_again(goals: Sequence[float]) -> bool:
     return len(goals) < MOST_LOOKS and any(gained[-2:])
 
 
-def training(problem: Problem) -> Members:
+def training(problem: TuningProblem) -> Members:
     """The ensemble that is tuned on: ordinary members, then stressed ones."""
     tune = problem.tune
     return problem.objective.training(
@@ -149,7 +149,7 @@ def training(problem: Problem) -> Members:
     )
 
 
-def points_of(past: list[Progress]) -> np.ndarray:
+def points_of(past: list[SearchState]) -> np.ndarray:
     """Points [K, m] that the searches were at, best first: the best ones, and fewer and fewer of the others."""
     x = np.concatenate([np.asarray(one.history["x"]).reshape(-1, one.starts.best.shape[-1]) for one in past])
     value = np.concatenate([np.asarray(one.history["value"]).ravel() for one in past])
@@ -158,7 +158,7 @@ def points_of(past: list[Progress]) -> np.ndarray:
     return x[first[chosen]]
 
 
-def _best(progress: Progress) -> tuple[np.ndarray, float]:
+def _best(progress: SearchState) -> tuple[np.ndarray, float]:
     x, value = best_of(progress)
     if not np.isfinite(value):
         raise ValueError(
@@ -168,7 +168,7 @@ def _best(progress: Progress) -> tuple[np.ndarray, float]:
     return x, value
 
 
-def _joined(past: list[Progress]) -> dict[str, np.ndarray]:
+def _joined(past: list[SearchState]) -> dict[str, np.ndarray]:
     """The histories of all rounds in a row; a round with fewer starts repeats its own."""
     width = max(len(one.active) for one in past)
 
@@ -180,12 +180,12 @@ def _joined(past: list[Progress]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([wide(one.history[name]) for one in past if one.history]) for name in names}
 
 
-def _teller(problem: Problem) -> Callable[[Progress, float], None]:
+def _teller(problem: TuningProblem) -> Callable[[SearchState, float], None]:
     """What is said after each iteration."""
     scale = float(np.asarray(problem.objective.loss.s_0))
     budget, spent = problem.tune.budget, []
 
-    def tell(progress: Progress, seconds: float) -> None:
+    def tell(progress: SearchState, seconds: float) -> None:
         spent.append(seconds)
         x, value = best_of(progress)
         gains = np.asarray(problem.objective.space.gains_at(jnp.asarray(x)))

@@ -10,10 +10,10 @@ from tuning.judge import held, rms
 from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
 from tuning.optimisers import BFGS
-from tuning.problem import Problem
+from tuning.problem import TuningProblem
 from tuning.search.descent import Descent
 from tuning.search.iteration import iterate
-from tuning.search.keeper import Progress
+from tuning.search.keeper import SearchState
 from tuning.search.optimise import SHORTEST
 
 # Coordinates of the slices: factors of about e^-1.5 to e^1.5 of a gain.
@@ -54,7 +54,7 @@ class Slices:
         return int(j), int(k), max(float(drop[j, k]), 0.0)
 
 
-def slices(problem: Problem, x: np.ndarray, who: Members) -> Slices:
+def slices(problem: TuningProblem, x: np.ndarray, who: Members) -> Slices:
     """Slices through x [m], one gain at a time."""
     m, space = len(x), problem.objective.space
     at = np.repeat(x[None], m * len(REACH), axis=0)
@@ -68,7 +68,7 @@ def slices(problem: Problem, x: np.ndarray, who: Members) -> Slices:
 
 
 def pareto(
-    problem: Problem, x: np.ndarray, who: Members, *, points: int = 6, iterations: int = 8
+    problem: TuningProblem, x: np.ndarray, who: Members, *, points: int = 6, iterations: int = 8
 ) -> list[dict[str, Any]]:
     """The front of settled tracking error against rms voltage: a family of weights of the effort, refined at once.
 
@@ -80,7 +80,7 @@ def pareto(
     weights = np.tile(problem.goal.weights, (points, 1))
     weights[1:, TERMS.index("effort")] = np.geomspace(1.0, 1000.0, points - 1)
     descent = Descent(problem.goal, BFGS, 0.0)
-    family = Progress(descent.begin(jnp.tile(jnp.asarray(x), (points, 1))), np.ones(points, bool))
+    family = SearchState(descent.begin(jnp.tile(jnp.asarray(x), (points, 1))), np.ones(points, bool))
     for _ in range(iterations):
         if family.active.any():
             iterate(problem.engine, problem.goal, who, family, descent, weights)

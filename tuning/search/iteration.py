@@ -4,20 +4,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tuning.objective.engine import Engine
 from tuning.objective.goal import Goal
+from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
 from tuning.search.descent import Descent
 from tuning.search.evolution import drawn, moved
-from tuning.search.keeper import Progress
+from tuning.search.keeper import SearchState
 
 
 def iterate(
     engine: Engine,
     goal: Goal,
     who: Members,
-    progress: Progress,
+    progress: SearchState,
     descent: Descent,
     weights: np.ndarray | None = None,
     seed: int = 0,
@@ -32,7 +32,7 @@ def _descended(
     engine: Engine,
     goal: Goal,
     who: Members,
-    progress: Progress,
+    progress: SearchState,
     descent: Descent,
     weights: np.ndarray | None,
 ) -> dict[int, dict[str, np.ndarray]]:
@@ -52,7 +52,7 @@ def _descended(
 
 
 def _evolved(
-    engine: Engine, goal: Goal, who: Members, progress: Progress, seed: int
+    engine: Engine, goal: Goal, who: Members, progress: SearchState, seed: int
 ) -> dict[int, dict[str, np.ndarray]]:
     """One population of each start that goes on by CMA-ES; returns what `_descended` does."""
     active = np.flatnonzero(progress.active & progress.evolving)
@@ -80,7 +80,7 @@ def _evolved(
 def record(
     engine: Engine,
     who: Members,
-    progress: Progress,
+    progress: SearchState,
     better: dict[int, dict[str, np.ndarray]],
     *,
     fresh: bool = False,

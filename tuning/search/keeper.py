@@ -26,7 +26,7 @@ LEAF, PAST, ACTIVE = "leaf_", "history_", "active"
 
 
 @dataclasses.dataclass
-class Progress:
+class SearchState:
     """A search under way. `history` holds one row per iteration; everything else can be read off a checkpoint.
 
     `since`: the iteration after which the phase began; `seconds` spent on it so far, `earlier` of them before a resume.
@@ -75,7 +75,7 @@ class Keeper:
         self.path, self.round = path, round
         self.fingerprint = flat({**provenance(), **facts})
 
-    def save(self, progress: Progress) -> None:
+    def save(self, progress: SearchState) -> None:
         """Keep this state instead of the one before. Raises ValueError if it cannot be written."""
         if self.path is None:
             return
@@ -87,7 +87,7 @@ class Keeper:
         facts = {"fingerprint": self.fingerprint, "round": self.round, "counts": counts}
         seal(self.path, {**leaves, **past, ACTIVE: progress.active}, facts)
 
-    def load(self, descent: Descent, starts: int, m: int) -> Progress | None:
+    def load(self, descent: Descent, starts: int, m: int) -> SearchState | None:
         """The search so far, of so many starts in m coordinates; None, with a line that says why, if it is damaged.
 
         Raises ValueError if it belongs to another problem.
@@ -152,7 +152,9 @@ def remove_all(directory: pathlib.Path) -> int:
     return len(left)
 
 
-def _progress(arrays: dict[str, np.ndarray], counts: dict[str, Any], descent: Descent, starts: int, m: int) -> Progress:
+def _progress(
+    arrays: dict[str, np.ndarray], counts: dict[str, Any], descent: Descent, starts: int, m: int
+) -> SearchState:
     """Raises DamagedError where these are not the arrays of such a search."""
     there = shapes(arrays)
     kinds = jax.eval_shape(descent.begin, jnp.zeros((starts, m))), clouds(starts, m)
@@ -170,4 +172,4 @@ def _progress(arrays: dict[str, np.ndarray], counts: dict[str, Any], descent: De
     history = {name.removeprefix(PAST): list(rows) for name, rows in arrays.items() if name.startswith(PAST)}
     state, drawn = jax.tree.unflatten(tree, [arrays[f"{LEAF}{n}"] for n in range(len(leaves))])
     state = jax.tree.map(jnp.asarray, state)
-    return Progress(state, arrays[ACTIVE], history, **counts, earlier=counts["seconds"], clouds=drawn)
+    return SearchState(state, arrays[ACTIVE], history, **counts, earlier=counts["seconds"], clouds=drawn)

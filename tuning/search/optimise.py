@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.host.interrupts import gently, heed
-from tuning.objective.engine import Engine
 from tuning.objective.goal import Goal
+from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
 from tuning.optimisers import BFGS
 from tuning.search.descent import Descent
 from tuning.search.evolution import begun, clouds
 from tuning.search.iteration import iterate, record
-from tuning.search.keeper import Keeper, Progress
+from tuning.search.keeper import Keeper, SearchState
 from tuning.search.screen import screen
 
 # A start has converged when its next step is shorter than this.
@@ -64,8 +64,8 @@ def search(
     settled: bool = False,
     keeper: Keeper | None = None,
     resume: bool = False,
-    tell: Callable[[Progress, float], None] = lambda search, seconds: None,
-) -> Progress:
+    tell: Callable[[SearchState, float], None] = lambda search, seconds: None,
+) -> SearchState:
     """Refine the best `keep` of these points, coordinates [K, m]. Ctrl-C ends it early.
 
     Where there are more points than that, they are screened and refined on a part of the members first; the best point
@@ -85,7 +85,7 @@ def search(
         if len(points) > keep:
             points = screen(engine, who, points, keep, goal)[:keep]
         starts = descent.begin(jnp.asarray(points))
-        progress = Progress(starts, np.ones(len(points), bool))
+        progress = SearchState(starts, np.ones(len(points), bool))
     try:
         while True:
             # Before there is anything to judge, Ctrl-C ends the process as elsewhere.
@@ -108,7 +108,7 @@ def search(
     return progress
 
 
-def _switch(progress: Progress, phase: Phase) -> None:
+def _switch(progress: SearchState, phase: Phase) -> None:
     """Which starts go on, and which of them by CMA-ES.
 
     Not those whose steps have become tiny or whose loss stalls, nor the worse half in time. A descent whose derivatives
@@ -133,7 +133,7 @@ def _switch(progress: Progress, phase: Phase) -> None:
     progress.active = active
 
 
-def _stalled(progress: Progress, patience: int, stall: float) -> np.ndarray:
+def _stalled(progress: SearchState, patience: int, stall: float) -> np.ndarray:
     """Whether the goal of each start [S] fell by less than `stall` over so many iterations of this phase."""
     if progress.iteration - progress.since <= patience:
         return np.zeros(len(progress.active), bool)
@@ -145,7 +145,7 @@ def _go_on_with_all(
     engine: Engine,
     goal: Goal,
     who: Members,
-    progress: Progress,
+    progress: SearchState,
     descent: Descent,
     given: np.ndarray,
     settled: bool = False,
@@ -179,7 +179,7 @@ def _go_on_with_all(
         record(engine, who, progress, {start: {name: terms[name][best] for name in TERMS}}, fresh=True)
 
 
-def best_of(progress: Progress) -> tuple[np.ndarray, float]:
+def best_of(progress: SearchState) -> tuple[np.ndarray, float]:
     """Coordinates [m] and goal of the best point seen in this phase."""
     value = np.asarray(progress.starts.value)
     at = int(np.argmin(value))

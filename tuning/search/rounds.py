@@ -14,9 +14,9 @@ from tuning.config import seeds
 from tuning.judge import StepError, compared, step_error, worst_of
 from tuning.judge import words as step_words
 from tuning.objective.members import Members
-from tuning.problem import Problem, problem_of
-from tuning.search.course import Answer, Course, looks, points_of, training
-from tuning.search.limits import limited
+from tuning.problem import TuningProblem, problem_of
+from tuning.search.course import Course, SearchResult, looks, points_of, training
+from tuning.search.multipliers import limited
 
 # Rounds in all, looks among them, times that steps are halved, and lost members that join in one round.
 MOST_ROUNDS, MOST_HALVINGS, MOST_JOINING = 12, 2, 16
@@ -25,12 +25,14 @@ MOST_ROUNDS, MOST_HALVINGS, MOST_JOINING = 12, 2, 16
 LOUDER = 1.5
 
 
-def rounds(problem: Problem, start: np.ndarray, out: pathlib.Path, facts: dict[str, Any], resume: bool) -> Answer:
+def rounds(
+    problem: TuningProblem, start: np.ndarray, out: pathlib.Path, facts: dict[str, Any], resume: bool
+) -> SearchResult:
     """Tune from the gains `start` [m]; `facts` are what the answer depends on, for the checkpoints in `out`.
 
     Raises ValueError where nothing can be evaluated, and where a checkpoint to go on with is that of another search.
     """
-    budget, answers = problem.tune.budget, list[Answer]()
+    budget, answers = problem.tune.budget, list[SearchResult]()
     course = Course(problem, training(problem), budget.seed, out, facts, resume)
     x = looks(course, start)
     for refuted in itertools.count(1):
@@ -68,7 +70,7 @@ def resolved(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepError]:
         x, _ = course.search(x[None])
 
 
-def validated(course: Course, x: np.ndarray, error: StepError) -> tuple[Answer, StepError, np.ndarray]:
+def validated(course: Course, x: np.ndarray, error: StepError) -> tuple[SearchResult, StepError, np.ndarray]:
     """What a validation ensemble says of x [m], and accurate steps of its worst members; and numbers of the lost."""
     budget = course.problem.tune.budget
     if course.interrupted or not budget.validation:
@@ -83,7 +85,7 @@ def validated(course: Course, x: np.ndarray, error: StepError) -> tuple[Answer, 
     return course.answer(x, error, lost.size + error.unseen), error, lost
 
 
-def retreated(course: Course, best: Answer) -> Answer:
+def retreated(course: Course, best: SearchResult) -> SearchResult:
     """An earlier point of the searches that accurate steps confirm, where there is one: else the best answer."""
     say("no answer is confirmed by accurate steps; they try earlier points of the search")
     for x in points_of(course.past):
@@ -95,7 +97,7 @@ def retreated(course: Course, best: Answer) -> Answer:
     return best
 
 
-def finer(problem: Problem) -> Problem | None:
+def finer(problem: TuningProblem) -> TuningProblem | None:
     """The same problem in steps half as long, or None where they were halved often enough; rollouts are counted on."""
     if problem.finer >= 2**MOST_HALVINGS:
         return None
@@ -104,7 +106,7 @@ def finer(problem: Problem) -> Problem | None:
     return fine
 
 
-def _joining(problem: Problem, lost: np.ndarray, error: StepError, louder: float) -> Members:
+def _joining(problem: TuningProblem, lost: np.ndarray, error: StepError, louder: float) -> Members:
     """The first of the lost members, under half the extra noise of the stressed ones: held, and with some margin.
 
     `lost` are members of the validation ensemble. Those that accurate steps do not hold are `louder` times as noisy.
@@ -116,7 +118,7 @@ def _joining(problem: Problem, lost: np.ndarray, error: StepError, louder: float
     return jax.tree.map(lambda a, b: np.concatenate([a, b]), those, these)
 
 
-def _lost(problem: Problem, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _lost(problem: TuningProblem, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of the validation members that are lost at x [m], first lost first; and of the worst that are held."""
     budget = problem.tune.budget
     count = budget.validation

@@ -3,11 +3,11 @@
 import numpy as np
 
 from ambjax.ensemble.design import points
-from tuning.objective.conditions import Bound
-from tuning.objective.engine import Engine
 from tuning.objective.goal import Goal
+from tuning.objective.lanes import Engine
 from tuning.objective.members import Members, Objective
 from tuning.objective.ranges import drawn, ranges
+from tuning.objective.shortfalls import Bound
 
 # Share of the members that points meet, and share of the points that goes on: 1/4 after an eighth of the members.
 ROUNDS = (8, 4), (4, 1)

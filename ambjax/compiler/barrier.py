@@ -15,7 +15,7 @@ from jax import Array
 Result = TypeVar("Result")
 
 
-def apart(function: Callable[..., Result]) -> Callable[..., Result]:
+def compiled_alone(function: Callable[..., Result]) -> Callable[..., Result]:
     """`function` of arrays, neither fused with its surroundings nor repeated in them on CPUs; elsewhere as it is.
 
     For what lies under a custom_jvp, whose rule may apply it to tangents if it is linear in them: reverse mode then
@@ -36,7 +36,7 @@ def apart(function: Callable[..., Result]) -> Callable[..., Result]:
 
 
 @jax.custom_jvp
-@apart
+@compiled_alone
 def _barrier(x: Array) -> Array:
     return x
 
@@ -46,7 +46,7 @@ def _kept_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arr
     return _barrier(*primals), _barrier(*tangents)
 
 
-def stored(tree: Result, beside: Any = ()) -> Result:
+def materialised(tree: Result, beside: Any = ()) -> Result:
     """The same values, and the same derivatives, stored: whoever uses them reads memory.
 
     Else XLA computes an intermediate again in every loop that uses it, and its derivatives once more for each. What is

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from tuning.config import Limits
+from tuning.config import LimitSettings
 from tuning.objective.limits import Limit
 from tuning.report.page import table
 
@@ -17,7 +17,7 @@ LOUD = (BROKEN, UNVERIFIED)
 
 
 def facts(
-    limits: tuple[Limit, ...], asked: Limits, columns: dict[str, np.ndarray], summary: Facts, refuted: str = ""
+    limits: tuple[Limit, ...], asked: LimitSettings, columns: dict[str, np.ndarray], summary: Facts, refuted: str = ""
 ) -> list[Facts]:
     """A row for each limit, and one for survival, of the held-out members' columns [N] (of `judge`) and summary.
 

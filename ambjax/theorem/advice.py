@@ -1,11 +1,11 @@
-"""The answer of a check in words: the question, the gains to change and to what, the fate of the rotor, what to do."""
+"""What `ambjax check` answers: the verdict, the gains to change and their values, the rotor's status, the advice."""
 
 import math
 import re
 
 from ambjax.host.words import command
 from ambjax.theorem.conditions import Condition, Report
-from ambjax.theorem.processor import Delays, Sampled
+from ambjax.theorem.sampled_report import Delays, SampledReport
 
 QUESTION = "Do the conditions of Theorem 1 hold along this run?"
 # A gain is advised this much above what it must exceed, rounded up to two digits.
@@ -34,7 +34,7 @@ def answer(report: Report, case: str) -> list[str]:
         words = f"No, {len(fails)} of {len(deciding)} {'does' if len(fails) == 1 else 'do'} not:"
     lines = [f"{QUESTION} {words}"]
     lines += [f"- {line}" for line in advice(report)]
-    lines.append(_fate(report, bool(fails)))
+    lines.append(_status(report, bool(fails)))
     if fails or report.lost:
         tune = command("ambjax", "tune", case)
         lines.append(f"{tune} looks for gains that hold the rotor, with a margin to these conditions.")
@@ -63,8 +63,8 @@ def advice(report: Report) -> list[str]:
     return lines
 
 
-def on_processor(sampled: Sampled, margin: Delays, unknown: Delays | None) -> list[str]:
-    """The lines below the tables of a processor: slopes, the distance to C, the rotor's fate, an alternating voltage,
+def on_processor(sampled: SampledReport, margin: Delays, unknown: Delays | None) -> list[str]:
+    """The lines below the tables of a processor: slopes, the distance to C, the rotor's status, an alternating voltage,
     the margin of a delay that the prediction knows, and of one that it does not (None: nothing is predicted).
     """
     lines = [
@@ -74,7 +74,7 @@ def on_processor(sampled: Sampled, margin: Delays, unknown: Delays | None) -> li
         if not slope.holds
     ]
     words = f"No, {len(lines)} of {len(sampled.slopes)} {'is' if len(lines) == 1 else 'are'} not:" if lines else "Yes."
-    end = fate(sampled.lost_at, sampled.lost_why, sampled.stalled, STALLED_PLANT)
+    end = status(sampled.lost_at, sampled.lost_why, sampled.stalled, STALLED_PLANT)
     lines = [f"Are all laws stable as they are stepped? {words}", *lines, _curve(*sampled.distance), end]
     if sampled.alternates:
         lines.append(_alternates(sampled.alternating or 0.0))
@@ -161,8 +161,8 @@ def _sides(line: Condition) -> tuple[str, str, str]:
     return name, f"[controller.{stage}] {name}", number(line.gain or 0.0)
 
 
-def _fate(report: Report, fails: bool) -> str:
-    words = fate(report.lost_at, report.lost_why, report.stalled)
+def _status(report: Report, fails: bool) -> str:
+    words = status(report.lost_at, report.lost_why, report.stalled)
     if report.lost and not fails:
         return f"{words} The theorem knows no noise, no limit of the voltage and no sampling: look there."
     if math.isinf(report.lost_at) and fails:
@@ -170,7 +170,7 @@ def _fate(report: Report, fails: bool) -> str:
     return words
 
 
-def fate(lost_at: float, lost_why: str, stalled: bool, remedy: str = STALLED) -> str:
+def status(lost_at: float, lost_why: str, stalled: bool, remedy: str = STALLED) -> str:
     """What became of the rotor, in a sentence that every command prints: held, lost, or not decided.
 
     `lost_at` (s): when the run ended early, +inf if it did not; `stalled`: because the integrator gave up, for which

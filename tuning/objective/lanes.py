@@ -48,7 +48,7 @@ class Lane(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Folded:
+class LaneFold:
     """The fold's result for a lane."""
 
     space: Space
@@ -64,7 +64,7 @@ def measured(world: tuple[Cascade, Scenario, Clock, Any]) -> Any:
 
 
 @dataclasses.dataclass(frozen=True)
-class Slope:
+class LaneGradient:
     """The outcomes of a lane [1 + L], its loss and what limits hold, their derivatives [1 + L, m] and the terms, in
     forward or reverse mode."""
 
@@ -122,7 +122,7 @@ class Engine:
     def terms(self, x: np.ndarray, who: Members) -> dict[str, np.ndarray]:
         """Terms of the loss by name, [S, N], of gain vectors x [S, m] and members [N]."""
         self.rollouts += len(x) * len(who.member)
-        return self._lanes(Folded(self.objective.space), x, who, self.lanes, fold=self._world[-1])
+        return self._lanes(LaneFold(self.objective.space), x, who, self.lanes, fold=self._world[-1])
 
     def metrics(self, x: np.ndarray, who: Members) -> dict[str, Any]:
         """{"loss": terms, "metrics": metrics.json names}, all [S, N].
@@ -145,11 +145,17 @@ class Engine:
         """
         self.rollouts += len(x) * len(who.member) * (len(self.objective.space) + 1)
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS)))
-        slope = Slope(self.objective.space, self.mode == "reverse")
+        slope = LaneGradient(self.objective.space, self.mode == "reverse")
         return self._lanes(slope, x, who, min(self.lanes, GRADIENT_LANES), weights=each)
 
     def _lanes(
-        self, function: Folded | Slope, x: np.ndarray, who: Members, width: int, weights: Any = None, fold: Any = None
+        self,
+        function: LaneFold | LaneGradient,
+        x: np.ndarray,
+        who: Members,
+        width: int,
+        weights: Any = None,
+        fold: Any = None,
     ) -> Any:
         """The function of every start x [S, m], with weights [S, 6] of its own, and member [N]: leaves [S, N, ...]."""
         start, member = np.divmod(np.arange(len(x) * len(who.member)), len(who.member))

@@ -26,17 +26,17 @@ MOST_NOISE = 0.1
 def read_aloud(path: str | pathlib.Path) -> Case:
     """A case file read for a command: what is doubtful in it is said on stderr. Raises ValueError as `read_case`."""
     case = read_case(path)
-    say_doubts(case, path)
+    print_warnings(case, path)
     return case
 
 
-def say_doubts(case: Case, path: str | pathlib.Path) -> None:
+def print_warnings(case: Case, path: str | pathlib.Path) -> None:
     """Say what is doubtful in a case, a line each."""
-    for doubt in doubts(case):
-        say(one_line(f"{path}: {doubt}"))
+    for warning in warnings_of(case):
+        say(one_line(f"{path}: {warning}"))
 
 
-def doubts(case: Case) -> list[str]:
+def warnings_of(case: Case) -> list[str]:
     """One line with path, value, why and what may have been meant, for each number of a case that is hardly meant."""
     return [*_assumed(case), *_sizes(case), *_noise(case), *_velocity(case), *_currents(case), *_motion(case)]
 

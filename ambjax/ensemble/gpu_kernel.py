@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble.engine import size
+from ambjax.ensemble.batching import size
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import RK4

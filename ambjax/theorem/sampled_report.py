@@ -1,4 +1,4 @@
-"""What decides on a processor: slopes of laws times the period, the distance to the singular curve C, the rotor's fate.
+"""Checks of a cascade on a processor: slopes of laws times T, the distance to the singular curve C, the rotor's status.
 
 Theorem 1 is about continuous time, where sigma, v_tilde and e reach 0. Stepped once in T they reach a band, and what it
 is made of is measured along a run: W, the largest disturbance of the rate of the signal that a law acts on, and how far
@@ -15,7 +15,7 @@ import numpy as np
 
 from ambjax.control import answers
 from ambjax.control.cascade import Cascade, CascadeState
-from ambjax.control.sampling import Sampling, band, disturbance, limits
+from ambjax.control.sampling import Sampling, band, disturbance, slope_limits
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
@@ -35,7 +35,7 @@ ALTERNATING = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
-class Slope:
+class SlopeCheck:
     """Slope times T of a law, the same as it is stepped, and its limits: for stability, and without oscillation.
 
     An explicit step keeps a slope; an implicit one makes a = slope T of a sign a/(1 + a), which is below both limits
@@ -84,8 +84,8 @@ class Band:
 
 
 @dataclasses.dataclass(frozen=True)
-class Sampled:
-    """Slopes and bands of a cascade on its processor, and the fate of the rotor there, under the case's noise.
+class SampledReport:
+    """Slopes and bands of a cascade on its processor, and the status of the rotor there, under the case's noise.
 
     `distance`: the least of (z/s_0, i_ref/i_0) to the singular curve C at the samples of that run, and its time (s);
     negative beyond C. `alternating`: share of the voltage's rms value that changes sign from sample to sample, without
@@ -93,7 +93,7 @@ class Sampled:
     integrator gave up at `lost_at`, and nothing is decided.
     """
 
-    slopes: list[Slope]
+    slopes: list[SlopeCheck]
     bands: list[Band]
     lost_at: float
     lost_why: str
@@ -143,7 +143,7 @@ def check(
     clock: Clock,
     settle: float,
     run: Callable[[Any, Clock], Outcome] = rolled,
-) -> Sampled:
+) -> SampledReport:
     """Slopes and bands of a cascade with a processor. Two runs of the loop: without noise and with it.
 
     `run` simulates: `ensemble.replay.record_system` has the rounding of `ambjax simulate`. Raises ValueError as
@@ -160,7 +160,7 @@ def check(
     bands = [line for rows, noise in lasting for line in _bands(cascade, scenario, clock, settled, rows, noise)]
     alternating = alternation(np.asarray(calm.rows.u)[settled:]) if np.isinf(calm.lost_at) else None
     stalled = int(outcome.lost_code) == STALLED
-    return Sampled(
+    return SampledReport(
         slopes(cascade, clock),
         bands,
         float(outcome.lost_at),
@@ -197,7 +197,7 @@ def _without_noise(scenario: Scenario) -> Scenario:
     return scenario if quiet in (None, scenario.sensor) else dataclasses.replace(scenario, sensor=quiet)
 
 
-def slopes(cascade: Cascade, clock: Clock) -> list[Slope]:
+def slopes(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
     """Slope times T of every law that has one, against its limits. Laws and processor of one member."""
     sampling, lines = sampling_of(cascade, clock), []
     for stage, law in zip(CascadeState._fields, map(answers.unhardened, cascade.laws), strict=True):
@@ -207,7 +207,9 @@ def slopes(cascade: Cascade, clock: Clock) -> list[Slope]:
             relaxed = 1 / (1 + 1 / slope) if slope else 0.0
             stepped = max(relaxed, float(answers.held(law, cascade.model)) * sampling.period)
         if slope:
-            lines.append(Slope(stage, slope, stepped, *limits(sampling.late if stage in DELAYED else 0.0), implicit))
+            lines.append(
+                SlopeCheck(stage, slope, stepped, *slope_limits(sampling.late if stage in DELAYED else 0.0), implicit)
+            )
     return lines
 
 

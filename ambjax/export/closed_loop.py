@@ -10,7 +10,7 @@ from jax import Array
 from ambjax.control.cascade import Command
 from ambjax.export.controller import BITS, OUTPUTS
 from ambjax.export.machine import Compiled
-from ambjax.export.twins import Case, Horizon, farthest, horizons
+from ambjax.export.twins import Horizon, LoopCase, farthest, horizons
 from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
@@ -98,7 +98,7 @@ BLOCK = 1000
 begin_jit, segment_jit = jax.jit(begin), jax.jit(segment, static_argnames=("count", "every"))
 
 
-def beside(case: Case, machines: dict[str, Compiled]) -> dict[str, Beside]:
+def beside(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, Beside]:
     """The case under each compiled controller, by precision, beside the case under JAX's."""
     given: Any = system_of(case.cascade, case.scenario, case.clock)
     host, found = Machines(*machines.values()), {}

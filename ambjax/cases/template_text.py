@@ -91,7 +91,7 @@ settle = 0.5                  # s; from when "settled" metrics count (left out: 
 # disturbance.q_z.shift = {{ uniform = [-0.1, 0.1] }}      # s; start and stop of the pulse together
 # actuator.u_max = {{ choices = [200, 500, 1000] }}        # V; equally likely
 
-# [tune]                      # for 'ambjax-tune': from the gains above to better ones. Each key with its default
+# [tune]                      # for 'ambjax tune': from the gains above to better ones. Each key with its default
 # gains = ["controller.position.c", "controller.position.k"]  # what moves; left out: the gains of the laws, but p
 # bounds.controller.position.c = [1.0, 500.0]  # of one; left out: what plant and theory suggest, see the report; c
 #                             # then ends at a fifth of the sample rate at most, others at 3 times their range or start

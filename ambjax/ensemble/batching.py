@@ -16,8 +16,8 @@ import numpy as np
 from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from ambjax.compiler.fast_path import block_bytes, one_kernel
 from ambjax.control.cascade import Cascade
-from ambjax.numerics.kernel import block_bytes, one_kernel
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method

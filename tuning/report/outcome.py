@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from tuning.objective.members import Members
-from tuning.problem import Problem
-from tuning.report.limits import BROKEN, UNJUDGED, UNVERIFIED, broken, prices
+from tuning.problem import TuningProblem
+from tuning.report.limit_table import BROKEN, UNJUDGED, UNVERIFIED, broken, prices
 
 Facts = dict[str, Any]
 YES, NO = "The tuned gains hold what is asked.", "The tuned gains do NOT hold what is asked:"
@@ -16,7 +16,7 @@ NOBODY = "No held-out member judges the tuned gains (tune.held_out = 0)."
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
+class TuningOutcome:
     """Of the `members` that judge, how many are lost or not decided (`stalled`), and how many may be.
 
     `limits`: the verdict of each limit by name, as in the report's table. `refuted`: why accurate steps do not confirm
@@ -63,22 +63,22 @@ class Outcome:
         return dataclasses.asdict(self) | {"good": self.good, "rotors_held": self.rotors_held, "against": self.against}
 
 
-def outcome_of(facts: Facts, may_lose: int) -> Outcome:
+def outcome_of(facts: Facts, may_lose: int) -> TuningOutcome:
     """The outcome of a search's facts: by the held-out members, or by those in training where there are none.
 
     `may_lose`: how many of the held-out members may be lost; of the others, none.
     """
     after, limits = facts["after"], {row["name"]: row["verdict"] for row in facts["limits"]}
     if not after["members"]:
-        return Outcome(facts["trained_on"], facts["lost_in_training"], 0, 0, limits, facts["refuted"])
-    return Outcome(after["members"], after["lost"], after["stalled"], may_lose, limits, facts["refuted"])
+        return TuningOutcome(facts["trained_on"], facts["lost_in_training"], 0, 0, limits, facts["refuted"])
+    return TuningOutcome(after["members"], after["lost"], after["stalled"], may_lose, limits, facts["refuted"])
 
 
-def verdict(facts: Facts, outcome: Outcome) -> str:
+def verdict(facts: Facts, outcome: TuningOutcome) -> str:
     """The answer, and what became of the members that judge, in a few sentences."""
     unjudged = [name for name, found in outcome.limits.items() if found == UNJUDGED]
     answer = f"{NO} {'; '.join(outcome.against)}." if not outcome.good else NOBODY if unjudged else YES
-    words = [answer, _fates(facts)]
+    words = [answer, _statuses(facts)]
     if outcome.refuted:
         words.append(f"That is {UNVERIFIED.upper()}: {outcome.refuted}.")
     words += [f"{line}." for line in [*broken(facts["limits"]), *prices(facts["limits"])]]
@@ -90,7 +90,7 @@ def verdict(facts: Facts, outcome: Outcome) -> str:
     return " ".join(words)
 
 
-def _fates(facts: Facts) -> str:
+def _statuses(facts: Facts) -> str:
     before, after = facts["before"], facts["after"]
     if not after["members"]:
         return f"{facts['lost_in_training']} members of the training ensemble are lost under the tuned gains."
@@ -110,7 +110,7 @@ def _largest(summary: Facts) -> str:
     return f", largest {summary['settled_max_abs_error_m']:.3g} m" if summary["held"] else ""
 
 
-def advice(problem: Problem, facts: Facts, outcome: Outcome, x: np.ndarray, who: Members) -> str:
+def advice(problem: TuningProblem, facts: Facts, outcome: TuningOutcome, x: np.ndarray, who: Members) -> str:
     """Why the gains do not hold what is asked, and what would help, in the order in which it matters; '' if they do."""
     if outcome.good:
         return ""
@@ -130,7 +130,7 @@ def advice(problem: Problem, facts: Facts, outcome: Outcome, x: np.ndarray, who:
     )
 
 
-def _of_the_lost(problem: Problem, facts: Facts, x: np.ndarray, who: Members) -> list[str]:
+def _of_the_lost(problem: TuningProblem, facts: Facts, x: np.ndarray, who: Members) -> list[str]:
     """What is tight where rotors are lost."""
     judged = f"{facts['after']['lost']} of {facts['after']['members']} held-out members, " * bool(
         facts["after"]["members"]
