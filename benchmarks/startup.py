@@ -36,7 +36,7 @@ def main() -> None:
         commands = {
             "import jax": [sys.executable, "-c", "import jax"],
             "ambjax --version": [*ambjax, "--version"],
-            "ambjax tune --version": [sys.executable, "-m", "tuning", "--version"],
+            "ambjax-tune --version": [sys.executable, "-m", "tuning", "--version"],
             "ambjax check": [*ambjax, "check", str(case)],
             "ambjax simulate": [*ambjax, "simulate", str(case), "--out", folder],
         }

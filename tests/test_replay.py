@@ -27,6 +27,7 @@ from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
 from ambjax.simulation.metrics import Named, Variation, standard_for
+from tuning.__main__ import parser as tuner
 
 # 16 kHz, converters of 14 bits, a Kalman observer, signs without a layer, a plant off by up to 10 %.
 CHANGES = {
@@ -383,7 +384,9 @@ def test_commands_in_files_are_commands(words, capsys):
     for line in found:
         _, command, *rest = shlex.split(line)
         case = [] if command == "template" else ["case.toml"]
-        parser().parse_args([command, *case, *(word for word in rest if word != "CASE.toml")])
+        parse = tuner() if command == "tune" else parser()
+        words = [*([] if command == "tune" else [command]), *case, *(word for word in rest if word != "CASE.toml")]
+        parse.parse_args(words)
 
 
 def test_a_case_in_which_nothing_differs_is_replayed_as_it_is(capsys, monkeypatch):

@@ -18,7 +18,7 @@ from tuning.judge import NEGLIGIBLE, StepError, compared, step_error, words, wor
 from tuning.optimisers import Retreat
 from tuning.problem import REFERENCE_MEMBERS
 from tuning.search.descent import Starts
-from tuning.search.optimise import Progress
+from tuning.search.keeper import SearchState
 from tuning.search.rounds import LOUDER, MOST_HALVINGS, _joining, finer, rounds
 
 ROTOR = (pathlib.Path(__file__).parent / "cases" / "rotor.toml").read_text()
@@ -148,7 +148,7 @@ def searched(engine, goal, who, points, **rest):
     x, value = np.array(points[:count]), np.arange(float(count)) / 100
     starts = Starts(x, Retreat(x, value, None), value, value)
     rows = {"x": [x], "value": [value], "lost": [np.zeros(count)], "members": [np.array(len(who.member))]}
-    return Progress(starts, np.zeros(count, bool), rows, iteration=1)
+    return SearchState(starts, np.zeros(count, bool), rows, iteration=1)
 
 
 @pytest.fixture

@@ -107,6 +107,13 @@ def options() -> dict[str, Any] | None:
     return None
 
 
+def _step(y: Any, lib: Any) -> Any:
+    """One turn of the probe's loop, computed with the functions of `lib` (numpy or jax.numpy)."""
+    turn = y - lib.round(y)
+    rational = turn * (1 + 0.7 * turn * turn) / (1 + turn * turn * (0.9 + 0.1 * turn * turn))
+    return y + rational + lib.where(y > 1, 1 / y, y) / lib.sqrt(lib.sqrt(y * y + 0.25))
+
+
 def _probe(trial: dict[str, Any]) -> str:
     """What is wrong with the mark and these options; empty if they work and change no result.
 
@@ -114,17 +121,12 @@ def _probe(trial: dict[str, Any]) -> str:
     for vectors and a remainder, and compares it with NumPy.
     """
 
-    def step(y: Any, lib: Any) -> Any:
-        turn = y - lib.round(y)
-        rational = turn * (1 + 0.7 * turn * turn) / (1 + turn * turn * (0.9 + 0.1 * turn * turn))
-        return y + rational + lib.where(y > 1, 1 / y, y) / lib.sqrt(lib.sqrt(y * y + 0.25))
-
     def body(_: Any, y: jax.Array) -> jax.Array:
-        return step(y, jnp)
+        return _step(y, jnp)
 
     def expected(y: np.ndarray) -> np.ndarray:
         for _ in range(3):
-            y = step(y, np)
+            y = _step(y, np)
         return y
 
     try:
