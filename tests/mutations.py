@@ -181,8 +181,8 @@ LOOP = [
     M(
         "the sliding step ignores the supply's limit",
         "ambjax/simulation/sliding.py",
-        "u = jnp.clip(u, -scenario.u_max, scenario.u_max)",
-        "u = jnp.clip(u, -1e9, 1e9)",
+        "u = limited(u, scenario.u_max)",
+        "u = limited(u, 1e9)",
         "tests/test_sliding.py::test_stiff_gains_under_held_noise_agree_with_error_control",
     ),
     M(
@@ -1370,8 +1370,8 @@ CHECK = [
     M(
         "the run without noise is with it",
         "ambjax/theorem/sampled_report.py",
-        "quiet = _without_noise(scenario)",
-        "quiet = scenario",
+        "cascade.on_processor(), _without_noise(scenario)",
+        "cascade.on_processor(), scenario",
         "tests/test_check_processor.py::test_noise_disturbs_and_its_lines_stand_beside_those_without",
     ),
     M(

@@ -11,7 +11,7 @@ from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
-from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
+from ambjax.numerics.smooth import TWO_OVER_PI, limited, smooth_sign
 from ambjax.world.plant import Plant
 
 
@@ -94,7 +94,7 @@ class ProportionalIntegral:
     def __call__(self, model: Plant, inputs: CurrentInputs, state: Array) -> tuple[Array, Array]:
         error = inputs.demand.i_ref - inputs.measured.i
         u = self.k_p * error + model.L * inputs.demand.i_ref_dot + state
-        excess = jnp.clip(u, -inputs.u_max, inputs.u_max) - u
+        excess = limited(u, inputs.u_max) - u
         return u, self.k_int * error + self.k_aw * excess
 
     def ranges(self, site: SearchContext) -> dict[str, Interval]:

@@ -20,10 +20,8 @@ from ambjax.compiler.fast_path import block_bytes, one_kernel
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import Fold
-from ambjax.simulation.rollout import Outcome, System, check_inputs, run
-from ambjax.simulation.sampled import system_of
+from ambjax.simulation.rollout import Outcome, System, prepare, run
 from ambjax.world.scenario import Scenario
 
 MOST_CALL = 4096
@@ -56,9 +54,7 @@ def run_ensemble(
 
     Raises ValueError as `rollout` does, and where the lengths of two leaves differ.
     """
-    check_inputs(cascade, scenario, clock)
-    clock = with_method(clock, cascade, scenario)
-    tree = canonical((system_of(cascade, scenario, clock), clock, fold))
+    tree = canonical((*prepare(cascade, scenario, clock), fold))
     return map_members(_rollout(every), tree, threads=threads, call=call)
 
 

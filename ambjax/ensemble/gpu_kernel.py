@@ -20,9 +20,8 @@ from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import RK4
 from ambjax.simulation.loop import Realised
-from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import Fold
-from ambjax.simulation.rollout import Outcome, check_inputs, run
+from ambjax.simulation.rollout import Outcome, prepare, run
 from ambjax.world.scenario import Scenario
 
 # One member per thread, 32 threads to a warp.
@@ -47,8 +46,7 @@ def run_whole(
 
     Raises ValueError as `run_ensemble` does, and for another method, a processor or a wrong block.
     """
-    check_inputs(cascade, scenario, clock)
-    clock = with_method(clock, cascade, scenario)
+    _, clock = prepare(cascade, scenario, clock)
     if not isinstance(clock.method, RK4):
         raise ValueError(f"clock.method = {clock.method}: the whole-rollout kernel integrates with RK4 only.")
     if cascade.processor is not None:

@@ -20,10 +20,8 @@ from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import Fold, standard_for
-from ambjax.simulation.rollout import Outcome, RolloutState, System, begin, check_inputs, finish, stretch
-from ambjax.simulation.sampled import system_of
+from ambjax.simulation.rollout import Outcome, RolloutState, System, begin, finish, prepare, stretch
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.scenario import Scenario
 
@@ -65,9 +63,8 @@ def record(
 
     Raises ValueError as `rollout` does.
     """
-    check_inputs(cascade, scenario, clock)
-    clock = with_method(clock, cascade, scenario)
-    return record_system(system_of(cascade, as_member(scenario), clock), clock, fold=fold, tell=tell)
+    system, clock = prepare(cascade, as_member(scenario), clock)
+    return record_system(system, clock, fold=fold, tell=tell)
 
 
 def record_system(

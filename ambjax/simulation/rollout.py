@@ -13,9 +13,10 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import Scalar, canonical, validate
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.integrate import Advanced, InitialValueProblem, choose
+from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import Ending, Fold
-from ambjax.simulation.sampled import check_parts, system_of
+from ambjax.simulation.sampled import Sampled, check_parts, system_of
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import ALIVE, Trajectory, first_time
 from ambjax.world.scenario import Scenario
@@ -75,10 +76,18 @@ def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | 
     Raises ValueError for a bad gain, parameter or clock, for an explicit step beyond its stability
     limit, and where the method is to be chosen but gains are traced (choose it outside: `with_method`).
     """
+    loop, clock, fold = canonical((*prepare(cascade, scenario, clock), fold))
+    return roll(loop, clock, fold, every=every)
+
+
+def prepare(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[ClosedLoop | Sampled, Clock]:
+    """Check a case, choose the method of a clock that has none, and return the system to roll out and its clock.
+
+    Raises ValueError as `rollout` does.
+    """
     check_inputs(cascade, scenario, clock)
     clock = with_method(clock, cascade, scenario)
-    loop, clock, fold = canonical((system_of(cascade, scenario, clock), clock, fold))
-    return roll(loop, clock, fold, every=every)
+    return system_of(cascade, scenario, clock), clock
 
 
 def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:

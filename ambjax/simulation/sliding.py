@@ -21,6 +21,7 @@ from ambjax.control import answers
 from ambjax.control.cascade import Cascade
 from ambjax.control.laws import CurrentDemand, CurrentInputs
 from ambjax.numerics.records import Scalar
+from ambjax.numerics.smooth import limited
 from ambjax.simulation.span import Instant, Span
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import State
@@ -53,7 +54,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
         def rate_of(i: Array) -> tuple[Array, Any]:
             inputs = CurrentInputs(estimate._replace(i=i + errors.i), CurrentDemand(i_ref, rate), scenario.u_max)
             u, inner_rate = cascade.current(model, inputs, inner)
-            u = jnp.clip(u, -scenario.u_max, scenario.u_max)
+            u = limited(u, scenario.u_max)
             return scenario.plant.i_dot(plant.z, plant.z_dot, i, u, q_i), (inner_rate, u)
 
         i_dot, slope, (inner_rate, u) = jax.jvp(rate_of, (plant.i,), (jnp.ones_like(plant.i),), has_aux=True)
@@ -102,7 +103,7 @@ class _Voltage(NamedTuple):
 
     def end(self, u_max: Scalar) -> Array:
         """u at the end, V."""
-        return jnp.clip(self.u - self.off * self.x * self.phi, -u_max, u_max)
+        return limited(self.u - self.off * self.x * self.phi, u_max)
 
     def moments(self) -> tuple[Array, Array]:
         """Means of u, V, and of u^2, V^2."""

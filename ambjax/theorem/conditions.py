@@ -18,10 +18,8 @@ from ambjax.control import answers
 from ambjax.control.cascade import USUAL, Cascade
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.loop import ClosedLoop
-from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import Lowest, Named, Peak
-from ambjax.simulation.rollout import check_inputs, roll
+from ambjax.simulation.rollout import check_inputs, prepare, roll
 from ambjax.simulation.trajectory import STALLED, STATUSES
 from ambjax.theorem.proof import Monitored
 from ambjax.world.plant import Plant
@@ -127,9 +125,10 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock) -> Report:
     if cascade.processor is not None:
         cascade, clock = cascade.in_continuous_time(), dataclasses.replace(clock, method=None)
         scenario = scenario.in_continuous_time()
-    clock = with_method(clock, cascade, scenario)
+    loop: Any
+    loop, clock = prepare(cascade, scenario, clock)
     method = str(clock.method)
-    system, clock, fold = canonical((Monitored(ClosedLoop(cascade, scenario)), clock, MONITORS))
+    system, clock, fold = canonical((Monitored(loop), clock, MONITORS))
     trajectory, extremes = roll(system, clock, fold, every=0)
     worst = {name: (float(value), float(at)) for name, (value, at) in extremes.items()}
     on_reference = delta_1_on_reference(cascade, scenario, clock)

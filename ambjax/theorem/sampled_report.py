@@ -18,8 +18,7 @@ from ambjax.control.cascade import Cascade, CascadeState
 from ambjax.control.sampling import Sampling, band, disturbance, slope_limits
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.method import with_method
-from ambjax.simulation.rollout import Outcome, check_inputs, roll
+from ambjax.simulation.rollout import Outcome, prepare, roll
 from ambjax.simulation.sampled import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
 from ambjax.theorem.watched import Watched
@@ -149,11 +148,10 @@ def check(
     `run` simulates: `ensemble.replay.record_system` has the rounding of `ambjax simulate`. Raises ValueError as
     `rollout` does.
     """
-    check_inputs(cascade, scenario, clock)
-    cascade, clock = cascade.on_processor(), with_method(clock, cascade, scenario)
-    quiet = _without_noise(scenario)
-    outcome = _watched(cascade, scenario, clock, run)
-    calm = outcome if quiet is scenario else _watched(cascade, quiet, clock, run)
+    loop, clock = prepare(cascade, scenario, clock)
+    cascade, quiet = cascade.on_processor(), _without_noise(scenario)
+    outcome = _watched(loop, clock, run)
+    calm = outcome if quiet is scenario else _watched(system_of(cascade, quiet, clock), clock, run)
     runs = [(calm, False)] if calm is outcome else [(calm, False), (outcome, True)]
     settled = min(round(settle / float(clock.sample_period)), max(clock.samples - 2, 0))
     lasting = [(one.rows, noise) for one, noise in runs if np.isinf(one.lost_at)]
@@ -171,9 +169,8 @@ def check(
     )
 
 
-def _watched(cascade: Cascade, scenario: Scenario, clock: Clock, run: Callable[[Any, Clock], Outcome]) -> Trajectory:
+def _watched(loop: Any, clock: Clock, run: Callable[[Any, Clock], Outcome]) -> Trajectory:
     """A run whose rows are those of `Watched`."""
-    loop: Any = system_of(cascade, scenario, clock)
     return run(Watched(loop), clock).trajectory
 
 
