@@ -1,6 +1,6 @@
-"""The cascade: observer, position, inversion and current law in a row, around a nominal plant.
+"""The cascade: an observer, a position law, an inversion law and a current law in series, with a nominal plant.
 
-Its modularity is the paper's first contribution: any law of a stage may stand with any of the others.
+Each stage may take any of its laws, independently of the other stages (the paper's first contribution).
 """
 
 import dataclasses
@@ -40,7 +40,7 @@ class CascadeState(NamedTuple):
 
 
 class Command(NamedTuple):
-    """What the cascade decides, stage by stage: A^2/m^2, A^2/m^2, A, A/s, V (before the supply's limit)."""
+    """Outputs of the stages: v_star and v_tilde (A^2/m^2), i_ref (A), i_ref_dot (A/s), u (V, before the limit)."""
 
     v_star: Array
     v_tilde: Array
@@ -50,8 +50,11 @@ class Command(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What a cascade on a processor meets at a sample: reference where its voltage takes effect, period in s, the
-    supply's limit and the voltages of the sample before and of the one before that, V."""
+    """Inputs of a cascade on a processor at a sample, apart from the measurement.
+
+    `reference`: at the instant from which the voltage of this sample acts. `period`: s. `u_max`: limit of the supply,
+    V. `past`: voltages of the last sample and of the one before it, V.
+    """
 
     reference: Reference
     period: Scalar
@@ -59,9 +62,9 @@ class Sample(NamedTuple):
     past: tuple[Array, Array]
 
 
-# A law that is left out: made for the model once, when the cascade is.
+# Marks a law that is left out. `Cascade.__post_init__` replaces it by the default law.
 _LEFT_OUT: Any = None
-# The law of each stage that stands in a cascade unless another is named.
+# The default law of each stage.
 USUAL = {
     "observer": observer.Direct,
     "position": position.SlidingMode,
@@ -72,11 +75,12 @@ USUAL = {
 
 @record
 class Cascade:
-    """The controller. `model` is the plant it believes in; the true one lives in the Scenario.
+    """The controller: four laws, the nominal plant `model`, and the processor.
 
-    A law left out is the paper's, with the gains of Table 2 and a p that suits the model (`answers.default_law`): 25
-    for the plant of Table 1. Laws are made once: `dataclasses.replace` with another model keeps those that are there.
-    `processor`: what the cascade runs on; None: continuous time, as in the paper.
+    The laws compute with `model`; the true plant is `Scenario.plant`. A law left out is the paper's, with the gains of
+    Table 2 and a steepness p scaled to the model (`answers.default_law`; 25 for the plant of Table 1).
+    `dataclasses.replace` with another model keeps the existing laws. `processor` is None in continuous time, as in the
+    paper.
     """
 
     observer: Observer = _LEFT_OUT
@@ -92,7 +96,7 @@ class Cascade:
                 object.__setattr__(self, stage, answers.default_law(kind, self.model))
 
     def init(self, measured: Measurement) -> CascadeState:
-        """States of all laws at t = 0, in continuous time or on the processor."""
+        """Return the states of all laws at t = 0, in continuous time or on the processor."""
         rest = self.position, self.inversion, self.current
         if self.processor is None:
             states = [law.init(self.model) for law in rest]
@@ -101,17 +105,17 @@ class Cascade:
         return CascadeState(self.observer.init(self.model, measured), *states)
 
     def scale(self) -> CascadeState:
-        """Size that matters of each number of the laws' states."""
+        """Return the characteristic size of each number of the laws' states; integration errors are relative to it."""
         if self.processor is None:
             return CascadeState(*(law.scale(self.model) for law in self.laws))
         return CascadeState(*(answers.scale_sampled(law, self.model) for law in self.laws))
 
     def layer(self) -> CascadeState:
-        """The largest error with which each state stays where a smoothed sign turns."""
+        """Return, for each state, the largest integration error that keeps it inside the layer of a smoothed sign."""
         return CascadeState(*(answers.layer(law, self.model) for law in self.laws))
 
     def slopes(self) -> dict[str, Scalar]:
-        """The steepest rate of each law by stage, 1/s."""
+        """Return the largest slope of each law (1/s) by stage."""
         return {stage: law.slope(self.model) for stage, law in zip(CascadeState._fields, self.laws, strict=True)}
 
     @property
@@ -122,17 +126,17 @@ class Cascade:
     def demand(
         self, measured: Measurement, state: CascadeState, reference: Reference
     ) -> tuple[ForceDemand, Measurement, CascadeState]:
-        """The force wanted, the estimate it is wanted for, and the rates of observer and position law.
+        """Return the demanded force, the estimate it was computed from, and the rates of observer and position law.
 
-        The rates of z and v_star are derivatives along (reference, z_dot, nominal z_ddot, law states): what
-        a law that inverts statically needs for i_ref'. Unused, they are never computed. Where the velocity is
-        estimated it is the estimate that moves so.
+        The rates of z and v_star are total derivatives along the reference, z_dot, the nominal z_ddot and the law
+        states. An inversion law without a state needs them for i_ref'; XLA removes them where they are unused. If the
+        observer estimates the velocity, the derivative is taken along the estimate.
         """
 
         def wanted(reference: Reference, z: Array, z_dot: Array, observed: State, positioned: State):
             estimate, observed_rate = self.observer(self.model, Measurement(z, z_dot, measured.i), observed)
             if answers.estimates_velocity(self.observer):
-                # XLA's compiler aborts on a one-kernel rollout (`numerics.kernel`) in which nothing reads z_dot
+                # XLA aborts when it compiles a one-kernel rollout (`compiler.fast_path`) in which z_dot is unused
                 estimate = estimate._replace(z_dot=estimate.z_dot + 0.0 * z_dot)
             v_star, positioned_rate = self.position(self.model, (estimate, reference), positioned)
             return (estimate.z, v_star), (estimate, observed_rate, positioned_rate)
@@ -151,15 +155,17 @@ class Cascade:
         return ForceDemand(z, z_rate, v_star, v_star_rate, gaps), estimate, rates
 
     def on_processor(self, *delays: Scalar, between: bool = False) -> "Cascade":
-        """The cascade with everything settled that decides which program is compiled for it: signs whose steepness is
-        inf become set-valued, and its processor is ready for `delays` (samples) too, or for all `between` them. Raises
-        as `Processor.resolved`."""
+        """Return the cascade with all choices made that determine its compiled program.
+
+        A sign with steepness inf becomes set-valued. The processor also admits `delays` (samples), or with `between`
+        every delay between them. Raises ValueError as `Processor.resolved` does.
+        """
         assert self.processor is not None
         laws = {stage: answers.hardened(getattr(self, stage)) for stage in USUAL}
         return dataclasses.replace(self, **laws, processor=self.processor.resolved(*delays, between=between))
 
     def check_smooth(self) -> None:
-        """Raise ValueError for a sign without a layer, which continuous time does not know."""
+        """Raise ValueError for a steepness of inf: in continuous time a sign must be smoothed."""
         for stage in USUAL:
             law = getattr(self, stage)
             for name in answers.hard_signs(law):
@@ -169,18 +175,21 @@ class Cascade:
                 )
 
     def in_continuous_time(self) -> "Cascade":
-        """The cascade without its processor; signs without a layer get the steepness that suits the model."""
+        """Return the cascade without its processor; a steepness of inf becomes the default one for the model."""
         laws = {stage: answers.softened(getattr(self, stage), self.model) for stage in USUAL}
         return dataclasses.replace(self, **laws, processor=None)
 
     def _advance(self, sample: Sample) -> Callable[..., Any]:
-        """`stepped` on this cascade's processor."""
+        """Return `laws.stepped` with the model, the period and the discretisation of this cascade."""
         implicit = self.processor is not None and self.processor.implicit
         return functools.partial(stepped, model=self.model, period=sample.period, implicit=implicit)
 
     def estimate(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State, Measurement]:
-        """What the laws act on at a sample, carried over the delay if that is predicted; the observer's next state; and
-        its estimate at the sample itself. `state`: the observer's."""
+        """Run the observer for one sample.
+
+        `state` is the observer's. Returns the estimate for the other laws (with prediction: at the end of the delay),
+        the observer's next state, and the estimate at the sample itself.
+        """
         processor: Any = self.processor
         now, state = self._advance(sample)(self.observer, measured, state)
         estimate = now
@@ -191,9 +200,9 @@ class Cascade:
     def step(
         self, measured: Measurement, state: CascadeState, sample: Sample
     ) -> tuple[Command, CascadeState, Measurement]:
-        """Command of one sample on a processor, states of the laws for the next one, and the observer's estimate.
+        """Return the command of one sample on a processor, the laws' next states, and the observer's estimate.
 
-        With prediction all but the observer act on the estimate carried over the delay.
+        With prediction, all laws but the observer use the estimate at the end of the delay.
         """
         advance = self._advance(sample)
 
@@ -204,7 +213,7 @@ class Cascade:
 
         point = (sample.reference, measured.z, measured.z_dot, state.observer, state.position)
         (z, v_star), (now, estimate, observed, positioned) = wanted(*point)
-        # what a law that inverts statically needs for i_ref'; unused, it is never computed
+        # an inversion law without a state needs the rates for i_ref'; XLA removes them where they are unused
         z_ddot = self.model.z_ddot(estimate.z, estimate.i)
         rates = jax.tree.map(
             lambda a, b: (b - a) / sample.period, (state.observer, state.position), (observed, positioned)
@@ -226,7 +235,7 @@ class Cascade:
     def __call__(
         self, measured: Measurement, state: CascadeState, reference: Reference, u_max: Scalar
     ) -> tuple[Command, CascadeState]:
-        """Command and rate of every law's state. `u_max` is the supply's limit in V (inf: none)."""
+        """Return the command and the rate of every law's state. `u_max`: limit of the supply, V (inf: none)."""
         force, estimate, rates = self.demand(measured, state, reference)
         wanted, inversion_rate = self.inversion(self.model, force, state.inversion)
         u, current_rate = self.current(self.model, CurrentInputs(estimate, wanted, u_max, force.gaps), state.current)
@@ -238,7 +247,7 @@ class Cascade:
 def _rates(
     law: Any, estimate: Measurement, z_ddot: Array, reference: Reference, state: State, rate: State
 ) -> tuple[Array, Array]:
-    """Rates of z and of a position law's v_star where the estimate itself moves, by its velocity and with z_ddot."""
+    """Return the rates of z and v_star along an estimate that moves with its own velocity and with z_ddot."""
 
     def v_star(reference: Reference, z: Array, z_dot: Array, state: State) -> Array:
         return law((Measurement(z, z_dot, estimate.i), reference), state)[0]

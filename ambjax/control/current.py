@@ -1,4 +1,4 @@
-"""Current laws: which voltage drives the current to its reference."""
+"""Current laws: the voltage that drives the current to its reference."""
 
 from typing import ClassVar
 
@@ -44,7 +44,7 @@ class SlidingMode:
         return self._voltage(model, inputs, self.robust(inputs.measured.i - inputs.demand.i_ref)), ()
 
     def step(self, model: Plant, inputs: CurrentInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
-        """The sign is that of i - i_ref at the step's end."""
+        """Step with the sign of i - i_ref at the end of the step."""
         e = inputs.measured.i - inputs.demand.i_ref
         return self._voltage(model, inputs, -self.k_i * share(e, period * self.k_i, self.p)), ()
 
@@ -72,9 +72,9 @@ class SlidingMode:
 class ProportionalIntegral:
     """u = k_p (i_ref - i) + L i_ref' + x, x' = k_int (i_ref - i) + k_aw (clip(u) - u): x in V.
 
-    The linear baseline: inductance taken at z = 0, no motional term. While the supply limits u the
-    integral is led back at rate k_aw (back-calculation; Astrom and Murray, Feedback Systems, 2008, 10.4).
-    The defaults hold the paper's tracking scenario; without the motional term, gains much lower do not.
+    The linear baseline: the inductance is that at z = 0, and there is no motional term. While the supply limits u,
+    back-calculation drives the integral back at the rate k_aw (Astrom and Murray, Feedback Systems, 2008, 10.4).
+    With the default gains the rotor survives the paper's tracking scenario; with much lower ones it is lost.
     """
 
     k_p: Scalar = gain(default=3e5, unit="V/A", doc="proportional gain")

@@ -1,6 +1,6 @@
-"""The guard of a controller on a processor: it refuses readings that the machine cannot give, and predicts them.
+"""The guard of a controller on a processor: refuses impossible readings and replaces them by predictions.
 
-docs/processor.md states the rules, so that a second program can be written from them.
+docs/processor.md defines the rules.
 """
 
 import dataclasses
@@ -15,9 +15,9 @@ from ambjax.world.plant import Plant, State
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement, Sensor
 
-# Bound of simulated noise in standard deviations: `numerics.gaussian.normals` gives no larger number.
+# Largest simulated noise in standard deviations: the bound of `numerics.gaussian.normals`.
 LARGEST_NORMAL = 6.8
-# Limits of the other readings: two gaps in a sample, 100 bias currents.
+# Default limits of velocity (gaps per sample) and current (bias currents).
 GAPS, CURRENTS = 2.0, 100.0
 
 
@@ -26,16 +26,22 @@ def _limit(unit: str, doc: str, least: float = 1e-30) -> Any:
 
 
 class Watch(NamedTuple):
-    """State of a guard: the readings that it expects at the next sample, and the number of samples in a row for which
-    it may still replace a reading: 0 before the first accepted one."""
+    """State of a guard.
+
+    `expected`: predicted readings of the next sample. `left`: number of successive samples for which a reading may
+    still be replaced; 0 before the first accepted reading.
+    """
 
     expected: Measurement
     left: Array
 
 
 class Judged(NamedTuple):
-    """Readings as the laws take them; whether one was refused; whether the laws step, or the safe command holds; and
-    `Watch.left` of the next sample."""
+    """Result of the guard at a sample.
+
+    `reading`: the readings that the laws receive. `refused`: whether a reading was refused. `steps`: whether the laws
+    step; otherwise the command is the safe one. `left`: `Watch.left` of the next sample.
+    """
 
     reading: Measurement
     refused: Array
@@ -45,10 +51,10 @@ class Judged(NamedTuple):
 
 @record
 class Guard:
-    """Refuses a reading that is NaN, beyond its limit, or further from the expected one than the rotor can have moved.
+    """Refuse a reading that is NaN, beyond its limit, or farther from the prediction than the rotor can have moved.
 
-    The nominal model's prediction from the last reading takes its place for up to `samples` samples in a row; then
-    u = 0 until a reading is within its limits. A number left out (None) is derived from the case by `settled`.
+    The nominal model's prediction replaces a refused reading for up to `samples` successive samples. After that u = 0
+    until a reading is within its limits. `settled` derives each number that is left out (None).
     """
 
     z: Scalar | None = _limit("m", "largest |z|; none: clearance times gain, plus offset and largest error")
@@ -74,13 +80,13 @@ class Guard:
 
     @property
     def derived(self) -> bool:
-        """Whether every number is left out: such limits admit all that a sensor without faults can read."""
+        """Whether every number is left out. Derived limits accept every reading of a sensor without faults."""
         return all(getattr(self, field.name) is None for field in dataclasses.fields(type(self)))
 
     def settled(self, model: Plant, scenario: Scenario, period: Scalar, estimated: bool) -> "Guard":
-        """The guard with every number; those left out are derived. `estimated`: the velocity is not measured.
+        """Return the guard with every number set. `estimated`: whether the velocity is estimated, not measured.
 
-        The clearance is that of the scenario, as a share of the gap, in the model. The pole is the model's.
+        The derivation uses the scenario's clearance as a share of the gap, and the gap and pole of `model`.
         """
         sensor = Sensor() if scenario.sensor is None else scenario.sensor
         touchdown, clearance = scenario.touchdown, scenario.touchdown / scenario.plant.s_0 * model.s_0
@@ -99,15 +105,15 @@ class Guard:
         return Guard(**{name: value if own[name] is None else own[name] for name, value in values.items()})
 
     def start(self) -> Watch:
-        """Before the first reading."""
+        """Return the state before the first reading."""
         zero = jnp.zeros(())
         return Watch(Measurement(zero, zero, zero), zero)
 
     def judged(self, model: Plant, measured: Measurement, watch: Watch, period: Scalar, estimated: bool) -> Judged:
-        """What becomes of the readings of a sample."""
+        """Accept or replace the readings of a sample. `period`: s."""
         guard: Any = self  # settled
         (z, _, i), time = watch.expected, (guard.samples - watch.left + 1) * period
-        # one magnet's whole pull at the expected place and current, m/s^2: by so much at most the model's force is off
+        # bound of the model's error in acceleration, m/s^2: the full pull of one magnet at the expected z and i
         share = (model.i_0 + jnp.abs(i)) / (model.s_0 - jnp.abs(z))
         reach = guard.noise + time * (guard.speed + time / 2 * (model.a * share * share))
         near = (jnp.abs(measured.z - z) <= reach) | (watch.left <= 0)
@@ -122,20 +128,20 @@ class Guard:
         return Judged(reading, ~good, good | (watch.left > 0), left)
 
     def refused(self, before: Watch, after: Watch) -> tuple[Array, Array]:
-        """Whether the sample between two states refused a reading, and whether it gave the safe command."""
+        """Return whether the sample between two states refused a reading, and whether it gave the safe command."""
         refused = after.left < jnp.asarray(self.samples)
         return refused, refused & (before.left <= 0)
 
 
 def expected(model: Plant, motion: Measurement, u: Array, period: Scalar) -> Measurement:
-    """Readings a sample later: of this motion (readings; the velocity as estimated), under a mean voltage u (V)."""
+    """Predict the readings of the next sample from `motion` under a mean voltage u (V)."""
     rates = model.rates(State(*motion), u)
     z, z_dot, i = (x + period * rate for x, rate in zip(motion, rates, strict=True))
     return Measurement(z + period * period / 2 * rates.z_dot, z_dot, i)
 
 
 def guarded(cascade: Any, scenario: Scenario, period: Scalar) -> Any:
-    """The cascade with the numbers of its guard settled for a scenario; as it is if it has no guard."""
+    """Return the cascade with the numbers of its guard set for a scenario; unchanged if it has no guard."""
     processor = cascade.processor
     if processor is None or processor.guard is None:
         return cascade

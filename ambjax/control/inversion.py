@@ -1,4 +1,4 @@
-"""Inversion laws: which current gives the force."""
+"""Inversion laws: the reference current for a demanded force."""
 
 from typing import ClassVar, NamedTuple
 
@@ -17,13 +17,13 @@ from ambjax.numerics.relaxation import relaxation
 from ambjax.numerics.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
 from ambjax.world.plant import Plant
 
-# |dv/di| is held at this share of its value at the origin, so that crossing the singular curve C,
-# where Eq. (6) divides by zero, gives a large finite rate; the crossing itself is reported.
+# Lower bound of |dv/di| as a share of its value at the origin. Eq. (6) divides by zero on the singular curve C; with
+# the bound the rate stays finite, and the trajectory reports the crossing.
 GRADIENT_FLOOR = 1e-4
 
 
 def v_and_gradient(model: Plant, inputs: ForceDemand, i_ref: Array) -> tuple[Array, Array]:
-    """v and dv/di at (z, i_ref), the latter kept away from 0."""
+    """Return v and dv/di at (z, i_ref), with |dv/di| bounded from below."""
     v, dv_di = model.v_and_dv_di(inputs.z, i_ref, inputs.gaps)
     return v, away_from_zero(dv_di, GRADIENT_FLOOR * 4 * model.i_0 / model.s_0**2)
 
@@ -59,7 +59,7 @@ class Adaptive:
         return model.v_size
 
     def layer(self, model: Plant) -> Scalar:
-        """A third of the smoothed sign's width in i_ref, A: of what v_tilde = 1/p is worth at z = 0 and i = 0."""
+        """Return a third of the width of the smoothed sign in i_ref (A): v_tilde = 1/p divided by dv/di(0, 0)."""
         return 0.3 / (self.p * model.dv_di(0.0, 0.0))
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:
@@ -81,7 +81,7 @@ class Adaptive:
         return {"gamma": gamma, **steepness(site, "gamma")}
 
     def slide(self, model: Plant, begin: ForceDemand, end: ForceDemand, i_ref: Array, h: Scalar) -> Relaxation:
-        """i_ref over a step: it slides to the sign's layer, and is slaved to v_star from there on. Eq. (14a)."""
+        """Integrate i_ref over a step: at the rate gamma up to the layer of the sign, then along v_star. Eq. (14a)."""
         v_0, gradient_0 = v_and_gradient(model, begin, i_ref)
         v_1, gradient_1 = v_and_gradient(model, end, i_ref)
         w = begin.v_star - v_0
@@ -93,14 +93,14 @@ class Adaptive:
         return Relaxation(sliding / gradient_0, slaved / gradient_1, turn, (w, w_1, w_2))
 
     def step(self, model: Plant, inputs: ForceDemand, state: Array, period: Scalar) -> tuple[CurrentDemand, Array]:
-        """v(z, i_ref) moves towards v_star as the sign at the step's end has it: gamma is its slew rate at most."""
+        """Step v(z, i_ref) towards v_star with the sign at the end of the step; gamma bounds the slew rate."""
         w = materialised(inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0])
         after = model.current_for(inputs.z, inputs.v_star - relax(w, period * self.gamma, self.p))
         return CurrentDemand(state, (after - state) * (1 / period)), after
 
 
 class Held(NamedTuple):
-    """State of `ClosedForm` on a processor: the current reference (A), and 1 once a sample has set it, before 0."""
+    """State of `ClosedForm` on a processor: i_ref (A), and a flag that is 0 before the first sample and 1 after it."""
 
     i_ref: Array
     begun: Array
@@ -108,14 +108,14 @@ class Held(NamedTuple):
 
 @record
 class ClosedForm:
-    """i_ref = the root of v(z, i_ref) = v_star that is continuous at i = 0, and its exact rate. No state.
+    """Static inversion: i_ref is the root of v(z, i_ref) = v_star that is continuous at i = 0, with its exact rate.
 
-    This is the static inversion that the paper argues against (Mouille and Lottin 1992): exact on a
-    known plant, and it passes every jump of v_star (noise) straight to i_ref.
+    The paper argues against this law (Mouille and Lottin 1992): it is exact on a known plant, but passes every jump of
+    v_star, such as noise, directly to i_ref. It has no state in continuous time.
 
-    On a processor it is the adaptive law with gamma = inf: the root found at a sample is the i_ref of the next one, and
-    i_ref' is what leads there in one period. Without that state the current law would correct the step of i_ref
-    that i_ref' has already commanded.
+    On a processor it equals the adaptive law with gamma = inf. The root computed at a sample is the i_ref of the next
+    sample, and i_ref' moves i_ref there in one period. Without this state the current law would correct the step of
+    i_ref that i_ref' has already commanded.
     """
 
     memory = (("i_ref", "A", "current reference of the next sample"), ("begun", "1", "1 after the first sample"))
@@ -140,7 +140,7 @@ class ClosedForm:
         return CurrentDemand(*jax.jvp(model.current_for, at, along)), ()
 
     def step(self, model: Plant, inputs: ForceDemand, state: Held, period: Scalar) -> tuple[CurrentDemand, Held]:
-        """i_ref of the sample before, and the rate to the root of this one. The first sample begins at its own root."""
+        """Return the last sample's i_ref and the rate to the root of this one; the first sample uses its own root."""
         after = model.current_for(inputs.z, inputs.v_star)
         i_ref = jnp.where(state.begun > 0.5, state.i_ref, after)
         return CurrentDemand(i_ref, (after - i_ref) * (1 / period)), Held(after, jnp.ones(()))

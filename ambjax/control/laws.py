@@ -1,11 +1,15 @@
-"""What a law is: the inputs, the output and the protocol of each stage.
+"""The inputs, outputs and protocols of the laws of each stage.
 
-A law is a frozen record: its type is the algorithm, its leaves are the gains. `init` gives its
-state at t = 0 and a call gives (output, state_rate); a law without state uses (). `scale` gives,
-for each state, the size that still matters (an integrator's error is measured against it), and
-`slope` the steepest rate of the law in 1/s, from which a step is chosen. `model` is the nominal
-plant: what the controller believes. A law may answer more: `control.answers` lists what. To add a law: one record
-in the file of its stage, one row in `KINDS` of the case-file reader, one row in the conformance test.
+A law is a frozen record: its type is the algorithm, its leaves are the gains. Every law has these methods, where
+`model` is the nominal plant:
+
+- `init(model)`: the state at t = 0; a law without a state returns ().
+- `law(model, inputs, state)`: the output and the rate of the state.
+- `scale(model)`: the characteristic size of each state; integration errors are relative to it.
+- `slope(model)`: the largest slope of the law, 1/s; the step size is chosen from it.
+
+`control.answers` lists the optional methods. To add a law: write a record in the file of its stage, add a row to
+`KINDS` of the case-file reader, and add a row to the conformance test.
 """
 
 from typing import Any, NamedTuple, Protocol
@@ -24,10 +28,10 @@ State = Any
 
 
 class ForceDemand(NamedTuple):
-    """Input of an inversion law: where the rotor is (m) and the force wanted there (A^2/m^2), with their rates.
+    """Input of an inversion law: estimated position z (m), demanded scaled force v_star (A^2/m^2), and their rates.
 
-    `z_rate` is the rate of the estimate z itself, which an observer may let differ from the velocity. `gaps` are
-    the model's at z, shared between laws where they are known: None asks a law to compute them.
+    `z_rate` is the rate of the estimate z, which may differ from the estimated velocity. `gaps` are the model's gaps
+    at z if they are already computed, else None.
     """
 
     z: Array
@@ -38,14 +42,14 @@ class ForceDemand(NamedTuple):
 
 
 class CurrentDemand(NamedTuple):
-    """Output of an inversion law: the current wanted, in A, and its rate, in A/s."""
+    """Output of an inversion law: the reference current i_ref (A) and its rate i_ref_dot (A/s)."""
 
     i_ref: Array
     i_ref_dot: Array
 
 
 class CurrentInputs(NamedTuple):
-    """Input of a current law: the measurement, the demand, the supply's limit in V, and the model's gaps, if known."""
+    """Input of a current law: the estimate, the demand, the limit of the supply (V), and the model's gaps or None."""
 
     measured: Measurement
     demand: CurrentDemand
@@ -54,10 +58,10 @@ class CurrentInputs(NamedTuple):
 
 
 class Relaxation(NamedTuple):
-    """Output of an inversion law's `slide(model, begin, end, i_ref, h)`: its one state, i_ref, over a step of h s.
+    """Output of `slide(model, begin, end, i_ref, h)` of an inversion law: its state i_ref over a step of h (s).
 
-    Two constant rates, A/s, of which the first ends after `turn`, s; and v_tilde, A^2/m^2, at the start, then and at
-    the end. `begin`, `end`: the ForceDemand at both ends of the step.
+    `begin` and `end` are the ForceDemand at both ends of the step. i_ref moves at the rate `first` (A/s) up to the time
+    `turn` (s), then at the rate `rest` (A/s). `v_tilde` (A^2/m^2): at the start, at `turn` and at the end.
     """
 
     first: Array
@@ -67,7 +71,7 @@ class Relaxation(NamedTuple):
 
 
 class Observer(Protocol):
-    """Measurement in, estimate out."""
+    """Protocol of an observer: returns the estimated motion for a measurement."""
 
     def init(self, model: Plant, measured: Measurement) -> State: ...
     def scale(self, model: Plant) -> State: ...
@@ -76,7 +80,7 @@ class Observer(Protocol):
 
 
 class PositionLaw(Protocol):
-    """Estimate and reference in, scaled force v_star (A^2/m^2) out."""
+    """Protocol of a position law: returns the scaled force v_star (A^2/m^2) for an estimate and a reference."""
 
     def init(self, model: Plant) -> State: ...
     def scale(self, model: Plant) -> State: ...
@@ -86,7 +90,7 @@ class PositionLaw(Protocol):
 
 
 class InversionLaw(Protocol):
-    """Force demand in, current demand out."""
+    """Protocol of an inversion law: returns the demanded current for a demanded force."""
 
     def init(self, model: Plant) -> State: ...
     def scale(self, model: Plant) -> State: ...
@@ -95,7 +99,7 @@ class InversionLaw(Protocol):
 
 
 class CurrentLaw(Protocol):
-    """Current demand in, voltage u (V) out."""
+    """Protocol of a current law: returns the voltage u (V) for a demanded current."""
 
     def init(self, model: Plant) -> State: ...
     def scale(self, model: Plant) -> State: ...
@@ -104,7 +108,7 @@ class CurrentLaw(Protocol):
 
 
 def stepped(law: Any, inputs: Any, state: State, *, model: Plant, period: Scalar, implicit: bool) -> tuple[Any, State]:
-    """Output of a law at a sample, and its state at the next: by its own discrete `step`, else by explicit Euler."""
+    """Return the output of a law at a sample and its next state, by its own `step` or else by explicit Euler."""
     with jax.named_scope(f"law:{type(law).__module__.rpartition('.')[2]}.{type(law).__qualname__}"):
         if answers.has_own_step(law, implicit):
             return law.step(model, inputs, state, period)

@@ -1,4 +1,4 @@
-"""Observers: what the laws are told of the rotor's motion."""
+"""Observers: the estimate of the rotor's motion that the other laws use."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -38,9 +38,10 @@ class Direct:
 
 @record
 class Complementary:
-    """z_hat' = z_dot + l (z_measured - z_hat): the velocity integrated, pulled slowly to the position.
+    """Complementary filter: z_hat' = z_dot + l (z_measured - z_hat).
 
-    Noise of the position sensor is low-passed at l; noise of the velocity is integrated, with memory 1/l.
+    The estimate integrates the velocity and follows the position slowly: it low-passes noise of the position sensor at
+    l (1/s), and integrates noise of the velocity with the time constant 1/l.
     """
 
     l: Scalar = gain(default=10.0, unit="1/s", doc="corner between velocity and position sensor")
@@ -72,10 +73,10 @@ class Complementary:
 
 @record
 class Difference:
-    """z_dot = w (z - z_f), z_f' = w (z - z_f): the position differenced and low-passed at w; z itself passes.
+    """Filtered difference: z_dot = w (z - z_f), z_f' = w (z - z_f). The position z is not filtered.
 
-    On a processor the backward difference (z_n - z_{n-1})/T through the low-pass with the pole exp(-w T): exact on a
-    ramp, late by 1/w. Noise of the position reaches the velocity w times as large.
+    On a processor: the backward difference (z_n - z_{n-1})/T through a low-pass with the pole exp(-w T). It is exact on
+    a ramp, and late by 1/w. Noise of the position appears in the velocity multiplied by w.
     """
 
     w: Scalar = gain(default=2000.0, unit="1/s", doc="corner of the low-pass on the differenced position")
@@ -96,7 +97,7 @@ class Difference:
         return inputs._replace(z_dot=z_dot), z_dot
 
     def step(self, model: Plant, inputs: Measurement, state: Array, period: Scalar) -> tuple[Measurement, Array]:
-        """With z_f+ = exp(-w T) z_f + (1 - exp(-w T)) z, the difference of z_n and z_f filters that of neighbours."""
+        """Step z_f+ = exp(-w T) z_f + (1 - exp(-w T)) z; z_n - z_f is then the low-passed backward difference."""
         z_dot = -jnp.expm1(-self.w * period) / period * (inputs.z - state)
         return inputs._replace(z_dot=z_dot), state + period * z_dot
 
@@ -105,8 +106,11 @@ class Difference:
 
 
 class Predicted(NamedTuple):
-    """State of `Kalman`: position (m), velocity (m/s) and disturbance (m/s^2) estimated for this sample from those
-    before; and the model's acceleration at the last (m/s^2), which continuous time does not need."""
+    """State of `Kalman`: predictions for this sample from the earlier ones.
+
+    Position (m), velocity (m/s), disturbance (m/s^2), and the model's acceleration at the last sample (m/s^2; unused in
+    continuous time).
+    """
 
     z: Array
     z_dot: Array
@@ -116,13 +120,13 @@ class Predicted(NamedTuple):
 
 @record
 class Kalman:
-    """A steady-state Kalman filter: the model driven by the measured current, and a disturbance that it does not know.
+    """Steady-state Kalman filter of the nominal model, driven by the measured current, with an unknown disturbance.
 
     z_hat' = z_dot_hat + 3 w e, z_dot_hat' = z_ddot(z, i) + d_hat + 3 w^2 e, d_hat' = w^3 e, e = z - z_hat, with Eq. (1)
-    at the measured z and i: whatever the gap, errors decay with three equal poles at w (A. J. Krener and A. Isidori,
-    Syst. Control Lett. 3 (1983) 47-52). One gain stands for both covariances: under white noise of intensity S_r
-    (m^2 s; std^2 T on a processor) and a disturbance whose rate is white with S_q (m^2/s^5), the velocity's variance
-    is 7/4 (S_r w^3 + S_q / w^3), least at w = (S_q/S_r)^(1/6), 8 % above the Riccati equation's in rms.
+    at the measured z and i. Errors decay with three equal poles at w, at any z (A. J. Krener and A. Isidori, Syst.
+    Control Lett. 3 (1983) 47-52). The gain w replaces both covariances. For white measurement noise of intensity S_r
+    (m^2 s; std^2 T on a processor) and a disturbance whose rate is white with S_q (m^2/s^5), the variance of the
+    velocity is 7/4 (S_r w^3 + S_q / w^3). It is smallest at w = (S_q/S_r)^(1/6): 8 % in rms above the optimal filter.
     """
 
     w: Scalar = gain(default=800.0, unit="1/s", doc="three equal poles of the estimation error")
@@ -155,11 +159,11 @@ class Kalman:
     def step(
         self, model: Plant, inputs: Measurement, state: Predicted, period: Scalar
     ) -> tuple[Measurement, Predicted]:
-        """The estimate includes this sample; q = exp(-w T) is the triple pole.
+        """Update the estimate with this sample, with the triple pole q = exp(-w T).
 
-        Gains 1 - q^3, 3/2 (1-q)^2 (1+q)/T, (1-q)^3/T^2: the fading-memory filter, least squares that forget (N.
-        Morrison, Introduction to Sequential Smoothing and Prediction, 1969). Between samples the model's
-        acceleration moves linearly: the last one was held, and what it lacked is added here.
+        The gains 1 - q^3, 3/2 (1-q)^2 (1+q)/T and (1-q)^3/T^2 are those of the fading-memory filter (N. Morrison,
+        Introduction to Sequential Smoothing and Prediction, 1969). The model's acceleration is taken as linear between
+        samples: the last step held it constant, and this step adds the difference.
         """
         z_ddot = model.z_ddot(inputs.z, inputs.i)
         more = z_ddot - state.z_ddot
@@ -178,9 +182,10 @@ class Kalman:
 
 @record
 class IRED1:
-    """The robust exact differentiator of order 1, implicit on a processor: z_dot exactly where |z_ddot| <= L.
+    """Robust exact differentiator of order 1: z_dot is exact where |z_ddot| <= L. Implicit on a processor.
 
-    `ambjax.numerics.differentiator` has the equations. z itself passes. In continuous time its sign is smoothed.
+    `ambjax.numerics.differentiator` has the equations. The position z is not filtered. In continuous time the sign is
+    smoothed.
     """
 
     L: Scalar = gain(default=50.0, unit="m/s^2", doc="bound on the acceleration")
@@ -203,7 +208,7 @@ class IRED1:
         return _smooth(self.L, model, inputs, state)
 
     def step(self, model: Plant, inputs: Measurement, state: Any, period: Scalar) -> tuple[Measurement, Any]:
-        """The estimate includes this sample."""
+        """Update the estimate with this sample."""
         return _implicit(self.L, inputs, state, period)
 
     def ranges(self, site: SearchContext) -> dict[str, Interval]:
@@ -212,7 +217,7 @@ class IRED1:
 
 @record
 class IRED2:
-    """The robust exact differentiator of order 2: as that of order 1, with the rate of the acceleration bounded."""
+    """Robust exact differentiator of order 2: as `IRED1`, exact where the rate of the acceleration is bounded by L."""
 
     L: Scalar = gain(default=3e4, unit="m/s^3", doc="bound on the rate of the acceleration")
     estimates_velocity: ClassVar[bool] = True
@@ -234,14 +239,14 @@ class IRED2:
         return _smooth(self.L, model, inputs, state)
 
     def step(self, model: Plant, inputs: Measurement, state: Any, period: Scalar) -> tuple[Measurement, Any]:
-        """The estimate includes this sample."""
+        """Update the estimate with this sample."""
         return _implicit(self.L, inputs, state, period)
 
     def ranges(self, site: SearchContext) -> dict[str, Interval]:
         return {"L": _bound(site, 3)}
 
 
-# The width of the smoothed sign of a differentiator in continuous time, as a share of the gap.
+# Width of the smoothed sign of a differentiator in continuous time, as a share of the gap.
 WIDTH = 1e-6
 
 
@@ -259,7 +264,7 @@ def _implicit(L: Scalar, inputs: Measurement, state: Any, period: Scalar) -> tup
 
 
 def differentiator_scale(model: Plant) -> tuple[Scalar, Scalar, Scalar]:
-    """What still matters of position, velocity and acceleration: m, m/s, m/s^2."""
+    """Return the characteristic sizes of position (m), velocity (m/s) and acceleration (m/s^2)."""
     z, z_dot, _ = model.sizes()
     return z, z_dot, jnp.abs(model.g) / 50 + 1e-3
 

@@ -1,4 +1,4 @@
-"""The processor that a cascade runs on: one step of all laws a sample, its voltage held, late by a delay."""
+"""The processor of a cascade: all laws step once a sample, and the voltage is held from a delay later on."""
 
 import dataclasses
 import math
@@ -14,17 +14,17 @@ from ambjax.numerics.records import Scalar, is_traced, leaf, record, static
 from ambjax.world.plant import Plant, State
 from ambjax.world.sensor import Measurement
 
-# Samples.
+# Largest delay, samples.
 MOST_DELAY = 2.0
 
 
 @record
 class Processor:
-    """How a cascade runs where it is sampled. The period is the clock's.
+    """How a sampled cascade runs. The period T is that of the clock.
 
-    At t_n = n T the sensors are read and every law makes a step; its voltage acts from t_n + delay T until
-    t_{n+1} + delay T; before the first, u = 0. With `predict` the laws act on the estimate carried over the delay by
-    the nominal model, and on the reference of that instant. `assumed` is for a prediction that does not know the delay.
+    At t_n = n T the sensors are read and every law steps. The voltage acts from t_n + delay T to t_{n+1} + delay T;
+    before the first sample acts, u = 0. With `predict` the laws use the nominal model's prediction for the end of the
+    delay and the reference at that instant. `assumed` is the delay of the prediction if it differs from the true one.
     """
 
     delay: Scalar = leaf(
@@ -45,7 +45,7 @@ class Processor:
         doc="delay that the prediction assumes; none: the delay itself",
     )
     guard: Guard | None = Guard()
-    """of the readings; None: every reading is believed"""
+    """guard of the readings; None: every reading is accepted"""
     whole: bool | None = static(default=None, doc="every delay is a whole number of samples; None: to be seen")
     most: int | None = static(default=None, doc="samples that the longest prediction reaches into; None: to be seen")
 
@@ -55,21 +55,20 @@ class Processor:
 
     @property
     def ahead(self) -> Scalar:
-        """Samples over which the estimate is carried where the processor predicts."""
+        """Horizon of the prediction, samples."""
         return self.delay if self.assumed is None else self.assumed
 
     @property
     def predicts(self) -> bool:
-        """Whether the estimate is carried over the delay."""
+        """Whether the laws use a prediction over the delay."""
         return bool(self.resolved().most) if self.predict is None else self.predict
 
     def resolved(self, *others: Scalar, between: bool = False) -> "Processor":
-        """This processor with everything settled that decides which program is compiled; for `others`, delays, too.
+        """Return this processor with all choices made that determine its compiled program.
 
-        `between`: for whatever lies between them as well, which need not be whole samples.
-
-        What was settled before for longer delays stays: a part of an ensemble runs the program of the whole.
-        Raises ValueError where the delay is traced and that was not settled before.
+        The program admits the processor's own delay and the delays `others`; with `between`, also every delay between
+        them. A program that already admits longer delays is kept, so that a part of an ensemble runs the program of
+        the whole ensemble. Raises ValueError if the delay is traced and no choice was made before.
         """
         if is_traced(self.delay):
             if self.most is None:
@@ -85,13 +84,13 @@ class Processor:
         return dataclasses.replace(self, whole=whole, most=most)
 
     def stretches(self, period: Scalar) -> tuple[Array, ...]:
-        """Lengths (s) of the parts of the prediction over which one voltage acts: u_{n-1}, and before it u_{n-2}."""
+        """Return the lengths (s) of the parts of the prediction in which u_{n-1} and, before it, u_{n-2} act."""
         ahead = jnp.asarray(self.ahead)
         return (jnp.minimum(ahead, 1.0) * period, jnp.maximum(ahead - 1.0, 0.0) * period)[: self.most]
 
 
 def carried(model: Plant, estimate: Measurement, past: tuple[Array, Array], lengths: tuple[Array, ...]) -> Measurement:
-    """The estimate after these lengths (s), the last first, under past voltages: one RK4 step of the model each."""
+    """Predict the estimate over these lengths (s), the last first, by one RK4 step of the model for each voltage."""
 
     def rates(x: State, u: Array) -> State:
         return materialised(model.rates(x, u), x)
