@@ -1,4 +1,4 @@
-"""Position laws: which scaled force moves the rotor onto the reference."""
+"""Position laws: the scaled force that moves the rotor onto the reference."""
 
 from typing import ClassVar
 
@@ -17,12 +17,12 @@ from ambjax.world.signals import Reference
 
 
 def sliding_variable(c: Scalar, motion: Measurement, reference: Reference) -> Array:
-    """sigma = e_z_dot + c e_z, in m/s, with e_z = z - r (Section 3.2)."""
+    """Return the sliding variable sigma = e_z_dot + c e_z (m/s), with e_z = z - r (Section 3.2)."""
     return motion.z_dot - reference.r_dot + c * (motion.z - reference.r)
 
 
 def force_for(c: Scalar, model: Plant, motion: Measurement, reference: Reference, robust: Scalar) -> Array:
-    """Scaled force that makes sigma_dot = `robust` (m/s^2) on the nominal plant, undisturbed. Eqs. (4), (5)."""
+    """Return the scaled force (A^2/m^2) that gives sigma_dot = `robust` (m/s^2) on the nominal plant. Eqs. (4), (5)."""
     wanted = -2 * model.k_z / model.m * motion.z - c * (motion.z_dot - reference.r_dot)
     return (wanted + reference.r_ddot + model.g + robust) * (1 / model.a)
 
@@ -70,7 +70,7 @@ class SlidingMode:
         return Relay(self.k, self.p)
 
     def held(self, model: Plant) -> Scalar:
-        """The manifold, along which the force wanted is that of the sample's start."""
+        """Return c: on the manifold the demanded force is that at the start of the sample."""
         return self.c
 
     def ranges(self, site: SearchContext) -> dict[str, Interval]:
@@ -84,7 +84,7 @@ class SlidingMode:
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()], period: Scalar
     ) -> tuple[Array, tuple[()]]:
-        """The sign is that of sigma at the step's end: undisturbed sigma reaches 0 and stays, whatever k."""
+        """Step with the sign of sigma at the end of the step: without disturbance sigma reaches 0 and stays there."""
         motion, reference = inputs
         robust = -self.k * share(self.sigma(motion, reference), period * self.k, self.p)
         return force_for(self.c, model, motion, reference, robust), ()
@@ -135,7 +135,7 @@ class SuperTwisting:
         return force_for(self.c, model, motion, reference, robust), -self.k_2 * smooth_sign(sigma, self.p)
 
     def held(self, model: Plant) -> Scalar:
-        """The manifold, along which the force wanted is that of the sample's start."""
+        """Return c: on the manifold the demanded force is that at the start of the sample."""
         return self.c
 
     def ranges(self, site: SearchContext) -> dict[str, Interval]:
@@ -156,7 +156,7 @@ class SuperTwisting:
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: Array, period: Scalar
     ) -> tuple[Array, Array]:
-        """Both terms at the step's end: R. Seeber and B. Andritsch, Automatica 173 (2025) 112027.
+        """Step with both terms at the end of the step (R. Seeber and B. Andritsch, Automatica 173 (2025) 112027).
 
         The robust term is -k_1 root(y) + 2 w+ - w, y + T k_1 root(y) + T^2 k_2 sgn(y) = sigma.
         """

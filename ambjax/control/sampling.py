@@ -1,8 +1,8 @@
-"""What sampling makes of a sign law: how steep it may be, and the band that is left where it cannot hold zero.
+"""Effects of sampling on a sign law: the largest stable slope, and the band around zero in which the signal stays.
 
-A sign law drives x' = -k sgn_p(x) + w, |w| <= W < k, in steps of T: into a band about 0, and no closer. Explicit steps
-of the sign itself leave |x| <= T (k + W); implicit ones T W (V. Acary and B. Brogliato, Syst. Control Lett. 59 (2010)
-284-293); a smoothed sign adds the x at which it balances W.
+A sign law drives x' = -k sgn_p(x) + w with |w| <= W < k. Steps of length T bring x into a band around 0. Explicit steps
+of the set-valued sign give |x| <= T (k + W), implicit steps |x| <= T W (V. Acary and B. Brogliato, Syst. Control Lett.
+59 (2010) 284-293). A smoothed sign adds the x at which it balances W.
 """
 
 import math
@@ -16,8 +16,7 @@ from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
 
 
 class Sampling(NamedTuple):
-    """How a law is sampled: period (s), samples by which its output acts later than on what it acts, whether signs are
-    implicit."""
+    """Sampling of a law: period (s), delay between its input and the effect of its output (samples), implicit signs."""
 
     period: float
     late: float
@@ -25,22 +24,22 @@ class Sampling(NamedTuple):
 
 
 class SlopeLimits(NamedTuple):
-    """Largest slope times T of a law that is stepped explicitly: for stability, and without oscillation."""
+    """Largest slope times T of an explicitly stepped law: for stability (`stable`), without oscillation (`quiet`)."""
 
     stable: float
     quiet: float
 
 
 def slope_limits(late: float) -> SlopeLimits:
-    """The limits of x_{n+1} = x_n - a x(n - late), 0 <= late <= 2, x between samples on the straight line: a = slope T.
+    """Return the limits of a = slope T in x_{n+1} = x_n - a x(n - late), 0 <= late <= 2.
 
-    2 and 1 without delay, 1 and 1/4 with one sample.
+    x is interpolated linearly between samples. The limits are 2 and 1 without delay, 1 and 1/4 with one sample.
     """
     if late <= 1:
         stable = min(1 / late if late else math.inf, 2 / (1 - 2 * late) if late < 0.5 else math.inf)
         return SlopeLimits(stable, 1 / (1 + math.sqrt(late)) ** 2)
     rest = late - 1
-    # r is a root of r^2 (r - 1) + a ((1 - rest) r + rest); at the largest a of a real one it is double
+    # characteristic polynomial r^2 (r - 1) + a ((1 - rest) r + rest): at the limit its real root r is double
     r = np.linspace(1e-6, 1.0, 20_001)
     quiet = float(np.max(r * r * (1 - r) / ((1 - rest) * r + rest)))
     # Jury: a^2 rest^2 + a < 1
@@ -48,28 +47,31 @@ def slope_limits(late: float) -> SlopeLimits:
 
 
 class Relay(NamedTuple):
-    """A smoothed sign that drives an error, x' = -k sgn_p(x) + w: its gain k (unit of x per s) and steepness p (inverse
-    of that unit; None: the sign itself)."""
+    """A sign that drives an error, x' = -k sgn_p(x) + w.
+
+    `gain`: k, in the unit of x per s. `steepness`: p, in the inverse unit of x; None: the set-valued sign.
+    """
 
     gain: Scalar
     steepness: Scalar | None
 
 
 def disturbance(relay: Relay, x: np.ndarray, period: float, implicit: bool) -> float:
-    """Largest |w| (unit of x per s) of x_{n+1} = x_n - T k s_n + T w_n for the samples x [N], s_n the share of its gain
-    that the relay used."""
+    """Return the largest |w| in x_{n+1} = x_n - T k s_n + T w_n for samples x [N], in the unit of x per s.
+
+    s_n in -1..1 is the value of the relay's sign at sample n.
+    """
     k, p = relay
     used = share(x[:-1], period * k, p) if implicit else smooth_sign(x[:-1], p)
     return float(np.max(np.abs(np.diff(x) / period + k * np.asarray(used)), initial=0.0))
 
 
 def band(relay: Relay, W: float, period: float, implicit: bool) -> float:
-    """A b, in the unit of x, that |x| does not exceed again under a disturbance of its rate up to W; inf where k does
-    not exceed W.
+    """Return an invariant bound b of |x| (unit of x) under a disturbance of its rate up to W; inf if k <= W.
 
-    The same holds of any larger b. Implicit: b = T W + x_W, k sgn_p(x_W) = W, for from |x| <= b the step ends at no
-    more than x_W. Explicit: the same where T k sgn_p is no steeper than 1, so that x does not change sign; else
-    also T (k + W).
+    Implicit steps: b = T W + x_W with k sgn_p(x_W) = W, because a step from |x| <= b ends within x_W before the
+    disturbance acts. Explicit steps: the same if the slope of T k sgn_p is at most 1, so that x does not change sign;
+    otherwise at least T (k + W). Every larger bound is invariant too.
     """
     k, p = float(relay.gain), math.inf if relay.steepness is None else float(relay.steepness)
     if not k > W:

@@ -1,4 +1,4 @@
-"""Where gains are searched: what a law is told of its surroundings, and the usual ways to make a range of them."""
+"""Ranges in which the tuner searches gains: the context that a law receives, and functions that derive a range."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -9,11 +9,11 @@ from ambjax.world.plant import Plant
 
 
 class SearchContext(NamedTuple):
-    """The surroundings of a search: nominal plant, pole w of the true one (1/s), sample period (s).
+    """Context of a search for gains.
 
-    `stepped`: on a processor, by laws whose signs act on the step's end. `bounds`: what Theorem 1 requires gains to
-    exceed, by symbol. `delta_1`: what Eq. (7) asks of the reference or of a
-    fall, whichever is more, A^2/m^2/s, and in words.
+    `model`: nominal plant. `w`: pole of the true plant, 1/s. `period`: sample period, s. `bounds`: lower bounds of
+    Theorem 1 on gains, by symbol (Q_z, Q_i, Delta_1). `delta_1`: the larger of the bounds of Eq. (7) on the reference
+    and in a fall (A^2/m^2/s), and its description. `stepped`: whether the laws run on a processor with implicit signs.
     """
 
     model: Plant
@@ -25,15 +25,15 @@ class SearchContext(NamedTuple):
 
     @property
     def pole(self) -> str:
-        """What w is, in words."""
+        """Description of w."""
         return f"w = {self.w:.3g} 1/s: pole of the unstable plant"
 
 
 class Interval(NamedTuple):
-    """Where a gain is looked for first, log-uniform, and where that comes from, in words.
+    """Log-uniform range of initial values of a gain, and a description of its source.
 
-    `firm`: it may not end beyond, or beyond where it starts. `times`: another gain of the law; low to high is then that
-    of the product of both, which is what matters.
+    `firm`: the tuned gain stays within the range (or at most at its starting value, if that lies outside). `times`:
+    name of another gain of the law; the range is then that of the product of both gains.
     """
 
     low: float
@@ -44,7 +44,7 @@ class Interval(NamedTuple):
 
 
 def manifold(site: SearchContext) -> Interval:
-    """Decay rate on a sliding manifold, 1/s."""
+    """Return the range of a decay rate on a sliding manifold, 1/s."""
     cap = max(1 / (5 * site.period), site.w / 10)
     if cap >= 10 * site.w:
         return Interval(site.w / 30, 10 * site.w, f"w/30 to 10 w, {site.pole}", True)
@@ -53,7 +53,10 @@ def manifold(site: SearchContext) -> Interval:
 
 
 def switch(site: SearchContext, name: str, p: Scalar, times: float, over: str) -> Interval:
-    """A switching gain by the slope 2/pi gain p of its smoothed sign, at least twice the disturbance bound `over`."""
+    """Return the range of a switching gain from the slope 2/pi gain p of its smoothed sign.
+
+    The range starts at twice the bound named `over`, or higher.
+    """
     per, below = TWO_OVER_PI * float(p), site.bounds.get(over, 0.0)
     low, high = site.w / 3 / per, times * site.w / per
     words = f"slope 2/pi {name} p from w/3 to {times:g} w, {site.pole}"
@@ -63,7 +66,10 @@ def switch(site: SearchContext, name: str, p: Scalar, times: float, over: str) -
 
 
 def authority(site: SearchContext, size: Scalar, share: tuple[float, float], what: str, over: str = "") -> Interval:
-    """A switching gain on a processor, where no slope limits it: these shares of `size`, which is `what` in words."""
+    """Return the range of a switching gain on a processor, where no slope limits it.
+
+    `share`: ends of the range as shares of `size`; `what` describes `size`.
+    """
     below = site.bounds.get(over, 0.0)
     low, high = (part * float(size) for part in share)
     words = f"{share[0]:g} to {share[1]:g} of {float(size):.3g}, {what}"
@@ -73,7 +79,7 @@ def authority(site: SearchContext, size: Scalar, share: tuple[float, float], wha
 
 
 def steepness(site: SearchContext, name: str) -> dict[str, Interval]:
-    """The steepness p of a sign on a processor, by its slope with the gain of this name; else nothing is said of it."""
+    """Return the range of the steepness p of a sign with the gain `name`, on a processor; in continuous time none."""
     if not site.stepped:
         return {}
     low, high = (slope / TWO_OVER_PI for slope in (site.w / 3, 10 / site.period))
@@ -82,6 +88,6 @@ def steepness(site: SearchContext, name: str) -> dict[str, Interval]:
 
 
 def rate(site: SearchContext, low: float, high: float, words: str, per: Scalar = 1.0, power: int = 1) -> Interval:
-    """A gain whose rate, gain times `per` (of dimension 1/s to this power), lies from `low` to `high` times w."""
+    """Return the range of a gain for which gain times `per`, in (1/s)^power, is (low w)^power to (high w)^power."""
     first, last = ((share * site.w) ** power / float(per) for share in (low, high))
     return Interval(first, last, f"{words}, {site.pole}")

@@ -1,1 +1,1 @@
-"""The world that a cascade meets: plant, signals, sensors and scenario."""
+"""Everything outside the controller: plants, signals, sensors, amplifier and scenario."""

@@ -1,4 +1,4 @@
-"""The amplifier between the commanded voltage and the coils: how fast, from where on, and up to which current."""
+"""The amplifier between the commanded voltage and the coils: bandwidth, slew rate, dead band and current limit."""
 
 from collections.abc import Callable
 
@@ -11,11 +11,11 @@ from ambjax.numerics.smooth import limited
 
 @record
 class Amplifier:
-    """What an amplifier makes of a voltage that is held: u_a' = w (u - u_a) with w = 2 pi bandwidth, at most `slew`.
+    """Response of an amplifier to a held voltage: u_a' = w (u - u_a), w = 2 pi bandwidth, |u_a'| at most `slew`.
 
-    Then the dead band (of a bridge's dead time) is taken off its size, and at the current limit what would push the
-    current further out is cut to what keeps it, or to the supply's end where the motion asks for more: the current then
-    leaves its limit. What is left out is ideal.
+    The dead band (from the dead time of a bridge) is subtracted from |u_a|. At the current limit, a voltage that would
+    increase |i| is reduced to the voltage that holds i, or to the limit of the supply if that is smaller; |i| then
+    exceeds its limit. A parameter left out is ideal.
     """
 
     bandwidth: Scalar | None = leaf(
@@ -33,21 +33,21 @@ class Amplifier:
 
     @property
     def slow(self) -> bool:
-        """Whether its voltage follows the command with a state of its own."""
+        """Whether the output voltage is a state: bandwidth or slew rate is limited."""
         return self.bandwidth is not None or self.slew is not None
 
     def slope(self) -> Scalar:
-        """The rate w at which its voltage follows, 1/s; 0 if at once."""
+        """The rate w of the output voltage, 1/s; 0 if it follows immediately."""
         return 0.0 if self.bandwidth is None else 2 * jnp.pi * self.bandwidth
 
     def ramp(self, u_a: Array, u: Array) -> Array:
-        """For how long the slew rate limits a voltage u_a on its way to u, s."""
+        """Return the time (s) for which the slew rate limits the voltage on its way from u_a to u."""
         if self.slew is None:
             return jnp.zeros_like(u)
         return jnp.maximum(jnp.abs(u - u_a) / self.slew - self._tail(), 0.0)
 
     def followed(self, u_a: Array, u: Array, time: Scalar) -> Array:
-        """Its voltage after `time` s, u_a (V) before, while u is commanded. Exact."""
+        """Return the output voltage (V) after `time` (s), from u_a (V), under a constant command u (V). Exact."""
         left, ramp = jnp.abs(u_a - u), self.ramp(u_a, u)
         if self.slew is not None:
             left = left - self.slew * jnp.minimum(ramp, time)
@@ -56,13 +56,13 @@ class Amplifier:
         return u + jnp.where(u_a > u, left, -left) * decay
 
     def _tail(self) -> Scalar:
-        """How long the rate of the first order stays below the slew rate, in times of 1/w; s."""
+        """Return the duration (s) of the final first-order part, in which the rate is below the slew rate."""
         return 0.0 if self.bandwidth is None else 1 / self.slope()
 
     def at_coil(self, u_a: Array, i: Array, u_max: Scalar, holding_voltage: Callable[[], Array]) -> Array:
-        """What of its voltage reaches the coils at a current of i (A), V: never beyond the supply's u_max (V).
+        """Return the voltage (V) at the coils for a current i (A), within the supply's u_max (V).
 
-        `holding_voltage`: what would keep that current, V.
+        `holding_voltage`: returns the voltage (V) that holds that current.
         """
         if self.dead_band is not None:
             size = jnp.maximum(jnp.abs(u_a) - self.dead_band, 0.0)

@@ -1,4 +1,4 @@
-"""The bearing: a vertical rotor between two electromagnets, Table 1, Eq. (3), and what any plant of it answers."""
+"""The bearing: a vertical rotor between two electromagnets (Table 1, Eq. (3)), and the protocol of its plants."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -11,13 +11,13 @@ from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.numerics.smooth import refined, safe_sqrt
 from ambjax.world.sensor import Measurement
 
-# A gap is never taken smaller than this share of s_0. No accepted state comes near it (the rotor has
-# touched down long before); it keeps a trial stage of an integrator, and its derivatives, finite.
+# Lower bound of a gap as a share of s_0. Accepted states stay far above it, since the rotor touches down before. It
+# keeps the trial stages of an integrator, and their derivatives, finite.
 GAP_FLOOR = 0.005
 
 
 class Gaps(NamedTuple):
-    """Upper gap, lower gap, and 1 / (upper lower): m, m, 1/m^2. Divisions are what a step's time goes into."""
+    """Upper gap (m), lower gap (m), and 1 / (upper lower) (1/m^2). One division serves all uses: divisions are slow."""
 
     upper: Array
     lower: Array
@@ -30,7 +30,7 @@ class Gaps(NamedTuple):
 
 
 def _product(z: Array, s_0: Array) -> Array:
-    """Product of the gaps, never taken smaller than with GAP_FLOOR."""
+    """Return the product of the gaps, bounded from below by GAP_FLOOR."""
     product, least = s_0 * s_0 - z * z, 2 * GAP_FLOOR * s_0 * s_0
     return jnp.where(product > least, product, least)
 
@@ -38,7 +38,7 @@ def _product(z: Array, s_0: Array) -> Array:
 @jax.custom_jvp
 @compiled_alone
 def _inverse(z: Array, s_0: Array) -> Array:
-    """1 / (upper gap, lower gap): from z, so that the gaps need not be stored for it."""
+    """Return 1 / (upper lower), computed from z so that the gaps need not be stored."""
     return refined(_product(z, s_0))
 
 
@@ -49,7 +49,7 @@ def _inverse_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) ->
 
 
 class Signals(NamedTuple):
-    """What a row shows of a plant beside its motion and current: scaled force (A^2/m^2), copper loss (W)."""
+    """Signals of a plant besides motion and current: scaled force v (A^2/m^2), copper loss (W)."""
 
     v: Array
     heat: Array
@@ -59,8 +59,8 @@ class Signals(NamedTuple):
 class Bearing:
     """Parameters of rotor and magnets, Table 1, and the force of given currents. Scalars of one member, SI units.
 
-    A plant is a record of this kind with a state of its own, a NamedTuple of scalars: it writes `start`, `rates`,
-    `rest`, `scale`, `measurement` and `signals`, and inherits what else is asked of a plant.
+    A plant subclasses this record. Its state is a NamedTuple of scalars. It implements `start`, `rates`, `rest`,
+    `scale`, `measurement` and `signals`, and inherits all else.
 
     Deviation: the paper prints k_z in N m; it is a stiffness, N/m, negative (restoring).
     """
@@ -84,43 +84,42 @@ class Bearing:
     g: Scalar = leaf(default=9.81, unit="m/s^2", at_least=-1e4, at_most=1e4, doc="gravitational acceleration")
 
     lumped: ClassVar[bool] = False
-    """Whether the state is (z, z_dot, i) and i_dot is linear in u, as `Plant`'s: the sliding step is made for that."""
+    """Whether the state is (z, z_dot, i) and i_dot is linear in u, as in `Plant`. The sliding step requires it."""
 
     def start(self, measurement: Measurement) -> Any:
-        """The state with this motion and current."""
+        """Return the state with this motion and current."""
         raise NotImplementedError
 
     def rates(self, state: Any, u: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Any:
-        """Time derivative of the state, of its structure: under a voltage (V) and disturbances (m/s^2, A/s)."""
+        """Return the time derivative of the state under a voltage u (V) and disturbances q_z (m/s^2), q_i (A/s)."""
         raise NotImplementedError
 
     def rest(self, state: Any, z: Scalar) -> Any:
-        """The state in which a lost rotor is frozen: at z, without velocity."""
+        """Return the state in which a lost rotor is frozen: at z (m), with zero velocity."""
         raise NotImplementedError
 
     def scale(self) -> Any:
-        """Size of each component of the state that still matters."""
+        """Return the characteristic size of each component of the state; integration errors are relative to it."""
         raise NotImplementedError
 
     def measurement(self, state: Any) -> Measurement:
-        """What ideal sensors see of the state."""
+        """Return the measurement of ideal sensors."""
         raise NotImplementedError
 
     def signals(self, state: Any) -> Signals:
-        """Force and heat at this state."""
+        """Return the scaled force and the copper loss in this state."""
         raise NotImplementedError
 
     def slope(self) -> Scalar:
-        """The steepest rate of the plant's motion, 1/s, from which a step is chosen."""
+        """The fastest rate of the plant's motion, 1/s; the step size is chosen from it."""
         return self.pole
 
     def coil_slope(self, z: Scalar) -> Scalar:
-        """The steepest rate R / L at which a coil's current settles with the rotor within +-z, 1/s: at the widest gap
-        2 R (s_0 + z) / kappa. Eq. (2)."""
+        """Return the fastest rate R/L of a coil's current (1/s) for |z| at most `z`: 2 R (s_0 + z)/kappa. Eq. (2)."""
         return 2 * self.R * (self.s_0 + z) / self.kappa
 
     def sizes(self) -> Measurement:
-        """What still matters of each measured quantity: 2 % of the gap, that in 0.1 s, 4 % of the bias current."""
+        """Return characteristic sizes of z, z_dot, i: 2 % of the gap, the same per 0.1 s, 4 % of the bias current."""
         offset = self.s_0 / 50
         return Measurement(offset, 10 * offset, self.i_0 / 25)
 
@@ -151,17 +150,17 @@ class Bearing:
 
     @property
     def pole(self) -> Scalar:
-        """Unstable pole of the magnets alone, sqrt(k_s / m), in 1/s: how fast the rotor falls to a side."""
+        """Unstable pole of the magnets alone, sqrt(k_s / m), in 1/s."""
         return (abs(self.k_s) / self.m) ** 0.5
 
     @property
     def sigma_size(self) -> Scalar:
-        """What sigma amounts to here, in m/s: a gap's width at the pole."""
+        """Characteristic size of sigma, in m/s: s_0 times the pole."""
         return self.pole * self.s_0
 
     @property
     def v_size(self) -> Scalar:
-        """What the scaled force amounts to here, in A^2/m^2: that of one magnet at the bias current."""
+        """Characteristic size of the scaled force, in A^2/m^2: that of one magnet at the bias current."""
         return (self.i_0 / self.s_0) * (self.i_0 / self.s_0)
 
     def gaps(self, z: Scalar) -> Gaps:
@@ -186,17 +185,17 @@ class Bearing:
         return self.v_and_dv_di(z, i)[1]
 
     def v_and_dv_di(self, z: Scalar, i: Scalar, gaps: Gaps | None = None) -> tuple[Array, Array]:
-        """v and dv/di at once. `gaps` are those at z, if they are known."""
+        """Return v and dv/di. `gaps` are those at z if they are already computed."""
         gaps = gaps or self.gaps(z)
         along = (self.i_0 * z + self.s_0 * i) * gaps.inverse
         across = (self.i_0 * self.s_0 + i * z) * gaps.inverse
         return 4 * along * across, 4 * gaps.inverse * (self.s_0 * across + z * along)
 
     def current_for(self, z: Scalar, v: Scalar) -> Array:
-        """The current whose scaled force at z is v, in A: the root of Eq. (3) continuous at i = 0.
+        """Return the current (A) with scaled force v at z: the root of Eq. (3) that is continuous at i = 0.
 
-        Written without cancellation, so it is smooth through z = 0, where the quadratic
-        degenerates. Where v has no real root it returns the point of C at that z, whose v is nearest.
+        The formula has no cancellation, so it is smooth through z = 0, where the quadratic degenerates. If v has no
+        real root, the result is the point of C at that z, where v is nearest.
         """
         # all times the square of the gaps' product
         upper, lower, _ = self.gaps(z)
@@ -208,7 +207,7 @@ class Bearing:
         return above / jnp.where(reachable, total + product * safe_sqrt(discriminant), difference)
 
     def equilibrium(self, z: Scalar = 0.0) -> tuple[Array, Array]:
-        """Current (A) and voltage (V) that hold the rotor still at z: z_ddot = i_dot = 0."""
+        """Return the current (A) and voltage (V) at which z_ddot = i_dot = 0 at z."""
         i = self.current_for(z, (self.g - 2 * self.k_z / self.m * z) / self.a)
         return i, self.R * i
 
@@ -224,8 +223,8 @@ class Bearing:
     def distance_to_C(self, z: Scalar, i: Scalar) -> Array:
         """Distance from (z/s_0, i/i_0) to the singular curve C, dimensionless. Eq. (9).
 
-        C in these coordinates is i = -(z + 1/z)/2, two branches. Points are spread over both, and
-        Newton steps on the derivative of the squared distance refine each. The nearest counts.
+        In these coordinates C is i = -(z + 1/z)/2 with two branches. Newton steps on the derivative of the squared
+        distance refine starting points on both branches; the nearest result is returned.
         """
         zeta, iota = jnp.asarray(z) / self.s_0, jnp.asarray(i) / self.i_0
         x = jnp.exp(jnp.linspace(-5.0, 5.0, 41))
@@ -238,6 +237,6 @@ class Bearing:
         return safe_sqrt(jnp.min((x - zeta) ** 2 + (iota + (x + 1 / x) / 2) ** 2))
 
     def signed_distance_to_C(self, z: Scalar, i: Scalar) -> Array:
-        """`distance_to_C`, negative beyond the curve: where `singularity` is negative."""
+        """`distance_to_C` with a sign: negative where `singularity` is negative, beyond the curve."""
         distance = self.distance_to_C(z, i)
         return jnp.where(self.singularity(z, i) > 0, distance, -distance)

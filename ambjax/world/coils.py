@@ -1,4 +1,4 @@
-"""The magnets as they are: two coils with a gap, a flux and a voltage each."""
+"""The two-coil plant: each coil has its own gap, flux and voltage."""
 
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from ambjax.world.sensor import Measurement
 
 
 class Currents(NamedTuple):
-    """Displacement (m), velocity (m/s), and the current of the upper and of the lower coil (A); or their rates."""
+    """State of `TwoCoil`: displacement (m), velocity (m/s), currents of the upper and lower coil (A); or the rates."""
 
     z: Array
     z_dot: Array
@@ -23,9 +23,9 @@ class Currents(NamedTuple):
 class TwoCoil(Bearing):
     """Rotor and magnets with the parameters of Table 1, in the state (z, z_dot, i_1, i_2).
 
-    The upper coil, gap s_0 - z, is under R i_0 + u, the lower one, gap s_0 + z, under R i_0 - u; the measured i is half
-    the difference of their currents. Flux linkage kappa i_1 / (2 (s_0 - z)) of the upper coil changes by u + R (i_0 -
-    i_1), and likewise below. Deviation: Eq. (2) has one current, that of the lower gap.
+    The upper coil (gap s_0 - z) has the voltage R i_0 + u, the lower one (gap s_0 + z) R i_0 - u. The measured i is
+    half the difference of the currents. The flux linkage kappa i_1 / (2 (s_0 - z)) of the upper coil has the rate
+    u + R (i_0 - i_1); the lower coil likewise. Deviation: Eq. (2) has one current, that of the lower gap.
     """
 
     def start(self, measurement: Measurement) -> Currents:
@@ -33,7 +33,7 @@ class TwoCoil(Bearing):
         return Currents(z, z_dot, self.i_0 + i, self.i_0 - i)
 
     def rates(self, state: Currents, u: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Currents:
-        """As the lumped plant's; q_i (A/s) is that of the measured current."""
+        """Return the rates as `Plant.rates` does; q_i (A/s) disturbs the measured current."""
         z, z_dot, i_1, i_2 = state
         gaps = self.gaps(z)
         above, below = gaps.inverses

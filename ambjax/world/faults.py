@@ -1,4 +1,4 @@
-"""Faults of a position sensor on a processor: readings that are far off, and readings that do not come."""
+"""Faults of a position sensor on a processor: outliers and dropouts."""
 
 from typing import Any, NamedTuple
 
@@ -14,14 +14,14 @@ VALUES = ("hold", "nan", "zero", "full-scale")
 
 
 class Struck(NamedTuple):
-    """Faults that begin at a sample: what is added to its reading, m, and whether readings stop."""
+    """Faults that begin at a sample: the number added to its reading (m), and whether a dropout begins."""
 
     outlier: Array
     drops: Array
 
 
 class Sensed(NamedTuple):
-    """State of a faulty sensor: its last reading of z, m, and the samples for which no reading comes any more."""
+    """State of a faulty sensor: its last reading of z (m), and the remaining samples of a dropout."""
 
     z: Array
     left: Array
@@ -39,21 +39,21 @@ def _at() -> Any:
 
 @record
 class Outliers:
-    """Single readings of z that are off by `size`, up or down with equal chances, after the converter."""
+    """Single readings of z with an error of +-`size`, each sign with probability 1/2, after the converter."""
 
     rate: Scalar = _rate()
     size: Scalar = leaf(default=1e-3, unit="m", at_least=0, at_most=1.0, doc="by which a reading is off")
     at: Scalar | None = _at()
 
     def struck(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Array:
-        """What is added to the reading of a sample, m."""
+        """Return the number added to the reading of a sample, m."""
         begins, sign = _begins(self, OUTLIERS, key, sample, period)
         return jnp.where(begins, sign * self.size, 0.0)
 
 
 @record
 class Dropouts:
-    """Stretches of time without a reading of z; `value` is what is read instead.
+    """Intervals without a reading of z. `value` is read instead.
 
     "hold": the last reading; "nan": NaN; "zero": 0 m; "full-scale": the end of the converter.
     """
@@ -66,15 +66,15 @@ class Dropouts:
     value: str = static(default=VALUES[0], doc="what is read meanwhile")
 
     def struck(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Array:
-        """Whether one begins at a sample."""
+        """Return whether a dropout begins at a sample."""
         return _begins(self, DROPOUTS, key, sample, period)[0]
 
     def samples(self, period: Scalar) -> Array:
-        """How many samples one takes."""
+        """Return the number of samples of a dropout."""
         return jnp.maximum(jnp.round(self.duration / period), 1.0)
 
     def read(self, last: Array, end: Scalar) -> Array:
-        """What is read in place of z, m; `end` is the end of the converter."""
+        """Return the reading (m) during a dropout; `end` is the end of the converter's range, m."""
         values = {"hold": last, "nan": jnp.nan, "zero": 0.0, "full-scale": end}
         return jnp.asarray(values[self.value], last.dtype)
 
@@ -82,7 +82,7 @@ class Dropouts:
 def _begins(
     fault: Outliers | Dropouts, stream: int, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar
 ) -> tuple[Array, Array]:
-    """Whether a fault begins at a sample, with probability rate T or where it is asked for; and a random sign."""
+    """Return whether a fault begins at a sample (with probability rate T, or at a set time), and a random sign."""
     first, second = threefry(key, (stream, sample))
     dtype = jnp.result_type(float)
     begins = first.astype(dtype) * 2.0**-32 < fault.rate * period

@@ -1,4 +1,4 @@
-"""The world that a cascade meets: true plant, start, reference, disturbances, realism."""
+"""The scenario: true plant, initial state, reference, disturbances, sensors and amplifier."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement, Sensor
 from ambjax.world.signals import Constant, Signal, edges_of, is_random, realised
 
-# A member's randomness beside its sensors': folded into its key where they fold the sample number, beyond any of those.
+# Streams of a member's key other than the sensors'. Sensors fold in the sample number; these numbers lie beyond it.
 DESIGN_STREAM, SIGNAL_STREAM = np.uint32(2**32 - 1), np.uint32(2**32 - 2)
 SLOTS = ("reference", "q_z", "q_v", "q_i")
 
@@ -28,13 +28,13 @@ class Initial:
     i: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="current deviation")
 
     def measurement(self) -> Measurement:
-        """The same, as ideal sensors see it."""
+        """The initial state as a measurement."""
         return Measurement(*(jnp.asarray(x) for x in (self.z, self.z_dot, self.i)))
 
 
 @record
 class Scenario:
-    """Everything that happens to a cascade. Member k of seed s always draws the same noise."""
+    """All inputs of a rollout besides the controller. Member k of seed s always draws the same noise."""
 
     plant: Bearing = Plant()
     reference: Signal = Constant()
@@ -64,7 +64,7 @@ class Scenario:
 
     @property
     def random(self) -> bool:
-        """Whether two members of this scenario meet something else: noise, or a signal that is drawn."""
+        """Whether two members differ: the scenario has sensor noise or a random signal."""
         sensor = self.sensor
         noisy = sensor is not None and bool(np.any([sensor.std, sensor.std_z_dot, sensor.std_i]))
         if sensor is not None:
@@ -73,7 +73,7 @@ class Scenario:
 
     @property
     def on_processor(self) -> str | None:
-        """The dotted path of something in it that is for a processor only; None if nothing is."""
+        """The dotted path of a part that requires a processor; None if there is none."""
         if self.amplifier is not None:
             given = (field.name for field in dataclasses.fields(self.amplifier))
             return f"actuator.{next((name for name in given if getattr(self.amplifier, name) is not None), '')}"
@@ -82,17 +82,17 @@ class Scenario:
         return f"sensor.{named[0]}" if named else None
 
     def in_continuous_time(self) -> "Scenario":
-        """The same without what is for a processor only: low-pass, converter and faults of the sensors, amplifier."""
+        """Return the scenario without the parts that require a processor: low-pass, converter, faults, amplifier."""
         none = {"bits": None, "bandwidth": None, "outliers": None, "dropouts": None}
         sensor = self.sensor and dataclasses.replace(self.sensor, **none)
         return dataclasses.replace(self, sensor=sensor, amplifier=None)
 
     def acceleration(self, t: Scalar) -> Array:
-        """The whole disturbance of Eq. (1) at time t: q_z + a q_v, m/s^2."""
+        """Return the total disturbance of Eq. (1) at time t: q_z + a q_v, m/s^2."""
         return self.q_z(t) + self.plant.a * self.q_v(t)
 
     def edges(self) -> tuple[Scalar, ...]:
-        """When the disturbances jump, s."""
+        """The times (s) at which the disturbances jump."""
         return tuple(edge for signal in (self.q_z, self.q_v, self.q_i) for edge in edges_of(signal))
 
     def key(self) -> Array:
@@ -105,7 +105,7 @@ class Scenario:
         return high, low
 
     def realised(self) -> "Scenario":
-        """This scenario with whatever is random in its signals drawn for the member."""
+        """Return the scenario with its random signals drawn for the member."""
         random = {slot: signal for slot in SLOTS if hasattr(signal := getattr(self, slot), "realised")}
         if not random:
             return self

@@ -1,4 +1,4 @@
-"""Sensors: what is measured, and the errors of it."""
+"""Sensors: measurements and their errors."""
 
 import dataclasses
 import math
@@ -17,7 +17,7 @@ SERIES = tuple(math.factorial(3) * (-1) ** j / math.factorial(j + 4) for j in ra
 
 
 class Errors(NamedTuple):
-    """Errors of the sensors, held over one sample: m, m/s, A."""
+    """Errors of the sensors, constant over one sample: z (m), z_dot (m/s), i (A)."""
 
     z: Array
     z_dot: Array
@@ -34,7 +34,7 @@ class FaultyErrors(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """What sensors, or an observer behind them, report: m, m/s, A."""
+    """Measured or estimated motion and current: z (m), z_dot (m/s), i (A)."""
 
     z: Array
     z_dot: Array
@@ -43,11 +43,11 @@ class Measurement(NamedTuple):
 
 @record
 class Sensor:
-    """Gaussian noise on each measurement, drawn once per sample period and held; the state itself is seen at once.
+    """Gaussian noise on each measurement, drawn once per sample period and held constant in it.
 
-    In this order: the position is low-passed (`bandwidth`), scaled and offset, noise is added, the converter rounds z
-    and i, and faults of the position sensor strike. A low-pass, a converter and faults are for a processor; without it,
-    measurements are looked at all the time.
+    A position reading is low-passed (`bandwidth`), scaled, offset, disturbed by noise, rounded by the converter, and
+    then replaced by faults, in this order. Low-pass, converter and faults require a processor. In continuous time the
+    measurement is continuous.
     """
 
     std: Scalar = leaf(default=0.0, unit="m", at_least=0, at_most=1.0, doc="standard deviation on z")
@@ -87,18 +87,18 @@ class Sensor:
         return self.outliers is not None or self.dropouts is not None
 
     def noise(self, key: tuple[Scalar, Scalar], sample: Scalar) -> Errors:
-        """The errors of sample number `sample` for the member with these words (Scenario.words)."""
+        """Return the errors of sample number `sample` for the member with the key `words` (`Scenario.words`)."""
         w = normals(key, sample)
         return Errors(self.std * w[0], self.std_z_dot * w[1], self.std_i * w[2])
 
     def struck(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Struck:
-        """The faults that begin at a sample of `period` s, for the member with these words."""
+        """Return the faults that begin at a sample of length `period` (s), for the member with the key `words`."""
         none = jnp.zeros(())
         outlier = none if self.outliers is None else self.outliers.struck(key, sample, period)
         return Struck(outlier, none > 0 if self.dropouts is None else self.dropouts.struck(key, sample, period))
 
     def sensed(self, z: Array, before: Sensed, struck: Struck, period: Scalar, s_0: Scalar) -> Sensed:
-        """The reading of z (m, converted) once faults have struck, and what is left of a dropout."""
+        """Return the reading of z (m, converted) with faults, and the next state of the faulty sensor."""
         z = z + struck.outlier
         if self.dropouts is None:
             return Sensed(z, before.left)
@@ -106,30 +106,30 @@ class Sensor:
         return Sensed(jnp.where(left > 0, self.dropouts.read(before.z, self.ends(s_0)), z), left)
 
     def ends(self, s_0: Scalar) -> Scalar:
-        """Ends of the converter of z, m, in a plant with this gap."""
+        """Return the end of the converter's range of z (m) for a plant with the gap s_0 (m)."""
         return s_0 if self.range_z is None else self.range_z
 
     def louder(self, factor: Scalar) -> "Sensor":
-        """The same sensor with `factor` times the noise."""
+        """Return the sensor with `factor` times the noise."""
         stds = {"std": self.std, "std_z_dot": self.std_z_dot, "std_i": self.std_i}
         return dataclasses.replace(self, **{name: std * factor for name, std in stds.items()})
 
     def reading(self, motion: Measurement, errors: Errors | FaultyErrors) -> Measurement:
-        """What is read of a motion (of z, as it left the low-pass) with these errors; z_dot = 0 if not measured."""
+        """Return the readings of a motion with these errors. `motion.z`: after the low-pass. z_dot = 0: not measured."""
         z_dot = motion.z_dot + errors.z_dot if self.velocity else jnp.zeros_like(motion.z_dot)
         return Measurement(self.gain * motion.z + self.offset + errors.z, z_dot, motion.i + errors.i)
 
     def converted(self, seen: Measurement, s_0: Scalar, i_0: Scalar) -> Measurement:
-        """What the converter makes of a reading; s_0 (m) and i_0 (A), those of the plant, for ranges left out."""
+        """Return the converted readings; s_0 (m) and i_0 (A) of the plant give the ranges that are left out."""
         if self.bits is None:
             return seen
         range_i = 2 * i_0 if self.range_i is None else self.range_i
         return seen._replace(z=converted(seen.z, self.bits, self.ends(s_0)), i=converted(seen.i, self.bits, range_i))
 
     def lagged(self, y: Array, before: Measurement, after: Measurement, h: Scalar) -> Array:
-        """Output of the low-pass h s later, y (m) before: y' = w (z - y), w = 2 pi bandwidth.
+        """Return the output of the low-pass after h (s), from y (m): y' = w (z - y), w = 2 pi bandwidth.
 
-        Exact for the cubic z that has the positions and velocities of both ends, whatever w h is.
+        Exact, for any w h, for the cubic z(t) with the positions and velocities of both ends.
         """
         assert self.bandwidth is not None
         # z = z_0 + s c_1 + s^2 c_2 + s^3 c_3, 0 <= s <= 1
@@ -140,12 +140,12 @@ class Sensor:
 
 
 def _moments(b: Array) -> tuple[Array, Array, Array, Array]:
-    """What y' = b (s^k - y), y(0) = 0, reaches at s = 1, for k = 0 to 3 and b >= 0.
+    """Return y(1) of y' = b (s^k - y), y(0) = 0, for k = 0 to 3 and b >= 0.
 
-    m_0 = 1 - exp(-b), and k m_{k-1} = b (1 - m_k): upwards it loses digits for b < 1, downwards it does not.
+    m_0 = 1 - exp(-b), and k m_{k-1} = b (1 - m_k). The upward recursion loses digits for b < 1, the downward one not.
     """
     short = b < 1
-    few, many = jnp.where(short, b, 0.0), jnp.where(short, 1.0, b)  # neither may leave the numbers where it is not used
+    few, many = jnp.where(short, b, 0.0), jnp.where(short, 1.0, b)  # both branches stay finite where they are unused
     m_3 = few * polynomial(few, SERIES)
     m_2 = few * (1 - m_3) / 3
     m_1 = few * (1 - m_2) / 2
@@ -159,9 +159,10 @@ def _moments(b: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def converted(x: Array, bits: Scalar, limit: Scalar) -> Array:
-    """x as a converter of so many bits over -limit..limit gives it: rounded to its steps, held at its ends.
+    """Return x as a converter with this number of bits over -limit..limit outputs it: rounded and saturated.
 
-    Steps of 2 limit / 2^bits; the last one below limit. Derivative: of what is held, as if nothing were rounded.
+    The step is 2 limit / 2^bits; the largest value is one step below limit. The derivative is that of the saturation
+    alone.
     """
     half = jnp.round(jnp.exp2(jnp.asarray(bits) - 1))  # XLA's is off by rounding
     step = limit / half

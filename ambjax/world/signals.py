@@ -1,7 +1,7 @@
 """Signals: pytrees that are functions of time. References and disturbances are one concept.
 
-Call a signal with a time in seconds. A jump counts from its instant on (right-continuous). A random signal has a
-method `realised(key)`, which draws the function of time that one member of an ensemble meets.
+Call a signal with a time in seconds. Signals are right-continuous: at a jump the value is the later one. A random
+signal has a method `realised(key)`, which draws the function of time for one member of an ensemble.
 """
 
 import dataclasses
@@ -18,10 +18,10 @@ from ambjax.numerics.smooth import TWO_PI, sine
 
 
 class Signal(Protocol):
-    """Anything that maps a time in seconds to a value. `span` gives an interval that it never leaves in 0..end (s).
+    """Protocol of a signal: maps a time (s) to a value. `span` returns bounds of its values for times in 0..end (s).
 
-    A signal that jumps also has `edges() -> tuple`, the instants of its jumps (s): a loop on a processor ends a step of
-    its integrator there.
+    A signal with jumps also has `edges() -> tuple`, the times of its jumps (s). On a processor, a step of the
+    integrator ends there.
     """
 
     def __call__(self, t: Scalar, /) -> Array: ...
@@ -29,12 +29,12 @@ class Signal(Protocol):
 
 
 def _hull(*values: Any) -> tuple[float, float]:
-    """The least and the largest of several numbers, or arrays of them."""
+    """Return the minimum and maximum of several numbers or arrays."""
     return float(min(map(np.min, values))), float(max(map(np.max, values)))
 
 
 def _swing(amplitude: Scalar, first: Scalar, last: Scalar) -> tuple[float, float]:
-    """Least and largest amplitude sin(2 pi x) for x from first to last, turns."""
+    """Return the minimum and maximum of amplitude sin(2 pi x) for x from `first` to `last` (turns)."""
     ends = [np.sin(TWO_PI * (x - np.floor(x))) for x in (first, last)]
     crest, trough = (np.ceil(first - at) <= last - at for at in (0.25, 0.75))
     high, low = np.where(crest, 1.0, np.maximum(*ends)), np.where(trough, -1.0, np.minimum(*ends))
@@ -100,7 +100,7 @@ class Pulse:
         return (self.start, self.stop)
 
     def shifted(self, by: Scalar) -> "Pulse":
-        """The same, `by` seconds later: it never ends before it starts."""
+        """Return the pulse `by` seconds later; it never ends before it starts."""
         return dataclasses.replace(self, start=self.start + by, stop=self.stop + by)
 
 
@@ -122,7 +122,7 @@ class Sine:
 
 @record
 class SmoothStep:
-    """0 until `start`, then 10 s^3 - 15 s^4 + 6 s^5 of the way over `duration`: twice differentiable (C2)."""
+    """0 until `start`, then amplitude (10 s^3 - 15 s^4 + 6 s^5) with s = (t - start)/duration, then amplitude (C2)."""
 
     amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height reached")
     start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="when it begins to rise")
@@ -156,7 +156,7 @@ class Chirp:
         return self.amplitude * sine(self._cycles(t, jnp.minimum(t, self.duration)))
 
     def _cycles(self, t: Any, sweep: Any) -> Any:
-        """Turns made by time t, `sweep` of which fell into the sweep."""
+        """Return the phase (turns) at time t; `sweep` is the time (s) spent in the sweep."""
         gain = (self.frequency_end - self.frequency) / self.duration
         return self.frequency * sweep + gain * sweep**2 / 2 + self.frequency_end * (t - sweep)
 
@@ -183,11 +183,11 @@ class Lines:
 
 @record
 class BandNoise:
-    """Random, smooth, stationary: power spread evenly over f_low..f_high, standard deviation `std`.
+    """Stationary band-limited noise: constant power density over f_low..f_high (Hz), standard deviation `std`.
 
-    A sum of sines, one at a random place in each of LINES equal parts of the band, each of random phase (after
-    Shinozuka and Deodatis, Appl. Mech. Rev. 44, 1991). Over members its autocovariance is std^2 times the mean of
-    cos(2 pi f tau) over the band, exactly; it has all derivatives, so that integrators keep their order.
+    A sum of sines: one at a random frequency in each of LINES equal parts of the band, with random phase (after
+    Shinozuka and Deodatis, Appl. Mech. Rev. 44, 1991). The autocovariance over members is exactly std^2 times the mean
+    of cos(2 pi f tau) over the band. The signal is smooth, so integrators keep their order.
     """
 
     std: Scalar = leaf(at_least=0, at_most=1e20, doc="standard deviation")
@@ -196,7 +196,7 @@ class BandNoise:
     ordered: ClassVar = ("f_low", "f_high")
 
     def realised(self, key: Array) -> Lines:
-        """What one member meets."""
+        """Draw the signal of one member."""
         place, turn = jax.random.uniform(key, (2, LINES))
         share = (jnp.arange(LINES) + place) / LINES
         return Lines(self.std, self.f_low + (self.f_high - self.f_low) * share, 2 * jnp.pi * turn)
@@ -237,17 +237,17 @@ class Sum:
 
 
 def is_random(signal: Any) -> bool:
-    """Whether members draw this signal, or a term of it."""
+    """Return whether the signal, or a term of it, is random."""
     return any(map(is_random, signal.terms)) if isinstance(signal, Sum) else hasattr(signal, "realised")
 
 
 def realised(signal: Any, key: Array) -> Any:
-    """The signal with whatever is random in it drawn from `key`."""
+    """Return the signal with its random terms drawn from `key`."""
     return signal.realised(key) if hasattr(signal, "realised") else signal
 
 
 def edges_of(signal: Any) -> tuple[Scalar, ...]:
-    """When the signal jumps, s; empty if it never does."""
+    """Return the times (s) at which the signal jumps; empty if it has no jumps."""
     return signal.edges() if hasattr(signal, "edges") else ()
 
 
@@ -260,14 +260,14 @@ class Reference(NamedTuple):
     r_dddot: Scalar = 0.0
 
     def rate(self) -> "Reference":
-        """Its time derivative, as far as it is known: what a law's output changes by if only time passes."""
+        """The time derivative; the rate of the third derivative is taken as 0."""
         return Reference(self.r_dot, self.r_ddot, self.r_dddot, jnp.zeros_like(self.r))
 
 
 def reference_at(signal: Signal, t: Scalar) -> Reference:
-    """r and its derivatives of one definition, by nested forward differentiation.
+    """Return the reference and its three derivatives at a time, by nested forward differentiation.
 
-    A jump contributes nothing to a derivative.
+    A jump does not contribute to a derivative.
     """
     t = jnp.asarray(t, jnp.result_type(float))
 
