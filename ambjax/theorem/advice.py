@@ -1,4 +1,4 @@
-"""What `ambjax check` answers: the verdict, the gains to change and their values, the rotor's status, the advice."""
+"""The text below the tables of `ambjax check`: the verdict, the gains to change, the rotor's status, the advice."""
 
 import math
 import re
@@ -8,24 +8,24 @@ from ambjax.theorem.conditions import Condition, Report
 from ambjax.theorem.sampled_report import Delays, SampledReport
 
 QUESTION = "Do the conditions of Theorem 1 hold along this run?"
-# A gain is advised this much above what it must exceed, rounded up to two digits.
+# Ratio of an advised gain to the number that it must exceed; the result is rounded up to two digits.
 MARGIN = 1.1
-# A lost rotor falls from this share of its time on.
+# Share of a lost run's time after which the rotor counts as falling.
 FALL = 0.9
-# Above what the reference alone asks, by this factor, gamma has room for transients.
+# With gamma larger by this factor than the bound on the reference, transients are covered.
 AMPLE = 2.0
 IMPLICIT = 'discretisation = "implicit"'
-# What can be done about a run that the integrator gave up.
+# Remedy for a run in which the integrator stalled.
 STALLED = (
     "Try a smaller p of the laws ([controller.inversion] gamma p is how hard its sign is), "
     'or a fixed step: [clock] dt = 1e-6 with method = "rodas3".'
 )
-# The same on a processor, which steps the laws: the plant alone is integrated.
+# The same on a processor, where only the plant is integrated.
 STALLED_PLANT = 'Use fixed steps of the plant, which cannot stall: [clock] dt = 1e-6 with method = "rodas3".'
 
 
 def answer(report: Report, case: str) -> list[str]:
-    """The lines below the table of `ambjax check`. `case`: the name of its file, as the user gave it."""
+    """Return the lines below the table of `ambjax check`. `case`: file name as given by the user."""
     deciding = [line for line in report.conditions if line.holds is not None]
     fails = [line for line in deciding if not line.holds]
     if not fails:
@@ -42,10 +42,10 @@ def answer(report: Report, case: str) -> list[str]:
 
 
 def advice(report: Report) -> list[str]:
-    """For each gain that fails a condition what it must exceed, where, and what to set it to; then what else fails.
+    """Return, for each failing gain, the number that it must exceed and a value to set; then the other failures.
 
-    While a rotor falls its own motion drives Delta_1 beyond all gains: what is worst in the last tenth of a lost run
-    sets no gain, and is told only where nothing else fails.
+    While a rotor falls, its motion drives Delta_1 beyond any gain. So a worst value in the last tenth of a lost run is
+    not used to advise a gain, and is reported only if nothing else fails.
     """
     fails = [line for line in report.conditions if line.holds is False]
     fall = FALL * report.lost_at if report.lost else math.inf
@@ -64,8 +64,10 @@ def advice(report: Report) -> list[str]:
 
 
 def on_processor(sampled: SampledReport, margin: Delays, unknown: Delays | None) -> list[str]:
-    """The lines below the tables of a processor: slopes, the distance to C, the rotor's status, an alternating voltage,
-    the margin of a delay that the prediction knows, and of one that it does not (None: nothing is predicted).
+    """Return the lines below the tables of a cascade on a processor.
+
+    They report slopes, the distance to C, the rotor's status, an alternating voltage, and two delay margins: for a
+    delay that the prediction uses, and for one that it does not (None: nothing is predicted).
     """
     lines = [
         f"- {slope.stage}: slope T as stepped, {number(slope.stepped)}, must stay below {number(slope.limit)}: a "
@@ -88,7 +90,7 @@ def on_processor(sampled: SampledReport, margin: Delays, unknown: Delays | None)
 
 
 def _curve(distance: float, at: float) -> str:
-    """The condition of Eq. (9) along the run on the processor."""
+    """Describe the condition of Eq. (9) along the run on the processor."""
     question = "Is (z/s_0, i_ref/i_0) off the singular curve C at all samples?"
     if distance > 0:
         return f"{question} Yes: the least distance is {number(distance)}, at {at:.4g} s."
@@ -122,7 +124,7 @@ def _margin(name: str, margin: Delays) -> str:
 
 
 def _samples(delay: float) -> str:
-    """To the resolution of a margin: 1.48676, 0.5, 2."""
+    """Format a number of samples with up to five decimals: 1.48676, 0.5, 2."""
     return f"{delay:.5f}".rstrip("0").rstrip(".")
 
 
@@ -156,7 +158,7 @@ def _of_the_fall(line: Condition, ideal: Condition | None) -> str:
 
 
 def _sides(line: Condition) -> tuple[str, str, str]:
-    """Name of a gain, where it stands in a case file, and its value."""
+    """Describe a gain: its name, its place in a case file, and its value."""
     _, stage, name = line.path.split(".")
     return name, f"[controller.{stage}] {name}", number(line.gain or 0.0)
 
@@ -171,10 +173,10 @@ def _status(report: Report, fails: bool) -> str:
 
 
 def status(lost_at: float, lost_why: str, stalled: bool, remedy: str = STALLED) -> str:
-    """What became of the rotor, in a sentence that every command prints: held, lost, or not decided.
+    """Return the sentence on the rotor's status that every command prints: held, lost, or not decided.
 
-    `lost_at` (s): when the run ended early, +inf if it did not; `stalled`: because the integrator gave up, for which
-    `remedy` says what to do.
+    `lost_at`: time (s) at which the run ended early, +inf if it did not. `stalled`: whether it ended because the
+    integrator stalled; `remedy` is then added.
     """
     if math.isinf(lost_at):
         return "The rotor is held."
@@ -187,13 +189,13 @@ def status(lost_at: float, lost_why: str, stalled: bool, remedy: str = STALLED) 
 
 
 def number(x: float) -> str:
-    """Plain where that is short, else three digits and a short exponent: 1000, 6.23e4."""
+    """Format a number: plain if that is short, else with three digits and a short exponent (1000, 6.23e4)."""
     if 1e-3 <= abs(x) < 1e4:
         return f"{x:.4g}"
     return re.sub(r"e([+-])0*", lambda e: "e-" if e[1] == "-" else "e", f"{x:.3g}")
 
 
 def _up(x: float) -> float:
-    """x rounded up to two digits."""
+    """Round x up to two digits."""
     unit = 10.0 ** (math.floor(math.log10(x)) - 1)
     return math.ceil(x / unit - 1e-9) * unit

@@ -1,8 +1,8 @@
-"""Theorem 1, monitored: its conditions with margins along a run, each with the time of its worst value.
+"""The conditions of Theorem 1 along a run: margins, and the time of each worst value.
 
-Conditions: k > Q_z, k_i > Q_i, gamma > Delta_1 (Eq. 7) and (z, i_ref) off the singular curve C (Eq. 9). On which of
-its gains a law tells itself. The steps of the proof are reported as residuals (see `ambjax.theorem.proof`). A condition
-on a gain that a law does not have is reported as not applicable.
+The conditions are k > Q_z, k_i > Q_i, gamma > Delta_1 (Eq. 7), and (z, i_ref) off the singular curve C (Eq. 9). Each
+law names the gain that its condition bounds (`Requirement`). A condition without such a gain is reported as not
+applicable. The steps of the proof are reported as residuals (see `ambjax.theorem.proof`).
 """
 
 import dataclasses
@@ -29,10 +29,11 @@ from ambjax.world.signals import Signal, reference_at
 
 @dataclasses.dataclass(frozen=True)
 class Condition:
-    """One line of the check: what must hold, the two sides, the margin, and the time of its worst value (s).
+    """One line of the check: the condition, its two sides, the margin, and the time of the worst value (s).
 
-    `holds` is None for a line that informs without deciding, or whose gain the law does not have. `path`: of the
-    gain, as in a case file, if the line is about one. `ideal`: the run has no part in `against`, only the reference.
+    `holds` is None for a line that is only informative, or whose gain the law does not have. `path`: path of the gain
+    in a case file, if the line is about a gain. `ideal`: whether `against` depends on the reference only, not on the
+    run.
     """
 
     name: str
@@ -48,7 +49,7 @@ class Condition:
 
     @property
     def margin(self) -> float | None:
-        """How much is left: positive where the condition holds."""
+        """The left side minus the right side: positive where the condition holds."""
         return None if self.gain is None else self.gain - self.against
 
 
@@ -65,7 +66,7 @@ class Report:
 
     @property
     def lost(self) -> bool:
-        """Whether the rotor is lost: not so where the integrator gave up, which decides nothing."""
+        """Whether the rotor is lost. False if the integrator stalled: the status is then unknown."""
         return math.isfinite(self.lost_at) and not self.stalled
 
     @property
@@ -75,9 +76,9 @@ class Report:
 
 
 class Side(NamedTuple):
-    """One way to take the right side of a condition: name and words of its line, and the signal whose peak it is.
+    """One definition of the right side of a condition: name, description, and the signal whose peak it is.
 
-    No signal: on the ideal motion.
+    Without a signal the right side is computed on the ideal motion z = r.
     """
 
     name: str
@@ -85,7 +86,7 @@ class Side(NamedTuple):
     where: str = ""
 
 
-# The right sides that a law's requirement may name.
+# Right sides by the name that a law's requirement uses.
 SIDES = {
     "Q_z": (Side("disturbance of z", "q_z"),),
     "Q_i": (Side("disturbance of i", "q_i"),),
@@ -97,9 +98,9 @@ SIDES = {
 
 
 class Required(NamedTuple):
-    """What is required of one law: its gain's name, dotted path and unit, what it must exceed, and its value.
+    """The requirement on one law: name, dotted path and unit of the gain, the right side, and the gain's value.
 
-    The value is None where the law is required nothing: the gain is then the one that the paper's law has.
+    The value is None if the law has no requirement; the gain is then that of the paper's law.
     """
 
     gain: str
@@ -116,10 +117,9 @@ MONITORS = Named(
 
 
 def check(cascade: Cascade, scenario: Scenario, clock: Clock) -> Report:
-    """Run the loop once, monitored, and judge the conditions of Theorem 1 along it: in continuous time, whatever the
-    cascade runs on.
+    """Simulate the loop once in continuous time and evaluate the conditions of Theorem 1 along the run.
 
-    Raises ValueError as `rollout` does.
+    A processor is ignored. Raises ValueError as `rollout` does.
     """
     check_inputs(cascade, scenario, clock)
     if cascade.processor is not None:
@@ -138,9 +138,9 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock) -> Report:
 
 
 def delta_1_on_reference(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[float, float]:
-    """sup |v_star' - (dv/dz) r_dot| on the ideal motion z = r, undisturbed, and when: Eq. (7) without transients.
+    """Return the largest |v_star' - (dv/dz) r_dot| on the ideal motion z = r (A^2/m^2/s), and its time (s).
 
-    What gamma must exceed merely to follow the reference on the nominal plant, A^2/m^2/s and s.
+    This is Eq. (7) without disturbance and transients: the lower bound of gamma for following the reference.
     """
     times = jnp.arange(min(clock.samples, 20_000)) * (clock.duration / min(clock.samples, 20_000))
     values = np.asarray(_drift(*canonical((cascade.model, scenario.realised().reference)), times))
@@ -163,9 +163,9 @@ def _drift(model: Plant, reference: Signal, times: Array) -> Array:
 
 
 def required(cascade: Cascade) -> list[Required]:
-    """What Theorem 1 requires of each law, in the order of its conditions; of an observer nothing, unless it says so.
+    """Return the requirement of Theorem 1 on each law, in the order of the conditions.
 
-    Raises ValueError for a law that names a right side which the theorem does not have.
+    An observer is included only if it has a requirement. Raises ValueError for an unknown right side.
     """
     rows = []
     for stage in ("position", "current", "inversion", "observer"):

@@ -1,9 +1,9 @@
-"""The closed loop with the steps of the stability proof beside it, Section 3.5.
+"""The closed loop together with the steps of the stability proof, Section 3.5.
 
-The proof's identities, Eqs. (12)-(14), are checked by integrating their right-hand sides beside the
-loop and comparing with sigma, v_tilde and e as the loop computes them. They differ by no more than
-integration error where the proof's assumptions hold (exact model, measured state, no limit on u), and
-by what those assumptions cost where they do not. V = sigma^2 is compared with its bound at every sample.
+The right-hand sides of the proof's identities, Eqs. (12)-(14), are integrated together with the loop and compared with
+its sigma, v_tilde and e. Where the proof's assumptions hold (exact model, measured state, no limit on u) they differ by
+the integration error only; elsewhere the difference shows the effect of a violated assumption. V = sigma^2 is compared
+with its bound at every sample.
 """
 
 from typing import NamedTuple
@@ -30,7 +30,7 @@ class Identities(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """What the proof speaks of, at one instant."""
+    """Quantities of the proof at one time."""
 
     moving: LoopState
     values: Identities
@@ -63,10 +63,10 @@ class TheoremRow(NamedTuple):
 
 
 class Witnessed(NamedTuple):
-    """State of the closed loop and of its witnesses, the integrals of the proof's right-hand sides.
+    """State of the closed loop, and the integrals of the proof's right-hand sides.
 
-    For e the witness is i_ref + e: e alone decays below the smallest normal number, where
-    arithmetic is a hundred times slower.
+    The integral for e is stored as i_ref + e: e alone decays below the smallest normal number, where arithmetic is a
+    hundred times slower.
     """
 
     loop: LoopState
@@ -75,7 +75,7 @@ class Witnessed(NamedTuple):
 
 @record
 class Monitored:
-    """The closed loop with the proof's right-hand sides integrated beside it."""
+    """System of the closed loop and the integrals of the proof's right-hand sides."""
 
     loop: ClosedLoop
 
@@ -115,11 +115,11 @@ class Monitored:
         return self.loop.scenario.plant.singularity(row.z, row.i_ref)
 
     def motion(self, state: LoopState) -> Measurement:
-        """What ideal sensors see."""
+        """Return the measurement of ideal sensors."""
         return self.loop.scenario.plant.measurement(state.plant)
 
     def terms(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> Terms:
-        """The signals of the proof. The robust term of a law that tells none is left out."""
+        """Return the quantities of the proof. A law without a robust term contributes none."""
         cascade, scenario = self.loop.cascade, self.loop.scenario
         plant, motion = scenario.plant, self.motion(state)
         z, _, i = motion
@@ -142,7 +142,7 @@ class Monitored:
     def _drift(
         self, inputs: ExternalInputs, state: LoopState, errors: Errors, i_ref: Array, moving: LoopState
     ) -> Array:
-        """d = v_star' - (dv/dz) z' along the true flow, i_ref held: the left side of Eq. (7), by one jvp."""
+        """Return d = v_star' - (dv/dz) z' along the true flow at constant i_ref: the left side of Eq. (7)."""
         cascade, reference = self.loop.cascade, inputs.reference
 
         def demanded(reference: Reference, x: LoopState) -> Array:

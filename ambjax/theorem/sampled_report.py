@@ -1,9 +1,9 @@
 """Checks of a cascade on a processor: slopes of laws times T, the distance to the singular curve C, the rotor's status.
 
-Theorem 1 is about continuous time, where sigma, v_tilde and e reach 0. Stepped once in T they reach a band, and what it
-is made of is measured along a run: W, the largest disturbance of the rate of the signal that a law acts on, and how far
-that signal is off the plant's. From W follows the band of the one (`control.sampling.band`), and with the second a
-bound of the other.
+Theorem 1 is about continuous time, where sigma, v_tilde and e reach 0. With steps of length T they reach a band around
+0. Two quantities are measured along a run: W, the largest disturbance of the rate of the signal that a law computes,
+and the largest difference between this signal and that of the plant. W gives the band of the computed signal
+(`control.sampling.band`); the band plus the difference bounds the plant's signal.
 """
 
 import dataclasses
@@ -24,21 +24,21 @@ from ambjax.simulation.trajectory import STALLED, Trajectory
 from ambjax.theorem.watched import Watched
 from ambjax.world.scenario import Scenario
 
-# The stages whose output acts a delay later; an observer and an inversion law act on states of their own.
+# Stages whose output acts after the delay. Observers and inversion laws act on states of their own, without delay.
 DELAYED = ("position", "current")
-# The signal that the law of a stage drives to zero, and its unit.
+# Signal that the law of each stage drives to zero, and its unit.
 SIGNALS = {"position": ("sigma", "m/s"), "inversion": ("v_tilde", "A^2/m^2"), "current": ("e", "A")}
-# A voltage alternates where (u_{n+1} - 2 u_n + u_{n-1})/4, its part that changes sign from sample to sample, has more
-# than this share of its rms value: that of an oscillation at a sixth of the sampling rate. White noise has 0.61.
+# A voltage counts as alternating if the rms of (u_{n+1} - 2 u_n + u_{n-1})/4 is more than this share of the rms of u.
+# An oscillation at a sixth of the sampling rate has this share; white noise has 0.61.
 ALTERNATING = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
 class SlopeCheck:
-    """Slope times T of a law, the same as it is stepped, and its limits: for stability, and without oscillation.
+    """Slope of a law times T, its effective value in a discrete step, and the limits for stability and no oscillation.
 
-    An explicit step keeps a slope; an implicit one makes a = slope T of a sign a/(1 + a), which is below both limits
-    unless the law is late.
+    An explicit step keeps the slope. An implicit step changes a = slope T of a sign to a/(1 + a), which is below both
+    limits unless the law is delayed.
     """
 
     stage: str
@@ -50,19 +50,19 @@ class SlopeCheck:
 
     @property
     def holds(self) -> bool:
-        """Whether the law is stable by itself."""
+        """Whether the law alone is stable."""
         return self.stepped < self.limit
 
 
 @dataclasses.dataclass(frozen=True)
 class Band:
-    """What is measured of a signal along a run from `settle` on, at the samples, and the bounds that follow.
+    """Measurements of a signal at the samples of a run after `settle`, and the bounds derived from them.
 
-    `noise`: whether the run is with the case's noise. `off`: largest difference between the plant's signal and the one
-    that the law acts on, of the estimate, carried over the delay where that is predicted. `computed`, `seen`: largest
-    magnitude of the latter and of the plant's. `gain`: of the law's sign; `disturbance`: W, per s, of the rate of the
-    signal that the law acts on. `band`: bound of `computed` for disturbances up to W; inf where the gain does not
-    exceed W. These three are None for a law that is more, or less, than a sign.
+    `noise`: whether the run has the case's noise. `computed`: largest magnitude of the signal that the law computes,
+    from the estimate (with prediction: at the end of the delay). `seen`: largest magnitude of the plant's signal.
+    `off`: largest difference of the two signals. `gain`: that of the law's sign. `disturbance`: W, the largest
+    disturbance of the rate of the computed signal, per s. `band`: bound of `computed` for disturbances up to W; inf if
+    the gain does not exceed W. The last three are None for a law that is not a single sign.
     """
 
     signal: str
@@ -84,12 +84,12 @@ class Band:
 
 @dataclasses.dataclass(frozen=True)
 class SampledReport:
-    """Slopes and bands of a cascade on its processor, and the status of the rotor there, under the case's noise.
+    """Slopes and bands of a cascade on its processor, and the rotor's status under the case's noise.
 
-    `distance`: the least of (z/s_0, i_ref/i_0) to the singular curve C at the samples of that run, and its time (s);
-    negative beyond C. `alternating`: share of the voltage's rms value that changes sign from sample to sample, without
-    noise, from `settle` on; None where that run does not last. Bands are of the runs that last. `stalled`: the
-    integrator gave up at `lost_at`, and nothing is decided.
+    `distance`: smallest distance of (z/s_0, i_ref/i_0) to the singular curve C at the samples (negative beyond C), and
+    its time (s). `alternating`: share of the voltage's rms that changes sign from sample to sample, without noise,
+    after `settle`; None if that run ends early. `bands`: of the runs that do not end early. `stalled`: whether the
+    integrator stalled at `lost_at`; the rotor's status is then unknown.
     """
 
     slopes: list[SlopeCheck]
@@ -112,12 +112,11 @@ class SampledReport:
 
 
 class Delays(NamedTuple):
-    """Of delays (samples) tried from the case's own up, `step` apart: every one up to `held` holds the rotor, and at
-    `lost` it is lost, `resolution` further.
+    """Result of runs with increasing delays (samples), `step` apart, from the delay of the case upwards.
 
-    `undecided` is the least beyond `held` where that is not known, for the integrator stalled (None: all is known up to
-    `lost`). Where the case's own does not hold: from 0 up, and `held` is None where that does not either. `lost` is
-    None where no delay tried loses it.
+    The rotor survives every delay up to `held` and is lost at `lost`. `undecided` is the smallest delay above `held` at
+    which the integrator stalled, or None. If the rotor is lost at the delay of the case, the delays start at 0; `held`
+    is None if it is lost there too. `lost` is None if the rotor survives every delay.
     """
 
     held: float | None
@@ -127,12 +126,12 @@ class Delays(NamedTuple):
 
     @property
     def resolution(self) -> float | None:
-        """How far `held` and `lost` are apart, samples."""
+        """`lost` minus `held`, samples."""
         return None if self.held is None or self.lost is None else self.lost - self.held
 
 
 def rolled(system: Any, clock: Clock) -> Outcome:
-    """A rollout, every sample recorded."""
+    """Roll out a system and record every sample."""
     return roll(*canonical((system, clock)), None, every=1)
 
 
@@ -143,10 +142,10 @@ def check(
     settle: float,
     run: Callable[[Any, Clock], Outcome] = rolled,
 ) -> SampledReport:
-    """Slopes and bands of a cascade with a processor. Two runs of the loop: without noise and with it.
+    """Return slopes and bands of a cascade with a processor, from two runs: without noise and with it.
 
-    `run` simulates: `ensemble.replay.record_system` has the rounding of `ambjax simulate`. Raises ValueError as
-    `rollout` does.
+    `run` simulates a system; `ensemble.replay.record_system` has the rounding of `ambjax simulate`. `settle`: s.
+    Raises ValueError as `rollout` does.
     """
     loop, clock = prepare(cascade, scenario, clock)
     cascade, quiet = cascade.on_processor(), _without_noise(scenario)
@@ -170,12 +169,12 @@ def check(
 
 
 def _watched(loop: Any, clock: Clock, run: Callable[[Any, Clock], Outcome]) -> Trajectory:
-    """A run whose rows are those of `Watched`."""
+    """Simulate a loop and record the rows of `Watched`."""
     return run(Watched(loop), clock).trajectory
 
 
 def _least(run: Trajectory) -> tuple[float, float]:
-    """The least signed distance to the singular curve C while the rotor was levitated, and its time (s)."""
+    """Return the smallest signed distance to the singular curve C until the rotor is lost, and its time (s)."""
     rows: Any = run.rows
     t, distance = np.asarray(rows.t), np.asarray(rows.distance)
     worst = int(np.argmin(np.where(t <= float(run.lost_at), distance, np.inf)))
@@ -183,19 +182,19 @@ def _least(run: Trajectory) -> tuple[float, float]:
 
 
 def alternation(u: np.ndarray) -> float:
-    """Share of the rms value of u [N] that changes sign from sample to sample: 1 for +-U, sin(pi f T)^2 at f Hz."""
+    """Return the share of the rms of u [N] that changes sign from sample to sample: sin(pi f T)^2 at a frequency f."""
     size = float(np.sqrt(np.mean(u * u)))
     return float(np.sqrt(np.mean(np.diff(u, 2) ** 2))) / (4 * size) if len(u) > 2 and size else 0.0
 
 
 def _without_noise(scenario: Scenario) -> Scenario:
-    """The same scenario where there is no noise."""
+    """Return the scenario without noise; the same object if it has none."""
     quiet = None if scenario.sensor is None else scenario.sensor.louder(0.0)
     return scenario if quiet in (None, scenario.sensor) else dataclasses.replace(scenario, sensor=quiet)
 
 
 def slopes(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
-    """Slope times T of every law that has one, against its limits. Laws and processor of one member."""
+    """Return slope times T and its limits for every law with a slope. `cascade`: of one member."""
     sampling, lines = sampling_of(cascade, clock), []
     for stage, law in zip(CascadeState._fields, map(answers.unhardened, cascade.laws), strict=True):
         implicit = answers.has_own_step(law, sampling.implicit)
@@ -211,19 +210,19 @@ def slopes(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
 
 
 def _steepest(slope: Any) -> float:
-    """A number; where infinities of a sign without a layer cancel, infinity."""
+    """Convert a slope to float; NaN, from canceling infinities of a set-valued sign, becomes inf."""
     return math.inf if math.isnan(float(slope)) else float(slope)
 
 
 def sampling_of(cascade: Cascade, clock: Clock) -> Sampling:
-    """How the laws of a cascade with a processor are sampled."""
+    """Return the sampling of the laws of a cascade with a processor."""
     processor: Any = cascade.on_processor().processor
     late = float(processor.delay) - (float(processor.ahead) if processor.predicts else 0.0)
     return Sampling(float(clock.sample_period), max(late, 0.0), processor.implicit)
 
 
 def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, rows: Any, noise: bool) -> list[Band]:
-    """The lines of one run, from sample number `settled` on."""
+    """Return the bands of one run, from sample number `settled` on."""
     sampling, lines = sampling_of(cascade, clock), []
     limited = _peak(rows.u[settled:]) >= float(scenario.u_max)
     for stage, (signal, unit) in SIGNALS.items():

@@ -1,4 +1,4 @@
-"""The loop on a processor with what its laws act on: their own sigma, v_tilde and e, sample by sample."""
+"""The loop on a processor with rows that record the laws' own sigma, v_tilde and e at every sample."""
 
 from typing import Any, NamedTuple
 
@@ -22,11 +22,10 @@ class WatchedSignals(NamedTuple):
 
 
 class WatchedRow(NamedTuple):
-    """One sample: time (s), voltage within the supply's limit (V), signals, and the distance of (z/s_0, i_ref/i_0) to
-    the singular curve C, negative beyond it.
+    """One sample: time (s), limited voltage (V), signals, and the signed distance of (z/s_0, i_ref/i_0) to C.
 
-    `computed` are the signals that the laws act on: of the estimate, carried over the delay where that is predicted.
-    `true` are those of the plant at the sample.
+    `computed`: signals that the laws compute from the estimate (with prediction: at the end of the delay). `true`:
+    signals of the plant at the sample. The distance to the singular curve C is negative beyond it.
     """
 
     t: Array
@@ -37,7 +36,7 @@ class WatchedRow(NamedTuple):
 
 
 class WatchedState(NamedTuple):
-    """State of the loop, and the signals that its laws acted on last."""
+    """State of the loop, and the signals that its laws computed at the last sample."""
 
     loop: SampledState
     computed: WatchedSignals
@@ -45,7 +44,7 @@ class WatchedState(NamedTuple):
 
 @record
 class Watched:
-    """A loop on a processor whose rows show the signals that its laws act on."""
+    """System of a loop on a processor whose rows record the signals that its laws compute."""
 
     loop: Sampled
 
@@ -59,7 +58,7 @@ class Watched:
         return WatchedState(self.loop.start(), WatchedSignals(*[jnp.zeros(())] * 3))
 
     def jump(self, t: Scalar, state: WatchedState, errors: Errors) -> WatchedState:
-        """The laws' step, and the signals that it acted on."""
+        """Step the laws and store the signals that they computed."""
         loop, before = self.loop, state.loop
         cascade, after = loop.loop.cascade, loop.jump(t, before, errors)
         reference = loop.reference(t)

@@ -115,7 +115,7 @@ class Sensor:
         return dataclasses.replace(self, **{name: std * factor for name, std in stds.items()})
 
     def reading(self, motion: Measurement, errors: Errors | FaultyErrors) -> Measurement:
-        """Return the readings of a motion with these errors. `motion.z`: after the low-pass. z_dot = 0: not measured."""
+        """Return the readings of a motion with these errors. `motion.z`: after the low-pass; z_dot = 0 if not read."""
         z_dot = motion.z_dot + errors.z_dot if self.velocity else jnp.zeros_like(motion.z_dot)
         return Measurement(self.gain * motion.z + self.offset + errors.z, z_dot, motion.i + errors.i)
 
