@@ -539,8 +539,8 @@ SEARCH = [
     M(
         "the range of c forgets the sample period",
         "ambjax/control/search.py",
-        "cap = max(1 / (5 * site.period), site.w / 10)",
-        "cap = 20 * site.w",
+        "cap = max(1 / (5 * context.period), context.w / 10)",
+        "cap = 20 * context.w",
         "tests/test_tuning_study.py::test_starts_reach_as_far_as_the_theory_suggests",
     ),
     M(
@@ -1299,9 +1299,9 @@ CHECK = [
     ),
     M(
         "explicit steps take the closed form of continuous time",
-        "ambjax/control/answers.py",
-        'hasattr(law, "step") and (implicit or hasattr(law, "init_sampled"))',
-        'hasattr(law, "step") and implicit',
+        "ambjax/control/inversion.py",
+        'own_steps = ("implicit", "explicit")',
+        'own_steps = ("implicit",)',
         "tests/test_sampled.py::test_against_the_independent_simulator[closed form, explicit]",
     ),
     M(

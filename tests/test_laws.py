@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from ambjax import AdaptiveRodas3, Cascade, Clock, Plant, Pulse, Scenario, Sine, rollout
-from ambjax.control import answers, current, inversion, observer, position
+from ambjax.control import current, inversion, observer, position
+from ambjax.control.base import default_law, memory_of
 from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand
 from ambjax.control.search import SearchContext
 from ambjax.numerics.records import validate
@@ -106,8 +107,8 @@ def test_states_rates_and_scales_have_one_structure(stage, law):
 @TABLE
 def test_states_have_names(stage, law):
     # those of the processor, which are exported
-    state = start(stage, law) if stage == "observer" else answers.init_sampled(law, MODEL)
-    named = answers.memory(law, state)
+    state = start(stage, law) if stage == "observer" else law.init_sampled(MODEL)
+    named = memory_of(law, state)
     assert len(named) == len(jax.tree.leaves(state))
     assert all(name.isidentifier() and unit and meaning for name, unit, meaning in named)
 
@@ -180,11 +181,11 @@ ERRORS = jnp.asarray([-1e9, -1e-3, 0.0, 1e-3, 1e9])
 
 
 @TABLE
-def test_what_a_law_answers_beside_its_output(stage, law):
-    assert jax.tree.structure(answers.layer(law, MODEL)) == jax.tree.structure(law.scale(MODEL))
-    assert all(x > 0 for x in jax.tree.leaves(answers.layer(law, MODEL)))
-    robust = np.asarray(answers.robust(law, ERRORS))
-    required = answers.requirement(law)
+def test_the_optional_methods_of_a_law(stage, law):
+    assert jax.tree.structure(law.layer(MODEL)) == jax.tree.structure(law.scale(MODEL))
+    assert all(x > 0 for x in jax.tree.leaves(law.layer(MODEL)))
+    robust = np.asarray(law.robust(ERRORS))
+    required = law.requirement
     # a law of whose gain the theorem requires something has a robust term of that size at most, which opposes the error
     assert (required is None) == (not robust.any())
     if required:
@@ -193,20 +194,20 @@ def test_what_a_law_answers_beside_its_output(stage, law):
         assert np.max(np.abs(robust)) == pytest.approx(getattr(law, required.gain), rel=0.02)
     steep = [f.name for f in dataclasses.fields(law) if f.metadata.get("steepness")]
     signs = dataclasses.replace(law, **dict.fromkeys(steep, np.inf))
-    ranges = [answers.ranges(law, SITE), *(answers.ranges(one, SITE._replace(stepped=True)) for one in (law, signs))]
+    ranges = [law.ranges(SITE), *(one.ranges(SITE._replace(stepped=True)) for one in (law, signs))]
     for name, interval in itertools.chain(*(found.items() for found in ranges)):
         assert name in gains(law)
         assert not interval.times or interval.times in gains(law)
         assert 0 < interval.low < interval.high < np.inf
         assert interval.source
-    assert bool(steep) == hasattr(law, "size")
+    assert bool(steep) == (law.size(MODEL) is not None)
     # a plant twice as wide, of the same pole: errors of twice the size meet a sign half as steep
     wide = dataclasses.replace(MODEL, s_0=2 * MODEL.s_0, i_0=MODEL.i_0 * 8**0.5)
     for name in steep:
         ratio = law.size(MODEL) / law.size(wide)
-        suited = getattr(answers.default_law(type(law), wide), name)
+        suited = getattr(default_law(type(law), wide), name)
         assert suited == pytest.approx(ratio * getattr(type(law)(), name), rel=1e-12)
-    assert answers.slides(law) == isinstance(law, inversion.Adaptive)
+    assert law.slides == isinstance(law, inversion.Adaptive)
 
 
 GAINS = [(stage, law, name) for stage, law in LAWS for name in gains(law)]

@@ -11,7 +11,7 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from ambjax import Cascade, Clock, Plant, Scenario, Sensor, Sine, rollout
 from ambjax.cases.reader import case_from
-from ambjax.control import answers, inversion, observer
+from ambjax.control import inversion, observer
 from ambjax.control.cascade import Sample
 from ambjax.control.inversion import Held
 from ambjax.control.observer import IRED1, IRED2, Complementary, Difference, Direct, Kalman, Predicted
@@ -57,8 +57,8 @@ def current_of(z, z_ddot, q=0.0):
 
 @EACH
 def test_no_measured_velocity_reaches_the_estimate(law):
-    assert answers.estimates_velocity(law)
-    assert answers.estimates_velocity(type(law))
+    assert law.estimates_velocity
+    assert type(law).estimates_velocity
     measured = Measurement(1e-4, 0.02, 0.01)
     state = law.init(MODEL, measured)
     for form in (lambda m: law(MODEL, m, state), lambda m: law.step(MODEL, m, state, T)):
@@ -71,7 +71,7 @@ def test_no_measured_velocity_reaches_the_estimate(law):
 
 @pytest.mark.parametrize("law", [Direct(), Complementary()])
 def test_the_others_need_it(law):
-    assert not answers.estimates_velocity(law)
+    assert not law.estimates_velocity
 
 
 @EACH

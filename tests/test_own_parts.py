@@ -30,19 +30,26 @@ from ambjax import (
 )
 from ambjax.cases.reader import Case
 from ambjax.cases.table import Table
-from ambjax.control.answers import Requirement
-from ambjax.control.position import force_for, sliding_variable
-from ambjax.control.search import Interval, manifold
 from ambjax.ensemble import Normal, Percent, Spread, run_ensemble
 from ambjax.ensemble.maps import Axis, grid
 from ambjax.ensemble.study import Study
-from ambjax.extend import leaf, record
-from ambjax.numerics.records import gain
+from ambjax.extend import (
+    Bearing,
+    Interval,
+    Measurement,
+    PositionLaw,
+    Requirement,
+    Signals,
+    force_for,
+    gain,
+    leaf,
+    manifold,
+    record,
+    sliding_variable,
+)
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.metrics import standard_for
 from ambjax.theorem.conditions import check
-from ambjax.world.bearing import Bearing, Signals
-from ambjax.world.sensor import Measurement
 from tuning.config import tune_from
 from tuning.problem import problem_of
 from tuning.search.rounds import rounds
@@ -92,7 +99,7 @@ class TwoCoils(Bearing):
 
 
 @record
-class BoundaryLayer:
+class BoundaryLayer(PositionLaw):
     """sigma' = -rho tanh(sigma / width): a position law with gains of its own names."""
 
     decay: Any = gain(default=17.0, unit="1/s", doc="decay rate on the manifold")
@@ -115,9 +122,9 @@ class BoundaryLayer:
     def robust(self, sigma):
         return -self.rho * jnp.tanh(sigma / self.width)
 
-    def ranges(self, site):
-        low = site.w / 3 * float(self.width)
-        return {"decay": manifold(site), "rho": Interval(low, 100 * low, "slope rho/width from w/3 to 33 w")}
+    def ranges(self, context):
+        low = context.w / 3 * float(self.width)
+        return {"decay": manifold(context), "rho": Interval(low, 100 * low, "slope rho/width from w/3 to 33 w")}
 
     def __call__(self, model, inputs, state):
         motion, reference = inputs
@@ -244,3 +251,13 @@ def test_tuned(tmp_path):
     gains = np.asarray(answer.problem.objective.space.gains_at(answer.x))
     assert np.all(np.isfinite(gains))
     assert np.any(gains != start)
+
+
+def test_a_law_without_the_base_class_is_refused():
+    class Bare:
+        pass
+
+    wrong: Any = Bare()
+    cascade = dataclasses.replace(CASCADE, current=wrong)
+    with pytest.raises(ValueError, match=r"controller\.current = Bare: .* ambjax\.extend\.CurrentLaw"):
+        rollout(cascade, SCENARIO, CLOCK)

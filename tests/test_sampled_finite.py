@@ -9,7 +9,7 @@ import pytest
 
 import ambjax as amb
 from ambjax.cases.reader import KINDS
-from ambjax.control import answers
+from ambjax.control.base import default_law
 from ambjax.control.processor import Processor
 from ambjax.simulation.metrics import Rms
 from tuning.space import Gain, Space, tunable
@@ -24,7 +24,7 @@ LAWS = [USUAL, *(USUAL | {stage: kind} for stage, kinds in KINDS.items() for kin
 
 def cascade_of(laws, smooth):
     """With one sample of delay, predicted; its signs smoothed, or not."""
-    made = {stage: answers.default_law(KINDS[stage][kind], amb.Plant()) for stage, kind in laws.items()}
+    made = {stage: default_law(KINDS[stage][kind], amb.Plant()) for stage, kind in laws.items()}
     if not smooth:
         for stage, law in made.items():
             steep = [field.name for field in dataclasses.fields(law) if field.metadata.get("steepness")]

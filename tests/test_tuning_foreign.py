@@ -15,7 +15,7 @@ from tomlkit import dumps
 from ambjax import Cascade, Plant, position
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
-from ambjax.control.answers import default_law
+from ambjax.control.base import default_law
 from tuning.__main__ import main
 from tuning.command import _laws
 from tuning.report.tuned import tuned

@@ -14,7 +14,8 @@ from ambjax.cases.reach import check_reference
 from ambjax.cases.table import Table, check_depth, load, show
 from ambjax.cases.timing import clock_from, settled
 from ambjax.cases.variation import spread_from
-from ambjax.control import answers, current, inversion, observer, position
+from ambjax.control import current, inversion, observer, position
+from ambjax.control.base import Law, default_law
 from ambjax.control.cascade import Cascade
 from ambjax.control.guard import Guard
 from ambjax.control.processor import Processor
@@ -36,7 +37,7 @@ from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Sensor
 
 # The laws by stage and kind; the first of a stage is the default. A new law is one row here.
-KINDS: dict[str, dict[str, type]] = {
+KINDS: dict[str, dict[str, type[Law]]] = {
     "observer": {
         "direct": observer.Direct,
         "complementary": observer.Complementary,
@@ -133,7 +134,7 @@ def case_from(raw: dict[str, Any], name: str = "case", text: str = "") -> Case:
     check_parts(cascade, scenario)
     clock, duration = clock_from(top.table("clock"))
     if isinstance(clock.method, Slide) and not slides(cascade, scenario.plant):
-        made = " or ".join(f'"{kind}"' for kind, law in KINDS["inversion"].items() if answers.slides(law))
+        made = " or ".join(f'"{kind}"' for kind, law in KINDS["inversion"].items() if law.slides)
         raise ValueError(
             f'clock.method = "sliding": it is made for controller.inversion.kind = {made} in continuous time, on a '
             'lumped plant, behind any observer but "ired-1" and "ired-2". Use method = "adaptive".'
@@ -176,7 +177,7 @@ def _cascade(table: Table, plant: Bearing, processor: Processor | None) -> Casca
     for stage, kinds in KINDS.items():
         law = table.table(stage)
         kind = law.choice("kind", list(kinds), next(iter(kinds)))
-        laws[stage] = law.record(kinds[kind], extra=("kind",), base=answers.default_law(kinds[kind], model))
+        laws[stage] = law.record(kinds[kind], extra=("kind",), base=default_law(kinds[kind], model))
     return Cascade(model=model, processor=processor, **laws)
 
 

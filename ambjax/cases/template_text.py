@@ -145,9 +145,9 @@ def _lines(kind: type, values: Any) -> list[str]:
 
 
 def _law(kind: type) -> list[str]:
-    """The lines of a law; that of p a comment, for whoever changes the plant above it leaves p to the program."""
-    scaled = hasattr(kind, "size")
-    lines = _lines(kind, kind())
+    """Return the lines of a law; a steepness p that scales with the plant becomes a comment."""
+    law = kind()
+    scaled, lines = law.size(Plant()) is not None, _lines(kind, law)
     return [
         line.replace("p =", "# p =").replace("  #", "#", 1) if scaled and line.startswith("p = ") else line
         for line in lines

@@ -12,7 +12,8 @@ import jax
 from jax import Array
 
 from ambjax.compiler.barrier import materialised
-from ambjax.control import answers, current, inversion, observer, position
+from ambjax.control import current, inversion, observer, position
+from ambjax.control.base import default_law, hard_signs, hardened, softened
 from ambjax.control.laws import (
     CurrentInputs,
     CurrentLaw,
@@ -78,7 +79,7 @@ class Cascade:
     """The controller: four laws, the nominal plant `model`, and the processor.
 
     The laws compute with `model`; the true plant is `Scenario.plant`. A law left out is the paper's, with the gains of
-    Table 2 and a steepness p scaled to the model (`answers.default_law`; 25 for the plant of Table 1).
+    Table 2 and a steepness p scaled to the model (`base.default_law`; 25 for the plant of Table 1).
     `dataclasses.replace` with another model keeps the existing laws. `processor` is None in continuous time, as in the
     paper.
     """
@@ -93,7 +94,7 @@ class Cascade:
     def __post_init__(self) -> None:
         for stage, kind in USUAL.items():
             if getattr(self, stage) is _LEFT_OUT:
-                object.__setattr__(self, stage, answers.default_law(kind, self.model))
+                object.__setattr__(self, stage, default_law(kind, self.model))
 
     def init(self, measured: Measurement) -> CascadeState:
         """Return the states of all laws at t = 0, in continuous time or on the processor."""
@@ -101,18 +102,18 @@ class Cascade:
         if self.processor is None:
             states = [law.init(self.model) for law in rest]
         else:
-            states = [answers.init_sampled(law, self.model) for law in rest]
+            states = [law.init_sampled(self.model) for law in rest]
         return CascadeState(self.observer.init(self.model, measured), *states)
 
     def scale(self) -> CascadeState:
         """Return the characteristic size of each number of the laws' states; integration errors are relative to it."""
         if self.processor is None:
             return CascadeState(*(law.scale(self.model) for law in self.laws))
-        return CascadeState(*(answers.scale_sampled(law, self.model) for law in self.laws))
+        return CascadeState(*(law.scale_sampled(self.model) for law in self.laws))
 
     def layer(self) -> CascadeState:
         """Return, for each state, the largest integration error that keeps it inside the layer of a smoothed sign."""
-        return CascadeState(*(answers.layer(law, self.model) for law in self.laws))
+        return CascadeState(*(law.layer(self.model) for law in self.laws))
 
     def slopes(self) -> dict[str, Scalar]:
         """Return the largest slope of each law (1/s) by stage."""
@@ -135,7 +136,7 @@ class Cascade:
 
         def wanted(reference: Reference, z: Array, z_dot: Array, observed: State, positioned: State):
             estimate, observed_rate = self.observer(self.model, Measurement(z, z_dot, measured.i), observed)
-            if answers.estimates_velocity(self.observer):
+            if self.observer.estimates_velocity:
                 # XLA aborts when it compiles a one-kernel rollout (`compiler.fast_path`) in which z_dot is unused
                 estimate = estimate._replace(z_dot=estimate.z_dot + 0.0 * z_dot)
             v_star, positioned_rate = self.position(self.model, (estimate, reference), positioned)
@@ -145,7 +146,7 @@ class Cascade:
         (z, v_star), (estimate, observed_rate, positioned_rate) = wanted(*point)
         gaps = self.model.gaps(estimate.z)
         z_ddot = self.model.z_ddot(estimate.z, estimate.i)
-        if answers.estimates_velocity(self.observer):
+        if self.observer.estimates_velocity:
             law = functools.partial(self.position, self.model)
             z_rate, v_star_rate = _rates(law, estimate, z_ddot, reference, state.position, positioned_rate)
         else:
@@ -161,14 +162,14 @@ class Cascade:
         every delay between them. Raises ValueError as `Processor.resolved` does.
         """
         assert self.processor is not None
-        laws = {stage: answers.hardened(getattr(self, stage)) for stage in USUAL}
+        laws = {stage: hardened(getattr(self, stage)) for stage in USUAL}
         return dataclasses.replace(self, **laws, processor=self.processor.resolved(*delays, between=between))
 
     def check_smooth(self) -> None:
         """Raise ValueError for a steepness of inf: in continuous time a sign must be smoothed."""
         for stage in USUAL:
             law = getattr(self, stage)
-            for name in answers.hard_signs(law):
+            for name in hard_signs(law):
                 raise ValueError(
                     f"controller.{stage}.{name} = inf: in continuous time a sign must be smoothed. Give a number, or "
                     "add [processor], on which the sign itself is stepped."
@@ -176,7 +177,7 @@ class Cascade:
 
     def in_continuous_time(self) -> "Cascade":
         """Return the cascade without its processor; a steepness of inf becomes the default one for the model."""
-        laws = {stage: answers.softened(getattr(self, stage), self.model) for stage in USUAL}
+        laws = {stage: softened(getattr(self, stage), self.model) for stage in USUAL}
         return dataclasses.replace(self, **laws, processor=None)
 
     def _advance(self, sample: Sample) -> Callable[..., Any]:
@@ -218,7 +219,7 @@ class Cascade:
         rates = jax.tree.map(
             lambda a, b: (b - a) / sample.period, (state.observer, state.position), (observed, positioned)
         )
-        if answers.estimates_velocity(self.observer):
+        if self.observer.estimates_velocity:
             law = functools.partial(advance, self.position)
             z_rate, v_star_rate = _rates(law, estimate, z_ddot, sample.reference, state.position, rates[1])
         else:

@@ -5,8 +5,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.answers import Requirement
-from ambjax.control.laws import CurrentInputs
+from ambjax.control.base import Requirement
+from ambjax.control.laws import CurrentInputs, CurrentLaw
 from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
 from ambjax.numerics.records import Scalar, gain, record
@@ -16,7 +16,7 @@ from ambjax.world.plant import Plant
 
 
 @record
-class SlidingMode:
+class SlidingMode(CurrentLaw):
     """u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - k_i sgn(i - i_ref)) + R i. Eq. (11), sgn smoothed."""
 
     k_i: Scalar = gain(default=152.0, unit="A/s", doc="switching gain; above the disturbance bound Q_i")
@@ -60,16 +60,16 @@ class SlidingMode:
     def relay(self) -> Relay:
         return Relay(self.k_i, self.p)
 
-    def ranges(self, site: SearchContext) -> dict[str, Interval]:
-        if site.stepped:
-            fast = site.w * float(site.model.i_0)
-            k_i = authority(site, fast, (0.1, 1e3), "w i_0: the bias current at the pole", "Q_i")
-            return {"k_i": k_i, **steepness(site, "k_i")}
-        return {"k_i": switch(site, "k_i", self.p, 200, "Q_i")}
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        if context.stepped:
+            fast = context.w * float(context.model.i_0)
+            k_i = authority(context, fast, (0.1, 1e3), "w i_0: the bias current at the pole", "Q_i")
+            return {"k_i": k_i, **steepness(context, "k_i")}
+        return {"k_i": switch(context, "k_i", self.p, 200, "Q_i")}
 
 
 @record
-class ProportionalIntegral:
+class ProportionalIntegral(CurrentLaw):
     """u = k_p (i_ref - i) + L i_ref' + x, x' = k_int (i_ref - i) + k_aw (clip(u) - u): x in V.
 
     The linear baseline: the inductance is that at z = 0, and there is no motional term. While the supply limits u,
@@ -97,10 +97,10 @@ class ProportionalIntegral:
         excess = limited(u, inputs.u_max) - u
         return u, self.k_int * error + self.k_aw * excess
 
-    def ranges(self, site: SearchContext) -> dict[str, Interval]:
-        per = 1 / float(site.model.L)
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        per = 1 / float(context.model.L)
         return {
-            "k_p": rate(site, 1 / 3, 200, "bandwidth k_p / L from w/3 to 200 w", per),
-            "k_int": rate(site, 1 / 30, 30, "corner sqrt(k_int / L) from w/30 to 30 w", per, 2),
-            "k_aw": rate(site, 1e-2, 10, "rate from w/100 to 10 w"),
+            "k_p": rate(context, 1 / 3, 200, "bandwidth k_p / L from w/3 to 200 w", per),
+            "k_int": rate(context, 1 / 30, 30, "corner sqrt(k_int / L) from w/30 to 30 w", per, 2),
+            "k_aw": rate(context, 1e-2, 10, "rate from w/100 to 10 w"),
         }

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control import answers
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.world.plant import Plant, State
 from ambjax.world.scenario import Scenario
@@ -145,7 +144,7 @@ def guarded(cascade: Any, scenario: Scenario, period: Scalar) -> Any:
     processor = cascade.processor
     if processor is None or processor.guard is None:
         return cascade
-    estimated = answers.estimates_velocity(cascade.observer)
+    estimated = cascade.observer.estimates_velocity
     guard = processor.guard.settled(cascade.model, scenario, period, estimated)
     return dataclasses.replace(cascade, processor=dataclasses.replace(processor, guard=guard))
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.compiler.barrier import materialised
-from ambjax.control.answers import Requirement
-from ambjax.control.laws import CurrentDemand, ForceDemand, Relaxation
+from ambjax.control.base import Requirement
+from ambjax.control.laws import CurrentDemand, ForceDemand, InversionLaw, Relaxation
 from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, SearchContext, steepness
 from ambjax.numerics.records import Scalar, gain, leaf, record
@@ -29,7 +29,7 @@ def v_and_gradient(model: Plant, inputs: ForceDemand, i_ref: Array) -> tuple[Arr
 
 
 @record
-class Adaptive:
+class Adaptive(InversionLaw):
     """i_ref' = gamma sgn(v_star - v(z, i_ref)) / (dv/di)(z, i_ref), with i_ref as its state. Eq. (6), sgn smoothed.
 
     Deviation: the default gamma is 7.5e4; the printed 1000 violates the paper's own Eq. (7).
@@ -73,12 +73,12 @@ class Adaptive:
     def relay(self) -> Relay:
         return Relay(self.gamma, self.p)
 
-    def ranges(self, site: SearchContext) -> dict[str, Interval]:
-        needed, words = site.delta_1
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        needed, words = context.delta_1
         name = words.partition(" ")[0]
-        times = 1000 if site.stepped else 100
+        times = 1000 if context.stepped else 100
         gamma = Interval(needed, times * needed, f"{name} to {times} {name}, {words}")
-        return {"gamma": gamma, **steepness(site, "gamma")}
+        return {"gamma": gamma, **steepness(context, "gamma")}
 
     def slide(self, model: Plant, begin: ForceDemand, end: ForceDemand, i_ref: Array, h: Scalar) -> Relaxation:
         """Integrate i_ref over a step: at the rate gamma up to the layer of the sign, then along v_star. Eq. (14a)."""
@@ -107,7 +107,7 @@ class Held(NamedTuple):
 
 
 @record
-class ClosedForm:
+class ClosedForm(InversionLaw):
     """Static inversion: i_ref is the root of v(z, i_ref) = v_star that is continuous at i = 0, with its exact rate.
 
     The paper argues against this law (Mouille and Lottin 1992): it is exact on a known plant, but passes every jump of
@@ -118,6 +118,7 @@ class ClosedForm:
     i_ref that i_ref' has already commanded.
     """
 
+    own_steps = ("implicit", "explicit")
     memory = (("i_ref", "A", "current reference of the next sample"), ("begun", "1", "1 after the first sample"))
 
     def init(self, model: Plant) -> tuple[()]:

@@ -1,4 +1,4 @@
-"""The inputs, outputs and protocols of the laws of each stage.
+"""The inputs, outputs and base classes of the laws of each stage.
 
 A law is a frozen record: its type is the algorithm, its leaves are the gains. Every law has these methods, where
 `model` is the nominal plant:
@@ -8,16 +8,17 @@ A law is a frozen record: its type is the algorithm, its leaves are the gains. E
 - `scale(model)`: the characteristic size of each state; integration errors are relative to it.
 - `slope(model)`: the largest slope of the law, 1/s; the step size is chosen from it.
 
-`control.answers` lists the optional methods. To add a law: write a record in the file of its stage, add a row to
-`KINDS` of the case-file reader, and add a row to the conformance test.
+`control.base.Law` has the optional methods with their defaults. To add a law: write a record in the file of its stage,
+add a row to `KINDS` of the case-file reader, and add a row to the conformance test.
 """
 
-from typing import Any, NamedTuple, Protocol
+import abc
+from typing import Any, NamedTuple
 
 import jax
 from jax import Array
 
-from ambjax.control import answers
+from ambjax.control.base import Law
 from ambjax.numerics.records import Scalar
 from ambjax.world.bearing import Gaps
 from ambjax.world.plant import Plant
@@ -70,47 +71,88 @@ class Relaxation(NamedTuple):
     v_tilde: tuple[Array, Array, Array]
 
 
-class Observer(Protocol):
-    """Protocol of an observer: returns the estimated motion for a measurement."""
+class Observer(Law, abc.ABC):
+    """Base class of an observer, which returns the estimated motion for a measurement."""
 
+    @abc.abstractmethod
     def init(self, model: Plant, measured: Measurement) -> State: ...
+
+    @abc.abstractmethod
     def scale(self, model: Plant) -> State: ...
+
+    @abc.abstractmethod
     def slope(self, model: Plant) -> Scalar: ...
+
+    @abc.abstractmethod
     def __call__(self, model: Plant, inputs: Measurement, state: State, /) -> tuple[Measurement, State]: ...
 
 
-class PositionLaw(Protocol):
-    """Protocol of a position law: returns the scaled force v_star (A^2/m^2) for an estimate and a reference."""
+class PositionLaw(Law, abc.ABC):
+    """Base class of a position law, which returns the scaled force v_star (A^2/m^2) for an estimate and a reference."""
 
+    @abc.abstractmethod
     def init(self, model: Plant) -> State: ...
+
+    @abc.abstractmethod
     def scale(self, model: Plant) -> State: ...
+
+    @abc.abstractmethod
     def slope(self, model: Plant) -> Scalar: ...
+
+    @abc.abstractmethod
     def sigma(self, motion: Measurement, reference: Reference) -> Array: ...
+
+    @abc.abstractmethod
     def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: State, /) -> tuple[Array, State]: ...
 
 
-class InversionLaw(Protocol):
-    """Protocol of an inversion law: returns the demanded current for a demanded force."""
+class InversionLaw(Law, abc.ABC):
+    """Base class of an inversion law, which returns the demanded current for a demanded force."""
 
+    @abc.abstractmethod
     def init(self, model: Plant) -> State: ...
+
+    @abc.abstractmethod
     def scale(self, model: Plant) -> State: ...
+
+    @abc.abstractmethod
     def slope(self, model: Plant) -> Scalar: ...
+
+    @abc.abstractmethod
     def __call__(self, model: Plant, inputs: ForceDemand, state: State, /) -> tuple[CurrentDemand, State]: ...
 
 
-class CurrentLaw(Protocol):
-    """Protocol of a current law: returns the voltage u (V) for a demanded current."""
+class CurrentLaw(Law, abc.ABC):
+    """Base class of a current law, which returns the voltage u (V) for a demanded current."""
 
+    @abc.abstractmethod
     def init(self, model: Plant) -> State: ...
+
+    @abc.abstractmethod
     def scale(self, model: Plant) -> State: ...
+
+    @abc.abstractmethod
     def slope(self, model: Plant) -> Scalar: ...
+
+    @abc.abstractmethod
     def __call__(self, model: Plant, inputs: CurrentInputs, state: State, /) -> tuple[Array, State]: ...
 
 
-def stepped(law: Any, inputs: Any, state: State, *, model: Plant, period: Scalar, implicit: bool) -> tuple[Any, State]:
+# Base class of the laws of each stage, by the stage's name.
+STAGES: dict[str, type[Law]] = {
+    "observer": Observer,
+    "position": PositionLaw,
+    "inversion": InversionLaw,
+    "current": CurrentLaw,
+}
+
+
+def stepped(law: Law, inputs: Any, state: State, *, model: Plant, period: Scalar, implicit: bool) -> tuple[Any, State]:
     """Return the output of a law at a sample and its next state, by its own `step` or else by explicit Euler."""
     with jax.named_scope(f"law:{type(law).__module__.rpartition('.')[2]}.{type(law).__qualname__}"):
-        if answers.has_own_step(law, implicit):
-            return law.step(model, inputs, state, period)
-        output, rate = law(model, inputs, state)
+        if law.has_own_step(implicit):
+            own: Any = law
+            return own.step(model, inputs, state, period)
+        function: Any = law
+        output, rate = function(model, inputs, state)
         return output, jax.tree.map(lambda x, d: x + period * d, state, rate)

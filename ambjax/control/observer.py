@@ -5,6 +5,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.control.laws import Observer
 from ambjax.control.search import Interval, SearchContext, rate
 from ambjax.numerics import differentiator
 from ambjax.numerics.records import Scalar, gain, leaf, record
@@ -20,7 +21,7 @@ DERIVATIVES = (
 
 
 @record
-class Direct:
+class Direct(Observer):
     """The measurement itself, as in the paper."""
 
     def init(self, model: Plant, measured: Measurement) -> tuple[()]:
@@ -37,7 +38,7 @@ class Direct:
 
 
 @record
-class Complementary:
+class Complementary(Observer):
     """Complementary filter: z_hat' = z_dot + l (z_measured - z_hat).
 
     The estimate integrates the velocity and follows the position slowly: it low-passes noise of the position sensor at
@@ -67,12 +68,12 @@ class Complementary:
     def __call__(self, model: Plant, inputs: Measurement, state: Array) -> tuple[Measurement, Array]:
         return inputs._replace(z=state), inputs.z_dot + self.l * (inputs.z - state)
 
-    def ranges(self, site: SearchContext) -> dict[str, Interval]:
-        return {"l": rate(site, 1e-3, 1, "corner from w/1000 to w")}
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        return {"l": rate(context, 1e-3, 1, "corner from w/1000 to w")}
 
 
 @record
-class Difference:
+class Difference(Observer):
     """Filtered difference: z_dot = w (z - z_f), z_f' = w (z - z_f). The position z is not filtered.
 
     On a processor: the backward difference (z_n - z_{n-1})/T through a low-pass with the pole exp(-w T). It is exact on
@@ -101,8 +102,8 @@ class Difference:
         z_dot = -jnp.expm1(-self.w * period) / period * (inputs.z - state)
         return inputs._replace(z_dot=z_dot), state + period * z_dot
 
-    def ranges(self, site: SearchContext) -> dict[str, Interval]:
-        return {"w": rate(site, 1, 20, "corner from w to 20 w")}
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        return {"w": rate(context, 1, 20, "corner from w to 20 w")}
 
 
 class Predicted(NamedTuple):
@@ -119,7 +120,7 @@ class Predicted(NamedTuple):
 
 
 @record
-class Kalman:
+class Kalman(Observer):
     """Steady-state Kalman filter of the nominal model, driven by the measured current, with an unknown disturbance.
 
     z_hat' = z_dot_hat + 3 w e, z_dot_hat' = z_ddot(z, i) + d_hat + 3 w^2 e, d_hat' = w^3 e, e = z - z_hat, with Eq. (1)
@@ -176,12 +177,12 @@ class Kalman:
         after = Predicted(z + period * z_dot + period**2 / 2 * whole, z_dot + period * whole, d, z_ddot)
         return Measurement(z, z_dot, inputs.i), after
 
-    def ranges(self, site: SearchContext) -> dict[str, Interval]:
-        return {"w": rate(site, 0.5, 5, "poles from w/2 to 5 w")}
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        return {"w": rate(context, 0.5, 5, "poles from w/2 to 5 w")}
 
 
 @record
-class IRED1:
+class IRED1(Observer):
     """Robust exact differentiator of order 1: z_dot is exact where |z_ddot| <= L. Implicit on a processor.
 
     `ambjax.numerics.differentiator` has the equations. The position z is not filtered. In continuous time the sign is
@@ -211,12 +212,12 @@ class IRED1:
         """Update the estimate with this sample."""
         return _implicit(self.L, inputs, state, period)
 
-    def ranges(self, site: SearchContext) -> dict[str, Interval]:
-        return {"L": _bound(site, 2)}
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        return {"L": _bound(context, 2)}
 
 
 @record
-class IRED2:
+class IRED2(Observer):
     """Robust exact differentiator of order 2: as `IRED1`, exact where the rate of the acceleration is bounded by L."""
 
     L: Scalar = gain(default=3e4, unit="m/s^3", doc="bound on the rate of the acceleration")
@@ -242,8 +243,8 @@ class IRED2:
         """Update the estimate with this sample."""
         return _implicit(self.L, inputs, state, period)
 
-    def ranges(self, site: SearchContext) -> dict[str, Interval]:
-        return {"L": _bound(site, 3)}
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        return {"L": _bound(context, 3)}
 
 
 # Width of the smoothed sign of a differentiator in continuous time, as a share of the gap.
@@ -269,6 +270,6 @@ def differentiator_scale(model: Plant) -> tuple[Scalar, Scalar, Scalar]:
     return z, z_dot, jnp.abs(model.g) / 50 + 1e-3
 
 
-def _bound(site: SearchContext, power: int) -> Interval:
+def _bound(context: SearchContext, power: int) -> Interval:
     words = f"(x w)^{power} s_0, x from 1/10 to 1"
-    return rate(site, 0.1, 1, words, 1 / float(site.model.s_0), power)
+    return rate(context, 0.1, 1, words, 1 / float(context.model.s_0), power)

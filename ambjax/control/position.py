@@ -5,7 +5,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.answers import Requirement
+from ambjax.control.base import Requirement
+from ambjax.control.laws import PositionLaw
 from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, SearchContext, authority, manifold, rate, steepness, switch
 from ambjax.numerics.records import Scalar, gain, record
@@ -28,7 +29,7 @@ def force_for(c: Scalar, model: Plant, motion: Measurement, reference: Reference
 
 
 @record
-class SlidingMode:
+class SlidingMode(PositionLaw):
     """v_star = (-2 k_z z/m - c (z_dot - r_dot) + r_ddot + g - k sgn(sigma)) / a. Eq. (5), sgn smoothed."""
 
     c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold")
@@ -69,17 +70,17 @@ class SlidingMode:
     def relay(self) -> Relay:
         return Relay(self.k, self.p)
 
-    def held(self, model: Plant) -> Scalar:
+    def explicit_rate(self, model: Plant) -> Scalar:
         """Return c: on the manifold the demanded force is that at the start of the sample."""
         return self.c
 
-    def ranges(self, site: SearchContext) -> dict[str, Interval]:
-        if site.stepped:
-            most = site.w**2 * float(site.model.s_0)
-            k = authority(site, most, (1e-3, 0.3), "w^2 s_0: what the magnets accelerate the rotor by", "Q_z")
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        if context.stepped:
+            most = context.w**2 * float(context.model.s_0)
+            k = authority(context, most, (1e-3, 0.3), "w^2 s_0: what the magnets accelerate the rotor by", "Q_z")
         else:
-            k = switch(site, "k", self.p, 100, "Q_z")
-        return {"c": manifold(site), "k": k, **steepness(site, "k")}
+            k = switch(context, "k", self.p, 100, "Q_z")
+        return {"c": manifold(context), "k": k, **steepness(context, "k")}
 
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()], period: Scalar
@@ -91,7 +92,7 @@ class SlidingMode:
 
 
 @record
-class SuperTwisting:
+class SuperTwisting(PositionLaw):
     """sigma_dot = -k_1 sqrt|sigma| sgn(sigma) + w, w' = -k_2 sgn(sigma): the paper's future work.
 
     Levant, Int. J. Control 58 (1993) 1247-1263. Both terms are smoothed with p: the root as
@@ -134,24 +135,24 @@ class SuperTwisting:
         robust = state - self.k_1 * smooth_root(sigma, self.p)
         return force_for(self.c, model, motion, reference, robust), -self.k_2 * smooth_sign(sigma, self.p)
 
-    def held(self, model: Plant) -> Scalar:
+    def explicit_rate(self, model: Plant) -> Scalar:
         """Return c: on the manifold the demanded force is that at the start of the sample."""
         return self.c
 
-    def ranges(self, site: SearchContext) -> dict[str, Interval]:
-        if site.stepped:
-            return {"c": manifold(site), **self._authorities(site)}
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        if context.stepped:
+            return {"c": manifold(context), **self._authorities(context)}
         root, integral = float(self.p) ** 0.5, TWO_OVER_PI * float(self.p)
         return {
-            "c": manifold(site),
-            "k_1": rate(site, 1 / 3, 100, "slope k_1 sqrt(p) from w/3 to 100 w", root),
-            "k_2": rate(site, 1e-2, 10, "corner sqrt(2/pi k_2 p) from w/100 to 10 w", integral, 2),
+            "c": manifold(context),
+            "k_1": rate(context, 1 / 3, 100, "slope k_1 sqrt(p) from w/3 to 100 w", root),
+            "k_2": rate(context, 1e-2, 10, "corner sqrt(2/pi k_2 p) from w/100 to 10 w", integral, 2),
         }
 
-    def _authorities(self, site: SearchContext) -> dict[str, Interval]:
-        size = float(site.model.s_0)
-        root = authority(site, (site.w**3 * size) ** 0.5, (1e-3, 0.3), "sqrt(w^3 s_0)")
-        return {"k_1": root, "k_2": authority(site, site.w**3 * size, (1e-5, 0.1), "w^3 s_0")}
+    def _authorities(self, context: SearchContext) -> dict[str, Interval]:
+        size = float(context.model.s_0)
+        root = authority(context, (context.w**3 * size) ** 0.5, (1e-3, 0.3), "sqrt(w^3 s_0)")
+        return {"k_1": root, "k_2": authority(context, context.w**3 * size, (1e-5, 0.1), "w^3 s_0")}
 
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: Array, period: Scalar

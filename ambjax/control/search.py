@@ -43,34 +43,34 @@ class Interval(NamedTuple):
     times: str = ""
 
 
-def manifold(site: SearchContext) -> Interval:
+def manifold(context: SearchContext) -> Interval:
     """Return the range of a decay rate on a sliding manifold, 1/s."""
-    cap = max(1 / (5 * site.period), site.w / 10)
-    if cap >= 10 * site.w:
-        return Interval(site.w / 30, 10 * site.w, f"w/30 to 10 w, {site.pole}", True)
-    words = f"w/30 to the cap 1/(5 T), T = {site.period:g} s: the sampled loop cannot slide faster; {site.pole}"
-    return Interval(site.w / 30, cap, words, True)
+    cap = max(1 / (5 * context.period), context.w / 10)
+    if cap >= 10 * context.w:
+        return Interval(context.w / 30, 10 * context.w, f"w/30 to 10 w, {context.pole}", True)
+    words = f"w/30 to the cap 1/(5 T), T = {context.period:g} s: the sampled loop cannot slide faster; {context.pole}"
+    return Interval(context.w / 30, cap, words, True)
 
 
-def switch(site: SearchContext, name: str, p: Scalar, times: float, over: str) -> Interval:
+def switch(context: SearchContext, name: str, p: Scalar, times: float, over: str) -> Interval:
     """Return the range of a switching gain from the slope 2/pi gain p of its smoothed sign.
 
     The range starts at twice the bound named `over`, or higher.
     """
-    per, below = TWO_OVER_PI * float(p), site.bounds.get(over, 0.0)
-    low, high = site.w / 3 / per, times * site.w / per
-    words = f"slope 2/pi {name} p from w/3 to {times:g} w, {site.pole}"
+    per, below = TWO_OVER_PI * float(p), context.bounds.get(over, 0.0)
+    low, high = context.w / 3 / per, times * context.w / per
+    words = f"slope 2/pi {name} p from w/3 to {times:g} w, {context.pole}"
     if 2 * below > low:
         words += f"; at least twice the disturbance, {below:.3g}"
     return Interval(max(low, 2 * below), max(high, 200 * below), words)
 
 
-def authority(site: SearchContext, size: Scalar, share: tuple[float, float], what: str, over: str = "") -> Interval:
+def authority(context: SearchContext, size: Scalar, share: tuple[float, float], what: str, over: str = "") -> Interval:
     """Return the range of a switching gain on a processor, where no slope limits it.
 
     `share`: ends of the range as shares of `size`; `what` describes `size`.
     """
-    below = site.bounds.get(over, 0.0)
+    below = context.bounds.get(over, 0.0)
     low, high = (part * float(size) for part in share)
     words = f"{share[0]:g} to {share[1]:g} of {float(size):.3g}, {what}"
     if 2 * below > low:
@@ -78,16 +78,16 @@ def authority(site: SearchContext, size: Scalar, share: tuple[float, float], wha
     return Interval(max(low, 2 * below), max(high, 200 * below), words)
 
 
-def steepness(site: SearchContext, name: str) -> dict[str, Interval]:
+def steepness(context: SearchContext, name: str) -> dict[str, Interval]:
     """Return the range of the steepness p of a sign with the gain `name`, on a processor; in continuous time none."""
-    if not site.stepped:
+    if not context.stepped:
         return {}
-    low, high = (slope / TWO_OVER_PI for slope in (site.w / 3, 10 / site.period))
-    words = f"slope 2/pi {name} p from w/3 to 10/T, hardly less than the sign itself; {site.pole}"
+    low, high = (slope / TWO_OVER_PI for slope in (context.w / 3, 10 / context.period))
+    words = f"slope 2/pi {name} p from w/3 to 10/T, hardly less than the sign itself; {context.pole}"
     return {"p": Interval(low, high, words, times=name)}
 
 
-def rate(site: SearchContext, low: float, high: float, words: str, per: Scalar = 1.0, power: int = 1) -> Interval:
+def rate(context: SearchContext, low: float, high: float, words: str, per: Scalar = 1.0, power: int = 1) -> Interval:
     """Return the range of a gain for which gain times `per`, in (1/s)^power, is (low w)^power to (high w)^power."""
-    first, last = ((share * site.w) ** power / float(per) for share in (low, high))
-    return Interval(first, last, f"{words}, {site.pole}")
+    first, last = ((share * context.w) ** power / float(per) for share in (low, high))
+    return Interval(first, last, f"{words}, {context.pole}")

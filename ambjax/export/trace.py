@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.control import answers
+from ambjax.control.base import memory_of
 from ambjax.control.cascade import CascadeState
 from ambjax.export.controller import BITS, INPUTS, OUTPUTS, Controller, Number, StepInputs, parameters_of
 from ambjax.export.emitter import traced
@@ -155,7 +155,7 @@ def _states(controller: Controller) -> list[Number]:
     cascade, memory = controller.parameters.controller, controller.start()
     found = []
     for stage, law, state in zip(CascadeState._fields, cascade.laws, memory.laws, strict=True):
-        told = answers.memory(law, state)
+        told = memory_of(law, state)
         assert len(told) == len(jax.tree.leaves(state)), f"{type(law).__name__}.memory: one entry for each state"
         if any(jnp.shape(x) != () for x in jax.tree.leaves(state)):
             raise ValueError(

@@ -10,6 +10,7 @@ from jax import Array, lax
 
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.control.cascade import Cascade
+from ambjax.control.laws import STAGES
 from ambjax.numerics.records import Scalar, canonical, validate
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.integrate import Advanced, InitialValueProblem, choose
@@ -92,6 +93,13 @@ def prepare(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[ClosedL
 
 def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     """Raise ValueError, with the dotted path and the fix, for whatever concrete value is not allowed."""
+    for stage, base in STAGES.items():
+        law = getattr(cascade, stage)
+        if not isinstance(law, base):
+            raise ValueError(
+                f"controller.{stage} = {type(law).__name__}: it is no law of this stage. Derive the class from "
+                f"ambjax.extend.{base.__name__}."
+            )
     validate(dataclasses.replace(cascade, processor=None), "controller")
     if cascade.processor is not None:
         validate(cascade.processor, "processor")

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.compiler.barrier import materialised
-from ambjax.control import answers
 from ambjax.control.cascade import Cascade, CascadeState, Command, Sample
 from ambjax.control.guard import Judged, Watch, expected, simulated
 from ambjax.control.processor import Processor
@@ -141,7 +140,7 @@ class Sampled:
         """What the processor computes of a measurement, and keeps: all but the plant. The exported C is this."""
         cascade, past, judged, laws = self.loop.cascade, (state.command.u, state.past[0]), None, state.control
         if self.processor.guard is not None:
-            estimated = answers.estimates_velocity(cascade.observer)
+            estimated = cascade.observer.estimates_velocity
             judged = self.processor.guard.judged(cascade.model, measured, state.watch, self.period, estimated)
             measured = judged.reading
         if not isinstance(state.started, tuple):
@@ -326,7 +325,7 @@ def check_parts(cascade: Cascade, scenario: Scenario) -> None:
                 "leave it out."
             )
     sensor = scenario.sensor
-    if sensor is not None and not sensor.velocity and not answers.estimates_velocity(cascade.observer):
+    if sensor is not None and not sensor.velocity and not cascade.observer.estimates_velocity:
         raise ValueError(
             "sensor.velocity = false: the velocity is not measured, and controller.observer does not estimate it. "
             'Choose one that does: kind = "kalman", for example.'

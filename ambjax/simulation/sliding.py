@@ -17,7 +17,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.compiler.barrier import compiled_alone, materialised
-from ambjax.control import answers
 from ambjax.control.cascade import Cascade
 from ambjax.control.laws import CurrentDemand, CurrentInputs
 from ambjax.numerics.records import Scalar
@@ -145,5 +144,5 @@ def _axpy(x: Any, h: Scalar, rate: Any) -> Any:
 
 def slides(cascade: Cascade, plant: Bearing) -> bool:
     """Whether this step is made for the cascade and the plant."""
-    slow = not answers.turns(cascade.observer)  # it goes by Heun's method
-    return cascade.processor is None and answers.slides(cascade.inversion) and plant.lumped and slow
+    slow = not cascade.observer.stiff  # it goes by Heun's method
+    return cascade.processor is None and cascade.inversion.slides and plant.lumped and slow

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.control import answers
 from ambjax.control.cascade import USUAL, Cascade
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
@@ -169,8 +168,8 @@ def required(cascade: Cascade) -> list[Required]:
     """
     rows = []
     for stage in ("position", "current", "inversion", "observer"):
-        law, paper = getattr(cascade, stage), answers.requirement(USUAL[stage])
-        own = answers.requirement(law)
+        law, paper = getattr(cascade, stage), USUAL[stage].requirement
+        own = law.requirement
         requirement, kind = (own, type(law)) if own else (paper, USUAL[stage])
         if requirement is None:
             continue

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control import answers
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.loop import ClosedLoop, ExternalInputs, LoopState
@@ -131,7 +130,7 @@ class Monitored:
         d = self._drift(inputs, state, errors, command.i_ref, moving)
         h = plant.a * (plant.signals(state.plant).v - v_tilde - plant.v(z, command.i_ref))
         laws = cascade.position, cascade.inversion, cascade.current
-        robust = Identities(*map(answers.robust, laws, (sigma, v_tilde, e)))
+        robust = Identities(*(law.robust(x) for law, x in zip(laws, (sigma, v_tilde, e), strict=True)))
         rates = Identities(robust.sigma + q_z + h, robust.v_tilde + d, robust.e + q_i)
         # |v(z, i) - v(z, i_ref)| <= L_v |e|: v is quadratic in i, so dv/di is largest at one end.
         L_v = jnp.maximum(jnp.abs(plant.dv_di(z, i)), jnp.abs(plant.dv_di(z, command.i_ref)))

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ambjax.control import answers
+from ambjax.control.base import unhardened
 from ambjax.control.cascade import Cascade, CascadeState
 from ambjax.control.sampling import Sampling, band, disturbance, slope_limits
 from ambjax.numerics.records import canonical
@@ -196,12 +196,12 @@ def _without_noise(scenario: Scenario) -> Scenario:
 def slopes(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
     """Return slope times T and its limits for every law with a slope. `cascade`: of one member."""
     sampling, lines = sampling_of(cascade, clock), []
-    for stage, law in zip(CascadeState._fields, map(answers.unhardened, cascade.laws), strict=True):
-        implicit = answers.has_own_step(law, sampling.implicit)
+    for stage, law in zip(CascadeState._fields, map(unhardened, cascade.laws), strict=True):
+        implicit = law.has_own_step(sampling.implicit)
         slope = stepped = _steepest(law.slope(cascade.model)) * sampling.period
         if implicit:
             relaxed = 1 / (1 + 1 / slope) if slope else 0.0
-            stepped = max(relaxed, float(answers.held(law, cascade.model)) * sampling.period)
+            stepped = max(relaxed, float(law.explicit_rate(cascade.model)) * sampling.period)
         if slope:
             lines.append(
                 SlopeCheck(stage, slope, stepped, *slope_limits(sampling.late if stage in DELAYED else 0.0), implicit)
@@ -228,10 +228,10 @@ def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, row
     for stage, (signal, unit) in SIGNALS.items():
         law = getattr(cascade, stage)
         x, true = (np.asarray(getattr(part, signal))[settled:] for part in (rows.computed, rows.true))
-        relay, notes = answers.relay(law), ["the supply limits u"] * limited
+        relay, notes = law.relay(), ["the supply limits u"] * limited
         gain = W = limit = None
         if relay is not None:
-            implicit = answers.has_own_step(law, sampling.implicit)
+            implicit = law.has_own_step(sampling.implicit)
             gain, W = float(relay.gain), disturbance(relay, x, sampling.period, implicit)
             limit = band(relay, W, sampling.period, implicit)
             if math.isinf(limit):

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.control import answers
 from ambjax.control.search import Interval, SearchContext
 from tuning.objective.members import Objective
 from tuning.objective.shortfalls import Bound
@@ -97,7 +96,7 @@ def _interval(site: SearchContext, cascade: Any, gain: Gain, value: float) -> In
         return Interval(gain.low, gain.high, "tune.bounds", True)
     _, stage, name = gain.path.split(".")
     about = Interval(value / ABOUT, value * ABOUT, f"a factor of {ABOUT:g} about the case's value")
-    return answers.ranges(getattr(cascade, stage), site).get(name, about)
+    return getattr(cascade, stage).ranges(site).get(name, about)
 
 
 def _quotient(gain: Gain, value: float, asked: Interval, cascade: Any, found: dict[str, Range]) -> Range:

@@ -1,0 +1,162 @@
+"""The base class of all laws: optional methods with their defaults, so that no caller asks which law it has.
+
+The classes of `control.laws` add the inputs and outputs of each stage.
+"""
+
+import dataclasses
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.control.sampling import Relay
+from ambjax.control.search import Interval, SearchContext
+from ambjax.numerics.records import Scalar, is_traced
+from ambjax.world.plant import Plant
+
+L = TypeVar("L", bound="Law")
+
+
+class Requirement(NamedTuple):
+    """Requirement of Theorem 1 on a law: the gain of this name exceeds `over` (Q_z, Q_i or Delta_1)."""
+
+    gain: str
+    over: str
+
+
+class Law:
+    """Base class of a law; it has no fields. A subclass is a frozen record whose leaves are the gains.
+
+    `requirement`: what Theorem 1 requires of a gain, or None. `estimates_velocity`: whether an observer needs no
+    measured velocity. `memory`: name, unit and meaning of each leaf of the state on a processor; None: derived from the
+    structure of the state. `own_steps`: discretisations for which a processor uses the method `step`; a class that
+    defines `step` and does not set this has ("implicit",). For the others it makes an explicit Euler step. `stiff`:
+    whether a state stays inside the layer of a smoothed sign; true if the class defines `layer`. `slides`: whether an
+    inversion law defines `slide`, a step over the layer (`laws.Relaxation`).
+    """
+
+    requirement: ClassVar[Requirement | None] = None
+    estimates_velocity: ClassVar[bool] = False
+    memory: ClassVar[tuple[tuple[str, str, str], ...] | None] = None
+    own_steps: ClassVar[tuple[str, ...]] = ()
+    stiff: ClassVar[bool] = False
+    slides: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        written = vars(cls)
+        if "step" in written and "own_steps" not in written:
+            cls.own_steps = ("implicit",)
+        cls.stiff, cls.slides = cls.stiff or "layer" in written, cls.slides or "slide" in written
+
+    def size(self, model: Plant) -> Scalar | None:
+        """Return the characteristic size of the argument of the smoothed sign; None if there is no such sign.
+
+        Default steepnesses scale with 1/size (`default_law`).
+        """
+        return None
+
+    def layer(self, model: Plant) -> Any:
+        """Return, for each state, the largest integration error that keeps it inside the layer of a smoothed sign."""
+        scale: Any = self
+        return jax.tree.map(lambda _: jnp.inf, scale.scale(model))
+
+    def robust(self, error: Array, /) -> Array:
+        """Return the term that the sign adds to the rate of the stage's error, Eqs. (12), (14)."""
+        return 0.0 * error
+
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        """Return the initial ranges of a search by gain name. A gain left out is searched around its value."""
+        return {}
+
+    def relay(self) -> Relay | None:
+        """Return the sign that alone drives the stage's error; None if there is none, or more than a sign."""
+        return None
+
+    def explicit_rate(self, model: Plant) -> Scalar:
+        """Return the largest rate (1/s) of the terms that the implicit `step` treats explicitly."""
+        return 0.0
+
+    def init_sampled(self, model: Plant) -> Any:
+        """Return the state at t = 0 on a processor; not used for observers."""
+        law: Any = self
+        return law.init(model)
+
+    def scale_sampled(self, model: Plant) -> Any:
+        """Return the characteristic size of each number of the state on a processor."""
+        law: Any = self
+        return law.scale(model)
+
+    def has_own_step(self, implicit: bool) -> bool:
+        """Whether a processor with implicit (or explicit) steps uses the method `step` of this law."""
+        return ("implicit" if implicit else "explicit") in self.own_steps
+
+
+def default_law(kind: type[L], model: Plant) -> L:
+    """Return the law of this kind with its default gains, and with steepnesses scaled to the model.
+
+    The default steepness suits the plant of Table 1. It scales with the inverse size of the sign's argument: for
+    p = 25 m^2/A^2 a sign of v is soft where v is about 2500 A^2/m^2, as in Table 1, and hard where v is about 1e7.
+    """
+    law: Any = kind()
+    size = law.size(model)
+    if size is None:
+        return law
+    ratio = law.size(Plant()) / size
+    return dataclasses.replace(law, **{name: getattr(law, name) * ratio for name in _steepnesses(law)})
+
+
+def _steepnesses(law: Law) -> list[str]:
+    fields: Any = law
+    return [field.name for field in dataclasses.fields(fields) if field.metadata.get("steepness")]
+
+
+def memory_of(law: Law, state: Any) -> list[tuple[str, str, str]]:
+    """Return name, unit and meaning of each leaf of a law's state."""
+    if law.memory is not None:
+        return list(law.memory)
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    paths = [jax.tree_util.keystr(path, simple=True, separator="_") for path, _ in leaves]
+    return [(f"x_{path}" if path.isdigit() else path or "x", "", "") for path in paths]
+
+
+def hard_signs(law: Law) -> list[str]:
+    """Return the names of the steepnesses that are inf or None: the sign is set-valued.
+
+    Raises ValueError if a steepness is inf for some members only.
+    """
+    names = []
+    for name in _steepnesses(law):
+        value = getattr(law, name)
+        if is_traced(value):
+            continue
+        infinite = np.array([True]) if value is None else np.isinf(np.asarray(value, float))
+        if infinite.any() and not infinite.all():
+            raise ValueError(
+                f"{name}: inf for some members and a number for others. A sign without a layer is another "
+                "program: give inf to all or to none."
+            )
+        if infinite.all():
+            names.append(name)
+    return names
+
+
+def hardened(law: L) -> L:
+    """Return the law with None for every steepness that is inf. Raises ValueError as `hard_signs` does."""
+    given: Any = law
+    return dataclasses.replace(given, **dict.fromkeys(hard_signs(law)))
+
+
+def unhardened(law: L) -> L:
+    """Return the law with inf for every steepness that is None, so that its slope is a number."""
+    given: Any = law
+    return dataclasses.replace(given, **dict.fromkeys(hard_signs(law), np.inf))
+
+
+def softened(law: L, model: Plant) -> L:
+    """Return the law with the default steepness for the model in place of every inf or None."""
+    given: Any = law
+    usual = default_law(type(law), model)
+    return dataclasses.replace(given, **{name: getattr(usual, name) for name in hard_signs(law)})
