@@ -1,7 +1,9 @@
+import ctypes
 import gc
 import os
 import pathlib
 import shutil
+import sys
 
 import pytest
 
@@ -27,6 +29,8 @@ def _release_programs():
 
     jax.clear_caches()
     gc.collect()
+    if sys.platform == "linux":  # the C library keeps freed memory otherwise
+        getattr(ctypes.CDLL(None), "malloc_trim", lambda _: 0)(0)
 
 
 @pytest.fixture

@@ -10,20 +10,21 @@ with it. Exit code 1 if one survives, if its text is no longer found exactly onc
 import argparse
 import os
 import pathlib
+import queue
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
+from forked import OVER_TIME, Parent
 from mutations import MUTATIONS, Mutation
 
 ROOT = pathlib.Path(__file__).parent.parent
 COPIED = ("ambjax", "tuning", "tests", "pyproject.toml")
-# Far more than any of these tests takes: a mutant may also loop forever.
-LIMIT_S = 400
+# Far more than any of these tests takes, because a mutant may loop forever. ALL_LIMIT_S is for all tests together.
+LIMIT_S, ALL_LIMIT_S = 400, 3600
 PASSED, FAILED = 0, 1
 KILLED, SURVIVED = "killed", "SURVIVED"
 
@@ -43,32 +44,33 @@ def mutated(mutation: Mutation, root: pathlib.Path = ROOT) -> str:
     return changed
 
 
-def run(root: pathlib.Path, change: Mutation | None, *words: str) -> tuple[int, str]:
+def parent() -> Parent:
+    """Start a process that forks the tests. Its compiled programs are those of the test suite."""
+    return Parent({"JAX_COMPILATION_CACHE_DIR": str(ROOT / ".pytest_cache" / "programs")} | dict(os.environ))
+
+
+def run(forks: Parent, root: pathlib.Path, change: Mutation | None, *words: str) -> tuple[int, str]:
     """Exit code and output of pytest in a copy of the project, one file of it changed."""
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
-        copy = pathlib.Path(folder)
+        copy = pathlib.Path(folder).resolve()
         for name in COPIED:
             if (root / name).is_dir():
-                shutil.copytree(root / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+                shutil.copytree(root / name, copy / name)  # with its bytecode, which stays valid
             elif (root / name).exists():
-                shutil.copy(root / name, copy / name)
+                shutil.copy2(root / name, copy / name)
         if change:
             (copy / change.file).write_text(mutated(change, root), encoding="utf-8")
-        command = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "", "-p", "no:cacheprovider", *words]
-        env = {"JAX_COMPILATION_CACHE_DIR": str(ROOT / ".pytest_cache" / "programs")} | dict(os.environ)
-        env |= {"PYTHONPATH": folder, "PYTHONDONTWRITEBYTECODE": "1"}
-        try:
-            done = subprocess.run(
-                command, cwd=copy, env=env, timeout=LIMIT_S, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-            )
-        except subprocess.TimeoutExpired:
-            return -1, f"not finished after {LIMIT_S} s"
-        return done.returncode, done.stdout
+            for stale in (copy / change.file).parent.glob(f"__pycache__/{pathlib.Path(change.file).stem}.*"):
+                stale.unlink()
+        limit_s = LIMIT_S if change else ALL_LIMIT_S
+        command = ["-q", "-x", "-m", "", "-p", "no:cacheprovider", *words]
+        code, output = forks.run(str(copy), command, limit_s)
+        return code, f"not finished after {limit_s} s" if code == OVER_TIME else output
 
 
-def verdict(mutation: Mutation, root: pathlib.Path = ROOT) -> str:
+def verdict(mutation: Mutation, root: pathlib.Path, forks: Parent) -> str:
     """KILLED, SURVIVED, or why neither can be said."""
-    code, output = run(root, mutation, "-n", "0", mutation.test)
+    code, output = run(forks, root, mutation, "-n", "0", mutation.test)
     if code in (PASSED, FAILED):
         return SURVIVED if code == PASSED else KILLED
     return f"NOT JUDGED (pytest ended with {code}): {output.strip()[-300:]}"
@@ -84,23 +86,43 @@ def hunt(
     except ValueError as error:
         say(str(error))
         return 1
+    parents = [parent() for _ in range(jobs)]
+    try:
+        return _hunt(mutations, root, parents, say)
+    finally:
+        for forks in parents:
+            forks.close()
+
+
+def _hunt(
+    mutations: Sequence[Mutation], root: pathlib.Path, parents: Sequence[Parent], say: Callable[[str], None]
+) -> int:
+    """The hunt, one mutant at a time for each parent."""
     tests = sorted({mutation.test for mutation in mutations})
     say(f"{len(tests)} tests without mutations ...")
-    code, output = run(root, None, "-n", str(jobs), "--dist", "loadscope", *tests)
+    code, output = run(parents[0], root, None, "-n", str(len(parents)), "--dist", "loadscope", *tests)
     if code != PASSED:
         say(f"{output}\nThe tests do not pass without mutations: mend them first.")
         return 1
+    free: queue.SimpleQueue[Parent] = queue.SimpleQueue()
+    for forks in parents:
+        free.put(forks)
 
     def one(mutation: Mutation) -> str:
-        began = time.perf_counter()
-        found = verdict(mutation, root)
+        forks, began = free.get(), time.perf_counter()
+        try:
+            found = verdict(mutation, root, forks)
+        finally:
+            free.put(forks)
         say(f"{found}, {time.perf_counter() - began:.0f} s: {mutation.says} [{mutation.test}]")
         return found
 
-    with ThreadPoolExecutor(jobs) as pool:
-        found = list(pool.map(one, mutations))
-    left = [mutation.says for mutation, what in zip(mutations, found, strict=True) if what != KILLED]
-    say(f"{len(mutations) - len(left)} of {len(mutations)} mutations were killed. {'; '.join(left)}".rstrip())
+    # Mutants of one test file run next to each other: they share compiled programs.
+    ordered = sorted(mutations, key=lambda mutation: mutation.test)
+    with ThreadPoolExecutor(len(parents)) as pool:
+        found = list(pool.map(one, ordered))
+    left = [mutation.says for mutation, what in zip(ordered, found, strict=True) if what != KILLED]
+    say(f"{len(ordered) - len(left)} of {len(ordered)} mutations were killed. {'; '.join(left)}".rstrip())
     return int(bool(left))
 
 

@@ -1,9 +1,10 @@
 """The hunt for mutants: its table fits the code, it tells the killed from the survivors, and none survives."""
 
+import contextlib
 import pathlib
 
 import pytest
-from mutate import KILLED, SURVIVED, hunt, main, verdict
+from mutate import KILLED, SURVIVED, hunt, main, parent, verdict
 from mutate import mutated as applied
 from mutations import MUTATIONS, Mutation
 
@@ -47,9 +48,10 @@ def project(tmp_path):
 
 
 def test_the_killed_are_told_from_survivors(project):
-    assert verdict(BREAK, project) == KILLED
-    assert verdict(BREAK._replace(test="tests/test_it.py::test_zero"), project) == SURVIVED
-    assert "NOT JUDGED" in verdict(BREAK._replace(test="tests/test_it.py::test_two"), project)
+    with contextlib.closing(parent()) as forks:
+        assert verdict(BREAK, project, forks) == KILLED
+        assert verdict(BREAK._replace(test="tests/test_it.py::test_zero"), project, forks) == SURVIVED
+        assert "NOT JUDGED" in verdict(BREAK._replace(test="tests/test_it.py::test_two"), project, forks)
     assert (project / BREAK.file).read_text() == PROGRAM  # never in place
 
 

@@ -265,9 +265,9 @@ def loss_of(clock, p, closed=False):
 @pytest.mark.parametrize(("p", "closed"), [(2.0, False), (INF, False), pytest.param(INF, True, marks=pytest.mark.slow)])
 def test_gradients_three_ways(p, closed):
     clock = amb.Clock(100, 1e-4, amb.RK4(2))
-    at, whole = np.array([0.1, -0.2, 0.05, 0.1]), loss_of(clock, p, closed)
-    # compiled as a whole: differentiated call by call, tracing takes twice as long as the rest
-    loss, forward, reverse = jax.jit(whole), jax.jit(jax.jacfwd(whole))(at), jax.jit(jax.grad(whole))(at)
+    # traced once: both derivatives are those of the traced program
+    at, loss = np.array([0.1, -0.2, 0.05, 0.1]), jax.jit(loss_of(clock, p, closed))
+    forward, reverse = jax.jit(jax.jacfwd(loss))(at), jax.jit(jax.grad(loss))(at)
     scale = np.abs(forward).max()
     np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-10 * scale)
     # central differences: their error is step^2 times a third derivative; where no clip switches, as here
@@ -280,7 +280,7 @@ def test_gradients_three_ways(p, closed):
     ("p", "closed"), [(25.0, False), (INF, False), pytest.param(INF, True, marks=pytest.mark.slow)]
 )
 def test_gradients_are_finite_over_six_decades_of_gains(p, closed):
-    loss = loss_of(amb.Clock(40, 1e-4, amb.RK4(1)), p, closed)
+    loss = jax.jit(loss_of(amb.Clock(40, 1e-4, amb.RK4(1)), p, closed))
     points = np.random.default_rng(4).uniform(-6.9, 6.9, (500, 4))
     values, slopes = jax.jit(jax.vmap(jax.value_and_grad(loss)))(points)
     assert np.isfinite(values).all()
