@@ -13,9 +13,9 @@ HEAD = """# Benchmarks
 `python benchmarks/report.py` generates this page from the JSON files in `results/`. Do not edit it.
 Each ratio compares two times of the same run of a script. Absolute times depend on the machine and its load.
 
-The comparison with other libraries and the scaling were measured before metrics included substeps; ensembles with all
-metrics cost more now. The times of `ambjax tune` and of the search were measured on a machine with other load, all other
-times on an idle machine.
+The comparison with other libraries and the scaling were measured before metrics included substeps; ensembles with
+all metrics cost more now. The times of `ambjax tune` and of the search were measured on a machine with other load,
+all other times on an idle machine.
 
     .venv/bin/pip install -e '.[bench]'
     .venv/bin/python benchmarks/single.py            # one run against SciPy and diffrax
@@ -55,7 +55,10 @@ def facts(machine: dict[str, Any]) -> str:
 def single() -> list[str]:
     data = load("single")
     lines = ["## One run of 2 s, at equal accuracy (`single.py`)", "", facts(data["machine"])]
-    lines += [f"Each solver uses its cheapest tolerance with a largest error in z of at most {data['target_error_m']:g} m.", ""]
+    lines += [
+        f"Each solver uses its cheapest tolerance with a largest error in z of at most {data['target_error_m']:g} m.",
+        "",
+    ]
     for gains in ("smooth", "repaired"):
         lines += [
             f"{gains} gains:",
@@ -103,9 +106,9 @@ def throughput() -> list[str]:
     data = load("throughput")
     lines = ["## Ensembles against the machine's limit (`throughput.py`)", "", facts(data["machine"])]
     lines += [
-        f"RK4 with steps of 10 us, {data['samples']} samples of 10 steps. Times are in ns per member and step, without",
-        "compilation. The limit is a C program with SIMD (`limit.c`), run alternately with ambjax. One member alone is a",
-        "`rollout`. Times one core: speed relative to one core; in brackets that of the limit.",
+        f"RK4 with steps of 10 us, {data['samples']} samples of 10 steps. Times are in ns per member and step,",
+        "without compilation. The limit is a C program with SIMD (`limit.c`), run alternately with ambjax. One",
+        "member alone is a `rollout`. Times one core: speed relative to one core; in brackets that of the limit.",
         "",
     ]
     rows = []
@@ -123,10 +126,10 @@ def peers() -> list[str]:
     data = load("peers")
     lines = ["## Ensembles against other libraries (`peers.py`)", "", facts(data["machine"])]
     lines += [
-        "One core, no noise. Times are in ns per member and 10 us simulated. Fixed-step peers take RK4 steps of 10 us and",
-        "are compared with the same steps. Adaptive peers (tolerance 1e-6) are compared with the cheapest step of ambjax",
-        "that reaches their measured error, and with the cheapest whose error is at most 1e-6 of the largest z",
-        f"({data['largest_z_m']:.1e} m).",
+        "One core, no noise. Times are in ns per member and 10 us simulated. Fixed-step peers take RK4 steps of 10",
+        "us and are compared with the same steps. Adaptive peers (tolerance 1e-6) are compared with the cheapest",
+        "step of ambjax that reaches their measured error, and with the cheapest whose error is at most 1e-6 of the",
+        f"largest z ({data['largest_z_m']:.1e} m).",
         "",
     ]
     rows = []
@@ -171,7 +174,10 @@ def held_noise() -> list[str]:
 def gradients() -> list[str]:
     data = load("gradients")
     lines = ["## Cost of a gradient of four gains (`gradients.py`)", "", facts(data["machine"])]
-    lines += ["One core, float64. Costs are in forward runs with the same code and step. The tuner uses forward mode.", ""]
+    lines += [
+        "One core, float64. Costs are in forward runs with the same code and step. The tuner uses forward mode.",
+        "",
+    ]
     rows = []
     for r in data["rows"]:
         cells = [r["step"], str(r["members"]), f"{1e9 * r['run_s'] / r['members'] / r['steps']:.0f}"]
@@ -188,8 +194,9 @@ def sampled() -> list[str]:
     first = data["rows"][0]
     lines += [
         f"{first['members']:,} members, float64, one core, held noise, 10 kHz, one sample of delay with prediction,",
-        f"{first['substeps']} substeps. Times are in ns per member and sample. C: `sampled.c`; its error is relative to a",
-        f"`rollout` under the same noise. Gradient: 4 gains, forward mode, {data['tangents_of']} members, in forward runs.",
+        f"{first['substeps']} substeps. Times are in ns per member and sample. C: `sampled.c`; its error is relative",
+        f"to a `rollout` under the same noise. Gradient: 4 gains, forward mode, {data['tangents_of']} members, in",
+        "forward runs.",
         "",
     ]
     rows = []
@@ -204,10 +211,10 @@ def tasks() -> list[str]:
     data = load("tasks")
     lines = ["## The tuning tasks (`tasks.py`)", "", facts(data["machine"])]
     lines += [
-        "`ambjax tune` runs with its defaults, from gains that lose the rotor. Exceptions: E minimises the mean of the worst",
-        "tenth of 64 members, and the pole of the observer ranges from 0.999 to 1e4. Figures are over the held-out members.",
-        "Steps: error of the settled rms error with the steps of the search, against adaptive RODAS3. u: after settling.",
-        "Seconds: processor time of the whole command, on a machine with other load.",
+        "`ambjax tune` runs with its defaults, from gains that lose the rotor. Exceptions: E minimises the mean of",
+        "the worst tenth of 64 members, and the pole of the observer ranges from 0.999 to 1e4. Figures are over the",
+        "held-out members. Steps: error of the settled rms error with the steps of the search, against adaptive",
+        "RODAS3. u: after settling. Seconds: processor time of the whole command, on a machine with other load.",
         "",
     ]
     return lines + _tasks(data)
@@ -218,9 +225,9 @@ def bearings() -> list[str]:
     lines = ["## Other bearings and the templates (`bearings.py`)", "", facts(data["machine"])]
     verified = sum(row["verified"] for row in data["tasks"].values())
     lines += [
-        "As above, without manual intervention. The gains of the templates hold the rotor at the start. The reference is",
-        "constant in all tasks but `tracking`.",
-        f"Accurate steps confirm {verified} of {len(data['tasks'])} answers.",
+        "As above, without manual intervention. The gains of the templates hold the rotor at the start. The",
+        f"reference is constant in all tasks but `tracking`. Accurate steps confirm {verified} of",
+        f"{len(data['tasks'])} answers.",
         "",
     ]
     return lines + _tasks(data)
@@ -247,10 +254,10 @@ def sampled_tasks() -> list[str]:
     data = load("sampled_tasks")
     lines = ["## The tuning tasks on a processor (`sampled_tasks.py`)", "", facts(data["machine"])]
     lines += [
-        "As above, on a processor of 10 or 20 kHz with a delay of one sample. Bar: settled rms error that CMA-ES reached",
-        "in 2 x 900 evaluations on 6 members with an independent simulator of the same loop. Seconds in brackets: the same",
-        "task in continuous time. p: of the position, inversion and current laws. Bounds: at most a fifth of the sample",
-        "rate for c, at least 0.05 1/s for l.",
+        "As above, on a processor of 10 or 20 kHz with a delay of one sample. Bar: settled rms error that CMA-ES",
+        "reached in 2 x 900 evaluations on 6 members with an independent simulator of the same loop. Seconds in",
+        "brackets: the same task in continuous time. p: of the position, inversion and current laws. Bounds: at most",
+        "a fifth of the sample rate for c, at least 0.05 1/s for l.",
         "",
     ]
     rows = []
@@ -271,12 +278,12 @@ def search() -> list[str]:
     data = load("search")
     lines = ["## The search against derivative-free methods (`search.py`)", "", facts(data["machine"])]
     lines += [
-        "All methods use the same loss, members, coordinates and ranges. TPE may leave the ranges by half their width, random",
-        "search may not. The budget of rollouts is the median that the gradient search takes over its seeds, or a multiple of",
-        "it. Loss: median and range over seeds. Powell's method is deterministic; Nelder-Mead and CMA-ES have deterministic",
-        "starting points. Reached: rollouts until the final median loss of the gradient search, median over seeds; a dash: not",
-        "within the budget. Rollouts do not measure cost, because padded lanes are computed too; the time is processor time of",
-        "one search on one core.",
+        "All methods use the same loss, members, coordinates and ranges. TPE may leave the ranges by half their",
+        "width, random search may not. The budget of rollouts is the median that the gradient search takes over its",
+        "seeds, or a multiple of it. Loss: median and range over seeds. Powell's method is deterministic;",
+        "Nelder-Mead and CMA-ES have deterministic starting points. Reached: rollouts until the final median loss of",
+        "the gradient search, median over seeds; a dash: not within the budget. Rollouts do not measure cost,",
+        "because padded lanes are computed too; the time is processor time of one search on one core.",
         "",
     ]
     rows = []
@@ -299,10 +306,10 @@ def from_answer() -> list[str]:
     data = load("from_answer")
     lines = ["## CMA-ES from the answer of a search (`from_answer.py`)", "", facts(data["machine"])]
     lines += [
-        "Each task is tuned with its defaults. CMA-ES then continues from the answer, on the training ensemble and the 16",
-        "validation members with the least clearance, with limits as penalties. Lower by: reduction of the settled rms error",
-        "of the 1,000 held-out members at its best point and at its last mean, with the number of lost members and the limits",
-        "broken there.",
+        "Each task is tuned with its defaults. CMA-ES then continues from the answer, on the training ensemble and",
+        "the 16 validation members with the least clearance, with limits as penalties. Lower by: reduction of the",
+        "settled rms error of the 1,000 held-out members at its best point and at its last mean, with the number of",
+        "lost members and the limits broken there.",
         "",
     ]
     rows = []
@@ -321,7 +328,10 @@ def from_answer() -> list[str]:
 def startup() -> list[str]:
     data = load("startup")
     lines = ["## Time of whole commands (`startup.py`)", "", facts(data["machine"])]
-    lines += [f"New processes with a warm compilation cache, on the paper's tracking case; medians of {data['runs']}.", ""]
+    lines += [
+        f"New processes with a warm compilation cache, on the paper's tracking case; medians of {data['runs']}.",
+        "",
+    ]
     rows = [
         [f"`{name}`", *(f"{row[key]:.2f}" for key in ("wall_s", "least_wall_s", "cpu_s", "cpu_over_import_jax"))]
         for name, row in data["rows"].items()
@@ -332,7 +342,10 @@ def startup() -> list[str]:
 def workarounds() -> list[str]:
     data = load("workarounds")
     lines = ["## Workarounds for XLA's compiler (`workarounds.py`)", "", facts(data["machine"])]
-    lines += [f"Ratio of the times without and with each workaround, in pairs of runs; medians of {data['rounds']}.", ""]
+    lines += [
+        f"Ratio of the times without and with each workaround, in pairs of runs; medians of {data['rounds']}.",
+        "",
+    ]
     jobs = [key for key in next(iter(data["rows"].values())) if key != "says"]
     rows = [[name, row["says"], *(f"{row[job]:.2f}" for job in jobs)] for name, row in data["rows"].items()]
     return lines + table(" | ".join(["workaround", "without it", *jobs]), rows)
