@@ -29,7 +29,7 @@ def main() -> None:
             path = given.out / f"{name}.toml"
             path.write_text(f"# The template {name}.\n{template(name)}")
         rows[name] = row = tasks.tuned(path, given.out / name)
-        print(f"{tasks.told(row)}; {'verified' if row['verified'] else 'NOT verified'}", flush=True)
+        print(f"{tasks.row_text(row)}; {'verified' if row['verified'] else 'NOT verified'}", flush=True)
     _measure.write("bearings", {"tasks": dict(sorted(rows.items()))})
 
 

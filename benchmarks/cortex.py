@@ -1,6 +1,7 @@
 """A Cortex-M4F under QEMU: programs of an exported controller, compiled for it and run there.
 
-`missing()` returns the tools that are not installed, as text. Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm.
+`missing()` returns the tools that are not installed, as text. Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi
+qemu-system-arm.
 """
 
 import pathlib

@@ -1,9 +1,9 @@
 """Run CMA-ES from the tuner's answer, to check whether the search stopped short.
 
-Each task is tuned as in tasks.py. CMA-ES continues from the answer for `--evaluations` evaluations, on the training ensemble
-and the 16 validation members with the least clearance, on the tuner's goal; limits are penalties on what members reach,
-without a margin for smoothing. The best point and the last mean are judged on the 1,000 held-out members of the
-tuner: a point that loses more of them, or breaks a limit, is marked. Results of tasks that are not asked for stay.
+Each task is tuned as in tasks.py. CMA-ES continues from the answer for `--evaluations` evaluations, on the training
+ensemble and the 16 validation members with the least clearance, on the tuner's goal; limits are penalties on what
+members reach, without a margin for smoothing. The best point and the last mean are judged on the 1,000 held-out
+members of the tuner: a point that loses more of them, or breaks a limit, is marked. Results of other tasks are kept.
 Run: python benchmarks/from_answer.py [--out DIR] [--evaluations 300] [--size 0.2] [TASK ...]
 """
 

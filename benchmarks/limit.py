@@ -1,7 +1,8 @@
 """The machine's limit: limit.c, built with the system's compiler and called on a workload.
 
 `missing()` returns the reason if there is no C program. `agreement` compares the program with `rollout`: without noise
-to 1e-9 relative in float64; with noise, which it draws by another generator, by the motion of the rotor. Run: python benchmarks/limit.py
+to 1e-9 relative in float64; with noise, which it draws by another generator, by the motion of the rotor. Run: python
+benchmarks/limit.py
 """
 
 import concurrent.futures

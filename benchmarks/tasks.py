@@ -26,7 +26,7 @@ def main() -> None:
     rows = kept("tasks")
     for name in given.tasks:
         rows[name] = row = tuned(TASKS / f"{name}.toml", given.out / name)
-        print(told(row), flush=True)
+        print(row_text(row), flush=True)
     _measure.write("tasks", {"tasks": dict(sorted(rows.items()))})
 
 
@@ -72,7 +72,7 @@ def tuned(path: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
     }
 
 
-def told(row: dict[str, Any]) -> str:
+def row_text(row: dict[str, Any]) -> str:
     """Return a row as one line of text."""
     return (
         f"{row['title']}: settled rms {row['settled_rms_error_m']:.2e} m, largest "

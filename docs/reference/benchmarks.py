@@ -5,7 +5,7 @@ import sys
 from reference.floors import ROOT
 
 FOLDER = ROOT / "benchmarks"
-# Where the pictures are, seen from the README beside the scripts and from the page.
+# Paths of the pictures, relative to benchmarks/README.md and to the generated page.
 FROM_THERE, FROM_HERE = "](results/", "](../../benchmarks/results/"
 
 

@@ -38,7 +38,7 @@ SETTINGS: dict[str, dataclasses.Field] = {
 WORDS = {
     "plant": "The true plant. Left out, or a key of it: Table 1 of the paper.",
     "controller": "The cascade: a nominal plant and one law per stage. Kinds and gains: [laws](laws.md).",
-    "controller.model": "What the controller believes of the plant, where that differs: any key of `[plant]`.",
+    "controller.model": "Parameters of the controller's model that differ from the plant: any key of `[plant]`.",
     "processor": "What the cascade runs on: one step of all laws a sample, its voltage held and late. Left out: "
     "continuous time, as in the paper. See [the processor](../processor.md).",
     "processor.guard": "Limits of the readings: one beyond them is refused and predicted. A key left out is derived "
