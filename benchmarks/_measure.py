@@ -1,4 +1,4 @@
-"""What the benchmarks share: timing, machine facts, JSON."""
+"""Functions shared by the benchmarks: timing, machine facts, JSON."""
 
 import contextlib
 import json
@@ -20,7 +20,7 @@ RESULTS = pathlib.Path(__file__).parent / "results"
 
 
 def median_time(run: Callable[[], Any], repeats: int = 7) -> float:
-    """Median wall time of `run`, in s, after one warm-up; waits for JAX's results."""
+    """Return the median wall time of `run`, in s, after one warm-up; wait for the results of JAX."""
     jax.block_until_ready(run())
     times = []
     for _ in range(repeats):
@@ -31,7 +31,7 @@ def median_time(run: Callable[[], Any], repeats: int = 7) -> float:
 
 
 class Timed(NamedTuple):
-    """Seconds of a run in each round, and what its first call took."""
+    """Seconds of a run in each round, and the time of its first call."""
 
     times: list[float]
     first: float
@@ -42,11 +42,11 @@ class Timed(NamedTuple):
 
     @property
     def compile_s(self) -> float:
-        """What the first call added."""
+        """Return the additional time of the first call, in s."""
         return max(self.first - self.seconds, 0.0)
 
     def over(self, other: "Timed") -> float:
-        """Median over rounds of this time over the other's: spells in which the machine is slow cancel."""
+        """Return the median over rounds of the ratio of two times; slow periods of the machine cancel."""
         return statistics.median(a / b for a, b in zip(self.times, other.times, strict=True))
 
 
@@ -83,7 +83,7 @@ def alternating(
 
 
 def child(script: str, *arguments: Any, **environment: str) -> Any:
-    """Run a benchmark script in a process of its own; the JSON that it prints as its last line."""
+    """Run a benchmark script in its own process and return the JSON of its last output line."""
     command = [sys.executable, script, *map(str, arguments)]
     done = subprocess.run(command, env=os.environ | environment, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout.splitlines()[-1])
@@ -125,13 +125,13 @@ def peak_memory() -> int:
 
 
 def one_core() -> None:
-    """Keep this process on one core, where the system can."""
+    """Pin this process to one core, if the system supports it."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
 def machine() -> dict[str, Any]:
-    """Facts a reader needs to place the numbers."""
+    """Return facts about the machine and the versions."""
     cpuinfo = pathlib.Path("/proc/cpuinfo")
     text = cpuinfo.read_text() if cpuinfo.exists() else ""
     model = next((line.split(":")[1].strip() for line in text.splitlines() if line.startswith("model name")), "")
@@ -146,7 +146,7 @@ def machine() -> dict[str, Any]:
 
 
 def write(name: str, results: dict[str, Any]) -> None:
-    """Write benchmarks/results/NAME.json with the machine's facts."""
+    """Write benchmarks/results/NAME.json with the facts about the machine."""
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / f"{name}.json"
     path.write_text(json.dumps({"machine": machine(), **results}, indent=2) + "\n")

@@ -1,6 +1,6 @@
-"""Other bearings than the paper's, standing still, and the two templates: each by `ambjax tune` with its defaults.
+"""Tune other bearings with a constant reference, and the two templates, by `ambjax tune` with its defaults.
 
-As `tasks.py`, whose rows these are: unattended, judged on 1,000 held-out members, verified by accurate steps.
+The rows are those of `tasks.py`: no manual intervention, 1,000 held-out members, verification by accurate steps.
 Run: python benchmarks/bearings.py [--out DIR] [NAME ...]
 """
 
@@ -29,7 +29,7 @@ def main() -> None:
             path = given.out / f"{name}.toml"
             path.write_text(f"# The template {name}.\n{template(name)}")
         rows[name] = row = tasks.tuned(path, given.out / name)
-        print(f"{tasks.told(row)}; {'verified' if row['verified'] else 'NOT verified'}", flush=True)
+        print(f"{tasks.row_text(row)}; {'verified' if row['verified'] else 'NOT verified'}", flush=True)
     _measure.write("bearings", {"tasks": dict(sorted(rows.items()))})
 
 

@@ -1,6 +1,7 @@
 """A Cortex-M4F under QEMU: programs of an exported controller, compiled for it and run there.
 
-`missing()` says in words which tool is not there. Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm.
+`missing()` returns the tools that are not installed, as text. Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi
+qemu-system-arm.
 """
 
 import pathlib
@@ -29,13 +30,13 @@ __attribute__((section(".vectors"), used)) static void *const vectors[16] = {
 
 
 def missing() -> str:
-    """Why nothing runs on a Cortex-M4F here; empty if it does."""
+    """Return the reason why no program can run on a Cortex-M4F; empty if one can."""
     absent = [tool for tool in (GCC, QEMU) if shutil.which(tool) is None]
     return f"{' and '.join(absent)} not found" if absent else ""
 
 
 def size(source: pathlib.Path) -> tuple[int, int]:
-    """Bytes of code and constants of a source, and the deepest stack frame of its functions."""
+    """Return the bytes of code and constants of a source, and the deepest stack frame of its functions."""
     target = source.with_suffix(".arm.o")
     subprocess.run([GCC, *FLAGS, "-fstack-usage", "-c", source, "-o", target], check=True)
     listed = subprocess.run(["arm-none-eabi-size", target], check=True, capture_output=True, text=True).stdout
@@ -44,7 +45,7 @@ def size(source: pathlib.Path) -> tuple[int, int]:
 
 
 def run(sources: list[pathlib.Path], folder: pathlib.Path, *more: str) -> tuple[int, str]:
-    """Exit code and output of a program of these sources. `more`: QEMU's options."""
+    """Return the exit code and the output of a program of these sources. `more`: options of QEMU."""
     (folder / "start.c").write_text(START)
     program = folder / "program.elf"
     linked = ["--specs=rdimon.specs", "-Wl,--section-start=.vectors=0x0", "-lm"]

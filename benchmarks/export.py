@@ -1,6 +1,6 @@
-"""What a step of an exported controller costs: time on this machine, instructions, code and stack on a Cortex-M4F.
+"""Cost of a step of an exported controller: time on this machine; instructions, code and stack on a Cortex-M4F.
 
-Cycles are those of the time stamp counter, the median of rounds; instructions are counted by QEMU, which knows no
+Cycles are the median of the time stamp counter over rounds. QEMU counts the instructions; it does not model the
 pipeline. Run: python benchmarks/export.py
 """
 
@@ -108,7 +108,7 @@ int main(void)
 
 
 def measured(cascade: Cascade, precision: str) -> dict[str, Any]:
-    """One row."""
+    """Return one row of the table."""
     controller = controller_of(cascade, 200.0, 1e-4)
     traced = trace(controller, precision)
     with tempfile.TemporaryDirectory() as name:

@@ -1,9 +1,9 @@
-"""What CMA-ES finds from the tuner's answer: whether the search stopped short.
+"""Run CMA-ES from the tuner's answer, to check whether the search stopped short.
 
-Each task is tuned as tasks.py does it. From its answer CMA-ES goes on for so many evaluations, on the training ensemble
-and the 16 validation members with the least clearance, on the tuner's goal; limits are penalties on what members reach,
-without a margin for smoothing. The best point and the last mean are judged on the 1,000 held-out members of the
-tuner: a point that loses more of them, or breaks a limit, is marked. Results of tasks that are not asked for stay.
+Each task is tuned as in tasks.py. CMA-ES continues from the answer for `--evaluations` evaluations, on the training
+ensemble and the 16 validation members with the least clearance, on the tuner's goal; limits are penalties on what
+members reach, without a margin for smoothing. The best point and the last mean are judged on the 1,000 held-out
+members of the tuner: a point that loses more of them, or breaks a limit, is marked. Results of other tasks are kept.
 Run: python benchmarks/from_answer.py [--out DIR] [--evaluations 300] [--size 0.2] [TASK ...]
 """
 
@@ -32,7 +32,7 @@ JOINED, LOUD, PENALTY = 16, 1.1, 300.0
 
 
 def members(problem: TuningProblem, x: np.ndarray) -> Members:
-    """The training ensemble, and the validation members with the least clearance at x [m]."""
+    """Return the training ensemble plus the validation members with the least clearance at x [m]."""
     count, seed = problem.tune.budget.validation, seeds(problem.tune.budget)[1]
     terms = problem.engine.terms(x[None], problem.objective.chosen(seed, np.arange(count), count))
     tight = np.argsort(-terms["clearance"][0] - terms["survival"][0], kind="stable")[:JOINED]
@@ -41,7 +41,7 @@ def members(problem: TuningProblem, x: np.ndarray) -> Members:
 
 
 def goals(problem: TuningProblem, x: np.ndarray, who: Members) -> np.ndarray:
-    """The goal [S] at x [S, m], limits as penalties on what ordinary members reach."""
+    """Return the objective [S] at x [S, m], with limits as penalties on the values of ordinary members."""
     terms, free = problem.engine.terms(x, who), dataclasses.replace(problem.goal, limits=())
     values = free.score(x, {name: rows for name, rows in terms.items() if not name.startswith(PREFIX)}, who)
     for limit in problem.goal.limits:
@@ -52,7 +52,7 @@ def goals(problem: TuningProblem, x: np.ndarray, who: Members) -> np.ndarray:
 
 
 def judged(problem: TuningProblem, x: np.ndarray) -> dict[str, Any]:
-    """Errors of the held-out members at x [m], how many are lost, and which limits are not held."""
+    """Return the errors of the held-out members at x [m], the number lost, and the limits not held."""
     columns = judge(problem, x, seeds(problem.tune.budget)[2], problem.tune.budget.held_out)
     summary = summarise(columns)
     broken = [limit.name for limit in problem.goal.limits if limit.reached(columns) > limit.asked]
@@ -61,7 +61,7 @@ def judged(problem: TuningProblem, x: np.ndarray) -> dict[str, Any]:
 
 
 def measured(task: str, out: pathlib.Path, evaluations: int, size: float) -> dict[str, Any]:
-    """One task: the tuner's answer, and what CMA-ES makes of it."""
+    """Return the tuner's answer for one task and the result of CMA-ES started from it."""
     import cma
 
     row = tasks.tuned(tasks.TASKS / f"{task}.toml", out)

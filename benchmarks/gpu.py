@@ -1,7 +1,8 @@
 """Throughput on an accelerator: the whole rollout as one kernel against a scan; float32 and float64, N up to a million.
 
-The workload of workload.py without and with held noise; a process of its own for each precision. The kernel's
-results are held to the scan's. Where there is no accelerator it says so and ends. Run: python benchmarks/gpu.py
+The workload is that of workload.py, without and with held noise, in one process per precision. The results of the
+kernel are compared with those of the scan. Without an accelerator, the script prints a message and ends. Run: python
+benchmarks/gpu.py
 """
 
 import argparse

@@ -1,9 +1,9 @@
-"""What a gradient costs: time over one forward run of the same engine and step, and memory against the horizon.
+"""Cost of a gradient: time over one forward run of the same engine and step, and memory against the horizon.
 
 Two loops, float64, one core: the tuner's own on task A (sliding steps, held noise, its whole loss), and the common
 workload without noise (smooth gains, RK4, 10 us a step, mean square of e_z). Differentiated in c, k, gamma and
 k_i. Forward mode carries one tangent for each; reverse mode, on the second, recomputes each sample from its start.
-Memory is the peak of a process of its own. Run: python benchmarks/gradients.py
+Memory is the peak of a separate process. Run: python benchmarks/gradients.py
 """
 
 import argparse
@@ -40,7 +40,7 @@ HORIZONS = (20_000, 200_000)
 
 
 def loss_of(work: workload.Workload) -> Callable[..., Any]:
-    """(log gains, where the rotor starts) to the mean square of e_z over s_0^2."""
+    """Return the mean square of e_z over s_0^2 as a function of (log gains, initial position)."""
 
     def loss(logs: Any, z: Any) -> Any:
         c, k, gamma, k_i = GAINS * jnp.exp(logs)
@@ -56,7 +56,7 @@ def loss_of(work: workload.Workload) -> Callable[..., Any]:
 
 
 def programs(loss: Callable[..., Any], members: int, axes: Any) -> dict[str, Callable[..., Any]]:
-    """The forward run and its derivatives over all members, compiled as the tuner compiles them."""
+    """Return the forward run and its derivatives over all members, compiled as in the tuner."""
     over = jax.vmap(loss, (None, axes)) if members > 1 else loss
 
     def forward(logs: Any, member: Any) -> Any:
@@ -72,14 +72,14 @@ def programs(loss: Callable[..., Any], members: int, axes: Any) -> dict[str, Cal
 
 
 def rk4(members: int, samples: int) -> tuple[Callable[..., Any], Any, Any, int]:
-    """Loss, its members, their axes, and steps of one member: the common workload."""
+    """Return the loss, members, axes, and steps of one member, for the common workload."""
     work = workload.workload(members, samples)
     z = np.asarray(work.scenario.initial.z)
     return loss_of(work), z if members > 1 else float(z[0]), 0, work.steps
 
 
 def tuner(members: int, samples: int) -> tuple[Callable[..., Any], Any, Any, int]:
-    """The same of the tuner's lanes, around gains that hold the rotor."""
+    """Return the same for the tuner's lanes, around gains that hold the rotor."""
     case, tune, _ = read_tune(TASK)
     case = dataclasses.replace(case, clock=dataclasses.replace(case.clock, samples=samples))
     objective = problem_of(case, tune).objective
@@ -98,14 +98,14 @@ def tuner(members: int, samples: int) -> tuple[Callable[..., Any], Any, Any, int
 
 
 def point(mode: str, steps: int) -> dict[str, Any]:
-    """Peak memory of this process after one call over this many steps of one member."""
+    """Return the peak memory of this process after one call over this many steps of one member."""
     loss, member, axes, _ = rk4(1, steps // workload.SUBSTEPS)
     jax.block_until_ready(programs(loss, 1, axes)[mode](np.zeros(len(GAINS)), member))
     return {"steps": steps, "peak_bytes": _measure.peak_memory()}
 
 
 def measure(name: str, build: Callable[..., Any], members: int) -> dict[str, Any]:
-    """One row: a loop and a number of members."""
+    """Return one row: a loop and a number of members."""
     loss, member, axes, steps = build(members, SAMPLES)
     compiled = programs(loss, members, axes)
     if build is tuner:

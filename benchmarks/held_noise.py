@@ -1,4 +1,4 @@
-"""Held noise on smooth gains: what a higher-order method per hold saves at 1e-6 relative error in z.
+"""Held noise on smooth gains: time of a higher-order method per hold at 1e-6 relative error in z.
 
 The common ensemble workload with held noise (100 us), 64 members, one core. Error: the largest |z - reference|
 over all members and samples, relative to the largest |z|; reference: RK4 with 100 substeps.
@@ -32,7 +32,7 @@ METHODS = [RK4(n) for n in (1, 2, 3, 4, 5, 6, 7, 8, 10, 14, 18)] + [DOP853(n) fo
 
 
 def measure(noise: str) -> dict[str, Any]:
-    """All methods under this noise."""
+    """Return the results of all methods under this noise."""
     work = workload.workload(64, 500, noise=True)
     scenario = dataclasses.replace(work.scenario, sensor=NOISES[noise])
 

@@ -1,8 +1,8 @@
 """The machine's limit: limit.c, built with the system's compiler and called on a workload.
 
-`missing()` says in words why there is no C program, if there is none. `agreement` holds it to our own rollout: without
-noise to 1e-9 relative in float64; with noise, whose numbers it draws by another generator, in how far it moves
-the rotor. Run: python benchmarks/limit.py
+`missing()` returns the reason if there is no C program. `agreement` compares the program with `rollout`: without noise
+to 1e-9 relative in float64; with noise, which it draws by another generator, by the motion of the rotor. Run: python
+benchmarks/limit.py
 """
 
 import concurrent.futures
@@ -48,7 +48,7 @@ class Problem(ctypes.Structure):
 
 @functools.cache
 def missing() -> str:
-    """Why there is no C program; empty if there is one."""
+    """Return the reason why there is no C program; empty if there is one."""
     try:
         for dtype in PRECISION:
             library(dtype)
@@ -59,7 +59,7 @@ def missing() -> str:
 
 @functools.cache
 def library(dtype: str, source: pathlib.Path = SOURCE) -> Any:
-    """The compiled program."""
+    """Return the compiled program."""
     compiler = shutil.which("gcc") or shutil.which("cc")
     if compiler is None:
         raise OSError("there is no gcc or cc on the PATH")
@@ -93,7 +93,7 @@ def numbers(work: Workload) -> dict[str, Any]:
 
 
 def run(work: Workload, dtype: str = "float64", threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Largest |z - r| of each member and its z at the end, m. Threads share the members evenly."""
+    """Return the largest |z - r| of each member and its final z, m. Threads share the members evenly."""
     program, z = library(dtype), np.asarray(work.scenario.initial.z).astype(dtype)
     peak = np.zeros_like(z)
 
@@ -114,7 +114,7 @@ def run(work: Workload, dtype: str = "float64", threads: int = 1) -> tuple[np.nd
 
 
 def ours(work: Workload) -> tuple[np.ndarray, np.ndarray]:
-    """The same by jit(vmap(rollout)); the row of one more sample tells the last z."""
+    """Return the same from jit(vmap(rollout)); the row of one additional sample contains the final z."""
     clock = Clock(work.clock.samples + 1, work.clock.sample_period, work.clock.method)
 
     @jax.jit

@@ -55,7 +55,7 @@ def spans(work: Workload) -> list[tuple[float, float, float]]:
 
 
 def instants(work: Workload) -> np.ndarray:
-    """Sample numbers at which z is compared; the last is the end."""
+    """Return the sample numbers at which z is compared; the last is the end."""
     return work.clock.samples // INSTANTS * np.arange(1, INSTANTS + 1)
 
 
@@ -105,7 +105,7 @@ def numpy_run(work: Workload) -> Any:
 
 @functools.cache
 def numba_program() -> Any:
-    """A plain parallel loop over members, RK4 written out, as one would write it by hand."""
+    """Return a plain parallel loop over members with RK4 written out by hand."""
     import numba
 
     f = numba.njit(workload.right_side(workload.GAMMA, workload.P_V, math))
@@ -142,7 +142,7 @@ def numba_run(work: Workload) -> Any:
 
 @functools.cache
 def diffrax_program(work_spans: tuple[tuple[float, float, float], ...], times: tuple[float, ...]) -> Any:
-    """vmap over diffeqsolve, steps ending on the jumps."""
+    """Return vmap over diffeqsolve, with steps that end on the jumps."""
     import diffrax
 
     f = workload.right_side(workload.GAMMA, workload.P_V, jnp)
@@ -172,12 +172,12 @@ def diffrax_run(work: Workload) -> Any:
 
 
 def per_member(work: Workload) -> float:
-    """What turns seconds of a run into nanoseconds per member and 10 us simulated."""
+    """Return the factor from seconds of a run to nanoseconds per member and 10 us simulated."""
     return 1e9 / work.members / (work.clock.samples * work.clock.sample_period / 1e-5)
 
 
 def serve() -> None:
-    """Run our engine once for each line on standard input, and answer each with z at the instants, of few members."""
+    """Run the ensemble once for each line on standard input; answer with z of a few members at the instants."""
     work = workload.workload(MEMBERS, SAMPLES)
     z = json.dumps(ours(work.few(CHECKED)).tolist())
     for _ in sys.stdin:
@@ -265,7 +265,7 @@ def main() -> None:
 
 
 def compare(rows: dict[str, dict[str, Any]], largest: float, ratio: Callable[[str, str], float]) -> None:
-    """How many times faster ambjax is: at the same step, or at no larger error; and at 1e-6 for adaptive peers."""
+    """Return the speed ratio at the same step, or at no larger error; and at 1e-6 for adaptive peers."""
     steps = [ours_named(*each) for each in OURS]
 
     def fastest(error: float) -> str:

@@ -10,40 +10,43 @@ import _measure
 
 HEAD = """# Benchmarks
 
-Written by `python benchmarks/report.py` from the JSON that the scripts left in `results/`; do not edit.
-Ratios are within one run of one script; absolute times depend on the machine and its load.
+`python benchmarks/report.py` generates this page from the JSON files in `results/`. Do not edit it.
+Each ratio compares two times of the same run of a script. Absolute times depend on the machine and its load.
 
-Peers and scaling were measured before metrics were folded over substeps: ensembles with all metrics cost more since.
-What `ambjax tune` and the search take was measured beside other work, all else on an idle machine.
+The comparison with other libraries and the scaling were measured before metrics included substeps; ensembles with
+all metrics cost more now. The times of `ambjax tune` and of the search were measured on a machine with other load,
+all other times on an idle machine.
 
     .venv/bin/pip install -e '.[bench]'
     .venv/bin/python benchmarks/single.py            # one run against SciPy and diffrax
-    .venv/bin/python benchmarks/work_precision.py    # the integrators among themselves
-    .venv/bin/python benchmarks/limit.py             # the C program alone, and its agreement with ambjax
-    .venv/bin/python benchmarks/throughput.py        # ensembles against that limit
-    .venv/bin/python benchmarks/sampled.py           # the cascade on a processor against its limit
+    .venv/bin/python benchmarks/work_precision.py    # accuracy and time of the integrators
+    .venv/bin/python benchmarks/limit.py             # the C program alone, compared with ambjax
+    .venv/bin/python benchmarks/throughput.py        # ensembles against the C program
+    .venv/bin/python benchmarks/sampled.py           # the cascade on a processor against C
     .venv/bin/python benchmarks/peers.py             # ensembles against other libraries
     .venv/bin/python benchmarks/scaling.py --full    # cost and memory against members and horizon
-    .venv/bin/python benchmarks/gpu.py               # the same on an accelerator, where there is one
-    .venv/bin/python benchmarks/held_noise.py        # what a higher order saves between jumps of the noise
-    .venv/bin/python benchmarks/gradients.py         # what a gradient costs, in time and memory
-    .venv/bin/python benchmarks/workarounds.py       # what each workaround of XLA's compiler gains
-    .venv/bin/python benchmarks/startup.py           # from the shell to the answer
+    .venv/bin/python benchmarks/gpu.py               # ensembles on an accelerator
+    .venv/bin/python benchmarks/held_noise.py        # integration methods under held noise
+    .venv/bin/python benchmarks/gradients.py         # time and memory of a gradient
+    .venv/bin/python benchmarks/workarounds.py       # effect of each workaround for XLA
+    .venv/bin/python benchmarks/startup.py           # time of whole commands
     .venv/bin/python benchmarks/tasks.py             # the five tuning tasks
-    .venv/bin/python benchmarks/sampled_tasks.py     # those on a processor
+    .venv/bin/python benchmarks/sampled_tasks.py     # the tuning tasks on a processor
     .venv/bin/python benchmarks/bearings.py          # other bearings, and the templates
-    .venv/bin/python benchmarks/search.py            # their search against derivative-free ones
-    .venv/bin/python benchmarks/from_answer.py       # what CMA-ES finds from the answer of a search
-    .venv/bin/python benchmarks/export.py            # a step of an exported controller, here and on a Cortex-M4F
+    .venv/bin/python benchmarks/search.py            # the search against derivative-free methods
+    .venv/bin/python benchmarks/from_answer.py       # CMA-ES started from a tuned answer
+    .venv/bin/python benchmarks/export.py            # a step of an exported controller, also on a Cortex-M4F
     .venv/bin/python benchmarks/report.py
 """
 
 
 def load(name: str) -> dict[str, Any]:
+    """Return the JSON of one script."""
     return json.loads((_measure.RESULTS / f"{name}.json").read_text())
 
 
 def facts(machine: dict[str, Any]) -> str:
+    """Return one sentence about the machine and the versions."""
     vectors = "with" if machine["avx512"] else "without"
     versions = f"Python {machine['python']}, jax {machine['jax']}"
     return f"{machine['cpu']}, {machine['cores']} cores, {vectors} AVX-512; {versions}."
@@ -52,7 +55,10 @@ def facts(machine: dict[str, Any]) -> str:
 def single() -> list[str]:
     data = load("single")
     lines = ["## One run of 2 s, at equal accuracy (`single.py`)", "", facts(data["machine"])]
-    lines += [f"Cheapest tolerance at which the largest error in z is at most {data['target_error_m']:g} m.", ""]
+    lines += [
+        f"Each solver uses its cheapest tolerance with a largest error in z of at most {data['target_error_m']:g} m.",
+        "",
+    ]
     for gains in ("smooth", "repaired"):
         lines += [
             f"{gains} gains:",
@@ -92,7 +98,7 @@ def work_precision() -> list[str]:
 
 
 def table(titles: str, rows: list[list[str]]) -> list[str]:
-    """A Markdown table and an empty line."""
+    """Return the lines of a Markdown table and an empty line."""
     return [f"| {titles} |", "|" + "---|" * (titles.count("|") + 1), *(f"| {' | '.join(row)} |" for row in rows), ""]
 
 
@@ -100,9 +106,9 @@ def throughput() -> list[str]:
     data = load("throughput")
     lines = ["## Ensembles against the machine's limit (`throughput.py`)", "", facts(data["machine"])]
     lines += [
-        f"RK4, 10 us a step, {data['samples']} samples of 10 steps; ns per member and step, compilation apart.",
-        "The limit is a C program with SIMD (`limit.c`), run in turn with ambjax. One member alone is a `rollout`.",
-        "Times one core: how many times faster than on one; in brackets the limit.",
+        f"RK4 with steps of 10 us, {data['samples']} samples of 10 steps. Times are in ns per member and step,",
+        "without compilation. The limit is a C program with SIMD (`limit.c`), run alternately with ambjax. One",
+        "member alone is a `rollout`. Times one core: speed relative to one core; in brackets that of the limit.",
         "",
     ]
     rows = []
@@ -120,9 +126,10 @@ def peers() -> list[str]:
     data = load("peers")
     lines = ["## Ensembles against other libraries (`peers.py`)", "", facts(data["machine"])]
     lines += [
-        "One core, no noise; nanoseconds per member and 10 us simulated. Fixed-step peers take RK4 steps of 10 us and",
-        "are compared step for step; adaptive ones (tolerance 1e-6) with the cheapest of our steps as accurate as",
-        f"they turn out to be, and with the cheapest that keeps 1e-6 of the largest z ({data['largest_z_m']:.1e} m).",
+        "One core, no noise. Times are in ns per member and 10 us simulated. Fixed-step peers take RK4 steps of 10",
+        "us and are compared with the same steps. Adaptive peers (tolerance 1e-6) are compared with the cheapest",
+        "step of ambjax that reaches their measured error, and with the cheapest whose error is at most 1e-6 of the",
+        f"largest z ({data['largest_z_m']:.1e} m).",
         "",
     ]
     rows = []
@@ -137,8 +144,8 @@ def peers() -> list[str]:
 def scaling() -> list[str]:
     data = load("scaling")
     lines = ["## Cost and memory against size (`scaling.py`)", "", facts(data["machine"])]
-    lines += ["Held noise, float64, one core; every point in a process of its own. Relative: to 1,024 members and"]
-    lines += ["200 samples, run in turn with the point, per member and step.", ""]
+    lines += ["Held noise, float64, one core, one process per point. Relative: time per member and step relative to"]
+    lines += ["1,024 members and 200 samples, run alternately with the point.", ""]
     for name in ("members", "samples"):
         rows = []
         for row in data[name]["rows"]:
@@ -152,7 +159,7 @@ def scaling() -> list[str]:
 def held_noise() -> list[str]:
     data = load("held_noise")
     lines = ["## Held noise: steps per hold (`held_noise.py`)", "", facts(data["machine"])]
-    lines += ["64 members, one core, smooth gains; errors relative to the largest |z|.", ""]
+    lines += ["64 members, one core, smooth gains. Errors are relative to the largest |z|.", ""]
     for case in data["cases"]:
         lines += [f"Noise: {case['noise']}.", ""]
         cells = [[r["method"], f"{r['relative_error']:.1e}", f"{1e3 * r['seconds']:.1f}"] for r in case["methods"]]
@@ -166,8 +173,11 @@ def held_noise() -> list[str]:
 
 def gradients() -> list[str]:
     data = load("gradients")
-    lines = ["## What a gradient of four gains costs (`gradients.py`)", "", facts(data["machine"])]
-    lines += ["One core, float64; in forward runs of the same engine and step. Forward mode is the tuner's.", ""]
+    lines = ["## Cost of a gradient of four gains (`gradients.py`)", "", facts(data["machine"])]
+    lines += [
+        "One core, float64. Costs are in forward runs with the same code and step. The tuner uses forward mode.",
+        "",
+    ]
     rows = []
     for r in data["rows"]:
         cells = [r["step"], str(r["members"]), f"{1e9 * r['run_s'] / r['members'] / r['steps']:.0f}"]
@@ -183,9 +193,10 @@ def sampled() -> list[str]:
     lines = ["## The cascade on a processor (`sampled.py`)", "", facts(data["machine"])]
     first = data["rows"][0]
     lines += [
-        f"{first['members']:,} members, float64, one core, held noise, 10 kHz, one sample of delay, predicted,",
-        f"{first['substeps']} substeps; ns per member and sample. C: `sampled.c`, relative error against our rollout",
-        f"under the same noise. Gradient of 4 gains, forward mode, {data['tangents_of']} members: in forward runs.",
+        f"{first['members']:,} members, float64, one core, held noise, 10 kHz, one sample of delay with prediction,",
+        f"{first['substeps']} substeps. Times are in ns per member and sample. C: `sampled.c`; its error is relative",
+        f"to a `rollout` under the same noise. Gradient: 4 gains, forward mode, {data['tangents_of']} members, in",
+        "forward runs.",
         "",
     ]
     rows = []
@@ -200,10 +211,10 @@ def tasks() -> list[str]:
     data = load("tasks")
     lines = ["## The tuning tasks (`tasks.py`)", "", facts(data["machine"])]
     lines += [
-        "`ambjax tune` with its defaults, but that E minimises the mean of its worst tenth on 64 members and the",
-        "pole of the observer may go from 0.999 to 1e4; from gains that lose the rotor; judged on held-out members.",
-        "Steps: error of the settled rms error in the search's own steps against adaptive RODAS3. u: once settled.",
-        "Seconds: all of `ambjax tune`, on one processor, beside other work.",
+        "`ambjax tune` runs with its defaults, from gains that lose the rotor. Exceptions: E minimises the mean of",
+        "the worst tenth of 64 members, and the pole of the observer ranges from 0.999 to 1e4. Figures are over the",
+        "held-out members. Steps: error of the settled rms error with the steps of the search, against adaptive",
+        "RODAS3. u: after settling. Seconds: processor time of the whole command, on a machine with other load.",
         "",
     ]
     return lines + _tasks(data)
@@ -214,9 +225,9 @@ def bearings() -> list[str]:
     lines = ["## Other bearings and the templates (`bearings.py`)", "", facts(data["machine"])]
     verified = sum(row["verified"] for row in data["tasks"].values())
     lines += [
-        "As above, unattended, but that the templates' own gains hold the rotor; all but `tracking` stand still.",
-        "Accurate steps confirm",
-        f"{verified} of {len(data['tasks'])}.",
+        "As above, without manual intervention. The gains of the templates hold the rotor at the start. The",
+        f"reference is constant in all tasks but `tracking`. Accurate steps confirm {verified} of",
+        f"{len(data['tasks'])} answers.",
         "",
     ]
     return lines + _tasks(data)
@@ -234,7 +245,7 @@ def _tasks(data: dict[str, Any]) -> list[str]:
 
 
 def _gains(row: dict[str, Any]) -> str:
-    """The gains of a task, with a mark at each that ends at a bound."""
+    """Return the gains of a task as text and mark each gain that ends at a bound."""
     marks = dict.fromkeys(row["at_bound"], " (at its bound)")
     return ", ".join(f"{path.rpartition('.')[2]} {x:.4g}{marks.get(path, '')}" for path, x in row["gains"].items())
 
@@ -243,10 +254,10 @@ def sampled_tasks() -> list[str]:
     data = load("sampled_tasks")
     lines = ["## The tuning tasks on a processor (`sampled_tasks.py`)", "", facts(data["machine"])]
     lines += [
-        "As above, on a processor of 10 or 20 kHz whose voltage is a sample late. Bar: what 2 x 900 evaluations of",
-        "CMA-ES on 6 members found with an independent simulator of the same loop. Seconds in brackets: of the same",
-        "task in continuous time.",
-        "p: of position, inversion and current law. Bounds: of c a fifth of the sample rate, of l 0.05 1/s.",
+        "As above, on a processor of 10 or 20 kHz with a delay of one sample. Bar: settled rms error that CMA-ES",
+        "reached in 2 x 900 evaluations on 6 members with an independent simulator of the same loop. Seconds in",
+        "brackets: the same task in continuous time. p: of the position, inversion and current laws. Bounds: at most",
+        "a fifth of the sample rate for c, at least 0.05 1/s for l.",
         "",
     ]
     rows = []
@@ -263,16 +274,16 @@ def sampled_tasks() -> list[str]:
 
 
 def search() -> list[str]:
-    """One table for each task."""
+    """Return one table with a row for each task and method."""
     data = load("search")
-    lines = ["## The search against derivative-free ones (`search.py`)", "", facts(data["machine"])]
+    lines = ["## The search against derivative-free methods (`search.py`)", "", facts(data["machine"])]
     lines += [
-        "The same loss, members, coordinates and ranges, which TPE can leave by half of them and random search",
-        "cannot; the budget of rollouts is what the search by gradients takes to its own end in the median over its",
-        "seeds, or a multiple of that. Loss: median over seeds and range. Seeds are what is random in a method:",
-        "Powell's has nothing, nor have Nelder-Mead and CMA-ES in where they begin. Reached: rollouts until the",
-        "median loss of the gradients at their own end, median over seeds; a dash: not in the budget. Rollouts are",
-        "not cost, since padded lanes are computed too: seconds are processor time of a search on one core.",
+        "All methods use the same loss, members, coordinates and ranges. TPE may leave the ranges by half their",
+        "width, random search may not. The budget of rollouts is the median that the gradient search takes over its",
+        "seeds, or a multiple of it. Loss: median and range over seeds. Powell's method is deterministic;",
+        "Nelder-Mead and CMA-ES have deterministic starting points. Reached: rollouts until the final median loss of",
+        "the gradient search, median over seeds; a dash: not within the budget. Rollouts do not measure cost,",
+        "because padded lanes are computed too; the time is processor time of one search on one core.",
         "",
     ]
     rows = []
@@ -291,14 +302,14 @@ def _search(task: str, method: str, seeds: list[dict[str, Any]]) -> list[str]:
 
 
 def from_answer() -> list[str]:
-    """One row for each task."""
+    """Return a table with one row for each task."""
     data = load("from_answer")
     lines = ["## CMA-ES from the answer of a search (`from_answer.py`)", "", facts(data["machine"])]
     lines += [
-        "Each task is tuned with its defaults; from the answer CMA-ES goes on, on the training ensemble and the 16",
-        "validation members with the least clearance, limits as penalties. Lower by: what its best point and its last",
-        "mean take off the settled rms error of the 1,000 held-out members; and how many members are lost or limits",
-        "broken there.",
+        "Each task is tuned with its defaults. CMA-ES then continues from the answer, on the training ensemble and",
+        "the 16 validation members with the least clearance, with limits as penalties. Lower by: reduction of the",
+        "settled rms error of the 1,000 held-out members at its best point and at its last mean, with the number of",
+        "lost members and the limits broken there.",
         "",
     ]
     rows = []
@@ -316,8 +327,11 @@ def from_answer() -> list[str]:
 
 def startup() -> list[str]:
     data = load("startup")
-    lines = ["## From the shell to the answer (`startup.py`)", "", facts(data["machine"])]
-    lines += [f"Fresh processes, all compiled before, on the paper's tracking case; medians of {data['runs']}.", ""]
+    lines = ["## Time of whole commands (`startup.py`)", "", facts(data["machine"])]
+    lines += [
+        f"New processes with a warm compilation cache, on the paper's tracking case; medians of {data['runs']}.",
+        "",
+    ]
     rows = [
         [f"`{name}`", *(f"{row[key]:.2f}" for key in ("wall_s", "least_wall_s", "cpu_s", "cpu_over_import_jax"))]
         for name, row in data["rows"].items()
@@ -327,8 +341,11 @@ def startup() -> list[str]:
 
 def workarounds() -> list[str]:
     data = load("workarounds")
-    lines = ["## Workarounds of XLA's compiler (`workarounds.py`)", "", facts(data["machine"])]
-    lines += [f"Times as long without one of them, in pairs of runs; medians of {data['rounds']}.", ""]
+    lines = ["## Workarounds for XLA's compiler (`workarounds.py`)", "", facts(data["machine"])]
+    lines += [
+        f"Ratio of the times without and with each workaround, in pairs of runs; medians of {data['rounds']}.",
+        "",
+    ]
     jobs = [key for key in next(iter(data["rows"].values())) if key != "says"]
     rows = [[name, row["says"], *(f"{row[job]:.2f}" for job in jobs)] for name, row in data["rows"].items()]
     return lines + table(" | ".join(["workaround", "without it", *jobs]), rows)
@@ -348,7 +365,7 @@ def export() -> list[str]:
     data = load("export")
     lines = ["## A step of the exported controller (`export.py`)", "", facts(data["machine"])]
     lines += [
-        "Cycles of the time stamp counter, median; on a Cortex-M4F instructions that QEMU counts, code and stack.",
+        "Cycles: median of the time stamp counter. Cortex-M4F: instructions counted by QEMU, bytes of code and stack.",
         "",
     ]
     rows = []
@@ -384,7 +401,7 @@ SECTIONS = {
 
 
 def page() -> str:
-    """Every section whose JSON is there."""
+    """Return the page with every section whose JSON exists."""
     lines = [HEAD]
     for name, section in SECTIONS.items():
         if (_measure.RESULTS / f"{name}.json").exists():
@@ -393,7 +410,7 @@ def page() -> str:
 
 
 def main() -> None:
-    """Write the page."""
+    """Write benchmarks/README.md."""
     (pathlib.Path(__file__).parent / "README.md").write_text(page())
 
 

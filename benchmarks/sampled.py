@@ -49,7 +49,7 @@ class Problem(ctypes.Structure):
 
 
 def cascade(gains: Any, p: float) -> Cascade:
-    """The paper's cascade on a processor."""
+    """Return the paper's cascade on a processor."""
     c, k, gamma, k_i = gains
     return Cascade(
         position=position.SlidingMode(c, k, p),
@@ -60,7 +60,7 @@ def cascade(gains: Any, p: float) -> Cascade:
 
 
 def sampled(members: int, samples: int, p: float) -> Workload:
-    """The common workload with that cascade, and as many substeps as our rollout takes by itself."""
+    """Return the common workload with that cascade and the default number of substeps of `rollout`."""
     work = workload.workload(members, samples, noise=True)
     scenario, ours = dataclasses.replace(work.scenario, u_max=U_MAX), cascade(GAINS.tolist(), p)
     return Workload(ours, scenario, with_method(Clock(samples, workload.PERIOD), ours, scenario))
@@ -81,7 +81,7 @@ def run(work: Workload, errors: np.ndarray | None = None) -> tuple[np.ndarray, n
 
 
 def errors_of(work: Workload) -> np.ndarray:
-    """What the sensors are off by in our rollout, [samples, 3, members]."""
+    """Return the sensor errors of `rollout`, [samples, 3, members]."""
     sensor: Any = work.scenario.sensor
 
     def words(member: Any) -> Any:
@@ -101,7 +101,7 @@ def agreement(p: float) -> float:
 
 
 def gradient(p: float) -> float:
-    """Forward runs that a gradient of the mean square of e_z costs."""
+    """Return the cost of a gradient of the mean square of e_z, in forward runs."""
     work = sampled(TANGENTS_OF, SAMPLES // 2, p)
 
     def loss(logs: Any, who: Any) -> Any:
@@ -117,7 +117,7 @@ def gradient(p: float) -> float:
 
 
 def measure(name: str) -> dict[str, Any]:
-    """One row: a sign."""
+    """Return one row: one kind of sign."""
     p = SIGNS[name]
     work = sampled(MEMBERS, SAMPLES, p)
     row: dict[str, Any] = {"p": name, "members": MEMBERS, "samples": SAMPLES, "substeps": workload.substeps(work.clock)}

@@ -1,4 +1,4 @@
-"""The tuning tasks on a processor, as tasks.py runs those in continuous time; beside each the bar that it is to reach.
+"""The tuning tasks on a processor, as in tasks.py in continuous time, each with the error that it must reach.
 
 A bar is what another search, CMA-ES on an independent simulator, found for the same loop; a task without one, as that
 of the ledger's reading `sampled`, must lose no rotor. Where a task is one of tasks.py on a processor, that is run too:
@@ -41,7 +41,7 @@ def main() -> None:
         bar = BARS.get(name, math.inf)
         rows[name] = row | {"bar_m": bar if math.isfinite(bar) else None}
         reached = row["settled_rms_error_m"] <= bar and row["lost"] == 0
-        print(f"{tasks.told(row)}; {'reaches' if reached else 'misses'} {bar:.3g} m", flush=True)
+        print(f"{tasks.row_text(row)}; {'reaches' if reached else 'misses'} {bar:.3g} m", flush=True)
         if other := COUNTERPARTS.get(name):
             continuous = tasks.tuned(tasks.TASKS / f"{other}.toml", given.out / other)
             rows[name]["continuous"] = {key: continuous[key] for key in ("seconds", "processor_s", "rollouts")}

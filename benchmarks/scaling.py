@@ -21,7 +21,7 @@ MEMBERS, FULL = (1_000, 10_000, 100_000), 1_000_000
 SAMPLES = (20, 200, 2_000)
 # At these the other of the two is varied.
 FIXED_SAMPLES, FIXED_MEMBERS = 200, 4_096
-# The reference, short enough to see the same machine as the shortest point; beside a long one it is run for a tenth
+# The reference, short enough to run under the same load as the shortest point; with a long point it runs for a tenth
 # of its time.
 REFERENCE, SHARE = (1_024, 200), 10
 # Rounds of a point: as many as run this many member-samples, but 3 at least and this many at most.

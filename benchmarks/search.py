@@ -1,4 +1,4 @@
-"""The search by gradients against derivative-free ones, on the same loss, members, coordinates and number of rollouts.
+"""The gradient search against derivative-free methods, on the same loss, members, coordinates and number of rollouts.
 
 One rollout is one member simulated once; a gradient of m gains counts m + 1. Every method moves in the same
 coordinates, in which a gain ends at its bound, and knows the ranges of the screen: CMA-ES, Nelder-Mead and Powell's
@@ -44,7 +44,7 @@ WORST = 10.0
 
 
 class SpentError(Exception):
-    """All rollouts are spent."""
+    """Raised when the budget of rollouts is spent."""
 
 
 class Judge:
@@ -129,7 +129,7 @@ METHODS: dict[str, Callable[[Judge, int], None]] = {
 
 
 def ours(problem: TuningProblem, who: Any, seed: int) -> list[tuple[int, float, float]]:
-    """Trace of the search by gradients, its looks around its own answer included, on all members."""
+    """Return the trace of the gradient search on all members, repeated searches around its answer included."""
     problem.engine.rollouts, trace, began = 0, [], time.process_time()
 
     def tell(progress: SearchState, _: float) -> None:
@@ -142,7 +142,7 @@ def ours(problem: TuningProblem, who: Any, seed: int) -> list[tuple[int, float, 
 
 
 class Told(NamedTuple):
-    """What a search came to: logarithm of the loss, rollouts, seconds, and rollouts until a goal (None: never)."""
+    """Result of a search: logarithm of the loss, rollouts, seconds, and rollouts until a goal (None: never)."""
 
     final: float
     rollouts: int
@@ -156,14 +156,14 @@ def told(trace: list[tuple[int, float, float]], goal: float) -> Told:
 
 
 def prepared(name: str) -> tuple[TuningProblem, Any]:
-    """A task's problem and training members, on one core."""
+    """Return the problem and the training members of a task, on one core."""
     case, tune, _ = read_tune(TASKS / f"{name}.toml")
     problem = problem_of(case, tune, threads=1)
     return problem, training(problem)
 
 
 def by_gradients(name: str, seeds: int) -> dict[str, Any]:
-    """The search by gradients on one task: budget, goal, and a row for each seed."""
+    """Run the gradient search on one task; return the budget, the goal, and a row for each seed."""
     problem, who = prepared(name)
     ours(problem, who, 0)  # compiles
     traces = [ours(problem, who, seed) for seed in range(seeds)]
@@ -177,7 +177,7 @@ def by_gradients(name: str, seeds: int) -> dict[str, Any]:
 
 
 def by_others(name: str, found: dict[str, Any], seeds: int, times: float, methods: list[str]) -> dict[str, Any]:
-    """Rows of the other methods on one task, with `times` the gradients' budget."""
+    """Return the rows of the other methods on one task, with `times` the budget of the gradients."""
     warnings.simplefilter("ignore")
     problem, who = prepared(name)
     space = problem.objective.space

@@ -87,7 +87,7 @@ def diffrax_run(gains: tuple[float, float], solver: Any, rtol: float) -> Callabl
 
 
 def best(make: Callable[[float], Callable[[], Any]], reference: np.ndarray) -> tuple[Any, dict[str, Any]] | None:
-    """The run at the cheapest tolerance that reaches the target; its error, and the first call's extra time."""
+    """Return the run at the cheapest tolerance that reaches the target, its error, and its compile time."""
     compile_s = 0.0
     for rtol in TOLERANCES:
         run = make(rtol)

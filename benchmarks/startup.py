@@ -1,4 +1,4 @@
-"""From the shell to the answer: fresh processes of `ambjax`, everything compiled before, against `import jax` alone.
+"""Time of whole commands: new processes of `ambjax` with a warm compilation cache, against `import jax` alone.
 
 The commands take turns, so that whatever else the machine does meets all of them. CPU seconds (user and system) are
 what a busy machine falsifies least; seconds of the wall are what a user of an idle one waits.
@@ -18,7 +18,7 @@ RUNS = 5
 
 
 def spent(command: list[str]) -> tuple[float, float]:
-    """Wall and CPU seconds of one process; what it says is dropped."""
+    """Return the wall and CPU seconds of one process; its output is discarded."""
     before, began = os.times(), time.perf_counter()
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     wall, after = time.perf_counter() - began, os.times()

@@ -26,17 +26,17 @@ def main() -> None:
     rows = kept("tasks")
     for name in given.tasks:
         rows[name] = row = tuned(TASKS / f"{name}.toml", given.out / name)
-        print(told(row), flush=True)
+        print(row_text(row), flush=True)
     _measure.write("tasks", {"tasks": dict(sorted(rows.items()))})
 
 
 def names(folder: pathlib.Path) -> list[str]:
-    """Names of the tasks in a folder of case files."""
+    """Return the names of the tasks in a folder of case files."""
     return sorted(path.stem for path in folder.glob("*.toml"))
 
 
 def kept(results: str) -> dict[str, Any]:
-    """Rows of the results of this name."""
+    """Return the rows of the results of this name."""
     path = _measure.RESULTS / f"{results}.json"
     return json.loads(path.read_text())["tasks"] if path.exists() else {}
 
@@ -72,8 +72,8 @@ def tuned(path: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
     }
 
 
-def told(row: dict[str, Any]) -> str:
-    """A row in one line."""
+def row_text(row: dict[str, Any]) -> str:
+    """Return a row as one line of text."""
     return (
         f"{row['title']}: settled rms {row['settled_rms_error_m']:.2e} m, largest "
         f"{row['settled_max_abs_error_m']:.2e} m, {row['lost']} of {row['members']} lost, steps off by "
@@ -82,7 +82,7 @@ def told(row: dict[str, Any]) -> str:
 
 
 def _processor_seconds() -> float:
-    """Processor seconds of all processes that were run and ended."""
+    """Return the processor seconds of all child processes that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 

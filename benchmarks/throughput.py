@@ -26,7 +26,7 @@ REPEATS = 15
 
 
 def measure(dtype: str, members: tuple[int, ...], samples: int) -> list[dict[str, Any]]:
-    """One row per number of members, threads and kind of noise."""
+    """Return one row per number of members, threads and kind of noise."""
     rows = []
     for noise, n in itertools.product((False, True), members):
         work, runs = workload.workload(n, samples, noise=noise), {}

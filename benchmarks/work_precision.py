@@ -42,7 +42,7 @@ def run(case: str, method: Any) -> Any:
 
 
 def measure(case: str, reference: np.ndarray, method: Any) -> dict[str, float] | None:
-    """Error and time; None where an explicit step is beyond its limit, so that rollout refuses it."""
+    """Return the error and the time; None if `rollout` refuses an explicit step beyond its stability limit."""
     try:
         z = np.asarray(jax.block_until_ready(run(case, method)))
     except ValueError:

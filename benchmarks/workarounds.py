@@ -1,4 +1,4 @@
-"""What each workaround of XLA's CPU compiler gains, with the version of jax that it was measured under.
+"""Speed gain of each workaround for XLA's CPU compiler, with the version of jax of the measurement.
 
 One is turned off at a time, in a process of its own, and the same processes run in turn with one that keeps them all,
 so that whatever else the machine does meets both. Three jobs on one core: 1,024 members of the common workload under
@@ -98,7 +98,7 @@ WITHOUT: dict[str, Callable[[], None]] = {
 
 
 def jobs() -> dict[str, Callable[[], Any]]:
-    """The runs that are timed."""
+    """Return the timed runs."""
     import gradients
     import sampled
     import workload

@@ -1,4 +1,4 @@
-"""What every ensemble benchmark runs, and its right-hand side written out once more for the peers.
+"""The workload of every ensemble benchmark, and a second implementation of its right-hand side for the peers.
 
 The paper's tracking scenario with the disturbance as scaled force, smooth gains (inversion gamma = 1e9,
 p = 25e-6, else the paper's), members that differ in where the rotor starts, RK4 with a step of 1e-5 s, ten
@@ -38,12 +38,12 @@ class Workload(NamedTuple):
 
     @property
     def steps(self) -> int:
-        """RK4 steps of one member."""
+        """Return the number of RK4 steps of one member."""
         return self.clock.samples * substeps(self.clock)
 
     @property
     def pulse(self) -> tuple[int, int]:
-        """First sample with the pulse and first one after it."""
+        """Return the first sample with the pulse and the first one after it."""
         force = vars(self.scenario.q_v)
         return round(force["start"] / PERIOD), round(force["stop"] / PERIOD)
 
@@ -57,7 +57,7 @@ class Workload(NamedTuple):
         return self._replace(clock=Clock(self.clock.samples // samples, period, method))
 
     def few(self, members: int) -> "Workload":
-        """Some of its members, spread evenly."""
+        """Return a workload with some of the members, spread evenly."""
         chosen = np.linspace(0, self.members - 1, members).round().astype(int)
         initial = dataclasses.replace(self.scenario.initial, z=np.asarray(self.scenario.initial.z)[chosen])
         member = np.asarray(self.scenario.member)[chosen]
@@ -65,7 +65,7 @@ class Workload(NamedTuple):
 
 
 def substeps(clock: Clock) -> int:
-    """Steps per sample of a method that has a number of them."""
+    """Return the steps per sample, for a method that declares them."""
     method: Any = clock.method
     return method.substeps
 

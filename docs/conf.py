@@ -1,4 +1,4 @@
-"""How the site is built: `sphinx-build -W docs docs/_build/html`. No network, neither to build nor to read it."""
+"""Configuration of the site, built by `sphinx-build -W docs docs/_build/html` without network access."""
 
 import os
 import pathlib

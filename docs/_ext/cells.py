@@ -1,4 +1,4 @@
-"""Cells of shell commands: `%%shell` runs them, and the page shows what a reader types."""
+"""Cells of shell commands: `%%shell` runs them, and the page shows the commands."""
 
 import subprocess
 from typing import Any
@@ -10,7 +10,7 @@ MAGIC = "%%shell"
 
 
 def shell(line: str, cell: str) -> None:
-    """Run a cell and print what it says. Raises RuntimeError unless it ends with the exit code in `line`, or 0."""
+    """Run a cell and print its output. Raises RuntimeError unless it ends with the exit code in `line`, or 0."""
     done = subprocess.run(["bash", "-o", "pipefail", "-c", cell], capture_output=True, text=True, check=False)
     print(done.stdout + done.stderr, end="")
     if done.returncode != int(line or 0):
@@ -18,12 +18,12 @@ def shell(line: str, cell: str) -> None:
 
 
 def load_ipython_extension(ipython: Any) -> None:
-    """What `%load_ext cells` on a page does."""
+    """Register the magic command; called by `%load_ext cells`."""
     ipython.register_magic_function(shell, "cell", "shell")
 
 
 def shown(app: Sphinx, tree: nodes.document) -> None:
-    """Take the line of the magic word off every cell that begins with it."""
+    """Remove the `%%shell` line of every cell that begins with it."""
     for block in list(tree.findall(nodes.literal_block)):
         if (text := block.astext()).startswith(MAGIC):
             text = text.partition("\n")[2]
@@ -31,6 +31,6 @@ def shown(app: Sphinx, tree: nodes.document) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Register it."""
+    """Register the extension."""
     app.connect("doctree-read", shown)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

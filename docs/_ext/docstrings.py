@@ -1,4 +1,4 @@
-"""Docstrings, which are plain text with `names` in backticks, made into what autodoc reads; and fields of records."""
+"""Convert plain-text docstrings with `names` in backticks for autodoc, and list the fields of records."""
 
 import dataclasses
 import operator
@@ -16,7 +16,7 @@ NOTHING = re.compile(r"Alias for field number \d+")
 
 
 def plain(line: str) -> str:
-    """A line with its names as literals and everything else as it stands."""
+    """Return a line with its names as literals and all other text escaped."""
     parts = re.split(r"`+([^`]+)`+", line)
     return "".join(f"``{part}``" if n % 2 else SPECIAL.sub(r"\\\1", part) for n, part in enumerate(parts))
 
@@ -33,7 +33,7 @@ def process(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: li
 
 
 def _item(row: Facts) -> str:
-    """A field as an item of a list."""
+    """Return a field as an item of a list."""
     told = [row.default and f"default {row.default}", row.unit, row.allowed]
     return f"- ``{row.name}``: {plain(row.doc)} ({'; '.join(filter(None, told))})"
 
@@ -56,7 +56,7 @@ def elsewhere(app: Sphinx, env: Any, node: Any, text: Any) -> Any:
 
 
 def _named(dotted: str) -> Any:
-    """What a dotted name stands for among the modules that are loaded, or None."""
+    """Return the object with a dotted name among the loaded modules, or None."""
     module, rest = dotted, ""
     while module and module not in sys.modules:
         module, _, last = module.rpartition(".")
@@ -68,7 +68,7 @@ def _named(dotted: str) -> Any:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Register it."""
+    """Register the extension."""
     app.connect("autodoc-process-docstring", process)
     app.connect("missing-reference", elsewhere)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,4 +1,4 @@
-"""Mathematics as MathML, which browsers draw themselves: no script and no fonts to fetch."""
+"""Mathematics as MathML, which browsers render without scripts or downloaded fonts."""
 
 from typing import Any
 
@@ -8,13 +8,13 @@ from sphinx.application import Sphinx
 
 
 def inline(writer: Any, node: nodes.math) -> None:
-    """A formula in a line of text."""
+    """Write an inline formula."""
     writer.body.append(convert(node.astext()))
     raise nodes.SkipNode
 
 
 def display(writer: Any, node: nodes.math_block) -> None:
-    """A formula of its own, with the number of its equation."""
+    """Write a displayed formula with its equation number."""
     writer.body.append(writer.starttag(node, "div", CLASS="formula"))
     writer.body.append(f'<div class="formula-body">{convert(node.astext(), display="block")}</div>')
     if node["number"]:

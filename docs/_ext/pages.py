@@ -1,4 +1,4 @@
-"""Writes the pages that come from records, parsers and results, before Sphinx looks for pages."""
+"""Write the pages generated from records, parsers and results, before Sphinx searches for pages."""
 
 import pathlib
 
@@ -22,6 +22,6 @@ def write(app: Sphinx) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Register it."""
+    """Register the extension."""
     app.connect("config-inited", lambda app, config: write(app))
     return {"parallel_read_safe": True, "parallel_write_safe": True}

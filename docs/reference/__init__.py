@@ -1,1 +1,1 @@
-"""Pages written from the records, parsers and results themselves, so that they cannot drift from the code."""
+"""Reference pages generated from the records, parsers and results of the code."""

@@ -1,4 +1,4 @@
-"""The Python API: the public names, and every module floor by floor."""
+"""The Python API: the public names, and every module by layer."""
 
 import inspect
 from typing import Any
@@ -17,7 +17,7 @@ PUBLIC = {
 
 
 def pages() -> dict[str, str]:
-    """The page of public names, and one for each floor."""
+    """Return the page of public names and one page for each layer."""
     floor = [(package, room) for package, order in floors().items() for room in order.split()]
     rooms = {f"{package}.{room}": modules(package, room) for package, room in floor}
     made = {f"api-{room}.rst": _floor(room, found) for room, found in rooms.items() if found}
@@ -25,7 +25,7 @@ def pages() -> dict[str, str]:
 
 
 def modules(package: str, room: str) -> list[str]:
-    """Dotted names of the modules of a floor, itself first; none for a package's own files."""
+    """Return the dotted names of the modules of a layer, the layer first; none for a package's own files."""
     path = ROOT / package / room
     if room.startswith("_"):
         return []
@@ -55,7 +55,7 @@ def _public(floor_pages: list[str]) -> str:
 
 
 def _link(thing: Any, name: str) -> str:
-    """A link to where a public name is described; plain code for what is no class, function or module."""
+    """Return a link to the description of a public name; plain code unless it is a class, function or module."""
     if inspect.ismodule(thing):
         return f"{{py:mod}}`{name} <{thing.__name__}>`"
     if getattr(thing, "__module__", "").startswith("ambjax") and hasattr(thing, "__qualname__"):
@@ -65,7 +65,7 @@ def _link(thing: Any, name: str) -> str:
 
 
 def _says(thing: Any) -> str:
-    """The first paragraph about a name; of a number, its value."""
+    """Return the first paragraph of the docstring of a name; for a number, its value."""
     if isinstance(thing, (int, float)):
         return f"{thing:g}"
     return "" if type(thing).__module__ in ("builtins", "typing") and not callable(thing) else first_paragraph(thing)

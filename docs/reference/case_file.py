@@ -38,7 +38,7 @@ SETTINGS: dict[str, dataclasses.Field] = {
 WORDS = {
     "plant": "The true plant. Left out, or a key of it: Table 1 of the paper.",
     "controller": "The cascade: a nominal plant and one law per stage. Kinds and gains: [laws](laws.md).",
-    "controller.model": "What the controller believes of the plant, where that differs: any key of `[plant]`.",
+    "controller.model": "Parameters of the controller's model that differ from the plant: any key of `[plant]`.",
     "processor": "What the cascade runs on: one step of all laws a sample, its voltage held and late. Left out: "
     "continuous time, as in the paper. See [the processor](../processor.md).",
     "processor.guard": "Limits of the readings: one beyond them is refused and predicted. A key left out is derived "
@@ -63,12 +63,12 @@ UNIT = re.compile(r"(?P<unit>1|m|s|A|V|kg|[\w^./]+/[\w^./]+)(; (?P<rest>.*))?")
 
 
 def pages() -> dict[str, str]:
-    """The pages, by file name."""
+    """Return the pages by file name."""
     return {"case-file.md": _case_file(), "laws.md": _laws(), "signals.md": _signals(), "spread.md": _spread()}
 
 
 def rows_of(path: str, record: type | None = None, beside: dict[str, Any] | None = None) -> list[Facts]:
-    """What is known of each key of a table; `record` declares them, or the template says what they mean."""
+    """Return a row for each key of a table; the fields come from `record`, or else from the template."""
     known = {field.name: field for field in dataclasses.fields(record)} if record else {}
     order = list(remarks())
     paths = [f"{path}.{key}" for key in keys(path, beside)]
@@ -92,7 +92,7 @@ def _row(path: str, field: dataclasses.Field | None, beside: dict[str, Any] | No
 
 
 def _allowed(path: str, beside: dict[str, Any] | None) -> str:
-    """What the reader allows; of two keys that depends on another."""
+    """Return the values that the reader allows for a key."""
     if path == "tune.alpha":
         return rule(path, {"risk": "cvar"})
     if path == "clock.method":
@@ -101,7 +101,7 @@ def _allowed(path: str, beside: dict[str, Any] | None) -> str:
 
 
 def _told(path: str) -> Facts:
-    """What the template says of a key: unit, default and meaning."""
+    """Return unit, default and meaning of a key from the template."""
     known = remarks()
     below = next((one for one in known if one.startswith(f"{path}.")), path)
     shown, meaning = ("", WORDS[path]) if path in WORDS else known.get(path, known.get(below, ("", "")))
@@ -116,7 +116,7 @@ def _told(path: str) -> Facts:
 
 
 def keys_table(rows: list[Facts]) -> list[str]:
-    """Rows as a Markdown table."""
+    """Return rows as a Markdown table."""
     cells = [(code(row.name), *map(escaped, row[1:])) for row in rows]
     return table(TITLES, cells, "keys")
 
@@ -206,7 +206,7 @@ def _spread() -> str:
 
 
 def _example(kind: str, make: Any) -> Any:
-    """A distribution of this kind: of one number, or of several."""
+    """Return an example of a distribution of this kind, for one number or for several."""
     try:
         return make(Table({kind: 10.0}))
     except ValueError:

@@ -1,4 +1,4 @@
-"""Every command and flag, from the parsers themselves."""
+"""Every command and flag, read from the argument parsers."""
 
 import argparse
 
@@ -10,7 +10,7 @@ HELP = (argparse._HelpAction, argparse._VersionAction)
 
 
 def pages() -> dict[str, str]:
-    """The page."""
+    """Return the page."""
     lines = [
         "# Commands",
         "",
@@ -24,7 +24,7 @@ def pages() -> dict[str, str]:
 
 
 def commands() -> dict[str, argparse.ArgumentParser]:
-    """The parsers of all commands, by what is typed."""
+    """Return the parsers of all commands, by command line."""
     groups = [one for one in parser()._actions if isinstance(one, argparse._SubParsersAction)]
     found = [choice for one in groups for choice in one.choices.values()]
     return {command.prog: command for command in found} | {"ambjax tune": tuner("ambjax tune")}
@@ -39,12 +39,12 @@ def _section(command: argparse.ArgumentParser) -> list[str]:
 
 
 def sentence(text: str) -> str:
-    """The text as a sentence."""
+    """Return the text as a sentence."""
     return text[:1].upper() + text[1:] + "." * (not text.endswith("."))
 
 
 def _written(action: argparse.Action) -> str:
-    """An argument as it is typed."""
+    """Return an argument as it is typed."""
     named = ", ".join(action.option_strings)
     taken = action.metavar or (action.dest if not named else "")
     return f"{named} {taken}".strip() if action.nargs != 0 else named

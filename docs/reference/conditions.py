@@ -1,4 +1,4 @@
-"""What `ambjax check` prints: the conditions of Theorem 1 and the steps of its proof, from one of the default loop."""
+"""The output of `ambjax check`: the conditions of Theorem 1 and the steps of its proof, for the default loop."""
 
 import functools
 
@@ -8,7 +8,7 @@ from reference.markdown import code, escaped, paragraphs, table
 
 
 def pages() -> dict[str, str]:
-    """The page."""
+    """Return the page."""
     found = report()
     lines = ["# Conditions of `ambjax check`", ""]
     lines += paragraphs(conditions)
@@ -27,5 +27,5 @@ def pages() -> dict[str, str]:
 
 @functools.cache
 def report() -> conditions.Report:
-    """A check of a few samples: its lines are those of any."""
+    """Return the check of a run of a few samples; every check has the same lines."""
     return conditions.check(Cascade(), Scenario(), Clock(samples=2))

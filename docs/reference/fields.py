@@ -1,4 +1,4 @@
-"""What the fields of a record declare: unit, default, bounds and meaning."""
+"""Unit, default, bounds and meaning that the fields of a record declare."""
 
 import ast
 import dataclasses
@@ -12,7 +12,7 @@ from ambjax.numerics.records import numbers
 
 
 class Facts(NamedTuple):
-    """One key: each in words, '' where there is nothing to say."""
+    """One key with its texts; '' for each text that is not available."""
 
     name: str
     unit: str
@@ -22,7 +22,7 @@ class Facts(NamedTuple):
 
 
 def facts(field: dataclasses.Field, default: Any = None) -> Facts:
-    """What a numeric field says of itself; `default` where the case file's is another."""
+    """Return the declaration of a numeric field; `default` replaces its default if that of the case file differs."""
     meta = field.metadata
     unit, allowed = "", ""
     if meta.get("leaf"):
@@ -33,7 +33,7 @@ def facts(field: dataclasses.Field, default: Any = None) -> Facts:
 
 
 def value(default: Any) -> str:
-    """A default in words; '' for none."""
+    """Return a default as text; '' for none."""
     if default is dataclasses.MISSING or default is None:
         return ""
     if isinstance(default, (str, bool)):
@@ -43,7 +43,7 @@ def value(default: Any) -> str:
 
 
 def attribute_docs(kind: type) -> dict[str, str]:
-    """The docstrings that stand below the fields of a class."""
+    """Return the docstrings below the fields of a class."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
     assert isinstance(tree, ast.ClassDef)
     found = {}

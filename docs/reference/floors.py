@@ -1,4 +1,4 @@
-"""Folders and modules with the first line of each, floor by floor: what the architecture page shows."""
+"""The folders and modules of each layer with the first line of their docstrings, for the architecture page."""
 
 import ast
 import pathlib
@@ -9,7 +9,7 @@ ROOT = pathlib.Path(__file__).parents[2]
 
 
 def pages() -> dict[str, str]:
-    """The list that the architecture page takes in."""
+    """Return the list that the architecture page includes."""
     lines: list[str] = []
     for package, order in floors().items():
         for room in reversed(order.split()):
@@ -20,7 +20,7 @@ def pages() -> dict[str, str]:
 
 
 def floors() -> dict[str, str]:
-    """The table of tests/test_layers.py, from the ground up; the tuner, which stands on ambjax, first here."""
+    """Return the table of tests/test_layers.py, from the bottom up, with `tuning` first."""
     tree = ast.parse((ROOT / "tests" / "test_layers.py").read_text())
     for node in tree.body:
         if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "FLOORS":
@@ -42,6 +42,6 @@ def _shown(path: pathlib.Path) -> str:
 
 
 def _says(path: pathlib.Path) -> str:
-    """The first paragraph of a file's docstring."""
+    """Return the first paragraph of the docstring of a file."""
     said = ast.get_docstring(ast.parse(path.read_text())) or ""
     return escaped(" ".join(said.split("\n\n")[0].split()))

@@ -1,4 +1,4 @@
-"""Markdown that says what a text says, whatever characters are in it."""
+"""Convert text to Markdown and escape its special characters."""
 
 import inspect
 import re
@@ -9,29 +9,29 @@ SPECIAL = re.compile(r"([\\|*<$\[\]])")
 
 
 def escaped(text: str) -> str:
-    """The text, its `names` as code and nothing else taken for markup."""
+    """Return the text with its `names` as code and all other markup escaped."""
     parts = re.split(r"`+([^`]+)`+", text)
     return "".join(code(part) if n % 2 else SPECIAL.sub(r"\\\1", part) for n, part in enumerate(parts))
 
 
 def code(text: str) -> str:
-    """The text as code, also within a table."""
+    """Return the text as code, valid in a table too."""
     bars = text.replace("|", "\\|")
     return f"`{bars}`" if text else ""
 
 
 def table(titles: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> list[str]:
-    """A table of finished cells, and an empty line; `kind`: its class, for the style sheet."""
+    """Return a table of finished cells and an empty line; `kind`: its class in the style sheet."""
     lines = [f"| {' | '.join(titles)} |", "|" + "---|" * len(titles), *(f"| {' | '.join(row)} |" for row in rows)]
     return [f":::{{container}} {kind}", "", *lines, "", ":::", ""] if kind else [*lines, ""]
 
 
 def first_paragraph(thing: Any) -> str:
-    """The first paragraph of a docstring, on one line."""
+    """Return the first paragraph of a docstring as one line."""
     return " ".join((inspect.getdoc(thing) or "").split("\n\n")[0].split())
 
 
 def paragraphs(thing: Any) -> list[str]:
-    """A docstring as Markdown, an empty line after each paragraph."""
+    """Return a docstring as Markdown, with an empty line after each paragraph."""
     found = (inspect.getdoc(thing) or "").split("\n\n")
     return [line for text in found for line in (escaped(" ".join(text.split())), "")]

@@ -42,7 +42,7 @@ UNITS = {"m_per_s": "m/s", "A2_per_m2": "A^2/m^2"}
 
 
 def pages() -> dict[str, str]:
-    """The page."""
+    """Return the page."""
     lines = ["# Metrics and arrays", "", "## `metrics.json`", ""]
     lines += ["Written by `ambjax simulate`; of each member by `ambjax ensemble`.", ""]
     lines += [
@@ -58,7 +58,7 @@ def pages() -> dict[str, str]:
 
 
 def rows() -> list[tuple[str, str, str]]:
-    """A row for each metric: name, unit and meaning."""
+    """Return a row for each metric: name, unit and meaning."""
     folds = metrics.Standard()._folds().folds
     told = {name: _meaning(name, fold) for name, fold in folds.items()} | OTHERS
     return [(code(name), escaped(_unit(name)), escaped(meaning)) for name, meaning in told.items()]
@@ -77,7 +77,7 @@ def _meaning(name: str, fold: Any) -> str:
 
 
 def arrays() -> dict[str, str]:
-    """What each array of trajectory.npz holds."""
+    """Return the meaning of each array of trajectory.npz."""
     told = {name: text for name, text in attribute_docs(Row).items() if name not in NOT_SAVED}
     status = {
         "lost_at": "when the rotor was lost, s; inf: never. One number",

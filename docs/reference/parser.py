@@ -1,4 +1,4 @@
-"""What the reader of case files allows, asked of the reader itself: its complaints name it."""
+"""The ranges that the reader of case files allows, taken from its error messages."""
 
 import re
 from typing import Any
@@ -12,7 +12,7 @@ NO_KEY = "?"
 
 
 def complaint(path: str, value: Any, beside: dict[str, Any] | None = None) -> str:
-    """What the reader says of a case with this value at a dotted path; `beside`: other keys of the same table."""
+    """Return the error message for this value at a dotted path; `beside`: other keys of the same table."""
     *tables, key = path.split(".")
     raw: dict[str, Any] = {}
     inner = raw
@@ -29,14 +29,14 @@ def complaint(path: str, value: Any, beside: dict[str, Any] | None = None) -> st
 
 
 def keys(table: str, beside: dict[str, Any] | None = None) -> list[str]:
-    """The keys that a table may have."""
+    """Return the keys that a table may have."""
     path = f"{table}.{NO_KEY}" if table else NO_KEY
     listed = complaint(path, 0, beside).rpartition("Keys allowed here: ")[2].rstrip(".")
     return [] if listed == "none" else listed.split(", ")
 
 
 def rule(path: str, beside: dict[str, Any] | None = None) -> str:
-    """What a value must be, in the reader's words."""
+    """Return the allowed values of a key, in the words of the reader."""
     said = complaint(path, NO_KEY, beside)
     said = said.partition(f'"{NO_KEY}": ')[2]
     said = said.removeprefix("it must be ").removeprefix("give ").partition(". Write ")[0]
@@ -47,7 +47,7 @@ LINE = re.compile(r"(?:# )?(?P<key>[\w.-]+) = (?P<value>.*?)(?:\s+# (?P<meaning>
 
 
 def remarks(scenario: str = "tracking") -> dict[str, tuple[str, str]]:
-    """Value and meaning of every key in the template, by dotted path, those of tables that are comments included."""
+    """Return value and meaning of every key in the template, by dotted path, commented tables included."""
     found: dict[str, tuple[str, str]] = {}
     table = last = ""
     for line in template(scenario).splitlines():

@@ -1,4 +1,4 @@
-"""All pages that are written, by file name."""
+"""All generated pages by file name."""
 
 from reference import api, benchmarks, case_file, commands, conditions, floors, metrics
 
@@ -6,5 +6,5 @@ WRITERS = (case_file, commands, metrics, conditions, api, floors, benchmarks)
 
 
 def pages() -> dict[str, str]:
-    """All of them: text by file name."""
+    """Return the text of all pages by file name."""
     return {name: text for writer in WRITERS for name, text in writer.pages().items()}
