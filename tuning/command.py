@@ -19,8 +19,7 @@ from ambjax.host.lock import alone
 from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import check
 from tuning.config import read_tune, seeds, settings
-from tuning.judge import StepError, held, judge, step_error, summarise, worst, worst_of
-from tuning.judge import words as step_words
+from tuning.judge import StepError, describe, held, judge, step_error, summarise, worst, worst_of
 from tuning.problem import TuningProblem, problem_of
 from tuning.report import accurate, breakdown, gradient, limit_table, outcome, pictures
 from tuning.report import document as report
@@ -90,15 +89,15 @@ def _tune(
         f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {problem.objective.clock.method}"
     )
     answer = rounds(problem, start, out, {"case": raw, "tune": settings(tune)}, args.resume)
-    problem, who, x = answer.problem, answer.who, answer.x
+    problem, members, x = answer.problem, answer.members, answer.x
     facts = _facts(answer, held_out)
     if args.gradients:
         say("gradient report ...")
-        facts["gradient"] = gradient.report(problem, x, who)
+        facts["gradient"] = gradient.report(problem, x, members)
     if args.pareto:
         say("front of error against voltage ...")
-        facts["pareto"] = explore.pareto(problem, x, who)
-    slices = explore.slices(problem, x, who)
+        facts["pareto"] = explore.pareto(problem, x, members)
+    slices = explore.slices(problem, x, members)
     with files(out) as part:
         _write(part, problem, answer.history, facts, slices)
     summary = plain(facts) | {"out": str(out)}
@@ -112,7 +111,7 @@ def _tune(
 
 
 def _facts(answer: SearchResult, held_out: int) -> dict[str, Any]:
-    problem, x, who = answer.problem, answer.x, answer.who
+    problem, x, members = answer.problem, answer.x, answer.members
     case, tune, space = problem.case, problem.tune, problem.objective.space
     rollouts = problem.engine.rollouts
     before = space.values(case.cascade)
@@ -128,7 +127,7 @@ def _facts(answer: SearchResult, held_out: int) -> dict[str, Any]:
     limited = limit_table.facts(problem.goal.limits, tune.limits, judged[1] if judged else {}, summaries[1], refuted)
     if refuted and judged:
         summaries[1] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
-    lost = int((problem.engine.terms(x[None], who)["survival"] > 0).sum())
+    lost = int((problem.engine.terms(x[None], members)["survival"] > 0).sum())
     line = check(tuned.cascade, case.scenario, dataclasses.replace(case.clock, method=None))
     facts: dict[str, Any] = {
         "case": case.name,
@@ -136,11 +135,11 @@ def _facts(answer: SearchResult, held_out: int) -> dict[str, Any]:
         "before": summaries[0],
         "after": summaries[1],
         "held_out_seed": held_out,
-        "trained_on": len(who.member),
+        "trained_on": len(members.member),
         "lost_in_training": lost,
         "limits": limited,
         "loss": loss,
-        "minimised": breakdown.minimised(problem, x, who),
+        "minimised": breakdown.minimised(problem, x, members),
         "conditions": report.conditions(line),
         "advice_on_conditions": on_conditions(line),
         "step_error": answer.error.facts() if answer.error else None,
@@ -164,7 +163,7 @@ def _facts(answer: SearchResult, held_out: int) -> dict[str, Any]:
     found = outcome.outcome_of(facts, tune.limits.may_lose(count))
     facts["outcome"] = found.facts()
     facts["verdict"] = outcome.verdict(facts, found)
-    facts["advice"] = outcome.advice(problem, facts, found, x, who)
+    facts["advice"] = outcome.advice(problem, facts, found, x, members)
     return facts
 
 
@@ -184,7 +183,7 @@ def _checked(
 
 
 def _confirmed(*errors: StepError | None) -> str:
-    return "; ".join(f"accurate steps: {step_words(error)}" for error in errors if error)
+    return "; ".join(f"accurate steps: {describe(error)}" for error in errors if error)
 
 
 def _worst_checked(answer: SearchResult, judged: dict[str, np.ndarray], held_out: int) -> StepError | None:
@@ -196,7 +195,7 @@ def _worst_checked(answer: SearchResult, judged: dict[str, np.ndarray], held_out
     error = step_error(
         answer.problem, answer.x, answer.problem.objective.chosen(held_out, those, len(judged["lost_at_s"]))
     )
-    say(f"accurate steps on the worst of them: {step_words(error)}")
+    say(f"accurate steps on the worst of them: {describe(error)}")
     return error
 
 

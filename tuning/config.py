@@ -11,7 +11,7 @@ from ambjax.cases.reader import Case, case_from, load
 from ambjax.cases.table import Table, one_line, show
 from ambjax.ensemble.spread import require_path
 from ambjax.extend import GAINS, leaf
-from tuning.objective.limits import KINDS, LEAST_MARGIN, SHARE, Limit
+from tuning.objective.limits import DEFAULT_SHARE, KINDS, LEAST_MARGIN, Limit
 from tuning.objective.loss import TERMS
 from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.optimisers import BFGS, NAMES
@@ -188,7 +188,10 @@ def _limits(table: Table, case: Case) -> LimitSettings:
     asked = {name: table.leaf(name, SHARES.get(name, LIMIT)) for name in KINDS if name in table.raw}
     u_max, source = float(np.max(np.asarray(case.scenario.u_max))), dict.fromkeys(asked, table.path)
     if "rms_u_V" not in asked and math.isfinite(u_max):
-        asked["rms_u_V"], source["rms_u_V"] = SHARE * u_max, f"default, {100 * SHARE:g} % of actuator.u_max"
+        asked["rms_u_V"], source["rms_u_V"] = (
+            DEFAULT_SHARE * u_max,
+            f"default, {100 * DEFAULT_SHARE:g} % of actuator.u_max",
+        )
     clearance = float(np.min(np.asarray(case.scenario.touchdown)))
     band = table.leaf("settling_band_m", LENGTH, BAND * clearance)
     if "settling_band_m" in table.raw and "settling_s" not in asked:
