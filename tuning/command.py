@@ -1,4 +1,4 @@
-"""What `ambjax tune` does: read, search, judge, write."""
+"""The command `ambjax tune`: reads a case, searches, judges the gains and writes the report."""
 
 import argparse
 import dataclasses
@@ -32,12 +32,12 @@ from tuning.search.rounds import rounds
 from tuning.space import Gain, Space, tunable
 
 WRITTEN = ("tuned.toml", "history.npz", "report.html", "report.md", "report.json")
-# Written last of all, when a search has its answer.
+# The last file written: its presence marks a search that has ended.
 REPORT = "report.json"
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """ambjax tune. Raises ValueError for bad input, before anything is written."""
+    """Run `ambjax tune`. Return the exit code and report.json. Raises ValueError for bad input, before any output."""
     case, tune, raw = read_tune(args.case)
     if args.resume and not (args.out and begun(pathlib.Path(args.out))):
         raise ValueError(f"--resume: there is no search in --out {args.out}. Check --out, or leave out --resume.")
@@ -59,9 +59,9 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
 
 
 def _clear(out: pathlib.Path) -> None:
-    """Remove the checkpoints of a search that has ended, lest this one is resumed with them.
+    """Remove the checkpoints of a search that has ended, so that this search is not resumed with them.
 
-    Raises ValueError for those of one that has not.
+    Raises ValueError if that search has not ended.
     """
     if unfinished(out, REPORT):
         raise ValueError(
@@ -73,7 +73,7 @@ def _clear(out: pathlib.Path) -> None:
 
 
 def _kept(out: pathlib.Path) -> str:
-    """What an interruption has left, and how to go on."""
+    """Return the message after an interruption: what is saved, and how to continue."""
     if not (out / checkpoint(1)).exists():
         return "nothing is kept"
     return f"the search so far is kept. To go on, give the same command with --out {out} --resume"
@@ -82,7 +82,7 @@ def _kept(out: pathlib.Path) -> str:
 def _tune(
     args: argparse.Namespace, raw: dict[str, Any], problem: TuningProblem, start: np.ndarray, out: pathlib.Path
 ) -> tuple[int, dict[str, Any]]:
-    """Search, judge and write; everything has been checked. `raw`: what the case file holds."""
+    """Search, judge and write. The input is valid. `raw`: the document of the case file; `start` [m]: its gains."""
     tune = problem.tune
     held_out = seeds(tune.budget)[2]
     say(
@@ -170,8 +170,11 @@ def _facts(answer: SearchResult, held_out: int) -> dict[str, Any]:
 def _checked(
     answer: SearchResult, judged: dict[str, np.ndarray] | None, held_out: int
 ) -> tuple[StepError | None, dict[str, Any] | None, str]:
-    """What accurate steps say of the worst held-out members and of the first, `judged` [N]; and why they do not
-    confirm the answer: '' where they do."""
+    """Simulate the worst and the first of the held-out members `judged` [N] again by accurate steps.
+
+    Returns the step error on the worst members, the comparison on the first ones, and the reason why accurate steps do
+    not confirm the answer ('' if they confirm it).
+    """
     problem, again, error = answer.problem, None, None
     if judged and not problem.sampled:
         error = _worst_checked(answer, judged, held_out) if answer.confirmed else None
@@ -187,7 +190,7 @@ def _confirmed(*errors: StepError | None) -> str:
 
 
 def _worst_checked(answer: SearchResult, judged: dict[str, np.ndarray], held_out: int) -> StepError | None:
-    """What accurate steps say of the worst held-out members that are held; None where none is."""
+    """Return the step error on the worst held-out members that are held; None if none is held."""
     those = np.flatnonzero(held(judged))
     if not those.size:
         return None
@@ -229,7 +232,7 @@ def _write(
 def _pictures(
     problem: TuningProblem, tuned: Cascade, history: Any, facts: dict[str, Any], slices: explore.Slices
 ) -> dict[str, bytes]:
-    """PNG by file name: those that the report shows."""
+    """Return the pictures of the report, PNG by file name."""
     paths, runs = problem.objective.space.paths, {"before": problem.case.cascade, "after": tuned}
     shown = {name: accurate.nominal(problem, one) for name, one in runs.items()}
     drawn = {
@@ -242,7 +245,7 @@ def _pictures(
 
 
 def _laws(problem: TuningProblem, tuned: dict[str, float]) -> dict[str, float]:
-    """Every gain of the tuned laws by path, those that were not tuned too: a p left out would follow the plant."""
+    """Return every gain of the laws by path, untuned ones included, because a p that is left out follows the plant."""
     everything = Space(tuple(Gain(path) for path in tunable(problem.case.cascade)))
     return dict(zip(everything.paths, everything.values(problem.case.cascade).tolist(), strict=True)) | tuned
 
