@@ -37,7 +37,7 @@ def members(problem: TuningProblem, x: np.ndarray) -> Members:
     terms = problem.engine.terms(x[None], problem.objective.chosen(seed, np.arange(count), count))
     tight = np.argsort(-terms["clearance"][0] - terms["survival"][0], kind="stable")[:JOINED]
     those = problem.objective.chosen(seed, tight, count)
-    return training(problem).joined(those._replace(loud=LOUD * those.loud))
+    return training(problem).joined(those._replace(noise_factor=LOUD * those.noise_factor))
 
 
 def goals(problem: TuningProblem, x: np.ndarray, who: Members) -> np.ndarray:
@@ -46,7 +46,7 @@ def goals(problem: TuningProblem, x: np.ndarray, who: Members) -> np.ndarray:
     values = free.score(x, {name: rows for name, rows in terms.items() if not name.startswith(PREFIX)}, who)
     for limit in problem.goal.limits:
         rows = terms[PREFIX + limit.name][:, : who.ordinary]
-        excess = [max(limit.beyond(float(limit.kind.judged(one))), 0.0) for one in rows]
+        excess = [max(limit.log_excess(float(limit.kind.judged(one))), 0.0) for one in rows]
         values = values + PENALTY * np.square(excess) / 2
     return np.where(np.isfinite(values), values, 10.0)
 

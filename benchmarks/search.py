@@ -33,7 +33,7 @@ from ambjax.ensemble.worker import processes
 from tuning.config import read_tune
 from tuning.objective.ranges import ranges
 from tuning.problem import TuningProblem, problem_of
-from tuning.search.course import Course, looks, training
+from tuning.search.course import Course, search_and_restart, training
 from tuning.search.keeper import SearchState
 
 TASKS = pathlib.Path(__file__).parent / "tasks"
@@ -137,7 +137,7 @@ def ours(problem: TuningProblem, who: Any, seed: int) -> list[tuple[int, float, 
             best = min(float(np.min(progress.history["value"][-1])), trace[-1][2] if trace else np.inf)
             trace.append((problem.engine.rollouts, time.process_time() - began, best))
 
-    looks(Course(problem, who, seed, tell=tell), problem.tune.space.values(problem.case.cascade))
+    search_and_restart(Course(problem, who, seed, tell=tell), problem.tune.space.values(problem.case.cascade))
     return trace
 
 

@@ -59,19 +59,19 @@ class Bowl:
         self.objective, self.mode, self.threads, self.rollouts = objective, mode, threads, 0
         self.accurate = isinstance(objective.clock.method, AdaptiveRodas3)
 
-    def _note(self, kind, x, who):
-        for seed in sorted(set(np.asarray(who.seed).tolist())):
-            numbers = np.asarray(who.member)[np.asarray(who.seed) == seed]
+    def _note(self, kind, x, members):
+        for seed in sorted(set(np.asarray(members.seed).tolist())):
+            numbers = np.asarray(members.member)[np.asarray(members.seed) == seed]
             self.world.asked.append((kind, seed, tuple(numbers.tolist()), len(x)))
-        self.rollouts += len(x) * len(who.member)
+        self.rollouts += len(x) * len(members.member)
 
-    def _terms(self, x, who, along=None):
+    def _terms(self, x, members, along=None):
         """Terms [S, N] at coordinates x [S, m]; their derivatives along coordinate `along` as imaginary parts."""
         logs, slopes = (np.asarray(part) for part in _log_gains(self.objective.space, jnp.asarray(x) * 1.0))
         if along is not None:
             logs = logs + 1j * TINY * np.where(np.arange(x.shape[1]) == along, slopes, 0.0)
         away = logs - np.log(self.world.best)
-        each = zip(*(np.asarray(one).tolist() for one in (who.seed, who.member, who.stressed)), strict=True)
+        each = zip(*(np.asarray(one).tolist() for one in (members.seed, members.member, members.stressed)), strict=True)
         limits = np.log([self.world.limit(*one, self.accurate) for one in each])
         beyond = logs[:, :1] - limits
         beyond = np.where(beyond.real > 0, beyond, 0.0)
@@ -82,20 +82,20 @@ class Bowl:
         terms = {name: each.get(name, nothing) for name in TERMS}
         return terms | {PREFIX + name: 200 * each["effort"] ** 0.5 for name in self.objective.loss.measures}
 
-    def terms(self, x, who):
-        self._note("terms", x, who)
-        return self._terms(x, who)
+    def terms(self, x, members):
+        self._note("terms", x, members)
+        return self._terms(x, members)
 
-    def metrics(self, x, who):
-        self._note("metrics", x, who)
-        found = self._terms(x, who)
-        each = zip(np.asarray(who.seed).tolist(), np.asarray(who.member).tolist(), strict=True)
+    def metrics(self, x, members):
+        self._note("metrics", x, members)
+        found = self._terms(x, members)
+        each = zip(np.asarray(members.seed).tolist(), np.asarray(members.member).tolist(), strict=True)
         stalled = np.array([self.world.stalls(*one, self.accurate) for one in each]) & (found["survival"] > -1)
         lost = (found["survival"] > 0) & ~stalled
         substeps = getattr(self.objective.clock.method, "substeps", None)
         bias = 0.0 if self.accurate else self.world.bias(substeps)
         error = S_0 * np.sqrt(found["tracking"]) * (1 + bias)
-        numbers = np.broadcast_to(np.asarray(who.member, float), lost.shape)
+        numbers = np.broadcast_to(np.asarray(members.member, float), lost.shape)
         metrics = {
             "settled_rms_error_m": error,
             "settled_max_abs_error_m": 2 * error,
@@ -107,15 +107,15 @@ class Bowl:
         }
         return {"loss": found, "metrics": metrics}
 
-    def gradient(self, x, who, weights):
-        self._note("gradient", x, who)
-        self.rollouts += len(x) * len(who.member) * x.shape[1]
+    def gradient(self, x, members, weights):
+        self._note("gradient", x, members)
+        self.rollouts += len(x) * len(members.member) * x.shape[1]
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS))).T[:, :, None]
-        found = [outcomes(each, self._terms(x, who, j), who.stressed) for j in range(x.shape[1])]
+        found = [outcomes(each, self._terms(x, members, j), members.stressed) for j in range(x.shape[1])]
         off = REVERSE if self.mode == "reverse" else 0.0
         slopes = (1 + off) * np.stack([np.stack(one, -1).imag for one in found], -1) / TINY
         chaos = self.world.chaos * np.sign(np.sin(1e6 * np.asarray(x)))[:, None, None, :]
-        return np.stack(found[0], -1).real, slopes + chaos, self._terms(x, who)
+        return np.stack(found[0], -1).real, slopes + chaos, self._terms(x, members)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -432,8 +432,8 @@ ENSEMBLE = [
     M(
         "the judge's gains are not exactly those that are written",
         "tuning/objective/lanes.py",
-        "self.objective.fixed(one, who)",
-        "self.objective.fixed(one * (1 + 1e-12), who)",
+        "self.objective.fixed(one, members)",
+        "self.objective.fixed(one * (1 + 1e-12), members)",
         "tests/test_replay.py::test_the_tuner_s_numbers_are_those_of_the_commands",
     ),
     M(
@@ -504,8 +504,8 @@ SEARCH = [
     M(
         "members that accurate steps lose do not join",
         "tuning/search/rounds.py",
-        "these = error.who._replace(",
-        "these = jax.tree.map(lambda a: a[:0], error.who)._replace(",
+        "these = error.unheld._replace(",
+        "these = jax.tree.map(lambda a: a[:0], error.unheld)._replace(",
         "tests/test_tuning_rounds.py::test_members_that_only_accurate_steps_lose_join_too",
     ),
     M(
@@ -518,8 +518,8 @@ SEARCH = [
     M(
         "the judge looks at the first chunk again and again",
         "tuning/judge.py",
-        "np.arange(first, min(first + AT_ONCE, count))",
-        "np.arange(min(AT_ONCE, count - first))",
+        "np.arange(first, min(first + CHUNK, count))",
+        "np.arange(min(CHUNK, count - first))",
         "tests/test_tuning_study.py::test_the_judge_sees_every_member_of_its_own_ensemble_once",
     ),
     M(
@@ -553,28 +553,28 @@ SEARCH = [
     M(
         "a steepness whose gain is not tuned has the range of the slope itself",
         "tuning/objective/ranges.py",
-        "asked._replace(low=asked.low / size, high=asked.high / size)",
-        "asked",
+        "interval._replace(low=interval.low / size, high=interval.high / size)",
+        "interval",
         "tests/test_tuning_foreign.py::test_on_a_processor_a_steepness_is_looked_for_by_its_slope",
     ),
     M(
         "a range comes from a zero",
         "tuning/objective/ranges.py",
-        "(STIR * float(scenario.touchdown),",
+        "(LEAST_DISPLACEMENT * float(scenario.touchdown),",
         "(0.0 * float(scenario.touchdown),",
         "tests/test_tuning_study.py::test_a_rotor_that_stands_still_has_starts_too",
     ),
     M(
         "--pareto raises",
         "tuning/command.py",
-        "explore.pareto(problem, x, who)",
+        "explore.pareto(problem, x, members)",
         "explore.pareto(problem, x)",
         "tests/test_tuning_study.py::test_pareto_is_in_the_report_and_has_a_picture",
     ),
     M(
         "--gradients raises",
         "tuning/command.py",
-        "gradient.report(problem, x, who)",
+        "gradient.report(problem, x, members)",
         "gradient.report(problem, x)",
         "tests/test_tuning_study.py::test_gradients_reports_three_ways_to_the_same_number",
     ),
@@ -623,8 +623,8 @@ SEARCH = [
     M(
         "a multiplier is what the judge finds, not the force that acted",
         "tuning/objective/limits.py",
-        "self.penalty * self.beyond(self.ratio * tuned), 0.0)",
-        "self.penalty * self.beyond(judged), 0.0)",
+        "self.penalty * self.log_excess(self.ratio * tuned), 0.0)",
+        "self.penalty * self.log_excess(judged), 0.0)",
         "tests/test_tuning_limits.py::test_the_pull_is_that_of_an_augmented_lagrangian",
     ),
     M(
@@ -651,7 +651,7 @@ SEARCH = [
     M(
         "the log of the search says that a limit cannot be held",
         "tuning/search/multipliers.py",
-        "a steeper pull has not lowered {names}: its multiplier stays, and the held-out members judge it",
+        "a larger penalty has not lowered {names}: its multiplier stays, and the held-out members judge it",
         "a limit does not give way: it cannot be held here",
         "tests/test_tuning_outcome.py::test_every_place_says_the_same",
     ),
@@ -742,8 +742,8 @@ SEARCH = [
     M(
         "the first pair of points does not set the scale of BFGS",
         "tuning/optimisers.py",
-        "jnp.where(state.seen == 1, curvature",
-        "jnp.where(state.seen == -1, curvature",
+        "jnp.where(state.trials == 1, curvature",
+        "jnp.where(state.trials == -1, curvature",
         "tests/test_tuning_study.py::test_bfgs_takes_the_same_way_whatever_the_unit_of_the_loss",
     ),
     M(
@@ -763,7 +763,7 @@ SEARCH = [
     M(
         "stressed members hear no more than the others",
         "tuning/objective/members.py",
-        "sensor.louder(loud)",
+        "sensor.louder(noise_factor)",
         "sensor.louder(1.0)",
         "tests/test_tuning_search.py::test_stressed_members_hear_more_and_count_by_being_held",
     ),
@@ -966,8 +966,8 @@ SEARCH = [
     M(
         "a gain may end beyond what the sampled loop can follow",
         "tuning/objective/ranges.py",
-        "(1 if asked.firm else BEYOND)",
-        "BEYOND",
+        "(1 if interval.firm else END_FACTOR)",
+        "END_FACTOR",
         "tests/test_tuning_study.py::test_gains_end_where_the_template_says",
     ),
 ]
@@ -975,7 +975,7 @@ SAMPLED = [
     M(
         "stressed members have another sensor, not more noise",
         "tuning/objective/members.py",
-        "sensor=sensor.louder(loud)",
+        "sensor=sensor.louder(noise_factor)",
         "sensor=jax.tree.map(lambda x: x * loud, sensor)",
         "tests/test_tuning_search.py::test_stressed_members_hear_more_and_count_by_being_held",
     ),
@@ -1003,8 +1003,8 @@ SAMPLED = [
     M(
         "a front is judged on stressed members",
         "tuning/search/explore.py",
-        "metrics(best, who.unstressed)",
-        "metrics(best, who)",
+        "metrics(best, members.unstressed)",
+        "metrics(best, members)",
         "tests/test_tuning_study.py::test_the_front_trades_error_for_voltage",
     ),
     M(

@@ -337,9 +337,9 @@ def test_a_histogram_is_of_all_members(log, drawn):
     counted = (shown >= alive.edges[0]) & (shown <= alive.edges[-1])
     assert (~counted).sum() == log
     assert ("1 at zero" in ax.get_title()) == log
-    for patch, baseline, who in ((alive, 0, ~lost), (dead, alive.values, lost)):
+    for patch, baseline, members in ((alive, 0, ~lost), (dead, alive.values, lost)):
         np.testing.assert_array_equal(
-            patch.values - baseline, np.bincount(of[counted & who], minlength=len(alive.edges) - 1)
+            patch.values - baseline, np.bincount(of[counted & members], minlength=len(alive.edges) - 1)
         )
     assert ax.get_ylim()[1] >= dead.values.max()
     # the marks are the quantiles of the survivors, as in summary.json

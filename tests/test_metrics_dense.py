@@ -13,7 +13,7 @@ from test_oracle import BUMP, Case, adaptive, current, in_ambjax, noise_of, puls
 
 from ambjax import AdaptiveRodas3, Clock, Sensor, Slide, rollout
 from ambjax.simulation.metrics import Standard
-from tuning.problem import FINE
+from tuning.problem import REFINEMENT
 
 PERIOD = 1e-4
 SAMPLES, SETTLE = 200, 50 * PERIOD
@@ -85,7 +85,7 @@ def least_tolerance(name, method):
 
 
 # `simulate` measures in adaptive steps, what a report of the tuner prints in eight times its 3 a sample.
-@pytest.mark.parametrize("method", [AdaptiveRodas3(), Slide(3 * FINE)], ids=["adaptive", "sliding"])
+@pytest.mark.parametrize("method", [AdaptiveRodas3(), Slide(3 * REFINEMENT)], ids=["adaptive", "sliding"])
 @pytest.mark.parametrize("name", LOOPS)
 def test_every_metric_is_what_a_dense_solution_says(name, method):
     found, expected = numbers(*LOOPS[name], SAMPLES, SETTLE, method)[0], dense(name)
@@ -126,7 +126,7 @@ def test_tuned_gains_of_the_benchmarks_measure_so_once_settled(name):
     world = World(**laws, reference=sine(), u_max=200.0)  # the disturbance comes later
     std = (3.1623e-4, 0.0, 0.0) if pole else (1e-6, 1e-4, 1e-4)
     samples, first = 2200, 2000
-    found, noise = numbers(world, std, samples, first * PERIOD, Slide(3 * FINE))
+    found, noise = numbers(world, std, samples, first * PERIOD, Slide(3 * REFINEMENT))
     expected = metrics(world, samples, PERIOD, first * PERIOD, noise)
     for key in ("rms_u_V", "settled_rms_u_V"):
         assert found[key] == pytest.approx(expected[key], rel=0.01), key  # seen: 0.8 %

@@ -19,7 +19,7 @@ from ambjax.control.base import default_law
 from tuning.__main__ import main
 from tuning.command import _laws
 from tuning.report.tuned import tuned
-from tuning.search.screen import around, everywhere
+from tuning.search.screen import around, initial_points
 from tuning.space import read
 
 CASES = pathlib.Path(__file__).parent / "cases"
@@ -58,7 +58,7 @@ def test_every_range_is_finite_and_positive(name, laws):
     for where in found.ranges:
         assert 0 < where.low < where.high <= where.most < np.inf
         assert where.source
-    points = everywhere(found.objective, found.goal.conditions, found.tune.space.values(found.case.cascade), 16, 1)
+    points = initial_points(found.objective, found.goal.conditions, found.tune.space.values(found.case.cascade), 16, 1)
     assert np.all(np.isfinite(points))
 
 
@@ -116,7 +116,7 @@ def test_on_a_processor_a_steepness_is_looked_for_by_its_slope(beside):
     for where in found.ranges:
         assert 0 < where.low < where.high <= where.most < np.inf
     space, start = found.objective.space, found.tune.space.values(found.case.cascade)
-    screen = everywhere(found.objective, found.goal.conditions, start, 64, 1)[1:]
+    screen = initial_points(found.objective, found.goal.conditions, start, 64, 1)[1:]
     gains = np.array([space.gains_at(jnp.asarray(x)) for x in screen])
     case = np.array([read(found.case.cascade, f"controller.{name}") for name in names])
     slopes = 2 / np.pi * gains[:, -3:] * (gains[:, :3] if beside else case)
@@ -189,7 +189,7 @@ def test_reading_the_tuned_file_gives_the_tuned_cascade(laws):
 def test_without_a_screen_there_is_the_case_alone():
     found = problem_from(BEARINGS["fan"], screen=0)
     start = found.tune.space.values(found.case.cascade)
-    points = everywhere(found.objective, found.goal.conditions, start, 0, 1)
+    points = initial_points(found.objective, found.goal.conditions, start, 0, 1)
     assert points.shape == (1, 4)
     np.testing.assert_allclose(found.objective.space.gains_at(points[0]), start, rtol=1e-12)
     np.testing.assert_array_equal(around(points[0], 0, 1), points)

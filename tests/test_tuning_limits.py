@@ -18,7 +18,7 @@ from ambjax.simulation.metrics import Named, standard_for
 from tuning.config import LimitSettings, settings
 from tuning.objective.lanes import Engine
 from tuning.objective.limits import KINDS, PENALTY, Limit, largest, measures
-from tuning.problem import FINE, problem_of
+from tuning.problem import REFINEMENT, problem_of
 from tuning.report.limit_table import MORE
 from tuning.report.pictures import amplitudes
 from tuning.search.rounds import rounds
@@ -159,20 +159,20 @@ def test_a_processor_s_steps_are_its_own():
     made = problem_from(SAMPLED)
     assert made.sampled
     assert made.judging is made.engine
-    assert made.reference.objective.clock.method.substeps == FINE * made.engine.objective.clock.method.substeps
+    assert made.reference.objective.clock.method.substeps == REFINEMENT * made.engine.objective.clock.method.substeps
     continuous = tomllib.loads(SAMPLED.replace("[processor]", "").replace("p = inf", "p = 25.0"))
     other = problem_of(*case_and_tune(continuous))
     assert not other.sampled
-    assert other.judging.objective.clock.method.substeps == FINE * other.engine.objective.clock.method.substeps
+    assert other.judging.objective.clock.method.substeps == REFINEMENT * other.engine.objective.clock.method.substeps
 
 
 @pytest.mark.slow
 def test_slopes_of_what_limits_hold_three_ways():
     made = problem_from(SAMPLED)
-    x, who = made.objective.space.encode(made.tune.space.values(made.case.cascade)), made.objective.members(1, 2)
+    x, members = made.objective.space.encode(made.tune.space.values(made.case.cascade)), made.objective.members(1, 2)
     forward, reverse = (Engine(made.objective, settle=0.01, mode=mode, threads=1) for mode in ("forward", "reverse"))
-    value, slopes, _ = forward.gradient(x[None], who, made.goal.weights)
-    other, back, _ = reverse.gradient(x[None], who, made.goal.weights)
+    value, slopes, _ = forward.gradient(x[None], members, made.goal.weights)
+    other, back, _ = reverse.gradient(x[None], members, made.goal.weights)
     assert value.shape == (1, 2, 1 + len(KINDS))
     np.testing.assert_allclose(value, other, rtol=1e-12)
     size = np.abs(slopes).max(axis=-1, keepdims=True)
@@ -195,16 +195,16 @@ def test_the_pull_is_that_of_an_augmented_lagrangian():
     assert float(limit.pull(values)) == pytest.approx(PENALTY * 0.1**2 / 2)
     assert float(limit.pull(0.5 * values)) == 0.0
     # the multiplier is the force that acted at the optimum, which the search's own number makes
-    assert limit.informed(10.0 * math.exp(0.05), 10.0 * math.exp(0.1)).multiplier == pytest.approx(PENALTY * 0.05)
-    told = limit.informed(10.0, 10.0 * math.exp(0.1))
+    assert limit.updated(10.0 * math.exp(0.05), 10.0 * math.exp(0.1)).multiplier == pytest.approx(PENALTY * 0.05)
+    told = limit.updated(10.0, 10.0 * math.exp(0.1))
     assert told.multiplier == pytest.approx(0.0)
     # the judge finds 10 % more than the search: from now on the search counts as he does
     assert float(told.excess(jnp.full(3, 10.0))) == pytest.approx(0.1)
     assert told.penalty == PENALTY
-    again = told.informed(9.9, 10.0 * math.exp(0.09))  # hardly less: it must be steeper
+    again = told.updated(9.9, 10.0 * math.exp(0.09))  # hardly less: it must be steeper
     assert again.multiplier == pytest.approx(PENALTY * (0.1 + math.log(0.99)))
     assert again.penalty > PENALTY
-    assert limit.informed(5.0, 5.0).multiplier == 0.0
+    assert limit.updated(5.0, 5.0).multiplier == 0.0
 
 
 # --- that they are kept, and what they cost ---
@@ -224,17 +224,17 @@ def test_a_limit_is_met_and_its_multiplier_is_the_price(monkeypatch, tmp_path):
         for one in (answer, looser)
     )
     # to first order in log 1.1 beyond the optima on the way, and both within 1 % of k
-    assert limit.bought(MORE) == pytest.approx(1 - theirs / ours, rel=0.2)
+    assert limit.error_reduction(MORE) == pytest.approx(1 - theirs / ours, rel=0.2)
 
 
 def test_the_price_falls_as_the_multiplier_does_on_the_way():
     """Where it is 20 at 10 V and, linear in the logarithm, 0 at 11 V, 10 % more takes off half of what 20 would."""
     limit = Limit("rms_u_V", 10.0, multiplier=20.0, forces=((11.0, 0.0), (10.0, 20.0)))
     # 200 stretches of a straight line
-    assert limit.bought(0.1) == pytest.approx(1 - 1.1 ** (-20 / 2 / 2), rel=1e-9)
+    assert limit.error_reduction(0.1) == pytest.approx(1 - 1.1 ** (-20 / 2 / 2), rel=1e-9)
     alone = Limit("rms_u_V", 10.0, multiplier=2.0, forces=((10.0, 2.0),))
-    assert alone.bought(0.1) == pytest.approx(1 - 1 / 1.1, rel=1e-9)
-    assert Limit("rms_u_V", 10.0).bought(0.1) == 0.0
+    assert alone.error_reduction(0.1) == pytest.approx(1 - 1 / 1.1, rel=1e-9)
+    assert Limit("rms_u_V", 10.0).error_reduction(0.1) == 0.0
 
 
 def test_a_limit_is_active_where_it_pulls_and_is_reached():

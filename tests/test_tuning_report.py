@@ -141,10 +141,10 @@ def test_what_was_minimised_is_the_goal(conditions):
     few = problem_from(CASE.replace("3e5", "1e3").replace('["controller.position.c", "controller.position.k"]',
                                                         '["controller.inversion.gamma"]'),
                      weights={"conditions": conditions, "peak": 0.5})  # fmt: skip
-    who = training(few)
+    members = training(few)
     at = few.objective.space.encode(few.tune.space.values(few.case.cascade))
-    parts = breakdown.minimised(few, at, who)
-    goal = few.goal.score(at[None], few.engine.terms(at[None], who), who)[0]
+    parts = breakdown.minimised(few, at, members)
+    goal = few.goal.score(at[None], few.engine.terms(at[None], members), members)[0]
     assert math.log(parts["total"]) == pytest.approx(goal, rel=1e-9)
     whole = (parts["risk"] + parts["held"]) * parts["penalty"] * parts["limits"]
     assert parts["total"] == pytest.approx(whole, rel=1e-12)
@@ -168,17 +168,17 @@ def test_the_lowest_point_of_slices_loses_no_more():
 
 def test_a_lower_point_beside_the_answer_is_said():
     facts = {"beside": {"path": "controller.position.c", "gain": 12.5, "lower": 0.2}}
-    assert "20 % lower, at controller.position.c = 12.5" in report._beside(facts)
-    assert "ended before it went there" in report._beside(facts)
+    assert "20 % lower, at controller.position.c = 12.5" in report._lower_point(facts)
+    assert "ended before it went there" in report._lower_point(facts)
     facts["beside"]["lower"] = 0.005
-    assert "as good as the answer" in report._beside(facts)
+    assert "as good as the answer" in report._lower_point(facts)
     facts["beside"]["lower"] = 0.0
-    assert "No point" in report._beside(facts)
+    assert "No point" in report._lower_point(facts)
 
 
 def test_the_picture_begins_at_what_the_table_says_was_minimised(study, x):
-    who = training(study)
-    found, parts = slices(study, x, who), breakdown.minimised(study, x, who)
+    members = training(study)
+    found, parts = slices(study, x, members), breakdown.minimised(study, x, members)
     np.testing.assert_allclose(np.exp(found.goals[:, len(REACH) // 2]), parts["total"], rtol=1e-9)
 
 

@@ -62,10 +62,10 @@ def test_members_of_another_seed_that_are_lost_join_and_are_held(monkeypatch, tm
     assert found.lost == 0
     assert c < 40.0 < world.best[0]  # without them c = 100 is best
     assert k == pytest.approx(world.best[1], rel=0.1)
-    joined = (found.who.seed == seed_of(VALIDATION)) & found.who.stressed
-    assert set(found.who.member[joined].tolist()) == fragile
+    joined = (found.members.seed == seed_of(VALIDATION)) & found.members.stressed
+    assert set(found.members.member[joined].tolist()) == fragile
     # half of the extra noise of a stressed member, 1.2
-    np.testing.assert_allclose(found.who.loud[joined], 1.1)
+    np.testing.assert_allclose(found.members.noise_factor[joined], 1.1)
 
 
 def test_without_validation_nobody_is_asked(monkeypatch, tmp_path):
@@ -105,7 +105,7 @@ def test_of_several_answers_that_lose_members_the_one_that_loses_least_is_return
     world.asked = Noticing()
     found, _ = tuned(monkeypatch, tmp_path, world)
     assert found.lost == 1
-    assert len(found.who.member) == 6 + 3  # the second round's: the three that the first lost have joined
+    assert len(found.members.member) == 6 + 3  # the second round's: the three that the first lost have joined
     assert next(lost, None) is None
 
 
@@ -134,7 +134,7 @@ def test_members_that_only_accurate_steps_lose_join_too(monkeypatch, tmp_path):
 
     found, (c, _) = tuned(monkeypatch, tmp_path, World(limit=limit))
     assert c < 40.0
-    assert 2 in found.who.member[found.who.stressed]
+    assert 2 in found.members.member[found.members.stressed]
     assert found.error.lost == 0
     assert found.lost == 0
 

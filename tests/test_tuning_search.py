@@ -24,11 +24,11 @@ from tuning.objective.risk import CVaR, Mean
 from tuning.objective.shortfalls import bounds
 from tuning.optimisers import CLIFF, NAMES, SHORTER, bfgs, optimiser
 from tuning.problem import problem_of
-from tuning.search.course import GAIN, MOST_LOOKS, look_again
+from tuning.search.course import GAIN, MOST_SEARCHES, should_restart
 from tuning.search.descent import Descent
 from tuning.search.keeper import Keeper, SearchState
-from tuning.search.optimise import _go_on_with_all, best_of, search
-from tuning.search.screen import FAR, NEAR, around, everywhere, screen
+from tuning.search.optimise import _begin_full_phase, best_of, search
+from tuning.search.screen import FAR, NEAR, around, initial_points, screen
 from tuning.space import Gain, Space
 
 PATHS = ("position.c", "position.k", "inversion.gamma", "current.k_i")
@@ -54,9 +54,9 @@ def engines():
 
 
 def test_gradient_three_ways(engines):
-    forward, reverse, who, x = engines
-    value, slopes, _ = forward.gradient(x[None], who, WEIGHTS)
-    other, back, _ = reverse.gradient(x[None], who, WEIGHTS)
+    forward, reverse, members, x = engines
+    value, slopes, _ = forward.gradient(x[None], members, WEIGHTS)
+    other, back, _ = reverse.gradient(x[None], members, WEIGHTS)
     assert value.shape == (1, 4, 1)  # the loss, and no limits
     np.testing.assert_allclose(value, other, rtol=1e-12)
     size = np.abs(slopes).max()
@@ -64,7 +64,7 @@ def test_gradient_three_ways(engines):
     np.testing.assert_allclose(slopes, back, rtol=1e-9, atol=1e-12 * size)
     h = 1e-3
     points = x + np.concatenate([s * h * np.eye(4) for s in (1, -1, 0.5, -0.5)])
-    losses = weigh(WEIGHTS, forward.terms(points, who), who.stressed)
+    losses = weigh(WEIGHTS, forward.terms(points, members), members.stressed)
     up, down, half_up, half_down = losses.reshape(4, 4, -1)
     differences = (4 * (half_up - half_down) / h - (up - down) / (2 * h)) / 3
     # h^4 truncation of the extrapolated differences: measured 2e-7
@@ -73,12 +73,12 @@ def test_gradient_three_ways(engines):
 
 def test_lanes_are_rollouts(engines):
     """A lane, its noise drawn beforehand, is the very rollout of that member."""
-    forward, _, who, x = engines
+    forward, _, members, x = engines
     problem = forward.objective
-    terms = forward.terms(x[None], who)
+    terms = forward.terms(x[None], members)
     k = 2
     scenario = dataclasses.replace(
-        SCENARIO, member=k, seed=3, plant=dataclasses.replace(SCENARIO.plant, m=float(who.values["plant.m"][k]))
+        SCENARIO, member=k, seed=3, plant=dataclasses.replace(SCENARIO.plant, m=float(members.values["plant.m"][k]))
     )
     alone = rollout(CASCADE, scenario, problem.clock, fold=problem.loss, every=0).measured
     for name in TERMS:  # the same operations, fused differently
@@ -97,10 +97,10 @@ def test_a_lane_has_the_delay_of_its_member(delays):
     """Delays that are spread are neither rounded to whole samples, as their ends may be, nor cut to the nominal one."""
     case, tune = case_and_tune(LATE | {"spread": {"processor": {"delay": {"uniform": delays}}}})
     problem = problem_of(case, tune)
-    who = problem.objective.members(4, 8)
+    members = problem.objective.members(4, 8)
     x = problem.objective.space.encode(problem.objective.space.values(case.cascade))
-    tracking = problem.engine.terms(x[None], who)["tracking"][0]
-    delays = who.values["processor.delay"]
+    tracking = problem.engine.terms(x[None], members)["tracking"][0]
+    delays = members.values["processor.delay"]
     assert np.all(delays != np.round(delays))
     for lane, delay in zip(tracking, delays, strict=True):
         processor = dataclasses.replace(case.cascade.processor, delay=float(delay), whole=None, most=None)
@@ -113,9 +113,9 @@ def test_members_do_not_depend_on_how_many_are_asked_for():
     problem = objective()
     many, few = problem.members(5, 6), problem.members(5, 2)
 
-    def errors(who, m):
+    def errors(members, m):
         """What member m's sensors add to its first sample."""
-        scenario = problem.world(jax.tree.map(lambda a: a[m], who))[1]
+        scenario = problem.world(jax.tree.map(lambda a: a[m], members))[1]
         return np.array(scenario.sensor.noise(scenario.words(), 0))
 
     np.testing.assert_array_equal(errors(many, 1), errors(few, 1))
@@ -125,20 +125,20 @@ def test_members_do_not_depend_on_how_many_are_asked_for():
 
 def test_stressed_members_hear_more_and_count_by_being_held():
     problem = objective()
-    who = problem.training(5, 2, 2, 1.5, 1.25)
-    np.testing.assert_array_equal(who.loud, [1.0, 1.0, 1.5, 1.5])
-    quiet, loud = (problem.world(jax.tree.map(lambda a, m=m: a[m], who))[1].sensor for m in (1, 2))
+    members = problem.training(5, 2, 2, 1.5, 1.25)
+    np.testing.assert_array_equal(members.noise_factor, [1.0, 1.0, 1.5, 1.5])
+    quiet, noise_factor = (problem.world(jax.tree.map(lambda a, m=m: a[m], members))[1].sensor for m in (1, 2))
     for name in ("std", "std_z_dot", "std_i"):
-        assert float(getattr(loud, name)) == 1.5 * float(getattr(quiet, name)) > 0
+        assert float(getattr(noise_factor, name)) == 1.5 * float(getattr(quiet, name)) > 0
     scaled = {"std": 0.0, "std_z_dot": 0.0, "std_i": 0.0}  # and nothing else: it is the same sensor
-    assert dataclasses.replace(loud, **scaled) == dataclasses.replace(quiet, **scaled)
-    np.testing.assert_allclose(who.shift, np.log(1.25) * np.array([[0.0], [0.0], [1.0], [-1.0]]) * np.ones(4))
+    assert dataclasses.replace(noise_factor, **scaled) == dataclasses.replace(quiet, **scaled)
+    np.testing.assert_allclose(members.shift, np.log(1.25) * np.array([[0.0], [0.0], [1.0], [-1.0]]) * np.ones(4))
     # one in four of 20 and of 6, but no fewer than 4 of either
     assert problem.training(5, 20, 6, 1.5, 1.25).part(4).member.tolist() == [0, 1, 2, 3, 4, 20, 21, 22, 23]
     assert problem.training(5, 20, 6, 1.5, 1.25).part(4, 1).member.tolist() == [0, 1, 2, 3, 4, *range(20, 26)]
     assert problem.training(5, 2, 1, 1.5, 1.25).part(4).member.tolist() == [0, 1, 2]
     terms = {name: np.ones((1, 4)) for name in TERMS}
-    np.testing.assert_allclose(weigh(WEIGHTS, terms, who.stressed)[0], [1.1 * 1.3 + 1.001] * 2 + [1.001] * 2)
+    np.testing.assert_allclose(weigh(WEIGHTS, terms, members.stressed)[0], [1.1 * 1.3 + 1.001] * 2 + [1.001] * 2)
 
 
 # --- optimisers ---
@@ -213,14 +213,14 @@ def small():
 
 
 def run(small, **more):
-    engine, goal, who, start = small
-    points = everywhere(engine.objective, goal.conditions, start, 8, seed=1)
-    return search(engine, goal, who, points, keep=2, **{"iterations": 9, **more})
+    engine, goal, members, start = small
+    points = initial_points(engine.objective, goal.conditions, start, 8, seed=1)
+    return search(engine, goal, members, points, keep=2, **{"iterations": 9, **more})
 
 
 def test_the_search_descends_and_keeps_the_best(small):
     found = run(small)
-    engine, goal, who, _ = small
+    engine, goal, members, _ = small
     value, members = np.asarray(found.history["value"]).min(axis=1), np.asarray(found.history["members"])
     assert set(members) == {5}  # so few that a part of them is all
     assert np.all(np.diff(value[: found.since]) <= 0)
@@ -228,19 +228,19 @@ def test_the_search_descends_and_keeps_the_best(small):
     assert 0 < found.since < found.iteration
     assert value[found.since] <= value[found.since - 1] * (1 - 1e-9)  # logarithms below 0
     x, best = best_of(found)
-    again = goal.score(x[None], engine.terms(x[None], who), who)[0]
+    again = goal.score(x[None], engine.terms(x[None], members), members)[0]
     assert again == pytest.approx(best, rel=1e-9)
 
 
 def test_the_screen_keeps_the_best_of_all_that_hold(small):
     """On so few points nothing is left out before all members are seen but what was worse on some."""
-    engine, goal, who, start = small
-    points = everywhere(engine.objective, goal.conditions, start, 8, seed=1)
+    engine, goal, members, start = small
+    points = initial_points(engine.objective, goal.conditions, start, 8, seed=1)
     assert points.shape == (10, 4)
     np.testing.assert_allclose(points[0], SPACE.encode(start))
-    kept = screen(engine, who, points, 2, goal)
-    values = goal.score(points, engine.terms(points, who), who)
-    best = goal.score(kept, engine.terms(kept, who), who)
+    kept = screen(engine, members, points, 2, goal)
+    values = goal.score(points, engine.terms(points, members), members)
+    best = goal.score(kept, engine.terms(kept, members), members)
     assert best[0] == pytest.approx(values.min())
     assert best[0] <= best[1]
 
@@ -257,27 +257,27 @@ def test_the_neighbourhoods_are_there_and_no_larger():
 
 
 def test_looks_end_when_two_in_a_row_gain_little_or_at_their_number():
-    assert look_again([0.0])
-    assert look_again([0.0, -0.5 * GAIN])  # one that gains nothing may be chance
-    assert not look_again([0.0, -0.5 * GAIN, -0.8 * GAIN])
-    assert not look_again([0.0, 1.0, -0.5 * GAIN])  # worse than what there was
-    assert look_again([0.0, 1.0, -2 * GAIN])
-    assert look_again([0.0, 1.0, -1.0, -1.0])
-    assert not look_again([0.0, -1.0, -1.0, -1.0])
-    gaining = [-float(n) for n in range(MOST_LOOKS)]
-    assert look_again(gaining[:-1])
-    assert not look_again(gaining)
+    assert should_restart([0.0])
+    assert should_restart([0.0, -0.5 * GAIN])  # one that gains nothing may be chance
+    assert not should_restart([0.0, -0.5 * GAIN, -0.8 * GAIN])
+    assert not should_restart([0.0, 1.0, -0.5 * GAIN])  # worse than what there was
+    assert should_restart([0.0, 1.0, -2 * GAIN])
+    assert should_restart([0.0, 1.0, -1.0, -1.0])
+    assert not should_restart([0.0, -1.0, -1.0, -1.0])
+    gaining = [-float(n) for n in range(MOST_SEARCHES)]
+    assert should_restart(gaining[:-1])
+    assert not should_restart(gaining)
 
 
 def test_lost_members_join_and_are_asked_only_to_be_held():
     problem = objective()
-    who = problem.training(5, 4, 2, 1.5, 1.25).joined(problem.chosen(9, np.array([7, 3]), 10))
-    assert who.ordinary == 4
-    assert who.member.tolist() == [0, 1, 2, 3, 7, 3, 4, 5]
-    assert who.seed.tolist() == [5] * 4 + [9] * 2 + [5] * 2
-    assert who.stressed.tolist() == [False] * 4 + [True] * 4
-    assert not np.any(who.shift[:6])
-    assert np.all(who.shift[6:] != 0)
+    members = problem.training(5, 4, 2, 1.5, 1.25).joined(problem.chosen(9, np.array([7, 3]), 10))
+    assert members.ordinary == 4
+    assert members.member.tolist() == [0, 1, 2, 3, 7, 3, 4, 5]
+    assert members.seed.tolist() == [5] * 4 + [9] * 2 + [5] * 2
+    assert members.stressed.tolist() == [False] * 4 + [True] * 4
+    assert not np.any(members.shift[:6])
+    assert np.all(members.shift[6:] != 0)
 
 
 @pytest.fixture
@@ -290,7 +290,7 @@ def told_compilations():
 
 def test_nothing_is_compiled_after_the_first_iteration(small, caplog, told_compilations):
     run(small)
-    engine, goal, who, start = small
+    engine, goal, members, start = small
     x = SPACE.encode(start * 1.3)[None]
 
     def kernels():
@@ -299,13 +299,13 @@ def test_nothing_is_compiled_after_the_first_iteration(small, caplog, told_compi
 
     with caplog.at_level("WARNING"):
         caplog.clear()
-        engine.gradient(np.repeat(x, 2, axis=0), who, goal.weights)
-        engine.terms(x, who)
+        engine.gradient(np.repeat(x, 2, axis=0), members, goal.weights)
+        engine.terms(x, members)
         other = dataclasses.replace(SCENARIO, u_max=250.0)
-        Engine(objective(60, scenario=other), settle=0.002).terms(x, who)  # nor for other numbers
+        Engine(objective(60, scenario=other), settle=0.002).terms(x, members)  # nor for other numbers
         assert not kernels()
         # what is not seen above is there to be seen
-        Engine(objective(7, method=Slide(3)), settle=0.0).terms(x, who)
+        Engine(objective(7, method=Slide(3)), settle=0.0).terms(x, members)
         assert len(kernels()) == 1
 
 
@@ -349,12 +349,12 @@ def test_a_search_whose_checkpoint_was_damaged_is_the_uninterrupted_one(small, t
 
 
 def test_the_second_phase_goes_back_to_what_was_given_where_the_path_is_worse(small):
-    engine, goal, who, start = small
+    engine, goal, members, start = small
     descent = Descent(goal, "bfgs", 0.1)
-    best, x = best_of(run(small))[0], everywhere(engine.objective, goal.conditions, start, 2, seed=1)[-2:]
+    best, x = best_of(run(small))[0], initial_points(engine.objective, goal.conditions, start, 2, seed=1)[-2:]
     path = {"x": [x], "value": [np.zeros(2)]}
     kept = SearchState(descent.begin(jnp.asarray(x)), np.ones(2, bool), path, iteration=1)
-    _go_on_with_all(engine, goal, who, kept, descent, best)
+    _begin_full_phase(engine, goal, members, kept, descent, best)
     np.testing.assert_array_equal(kept.starts.trial[0], best)
     assert kept.active.tolist() == [True, False]
     assert (kept.phase, kept.since) == (1, 1)
@@ -363,22 +363,22 @@ def test_the_second_phase_goes_back_to_what_was_given_where_the_path_is_worse(sm
 @pytest.mark.parametrize("phase", [0, 1])
 def test_a_phase_goes_on_by_values_where_derivatives_are_no_numbers(small, phase):
     """Where a loop chatters, losses are finite and derivatives overflow."""
-    engine, goal, who, start = small
+    engine, goal, members, start = small
     whole = run(small)
     first = [0, whole.since][phase]
 
     class Chattering:
         objective, rollouts, calls = engine.objective, 0, -1
 
-        def terms(self, x, who):
-            return engine.terms(x, who)
+        def terms(self, x, members):
+            return engine.terms(x, members)
 
-        def gradient(self, x, who, weights):
-            losses, slopes, terms = engine.gradient(x, who, weights)
+        def gradient(self, x, members, weights):
+            losses, slopes, terms = engine.gradient(x, members, weights)
             self.calls += 1
             return losses, np.nan * slopes if self.calls == first else slopes, terms
 
-    found = run((Chattering(), goal, who, start))
+    found = run((Chattering(), goal, members, start))
     values = np.array(found.history["value"])
     assert not np.isfinite(values[first]).any()
     assert np.isfinite(values[first + 1]).any()
@@ -529,7 +529,7 @@ def test_a_killed_tuning_goes_on_and_damage_is_found(tmp_path):
     assert (out / "tuned.toml").read_bytes() == (whole / "tuned.toml").read_bytes()
     # a finished search is judged again, in words; another one is refused by what differs
     again = command(path, "--out", whole, "--resume")
-    assert "round 1: its search had ended; what it found is taken from" in again.stderr
+    assert "round 1: the search is complete; its result is read from" in again.stderr
     assert (out / "tuned.toml").read_bytes() == (whole / "tuned.toml").read_bytes()
     path.write_text(CASE.replace("u_max = 400.0", "u_max = 300.0"))
     other = command(path, "--out", whole, "--resume")

@@ -34,7 +34,7 @@ from tuning.report import gradient
 from tuning.search import explore
 from tuning.search.descent import Descent
 from tuning.search.optimise import HALVINGS, search
-from tuning.search.screen import everywhere
+from tuning.search.screen import initial_points
 from tuning.space import Gain, Space
 
 
@@ -53,7 +53,7 @@ def begins(monkeypatch, count, tables=None, **tune):
     paths = [f"controller.{path}" for path in GAINS]
     made = study(monkeypatch, World(), tables, **{"gains": paths, "bounds": {}} | tune)
     start = made.tune.space.values(made.case.cascade)
-    points = everywhere(made.objective, made.goal.conditions, start, count, 1)
+    points = initial_points(made.objective, made.goal.conditions, start, count, 1)
     gains = np.array([made.objective.space.gains_at(jnp.asarray(x)) for x in points])
     np.testing.assert_allclose(gains[0], start, rtol=1e-9)
     assert np.all(np.isfinite(gains))
@@ -94,7 +94,7 @@ def test_the_judge_sees_every_member_of_its_own_ensemble_once(monkeypatch):
     world = World(limit=lambda seed, number, *_: 40.0 if number == 5 else math.inf)
     world.bias = lambda substeps: 0.5 if substeps == 3 else 0.0
     made = study(monkeypatch, world)
-    monkeypatch.setattr(tuning.judge, "AT_ONCE", 4)
+    monkeypatch.setattr(tuning.judge, "CHUNK", 4)
     x = at(made, 80.0, 60.0)
     found = judge(made, x, 77, 10)
     np.testing.assert_array_equal(found["chatter_V"], 1 + np.arange(10))  # a Bowl's member k chatters by 1 + k
@@ -119,7 +119,13 @@ def test_a_summary_is_pooled_and_counts_the_lost_and_the_stalled():
     }
     told = summarise(found)
     # nobody knows of a stalled one: it is not lost, and has not survived
-    assert (told["members"], told["lost"], told["stalled"], told["held"], told["survival"]) == (4, 1, 1, 2, 0.5)
+    assert (
+        told["members"],
+        told["lost"],
+        told["stalled"],
+        told["held"],
+        told["survival"],
+    ) == (4, 1, 1, 2, 0.5)
     theirs = stats.binomtest(2, 4).proportion_ci(0.95, method="wilson")
     assert (told["survival_low"], told["survival_high"]) == pytest.approx((theirs.low, theirs.high))
     assert told["settled_rms_error_m"] == pytest.approx(math.sqrt(2.5) * 1e-6)  # of the two that are held
@@ -143,10 +149,10 @@ def test_members_that_only_accurate_steps_lose_are_named(monkeypatch):
     made = study(monkeypatch, world)
     error = step_error(made, at(made, 80.0, 60.0))
     assert error.lost == 2
-    assert error.who.member.tolist() == [1, 3]
+    assert error.members.member.tolist() == [1, 3]
     assert error.refuted  # whatever the error of the others
     error = step_error(made, at(made, 30.0, 60.0))
-    assert error.lost == len(error.who.member) == 0
+    assert error.lost == len(error.members.member) == 0
 
 
 def test_an_error_of_which_no_share_is_told_is_told_in_metres(monkeypatch):
@@ -172,8 +178,8 @@ def test_slices_run_along_each_gain_through_the_optimum(monkeypatch):
     world = World(limit=lambda seed, number, *_: 200.0 if number == 1 else math.inf)
     made = study(monkeypatch, world, bounds={"controller": {"position": {"c": [1e-3, 1e9], "k": [1e-3, 1e9]}}})
     x = at(made, *world.best)
-    who = made.objective.training(1, 4, 2, 1.2, 1.25)
-    found = explore.slices(made, x, who)
+    members = made.objective.training(1, 4, 2, 1.2, 1.25)
+    found = explore.slices(made, x, members)
     factors = np.exp(explore.REACH)  # far from bounds a coordinate is a logarithm
     for j, best in enumerate(world.best):
         np.testing.assert_allclose(found.gains[j], best * factors, rtol=1e-9)
@@ -196,11 +202,11 @@ def test_the_front_counts_who_stalls_apart(monkeypatch):
 def test_the_front_trades_error_for_voltage(monkeypatch):
     """As the judge finds, whose steps are 24 a sample, not as the search does."""
     made = study(monkeypatch, World(bias=lambda substeps: 0.5 if substeps == 3 else 0.0))
-    who = made.objective.training(1, 4, 2, 1.2, 1.25)
+    members = made.objective.training(1, 4, 2, 1.2, 1.25)
     judged = []
     judge = made.judging.metrics
     monkeypatch.setattr(made.judging, "metrics", lambda x, them: judged.append(them) or judge(x, them))
-    rows = explore.pareto(made, at(made, 100.0, 60.0), who)
+    rows = explore.pareto(made, at(made, 100.0, 60.0), members)
     assert [list(them.stressed) for them in judged] == [[False] * 4]
     voltage, error, k = (
         np.array(column)
@@ -247,8 +253,8 @@ def test_the_worse_half_of_the_starts_is_left_behind(monkeypatch):
     world = World()
     made = study(monkeypatch, world)
     begins = np.stack([at(made, c, k) for c, k in ((3.0, 3.0), (6.0, 500.0), (900.0, 2.0), (2.0, 700.0))])
-    who = made.objective.training(1, 4, 2, 1.2, 1.25)
-    found = search(made.engine, made.goal, who, begins, keep=4, iterations=12)
+    members = made.objective.training(1, 4, 2, 1.2, 1.25)
+    found = search(made.engine, made.goal, members, begins, keep=4, iterations=12)
     starts = [points for kind, *_, points in world.asked if kind == "gradient"]
     assert starts[: HALVINGS[0]] == [4] * HALVINGS[0]
     assert max(starts[HALVINGS[0] : HALVINGS[1]]) == 2
@@ -347,12 +353,12 @@ def test_horizons_have_samples_and_settled_ones_among_them(monkeypatch, samples,
     for count in horizons:
         short = gradient._shorter(made, count)
         assert float(short.loss.settle) <= (count - 1) * 1e-4
-    x, who = at(made, 80.0, 40.0), made.objective.training(1, 4, 2, 1.2, 1.25)
-    rows = gradient.against_horizon(made, x, who)
+    x, members = at(made, 80.0, 40.0), made.objective.training(1, 4, 2, 1.2, 1.25)
+    rows = gradient.against_horizon(made, x, members)
     np.testing.assert_allclose([row["horizon_s"] for row in rows], np.array(horizons) * 1e-4)
     assert all(math.isfinite(row["norm"]) for row in rows)
     monkeypatch.setattr(Bowl, "gradient", lambda *_: (np.zeros((1, 4, 1)), np.zeros((1, 4, 1, 2)), {}))
-    assert gradient.against_horizon(made, x, who) == []
+    assert gradient.against_horizon(made, x, members) == []
 
 
 def test_pareto_is_in_the_report_and_has_a_picture(everything):

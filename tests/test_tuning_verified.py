@@ -14,12 +14,12 @@ import tuning.search.course
 import tuning.search.rounds
 from ambjax.cases.reader import case_from
 from tuning.__main__ import main
-from tuning.judge import NEGLIGIBLE, StepError, compared, step_error, words, worst_of
+from tuning.judge import NEGLIGIBLE, StepError, compared, describe, step_error, worst_of
 from tuning.optimisers import Retreat
 from tuning.problem import REFERENCE_MEMBERS
 from tuning.search.descent import Starts
 from tuning.search.keeper import SearchState
-from tuning.search.rounds import LOUDER, MOST_HALVINGS, _joining, finer, rounds
+from tuning.search.rounds import MOST_HALVINGS, NOISE_GROWTH, _joining, finer, rounds
 
 ROTOR = (pathlib.Path(__file__).parent / "cases" / "rotor.toml").read_text()
 # Under noise on the velocity, hard signs of these gains drive i_ref onto the singular curve within milliseconds of
@@ -66,9 +66,9 @@ def at(found, gains=None):
 
 def error_of(found, **changes):
     """A StepError of four members that are held, and agree; changed."""
-    who = compared(found)
+    members = compared(found)
     none = found.objective.chosen(1, np.arange(0), 4)
-    right = StepError(1e-6, 1e-6, 0.0, len(who.member), len(who.member), 0, 0, none, 1e-10)
+    right = StepError(1e-6, 1e-6, 0.0, len(members.member), len(members.member), 0, 0, none, 1e-10)
     return right._replace(**changes)
 
 
@@ -81,7 +81,7 @@ def test_what_refutes_an_answer(small):
     assert "cannot decide 2 of 4" in stalled.refuted
     assert "lose" not in stalled.refuted
     nothing = error_of(small, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
-    assert nothing.refuted == words(nothing) == "no member compared is held by both"
+    assert nothing.refuted == describe(nothing) == "no member compared is held by both"
     assert not nothing.resolved
     coarse = error_of(small, search_m=1.2e-6, relative=0.2)
     assert "off by 20 %" in coarse.refuted
@@ -103,12 +103,12 @@ def test_false_survival_is_refuted():
     """The search's own steps hold every member; accurate steps none."""
     found = problem_from(FALSE)
     x = at(found)
-    who = compared(found)
-    assert not np.any(found.engine.terms(x[None], who)["survival"])
-    error = step_error(found, x, who)
+    members = compared(found)
+    assert not np.any(found.engine.terms(x[None], members)["survival"])
+    error = step_error(found, x, members)
     assert error.refuted
     assert error.unseen == error.tried == REFERENCE_MEMBERS
-    np.testing.assert_array_equal(error.who.member, who.member)
+    np.testing.assert_array_equal(error.unheld.member, members.member)
 
 
 def test_the_worst_are_the_largest():
@@ -117,10 +117,10 @@ def test_the_worst_are_the_largest():
 
 def test_members_that_accurate_steps_do_not_hold_join_louder(small):
     unseen = small.objective.chosen(1, np.array([2, 3]), 4)
-    error = error_of(small, lost=1, stalled=1, members=2, who=unseen)
-    joined = _joining(small, np.array([7, 5]), error, LOUDER**2)
+    error = error_of(small, lost=1, stalled=1, members=2, unheld=unseen)
+    joined = _joining(small, np.array([7, 5]), error, NOISE_GROWTH**2)
     assert joined.member.tolist() == [7, 5, 2, 3]
-    np.testing.assert_allclose(joined.loud, [1.1, 1.1, LOUDER**2, LOUDER**2])
+    np.testing.assert_allclose(joined.noise_factor, [1.1, 1.1, NOISE_GROWTH**2, NOISE_GROWTH**2])
 
 
 def test_steps_are_halved_so_often_and_no_more(small):
@@ -137,17 +137,17 @@ class Verdicts:
     def __init__(self, *errors):
         self.errors, self.asked = list(errors), []
 
-    def __call__(self, study, x, who=None):
-        self.asked.append((x, len((compared(study) if who is None else who).member), study.finer))
+    def __call__(self, study, x, members=None):
+        self.asked.append((x, len((compared(study) if members is None else members).member), study.finer))
         return self.errors.pop(0) if len(self.errors) > 1 else self.errors[0]
 
 
-def searched(engine, goal, who, points, **rest):
+def searched(engine, goal, members, points, **rest):
     """In place of a search: the first point is the answer, the others lie on the way to it."""
     count = min(len(points), 8)
     x, value = np.array(points[:count]), np.arange(float(count)) / 100
     starts = Starts(x, Retreat(x, value, None), value, value)
-    rows = {"x": [x], "value": [value], "lost": [np.zeros(count)], "members": [np.array(len(who.member))]}
+    rows = {"x": [x], "value": [value], "lost": [np.zeros(count)], "members": [np.array(len(members.member))]}
     return SearchState(starts, np.zeros(count, bool), rows, iteration=1)
 
 
@@ -173,10 +173,10 @@ def test_an_answer_is_confirmed_on_the_worst_members_too(run, small):
 
 def test_the_search_goes_on_with_members_that_are_not_confirmed(run, small):
     unseen = small.objective.chosen(1, np.array([1]), 4)
-    answer, verdicts = run(error_of(small, stalled=1, members=3, who=unseen), error_of(small))
+    answer, verdicts = run(error_of(small, stalled=1, members=3, unheld=unseen), error_of(small))
     assert answer.good
-    assert answer.who.member.size == small.tune.budget.members + small.tune.budget.stressed + 1
-    assert answer.who.loud.max() == LOUDER
+    assert answer.members.member.size == small.tune.budget.members + small.tune.budget.stressed + 1
+    assert answer.members.noise_factor.max() == NOISE_GROWTH
     assert [count for _, count, _ in verdicts.asked] == [4, 4, 8]
 
 
@@ -247,7 +247,7 @@ def test_the_search_goes_on_to_where_it_is_confirmed(tmp_path, capsys):
     assert main([str(path), "--out", str(out), "--json"]) == 0
     said = capsys.readouterr().err.splitlines()
     steps = [n for n, line in enumerate(said) if line.startswith("step of the search against")]
-    on = said.index("the search goes on with members that are lost, or that accurate steps do not hold")
+    on = said.index("the search continues with members that are lost, or that accurate steps do not hold")
     assert steps[0] < on < steps[-1]
     assert "settled rms error" not in said[steps[0]]  # nobody is held by accurate steps, too
     assert "settled rms error off by" in said[steps[-1]]

@@ -13,7 +13,7 @@ PROGRAM = "ambjax-tune"
 
 
 def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
-    """All arguments, under the name by which the tuner was called."""
+    """Return the parser of the command line for the program name `program`."""
     top = Parser(
         prog=program,
         description="Tune the gains of a case by gradients of an ensemble's loss: tuned.toml, history.npz, report.",
@@ -29,10 +29,10 @@ def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None, program: str = PROGRAM) -> int:
-    """Tune. Returns 0 if the tuned gains hold the share of held-out rotors and the limits that [tune.limits] asks for,
-    and accurate steps confirm it; 1 if not, 2 for bad input.
+    """Tune a case. Return 0 if accurate steps confirm that the gains meet [tune.limits], 1 if not, 2 for bad input.
 
-    Ctrl-C during the search ends it and what it found is judged; otherwise, or again, it ends the process with 130.
+    Ctrl-C during the search ends the search, and its result is judged. A second Ctrl-C, or one at another time, ends
+    the process with 130.
     """
     open_streams()
     with listening(program):

@@ -1,4 +1,4 @@
-"""What `ambjax tune` does: read, search, judge, write."""
+"""The command `ambjax tune`: reads a case, searches, judges the gains and writes the report."""
 
 import argparse
 import dataclasses
@@ -19,8 +19,7 @@ from ambjax.host.lock import alone
 from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import check
 from tuning.config import read_tune, seeds, settings
-from tuning.judge import StepError, held, judge, step_error, summarise, worst, worst_of
-from tuning.judge import words as step_words
+from tuning.judge import StepError, describe, held, judge, step_error, summarise, worst, worst_of
 from tuning.problem import TuningProblem, problem_of
 from tuning.report import accurate, breakdown, gradient, limit_table, outcome, pictures
 from tuning.report import document as report
@@ -33,12 +32,12 @@ from tuning.search.rounds import rounds
 from tuning.space import Gain, Space, tunable
 
 WRITTEN = ("tuned.toml", "history.npz", "report.html", "report.md", "report.json")
-# Written last of all, when a search has its answer.
+# The last file written: its presence marks a search that has ended.
 REPORT = "report.json"
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """ambjax tune. Raises ValueError for bad input, before anything is written."""
+    """Run `ambjax tune`. Return the exit code and report.json. Raises ValueError for bad input, before any output."""
     case, tune, raw = read_tune(args.case)
     if args.resume and not (args.out and begun(pathlib.Path(args.out))):
         raise ValueError(f"--resume: there is no search in --out {args.out}. Check --out, or leave out --resume.")
@@ -60,9 +59,9 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
 
 
 def _clear(out: pathlib.Path) -> None:
-    """Remove the checkpoints of a search that has ended, lest this one is resumed with them.
+    """Remove the checkpoints of a search that has ended, so that this search is not resumed with them.
 
-    Raises ValueError for those of one that has not.
+    Raises ValueError if that search has not ended.
     """
     if unfinished(out, REPORT):
         raise ValueError(
@@ -74,7 +73,7 @@ def _clear(out: pathlib.Path) -> None:
 
 
 def _kept(out: pathlib.Path) -> str:
-    """What an interruption has left, and how to go on."""
+    """Return the message after an interruption: what is saved, and how to continue."""
     if not (out / checkpoint(1)).exists():
         return "nothing is kept"
     return f"the search so far is kept. To go on, give the same command with --out {out} --resume"
@@ -83,22 +82,22 @@ def _kept(out: pathlib.Path) -> str:
 def _tune(
     args: argparse.Namespace, raw: dict[str, Any], problem: TuningProblem, start: np.ndarray, out: pathlib.Path
 ) -> tuple[int, dict[str, Any]]:
-    """Search, judge and write; everything has been checked. `raw`: what the case file holds."""
+    """Search, judge and write. The input is valid. `raw`: the document of the case file; `start` [m]: its gains."""
     tune = problem.tune
     held_out = seeds(tune.budget)[2]
     say(
         f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {problem.objective.clock.method}"
     )
     answer = rounds(problem, start, out, {"case": raw, "tune": settings(tune)}, args.resume)
-    problem, who, x = answer.problem, answer.who, answer.x
+    problem, members, x = answer.problem, answer.members, answer.x
     facts = _facts(answer, held_out)
     if args.gradients:
         say("gradient report ...")
-        facts["gradient"] = gradient.report(problem, x, who)
+        facts["gradient"] = gradient.report(problem, x, members)
     if args.pareto:
         say("front of error against voltage ...")
-        facts["pareto"] = explore.pareto(problem, x, who)
-    slices = explore.slices(problem, x, who)
+        facts["pareto"] = explore.pareto(problem, x, members)
+    slices = explore.slices(problem, x, members)
     with files(out) as part:
         _write(part, problem, answer.history, facts, slices)
     summary = plain(facts) | {"out": str(out)}
@@ -112,7 +111,7 @@ def _tune(
 
 
 def _facts(answer: SearchResult, held_out: int) -> dict[str, Any]:
-    problem, x, who = answer.problem, answer.x, answer.who
+    problem, x, members = answer.problem, answer.x, answer.members
     case, tune, space = problem.case, problem.tune, problem.objective.space
     rollouts = problem.engine.rollouts
     before = space.values(case.cascade)
@@ -128,7 +127,7 @@ def _facts(answer: SearchResult, held_out: int) -> dict[str, Any]:
     limited = limit_table.facts(problem.goal.limits, tune.limits, judged[1] if judged else {}, summaries[1], refuted)
     if refuted and judged:
         summaries[1] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
-    lost = int((problem.engine.terms(x[None], who)["survival"] > 0).sum())
+    lost = int((problem.engine.terms(x[None], members)["survival"] > 0).sum())
     line = check(tuned.cascade, case.scenario, dataclasses.replace(case.clock, method=None))
     facts: dict[str, Any] = {
         "case": case.name,
@@ -136,11 +135,11 @@ def _facts(answer: SearchResult, held_out: int) -> dict[str, Any]:
         "before": summaries[0],
         "after": summaries[1],
         "held_out_seed": held_out,
-        "trained_on": len(who.member),
+        "trained_on": len(members.member),
         "lost_in_training": lost,
         "limits": limited,
         "loss": loss,
-        "minimised": breakdown.minimised(problem, x, who),
+        "minimised": breakdown.minimised(problem, x, members),
         "conditions": report.conditions(line),
         "advice_on_conditions": on_conditions(line),
         "step_error": answer.error.facts() if answer.error else None,
@@ -164,15 +163,18 @@ def _facts(answer: SearchResult, held_out: int) -> dict[str, Any]:
     found = outcome.outcome_of(facts, tune.limits.may_lose(count))
     facts["outcome"] = found.facts()
     facts["verdict"] = outcome.verdict(facts, found)
-    facts["advice"] = outcome.advice(problem, facts, found, x, who)
+    facts["advice"] = outcome.advice(problem, facts, found, x, members)
     return facts
 
 
 def _checked(
     answer: SearchResult, judged: dict[str, np.ndarray] | None, held_out: int
 ) -> tuple[StepError | None, dict[str, Any] | None, str]:
-    """What accurate steps say of the worst held-out members and of the first, `judged` [N]; and why they do not
-    confirm the answer: '' where they do."""
+    """Simulate the worst and the first of the held-out members `judged` [N] again by accurate steps.
+
+    Returns the step error on the worst members, the comparison on the first ones, and the reason why accurate steps do
+    not confirm the answer ('' if they confirm it).
+    """
     problem, again, error = answer.problem, None, None
     if judged and not problem.sampled:
         error = _worst_checked(answer, judged, held_out) if answer.confirmed else None
@@ -184,11 +186,11 @@ def _checked(
 
 
 def _confirmed(*errors: StepError | None) -> str:
-    return "; ".join(f"accurate steps: {step_words(error)}" for error in errors if error)
+    return "; ".join(f"accurate steps: {describe(error)}" for error in errors if error)
 
 
 def _worst_checked(answer: SearchResult, judged: dict[str, np.ndarray], held_out: int) -> StepError | None:
-    """What accurate steps say of the worst held-out members that are held; None where none is."""
+    """Return the step error on the worst held-out members that are held; None if none is held."""
     those = np.flatnonzero(held(judged))
     if not those.size:
         return None
@@ -196,7 +198,7 @@ def _worst_checked(answer: SearchResult, judged: dict[str, np.ndarray], held_out
     error = step_error(
         answer.problem, answer.x, answer.problem.objective.chosen(held_out, those, len(judged["lost_at_s"]))
     )
-    say(f"accurate steps on the worst of them: {step_words(error)}")
+    say(f"accurate steps on the worst of them: {describe(error)}")
     return error
 
 
@@ -230,7 +232,7 @@ def _write(
 def _pictures(
     problem: TuningProblem, tuned: Cascade, history: Any, facts: dict[str, Any], slices: explore.Slices
 ) -> dict[str, bytes]:
-    """PNG by file name: those that the report shows."""
+    """Return the pictures of the report, PNG by file name."""
     paths, runs = problem.objective.space.paths, {"before": problem.case.cascade, "after": tuned}
     shown = {name: accurate.nominal(problem, one) for name, one in runs.items()}
     drawn = {
@@ -243,7 +245,7 @@ def _pictures(
 
 
 def _laws(problem: TuningProblem, tuned: dict[str, float]) -> dict[str, float]:
-    """Every gain of the tuned laws by path, those that were not tuned too: a p left out would follow the plant."""
+    """Return every gain of the laws by path, untuned ones included, because a p that is left out follows the plant."""
     everything = Space(tuple(Gain(path) for path in tunable(problem.case.cascade)))
     return dict(zip(everything.paths, everything.values(problem.case.cascade).tolist(), strict=True)) | tuned
 

@@ -1,4 +1,4 @@
-"""The table [tune] of a case file: what to tune, what counts, and how much to spend."""
+"""The table [tune] of a case file: the gains to tune, the loss and its limits, and the size of the search."""
 
 import dataclasses
 import math
@@ -11,7 +11,7 @@ from ambjax.cases.reader import Case, case_from, load
 from ambjax.cases.table import Table, one_line, show
 from ambjax.ensemble.spread import require_path
 from ambjax.extend import GAINS, leaf
-from tuning.objective.limits import KINDS, LEAST_MARGIN, SHARE, Limit
+from tuning.objective.limits import DEFAULT_SHARE, KINDS, LEAST_MARGIN, Limit
 from tuning.objective.loss import TERMS
 from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.optimisers import BFGS, NAMES
@@ -19,7 +19,7 @@ from tuning.space import CLOSEST, Gain, Space, tunable
 
 WEIGHTS = {"tracking": 1.0, "peak": 0.0, "effort": 0.1, "chatter": 0.1, "clearance": 1e-3, "survival": 1.0}
 WORDS = ["gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
-# Numbers of [tune], weights and limits, with both ends, decades beyond what is of use.
+# Defaults and bounds of the numbers of [tune]. The bounds are decades wider than useful values.
 NUMBERS: dict[str, dataclasses.Field] = {
     "conditions_margin": leaf(0.1, at_least=0, at_most=1e3),
     "early": leaf(0.0, at_least=0, at_most=1e6),
@@ -31,56 +31,56 @@ WEIGHT: dataclasses.Field = leaf(at_least=0, at_most=1e9)
 LIMIT: dataclasses.Field = leaf(at_least=1e-12, at_most=1e12, infinite=True)
 SHARES: dict[str, dataclasses.Field] = dict.fromkeys(("clearance_used", "survival"), leaf(above=0, at_most=1))
 LENGTH: dataclasses.Field = leaf(at_least=1e-12, at_most=1.0, unit="m")
-# Whole numbers; of members and points, which are made all at once in memory, fewer.
+# Largest whole numbers; smaller for members and points, which are in memory at once.
 MOST_WHOLE, MOST_MEMBERS = 2**31 - 1, 2**20
-# Band of the settling time, left out: a share of the clearance.
+# Default band of the settling time, as a share of the clearance.
 BAND = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """How the search is run; whole numbers, unless a unit is given."""
+    """Size of the search."""
 
     members: int = leaf(32, at_least=1, at_most=MOST_MEMBERS, whole=True)
-    """members of the ensemble that is tuned on"""
+    """ordinary members of the training ensemble"""
     stressed: int = leaf(8, at_least=0, at_most=MOST_MEMBERS, whole=True)
-    """further members of whom nothing is asked but to be held: with `stress` times the noise, and every gain off by a
-    factor of `gain_margin`, up or down"""
+    """stressed members of the training ensemble, for which only the loss of the rotor counts: `stress` times the noise,
+    and each gain multiplied or divided by `gain_margin`"""
     validation: int = leaf(2000, at_least=0, at_most=MOST_MEMBERS, whole=True)
-    """members of another seed at the end of a search; those that are lost join the stressed ones, and it goes on"""
+    """members of the validation ensemble; lost ones join the stressed members, and the search continues"""
     held_out: int = leaf(1000, at_least=0, at_most=MOST_MEMBERS, whole=True)
-    """members of the ensemble that judges, of another seed"""
+    """members of the ensemble that judges the gains"""
     seed: int = leaf(1, at_least=0, at_most=MOST_WHOLE, whole=True)
-    """of the training ensemble and of the screen; the other ensembles have seeds far from it"""
+    """seed of the training ensemble and of the screen; the seeds of the other ensembles follow from it (`seeds`)"""
     screen: int = leaf(128, at_least=0, at_most=MOST_MEMBERS, whole=True)
-    """points of the first screen; 0: none, start from the case's gains alone"""
+    """points of the first screen; 0: start from the case's gains alone"""
     starts: int = leaf(4, at_least=1, at_most=MOST_WHOLE, whole=True)
-    """best of them that are refined"""
+    """number of points that are refined"""
     iterations: int = leaf(40, at_least=1, at_most=MOST_WHOLE, whole=True)
-    """of either phase of the refinement, at most"""
+    """largest number of iterations of each phase of the refinement"""
     substeps: int = leaf(3, at_least=1, at_most=MOST_WHOLE, whole=True)
     """steps per sample"""
 
 
 @dataclasses.dataclass(frozen=True)
 class LimitSettings:
-    """What [tune.limits] says."""
+    """The table [tune.limits]."""
 
     each: tuple[Limit, ...] = ()
-    """in the order of their names"""
+    """the limits, in the order of their names"""
     survival: float = 1.0
     """share of the held-out members that must be held"""
     band: float = 0.0
-    """of the settling time, m"""
+    """band of the settling time, m"""
 
     def may_lose(self, members: int) -> int:
-        """How many of so many members may be lost."""
+        """Return the largest number of `members` that may be lost."""
         return math.floor((1 - self.survival) * members + 1e-9)
 
 
 @dataclasses.dataclass(frozen=True)
 class Tune:
-    """Everything that [tune] says. `weights` in the order of TERMS."""
+    """The table [tune]. `weights` are in the order of TERMS; `conditions` is the weight of the conditions."""
 
     space: Space
     weights: tuple[float, ...]
@@ -97,7 +97,7 @@ class Tune:
 
 
 def read_tune(path: str | pathlib.Path) -> tuple[Case, Tune, dict[str, Any]]:
-    """Case, [tune] and the raw document of a case file. Raises ValueError, one line, for anything wrong in it."""
+    """Return the case, [tune] and the raw document of a case file. Raises ValueError, one line, for an invalid file."""
     raw, text = load(path)
     name = pathlib.Path(path).stem
     try:
@@ -108,7 +108,7 @@ def read_tune(path: str | pathlib.Path) -> tuple[Case, Tune, dict[str, Any]]:
 
 
 def tune_from(table: Table, case: Case) -> Tune:
-    """[tune] of a case; whatever is left out has a default."""
+    """Return [tune] of a case. Missing keys have defaults. Raises ValueError for an invalid table."""
     counts = {field.name: field for field in dataclasses.fields(Budget)}
     table.only([*WORDS, *NUMBERS, *counts])
     budget = Budget(**{name: table.whole(name, field) for name, field in counts.items()})
@@ -152,7 +152,7 @@ def _space(table: Table, case: Case) -> Space:
 
 
 def _flat(raw: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Dotted keys of nested tables: TOML reads controller.position.c = [1, 2] as three tables."""
+    """Return nested tables with dotted keys, because TOML reads controller.position.c = [1, 2] as nested tables."""
     flat: dict[str, Any] = {}
     for key, value in raw.items():
         flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
@@ -188,7 +188,10 @@ def _limits(table: Table, case: Case) -> LimitSettings:
     asked = {name: table.leaf(name, SHARES.get(name, LIMIT)) for name in KINDS if name in table.raw}
     u_max, source = float(np.max(np.asarray(case.scenario.u_max))), dict.fromkeys(asked, table.path)
     if "rms_u_V" not in asked and math.isfinite(u_max):
-        asked["rms_u_V"], source["rms_u_V"] = SHARE * u_max, f"default, {100 * SHARE:g} % of actuator.u_max"
+        asked["rms_u_V"], source["rms_u_V"] = (
+            DEFAULT_SHARE * u_max,
+            f"default, {100 * DEFAULT_SHARE:g} % of actuator.u_max",
+        )
     clearance = float(np.min(np.asarray(case.scenario.touchdown)))
     band = table.leaf("settling_band_m", LENGTH, BAND * clearance)
     if "settling_band_m" in table.raw and "settling_s" not in asked:
@@ -224,7 +227,7 @@ def _risk(table: Table) -> Risk:
 
 
 def settings(tune: Tune) -> dict[str, Any]:
-    """[tune] as plain data, for the report and the fingerprint of a checkpoint."""
+    """Return [tune] as plain data, for the report and the fingerprint of a checkpoint."""
     facts = {
         "gains": tune.space.paths,
         "bounds": {gain.path: [gain.low, gain.high] for gain in tune.space.gains},
@@ -241,5 +244,5 @@ def settings(tune: Tune) -> dict[str, Any]:
 
 
 def seeds(budget: Budget) -> tuple[int, int, int]:
-    """Seeds of the training, the validation and the held-out ensemble."""
+    """Return the seeds of the training, the validation and the held-out ensemble."""
     return budget.seed, int(np.uint32(budget.seed + 2_000_003)), int(np.uint32(budget.seed + 1_000_001))

@@ -1,4 +1,4 @@
-"""What gains are worth: an ensemble that judges them, and accurate steps against the search's own."""
+"""Evaluation of gains: by an ensemble in fine steps, and by a comparison of the search's steps with accurate ones."""
 
 import math
 from collections.abc import Mapping
@@ -14,29 +14,29 @@ from tuning.objective.lanes import Engine
 from tuning.objective.members import Members
 from tuning.problem import REFERENCE_MEMBERS, TuningProblem
 
-# Members simulated at a time when an ensemble is judged.
-AT_ONCE = 1024
-# Beyond this relative error of the settled rms error the steps are refined and the search goes on.
+# Members of one simulation when an ensemble is judged.
+CHUNK = 1024
+# Largest relative error of the settled rms error. Above it the steps are refined and the search continues,
 RESOLVED = 0.1
-# unless the two differ by less than this share of the gap: as much as the reference itself is worth.
+# unless both errors differ by less than this share of the gap, the accuracy of the reference.
 NEGLIGIBLE = 1e-6
 
 
 def judge(problem: TuningProblem, x: np.ndarray, seed: int, count: int) -> dict[str, np.ndarray]:
-    """Every metric [count] of the members of an ensemble under the gains at x [m], and the loss's terms."""
+    """Return the metrics and the terms of the loss ("loss.NAME"), each [count], of an ensemble at coordinates x [m]."""
     parts = []
-    for first in range(0, count, AT_ONCE):
-        who = problem.objective.chosen(seed, np.arange(first, min(first + AT_ONCE, count)), count)
-        metrics = problem.judging.metrics(x[None], who)
+    for first in range(0, count, CHUNK):
+        members = problem.objective.chosen(seed, np.arange(first, min(first + CHUNK, count)), count)
+        metrics = problem.judging.metrics(x[None], members)
         parts.append({**metrics["metrics"], **{f"loss.{name}": v for name, v in metrics["loss"].items()}})
     return {name: np.concatenate([part[name][0] for part in parts]) for name in parts[0]}
 
 
 def worst(problem: TuningProblem, judged: dict[str, np.ndarray], seed: int) -> dict[str, Any]:
-    """The member of the ensemble `judged` [N] that fares worst: the first lost, else that of the largest settled error.
+    """Return the worst member of the judged ensemble [N]: the first one lost, else that of the largest settled error.
 
-    `replay` is the command that simulates it by itself, beside the report, and gives these numbers; None where the
-    judge's steps are not those of `ambjax simulate`.
+    `replay` is the command, run in the directory of the report, that simulates the member and returns these values. It
+    is None if the judge's steps differ from those of `ambjax simulate`.
     """
     error, lost_at = judged["settled_max_abs_error_m"], judged["lost_at_s"]
     index = int(np.lexsort((-error, lost_at))[0])
@@ -51,15 +51,16 @@ def worst(problem: TuningProblem, judged: dict[str, np.ndarray], seed: int) -> d
 
 
 def rms(values: np.ndarray) -> float:
-    """Root mean square over an ensemble."""
+    """Return the root mean square over an ensemble."""
     return float(np.sqrt(np.mean(values**2)))
 
 
 class StepError(NamedTuple):
-    """Steps of the search, or finer ones of the judge, against accurate ones: settled rms error of both, m.
+    """Comparison of coarse steps, those of the search or of the judge, with accurate ones.
 
-    Of those `members` whom both hold; `relative` is NaN if there is none. `lost`, `stalled`: how many of the `tried`
-    the coarser steps hold, but the accurate ones lose, or cannot decide; `who` they are.
+    `search_m`, `reference_m` (m): settled rms error by either, over the `members` held by both. `relative`: its
+    relative error, NaN without such members. `tried`: number of members compared. `lost`, `stalled`: number of members
+    that are held by coarse steps, but lost, or stalled, by accurate ones. `unheld`: these members.
     """
 
     search_m: float
@@ -69,23 +70,23 @@ class StepError(NamedTuple):
     tried: int
     lost: int
     stalled: int
-    who: Members
+    unheld: Members
     negligible_m: float
-    """a difference that is none"""
+    """difference of the errors (m) below which the steps count as resolved"""
 
     @property
     def unseen(self) -> int:
-        """Members that accurate steps do not hold, though the coarser ones do."""
+        """Number of members that coarse steps hold and accurate steps do not."""
         return self.lost + self.stalled
 
     @property
     def resolved(self) -> bool:
-        """Whether the coarser steps tell the truth of the error there."""
+        """Whether the error by coarse steps agrees with that by accurate ones."""
         return abs(self.relative) <= RESOLVED or abs(self.search_m - self.reference_m) <= self.negligible_m
 
     @property
     def refuted(self) -> str:
-        """Why accurate steps do not confirm that the rotor is held there, and how well; '' where they do."""
+        """The reason why accurate steps do not confirm the result; '' if they confirm it."""
         if self.lost:
             return f"accurate steps lose {self.lost} of {self.tried} members tried, which coarser ones hold"
         if self.stalled:
@@ -96,51 +97,51 @@ class StepError(NamedTuple):
 
     @property
     def off(self) -> str:
-        """How far off the coarser steps are, in words: a share, or both where there is none."""
+        """The error of the coarse steps, for a sentence: relative, or both values if the reference is 0."""
         if math.isfinite(self.relative):
             return f"off by {100 * self.relative:.2g} %"
         found = (f"{x:.2g} m" if math.isfinite(x) else "no number" for x in (self.search_m, self.reference_m))
         return "of {} against {}".format(*found)
 
     def facts(self) -> dict[str, Any]:
-        """All of it as plain data."""
-        summary = {name: getattr(self, name) for name in self._fields if name not in ("who", "negligible_m")}
-        return summary | {"resolved": self.resolved, "refuted": self.refuted, "told": words(self)}
+        """Return the comparison as plain data for report.json."""
+        summary = {name: getattr(self, name) for name in self._fields if name not in ("unheld", "negligible_m")}
+        return summary | {"resolved": self.resolved, "refuted": self.refuted, "told": describe(self)}
 
 
-def words(error: StepError) -> str:
-    """What accurate steps say, in words."""
-    told = error.members and not error.unseen
-    return f"settled rms error {error.off} on {error.members} members" if told else error.refuted
+def describe(error: StepError) -> str:
+    """Return the result of the comparison as a phrase."""
+    described = error.members and not error.unseen
+    return f"settled rms error {error.off} on {error.members} members" if described else error.refuted
 
 
 def compared(problem: TuningProblem) -> Members:
-    """The members on whom steps are compared first: of the training ensemble."""
+    """Return the members used to compare steps: the first REFERENCE_MEMBERS of the training ensemble."""
     count = problem.tune.budget.members
     return problem.objective.chosen(seeds(problem.tune.budget)[0], np.arange(min(REFERENCE_MEMBERS, count)), count)
 
 
 def worst_of(values: np.ndarray) -> np.ndarray:
-    """Numbers of the members with the largest values [n], REFERENCE_MEMBERS of them, worst first."""
+    """Return the indices of the REFERENCE_MEMBERS largest values [n], largest first."""
     return np.argsort(-values, kind="stable")[:REFERENCE_MEMBERS]
 
 
-def step_error(problem: TuningProblem, x: np.ndarray, who: Members | None = None) -> StepError:
-    """What the search's own steps are worth at x [m], on these members; left out: on the first that it is tuned on."""
-    who = compared(problem) if who is None else who
-    ours, theirs = (metrics_of(engine, x, who) for engine in problem.steps)
-    return difference(problem, ours, theirs, who)
+def step_error(problem: TuningProblem, x: np.ndarray, members: Members | None = None) -> StepError:
+    """Compare the search's steps with accurate ones at x [m], on `members` (default: those of `compared`)."""
+    members = compared(problem) if members is None else members
+    ours, theirs = (metrics_of(engine, x, members) for engine in problem.steps)
+    return difference(problem, ours, theirs, members)
 
 
-def metrics_of(engine: Engine, x: np.ndarray, who: Members) -> dict[str, np.ndarray]:
-    """Every metric [n] of these members under the gains at x [m]."""
-    return {name: values[0] for name, values in engine.metrics(x[None], who)["metrics"].items()}
+def metrics_of(engine: Engine, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:
+    """Return every metric [n] of the members at coordinates x [m]."""
+    return {name: values[0] for name, values in engine.metrics(x[None], members)["metrics"].items()}
 
 
 def difference(
-    problem: TuningProblem, ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], who: Members
+    problem: TuningProblem, ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], members: Members
 ) -> StepError:
-    """What steps are worth by which these members' metrics [n] are `ours`, and `theirs` by accurate ones."""
+    """Compare the members' metrics [n] by coarse steps (`ours`) with those by accurate steps (`theirs`)."""
     ended = [np.isfinite(metrics["lost_at_s"]) for metrics in (ours, theirs)]
     held, unseen = ~(ended[0] | ended[1]), ended[1] & ~ended[0]
     stalled = unseen & theirs["stalled"]
@@ -148,23 +149,23 @@ def difference(
         rms(metrics["settled_rms_error_m"][held]) if held.any() else math.nan for metrics in (ours, theirs)
     )
     relative = search_m / reference_m - 1 if reference_m > 0 else math.nan
-    those: Members = jax.tree.map(lambda a: a[unseen], who)
+    those: Members = jax.tree.map(lambda a: a[unseen], members)
     negligible = NEGLIGIBLE * float(np.asarray(problem.objective.loss.s_0))
     both, lost = int(held.sum()), int((unseen & ~stalled).sum())
     return StepError(search_m, reference_m, relative, both, len(held), lost, int(stalled.sum()), those, negligible)
 
 
 def held(metrics: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Which members [N] run to the end: neither lost nor stalled."""
+    """Return which members [N] run to the end, neither lost nor stalled."""
     return ~np.isfinite(metrics["lost_at_s"])
 
 
 def summarise(metrics: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Numbers of an ensemble [N] for the report: statuses, survival, and pooled, mean and largest metrics.
+    """Return the statistics of an ensemble [N] for the report: statuses, survival, and metrics over members.
 
-    A member whose integration stalled is not `lost`, for its status is not known; but it is not `held` either, and does
-    not survive. Metrics are of the members that are held: a rotor that is lost is frozen, and from then on its voltage
-    and current are 0. Without such members there are none.
+    The status of a member whose integration stalled is unknown: it counts neither as lost nor as held, and not as a
+    survivor. Metrics include held members only, because the voltage and current of a lost rotor are 0. They are absent
+    if no member is held.
     """
     alive, n = held(metrics), len(metrics["lost_at_s"])
     survival = wilson(int(alive.sum()), n)

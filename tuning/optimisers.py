@@ -1,7 +1,7 @@
-"""Optimisers by name, all of them optax's transformations: its own of first order, and a BFGS for a handful of gains.
+"""Optimisers by name, as optax transformations: optax's first-order methods, and a BFGS for a few gains.
 
-Each is told the value at the point where the gradient was taken, `update(gradient, state, x, value=...)`, and holds in
-its state the best point and value so far; a trial that it refuses is left again.
+`update(gradient, state, x, value=...)` receives the value at the trial x. The state holds the best point so far and its
+value. After a rejected trial the next one starts from the best point.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ import optax
 from jax import Array
 
 BFGS = "bfgs"
-# optax's optimisers that need a learning rate alone, and only gradients.
+# optax's optimisers that need only gradients and a learning rate.
 FIRST_ORDER: dict[str, Callable[[float], optax.GradientTransformation]] = {
     "adabelief": optax.adabelief,
     "adagrad": optax.adagrad,
@@ -29,53 +29,53 @@ FIRST_ORDER: dict[str, Callable[[float], optax.GradientTransformation]] = {
 }
 NAMES = (BFGS, *FIRST_ORDER)
 
-# Longest step of the BFGS: about a factor e in one gain. The first step, before any curvature is known.
+# Longest step of the BFGS (1: a factor e of one gain), and the first step, taken before an estimate of the curvature.
 LONGEST, FIRST = 1.0, 0.3
-# A refused trial halves the longest step; one far behind a cliff says nothing about curvature, and quarters it.
+# A rejected trial reduces the trust radius to this share of its step: HALF, or QUARTER beyond a cliff.
 HALF, QUARTER = 0.5, 0.25
-# A trial whose value, a logarithm, is worse than the best by more than this is behind a cliff.
+# A trial is beyond a cliff if its value, a logarithm, exceeds the best by more than this.
 CLIFF = 1.0
-# A refused step of an optimiser of optax's own is tried again at this share of its length.
+# A rejected step of a first-order optimiser is repeated at this share of its length.
 SHORTER = 0.25
 
 
 class Curvature(NamedTuple):
-    """State of the BFGS: best point [m], value and gradient [m] there, inverse Hessian [m, m], longest step, trials."""
+    """State of the BFGS: best point [m], its value and gradient [m], inverse Hessian [m, m], trust radius, trials."""
 
     best: Array
     value: Array
     gradient: Array
     inverse: Array
     radius: Array
-    seen: Array
+    trials: Array
 
-    def anew(self, fresh: "Curvature") -> "Curvature":
-        """The fresh state elsewhere, for another goal of the same curvature."""
+    def restarted(self, fresh: "Curvature") -> "Curvature":
+        """Return the state `fresh` with the inverse Hessian of this one, for a goal of the same curvature."""
         return fresh._replace(inverse=self.inverse, radius=jnp.full_like(self.radius, LONGEST))
 
 
 class Retreat(NamedTuple):
-    """State of a first-order optimiser that steps back: its own (`inner`), the best point [m] and its value."""
+    """State of a first-order optimiser that steps back: best point [m], its value, and the state of optax (`inner`)."""
 
     best: Array
     value: Array
     inner: Any
 
-    def anew(self, fresh: "Retreat") -> "Retreat":
-        """The fresh state elsewhere, for another goal."""
+    def restarted(self, fresh: "Retreat") -> "Retreat":
+        """Return the state `fresh`."""
         return fresh
 
 
 def optimiser(name: str, learning_rate: float) -> optax.GradientTransformationExtraArgs:
-    """The optimiser of this name, one of NAMES; the BFGS finds the length of its steps itself."""
+    """Return the optimiser of this name, one of NAMES. The BFGS does not use `learning_rate`."""
     return bfgs() if name == BFGS else stepping_back(FIRST_ORDER[name](learning_rate))
 
 
 def bfgs() -> optax.GradientTransformationExtraArgs:
-    """A dense BFGS (Nocedal and Wright, Numerical Optimization, 2006, 6.1) in a trust region.
+    """Return a dense BFGS (Nocedal and Wright, Numerical Optimization, 2006, 6.1) with a trust region.
 
-    A refused trial, no better than the best, tells of the curvature too, if it is on the same slope (CLIFF): the next
-    one starts from the best point again, better informed. Values are logarithms.
+    A trial is rejected if it does not improve on the best point. It still updates the inverse Hessian, unless it lies
+    beyond a cliff (CLIFF). Values are logarithms.
     """
 
     def init(x: Array) -> Curvature:
@@ -87,37 +87,38 @@ def bfgs() -> optax.GradientTransformationExtraArgs:
         accept = finite & (value < state.value)
         smooth = finite & (value < state.value + CLIFF)
         s, y = x - state.best, gradient - state.gradient
-        inverse = _informed(state, s, y, smooth)
+        inverse = _updated_inverse(state, s, y, smooth)
         tried = jnp.sqrt(s @ s)
         wider = jnp.minimum(jnp.maximum(state.radius, 2 * tried), LONGEST)
         narrower = jnp.where(smooth, HALF, QUARTER) * tried
-        radius = jnp.where(state.seen == 0, state.radius, jnp.where(accept, wider, narrower))
+        radius = jnp.where(state.trials == 0, state.radius, jnp.where(accept, wider, narrower))
         best, slope = jnp.where(accept, x, state.best), jnp.where(accept, gradient, state.gradient)
         step = -inverse @ slope
         step = jnp.where(slope @ step < 0, step, -slope)
         length = jnp.sqrt(step @ step)
         step = step * jnp.minimum(1.0, radius / jnp.where(length > 0, length, 1.0))
         value = jnp.where(accept, value, state.value)
-        return best + step - x, Curvature(best, value, slope, inverse, radius, state.seen + 1)
+        return best + step - x, Curvature(best, value, slope, inverse, radius, state.trials + 1)
 
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
 
 
-def _informed(state: Curvature, s: Array, y: Array, smooth: Array) -> Array:
-    """The inverse Hessian [m, m] that knows of the step s [m] and the gradient's change y [m] along it."""
+def _updated_inverse(state: Curvature, s: Array, y: Array, smooth: Array) -> Array:
+    """Return the inverse Hessian [m, m] after an update with the step s [m] and the gradient's change y [m]."""
     curvature = s @ y
-    usable = (state.seen > 0) & smooth & (curvature > 1e-10 * jnp.sqrt((s @ s) * (y @ y)))
+    usable = (state.trials > 0) & smooth & (curvature > 1e-10 * jnp.sqrt((s @ s) * (y @ y)))
     rho = 1 / jnp.where(usable, curvature, 1.0)
     # the first pair sets the scale
-    scale = jnp.where(state.seen == 1, curvature / jnp.where(usable, y @ y, 1.0), 1.0)
+    scale = jnp.where(state.trials == 1, curvature / jnp.where(usable, y @ y, 1.0), 1.0)
     left = jnp.eye(len(s), dtype=s.dtype) - rho * jnp.outer(s, y)
     return jnp.where(usable, scale * left @ state.inverse @ left.T + rho * jnp.outer(s, s), state.inverse)
 
 
 def stepping_back(inner: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
-    """An optimiser whose trials where the value or gradient is no number are refused: it does not see them.
+    """Return an optimiser that rejects trials with a value or gradient that is not finite.
 
-    The next one is at SHORTER of the way from the best point to the refused one.
+    A rejected trial does not change the state of `inner`. The next trial is at the share SHORTER of the way from the
+    best point to the rejected one.
     """
 
     def init(x: Array) -> Retreat:
@@ -136,6 +137,6 @@ def stepping_back(inner: optax.GradientTransformation) -> optax.GradientTransfor
 
 
 def _finite(gradient: Array, value: Array) -> tuple[Array, Array]:
-    """Whether value and gradient [m] are numbers, and the gradient, or zeros."""
+    """Return whether value and gradient [m] are finite, and the gradient, or zeros if they are not."""
     finite = jnp.isfinite(value) & jnp.isfinite(gradient).all()
     return finite, jnp.where(finite, gradient, 0.0)

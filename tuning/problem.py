@@ -1,4 +1,4 @@
-"""A problem: a case and its [tune], made into an objective, a goal and an engine."""
+"""The tuning problem: the objective, goal and engine of a case and its table [tune]."""
 
 import dataclasses
 import functools
@@ -17,19 +17,18 @@ from tuning.objective.members import Objective
 from tuning.objective.ranges import Range, bounded
 from tuning.objective.shortfalls import bounds
 
-# How many times as fine as the search's the steps are when an ensemble is judged. On the tuned loops of
-# tests/test_metrics_dense.py, which holds twenty-four a sample, these miss the settled rms voltage by 0.8 % at most;
-# twelve a sample by 4.6 %, three by 56 %.
-FINE = 8
-# Members and tolerance of the accurate reference against which the steps of the search are held.
+# Ratio of the number of steps of the judge to that of the search. On the tuned loops of tests/test_metrics_dense.py, 24
+# steps a sample have an error of at most 0.8 % in the settled rms voltage, 12 steps 4.6 %, 3 steps 56 %.
+REFINEMENT = 8
+# Number of members, relative tolerance and largest number of step trials of the accurate reference.
 REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 10_000
-# Beyond this many gains reverse mode is the cheaper one.
+# Largest number of gains for which forward mode is cheaper than reverse mode.
 MOST_FORWARD = 8
 
 
 @dataclasses.dataclass(frozen=True)
 class TuningProblem:
-    """Case, settings and what is compiled from them."""
+    """A case, its settings, and the objective, engine and goal made from them."""
 
     case: Case
     tune: Tune
@@ -38,22 +37,22 @@ class TuningProblem:
     goal: Goal
     ranges: list[Range]
     finer: int = 1
-    """how many times as fine its steps are as [tune] asks for"""
+    """ratio of the number of steps to that of tune.substeps"""
 
     @property
     def sampled(self) -> bool:
-        """Whether the laws run on a processor: their steps are the loop's own, and only the plant is integrated."""
+        """Whether the laws run on a processor, so that only the plant is integrated."""
         return self.case.cascade.processor is not None
 
     @functools.cached_property
     def reference(self) -> Engine:
-        """The same objective in accurate steps; of a plant alone, which is not stiff, in steps FINE times as fine."""
+        """The objective in accurate steps: adaptive RODAS3, or REFINEMENT times as many steps of the plant alone."""
         accurate = integrate.AdaptiveRodas3(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS)
         return self._stepping(self._fine if self.sampled else accurate, lanes=REFERENCE_MEMBERS)
 
     @functools.cached_property
     def judging(self) -> Engine:
-        """The same objective in steps FINE times as fine: what a report prints. On a processor in the case's own."""
+        """The objective in the judge's steps: REFINEMENT times as many, or the case's own steps on a processor."""
         if not self.sampled:
             return self._stepping(self._fine, threads=self.engine.threads)
         method = self.case.clock.integrator
@@ -63,24 +62,24 @@ class TuningProblem:
 
     @property
     def replays(self) -> bool:
-        """Whether the judge takes the steps of `ambjax ensemble` and `ambjax simulate`, so that these give its numbers.
+        """Whether the judge's steps are those of `ambjax ensemble` and `ambjax simulate`, so that its values are too.
 
-        They are the case's own: on a processor, unless the search found them too coarse.
+        This is so on a processor, unless the search found these steps too coarse.
         """
         return self.sampled and self.finer == 1
 
     @property
     def _fine(self) -> integrate.Integrator:
         method: Any = self.objective.clock.method
-        return dataclasses.replace(method, substeps=FINE * method.substeps)
+        return dataclasses.replace(method, substeps=REFINEMENT * method.substeps)
 
     @property
     def accurate(self) -> str:
-        """What the accurate steps are, in words."""
-        return f"{FINE} times as many steps of the plant" if self.sampled else "adaptive RODAS3"
+        """Description of the accurate steps, for the report."""
+        return f"{REFINEMENT} times as many steps of the plant" if self.sampled else "adaptive RODAS3"
 
     def limited(self, limits: tuple[Limit, ...]) -> "TuningProblem":
-        """With limits that have learnt something."""
+        """Return the problem with these limits."""
         return dataclasses.replace(self, goal=dataclasses.replace(self.goal, limits=limits))
 
     def _stepping(self, method: integrate.Integrator, **more: Any) -> Engine:
@@ -89,9 +88,9 @@ class TuningProblem:
 
     @functools.cached_property
     def steps(self) -> tuple[Engine, Engine]:
-        """The search's own steps and accurate ones, to be compared: both without the converter, if there is one.
+        """Engines with the search's steps and with accurate ones, both without the sensor's converter.
 
-        Where it rounds otherwise for a last digit's sake, two runs go different ways, and differ by more than steps do.
+        The converter amplifies a difference in the last digit to one of a quantum, which would hide the step error.
         """
         scenario = self.objective.scenario
         if scenario.sensor is None or scenario.sensor.bits is None:
@@ -103,9 +102,10 @@ class TuningProblem:
 
 
 def method_for(case: Case, substeps: int, finer: int) -> integrate.Integrator:
-    """The step of the search, `finer` times as fine: of fixed number, so that all members take as long.
+    """Return the search's integration method, with `finer` times as many steps.
 
-    Where the loop slides, `substeps` a sample, blind to the stiffness of the inversion law.
+    The number of steps is fixed, so that all members take equally long. In sliding mode there are `substeps` steps a
+    sample, independent of the stiffness of the inversion law.
     """
     if slides(case.cascade, case.scenario.plant):
         return integrate.Slide(finer * substeps)
@@ -114,7 +114,10 @@ def method_for(case: Case, substeps: int, finer: int) -> integrate.Integrator:
 
 
 def problem_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = None) -> TuningProblem:
-    """The problem of a case, in steps `finer` times as fine as [tune] asks for."""
+    """Return the tuning problem of a case, with `finer` times as many steps as tune.substeps.
+
+    `threads`: number of cores; None: all.
+    """
     clock = case.clock.with_method(method_for(case, tune.budget.substeps, finer))
     limits = tune.limits
     measured = measures(limits.each, case.scenario, clock, case.settle, limits.band)

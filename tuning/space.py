@@ -1,7 +1,7 @@
-"""Space: which gains may move, and within which bounds; coordinates in which they move freely.
+"""Search space: the gains to tune, their bounds, and a map from unbounded coordinates to gains.
 
-A coordinate is the logarithm of a gain, bent at its bounds: x real, one unit about a factor e. Gains that
-are not in the space are not touched: decode returns the very leaves it was given.
+A coordinate is the logarithm of a gain, bent at its bounds by softplus functions: one unit is about a factor e. Gains
+outside of the space stay the same objects in `Space.decode`.
 """
 
 import dataclasses
@@ -16,12 +16,13 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade
 
-# How sharply a coordinate bends at a bound: within 1/SHARP of it, in logarithms. A logistic curve over the whole
-# interval would put a bound at infinity: a search whose optimum lies there creeps.
+# A coordinate bends within 1/SHARP of a bound, in logarithms. A logistic curve over the whole interval would put the
+# bound at infinity, so that a search converges slowly to an optimum at the bound.
 SHARP = 4.0
-# A gain well within its bounds is away from them by this share of its size, or of the way between them in logarithms.
+# Distance of `Gain.inner` from the bounds: a share of the bound, the distance from 0 in units of the gain, and the
+# largest share of the interval in logarithms.
 MARGIN, MARGIN_OF_ZERO, SHARE = 0.02, 1e-12, 0.1
-# Bounds that lie closer together than by this share leave a search nothing but rounding.
+# Smallest relative distance of two bounds. Closer bounds leave an interval of the size of the rounding error.
 CLOSEST = 1e-6
 ROOT = "controller"
 STAGES = ("observer", "position", "inversion", "current")
@@ -29,10 +30,10 @@ STAGES = ("observer", "position", "inversion", "current")
 
 @dataclasses.dataclass(frozen=True)
 class Gain:
-    """One gain: its dotted path as in the case file, and the open interval in which it may move.
+    """A gain: its dotted path as in the case file, and its open interval (low, high).
 
-    low = 0 and high = inf: positive, x = log g. low > 0: above, x = log(g - low). With an upper bound: log g = x well
-    within the interval, bent at its ends by softplus functions, so that an end is 1 % away 0.8 beyond it.
+    Without an upper bound the coordinate is x = log(g - low). With one, log g = x well within the interval, and
+    softplus functions bend it at the bounds: at a coordinate 0.8 beyond a bound the gain is 1 % away from it.
     """
 
     path: str
@@ -41,11 +42,11 @@ class Gain:
 
     @property
     def name(self) -> str:
-        """The last word of the path."""
+        """The last part of the path."""
         return self.path.rpartition(".")[2]
 
     def encode(self, gain: Any) -> Any:
-        """Coordinate of a gain strictly within the bounds."""
+        """Return the coordinate of a gain strictly within the bounds."""
         if math.isinf(self.high):
             return np.log(gain - self.low)
         if self.low == 0.0:
@@ -55,7 +56,7 @@ class Gain:
         return math.log(self.low) + (rise + np.log(-np.expm1(-rise)) - np.log(-np.expm1(-fall))) / SHARP
 
     def decode(self, x: Array) -> Array:
-        """Gain at a coordinate."""
+        """Return the gain at a coordinate."""
         if math.isinf(self.high):
             return self.low + jnp.exp(x)
         high = math.log(self.high)
@@ -68,14 +69,14 @@ class Gain:
 
     @property
     def inner(self) -> tuple[float, float]:
-        """What is well within the bounds."""
+        """An interval (low, high) well within the bounds."""
         if self.low == 0.0:
             return MARGIN_OF_ZERO * min(self.high, 1.0), self.high / (1 + MARGIN)
         aside = min(1 + MARGIN, (self.high / self.low) ** SHARE)
         return self.low * aside, self.high / aside
 
     def at_bound(self, gain: float) -> str:
-        """'low' or 'high' where the gain is within 1 % of a bound, else ''."""
+        """Return 'low' or 'high' if the gain is within 1 % of that bound, else ''."""
         if self.low > 0 and gain <= 1.01 * self.low:
             return "low"
         return "high" if math.isfinite(self.high) and gain >= 0.99 * self.high else ""
@@ -83,7 +84,7 @@ class Gain:
 
 @dataclasses.dataclass(frozen=True)
 class Space:
-    """Several gains. Raises ValueError where it is empty, a path is given twice or bounds make no interval."""
+    """The gains to tune. Raises ValueError if it is empty, a path occurs twice or low >= high for a gain."""
 
     gains: tuple[Gain, ...]
 
@@ -103,19 +104,19 @@ class Space:
 
     @property
     def paths(self) -> list[str]:
-        """Dotted paths in order."""
+        """Dotted paths of the gains, in order."""
         return [gain.path for gain in self.gains]
 
     def values(self, cascade: Cascade) -> np.ndarray:
-        """The gains of a cascade in order, [m]."""
+        """Return the gains [m] of a cascade, in order."""
         return np.array([float(read(cascade, gain.path)) for gain in self.gains])
 
     def gains_at(self, x: Array) -> Array:
-        """Gains [m] at coordinates [m]."""
+        """Return the gains [m] at coordinates x [m]."""
         return jnp.stack([gain.decode(x[j]) for j, gain in enumerate(self.gains)])
 
     def encode(self, gains: Sequence[float] | np.ndarray) -> np.ndarray:
-        """Coordinates [m] of gains [m]. Raises ValueError for a gain outside its bounds."""
+        """Return the coordinates [m] of gains [m]. Raises ValueError for a gain outside its bounds."""
         for gain, value in zip(self.gains, gains, strict=True):
             if not gain.low < value < gain.high:
                 raise ValueError(
@@ -125,20 +126,20 @@ class Space:
         return np.array([gain.encode(value) for gain, value in zip(self.gains, gains, strict=True)])
 
     def clip(self, gains: np.ndarray) -> np.ndarray:
-        """Gains moved inside their bounds by 2 % at least; by a tenth of the way where these lie closer together."""
+        """Return the gains [m], clipped to `Gain.inner`: 2 % inside of the bounds, or less if these are close."""
         return np.array([float(np.clip(value, *gain.inner)) for gain, value in zip(self.gains, gains, strict=True)])
 
     def decode(self, x: Array, cascade: Cascade) -> Cascade:
-        """The cascade with the gains at coordinates x [m]; everything else the same objects as before."""
+        """Return the cascade with the gains at coordinates x [m]. All other leaves are the same objects."""
         for j, gain in enumerate(self.gains):
             cascade = _write(cascade, gain.path, gain.decode(x[j]))
         return cascade
 
 
 def tunable(cascade: Cascade, *, steepness: bool = True) -> list[str]:
-    """Dotted paths of all gains of a cascade that may be tuned: the positive leaves of its laws.
+    """Return the dotted paths of the gains of a cascade that may be tuned: the positive leaves of its laws.
 
-    `steepness`: those of smoothed signs too, where they are smoothed.
+    `steepness`: whether to include the steepness of smoothed signs.
     """
     paths = []
     for stage in STAGES:
@@ -152,7 +153,7 @@ def tunable(cascade: Cascade, *, steepness: bool = True) -> list[str]:
 
 
 def read(cascade: Cascade, path: str) -> Any:
-    """The gain of a cascade at a dotted path."""
+    """Return the gain of a cascade at a dotted path."""
     _, stage, name = path.split(".")
     return getattr(getattr(cascade, stage), name)
 

@@ -1,1 +1,1 @@
-"""What is minimised: loss, risk, conditions and ranges of gains, over many members at once."""
+"""The objective of a search: loss, risk, conditions, limits, and ranges of the gains."""

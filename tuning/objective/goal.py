@@ -1,4 +1,4 @@
-"""What is minimised over an ensemble: one number from the members' losses and the gains."""
+"""The goal: one number, minimised by the search, from the losses of the members and the gains."""
 
 import dataclasses
 from typing import Any
@@ -17,10 +17,10 @@ from tuning.space import Space
 
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """What is minimised: the log of the risk of the weighed losses, plus the conditions' shortfall times `weight`,
-    plus the pull of the limits.
+    """The function that a search minimises.
 
-    The mean loss of stressed members is added to the others' risk; limits are not theirs.
+    goal = log(risk(losses) + mean(losses of stressed members)) + weight * shortfall(conditions) + sum(limit.pull).
+    The risk and the limits include ordinary members only. `margin` is the relative margin of the conditions.
     """
 
     space: Space
@@ -32,23 +32,26 @@ class Goal:
     limits: tuple[Limit, ...] = ()
 
     def __call__(self, outcomes: Array, x: Array, ordinary: int) -> Array:
-        """The goal at coordinates x [m], of outcomes [N, 1 + L]: losses, and what limits hold. The first members are
-        `ordinary`."""
+        """Return the goal at coordinates x [m].
+
+        `outcomes` [N, 1 + L]: the weighted loss and the limited quantities of each member. The first `ordinary` members
+        are not stressed.
+        """
         losses = outcomes[:, 0]
         risk, stressed = self.risk(losses[:ordinary]), losses[ordinary:]
         loss = risk + (jnp.mean(stressed) if stressed.size else 0.0)
         return jnp.log(loss + 1e-30) + self.weight * self.penalty(x) + self.pull(outcomes[:ordinary, 1:])
 
     def penalty(self, x: Array) -> Array:
-        """Shortfall of the theorem's conditions at x [m]."""
+        """Return the shortfall of the theorem's conditions at coordinates x [m]."""
         return shortfall(dict(zip(self.space.paths, self.space.gains_at(x), strict=True)), self.conditions, self.margin)
 
     def pull(self, held: Array) -> Any:
-        """What the limits add, of what members hold [N, L]."""
+        """Return the sum of the limits' terms for the limited quantities `held` [N, L] of the ordinary members."""
         return sum(limit.pull(held[:, j]) for j, limit in enumerate(self.limits))
 
-    def score(self, x: np.ndarray, terms: dict[str, np.ndarray], who: Members) -> np.ndarray:
-        """The goal [S] at x [S, m] from the terms [S, N] of members [N]; +inf where it is not a number."""
-        each = zip(np.stack(outcomes(self.weights, terms, who.stressed), -1), x, strict=True)
-        values = np.array([self(jnp.asarray(one), jnp.asarray(at), who.ordinary) for one, at in each])
+    def score(self, x: np.ndarray, terms: dict[str, np.ndarray], members: Members) -> np.ndarray:
+        """Return the goal [S] at x [S, m] from the terms [S, N] of members [N]; +inf where it is not finite."""
+        each = zip(np.stack(outcomes(self.weights, terms, members.stressed), -1), x, strict=True)
+        values = np.array([self(jnp.asarray(one), jnp.asarray(at), members.ordinary) for one, at in each])
         return np.where(np.isfinite(values), values, np.inf)

@@ -1,9 +1,10 @@
-"""The engine: an objective and its derivatives for many gains and members at once, with common random numbers.
+"""The engine: evaluates an objective and its derivatives for many gains and members, with common random numbers.
 
-The work is cut into lanes: one rollout of one member under one vector of gains. A kernel takes a fixed number of lanes
-and is compiled once: one for the terms of the loss, one of fewer lanes for their derivatives, one for metrics. Whatever
-the number of starts or members, nothing is recompiled. That number does not depend on the cores, for a last digit may
-depend on it. Other steps, as those of the judge, are another engine.
+A lane is one rollout of one member under one vector of gains. A kernel processes a fixed number of lanes and is
+compiled once. There are three kernels: for the terms of the loss, for their derivatives (with fewer lanes), and for
+metrics. A new number of starts or members does not recompile them. The number of lanes does not depend on the number of
+cores, because it can change the last digit of a result. A different integration method, as that of the judge, needs
+another engine.
 """
 
 import dataclasses
@@ -26,22 +27,23 @@ from tuning.objective.loss import TERMS, Loss, outcomes
 from tuning.objective.members import Members, Objective
 from tuning.space import Space
 
-# Lanes of one kernel call. Loops over half as many are unrolled into scalar code by XLA's compiler: half again as long.
+# Lanes of one kernel call. With 32 lanes XLA unrolls the loops into scalar code, which takes 1.5 times as long.
 LANES = 64
-# With derivatives, where the loops are longer, halves cost 14 % more each, and most iterations ask for 16 to 64 lanes:
-# they keep two cores busy, or are one call. 16 cost 0.63 of 32: a second kernel for few lanes takes longer to compile
-# than it saves in a search.
+# Lanes of one kernel call with derivatives. Two calls of 32 lanes cost 14 % more than one of 64, but most iterations
+# need 16 to 64 lanes: 32 keeps two cores busy. 16 lanes cost 0.63 of 32: a second kernel for few lanes
+# would take longer to compile than it saves in a search.
 GRADIENT_LANES = 32
 
 
 class Lane(NamedTuple):
-    """What one lane is made of: coordinates [m], member, the world that all share, weights of the terms [6], fold.
+    """The inputs of one lane.
 
-    The world: cascade, scenario, clock and loss. The weights and the fold are there where they are asked for.
+    `x` [m]: coordinates. `members`: one member (scalar fields). `world`: the cascade, scenario, clock and loss, shared
+    by all lanes. `weights` [6]: of the terms, for derivatives only. `fold`: for values only.
     """
 
     x: Any
-    who: Members
+    members: Members
     world: tuple[Cascade, Scenario, Clock, Loss]
     weights: Any = None
     fold: Any = None
@@ -49,24 +51,27 @@ class Lane(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class LaneFold:
-    """The fold's result for a lane."""
+    """Function of a lane that returns the result of its fold."""
 
     space: Space
 
     def __call__(self, lane: Lane) -> Any:
-        return Objective(self.space, *lane.world).run(lane.x, lane.who, lane.fold)
+        return Objective(self.space, *lane.world).run(lane.x, lane.members, lane.fold)
 
 
 def measured(world: tuple[Cascade, Scenario, Clock, Any]) -> Any:
-    """The result of a fold over the rollout of one member."""
+    """Return the result of a fold over the rollout of one member."""
     cascade, scenario, clock, fold = world
     return rollout(cascade, scenario, clock, fold=fold, every=0).measured
 
 
 @dataclasses.dataclass(frozen=True)
 class LaneGradient:
-    """The outcomes of a lane [1 + L], its loss and what limits hold, their derivatives [1 + L, m] and the terms, in
-    forward or reverse mode."""
+    """Function of a lane that returns its outcomes, their derivatives and the terms of the loss.
+
+    The outcomes [1 + L] are the weighted loss and the limited quantities. The derivatives [1 + L, m] are computed in
+    forward or reverse mode.
+    """
 
     space: Space
     reverse: bool
@@ -79,7 +84,7 @@ class LaneGradient:
 
         one = jax.custom_batching.custom_vmap(lambda lane: self._along(self._outcomes, lane))
 
-        # Directions outside, lanes inside: what is contiguous in memory is as long as a vector.
+        # Map over directions outside and lanes inside, so that the contiguous axis in memory is that of the lanes.
         @one.def_vmap
         def every(size: int, batched: Any, lane: Lane) -> Any:
             axes = jax.tree.map(lambda moves: 0 if moves else None, batched[0])
@@ -89,11 +94,11 @@ class LaneGradient:
         return one(lane)
 
     def _outcomes(self, x: Array, lane: Lane) -> tuple[Array, dict[str, Array]]:
-        terms = Objective(self.space, *lane.world).run(x, lane.who, lane.world[-1])
-        return jnp.stack(outcomes(lane.weights, terms, lane.who.stressed)), terms
+        terms = Objective(self.space, *lane.world).run(x, lane.members, lane.world[-1])
+        return jnp.stack(outcomes(lane.weights, terms, lane.members.stressed)), terms
 
     def _along(self, outcomes: Callable[..., Any], lane: Lane) -> Any:
-        """Outcomes, derivatives along each coordinate and terms, of one lane or of many."""
+        """Return outcomes, derivatives along each coordinate, and terms, of one lane or of many."""
 
         def along(direction: Array) -> Any:
             every = jnp.broadcast_to(direction, lane.x.shape)
@@ -103,7 +108,11 @@ class LaneGradient:
 
 
 class Engine:
-    """The lanes of an objective, compiled, on `threads` cores (None: all); a call blocks until its answer is there."""
+    """Compiled evaluation of an objective on `threads` cores (None: all). Each call blocks until its result is ready.
+
+    `settle` (s): the metrics count errors from this time on. `mode`: "forward" or "reverse" differentiation.
+    `lanes`: lanes of one kernel call.
+    """
 
     def __init__(
         self,
@@ -119,50 +128,50 @@ class Engine:
         self._world: Any = canonical((objective.cascade, objective.scenario, objective.clock, objective.loss))
         self._standard = canonical(Named({"loss": objective.loss, "metrics": standard_for(settle, objective.scenario)}))
 
-    def terms(self, x: np.ndarray, who: Members) -> dict[str, np.ndarray]:
-        """Terms of the loss by name, [S, N], of gain vectors x [S, m] and members [N]."""
-        self.rollouts += len(x) * len(who.member)
-        return self._lanes(LaneFold(self.objective.space), x, who, self.lanes, fold=self._world[-1])
+    def terms(self, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:
+        """Return the terms of the loss by name, each [S, N], at coordinates x [S, m] for members [N]."""
+        self.rollouts += len(x) * len(members.member)
+        return self._lanes(LaneFold(self.objective.space), x, members, self.lanes, fold=self._world[-1])
 
-    def metrics(self, x: np.ndarray, who: Members) -> dict[str, Any]:
-        """{"loss": terms, "metrics": metrics.json names}, all [S, N].
+    def metrics(self, x: np.ndarray, members: Members) -> dict[str, Any]:
+        """Return {"loss": terms, "metrics": the metrics of metrics.json}, each [S, N], at x [S, m] for members [N].
 
-        With LANES lanes, in the steps of `ambjax ensemble` and of members as they are drawn, these are the bits of its
-        members.npz: the gains are constants of the program, as there, and not computed in it from coordinates.
+        The gains are constants of the compiled program, as in `ambjax ensemble`. So, with LANES lanes, the same
+        integration method and members as drawn, the metrics equal those of members.npz bit by bit.
         """
-        self.rollouts += len(x) * len(who.member)
+        self.rollouts += len(x) * len(members.member)
         found, block = [], None if self.lanes == LANES else self.lanes
         for one in x:
-            world = canonical((*self.objective.fixed(one, who), self.objective.clock, self._standard))
+            world = canonical((*self.objective.fixed(one, members), self.objective.clock, self._standard))
             found.append(map_members(measured, world, threads=self.threads, call=self.lanes, block=block))
         return jax.tree.map(lambda *parts: np.stack(parts), *found)
 
-    def gradient(self, x: np.ndarray, who: Members, weights: Any) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-        """Outcomes [S, N, 1 + L], the weighed loss and what limits hold, their derivatives [S, N, 1 + L, m] and the
-        terms [S, N].
+    def gradient(self, x: np.ndarray, members: Members, weights: Any) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+        """Return outcomes [S, N, 1 + L], their derivatives [S, N, 1 + L, m] and the terms [S, N] at x [S, m].
 
-        `weights`: of the terms, in the order of TERMS, for all starts or for each: [6] or [S, 6].
+        The outcomes are the weighted loss and the limited quantities. `weights`: of the terms, in the order of TERMS,
+        for all starts [6] or for each start [S, 6].
         """
-        self.rollouts += len(x) * len(who.member) * (len(self.objective.space) + 1)
+        self.rollouts += len(x) * len(members.member) * (len(self.objective.space) + 1)
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS)))
         slope = LaneGradient(self.objective.space, self.mode == "reverse")
-        return self._lanes(slope, x, who, min(self.lanes, GRADIENT_LANES), weights=each)
+        return self._lanes(slope, x, members, min(self.lanes, GRADIENT_LANES), weights=each)
 
     def _lanes(
         self,
         function: LaneFold | LaneGradient,
         x: np.ndarray,
-        who: Members,
+        members: Members,
         width: int,
         weights: Any = None,
         fold: Any = None,
     ) -> Any:
-        """The function of every start x [S, m], with weights [S, 6] of its own, and member [N]: leaves [S, N, ...]."""
-        start, member = np.divmod(np.arange(len(x) * len(who.member)), len(who.member))
+        """Apply the function to every start x [S, m], with its weights [S, 6], and member [N]: leaves [S, N, ...]."""
+        start, member = np.divmod(np.arange(len(x) * len(members.member)), len(members.member))
         at = np.asarray(x, jnp.result_type(float))[start]
-        those = jax.tree.map(lambda a: a[member], who)
-        lane = Lane(at, those, self._world, None if weights is None else weights[start], fold)
+        selected = jax.tree.map(lambda a: a[member], members)
+        lane = Lane(at, selected, self._world, None if weights is None else weights[start], fold)
         results = map_members(
             function, lane, threads=self.threads, call=width, block=width, plain=self.mode == "reverse"
         )
-        return jax.tree.map(lambda a: a.reshape(len(x), len(who.member), *a.shape[1:]), results)
+        return jax.tree.map(lambda a: a.reshape(len(x), len(members.member), *a.shape[1:]), results)

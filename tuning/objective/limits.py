@@ -1,9 +1,9 @@
-"""Limits of what an engineer limits: how each is measured on a member and over an ensemble, and how it pulls.
+"""Limits on quantities of an ensemble: their measurement, and their terms of the goal.
 
-A search minimises the error subject to them by an augmented Lagrangian (Nocedal and Wright, Numerical Optimization,
-2006, 17.3) in logarithms: with g = log(reached / allowed), each adds (max(0, multiplier + penalty g)^2 - multiplier^2)
-/ (2 penalty) to the goal, a logarithm too. At the optimum the multiplier is minus the elasticity of what is minimised:
-1 % more of the limit buys `multiplier` % less of it.
+A search minimises the error subject to the limits by an augmented Lagrangian (Nocedal and Wright, Numerical
+Optimization, 2006, 17.3). With g = log(reached / allowed), a limit adds (max(0, multiplier + penalty g)^2 -
+multiplier^2) / (2 penalty) to the goal, which is a logarithm. At the optimum the multiplier is minus the elasticity of
+the minimised quantity: a limit 1 % higher lowers it by `multiplier` %.
 """
 
 import dataclasses
@@ -22,30 +22,30 @@ from ambjax.simulation.metrics import Driven, Ending, Fold, Peak, Variation
 from ambjax.simulation.response import Overshoot, Settling
 from ambjax.world.scenario import Scenario
 
-# How steeply a limit that is exceeded pulls at first: 10 % beyond it count as 14 % of the mean square error where the
-# multiplier is 0. By how much steeper where an update leaves more than this share of the excess, and at most.
-PENALTY, STEEPER, LEFT, STEEPEST = 30.0, 4.0, 0.3, 2000.0
-# Exponent of the norms that stand for maxima.
+# Initial penalty: at a multiplier of 0, an excess of 10 % adds 0.14 to the goal. Factor by which the penalty grows when
+# an update leaves more than the share SUFFICIENT_DECREASE of the excess (Nocedal and Wright, ch. 17); largest penalty.
+PENALTY, PENALTY_GROWTH, SUFFICIENT_DECREASE, MOST_PENALTY = 30.0, 4.0, 0.3, 2000.0
+# Exponent of the norms that approximate maxima.
 NORM = 16
-# Before the names of what limits hold among the terms of a loss.
+# Prefix of the names of limited quantities among the terms of a loss.
 PREFIX = "limit."
-# Of what is 0 there is no logarithm.
+# Lower bound of the argument of a logarithm.
 TINY = 1e-30
-# Where it pulls, a limit is met from this share below what is allowed, to half of the margin above.
-BELOW = 0.01
-# Half of a margin is what a search meets a limit to: of less, a limit that was met would not be held.
+# A limit with a multiplier above 0 is met from this share below the allowed value to half of the margin above it.
+TOLERANCE_BELOW = 0.01
+# Smallest margin. A search meets a limit to half of its margin only, so a smaller margin would not keep it held.
 LEAST_MARGIN = 0.002
-# What a supply is worth without being asked: rms voltage as a share of its limit.
-SHARE = 0.6
-# Stretches of the integral that prices a limit.
-STRETCHES = 200
+# Default limit of the rms voltage, as a share of actuator.u_max.
+DEFAULT_SHARE = 0.6
+# Intervals of the integral in `Limit.error_reduction`.
+PRICE_INTERVALS = 200
 
 
 @record
 class Typical:
-    """The 16-norm over samples of |row.`of`|: a smooth maximum.
+    """Fold: the 16-norm over samples of |row.`of`| in units of `size`, a smooth maximum.
 
-    At its stop a voltage has no slope; the samples that are below it do.
+    A saturated voltage has the derivative 0. The norm includes the unsaturated samples, which have another one.
     """
 
     of: str = static()
@@ -68,7 +68,7 @@ class Typical:
 
 @record
 class Scaled:
-    """A fold's number, divided."""
+    """Fold: the result of another fold, divided by `by`."""
 
     fold: Fold
     by: Scalar = leaf(above=0, at_most=1e30)
@@ -85,7 +85,11 @@ class Scaled:
 
 @dataclasses.dataclass(frozen=True)
 class LimitContext:
-    """What the measures of a case depend on: from when errors count (s), run's duration (s), clearance and band (m)."""
+    """Quantities of a case that the folds of limits depend on.
+
+    `settle` (s): start of the settled part. `duration` (s): of the run. `touchdown` (m): clearance. `band` (m): of the
+    settling time.
+    """
 
     settle: float
     duration: float
@@ -94,24 +98,25 @@ class LimitContext:
 
 
 def pooled(values: Any) -> Any:
-    """Root mean square over members."""
+    """Return the root mean square over members."""
     return jnp.sqrt(jnp.mean(values**2) + TINY)
 
 
 def largest(values: Any) -> Any:
-    """16-norm over members: at least the largest, and smooth."""
+    """Return the 16-norm over members: smooth, and not below the maximum."""
     top = jax.lax.stop_gradient(jnp.maximum(jnp.max(values), TINY))
     total = jnp.sum((values / top) ** NORM)
-    # 0 where all are 0: a root has no slope there
+    # 0 if all are 0: the derivative of the root is infinite there
     return top * jnp.where(total > 0, total, 1.0) ** (1 / NORM)
 
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A quantity that may be limited: its unit; what it is of a member, and over members, in words.
+    """A quantity that may be limited.
 
-    `fold` measures it on a member for the search; `exact` names the column in which a judge finds it, None: the fold's
-    own number. `tuned` makes one number of all members for the search, `judged` for the judge.
+    `words` describes the quantity of one member, `over` its reduction over members, both for the report. `fold` returns
+    the fold that measures it in the search, of a LimitContext and the limit. `exact` is the column of its exact value
+    in the judge's metrics; None: the fold's result. `tuned` reduces the members for the search, `judged` for the judge.
     """
 
     unit: str
@@ -122,9 +127,9 @@ class Kind:
     tuned: Callable[[Any], Any]
     judged: Callable[[np.ndarray], Any]
     margin: float
-    """share by which two ensembles differ at most: of their averages less than of their worst members"""
+    """default margin: relative difference between two ensembles, smaller for means than for worst members"""
     worst: bool = False
-    """whether one member decides"""
+    """whether the quantity is that of the worst member"""
 
 
 _POOLED = {"over": "root mean square over members", "tuned": pooled, "judged": pooled, "margin": 0.005}
@@ -135,52 +140,52 @@ KINDS: dict[str, Kind] = {
     "rms_u_V": Kind(
         "V",
         "root mean square voltage from run.settle on",
-        fold=lambda site, asked: Driven("u_squared", site.settle, root=True),
+        fold=lambda context, asked: Driven("u_squared", context.settle, root=True),
         exact="settled_rms_u_V",
         **_POOLED,
     ),
     "max_u_V": Kind(
         "V",
         "largest voltage of the run",
-        fold=lambda site, asked: Typical("u_peak", asked),
+        fold=lambda context, asked: Typical("u_peak", asked),
         exact="max_abs_u_V",
         **_WORST,
     ),
     "max_abs_i_A": Kind(
-        "A", "largest current of the run", fold=lambda site, asked: Peak("i"), exact="max_abs_i_A", **_WORST
+        "A", "largest current of the run", fold=lambda context, asked: Peak("i"), exact="max_abs_i_A", **_WORST
     ),
     "chatter_V_per_s": Kind(
         "V/s",
         "variation of the voltage, averaged over each sample, per second from run.settle on",
-        fold=lambda site, asked: Scaled(Variation(site.settle), site.duration - site.settle),
+        fold=lambda context, asked: Scaled(Variation(context.settle), context.duration - context.settle),
         exact=None,
         **_MEAN,
     ),
     "largest_error_m": Kind(
         "m",
         "largest |z - r| from run.settle on",
-        fold=lambda site, asked: Peak("e_z", site.settle),
+        fold=lambda context, asked: Peak("e_z", context.settle),
         exact="settled_max_abs_error_m",
         **_WORST,
     ),
     "settling_s": Kind(
         "s",
         "time of the run from which |z - r|, at the samples, stays within settling_band_m",
-        fold=lambda site, asked: Settling(site.band),
+        fold=lambda context, asked: Settling(context.band),
         exact=None,
         **_WORST,
     ),
     "overshoot_m": Kind(
         "m",
         "how far z goes, at the samples, beyond where it began and where r has been",
-        fold=lambda site, asked: Overshoot(),
+        fold=lambda context, asked: Overshoot(),
         exact=None,
         **_WORST,
     ),
     "clearance_used": Kind(
         "",
         "largest |z| as a share of the clearance",
-        fold=lambda site, asked: Scaled(Peak("z"), site.touchdown),
+        fold=lambda context, asked: Scaled(Peak("z"), context.touchdown),
         exact="clearance_used",
         **_WORST,
     ),
@@ -189,15 +194,17 @@ KINDS: dict[str, Kind] = {
 
 @dataclasses.dataclass(frozen=True)
 class Limit:
-    """At most `asked` of a KIND; `source` says who asks. What a search has learnt: `multiplier`, `penalty`, by how much
-    the judge's number exceeds the search's (`ratio`), the last g (`missed`), and what acted at each optimum on the way:
-    (reached, multiplier) (`forces`)."""
+    """Upper limit `asked` of the quantity KINDS[`name`], and the state of its augmented Lagrangian.
+
+    `source`: origin of the limit, for the report. `multiplier`, `penalty`: of the augmented Lagrangian. `ratio`: the
+    judge's value over the search's. `missed`: g at the last update. `forces`: (reached, multiplier) of every update.
+    """
 
     name: str
     asked: float
     source: str = "tune.limits"
     margin: float = 0.0
-    """share by which a search stays below it"""
+    """share by which the search keeps the quantity below the limit"""
     multiplier: float = 0.0
     ratio: float = 1.0
     penalty: float = PENALTY
@@ -206,66 +213,71 @@ class Limit:
 
     @property
     def kind(self) -> Kind:
-        """How it is measured."""
+        """The limited quantity."""
         return KINDS[self.name]
 
     @property
     def allowed(self) -> float:
-        """What a search keeps to."""
+        """Upper bound that the search uses: the limit less its margin."""
         return (1 - self.margin) * self.asked
 
     def excess(self, values: Array) -> Array:
-        """g = log(reached / allowed), of a search's own numbers [N]."""
+        """Return g = log(reached / allowed) for the search's values [N], corrected by `ratio`."""
         reached = self.ratio * self.kind.tuned(values)
         return jnp.log(jnp.maximum(reached, TINY)) - math.log(self.allowed)
 
     def pull(self, values: Array) -> Array:
-        """What it adds to the goal."""
+        """Return the limit's term of the goal for the search's values [N]."""
         force = jnp.maximum(self.multiplier + self.penalty * self.excess(values), 0.0)
         return (force**2 - self.multiplier**2) / (2 * self.penalty)
 
-    def beyond(self, reached: float) -> float:
-        """g of a number that is reached."""
+    def log_excess(self, reached: float) -> float:
+        """Return g = log(reached / allowed)."""
         return math.log(max(reached, TINY) / self.allowed)
 
     def active(self, reached: float | None) -> bool:
-        """Whether it pulls and is reached, by members that judge; None: by none, and its multiplier alone decides."""
-        near = reached is None or self.beyond(reached) >= -(BELOW + self.margin)
+        """Return whether the limit is active: its multiplier is above 0, and the judge's value reaches it.
+
+        If no member is judged, `reached` is None and the multiplier alone decides.
+        """
+        near = reached is None or self.log_excess(reached) >= -(TOLERANCE_BELOW + self.margin)
         return self.multiplier > 0 and near
 
-    def informed(self, tuned: float, judged: float) -> "Limit":
-        """It knows what the search's number and the judge's are at an optimum of the goal with it: the multiplier is
-        the force that acted there."""
-        excess = self.beyond(judged)
-        force = max(self.multiplier + self.penalty * self.beyond(self.ratio * tuned), 0.0)
-        slow = force > 0 and abs(excess) > LEFT * abs(self.missed)
-        penalty = min(STEEPER * self.penalty, STEEPEST) if slow else self.penalty
+    def updated(self, tuned: float, judged: float) -> "Limit":
+        """Return the limit after an update of its multiplier at an optimum of the goal.
+
+        `tuned` and `judged` are the values of the search and of the judge there.
+        """
+        excess = self.log_excess(judged)
+        force = max(self.multiplier + self.penalty * self.log_excess(self.ratio * tuned), 0.0)
+        slow = force > 0 and abs(excess) > SUFFICIENT_DECREASE * abs(self.missed)
+        penalty = min(PENALTY_GROWTH * self.penalty, MOST_PENALTY) if slow else self.penalty
         ratio = max(judged, TINY) / max(tuned, TINY)
         forces = (*self.forces, (max(judged, TINY), force))
         return dataclasses.replace(self, multiplier=force, ratio=ratio, penalty=penalty, missed=excess, forces=forces)
 
-    def bought(self, more: float) -> float:
-        """Share of the root mean square error that this share more of the limit takes off.
+    def error_reduction(self, more: float) -> float:
+        """Return the relative decrease of the rms error when the limit grows by the share `more`.
 
-        What is minimised falls by the multiplier, which falls on the way: each optimum that a search came by was that
-        of a looser limit. Between them it is linear in the logarithm of the limit; beyond them as at the last.
+        It is the integral of the multiplier over the logarithm of the limit. The multiplier is interpolated linearly
+        between the optima of the updates, which belong to looser limits, and is constant outside of them.
         """
         if not self.multiplier:
             return 0.0
         logs, forces = np.array(sorted((math.log(reached), force) for reached, force in self.forces)).T
         begin = math.log(self.forces[-1][0])
-        at = np.linspace(begin, begin + math.log1p(more), STRETCHES + 1)
+        at = np.linspace(begin, begin + math.log1p(more), PRICE_INTERVALS + 1)
         return -math.expm1(-float(np.trapezoid(np.interp(at, logs, forces), at)) / 2)
 
     def reached(self, columns: Mapping[str, np.ndarray]) -> float:
-        """The judge's number, of every metric and term [N] of an ensemble."""
+        """Return the judge's value. `columns`: every metric and term of an ensemble by name, each [N]."""
         return float(self.kind.judged(self.of_members(columns)))
 
     def of_members(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The quantity of each member that is held, or of every one where none is.
+        """Return the quantity of each member that is held, or of all members if none is held.
 
-        `columns` [N]: every metric and term of an ensemble. A rotor that is lost counts 0 V from then on, which would
-        lower an average; whether it may be lost is decided by `survival`.
+        `columns`: every metric and term of an ensemble by name, each [N]. Lost rotors are left out: their voltage is 0
+        after the loss, which would lower a mean. The limit `survival` counts them.
         """
         alive = ~np.isfinite(columns["lost_at_s"])
         values = np.asarray(columns[self.kind.exact or f"loss.{PREFIX}{self.name}"])
@@ -273,6 +285,6 @@ class Limit:
 
 
 def measures(limits: tuple[Limit, ...], scenario: Scenario, clock: Clock, settle: float, band: float) -> dict[str, Any]:
-    """A fold for each limit, by its name."""
-    site = LimitContext(settle, float(clock.duration), float(scenario.touchdown), band)
-    return {limit.name: limit.kind.fold(site, limit.asked) for limit in limits}
+    """Return the fold of each limit by name. `settle` (s): start of the settled part; `band` (m): of settling_s."""
+    context = LimitContext(settle, float(clock.duration), float(scenario.touchdown), band)
+    return {limit.name: limit.kind.fold(context, limit.asked) for limit in limits}

@@ -1,4 +1,4 @@
-"""The loss of one rollout as a fold: dimensionless terms, reported apart and weighed afterwards."""
+"""The loss of one rollout: a fold that returns dimensionless terms, and their weighted sum."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -14,17 +14,17 @@ from ambjax.simulation.trajectory import ALIVE
 from ambjax.world.scenario import Scenario
 from tuning.objective.limits import PREFIX
 
-# Exponent of the norm that stands for the maximum: 1.2 to 1.6 times below it over 1e4 samples of noise.
+# Exponent of the norm that approximates the maximum: over 1e4 samples of noise it is 1.2 to 1.6 times smaller.
 NORM = 16
 TERMS = ("tracking", "peak", "effort", "chatter", "clearance", "survival")
-# Terms that say whether the rotor is held.
+# Terms that measure how close the rotor is to touchdown, and its loss.
 HELD = ("clearance", "survival")
-# Terms that are a price, not an aim.
+# Terms that multiply the error.
 COSTS = ("effort", "chatter")
 
 
 class Sums(NamedTuple):
-    """What the fold carries."""
+    """Carry of the fold: sums over samples, and the carries of the limits' folds."""
 
     square: Array
     power: Array
@@ -41,16 +41,16 @@ class Sums(NamedTuple):
 
 @record
 class Loss:
-    """Terms of one member, each 0 or more and dimensionless, by name (TERMS).
+    """Fold: the terms of the loss of one member by name (TERMS), dimensionless and not negative.
 
-    tracking: mean of (e_z / s_0)^2 from `settle` on, earlier samples counted `early` times.
-    peak: the square of the 16-norm of e_z / s_0 over the same samples: a smooth maximum, of the samples alone.
+    tracking: mean of (e_z / s_0)^2 from `settle` on; earlier samples have the weight `early`.
+    peak: square of the 16-norm of e_z / s_0 over the same samples, a smooth maximum.
     effort: mean over time of (u / u_scale)^2 while the drive is on.
     chatter: mean over samples of ((u_k - u_{k-1}) / u_scale)^2, where u_k is the average of u over sample k.
-    clearance: mean of max(0, share)^2, share of the way from halfway between |r| and the stop to the stop.
-    survival: share of the horizon after the rotor was lost; its derivative is that of the time at which
-    |z| reaches the stop at its last speed, so it points to gains that keep the rotor longer.
-    And what each fold of `measures` says, under its name with PREFIX.
+    clearance: mean of max(0, (|z| - h) / (stop - h))^2, where h = (|r| + stop) / 2.
+    survival: share of the horizon after the loss of the rotor. Its derivative is that of the time at which |z| reaches
+    the stop at its last speed, so a descent step keeps the rotor for longer.
+    The result also holds the result of each fold of `measures`, under its name with PREFIX.
     """
 
     settle: Scalar = leaf(default=0.2, unit="s", at_least=0, at_most=1e6)
@@ -106,17 +106,20 @@ class Loss:
 
 
 def loss_for(scenario: Scenario, settle: float, early: float = 0.0, measures: Mapping[str, Fold] | None = None) -> Loss:
-    """The loss of a scenario: u counts in units of the supply's limit, or of R i_0 without one."""
+    """Return the loss of a scenario. u is scaled by the supply's limit, or by R i_0 without a limit.
+
+    `settle` (s): start of the settled part. `early`: weight of the samples before it. `measures`: folds of limits.
+    """
     plant = scenario.plant
     u_scale = jnp.where(jnp.isfinite(scenario.u_max), scenario.u_max, plant.R * plant.i_0)
     return Loss(settle, early, plant.s_0, float(u_scale), scenario.touchdown, dict(measures or {}))
 
 
 def weigh(weights: Any, terms: dict[str, Any], stressed: Any) -> Any:
-    """The loss: errors and losses weighed and added, times 1 + weighed costs; of a stressed member, HELD alone.
+    """Return the loss: clearance + survival + (tracking + peak) (1 + effort + chatter), each term times its weight.
 
-    Costs count relative to the error, since its size is not known before: with a weight of 0.1, voltage at
-    its limit throughout is worth a tenth of the error.
+    For a stressed member it is clearance + survival. Costs are relative to the error, whose size is unknown in advance:
+    at a weight of 0.1, a voltage at its limit throughout adds a tenth of the error.
     """
     ordinary = 1.0 - 1.0 * stressed
     each = dict(zip(TERMS, (weights[k] * terms[name] for k, name in enumerate(TERMS)), strict=True))
@@ -126,5 +129,5 @@ def weigh(weights: Any, terms: dict[str, Any], stressed: Any) -> Any:
 
 
 def outcomes(weights: Any, terms: dict[str, Any], stressed: Any) -> list[Any]:
-    """The weighed loss, and what each limit holds, in the order of their names."""
+    """Return the weighted loss and the limited quantities, in the order of their names."""
     return [weigh(weights, terms, stressed), *(terms[name] for name in sorted(terms) if name.startswith(PREFIX))]

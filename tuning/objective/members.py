@@ -1,4 +1,4 @@
-"""The members that gains are tuned on, and the objective: gains and a member to what a fold of its rollout says."""
+"""Members of an ensemble, and the objective, which maps gains and a member to the result of a fold."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -16,53 +16,54 @@ from ambjax.world.scenario import Scenario
 from tuning.objective.loss import Loss
 from tuning.space import Space
 
-# Members of a kind that say something about all of it.
-FEWEST = 4
+# Fewest ordinary, and fewest stressed, members of a part.
+LEAST_PART = 4
 
 
 class Members(NamedTuple):
-    """Members of an ensemble: their numbers [n], seed, and what is spread over them by path [n].
+    """Members of an ensemble.
 
-    `stressed` [n], the last ones: members of whom nothing is asked but to be held, with sensors `loud` [n] times as
-    noisy, under gains that are off by `shift` [n, m], in coordinates.
+    `member` [n]: their numbers. `seed` [n]: of their ensembles. `values`: the spread values [n] by path.
+    `noise_factor` [n]: factor on the sensor noise. `shift` [n, m]: offset of the coordinates of the gains.
+    `stressed` [n]: whether only the loss of the rotor counts for a member; stressed members come last.
     """
 
     member: Any
     seed: Any
     values: dict[str, Any]
-    loud: Any
+    noise_factor: Any
     shift: Any
     stressed: Any
 
     @property
     def ordinary(self) -> int:
-        """How many are not stressed."""
+        """The number of members that are not stressed."""
         return int(np.sum(~self.stressed))
 
     @property
     def unstressed(self) -> "Members":
-        """Those who are not stressed."""
+        """The members that are not stressed."""
         return jax.tree.map(lambda a: a[: self.ordinary], self)
 
     def joined(self, others: "Members") -> "Members":
-        """These and others, who are asked only to be held and come first among such."""
+        """Return these members and `others`. The others become stressed, and come before the stressed members here."""
         more, n = others._replace(stressed=np.ones(len(others.stressed), bool)), self.ordinary
         return jax.tree.map(lambda a, b: np.concatenate([a[:n], b, a[n:]]), self, more)
 
     def part(self, share: int, held: int | None = None) -> "Members":
-        """The first of either kind, FEWEST at least: ordinary ones, one in `share`, then those asked to be held.
+        """Return one ordinary member in `share` and one stressed member in `held` (default: `share`), the first ones.
 
-        Of these one in `held`; left out: one in `share` too.
+        At least LEAST_PART of either kind are kept, or all of them if there are fewer.
         """
         kinds = (self.ordinary, share), (len(self.stressed) - self.ordinary, held or share)
-        few, some = (max(count // each, min(FEWEST, count)) for count, each in kinds)
+        few, some = (max(count // each, min(LEAST_PART, count)) for count, each in kinds)
         index = np.concatenate([np.arange(few), np.arange(self.ordinary, self.ordinary + some)])
         return jax.tree.map(lambda a: a[index], self)
 
 
 @dataclasses.dataclass(frozen=True)
 class Objective:
-    """What is tuned, in which world, and what counts: the part of a problem that is compiled."""
+    """The gains to tune, the simulated world and the loss: the part of a problem that is compiled."""
 
     space: Space
     cascade: Cascade
@@ -72,50 +73,54 @@ class Objective:
     spread: Spread = Spread()
 
     def members(self, seed: int, count: int) -> Members:
-        """The first `count` members of the ensemble with this seed."""
+        """Return the first `count` members of the ensemble with this seed."""
         return self.chosen(seed, np.arange(count), count)
 
     def training(self, seed: int, count: int, extra: int, noise: float, gains: float) -> Members:
-        """`count` members, and `extra` more, stressed: noise times `noise`, every gain off by a factor of `gains`.
+        """Return `count` ordinary and `extra` stressed members.
 
-        The first of these has all gains above, the second all below, the others a mixture drawn from the seed.
+        A stressed member has `noise` times the sensor noise, and each of its gains is multiplied or divided by
+        `gains`. The first stressed member has all gains multiplied, the second all divided. The signs of the others
+        are drawn from the seed.
         """
-        who = self.members(seed, count + extra)
-        stressed = who.member >= count
+        members = self.members(seed, count + extra)
+        stressed = members.member >= count
         sign = np.random.default_rng(seed).choice([-1.0, 1.0], (count + extra, len(self.space)))
         sign[count : count + 2] = np.array([[1.0], [-1.0]])[:extra]
         shift = np.log(gains) * np.where(stressed[:, None], sign, 0.0)
-        return who._replace(loud=np.where(stressed, noise, 1.0), shift=shift, stressed=stressed)
+        return members._replace(noise_factor=np.where(stressed, noise, 1.0), shift=shift, stressed=stressed)
 
     def chosen(self, seed: int, numbers: np.ndarray, total: int) -> Members:
-        """Members with these numbers of an ensemble of `total`."""
+        """Return the members with these numbers [n] of an ensemble of `total` members."""
         values = draw(self.spread, self.cascade, self.scenario, seed, numbers, total) if self.spread.entries else {}
         n = len(numbers)
         still = np.zeros((n, len(self.space)))
         return Members(numbers, np.full(n, seed), values, np.ones(n), still, np.zeros(n, bool))
 
-    def world(self, who: Members) -> tuple[Cascade, Scenario]:
-        """The cascade (its gains to be replaced) and scenario of one member, whose fields are scalars."""
-        scenario = dataclasses.replace(self.scenario, member=who.member, seed=who.seed)
-        cascade, scenario = apply(self.cascade, scenario, who.values) if who.values else (self.cascade, scenario)
-        return cascade, _louder(scenario, who.loud)
+    def world(self, members: Members) -> tuple[Cascade, Scenario]:
+        """Return the cascade and the scenario of one member with scalar fields. The gains are the case's."""
+        scenario = dataclasses.replace(self.scenario, member=members.member, seed=members.seed)
+        cascade, scenario = (
+            apply(self.cascade, scenario, members.values) if members.values else (self.cascade, scenario)
+        )
+        return cascade, _with_noise(scenario, members.noise_factor)
 
-    def fixed(self, x: np.ndarray, who: Members) -> tuple[Cascade, Scenario]:
-        """The cascade with the gains at x [m] and the scenario of the members [n]; leaves that vary are arrays [n]."""
-        seed = who.seed if np.ptp(who.seed) else int(who.seed[0])
-        scenario = dataclasses.replace(self.scenario, member=np.asarray(who.member), seed=seed)
-        cascade, scenario = apply(self.cascade, scenario, who.values)
-        at = (x + who.shift).T if np.any(who.shift) else x  # of each gain one coordinate, or [n]
+    def fixed(self, x: np.ndarray, members: Members) -> tuple[Cascade, Scenario]:
+        """Return the cascade with the gains at x [m] and the scenario of members [n]. Varying leaves are arrays [n]."""
+        seed = members.seed if np.ptp(members.seed) else int(members.seed[0])
+        scenario = dataclasses.replace(self.scenario, member=np.asarray(members.member), seed=seed)
+        cascade, scenario = apply(self.cascade, scenario, members.values)
+        at = (x + members.shift).T if np.any(members.shift) else x  # [m] or [m, n]
         cascade = self.space.decode(jnp.asarray(at), cascade)
-        return cascade, _louder(scenario, who.loud) if np.any(who.loud != 1) else scenario
+        return cascade, _with_noise(scenario, members.noise_factor) if np.any(members.noise_factor != 1) else scenario
 
-    def run(self, x: Array, who: Members, fold: Any) -> Any:
-        """The fold's result for one lane."""
-        cascade, scenario = self.world(who)
-        return rollout(self.space.decode(x + who.shift, cascade), scenario, self.clock, fold=fold, every=0).measured
+    def run(self, x: Array, members: Members, fold: Any) -> Any:
+        """Return the fold's result for the rollout of one member at coordinates x [m]."""
+        cascade, scenario = self.world(members)
+        return rollout(self.space.decode(x + members.shift, cascade), scenario, self.clock, fold=fold, every=0).measured
 
 
-def _louder(scenario: Scenario, loud: Any) -> Scenario:
-    """The scenario with `loud` times the sensors' noise."""
+def _with_noise(scenario: Scenario, noise_factor: Any) -> Scenario:
+    """Return the scenario with `noise_factor` times the sensor noise."""
     sensor = scenario.sensor
-    return scenario if sensor is None else dataclasses.replace(scenario, sensor=sensor.louder(loud))
+    return scenario if sensor is None else dataclasses.replace(scenario, sensor=sensor.louder(noise_factor))

@@ -1,4 +1,4 @@
-"""Where each gain is looked for first, and why: ranges from the plant, the clock and what the theorem asks."""
+"""Initial search ranges of the gains, from the plant, the clock and the theorem's conditions."""
 
 import dataclasses
 from typing import Any
@@ -10,21 +10,21 @@ from tuning.objective.members import Objective
 from tuning.objective.shortfalls import Bound
 from tuning.space import Gain, Space, read
 
-# Displacement that a rotor at rest is at least expected to make, as a share of the clearance.
-STIR = 0.01
-# How far beyond its range, or beyond where it starts, a gain may end.
-BEYOND = 3.0
-# Range of a gain of which its law says nothing: this factor about its value.
-ABOUT = 30.0
-# Decades that a range spans where only one of its ends is known.
-WIDE = 1e3
+# Least displacement assumed for a rotor that starts at rest, as a share of the clearance.
+LEAST_DISPLACEMENT = 0.01
+# Upper bound of a gain without one: this factor times the larger of the end of its range and its initial value.
+END_FACTOR = 3.0
+# Range of a gain for which the law defines none: its value divided and multiplied by this factor.
+DEFAULT_FACTOR = 30.0
+# Ratio of the ends of a range of which only one end is known.
+OPEN_RATIO = 1e3
 
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """Where a gain is looked for first, the largest value that it may take, and where these come from, in words.
+    """Initial search range [low, high] of a gain, its upper bound `most`, and a text that names their source.
 
-    `product`: the path of another gain of the space, and the range of the product of both.
+    `product`: path of another gain of the space, and the range of the product of both gains. None: no such range.
     """
 
     low: float
@@ -35,14 +35,15 @@ class Range:
 
 
 def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray) -> list[Range]:
-    """A range for each gain of the space, log-uniform: bounds if there are two, else what its law suggests, else
-    within a factor of ABOUT of its value.
+    """Return a range for each gain of the space, from the gains `start` [m] of the case.
 
-    A gain may end at up to BEYOND times the end of its range or of where it starts, a firm one only at these.
+    The range is that of tune.bounds if both bounds are given, else that of the law, else DEFAULT_FACTOR around the
+    value. Without an upper bound a gain may reach END_FACTOR times the larger of the end of its range and `start`; if
+    the law's interval is firm, the factor is 1.
     """
-    site, gains = _site(objective, conditions), objective.space.gains
-    asked = [_interval(site, objective.cascade, *one) for one in zip(gains, start, strict=True)]
-    rows = list(zip(gains, start, asked, strict=True))
+    context, gains = _context(objective, conditions), objective.space.gains
+    interval = [_interval(context, objective.cascade, *one) for one in zip(gains, start, strict=True)]
+    rows = list(zip(gains, start, interval, strict=True))
     found = {gain.path: _range(gain, value, one) for gain, value, one in rows if not one.times}
     for gain, value, one in rows:
         if one.times:
@@ -51,7 +52,7 @@ def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarra
 
 
 def drawn(space: Space, box: list[Range], cube: np.ndarray) -> np.ndarray:
-    """Gains [n, m] at points of the unit cube [n, m] of their ranges, log-uniform."""
+    """Map points of the unit cube [n, m] to gains [n, m], log-uniform over the ranges `box`."""
     ends = np.log([one.product[1:] if one.product else (one.low, one.high) for one in box])
     gains = np.exp(ends[:, 0] + cube * (ends[:, 1] - ends[:, 0]))
     for j, one in enumerate(box):
@@ -61,67 +62,70 @@ def drawn(space: Space, box: list[Range], cube: np.ndarray) -> np.ndarray:
 
 
 def bounded(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray) -> tuple[Space, list[Range]]:
-    """The space with an upper bound for gains that have none, and the ranges that these come from.
+    """Return the space with an upper bound for every gain, and the ranges that the bounds come from.
 
-    Without one, gains along which the loss is flat (gamma, above all) drift to where no step resolves them.
+    Without an upper bound, a gain along which the loss is flat (gamma, above all) drifts to values at which the
+    integration step is too coarse.
     """
     gains, box = objective.space.gains, ranges(objective, conditions, start)
     return Space(tuple(dataclasses.replace(gain, high=at.most) for gain, at in zip(gains, box, strict=True))), box
 
 
-def _site(objective: Objective, conditions: tuple[Bound, ...]) -> SearchContext:
+def _context(objective: Objective, conditions: tuple[Bound, ...]) -> SearchContext:
     model, scenario = objective.cascade.model, objective.scenario
     w = float(scenario.plant.pole)
     bounds = {bound.symbol: bound.value for bound in conditions}
     stiffness = 4 * float(model.i_0) ** 2 / float(model.s_0) ** 3
-    fall = stiffness * w
+    growth = stiffness * w
     places = [
         (abs(float(scenario.initial.z)), "initial.z"),
         (abs(float(scenario.initial.z_dot)) / w, "initial.z_dot / w"),
-        (STIR * float(scenario.touchdown), f"{100 * STIR:g} % of the clearance"),
+        (LEAST_DISPLACEMENT * float(scenario.touchdown), f"{100 * LEAST_DISPLACEMENT:g} % of the clearance"),
     ]
     z, where = max(places)
     delta = bounds.get("Delta_1", 0.0)
-    if delta >= fall * z:
+    if delta >= growth * z:
         needed = delta, f"Delta_1 = {delta:.3g} A^2/m^2/s along the reference, Eq. (7)"
     else:
-        needed = fall * z, f"D = dv/dz w z = {fall * z:.3g} A^2/m^2/s, what Eq. (7) asks of a fall from {where}"
+        needed = growth * z, f"D = dv/dz w z = {growth * z:.3g} A^2/m^2/s, required by Eq. (7) for a fall from {where}"
     processor = objective.cascade.processor
     stepped = processor is not None and processor.implicit
     return SearchContext(model, w, float(objective.clock.sample_period), bounds, needed, stepped)
 
 
-def _interval(site: SearchContext, cascade: Any, gain: Gain, value: float) -> Interval:
+def _interval(context: SearchContext, cascade: Any, gain: Gain, value: float) -> Interval:
     if gain.low > 0 and np.isfinite(gain.high):
         return Interval(gain.low, gain.high, "tune.bounds", True)
     _, stage, name = gain.path.split(".")
-    about = Interval(value / ABOUT, value * ABOUT, f"a factor of {ABOUT:g} about the case's value")
-    return getattr(cascade, stage).ranges(site).get(name, about)
+    about = Interval(
+        value / DEFAULT_FACTOR, value * DEFAULT_FACTOR, f"a factor of {DEFAULT_FACTOR:g} about the case's value"
+    )
+    return getattr(cascade, stage).ranges(context).get(name, about)
 
 
-def _quotient(gain: Gain, value: float, asked: Interval, cascade: Any, found: dict[str, Range]) -> Range:
-    """The range of a gain of which that of its product with another is asked."""
-    other = f"{gain.path.rpartition('.')[0]}.{asked.times}"
+def _quotient(gain: Gain, value: float, interval: Interval, cascade: Any, found: dict[str, Range]) -> Range:
+    """Return the range of a gain whose law defines the interval of its product with another gain."""
+    other = f"{gain.path.rpartition('.')[0]}.{interval.times}"
     if other not in found:
         size = float(read(cascade, other))
-        return _range(gain, value, asked._replace(low=asked.low / size, high=asked.high / size))
-    ends = asked.low / found[other].high, asked.high / found[other].low
-    whole = _range(gain, value, asked._replace(low=ends[0], high=ends[1]))
-    return dataclasses.replace(whole, product=(other, asked.low, asked.high))
+        return _range(gain, value, interval._replace(low=interval.low / size, high=interval.high / size))
+    ends = interval.low / found[other].high, interval.high / found[other].low
+    whole = _range(gain, value, interval._replace(low=ends[0], high=ends[1]))
+    return dataclasses.replace(whole, product=(other, interval.low, interval.high))
 
 
-def _range(gain: Gain, value: float, asked: Interval) -> Range:
+def _range(gain: Gain, value: float, interval: Interval) -> Range:
     if gain.low > 0 and np.isfinite(gain.high):
-        return Range(gain.low, gain.high, gain.high, asked.source)
-    low, high, source = asked[:3]
+        return Range(gain.low, gain.high, gain.high, interval.source)
+    low, high, source = interval[:3]
     if gain.low > 0 or np.isfinite(gain.high):
         source += "; within tune.bounds"
     low, high = max(low, gain.low * 1.05), min(high, gain.high / 1.05)
     if low >= high and gain.low > 0:
-        high = low * WIDE
+        high = low * OPEN_RATIO
     elif low >= high:
-        low = high / WIDE
+        low = high / OPEN_RATIO
     if np.isfinite(gain.high):
         return Range(low, high, gain.high, source)
-    most = max(high, value) * (1 if asked.firm else BEYOND)
+    most = max(high, value) * (1 if interval.firm else END_FACTOR)
     return Range(low, high, most, f"{source}; may end at up to {most:.3g}")

@@ -1,4 +1,4 @@
-"""Risk: one number from the losses of an ensemble [N]."""
+"""Risk measures: one number from the losses of an ensemble [N]."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from jax import Array
 
 @dataclasses.dataclass(frozen=True)
 class Mean:
-    """The average."""
+    """Mean of the losses."""
 
     def __call__(self, losses: Array) -> Array:
         return jnp.mean(losses)
@@ -20,10 +20,11 @@ class Mean:
 
 @dataclasses.dataclass(frozen=True)
 class CVaR:
-    """Average of the worst share 1 - alpha: conditional value at risk.
+    """Conditional value at risk: the mean of the worst share 1 - alpha of the losses.
 
-    Rockafellar and Uryasev, J. Risk 2 (2000) 21-41: the minimum over q of q + mean(max(l - q, 0)) / (1 - alpha),
-    reached at the alpha quantile; its gradient is that of the members beyond, one of them counted in part.
+    Rockafellar and Uryasev, J. Risk 2 (2000) 21-41. It equals the minimum over q of
+    q + mean(max(l - q, 0)) / (1 - alpha), which lies at the alpha quantile. If (1 - alpha) N is not whole, the last of
+    the worst members counts in part.
     """
 
     alpha: float = 0.9
@@ -40,7 +41,7 @@ class CVaR:
 
 @dataclasses.dataclass(frozen=True)
 class SoftWorst:
-    """Smooth worst case: log-mean-exp of beta times the losses over their mean. Between the mean and the maximum."""
+    """Smooth maximum: mean(l) / beta * log(mean(exp(beta l / mean(l)))), between the mean and the maximum."""
 
     beta: float = 5.0
 

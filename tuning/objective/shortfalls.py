@@ -1,4 +1,4 @@
-"""The conditions of Theorem 1 on the gains, as lower bounds and as margins."""
+"""The conditions of Theorem 1: lower bounds of the gains, and a penalty for gains below them."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -16,7 +16,7 @@ from ambjax.world.scenario import Scenario
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """A gain must exceed `value`: `symbol` is what the paper calls it."""
+    """Condition: the gain at `path` exceeds `value` (in `unit`), which the paper calls `symbol`."""
 
     path: str
     value: float
@@ -25,7 +25,10 @@ class Bound:
 
 
 def bounds(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Bound, ...]:
-    """What the laws require of their gains: k > Q_z, k_i > Q_i, gamma > Delta_1 (Eq. 7, on the ideal motion z = r)."""
+    """Return the lower bounds k > Q_z, k_i > Q_i and gamma > Delta_1 (Eq. 7) of the laws' gains.
+
+    Delta_1 is evaluated on the ideal motion z = r. Q_z and Q_i are maxima over the samples of the clock.
+    """
     t = jnp.arange(clock.samples) * clock.sample_period
 
     def largest(signal: Callable[[Array], Array]) -> float:
@@ -41,7 +44,10 @@ def bounds(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Bound, .
 
 
 def shortfall(gains: Mapping[str, Array], bounds: tuple[Bound, ...], margin: float) -> Array:
-    """Sum of max(0, log((1 + margin) bound / gain))^2 over the gains that are bounded: 0 where all hold with margin."""
+    """Return the sum of max(0, log((1 + margin) bound / gain))^2 over `gains` by path with a bound.
+
+    It is 0 if every condition holds with the relative margin `margin`.
+    """
     total = jnp.zeros(())
     for bound in bounds:
         if bound.path in gains and bound.value > 0:

@@ -29,9 +29,9 @@ def compared(problem: TuningProblem, x: np.ndarray, seed: int, count: int, names
     not confirm what the report says of them; '' where they do, or the report itself holds nobody.
     """
     numbers = np.arange(min(AGAIN, count))
-    who = problem.objective.chosen(seed, numbers, count)
-    both = metrics_of(problem.judging, x, who), metrics_of(problem.reference, x, who)
-    error = difference(problem, *both, who)
+    members = problem.objective.chosen(seed, numbers, count)
+    both = metrics_of(problem.judging, x, members), metrics_of(problem.reference, x, members)
+    error = difference(problem, *both, members)
     held = np.logical_and.reduce([~np.isfinite(metrics["lost_at_s"]) for metrics in both])
     ways = ("report", "accurate")
     facts: dict[str, Any] = {"members": len(numbers), "held": int(held.sum()), "marked_beyond": MARKED}

@@ -38,11 +38,11 @@ def table(goal: Goal, columns: dict[str, np.ndarray]) -> Facts:
     }
 
 
-def minimised(problem: TuningProblem, x: np.ndarray, who: Members) -> Facts:
+def minimised(problem: TuningProblem, x: np.ndarray, members: Members) -> Facts:
     """What the search brought down, at x [m]: the parts of its goal, (risk + held) x penalty x limits = total."""
-    goal, n = problem.goal, who.ordinary
-    terms = {k: v[0] for k, v in problem.engine.terms(x[None], who).items()}
-    losses, *reached = outcomes(goal.weights, terms, who.stressed)
+    goal, n = problem.goal, members.ordinary
+    terms = {k: v[0] for k, v in problem.engine.terms(x[None], members).items()}
+    losses, *reached = outcomes(goal.weights, terms, members.stressed)
     penalty = float(goal.penalty(jnp.asarray(x)))
     pull = float(goal.pull(jnp.stack([jnp.asarray(one[:n]) for one in reached], -1))) if reached else 0.0
     parts = {

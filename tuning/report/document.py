@@ -232,12 +232,12 @@ def _minimised(facts: Facts) -> list[str]:
         "",
         "![What was minimised along each gain, through the answer](slices.png)",
         "",
-        _beside(facts),
+        _lower_point(facts),
         "",
     ]
 
 
-def _beside(facts: Facts) -> str:
+def _lower_point(facts: Facts) -> str:
     """Whether the picture shows a lower point than the answer, and what of it."""
     beside = facts.get("beside")
     if not beside or beside["lower"] == 0:

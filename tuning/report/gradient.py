@@ -37,15 +37,15 @@ def three_ways(problem: TuningProblem, x: np.ndarray) -> dict[str, Any]:
     whether the three agree (`verdict`); `agree`: whether they do for every gain.
     """
     objective = _shorter(problem, min(SAMPLES, problem.objective.clock.samples))
-    who = objective.members(problem.tune.budget.seed, min(FEW, problem.tune.budget.members))
+    members = objective.members(problem.tune.budget.seed, min(FEW, problem.tune.budget.members))
     weights = problem.goal.weights
     settle = float(np.asarray(objective.loss.settle))
     forward, reverse = (Engine(objective, settle=settle, mode=mode, lanes=16) for mode in ("forward", "reverse"))
-    by_forward = forward.gradient(x[None], who, weights)[1][0, :, 0].mean(axis=0)
-    by_reverse = reverse.gradient(x[None], who, weights)[1][0, :, 0].mean(axis=0)
+    by_forward = forward.gradient(x[None], members, weights)[1][0, :, 0].mean(axis=0)
+    by_reverse = reverse.gradient(x[None], members, weights)[1][0, :, 0].mean(axis=0)
     steps = np.concatenate([s * STEP * np.eye(len(x)) for s in (1, -1, 0.5, -0.5)])
-    terms = forward.terms(x + steps, who)
-    values = weigh(weights, terms, who.stressed).mean(axis=1)
+    terms = forward.terms(x + steps, members)
+    values = weigh(weights, terms, members.stressed).mean(axis=1)
     up, down, half_up, half_down = np.reshape(values, (4, len(x)))
     coarse, fine = (up - down) / (2 * STEP), (half_up - half_down) / STEP
     floor = float(max(NOTHING * np.abs([by_forward, by_reverse]).max(), ROUNDING * np.abs(values).max()))
@@ -90,14 +90,14 @@ def verdict(forward: float, reverse: float, coarse: float, fine: float, floor: f
     return AGREED
 
 
-def against_horizon(problem: TuningProblem, x: np.ndarray, who: Members) -> list[dict[str, float]]:
+def against_horizon(problem: TuningProblem, x: np.ndarray, members: Members) -> list[dict[str, float]]:
     """Norm of the gradient of the log of the mean loss, and share of lost members, by horizon in s; where it is 0,
     as it may be over a sample or two, there is no log, and no row."""
     rows, all_ = [], problem.objective.clock.samples
     for samples in sorted({max(round(share * all_), 1) for share in (*HORIZONS, 1.0)}):
         objective = _shorter(problem, samples)
         engine = problem.engine if samples == all_ else Engine(objective, settle=float(objective.loss.settle))
-        few = who.part(4)
+        few = members.part(4)
         outcomes, slopes, terms = engine.gradient(x[None], few, problem.goal.weights)
         if not outcomes[0, :, 0].mean():
             continue
@@ -111,9 +111,9 @@ def against_horizon(problem: TuningProblem, x: np.ndarray, who: Members) -> list
     return rows
 
 
-def signal_to_noise(problem: TuningProblem, x: np.ndarray, who: Members) -> dict[str, Any]:
+def signal_to_noise(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, Any]:
     """Mean of the members' gradients over its standard error, by gain; each member is a seed of its own."""
-    outcomes, slopes, terms = problem.engine.gradient(x[None], who, problem.goal.weights)
+    outcomes, slopes, terms = problem.engine.gradient(x[None], members, problem.goal.weights)
     relative = slopes[0, :, 0] / outcomes[0, :, 0].mean()
     error = relative.std(axis=0, ddof=1) / np.sqrt(len(relative)) if len(relative) > 1 else np.full(len(x), np.nan)
     return {
@@ -124,11 +124,11 @@ def signal_to_noise(problem: TuningProblem, x: np.ndarray, who: Members) -> dict
     }
 
 
-def report(problem: TuningProblem, x: np.ndarray, who: Members) -> dict[str, Any]:
+def report(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, Any]:
     """All of it, at coordinates x [m]."""
     return {
         "gains": problem.objective.space.paths,
         "three_ways": three_ways(problem, x),
-        "horizons": against_horizon(problem, x, who),
-        "noise": signal_to_noise(problem, x, who),
+        "horizons": against_horizon(problem, x, members),
+        "noise": signal_to_noise(problem, x, members),
     }

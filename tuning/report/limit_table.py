@@ -58,7 +58,7 @@ def _row(limit: Limit, columns: dict[str, np.ndarray], summary: Facts, refuted: 
     reached = limit.reached(columns) if judged else None
     kept = reached <= limit.asked if reached is not None else False if summary["members"] else None
     active, found = limit.active(reached), _verdict(kept, refuted)
-    price = summary["settled_rms_error_m"] * limit.bought(MORE) if active and judged else 0.0
+    price = summary["settled_rms_error_m"] * limit.error_reduction(MORE) if active and judged else 0.0
     return {
         "name": limit.name,
         "unit": limit.kind.unit,

@@ -110,7 +110,7 @@ def _largest(summary: Facts) -> str:
     return f", largest {summary['settled_max_abs_error_m']:.3g} m" if summary["held"] else ""
 
 
-def advice(problem: TuningProblem, facts: Facts, outcome: TuningOutcome, x: np.ndarray, who: Members) -> str:
+def advice(problem: TuningProblem, facts: Facts, outcome: TuningOutcome, x: np.ndarray, members: Members) -> str:
     """Why the gains do not hold what is asked, and what would help, in the order in which it matters; '' if they do."""
     if outcome.good:
         return ""
@@ -126,20 +126,20 @@ def advice(problem: TuningProblem, facts: Facts, outcome: TuningOutcome, x: np.n
     if outcome.stalled:
         words.append(f"Not decided: {outcome.stalled} held-out members, whose integration stalls. Raise tune.substeps.")
     return " ".join(
-        [*words, *(_of_the_lost(problem, facts, x, who) if not outcome.rotors_held and outcome.lost else [])]
+        [*words, *(_of_the_lost(problem, facts, x, members) if not outcome.rotors_held and outcome.lost else [])]
     )
 
 
-def _of_the_lost(problem: TuningProblem, facts: Facts, x: np.ndarray, who: Members) -> list[str]:
+def _of_the_lost(problem: TuningProblem, facts: Facts, x: np.ndarray, members: Members) -> list[str]:
     """What is tight where rotors are lost."""
     judged = f"{facts['after']['lost']} of {facts['after']['members']} held-out members, " * bool(
         facts["after"]["members"]
     )
-    words = [f"Rotors are lost: {judged}{facts['lost_in_training']} of {len(who.member)} in training."]
+    words = [f"Rotors are lost: {judged}{facts['lost_in_training']} of {len(members.member)} in training."]
     for row in facts["conditions"]:
         if row["holds"] is False and row["gain"] is not None:
             words.append(f"{row['requires']} fails: {row['gain']:.3g} against {row['against']:.3g} {row['unit']}.")
-    effort = problem.engine.terms(x[None], who)["effort"].mean()
+    effort = problem.engine.terms(x[None], members)["effort"].mean()
     u_max = float(np.asarray(problem.case.scenario.u_max))
     if np.isfinite(u_max) and effort > 0.25:
         words.append(

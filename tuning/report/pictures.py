@@ -17,7 +17,7 @@ HIGHEST = 30.0
 # Of a run, the start and the end are shown enlarged, for this long, in s, or for a quarter of it.
 ZOOM = 0.02
 # What follows a loss is shown for this share of what is shown before it.
-BEYOND = 0.15
+SHOWN_AFTER_LOSS = 0.15
 # What moves by less than this share of a signal's largest value is shown flat.
 FLAT = 1e-2
 # Amplitudes below this share of the largest are cut off; and samples of which there is a spectrum.
@@ -44,9 +44,9 @@ def before_after(runs: dict[str, Trajectory]) -> bytes:
         ended = float(run.lost_at)
         last = min(ended, t[-1] + (t[1] - t[0] if len(t) > 1 else 0.0))
         near = max(min(ZOOM, last / 4), t[min(4, len(t) - 1)])
-        beyond = BEYOND * np.isfinite(ended)
-        late = max(last - near, 0.0), max(last + beyond * near, near)
-        columns = (0.0, max(last + beyond * last, near)), (0.0, near), late
+        after = SHOWN_AFTER_LOSS * np.isfinite(ended)
+        late = max(last - near, 0.0), max(last + after * near, near)
+        columns = (0.0, max(last + after * last, near)), (0.0, near), late
         for ax, (low, high) in zip(line, columns, strict=True):
             part = stretch_of(t, low, high)
             held = alive[part]

@@ -1,1 +1,1 @@
-"""How it is minimised: screen, descent, rounds."""
+"""The search for the minimum of the goal: screen, descent, restarts and rounds."""

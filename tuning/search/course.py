@@ -1,5 +1,7 @@
-"""A course of searches: each goes on from what those before it found; looks, each around the best answer so far, for
-one may end at a cliff behind which it goes on."""
+"""A course of searches, each from the result of the previous ones, and restarts around the best point so far.
+
+Restarts are needed because a search may end at a cliff of the goal, with lower values behind it.
+"""
 
 import dataclasses
 import itertools
@@ -19,77 +21,81 @@ from tuning.objective.members import Members
 from tuning.problem import TuningProblem
 from tuning.search.keeper import Keeper, SearchState, checkpoint
 from tuning.search.optimise import best_of, search
-from tuning.search.screen import around, everywhere
+from tuning.search.screen import around, initial_points
 
-# Looks at most.
-MOST_LOOKS = 5
-# A look must gain this share of the loss; two in a row that do not are the last. One alone is chance: what it draws of
-# the neighbourhood may miss the better optimum.
+# Largest number of searches in `search_and_restart`.
+MOST_SEARCHES = 5
+# Restarts end after two searches in a row that lower the loss by less than this share. One alone may be chance: its
+# random points may miss a better optimum.
 GAIN = 0.01
-# Points of the paths of all searches that are tried with accurate steps where no answer was confirmed.
-RETREATS = 12
+# Number of earlier points tried with accurate steps if these confirm no answer.
+RETREAT_POINTS = 12
 
 
 @dataclasses.dataclass(frozen=True)
 class SearchResult:
-    """What the rounds found: gains at x [m], the problem and members that they were last judged by, and how it went."""
+    """Result of the rounds: coordinates x [m], the problem and members of the last search, the step error at x."""
 
     problem: TuningProblem
-    who: Members
+    members: Members
     x: np.ndarray
     error: StepError | None
     history: dict[str, np.ndarray]
     lost: int
-    """members of the validation ensemble, and those that accurate steps do not hold"""
+    """number of validation members that are lost, and of members that accurate steps do not hold"""
     seconds: float
-    """in all, those before a resume included"""
+    """duration of all searches in s, the time before a resume included"""
 
     @property
     def confirmed(self) -> bool:
-        """Whether accurate steps confirm it."""
+        """Whether accurate steps confirm the result."""
         return self.error is not None and not self.error.refuted
 
     @property
     def good(self) -> bool:
-        """And no more validation members are lost than may be."""
+        """Whether the result is confirmed, and no more validation members are lost than [tune.limits] allows."""
         tune = self.problem.tune
         return self.confirmed and self.lost <= tune.limits.may_lose(tune.budget.validation)
 
 
 @dataclasses.dataclass
 class Course:
-    """Searches in a row: `past`; the problem and members that they have come to; what is random has this `seed`.
+    """A sequence of searches, with the current problem and members.
 
-    Checkpoints lie in `out` (None: there are none) and hold `facts`; `resume` goes on with them.
+    `seed`: of all random numbers. `out`: directory of the checkpoints; None: no checkpoints. `facts`: the settings that
+    a checkpoint must match. `resume`: whether to continue from the checkpoints.
     """
 
     problem: TuningProblem
-    who: Members
+    members: Members
     seed: int
     out: pathlib.Path | None = None
     facts: dict[str, Any] = dataclasses.field(default_factory=dict)
     resume: bool = False
     tell: Callable[[SearchState, float], None] | None = None
-    """called after each iteration; left out: a line is said"""
+    """called after each iteration with the search and its duration in s; None: print a line"""
     past: list[SearchState] = dataclasses.field(default_factory=list)
-    asides: int = 0
-    """searches that limits asked for: no rounds"""
+    """the searches so far"""
+    limit_searches: int = 0
+    """number of searches that follow an update of the limits' multipliers, not counted as rounds"""
     began: float = dataclasses.field(default_factory=time.perf_counter)
 
     def search(self, points: np.ndarray, *, settled: bool = False) -> tuple[np.ndarray, float]:
-        """The best point [m] that a search from these [K, m] finds, and its goal; `settled`: one has ended at the
-        first."""
+        """Search from these points [K, m]. Return the best point [m] and its goal.
+
+        `settled`: whether an earlier search on all members ended at the first point.
+        """
         tune, number = self.problem.tune, len(self.past) + 1
         path = self.out / checkpoint(number) if self.out else None
         progress = search(
-            self.problem.engine, self.problem.goal, self.who, points, keep=tune.budget.starts,
+            self.problem.engine, self.problem.goal, self.members, points, keep=tune.budget.starts,
             iterations=tune.budget.iterations, name=tune.optimiser, rate=tune.learning_rate,
             seed=self.seed + len(self.past), settled=settled,
-            keeper=Keeper(path, self.facts, number), resume=self.resume, tell=self.tell or _teller(self.problem),
+            keeper=Keeper(path, self.facts, number), resume=self.resume, tell=self.tell or _progress_line(self.problem),
         )  # fmt: skip
         if progress.ended:
-            say(f"round {number}: its search had ended; what it found is taken from {path}")
-        if progress.interrupted and not progress.history:  # before anything new was found
+            say(f"round {number}: the search is complete; its result is read from {path}")
+        if progress.interrupted and not progress.history:  # interrupted before the first iteration
             if not self.past:
                 raise KeyboardInterrupt
             progress = dataclasses.replace(self.past.pop(), interrupted=True)
@@ -97,52 +103,54 @@ class Course:
         return _best(progress)
 
     def around(self, x: np.ndarray) -> np.ndarray:
-        """Points around x for the next search."""
+        """Return points [K, m] around x [m] for the next search."""
         return around(x, self.problem.tune.budget.screen, self.seed + len(self.past))
 
     @property
     def interrupted(self) -> bool:
-        """Whether Ctrl-C ended the last search."""
+        """Whether the last search was interrupted by Ctrl-C."""
         return self.past[-1].interrupted
 
     @property
-    def hopeless(self) -> bool:
-        """Whether the last search lost every member."""
+    def all_lost(self) -> bool:
+        """Whether every member is lost at the best point of the last search."""
         past = self.past[-1].history
         return int(past["lost"][-1][int(np.argmin(past["value"][-1]))]) == past["members"][-1]
 
     def answer(self, x: np.ndarray, error: StepError | None, lost: int) -> SearchResult:
-        """What x is, as far as it is known now."""
+        """Return the result x [m], with its step error and number of lost members."""
         seconds = time.perf_counter() - self.began + sum(progress.earlier for progress in self.past)
-        return SearchResult(self.problem, self.who, x, error, _joined(self.past), lost, seconds)
+        return SearchResult(self.problem, self.members, x, error, _joined(self.past), lost, seconds)
 
 
-def looks(course: Course, start: np.ndarray) -> np.ndarray:
-    """The best point [m] of a search from the gains `start` [m], and of others around it until that is worth no more.
+def search_and_restart(course: Course, start: np.ndarray) -> np.ndarray:
+    """Search from the gains `start` [m], then restart around the best point while that lowers the loss.
 
-    No others where all members are lost, or nothing is screened.
+    Returns the best point [m]. There are no restarts if all members are lost or tune.screen is 0.
     """
     problem, budget = course.problem, course.problem.tune.budget
-    x, value = course.search(everywhere(problem.objective, problem.goal.conditions, start, budget.screen, course.seed))
-    if course.hopeless or not budget.screen:
+    x, value = course.search(
+        initial_points(problem.objective, problem.goal.conditions, start, budget.screen, course.seed)
+    )
+    if course.all_lost or not budget.screen:
         return x
     seen = [(value, x)]  # on the same members, in the same steps
-    while look_again([value for value, _ in seen]) and not course.interrupted:
+    while should_restart([value for value, _ in seen]) and not course.interrupted:
         x, value = course.search(course.around(x), settled=True)
         seen.append((value, x))
         x = min(seen, key=lambda look: look[0])[1]
     return x
 
 
-def look_again(goals: Sequence[float]) -> bool:
-    """Whether another look is worth its rollouts after looks that ended at these goals, logarithms."""
+def should_restart(goals: Sequence[float]) -> bool:
+    """Return whether to restart after searches that ended at these goals (logarithms)."""
     best = [math.inf, *itertools.accumulate(goals, min)]
     gained = [before - after > GAIN for before, after in itertools.pairwise(best)]
-    return len(goals) < MOST_LOOKS and any(gained[-2:])
+    return len(goals) < MOST_SEARCHES and any(gained[-2:])
 
 
 def training(problem: TuningProblem) -> Members:
-    """The ensemble that is tuned on: ordinary members, then stressed ones."""
+    """Return the training ensemble: ordinary members, then stressed ones."""
     tune = problem.tune
     return problem.objective.training(
         tune.budget.seed, tune.budget.members, tune.budget.stressed, tune.stress, tune.gain_margin
@@ -150,11 +158,11 @@ def training(problem: TuningProblem) -> Members:
 
 
 def points_of(past: list[SearchState]) -> np.ndarray:
-    """Points [K, m] that the searches were at, best first: the best ones, and fewer and fewer of the others."""
+    """Return points [K, m] of the searches' paths, best first, denser among the better ones."""
     x = np.concatenate([np.asarray(one.history["x"]).reshape(-1, one.starts.best.shape[-1]) for one in past])
     value = np.concatenate([np.asarray(one.history["value"]).ravel() for one in past])
     _, first = np.unique(np.where(np.isfinite(value), value, np.inf), return_index=True)
-    chosen = np.unique((np.linspace(0, np.sqrt(len(first) - 1), RETREATS).round(6) ** 2).astype(int))
+    chosen = np.unique((np.linspace(0, np.sqrt(len(first) - 1), RETREAT_POINTS).round(6) ** 2).astype(int))
     return x[first[chosen]]
 
 
@@ -162,14 +170,14 @@ def _best(progress: SearchState) -> tuple[np.ndarray, float]:
     x, value = best_of(progress)
     if not np.isfinite(value):
         raise ValueError(
-            "tune: the loss or its derivative is not a finite number at any start that was tried. Look at the case "
-            "with 'ambjax simulate' (does u chatter?), or change tune.screen and tune.bounds."
+            "tune: the loss or its derivative is not finite at any starting point. Check the case with 'ambjax "
+            "simulate' (for chattering of u), or change tune.screen and tune.bounds."
         )
     return x, value
 
 
 def _joined(past: list[SearchState]) -> dict[str, np.ndarray]:
-    """The histories of all rounds in a row; a round with fewer starts repeats its own."""
+    """Concatenate the histories of all searches. A search with fewer starts repeats its first one."""
     width = max(len(one.active) for one in past)
 
     def wide(rows: Any) -> np.ndarray:
@@ -180,8 +188,8 @@ def _joined(past: list[SearchState]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([wide(one.history[name]) for one in past if one.history]) for name in names}
 
 
-def _teller(problem: TuningProblem) -> Callable[[SearchState, float], None]:
-    """What is said after each iteration."""
+def _progress_line(problem: TuningProblem) -> Callable[[SearchState, float], None]:
+    """Return the callback that prints a line after each iteration."""
     scale = float(np.asarray(problem.objective.loss.s_0))
     budget, spent = problem.tune.budget, []
 
@@ -192,7 +200,7 @@ def _teller(problem: TuningProblem) -> Callable[[SearchState, float], None]:
         last = {name: rows[-1] for name, rows in progress.history.items()}
         best, count = int(np.argmin(last["value"])), int(last["members"])
         done, going = progress.iteration - progress.since, progress.active.sum()
-        # the first iteration compiles, and says nothing about the others
+        # leave out the first iteration, which compiles
         each = float(np.median(spent[1:])) if len(spent) > 1 else math.nan
         left = (budget.iterations - done) * each * going / len(progress.active)
         wait = f", at most {left:.0f} s left in this phase" if math.isfinite(left) else ""

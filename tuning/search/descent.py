@@ -1,4 +1,4 @@
-"""Descent: where a start is tried next, from the losses and derivatives of the members at its last trial."""
+"""Descent: the next trial of each start, from the losses and derivatives of the members at its last trial."""
 
 import functools
 from typing import Any, NamedTuple
@@ -13,8 +13,11 @@ from tuning.optimisers import Curvature, Retreat, optimiser
 
 
 class Starts(NamedTuple):
-    """All starts: the point to try [S, m], the optimiser's state, the distance from the best point to the trial [S],
-    and the norm of the goal's gradient at the best point [S]."""
+    """State of all starts.
+
+    `trial` [S, m]: next points. `state`: of the optimiser. `length` [S]: distance from the best point to the trial.
+    `rise` [S]: norm of the goal's gradient at the best point.
+    """
 
     trial: Array
     state: Curvature | Retreat
@@ -28,34 +31,35 @@ class Starts(NamedTuple):
 
     @property
     def value(self) -> Array:
-        """The goal there [S]; +inf where nothing was tried."""
+        """The goal at the best points [S]; +inf before the first trial."""
         return self.state.value
 
 
 class Descent:
-    """Starts that descend, each on its own, by the optimiser of this name; compiled once."""
+    """Independent descents of several starts by the optimiser `name` with the learning rate `rate`; compiled once."""
 
     def __init__(self, goal: Goal, name: str, rate: float):
         self.goal, self.method = goal, optimiser(name, rate)
 
     @functools.partial(jax.jit, static_argnums=0)
     def begin(self, x: Array) -> Starts:
-        """At coordinates x [S, m]."""
+        """Return the initial state at coordinates x [S, m]."""
         state: Any = jax.vmap(self.method.init)(x)
         infinite = jnp.full(len(x), jnp.inf, x.dtype)
         return Starts(x, state, infinite, infinite)
 
     @functools.partial(jax.jit, static_argnums=0)
-    def anew(self, x: Array, starts: Starts) -> Starts:
-        """At coordinates x [S, m], for another goal that has the curvature of the one that these starts descended."""
+    def restarted(self, x: Array, starts: Starts) -> Starts:
+        """Return the initial state at coordinates x [S, m] with the curvature of `starts`, for a similar goal."""
         begun = self.begin(x)
-        return begun._replace(state=jax.vmap(lambda old, fresh: old.anew(fresh))(starts.state, begun.state))
+        return begun._replace(state=jax.vmap(lambda old, fresh: old.restarted(fresh))(starts.state, begun.state))
 
     @functools.partial(jax.jit, static_argnums=(0, 1))
     def step(self, ordinary: int, starts: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
-        """What outcomes [S, N, 1 + L] and slopes [S, N, 1 + L, m] at the trials make of the starts that are `on` [S].
+        """Return the starts after one step of those that are `on` [S].
 
-        The first `ordinary` of the members are not stressed.
+        `outcomes` [S, N, 1 + L] and `slopes` [S, N, 1 + L, m] are those at the trials. The first `ordinary` members are
+        not stressed.
         """
         return jax.vmap(functools.partial(self._one, ordinary))(starts, outcomes, slopes, on)
 

@@ -1,7 +1,7 @@
-"""CMA-ES: a search by values alone, for goals whose derivatives do not lead to a minimum.
+"""CMA-ES: a derivative-free search, for goals whose derivatives do not lead to a minimum.
 
-A population is drawn from a normal distribution; its better half moves the mean, and adapts covariance and size. The
-parameters are the defaults of N. Hansen, The CMA Evolution Strategy: A Tutorial, arXiv:1604.00772 (2023), Table 1,
+A population is drawn from a normal distribution. Its better half updates the mean, the covariance and the step size.
+The parameters are the defaults of N. Hansen, The CMA Evolution Strategy: A Tutorial, arXiv:1604.00772 (2023), Table 1,
 without negative weights.
 """
 
@@ -12,26 +12,26 @@ import numpy as np
 
 # Standard deviation of the first population in each coordinate: a factor of e^0.3 of a gain.
 SIZE = 0.3
-# A search has converged when the better half of no population is better, by this share of the goal, than those before.
+# A search has converged if the level of PATIENCE populations in a row does not fall by the share STALL of the goal.
 STALL, PATIENCE = 0.01, 6
 
 
 class Cloud(NamedTuple):
-    """The distribution: mean [m], size, covariance [m, m] in units of size^2, and the two paths of the mean [m]."""
+    """State of the distribution: mean [m], step size, covariance [m, m] in units of size^2, evolution paths [m]."""
 
     mean: Any
     size: Any
     covariance: Any
     path: Any
-    """of the mean in coordinates of unit covariance, by which the size is adapted"""
+    """evolution path in coordinates of unit covariance, which adapts the step size"""
     drift: Any
-    """of the mean itself, by which the covariance is"""
+    """evolution path of the mean, which adapts the covariance"""
     drawn: Any
-    """populations so far; -1: none will be"""
+    """number of populations so far; -1: the start does not use CMA-ES"""
     level: Any
-    """weighted mean of the better half of a population, the lowest so far but for less than STALL"""
+    """lowest weighted mean of the better half of a population, updated only if it falls by STALL"""
     stale: Any
-    """populations since then"""
+    """number of populations since the last update of `level`"""
 
     @property
     def reach(self) -> float:
@@ -40,12 +40,12 @@ class Cloud(NamedTuple):
 
     @property
     def converged(self) -> bool:
-        """Whether it stalls: by populations, of which a single point may be better by chance."""
+        """Whether the search stalls. Populations decide, since a single point may be better by chance."""
         return bool(self.stale >= PATIENCE)
 
 
 class Rates(NamedTuple):
-    """Of a space of m dimensions: weights of the better half [h], their effective number and the learning rates."""
+    """Parameters in m dimensions: weights of the better half [h], their effective number, and the learning rates."""
 
     weights: np.ndarray
     effective: float
@@ -57,7 +57,7 @@ class Rates(NamedTuple):
 
 
 def rates(m: int) -> Rates:
-    """The defaults for m dimensions."""
+    """Return the default parameters for m dimensions."""
     half = population(m) // 2
     weights = math.log((population(m) + 1) / 2) - np.log(np.arange(1, half + 1))
     weights = weights / weights.sum()
@@ -71,31 +71,31 @@ def rates(m: int) -> Rates:
 
 
 def population(m: int) -> int:
-    """Points that are drawn at once in m dimensions."""
+    """Return the population size in m dimensions."""
     return 4 + int(3 * math.log(m))
 
 
 def begun(mean: np.ndarray) -> Cloud:
-    """The first distribution, about a point [m]."""
+    """Return the initial distribution around a point [m]."""
     m = len(mean)
     return Cloud(mean, np.array(SIZE), np.eye(m), np.zeros(m), np.zeros(m), np.array(0), np.array(np.inf), np.array(0))
 
 
 def clouds(starts: int, m: int) -> Cloud:
-    """Of so many starts in m dimensions, leaves [starts, ...]: none has begun."""
+    """Return the distributions of several starts in m dimensions, leaves [starts, ...], none of them in use."""
     one = begun(np.zeros(m))._replace(drawn=np.array(-1))
     return Cloud(*(np.repeat(np.asarray(leaf)[None], starts, axis=0) for leaf in one))
 
 
 def drawn(cloud: Cloud, seed: int) -> np.ndarray:
-    """The next population [n, m]."""
+    """Return the next population [n, m]."""
     m = len(cloud.mean)
     normal = np.random.default_rng([seed, int(cloud.drawn)]).standard_normal((population(m), m))
     return cloud.mean + cloud.size * normal @ _root(cloud.covariance).T
 
 
 def moved(cloud: Cloud, points: np.ndarray, values: np.ndarray) -> Cloud:
-    """The distribution that the values [n] at its last population, points [n, m], make of it."""
+    """Return the distribution updated with the values [n] at its last population `points` [n, m]."""
     m, now = len(cloud.mean), int(cloud.drawn) + 1
     r = rates(m)
     order = np.argsort(values, kind="stable")[: len(r.weights)]
@@ -118,6 +118,6 @@ def moved(cloud: Cloud, points: np.ndarray, values: np.ndarray) -> Cloud:
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
-    """The symmetric square root of a covariance [m, m]."""
+    """Return the symmetric square root of a covariance [m, m]."""
     squares, axes = np.linalg.eigh((covariance + covariance.T) / 2)
     return (axes * np.sqrt(np.maximum(squares, 1e-20))) @ axes.T

@@ -1,4 +1,4 @@
-"""What surrounds the optimum: slices of the loss, sensitivities, and the front of error against voltage."""
+"""The neighbourhood of the optimum: slices of the goal, sensitivities, and the Pareto front of error and voltage."""
 
 import dataclasses
 from typing import Any
@@ -22,31 +22,32 @@ REACH = np.linspace(-1.5, 1.5, 13)
 
 @dataclasses.dataclass(frozen=True)
 class Slices:
-    """The goal along each gain through the optimum: gains [m, k], goals [m, k] (logs), lost members [m, k]."""
+    """Slices of the goal along each gain through the optimum: gains, goals (logs) and lost members, each [m, k]."""
 
     gains: np.ndarray
     goals: np.ndarray
     lost: np.ndarray
 
     def sensitivity(self) -> np.ndarray:
-        """By how much the risk grows, in per cent, when a gain is off by a factor e^0.25: the worse side, [m].
+        """Return the growth of the risk in per cent when a gain is off by a factor e^0.25, the worse side, [m].
 
-        Of a gain with `more_lost` it is no measure: losing a rotor costs some 1e6 times an error.
+        It has no meaning for a gain with `more_lost` > 0: the loss of a rotor costs about 1e6 times an error.
         """
         middle = len(REACH) // 2
         beside = np.maximum(self.goals[:, middle - 1], self.goals[:, middle + 1])
         return 100 * np.expm1(beside - self.goals[:, middle])
 
     def more_lost(self) -> np.ndarray:
-        """Members lost beyond those of the answer when a gain is off by a factor e^0.25: the worse side, [m]."""
+        """Return the number of additional lost members when a gain is off by a factor e^0.25, the worse side, [m]."""
         middle = len(REACH) // 2
         beside = np.maximum(self.lost[:, middle - 1], self.lost[:, middle + 1])
         return np.maximum(beside - self.lost[:, middle], 0)
 
     def lowest(self) -> tuple[int, int, float]:
-        """Gain and point of its slice where the goal is lowest, and by how much, a logarithm; 0 where nothing is lower.
+        """Return the gain and the point of its slice with the lowest goal, and the decrease of the goal there.
 
-        Points that lose more members than the answer do not count.
+        The decrease is a logarithm, and 0 if no point is lower. Points that lose more members than the optimum do not
+        count.
         """
         middle = len(REACH) // 2
         drop = np.where(self.lost <= self.lost[:, [middle]], self.goals[:, [middle]] - self.goals, 0.0)
@@ -54,27 +55,26 @@ class Slices:
         return int(j), int(k), max(float(drop[j, k]), 0.0)
 
 
-def slices(problem: TuningProblem, x: np.ndarray, who: Members) -> Slices:
-    """Slices through x [m], one gain at a time."""
+def slices(problem: TuningProblem, x: np.ndarray, members: Members) -> Slices:
+    """Return the slices of the goal through x [m], one gain at a time."""
     m, space = len(x), problem.objective.space
     at = np.repeat(x[None], m * len(REACH), axis=0)
     for j in range(m):
         at[j * len(REACH) : (j + 1) * len(REACH), j] += REACH
-    terms = problem.engine.terms(at, who)
-    goals = problem.goal.score(at, terms, who).reshape(m, -1)
+    terms = problem.engine.terms(at, members)
+    goals = problem.goal.score(at, terms, members).reshape(m, -1)
     gains = np.stack([np.asarray(space.gains_at(jnp.asarray(one))) for one in at])
     own = np.stack([gains[j * len(REACH) : (j + 1) * len(REACH), j] for j in range(m)])
     return Slices(own, goals, (terms["survival"] > 0).sum(axis=1).reshape(m, -1))
 
 
 def pareto(
-    problem: TuningProblem, x: np.ndarray, who: Members, *, points: int = 6, iterations: int = 8
+    problem: TuningProblem, x: np.ndarray, members: Members, *, points: int = 6, iterations: int = 8
 ) -> list[dict[str, Any]]:
-    """The front of settled tracking error against rms voltage: a family of weights of the effort, refined at once.
+    """Return the Pareto front of settled rms error and rms voltage, from optima for several weights of the effort.
 
-    The first has the search's own; voltage at its limit is worth from as much as the error to a thousand times that.
-    Each is judged on the members of the training ensemble itself, none stressed, in the finer steps: on those that it
-    holds. A point that holds none is left out.
+    The first point has the search's own weight, the others 1 to 1000. All are refined at once. Each is judged in the
+    judge's steps on the ordinary training members that it holds. A point that holds no member is left out.
     """
     space = problem.objective.space
     weights = np.tile(problem.goal.weights, (points, 1))
@@ -83,10 +83,10 @@ def pareto(
     family = SearchState(descent.begin(jnp.tile(jnp.asarray(x), (points, 1))), np.ones(points, bool))
     for _ in range(iterations):
         if family.active.any():
-            iterate(problem.engine, problem.goal, who, family, descent, weights)
+            iterate(problem.engine, problem.goal, members, family, descent, weights)
             family.active &= np.asarray(family.starts.length) > SHORTEST
     best = np.asarray(family.starts.best)
-    metrics = problem.judging.metrics(best, who.unstressed)["metrics"]
+    metrics = problem.judging.metrics(best, members.unstressed)["metrics"]
     alive = held(metrics)
     rows = [
         {

@@ -1,4 +1,4 @@
-"""One iteration of a search: a step of the starts that descend, a population of those that go on by CMA-ES."""
+"""One iteration of a search: a step of each descending start, and a population of each start that uses CMA-ES."""
 
 import jax
 import jax.numpy as jnp
@@ -16,52 +16,59 @@ from tuning.search.keeper import SearchState
 def iterate(
     engine: Engine,
     goal: Goal,
-    who: Members,
+    members: Members,
     progress: SearchState,
     descent: Descent,
     weights: np.ndarray | None = None,
     seed: int = 0,
 ) -> None:
-    """One iteration of all active starts, which `progress` then holds. `weights` [S, 6]: each start has its own."""
+    """Run one iteration of all active starts and update `progress`.
+
+    `weights` [S, 6]: of the terms for each start; None: those of the goal. `seed`: of the populations.
+    """
     fresh = progress.iteration == progress.since
-    better = _descended(engine, goal, who, progress, descent, weights) | _evolved(engine, goal, who, progress, seed)
-    record(engine, who, progress, better, fresh=fresh)
+    better = _descended(engine, goal, members, progress, descent, weights) | _evolved(
+        engine, goal, members, progress, seed
+    )
+    record(engine, members, progress, better, fresh=fresh)
 
 
 def _descended(
     engine: Engine,
     goal: Goal,
-    who: Members,
+    members: Members,
     progress: SearchState,
     descent: Descent,
     weights: np.ndarray | None,
 ) -> dict[int, dict[str, np.ndarray]]:
-    """One step of the starts that descend. Returns the terms [N] by name of those that have a better point."""
+    """Run one step of the descending starts. Return the terms [N] by name of each start that improves."""
     starts, on = progress.starts, progress.active & ~progress.evolving
     active = np.flatnonzero(on)
     if not active.size:
         return {}
     trial = np.asarray(starts.trial)
-    losses, slopes, terms = engine.gradient(trial[active], who, goal.weights if weights is None else weights[active])
+    losses, slopes, terms = engine.gradient(
+        trial[active], members, goal.weights if weights is None else weights[active]
+    )
     full = np.full((len(trial), *losses.shape[1:]), np.nan), np.full((len(trial), *slopes.shape[1:]), np.nan)
     for whole, part in zip(full, (losses, slopes), strict=True):
         whole[active] = part
-    progress.starts = descent.step(who.ordinary, starts, *full, on)
+    progress.starts = descent.step(members.ordinary, starts, *full, on)
     better = np.flatnonzero((np.asarray(progress.starts.value) < np.asarray(starts.value))[active])
     return {int(active[row]): {name: terms[name][row] for name in TERMS} for row in better}
 
 
 def _evolved(
-    engine: Engine, goal: Goal, who: Members, progress: SearchState, seed: int
+    engine: Engine, goal: Goal, members: Members, progress: SearchState, seed: int
 ) -> dict[int, dict[str, np.ndarray]]:
-    """One population of each start that goes on by CMA-ES; returns what `_descended` does."""
+    """Evaluate one population of each start that uses CMA-ES. Return the same as `_descended`."""
     active = np.flatnonzero(progress.active & progress.evolving)
     if not active.size:
         return {}
     own = [progress.cloud(at) for at in active]
     points = [drawn(cloud, seed + int(at)) for cloud, at in zip(own, active, strict=True)]
-    terms = engine.terms(np.concatenate(points), who)
-    values = goal.score(np.concatenate(points), terms, who).reshape(len(points), -1)
+    terms = engine.terms(np.concatenate(points), members)
+    values = goal.score(np.concatenate(points), terms, members).reshape(len(points), -1)
     best, value, length = (np.array(x) for x in (progress.starts.best, progress.starts.value, progress.starts.length))
     better = {}
     for row, at in enumerate(active):
@@ -79,28 +86,28 @@ def _evolved(
 
 def record(
     engine: Engine,
-    who: Members,
+    members: Members,
     progress: SearchState,
     better: dict[int, dict[str, np.ndarray]],
     *,
     fresh: bool = False,
 ) -> None:
-    """Add a row to the history: of each start its best point; of those that are `better`, its terms [N] by name.
+    """Add a row to the history with the best point of each start.
 
-    `fresh`: what the row before says is of other members.
+    `better`: terms [N] by name of each start that improved. `fresh`: whether the previous row belongs to other members.
     """
     past, count = progress.history, len(progress.active)
-    lost = np.full(count, len(who.member)) if fresh else np.array(past["lost"][-1])
+    lost = np.full(count, len(members.member)) if fresh else np.array(past["lost"][-1])
     means = np.full((count, len(TERMS)), np.nan) if fresh else np.array(past["terms"][-1])
     for at, terms in better.items():
         lost[at] = int((terms["survival"] > 0).sum())
-        means[at] = [terms[name][: who.ordinary].mean() for name in TERMS]
+        means[at] = [terms[name][: members.ordinary].mean() for name in TERMS]
     row = {
         "value": np.asarray(progress.starts.value),
         "x": np.asarray(progress.starts.best),
         "gains": np.asarray(jax.vmap(engine.objective.space.gains_at)(progress.starts.best)),
         "lost": lost,
-        "members": np.array(len(who.member)),
+        "members": np.array(len(members.member)),
         "terms": means,
         "rollouts": np.array(engine.rollouts),
     }

@@ -1,4 +1,4 @@
-"""A search under way and its checkpoint: a sealed file, so that what is gone on with is what was left."""
+"""The state of a search and its checkpoint, a file with a checksum."""
 
 import dataclasses
 import json
@@ -16,20 +16,21 @@ from tuning.objective.loss import TERMS
 from tuning.search.descent import Descent, Starts
 from tuning.search.evolution import Cloud, clouds
 
-# What a checkpoint holds of a search beside arrays and history.
+# Scalar fields of SearchState in a checkpoint.
 COUNTS = ("iteration", "phase", "since", "seconds")
 FACTS = {"fingerprint", "round", "counts"}
 NAME = re.compile(r"checkpoint-[0-9]+\.npz")
-# Marks the directory of a search from its beginning on, before there is a checkpoint.
+# File that marks the directory of a search before its first checkpoint.
 MARK = "search.json"
 LEAF, PAST, ACTIVE = "leaf_", "history_", "active"
 
 
 @dataclasses.dataclass
 class SearchState:
-    """A search under way. `history` holds one row per iteration; everything else can be read off a checkpoint.
+    """State of a search.
 
-    `since`: the iteration after which the phase began; `seconds` spent on it so far, `earlier` of them before a resume.
+    `active` [S]: starts that continue. `history`: one row per iteration. `since`: iteration after which the phase
+    began. `seconds`: duration so far; `earlier`: the part of it before a resume.
     """
 
     starts: Starts
@@ -42,7 +43,7 @@ class SearchState:
     earlier: float = 0.0
     interrupted: bool = False
     clouds: Cloud = None  # pyright: ignore[reportAssignmentType]
-    """of the starts that go on by CMA-ES, leaves [S, ...]"""
+    """CMA-ES distributions of the starts, leaves [S, ...]"""
 
     def __post_init__(self) -> None:
         if self.clouds is None:
@@ -50,11 +51,11 @@ class SearchState:
 
     @property
     def evolving(self) -> np.ndarray:
-        """Which starts go on by CMA-ES [S]."""
+        """Whether each start uses CMA-ES [S]."""
         return self.clouds.drawn >= 0
 
     def cloud(self, at: Any) -> Cloud:
-        """The distribution of one start."""
+        """Return the distribution of one start."""
         return Cloud(*(leaf[at] for leaf in self.clouds))
 
     def put(self, at: Any, cloud: Cloud) -> None:
@@ -64,19 +65,22 @@ class SearchState:
 
     @property
     def ended(self) -> bool:
-        """Whether a checkpoint was all of it: nothing has been done since."""
+        """Whether the search was complete in its checkpoint, so that a resume adds nothing."""
         return self.earlier > 0 and self.seconds == self.earlier
 
 
 class Keeper:
-    """The checkpoint of round number `round` of what `facts` tell (nested, with names): written whole or not at all."""
+    """Reads and writes the checkpoint of round number `round`. It is replaced atomically.
+
+    `path`: of the file; None: no checkpoint. `facts`: nested settings that a checkpoint must match to be resumed.
+    """
 
     def __init__(self, path: pathlib.Path | None, facts: dict[str, Any], round: int = 1):
         self.path, self.round = path, round
         self.fingerprint = flat({**provenance(), **facts})
 
     def save(self, progress: SearchState) -> None:
-        """Keep this state instead of the one before. Raises ValueError if it cannot be written."""
+        """Write this state to the checkpoint. Raises ValueError if it cannot be written."""
         if self.path is None:
             return
         leaves = {
@@ -88,9 +92,10 @@ class Keeper:
         seal(self.path, {**leaves, **past, ACTIVE: progress.active}, facts)
 
     def load(self, descent: Descent, starts: int, m: int) -> SearchState | None:
-        """The search so far, of so many starts in m coordinates; None, with a line that says why, if it is damaged.
+        """Return the saved search of `starts` starts in m coordinates, or None if there is none.
 
-        Raises ValueError if it belongs to another problem.
+        If the checkpoint is damaged, prints the reason and returns None. Raises ValueError if it belongs to another
+        problem.
         """
         if self.path is None or not self.path.exists():
             return None
@@ -113,31 +118,31 @@ class Keeper:
 
 
 def begin(directory: pathlib.Path) -> None:
-    """Mark a directory as that of a search, so that a search that is killed from here on can be resumed.
+    """Mark a directory as that of a search, so that the search can be resumed even before its first checkpoint.
 
-    Raises ValueError where it cannot be written.
+    Raises ValueError if the mark cannot be written.
     """
     text = json.dumps(provenance(), indent=2) + "\n"
     write_whole(directory / MARK, lambda file: file.write(text.encode()))
 
 
 def begun(directory: pathlib.Path) -> bool:
-    """Whether a search has begun in this directory, so that --resume has something to go on with."""
+    """Return whether a search has begun in this directory and can be resumed."""
     return (directory / MARK).exists()
 
 
 def checkpoint(number: int) -> str:
-    """Name of the checkpoint of this round."""
+    """Return the file name of the checkpoint of this round."""
     return f"checkpoint-{number}.npz"
 
 
 def checkpoints(directory: pathlib.Path) -> list[pathlib.Path]:
-    """Those of a search in this directory: files with such names, and no others."""
+    """Return the checkpoint files of a search in this directory."""
     return sorted(path for path in directory.glob("checkpoint-*.npz") if NAME.fullmatch(path.name) and path.is_file())
 
 
 def unfinished(directory: pathlib.Path, report: str) -> bool:
-    """Whether a directory holds a search that may be gone on with: checkpoints, and no later file of this name."""
+    """Return whether a directory holds a search that has not ended: checkpoints newer than the file `report`."""
     left, ended = checkpoints(directory), directory / report
     return bool(left) and not (
         ended.exists() and ended.stat().st_mtime_ns >= max(path.stat().st_mtime_ns for path in left)
@@ -145,7 +150,7 @@ def unfinished(directory: pathlib.Path, report: str) -> bool:
 
 
 def remove_all(directory: pathlib.Path) -> int:
-    """Remove checkpoints of a search that nobody goes on with. Returns how many there were."""
+    """Remove the checkpoints of a search. Return their number."""
     left = checkpoints(directory)
     for path in left:
         path.unlink()
@@ -155,7 +160,7 @@ def remove_all(directory: pathlib.Path) -> int:
 def _progress(
     arrays: dict[str, np.ndarray], counts: dict[str, Any], descent: Descent, starts: int, m: int
 ) -> SearchState:
-    """Raises DamagedError where these are not the arrays of such a search."""
+    """Return the search in these arrays. Raises DamagedError if their names, types or shapes do not fit."""
     there = shapes(arrays)
     kinds = jax.eval_shape(descent.begin, jnp.zeros((starts, m))), clouds(starts, m)
     leaves, tree = jax.tree.flatten(kinds)

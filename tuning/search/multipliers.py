@@ -1,6 +1,7 @@
-"""Limits at an optimum: what is reached by the judge's own measure, and the search goes on until all are met.
+"""The method of multipliers: update the limits' multipliers at an optimum and search again until all limits are met.
 
-An optimum exceeds its limits by about (what the multiplier must be - what it is) / penalty; an update closes that gap.
+The limited quantities are those of the judge. An optimum exceeds a limit by about (required multiplier - multiplier) /
+penalty, which an update corrects.
 """
 
 import numpy as np
@@ -8,68 +9,75 @@ import numpy as np
 from ambjax.commands.outputs import say
 from tuning.config import seeds
 from tuning.judge import judge
-from tuning.objective.limits import BELOW, PENALTY, PREFIX, Limit
+from tuning.objective.limits import PENALTY, PREFIX, TOLERANCE_BELOW, Limit
 from tuning.search.course import Course
 
-# Updates of the multipliers at one place, at most.
+# Largest number of updates of the multipliers in one round.
 MOST_UPDATES = 6
-# What an excess must fall by.
-LEAST = 1e-3
-# An average that is this share below its limit is not judged: it hardly varies over members.
-FAR = 0.1
-# Members that judge averages.
-FEW = 256
+# Decrease of g below which an excess counts as unchanged.
+LEAST_DECREASE = 1e-3
+# Averages that are below their limits by this g or more are not judged, because they hardly vary over members.
+CLEARLY_BELOW = 0.1
+# Members of the ensemble that judges averages.
+AVERAGING_MEMBERS = 256
 
 
 def limited(course: Course, x: np.ndarray) -> np.ndarray:
-    """What searches from x [m] find once every limit pulls as strongly as it must; x itself where none is near."""
+    """Search from x [m] until every limit is met, with updates of the multipliers. Return x itself if none is near."""
     for _ in range(MOST_UPDATES):
         goal = course.problem.goal
         numbers = _numbers(course, x)
-        limits = tuple(limit.informed(*found) for limit, found in zip(goal.limits, numbers, strict=True))
+        limits = tuple(limit.updated(*found) for limit, found in zip(goal.limits, numbers, strict=True))
         stuck = [limit for limit, (_, judged) in zip(goal.limits, numbers, strict=True) if _stuck(limit, judged)]
         if stuck:
             names = ", ".join(limit.name for limit in stuck)
-            say(f"a steeper pull has not lowered {names}: its multiplier stays, and the held-out members judge it")
+            say(f"a larger penalty has not lowered {names}: its multiplier stays, and the held-out members judge it")
             break
         course.problem = course.problem.limited(limits)
         done = []
         for before, after, (_, judged) in zip(goal.limits, limits, numbers, strict=True):
             idle = before.multiplier == after.multiplier == 0
-            done.append(_met(after, judged) or (idle and after.beyond(judged) <= 0))
+            done.append(_met(after, judged) or (idle and after.log_excess(judged) <= 0))
             if not (idle and done[-1]):
                 say(f"limit {after.name} = {after.asked:g} {after.kind.unit}: {judged:.4g} on members of another seed")
         if course.interrupted or all(done):
             break
-        course.asides += 1
+        course.limit_searches += 1
         x, _ = course.search(x[None])
     return x
 
 
 def _stuck(limit: Limit, judged: float) -> bool:
-    """Whether a limit is exceeded as it was before its pull became steeper."""
-    excess = limit.beyond(judged)
-    return limit.penalty > PENALTY and excess > limit.margin + LEAST and 0 < limit.missed < excess + LEAST
+    """Return whether a limit is exceeded as much as before its penalty grew."""
+    excess = limit.log_excess(judged)
+    return (
+        limit.penalty > PENALTY
+        and excess > limit.margin + LEAST_DECREASE
+        and 0 < limit.missed < excess + LEAST_DECREASE
+    )
 
 
 def _met(limit: Limit, judged: float) -> bool:
-    """Whether what is allowed is held, and made use of."""
-    return -BELOW <= limit.beyond(judged) <= limit.margin / 2
+    """Return whether the limit holds and is used up."""
+    return -TOLERANCE_BELOW <= limit.log_excess(judged) <= limit.margin / 2
 
 
 def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
-    """What each limit reaches at x [m], as the search measures it, and as a judge does on members of another seed."""
+    """Return each limited quantity at x [m] as (the search's value, the judge's value on members of another seed)."""
     problem, budget = course.problem, course.problem.tune.budget
-    limits, n = problem.goal.limits, course.who.ordinary
+    limits, n = problem.goal.limits, course.members.ordinary
     if not limits:
         return []
-    terms = problem.engine.terms(x[None], course.who)
+    terms = problem.engine.terms(x[None], course.members)
     tuned = [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in limits]
     known = [limit.ratio * ours for limit, ours in zip(limits, tuned, strict=True)]
-    if all(not limit.kind.worst and limit.beyond(one) < -FAR for limit, one in zip(limits, known, strict=True)):
+    if all(
+        not limit.kind.worst and limit.log_excess(one) < -CLEARLY_BELOW
+        for limit, one in zip(limits, known, strict=True)
+    ):
         return list(zip(tuned, known, strict=True))
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
     if not any(limit.kind.worst for limit in limits):
-        count = min(count, FEW)
+        count = min(count, AVERAGING_MEMBERS)
     columns = judge(problem, x, seed, count)
     return [(ours, limit.reached(columns)) for limit, ours in zip(limits, tuned, strict=True)]

@@ -1,4 +1,4 @@
-"""Where to start: the case's own gains, informed ones, and quasi-random points over decades around them."""
+"""Starting points: the case's gains, the middle of the search ranges, and quasi-random points."""
 
 import numpy as np
 
@@ -9,18 +9,18 @@ from tuning.objective.members import Members, Objective
 from tuning.objective.ranges import drawn, ranges
 from tuning.objective.shortfalls import Bound
 
-# Share of the members that points meet, and share of the points that goes on: 1/4 after an eighth of the members.
+# Rounds of successive halving (a, b): one member in a is simulated, and one point in b is kept.
 ROUNDS = (8, 4), (4, 1)
-# How far from a point its neighbourhoods reach, in coordinates: factors of e^1.5 up or down of each gain, and of e^3.
+# Half-widths of the two neighbourhoods of a point, in coordinates: factors of e^1.5 and e^3 of each gain.
 NEAR, FAR = 1.5, 3.0
 
 
-def everywhere(
+def initial_points(
     objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray, count: int, seed: int
 ) -> np.ndarray:
-    """Coordinates [count + 2, m]: the case's gains, the middle of the ranges, and quasi-random points over them.
+    """Return coordinates [count + 2, m]: the gains `start` [m], the middle of the ranges, and quasi-random points.
 
-    With count 0 the case's gains alone, [1, m].
+    If `count` is 0, only the gains `start`, [1, m].
     """
     space = objective.space
     if not count:
@@ -33,7 +33,7 @@ def everywhere(
 
 
 def around(x: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Coordinates [count + 1, m]: x, and quasi-random points around it, NEAR and FAR by turns."""
+    """Return coordinates [count + 1, m]: x [m], and quasi-random points within NEAR and FAR of it in turn."""
     if not count:
         return x[None]
     cube = points("sobol", seed, len(x), np.arange(count), count)
@@ -41,13 +41,13 @@ def around(x: np.ndarray, count: int, seed: int) -> np.ndarray:
     return np.concatenate([x[None], x + reach * (2 * cube - 1)])
 
 
-def screen(engine: Engine, who: Members, x: np.ndarray, keep: int, goal: Goal) -> np.ndarray:
-    """The best of points x [K, m], at least `keep`, best first, by successive halving: on few members, then on more.
+def screen(engine: Engine, members: Members, x: np.ndarray, keep: int, goal: Goal) -> np.ndarray:
+    """Return the best of points x [K, m], at least `keep`, best first, by successive halving over members.
 
-    Some of the stressed members are there from the first: to be held is what is asked first.
+    Each round includes stressed members.
     """
     for part, left in ROUNDS:
-        some = who.part(part)
+        some = members.part(part)
         values = goal.score(x, engine.terms(x, some), some)
         x = x[np.argsort(values, kind="stable")[: max(len(x) // left, 2 * keep)]]
     return x
