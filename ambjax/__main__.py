@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any, NoReturn
 
 from ambjax._version import __version__
-from ambjax.host.interrupts import listening
+from ambjax.host.interrupts import exit_on_interrupt
 from ambjax.host.streams import lenient, open_streams
 from ambjax.host.words import one_line
 
@@ -106,7 +106,7 @@ def main(argv: list[str] | None = None) -> int:
     if words[:1] == ["tune"]:
         return _extension("tune")(words[1:], "ambjax tune")
     open_streams()
-    with listening("ambjax"):
+    with exit_on_interrupt("ambjax"):
         return answer(parser(), words, _run)
 
 

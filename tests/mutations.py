@@ -1754,7 +1754,7 @@ SURROUNDINGS = [
     M(
         "Ctrl-C between two files leaves a mix",
         "ambjax/commands/outputs.py",
-        "with unbroken():",
+        "with uninterrupted():",
         "with contextlib.nullcontext():",
         "tests/test_surroundings.py::test_files_move_all_or_not_at_all",
     ),

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
-from ambjax.ensemble import shares, spearman
+from ambjax.ensemble import shares
 from ambjax.ensemble.drivers import drivers
 
 RNG = np.random.default_rng(11)
@@ -109,32 +108,3 @@ def test_nothing_spread_and_few_members():
 def test_shares_refuse_what_is_infinite():
     with pytest.raises(ValueError, match="not finite"):
         shares([np.arange(9.0)], [np.array([np.inf] * 9)])
-
-
-@pytest.mark.parametrize("n", [3, 10, 500])
-def test_spearman_is_scipy_s_ties_included(n):
-    x = [RNG.normal(size=n), RNG.integers(3, size=n), np.arange(n)]
-    y = [x[0] ** 3 + RNG.normal(size=n), np.exp(x[2] / n), np.where(RNG.random(n) < 0.3, np.inf, x[2])]
-    rho, p = spearman(x, y)
-    for a in range(3):
-        for b in range(3):
-            if np.ptp(x[a]) == 0:
-                continue
-            theirs = stats.spearmanr(x[a], np.where(np.isinf(y[b]), 1e9, y[b]))
-            if np.isnan(theirs.statistic):
-                continue
-            np.testing.assert_allclose(rho[a, b], theirs.statistic, rtol=0, atol=1e-12)
-            # near rho = 1 the p-value is that of a rounding error
-            np.testing.assert_allclose(p[a, b], theirs.pvalue, rtol=1e-6, atol=1e-6)
-
-
-def test_spearman_of_constants_and_of_few_members():
-    rho, p = spearman([np.ones(9), np.arange(9)], [np.arange(9.0), np.full(9, np.inf)])
-    np.testing.assert_allclose(rho, [[0, 0], [1, 0]], atol=1e-15)
-    np.testing.assert_allclose(p, [[1, 1], [0, 1]], atol=1e-12)
-    rho, p = spearman([np.array([1.0, 2.0])], [np.array([5.0, 3.0])])
-    assert p == 1
-    np.testing.assert_allclose(rho, -1)
-    rho, p = spearman([np.ones(1)], [np.ones(1)])
-    assert rho == 0
-    assert p == 1

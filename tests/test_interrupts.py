@@ -1,4 +1,4 @@
-"""Ctrl-C: one line and exit code 130, whatever runs; gently where there is something to end."""
+"""Ctrl-C: one line and exit code 130, whatever runs; deferred where there is something to end."""
 
 import subprocess
 import sys
@@ -8,7 +8,7 @@ import pytest
 HEAD = """
 import os, signal, sys, threading, time
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from ambjax.host.interrupts import gently, heed, keeping, listening, unbroken
+from ambjax.host.interrupts import deferred, exit_on_interrupt, raise_if_interrupted, reporting, uninterrupted
 
 def interrupt():
     os.kill(os.getpid(), signal.SIGINT)
@@ -19,52 +19,54 @@ def ever():
 """
 # What runs when it comes, what the line says.
 CASES = {
-    "asleep": ("with listening('p'):\n interrupt()\n ever()", "p: interrupted.\n"),
+    "asleep": ("with exit_on_interrupt('p'):\n interrupt()\n ever()", "p: interrupted.\n"),
     "where exceptions are lost": (
-        "class Lost:\n def __del__(self):\n  interrupt()\n  ever()\nwith listening('p'):\n Lost()\n ever()",
+        "class Lost:\n def __del__(self):\n  interrupt()\n  ever()\nwith exit_on_interrupt('p'):\n Lost()\n ever()",
         "p: interrupted.\n",
     ),
     "where everything is caught": (
-        "with listening('p'):\n while True:\n  try:\n   interrupt()\n   ever()\n  except BaseException: pass",
+        "with exit_on_interrupt('p'):\n while True:\n  try:\n   interrupt()\n   ever()\n  except BaseException: pass",
         "p: interrupted.\n",
     ),
     "in another thread": (
-        "with listening('p'):\n threading.Thread(target=interrupt).start()\n ever()",
+        "with exit_on_interrupt('p'):\n threading.Thread(target=interrupt).start()\n ever()",
         "p: interrupted.\n",
     ),
     "something is kept": (
-        "with listening('p'), keeping(lambda: '3 are kept'):\n interrupt()\n ever()",
+        "with exit_on_interrupt('p'), reporting(lambda: '3 are kept'):\n interrupt()\n ever()",
         "p: interrupted: 3 are kept.\n",
     ),
     "while it is being kept": (
-        "n = [0]\nwith listening('p'), keeping(lambda: f'{n[0]} are kept'):\n with unbroken():\n  interrupt()\n"
-        "  time.sleep(0.2)\n  n[0] = 1\n ever()",
+        "n = [0]\nwith exit_on_interrupt('p'), reporting(lambda: f'{n[0]} are kept'):\n with uninterrupted():\n"
+        "  interrupt()\n  time.sleep(0.2)\n  n[0] = 1\n ever()",
         "p: interrupted: 1 are kept.\n",
     ),
     "again": (
-        "with listening('p'), gently('It ends.'):\n interrupt()\n time.sleep(0.2)\n interrupt()\n ever()",
+        "with exit_on_interrupt('p'), deferred('It ends.'):\n interrupt()\n time.sleep(0.2)\n interrupt()\n ever()",
         "p: It ends. Ctrl-C again ends it at once.\np: interrupted.\n",
     ),
-    "stderr takes nothing": ("with listening('p'):\n os.close(2)\n interrupt()\n ever()", ""),
+    "stderr takes nothing": ("with exit_on_interrupt('p'):\n os.close(2)\n interrupt()\n ever()", ""),
     "stderr is full": (
         "w = os.pipe()[1]\nos.set_blocking(w, False)\ntry:\n while True: os.write(w, bytes(65536))\n"
-        "except BlockingIOError: os.set_blocking(w, True)\nos.dup2(w, 2)\nwith listening('p'):\n interrupt()\n ever()",
+        "except BlockingIOError: os.set_blocking(w, True)\nos.dup2(w, 2)\nwith exit_on_interrupt('p'):\n"
+        " interrupt()\n ever()",
         "",
     ),
-    "gently, to nobody": (
-        "with listening('p'), gently('It ends.'):\n os.close(2)\n interrupt()\n time.sleep(0.2)\n interrupt()\n ever()",
+    "deferred, to nobody": (
+        "with exit_on_interrupt('p'), deferred('It ends.'):\n"
+        " os.close(2)\n interrupt()\n time.sleep(0.2)\n interrupt()\n ever()",
         "",
     ),
     "what is kept cannot be told": (
-        "with listening('p'), keeping(lambda: 1 / 0):\n interrupt()\n ever()",
+        "with exit_on_interrupt('p'), reporting(lambda: 1 / 0):\n interrupt()\n ever()",
         "p: interrupted; what is kept is not known (ZeroDivisionError).\n",
     ),
     "a name of no alphabet": (
-        "with listening('p'), keeping(lambda: '\\udcff'):\n interrupt()\n ever()",
+        "with exit_on_interrupt('p'), reporting(lambda: '\\udcff'):\n interrupt()\n ever()",
         "p: interrupted: \\udcff.\n",
     ),
     "below a bar": (
-        "from tqdm import tqdm\nwith listening('p'), tqdm(total=9, mininterval=0) as bar:\n bar.update(3)\n"
+        "from tqdm import tqdm\nwith exit_on_interrupt('p'), tqdm(total=9, mininterval=0) as bar:\n bar.update(3)\n"
         " interrupt()\n ever()",
         "\np: interrupted.\n",
     ),
@@ -86,17 +88,17 @@ def test_it_ends_at_once_with_one_line(case):
 
 def test_a_gentle_one_is_heeded_once_asked():
     code = """
-with listening("p"):
-    with gently("It ends."):
-        heed()
+with exit_on_interrupt("p"):
+    with deferred("It ends."):
+        raise_if_interrupted()
         interrupt()
         time.sleep(0.2)
         try:
-            heed()
+            raise_if_interrupted()
         except KeyboardInterrupt:
             print("heeded")
-with listening("p"):
-    heed()
+with exit_on_interrupt("p"):
+    raise_if_interrupted()
 print("anew", signal.getsignal(signal.SIGINT) is signal.default_int_handler)
 """
     done = run(code)
@@ -105,6 +107,6 @@ print("anew", signal.getsignal(signal.SIGINT) is signal.default_int_handler)
 
 
 def test_where_it_is_ignored_it_stays_ignored():
-    code = "signal.signal(signal.SIGINT, signal.SIG_IGN)\nwith listening('p'):\n interrupt()\n print('on')"
+    code = "signal.signal(signal.SIGINT, signal.SIG_IGN)\nwith exit_on_interrupt('p'):\n interrupt()\n print('on')"
     done = run(code)
     assert (done.returncode, done.stdout, done.stderr) == (0, "on\n", "")

@@ -218,7 +218,7 @@ def test_files_move_all_or_not_at_all(monkeypatch):
     out, moved = pathlib.Path(), []
     replace = pathlib.Path.replace
     monkeypatch.setattr(
-        pathlib.Path, "replace", lambda a, b: (moved.append(interrupts._ear.busy.locked()), replace(a, b))
+        pathlib.Path, "replace", lambda a, b: (moved.append(interrupts._handler.busy.locked()), replace(a, b))
     )
 
     def put():

@@ -6,7 +6,7 @@ from typing import Any
 
 from ambjax import __version__
 from ambjax.__main__ import Parser, answer
-from ambjax.host.interrupts import listening
+from ambjax.host.interrupts import exit_on_interrupt
 from ambjax.host.streams import open_streams
 
 PROGRAM = "ambjax-tune"
@@ -35,7 +35,7 @@ def main(argv: list[str] | None = None, program: str = PROGRAM) -> int:
     the process with 130.
     """
     open_streams()
-    with listening(program):
+    with exit_on_interrupt(program):
         return answer(parser(program), argv, _run)
 
 

@@ -14,7 +14,7 @@ from ambjax.cases.table import one_line
 from ambjax.commands.outputs import directory, files, plain, say, write_json, written
 from ambjax.commands.warnings import print_warnings
 from ambjax.control.cascade import Cascade
-from ambjax.host.interrupts import keeping
+from ambjax.host.interrupts import reporting
 from ambjax.host.lock import alone
 from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import check
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         if not args.resume:
             _clear(out)
         begin(out)
-        with keeping(lambda: _kept(out)):
+        with reporting(lambda: _kept(out)):
             return _tune(args, raw, problem, start, out)
 
 

@@ -19,7 +19,7 @@ from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
 from ambjax.ensemble.worker import chunk, ignore_sigint, processes, work
-from ambjax.host.interrupts import keeping, unbroken
+from ambjax.host.interrupts import reporting, uninterrupted
 from ambjax.host.lock import alone
 from ambjax.host.words import one_line
 from ambjax.simulation.integrate import Slide
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     case = read_aloud(args.case)
     study, store = _study_and_store(case, args)
     out = store.directory
-    with keeping(lambda: _state_words(store)), contextlib.ExitStack() as held:
+    with reporting(lambda: _state_words(store)), contextlib.ExitStack() as held:
         error = None
         with contextlib.nullcontext() if store.finished() else _executor(args) as executor:
             make(out)  # not before everything that was asked for is known to be possible
@@ -105,7 +105,7 @@ def _pilot(study: Study, store: Store, executor: tuple[Executor, int] | None) ->
     first = len(columns["index"])
     pace = Pace(first / seconds, None if executor is None else executor[1] // AHEAD)
     say_how_long(study, pace)
-    with unbroken():
+    with uninterrupted():
         store.cut(store.chunk or pace.chunk(study.members))
         for start, stop in store.spans()[: first // store.chunk]:
             store.put((start, stop), {name: column[start:stop] for name, column in columns.items()})
@@ -177,7 +177,7 @@ def _run(study: Study, store: Store, executor: tuple[Executor, int] | None) -> N
     with tqdm(total=study.members, initial=before, unit="member", unit_scale=True, delay=2, desc="ensemble") as bar:
         results = _here(study, store, missing) if executor is None else _elsewhere(study, store, missing, *executor)
         for span, columns in results:
-            with unbroken():
+            with uninterrupted():
                 store.put(span, columns)
             bar.update(span[1] - span[0])
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.ensemble.store import MANIFEST, RESULT
-from ambjax.host.interrupts import unbroken
+from ambjax.host.interrupts import uninterrupted
 from ambjax.host.words import one_line
 
 
@@ -116,7 +116,7 @@ def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
                 yield part
                 names = sorted(p.relative_to(part) for p in part.rglob("*") if p.is_file())
                 check_places(out, names)
-                with unbroken():
+                with uninterrupted():
                     for name in names:
                         (out / name).parent.mkdir(parents=True, exist_ok=True)
                         (part / name).replace(out / name)

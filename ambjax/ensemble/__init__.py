@@ -2,7 +2,7 @@
 
 from ambjax.ensemble.batching import map_members, run_ensemble
 from ambjax.ensemble.distributions import Choice, LogUniform, Normal, Percent, Uniform
-from ambjax.ensemble.drivers import shares, spearman
+from ambjax.ensemble.drivers import shares
 from ambjax.ensemble.intervals import cvar, quantile, wilson
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.ensemble.statistics import summary
@@ -21,7 +21,6 @@ __all__ = [
     "quantile",
     "run_ensemble",
     "shares",
-    "spearman",
     "summary",
     "wilson",
 ]

@@ -3,7 +3,8 @@
 The share is Sobol's first-order index Var(E[y | x])/Var(y) of the metric's ranks: whatever the shape, a V as well as a
 line, and neither a few lost rotors nor times that are never reached (+inf) decide alone. E[y | x] is the least-squares
 fit of cosines of x's rank, as in Plischke's EASI (Reliab. Eng. Syst. Saf. 95, 2010, 354-360), freed of its bias as in
-Tissot and Prieur (Reliab. Eng. Syst. Saf. 107, 2012, 205-213). Spearman's rank correlation tells the trend's sign.
+Tissot and Prieur (Reliab. Eng. Syst. Saf. 107, 2012, 205-213). The sign of the trend is that of
+Spearman's rank correlation.
 
 Why ours: SALib's `rbd_fast` is this estimator, but takes ties in their members' order (a choice of two for a ramp, a
 constant for a cause), resamples half the members for its intervals, and has neither p nor pairs; scipy's
@@ -16,43 +17,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-# Half waves over the range of x: a V is told to 1 %, a full sine too.
+# Number of cosines fitted to a metric. Six explain a V-shaped relation, or one period of a sine, to 1 %.
 TERMS = 6
-# So many members, that differ from most, a cosine is fitted with at least.
+# Minimum number of members per cosine, not counting those that have the commonest value.
 PER_TERM = 4
-# Half waves of each of two quantities, for what they do together, and members looked at for that.
+# Number of cosines of each quantity of a pair, and number of members used to find pairs.
 PAIR_TERMS, PAIR_MEMBERS = 2, 16_384
 
 
-class Correlation(NamedTuple):
-    """Spearman's rho, and the probability that unrelated columns show as much."""
-
-    rho: np.ndarray
-    p: np.ndarray
-
-
 class Shares(NamedTuple):
-    """Shares of variation with their intervals, and the probability that unrelated columns show as much."""
+    """Shares of variation, ends of their intervals, and p, the probability of such a share for unrelated columns."""
 
     share: np.ndarray
     low: np.ndarray
     high: np.ndarray
     p: np.ndarray
-
-
-def spearman(x: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> Correlation:
-    """Rank correlation of every column of x with every column of y, arrays [len(x), len(y)].
-
-    Ties share their mean rank. A column that is the same for all members is related to nothing: rho = 0, p = 1. p is
-    from Student's t with N - 2 degrees of freedom, 1 for fewer than three members.
-    """
-    from scipy.special import stdtr
-
-    rho, degrees = _correlation(_standard_ranks(x), _standard_ranks(y)), len(x[0]) - 2
-    if degrees < 1:
-        return Correlation(rho, np.ones_like(rho))
-    t = np.abs(rho) * np.sqrt(degrees / np.maximum(1 - rho**2, np.finfo(float).eps))
-    return Correlation(rho, 2 * stdtr(degrees, -t))
 
 
 def _correlation(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -169,7 +148,7 @@ def _explanation(waves: np.ndarray, Y: np.ndarray, terms: Sequence[int], confide
 
 
 def _terms(columns: Sequence[np.ndarray], most: int = TERMS) -> list[int]:
-    """How many cosines each column bears: some members that differ from the commonest value for each."""
+    """Return the number of cosines to fit to each column, by the members that differ from its commonest value."""
     differing = [len(column) - int(np.unique(column, return_counts=True)[1].max()) for column in columns]
     return [min(most, count // PER_TERM) for count in differing]
 
@@ -189,7 +168,7 @@ def _standard_ranks(columns: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _standard(column: np.ndarray) -> np.ndarray:
-    """Mean 0 and mean square 1; zeros if all are alike."""
+    """Scale a column to mean 0 and mean square 1; return zeros if all values are equal."""
     x = column - column.mean()
     size = np.abs(x).max()
     return x / size / np.sqrt(np.mean((x / size) ** 2)) if size > 1e-14 * np.abs(column).max() else np.zeros(len(x))

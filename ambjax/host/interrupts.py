@@ -1,8 +1,8 @@
-"""Ctrl-C: one line, exit code 130, at any instant.
+"""Ctrl-C handling: print one line on stderr and exit with code 130, at any instant.
 
-Python's own way, an exception in the middle of whatever runs, is lost or becomes another error where that is a library
-on its way in, a compiler or a callback. Here a thread hears of the signal by a pipe, whatever the main thread does, and
-ends the process. That loses nothing: whatever is worth keeping is on disk, whole, the moment that it is finished.
+Python's default raises KeyboardInterrupt in the main thread. A library that is being imported, a compiler or a callback
+can swallow that exception or replace it. Here the signal writes to a pipe, and a thread that reads the pipe ends the
+process. No finished work is lost, because every result is written to disk, complete, as soon as it is finished.
 """
 
 import contextlib
@@ -14,50 +14,54 @@ import threading
 from collections.abc import Callable, Iterator
 
 INTERRUPTED = 130
-# How long a line waits for room on stderr, in s.
-PATIENCE = 1.0
+# Time for which a message waits until stderr accepts it, s.
+STDERR_TIMEOUT = 1.0
 
 
-class _Ear:
-    """What is done about Ctrl-C at present: one for the process."""
+class _Handler:
+    """The current reaction to Ctrl-C. There is one instance per process."""
 
     program = ""
     report: Callable[[], str] | None = None
-    gently = ""
-    asked = False
+    deferral = ""
+    pending = False
 
     def __init__(self) -> None:
         self.busy = threading.Lock()
 
-    def hear(self) -> None:
-        if self.gently and not self.asked:
-            self.asked = True
-            self._say(f"{self.gently} Ctrl-C again ends it at once.")
+    def handle(self) -> None:
+        """Record the first Ctrl-C of a `deferred` block; end the process on any other."""
+        if self.deferral and not self.pending:
+            self.pending = True
+            self._print(f"{self.deferral} Ctrl-C again ends it at once.")
             return
         with self.busy:
             try:
                 words = self.report() if self.report is not None else ""
-                self._say(f"interrupted{f': {words}' if words else ''}.")
-            except Exception as error:  # the report's
-                self._say(f"interrupted; what is kept is not known ({type(error).__name__}).")
+                self._print(f"interrupted{f': {words}' if words else ''}.")
+            except Exception as error:  # raised by the report
+                self._print(f"interrupted; what is kept is not known ({type(error).__name__}).")
             finally:
                 os._exit(INTERRUPTED)
 
-    def _say(self, words: str) -> None:
-        """On stderr, if it takes it: whatever is wrong there, the thread that listens lives on."""
+    def _print(self, words: str) -> None:
+        """Write a line to stderr. A failure to write must not end the thread."""
         with contextlib.suppress(Exception):
             begin = "\n" if _bar_is_open() else ""
-            if os.name == "posix" and not select.select([], [2], [], PATIENCE)[1]:
-                return  # nobody reads it, or its terminal is paused
+            if os.name == "posix" and not select.select([], [2], [], STDERR_TIMEOUT)[1]:
+                return  # the reader is gone, or the terminal is paused
             os.write(2, f"{begin}{self.program}: {words}\n".encode(errors="backslashreplace"))
 
 
-_ear = _Ear()
+_handler = _Handler()
 
 
 @contextlib.contextmanager
-def listening(program: str) -> Iterator[None]:
-    """Ctrl-C in this block ends the process so; in another thread than the main one, or where it is ignored: not."""
+def exit_on_interrupt(program: str) -> Iterator[None]:
+    """End the process on Ctrl-C in this block, with a message that begins with `program`.
+
+    Has no effect outside the main thread, or where SIGINT is ignored.
+    """
     main = threading.current_thread() is threading.main_thread()
     if not main or signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None):
         yield
@@ -65,9 +69,9 @@ def listening(program: str) -> Iterator[None]:
     read_end, write_end = os.pipe()
     if os.name == "posix":
         os.set_blocking(write_end, False)
-    _ear.program, _ear.asked = program, False
+    _handler.program, _handler.pending = program, False
     before = signal.signal(signal.SIGINT, lambda *_: None), signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
-    thread = threading.Thread(target=_listen, args=(read_end,), daemon=True)
+    thread = threading.Thread(target=_read_signals, args=(read_end,), daemon=True)
     thread.start()
     try:
         yield
@@ -80,45 +84,48 @@ def listening(program: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def keeping(words: Callable[[], str]) -> Iterator[None]:
-    """Where Ctrl-C ends this block, its line says what `words` returns, called in another thread."""
-    before, _ear.report = _ear.report, words
+def reporting(words: Callable[[], str]) -> Iterator[None]:
+    """Add the text that `words` returns to the message of a Ctrl-C in this block. Another thread calls `words`."""
+    before, _handler.report = _handler.report, words
     try:
         yield
     finally:
-        _ear.report = before
+        _handler.report = before
 
 
 @contextlib.contextmanager
-def gently(words: str) -> Iterator[None]:
-    """In this block the first Ctrl-C says these words, a sentence, and is left to `heed`."""
-    before, _ear.gently = _ear.gently, words
+def deferred(words: str) -> Iterator[None]:
+    """Print `words`, a sentence, on the first Ctrl-C in this block, and leave the exit to `raise_if_interrupted`.
+
+    Has no effect if `words` is empty. A second Ctrl-C ends the process.
+    """
+    before, _handler.deferral = _handler.deferral, words
     try:
         yield
     finally:
-        _ear.gently = before
+        _handler.deferral = before
 
 
 @contextlib.contextmanager
-def unbroken() -> Iterator[None]:
-    """Ctrl-C waits until this block, a short one, has ended: what it keeps is counted among what is kept."""
-    with _ear.busy:
+def uninterrupted() -> Iterator[None]:
+    """Delay Ctrl-C until the end of this short block, so that the report includes the files written in it."""
+    with _handler.busy:
         yield
 
 
-def heed() -> None:
-    """Raises KeyboardInterrupt if a gentle Ctrl-C has been heard."""
-    if _ear.asked:
+def raise_if_interrupted() -> None:
+    """Raise KeyboardInterrupt if a `deferred` block has received Ctrl-C."""
+    if _handler.pending:
         raise KeyboardInterrupt
 
 
-def _listen(heard: int) -> None:
-    while got := os.read(heard, 1):
-        if got[0] == signal.SIGINT:
-            _ear.hear()
+def _read_signals(read_end: int) -> None:
+    while received := os.read(read_end, 1):
+        if received[0] == signal.SIGINT:
+            _handler.handle()
 
 
 def _bar_is_open() -> bool:
-    """Whether a progress bar stands on the last line of the terminal."""
+    """Return whether the last line of the terminal shows a progress bar."""
     tqdm = getattr(sys.modules.get("tqdm"), "tqdm", None)
     return any(bar.last_print_t > bar.start_t for bar in getattr(tqdm, "_instances", ()))

@@ -1,4 +1,4 @@
-"""A lock on a directory: one process at a time, released by the system when its holder ends."""
+"""A lock on a directory: one process at a time, which the system releases when the process ends."""
 
 import contextlib
 import errno
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from filelock import FileLock, Timeout
 
 LOCK = ".ambjax-lock"
-# What a file system without locks answers.
+# Error codes of a file system without locks.
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 

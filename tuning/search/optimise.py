@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.host.interrupts import gently, heed
+from ambjax.host.interrupts import deferred, raise_if_interrupted
 from tuning.objective.goal import Goal
 from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS
@@ -91,8 +91,8 @@ def search(
     try:
         while True:
             # Before the first iteration there is nothing to judge, so Ctrl-C ends the process.
-            with gently(INTERRUPT_MESSAGE if progress.history else ""):
-                heed()
+            with deferred(INTERRUPT_MESSAGE if progress.history else ""):
+                raise_if_interrupted()
                 before = progress.seconds
                 if not progress.active.any() or progress.iteration - progress.since >= iterations:
                     if progress.phase + 1 == len(phases):
