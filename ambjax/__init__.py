@@ -1,6 +1,6 @@
-"""A rotor levitated by an active magnetic bearing under a cascaded sliding-mode controller, differentiable.
+"""Differentiable simulation of an active-magnetic-bearing rotor under a cascaded sliding-mode controller.
 
-Names are imported when they are first used, so that what needs none of them (`ambjax --version`) does not wait for JAX.
+Public names are imported on first use, so that `import ambjax` and `ambjax --version` do not import JAX.
 """
 
 import importlib
@@ -64,7 +64,7 @@ __all__ = [
     "with_method",
 ]
 
-# Where each public name comes from; tests/test_startup.py holds this table to the imports above.
+# Public names by module. Static checkers read the imports above; tests/test_startup.py compares the two.
 _NAMES = {
     "control": "current inversion observer position",
     "control.cascade": "Cascade",
@@ -83,7 +83,7 @@ _NAMES = {
     "world.sensor": "Sensor",
     "world.signals": "BandNoise Chirp Constant Pulse Sine SmoothStep Step Sum",
 }
-# Packages that are there after `import ambjax`, imported when they are first used.
+# Packages available as attributes of ambjax, imported on first use.
 _PACKAGES = ("ensemble", "paper")
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 
@@ -94,7 +94,7 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'ambjax' has no attribute '{name}'")
     home = f"ambjax.{_HOME[name]}"
-    if home == "ambjax.control":  # its modules are the names
+    if home == "ambjax.control":  # these names are modules
         return importlib.import_module(f"{home}.{name}")
     return getattr(importlib.import_module(home), name)
 

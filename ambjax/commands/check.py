@@ -1,4 +1,4 @@
-"""`ambjax check`: Theorem 1's conditions along a case, and beside them what decides on its processor."""
+"""`ambjax check`: the conditions of Theorem 1 along a run, and the stability conditions on the case's processor."""
 
 import argparse
 import dataclasses
@@ -7,28 +7,29 @@ from typing import Any
 
 from ambjax.cases.reader import Case
 from ambjax.commands.outputs import plain, table
-from ambjax.commands.warnings import read_aloud
+from ambjax.commands.warnings import read_with_warnings
 from ambjax.theorem.conditions import Condition, check
 from ambjax.theorem.sampled_report import Delays, SampledReport
 
 Summary = dict[str, Any]
 CONTINUOUS = (
-    "All of this is about continuous time, for which the theorem is: the case's [processor] is left out, its "
-    "converters and amplifier too, and signs without a layer have one. It decides nothing here."
+    "The tables above are for continuous time, as in the theorem: without the case's [processor], converters and "
+    "amplifier, and with a boundary layer for each sign that has none. They do not set the verdict of this case."
 )
 
 BAND = (
-    "At the samples from run.settle on. Disturbed by: the largest rate of the signal that the law acts on, beyond what "
-    "the law's sign asks for. Band: what the law keeps that signal in under such disturbances. Off by: the largest "
-    "difference between that signal and the plant's. Bound: the sum of both, for the plant's signal beside it."
+    "Evaluated at the samples after run.settle. Disturbed by: largest rate of the law's signal in excess of the rate "
+    "that its sign term commands. Band: the set in which the law keeps its signal under such disturbances. Off by: "
+    "largest difference between the law's signal and the plant's. Bound: band plus off by, a bound on the plant's "
+    "signal. Largest: largest value of the plant's signal."
 )
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
-    """ambjax check."""
+    """Check the conditions of a case and print them. Exit code 1 if one fails."""
     from ambjax.theorem import advice
 
-    case = read_aloud(args.case)
+    case = read_with_warnings(args.case)
     report = check(case.cascade, case.scenario, case.clock)
     summary = {
         "holds": report.holds,
@@ -50,7 +51,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 
 def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
-    """Print what decides on the case's processor. Keys of the summary, of which "holds" is the processor's."""
+    """Check and print the conditions on the case's processor. Return their summary, whose "holds" is the verdict."""
     from ambjax.ensemble.delays import delay_margin
     from ambjax.ensemble.replay import as_member, record_system
     from ambjax.theorem import advice, sampled_report
@@ -58,7 +59,7 @@ def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
     scenario = as_member(case.scenario)
     sampled = sampled_report.check(case.cascade, scenario, case.clock, case.settle, record_system)
     margin, unknown = delay_margin(case.cascade, case.scenario, case.clock), None
-    if (chosen := case.cascade.processor) is not None and chosen.predict is not False:
+    if (processor := case.cascade.processor) is not None and processor.predict is not False:
         unknown = delay_margin(case.cascade, case.scenario, case.clock, known=False)
     if not args.json:
         print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")
@@ -92,7 +93,7 @@ def _condition(c: Condition) -> Summary:
 
 
 def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
-    advice = {True: "holds", False: "FAILS", None: "-"}
+    verdicts = {True: "holds", False: "FAILS", None: "-"}
 
     def number(x: float | None) -> str:
         return "-" if x is None else f"{x:.5g}"
@@ -105,7 +106,7 @@ def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
             number(c.margin),
             c.unit,
             f"{c.at_s:.5g}",
-            advice[c.holds],
+            verdicts[c.holds],
             c.note,
         )
         for c in conditions
@@ -148,4 +149,4 @@ def _print_sampled(sampled: SampledReport) -> None:
         head = ("signal", "unit", "noise", "gain, per s", "disturbed by", "band", "off by", "bound", "largest", "note")
         print("\n" + table(head, bands) + "\n" + BAND)
     else:
-        print("\nNo bands: the run does not last, without noise neither.")
+        print("\nNo bands: the rotor is lost, with and without noise.")

@@ -1,4 +1,4 @@
-"""`ambjax ensemble`: a study run chunk by chunk, here or on worker processes, and what is made of it."""
+"""`ambjax ensemble`: run a study in chunks, in this process or on workers, and write its summary and plots."""
 
 import argparse
 import contextlib
@@ -13,7 +13,7 @@ from tqdm import tqdm
 from ambjax.cases.reader import Case
 from ambjax.commands.outputs import check_places, files, make, plain, say, table, target, write_json, written
 from ambjax.commands.pace import Pace, error_words, pilot, say_how_long, sliding_error
-from ambjax.commands.warnings import read_aloud, reversal
+from ambjax.commands.warnings import read_with_warnings, reversal
 from ambjax.ensemble import statistics
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.store import Store
@@ -24,17 +24,17 @@ from ambjax.host.lock import alone
 from ambjax.host.words import one_line
 from ambjax.simulation.integrate import Slide
 
-# Beside members.npz; the last where something is spread.
+# Files written with members.npz; the last one only if the case has a spread.
 WRITTEN = ("summary.json", "fan.png", "histograms.png", "tornado.png")
-# Chunks in flight for each worker: one runs, one waits.
+# Chunks submitted per worker: one runs, one waits.
 AHEAD = 2
-# More than any machine has cores; each takes memory of its own.
+# Above the core count of any machine; each process needs its own memory.
 MOST_PROCESSES = 1024
-# The fan chart is drawn from so many members and instants, whatever the size of the study.
+# Members and instants in the fan chart, for a study of any size.
 FAN_MEMBERS, FAN_TIMES = 256, 500
-# How long to look for the scheduler of a cluster.
+# Timeout for the connection to the scheduler of a cluster.
 PATIENCE = "10s"
-# Where every member is lost, the fan chart ends at so many times the last loss.
+# If every member is lost, the fan chart ends at this multiple of the last loss time.
 BEYOND = 1.15
 BANDS = (0.0, 5.0, 25.0, 50.0, 75.0, 95.0, 100.0)
 GO_ON = "What is finished is kept: give the same command with --out and --resume to go on."
@@ -42,7 +42,7 @@ METRICS = ("settled_max_abs_error_m", "settled_rms_error_m", "max_abs_error_m", 
 
 
 def study_of(case: Case, seed: int | None, members: int) -> Study:
-    """The study of a case file. Raises ValueError for a member count or seed out of range."""
+    """Return the study of a case. Raises ValueError for a member count or seed out of range."""
     if not 1 <= members <= MOST_MEMBERS:
         raise ValueError(f"--members {members}: it must be a whole number from 1 to {MOST_MEMBERS:,}.")
     seed = int(case.scenario.seed) if seed is None else seed
@@ -52,16 +52,16 @@ def study_of(case: Case, seed: int | None, members: int) -> Study:
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """ambjax ensemble."""
-    case = read_aloud(args.case)
+    """Run or resume a study and report it. Exit code 1 if a member does not survive."""
+    case = read_with_warnings(args.case)
     study, store = _study_and_store(case, args)
     out = store.directory
     with reporting(lambda: _state_words(store)), contextlib.ExitStack() as held:
         error = None
         with contextlib.nullcontext() if store.finished() else _executor(args) as executor:
-            make(out)  # not before everything that was asked for is known to be possible
+            make(out)  # only after all options are checked
             held.enter_context(alone(out))
-            _check(study, store, args)  # again: another run may have begun, or ended, since
+            _check(study, store, args)  # again, under the lock: another run may have changed the directory
             fresh = not store.begun()
             store.begin()
             say(f"method: {case.clock.method}; writing to {out}")
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
 
 
 def _study_and_store(case: Case, args: argparse.Namespace) -> tuple[Study, Store]:
-    """The study that is asked for, and where it is kept; nothing is written. Raises ValueError for what cannot be."""
+    """Return the study and its store without writing anything. Raises ValueError for options that cannot be met."""
     study = study_of(case, args.seed, args.members)
     if args.chunk is not None and args.chunk < 1:
         raise ValueError(f"--chunk {args.chunk}: it must be a whole number of members, at least 1.")
@@ -85,7 +85,7 @@ def _study_and_store(case: Case, args: argparse.Namespace) -> tuple[Study, Store
         raise ValueError(f"--processes {args.processes}: it must be a whole number from 1 to {MOST_PROCESSES}.")
     if args.resume and args.out is None:
         raise ValueError("--resume: add --out DIR, the directory of the study that was interrupted.")
-    study.drawn(np.array([0]))  # raises what the design has against so many members
+    study.drawn(np.array([0]))  # raises ValueError if the design cannot draw this many members
     out = target(args.out, f"ensemble-{case.name}")
     chunk = None if args.chunk is None else min(args.chunk, study.members)
     store = Store(out, study.fingerprint(), study.members, chunk)
@@ -112,7 +112,7 @@ def _pilot(study: Study, store: Store, executor: tuple[Executor, int] | None) ->
 
 
 def _state_words(store: Store) -> str:
-    """What an interruption has left, and how to go on."""
+    """Return the message of an interruption: how many members are kept, and how to resume."""
     if not store.begun():
         return "nothing is kept"
     again = f"give the same command with --out {store.directory} --resume"
@@ -122,7 +122,7 @@ def _state_words(store: Store) -> str:
 def _report(
     case: Case, study: Study, args: argparse.Namespace, out: pathlib.Path, error: dict[str, Any] | None
 ) -> tuple[int, dict[str, Any]]:
-    """What is made of a finished study; `error` is that of its sliding step, if it has one."""
+    """Write and print the results of a finished study. `error`: result of `sliding_error`, or None."""
     with np.load(out / "members.npz") as file:
         columns = {name: file[name] for name in file.files}
     summary = _summary(case, study, columns, str(args.case))
@@ -142,7 +142,7 @@ def _report(
 
 @contextlib.contextmanager
 def _executor(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]:
-    """Where chunks run: None for this process, or an executor and the number of chunks to keep in flight."""
+    """Yield an executor and the number of chunks to submit at a time, or None to run in this process."""
     if args.cluster is not None:
         try:
             from distributed import Client, KilledWorker
@@ -169,7 +169,7 @@ def _executor(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]
 
 
 def _run(study: Study, store: Store, executor: tuple[Executor, int] | None) -> None:
-    """Compute what is missing; every finished chunk is on disk at once."""
+    """Compute the missing chunks and write each to disk as soon as it is finished."""
     missing, remarks = store.survey()
     for remark in remarks:
         say(remark)
@@ -221,7 +221,7 @@ def _pictures(
     from ambjax.pictures import tornado
 
     lost_at = columns["lost_at"]
-    # nothing is left to show long after the last member is lost
+    # End the fan chart soon after the last loss if every member is lost.
     bands = study.bands(FAN_MEMBERS, FAN_TIMES, BEYOND * float(np.max(lost_at)))
     shown = {name: _quantiles(x, bands.extremes.get(name)) for name, x in bands.signals.items()}
     few = len(bands.trajectory.lost_at)
@@ -236,9 +236,10 @@ def _pictures(
 
 
 def _quantiles(x: np.ndarray, extremes: tuple[np.ndarray, np.ndarray] | None) -> dict[float, np.ndarray]:
-    """Quantiles [T] of x [members, T] over the members that are left at each instant, by per cent; NaN where none is.
+    """Compute quantiles [T] of x [members, T] over the surviving members at each instant, keyed by per cent.
 
-    The outermost are the `extremes` between the neighbouring instants, where there are any.
+    NaN where no member survives. `extremes`, if given, replace the 0 and 100 % quantiles: minimum and maximum between
+    neighbouring instants.
     """
     left = np.isfinite(x).any(axis=0)
     quantiles = np.full((len(BANDS), x.shape[1]), np.nan)

@@ -1,10 +1,11 @@
-"""`ambjax export`: the controller of a case as C, and the proof that it is that controller."""
+"""`ambjax export`: write the controller of a case as C and, with --verify, compare the C with JAX."""
 
 import argparse
 import dataclasses
 import hashlib
+import pathlib
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -18,13 +19,13 @@ from ambjax.export import machine, package, texts, verify
 from ambjax.export.controller import Controller, controller_of
 from ambjax.export.source import Origin
 from ambjax.export.statements import PRECISIONS, RESERVED
-from ambjax.export.twins import LoopCase as Compared
+from ambjax.export.twins import LoopCase
 
 Summary = dict[str, Any]
-# What --verify writes beside the package's files.
+# Files that --verify adds to the package.
 VERIFIED = ("verify.md", "verify.json")
-# Names that a header of C has already.
-TAKEN = {
+# Names of the standard C headers, which a prefix must not repeat: the package contains PREFIX.h.
+HEADER_NAMES = {
     *("assert", "complex", "ctype", "errno", "fenv", "inttypes", "iso646", "limits", "locale", "math", "setjmp"),
     *("signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time", "wchar"),
     "wctype",
@@ -32,8 +33,34 @@ TAKEN = {
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
-    """ambjax export."""
+    """Export the controller of a case. Exit code 1 if --verify finds a difference between the C and JAX."""
     case = read_case(args.case)
+    plan = _plan(case, args)
+    print_warnings(case, args.case)
+    with files(plan.out) as part:
+        sources, checks = _verified(case, plan) if args.verify else (_built(plan), [])
+        _write(part, plan, case.name, sources, checks)
+    if not checks:
+        _remove_verification(plan.out)
+    if not args.json:
+        _print(plan.out, sources, checks)
+    ok = verify.holds(checks) if checks else None
+    return int(ok is False), {"ok": ok, "checks": [check._asdict() for check in checks], "out": str(plan.out)}
+
+
+class Plan(NamedTuple):
+    """A checked export: the controller, the C type and prefix of the package, its origin, mark and directory."""
+
+    controller: Controller
+    precision: str
+    prefix: str
+    origin: Origin
+    mark: str
+    out: pathlib.Path
+
+
+def _plan(case: Case, args: argparse.Namespace) -> Plan:
+    """Build the controller and make the output directory. Raises ValueError for a case or option that cannot be met."""
     controller = controller_of(guarded_for(case), case.scenario.u_max, float(case.clock.sample_period))
     prefix = _prefix(args.prefix, case.name)
     if args.verify:
@@ -43,63 +70,74 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     out = directory(args.out, f"export-{case.name}")
     mark = texts.MARK.format(p=prefix)
     spare(out, [*(name.format(p=prefix) for name in package.NAMES), *VERIFIED], mark)
-    print_warnings(case, args.case)
-    with files(out) as part:
-        if args.verify:
-            sources, checks = _verified(case, controller, args.precision, prefix, origin)
-        else:
-            sources, checks = package.files(controller, args.precision, prefix, origin), []
-        ok = verify.holds(checks) if checks else None
-        for name, text in sources.items():
-            (part / name).write_text(text, encoding="utf-8")
-        if checks:
-            (part / VERIFIED[0]).write_text(verify.table(checks, case.name, mark), encoding="utf-8")
-            write_json(part / VERIFIED[1], {"from": mark, "ok": ok, "checks": [x._asdict() for x in checks]})
-    if not checks:  # what was verified is not there any more
-        for name in VERIFIED:
-            (out / name).unlink(missing_ok=True)
-    if not args.json:
-        if checks:
-            rows = [(x.name, x.precision, x.found, x.allowed, x.verdict) for x in checks]
-            print(table(("check", "precision", "found", "allowed", "verdict"), rows))
-            print(verify.summary(checks))
-        written(out, ", ".join([*sources, *(VERIFIED if checks else ())]))
-    return int(ok is False), {"ok": ok, "checks": [x._asdict() for x in checks], "out": str(out)}
+    return Plan(controller, args.precision, prefix, origin, mark, out)
+
+
+def _built(plan: Plan) -> dict[str, str]:
+    """Return the text of each file of the package, unverified."""
+    return package.files(plan.controller, plan.precision, plan.prefix, plan.origin)
+
+
+def _write(
+    folder: pathlib.Path, plan: Plan, case_name: str, sources: dict[str, str], checks: list[verify.Check]
+) -> None:
+    """Write the package and, if there are checks, the files that record them."""
+    for name, text in sources.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    if checks:
+        (folder / VERIFIED[0]).write_text(verify.table(checks, case_name, plan.mark), encoding="utf-8")
+        rows = [check._asdict() for check in checks]
+        write_json(folder / VERIFIED[1], {"from": plan.mark, "ok": verify.holds(checks), "checks": rows})
+
+
+def _remove_verification(out: pathlib.Path) -> None:
+    """Remove the verification of an earlier export, which does not apply to the new package."""
+    for name in VERIFIED:
+        (out / name).unlink(missing_ok=True)
+
+
+def _print(out: pathlib.Path, sources: dict[str, str], checks: list[verify.Check]) -> None:
+    if checks:
+        rows = [(check.name, check.precision, check.found, check.allowed, check.verdict) for check in checks]
+        print(table(("check", "precision", "found", "allowed", "verdict"), rows))
+        print(verify.summary(checks))
+    written(out, ", ".join([*sources, *(VERIFIED if checks else ())]))
 
 
 def guarded_for(case: Case) -> Any:
-    """The cascade of a case with the limits of its guard, wide enough for the sensor at both ends of every spread."""
-    wide = ends(case.spread, case.cascade, case.scenario, ("sensor.", "run.clearance", "plant.s_0"))[1]
-    cascade = guarded(case.cascade, wide, float(case.clock.sample_period))
+    """Return the cascade of a case with guard limits wide enough for the sensor at both ends of every spread."""
+    widest = ends(case.spread, case.cascade, case.scenario, ("sensor.", "run.clearance", "plant.s_0"))[1]
+    cascade = guarded(case.cascade, widest, float(case.clock.sample_period))
     if cascade.processor is None or cascade.processor.guard is None:
         return cascade
     guard = jax.tree.map(lambda x: float(np.max(x)), cascade.processor.guard)
     return dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=guard))
 
 
-def _verified(
-    case: Case, controller: Controller, precision: str, prefix: str, origin: Origin
-) -> tuple[dict[str, str], list[verify.Check]]:
-    """The files, and the checks of them in both precisions."""
-    say("verify: one step at 10,000 points and at 10,000 of other parameters, then the closed loop, in both precisions")
-    drafts = {name: verify.draft(controller, name, prefix, origin) for name in PRECISIONS}
-    checks = verify.verify(drafts, Compared(case.cascade, case.scenario, case.clock, case.settle))
-    return dict(drafts[precision].files), checks
+def _verified(case: Case, plan: Plan) -> tuple[dict[str, str], list[verify.Check]]:
+    """Return the files of the package and the checks of both precisions."""
+    say(
+        "verify: in both precisions, one step at 10,000 points, one step at 10,000 points with other parameters, "
+        "and the closed loop"
+    )
+    drafts = {name: verify.draft(plan.controller, name, plan.prefix, plan.origin) for name in PRECISIONS}
+    checks = verify.verify(drafts, LoopCase(case.cascade, case.scenario, case.clock, case.settle))
+    return dict(drafts[plan.precision].files), checks
 
 
-def _prefix(asked: str | None, name: str) -> str:
-    """What all names of the C begin with. Raises ValueError for what is no name in C."""
-    if asked is None:
-        found = re.sub(r"\W", "_", name, flags=re.ASCII)
-        return found if _is_name(found) else f"amb_{found}"
-    if not _is_name(asked):
+def _prefix(option: str | None, name: str) -> str:
+    """Return the prefix of all C names: the option, or the case's name. Raises ValueError for an invalid C name."""
+    if option is None:
+        derived = re.sub(r"\W", "_", name, flags=re.ASCII)
+        return derived if _is_name(derived) else f"amb_{derived}"
+    if not _is_name(option):
         raise ValueError(
-            f"--prefix {asked}: it must be a name in C, letters, digits and '_', and neither one of its words nor of "
-            "its headers. Use --prefix controller, for example."
+            f"--prefix {option}: it must be a C identifier (a letter, then letters, digits or '_'), and neither a C "
+            "keyword nor the name of a C header. Use --prefix controller, for example."
         )
-    return asked
+    return option
 
 
 def _is_name(text: str) -> bool:
-    words = RESERVED | TAKEN | {"break", "continue", "else", "for", "if", "return", "while"}
+    words = RESERVED | HEADER_NAMES | {"break", "continue", "else", "for", "if", "return", "while"}
     return re.fullmatch(r"[A-Za-z]\w{0,60}", text, flags=re.ASCII) is not None and text not in words

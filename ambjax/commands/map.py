@@ -1,4 +1,4 @@
-"""`ambjax map`: survival and error over a grid of two quantities, for one case or for several side by side."""
+"""`ambjax map`: survival and error over a grid of two quantities, for one or more cases."""
 
 import argparse
 import itertools
@@ -11,7 +11,7 @@ from ambjax.cases.reader import Case
 from ambjax.cases.timing import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
 from ambjax.commands.ensemble import study_of
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
-from ambjax.commands.warnings import read_aloud
+from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.maps import GRIDS, PERIOD, SURE, Axis, Map, grid, stepped
 from ambjax.ensemble.paths import places
@@ -20,14 +20,14 @@ from ambjax.numerics.records import numbers, within
 WRITTEN = ("map.png", "map.json")
 COUNT = 21
 MOST_CELLS = 1_000_000
-# Samples of all runs of a map over clock.sample_period: hours.
+# Most samples of all runs in a map over clock.sample_period, some hours of computation.
 MOST_TOTAL = 10_000_000_000
 FORM = "PATH=LOW:HIGH[:COUNT][:log], as in initial.z=-1e-3:1e-3:41 or plant.m=-20%:20%"
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """ambjax map."""
-    cases = [read_aloud(path) for path in [args.case, *(args.against or [])]]
+    """Simulate the cells of a map for each case and write map.png and map.json."""
+    cases = [read_with_warnings(path) for path in [args.case, *(args.against or [])]]
     studies = [study_of(case, args.seed, args.members) for case in cases]
     axes = [(_axis("--x", args.x, case), _axis("--y", args.y, case)) for case in cases]
     cells = len(axes[0][0].values) * len(axes[0][1].values)
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
 
 
 def _axis(flag: str, text: str, case: Case) -> Axis:
-    """An axis from its flag's text. Raises ValueError with the flag, the text and the form."""
+    """Parse the value of --x or --y. Raises ValueError with the option, its text and the valid form."""
 
     def refuse(why: str) -> ValueError:
         return ValueError(f"{flag} {text}: {why}. Write {FORM}.")
@@ -85,7 +85,7 @@ def _axis(flag: str, text: str, case: Case) -> Axis:
 
 
 def _check_samples(case: Case, x: Axis, y: Axis, members: int) -> None:
-    """Refuse sample periods beyond the run, and more samples than can be waited for."""
+    """Raise ValueError for sample periods too long for the run, or a map with too many samples."""
     for flag, axis, other in (("--x", x, y), ("--y", y, x)):
         if axis.path != PERIOD:
             continue
@@ -155,7 +155,7 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
 
 
 def _unsure(one: Map) -> str:
-    """Why a map says nothing about the confidence of its cells."""
+    """Explain why a map gives no confidence statement for its cells."""
     if not one.varied:
         return "no noise, and nothing is spread: all runs of a cell are alike, and one decides it"
     enough = next(n for n in itertools.count(1) if wilson(n, n).low >= SURE)
@@ -164,7 +164,7 @@ def _unsure(one: Map) -> str:
 
 
 def _spread_words(one: Map) -> str:
-    """What a map shows of the case's spread."""
+    """List the quantities of [spread] that are drawn for each member."""
     return f"drawn for each member: {', '.join(one.drawn)}" if one.drawn else "nominal: nothing is spread"
 
 
@@ -188,7 +188,7 @@ def _draw(cases: list[Case], maps: list[Map], path: Any) -> None:
 
 
 def _short(one: Map) -> str:
-    """What a map shows, for a title: spread quantities by name, or how many they are."""
+    """Return the subtitle of a panel: the spread quantities, or their number if there are more than three."""
     few = len(one.drawn) <= 3
     what = ", ".join(one.drawn) if few else f"{len(one.drawn)} quantities"
     words = f"spread: {what}" if what else "nominal"

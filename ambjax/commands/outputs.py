@@ -1,6 +1,6 @@
-"""What the commands write: directories, files, JSON, tables, and remarks on stderr.
+"""Output of the commands: directories, files, JSON, tables, and remarks on stderr.
 
-Every file goes through `files`: all that a command writes is in its directory at once, or nothing of it is.
+Commands write all files through `files`, which moves them into the output directory together, or none if one fails.
 """
 
 import contextlib
@@ -22,18 +22,18 @@ from ambjax.host.words import one_line
 
 
 def directory(out: str | None, name: str, names: Iterable[str] = ()) -> pathlib.Path:
-    """The directory to write to: as asked, or a new one under ./out. Made, and seen to be writable.
+    """Make the output directory `out`, or a new one under ./out called `name`, and return it.
 
-    Raises ValueError if it cannot be made or written, holds a study, whose files are not to be mixed with others, or
-    folders of these names, which files will have.
+    Raises ValueError if the directory cannot be made or written, if it holds the study of an ensemble, or if it has a
+    folder with one of `names`, which the command writes as files.
     """
     path = target(out, name)
-    while out is None and not _made(path):  # another run was quicker
+    while out is None and not _made(path):  # another run has made it meanwhile
         path = target(out, name)
     for file in (MANIFEST, RESULT):
         with _refusal(path):
-            there = (path / file).exists()
-        if there:
+            exists = (path / file).exists()
+        if exists:
             raise ValueError(f"--out {path}: it holds the study of an ensemble ({file}). Choose another directory.")
     make(path)
     check_places(path, names)
@@ -41,19 +41,21 @@ def directory(out: str | None, name: str, names: Iterable[str] = ()) -> pathlib.
 
 
 def check_places(out: pathlib.Path, names: Iterable[str | pathlib.PurePath]) -> None:
-    """Raises ValueError where files of these names, below `out`, cannot be put: a folder, or no folder, is there."""
+    """Raise ValueError if a folder in `out` has one of these file names, or a file the name of a needed folder."""
     for name in map(pathlib.PurePath, names):
-        there = [
+        blocking = [
             parent for parent in name.parents[:-1] if os.path.lexists(out / parent) and not (out / parent).is_dir()
         ]
-        if there:
-            raise ValueError(f"--out {out}: {there[0]} is no folder there. Move it away, or choose another directory.")
+        if blocking:
+            raise ValueError(
+                f"--out {out}: {blocking[0]} is no folder there. Move it away, or choose another directory."
+            )
         if (out / name).is_dir() and not (out / name).is_symlink():
             raise ValueError(f"--out {out}: {name} is a folder there. Move it away, or choose another directory.")
 
 
 def spare(out: pathlib.Path, names: Iterable[str], mark: str) -> None:
-    """Raise ValueError where what has one of these names in `out` is not a file with this mark: it would be lost."""
+    """Raise ValueError if a file in `out` has one of these names but not this mark: it is the user's own file."""
     for name in names:
         if os.path.lexists(out / name) and not _holds(out / name, mark):
             raise ValueError(
@@ -70,9 +72,9 @@ def _holds(path: pathlib.Path, mark: str) -> bool:
 
 
 def target(out: str | None, name: str) -> pathlib.Path:
-    """The directory to write to, which need not exist yet: as asked, or a new one under ./out.
+    """Return the output directory without making it: `out`, or an unused name under ./out.
 
-    Raises ValueError for one without a name.
+    Raises ValueError for an empty name.
     """
     if out is not None:
         if not out.strip():
@@ -85,7 +87,7 @@ def target(out: str | None, name: str) -> pathlib.Path:
 
 
 def _made(path: pathlib.Path) -> bool:
-    """Make a new directory; False: it is there already. Raises ValueError if it cannot be made."""
+    """Make a new directory. Return False if it exists already. Raises ValueError if it cannot be made."""
     with _refusal(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -96,7 +98,7 @@ def _made(path: pathlib.Path) -> bool:
 
 
 def make(path: pathlib.Path) -> None:
-    """Make a directory and see that it can be written. Raises ValueError if not."""
+    """Make a directory if it does not exist. Raises ValueError if it cannot be made or written."""
     with _refusal(path):
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
@@ -105,9 +107,9 @@ def make(path: pathlib.Path) -> None:
 
 @contextlib.contextmanager
 def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A folder to write in: what it holds at the end of the block moves into `out`, and nothing does if that fails.
+    """Yield a temporary folder whose files move into `out` at the end of the block, or not at all if the block fails.
 
-    A directory that is empty then goes too. Raises ValueError where the disk is full or `out` cannot be written.
+    After a failure, an empty `out` is removed. Raises ValueError if the disk is full or `out` cannot be written.
     """
     with _refusal(out):
         try:
@@ -128,7 +130,7 @@ def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
 
 @contextlib.contextmanager
 def _refusal(out: pathlib.Path) -> Iterator[None]:
-    """What the system has against writing, as a ValueError that names --out."""
+    """Convert an OSError of writing to a ValueError that names --out."""
     try:
         yield
     except OSError as error:
@@ -137,7 +139,7 @@ def _refusal(out: pathlib.Path) -> Iterator[None]:
 
 
 def plain(value: Any) -> Any:
-    """Numbers as JSON has them: arrays as lists, infinities and NaN as null."""
+    """Return a value as JSON can represent it: arrays as lists, infinities and NaN as null."""
     if isinstance(value, dict):
         return {k: plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -153,7 +155,7 @@ def write_json(path: pathlib.Path, value: Any) -> None:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Columns aligned by spaces."""
+    """Return a text table with columns aligned by spaces."""
     lines = [list(header), *map(list, rows)]
     widths = [max(len(line[c]) for line in lines) for c in range(len(header))]
     ruled = [lines[0], ["-" * w for w in widths], *lines[1:]]
@@ -161,11 +163,11 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def written(out: pathlib.Path, names: str) -> None:
-    """The last line of a command's answer: what is where."""
+    """Print which files the command has written, the last line of its output."""
     print(one_line(f"written: {out}/{names}"))
 
 
 def say(text: str) -> None:
-    """Progress and remarks, a line each, go to stderr: stdout is the answer alone. None of them stops anything."""
+    """Print a remark on one line of stderr; stdout carries the results only. A failure of stderr is ignored."""
     with contextlib.suppress(OSError, ValueError):
         print(one_line(text), file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""`ambjax simulate`: a case's trajectory, its metrics and a picture of it."""
+"""`ambjax simulate`: write the trajectory of a case, its metrics and a plot."""
 
 import argparse
 import dataclasses
@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from ambjax.cases.reader import Case
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
-from ambjax.commands.warnings import read_aloud, reversal
+from ambjax.commands.warnings import read_with_warnings, reversal
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.replay import Replay, record, replay
 from ambjax.ensemble.study import Study
@@ -23,8 +23,8 @@ WRITTEN = ("trajectory.npz", "metrics.json", "overview.png")
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
-    """ambjax simulate."""
-    case = read_aloud(args.case)
+    """Simulate a case or one member of its ensemble. Exit code 1 if the rotor is lost or the integrator stalls."""
+    case = read_with_warnings(args.case)
     study = _study(case, args)
     if study is not None:
         cascade, scenario = study.member(args.member)
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 
 def _check(numbers: dict[str, Any], path: str) -> None:
-    """Raise ValueError where a metric is no number, which no case may bring about; a time may be infinite: never."""
+    """Raise ValueError if a metric is not finite, which is a bug. Times may be infinite: the event never occurs."""
     wrong = [name for name, x in numbers.items() if not (np.isfinite(x) or (name.endswith("_s") and x == math.inf))]
     if wrong:
         raise ValueError(
@@ -86,7 +86,7 @@ def _check(numbers: dict[str, Any], path: str) -> None:
 
 
 def _window(case: Case, args: argparse.Namespace) -> tuple[float, float] | None:
-    """The stretch of time to draw, s; None: not asked for."""
+    """Return begin and end of the plot in s, or None for the whole run. Raises ValueError outside the run."""
     if args.begin is None and args.end is None:
         return None
     period, last = float(case.clock.sample_period), float(case.clock.duration)
@@ -98,7 +98,7 @@ def _window(case: Case, args: argparse.Namespace) -> tuple[float, float] | None:
 
 
 def _study(case: Case, args: argparse.Namespace) -> Study | None:
-    """The study whose member --member asks for; None without that option."""
+    """Return the study that contains member --member, or None without that option. Raises ValueError."""
     if args.member is None:
         if args.seed is not None or args.members is not None:
             raise ValueError("--seed and --members belong to --member: add it, or set run.seed in the case file.")
@@ -116,14 +116,14 @@ def _study(case: Case, args: argparse.Namespace) -> Study | None:
 
 
 def simulate(case: Case) -> Outcome:
-    """A rollout of a case, every sample recorded, with a progress bar if it takes more than two seconds."""
+    """Simulate a case and record every sample, with a progress bar if it takes more than two seconds."""
     with _bar(case) as bar:
         fold = standard_for(case.settle, case.scenario)
         return record(case.cascade, case.scenario, case.clock, fold=fold, tell=bar.update)
 
 
 def _replay(case: Case, study: Study, member: int) -> Replay:
-    """The same of a member of a study."""
+    """Simulate one member of a study and record every sample, with a progress bar."""
     with _bar(case) as bar:
         return replay(study, member, bar.update)
 

@@ -7,7 +7,7 @@ from ambjax.cases.template_text import template
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """ambjax template."""
+    """Print an annotated case file."""
     text = template(args.scenario)
     if not args.json:
         print(text, end="")

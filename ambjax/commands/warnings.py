@@ -1,7 +1,4 @@
-"""What a case says that is allowed but hardly meant: a remark for each, in words, before it is run.
-
-Units that were taken for others above all: they are SI, and bearings are described in millimetres.
-"""
+"""Warnings about values of a case that are valid but probably unintended, such as millimetres given as metres."""
 
 import dataclasses
 import math
@@ -15,29 +12,29 @@ from ambjax.cases.reader import Case, read_case
 from ambjax.commands.outputs import say
 from ambjax.host.words import one_line
 
-# Gaps, areas of a pole and permeabilities that are built, with room to spare: the paper's are 5e-3, 0.121, 1.25e-6.
+# Plausible ranges of gap (m), pole area (m^2) and permeability (N/A^2); the paper's values are 5e-3, 0.121, 1.25e-6.
 GAPS, AREAS, PERMEABILITIES = (2e-5, 2e-2), (1e-6, 1.0), (6e-7, 2.5e-6)
-# The number of a plant whose default holds for every machine.
+# The plant parameter whose default is correct for every machine.
 GRAVITY = "g"
-# Noise beyond this share of the gap tells little of where in it the rotor is.
+# Largest plausible standard deviation of the position noise, as a share of the gap.
 MOST_NOISE = 0.1
 
 
-def read_aloud(path: str | pathlib.Path) -> Case:
-    """A case file read for a command: what is doubtful in it is said on stderr. Raises ValueError as `read_case`."""
+def read_with_warnings(path: str | pathlib.Path) -> Case:
+    """Read a case file and print its warnings on stderr. Raises ValueError as `read_case` does."""
     case = read_case(path)
     print_warnings(case, path)
     return case
 
 
 def print_warnings(case: Case, path: str | pathlib.Path) -> None:
-    """Say what is doubtful in a case, a line each."""
+    """Print the warnings of a case on stderr, one line each."""
     for warning in warnings_of(case):
         say(one_line(f"{path}: {warning}"))
 
 
 def warnings_of(case: Case) -> list[str]:
-    """One line with path, value, why and what may have been meant, for each number of a case that is hardly meant."""
+    """Return one line for each doubtful value of a case: its path, the value, the reason and the likely intention."""
     return [*_assumed(case), *_sizes(case), *_noise(case), *_velocity(case), *_currents(case), *_motion(case)]
 
 
@@ -82,9 +79,10 @@ def _velocity(case: Case) -> Iterator[str]:
 
 
 def reversal(case: Case, most_i: float) -> Iterator[str]:
-    """Said of a run whose largest |i| (A) the case does not show: that it asks one coil for a current the other way.
+    """Yield a warning if the largest |i| of a run, `most_i` in A, reverses the current of one coil.
 
-    Of the paper's plant alone: what two coils carry is not told by i, half their difference.
+    Applies to the paper's plant only. With two coils, i is half the difference of their currents and does not determine
+    either of them.
     """
     if case.scenario.plant.lumped and most_i > case.scenario.plant.i_0:
         yield f"|i| reaches {most_i:.4g} A, {_beyond(case)} plant.kind = 'two-coil' gives each coil its own."
