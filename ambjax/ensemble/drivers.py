@@ -1,13 +1,17 @@
-"""What drives a metric: the share of its variation that each spread quantity explains, from members already drawn.
+"""Sensitivity of a metric: the share of its variation that each spread quantity explains.
 
-The share is Sobol's first-order index Var(E[y | x])/Var(y) of the metric's ranks: whatever the shape, a V as well as a
-line, and neither a few lost rotors nor times that are never reached (+inf) decide alone. E[y | x] is the least-squares
-fit of cosines of x's rank, as in Plischke's EASI (Reliab. Eng. Syst. Saf. 95, 2010, 354-360), freed of its bias as in
-Tissot and Prieur (Reliab. Eng. Syst. Saf. 107, 2012, 205-213). Spearman's rank correlation tells the trend's sign.
+The share is estimated from members that are already simulated. It is Sobol's first-order index Var(E[y | x])/Var(y),
+where y is the rank of the metric. The index detects a dependence of any shape, a V as well as a line. Ranks bound the
+influence of a few lost rotors and of times that are never reached (+inf).
 
-Why ours: SALib's `rbd_fast` is this estimator, but takes ties in their members' order (a choice of two for a ramp, a
-constant for a cause), resamples half the members for its intervals, and has neither p nor pairs; scipy's
-`sobol_indices` calls the model at points of its own.
+E[y | x] is a least-squares fit of cosines of the rank of x, as in Plischke's EASI (Reliab. Eng. Syst. Saf. 95, 2010,
+354-360). Its bias is removed as in Tissot and Prieur (Reliab. Eng. Syst. Saf. 107, 2012, 205-213). Spearman's rank
+correlation gives the sign of the trend.
+
+Existing implementations do not fit. SALib's `rbd_fast` is the same estimator, but it ranks ties in member order, so
+that a choice of two values becomes a ramp and a constant appears to have an influence. It resamples half the members
+for its intervals, and computes neither p-values nor shares of pairs. SciPy's `sobol_indices` evaluates the model at its
+own points.
 """
 
 import itertools
@@ -16,23 +20,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-# Half waves over the range of x: a V is told to 1 %, a full sine too.
+# Cosines, in half waves over the range of x. Six represent a V, or a full sine, to 1 %.
 TERMS = 6
-# So many members, that differ from most, a cosine is fitted with at least.
+# Least number of members per fitted cosine; members with the most common value of the metric do not count.
 PER_TERM = 4
-# Half waves of each of two quantities, for what they do together, and members looked at for that.
+# For shares of pairs: half waves of each of the two quantities, and members that are used.
 PAIR_TERMS, PAIR_MEMBERS = 2, 16_384
 
 
 class Correlation(NamedTuple):
-    """Spearman's rho, and the probability that unrelated columns show as much."""
+    """Spearman's rho, and its p-value: the probability of so large a |rho| for independent columns."""
 
     rho: np.ndarray
     p: np.ndarray
 
 
 class Shares(NamedTuple):
-    """Shares of variation with their intervals, and the probability that unrelated columns show as much."""
+    """Shares of variation with their intervals, and the p-value: the probability of so large a share by chance."""
 
     share: np.ndarray
     low: np.ndarray
@@ -41,10 +45,12 @@ class Shares(NamedTuple):
 
 
 def spearman(x: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> Correlation:
-    """Rank correlation of every column of x with every column of y, arrays [len(x), len(y)].
+    """Compute the rank correlation of every column of x with every column of y, columns [N].
 
-    Ties share their mean rank. A column that is the same for all members is related to nothing: rho = 0, p = 1. p is
-    from Student's t with N - 2 degrees of freedom, 1 for fewer than three members.
+    Ties get their mean rank. A constant column has rho = 0 and p = 1. The p-value is that of Student's t with N - 2
+    degrees of freedom; it is 1 for fewer than three members.
+
+    Returns rho and p as arrays [len(x), len(y)].
     """
     from scipy.special import stdtr
 
@@ -60,11 +66,12 @@ def _correlation(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def shares(x: Sequence[np.ndarray], y: Sequence[np.ndarray], confidence: float = 0.95) -> Shares:
-    """Share of the variation of every column of y that each column of x alone explains, arrays [len(x), len(y)].
+    """Compute the share of the variation of every column of y that each column of x alone explains, columns [N].
 
-    Of y as it is: give ranks for the share of ranks. Intervals are the delta method's. A column that is the same for
-    all members, or for all but a few, neither explains nor is explained: 0, (0, 1), p = 1. Raises ValueError for
-    columns that are not finite.
+    The values of y are used as they are; pass ranks to get the share of ranks. Intervals come from the delta method. A
+    column that is constant, or constant for all but a few members, has share 0, interval (0, 1) and p = 1.
+
+    Returns arrays [len(x), len(y)]. Raises ValueError if a column of y is not finite.
     """
     columns = [np.asarray(column, float) for column in y]
     if not all(np.isfinite(column).all() for column in columns):
@@ -78,12 +85,16 @@ def shares(x: Sequence[np.ndarray], y: Sequence[np.ndarray], confidence: float =
 def drivers(
     spread: Mapping[str, np.ndarray], metrics: Mapping[str, np.ndarray], confidence: float = 0.95
 ) -> tuple[dict[str, list[dict[str, Any]]], dict[str, dict[str, Any]]]:
-    """By metric: the spread quantities by the share they explain, and what is explained in all, with words.
+    """Rank the spread quantities by the share of each metric that they explain, and summarise what is explained.
 
-    A quantity has path, share, low, high, p, and rho (rank correlation: the sign of the trend). What is explained has
-    "alone", the sum of the shares that are seen, "pair", the two quantities that together explain most beyond that
-    (None: none is seen), and "says". Seen is what noise shows with a probability below 1 - confidence, all looks at a
-    metric taken together.
+    spread: columns [N] of the spread quantities, by dotted path.
+    metrics: columns [N] of the metrics, by name.
+
+    Returns two dicts by metric. The first holds a list of quantities in descending order of their share, each with
+    "path", "share", "low", "high", "p" and "rho" (the rank correlation, which gives the sign of the trend). The second
+    holds "alone", the sum of the significant shares; "pair", the two quantities with the largest significant share
+    beyond their own (None: no pair is significant); and "says", a sentence. Significance is at the level
+    1 - confidence for all tests of a metric together (Bonferroni's correction).
     """
     if not spread:
         return {name: [] for name in metrics}, {name: _account(0.0, None, "nothing is spread") for name in metrics}
@@ -115,7 +126,7 @@ def _words(ranks: np.ndarray, alone: float, pair: dict[str, Any] | None, unknown
     if not alone and pair is None:
         return "nothing that is spread explains it, alone or in pairs: noise"
     together = ""
-    if pair is not None:  # estimates, whose sum may come out above all there is
+    if pair is not None:  # the sum of the estimates may exceed 1
         more = 100 * min(pair["share"], 1.0 - alone)
         amount = f"{more:.0f} % more" if more >= 1 else "a little more"
         together = f", and {' with '.join(pair['paths'])} together {amount}"
@@ -127,7 +138,7 @@ def _words(ranks: np.ndarray, alone: float, pair: dict[str, Any] | None, unknown
 def _pairs(
     spread: dict[str, np.ndarray], ranks: Sequence[np.ndarray], confidence: float
 ) -> list[dict[str, Any] | None]:
-    """For each column: the pair that explains most beyond what each of the two explains alone; None: none is seen."""
+    """Return, for each column, the pair with the largest significant share beyond the two alone; None without one."""
     sample = slice(0, PAIR_MEMBERS)
     Y = np.stack([_standard(column[sample]) for column in ranks])
     waves = {path: _cosines(x[sample], PAIR_TERMS) for path, x in spread.items()}
@@ -144,7 +155,10 @@ def _pairs(
 
 
 def _explanation(waves: np.ndarray, Y: np.ndarray, terms: Sequence[int], confidence: float) -> tuple[np.ndarray, ...]:
-    """Share, low, high and p of each row of Y [columns, N], standard, explained by its first terms of waves [., N]."""
+    """Return share, low, high and p of each row of Y [columns, N], in standard form.
+
+    Row k is fitted with the first terms[k] rows of `waves` [., N].
+    """
     from scipy.special import fdtrc, ndtri
 
     n = Y.shape[1]
@@ -160,7 +174,8 @@ def _explanation(waves: np.ndarray, Y: np.ndarray, terms: Sequence[int], confide
         fit = min(fit, 1.0)
         share = fit - rank / rest * (1 - fit)
         f, y = gain @ waves[:count], Y[column]
-        # d share = (2 f y - share y^2 - fitted)/Var(y) by member; the cosines' own noise counts where nothing is fitted
+        # Influence of a member on the fit: 2 f y - fit y^2 - fit. The term with rank is the noise of the coefficients,
+        # which dominates if the true share is 0.
         influence = np.mean((2 * f * y - fit * y**2 - fit) ** 2) / n
         half = ndtri((1 + confidence) / 2) * np.sqrt(influence + 2 * rank * (1 - fit) ** 2 / n**2)
         p = fdtrc(rank, rest, fit / rank / max((1 - fit) / rest, np.finfo(float).tiny))
@@ -169,13 +184,13 @@ def _explanation(waves: np.ndarray, Y: np.ndarray, terms: Sequence[int], confide
 
 
 def _terms(columns: Sequence[np.ndarray], most: int = TERMS) -> list[int]:
-    """How many cosines each column bears: some members that differ from the commonest value for each."""
+    """Return the number of cosines for each column: one per PER_TERM members off the most common value, or `most`."""
     differing = [len(column) - int(np.unique(column, return_counts=True)[1].max()) for column in columns]
     return [min(most, count // PER_TERM) for count in differing]
 
 
 def _cosines(column: np.ndarray, terms: int) -> np.ndarray:
-    """[terms, N]: sqrt(2) cos(pi k u), k from 1, u in 0..1 the share of members below."""
+    """Return sqrt(2) cos(pi k u), k = 1 to `terms`, [terms, N]; u in 0..1 is the relative rank of each member."""
     from scipy.stats import rankdata
 
     u = (rankdata(column) - 0.5) / len(column)
@@ -189,7 +204,7 @@ def _standard_ranks(columns: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _standard(column: np.ndarray) -> np.ndarray:
-    """Mean 0 and mean square 1; zeros if all are alike."""
+    """Shift and scale a column to mean 0 and mean square 1; zeros if it is constant."""
     x = column - column.mean()
     size = np.abs(x).max()
     return x / size / np.sqrt(np.mean((x / size) ** 2)) if size > 1e-14 * np.abs(column).max() else np.zeros(len(x))
