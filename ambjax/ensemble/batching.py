@@ -84,14 +84,14 @@ def map_members(
     Each leaf of `tree` is a number, shared by all members, or an array [N, ...] with one entry per member. At least one
     leaf must be an array. Members run on all devices of the default backend.
 
-    function: maps a tree with the leaves of one member to a pytree of arrays. JAX traces it, and compiles it again for
-        a function that does not compare equal (==): use a named function or a frozen dataclass, not a new lambda.
-    threads: CPU cores to use (None: all cores that this process may use).
-    call: members in one call of the compiled program, rounded up to whole blocks (None: equal shares for all cores, at
-        most 4096 members each). Memory grows with `call`, not with N. Another value of `call` compiles again. If there
-        are fewer blocks than cores, some cores are idle.
-    block: members that run together in vector instructions (None: as many as fit the first-level cache).
-    plain: compile without the fast path, which does not support reverse-mode differentiation.
+    - `function`: maps a tree with the leaves of one member to a pytree of arrays. JAX traces it, and compiles it again
+      for a function that does not compare equal (==): use a named function or a frozen dataclass, not a new lambda.
+    - `threads`: CPU cores to use (None: all cores that this process may use).
+    - `call`: members in one call of the compiled program, rounded up to whole blocks (None: equal shares for all cores,
+      at most 4096 members each). Memory grows with `call`, not with N. Another value of `call` compiles again. If there
+      are fewer blocks than cores, some cores are idle.
+    - `block`: members that run together in vector instructions (None: as many as fit the first-level cache).
+    - `plain`: compile without the fast path, which does not support reverse-mode differentiation.
 
     Returns NumPy arrays in member order, every leaf with a leading axis [N].
 

@@ -19,10 +19,10 @@ NEVER = jnp.inf
 class BlockValues(NamedTuple):
     """Result of `Blocks` for one run.
 
-    low, high: minimum and maximum of each signal in each block [count]; +inf and -inf in blocks without a sample at
-        which the rotor is alive.
-    variation: total variation of u_mean over the steps that begin in each block [count], V.
-    last: each signal at the last sample; NaN if the rotor is not alive there.
+    - `low`, `high`: minimum and maximum of each signal in each block [count]; +inf and -inf in blocks without a sample
+      at which the rotor is alive.
+    - `variation`: total variation of u_mean over the steps that begin in each block [count], V.
+    - `last`: each signal at the last sample; NaN if the rotor is not alive there.
     """
 
     low: dict[str, Array]
@@ -43,10 +43,10 @@ class Carry(NamedTuple):
 class Blocks:
     """Fold that reduces signals over `count` blocks of `every` samples each.
 
-    of: names of the signals, which are fields of a Row.
-    every: samples in a block.
-    count: number of blocks.
-    period: sample period, s.
+    - `of`: names of the signals, which are fields of a Row.
+    - `every`: samples in a block.
+    - `count`: number of blocks.
+    - `period`: sample period, s.
     """
 
     of: tuple[str, ...] = static()

@@ -27,7 +27,8 @@ def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: b
     scans from 0 to that delay. A run that diverges counts as lost. All other inputs stay as in the case.
 
     The controller predicts over the delay unless the processor's `predict` is False, as in a map over delays.
-    known: whether the controller predicts over the delay of each run (True) or over the case's own delay (False).
+
+    - `known`: whether the controller predicts over the delay of each run (True) or over the case's own delay (False).
 
     Returns the Delays, in samples. Raises ValueError as `rollout` does.
     """

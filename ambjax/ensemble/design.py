@@ -31,9 +31,9 @@ DOMAIN = 0x616D626A
 def points(design: str, seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
     """Compute the points [n, dims] of `members` in the open unit cube.
 
-    design: a key of DESIGNS.
-    members: integers [n], 0 <= member < total.
-    total: number of members of the whole ensemble.
+    - `design`: a key of DESIGNS.
+    - `members`: integers [n], 0 <= member < total.
+    - `total`: number of members of the whole ensemble.
 
     Raises ValueError for an unknown design, a member outside 0 <= member < total, or a total that is too large.
     """

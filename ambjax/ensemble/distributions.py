@@ -20,9 +20,9 @@ SHAPES = ("uniform", "normal")
 class Distribution(Protocol):
     """Distribution of one number. `str` gives it in the syntax of a case file.
 
-    fault: the reason why the parameters are invalid, in words; None if they are valid.
-    support: smallest and largest value.
-    quantile: inverse cumulative distribution at u in (0, 1).
+    - `fault`: the reason why the parameters are invalid, in words; None if they are valid.
+    - `support`: smallest and largest value.
+    - `quantile`: inverse cumulative distribution at u in (0, 1).
     """
 
     relative: bool

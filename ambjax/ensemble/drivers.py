@@ -87,8 +87,8 @@ def drivers(
 ) -> tuple[dict[str, list[dict[str, Any]]], dict[str, dict[str, Any]]]:
     """Rank the spread quantities by the share of each metric that they explain, and summarise what is explained.
 
-    spread: columns [N] of the spread quantities, by dotted path.
-    metrics: columns [N] of the metrics, by name.
+    - `spread`: columns [N] of the spread quantities, by dotted path.
+    - `metrics`: columns [N] of the metrics, by name.
 
     Returns two dicts by metric. The first holds a list of quantities in descending order of their share, each with
     "path", "share", "low", "high", "p" and "rho" (the rank correlation, which gives the sign of the trend). The second

@@ -43,9 +43,9 @@ def run_whole(
     Arguments and results are those of `run_ensemble`, without rows: each leaf of `cascade`, `scenario` and `fold` is a
     number, shared by all members, or an array [N]. Noise is that of `rollout`.
 
-    clock: its method must be RK4.
-    block: members of one Pallas program, a power of two, at least 32.
-    interpret: run the kernel in Pallas's interpreter, which works on any device but is slow. For tests.
+    - `clock`: its method must be RK4.
+    - `block`: members of one Pallas program, a power of two, at least 32.
+    - `interpret`: run the kernel in Pallas's interpreter, which works on any device but is slow. For tests.
 
     Returns an Outcome whose leaves have shape [N], in member order.
 

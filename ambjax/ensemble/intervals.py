@@ -165,8 +165,8 @@ def _studentised_ends(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ends of the studentised interval [columns].
 
-    whole: the estimate and its standard error, each [1, columns].
-    resamples: the same of each resample, [replicates, columns].
+    - `whole`: the estimate and its standard error, each [1, columns].
+    - `resamples`: the same of each resample, [replicates, columns].
 
     A resample with standard error 0 (all its values are equal) counts as infinitely far from the estimate. If the
     standard error of the estimate itself is 0 (its tail is a single value), the percentile interval is returned.

@@ -28,9 +28,9 @@ STEP = ("plant.", "controller.", "actuator.bandwidth", "run.clearance", "disturb
 class Spread:
     """The numbers that vary between members, and the design of experiments.
 
-    entries: pairs of dotted path and distribution, one for each number that varies.
-    design: "random" (independent members), "latin-hypercube" (each number stratified over all members), or "sobol"
-        (low discrepancy in all numbers together; best if the number of members is a power of 2).
+    - `entries`: pairs of dotted path and distribution, one for each number that varies.
+    - `design`: "random" (independent members), "latin-hypercube" (each number stratified over all members), or "sobol"
+      (low discrepancy in all numbers together; best if the number of members is a power of 2).
     """
 
     entries: tuple[tuple[str, Distribution], ...] = ()
