@@ -1,1 +1,1 @@
-"""What the program needs of the machine it runs on: sealed files, a lock, streams, Ctrl-C, one line of words."""
+"""Services of the operating system: files with checksums, a lock, standard streams, Ctrl-C, and text for messages."""

@@ -1,8 +1,8 @@
-"""Ctrl-C: one line, exit code 130, at any instant.
+"""Handling of Ctrl-C: the process prints one line and ends with exit code 130, at any instant.
 
-Python's own way, an exception in the middle of whatever runs, is lost or becomes another error where that is a library
-on its way in, a compiler or a callback. Here a thread hears of the signal by a pipe, whatever the main thread does, and
-ends the process. That loses nothing: whatever is worth keeping is on disk, whole, the moment that it is finished.
+Python raises KeyboardInterrupt in the code that happens to run. During an import, a compilation or a callback that
+exception is lost, or becomes another error. Here a thread reads the signal from a pipe, independently of the main
+thread, and ends the process. Finished results are not lost, because each is written atomically when it is finished.
 """
 
 import contextlib
@@ -14,12 +14,19 @@ import threading
 from collections.abc import Callable, Iterator
 
 INTERRUPTED = 130
-# How long a line waits for room on stderr, in s.
+# Longest time to wait until stderr accepts a line, s.
 PATIENCE = 1.0
 
 
 class _Ear:
-    """What is done about Ctrl-C at present: one for the process."""
+    """Current response of the process to Ctrl-C. There is one instance.
+
+    - `program`: name of the program, the prefix of messages.
+    - `report`: returns the words that follow "interrupted"; None: no words.
+    - `gently`: message for the first Ctrl-C, which then does not end the process; empty: the first one ends it.
+    - `asked`: whether that first Ctrl-C was received.
+    - `busy`: lock that delays the end of the process.
+    """
 
     program = ""
     report: Callable[[], str] | None = None
@@ -44,11 +51,11 @@ class _Ear:
                 os._exit(INTERRUPTED)
 
     def _say(self, words: str) -> None:
-        """On stderr, if it takes it: whatever is wrong there, the thread that listens lives on."""
+        """Write a line to stderr. Suppresses every error, because the listening thread must continue."""
         with contextlib.suppress(Exception):
             begin = "\n" if _bar_is_open() else ""
             if os.name == "posix" and not select.select([], [2], [], PATIENCE)[1]:
-                return  # nobody reads it, or its terminal is paused
+                return  # a full pipe, or a paused terminal
             os.write(2, f"{begin}{self.program}: {words}\n".encode(errors="backslashreplace"))
 
 
@@ -57,7 +64,10 @@ _ear = _Ear()
 
 @contextlib.contextmanager
 def listening(program: str) -> Iterator[None]:
-    """Ctrl-C in this block ends the process so; in another thread than the main one, or where it is ignored: not."""
+    """Handle Ctrl-C in this block as the module describes.
+
+    Has no effect outside the main thread, or if SIGINT is ignored.
+    """
     main = threading.current_thread() is threading.main_thread()
     if not main or signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None):
         yield
@@ -81,7 +91,7 @@ def listening(program: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def keeping(words: Callable[[], str]) -> Iterator[None]:
-    """Where Ctrl-C ends this block, its line says what `words` returns, called in another thread."""
+    """Report the result of `words()` if Ctrl-C ends the process in this block. Another thread calls `words`."""
     before, _ear.report = _ear.report, words
     try:
         yield
@@ -91,7 +101,7 @@ def keeping(words: Callable[[], str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def gently(words: str) -> Iterator[None]:
-    """In this block the first Ctrl-C says these words, a sentence, and is left to `heed`."""
+    """At the first Ctrl-C in this block, print the sentence `words` and let `heed` raise. A second ends the process."""
     before, _ear.gently = _ear.gently, words
     try:
         yield
@@ -101,13 +111,13 @@ def gently(words: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def unbroken() -> Iterator[None]:
-    """Ctrl-C waits until this block, a short one, has ended: what it keeps is counted among what is kept."""
+    """Delay Ctrl-C until this block ends, so that its result is included in the report. The block must be short."""
     with _ear.busy:
         yield
 
 
 def heed() -> None:
-    """Raises KeyboardInterrupt if a gentle Ctrl-C has been heard."""
+    """Raise KeyboardInterrupt if a first Ctrl-C was received in a `gently` block."""
     if _ear.asked:
         raise KeyboardInterrupt
 
@@ -119,6 +129,6 @@ def _listen(heard: int) -> None:
 
 
 def _bar_is_open() -> bool:
-    """Whether a progress bar stands on the last line of the terminal."""
+    """Return whether the last line of the terminal shows a progress bar."""
     tqdm = getattr(sys.modules.get("tqdm"), "tqdm", None)
     return any(bar.last_print_t > bar.start_t for bar in getattr(tqdm, "_instances", ()))

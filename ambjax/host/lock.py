@@ -1,4 +1,4 @@
-"""A lock on a directory: one process at a time, released by the system when its holder ends."""
+"""A lock on a directory, for one process at a time. The operating system releases it when the process ends."""
 
 import contextlib
 import errno
@@ -8,16 +8,16 @@ from collections.abc import Iterator
 from filelock import FileLock, Timeout
 
 LOCK = ".ambjax-lock"
-# What a file system without locks answers.
+# Error codes of a file system without locks.
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 @contextlib.contextmanager
 def alone(directory: pathlib.Path) -> Iterator[None]:
-    """Hold the directory in this block.
+    """Hold the lock on the directory in this block.
 
-    Has no effect on a file system without locks. Raises ValueError if another process holds the directory, OSError if
-    the lock file cannot be made.
+    Has no effect on a file system without locks. Raises ValueError if another process holds the lock, and OSError if
+    the lock file cannot be created.
     """
     lock = FileLock(directory / LOCK, timeout=0)
     try:

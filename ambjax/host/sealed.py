@@ -1,7 +1,7 @@
-"""Files that are there whole or not at all, and that show it when they were damaged later.
+"""Files that are written atomically, and carry a checksum that detects later damage.
 
-A sealed file is an .npz with one entry more, `seal`: JSON that holds facts (what the arrays belong to), the dtype and
-shape of every array, and a SHA-256 of all of it. Whoever reads one gets what was written, or is told why not.
+A sealed file is an .npz with an additional entry `seal`. The seal is JSON with facts (metadata of the arrays), the
+dtype and shape of every array, and a SHA-256 of facts and arrays. Reading verifies the seal.
 """
 
 import contextlib
@@ -24,15 +24,15 @@ Arrays = dict[str, np.ndarray]
 
 
 class DamagedError(Exception):
-    """A file does not hold what was written into it; the text says why, in a few words."""
+    """A file does not hold the data that were written to it. The text gives the reason in a few words."""
 
 
 def write_whole(path: pathlib.Path, write: Callable[[IO[bytes]], Any]) -> None:
-    """Write to a new file beside `path`, *.part, then rename it: `path` holds everything or what it held before.
+    """Write a file atomically: call `write` with a new file *.part in the same directory, then rename it to `path`.
 
-    Raises ValueError if that cannot be done (a full disk, for one).
+    After a failure `path` is unchanged. Raises ValueError if the file cannot be written, for example on a full disk.
     """
-    # a name that nobody else has, and nothing that a link leads to
+    # A random name avoids files of other processes; mode "x" refuses to follow an existing link.
     part = path.with_name(f"{path.name}-{secrets.token_hex(8)}.part")
     try:
         with part.open("xb") as file:
@@ -48,7 +48,10 @@ def write_whole(path: pathlib.Path, write: Callable[[IO[bytes]], Any]) -> None:
 
 
 def seal(path: pathlib.Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
-    """Write arrays, of any names but `seal`, with facts as JSON has them. Raises ValueError as `write_whole`."""
+    """Write a sealed file of arrays, with any names but `seal`, and of facts that JSON can hold.
+
+    Raises ValueError as `write_whole` does.
+    """
     arrays = {name: np.asarray(array) for name, array in arrays.items()}
     content = dict(facts) | {ARRAYS: shapes(arrays)}
     mark = np.array(json.dumps(content | {CHECKSUM: _checksum(content, arrays)}).encode())
@@ -56,17 +59,17 @@ def seal(path: pathlib.Path, arrays: Mapping[str, np.ndarray], facts: Mapping[st
 
 
 def unseal(path: pathlib.Path) -> tuple[Arrays, dict[str, Any]]:
-    """The arrays and facts of a sealed file. Raises DamagedError where they are not what was sealed."""
+    """Return the arrays and facts of a sealed file. Raises DamagedError if the file does not match its seal."""
     try:
         if not zipfile.is_zipfile(path):
             raise DamagedError("it is not a whole archive")
-        with path.open("rb") as file, np.load(file) as archive:  # np.load itself leaves a damaged one open
+        with path.open("rb") as file, np.load(file) as archive:  # np.load does not close a damaged file
             arrays = {name: archive[name] for name in archive.files}
         content = dict(json.loads(arrays.pop(SEAL).item()))
         checksum = content.pop(CHECKSUM)
     except DamagedError:
         raise
-    except Exception as error:  # a damaged archive raises whatever the part of it that is read first happens to raise
+    except Exception as error:  # the type depends on which part of the archive is damaged
         raise DamagedError(f"a part of it cannot be read ({type(error).__name__})") from None
     if checksum != _checksum(content, arrays):
         raise DamagedError("its checksum is wrong")
@@ -76,12 +79,12 @@ def unseal(path: pathlib.Path) -> tuple[Arrays, dict[str, Any]]:
 
 
 def shapes(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Dtype and shape of each array, as JSON has them."""
+    """Return the dtype and shape of each array, in JSON form."""
     return {name: [np.lib.format.dtype_to_descr(array.dtype), list(array.shape)] for name, array in arrays.items()}
 
 
 def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """The first fact in which two fingerprints differ, in words: `there` and `here`. Empty: none."""
+    """Describe the first fact in which two fingerprints differ; an empty string if they are equal."""
     for key in {**there, **here}:
         if there.get(key) != here.get(key):
             return f"{key} is {there.get(key)} there and {here.get(key)} here"
@@ -89,7 +92,7 @@ def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested tables as one, keys dotted, values as JSON has them: a fingerprint whose differences have names."""
+    """Flatten nested tables into one with dotted keys and values in JSON form, for use as a fingerprint."""
     entries: dict[str, Any] = {}
     for key, value in tree.items():
         name = f"{prefix}{key}"
@@ -98,7 +101,7 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def provenance() -> dict[str, str]:
-    """What computes: results may differ by rounding, or more, where one of these does."""
+    """Return the versions of ambjax and JAX and the floating-point type. Results may differ if one of these differs."""
     import jax
     import jax.numpy as jnp
 
@@ -106,7 +109,7 @@ def provenance() -> dict[str, str]:
 
 
 def checksum_of(facts: Mapping[str, Any]) -> str:
-    """SHA-256 of facts as JSON has them, in hexadecimal."""
+    """Return the SHA-256 of facts in JSON form, in hexadecimal."""
     return _checksum(facts, {})
 
 

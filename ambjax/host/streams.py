@@ -1,4 +1,4 @@
-"""Standard streams that are never in the way of the work: open, of any alphabet, and silent once they take nothing."""
+"""Standard streams whose failures do not stop a command: closed streams, missing characters, and write errors."""
 
 import contextlib
 import os
@@ -8,7 +8,10 @@ from typing import Any
 
 
 class Lenient:
-    """A text stream that keeps its first failure, after which what is written goes nowhere. Else it is the stream."""
+    """Wrapper of a text stream that records the first failure and then discards all output.
+
+    All other attributes are those of the stream.
+    """
 
     def __init__(self, stream: Any):
         self.stream, self.failed = stream, None
@@ -21,7 +24,7 @@ class Lenient:
         self._try(self.stream.flush)
 
     def failure(self) -> Exception | None:
-        """Why something that was written has not arrived; None: all of it has."""
+        """Flush the stream and return its first failure; None if all output was written."""
         self.flush()
         return self.failed
 
@@ -29,7 +32,7 @@ class Lenient:
         if self.failed is None:
             try:
                 act()
-            except (OSError, ValueError) as why:  # ValueError: it is closed
+            except (OSError, ValueError) as why:  # ValueError: the stream is closed
                 self.failed = why
 
     def __getattr__(self, name: str) -> Any:
@@ -37,10 +40,10 @@ class Lenient:
 
 
 def open_streams() -> None:
-    """Give streams that the caller has closed an end: print would put on stdout what is meant for a missing stderr.
+    """Open closed standard streams on the null device, and escape characters that stdout or stderr cannot encode.
 
-    In the order of their numbers, so that no file that is opened later takes the place of one. What the alphabet of
-    stdout or stderr lacks is written as an escape.
+    Without stderr, `print` would write messages for stderr to stdout. The streams are opened in the order of their file
+    descriptors, so that no file opened later gets the descriptor of a standard stream.
     """
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
@@ -52,9 +55,10 @@ def open_streams() -> None:
 
 @contextlib.contextmanager
 def lenient() -> Iterator[Lenient]:
-    """stdout, which is yielded, and stderr are lenient in this block.
+    """Wrap stdout and stderr in `Lenient` in this block, and yield the wrapped stdout.
 
-    One that failed stays so: what it holds would fail once more as Python ends, and become the exit code.
+    A stream that failed stays wrapped. Otherwise its buffer would fail again when Python exits, and change the exit
+    code.
     """
     before = {name: getattr(sys, name) for name in ("stdout", "stderr")}
     now = {name: Lenient(stream) for name, stream in before.items()}

@@ -4,10 +4,10 @@ import shlex
 
 
 def one_line(text: str) -> str:
-    """The text with line breaks and whatever else does not print written as escapes: a message is one line."""
+    """Return the text with line breaks and other unprintable characters as escapes, so that a message is one line."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def command(*words: str) -> str:
-    """A command for a message, between backticks: a word that a shell would split has quotes of its own."""
+    """Return a command for a message, between backticks; words that a shell would split are quoted."""
     return f"`{shlex.join(words)}`"
