@@ -36,7 +36,7 @@ def _threefry(k_0: Array, k_1: Array, x: Array, y: Array) -> tuple[Array, Array]
 
 @compiled_alone
 def _both(*words: Array) -> Array:
-    """Return both words of `_threefry` in the bits of one complex number, because XLA computes two results twice."""
+    """Return both words of `_threefry` in the bits of one complex number: XLA would repeat the work for two results."""
     return lax.complex(*[lax.bitcast_convert_type(word, jnp.float32) for word in _threefry(*words)])
 
 
