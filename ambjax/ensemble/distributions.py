@@ -26,7 +26,7 @@ class Distribution(Protocol):
     """
 
     relative: bool
-    """whether the nominal value matters"""
+    """whether the values depend on the nominal value"""
 
     def fault(self) -> str | None: ...
     def support(self, nominal: float) -> tuple[float, float]: ...

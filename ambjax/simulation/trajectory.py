@@ -27,17 +27,17 @@ class Row(NamedTuple):
     z: Array
     """rotor displacement, m"""
     z_dot: Array
-    """its rate, m/s"""
+    """rotor velocity, m/s"""
     i: Array
     """current deviation, A"""
     i_ref: Array
-    """its reference, A"""
+    """reference of the current deviation, A"""
     u: Array
-    """applied voltage (after the supply's limit; 0 once lost), V"""
+    """applied voltage (after the supply's limit; 0 after the rotor is lost), V"""
     u_mean: Array
-    """the same, averaged over the sample that begins at t: what is left of spikes shorter than a sample, V"""
+    """mean of the applied voltage over the sample that begins at t (spikes shorter than a sample included), V"""
     u_peak: Array
-    """largest |voltage| at the coils over the same sample, V; on a processor with an amplifier u is what it is told"""
+    """largest |voltage| at the coils over the same sample (with an amplifier, u is its command), V"""
     v: Array
     """scaled magnetic force v(z, i), A^2/m^2. Eq. (3)"""
     v_star: Array
@@ -45,21 +45,21 @@ class Row(NamedTuple):
     v_tilde: Array
     """input error v_star - v(z, i_ref) as the controller computed it, A^2/m^2"""
     sigma: Array
-    """sliding variable of the true motion, m/s"""
+    """sliding variable, computed from the true motion, m/s"""
     r: Array
     """reference, m"""
     q_z: Array
-    """disturbance acceleration, scaled force included, m/s^2"""
+    """disturbance acceleration, including the scaled force, m/s^2"""
     q_i: Array
-    """disturbance of the current's rate, A/s"""
+    """disturbance of the current derivative, A/s"""
     z_measured: Array
-    """displacement as the sensor reports it, m; 0 where it reports NaN"""
+    """displacement that the sensor reports (0 if it reports NaN), m"""
     heat: Array
     """copper loss in both coils, W"""
     refused: Array
-    """whether the guard of a processor refused a reading, bool"""
+    """whether the guard of the processor refused the reading, bool"""
     alive: Array
-    """whether the rotor was still levitated, bool"""
+    """whether the rotor is levitated, bool"""
 
     @property
     def e_z(self) -> Array:
