@@ -37,7 +37,7 @@ class Row(NamedTuple):
     u_mean: Array
     """mean of the applied voltage over the sample that begins at t (spikes shorter than a sample included), V"""
     u_peak: Array
-    """largest |voltage| at the coils over the same sample (with an amplifier, u is its command), V"""
+    """largest |voltage| at the coils over the sample (with an amplifier, u is its command), V"""
     v: Array
     """scaled magnetic force v(z, i), A^2/m^2. Eq. (3)"""
     v_star: Array
@@ -45,7 +45,7 @@ class Row(NamedTuple):
     v_tilde: Array
     """input error v_star - v(z, i_ref) as the controller computed it, A^2/m^2"""
     sigma: Array
-    """sliding variable, computed from the true motion, m/s"""
+    """sliding variable of the true motion, m/s"""
     r: Array
     """reference, m"""
     q_z: Array
