@@ -50,6 +50,7 @@ def points(design: str, seed: int, dims: int, members: np.ndarray, total: int) -
 
 
 def _random(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
+    """Return independent points, from a random key for each member and dimension."""
     pairs = np.stack([np.repeat(members, dims), np.tile(np.arange(dims), len(members))]).astype(np.uint32)
     columns = np.pad(pairs, ((0, 0), (0, -pairs.shape[1] % BLOCK)))
     blocks = np.split(columns, columns.shape[1] // BLOCK, axis=1)
@@ -70,6 +71,7 @@ def _words(seed: Array, members: Array, dims: Array) -> Array:
 
 
 def _sobol(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
+    """Return points of SciPy's scrambled Sobol sequence; member k is its k-th point."""
     from scipy.stats import qmc
 
     engine = qmc.Sobol(dims, scramble=True, bits=SOBOL_BITS, rng=np.random.default_rng([DOMAIN, seed]))
@@ -87,6 +89,7 @@ def _sobol(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
 
 
 def _latin_hypercube(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
+    """Return points of a Latin hypercube of `total` members."""
     if total * dims > MOST_LATIN:
         raise ValueError(
             f'design = "latin-hypercube": {total:,} members of {dims} quantities exceed the {MOST_LATIN:,} '

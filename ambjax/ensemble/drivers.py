@@ -119,6 +119,7 @@ def _account(alone: float, pair: dict[str, Any] | None, says: str) -> dict[str, 
 
 
 def _words(ranks: np.ndarray, alone: float, pair: dict[str, Any] | None, unknown: bool) -> str:
+    """Describe in words what is explained of one metric."""
     if np.ptp(ranks) == 0:
         return "it is the same for all members"
     if unknown:

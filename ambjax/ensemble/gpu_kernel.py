@@ -67,6 +67,7 @@ def run_whole(
 def _whole(
     cascade: Cascade, scenario: Scenario, clock: Clock, fold: Fold | None, *, members: int, block: int, interpret: bool
 ) -> Outcome:
+    """Build the kernel, run it on all members, and return their outcomes [N]."""
     scenario, key = _with_draws(scenario, members)
     leaves, tree = jax.tree.flatten((Realised(cascade, scenario, key), clock, fold))
     axes = [0 if x.ndim else None for x in leaves]

@@ -62,6 +62,7 @@ def _absent(signal: Any) -> bool:
 
 
 def _below(node: Any, path: str, route: tuple[int | str, ...]) -> Iterator[tuple[str, Place]]:
+    """Yield every number in a record and its nested records, by dotted path."""
     if isinstance(node, tuple):
         for index, item in enumerate(node):
             yield from _below(item, f"{path}.{index}", (*route, index))
@@ -124,6 +125,7 @@ def _get(node: Any, route: tuple[int | str, ...]) -> Any:
 
 
 def _set(node: Any, route: tuple[int | str, ...], value: Any) -> Any:
+    """Return the record or tuple `node` with the number at `route` replaced."""
     if not route:
         return value
     step, *rest = route

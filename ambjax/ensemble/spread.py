@@ -128,6 +128,8 @@ def require_path(path: str, known: Iterable[str], value: str = "") -> None:
 
 
 def _check_one(path: str, kind: Distribution, place: Place) -> None:
+    """Raise ValueError for a distribution that is not valid for its number."""
+
     def refuse(text: str) -> ValueError:
         return ValueError(f"spread.{path} = {kind}: {text}")
 

@@ -133,6 +133,7 @@ def _plain(estimate: Estimate) -> dict[str, float | None]:
 
 
 def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) -> dict[str, Any]:
+    """Return the statistics of each metric, with intervals, by name."""
     finite = [name for name, x in metrics.items() if x.size and np.isfinite(x).all()]
     intervals = bootstrap([metrics[name] for name in finite], ALPHA, confidence, seed) if finite else {}
     nothing = Estimate(np.inf, np.inf, np.inf)
@@ -153,6 +154,8 @@ def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) ->
 def _worst(
     index: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray, name: str, values: np.ndarray, count: int
 ) -> list[dict[str, Any]]:
+    """Return the `count` worst members: ended ones by time, then survivors by `values` in descending order."""
+
     def status(k: int) -> str:
         return "survives" if np.isinf(lost_at[k]) else "stalled" if stalled[k] else "lost"
 

@@ -174,6 +174,7 @@ class Store:
         write_whole(self.manifest, lambda file: file.write(text))
 
     def _compare(self) -> None:
+        """Read the manifest, and raise ValueError if it is damaged or of another study."""
         try:
             record = dict(json.loads(self.manifest.read_text(encoding="utf-8")))
             if record.pop(CHECKSUM, None) != checksum_of(record):
@@ -189,6 +190,7 @@ class Store:
             )
 
     def _check_room(self, columns: int) -> None:
+        """Raise ValueError if the disk has no room for `columns` numbers per member."""
         # Chunks and members.npz exist at the same time at the end, hence the factor 2.
         need = 2 * 8 * columns * self.members
         real = pathlib.Path(os.path.realpath(self.directory))  # Path.resolve raises on a loop of links
@@ -233,6 +235,7 @@ class Store:
         return {name: Column(kind, digests[name].hexdigest()) for name, kind in kinds.items()}
 
     def _merge(self, file: IO[bytes], columns: dict[str, Column]) -> None:
+        """Write all columns to an .npz archive, chunk by chunk, to bound the memory."""
         with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
             for name, column in columns.items():
                 head = {"descr": column.kind, "fortran_order": False, "shape": (self.members,)}
@@ -242,6 +245,7 @@ class Store:
                         out.write(np.ascontiguousarray(part).tobytes())
 
     def _column(self, name: str) -> Iterator[np.ndarray]:
+        """Yield one column, chunk by chunk. Raises DamagedError for a chunk that cannot be read."""
         for span in self.spans():
             try:
                 with self._path(span).open("rb") as file, np.load(file) as chunk:

@@ -98,6 +98,7 @@ def ignore_sigint() -> Iterator[None]:
 
 
 def _begin() -> None:
+    """Configure a worker process, which then ends when its parent ends."""
     prepare()
 
     def wait() -> None:

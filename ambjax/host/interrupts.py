@@ -37,6 +37,7 @@ class _Ear:
         self.busy = threading.Lock()
 
     def hear(self) -> None:
+        """Respond to one Ctrl-C: print the message of `gently` once; otherwise report and end the process."""
         if self.gently and not self.asked:
             self.asked = True
             self._say(f"{self.gently} Ctrl-C again ends it at once.")

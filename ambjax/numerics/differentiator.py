@@ -73,6 +73,7 @@ def _root(c: Array, m: int) -> Array:
 @jax.custom_jvp
 @compiled_alone
 def _cubic_root(c: Array) -> Array:
+    """Return the root of `_root` for m = 2."""
     square, linear, _ = LAM[2]
     # The root of each term alone is an upper bound. The left side is convex, so Newton's steps decrease to the root.
     r = jnp.minimum(jnp.minimum(c / linear, jnp.sqrt(c / square)), jnp.cbrt(c))

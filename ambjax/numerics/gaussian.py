@@ -23,6 +23,7 @@ ATANH_TERMS = {"float64": 10, "float32": 5}
 
 
 def _threefry(k_0: Array, k_1: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    """Return two random words from the key (k_0, k_1) and the counter (x, y)."""
     schedule = (k_0, k_1, k_0 ^ k_1 ^ jnp.uint32(0x1BD11BDA))
     x, y = x + k_0, y + k_1
     for group in range(5):

@@ -89,6 +89,7 @@ def _hard_twist(x: Array, a: Array, b: Array) -> Array:
 
 @jax.custom_jvp
 def _twisted(x: Array, a: Array, b: Array, p: Array) -> Array:
+    """Return the y of `twist`, by Halley's method safeguarded by bisection."""
     size = jnp.abs(x)
     # Omitting the root term gives an upper bound; the root term of an upper bound gives a lower bound.
     above = relax(size, b, p)

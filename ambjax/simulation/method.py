@@ -110,6 +110,7 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
 
 
 def _check_limit(clock: Clock, limit: float, cascade: Cascade, scenario: Scenario) -> None:
+    """Raise ValueError if the step is above the stability limit of the method."""
     try:
         named = slopes(cascade, scenario)
         step = clock.integrator.step_size(float(np.max(np.asarray(clock.sample_period))))

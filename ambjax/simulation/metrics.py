@@ -231,6 +231,7 @@ class Standard:
     e_band: Scalar = leaf(default=1e-3, unit="A", above=0, at_most=1e6)
 
     def _folds(self) -> Named:
+        """Return the fold of each metric by name."""
         late = self.settle
         return Named(
             {

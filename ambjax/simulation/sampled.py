@@ -89,6 +89,7 @@ class Sampled:
         return FaultyErrors(*drawn, sensor.struck(self.loop.words(), sample, self.period))
 
     def start(self) -> SampledState:
+        """Return the state at t = 0."""
         scenario, zero = self.loop.scenario, jnp.zeros(())
         plant = scenario.plant.start(scenario.initial.measurement())
         seen = scenario.plant.measurement(plant).z if self._lags else ()
@@ -264,6 +265,7 @@ class Sampled:
         return InitialValueProblem(inputs, rates, scale, self._status, None, observed, SHOWN, edges=edges)
 
     def _at_coil(self, outside: ExternalInputs, u: Array, x: Any) -> Array:
+        """Return the voltage at the coils, V, for the amplifier's voltage u."""
         plant, amplifier = self.loop.scenario.plant, self.loop.scenario.amplifier
         if amplifier is None:
             return u
