@@ -1,8 +1,8 @@
-"""Have XLA's CPU backend compile a function as a loop of its own.
+"""Barriers against fusion: XLA's CPU backend compiles a function as a separate loop.
 
-XLA fuses elementwise arithmetic into large loops and repeats divisions in every fusion that uses them. An
-iteration of a loop with several divisions in a row is one long chain, of which the processor holds hardly two at
-once; shorter loops overlap. No barrier of JAX's survives to that point, but a call that XLA may not inline does.
+XLA fuses elementwise arithmetic into large loops, and repeats divisions in every fusion that uses them. An iteration
+with several divisions in sequence is a long dependency chain, of which the processor overlaps hardly two. Shorter loops
+overlap better. JAX's optimisation barriers are removed before fusion; a call that XLA must not inline is kept.
 """
 
 import functools
@@ -16,10 +16,10 @@ Result = TypeVar("Result")
 
 
 def compiled_alone(function: Callable[..., Result]) -> Callable[..., Result]:
-    """`function` of arrays, neither fused with its surroundings nor repeated in them on CPUs; elsewhere as it is.
+    """Return a version of `function`, of arrays, that XLA neither fuses nor repeats on CPUs. Elsewhere it is unchanged.
 
-    For what lies under a custom_jvp, whose rule may apply it to tangents if it is linear in them: reverse mode then
-    transposes it.
+    Use it below a custom_jvp. The rule may apply it to tangents if it is linear in them; reverse mode then transposes
+    it.
     """
     inner = jax.jit(function)
 
@@ -47,10 +47,10 @@ def _kept_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arr
 
 
 def materialised(tree: Result, beside: Any = ()) -> Result:
-    """The same values, and the same derivatives, stored: whoever uses them reads memory.
+    """Return the same values, with the same derivatives, stored in memory.
 
-    Else XLA computes an intermediate again in every loop that uses it, and its derivatives once more for each. What is
-    a leaf of `beside` is there already.
+    Otherwise XLA computes an intermediate value and its derivatives again in every loop that uses it. Leaves of
+    `beside` are stored already, and are not stored again.
     """
     there = set(map(id, jax.tree.leaves(beside)))
     return jax.tree.map(lambda x: x if id(x) in there else _barrier(x), tree)

@@ -1,11 +1,11 @@
-"""The fast path on CPUs: have XLA compile a whole rollout as one function, with the machine's widest vectors.
+"""The fast path on CPUs: XLA compiles a whole rollout as one function, with the widest vectors of the machine.
 
-XLA's CPU backend dispatches every fused operation of a loop's body on its own, some 30 ns each;
-for a loop body of a few hundred flops that is nearly all the time. A call marked as below is compiled,
-loops and all, into one function instead. Where the processor has AVX-512, XLA is also asked to use all of
-it. Neither is documented, so both are probed once per process: where one is unknown or changes the
-result, the rest runs, correct and slower, and one line in the log says so. AMBJAX_PLAIN=1 in the
-environment turns both off.
+XLA's CPU backend dispatches every fused operation of a loop's body separately, at about 30 ns each. For a loop body of
+a few hundred floating-point operations that is nearly all the time. A call with the attributes MARK is compiled into
+one function, loops included. On processors with AVX-512 a compiler option also selects vectors of 512 bits.
+
+Neither feature is documented, so both are tested once per process. If one is not available or changes a result, the
+program runs without it, correct but slower, and logs one line. AMBJAX_PLAIN=1 in the environment disables both.
 """
 
 import functools
@@ -33,14 +33,16 @@ def _mark(tree: Any) -> Any:
 
 
 def one_kernel(function: Callable[..., Any], static_argnames: tuple[str, ...] = ()) -> Callable[..., Any]:
-    """jit(`function`) compiled as one kernel where that works, as usual elsewhere.
+    """Return jit(`function`), compiled as one kernel if that is possible.
 
-    Only an outermost call is marked: inside another jit, grad or vmap the whole belongs to that
-    transformation, and reverse mode through a marked call aborts XLA's compiler. So apply this to the
-    outermost function: one_kernel(vmap(f)), one_kernel(value_and_grad(f)). Every array must be an
-    argument: a large constant in a marked function can abort the compiler too. Over many hundred members at
-    once XLA may split an operation over threads, which it cannot do inside one function: such a call is
-    compiled as usual, with a line in the log; jax.lax.map with a batch_size keeps the blocks small.
+    Only an outermost call is marked. Inside another jit, grad or vmap the function is compiled as a part of that
+    transformation, and reverse mode through a marked call aborts XLA's compiler. Apply it to the outermost function:
+    one_kernel(vmap(f)), one_kernel(value_and_grad(f)). Every array must be an argument, because a large constant in a
+    marked function can abort the compiler too.
+
+    With many hundred members at once XLA may split an operation over threads, which is not possible inside one
+    function. Such a call is compiled in the ordinary way, with a line in the log. jax.lax.map with a batch_size keeps
+    blocks small.
     """
     inner = jax.jit(function, static_argnames=static_argnames)
     refused: set[tuple[Any, ...]] = set()
@@ -71,7 +73,7 @@ def one_kernel(function: Callable[..., Any], static_argnames: tuple[str, ...] = 
 
 @functools.cache
 def _cpuinfo() -> str:
-    """What Linux tells about the processor; empty elsewhere."""
+    """Return Linux's description of the processor; an empty string on other systems."""
     cpuinfo = pathlib.Path("/proc/cpuinfo")
     return cpuinfo.read_text() if cpuinfo.exists() else ""
 
@@ -81,17 +83,17 @@ def _has_avx512() -> bool:
 
 
 def block_bytes(members: int) -> int:
-    """Length of the vectors, in bytes, into which this many members that run together are cut.
+    """Return the size, in bytes, of one number's array in a block, for an ensemble of `members` members.
 
-    Small enough for the first-level cache, large enough to pay for the start of each loop over them. On Intel's
-    cores with AVX-512 twice as much is slower; AMD's are faster with it, unless much of the last would be padding.
+    A block must fit the first-level cache, and be large enough to outweigh the start of each loop over it. Twice the
+    size is slower on Intel's cores with AVX-512. It is faster on AMD's, unless much of the last block is padding.
     """
     return 1024 if members >= 256 and _has_avx512() and "AuthenticAMD" in _cpuinfo() else 512
 
 
 @functools.cache
 def options() -> dict[str, Any] | None:
-    """Compiler options of the fast path on this machine; None if there is no fast path."""
+    """Return the compiler options of the fast path on this machine; None if there is no fast path."""
     if jax.default_backend() != "cpu":
         return None
     if os.environ.get("AMBJAX_PLAIN", "0") not in ("", "0"):
@@ -108,17 +110,17 @@ def options() -> dict[str, Any] | None:
 
 
 def _step(y: Any, lib: Any) -> Any:
-    """One turn of the probe's loop, computed with the functions of `lib` (numpy or jax.numpy)."""
+    """Compute one iteration of the probe's loop with the functions of `lib` (numpy or jax.numpy)."""
     turn = y - lib.round(y)
     rational = turn * (1 + 0.7 * turn * turn) / (1 + turn * turn * (0.9 + 0.1 * turn * turn))
     return y + rational + lib.where(y > 1, 1 / y, y) / lib.sqrt(lib.sqrt(y * y + 0.25))
 
 
 def _probe(trial: dict[str, Any]) -> str:
-    """What is wrong with the mark and these options; empty if they work and change no result.
+    """Test the mark with these compiler options. Returns the fault in words; empty if the result is correct.
 
-    Compiles a small loop over the operations of a rollout (division, root, rounding, selection), with enough lanes
-    for vectors and a remainder, and compares it with NumPy.
+    The test compiles a small loop with the operations of a rollout (division, root, rounding, selection), with enough
+    lanes for vectors and a remainder, and compares the result with NumPy's.
     """
 
     def body(_: Any, y: jax.Array) -> jax.Array:
@@ -140,5 +142,5 @@ def _probe(trial: dict[str, Any]) -> str:
         return str(fault).splitlines()[0] if str(fault) else type(fault).__name__
     if "xla_cpu_small_call" not in (compiled.as_text() or ""):
         return "this version of XLA does not know the mark"
-    # A wrong lane is wrong in the first digits; rounding grows thirtyfold in three turns of the loop.
+    # An error in a lane changes the first digits; rounding errors grow by a factor of 30 in three iterations.
     return "" if error < 1e4 * jnp.finfo(argument.dtype).eps else f"results are off by {error:.1e} with options {trial}"

@@ -1,7 +1,6 @@
-"""The engine: many members at once, in blocks that fit the first-level cache, on every core or device.
+"""The ensemble engine: run many members at once, in blocks that fit the first-level cache, on all cores or devices.
 
-Whatever is asked of a member, its result depends on nothing else: not on who runs beside it, in which block,
-thread, device or order.
+The result of a member does not depend on the other members, nor on its block, thread, device or position in the order.
 """
 
 import functools
@@ -29,7 +28,7 @@ MEMBERS = "members"
 
 
 class Parts(NamedTuple):
-    """A pytree split into the leaves that differ between members, [N] each, and those that all share."""
+    """A pytree split into the leaves that vary between members, [N, ...] each, and the leaves that all share."""
 
     moving: Any
     shared: Any
@@ -45,14 +44,16 @@ def run_ensemble(
     threads: int | None = None,
     call: int | None = None,
 ) -> Outcome:
-    """Simulate every member of an ensemble; results in member order, every leaf with a leading axis [N].
+    """Simulate every member of an ensemble.
 
-    Leaves of `cascade`, `scenario` and `fold` are numbers, shared by all members, or arrays [N], one entry for
-    each; at least one must be an array (`scenario.member`, for one). A member is told by that; so is its noise.
-    `fold` sees every sample; rows are recorded at every `every`-th sample (0: none), [N, rows]. `threads` and `call`
-    as in `map_members`.
+    Each leaf of `cascade`, `scenario` and `fold` is a number, shared by all members, or an array [N] with one entry per
+    member. At least one leaf must be an array, for example `scenario.member`; that number selects a member's noise.
+    `fold` is updated at every sample. Rows are recorded at every `every`-th sample (0: none).
+    `threads` and `call` are those of `map_members`.
 
-    Raises ValueError as `rollout` does, and where the lengths of two leaves differ.
+    Returns an Outcome in member order: every leaf has a leading axis [N], rows have shape [N, rows].
+
+    Raises ValueError as `rollout` does, and if the lengths of two leaves differ.
     """
     tree = canonical((*prepare(cascade, scenario, clock), fold))
     return map_members(_rollout(every), tree, threads=threads, call=call)
@@ -60,7 +61,7 @@ def run_ensemble(
 
 @functools.cache
 def _rollout(every: int) -> Callable[[Any], Outcome]:
-    """The rollout of one member; the same function each time, so that it compiles once."""
+    """Return the rollout of one member. The function is cached, so that it compiles once."""
 
     def one(tree: tuple[System, Clock, Fold | None]) -> Outcome:
         system, clock, fold = tree
@@ -78,26 +79,31 @@ def map_members(
     block: int | None = None,
     plain: bool = False,
 ) -> Any:
-    """function(member) of every member of an ensemble; results in member order, every leaf with a leading axis [N].
+    """Return function(member) for every member of an ensemble.
 
-    Leaves of `tree` are numbers, shared by all members, or arrays [N, ...], one entry for each; at least one must be
-    an array. `function`, of a tree whose leaves are those of one member, is traced by JAX, and is compiled again for
-    one that is not equal (==): give it a name, or make it a frozen dataclass. Members run on all devices that
-    there are, on a CPU on `threads` cores (None: all that this process may use). One call of the compiled program
-    takes `call` members, in whole blocks (None: equal shares for all cores, 4096 at most; of fewer blocks than cores,
-    some cores get none): memory grows with that, not with N, and another number compiles again. `block` of them run
-    together, in vectors (None: as many as fit the first-level cache). `plain`: without the fast path, which knows no
-    reverse mode. Results are NumPy arrays.
+    Each leaf of `tree` is a number, shared by all members, or an array [N, ...] with one entry per member. At least one
+    leaf must be an array. Members run on all devices of the default backend.
 
-    Raises ValueError where the lengths of two leaves differ, or there is none.
+    - `function`: maps a tree with the leaves of one member to a pytree of arrays. JAX traces it, and compiles it again
+      for a function that does not compare equal (==): use a named function or a frozen dataclass, not a new lambda.
+    - `threads`: CPU cores to use (None: all cores that this process may use).
+    - `call`: members in one call of the compiled program, rounded up to whole blocks (None: equal shares for all cores,
+      at most 4096 members each). Memory grows with `call`, not with N. Another value of `call` compiles again. If there
+      are fewer blocks than cores, some cores are idle.
+    - `block`: members that run together in vector instructions (None: as many as fit the first-level cache).
+    - `plain`: compile without the fast path, which does not support reverse-mode differentiation.
+
+    Returns NumPy arrays in member order, every leaf with a leading axis [N].
+
+    Raises ValueError if the lengths of two leaves differ, or if no leaf is an array.
     """
     return _Engine(function, tree, threads, call, block, plain).results()
 
 
 def size(tree: Any) -> int:
-    """Number of members: the common length of all array leaves.
+    """Return the number of members: the common length of all array leaves.
 
-    Raises ValueError if there is none, or if they differ.
+    Raises ValueError if there is no array leaf, or if the lengths differ.
     """
     lengths = {np.shape(x)[0] for x in jax.tree.leaves(tree) if np.ndim(x)}
     if len(lengths) != 1:
@@ -110,7 +116,7 @@ def size(tree: Any) -> int:
 
 
 class _Engine:
-    """One ensemble, cut into calls of equal shape, so that it compiles once."""
+    """One ensemble, split into calls of equal shape, so that the program compiles once."""
 
     def __init__(self, function: Callable[[Any], Any], tree: Any, threads: Any, call: Any, block: Any, plain: bool):
         leaves, self.tree = jax.tree.flatten(tree)
@@ -120,7 +126,7 @@ class _Engine:
         self.function, self.devices = function, jax.devices()
         alone = len(self.devices) == 1 and self.devices[0].platform == "cpu"
         self.workers = (threads or cores()) if alone else 1
-        # equal calls: the last one is as long as the others, whatever is left for it
+        # All calls have the same length; the last call may hold fewer members than its length.
         calls = max(-(-self.members // (MOST_CALL * self.workers)), 1) * self.workers
         share = call or -(-self.members // calls)
         self.block = block or block_bytes(share) // jnp.result_type(float).itemsize
@@ -129,7 +135,7 @@ class _Engine:
         self.program = _program(len(self.devices), plain)
 
     def results(self) -> Any:
-        """Run all calls and put the results in order."""
+        """Run all calls and concatenate their results in member order."""
         starts = range(0, self.members, self.call)
         with ThreadPoolExecutor(min(self.workers, len(starts))) as pool:
             parts = list(pool.map(self._one, starts))
@@ -137,7 +143,7 @@ class _Engine:
         return jax.tree.map(lambda x: x[: self.members], whole)
 
     def _one(self, start: int) -> Any:
-        """One call: members from `start` on, the last one repeated where the call is longer than what is left."""
+        """Run one call: members from `start` on; the last member is repeated to fill the call."""
         index = np.minimum(np.arange(start, start + self.call), self.members - 1)
         parts = Parts(tuple(x[index] for x in self.moving), self.shared)
         results = self.program(parts, function=self.function, moves=self.moves, tree=self.tree, block=self.block)
@@ -145,12 +151,12 @@ class _Engine:
 
 
 def cores() -> int:
-    """Processor cores that this process may use."""
+    """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _blocks(parts: Parts, *, function: Callable[[Any], Any], moves: tuple[bool, ...], tree: Any, block: int) -> Any:
-    """All members of a call: a loop over blocks, the whole function of a block inside it."""
+    """Run all members of a call: a loop over blocks, with the whole function vectorised over a block."""
 
     def member(moving: tuple[Array, ...]) -> Any:
         own, common = iter(moving), iter(parts.shared)
@@ -170,7 +176,7 @@ _usual = jax.jit(_blocks, static_argnames=STATIC)
 
 @functools.cache
 def _program(devices: int, plain: bool) -> Callable[..., Any]:
-    """The compiled program: for one device, or with members sharded over several."""
+    """Return the compiled program: for one device, or with members sharded over several devices."""
     if devices == 1:
         return _usual if plain else _fast
     mesh = Mesh(np.asarray(jax.devices()[:devices]), (MEMBERS,))
@@ -178,7 +184,7 @@ def _program(devices: int, plain: bool) -> Callable[..., Any]:
 
     def spread(parts: Parts, **static: Any) -> Any:
         one = functools.partial(_blocks, **static)
-        # Members do not speak to each other: nothing to check, and constants may stay unsharded.
+        # Members exchange no data, so the check of replication is not needed, and constants may stay unsharded.
         where = {"mesh": mesh, "in_specs": (Parts(over, everywhere),), "out_specs": over, "check_vma": False}
         return jax.shard_map(one, **where)(parts)
 

@@ -1,7 +1,7 @@
-"""What the fan chart shows of a run beside its instants: extremes and the voltage's variation, block by block.
+"""The fold behind the fan chart: extremes of signals and the variation of the voltage, block by block.
 
-A run of many samples is recorded at few instants. What happens between two of them is folded over the block of
-samples that begins at the first.
+A fan chart records a long run at a few instants only. This fold reduces the samples between two instants, a block,
+to the smallest and largest value of each signal and the total variation of the voltage.
 """
 
 from typing import Any, NamedTuple
@@ -12,15 +12,17 @@ from jax import Array, lax
 from ambjax.numerics.records import Scalar, leaf, record, static
 from ambjax.simulation.metrics import Ending
 
-# Beyond every value: the extremes of no value at all.
+# Initial minimum of a block (its negative: initial maximum), before any value is included.
 NEVER = jnp.inf
 
 
 class BlockValues(NamedTuple):
-    """Blocks of one run: extremes by signal [count] (+inf and -inf where the rotor is not alive), and more.
+    """Result of `Blocks` for one run.
 
-    `variation` [count]: the total variation of u_mean over the steps that begin in a block, V. `last`: each signal at
-    the last sample, NaN if the rotor is not alive then.
+    - `low`, `high`: minimum and maximum of each signal in each block [count]; +inf and -inf in blocks without a sample
+      at which the rotor is alive.
+    - `variation`: total variation of u_mean over the steps that begin in each block [count], V.
+    - `last`: each signal at the last sample; NaN if the rotor is not alive there.
     """
 
     low: dict[str, Array]
@@ -30,7 +32,7 @@ class BlockValues(NamedTuple):
 
 
 class Carry(NamedTuple):
-    """Blocks so far, and u_mean and whether the rotor was alive at the sample before."""
+    """State of the fold: the blocks so far, and u_mean (V) and `alive` at the previous sample."""
 
     folded: BlockValues
     u_mean: Array
@@ -39,7 +41,13 @@ class Carry(NamedTuple):
 
 @record
 class Blocks:
-    """Fold: the signals `of` a row over each of `count` blocks of `every` samples, one `period` (s) each."""
+    """Fold that reduces signals over `count` blocks of `every` samples each.
+
+    - `of`: names of the signals, which are fields of a Row.
+    - `every`: samples in a block.
+    - `count`: number of blocks.
+    - `period`: sample period, s.
+    """
 
     of: tuple[str, ...] = static()
     every: int = static()
@@ -75,5 +83,5 @@ class Blocks:
 
 
 def _with(values: Array, at: Array, combine: Any, x: Array) -> Array:
-    """values [count] with combine(values[at], x) in the place of values[at]."""
+    """Return `values` [count] with entry `at` replaced by combine(values[at], x)."""
     return lax.dynamic_update_index_in_dim(values, combine(lax.dynamic_index_in_dim(values, at, 0, False), x), at, 0)

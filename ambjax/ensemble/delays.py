@@ -1,4 +1,4 @@
-"""The delay margin of a cascade on a processor: the largest delay with which it still holds its rotor."""
+"""The delay margin of a cascade on a processor: the largest delay at which the rotor survives."""
 
 import dataclasses
 from typing import Any
@@ -13,20 +13,24 @@ from ambjax.simulation.trajectory import STALLED
 from ambjax.theorem.sampled_report import Delays
 from ambjax.world.scenario import Scenario
 
-# Delays of a pass, which run together. The scan's are 1/128 sample apart or less: a rotor may be lost in a narrow
-# interval of delays, and one between two that are tried is not seen. The second pass divides a step of the scan by 256.
+# Delays of one pass, simulated together in one ensemble. The first pass has steps of 1/128 sample or less, because the
+# rotor may be lost in a narrow interval of delays only; an interval between two neighbouring delays is not found.
+# The second pass divides one step of the first by 256.
 DELAYS = 257
 
 
 def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: bool = True) -> Delays:
-    """The largest delay with which a cascade on a processor holds its rotor over the clock's horizon.
+    """Compute the largest delay at which the rotor survives the clock's horizon with a cascade on a processor.
 
-    Scans the delays from the case's own to the longest there is, `DELAYS` of them in one ensemble; then divides the
-    first step in which the rotor is lost as finely. A run that diverges is a loss. Where the case's own delay loses the
-    rotor the scan goes from 0 to it. All else stays. Delays are predicted unless `predict` is False, as in a map over
-    them: with `known` by the delay that is tried, else by the case's own.
+    The search scans `DELAYS` delays, from the case's own delay to the longest one allowed, in one ensemble. A second
+    pass divides the first step in which the rotor is lost. If the rotor is lost at the case's own delay, the search
+    scans from 0 to that delay. A run that diverges counts as lost. All other inputs stay as in the case.
 
-    Raises ValueError as `rollout` does.
+    The controller predicts over the delay unless the processor's `predict` is False, as in a map over delays.
+
+    - `known`: whether the controller predicts over the delay of each run (True) or over the case's own delay (False).
+
+    Returns the Delays, in samples. Raises ValueError as `rollout` does.
     """
     processor: Any = cascade.on_processor(0.0, MOST_DELAY).processor
     processor, own = dataclasses.replace(processor, predict=processor.predict is not False), float(processor.delay)
@@ -52,7 +56,7 @@ def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: b
 
 
 def _read(delays: np.ndarray, lost_at: np.ndarray, code: np.ndarray) -> Delays:
-    """What the runs with these delays, ascending, say: [N] each, the time (s) at which a run ended early and why."""
+    """Return the margin from runs at ascending `delays` [N], the time (s) of each early end [N] and its code [N]."""
     ended, step = np.isfinite(lost_at), float(delays[1] - delays[0])
     if not ended.any():
         return Delays(float(delays[-1]), None, None, step)

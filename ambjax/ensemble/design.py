@@ -1,7 +1,7 @@
-"""Designs: where the members of an ensemble lie in the unit cube.
+"""Designs of experiments: the points of an ensemble's members in the unit cube.
 
-Member k's point depends on (seed, k), for the Latin hypercube also on the total, never on the chunk in
-which it is asked for. Coordinates lie strictly between 0 and 1, so that every quantile of them is finite.
+The point of member k depends on (seed, k), for the Latin hypercube also on the number of members, but never on the
+chunk that contains the member. Coordinates lie strictly between 0 and 1, so that every quantile of them is finite.
 """
 
 import functools
@@ -14,23 +14,28 @@ from jax import Array
 
 from ambjax.world.scenario import DESIGN_STREAM, Scenario
 
-# Bits of a coordinate; points are the centres of such cells, so never 0 or 1. More than 32 SciPy cannot fast-forward.
+# Bits of a coordinate. Points are centres of cells of that size, so they are never 0 or 1. SciPy's Sobol generator
+# cannot fast-forward with more than 32 bits.
 BITS = 52
 SOBOL_BITS = 32
-# Random numbers are made this many at a time, so that their code is compiled once.
+# Random numbers are generated in blocks of this size, so that the generator is compiled once.
 BLOCK = 2**14
-# A Latin hypercube is made whole; its numbers take 8 bytes each, three times over while it is made.
+# Largest table of a Latin hypercube, which must be generated as a whole: 8 bytes a number, and three copies meanwhile.
 MOST_LATIN = 30_000_000
-# The member's number is a signed integer of 32 bits where JAX computes in float32.
+# A member's number is a signed 32-bit integer when JAX computes in float32.
 MOST_MEMBERS = 2**31
-# So that a design does not share random numbers with a user's own generator of the same seed.
+# Added to the seed, so that a design shares no random numbers with another NumPy generator of the same seed.
 DOMAIN = 0x616D626A
 
 
 def points(design: str, seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
-    """Points [n, dims] in the open unit cube of the members (integers [n], 0 <= member < total).
+    """Compute the points [n, dims] of `members` in the open unit cube.
 
-    Raises ValueError for an unknown design, a member outside the total, or a total too large.
+    - `design`: a key of DESIGNS.
+    - `members`: integers [n], 0 <= member < total.
+    - `total`: number of members of the whole ensemble.
+
+    Raises ValueError for an unknown design, a member outside 0 <= member < total, or a total that is too large.
     """
     members = np.atleast_1d(np.asarray(members, np.int64))
     if design not in DESIGNS:
@@ -45,6 +50,7 @@ def points(design: str, seed: int, dims: int, members: np.ndarray, total: int) -
 
 
 def _random(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
+    """Return independent points, from a random key for each member and dimension."""
     pairs = np.stack([np.repeat(members, dims), np.tile(np.arange(dims), len(members))]).astype(np.uint32)
     columns = np.pad(pairs, ((0, 0), (0, -pairs.shape[1] % BLOCK)))
     blocks = np.split(columns, columns.shape[1] // BLOCK, axis=1)
@@ -55,7 +61,7 @@ def _random(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray
 
 @jax.jit
 def _words(seed: Array, members: Array, dims: Array) -> Array:
-    """Two words of 32 random bits for each pair of a member and a dimension: the same in either precision of JAX."""
+    """Return two words of 32 random bits for each pair of a member and a dimension; equal in float32 and float64."""
 
     def one(member: Array, dim: Array) -> Array:
         key = jax.random.fold_in(Scenario(seed=seed, member=member).key(), DESIGN_STREAM)
@@ -65,6 +71,7 @@ def _words(seed: Array, members: Array, dims: Array) -> Array:
 
 
 def _sobol(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
+    """Return points of SciPy's scrambled Sobol sequence; member k is its k-th point."""
     from scipy.stats import qmc
 
     engine = qmc.Sobol(dims, scramble=True, bits=SOBOL_BITS, rng=np.random.default_rng([DOMAIN, seed]))
@@ -74,7 +81,7 @@ def _sobol(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
         ahead = int(run[0]) - engine.num_generated
         if ahead:
             engine.fast_forward(ahead)
-        elif run[0] == 0:  # the first point apart: SciPy warns where the first draw is no power of 2
+        elif run[0] == 0:  # SciPy warns if the first draw is not a power of 2, so the first point is drawn alone
             parts.append(engine.random(1))
             run = run[1:]
         parts.append(engine.random(len(run)))
@@ -82,6 +89,7 @@ def _sobol(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
 
 
 def _latin_hypercube(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
+    """Return points of a Latin hypercube of `total` members."""
     if total * dims > MOST_LATIN:
         raise ValueError(
             f'design = "latin-hypercube": {total:,} members of {dims} quantities exceed the {MOST_LATIN:,} '

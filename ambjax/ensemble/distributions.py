@@ -1,8 +1,8 @@
-"""Distributions: how one number is spread.
+"""Distributions of a number of the case that varies between members.
 
-Each is a record with `quantile(u, nominal)`, its inverse cumulative distribution, so that every design of points u in
-the unit cube works with each; and `support(nominal)`, the interval that it never leaves. Normal shapes are
-cut at 6 standard deviations, beyond which lie 2 in 1e9: so they have bounds too.
+Each is a record with `quantile(u, nominal)`, the inverse cumulative distribution, so that it works with every design of
+points u in the unit cube; and `support(nominal)`, the interval that contains all values. Normal shapes are truncated at
+6 standard deviations, which excludes a probability of 2e-9, so they have finite bounds too.
 """
 
 import math
@@ -12,16 +12,21 @@ import numpy as np
 
 from ambjax.numerics.records import Scalar, leaf, record, static
 
-# Standard deviations at which normal shapes are cut.
+# Standard deviations at which normal shapes are truncated.
 CUT = 6.0
 SHAPES = ("uniform", "normal")
 
 
 class Distribution(Protocol):
-    """How one number is spread. `str` gives it as it stands in a case file."""
+    """Distribution of one number. `str` gives it in the syntax of a case file.
+
+    - `fault`: the reason why the parameters are invalid, in words; None if they are valid.
+    - `support`: smallest and largest value.
+    - `quantile`: inverse cumulative distribution at u in (0, 1).
+    """
 
     relative: bool
-    """whether the nominal value matters"""
+    """whether the values depend on the nominal value"""
 
     def fault(self) -> str | None: ...
     def support(self, nominal: float) -> tuple[float, float]: ...
@@ -29,7 +34,7 @@ class Distribution(Protocol):
 
 
 def cut_normal(u: np.ndarray) -> np.ndarray:
-    """Quantile of the standard normal distribution cut at +-6."""
+    """Return the quantile of the standard normal distribution truncated at +-6."""
     from scipy.special import ndtr, ndtri
 
     outside = ndtr(-CUT)
@@ -38,7 +43,7 @@ def cut_normal(u: np.ndarray) -> np.ndarray:
 
 @record
 class Normal:
-    """nominal + std z, z standard normal."""
+    """Normal distribution: nominal + std z, z standard normal."""
 
     std: Scalar = leaf(at_least=0, doc="standard deviation, in the unit of the number")
     relative = True
@@ -62,7 +67,7 @@ class Normal:
 
 @record
 class Percent:
-    """nominal (1 + percent/100 x): x uniform in -1..1, or standard normal."""
+    """Relative distribution: nominal + |nominal| percent/100 x, with x uniform in -1..1 or standard normal."""
 
     percent: Scalar = leaf(at_least=0, doc="half width, or standard deviation, in per cent of nominal")
     shape: str = static(default="uniform")
@@ -88,7 +93,7 @@ class Percent:
 
 @record
 class Uniform:
-    """Anything from low to high, equally likely. The nominal value does not matter."""
+    """Uniform distribution from low to high. It does not depend on the nominal value."""
 
     low: Scalar = leaf(doc="least value")
     high: Scalar = leaf(doc="largest value")
@@ -109,7 +114,7 @@ class Uniform:
 
 @record
 class LogUniform:
-    """Its logarithm is uniform: every decade from low to high is equally likely."""
+    """Log-uniform distribution: the logarithm of the number is uniform from log(low) to log(high)."""
 
     low: Scalar = leaf(above=0, doc="least value")
     high: Scalar = leaf(above=0, doc="largest value")
@@ -125,13 +130,13 @@ class LogUniform:
         return self.low, self.high
 
     def quantile(self, u: np.ndarray, nominal: float) -> np.ndarray:
-        low, high = math.log(self.low), math.log(self.high)  # their ratio may overflow
-        return np.clip(np.exp(low + (high - low) * np.asarray(u)), self.low, self.high)  # exp may round beyond its ends
+        low, high = math.log(self.low), math.log(self.high)  # logarithms, because high/low may overflow
+        return np.clip(np.exp(low + (high - low) * np.asarray(u)), self.low, self.high)  # exp may round outward
 
 
 @record
 class Choice:
-    """One of several values, equally likely."""
+    """Discrete distribution: one of several values, all equally likely."""
 
     values: tuple[Scalar, ...]
     relative = False

@@ -1,4 +1,4 @@
-"""What drives a metric: the share of its variation that each spread quantity explains, from members already drawn.
+"""Sensitivity of a metric: the share of its variation that each spread quantity explains.
 
 The share is Sobol's first-order index Var(E[y | x])/Var(y) of the metric's ranks: whatever the shape, a V as well as a
 line, and neither a few lost rotors nor times that are never reached (+inf) decide alone. E[y | x] is the least-squares
@@ -6,9 +6,14 @@ fit of cosines of x's rank, as in Plischke's EASI (Reliab. Eng. Syst. Saf. 95, 2
 Tissot and Prieur (Reliab. Eng. Syst. Saf. 107, 2012, 205-213). The sign of the trend is that of
 Spearman's rank correlation.
 
-Why ours: SALib's `rbd_fast` is this estimator, but takes ties in their members' order (a choice of two for a ramp, a
-constant for a cause), resamples half the members for its intervals, and has neither p nor pairs; scipy's
-`sobol_indices` calls the model at points of its own.
+E[y | x] is a least-squares fit of cosines of the rank of x, as in Plischke's EASI (Reliab. Eng. Syst. Saf. 95, 2010,
+354-360). Its bias is removed as in Tissot and Prieur (Reliab. Eng. Syst. Saf. 107, 2012, 205-213). Spearman's rank
+correlation gives the sign of the trend.
+
+Existing implementations do not fit. SALib's `rbd_fast` is the same estimator, but it ranks ties in member order, so
+that a choice of two values becomes a ramp and a constant appears to have an influence. It resamples half the members
+for its intervals, and computes neither p-values nor shares of pairs. SciPy's `sobol_indices` evaluates the model at its
+own points.
 """
 
 import itertools
@@ -39,11 +44,12 @@ def _correlation(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def shares(x: Sequence[np.ndarray], y: Sequence[np.ndarray], confidence: float = 0.95) -> Shares:
-    """Share of the variation of every column of y that each column of x alone explains, arrays [len(x), len(y)].
+    """Compute the share of the variation of every column of y that each column of x alone explains, columns [N].
 
-    Of y as it is: give ranks for the share of ranks. Intervals are the delta method's. A column that is the same for
-    all members, or for all but a few, neither explains nor is explained: 0, (0, 1), p = 1. Raises ValueError for
-    columns that are not finite.
+    The values of y are used as they are; pass ranks to get the share of ranks. Intervals come from the delta method. A
+    column that is constant, or constant for all but a few members, has share 0, interval (0, 1) and p = 1.
+
+    Returns arrays [len(x), len(y)]. Raises ValueError if a column of y is not finite.
     """
     columns = [np.asarray(column, float) for column in y]
     if not all(np.isfinite(column).all() for column in columns):
@@ -57,12 +63,16 @@ def shares(x: Sequence[np.ndarray], y: Sequence[np.ndarray], confidence: float =
 def drivers(
     spread: Mapping[str, np.ndarray], metrics: Mapping[str, np.ndarray], confidence: float = 0.95
 ) -> tuple[dict[str, list[dict[str, Any]]], dict[str, dict[str, Any]]]:
-    """By metric: the spread quantities by the share they explain, and what is explained in all, with words.
+    """Rank the spread quantities by the share of each metric that they explain, and summarise what is explained.
 
-    A quantity has path, share, low, high, p, and rho (rank correlation: the sign of the trend). What is explained has
-    "alone", the sum of the shares that are seen, "pair", the two quantities that together explain most beyond that
-    (None: none is seen), and "says". Seen is what noise shows with a probability below 1 - confidence, all looks at a
-    metric taken together.
+    - `spread`: columns [N] of the spread quantities, by dotted path.
+    - `metrics`: columns [N] of the metrics, by name.
+
+    Returns two dicts by metric. The first holds a list of quantities in descending order of their share, each with
+    "path", "share", "low", "high", "p" and "rho" (the rank correlation, which gives the sign of the trend). The second
+    holds "alone", the sum of the significant shares; "pair", the two quantities with the largest significant share
+    beyond their own (None: no pair is significant); and "says", a sentence. Significance is at the level
+    1 - confidence for all tests of a metric together (Bonferroni's correction).
     """
     if not spread:
         return {name: [] for name in metrics}, {name: _account(0.0, None, "nothing is spread") for name in metrics}
@@ -87,6 +97,7 @@ def _account(alone: float, pair: dict[str, Any] | None, says: str) -> dict[str, 
 
 
 def _words(ranks: np.ndarray, alone: float, pair: dict[str, Any] | None, unknown: bool) -> str:
+    """Describe in words what is explained of one metric."""
     if np.ptp(ranks) == 0:
         return "it is the same for all members"
     if unknown:
@@ -94,7 +105,7 @@ def _words(ranks: np.ndarray, alone: float, pair: dict[str, Any] | None, unknown
     if not alone and pair is None:
         return "nothing that is spread explains it, alone or in pairs: noise"
     together = ""
-    if pair is not None:  # estimates, whose sum may come out above all there is
+    if pair is not None:  # the sum of the estimates may exceed 1
         more = 100 * min(pair["share"], 1.0 - alone)
         amount = f"{more:.0f} % more" if more >= 1 else "a little more"
         together = f", and {' with '.join(pair['paths'])} together {amount}"
@@ -106,7 +117,7 @@ def _words(ranks: np.ndarray, alone: float, pair: dict[str, Any] | None, unknown
 def _pairs(
     spread: dict[str, np.ndarray], ranks: Sequence[np.ndarray], confidence: float
 ) -> list[dict[str, Any] | None]:
-    """For each column: the pair that explains most beyond what each of the two explains alone; None: none is seen."""
+    """Return, for each column, the pair with the largest significant share beyond the two alone; None without one."""
     sample = slice(0, PAIR_MEMBERS)
     Y = np.stack([_standard(column[sample]) for column in ranks])
     waves = {path: _cosines(x[sample], PAIR_TERMS) for path, x in spread.items()}
@@ -123,7 +134,10 @@ def _pairs(
 
 
 def _explanation(waves: np.ndarray, Y: np.ndarray, terms: Sequence[int], confidence: float) -> tuple[np.ndarray, ...]:
-    """Share, low, high and p of each row of Y [columns, N], standard, explained by its first terms of waves [., N]."""
+    """Return share, low, high and p of each row of Y [columns, N], in standard form.
+
+    Row k is fitted with the first terms[k] rows of `waves` [., N].
+    """
     from scipy.special import fdtrc, ndtri
 
     n = Y.shape[1]
@@ -139,7 +153,8 @@ def _explanation(waves: np.ndarray, Y: np.ndarray, terms: Sequence[int], confide
         fit = min(fit, 1.0)
         share = fit - rank / rest * (1 - fit)
         f, y = gain @ waves[:count], Y[column]
-        # d share = (2 f y - share y^2 - fitted)/Var(y) by member; the cosines' own noise counts where nothing is fitted
+        # Influence of a member on the fit: 2 f y - fit y^2 - fit. The term with rank is the noise of the coefficients,
+        # which dominates if the true share is 0.
         influence = np.mean((2 * f * y - fit * y**2 - fit) ** 2) / n
         half = ndtri((1 + confidence) / 2) * np.sqrt(influence + 2 * rank * (1 - fit) ** 2 / n**2)
         p = fdtrc(rank, rest, fit / rank / max((1 - fit) / rest, np.finfo(float).tiny))
@@ -154,7 +169,7 @@ def _terms(columns: Sequence[np.ndarray], most: int = TERMS) -> list[int]:
 
 
 def _cosines(column: np.ndarray, terms: int) -> np.ndarray:
-    """[terms, N]: sqrt(2) cos(pi k u), k from 1, u in 0..1 the share of members below."""
+    """Return sqrt(2) cos(pi k u), k = 1 to `terms`, [terms, N]; u in 0..1 is the relative rank of each member."""
     from scipy.stats import rankdata
 
     u = (rankdata(column) - 0.5) / len(column)

@@ -1,9 +1,9 @@
-"""Whole rollouts in one kernel, for accelerators: the time loop inside, one lane per member.
+"""Whole rollouts in one kernel, for accelerators: the kernel contains the time loop, and each lane runs one member.
 
-On an accelerator a loop outside a kernel launches several kernels per step, each of which takes longer than
-the arithmetic. Here Pallas (through Triton) compiles one program that loads the members' numbers, loops over
-all samples in registers and stores the result of the fold. What runs is the rollout's own code, traced inside the
-kernel; only what jax.random draws is drawn before.
+If the time loop is outside the kernel, every step launches several kernels, and each launch takes longer than the
+arithmetic. Here Pallas (through Triton) compiles one program that loads the numbers of its members, loops over all
+samples in registers, and stores the result of the fold. The kernel traces the code of the ordinary rollout; only the
+random numbers of jax.random are drawn before the kernel starts.
 """
 
 import dataclasses
@@ -38,13 +38,18 @@ def run_whole(
     block: int = BLOCK,
     interpret: bool = False,
 ) -> Outcome:
-    """Simulate every member of an ensemble by one kernel on an accelerator; the contract of `run_ensemble`.
+    """Simulate every member of an ensemble in one kernel on an accelerator.
 
-    Leaves of `cascade`, `scenario` and `fold` are numbers, shared by all members, or arrays [N]; so are the results,
-    in member order, without rows. `block` members, a power of two of at least 32, share a program. `interpret`
-    runs the kernel's program on any device, slowly: for tests. The method must be RK4. Noise is that of `rollout`.
+    Arguments and results are those of `run_ensemble`, without rows: each leaf of `cascade`, `scenario` and `fold` is a
+    number, shared by all members, or an array [N]. Noise is that of `rollout`.
 
-    Raises ValueError as `run_ensemble` does, and for another method, a processor or a wrong block.
+    - `clock`: its method must be RK4.
+    - `block`: members of one Pallas program, a power of two, at least 32.
+    - `interpret`: run the kernel in Pallas's interpreter, which works on any device but is slow. For tests.
+
+    Returns an Outcome whose leaves have shape [N], in member order.
+
+    Raises ValueError as `run_ensemble` does, and for another method, a cascade on a processor, or an invalid `block`.
     """
     _, clock = prepare(cascade, scenario, clock)
     if not isinstance(clock.method, RK4):
@@ -62,13 +67,14 @@ def run_whole(
 def _whole(
     cascade: Cascade, scenario: Scenario, clock: Clock, fold: Fold | None, *, members: int, block: int, interpret: bool
 ) -> Outcome:
+    """Build the kernel, run it on all members, and return their outcomes [N]."""
     scenario, key = _with_draws(scenario, members)
     leaves, tree = jax.tree.flatten((Realised(cascade, scenario, key), clock, fold))
     axes = [0 if x.ndim else None for x in leaves]
     member = jax.vmap(lambda *leaves: run(*jax.tree.unflatten(tree, leaves), every=0), in_axes=axes)
     results, result_tree = jax.tree.flatten(jax.eval_shape(member, *leaves))
     programs = -(-members // block)
-    # The last program runs its last member again in the lanes that are left.
+    # The last program fills its unused lanes with copies of the last member.
     index = jnp.minimum(jnp.arange(programs * block), members - 1)
     operands = [x[index] if x.ndim else x[None] for x in leaves]
 
@@ -84,7 +90,7 @@ def _whole(
 def _launch(
     kernel: Any, operands: list[Array], axes: list[Any], results: list[Any], programs: int, block: int, interpret: bool
 ) -> Any:
-    """Call the kernel on a grid of programs, each on its block of the members' numbers and on all shared ones."""
+    """Call the kernel on a grid of programs; each reads its block of the members' numbers and all shared numbers."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
@@ -104,9 +110,9 @@ def _launch(
 
 
 def _with_draws(scenario: Scenario, members: int) -> tuple[Scenario, tuple[Array, Array]]:
-    """What jax.random must draw outside the kernel: the members' random signals, and their keys as two words [N]."""
+    """Draw outside the kernel what needs jax.random: the members' random signals, and their keys as two words [N]."""
     leaves, tree = jax.tree.flatten(scenario)
-    # vmap needs something with an axis, which need not be in the scenario
+    # vmap needs an argument with a mapped axis, and the scenario may have none: hence arange(members).
     axes = ([0 if x.ndim else None for x in leaves], 0)
 
     def one(leaves: list[Array], _: Array) -> tuple[Scenario | None, tuple[Array, Array]]:
@@ -115,6 +121,6 @@ def _with_draws(scenario: Scenario, members: int) -> tuple[Scenario, tuple[Array
         return None if draws is alone else draws, alone.words()
 
     draws, words = jax.vmap(one, in_axes=axes)(leaves, jnp.arange(members))
-    scenario = draws or scenario  # nothing random: what members share, they go on sharing
+    scenario = draws or scenario  # without random signals, shared leaves stay shared
     nobody = jnp.zeros((), jnp.result_type(int))
     return dataclasses.replace(scenario, seed=nobody, member=nobody), words

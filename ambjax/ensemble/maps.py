@@ -1,4 +1,4 @@
-"""Maps: survival and error over a grid of two quantities, each cell a small ensemble."""
+"""Maps: survival and error over a grid of two quantities. Each cell of the grid is a small ensemble."""
 
 import dataclasses
 from typing import NamedTuple
@@ -18,14 +18,14 @@ from ambjax.simulation.metrics import standard_for
 from ambjax.world.scenario import Scenario
 
 PERIOD = "clock.sample_period"
-# A cell is sure of its survival where the lower end of its interval is at least this share.
+# Survival of a cell is certain if the lower end of its interval is at least this share.
 SURE = 0.95
-# Fields of a Map by cell.
+# Fields of a Map with one value per cell.
 GRIDS = ("survival", "low", "high", "error", "lost", "stalled")
 
 
 class Axis(NamedTuple):
-    """One quantity of a map: its dotted path and its values, ascending; `log` if they are spaced so."""
+    """One axis of a map: the dotted path of a quantity and its values, ascending. `log`: logarithmic spacing."""
 
     path: str
     values: np.ndarray
@@ -33,11 +33,15 @@ class Axis(NamedTuple):
 
 
 class Map(NamedTuple):
-    """Results by cell [ny, nx]: share of survivors with its 95 % interval, and the median settled |z - r|, m.
+    """Results of a map. Arrays have one value per cell, [ny, nx].
 
-    The error is NaN where no member of the cell survives. `lost` and `stalled` count the members that do not survive:
-    of the latter the integrator gave up, and their status is not known. `members`: runs of each cell. `varied`: whether
-    they differ, by noise or by what was spread. `drawn`: dotted paths of the latter.
+    - `survival`, `low`, `high`: share of survivors, and the ends of its 95 % interval.
+    - `error`: median over the survivors of the largest settled |z - r|, m; NaN in cells without a survivor.
+    - `lost`: number of members whose rotor is lost.
+    - `stalled`: number of members whose integration stopped early, so that their status is not known.
+    - `members`: number of members in each cell.
+    - `varied`: whether the members of a cell differ, by noise or by the case's spread.
+    - `drawn`: dotted paths of the spread quantities.
     """
 
     x: Axis
@@ -54,16 +58,16 @@ class Map(NamedTuple):
 
     @property
     def decisive(self) -> bool:
-        """Whether members differ, and a cell has enough of them for its interval to lie above SURE if all survive."""
+        """Whether members differ, and are so many that the interval of a cell lies above SURE if all survive."""
         return self.varied and bool(wilson(self.members, self.members).low >= SURE)
 
     @property
     def middle(self) -> int:
-        """Number of the row of y nearest the middle of its range."""
+        """Index of the row whose y is nearest to the middle of the range of y."""
         return int(np.argmin(np.abs(self.y.values - (self.y.values[0] + self.y.values[-1]) / 2)))
 
     def reach(self) -> tuple[float, float] | None:
-        """Ends of the longest unbroken stretch of x in which all members survive, on the middle row of y."""
+        """Return the ends of the longest interval of x in which all members survive, on the middle row, or None."""
         held = np.concatenate([[False], self.survival[self.middle] == 1, [False]])
         begin, end = np.flatnonzero(held[1:] & ~held[:-1]), np.flatnonzero(held[:-1] & ~held[1:]) - 1
         if not begin.size:
@@ -73,13 +77,14 @@ class Map(NamedTuple):
 
 
 def grid(study: Study, x: Axis, y: Axis) -> Map:
-    """`study.members` members in every cell, all cells in one ensemble; member k has the same noise in each.
+    """Compute a map with `study.members` members in every cell.
 
-    The axes may be any numbers of the case, or clock.sample_period: its values are run one after the other, each with
-    as many samples as the case's duration has of them. With one member the case is nominal: nothing is spread, and the
-    noise is that of member 0. With more, the case's own spread applies to all quantities that are no axis.
+    All cells run in one ensemble, and member k has the same noise in each cell. An axis may be any number of the case,
+    or clock.sample_period. The sample periods run one after the other, each for the duration of the case. With one
+    member the case is nominal: no spread, and the noise of member 0. With more members, the case's spread applies to
+    all quantities that are not axes.
 
-    Raises ValueError for a path that does not exist.
+    Raises ValueError for a path that does not exist, and for values of an axis that the case does not allow.
     """
     if x.path == PERIOD:
         transpose = grid(study, y, x)
@@ -108,9 +113,10 @@ def grid(study: Study, x: Axis, y: Axis) -> Map:
 
 
 def stepped(study: Study, x: Axis, y: Axis) -> Study:
-    """On a processor, the study with its method chosen for the axes' ends too, if it was chosen for its spread's.
+    """Return the study with an integration method that holds for all values of the axes.
 
-    Raises ValueError for a path that does not exist.
+    Applies to a cascade on a processor whose method is the automatic choice for the spread; any other study is returned
+    unchanged. Raises ValueError as `grid` does.
     """
     _check(study, x, y)
     cascade, scenario, clock = study.cascade, study.scenario, study.clock
@@ -126,12 +132,12 @@ def stepped(study: Study, x: Axis, y: Axis) -> Study:
 
 
 def _entries(study: Study, axes: tuple[str, ...]) -> tuple[tuple[str, Distribution], ...]:
-    """What is spread: nothing for one member."""
+    """Return the entries of the study's spread that are not axes; none for one member."""
     return tuple(entry for entry in study.spread.entries if entry[0] not in axes) if study.members > 1 else ()
 
 
 def _check(study: Study, x: Axis, y: Axis) -> None:
-    """Raise ValueError for axes that the case lacks, or that as spreads it would refuse."""
+    """Raise ValueError for axes whose path is not in the case, or whose values are not valid as a spread."""
     known = [*places(study.cascade, study.scenario), PERIOD]
     for name, axis in (("x", x), ("y", y)):
         if axis.path not in known:
@@ -159,7 +165,10 @@ def _at_period(study: Study, period: float) -> Study:
 
 
 def _cells(study: Study, x: Axis, y: Axis | None) -> tuple[np.ndarray, ...]:
-    """Whether lost or stalled, whether stalled, and largest settled |z - r|: [ny, nx, members]."""
+    """Return, for each member, whether it is lost or stalled, whether it is stalled, and its settled error, m.
+
+    The settled error is the largest settled |z - r|. Each array has shape [ny, nx, members].
+    """
     shape = (1 if y is None else len(y.values), len(x.values), study.members)
     member = np.broadcast_to(np.arange(study.members), shape).ravel()
     axes = {x.path: np.broadcast_to(x.values[None, :, None], shape).ravel()}

@@ -1,4 +1,4 @@
-"""Dotted paths of the case file, and the numbers of a cascade and a scenario that they name."""
+"""Dotted paths of the case file, and the numbers of a cascade and a scenario to which they refer."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -16,7 +16,12 @@ TIME = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time by whic
 
 
 class Place(NamedTuple):
-    """One number: how to reach it in (cascade, scenario), the field that declares it, and its value."""
+    """One number of a case.
+
+    - `route`: indices and attribute names that lead to it from the tuple (cascade, scenario).
+    - `field`: the dataclass field that declares it.
+    - `value`: its value.
+    """
 
     route: tuple[int | str, ...]
     field: dataclasses.Field
@@ -24,11 +29,11 @@ class Place(NamedTuple):
 
 
 def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
-    """Every number that this cascade and this scenario have, by dotted path.
+    """Return every number of the cascade and the scenario, by dotted path.
 
-    plant.* is the true plant, controller.model.* the nominal one. disturbance.q_z.* is the scaled force if that
-    is the only disturbance of z there is, as in a case file; where there are both, it is disturbance.q_v.*. The path
-    *.shift moves a signal in time, start and stop together; it is 0.
+    The paths plant.* refer to the true plant, and controller.model.* to the nominal one. The scaled force is
+    disturbance.q_z.* if it is the only disturbance of z, as in a case file; with both disturbances it is
+    disturbance.q_v.*. The path *.shift moves start and stop of a signal together in time; its value is 0.
     """
     table: dict[str, Place] = {}
     for stage in ("model", "observer", "position", "inversion", "current"):
@@ -57,6 +62,7 @@ def _absent(signal: Any) -> bool:
 
 
 def _below(node: Any, path: str, route: tuple[int | str, ...]) -> Iterator[tuple[str, Place]]:
+    """Yield every number in a record and its nested records, by dotted path."""
     if isinstance(node, tuple):
         for index, item in enumerate(node):
             yield from _below(item, f"{path}.{index}", (*route, index))
@@ -73,9 +79,9 @@ def _below(node: Any, path: str, route: tuple[int | str, ...]) -> Iterator[tuple
 
 
 def kinds(node: Any, path: str = "") -> Iterator[tuple[str, str]]:
-    """What a record and those within it have that is no number, by dotted path: types, and fields that are static.
+    """Yield what is not a number in a record and its nested records: the type and the static fields, by dotted path.
 
-    `path` ends with a dot.
+    `path`: prefix of the dotted paths, which ends with a dot or is empty.
     """
     if isinstance(node, tuple):
         for index, item in enumerate(node):
@@ -85,7 +91,7 @@ def kinds(node: Any, path: str = "") -> Iterator[tuple[str, str]]:
     yield f"{path}kind", type(node).__name__
     for field in dataclasses.fields(node):
         value, at = getattr(node, field.name), f"{path}{field.name}"
-        if field.metadata.get("static"):  # what has no name of its own is told by its type
+        if field.metadata.get("static"):  # an object without a name is represented by its type
             named = isinstance(value, (str, int, float, bool, type(None)))
             yield at, str(value) if named else getattr(value, "__qualname__", type(value).__name__)
         elif not field.metadata.get("leaf"):
@@ -93,7 +99,7 @@ def kinds(node: Any, path: str = "") -> Iterator[tuple[str, str]]:
 
 
 def order_pairs(cascade: Cascade, scenario: Scenario) -> list[tuple[str, str]]:
-    """Pairs of paths of which the first must stay below the second: start and stop of a pulse, for one."""
+    """Return pairs of paths whose first number must be below the second, for example start and stop of a pulse."""
     pairs = []
     known = places(cascade, scenario)
     for path, place in known.items():
@@ -105,7 +111,7 @@ def order_pairs(cascade: Cascade, scenario: Scenario) -> list[tuple[str, str]]:
 
 
 def with_values(cascade: Cascade, scenario: Scenario, values: Mapping[str, Any]) -> tuple[Cascade, Scenario]:
-    """The same cascade and scenario with the numbers at these paths replaced; shifts come last."""
+    """Return the cascade and scenario with the numbers at these paths replaced. Shifts are applied last."""
     known, world = places(cascade, scenario), (cascade, scenario)
     for path in sorted(values, key=lambda path: known[path].route[-1] == SHIFT):
         world = _set(world, known[path].route, values[path])
@@ -119,6 +125,7 @@ def _get(node: Any, route: tuple[int | str, ...]) -> Any:
 
 
 def _set(node: Any, route: tuple[int | str, ...], value: Any) -> Any:
+    """Return the record or tuple `node` with the number at `route` replaced."""
     if not route:
         return value
     step, *rest = route

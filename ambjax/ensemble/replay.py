@@ -1,9 +1,9 @@
-"""One member by itself, with the rounding that it has in an ensemble.
+"""Replay of one member of an ensemble, with the same rounding as in the ensemble.
 
-XLA compiles a rollout of one member into scalar code and a block of members into vector code. The two contract products
-and sums into fused operations at different places, so their results differ in the last bit. In a loop with a converter
-or a sign without a layer that difference grows until the runs have nothing in common. So a member that is simulated by
-itself runs in a block of the size that an ensemble has, and fills every lane of it.
+XLA compiles a rollout of one member into scalar code, and a block of members into vector code. The two contract
+products and sums into fused operations at different places, so their results differ in the last bit. In a loop with a
+converter, or with a sign without a boundary layer, that difference grows until the two runs are unrelated. A member
+that is simulated alone therefore runs in a block of the same size as in an ensemble, and fills every lane of the block.
 """
 
 import dataclasses
@@ -25,15 +25,17 @@ from ambjax.simulation.rollout import Outcome, RolloutState, System, begin, fini
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.scenario import Scenario
 
-# Samples in one call of the compiled program: their rows of all lanes take 20 MB.
+# Samples in one call of the compiled program: the rows of all lanes take 20 MB.
 STRETCH = 2048
 
 
 class Replay(NamedTuple):
-    """A member of a study: its trajectory and its metrics.
+    """One member of a study: its trajectory and its metrics.
 
-    `metrics` have the bits of the member's row in the study. `deviation` is the largest relative difference between
-    these and the metrics of the recorded trajectory: at most `rounding` where the trajectory is that of the study.
+    - `trajectory`: the member's trajectory, with every sample recorded.
+    - `metrics`: the member's metrics by name, bit for bit equal to its row in the study.
+    - `deviation`: largest relative difference between `metrics` and the metrics of `trajectory`.
+    - `rounding`: bound on `deviation` if the trajectory is that of the study.
     """
 
     trajectory: Trajectory
@@ -43,7 +45,7 @@ class Replay(NamedTuple):
 
 
 def as_member(scenario: Scenario) -> Scenario:
-    """The scenario with its member's number as an array [1]: that varies in every ensemble."""
+    """Return the scenario with its member number as an array [1], as in an ensemble of one member."""
     return dataclasses.replace(scenario, member=np.atleast_1d(np.asarray(scenario.member)))
 
 
@@ -55,11 +57,13 @@ def record(
     fold: Fold | None = None,
     tell: Callable[[int], Any] = lambda _: None,
 ) -> Outcome:
-    """Simulate one member and record every sample, with the rounding of an ensemble's block.
+    """Simulate one member with the rounding of an ensemble's block, and record every sample.
 
-    Leaves are numbers; those that vary in the ensemble are arrays [1], as from `Study.batch`. Rows are [samples], all
-    else has the shape that `rollout` gives it. `tell` is called with the number of samples that were added. On a CPU
-    every bit of a row is that of the ensemble (tests/test_replay.py); a sum in a fold may differ in the last one.
+    Leaves are numbers, except that leaves which vary in the ensemble are arrays [1], as `Study.batch` returns them.
+    `tell` is called with the number of new samples after each part of the run.
+
+    Returns the Outcome of `rollout`, with rows [samples]. On a CPU the rows are bit for bit those of the ensemble
+    (tests/test_replay.py); a sum in a fold may differ in the last bit.
 
     Raises ValueError as `rollout` does.
     """
@@ -70,7 +74,7 @@ def record(
 def record_system(
     system: Any, clock: Clock, *, fold: Fold | None = None, tell: Callable[[int], Any] = lambda _: None
 ) -> Outcome:
-    """`record` of a `rollout.System`, of which a leaf is an array [1] (`as_member`); nothing is checked."""
+    """Do the work of `record` for a `rollout.System`, without checks. At least one leaf must be an array [1]."""
     tree = canonical((system, clock, fold))
     count = min(STRETCH, clock.samples)
     progress, rows, outcomes = map_members(_begun, tree, threads=1, call=1), [], list[Outcome]()
@@ -78,7 +82,7 @@ def record_system(
         progress, outcome = map_members(_stretched(count), (*tree, progress, first), threads=1, call=1)
         outcomes = [jax.tree.map(lambda x: x[0], outcome)]
         left = min(count, clock.samples - first)
-        # a copy: the array holds the rows of all lanes
+        # Copy, because the slice would keep the rows of all lanes in memory.
         rows.append(jax.tree.map(lambda x, n=left: x[:n].copy(), outcomes[0].trajectory.rows))
         tell(left)
     whole = jax.tree.map(lambda *xs: np.concatenate(xs), *rows)
@@ -86,8 +90,9 @@ def record_system(
 
 
 def replay(study: Study, index: int, tell: Callable[[int], Any] = lambda _: None) -> Replay:
-    """One member of a study. Its metrics come from the study's own compiled program, its trajectory from `record`.
+    """Simulate one member of a study again.
 
+    The metrics come from the compiled program of the study, the trajectory from `record`. `tell` is that of `record`.
     Raises ValueError as `rollout` does.
     """
     columns = chunk(study, index, index + 1, CALL, threads=1)
@@ -100,7 +105,7 @@ def replay(study: Study, index: int, tell: Callable[[int], Any] = lambda _: None
 
 
 def _relative(a: Any, b: Any) -> float:
-    """|a - b| as a share of the larger; 1 where only one of them is finite."""
+    """Return |a - b|/max(|a|, |b|); 1 if only one of the two is finite."""
     a, b = float(a), float(b)
     if a == b:
         return 0.0
@@ -113,7 +118,7 @@ def _begun(tree: tuple[System, Clock, Fold | None]) -> RolloutState:
 
 @functools.cache
 def _stretched(count: int) -> Callable[[Any], Any]:
-    """The same function each time, so that it compiles once."""
+    """Return the simulation of `count` samples. The function is cached, so that it compiles once."""
 
     def one(tree: tuple[System, Clock, Fold | None, RolloutState, Any]) -> tuple[RolloutState, Outcome]:
         system, clock, fold, progress, first = tree

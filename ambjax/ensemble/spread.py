@@ -1,7 +1,7 @@
-"""Spreads: which numbers of a case vary from member to member of an ensemble, and how.
+"""Spreads: which numbers of a case vary between the members of an ensemble, and their distributions.
 
-Every spread has bounds, and one whose bounds leave what its number allows (a negative mass, a pulse that ends before it
-starts, a rotor beyond its stops) is refused, never bent.
+Every spread has bounds. A spread whose bounds exceed the allowed range of its number raises ValueError; it is never
+truncated. Examples are a negative mass, a pulse that ends before it starts, and a rotor outside its clearance.
 """
 
 import dataclasses
@@ -19,17 +19,18 @@ from ambjax.ensemble.paths import Place, order_pairs, places, with_values
 from ambjax.numerics.records import numbers, within
 from ambjax.world.scenario import Scenario
 
-# How the paths begin on whose values a step depends: a disturbance has edges at which steps end. Whatever else an
-# amplifier or a sensor does is solved exactly.
+# Prefixes of the paths whose values affect the choice of the integration step. A disturbance is among them because
+# steps end at its edges. Sensors, and amplifiers apart from their bandwidth, are solved exactly.
 STEP = ("plant.", "controller.", "actuator.bandwidth", "run.clearance", "disturbance.")
 
 
 @dataclasses.dataclass(frozen=True)
 class Spread:
-    """(dotted path, distribution) for each number that varies, and the design by which members are drawn.
+    """The numbers that vary between members, and the design of experiments.
 
-    `design`: "random" (independent members), "latin-hypercube" (each number stratified over all members) or "sobol"
-    (all numbers together evenly spread; best at a power of 2 of members).
+    - `entries`: pairs of dotted path and distribution, one for each number that varies.
+    - `design`: "random" (independent members), "latin-hypercube" (each number stratified over all members), or "sobol"
+      (low discrepancy in all numbers together; best if the number of members is a power of 2).
     """
 
     entries: tuple[tuple[str, Distribution], ...] = ()
@@ -44,9 +45,10 @@ class Spread:
 def draw(
     spread: Spread, cascade: Cascade, scenario: Scenario, seed: int, members: np.ndarray, total: int
 ) -> dict[str, np.ndarray]:
-    """Values by path, float64 [n], of the members (integers [n]) of an ensemble of `total`.
+    """Draw the values of `members` (integers [n]) of an ensemble of `total` members.
 
-    Member k's values depend on (seed, k) only, for a Latin hypercube also on the total. Raises as `check_spread` does.
+    Returns the values by dotted path, float64 [n]. The values of member k depend only on (seed, k), and for a Latin
+    hypercube on the total. Raises ValueError as `check_spread` does.
     """
     known = check_spread(spread, cascade, scenario)
     u = points(spread.design, seed, len(spread.entries), members, total)
@@ -54,10 +56,10 @@ def draw(
 
 
 def apply(cascade: Cascade, scenario: Scenario, values: Mapping[str, Any]) -> tuple[Cascade, Scenario]:
-    """The cascade and scenario with the numbers at these paths replaced: by arrays [n], an ensemble.
+    """Return the cascade and scenario with the numbers at these dotted paths replaced.
 
-    plant.* moves the true plant alone: the controller keeps believing in its own unless controller.model.* moves too.
-    Raises ValueError for a path that does not exist.
+    Values that are arrays [n] make an ensemble. The paths plant.* change the true plant only; the controller's model
+    changes with controller.model.*. Raises ValueError for a path that does not exist.
     """
     known = places(cascade, scenario)
     for path in values:
@@ -66,16 +68,17 @@ def apply(cascade: Cascade, scenario: Scenario, values: Mapping[str, Any]) -> tu
 
 
 def corners(spread: Spread, cascade: Cascade, scenario: Scenario) -> tuple[Cascade, Scenario]:
-    """Every combination of the ends of the spreads on which a step depends, each on an axis of its own.
+    """Return the cascade and scenario at every combination of the ends of the spreads that affect the step.
 
-    What is read off an ensemble by its largest slope, the integrator, then holds for every member.
+    Each such number gets an array axis of length 2. An integration method chosen for the largest slope of this ensemble
+    then holds for every member. Raises ValueError as `check_spread` does.
     """
     check_spread(spread, cascade, scenario)
     return ends(spread, cascade, scenario, STEP)
 
 
 def ends(spread: Spread, cascade: Cascade, scenario: Scenario, under: tuple[str, ...]) -> tuple[Cascade, Scenario]:
-    """The numbers whose paths begin so replaced by both ends of their spreads, each on an axis of its own."""
+    """Replace each spread number whose path begins with a prefix in `under` by its two ends, on an axis of its own."""
     known = places(cascade, scenario)
     supports = [(p, d.support(_nominal(known[p]))) for p, d in spread.entries if p.startswith(under)]
     shape = [1] * len(supports)
@@ -88,9 +91,9 @@ def _nominal(place: Place) -> float:
 
 
 def check_spread(spread: Spread, cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
-    """Raise ValueError, one line with path, value, what is allowed and the fix, for a spread that makes no sense here.
+    """Return the places of all paths, or raise ValueError if the spread is not valid for this cascade and scenario.
 
-    Returns the places of all paths.
+    The message is one line with the path, the value, the allowed range and the fix.
     """
     if spread.design not in DESIGNS:
         raise ValueError(f"spread.design = {spread.design!r}: it must be one of {', '.join(map(repr, DESIGNS))}.")
@@ -105,9 +108,9 @@ def check_spread(spread: Spread, cascade: Cascade, scenario: Scenario) -> dict[s
 
 
 def require_path(path: str, known: Iterable[str], value: str = "") -> None:
-    """Raise ValueError for a path that is not among the known ones, naming those that are near it.
+    """Raise ValueError for a path that is not in `known`; the message lists similar paths.
 
-    `value` is what it was to be, for the message.
+    `value` is the value that the user gave, for the message.
     """
     known = list(known)
     if path in known:
@@ -125,6 +128,8 @@ def require_path(path: str, known: Iterable[str], value: str = "") -> None:
 
 
 def _check_one(path: str, kind: Distribution, place: Place) -> None:
+    """Raise ValueError for a distribution that is not valid for its number."""
+
     def refuse(text: str) -> ValueError:
         return ValueError(f"spread.{path} = {kind}: {text}")
 
@@ -150,7 +155,7 @@ def _check_one(path: str, kind: Distribution, place: Place) -> None:
 def _check_together(
     kinds: dict[str, Distribution], known: dict[str, Place], cascade: Cascade, scenario: Scenario
 ) -> None:
-    """What two numbers ask of each other: the order of start and stop, the rotor's place within its stops."""
+    """Check conditions between two numbers: start before stop, and the rotor inside its clearance."""
 
     def reach(path: str) -> tuple[float, float]:
         nominal = _nominal(known[path])

@@ -1,4 +1,4 @@
-"""Statistics of an ensemble: its status, its metrics with intervals, what drives them, and who fares worst."""
+"""Statistics of an ensemble: survival, metrics with intervals, sensitivity to the spread, and the worst members."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,16 +9,17 @@ import numpy as np
 from ambjax.ensemble.drivers import drivers
 from ambjax.ensemble.intervals import STATISTICS, TAIL, Estimate, bootstrap, column_of, quantile, wilson
 
-# The share of members that CVaR leaves out.
+# Level of the CVaR: the share of members that it excludes.
 ALPHA = 0.95
-# From this kurtosis on, an exponential's, a tail is heavy (a normal's is 3), and how many of the 95 % intervals of a
-# lognormal's standard deviation cover it then, in per cent, by members (measured over 600 to 2,000 ensembles).
+# HEAVY: kurtosis above which a tail counts as heavy. An exponential distribution has 9, a normal one 3.
+# COVERED: coverage, in per cent, of the 95 % interval of the standard deviation of a lognormal distribution, by number
+# of members (measured over 600 to 2,000 ensembles).
 HEAVY, COVERED = 9.0, {50: 83, 200: 87, 1000: 90, 5000: 92}
-# The metric by which members are ranked once all lost ones are named.
+# Metric that ranks the surviving members in the list of the worst.
 DECIDING = "settled_max_abs_error_m"
-# Of whom a summary's metrics and their drivers are.
+# Members that a summary's metrics and drivers describe.
 OF = "survivors"
-# Columns that are no metrics.
+# Columns that are not metrics.
 FATE = ("index", "lost_at", "lost", "stalled", "lost_at_s")
 SPREAD = "spread."
 
@@ -32,20 +33,26 @@ def summary(
     deciding: str = DECIDING,
     worst: int = 10,
 ) -> dict[str, Any]:
-    """Statistics of an ensemble, ready for JSON: no arrays, and None for what is infinite or unknown.
+    """Compute the statistics of an ensemble, in a form that JSON can hold: no arrays; None if infinite or unknown.
 
-    `columns` are those of members.npz, arrays [N]: index, lost_at (s, +inf: ran to the end), stalled, the metrics, and
-    "spread." + path for each of `spread_names`. A member survives, is lost, or is stalled: the integrator gave up, and
-    its status is not known.
+    - `columns`: the columns of members.npz, arrays [N]: index, lost_at (s; +inf if the run reached its end), stalled,
+      the metrics, and "spread." + path for each path in `spread_names`.
+    - `seed`: seed of the bootstrap.
+    - `confidence`: level of all intervals.
+    - `deciding`: metric that ranks the survivors in the list of the worst members.
+    - `worst`: length of that list.
 
-    The metrics and what drives them are statistics of the survivors (`metrics_of`): a rotor that is lost is frozen, and
-    from then on its voltage, current and chatter are 0. Lost and stalled members count in `survival`, in the drivers of
-    lost_at_s and in `worst`. Of a metric that is infinite for some survivors (a time never reached) there are
-    quantiles, but no mean, standard deviation or CVaR; `finite` counts the others. Without survivors every statistic is
-    None. `drivers` and `explained` are those of `ensemble.drivers.drivers`. `worst` lists lost and stalled members by
-    time, then survivors by `deciding`. `notes` name the statistics for which this ensemble is too small.
+    A member survives, is lost, or is stalled (its integration stopped early, so that its status is not known). Metrics
+    and their drivers are computed from the survivors (`metrics_of`), because a lost rotor is frozen, and its voltage,
+    current and chatter are 0 from then on. Lost and stalled members count in `survival`, in the drivers of lost_at_s
+    and in `worst`.
 
-    Raises ValueError where there is no column `deciding`, and for columns that are not one number for each member.
+    A metric that is infinite for some survivors (a time never reached) has quantiles, but no mean, standard deviation
+    or CVaR; `finite` counts its finite values. Without survivors every statistic is None. `drivers` and `explained` are
+    the results of `ensemble.drivers.drivers`. `worst` lists lost and stalled members by time, then survivors by
+    `deciding` in descending order. `notes` names the statistics for which the ensemble is too small.
+
+    Raises ValueError if there is no column `deciding`, or if a column is not one number for each member.
     """
     lost_at = column_of(columns["lost_at"])
     metrics = {k: column_of(v) for k, v in columns.items() if k not in FATE and not k.startswith(SPREAD)}
@@ -78,7 +85,7 @@ def summary(
 def _drivers(
     spread: dict[str, np.ndarray], held: dict[str, np.ndarray], lost_at: np.ndarray, confidence: float
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What drives each metric among the survivors, and when members are lost among all, as `drivers` returns them."""
+    """Return the drivers of each metric, computed from the survivors, and of lost_at_s, computed from all members."""
     ended = np.isfinite(lost_at)
     if ended.all():
         nothing = {"alone": 0.0, "pair": None, "says": "no member survives"}
@@ -91,7 +98,7 @@ def _drivers(
 
 
 def _notes(n: int, metrics: Mapping[str, np.ndarray], confidence: float) -> list[str]:
-    """For what n survivors are too few: the interval of a CVaR, and that of a standard deviation of heavy tails."""
+    """Return a note for each interval that n survivors do not support: of a CVaR, and of a heavy-tailed deviation."""
     if not n:
         return ["no member survives: there are no statistics of the metrics"]
     notes, sure, tail = [], f"{100 * confidence:g} %", (1 - ALPHA) * n
@@ -109,7 +116,7 @@ def _notes(n: int, metrics: Mapping[str, np.ndarray], confidence: float) -> list
 
 
 def _kurtosis(x: np.ndarray) -> float:
-    """Fourth central moment over the squared second; 0 where all values are alike."""
+    """Return the fourth central moment over the squared second; 0 if all values are equal."""
     size = np.abs(x - x.mean()).max()
     if size <= 1e-14 * np.abs(x).max():
         return 0.0
@@ -126,6 +133,7 @@ def _plain(estimate: Estimate) -> dict[str, float | None]:
 
 
 def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) -> dict[str, Any]:
+    """Return the statistics of each metric, with intervals, by name."""
     finite = [name for name, x in metrics.items() if x.size and np.isfinite(x).all()]
     intervals = bootstrap([metrics[name] for name in finite], ALPHA, confidence, seed) if finite else {}
     nothing = Estimate(np.inf, np.inf, np.inf)
@@ -146,6 +154,8 @@ def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) ->
 def _worst(
     index: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray, name: str, values: np.ndarray, count: int
 ) -> list[dict[str, Any]]:
+    """Return the `count` worst members: ended ones by time, then survivors by `values` in descending order."""
+
     def status(k: int) -> str:
         return "survives" if np.isinf(lost_at[k]) else "stalled" if stalled[k] else "lost"
 

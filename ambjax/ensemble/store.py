@@ -1,8 +1,8 @@
-"""Where a study's results are kept: one sealed file per finished chunk, written whole or not at all.
+"""Storage of a study's results. Studies are resumable.
 
-A run that is killed at any instant loses the chunks that were being computed and nothing else. What
-is put together at the end is, byte for byte, what an uninterrupted run writes. A file that was damaged meanwhile
-is found, and what it held is computed again: chunks go only when the whole has been read back.
+Each finished chunk is written atomically to a file with a checksum. A run that is killed loses only the chunks that are
+being computed. Damaged chunks are found and computed again. At the end all chunks are merged into members.npz, which is
+byte for byte the same after an interruption. The chunks are removed only after members.npz has been read back.
 """
 
 import collections
@@ -31,21 +31,21 @@ from ambjax.host.sealed import (
 
 MANIFEST = "study.json"
 RESULT = "members.npz"
-# Fixed, so that equal results are equal files.
+# Time stamp of all entries. It is fixed, so that equal results give equal files.
 EPOCH = (1980, 1, 1, 0, 0, 0)
 
 Span = tuple[int, int]
 
 
 class Column(NamedTuple):
-    """A column of all members: its dtype as JSON has it, and the SHA-256 of its numbers."""
+    """A column of all members: its dtype in JSON form, and the SHA-256 of its numbers."""
 
     kind: Any
     digest: str
 
 
 class Survey(NamedTuple):
-    """Chunks that must be computed, in order, and a line for each file that does not hold what it should."""
+    """Chunks that must be computed, in order, and one remark for each damaged file."""
 
     missing: list[Span]
     remarks: list[str]
@@ -54,7 +54,8 @@ class Survey(NamedTuple):
 class Store:
     """A directory that holds a study of `members` members in chunks of `chunk` members.
 
-    `chunk` None: the size that the directory has recorded; 0 until `cut` chooses one.
+    - `facts`: the fingerprint of the study, recorded in the manifest.
+    - `chunk`: None uses the size that the directory has recorded; it is 0 until `cut` sets it.
     """
 
     def __init__(self, directory: pathlib.Path, facts: dict[str, Any], members: int, chunk: int | None):
@@ -64,10 +65,10 @@ class Store:
         self.chunks, self.manifest, self.path = directory / "chunks", directory / MANIFEST, directory / RESULT
 
     def check(self, columns: int, resume: bool) -> None:
-        """Make sure that the directory is free, or holds the beginning of this very study. Changes nothing there.
+        """Check that the directory is free, or holds a part of this study. Does not change the directory.
 
-        Raises ValueError if it holds another study, one that nobody asked to resume, none where one is to be
-        resumed, or if the disk has no room for `columns` numbers per member.
+        Raises ValueError if the directory holds another study, if it holds a study and `resume` is False, if it holds
+        none and `resume` is True, or if the disk has no room for `columns` numbers per member.
         """
         if self.begun() and not resume:
             raise ValueError(
@@ -83,9 +84,9 @@ class Store:
             self._check_room(columns)
 
     def begin(self) -> None:
-        """Mark the directory as this study's, so that a run that is killed from here on can be resumed.
+        """Write the manifest, so that a run that is killed from now on can be resumed.
 
-        Call it after `check`. Raises ValueError where the directory cannot be written.
+        Call `check` first. Raises ValueError if the directory cannot be written.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         self._tell()
@@ -94,12 +95,12 @@ class Store:
             left.unlink()
 
     def cut(self, chunk: int) -> None:
-        """Record the number of members of a chunk. Raises ValueError where the directory cannot be written."""
+        """Record the number of members in a chunk. Raises ValueError if the directory cannot be written."""
         self.chunk = chunk
         self._tell()
 
     def survey(self) -> Survey:
-        """What is not there yet; every chunk that is there is read and held against its seal."""
+        """Return the missing and damaged chunks. Reads every chunk and verifies its checksum and its columns."""
         missing, remarks, layouts = [], list[str](), dict[Span, str]()
         if self.result:
             there = "its checksum is wrong" if self.path.exists() else "it is gone"
@@ -124,25 +125,26 @@ class Store:
         return Survey(sorted(missing), remarks)
 
     def spans(self) -> list[Span]:
-        """All chunks in order: (first member, one past the last). None before `cut`."""
+        """Return all chunks in order as (first member, last member + 1); an empty list before `cut`."""
         if not self.chunk:
             return []
         return [(n, min(n + self.chunk, self.members)) for n in range(0, self.members, self.chunk)]
 
     def count(self) -> int:
-        """Number of members that are on disk."""
+        """Return the number of members on disk."""
         if self.path.exists() and not self.chunks.exists():
             return self.members
         return sum(stop - start for start, stop in self.spans() if self._path((start, stop)).exists())
 
     def put(self, span: Span, columns: Arrays) -> None:
-        """Keep a finished chunk. Raises ValueError where it cannot be written."""
+        """Write a finished chunk. Raises ValueError if it cannot be written."""
         seal(self._path(span), columns, self._facts(span))
 
     def finish(self) -> pathlib.Path:
-        """Put all chunks together as members.npz, a column at a time, read it back, and only then remove them.
+        """Merge all chunks into members.npz, column by column, read it back, and then remove the chunks.
 
-        Raises ValueError, and leaves the chunks, if the disk gives back something else than what was written.
+        Returns the path of members.npz. Raises ValueError, and keeps the chunks, if a chunk is damaged or if the data
+        read back differ from the data written.
         """
         if not self.finished():
             try:
@@ -159,11 +161,11 @@ class Store:
         return self.path
 
     def begun(self) -> bool:
-        """Whether there is anything to resume."""
+        """Return whether the directory holds a study."""
         return self.manifest.exists()
 
     def finished(self) -> bool:
-        """Whether members.npz is there, and is what was put together."""
+        """Return whether members.npz exists and has the recorded checksum."""
         return bool(self.result) and self.path.is_file() and _digest(self.path) == self.result
 
     def _tell(self) -> None:
@@ -172,6 +174,7 @@ class Store:
         write_whole(self.manifest, lambda file: file.write(text))
 
     def _compare(self) -> None:
+        """Read the manifest, and raise ValueError if it is damaged or of another study."""
         try:
             record = dict(json.loads(self.manifest.read_text(encoding="utf-8")))
             if record.pop(CHECKSUM, None) != checksum_of(record):
@@ -187,9 +190,10 @@ class Store:
             )
 
     def _check_room(self, columns: int) -> None:
-        # Chunks and the result exist side by side at the end.
+        """Raise ValueError if the disk has no room for `columns` numbers per member."""
+        # Chunks and members.npz exist at the same time at the end, hence the factor 2.
         need = 2 * 8 * columns * self.members
-        real = pathlib.Path(os.path.realpath(self.directory))  # resolve raises where links lead to each other
+        real = pathlib.Path(os.path.realpath(self.directory))  # Path.resolve raises on a loop of links
         where = next(p for p in (self.directory, *real.parents) if p.exists())
         free = shutil.disk_usage(where).free
         if need > free:
@@ -203,7 +207,7 @@ class Store:
         return {"study": checksum_of(self.facts), "first": span[0], "stop": span[1]}
 
     def _read(self, span: Span) -> Arrays:
-        """A chunk's columns. Raises DamagedError if they are not the whole of this chunk of this study."""
+        """Return the columns of a chunk. Raises DamagedError if they are incomplete, or of another chunk or study."""
         columns, facts = unseal(self._path(span))
         differs = difference(facts, self._facts(span))
         if differs:
@@ -212,9 +216,10 @@ class Store:
         return columns
 
     def _columns(self) -> dict[str, Column]:
-        """All columns by name. Raises DamagedError unless every chunk is whole, of this study and like the first.
+        """Return the dtype and checksum of all columns, by name.
 
-        Whoever else writes here may have changed one since it was computed.
+        Reads every chunk again, because a file may have changed since it was written. Raises DamagedError if a chunk is
+        incomplete, of another study, or has other columns than the first chunk.
         """
         kinds, digests = dict[str, Any](), collections.defaultdict(hashlib.sha256)
         for span in self.spans():
@@ -230,6 +235,7 @@ class Store:
         return {name: Column(kind, digests[name].hexdigest()) for name, kind in kinds.items()}
 
     def _merge(self, file: IO[bytes], columns: dict[str, Column]) -> None:
+        """Write all columns to an .npz archive, chunk by chunk, to bound the memory."""
         with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
             for name, column in columns.items():
                 head = {"descr": column.kind, "fortran_order": False, "shape": (self.members,)}
@@ -239,6 +245,7 @@ class Store:
                         out.write(np.ascontiguousarray(part).tobytes())
 
     def _column(self, name: str) -> Iterator[np.ndarray]:
+        """Yield one column, chunk by chunk. Raises DamagedError for a chunk that cannot be read."""
         for span in self.spans():
             try:
                 with self._path(span).open("rb") as file, np.load(file) as chunk:
@@ -247,11 +254,11 @@ class Store:
                 raise DamagedError(f"{self._path(span)} cannot be read ({error})") from None
 
     def _read_back(self, columns: dict[str, Column]) -> None:
-        """Raises DamagedError unless members.npz holds these columns, one row for each member, in order."""
+        """Raise DamagedError unless members.npz holds these columns, with one row for each member, in order."""
         there = dict[str, Any]()
         try:
             with self.path.open("rb") as file, np.load(file) as whole:
-                for name in whole.files:  # a column at a time
+                for name in whole.files:  # column by column, to bound the memory
                     column = whole[name]
                     kind, shape = shapes({name: column})[name]
                     there[name] = [kind, hashlib.sha256(np.ascontiguousarray(column).data).hexdigest(), shape]
@@ -266,7 +273,7 @@ class Store:
 
 
 def kinds_of(columns: Arrays) -> dict[str, Any]:
-    """Names and dtypes of columns, in order."""
+    """Return the names and dtypes of columns, in order."""
     return {name: kind for name, (kind, _) in shapes(columns).items()}
 
 

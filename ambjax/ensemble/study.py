@@ -1,4 +1,4 @@
-"""A study: one case, how it is spread, a seed and a number of members; any part of it can be run anywhere."""
+"""A study: one case, its spread, a seed and a number of members. Any part of a study can run on any machine."""
 
 import dataclasses
 import math
@@ -20,21 +20,24 @@ from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.scenario import Scenario
 
 SPREAD = "spread."
-# Columns of members.npz beside the spread quantities, at most: to estimate what a study needs on disk.
+# Largest number of columns of members.npz besides the spread quantities, to estimate the disk space of a study.
 COLUMNS = 28
-# Parts of a run over each of which the voltage's variation is one number.
+# Number of equal parts of a run; the variation of the voltage is one number for each part.
 WINDOWS = 25
-# Signals of a fan chart, and the fields of a Row that they are.
+# Signals of a fan chart, and the corresponding fields of a Row.
 SHOWN = {"z - r": "e_z", "u": "u_mean", "sigma": "sigma"}
 
 
 class Bands(NamedTuple):
-    """What a fan chart shows of some members: instants t [T] (s), trajectories, and signals by name [members, T].
+    """The data of a fan chart.
 
-    Signals are NaN from the instant on at which a member is lost. "variation of u" is its total variation per second,
-    V/s, in each of WINDOWS equal parts of the run; NaN from the part on in which a member is lost. `extremes`: for each
-    other signal the smallest and the largest value, each [T], that any member alive has at a sample between the
-    instant before and the instant after; NaN where there is none.
+    - `t`: instants [T], s.
+    - `trajectory`: trajectories of the members.
+    - `signals`: signals by name [members, T]; NaN from the instant at which a member is lost. "variation of u" is the
+      total variation of the voltage per second, V/s, in each of WINDOWS equal parts of the run; NaN from the part in
+      which a member is lost.
+    - `extremes`: for each other signal, the minimum and the maximum, each [T], over the members that are alive and over
+      the samples between the previous and the next instant; NaN if there is no such sample.
     """
 
     t: np.ndarray
@@ -45,9 +48,10 @@ class Bands(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """What an ensemble is. Member k depends on (seed, k) and, in a Latin hypercube, on `members`.
+    """The definition of an ensemble. Member k depends on (seed, k) and, in a Latin hypercube, on `members`.
 
-    `clock.method` must hold for every member (a case file's does: it is chosen for the spread's extremes).
+    `clock.method` must be valid for every member. The method of a case file is, because it is chosen for the extremes
+    of the spread.
     """
 
     cascade: Cascade
@@ -60,26 +64,26 @@ class Study:
 
     @property
     def varies(self) -> bool:
-        """Whether two members differ."""
+        """Whether the members differ."""
         return bool(self.spread.entries) or self.scenario.random
 
     def drawn(self, members: np.ndarray) -> dict[str, np.ndarray]:
-        """The spread quantities of these members (integers [n]) by dotted path, [n] each."""
+        """Draw the spread quantities of these members (integers [n]); arrays [n] by dotted path."""
         return draw(self.spread, self.cascade, self.scenario, self.seed, members, self.members)
 
     def batch(self, members: np.ndarray) -> tuple[Cascade, Scenario]:
-        """The cascade and scenario of these members (integers [n]), leaves that vary [n]."""
+        """Return the cascade and scenario of these members (integers [n]); leaves that vary are arrays [n]."""
         cascade, scenario = apply(self.cascade, self.scenario, self.drawn(members))
         return cascade, dataclasses.replace(scenario, seed=self.seed, member=members)
 
     def member(self, index: int) -> tuple[Cascade, Scenario]:
-        """Cascade and scenario of one member, leaves numbers."""
+        """Return the cascade and scenario of one member; all leaves are numbers."""
         values = {path: float(x[0]) for path, x in self.drawn(np.array([index])).items()}
         cascade, scenario = apply(self.cascade, self.scenario, values)
         return cascade, dataclasses.replace(scenario, seed=self.seed, member=index)
 
     def command(self, case: str, index: int) -> str:
-        """The command that simulates one member by itself; `case` is the path of the case file."""
+        """Return the command line that simulates one member alone; `case` is the path of the case file."""
         words = ["ambjax", "simulate", case]
         if self.varies:
             words += ["--member", str(index), "--seed", str(self.seed)]
@@ -90,9 +94,11 @@ class Study:
     def columns(
         self, start: int, stop: int, *, call: int | None = None, threads: int | None = None, lost: bool = False
     ) -> dict[str, Any]:
-        """Members start <= k < stop, one row each: index, lost_at, every metric, and spread.PATH. [stop - start].
+        """Simulate members start <= k < stop and return their columns, each [stop - start], by name.
 
-        `lost`: every rotor is lost where it starts; that compiles the very program, and costs little more.
+        The columns are index, lost_at (s), every metric, and spread.PATH for each spread quantity. `call` and `threads`
+        are those of `map_members`. With `lost` every rotor starts outside its clearance and is lost at once: such a run
+        compiles the same program, and takes little more time than that.
         """
         members = np.arange(start, stop)
         cascade, scenario = self.batch(members)
@@ -105,9 +111,9 @@ class Study:
         return {"index": members, "lost_at": outcome.trajectory.lost_at, **outcome.measured, **values}
 
     def bands(self, members: int, times: int, until: float = math.inf) -> Bands:
-        """What a fan chart shows of the first `members` members, up to the time `until` (s) or the end of the run.
+        """Compute the data of a fan chart of the first `members` members, up to time `until` (s) or the end of the run.
 
-        Instants: every so many samples that there are at most `times` of them, and the last sample.
+        The instants are equally spaced, at most `times` of them, and the last sample is added.
         """
         period = float(self.clock.sample_period)
         samples = int(min(self.clock.samples, math.ceil(until / period) + 1 if math.isfinite(until) else math.inf))
@@ -118,7 +124,7 @@ class Study:
         clock = dataclasses.replace(self.clock, samples=samples)
         outcome = run_ensemble(cascade, scenario, clock, fold=fold, every=every)
         rows, folded = outcome.trajectory.rows, outcome.measured
-        # the last instant too, unless it is that of the last block
+        # Add the last sample, unless the last block begins there.
         ends = [(samples - 1) * period] if (samples - 1) % every else []
         t = np.append(np.asarray(rows.t[0]), ends)
         signals, extremes = {}, {}
@@ -135,7 +141,7 @@ class Study:
         return Bands(t, outcome.trajectory, signals | {"variation of u": rate[:, part]}, extremes)
 
     def fingerprint(self) -> dict[str, Any]:
-        """Everything that a member's numbers depend on, by name, as JSON has it."""
+        """Return everything that the results of a member depend on, by name, in JSON form."""
         facts: dict[str, Any] = {**provenance(), "members": self.members, "seed": self.seed}
         facts |= {**dict(kinds(self.cascade, "controller.")), **dict(kinds(self.scenario))}
         facts |= {path: str(place.value) for path, place in places(self.cascade, self.scenario).items()}
@@ -146,7 +152,7 @@ class Study:
 
 
 def _beside(blocks: np.ndarray, combine: Callable[[np.ndarray, np.ndarray], np.ndarray], instants: int) -> np.ndarray:
-    """[instants] of what each block has [count]: at an instant, of the blocks that end and begin there; NaN: none."""
+    """Combine, at each instant, the values [count] of the blocks that end and begin there; NaN if neither is finite."""
     values = np.where(np.isfinite(blocks), blocks, np.nan)
     padded = np.concatenate([[np.nan], values, [np.nan]])
     return combine(padded[:-1], padded[1:])[:instants]

@@ -1,4 +1,4 @@
-"""What a process must do before it simulates, and what worker processes are sent."""
+"""Worker processes: configuration of JAX, and the simulation of one chunk of a study."""
 
 import contextlib
 import multiprocessing
@@ -13,27 +13,27 @@ from typing import Any
 
 from ambjax.ensemble.study import Study
 
-# Members in one call of the compiled program on a CPU. Fixed, because a last digit may depend on it: a study's numbers
-# must not depend on the cores of the machine, nor on where its chunks run.
+# Members in one call of the compiled program on a CPU. Fixed, because the last digit of a result may depend on it: the
+# results of a study must not depend on the number of cores, nor on the process that computes a chunk.
 CALL = 64
-# Size of the cache of compiled programs, in bytes. JAX removes the entries that were not used for longest.
+# Size of the cache of compiled programs, in bytes. JAX removes the least recently used entries.
 CACHE_SIZE = 256 * 2**20
 
 
 def prepare() -> None:
     """Configure JAX for a command: float64 unless JAX_ENABLE_X64 is set, and a cache of compiled programs.
 
-    The cache is bounded and can be shared by processes. JAX_COMPILATION_CACHE_DIR replaces it.
+    Processes share the cache, and its size is bounded. JAX_COMPILATION_CACHE_DIR sets another directory.
 
-    Raises ValueError where JAX has no device of the kind that JAX_PLATFORMS asks for.
+    Raises ValueError if JAX has no device of the kind in JAX_PLATFORMS.
     """
     import jax
     import platformdirs
 
-    if "JAX_ENABLE_X64" not in os.environ:  # jax has been imported by now, so setting it there would be too late
+    if "JAX_ENABLE_X64" not in os.environ:  # jax is imported already, so the variable would have no effect
         jax.config.update("jax_enable_x64", True)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        # Without a cache, because there is no home directory or the disk is full, a run is slower and no less correct.
+        # No home directory or a full disk: the run continues without a cache, slower but with the same results.
         warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
         with contextlib.suppress(OSError, RuntimeError):
             cache = pathlib.Path(platformdirs.user_cache_dir("ambjax")) / "programs"
@@ -44,7 +44,7 @@ def prepare() -> None:
     if platforms := os.environ.get("JAX_PLATFORMS"):
         try:
             jax.default_backend()
-        except (AssertionError, RuntimeError) as error:  # the first is all it says of a known kind without a device
+        except (AssertionError, RuntimeError) as error:  # AssertionError: a known kind without a device
             why = str(error).partition("\n")[0] or "none of them is here"
             raise ValueError(f"JAX_PLATFORMS={platforms}: {why}. Leave it out, or set it to cpu.") from None
 
@@ -52,9 +52,9 @@ def prepare() -> None:
 def chunk(
     study: Study, start: int, stop: int, size: int, threads: int | None = None, *, lost: bool = False
 ) -> dict[str, Any]:
-    """Members start <= k < stop of a study that is cut into chunks of `size`, on so many cores (None: all).
+    """Simulate members start <= k < stop of a study with chunks of `size` members, and return their columns.
 
-    `lost` as in `Study.columns`.
+    `threads`: CPU cores to use (None: all). `lost` is that of `Study.columns`.
     """
     import jax
 
@@ -63,14 +63,17 @@ def chunk(
 
 
 def work(study: Study, start: int, stop: int, size: int) -> dict[str, Any]:
-    """A chunk of a study in a process of its own, on one core."""
+    """Simulate a chunk of a study in a worker process, on one core, and return its columns."""
     prepare()
     return chunk(study, start, stop, size, threads=1)
 
 
 @contextlib.contextmanager
 def processes(count: int) -> Iterator[Executor]:
-    """Prepared worker processes that end at once with the block if it fails, and with this process however it ends."""
+    """Provide worker processes with JAX configured.
+
+    If the block raises, the workers are terminated at once. They also end when this process ends for any reason.
+    """
     others = set(multiprocessing.active_children())
     with ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_begin) as pool:
         try:
@@ -83,7 +86,7 @@ def processes(count: int) -> Iterator[Executor]:
 
 @contextlib.contextmanager
 def ignore_sigint() -> Iterator[None]:
-    """Processes that are started in this block do not hear Ctrl-C, which is then their parent's alone."""
+    """Block SIGINT in the processes that are started in this block, so that only their parent handles Ctrl-C."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
@@ -95,6 +98,7 @@ def ignore_sigint() -> Iterator[None]:
 
 
 def _begin() -> None:
+    """Configure a worker process, which then ends when its parent ends."""
     prepare()
 
     def wait() -> None:

@@ -14,10 +14,10 @@ NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 @contextlib.contextmanager
 def alone(directory: pathlib.Path) -> Iterator[None]:
-    """Hold the directory in this block.
+    """Hold the lock on the directory in this block.
 
-    Has no effect on a file system without locks. Raises ValueError if another process holds the directory, OSError if
-    the lock file cannot be made.
+    Has no effect on a file system without locks. Raises ValueError if another process holds the lock, and OSError if
+    the lock file cannot be created.
     """
     lock = FileLock(directory / LOCK, timeout=0)
     try:

@@ -1,1 +1,1 @@
-"""Records of numbers, smooth functions, random numbers, and what makes XLA compile them well."""
+"""Numerical building blocks: records of numbers, smooth functions, implicit signs, random numbers, linear algebra."""

@@ -1,8 +1,9 @@
-"""The robust exact differentiator, of order m = 1 or 2: f', if |f^(m+1)| <= L, exactly and in finite time.
+"""The robust exact differentiator of order m = 1 or 2.
 
-x_k' = x_{k+1} + lam_k L^((k+1)/(m+1)) |e|^((m-k)/(m+1)) sgn e, e = f - x_0, k = 0 .. m. A. Levant, Int. J. Control
-76 (2003) 924-941. On a processor by backward Euler, with outputs that neither chatter nor are biased: R. Seeber,
-Proper implicit discretization of arbitrary-order robust exact differentiators, arXiv 2404.02770.
+If |f^(m+1)| <= L, its estimate of f' is exact after a finite time (A. Levant, Int. J. Control 76 (2003) 924-941):
+x_k' = x_{k+1} + lam_k L^((k+1)/(m+1)) |e|^((m-k)/(m+1)) sgn e, e = f - x_0, k = 0 .. m. On a processor it is
+discretised by backward Euler, so that the outputs have neither chatter nor bias (R. Seeber, Proper implicit
+discretization of arbitrary-order robust exact differentiators, arXiv 2404.02770).
 """
 
 from typing import Any
@@ -14,18 +15,20 @@ from jax import Array
 from ambjax.compiler.barrier import compiled_alone
 from ambjax.numerics.records import Scalar
 
-# lam_0 .. lam_m by order: Levant's.
+# Levant's coefficients lam_0 .. lam_m, by order m.
 LAM = {1: (1.5, 1.1), 2: (2.0, 2.12, 1.1)}
-# Of Newton's method for the cubic, from above: 5 leave 2e-16 of the right-hand side, whatever it is.
+# Newton steps for the cubic, from above: after 5 the relative residual is below 2e-16 for every right-hand side.
 NEWTON = 5
 
 
 def smooth_rates(x: tuple[Array, ...], f: Array, L: Scalar, width: Scalar) -> tuple[Array, ...]:
-    """x' in continuous time, the powers of |e| smoothed over `width`: within it, a linear observer of rate
-    (L/width)^(1/(m+1))."""
+    """Return x' in continuous time, with the powers of |e| smoothed over `width`.
+
+    For |e| below `width` (in the unit of f) it is a linear observer of rate (L/width)^(1/(m+1)).
+    """
     m, e = len(x) - 1, f - x[0]
     fast, near = (L / width) ** (1 / (m + 1)), e * e + width * width
-    # e (e^2 + width^2)^(-(k+1)/(2(m+1))), measured in widths
+    # e (e^2 + width^2)^(-(k+1)/(2(m+1))), in units of `width`
     pushes = [
         lam * fast ** (k + 1) * e * (near / (width * width)) ** (-(k + 1) / (2 * (m + 1)))
         for k, lam in enumerate(LAM[m])
@@ -34,16 +37,19 @@ def smooth_rates(x: tuple[Array, ...], f: Array, L: Scalar, width: Scalar) -> tu
 
 
 def slope(m: int, L: Scalar, width: Scalar) -> Scalar:
-    """The steepest rate of `smooth_rates` of order m, 1/s."""
+    """Return the largest slope of `smooth_rates` of order m, 1/s."""
     return LAM[m][0] * (L / width) ** (1 / (m + 1))
 
 
 def implicit_step(x: tuple[Array, ...], f: Array, L: Scalar, T: Scalar) -> tuple[Array, ...]:
-    """x at this sample from x at the one before, by backward Euler: the sign is that of f - x_0 after the step."""
+    """Return x at this sample from x at the previous one, by backward Euler with period T (s).
+
+    The sign is that of f - x_0 after the step.
+    """
     m = len(x) - 1
     lam, b = LAM[m], f - sum(T**k * one for k, one in enumerate(x))
     ratio = b / (L * T ** (m + 1))
-    # r^(m+1) + lam_0 r^m + .. + lam_m = |ratio|; 0 where the sign takes up all of b
+    # r^(m+1) + lam_0 r^m + .. + lam_m = |ratio|; r = 0 if the set-valued sign balances b
     r = _root(jnp.maximum(jnp.abs(ratio) - lam[m], 0.0), m)
     after = [x[m] + L * T * jnp.clip(ratio, -lam[m], lam[m])]
     for k in reversed(range(m)):
@@ -53,12 +59,12 @@ def implicit_step(x: tuple[Array, ...], f: Array, L: Scalar, T: Scalar) -> tuple
 
 
 def velocity(x: tuple[Array, ...], T: Scalar) -> Array:
-    """f' at this sample, exact for polynomials of degree m: the states of order 2 are those of half a sample before."""
+    """Return f' at this sample, exact for polynomials of degree m. States of order 2 lag by half a sample."""
     return x[1] + T / 2 * x[2] if len(x) == 3 else x[1]
 
 
 def _root(c: Array, m: int) -> Array:
-    """The r >= 0 with r^(m+1) + lam_0 r^m + .. + lam_{m-1} r = c, c >= 0."""
+    """Return the r >= 0 with r^(m+1) + lam_0 r^m + .. + lam_{m-1} r = c, c >= 0."""
     if m == 1:
         return 2 * c / (LAM[1][0] + jnp.sqrt(LAM[1][0] ** 2 + 4 * c))
     return _cubic_root(c)
@@ -67,8 +73,9 @@ def _root(c: Array, m: int) -> Array:
 @jax.custom_jvp
 @compiled_alone
 def _cubic_root(c: Array) -> Array:
+    """Return the root of `_root` for m = 2."""
     square, linear, _ = LAM[2]
-    # each term alone gives a root too high, and the left side is convex: Newton's steps fall towards the root
+    # The root of each term alone is an upper bound. The left side is convex, so Newton's steps decrease to the root.
     r = jnp.minimum(jnp.minimum(c / linear, jnp.sqrt(c / square)), jnp.cbrt(c))
     for _ in range(NEWTON):
         r = r - (((r + square) * r + linear) * r - c) / ((3 * r + 2 * square) * r + linear)
@@ -77,6 +84,6 @@ def _cubic_root(c: Array) -> Array:
 
 @_cubic_root.defjvp
 def _cubic_root_jvp(primals: tuple[Array], tangents: tuple[Any]) -> tuple[Array, Array]:
-    # of the equation, not of the iteration
+    # derivative of the implicit equation, not of the iteration
     r, (square, linear, _) = _cubic_root(*primals), LAM[2]
     return r, tangents[0] / ((3 * r + 2 * square) * r + linear)

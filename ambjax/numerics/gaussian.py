@@ -1,8 +1,8 @@
-"""Gaussian numbers by counter: any sample of any member at once, in a few vector operations each.
+"""Counter-based Gaussian random numbers: any sample of any member, directly, in a few vector operations.
 
-jax.random.normal draws from the same distribution, other numbers, by the inverse error function, whose logarithm is a
-library call for every number on CPUs: twenty times what a step of the loop costs. Here Threefry's words go through Box
-and Muller's transform.
+jax.random.normal draws other numbers from the same distribution. It uses the inverse error function, whose logarithm is
+a library call for every number on CPUs and costs twenty times as much as a step of the loop. Here the words of Threefry
+are transformed by the method of Box and Muller.
 """
 
 import jax
@@ -15,14 +15,15 @@ from ambjax.numerics.records import Scalar
 from ambjax.numerics.smooth import cosine, sine
 
 ROTATIONS = (13, 15, 26, 6), (17, 29, 16, 24)
-# jax.random.fold_in counts with 0 in the first word; these are other streams of the same key.
+# First words of the counter. jax.random.fold_in uses 0, so these are other streams of the same key.
 STREAMS = 1, 2
 LN_2, ROOT_HALF = float(np.log(2.0)), float(np.sqrt(0.5))
-# Terms of the series of atanh(s) / s in s^2 <= 0.0295: to rounding.
+# Number of terms of the series of atanh(s)/s, s^2 <= 0.0295, for an error at the level of rounding.
 ATANH_TERMS = {"float64": 10, "float32": 5}
 
 
 def _threefry(k_0: Array, k_1: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    """Return two random words from the key (k_0, k_1) and the counter (x, y)."""
     schedule = (k_0, k_1, k_0 ^ k_1 ^ jnp.uint32(0x1BD11BDA))
     x, y = x + k_0, y + k_1
     for group in range(5):
@@ -36,12 +37,15 @@ def _threefry(k_0: Array, k_1: Array, x: Array, y: Array) -> tuple[Array, Array]
 
 @compiled_alone
 def _both(*words: Array) -> Array:
-    """Both words of `_threefry` in the bits of one complex number: of two results XLA computes each apart."""
+    """Return both words of `_threefry` in the bits of one complex number: XLA would repeat the work for two results."""
     return lax.complex(*[lax.bitcast_convert_type(word, jnp.float32) for word in _threefry(*words)])
 
 
 def threefry(key: tuple[Scalar, Scalar], count: tuple[Scalar, Scalar]) -> tuple[Array, Array]:
-    """Threefry-2x32 with 20 rounds (Salmon et al., SC 2011), the generator of jax.random: two words from two."""
+    """Return two random 32-bit words from a counter of two words, by Threefry-2x32 with 20 rounds.
+
+    It is the generator of jax.random (Salmon et al., SC 2011).
+    """
     words = [jnp.asarray(word).astype(jnp.uint32) for word in (*key, *count)]
     if jax.default_backend() != "cpu":
         return _threefry(*words)
@@ -52,7 +56,7 @@ def threefry(key: tuple[Scalar, Scalar], count: tuple[Scalar, Scalar]) -> tuple[
 
 @compiled_alone
 def _radius(word: Array) -> Array:
-    """sqrt(-2 ln u) for u = (word + 1/2) / 2^32."""
+    """Return sqrt(-2 ln u) for u = (word + 1/2) / 2^32."""
     dtype = jnp.result_type(float)
     whole, bits = (jnp.uint64, 52) if dtype == jnp.float64 else (jnp.uint32, 23)
     one = jnp.asarray(np.ones((), dtype).view(whole))
@@ -69,10 +73,13 @@ def _radius(word: Array) -> Array:
 
 
 def normals(key: tuple[Scalar, Scalar], number: Scalar) -> tuple[Array, Array, Array]:
-    """Three independent standard normal numbers, the `number`-th of the member whose key is two 32-bit words.
+    """Return three independent standard normal numbers.
+
+    - `key`: the random key of a member, two 32-bit words.
+    - `number`: counter, for example the number of the sample.
 
     Box and Muller (Ann. Math. Statist. 29 (1958) 610): sqrt(-2 ln u) times cosine and sine of 2 pi w. u and w have
-    32 bits, so that no number is beyond 6.8.
+    32 bits, so that no absolute value exceeds 6.8.
     """
     (a, b), (c, d) = (threefry(key, (stream, number)) for stream in STREAMS)
     turn, other = (x.astype(jnp.result_type(float)) * 2.0**-32 for x in (b, d))

@@ -1,7 +1,7 @@
-"""Linear algebra on states: pytrees of a few scalars, written out.
+"""Linear algebra on states, which are pytrees of a few scalars.
 
-The systems are 3x3 to 8x8 and sit in the innermost loop. Written out, each entry is one scalar
-(one vector lane per member under vmap); a library call would cost more than the arithmetic.
+The systems are 3x3 to 8x8 and occur in the innermost loop. Each entry of a matrix is a separate scalar (under vmap, one
+vector lane per member). A library call would take longer than the arithmetic.
 """
 
 from collections.abc import Callable
@@ -16,17 +16,16 @@ from ambjax.numerics.smooth import away_from_zero
 
 
 class Factors(NamedTuple):
-    """L and U of (I - g J) in one table, eliminated from the last component to the first."""
+    """The factors L and U of I - g J in one table. Elimination goes from the last component to the first."""
 
     table: list[list[Any]]
     inverse_pivots: list[Any]
 
 
 def jacobian(function: Callable[[Any], Any], state: Any) -> list[list[Any]]:
-    """d function_i / d state_j as nested lists [i][j], by one forward derivative per component.
+    """Return d function_i / d state_j as nested lists [i][j], by one forward derivative per component.
 
-    Each derivative sees the other components as constants, so terms that are zero by structure are
-    never computed.
+    The other components are constants in each derivative, so that structural zeros are not computed.
     """
     leaves, tree = jax.tree.flatten(state)
 
@@ -45,9 +44,9 @@ def jacobian(function: Callable[[Any], Any], state: Any) -> list[list[Any]]:
 def factor(jac: list[list[Any]], g: Scalar) -> Factors:
     """Factor I - g J without row exchanges.
 
-    Controller states come last in a state and are eliminated first: their diagonal 1 + g slope is
-    large where the loop is stiff, and what is left is the slow, closed-loop motion of the rotor. A
-    pivot of 0 is moved off it, so that a hopeless trial step stays finite and is rejected.
+    Controller states are last in a state and eliminated first. Their diagonal entries 1 + g slope are large if the loop
+    is stiff, and the remaining system is the slow closed-loop motion of the rotor. A pivot near 0 is moved away from 0,
+    so that an inaccurate trial step stays finite and is rejected.
     """
     n = len(jac)
     order = range(n - 1, -1, -1)
@@ -63,7 +62,7 @@ def factor(jac: list[list[Any]], g: Scalar) -> Factors:
 
 
 def solve(factors: Factors, right: Any) -> Any:
-    """The state x with (I - g J) x = right."""
+    """Return the state x with (I - g J) x = right."""
     m, inverses = factors
     leaves, tree = jax.tree.flatten(right)
     y = list(reversed(leaves))

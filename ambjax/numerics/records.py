@@ -1,8 +1,8 @@
-"""Records: frozen dataclasses that are JAX pytrees, and the checks that their fields declare.
+"""Records: frozen dataclasses that are JAX pytrees, with fields that declare unit and bounds.
 
-A record's type says what it is; its leaves are numbers that may be traced, batched and
-differentiated. Fields declare unit, bounds and meaning once, and the case-file reader, the
-template and `validate` all read them from there.
+The leaves of a record are numbers that may be traced, batched and differentiated. Its type and its static fields are
+part of the tree structure. Each field declares unit, bounds and meaning once, for the case-file reader, the template
+and `validate`.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from jax.core import Tracer
 
 T = TypeVar("T")
 
-# A real number, or an array of them: one member's scalar, traced or not.
+# A real number of one member, traced or not; an array of them for an ensemble.
 Scalar = Any
 
 
@@ -35,11 +35,18 @@ def leaf(
     whole: bool = False,
     optional: bool = False,
 ) -> Any:
-    """A numeric field: its unit, its bounds and what it means.
+    """Declare a numeric field.
 
-    `above` and `at_least` bound it from below, `at_most` from above; `infinite` admits +inf beside what they
-    allow; `whole` admits whole numbers only; `optional` admits None. The bounds lie decades beyond what is built, so
-    that no product of a few numbers overflows and none of two such numbers is taken for 0.
+    - `unit`: its unit.
+    - `doc`: its meaning.
+    - `above`, `at_least`: exclusive and inclusive lower bound.
+    - `at_most`: inclusive upper bound.
+    - `infinite`: allow +inf too.
+    - `whole`: allow whole numbers only.
+    - `optional`: allow None.
+
+    Bounds are decades beyond practical values. They ensure that a product of a few numbers neither overflows nor
+    underflows to 0.
     """
     metadata = {
         "unit": unit,
@@ -55,22 +62,22 @@ def leaf(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-# Ends of a gain's range: its unit, and so its size, depends on the law and the plant.
+# Bounds of all gains. They are wide, because the unit and the size of a gain depend on the law and the plant.
 GAINS = 1e-30, 1e30
 
 
 def gain(*, default: Any, unit: str, doc: str, steepness: bool = False) -> Any:
-    """A positive numeric field over all decades, which may be tuned on a scale of logarithms.
+    """Declare a gain: a positive numeric field, tuned on a logarithmic scale.
 
-    `steepness`: that of a smoothed sign, which is suited to the plant, and tuned only where that is asked for; inf, the
-    sign itself, on a processor.
+    `steepness`: whether it is the steepness of a smoothed sign, which is matched to the plant, and tuned only on
+    request. On a processor it may be inf, for the set-valued sign.
     """
     plain = leaf(default=default, unit=unit, doc=doc, above=GAINS[0], at_most=GAINS[1], infinite=steepness)
     return dataclasses.field(default=default, metadata={**plain.metadata, "steepness": steepness})
 
 
 def static(default: Any = dataclasses.MISSING, *, doc: str = "") -> Any:
-    """A field that is part of the structure (hashable, never traced)."""
+    """Declare a field that is part of the tree structure: hashable, never traced."""
     return dataclasses.field(default=default, metadata={"static": True, "doc": doc})
 
 
@@ -78,8 +85,8 @@ def static(default: Any = dataclasses.MISSING, *, doc: str = "") -> Any:
 def record(cls: type[T]) -> type[T]:
     """Make `cls` a frozen dataclass and register it as a pytree.
 
-    Not by JAX's own `register_dataclass`: there, tree structures of two types with equal static fields compare
-    equal, and one law's compiled program could be taken for another's. Here the type is part of the structure.
+    The type is part of the tree structure. With JAX's `register_dataclass` the structures of two types with equal
+    static fields compare equal, so that the compiled program of one law could be used for another.
     """
     made = dataclasses.dataclass(frozen=True)(cls)
     fields = dataclasses.fields(made)  # pyright: ignore[reportArgumentType]
@@ -110,19 +117,19 @@ def record(cls: type[T]) -> type[T]:
 
 
 def _getter(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
-    """A function from an object to its attributes of these names: every rollout flattens some twenty records thrice."""
+    """Return a fast function from an object to its attributes: a rollout flattens about twenty records three times."""
     if len(names) > 1:
         return operator.attrgetter(*names)
     return lambda node: tuple(getattr(node, name) for name in names)
 
 
 def is_traced(x: Any) -> bool:
-    """Whether x has no concrete value, because some JAX transformation is looking at it."""
+    """Return whether x is traced by a JAX transformation, and has no concrete value."""
     return isinstance(x, Tracer)
 
 
 def numbers(field: dataclasses.Field) -> str:
-    """What a field allows, in words."""
+    """Describe the numbers that a field allows, in words."""
     meta = field.metadata
     above, at_least, at_most = meta["above"], meta["at_least"], meta["at_most"]
     unit = f" ({meta['unit']})" if meta["unit"] else ""
@@ -138,19 +145,19 @@ def numbers(field: dataclasses.Field) -> str:
 
 
 def within(meta: Any, value: Any) -> bool:
-    """Whether a number, or every number of an array, is what a field with this metadata allows."""
+    """Return whether a field with this metadata allows a number, or every number of an array."""
     if isinstance(value, (int, float)):
         if value == math.inf:
             return meta["infinite"]
         above, at_least, at_most = meta["above"], meta["at_least"], meta["at_most"]
-        return (  # nothing of this holds for NaN
+        return (  # False for NaN
             -math.inf < value
             and not (meta["whole"] and value % 1)
             and (above is None or value > above)
             and (at_least is None or value >= at_least)
             and (at_most is None or value <= at_most)
         )
-    low, high = np.min(value), np.max(value)  # NaN carries through both
+    low, high = np.min(value), np.max(value)  # both are NaN if a value is
     whole = not meta["whole"] or not np.any(np.asarray(value) % 1)
     return whole and all(within(meta, float(x)) for x in (low, high))
 
@@ -162,7 +169,7 @@ def _example(field: dataclasses.Field) -> str:
 
 
 def check_number(field: dataclasses.Field, name: str, value: Any) -> None:
-    """Raise ValueError, with the dotted name, the value and what is allowed, for a number that its field does not."""
+    """Raise ValueError, with the dotted name, the value and the allowed range, for a number outside that range."""
     try:
         number = value if isinstance(value, (int, float)) else np.asarray(value, dtype=float)
     except (TypeError, ValueError):
@@ -173,9 +180,9 @@ def check_number(field: dataclasses.Field, name: str, value: Any) -> None:
 
 
 def validate(node: Any, path: str = "") -> None:
-    """Check every concrete leaf under `node` against its field; traced leaves pass unseen.
+    """Check every concrete leaf under `node` against its field. Traced leaves are not checked.
 
-    Raises ValueError with the dotted path, the value, what is allowed and an example.
+    Raises ValueError with the dotted path, the value, the allowed range and an example.
     """
     if isinstance(node, (tuple, list)):
         for index, item in enumerate(node):
@@ -193,25 +200,25 @@ def validate(node: Any, path: str = "") -> None:
 
 @functools.cache
 def _fields(kind: type) -> tuple[tuple[dataclasses.Field, bool], ...]:
-    """Fields of a record, and whether each is a number; none of any other type. Every rollout asks for them."""
+    """Return the fields of a record type, and whether each is a leaf; () for other types. Cached for speed."""
     fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
     return tuple((field, bool(field.metadata.get("leaf"))) for field in fields)
 
 
 def _worst(value: Any, number: Any) -> str:
-    """What to show of a value that is refused: of an array, its range."""
+    """Return the text for an invalid value in a message; for an array, its range."""
     return f"{np.min(number):g} to {np.max(number):g}" if np.ndim(number) else repr(value)
 
 
-# The leaves that are whole numbers; every other number is real, even where somebody wrote 17 for 17.0.
+# Leaves that are integers. All other leaves become floating-point numbers, also if they are given as integers.
 WHOLE = ("seed", "member")
 
 
 def canonical(node: T) -> T:
-    """The same pytree with every number an array of the working precision (seeds: of integers).
+    """Return the pytree with every number as an array of the working precision, or of integers for leaves in WHOLE.
 
-    Python numbers, NumPy scalars and arrays then trace alike, so that a change of a value, or of
-    the type that carries it, never recompiles.
+    Python numbers, NumPy scalars and arrays then trace alike, so that a change of a value or of its Python type never
+    recompiles.
     """
     leaves, tree = jax.tree.flatten(node)
     kinds = jnp.result_type(float), jnp.result_type(int)
@@ -219,14 +226,14 @@ def canonical(node: T) -> T:
 
 
 def _converted(x: Any, kind: Any) -> Any:
-    if not isinstance(x, jax.Array):  # NumPy converts in microseconds what eager JAX takes a dispatch for
+    if not isinstance(x, jax.Array):  # NumPy is faster than a dispatch of eager JAX
         return np.asarray(x, kind)
     return x if x.dtype == kind and not x.weak_type else jax.lax.convert_element_type(x, kind)
 
 
 @functools.cache
 def _whole(tree: Any) -> tuple[bool, ...]:
-    """Of each leaf of a tree of this structure, whether it is one of WHOLE."""
+    """Return, for each leaf of this tree structure, whether its name is in WHOLE."""
     numbered = jax.tree.unflatten(tree, range(tree.num_leaves))
     paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(numbered)]
     return tuple(bool(path) and getattr(path[-1], "name", "") in WHOLE for path in paths)

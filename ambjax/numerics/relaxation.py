@@ -1,4 +1,4 @@
-"""A variable that relaxes under a smoothed sign: w' = drift - gain sgn(w), over a step of any length."""
+"""Relaxation of a variable under a smoothed sign, w' = drift - gain sgn(w), over a step of any length."""
 
 from typing import Any
 
@@ -9,17 +9,20 @@ from jax import Array
 from ambjax.numerics.records import Scalar
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
 
-# Newton steps on the slaved sign: monotone from below; they leave less than 1e-3 of the right-hand side.
+# Newton steps for the implicit sign. They converge monotonically from below; the relative residual is below 1e-3.
 NEWTON = 6
-# |w| p below which w is slaved at once. Within the layer it relaxes in 1/(gamma p), not at its initial rate: a slide
-# there would end anywhere in the step for a change of w by a millionth, and derivatives would be such cliffs'.
+# |w| p below which there is no slide. Within this boundary layer w relaxes with time constant 1/(gamma p), not at its
+# initial rate. The end of a slide there would be extremely sensitive to w, and derivatives would be useless.
 EDGE = 1.0
 
 
 def relaxation(w: Array, drift: Array, gain: Scalar, p: Scalar, h: Scalar) -> tuple[Array, Array, Array]:
-    """w' = drift - gain sgn(w) over h, as two constant rates of `gain sgn(w)`: (first, second, time of the first).
+    """Solve w' = drift - gain sgn(w) over h (s) approximately, with two constant values of gain sgn(w).
 
-    First it slides at its initial rate to the sign's layer (or to the end); then it is slaved, one backward Euler step.
+    First w slides at its initial rate until it reaches the boundary layer of the sign, or until the end. The rest is
+    one backward Euler step.
+
+    Returns the first value, the second value, and the duration of the first, s.
     """
     first = gain * smooth_sign(w, p)
     closing = first - drift
@@ -32,9 +35,9 @@ def relaxation(w: Array, drift: Array, gain: Scalar, p: Scalar, h: Scalar) -> tu
 
 @jax.custom_jvp
 def _implicit(b: Array, reach: Array, p: Scalar) -> Array:
-    """The w with w + reach sgn(w) = b, by Newton's method from below: the left side is concave in |w|.
+    """Return the w with w + reach sgn(w) = b, by Newton's method from below; the left side is concave in |w|.
 
-    Its derivative is that of the equation, not of the iteration: a fifth of the work.
+    The derivative is that of the implicit equation, not of the iteration, which takes a fifth of the work.
     """
     size = jnp.abs(b)
     w = jnp.maximum(size / (1 + reach * p * TWO_OVER_PI), size - reach)

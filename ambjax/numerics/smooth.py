@@ -1,4 +1,4 @@
-"""Smooth stand-ins for functions whose derivative jumps or blows up."""
+"""Smooth replacements of functions with discontinuous or unbounded derivatives, and fast vectorised functions."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +13,7 @@ from ambjax.numerics.records import Scalar
 TWO_OVER_PI = 0.6366197723675814
 TWO_PI = 6.283185307179586
 HALF_PI = 1.5707963267948966
-# arctan x = x P(x^2) / Q(x^2) on |x| <= 1, to 2e-15 relative in float64.
+# arctan x = x P(x^2) / Q(x^2) on |x| <= 1, relative error 2e-15, for float64.
 ARCTAN_P = (
     1.0,
     2.27400010594489066,
@@ -33,7 +33,7 @@ ARCTAN_Q = (
 )
 
 
-# arctan x = x R(x^2) on |x| <= 1, to 1.5e-8 relative: a weighted least-squares fit, for float32.
+# arctan x = x R(x^2) on |x| <= 1, relative error 1.5e-8, for float32: a weighted least-squares fit.
 ARCTAN_R = (
     0.9999999847653734,
     -0.33333073339931396,
@@ -46,7 +46,7 @@ ARCTAN_R = (
     0.0028498761308979135,
 )
 
-# sin(2 pi y) = y S(y^2) on |y| <= 1/4, to 3e-19 and 7e-9 relative: interpolated at Chebyshev nodes.
+# sin(2 pi y) = y S(y^2) on |y| <= 1/4, relative error 3e-19 and 7e-9: interpolation at Chebyshev nodes.
 SINE_S = {
     "float64": (
         6.283185307179586,
@@ -64,11 +64,11 @@ SINE_S = {
 
 
 def refined(x: Array) -> Array:
-    """1/x for |x| between 1e-37 and 1e37.
+    """Return 1/x for |x| between 1e-37 and 1e37.
 
-    CPUs divide vectors of float32 much faster than those of float64: there a float32 quotient is refined by one step
-    of third order, to the last bit or the one before. In a trace it is a call named RECIPROCAL, so that an exporter can
-    write the plain quotient.
+    CPUs divide vectors of float32 much faster than vectors of float64. In float64 on a CPU, a float32 quotient is
+    therefore refined by one step of third order, with an error of at most about one unit in the last place. In a trace
+    it is a call named RECIPROCAL, so that the exporter can write the ordinary quotient.
     """
     return _refined_reciprocal(x)
 
@@ -86,7 +86,10 @@ RECIPROCAL = "_refined_reciprocal"
 
 
 def polynomial(u: Array, coefficients: Sequence[Scalar]) -> Any:
-    """Neighbours in pairs, then pairs in pairs (Estrin): a third of the latency of Horner's scheme."""
+    """Evaluate a polynomial in u, coefficients in ascending order, by Estrin's scheme.
+
+    Its latency is a third of that of Horner's scheme.
+    """
     terms = list(coefficients)
     while len(terms) > 1:
         odd = [*terms[1::2], *[None] * (len(terms) % 2)]
@@ -98,10 +101,11 @@ def polynomial(u: Array, coefficients: Sequence[Scalar]) -> Any:
 @jax.custom_jvp
 @compiled_alone
 def arctan_per(x: Array, per: Array) -> Array:
-    """arctan(x) / per with one division, which vectorises; XLA's own arctan is a scalar library call on CPUs.
+    """Return arctan(x) / per with one division.
 
-    For |x| > 1 it is pi/2 - arctan(1/|x|). In float64 numerator and denominator are multiplied by a power
-    of x there, which reverses their coefficients: division is what costs most in a step of the loop.
+    The function vectorises, whereas XLA's arctan is a scalar library call on CPUs. For |x| > 1 it is
+    pi/2 - arctan(1/|x|). In float64, numerator and denominator are then multiplied by a power of x, which reverses
+    their coefficients and saves a division, the most expensive operation in a step of the loop.
     """
     size = jnp.abs(x)
     large = size > 1
@@ -127,19 +131,22 @@ def _arctan_per_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array])
 
 
 def _turn(x: Array) -> Array:
-    """The part of x turns in -1/2..1/2, exactly."""
+    """Return the angle x, in turns, reduced to -1/2..1/2 without rounding error."""
     return x - jnp.floor(x + 0.5)
 
 
 def _quarter(y: Array) -> Array:
-    """sin(2 pi y) for |y| <= 1/4."""
+    """Return sin(2 pi y) for |y| <= 1/4."""
     return y * polynomial(y * y, SINE_S[y.dtype.name])
 
 
 @jax.custom_jvp
 @compiled_alone
 def sine(x: Array) -> Array:
-    """sin(2 pi x): an angle in turns is reduced exactly, and it vectorises; XLA's own is a library call on CPUs."""
+    """Return sin(2 pi x), x in turns.
+
+    The reduction of x is exact. The function vectorises, whereas XLA's sine is a library call on CPUs.
+    """
     y = _turn(x)
     return _quarter(jnp.where(jnp.abs(y) > 0.25, jnp.where(y < 0, -0.5, 0.5) - y, y))
 
@@ -147,7 +154,7 @@ def sine(x: Array) -> Array:
 @jax.custom_jvp
 @compiled_alone
 def cosine(x: Array) -> Array:
-    """cos(2 pi x)."""
+    """Return cos(2 pi x), x in turns."""
     return _quarter(0.25 - jnp.abs(_turn(x)))
 
 
@@ -164,9 +171,9 @@ def _cosine_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, A
 
 
 def smooth_sign(x: Scalar, p: Scalar | None, per: Scalar = 1.0) -> Array:
-    """sgn(x) as 2/pi arctan(p x), divided by `per`; slope 2p/pi at zero. Remark 3 of the paper.
+    """Return the smoothed sign 2/pi arctan(p x), divided by `per`. Remark 3 of the paper.
 
-    `p` has the inverse unit of `x`; None: the sign itself, 0 at 0.
+    `p` has the inverse unit of `x`; the slope at 0 is 2p/pi. p = None gives the sign itself, 0 at 0.
     """
     if p is None:
         return jnp.sign(jnp.asarray(x)) / per
@@ -174,7 +181,10 @@ def smooth_sign(x: Scalar, p: Scalar | None, per: Scalar = 1.0) -> Array:
 
 
 def smooth_root(x: Scalar, p: Scalar | None) -> Array:
-    """sqrt(|x|) sgn(x) as x / (x^2 + 1/p^2)^(1/4); slope sqrt(p) at zero instead of infinity, the root's for p None."""
+    """Return the smoothed root x / (x^2 + 1/p^2)^(1/4) of sqrt(|x|) sgn(x).
+
+    The slope at 0 is sqrt(p). p = None gives sqrt(|x|) sgn(x) itself, whose slope at 0 is infinite.
+    """
     x = jnp.asarray(x)
     if p is None:
         return jnp.sign(x) * safe_sqrt(jnp.abs(x))
@@ -182,20 +192,20 @@ def smooth_root(x: Scalar, p: Scalar | None) -> Array:
 
 
 def safe_sqrt(x: Scalar) -> Array:
-    """sqrt(max(x, 0)) with derivative 0, not infinity, where x <= 0."""
+    """Return sqrt(max(x, 0)), with derivative 0 instead of infinity for x <= 0."""
     x = jnp.asarray(x)
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
 def away_from_zero(x: Scalar, floor: Scalar) -> Array:
-    """x, with its magnitude held at `floor` or more and its sign kept (0 counts as positive)."""
+    """Return x with its magnitude limited to at least `floor` and its sign unchanged; 0 counts as positive."""
     x = jnp.asarray(x)
     near = jnp.abs(x) < floor
     return jnp.where(near, jnp.where(x < 0, -1.0, 1.0) * floor, x)
 
 
 def limited(x: Scalar, most: Scalar) -> Array:
-    """x held within -most..most; NaN stays NaN. Not jnp.clip, which looks for NaN at three times the cost."""
+    """Return x limited to -most..most. NaN stays NaN. jnp.clip tests for NaN, and takes three times as long."""
     x, most = jnp.asarray(x), jnp.asarray(most)
     return jnp.where(x > most, most, jnp.where(x < -most, -most, x))

@@ -1,1 +1,1 @@
-"""From a cascade in a scenario to trajectories and metrics: the loop, its integrators, clock and folds."""
+"""Simulation of a cascade in a scenario: the closed loop, integrators, the clock, trajectories and metrics."""

@@ -1,4 +1,4 @@
-"""The clock: samples, their period, and the integrator between them."""
+"""The clock: number of samples, sample period, and the integrator between samples."""
 
 import dataclasses
 
@@ -8,9 +8,11 @@ from ambjax.simulation.integrate import Integrator
 
 @record
 class Clock:
-    """Samples, their period, and the integrator between them. `method` None: `ambjax.with_method` chooses.
+    """Number of samples, sample period, and the integrator between samples.
 
-    `cuts` is for a cascade on a processor, and `ambjax.with_method` counts it. None: all edges that there are.
+    - `method`: the integrator; None: `ambjax.with_method` chooses it.
+    - `cuts`: largest number of edges of disturbances inside one sample, for a cascade on a processor.
+      `ambjax.with_method` computes it; None: the number of all edges.
     """
 
     samples: int = static(default=20_000, doc="number of sample periods")
@@ -27,7 +29,7 @@ class Clock:
 
     @property
     def integrator(self) -> Integrator:
-        """The method. Raises ValueError where none was chosen."""
+        """The integration method. Raises ValueError if `method` is None."""
         if self.method is None:
             raise ValueError(
                 "clock.method is None (dt = 'auto'): choose it: clock = with_method(clock, cascade, scenario)."
@@ -35,5 +37,5 @@ class Clock:
         return self.method
 
     def with_method(self, method: Integrator) -> "Clock":
-        """This clock with another integrator."""
+        """Return this clock with another integrator."""
         return dataclasses.replace(self, method=method)

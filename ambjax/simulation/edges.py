@@ -1,7 +1,7 @@
-"""Edges: instants at which the rates of a problem jump. Integrators end a step at each of them.
+"""Edges: instants at which the rates of a problem jump. Integrators end a step at each edge.
 
-A method keeps its order only on steps over which the rates are smooth. A jump inside a step is an error of first
-order in the step's length, whatever the method.
+A method has its order only on steps in which the rates are smooth. A jump inside a step causes an error of first order
+in the step length for every method.
 """
 
 import itertools
@@ -17,15 +17,19 @@ from ambjax.world.scenario import Scenario
 
 
 class Edges(NamedTuple):
-    """Instants `at` which rates jump, s. At most `most` of them lie strictly inside one advance of an integrator."""
+    """Instants at which the rates jump.
+
+    - `at`: the instants, s.
+    - `most`: largest number of them strictly inside one advance of an integrator.
+    """
 
     at: tuple[Scalar, ...] = ()
     most: int = 0
 
     def until(self, now: Scalar, h: Scalar) -> Array:
-        """Time from `now` to the first edge within the next `h`, s; h if there is none.
+        """Return the time from `now` to the first edge within the next `h`, s; h if there is no edge.
 
-        An edge within rounding of either end is not inside: `inset` places it on the right side of that end.
+        An edge within rounding of either end is not inside: `inset` moves the stages to the correct side of it.
         """
         tolerance, step = inset(now, h), jnp.asarray(h)
         for edge in self.at:
@@ -34,7 +38,7 @@ class Edges(NamedTuple):
         return step
 
     def pieces(self, t: Scalar, time: Scalar) -> list[Array]:
-        """Lengths of the `most` + 1 intervals (s; 0 too) into which the edges divide t to t + time."""
+        """Return the lengths, s, of the `most` + 1 parts into which edges divide t to t + time; some may be 0."""
         lengths, left = [], jnp.asarray(time)
         for _ in range(self.most):
             lengths.append(self.until(t, left))
@@ -42,17 +46,17 @@ class Edges(NamedTuple):
         return [*lengths, left]
 
     def steps(self, t: Scalar, h: Scalar, count: int) -> Callable[[Array], tuple[Array, Array, Array]]:
-        """Begin, end and length (s) of each of `count` + `most` steps, as a function of its number.
+        """Divide `count` equal steps of length h, from t on, at the edges inside them.
 
-        They are `count` equal ones of length h from t on, divided at the edges inside; those that are left over have
-        no length.
+        Returns a function from the number of a step, 0 to `count` + `most` - 1, to its begin, end and length, s. If
+        there are fewer edges than `most`, some steps have length 0.
         """
         if not self.most:
             return lambda number: (t + number * h, t + (number + 1) * h, jnp.asarray(h))
         after = list(itertools.accumulate(self.pieces(t, count * h)[:-1]))
 
         def step(number: Array) -> tuple[Array, Array, Array]:
-            # The ends of equal steps, into which one edge after another is inserted: merged, they remain in order.
+            # Insert one edge after another into the sorted ends of equal steps; the clip keeps them sorted.
             ends = [h * jnp.clip(number + k, 0, count) for k in range(-self.most, 2)]
             for edge in after:
                 ends = [jnp.clip(edge, low, high) for low, high in itertools.pairwise(ends)]
@@ -66,15 +70,19 @@ NO_EDGES = Edges()
 
 
 def inset(t: Scalar, h: Scalar) -> Scalar:
-    """By how much the stages of a step of length h from t on are moved into it, s: a few units in the last place."""
+    """Return the distance by which stages at the ends of a step are moved into it, s: a few units in the last place.
+
+    The step begins at t (s) and has length h (s).
+    """
     return 4 * jnp.finfo(jnp.result_type(float)).eps * (abs(t) + h)
 
 
 def most_inside(scenario: Scenario, period: Scalar) -> int | None:
-    """The largest number of edges of the disturbances that lie strictly inside one sample; None if one is traced.
+    """Return the largest number of edges of the disturbances strictly inside one sample; None if one is traced.
 
-    `period`: of the samples, s, or several. An edge that differs between members is taken to lie inside a sample, and
-    two edges to share one where their distance may be shorter than the period for some member between those given.
+    `period`: one sample period or several, s. The number is an upper bound for an ensemble. An edge that differs
+    between members counts as inside a sample. Two edges count as in the same sample if their distance may be shorter
+    than the period for a member within the range of those given.
     """
     edges = scenario.edges()
     if any(map(is_traced, (*edges, period))):
@@ -90,7 +98,7 @@ def most_inside(scenario: Scenario, period: Scalar) -> int | None:
 
 
 def _between_samples(edge: np.ndarray, periods: np.ndarray) -> bool:
-    """Whether an edge (s) lies between the samples, or differs between members."""
+    """Return whether an edge (s) lies between samples, or differs between members."""
     if np.ptp(edge) > 0:
         return True
     at = np.ravel(edge)[0]

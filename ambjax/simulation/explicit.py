@@ -16,7 +16,10 @@ from ambjax.simulation.span import Span
 
 @functools.cache
 def _combination(weights: tuple[float, ...]) -> Callable[..., Array]:
-    """x + h sum of weight * rate, in a loop of its own: what it is given and gives is stored, never computed again."""
+    """Return the function x + h sum of weight * rate, compiled as a separate loop.
+
+    Its inputs and outputs are stored in memory, so that XLA's fusion cannot compute them again.
+    """
 
     def plain(x: Array, h: Array, rates: tuple[Array, ...]) -> Array:
         first, *others = ((w, k) for w, k in zip(weights, rates, strict=True) if w)
@@ -31,16 +34,19 @@ def _combination(weights: tuple[float, ...]) -> Callable[..., Array]:
     def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
         (x, h, rates), (dx, dh, d_rates) = primals, tangents
         slope = sum(w * k for w, k in zip(weights, rates, strict=True) if w)
-        return combination(x, h, rates), combination(dx, h, d_rates) + dh * slope  # nor are tangents fused
+        return combination(x, h, rates), combination(dx, h, d_rates) + dh * slope  # tangents are not fused either
 
     return combination
 
 
 class _Explicit(_Fixed):
-    """An explicit Runge-Kutta method: the times of its stages, and weights in the state after each, the new one last.
+    """Base class of explicit Runge-Kutta methods.
 
-    Stages are written out, and the state that each begins from is kept from XLA's fusion: fused, shared terms of the
-    right-hand side are computed again for every component of every stage.
+    - `TIMES`: times of the stages, as fractions of the step.
+    - `ROWS`: weights of the rates in the state after each stage; the last row gives the new state.
+
+    The state at the start of each stage is excluded from XLA's fusion. With fusion, shared terms of the right-hand side
+    would be computed again for every component of every stage.
     """
 
     TIMES: ClassVar[tuple[float, ...]]
@@ -54,7 +60,8 @@ class _Explicit(_Fixed):
             stages.append(materialised(rates, x))
             combination = _combination(row)
             x = jax.tree.map(lambda x, *ks, combination=combination: combination(x, h, ks), state, *stages)
-            # Integrals by the method's own rule; other stages are trial states, and no extremes.
+            # Integrals use the weights of the method. Only the first stage counts for extremes; the others are trial
+            # states.
             span = span.seen(instant, weight * h, h) if len(stages) == 1 else span.weighed(instant, weight * h)
         return x, span
 
@@ -85,10 +92,10 @@ class RK4(_Explicit):
 
 @record
 class DOP853(_Explicit):
-    """Dormand and Prince's method of order 8, in 12 stages: for held noise, at one or two steps a hold.
+    """Dormand and Prince's method of order 8, in 12 stages: for held noise, with one or two steps per hold.
 
-    Coefficients: Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I (2nd ed., 1993), II.10. Their
-    error estimates serve steps of variable length only.
+    Coefficients: Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I (2nd ed., 1993), II.10. The
+    error estimates are omitted, because the steps are fixed.
     """
 
     limit = 6.39

@@ -1,16 +1,15 @@
-"""Integrators: one signature, `advance`, over one sample period in which the inputs are held.
+"""Integrators: methods that advance an initial value problem over one sample period with held measurement errors.
 
     advance(problem, t, period, state, memory, code=0) -> Advanced(state, code, t, memory, span)
 
-A `Problem` is a right-hand side on any pytree of scalars, what drives it as a function of time, the
-size of each component that still matters, and the status of a state: 0 while all is well. An integrator
-stops at the first state whose code is not 0 and returns the last good one; begun with such a code, it
-moves nothing. `memory` is what the method carries from one sample to the next (`start(period)` makes the
-first), `span` what was seen on the way (`ambjax.simulation.span`).
+The state is any pytree of scalars. An integrator stops at the first state whose status code is not 0, and returns the
+state before it. If the initial code is not 0, the state does not change. `memory` is the data that the method carries
+from one sample to the next; `start(period)` returns the initial memory. `span` holds the extremes and integrals of
+signals over the sample (`ambjax.simulation.span`).
 
-Stage times are moved inside the step by a few units in the last place, so that a jump that falls on
-a step's edge is seen by the steps after it and not by those before: otherwise the last stage sees
-it early and the method falls to first order there.
+Stage times are moved into the step by a few units in the last place. A jump at the boundary of two steps then belongs
+to the second step. Otherwise the last stage of the first step would include the jump, and the method would be of first
+order there.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,18 +30,24 @@ State = TypeVar("State")
 InputFunction = Callable[[Array], Any]
 Rates = Callable[[Any, Any], Any]
 StatusFunction = Callable[[Any], Array]
-# Stage times of one step, by the share of it that has passed.
+# Time of a stage as a function of its fraction of the step, 0 to 1.
 Times = Callable[[float], Array]
 
 
 class InitialValueProblem(NamedTuple):
-    """What is integrated: rates(inputs(t), state), scale (a state) and status(state) -> code.
+    """An initial value problem, whose time derivative is rates(inputs(t), state).
 
-    `layer` (a state): the largest error with which a component stays where a smoothed sign turns; None: none does.
-    `observed(inputs(t), state) -> (rates, Instant)`: the rates and what is to be seen; None: nothing is. `shown`: any
-    such instant, for its structure. `jumps`: whether the rates jump at the start of a sample; `edges`: where else.
-    `slide(inputs(t_0), inputs(t_1), h, state, span) -> (state, span)`, where there is one, is a step made for this
-    very system.
+    - `inputs`: external inputs as a function of time.
+    - `rates`: right-hand side rates(inputs, state).
+    - `scale`: a state with the smallest relevant magnitude of each component.
+    - `status`: status(state) -> code, 0 while the state is valid.
+    - `layer`: a state with the width of the boundary layer of each component's smoothed sign; None: no such signs.
+    - `observed`: observed(inputs, state) -> (rates, Instant), the rates and the signals to record; None: no signals.
+    - `shown`: any Instant, which defines the structure of those signals.
+    - `jumps`: whether the rates jump at the start of a sample.
+    - `slide`: slide(inputs(t_0), inputs(t_1), h, state, span) -> (state, span), a step for this particular system;
+      None: there is none.
+    - `edges`: other instants at which the rates jump.
     """
 
     inputs: InputFunction
@@ -57,12 +62,19 @@ class InitialValueProblem(NamedTuple):
     edges: Edges = NO_EDGES
 
     def watched(self, inputs: Any, state: Any) -> tuple[Any, Instant]:
-        """Rates, and what is to be seen."""
+        """Return the rates, and the signals to record."""
         return (self.rates(inputs, state), NOTHING) if self.observed is None else self.observed(inputs, state)
 
 
 class Advanced(NamedTuple):
-    """The end of one sample period: last good state, status's code, the time it refers to, memory, what was seen."""
+    """Result of `advance`.
+
+    - `state`: last state with status code 0.
+    - `code`: status code at the end.
+    - `t`: time of the end, s; of the first invalid state, if there is one.
+    - `memory`: data for the next sample.
+    - `span`: extremes and integrals of the signals.
+    """
 
     state: Any
     code: Array
@@ -72,15 +84,15 @@ class Advanced(NamedTuple):
 
 
 class Integrator(Protocol):
-    """What `rollout` needs of a method."""
+    """Interface of an integration method, as `rollout` uses it."""
 
     @property
     def limit(self) -> float | None:
-        """Largest stable step times slope on the negative real axis; None if there is none."""
+        """Largest stable product of step and slope on the negative real axis; None if there is no limit."""
         ...
 
     def step_size(self, period: float) -> float | None:
-        """The step in s, or None if the method chooses it as it goes."""
+        """Return the step, s; None if the step is adaptive."""
         ...
 
     def start(self, period: Scalar) -> Any: ...
@@ -98,9 +110,11 @@ def in_turn(
     memory: Any,
     code: Scalar = ALIVE,
 ) -> list[Advanced]:
-    """Problems one after another, each for its time (s; 0 too): a sample within which rates jump at known instants.
+    """Integrate problems one after another, for a sample in which the rates jump at known instants.
 
-    What has been reached after each of them, since the first began.
+    `stretches`: pairs of a problem and its duration, s; the duration may be 0.
+
+    Returns the results after each problem, accumulated from the start of the first.
     """
     (problem, time), *others = stretches
     reached = [method.advance(problem, t, time, state, memory, code)]
@@ -113,26 +127,26 @@ def in_turn(
 
 
 def axpy(state: State, *terms: tuple[Scalar, State]) -> State:
-    """state + sum of factor * direction over the terms, leaf by leaf."""
+    """Return state + sum of factor * direction over the terms, leaf by leaf."""
     for factor, direction in terms:
         state = jax.tree.map(lambda x, d, factor=factor: x + factor * d, state, direction)
     return state
 
 
 def choose(condition: Array, yes: State, no: State) -> State:
-    """jnp.where over whole states."""
+    """Apply jnp.where to every leaf of two states."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
 def _inside(t: Scalar, h: Scalar) -> Times:
-    """Stage times t + share h, kept strictly inside the step."""
+    """Return the stage times t + share h, moved strictly inside the step."""
     moved = inset(t, h)
     return lambda share: t + moved + share * (h - 2 * moved)
 
 
 @record
 class _Fixed:
-    """Equal substeps of `_step`, divided at edges, by a loop of fixed length: forward and reverse mode both work."""
+    """Equal substeps, divided at edges, in a loop of fixed length: supports forward and reverse mode."""
 
     substeps: int = static(default=1, doc="steps per sample period")
 
@@ -154,7 +168,7 @@ class _Fixed:
         def body(number: Array, carry: tuple[Any, Array, Array, Span]) -> tuple[Any, Array, Array, Span]:
             x, code, end, span = carry
             alive = code == ALIVE
-            # Times do not depend on who is alive: members share them, and what is driven by them.
+            # Times do not depend on the status, so that members share the times and the inputs at these times.
             start, stop, step = steps(number)
             new, after = self._step(problem, _inside(start, step), step, x, span)
             code = jnp.where(alive, problem.status(new), code)
@@ -167,10 +181,11 @@ class _Fixed:
 
 
 def rodas3_step(problem: InitialValueProblem, at: Times, h: Scalar, state: Any) -> tuple[Any, Any, Instant]:
-    """One step of RODAS3, its error estimate and what is seen at its start: order 3(2), L-stable, stiffly accurate.
+    """Compute one step of RODAS3, its error estimate, and the signals at its start.
 
-    Sandu et al., Atmospheric Environment 31 (1997) 3459-3472. One Jacobian, one factorisation of
-    I - h J / 2 and three evaluations a step. Stages are scaled by h, so h = 0 is the identity.
+    RODAS3 is a Rosenbrock method of order 3(2), L-stable and stiffly accurate (Sandu et al., Atmospheric Environment 31
+    (1997) 3459-3472). A step takes one Jacobian, one factorisation of I - h J / 2 and three evaluations. Stages are
+    scaled by h, so that h = 0 is the identity.
     """
     t_0 = at(0.0)
     rates = jax.jit(problem.rates)  # traced once here, not once per column of the Jacobian
@@ -194,7 +209,7 @@ def rodas3_step(problem: InitialValueProblem, at: Times, h: Scalar, state: Any) 
 
 @record
 class Rodas3(_Fixed):
-    """RODAS3 with equal substeps: for stiff loops when a loop of fixed length is wanted (reverse mode)."""
+    """RODAS3 with equal substeps, for stiff loops that need reverse-mode differentiation."""
 
     limit = None
 
@@ -209,10 +224,11 @@ class Rodas3(_Fixed):
 
 @record
 class Slide(_Fixed):
-    """Equal substeps of the loop's own step (`ambjax.simulation.sliding`): for stiff gains under held noise.
+    """The sliding step (`ambjax.simulation.sliding`) with equal substeps, for stiff gains under held noise.
 
-    Second order in the loop's slow motion, however stiff the inversion law is; that must have a `slide`, as
-    `inversion.Adaptive` does, and the plant be lumped.
+    The step is of second order in the slow motion of the loop, for any stiffness of the inversion law. It requires an
+    inversion law with a method `slide`, such as `inversion.Adaptive`, and a lumped plant; otherwise a simulation raises
+    ValueError.
     """
 
     limit = None
@@ -230,17 +246,18 @@ class Slide(_Fixed):
 
 @record
 class AdaptiveRodas3:
-    """RODAS3 whose steps keep the estimated error of each step below `tolerance` (scale + |state|).
+    """RODAS3 with adaptive steps: the estimated error of each step stays below `tolerance` (scale + |state|).
 
-    And within the layer of a smoothed sign, where there is one: an error beyond it lands on the sign's other side,
-    the next step back on this one, and the run chatters across in ever smaller steps until it stalls.
-    The corner where a stiff smoothed sign leaves saturation lasts microseconds and comes rarely: steps shrink
-    there and grow again. The step carries over from one sample to the next. A while loop: forward
-    mode and vmap work, reverse mode does not (JAX cannot reverse a loop of unknown length).
+    The error also stays within the boundary layer of each smoothed sign. A larger error would move the state to the
+    other side of the sign and the next step back, so that the steps shrink until the run stalls. Where a stiff smoothed
+    sign leaves saturation, for a few microseconds, the steps shrink and then grow again. The last step of a sample is
+    the first trial step of the next.
 
-    The tolerance limits the error of a step, not that of z at the end. The latter is in proportion to how far the loop
-    carries a kick: at 1e-7, z is within 1e-8 m where a kick of 1 m/s moves it by at most 0.1 m. A rotor that is barely
-    caught carries kicks further.
+    Forward mode and vmap work. Reverse mode does not, because JAX cannot reverse a while loop.
+
+    The tolerance bounds the error of a step, not the error of z at the end, which is proportional to the response of
+    the loop to a disturbance. At a tolerance of 1e-7, z is within 1e-8 m if a velocity impulse of 1 m/s moves z by at
+    most 0.1 m. The response of a rotor that is nearly lost is larger.
     """
 
     tolerance: Scalar = leaf(default=1e-6, unit="1", above=0, at_most=1.0, doc="relative error allowed per step")
@@ -273,11 +290,11 @@ class AdaptiveRodas3:
             size = self._size(error, x, new, problem)
             accept = size <= 1
             suggestion = step * jnp.clip(0.9 * jnp.maximum(size, 1e-9) ** (-1 / 3), 0.2, 5.0)
-            # A step cut short by an edge or the sample's end says little about the next one.
+            # A step that an edge or the end of the sample shortened must not reduce the next step.
             h = jnp.where(last & accept, jnp.maximum(h, suggestion), suggestion)
             verdict = jnp.where(accept, problem.status(new), ALIVE)
-            # By the trapezoidal rule, in which this state ends one step and begins the next. Not so the first step
-            # after a jump, by the rule of its end alone: slaved states leave what the jump found within nanoseconds.
+            # Trapezoidal rule: the weight of a state is half of the steps before and after it. The first step after a
+            # jump has only the value at its end, because fast states leave their initial values within nanoseconds.
             first = problem.jumps & (elapsed == 0)
             span = choose(accept, span.seen(here, (before + jnp.where(first, 0.0, step)) / 2, step), span)
             before = jnp.where(accept, jnp.where(first, 2 * step, step), before)
@@ -293,7 +310,7 @@ class AdaptiveRodas3:
         return Advanced(x, jnp.where(stalled, STALLED, code), t + elapsed, h, span)
 
     def _size(self, error: Any, x: Any, new: Any, problem: InitialValueProblem) -> Array:
-        """Root mean square of the error against what is allowed; huge if anything is not finite."""
+        """Return the root mean square of error over allowed error; 1e9 if a component is not finite."""
         layer = jax.tree.map(lambda _: jnp.inf, problem.scale) if problem.layer is None else problem.layer
 
         def ratio(e: Array, a: Array, b: Array, s: Array, most: Array) -> Array:

@@ -18,12 +18,12 @@ from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.signals import Reference, reference_at
 
-# A state this many times its scale has left the model's meaning, long before numbers overflow.
+# A state above this many times its scale counts as diverged: the model is not valid there, and no number overflows yet.
 DIVERGENCE = 1e6
 
 
 class ExternalInputs(NamedTuple):
-    """What reaches the loop from outside at one instant: reference, disturbances (m/s^2, A/s)."""
+    """External inputs of the loop at one instant: reference, and disturbances q_z (m/s^2) and q_i (A/s)."""
 
     reference: Reference
     q_z: Array
@@ -31,7 +31,7 @@ class ExternalInputs(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """Signals whose extremes between samples matter: as in a Row. m, m, m/s, V, A, A, A^2/m^2."""
+    """Signals whose extremes between samples are recorded, named as in a Row: m, m, m/s, V, A, A, A^2/m^2."""
 
     z: Array
     e_z: Array
@@ -43,19 +43,19 @@ class Sizes(NamedTuple):
 
 
 class Densities(NamedTuple):
-    """What is integrated over time: u (V), u^2 (V^2), and the copper loss in both coils (W)."""
+    """Signals that are integrated over time: u (V), u^2 (V^2), and the copper loss in both coils (W)."""
 
     u: Array
     u_squared: Array
     heat: Array
 
 
-# For its structure only.
+# An Instant with the structure of those of the loop.
 SHOWN = Instant(Sizes(*[0.0] * 7), Densities(*[0.0] * 3))  # pyright: ignore[reportArgumentType]
 
 
 class LoopState(NamedTuple):
-    """State of the plant, its own, then of the cascade. The order matters to `linear.factor`."""
+    """State of the plant, then of the cascade. `linear.factor` relies on this order."""
 
     plant: Any
     control: CascadeState
@@ -63,84 +63,87 @@ class LoopState(NamedTuple):
 
 @record
 class ClosedLoop:
-    """A cascade in a scenario. `errors` below: those of the sensors, constant over a sample."""
+    """The closed loop of a cascade in a scenario, in continuous time.
+
+    The argument `errors` of its methods holds the measurement errors, constant over a sample.
+    """
 
     cascade: Cascade
     scenario: Scenario
 
     def realised(self) -> "Realised":
-        """The loop of one member: with its scenario's random signals drawn, and the key of its sensors."""
+        """Return the loop of one member, with its random signals drawn and the random key of its sensors."""
         return Realised(self.cascade, self.scenario.realised(), self.scenario.words())
 
     def words(self) -> tuple[Scalar, Scalar]:
-        """The member's key as two 32-bit words."""
+        """Return the random key of the member as two 32-bit words."""
         return self.scenario.words()
 
     def sensor_errors(self, sample: Scalar) -> Errors:
-        """Errors of all sensors during sample number `sample`; zeros without a sensor model."""
+        """Return the errors of all sensors in sample number `sample`; zeros without a sensor model."""
         if self.scenario.sensor is None:
             return Errors(*[jnp.zeros(())] * 3)
         return self.scenario.sensor.noise(self.words(), sample)
 
     def start(self) -> LoopState:
-        """The state at t = 0."""
+        """Return the state at t = 0."""
         plant = self.scenario.plant.start(self.scenario.initial.measurement())
         return LoopState(plant, self.cascade.init(self.measured(plant, self.sensor_errors(0))))
 
     def measured(self, plant: Any, errors: Errors) -> Measurement:
-        """What the sensors report of the plant's state."""
+        """Return the readings of the sensors for this state of the plant."""
         motion, sensor = self.scenario.plant.measurement(plant), self.scenario.sensor
         return motion if sensor is None else sensor.reading(motion, errors)
 
     def scale(self) -> LoopState:
-        """Size of each component that still matters."""
+        """Return the smallest relevant magnitude of each component of the state."""
         return jax.tree.map(jnp.asarray, LoopState(self.scenario.plant.scale(), self.cascade.scale()))
 
     def layer(self) -> LoopState:
-        """The largest error that keeps a component where its smoothed sign turns: the laws' states have such signs."""
+        """Return the width of the boundary layer of each component's smoothed sign; infinity for the plant."""
         plant = jax.tree.map(lambda _: jnp.inf, self.scenario.plant.scale())
         return jax.tree.map(jnp.asarray, LoopState(plant, self.cascade.layer()))
 
     def inputs(self, t: Scalar) -> ExternalInputs:
-        """Everything that depends on time alone."""
+        """Return the reference and the disturbances at time t, s."""
         scenario = self.scenario
         return ExternalInputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t))
 
     def command(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> tuple[Command, CascadeState, Array]:
-        """What the cascade decides from the measured state, the rates of its states, and the applied voltage."""
+        """Return the command of the cascade, the rates of its states, and the applied voltage, V."""
         u_max = jnp.asarray(self.scenario.u_max)
         seen = self.measured(state.plant, errors)
         command, rates = self.cascade(seen, state.control, inputs.reference, u_max)
         return command, rates, limited(command.u, u_max)
 
     def rates(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> LoopState:
-        """Time derivative of the state: Eqs. (1), (2) and the laws."""
+        """Return the time derivative of the state: Eqs. (1), (2) and the laws."""
         _, control, u = self.command(inputs, state, errors)
         return self.moved(inputs, state, control, u)
 
     def observed(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> tuple[LoopState, Instant]:
-        """The rates, and what is seen of the loop at one instant."""
+        """Return the rates, and the signals of the loop at one instant."""
         command, control, u = self.command(inputs, state, errors)
         shown = self.shown(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
         return self.moved(inputs, state, control, u), shown
 
     def shown(self, reference: Reference, plant: Any, i_ref: Array, v_tilde: Array, u: Array) -> Instant:
-        """What is seen of the loop with this state of the plant, its references, input error and voltage."""
+        """Return the signals at one instant, from the plant's state, references, input error and voltage."""
         motion, heat = self.scenario.plant.measurement(plant), self.scenario.plant.signals(plant).heat
         sigma = self.cascade.position.sigma(motion, reference)
         sizes = Sizes(motion.z, motion.z - reference.r, sigma, u, motion.i, motion.i - i_ref, v_tilde)
         return Instant(sizes, Densities(u, u * u, heat))
 
     def moved(self, inputs: ExternalInputs, state: LoopState, control: CascadeState, u: Array) -> LoopState:
-        """Time derivative of the state, given that of the cascade and the applied voltage."""
+        """Return the time derivative of the state, from the rates of the cascade and the applied voltage."""
         return LoopState(self.scenario.plant.rates(state.plant, u, inputs.q_z, inputs.q_i), control)
 
     def status(self, state: LoopState) -> Array:
-        """0 while the rotor is levitated, else the code of what became of it."""
+        """Return the status code of the rotor: 0 while it is levitated."""
         return self.judged(state, self.scale(), state.plant)
 
     def judged(self, state: Any, scale: Any, plant: Any) -> Array:
-        """The same of a state, or a part of one, and its scale; with the state of the plant."""
+        """Return the status code for a state, or a part of a state, with its scale and the state of the plant."""
         sane = [jnp.abs(x) <= DIVERGENCE * s for x, s in zip(*map(jax.tree.leaves, (state, scale)), strict=True)]
         touched = jnp.abs(self.scenario.plant.measurement(plant).z) >= self.scenario.touchdown
         return jnp.where(functools.reduce(jnp.logical_and, sane), jnp.where(touched, TOUCHED, ALIVE), DIVERGED).astype(
@@ -148,14 +151,17 @@ class ClosedLoop:
         )
 
     def rest(self, state: LoopState, code: Array) -> LoopState:
-        """The state in which a lost rotor is frozen: at rest, against the stop it touched; controller as it was."""
+        """Return the state in which a lost rotor is frozen: at rest, at the stop that it touched.
+
+        The state of the controller does not change.
+        """
         plant = self.scenario.plant
         z = plant.measurement(state.plant).z
         stop = jnp.where(z < 0, -1.0, 1.0) * self.scenario.touchdown
         return state._replace(plant=plant.rest(state.plant, jnp.where(code == TOUCHED, stop, z)))
 
     def problem(self, errors: Errors) -> InitialValueProblem:
-        """What an integrator is given for one sample."""
+        """Return the initial value problem of one sample."""
         step = functools.partial(slide, self, errors) if slides(self.cascade, self.scenario.plant) else None
         rates = lambda inputs, x: self.rates(inputs, x, errors)  # noqa: E731
         observed = lambda inputs, x: self.observed(inputs, x, errors)  # noqa: E731
@@ -165,7 +171,7 @@ class ClosedLoop:
         )
 
     def row(self, t: Scalar, state: LoopState, errors: Errors, alive: Array) -> Row:
-        """All signals at one instant. The drive of a lost rotor is off: u = 0."""
+        """Return all signals at one instant. The drive of a lost rotor is off: u = 0."""
         inputs = self.inputs(t)
         command, _, u = self.command(inputs, state, errors)
         seen = self.measured(state.plant, errors)
@@ -174,7 +180,7 @@ class ClosedLoop:
     def signals(
         self, t: Scalar, inputs: ExternalInputs, state: Any, command: Command, seen: Measurement, alive: Array
     ) -> Row:
-        """All signals of a state of the plant, what was seen and decided there, u within the supply's limit."""
+        """Return all signals, from the plant's state, the readings `seen` and the command; u is already limited."""
         plant = self.scenario.plant
         motion, signals = plant.measurement(state), plant.signals(state)
         return Row(
@@ -200,18 +206,18 @@ class ClosedLoop:
         )
 
     def noted(self, row: Row, span: Span) -> Row:
-        """The row of a sample, with what is known only at its end."""
+        """Return the row of a sample, with mean and peak voltage, which are known at its end."""
         mean = span.densities.u / jnp.where(span.time > 0, span.time, 1.0)
         return row._replace(u_mean=mean, u_peak=jnp.maximum(jnp.abs(row.u), span.most.u))
 
     def singularity(self, row: Row) -> Array:
-        """Positive while (z, i_ref) is on the good side of the singular curve C, 0 on it. Eq. (9)."""
+        """Return a number that is 0 on the singular curve C, and positive on the admissible side of C. Eq. (9)."""
         return self.scenario.plant.singularity(row.z, row.i_ref)
 
 
 @record
 class Realised(ClosedLoop):
-    """The closed loop of one member; `key` is the member's key as two 32-bit words."""
+    """The closed loop of one member. `key`: the random key of the member as two 32-bit words."""
 
     key: tuple[Scalar, Scalar]
 

@@ -1,4 +1,4 @@
-"""Which integrator, with how many substeps: read off the loop's own slopes."""
+"""Choice of the integrator and its number of substeps from the slopes of the loop."""
 
 import dataclasses
 import math
@@ -15,36 +15,39 @@ from ambjax.simulation.explicit import RK4
 from ambjax.simulation.integrate import AdaptiveRodas3, Integrator, Rodas3
 from ambjax.world.scenario import Scenario
 
-# RK4 at this step times slope is accurate to about 1e-9 m on smooth gains (benchmarks/work_precision.py)
+# Product of step and slope at which RK4 is accurate to about 1e-9 m on smooth gains (benchmarks/work_precision.py).
 ACCURATE = 1.0
-# The plant under a held voltage is not stiff: RK4 at this step times its pole leaves less than 1e-11 m.
+# On a processor: product of step and plant pole at which the error of RK4 is below 1e-11 m. The plant under a held
+# voltage is not stiff.
 SAMPLED = 0.02
-# Its coils may be: at this step times R / L, RK4 leaves less than 1e-11 m and 1e-6 A of a sample in which they settle.
-# Beyond so many substeps an L-stable method is cheaper.
+# The coils may be stiff. SETTLED: product of step and R/L at which the error of RK4 is below 1e-11 m and 1e-6 A in a
+# sample in which the current settles. MOST_SETTLED: number of substeps above which an L-stable method is cheaper.
 SETTLED, MOST_SETTLED = 0.5, 64
-# An amplifier's voltage is known as a function of time: at this step times its rate, RK4 integrates it to 1e-9 A.
+# Product of step and amplifier rate at which RK4 integrates the amplifier's voltage, a known function of time, to 1e-9
+# A.
 DRIVEN = 0.5
-# Names of the plant's slopes beside the laws', for messages.
+# Names of the plant's slopes in messages.
 PLANT, COILS = "plant", "current in the coils"
-# More RK4 substeps per sample than this cost more than the L-stable method's larger steps.
+# Number of RK4 substeps per sample above which the larger steps of the L-stable method are cheaper.
 MOST_SUBSTEPS = 4
-# Fixed L-stable steps: the corner of a smoothed sign costs an impulse that grows as slope h^2. At this value the
-# gradient in gamma under held noise is right to 1e-3; with steps twice as long it was 12 % off.
+# Fixed L-stable steps: largest value of slope h^2. The error at the corner of a smoothed sign is an impulse
+# proportional to slope h^2. At this value the gradient in gamma under held noise is correct to 1e-3; with twice the
+# step its error is 12 %.
 CORNER = 7.5e-6
-# Error per step of the adaptive method. The error of z is in proportion to how far the loop carries a kick: the largest
-# distance, m, that a velocity of 1 m/s added at one instant moves z later. At QUIET_TOLERANCE, z is within 1e-8 m where
-# that is at most 0.1 m. A loop near the edge of losing its rotor carries a kick without bound, so that no error in
-# metres holds for every loop (tests/test_tolerance.py). Under noise every sample begins with a jump, and
-# QUIET_TOLERANCE would cost up to twice the steps.
+# Relative error per step of the adaptive method, with and without noise. The error of z is proportional to the response
+# of the loop to an impulse: the largest later change of z, m, after a velocity change of 1 m/s. At QUIET_TOLERANCE, z
+# is within 1e-8 m if that response is at most 0.1 m. The response is unbounded for a loop that nearly loses its rotor,
+# so that no error in metres holds for every loop (tests/test_tolerance.py). Under noise every sample begins with a
+# jump, and QUIET_TOLERANCE would take up to twice the steps.
 TOLERANCE, QUIET_TOLERANCE = 1e-6, 1e-7
 
 
 def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
-    """Steepest rate of each law, of the unstable plant and of its coils, 1/s; the largest over an ensemble.
+    """Return the largest slope of each law, of the unstable plant and of its coils, 1/s; the maximum over an ensemble.
 
-    Raises ValueError where one is traced: a step can be chosen only from numbers.
+    Raises ValueError if a slope is traced, because a step can be chosen only from numbers.
     """
-    # on a processor the laws are stepped, and the plant alone is integrated
+    # On a processor the laws have discrete steps, and only the plant is integrated.
     laws = {} if cascade.processor else {f"{stage} law": slope for stage, slope in cascade.slopes().items()}
     named = laws | {PLANT: scenario.plant.slope(), COILS: scenario.plant.coil_slope(scenario.touchdown)}
     if traced := [name for name, slope in named.items() if is_traced(slope)]:
@@ -56,12 +59,16 @@ def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
 
 
 def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *, reverse: bool = False) -> Integrator:
-    """Adaptive RODAS3, unless RK4 suits better: noise held over slopes that a few substeps resolve, or a processor.
+    """Choose RK4, adaptive RODAS3, or RODAS3 with equal substeps.
 
-    Without noise, steps may grow over many slopes and only error control knows how far. Under noise that
-    jumps every sample there is no such gain, and the explicit method is the cheaper one. `reverse` asks
-    for a loop of fixed length, which reverse mode can run: RK4 or RODAS3 with equal substeps. A jump of a
-    disturbance between the steps of these costs about 3e-8 m per m/s^2 on smooth gains.
+    RK4 is chosen for held noise if a few substeps resolve the slopes, and for a cascade on a processor. Otherwise the
+    choice is adaptive RODAS3. Without noise adaptive steps can be much longer than the slopes suggest. Under noise,
+    which jumps at every sample, they cannot, and the explicit method is cheaper.
+
+    `reverse`: choose a method with a fixed number of steps, which supports reverse mode: RK4, or RODAS3 with equal
+    substeps. A jump of a disturbance inside such a step causes an error of about 3e-8 m per m/s^2 on smooth gains.
+
+    Raises ValueError as `slopes` does.
     """
     named = slopes(cascade, scenario)
     slope = max(named.values())
@@ -79,18 +86,19 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
         return RK4(substeps)
     if reverse:
         return Rodas3(fixed)
-    # Rounding must stay well below the tolerance, or steps are rejected for noise: in float32, 1.2e-4.
+    # The tolerance must be well above rounding, or steps are rejected because of it. In float32 it is 1.2e-4.
     tolerance = QUIET_TOLERANCE if scenario.sensor is None else TOLERANCE
     return AdaptiveRodas3(max(tolerance, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps)))
 
 
 def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: bool = False) -> Clock:
-    """`clock` with its method chosen if it had none, and checked against its stability limit if it had.
+    """Return `clock` with an integration method.
 
-    For a cascade on a processor also with `cuts`: how many edges of disturbances lie inside one sample. A larger number
-    that was counted before remains, so that a part of an ensemble runs the program of the whole.
+    A clock without a method gets the result of `choose_method`; otherwise the method is checked against its stability
+    limit. For a cascade on a processor `cuts`, the number of edges of disturbances inside one sample, is computed too.
+    A larger `cuts` of the clock is kept, so that a part of an ensemble runs the compiled program of the whole.
 
-    Raises ValueError for an explicit step beyond the limit, naming both and the fix.
+    Raises ValueError for an explicit step above the stability limit; the message names both and the fix.
     """
     if clock.method is None:
         clock = clock.with_method(choose_method(cascade, scenario, float(clock.sample_period), reverse=reverse))
@@ -102,11 +110,12 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
 
 
 def _check_limit(clock: Clock, limit: float, cascade: Cascade, scenario: Scenario) -> None:
+    """Raise ValueError if the step is above the stability limit of the method."""
     try:
         named = slopes(cascade, scenario)
         step = clock.integrator.step_size(float(np.max(np.asarray(clock.sample_period))))
     except (ValueError, jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
-        return  # traced: the caller checked the concrete values, or takes the risk
+        return  # traced values cannot be checked
     law = max(named, key=lambda name: named[name])
     limit /= named[law]
     if step is not None and step > limit:

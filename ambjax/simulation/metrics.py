@@ -1,11 +1,12 @@
-"""Metrics as folds: they see one row at a time and keep a few numbers, whatever the length of the run.
+"""Metrics as folds, which process one row at a time and keep a few numbers for a run of any length.
 
-A fold is a record with `init() -> carry`, `update(carry, row, span) -> carry` and
-`result(carry, ending) -> numbers`: `row` is the start of a sample, `span` what the integrator saw from there to the
-next (`span`, `loop.Sizes`, `loop.Densities`). Errors count every sample, a lost rotor's too (frozen where it was
-lost). Under held noise u, i, e and v_tilde are not smooth, and the start of a sample is where they have just
-jumped: so extremes are taken over the integrator's substeps, and effort, chatter and copper loss over time, while the
-drive is on.
+A fold is a record with `init() -> carry`, `update(carry, row, span) -> carry` and `result(carry, ending) -> numbers`.
+`row` holds the signals at the start of a sample, and `span` the extremes and integrals from there to the next sample
+(`span`, `loop.Sizes`, `loop.Densities`).
+
+Errors include every sample, also those of a lost rotor, which is frozen. Under held noise u, i, e and v_tilde jump at
+the start of each sample, where their values are not typical. Extremes of these are therefore taken over the
+integrator's substeps. Effort, chatter and copper loss are computed over the time during which the drive is on.
 """
 
 from collections.abc import Mapping
@@ -21,7 +22,13 @@ from ambjax.world.plant import Plant
 
 
 class Ending(NamedTuple):
-    """How a rollout ended: code and time (s, +inf: never) of the loss, first crossing of C, horizon in s."""
+    """The end of a rollout.
+
+    - `lost_code`: status code; 0 if the rotor survives.
+    - `lost_at`: time of the loss, s; +inf: never.
+    - `singular_at`: time of the first crossing of the singular curve C, s; +inf: never.
+    - `duration`: horizon of the run, s.
+    """
 
     lost_code: Array
     lost_at: Array
@@ -30,7 +37,7 @@ class Ending(NamedTuple):
 
 
 class Fold(Protocol):
-    """A streaming metric."""
+    """Interface of a streaming metric."""
 
     def init(self) -> Any: ...
     def update(self, carry: Any, row: Any, span: Any) -> Any: ...
@@ -43,9 +50,11 @@ def _zero() -> Array:
 
 @record
 class Peak:
-    """Largest |row.`of`| from `after` on, and when; between samples too for the signals that a span shows the size of.
+    """Largest absolute value of a signal; between samples too, if the span records its extremes.
 
-    `timed`: the time is that of the sample in which it was reached.
+    - `of`: name of the signal, a field of a Row.
+    - `after`: start of the evaluation, s.
+    - `timed`: return (value, time), with the start of the sample that contains the maximum, instead of the value.
     """
 
     of: str = static()
@@ -69,7 +78,7 @@ class Peak:
 
 @record
 class Lowest:
-    """Smallest row.`of` and when: (value, time)."""
+    """Smallest value of the signal `of` at a sample while the rotor is alive, and its time: (value, time)."""
 
     of: str = static()
 
@@ -88,7 +97,7 @@ class Lowest:
 
 @record
 class Rms:
-    """Root mean square of row.`of` over the samples from `after` on."""
+    """Root mean square of the signal `of` over the samples from `after` (s) on."""
 
     of: str = static()
     after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
@@ -107,7 +116,7 @@ class Rms:
 
 @record
 class Driven:
-    """Mean over time of span.densities.`of` from `after` on, while the drive is on; its root if `root`."""
+    """Mean over time of the density `of`, from `after` (s) on, while the drive is on; its square root if `root`."""
 
     of: str = static()
     after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
@@ -130,10 +139,10 @@ class Driven:
 
 @record
 class Variation:
-    """Total variation from `after` on, V, of the voltage averaged over each sample, while the drive is on: chatter.
+    """Chatter: total variation, V, of the sample means of the voltage, from `after` (s) on, while the drive is on.
 
-    Of the voltage itself it would count spikes of the laws' signs, shorter than any drive's rise time and, with a
-    set-valued sign, without number.
+    The variation of the voltage itself would include spikes from the signs of the laws, which are shorter than the rise
+    time of any drive. With a set-valued sign their number is unbounded.
     """
 
     after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
@@ -152,7 +161,7 @@ class Variation:
 
 @record
 class Count:
-    """Number of samples in which row.`of` holds."""
+    """Number of samples at which the boolean signal `of` is true."""
 
     of: str = static()
 
@@ -168,7 +177,7 @@ class Count:
 
 @record
 class Reaching:
-    """Start of the sample in which |row.`of`| first comes within `band`, s; +inf if it never does."""
+    """Start of the first sample in which the absolute value of the signal `of` is within `band`, s; +inf: never."""
 
     of: str = static()
     band: Scalar = leaf(above=0, at_most=1e30)
@@ -188,7 +197,7 @@ class Reaching:
 
 @record
 class Named:
-    """Several folds at once, by name."""
+    """Several folds by name; the result is a dict."""
 
     folds: Mapping[str, Fold]
 
@@ -204,10 +213,13 @@ class Named:
 
 @record
 class Standard:
-    """The metrics of metrics.json: a dict of numbers named with their units.
+    """The metrics of metrics.json: a dict of numbers whose names include their units.
 
-    `settle` (s) is when "settled" begins, `touchdown` (m) what "clearance used" is a share of; within its band a signal
-    counts as having reached zero. The defaults are those for the plant of Table 1: see `standard_for`.
+    - `settle`: start of the evaluation of the settled metrics, s.
+    - `touchdown`: clearance, m; the unit of `clearance_used`.
+    - `sigma_band`, `v_tilde_band`, `e_band`: a signal within its band counts as having reached zero.
+
+    The defaults are for the plant of Table 1; `standard_for` scales them to another plant.
     """
 
     settle: Scalar = leaf(
@@ -219,6 +231,7 @@ class Standard:
     e_band: Scalar = leaf(default=1e-3, unit="A", above=0, at_most=1e6)
 
     def _folds(self) -> Named:
+        """Return the fold of each metric by name."""
         late = self.settle
         return Named(
             {
@@ -262,8 +275,10 @@ class Standard:
 
 
 def standard_for(settle: Scalar, scenario: Any) -> Standard:
-    """The metrics of a scenario: its own clearance, and bands that are the same share of the plant's sizes as those
-    of Table 1's: 4e-4 of sigma's, 4e-5 of v's, 4e-3 of i_0."""
+    """Return the metrics for a scenario, with its clearance and with bands in proportion to the sizes of its plant.
+
+    The ratios are those of the plant of Table 1: 4e-4 of the size of sigma, 4e-5 of the size of v, and 4e-3 of i_0.
+    """
     plant, usual, paper = scenario.plant, Standard(), Plant()
     return Standard(
         settle,

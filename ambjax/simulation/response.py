@@ -1,6 +1,7 @@
-"""How a rotor comes to its reference, as folds: when it has settled, and how far it overshoots.
+"""Settling time and overshoot, as folds.
 
-Both are numbers that move with the gains: their derivatives are those of the crossing, and of the farthest sample.
+Both are differentiable in the gains. Their derivatives are those of the crossing of the band, and of the sample with
+the largest excursion.
 """
 
 from typing import Any, NamedTuple
@@ -11,12 +12,16 @@ from jax import Array
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.simulation.metrics import Ending
 
-# A crossing slower than this share of the band per sample has no slope of its own.
+# Smallest slope of a crossing, in bands per sample, which bounds the derivative of the settling time.
 SLOWEST = 1e-3
 
 
 class Crossing(NamedTuple):
-    """When |z - r| last came within the band, s; time of the last sample, s, and |z - r| there, m."""
+    """State of `Settling`.
+
+    - `at`: time at which |z - r| last came within the band, s.
+    - `t`, `size`: time of the previous sample, s, and |z - r| there, m.
+    """
 
     at: Array
     t: Array
@@ -25,10 +30,10 @@ class Crossing(NamedTuple):
 
 @record
 class Settling:
-    """Time of the run, s, at which |z - r| last comes within `band` (m), interpolated between samples.
+    """Settling time, s: the time at which |z - r| last comes within `band` (m), interpolated between samples.
 
-    0 if it never leaves it; where it is outside at the end, the duration times |z - r| / band there, so that it is
-    longer than the run.
+    It is 0 if |z - r| never leaves the band. If |z - r| is outside at the end, it is the duration times |z - r|/band
+    there, and therefore longer than the run.
     """
 
     band: Scalar = leaf(unit="m", above=0, at_most=1.0)
@@ -50,7 +55,7 @@ class Settling:
 
 
 class Reach(NamedTuple):
-    """Lowest and highest of where z began and of r so far, and how far z went beyond, m."""
+    """State of `Overshoot`: minimum and maximum of the initial z and of r so far, and the excursion of z beyond, m."""
 
     low: Array
     high: Array
@@ -59,8 +64,10 @@ class Reach(NamedTuple):
 
 @record
 class Overshoot:
-    """How far z leaves the range from where it began to the reference's extremes so far, m: for a step of r the
-    overshoot as it is usually meant; for a rotor lifted to r = 0, how far it goes beyond 0."""
+    """Overshoot, m: the largest excursion of z beyond the range of its initial value and of the reference so far.
+
+    For a step of r it is the usual overshoot; for a rotor that is lifted to r = 0, the excursion beyond 0.
+    """
 
     def init(self) -> Reach:
         zero = jnp.zeros((), jnp.result_type(float))

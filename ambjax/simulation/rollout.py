@@ -1,4 +1,4 @@
-"""Rollout: a cascade in a scenario, sample by sample, to a trajectory, to folds, or to both."""
+"""Rollout: simulation of a cascade in a scenario, sample by sample, to a trajectory, a fold, or both."""
 
 import dataclasses
 import functools
@@ -25,25 +25,30 @@ from ambjax.world.sensor import Errors
 
 
 class Outcome(NamedTuple):
-    """A trajectory (its rows are None if none were recorded) and the result of the fold (None without one)."""
+    """Result of a rollout.
+
+    - `trajectory`: the trajectory; its rows are None if none were recorded.
+    - `measured`: result of the fold; None without a fold.
+    """
 
     trajectory: Trajectory
     measured: Any
 
 
 class System(Protocol):
-    """What is rolled out: the closed loop, or the closed loop with something attached to its state.
+    """Interface of a system for a rollout: the closed loop, or the closed loop with an extended state.
 
-    A system whose state jumps at the start of a sample, as one with a controller on a processor does, also has
+    A system whose state jumps at the start of a sample, such as a controller on a processor, also has
 
         jump(t, state, errors) -> state
 
-    It comes first in a sample: the row shows, and the integrator starts from, the state after it. A lost rotor's state
-    does not jump. And a system that integrates a part of its state, or whose rates jump within a sample, has
+    It is called first in a sample: the row and the integrator use the state after the jump. The state of a lost rotor
+    does not jump. A system that integrates only a part of its state, or whose rates jump within a sample, has
 
         advance(method, errors, t, period, state, memory, code) -> Advanced
 
-    in place of `method.advance(problem(errors), ...)`, its `problem` then being nobody's: `integrate.in_turn` helps.
+    which replaces `method.advance(problem(errors), ...)`; its `problem` is then not called. `integrate.in_turn` is
+    useful for such a system.
     """
 
     def realised(self) -> Self: ...
@@ -58,7 +63,7 @@ class System(Protocol):
 
 
 class RolloutState(NamedTuple):
-    """What travels from sample to sample."""
+    """State of a rollout between two samples: of the system, the ending, the integrator and the fold."""
 
     state: Any
     ending: Ending
@@ -69,20 +74,22 @@ class RolloutState(NamedTuple):
 def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | None = None, every: int = 1) -> Outcome:
     """Simulate `scenario.plant` under `cascade` for `clock.samples` sample periods.
 
-    Rows are recorded at the start of every `every`-th sample (0: none), and `fold` sees every
-    sample, so metrics need no stored trajectory. Pure and jitted; works under vmap, jvp and grad (an
-    adaptive method: forward mode only). A rotor that touches down, or a state that leaves the
-    model's range, is frozen and reported in the trajectory; values and derivatives stay finite.
+    Rows are recorded at the start of every `every`-th sample (0: none). `fold` is updated at every sample, so that
+    metrics need no stored trajectory.
 
-    Raises ValueError for a bad gain, parameter or clock, for an explicit step beyond its stability
-    limit, and where the method is to be chosen but gains are traced (choose it outside: `with_method`).
+    The function is pure and jitted. It works under vmap, jvp and grad; with an adaptive method in forward mode only.
+    If the rotor touches down, or a state leaves the range of the model, the state is frozen and the trajectory reports
+    the loss. Values and derivatives stay finite.
+
+    Raises ValueError for an invalid gain, parameter or clock, for an explicit step above its stability limit, and for a
+    clock without a method if gains are traced. In that case choose the method outside with `with_method`.
     """
     loop, clock, fold = canonical((*prepare(cascade, scenario, clock), fold))
     return roll(loop, clock, fold, every=every)
 
 
 def prepare(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[ClosedLoop | Sampled, Clock]:
-    """Check a case, choose the method of a clock that has none, and return the system to roll out and its clock.
+    """Check a case, choose the method of a clock without one, and return the system for the rollout and its clock.
 
     Raises ValueError as `rollout` does.
     """
@@ -111,7 +118,7 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
 
 
 def run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:
-    """The whole rollout, unjitted and unchecked: what `rollout` compiles, and ensembles map over members."""
+    """Do a whole rollout, without jit and without checks. `rollout` compiles it, and ensembles map it over members."""
     progress, rows = segment(system, clock, fold, begin(system, clock, fold), 0, clock.samples, every)
     return finish(progress, rows, fold)
 
@@ -120,7 +127,7 @@ roll = one_kernel(run, static_argnames=("every",))
 
 
 def begin(system: System, clock: Clock, fold: Fold | None) -> RolloutState:
-    """Before the first sample."""
+    """Return the state of the rollout before the first sample."""
     system = system.realised()
     dtype = jnp.result_type(float)
     state = jax.tree.map(lambda x: jnp.asarray(x, dtype), system.start())
@@ -134,7 +141,7 @@ def begin(system: System, clock: Clock, fold: Fold | None) -> RolloutState:
 def segment(
     system: System, clock: Clock, fold: Fold | None, progress: RolloutState, first: Scalar, count: int, every: int
 ) -> tuple[RolloutState, Any]:
-    """`count` samples from number `first` on, and the rows recorded on the way (None if every = 0)."""
+    """Simulate `count` samples from number `first` on. Returns the new state and the rows (None if every = 0)."""
     step = functools.partial(_sample, system.realised(), clock, fold)
 
     def unrecorded(progress: RolloutState, first: Scalar, count: int) -> RolloutState:
@@ -159,9 +166,9 @@ def segment(
 def stretch(
     system: System, clock: Clock, fold: Fold | None, progress: RolloutState, first: Scalar, count: int
 ) -> tuple[RolloutState, Any]:
-    """Rows of `count` samples from number `first` on. Beyond the clock's last sample the progress does not change.
+    """Simulate `count` samples from number `first` on, and record every row. Returns the new state and the rows.
 
-    One compiled program therefore serves every stretch of a run.
+    After the clock's last sample the state does not change, so that one compiled program serves every part of a run.
     """
     step = functools.partial(_sample, system.realised(), clock, fold)
 
@@ -173,14 +180,14 @@ def stretch(
 
 
 def finish(progress: RolloutState, rows: Any, fold: Fold | None) -> Outcome:
-    """After the last sample."""
+    """Return the outcome, from the state after the last sample and the rows."""
     lost_code, lost_at, singular_at, _ = progress.ending
     measured = None if fold is None else fold.result(progress.fold, progress.ending)
     return Outcome(Trajectory(rows, lost_at, lost_code, singular_at), measured)
 
 
 def _advanced(system: Any, clock: Clock, errors: Errors, t: Array, state: Any, memory: Any, code: Array) -> Advanced:
-    """The state at the end of the sample that begins at t."""
+    """Advance the system over the sample that begins at t (s)."""
     method, period = clock.integrator, clock.sample_period
     if hasattr(system, "advance"):
         return system.advance(method, errors, t, period, state, memory, code)
@@ -188,9 +195,9 @@ def _advanced(system: Any, clock: Clock, errors: Errors, t: Array, state: Any, m
 
 
 def _sample(system: Any, clock: Clock, fold: Fold | None, progress: RolloutState, k: Array) -> tuple[RolloutState, Any]:
-    """Observe at the start of sample k, then integrate to its end with its measurement error held.
+    """Record the row at the start of sample k, then integrate to its end with the measurement errors held.
 
-    Recomputed in reverse mode, so that memory there grows with samples and not with substeps.
+    Reverse mode recomputes a sample (checkpoint), so that its memory grows with the samples, not with the substeps.
     """
 
     @functools.partial(jax.checkpoint, prevent_cse=False)

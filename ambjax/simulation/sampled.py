@@ -1,8 +1,8 @@
-"""The loop of a cascade on a processor: sensors read, laws stepped, a voltage held, the plant in between.
+"""The closed loop of a cascade on a processor: sampled measurements, discrete laws, and a held voltage.
 
-At t_n, in this order: the plant is measured; the laws step; u_n, held within the supply's limit, acts from
-t_n + delay T until t_{n+1} + delay T (before the first, u = 0); the plant alone moves to t_{n+1}, under one voltage, or
-under two where the delay is no whole number of samples.
+At t_n the plant is measured first, and then the laws make a step. The voltage u_n, within the supply's limit, acts from
+t_n + delay T until t_{n+1} + delay T; before the first voltage u = 0. Then the plant is integrated to t_{n+1}, under
+one voltage, or under two if the delay is not a whole number of samples.
 """
 
 import dataclasses
@@ -33,10 +33,18 @@ from ambjax.world.signals import Reference, reference_at
 
 
 class SampledState(NamedTuple):
-    """State of the plant and of the laws; what they decided last, u within the supply's limit; the two voltages
-    before, V; 1, or 0 once a law has left the numbers; output of the sensor's low-pass (m) and the voltage of the
-    amplifier, where they have a state; the state of the guard, if there is one; 1, or 0 until the laws have begun with
-    an accepted reading, where the first may be refused; the last reading of a sensor that has faults."""
+    """State of the closed loop on a processor. Optional parts are () if the loop does not have them.
+
+    - `plant`, `control`: state of the plant and of the laws.
+    - `command`: last command, with u within the supply's limit.
+    - `past`: the two voltages before it, V.
+    - `sane`: 1, or 0 after a law has returned a number that is not finite.
+    - `seen`: output of the low-pass of the position sensor, m.
+    - `u_a`: voltage of the amplifier, V.
+    - `watch`: state of the guard.
+    - `started`: 1, or 0 until the guard has accepted a reading, from which the laws are initialised.
+    - `sensed`: last reading of a sensor with faults.
+    """
 
     plant: Any
     control: CascadeState
@@ -52,9 +60,11 @@ class SampledState(NamedTuple):
 
 @record
 class Sampled:
-    """The closed loop with its cascade on a processor, one step a `period` (s).
+    """The closed loop of a cascade on a processor.
 
-    `cuts`: at most so many edges of disturbances lie inside one sample; None: all that there are.
+    - `loop`: the closed loop in continuous time.
+    - `period`: sample period, s.
+    - `cuts`: largest number of edges of disturbances inside one sample; None: the number of all edges.
     """
 
     loop: ClosedLoop
@@ -63,7 +73,7 @@ class Sampled:
 
     @property
     def processor(self) -> Processor:
-        """What the cascade runs on."""
+        """The processor of the cascade."""
         processor = self.loop.cascade.processor
         assert processor is not None
         return processor
@@ -78,6 +88,7 @@ class Sampled:
         return FaultyErrors(*drawn, sensor.struck(self.loop.words(), sample, self.period))
 
     def start(self) -> SampledState:
+        """Return the state at t = 0."""
         scenario, zero = self.loop.scenario, jnp.zeros(())
         plant = scenario.plant.start(scenario.initial.measurement())
         seen = scenario.plant.measurement(plant).z if self._lags else ()
@@ -104,7 +115,7 @@ class Sampled:
         return sensor is not None and sensor.bandwidth is not None
 
     def measured(self, plant: Any, seen: Any, errors: Errors | FaultyErrors) -> Measurement:
-        """What sensors without faults report of the plant's state; `seen`: output of the position's low-pass, m."""
+        """Return the readings of sensors without faults; `seen`: output of the position sensor's low-pass, m."""
         true, sensor = self.loop.scenario.plant, self.loop.scenario.sensor
         motion = true.measurement(plant)
         if sensor is None:
@@ -114,30 +125,33 @@ class Sampled:
         return sensor.converted(sensor.reading(motion, errors), true.s_0, true.i_0)
 
     def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
-        """The laws' step: what they decide now, and their states at the next sample."""
+        """Do the step of the laws: return the state with the new command, and with the laws' states at t + period."""
         state, measured = self._struck(self.measured(state.plant, state.seen, errors), state, errors)
         return self.decided(measured, self.reference(t), state)
 
     def reference(self, t: Scalar) -> Reference:
-        """What the laws of the sample at t (s) follow: the reference of the instant that they act on."""
+        """Return the reference for the laws of the sample at t (s), which is that of t plus the predicted delay."""
         late = self.processor.ahead * self.period if self.processor.predicts else 0.0
         return reference_at(self.loop.scenario.reference, t + late)
 
     def _struck(self, measured: Measurement, state: SampledState, errors: Any) -> tuple[SampledState, Measurement]:
-        """The state and the measurement once faults have struck the position sensor."""
+        """Apply the faults of the position sensor, and return the new state and measurement."""
         sensor, sensed = self.loop.scenario.sensor, state.sensed
         if sensor is None or not sensed or not isinstance(errors, FaultyErrors):
             return state, measured
         sensed = sensor.sensed(measured.z, sensed, errors.struck, self.period, self.loop.scenario.plant.s_0)
         z = jnp.where(jnp.isnan(sensed.z), 0.0, sensed.z)
         state = state._replace(sensed=sensed._replace(z=z))
-        if self.processor.guard is None:  # NaN ends the run, and derivatives stay finite
+        if self.processor.guard is None:  # NaN ends the run; 0 keeps derivatives finite
             state = state._replace(sane=jnp.where(jnp.isnan(sensed.z), 0.0, state.sane))
             return state, measured._replace(z=z)
         return state, measured._replace(z=sensed.z)
 
     def decided(self, measured: Measurement, reference: Reference, state: SampledState) -> SampledState:
-        """What the processor computes of a measurement, and keeps: all but the plant. The exported C is this."""
+        """Compute the command from a measurement, and return the new state. The plant does not change.
+
+        The exported C code is generated from this function.
+        """
         cascade, past, judged, laws = self.loop.cascade, (state.command.u, state.past[0]), None, state.control
         if self.processor.guard is not None:
             estimated = cascade.observer.estimates_velocity
@@ -149,7 +163,7 @@ class Sampled:
         command, control, estimate = cascade.step(measured, laws, sample)
         command = command._replace(u=limited(command.u, sample.u_max))
         new = materialised((control, command, self._watched(judged, estimate, (command.u, *past))))
-        # 0 times a number is 0, times anything else it is not
+        # The sum is 0 only if every number is finite: 0 times NaN or infinity is NaN.
         sane = materialised(sum(0.0 * x for x in jax.tree.leaves(new))) == 0
         keeps = sane if judged is None else sane & judged.steps
         old = (state.control, state.command, state.watch)
@@ -158,18 +172,18 @@ class Sampled:
         if not isinstance(started, tuple):
             begins = keeps if judged is None else keeps & ~judged.refused
             started = (started.astype(bool) | begins).astype(started.dtype)
-        if judged is not None:  # else the safe command; its sample says nothing of the laws
+        if judged is not None:  # if not judged.steps: the safe command u = 0
             command, sane = command._replace(u=jnp.where(judged.steps, command.u, 0.0)), sane | ~judged.steps
             watch = watch._replace(left=judged.left)
         sane = jnp.where(sane, state.sane, 0.0)
         return state._replace(control=control, command=command, past=past, sane=sane, watch=watch, started=started)
 
     def _watched(self, judged: Judged | None, estimate: Measurement, voltages: tuple[Array, ...]) -> Watch | tuple[()]:
-        """The guard's state at the next sample, `voltages` being those of this sample and of those before."""
+        """Return the guard's state at the next sample. `voltages`: of this sample and of the two before, V."""
         if judged is None:
             return ()
         delay = jnp.asarray(self.processor.ahead)
-        # shares of the sample for which each of them acts
+        # Each voltage is weighted by the fraction of the sample during which it acts.
         (u, before, first), share = voltages, 1 - jnp.abs(delay - 1)
         u = jnp.maximum(1 - delay, 0.0) * u + share * before + jnp.maximum(delay - 1, 0.0) * first
         motion = judged.reading._replace(z_dot=estimate.z_dot)
@@ -185,7 +199,7 @@ class Sampled:
         memory: Any,
         code: Array,
     ) -> Advanced:
-        """The plant to the next sample, under the voltages that act on the way."""
+        """Integrate the plant to the next sample, under the voltages that act in between."""
         code = jnp.where((code == 0) & (state.sane == 0), DIVERGED, code)
         delay, voltages = jnp.asarray(self.processor.delay), (state.command.u, *state.past)
         late = (delay - jnp.floor(delay)) * period
@@ -200,7 +214,7 @@ class Sampled:
         return after._replace(state=state._replace(plant=after.state, seen=seen, u_a=u_a))
 
     def _lagged(self, state: SampledState, reached: list[Any], times: list[Scalar]) -> Any:
-        """Output of the position sensor's low-pass after the plant went through these states, m."""
+        """Return the output of the position sensor's low-pass, m, after the plant's motion through these states."""
         seen: Any = state.seen
         sensor = self.loop.scenario.sensor
         if sensor is None or not self._lags:
@@ -213,14 +227,14 @@ class Sampled:
     def _stretches(
         self, state: SampledState, t: Array, voltages: list[tuple[Callable[[Scalar], Array], Scalar]]
     ) -> list[tuple[InitialValueProblem, Scalar]]:
-        """What is integrated from t on, under these voltages, each for its time (s)."""
+        """Return the initial value problems from t (s) on, one per voltage and its duration (s), divided as needed."""
         at = self.loop.scenario.edges()
         edges = Edges(at, len(at) if self.cuts is None else min(self.cuts, len(at)))
         if not edges.most:
             edges = NO_EDGES
         if not self._lags:
             return [(self._under(state, voltage, edges), time) for voltage, time in voltages]
-        # the sensor's low-pass is solved for a motion that is smooth over each stretch
+        # The solution of the sensor's low-pass requires a motion that is smooth over each part, so divide at edges too.
         cut = []
         for voltage, time in voltages:
             cut += [(self._under(state, voltage, NO_EDGES), length) for length in edges.pieces(t, time)]
@@ -228,7 +242,7 @@ class Sampled:
         return cut
 
     def _under(self, state: SampledState, voltage: Any, edges: Edges) -> InitialValueProblem:
-        """What an integrator is given while the coils' voltage is this function of time and of the plant's state."""
+        """Return the initial value problem of the plant, with `voltage` (V) as a function of time."""
         loop, command = self.loop, state.command
         plant, e = loop.scenario.plant, loop.scenario.plant.measurement(state.plant).i - command.i_ref
 
@@ -250,6 +264,7 @@ class Sampled:
         return InitialValueProblem(inputs, rates, scale, self._status, None, observed, SHOWN, edges=edges)
 
     def _at_coil(self, outside: ExternalInputs, u: Array, x: Any) -> Array:
+        """Return the voltage at the coils, V, for the amplifier's voltage u."""
         plant, amplifier = self.loop.scenario.plant, self.loop.scenario.amplifier
         if amplifier is None:
             return u
@@ -267,7 +282,7 @@ class Sampled:
         return self._status(state.plant)
 
     def rest(self, state: SampledState, code: Array) -> SampledState:
-        """Frozen, and the drive off."""
+        """Return the state in which a lost rotor is frozen, with the drive off."""
         zero = jnp.zeros_like(state.command.u)
         plant = self.loop.rest(LoopState(state.plant, state.control), code).plant
         seen = self.loop.scenario.plant.measurement(plant).z if self._lags else ()
@@ -275,7 +290,7 @@ class Sampled:
         return off._replace(plant=plant, seen=seen, u_a=jax.tree.map(jnp.zeros_like, state.u_a))
 
     def row(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors, alive: Array) -> Row:
-        """Sample n: the plant, u_n, and i_ref before its step."""
+        """Return the signals of sample n: the plant's state, u_n, and i_ref before the step of the laws."""
         seen = self.measured(state.plant, state.seen, errors)
         if state.sensed:
             seen = seen._replace(z=state.sensed.z)
@@ -292,7 +307,7 @@ class Sampled:
 
 
 def _one_of(voltages: tuple[Array, ...], lag: Array) -> Array:
-    """The voltage of the sample so many before."""
+    """Return the voltage of the sample `lag` samples ago, lag = 0, 1 or 2."""
     now, before, first = voltages
     return jnp.where(lag < 0.5, now, jnp.where(lag < 1.5, before, first))
 
@@ -300,9 +315,10 @@ def _one_of(voltages: tuple[Array, ...], lag: Array) -> Array:
 def _amplified(
     amplifier: Amplifier | None, t: Array, u_a: Any, acting: list[tuple[Array, Scalar]]
 ) -> tuple[list[tuple[Callable[[Scalar], Array], Scalar]], Any]:
-    """An amplifier's voltage as functions of time, each with how long it holds (s), and that at the end.
+    """Return the amplifier's voltage as functions of time with their durations (s), and the voltage at the end.
 
-    From t on it is commanded what is `acting`, each (V) for its time. It has a corner where a ramp ends.
+    `acting`: commanded voltages (V) from t on, each with its duration (s). With a slew-rate limit each is divided at
+    the end of its ramp, where the voltage has a corner.
     """
     if amplifier is None or not amplifier.slow:
         return [(lambda _, u=u: u, time) for u, time in acting], u_a
@@ -316,7 +332,7 @@ def _amplified(
 
 
 def check_parts(cascade: Cascade, scenario: Scenario) -> None:
-    """Raise ValueError, with the path and the fix, for parts of a loop that do not work together."""
+    """Raise ValueError, with the path and the fix, for parts of a loop that are not compatible."""
     if cascade.processor is None:
         cascade.check_smooth()
         if (path := scenario.on_processor) is not None:
@@ -333,7 +349,7 @@ def check_parts(cascade: Cascade, scenario: Scenario) -> None:
 
 
 def system_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> ClosedLoop | Sampled:
-    """The loop to roll out: with the cascade in continuous time, or on its processor."""
+    """Return the closed loop of the cascade, in continuous time or on its processor."""
     if cascade.processor is None:
         return ClosedLoop(cascade, scenario)
     period = clock.sample_period

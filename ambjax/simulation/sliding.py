@@ -1,13 +1,16 @@
-"""One step of the closed loop that knows where its stiffness is: in an inversion law that slides, as the adaptive one.
+"""The sliding step: an integration step for a closed loop whose stiffness is in a sliding inversion law.
 
-Under measurements that jump every sample, i_ref slides to its new place within microseconds and is
-slaved to it for the rest: w' = d - gamma sgn(w) for w = v_star - v(z, i_ref), Eq. (14a). A linearised
-implicit step sees no stiffness while the sign is saturated and overshoots by gamma h; an explicit one
-needs steps below 1/(gamma p). Here the step is cut where the slide ends, the slaved part is solved
-implicitly with the whole arctan (not its slope), and the supply's limit is applied to each part: while
-i_ref slides the voltage is at its limit, and the current sees an impulse, not the whole jump.
+The adaptive inversion law is such a law: w' = d - gamma sgn(w) for w = v_star - v(z, i_ref), Eq. (14a). When the
+measurements jump at a sample, i_ref slides to its new value within microseconds, and then follows that value.
+General methods are not suitable. A linearised implicit step has no stiffness in its Jacobian while the sign is
+saturated, and overshoots by gamma h. An explicit step must be shorter than 1/(gamma p).
 
-The rotor's motion and the states of the other laws go by Heun's method, the current by an exponential step.
+This step is divided at the end of the slide. The second part is solved implicitly with the full arctan, not with its
+slope. The supply's limit applies to each part: during the slide the voltage is at its limit, so that the current
+receives a bounded impulse instead of the whole jump.
+
+The motion of the rotor and the states of the other laws are integrated by Heun's method, the current by an exponential
+step.
 """
 
 from typing import Any, NamedTuple
@@ -28,7 +31,10 @@ from ambjax.world.sensor import Errors, Measurement
 
 
 def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
-    """The state after h of a ClosedLoop for which `slides` holds; `begin`, `end`: its inputs."""
+    """Advance the state of a ClosedLoop, for which `slides` is true, by h (s).
+
+    `begin`, `end`: external inputs at the start and at the end of the step. Returns the new state and span.
+    """
     cascade, scenario = loop.cascade, loop.scenario
     model, (z, z_dot, i), control = cascade.model, state.plant, state.control
     i_ref = control.inversion
@@ -48,7 +54,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     sliding, slaved, tau, force_1 = materialised((sliding, slaved, tau, force_1))
 
     def current(plant: State, estimate: Measurement, i_ref: Array, rate: Array, inner: Any, q_i: Array, h: Array):
-        """i - i_ref and the current law's state after h at constant i_ref' = rate; and what is seen on the way."""
+        """Return i - i_ref and the current law's state after h at constant i_ref' = rate, and the voltage meanwhile."""
 
         def rate_of(i: Array) -> tuple[Array, Any]:
             inputs = CurrentInputs(estimate._replace(i=i + errors.i), CurrentDemand(i_ref, rate), scenario.u_max)
@@ -66,7 +72,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     i_ref_0, i_ref = i_ref, i_ref + tau * sliding
     middle = State((z + ahead.z) / 2, (z_dot + ahead.z_dot) / 2, i_ref + e)
     estimate = jax.tree.map(lambda a, b: (a + b) / 2, estimate_0, estimate_1)
-    # The current moves fast while it slides: what counts at the start of the rest is where it ended.
+    # During the slide the current changes fast; the second part starts with the acceleration at the final current.
     z_ddot_0 += (1 - tau * per_h) * (scenario.plant.z_ddot(z, middle.i, begin.q_z) - z_ddot_0)
     e, inner, second = current(middle, estimate, i_ref, slaved, inner, end.q_i, h - tau)
     e, inner = materialised((e, inner))
@@ -75,7 +81,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     plant = State(
         z + h * z_dot + h * h / 6 * (2 * z_ddot_0 + z_ddot_1), z_dot + h / 2 * (z_ddot_0 + z_ddot_1), i_ref + e
     )
-    # a slide of no length is none: w was within the sign's layer
+    # tau = 0: no slide, because w was within the boundary layer of the sign.
     instants = (
         loop.shown(begin.reference, state.plant, i_ref_0, w, jnp.where(tau > 0, first.u, second.u)),
         loop.shown(begin.reference, state.plant._replace(i=middle.i), i_ref - (h - tau) * slaved, w_1, second.u),
@@ -92,7 +98,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
 
 
 class _Voltage(NamedTuple):
-    """u over one part of a step, as the exponential step has it: u + off (1 - exp(x s)), s from 0 to 1."""
+    """Voltage over one part of a step, from the exponential step: u + off (1 - exp(x s)), s from 0 to 1."""
 
     u: Array
     off: Array
@@ -101,17 +107,20 @@ class _Voltage(NamedTuple):
     """(exp(x) - 1) / x"""
 
     def end(self, u_max: Scalar) -> Array:
-        """u at the end, V."""
+        """Return u at the end, V."""
         return limited(self.u - self.off * self.x * self.phi, u_max)
 
     def moments(self) -> tuple[Array, Array]:
-        """Means of u, V, and of u^2, V^2."""
+        """Return the means of u, V, and of u^2, V^2."""
         rest, once, twice = self.u + self.off, self.off * self.phi, self.phi * (1 + self.x * self.phi / 2)
         return rest - once, rest * (rest - 2 * once) + self.off * self.off * twice
 
 
 def _with_step(span: Span, instants: tuple[Instant, ...], u: Array, rest: _Voltage, tau: Array, left: Array) -> Span:
-    """The span, and a step: `u` for tau, then the rest of it, with what is shown at its start, turn and end."""
+    """Add a step to the span: voltage `u` for tau, then `rest` for `left`.
+
+    `instants`: signals at the start of the step, at the end of the slide, and at the end of the step.
+    """
     before = span.densities
     for instant, weight in zip(instants, (tau / 2, (tau + left) / 2, left / 2), strict=True):
         span = span.seen(instant, weight)
@@ -125,7 +134,7 @@ def _with_step(span: Span, instants: tuple[Instant, ...], u: Array, rest: _Volta
 @jax.custom_jvp
 @compiled_alone
 def _phi(x: Array) -> Array:
-    """(exp(x) - 1) / x."""
+    """Return (exp(x) - 1) / x."""
     small = jnp.abs(x) < 1e-3
     return jnp.where(small, 1 + x / 2 + x * x / 6, (jnp.exp(x) - 1) * (1 / jnp.where(small, 1.0, x)))
 

@@ -1,8 +1,8 @@
-"""What happens between two samples: signals folded over time by the integrator.
+"""Spans: extremes and integrals of signals between two samples, accumulated by the integrator.
 
-Under held noise the reference of the current jumps every sample and slides to its place within microseconds, with the
-drive at its stop. What is read at the samples is that jump and nothing else; so an integrator looks at the signals
-at every substep, and hands on their integrals and extremes.
+Under held noise the current reference jumps at every sample and settles within microseconds, while the voltage is at
+its limit. Values at the samples show only that jump. The integrator therefore evaluates the signals at every substep,
+and returns their extremes and integrals.
 """
 
 from typing import Any, NamedTuple
@@ -15,8 +15,11 @@ from ambjax.numerics.records import Scalar
 
 
 class Instant(NamedTuple):
-    """What a system shows at one instant: `sizes`, signals of which the extremes of |.| matter, and `densities`, of
-    which the integral over time does. Each a pytree of scalars, or empty if nobody is to look."""
+    """Signals of a system at one instant, each a pytree of scalars, or empty.
+
+    - `sizes`: signals for which a Span records the extremes of the absolute value.
+    - `densities`: signals for which a Span records the integral over time.
+    """
 
     sizes: Any
     densities: Any
@@ -26,7 +29,12 @@ NOTHING = Instant((), ())
 
 
 class Span(NamedTuple):
-    """A stretch of time, s: largest and smallest |sizes| on it (0 and +inf if it is empty), integrals of densities."""
+    """Signals over an interval of time.
+
+    - `time`: length of the interval, s.
+    - `most`, `least`: largest and smallest |sizes|; 0 and +inf if the interval is empty.
+    - `densities`: integrals of the densities.
+    """
 
     time: Array
     most: Any
@@ -34,19 +42,19 @@ class Span(NamedTuple):
     densities: Any
 
     def seen(self, instant: Instant, weight: Scalar, time: Scalar = 0.0) -> "Span":
-        """With one more instant, which counts for `weight` (s) in the integrals; `time` longer."""
+        """Add an instant to the extremes, and to the integrals with `weight` (s). Add `time` (s) to the length."""
         sizes = jax.tree.map(jnp.abs, instant.sizes)
         most = jax.tree.map(jnp.maximum, self.most, sizes)
         least = jax.tree.map(jnp.minimum, self.least, sizes)
         return Span(self.time + time, most, least, self.densities).weighed(instant, weight)
 
     def weighed(self, instant: Instant, weight: Scalar) -> "Span":
-        """With an instant that counts in the integrals alone: a trial state, which the system never takes."""
+        """Add an instant to the integrals only, for a trial state that is not on the trajectory."""
         more = jax.tree.map(lambda total, x: total + weight * x, self.densities, instant.densities)
         return self._replace(densities=more)
 
     def joined(self, after: "Span") -> "Span":
-        """This stretch and the one after it."""
+        """Return the union of this interval and the next one."""
         most = jax.tree.map(jnp.maximum, self.most, after.most)
         least = jax.tree.map(jnp.minimum, self.least, after.least)
         more = jax.tree.map(lambda x, y: x + y, self.densities, after.densities)
@@ -54,7 +62,7 @@ class Span(NamedTuple):
 
 
 def blank(like: Instant) -> Span:
-    """No time at all. `like`: any instant, for its structure."""
+    """Return an empty interval. `like`: any Instant with the structure of the signals."""
     zero = jnp.zeros((), jnp.result_type(float))
     nothing = jax.tree.map(lambda _: zero, like)
     return Span(zero, nothing.sizes, jax.tree.map(lambda _: zero + jnp.inf, like.sizes), nothing.densities)

@@ -1,4 +1,4 @@
-"""What happened: one row per recorded sample, and the status of the rotor."""
+"""Trajectories: one row per recorded sample, and the status of the rotor."""
 
 import pathlib
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from jax import Array
 
 from ambjax.numerics.records import Scalar, record
 
-# Why a rotor was lost. Codes travel inside compiled code; people read the words.
+# Status codes of a rotor, for compiled code, and their descriptions.
 ALIVE, TOUCHED, DIVERGED, STALLED = range(4)
 STATUSES = (
     "",
@@ -20,24 +20,24 @@ STATUSES = (
 
 
 class Row(NamedTuple):
-    """One sample of a closed loop, SI units. In a Trajectory every field has a leading time axis."""
+    """Signals of a closed loop at one sample, in SI units. In a Trajectory every field has a leading time axis."""
 
     t: Array
     """time, s"""
     z: Array
     """rotor displacement, m"""
     z_dot: Array
-    """its rate, m/s"""
+    """rotor velocity, m/s"""
     i: Array
     """current deviation, A"""
     i_ref: Array
-    """its reference, A"""
+    """reference of the current deviation, A"""
     u: Array
-    """applied voltage (after the supply's limit; 0 once lost), V"""
+    """applied voltage (after the supply's limit; 0 after the rotor is lost), V"""
     u_mean: Array
-    """the same, averaged over the sample that begins at t: what is left of spikes shorter than a sample, V"""
+    """mean of the applied voltage over the sample that begins at t (spikes shorter than a sample included), V"""
     u_peak: Array
-    """largest |voltage| at the coils over the same sample, V; on a processor with an amplifier u is what it is told"""
+    """largest |voltage| at the coils over the sample (with an amplifier, u is its command), V"""
     v: Array
     """scaled magnetic force v(z, i), A^2/m^2. Eq. (3)"""
     v_star: Array
@@ -49,17 +49,17 @@ class Row(NamedTuple):
     r: Array
     """reference, m"""
     q_z: Array
-    """disturbance acceleration, scaled force included, m/s^2"""
+    """disturbance acceleration, including the scaled force, m/s^2"""
     q_i: Array
-    """disturbance of the current's rate, A/s"""
+    """disturbance of the current derivative, A/s"""
     z_measured: Array
-    """displacement as the sensor reports it, m; 0 where it reports NaN"""
+    """displacement that the sensor reports (0 if it reports NaN), m"""
     heat: Array
     """copper loss in both coils, W"""
     refused: Array
-    """whether the guard of a processor refused a reading, bool"""
+    """whether the guard of the processor refused the reading, bool"""
     alive: Array
-    """whether the rotor was still levitated, bool"""
+    """whether the rotor is levitated, bool"""
 
     @property
     def e_z(self) -> Array:
@@ -77,7 +77,13 @@ NOT_SAVED = ("u_peak", "heat", "alive")
 
 @record
 class Trajectory:
-    """Rows, and the status: when and why the rotor was lost, and when C was first crossed (+inf: never)."""
+    """The recorded rows of a rollout, and the status of the rotor.
+
+    - `rows`: a Row whose fields have a leading axis of recorded samples; None if no rows were recorded.
+    - `lost_at`: time at which the rotor was lost, s; +inf: never.
+    - `lost_code`: status code, an index of STATUSES; 0 if the rotor survives.
+    - `singular_at`: time at which the singular curve C was first crossed, s; +inf: never.
+    """
 
     rows: Row
     lost_at: Scalar
@@ -86,11 +92,11 @@ class Trajectory:
 
     @property
     def lost_why(self) -> str:
-        """Why the rotor was lost, in words; empty if it was not. One member only."""
+        """The reason of the loss, in words; empty if the rotor survives. For one member only."""
         return STATUSES[int(self.lost_code)]
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Every saved array by name, float64, and the status."""
+        """Return the saved arrays by name, float64, with the status."""
         arrays = {k: np.asarray(v, np.float64) for k, v in self.rows._asdict().items() if k not in NOT_SAVED}
         arrays["lost_at"] = np.asarray(self.lost_at, np.float64)
         arrays["lost_why"] = np.asarray(self.lost_why)
@@ -98,10 +104,10 @@ class Trajectory:
         return arrays
 
     def save(self, path: str | pathlib.Path) -> None:
-        """Write trajectory.npz."""
+        """Write the arrays to an .npz file."""
         np.savez_compressed(path, **self.arrays())  # pyright: ignore[reportArgumentType]
 
 
 def first_time(condition: Array, t: Scalar, earlier: Scalar) -> Array:
-    """`earlier` if it is finite already, else t where `condition` holds, else +inf."""
+    """Return `earlier` if it is finite, else t if `condition` holds, else +inf."""
     return jnp.where(jnp.isfinite(earlier), earlier, jnp.where(condition, t, jnp.inf))
