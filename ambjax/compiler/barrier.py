@@ -16,7 +16,7 @@ Result = TypeVar("Result")
 
 
 def compiled_alone(function: Callable[..., Result]) -> Callable[..., Result]:
-    """Return a version of `function`, of arrays, that XLA neither fuses nor repeats on CPUs. Elsewhere it is unchanged.
+    """Return a version of `function` that XLA neither fuses nor repeats on CPUs. On other devices it is unchanged.
 
     Use it below a custom_jvp. The rule may apply it to tangents if it is linear in them; reverse mode then transposes
     it.

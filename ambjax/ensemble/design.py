@@ -20,7 +20,7 @@ BITS = 52
 SOBOL_BITS = 32
 # Random numbers are generated in blocks of this size, so that the generator is compiled once.
 BLOCK = 2**14
-# Largest table of a Latin hypercube, which must be generated as a whole: 8 bytes a number, and three copies meanwhile.
+# Largest number of entries of a Latin hypercube, which is generated as a whole: 8 bytes each, in three copies.
 MOST_LATIN = 30_000_000
 # A member's number is a signed 32-bit integer when JAX computes in float32.
 MOST_MEMBERS = 2**31

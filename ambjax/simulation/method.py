@@ -92,7 +92,7 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
 
 
 def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: bool = False) -> Clock:
-    """Return `clock` with an integration method.
+    """Return `clock` with an integration method that is valid for the cascade and the scenario.
 
     A clock without a method gets the result of `choose_method`; otherwise the method is checked against its stability
     limit. For a cascade on a processor `cuts`, the number of edges of disturbances inside one sample, is computed too.

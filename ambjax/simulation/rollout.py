@@ -25,7 +25,7 @@ from ambjax.world.sensor import Errors
 
 
 class Outcome(NamedTuple):
-    """Result of a rollout.
+    """Result of a rollout: the trajectory, and the result of the fold.
 
     - `trajectory`: the trajectory; its rows are None if none were recorded.
     - `measured`: result of the fold; None without a fold.

@@ -179,7 +179,7 @@ class Sampled:
         return state._replace(control=control, command=command, past=past, sane=sane, watch=watch, started=started)
 
     def _watched(self, judged: Judged | None, estimate: Measurement, voltages: tuple[Array, ...]) -> Watch | tuple[()]:
-        """Return the guard's state at the next sample. `voltages`: of this sample and of the two before, V."""
+        """Return the guard's state at the next sample. `voltages`: of this sample and the two previous ones, V."""
         if judged is None:
             return ()
         delay = jnp.asarray(self.processor.ahead)
@@ -227,7 +227,7 @@ class Sampled:
     def _stretches(
         self, state: SampledState, t: Array, voltages: list[tuple[Callable[[Scalar], Array], Scalar]]
     ) -> list[tuple[InitialValueProblem, Scalar]]:
-        """Return the initial value problems from t (s) on, one per voltage and its duration (s), divided as needed."""
+        """Return the initial value problems from t (s) on, with their durations (s), for the voltages that act."""
         at = self.loop.scenario.edges()
         edges = Edges(at, len(at) if self.cuts is None else min(self.cuts, len(at)))
         if not edges.most:

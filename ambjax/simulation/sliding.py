@@ -54,7 +54,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     sliding, slaved, tau, force_1 = materialised((sliding, slaved, tau, force_1))
 
     def current(plant: State, estimate: Measurement, i_ref: Array, rate: Array, inner: Any, q_i: Array, h: Array):
-        """Return i - i_ref and the current law's state after h at constant i_ref' = rate, and the voltage meanwhile."""
+        """Return i - i_ref, the current law's state, and the voltage, over h (s) at constant i_ref' = rate."""
 
         def rate_of(i: Array) -> tuple[Array, Any]:
             inputs = CurrentInputs(estimate._replace(i=i + errors.i), CurrentDemand(i_ref, rate), scenario.u_max)
