@@ -1,1 +1,1 @@
-"""What an answer is worth, in words, numbers and pictures."""
+"""The report of a search: verdict, tables, pictures, and the tuned case file."""

@@ -1,6 +1,6 @@
-"""What the report's own steps are worth on each of its numbers, and nominal runs for its pictures.
+"""The error of the report's fixed steps in each of its numbers, and nominal runs for its pictures.
 
-The steps of the report are of fixed number, for speed; here a few members are simulated again by adaptive RODAS3.
+A few members are simulated again by adaptive RODAS3 and compared.
 """
 
 import dataclasses
@@ -15,18 +15,19 @@ from ambjax.simulation.trajectory import Trajectory
 from tuning.judge import difference, metrics_of, summarise
 from tuning.problem import TuningProblem
 
-# Held-out members that are simulated again.
+# Number of held-out members that are simulated again.
 AGAIN = 8
-# A number that the report's own steps miss by more than this share is marked.
+# Relative error of the report's steps above which a number is marked.
 MARKED = 0.05
 
 
 def compared(problem: TuningProblem, x: np.ndarray, seed: int, count: int, names: tuple[str, ...]) -> dict[str, Any]:
-    """The first members of the ensemble of `count` with this seed at x [m], by the report's steps and by accurate ones.
+    """Compare the report's steps with accurate steps on the first members of an ensemble, at coordinates x [m].
 
-    `members` simulated, `held` by both; over these the summaries (`summarise`) of `names`: of the report, accurate,
-    and the relative error of the former. `lost`, `stalled`: how many are, by either. `refuted`: why accurate steps do
-    not confirm what the report says of them; '' where they do, or the report itself holds nobody.
+    Returns plain data. `members`: number of members simulated. `held`: number that survive with both steps; over these,
+    the summaries (`summarise`) of `names` with the report's steps, with accurate steps, and the relative error.
+    `lost`, `stalled`: numbers with either steps. `refuted`: why accurate steps contradict the report; '' if not,
+    or if no member survives in the report.
     """
     numbers = np.arange(min(AGAIN, count))
     members = problem.objective.chosen(seed, numbers, count)
@@ -50,16 +51,16 @@ def compared(problem: TuningProblem, x: np.ndarray, seed: int, count: int, names
 
 
 def _relative(ours: float, theirs: float) -> float:
-    """How far off ours is: +inf where theirs is 0 and ours is not."""
+    """Return the relative error of `ours`; +inf if `theirs` is 0 and `ours` is not."""
     if ours == theirs:
         return 0.0
     return ours / theirs - 1 if theirs else float("inf")
 
 
 def nominal(problem: TuningProblem, cascade: Cascade) -> Trajectory:
-    """The case's own run, nothing spread, under this cascade: a row for each sample.
+    """Simulate the nominal case under this cascade and record every sample.
 
-    In accurate steps; where the judge takes those of `ambjax simulate`, that command's run.
+    The steps are accurate ones, or those of `ambjax simulate` if the judge uses these.
     """
     case = problem.case
     if problem.replays:

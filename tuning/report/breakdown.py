@@ -1,4 +1,4 @@
-"""Of what the loss is made, so that a reader can add it up: what each term adds, and what the search minimised."""
+"""Breakdown of the loss: the contribution of each term, and the parts of the minimised goal."""
 
 from typing import Any
 
@@ -10,22 +10,22 @@ from tuning.objective.loss import COSTS, HELD, TERMS, outcomes, weigh
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
 
-# The loss of one member in words. Costs multiply: they count relative to the error.
+# The loss of one member as a formula. Costs are factors: they count relative to the error.
 FORMULA = f"{' + '.join(HELD)} + (tracking + peak) x (1 + {' + '.join(COSTS)})"
 Facts = dict[str, Any]
 
 
 def contributions(weights: Any, terms: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What each term adds to the loss of each member [N], none of them stressed: they sum to `weigh`."""
+    """Return the contribution of each term to the loss of each unstressed member [N]; the sum is `weigh`."""
     each = {name: weights[k] * np.asarray(terms[name]) for k, name in enumerate(TERMS)}
     error = sum(values for name, values in each.items() if name not in (*COSTS, *HELD))
     return {name: error * values if name in COSTS else values for name, values in each.items()}
 
 
 def table(goal: Goal, columns: dict[str, np.ndarray]) -> Facts:
-    """Means over an ensemble, by term: its value and what it adds to the loss; the mean loss, and its risk.
+    """Return, for an ensemble, the mean value and mean contribution of each term, the mean loss, and the risk.
 
-    `columns`: those of `judge`, the terms [N] named "loss.tracking" and so on.
+    `columns`: the columns of `judge`; the terms [N] are named "loss.tracking" and so on.
     """
     terms = {name: np.asarray(columns[f"loss.{name}"]) for name in TERMS}
     adds = contributions(goal.weights, terms)
@@ -39,7 +39,7 @@ def table(goal: Goal, columns: dict[str, np.ndarray]) -> Facts:
 
 
 def minimised(problem: TuningProblem, x: np.ndarray, members: Members) -> Facts:
-    """What the search brought down, at x [m]: the parts of its goal, (risk + held) x penalty x limits = total."""
+    """Return the parts of the minimised goal at x [m]: (risk + held) x penalty x limits = total."""
     goal, n = problem.goal, members.ordinary
     terms = {k: v[0] for k, v in problem.engine.terms(x[None], members).items()}
     losses, *reached = outcomes(goal.weights, terms, members.stressed)

@@ -25,17 +25,17 @@ SHOWN = (
     "chatter_V.mean",
     "clearance_used.largest",
 )
-# A point of a slice that is lower by less than this share is as good as the answer: a search stops at such gains.
+# Relative improvement below which a point of a slice counts as equal to the answer.
 AS_GOOD = 0.01
 
 
 def conditions(check: Check) -> list[Facts]:
-    """The theorem's conditions as plain data."""
+    """Return the theorem's conditions as plain data."""
     return [dataclasses.asdict(line) | {"margin": line.margin} for line in check.conditions]
 
 
 def gains_table(space: Space, before: np.ndarray, after: np.ndarray, sensitivity: np.ndarray | None) -> list[Facts]:
-    """One row for each gain."""
+    """Return one row for each gain."""
     return [
         {
             "path": gain.path,
@@ -52,7 +52,7 @@ def gains_table(space: Space, before: np.ndarray, after: np.ndarray, sensitivity
 
 
 def markdown(facts: Facts) -> str:
-    """report.md: beside it lie the pictures that it shows."""
+    """Return the text of report.md. It refers to the pictures in the same folder."""
     lines = [f"# Tuning of {literal(facts['case'])}", "", facts["verdict"], ""]
     lines += (
         limit_table.section(facts.get("limits", []))
@@ -113,7 +113,7 @@ def _gains(facts: Facts) -> list[str]:
 
 
 def _sensitivity(row: Facts, facts: Facts) -> str:
-    """By how much the risk grows where a gain is off, or how many members that loses."""
+    """Describe the growth of the risk, or the additional lost members, when a gain is off."""
     if row.get("sensitivity_lost"):
         return f"**{row['sensitivity_lost']} of {facts['trained_on']} members lost**"
     return "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
@@ -140,7 +140,7 @@ def _held_out(facts: Facts) -> list[str]:
 
 
 def _worst(worst: Facts | None) -> list[str]:
-    """The member that fares worst, and the command that simulates it by itself."""
+    """Describe the worst member, with the command that simulates it alone."""
     if worst is None:
         return []
     status = f"largest settled error {worst['settled_max_abs_error_m']:.4g} m"
@@ -151,7 +151,7 @@ def _worst(worst: Facts | None) -> list[str]:
 
 
 def _again(again: Facts | None, name: str) -> list[str]:
-    """The cells of a metric by either step, and how far the report's is off; bold where that is much."""
+    """Return the cells of a metric with either steps and the relative error, in bold if it is large."""
     if again is None:
         return []
     pair = again["metrics"].get(name)
@@ -238,7 +238,7 @@ def _minimised(facts: Facts) -> list[str]:
 
 
 def _lower_point(facts: Facts) -> str:
-    """Whether the picture shows a lower point than the answer, and what of it."""
+    """Describe a point of the slices with a lower risk than the answer, if there is one."""
     beside = facts.get("beside")
     if not beside or beside["lower"] == 0:
         return "No point of these slices that loses no more members is lower than the answer."

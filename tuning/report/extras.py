@@ -1,4 +1,4 @@
-"""Sections of the report that are there only if they were asked for: --pareto and --gradients."""
+"""Optional sections of the report: --pareto and --gradients."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ Facts = dict[str, Any]
 
 
 def pareto(rows: list[Facts]) -> list[str]:
-    """The front of error against voltage."""
+    """Return the section on the front of error against voltage."""
     cells = [
         [
             f"{row['effort_weight']:g}",
@@ -34,7 +34,7 @@ def pareto(rows: list[Facts]) -> list[str]:
 
 
 def gradient(facts: Facts) -> list[str]:
-    """What the gradient is worth, three ways, by horizon and by member."""
+    """Return the section on the gradient: three ways to compute it, growth with the horizon, noise over members."""
     ways, noise = facts["three_ways"], facts["noise"]
     lines = ["## Gradients, in the logarithms of the gains", ""]
     lines += [f"Over {ways['samples']} samples, of the mean loss:", ""]
@@ -54,7 +54,7 @@ def gradient(facts: Facts) -> list[str]:
 
 
 def _verdict(ways: Facts) -> list[str]:
-    """How many gains the three ways agree on, by which tolerances, and why they may not."""
+    """Describe for how many gains the three ways agree, the tolerances, and causes of disagreement."""
     count, agreed = len(ways["verdicts"]), ways["verdicts"].count(AGREED)
     lines = [
         f"**The three agree on {agreed} of {count} gains**: forward and reverse mode to {MODES:g} of the derivative, "

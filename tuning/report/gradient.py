@@ -1,4 +1,4 @@
-"""What a gradient is worth: three ways to the same number, growth with the horizon, signal against noise."""
+"""Quality of the gradient: agreement of three ways to compute it, growth with the horizon, signal-to-noise ratio."""
 
 import dataclasses
 from typing import Any
@@ -12,29 +12,29 @@ from tuning.problem import TuningProblem
 
 # Samples over which the three ways are compared, members that take part, and the step of the differences.
 SAMPLES, FEW, STEP = 500, 4, 1e-3
-# By what share of the derivative two ways may differ and agree: both modes by rounding; differences of the steps STEP
-# and STEP / 2 with each other, or the step resolves no slope; and their extrapolation with the modes.
+# Largest relative differences at which two ways agree: forward and reverse mode; central differences with the steps
+# STEP and STEP / 2 (beyond it the step does not resolve the slope); their extrapolation and the modes.
 MODES, STEADY, AGREE = 1e-6, 0.05, 1e-3
-# Shares of the largest derivative and of the loss below which two ways agree: rounding.
+# Differences below these shares of the largest derivative and of the loss are rounding.
 NOTHING, ROUNDING = 1e-6, 1e-9
 AGREED = "agree"
 HORIZONS = (0.125, 0.25, 0.5)
 
 
 def _shorter(problem: TuningProblem, samples: int) -> Any:
-    """The objective over fewer samples; settled from the same share of them on."""
+    """Return the objective over fewer samples; the settled part starts at the same share of them."""
     objective = problem.objective
     clock = dataclasses.replace(objective.clock, samples=samples)
-    # and a sample at least is settled
+    # at least one sample is settled
     settle = min(objective.loss.settle * samples / objective.clock.samples, (samples - 1) * clock.sample_period)
     return dataclasses.replace(objective, clock=clock, loss=dataclasses.replace(objective.loss, settle=settle))
 
 
 def three_ways(problem: TuningProblem, x: np.ndarray) -> dict[str, Any]:
-    """Gradient [m] of the mean loss at x [m] by forward and reverse mode and by Richardson-extrapolated differences.
+    """Compute the gradient [m] of the mean loss at x [m] by forward mode, reverse mode and extrapolated differences.
 
-    `coarse`, `fine`: the central differences of the steps STEP and STEP / 2 that are extrapolated. `verdicts`: by gain,
-    whether the three agree (`verdict`); `agree`: whether they do for every gain.
+    Returns plain data. `coarse`, `fine`: central differences with the steps STEP and STEP / 2. `verdicts`: for each
+    gain, whether the three agree (`verdict`). `agree`: whether they agree for every gain.
     """
     objective = _shorter(problem, min(SAMPLES, problem.objective.clock.samples))
     members = objective.members(problem.tune.budget.seed, min(FEW, problem.tune.budget.members))
@@ -64,18 +64,18 @@ def three_ways(problem: TuningProblem, x: np.ndarray) -> dict[str, Any]:
 
 
 def extrapolated(coarse: Any, fine: Any) -> Any:
-    """Richardson's extrapolation of central differences with a step and its half."""
+    """Return Richardson's extrapolation of central differences with a step and with half of it."""
     return (4 * fine - coarse) / 3
 
 
 def verdict(forward: float, reverse: float, coarse: float, fine: float, floor: float) -> str:
-    """Whether three ways to a derivative agree, in words: AGREED, or what was measured that speaks against it.
+    """Return AGREED if three ways to a derivative agree, else a description of the difference.
 
-    `coarse`, `fine`: central differences of the steps STEP and STEP / 2. What differs by less than `floor` agrees.
+    `coarse`, `fine`: central differences with the steps STEP and STEP / 2. Differences below `floor` are ignored.
     """
 
     def apart(a: float, b: float) -> float:
-        """The difference beyond `floor`, as a share of the larger."""
+        """Return the difference beyond `floor`, relative to the larger number."""
         return max(abs(a - b) - floor, 0.0) / max(abs(a), abs(b), floor)
 
     if not np.isfinite([forward, reverse, coarse, fine]).all():
@@ -91,8 +91,10 @@ def verdict(forward: float, reverse: float, coarse: float, fine: float, floor: f
 
 
 def against_horizon(problem: TuningProblem, x: np.ndarray, members: Members) -> list[dict[str, float]]:
-    """Norm of the gradient of the log of the mean loss, and share of lost members, by horizon in s; where it is 0,
-    as it may be over a sample or two, there is no log, and no row."""
+    """Return, by horizon (s), the norm of the gradient of the log of the mean loss, and the share of lost members.
+
+    A horizon with a loss of 0, possible over one or two samples, has no row.
+    """
     rows, all_ = [], problem.objective.clock.samples
     for samples in sorted({max(round(share * all_), 1) for share in (*HORIZONS, 1.0)}):
         objective = _shorter(problem, samples)
@@ -112,7 +114,7 @@ def against_horizon(problem: TuningProblem, x: np.ndarray, members: Members) -> 
 
 
 def signal_to_noise(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, Any]:
-    """Mean of the members' gradients over its standard error, by gain; each member is a seed of its own."""
+    """Return the mean of the members' gradients divided by its standard error, by gain."""
     outcomes, slopes, terms = problem.engine.gradient(x[None], members, problem.goal.weights)
     relative = slopes[0, :, 0] / outcomes[0, :, 0].mean()
     error = relative.std(axis=0, ddof=1) / np.sqrt(len(relative)) if len(relative) > 1 else np.full(len(x), np.nan)
@@ -125,7 +127,7 @@ def signal_to_noise(problem: TuningProblem, x: np.ndarray, members: Members) -> 
 
 
 def report(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, Any]:
-    """All of it, at coordinates x [m]."""
+    """Return the data of the whole gradient report at coordinates x [m]."""
     return {
         "gains": problem.objective.space.paths,
         "three_ways": three_ways(problem, x),

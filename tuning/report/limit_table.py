@@ -1,4 +1,4 @@
-"""Limits in the report: asked, reached by the members that judge, held or not, and what 10 % more would buy."""
+"""Limits in the report: allowed and reached values, verdicts, and the effect of a limit that is 10 % higher."""
 
 from typing import Any
 
@@ -9,9 +9,9 @@ from tuning.objective.limits import Limit
 from tuning.report.page import table
 
 Facts = dict[str, Any]
-# What more of a limit is priced.
+# Relative increase of a limit for which the effect is computed.
 MORE = 0.1
-# What is said of a limit, in every place.
+# Verdicts on a limit.
 HELD, BROKEN, UNVERIFIED, UNJUDGED = "held", "NOT HELD", "not verified", "not judged"
 LOUD = (BROKEN, UNVERIFIED)
 
@@ -19,12 +19,11 @@ LOUD = (BROKEN, UNVERIFIED)
 def facts(
     limits: tuple[Limit, ...], asked: LimitSettings, columns: dict[str, np.ndarray], summary: Facts, refuted: str = ""
 ) -> list[Facts]:
-    """A row for each limit, and one for survival, of the held-out members' columns [N] (of `judge`) and summary.
+    """Return a row for each limit and one for survival, from the held-out members' columns [N] and their summary.
 
-    `refuted`: why accurate steps do not confirm what these members do; '' where they do. `held` is None where no member
-    judges, and where a limit would be held but accurate steps do not confirm it; `verdict` is that in a word.
-    `price_m`: what a limit 10 % higher takes off the settled rms error, m (`Limit.bought`); None where the limit is not
-    held.
+    `refuted`: why accurate steps contradict the judged members; '' if they confirm them. In a row, `held` is None if no
+    member was judged, or if the limit is held but accurate steps contradict it; `verdict` is its text. `price_m`: the
+    decrease of the settled rms error (m) for a limit 10 % higher (`Limit.error_reduction`); None if it is not held.
     """
     members, held = summary["members"], summary["held"]
     share = held / members if members else None
@@ -45,7 +44,7 @@ def facts(
 
 
 def _verdict(kept: bool | None, refuted: str) -> Facts:
-    """Whether a limit is held, and that in a word. `kept`: whether the members that judge keep it; None: none does."""
+    """Return whether a limit is held, and its verdict. `kept`: whether the judged members keep it; None: no members."""
     if kept is None:
         return {"held": None, "verdict": UNJUDGED}
     if not kept:
@@ -75,7 +74,7 @@ def _row(limit: Limit, columns: dict[str, np.ndarray], summary: Facts, refuted: 
 
 
 def broken(rows: list[Facts]) -> list[str]:
-    """A sentence for each limit that is not held, survival too."""
+    """Return a sentence for each limit that is not held, including survival."""
     return [
         f"tune.limits.{row['name']} is {BROKEN}: {_reached(row)}, {_side(row)} {row['asked']:g} ({row['source']})"
         for row in rows
@@ -84,7 +83,7 @@ def broken(rows: list[Facts]) -> list[str]:
 
 
 def prices(rows: list[Facts]) -> list[str]:
-    """A sentence for each limit that is active, and held."""
+    """Return a sentence for each limit that is active and held."""
     return [
         f"{row['name']} = {row['reached']:.4g}{_unit(row)} is at its limit, {row['asked']:g}: {100 * MORE:g} % more "
         f"would take about {row['price_m']:.2g} m off the settled rms error"
@@ -94,7 +93,7 @@ def prices(rows: list[Facts]) -> list[str]:
 
 
 def section(rows: list[Facts]) -> list[str]:
-    """Limits as a part of the report."""
+    """Return the section on limits."""
     if not rows:
         return []
     cells = [

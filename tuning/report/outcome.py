@@ -1,5 +1,4 @@
-"""What the members that judge, and accurate steps, say of the tuned gains: one fact, from which the exit code, the log,
-the report and report.json take every word; and what would help."""
+"""The outcome of a search: one record from which exit code, log, report and report.json derive; and the advice."""
 
 import dataclasses
 from typing import Any
@@ -17,10 +16,10 @@ NOBODY = "No held-out member judges the tuned gains (tune.held_out = 0)."
 
 @dataclasses.dataclass(frozen=True)
 class TuningOutcome:
-    """Of the `members` that judge, how many are lost or not decided (`stalled`), and how many may be.
+    """Result of judging the tuned gains on `members` members.
 
-    `limits`: the verdict of each limit by name, as in the report's table. `refuted`: why accurate steps do not confirm
-    all this; '' where they do.
+    `lost`, `stalled`: numbers of members lost and undecided. `may_lose`: number allowed. `limits`: the verdict of each
+    limit by name. `refuted`: why accurate steps contradict this result; '' if they confirm it.
     """
 
     members: int
@@ -32,22 +31,22 @@ class TuningOutcome:
 
     @property
     def rotors_held(self) -> bool:
-        """Whether no more rotors are lost or undecided than may be."""
+        """Whether at most the allowed number of rotors is lost or undecided."""
         return self.lost + self.stalled <= self.may_lose
 
     @property
     def broken(self) -> list[str]:
-        """Names of the limits that are not held, but for survival, which is `rotors_held`."""
+        """Names of the limits that are not held, without survival (`rotors_held`)."""
         return [name for name, verdict in self.limits.items() if verdict == BROKEN and name != "survival"]
 
     @property
     def good(self) -> bool:
-        """Whether the gains hold what is asked: exit code 0."""
+        """Whether the gains meet all requirements: exit code 0."""
         return not self.against
 
     @property
     def against(self) -> list[str]:
-        """What speaks against the gains, a few words each; empty where they hold what is asked."""
+        """Short descriptions of the requirements that are not met."""
         words = []
         if not self.rotors_held:
             ended = f"{self.lost} lost" + f" and {self.stalled} not decided" * bool(self.stalled)
@@ -59,14 +58,14 @@ class TuningOutcome:
         return words
 
     def facts(self) -> Facts:
-        """All of it as plain data."""
+        """Return the outcome as plain data."""
         return dataclasses.asdict(self) | {"good": self.good, "rotors_held": self.rotors_held, "against": self.against}
 
 
 def outcome_of(facts: Facts, may_lose: int) -> TuningOutcome:
-    """The outcome of a search's facts: by the held-out members, or by those in training where there are none.
+    """Return the outcome from the facts of a search: of the held-out members, else of the training members.
 
-    `may_lose`: how many of the held-out members may be lost; of the others, none.
+    `may_lose`: number of held-out members that may be lost. No training member may be lost.
     """
     after, limits = facts["after"], {row["name"]: row["verdict"] for row in facts["limits"]}
     if not after["members"]:
@@ -75,7 +74,7 @@ def outcome_of(facts: Facts, may_lose: int) -> TuningOutcome:
 
 
 def verdict(facts: Facts, outcome: TuningOutcome) -> str:
-    """The answer, and what became of the members that judge, in a few sentences."""
+    """Return the verdict and the status of the judged members in a few sentences."""
     unjudged = [name for name, found in outcome.limits.items() if found == UNJUDGED]
     answer = f"{NO} {'; '.join(outcome.against)}." if not outcome.good else NOBODY if unjudged else YES
     words = [answer, _statuses(facts)]
@@ -111,7 +110,7 @@ def _largest(summary: Facts) -> str:
 
 
 def advice(problem: TuningProblem, facts: Facts, outcome: TuningOutcome, x: np.ndarray, members: Members) -> str:
-    """Why the gains do not hold what is asked, and what would help, in the order in which it matters; '' if they do."""
+    """Return why requirements are not met and the remedies, the most important first; '' if all are met."""
     if outcome.good:
         return ""
     words = []
@@ -131,7 +130,7 @@ def advice(problem: TuningProblem, facts: Facts, outcome: TuningOutcome, x: np.n
 
 
 def _of_the_lost(problem: TuningProblem, facts: Facts, x: np.ndarray, members: Members) -> list[str]:
-    """What is tight where rotors are lost."""
+    """Return the limits that are nearly reached, as possible causes of lost rotors."""
     judged = f"{facts['after']['lost']} of {facts['after']['members']} held-out members, " * bool(
         facts["after"]["members"]
     )

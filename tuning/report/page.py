@@ -1,4 +1,4 @@
-"""One HTML page of a Markdown text and its pictures, which needs nothing else."""
+"""One self-contained HTML page from a Markdown text and its pictures."""
 
 import base64
 import html
@@ -8,30 +8,30 @@ from typing import Any
 
 from markdown_it import MarkdownIt
 
-# Whatever is wider than a narrow screen scrolls in a box of its own; a picture stays legible there.
+# Elements that are wider than a narrow screen scroll in a box, so that pictures stay legible.
 STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:72rem;margin:2rem auto;padding:0 1rem;color:#222}
 body{overflow-wrap:anywhere}p,li{max-width:60rem}.wide{display:block;overflow-x:auto;margin:.6rem 0}
 table{border-collapse:collapse;overflow-wrap:normal}td,th{border:1px solid #ccc;padding:.2rem .6rem;text-align:left}
 th{background:#f3f3f3}.short{white-space:nowrap}img{display:block;max-width:max(100%,44rem)}"""
-# A cell of at most this many characters is one line: a number does not break at the sign of its exponent.
+# Cells of at most this many characters are not wrapped: a number must not break at the sign of its exponent.
 SHORT = 48
 PUNCTUATION = re.compile(r"([\\`*_\[\]<>|~&#!$])")
 
 
 def literal(text: str) -> str:
-    """Text that Markdown shows as it is, in a table too: neither HTML nor emphasis nor a cell's end; one line."""
+    """Escape a text so that Markdown shows it literally on one line, in tables too."""
     visible = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
     return PUNCTUATION.sub(r"\\\1", visible)
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """A table; cells are Markdown, of which only `|` has to be escaped."""
+    """Return a Markdown table. Cells are Markdown; `|` is escaped."""
     lines = [head, ["---"] * len(head), *rows]
     return ["| " + " | ".join(cell.replace("\\|", "|").replace("|", "\\|") for cell in line) + " |" for line in lines]
 
 
 def page(text: str, pictures: Mapping[str, bytes], title: str) -> str:
-    """The page. `pictures`: PNG by file name; an image of Markdown that names one is shown from within the page."""
+    """Return the HTML page. `pictures`: PNG data by file name; images with these names are embedded."""
     markdown = MarkdownIt("commonmark", {"html": False}).enable("table")
     markdown.add_render_rule("table_open", lambda *_: '<div class="wide"><table>\n')
     markdown.add_render_rule("td_open", lambda _, tokens, at, *__: _cell(tokens[at + 1].content))

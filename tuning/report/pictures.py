@@ -12,23 +12,23 @@ from ambjax.pictures.thinning import stretch_of, thin
 from ambjax.simulation.trajectory import STALLED, Trajectory
 from tuning.search.explore import Slices
 
-# Where the picture of the risk ends: a lost member costs a million times an error.
+# Upper end of the axis of the risk: a lost member costs about 1e6 times an error.
 HIGHEST = 30.0
-# Of a run, the start and the end are shown enlarged, for this long, in s, or for a quarter of it.
+# Length (s) of the enlarged start and end of a run; at most a quarter of the run.
 ZOOM = 0.02
-# What follows a loss is shown for this share of what is shown before it.
+# Time shown after a loss as a share of the time before it.
 SHOWN_AFTER_LOSS = 0.15
-# What moves by less than this share of a signal's largest value is shown flat.
+# Variations below this share of a signal's largest value are shown flat.
 FLAT = 1e-2
-# Amplitudes below this share of the largest are cut off; and samples of which there is a spectrum.
+# Smallest amplitude shown, as a share of the largest; smallest number of samples for a spectrum.
 FAINTEST, FEWEST = 1e-5, 16
 
 
 @own_style
 def before_after(runs: dict[str, Trajectory]) -> bytes:
-    """PNG: z - r and u, averaged over each sample, of runs by name, in rows; in columns the whole, start and end.
+    """Draw z - r and u (averaged over each sample) of runs by name, as PNG: columns are the whole run, start and end.
 
-    A run that is lost ends shortly after the loss, in the first and in the last column.
+    A lost run is cut shortly after the loss.
     """
     from matplotlib.figure import Figure
 
@@ -81,7 +81,7 @@ def before_after(runs: dict[str, Trajectory]) -> bytes:
 
 @own_style
 def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
-    """PNG: amplitude of u (V), averaged over each sample, over frequency, of runs by name, from `settle` (s) on."""
+    """Draw the amplitude spectrum of u (V, averaged over each sample) of runs by name after `settle` (s), as PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 3.6), layout="constrained")
@@ -101,9 +101,9 @@ def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
 
 
 def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies (Hz) above 0 and amplitudes of a signal sampled with this period, s, under a Hann window.
+    """Return frequencies (Hz) above 0 and amplitudes of a signal with this sample period (s), under a Hann window.
 
-    A sine's amplitude is that of its peak, that of half the sample rate included. Both are empty for fewer than
+    The amplitude of a sine is that of its peak, also at half the sample rate. Both arrays are empty for fewer than
     FEWEST samples.
     """
     n = len(values)
@@ -118,7 +118,7 @@ def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarra
 
 @own_style
 def convergence(history: dict[str, Any], paths: list[str]) -> bytes:
-    """PNG: what is minimised and the gains of the best start against iterations."""
+    """Draw the minimised goal and the gains of the best start over the iterations, as PNG."""
     from matplotlib.figure import Figure
 
     value, gains, members = (np.asarray(history[name]) for name in ("value", "gains", "members"))
@@ -144,7 +144,7 @@ def convergence(history: dict[str, Any], paths: list[str]) -> bytes:
 
 @own_style
 def landscape(slices: Slices, paths: list[str]) -> bytes:
-    """PNG: what was minimised along each gain through the answer."""
+    """Draw the minimised goal along each gain through the answer, as PNG."""
     from matplotlib.figure import Figure
 
     m = len(paths)
@@ -173,7 +173,7 @@ def landscape(slices: Slices, paths: list[str]) -> bytes:
 
 @own_style
 def front(rows: list[dict[str, Any]]) -> bytes:
-    """PNG: settled rms error against settled rms voltage; points of gains that lose members are crossed out."""
+    """Draw settled rms error over settled rms voltage, as PNG; points with lost members are crossed out."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5, 3.4), layout="constrained")
@@ -184,7 +184,7 @@ def front(rows: list[dict[str, Any]]) -> bytes:
         voltages = [r["settled_rms_u_V"] for r in lost]
         ax.plot(voltages, [r["settled_rms_error_m"] for r in lost], "C3x", ms=8, label="members lost or not decided")
         ax.legend(fontsize=8)
-    # at least half a decade: a front of one point has no scale of its own
+    # at least half a decade, for a front of a single point
     ax.set_ylim(min(min(errors) / 1.2, max(errors) / 2), max(max(errors) * 1.2, min(errors) * 2))
     ax.set(xlabel="settled rms voltage (V)", ylabel="settled rms error (m)", yscale="log")
     ax.grid(alpha=0.3, which="both")

@@ -1,4 +1,4 @@
-"""tuned.toml: the case file as its author wrote it, comments and all, with the tuned gains."""
+"""tuned.toml: the user's case file, with its comments, and the tuned gains."""
 
 import re
 import tomllib
@@ -10,17 +10,17 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, InlineTable, Table
 
 FIRST = "Tuned by ambjax tune from the case"
-# What such a file begins with: it says nothing of the next search.
+# First line of such a file. It is removed when the file is tuned again.
 HEAD = re.compile(rf"\A# {FIRST} [^\n]*\n(#[^\n]*\n)?\n?")
-# What may stand in no comment; halves of characters are names of files that are not UTF-8.
+# Characters that a comment must not contain; surrogates come from file names that are not UTF-8.
 CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
 
 def tuned(text: str, gains: Mapping[str, float], case: str, verdict: str) -> str:
-    """The text of a case file with the numbers at these dotted paths; tables that lack are added.
+    """Return the text of a case file with the given numbers at these dotted paths; missing tables are added.
 
-    It begins with the name of the case and the verdict as a comment. Raises ValueError where the text cannot be
-    changed so.
+    The text begins with a comment: the name of the case and the verdict. Raises ValueError if the text cannot be
+    changed in this way.
     """
     try:
         document = tomlkit.parse(HEAD.sub("", text.replace("\r\n", "\n")))
@@ -37,7 +37,7 @@ def tuned(text: str, gains: Mapping[str, float], case: str, verdict: str) -> str
 
 
 def _wanted(text: str, gains: Mapping[str, float]) -> dict[str, Any]:
-    """What the changed text must say."""
+    """Return the data that the changed text must parse to."""
     document = tomllib.loads(text)
     for path, value in gains.items():
         table = document
@@ -53,8 +53,11 @@ def _escaped(character: re.Match[str]) -> str:
 
 
 def _table(table: Any, path: list[str]) -> Any:
-    """The table at this path, added where it lacks: inline in an inline one, else behind the last of its kind; at the
-    end where keys of the root come after that, which would be the new table's."""
+    """Return the table at this path; add it if it is missing.
+
+    A table inside an inline table is inline. Others follow the last table of the same kind, or stand at the end of the
+    document if root keys follow there, which would otherwise become keys of the new table.
+    """
     document = table
     for depth, word in enumerate(path):
         if word not in table:
@@ -70,7 +73,7 @@ def _table(table: Any, path: list[str]) -> Any:
 
 
 def _followed(document: tomlkit.TOMLDocument, name: str) -> bool:
-    """Whether keys of the root come after the root's first item of this name."""
+    """Return whether root keys follow the first root item of this name."""
     keys = [(key, item) for key, item in document.body if key is not None]
     first = next(n for n, (key, _) in enumerate(keys) if key.key == name)
     return any(key.is_dotted() or not isinstance(item, (Table, AoT)) for key, item in keys[first + 1 :])
@@ -85,7 +88,7 @@ def _append(document: tomlkit.TOMLDocument, path: list[str], word: str) -> None:
 
 
 def _put(table: Any, name: str, value: float) -> None:
-    """The number under this name; behind the others if it is new, and as it is written if it is that number."""
+    """Set the number of this name; append a new one, and keep the text of an equal one."""
     if name in table:
         if table[name] != value:
             table[name] = value
@@ -98,7 +101,7 @@ def _put(table: Any, name: str, value: float) -> None:
 
 
 def _behind(last: Table | None) -> Table:
-    """A new table that takes over the comments at the end of the one before: they are about what comes next."""
+    """Return a new table that takes over the comments at the end of the preceding table: they refer to what follows."""
     table = tomlkit.table()
     rest = [] if last is None else _cut(last)
     table.value.body.extend(rest or [(None, tomlkit.nl())])
@@ -106,7 +109,7 @@ def _behind(last: Table | None) -> Table:
 
 
 def _last(table: Any) -> Table | None:
-    """The innermost table at the end of a table of tables; None where there is none, or its parts lie apart."""
+    """Return the innermost table at the end of a table of tables; None if there is none, or it has separate parts."""
     last = None
     while isinstance(table, Table):
         last = table
@@ -115,7 +118,7 @@ def _last(table: Any) -> Table | None:
 
 
 def _cut(table: Table) -> list[Any]:
-    """Take off, and return, the comments and empty lines at the end of a table."""
+    """Remove and return the comments and empty lines at the end of a table."""
     body = table.value.body
     end = len(body)
     while end and body[end - 1][0] is None:
