@@ -23,26 +23,26 @@ ambjax simulates, checks, tunes and exports the controller of a rotor in an acti
   ambjax export tuned/tuned.toml      write the controller as C
 
 'ambjax --help' lists all commands; 'ambjax COMMAND --help' lists the options of one."""
-# The group of entry points in which a package that stands on this one, such as the tuner, declares its command.
+# Entry-point group in which a dependent package, such as the tuner, declares its command.
 EXTENSIONS = "ambjax.commands"
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose complaints are one line, and exit with 2."""
+    """An argument parser that reports an error on one line of stderr and exits with 2."""
 
     def error(self, message: str) -> NoReturn:
         sys.exit(complain(f"{message}. See '{self.prog} --help'.", self.prog.split()[0]))
 
 
 def complain(message: str, program: str = "ambjax") -> int:
-    """Say what is wrong with the input, on one line of stderr. Returns the exit code for that."""
+    """Print an error message on one line of stderr. Return the exit code of bad input, 2."""
     with contextlib.suppress(OSError):
         print(one_line(f"{program}: {message}"), file=sys.stderr)
     return 2
 
 
 def parser() -> Parser:
-    """All commands and their arguments."""
+    """Return the parser of all commands and their options."""
     top = Parser(prog="ambjax", description="Simulate and check a rotor in an active magnetic bearing.")
     top.add_argument("--version", action="version", version=f"ambjax {__version__}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
@@ -52,7 +52,7 @@ def parser() -> Parser:
         if case:
             one.add_argument("case", metavar="CASE.toml", help="a case file; 'ambjax template' prints one")
         if out:
-            one.add_argument("--out", metavar="DIR", help="where to write (default: a new directory under ./out)")
+            one.add_argument("--out", metavar="DIR", help="directory to write to (default: a new one under ./out)")
         one.add_argument("--json", action="store_true", help="print a machine-readable summary and nothing else")
         return one
 
@@ -60,47 +60,54 @@ def parser() -> Parser:
     template = command("template", "print an annotated case file")
     template.add_argument("scenario", nargs="?", default="tracking", choices=["tracking", "regulation", "rig"])
     simulate = command("simulate", "simulate a case: trajectory.npz, metrics.json, overview.png", case=True, out=True)
-    simulate.add_argument("--member", type=int, metavar="K", help="member K of the case's ensemble, its [spread] drawn")
+    simulate.add_argument("--member", type=int, metavar="K", help="simulate member K of the case's ensemble")
     _seed_option(simulate)
     simulate.add_argument("--members", type=int, metavar="N", help="size of the ensemble (for a Latin hypercube)")
-    simulate.add_argument("--from", dest="begin", type=float, metavar="T", help="draw the run from T (s) on")
-    simulate.add_argument("--to", dest="end", type=float, metavar="T", help="draw the run up to T (s)")
+    simulate.add_argument("--from", dest="begin", type=float, metavar="T", help="time at which the picture begins, s")
+    simulate.add_argument("--to", dest="end", type=float, metavar="T", help="time at which the picture ends, s")
     ensemble = command("ensemble", "simulate many members: members.npz, summary.json, fan.png", case=True, out=True)
-    ensemble.add_argument("--members", type=int, metavar="N", required=True, help="how many members")
+    ensemble.add_argument("--members", type=int, metavar="N", required=True, help="number of members")
     _seed_option(ensemble)
     ensemble.add_argument(
-        "--chunk", type=int, metavar="M", help="members kept at a time (default: about 2 s of work, 64 a core at least)"
+        "--chunk", type=int, metavar="M", help="members per chunk (default: about 2 s of work, at least 64 per core)"
     )
-    ensemble.add_argument("--resume", action="store_true", help="go on with a study that was interrupted in --out")
+    ensemble.add_argument("--resume", action="store_true", help="continue the interrupted study in --out")
     where = ensemble.add_mutually_exclusive_group()
-    where.add_argument("--processes", type=int, metavar="P", help="run on P processes (default: threads of this one)")
-    where.add_argument("--cluster", metavar="ADDRESS", help="run on a Dask cluster: address of its scheduler")
+    where.add_argument(
+        "--processes", type=int, metavar="P", help="run on P processes (default: threads of one process)"
+    )
+    where.add_argument("--cluster", metavar="ADDRESS", help="run on the Dask cluster whose scheduler has this address")
     grid = command("map", "survival and error over a grid of two quantities: map.png, map.json", case=True, out=True)
     for axis in ("--x", "--y"):
         form = "PATH=LOW:HIGH[:COUNT][:log]"
-        grid.add_argument(axis, metavar=form, required=True, help="a quantity and its range; ends may be in per cent")
+        grid.add_argument(
+            axis, metavar=form, required=True, help="a quantity and its range; LOW and HIGH may be in per cent"
+        )
     grid.add_argument("--members", type=int, metavar="N", default=1, help="members per cell (default: 1)")
-    grid.add_argument("--against", metavar="OTHER.toml", action="append", help="another case, beside the first")
+    grid.add_argument("--against", metavar="OTHER.toml", action="append", help="another case, mapped beside the first")
     _seed_option(grid)
-    words = "check Theorem 1's conditions along a case, or what decides on its processor; exit code 1 if one fails"
+    words = "check the conditions of Theorem 1 and those of the case's [processor]; exit code 1 if one fails"
     command("check", words, case=True)
-    export = command("export", "the controller of a case with [processor] as C", case=True, out=True)
-    export.add_argument("--verify", action="store_true", help="hold the C to JAX; exit code 1 if it fails")
-    export.add_argument("--precision", choices=["float", "double"], default="float", help="type of its numbers")
-    export.add_argument("--prefix", metavar="NAME", help="what its names begin with (default: the case's name)")
-    # Listed here, run by a parser of its own: see main.
+    export = command("export", "write the controller of a case with [processor] as C", case=True, out=True)
+    export.add_argument("--verify", action="store_true", help="compare the C with JAX; exit code 1 if they differ")
+    export.add_argument("--precision", choices=["float", "double"], default="float", help="type of the C's numbers")
+    export.add_argument("--prefix", metavar="NAME", help="prefix of all names in the C (default: the case's name)")
+    # Only listed here: `main` passes the arguments of tune to the tuner's own parser.
     command("tune", "tune the gains of a case by gradients: tuned.toml, report.html")
     return top
 
 
 def _seed_option(command: Parser) -> None:
-    command.add_argument("--seed", type=int, metavar="S", help="seed of noise and spread (default: the case's)")
+    command.add_argument(
+        "--seed", type=int, metavar="S", help="seed of noise and spread (default: run.seed of the case)"
+    )
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command. Returns its exit code: 0 done, 1 the answer is no, 2 bad input.
+    """Run the command line `argv` (default: sys.argv) and return the exit code.
 
-    Without a command, print the commands that a new user runs first.
+    0: done. 1: done, and the answer is no. 2: bad input. Without a command, print the commands that a new user runs
+    first.
     """
     words = sys.argv[1:] if argv is None else argv
     if words[:1] == ["tune"]:
@@ -111,7 +118,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _extension(name: str) -> Callable[[list[str], str], int]:
-    """The command that another package declares under this name."""
+    """Return the command that another package declares under this name; if there is none, one that reports that."""
     import importlib.metadata
 
     found = tuple(importlib.metadata.entry_points(group=EXTENSIONS, name=name))
@@ -134,15 +141,16 @@ Run = Callable[[argparse.Namespace], tuple[int, Any]]
 
 
 def answer(parser: argparse.ArgumentParser, words: list[str] | None, run: Run) -> int:
-    """Run a command and print its summary if --json asks for that. Returns the exit code; what goes wrong is one line.
+    """Run a command, print its summary if --json is given, and return the exit code.
 
-    No stream that takes nothing stops it. Whoever closes stdout has seen enough of the answer; any other failure of
-    stdout is told, with 2. Raises SystemExit as the parser does.
+    An error is reported on one line of stderr. A stream that cannot be written does not stop the command. A reader that
+    closes stdout is no error; any other failure of stdout is reported at the end, with exit code 2. Raises SystemExit
+    as the parser does.
     """
     with lenient() as stdout:
         try:
             args = parser.parse_args(words)
-        except SystemExit as end:  # bad arguments, or an answer too: --help, --version
+        except SystemExit as end:  # bad arguments, or --help or --version, which print to stdout
             if end.code or stdout.failure() is None:
                 raise
             code = 0
@@ -152,7 +160,7 @@ def answer(parser: argparse.ArgumentParser, words: list[str] | None, run: Run) -
         if failure is None or isinstance(failure, BrokenPipeError):
             return code
         why = getattr(failure, "strerror", None) or failure
-        return complain(f"the answer could not be written: {why}. Make room, or write somewhere else.", parser.prog)
+        return complain(f"cannot write to stdout: {why}. Free some disk space, or write elsewhere.", parser.prog)
 
 
 def _code(run: Callable[[], tuple[int, Any]], as_json: bool, program: str) -> int:
@@ -164,12 +172,12 @@ def _code(run: Callable[[], tuple[int, Any]], as_json: bool, program: str) -> in
         return complain(str(error), program)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        return complain(f"{where}{error.strerror or error}. Make room, or write somewhere else.", program)
+        return complain(f"{where}{error.strerror or error}. Free some disk space, or write elsewhere.", program)
     except MemoryError:
-        return complain("there is not enough memory for that. Ask for less at once: fewer members or samples.", program)
-    except (NotImplementedError, RecursionError):  # faults of ours, RuntimeErrors too
+        return complain("there is not enough memory for this run. Use fewer members or fewer samples.", program)
+    except (NotImplementedError, RecursionError):  # defects of ambjax; both are RuntimeErrors
         raise
-    except RuntimeError as error:  # what JAX says of a device: that it is not there, or that its memory is full
+    except RuntimeError as error:  # JAX reports a missing device, or full device memory
         return complain(str(error).strip().partition("\n")[0] or type(error).__name__, program)
     except KeyboardInterrupt as stop:
         complain(f"interrupted{f': {stop}' if str(stop) else ''}.", program)
