@@ -254,7 +254,7 @@ def test_the_command_says_what_is_drawn_and_what_is_not_decided(tmp_path, capsys
     assert main([*argv, "--members", "2"]) == 0
     text = capsys.readouterr().out
     assert "case: drawn for each member: plant.m" in text
-    assert "case: 0 runs lost, 1 not decided (in 1 cells): the integrator gave up there" in text
+    assert "case: 0 runs lost, 1 not decided (in 1 cells): the integrator stalled there" in text
     (found,) = json.loads((tmp_path / "out" / "map.json").read_text())["cases"]
     assert found["stalled"] == [[1, 0, 0], [0, 0, 0], [0, 0, 0]]
     assert found["survival"][0][0] == 0.5

@@ -154,7 +154,7 @@ def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(flags):
     kept = finished_chunks("out")
     assert 2 <= kept < many // 32
     said = [line for line in err.splitlines() if line.startswith("ambjax: ")]
-    again = "To go on, give the same command with --out out --resume."
+    again = "To continue, repeat the command with --out out --resume."
     assert said == [f"ambjax: interrupted: {32 * kept} of {many} members are kept. {again}"]
     assert "Traceback" not in err
     for path in pathlib.Path("out", "chunks").glob("*.npz"):

@@ -1,4 +1,4 @@
-"""`ambjax ensemble`: a study run chunk by chunk, here or on worker processes, and what is made of it."""
+"""`ambjax ensemble`: run a study in chunks, in this process or on workers, then write its summary and pictures."""
 
 import argparse
 import contextlib
@@ -24,25 +24,28 @@ from ambjax.host.lock import alone
 from ambjax.host.words import one_line
 from ambjax.simulation.integrate import Slide
 
-# Beside members.npz; the last where something is spread.
+# Files written beside members.npz; the last only if the case has a [spread].
 WRITTEN = ("summary.json", "fan.png", "histograms.png", "tornado.png")
-# Chunks in flight for each worker: one runs, one waits.
+# Chunks submitted per worker: one runs, one waits.
 AHEAD = 2
-# More than any machine has cores; each takes memory of its own.
+# Largest number of processes; each needs its own memory.
 MOST_PROCESSES = 1024
-# The fan chart is drawn from so many members and instants, whatever the size of the study.
+# Members and instants from which the fan chart is drawn, for a study of any size.
 FAN_MEMBERS, FAN_TIMES = 256, 500
-# How long to look for the scheduler of a cluster.
+# Timeout of the connection to the scheduler of a cluster.
 PATIENCE = "10s"
-# Where every member is lost, the fan chart ends at so many times the last loss.
+# If every member is lost, the fan chart ends at this multiple of the last loss's time.
 BEYOND = 1.15
 BANDS = (0.0, 5.0, 25.0, 50.0, 75.0, 95.0, 100.0)
-GO_ON = "What is finished is kept: give the same command with --out and --resume to go on."
+GO_ON = "Finished chunks are kept: repeat the command with --out and --resume to continue."
 METRICS = ("settled_max_abs_error_m", "settled_rms_error_m", "max_abs_error_m", "max_abs_u_V", "rms_u_V", "max_abs_i_A")
 
 
 def study_of(case: Case, seed: int | None, members: int) -> Study:
-    """The study of a case file. Raises ValueError for a member count or seed out of range."""
+    """Return the study of a case with this number of members; `seed` None: the seed of the case.
+
+    Raises ValueError for a number of members or a seed out of range.
+    """
     if not 1 <= members <= MOST_MEMBERS:
         raise ValueError(f"--members {members}: it must be a whole number from 1 to {MOST_MEMBERS:,}.")
     seed = int(case.scenario.seed) if seed is None else seed
@@ -59,9 +62,9 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     with keeping(lambda: _state_words(store)), contextlib.ExitStack() as held:
         error = None
         with contextlib.nullcontext() if store.finished() else _executor(args) as executor:
-            make(out)  # not before everything that was asked for is known to be possible
+            make(out)  # only after all options have been checked
             held.enter_context(alone(out))
-            _check(study, store, args)  # again: another run may have begun, or ended, since
+            _check(study, store, args)  # again: another run may have begun, or ended, since the first check
             fresh = not store.begun()
             store.begin()
             say(f"method: {case.clock.method}; writing to {out}")
@@ -77,7 +80,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
 
 
 def _study_and_store(case: Case, args: argparse.Namespace) -> tuple[Study, Store]:
-    """The study that is asked for, and where it is kept; nothing is written. Raises ValueError for what cannot be."""
+    """Return the study and its store from the options; write nothing. Raises ValueError for an invalid option."""
     study = study_of(case, args.seed, args.members)
     if args.chunk is not None and args.chunk < 1:
         raise ValueError(f"--chunk {args.chunk}: it must be a whole number of members, at least 1.")
@@ -85,7 +88,7 @@ def _study_and_store(case: Case, args: argparse.Namespace) -> tuple[Study, Store
         raise ValueError(f"--processes {args.processes}: it must be a whole number from 1 to {MOST_PROCESSES}.")
     if args.resume and args.out is None:
         raise ValueError("--resume: add --out DIR, the directory of the study that was interrupted.")
-    study.drawn(np.array([0]))  # raises what the design has against so many members
+    study.drawn(np.array([0]))  # raises ValueError if the design cannot have so many members
     out = target(args.out, f"ensemble-{case.name}")
     chunk = None if args.chunk is None else min(args.chunk, study.members)
     store = Store(out, study.fingerprint(), study.members, chunk)
@@ -112,17 +115,17 @@ def _pilot(study: Study, store: Store, executor: tuple[Executor, int] | None) ->
 
 
 def _state_words(store: Store) -> str:
-    """What an interruption has left, and how to go on."""
+    """Return the message of an interruption: how many members are kept, and how to continue."""
     if not store.begun():
         return "nothing is kept"
-    again = f"give the same command with --out {store.directory} --resume"
-    return f"{store.count()} of {store.members} members are kept. To go on, {again}"
+    again = f"repeat the command with --out {store.directory} --resume"
+    return f"{store.count()} of {store.members} members are kept. To continue, {again}"
 
 
 def _report(
     case: Case, study: Study, args: argparse.Namespace, out: pathlib.Path, error: dict[str, Any] | None
 ) -> tuple[int, dict[str, Any]]:
-    """What is made of a finished study; `error` is that of its sliding step, if it has one."""
+    """Write and print the summary of a finished study. `error`: that of its sliding step, if it has one."""
     with np.load(out / "members.npz") as file:
         columns = {name: file[name] for name in file.files}
     summary = _summary(case, study, columns, str(args.case))
@@ -142,7 +145,7 @@ def _report(
 
 @contextlib.contextmanager
 def _executor(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]:
-    """Where chunks run: None for this process, or an executor and the number of chunks to keep in flight."""
+    """Yield None to run chunks in this process, or an executor and the number of chunks to keep submitted."""
     if args.cluster is not None:
         try:
             from distributed import Client, KilledWorker
@@ -151,25 +154,29 @@ def _executor(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]
         try:
             client = Client(args.cluster, timeout=PATIENCE)
         except (OSError, ValueError) as error:
-            raise ValueError(f"--cluster {args.cluster}: no scheduler answers there ({error}).") from None
+            raise ValueError(
+                f"--cluster {args.cluster}: no scheduler answers there ({error}). Check the address."
+            ) from None
         try:
             with client:
                 yield client.get_executor(), AHEAD * max(len(client.scheduler_info()["workers"]), 1)
         except (KilledWorker, CancelledError):
-            raise ValueError(f"--cluster {args.cluster}: it, or its workers again and again, died. {GO_ON}") from None
+            raise ValueError(
+                f"--cluster {args.cluster}: the cluster, or its workers repeatedly, died. {GO_ON}"
+            ) from None
     elif args.processes is not None:
         try:
             with processes(args.processes) as pool:
                 yield pool, AHEAD * args.processes
         except BrokenExecutor:
-            why = "a worker process died, perhaps for want of memory"
-            raise ValueError(f"--processes {args.processes}: {why}; fewer need less. {GO_ON}") from None
+            why = "a worker process died, perhaps because memory ran out; fewer processes need less"
+            raise ValueError(f"--processes {args.processes}: {why}. {GO_ON}") from None
     else:
         yield None
 
 
 def _run(study: Study, store: Store, executor: tuple[Executor, int] | None) -> None:
-    """Compute what is missing; every finished chunk is on disk at once."""
+    """Compute the missing chunks, and write each to disk when it is finished."""
     missing, remarks = store.survey()
     for remark in remarks:
         say(remark)
@@ -221,7 +228,7 @@ def _pictures(
     from ambjax.pictures import tornado
 
     lost_at = columns["lost_at"]
-    # nothing is left to show long after the last member is lost
+    # no member is left to show after the last one is lost
     bands = study.bands(FAN_MEMBERS, FAN_TIMES, BEYOND * float(np.max(lost_at)))
     shown = {name: _quantiles(x, bands.extremes.get(name)) for name, x in bands.signals.items()}
     few = len(bands.trajectory.lost_at)
@@ -236,9 +243,10 @@ def _pictures(
 
 
 def _quantiles(x: np.ndarray, extremes: tuple[np.ndarray, np.ndarray] | None) -> dict[float, np.ndarray]:
-    """Quantiles [T] of x [members, T] over the members that are left at each instant, by per cent; NaN where none is.
+    """Return the quantiles [T], keyed by per cent, of x [members, T] over the members not yet lost at each instant.
 
-    The outermost are the `extremes` between the neighbouring instants, where there are any.
+    NaN where all members are lost. `extremes`, if given, replaces the outermost quantiles: minimum and maximum between
+    the neighbouring instants.
     """
     left = np.isfinite(x).any(axis=0)
     quantiles = np.full((len(BANDS), x.shape[1]), np.nan)
@@ -254,7 +262,7 @@ def _text(summary: dict[str, Any]) -> str:
     held = f"{summary['survivors']} of {summary['members']} members survive"
     lines = [f"{held}: {share:.4g} % ({sure} {low:.4g} to {high:.4g} %)"]
     if summary["stalled"]:
-        why = "the integrator gave up, and whether the rotor is held is not known"
+        why = "the integrator stalled, so whether the rotor survives is not known"
         lines += [f"{summary['lost']} lost, {summary['stalled']} not decided: {why}"]
     lines += [f"note: {note}" for note in summary["notes"]]
 
@@ -267,11 +275,11 @@ def _text(summary: dict[str, Any]) -> str:
         rows.append(
             (name, *(number(metric[key]["estimate"]) for key in ("median", "q95", "cvar_95")), number(metric["max"]))
         )
-    head = f"metric, of the {summary['survivors']} {summary['metrics_of']}"
+    head = f"metric over the {summary['survivors']} {summary['metrics_of']}"
     lines += ["", table((head, "median", "95 % quantile", "mean of worst 5 %", "largest"), rows)]
     drivers, account = summary["drivers"][statistics.DECIDING][:5], summary["explained"][statistics.DECIDING]
     if drivers:
-        lines += ["", f"What drives {statistics.DECIDING} of the {summary['metrics_of']}: {account['says']}."]
+        lines += ["", f"Quantities that drive {statistics.DECIDING} of the {summary['metrics_of']}: {account['says']}."]
     if account["alone"]:
         bars = [
             (
@@ -282,6 +290,6 @@ def _text(summary: dict[str, Any]) -> str:
             )
             for d in drivers
         ]
-        lines += [table(("quantity", "explains alone", sure, "rank correlation"), bars)]
+        lines += [table(("quantity", "share explained alone", sure, "rank correlation"), bars)]
     worst = summary["worst"][0]
-    return "\n".join([*lines, "", f"The worst member alone: {one_line(worst['replay'])}"])
+    return "\n".join([*lines, "", f"To simulate the worst member: {one_line(worst['replay'])}"])

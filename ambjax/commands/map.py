@@ -143,7 +143,7 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
         if one.stalled.any():
             many, lost = int(one.stalled.sum()), int(one.lost.sum())
             where = f"in {np.count_nonzero(one.stalled)} cells"
-            lines += [f"{case.name}: {lost} runs lost, {many} not decided ({where}): the integrator gave up there"]
+            lines += [f"{case.name}: {lost} runs lost, {many} not decided ({where}): the integrator stalled there"]
     header = [
         "case",
         "runs that survive",

@@ -1,6 +1,6 @@
-"""What the commands write: directories, files, JSON, tables, and remarks on stderr.
+"""Output of the commands: directories, files, JSON, tables, and remarks on stderr.
 
-Every file goes through `files`: all that a command writes is in its directory at once, or nothing of it is.
+Commands write files through `files`, which moves all of them into the output directory at the end, or none.
 """
 
 import contextlib
@@ -22,13 +22,13 @@ from ambjax.host.words import one_line
 
 
 def directory(out: str | None, name: str, names: Iterable[str] = ()) -> pathlib.Path:
-    """The directory to write to: as asked, or a new one under ./out. Made, and seen to be writable.
+    """Make the directory `out`, or a new one under ./out named `name`, check that it is writable, and return it.
 
-    Raises ValueError if it cannot be made or written, holds a study, whose files are not to be mixed with others, or
-    folders of these names, which files will have.
+    Raises ValueError if it cannot be made or written, if it holds the study of an ensemble, or if a file of `names`
+    cannot be written because a folder has that name.
     """
     path = target(out, name)
-    while out is None and not _made(path):  # another run was quicker
+    while out is None and not _made(path):  # another process made the same directory first
         path = target(out, name)
     for file in (MANIFEST, RESULT):
         with _refusal(path):
@@ -41,24 +41,26 @@ def directory(out: str | None, name: str, names: Iterable[str] = ()) -> pathlib.
 
 
 def check_places(out: pathlib.Path, names: Iterable[str | pathlib.PurePath]) -> None:
-    """Raises ValueError where files of these names, below `out`, cannot be put: a folder, or no folder, is there."""
+    """Raise ValueError if a folder has the path of a file of `names` below `out`, or a file the path of its folder."""
     for name in map(pathlib.PurePath, names):
         there = [
             parent for parent in name.parents[:-1] if os.path.lexists(out / parent) and not (out / parent).is_dir()
         ]
         if there:
-            raise ValueError(f"--out {out}: {there[0]} is no folder there. Move it away, or choose another directory.")
+            raise ValueError(
+                f"--out {out}: {there[0]} is there already and is not a folder. Move it, or choose another directory."
+            )
         if (out / name).is_dir() and not (out / name).is_symlink():
-            raise ValueError(f"--out {out}: {name} is a folder there. Move it away, or choose another directory.")
+            raise ValueError(f"--out {out}: {name} is a folder there. Move it, or choose another directory.")
 
 
 def spare(out: pathlib.Path, names: Iterable[str], mark: str) -> None:
-    """Raise ValueError where what has one of these names in `out` is not a file with this mark: it would be lost."""
+    """Raise ValueError if an entry of `out` has one of these names but not this mark, and would be overwritten."""
     for name in names:
         if os.path.lexists(out / name) and not _holds(out / name, mark):
             raise ValueError(
-                f"--out {out}: {name} is there already, not from an export of the same prefix, and would be lost. "
-                "Choose another directory, or move it away."
+                f"--out {out}: {name} is there already, is not from an export with the same prefix, and would be "
+                "overwritten. Choose another directory, or move the file."
             )
 
 
@@ -70,14 +72,14 @@ def _holds(path: pathlib.Path, mark: str) -> bool:
 
 
 def target(out: str | None, name: str) -> pathlib.Path:
-    """The directory to write to, which need not exist yet: as asked, or a new one under ./out.
+    """Return the directory to write to, without making it: `out`, or an unused name under ./out.
 
-    Raises ValueError for one without a name.
+    Raises ValueError if `out` is empty.
     """
     if out is not None:
         if not out.strip():
             raise ValueError(
-                "--out: the name of the directory is empty. Give one, '.' for this folder, or leave it out."
+                "--out: the name of the directory is empty. Give a name, '.' for this directory, or omit --out."
             )
         return pathlib.Path(out)
     candidates = (pathlib.Path("out") / (name if n == 1 else f"{name}-{n}") for n in itertools.count(1))
@@ -85,7 +87,7 @@ def target(out: str | None, name: str) -> pathlib.Path:
 
 
 def _made(path: pathlib.Path) -> bool:
-    """Make a new directory; False: it is there already. Raises ValueError if it cannot be made."""
+    """Make a new directory. Return False if it exists already. Raises ValueError if it cannot be made."""
     with _refusal(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -96,7 +98,7 @@ def _made(path: pathlib.Path) -> bool:
 
 
 def make(path: pathlib.Path) -> None:
-    """Make a directory and see that it can be written. Raises ValueError if not."""
+    """Make a directory and check that it is writable. Raises ValueError if it cannot be made or written."""
     with _refusal(path):
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
@@ -105,9 +107,10 @@ def make(path: pathlib.Path) -> None:
 
 @contextlib.contextmanager
 def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A folder to write in: what it holds at the end of the block moves into `out`, and nothing does if that fails.
+    """Context manager that yields a temporary folder, and moves its files into `out` when the block ends.
 
-    A directory that is empty then goes too. Raises ValueError where the disk is full or `out` cannot be written.
+    If the block fails, no file is moved, and `out` is removed if it is empty. Raises ValueError if the disk is full or
+    `out` cannot be written.
     """
     with _refusal(out):
         try:
@@ -128,16 +131,16 @@ def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
 
 @contextlib.contextmanager
 def _refusal(out: pathlib.Path) -> Iterator[None]:
-    """What the system has against writing, as a ValueError that names --out."""
+    """Context manager that turns an OSError into a ValueError that names --out."""
     try:
         yield
     except OSError as error:
         why = error.strerror or str(error)
-        raise ValueError(f"--out {out}: cannot write there ({why}). Make room, or choose another directory.") from None
+        raise ValueError(f"--out {out}: cannot write there ({why}). Free space, or choose another directory.") from None
 
 
 def plain(value: Any) -> Any:
-    """Numbers as JSON has them: arrays as lists, infinities and NaN as null."""
+    """Return a value in JSON's types: arrays become lists; infinities and NaN become None."""
     if isinstance(value, dict):
         return {k: plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -153,7 +156,7 @@ def write_json(path: pathlib.Path, value: Any) -> None:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Columns aligned by spaces."""
+    """Return a text table whose columns are aligned with spaces."""
     lines = [list(header), *map(list, rows)]
     widths = [max(len(line[c]) for line in lines) for c in range(len(header))]
     ruled = [lines[0], ["-" * w for w in widths], *lines[1:]]
@@ -161,11 +164,11 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def written(out: pathlib.Path, names: str) -> None:
-    """The last line of a command's answer: what is where."""
+    """Print the last line of a command's output: the files that it wrote, and where."""
     print(one_line(f"written: {out}/{names}"))
 
 
 def say(text: str) -> None:
-    """Progress and remarks, a line each, go to stderr: stdout is the answer alone. None of them stops anything."""
+    """Print progress or a remark as one line on stderr; stdout holds only results. A failure to print is ignored."""
     with contextlib.suppress(OSError, ValueError):
         print(one_line(text), file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""How long an ensemble takes, how it is cut into chunks for that, and what the sliding step is worth on it."""
+"""The duration of an ensemble, the size of its chunks, and the error of the sliding step on it."""
 
 import dataclasses
 import time
@@ -16,30 +16,30 @@ from ambjax.simulation.integrate import AdaptiveRodas3
 from ambjax.simulation.method import TOLERANCE
 from ambjax.simulation.sliding import slides
 
-# What a chunk takes, in s: so much is lost at most, and so long does the progress bar stand still.
+# Duration of a chunk, s: the work that an interruption loses, and the time between updates of the progress bar.
 BEAT = 2.0
 MOST_CHUNK = 65_536
-# Members of the pilot on an accelerator, whose calls are whole chunks.
+# Members of the pilot run, and of a chunk, on an accelerator, which computes a chunk in one call.
 BESIDE_CPU = 1024
-# A shorter run is not announced; for a longer one a faster method is named, in s.
+# Durations, s: a run shorter than SHORT is not announced; for one longer than LONG the message names a faster method.
 SHORT, LONG = 3.0, 60.0
-# Members on which the sliding step is compared with adaptive ones, and by what.
+# Members, and metrics, in which the sliding step is compared with adaptive steps.
 COMPARISON, BY = 16, ("settled_rms_error_m", "rms_u_V", "chatter_V")
 
 
 class Pace(NamedTuple):
-    """Members per second of this process on all its cores, and the worker processes that run instead (None: none)."""
+    """Members per second of this process on all its cores, and the number of worker processes (None: none)."""
 
     rate: float
     workers: int | None
 
     @property
     def whole(self) -> float:
-        """Members per second of the whole study, s^-1; workers elsewhere taken to be as fast as a core here."""
+        """Members per second of the whole study, s^-1, if each worker is as fast as one core of this machine."""
         return self.rate if self.workers is None else self.rate / cores() * self.workers
 
     def chunk(self, members: int) -> int:
-        """Members in a chunk: whole calls of what runs it, for about BEAT seconds, and enough chunks for all."""
+        """Return the members per chunk: a whole number of calls, about BEAT seconds, and two chunks per worker."""
         if jax.default_backend() != "cpu":
             return min(BESIDE_CPU, members)
         unit, rate = (CALL * cores(), self.rate) if self.workers is None else (CALL, self.rate / cores())
@@ -49,10 +49,10 @@ class Pace(NamedTuple):
 
 
 def pilot(study: Study) -> tuple[dict[str, np.ndarray], float]:
-    """The rows of the first members, as many as run here at once, and the seconds that they took.
+    """Simulate the first members, as many as run at once. Return their columns and the duration in seconds.
 
-    The program is compiled before, by rotors that are lost when they start: they cost next to nothing. Then a line says
-    what is waited for, where there is more to come: of slow members a call takes a minute.
+    The program is compiled first, on rotors that are lost at the start, which take almost no time. If more members
+    follow, a message announces the timing, because one call can take a minute.
     """
     first = min(CALL * cores() if jax.default_backend() == "cpu" else BESIDE_CPU, study.members)
     chunk(study, 0, first, first, lost=True)
@@ -64,7 +64,7 @@ def pilot(study: Study) -> tuple[dict[str, np.ndarray], float]:
 
 
 def say_how_long(study: Study, pace: Pace) -> None:
-    """Announce a run that takes more than a moment, and name the faster step where there is one."""
+    """Print the expected duration of a run longer than SHORT, and a faster method where the case allows one."""
     seconds = study.members / pace.whole
     if seconds < SHORT:
         return
@@ -75,12 +75,12 @@ def say_how_long(study: Study, pace: Pace) -> None:
         and isinstance(study.clock.method, AdaptiveRodas3)
         and slides(study.cascade, study.scenario.plant)
     ):
-        words += '; clock.method = "sliding" would be faster: its error is measured and told'
+        words += '; clock.method = "sliding" would be faster, and its error is measured and printed'
     say(words)
 
 
 def duration(seconds: float) -> str:
-    """A time in words, two digits."""
+    """Return a time in s, min or h, to two digits."""
     for size, unit in ((3600.0, "h"), (60.0, "min")):
         if seconds >= 2 * size:
             return f"{seconds / size:.2g} {unit}" if seconds < 10 * size else f"{seconds / size:.0f} {unit}"
@@ -88,10 +88,10 @@ def duration(seconds: float) -> str:
 
 
 def sliding_error(study: Study) -> dict[str, Any]:
-    """The largest relative difference of each metric in BY between this study's steps and adaptive ones.
+    """Return the largest relative difference of each metric in BY between this study's steps and adaptive steps.
 
-    Over those of its first members whom both hold (None: no such member); `lost_by_one` counts those whom one of them
-    loses, or cannot decide, and not the other.
+    The difference is taken over the first COMPARISON members that survive in both (None: no such member).
+    `lost_by_one` counts the members that are lost, or not decided, with only one of the two.
     """
     tolerance = max(TOLERANCE, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps))
     accurate = dataclasses.replace(study, clock=dataclasses.replace(study.clock, method=AdaptiveRodas3(tolerance)))
@@ -102,16 +102,16 @@ def sliding_error(study: Study) -> dict[str, Any]:
     error: dict[str, Any] = {"members": count, "lost_by_one": int((ends[0] != ends[1]).sum())}
     for name in BY:
         a, b = (np.asarray(columns[name])[both] for columns in (ours, theirs))
-        size = np.maximum(np.abs(b), np.finfo(float).tiny)  # nothing to compare with: 0 if equal, else huge
+        size = np.maximum(np.abs(b), np.finfo(float).tiny)  # at a metric of 0: 0 if equal, else huge
         error[name] = float(np.max(np.abs(a - b) / size)) if both.any() else None
     return error
 
 
 def error_words(error: dict[str, Any]) -> str:
-    """The error of the sliding step in words."""
+    """Return the error of the sliding step in words."""
     words = f"sliding step against adaptive steps, {error['members']} members: "
     if error[BY[0]] is None:
-        words += "none is held by both"
+        words += "none survives with both"
     else:
         words += ", ".join(f"{name} off by {100 * error[name]:.2g} %" for name in BY) + " at most"
-    return f"{words}; {error['lost_by_one']} held by one of them only"
+    return f"{words}; {error['lost_by_one']} survive with only one"
