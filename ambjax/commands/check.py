@@ -1,4 +1,4 @@
-"""`ambjax check`: Theorem 1's conditions along a case, and beside them what decides on its processor."""
+"""`ambjax check`: check the conditions of Theorem 1 along a case, and the sampled conditions of its processor."""
 
 import argparse
 import dataclasses
@@ -13,14 +13,14 @@ from ambjax.theorem.sampled_report import Delays, SampledReport
 
 Summary = dict[str, Any]
 CONTINUOUS = (
-    "All of this is about continuous time, for which the theorem is: the case's [processor] is left out, its "
-    "converters and amplifier too, and signs without a layer have one. It decides nothing here."
+    "These conditions hold in continuous time, as the theorem does: they leave out the case's [processor], converters "
+    "and amplifier, and give a boundary layer to a sign without one. They do not decide the verdict of this case."
 )
 
 BAND = (
-    "At the samples from run.settle on. Disturbed by: the largest rate of the signal that the law acts on, beyond what "
-    "the law's sign asks for. Band: what the law keeps that signal in under such disturbances. Off by: the largest "
-    "difference between that signal and the plant's. Bound: the sum of both, for the plant's signal beside it."
+    "At the samples from run.settle on. Disturbed by: the largest rate of the law's signal without the part that the "
+    "law's sign commands. Band: the bound that the law keeps on its signal under this disturbance. Off by: the largest "
+    "difference between the law's signal and the plant's. Bound: band plus off by. Largest: the plant's signal."
 )
 
 
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 
 def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
-    """Print what decides on the case's processor. Keys of the summary, of which "holds" is the processor's."""
+    """Check and print the sampled conditions of the case's processor. Return keys of the summary, "holds" included."""
     from ambjax.ensemble.delays import delay_margin
     from ambjax.ensemble.replay import as_member, record_system
     from ambjax.theorem import advice, sampled_report
@@ -148,4 +148,4 @@ def _print_sampled(sampled: SampledReport) -> None:
         head = ("signal", "unit", "noise", "gain, per s", "disturbed by", "band", "off by", "bound", "largest", "note")
         print("\n" + table(head, bands) + "\n" + BAND)
     else:
-        print("\nNo bands: the run does not last, without noise neither.")
+        print("\nNo bands: the run ends early, with noise and without.")

@@ -1,4 +1,4 @@
-"""`ambjax map`: survival and error over a grid of two quantities, for one case or for several side by side."""
+"""`ambjax map`: map the survival and the error over two quantities, for one case or several side by side."""
 
 import argparse
 import itertools
@@ -20,7 +20,7 @@ from ambjax.numerics.records import numbers, within
 WRITTEN = ("map.png", "map.json")
 COUNT = 21
 MOST_CELLS = 1_000_000
-# Samples of all runs of a map over clock.sample_period: hours.
+# Largest number of samples, summed over all runs, of a map over clock.sample_period: hours of computation.
 MOST_TOTAL = 10_000_000_000
 FORM = "PATH=LOW:HIGH[:COUNT][:log], as in initial.z=-1e-3:1e-3:41 or plant.m=-20%:20%"
 
@@ -32,7 +32,9 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     axes = [(_axis("--x", args.x, case), _axis("--y", args.y, case)) for case in cases]
     cells = len(axes[0][0].values) * len(axes[0][1].values)
     if cells * args.members > MOST_CELLS:
-        raise ValueError(f"--members {args.members}: {cells} cells of so many exceed {MOST_CELLS:,} runs. Take fewer.")
+        raise ValueError(
+            f"--members {args.members}: times {cells} cells, it exceeds {MOST_CELLS:,} runs. Reduce either."
+        )
     for case, (x, y) in zip(cases, axes, strict=True):
         _check_samples(case, x, y, args.members)
     studies = [stepped(study, x, y) for study, (x, y) in zip(studies, axes, strict=True)]
@@ -42,7 +44,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         for case, study, (x, y) in zip(cases, studies, axes, strict=True):
             say(f"{case.name}: {cells} cells of {args.members}; method: {study.clock.method}")
             if args.members == 1 and case.spread.entries:
-                say(f"{case.name}: nominal, its [spread] is not drawn; --members N, N above 1, draws it.")
+                say(f"{case.name}: nominal: one member does not draw the [spread]; --members 2 or more does.")
             maps.append(grid(study, x, y))
         summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
         _draw(cases, maps, part / "map.png")
@@ -54,7 +56,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
 
 
 def _axis(flag: str, text: str, case: Case) -> Axis:
-    """An axis from its flag's text. Raises ValueError with the flag, the text and the form."""
+    """Return the axis that the option's text describes. Raises ValueError with the option, its text and the form."""
 
     def refuse(why: str) -> ValueError:
         return ValueError(f"{flag} {text}: {why}. Write {FORM}.")
@@ -64,7 +66,7 @@ def _axis(flag: str, text: str, case: Case) -> Axis:
     log = parts[-1] == "log"
     parts = parts[:-1] if log else parts
     if len(parts) not in (2, 3):
-        raise refuse("it must be a path and a range")
+        raise refuse("it must be a path, '=' and a range")
     known = places(case.cascade, case.scenario)
     nominal = float(case.clock.sample_period) if path == PERIOD else _nominal(known.get(path))
     try:
@@ -73,9 +75,9 @@ def _axis(flag: str, text: str, case: Case) -> Axis:
     except ValueError as error:
         raise refuse(str(error)) from None
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise refuse(f"the range must rise from one finite number to another, and it is {low:g} to {high:g}")
+        raise refuse(f"LOW must be less than HIGH, both finite; they are {low:g} and {high:g}")
     if not 2 <= count <= MOST_CELLS:
-        raise refuse(f"there must be 2 to {MOST_CELLS:,} values, and there are {count}")
+        raise refuse(f"COUNT must be 2 to {MOST_CELLS:,}, and it is {count}")
     field = SAMPLE_PERIOD if path == PERIOD else known[path].field if path in known else None
     if field is not None and not within(field.metadata, np.array([low, high])):
         raise refuse(f"{path} must be {numbers(field)}, and the range is {low:g} to {high:g}")
@@ -85,7 +87,7 @@ def _axis(flag: str, text: str, case: Case) -> Axis:
 
 
 def _check_samples(case: Case, x: Axis, y: Axis, members: int) -> None:
-    """Refuse sample periods beyond the run, and more samples than can be waited for."""
+    """Raise ValueError if an axis of sample periods makes runs with too few samples, or too many samples in all."""
     for flag, axis, other in (("--x", x, y), ("--y", y, x)):
         if axis.path != PERIOD:
             continue
@@ -95,19 +97,19 @@ def _check_samples(case: Case, x: Axis, y: Axis, members: int) -> None:
         if samples.min() < FEWEST_SAMPLES:
             raise ValueError(
                 f"{flag} {PERIOD}: it reaches {high:g} s, but clock.duration is {duration:g} s, and a run needs "
-                f"{FEWEST_SAMPLES} samples. End it at {duration / FEWEST_SAMPLES:g} s."
+                f"{FEWEST_SAMPLES} samples. Set HIGH to at most {duration / FEWEST_SAMPLES:g} s."
             )
         unsettled = axis.values[(samples - 1) * axis.values < case.settle]
         if unsettled.size:
             raise ValueError(
-                f"{flag} {PERIOD}: with {unsettled[0]:g} s no sample is at or behind run.settle = {case.settle:g} s. "
-                "End it lower, or begin run.settle earlier."
+                f"{flag} {PERIOD}: with {unsettled[0]:g} s no sample is at or after run.settle = {case.settle:g} s. "
+                "Lower HIGH or run.settle."
             )
         if duration / low > MOST_SAMPLES or total > MOST_TOTAL:
             raise ValueError(
-                f"{flag} {PERIOD}: from {low:g} s on it makes runs of up to {duration / low:.3g} samples, {total:.3g} "
-                f"in all; at most {MOST_SAMPLES:,} and {MOST_TOTAL:.0e} are taken. Begin it higher, or shorten "
-                "clock.duration."
+                f"{flag} {PERIOD}: from {low:g} s on, it makes runs of up to {duration / low:.3g} samples, {total:.3g} "
+                f"in all; at most {MOST_SAMPLES:,} a run and {MOST_TOTAL:.0e} in all are allowed. Raise LOW, or "
+                "shorten clock.duration."
             )
 
 
@@ -119,7 +121,7 @@ def _value(text: str, nominal: float | None) -> float:
     if not text.endswith("%"):
         return float(text)
     if nominal is None or not math.isfinite(nominal) or nominal == 0:
-        raise ValueError("per cent need a number other than 0 to refer to, and the case has none there")
+        raise ValueError("per cent need a number other than 0 in the case, and the case has none at this path")
     return nominal * (1 + float(text[:-1]) / 100)
 
 
@@ -148,24 +150,24 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
         "case",
         "runs that survive",
         "cells in which all survive",
-        *[f"cells surely above {100 * SURE:g} %"] * sure,
+        *[f"cells above {100 * SURE:g} % with confidence"] * sure,
     ]
     head = f"{first.x.path} survived at {first.y.path} = {first.y.values[first.middle]:.3g}"
     return "\n".join([table([*header, head], rows), *lines])
 
 
 def _unsure(one: Map) -> str:
-    """Why a map says nothing about the confidence of its cells."""
+    """Return why a map makes no confidence statement about its cells."""
     if not one.varied:
-        return "no noise, and nothing is spread: all runs of a cell are alike, and one decides it"
+        return "without noise and [spread], all runs of a cell are the same, and one decides it"
     enough = next(n for n in itertools.count(1) if wilson(n, n).low >= SURE)
     runs = f"{one.members} run{'s' * (one.members > 1)} a cell"
-    return f"{runs}: too few for a confidence statement about a cell; --members {enough} or more allow one"
+    return f"{runs}: too few for a confidence statement about a cell; give --members {enough} or more"
 
 
 def _spread_words(one: Map) -> str:
-    """What a map shows of the case's spread."""
-    return f"drawn for each member: {', '.join(one.drawn)}" if one.drawn else "nominal: nothing is spread"
+    """Return in words which quantities a map draws for each member."""
+    return f"drawn for each member: {', '.join(one.drawn)}" if one.drawn else "nominal: no quantity is drawn"
 
 
 def _draw(cases: list[Case], maps: list[Map], path: Any) -> None:
@@ -188,7 +190,7 @@ def _draw(cases: list[Case], maps: list[Map], path: Any) -> None:
 
 
 def _short(one: Map) -> str:
-    """What a map shows, for a title: spread quantities by name, or how many they are."""
+    """Return the spread quantities for a title: up to three names, else their number."""
     few = len(one.drawn) <= 3
     what = ", ".join(one.drawn) if few else f"{len(one.drawn)} quantities"
     words = f"spread: {what}" if what else "nominal"
