@@ -1,4 +1,4 @@
-"""`ambjax export`: the controller of a case as C, and the proof that it is that controller."""
+"""`ambjax export`: write the controller of a case as C, and verify the C against JAX."""
 
 import argparse
 import dataclasses
@@ -21,9 +21,9 @@ from ambjax.export.statements import PRECISIONS, RESERVED
 from ambjax.export.twins import LoopCase as Compared
 
 Summary = dict[str, Any]
-# What --verify writes beside the package's files.
+# Files that --verify adds to the package.
 VERIFIED = ("verify.md", "verify.json")
-# Names that a header of C has already.
+# Names of headers of C.
 TAKEN = {
     *("assert", "complex", "ctype", "errno", "fenv", "inttypes", "iso646", "limits", "locale", "math", "setjmp"),
     *("signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time", "wchar"),
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         if checks:
             (part / VERIFIED[0]).write_text(verify.table(checks, case.name, mark), encoding="utf-8")
             write_json(part / VERIFIED[1], {"from": mark, "ok": ok, "checks": [x._asdict() for x in checks]})
-    if not checks:  # what was verified is not there any more
+    if not checks:  # an earlier run's verification does not hold for the new files
         for name in VERIFIED:
             (out / name).unlink(missing_ok=True)
     if not args.json:
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 
 def guarded_for(case: Case) -> Any:
-    """The cascade of a case with the limits of its guard, wide enough for the sensor at both ends of every spread."""
+    """Return the cascade of a case with limits of its guard that fit the sensor at both ends of every spread."""
     wide = ends(case.spread, case.cascade, case.scenario, ("sensor.", "run.clearance", "plant.s_0"))[1]
     cascade = guarded(case.cascade, wide, float(case.clock.sample_period))
     if cascade.processor is None or cascade.processor.guard is None:
@@ -80,22 +80,27 @@ def guarded_for(case: Case) -> Any:
 def _verified(
     case: Case, controller: Controller, precision: str, prefix: str, origin: Origin
 ) -> tuple[dict[str, str], list[verify.Check]]:
-    """The files, and the checks of them in both precisions."""
-    say("verify: one step at 10,000 points and at 10,000 of other parameters, then the closed loop, in both precisions")
+    """Return the files in one precision, and the checks in both precisions."""
+    say(
+        "verify, in both precisions: a step at 10,000 points, at 10,000 points of other parameters, and the closed loop"
+    )
     drafts = {name: verify.draft(controller, name, prefix, origin) for name in PRECISIONS}
     checks = verify.verify(drafts, Compared(case.cascade, case.scenario, case.clock, case.settle))
     return dict(drafts[precision].files), checks
 
 
 def _prefix(asked: str | None, name: str) -> str:
-    """What all names of the C begin with. Raises ValueError for what is no name in C."""
+    """Return the prefix of all names of the C: `asked`, or one made from the case's name.
+
+    Raises ValueError if `asked` is not a valid name in C.
+    """
     if asked is None:
         found = re.sub(r"\W", "_", name, flags=re.ASCII)
         return found if _is_name(found) else f"amb_{found}"
     if not _is_name(asked):
         raise ValueError(
-            f"--prefix {asked}: it must be a name in C, letters, digits and '_', and neither one of its words nor of "
-            "its headers. Use --prefix controller, for example."
+            f"--prefix {asked}: it must be a name in C: letters, digits and '_', and neither a keyword nor the name of "
+            "a header. Use --prefix controller, for example."
         )
     return asked
 

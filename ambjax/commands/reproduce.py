@@ -1,4 +1,4 @@
-"""`ambjax reproduce`: the paper's scenarios, figures and claims."""
+"""`ambjax reproduce`: simulate the paper's scenarios, draw its figures and judge its claims."""
 
 import argparse
 import contextlib
@@ -19,7 +19,7 @@ from ambjax.paper.evidence import Evidence, gather
 from ambjax.pictures import figures
 
 Summary = dict[str, Any]
-# How the picture of all readings on the processor names those that were tuned.
+# Labels of the tuned readings in readings.png.
 SHOWN_AS: dict[str, str] = {"tuned": "tuned in continuous time", "sampled": "tuned for the processor"}
 
 
@@ -32,7 +32,7 @@ def _paper_figures(reading: str, evidence: Evidence, out: pathlib.Path) -> None:
 
 
 def _names() -> Iterator[str]:
-    """Of all that is written."""
+    """Yield the names of all files that the command writes."""
     yield from ("readings.png", "ledger.md", "ledger.json")
     for reading, number in itertools.product(paper.READINGS, figures.PAPER_FIGURES):
         yield f"figure_{number}.png" if reading == "repaired" else f"{reading}/figure_{number}.png"
@@ -40,11 +40,13 @@ def _names() -> Iterator[str]:
 
 @contextlib.contextmanager
 def _alive() -> Iterator[None]:
-    """The death of a worker process as a ValueError."""
+    """Context manager that turns the death of a worker process into a ValueError."""
     try:
         yield
     except BrokenExecutor:
-        raise ValueError("a worker process died, perhaps for want of memory. Nothing is kept: begin again.") from None
+        raise ValueError(
+            "a worker process died, perhaps because memory ran out. Nothing is kept: start again."
+        ) from None
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
@@ -64,7 +66,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
             bar.set_description_str(f"{text:<34}")
             bar.update()
 
-        # Tracing holds the interpreter, so the reading of another structure has one of its own; a thread draws.
+        # Tracing keeps the interpreter busy: the noisy readings run in another process, and a thread draws.
         evidence, jobs = {}, []
         with _alive(), ThreadPoolExecutor(1) as artist, processes(1) as other:
             theirs = {reading: other.submit(gather, reading) for reading in paper.NOISY}

@@ -1,6 +1,6 @@
-"""What a case says that is allowed but hardly meant: a remark for each, in words, before it is run.
+"""Warnings about numbers of a case that are allowed but probably wrong, printed before the case is run.
 
-Units that were taken for others above all: they are SI, and bearings are described in millimetres.
+The most common cause is a wrong unit: a case file has SI units, and bearings are often described in millimetres.
 """
 
 import dataclasses
@@ -15,29 +15,29 @@ from ambjax.cases.reader import Case, read_case
 from ambjax.commands.outputs import say
 from ambjax.host.words import one_line
 
-# Gaps, areas of a pole and permeabilities that are built, with room to spare: the paper's are 5e-3, 0.121, 1.25e-6.
+# Usual ranges of the gap (m), the area of a pole (m^2) and the permeability (N/A^2). The paper's: 5e-3, 0.121, 1.25e-6.
 GAPS, AREAS, PERMEABILITIES = (2e-5, 2e-2), (1e-6, 1.0), (6e-7, 2.5e-6)
-# The number of a plant whose default holds for every machine.
+# The plant's parameter whose default fits every machine.
 GRAVITY = "g"
-# Noise beyond this share of the gap tells little of where in it the rotor is.
+# Largest share of the gap that the standard deviation of the position sensor may have without a warning.
 MOST_NOISE = 0.1
 
 
 def read_aloud(path: str | pathlib.Path) -> Case:
-    """A case file read for a command: what is doubtful in it is said on stderr. Raises ValueError as `read_case`."""
+    """Read a case file and print its warnings on stderr. Raises ValueError as `read_case` does."""
     case = read_case(path)
     print_warnings(case, path)
     return case
 
 
 def print_warnings(case: Case, path: str | pathlib.Path) -> None:
-    """Say what is doubtful in a case, a line each."""
+    """Print the warnings about a case on stderr, one line each."""
     for warning in warnings_of(case):
         say(one_line(f"{path}: {warning}"))
 
 
 def warnings_of(case: Case) -> list[str]:
-    """One line with path, value, why and what may have been meant, for each number of a case that is hardly meant."""
+    """Return one line for each doubtful number of a case: its path, its value, the reason, and the probable cause."""
     return [*_assumed(case), *_sizes(case), *_noise(case), *_velocity(case), *_currents(case), *_motion(case)]
 
 
@@ -48,7 +48,7 @@ def _assumed(case: Case) -> Iterator[str]:
         f"{field.name} = {getattr(plant, field.name):g} {field.metadata['unit']}".removesuffix(" 1") for field in fields
     ]
     if left:
-        yield f"[plant] leaves out numbers, which keep the paper's values: {', '.join(left)}. Write those that differ."
+        yield f"[plant] omits numbers, which keep the paper's values: {', '.join(left)}. Give those that differ."
 
 
 def _sizes(case: Case) -> Iterator[str]:
@@ -59,7 +59,7 @@ def _sizes(case: Case) -> Iterator[str]:
         ("mu_0", plant.mu_0, PERMEABILITIES, "N/A^2: that of air is 1.257e-6", "another unit"),
     ):
         if not low <= value <= high:
-            yield f"plant.{name} = {value:g} {usual}. Was {slip} meant?"
+            yield f"plant.{name} = {value:g} {usual}. Is it in {slip}?"
     if plant.k_z > 0:
         yield f"plant.k_z = {plant.k_z:g} N/m pushes the rotor away from z = 0; a bearing that restores has k_z < 0."
 
@@ -68,7 +68,7 @@ def _noise(case: Case) -> Iterator[str]:
     sensor, gap = case.scenario.sensor, case.scenario.plant.s_0
     if sensor is not None and sensor.std > MOST_NOISE * gap:
         share = 100 * sensor.std / gap
-        yield f"sensor.std = {sensor.std:g} m is {share:.3g} % of the gap, {gap:g} m. Was another unit meant?"
+        yield f"sensor.std = {sensor.std:g} m is {share:.3g} % of the gap, {gap:g} m. Is it in another unit?"
 
 
 def _velocity(case: Case) -> Iterator[str]:
@@ -76,24 +76,24 @@ def _velocity(case: Case) -> Iterator[str]:
     perfect = sensor is None or (sensor.velocity and sensor.std_z_dot == 0)
     if perfect and not (sensor is None and case.cascade.processor is None):
         yield (
-            "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ANY ERROR, which no bearing does. Give it an "
-            "error, or velocity = false and an observer that estimates it."
+            "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ANY ERROR, as no real sensor does. Set "
+            "sensor.std_z_dot, or set sensor.velocity = false and use an observer that estimates the velocity."
         )
 
 
 def reversal(case: Case, most_i: float) -> Iterator[str]:
-    """Said of a run whose largest |i| (A) the case does not show: that it asks one coil for a current the other way.
+    """Yield a warning if the largest |i| of a run, `most_i` (A), exceeds the bias and reverses a coil.
 
-    Of the paper's plant alone: what two coils carry is not told by i, half their difference.
+    Only for the lumped plant. With two coils, i is half the difference of their currents and does not show a reversal.
     """
     if case.scenario.plant.lumped and most_i > case.scenario.plant.i_0:
-        yield f"|i| reaches {most_i:.4g} A, {_beyond(case)} plant.kind = 'two-coil' gives each coil its own."
+        yield f"|i| reaches {most_i:.4g} A, {_beyond(case)} plant.kind = 'two-coil' simulates each coil's current."
 
 
 def _beyond(case: Case) -> str:
     i_0 = case.scenario.plant.i_0
     return (
-        f"above the bias plant.i_0 = {i_0:g} A: one coil's current, i_0 - |i|, is reversed; not every drive does that."
+        f"above the bias plant.i_0 = {i_0:g} A: one coil's current, i_0 - |i|, is reversed; not every drive can do it."
     )
 
 
@@ -103,7 +103,7 @@ def _currents(case: Case) -> Iterator[str]:
         yield f"initial.i = {scenario.initial.i:g} A is {beyond}"
     weight = plant.m * plant.g / plant.k_i  # v = 4 i_0 i / s_0^2 at z = 0
     if abs(weight) > plant.i_0:
-        yield f"plant: to carry the rotor at z = 0 takes {abs(weight):.4g} A, {beyond} Check m, n, A, s_0 and i_0."
+        yield f"plant: carrying the rotor at z = 0 takes {abs(weight):.4g} A, {beyond} Check m, n, A, s_0 and i_0."
     if plant.R * abs(weight) > scenario.u_max:
         least = plant.R * abs(weight)
         yield f"actuator.u_max = {scenario.u_max:g} V is less than the {least:.4g} V that carry the rotor at z = 0."
@@ -114,10 +114,10 @@ def _motion(case: Case) -> Iterator[str]:
     period, fall = float(clock.sample_period), 1 / math.sqrt(plant.k_s / plant.m)
     if scenario.sensor is not None and period > fall:
         yield (
-            f"clock.sample_period = {period:g} s, for which a measurement's error is held, is longer than the "
-            f"{fall:.3g} s in which the rotor falls to a side. Were milliseconds or microseconds meant?"
+            f"clock.sample_period = {period:g} s, for which each measurement error is held, is longer than the time "
+            f"constant of the unstable rotor, {fall:.3g} s. Is it in milliseconds or microseconds?"
         )
     wide = widest(case.spread, case.cascade, scenario)
     far, stop = reach(wide, clock), float(np.min(wide.touchdown))
     if not far < stop:
-        yield f"reference: it may reach {far:.4g} m, and the rotor touches down at {stop:.4g} m (run.clearance)."
+        yield f"reference: it may reach {far:.4g} m, but the rotor touches down at {stop:.4g} m (run.clearance)."
