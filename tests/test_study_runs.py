@@ -395,7 +395,7 @@ def test_the_sliding_step_needs_its_inversion_law(capsys):
     text = HARD.replace("dt = 5e-5", 'method = "sliding"')
     text = text.replace("gamma = 3.5e5\np = 25.0", 'kind = "closed-form"')
     err = refused(["ensemble", write(text), "--members", "3"], capsys)
-    assert 'clock.method = "sliding": it is made for controller.inversion.kind = "adaptive"' in err
+    assert 'clock.method = "sliding": it needs controller.inversion.kind = "adaptive"' in err
 
 
 def test_stalled_members_are_told_apart(capsys):
