@@ -411,11 +411,11 @@ ARGUMENTS = {
     "seed": (["ensemble", "case.toml", "--members", "9", "--seed", "9" * 30], ["--seed", "4294967295"]),
 }
 MAPS = {
-    "count of 1e12": ("plant.m=0.5:0.6:1000000000000", ["--x", "2 to 1,000,000 values"]),
+    "count of 1e12": ("plant.m=0.5:0.6:1000000000000", ["--x", "2 to 1,000,000"]),
     "count of 5,000 digits": ("plant.m=0.5:0.6:" + "9" * 5000, ["--x"]),
     "beyond a field's range": ("plant.m=-1:1:3", ["--x", "from 1e-06 to 1e+06 (kg)"]),
     "period of nothing": ("clock.sample_period=1e-300:1e-4:3", ["from 1e-09"]),
-    "period that takes years": ("clock.sample_period=1e-9:1e-4:3", ["2e+09 samples", "Begin it higher"]),
+    "period that takes years": ("clock.sample_period=1e-9:1e-4:3", ["2e+09 samples", "Raise LOW"]),
     "period beyond the run": ("clock.sample_period=1e-4:5:3", ["reaches 5 s", "clock.duration is 2 s"]),
 }
 
