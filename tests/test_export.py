@@ -378,13 +378,13 @@ def test_the_example_of_the_readme_compiles_and_reads_what_the_step_reads(tmp_pa
 def test_the_header_says_what_is_fixed_and_what_is_checked():
     header = text(cascade=CASCADES["the paper's"])["amb.h"]
     for line in (
-        "Fixed at export: T = 0.0001 s, the laws, which signs are hard, whether the delay is",
+        "Fixed at export: T = 0.0001 s, the laws, which signs have no layer, and whether the",
         "params->limits.u_max: u is limited to +-200 V.",
         "params->processor.guard: a reading is refused beyond |z| = 0.0045 m, |z_dot| = 100 m/s, |i| = 25 A, or if it",
         "18 samples in a row (0.0018 s); then u = 0.",
         "params->limits: a step is invalid beyond |r| = 0.01 m, |r_dot| = 100 m/s, |r_ddot| = 1e+06 m/s^2.",
         "params->inversion.p: finite, else every step is invalid.",
-        "An invalid or failed step holds u, and so does the next: there is no timeout. The caller decides how long.",
+        "An invalid or failed step holds u. There is no timeout: the caller decides for how many steps u may be held.",
     ):
         assert f" * {line}\n" in header
     header = text(u_max=INF, processor=Processor(1.0, guard=None))["amb.h"]
