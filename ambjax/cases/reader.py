@@ -172,7 +172,7 @@ def _left_out(table: Table, plant: Bearing) -> tuple[str, ...]:
 
 def _cascade(table: Table, plant: Bearing, processor: Processor | None) -> Cascade:
     table.only(["model", *KINDS])
-    model = table.table("model").record(Plant, base=plant)  # lumped, whatever the true plant is
+    model = table.table("model").record(Plant, base=plant)  # always lumped, even for a two-coil plant
     laws = {}
     for stage, kinds in KINDS.items():
         law = table.table(stage)

@@ -45,7 +45,7 @@ def points(trace: Trace, count: int, seed: int = 0) -> Points:
     borders = _borders(trace, x[:, started & np.isfinite(x[own.size :]).all(axis=0)][:, :POOL])
     borders = borders[:, _seen(trace, borders, np.ones(borders.shape[1], bool))[1]]
     borders = borders[:, random.permutation(borders.shape[1])[: count // 2]]
-    # most random states demand more voltage than the supply has: add some that do not
+    # most random states saturate the voltage: add some that do not
     far, normal = _seen(trace, x, started)
     calm = np.flatnonzero(started & normal & ~far)[: int(CALM * count)]
     rest = np.setdiff1d(np.flatnonzero(normal), calm)[: count - calm.size - borders.shape[1]]
@@ -57,7 +57,7 @@ def points(trace: Trace, count: int, seed: int = 0) -> Points:
 def varied(trace: Trace, count: int, seed: int = 2) -> Points:
     """Return points with other parameters: each alone at every end of its range, then all at random ends.
 
-    The ends are `Number.ends`. They include values that a step must refuse.
+    The ends are `Number.ends`. They include values that a step must reject.
     """
     random, dtype = np.random.default_rng(seed), PRECISIONS[trace.precision]
     cases = [(k, end) for k, x in enumerate(trace.parameters) if x.allowed != UNREAD for end in x.ends]
@@ -92,7 +92,7 @@ def _split(trace: Trace, x: np.ndarray, started: np.ndarray) -> Points:
 def _seen(trace: Trace, x: np.ndarray, started: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return whether the voltage is at its limit or held, and whether no intermediate number is subnormal.
 
-    JAX takes a subnormal number for 0 on CPUs, and C does not.
+    On CPUs, JAX replaces a subnormal number by 0, and C does not.
     """
     values, normal = evaluated(trace, x, started), np.ones(x.shape[1], bool)
     for value in values:
@@ -105,13 +105,13 @@ def _seen(trace: Trace, x: np.ndarray, started: np.ndarray) -> tuple[np.ndarray,
 def _drawn(trace: Trace, random: np.random.Generator, parameters: np.ndarray) -> np.ndarray:
     """Return random states and inputs of either sign, over decades, with zeros, limits and non-finite numbers."""
     sizes, count = np.array(_sizes(trace)), parameters.shape[1]
-    limits = np.ones((sizes.size, count))  # without a guard a reading has none
+    limits = np.ones((sizes.size, count))  # without a guard, readings have no limit
     for k, x in enumerate(trace.parameters):
         if x.name in INPUTS_AT:
             limits[len(trace.state) + INPUTS_AT[x.name]] = parameters[k]
     shape = sizes.size, count
     x = sizes[:, None] * 10.0 ** random.uniform(*DECADES, shape) * random.choice([-1.0, 1.0], shape)
-    x *= (np.arange(count) % 7 > 0) | (random.random(shape) < 0.5)  # in every seventh point half are 0
+    x *= (np.arange(count) % 7 > 0) | (random.random(shape) < 0.5)  # in every seventh point, half of the numbers are 0
     edges = [0.0 * limits, -0.0 * limits, 1e-30 * sizes[:, None] * np.ones(shape)]
     edges += [sign * limits * (1 + off) for sign in (1, -1) for off in (0, 4e-16, -2e-16, 2e-7, -1e-7)]
     edge = np.take_along_axis(np.array(edges), random.integers(len(edges), size=(1, *shape)), axis=0)[0]

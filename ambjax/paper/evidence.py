@@ -131,7 +131,7 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
     """Run all simulations and checks of a reading and return the evidence. `say` receives the name of each stage."""
     cascade = paper.cascade(reading)
     runs, checks = {}, {}
-    with ThreadPoolExecutor() as pool:  # compiling and running leave the interpreter free
+    with ThreadPoolExecutor() as pool:  # compiling and running release the interpreter
         say(f"{reading}: noise")
         periods = (float(paper.CLOCK.sample_period),) if cascade.processor else NOISE_PERIODS
         first = pool.submit(_noise, cascade, reading, periods[0])
@@ -143,7 +143,7 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
             runs[name] = _run(cascade, reading, name)
             checks[name] = checking.result()
         noisy = runs["tracking"].trajectory
-        if reading not in paper.NOISY:  # there it is the tracking scenario
+        if reading not in paper.NOISY:  # the tracking scenario of the others has the noise already
             noisy = _simulate(reading, cascade, paper.noisy(paper.scenario("tracking", reading))).trajectory
         say(f"{reading}: on a processor")
         on_processor = {True: runs["tracking"]} if cascade.processor else _on_processor(reading)

@@ -68,7 +68,7 @@ def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.
     height = 1.6 * len(panels) + 0.9
     figure = Figure(figsize=(7.0, height))
     axes = figure.subplots(len(panels), 1, sharex=True)
-    # Fixed margins (in inches over the height): a layout engine would draw everything twice.
+    # Fixed margins (in inches over the height): because a layout engine draws everything twice.
     figure.subplots_adjust(0.15, 0.5 / height, 0.97, 1 - 0.5 / height, hspace=0.2)
     for ax, panel in zip(axes, panels, strict=True):
         draw(ax, panel, trajectory)
@@ -130,7 +130,7 @@ def draw(
     if stretch is not None:
         _keep_scale(ax, [panel.factor * signal_of(rows, curve.signal)[t < lost_at] for curve in panel.curves])
     if len(panel.curves) > 1:
-        # Above the panel: inside, it would hide a peak of some run or other.
+        # Above the panel, because inside it could hide a peak.
         above = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "frameon": False, "borderaxespad": 0.1}
         ax.legend(fontsize=8, ncols=len(panel.curves), **above)
     if np.isfinite(lost_at):
@@ -177,7 +177,7 @@ def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:
         why = trajectory.lost_why.replace(": ", ":\n").replace(" reached ", "\nreached ")
         status = "not decided from" if trajectory.lost_code == STALLED else "lost at"
         words = f"{status} {lost_at:.4g} s\n{why}"
-        paper = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1}  # a curve may run behind the words
+        paper = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1}  # a curve may pass behind the text
         ax.text(0.99, 0.06, words, transform=ax.transAxes, ha="right", va="bottom", fontsize=7, color=INK, bbox=paper)
 
 

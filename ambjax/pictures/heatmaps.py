@@ -127,7 +127,7 @@ def _outline(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, inside: np.ndar
     row, column = np.nonzero(inside[1:] != inside[:-1])
     at = y_edges[row + 1]
     level = np.stack([np.stack([x_edges[column], at], 1), np.stack([x_edges[column + 1], at], 1)], 1)
-    # a white seam below all of the line, so that it is seen on dark cells
+    # a white seam below the whole line makes it visible on dark cells
     for colour, stroke in (("white", width + 1.4), (INK, width)):
         lines = LineCollection([*upright, *level], colors=colour, linewidths=stroke, capstyle="projecting")
         ax.add_collection(lines, autolim=False)
