@@ -107,7 +107,8 @@ def _seed_option(command: Parser) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run a command and return its exit code: 0 done, 1 done but the answer is no, 2 wrong input.
 
-    Without a command, print the commands that a new user runs first.
+    0: done. 1: done, and the answer is no. 2: bad input. Without a command, print the commands that a new user runs
+    first.
     """
     words = sys.argv[1:] if argv is None else argv
     if words[:1] == ["tune"]:

@@ -355,7 +355,7 @@ def test_a_compiler_that_takes_nan_for_a_number_is_refused(tmp_path):
         (tmp_path / name).write_text(made[name])
     assert not compiles(tmp_path, "amb.c", "-std=c99", "-O3")
     for flag in ("-ffast-math", "-ffinite-math-only", "-Ofast"):
-        assert "NaN and infinity must be seen" in compiles(tmp_path, "amb.c", "-std=c99", flag), flag
+        assert "NaN and infinity must be detected" in compiles(tmp_path, "amb.c", "-std=c99", flag), flag
 
 
 @compiled
@@ -378,13 +378,13 @@ def test_the_example_of_the_readme_compiles_and_reads_what_the_step_reads(tmp_pa
 def test_the_header_says_what_is_fixed_and_what_is_checked():
     header = text(cascade=CASCADES["the paper's"])["amb.h"]
     for line in (
-        "Fixed at export: T = 0.0001 s, the laws, which signs are hard, whether the delay is",
+        "Fixed at export: T = 0.0001 s, the laws, which signs have no layer, and whether the",
         "params->limits.u_max: u is limited to +-200 V.",
         "params->processor.guard: a reading is refused beyond |z| = 0.0045 m, |z_dot| = 100 m/s, |i| = 25 A, or if it",
         "18 samples in a row (0.0018 s); then u = 0.",
         "params->limits: a step is invalid beyond |r| = 0.01 m, |r_dot| = 100 m/s, |r_ddot| = 1e+06 m/s^2.",
         "params->inversion.p: finite, else every step is invalid.",
-        "An invalid or failed step holds u, and so does the next: there is no timeout. The caller decides how long.",
+        "An invalid or failed step holds u. There is no timeout: the caller decides for how many steps u may be held.",
     ):
         assert f" * {line}\n" in header
     header = text(u_max=INF, processor=Processor(1.0, guard=None))["amb.h"]
@@ -433,7 +433,7 @@ def test_the_directory_compiles_and_tests_itself(case, tmp_path, capsys):
     assert sorted(x.name for x in (tmp_path / "c").iterdir()) == names
     done = subprocess.run(["make", "test"], cwd=tmp_path / "c", capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "100 of 100 steps as JAX makes them" in done.stdout
+    assert "100 of 100 steps agree with JAX" in done.stdout
 
 
 def contents(out):
@@ -518,7 +518,7 @@ COMPILERS = {
     ),
     "nothing that it makes may run": (
         f'#!/bin/sh\ncc "$@" || exit 1; {LAST} chmod a-x "$2"',
-        "what {cc} made cannot be run in ",
+        "the output of {cc} cannot be run in ",
     ),
     "it has no sanitizers": (
         '#!/bin/sh\ncase "$*" in *sanitize*) echo "ld: cannot find -lasan" >&2; exit 1 ;; esac; exec cc "$@"',
@@ -531,7 +531,7 @@ COMPILERS = {
     ),
     "its libraries are none": (
         f'#!/bin/sh\ncc "$@" || exit 1; case "$*" in *-shared*) {LAST} echo > "$2" ;; esac',
-        "what {cc} made cannot be loaded in ",
+        "the output of {cc} cannot be loaded in ",
     ),
 }
 
@@ -550,7 +550,7 @@ def test_a_machine_that_decides_nothing_is_told_as_that(case, tmp_path, capsys, 
 def test_programs_that_do_not_end_or_find_no_room_decide_nothing(case, tmp_path, capsys, monkeypatch):
     out = ("--out", tmp_path / "c", "--verify")
     monkeypatch.setattr(machine, "PATIENCE", 1e-9)
-    assert "did not end within 1e-09 s, and nothing is decided" in refused(capsys, case, *out)
+    assert "did not end within 1e-09 s, so the check is not decided" in refused(capsys, case, *out)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
     assert "cannot write to the folder for temporary files (No such file" in refused(capsys, case, *out)
     with pytest.raises(ValueError, match="cannot write to the folder for temporary files"):

@@ -24,7 +24,7 @@ def test_the_vectors_on_a_small_processor(name, to, tmp_path):
     for file, content in text(cascade=CASCADES[name], to=to).items():
         (tmp_path / file).write_text(content)
     code, said = cortex.run([tmp_path / "amb.c", tmp_path / "amb_test.c"], tmp_path)
-    assert "100 of 100 steps as JAX makes them, 0 faults" in said
+    assert "100 of 100 steps agree with JAX, 0 faults" in said
     assert code == 0
 
 

@@ -117,11 +117,11 @@ X, Y = "initial.z=-1e-5:1e-5:3", "initial.z_dot=-1e-3:1e-3:3"
 @pytest.mark.parametrize(
     ("x", "y", "words"),
     [
-        ("initial.z", Y, "it must be a path and a range"),
-        ("initial.z=1e-5:-1e-5", Y, "the range must rise"),
-        ("initial.z=0:nan", Y, "the range must rise"),
+        ("initial.z", Y, "it must be a path, '=' and a range"),
+        ("initial.z=1e-5:-1e-5", Y, "LOW must be less than HIGH"),
+        ("initial.z=0:nan", Y, "LOW must be less than HIGH"),
         ("initial.z=0:abc", Y, "could not convert"),
-        ("initial.z=0:1e-5:1", Y, "2 to 1,000,000 values"),
+        ("initial.z=0:1e-5:1", Y, "COUNT must be 2 to 1,000,000"),
         ("initial.z=0:1e-5:2.5", Y, "invalid literal"),
         ("initial.z=0:1e-5:5:log", Y, "must begin above 0"),
         ("initial.z=-10%:10%", Y, "per cent need a number other than 0"),
@@ -132,9 +132,9 @@ X, Y = "initial.z=-1e-5:1e-5:3", "initial.z_dot=-1e-3:1e-3:3"
         ("run.clearance=1e-3:5e-2:3", Y, "--x run.clearance=0.001:0.05: run.clearance reaches 0.05 m, but must stay"),
         (X, "plant.s_0=1e-6:1e-5", "--x initial.z=-1e-05:1e-05: |initial.z| reaches 1e-05 m, but must stay below"),
         ("disturbance.q_z.start=0.1:0.3", Y, "--x disturbance.q_z.start=0.1:0.3: disturbance.q_z.start reaches 0.3"),
-        ("clock.sample_period=1e-4:2e-3:5", Y, "a run needs 2 samples. End it at 0.001 s"),
-        (Y, "clock.sample_period=1e-4:2e-3:5", "a run needs 2 samples. End it at 0.001 s"),
-        ("clock.sample_period=1e-4:9e-4:5", Y, "with 0.0007 s no sample is at or behind run.settle = 0.0015 s"),
+        ("clock.sample_period=1e-4:2e-3:5", Y, "a run needs 2 samples. Set HIGH to at most 0.001 s"),
+        (Y, "clock.sample_period=1e-4:2e-3:5", "a run needs 2 samples. Set HIGH to at most 0.001 s"),
+        ("clock.sample_period=1e-4:9e-4:5", Y, "with 0.0007 s no sample is at or after run.settle = 0.0015 s"),
     ],
 )
 def test_bad_axes_are_refused_in_one_line(x, y, words, tmp_path, capsys, monkeypatch):
@@ -207,13 +207,13 @@ def test_confidence_is_stated_where_so_many_members_allow_it(members):
     assert one.decisive == (members >= 73)
     said = commands._text([case], [one])
     assert "75.0 %             75.0 %" in said
-    assert ("cells surely above 95 %" in said) == one.decisive
-    assert ("too few for a confidence statement about a cell; --members 73 or more" in said) != one.decisive
+    assert ("cells above 95 % with confidence" in said) == one.decisive
+    assert ("too few for a confidence statement about a cell; give --members 73 or more" in said) != one.decisive
     assert said.count("75.0 %") == 2 + one.decisive
     # where all members are alike, many are as good as one
     alike = one._replace(varied=False)
     assert "surely" not in commands._text([case], [alike])
-    assert "all runs of a cell are alike" in commands._text([case], [alike])
+    assert "all runs of a cell are the same" in commands._text([case], [alike])
     assert commands._summary(case, alike)["decisive"] is False
 
 
@@ -231,7 +231,7 @@ def test_the_command_draws_and_prints_two_cases_side_by_side(tmp_path, capsys):
     text = capsys.readouterr().out
     assert "one" in text
     assert "two" in text
-    assert "one: nominal: nothing is spread" in text
+    assert "one: nominal: no quantity is drawn" in text
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"map.png", "map.json"}
 
 
@@ -240,8 +240,8 @@ def test_the_command_says_what_is_drawn_and_what_is_not_decided(tmp_path, capsys
     argv = ["map", str(tmp_path / "case.toml"), "--x", X, "--y", Y, "--out", str(tmp_path / "out")]
     assert main(argv) == 0
     said = capsys.readouterr()
-    assert "its [spread] is not drawn; --members N" in said.err
-    assert "case: nominal: nothing is spread" in said.out
+    assert "one member does not draw the [spread]; --members 2" in said.err
+    assert "case: nominal: no quantity is drawn" in said.out
     run = maps.run_ensemble
 
     def stalling(*args, **options):
@@ -254,7 +254,7 @@ def test_the_command_says_what_is_drawn_and_what_is_not_decided(tmp_path, capsys
     assert main([*argv, "--members", "2"]) == 0
     text = capsys.readouterr().out
     assert "case: drawn for each member: plant.m" in text
-    assert "case: 0 runs lost, 1 not decided (in 1 cells): the integrator gave up there" in text
+    assert "case: 0 runs lost, 1 not decided (in 1 cells): the integrator stalled there" in text
     (found,) = json.loads((tmp_path / "out" / "map.json").read_text())["cases"]
     assert found["stalled"] == [[1, 0, 0], [0, 0, 0], [0, 0, 0]]
     assert found["survival"][0][0] == 0.5

@@ -334,6 +334,6 @@ def test_in_continuous_time_behind_sensors(law):
 def test_no_sliding_step_behind_a_differentiator(kind):
     """That would step it by Heun's method, far beyond its stability."""
     case = {"controller": {"observer": {"kind": kind}}, "clock": {"method": "sliding"}}
-    with pytest.raises(ValueError, match=r"^clock.method = \"sliding\": .* behind any observer but \"ired-1\""):
+    with pytest.raises(ValueError, match=r"^clock.method = \"sliding\": .* an observer other than \"ired-1\""):
         case_from(case)
     case_from(case | {"controller": {"observer": {"kind": "kalman"}}})

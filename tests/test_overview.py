@@ -140,5 +140,5 @@ def test_a_stretch_outside_the_run_is_refused(case, flags, capsys):
     assert main(["simulate", case, *flags]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert "the stretch must lie within 0 to 0.05 s, clock.duration" in error
+    assert "both must lie within 0 to 0.05 s (clock.duration)" in error
     assert not pathlib.Path("out").exists()

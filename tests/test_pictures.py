@@ -183,7 +183,7 @@ def test_fan_does_not_let_one_member_hide_the_rest(tmp_path, drawn):
     pictures.fan(t, {"z - r": bands}, {}, "one went astray", tmp_path / "fan.png")
     ax = drawn[0].axes[0]
     assert ax.get_ylim()[1] < 60  # µm: the others reach 24
-    assert "band goes to 4500 µm, beyond this axis" in texts(drawn[0])
+    assert "band reaches 4500 µm, beyond this axis" in texts(drawn[0])
 
 
 def test_fan_does_not_let_a_brief_transient_hide_the_rest(tmp_path, drawn):
@@ -210,7 +210,7 @@ def test_fan_smooths_a_median_that_chatters(tmp_path, drawn):
 
 
 def test_fan_refuses_unknown_quantity(tmp_path):
-    with pytest.raises(ValueError, match=r"'w'; it knows z - r, z, sigma"):
+    with pytest.raises(ValueError, match=r"'w'. Use one of z - r, z, sigma"):
         pictures.fan(np.zeros(1), {"w": {50: np.zeros(1)}}, {}, "", tmp_path / "fan.png")
     assert not (tmp_path / "fan.png").exists()
 

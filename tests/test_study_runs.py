@@ -154,7 +154,7 @@ def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(flags):
     kept = finished_chunks("out")
     assert 2 <= kept < many // 32
     said = [line for line in err.splitlines() if line.startswith("ambjax: ")]
-    again = "To go on, give the same command with --out out --resume."
+    again = "To continue, repeat the command with --out out --resume."
     assert said == [f"ambjax: interrupted: {32 * kept} of {many} members are kept. {again}"]
     assert "Traceback" not in err
     for path in pathlib.Path("out", "chunks").glob("*.npz"):
@@ -395,7 +395,7 @@ def test_the_sliding_step_needs_its_inversion_law(capsys):
     text = HARD.replace("dt = 5e-5", 'method = "sliding"')
     text = text.replace("gamma = 3.5e5\np = 25.0", 'kind = "closed-form"')
     err = refused(["ensemble", write(text), "--members", "3"], capsys)
-    assert 'clock.method = "sliding": it is made for controller.inversion.kind = "adaptive"' in err
+    assert 'clock.method = "sliding": it needs controller.inversion.kind = "adaptive"' in err
 
 
 def test_stalled_members_are_told_apart(capsys):
@@ -436,8 +436,8 @@ BAD = {
     "negative scale": ("ensemble --members 9", "plant.R = { normal = -1.0 }\n", ["spread.plant.R", "-1"]),
     "per cent of zero": ("ensemble --members 9", "initial.i = { percent = 1 }\n", ["spread.initial.i", "uniform"]),
     "spread simulated": ("simulate", "plant.k_z = { percent = -5 }\n", ["spread.plant.k_z", "-5"]),
-    "seed of nobody": ("simulate --seed 3", "", ["--seed and --members belong to --member"]),
-    "members of nobody": ("simulate --members 3", "", ["--seed and --members belong to --member"]),
+    "seed of nobody": ("simulate --seed 3", "", ["--seed and --members need --member"]),
+    "members of nobody": ("simulate --members 3", "", ["--seed and --members need --member"]),
     "member -1": ("simulate --member -1", "", ["--member -1", "from 0 to 2147483647"]),
     "member N": ("simulate --member 9 --members 9", "", ["--member 9", "from 0 to 8"]),
     "member huge": ("simulate --member 1099511627776", "", ["--member 1099511627776", "from 0 to 2147483647"]),

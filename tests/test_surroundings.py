@@ -211,7 +211,7 @@ def test_a_folder_in_the_place_of_a_file_is_seen_before_the_work(name, monkeypat
     monkeypatch.setattr(simulate, "simulate", None)
     pathlib.Path("out", name).mkdir(parents=True)
     assert main(["simulate", write(SHORT), "--out", "out"]) == 2
-    assert f"--out out: {name} is a folder there. Move it away" in capsys.readouterr().err
+    assert f"--out out: {name} is a folder there. Move it, or choose" in capsys.readouterr().err
 
 
 def test_files_move_all_or_not_at_all(monkeypatch):

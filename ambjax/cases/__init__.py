@@ -1,1 +1,1 @@
-"""Case files: read, checked, doubted, and written as templates."""
+"""Case files: reading, checks, and templates."""

@@ -1,4 +1,4 @@
-"""How far a case asks the rotor to go: a reference beyond the clearance is refused where the case is read."""
+"""Check that the reference of a case stays within the clearance."""
 
 import math
 
@@ -11,27 +11,27 @@ from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import Scenario
 from ambjax.world.signals import BandNoise, Sum
 
-# Instants at which a signal is sampled at a time.
+# Instants per block at which a signal is sampled.
 BLOCK = 2**16
-# Members at the ends of a spread whose sums are sampled.
+# Largest number of combinations of the ends of a spread at which a sum is sampled.
 MOST_CORNERS = 64
 
 
 def reach(scenario: Scenario, clock: Clock) -> float:
-    """A bound on |r| over the run, m; over all members where leaves are arrays. Reached but for sums and noise."""
+    """Return a bound on |r| over the run and over all members, m. A sum or noise may stay below the bound."""
     return max(map(abs, scenario.reference.span(float(clock.duration))))
 
 
 def widest(spread: Spread, cascade: Cascade, scenario: Scenario) -> Scenario:
-    """The scenario with the ends of every spread of reference and clearance, each on an axis of its own."""
+    """Return the scenario with the ends of every spread of reference and clearance, each on its own array axis."""
     return ends(spread, cascade, scenario, ("reference.", "plant.s_0", "run.clearance"))[1]
 
 
 def check_reference(spread: Spread, cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
-    """Raise ValueError for a reference that leaves the clearance, with how far it goes and the fix.
+    """Raise ValueError, with the largest |r| and the fix, if the reference leaves the clearance.
 
-    Of a sum or of noise, whose bound may never be reached, samples decide: of the case, and of up to MOST_CORNERS
-    combinations of the ends of its spread, where there are no more.
+    A sum or noise may never reach its bound, so its samples decide: those of the case, and those of all combinations of
+    the ends of its spread if there are at most MOST_CORNERS.
     """
     _compare("reference", scenario, clock)
     wide = widest(spread, cascade, scenario)
@@ -57,7 +57,7 @@ def _compare(what: str, scenario: Scenario, clock: Clock) -> None:
 
 
 def sampled(scenario: Scenario, clock: Clock) -> float:
-    """Largest |r| at the samples of the run, m."""
+    """Return the largest |r| at the samples of the run, m."""
     signal, far = scenario.realised().reference, 0.0
     for first in range(0, clock.samples, BLOCK):
         t = np.arange(first, first + BLOCK).clip(max=clock.samples) * float(clock.sample_period)

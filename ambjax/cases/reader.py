@@ -1,7 +1,7 @@
-"""Case files: TOML in, cascade, scenario and clock out; strict, and with errors for people.
+"""Reader of case files: from TOML to a cascade, a scenario and a clock.
 
-An unknown key, a wrong type, a number out of bounds or two settings that contradict each other is a
-ValueError whose one line names the dotted path, the value, what is allowed and the fix.
+The reader is strict. An unknown key, a wrong type, a number out of bounds or a contradiction of two settings raises a
+ValueError with one line: the dotted path, the value, what is allowed and the fix.
 """
 
 import dataclasses
@@ -75,23 +75,24 @@ TABLES = [
     "run",
     "spread",
 ]
-OTHERS = ["tune"]  # read by ambjax tune; the commands here pass it by
+OTHERS = ["tune"]  # read by the tuner, ignored by the other commands
 UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
-# Terms of a sum: each is compiled.
+# Largest number of terms of a sum; each term is compiled.
 MOST_TERMS = 100
-SETTLE = leaf(default=0.5, unit="s", at_least=0, at_most=1e6, doc='from when "settled" metrics count')
+SETTLE = leaf(default=0.5, unit="s", at_least=0, at_most=1e6, doc='time from which "settled" metrics count')
 (DELAY,) = (field for field in dataclasses.fields(Processor) if field.name == "delay")
 FIELDS = {field.name: field for kind in (Scenario, Clock) for field in dataclasses.fields(kind)}
-# A name enters titles, paths, tables and pages: whatever means something there is left out of it.
+# Characters that are replaced in the name of a case, which appears in titles, paths, tables and pages; its length.
 UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """What a case file says. `settle` in s; `method` as chosen or asked for, for every spread, is in the clock.
+    """The contents of a case file.
 
-    `text`: the file as it was read, byte for byte in UTF-8. `assumed`: names of the plant's numbers that the file
-    leaves at the paper's values although it gives others of them; empty where it gives all or none.
+    `clock` has the integration method, given or chosen, that fits every end of the spread. `settle`: time from which
+    "settled" metrics count, s. `text`: the file as it was read. `assumed`: names of the plant's parameters that the
+    file omits while it gives others; they keep the paper's values. Empty if the file gives all or none.
     """
 
     name: str
@@ -105,9 +106,9 @@ class Case:
 
 
 def read_case(path: str | pathlib.Path) -> Case:
-    """Read and check a case file.
+    """Read and check the case file at `path`, and return the case.
 
-    Raises ValueError, one line, for anything wrong with the file or in it.
+    Raises ValueError, one line, if the file cannot be read or any part of it is invalid.
     """
     path = pathlib.Path(path)
     raw, text = load(path)
@@ -118,12 +119,12 @@ def read_case(path: str | pathlib.Path) -> Case:
 
 
 def safe_name(text: str) -> str:
-    """The text without what means something in a path, a title, a table or a page, and not too long."""
+    """Return the text with unsafe characters of paths, titles, tables and pages replaced, cut to LONGEST_NAME."""
     return UNSAFE.sub("_", text)[:LONGEST_NAME].strip() or "case"
 
 
 def case_from(raw: dict[str, Any], name: str = "case", text: str = "") -> Case:
-    """A case from a parsed TOML document of this text. Raises ValueError as `read_case` does."""
+    """Return the case of a parsed TOML document `raw` with source `text`. Raises ValueError as `read_case` does."""
     check_depth(raw)
     top = Table(raw)
     top.only([*TABLES, *OTHERS])
@@ -136,8 +137,8 @@ def case_from(raw: dict[str, Any], name: str = "case", text: str = "") -> Case:
     if isinstance(clock.method, Slide) and not slides(cascade, scenario.plant):
         made = " or ".join(f'"{kind}"' for kind, law in KINDS["inversion"].items() if law.slides)
         raise ValueError(
-            f'clock.method = "sliding": it is made for controller.inversion.kind = {made} in continuous time, on a '
-            'lumped plant, behind any observer but "ired-1" and "ired-2". Use method = "adaptive".'
+            f'clock.method = "sliding": it needs controller.inversion.kind = {made}, continuous time, a lumped plant, '
+            'and an observer other than "ired-1" and "ired-2". Use method = "adaptive".'
         )
     _check_start(scenario)
     settle = duration / 4 if settle is None else settled(settle, clock)
@@ -164,7 +165,7 @@ def _plant(table: Table) -> Bearing:
 
 
 def _left_out(table: Table, plant: Bearing) -> tuple[str, ...]:
-    """Names of the plant's numbers that its table leaves out; none where it gives no number at all."""
+    """Return the names of the plant's parameters that its table omits; none if the table gives no number at all."""
     names = [field.name for field in dataclasses.fields(plant) if field.metadata.get("leaf")]
     left = tuple(name for name in names if name not in table.raw)
     return left if len(left) < len(names) else ()
@@ -172,7 +173,7 @@ def _left_out(table: Table, plant: Bearing) -> tuple[str, ...]:
 
 def _cascade(table: Table, plant: Bearing, processor: Processor | None) -> Cascade:
     table.only(["model", *KINDS])
-    model = table.table("model").record(Plant, base=plant)  # lumped, whatever the true plant is
+    model = table.table("model").record(Plant, base=plant)  # always lumped, even for a two-coil plant
     laws = {}
     for stage, kinds in KINDS.items():
         law = table.table(stage)
@@ -187,7 +188,7 @@ def _signal(table: Table, extra: tuple[str, ...] = ()) -> Any:
         table.only(["kind", "terms", *extra])
         terms = table.raw.get("terms")
         if not isinstance(terms, list) or not terms:
-            raise ValueError(f"{table.at('terms')} = {show(terms)}: give a list of at least one signal table.")
+            raise ValueError(f"{table.at('terms')} = {show(terms)}: it must be a list of at least one signal table.")
         if len(terms) > MOST_TERMS:
             raise ValueError(f"{table.at('terms')}: {len(terms)} terms are too many; give at most {MOST_TERMS}.")
         return signals.Sum(tuple(_signal(Table(t, f"{table.at('terms')}[{n}]")) for n, t in enumerate(terms)))
@@ -251,6 +252,6 @@ def _check_start(scenario: Scenario) -> None:
         raise ValueError(f"run.clearance = {stop:g} m: it must be less than the gap plant.s_0 = {gap:g} m.")
     if not abs(z) < stop:
         raise ValueError(
-            f"initial.z = {z:g} m: the rotor would touch its stop at once; |z| must be below {stop:g} m "
+            f"initial.z = {z:g} m: the rotor would touch its stop at the start; |z| must be less than {stop:g} m "
             "(run.clearance, by default 0.9 of plant.s_0)."
         )

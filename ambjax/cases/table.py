@@ -1,4 +1,4 @@
-"""TOML being read strictly, a file and one table of it: what every reader of case files is built on."""
+"""Strict reading of TOML: a file, and one table of it. All readers of case files use it."""
 
 import dataclasses
 import difflib
@@ -9,18 +9,18 @@ from typing import Any
 from ambjax.host.words import one_line
 from ambjax.numerics.records import check_number, numbers, validate, within
 
-# What of a key or a value is shown; keys beyond this length are like no other.
+# Characters of a key or a value that a message shows.
 LONGEST = 60
-# No case nests deeper than a sum of sums; whatever walks one may rely on it.
+# Largest depth of nested tables and lists. A sum of sums needs less; the readers rely on the limit.
 DEEPEST = 32
-# No case file is larger: what is, is something else.
+# Largest size of a case file.
 MOST_BYTES = 10_000_000
 
 
 def load(path: str | pathlib.Path) -> tuple[dict[str, Any], str]:
-    """A case file as parsed TOML, not yet checked, and its text. Raises ValueError, one line, if it is none.
+    """Return a case file as parsed TOML, not yet checked, and its text. Raises ValueError, one line, if it is not TOML.
 
-    Read once and no more: a pipe gives nothing the second time.
+    The file is read only once, because it may be a pipe.
     """
     path = pathlib.Path(path)
 
@@ -33,7 +33,7 @@ def load(path: str | pathlib.Path) -> tuple[dict[str, Any], str]:
     except OSError as error:
         raise refuse(f"cannot be read ({error.strerror}). Check the path and its permissions.") from None
     if len(content) > MOST_BYTES:
-        raise refuse(f"more than {MOST_BYTES:,} bytes are no case file. See 'ambjax template' for one.")
+        raise refuse(f"a case file has at most {MOST_BYTES:,} bytes, and this file has more. See 'ambjax template'.")
     try:
         text = content.decode("utf-8")
         return tomllib.loads(text), text
@@ -42,23 +42,23 @@ def load(path: str | pathlib.Path) -> tuple[dict[str, Any], str]:
     except tomllib.TOMLDecodeError as error:
         raise refuse(f"not valid TOML: {error}. See 'ambjax template' for a file to start from.") from None
     except RecursionError:
-        raise refuse(f"tables or lists are nested deeper than {DEEPEST}, which no case is.") from None
-    except ValueError:  # Python converts no number of thousands of digits
+        raise refuse(f"tables or lists are nested deeper than {DEEPEST} levels. Nest them less.") from None
+    except ValueError:  # Python refuses to convert thousands of digits
         raise refuse("a number has thousands of digits. Write it as in 1.5e3.") from None
 
 
 def check_depth(raw: Any) -> None:
-    """Refuse what is nested deeper than any case, before anything walks it."""
+    """Raise ValueError if tables or lists are nested deeper than DEEPEST."""
     level = [raw]
     for _ in range(DEEPEST):
         inner = (x.values() if isinstance(x, dict) else x for x in level if isinstance(x, (dict, list)))
         level = [x for values in inner for x in values]
     if level:
-        raise ValueError(f"tables or lists are nested deeper than {DEEPEST}, which no case is.")
+        raise ValueError(f"tables or lists are nested deeper than {DEEPEST} levels. Nest them less.")
 
 
 class Table:
-    """One TOML table being read: every key must be taken, and each complaint knows its dotted path."""
+    """A TOML table that is read strictly: an unknown key is an error, and each error names its dotted path."""
 
     def __init__(self, raw: Any, path: str = ""):
         if not isinstance(raw, dict):
@@ -66,11 +66,11 @@ class Table:
         self.raw, self.path = raw, path
 
     def at(self, key: str) -> str:
-        """Dotted path of a key."""
+        """Return the dotted path of a key."""
         return f"{self.path}.{cut(key)}" if self.path else cut(key)
 
     def only(self, allowed: list[str]) -> None:
-        """Refuse keys that mean nothing here, with a guess at what was meant."""
+        """Raise ValueError for a key that is not in `allowed`, and suggest a similar one."""
         for key in self.raw:
             if key not in allowed:
                 close = difflib.get_close_matches(key[:LONGEST], allowed, n=1)
@@ -81,11 +81,11 @@ class Table:
                 )
 
     def table(self, key: str) -> "Table":
-        """A table within this one; empty if left out."""
+        """Return a table within this one; empty if left out."""
         return Table(self.raw.get(key, {}), self.at(key))
 
     def number(self, key: str, default: Any, allowed: str = "a number") -> Any:
-        """A number, or the default if left out."""
+        """Return a number, or the default if left out. Raises ValueError, with `allowed`, for anything else."""
         value = self.raw.get(key, default)
         if value is default:
             return default
@@ -97,28 +97,28 @@ class Table:
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be {allowed}.") from None
 
     def leaf(self, key: str, field: dataclasses.Field, default: Any = None) -> Any:
-        """A number that the field of a record, or one like it, allows; or the default if left out."""
+        """Return a number within the bounds of `field`, or the default if left out. Raises ValueError out of bounds."""
         value = self.number(key, default, numbers(field))
         if key in self.raw:
             check_number(field, self.at(key), value)
         return value
 
     def whole(self, key: str, field: dataclasses.Field) -> int:
-        """A whole number, written as one, that the field allows; or its default if left out."""
+        """Return an integer within the bounds of `field`, or its default if left out. Raises ValueError otherwise."""
         value = self.raw.get(key, field.default)
         if isinstance(value, bool) or not isinstance(value, int) or not within(field.metadata, value):
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be {numbers(field)}.")
         return value
 
     def switch(self, key: str) -> bool | None:
-        """true or false; None if left out."""
+        """Return a Boolean; None if left out."""
         value = self.raw.get(key)
         if value is not None and not isinstance(value, bool):
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be true or false, without quotes.")
         return value
 
     def choice(self, key: str, allowed: list[str], default: str | None = None) -> str:
-        """One of several words."""
+        """Return one of the `allowed` words, or the default if left out. Raises ValueError for any other."""
         value = self.raw.get(key, default)
         if value is None:
             raise ValueError(f"{self.at(key)} is missing: it must be one of {quoted(allowed)}.")
@@ -129,7 +129,11 @@ class Table:
         return value
 
     def record(self, kind: type, extra: tuple[str, ...] = (), base: Any = None) -> Any:
-        """A record whose leaves are this table's keys, defaults from `base` or from the record itself."""
+        """Return a record of type `kind` whose leaves are this table's keys.
+
+        `extra`: further keys that the table may have. `base`: a record that gives the defaults, else `kind`. Raises
+        ValueError for an unknown or missing key, or a value out of bounds.
+        """
         fields = [field for field in dataclasses.fields(kind) if field.metadata.get("leaf")]
         self.only([*extra, *(f.name for f in fields)])
         values: dict[str, Any] = {}
@@ -144,7 +148,7 @@ class Table:
         return one
 
     def _check_order(self, record: Any) -> None:
-        """Refuse a pulse that ends before it starts, and its like."""
+        """Raise ValueError if the two leaves that the record orders, such as start and stop, are not in that order."""
         if pair := getattr(record, "ordered", None):
             low, high = (getattr(record, name) for name in pair)
             if not low < high:
@@ -152,7 +156,7 @@ class Table:
 
 
 def show(value: Any) -> str:
-    """A value as it would stand in the file, cut if it is long."""
+    """Return a value as a case file writes it, cut if it is long."""
     if isinstance(value, int) and abs(value) >= 10**LONGEST:  # Python refuses to write thousands of digits
         return f"a whole number of {len(hex(abs(value))) - 2} hexadecimal digits"
     if isinstance(value, list):
@@ -166,11 +170,11 @@ def show(value: Any) -> str:
 
 
 def cut(text: str) -> str:
-    """The text, or its beginning if it is long."""
+    """Return the text, or its beginning if it is long."""
     return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
 
 
 def quoted(words: list[str]) -> str:
-    """'a', 'b' or 'c'."""
+    """Return the words as 'a', 'b' or 'c'."""
     names = [f"'{w}'" for w in words]
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"

@@ -1,4 +1,4 @@
-"""The table [clock] of a case file: samples, their period, the integrator between them, and what is settled."""
+"""The table [clock] of a case file: samples, their period, and the integrator; and the check of run.settle."""
 
 import dataclasses
 import math
@@ -12,11 +12,11 @@ from ambjax.simulation.integrate import AdaptiveRodas3, Integrator, Rodas3, Slid
 METHODS: dict[str, type] = {"rk4": RK4, "dop853": DOP853, "euler": Euler, "rodas3": Rodas3, "sliding": Slide}
 # Substeps of the sliding step where dt = "auto".
 SLIDING_SUBSTEPS = 3
-# Rows that a run may record: 16 numbers each, so this is about 2.5 GB.
+# Largest number of rows of a run; with 16 numbers a row, about 2.5 GB.
 MOST_SAMPLES = 20_000_000
-# Metrics compare samples; and by how much two times that are the same may differ.
+# Samples that the metrics need; relative rounding error within which two times are equal.
 FEWEST_SAMPLES, ROUNDING = 2, 1e-9
-# Steps of a run with a given dt: hours.
+# Largest number of steps of a run with a given dt: hours of computation.
 MOST_STEPS = 10_000_000_000
 DURATION = leaf(default=2.0, unit="s", at_least=1e-9, at_most=1e6, doc="simulated time")
 DT = leaf(default=1e-6, unit="s", at_least=1e-15, at_most=1e6, doc="integration step")
@@ -24,7 +24,10 @@ DT = leaf(default=1e-6, unit="s", at_least=1e-15, at_most=1e6, doc="integration 
 
 
 def clock_from(table: Table) -> tuple[Clock, float]:
-    """The clock, its method None where it is to be chosen, and clock.duration, s. Raises ValueError as `read_case`."""
+    """Return the clock and clock.duration in s. The clock's method is None if the reader is to choose it.
+
+    Raises ValueError as `read_case` does.
+    """
     table.only(["duration", "sample_period", "dt", "method"])
     duration = table.leaf("duration", DURATION, DURATION.default)
     period = table.leaf("sample_period", SAMPLE_PERIOD, SAMPLE_PERIOD.default)
@@ -49,18 +52,18 @@ def clock_from(table: Table) -> tuple[Clock, float]:
 
 
 def settled(settle: float, clock: Clock) -> float:
-    """run.settle, s, of a run that has a sample from then on. Raises ValueError for one that has none."""
+    """Return run.settle, s. Raises ValueError if no sample of the run is at or after it."""
     last = (clock.samples - 1) * clock.sample_period
     if settle > (1 + ROUNDING) * last:
         raise ValueError(
             f"run.settle = {settle:g} s: it must be at most {last:.12g} s, the last sample of clock.duration = "
-            f"{clock.duration:g} s, or nothing is settled. Begin it earlier, or lengthen clock.duration."
+            f"{clock.duration:g} s. Lower run.settle, or lengthen clock.duration."
         )
     return min(settle, last)
 
 
 def _whole(ratio: float) -> int | None:
-    """The whole number of at least 1 that `ratio` is to rounding, or None."""
+    """Return `ratio` as an integer of at least 1 if it is one within rounding, else None."""
     nearest = round(ratio) if math.isfinite(ratio) else 0
     return nearest if nearest >= 1 and abs(ratio - nearest) <= ROUNDING * nearest else None
 
@@ -83,7 +86,7 @@ def _method(table: Table, period: float, samples: int) -> Integrator | None:
         )
     if samples * substeps > MOST_STEPS:
         raise ValueError(
-            f"{table.at('dt')} = {dt:g} s makes {samples * substeps:.3g} steps; at most {MOST_STEPS:.0e} are taken. "
+            f"{table.at('dt')} = {dt:g} s makes {samples * substeps:.3g} steps; at most {MOST_STEPS:.0e} are allowed. "
             'Use dt = "auto", or shorten clock.duration.'
         )
     return method(substeps)

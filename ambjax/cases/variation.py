@@ -1,4 +1,4 @@
-"""The table [spread] of a case file: dotted path = { how it is spread }."""
+"""The table [spread] of a case file: each dotted path is given a distribution."""
 
 from collections.abc import Callable
 from typing import Any
@@ -39,7 +39,7 @@ def _number(table: Table, key: str) -> float:
     return table.number(key, None)
 
 
-# How a number may be spread: the key in its table, and what it makes. A new distribution is one row here.
+# The distributions by their key in the table of a path. A new distribution needs one row here.
 DISTRIBUTIONS: dict[str, Callable[[Table], Distribution]] = {
     "percent": lambda t: Percent(_number(t, "percent"), t.choice("shape", list(SHAPES), SHAPES[0])),
     "normal": lambda t: Normal(_number(t, "normal")),
@@ -50,7 +50,7 @@ DISTRIBUTIONS: dict[str, Callable[[Table], Distribution]] = {
 
 
 def spread_from(top: Table, cascade: Cascade, scenario: Scenario) -> Spread:
-    """The [spread] of a case that has this cascade and scenario; empty if left out.
+    """Return the [spread] of a case with this cascade and scenario; empty if left out.
 
     Raises ValueError with the dotted path, the value, what is allowed and the fix.
     """
@@ -80,7 +80,7 @@ def _entries(raw: dict[str, Any], prefix: str, known: list[str]) -> list[tuple[s
 def _distribution(raw: Any, path: str) -> Distribution:
     where = f"spread.{path}"
     if not isinstance(raw, dict):
-        raise ValueError(f"{where} = {show(raw)}: it must say how to spread, as in {path} = {{ percent = 10 }}.")
+        raise ValueError(f"{where} = {show(raw)}: it must be a distribution, as in {path} = {{ percent = 10 }}.")
     table = Table(raw, where)
     kinds = [kind for kind in DISTRIBUTIONS if kind in raw]
     table.only(["percent", "shape"] if kinds == ["percent"] else kinds or list(DISTRIBUTIONS))
@@ -90,7 +90,7 @@ def _distribution(raw: Any, path: str) -> Distribution:
 
 
 def _refuse_nothing_in_two_units(spread: Spread, top: Table) -> None:
-    """A scaled force that is constantly 0 looks like no disturbance at all, whose unit is another."""
+    """Raise ValueError for a spread of a constant scaled force of 0: it reads as no disturbance, in another unit."""
     path = "disturbance.q_z.value"
     signal = top.raw.get("disturbance", {}).get("q_z", {})
     if path in spread.paths and signal.get("unit") == "A^2/m^2" and signal.get("value", 0) == 0:

@@ -37,7 +37,7 @@ PATIENCE = "10s"
 # If every member is lost, the fan chart ends at this multiple of the last loss time.
 BEYOND = 1.15
 BANDS = (0.0, 5.0, 25.0, 50.0, 75.0, 95.0, 100.0)
-GO_ON = "What is finished is kept: give the same command with --out and --resume to go on."
+GO_ON = "Finished chunks are kept: repeat the command with --out and --resume to continue."
 METRICS = ("settled_max_abs_error_m", "settled_rms_error_m", "max_abs_error_m", "max_abs_u_V", "rms_u_V", "max_abs_i_A")
 
 
@@ -115,8 +115,8 @@ def _state_words(store: Store) -> str:
     """Return the message of an interruption: how many members are kept, and how to resume."""
     if not store.begun():
         return "nothing is kept"
-    again = f"give the same command with --out {store.directory} --resume"
-    return f"{store.count()} of {store.members} members are kept. To go on, {again}"
+    again = f"repeat the command with --out {store.directory} --resume"
+    return f"{store.count()} of {store.members} members are kept. To continue, {again}"
 
 
 def _report(
@@ -151,19 +151,23 @@ def _executor(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]
         try:
             client = Client(args.cluster, timeout=PATIENCE)
         except (OSError, ValueError) as error:
-            raise ValueError(f"--cluster {args.cluster}: no scheduler answers there ({error}).") from None
+            raise ValueError(
+                f"--cluster {args.cluster}: no scheduler answers there ({error}). Check the address."
+            ) from None
         try:
             with client:
                 yield client.get_executor(), AHEAD * max(len(client.scheduler_info()["workers"]), 1)
         except (KilledWorker, CancelledError):
-            raise ValueError(f"--cluster {args.cluster}: it, or its workers again and again, died. {GO_ON}") from None
+            raise ValueError(
+                f"--cluster {args.cluster}: the cluster, or its workers repeatedly, died. {GO_ON}"
+            ) from None
     elif args.processes is not None:
         try:
             with processes(args.processes) as pool:
                 yield pool, AHEAD * args.processes
         except BrokenExecutor:
-            why = "a worker process died, perhaps for want of memory"
-            raise ValueError(f"--processes {args.processes}: {why}; fewer need less. {GO_ON}") from None
+            why = "a worker process died, perhaps because memory ran out; fewer processes need less"
+            raise ValueError(f"--processes {args.processes}: {why}. {GO_ON}") from None
     else:
         yield None
 
@@ -255,7 +259,7 @@ def _text(summary: dict[str, Any]) -> str:
     held = f"{summary['survivors']} of {summary['members']} members survive"
     lines = [f"{held}: {share:.4g} % ({sure} {low:.4g} to {high:.4g} %)"]
     if summary["stalled"]:
-        why = "the integrator gave up, and whether the rotor is held is not known"
+        why = "the integrator stalled, so whether the rotor survives is not known"
         lines += [f"{summary['lost']} lost, {summary['stalled']} not decided: {why}"]
     lines += [f"note: {note}" for note in summary["notes"]]
 
@@ -268,11 +272,11 @@ def _text(summary: dict[str, Any]) -> str:
         rows.append(
             (name, *(number(metric[key]["estimate"]) for key in ("median", "q95", "cvar_95")), number(metric["max"]))
         )
-    head = f"metric, of the {summary['survivors']} {summary['metrics_of']}"
+    head = f"metric over the {summary['survivors']} {summary['metrics_of']}"
     lines += ["", table((head, "median", "95 % quantile", "mean of worst 5 %", "largest"), rows)]
     drivers, account = summary["drivers"][statistics.DECIDING][:5], summary["explained"][statistics.DECIDING]
     if drivers:
-        lines += ["", f"What drives {statistics.DECIDING} of the {summary['metrics_of']}: {account['says']}."]
+        lines += ["", f"Quantities that drive {statistics.DECIDING} of the {summary['metrics_of']}: {account['says']}."]
     if account["alone"]:
         bars = [
             (
@@ -283,6 +287,6 @@ def _text(summary: dict[str, Any]) -> str:
             )
             for d in drivers
         ]
-        lines += [table(("quantity", "explains alone", sure, "rank correlation"), bars)]
+        lines += [table(("quantity", "share explained alone", sure, "rank correlation"), bars)]
     worst = summary["worst"][0]
-    return "\n".join([*lines, "", f"The worst member alone: {one_line(worst['replay'])}"])
+    return "\n".join([*lines, "", f"To simulate the worst member: {one_line(worst['replay'])}"])

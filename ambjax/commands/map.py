@@ -32,7 +32,9 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     axes = [(_axis("--x", args.x, case), _axis("--y", args.y, case)) for case in cases]
     cells = len(axes[0][0].values) * len(axes[0][1].values)
     if cells * args.members > MOST_CELLS:
-        raise ValueError(f"--members {args.members}: {cells} cells of so many exceed {MOST_CELLS:,} runs. Take fewer.")
+        raise ValueError(
+            f"--members {args.members}: times {cells} cells, it exceeds {MOST_CELLS:,} runs. Reduce either."
+        )
     for case, (x, y) in zip(cases, axes, strict=True):
         _check_samples(case, x, y, args.members)
     studies = [stepped(study, x, y) for study, (x, y) in zip(studies, axes, strict=True)]
@@ -42,7 +44,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         for case, study, (x, y) in zip(cases, studies, axes, strict=True):
             say(f"{case.name}: {cells} cells of {args.members}; method: {study.clock.method}")
             if args.members == 1 and case.spread.entries:
-                say(f"{case.name}: nominal, its [spread] is not drawn; --members N, N above 1, draws it.")
+                say(f"{case.name}: nominal: one member does not draw the [spread]; --members 2 or more does.")
             maps.append(grid(study, x, y))
         summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
         _draw(cases, maps, part / "map.png")
@@ -64,7 +66,7 @@ def _axis(flag: str, text: str, case: Case) -> Axis:
     log = parts[-1] == "log"
     parts = parts[:-1] if log else parts
     if len(parts) not in (2, 3):
-        raise refuse("it must be a path and a range")
+        raise refuse("it must be a path, '=' and a range")
     known = places(case.cascade, case.scenario)
     nominal = float(case.clock.sample_period) if path == PERIOD else _nominal(known.get(path))
     try:
@@ -73,9 +75,9 @@ def _axis(flag: str, text: str, case: Case) -> Axis:
     except ValueError as error:
         raise refuse(str(error)) from None
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise refuse(f"the range must rise from one finite number to another, and it is {low:g} to {high:g}")
+        raise refuse(f"LOW must be less than HIGH, both finite; they are {low:g} and {high:g}")
     if not 2 <= count <= MOST_CELLS:
-        raise refuse(f"there must be 2 to {MOST_CELLS:,} values, and there are {count}")
+        raise refuse(f"COUNT must be 2 to {MOST_CELLS:,}, and it is {count}")
     field = SAMPLE_PERIOD if path == PERIOD else known[path].field if path in known else None
     if field is not None and not within(field.metadata, np.array([low, high])):
         raise refuse(f"{path} must be {numbers(field)}, and the range is {low:g} to {high:g}")
@@ -95,19 +97,19 @@ def _check_samples(case: Case, x: Axis, y: Axis, members: int) -> None:
         if samples.min() < FEWEST_SAMPLES:
             raise ValueError(
                 f"{flag} {PERIOD}: it reaches {high:g} s, but clock.duration is {duration:g} s, and a run needs "
-                f"{FEWEST_SAMPLES} samples. End it at {duration / FEWEST_SAMPLES:g} s."
+                f"{FEWEST_SAMPLES} samples. Set HIGH to at most {duration / FEWEST_SAMPLES:g} s."
             )
         unsettled = axis.values[(samples - 1) * axis.values < case.settle]
         if unsettled.size:
             raise ValueError(
-                f"{flag} {PERIOD}: with {unsettled[0]:g} s no sample is at or behind run.settle = {case.settle:g} s. "
-                "End it lower, or begin run.settle earlier."
+                f"{flag} {PERIOD}: with {unsettled[0]:g} s no sample is at or after run.settle = {case.settle:g} s. "
+                "Lower HIGH or run.settle."
             )
         if duration / low > MOST_SAMPLES or total > MOST_TOTAL:
             raise ValueError(
-                f"{flag} {PERIOD}: from {low:g} s on it makes runs of up to {duration / low:.3g} samples, {total:.3g} "
-                f"in all; at most {MOST_SAMPLES:,} and {MOST_TOTAL:.0e} are taken. Begin it higher, or shorten "
-                "clock.duration."
+                f"{flag} {PERIOD}: from {low:g} s on, it makes runs of up to {duration / low:.3g} samples, {total:.3g} "
+                f"in all; at most {MOST_SAMPLES:,} a run and {MOST_TOTAL:.0e} in all are allowed. Raise LOW, or "
+                "shorten clock.duration."
             )
 
 
@@ -119,7 +121,7 @@ def _value(text: str, nominal: float | None) -> float:
     if not text.endswith("%"):
         return float(text)
     if nominal is None or not math.isfinite(nominal) or nominal == 0:
-        raise ValueError("per cent need a number other than 0 to refer to, and the case has none there")
+        raise ValueError("per cent need a number other than 0 in the case, and the case has none at this path")
     return nominal * (1 + float(text[:-1]) / 100)
 
 
@@ -143,12 +145,12 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
         if one.stalled.any():
             many, lost = int(one.stalled.sum()), int(one.lost.sum())
             where = f"in {np.count_nonzero(one.stalled)} cells"
-            lines += [f"{case.name}: {lost} runs lost, {many} not decided ({where}): the integrator gave up there"]
+            lines += [f"{case.name}: {lost} runs lost, {many} not decided ({where}): the integrator stalled there"]
     header = [
         "case",
         "runs that survive",
         "cells in which all survive",
-        *[f"cells surely above {100 * SURE:g} %"] * sure,
+        *[f"cells above {100 * SURE:g} % with confidence"] * sure,
     ]
     head = f"{first.x.path} survived at {first.y.path} = {first.y.values[first.middle]:.3g}"
     return "\n".join([table([*header, head], rows), *lines])
@@ -157,10 +159,10 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
 def _unsure(one: Map) -> str:
     """Explain why a map gives no confidence statement for its cells."""
     if not one.varied:
-        return "no noise, and nothing is spread: all runs of a cell are alike, and one decides it"
+        return "without noise and [spread], all runs of a cell are the same, and one decides it"
     enough = next(n for n in itertools.count(1) if wilson(n, n).low >= SURE)
     runs = f"{one.members} run{'s' * (one.members > 1)} a cell"
-    return f"{runs}: too few for a confidence statement about a cell; --members {enough} or more allow one"
+    return f"{runs}: too few for a confidence statement about a cell; give --members {enough} or more"
 
 
 def _spread_words(one: Map) -> str:

@@ -51,7 +51,7 @@ def check_places(out: pathlib.Path, names: Iterable[str | pathlib.PurePath]) -> 
                 f"--out {out}: {blocking[0]} is no folder there. Move it away, or choose another directory."
             )
         if (out / name).is_dir() and not (out / name).is_symlink():
-            raise ValueError(f"--out {out}: {name} is a folder there. Move it away, or choose another directory.")
+            raise ValueError(f"--out {out}: {name} is a folder there. Move it, or choose another directory.")
 
 
 def spare(out: pathlib.Path, names: Iterable[str], mark: str) -> None:
@@ -59,8 +59,8 @@ def spare(out: pathlib.Path, names: Iterable[str], mark: str) -> None:
     for name in names:
         if os.path.lexists(out / name) and not _holds(out / name, mark):
             raise ValueError(
-                f"--out {out}: {name} is there already, not from an export of the same prefix, and would be lost. "
-                "Choose another directory, or move it away."
+                f"--out {out}: {name} is there already, is not from an export with the same prefix, and would be "
+                "overwritten. Choose another directory, or move the file."
             )
 
 
@@ -79,7 +79,7 @@ def target(out: str | None, name: str) -> pathlib.Path:
     if out is not None:
         if not out.strip():
             raise ValueError(
-                "--out: the name of the directory is empty. Give one, '.' for this folder, or leave it out."
+                "--out: the name of the directory is empty. Give a name, '.' for this directory, or omit --out."
             )
         return pathlib.Path(out)
     candidates = (pathlib.Path("out") / (name if n == 1 else f"{name}-{n}") for n in itertools.count(1))
@@ -135,7 +135,7 @@ def _refusal(out: pathlib.Path) -> Iterator[None]:
         yield
     except OSError as error:
         why = error.strerror or str(error)
-        raise ValueError(f"--out {out}: cannot write there ({why}). Make room, or choose another directory.") from None
+        raise ValueError(f"--out {out}: cannot write there ({why}). Free space, or choose another directory.") from None
 
 
 def plain(value: Any) -> Any:

@@ -111,7 +111,7 @@ def error_words(error: dict[str, Any]) -> str:
     """Return the error of the sliding step as text."""
     words = f"sliding step against adaptive steps, {error['members']} members: "
     if error[BY[0]] is None:
-        words += "none is held by both"
+        words += "none survives with both"
     else:
         words += ", ".join(f"{name} off by {100 * error[name]:.2g} %" for name in BY) + " at most"
-    return f"{words}; {error['lost_by_one']} held by one of them only"
+    return f"{words}; {error['lost_by_one']} survive with only one"

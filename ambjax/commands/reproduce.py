@@ -44,7 +44,9 @@ def _alive() -> Iterator[None]:
     try:
         yield
     except BrokenExecutor:
-        raise ValueError("a worker process died, perhaps for want of memory. Nothing is kept: begin again.") from None
+        raise ValueError(
+            "a worker process died, perhaps because memory ran out. Nothing is kept: start again."
+        ) from None
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:

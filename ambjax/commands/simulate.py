@@ -39,8 +39,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     _check(numbers, args.case)
     if replayed is not None and replayed.deviation > replayed.rounding:
         say(
-            f"trajectory.npz and overview.png are not exactly this member's: their metrics differ from those of the "
-            f"ensemble, which metrics.json holds, by up to {100 * replayed.deviation:.2g} %."
+            f"trajectory.npz and overview.png repeat this member only approximately: their metrics differ by up to "
+            f"{100 * replayed.deviation:.2g} % from those of the ensemble, which metrics.json holds."
         )
     for warning in reversal(case, float(numbers["max_abs_i_A"])):
         say(warning)
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         which = "" if study is None else " for the nominal case"
         look = (
             f" {command('ambjax', 'check', args.case)} compares the gains with the conditions of Theorem 1{which}; "
-            f"{command('ambjax', 'tune', args.case)} looks for gains that hold it."
+            f"{command('ambjax', 'tune', args.case)} searches for gains that hold the rotor."
         )
         say(words if metrics["stalled"] else words + look)
     return int(ended), metrics | {"out": str(out)}
@@ -80,7 +80,7 @@ def _check(numbers: dict[str, Any], path: str) -> None:
     wrong = [name for name, x in numbers.items() if not (np.isfinite(x) or (name.endswith("_s") and x == math.inf))]
     if wrong:
         raise ValueError(
-            f"{path}: {', '.join(wrong)}: no finite number came of this run, so nothing is written. That is a fault of "
+            f"{path}: {', '.join(wrong)}: this run gave no finite number, so nothing is written. This is a defect of "
             "ambjax, not of the case: please report it with the case file."
         )
 
@@ -92,8 +92,8 @@ def _window(case: Case, args: argparse.Namespace) -> tuple[float, float] | None:
     period, last = float(case.clock.sample_period), float(case.clock.duration)
     begin, end = 0.0 if args.begin is None else args.begin, last if args.end is None else args.end
     if not (begin >= 0 and begin + period * (1 - 1e-9) <= end <= last * (1 + 1e-9)):
-        limits = f"the stretch must lie within 0 to {last:g} s, clock.duration, and be at least {period:g} s long"
-        raise ValueError(f"--from {begin:g} --to {end:g}: {limits}, clock.sample_period. Choose other times.")
+        limits = f"both must lie within 0 to {last:g} s (clock.duration), and --to at least {period:g} s after --from"
+        raise ValueError(f"--from {begin:g} --to {end:g}: {limits} (clock.sample_period). Choose other times.")
     return begin, end
 
 
@@ -101,15 +101,15 @@ def _study(case: Case, args: argparse.Namespace) -> Study | None:
     """Return the study that contains member --member, or None without that option. Raises ValueError."""
     if args.member is None:
         if args.seed is not None or args.members is not None:
-            raise ValueError("--seed and --members belong to --member: add it, or set run.seed in the case file.")
+            raise ValueError("--seed and --members need --member: add --member K, or set run.seed in the case file.")
         return None
     if case.spread.design == "latin-hypercube" and args.members is None:
-        raise ValueError("--member: add --members N, the size of the ensemble; a Latin hypercube depends on it.")
+        raise ValueError("--member: add --members N, the size of the ensemble, on which a Latin hypercube depends.")
     from ambjax.commands.ensemble import study_of
 
     study = study_of(case, args.seed, MOST_MEMBERS if args.members is None else args.members)
     if not study.varies:
-        raise ValueError("--member: nothing in this case differs from member to member; add [spread], or leave it out.")
+        raise ValueError("--member: all members of this case are the same. Add [spread] to the case, or omit --member.")
     if not 0 <= args.member < study.members:
         raise ValueError(f"--member {args.member}: it must be a whole number from 0 to {study.members - 1}.")
     return study

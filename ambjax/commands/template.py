@@ -1,4 +1,4 @@
-"""`ambjax template`: an annotated case file."""
+"""`ambjax template`: print an annotated case file."""
 
 import argparse
 from typing import Any

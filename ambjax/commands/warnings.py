@@ -45,7 +45,7 @@ def _assumed(case: Case) -> Iterator[str]:
         f"{field.name} = {getattr(plant, field.name):g} {field.metadata['unit']}".removesuffix(" 1") for field in fields
     ]
     if left:
-        yield f"[plant] leaves out numbers, which keep the paper's values: {', '.join(left)}. Write those that differ."
+        yield f"[plant] omits numbers, which keep the paper's values: {', '.join(left)}. Give those that differ."
 
 
 def _sizes(case: Case) -> Iterator[str]:
@@ -56,7 +56,7 @@ def _sizes(case: Case) -> Iterator[str]:
         ("mu_0", plant.mu_0, PERMEABILITIES, "N/A^2: that of air is 1.257e-6", "another unit"),
     ):
         if not low <= value <= high:
-            yield f"plant.{name} = {value:g} {usual}. Was {slip} meant?"
+            yield f"plant.{name} = {value:g} {usual}. Is it in {slip}?"
     if plant.k_z > 0:
         yield f"plant.k_z = {plant.k_z:g} N/m pushes the rotor away from z = 0; a bearing that restores has k_z < 0."
 
@@ -65,7 +65,7 @@ def _noise(case: Case) -> Iterator[str]:
     sensor, gap = case.scenario.sensor, case.scenario.plant.s_0
     if sensor is not None and sensor.std > MOST_NOISE * gap:
         share = 100 * sensor.std / gap
-        yield f"sensor.std = {sensor.std:g} m is {share:.3g} % of the gap, {gap:g} m. Was another unit meant?"
+        yield f"sensor.std = {sensor.std:g} m is {share:.3g} % of the gap, {gap:g} m. Is it in another unit?"
 
 
 def _velocity(case: Case) -> Iterator[str]:
@@ -73,8 +73,8 @@ def _velocity(case: Case) -> Iterator[str]:
     perfect = sensor is None or (sensor.velocity and sensor.std_z_dot == 0)
     if perfect and not (sensor is None and case.cascade.processor is None):
         yield (
-            "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ANY ERROR, which no bearing does. Give it an "
-            "error, or velocity = false and an observer that estimates it."
+            "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ANY ERROR, as no real sensor does. Set "
+            "sensor.std_z_dot, or set sensor.velocity = false and use an observer that estimates the velocity."
         )
 
 
@@ -85,13 +85,13 @@ def reversal(case: Case, most_i: float) -> Iterator[str]:
     either of them.
     """
     if case.scenario.plant.lumped and most_i > case.scenario.plant.i_0:
-        yield f"|i| reaches {most_i:.4g} A, {_beyond(case)} plant.kind = 'two-coil' gives each coil its own."
+        yield f"|i| reaches {most_i:.4g} A, {_beyond(case)} plant.kind = 'two-coil' simulates each coil's current."
 
 
 def _beyond(case: Case) -> str:
     i_0 = case.scenario.plant.i_0
     return (
-        f"above the bias plant.i_0 = {i_0:g} A: one coil's current, i_0 - |i|, is reversed; not every drive does that."
+        f"above the bias plant.i_0 = {i_0:g} A: one coil's current, i_0 - |i|, is reversed; not every drive can do it."
     )
 
 
@@ -101,7 +101,7 @@ def _currents(case: Case) -> Iterator[str]:
         yield f"initial.i = {scenario.initial.i:g} A is {beyond}"
     weight = plant.m * plant.g / plant.k_i  # v = 4 i_0 i / s_0^2 at z = 0
     if abs(weight) > plant.i_0:
-        yield f"plant: to carry the rotor at z = 0 takes {abs(weight):.4g} A, {beyond} Check m, n, A, s_0 and i_0."
+        yield f"plant: carrying the rotor at z = 0 takes {abs(weight):.4g} A, {beyond} Check m, n, A, s_0 and i_0."
     if plant.R * abs(weight) > scenario.u_max:
         least = plant.R * abs(weight)
         yield f"actuator.u_max = {scenario.u_max:g} V is less than the {least:.4g} V that carry the rotor at z = 0."
@@ -112,10 +112,10 @@ def _motion(case: Case) -> Iterator[str]:
     period, fall = float(clock.sample_period), 1 / math.sqrt(plant.k_s / plant.m)
     if scenario.sensor is not None and period > fall:
         yield (
-            f"clock.sample_period = {period:g} s, for which a measurement's error is held, is longer than the "
-            f"{fall:.3g} s in which the rotor falls to a side. Were milliseconds or microseconds meant?"
+            f"clock.sample_period = {period:g} s, for which each measurement error is held, is longer than the time "
+            f"constant of the unstable rotor, {fall:.3g} s. Is it in milliseconds or microseconds?"
         )
     wide = widest(case.spread, case.cascade, scenario)
     far, stop = reach(wide, clock), float(np.min(wide.touchdown))
     if not far < stop:
-        yield f"reference: it may reach {far:.4g} m, and the rotor touches down at {stop:.4g} m (run.clearance)."
+        yield f"reference: it may reach {far:.4g} m, but the rotor touches down at {stop:.4g} m (run.clearance)."

@@ -1,1 +1,1 @@
-"""The controller as C: the step that the simulator runs, traced, written as C99 and held against the trace."""
+"""Export of the controller as C: trace the simulator's step, write it as C99, and verify the C against JAX."""

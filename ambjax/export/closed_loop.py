@@ -1,4 +1,4 @@
-"""Software in the loop: JAX's plant under the compiled C, beside JAX's plant under JAX's controller."""
+"""Software in the loop: JAX's plant with the compiled controller, compared with JAX's own closed loop."""
 
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ FAULTS = [1 << k for k, name in enumerate(BITS) if name in ("invalid", "failed")
 
 
 class Kept(NamedTuple):
-    """What the C keeps, and how often an input was invalid or a law gave no number."""
+    """State of the C, and the number of samples with an invalid input or a law without a finite result."""
 
     numbers: Array
     started: Array
@@ -32,14 +32,14 @@ class Kept(NamedTuple):
 
 
 class Machines:
-    """Compiled controllers as one function of numbers: which of them, what it keeps, what it reads."""
+    """Compiled controllers behind one function of the controller's index, its state and its inputs."""
 
     def __init__(self, *machines: Compiled):
         self.machines = machines
         self.room = max(machine.state["numbers"].size for machine in machines)
 
     def step(self, which: Any, numbers: Any, started: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers kept, and started, bits and outputs."""
+        """Compute one sample of controller `which`. Return its state, padded, and started, bits and outputs."""
         machine = self.machines[int(which)]
         count = machine.state["numbers"].size
         machine.state["numbers"], machine.state["started"] = np.asarray(numbers)[:count], int(started)
@@ -52,7 +52,7 @@ class Machines:
 
 @record
 class Looped(Sampled):
-    """The sampled loop with its laws in C: `which` of the machines."""
+    """The sampled loop whose laws are the compiled controller `which` of `machines`."""
 
     which: Scalar
     machines: Machines = static()
@@ -74,32 +74,32 @@ class Looped(Sampled):
         after: Any = Kept(numbers, rest[0], kept.faults + faulty)
         past, sane = (state.command.u, state.past[0]), jnp.where(faulty, 0.0, state.sane)
         watch, guard = state.watch, self.processor.guard
-        if watch and guard:  # what a row reads of it
+        if watch and guard:  # a row reads whether the guard refused a reading
             watch = watch._replace(left=jnp.where(rest[1].astype(int) & REFUSED, 0.0, jnp.asarray(guard.samples)))
         return state._replace(control=after, command=command, past=past, sane=sane, watch=watch)
 
 
 class Beside(NamedTuple):
-    """The rotor under compiled C beside the rotor under JAX's controller, over the horizon.
+    """Comparison of the closed loop with compiled C and that of JAX, over the horizon.
 
-    `times`: at the worst sample, how far z has parted from JAX's over how far that of the twins has; NaN if the horizon
-    is too short for a verdict.
+    `times`: distance of z from JAX's divided by the distance of the farthest twin, the largest over the samples; NaN if
+    the horizon is too short for a verdict.
     """
 
     horizon: Horizon
     times: float
 
 
-# The most `times` that is allowed. Correct programs stay below 1 (tests/test_export_verify.py): the twins are changed
-# in every state, and a program rounds in its arithmetic alone.
+# Largest allowed `times`. Correct programs stay below 1 (tests/test_export_verify.py), because every state of a twin is
+# changed, whereas a program rounds only in its arithmetic.
 TIMES = 2.0
-# Samples that are run at once, until the horizon is reached.
+# Samples per call, until the horizon is reached.
 BLOCK = 1000
 begin_jit, segment_jit = jax.jit(begin), jax.jit(segment, static_argnames=("count", "every"))
 
 
 def beside(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, Beside]:
-    """The case under each compiled controller, by precision, beside the case under JAX's."""
+    """Compare the closed loop with each compiled controller with that of JAX. Keys: the precisions."""
     given: Any = system_of(case.cascade, case.scenario, case.clock)
     host, found = Machines(*machines.values()), {}
     for which, (precision, horizon) in enumerate(horizons(case, list(machines)).items()):
@@ -109,7 +109,7 @@ def beside(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, Beside]:
 
 
 def _times(z: np.ndarray, horizon: Horizon) -> float:
-    """Distance of z from JAX's over that of the twins, the largest over the horizon."""
+    """Return the distance of z from JAX's divided by that of the twins, the largest over the horizon."""
     n = horizon.samples
     if not horizon.decisive:
         return np.nan
@@ -120,7 +120,7 @@ def _times(z: np.ndarray, horizon: Horizon) -> float:
 
 
 def _displacement(system: Looped, clock: Clock, count: int) -> np.ndarray:
-    """z of a loop over its first `count` samples and a few more, m."""
+    """Return z of a loop over at least its first `count` samples, m."""
     system, clock = canonical((system, clock))
     progress, rows, block = begin_jit(system, clock, None), [], min(BLOCK, clock.samples)
     for first in range(0, max(count, 1), block):

@@ -1,6 +1,7 @@
-"""What is exported: the step that the simulator runs, with what it reads, keeps and gives, each by name.
+"""The exported controller: the simulator's step, with names for its inputs, states, parameters and outputs.
 
-`Controller.step` is `Sampled.decided`, the guard of the readings in it, behind a check of all other inputs.
+`Controller.step` first checks the reference and the parameters, then runs `Sampled.decided`, which has the guard of the
+readings.
 """
 
 import dataclasses
@@ -23,22 +24,26 @@ from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 
 (U_MAX,) = (field for field in dataclasses.fields(Scenario) if field.name == "u_max")
+# Singularity function of Eq. (9) below which a step reports the singular curve as near.
 NEAR = 0.1
 # Factor by which a parameter is divided and multiplied to reach the ends at which the C is compared with JAX.
 SPAN = 100.0
 
 
 def _end(of: str, unit: str) -> Any:
-    return leaf(unit=unit, at_least=1e-30, at_most=1e30, doc=f"largest |{of}| that is believed")
+    return leaf(unit=unit, at_least=1e-30, at_most=1e30, doc=f"largest valid |{of}|")
 
 
 @record
 class StepLimits:
-    """The supply's limit, and those of the reference: GAPS gaps, and that in a sample for each further derivative."""
+    """The limit of the supply, and the limits of the reference.
+
+    The largest |r| is GAPS gaps; the limit of each derivative is that of the one before, per sample period.
+    """
 
     u_max: Scalar = dataclasses.field(metadata=U_MAX.metadata)
     near: Scalar = leaf(
-        unit="1", at_least=-1e30, at_most=1, doc="where Eq. (9), 1 at rest and 0 on the singular curve, counts as near"
+        unit="1", at_least=-1e30, at_most=1, doc="value of Eq. (9) that counts as near; 1 at rest, 0 on the curve"
     )
     r: Scalar = _end("r", "m")
     r_dot: Scalar = _end("r_dot", "m/s")
@@ -47,7 +52,7 @@ class StepLimits:
 
 
 class StepInputs(NamedTuple):
-    """What a step reads: sensors, and the reference of the instant at which its voltage takes effect."""
+    """Inputs of a step: the sensors, and the reference at the instant at which the step's voltage takes effect."""
 
     z: Array
     z_dot: Array
@@ -59,7 +64,7 @@ class StepInputs(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What a step keeps for the next."""
+    """State that a step keeps for the next."""
 
     laws: CascadeState
     last: Command
@@ -71,7 +76,7 @@ class Memory(NamedTuple):
 
 
 class Status(NamedTuple):
-    """What a step reports, a bit each."""
+    """Status of a step, one bit each; BITS has their meanings."""
 
     saturated: Array
     refused: Array
@@ -82,7 +87,7 @@ class Status(NamedTuple):
 
 
 class StepOutputs(NamedTuple):
-    """What a step gives."""
+    """Outputs of a step; OUTPUTS has their units and meanings."""
 
     u: Array
     i_ref: Array
@@ -92,12 +97,12 @@ class StepOutputs(NamedTuple):
 
 INPUTS = {
     "z": ("m", "rotor displacement, measured"),
-    "z_dot": ("m/s", "its rate, measured"),
+    "z_dot": ("m/s", "rotor velocity, measured"),
     "i": ("A", "current deviation, measured"),
     "r": ("m", "reference of z at the instant at which this step's voltage takes effect"),
-    "r_dot": ("m/s", "its rate"),
-    "r_ddot": ("m/s^2", "its second derivative"),
-    "r_dddot": ("m/s^3", "its third derivative"),
+    "r_dot": ("m/s", "first derivative of r"),
+    "r_ddot": ("m/s^2", "second derivative of r"),
+    "r_dddot": ("m/s^3", "third derivative of r"),
 }
 OUTPUTS = {
     "u": ("V", "voltage to apply, within the supply's limit"),
@@ -107,19 +112,19 @@ OUTPUTS = {
 }
 BITS = {
     "saturated": "u is at the supply's limit",
-    "refused": "a reading is NaN, beyond its limit or too far from the expected one, which took its place",
-    "failed": "a law gave no finite number: its state is kept, u is held",
+    "refused": "a reading is NaN, beyond its limit or too far from the prediction, which replaces it",
+    "failed": "a law returned no finite number: its state is kept, u is held",
     "singular": "(z, i_ref) is near the singular curve of Eq. (9)",
-    "safe": "u is 0, the laws wait: readings are refused for more than guard.samples, or from the start",
+    "safe": "u is 0, the laws wait: readings are refused in more than guard.samples steps, or from the start",
     "invalid": "the reference, params->processor.delay or a steepness p is NaN or out of range: u is held",
 }
 
 
 class Number(NamedTuple):
-    """A parameter or a state: dotted name, unit, what is allowed, meaning, value.
+    """A parameter or a state: dotted name, unit, allowed values, meaning, value.
 
-    `ends`: of a parameter, the values at which the C is compared with JAX beside the case's: the lowest and the highest
-    first, then those that are not finite or that a step must refuse.
+    `ends`: further values of a parameter at which the C is compared with JAX: the lowest and the highest first, then
+    those that are not finite or that a step must reject.
     """
 
     name: str
@@ -131,7 +136,7 @@ class Number(NamedTuple):
 
 
 class Parameters(NamedTuple):
-    """All numbers that the C may change: those of the cascade and the limits."""
+    """All numbers that a user of the C may change: the parameters of the cascade, and the limits."""
 
     controller: Cascade
     limits: StepLimits
@@ -139,7 +144,7 @@ class Parameters(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Controller:
-    """A cascade on its processor, as it is exported. Raises ValueError for one in continuous time."""
+    """A cascade on its processor as it is exported: its parameters and the sample period, s."""
 
     parameters: Parameters
     period: float
@@ -147,16 +152,19 @@ class Controller:
     def step(
         self, parameters: Parameters, memory: Memory, inputs: StepInputs, period: Scalar, read: frozenset[str]
     ) -> tuple[Memory, StepOutputs, Status]:
-        """One sample. Inputs that are not in `read` are not looked at, nor is the delay where nothing is predicted."""
+        """Compute one sample. Return the memory for the next one, the outputs and the status.
+
+        Only the inputs named in `read` are checked, and the delay only if the step predicts a reading.
+        """
         cascade, limits = parameters
         measured = Measurement(*inputs[:3])
         fine = [
             jnp.abs(getattr(inputs, name)) <= getattr(limits, name) for name in StepInputs._fields[3:] if name in read
         ]
         processor: Any = cascade.processor
-        if processor.predicts or processor.guard is not None:  # the parts of a prediction are those of this delay
+        if processor.predicts or processor.guard is not None:  # the prediction's program depends on the delay
             fine += [processor.delay >= 0, processor.delay <= processor.most]
-        fine += [jnp.isfinite(p) for p in _steepnesses(cascade)]  # p = inf is another program
+        fine += [jnp.isfinite(p) for p in _steepnesses(cascade)]  # p = inf needs another program
         valid = functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
         system = Sampled(ClosedLoop(cascade, Scenario(u_max=limits.u_max)), period, 0)
         past = (memory.before, memory.before)
@@ -167,7 +175,7 @@ class Controller:
         if processor.guard is not None:
             refused, safe = processor.guard.refused(memory.watch, watch)
         laws, started = choose(valid, (after.control, after.started), (memory.laws, memory.started))
-        # an invalid sample breaks off what is expected: the next reading within its limits is accepted
+        # an invalid sample resets the guard: the next reading within its limits is accepted
         kept = Memory(laws, last, after.past[0], choose(valid, watch, jax.tree.map(jnp.zeros_like, watch)), started)
         status = Status(
             jnp.abs(last.u) >= limits.u_max,
@@ -180,7 +188,7 @@ class Controller:
         return kept, StepOutputs(last.u, last.i_ref, last.v_star, last.v_tilde), status
 
     def start(self) -> Memory:
-        """Before the first step: no voltage, laws without a state, no reading expected."""
+        """Return the memory before the first step: no voltage, laws without a state, no predicted reading."""
         cascade, zero = self.parameters.controller, jnp.zeros(())
         laws = jax.tree.map(jnp.zeros_like, cascade.init(Measurement(zero, zero, zero)))
         guard = cascade.processor.guard if cascade.processor else None
@@ -188,20 +196,20 @@ class Controller:
 
 
 def choose(condition: Array, a: Any, b: Any) -> Any:
-    """a where `condition` holds, else b."""
+    """Return a where `condition` holds, else b; a and b are pytrees."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
 def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scenario | None = None) -> Controller:
-    """The controller of a case. Raises ValueError for one without [processor].
+    """Return the controller of a case. Raises ValueError for a cascade in continuous time.
 
-    `scenario`: clearance and sensors, from which limits of the guard are derived that are not given. None: the model's
-    own clearance, and sensors without error.
+    `u_max`: limit of the supply, V. `period`: sample period, s. `scenario`: clearance and sensors, from which the
+    limits of the guard are derived that the case does not give. None: the model's clearance, and sensors without error.
     """
     if cascade.processor is None:
         raise ValueError(
-            "[processor] is missing: what runs on a processor is exported, and this case is in continuous time. Add "
-            "[processor], tune for it, and export that."
+            "[processor] is missing: only a controller on a processor can be exported, and this case is in continuous "
+            "time. Add [processor], tune the gains for it, and export the tuned case."
         )
     cascade, period = cascade.on_processor(), float(period)
     model = cascade.model
@@ -212,7 +220,7 @@ def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scen
 
 
 def parameters_of(parameters: Parameters) -> list[Number]:
-    """Every number of the parameters, in the order of its leaves. Raises ValueError for an array."""
+    """Return every number of the parameters, in the order of their leaves. Raises ValueError for an array."""
     found = [*_numbers(parameters.controller, ""), *_numbers(parameters.limits, "limits.")]
     assert [x.value for x in found] == [float(x) for x in jax.tree.leaves(parameters)]
     processor: Any = parameters.controller.processor
@@ -222,7 +230,7 @@ def parameters_of(parameters: Parameters) -> list[Number]:
 
 
 def _steepnesses(cascade: Cascade) -> list[Any]:
-    """The steepnesses of the smoothed signs of all laws."""
+    """Return the steepnesses of the smoothed signs of all laws."""
     laws: tuple[Any, ...] = cascade.laws
     fields = [(law, field) for law in laws for field in dataclasses.fields(law)]
     found = [getattr(law, field.name) for law, field in fields if field.metadata.get("steepness")]
@@ -254,9 +262,9 @@ def _number(name: str, field: dataclasses.Field, value: float) -> Number:
 
 
 def _ends(meta: Any, value: float) -> tuple[float, ...]:
-    """The values at which a parameter is compared beside the case's: SPAN below and above it, within what is allowed.
+    """Return the further values of a parameter for the comparison: 1/SPAN and SPAN times `value`, within its bounds.
 
-    A parameter that is 0 goes to -1 and 1 in its unit, one that is inf to 1 and 100.
+    A parameter that is 0 is set to -1 and 1 in its unit; one that is inf, to 1 and SPAN.
     """
     low, high = sorted((value / SPAN, value * SPAN)) if value else (-1.0, 1.0)
     if math.isinf(value):

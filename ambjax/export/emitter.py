@@ -1,6 +1,6 @@
-"""A trace of JAX as straight-line scalar code: calls inlined, loops unrolled, branches as choices.
+"""Translate a JAX trace to straight-line scalar code: inline calls, unroll loops, turn branches into selections.
 
-The order of operations is the trace's, so that C compiled without contraction rounds as JAX does operation by
+The order of operations stays that of the trace, so that C compiled without contraction rounds as JAX does operation by
 operation.
 """
 
@@ -22,9 +22,10 @@ COMPOSED = ("rsqrt", "exp2", "logistic")
 def traced(
     program: Program, function: Callable[..., Any], arguments: Any, operands: Sequence[Operand]
 ) -> list[Operand]:
-    """Operands of the leaves that `function(*arguments)` gives, with these operands for the leaves of its arguments.
+    """Trace `function(*arguments)` into `program` and return the operands of the leaves of its result.
 
-    Raises ValueError for a primitive that is no scalar arithmetic; it names the primitive and the law that uses it.
+    `operands`: those of the leaves of the arguments. Raises ValueError, with the primitive and the law that uses it,
+    for a primitive that is not scalar arithmetic.
     """
     closed = jax.make_jaxpr(function)(*arguments)
     return _Reader(program).closed(closed, list(operands), "")
@@ -89,13 +90,13 @@ class _Reader:
         if name == "round":
             name = ("round_away", "round_even")[int(params["rounding_method"])]
         name = {"add_any": "add"}.get(name, name)
-        whole = dtype.kind in "iu"  # constants alone
+        whole = dtype.kind in "iu"  # allowed between constants only
         if name not in OPS or (whole and any(isinstance(x, Ref) for x in args)):
             raise ValueError(refusal(name, law, "of whole numbers" if whole else ""))
         return apply(name, args, dtype, law)
 
     def _composed(self, name: str, x: Operand, dtype: Any, law: str) -> Operand:
-        """What C has not, of what it has, as XLA has it."""
+        """Compose a primitive that C lacks from others, as XLA does."""
         apply, one = self.program.apply, np.ones((), dtype)[()]
         if name == "rsqrt":
             return apply("div", (one, apply("sqrt", (x,), dtype, law)), dtype, law)
@@ -105,7 +106,7 @@ class _Reader:
         return apply("div", (one, apply("add", (one, grown), dtype, law)), dtype, law)
 
     def _power(self, x: Operand, y: int, dtype: Any, law: str) -> Operand:
-        """By squaring, as JAX has it."""
+        """Compute an integer power by repeated squaring, as JAX does."""
         total, left = None, abs(y)
         while left > 0:
             if left & 1:
@@ -120,7 +121,7 @@ class _Reader:
         before = self.program.dtype(x)
         if not isinstance(x, Ref):
             return x.astype(dtype)
-        if before == dtype or (before.kind == "b" and dtype.kind in "iu"):  # an index of two branches
+        if before == dtype or (before.kind == "b" and dtype.kind in "iu"):  # the index of one of two branches
             return x
         if "f" not in (before.kind, dtype.kind) or {before.kind, dtype.kind} & set("iu"):
             raise ValueError(refusal("convert_element_type", law, f"from {before.name} to {dtype.name}"))
@@ -159,12 +160,12 @@ class _Reader:
 
 
 def refusal(name: str, law: str, how: str = "") -> str:
-    """Why a step is not exported."""
+    """Return the error message for a primitive that cannot be exported, and the fix."""
     told = f"the primitive {name!r}{f' {how}' if how else ''} cannot be written as scalar C"
     return f"{law or 'the step'}: {told}. Write the law with real scalars and loops of a fixed length."
 
 
 def _law(stack: str) -> str:
-    """The innermost law in a stack of JAX's name scopes; jvp(...) and its like wrap them."""
+    """Return the innermost law in a stack of JAX's name scopes, which transformations such as jvp(...) wrap."""
     found = re.findall(r"law:([^/()]+)", stack)
     return found[-1] if found else ""

@@ -1,4 +1,4 @@
-"""The C compiler of this machine, and the controller that it makes as a function of Python."""
+"""The C compiler of this machine, and a compiled controller as a Python object."""
 
 import contextlib
 import ctypes
@@ -22,45 +22,44 @@ STRICT = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promo
 EXACT = "-ffp-contract=off"
 SANITIZED = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 SHARED = ["-shared", "-fPIC"]
-# Seconds that a program may take.
+# Time limit of a compiled program, s.
 PATIENCE = 60
 
 
 def compiler() -> str:
-    """The C compiler: $CC, or cc, gcc or clang. Raises ValueError where there is none."""
+    """Return the C compiler: $CC, or cc, gcc or clang. Raises ValueError if there is none."""
     asked = os.environ.get("CC")
     for name in [asked] if asked else ["cc", "gcc", "clang"]:
         if found := shutil.which(name):
             return found
     raise ValueError(
-        f"--verify: there is no C compiler ({asked or 'cc, gcc or clang'}). Install one, name it in CC, or leave out "
-        "--verify."
+        f"--verify: there is no C compiler ({asked or 'cc, gcc or clang'}). Install one, or set CC, or omit --verify."
     )
 
 
 def build(sources: list[pathlib.Path], target: pathlib.Path, *flags: str) -> str:
-    """Compile; the compiler's complaint, empty if there is none."""
+    """Compile `sources` to `target`. Return the compiler's error message, empty if there is none."""
     command = [compiler(), *STRICT, EXACT, *flags, *map(str, sources), "-o", str(target), "-lm"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
     except OSError as error:
         raise ValueError(
-            f"--verify: the C compiler {command[0]} cannot be run ({error.strerror}). Name another in CC, or leave out "
+            f"--verify: the C compiler {command[0]} cannot be run ({error.strerror}). Set CC to another, or omit "
             "--verify."
         ) from None
     return "" if done.returncode == 0 else done.stderr.strip() or f"exit code {done.returncode}"
 
 
 def execute(program: pathlib.Path) -> tuple[int, str]:
-    """Exit code of a compiled program, and what it said. Raises ValueError where it cannot be run, or does not end."""
+    """Run a compiled program. Return its exit code and its output. Raises ValueError if it does not run, or not end."""
     try:
         done = subprocess.run(
             [program], capture_output=True, text=True, errors="replace", check=False, timeout=PATIENCE
         )
     except subprocess.TimeoutExpired:
         raise ValueError(
-            f"--verify: the program {program.name} did not end within {PATIENCE:g} s, and nothing is decided. Try "
-            "again when the machine is less busy, or leave out --verify."
+            f"--verify: the program {program.name} did not end within {PATIENCE:g} s, so the check is not decided. Try "
+            "again when the machine is less busy, or omit --verify."
         ) from None
     except OSError as error:
         raise ValueError(_unused("run", program, error.strerror or str(error))) from None
@@ -68,7 +67,7 @@ def execute(program: pathlib.Path) -> tuple[int, str]:
 
 
 def load(library: pathlib.Path) -> ctypes.CDLL:
-    """A compiled library. Raises ValueError where this machine cannot load it."""
+    """Load a compiled library. Raises ValueError if this machine cannot load it."""
     try:
         return ctypes.CDLL(str(library))
     except OSError as error:
@@ -77,36 +76,36 @@ def load(library: pathlib.Path) -> ctypes.CDLL:
 
 def _unused(verb: str, what: pathlib.Path, why: str) -> str:
     return (
-        f"--verify: what {compiler()} made cannot be {verb} in {what.parent} ({why}). Name a folder that allows it in "
-        "TMPDIR, a compiler for this machine in CC, or leave out --verify."
+        f"--verify: the output of {compiler()} cannot be {verb} in {what.parent} ({why}). Set TMPDIR to a folder that "
+        "allows it, set CC to a compiler for this machine, or omit --verify."
     )
 
 
 @contextlib.contextmanager
 def scratch() -> Iterator[pathlib.Path]:
-    """A folder for what is compiled, gone at the end. Raises ValueError where it cannot be written."""
+    """Yield a temporary folder for compilation. Raises ValueError if it cannot be written."""
     try:
         with tempfile.TemporaryDirectory(prefix="ambjax-") as folder:
             yield pathlib.Path(folder)
     except OSError as error:
         raise ValueError(
-            f"--verify: cannot write to the folder for temporary files ({error.strerror or error}). Make room, name "
-            "another in TMPDIR, or leave out --verify."
+            f"--verify: cannot write to the folder for temporary files ({error.strerror or error}). Free space, set "
+            "TMPDIR to another folder, or omit --verify."
         ) from None
 
 
 def check() -> None:
-    """See that this machine makes programs, plain and sanitized, and libraries, and runs them.
+    """Check that this machine compiles and runs programs, plain and sanitized, and compiles and loads libraries.
 
-    Raises ValueError for what it does not: the C would not be judged, but the machine.
+    Raises ValueError if it does not: a failure of the machine must not count as a failure of the C.
     """
     with scratch() as folder:
         source = folder / "empty.c"
         source.write_text("int main(void)\n{\n    return 0;\n}\n", encoding="utf-8")
         for what, flags, fix in (
-            ("program", [], "Name another in CC"),
-            ("sanitized program", SANITIZED, "Install libasan and libubsan, name a compiler that has them in CC"),
-            ("library", SHARED, "Name another in CC"),
+            ("program", [], "Set CC to another compiler"),
+            ("sanitized program", SANITIZED, "Install libasan and libubsan, set CC to a compiler that has them"),
+            ("library", SHARED, "Set CC to another compiler"),
         ):
             made = folder / f"empty{len(flags)}"
             said = build([source], made, *flags)
@@ -117,13 +116,12 @@ def check() -> None:
                 said = "" if code == 0 else told.strip() or f"exit code {code}"
             if said:
                 raise ValueError(
-                    f"--verify: {compiler()} makes no {what} that works here ({short(said)}). {fix}, or leave out "
-                    "--verify."
+                    f"--verify: {compiler()} makes no {what} that works here ({short(said)}). {fix}, or omit --verify."
                 )
 
 
 def short(text: str) -> str:
-    """The last line of what a program said; of a compiler, its first error, or the library that it misses."""
+    """Return the first error in a compiler's output, or the library that it misses; else the last line of the text."""
     lines = [line for line in text.strip().splitlines() if line]
     found = [line[line.index("cannot find") :] for line in lines if "cannot find" in line]
     found += [line.partition("error:")[2].strip() for line in lines if "error:" in line]
@@ -131,7 +129,7 @@ def short(text: str) -> str:
 
 
 class Compiled:
-    """A controller in a shared library. `state` is its memory: numbers, then whether it was started."""
+    """A controller in a shared library. `state` is its memory: the numbers, then whether it has started."""
 
     def __init__(self, library: pathlib.Path, trace: Trace, prefix: str):
         self.trace, real = trace, np.dtype(PRECISIONS[trace.precision])
@@ -148,11 +146,11 @@ class Compiled:
         self._keeps: Any = loaded
 
     def step(self) -> int:
-        """One sample, of `inputs`, into `state` and `outputs`."""
+        """Compute one sample from `inputs`, update `state` and `outputs`, and return the status bits."""
         return self._step(*self._at)
 
     def results(self, at: Points) -> Results:
-        """The step at these points."""
+        """Return the results of one step from each of these points."""
         count = at.started.size
         state, started = np.empty_like(at.state), np.empty(count, bool)
         outputs, bits = np.empty((len(self.outputs), count), at.state.dtype), np.empty(count, np.int64)

@@ -15,21 +15,22 @@ from ambjax.export.texts import MAKEFILE, MARK, README, TEST
 from ambjax.export.trace import Trace, trace
 from ambjax.world.sensor import Measurement
 
-# Points of the test program, and the units in the last place, or the share, by which the C may be off JAX.
+# Points of the test program.
 VECTORS = 100
 # Names of the files, by their prefix.
 NAMES = ("{p}.h", "{p}.c", "{p}_test.c", "{p}_vectors.h", "Makefile", "README.md")
+# Tolerance between the C and JAX: units in the last place (double), relative (float).
 ULPS, SHARE = 4, 1e-5
 
 
 def files(controller: Controller, precision: str, prefix: str, origin: Origin) -> dict[str, str]:
-    """Text of each file by name. Raises ValueError for a law that does what scalar C cannot."""
+    """Return the text of each file by name. Raises ValueError for a law that scalar C cannot express."""
     traced = trace(controller, precision)
     return written(traced, prefix, origin)
 
 
 def written(traced: Trace, prefix: str, origin: Origin) -> dict[str, str]:
-    """The same of a trace."""
+    """Return the files of a traced controller, texts by name."""
     writer, at = Writer(traced, prefix, origin), points(traced, VECTORS, seed=1)
     vectors, makefile = _vectors(writer, at, results(traced, at)), MAKEFILE.format(p=prefix)
     texts = (writer.header(), writer.source(), _test(writer), vectors, makefile, _readme(writer))
@@ -37,7 +38,7 @@ def written(traced: Trace, prefix: str, origin: Origin) -> dict[str, str]:
 
 
 def tolerance(precision: str) -> tuple[float, float]:
-    """Share of a number by which the C may be off JAX, and what is taken for 0."""
+    """Return the relative tolerance between the C and JAX, and the absolute one near 0."""
     kind = np.finfo(PRECISIONS[precision])
     share = SHARE if precision == "float" else ULPS * float(kind.eps) / 2
     return share, float(kind.tiny) * 1e4
@@ -59,8 +60,8 @@ def _vectors(writer: Writer, at: Points, given: Results) -> str:
         [
             writer.banner(f"{p}_vectors.h"),
             "",
-            "/* Steps as JAX makes them: state and input before, state and output after. Random, with edges and both",
-            " * sides of where a comparison turns. */",
+            "/* Steps computed by JAX: state and input before, state and output after. Points are random, or at limits",
+            " * and on both sides of the threshold of a comparison. */",
             "",
             f"#ifndef {guard}",
             f"#define {guard}",
@@ -110,7 +111,7 @@ def _test(writer: Writer) -> str:
         P=p.upper(),
         abs=abs_,
         readings=len(Measurement._fields),
-        told="refused" if guard else "believed, and a law fails",
+        told="refused" if guard else "accepted and make a law fail",
         unseen=unseen,
         share=literal(share, t.precision),
         small=literal(small, t.precision),
@@ -144,12 +145,12 @@ def _readme(writer: Writer) -> str:
 
 
 def _source(name: str) -> str:
-    """The function of the README's example that gives an input: read_z, reference_r_dot."""
+    """Return the name of the function that reads an input in the README's example: read_z, reference_r_dot."""
     return f"{'reference' if name.startswith('r') else 'read'}_{name}"
 
 
 def described(controller: Controller) -> list[str]:
-    """The cascade in words: the law of each stage, and signs that have no layer."""
+    """Return the cascade in words: the law of each stage, and its signs without a boundary layer."""
     return list(_described(controller))
 
 

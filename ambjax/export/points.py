@@ -1,6 +1,6 @@
 """The points at which the exported step is compared with JAX: parameters, states and inputs.
 
-`points` keeps the case's parameters; `varied` moves each of them to the ends of its range.
+`points` keeps the case's parameters; `varied` sets each of them to the ends of its range.
 """
 
 from typing import Any, NamedTuple
@@ -13,16 +13,15 @@ from ambjax.export.program import Ref
 from ambjax.export.statements import PRECISIONS
 from ambjax.export.trace import UNREAD, Trace
 
-# Decades around the size that matters, to the ends of the gap; the probability that a number is an edge, and that a
-# point is a first step.
+# Decades around the scale of each number; the probabilities that a number is an edge and that a point is a first step.
 DECADES, EDGY, FIRST = (-7.0, 1.7), 0.02, 0.05
-# Random points between which borders are sought; draws per point; share of points within the supply's limit, if found.
+# Random points between which borders are searched; draws per point; share of points within the supply's limit, if any.
 POOL, DRAWS, CALM = 3000, 4, 0.4
-# Pairs of points on both sides of a border that are sought for each comparison, and bisections of each pair.
+# Pairs of points on both sides of the threshold of each comparison, and bisections of each pair.
 PAIRS, HALVINGS = 4, 64
 # Share of varied points that move one parameter, the others having the case's values; the rest move all at once.
 ALONE = 0.7
-# Of the points at an end of a limit, the share whose input lies at that limit; their relative distances from it.
+# Share of the points with a limit at an end of its range whose input is set near that limit; its relative distances.
 AT_LIMIT, BESIDE = 0.5, (-1e-6, 1e-6)
 
 
@@ -36,7 +35,7 @@ class Points(NamedTuple):
 
 
 def points(trace: Trace, count: int, seed: int = 0) -> Points:
-    """Random states and inputs over decades, edges, and both sides of every comparison, at the case's parameters."""
+    """Return points with the case's parameters: random over decades, edges, and both sides of every comparison."""
     random, dtype = np.random.default_rng(seed), PRECISIONS[trace.precision]
     drawn = max(DRAWS * count, POOL)
     own = np.array([x.value for x in trace.parameters])
@@ -46,7 +45,7 @@ def points(trace: Trace, count: int, seed: int = 0) -> Points:
     borders = _borders(trace, x[:, started & np.isfinite(x[own.size :]).all(axis=0)][:, :POOL])
     borders = borders[:, _seen(trace, borders, np.ones(borders.shape[1], bool))[1]]
     borders = borders[:, random.permutation(borders.shape[1])[: count // 2]]
-    # most random states demand more voltage than the supply has: add some that do not
+    # most random states saturate the voltage: add some that do not
     far, normal = _seen(trace, x, started)
     calm = np.flatnonzero(started & normal & ~far)[: int(CALM * count)]
     rest = np.setdiff1d(np.flatnonzero(normal), calm)[: count - calm.size - borders.shape[1]]
@@ -56,9 +55,9 @@ def points(trace: Trace, count: int, seed: int = 0) -> Points:
 
 
 def varied(trace: Trace, count: int, seed: int = 2) -> Points:
-    """Random states and inputs at other parameters: each one alone at every end of its range, then all at random ends.
+    """Return points with other parameters: each alone at every end of its range, then all at random ends.
 
-    The ends are `Number.ends`. They include values that a step must refuse.
+    The ends are `Number.ends`. They include values that a step must reject.
     """
     random, dtype = np.random.default_rng(seed), PRECISIONS[trace.precision]
     cases = [(k, end) for k, x in enumerate(trace.parameters) if x.allowed != UNREAD for end in x.ends]
@@ -80,7 +79,7 @@ def varied(trace: Trace, count: int, seed: int = 2) -> Points:
     return _split(trace, x[:, normal], started[normal])
 
 
-# Which input each limit is of.
+# Index of the input that each limit bounds.
 INPUTS_AT = {f"{of}.{name}": k for k, name in enumerate(INPUTS) for of in ("limits", "processor.guard")}
 
 
@@ -91,9 +90,9 @@ def _split(trace: Trace, x: np.ndarray, started: np.ndarray) -> Points:
 
 
 def _seen(trace: Trace, x: np.ndarray, started: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the voltage is at its limit or held, and whether no intermediate number is subnormal.
+    """Return whether the voltage is at its limit or held, and whether no intermediate number is subnormal.
 
-    JAX takes a subnormal number for 0 on CPUs, and C does not.
+    On CPUs, JAX replaces a subnormal number by 0, and C does not.
     """
     values, normal = evaluated(trace, x, started), np.ones(x.shape[1], bool)
     for value in values:
@@ -104,15 +103,15 @@ def _seen(trace: Trace, x: np.ndarray, started: np.ndarray) -> tuple[np.ndarray,
 
 
 def _drawn(trace: Trace, random: np.random.Generator, parameters: np.ndarray) -> np.ndarray:
-    """States and inputs: of either sign, over decades, with zeros, limits and non-finite numbers among them."""
+    """Return random states and inputs of either sign, over decades, with zeros, limits and non-finite numbers."""
     sizes, count = np.array(_sizes(trace)), parameters.shape[1]
-    limits = np.ones((sizes.size, count))  # without a guard a reading has none
+    limits = np.ones((sizes.size, count))  # without a guard, readings have no limit
     for k, x in enumerate(trace.parameters):
         if x.name in INPUTS_AT:
             limits[len(trace.state) + INPUTS_AT[x.name]] = parameters[k]
     shape = sizes.size, count
     x = sizes[:, None] * 10.0 ** random.uniform(*DECADES, shape) * random.choice([-1.0, 1.0], shape)
-    x *= (np.arange(count) % 7 > 0) | (random.random(shape) < 0.5)  # in every seventh point half are 0
+    x *= (np.arange(count) % 7 > 0) | (random.random(shape) < 0.5)  # in every seventh point, half of the numbers are 0
     edges = [0.0 * limits, -0.0 * limits, 1e-30 * sizes[:, None] * np.ones(shape)]
     edges += [sign * limits * (1 + off) for sign in (1, -1) for off in (0, 4e-16, -2e-16, 2e-7, -1e-7)]
     edge = np.take_along_axis(np.array(edges), random.integers(len(edges), size=(1, *shape)), axis=0)[0]
@@ -123,7 +122,7 @@ def _drawn(trace: Trace, random: np.random.Generator, parameters: np.ndarray) ->
 
 
 def _sizes(trace: Trace) -> list[float]:
-    """The size that matters of each state and input."""
+    """Return the scale of each state and input."""
     controller = trace.controller
     cascade, limits = controller.parameters
     model = cascade.model
@@ -138,7 +137,7 @@ def _sizes(trace: Trace) -> list[float]:
 
 
 def _borders(trace: Trace, x: np.ndarray) -> np.ndarray:
-    """Points next to where a comparison of the step turns, on both sides of it, found by bisection."""
+    """Return points next to the threshold of each comparison, on both sides of it, found by bisection."""
     nodes = trace.program.nodes
     begun = np.ones(x.shape[1], bool)
     outcomes, found = evaluated(trace, x, begun), []
@@ -158,7 +157,7 @@ def _borders(trace: Trace, x: np.ndarray) -> np.ndarray:
 
 
 def evaluated(trace: Trace, x: np.ndarray, started: np.ndarray) -> list[np.ndarray]:
-    """Every node at parameters, states and inputs, by NumPy."""
+    """Return the value of every node at these parameters, states and inputs, computed with NumPy."""
     count, program, dtype = x.shape[1], trace.program, PRECISIONS[trace.precision]
     rows: Any = iter(x)
     values: list[Any] = [next(rows) for _ in trace.parameters]

@@ -1,7 +1,7 @@
-"""Scalar primitives: each as a C expression, as NumPy computes it, and what it costs.
+"""Scalar primitives: the C expression, the NumPy function and the cost of each.
 
-`{0}`, `{1}` are operands, `{f}` is the suffix of float functions. NumPy's twin folds constants and finds where a
-comparison turns; what the C is held against is JAX.
+`{0}`, `{1}` are operands, `{f}` is the suffix of float functions. The NumPy function folds constants and finds the
+thresholds of comparisons; the verification compares the C with JAX, not with NumPy.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from ambjax.numerics.smooth import RECIPROCAL
 
 
 class Op(NamedTuple):
-    """C text; NumPy's twin; what it is counted as; whether operands commute, and whether the result is a bool."""
+    """C text; NumPy function; kind of cost; whether the operands commute, and whether the result is a bool."""
 
     text: str
     numpy: Callable[..., Any]
@@ -36,7 +36,7 @@ def _compare(sign: str, numpy: Callable[..., Any]) -> Op:
     return Op(f"{{0}} {sign} {{1}}", numpy, "comparison", sign in ("==", "!="), True)
 
 
-# For bools `&` and its like work as `&&` would, both operands being there already; `and` and `or` of C read better.
+# For bools, `&` and `|` give the same result as `&&` and `||`, because both operands are computed already.
 OPS: dict[str, Op] = {
     "add": Op("{0} + {1}", np.add, "add", True),
     "sub": Op("{0} - {1}", np.subtract, "add"),
@@ -78,15 +78,15 @@ OPS: dict[str, Op] = {
     "real": Op("({to}){0}", lambda x: x, "conversion"),
     "flag": Op("{0} ? {one} : {zero}", lambda x: np.where(x, 1.0, 0.0), "conversion"),
 }
-# What gives its operand as it is, where there are no shapes.
+# Primitives that return a scalar operand unchanged.
 SAME = ("broadcast_in_dim", "copy", "copy_p", "optimization_barrier", "reshape", "squeeze", "stop_gradient")
 SAME += ("xla_metadata_value", "pvary")
-# Calls, whose text is that of what they call: derivatives of one's own have no say in a value.
+# Primitives that call another trace, which is inlined. Custom derivatives do not change a value.
 CALLS = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat2")
 
 COUNTED = ("add", "multiply", "divide", "root", "call")
 
 
 def is_reciprocal(eqn: Any) -> bool:
-    """Whether a call computes 1/x by refining a float32 quotient. Exported code divides once instead."""
+    """Return whether a call computes 1/x by refining a float32 quotient. Exported code divides once instead."""
     return eqn.params.get("name") == RECIPROCAL and len(eqn.invars) == len(eqn.outvars) == 1

@@ -1,6 +1,7 @@
-"""Straight-line scalar code: one node an operation, equal expressions shared, constants folded.
+"""Straight-line scalar code: one node per operation, with equal expressions shared and constants folded.
 
-A node that nothing reads is not written; a constant is a NumPy scalar, and what depends on constants alone is one.
+A node that no other node or result uses is not written. A constant is a NumPy scalar, and so is any expression of
+constants.
 """
 
 from collections.abc import Sequence
@@ -10,7 +11,7 @@ import numpy as np
 
 from ambjax.export.primitives import OPS
 
-# Statements of a program; what has more was unrolled from a loop that belongs in no control step.
+# Largest number of operations of a step. A longer step comes from an unrolled loop that is too long for a controller.
 MOST = 20_000
 
 
@@ -41,16 +42,16 @@ class Program:
         self._known: dict[Any, Ref] = {}
 
     def input(self, text: str, dtype: Any) -> Ref:
-        """A node that reads C text."""
+        """Add an input node, which the C expression `text` reads."""
         self.nodes.append(Node("input", (), np.dtype(dtype), text=text))
         return Ref(len(self.nodes) - 1)
 
     def dtype(self, x: Operand) -> np.dtype:
-        """Dtype of an operand."""
+        """Return the dtype of an operand."""
         return self.nodes[x.node].dtype if isinstance(x, Ref) else x.dtype
 
     def apply(self, op: str, args: Sequence[Operand], dtype: Any, law: str) -> Operand:
-        """The value of an operation: a constant, a node that is there already, or a new one."""
+        """Return the operand of an operation: a constant, an existing equal node, or a new node."""
         dtype, args = np.dtype(dtype), tuple(args)
         if (known := _simpler(op, args)) is not None:
             return known
@@ -67,7 +68,7 @@ class Program:
         return self._known[key]
 
     def needed(self, outputs: Sequence[Operand]) -> set[int]:
-        """Numbers of the nodes on which these depend."""
+        """Return the numbers of the nodes on which these operands depend."""
         seen: set[int] = set()
         stack = [x.node for x in outputs if isinstance(x, Ref)]
         while stack:
@@ -77,7 +78,7 @@ class Program:
         return seen
 
     def evaluate(self, inputs: dict[int, Any]) -> list[Any]:
-        """Value of every node by NumPy, given those of input nodes: arrays of one shape."""
+        """Return the value of every node, computed with NumPy from those of the input nodes, arrays of one shape."""
         values: list[Any] = []
         with np.errstate(all="ignore"):
             for number, node in enumerate(self.nodes):
@@ -88,7 +89,7 @@ class Program:
 
 
 def _key(x: Operand) -> tuple[str, str]:
-    """What makes two operands the same: the bits of a constant, -0 being another than 0."""
+    """Return the key by which operands are equal: a node's number or a constant's bits, so that -0 differs from 0."""
     return ("node", f"{x.node:06}") if isinstance(x, Ref) else (x.dtype.str, x.tobytes().hex())
 
 
@@ -97,7 +98,7 @@ def _is(x: Operand, value: float) -> bool:
 
 
 def _simpler(op: str, args: tuple[Operand, ...]) -> Operand | None:
-    """The operand that an operation gives back as it is, if it does."""
+    """Return the operand that an operation returns unchanged, or None."""
     if op in ("add", "mul"):
         neutral = 0.0 if op == "add" else 1.0
         for one, other in (args, args[::-1]):
@@ -118,5 +119,5 @@ def _simpler(op: str, args: tuple[Operand, ...]) -> Operand | None:
 
 
 def of(law: str) -> str:
-    """A law as the beginning of a complaint."""
+    """Return the name of a law as the beginning of an error message."""
     return f"{law}: " if law else ""

@@ -1,9 +1,9 @@
-"""What JAX makes of a step, operation by operation: the reference of the exported C.
+"""Results of a step computed with JAX operation by operation: the reference of the exported C.
 
-Compiled as a whole, XLA fuses a product and a sum into one rounding where it likes to; operation by operation it does
-not, and two programs of the same operations in the same order agree to the last bits. That is what is compared; what
-the compiled simulator makes of the same controller is the business of `loop`. Functions of <math.h> are taken from
-there: XLA has its own, of which log1p is off by 1e2 units in the last place.
+If XLA compiles a whole step, it may fuse a product and a sum into one rounding. Operation by operation it does not, and
+two programs with the same operations in the same order agree to the last bits. `closed_loop` compares the C with the
+compiled simulator. Functions of <math.h> come from the C library, because XLA's own differ: its log1p is off by 1e2
+units in the last place.
 """
 
 import ctypes
@@ -21,7 +21,7 @@ from ambjax.export.trace import Trace, arguments, precision
 
 
 class Results(NamedTuple):
-    """What a step makes of points: next states, whether started, outputs, and the bits."""
+    """Results of a step at some points: next states, whether the laws have started, outputs, and status bits."""
 
     state: np.ndarray
     started: np.ndarray
@@ -30,7 +30,7 @@ class Results(NamedTuple):
 
 
 def results(trace: Trace, at: Points) -> Results:
-    """The step at these points by JAX, operation by operation."""
+    """Return the results of the step at these points, computed with JAX operation by operation."""
     count = at.started.size
     with precision(trace.precision):
         given: Any = arguments(trace.controller)
@@ -47,7 +47,7 @@ def results(trace: Trace, at: Points) -> Results:
 
 
 def one_by_one(closed: ClosedJaxpr, args: list[Any], count: int) -> list[Any]:
-    """What a trace gives for scalars or rows of `count`, each primitive run by JAX alone, on rows.
+    """Evaluate a trace for scalars or rows of `count`, one primitive at a time.
 
     On rows: dividing a row by a scalar, XLA multiplies by its reciprocal.
     """
@@ -96,7 +96,7 @@ def _one(eqn: Any, args: list[Any], count: int) -> list[Any]:
 
 
 def _of_library(name: str, args: list[Any], dtype: np.dtype, count: int) -> np.ndarray:
-    """A function of <math.h>, as this machine has it, of rows."""
+    """Evaluate a function of this machine's <math.h> on rows."""
     single = dtype == np.float32
     function, kind = getattr(ctypes.CDLL(None), name + "f" * single), ctypes.c_float if single else ctypes.c_double
     function.restype, function.argtypes = kind, [kind] * len(args)

@@ -1,4 +1,4 @@
-"""The C of a traced step: header and source."""
+"""Write the header and the source of a traced step as C."""
 
 import functools
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,11 +12,11 @@ from ambjax.export.statements import Statements, literal, word
 from ambjax.export.texts import HEADER, MARK, SOURCE
 from ambjax.export.trace import UNREAD, Trace
 
-SLACK = 256  # bytes of a stack frame beside its numbers: registers saved, padding
+SLACK = 256  # bytes of a stack frame in addition to its numbers: saved registers, padding
 
 
 class Origin(NamedTuple):
-    """Where a controller is from: name of the case, SHA-256 of its file, and the cascade in words."""
+    """The origin of a controller: name of the case, SHA-256 of its file, and the cascade in words."""
 
     case: str
     digest: str
@@ -33,7 +33,7 @@ class Writer:
     # --- numbers in structs ---
 
     def struct(self, kind: str, numbers: Iterable[Number], more: Sequence[str] = ()) -> str:
-        """A struct of numbers, dotted names as structs within it."""
+        """Return the definition of a struct of numbers; a dotted name becomes a struct within it."""
         lines, open_ = ["typedef struct {"], ""
         for x in numbers:
             outer, _, name = word(x.name).rpartition(".")
@@ -50,14 +50,14 @@ class Writer:
         return "    " * (1 + (outer.count(".") + 1 if outer else 0))
 
     def _opened(self, now: str, then: str) -> list[str]:
-        """Lines that leave the struct `now` and enter `then`."""
+        """Return the lines that close the struct `now` and open `then`."""
         a, b = now.split(".") if now else [], then.split(".") if then else []
         same = next((k for k, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b)))
         closed = ["    " * (k + 1) + f"}} {a[k]};" for k in reversed(range(same, len(a)))]
         return closed + ["    " * (k + 1) + "struct {" for k in range(same, len(b))]
 
     def values(self, numbers: Sequence[Number]) -> str:
-        """The numbers as an initialiser of their struct, the lines of a macro: each with its name in a comment."""
+        """Return the numbers as an initialiser of their struct, in the lines of a macro, with names in comments."""
         tree: dict[str, Any] = {}
         for x in numbers:
             *outer, name = word(x.name).split(".")
@@ -76,12 +76,12 @@ class Writer:
     # --- the step ---
 
     def step(self) -> str:
-        """The step as a function."""
+        """Return the step as a C function."""
         p, trace = self.prefix, self.trace
         lines = [self.signature("step"), "{", "    uint32_t status = 0u;", *self.text.body()]
         given = [(f"state->{word(x.name)}", self.text.operand(after)) for x, after in trace.state]
         given += [(f"output->{word(x.name)}", self.text.operand(value)) for x, value in trace.outputs]
-        # what is read of the state is read before it is written
+        # state that is copied to another place is read before it is written
         read = dict.fromkeys(value for _, value in given if value.startswith("state->"))
         old = {value: f"old{k}" for k, value in enumerate(read)}
         lines += [f"    const {p}_real {name} = {value};" for value, name in old.items()]
@@ -92,7 +92,7 @@ class Writer:
         return "\n".join([*lines, "    return status;", "}"])
 
     def signature(self, function: str) -> str:
-        """First line of a function."""
+        """Return the first line of a function."""
         p = self.prefix
         if function != "step":
             return f"void {p}_{function}({p}_state *state)"
@@ -101,7 +101,7 @@ class Writer:
         )
 
     def source(self) -> str:
-        """NAME.c."""
+        """Return the source file, PREFIX.c."""
         zeros = [f"    state->{word(x.name)} = {literal(0, self.trace.precision)};" for x, _ in self.trace.state]
         return SOURCE.format(
             p=self.prefix,
@@ -115,7 +115,7 @@ class Writer:
         )
 
     def banner(self, file: str) -> str:
-        """First lines of a file: what it is, and where it is from."""
+        """Return the first comment of a file: its contents and its origin."""
         lines = [f"{file}: the controller of case '{self.origin.case}' as C99, written by ambjax {__version__}."]
         lines += [MARK.format(p=self.prefix), f"SHA-256 of the case: {self.origin.digest}"]
         return "/* " + "\n * ".join(lines) + " */"
@@ -123,7 +123,7 @@ class Writer:
     # --- the header ---
 
     def header(self) -> str:
-        """NAME.h."""
+        """Return the header file, PREFIX.h."""
         p, t = self.prefix, self.trace
         inputs = [x._replace(allowed="" if x.name in t.read else UNREAD) for x in t.inputs]
         return HEADER.format(
@@ -137,7 +137,9 @@ class Writer:
             bits="\n".join(f"#define {p}_{x.upper()} {1 << k}u /* {BITS[x]} */" for k, (x, _) in enumerate(t.bits)),
             params=self.struct("params", t.parameters),
             state=self.struct(
-                "state", [x for x, _ in t.state], ["uint32_t started; /* 0: the next accepted readings begin */"]
+                "state",
+                [x for x, _ in t.state],
+                ["uint32_t started; /* 0: the laws start at the next accepted readings */"],
             ),
             input=self.struct("input", inputs),
             output=self.struct("output", [x for x, _ in t.outputs]),
@@ -146,7 +148,7 @@ class Writer:
         )
 
     def told(self) -> list[str]:
-        """The header's own words: cascade, order of work, cost."""
+        """Return the description in the header: cascade, order of work, cost."""
         t, counts = self.trace, self.trace.counts()
         size = 4 if t.precision == "float" else 8
         order = "\n".join(order_of_work(t)).splitlines()
@@ -160,8 +162,8 @@ class Writer:
             *fixed(t),
             "",
             f"A step: {t.flops()} flops. {cost}.",
-            f"State: {t.state_bytes()} bytes. Stack: at most {stack} bytes, were every intermediate kept.",
-            "Compile with -ffp-contract=off: a fused product rounds once where the simulator rounds twice.",
+            f"State: {t.state_bytes()} bytes. Stack: at most {stack} bytes, if every intermediate number is kept.",
+            "Compile with -ffp-contract=off: a fused multiply-add rounds once where the simulator rounds twice.",
         ]
 
 
@@ -179,13 +181,13 @@ COSTS = {
 
 
 def order_of_work(trace: Trace) -> list[str]:
-    """What is done when, in words."""
+    """Return the order of work of every sample, in words."""
     controller = trace.controller
     processor: Any = controller.parameters.controller.processor
     delay = processor.delay
     lines = [
-        f"Every T = {controller.period:g} s: read the sensors, call the step at once, and let output->u act",
-        f"{delay:g} T after the reading, until that of the next sample takes its place; before the first, 0 V.",
+        f"Every T = {controller.period:g} s: read the sensors, call the step at once, and apply output->u",
+        f"{delay:g} T after the reading, until the u of the next sample replaces it; before the first u, apply 0 V.",
     ]
     ahead = f"{delay:g} T after the reading" if processor.predicts else "of the reading"
     lines.append(f"The reference is that of the instant {ahead}.")
@@ -193,19 +195,19 @@ def order_of_work(trace: Trace) -> list[str]:
 
 
 def fixed(trace: Trace) -> list[str]:
-    """What is fixed at export, what can be set in params, what a step checks, and how long it replaces or holds."""
+    """Return in words what the export fixes, what params can set, what a step checks, and how long it predicts."""
     parameters = {x.name: x for x in trace.parameters}
     u_max, delay = parameters["limits.u_max"].value, parameters["processor.delay"].allowed
     lines = [
-        f"Fixed at export: T = {trace.controller.period:g} s, the laws, which signs are hard, whether the delay is",
-        "predicted. Export again to change one of them. All of params may be set between two steps.",
+        f"Fixed at export: T = {trace.controller.period:g} s, the laws, which signs have no layer, and whether the",
+        "delay is predicted. Export again to change one of these. Any value in params may change between two steps.",
         f"params->limits.u_max: u is {'not limited' if np.isinf(u_max) else f'limited to +-{u_max:g} V'}.",
     ]
     if samples := parameters.get("processor.guard.samples"):
         time = samples.value * trace.controller.period
         lines += [
             f"params->processor.guard: a reading is refused beyond {_ends(trace, 'processor.guard')}, or if it",
-            "cannot follow from the last. The model's prediction takes its place for at most",
+            "cannot follow from the last one. The model's prediction replaces it for at most",
             f"{samples.value:g} samples in a row ({time:g} s); then u = 0.",
         ]
     else:
@@ -219,13 +221,13 @@ def fixed(trace: Trace) -> list[str]:
         lines += [f"params->{word(x.name)}: finite, else every step is invalid."]
     return [
         *lines,
-        "No other parameter is checked. A law that gives no finite number sets the bit FAILED.",
-        "An invalid or failed step holds u, and so does the next: there is no timeout. The caller decides how long.",
+        "No other parameter is checked. A law that returns no finite number sets the bit FAILED.",
+        "An invalid or failed step holds u. There is no timeout: the caller decides for how many steps u may be held.",
     ]
 
 
 def _ends(trace: Trace, of: str) -> str:
-    """The largest size of each input that a struct of params allows."""
+    """Return the limits of the inputs in a struct of params, in words."""
     parameters = {x.name: x for x in trace.parameters}
     found = {name: parameters.get(f"{of}.{name}") for name in INPUTS if name in trace.read}
     return ", ".join(f"|{name}| = {x.value:g} {x.unit}" for name, x in found.items() if x)

@@ -1,4 +1,4 @@
-"""A program as C statements, one a node."""
+"""Write a program as C statements, one per node."""
 
 import re
 from typing import Any
@@ -8,7 +8,7 @@ import numpy as np
 from ambjax.export.primitives import OPS
 from ambjax.export.program import Operand, Program, Ref
 
-# Words that C or C++ keep for themselves and Python does not.
+# Keywords of C or C++ that are valid names in Python.
 RESERVED = {
     *("auto", "bool", "case", "catch", "char", "const", "constexpr", "default", "delete", "do", "double", "enum"),
     *("explicit", "export", "extern", "float", "friend", "goto", "inline", "int", "long", "mutable", "namespace"),
@@ -29,13 +29,13 @@ PRECISIONS = {"float": "float32", "double": "float64"}
 
 
 def word(name: str) -> str:
-    """A dotted name as C has it: none of its keywords, ASCII."""
+    """Return a dotted name as a valid C name: in ASCII, and no keyword."""
     parts = [part + "_" if part in RESERVED else part for part in name.split(".")]
     return ".".join(re.sub(r"[^\x00-\x7f]", lambda found: f"_u{ord(found[0]):04x}", part) for part in parts)
 
 
 def literal(x: Any, precision: str) -> str:
-    """A number as a C constant of a precision: the shortest that reads back as it."""
+    """Return a number as a C constant of a precision: the shortest text with the same value."""
     suffix, kind = ("f", np.float32) if precision == "float" else ("", np.float64)
     value = kind(x)
     if np.isinf(value):
@@ -47,7 +47,7 @@ def literal(x: Any, precision: str) -> str:
 
 
 class Statements:
-    """A program's nodes `order` as C in a precision, all names beginning with `prefix`."""
+    """The nodes `order` of a program as C in a precision, all names with `prefix`."""
 
     def __init__(self, program: Program, order: list[int], precision: str, prefix: str):
         self.program, self.order, self.precision, self.prefix = program, order, precision, prefix
@@ -55,7 +55,7 @@ class Statements:
         self.real = np.dtype(PRECISIONS[precision])
 
     def operand(self, x: Operand) -> str:
-        """An operand as C text."""
+        """Return an operand as C text."""
         if isinstance(x, Ref):
             node = self.program.nodes[x.node]
             if node.op != "input":
@@ -69,13 +69,13 @@ class Statements:
         return f"({text})" if text.startswith("-") else text
 
     def kind(self, dtype: np.dtype) -> str:
-        """C type of a dtype."""
+        """Return the C type of a dtype."""
         if dtype.kind == "b":
             return "int"
         return f"{self.prefix}_real" if dtype == self.real else "float"
 
     def statement(self, number: int) -> str:
-        """One node as a declaration."""
+        """Return one node as a declaration."""
         node = self.program.nodes[number]
         single = self.precision == "float" or any(self.program.dtype(x) == np.float32 for x in node.args)
         text = OPS[node.op].text.format(
@@ -89,7 +89,7 @@ class Statements:
         return f"    const {self.kind(node.dtype)} v{self.number[number]} = {text};"
 
     def body(self) -> list[str]:
-        """All statements, those of a law below its name."""
+        """Return all statements; those of each law follow a comment with its name."""
         lines, law = [], ""
         for number in self.order:
             node = self.program.nodes[number]
@@ -100,7 +100,7 @@ class Statements:
         return lines
 
     def helpers(self) -> list[str]:
-        """Functions that the step uses and C has not: as JAX has them, NaN included."""
+        """Return the functions that the step uses and C lacks. They treat NaN as JAX does."""
         used = {self.program.nodes[n].op for n in self.order}
         real, lines = f"{self.prefix}_real", []
         for name, text in HELPERS.items():

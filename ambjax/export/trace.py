@@ -1,4 +1,4 @@
-"""The traced step with names: which numbers it reads, keeps and gives, and what each costs."""
+"""The traced step of a controller: its named inputs, states, outputs and parameters, and its cost."""
 
 import dataclasses
 from collections import Counter
@@ -17,12 +17,12 @@ from ambjax.export.program import Operand, Program, Ref
 from ambjax.export.statements import PERIOD, PRECISIONS, word
 from ambjax.numerics.records import canonical
 
-# Of a number that the step has no use for, in place of what is allowed.
+# Text that replaces the allowed values of a number that the step does not use.
 UNREAD = "not read"
 
 
 def precision(name: str) -> Any:
-    """JAX in single or double precision within a block, whatever it is set to."""
+    """Return a context manager that sets JAX to single ("float") or double precision."""
     import jax.experimental
 
     home: Any = jax if hasattr(jax, "enable_x64") else jax.experimental
@@ -30,7 +30,7 @@ def precision(name: str) -> Any:
 
 
 def arguments(controller: Controller) -> Any:
-    """Parameters, memory, inputs and period as JAX has them in its present precision."""
+    """Return parameters, memory, inputs and period as JAX values in its present precision."""
     zero = jnp.zeros(())
     inputs = StepInputs(*[zero] * len(StepInputs._fields))
     return (*canonical((controller.parameters,)), controller.start(), inputs, jnp.asarray(controller.period))
@@ -38,9 +38,10 @@ def arguments(controller: Controller) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Trace:
-    """The step as a program. `state` pairs each number with its next value, `outputs` and `bits` with theirs.
+    """The step as a program. `state` pairs each number with its next value; `outputs` and `bits`, with their values.
 
-    `keep` and `leaves`: of all leaves of the memory, the numbers of those that the C keeps, and their count.
+    `read`: names of the inputs that the step uses. `keep`: indices of the leaves of the memory that the C keeps.
+    `refs`: operands of the parameters, the memory, the inputs and the period.
     """
 
     controller: Controller
@@ -57,15 +58,15 @@ class Trace:
     refs: list[Ref]
 
     def roots(self) -> list[Operand]:
-        """All that the step gives."""
+        """Return the operands of all results of the step."""
         return [x for _, x in [*self.state, *self.outputs, *self.bits]] + [self.started]
 
     def order(self) -> list[int]:
-        """Numbers of the nodes that are written, in order."""
+        """Return the numbers of the nodes that are written, in order."""
         return sorted(n for n in self.program.needed(self.roots()) if self.program.nodes[n].op != "input")
 
     def counts(self) -> Counter:
-        """How many operations of each cost a step takes; what depends on the period alone is the compiler's."""
+        """Return the number of operations of each kind in a step, without those that depend on the period alone."""
         nodes = self.program.nodes
         fixed = {n for n, node in enumerate(nodes) if node.text == PERIOD}
         found: Counter = Counter()
@@ -78,20 +79,20 @@ class Trace:
         return found
 
     def state_bytes(self) -> int:
-        """Size of the state struct: its numbers, and whether it was started, aligned."""
+        """Return the size of the state struct in bytes: its numbers and the flag `started`, aligned."""
         size = np.dtype(PRECISIONS[self.precision]).itemsize
         return (len(self.state) + 1) * size
 
     def flops(self) -> int:
-        """Additions, multiplications, divisions, roots and function calls."""
+        """Return the number of additions, multiplications, divisions, roots and function calls in a step."""
         counts = self.counts()
         return sum(counts[cost] for cost in COUNTED)
 
 
 def trace(controller: Controller, to: str) -> Trace:
-    """The step traced in a precision, `float` or `double`.
+    """Trace the step of a controller in a precision, `float` or `double`.
 
-    Raises ValueError for a law that does what scalar C cannot.
+    Raises ValueError for a law that scalar C cannot express.
     """
     with precision(to):
         first = _traced(controller, to, frozenset())
@@ -110,7 +111,7 @@ def _traced(controller: Controller, to: str, read: frozenset[str]) -> Trace:
     results = traced(program, lambda *x: step(*x, read), given, refs)
     for x in results:
         if program.dtype(x).kind == "f" and program.dtype(x) != real:
-            raise ValueError(f"the step gives {program.dtype(x).name} where all is {real.name}.")
+            raise ValueError(f"the step returns {program.dtype(x).name}, but must return {real.name}.")
     after, started = results[: len(states)], results[len(states)]
     outputs, bits = results[len(states) + 1 : -len(BITS)], results[-len(BITS) :]
     at = refs[len(parameters) :]
@@ -140,7 +141,7 @@ def _output(name: str) -> tuple[str, str, str]:
 
 
 def _alive(program: Program, before: list[Ref], after: list[Operand], roots: list[Operand]) -> list[int]:
-    """Numbers of the states on which anything but they themselves depends."""
+    """Return the indices of the states on which a result, or another kept state, depends."""
     keep: set[int] = set()
     while True:
         seen = program.needed([*roots, *(after[k] for k in keep)])
@@ -151,7 +152,7 @@ def _alive(program: Program, before: list[Ref], after: list[Operand], roots: lis
 
 
 def _states(controller: Controller) -> list[Number]:
-    """Every real number of the memory, in the order of its leaves."""
+    """Return every real number of the memory, in the order of its leaves. Raises ValueError for an array."""
     cascade, memory = controller.parameters.controller, controller.start()
     found = []
     for stage, law, state in zip(CascadeState._fields, cascade.laws, memory.laws, strict=True):
@@ -163,13 +164,13 @@ def _states(controller: Controller) -> list[Number]:
             )
         words = f"state of {type(law).__name__}"
         found += [Number(f"{stage}.{name}", unit, "", doc or words, 0.0) for name, unit, doc in told]
-    commands = {**OUTPUTS, "i_ref_dot": ("A/s", "its rate")}
+    commands = {**OUTPUTS, "i_ref_dot": ("A/s", "rate of i_ref")}
     found += [
         Number(f"last.{name}", commands[name][0], "", f"last {commands[name][1]}", 0.0) for name in memory.last._fields
     ]
     found.append(Number("before.u", "V", "", "voltage of the sample before the last", 0.0))
     if memory.watch:
-        names = {**{f"watch.{name}": (INPUTS[name][0], "expected reading") for name in memory.watch.expected._fields}}
-        names["watch.left"] = ("samples", "for which a reading may still be replaced")
+        names = {**{f"watch.{name}": (INPUTS[name][0], "predicted reading") for name in memory.watch.expected._fields}}
+        names["watch.left"] = ("samples", "number for which a reading may still be replaced")
         found += [Number(name, unit, "", doc, 0.0) for name, (unit, doc) in names.items()]
     return found

@@ -1,9 +1,9 @@
-"""The horizon of a comparison of closed loops: how long rounding alone leaves them together.
+"""The horizon within which two closed loops can be compared despite rounding errors.
 
-A closed loop with hard signs or converters amplifies rounding until two correct programs have nothing in common but
-their statistics. Twins of JAX's loop measure that: in each, every state of the plant and of the laws, and the voltage,
-is changed by one unit in the last place, up or down at random, at every sample. Until the twins part, a correct program
-stays as close to JAX's loop as they do.
+A closed loop with hard signs or converters amplifies rounding errors until two correct programs agree only in their
+statistics. Twins of JAX's loop measure this growth: in each, every state of the plant and of the laws, and the voltage,
+is changed by one unit in the last place, up or down at random, at every sample. While the twins stay close to JAX's
+loop, a correct program does too.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ SIGNALS = ("z", "u")
 
 
 class LoopCase(NamedTuple):
-    """What is compared: a cascade on its processor in a scenario, over a clock; `settle`: when it has settled, s."""
+    """The loop to compare: a cascade on its processor, a scenario and a clock; `settle`: the settling time, s."""
 
     cascade: Cascade
     scenario: Scenario
@@ -40,11 +40,11 @@ class LoopCase(NamedTuple):
 
 
 class Horizon(NamedTuple):
-    """JAX's loop, and how far the twins of one precision part from it.
+    """JAX's loop, and the distance of the twins of one precision from it.
 
-    `signals`: z (m) and u (V) of JAX's loop, [samples]. `parted`: the largest distance of any twin so far, likewise.
-    `sizes`: the rms of z - r and of u, after the settling time. `samples`: how many pass before a twin parts by more
-    than PARTED of a size, or the rotor is lost.
+    `signals`: z (m) and u (V) of JAX's loop, [samples]. `parted`: the largest distance of any twin up to each sample,
+    [samples]. `sizes`: the rms of z - r and of u, after the settling time. `samples`: number of samples before a twin
+    differs by more than PARTED of a size, or the rotor is lost.
     """
 
     signals: dict[str, np.ndarray]
@@ -60,35 +60,35 @@ class Horizon(NamedTuple):
 
 @record
 class Twin(Sampled):
-    """The sampled loop with every state changed by `unit` of its size at every sample; `seed` draws the signs."""
+    """The sampled loop with every state changed by `unit` times its scale at every sample; `seed` draws the signs."""
 
     seed: Scalar
     unit: Scalar
 
     def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
-        """The laws' step from the changed states, and its changed command."""
+        """Compute the laws' step from the changed states, and change its command."""
         sample = jnp.rint(t / self.period).astype(jnp.int32)
         key = jax.random.fold_in(jax.random.key(jnp.asarray(self.seed, jnp.int32)), sample)
         before, after = jax.random.split(key)
         moved = self._moved(before, state, self._sizes(state))
-        # flags and counts are no states
+        # flags and counters are not changed
         watch = moved.watch._replace(left=state.watch.left) if state.watch else ()
         state = moved._replace(sane=state.sane, watch=watch, started=state.started, sensed=state.sensed)
         stepped = super().jump(t, state, errors)
         return stepped._replace(command=self._moved(after, stepped.command, self._sizes(stepped).command))
 
     def _moved(self, key: Array, state: Any, sizes: Any) -> Any:
-        """Every number one unit of its size up or down."""
+        """Return every number changed by one unit of its scale, up or down."""
         leaves, tree = jax.tree.flatten(state)
         signs = jax.random.rademacher(key, (len(leaves),), float)
         steps = [jnp.maximum(jnp.abs(x), size) for x, size in zip(leaves, jax.tree.leaves(sizes), strict=True)]
         return jax.tree.unflatten(tree, [x + self.unit * s * h for x, s, h in zip(leaves, signs, steps, strict=True)])
 
     def _sizes(self, state: SampledState) -> SampledState:
-        """The size that matters of each state: the unit in the last place of a smaller number is that of the size.
+        """Return the scale of each state. A number below its scale changes by the unit in the last place of the scale.
 
-        Of a voltage, what drives the coil's current reference within a sample: laws divide a difference of two of them
-        by the period.
+        The scale of a voltage is that which drives the coil's current reference within one sample, because the laws
+        divide the difference of two references by the period.
         """
         cascade, plant = self.loop.cascade, self.loop.scenario.plant
         model = cascade.model
@@ -111,7 +111,7 @@ class Twin(Sampled):
 
 
 def horizons(case: LoopCase, precisions: list[str]) -> dict[str, Horizon]:
-    """JAX's loop beside its twins, for each precision."""
+    """Simulate JAX's loop and its twins. Return the horizon of each precision."""
     given: Any = system_of(case.cascade, case.scenario, case.clock)
     twin, clock = canonical((Twin(given.loop, given.period, given.cuts, 0.0, 0.0), case.clock))
     units = [0.0] + [float(np.finfo(PRECISIONS[x]).eps) for x in precisions for _ in range(TWINS)]
@@ -132,7 +132,7 @@ def horizons(case: LoopCase, precisions: list[str]) -> dict[str, Horizon]:
 
 
 def farthest(loops: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """The largest distance so far of any of the loops, [loops, samples], from the reference."""
+    """Return the largest distance of any loop [loops, samples] from the reference up to each sample, [samples]."""
     return np.maximum.accumulate(np.abs(loops - reference).max(axis=0))
 
 
@@ -143,7 +143,7 @@ def _count(parted: dict[str, np.ndarray], sizes: dict[str, float], alive: int) -
 
 @jax.jit
 def _together(twin: Twin, clock: Clock, units: Array, seeds: Array) -> Any:
-    """z and u of one loop for each unit and seed, [loops, samples]; r, likewise; when each rotor is lost, s."""
+    """Return z and u of one loop for each unit and seed, [loops, samples]; r, same shape; time of each loss, s."""
 
     def one(unit: Array, seed: Array) -> Any:
         system: Any = dataclasses.replace(twin, unit=unit, seed=seed)

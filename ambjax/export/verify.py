@@ -1,4 +1,4 @@
-"""The C held to JAX: it compiles without a warning, steps and holds the rotor as JAX does, and tests itself."""
+"""Verification of the C against JAX: compilation without warnings, the test program, single steps, and closed loops."""
 
 import dataclasses
 import pathlib
@@ -18,14 +18,14 @@ from ambjax.export.statements import PRECISIONS
 from ambjax.export.trace import Trace, trace
 from ambjax.export.twins import LEAST, PARTED, TWINS, LoopCase
 
-# Random states and inputs of the comparison of one step.
+# Number of points (states and inputs) at which one step is compared.
 COUNT = 10_000
 
 
 class Check(NamedTuple):
-    """One line of the table: what is checked, in which precision, what was found and is allowed, whether it holds.
+    """One row of the table: the check, its precision, what was found, what is allowed, and whether the check holds.
 
-    `ok` is None where the check is not decisive.
+    `ok` is None if the check is not decisive.
     """
 
     name: str
@@ -42,9 +42,9 @@ class Check(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Draft:
-    """A controller as files of a precision, and JAX's results of its step.
+    """The files of a controller in one precision, and JAX's results of its step.
 
-    `steps`: by the name of a check, points and results: with the case's parameters, and with others.
+    `steps`: by check, points and results; one check has the case's parameters, the other has varied ones.
     """
 
     trace: Trace
@@ -54,7 +54,7 @@ class Draft:
 
 
 def draft(controller: Controller, precision: str, prefix: str, origin: Origin, count: int = COUNT) -> Draft:
-    """Files and references of a controller. Raises ValueError for a law that does what scalar C cannot."""
+    """Return the files of a controller and JAX's results. Raises ValueError for a law that scalar C cannot express."""
     traced = trace(controller, precision)
     at = {"one step": points(traced, count), "parameters": varied(traced, count)}
     steps = {name: (x, results(traced, x)) for name, x in at.items()}
@@ -62,9 +62,9 @@ def draft(controller: Controller, precision: str, prefix: str, origin: Origin, c
 
 
 def verify(drafts: Mapping[str, Draft], case: LoopCase | None) -> list[Check]:
-    """Every check, in both precisions; without a case none of the closed loop.
+    """Run and return all checks, in every precision of `drafts`. `case` None: without those of the closed loop.
 
-    Raises ValueError where the machine decides nothing: without a compiler, or where what it makes cannot be run.
+    Raises ValueError if there is no compiler, or if this machine cannot run the compiled programs.
     """
     checks, machines = [], {}
     with scratch() as folder:
@@ -85,7 +85,7 @@ def verify(drafts: Mapping[str, Draft], case: LoopCase | None) -> list[Check]:
 
 
 def _built(one: Draft, precision: str, at: pathlib.Path) -> Iterator[Check]:
-    """Compiled strictly; the test program plain and under sanitizers; the library."""
+    """Compile with strict warnings, run the test program plain and sanitized, and build the library."""
     source, test = at / f"{one.prefix}.c", at / f"{one.prefix}_test.c"
     for how, flags in (("", []), (", sanitized", SANITIZED)):
         program = at / f"test{len(flags)}"
@@ -100,7 +100,7 @@ def _built(one: Draft, precision: str, at: pathlib.Path) -> Iterator[Check]:
 
 
 def _stepped(name: str, one: Draft, precision: str, machine: Compiled) -> Iterator[Check]:
-    """One step from each point."""
+    """Compare one step from each point."""
     at, should = one.steps[name]
     found, kind = machine.results(at), np.finfo(PRECISIONS[precision])
     is_, as_ = (np.concatenate([x.state, x.outputs]) for x in (found, should))
@@ -118,7 +118,7 @@ def _stepped(name: str, one: Draft, precision: str, machine: Compiled) -> Iterat
 
 
 def deviation(found: np.ndarray, should: np.ndarray, tiny: float) -> np.ndarray:
-    """How far numbers are off, as a share of what they should be; what is no number is off by 0 or by inf."""
+    """Return the relative deviation of numbers; 0 for two equal infinities or two NaN, inf if only one is NaN."""
     with np.errstate(all="ignore"):
         off = np.abs(found.astype(float) - should) / np.maximum(np.abs(should.astype(float)), 1e4 * tiny)
     same = (found == should) | (np.isnan(found) & np.isnan(should))
@@ -126,13 +126,13 @@ def deviation(found: np.ndarray, should: np.ndarray, tiny: float) -> np.ndarray:
 
 
 def _looped(precision: str, found: closed_loop.Beside) -> Check:
-    """The closed loop over its horizon."""
+    """Compare the closed loop over its horizon."""
     name, horizon = "closed loop, dz", found.horizon
     count, samples = horizon.samples, horizon.signals["z"].size
     if not horizon.decisive:
-        told = f"rounding alone parts JAX's loop from itself within {count} of {samples:,} samples"
+        told = f"twins of JAX's loop differ too much after {count} of {samples:,} samples"
         return Check(name, precision, told, f"at least {LEAST} samples", None)
-    told = f"{found.times:.2g} times what rounding does, over {count:,} of {samples:,} samples"
+    told = f"{found.times:.2g} times the rounding error, over {count:,} of {samples:,} samples"
     reached, size = float(horizon.parted["z"][count - 1]), horizon.sizes["z"]
     share = f", {reached / size:.1g} of the rms error" if size > 0 else ""
     allowed = f"{closed_loop.TIMES:g} times (rounding reaches {reached:.1g} m{share})"
@@ -140,46 +140,46 @@ def _looped(precision: str, found: closed_loop.Beside) -> Check:
 
 
 def table(checks: list[Check], case: str, mark: str) -> str:
-    """The checks as a page of Markdown, which ends with this line."""
+    """Return the checks as a Markdown page that ends with the line `mark`."""
     rows = [f"| {x.name} | {x.precision} | {x.found} | {x.allowed} | {x.verdict} |" for x in checks]
     verdict = summary(checks)
     head = "| check | precision | found | allowed | verdict |\n|---|---|---|---|---|"
     return (
-        f"# The controller of case '{case}' as C, held to JAX\n\n{verdict}\n\n{head}\n"
+        f"# The controller of case '{case}' as C, compared with JAX\n\n{verdict}\n\n{head}\n"
         + "\n".join(rows)
         + f"\n\n{TOLD}\n{mark}\n"
     )
 
 
 def holds(checks: list[Check]) -> bool:
-    """Whether no check fails. One that is not decisive does not fail."""
+    """Return whether no check fails. A check that is not decisive does not fail."""
     return all(x.ok is not False for x in checks)
 
 
 def summary(checks: list[Check]) -> str:
-    """The verdict of all checks in one sentence."""
+    """Return the verdict of all checks in one sentence."""
     open_ = sum(x.ok is None for x in checks)
     if not holds(checks):
-        return "It does NOT hold."
-    return f"No check fails; {open_} of {len(checks)} are not decisive." if open_ else "All of it holds."
+        return "Some checks FAIL."
+    return f"No check fails; {open_} of {len(checks)} are not decisive." if open_ else "All checks hold."
 
 
-TOLD = f"""One step: states and inputs at random over decades, with zeros, limits, NaN and infinities, and the points
-next to where each comparison of the step turns, on both sides. The reference is JAX in that precision, each primitive
-run alone, with functions of math.h from there: compiled as a whole, XLA rounds a product and a sum once where the C
-({EXACT}) rounds twice. A number may be off by a share of its own size. Points at which an intermediate number is
-subnormal are left out: XLA takes it for 0.
+TOLD = f"""One step: the points are random states and inputs over decades, zeros, limits, NaN and infinities, and points
+on both sides of the threshold of each comparison in the step. The reference is JAX in the same precision, one primitive
+at a time, with the functions of math.h: if XLA compiles the whole step, it rounds a product and a sum once where the C
+({EXACT}) rounds twice. The tolerance of a number is relative. Points at which an intermediate number is subnormal are
+omitted, because XLA replaces it by 0.
 
-Parameters: the same at other parameters, so that a gain or a limit that is written into the C as a constant is found.
-Every parameter that the step reads goes to {1 / SPAN:g} and {SPAN:g} times the case's value, within what the header
-allows, first alone, then with the others at random ends. Alone it also goes to NaN, u_max and a steepness p to inf,
-and processor.delay to values outside its range: the C must reject what JAX rejects.
+Parameters: one step with other parameters. This check finds a gain or a limit that the C has as a constant. Every
+parameter that the step reads is set to {1 / SPAN:g} and {SPAN:g} times the case's value, within the range in the
+header, first alone, then with the others at random ends of their ranges. Alone, it is also set to NaN, u_max and a
+steepness p to inf, and processor.delay to values outside its range: the C must reject what JAX rejects.
 
-Closed loop: JAX's plant and sensors under the compiled C, beside the whole compiled by JAX in double precision. Signs
-and converters amplify rounding, so the loops are compared only while rounding has not grown. {TWINS} twins of JAX's
-loop measure that: in each, every state of plant and laws and the voltage is changed by one unit in the last place of
-the precision, up or down at random, at every sample. The horizon ends before the first sample at which a twin is off by
-more than {PARTED:g} of the rms of z - r, or of that of u, or at which the rotor is lost. Up to there, z of the C's loop
-may at no sample be off by more than {closed_loop.TIMES:g} times what the farthest twin is off. With a horizon of
-fewer than {LEAST} samples the row is not decisive.
+Closed loop: JAX's plant and sensors with the compiled C, compared with the same loop in JAX in double precision. Signs
+and converters amplify rounding errors, so the loops are compared only while these errors are small. {TWINS} twins of
+JAX's loop measure them: in each, every state of plant and laws and the voltage is changed by one unit in the last place
+of the precision, up or down at random, at every sample. The horizon ends before the first sample at which a twin
+differs by more than {PARTED:g} of the rms of z - r, or of the rms of u, or at which the rotor is lost. Within the
+horizon, z of the C's loop may differ by at most {closed_loop.TIMES:g} times the difference of the farthest twin, at
+every sample. With a horizon of fewer than {LEAST} samples the row is not decisive.
 """

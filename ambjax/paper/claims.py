@@ -1,7 +1,7 @@
-"""The paper's claims, of its Section 4 and abstract, each against what the simulation does.
+"""The claims of the paper's Section 4 and abstract, each with the function that judges it.
 
-Each claim is one function from the evidence of a reading to a number, a verdict and its cause. No
-verdict is typed in: all are computed from the runs in `ambjax.paper.evidence`.
+The function of a claim takes the evidence of one reading and returns a number, a verdict and its cause. Every verdict
+is computed from the runs in `ambjax.paper.evidence`.
 """
 
 import dataclasses
@@ -16,16 +16,16 @@ from ambjax.paper.readings import PULSE, SETTLE, TABLE_2
 from ambjax.world.plant import Plant
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "not determined by the paper"
-# Of a claim about runs that the integrator gave up: whether the rotor is held is not known.
+# Verdict on a claim about stalled runs, of which it is not known whether the rotor survives.
 UNDECIDED = "not decided"
-STALLED = "the integrator could not meet its tolerance: whether the rotor is held is not known"
+STALLED = "the integrator could not meet its tolerance, so whether the rotor survives is not known"
 SIGMA_RADIUS, TRACKING_ERROR, INVERSION_TIME = 6e-6, 2.3e-5, 0.01
 GAP = float(Plant().s_0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """What one reading gives for a claim: in words, as a number, the verdict, and why."""
+    """The result of one claim in one reading: in words, as a number, the verdict, and its cause."""
 
     ours: str
     value: float | None
@@ -35,7 +35,7 @@ class Finding:
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """A claim: what and where, the paper's number, and the criterion that decides."""
+    """A claim: its statement, its section in the paper, the paper's number, the criterion, and its judge."""
 
     says: str
     where: str
@@ -48,7 +48,7 @@ CLAIMS: list[Claim] = []
 
 
 def claim(says: str, where: str, paper: str, criterion: str) -> Callable[[Callable[[Evidence], Finding]], Any]:
-    """Enter the function below into the ledger."""
+    """Decorator that enters a claim into CLAIMS, with the decorated function as its judge."""
 
     def enter(judge: Callable[[Evidence], Finding]) -> Callable[[Evidence], Finding]:
         CLAIMS.append(Claim(says, where, paper, criterion, judge))
@@ -62,7 +62,7 @@ def _finding(ours: str, value: float, condition: bool, cause: str) -> Finding:
 
 
 def _ended(run: Run, evidence: Evidence) -> Finding | None:
-    """The finding for a claim about a run that lost the rotor, or stalled, or None."""
+    """Return the finding on a claim about a run that is lost or stalled; None if the run reached its end."""
     if math.isinf(run.metrics["lost_at_s"]):
         return None
     if run.metrics["stalled"]:
@@ -76,7 +76,7 @@ def _ended(run: Run, evidence: Evidence) -> Finding | None:
 
 
 def _worst(rows: Any, name: str, begin: float, end: float) -> float:
-    """Largest |signal| in begin <= t < end."""
+    """Return the largest |signal| in begin <= t < end."""
     return float(np.abs(getattr(rows, name)[(rows.t >= begin) & (rows.t < end)]).max())
 
 
@@ -152,7 +152,7 @@ def _radius(evidence: Evidence) -> Finding:
     rows = evidence.regulation.trajectory.rows
     quiet, pulse = _worst(rows, "sigma", SETTLE, PULSE.start), _worst(rows, "sigma", PULSE.start, PULSE.stop)
     worst = max(quiet, pulse)
-    cause = f"{quiet:.1e} m/s before the pulse, {pulse:.1e} in it; noise apart, k 2/pi arctan(p sigma) balances q_z"
+    cause = f"{quiet:.1e} m/s before the pulse, {pulse:.1e} in it; without noise, k 2/pi arctan(p sigma) balances q_z"
     ended = _ended(evidence.regulation, evidence)
     return ended or _finding(f"{worst:.1e} m/s", worst, worst <= 1.05 * SIGMA_RADIUS, cause)
 
@@ -238,7 +238,7 @@ def _noise(evidence: Evidence) -> Finding:
     largest = max(n.survived for n in evidence.noise)
     unknown = sum(bool(n.stalled.any()) and not n.lost.any() for n in evidence.noise)
     if largest == 0.0 and not unknown:
-        return Finding("survives none", 0.0, FAILS, "the rotor is lost at the smallest noise, and without noise")
+        return Finding("survives none", 0.0, FAILS, "the rotor is lost at the smallest noise and without noise")
     words = "survives std " + ", ".join(f"{n.survived:.1e} m held {n.sample_period:g} s" for n in evidence.noise)
     survivors = sum(n.survived >= TABLE_2.noise_std * 0.999 for n in evidence.noise)
     cause = f"the printed std is survived at {survivors} of {len(evidence.noise)} sample periods tried"
@@ -252,13 +252,15 @@ def _noise(evidence: Evidence) -> Finding:
 @claim("The noise is specified", "4", "variance only", "sigma's radius is the same to 10 % at every sample period")
 def _specification(evidence: Evidence) -> Finding:
     if not any(n.survived for n in evidence.noise):
-        return Finding("no survivor", None, OPEN, "the rotor is held at no noise, so the sample period cannot be told")
+        return Finding(
+            "no survivor", None, OPEN, "the rotor survives none of the noise levels, so nothing can be compared"
+        )
     if len(evidence.noise) == 1:
         words = f"held {evidence.noise[0].sample_period:g} s"
-        return Finding(words, None, OPEN, "on a processor noise is held for its period; the paper has none")
+        return Finding(words, None, OPEN, "on a processor, noise is held for its period; the paper gives no period")
     radii = [float(n.sigma[0]) for n in evidence.noise]
     spread = max(radii) / min(radii)
-    cause = f"at std {NOISE_STDS[0]:.0e} m the radius differs {spread:.1f}-fold between sample periods; none is printed"
+    cause = f"at std {NOISE_STDS[0]:.0e} m the radius differs {spread:.1f}-fold between sample periods; none is given"
     return Finding(f"radius varies {spread:.1f}-fold", spread, OPEN if spread > 1.1 else HOLDS, cause)
 
 
@@ -280,6 +282,6 @@ def _robust(evidence: Evidence) -> Finding:
     if stalled:
         return Finding(f"stalled in {len(stalled)} of {cases}", None, UNDECIDED, "true " + ", ".join(stalled))
     cause = (
-        f"one of {', '.join(UNCERTAIN)} off by 10 % either way, controller unaware: our choice, the paper tests none"
+        f"one of {', '.join(UNCERTAIN)} off by 10 % up or down, controller unchanged; our choice, the paper tests none"
     )
     return _finding(f"{error:.1e} m at worst", error, error < 0.01 * GAP, cause)

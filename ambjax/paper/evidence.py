@@ -1,4 +1,4 @@
-"""The runs behind the claims ledger: for one reading, everything that its verdicts are computed from."""
+"""The evidence for the claims: all runs of one reading from which the ledger computes its verdicts."""
 
 import dataclasses
 from collections.abc import Callable
@@ -24,19 +24,21 @@ from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Sensor
 
-# The noise scan: 10 nm to the paper's 0.316 mm; for each, the sample periods and two seeds.
+# The noise scan: standard deviations, from 10 nm to the paper's 0.316 mm; sample periods, s; samples and seeds of each.
 NOISE_STDS = np.logspace(-8, -3.5, 10)
 NOISE_PERIODS = (1e-5, 1e-4, 1e-3)
 NOISE_SAMPLES = 3000
 SEEDS = 2
+# Initial |z| of the basin scan, m.
 BASIN = np.logspace(-7, -3, 10)
+# The plant's parameters that are varied, one at a time.
 UNCERTAIN = ("m", "k_z", "R", "A")
-# Under noise that is held, at half the cost and from half the program: within 4e-9 m of an adaptive step (tested).
+# Steps of a reading under held noise, instead of adaptive ones: half the cost, and within 4e-9 m of them (tested).
 STEPS = {"tuned": Slide(16)}
 
 
 class Run(NamedTuple):
-    """One rollout: what was recorded, its metrics as floats, and the same rollout without the pulse, if asked for."""
+    """One rollout: its trajectory, its metrics as floats, and the trajectory without the pulse (None: not computed)."""
 
     trajectory: Trajectory
     metrics: dict[str, float]
@@ -44,9 +46,10 @@ class Run(NamedTuple):
 
 
 class Survival(NamedTuple):
-    """Of values tried, ascending: the largest up to which all are held (0: none is), and the next, if not decided.
+    """Result of a scan of ascending values.
 
-    `undecided`: at it none is lost, but the integrator stalled. None: at the next one is lost, or all are held.
+    `upto`: the largest value up to which every member survives; 0 if there is none. `undecided`: the next value, if no
+    member is lost there but the integrator stalled; None if a member is lost there, or if all values are survived.
     """
 
     upto: float
@@ -54,7 +57,10 @@ class Survival(NamedTuple):
 
 
 def held(tried: np.ndarray, lost: np.ndarray, stalled: np.ndarray) -> Survival:
-    """What is held of values [N], ascending: at which some are lost, and at which some are stalled, bool [N]."""
+    """Return the survival of a scan over the ascending values `tried` [N].
+
+    `lost`, `stalled`: bool [N], whether any member at this value is lost, or stalled.
+    """
     ended = np.flatnonzero(lost | stalled)
     first = int(ended[0]) if ended.size else len(tried)
     unknown = bool(ended.size) and not lost[first]
@@ -62,8 +68,11 @@ def held(tried: np.ndarray, lost: np.ndarray, stalled: np.ndarray) -> Survival:
 
 
 class Noise(NamedTuple):
-    """The noise scan at one sample period: per std, whether members are lost or stalled, and the mean radius of sigma
-    (m/s) of the rest."""
+    """The noise scan at one sample period, s, over `horizon`, s.
+
+    For each of NOISE_STDS: whether a member is lost, whether one is stalled, and the largest settled |sigma|, m/s, mean
+    over the seeds.
+    """
 
     sample_period: float
     horizon: float
@@ -73,16 +82,19 @@ class Noise(NamedTuple):
 
     @property
     def survived(self) -> float:
-        """Largest std, in m, up to which every member was held; 0 if at the smallest one was not."""
+        """Largest std, in m, up to which every member survives; 0 if one does not at the smallest."""
         return held(NOISE_STDS, self.lost, self.stalled).upto
 
     @property
     def undecided(self) -> float | None:
-        """The next std, in m, where no member is lost there but one stalled."""
+        """The next std, in m, if no member is lost there but one stalled; else None."""
         return held(NOISE_STDS, self.lost, self.stalled).undecided
 
     def std_for(self, radius: float) -> float | None:
-        """The std whose sigma neighbourhood has this radius, interpolated on logarithms; None if none does."""
+        """Return the std, m, at which sigma's neighbourhood has this radius, m/s; None if the scan does not reach it.
+
+        The std is interpolated linearly on logarithmic scales.
+        """
         count = int(np.sum(self.survived >= NOISE_STDS))
         if count < 2 or not self.sigma[0] <= radius <= self.sigma[count - 1]:
             return None
@@ -91,7 +103,7 @@ class Noise(NamedTuple):
 
 
 class Uncertain(NamedTuple):
-    """Tracking with one true parameter off: what loses the rotor, what stalls, and the largest settled error, m."""
+    """Tracking with one true parameter off: the lost cases, the stalled cases, and the largest settled error, m."""
 
     lost: list[str]
     stalled: list[str]
@@ -116,10 +128,10 @@ class Evidence(NamedTuple):
 
 
 def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evidence:
-    """Run everything for a reading; `say` is told what is about to run."""
+    """Run all simulations and checks of a reading and return the evidence. `say` receives the name of each stage."""
     cascade = paper.cascade(reading)
     runs, checks = {}, {}
-    with ThreadPoolExecutor() as pool:  # compiling and running leave the interpreter free
+    with ThreadPoolExecutor() as pool:  # compiling and running release the interpreter
         say(f"{reading}: noise")
         periods = (float(paper.CLOCK.sample_period),) if cascade.processor else NOISE_PERIODS
         first = pool.submit(_noise, cascade, reading, periods[0])
@@ -131,11 +143,11 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
             runs[name] = _run(cascade, reading, name)
             checks[name] = checking.result()
         noisy = runs["tracking"].trajectory
-        if reading not in paper.NOISY:  # there it is the tracking scenario
+        if reading not in paper.NOISY:  # the tracking scenario of the others has the noise already
             noisy = _simulate(reading, cascade, paper.noisy(paper.scenario("tracking", reading))).trajectory
         say(f"{reading}: on a processor")
         on_processor = {True: runs["tracking"]} if cascade.processor else _on_processor(reading)
-        # The first compiled what these run.
+        # The first scan compiled the program that these reuse.
         noise = [first.result(), *pool.map(lambda period: _noise(cascade, reading, period), periods[1:])]
     say(f"{reading}: basin of attraction")
     basin = _basin(cascade, reading)
@@ -146,7 +158,7 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
 
 
 def _simulate(reading: str, cascade: Cascade, scenario: Scenario) -> Run:
-    if scenario.sensor is None:  # with one of no error: the same program as under noise
+    if scenario.sensor is None:  # a sensor without error, so that the program is the same as under noise
         scenario = dataclasses.replace(scenario, sensor=Sensor())
     clock = paper.CLOCK
     if cascade.processor is None:
@@ -167,7 +179,7 @@ def _run(cascade: Cascade, reading: str, name: str) -> Run:
 
 
 def _uncertain(cascade: Cascade, reading: str) -> Uncertain:
-    """Tracking with one true parameter at a time 10 % off what the controller believes."""
+    """Simulate tracking with one true parameter at a time 10 % off the controller's model."""
     cases = [(name, factor) for name in UNCERTAIN for factor in (0.9, 1.1)]
 
     def one(case: tuple[str, float]) -> dict[str, float]:
@@ -186,13 +198,13 @@ def _uncertain(cascade: Cascade, reading: str) -> Uncertain:
 
 @one_kernel
 def _scan(cascade: Cascade, scenarios: Scenario, clock: Clock) -> dict[str, Any]:
-    """Metrics of each member, one after the other: side by side, all would wait for the stiffest."""
+    """Return the metrics of each member. They run in sequence: in a batch, all would wait for the stiffest."""
     fold = Standard(0.4 * clock.duration)
     return jax.lax.map(lambda s: rollout(cascade, s, clock, fold=fold, every=0).measured, scenarios)
 
 
 def _batch(one: Any, size: int, **leaves: Any) -> Any:
-    """An ensemble: every leaf of a scenario, or of a part of one, repeated; `leaves` replace whole fields."""
+    """Return an ensemble of `size` copies of a scenario or of a part of one; `leaves` replace fields."""
     copies = jax.tree.map(lambda x: jnp.broadcast_to(x, (size,)), canonical(one))
     return dataclasses.replace(copies, **leaves)
 
@@ -200,12 +212,12 @@ def _batch(one: Any, size: int, **leaves: Any) -> Any:
 def _scanned(cascade: Cascade, scenarios: Scenario, period: float) -> tuple[Cascade, Scenario, Clock]:
     if cascade.processor is not None:
         return cascade.on_processor(), scenarios, with_method(Clock(NOISE_SAMPLES, period), cascade, scenarios)
-    # This tolerance agrees with 1e-6 to 1 % of sigma's radius at all of these levels, at half the cost.
+    # With this tolerance sigma's radius differs from that at 1e-6 by at most 1 % at all noise levels, at half the cost.
     return cascade, scenarios, Clock(NOISE_SAMPLES, period, AdaptiveRodas3(1e-4))
 
 
 def _noise(cascade: Cascade, reading: str, period: float) -> Noise:
-    """Regulation without the pulse under held noise."""
+    """Scan regulation without the pulse over the noise levels at one sample period, s."""
     stds, seeds = np.repeat(NOISE_STDS, SEEDS), np.tile(np.arange(SEEDS), len(NOISE_STDS))
     quiet, size = paper.scenario("regulation", reading, pulse=False), len(stds)
     sensors = _batch(Sensor(), size, std=jnp.asarray(stds))
@@ -217,7 +229,7 @@ def _noise(cascade: Cascade, reading: str, period: float) -> Noise:
 
 
 def _basin(cascade: Cascade, reading: str) -> Survival:
-    """Regulation, undisturbed, from rest at z(0) off the origin with i = i_ref at its equilibrium for z = 0."""
+    """Scan undisturbed regulation over z(0), from rest, with i = i_ref at the equilibrium for z = 0."""
     offsets = np.concatenate([BASIN, -BASIN])
     size, plant = len(offsets), Plant()
     current = float(plant.equilibrium(0.0)[0])

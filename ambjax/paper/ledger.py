@@ -1,4 +1,4 @@
-"""The ledger: every claim of the paper judged on each reading, and the noise scan, as data and as a page."""
+"""The ledger: the verdict on every claim of the paper in each reading, and the noise scan, as data and as a page."""
 
 import dataclasses
 import math
@@ -20,12 +20,12 @@ TUNED_WORDS = (
 )
 SAMPLED_WORDS = (
     f"as `tuned`, on a processor of {1 / float(CLOCK.sample_period):g} Hz: {PROCESSOR.resolved()}; signs without a "
-    f"layer, gains tuned for it and for plants off by up to 10 %: {_gains(SAMPLED)}"
+    f"boundary layer, gains tuned on this processor for plants off by up to 10 %: {_gains(SAMPLED)}"
 )
 
 
 def judge(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
-    """Every claim with its finding per reading, as plain data."""
+    """Return every claim with its finding in each reading, as plain data. `evidence`: by reading."""
     rows = []
     for entry in CLAIMS:
         row = {name: getattr(entry, name) for name in ("says", "where", "paper", "criterion")}
@@ -35,8 +35,11 @@ def judge(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
 
 
 def noise_table(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
-    """The noise scan as plain data: per reading and sample period, what is survived, where that ends in a run that
-    stalled (None: it does not), and what gives 6e-6 m/s."""
+    """Return the noise scan as plain data, one row for each reading and sample period.
+
+    A row has the largest std survived, m; the next std if it is not decided (else None); and the std at which sigma's
+    neighbourhood has the radius 6e-6 m/s (None: not reached).
+    """
     return [
         {
             "reading": name,
@@ -52,7 +55,10 @@ def noise_table(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
 
 
 def processor_table(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
-    """What becomes of each reading on the processor of `sampled`, tracking, as plain data; inf: it ran to the end."""
+    """Return the status and metrics of each reading, tracking, on the processor of `sampled`, as plain data.
+
+    `lost_at_s` is inf if the rotor survives.
+    """
     return [
         {
             "reading": name,
@@ -68,7 +74,7 @@ def processor_table(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
 
 
 def _processor_lines(rows: list[dict[str, Any]]) -> list[str]:
-    lines = ["", "## The readings on that processor (tracking, pulse included)", ""]
+    lines = ["", "## All readings on the processor of `sampled` (tracking, pulse included)", ""]
     lines += [
         "| reading | noise and supply | lost | largest error after settling | voltage, rms |",
         "|---|---|---|---|---|",
@@ -85,7 +91,7 @@ def _processor_lines(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def markdown(rows: list[dict[str, Any]], noise: list[dict[str, Any]], processor: list[dict[str, Any]]) -> str:
-    """The ledger as a Markdown page."""
+    """Return the ledger as a Markdown page, from the results of `judge`, `noise_table` and `processor_table`."""
     readings = list(rows[0]["findings"])
     lines = ["# Ledger: the paper's claims, per reading", ""]
     lines += [

@@ -1,17 +1,17 @@
-"""The paper's simulation study, Section 4: its numbers, its two scenarios, and three readings of them.
+"""The paper's simulation study, Section 4: its numbers, its two scenarios, and four readings of them.
 
 D. Papageorgiou and I. Santos, "Sliding Mode Control of Active Magnetic Bearings - A Cascaded Architecture".
 
 literal: Table 2 as printed, the disturbance an acceleration q_z = Q_z = 1 m/s^2 as in Eq. (1).
 repaired: gamma = 7.5e4 instead of 1000, so that Eq. (7) holds, and the disturbance a scaled magnetic
 force of 1 A^2/m^2, as the text words it, so q_z = a Q_z = 0.141 m/s^2.
-tuned: the disturbance as for `repaired`, under the paper's own noise (held 100 us, on z) and a supply of 200 V, with
-an observer and gains that `ambjax tune benchmarks/tasks/C.toml` found; a search today may end at others.
-sampled: as `tuned`, on a processor of 10 kHz whose voltage is a sample late, its signs without a layer, with gains
-that `ambjax tune benchmarks/tasks/sampled/C10-robust.toml` found: its members' plants are off by up to 10 %.
+tuned: the disturbance of `repaired`, the paper's noise on z (held for 100 us), and a supply of 200 V. The observer and
+the gains are those that `ambjax tune benchmarks/tasks/C.toml` found; a search today may find others.
+sampled: as `tuned`, on a processor of 10 kHz whose voltage acts one sample late, with signs without a boundary layer.
+`ambjax tune benchmarks/tasks/sampled/C10-robust.toml` found the gains, for plants off by up to 10 %.
 
-The paper does not print when the pulse acts, the initial state, or the sample time of its noise; here:
-0.8 s to 1.3 s of 2 s, all zero, and a parameter.
+The paper does not give the times of the pulse, the initial state or the sample time of the noise. Here the pulse acts
+from 0.8 s to 1.3 s of 2 s, the initial state is zero, and the sample time is a parameter.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ from ambjax.world.signals import Pulse, Sine
 
 
 class Table2(NamedTuple):
-    """Table 2 and the noise of Section 4, as printed. p serves all three smoothed signs."""
+    """Table 2 and the noise of Section 4, as printed, in SI units. All three smoothed signs have the same p."""
 
     A_r: float = 0.0025
     f_r: float = 2.0
@@ -53,9 +53,9 @@ PULSE = Pulse(TABLE_2.Q_z, 0.8, 1.3)
 SETTLE = 0.5
 CLOCK = Clock(samples=20_000, sample_period=1e-4)
 READINGS = ("literal", "repaired", "tuned", "sampled")
-# Those that live under the paper's noise and on a finite supply; the others are noise-free.
+# The readings with the paper's noise and a finite supply; the others have neither.
 NOISY = ("tuned", "sampled")
-# Where the rotor is asked to live with the printed noise: a finite supply, V.
+# Supply of the noisy readings, V.
 SUPPLY = 200.0
 
 
@@ -76,7 +76,7 @@ PROCESSOR = Processor(delay=1.0)
 
 
 def cascade(reading: str) -> Cascade:
-    """The paper's controller under a reading."""
+    """Return the paper's controller in a reading."""
     t = TABLE_2
     if reading in NOISY:
         gains, p = (TUNED, t.p) if reading == "tuned" else (SAMPLED, math.inf)
@@ -96,14 +96,15 @@ def cascade(reading: str) -> Cascade:
 
 
 def on_processor(reading: str) -> Cascade:
-    """The same on the processor of `sampled`."""
+    """Return the controller of a reading on the processor of `sampled`."""
     return dataclasses.replace(cascade(reading), processor=PROCESSOR)
 
 
 def scenario(name: str, reading: str, *, pulse: bool = True) -> Scenario:
-    """The regulation or tracking scenario under a reading; noise-free but for those of NOISY.
+    """Return the "regulation" or "tracking" scenario in a reading; `pulse` False: without the disturbance.
 
-    Both are one structure (regulation: amplitude 0), so that they share one compilation.
+    Only the readings in NOISY have noise and a supply limit. Both scenarios have the same structure (regulation has
+    amplitude 0), so they share one compilation.
     """
     reference = dataclasses.replace(REFERENCE, amplitude=REFERENCE.amplitude if name == "tracking" else 0.0)
     none = dataclasses.replace(PULSE, amplitude=0.0)
@@ -114,5 +115,5 @@ def scenario(name: str, reading: str, *, pulse: bool = True) -> Scenario:
 
 
 def noisy(scenario: Scenario) -> Scenario:
-    """The scenario under the paper's noise on z, held for a sample, and a supply of SUPPLY."""
+    """Return the scenario with the paper's noise on z, held for one sample, and a supply of SUPPLY."""
     return dataclasses.replace(scenario, sensor=Sensor(TABLE_2.noise_std), u_max=SUPPLY)

@@ -1,1 +1,1 @@
-"""What is drawn, from arrays in SI units."""
+"""Pictures, drawn from arrays in SI units."""

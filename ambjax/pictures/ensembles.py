@@ -18,7 +18,7 @@ from ambjax.pictures.scales import axis_of, digits, finish, log_ticks, prefix_of
 from ambjax.pictures.style import own_style
 from ambjax.pictures.thinning import envelope, smoothed, thin
 
-# What a fan can show: label and SI unit.
+# Quantities of a fan chart: label and SI unit.
 QUANTITIES = {
     "z - r": ("$z - r$", "m"),
     "z": ("position $z$", "m"),
@@ -42,7 +42,7 @@ CHIEF = (
     "chatter_V",
     "copper_loss_W",
 )
-# Parts of the run over which a chattering median is averaged.
+# Number of parts of the run over each of which a chattering median is averaged.
 SMOOTHED = 50
 LOST = {"facecolor": RED, "edgecolor": "white", "hatch": "////", "linewidth": 0.0}
 MARKS: dict[float, tuple[Any, str]] = {0.5: ("-", "median"), 0.95: ("--", "95 % quantile")}
@@ -60,10 +60,10 @@ def fan(
 ) -> None:
     """Write quantile bands over time, one panel per quantity (keys of QUANTITIES), all in SI units.
 
-    `bands[quantity][percent]` is that quantile at the times t [T] (s) over the members still alive; NaN where none is.
-    `limits[quantity]` (> 0) is drawn at plus and minus its value where the data come near it. `lost_at` [N] (s, +inf:
-    never) adds a panel with the share of these members that survives; `stalled` [N] (bool) marks those that the
-    integrator gave up. Raises ValueError for an unknown quantity.
+    `bands[quantity][percent]`: the quantile [T] at the times t [T] (s) over the members not yet lost; NaN if all are
+    lost. `limits[quantity]` (> 0): drawn at plus and minus its value if the data come near it. `lost_at` [N] (s, +inf:
+    never): adds a panel with the share of survivors. `stalled` [N] (bool): members at which the integrator stalled.
+    Raises ValueError for an unknown quantity.
     """
     t = np.asarray(t, float)
     end = t[-1]
@@ -88,7 +88,7 @@ def fan(
 
 def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float, np.ndarray], limit: float) -> None:
     if quantity not in QUANTITIES:
-        raise ValueError(f"fan: cannot draw {quantity!r}; it knows {', '.join(QUANTITIES)}")
+        raise ValueError(f"fan: cannot draw {quantity!r}. Use one of {', '.join(QUANTITIES)}.")
     label, unit = QUANTITIES[quantity]
     percents = sorted(quantiles)
     curves = [np.asarray(quantiles[percent], float) for percent in percents]
@@ -111,14 +111,14 @@ def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float,
     ax.set_ylim(factor * low, factor * high)
     if beyond > 0:
         words = (
-            f"the {percents[0]:g} to {percents[-1]:g} % band goes to {digits(factor * beyond)} {unit}, beyond this axis"
+            f"the {percents[0]:g} to {percents[-1]:g} % band reaches {digits(factor * beyond)} {unit}, beyond this axis"
         )
         ax.set_title(words, fontsize=7, loc="right", pad=2, color=INK)
     finish(ax, f"{label}\n({unit})")
 
 
 def _median(t: np.ndarray, y: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], str]:
-    """The median to draw, and its name: where it chatters from instant to instant, its means over parts of the run."""
+    """Return the curve of the median and its label. A chattering median is averaged over parts of the run."""
     finite = np.isfinite(y)
     steps = np.diff(y[finite])
     turns = np.count_nonzero(np.diff(np.sign(steps)))
@@ -128,15 +128,15 @@ def _median(t: np.ndarray, y: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray]
 
 
 def _tint(k: int, pairs: int) -> Any:
-    """Blue for the k-th of `pairs` nested bands, counted from outside: the inner, the stronger."""
+    """Return the blue of the k-th of `pairs` nested bands, counted from outside. Inner bands are darker."""
     strength = 0.2 + 0.45 * k / max(pairs - 1, 1)
     return tuple(1 - strength * (1 - part) for part in to_rgb(BLUE))
 
 
 def _reach(curves: Sequence[np.ndarray]) -> tuple[float, float, float]:
-    """Lowest and highest value to show, and the largest size if something brief or rare would dwarf the rest (else 0).
+    """Return the lowest and highest value to show, and the largest |value| if it lies far beyond them (else 0).
 
-    The rest: all bands but the outermost, for nine tenths of the time.
+    If brief or rare extremes exceed the inner bands by far, the range covers the inner bands for 90 % of the time.
     """
     values, inner = np.concatenate(curves), curves[1:-1] or curves
     lower, upper = inner[0][np.isfinite(inner[0])], inner[-1][np.isfinite(inner[-1])]
@@ -152,7 +152,7 @@ def _reach(curves: Sequence[np.ndarray]) -> tuple[float, float, float]:
 
 
 def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray | None) -> None:
-    """Draw the share of members still alive, and a tick for each time at which one is lost or given up."""
+    """Draw the share of survivors over time, with a tick at each time at which a member is lost or stalls."""
     ended = np.isfinite(lost_at)
     at, many = np.unique(lost_at[ended], return_counts=True)
     dead = np.concatenate([[0], np.cumsum(many), [many.sum()]])
@@ -175,21 +175,20 @@ def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray
 
 
 def _statuses(lost: int, stalled: int) -> str:
-    """How many are lost, and how many the integrator gave up."""
+    """Return in words the numbers of lost and of stalled members."""
     return f"{lost} lost" + f", {stalled} not decided" * bool(stalled)
 
 
 @own_style
 def histograms(columns: Mapping[str, Any], path: pathlib.Path, metrics: Sequence[str] = CHIEF) -> None:
-    """Write a grid of histograms of the `metrics` that `columns` (members.npz, each [N]) has, survivors and lost apart.
+    """Write histograms of the `metrics` in `columns` (of members.npz, each [N]), with survivors and lost apart.
 
-    Who does not survive is read from a finite `lost_at` or `lost_at_s`, without them all survive; and whom of these the
-    integrator gave up from `stalled`.
-    Raises ValueError if `columns` has none of the metrics.
+    A member with a finite `lost_at` or `lost_at_s` does not survive; without these columns all survive. `stalled` marks
+    members at which the integrator stalled. Raises ValueError if `columns` has none of the metrics.
     """
     names = [name for name in metrics if name in columns]
     if not names:
-        raise ValueError(f"histograms: none of {', '.join(metrics)} among the columns {', '.join(columns)}")
+        raise ValueError(f"histograms: none of {', '.join(metrics)} is a column. The columns are {', '.join(columns)}.")
     lost = _lost(columns, len(columns[names[0]]))
     open_ = int(np.sum(lost & np.asarray(columns.get("stalled", False), bool)))
     across = min(3, len(names))
@@ -257,7 +256,7 @@ def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> Non
 
 
 def _bins(values: np.ndarray, log: bool) -> np.ndarray:
-    """Edges of 40 bins over the values; a constant gets some room around it."""
+    """Return the edges of 40 bins over the values, or of 41 bins around a constant."""
     low, high = (values.min(), values.max()) if values.size else (0.0, 1.0)
     if log:
         return np.geomspace(low / 1.001, 1.001 * high, 41)

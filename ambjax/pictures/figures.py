@@ -1,4 +1,4 @@
-"""Pictures of trajectories: panels of signals, and the paper's Figures 3 to 6 and readings made of them."""
+"""Pictures of trajectories: panels of signals, the paper's Figures 3 to 6, and the comparison of readings."""
 
 import pathlib
 from typing import NamedTuple
@@ -20,7 +20,7 @@ FLAT = 0.005
 
 
 class Curve(NamedTuple):
-    """A signal of a Row and how to draw it."""
+    """A signal of a Row, its label, its colour and its line style."""
 
     signal: str
     label: str
@@ -45,7 +45,7 @@ DISTURBANCE = Panel("disturbance $q_z$", "m/s²", 1.0, (Curve("q_z", "$q_z$"),))
 FORCE = Panel("scaled force", "A²/m²", 1.0, (Curve("v", "$v$"), Curve("v_star", "$v^*$", ORANGE, "--")))
 FORCE_ERROR = Panel("force error $\\tilde v$", "A²/m²", 1.0, (Curve("v_tilde", "$\\tilde v$"),))
 VOLTAGE = Panel("voltage $u$", "V", 1.0, (Curve("u", "$u$"),))
-# Under noise u jumps with each sample, and what a drive gives is near its average over the sample.
+# Under noise u jumps at each sample; the voltage of a drive is close to the average over the sample.
 AVERAGED = Panel("voltage $u$,\naveraged", "V", 1.0, (Curve("u_mean", "$u$"),))
 CURRENT_DISTURBANCE = Panel("disturbance $q_i$", "A/s", 1.0, (Curve("q_i", "$q_i$"),))
 MEASUREMENT = Panel("measured position", "mm", 1e3, (Curve("z_measured", "$z$ measured", GREEN), Curve("z", "$z$")))
@@ -63,12 +63,12 @@ PAPER_FIGURES = {
 
 @own_style
 def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.Path) -> None:
-    """Write the paper's Figure `number` for a trajectory of its scenario."""
+    """Write the paper's Figure `number`, drawn from a trajectory of its scenario."""
     _, panels = PAPER_FIGURES[number]
     height = 1.6 * len(panels) + 0.9
     figure = Figure(figsize=(7.0, height))
     axes = figure.subplots(len(panels), 1, sharex=True)
-    # Fixed margins (in inches over the height): a layout engine would draw everything twice.
+    # Fixed margins (in inches over the height): because a layout engine draws everything twice.
     figure.subplots_adjust(0.15, 0.5 / height, 0.97, 1 - 0.5 / height, hspace=0.2)
     for ax, panel in zip(axes, panels, strict=True):
         draw(ax, panel, trajectory)
@@ -82,7 +82,7 @@ def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.
 
 @own_style
 def readings(trajectories: dict[str, Trajectory], title: str, settle: float, path: pathlib.Path) -> None:
-    """Write one picture of a scenario under each reading, a column each: position above, error below."""
+    """Write one picture of a scenario in all readings, one column each: position above, error below."""
     figure = Figure(figsize=(4.0 * len(trajectories), 4.9), layout="constrained")
     axes = figure.subplots(2, len(trajectories), squeeze=False)
     position = POSITION._replace(curves=(Curve("z_measured", "$z$ measured", "#bbbbbb"), *POSITION.curves))
@@ -106,9 +106,9 @@ def draw(
     first: bool = False,
     stretch: tuple[float, float] | None = None,
 ) -> None:
-    """Draw a panel of the whole run, or of a stretch of it (s).
+    """Draw a panel of the whole run, or of the stretch from one time to another (s).
 
-    A stretch of more samples than pixels shows the mean of each column over a band of its extremes.
+    If a stretch has more samples than pixels, the panel shows the mean of each pixel column over a band of extremes.
     """
     rows, lost_at = trajectory.rows, float(trajectory.lost_at)
     t = np.asarray(rows.t)
@@ -130,7 +130,7 @@ def draw(
     if stretch is not None:
         _keep_scale(ax, [panel.factor * signal_of(rows, curve.signal)[t < lost_at] for curve in panel.curves])
     if len(panel.curves) > 1:
-        # Above the panel: inside, it would hide a peak of some run or other.
+        # Above the panel, because inside it could hide a peak.
         above = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "frameon": False, "borderaxespad": 0.1}
         ax.legend(fontsize=8, ncols=len(panel.curves), **above)
     if np.isfinite(lost_at):
@@ -141,7 +141,7 @@ def draw(
 
 
 def _keep_scale(ax: Axes, whole: list[np.ndarray]) -> None:
-    """No stretch is enlarged so far in height that the last digits of a settled signal look like an event."""
+    """Limit the vertical magnification, so that rounding in a settled signal does not look like an event."""
     ax.ticklabel_format(axis="y", useOffset=False)
     values = np.concatenate(whole)
     (low, high), least = ax.get_ylim(), FLAT * np.ptp(values) if values.size else 0.0
@@ -150,7 +150,7 @@ def _keep_scale(ax: Axes, whole: list[np.ndarray]) -> None:
 
 
 def _band(ax: Axes, t: np.ndarray, y: np.ndarray, colour: str) -> tuple[np.ndarray, np.ndarray]:
-    """The curve to draw: y itself or, of many samples, the mean of each column, over a band of its extremes."""
+    """Return the curve to draw: y itself; with many samples, the mean of each column, over a band of the extremes."""
     if len(t) <= 4 * PIXELS:
         return t, y
     x, low, high = envelope(t, y, y, PIXELS)
@@ -159,7 +159,7 @@ def _band(ax: Axes, t: np.ndarray, y: np.ndarray, colour: str) -> tuple[np.ndarr
 
 
 def _first_moments(ax: Axes, trajectory: Trajectory, until: float = 0.01) -> None:
-    """The first 10 ms, in which the paper's inversion error reaches zero, enlarged."""
+    """Draw an inset of the first 10 ms, in which the paper's inversion error reaches zero."""
     early = np.asarray(trajectory.rows.t) <= until
     inset = ax.inset_axes((0.32, 0.3, 0.4, 0.6))
     inset.plot(1e3 * np.asarray(trajectory.rows.t)[early], signal_of(trajectory.rows, "v_tilde")[early], color=BLUE)
@@ -169,7 +169,7 @@ def _first_moments(ax: Axes, trajectory: Trajectory, until: float = 0.01) -> Non
 
 
 def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:
-    """Shade what follows the loss, and say why."""
+    """Shade the time after the loss, and write its cause."""
     lost_at, end = float(trajectory.lost_at), float(np.asarray(trajectory.rows.t)[-1])
     ax.axvspan(lost_at, max(end, ax.get_xlim()[1]), color=RED, alpha=0.12, linewidth=0)
     ax.axvline(lost_at, color=RED, linewidth=1.0)
@@ -177,10 +177,10 @@ def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:
         why = trajectory.lost_why.replace(": ", ":\n").replace(" reached ", "\nreached ")
         status = "not decided from" if trajectory.lost_code == STALLED else "lost at"
         words = f"{status} {lost_at:.4g} s\n{why}"
-        paper = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1}  # a curve may run behind the words
+        paper = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1}  # a curve may pass behind the text
         ax.text(0.99, 0.06, words, transform=ax.transAxes, ha="right", va="bottom", fontsize=7, color=INK, bbox=paper)
 
 
 def signal_of(rows: Row, name: str) -> np.ndarray:
-    """A signal of rows by its name, floats [T]."""
+    """Return the signal of this name, floats [T]."""
     return np.asarray(getattr(rows, name), float)

@@ -20,7 +20,7 @@ from ambjax.pictures.style import own_style
 CONTOUR = 0.95
 # Widths of the contours of survival and of the bounds of its interval; the last is drawn on top.
 LINES = {"low": 0.8, "high": 0.8, "survival": 2.2}
-# Both colour maps run evenly from dark to light: in grey print, too, light is good.
+# Both colour maps run evenly from dark to light, so that light means good in grey print too.
 SURVIVAL, ERROR = "cividis", "viridis_r"
 NOBODY = {"facecolor": "#d4d4d4", "edgecolor": "#8a8a8a", "hatch": "////", "linewidth": 0.0}
 
@@ -35,13 +35,13 @@ def maps(
     path: pathlib.Path,
     error_metric: str = "settled_max_abs_error_m",
 ) -> None:
-    """Write heat maps side by side: survival above and, where a panel has it, the error below.
+    """Write heat maps side by side: survival above, and the error below if a panel has one.
 
-    A panel has title, x [nx] and y [ny] ascending, survival with the bounds low and high of its confidence interval
-    [ny, nx] (shares 0..1; NaN: not run; bounds of None are not drawn), and error [ny, nx] (in the unit of
-    `error_metric`; not finite: no survivor) or None. A label that ends in an SI unit, "z (m)", gets its prefix here.
-    Colours are shared along a row. Raises ValueError without panels, and where a log axis has values that are not
-    positive.
+    A panel has a title; x [nx] and y [ny], ascending; survival with the bounds low and high of its confidence interval,
+    [ny, nx] (shares 0..1; NaN: not run; bounds of None are not drawn); and error [ny, nx] (in the unit of
+    `error_metric`; not finite: no survivor) or None. A label that ends in an SI unit, such as "z (m)", gets a prefix.
+    All panels of a row share the colours. Raises ValueError if there are no panels, or if a log axis has values that
+    are not positive.
     """
     if not panels:
         raise ValueError("maps: no panels to draw")
@@ -60,7 +60,7 @@ def maps(
         Line2D([], [], color=INK, linewidth=LINES["survival"], label="95 % survival"),
     ]
     if any(panel["low"] is not None for panel in panels):
-        words = "the same for the bounds of its confidence interval"
+        words = "bounds of the confidence interval at 95 %"
         keys.append(Line2D([], [], color=INK, linewidth=LINES["low"], label=words))
     grids = [grid for panel in panels for grid in (panel["survival"], panel["error"]) if grid is not None]
     if not all(np.isfinite(grid).all() for grid in grids):
@@ -70,13 +70,13 @@ def maps(
 
 
 def _errors(figure: Figure, axes: Any, panels: Sequence[Mapping[str, Any]], metric: str, labels: Any) -> None:
-    """The lower row: errors on one logarithmic scale."""
+    """Draw the lower row: the errors, on one logarithmic scale."""
     errors = [panel["error"] for panel in panels if panel["error"] is not None]
     values = np.concatenate([np.ravel(np.asarray(error, float)) for error in errors])
     values = values[np.isfinite(values) & (values > 0)]
     factor, words, unit = axis_of(metric, size_of(values, log=True))
     low, high = (factor * values.min(), factor * values.max()) if values.size else (1.0, 1.0)
-    if high < 2 * low:  # a constant too needs some room
+    if high < 2 * low:  # a constant needs a range too
         low, high = low / 1.5, high * 1.5
     norm = LogNorm(low, high)
     for ax, panel in zip(axes, panels, strict=True):
@@ -92,7 +92,7 @@ def _errors(figure: Figure, axes: Any, panels: Sequence[Mapping[str, Any]], metr
 
 
 def _cells(ax: Axes, panel: Mapping[str, Any], values: np.ndarray, norm: Normalize, colours: str, labels: Any) -> None:
-    """One heat map with its axes and contours; cells that are not finite show the hatched ground."""
+    """Draw one heat map with its axes and contours. Cells that are not finite show the hatched background."""
     x_label, y_label, x_log, y_log = labels
     x, y = np.asarray(panel["x"], float), np.asarray(panel["y"], float)
     x_factor, x_label = label_of(x_label, size_of(x, x_log))
@@ -117,9 +117,9 @@ def _cells(ax: Axes, panel: Mapping[str, Any], values: np.ndarray, norm: Normali
 
 
 def _outline(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, inside: np.ndarray, width: float) -> None:
-    """Draw the edges between cells inside and outside.
+    """Draw the edges between the cells inside and outside.
 
-    Not a line interpolated between centres: that would cut through cells where survival falls from all to nothing.
+    A contour interpolated between the centres would cut through cells where survival falls from all to none.
     """
     row, column = np.nonzero(inside[:, 1:] != inside[:, :-1])
     at = x_edges[column + 1]
@@ -127,14 +127,14 @@ def _outline(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, inside: np.ndar
     row, column = np.nonzero(inside[1:] != inside[:-1])
     at = y_edges[row + 1]
     level = np.stack([np.stack([x_edges[column], at], 1), np.stack([x_edges[column + 1], at], 1)], 1)
-    # a white seam below all of the line, so that it is seen on dark cells
+    # a white seam below the whole line makes it visible on dark cells
     for colour, stroke in (("white", width + 1.4), (INK, width)):
         lines = LineCollection([*upright, *level], colors=colour, linewidths=stroke, capstyle="projecting")
         ax.add_collection(lines, autolim=False)
 
 
 def _range(panel: Mapping[str, Any]) -> str:
-    """Words on how much of the grid survives: a contour that is absent means either of two things."""
+    """Return in words how much of the grid survives, because a missing contour means all of it or none."""
     share = np.asarray(panel["survival"], float)
     cells = share[np.isfinite(share)]
     if not cells.size:

@@ -1,4 +1,4 @@
-"""The overview of a run: every signal, the whole of it and enlarged how it starts and how it ends."""
+"""The overview of a run: every signal, over the whole run, and enlarged at its start and at its end."""
 
 import itertools
 import pathlib
@@ -24,15 +24,15 @@ from ambjax.pictures.figures import (
 from ambjax.pictures.style import own_style
 from ambjax.simulation.trajectory import STALLED, Trajectory
 
-# Turns of a chattering voltage that can be followed.
+# Largest number of turns of a chattering voltage in the enlarged end of a run.
 TURNS = 40
 
 
 @own_style
 def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tuple[float, float] | None = None) -> None:
-    """Write one page with every signal of a run: the whole of it, and enlarged how it starts and how it ends.
+    """Write one page with every signal of a run, over the whole run, and enlarged at its start and at its end.
 
-    `window` (s): that stretch of it instead.
+    `window`: begin and end, s; the page then shows only this stretch.
     """
     panels = _panels(trajectory)
     if window is None:
@@ -41,10 +41,10 @@ def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tup
         half = -(-len(panels) // 2)
         columns = [(_status(trajectory), *window), ("", *window)]
         grid = list(itertools.zip_longest(panels[:half], panels[half:]))
-    # the whole run has as much room as the two others
+    # the whole run is as wide as the two enlargements together
     width, height = 13.0, 1.55 * len(grid) + 1.2
     figure = Figure(figsize=(width, height))
-    # Fixed, in inches: a layout that measures its labels takes as long as everything else.
+    # Fixed margins, in inches: a layout engine would double the time.
     figure.subplots_adjust(1.05 / width, 0.5 / height, 1 - 0.2 / width, 1 - 0.85 / height, wspace=0.24, hspace=0.24)
     ratios = [2, 1, 1] if window is None else [1, 1]
     axes = figure.subplots(len(grid), len(columns), sharex="col", squeeze=False, width_ratios=ratios)
@@ -68,7 +68,7 @@ def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tup
 
 
 def _panels(trajectory: Trajectory) -> tuple[Panel, ...]:
-    """The panels of every run, and those of q_i and of the measured position where there is anything to see."""
+    """Return the panels of a run; those of q_i and of the measured position only if they differ from 0 and from z."""
     panels = (POSITION, ERROR, SLIDING, DISTURBANCE, CURRENT, FORCE, FORCE_ERROR, AVERAGED)
     rows = trajectory.rows
     if np.any(np.asarray(rows.q_i)):
@@ -77,7 +77,7 @@ def _panels(trajectory: Trajectory) -> tuple[Panel, ...]:
 
 
 def _stretches(trajectory: Trajectory) -> list[tuple[str, float, float]]:
-    """The whole run up to shortly after a loss, its start, and its last moments: words, from, to (s)."""
+    """Return title, begin and end (s) of each column: the run up to shortly after a loss, its start, and its end."""
     t, lost_at = np.asarray(trajectory.rows.t, float), float(trajectory.lost_at)
     loss = bool(np.isfinite(lost_at))
     begin, end = t[0], min(lost_at, t[-1])
@@ -106,7 +106,7 @@ def _short(seconds: float) -> str:
 
 
 def _last_moments(trajectory: Trajectory, end: float) -> float:
-    """How much of the end to enlarge, s: 20 ms, a fifth of the run at most, and TURNS of the voltage."""
+    """Return the length of the enlarged end, s: 20 ms, but at most a fifth of the run, and TURNS of the voltage."""
     t = np.asarray(trajectory.rows.t, float)
     longest = min(0.02, (end - t[0]) / 5)
     late = (t >= end - longest) & (t < end)
@@ -115,9 +115,9 @@ def _last_moments(trajectory: Trajectory, end: float) -> float:
 
 
 def _transient(trajectory: Trajectory, end: float, loss: bool) -> float:
-    """How much of the start to enlarge, s: thrice what the errors take to come down.
+    """Return the length of the enlarged start, s: three times the time in which the errors decay.
 
-    At most a twentieth of the run, or a third of it if it ended in a loss.
+    The length is at most a twentieth of the run, or a third of a run that ends in a loss.
     """
     t = np.asarray(trajectory.rows.t, float)
     alive = t <= max(end, t[min(1, len(t) - 1)])

@@ -1,4 +1,4 @@
-"""The axes of pictures: units, SI prefixes, ticks of log axes, edges of cells."""
+"""Axes of pictures: units, SI prefixes, ticks of logarithmic axes, and edges of cells."""
 
 import math
 import re
@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
 
-# The units that metrics' names end in, longest first: _m_per_s ends in _s too.
+# Units by the suffix of a metric's name, longest first, because _m_per_s ends in _s too.
 SUFFIXES = {"_A2_per_m2": "A²/m²", "_m_per_s": "m/s", "_m": "m", "_V": "V", "_A": "A", "_W": "W", "_s": "s"}
 SYMBOLS = {"v tilde": r"$\tilde v$", "sigma": r"$\sigma$", "u": "$u$", "i": "$i$"}
 SMALL = {1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
@@ -16,10 +16,10 @@ LARGE = {1e9: "G", 1e6: "M", 1e3: "k"}
 
 
 def prefix_of(unit: str, size: float) -> tuple[float, str]:
-    """Factor from SI to a prefixed unit in which `size` lies in [1, 1000), and that unit: 2e-5 m is 20 µm.
+    """Return the factor from an SI unit to a prefixed one in which `size` lies in [1, 1000), and the prefixed unit.
 
-    Only units that begin with a plain m, s, V, A, W, N, H, T, Hz or Ω take a prefix (not A²/m², kg, 1/s), and
-    lengths and times none above 1. A size of zero, or one that is not finite, keeps the unit.
+    For example, 2e-5 m is 20 µm. Only units that begin with a plain m, s, V, A, W, N, H, T, Hz or Ω take a prefix (not
+    A²/m², kg, 1/s); lengths and times take no prefix above 1. A size that is zero or not finite keeps the unit.
     """
     first = unit.split("/")[0]
     small = first in ("m", "s", "V", "A", "W", "N", "H", "T", "Hz", "Ω")
@@ -32,7 +32,10 @@ def prefix_of(unit: str, size: float) -> tuple[float, str]:
 
 
 def size_of(values: np.ndarray, log: bool = False) -> float:
-    """The size that decides an axis' prefix: the largest of |values|; on a log axis the middle of the decades; or 0."""
+    """Return the size from which an axis gets its prefix: the largest |value|, or the geometric middle on a log axis.
+
+    0 if no value is finite and not zero.
+    """
     sizes = np.abs(np.asarray(values, float))
     sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
     if not sizes.size:
@@ -41,7 +44,7 @@ def size_of(values: np.ndarray, log: bool = False) -> float:
 
 
 def axis_of(metric: str, size: float) -> tuple[float, str, str]:
-    """Factor, label and unit of a metric of metrics.json: rms_error_m of size 2e-5 is (1e6, "rms error", "µm")."""
+    """Return factor, label and unit of a metric's axis: (1e6, "rms error", "µm") for rms_error_m of size 2e-5."""
     if metric == "clearance_used":
         return 100.0, "clearance used", "%"
     if metric == "refused":
@@ -56,9 +59,10 @@ def axis_of(metric: str, size: float) -> tuple[float, str, str]:
 
 
 def label_of(label: str, size: float) -> tuple[float, str]:
-    """Factor and label of an axis whose label ends in its SI unit: "initial z (m)" of 2e-5 is "initial z (µm)".
+    """Return factor and label of an axis whose label ends in its SI unit.
 
-    Powers are written as in print, m/s^2 as m/s²; the unit 1 is left out.
+    For example, "initial z (m)" of size 2e-5 becomes "initial z (µm)". The power in m/s^2 becomes m/s²; the unit 1 is
+    omitted.
     """
     match = re.fullmatch(r"(.*)\(([^()]*)\)\s*", label)
     if not match:
@@ -71,14 +75,14 @@ def label_of(label: str, size: float) -> tuple[float, str]:
 
 
 def digits(value: float) -> str:
-    """A number with three digits, or all before the point: 12.3, 7000, 1.2e-05."""
+    """Return a number as text with three digits, or with all digits before the point: 12.3, 7000, 1.2e-05."""
     return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 def edges(centres: np.ndarray, log: bool) -> np.ndarray:
-    """[n + 1] edges half way between n ascending centres, in decades if `log`.
+    """Return the n + 1 edges halfway between n ascending centres, on a logarithmic scale if `log`.
 
-    Raises ValueError where a log axis has a centre that is not positive.
+    Raises ValueError if a log axis has a centre that is not positive.
     """
     centres = np.asarray(centres, float)
     if log and not np.all(centres > 0):
@@ -94,7 +98,7 @@ def edges(centres: np.ndarray, log: bool) -> np.ndarray:
 
 
 def finish(ax: Axes, y_label: str) -> None:
-    """The look that all charts share."""
+    """Set the label and the style that all charts share."""
     ax.set_ylabel(y_label, fontsize=9)
     ax.tick_params(labelsize=8)
     ax.grid(alpha=0.3, linewidth=0.5)
@@ -102,7 +106,7 @@ def finish(ax: Axes, y_label: str) -> None:
 
 
 def log_ticks(axis: Axis, low: float, high: float) -> None:
-    """Ticks in plain numbers for a logarithmic scale: the fewer decades, the more in each."""
+    """Set ticks in plain numbers on a logarithmic axis; fewer decades have more ticks each."""
     decades = math.log10(high / low)
     if decades < 0.8:
         at = list(MaxNLocator(5).tick_values(low, high))

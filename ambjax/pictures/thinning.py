@@ -1,17 +1,16 @@
-"""Curves of many samples drawn with few points: ends, extremes and gaps of the data stay."""
+"""Reduction of curves with many samples to few points that keep the ends, extremes and gaps of the data."""
 
 import numpy as np
 
-# Bins of a curve that is thinned: more than a picture has pixels across.
+# Bins of a thinned curve: more than the width of a picture in pixels.
 BINS = 2000
 
 
 def thin(t: np.ndarray, y: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray]:
-    """Samples [K] of the curve y(t) [T] that look like all of them; up to 4 `bins` samples are returned as they are.
+    """Return K of the T samples of the curve y(t), enough to draw it; up to 4 `bins` samples are returned unchanged.
 
-    Keeps the first and the last sample, the minimum and maximum of each bin (the last partial bin included), and the
-    samples on both sides of every border between finite values and NaN, so that a gap begins and ends where it does
-    in the data.
+    Keep the first and the last sample, the minimum and maximum of each bin (the last partial bin included), and the
+    samples on both sides of every border between finite values and NaN, so that each gap keeps its place.
     """
     n = len(t)
     if n <= 4 * bins:
@@ -27,14 +26,14 @@ def thin(t: np.ndarray, y: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np
 
 
 def _bin_starts(samples: int, bins: int) -> np.ndarray:
-    """Index of the first sample of each of `bins` bins, [bins]; their sizes differ by one sample at most."""
+    """Return the index of the first sample of each bin, [bins]. The sizes of the bins differ by at most one sample."""
     return np.arange(bins) * samples // bins
 
 
 def smoothed(t: np.ndarray, y: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray]:
-    """Means of y over each of `bins` bins of samples, at the mean time of each.
+    """Return the mean times and means of y over `bins` bins of samples, [bins + 2].
 
-    The first mean extends to the first sample, the last to the last: [bins + 2].
+    The first mean is repeated at the first sample, and the last mean at the last sample.
     """
     starts = _bin_starts(len(t), bins)
     centres, means = (np.add.reduceat(values, starts) / np.diff(starts, append=len(t)) for values in (t, y))
@@ -44,10 +43,10 @@ def smoothed(t: np.ndarray, y: np.ndarray, bins: int) -> tuple[np.ndarray, np.nd
 def envelope(
     t: np.ndarray, low: np.ndarray, high: np.ndarray, bins: int = BINS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times, lower and upper border of a band; up to 4 `bins` samples are returned as they are.
+    """Return times, lower and upper border of a band; up to 4 `bins` samples are returned unchanged.
 
-    Of more, each bin has the minimum of `low` and the maximum of `high` from its first sample to that of the next bin,
-    the last bin to the last sample. NaN is left out; a bin of nothing else is NaN.
+    With more samples, each bin has the minimum of `low` and the maximum of `high`, from its first sample to the first
+    of the next bin; the last bin ends at the last sample. NaN is ignored; a bin that has only NaN is NaN.
     """
     if len(t) <= 4 * bins:
         return t, low, high
@@ -58,8 +57,8 @@ def envelope(
 
 
 def stretch_of(t: np.ndarray, low: float, high: float) -> slice:
-    """The samples from `low` to `high`, s, and where these lie between samples the neighbour outside as well.
+    """Return the samples from `low` to `high`, s, with the outer neighbour of a bound that lies between two samples.
 
-    So a curve reaches both ends of its axis, and a bound that rounding puts beside its sample does not drop it.
+    The curve then reaches both ends of its axis, and a rounding error of a bound does not drop a sample.
     """
     return slice(max(int(np.searchsorted(t, low, "right")) - 1, 0), int(np.searchsorted(t, high, "left")) + 1)

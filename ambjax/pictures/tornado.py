@@ -1,4 +1,4 @@
-"""Tornado charts: what drives a metric."""
+"""Tornado charts: the share of a metric's variation that each spread quantity explains."""
 
 import pathlib
 import textwrap
@@ -29,12 +29,13 @@ class Bar(NamedTuple):
 
 @own_style
 def tornado(drivers: Sequence[Bar], metric: str, says: str, path: pathlib.Path) -> None:
-    """Write the share of a metric's variation that each driver explains, the greatest on top, and what that `says`.
+    """Write a chart with the share of a metric's variation that each driver explains, the largest on top.
 
-    At most 12 bars, coloured by the trend; whiskers from low to high. Raises ValueError without drivers.
+    The chart has at most MOST_DRIVERS bars, coloured by the trend, with whiskers from low to high. `says`: the text
+    below the title. Raises ValueError without drivers.
     """
     if not drivers:
-        raise ValueError("tornado: no drivers; an ensemble without [spread] has none to rank")
+        raise ValueError("tornado: there are no drivers. Only an ensemble with [spread] has drivers.")
     ranking = sorted(drivers, key=lambda driver: -driver.share)
     bars = ranking[:MOST_DRIVERS]
     figure = Figure(figsize=(7.5, 0.36 * len(bars) + 2.2), layout="constrained")
@@ -49,9 +50,9 @@ def tornado(drivers: Sequence[Bar], metric: str, says: str, path: pathlib.Path) 
     ax.set_xlim(0, 112)
     ax.set_xticks(np.linspace(0, 100, 6))
     more = len(ranking) - len(bars)
-    words = "explains alone, % of how members rank; whiskers: its interval"
+    words = "share of the members' ranking explained alone, %; whiskers: interval"
     ax.set_xlabel(words + (f"; {more} weaker not shown" if more else ""), fontsize=9)
-    figure.suptitle(f"What drives {axis_of(metric, 0.0)[1]}", fontsize=11)
+    figure.suptitle(f"Drivers of {axis_of(metric, 0.0)[1]}", fontsize=11)
     ax.set_title(textwrap.fill(says, 95), fontsize=8)
     finish(ax, "")
     trends = dict.fromkeys(_trend(one) for one in bars)
@@ -61,7 +62,7 @@ def tornado(drivers: Sequence[Bar], metric: str, says: str, path: pathlib.Path) 
 
 
 def _trend(one: Bar) -> str:
-    """Which way the metric goes: a straight trend explains at least half of what is explained, or there is none."""
+    """Return the trend of the metric. A monotonic trend must explain at least half of the share."""
     rising, falling, neither = TRENDS
     if one.share <= 0 or one.rho**2 < 0.5 * one.share:
         return neither
