@@ -227,7 +227,7 @@ def test_files_move_all_or_not_at_all(monkeypatch):
                 (part / name / "c").parent.mkdir()
                 (part / name / "c").write_text("new")
 
-    for obstacle, words in (("b/c/", "b/c is a folder"), ("b", "b is no folder")):
+    for obstacle, words in (("b/c/", "b/c is a folder"), ("b", "b is there already and is not a folder")):
         if obstacle.endswith("/"):
             pathlib.Path(obstacle).mkdir(parents=True)
         else:
