@@ -15,7 +15,7 @@ from ambjax.control.processor import Processor
 from ambjax.control.sampling import Relay, band, disturbance, slope_limits
 from ambjax.ensemble import delays as searched
 from ambjax.ensemble.delays import DELAYS, delay_margin
-from ambjax.extend import record
+from ambjax.extend import InversionLaw, record
 from ambjax.simulation.rollout import Outcome
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Trajectory
 from ambjax.theorem import advice, sampled_report
@@ -196,12 +196,15 @@ def test_noise_disturbs_and_its_lines_stand_beside_those_without():
 
 
 @record
-class Static:
+class Static(InversionLaw):
     """A static inversion without a step of its own: i_ref jumps at a sample, and i_ref' is that of continuous time."""
 
     law: ClosedForm = ClosedForm()
 
     def init(self, model):
+        return ()
+
+    def scale(self, model):
         return ()
 
     def slope(self, model):
@@ -367,7 +370,7 @@ def test_check_says_no_where_an_explicit_slope_is_beyond_its_limit(capsys):
     assert main(["check", write(CASE + 'discretisation = "explicit"\npredict = false\n')]) == 1
     theorem, _, said = capsys.readouterr().out.partition("On the processor")
     assert "Yes, all 5" in theorem
-    assert "about continuous time" in theorem
+    assert "for continuous time" in theorem
     assert "- inversion: slope T as stepped, 318.3, must stay below" in said
     assert "1 of 3 is not" in said
     assert "The rotor is held." in said

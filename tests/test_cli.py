@@ -56,7 +56,7 @@ BAD = {
     "no supply": ("[actuator]\nu_max = 0.0\n", ["actuator.u_max", "from 1e-09", "inf"]),
     "NaN supply": ("[actuator]\nu_max = nan\n", ["actuator.u_max = nan", "from 1e-09"]),
     "z beyond the gap": ("[initial]\nz = 6e-3\n", ["initial.z = 0.006", "0.0045"]),
-    "z at the stop": ("[initial]\nz = -4.51e-3\n", ["initial.z", "below 0.0045"]),
+    "z at the stop": ("[initial]\nz = -4.51e-3\n", ["initial.z", "less than 0.0045"]),
     "clearance beyond the gap": ("[run]\nclearance = 0.01\n", ["run.clearance", "plant.s_0"]),
     "zero clearance": ("[run]\nclearance = 0.0\n", ["run.clearance", "from 1e-09"]),
     "zero duration": ("[clock]\nduration = 0.0\n", ["clock.duration", "from 1e-09"]),

@@ -32,6 +32,7 @@ from ambjax.export.texts import MARK
 from ambjax.export.trace import arguments, trace
 from ambjax.export.twins import LoopCase
 from ambjax.export.verify import draft, verify
+from ambjax.extend import PositionLaw
 from ambjax.numerics.records import gain, record
 from ambjax.paper import readings
 
@@ -42,7 +43,7 @@ ORIGIN = Origin("test", "0" * 64, [])
 
 
 @record
-class Layered:
+class Layered(PositionLaw):
     """A position law of a user: a boundary layer of two slopes, by a loop and a branch, with a state."""
 
     decay: Any = gain(default=17.0, unit="1/s", doc="decay rate on the manifold")

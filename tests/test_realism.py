@@ -306,6 +306,6 @@ def test_the_step_holds_for_the_ends_of_an_amplifier_s_spread():
     ("table", "loud"),
     [({"std": 1e-6}, True), ({"std_z_dot": 1e-4}, False), (None, True)],
 )
-def test_a_perfect_velocity_is_said_loudly(table, noise_factor):
+def test_a_perfect_velocity_is_said_loudly(table, loud):
     raw = CASE | ({} if table is None else {"sensor": table})
-    assert any("VELOCITY" in line for line in warnings_of(case_from(raw))) == noise_factor
+    assert any("VELOCITY" in line for line in warnings_of(case_from(raw))) == loud

@@ -127,11 +127,11 @@ def test_stressed_members_hear_more_and_count_by_being_held():
     problem = objective()
     members = problem.training(5, 2, 2, 1.5, 1.25)
     np.testing.assert_array_equal(members.noise_factor, [1.0, 1.0, 1.5, 1.5])
-    quiet, noise_factor = (problem.world(jax.tree.map(lambda a, m=m: a[m], members))[1].sensor for m in (1, 2))
+    quiet, louder = (problem.world(jax.tree.map(lambda a, m=m: a[m], members))[1].sensor for m in (1, 2))
     for name in ("std", "std_z_dot", "std_i"):
-        assert float(getattr(noise_factor, name)) == 1.5 * float(getattr(quiet, name)) > 0
+        assert float(getattr(louder, name)) == 1.5 * float(getattr(quiet, name)) > 0
     scaled = {"std": 0.0, "std_z_dot": 0.0, "std_i": 0.0}  # and nothing else: it is the same sensor
-    assert dataclasses.replace(noise_factor, **scaled) == dataclasses.replace(quiet, **scaled)
+    assert dataclasses.replace(louder, **scaled) == dataclasses.replace(quiet, **scaled)
     np.testing.assert_allclose(members.shift, np.log(1.25) * np.array([[0.0], [0.0], [1.0], [-1.0]]) * np.ones(4))
     # one in four of 20 and of 6, but no fewer than 4 of either
     assert problem.training(5, 20, 6, 1.5, 1.25).part(4).member.tolist() == [0, 1, 2, 3, 4, 20, 21, 22, 23]
@@ -221,8 +221,8 @@ def run(small, **more):
 def test_the_search_descends_and_keeps_the_best(small):
     found = run(small)
     engine, goal, members, _ = small
-    value, members = np.asarray(found.history["value"]).min(axis=1), np.asarray(found.history["members"])
-    assert set(members) == {5}  # so few that a part of them is all
+    value, counts = np.asarray(found.history["value"]).min(axis=1), np.asarray(found.history["members"])
+    assert set(counts) == {5}  # so few that a part of them is all
     assert np.all(np.diff(value[: found.since]) <= 0)
     assert np.all(np.diff(value[found.since :]) <= 0)
     assert 0 < found.since < found.iteration

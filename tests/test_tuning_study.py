@@ -23,10 +23,10 @@ import tuning.search.rounds
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from tuning.config import Budget, seeds
-from tuning.judge import RESOLVED, judge, step_error, summarise, words
+from tuning.judge import RESOLVED, describe, judge, step_error, summarise
 from tuning.objective.goal import Goal
 from tuning.objective.loss import TERMS
-from tuning.objective.ranges import BEYOND
+from tuning.objective.ranges import END_FACTOR
 from tuning.objective.risk import Mean
 from tuning.objective.shortfalls import Bound
 from tuning.optimisers import bfgs
@@ -160,8 +160,8 @@ def test_an_error_of_which_no_share_is_told_is_told_in_metres(monkeypatch):
     error = step_error(study(monkeypatch, World()), np.zeros(2))
     zero = error._replace(search_m=1e-6, reference_m=0.0, relative=math.nan)
     assert zero.refuted == "coarser steps give a settled rms error of 1e-06 m against 0 m"
-    assert words(zero._replace(search_m=0.0)) == "settled rms error of 0 m against 0 m on 4 members"
-    assert "of 1e-06 m against no number" in words(zero._replace(reference_m=math.nan))
+    assert describe(zero._replace(search_m=0.0)) == "settled rms error of 0 m against 0 m on 4 members"
+    assert "of 1e-06 m against no number" in describe(zero._replace(reference_m=math.nan))
 
 
 def test_where_nobody_is_held_by_both_nothing_is_said_of_the_step(monkeypatch):
@@ -462,7 +462,7 @@ def test_gains_end_where_the_template_says(monkeypatch):
     assert c[0].high == c[1].most == pytest.approx(1 / (5 * 1e-4))
     assert "the cap 1/(5 T)" in c[1].source
     for gain, found, value in others:
-        assert gain.high == found.most == pytest.approx(BEYOND * max(found.high, value))
+        assert gain.high == found.most == pytest.approx(END_FACTOR * max(found.high, value))
         assert f"may end at up to {found.most:.3g}" in found.source
     least = np.array(space.gains_at(jnp.full(len(space), 100.0)))
     np.testing.assert_allclose(least, [gain.high for gain in space.gains], rtol=1e-9)
@@ -470,7 +470,8 @@ def test_gains_end_where_the_template_says(monkeypatch):
     assert beyond.objective.space.gains[0].high == 3000.0
     words = " ".join(template("tracking").replace("#", " ").split())
     assert (
-        f"c then ends at a fifth of the sample rate at most, others at {BEYOND:g} times their range or start" in words
+        f"c then ends at a fifth of the sample rate at most, others at {END_FACTOR:g} times their range or start"
+        in words
     )
 
 

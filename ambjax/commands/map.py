@@ -166,8 +166,8 @@ def _unsure(one: Map) -> str:
 
 
 def _spread_words(one: Map) -> str:
-    """List the quantities of [spread] that are drawn for each member."""
-    return f"drawn for each member: {', '.join(one.drawn)}" if one.drawn else "nominal: nothing is spread"
+    """Return in words which quantities a map draws for each member."""
+    return f"drawn for each member: {', '.join(one.drawn)}" if one.drawn else "nominal: no quantity is drawn"
 
 
 def _draw(cases: list[Case], maps: list[Map], path: Any) -> None:

@@ -48,7 +48,8 @@ def check_places(out: pathlib.Path, names: Iterable[str | pathlib.PurePath]) -> 
         ]
         if blocking:
             raise ValueError(
-                f"--out {out}: {blocking[0]} is no folder there. Move it away, or choose another directory."
+                f"--out {out}: {blocking[0]} is there already and is not a folder. "
+                "Move it, or choose another directory."
             )
         if (out / name).is_dir() and not (out / name).is_symlink():
             raise ValueError(f"--out {out}: {name} is a folder there. Move it, or choose another directory.")
