@@ -149,10 +149,10 @@ def test_members_that_only_accurate_steps_lose_are_named(monkeypatch):
     made = study(monkeypatch, world)
     error = step_error(made, at(made, 80.0, 60.0))
     assert error.lost == 2
-    assert error.members.member.tolist() == [1, 3]
+    assert error.unheld.member.tolist() == [1, 3]
     assert error.refuted  # whatever the error of the others
     error = step_error(made, at(made, 30.0, 60.0))
-    assert error.lost == len(error.members.member) == 0
+    assert error.lost == len(error.unheld.member) == 0
 
 
 def test_an_error_of_which_no_share_is_told_is_told_in_metres(monkeypatch):
@@ -469,10 +469,7 @@ def test_gains_end_where_the_template_says(monkeypatch):
     beyond = study(monkeypatch, World(), {"controller": {"position": {"c": 3000.0}}}, gains=paths, bounds={})
     assert beyond.objective.space.gains[0].high == 3000.0
     words = " ".join(template("tracking").replace("#", " ").split())
-    assert (
-        f"c then ends at a fifth of the sample rate at most, others at {END_FACTOR:g} times their range or start"
-        in words
-    )
+    assert f"c is then at most a fifth of the sample rate, others {END_FACTOR:g} times their range or start" in words
 
 
 def test_the_pictures_are_of_the_case_and_of_the_tuned_laws(monkeypatch):
