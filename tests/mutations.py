@@ -1062,7 +1062,7 @@ SAMPLED = [
         "ambjax/simulation/sampled.py",
         "u = jnp.maximum(1 - delay, 0.0) * u + share * before",
         "u = u + 0.0 * share * before",
-        "tests/test_guard.py::test_guard_and_faults_against_the_independent_simulator",
+        "tests/test_guard.py::test_the_expected_current_follows_the_voltages_that_act_within_the_sample",
     ),
     M(
         "the safe command holds the voltage",

@@ -16,8 +16,10 @@ from ambjax.control.guard import Guard, guarded, simulated
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
 from ambjax.simulation.metrics import Count, Named, Rms, standard_for
+from ambjax.simulation.sampled import system_of
 from ambjax.world.faults import VALUES, Dropouts, Outliers
 from ambjax.world.sensor import Errors, Measurement, Sensor
+from ambjax.world.signals import reference_at
 
 T = 1e-4
 CLOCK = amb.Clock(160, T, amb.RK4(3))
@@ -91,6 +93,26 @@ def test_guard_and_faults_against_the_independent_simulator(name):
         assert np.sum(np.asarray(rows.u)[120:125] == 0) == (2 if samples == 3 else 0)
         np.testing.assert_allclose(rows.z, run.z, rtol=0, atol=1e-10)
         np.testing.assert_allclose(rows.u, run.u, rtol=0, atol=1e-6 * np.abs(run.u).max())
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.5, 1.0, 1.5, 2.0])
+def test_the_expected_current_follows_the_voltages_that_act_within_the_sample(delay):
+    """By Eq. (2) written out, under the mean of u_n from n + delay on and of the two voltages before it."""
+    cascade, scenario, clock = loop_of(World(**TRACKING, delay=delay, **soft()), 5, (0.0, 0.0, 0.0))
+    cascade = dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=Guard()))
+    system = system_of(guarded(cascade, scenario, T), scenario, clock).realised()
+    state = system.start()
+    before, first = 7.0, -3.0
+    state = state._replace(command=state.command._replace(u=jnp.asarray(before)), past=(jnp.asarray(first),) * 2)
+    z, z_dot, i = 1e-4, 0.01, 0.2
+    measured = Measurement(*map(jnp.asarray, (z, z_dot, i)))
+    after = system.decided(measured, reference_at(scenario.reference, 0.0), state)
+    u = float(after.command.u)
+    mean = delay * before + (1 - delay) * u if delay <= 1 else (delay - 1) * first + (2 - delay) * before
+    plant = scenario.plant
+    gap = plant.s_0 + z
+    rate = 2 * z_dot * i / gap + 2 * gap * (mean - plant.R * i) / plant.kappa
+    assert float(after.watch.expected.i) == pytest.approx(i + T * rate, rel=1e-12)
 
 
 def test_limits_left_out_admit_all_that_a_sensor_without_faults_reads():
