@@ -6,7 +6,7 @@ import importlib
 import json
 import sys
 from collections.abc import Callable
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from ambjax._version import __version__
 from ambjax.host.interrupts import exit_on_interrupt
@@ -89,6 +89,13 @@ def parser() -> Parser:
     _seed_option(grid)
     summary = "check the conditions of Theorem 1, or those of the case's processor; exit code 1 if one fails"
     command("check", summary, case=True)
+    summary = "sensitivity peaks with ISO 14839-3 zones, margins, stiffness: sensitivity.json, sensitivity.png"
+    sensitivity = command("sensitivity", summary, case=True, out=True)
+    sensitivity.add_argument("--members", type=int, metavar="N", help="members of [spread] to analyse (default: 100)")
+    sensitivity.add_argument(
+        "--inject", action="store_true", help="also inject a multi-sine in continuous time; on a processor it always is"
+    )
+    _seed_option(sensitivity)
     export = command("export", "write the controller of a case with [processor] as C", case=True, out=True)
     export.add_argument("--verify", action="store_true", help="compare the C with JAX; exit code 1 if they differ")
     export.add_argument("--precision", choices=["float", "double"], default="float", help="C type of all numbers")
@@ -128,7 +135,7 @@ def _extension(name: str) -> Callable[[list[str], str], int]:
     return lambda *_: complain(f"{name}: this command is not installed. Reinstall ambjax with pip.")
 
 
-def _run(args: argparse.Namespace) -> tuple[int, Any]:
+def _run(args: argparse.Namespace) -> tuple[int, object]:
     if args.command is None:
         print(FIRST_DAY)
         return 0, None
@@ -138,7 +145,7 @@ def _run(args: argparse.Namespace) -> tuple[int, Any]:
     return importlib.import_module(f"ambjax.commands.{args.command}").run(args)
 
 
-Run = Callable[[argparse.Namespace], tuple[int, Any]]
+Run = Callable[[argparse.Namespace], tuple[int, object]]
 
 
 def answer(parser: argparse.ArgumentParser, words: list[str] | None, run: Run) -> int:
@@ -164,7 +171,7 @@ def answer(parser: argparse.ArgumentParser, words: list[str] | None, run: Run) -
         return complain(f"cannot write to stdout: {why}. Free disk space, or redirect it elsewhere.", parser.prog)
 
 
-def _code(run: Callable[[], tuple[int, Any]], as_json: bool, program: str) -> int:
+def _code(run: Callable[[], tuple[int, object]], as_json: bool, program: str) -> int:
     """Call `run` and return its exit code; convert the errors that a user can fix into one line and a code."""
     try:
         code, summary = run()

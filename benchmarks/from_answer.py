@@ -44,7 +44,7 @@ def goals(problem: TuningProblem, x: np.ndarray, who: Members) -> np.ndarray:
     """Return the objective [S] at x [S, m], with limits as penalties on the values of ordinary members."""
     terms, free = problem.engine.terms(x, who), dataclasses.replace(problem.goal, limits=())
     values = free.score(x, {name: rows for name, rows in terms.items() if not name.startswith(PREFIX)}, who)
-    for limit in problem.goal.limits:
+    for limit in problem.limits:
         rows = terms[PREFIX + limit.name][:, : who.ordinary]
         excess = [max(limit.log_excess(float(limit.kind.judged(one))), 0.0) for one in rows]
         values = values + PENALTY * np.square(excess) / 2
@@ -55,7 +55,7 @@ def judged(problem: TuningProblem, x: np.ndarray) -> dict[str, Any]:
     """Return the errors of the held-out members at x [m], the number lost, and the limits not held."""
     columns = judge(problem, x, seeds(problem.tune.budget)[2], problem.tune.budget.held_out)
     summary = summarise(columns)
-    broken = [limit.name for limit in problem.goal.limits if limit.reached(columns) > limit.asked]
+    broken = [limit.name for limit in problem.limits if limit.reached(columns) > limit.threshold]
     names = ("settled_rms_error_m", "settled_max_abs_error_m", "lost")
     return {name: summary[name] for name in names} | {"broken": broken}
 

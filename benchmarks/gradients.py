@@ -25,7 +25,7 @@ import workload
 
 from ambjax import Cascade, Initial, current, inversion, position, rollout
 from ambjax.compiler.fast_path import one_kernel
-from ambjax.simulation.metrics import Rms
+from ambjax.simulation.folds import Rms
 from tuning.config import read_tune
 from tuning.objective.loss import weigh
 from tuning.problem import problem_of

@@ -19,7 +19,7 @@ import workload
 
 from ambjax import DOP853, RK4, Sensor, paper
 from ambjax.ensemble import run_ensemble
-from ambjax.simulation.metrics import Peak
+from ambjax.simulation.folds import Peak
 
 TARGET = 1e-6
 NOISES = {

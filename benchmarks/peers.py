@@ -72,7 +72,7 @@ def c_program(work: Workload) -> Any:
 def scipy_run(work: Workload, method: str, rtol: float) -> Any:
     f = workload.right_side(workload.GAMMA, workload.P_V, math)
     times, columns = instants(work) * PERIOD, []
-    for z in work.scenario.initial.z:
+    for z in np.asarray(work.scenario.initial.z):
         y, column = [float(z), 0.0, 0.0, 0.0], []
         for begin, end, force in spans(work):
             at = np.append(times[(times > begin + 1e-9) & (times < end - 1e-9)], end)
@@ -173,7 +173,7 @@ def diffrax_run(work: Workload) -> Any:
 
 def per_member(work: Workload) -> float:
     """Return the factor from seconds of a run to nanoseconds per member and 10 us simulated."""
-    return 1e9 / work.members / (work.clock.samples * work.clock.sample_period / 1e-5)
+    return 1e9 / work.members / (work.clock.samples * float(work.clock.sample_period) / 1e-5)
 
 
 def serve() -> None:

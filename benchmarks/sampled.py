@@ -27,8 +27,9 @@ from workload import Workload
 from ambjax import Cascade, Clock, Initial, current, inversion, position, rollout
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
+from ambjax.simulation.folds import Rms
 from ambjax.simulation.method import with_method
-from ambjax.simulation.metrics import Rms, standard_for
+from ambjax.simulation.metrics import standard_for
 
 # c, k, gamma, k_i: they hold the rotor with either sign.
 GAINS = np.array([200.0, 25.0, 2e6, 2000.0])

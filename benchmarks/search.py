@@ -132,12 +132,12 @@ def ours(problem: TuningProblem, who: Any, seed: int) -> list[tuple[int, float, 
     """Return the trace of the gradient search on all members, repeated searches around its answer included."""
     problem.engine.rollouts, trace, began = 0, [], time.process_time()
 
-    def tell(progress: SearchState, _: float) -> None:
+    def note(progress: SearchState, _: float) -> None:
         if progress.history["members"][-1] == len(who.member):  # else its goal is that of a part of them
             best = min(float(np.min(progress.history["value"][-1])), trace[-1][2] if trace else np.inf)
             trace.append((problem.engine.rollouts, time.process_time() - began, best))
 
-    search_and_restart(Course(problem, who, seed, tell=tell), problem.tune.space.values(problem.case.cascade))
+    search_and_restart(Course(problem, who, seed, on_iteration=note), problem.tune.space.values(problem.case.cascade))
     return trace
 
 

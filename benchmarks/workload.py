@@ -11,11 +11,12 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from ambjax import RK4, Cascade, Clock, Initial, Plant, Pulse, Scenario, Sensor, inversion, paper, rollout
 from ambjax.ensemble import run_ensemble
-from ambjax.simulation.metrics import Peak
+from ambjax.simulation.folds import Peak
 
 GAMMA, P_V = 1e9, 25e-6
 PERIOD, SUBSTEPS = 1e-4, 10
@@ -34,7 +35,7 @@ class Workload(NamedTuple):
 
     @property
     def members(self) -> int:
-        return len(self.scenario.initial.z)
+        return np.size(self.scenario.initial.z)
 
     @property
     def steps(self) -> int:
@@ -59,7 +60,7 @@ class Workload(NamedTuple):
     def few(self, members: int) -> "Workload":
         """Return a workload with some of the members, spread evenly."""
         chosen = np.linspace(0, self.members - 1, members).round().astype(int)
-        initial = dataclasses.replace(self.scenario.initial, z=np.asarray(self.scenario.initial.z)[chosen])
+        initial = dataclasses.replace(self.scenario.initial, z=jnp.asarray(self.scenario.initial.z)[chosen])
         member = np.asarray(self.scenario.member)[chosen]
         return self._replace(scenario=dataclasses.replace(self.scenario, initial=initial, member=member))
 
@@ -77,8 +78,8 @@ def workload(members: int, samples: int, *, noise: bool = False) -> Workload:
         paper.scenario("tracking", "repaired"),
         q_v=Pulse(1.0, start * PERIOD, stop * PERIOD),
         sensor=NOISE if noise else None,
-        initial=Initial(z=SPREAD * ((2 * np.arange(members) + 1) / members - 1)),
-        member=np.arange(members),
+        initial=Initial(z=jnp.asarray(SPREAD * ((2 * np.arange(members) + 1) / members - 1))),
+        member=jnp.arange(members),
     )
     return Workload(cascade, scenario, Clock(samples, PERIOD, RK4(SUBSTEPS)))
 
@@ -87,7 +88,8 @@ def ours(work: Workload, threads: int = 1, **options: Any) -> Any:
     """The largest |z - r| of each member, by ambjax: the ensemble engine, or `rollout` where there is one member."""
     if work.members > 1:
         return run_ensemble(*work, fold=FOLD, threads=threads, **options).measured
-    alone = dataclasses.replace(work.scenario, initial=Initial(z=float(work.scenario.initial.z[0])), member=0)
+    first = float(np.ravel(work.scenario.initial.z)[0])
+    alone = dataclasses.replace(work.scenario, initial=Initial(z=first), member=0)
     return rollout(work.cascade, alone, work.clock, fold=FOLD, every=0).measured
 
 

@@ -147,13 +147,20 @@ def document(tables=None, **tune):
     )
 
 
-def study(monkeypatch, world, tables=None, **tune):
-    """The problem of that case in a world, every engine of it a Bowl."""
+def instead_of_engines(monkeypatch, world):
+    """Every engine made from now on is a Bowl in this world."""
     import tuning.problem
     import tuning.report.gradient
 
     monkeypatch.setattr(Bowl, "world", world, raising=False)
     for module in (tuning.problem, tuning.report.gradient):
         monkeypatch.setattr(module, "Engine", Bowl)
+
+
+def study(monkeypatch, world, tables=None, **tune):
+    """The problem of that case in a world, every engine of it a Bowl."""
+    import tuning.problem
+
+    instead_of_engines(monkeypatch, world)
     raw = document(tables, **tune)
     return tuning.problem.problem_of(*case_and_tune(raw))

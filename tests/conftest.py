@@ -16,6 +16,10 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
 
 
+# Tracing allocates millions of objects that stay, and the collector visits all of them again and again.
+gc.set_threshold(100_000, 20, 20)
+
+
 def pytest_configure(config):
     if not hasattr(config, "workerinput") and sum(file.stat().st_size for file in CACHE.glob("*")) > LARGEST:
         shutil.rmtree(CACHE)

@@ -107,6 +107,27 @@ LAWS = [
         "tests/test_laws.py::test_pi_integral_is_bounded_while_the_supply_saturates",
     ),
     M(
+        "the integral of the PID law winds up",
+        "ambjax/control/position.py",
+        "self.k_int * e + self.k_aw * lacking",
+        "self.k_int * e",
+        "tests/test_laws.py::test_a_pid_steps_its_filter_and_its_anti_windup_by_backward_euler",
+    ),
+    M(
+        "the integral of the PID law winds up on a processor",
+        "ambjax/control/position.py",
+        "+ leak * lacking) / (1 + leak)",
+        ")",
+        "tests/test_laws.py::test_the_integral_of_a_pid_follows_the_force_while_the_current_cannot",
+    ),
+    M(
+        "the linear magnet forgets the negative stiffness",
+        "ambjax/control/inversion.py",
+        "(v_star - model.dv_dz(0.0, 0.0) * z)",
+        "v_star",
+        "tests/test_laws.py::test_linearised_inversion_is_exact_at_the_origin_and_without_a_force",
+    ),
+    M(
         "the observer is pulled away from the measurement",
         "ambjax/control/observer.py",
         "inputs.z_dot + self.l * (inputs.z - state)",
@@ -209,8 +230,9 @@ LOOP = [
     M(
         "noise is redrawn at each evaluation",
         "ambjax/simulation/loop.py",
-        "seen = self.measured(state.plant, errors)\n        command",
-        "seen = self.measured(state.plant, self.sensor_errors((state.plant.z * 1e18).astype(int)))\n        command",
+        "measured = self.received(inputs, state.plant, errors)\n        command",
+        "measured = self.measured(state.plant, self.sensor_errors((1e18 * state.plant.z).astype(int)))\n"
+        "        command",
         "tests/test_ensemble.py::test_settled_rms_agrees_with_the_lyapunov_equation",
     ),
     M(
@@ -245,7 +267,7 @@ LOOP = [
 METHODS = [
     M(
         "a coefficient of RODAS3 is off",
-        "ambjax/simulation/integrate.py",
+        "ambjax/simulation/rosenbrock.py",
         "(-8.0 / 3.0, u_3)",
         "(-7.0 / 3.0, u_3)",
         "tests/test_integrate.py::test_order_on_a_problem_with_known_solution",
@@ -260,20 +282,20 @@ METHODS = [
     M(
         "a stage sees the jump at the end of its step",
         "ambjax/simulation/edges.py",
-        "return 4 * jnp.finfo",
-        "return 0 * jnp.finfo",
+        "return 4 * float(jnp.finfo",
+        "return 0 * float(jnp.finfo",
         "tests/test_integrate.py::test_a_jump_on_the_edge_of_a_step_keeps_the_order",
     ),
     M(
         "the adaptive method controls the error of the position alone",
-        "ambjax/simulation/integrate.py",
+        "ambjax/simulation/rosenbrock.py",
         "jnp.sqrt(sum(ratios) / len(ratios))",
         "jnp.sqrt(ratios[0])",
         "tests/test_tolerance.py::test_an_error_is_that_of_some_steps_carried_by_the_loop",
     ),
     M(
         "a stalled integration counts as a rotor that is held",
-        "ambjax/simulation/integrate.py",
+        "ambjax/simulation/rosenbrock.py",
         "jnp.where(stalled, STALLED, code)",
         "code",
         "tests/test_integrate.py::test_a_stalled_rollout_says_so_and_stays_finite",
@@ -301,21 +323,21 @@ METHODS = [
     ),
     M(
         "the mean square of the voltage is read at the samples",
-        "ambjax/simulation/metrics.py",
+        "ambjax/simulation/folds.py",
         "more = getattr(span.densities, self.of), span.time",
         "more = (row.u**2 * span.time if self.of == 'u_squared' else getattr(span.densities, self.of)), span.time",
         "tests/test_metrics_dense.py::test_every_metric_is_what_a_dense_solution_says[noise without a limit-adaptive]",
     ),
     M(
         "peaks between the samples are not seen",
-        "ambjax/simulation/metrics.py",
+        "ambjax/simulation/folds.py",
         '        if self.of in getattr(span.most, "_fields", ()):',
         '        if self.of == "":',
         "tests/test_metrics_dense.py::test_every_metric_is_what_a_dense_solution_says[noise without a limit-adaptive]",
     ),
     M(
         "chatter is of the voltage at the samples",
-        "ambjax/simulation/metrics.py",
+        "ambjax/simulation/folds.py",
         "value, counts = row.u_mean, row.alive",
         "value, counts = row.u, row.alive",
         "tests/test_loss_dense.py::test_costs_and_limits_are_those_of_a_dense_solution[noisy]",
@@ -376,8 +398,8 @@ ENSEMBLE = [
     M(
         "frozen members count in the extremes of a fan",
         "ambjax/ensemble/blocks.py",
-        "jnp.where(row.alive, x, -NEVER)",
-        "jnp.where(True, x, -NEVER)",
+        "jnp.where(row.alive, x, -NO_VALUE)",
+        "jnp.where(True, x, -NO_VALUE)",
         "tests/test_ensemble.py::test_bands_at_few_instants_have_all_that_is_between_them",
     ),
     M(
@@ -482,9 +504,9 @@ SEARCH = [
     ),
     M(
         "who judges is who validated",
-        "tuning/command.py",
-        "held_out = seeds(tune.budget)[2]",
-        "held_out = seeds(tune.budget)[1]",
+        "tuning/report/judging.py",
+        "held_out, rollouts = seeds(problem.tune.budget)[2]",
+        "held_out, rollouts = seeds(problem.tune.budget)[1]",
         "tests/test_tuning_study.py::test_tuned_gains_are_judged_by_members_that_nothing_else_was_asked_of",
     ),
     M(
@@ -566,16 +588,16 @@ SEARCH = [
     ),
     M(
         "--pareto raises",
-        "tuning/command.py",
-        "explore.pareto(problem, x, members)",
-        "explore.pareto(problem, x)",
+        "tuning/report/judging.py",
+        "explore.pareto(answer.problem, answer.x, answer.members)",
+        "explore.pareto(answer.problem, answer.x)",
         "tests/test_tuning_study.py::test_pareto_is_in_the_report_and_has_a_picture",
     ),
     M(
         "--gradients raises",
-        "tuning/command.py",
-        "gradient.report(problem, x, members)",
-        "gradient.report(problem, x)",
+        "tuning/report/judging.py",
+        "gradient.report(answer.problem, answer.x, answer.members)",
+        "gradient.report(answer.problem, answer.x)",
         "tests/test_tuning_study.py::test_gradients_reports_three_ways_to_the_same_number",
     ),
     M(
@@ -616,9 +638,16 @@ SEARCH = [
     M(
         "limits pull nothing",
         "tuning/objective/goal.py",
-        "sum(limit.pull(held[:, j])",
-        "sum(0.0 * limit.pull(held[:, j])",
+        "sum(term(held[:, j])",
+        "sum(0.0 * term(held[:, j])",
         "tests/test_tuning_limits.py::test_a_limit_is_met_and_its_multiplier_is_the_price",
+    ),
+    M(
+        "another limit compiles the search again",
+        "tuning/objective/limits.py",
+        "    log_allowed: Scalar\n",
+        "    log_allowed: Scalar = static()\n",
+        "tests/test_tuning_limits.py::test_other_limits_do_not_trace_the_step_again",
     ),
     M(
         "a multiplier is what the judge finds, not the force that acted",
@@ -637,8 +666,8 @@ SEARCH = [
     M(
         "the exit code has a verdict of its own",
         "tuning/command.py",
-        'good = facts["outcome"]["good"]',
-        'good = facts["verified"]',
+        'int(not facts.outcome["good"])',
+        "int(not facts.verified)",
         "tests/test_tuning_outcome.py::test_every_place_says_the_same",
     ),
     M(
@@ -672,15 +701,15 @@ SEARCH = [
     M(
         "a supply has no limit unless it is asked for",
         "tuning/config.py",
-        '"rms_u_V" not in asked and math.isfinite(u_max)',
-        '"rms_u_V" not in asked and math.isnan(u_max)',
+        '"rms_u_V" not in thresholds and math.isfinite(u_max)',
+        '"rms_u_V" not in thresholds and math.isnan(u_max)',
         "tests/test_tuning_limits.py::test_a_supply_keeps_room_unless_it_is_told_not_to",
     ),
     M(
         "what the judge finds does not correct the search",
         "tuning/objective/limits.py",
-        "reached = self.ratio * self.kind.tuned(values)",
-        "reached = self.kind.tuned(values)",
+        "reached = self.ratio * KINDS[self.name].tuned(values)",
+        "reached = KINDS[self.name].tuned(values)",
         "tests/test_tuning_limits.py::test_what_the_judge_finds_counts",
     ),
     M(
@@ -797,7 +826,7 @@ SEARCH = [
     ),
     M(
         "the members that accurate steps simulate again prove nothing",
-        "tuning/command.py",
+        "tuning/report/judging.py",
         'refuted or (again["refuted"] if again else "")',
         "refuted",
         "tests/test_tuning_study.py::test_a_member_that_accurate_steps_alone_do_not_hold_is_no_survivor",
@@ -1024,7 +1053,7 @@ SAMPLED = [
     ),
     M(
         "the largest of zeros has a slope that is no number",
-        "tuning/objective/limits.py",
+        "tuning/objective/quantities.py",
         "jnp.where(total > 0, total, 1.0)",
         "total",
         "tests/test_tuning_limits.py::test_the_largest_over_members_is_smooth_and_no_less",
@@ -1046,8 +1075,8 @@ SAMPLED = [
     M(
         "a guard predicts for ever",
         "ambjax/control/guard.py",
-        "return Judged(reading, ~good, good | (watch.left > 0), left)",
-        "return Judged(reading, ~good, jnp.asarray(True), left)",
+        "return GuardResult(reading, ~good, good | (watch.left > 0), left)",
+        "return GuardResult(reading, ~good, jnp.asarray(True), left)",
         "tests/test_export.py::test_after_so_many_refused_samples_u_is_0_until_a_reading_is_accepted",
     ),
     M(
@@ -1067,7 +1096,7 @@ SAMPLED = [
     M(
         "the safe command holds the voltage",
         "ambjax/simulation/sampled.py",
-        "u=jnp.where(judged.steps, command.u, 0.0)",
+        "u=jnp.where(checked.steps, command.u, 0.0)",
         "u=command.u",
         "tests/test_export.py::test_after_so_many_refused_samples_u_is_0_until_a_reading_is_accepted",
     ),
@@ -1095,15 +1124,15 @@ SAMPLED = [
     M(
         "the voltages of the two samples before change places",
         "ambjax/simulation/sampled.py",
-        "past, judged, laws = self.loop.cascade, (state.command.u, state.past[0]),",
-        "past, judged, laws = self.loop.cascade, (state.past[0], state.command.u),",
+        "past, checked, laws = self.loop.cascade, (state.command.u, state.past[0]),",
+        "past, checked, laws = self.loop.cascade, (state.past[0], state.command.u),",
         "tests/test_sampled.py::test_the_voltage_of_a_sample_acts_late",
     ),
     M(
         "the second stretch of a sample is as long as the whole",
-        "ambjax/simulation/sampled.py",
-        "jnp.floor(delay)), period - late)",
-        "jnp.floor(delay)), period)",
+        "ambjax/simulation/between.py",
+        "(last, period - late)]",
+        "(last, period)]",
         "tests/test_sampled.py::test_the_voltage_of_a_sample_acts_late",
     ),
     M(
@@ -1115,14 +1144,14 @@ SAMPLED = [
     ),
     M(
         "a step on a processor does not end at the edges of a disturbance",
-        "ambjax/simulation/sampled.py",
-        "self._status, None, observed, SHOWN, edges=edges)",
-        "self._status, None, observed, SHOWN)",
+        "ambjax/simulation/between.py",
+        "status, None, observed, SHOWN, edges=edges)",
+        "status, None, observed, SHOWN)",
         "tests/test_sampled.py::test_against_the_independent_simulator[edges between samples]",
     ),
     M(
         "the sensor's low-pass takes the motion for smooth across an edge",
-        "ambjax/simulation/sampled.py",
+        "ambjax/simulation/between.py",
         "for length in edges.pieces(t, time)]",
         "for length in [time]]",
         "tests/test_sampled.py::test_against_the_independent_simulator[a real position sensor]",
@@ -1172,7 +1201,7 @@ SAMPLED = [
     M(
         "the converter looks before the low-pass",
         "ambjax/simulation/sampled.py",
-        "motion = motion._replace(z=seen)",
+        "motion = motion._replace(z=z_filtered)",
         "motion = motion._replace(z=motion.z)",
         "tests/test_sampled.py::test_against_the_independent_simulator[a real position sensor]",
     ),
@@ -1186,8 +1215,8 @@ SAMPLED = [
     M(
         "the amplifier forgets its voltage from sample to sample",
         "ambjax/simulation/sampled.py",
-        "plant=after.state, seen=seen, u_a=u_a)",
-        "plant=after.state, seen=seen)",
+        "plant=after.state, z_filtered=z_filtered, u_a=u_a)",
+        "plant=after.state, z_filtered=z_filtered)",
         "tests/test_sampled.py::test_against_the_independent_simulator[a real amplifier]",
     ),
     M(
@@ -1199,7 +1228,7 @@ SAMPLED = [
     ),
     M(
         "the current limit holds against Eq. (2)'s resistance alone",
-        "ambjax/simulation/sampled.py",
+        "ambjax/simulation/between.py",
         "return still / (still - driven)  # i' is linear in u",
         "return plant.R * plant.measurement(x).i",
         "tests/test_realism.py::test_the_current_stays_within_its_limit",
@@ -1286,16 +1315,30 @@ CHECK = [
     M(
         "the closed form commands the step of its root that it has made",
         "ambjax/control/inversion.py",
-        "return CurrentDemand(i_ref, (after - i_ref) * (1 / period)), Held(after",
-        "return CurrentDemand(after, (after - i_ref) * (1 / period)), Held(after",
-        "tests/test_laws.py::test_closed_form_inversion_on_a_processor_commands_each_step_of_its_root_once",
+        "return CurrentDemand(i_ref, (after - i_ref) * (1 / period)), StaticInversionState(after",
+        "return CurrentDemand(after, (after - i_ref) * (1 / period)), StaticInversionState(after",
+        "tests/test_laws.py::test_static_inversion_on_a_processor_commands_each_step_of_its_root_once[ClosedForm]",
     ),
     M(
         "the closed form jumps from 0 at its first sample",
         "ambjax/control/inversion.py",
         "jnp.where(state.begun > 0.5, state.i_ref, after)",
         "state.i_ref",
-        "tests/test_laws.py::test_closed_form_inversion_on_a_processor_commands_each_step_of_its_root_once",
+        "tests/test_laws.py::test_static_inversion_on_a_processor_commands_each_step_of_its_root_once[ClosedForm]",
+    ),
+    M(
+        "a law without the base class of its stage is accepted",
+        "ambjax/simulation/rollout.py",
+        "if not isinstance(law, base):",
+        "if False:",
+        "tests/test_own_parts.py::test_a_law_without_the_base_class_is_refused",
+    ),
+    M(
+        "a processor makes Euler steps of laws that have a step of their own",
+        "ambjax/control/base.py",
+        'cls.own_steps = ("implicit",)',
+        "cls.own_steps = ()",
+        "tests/test_sampled.py::test_against_the_independent_simulator[two samples]",
     ),
     M(
         "explicit steps take the closed form of continuous time",
@@ -1569,7 +1612,7 @@ STATUSES = [
     ),
     M(
         "a claim fails for a run that stalled",
-        "ambjax/paper/claims.py",
+        "ambjax/paper/findings.py",
         'if run.metrics["stalled"]:',
         "if False:",
         "tests/test_paper.py::test_a_stall_is_neither_held_nor_lost",
@@ -1619,7 +1662,7 @@ STATUSES = [
     M(
         "the folder of a search is not marked before its first checkpoint",
         "tuning/command.py",
-        "        begin(out)\n",
+        "        begin(plan.out)\n",
         "",
         "tests/test_tuning_study.py::test_a_search_killed_before_its_first_checkpoint_is_resumed",
     ),
@@ -1682,7 +1725,7 @@ STATUSES = [
     M(
         "a map of one run a cell states the confidence of its cells",
         "ambjax/ensemble/maps.py",
-        "return self.varied and bool(wilson(self.members, self.members).low >= SURE)",
+        "return self.varied and bool(wilson(self.members, self.members).low >= CERTAIN)",
         "return True",
         "tests/test_maps.py::test_confidence_is_stated_where_so_many_members_allow_it",
     ),
@@ -1695,6 +1738,34 @@ STATUSES = [
     ),
 ]
 SURROUNDINGS = [
+    M(
+        "a law of one's own travels without its file",
+        "ambjax/cases/own_laws.py",
+        "        pickle_with_source(found)",
+        "        pass",
+        "tests/test_own_laws.py::test_a_law_travels_to_a_process_that_has_no_such_file",
+    ),
+    M(
+        "a study goes on with another law of one's own",
+        "ambjax/ensemble/paths.py",
+        "if digest := digest_of(type(node)):",
+        'if digest := "":',
+        "tests/test_own_laws.py::test_a_study_is_not_resumed_with_another_law",
+    ),
+    M(
+        "tuned.toml names the law's file as the case does",
+        "ambjax/cases/own_laws.py",
+        'kind = f"{_relative(file, out)}:{law.law.__name__}"',
+        "kind = law.kind",
+        "tests/test_own_laws.py::test_tuned_toml_finds_the_law_from_its_own_folder[mine.py:PD-there/deep-../../mine.py:PD]",
+    ),
+    M(
+        "a mistake in a law of one's own is met in the simulation",
+        "ambjax/cases/own_laws.py",
+        "        try_law(found(), stage, model)",
+        "        pass",
+        "tests/test_own_laws.py::test_a_wrong_law_is_one_clear_line[a rate of another shape]",
+    ),
     M(
         "chunks are put together whosever they are",
         "ambjax/ensemble/store.py",
@@ -1759,6 +1830,64 @@ SURROUNDINGS = [
         "tests/test_surroundings.py::test_files_move_all_or_not_at_all",
     ),
 ]
+INJECTION = [
+    M(
+        "the injected wave is taken off the reading",
+        "ambjax/linear/multisine.py",
+        "measured._replace(z=measured.z + self.injected(t))",
+        "measured._replace(z=measured.z - self.injected(t))",
+        "tests/test_injection.py::test_the_peak_is_that_of_the_independent_simulator[complementary]",
+    ),
+    M(
+        "the injected wave enters the velocity",
+        "ambjax/linear/multisine.py",
+        "measured._replace(z=measured.z + inputs.e)",
+        "measured._replace(z_dot=measured.z_dot + inputs.e)",
+        "tests/test_injection.py::test_continuous_time_is_the_linear_analysis[smooth]",
+    ),
+    M(
+        "an injected wave has no phases",
+        "ambjax/linear/multisine.py",
+        "jnp.cos(self.angles(sample) + self.phases)",
+        "jnp.cos(self.angles(sample))",
+        "tests/test_injection.py::test_the_wave_repeats_exactly_and_has_the_stated_amplitude",
+    ),
+    M(
+        "the injected wave's response is conjugated",
+        "ambjax/linear/multisine.py",
+        "-jnp.sin(angles)",
+        "jnp.sin(angles)",
+        "tests/test_injection.py::test_continuous_time_is_the_linear_analysis[smooth]",
+    ),
+    M(
+        "the injected wave is a sample late",
+        "ambjax/linear/multisine.py",
+        ".astype(int))",
+        ".astype(int) - 1)",
+        "tests/test_injection.py::test_the_peak_is_that_of_the_independent_simulator[complementary]",
+    ),
+    M(
+        "the response to the injected wave counts from the start",
+        "ambjax/linear/multisine.py",
+        "counts = carry.sample >= self.skip",
+        "counts = carry.sample >= 0",
+        "tests/test_injection.py::test_continuous_time_is_the_linear_analysis[smooth]",
+    ),
+    M(
+        "the sliding step takes the injected wave for none",
+        "ambjax/linear/injection.py",
+        "None if isinstance(clock.method, Slide) else clock.method",
+        "clock.method",
+        "tests/test_injection.py::test_continuous_time_is_the_linear_analysis[smooth]",
+    ),
+    M(
+        "members that are lost under the injected wave count",
+        "ambjax/linear/injection.py",
+        "kept = code == ALIVE",
+        "kept = code >= ALIVE",
+        "tests/test_injection.py::test_true_signs_under_noise_and_a_lost_rotor",
+    ),
+]
 MUTATIONS = [
     *PLANT,
     *LAWS,
@@ -1772,4 +1901,5 @@ MUTATIONS = [
     *EXPORT,
     *STATUSES,
     *SURROUNDINGS,
+    *INJECTION,
 ]

@@ -19,9 +19,10 @@ from tomlkit import dumps
 
 import ambjax
 import tuning
-from ambjax.__main__ import main
+from ambjax.__main__ import main, parser
 from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.template_text import template
+from ambjax.cases.tune_table import Budget
 from ambjax.commands import simulate
 from ambjax.commands.outputs import files
 from ambjax.commands.warnings import reversal, warnings_of
@@ -31,13 +32,14 @@ from ambjax.numerics.records import validate, within
 from ambjax.pictures import overview
 from ambjax.simulation.clock import Clock
 from ambjax.world.amplifier import Amplifier
+from ambjax.world.band_noise import LINES, BandNoise
 from ambjax.world.coils import TwoCoil
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Sensor
-from ambjax.world.signals import LINES, BandNoise, Chirp, Pulse, Sine, SmoothStep, Step, Sum
+from ambjax.world.signals import Chirp, Pulse, Sine, SmoothStep, Step, Sum
 from tuning.__main__ import main as tune
-from tuning.config import Budget, read_tune, settings
+from tuning.config import read_tune, settings
 from tuning.objective.loss import Loss
 from tuning.report.tuned import tuned
 
@@ -459,7 +461,8 @@ def test_a_finished_study_is_not_mixed_with_a_simulation(capsys):
 
 
 def test_a_member_of_noise_alone_is_a_member():
-    assert main(["simulate", write(SHORT + "[sensor]\nstd = 1e-9\n"), "--member", "3"]) == 0
+    path = write(SHORT + "[sensor]\nstd = 1e-9\n")
+    assert simulate._study(read_case(path), parser().parse_args(["simulate", path, "--member", "3"])) is not None
 
 
 # --- disks and streams ---

@@ -14,6 +14,7 @@ from tomlkit import dumps
 
 from ambjax.cases.reader import KINDS, SIGNALS, TABLES, read_case
 from ambjax.cases.timing import DURATION, METHODS
+from ambjax.cases.tune_table import NUMBERS as TUNED
 from ambjax.commands import simulate
 from ambjax.commands.warnings import warnings_of
 from ambjax.ensemble.design import DESIGNS
@@ -24,10 +25,9 @@ from ambjax.world.amplifier import Amplifier
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Sensor
-from tuning.config import NUMBERS as TUNED
 from tuning.config import read_tune
-from tuning.objective.limits import KINDS as LIMITS
 from tuning.objective.loss import TERMS
+from tuning.objective.quantities import KINDS as LIMITS
 
 # Every run is of so few samples, and of so few structures, each of which is compiled once.
 SAMPLES, MOST_STRUCTURES = 4, 12

@@ -251,7 +251,9 @@ def test_the_singular_curve_is_judged_on_the_processor_s_run():
     assert sampled.distance[0] < 0
     assert not sampled.holds
     said = advice.on_processor(sampled, Delays(2.0, None, None, 0.1), None)
-    assert any(line.startswith("Is (z/s_0, i_ref/i_0) off the singular curve C") and " No: " in line for line in said)
+    assert any(
+        line.startswith("Does (z/s_0, i_ref/i_0) stay off the singular curve C") and " No: " in line for line in said
+    )
     world = dataclasses.replace(world, sensor=amb.Sensor(0.0, 1e-4))
     calm = sampled_report.check(crossing, world, clock, 0.005)
     assert calm.holds
@@ -368,10 +370,11 @@ settle = 0.01
 def test_check_says_no_where_an_explicit_slope_is_beyond_its_limit(capsys):
     # gamma 2 p/pi T is 318; nothing loses the rotor in this time, the theorem's conditions hold, and the answer is no
     assert main(["check", write(CASE + 'discretisation = "explicit"\npredict = false\n')]) == 1
-    theorem, _, said = capsys.readouterr().out.partition("On the processor")
+    said, _, theorem = capsys.readouterr().out.partition("Theorem 1:")
+    assert "The linearised loop is not stable" in said.partition("On the processor")[0]
     assert "Yes, all 5" in theorem
     assert "for continuous time" in theorem
-    assert "- inversion: slope T as stepped, 318.3, must stay below" in said
+    assert "- inversion: slope T of the step is 318.3 and must be less than" in said
     assert "1 of 3 is not" in said
     assert "The rotor is held." in said
     assert "Delay margin" in said

@@ -38,7 +38,7 @@ BAD = {
     "p = 0": ("[controller.position]\np = 0.0\n", ["controller.position.p = 0", "above 1e-30", "25"]),
     "negative gain": ("[controller.current]\nk_i = -1.0\n", ["controller.current.k_i = -1"]),
     "bad nominal model": ("[controller]\nmodel = { m = 0.0 }\n", ["controller.model.m = 0"]),
-    "unknown law": ('[controller.position]\nkind = "pid"\n', ["controller.position.kind", "sliding-mode"]),
+    "unknown law": ('[controller.position]\nkind = "lqr"\n', ["position.kind", "sliding-mode", "FILE.py:CLASS"]),
     "gain of another law": ('[controller.current]\nkind = "pi"\nk_i = 1.0\n', ["controller.current.k_i", "k_p"]),
     "unknown signal": ('[reference]\nkind = "sin"\n', ["reference.kind", "Did you mean 'sine'"]),
     "signal without kind": ("[reference]\namplitude = 1e-3\n", ["reference.kind is missing"]),

@@ -154,8 +154,8 @@ def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
 def test_fingerprints_name_what_differs():
     there, here = ({"case": {"plant": {"m": m}, "terms": [{"a": 1}]}, "round": 1} for m in (0.5, 0.6))
     assert difference(flat(there), flat(there)) == ""
-    assert difference(flat(there), flat(here)) == "case.plant.m is 0.5 there and 0.6 here"
-    assert difference({}, {"version": "2"}) == "version is None there and 2 here"
+    assert difference(flat(there), flat(here)) == "case.plant.m is 0.5 in the file and 0.6 in this run"
+    assert difference({}, {"version": "2"}) == "version is None in the file and 2 in this run"
     assert set(sealed.provenance()) == {"version", "jax", "precision"}
 
 
@@ -286,7 +286,7 @@ def test_chunks_stay_until_the_whole_was_read_back(begun, whole, monkeypatch):
 
         with monkeypatch.context() as disk:
             disk.setattr("ambjax.ensemble.store.write_whole", lying)
-            with pytest.raises(ValueError, match=r"members.npz: not put together, .* The chunks are kept"):
+            with pytest.raises(ValueError, match=r"members.npz: the chunks could not be merged .* They are kept"):
                 store.finish()
         assert len(list(store.chunks.glob("*.npz"))) == 3
         assert not store_in(begun).finished()
@@ -310,7 +310,7 @@ def test_a_chunk_that_goes_bad_before_the_end_stops_it(begun):
     store = store_in(begun)
     compute(store)
     truncated(0.5)(chunk_file(begun, 1))
-    with pytest.raises(ValueError, match="The chunks are kept: give the same command with --resume"):
+    with pytest.raises(ValueError, match="They are kept: repeat the command with --resume"):
         store.finish()
     assert not store.path.exists()
     assert len(list(begun.rglob("*.part"))) == 0
@@ -355,9 +355,9 @@ def test_the_chunk_is_the_directorys_unless_one_is_asked_for(begun, whole):
     assert store.chunk == CHUNK
     assert compute(store) == ([], [])
     assert store.finish().read_bytes() == whole
-    with pytest.raises(ValueError, match="another study: chunk is 20 there and 10 here"):
+    with pytest.raises(ValueError, match="another study: chunk is 20 in the file and 10 in this run"):
         store_in(begun, chunk=10)
-    with pytest.raises(ValueError, match="another study: seed is 3 there and 5 here"):
+    with pytest.raises(ValueError, match="another study: seed is 3 in the file and 5 in this run"):
         store_in(begun, facts=FACTS | {"seed": 5})
 
 
@@ -469,7 +469,7 @@ def test_a_folder_in_place_of_a_checkpoint_is_told_by_name_and_left(checkpoint, 
     checkpoint.path.unlink()
     checkpoint.path.mkdir()
     assert checkpoint.load(descent, STARTS, GAINS) is None
-    assert capsys.readouterr().err.startswith(f"{checkpoint.path}: it is not a whole archive")
+    assert capsys.readouterr().err.startswith(f"{checkpoint.path}: it is an incomplete archive")
     with pytest.raises(ValueError, match=r"checkpoint-2.npz: cannot be written \(Is a directory\)"):
         checkpoint.save(search_of(descent))
     assert [path.name for path in checkpoint.path.parent.iterdir()] == ["checkpoint-2.npz"]
@@ -478,11 +478,14 @@ def test_a_folder_in_place_of_a_checkpoint_is_told_by_name_and_left(checkpoint, 
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        ({"case": {"plant": {"m": 0.6}}, "tune": {"members": 4}}, "case.plant.m is 0.5 there and 0.6 here"),
-        ({"case": {"plant": {"m": 0.5}}, "tune": {"members": 5}}, "tune.members is 4 there and 5 here"),
-        (TOLD | {"version": "0"}, "there and 0 here"),
-        (TOLD | {"jax": "0"}, "there and 0 here"),
-        (TOLD | {"precision": "float32"}, "precision is float64 there and float32 here"),
+        (
+            {"case": {"plant": {"m": 0.6}}, "tune": {"members": 4}},
+            "case.plant.m is 0.5 in the file and 0.6 in this run",
+        ),
+        ({"case": {"plant": {"m": 0.5}}, "tune": {"members": 5}}, "tune.members is 4 in the file and 5 in this run"),
+        (TOLD | {"version": "0"}, "in the file and 0 in this run"),
+        (TOLD | {"jax": "0"}, "in the file and 0 in this run"),
+        (TOLD | {"precision": "float32"}, "precision is float64 in the file and float32 in this run"),
     ],
 )
 def test_a_checkpoint_of_another_search_is_refused_in_words(other, words, checkpoint, descent):
@@ -516,7 +519,7 @@ def test_a_chunk_that_was_replaced_while_the_study_ran_is_refused_by_name(kind, 
     path = chunk_file(begun, 1)
     CHUNK_STRANGE[kind](path)
     with pytest.raises(
-        ValueError, match=r"members.npz: not put together, .*/chunks/000000000020.* The chunks are kept"
+        ValueError, match=r"members.npz: the chunks could not be merged \(.*/chunks/000000000020.* They are kept"
     ):
         store.finish()
     assert not store.path.exists()

@@ -59,7 +59,7 @@ def test_noise_is_called_noise():
     for _ in range(200):
         x = RNG.uniform(-1, 1, (5, 100))
         _, explained = drivers({str(k): column for k, column in enumerate(x)}, {"error": RNG.lognormal(size=100)})
-        said.append(explained["error"]["says"] == "nothing that is spread explains it, alone or in pairs: noise")
+        said.append(explained["error"]["says"] == "no spread quantity or pair explains it: noise")
     # 95 %, and three times the error of 200 trials
     assert np.mean(said) > 0.95 - 0.047
 
@@ -89,7 +89,7 @@ def test_lost_members_and_choices_and_constants():
     assert ranked["error"][0]["path"] == "kinds"
     np.testing.assert_allclose(ranked["error"][0]["share"], 0.75, atol=0.05)
     assert explained["same"]["says"] == "it is the same for all members"
-    assert explained["rare"]["says"] == "too few members differ to tell what drives it"
+    assert explained["rare"]["says"] == "too few members differ to identify its drivers"
     assert {row["share"] for row in ranked["same"]} == {0.0}
 
 

@@ -23,8 +23,8 @@ from ambjax.ensemble.batching import size
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
 from ambjax.host.sealed import difference
+from ambjax.simulation.folds import Rms
 from ambjax.simulation.loop import ClosedLoop, LoopState
-from ambjax.simulation.metrics import Rms
 from ambjax.simulation.rollout import Outcome
 from ambjax.simulation.trajectory import Row, Trajectory
 
@@ -262,7 +262,7 @@ def test_members_npz_has_a_row_per_member_and_every_metric(tmp_path):
 def test_resuming_another_study_is_refused_by_the_key_that_differs(change, key, tmp_path):
     run(STUDY, tmp_path, stop_after=1)
     before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(ValueError, match=rf"another study: {key} is .* there and .* here"):
+    with pytest.raises(ValueError, match=rf"another study: {key} is .* in the file and .* in this run"):
         run(dataclasses.replace(STUDY, **change), tmp_path, resume=True)
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -271,14 +271,14 @@ def test_what_is_no_number_belongs_to_a_study():
     """Which discretisation, whether there is prediction, what is measured: members of two kinds are no ensemble."""
     sampled = [dataclasses.replace(STUDY.cascade, processor=Processor(implicit=x)) for x in (True, False)]
     one, other = (dataclasses.replace(STUDY, cascade=cascade).fingerprint() for cascade in sampled)
-    assert difference(one, other) == "controller.processor.implicit is True there and False here"
+    assert difference(one, other) == "controller.processor.implicit is True in the file and False in this run"
 
 
 def test_a_store_refuses_what_it_cannot_hold(tmp_path):
     run(STUDY, tmp_path, stop_after=1)
-    with pytest.raises(ValueError, match=r"holds a study already\. Add --resume"):
+    with pytest.raises(ValueError, match=r"already holds a study\. Add --resume"):
         run(STUDY, tmp_path)
-    with pytest.raises(ValueError, match="another study: chunk is 64 there and 32 here"):
+    with pytest.raises(ValueError, match="another study: chunk is 64 in the file and 32 in this run"):
         run(STUDY, tmp_path, chunk=32, resume=True)
     huge = Store(tmp_path / "huge", {}, 2**50, 1024)
     with pytest.raises(ValueError, match=r"GB free. At most [\d,]+ members fit"):

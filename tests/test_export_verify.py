@@ -16,7 +16,7 @@ from ambjax.control import current, inversion, observer, position
 from ambjax.control.guard import guarded
 from ambjax.control.processor import Processor
 from ambjax.export import closed_loop, machine
-from ambjax.export.controller import INPUTS
+from ambjax.export.interface import INPUTS
 from ambjax.export.machine import Compiled
 from ambjax.export.points import evaluated
 from ambjax.export.trace import UNREAD, arguments
@@ -140,8 +140,8 @@ def test_a_twin_without_a_unit_is_jaxs_loop_and_one_with_it_differs_in_every_sta
     leaves = jax.tree.leaves
     np.testing.assert_array_equal(leaves(still), leaves(plain))
     # flags and counts are no states
-    assert (moved.sane, moved.watch.left) == (plain.sane, plain.watch.left)
-    before, after = (np.array(leaves(x._replace(sane=(), watch=x.watch.expected))) for x in (plain, moved))
+    assert (moved.finite, moved.watch.left) == (plain.finite, plain.watch.left)
+    before, after = (np.array(leaves(x._replace(finite=(), watch=x.watch.expected))) for x in (plain, moved))
     np.testing.assert_array_equal(before == after, False)
     assert np.all(np.abs(after - before) < 1e-4)  # the laws amplify a unit of 1e-12: a force of 2500 A^2/m^2 in z
     # every seed and every sample draws signs of its own
@@ -178,7 +178,7 @@ def test_a_loop_is_judged_against_its_twins_within_the_horizon_only():
 
 def test_a_horizon_too_short_decides_nothing():
     good, bad = Check("a", "double", "", "", True), Check("b", "double", "", "", False)
-    row = _looped("float", closed_loop.Beside(horizon(LEAST - 1), np.nan))
+    row = _looped("float", closed_loop.LoopComparison(horizon(LEAST - 1), np.nan))
     assert (row.ok, row.verdict) == (None, "not decisive")
     assert row.found == f"twins of JAX's loop differ too much after {LEAST - 1} of 100 samples"
     assert holds([good, row])
@@ -187,9 +187,9 @@ def test_a_horizon_too_short_decides_nothing():
     assert not holds([good, row, bad])
     assert summary([good, row, bad]) == "Some checks FAIL."
     assert summary([good]) == "All checks hold."
-    row = _looped("float", closed_loop.Beside(horizon(LEAST), closed_loop.TIMES))
+    row = _looped("float", closed_loop.LoopComparison(horizon(LEAST), closed_loop.TIMES))
     assert (row.ok, row.verdict) == (True, "holds")
-    assert _looped("float", closed_loop.Beside(horizon(LEAST), 1.001 * closed_loop.TIMES)).verdict == "FAILS"
+    assert _looped("float", closed_loop.LoopComparison(horizon(LEAST), 1.001 * closed_loop.TIMES)).verdict == "FAILS"
 
 
 @compiled
@@ -207,7 +207,7 @@ def test_a_loop_that_amplifies_rounding_is_compared_until_it_does(tmp_path):
     for name, source in sources.items():
         controller, told = library(source, one, tmp_path, name), []
         controller.step = lambda step=controller.step, told=told: told.append(step()) or told[-1]
-        rows[name] = closed_loop.beside(case, {"double": controller})["double"]
+        rows[name] = closed_loop.compare_loops(case, {"double": controller})["double"]
         assert sum(bits & 2 > 0 for bits in told) == 11
     found = rows["correct"].horizon
     assert LEAST < found.samples < 600
@@ -313,7 +313,7 @@ def test_correct_c_passes_whatever_the_seed(name, tmp_path):
     machines = {to: library(one.files["amb.c"], one, tmp_path, to) for to, one in made.items()}
     for seed in range(6):
         scenario = dataclasses.replace(case.scenario, seed=seed)
-        found = closed_loop.beside(
+        found = closed_loop.compare_loops(
             LoopCase(case.cascade, scenario, case.clock.with_method(RK4(3)), case.settle), machines
         )
         for precision, one in found.items():

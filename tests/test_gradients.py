@@ -27,7 +27,7 @@ from ambjax import (
     rollout,
 )
 from ambjax.compiler.fast_path import one_kernel
-from ambjax.simulation.metrics import Rms
+from ambjax.simulation.folds import Rms
 
 TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.01, 0.03), sensor=Sensor(0.0))
 NOISE = np.array([0.0, 1e-6])
@@ -180,7 +180,7 @@ from ambjax.compiler import fast_path
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.numerics.records import canonical
 from ambjax.compiler.fast_path import one_kernel
-from ambjax.simulation.metrics import Rms
+from ambjax.simulation.folds import Rms
 
 def loss(cascade):
     # squared: the cotangent of the rollout is no constant

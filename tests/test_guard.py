@@ -15,8 +15,9 @@ from ambjax.cases.reader import case_from
 from ambjax.control.guard import Guard, guarded, simulated
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
-from ambjax.simulation.metrics import Count, Named, Rms, standard_for
-from ambjax.simulation.sampled import system_of
+from ambjax.simulation.folds import Count, Named, Rms
+from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.system import system_of
 from ambjax.world.faults import VALUES, Dropouts, Outliers
 from ambjax.world.sensor import Errors, Measurement, Sensor
 from ambjax.world.signals import reference_at
@@ -81,7 +82,7 @@ def test_guard_and_faults_against_the_independent_simulator(name):
         fold = Count("refused")
         rows, measured = (lambda x: (x.trajectory.rows, x.measured))(amb.rollout(own, world, clock, fold=fold))
         words, read = world.words(), {"nan": math.nan, "full-scale": 5e-3}[value]
-        outlier = float(world.sensor.struck(words, 60, T).outlier)
+        outlier = float(world.sensor.fault_onsets(words, 60, T).outlier)
         assert abs(outlier) == 9.9e-3
         given = dataclasses.replace(
             WORLDS[name], guard={f.name: float(getattr(guard, f.name)) for f in dataclasses.fields(guard)},
@@ -106,7 +107,7 @@ def test_the_expected_current_follows_the_voltages_that_act_within_the_sample(de
     state = state._replace(command=state.command._replace(u=jnp.asarray(before)), past=(jnp.asarray(first),) * 2)
     z, z_dot, i = 1e-4, 0.01, 0.2
     measured = Measurement(*map(jnp.asarray, (z, z_dot, i)))
-    after = system.decided(measured, reference_at(scenario.reference, 0.0), state)
+    after = system.with_command(measured, reference_at(scenario.reference, 0.0), state)
     u = float(after.command.u)
     mean = delay * before + (1 - delay) * u if delay <= 1 else (delay - 1) * first + (2 - delay) * before
     plant = scenario.plant
@@ -160,7 +161,7 @@ def test_faults_are_those_of_the_member_and_the_sample():
     """Rates within 5 standard deviations of a binomial; both signs; one at a given time; whoever runs beside."""
     sensor = Sensor(outliers=Outliers(500.0, 1e-3, 0.0205), dropouts=Dropouts(200.0, 3e-4, 0.0305))
     _, scenario = struck()
-    draw = jax.jit(jax.vmap(lambda n: sensor.struck(scenario.words(), n, T)))
+    draw = jax.jit(jax.vmap(lambda n: sensor.fault_onsets(scenario.words(), n, T)))
     outlier, drops = (np.asarray(x) for x in draw(jnp.arange(100_000)))
     for hits, rate in ((outlier != 0, 0.05), (outlier > 0, 0.025), (drops, 0.02)):
         assert abs(hits.mean() - rate) < 5 * math.sqrt(rate / 1e5)
@@ -190,7 +191,7 @@ def test_what_is_read_in_a_dropout(value):
     assert np.asarray(rows.refused)[50:54].all() == (value != "hold")
 
 
-@pytest.mark.parametrize("guard", [Guard(), None], ids=["guard", "none"])
+@pytest.mark.parametrize("guard", [Guard(), pytest.param(None, marks=pytest.mark.slow)], ids=["guard", "none"])
 def test_derivatives_are_finite_whatever_is_read(guard):
     cascade, scenario = struck(guard, outliers=Outliers(at=1e-3, size=1e-3), dropouts=Dropouts(at=4e-3, value="nan"))
     cascade, clock = cascade.on_processor(), amb.Clock(60, T, amb.RK4(1))
@@ -200,7 +201,7 @@ def test_derivatives_are_finite_whatever_is_read(guard):
         outcome = amb.rollout(made, scenario, clock, fold=Rms("e_z"), every=0)
         return 1e9 * outcome.measured, outcome.trajectory.lost_at
 
-    slope, lost_at = jax.grad(loss, has_aux=True)(1440.0)
+    slope, lost_at = jax.jit(jax.grad(loss, has_aux=True))(1440.0)
     assert np.isfinite(slope)
     assert slope != 0
     assert np.isfinite(lost_at) == (guard is None)

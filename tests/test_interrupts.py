@@ -59,7 +59,7 @@ CASES = {
     ),
     "what is kept cannot be told": (
         "with exit_on_interrupt('p'), reporting(lambda: 1 / 0):\n interrupt()\n ever()",
-        "p: interrupted; what is kept is not known (ZeroDivisionError).\n",
+        "p: interrupted; it is not known which results are kept (ZeroDivisionError).\n",
     ),
     "a name of no alphabet": (
         "with exit_on_interrupt('p'), reporting(lambda: '\\udcff'):\n interrupt()\n ever()",

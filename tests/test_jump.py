@@ -10,8 +10,8 @@ from scipy.linalg import expm
 
 from ambjax import RK4, AdaptiveRodas3, Clock
 from ambjax.extend import canonical, leaf, record
+from ambjax.simulation.folds import Driven
 from ambjax.simulation.integrate import InitialValueProblem, in_turn
-from ambjax.simulation.metrics import Driven
 from ambjax.simulation.rollout import roll
 from ambjax.simulation.span import Instant
 from ambjax.simulation.trajectory import ALIVE, TOUCHED
@@ -160,7 +160,7 @@ def test_derivatives_go_through_jumps_and_stretches():
     def end(delay):
         return run(Sampled(delay=delay), RK4(4)).trajectory.rows.x[-1]
 
-    forward, reverse = jax.jacfwd(end)(0.3), jax.grad(end)(0.3)
+    forward, reverse = jax.jit(jax.jacfwd(end))(0.3), jax.jit(jax.grad(end))(0.3)
     assert float(forward) == pytest.approx(float(reverse), rel=1e-9)
     h = 1e-5
     difference = (float(end(0.3 + h)) - float(end(0.3 - h))) / (2 * h)

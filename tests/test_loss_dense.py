@@ -9,7 +9,7 @@ from oracle import World
 from test_oracle import Case, adaptive, current, in_ambjax, noise_of, pulse, sine, smc
 
 from ambjax import AdaptiveRodas3, Clock, Sensor, rollout
-from ambjax.simulation.metrics import Named
+from ambjax.simulation.folds import Named
 from tuning.objective.limits import Limit, measures
 from tuning.objective.loss import Loss
 

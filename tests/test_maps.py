@@ -14,7 +14,7 @@ from ambjax.ensemble import Normal, Spread, maps, wilson
 from ambjax.ensemble.maps import PERIOD, Axis, grid, stepped
 from ambjax.ensemble.store import MANIFEST
 from ambjax.ensemble.study import Study
-from ambjax.simulation.metrics import Peak
+from ambjax.simulation.folds import Peak
 
 PLANT = Plant()
 CURRENT = float(PLANT.equilibrium(0.0)[0])
@@ -126,7 +126,7 @@ X, Y = "initial.z=-1e-5:1e-5:3", "initial.z_dot=-1e-3:1e-3:3"
         ("initial.z=0:1e-5:5:log", Y, "must begin above 0"),
         ("initial.z=-10%:10%", Y, "per cent need a number other than 0"),
         ("initial.zz=0:1e-5", Y, "Did you mean 'initial.z'"),
-        (X, X, "it is the quantity of --x too"),
+        (X, X, "--x has the same quantity"),
         ("plant.m=-120%:10%", Y, "from 1e-06"),
         ("sensor.std=0:1e-6", Y, "no sensor noise"),
         ("run.clearance=1e-3:5e-2:3", Y, "--x run.clearance=0.001:0.05: run.clearance reaches 0.05 m, but must stay"),

@@ -11,9 +11,10 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from ambjax import Cascade, Clock, Plant, Scenario, Sensor, Sine, rollout
 from ambjax.cases.reader import case_from
-from ambjax.control import inversion, observer
+from ambjax.control import inversion
 from ambjax.control.cascade import Sample
-from ambjax.control.inversion import Held
+from ambjax.control.exact import WIDTH
+from ambjax.control.inversion import StaticInversionState
 from ambjax.control.observer import IRED1, IRED2, Complementary, Difference, Direct, Kalman, Predicted
 from ambjax.control.processor import Processor
 from ambjax.numerics import differentiator
@@ -262,7 +263,7 @@ def test_order_towards_continuous_time(law, order):
 def test_the_differentiators_in_continuous_time(law):
     """Exact but for the width of the smoothed sign, (width/L)^(1/(m+1)) seconds late or so."""
     order = 1 if isinstance(law, IRED1) else 2
-    late = (observer.WIDTH * MODEL.s_0 / law.L) ** (1 / (order + 1))
+    late = (WIDTH * MODEL.s_0 / law.L) ** (1 / (order + 1))
     assert law.slope(MODEL) == pytest.approx(differentiator.LAM[order][0] / late)
 
     def rates(t, x):
@@ -305,7 +306,7 @@ def test_an_estimate_that_is_right_gives_the_command_of_a_measured_velocity(law,
         if law != Direct():
             state = state._replace(observer=right(law, z, z_dot, sampled))
         if sampled and isinstance(law_i, inversion.ClosedForm):  # no first sample, which has no rate
-            state = state._replace(inversion=Held(jnp.asarray(0.01), jnp.asarray(1.0)))
+            state = state._replace(inversion=StaticInversionState(jnp.asarray(0.01), jnp.asarray(1.0)))
         if sampled:
             past = (jnp.asarray(40.0), jnp.asarray(-20.0))
             return cascade.step(measured, state, Sample(reference, T, jnp.asarray(200.0), past))[0]

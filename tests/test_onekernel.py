@@ -24,8 +24,8 @@ from ambjax import (
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
 from ambjax.ensemble.gpu_kernel import run_whole
-from ambjax.simulation.metrics import Named, Peak, Variation
-from ambjax.world.signals import BandNoise
+from ambjax.simulation.folds import Named, Peak, Variation
+from ambjax.world.band_noise import BandNoise
 
 MEMBERS, CLOCK = 37, Clock(5, 1e-4, RK4(2))
 CASCADE = Cascade(inversion=inversion.Adaptive(np.linspace(1e8, 1e9, MEMBERS), 25e-6))

@@ -11,7 +11,7 @@ from matplotlib.image import imread
 
 from ambjax import AdaptiveRodas3, paper, rollout
 from ambjax.__main__ import main
-from ambjax.paper import claims
+from ambjax.paper import claims, findings
 from ambjax.paper.evidence import NOISE_STDS, STEPS, Evidence, Noise, Run, Survival, Uncertain, held
 from ambjax.paper.ledger import judge, markdown, noise_table, processor_table
 from ambjax.simulation.trajectory import STALLED, Row, Trajectory
@@ -48,15 +48,15 @@ def test_verdicts_follow_the_evidence():
         return types.SimpleNamespace(tracking=run, check_tracking=types.SimpleNamespace(conditions=[condition]))
 
     judge = judges["Tracking: largest error 2.3e-5 m"]
-    assert judge(tracking(2.3e-5)).verdict == claims.HOLDS
-    assert judge(tracking(2.4e-5)).verdict == claims.FAILS
+    assert judge(tracking(2.3e-5)).verdict == findings.HOLDS
+    assert judge(tracking(2.4e-5)).verdict == findings.FAILS
     lost = judge(tracking(1e-6, lost=True))
-    assert lost.verdict == claims.FAILS
+    assert lost.verdict == findings.FAILS
     assert "gamma = 1000 < Delta_1 = 6e+04" in lost.cause
 
     judge = judges["All this under sensor noise of variance 1e-7"]
     levels = len(NOISE_STDS)
-    for scans, verdict in (([levels, levels], claims.HOLDS), ([3, 3], claims.FAILS), ([levels, 3], claims.OPEN)):
+    for scans, verdict in (([levels, levels], findings.HOLDS), ([3, 3], findings.FAILS), ([levels, 3], findings.OPEN)):
         assert judge(types.SimpleNamespace(noise=[noise(n) for n in scans])).verdict == verdict
 
 
@@ -75,8 +75,8 @@ def test_a_stall_is_neither_held_nor_lost():
     )
     (rows, scans, sampled) = judge({"x": evidence}), noise_table({"x": evidence}), processor_table({"x": evidence})
     verdicts = {row["says"]: row["findings"]["x"]["verdict"] for row in rows}
-    others = {"The noise is about 20 % of the gap": claims.HOLDS, "The noise is specified": claims.OPEN}
-    assert verdicts == dict.fromkeys(verdicts, claims.UNDECIDED) | others
+    others = {"The noise is about 20 % of the gap": findings.HOLDS, "The noise is specified": findings.OPEN}
+    assert verdicts == dict.fromkeys(verdicts, findings.UNDECIDED) | others
     page = markdown(rows, scans, sampled)
     assert "not decided: stalled at 10 ms" in page
     assert "| none, not decided at 1.0e-08 m |" in page
@@ -87,7 +87,7 @@ def test_a_stall_is_neither_held_nor_lost():
     )
     judges = {c.says: c.judge(lost).verdict for c in claims.CLAIMS}
     for says in ("The origin is uniformly asymptotically stable", "Accurate and robust positioning"):
-        assert judges[says] == claims.FAILS
+        assert judges[says] == findings.FAILS
 
 
 def test_what_is_held_ends_where_it_is_lost_or_not_known():
@@ -111,18 +111,18 @@ def test_reproduce(tmp_path, monkeypatch):
     found = {c["says"]: c["findings"] for c in written["claims"]}
     assert len(found) == len(claims.CLAIMS)
     verdicts = {f["verdict"] for both in found.values() for f in both.values()}
-    assert verdicts <= {claims.HOLDS, claims.FAILS, claims.OPEN}  # nothing stalls
+    assert verdicts <= {findings.HOLDS, findings.FAILS, findings.OPEN}  # nothing stalls
     error = found["Tracking: largest error 2.3e-5 m"]["repaired"]
-    assert error["verdict"] == claims.HOLDS
+    assert error["verdict"] == findings.HOLDS
     assert 2.2e-5 < error["value"] < 2.4e-5
     assert found["Regulation is insensitive to the pulse"]["repaired"]["value"] == pytest.approx(2.08e-5, rel=0.01)
-    assert found["Theorem 1's conditions hold under Table 2"]["literal"]["verdict"] == claims.FAILS
+    assert found["Theorem 1's conditions hold under Table 2"]["literal"]["verdict"] == findings.FAILS
     assert found["Tracking: largest error 2.3e-5 m"]["literal"]["value"] is None
     # the tuned gains hold the rotor in the paper's noise, at less than half the error that the paper claims
     error = found["Tracking: largest error 2.3e-5 m"]["tuned"]
-    assert error["verdict"] == claims.HOLDS
+    assert error["verdict"] == findings.HOLDS
     assert error["value"] < 1e-5
-    assert found["All this under sensor noise of variance 1e-7"]["tuned"]["verdict"] == claims.HOLDS
+    assert found["All this under sensor noise of variance 1e-7"]["tuned"]["verdict"] == findings.HOLDS
     # on the processor
     told = {(row["reading"], row["noise"]): row for row in written["processor"]}
     assert set(told) == {(one, True) for one in paper.READINGS} | {("literal", False), ("repaired", False)}
@@ -130,7 +130,7 @@ def test_reproduce(tmp_path, monkeypatch):
     assert told["repaired", False]["lost_at_s"] is None
     assert told["repaired", True]["lost_at_s"] < 0.02
     ours = found["Tracking: largest error 2.3e-5 m"]["sampled"]
-    assert ours["verdict"] == claims.HOLDS
+    assert ours["verdict"] == findings.HOLDS
     assert (
         told["sampled", True]["settled_max_abs_error_m"]
         == ours["value"]

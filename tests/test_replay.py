@@ -20,13 +20,14 @@ from texts import write
 from ambjax.__main__ import main, parser
 from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.rig import RIG
-from ambjax.commands import ensemble as studies
 from ambjax.commands import simulate as simulating
+from ambjax.commands import study_report
 from ambjax.ensemble import replay as replaying
 from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
-from ambjax.simulation.metrics import Named, Variation, standard_for
+from ambjax.simulation.folds import Named, Variation
+from ambjax.simulation.metrics import standard_for
 from tuning.__main__ import parser as tuner
 
 # 16 kHz, converters of 14 bits, a Kalman observer, signs without a layer, a plant off by up to 10 %.
@@ -60,7 +61,7 @@ def study_of(text, members=MEMBERS):
 
 def no_pictures(patch):
     """Drawing takes longer than these runs."""
-    patch.setattr(studies, "_pictures", lambda *_: None)
+    patch.setattr(study_report, "_pictures", lambda *_: None)
     patch.setattr("ambjax.pictures.overview.overview", lambda *_: None)
 
 

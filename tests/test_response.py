@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax.simulation.metrics import Ending
+from ambjax.simulation.folds import Ending
 from ambjax.simulation.response import Overshoot, Settling
 
 PERIOD, SAMPLES = 1e-3, 3000

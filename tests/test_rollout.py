@@ -31,8 +31,8 @@ from ambjax.compiler import fast_path
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.numerics.records import record, static
 from ambjax.simulation.explicit import Euler
+from ambjax.simulation.folds import Driven, Lowest, Named, Peak, Reaching, Rms, Variation
 from ambjax.simulation.loop import SHOWN
-from ambjax.simulation.metrics import Driven, Lowest, Named, Peak, Reaching, Rms, Variation
 from ambjax.simulation.span import blank
 from ambjax.simulation.trajectory import DIVERGED, TOUCHED, Row
 
@@ -439,6 +439,7 @@ np.savez(sys.argv[1], **out)
 """
 
 
+@pytest.mark.slow
 def test_float32_is_within_20_nm_of_float64(tracking, tmp_path):
     path = tmp_path / "single.npz"
     subprocess.run(

@@ -11,7 +11,7 @@ import ambjax as amb
 from ambjax.cases.reader import KINDS
 from ambjax.control.base import default_law
 from ambjax.control.processor import Processor
-from ambjax.simulation.metrics import Rms
+from ambjax.simulation.folds import Rms
 from tuning.space import Gain, Space, tunable
 
 # Three decades up and down of the law's own gains.

@@ -215,8 +215,16 @@ CONFIGURATIONS = {
     # the steep one stands for the set-valued one, which it nears with 1/p
     "super-twisting, set-valued": {"position": twisting(k_1=4.0, p=1e5), "discretisation": "implicit"},
 }
+FAST = {
+    ("direct", "implicit"),
+    ("half a sample", "explicit"),
+    ("complementary", "implicit"),
+    ("closed form", "explicit"),
+    ("super-twisting, set-valued", "implicit"),
+    ("limited supply, pi", "explicit"),
+}
 ORDERS = [
-    (name, discretisation)
+    pytest.param(name, discretisation, marks=() if (name, discretisation) in FAST else pytest.mark.slow)
     for name, options in CONFIGURATIONS.items()
     for discretisation in ("implicit", "explicit")
     if options.get("discretisation", discretisation) == discretisation
@@ -341,6 +349,7 @@ def repaired(rate, **options):
     return settled_rms(simulate(World(period=1 / rate, reference=SINE, q_v=PULSE, **options), rate + 1, fast=True))
 
 
+@pytest.mark.slow
 def test_known_errors_of_the_repaired_gains(monkeypatch):
     """As another simulator found them, to its two digits; the position law explicit, the others implicit."""
     explicit = {"discretisation": "explicit", "delay": 0.0}

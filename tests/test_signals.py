@@ -25,7 +25,8 @@ from ambjax import (
     rollout,
 )
 from ambjax.theorem.conditions import check
-from ambjax.world.signals import LINES, reference_at
+from ambjax.world.band_noise import LINES
+from ambjax.world.signals import reference_at
 
 T = np.array([0.0, 0.013, 0.1, 0.2501, 0.77, 3.0])
 W = 2 * np.pi * 2.0

@@ -25,9 +25,9 @@ from ambjax import (
 )
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.ensemble import run_ensemble
-from ambjax.numerics.relaxation import _implicit, relaxation
+from ambjax.numerics.relax import _backward_euler, relaxation
 from ambjax.numerics.smooth import smooth_sign
-from ambjax.simulation.metrics import Rms
+from ambjax.simulation.folds import Rms
 from ambjax.simulation.sliding import _phi
 
 TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.01, 0.02), u_max=200.0)
@@ -45,7 +45,7 @@ def cascade(c, k, gamma, k_i, p=25.0, **more):
 def test_the_implicit_sign_is_solved():
     b = jnp.asarray(np.concatenate([-np.geomspace(1e-9, 1e4, 200), [0.0], np.geomspace(1e-9, 1e4, 200)]))
     for reach in (1e-6, 1e-2, 1.0, 166.0, 1e5):
-        w = _implicit(b, reach, 25.0)
+        w = _backward_euler(b, reach, 25.0)
         # Newton's last step, relative to the larger of both terms
         assert np.max(np.abs(w + reach * smooth_sign(w, 25.0) - b) / (np.abs(b) + 1e-12)) < 1e-3
 

@@ -202,8 +202,8 @@ def test_the_interval_has_no_end_where_resamples_say_nothing():
         assert np.all(moments.low <= moments.value)
         assert moments.high[0] == np.inf  # one resample in nine is one value thrice
     assert summary(columns(201), [], seed=0)["notes"] == [  # two of whom do not survive
-        "the mean of the worst 5 % rests on 9.95 survivors: its 95 % interval may cover less, or have no upper end; "
-        "it needs 200"
+        "the mean of the worst 5 % is that of 9.95 survivors: its 95 % interval may cover less, or have no upper end; "
+        "at least 200 survivors are needed"
     ]
     assert summary(columns(202), [], seed=0)["notes"] == []
 

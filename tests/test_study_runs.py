@@ -16,9 +16,9 @@ from texts import write
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
 from ambjax.commands import ensemble as studies
-from ambjax.commands import pace
+from ambjax.commands import pace, study_report, workers
 from ambjax.ensemble import statistics, worker
-from ambjax.simulation.integrate import Slide
+from ambjax.simulation.sliding import Slide
 
 CASE = """
 [controller.inversion]
@@ -44,8 +44,8 @@ plant.m = {{ percent = 10 }}
 initial.z = {{ normal = 1e-6 }}
 """
 TINY = CASE.format(duration="2e-3")
-# Some 0.1 s for each chunk, so that something can happen in the middle of a run.
-LONGER, MEMBERS, CHUNKS = CASE.format(duration="0.2"), 1536, 48
+# Some 50 ms for each chunk, so that something can happen in the middle of a run.
+LONGER, MEMBERS, CHUNKS = CASE.format(duration="0.1"), 1536, 48
 RUN = ["ensemble", "case.toml", "--members", str(MEMBERS), "--chunk", "32", "--seed", "3"]
 
 
@@ -55,7 +55,7 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Drawing takes longer than these studies."""
-    monkeypatch.setattr(studies, "_pictures", lambda *_: None)
+    monkeypatch.setattr(study_report, "_pictures", lambda *_: None)
 
 
 # Ctrl-C is heard even if the tests run in the background of a shell, which has its children ignore it.
@@ -111,7 +111,7 @@ def test_processes_give_the_same_file(capsys, monkeypatch):
     # a chunk is several calls of the compiled program, and the last one is no whole chunk
     argv = ["ensemble", "case.toml", "--members", "200", "--chunk", "128", "--seed", "3"]
     with monkeypatch.context() as hasty:
-        hasty.setattr(studies, "_pictures", lambda *_: None)
+        hasty.setattr(study_report, "_pictures", lambda *_: None)
         assert main([*argv, "--out", "here"]) == 0
     assert main([*argv, "--out", "there", "--processes", "2"]) == 0
     assert result("here") == result("there")
@@ -247,7 +247,7 @@ def test_a_finished_study_is_not_run_again(no_pictures, monkeypatch, capsys):
     assert main(argv) == 0
     first, members = capsys.readouterr().out, result("out")
     pathlib.Path("out", "chunks").mkdir()  # as a kill in the last moment leaves it
-    monkeypatch.setattr(studies, "_run", None)
+    monkeypatch.setattr(studies, "compute", None)
     assert main([*argv, "--resume"]) == 0
     assert json.loads(capsys.readouterr().out) == json.loads(first)
     assert result("out") == members
@@ -269,7 +269,7 @@ def test_what_was_damaged_is_computed_again_with_a_line(no_pictures, capsys):
     (out / "members.npz").write_bytes(result("whole")[:-100])
     assert main([*argv, "--out", "out", "--resume"]) == 0
     said = [line for line in capsys.readouterr().err.splitlines() if "computed again" in line]
-    assert said == ["out/members.npz: its checksum is wrong; what is not in out/chunks is computed again"]
+    assert said == ["out/members.npz: its checksum is wrong; members that are not in out/chunks are computed again"]
     assert result("out") == result("whole")
 
 
@@ -291,8 +291,11 @@ def test_a_chunk_damaged_after_a_kill_is_computed_again(no_pictures, capsys):
         watch.setattr(studies.Store, "put", lambda store, span, columns: (seen.append(span), put(store, span, columns)))
         assert main([*RUN[:4], *RUN[6:], "--out", "out", "--resume"]) == 0  # the chunk is the directory's
     err = capsys.readouterr().err
-    assert f"{kept[1]}: it belongs elsewhere: first is 0 there and 32 here; members 32 to 63 are computed again" in err
-    assert f"{kept[3]}: it is not a whole archive; members 96 to 127 are computed again" in err
+    assert (
+        f"{kept[1]}: it is of another chunk or study: first is 0 in the file and 32 in this run; members 32 to 63 are "
+        "computed again" in err
+    )
+    assert f"{kept[3]}: it is an incomplete archive; members 96 to 127 are computed again" in err
     assert {(32, 64), (96, 128)} <= set(seen)
     assert len(seen) == CHUNKS - len(stamps) + 2
     assert result("out") == result("whole")
@@ -319,9 +322,9 @@ def test_a_long_run_is_announced_and_the_faster_step_named(capsys):
         ("sliding", "about 13 min for 2,000 members (2.6 a second)\n"),
     ):
         study = studies.study_of(read_case(write(TINY.replace("dt = 5e-5", f'method = "{name}"'))), 1, 2000)
-        pace.say_how_long(study, pace.Pace(2.6, None))
+        pace.print_estimate(study, pace.Pace(2.6, None))
         assert words in capsys.readouterr().err
-    pace.say_how_long(studies.study_of(case, 1, 2000), pace.Pace(2000.0, None))
+    pace.print_estimate(studies.study_of(case, 1, 2000), pace.Pace(2000.0, None))
     assert capsys.readouterr().err == ""
     assert [pace.duration(s) for s in (5.0, 100, 119, 770, 7000, 9000, 90000)] == [
         "5 s", "100 s", "119 s", "13 min", "117 min", "2.5 h", "25 h",
@@ -353,7 +356,7 @@ def test_the_command_takes_chunks_and_first_members_from_the_pilot(no_pictures, 
 
     monkeypatch.setattr(pace, "cores", lambda: 2)
     monkeypatch.setattr(studies, "pilot", pilot)
-    monkeypatch.setattr(studies, "chunk", chunk)
+    monkeypatch.setattr(workers, "chunk", chunk)
     assert main(["ensemble", write(TINY), "--members", "300", "--out", "out"]) in (0, 1)
     assert "about 10 s for 300 members (30 a second)" in capsys.readouterr().err
     assert json.loads(pathlib.Path("out/study.json").read_text())["chunk"] == 128
@@ -403,12 +406,12 @@ def test_stalled_members_are_told_apart(capsys):
     columns |= {"stalled": np.arange(10) < 2}
     columns["lost"][5] = True
     columns["lost_at"][[0, 1, 5]] = 0.1
-    for name in studies.METRICS:
+    for name in study_report.METRICS:
         columns[name] = np.linspace(0, 1, 10)
     summary = statistics.summary(columns, [], 1)
     summary["worst"][0]["replay"] = "ambjax simulate"
     assert (summary["survivors"], summary["lost"], summary["stalled"]) == (7, 1, 2)
-    lines = studies._text(summary).splitlines()
+    lines = study_report.text(summary).splitlines()
     assert lines[0].startswith("7 of 10 members survive: ")
     assert lines[1].startswith("1 lost, 2 not decided")
 
@@ -475,7 +478,7 @@ def test_an_absent_cluster_is_one_clear_line(monkeypatch, capsys):
         without.setitem(sys.modules, "distributed", None)
         assert "pip install 'ambjax[cluster]'" in refused(argv, capsys)
     pytest.importorskip("distributed")
-    monkeypatch.setattr(studies, "PATIENCE", "0.5s")
+    monkeypatch.setattr(workers, "PATIENCE", "0.5s")
     assert "--cluster tcp://127.0.0.1:9: no scheduler answers there" in refused(argv, capsys)
     assert "--cluster nonsense://x: " in refused([*argv[:-1], "nonsense://x"], capsys)
 
@@ -485,7 +488,7 @@ def test_another_study_is_refused_and_left_alone(no_pictures, capsys):
     argv = ["ensemble", "case.toml", "--members", "9", "--out", "out"]
     assert main(argv) == 0
     capsys.readouterr()
-    assert "--out out: it holds a study already. Add --resume" in refused(argv, capsys)
+    assert "--out out: it already holds a study. Add --resume" in refused(argv, capsys)
     for key, other in (("seed", ["--seed", "5"]), ("members", ["--members", "8"]), ("chunk", ["--chunk", "4"])):
         assert f"another study: {key} is " in refused([*argv, *other, "--resume"], capsys)
     write(TINY.replace("percent = 10", "percent = 9"))

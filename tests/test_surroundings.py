@@ -23,7 +23,7 @@ from ambjax.__main__ import answer, main, parser
 from ambjax.commands import ensemble, outputs, reproduce, simulate
 from ambjax.ensemble import worker
 from ambjax.host import interrupts
-from ambjax.host.lock import LOCK, alone
+from ambjax.host.lock import LOCK, locked
 from ambjax.host.sealed import write_whole
 from ambjax.host.streams import lenient, open_streams
 from ambjax.pictures import tornado
@@ -135,13 +135,13 @@ def test_a_fault_of_ours_keeps_its_traceback():
 
 def test_one_run_at_a_time():
     here = pathlib.Path()
-    with alone(here):
-        with pytest.raises(ValueError, match="another run is at work there"), alone(here):
+    with locked(here):
+        with pytest.raises(ValueError, match="another run is using this directory"), locked(here):
             pass
         assert os.path.lexists(LOCK)
     assert not os.path.lexists(LOCK)
     pathlib.Path(LOCK).touch()  # as a kill leaves it
-    with alone(here):
+    with locked(here):
         pass
     assert os.listdir() == []  # noqa: PTH208
 
@@ -156,9 +156,9 @@ def test_a_study_whose_folder_is_at_work_is_refused(capsys):
     argv = ["ensemble", write(STUDY), "--members", "2", "--out", "out"]
     out = pathlib.Path("out")
     out.mkdir()
-    with alone(out):
+    with locked(out):
         assert main(argv) == 2
-        assert "--out out: another run is at work there" in capsys.readouterr().err
+        assert "--out out: another run is using this directory" in capsys.readouterr().err
         assert os.listdir(out) == [LOCK]  # noqa: PTH208
 
 
@@ -167,9 +167,9 @@ def test_a_search_whose_folder_is_at_work_is_refused_and_touches_nothing(capsys)
     out.mkdir()
     (out / "checkpoint-1.npz").touch()
     (out / "report.json").touch()
-    with alone(out):
+    with locked(out):
         assert tune([write(STUDY), "--out", "out"]) == 2
-    assert "--out out: another run is at work there" in capsys.readouterr().err
+    assert "--out out: another run is using this directory" in capsys.readouterr().err
     assert (out / "checkpoint-1.npz").exists()
 
 
@@ -179,9 +179,9 @@ def test_a_study_that_another_run_began_meanwhile_is_refused(monkeypatch, capsys
         write("{}", "out/study.json")
         yield
 
-    monkeypatch.setattr(ensemble, "alone", late)
+    monkeypatch.setattr(ensemble, "locked", late)
     assert main(["ensemble", write(STUDY), "--members", "2", "--out", "out"]) == 2
-    assert "it holds a study already" in capsys.readouterr().err
+    assert "it already holds a study" in capsys.readouterr().err
     assert os.listdir("out") == ["study.json"]  # noqa: PTH208
 
 
@@ -211,7 +211,7 @@ def test_a_folder_in_the_place_of_a_file_is_seen_before_the_work(name, monkeypat
     monkeypatch.setattr(simulate, "simulate", None)
     pathlib.Path("out", name).mkdir(parents=True)
     assert main(["simulate", write(SHORT), "--out", "out"]) == 2
-    assert f"--out out: {name} is a folder there. Move it, or choose" in capsys.readouterr().err
+    assert f"--out out: {name} exists and is a folder. Move it, or choose" in capsys.readouterr().err
 
 
 def test_files_move_all_or_not_at_all(monkeypatch):
@@ -227,7 +227,7 @@ def test_files_move_all_or_not_at_all(monkeypatch):
                 (part / name / "c").parent.mkdir()
                 (part / name / "c").write_text("new")
 
-    for obstacle, words in (("b/c/", "b/c is a folder"), ("b", "b is there already and is not a folder")):
+    for obstacle, words in (("b/c/", "b/c exists and is a folder"), ("b", "b exists and is not a folder")):
         if obstacle.endswith("/"):
             pathlib.Path(obstacle).mkdir(parents=True)
         else:

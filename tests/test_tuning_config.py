@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 from texts import case_and_tune
 
-from tuning.config import LIMIT, NUMBERS, SHARES, WEIGHT, Budget
-from tuning.objective.limits import KINDS
+from ambjax.cases.tune_table import NUMBERS, WEIGHTS, Budget
+from tuning.config import LIMIT, SHARES
 from tuning.objective.loss import TERMS
+from tuning.objective.quantities import KINDS
 
 
 def parsed(tune):
     return case_and_tune({"sensor": {"std": 1e-6}, "tune": tune})[1]
 
 
-ENDS = NUMBERS | {f"weights.{name}": WEIGHT for name in [*TERMS, "conditions"]}
+ENDS = NUMBERS | {f"weights.{name}": WEIGHTS[name] for name in [*TERMS, "conditions"]}
 ENDS |= {f"limits.{name}": SHARES.get(name, LIMIT) for name in [*KINDS, "survival"]}
 
 

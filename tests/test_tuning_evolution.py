@@ -86,7 +86,7 @@ def test_a_minimum_is_found_where_derivatives_lead_elsewhere(monkeypatch, tmp_pa
 
 def test_three_limits_are_kept_where_derivatives_lead_elsewhere(monkeypatch, tmp_path):
     answer, (c, k) = found(monkeypatch, tmp_path, World(chaos=1e30), limits=LIMITS)
-    limits = {limit.name: limit for limit in answer.problem.goal.limits}
+    limits = {limit.name: limit for limit in answer.problem.limits}
     assert set(limits) == set(LIMITS) - {"margin"}
     assert 29.0 < k <= 30.0 * math.exp(0.001)  # at most half of the margin beyond, and 10 V is at 30
     assert c == pytest.approx(100.0, rel=0.1)

@@ -1,6 +1,7 @@
 """Limits: how they are asked for and measured, that the search keeps them, what they cost, and what is said of it."""
 
 import argparse
+import dataclasses
 import math
 import tomllib
 
@@ -14,10 +15,14 @@ from tomlkit import dumps
 
 import tuning.command
 from ambjax import rollout
-from ambjax.simulation.metrics import Named, standard_for
+from ambjax.numerics.records import is_traced
+from ambjax.simulation.folds import Named
+from ambjax.simulation.metrics import standard_for
 from tuning.config import LimitSettings, settings
 from tuning.objective.lanes import Engine
-from tuning.objective.limits import KINDS, PENALTY, Limit, largest, measures
+from tuning.objective.limits import PENALTY, Limit, measures
+from tuning.objective.quantities import KINDS, largest
+from tuning.objective.risk import Mean
 from tuning.problem import REFINEMENT, problem_of
 from tuning.report.limit_table import MORE
 from tuning.report.pictures import amplitudes
@@ -47,18 +52,18 @@ def test_a_supply_keeps_room_unless_it_is_told_not_to():
     supply = {"actuator": {"u_max": 200.0}}
     assert asked({}).each == ()
     (default,) = asked({}, **supply).each
-    assert (default.name, default.asked) == ("rms_u_V", 120.0)
+    assert (default.name, default.threshold) == ("rms_u_V", 120.0)
     assert "60 %" in default.source
     assert asked({"rms_u_V": math.inf}, **supply).each == ()
     (given,) = asked({"rms_u_V": 150}, **supply).each
-    assert (given.asked, given.source) == (150.0, "tune.limits")
+    assert (given.threshold, given.source) == (150.0, "tune.limits")
 
 
 def test_limits_are_in_order_and_in_the_fingerprint():
     each = asked({"settling_s": 0.1, "max_u_V": 50.0, "margin": 0.1}).each
     assert [(one.name, one.margin) for one in each] == [("max_u_V", 0.1), ("settling_s", 0.1)]
     tune = case_and_tune({"tune": {"limits": {"max_u_V": 50.0, "survival": 0.99}}})[1]
-    assert settings(tune)["limits"] == {"max_u_V": {"asked": 50.0, "margin": KINDS["max_u_V"].margin}}
+    assert settings(tune)["limits"] == {"max_u_V": {"threshold": 50.0, "margin": KINDS["max_u_V"].margin}}
     assert settings(tune)["survival"] == 0.99
     assert asked({"settling_s": 0.1}).band == pytest.approx(45e-6)  # 1 % of 4.5 mm
 
@@ -141,7 +146,7 @@ clearance_used = 0.6
 def test_the_search_measures_what_the_judge_does():
     made = problem_from(SAMPLED)
     case = made.case
-    folds = measures(made.goal.limits, case.scenario, case.clock, case.settle, 45e-6)
+    folds = measures(made.limits, case.scenario, case.clock, case.settle, 45e-6)
     fold = Named({"ours": Named(folds), "theirs": standard_for(case.settle, case.scenario)})
     both = rollout(case.cascade, case.scenario, case.clock, fold=fold, every=0).measured
     ours, theirs = ({name: float(value) for name, value in both[part].items()} for part in ("ours", "theirs"))
@@ -192,19 +197,43 @@ def test_the_largest_over_members_is_smooth_and_no_less():
 
 def test_the_pull_is_that_of_an_augmented_lagrangian():
     limit, values = Limit("rms_u_V", 10.0), jnp.full(3, 10.0 * math.exp(0.1))
-    assert float(limit.pull(values)) == pytest.approx(PENALTY * 0.1**2 / 2)
-    assert float(limit.pull(0.5 * values)) == 0.0
+    assert float(limit.term(values)) == pytest.approx(PENALTY * 0.1**2 / 2)
+    assert float(limit.term(0.5 * values)) == 0.0
     # the multiplier is the force that acted at the optimum, which the search's own number makes
     assert limit.updated(10.0 * math.exp(0.05), 10.0 * math.exp(0.1)).multiplier == pytest.approx(PENALTY * 0.05)
     told = limit.updated(10.0, 10.0 * math.exp(0.1))
     assert told.multiplier == pytest.approx(0.0)
     # the judge finds 10 % more than the search: from now on the search counts as he does
-    assert float(told.excess(jnp.full(3, 10.0))) == pytest.approx(0.1)
+    assert float(told.term.excess(jnp.full(3, 10.0))) == pytest.approx(0.1)
     assert told.penalty == PENALTY
     again = told.updated(9.9, 10.0 * math.exp(0.09))  # hardly less: it must be steeper
     assert again.multiplier == pytest.approx(PENALTY * (0.1 + math.log(0.99)))
     assert again.penalty > PENALTY
     assert limit.updated(5.0, 5.0).multiplier == 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Counting(Mean):
+    """The mean, counting how often it is traced."""
+
+    traces = 0
+
+    def __call__(self, losses):
+        Counting.traces += is_traced(losses)
+        return super().__call__(losses)
+
+
+def test_other_limits_do_not_trace_the_step_again(monkeypatch, tmp_path):
+    """Two tunings, each of several searches with multipliers of their own."""
+    counts = []
+    for volts in (10.0, 11.0):
+        made = study(monkeypatch, World(), limits={"rms_u_V": volts, "margin": 0.002})
+        made = dataclasses.replace(made, goal=dataclasses.replace(made.goal, risk=Counting()))
+        start, folder = made.tune.space.values(made.case.cascade), tmp_path / f"{volts:g}"
+        folder.mkdir()
+        assert rounds(made, start, folder, {}, False).problem.limits[0].multiplier > 0
+        counts.append(Counting.traces)
+    assert counts == [1, 1]
 
 
 # --- that they are kept, and what they cost ---
@@ -214,7 +243,7 @@ def test_a_limit_is_met_and_its_multiplier_is_the_price(monkeypatch, tmp_path):
     answer, (c, k) = found(monkeypatch, tmp_path, **TEN)
     assert k == pytest.approx(30.0, rel=0.012)  # as near as an active limit is met, 1 %
     assert c == pytest.approx(100.0, rel=0.05)
-    (limit,) = answer.problem.goal.limits
+    (limit,) = answer.problem.limits
     y = math.log(0.5)  # the error goes as 1 + y^2, y = log(k / 60), and k as the limit
     assert limit.multiplier == pytest.approx(-2 * y / (1 + y**2), rel=0.1)
     # against a problem whose limit is 10 % looser
@@ -264,7 +293,7 @@ def test_a_limited_study_that_is_resumed_ends_alike(monkeypatch, tmp_path):
     whole = rounds(made, start, tmp_path, {"of": "ten"}, False)
     again = rounds(study(monkeypatch, World(), **TEN), start, tmp_path, {"of": "ten"}, True)
     np.testing.assert_array_equal(again.x, whole.x)
-    assert again.problem.goal.limits == whole.problem.goal.limits
+    assert again.problem.limits == whole.problem.limits
 
 
 # --- the command ---
@@ -283,7 +312,7 @@ def test_the_command_says_what_a_limit_costs(monkeypatch, tmp_path):
     code, summary, out = command(monkeypatch, tmp_path, limits={"rms_u_V": 10.0})
     assert code == 0
     row, survival = summary["limits"]
-    assert (row["name"], row["asked"], row["held"], row["active"]) == ("rms_u_V", 10.0, True, True)
+    assert (row["name"], row["threshold"], row["held"], row["active"]) == ("rms_u_V", 10.0, True, True)
     assert row["reached"] == pytest.approx(summary["after"]["settled_rms_u_V.mean"])
     assert row["price_m"] > 0
     assert (survival["reached"], survival["held"]) == (1.0, True)

@@ -7,10 +7,12 @@ import math
 import re
 import shutil
 import subprocess
+import types
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bowl import World, instead_of_engines
 from texts import problem_from
 
 from ambjax import rollout
@@ -22,8 +24,9 @@ from tuning.config import seeds
 from tuning.judge import judge
 from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS, weigh
-from tuning.report import accurate, breakdown, extras, gradient, pictures
+from tuning.report import accurate, breakdown, extras, gradient, held_out, pictures
 from tuning.report import document as report
+from tuning.report.facts import SHOWN
 from tuning.report.page import literal, page
 from tuning.search.explore import REACH, Slices, slices
 from tuning.search.rounds import training
@@ -73,12 +76,13 @@ def x(study):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """The folder of a whole run of the command; the case's name is an attack on its readers."""
+    """The folder of a whole run of the command, its engine a Bowl; the case's name is an attack on its readers."""
     folder = tmp_path_factory.mktemp("written")
     path = folder / "<img src=x onerror=alert(1)> a|b *c* [d](e).toml"
     path.write_text(CASE, encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder.parent / "cache"))
+        instead_of_engines(patch, World())
         assert main([str(path), "--out", str(folder / "out"), "--pareto"]) in (0, 1)
     return folder / "out"
 
@@ -148,7 +152,7 @@ def test_what_was_minimised_is_the_goal(conditions):
     assert math.log(parts["total"]) == pytest.approx(goal, rel=1e-9)
     whole = (parts["risk"] + parts["held"]) * parts["penalty"] * parts["limits"]
     assert parts["total"] == pytest.approx(whole, rel=1e-12)
-    assert (parts["ordinary"], parts["asked_to_be_held"]) == (4, 2)
+    assert (parts["ordinary"], parts["survival_only"]) == (4, 2)
     assert (parts["penalty"] > 1) == (conditions > 0)
 
 
@@ -167,13 +171,13 @@ def test_the_lowest_point_of_slices_loses_no_more():
 
 
 def test_a_lower_point_beside_the_answer_is_said():
-    facts = {"beside": {"path": "controller.position.c", "gain": 12.5, "lower": 0.2}}
-    assert "20 % lower, at controller.position.c = 12.5" in report._lower_point(facts)
-    assert "ended before it went there" in report._lower_point(facts)
-    facts["beside"]["lower"] = 0.005
-    assert "as good as the answer" in report._lower_point(facts)
-    facts["beside"]["lower"] = 0.0
-    assert "No point" in report._lower_point(facts)
+    beside = {"path": "controller.position.c", "gain": 12.5, "lower": 0.2}
+    assert "20 % lower, at controller.position.c = 12.5" in report._lower_point(beside)
+    assert "ended before it went there" in report._lower_point(beside)
+    beside["lower"] = 0.005
+    assert "as good as the answer" in report._lower_point(beside)
+    beside["lower"] = 0.0
+    assert "No point" in report._lower_point(beside)
 
 
 def test_the_picture_begins_at_what_the_table_says_was_minimised(study, x):
@@ -190,11 +194,11 @@ def test_accurate_values_are_those_of_adaptive_rollouts():
     study.__dict__["judging"] = study.engine
     x = study.objective.space.encode(study.tune.space.values(study.case.cascade))
     seed = seeds(study.tune.budget)[2]
-    told = accurate.compared(study, x, seed, 12, report.SHOWN)
-    assert (told["members"], told["held"]) == (accurate.AGAIN, accurate.AGAIN)
+    told = accurate.compared(study, x, seed, 12, SHOWN)
+    assert (told["members"], told["held"]) == (accurate.COMPARED, accurate.COMPARED)
     assert abs(told["metrics"]["settled_rms_error_m"]["relative"]) > 1e-3
     found = []
-    for k in range(accurate.AGAIN):
+    for k in range(accurate.COMPARED):
         one = study.objective.chosen(seed, np.array([k]), 12)
         cascade, scenario = study.objective.world(type(one)(*({p: v[0] for p, v in field.items()} if isinstance(
             field, dict) else field[0] for field in one)))  # fmt: skip
@@ -217,7 +221,7 @@ def test_accurate_steps_against_themselves_are_off_by_nothing(study, x):
     engine = Engine(objective, settle=study.case.settle, lanes=4)
     same = dataclasses.replace(study)
     same.__dict__["judging"] = engine
-    told = accurate.compared(same, x, 5, 3, report.SHOWN)
+    told = accurate.compared(same, x, 5, 3, SHOWN)
     assert told["members"] == 3
     assert {row["relative"] for row in told["metrics"].values()} == {0.0}
     assert told["lost"] == {"report": 0, "accurate": 0}
@@ -229,23 +233,26 @@ def test_what_is_off_by_much_is_marked():
         "metrics": {"a": {"report": 1.04, "accurate": 1.0, "relative": 0.04},
                     "b": {"report": 1.47, "accurate": 1.0, "relative": 0.47}},
     }  # fmt: skip
-    assert report._again(again, "a") == ["1.04", "1", "4 %"]
-    assert report._again(again, "b") == ["1.47", "1", "**47 %**"]
-    assert report._again(again, "c") == ["-"] * 3
-    assert report._statuses(again, "lost") == ["0 of 8", "2 of 8", "-"]
-    assert "In bold: off by more than 5 %" in report._accurate(again)[0]
+    assert held_out._again(again, "a") == ["1.04", "1", "4 %"]
+    assert held_out._again(again, "b") == ["1.47", "1", "**47 %**"]
+    assert held_out._again(again, "c") == ["-"] * 3
+    assert held_out._statuses(again, "lost") == ["0 of 8", "2 of 8", "-"]
+    assert "In bold: off by more than 5 %" in held_out._accurate(again)[0]
     del again["metrics"]["b"]
-    assert "No number is off by more than 5 %" in report._accurate(again)[0]
+    assert "No number is off by more than 5 %" in held_out._accurate(again)[0]
     again["metrics"] = {}
-    assert "nothing in this table is confirmed" in report._accurate(again)[0]
+    assert "nothing in this table is confirmed" in held_out._accurate(again)[0]
 
 
 def test_the_columns_of_accurate_steps_are_in_the_report(written):
     head, *rows = cells((written / "report.md").read_text(), "12 held-out members")
     assert head[3:] == ["after, 8 of them", "by accurate steps", "off by"]
     facts = json.loads((written / "report.json").read_text())
-    for row in rows[: len(report.SHOWN)]:
-        told = facts["accurate"]["metrics"][row[0].strip("`")]
+    metrics = facts["accurate"]["metrics"]
+    rows = [row for row in rows if row[0].strip("`") in metrics]
+    assert len(rows) == len(metrics) > 3
+    for row in rows:
+        told = metrics[row[0].strip("`")]
         assert float(row[4]) == pytest.approx(told["accurate"], rel=1e-3)
         assert row[5].startswith("**") == (abs(told["relative"]) > 0.05)
 
@@ -360,10 +367,12 @@ def test_rows_of_the_picture_are_of_the_run_that_they_name(study, monkeypatch):
 def test_ranges_and_their_sources_are_in_the_table():
     row = {"path": "controller.position.c", "before": 1.0, "after": 2.0, "least": 0.0, "most": 30.0, "at_bound": "",
            "sensitivity_percent": 3.0}  # fmt: skip
-    bare = report._gains({"gains": [row]})
+    bare = report._gains(types.SimpleNamespace(gains=[row], trained_on=40, nominal_steps="by accurate steps"))
     assert "may end from" in bare[2]
     assert "looked for" not in "".join(bare)
-    told = "\n".join(report._gains({"gains": [row | {"low": 0.5, "high": 20.0, "source": "w/30 to 10 w"}]}))
+    ranged = row | {"low": 0.5, "high": 20.0, "source": "w/30 to 10 w"}
+    facts = types.SimpleNamespace(gains=[ranged], trained_on=40, nominal_steps="by accurate steps")
+    told = "\n".join(report._gains(facts))
     assert "| controller.position.c | 1 | 2 | 0.5 | 20 | 0 | 30 | - | 3 % |" in told
     assert "- controller.position.c: w/30 to 10 w" in told
 

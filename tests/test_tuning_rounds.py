@@ -25,7 +25,7 @@ def tuned(monkeypatch, tmp_path, world, **tune):
 
 def seed_of(which, seed=1):
     """The seed of one of the three ensembles."""
-    from tuning.config import Budget
+    from ambjax.cases.tune_table import Budget
 
     return seeds(Budget(seed=seed))[which]
 

@@ -205,8 +205,9 @@ def test_every_optimiser_descends_and_steps_back(name):
 
 
 @pytest.fixture(scope="module")
-def small():
-    problem = objective(60)
+def small(engines):
+    """A search of the problem whose programs are compiled already."""
+    problem = engines[0].objective
     engine = Engine(problem, settle=0.002, threads=2)
     goal = Goal(SPACE, (1.0, 0.0, 0.0, 0.0, 1e-3, 1.0), Mean(), bounds(CASCADE, SCENARIO, problem.clock), 1.0, 0.1)
     return engine, goal, problem.training(3, 4, 1, 1.2, 1.25), SPACE.values(CASCADE)
@@ -302,7 +303,7 @@ def test_nothing_is_compiled_after_the_first_iteration(small, caplog, told_compi
         engine.gradient(np.repeat(x, 2, axis=0), members, goal.weights)
         engine.terms(x, members)
         other = dataclasses.replace(SCENARIO, u_max=250.0)
-        Engine(objective(60, scenario=other), settle=0.002).terms(x, members)  # nor for other numbers
+        Engine(dataclasses.replace(engine.objective, scenario=other), settle=0.002).terms(x, members)  # nor for others
         assert not kernels()
         # what is not seen above is there to be seen
         Engine(objective(7, method=Slide(3)), settle=0.0).terms(x, members)
@@ -322,13 +323,13 @@ def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):
 
     keeper = Keeper(tmp_path / "kept.npz", told)
     with pytest.raises(StopError):
-        run(small, keeper=keeper, tell=stop)
+        run(small, keeper=keeper, on_iteration=stop)
     resumed = run(small, keeper=keeper, resume=True)
     for a, b in zip(jax.tree.leaves(whole.starts), jax.tree.leaves(resumed.starts), strict=True):
         np.testing.assert_array_equal(a, b)
     assert 0 < resumed.earlier < resumed.seconds  # what it took before counts
     assert not list(tmp_path.glob("*.part*"))
-    with pytest.raises(ValueError, match="another search: case is 1 there and 2 here"):
+    with pytest.raises(ValueError, match="another search: case is 1 in the file and 2 in this run"):
         run(small, keeper=Keeper(tmp_path / "kept.npz", {"case": 2}), resume=True)
 
 
@@ -392,7 +393,7 @@ def test_ctrl_c_keeps_the_best(small):
         if kept.iteration == 3:
             raise KeyboardInterrupt
 
-    found = run(small, tell=stop)
+    found = run(small, on_iteration=stop)
     assert found.interrupted
     assert found.iteration == 3
     assert np.isfinite(best_of(found)[1])
@@ -432,6 +433,14 @@ def test_everything_in_tune_has_a_default():
     [
         ({"gains": []}, "tune.gains is empty"),
         ({"gains": ["controller.position.cc"]}, "Did you mean 'controller.position.c'"),
+        (
+            {"gains": ["controller.position.c", "plant.m"]},
+            "tune.gains: 'plant.m': there is no such number to tune in this case. There are: ",
+        ),
+        (
+            {"bounds": {"controller": {"position": {"cc": [1, 2]}}}},
+            "tune.bounds: 'controller.position.cc': there is no such number to tune in this case. Did you mean 'c",
+        ),
         ({"gains": "c"}, "give a list of paths"),
         ({"optimiser": "adamm"}, "Did you mean 'adam'"),
         ({"weights": {"tracking": 0.0}}, "nothing asks the rotor to follow"),
@@ -525,7 +534,7 @@ def test_a_killed_tuning_goes_on_and_damage_is_found(tmp_path):
     first.write_bytes(first.read_bytes()[:-200])
     done = command(path, "--out", out, "--resume")
     assert done.returncode == 0, done.stderr
-    assert f"{first}: it is not a whole archive; round 1 is begun again\n" in done.stderr
+    assert f"{first}: it is an incomplete archive; round 1 is begun again\n" in done.stderr
     assert (out / "tuned.toml").read_bytes() == (whole / "tuned.toml").read_bytes()
     # a finished search is judged again, in words; another one is refused by what differs
     again = command(path, "--out", whole, "--resume")
@@ -534,7 +543,7 @@ def test_a_killed_tuning_goes_on_and_damage_is_found(tmp_path):
     path.write_text(CASE.replace("u_max = 400.0", "u_max = 300.0"))
     other = command(path, "--out", whole, "--resume")
     assert other.returncode == 2
-    assert "belongs to another search: case.actuator.u_max is 400.0 there and 300.0 here" in other.stderr
+    assert "belongs to another search: case.actuator.u_max is 400.0 in the file and 300.0 in this run" in other.stderr
     # begun anew in the same directory, nothing of the old search is left to be resumed with
     old = len(list(whole.glob("checkpoint-*.npz")))
     fresh = command(path, "--out", whole)

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from ambjax import Cascade, Clock, Initial, Pulse, Scenario, Sine, Slide, inversion, position, rollout
 from ambjax.cases.template_text import template
+from ambjax.simulation.folds import Rms
 from ambjax.simulation.loop import SHOWN, Densities
-from ambjax.simulation.metrics import Rms
 from ambjax.simulation.span import blank
 from ambjax.theorem.conditions import delta_1_on_reference
 from tuning.config import read_tune

@@ -22,7 +22,8 @@ import tuning.judge
 import tuning.search.rounds
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
-from tuning.config import Budget, seeds
+from ambjax.cases.tune_table import Budget
+from tuning.config import seeds
 from tuning.judge import RESOLVED, describe, judge, step_error, summarise
 from tuning.objective.goal import Goal
 from tuning.objective.loss import TERMS
@@ -372,7 +373,7 @@ def test_pareto_is_in_the_report_and_has_a_picture(everything):
 def test_a_case_from_a_pipe_is_read_once(monkeypatch, tmp_path):
     """The second time it is empty, and tuned.toml would be of gains alone: another case."""
     study(monkeypatch, World())
-    monkeypatch.setattr(tuning.command, "_tune", lambda args, raw, problem, start, out: (raw, problem.case.text))
+    monkeypatch.setattr(tuning.command, "_tune", lambda plan, args: (plan.raw, plan.problem.case.text))
     text = dumps(document())
     args = argparse.Namespace(case=piped(text), out=str(tmp_path / "out"), resume=False, json=True)
     assert tuning.command.run(args) == (tomllib.loads(text), text)
@@ -381,7 +382,7 @@ def test_a_case_from_a_pipe_is_read_once(monkeypatch, tmp_path):
 def test_a_file_whose_gains_could_not_be_written_is_refused_at_the_start(monkeypatch, tmp_path):
     """Not after hours of search."""
     broken = "[plant]\nm = 1.0\nx = 1.0\n"
-    monkeypatch.setattr(tuning.command, "tuned_text", lambda *_: broken)
+    monkeypatch.setattr("tuning.report.tuned.tuned", lambda *_: broken)
     with pytest.raises(ValueError, match=r"case.toml: plant.x = 1.0: unknown key"):
         command(monkeypatch, tmp_path, World())
     assert not (tmp_path / "out").exists()
@@ -480,6 +481,6 @@ def test_the_pictures_are_of_the_case_and_of_the_tuned_laws(monkeypatch):
         monkeypatch.setattr(tuning.command.pictures, name, lambda *_: b"")
     for name in ("before_after", "spectrum"):
         monkeypatch.setattr(tuning.command.pictures, name, lambda runs, *_: runs)
-    drawn = tuning.command._pictures(made, tuned, None, {}, None)
+    drawn = tuning.command._pictures(made, tuned, None, None, None)
     wanted = {"before": float(made.case.cascade.position.c), "after": pytest.approx(80.0)}
     assert drawn["nominal.png"] == drawn["spectrum.png"] == wanted

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from texts import problem_from
 
-import tuning.command
+import tuning.report.judging
 import tuning.search.course
 import tuning.search.rounds
 from ambjax.cases.reader import case_from
@@ -203,7 +203,7 @@ def test_a_refuted_answer_is_a_failure_in_every_file(small, monkeypatch, tmp_pat
     refuted = Verdicts(
         error_of(small, stalled=4, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
     )
-    for place in (tuning.search.rounds, tuning.command):
+    for place in (tuning.search.rounds, tuning.report.judging):
         monkeypatch.setattr(place, "step_error", refuted)
     monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 1)
     monkeypatch.setattr(tuning.search.rounds, "MOST_HALVINGS", 0)
@@ -227,7 +227,7 @@ def test_an_answer_confirmed_in_training_is_still_refuted_by_held_out_members(sm
     right = error_of(small)
     monkeypatch.setattr(tuning.search.rounds, "step_error", Verdicts(right))
     wrong = Verdicts(right._replace(lost=2, members=2))
-    monkeypatch.setattr(tuning.command, "step_error", wrong)
+    monkeypatch.setattr(tuning.report.judging, "step_error", wrong)
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(SMALL)
     assert main([str(path), "--out", str(out), "--json"]) == 1

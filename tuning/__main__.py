@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-from typing import Any
 
 from ambjax import __version__
 from ambjax.__main__ import Parser, answer
@@ -39,7 +38,7 @@ def main(argv: list[str] | None = None, program: str = PROGRAM) -> int:
         return answer(parser(program), argv, _run)
 
 
-def _run(args: argparse.Namespace) -> tuple[int, Any]:
+def _run(args: argparse.Namespace) -> tuple[int, object]:
     from ambjax.ensemble.worker import prepare
 
     prepare()

@@ -106,7 +106,7 @@ class StepError(NamedTuple):
     def facts(self) -> dict[str, Any]:
         """Return the comparison as plain data for report.json."""
         summary = {name: getattr(self, name) for name in self._fields if name not in ("unheld", "negligible_m")}
-        return summary | {"resolved": self.resolved, "refuted": self.refuted, "told": describe(self)}
+        return summary | {"resolved": self.resolved, "refuted": self.refuted, "text": describe(self)}
 
 
 def describe(error: StepError) -> str:

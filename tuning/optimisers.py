@@ -82,7 +82,7 @@ def bfgs() -> optax.GradientTransformationExtraArgs:
         never, radius = (jnp.asarray(number, x.dtype) for number in (jnp.inf, FIRST))
         return Curvature(x, never, jnp.zeros_like(x), jnp.eye(len(x), dtype=x.dtype), radius, jnp.zeros((), int))
 
-    def update(gradient: Array, state: Curvature, x: Array, *, value: Array, **_: Any) -> tuple[Array, Curvature]:
+    def update(gradient: Array, state: Curvature, x: Array, *, value: Array, **_: object) -> tuple[Array, Curvature]:
         finite, gradient = _finite(gradient, value)
         accept = finite & (value < state.value)
         smooth = finite & (value < state.value + CLIFF)
@@ -124,7 +124,7 @@ def stepping_back(inner: optax.GradientTransformation) -> optax.GradientTransfor
     def init(x: Array) -> Retreat:
         return Retreat(x, jnp.asarray(jnp.inf, x.dtype), inner.init(x))
 
-    def update(gradient: Array, state: Retreat, x: Array, *, value: Array, **_: Any) -> tuple[Array, Retreat]:
+    def update(gradient: Array, state: Retreat, x: Array, *, value: Array, **_: object) -> tuple[Array, Retreat]:
         accept, gradient = _finite(gradient, value)
         better = accept & (value < state.value)
         step: Any

@@ -5,9 +5,10 @@ import functools
 from typing import Any
 
 from ambjax.cases.reader import Case
-from ambjax.simulation import integrate
+from ambjax.simulation.integrate import Integrator
 from ambjax.simulation.method import choose_method
-from ambjax.simulation.sliding import slides
+from ambjax.simulation.rosenbrock import AdaptiveRodas3
+from ambjax.simulation.sliding import Slide, slides
 from tuning.config import Tune
 from tuning.objective.goal import Goal
 from tuning.objective.lanes import Engine
@@ -38,6 +39,8 @@ class TuningProblem:
     ranges: list[Range]
     finer: int = 1
     """ratio of the number of steps to that of tune.substeps"""
+    limits: tuple[Limit, ...] = ()
+    """the limits, and the state of their augmented Lagrangian"""
 
     @property
     def sampled(self) -> bool:
@@ -47,7 +50,7 @@ class TuningProblem:
     @functools.cached_property
     def reference(self) -> Engine:
         """The objective in accurate steps: adaptive RODAS3, or REFINEMENT times as many steps of the plant alone."""
-        accurate = integrate.AdaptiveRodas3(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS)
+        accurate = AdaptiveRodas3(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS)
         return self._stepping(self._fine if self.sampled else accurate, lanes=REFERENCE_MEMBERS)
 
     @functools.cached_property
@@ -69,7 +72,7 @@ class TuningProblem:
         return self.sampled and self.finer == 1
 
     @property
-    def _fine(self) -> integrate.Integrator:
+    def _fine(self) -> Integrator:
         method: Any = self.objective.clock.method
         return dataclasses.replace(method, substeps=REFINEMENT * method.substeps)
 
@@ -80,9 +83,11 @@ class TuningProblem:
 
     def limited(self, limits: tuple[Limit, ...]) -> "TuningProblem":
         """Return the problem with these limits."""
-        return dataclasses.replace(self, goal=dataclasses.replace(self.goal, limits=limits))
+        return dataclasses.replace(
+            self, limits=limits, goal=dataclasses.replace(self.goal, limits=tuple(limit.term for limit in limits))
+        )
 
-    def _stepping(self, method: integrate.Integrator, **more: Any) -> Engine:
+    def _stepping(self, method: Integrator, **more: Any) -> Engine:
         objective = dataclasses.replace(self.objective, clock=dataclasses.replace(self.objective.clock, method=method))
         return Engine(objective, settle=self.case.settle, **more)
 
@@ -101,14 +106,14 @@ class TuningProblem:
         return exact._stepping(objective.clock.integrator, lanes=REFERENCE_MEMBERS), exact.reference
 
 
-def method_for(case: Case, substeps: int, finer: int) -> integrate.Integrator:
+def method_for(case: Case, substeps: int, finer: int) -> Integrator:
     """Return the search's integration method, with `finer` times as many steps.
 
     The number of steps is fixed, so that all members take equally long. In sliding mode there are `substeps` steps a
     sample, independent of the stiffness of the inversion law.
     """
     if slides(case.cascade, case.scenario.plant):
-        return integrate.Slide(finer * substeps)
+        return Slide(finer * substeps)
     method: Any = choose_method(case.cascade, case.scenario, float(case.clock.sample_period), reverse=True)
     return dataclasses.replace(method, substeps=finer * method.substeps)
 
@@ -126,8 +131,7 @@ def problem_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = 
     conditions = bounds(case.cascade, case.scenario, clock)
     space, box = bounded(objective, conditions, tune.space.values(case.cascade))
     objective = dataclasses.replace(objective, space=space)
-    goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin, limits.each)
+    goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin)
     mode = "forward" if len(tune.space) <= MOST_FORWARD else "reverse"
-    return TuningProblem(
-        case, tune, objective, Engine(objective, settle=case.settle, mode=mode, threads=threads), goal, box, finer
-    )
+    engine = Engine(objective, settle=case.settle, mode=mode, threads=threads)
+    return TuningProblem(case, tune, objective, engine, goal, box, finer).limited(limits.each)

@@ -158,7 +158,7 @@ def read(cascade: Cascade, path: str) -> Any:
     return getattr(getattr(cascade, stage), name)
 
 
-def _write(cascade: Cascade, path: str, value: Any) -> Cascade:
+def _write(cascade: Cascade, path: str, value: object) -> Cascade:
     _, stage, name = path.split(".")
     law = dataclasses.replace(getattr(cascade, stage), **{name: value})
     return dataclasses.replace(cascade, **{stage: law})

@@ -3,13 +3,15 @@
 import math
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, ends
 from ambjax.simulation.clock import Clock
+from ambjax.world.band_noise import BandNoise
 from ambjax.world.scenario import Scenario
-from ambjax.world.signals import BandNoise, Sum
+from ambjax.world.signals import Sum
 
 # Instants per block at which a signal is sampled.
 BLOCK = 2**16
@@ -61,5 +63,5 @@ def sampled(scenario: Scenario, clock: Clock) -> float:
     signal, far = scenario.realised().reference, 0.0
     for first in range(0, clock.samples, BLOCK):
         t = np.arange(first, first + BLOCK).clip(max=clock.samples) * float(clock.sample_period)
-        far = max(far, float(np.max(np.abs(signal(t)))))
+        far = max(far, float(np.max(np.abs(signal(jnp.asarray(t))))))
     return far

@@ -10,6 +10,7 @@ import pathlib
 import re
 from typing import Any
 
+from ambjax.cases.own_laws import FORM, OwnLaw, is_own, own_law
 from ambjax.cases.reach import check_reference
 from ambjax.cases.table import Table, check_depth, load, show
 from ambjax.cases.timing import clock_from, settled
@@ -21,14 +22,15 @@ from ambjax.control.guard import Guard
 from ambjax.control.processor import Processor
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.host.words import one_line
+from ambjax.linear.analysis import Zones
 from ambjax.numerics.records import leaf
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.integrate import Slide
 from ambjax.simulation.method import with_method
-from ambjax.simulation.sampled import check_parts
-from ambjax.simulation.sliding import slides
+from ambjax.simulation.sliding import Slide, slides
+from ambjax.simulation.system import check_parts
 from ambjax.world import signals
 from ambjax.world.amplifier import Amplifier
+from ambjax.world.band_noise import BandNoise
 from ambjax.world.bearing import Bearing
 from ambjax.world.coils import TwoCoil
 from ambjax.world.faults import VALUES, Dropouts, Outliers
@@ -46,8 +48,16 @@ KINDS: dict[str, dict[str, type[Law]]] = {
         "ired-1": observer.IRED1,
         "ired-2": observer.IRED2,
     },
-    "position": {"sliding-mode": position.SlidingMode, "super-twisting": position.SuperTwisting},
-    "inversion": {"adaptive": inversion.Adaptive, "closed-form": inversion.ClosedForm},
+    "position": {
+        "sliding-mode": position.SlidingMode,
+        "super-twisting": position.SuperTwisting,
+        "pid": position.PID,
+    },
+    "inversion": {
+        "adaptive": inversion.Adaptive,
+        "closed-form": inversion.ClosedForm,
+        "linearised": inversion.Linearised,
+    },
     "current": {"sliding-mode": current.SlidingMode, "pi": current.ProportionalIntegral},
 }
 SIGNALS: dict[str, type] = {
@@ -57,7 +67,7 @@ SIGNALS: dict[str, type] = {
     "sine": signals.Sine,
     "smoothstep": signals.SmoothStep,
     "chirp": signals.Chirp,
-    "band-noise": signals.BandNoise,
+    "band-noise": BandNoise,
     "sum": signals.Sum,
 }
 PLANTS: dict[str, type] = {"lumped": Plant, "two-coil": TwoCoil}
@@ -74,6 +84,7 @@ TABLES = [
     "clock",
     "run",
     "spread",
+    "sensitivity",
 ]
 OTHERS = ["tune"]  # read by the tuner, ignored by the other commands
 UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
@@ -92,7 +103,8 @@ class Case:
 
     `clock` has the integration method, given or chosen, that fits every end of the spread. `settle`: time from which
     "settled" metrics count, s. `text`: the file as it was read. `assumed`: names of the plant's parameters that the
-    file omits while it gives others; they keep the paper's values. Empty if the file gives all or none.
+    file omits while it gives others; they keep the paper's values. Empty if the file gives all or none. `own_laws`: the
+    laws that the file names and that are no part of the package. `zones`: range and limits of the sensitivity.
     """
 
     name: str
@@ -103,6 +115,8 @@ class Case:
     spread: Spread = Spread()
     text: str = ""
     assumed: tuple[str, ...] = ()
+    own_laws: tuple[OwnLaw, ...] = ()
+    zones: Zones = Zones()
 
 
 def read_case(path: str | pathlib.Path) -> Case:
@@ -113,7 +127,7 @@ def read_case(path: str | pathlib.Path) -> Case:
     path = pathlib.Path(path)
     raw, text = load(path)
     try:
-        return case_from(raw, path.stem, text)
+        return case_from(raw, path.stem, text, path.parent)
     except ValueError as error:
         raise ValueError(one_line(f"{path}: {error}")) from None
 
@@ -123,14 +137,24 @@ def safe_name(text: str) -> str:
     return UNSAFE.sub("_", text)[:LONGEST_NAME].strip() or "case"
 
 
-def case_from(raw: dict[str, Any], name: str = "case", text: str = "") -> Case:
-    """Return the case of a parsed TOML document `raw` with source `text`. Raises ValueError as `read_case` does."""
+def case_from(
+    raw: dict[str, Any],
+    name: str = "case",
+    text: str = "",
+    folder: pathlib.Path = pathlib.Path(),
+    own: tuple[OwnLaw, ...] = (),
+) -> Case:
+    """Return the case of a parsed TOML document `raw` with source `text`. Raises ValueError as `read_case` does.
+
+    `folder`: that of the case file, to which the file of a law of one's own is relative. `own`: such laws that are
+    imported already; they are not imported again.
+    """
     check_depth(raw)
     top = Table(raw)
     top.only([*TABLES, *OTHERS])
     plant = _plant(top.table("plant"))
     processor = _processor(top.table("processor")) if "processor" in top.raw else None
-    cascade = _cascade(top.table("controller"), plant, processor)
+    cascade, own = _cascade(top.table("controller"), plant, processor, folder, own)
     scenario, settle = _scenario(top, plant)
     check_parts(cascade, scenario)
     clock, duration = clock_from(top.table("clock"))
@@ -148,7 +172,9 @@ def case_from(raw: dict[str, Any], name: str = "case", text: str = "") -> Case:
     if (late := ends(spread, cascade, scenario, ("processor.",))[0].processor) is not None:
         cascade = cascade.on_processor(late.delay, between="processor.delay" in spread.paths)
     assumed = _left_out(top.table("plant"), plant)
-    return Case(safe_name(name), cascade, scenario, clock, settle, spread, text, assumed)
+    zones = top.table("sensitivity").record(Zones)
+    zones.check(None if cascade.processor is None else clock.sample_period)
+    return Case(safe_name(name), cascade, scenario, clock, settle, spread, text, assumed, own, zones)
 
 
 def _processor(table: Table) -> Processor:
@@ -171,15 +197,22 @@ def _left_out(table: Table, plant: Bearing) -> tuple[str, ...]:
     return left if len(left) < len(names) else ()
 
 
-def _cascade(table: Table, plant: Bearing, processor: Processor | None) -> Cascade:
+def _cascade(
+    table: Table, plant: Bearing, processor: Processor | None, folder: pathlib.Path, known: tuple[OwnLaw, ...]
+) -> tuple[Cascade, tuple[OwnLaw, ...]]:
     table.only(["model", *KINDS])
     model = table.table("model").record(Plant, base=plant)  # always lumped, even for a two-coil plant
-    laws = {}
+    laws, own = {}, []
     for stage, kinds in KINDS.items():
         law = table.table(stage)
-        kind = law.choice("kind", list(kinds), next(iter(kinds)))
-        laws[stage] = law.record(kinds[kind], extra=("kind",), base=default_law(kinds[kind], model))
-    return Cascade(model=model, processor=processor, **laws)
+        if is_own(law.raw.get("kind")):
+            found = [one for one in known if one.stage == stage]
+            own += found or [own_law(stage, law.raw["kind"], folder, model)]
+            kind = own[-1].law
+        else:
+            kind = kinds[law.choice("kind", list(kinds), next(iter(kinds)), FORM)]
+        laws[stage] = law.record(kind, extra=("kind",), base=default_law(kind, model))
+    return Cascade(model=model, processor=processor, **laws), tuple(own)
 
 
 def _signal(table: Table, extra: tuple[str, ...] = ()) -> Any:

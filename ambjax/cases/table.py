@@ -47,7 +47,7 @@ def load(path: str | pathlib.Path) -> tuple[dict[str, Any], str]:
         raise refuse("a number has thousands of digits. Write it as in 1.5e3.") from None
 
 
-def check_depth(raw: Any) -> None:
+def check_depth(raw: object) -> None:
     """Raise ValueError if tables or lists are nested deeper than DEEPEST."""
     level = [raw]
     for _ in range(DEEPEST):
@@ -60,7 +60,7 @@ def check_depth(raw: Any) -> None:
 class Table:
     """A TOML table that is read strictly: an unknown key is an error, and each error names its dotted path."""
 
-    def __init__(self, raw: Any, path: str = ""):
+    def __init__(self, raw: Any, path: str = "") -> None:
         if not isinstance(raw, dict):
             raise ValueError(f"{path} = {show(raw)}: it must be a table. Write [{path}] and its keys below it.")
         self.raw, self.path = raw, path
@@ -84,7 +84,7 @@ class Table:
         """Return a table within this one; empty if left out."""
         return Table(self.raw.get(key, {}), self.at(key))
 
-    def number(self, key: str, default: Any, allowed: str = "a number") -> Any:
+    def number(self, key: str, default: object, allowed: str = "a number") -> Any:
         """Return a number, or the default if left out. Raises ValueError, with `allowed`, for anything else."""
         value = self.raw.get(key, default)
         if value is default:
@@ -96,7 +96,7 @@ class Table:
         except OverflowError:  # a whole number of hundreds of digits
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be {allowed}.") from None
 
-    def leaf(self, key: str, field: dataclasses.Field, default: Any = None) -> Any:
+    def leaf(self, key: str, field: dataclasses.Field, default: object = None) -> Any:
         """Return a number within the bounds of `field`, or the default if left out. Raises ValueError out of bounds."""
         value = self.number(key, default, numbers(field))
         if key in self.raw:
@@ -117,18 +117,22 @@ class Table:
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be true or false, without quotes.")
         return value
 
-    def choice(self, key: str, allowed: list[str], default: str | None = None) -> str:
-        """Return one of the `allowed` words, or the default if left out. Raises ValueError for any other."""
+    def choice(self, key: str, allowed: list[str], default: str | None = None, other: str = "") -> str:
+        """Return one of the `allowed` words, or the default if left out. Raises ValueError for any other.
+
+        `other`: what else the key may have, for the message; the caller has read it.
+        """
         value = self.raw.get(key, default)
+        words = quoted(allowed) + (f"; or {other}" if other else "")
         if value is None:
-            raise ValueError(f"{self.at(key)} is missing: it must be one of {quoted(allowed)}.")
+            raise ValueError(f"{self.at(key)} is missing: it must be one of {words}.")
         if value not in allowed:
             close = difflib.get_close_matches(show(value).strip('"'), allowed, n=1)
             hint = f" Did you mean '{close[0]}'?" if close else ""
-            raise ValueError(f"{self.at(key)} = {show(value)}: it must be one of {quoted(allowed)}.{hint}")
+            raise ValueError(f"{self.at(key)} = {show(value)}: it must be one of {words}.{hint}")
         return value
 
-    def record(self, kind: type, extra: tuple[str, ...] = (), base: Any = None) -> Any:
+    def record(self, kind: type, extra: tuple[str, ...] = (), base: object = None) -> Any:
         """Return a record of type `kind` whose leaves are this table's keys.
 
         `extra`: further keys that the table may have. `base`: a record that gives the defaults, else `kind`. Raises
@@ -147,7 +151,7 @@ class Table:
         self._check_order(one)
         return one
 
-    def _check_order(self, record: Any) -> None:
+    def _check_order(self, record: object) -> None:
         """Raise ValueError if the two leaves that the record orders, such as start and stop, are not in that order."""
         if pair := getattr(record, "ordered", None):
             low, high = (getattr(record, name) for name in pair)
@@ -155,7 +159,7 @@ class Table:
                 raise ValueError(f"{self.at(pair[1])} = {high:g}: it must be more than {pair[0]} = {low:g}.")
 
 
-def show(value: Any) -> str:
+def show(value: object) -> str:
     """Return a value as a case file writes it, cut if it is long."""
     if isinstance(value, int) and abs(value) >= 10**LONGEST:  # Python refuses to write thousands of digits
         return f"a whole number of {len(hex(abs(value))) - 2} hexadecimal digits"

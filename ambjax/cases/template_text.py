@@ -2,8 +2,8 @@
 
 import dataclasses
 import math
-from typing import Any
 
+from ambjax.cases import tune_table
 from ambjax.cases.reader import KINDS, PLANTS, SIGNALS
 from ambjax.cases.rig import RIG
 from ambjax.ensemble.design import DESIGNS
@@ -82,6 +82,16 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # dead_band = 0.5             # V; subtracted from the size of its voltage (left out: none)
 # i_max = 1.0                 # A; above it, the voltage does not increase |i| (left out: no limit)
 
+# [sensitivity]               # range and zones of 'ambjax sensitivity' (ISO 14839, from secondary sources)
+# f_low = 1.0                 # Hz; lowest frequency; 0 is always included
+# f_high = 2e3                # Hz; highest (left out: 2 kHz, or 0.45 of the sample rate if that is lower)
+# zone_a = 3.0                # peak of |S| below which zone A holds
+# zone_b = 4.0                # likewise, zone B
+# zone_c = 5.0                # likewise, zone C; above it zone D
+# clearance_a = 0.3           # share of the clearance that is used, zone A
+# clearance_b = 0.4           # likewise, zone B
+# clearance_c = 0.5           # likewise, zone C; above it zone D
+
 # [spread]                    # what varies over an ensemble, by dotted path; 'ambjax simulate' ignores it
 # design = "random"           # or {designs}
 # plant.m = {{ percent = 10 }}  # uniform, +-10 % of the value above; the controller's model keeps that value
@@ -90,50 +100,10 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # disturbance.q_z.amplitude = {{ log-uniform = [0.1, 2.0] }}
 # disturbance.q_z.shift = {{ uniform = [-0.1, 0.1] }}      # s; start and stop of the pulse together
 # actuator.u_max = {{ choices = [200, 500, 1000] }}        # V; equally likely
-
-# [tune]                      # for 'ambjax tune', which starts at the gains above. Each key has its default here
-# gains = ["controller.position.c", "controller.position.k"]  # gains to tune; left out: all gains of the laws but p
-# bounds.controller.position.c = [1.0, 500.0]  # bounds of one gain; left out: from plant and theory, see the report; c
-#                             # is then at most a fifth of the sample rate, others 3 times their range or start
-# weights.tracking = 1.0      # each weight multiplies a dimensionless term: here the mean square error after run.settle
-# weights.peak = 0.0          # largest error after run.settle
-# weights.effort = 0.1        # mean square voltage
-# weights.chatter = 0.1       # mean square step of the voltage
-# weights.clearance = 1e-3    # closeness to the stop
-# weights.survival = 1.0      # loss of the rotor, the earlier the more
-# weights.conditions = 1.0    # conditions of Theorem 1 that fail, or hold by less than the margin
-# limits.rms_u_V = 120.0      # V; root mean square voltage after run.settle, over members (left out: 60 % of u_max)
-# limits.max_u_V = 150.0      # V; largest voltage of any member; inf, here and below: no limit (left out: none)
-# limits.max_abs_i_A = 5.0    # A; largest current of any member (left out: none)
-# limits.chatter_V_per_s = 1e5  # V/s; variation of the voltage after run.settle, mean over members (left out: none)
-# limits.largest_error_m = 1e-5  # m; largest error after run.settle, of any member (left out: none)
-# limits.settling_s = 0.2     # s; time of the run after which every error stays within the band (left out: none)
-# limits.settling_band_m = 45e-6  # m; half-width of the settling band (left out: 1 % of the clearance)
-# limits.overshoot_m = 1e-4   # m; how far z goes beyond its start and beyond the range of r so far (left out: none)
-# limits.clearance_used = 0.8 # largest |z| of any member as a share of the clearance (left out: none)
-# limits.survival = 1.0       # share of the held-out members that must survive
-# limits.margin = 0.01        # share by which the search stays below a limit; left out: 0.005 of means, 0.03 of maxima
-# conditions_margin = 0.1     # share by which each gain is to exceed its condition of Theorem 1
-# early = 0.0                 # weight of errors before run.settle, relative to 1 after it
-# risk = "cvar"               # how the members' losses are combined: "cvar", "soft-worst" or "mean"; left out: "mean"
-# alpha = 0.9                 # for "cvar": the mean of the worst 1 - alpha; left out: 0.9
-# members = 32                # members of the training ensemble, each with its own noise and [spread]
-# stressed = 8                # further members that only have to survive, with more noise and with other gains
-# stress = 1.2                # factor on the noise of the stressed members
-# gain_margin = 1.25          # factor on each gain of the stressed members, up or down
-# validation = 2000           # further members; those lost with the tuned gains join the stressed ones
-# held_out = 1000             # further members, on which the tuned gains are judged
-# seed = 1                    # seed of the members and of the screen; the other ensembles' seeds are far from it
-# screen = 128                # points at which the search begins; 0: only at the gains above
-# starts = 4                  # number of the best of these points, which are refined
-# iterations = 40             # largest number of iterations in each phase of the refinement
-# substeps = 3                # integration steps per sample
-# optimiser = "bfgs"          # or one of optax, such as "adam"
-# learning_rate = 0.1         # step size of an optimiser of optax
 """
 
 
-def _lines(kind: type, values: Any) -> list[str]:
+def _lines(kind: type, values: object) -> list[str]:
     lines = []
     for field in dataclasses.fields(kind):
         value = getattr(values, field.name)
@@ -159,7 +129,14 @@ def _others(kinds: dict[str, type]) -> str:
 
 
 def _with_note(text: str, comment: str) -> str:
-    return f"{text:<30}# {comment}"
+    return f"{text:<29} # {comment}"
+
+
+def _tune() -> list[str]:
+    """Return the lines of [tune], all of them comments."""
+    head = ("# [tune]", "for 'ambjax tune', which starts at the gains above. Each key has its default here")
+    rows = [(f"# {line.text}" if line.text else "#", line.comment) for line in tune_table.lines()]
+    return [_with_note(*row) if len(row[0]) < 30 else f"{row[0]}  # {row[1]}" for row in [head, *rows]]
 
 
 def _number(value: float) -> str:
@@ -191,4 +168,5 @@ def template(scenario: str) -> str:
     lines += ['kind = "pulse"', _with_note('unit = "A^2/m^2"', 'scaled force; or "m/s^2", the default')]
     lines += _lines(type(PULSE), PULSE)
     designs = " or ".join(f'"{d}"' for d in list(DESIGNS)[1:])
-    return "\n".join(lines) + "\n" + REST.format(paper_std=TABLE_2.noise_std, designs=designs)
+    rest = REST.format(paper_std=TABLE_2.noise_std, designs=designs)
+    return "\n".join(lines) + "\n" + rest + "\n" + "\n".join(_tune()) + "\n"

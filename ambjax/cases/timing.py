@@ -7,7 +7,9 @@ from ambjax.cases.table import Table, show
 from ambjax.numerics.records import leaf, numbers
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
-from ambjax.simulation.integrate import AdaptiveRodas3, Integrator, Rodas3, Slide
+from ambjax.simulation.integrate import Integrator
+from ambjax.simulation.rosenbrock import AdaptiveRodas3, Rodas3
+from ambjax.simulation.sliding import Slide
 
 METHODS: dict[str, type] = {"rk4": RK4, "dop853": DOP853, "euler": Euler, "rodas3": Rodas3, "sliding": Slide}
 # Substeps of the sliding step where dt = "auto".
@@ -53,7 +55,7 @@ def clock_from(table: Table) -> tuple[Clock, float]:
 
 def settled(settle: float, clock: Clock) -> float:
     """Return run.settle, s. Raises ValueError if no sample of the run is at or after it."""
-    last = (clock.samples - 1) * clock.sample_period
+    last = (clock.samples - 1) * float(clock.sample_period)
     if settle > (1 + ROUNDING) * last:
         raise ValueError(
             f"run.settle = {settle:g} s: it must be at most {last:.12g} s, the last sample of clock.duration = "

@@ -77,7 +77,7 @@ def _entries(raw: dict[str, Any], prefix: str, known: list[str]) -> list[tuple[s
     return entries
 
 
-def _distribution(raw: Any, path: str) -> Distribution:
+def _distribution(raw: object, path: str) -> Distribution:
     where = f"spread.{path}"
     if not isinstance(raw, dict):
         raise ValueError(f"{where} = {show(raw)}: it must be a distribution, as in {path} = {{ percent = 10 }}.")

@@ -1,19 +1,20 @@
-"""`ambjax check`: the conditions of Theorem 1 along a run, and the stability conditions on the case's processor."""
+"""`ambjax check`: sensitivity and margins, the conditions on the case's processor, and those of Theorem 1."""
 
 import argparse
 import dataclasses
 import math
-from typing import Any
+from collections.abc import Mapping
 
 from ambjax.cases.reader import Case
+from ambjax.commands.acceptance import acceptance
 from ambjax.commands.outputs import plain, table
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.theorem.conditions import Condition, check
 from ambjax.theorem.sampled_report import Delays, SampledReport
 
-Summary = dict[str, Any]
+Summary = dict[str, object]
 CONTINUOUS = (
-    "The tables above are for continuous time, as in the theorem: without the case's [processor], converters and "
+    "The tables of Theorem 1 are for continuous time: without the case's [processor], converters and "
     "amplifier, and with a boundary layer for each sign that has none. They do not set the verdict of this case."
 )
 
@@ -26,7 +27,7 @@ BAND = (
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
-    """Check the conditions of a case and print them. Exit code 1 if one fails."""
+    """Check a case and print the answers, the loop that will run first. Exit code 1 if a condition fails."""
     from ambjax.theorem import advice
 
     case = read_with_warnings(args.case)
@@ -40,13 +41,18 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         "conditions": [_condition(c) for c in report.conditions],
         "proof": [_condition(c) for c in report.proof],
     }
+    loop, text = acceptance(case)
+    summary |= {"loop": loop}
     if not args.json:
+        print(text)
+    if case.cascade.processor is not None:
+        summary |= _on_processor(case, args)
+    if not args.json:
+        print("\nTheorem 1:\n")
         _print_check(report.conditions, report.proof)
         print("\n" + "\n".join(advice.answer(report, args.case)))
-    if case.cascade.processor is not None:
-        if not args.json:
+        if case.cascade.processor is not None:
             print(CONTINUOUS)
-        summary |= _on_processor(case, args)
     return int(not summary["holds"]), plain(summary)
 
 
@@ -84,11 +90,11 @@ def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
     }
 
 
-def _margin(margin: Delays) -> Summary:
+def _margin(margin: Delays) -> Mapping[str, object]:
     return margin._asdict() | {"resolution": margin.resolution}
 
 
-def _condition(c: Condition) -> Summary:
+def _condition(c: Condition) -> Mapping[str, object]:
     return dataclasses.asdict(c) | {"margin": c.margin}
 
 

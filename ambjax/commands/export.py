@@ -5,7 +5,7 @@ import dataclasses
 import hashlib
 import pathlib
 import re
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from ambjax.cases.reader import Case, read_case
 from ambjax.commands.outputs import directory, files, say, spare, table, write_json, written
 from ambjax.commands.warnings import print_warnings
+from ambjax.control.cascade import Cascade
 from ambjax.control.guard import guarded
 from ambjax.ensemble.spread import ends
 from ambjax.export import machine, package, texts, verify
@@ -21,7 +22,7 @@ from ambjax.export.source import Origin
 from ambjax.export.statements import PRECISIONS, RESERVED
 from ambjax.export.twins import LoopCase
 
-Summary = dict[str, Any]
+Summary = dict[str, object]
 # Files that --verify adds to the package.
 VERIFIED = ("verify.md", "verify.json")
 # Names of the standard C headers, which a prefix must not repeat: the package contains PREFIX.h.
@@ -104,7 +105,7 @@ def _print(out: pathlib.Path, sources: dict[str, str], checks: list[verify.Check
     written(out, ", ".join([*sources, *(VERIFIED if checks else ())]))
 
 
-def guarded_for(case: Case) -> Any:
+def guarded_for(case: Case) -> Cascade:
     """Return the cascade of a case with guard limits wide enough for the sensor at both ends of every spread."""
     widest = ends(case.spread, case.cascade, case.scenario, ("sensor.", "run.clearance", "plant.s_0"))[1]
     cascade = guarded(case.cascade, widest, float(case.clock.sample_period))

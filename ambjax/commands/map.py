@@ -3,6 +3,8 @@
 import argparse
 import itertools
 import math
+import pathlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,8 +15,8 @@ from ambjax.commands.ensemble import study_of
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.intervals import wilson
-from ambjax.ensemble.maps import GRIDS, PERIOD, SURE, Axis, Map, grid, stepped
-from ambjax.ensemble.paths import places
+from ambjax.ensemble.maps import CERTAIN, GRIDS, PERIOD, Axis, Map, grid, stepped
+from ambjax.ensemble.paths import Place, places
 from ambjax.numerics.records import numbers, within
 
 WRITTEN = ("map.png", "map.json")
@@ -25,7 +27,7 @@ MOST_TOTAL = 10_000_000_000
 FORM = "PATH=LOW:HIGH[:COUNT][:log], as in initial.z=-1e-3:1e-3:41 or plant.m=-20%:20%"
 
 
-def run(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     """Simulate the cells of a map for each case and write map.png and map.json."""
     cases = [read_with_warnings(path) for path in [args.case, *(args.against or [])]]
     studies = [study_of(case, args.seed, args.members) for case in cases]
@@ -113,7 +115,7 @@ def _check_samples(case: Case, x: Axis, y: Axis, members: int) -> None:
             )
 
 
-def _nominal(place: Any) -> float | None:
+def _nominal(place: Place | None) -> float | None:
     return None if place is None or place.value is None else float(place.value)
 
 
@@ -125,7 +127,7 @@ def _value(text: str, nominal: float | None) -> float:
     return nominal * (1 + float(text[:-1]) / 100)
 
 
-def _summary(case: Case, one: Map) -> dict[str, Any]:
+def _summary(case: Case, one: Map) -> Mapping[str, object]:
     facts: dict[str, Any] = {"case": case.name, "x": one.x._asdict(), "y": one.y._asdict()}
     return facts | {key: getattr(one, key) for key in (*GRIDS, "members", "drawn", "decisive")} | {"reach": one.reach()}
 
@@ -137,11 +139,11 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
         reach = one.reach()
         held = "nowhere" if reach is None else f"{reach[0]:.4g} to {reach[1]:.4g}"
         cells = [f"{100 * share:.1f} %" for share in (one.survival.mean(), np.mean(one.survival == 1))]
-        cells += [f"{100 * np.mean(one.low >= SURE):.1f} %" if one.decisive else "-"] * sure
+        cells += [f"{100 * np.mean(one.low >= CERTAIN):.1f} %" if one.decisive else "-"] * sure
         rows.append((case.name, *cells, held))
         lines += [f"{case.name}: {_spread_words(one)}"]
         if not one.decisive:
-            lines += [f"{case.name}: {_unsure(one)}"]
+            lines += [f"{case.name}: {_confidence_note(one)}"]
         if one.stalled.any():
             many, lost = int(one.stalled.sum()), int(one.lost.sum())
             where = f"in {np.count_nonzero(one.stalled)} cells"
@@ -150,17 +152,17 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
         "case",
         "runs that survive",
         "cells in which all survive",
-        *[f"cells above {100 * SURE:g} % with confidence"] * sure,
+        *[f"cells above {100 * CERTAIN:g} % with confidence"] * sure,
     ]
     head = f"{first.x.path} survived at {first.y.path} = {first.y.values[first.middle]:.3g}"
     return "\n".join([table([*header, head], rows), *lines])
 
 
-def _unsure(one: Map) -> str:
+def _confidence_note(one: Map) -> str:
     """Explain why a map gives no confidence statement for its cells."""
     if not one.varied:
         return "without noise and [spread], all runs of a cell are the same, and one decides it"
-    enough = next(n for n in itertools.count(1) if wilson(n, n).low >= SURE)
+    enough = next(n for n in itertools.count(1) if wilson(n, n).low >= CERTAIN)
     runs = f"{one.members} run{'s' * (one.members > 1)} a cell"
     return f"{runs}: too few for a confidence statement about a cell; give --members {enough} or more"
 
@@ -170,7 +172,7 @@ def _spread_words(one: Map) -> str:
     return f"drawn for each member: {', '.join(one.drawn)}" if one.drawn else "nominal: no quantity is drawn"
 
 
-def _draw(cases: list[Case], maps: list[Map], path: Any) -> None:
+def _draw(cases: list[Case], maps: list[Map], path: pathlib.Path) -> None:
     from ambjax.pictures import heatmaps
 
     panels = [

@@ -28,7 +28,7 @@ def directory(out: str | None, name: str, names: Iterable[str] = ()) -> pathlib.
     folder with one of `names`, which the command writes as files.
     """
     path = target(out, name)
-    while out is None and not _made(path):  # another run has made it meanwhile
+    while out is None and not _make_new(path):  # another run has made it meanwhile
         path = target(out, name)
     for file in (MANIFEST, RESULT):
         with _refusal(path):
@@ -48,11 +48,10 @@ def check_places(out: pathlib.Path, names: Iterable[str | pathlib.PurePath]) -> 
         ]
         if blocking:
             raise ValueError(
-                f"--out {out}: {blocking[0]} is there already and is not a folder. "
-                "Move it, or choose another directory."
+                f"--out {out}: {blocking[0]} exists and is not a folder. Move it, or choose another directory."
             )
         if (out / name).is_dir() and not (out / name).is_symlink():
-            raise ValueError(f"--out {out}: {name} is a folder there. Move it, or choose another directory.")
+            raise ValueError(f"--out {out}: {name} exists and is a folder. Move it, or choose another directory.")
 
 
 def spare(out: pathlib.Path, names: Iterable[str], mark: str) -> None:
@@ -60,7 +59,7 @@ def spare(out: pathlib.Path, names: Iterable[str], mark: str) -> None:
     for name in names:
         if os.path.lexists(out / name) and not _holds(out / name, mark):
             raise ValueError(
-                f"--out {out}: {name} is there already, is not from an export with the same prefix, and would be "
+                f"--out {out}: {name} exists, is not from an export with the same prefix, and would be "
                 "overwritten. Choose another directory, or move the file."
             )
 
@@ -87,7 +86,7 @@ def target(out: str | None, name: str) -> pathlib.Path:
     return next(p for p in candidates if not os.path.lexists(p))
 
 
-def _made(path: pathlib.Path) -> bool:
+def _make_new(path: pathlib.Path) -> bool:
     """Make a new directory. Return False if it exists already. Raises ValueError if it cannot be made."""
     with _refusal(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -139,7 +138,7 @@ def _refusal(out: pathlib.Path) -> Iterator[None]:
         raise ValueError(f"--out {out}: cannot write there ({why}). Free space, or choose another directory.") from None
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Return a value as JSON can represent it: arrays as lists, infinities and NaN as null."""
     if isinstance(value, dict):
         return {k: plain(v) for k, v in value.items()}
@@ -150,7 +149,7 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def write_json(path: pathlib.Path, value: Any) -> None:
+def write_json(path: pathlib.Path, value: object) -> None:
     """Write a JSON file."""
     path.write_text(json.dumps(plain(value), indent=2) + "\n", encoding="utf-8")
 

@@ -12,8 +12,8 @@ from ambjax.commands.outputs import say
 from ambjax.ensemble.batching import cores
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
-from ambjax.simulation.integrate import AdaptiveRodas3
 from ambjax.simulation.method import TOLERANCE
+from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.sliding import slides
 
 # Target duration of a chunk, s: the work lost by an interruption, and the interval of the progress bar.
@@ -63,7 +63,7 @@ def pilot(study: Study) -> tuple[dict[str, np.ndarray], float]:
     return {name: np.asarray(x) for name, x in columns.items()}, time.perf_counter() - began
 
 
-def say_how_long(study: Study, pace: Pace) -> None:
+def print_estimate(study: Study, pace: Pace) -> None:
     """Print the expected duration of a longer run, and suggest the sliding step if it applies."""
     seconds = study.members / pace.whole
     if seconds < SHORT:

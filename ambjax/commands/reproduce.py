@@ -7,7 +7,6 @@ import pathlib
 import time
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
-from typing import Any
 
 from tqdm import tqdm
 
@@ -18,7 +17,7 @@ from ambjax.paper import ledger
 from ambjax.paper.evidence import Evidence, gather
 from ambjax.pictures import figures
 
-Summary = dict[str, Any]
+Summary = dict[str, object]
 # Labels of the tuned readings in readings.png.
 SHOWN_AS: dict[str, str] = {"tuned": "tuned in continuous time", "sampled": "tuned for the processor"}
 

@@ -18,7 +18,7 @@ from ambjax.host.words import command
 from ambjax.simulation.metrics import standard_for
 from ambjax.simulation.rollout import Outcome
 
-Summary = dict[str, Any]
+Summary = dict[str, object]
 WRITTEN = ("trajectory.npz", "metrics.json", "overview.png")
 
 

@@ -28,7 +28,9 @@ def read_with_warnings(path: str | pathlib.Path) -> Case:
 
 
 def print_warnings(case: Case, path: str | pathlib.Path) -> None:
-    """Print the warnings of a case on stderr, one line each."""
+    """Print the laws of one's own and the warnings of a case on stderr, one line each."""
+    for law in case.own_laws:
+        say(one_line(f"{path}: {law}"))
     for warning in warnings_of(case):
         say(one_line(f"{path}: {warning}"))
 

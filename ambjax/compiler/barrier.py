@@ -24,7 +24,7 @@ def compiled_alone(function: Callable[..., Result]) -> Callable[..., Result]:
     inner = jax.jit(function)
 
     @functools.wraps(function)
-    def call(*args: Any) -> Result:
+    def call(*args: object) -> Result:
         if jax.default_backend() != "cpu":
             return function(*args)
         from jax.experimental.xla_metadata import set_xla_metadata
@@ -46,7 +46,7 @@ def _kept_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arr
     return _barrier(*primals), _barrier(*tangents)
 
 
-def materialised(tree: Result, beside: Any = ()) -> Result:
+def materialised(tree: Result, beside: object = ()) -> Result:
     """Return the same values, with the same derivatives, stored in memory.
 
     Otherwise XLA computes an intermediate value and its derivatives again in every loop that uses it. Leaves of

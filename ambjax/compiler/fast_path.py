@@ -13,7 +13,7 @@ import logging
 import os
 import pathlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,14 +25,16 @@ log = logging.getLogger(__name__)
 MARK = {"inlineable": "false", "xla_cpu_small_call": "true"}
 WIDE = {"xla_cpu_prefer_vector_width": 512}
 
+Result = TypeVar("Result")
 
-def _mark(tree: Any) -> Any:
+
+def _mark(tree: object) -> Any:
     from jax.experimental.xla_metadata import set_xla_metadata
 
     return set_xla_metadata(tree, **MARK)
 
 
-def one_kernel(function: Callable[..., Any], static_argnames: tuple[str, ...] = ()) -> Callable[..., Any]:
+def one_kernel(function: Callable[..., Result], static_argnames: tuple[str, ...] = ()) -> Callable[..., Result]:
     """Return jit(`function`), compiled as one kernel if that is possible.
 
     Only an outermost call is marked. Inside another jit, grad or vmap the function is compiled as a part of that
@@ -49,14 +51,14 @@ def one_kernel(function: Callable[..., Any], static_argnames: tuple[str, ...] = 
     shapes_of = lambda leaves: tuple(map(jnp.shape, leaves))  # noqa: E731
 
     @functools.cache
-    def outermost() -> Callable[..., Any]:
-        def marked(*args: Any, **static: Any) -> Any:
+    def outermost() -> Callable[..., Result]:
+        def marked(*args: object, **static: object) -> Result:
             return _mark(inner(*args, **static))
 
         return jax.jit(marked, static_argnames=static_argnames, compiler_options=options())
 
     @functools.wraps(function)
-    def call(*args: Any, **static: Any) -> Any:
+    def call(*args: object, **static: object) -> Result:
         leaves = jax.tree.leaves(args)
         if any(isinstance(x, Tracer) for x in leaves) or options() is None:
             return inner(*args, **static)
@@ -123,7 +125,7 @@ def _probe(trial: dict[str, Any]) -> str:
     lanes for vectors and a remainder, and compares the result with NumPy's.
     """
 
-    def body(_: Any, y: jax.Array) -> jax.Array:
+    def body(_: object, y: jax.Array) -> jax.Array:
         return _step(y, jnp)
 
     def expected(y: np.ndarray) -> np.ndarray:

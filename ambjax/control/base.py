@@ -44,7 +44,7 @@ class Law:
     stiff: ClassVar[bool] = False
     slides: ClassVar[bool] = False
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
+    def __init_subclass__(cls, **kwargs: object) -> None:
         super().__init_subclass__(**kwargs)
         written = vars(cls)
         if "step" in written and "own_steps" not in written:
@@ -58,7 +58,7 @@ class Law:
         """
         return None
 
-    def layer(self, model: Plant) -> Any:
+    def layer(self, model: Plant) -> object:
         """Return, for each state, the largest integration error that keeps it inside the layer of a smoothed sign."""
         scale: Any = self
         return jax.tree.map(lambda _: jnp.inf, scale.scale(model))
@@ -79,12 +79,12 @@ class Law:
         """Return the largest rate (1/s) of the terms that the implicit `step` treats explicitly."""
         return 0.0
 
-    def init_sampled(self, model: Plant) -> Any:
+    def init_sampled(self, model: Plant) -> object:
         """Return the state at t = 0 on a processor; not used for observers."""
         law: Any = self
         return law.init(model)
 
-    def scale_sampled(self, model: Plant) -> Any:
+    def scale_sampled(self, model: Plant) -> object:
         """Return the characteristic size of each number of the state on a processor."""
         law: Any = self
         return law.scale(model)
@@ -113,7 +113,7 @@ def _steepnesses(law: Law) -> list[str]:
     return [field.name for field in dataclasses.fields(fields) if field.metadata.get("steepness")]
 
 
-def memory_of(law: Law, state: Any) -> list[tuple[str, str, str]]:
+def memory_of(law: Law, state: object) -> list[tuple[str, str, str]]:
     """Return name, unit and meaning of each leaf of a law's state."""
     if law.memory is not None:
         return list(law.memory)

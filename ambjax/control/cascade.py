@@ -34,10 +34,10 @@ from ambjax.world.signals import Reference
 class CascadeState(NamedTuple):
     """The state of each law, or its rate."""
 
-    observer: State
-    position: State
-    inversion: State
-    current: State
+    observer: Any
+    position: Any
+    inversion: Any
+    current: Any
 
 
 class Command(NamedTuple):
@@ -134,7 +134,9 @@ class Cascade:
         observer estimates the velocity, the derivative is taken along the estimate.
         """
 
-        def wanted(reference: Reference, z: Array, z_dot: Array, observed: State, positioned: State):
+        def wanted(
+            reference: Reference, z: Array, z_dot: Array, observed: object, positioned: object
+        ) -> tuple[tuple[Array, Array], tuple[Measurement, object, object]]:
             estimate, observed_rate = self.observer(self.model, Measurement(z, z_dot, measured.i), observed)
             if self.observer.estimates_velocity:
                 # XLA aborts when it compiles a one-kernel rollout (`compiler.fast_path`) in which z_dot is unused
@@ -207,7 +209,9 @@ class Cascade:
         """
         advance = self._advance(sample)
 
-        def wanted(reference: Reference, z: Array, z_dot: Array, observed: State, positioned: State):
+        def wanted(
+            reference: Reference, z: Array, z_dot: Array, observed: object, positioned: object
+        ) -> tuple[tuple[Array, Array], tuple[Measurement, Measurement, object, object]]:
             estimate, observed, now = self.estimate(Measurement(z, z_dot, measured.i), observed, sample)
             v_star, positioned = advance(self.position, (estimate, reference), positioned)
             return (estimate.z, v_star), (now, estimate, observed, positioned)
@@ -246,7 +250,12 @@ class Cascade:
 
 
 def _rates(
-    law: Any, estimate: Measurement, z_ddot: Array, reference: Reference, state: State, rate: State
+    law: Callable[..., tuple[Array, State]],
+    estimate: Measurement,
+    z_ddot: Array,
+    reference: Reference,
+    state: State,
+    rate: State,
 ) -> tuple[Array, Array]:
     """Return the rates of z and v_star along an estimate that moves with its own velocity and with z_ddot."""
 

@@ -16,7 +16,7 @@ from ambjax.world.plant import Plant
 
 
 @record
-class SlidingMode(CurrentLaw):
+class SlidingMode(CurrentLaw[tuple[()]]):
     """u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - k_i sgn(i - i_ref)) + R i. Eq. (11), sgn smoothed."""
 
     k_i: Scalar = gain(default=152.0, unit="A/s", doc="switching gain; above the disturbance bound Q_i")
@@ -69,7 +69,7 @@ class SlidingMode(CurrentLaw):
 
 
 @record
-class ProportionalIntegral(CurrentLaw):
+class ProportionalIntegral(CurrentLaw[Array]):
     """u = k_p (i_ref - i) + L i_ref' + x, x' = k_int (i_ref - i) + k_aw (clip(u) - u): x in V.
 
     The linear baseline: the inductance is that at z = 0, and there is no motional term. While the supply limits u,

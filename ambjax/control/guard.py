@@ -35,7 +35,7 @@ class Watch(NamedTuple):
     left: Array
 
 
-class Judged(NamedTuple):
+class GuardResult(NamedTuple):
     """Result of the guard at a sample.
 
     `reading`: the readings that the laws receive. `refused`: whether a reading was refused. `steps`: whether the laws
@@ -60,7 +60,7 @@ class Guard:
     z_dot: Scalar | None = _limit("m/s", "largest |z_dot|; none: two gaps in a sample, 2 s_0/T")
     i: Scalar | None = _limit("A", "largest |i|; none: 100 i_0")
     noise: Scalar | None = _limit(
-        "m", "by which two readings of one z may differ; none: 13.6 sensor.std and a step of the converter", 0
+        "m", "largest difference of two readings of one z; none: 13.6 sensor.std and a step of the converter", 0
     )
     speed: Scalar | None = _limit(
         "m/s",
@@ -108,7 +108,7 @@ class Guard:
         zero = jnp.zeros(())
         return Watch(Measurement(zero, zero, zero), zero)
 
-    def judged(self, model: Plant, measured: Measurement, watch: Watch, period: Scalar, estimated: bool) -> Judged:
+    def check(self, model: Plant, measured: Measurement, watch: Watch, period: Scalar, estimated: bool) -> GuardResult:
         """Accept or replace the readings of a sample. `period`: s."""
         guard: Any = self  # settled
         (z, _, i), time = watch.expected, (guard.samples - watch.left + 1) * period
@@ -124,7 +124,7 @@ class Guard:
         good = fine.z & fine.z_dot & fine.i
         left = jnp.where(good, jnp.asarray(guard.samples), jnp.maximum(watch.left - 1, 0.0))
         reading = Measurement(*(jnp.where(ok, x, y) for ok, x, y in zip(fine, measured, watch.expected, strict=True)))
-        return Judged(reading, ~good, good | (watch.left > 0), left)
+        return GuardResult(reading, ~good, good | (watch.left > 0), left)
 
     def refused(self, before: Watch, after: Watch) -> tuple[Array, Array]:
         """Return whether the sample between two states refused a reading, and whether it gave the safe command."""

@@ -1,5 +1,8 @@
 """Inversion laws: the reference current for a demanded force."""
 
+import abc
+import dataclasses
+import functools
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -12,8 +15,7 @@ from ambjax.control.laws import CurrentDemand, ForceDemand, InversionLaw, Relaxa
 from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, SearchContext, steepness
 from ambjax.numerics.records import Scalar, gain, leaf, record
-from ambjax.numerics.relax import relax
-from ambjax.numerics.relaxation import relaxation
+from ambjax.numerics.relax import relax, relaxation
 from ambjax.numerics.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
 from ambjax.world.plant import Plant
 
@@ -29,7 +31,7 @@ def v_and_gradient(model: Plant, inputs: ForceDemand, i_ref: Array) -> tuple[Arr
 
 
 @record
-class Adaptive(InversionLaw):
+class Adaptive(InversionLaw[Array]):
     """i_ref' = gamma sgn(v_star - v(z, i_ref)) / (dv/di)(z, i_ref), with i_ref as its state. Eq. (6), sgn smoothed.
 
     Deviation: the default gamma is 7.5e4; the printed 1000 violates the paper's own Eq. (7).
@@ -48,6 +50,9 @@ class Adaptive(InversionLaw):
 
     def init(self, model: Plant) -> Array:
         return jnp.asarray(self.i_ref)
+
+    def started(self, i_ref: Array) -> "Adaptive":
+        return dataclasses.replace(self, i_ref=i_ref)
 
     def scale(self, model: Plant) -> Scalar:
         return model.i_0 / 25
@@ -99,49 +104,76 @@ class Adaptive(InversionLaw):
         return CurrentDemand(state, (after - state) * (1 / period)), after
 
 
-class Held(NamedTuple):
-    """State of `ClosedForm` on a processor: i_ref (A), and a flag that is 0 before the first sample and 1 after it."""
+class StaticInversionState(NamedTuple):
+    """State of a static inversion on a processor: i_ref (A), and a flag that is 0 before the first sample, then 1."""
 
     i_ref: Array
     begun: Array
 
 
-@record
-class ClosedForm(InversionLaw):
-    """Static inversion: i_ref is the root of v(z, i_ref) = v_star that is continuous at i = 0, with its exact rate.
+class StaticInversion(InversionLaw[tuple[()]]):
+    """Base class of a law whose i_ref is a function of z and v_star, with its exact rate; no state in continuous time.
 
-    The paper argues against this law (Mouille and Lottin 1992): it is exact on a known plant, but passes every jump of
-    v_star, such as noise, directly to i_ref. It has no state in continuous time.
-
-    On a processor it equals the adaptive law with gamma = inf. The root computed at a sample is the i_ref of the next
-    sample, and i_ref' moves i_ref there in one period. Without this state the current law would correct the step of
-    i_ref that i_ref' has already commanded.
+    On a processor, the i_ref computed at a sample is the i_ref of the next sample, and i_ref' moves i_ref there in one
+    period. Without this state the current law would correct the step of i_ref that i_ref' has already commanded.
     """
 
     own_steps = ("implicit", "explicit")
     memory = (("i_ref", "A", "current reference of the next sample"), ("begun", "1", "1 after the first sample"))
 
+    @abc.abstractmethod
+    def inverse(self, model: Plant, z: Array, v_star: Array) -> Array:
+        """Return the current (A) for a position and a demanded force."""
+
     def init(self, model: Plant) -> tuple[()]:
         return ()
 
-    def init_sampled(self, model: Plant) -> Held:
-        return Held(jnp.zeros(()), jnp.zeros(()))
+    def init_sampled(self, model: Plant) -> StaticInversionState:
+        return StaticInversionState(jnp.zeros(()), jnp.zeros(()))
 
     def scale(self, model: Plant) -> tuple[()]:
         return ()
 
-    def scale_sampled(self, model: Plant) -> Held:
-        return Held(jnp.asarray(model.i_0 / 25), jnp.ones(()))
+    def scale_sampled(self, model: Plant) -> StaticInversionState:
+        return StaticInversionState(jnp.asarray(model.i_0 / 25), jnp.ones(()))
 
     def slope(self, model: Plant) -> Scalar:
         return 0.0
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: tuple[()]) -> tuple[CurrentDemand, tuple[()]]:
         at, along = (inputs.z, inputs.v_star), (inputs.z_rate, inputs.v_star_rate)
-        return CurrentDemand(*jax.jvp(model.current_for, at, along)), ()
+        return CurrentDemand(*jax.jvp(functools.partial(self.inverse, model), at, along)), ()
 
-    def step(self, model: Plant, inputs: ForceDemand, state: Held, period: Scalar) -> tuple[CurrentDemand, Held]:
-        """Return the last sample's i_ref and the rate to the root of this one; the first sample uses its own root."""
-        after = model.current_for(inputs.z, inputs.v_star)
+    def step(
+        self, model: Plant, inputs: ForceDemand, state: StaticInversionState, period: Scalar
+    ) -> tuple[CurrentDemand, StaticInversionState]:
+        """Return the last sample's i_ref and the rate to the one of this sample; the first sample uses its own."""
+        after = self.inverse(model, inputs.z, inputs.v_star)
         i_ref = jnp.where(state.begun > 0.5, state.i_ref, after)
-        return CurrentDemand(i_ref, (after - i_ref) * (1 / period)), Held(after, jnp.ones(()))
+        return CurrentDemand(i_ref, (after - i_ref) * (1 / period)), StaticInversionState(after, jnp.ones(()))
+
+
+@record
+class ClosedForm(StaticInversion):
+    """Static inversion: i_ref is the root of v(z, i_ref) = v_star that is continuous at i = 0, with its exact rate.
+
+    The paper argues against this law (Mouille and Lottin 1992): it is exact on a known plant, but passes every jump of
+    v_star, such as noise, directly to i_ref. It has no state in continuous time. On a processor it equals the adaptive
+    law with gamma = inf.
+    """
+
+    def inverse(self, model: Plant, z: Array, v_star: Array) -> Array:
+        return model.current_for(z, v_star)
+
+
+@record
+class Linearised(StaticInversion):
+    """i_ref = (v_star - (dv/dz) z)/(dv/di), both derivatives at z = 0, i = 0: the textbook's linear magnet.
+
+    In forces: i = (F + k_s z)/k_i, with the negative stiffness k_s and the force-current factor k_i (Schweitzer and
+    Maslen, Magnetic Bearings, 2009, 2.1). With position.PID it is the loop of the textbook. The inversion error v_tilde
+    is zero at z = 0, and for v_star = 0 at every z; elsewhere it is of third order in z and v_star.
+    """
+
+    def inverse(self, model: Plant, z: Array, v_star: Array) -> Array:
+        return (v_star - model.dv_dz(0.0, 0.0) * z) / model.dv_di(0.0, 0.0)

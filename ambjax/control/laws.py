@@ -13,7 +13,7 @@ add a row to `KINDS` of the case-file reader, and add a row to the conformance t
 """
 
 import abc
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 from jax import Array
@@ -25,7 +25,8 @@ from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 
-State = Any
+# State of a law: any pytree of scalars; () if the law has none.
+State = TypeVar("State")
 
 
 class ForceDemand(NamedTuple):
@@ -71,14 +72,18 @@ class Relaxation(NamedTuple):
     v_tilde: tuple[Array, Array, Array]
 
 
-class Observer(Law, abc.ABC):
+class Observer(Law, Generic[State], abc.ABC):
     """Base class of an observer, which returns the estimated motion for a measurement."""
 
     @abc.abstractmethod
     def init(self, model: Plant, measured: Measurement) -> State: ...
 
+    def started(self) -> "Observer":
+        """Return the observer with its estimate starting at the measurement; itself if no field sets it."""
+        return self
+
     @abc.abstractmethod
-    def scale(self, model: Plant) -> State: ...
+    def scale(self, model: Plant) -> object: ...
 
     @abc.abstractmethod
     def slope(self, model: Plant) -> Scalar: ...
@@ -87,14 +92,14 @@ class Observer(Law, abc.ABC):
     def __call__(self, model: Plant, inputs: Measurement, state: State, /) -> tuple[Measurement, State]: ...
 
 
-class PositionLaw(Law, abc.ABC):
+class PositionLaw(Law, Generic[State], abc.ABC):
     """Base class of a position law, which returns the scaled force v_star (A^2/m^2) for an estimate and a reference."""
 
     @abc.abstractmethod
     def init(self, model: Plant) -> State: ...
 
     @abc.abstractmethod
-    def scale(self, model: Plant) -> State: ...
+    def scale(self, model: Plant) -> object: ...
 
     @abc.abstractmethod
     def slope(self, model: Plant) -> Scalar: ...
@@ -106,14 +111,18 @@ class PositionLaw(Law, abc.ABC):
     def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: State, /) -> tuple[Array, State]: ...
 
 
-class InversionLaw(Law, abc.ABC):
+class InversionLaw(Law, Generic[State], abc.ABC):
     """Base class of an inversion law, which returns the demanded current for a demanded force."""
 
     @abc.abstractmethod
     def init(self, model: Plant) -> State: ...
 
+    def started(self, i_ref: Array) -> "InversionLaw":
+        """Return the law with its reference current starting at i_ref (A); the law itself if no field sets it."""
+        return self
+
     @abc.abstractmethod
-    def scale(self, model: Plant) -> State: ...
+    def scale(self, model: Plant) -> object: ...
 
     @abc.abstractmethod
     def slope(self, model: Plant) -> Scalar: ...
@@ -122,14 +131,14 @@ class InversionLaw(Law, abc.ABC):
     def __call__(self, model: Plant, inputs: ForceDemand, state: State, /) -> tuple[CurrentDemand, State]: ...
 
 
-class CurrentLaw(Law, abc.ABC):
+class CurrentLaw(Law, Generic[State], abc.ABC):
     """Base class of a current law, which returns the voltage u (V) for a demanded current."""
 
     @abc.abstractmethod
     def init(self, model: Plant) -> State: ...
 
     @abc.abstractmethod
-    def scale(self, model: Plant) -> State: ...
+    def scale(self, model: Plant) -> object: ...
 
     @abc.abstractmethod
     def slope(self, model: Plant) -> Scalar: ...
@@ -147,7 +156,9 @@ STAGES: dict[str, type[Law]] = {
 }
 
 
-def stepped(law: Law, inputs: Any, state: State, *, model: Plant, period: Scalar, implicit: bool) -> tuple[Any, State]:
+def stepped(
+    law: Law, inputs: object, state: State, *, model: Plant, period: Scalar, implicit: bool
+) -> tuple[Any, State]:
     """Return the output of a law at a sample and its next state, by its own `step` or else by explicit Euler."""
     with jax.named_scope(f"law:{type(law).__module__.rpartition('.')[2]}.{type(law).__qualname__}"):
         if law.has_own_step(implicit):

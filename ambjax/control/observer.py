@@ -1,27 +1,21 @@
 """Observers: the estimate of the rotor's motion that the other laws use."""
 
-from typing import Any, ClassVar, NamedTuple
+import dataclasses
+from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.control.exact import DERIVATIVES, ExactDifferentiator
 from ambjax.control.laws import Observer
 from ambjax.control.search import Interval, SearchContext, rate
-from ambjax.numerics import differentiator
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
 
-# States of a differentiator.
-DERIVATIVES = (
-    ("z", "m", "position after the last sample"),
-    ("z_dot", "m/s", "its rate"),
-    ("z_ddot", "m/s^2", "its second derivative"),
-)
-
 
 @record
-class Direct(Observer):
+class Direct(Observer[tuple[()]]):
     """The measurement itself, as in the paper."""
 
     def init(self, model: Plant, measured: Measurement) -> tuple[()]:
@@ -38,7 +32,7 @@ class Direct(Observer):
 
 
 @record
-class Complementary(Observer):
+class Complementary(Observer[Array]):
     """Complementary filter: z_hat' = z_dot + l (z_measured - z_hat).
 
     The estimate integrates the velocity and follows the position slowly: it low-passes noise of the position sensor at
@@ -59,6 +53,9 @@ class Complementary(Observer):
     def init(self, model: Plant, measured: Measurement) -> Array:
         return jnp.asarray(measured.z if self.z_hat is None else self.z_hat)
 
+    def started(self) -> "Complementary":
+        return dataclasses.replace(self, z_hat=None)
+
     def scale(self, model: Plant) -> Scalar:
         return model.s_0 / 50
 
@@ -73,7 +70,7 @@ class Complementary(Observer):
 
 
 @record
-class Difference(Observer):
+class Difference(Observer[Array]):
     """Filtered difference: z_dot = w (z - z_f), z_f' = w (z - z_f). The position z is not filtered.
 
     On a processor: the backward difference (z_n - z_{n-1})/T through a low-pass with the pole exp(-w T). It is exact on
@@ -120,7 +117,7 @@ class Predicted(NamedTuple):
 
 
 @record
-class Kalman(Observer):
+class Kalman(Observer[Predicted]):
     """Steady-state Kalman filter of the nominal model, driven by the measured current, with an unknown disturbance.
 
     z_hat' = z_dot_hat + 3 w e, z_dot_hat' = z_ddot(z, i) + d_hat + 3 w^2 e, d_hat' = w^3 e, e = z - z_hat, with Eq. (1)
@@ -182,7 +179,7 @@ class Kalman(Observer):
 
 
 @record
-class IRED1(Observer):
+class IRED1(ExactDifferentiator):
     """Robust exact differentiator of order 1: z_dot is exact where |z_ddot| <= L. Implicit on a processor.
 
     `ambjax.numerics.differentiator` has the equations. The position z is not filtered. In continuous time the sign is
@@ -190,86 +187,14 @@ class IRED1(Observer):
     """
 
     L: Scalar = gain(default=50.0, unit="m/s^2", doc="bound on the acceleration")
-    estimates_velocity: ClassVar[bool] = True
+    order: ClassVar[int] = 1
     memory = DERIVATIVES[:2]
-
-    def init(self, model: Plant, measured: Measurement) -> tuple[Array, ...]:
-        return jnp.asarray(measured.z), jnp.zeros(())
-
-    def scale(self, model: Plant) -> tuple[Scalar, ...]:
-        return differentiator_scale(model)[:2]
-
-    def slope(self, model: Plant) -> Scalar:
-        return differentiator.slope(1, self.L, _width(model))
-
-    def layer(self, model: Plant) -> tuple[Scalar, ...]:
-        return 0.3 * _width(model), jnp.inf
-
-    def __call__(self, model: Plant, inputs: Measurement, state: Any) -> tuple[Measurement, Any]:
-        return _smooth(self.L, model, inputs, state)
-
-    def step(self, model: Plant, inputs: Measurement, state: Any, period: Scalar) -> tuple[Measurement, Any]:
-        """Update the estimate with this sample."""
-        return _implicit(self.L, inputs, state, period)
-
-    def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        return {"L": _bound(context, 2)}
 
 
 @record
-class IRED2(Observer):
+class IRED2(ExactDifferentiator):
     """Robust exact differentiator of order 2: as `IRED1`, exact where the rate of the acceleration is bounded by L."""
 
     L: Scalar = gain(default=3e4, unit="m/s^3", doc="bound on the rate of the acceleration")
-    estimates_velocity: ClassVar[bool] = True
+    order: ClassVar[int] = 2
     memory = DERIVATIVES
-
-    def init(self, model: Plant, measured: Measurement) -> tuple[Array, ...]:
-        return jnp.asarray(measured.z), jnp.zeros(()), jnp.zeros(())
-
-    def scale(self, model: Plant) -> tuple[Scalar, ...]:
-        return differentiator_scale(model)
-
-    def slope(self, model: Plant) -> Scalar:
-        return differentiator.slope(2, self.L, _width(model))
-
-    def layer(self, model: Plant) -> tuple[Scalar, ...]:
-        return 0.3 * _width(model), jnp.inf, jnp.inf
-
-    def __call__(self, model: Plant, inputs: Measurement, state: Any) -> tuple[Measurement, Any]:
-        return _smooth(self.L, model, inputs, state)
-
-    def step(self, model: Plant, inputs: Measurement, state: Any, period: Scalar) -> tuple[Measurement, Any]:
-        """Update the estimate with this sample."""
-        return _implicit(self.L, inputs, state, period)
-
-    def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        return {"L": _bound(context, 3)}
-
-
-# Width of the smoothed sign of a differentiator in continuous time, as a share of the gap.
-WIDTH = 1e-6
-
-
-def _width(model: Plant) -> Scalar:
-    return WIDTH * model.s_0
-
-
-def _smooth(L: Scalar, model: Plant, inputs: Measurement, state: Any) -> tuple[Measurement, Any]:
-    return inputs._replace(z_dot=state[1]), differentiator.smooth_rates(state, inputs.z, L, _width(model))
-
-
-def _implicit(L: Scalar, inputs: Measurement, state: Any, period: Scalar) -> tuple[Measurement, Any]:
-    after = differentiator.implicit_step(state, inputs.z, L, period)
-    return inputs._replace(z_dot=differentiator.velocity(after, period)), after
-
-
-def differentiator_scale(model: Plant) -> tuple[Scalar, Scalar, Scalar]:
-    """Return the characteristic sizes of position (m), velocity (m/s) and acceleration (m/s^2)."""
-    z, z_dot, _ = model.sizes()
-    return z, z_dot, jnp.abs(model.g) / 50 + 1e-3
-
-
-def _bound(context: SearchContext, power: int) -> Interval:
-    words = f"(x w)^{power} s_0, x from 1/10 to 1"
-    return rate(context, 0.1, 1, words, 1 / float(context.model.s_0), power)

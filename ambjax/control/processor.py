@@ -42,7 +42,7 @@ class Processor:
         at_least=0,
         at_most=MOST_DELAY,
         optional=True,
-        doc="delay that the prediction assumes; none: the delay itself",
+        doc="delay that the prediction assumes; none: the actual delay",
     )
     guard: Guard | None = Guard()
     """guard of the readings; None: every reading is accepted"""

@@ -8,6 +8,7 @@ of the set-valued sign give |x| <= T (k + W), implicit steps |x| <= T W (V. Acar
 import math
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from ambjax.numerics.records import Scalar
@@ -62,7 +63,8 @@ def disturbance(relay: Relay, x: np.ndarray, period: float, implicit: bool) -> f
     s_n in -1..1 is the value of the relay's sign at sample n.
     """
     k, p = relay
-    used = share(x[:-1], period * k, p) if implicit else smooth_sign(x[:-1], p)
+    before = jnp.asarray(x[:-1])
+    used = share(before, period * k, p) if implicit else smooth_sign(before, p)
     return float(np.max(np.abs(np.diff(x) / period + k * np.asarray(used)), initial=0.0))
 
 

@@ -7,7 +7,7 @@ import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +19,16 @@ from ambjax.compiler.fast_path import block_bytes, one_kernel
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.metrics import Fold
+from ambjax.simulation.folds import Fold
 from ambjax.simulation.rollout import Outcome, System, prepare, run
 from ambjax.world.scenario import Scenario
 
 MOST_CALL = 4096
 MEMBERS = "members"
+
+# An ensemble, or one of its members, and the result of a function of it.
+Tree = TypeVar("Tree")
+Result = TypeVar("Result")
 
 
 class Parts(NamedTuple):
@@ -60,7 +64,7 @@ def run_ensemble(
 
 
 @functools.cache
-def _rollout(every: int) -> Callable[[Any], Outcome]:
+def _rollout(every: int) -> Callable[[tuple[System, Clock, Fold | None]], Outcome]:
     """Return the rollout of one member. The function is cached, so that it compiles once."""
 
     def one(tree: tuple[System, Clock, Fold | None]) -> Outcome:
@@ -71,14 +75,14 @@ def _rollout(every: int) -> Callable[[Any], Outcome]:
 
 
 def map_members(
-    function: Callable[[Any], Any],
-    tree: Any,
+    function: Callable[[Tree], Result],
+    tree: Tree,
     *,
     threads: int | None = None,
     call: int | None = None,
     block: int | None = None,
     plain: bool = False,
-) -> Any:
+) -> Result:
     """Return function(member) for every member of an ensemble.
 
     Each leaf of `tree` is a number, shared by all members, or an array [N, ...] with one entry per member. At least one
@@ -100,7 +104,7 @@ def map_members(
     return _Engine(function, tree, threads, call, block, plain).results()
 
 
-def size(tree: Any) -> int:
+def size(tree: object) -> int:
     """Return the number of members: the common length of all array leaves.
 
     Raises ValueError if there is no array leaf, or if the lengths differ.
@@ -115,10 +119,18 @@ def size(tree: Any) -> int:
     return lengths.pop()
 
 
-class _Engine:
+class _Engine(Generic[Tree, Result]):
     """One ensemble, split into calls of equal shape, so that the program compiles once."""
 
-    def __init__(self, function: Callable[[Any], Any], tree: Any, threads: Any, call: Any, block: Any, plain: bool):
+    def __init__(
+        self,
+        function: Callable[[Tree], Result],
+        tree: Tree,
+        threads: int | None,
+        call: int | None,
+        block: int | None,
+        plain: bool,
+    ) -> None:
         leaves, self.tree = jax.tree.flatten(tree)
         self.members, self.moves = size(tree), tuple(bool(np.ndim(x)) for x in leaves)
         self.moving = [np.asarray(x) for x in leaves if np.ndim(x)]
@@ -134,7 +146,7 @@ class _Engine:
         self.call = -(-share // unit) * unit
         self.program = _program(len(self.devices), plain)
 
-    def results(self) -> Any:
+    def results(self) -> Result:
         """Run all calls and concatenate their results in member order."""
         starts = range(0, self.members, self.call)
         with ThreadPoolExecutor(min(self.workers, len(starts))) as pool:
@@ -142,7 +154,7 @@ class _Engine:
         whole = jax.tree.map(lambda *xs: np.concatenate(xs), *parts)
         return jax.tree.map(lambda x: x[: self.members], whole)
 
-    def _one(self, start: int) -> Any:
+    def _one(self, start: int) -> Result:
         """Run one call: members from `start` on; the last member is repeated to fill the call."""
         index = np.minimum(np.arange(start, start + self.call), self.members - 1)
         parts = Parts(tuple(x[index] for x in self.moving), self.shared)
@@ -155,10 +167,17 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _blocks(parts: Parts, *, function: Callable[[Any], Any], moves: tuple[bool, ...], tree: Any, block: int) -> Any:
+def _blocks(
+    parts: Parts,
+    *,
+    function: Callable[[Tree], Result],
+    moves: tuple[bool, ...],
+    tree: Any,
+    block: int,
+) -> Result:
     """Run all members of a call: a loop over blocks, with the whole function vectorised over a block."""
 
-    def member(moving: tuple[Array, ...]) -> Any:
+    def member(moving: tuple[Array, ...]) -> Result:
         own, common = iter(moving), iter(parts.shared)
         return function(jax.tree.unflatten(tree, [next(own) if its else next(common) for its in moves]))
 
@@ -182,7 +201,7 @@ def _program(devices: int, plain: bool) -> Callable[..., Any]:
     mesh = Mesh(np.asarray(jax.devices()[:devices]), (MEMBERS,))
     over, everywhere = PartitionSpec(MEMBERS), PartitionSpec()
 
-    def spread(parts: Parts, **static: Any) -> Any:
+    def spread(parts: Parts, **static: object) -> object:
         one = functools.partial(_blocks, **static)
         # Members exchange no data, so the check of replication is not needed, and constants may stay unsharded.
         where = {"mesh": mesh, "in_specs": (Parts(over, everywhere),), "out_specs": over, "check_vma": False}
@@ -191,7 +210,7 @@ def _program(devices: int, plain: bool) -> Callable[..., Any]:
     compiled = jax.jit if plain else one_kernel
     kernel = compiled(spread, static_argnames=STATIC)
 
-    def placed(parts: Parts, **static: Any) -> Any:
+    def placed(parts: Parts, **static: object) -> object:
         moving = jax.device_put(parts.moving, NamedSharding(mesh, over))
         return kernel(Parts(moving, jax.device_put(parts.shared, NamedSharding(mesh, everywhere))), **static)
 

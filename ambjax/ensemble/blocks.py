@@ -4,16 +4,19 @@ A fan chart records a long run at a few instants only. This fold reduces the sam
 to the smallest and largest value of each signal and the total variation of the voltage.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
 
 from ambjax.numerics.records import Scalar, leaf, record, static
-from ambjax.simulation.metrics import Ending
+from ambjax.simulation.folds import Ending
+from ambjax.simulation.span import Span
+from ambjax.simulation.trajectory import Row
 
 # Initial minimum of a block (its negative: initial maximum), before any value is included.
-NEVER = jnp.inf
+NO_VALUE = jnp.inf
 
 
 class BlockValues(NamedTuple):
@@ -56,24 +59,28 @@ class Blocks:
 
     def init(self) -> Carry:
         dtype = jnp.result_type(float)
-        low, high = ({name: jnp.full(self.count, x, dtype) for name in self.of} for x in (NEVER, -NEVER))
+        low, high = ({name: jnp.full(self.count, x, dtype) for name in self.of} for x in (NO_VALUE, -NO_VALUE))
         last = {name: jnp.asarray(jnp.nan, dtype) for name in self.of}
         folded = BlockValues(low, high, jnp.zeros(self.count, dtype), last)
         return Carry(folded, jnp.zeros((), dtype), jnp.asarray(False))
 
-    def update(self, carry: Carry, row: Any, span: Any) -> Carry:
+    def update(self, carry: Carry, row: Row, span: Span) -> Carry:
         sample = jnp.floor(row.t / self.period + 0.5).astype(int)
         block, before = sample // self.every, jnp.maximum(sample - 1, 0) // self.every
         values = {name: getattr(row, name) for name in self.of}
         folded = carry.folded
-        low = {k: _with(folded.low[k], block, jnp.minimum, jnp.where(row.alive, x, NEVER)) for k, x in values.items()}
+        low = {
+            k: _combined(folded.low[k], block, jnp.minimum, jnp.where(row.alive, x, NO_VALUE))
+            for k, x in values.items()
+        }
         high = {
-            k: _with(folded.high[k], block, jnp.maximum, jnp.where(row.alive, x, -NEVER)) for k, x in values.items()
+            k: _combined(folded.high[k], block, jnp.maximum, jnp.where(row.alive, x, -NO_VALUE))
+            for k, x in values.items()
         }
         step = jnp.where(row.alive & carry.alive, jnp.abs(row.u_mean - carry.u_mean), 0.0)
         last = {k: jnp.where(row.alive, x, jnp.nan) for k, x in values.items()}
         return Carry(
-            BlockValues(low, high, _with(folded.variation, before, jnp.add, step), last),
+            BlockValues(low, high, _combined(folded.variation, before, jnp.add, step), last),
             row.u_mean,
             jnp.asarray(row.alive),
         )
@@ -82,6 +89,6 @@ class Blocks:
         return carry.folded
 
 
-def _with(values: Array, at: Array, combine: Any, x: Array) -> Array:
+def _combined(values: Array, at: Array, combine: Callable[[Array, Array], Array], x: Array) -> Array:
     """Return `values` [count] with entry `at` replaced by combine(values[at], x)."""
     return lax.dynamic_update_index_in_dim(values, combine(lax.dynamic_index_in_dim(values, at, 0, False), x), at, 0)

@@ -62,7 +62,7 @@ def shares(x: Sequence[np.ndarray], y: Sequence[np.ndarray], confidence: float =
 
 def drivers(
     spread: Mapping[str, np.ndarray], metrics: Mapping[str, np.ndarray], confidence: float = 0.95
-) -> tuple[dict[str, list[dict[str, Any]]], dict[str, dict[str, Any]]]:
+) -> tuple[dict[str, list[dict[str, object]]], dict[str, dict[str, object]]]:
     """Rank the spread quantities by the share of each metric that they explain, and summarise what is explained.
 
     - `spread`: columns [N] of the spread quantities, by dotted path.
@@ -92,7 +92,7 @@ def drivers(
     return ranking, accounts
 
 
-def _account(alone: float, pair: dict[str, Any] | None, says: str) -> dict[str, Any]:
+def _account(alone: float, pair: dict[str, Any] | None, says: str) -> dict[str, object]:
     return {"alone": alone, "pair": pair, "says": says}
 
 
@@ -101,16 +101,16 @@ def _words(ranks: np.ndarray, alone: float, pair: dict[str, Any] | None, unknown
     if np.ptp(ranks) == 0:
         return "it is the same for all members"
     if unknown:
-        return "too few members differ to tell what drives it"
+        return "too few members differ to identify its drivers"
     if not alone and pair is None:
-        return "nothing that is spread explains it, alone or in pairs: noise"
+        return "no spread quantity or pair explains it: noise"
     together = ""
     if pair is not None:  # the sum of the estimates may exceed 1
         more = 100 * min(pair["share"], 1.0 - alone)
         amount = f"{more:.0f} % more" if more >= 1 else "a little more"
         together = f", and {' with '.join(pair['paths'])} together {amount}"
     left = alone + (0.0 if pair is None else pair["share"]) < 0.995
-    rest = "; the rest is noise, or several acting together" * left
+    rest = "; the rest is noise, or more than two quantities together" * left
     return f"what is spread explains {100 * alone:.0f} % of how members rank, each quantity alone{together}{rest}"
 
 

@@ -8,6 +8,7 @@ random numbers of jax.random are drawn before the kernel starts.
 
 import dataclasses
 import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -19,8 +20,8 @@ from ambjax.ensemble.batching import size
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import RK4
+from ambjax.simulation.folds import Fold
 from ambjax.simulation.loop import Realised
-from ambjax.simulation.metrics import Fold
 from ambjax.simulation.rollout import Outcome, prepare, run
 from ambjax.world.scenario import Scenario
 
@@ -88,13 +89,19 @@ def _whole(
 
 
 def _launch(
-    kernel: Any, operands: list[Array], axes: list[Any], results: list[Any], programs: int, block: int, interpret: bool
+    kernel: Callable[..., None],
+    operands: list[Array],
+    axes: Sequence[int | None],
+    results: Sequence[jax.ShapeDtypeStruct],
+    programs: int,
+    block: int,
+    interpret: bool,
 ) -> Any:
     """Call the kernel on a grid of programs; each reads its block of the members' numbers and all shared numbers."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    def lanes(x: Any) -> pl.BlockSpec:
+    def lanes(x: Array | jax.ShapeDtypeStruct) -> pl.BlockSpec:
         return pl.BlockSpec((block, *x.shape[1:]), lambda n: (n, *(0 for _ in x.shape[1:])))
 
     shared = pl.BlockSpec((1,), lambda n: (0,))

@@ -11,7 +11,7 @@ from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.distributions import Choice, Distribution, Uniform
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.paths import places
-from ambjax.ensemble.spread import STEP, Spread, apply, check_spread, corners, ends, require_path
+from ambjax.ensemble.spread import STEP, Spread, apply, check_spread, corners, ends, no_such_number
 from ambjax.ensemble.study import Study
 from ambjax.simulation.method import choose_method
 from ambjax.simulation.metrics import standard_for
@@ -19,7 +19,7 @@ from ambjax.world.scenario import Scenario
 
 PERIOD = "clock.sample_period"
 # Survival of a cell is certain if the lower end of its interval is at least this share.
-SURE = 0.95
+CERTAIN = 0.95
 # Fields of a Map with one value per cell.
 GRIDS = ("survival", "low", "high", "error", "lost", "stalled")
 
@@ -58,8 +58,8 @@ class Map(NamedTuple):
 
     @property
     def decisive(self) -> bool:
-        """Whether members differ, and are so many that the interval of a cell lies above SURE if all survive."""
-        return self.varied and bool(wilson(self.members, self.members).low >= SURE)
+        """Whether members differ, and are so many that the interval of a cell lies above CERTAIN if all survive."""
+        return self.varied and bool(wilson(self.members, self.members).low >= CERTAIN)
 
     @property
     def middle(self) -> int:
@@ -141,12 +141,9 @@ def _check(study: Study, x: Axis, y: Axis) -> None:
     known = [*places(study.cascade, study.scenario), PERIOD]
     for name, axis in (("x", x), ("y", y)):
         if axis.path not in known:
-            try:
-                require_path(axis.path, known)
-            except ValueError as error:
-                raise ValueError(str(error).replace("spread.", f"--{name} ", 1)) from None
+            raise ValueError(f"--{name} {axis.path}: {no_such_number(axis.path, known)}")
     if x.path == y.path:
-        raise ValueError(f"--y {y.path}: it is the quantity of --x too. Choose another.")
+        raise ValueError(f"--y {y.path}: --x has the same quantity. Choose another.")
     axes = {axis.path: (name, Choice(tuple(axis.values))) for name, axis in (("x", x), ("y", y)) if axis.path != PERIOD}
     entries = (*((path, values) for path, (_, values) in axes.items()), *_entries(study, (x.path, y.path)))
     try:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ambjax.control.cascade import Cascade
+from ambjax.host.imports import digest_of
 from ambjax.numerics.records import is_traced, leaf
 from ambjax.world.scenario import Scenario
 from ambjax.world.signals import Constant
@@ -57,11 +58,11 @@ def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     return table
 
 
-def _absent(signal: Any) -> bool:
+def _absent(signal: object) -> bool:
     return isinstance(signal, Constant) and not is_traced(signal.value) and not np.any(signal.value)
 
 
-def _below(node: Any, path: str, route: tuple[int | str, ...]) -> Iterator[tuple[str, Place]]:
+def _below(node: object, path: str, route: tuple[int | str, ...]) -> Iterator[tuple[str, Place]]:
     """Yield every number in a record and its nested records, by dotted path."""
     if isinstance(node, tuple):
         for index, item in enumerate(node):
@@ -78,8 +79,10 @@ def _below(node: Any, path: str, route: tuple[int | str, ...]) -> Iterator[tuple
         yield f"{path}.{SHIFT}", Place((*route, SHIFT), TIME, 0.0)
 
 
-def kinds(node: Any, path: str = "") -> Iterator[tuple[str, str]]:
+def kinds(node: object, path: str = "") -> Iterator[tuple[str, str]]:
     """Yield what is not a number in a record and its nested records: the type and the static fields, by dotted path.
+
+    Of a law that a case file imports, also the digest of its source.
 
     `path`: prefix of the dotted paths, which ends with a dot or is empty.
     """
@@ -89,6 +92,8 @@ def kinds(node: Any, path: str = "") -> Iterator[tuple[str, str]]:
     if not dataclasses.is_dataclass(node):
         return
     yield f"{path}kind", type(node).__name__
+    if digest := digest_of(type(node)):
+        yield f"{path}source", digest
     for field in dataclasses.fields(node):
         value, at = getattr(node, field.name), f"{path}{field.name}"
         if field.metadata.get("static"):  # an object without a name is represented by its type
@@ -110,7 +115,7 @@ def order_pairs(cascade: Cascade, scenario: Scenario) -> list[tuple[str, str]]:
     return pairs
 
 
-def with_values(cascade: Cascade, scenario: Scenario, values: Mapping[str, Any]) -> tuple[Cascade, Scenario]:
+def with_values(cascade: Cascade, scenario: Scenario, values: Mapping[str, object]) -> tuple[Cascade, Scenario]:
     """Return the cascade and scenario with the numbers at these paths replaced. Shifts are applied last."""
     known, world = places(cascade, scenario), (cascade, scenario)
     for path in sorted(values, key=lambda path: known[path].route[-1] == SHIFT):

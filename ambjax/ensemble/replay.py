@@ -9,7 +9,7 @@ that is simulated alone therefore runs in a block of the same size as in an ense
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsFloat
 
 import jax
 import numpy as np
@@ -18,9 +18,10 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
-from ambjax.numerics.records import canonical
+from ambjax.numerics.records import Scalar, canonical
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.metrics import Fold, standard_for
+from ambjax.simulation.folds import Fold
+from ambjax.simulation.metrics import standard_for
 from ambjax.simulation.rollout import Outcome, RolloutState, System, begin, finish, prepare, stretch
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.scenario import Scenario
@@ -55,7 +56,7 @@ def record(
     clock: Clock,
     *,
     fold: Fold | None = None,
-    tell: Callable[[int], Any] = lambda _: None,
+    tell: Callable[[int], object] = lambda _: None,
 ) -> Outcome:
     """Simulate one member with the rounding of an ensemble's block, and record every sample.
 
@@ -72,7 +73,7 @@ def record(
 
 
 def record_system(
-    system: Any, clock: Clock, *, fold: Fold | None = None, tell: Callable[[int], Any] = lambda _: None
+    system: System, clock: Clock, *, fold: Fold | None = None, tell: Callable[[int], object] = lambda _: None
 ) -> Outcome:
     """Do the work of `record` for a `rollout.System`, without checks. At least one leaf must be an array [1]."""
     tree = canonical((system, clock, fold))
@@ -89,7 +90,7 @@ def record_system(
     return outcomes[0]._replace(trajectory=dataclasses.replace(outcomes[0].trajectory, rows=whole))
 
 
-def replay(study: Study, index: int, tell: Callable[[int], Any] = lambda _: None) -> Replay:
+def replay(study: Study, index: int, tell: Callable[[int], object] = lambda _: None) -> Replay:
     """Simulate one member of a study again.
 
     The metrics come from the compiled program of the study, the trajectory from `record`. `tell` is that of `record`.
@@ -104,7 +105,7 @@ def replay(study: Study, index: int, tell: Callable[[int], Any] = lambda _: None
     return Replay(outcome.trajectory, metrics, deviation, study.clock.samples * eps)
 
 
-def _relative(a: Any, b: Any) -> float:
+def _relative(a: SupportsFloat, b: SupportsFloat) -> float:
     """Return |a - b|/max(|a|, |b|); 1 if only one of the two is finite."""
     a, b = float(a), float(b)
     if a == b:
@@ -117,10 +118,12 @@ def _begun(tree: tuple[System, Clock, Fold | None]) -> RolloutState:
 
 
 @functools.cache
-def _stretched(count: int) -> Callable[[Any], Any]:
+def _stretched(
+    count: int,
+) -> Callable[[tuple[System, Clock, Fold | None, RolloutState, Scalar]], tuple[RolloutState, Outcome]]:
     """Return the simulation of `count` samples. The function is cached, so that it compiles once."""
 
-    def one(tree: tuple[System, Clock, Fold | None, RolloutState, Any]) -> tuple[RolloutState, Outcome]:
+    def one(tree: tuple[System, Clock, Fold | None, RolloutState, Scalar]) -> tuple[RolloutState, Outcome]:
         system, clock, fold, progress, first = tree
         progress, rows = stretch(system, clock, fold, progress, first, count)
         return progress, finish(progress, rows, fold)

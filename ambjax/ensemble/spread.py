@@ -8,7 +8,6 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -55,7 +54,7 @@ def draw(
     return {path: kind.quantile(u[:, n], _nominal(known[path])) for n, (path, kind) in enumerate(spread.entries)}
 
 
-def apply(cascade: Cascade, scenario: Scenario, values: Mapping[str, Any]) -> tuple[Cascade, Scenario]:
+def apply(cascade: Cascade, scenario: Scenario, values: Mapping[str, object]) -> tuple[Cascade, Scenario]:
     """Return the cascade and scenario with the numbers at these dotted paths replaced.
 
     Values that are arrays [n] make an ensemble. The paths plant.* change the true plant only; the controller's model
@@ -113,8 +112,14 @@ def require_path(path: str, known: Iterable[str], value: str = "") -> None:
     `value` is the value that the user gave, for the message.
     """
     known = list(known)
-    if path in known:
-        return
+    if path not in known:
+        what = f"spread.{path} = {value}" if value else f"spread.{path}"
+        raise ValueError(f"{what}: {no_such_number(path, known)}")
+
+
+def no_such_number(path: str, known: Iterable[str], where: str = "in this case") -> str:
+    """Return the message for a path that is not in `known`; it lists similar paths. `where`: scope of `known`."""
+    known = list(known)
     close = difflib.get_close_matches(path, known, n=1)
     hint = f" Did you mean '{close[0]}'?" if close else ""
     if path.split(".")[0] == "sensor":
@@ -123,8 +128,7 @@ def require_path(path: str, known: Iterable[str], value: str = "") -> None:
     near = next((some for stem in stems if (some := [p for p in known if p.startswith(stem + ".")])), known)
     if len(near) > 12:
         near = dict.fromkeys(p.rpartition(".")[0] + ".*" for p in near)
-    what = f"spread.{path} = {value}" if value else f"spread.{path}"
-    raise ValueError(f"{what}: there is no such number in this case.{hint} There are: {', '.join(near)}.")
+    return f"there is no such number {where}.{hint} There are: {', '.join(near)}."
 
 
 def _check_one(path: str, kind: Distribution, place: Place) -> None:

@@ -18,7 +18,7 @@ HEAVY, COVERED = 9.0, {50: 83, 200: 87, 1000: 90, 5000: 92}
 # Metric that ranks the surviving members in the list of the worst.
 DECIDING = "settled_max_abs_error_m"
 # Members that a summary's metrics and drivers describe.
-OF = "survivors"
+DESCRIBED = "survivors"
 # Columns that are not metrics.
 FATE = ("index", "lost_at", "lost", "stalled", "lost_at_s")
 SPREAD = "spread."
@@ -74,7 +74,7 @@ def summary(
         "confidence": confidence,
         "seed": int(seed),
         "notes": _notes(survivors, held, confidence),
-        "metrics_of": OF,
+        "metrics_of": DESCRIBED,
         "metrics": _metrics(held, seed, confidence),
         "drivers": ranking,
         "explained": accounts,
@@ -84,7 +84,7 @@ def summary(
 
 def _drivers(
     spread: dict[str, np.ndarray], held: dict[str, np.ndarray], lost_at: np.ndarray, confidence: float
-) -> tuple[dict[str, Any], dict[str, Any]]:
+) -> tuple[Mapping[str, object], Mapping[str, object]]:
     """Return the drivers of each metric, computed from the survivors, and of lost_at_s, computed from all members."""
     ended = np.isfinite(lost_at)
     if ended.all():
@@ -101,17 +101,19 @@ def _notes(n: int, metrics: Mapping[str, np.ndarray], confidence: float) -> list
     """Return a note for each interval that n survivors do not support: of a CVaR, and of a heavy-tailed deviation."""
     if not n:
         return ["no member survives: there are no statistics of the metrics"]
-    notes, sure, tail = [], f"{100 * confidence:g} %", (1 - ALPHA) * n
+    notes, level, tail = [], f"{100 * confidence:g} %", (1 - ALPHA) * n
     if tail < TAIL:
         least = math.ceil(TAIL / (1 - ALPHA) - 1e-9)
-        rests = f"the mean of the worst 5 % rests on {tail:.3g} survivors"
-        notes.append(f"{rests}: its {sure} interval may cover less, or have no upper end; it needs {least}")
+        notes.append(
+            f"the mean of the worst 5 % is that of {tail:.3g} survivors: its {level} interval may cover less, or have "
+            f"no upper end; at least {least} survivors are needed"
+        )
     heavy = [name for name, x in metrics.items() if np.isfinite(x).all() and _kurtosis(x) > HEAVY]
     if heavy:
         which = ", ".join(heavy[:3]) + f" and {len(heavy) - 3} more" * (len(heavy) > 3)
         at = max((k for k in COVERED if k <= n), default=min(COVERED))
-        worth = f"{COVERED[at]} % instead of 95 % for a lognormal of {at:,} members"
-        notes.append(f"heavy tails ({which}): the {sure} interval of a standard deviation may cover less, {worth}")
+        covered = f"{COVERED[at]} % instead of 95 % for a lognormal of {at:,} members"
+        notes.append(f"heavy tails ({which}): the {level} interval of a standard deviation may cover less, {covered}")
     return notes
 
 
@@ -124,7 +126,7 @@ def _kurtosis(x: np.ndarray) -> float:
     return float(np.mean(d**4) / np.mean(d**2) ** 2)
 
 
-def _number(x: Any) -> float | None:
+def _number(x: float | np.ndarray) -> float | None:
     return float(x) if np.isfinite(x) else None
 
 
@@ -132,7 +134,7 @@ def _plain(estimate: Estimate) -> dict[str, float | None]:
     return {"estimate": _number(estimate.value), "low": _number(estimate.low), "high": _number(estimate.high)}
 
 
-def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) -> dict[str, Any]:
+def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) -> dict[str, object]:
     """Return the statistics of each metric, with intervals, by name."""
     finite = [name for name, x in metrics.items() if x.size and np.isfinite(x).all()]
     intervals = bootstrap([metrics[name] for name in finite], ALPHA, confidence, seed) if finite else {}
@@ -153,7 +155,7 @@ def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) ->
 
 def _worst(
     index: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray, name: str, values: np.ndarray, count: int
-) -> list[dict[str, Any]]:
+) -> list[dict[str, object]]:
     """Return the `count` worst members: ended ones by time, then survivors by `values` in descending order."""
 
     def status(k: int) -> str:

@@ -58,10 +58,10 @@ class Store:
     - `chunk`: None uses the size that the directory has recorded; it is 0 until `cut` sets it.
     """
 
-    def __init__(self, directory: pathlib.Path, facts: dict[str, Any], members: int, chunk: int | None):
+    def __init__(self, directory: pathlib.Path, facts: dict[str, object], members: int, chunk: int | None) -> None:
         self.directory, self.members = directory, members
         self.facts, self.chunk, self.result = facts, chunk or 0, ""
-        self.asked = chunk
+        self.requested = chunk
         self.chunks, self.manifest, self.path = directory / "chunks", directory / MANIFEST, directory / RESULT
 
     def check(self, columns: int, resume: bool) -> None:
@@ -72,14 +72,15 @@ class Store:
         """
         if self.begun() and not resume:
             raise ValueError(
-                f"--out {self.directory}: it holds a study already. Add --resume to go on with it, or choose another."
+                f"--out {self.directory}: it already holds a study. Add --resume to continue it, or choose another "
+                "directory."
             )
         if self.begun():
             self._compare()
         elif resume:
-            raise ValueError(f"--resume: there is no study in {self.directory}. Check --out, or leave out --resume.")
+            raise ValueError(f"--resume: there is no study in {self.directory}. Check --out, or omit --resume.")
         elif self.path.exists() or self.chunks.exists():
-            raise ValueError(f"--out {self.directory}: it holds results, but no {MANIFEST}. Choose another.")
+            raise ValueError(f"--out {self.directory}: it holds results, but no {MANIFEST}. Choose another directory.")
         if not self.finished():
             self._check_room(columns)
 
@@ -89,7 +90,7 @@ class Store:
         Call `check` first. Raises ValueError if the directory cannot be written.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
-        self._tell()
+        self._write_manifest()
         self.chunks.mkdir(exist_ok=True)
         for left in (path for name in ("chunks/", RESULT, MANIFEST) for path in self.directory.glob(f"{name}*.part")):
             left.unlink()
@@ -97,14 +98,14 @@ class Store:
     def cut(self, chunk: int) -> None:
         """Record the number of members in a chunk. Raises ValueError if the directory cannot be written."""
         self.chunk = chunk
-        self._tell()
+        self._write_manifest()
 
     def survey(self) -> Survey:
         """Return the missing and damaged chunks. Reads every chunk and verifies its checksum and its columns."""
         missing, remarks, layouts = [], list[str](), dict[Span, str]()
         if self.result:
-            there = "its checksum is wrong" if self.path.exists() else "it is gone"
-            remarks.append(f"{self.path}: {there}; what is not in {self.chunks} is computed again")
+            reason = "its checksum is wrong" if self.path.exists() else "the file is missing"
+            remarks.append(f"{self.path}: {reason}; members that are not in {self.chunks} are computed again")
         for span in self.spans():
             path = self._path(span)
             try:
@@ -153,10 +154,11 @@ class Store:
                 self._read_back(columns)
             except (DamagedError, OSError) as why:
                 raise ValueError(
-                    f"{self.path}: not put together, {why}. The chunks are kept: give the same command with --resume."
+                    f"{self.path}: the chunks could not be merged ({why}). They are kept: repeat the command with "
+                    "--resume."
                 ) from None
             self.result = _digest(self.path)
-            self._tell()
+            self._write_manifest()
         shutil.rmtree(self.chunks, ignore_errors=True)
         return self.path
 
@@ -168,7 +170,7 @@ class Store:
         """Return whether members.npz exists and has the recorded checksum."""
         return bool(self.result) and self.path.is_file() and _digest(self.path) == self.result
 
-    def _tell(self) -> None:
+    def _write_manifest(self) -> None:
         content = self.facts | {"chunk": self.chunk or None} | ({RESULT: self.result} if self.result else {})
         text = json.dumps(content | {CHECKSUM: checksum_of(content)}, indent=2).encode() + b"\n"
         write_whole(self.manifest, lambda file: file.write(text))
@@ -179,14 +181,15 @@ class Store:
             record = dict(json.loads(self.manifest.read_text(encoding="utf-8")))
             if record.pop(CHECKSUM, None) != checksum_of(record):
                 raise ValueError("its checksum is wrong")
-            kept, self.result = int(record.pop("chunk") or 0), str(record.pop(RESULT, ""))
-            self.chunk = self.asked or kept
+            recorded, self.result = int(record.pop("chunk") or 0), str(record.pop(RESULT, ""))
+            self.chunk = self.requested or recorded
         except (OSError, TypeError, ValueError, KeyError, RecursionError) as error:
             raise ValueError(f"{self.manifest}: cannot be read ({error}). Choose another --out.") from None
-        differs = difference(record | {"chunk": kept or self.chunk}, self.facts | {"chunk": self.chunk})
+        differs = difference(record | {"chunk": recorded or self.chunk}, self.facts | {"chunk": self.chunk})
         if differs:
             raise ValueError(
-                f"--resume: {self.directory} holds another study: {differs}. Make them equal, or choose another --out."
+                f"--resume: {self.directory} holds another study: {differs}. Restore the case and options, or choose "
+                "another --out."
             )
 
     def _check_room(self, columns: int) -> None:
@@ -203,7 +206,7 @@ class Store:
                 f"{free / 1e9:.3g} GB free. At most {most:,} members fit; or choose another --out."
             )
 
-    def _facts(self, span: Span) -> dict[str, Any]:
+    def _facts(self, span: Span) -> dict[str, object]:
         return {"study": checksum_of(self.facts), "first": span[0], "stop": span[1]}
 
     def _read(self, span: Span) -> Arrays:
@@ -211,7 +214,7 @@ class Store:
         columns, facts = unseal(self._path(span))
         differs = difference(facts, self._facts(span))
         if differs:
-            raise DamagedError(f"it belongs elsewhere: {differs}")
+            raise DamagedError(f"it is of another chunk or study: {differs}")
         _check_rows(columns, *span)
         return columns
 
@@ -263,16 +266,16 @@ class Store:
                     kind, shape = shapes({name: column})[name]
                     there[name] = [kind, hashlib.sha256(np.ascontiguousarray(column).data).hexdigest(), shape]
         except Exception as error:  # as in unseal
-            raise DamagedError(f"what was written cannot be read back ({error})") from None
+            raise DamagedError(f"the written file cannot be read ({error})") from None
         wrong = difference(there, {name: [*column, [self.members]] for name, column in columns.items()})
         if wrong:
-            raise DamagedError(f"what was written reads otherwise: {wrong}")
+            raise DamagedError(f"the written file differs from the data: {wrong}")
 
     def _path(self, span: Span) -> pathlib.Path:
         return self.chunks / f"{span[0]:012d}-{span[1]:012d}.npz"
 
 
-def kinds_of(columns: Arrays) -> dict[str, Any]:
+def kinds_of(columns: Arrays) -> dict[str, object]:
     """Return the names and dtypes of columns, in order."""
     return {name: kind for name, (kind, _) in shapes(columns).items()}
 

@@ -67,7 +67,7 @@ class Study:
         """Whether the members differ."""
         return bool(self.spread.entries) or self.scenario.random
 
-    def drawn(self, members: np.ndarray) -> dict[str, np.ndarray]:
+    def drawn(self, members: np.ndarray) -> dict[str, Any]:
         """Draw the spread quantities of these members (integers [n]); arrays [n] by dotted path."""
         return draw(self.spread, self.cascade, self.scenario, self.seed, members, self.members)
 
@@ -140,9 +140,9 @@ class Study:
         part = np.searchsorted(starts, np.minimum(np.arange(len(t)), count - 1), side="right") - 1
         return Bands(t, outcome.trajectory, signals | {"variation of u": rate[:, part]}, extremes)
 
-    def fingerprint(self) -> dict[str, Any]:
+    def fingerprint(self) -> dict[str, object]:
         """Return everything that the results of a member depend on, by name, in JSON form."""
-        facts: dict[str, Any] = {**provenance(), "members": self.members, "seed": self.seed}
+        facts: dict[str, object] = {**provenance(), "members": self.members, "seed": self.seed}
         facts |= {**dict(kinds(self.cascade, "controller.")), **dict(kinds(self.scenario))}
         facts |= {path: str(place.value) for path, place in places(self.cascade, self.scenario).items()}
         facts |= {"clock.samples": self.clock.samples, "clock.sample_period": str(self.clock.sample_period)}

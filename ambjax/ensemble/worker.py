@@ -9,7 +9,8 @@ import threading
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
-from typing import Any
+
+import numpy as np
 
 from ambjax.ensemble.study import Study
 
@@ -46,12 +47,12 @@ def prepare() -> None:
             jax.default_backend()
         except (AssertionError, RuntimeError) as error:  # AssertionError: a known kind without a device
             why = str(error).partition("\n")[0] or "none of them is here"
-            raise ValueError(f"JAX_PLATFORMS={platforms}: {why}. Leave it out, or set it to cpu.") from None
+            raise ValueError(f"JAX_PLATFORMS={platforms}: {why}. Unset it, or set it to cpu.") from None
 
 
 def chunk(
     study: Study, start: int, stop: int, size: int, threads: int | None = None, *, lost: bool = False
-) -> dict[str, Any]:
+) -> dict[str, np.ndarray]:
     """Simulate members start <= k < stop of a study with chunks of `size` members, and return their columns.
 
     `threads`: CPU cores to use (None: all). `lost` is that of `Study.columns`.
@@ -62,7 +63,7 @@ def chunk(
     return study.columns(start, stop, call=call, threads=threads, lost=lost)
 
 
-def work(study: Study, start: int, stop: int, size: int) -> dict[str, Any]:
+def work(study: Study, start: int, stop: int, size: int) -> dict[str, np.ndarray]:
     """Simulate a chunk of a study in a worker process, on one core, and return its columns."""
     prepare()
     return chunk(study, start, stop, size, threads=1)

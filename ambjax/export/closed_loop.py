@@ -8,14 +8,15 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.cascade import Command
-from ambjax.export.controller import BITS, OUTPUTS
+from ambjax.export.interface import BITS, OUTPUTS
 from ambjax.export.machine import Compiled
 from ambjax.export.twins import Horizon, LoopCase, farthest, horizons
 from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.rollout import begin, segment
-from ambjax.simulation.sampled import Sampled, SampledState, system_of
+from ambjax.simulation.sampled import Sampled, SampledState
+from ambjax.simulation.system import system_of
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 
@@ -23,7 +24,7 @@ FAULTS = [1 << k for k, name in enumerate(BITS) if name in ("invalid", "failed")
 (REFUSED,) = (1 << k for k, name in enumerate(BITS) if name == "refused")
 
 
-class Kept(NamedTuple):
+class ControllerState(NamedTuple):
     """State of the C, and the number of samples with an invalid input or a law without a finite result."""
 
     numbers: Array
@@ -34,24 +35,26 @@ class Kept(NamedTuple):
 class Machines:
     """Compiled controllers behind one function of the controller's index, its state and its inputs."""
 
-    def __init__(self, *machines: Compiled):
+    def __init__(self, *machines: Compiled) -> None:
         self.machines = machines
         self.room = max(machine.state["numbers"].size for machine in machines)
 
-    def step(self, which: Any, numbers: Any, started: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray]:
+    def step(
+        self, which: np.ndarray, numbers: np.ndarray, started: np.ndarray, inputs: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Compute one sample of controller `which`. Return its state, padded, and started, bits and outputs."""
         machine = self.machines[int(which)]
         count = machine.state["numbers"].size
         machine.state["numbers"], machine.state["started"] = np.asarray(numbers)[:count], int(started)
         machine.inputs[:] = np.asarray(inputs)
         bits = machine.step()
-        kept = np.zeros(self.room)
-        kept[:count] = machine.state["numbers"]
-        return kept, np.array([float(machine.state["started"]), float(bits), *machine.outputs], float)
+        state = np.zeros(self.room)
+        state[:count] = machine.state["numbers"]
+        return state, np.array([float(machine.state["started"]), float(bits), *machine.outputs], float)
 
 
 @record
-class Looped(Sampled):
+class CompiledLoop(Sampled):
     """The sampled loop whose laws are the compiled controller `which` of `machines`."""
 
     which: Scalar
@@ -59,27 +62,27 @@ class Looped(Sampled):
 
     def start(self) -> SampledState:
         zero = jnp.zeros(())
-        return super().start()._replace(control=Kept(jnp.zeros(self.machines.room), zero, zero))
+        return super().start()._replace(control=ControllerState(jnp.zeros(self.machines.room), zero, zero))
 
-    def decided(self, measured: Measurement, reference: Reference, state: SampledState) -> SampledState:
-        kept: Any = state.control
+    def with_command(self, measured: Measurement, reference: Reference, state: SampledState) -> SampledState:
+        memory: Any = state.control
         inputs = jnp.stack([*measured, *reference])
         shapes = jax.ShapeDtypeStruct((self.machines.room,), float), jax.ShapeDtypeStruct((2 + len(OUTPUTS),), float)
         numbers, rest = jax.pure_callback(
-            self.machines.step, shapes, self.which, kept.numbers, kept.started, inputs, vmap_method="sequential"
+            self.machines.step, shapes, self.which, memory.numbers, memory.started, inputs, vmap_method="sequential"
         )
         answer = dict(zip(OUTPUTS, rest[2:], strict=True))
         command = Command(**answer, i_ref_dot=jnp.zeros(()))
         faulty = rest[1].astype(int) & sum(FAULTS) != 0
-        after: Any = Kept(numbers, rest[0], kept.faults + faulty)
-        past, sane = (state.command.u, state.past[0]), jnp.where(faulty, 0.0, state.sane)
+        after: Any = ControllerState(numbers, rest[0], memory.faults + faulty)
+        past, finite = (state.command.u, state.past[0]), jnp.where(faulty, 0.0, state.finite)
         watch, guard = state.watch, self.processor.guard
         if watch and guard:  # a row reads whether the guard refused a reading
             watch = watch._replace(left=jnp.where(rest[1].astype(int) & REFUSED, 0.0, jnp.asarray(guard.samples)))
-        return state._replace(control=after, command=command, past=past, sane=sane, watch=watch)
+        return state._replace(control=after, command=command, past=past, finite=finite, watch=watch)
 
 
-class Beside(NamedTuple):
+class LoopComparison(NamedTuple):
     """Comparison of the closed loop with compiled C and that of JAX, over the horizon.
 
     `times`: distance of z from JAX's divided by the distance of the farthest twin, the largest over the samples; NaN if
@@ -98,13 +101,13 @@ BLOCK = 1000
 begin_jit, segment_jit = jax.jit(begin), jax.jit(segment, static_argnames=("count", "every"))
 
 
-def beside(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, Beside]:
+def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, LoopComparison]:
     """Compare the closed loop with each compiled controller with that of JAX. Keys: the precisions."""
     given: Any = system_of(case.cascade, case.scenario, case.clock)
     host, found = Machines(*machines.values()), {}
     for which, (precision, horizon) in enumerate(horizons(case, list(machines)).items()):
-        looped = Looped(ClosedLoop(given.loop.cascade, case.scenario), given.period, given.cuts, which, host)
-        found[precision] = Beside(horizon, _times(_displacement(looped, case.clock, horizon.samples), horizon))
+        looped = CompiledLoop(ClosedLoop(given.loop.cascade, case.scenario), given.period, given.cuts, which, host)
+        found[precision] = LoopComparison(horizon, _times(_displacement(looped, case.clock, horizon.samples), horizon))
     return found
 
 
@@ -119,7 +122,7 @@ def _times(z: np.ndarray, horizon: Horizon) -> float:
     return float(np.max(np.where(np.isnan(times), np.inf, times)))
 
 
-def _displacement(system: Looped, clock: Clock, count: int) -> np.ndarray:
+def _displacement(system: CompiledLoop, clock: Clock, count: int) -> np.ndarray:
     """Return z of a loop over at least its first `count` samples, m."""
     system, clock = canonical((system, clock))
     progress, rows, block = begin_jit(system, clock, None), [], min(BLOCK, clock.samples)

@@ -1,14 +1,14 @@
 """The exported controller: the simulator's step, with names for its inputs, states, parameters and outputs.
 
-`Controller.step` first checks the reference and the parameters, then runs `Sampled.decided`, which has the guard of the
-readings.
+`Controller.step` first checks the reference and the parameters. Then it runs `Sampled.with_command`, which includes the
+guard of the readings.
 """
 
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +16,16 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade, CascadeState, Command
 from ambjax.control.guard import GAPS, Watch, guarded
+from ambjax.export.interface import Status, StepInputs, StepOutputs
 from ambjax.numerics.records import Scalar, leaf, numbers, record
+from ambjax.simulation.integrate import choose
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled, SampledState
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
+
+T = TypeVar("T")
 
 (U_MAX,) = (field for field in dataclasses.fields(Scenario) if field.name == "u_max")
 # Singularity function of Eq. (9) below which a step reports the singular curve as near.
@@ -51,18 +55,6 @@ class StepLimits:
     r_dddot: Scalar = _end("r_dddot", "m/s^3")
 
 
-class StepInputs(NamedTuple):
-    """Inputs of a step: the sensors, and the reference at the instant at which the step's voltage takes effect."""
-
-    z: Array
-    z_dot: Array
-    i: Array
-    r: Array
-    r_dot: Array
-    r_ddot: Array
-    r_dddot: Array
-
-
 class Memory(NamedTuple):
     """State that a step keeps for the next."""
 
@@ -73,51 +65,6 @@ class Memory(NamedTuple):
     watch: Watch | tuple[()]
     """state of the guard"""
     started: Array
-
-
-class Status(NamedTuple):
-    """Status of a step, one bit each; BITS has their meanings."""
-
-    saturated: Array
-    refused: Array
-    failed: Array
-    singular: Array
-    safe: Array
-    invalid: Array
-
-
-class StepOutputs(NamedTuple):
-    """Outputs of a step; OUTPUTS has their units and meanings."""
-
-    u: Array
-    i_ref: Array
-    v_star: Array
-    v_tilde: Array
-
-
-INPUTS = {
-    "z": ("m", "rotor displacement, measured"),
-    "z_dot": ("m/s", "rotor velocity, measured"),
-    "i": ("A", "current deviation, measured"),
-    "r": ("m", "reference of z at the instant at which this step's voltage takes effect"),
-    "r_dot": ("m/s", "first derivative of r"),
-    "r_ddot": ("m/s^2", "second derivative of r"),
-    "r_dddot": ("m/s^3", "third derivative of r"),
-}
-OUTPUTS = {
-    "u": ("V", "voltage to apply, within the supply's limit"),
-    "i_ref": ("A", "current reference"),
-    "v_star": ("A^2/m^2", "demanded scaled force"),
-    "v_tilde": ("A^2/m^2", "input error v_star - v(z, i_ref)"),
-}
-BITS = {
-    "saturated": "u is at the supply's limit",
-    "refused": "a reading is NaN, beyond its limit or too far from the prediction, which replaces it",
-    "failed": "a law returned no finite number: its state is kept, u is held",
-    "singular": "(z, i_ref) is near the singular curve of Eq. (9)",
-    "safe": "u is 0, the laws wait: more than guard.samples readings in a row, or all so far, are refused",
-    "invalid": "the reference, params->processor.delay or a steepness p is NaN or out of range: u is held",
-}
 
 
 class Number(NamedTuple):
@@ -169,18 +116,19 @@ class Controller:
         system = Sampled(ClosedLoop(cascade, Scenario(u_max=limits.u_max)), period, 0)
         past = (memory.before, memory.before)
         state = SampledState((), memory.laws, memory.last, past, jnp.ones(()), (), (), memory.watch, memory.started, ())
-        after = system.decided(measured, Reference(*inputs[3:]), state)
+        after = system.with_command(measured, Reference(*inputs[3:]), state)
         last = choose(valid, after.command, memory.last)
         watch, refused, safe = after.watch, jnp.asarray(False), jnp.asarray(False)
         if processor.guard is not None:
             refused, safe = processor.guard.refused(memory.watch, watch)
+        assert not isinstance(after.started, tuple)  # an array in the memory remains one
         laws, started = choose(valid, (after.control, after.started), (memory.laws, memory.started))
         # an invalid sample resets the guard: the next reading within its limits is accepted
         kept = Memory(laws, last, after.past[0], choose(valid, watch, jax.tree.map(jnp.zeros_like, watch)), started)
         status = Status(
             jnp.abs(last.u) >= limits.u_max,
             valid & refused,
-            valid & (after.sane == 0),
+            valid & (after.finite == 0),
             valid & ~refused & (cascade.model.singularity(measured.z, last.i_ref) <= limits.near),
             valid & safe,
             ~valid,
@@ -193,11 +141,6 @@ class Controller:
         laws = jax.tree.map(jnp.zeros_like, cascade.init(Measurement(zero, zero, zero)))
         guard = cascade.processor.guard if cascade.processor else None
         return Memory(laws, Command(*[zero] * 5), zero, guard.start() if guard else (), jnp.asarray(False))
-
-
-def choose(condition: Array, a: Any, b: Any) -> Any:
-    """Return a where `condition` holds, else b; a and b are pytrees."""
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
 def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scenario | None = None) -> Controller:
@@ -229,7 +172,7 @@ def parameters_of(parameters: Parameters) -> list[Number]:
     return [x._replace(**delay) if x.name == "processor.delay" else x for x in found]
 
 
-def _steepnesses(cascade: Cascade) -> list[Any]:
+def _steepnesses(cascade: Cascade) -> list[Scalar]:
     """Return the steepnesses of the smoothed signs of all laws."""
     laws: tuple[Any, ...] = cascade.laws
     fields = [(law, field) for law in laws for field in dataclasses.fields(law)]
@@ -261,7 +204,7 @@ def _number(name: str, field: dataclasses.Field, value: float) -> Number:
     return Number(name, unit, allowed, doc, value, _ends(meta, value))
 
 
-def _ends(meta: Any, value: float) -> tuple[float, ...]:
+def _ends(meta: Mapping[str, Any], value: float) -> tuple[float, ...]:
     """Return the further values of a parameter for the comparison: 1/SPAN and SPAN times `value`, within its bounds.
 
     A parameter that is 0 is set to -1 and 1 in its unit; one that is inf, to 1 and SPAN.

@@ -5,14 +5,14 @@ operation.
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
-from ambjax.export.primitives import CALLS, OPS, SAME, is_reciprocal
+from ambjax.export.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal
 from ambjax.export.program import Operand, Program, Ref, of
 
 LOOPS = ("scan", "while")
@@ -20,7 +20,7 @@ COMPOSED = ("rsqrt", "exp2", "logistic")
 
 
 def traced(
-    program: Program, function: Callable[..., Any], arguments: Any, operands: Sequence[Operand]
+    program: Program, function: Callable[..., object], arguments: Iterable[object], operands: Sequence[Operand]
 ) -> list[Operand]:
     """Trace `function(*arguments)` into `program` and return the operands of the leaves of its result.
 
@@ -32,7 +32,7 @@ def traced(
 
 
 class _Reader:
-    def __init__(self, program: Program):
+    def __init__(self, program: Program) -> None:
         self.program = program
 
     def closed(self, closed: ClosedJaxpr, operands: list[Operand], law: str) -> list[Operand]:
@@ -44,9 +44,8 @@ class _Reader:
     def jaxpr(self, jaxpr: Jaxpr, consts: list[Operand], operands: list[Operand], law: str) -> list[Operand]:
         known: dict[Any, Operand] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *operands], strict=True))
 
-        def value(x: Any) -> Operand:
-            aval: Any = x.aval
-            return np.asarray(x.val, aval.dtype)[()] if isinstance(x, Literal) else known[x]
+        def value(x: Atom) -> Operand:
+            return np.asarray(x.val, dtype_of(x))[()] if isinstance(x, Literal) else known[x]
 
         for eqn in jaxpr.eqns:
             inner = _law(str(eqn.source_info.name_stack)) or law
@@ -56,9 +55,9 @@ class _Reader:
             known.update(zip(eqn.outvars, results, strict=True))
         return [value(x) for x in jaxpr.outvars]
 
-    def equation(self, name: str, eqn: Any, args: list[Operand], law: str) -> list[Operand]:
+    def equation(self, name: str, eqn: JaxprEqn, args: list[Operand], law: str) -> list[Operand]:
         if is_reciprocal(eqn):
-            dtype = np.dtype(eqn.outvars[0].aval.dtype)
+            dtype = dtype_of(eqn.outvars[0])
             return [self.program.apply("div", (np.ones((), dtype)[()], args[0]), dtype, law)]
         if name in CALLS:
             inner = next(eqn.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in eqn.params)
@@ -69,8 +68,8 @@ class _Reader:
             return getattr(self, f"_{name}")(eqn.params, args, law)
         return [self.scalar(name, eqn, args, law)]
 
-    def scalar(self, name: str, eqn: Any, args: list[Operand], law: str) -> Operand:
-        apply, dtype, params = self.program.apply, np.dtype(eqn.outvars[0].aval.dtype), eqn.params
+    def scalar(self, name: str, eqn: JaxprEqn, args: list[Operand], law: str) -> Operand:
+        apply, dtype, params = self.program.apply, dtype_of(eqn.outvars[0]), eqn.params
         if dtype.kind == "f" and dtype.itemsize not in (4, 8):
             raise ValueError(refusal(name, law, f"of {dtype.name}"))
         if name == "convert_element_type":
@@ -95,7 +94,7 @@ class _Reader:
             raise ValueError(refusal(name, law, "of whole numbers" if whole else ""))
         return apply(name, args, dtype, law)
 
-    def _composed(self, name: str, x: Operand, dtype: Any, law: str) -> Operand:
+    def _composed(self, name: str, x: Operand, dtype: np.dtype, law: str) -> Operand:
         """Compose a primitive that C lacks from others, as XLA does."""
         apply, one = self.program.apply, np.ones((), dtype)[()]
         if name == "rsqrt":
@@ -105,7 +104,7 @@ class _Reader:
         grown = apply("exp", (apply("neg", (x,), dtype, law),), dtype, law)
         return apply("div", (one, apply("add", (one, grown), dtype, law)), dtype, law)
 
-    def _power(self, x: Operand, y: int, dtype: Any, law: str) -> Operand:
+    def _power(self, x: Operand, y: int, dtype: np.dtype, law: str) -> Operand:
         """Compute an integer power by repeated squaring, as JAX does."""
         total, left = None, abs(y)
         while left > 0:
@@ -161,8 +160,8 @@ class _Reader:
 
 def refusal(name: str, law: str, how: str = "") -> str:
     """Return the error message for a primitive that cannot be exported, and the fix."""
-    told = f"the primitive {name!r}{f' {how}' if how else ''} cannot be written as scalar C"
-    return f"{law or 'the step'}: {told}. Write the law with real scalars and loops of a fixed length."
+    reason = f"the primitive {name!r}{f' {how}' if how else ''} cannot be written as scalar C"
+    return f"{law or 'the step'}: {reason}. Write the law with real scalars and loops of a fixed length."
 
 
 def _law(stack: str) -> str:

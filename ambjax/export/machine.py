@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.export.controller import INPUTS
+from ambjax.export.interface import INPUTS
 from ambjax.export.points import Points
 from ambjax.export.reference import Results
 from ambjax.export.statements import PRECISIONS
@@ -28,12 +28,12 @@ PATIENCE = 60
 
 def compiler() -> str:
     """Return the C compiler: $CC, or cc, gcc or clang. Raises ValueError if there is none."""
-    asked = os.environ.get("CC")
-    for name in [asked] if asked else ["cc", "gcc", "clang"]:
+    requested = os.environ.get("CC")
+    for name in [requested] if requested else ["cc", "gcc", "clang"]:
         if found := shutil.which(name):
             return found
     raise ValueError(
-        f"--verify: there is no C compiler ({asked or 'cc, gcc or clang'}). Install one, or set CC, or omit --verify."
+        f"--verify: there is no C compiler ({requested or 'cc, gcc or clang'}). Install one, set CC, or omit --verify."
     )
 
 
@@ -107,16 +107,16 @@ def check() -> None:
             ("sanitized program", SANITIZED, "Install libasan and libubsan, set CC to a compiler that has them"),
             ("library", SHARED, "Set CC to another compiler"),
         ):
-            made = folder / f"empty{len(flags)}"
-            said = build([source], made, *flags)
-            if not said and flags is SHARED:
-                load(made)
-            elif not said:
-                code, told = execute(made)
-                said = "" if code == 0 else told.strip() or f"exit code {code}"
-            if said:
+            binary = folder / f"empty{len(flags)}"
+            messages = build([source], binary, *flags)
+            if not messages and flags is SHARED:
+                load(binary)
+            elif not messages:
+                code, output = execute(binary)
+                messages = "" if code == 0 else output.strip() or f"exit code {code}"
+            if messages:
                 raise ValueError(
-                    f"--verify: {compiler()} makes no {what} that works here ({short(said)}). {fix}, or omit --verify."
+                    f"--verify: {compiler()} makes no {what} that works ({short(messages)}). {fix}, or omit --verify."
                 )
 
 
@@ -131,7 +131,7 @@ def short(text: str) -> str:
 class Compiled:
     """A controller in a shared library. `state` is its memory: the numbers, then whether it has started."""
 
-    def __init__(self, library: pathlib.Path, trace: Trace, prefix: str):
+    def __init__(self, library: pathlib.Path, trace: Trace, prefix: str) -> None:
         self.trace, real = trace, np.dtype(PRECISIONS[trace.precision])
         loaded = load(library)
         self._step = getattr(loaded, f"{prefix}_step")

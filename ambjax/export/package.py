@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.export.controller import INPUTS, OUTPUTS, Controller
+from ambjax.export.controller import Controller
+from ambjax.export.interface import INPUTS, OUTPUTS
 from ambjax.export.points import Points, points
 from ambjax.export.reference import Results, results
 from ambjax.export.source import Origin, Writer, fixed, order_of_work
@@ -111,7 +112,7 @@ def _test(writer: Writer) -> str:
         P=p.upper(),
         abs=abs_,
         readings=len(Measurement._fields),
-        told="refused" if guard else "accepted and make a law fail",
+        effect="refused" if guard else "accepted and make a law fail",
         unseen=unseen,
         share=literal(share, t.precision),
         small=literal(small, t.precision),

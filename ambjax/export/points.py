@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ambjax.export.controller import INPUTS
+from ambjax.export.interface import INPUTS
 from ambjax.export.program import Ref
 from ambjax.export.statements import PRECISIONS
 from ambjax.export.trace import UNREAD, Trace

@@ -5,9 +5,10 @@ thresholds of comparisons; the verification compares the C with JAX, not with Nu
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from jax.extend.core import JaxprEqn, Literal, Var
 
 from ambjax.numerics.smooth import RECIPROCAL
 
@@ -28,11 +29,11 @@ def _erf(name: str) -> Callable[..., Any]:
     return np.vectorize(getattr(math, name), otypes=[float])
 
 
-def _function(name: str, numpy: Callable[..., Any] | None = None) -> Op:
+def _function(name: str, numpy: Callable[..., object] | None = None) -> Op:
     return Op(f"{name}{{f}}({{0}})", numpy or getattr(np, name))
 
 
-def _compare(sign: str, numpy: Callable[..., Any]) -> Op:
+def _compare(sign: str, numpy: Callable[..., object]) -> Op:
     return Op(f"{{0}} {sign} {{1}}", numpy, "comparison", sign in ("==", "!="), True)
 
 
@@ -87,6 +88,16 @@ CALLS = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_v
 COUNTED = ("add", "multiply", "divide", "root", "call")
 
 
-def is_reciprocal(eqn: Any) -> bool:
+# A variable of a trace, or a constant in it.
+Atom: TypeAlias = Var | Literal
+
+
+def dtype_of(x: Atom) -> np.dtype:
+    """Return the dtype of a variable or constant of a trace."""
+    aval: Any = x.aval
+    return np.dtype(aval.dtype)
+
+
+def is_reciprocal(eqn: JaxprEqn) -> bool:
     """Return whether a call computes 1/x by refining a float32 quotient. Exported code divides once instead."""
     return eqn.params.get("name") == RECIPROCAL and len(eqn.invars) == len(eqn.outvars) == 1

@@ -4,10 +4,11 @@ A node that no other node or result uses is not written. A constant is a NumPy s
 constants.
 """
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from ambjax.export.primitives import OPS
 
@@ -21,7 +22,8 @@ class Ref(NamedTuple):
     node: int
 
 
-Operand = Any  # Ref, or a NumPy scalar
+# A node, or a constant: a NumPy scalar, which the types of NumPy take for an array.
+Operand: TypeAlias = Ref | np.ndarray | np.number | np.bool_
 
 
 class Node(NamedTuple):
@@ -41,7 +43,7 @@ class Program:
         self.nodes: list[Node] = []
         self._known: dict[Any, Ref] = {}
 
-    def input(self, text: str, dtype: Any) -> Ref:
+    def input(self, text: str, dtype: npt.DTypeLike) -> Ref:
         """Add an input node, which the C expression `text` reads."""
         self.nodes.append(Node("input", (), np.dtype(dtype), text=text))
         return Ref(len(self.nodes) - 1)
@@ -50,7 +52,7 @@ class Program:
         """Return the dtype of an operand."""
         return self.nodes[x.node].dtype if isinstance(x, Ref) else x.dtype
 
-    def apply(self, op: str, args: Sequence[Operand], dtype: Any, law: str) -> Operand:
+    def apply(self, op: str, args: Sequence[Operand], dtype: npt.DTypeLike, law: str) -> Operand:
         """Return the operand of an operation: a constant, an existing equal node, or a new node."""
         dtype, args = np.dtype(dtype), tuple(args)
         if (known := _simpler(op, args)) is not None:
@@ -77,9 +79,9 @@ class Program:
                 stack += [x.node for x in self.nodes[node].args if isinstance(x, Ref)]
         return seen
 
-    def evaluate(self, inputs: dict[int, Any]) -> list[Any]:
+    def evaluate(self, inputs: Mapping[int, np.ndarray]) -> list[np.ndarray]:
         """Return the value of every node, computed with NumPy from those of the input nodes, arrays of one shape."""
-        values: list[Any] = []
+        values: list[np.ndarray] = []
         with np.errstate(all="ignore"):
             for number, node in enumerate(self.nodes):
                 args = [values[x.node] if isinstance(x, Ref) else x for x in node.args]

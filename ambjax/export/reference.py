@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
+from jax.typing import ArrayLike
 
-from ambjax.export.controller import BITS
+from ambjax.export.interface import BITS
 from ambjax.export.points import Points
-from ambjax.export.primitives import CALLS, OPS, SAME, is_reciprocal
+from ambjax.export.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal
 from ambjax.export.trace import Trace, arguments, precision
 
 
@@ -46,17 +47,16 @@ def results(trace: Trace, at: Points) -> Results:
     return Results(kept, spread[begun - 1], np.array(spread[begun : -len(BITS)]), np.asarray(bits))
 
 
-def one_by_one(closed: ClosedJaxpr, args: list[Any], count: int) -> list[Any]:
+def one_by_one(closed: ClosedJaxpr, args: list[ArrayLike], count: int) -> list[ArrayLike]:
     """Evaluate a trace for scalars or rows of `count`, one primitive at a time.
 
     On rows: dividing a row by a scalar, XLA multiplies by its reciprocal.
     """
     jaxpr = closed.jaxpr
-    known: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *args], strict=True))
+    known: dict[Any, ArrayLike] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *args], strict=True))
 
-    def value(x: Any) -> Any:
-        aval: Any = x.aval
-        return np.asarray(x.val, aval.dtype) if isinstance(x, Literal) else known[x]
+    def value(x: Atom) -> ArrayLike:
+        return np.asarray(x.val, dtype_of(x)) if isinstance(x, Literal) else known[x]
 
     for eqn in jaxpr.eqns:
         results = _one(eqn, [value(x) for x in eqn.invars], count)
@@ -64,13 +64,13 @@ def one_by_one(closed: ClosedJaxpr, args: list[Any], count: int) -> list[Any]:
     return [value(x) for x in jaxpr.outvars]
 
 
-def _one(eqn: Any, args: list[Any], count: int) -> list[Any]:
+def _one(eqn: JaxprEqn, args: list[ArrayLike], count: int) -> list[ArrayLike]:
     name, params = eqn.primitive.name, eqn.params
     whole = lambda closed: closed if isinstance(closed, ClosedJaxpr) else ClosedJaxpr(closed, [])  # noqa: E731
     if name in SAME:
         return args
     if is_reciprocal(eqn):
-        return [1 / jnp.broadcast_to(jnp.asarray(args[0], eqn.invars[0].aval.dtype), (count,))]
+        return [1 / jnp.broadcast_to(jnp.asarray(args[0], dtype_of(eqn.invars[0])), (count,))]
     if name in CALLS:
         inner = next(params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params)
         return one_by_one(whole(inner), args, count)
@@ -90,12 +90,12 @@ def _one(eqn: Any, args: list[Any], count: int) -> list[Any]:
             carry = one_by_one(params["body_jaxpr"], fixed + carry, count)
         return carry
     if name in OPS and OPS[name].cost == "call":
-        return [_of_library(OPS[name].text.partition("{f}")[0], args, np.dtype(eqn.outvars[0].aval.dtype), count)]
-    rows = [jnp.broadcast_to(jnp.asarray(x, v.aval.dtype), (count,)) for x, v in zip(args, eqn.invars, strict=True)]
+        return [_of_library(OPS[name].text.partition("{f}")[0], args, dtype_of(eqn.outvars[0]), count)]
+    rows = [jnp.broadcast_to(jnp.asarray(x, dtype_of(v)), (count,)) for x, v in zip(args, eqn.invars, strict=True)]
     return [eqn.primitive.bind(*rows, **params)]
 
 
-def _of_library(name: str, args: list[Any], dtype: np.dtype, count: int) -> np.ndarray:
+def _of_library(name: str, args: list[ArrayLike], dtype: np.dtype, count: int) -> np.ndarray:
     """Evaluate a function of this machine's <math.h> on rows."""
     single = dtype == np.float32
     function, kind = getattr(ctypes.CDLL(None), name + "f" * single), ctypes.c_float if single else ctypes.c_double

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ambjax._version import __version__
-from ambjax.export.controller import BITS, INPUTS, Number
+from ambjax.export.controller import Number
+from ambjax.export.interface import BITS, INPUTS
 from ambjax.export.statements import Statements, literal, word
 from ambjax.export.texts import HEADER, MARK, SOURCE
 from ambjax.export.trace import UNREAD, Trace
@@ -26,7 +27,7 @@ class Origin(NamedTuple):
 class Writer:
     """A traced step as text, all names beginning with `prefix`."""
 
-    def __init__(self, trace: Trace, prefix: str, origin: Origin):
+    def __init__(self, trace: Trace, prefix: str, origin: Origin) -> None:
         self.trace, self.prefix, self.origin = trace, prefix, origin
         self.text = Statements(trace.program, trace.order(), trace.precision, prefix)
 
@@ -39,8 +40,8 @@ class Writer:
             outer, _, name = word(x.name).rpartition(".")
             lines += self._opened(open_, outer)
             open_ = outer
-            told = ", ".join(filter(None, (x.unit, x.allowed)))
-            note = " ".join(filter(None, (f"[{told}]" if told else "", x.doc)))
+            details = ", ".join(filter(None, (x.unit, x.allowed)))
+            note = " ".join(filter(None, (f"[{details}]" if details else "", x.doc)))
             lines.append(f"{self._indent(outer)}{self.prefix}_real {name};{f' /* {note} */' if note else ''}")
         lines += [*self._opened(open_, ""), *(f"    {line}" for line in more), f"}} {self.prefix}_{kind};"]
         return "\n".join(lines)
@@ -130,7 +131,7 @@ class Writer:
             p=p,
             P=p.upper(),
             banner=self.banner(f"{p}.h"),
-            told="\n".join(f" * {line}".rstrip() for line in self.told()),
+            notes="\n".join(f" * {line}".rstrip() for line in self.notes()),
             real=t.precision,
             maths="#include <math.h>\n" if any(np.isinf(x.value) for x in t.parameters) else "",
             period=literal(t.controller.period, t.precision),
@@ -147,7 +148,7 @@ class Writer:
             **{name: self.signature(name) for name in ("init", "step", "reset")},
         )
 
-    def told(self) -> list[str]:
+    def notes(self) -> list[str]:
         """Return the description in the header: cascade, order of work, cost."""
         t, counts = self.trace, self.trace.counts()
         size = 4 if t.precision == "float" else 8

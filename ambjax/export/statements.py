@@ -1,7 +1,7 @@
 """Write a program as C statements, one per node."""
 
 import re
-from typing import Any
+from typing import SupportsFloat
 
 import numpy as np
 
@@ -34,7 +34,7 @@ def word(name: str) -> str:
     return ".".join(re.sub(r"[^\x00-\x7f]", lambda found: f"_u{ord(found[0]):04x}", part) for part in parts)
 
 
-def literal(x: Any, precision: str) -> str:
+def literal(x: SupportsFloat, precision: str) -> str:
     """Return a number as a C constant of a precision: the shortest text with the same value."""
     suffix, kind = ("f", np.float32) if precision == "float" else ("", np.float64)
     value = kind(x)
@@ -49,7 +49,7 @@ def literal(x: Any, precision: str) -> str:
 class Statements:
     """The nodes `order` of a program as C in a precision, all names with `prefix`."""
 
-    def __init__(self, program: Program, order: list[int], precision: str, prefix: str):
+    def __init__(self, program: Program, order: list[int], precision: str, prefix: str) -> None:
         self.program, self.order, self.precision, self.prefix = program, order, precision, prefix
         self.number = {n: k for k, n in enumerate(order)}
         self.real = np.dtype(PRECISIONS[precision])

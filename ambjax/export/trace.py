@@ -2,16 +2,19 @@
 
 import dataclasses
 from collections import Counter
+from contextlib import AbstractContextManager
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ambjax.control.base import memory_of
 from ambjax.control.cascade import CascadeState
-from ambjax.export.controller import BITS, INPUTS, OUTPUTS, Controller, Number, StepInputs, parameters_of
+from ambjax.export.controller import Controller, Memory, Number, Parameters, parameters_of
 from ambjax.export.emitter import traced
+from ambjax.export.interface import BITS, INPUTS, OUTPUTS, StepInputs
 from ambjax.export.primitives import COUNTED, OPS
 from ambjax.export.program import Operand, Program, Ref
 from ambjax.export.statements import PERIOD, PRECISIONS, word
@@ -21,7 +24,7 @@ from ambjax.numerics.records import canonical
 UNREAD = "not read"
 
 
-def precision(name: str) -> Any:
+def precision(name: str) -> AbstractContextManager[object]:
     """Return a context manager that sets JAX to single ("float") or double precision."""
     import jax.experimental
 
@@ -29,7 +32,7 @@ def precision(name: str) -> Any:
     return home.enable_x64(name == "double")
 
 
-def arguments(controller: Controller) -> Any:
+def arguments(controller: Controller) -> tuple[Parameters, Memory, StepInputs, Array]:
     """Return parameters, memory, inputs and period as JAX values in its present precision."""
     zero = jnp.zeros(())
     inputs = StepInputs(*[zero] * len(StepInputs._fields))
@@ -118,7 +121,7 @@ def _traced(controller: Controller, to: str, read: frozenset[str]) -> Trace:
     keep = _alive(program, at[: len(states)], after, [*outputs, *bits, started])
     roots = [*outputs, *bits, started, *(after[k] for k in keep)]
     seen = program.needed(roots)
-    told = at[len(states) + 1 : -1]
+    input_refs = at[len(states) + 1 : -1]
     return Trace(
         controller,
         to,
@@ -129,7 +132,7 @@ def _traced(controller: Controller, to: str, read: frozenset[str]) -> Trace:
         started,
         [(Number(name, *_output(name), 0.0), x) for name, x in zip(OUTPUTS, outputs, strict=True)],
         list(zip(BITS, bits, strict=True)),
-        frozenset(name for name, ref in zip(StepInputs._fields, told, strict=True) if ref.node in seen),
+        frozenset(name for name, ref in zip(StepInputs._fields, input_refs, strict=True) if ref.node in seen),
         keep,
         refs,
     )
@@ -156,14 +159,14 @@ def _states(controller: Controller) -> list[Number]:
     cascade, memory = controller.parameters.controller, controller.start()
     found = []
     for stage, law, state in zip(CascadeState._fields, cascade.laws, memory.laws, strict=True):
-        told = memory_of(law, state)
-        assert len(told) == len(jax.tree.leaves(state)), f"{type(law).__name__}.memory: one entry for each state"
+        entries = memory_of(law, state)
+        assert len(entries) == len(jax.tree.leaves(state)), f"{type(law).__name__}.memory: one entry for each state"
         if any(jnp.shape(x) != () for x in jax.tree.leaves(state)):
             raise ValueError(
                 f"controller.{stage}: a state of {type(law).__name__} is an array; only scalars can be exported."
             )
         words = f"state of {type(law).__name__}"
-        found += [Number(f"{stage}.{name}", unit, "", doc or words, 0.0) for name, unit, doc in told]
+        found += [Number(f"{stage}.{name}", unit, "", doc or words, 0.0) for name, unit, doc in entries]
     commands = {**OUTPUTS, "i_ref_dot": ("A/s", "rate of i_ref")}
     found += [
         Number(f"last.{name}", commands[name][0], "", f"last {commands[name][1]}", 0.0) for name in memory.last._fields

@@ -7,7 +7,7 @@ loop, a correct program does too.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +20,12 @@ from ambjax.export.statements import PRECISIONS
 from ambjax.numerics.records import Scalar, canonical, record
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import run
-from ambjax.simulation.sampled import Sampled, SampledState, system_of
+from ambjax.simulation.sampled import Sampled, SampledState
+from ambjax.simulation.system import system_of
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, FaultyErrors
+
+T = TypeVar("T")
 
 # Twins of each precision; the share of a signal's rms at which they have parted; samples that a verdict takes at least.
 TWINS, PARTED, LEAST = 8, 1e-2, 20
@@ -73,11 +76,11 @@ class Twin(Sampled):
         moved = self._moved(before, state, self._sizes(state))
         # flags and counters are not changed
         watch = moved.watch._replace(left=state.watch.left) if state.watch else ()
-        state = moved._replace(sane=state.sane, watch=watch, started=state.started, sensed=state.sensed)
+        state = moved._replace(finite=state.finite, watch=watch, started=state.started, sensed=state.sensed)
         stepped = super().jump(t, state, errors)
         return stepped._replace(command=self._moved(after, stepped.command, self._sizes(stepped).command))
 
-    def _moved(self, key: Array, state: Any, sizes: Any) -> Any:
+    def _moved(self, key: Array, state: T, sizes: T) -> T:
         """Return every number changed by one unit of its scale, up or down."""
         leaves, tree = jax.tree.flatten(state)
         signs = jax.random.rademacher(key, (len(leaves),), float)
@@ -92,7 +95,7 @@ class Twin(Sampled):
         """
         cascade, plant = self.loop.cascade, self.loop.scenario.plant
         model = cascade.model
-        i, v = model.i_0 / 25, model.v_size
+        i, v = jnp.asarray(model.i_0) / 25, jnp.asarray(model.v_size)
         gap = jnp.maximum(model.s_0 - jnp.abs(plant.measurement(state.plant).z), 0.01 * model.s_0)
         driven = model.L * model.s_0 / gap * jnp.maximum(jnp.abs(state.command.i_ref), i) / self.period
         volt = jnp.abs(model.R * model.i_0) + driven
@@ -101,8 +104,8 @@ class Twin(Sampled):
             control=cascade.scale(),
             command=Command(i_ref=i, i_ref_dot=i * model.pole, u=volt, v_star=v, v_tilde=v),
             past=(volt, volt),
-            sane=jnp.zeros(()),
-            seen=jax.tree.map(lambda _: plant.s_0 / 50, state.seen),
+            finite=jnp.zeros(()),
+            z_filtered=jax.tree.map(lambda _: plant.s_0 / 50, state.z_filtered),
             u_a=jax.tree.map(lambda _: volt, state.u_a),
             watch=state.watch and Watch(plant.sizes(), jnp.zeros(())),
             started=state.started,
@@ -142,10 +145,10 @@ def _count(parted: dict[str, np.ndarray], sizes: dict[str, float], alive: int) -
 
 
 @jax.jit
-def _together(twin: Twin, clock: Clock, units: Array, seeds: Array) -> Any:
+def _together(twin: Twin, clock: Clock, units: Array, seeds: Array) -> tuple[tuple[Array, ...], Array, Scalar]:
     """Return z and u of one loop for each unit and seed, [loops, samples]; r, same shape; time of each loss, s."""
 
-    def one(unit: Array, seed: Array) -> Any:
+    def one(unit: Array, seed: Array) -> tuple[tuple[Array, ...], Array, Scalar]:
         system: Any = dataclasses.replace(twin, unit=unit, seed=seed)
         made = run(system, clock, None, every=1).trajectory
         return tuple(getattr(made.rows, name) for name in SIGNALS), made.rows.r, made.lost_at

@@ -79,7 +79,7 @@ def verify(drafts: Mapping[str, Draft], case: LoopCase | None) -> list[Check]:
                 for name in one.steps:
                     checks += _stepped(name, one, precision, machines[precision])
         if case is not None and len(machines) == len(drafts):
-            for precision, found in closed_loop.beside(case, machines).items():
+            for precision, found in closed_loop.compare_loops(case, machines).items():
                 checks.append(_looped(precision, found))
     return checks
 
@@ -89,14 +89,14 @@ def _built(one: Draft, precision: str, at: pathlib.Path) -> Iterator[Check]:
     source, test = at / f"{one.prefix}.c", at / f"{one.prefix}_test.c"
     for how, flags in (("", []), (", sanitized", SANITIZED)):
         program = at / f"test{len(flags)}"
-        said = build([source, test], program, *flags)
+        messages = build([source, test], program, *flags)
         words = "-fsanitize=address,undefined" if flags else " ".join(STRICT[2:])
-        yield Check(f"compiles{how}", precision, short(said) or "no warning", words, not said)
-        if not said:
-            code, told = execute(program)
-            yield Check(f"test program{how}", precision, short(told), "exit code 0", code == 0)
-    said = build([source], at / "controller.so", *SHARED)
-    yield Check("library", precision, short(said) or "no warning", EXACT, not said)
+        yield Check(f"compiles{how}", precision, short(messages) or "no warning", words, not messages)
+        if not messages:
+            code, output = execute(program)
+            yield Check(f"test program{how}", precision, short(output), "exit code 0", code == 0)
+    messages = build([source], at / "controller.so", *SHARED)
+    yield Check("library", precision, short(messages) or "no warning", EXACT, not messages)
 
 
 def _stepped(name: str, one: Draft, precision: str, machine: Compiled) -> Iterator[Check]:
@@ -125,18 +125,18 @@ def deviation(found: np.ndarray, should: np.ndarray, tiny: float) -> np.ndarray:
     return np.where(same, 0.0, np.where(np.isnan(off), np.inf, off))
 
 
-def _looped(precision: str, found: closed_loop.Beside) -> Check:
+def _looped(precision: str, found: closed_loop.LoopComparison) -> Check:
     """Compare the closed loop over its horizon."""
     name, horizon = "closed loop, dz", found.horizon
     count, samples = horizon.samples, horizon.signals["z"].size
     if not horizon.decisive:
-        told = f"twins of JAX's loop differ too much after {count} of {samples:,} samples"
-        return Check(name, precision, told, f"at least {LEAST} samples", None)
-    told = f"{found.times:.2g} times the rounding error, over {count:,} of {samples:,} samples"
+        result = f"twins of JAX's loop differ too much after {count} of {samples:,} samples"
+        return Check(name, precision, result, f"at least {LEAST} samples", None)
+    result = f"{found.times:.2g} times the rounding error, over {count:,} of {samples:,} samples"
     reached, size = float(horizon.parted["z"][count - 1]), horizon.sizes["z"]
     share = f", {reached / size:.1g} of the rms error" if size > 0 else ""
     allowed = f"{closed_loop.TIMES:g} times (rounding reaches {reached:.1g} m{share})"
-    return Check(name, precision, told, allowed, found.times <= closed_loop.TIMES)
+    return Check(name, precision, result, allowed, found.times <= closed_loop.TIMES)
 
 
 def table(checks: list[Check], case: str, mark: str) -> str:
@@ -147,7 +147,7 @@ def table(checks: list[Check], case: str, mark: str) -> str:
     return (
         f"# The controller of case '{case}' as C, compared with JAX\n\n{verdict}\n\n{head}\n"
         + "\n".join(rows)
-        + f"\n\n{TOLD}\n{mark}\n"
+        + f"\n\n{NOTES}\n{mark}\n"
     )
 
 
@@ -164,11 +164,11 @@ def summary(checks: list[Check]) -> str:
     return f"No check fails; {open_} of {len(checks)} are not decisive." if open_ else "All checks hold."
 
 
-TOLD = f"""One step: the points are random states and inputs over decades, zeros, limits, NaN and infinities, and points
-on both sides of the threshold of each comparison in the step. The reference is JAX in the same precision, one primitive
-at a time, with the functions of math.h: if XLA compiles the whole step, it rounds a product and a sum once where the C
-({EXACT}) rounds twice. The tolerance of a number is relative. Points at which an intermediate number is subnormal are
-omitted, because XLA replaces it by 0.
+NOTES = f"""One step: the points are random states and inputs over decades, zeros, limits, NaN and infinities, and
+points on both sides of the threshold of each comparison in the step. The reference is JAX in the same
+precision, one primitive at a time, with the functions of math.h: if XLA compiles the whole step, it rounds
+a product and a sum once where the C ({EXACT}) rounds twice. The tolerance of a number is relative. Points
+at which an intermediate number is subnormal are omitted, because XLA replaces it by 0.
 
 Parameters: one step with other parameters. This check finds a gain or a limit that the C has as a constant. Every
 parameter that the step reads is set to {1 / SPAN:g} and {SPAN:g} times the case's value, within the range in the

@@ -40,7 +40,7 @@ class _Handler:
                 words = self.report() if self.report is not None else ""
                 self._print(f"interrupted{f': {words}' if words else ''}.")
             except Exception as error:  # raised by the report
-                self._print(f"interrupted; what is kept is not known ({type(error).__name__}).")
+                self._print(f"interrupted; it is not known which results are kept ({type(error).__name__}).")
             finally:
                 os._exit(INTERRUPTED)
 

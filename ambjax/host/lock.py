@@ -13,7 +13,7 @@ NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 @contextlib.contextmanager
-def alone(directory: pathlib.Path) -> Iterator[None]:
+def locked(directory: pathlib.Path) -> Iterator[None]:
     """Hold the lock on the directory in this block.
 
     Has no effect on a file system without locks. Raises ValueError if another process holds the lock, and OSError if
@@ -24,7 +24,7 @@ def alone(directory: pathlib.Path) -> Iterator[None]:
         lock.acquire()
     except Timeout:
         raise ValueError(
-            f"--out {directory}: another run is at work there. Wait for it, or choose another directory."
+            f"--out {directory}: another run is using this directory. Wait for it, or choose another directory."
         ) from None
     except OSError as error:
         if error.errno not in NO_LOCKS:

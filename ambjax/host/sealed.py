@@ -28,7 +28,7 @@ class DamagedError(Exception):
     """A file does not hold what was written into it. The text gives the reason."""
 
 
-def write_whole(path: pathlib.Path, write: Callable[[IO[bytes]], Any]) -> None:
+def write_whole(path: pathlib.Path, write: Callable[[IO[bytes]], object]) -> None:
     """Write a file atomically: write to a new file `path`-*.part, then rename it to `path`.
 
     After a failure `path` holds what it held before. Raises ValueError if the file cannot be written (disk full).
@@ -42,13 +42,15 @@ def write_whole(path: pathlib.Path, write: Callable[[IO[bytes]], Any]) -> None:
             os.fsync(file.fileno())
         part.replace(path)
     except OSError as error:
-        raise ValueError(f"{path}: cannot be written ({error.strerror}). Make room, or choose another --out.") from None
+        raise ValueError(
+            f"{path}: cannot be written ({error.strerror}). Free disk space, or choose another --out."
+        ) from None
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
 
 
-def seal(path: pathlib.Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
+def seal(path: pathlib.Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, object]) -> None:
     """Write a sealed file. No array may have the name `seal`; facts must be JSON values.
 
     Raises ValueError if the file cannot be written.
@@ -63,7 +65,7 @@ def unseal(path: pathlib.Path) -> tuple[Arrays, dict[str, Any]]:
     """Return the arrays and facts of a sealed file. Raises DamagedError if they differ from what was sealed."""
     try:
         if not zipfile.is_zipfile(path):
-            raise DamagedError("it is not a whole archive")
+            raise DamagedError("it is an incomplete archive")
         with path.open("rb") as file, np.load(file) as archive:  # np.load leaves a damaged file open
             arrays = {name: archive[name] for name in archive.files}
         content = dict(json.loads(arrays.pop(SEAL).item()))
@@ -75,7 +77,7 @@ def unseal(path: pathlib.Path) -> tuple[Arrays, dict[str, Any]]:
     if checksum != _checksum(content, arrays):
         raise DamagedError("its checksum is wrong")
     if content.pop(ARRAYS) != shapes(arrays):
-        raise DamagedError("its arrays are not those that were sealed")
+        raise DamagedError("its arrays are not those that its record lists")
     return arrays, content
 
 
@@ -84,15 +86,15 @@ def shapes(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     return {name: [np.lib.format.dtype_to_descr(array.dtype), list(array.shape)] for name, array in arrays.items()}
 
 
-def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """Describe the first fact in which two fingerprints differ. Empty if they are equal."""
-    for key in {**there, **here}:
-        if there.get(key) != here.get(key):
-            return f"{key} is {there.get(key)} there and {here.get(key)} here"
+def difference(recorded: Mapping[str, object], current: Mapping[str, object]) -> str:
+    """Describe the first fact in which the fingerprints of a file and of this run differ. Empty if they are equal."""
+    for key in {**recorded, **current}:
+        if recorded.get(key) != current.get(key):
+            return f"{key} is {recorded.get(key)} in the file and {current.get(key)} in this run"
     return ""
 
 
-def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(tree: Mapping[str, object], prefix: str = "") -> dict[str, Any]:
     """Flatten nested tables into one with dotted keys and JSON values, so that `difference` can name a key."""
     entries: dict[str, Any] = {}
     for key, value in tree.items():
@@ -109,17 +111,17 @@ def provenance() -> dict[str, str]:
     return {"version": __version__, "jax": jax.__version__, "precision": str(jnp.result_type(float))}
 
 
-def checksum_of(facts: Mapping[str, Any]) -> str:
+def checksum_of(facts: Mapping[str, object]) -> str:
     """Return the SHA-256 of facts, written as JSON, in hexadecimal."""
     return _checksum(facts, {})
 
 
-def _checksum(facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
+def _checksum(facts: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> str:
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     for name in sorted(arrays):
         digest.update(name.encode() + b"\0" + np.ascontiguousarray(arrays[name]).tobytes())
     return digest.hexdigest()
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     return json.loads(json.dumps(value, default=str))

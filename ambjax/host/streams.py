@@ -10,7 +10,7 @@ from typing import Any
 class Lenient:
     """A wrapper of a text stream that records the first failure and discards all text after it."""
 
-    def __init__(self, stream: Any):
+    def __init__(self, stream: Any) -> None:
         self.stream, self.failed = stream, None
 
     def write(self, text: str) -> int:
@@ -25,7 +25,7 @@ class Lenient:
         self.flush()
         return self.failed
 
-    def _try(self, act: Callable[[], Any]) -> None:
+    def _try(self, act: Callable[[], object]) -> None:
         if self.failed is None:
             try:
                 act()

@@ -6,8 +6,6 @@ discretised by backward Euler, so that the outputs have neither chatter nor bias
 discretization of arbitrary-order robust exact differentiators, arXiv 2404.02770).
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -83,7 +81,7 @@ def _cubic_root(c: Array) -> Array:
 
 
 @_cubic_root.defjvp
-def _cubic_root_jvp(primals: tuple[Array], tangents: tuple[Any]) -> tuple[Array, Array]:
+def _cubic_root_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     # derivative of the implicit equation, not of the iteration
     r, (square, linear, _) = _cubic_root(*primals), LAM[2]
     return r, tangents[0] / ((3 * r + 2 * square) * r + linear)

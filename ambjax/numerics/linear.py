@@ -5,7 +5,7 @@ vector lane per member). A library call would take longer than the arithmetic.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,23 +14,25 @@ from jax import Array
 from ambjax.numerics.records import Scalar
 from ambjax.numerics.smooth import away_from_zero
 
+S = TypeVar("S")
+
 
 class Factors(NamedTuple):
     """The factors L and U of I - g J in one table. Elimination goes from the last component to the first."""
 
-    table: list[list[Any]]
-    inverse_pivots: list[Any]
+    table: list[list[Array]]
+    inverse_pivots: list[Array]
 
 
-def jacobian(function: Callable[[Any], Any], state: Any) -> list[list[Any]]:
+def jacobian(function: Callable[[S], object], state: S) -> list[list[Array]]:
     """Return d function_i / d state_j as nested lists [i][j], by one forward derivative per component.
 
     The other components are constants in each derivative, so that structural zeros are not computed.
     """
     leaves, tree = jax.tree.flatten(state)
 
-    def column(j: int) -> list[Any]:
-        def along(x: Array) -> list[Any]:
+    def column(j: int) -> list[Array]:
+        def along(x: Array) -> list[Array]:
             varied = [*leaves[:j], x, *leaves[j + 1 :]]
             return jax.tree.leaves(function(jax.tree.unflatten(tree, varied)))
 
@@ -41,7 +43,7 @@ def jacobian(function: Callable[[Any], Any], state: Any) -> list[list[Any]]:
     return [list(row) for row in zip(*columns, strict=True)]
 
 
-def factor(jac: list[list[Any]], g: Scalar) -> Factors:
+def factor(jac: list[list[Array]], g: Scalar) -> Factors:
     """Factor I - g J without row exchanges.
 
     Controller states are last in a state and eliminated first. Their diagonal entries 1 + g slope are large if the loop
@@ -51,7 +53,7 @@ def factor(jac: list[list[Any]], g: Scalar) -> Factors:
     n = len(jac)
     order = range(n - 1, -1, -1)
     m = [[(1.0 if i == j else 0.0) - g * jac[i][j] for j in order] for i in order]
-    inverses: list[Any] = []
+    inverses: list[Array] = []
     for k in range(n):
         inverses.append(1.0 / away_from_zero(m[k][k], 1e-12))
         for i in range(k + 1, n):
@@ -61,7 +63,7 @@ def factor(jac: list[list[Any]], g: Scalar) -> Factors:
     return Factors(m, inverses)
 
 
-def solve(factors: Factors, right: Any) -> Any:
+def solve(factors: Factors, right: S) -> S:
     """Return the state x with (I - g J) x = right."""
     m, inverses = factors
     leaves, tree = jax.tree.flatten(right)

@@ -9,22 +9,25 @@ import dataclasses
 import functools
 import math
 import operator
-from collections.abc import Callable
-from typing import Any, TypeVar, dataclass_transform
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
+from jax import Array
 from jax.core import Tracer
 
 T = TypeVar("T")
 
-# A real number of one member, traced or not; an array of them for an ensemble.
-Scalar = Any
+# A real number of one member, traced or not; an array of them for an ensemble. Arrays of NumPy work too, but are not in
+# the type: type checkers take the product of an array of NumPy and one of JAX for one of NumPy.
+Scalar: TypeAlias = Array | float
 
 
 def leaf(
-    default: Any = dataclasses.MISSING,
+    default: object = dataclasses.MISSING,
     *,
     unit: str = "",
     doc: str = "",
@@ -66,7 +69,7 @@ def leaf(
 GAINS = 1e-30, 1e30
 
 
-def gain(*, default: Any, unit: str, doc: str, steepness: bool = False) -> Any:
+def gain(*, default: object, unit: str, doc: str, steepness: bool = False) -> Any:
     """Declare a gain: a positive numeric field, tuned on a logarithmic scale.
 
     `steepness`: whether it is the steepness of a smoothed sign, which is matched to the plant, and tuned only on
@@ -76,7 +79,7 @@ def gain(*, default: Any, unit: str, doc: str, steepness: bool = False) -> Any:
     return dataclasses.field(default=default, metadata={**plain.metadata, "steepness": steepness})
 
 
-def static(default: Any = dataclasses.MISSING, *, doc: str = "") -> Any:
+def static(default: object = dataclasses.MISSING, *, doc: str = "") -> Any:
     """Declare a field that is part of the tree structure: hashable, never traced."""
     return dataclasses.field(default=default, metadata={"static": True, "doc": doc})
 
@@ -88,8 +91,8 @@ def record(cls: type[T]) -> type[T]:
     The type is part of the tree structure. With JAX's `register_dataclass` the structures of two types with equal
     static fields compare equal, so that the compiled program of one law could be used for another.
     """
-    made = dataclasses.dataclass(frozen=True)(cls)
-    fields = dataclasses.fields(made)  # pyright: ignore[reportArgumentType]
+    record_type = dataclasses.dataclass(frozen=True)(cls)
+    fields = dataclasses.fields(record_type)  # pyright: ignore[reportArgumentType]
     fixed = [f.name for f in fields if f.metadata.get("static")]
     names = [f.name for f in fields if not f.metadata.get("static")]
     keys = [jax.tree_util.GetAttrKey(name) for name in names]
@@ -97,33 +100,33 @@ def record(cls: type[T]) -> type[T]:
     values = _getter(names)
     fixed_values = _getter(fixed)
 
-    def structure(node: Any) -> tuple[Any, ...]:
-        return (made, *fixed_values(node))
+    def structure(node: T) -> tuple[object, ...]:
+        return (record_type, *fixed_values(node))
 
-    def flatten(node: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    def flatten(node: T) -> tuple[tuple[object, ...], tuple[object, ...]]:
         return values(node), structure(node)
 
-    def with_keys(node: Any) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
+    def with_keys(node: T) -> tuple[list[tuple[Hashable, object]], tuple[object, ...]]:
         return list(zip(keys, values(node), strict=True)), structure(node)
 
-    def unflatten(kept: tuple[Any, ...], leaves: Any) -> Any:
-        node = object.__new__(made)
+    def unflatten(kept: tuple[object, ...], leaves: Iterable[object]) -> T:
+        node = object.__new__(record_type)
         node.__dict__.update(zip(fixed, kept[1:], strict=True))
         node.__dict__.update(zip(names, leaves, strict=True))
         return node
 
-    jax.tree_util.register_pytree_with_keys(made, with_keys, unflatten, flatten)
-    return made
+    jax.tree_util.register_pytree_with_keys(record_type, with_keys, unflatten, flatten)
+    return record_type
 
 
-def _getter(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
+def _getter(names: list[str]) -> Callable[[object], tuple[object, ...]]:
     """Return a fast function from an object to its attributes: a rollout flattens about twenty records three times."""
     if len(names) > 1:
         return operator.attrgetter(*names)
     return lambda node: tuple(getattr(node, name) for name in names)
 
 
-def is_traced(x: Any) -> bool:
+def is_traced(x: object) -> bool:
     """Return whether x is traced by a JAX transformation, and has no concrete value."""
     return isinstance(x, Tracer)
 
@@ -144,7 +147,7 @@ def numbers(field: dataclasses.Field) -> str:
     return f"{kind}{end}"
 
 
-def within(meta: Any, value: Any) -> bool:
+def within(meta: Mapping[str, Any], value: npt.ArrayLike) -> bool:
     """Return whether a field with this metadata allows a number, or every number of an array."""
     if isinstance(value, (int, float)):
         if value == math.inf:
@@ -168,7 +171,7 @@ def _example(field: dataclasses.Field) -> str:
     return f" Use {default:g}, for example." if usable else ""
 
 
-def check_number(field: dataclasses.Field, name: str, value: Any) -> None:
+def check_number(field: dataclasses.Field, name: str, value: object) -> None:
     """Raise ValueError, with the dotted name, the value and the allowed range, for a number outside that range."""
     try:
         number = value if isinstance(value, (int, float)) else np.asarray(value, dtype=float)
@@ -179,7 +182,7 @@ def check_number(field: dataclasses.Field, name: str, value: Any) -> None:
         raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.{_example(field)}")
 
 
-def validate(node: Any, path: str = "") -> None:
+def validate(node: object, path: str = "") -> None:
     """Check every concrete leaf under `node` against its field. Traced leaves are not checked.
 
     Raises ValueError with the dotted path, the value, the allowed range and an example.
@@ -205,7 +208,7 @@ def _fields(kind: type) -> tuple[tuple[dataclasses.Field, bool], ...]:
     return tuple((field, bool(field.metadata.get("leaf"))) for field in fields)
 
 
-def _worst(value: Any, number: Any) -> str:
+def _worst(value: object, number: npt.ArrayLike) -> str:
     """Return the text for an invalid value in a message; for an array, its range."""
     return f"{np.min(number):g} to {np.max(number):g}" if np.ndim(number) else repr(value)
 
@@ -225,7 +228,7 @@ def canonical(node: T) -> T:
     return jax.tree.unflatten(tree, [_converted(x, kinds[w]) for x, w in zip(leaves, _whole(tree), strict=True)])
 
 
-def _converted(x: Any, kind: Any) -> Any:
+def _converted(x: Array | npt.ArrayLike, kind: np.dtype) -> Array | np.ndarray:
     if not isinstance(x, jax.Array):  # NumPy is faster than a dispatch of eager JAX
         return np.asarray(x, kind)
     return x if x.dtype == kind and not x.weak_type else jax.lax.convert_element_type(x, kind)

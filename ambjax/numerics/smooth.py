@@ -1,7 +1,6 @@
 """Smooth replacements of functions with discontinuous or unbounded derivatives, and fast vectorised functions."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -85,7 +84,7 @@ def _refined_reciprocal(x: Array) -> Array:
 RECIPROCAL = "_refined_reciprocal"
 
 
-def polynomial(u: Array, coefficients: Sequence[Scalar]) -> Any:
+def polynomial(u: Array, coefficients: Sequence[Scalar]) -> Scalar:
     """Evaluate a polynomial in u, coefficients in ascending order, by Estrin's scheme.
 
     Its latency is a third of that of Horner's scheme.
@@ -130,7 +129,7 @@ def _arctan_per_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array])
     return value, (dx / (1 + x * x) - value * d_per) / per
 
 
-def _turn(x: Array) -> Array:
+def _reduced_angle(x: Array) -> Array:
     """Return the angle x, in turns, reduced to -1/2..1/2 without rounding error."""
     return x - jnp.floor(x + 0.5)
 
@@ -147,7 +146,7 @@ def sine(x: Array) -> Array:
 
     The reduction of x is exact. The function vectorises, whereas XLA's sine is a library call on CPUs.
     """
-    y = _turn(x)
+    y = _reduced_angle(x)
     return _quarter(jnp.where(jnp.abs(y) > 0.25, jnp.where(y < 0, -0.5, 0.5) - y, y))
 
 
@@ -155,7 +154,7 @@ def sine(x: Array) -> Array:
 @compiled_alone
 def cosine(x: Array) -> Array:
     """Return cos(2 pi x), x in turns."""
-    return _quarter(0.25 - jnp.abs(_turn(x)))
+    return _quarter(0.25 - jnp.abs(_reduced_angle(x)))
 
 
 @sine.defjvp

@@ -5,32 +5,17 @@ is computed from the runs in `ambjax.paper.evidence`.
 """
 
 import dataclasses
-import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from ambjax.paper.evidence import BASIN, NOISE_STDS, UNCERTAIN, Evidence, Run
+from ambjax.paper.findings import FAILS, HOLDS, OPEN, STALLED, UNDECIDED, Finding, finding, largest_in, unfinished
 from ambjax.paper.readings import PULSE, SETTLE, TABLE_2
 from ambjax.world.plant import Plant
 
-HOLDS, FAILS, OPEN = "holds", "does not hold", "not determined by the paper"
-# Verdict on a claim about stalled runs, of which it is not known whether the rotor survives.
-UNDECIDED = "not decided"
-STALLED = "the integrator could not meet its tolerance, so whether the rotor survives is not known"
 SIGMA_RADIUS, TRACKING_ERROR, INVERSION_TIME = 6e-6, 2.3e-5, 0.01
 GAP = float(Plant().s_0)
-
-
-@dataclasses.dataclass(frozen=True)
-class Finding:
-    """The result of one claim in one reading: in words, as a number, the verdict, and its cause."""
-
-    ours: str
-    value: float | None
-    verdict: str
-    cause: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +32,9 @@ class Claim:
 CLAIMS: list[Claim] = []
 
 
-def claim(says: str, where: str, paper: str, criterion: str) -> Callable[[Callable[[Evidence], Finding]], Any]:
+def claim(
+    says: str, where: str, paper: str, criterion: str
+) -> Callable[[Callable[[Evidence], Finding]], Callable[[Evidence], Finding]]:
     """Decorator that enters a claim into CLAIMS, with the decorated function as its judge."""
 
     def enter(judge: Callable[[Evidence], Finding]) -> Callable[[Evidence], Finding]:
@@ -55,29 +42,6 @@ def claim(says: str, where: str, paper: str, criterion: str) -> Callable[[Callab
         return judge
 
     return enter
-
-
-def _finding(ours: str, value: float, condition: bool, cause: str) -> Finding:
-    return Finding(ours, value, HOLDS if condition else FAILS, cause)
-
-
-def _ended(run: Run, evidence: Evidence) -> Finding | None:
-    """Return the finding on a claim about a run that is lost or stalled; None if the run reached its end."""
-    if math.isinf(run.metrics["lost_at_s"]):
-        return None
-    if run.metrics["stalled"]:
-        return Finding(f"stalled at {run.metrics['lost_at_s'] * 1e3:.1f} ms", None, UNDECIDED, STALLED)
-    inversion = next(c for c in evidence.check_tracking.conditions if c.name == "inversion, ideal")
-    words = f"rotor lost at {run.metrics['lost_at_s'] * 1e3:.1f} ms"
-    cause = run.trajectory.lost_why
-    if inversion.gain is not None and inversion.gain <= inversion.against:
-        cause = f"gamma = {inversion.gain:g} < Delta_1 = {inversion.against:.3g} A^2/m^2/s, Eq. (7)"
-    return Finding(words, None, FAILS, cause)
-
-
-def _worst(rows: Any, name: str, begin: float, end: float) -> float:
-    """Return the largest |signal| in begin <= t < end."""
-    return float(np.abs(getattr(rows, name)[(rows.t >= begin) & (rows.t < end)]).max())
 
 
 @claim("Theorem 1's conditions hold under Table 2", "3.5", "assumed", "every margin positive, both scenarios")
@@ -94,7 +58,7 @@ def _theorem(evidence: Evidence) -> Finding:
     words = f"{len(failing)} of {len(lines)} conditions fail" if failing else f"tightest margin {share:.0f} %"
     if not failing and (evidence.check_regulation.stalled or evidence.check_tracking.stalled):
         return Finding(words, share, UNDECIDED, STALLED)
-    return _finding(words, share, not failing, cause)
+    return finding(words, share, not failing, cause)
 
 
 @claim(
@@ -108,7 +72,7 @@ def _stable(evidence: Evidence) -> Finding:
     )
     if unknown is not None:
         cause += f"; not decided at {unknown:.1e} m, where the integrator stalled"
-    if ended := _ended(evidence.regulation, evidence):
+    if ended := unfinished(evidence.regulation, evidence):
         cause += f"; from i = i_ref = 0: {ended.ours}"
     verdict = HOLDS if basin > 0 and ended is None else UNDECIDED
     if (basin == 0 and unknown is None) or (ended is not None and ended.verdict == FAILS):
@@ -122,9 +86,11 @@ def _stable(evidence: Evidence) -> Finding:
 )  # fmt: skip
 def _converges(evidence: Evidence) -> Finding:
     rows = evidence.regulation.trajectory.rows
-    z, e = _worst(rows, "e_z", 1.9, 2.0), _worst(rows, "e", 1.9, 2.0)
+    z, e = largest_in(rows, "e_z", 1.9, 2.0), largest_in(rows, "e", 1.9, 2.0)
     cause = "over the last 0.1 s, 0.6 s after the pulse"
-    return _ended(evidence.regulation, evidence) or _finding(f"{z:.1e} m, {e:.1e} A", z, z < 1e-6 and e < 1e-3, cause)
+    return unfinished(evidence.regulation, evidence) or finding(
+        f"{z:.1e} m, {e:.1e} A", z, z < 1e-6 and e < 1e-3, cause
+    )
 
 
 @claim(
@@ -139,7 +105,7 @@ def _finite_time(evidence: Evidence) -> Finding:
     outside = np.flatnonzero(np.abs(rows.sigma[early]) > SIGMA_RADIUS)
     at = float(rows.t[early][outside[-1]]) if outside.size else 0.0
     cause = "last time before the pulse that |sigma| > 6e-6 m/s"
-    return _ended(evidence.regulation, evidence) or _finding(f"{at:.4g} s", at, at < 0.1, cause)
+    return unfinished(evidence.regulation, evidence) or finding(f"{at:.4g} s", at, at < 0.1, cause)
 
 
 @claim(
@@ -150,11 +116,11 @@ def _finite_time(evidence: Evidence) -> Finding:
 )
 def _radius(evidence: Evidence) -> Finding:
     rows = evidence.regulation.trajectory.rows
-    quiet, pulse = _worst(rows, "sigma", SETTLE, PULSE.start), _worst(rows, "sigma", PULSE.start, PULSE.stop)
+    quiet, pulse = largest_in(rows, "sigma", SETTLE, PULSE.start), largest_in(rows, "sigma", PULSE.start, PULSE.stop)
     worst = max(quiet, pulse)
     cause = f"{quiet:.1e} m/s before the pulse, {pulse:.1e} in it; without noise, k 2/pi arctan(p sigma) balances q_z"
-    ended = _ended(evidence.regulation, evidence)
-    return ended or _finding(f"{worst:.1e} m/s", worst, worst <= 1.05 * SIGMA_RADIUS, cause)
+    ended = unfinished(evidence.regulation, evidence)
+    return ended or finding(f"{worst:.1e} m/s", worst, worst <= 1.05 * SIGMA_RADIUS, cause)
 
 
 @claim(
@@ -166,18 +132,18 @@ def _radius_by_noise(evidence: Evidence) -> Finding:
     hits = {period: std for period, std in stds.items() if std is not None}
     if not hits:
         verdict = UNDECIDED if any(n.undecided for n in evidence.noise) else FAILS
-        ended = _ended(evidence.regulation, evidence)
+        ended = unfinished(evidence.regulation, evidence)
         return ended or Finding("at no std scanned", None, verdict, "see the noise table")
     nearest = max(hits.values())
     cause = f"the printed std is {TABLE_2.noise_std / nearest:.0f} times the largest that gives this radius"
     words = "at std " + ", ".join(f"{std:.1e} m held {period:g} s" for period, std in hits.items())
-    return _finding(words, nearest, 0.8 <= nearest / TABLE_2.noise_std <= 1.25, cause)
+    return finding(words, nearest, 0.8 <= nearest / TABLE_2.noise_std <= 1.25, cause)
 
 
 def _pulse_effect(evidence: Evidence, run: Run) -> Finding:
     change = float(np.abs(run.trajectory.rows.z - run.quiet.rows.z).max())
     cause = f"the pulse moves the rotor by {100 * change / GAP:.2g} % of the gap; without noise by q_z pi / (2 c k p)"
-    return _ended(run, evidence) or _finding(f"{change:.3e} m", change, change <= TRACKING_ERROR, cause)
+    return unfinished(run, evidence) or finding(f"{change:.3e} m", change, change <= TRACKING_ERROR, cause)
 
 
 @claim(
@@ -191,7 +157,7 @@ def _inversion(evidence: Evidence, run: Run) -> Finding:
     at = run.metrics["v_tilde_reached_s"]
     late = run.metrics["settled_max_abs_v_tilde_A2_per_m2"]
     cause = f"first |v_tilde| <= 0.1 A^2/m^2; after {SETTLE} s it stays within {late:.2g}"
-    return _ended(run, evidence) or _finding(f"{at:.4g} s", at, at < INVERSION_TIME, cause)
+    return unfinished(run, evidence) or finding(f"{at:.4g} s", at, at < INVERSION_TIME, cause)
 
 
 @claim(
@@ -210,15 +176,15 @@ def _inversion_tracking(evidence: Evidence) -> Finding:
 def _current(evidence: Evidence) -> Finding:
     worst = max(r.metrics["settled_max_abs_current_error_A"] for r in (evidence.regulation, evidence.tracking))
     cause = f"largest |i - i_ref| after {SETTLE} s, pulse included; q_i = 0, so Eq. (14) decays to 0 unless u saturates"
-    ended = _ended(evidence.regulation, evidence) or _ended(evidence.tracking, evidence)
-    return ended or _finding(f"{worst:.1e} A", worst, worst < 1e-3, cause)
+    ended = unfinished(evidence.regulation, evidence) or unfinished(evidence.tracking, evidence)
+    return ended or finding(f"{worst:.1e} A", worst, worst < 1e-3, cause)
 
 
 @claim("Tracking: largest error 2.3e-5 m", "4", "2.3e-5 m", "rounds to 2.3e-5 m or less")
 def _tracking(evidence: Evidence) -> Finding:
     error = evidence.tracking.metrics["settled_max_abs_error_m"]
     cause = f"largest |z - r| after {SETTLE} s, pulse included"
-    return _ended(evidence.tracking, evidence) or _finding(f"{error:.3e} m", error, error < 2.35e-5, cause)
+    return unfinished(evidence.tracking, evidence) or finding(f"{error:.3e} m", error, error < 2.35e-5, cause)
 
 
 @claim(
@@ -268,7 +234,7 @@ def _specification(evidence: Evidence) -> Finding:
 def _share(evidence: Evidence) -> Finding:
     share = 3 * TABLE_2.noise_std / GAP
     cause = "arithmetic on the printed variance, its unit read as m^2"
-    return _finding(f"3 std = {100 * share:.0f} % of s_0", share, abs(share - 0.2) < 0.02, cause)
+    return finding(f"3 std = {100 * share:.0f} % of s_0", share, abs(share - 0.2) < 0.02, cause)
 
 
 @claim(
@@ -284,4 +250,4 @@ def _robust(evidence: Evidence) -> Finding:
     cause = (
         f"one of {', '.join(UNCERTAIN)} off by 10 % up or down, controller unchanged; our choice, the paper tests none"
     )
-    return _finding(f"{error:.1e} m at worst", error, error < 0.01 * GAP, cause)
+    return finding(f"{error:.1e} m at worst", error, error < 0.01 * GAP, cause)

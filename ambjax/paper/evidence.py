@@ -14,10 +14,11 @@ from ambjax.compiler.fast_path import one_kernel
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.integrate import AdaptiveRodas3, Slide
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import Standard
 from ambjax.simulation.rollout import rollout
+from ambjax.simulation.rosenbrock import AdaptiveRodas3
+from ambjax.simulation.sliding import Slide
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.theorem.conditions import Report, check
 from ambjax.world.plant import Plant
@@ -203,7 +204,7 @@ def _scan(cascade: Cascade, scenarios: Scenario, clock: Clock) -> dict[str, Any]
     return jax.lax.map(lambda s: rollout(cascade, s, clock, fold=fold, every=0).measured, scenarios)
 
 
-def _batch(one: Any, size: int, **leaves: Any) -> Any:
+def _batch(one: object, size: int, **leaves: object) -> Any:
     """Return an ensemble of `size` copies of a scenario or of a part of one; `leaves` replace fields."""
     copies = jax.tree.map(lambda x: jnp.broadcast_to(x, (size,)), canonical(one))
     return dataclasses.replace(copies, **leaves)

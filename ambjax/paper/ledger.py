@@ -34,7 +34,7 @@ def judge(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
     return rows
 
 
-def noise_table(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
+def noise_table(evidence: dict[str, Evidence]) -> list[dict[str, object]]:
     """Return the noise scan as plain data, one row for each reading and sample period.
 
     A row has the largest std survived, m; the next std if it is not decided (else None); and the std at which sigma's
@@ -54,7 +54,7 @@ def noise_table(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
     ]
 
 
-def processor_table(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
+def processor_table(evidence: dict[str, Evidence]) -> list[dict[str, object]]:
     """Return the status and metrics of each reading, tracking, on the processor of `sampled`, as plain data.
 
     `lost_at_s` is inf if the rotor survives.

@@ -180,7 +180,7 @@ def _statuses(lost: int, stalled: int) -> str:
 
 
 @own_style
-def histograms(columns: Mapping[str, Any], path: pathlib.Path, metrics: Sequence[str] = CHIEF) -> None:
+def histograms(columns: Mapping[str, np.ndarray], path: pathlib.Path, metrics: Sequence[str] = CHIEF) -> None:
     """Write histograms of the `metrics` in `columns` (of members.npz, each [N]), with survivors and lost apart.
 
     A member with a finite `lost_at` or `lost_at_s` does not survive; without these columns all survive. `stalled` marks
@@ -207,7 +207,7 @@ def histograms(columns: Mapping[str, Any], path: pathlib.Path, metrics: Sequence
     figure.savefig(path, dpi=130)
 
 
-def _lost(columns: Mapping[str, Any], members: int) -> np.ndarray:
+def _lost(columns: Mapping[str, object], members: int) -> np.ndarray:
     for name in ("lost_at", "lost_at_s"):
         if name in columns:
             return np.isfinite(np.asarray(columns[name], float))

@@ -22,7 +22,7 @@ CONTOUR = 0.95
 LINES = {"low": 0.8, "high": 0.8, "survival": 2.2}
 # Both colour maps run evenly from dark to light, so that light means good in grey print too.
 SURVIVAL, ERROR = "cividis", "viridis_r"
-NOBODY = {"facecolor": "#d4d4d4", "edgecolor": "#8a8a8a", "hatch": "////", "linewidth": 0.0}
+EMPTY_CELL = {"facecolor": "#d4d4d4", "edgecolor": "#8a8a8a", "hatch": "////", "linewidth": 0.0}
 
 
 @own_style
@@ -64,12 +64,14 @@ def maps(
         keys.append(Line2D([], [], color=INK, linewidth=LINES["low"], label=words))
     grids = [grid for panel in panels for grid in (panel["survival"], panel["error"]) if grid is not None]
     if not all(np.isfinite(grid).all() for grid in grids):
-        keys.append(Patch(label="no survivor" if rows == 2 else "not run", **NOBODY))
+        keys.append(Patch(label="no survivor" if rows == 2 else "not run", **EMPTY_CELL))
     figure.legend(handles=keys, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     figure.savefig(path, dpi=150)
 
 
-def _errors(figure: Figure, axes: Any, panels: Sequence[Mapping[str, Any]], metric: str, labels: Any) -> None:
+def _errors(
+    figure: Figure, axes: Sequence[Axes], panels: Sequence[Mapping[str, Any]], metric: str, labels: Any
+) -> None:
     """Draw the lower row: the errors, on one logarithmic scale."""
     errors = [panel["error"] for panel in panels if panel["error"] is not None]
     values = np.concatenate([np.ravel(np.asarray(error, float)) for error in errors])
@@ -98,7 +100,7 @@ def _cells(ax: Axes, panel: Mapping[str, Any], values: np.ndarray, norm: Normali
     x_factor, x_label = label_of(x_label, size_of(x, x_log))
     y_factor, y_label = label_of(y_label, size_of(y, y_log))
     x_edges, y_edges = edges(x_factor * x, x_log), edges(y_factor * y, y_log)
-    ax.patch.set(**NOBODY)
+    ax.patch.set(**EMPTY_CELL)
     ax.set_xscale("log" if x_log else "linear")
     ax.set_yscale("log" if y_log else "linear")
     ax.pcolormesh(x_edges, y_edges, np.ma.masked_invalid(values), norm=norm, cmap=colours)
@@ -133,7 +135,7 @@ def _outline(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, inside: np.ndar
         ax.add_collection(lines, autolim=False)
 
 
-def _range(panel: Mapping[str, Any]) -> str:
+def _range(panel: Mapping[str, object]) -> str:
     """Return in words how much of the grid survives, because a missing contour means all of it or none."""
     share = np.asarray(panel["survival"], float)
     cells = share[np.isfinite(share)]

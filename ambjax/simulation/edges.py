@@ -74,7 +74,12 @@ def inset(t: Scalar, h: Scalar) -> Scalar:
 
     The step begins at t (s) and has length h (s).
     """
-    return 4 * jnp.finfo(jnp.result_type(float)).eps * (abs(t) + h)
+    return _rounding() * (abs(t) + h)
+
+
+def _rounding() -> float:
+    """Return a few units in the last place of 1 in the working precision."""
+    return 4 * float(jnp.finfo(jnp.result_type(float)).eps)
 
 
 def most_inside(scenario: Scenario, period: Scalar) -> int | None:
@@ -103,4 +108,4 @@ def _between_samples(edge: np.ndarray, periods: np.ndarray) -> bool:
         return True
     at = np.ravel(edge)[0]
     nearest = np.round(at / periods) * periods
-    return bool(np.any(np.abs(at - nearest) > inset(nearest, periods)))
+    return bool(np.any(np.abs(at - nearest) > _rounding() * (np.abs(nearest) + periods)))

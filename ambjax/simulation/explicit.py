@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from jax import Array
 
 from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.numerics.records import Scalar, record
-from ambjax.simulation.integrate import InitialValueProblem, Times, _Fixed
+from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, State, Times
 from ambjax.simulation.span import Span
 
 
@@ -31,7 +31,9 @@ def _combination(weights: tuple[float, ...]) -> Callable[..., Array]:
     combination = jax.custom_jvp(compiled_alone(plain))
 
     @combination.defjvp
-    def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    def _(
+        primals: tuple[Array, Array, tuple[Array, ...]], tangents: tuple[Array, Array, tuple[Array, ...]]
+    ) -> tuple[Array, Array]:
         (x, h, rates), (dx, dh, d_rates) = primals, tangents
         slope = sum(w * k for w, k in zip(weights, rates, strict=True) if w)
         return combination(x, h, rates), combination(dx, h, d_rates) + dh * slope  # tangents are not fused either
@@ -39,7 +41,7 @@ def _combination(weights: tuple[float, ...]) -> Callable[..., Array]:
     return combination
 
 
-class _Explicit(_Fixed):
+class _Explicit(FixedSteps):
     """Base class of explicit Runge-Kutta methods.
 
     - `TIMES`: times of the stages, as fractions of the step.
@@ -52,7 +54,9 @@ class _Explicit(_Fixed):
     TIMES: ClassVar[tuple[float, ...]]
     ROWS: ClassVar[tuple[tuple[float, ...], ...]]
 
-    def _step(self, problem: InitialValueProblem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
+    def _step(
+        self, problem: InitialValueProblem[Inputs, State], at: Times, h: Scalar, state: State, span: Span
+    ) -> tuple[State, Span]:
         inputs = {share: problem.inputs(at(share)) for share in self.TIMES}
         x, stages, h = state, [], jnp.asarray(h)
         for share, row, weight in zip(self.TIMES, self.ROWS, self.ROWS[-1], strict=True):
@@ -62,7 +66,11 @@ class _Explicit(_Fixed):
             x = jax.tree.map(lambda x, *ks, combination=combination: combination(x, h, ks), state, *stages)
             # Integrals use the weights of the method. Only the first stage counts for extremes; the others are trial
             # states.
-            span = span.seen(instant, weight * h, h) if len(stages) == 1 else span.weighed(instant, weight * h)
+            span = (
+                span.with_instant(instant, weight * h, h)
+                if len(stages) == 1
+                else span.with_densities(instant, weight * h)
+            )
         return x, span
 
 

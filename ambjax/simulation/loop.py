@@ -90,7 +90,7 @@ class ClosedLoop:
         plant = self.scenario.plant.start(self.scenario.initial.measurement())
         return LoopState(plant, self.cascade.init(self.measured(plant, self.sensor_errors(0))))
 
-    def measured(self, plant: Any, errors: Errors) -> Measurement:
+    def measured(self, plant: object, errors: Errors) -> Measurement:
         """Return the readings of the sensors for this state of the plant."""
         motion, sensor = self.scenario.plant.measurement(plant), self.scenario.sensor
         return motion if sensor is None else sensor.reading(motion, errors)
@@ -109,11 +109,15 @@ class ClosedLoop:
         scenario = self.scenario
         return ExternalInputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t))
 
+    def received(self, inputs: Any, plant: Any, errors: Errors) -> Measurement:
+        """Return what the controller reads; `inputs`: those of the instant, of the method `inputs`."""
+        return self.measured(plant, errors)
+
     def command(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> tuple[Command, CascadeState, Array]:
         """Return the command of the cascade, the rates of its states, and the applied voltage, V."""
         u_max = jnp.asarray(self.scenario.u_max)
-        seen = self.measured(state.plant, errors)
-        command, rates = self.cascade(seen, state.control, inputs.reference, u_max)
+        measured = self.received(inputs, state.plant, errors)
+        command, rates = self.cascade(measured, state.control, inputs.reference, u_max)
         return command, rates, limited(command.u, u_max)
 
     def rates(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> LoopState:
@@ -127,7 +131,7 @@ class ClosedLoop:
         shown = self.shown(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
         return self.moved(inputs, state, control, u), shown
 
-    def shown(self, reference: Reference, plant: Any, i_ref: Array, v_tilde: Array, u: Array) -> Instant:
+    def shown(self, reference: Reference, plant: object, i_ref: Array, v_tilde: Array, u: Array) -> Instant:
         """Return the signals at one instant, from the plant's state, references, input error and voltage."""
         motion, heat = self.scenario.plant.measurement(plant), self.scenario.plant.signals(plant).heat
         sigma = self.cascade.position.sigma(motion, reference)
@@ -140,15 +144,15 @@ class ClosedLoop:
 
     def status(self, state: LoopState) -> Array:
         """Return the status code of the rotor: 0 while it is levitated."""
-        return self.judged(state, self.scale(), state.plant)
+        return self.status_of(state, self.scale(), state.plant)
 
-    def judged(self, state: Any, scale: Any, plant: Any) -> Array:
+    def status_of(self, state: object, scale: object, plant: object) -> Array:
         """Return the status code for a state, or a part of a state, with its scale and the state of the plant."""
-        sane = [jnp.abs(x) <= DIVERGENCE * s for x, s in zip(*map(jax.tree.leaves, (state, scale)), strict=True)]
+        in_range = [jnp.abs(x) <= DIVERGENCE * s for x, s in zip(*map(jax.tree.leaves, (state, scale)), strict=True)]
         touched = jnp.abs(self.scenario.plant.measurement(plant).z) >= self.scenario.touchdown
-        return jnp.where(functools.reduce(jnp.logical_and, sane), jnp.where(touched, TOUCHED, ALIVE), DIVERGED).astype(
-            jnp.int32
-        )
+        return jnp.where(
+            functools.reduce(jnp.logical_and, in_range), jnp.where(touched, TOUCHED, ALIVE), DIVERGED
+        ).astype(jnp.int32)
 
     def rest(self, state: LoopState, code: Array) -> LoopState:
         """Return the state in which a lost rotor is frozen: at rest, at the stop that it touched.
@@ -174,13 +178,13 @@ class ClosedLoop:
         """Return all signals at one instant. The drive of a lost rotor is off: u = 0."""
         inputs = self.inputs(t)
         command, _, u = self.command(inputs, state, errors)
-        seen = self.measured(state.plant, errors)
-        return self.signals(t, inputs, state.plant, command._replace(u=u), seen, alive)
+        measured = self.received(inputs, state.plant, errors)
+        return self.signals(t, inputs, state.plant, command._replace(u=u), measured, alive)
 
     def signals(
-        self, t: Scalar, inputs: ExternalInputs, state: Any, command: Command, seen: Measurement, alive: Array
+        self, t: Scalar, inputs: ExternalInputs, state: object, command: Command, measured: Measurement, alive: Array
     ) -> Row:
-        """Return all signals, from the plant's state, the readings `seen` and the command; u is already limited."""
+        """Return all signals, from the plant's state, the readings `measured` and the command; u is already limited."""
         plant = self.scenario.plant
         motion, signals = plant.measurement(state), plant.signals(state)
         return Row(
@@ -199,7 +203,7 @@ class ClosedLoop:
             r=inputs.reference.r,
             q_z=inputs.q_z,
             q_i=inputs.q_i,
-            z_measured=seen.z,
+            z_measured=measured.z,
             heat=jnp.where(alive, signals.heat, 0.0),
             refused=jnp.zeros_like(alive),
             alive=alive,

@@ -12,7 +12,8 @@ from ambjax.numerics.records import is_traced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.edges import most_inside
 from ambjax.simulation.explicit import RK4
-from ambjax.simulation.integrate import AdaptiveRodas3, Integrator, Rodas3
+from ambjax.simulation.integrate import Integrator
+from ambjax.simulation.rosenbrock import AdaptiveRodas3, Rodas3
 from ambjax.world.scenario import Scenario
 
 # Product of step and slope at which RK4 is accurate to about 1e-9 m on smooth gains (benchmarks/work_precision.py).

@@ -4,13 +4,15 @@ Both are differentiable in the gains. Their derivatives are those of the crossin
 the largest excursion.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.simulation.metrics import Ending
+from ambjax.simulation.folds import Ending
+from ambjax.simulation.span import Span
+from ambjax.simulation.trajectory import Row
 
 # Smallest slope of a crossing, in bands per sample, which bounds the derivative of the settling time.
 SLOWEST = 1e-3
@@ -42,7 +44,7 @@ class Settling:
         zero = jnp.zeros((), jnp.result_type(float))
         return Crossing(zero, zero, zero)
 
-    def update(self, carry: Crossing, row: Any, span: Any) -> Crossing:
+    def update(self, carry: Crossing, row: Row, span: Span) -> Crossing:
         size = jnp.abs(row.z - row.r)
         fall = jnp.maximum(carry.size - size, SLOWEST * self.band)
         share = jnp.minimum((carry.size - self.band) / fall, 1.0)
@@ -73,7 +75,7 @@ class Overshoot:
         zero = jnp.zeros((), jnp.result_type(float))
         return Reach(zero + jnp.inf, zero - jnp.inf, zero)
 
-    def update(self, carry: Reach, row: Any, span: Any) -> Reach:
+    def update(self, carry: Reach, row: Row, span: Span) -> Reach:
         began = jnp.where(row.t <= 0, row.z, row.r)
         low = jnp.minimum(carry.low, jnp.minimum(began, row.r))
         high = jnp.maximum(carry.high, jnp.maximum(began, row.r))

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +13,20 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.laws import STAGES
 from ambjax.numerics.records import Scalar, canonical, validate
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.integrate import Advanced, InitialValueProblem, choose
+from ambjax.simulation.folds import Ending, Fold
+from ambjax.simulation.integrate import Advanced, choose
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.method import with_method
-from ambjax.simulation.metrics import Ending, Fold
-from ambjax.simulation.sampled import Sampled, check_parts, system_of
+from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.span import Span
-from ambjax.simulation.trajectory import ALIVE, Trajectory, first_time
+from ambjax.simulation.system import check_parts, system_of
+from ambjax.simulation.trajectory import ALIVE, Row, Trajectory, first_time
 from ambjax.world.scenario import Scenario
-from ambjax.world.sensor import Errors
+
+# State of a system, the errors of its sensors, and its row.
+S = TypeVar("S")
+E = TypeVar("E")
+R = TypeVar("R")
 
 
 class Outcome(NamedTuple):
@@ -35,7 +40,7 @@ class Outcome(NamedTuple):
     measured: Any
 
 
-class System(Protocol):
+class System(Protocol[S, E, R]):
     """Interface of a system for a rollout: the closed loop, or the closed loop with an extended state.
 
     A system whose state jumps at the start of a sample, such as a controller on a processor, also has
@@ -43,23 +48,25 @@ class System(Protocol):
         jump(t, state, errors) -> state
 
     It is called first in a sample: the row and the integrator use the state after the jump. The state of a lost rotor
-    does not jump. A system that integrates only a part of its state, or whose rates jump within a sample, has
+    does not jump. A system whose rates are smooth within a sample has
+
+        problem(errors) -> InitialValueProblem
+
+    A system that integrates only a part of its state, or whose rates jump within a sample, has instead
 
         advance(method, errors, t, period, state, memory, code) -> Advanced
 
-    which replaces `method.advance(problem(errors), ...)`; its `problem` is then not called. `integrate.in_turn` is
-    useful for such a system.
+    which replaces `method.advance(problem(errors), ...)`. `integrate.in_turn` is useful for such a system.
     """
 
     def realised(self) -> Self: ...
-    def sensor_errors(self, sample: Scalar) -> Errors: ...
-    def start(self) -> Any: ...
-    def problem(self, errors: Errors) -> InitialValueProblem: ...
-    def status(self, state: Any) -> Array: ...
-    def rest(self, state: Any, code: Array) -> Any: ...
-    def row(self, t: Scalar, state: Any, errors: Errors, alive: Array) -> Any: ...
-    def noted(self, row: Any, span: Span) -> Any: ...
-    def singularity(self, row: Any) -> Array: ...
+    def sensor_errors(self, sample: Scalar) -> E: ...
+    def start(self) -> S: ...
+    def status(self, state: S) -> Array: ...
+    def rest(self, state: S, code: Array) -> S: ...
+    def row(self, t: Scalar, state: S, errors: E, alive: Array) -> R: ...
+    def noted(self, row: R, span: Span) -> R: ...
+    def singularity(self, row: R) -> Array: ...
 
 
 class RolloutState(NamedTuple):
@@ -140,14 +147,14 @@ def begin(system: System, clock: Clock, fold: Fold | None) -> RolloutState:
 
 def segment(
     system: System, clock: Clock, fold: Fold | None, progress: RolloutState, first: Scalar, count: int, every: int
-) -> tuple[RolloutState, Any]:
+) -> tuple[RolloutState, Row | None]:
     """Simulate `count` samples from number `first` on. Returns the new state and the rows (None if every = 0)."""
     step = functools.partial(_sample, system.realised(), clock, fold)
 
     def unrecorded(progress: RolloutState, first: Scalar, count: int) -> RolloutState:
         return lax.fori_loop(0, count, lambda n, progress: step(progress, first + n)[0], progress)
 
-    def block(progress: RolloutState, k: Array, length: int) -> tuple[RolloutState, Any]:
+    def block(progress: RolloutState, k: Array, length: int) -> tuple[RolloutState, Row]:
         progress, row = step(progress, k)
         if length > 1:
             progress = unrecorded(progress, k + 1, length - 1)
@@ -165,28 +172,30 @@ def segment(
 
 def stretch(
     system: System, clock: Clock, fold: Fold | None, progress: RolloutState, first: Scalar, count: int
-) -> tuple[RolloutState, Any]:
+) -> tuple[RolloutState, Row]:
     """Simulate `count` samples from number `first` on, and record every row. Returns the new state and the rows.
 
     After the clock's last sample the state does not change, so that one compiled program serves every part of a run.
     """
     step = functools.partial(_sample, system.realised(), clock, fold)
 
-    def sample(progress: RolloutState, k: Array) -> tuple[RolloutState, Any]:
+    def sample(progress: RolloutState, k: Array) -> tuple[RolloutState, Row]:
         after, row = step(progress, k)
         return choose(k < clock.samples, after, progress), row
 
     return lax.scan(sample, progress, first + jnp.arange(count))
 
 
-def finish(progress: RolloutState, rows: Any, fold: Fold | None) -> Outcome:
+def finish(progress: RolloutState, rows: Row | None, fold: Fold | None) -> Outcome:
     """Return the outcome, from the state after the last sample and the rows."""
     lost_code, lost_at, singular_at, _ = progress.ending
     measured = None if fold is None else fold.result(progress.fold, progress.ending)
-    return Outcome(Trajectory(rows, lost_at, lost_code, singular_at), measured)
+    return Outcome(Trajectory(cast(Row, rows), lost_at, lost_code, singular_at), measured)
 
 
-def _advanced(system: Any, clock: Clock, errors: Errors, t: Array, state: Any, memory: Any, code: Array) -> Advanced:
+def _advanced(
+    system: Any, clock: Clock, errors: object, t: Array, state: object, memory: object, code: Array
+) -> Advanced:
     """Advance the system over the sample that begins at t (s)."""
     method, period = clock.integrator, clock.sample_period
     if hasattr(system, "advance"):
@@ -194,14 +203,14 @@ def _advanced(system: Any, clock: Clock, errors: Errors, t: Array, state: Any, m
     return method.advance(system.problem(errors), t, period, state, memory, code)
 
 
-def _sample(system: Any, clock: Clock, fold: Fold | None, progress: RolloutState, k: Array) -> tuple[RolloutState, Any]:
+def _sample(system: Any, clock: Clock, fold: Fold | None, progress: RolloutState, k: Array) -> tuple[RolloutState, Row]:
     """Record the row at the start of sample k, then integrate to its end with the measurement errors held.
 
     Reverse mode recomputes a sample (checkpoint), so that its memory grows with the samples, not with the substeps.
     """
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
-    def run(system: Any, clock: Clock, fold: Fold | None, progress: RolloutState) -> tuple[RolloutState, Any]:
+    def run(system: Any, clock: Clock, fold: Fold | None, progress: RolloutState) -> tuple[RolloutState, Row]:
         state, ending, memory, folded = progress
         dtype = jnp.result_type(float)
         t = k.astype(dtype) * clock.sample_period

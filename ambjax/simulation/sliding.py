@@ -13,7 +13,7 @@ The motion of the rotor and the states of the other laws are integrated by Heun'
 step.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,12 +22,15 @@ from jax import Array
 from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.control.cascade import Cascade
 from ambjax.control.laws import CurrentDemand, CurrentInputs
-from ambjax.numerics.records import Scalar
+from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import limited
+from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, Times, axpy
 from ambjax.simulation.span import Instant, Span
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import State
 from ambjax.world.sensor import Errors, Measurement
+
+S = TypeVar("S")
 
 
 def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
@@ -44,7 +47,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     z_ddot_0 = scenario.plant.z_ddot(z, i, begin.q_z)
     ahead = State(z + h * z_dot + h * h / 2 * z_ddot_0, z_dot + h * z_ddot_0, i)
     control_1 = control._replace(
-        observer=_axpy(control.observer, h, rates_0.observer), position=_axpy(control.position, h, rates_0.position)
+        observer=axpy(control.observer, (h, rates_0.observer)), position=axpy(control.position, (h, rates_0.position))
     )
     ahead, control_1, force_0 = materialised((ahead, control_1, force_0))
     force_1, estimate_1, rates_1 = cascade.demand(loop.measured(ahead, errors), control_1, end.reference)
@@ -53,10 +56,12 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     sliding, slaved, tau, (w, w_1, w_2) = inversion.slide(model, force_0, force_1, i_ref, h)
     sliding, slaved, tau, force_1 = materialised((sliding, slaved, tau, force_1))
 
-    def current(plant: State, estimate: Measurement, i_ref: Array, rate: Array, inner: Any, q_i: Array, h: Array):
+    def current(
+        plant: State, estimate: Measurement, i_ref: Array, rate: Array, inner: S, q_i: Array, h: Array
+    ) -> tuple[Array, S, _Voltage]:
         """Return i - i_ref, the current law's state, and the voltage, over h (s) at constant i_ref' = rate."""
 
-        def rate_of(i: Array) -> tuple[Array, Any]:
+        def rate_of(i: Array) -> tuple[Array, tuple[S, Array]]:
             inputs = CurrentInputs(estimate._replace(i=i + errors.i), CurrentDemand(i_ref, rate), scenario.u_max)
             u, inner_rate = cascade.current(model, inputs, inner)
             u = limited(u, scenario.u_max)
@@ -65,7 +70,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
         i_dot, slope, (inner_rate, u) = jax.jvp(rate_of, (plant.i,), (jnp.ones_like(plant.i),), has_aux=True)
         phi, volts = _phi(h * slope), scenario.plant.u_per_i_dot(plant.z)
         e = plant.i - i_ref + h * phi * (i_dot - rate)
-        return e, _axpy(inner, h, inner_rate), _Voltage(u, (rate - i_dot) * volts, h * slope, phi)
+        return e, axpy(inner, (h, inner_rate)), _Voltage(u, (rate - i_dot) * volts, h * slope, phi)
 
     e, inner, first = current(state.plant, estimate_0, i_ref, sliding, control.current, begin.q_i, tau)
     e, inner = materialised((e, inner))
@@ -89,8 +94,8 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     )
     span = _with_step(span, instants, first.u, second, tau, h - tau)
     control = control._replace(
-        observer=_axpy(_axpy(control.observer, h / 2, rates_0.observer), h / 2, rates_1.observer),
-        position=_axpy(_axpy(control.position, h / 2, rates_0.position), h / 2, rates_1.position),
+        observer=axpy(control.observer, (h / 2, rates_0.observer), (h / 2, rates_1.observer)),
+        position=axpy(control.position, (h / 2, rates_0.position), (h / 2, rates_1.position)),
         inversion=i_ref,
         current=inner,
     )
@@ -123,7 +128,7 @@ def _with_step(span: Span, instants: tuple[Instant, ...], u: Array, rest: _Volta
     """
     before = span.densities
     for instant, weight in zip(instants, (tau / 2, (tau + left) / 2, left / 2), strict=True):
-        span = span.seen(instant, weight)
+        span = span.with_instant(instant, weight)
     mean, square = materialised(rest).moments()
     densities = span.densities._replace(
         u=before.u + tau * u + left * mean, u_squared=before.u_squared + tau * u * u + left * square
@@ -147,11 +152,31 @@ def _phi_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arra
     return y, slope * dx
 
 
-def _axpy(x: Any, h: Scalar, rate: Any) -> Any:
-    return jax.tree.map(lambda a, b: a + h * b, x, rate)
-
-
 def slides(cascade: Cascade, plant: Bearing) -> bool:
     """Whether this step is made for the cascade and the plant."""
     slow = not cascade.observer.stiff  # it goes by Heun's method
     return cascade.processor is None and cascade.inversion.slides and plant.lumped and slow
+
+
+@record
+class Slide(FixedSteps):
+    """The sliding step (`ambjax.simulation.sliding`) with equal substeps, for stiff gains under held noise.
+
+    The step is of second order in the slow motion of the loop, for any stiffness of the inversion law. It requires an
+    inversion law with a method `slide`, such as `inversion.Adaptive`, and a lumped plant; otherwise a simulation raises
+    ValueError.
+    """
+
+    limit = None
+
+    def _step(
+        self, problem: InitialValueProblem[Inputs, S], at: Times, h: Scalar, state: S, span: Span
+    ) -> tuple[S, Span]:
+        if problem.slide is None:
+            raise ValueError(
+                "clock.method = Slide(...): it steps lumped plants under an 'adaptive' inversion law. Use Rodas3."
+            )
+        return problem.slide(problem.inputs(at(0.0)), problem.inputs(at(1.0)), h, state, span)
+
+    def __str__(self) -> str:
+        return f"sliding step, {self.substeps} substeps"

@@ -41,14 +41,14 @@ class Span(NamedTuple):
     least: Any
     densities: Any
 
-    def seen(self, instant: Instant, weight: Scalar, time: Scalar = 0.0) -> "Span":
+    def with_instant(self, instant: Instant, weight: Scalar, time: Scalar = 0.0) -> "Span":
         """Add an instant to the extremes, and to the integrals with `weight` (s). Add `time` (s) to the length."""
         sizes = jax.tree.map(jnp.abs, instant.sizes)
         most = jax.tree.map(jnp.maximum, self.most, sizes)
         least = jax.tree.map(jnp.minimum, self.least, sizes)
-        return Span(self.time + time, most, least, self.densities).weighed(instant, weight)
+        return Span(self.time + time, most, least, self.densities).with_densities(instant, weight)
 
-    def weighed(self, instant: Instant, weight: Scalar) -> "Span":
+    def with_densities(self, instant: Instant, weight: Scalar) -> "Span":
         """Add an instant to the integrals only, for a trial state that is not on the trajectory."""
         more = jax.tree.map(lambda total, x: total + weight * x, self.densities, instant.densities)
         return self._replace(densities=more)

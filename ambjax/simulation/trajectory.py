@@ -14,7 +14,7 @@ ALIVE, TOUCHED, DIVERGED, STALLED = range(4)
 STATUSES = (
     "",
     "touched down: |z| reached the clearance",
-    "diverged: a state left the range in which the model means anything",
+    "diverged: a state left the range in which the model is valid",
     "stalled: the integrator could not meet its tolerance",
 )
 

@@ -11,14 +11,14 @@ QUESTION = "Do the conditions of Theorem 1 hold along this run?"
 # Ratio of an advised gain to the number that it must exceed; the result is rounded up to two digits.
 MARGIN = 1.1
 # Share of a lost run's time after which the rotor counts as falling.
-FALL = 0.9
+FALL_SHARE = 0.9
 # With gamma larger by this factor than the bound on the reference, transients are covered.
-AMPLE = 2.0
+TRANSIENT_FACTOR = 2.0
 IMPLICIT = 'discretisation = "implicit"'
 # Remedy for a run in which the integrator stalled.
 STALLED = (
-    "Try a smaller p of the laws ([controller.inversion] gamma p is how hard its sign is), "
-    'or a fixed step: [clock] dt = 1e-6 with method = "rodas3".'
+    "Lower the steepness p of the laws ([controller.inversion] p first), "
+    'or use a fixed step: [clock] dt = 1e-6 with method = "rodas3".'
 )
 # The same on a processor, where only the plant is integrated.
 STALLED_PLANT = 'Use fixed steps of the plant, which cannot stall: [clock] dt = 1e-6 with method = "rodas3".'
@@ -37,7 +37,7 @@ def answer(report: Report, case: str) -> list[str]:
     lines.append(_status(report, bool(fails)))
     if fails or report.lost:
         tune = command("ambjax", "tune", case)
-        lines.append(f"{tune} looks for gains that hold the rotor, with a margin to these conditions.")
+        lines.append(f"{tune} searches for gains that hold the rotor and meet these conditions with a margin.")
     return lines
 
 
@@ -48,15 +48,15 @@ def advice(report: Report) -> list[str]:
     not used to advise a gain, and is reported only if nothing else fails.
     """
     fails = [line for line in report.conditions if line.holds is False]
-    fall = FALL * report.lost_at if report.lost else math.inf
+    fall = FALL_SHARE * report.lost_at if report.lost else math.inf
     rows = [line for line in fails if line.path and (line.ideal or line.at_s < fall)]
-    lines = [_raise(max((r for r in rows if r.path == p), key=_right)) for p in dict.fromkeys(r.path for r in rows)]
+    lines = [_to_raise(max((r for r in rows if r.path == p), key=_right)) for p in dict.fromkeys(r.path for r in rows)]
     if not rows:
         ideal = {line.path: line for line in report.conditions if line.ideal}
         lines = [_of_the_fall(line, ideal.get(line.path)) for line in fails if line.path]
     lines += [
-        f"{line.requires} fails at {line.at_s:.4g} s: keep the run off the singular curve, by a smaller reference, "
-        "or a start of i_ref ([controller.inversion] i_ref) on the right side of it."
+        f"{line.requires} fails at {line.at_s:.4g} s: choose a smaller reference, or an initial i_ref "
+        "([controller.inversion] i_ref) on the other side of the singular curve C."
         for line in fails
         if not line.path
     ]
@@ -70,33 +70,34 @@ def on_processor(sampled: SampledReport, margin: Delays, unknown: Delays | None)
     delay that the prediction uses, and for one that it does not (None: nothing is predicted).
     """
     lines = [
-        f"- {slope.stage}: slope T as stepped, {number(slope.stepped)}, must stay below {number(slope.limit)}: a "
-        f"smaller gain or p, a shorter clock.sample_period, or {'predict = true' if slope.implicit else IMPLICIT}."
+        f"- {slope.stage}: slope T of the step is {number(slope.stepped)} and must be less than "
+        f"{number(slope.limit)}. Lower the gain or p, shorten clock.sample_period, or set "
+        f"{'predict = true' if slope.implicit else IMPLICIT}."
         for slope in sampled.slopes
         if not slope.holds
     ]
     words = f"No, {len(lines)} of {len(sampled.slopes)} {'is' if len(lines) == 1 else 'are'} not:" if lines else "Yes."
     end = status(sampled.lost_at, sampled.lost_why, sampled.stalled, STALLED_PLANT)
-    lines = [f"Are all laws stable as they are stepped? {words}", *lines, _curve(*sampled.distance), end]
+    lines = [f"Is every law stable with its discrete step? {words}", *lines, _curve(*sampled.distance), end]
     if sampled.alternates:
         lines.append(_alternates(sampled.alternating or 0.0))
     if unknown is None:
         return [*lines, _margin("Delay margin", margin)]
     return [
         *lines,
-        _margin("Delay margin, the prediction knows the delay", margin),
-        _margin("Delay margin, the prediction assumes the case's delay", unknown),
+        _margin("Delay margin if the prediction uses the actual delay", margin),
+        _margin("Delay margin if the prediction uses the case's delay", unknown),
     ]
 
 
 def _curve(distance: float, at: float) -> str:
     """Describe the condition of Eq. (9) along the run on the processor."""
-    question = "Is (z/s_0, i_ref/i_0) off the singular curve C at all samples?"
+    question = "Does (z/s_0, i_ref/i_0) stay off the singular curve C at all samples?"
     if distance > 0:
-        return f"{question} Yes: the least distance is {number(distance)}, at {at:.4g} s."
+        return f"{question} Yes: the smallest distance is {number(distance)}, at {at:.4g} s."
     return (
         f"{question} No: it is {number(-distance)} beyond C at {at:.4g} s. Choose a smaller reference, a slower "
-        "position law (c, k), or less noise behind an observer."
+        "position law (c, k), or an observer that attenuates the noise more."
     )
 
 
@@ -117,9 +118,10 @@ def _margin(name: str, margin: Delays) -> str:
         rests += [] if lost is None else [f"lost at {_samples(lost)}"]
         return f"{name}: the rotor is {', '.join(rests)} ({tried})."
     if held is None:
-        return f"{name}: none, for the rotor is lost without a delay too."
+        return f"{name}: none, because the rotor is lost even without a delay."
     if lost is None:
-        return f"{name}: the rotor is held up to {_samples(held)} samples, the longest delay there is ({tried})."
+        longest = "the longest delay that ambjax simulates"
+        return f"{name}: the rotor is held up to {_samples(held)} samples, {longest} ({tried})."
     return f"{name}: the rotor is held up to {_samples(held)} samples and lost at {_samples(lost)} ({tried})."
 
 
@@ -132,9 +134,9 @@ def _right(line: Condition) -> float:
     return line.against
 
 
-def _raise(line: Condition) -> str:
+def _to_raise(line: Condition) -> str:
     if not math.isfinite(line.against):
-        return f"{line.requires} cannot be judged: its right side is no number along this run."
+        return f"{line.requires} cannot be evaluated: its right-hand side is not finite along this run."
     name, key, gain = _sides(line)
     return (
         f"{name} = {gain} must exceed {number(line.against)} {line.unit} ({line.requires.partition(' > ')[2]}, at "
@@ -145,16 +147,16 @@ def _raise(line: Condition) -> str:
 def _of_the_fall(line: Condition, ideal: Condition | None) -> str:
     name, key, gain = _sides(line)
     words = (
-        f"{name} = {gain} is exceeded by {line.requires.partition(' > ')[2]}, {number(line.against)} {line.unit}, at "
-        f"{line.at_s:.4g} s, as the rotor falls: no gain is to be set by that. What makes it fall may be another gain, "
-        "a disturbance, noise or the supply"
+        f"{line.requires.partition(' > ')[2]} = {number(line.against)} {line.unit} exceeds {name} = {gain} at "
+        f"{line.at_s:.4g} s, while the rotor falls. Do not choose {name} by this value: another gain, a disturbance, "
+        "noise or the supply may cause the fall."
     )
-    if ideal is not None and ideal.gain is not None and ideal.gain < AMPLE * ideal.against:
+    if ideal is not None and ideal.gain is not None and ideal.gain < TRANSIENT_FACTOR * ideal.against:
         words += (
-            f"; or {name} itself, for the reference alone asks for {number(ideal.against)}, and transients for more: "
-            f"then set {key} above {number(_up(AMPLE * ideal.against))}"
+            f" {name} may cause it too: the reference alone requires {number(ideal.against)}, and transients require "
+            f"more. In that case set {key} above {number(_up(TRANSIENT_FACTOR * ideal.against))}."
         )
-    return f"{words}."
+    return words
 
 
 def _sides(line: Condition) -> tuple[str, str, str]:
@@ -166,9 +168,9 @@ def _sides(line: Condition) -> tuple[str, str, str]:
 def _status(report: Report, fails: bool) -> str:
     words = status(report.lost_at, report.lost_why, report.stalled)
     if report.lost and not fails:
-        return f"{words} The theorem knows no noise, no limit of the voltage and no sampling: look there."
+        return f"{words} The theorem assumes no noise, no voltage limit and no sampling: one of them is the cause."
     if math.isinf(report.lost_at) and fails:
-        return "The rotor is held all the same: the theorem just does not promise it."
+        return "The rotor is held nevertheless: the conditions are sufficient, not necessary."
     return words
 
 
@@ -183,7 +185,7 @@ def status(lost_at: float, lost_why: str, stalled: bool, remedy: str = STALLED) 
     if not stalled:
         return f"The rotor is lost at {lost_at:.4g} s: {lost_why}."
     return (
-        f"Whether the rotor is held is not decided: at {lost_at:.4g} s the integrator stalled, for it could not meet "
+        f"The status of the rotor is not decided: at {lost_at:.4g} s the integrator stalled, because it could not meet "
         f"its tolerance. {remedy}"
     )
 

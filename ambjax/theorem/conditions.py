@@ -17,7 +17,7 @@ from jax import Array
 from ambjax.control.cascade import USUAL, Cascade
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.metrics import Lowest, Named, Peak
+from ambjax.simulation.folds import Lowest, Named, Peak
 from ambjax.simulation.rollout import check_inputs, prepare, roll
 from ambjax.simulation.trajectory import STALLED, STATUSES
 from ambjax.theorem.proof import Monitored

@@ -61,7 +61,7 @@ class TheoremRow(NamedTuple):
     V_margin: Array
 
 
-class Witnessed(NamedTuple):
+class MonitoredState(NamedTuple):
     """State of the closed loop, and the integrals of the proof's right-hand sides.
 
     The integral for e is stored as i_ref + e: e alone decays below the smallest normal number, where arithmetic is a
@@ -69,7 +69,7 @@ class Witnessed(NamedTuple):
     """
 
     loop: LoopState
-    witness: Identities
+    integrals: Identities
 
 
 @record
@@ -84,28 +84,30 @@ class Monitored:
     def sensor_errors(self, sample: Scalar) -> Errors:
         return self.loop.sensor_errors(sample)
 
-    def start(self) -> Witnessed:
+    def start(self) -> MonitoredState:
         state = self.loop.start()
         values = self.terms(self.loop.inputs(0.0), state, self.sensor_errors(0)).values
-        return Witnessed(state, values._replace(e=self.motion(state).i))
+        return MonitoredState(state, values._replace(e=self.motion(state).i))
 
     def problem(self, errors: Errors) -> InitialValueProblem:
         plant = self.loop.scenario.plant
         _, z_dot, i = map(jnp.asarray, plant.sizes())
         sizes = Identities(z_dot, plant.dv_di(0.0, 0.0) * i / 100, i)
 
-        def rates(inputs: ExternalInputs, state: Witnessed) -> Witnessed:
+        def rates(inputs: ExternalInputs, state: MonitoredState) -> MonitoredState:
             terms = self.terms(inputs, state.loop, errors)
-            return Witnessed(terms.moving, terms.rates._replace(e=terms.rates.e + terms.i_ref_dot))
+            return MonitoredState(terms.moving, terms.rates._replace(e=terms.rates.e + terms.i_ref_dot))
 
-        layer = Witnessed(self.loop.layer(), Identities(*(jnp.asarray(jnp.inf) for _ in sizes)))
-        return InitialValueProblem(self.loop.inputs, rates, Witnessed(self.loop.scale(), sizes), self.status, layer)
+        layer = MonitoredState(self.loop.layer(), Identities(*(jnp.asarray(jnp.inf) for _ in sizes)))
+        return InitialValueProblem(
+            self.loop.inputs, rates, MonitoredState(self.loop.scale(), sizes), self.status, layer
+        )
 
-    def status(self, state: Witnessed) -> Array:
+    def status(self, state: MonitoredState) -> Array:
         return self.loop.status(state.loop)
 
-    def rest(self, state: Witnessed, code: Array) -> Witnessed:
-        return Witnessed(self.loop.rest(state.loop, code), state.witness)
+    def rest(self, state: MonitoredState, code: Array) -> MonitoredState:
+        return MonitoredState(self.loop.rest(state.loop, code), state.integrals)
 
     def noted(self, row: TheoremRow, span: Span) -> TheoremRow:
         return row
@@ -150,13 +152,13 @@ class Monitored:
 
         return jax.jvp(demanded, (reference, state), (reference.rate(), moving))[1]
 
-    def row(self, t: Array, state: Witnessed, errors: Errors, alive: Array) -> TheoremRow:
+    def row(self, t: Array, state: MonitoredState, errors: Errors, alive: Array) -> TheoremRow:
         inputs = self.loop.inputs(t)
         terms = self.terms(inputs, state.loop, errors)
         z, _, i = self.motion(state.loop)
         i_ref = i - terms.values.e
         values = terms.values._replace(e=i)
-        off = Identities(*(a - b for a, b in zip(values, state.witness, strict=True)))
+        off = Identities(*(a - b for a, b in zip(values, state.integrals, strict=True)))
         # V' = 2 sigma sigma', with sigma' from the plant's own acceleration, not from the identity.
         sigma_dot = self._sigma_dot(inputs.reference, state.loop, terms.moving)
         return TheoremRow(

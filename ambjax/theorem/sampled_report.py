@@ -9,7 +9,7 @@ and the largest difference between this signal and that of the plant. W gives th
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsFloat
 
 import numpy as np
 
@@ -18,8 +18,8 @@ from ambjax.control.cascade import Cascade, CascadeState
 from ambjax.control.sampling import Sampling, band, disturbance, slope_limits
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.rollout import Outcome, prepare, roll
-from ambjax.simulation.sampled import system_of
+from ambjax.simulation.rollout import Outcome, System, prepare, roll
+from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
 from ambjax.theorem.watched import Watched
 from ambjax.world.scenario import Scenario
@@ -130,7 +130,7 @@ class Delays(NamedTuple):
         return None if self.held is None or self.lost is None else self.lost - self.held
 
 
-def rolled(system: Any, clock: Clock) -> Outcome:
+def rolled(system: object, clock: Clock) -> Outcome:
     """Roll out a system and record every sample."""
     return roll(*canonical((system, clock)), None, every=1)
 
@@ -140,7 +140,7 @@ def check(
     scenario: Scenario,
     clock: Clock,
     settle: float,
-    run: Callable[[Any, Clock], Outcome] = rolled,
+    run: Callable[[System, Clock], Outcome] = rolled,
 ) -> SampledReport:
     """Return slopes and bands of a cascade with a processor, from two runs: without noise and with it.
 
@@ -168,7 +168,7 @@ def check(
     )
 
 
-def _watched(loop: Any, clock: Clock, run: Callable[[Any, Clock], Outcome]) -> Trajectory:
+def _watched(loop: Any, clock: Clock, run: Callable[[System, Clock], Outcome]) -> Trajectory:
     """Simulate a loop and record the rows of `Watched`."""
     return run(Watched(loop), clock).trajectory
 
@@ -209,7 +209,7 @@ def slopes(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
     return lines
 
 
-def _steepest(slope: Any) -> float:
+def _steepest(slope: SupportsFloat) -> float:
     """Convert a slope to float; NaN, from canceling infinities of a set-valued sign, becomes inf."""
     return math.inf if math.isnan(float(slope)) else float(slope)
 
@@ -237,7 +237,7 @@ def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, row
             if math.isinf(limit):
                 notes.append("the disturbance exceeds the gain")
             elif abs(x[0]) > limit:
-                notes.append("not reached at run.settle: where it is then")
+                notes.append("not reached at run.settle: the value at that time")
                 limit = float(abs(x[0]))
         lines.append(
             Band(signal, unit, noise, gain, W, limit, _peak(x), _peak(true - x), _peak(true), "; ".join(notes))

@@ -63,7 +63,7 @@ class Watched:
         cascade, after = loop.loop.cascade, loop.jump(t, before, errors)
         reference = loop.reference(t)
         sample = Sample(reference, loop.period, jnp.asarray(loop.loop.scenario.u_max), after.past)
-        measured = loop.measured(before.plant, before.seen, errors)
+        measured = loop.measured(before.plant, before.z_filtered, errors)
         estimate, *_ = cascade.estimate(measured, before.control.observer, sample)
         sigma, command = cascade.position.sigma(estimate, reference), after.command
         return WatchedState(after, WatchedSignals(sigma, command.v_tilde, estimate.i - command.i_ref))
@@ -75,7 +75,7 @@ class Watched:
         t: Scalar,
         period: Scalar,
         state: WatchedState,
-        memory: Any,
+        memory: object,
         code: Array,
     ) -> Advanced:
         after = self.loop.advance(method, errors, t, period, state.loop, memory, code)

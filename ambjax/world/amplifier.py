@@ -19,13 +19,13 @@ class Amplifier:
     """
 
     bandwidth: Scalar | None = leaf(
-        default=None, unit="Hz", at_least=1, at_most=1e6, optional=True, doc="first order; none: at once"
+        default=None, unit="Hz", at_least=1, at_most=1e6, optional=True, doc="first order; none: no lag"
     )
     slew: Scalar | None = leaf(
         default=None, unit="V/s", at_least=1e-3, at_most=1e15, optional=True, doc="largest rate of u; none: no limit"
     )
     dead_band: Scalar | None = leaf(
-        default=None, unit="V", at_least=0, at_most=1e12, optional=True, doc="taken off the size of u; none: 0"
+        default=None, unit="V", at_least=0, at_most=1e12, optional=True, doc="subtracted from |u|; none: 0"
     )
     i_max: Scalar | None = leaf(
         default=None, unit="A", at_least=1e-9, at_most=1e6, optional=True, doc="limit of |i|; none: no limit"

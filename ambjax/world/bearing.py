@@ -1,6 +1,6 @@
 """The bearing: a vertical rotor between two electromagnets (Table 1, Eq. (3)), and the protocol of its plants."""
 
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,9 @@ from ambjax.world.sensor import Measurement
 # Lower bound of a gap as a share of s_0. Accepted states stay far above it, since the rotor touches down before. It
 # keeps the trial stages of an integrator, and their derivatives, finite.
 GAP_FLOOR = 0.005
+
+# State of a plant, or its rates: a NamedTuple of scalars.
+S = TypeVar("S")
 
 
 class Gaps(NamedTuple):
@@ -56,7 +59,7 @@ class Signals(NamedTuple):
 
 
 @record
-class Bearing:
+class Bearing(Generic[S]):
     """Parameters of rotor and magnets, Table 1, and the force of given currents. Scalars of one member, SI units.
 
     A plant subclasses this record. Its state is a NamedTuple of scalars. It implements `start`, `rates`, `rest`,
@@ -86,27 +89,27 @@ class Bearing:
     lumped: ClassVar[bool] = False
     """Whether the state is (z, z_dot, i) and i_dot is linear in u, as in `Plant`. The sliding step requires it."""
 
-    def start(self, measurement: Measurement) -> Any:
+    def start(self, measurement: Measurement) -> S:
         """Return the state with this motion and current."""
         raise NotImplementedError
 
-    def rates(self, state: Any, u: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Any:
+    def rates(self, state: S, u: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> S:
         """Return the time derivative of the state under a voltage u (V) and disturbances q_z (m/s^2), q_i (A/s)."""
         raise NotImplementedError
 
-    def rest(self, state: Any, z: Scalar) -> Any:
+    def rest(self, state: S, z: Array) -> S:
         """Return the state in which a lost rotor is frozen: at z (m), with zero velocity."""
         raise NotImplementedError
 
-    def scale(self) -> Any:
+    def scale(self) -> S:
         """Return the characteristic size of each component of the state; integration errors are relative to it."""
         raise NotImplementedError
 
-    def measurement(self, state: Any) -> Measurement:
+    def measurement(self, state: S) -> Measurement:
         """Return the measurement of ideal sensors."""
         raise NotImplementedError
 
-    def signals(self, state: Any) -> Signals:
+    def signals(self, state: S) -> Signals:
         """Return the scaled force and the copper loss in this state."""
         raise NotImplementedError
 
@@ -120,8 +123,8 @@ class Bearing:
 
     def sizes(self) -> Measurement:
         """Return characteristic sizes of z, z_dot, i: 2 % of the gap, the same per 0.1 s, 4 % of the bias current."""
-        offset = self.s_0 / 50
-        return Measurement(offset, 10 * offset, self.i_0 / 25)
+        offset = jnp.asarray(self.s_0) / 50
+        return Measurement(offset, 10 * offset, jnp.asarray(self.i_0) / 25)
 
     @property
     def kappa(self) -> Scalar:

@@ -20,7 +20,7 @@ class Currents(NamedTuple):
 
 
 @record
-class TwoCoil(Bearing):
+class TwoCoil(Bearing[Currents]):
     """Rotor and magnets with the parameters of Table 1, in the state (z, z_dot, i_1, i_2).
 
     The upper coil (gap s_0 - z) has the voltage R i_0 + u, the lower one (gap s_0 + z) R i_0 - u. The measured i is

@@ -13,7 +13,7 @@ OUTLIERS, DROPOUTS = 3, 4
 VALUES = ("hold", "nan", "zero", "full-scale")
 
 
-class Struck(NamedTuple):
+class FaultOnsets(NamedTuple):
     """Faults that begin at a sample: the number added to its reading (m), and whether a dropout begins."""
 
     outlier: Array
@@ -28,12 +28,23 @@ class Sensed(NamedTuple):
 
 
 def _rate() -> Any:
-    return leaf(default=0.0, unit="1/s", at_least=0, at_most=1e9, doc="mean number in a second, each sample alike")
+    return leaf(
+        default=0.0,
+        unit="1/s",
+        at_least=0,
+        at_most=1e9,
+        doc="mean number per second, with equal probability at each sample",
+    )
 
 
 def _at() -> Any:
     return leaf(
-        default=None, unit="s", at_least=0, at_most=1e6, optional=True, doc="one more at the nearest sample; none: none"
+        default=None,
+        unit="s",
+        at_least=0,
+        at_most=1e6,
+        optional=True,
+        doc="time of one more, at the nearest sample; none: no other",
     )
 
 
@@ -42,10 +53,10 @@ class Outliers:
     """Single readings of z with an error of +-`size`, each sign with probability 1/2, after the converter."""
 
     rate: Scalar = _rate()
-    size: Scalar = leaf(default=1e-3, unit="m", at_least=0, at_most=1.0, doc="by which a reading is off")
+    size: Scalar = leaf(default=1e-3, unit="m", at_least=0, at_most=1.0, doc="error of a reading")
     at: Scalar | None = _at()
 
-    def struck(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Array:
+    def onset(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Array:
         """Return the number added to the reading of a sample, m."""
         begins, sign = _begins(self, OUTLIERS, key, sample, period)
         return jnp.where(begins, sign * self.size, 0.0)
@@ -65,7 +76,7 @@ class Dropouts:
     at: Scalar | None = _at()
     value: str = static(default=VALUES[0], doc="what is read meanwhile")
 
-    def struck(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Array:
+    def onset(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Array:
         """Return whether a dropout begins at a sample."""
         return _begins(self, DROPOUTS, key, sample, period)[0]
 

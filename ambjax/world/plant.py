@@ -19,7 +19,7 @@ class State(NamedTuple):
 
 
 @record
-class Plant(Bearing):
+class Plant(Bearing[State]):
     """Rotor and magnets with the parameters of Table 1, in the state (z, z_dot, i)."""
 
     lumped = True
@@ -49,11 +49,11 @@ class Plant(Bearing):
 
     def z_ddot(self, z: Scalar, i: Scalar, q_z: Scalar = 0.0) -> Array:
         """Acceleration, in m/s^2: 2 k_z z/m + a v(z, i) - g + q_z. Eq. (1)."""
-        return self.rates(State(z, 0.0, i), 0.0, q_z).z_dot  # pyright: ignore[reportArgumentType]
+        return self.rates(State(*map(jnp.asarray, (z, 0.0, i))), 0.0, q_z).z_dot
 
     def i_dot(self, z: Scalar, z_dot: Scalar, i: Scalar, u: Scalar, q_i: Scalar = 0.0) -> Array:
         """Rate of the current deviation, in A/s: 2 z_dot i/(s_0+z) + 2 (s_0+z)(u - R i)/kappa + q_i. Eq. (2)."""
-        return self.rates(State(z, z_dot, i), u, 0.0, q_i).i
+        return self.rates(State(*map(jnp.asarray, (z, z_dot, i))), u, 0.0, q_i).i
 
     def u_per_i_dot(self, z: Scalar) -> Array:
         """Voltage per rate of the current, in V s/A: kappa / (2 (s_0+z)). Eq. (2)."""

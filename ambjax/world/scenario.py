@@ -66,7 +66,7 @@ class Scenario:
     def random(self) -> bool:
         """Whether two members differ: the scenario has sensor noise or a random signal."""
         sensor = self.sensor
-        noisy = sensor is not None and bool(np.any([sensor.std, sensor.std_z_dot, sensor.std_i]))
+        noisy = sensor is not None and any(np.any(std) for std in (sensor.std, sensor.std_z_dot, sensor.std_i))
         if sensor is not None:
             noisy = noisy or any(np.any(x.rate) for x in (sensor.outliers, sensor.dropouts) if x is not None)
         return noisy or any(is_random(getattr(self, slot)) for slot in SLOTS)

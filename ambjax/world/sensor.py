@@ -10,7 +10,7 @@ from jax import Array, lax
 from ambjax.numerics.gaussian import normals
 from ambjax.numerics.records import Scalar, leaf, record, static
 from ambjax.numerics.smooth import polynomial
-from ambjax.world.faults import Dropouts, Outliers, Sensed, Struck
+from ambjax.world.faults import Dropouts, FaultOnsets, Outliers, Sensed
 
 # m_3 of a low-pass over b = w h < 1 is b times the sum of 3! (-b)^j / (j + 4)!; the next term is below 1e-18.
 SERIES = tuple(math.factorial(3) * (-1) ** j / math.factorial(j + 4) for j in range(16))
@@ -30,7 +30,7 @@ class FaultyErrors(NamedTuple):
     z: Array
     z_dot: Array
     i: Array
-    struck: Struck
+    onsets: FaultOnsets
 
 
 class Measurement(NamedTuple):
@@ -61,7 +61,7 @@ class Sensor:
         at_least=1,
         at_most=1e9,
         optional=True,
-        doc="of the position sensor, first order; none: at once",
+        doc="of the position sensor, first order; none: no lag",
     )
     bits: Scalar | None = leaf(
         default=None,
@@ -91,18 +91,18 @@ class Sensor:
         w = normals(key, sample)
         return Errors(self.std * w[0], self.std_z_dot * w[1], self.std_i * w[2])
 
-    def struck(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Struck:
+    def fault_onsets(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> FaultOnsets:
         """Return the faults that begin at a sample of length `period` (s), for the member with the key `words`."""
         none = jnp.zeros(())
-        outlier = none if self.outliers is None else self.outliers.struck(key, sample, period)
-        return Struck(outlier, none > 0 if self.dropouts is None else self.dropouts.struck(key, sample, period))
+        outlier = none if self.outliers is None else self.outliers.onset(key, sample, period)
+        return FaultOnsets(outlier, none > 0 if self.dropouts is None else self.dropouts.onset(key, sample, period))
 
-    def sensed(self, z: Array, before: Sensed, struck: Struck, period: Scalar, s_0: Scalar) -> Sensed:
+    def sensed(self, z: Array, before: Sensed, onsets: FaultOnsets, period: Scalar, s_0: Scalar) -> Sensed:
         """Return the reading of z (m, converted) with faults, and the next state of the faulty sensor."""
-        z = z + struck.outlier
+        z = z + onsets.outlier
         if self.dropouts is None:
             return Sensed(z, before.left)
-        left = jnp.where(struck.drops, self.dropouts.samples(period), jnp.maximum(before.left - 1, 0.0))
+        left = jnp.where(onsets.drops, self.dropouts.samples(period), jnp.maximum(before.left - 1, 0.0))
         return Sensed(jnp.where(left > 0, self.dropouts.read(before.z, self.ends(s_0)), z), left)
 
     def ends(self, s_0: Scalar) -> Scalar:
@@ -119,12 +119,14 @@ class Sensor:
         z_dot = motion.z_dot + errors.z_dot if self.velocity else jnp.zeros_like(motion.z_dot)
         return Measurement(self.gain * motion.z + self.offset + errors.z, z_dot, motion.i + errors.i)
 
-    def converted(self, seen: Measurement, s_0: Scalar, i_0: Scalar) -> Measurement:
+    def converted(self, reading: Measurement, s_0: Scalar, i_0: Scalar) -> Measurement:
         """Return the converted readings; s_0 (m) and i_0 (A) of the plant give the ranges that are left out."""
         if self.bits is None:
-            return seen
+            return reading
         range_i = 2 * i_0 if self.range_i is None else self.range_i
-        return seen._replace(z=converted(seen.z, self.bits, self.ends(s_0)), i=converted(seen.i, self.bits, range_i))
+        return reading._replace(
+            z=converted(reading.z, self.bits, self.ends(s_0)), i=converted(reading.i, self.bits, range_i)
+        )
 
     def lagged(self, y: Array, before: Measurement, after: Measurement, h: Scalar) -> Array:
         """Return the output of the low-pass after h (s), from y (m): y' = w (z - y), w = 2 pi bandwidth.

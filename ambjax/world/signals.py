@@ -5,7 +5,6 @@ signal has a method `realised(key)`, which draws the function of time for one me
 """
 
 import dataclasses
-import math
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
@@ -28,12 +27,12 @@ class Signal(Protocol):
     def span(self, end: float, /) -> tuple[float, float]: ...
 
 
-def _hull(*values: Any) -> tuple[float, float]:
+def _hull(*values: Scalar | np.ndarray) -> tuple[float, float]:
     """Return the minimum and maximum of several numbers or arrays."""
     return float(min(map(np.min, values))), float(max(map(np.max, values)))
 
 
-def _swing(amplitude: Scalar, first: Scalar, last: Scalar) -> tuple[float, float]:
+def _swing(amplitude: Scalar, first: Scalar | np.ndarray, last: Scalar | np.ndarray) -> tuple[float, float]:
     """Return the minimum and maximum of amplitude sin(2 pi x) for x from `first` to `last` (turns)."""
     ends = [np.sin(TWO_PI * (x - np.floor(x))) for x in (first, last)]
     crest, trough = (np.ceil(first - at) <= last - at for at in (0.25, 0.75))
@@ -153,62 +152,15 @@ class Chirp:
 
     def __call__(self, t: Scalar) -> Array:
         t = jnp.asarray(t)
-        return self.amplitude * sine(self._cycles(t, jnp.minimum(t, self.duration)))
+        return self.amplitude * sine(jnp.asarray(self._cycles(t, jnp.minimum(t, self.duration))))
 
-    def _cycles(self, t: Any, sweep: Any) -> Any:
+    def _cycles(self, t: Scalar, sweep: Scalar | np.ndarray) -> Scalar | np.ndarray:
         """Return the phase (turns) at time t; `sweep` is the time (s) spent in the sweep."""
         gain = (self.frequency_end - self.frequency) / self.duration
         return self.frequency * sweep + gain * sweep**2 / 2 + self.frequency_end * (t - sweep)
 
     def span(self, end: float) -> tuple[float, float]:
-        return _swing(self.amplitude, np.zeros(()), self._cycles(end, np.minimum(end, self.duration)))
-
-
-# Sines in one realisation of band-limited noise. Its fourth moment falls short of a Gaussian's by 1.5/LINES of std^4.
-LINES = 32
-
-
-@record
-class Lines:
-    """std sqrt(2/n) sum of sin(2 pi frequencies t + phases), n of each: Hz and rad."""
-
-    std: Scalar
-    frequencies: Array
-    phases: Array
-
-    def __call__(self, t: Scalar) -> Array:
-        turns = self.frequencies * jnp.asarray(t)[..., None] + self.phases / TWO_PI
-        return self.std * math.sqrt(2 / self.phases.size) * jnp.sum(sine(turns), axis=-1)
-
-
-@record
-class BandNoise:
-    """Stationary band-limited noise: constant power density over f_low..f_high (Hz), standard deviation `std`.
-
-    A sum of sines: one at a random frequency in each of LINES equal parts of the band, with random phase (after
-    Shinozuka and Deodatis, Appl. Mech. Rev. 44, 1991). The autocovariance over members is exactly std^2 times the mean
-    of cos(2 pi f tau) over the band. The signal is smooth, so integrators keep their order.
-    """
-
-    std: Scalar = leaf(at_least=0, at_most=1e20, doc="standard deviation")
-    f_low: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="lower end of the band")
-    f_high: Scalar = leaf(unit="Hz", above=0, at_most=1e9, doc="upper end of the band; above f_low")
-    ordered: ClassVar = ("f_low", "f_high")
-
-    def realised(self, key: Array) -> Lines:
-        """Draw the signal of one member."""
-        place, turn = jax.random.uniform(key, (2, LINES))
-        share = (jnp.arange(LINES) + place) / LINES
-        return Lines(self.std, self.f_low + (self.f_high - self.f_low) * share, 2 * jnp.pi * turn)
-
-    def __call__(self, t: Scalar) -> Array:
-        raise ValueError(
-            "band-noise is a function of time only for one member: use scenario.realised(), as a rollout does."
-        )
-
-    def span(self, end: float) -> tuple[float, float]:
-        crest = math.sqrt(2 * LINES) * np.asarray(self.std)  # all sines at their crests at once: 8 std
-        return _hull(-crest, crest)
+        return _swing(self.amplitude, 0.0, self._cycles(end, np.minimum(end, self.duration)))
 
 
 @record
@@ -236,7 +188,7 @@ class Sum:
         return Sum(tuple(realised(term, jax.random.fold_in(key, n)) for n, term in enumerate(self.terms)))
 
 
-def is_random(signal: Any) -> bool:
+def is_random(signal: object) -> bool:
     """Return whether the signal, or a term of it, is random."""
     return any(map(is_random, signal.terms)) if isinstance(signal, Sum) else hasattr(signal, "realised")
 
@@ -261,7 +213,7 @@ class Reference(NamedTuple):
 
     def rate(self) -> "Reference":
         """The time derivative; the rate of the third derivative is taken as 0."""
-        return Reference(self.r_dot, self.r_ddot, self.r_dddot, jnp.zeros_like(self.r))
+        return Reference(self.r_dot, self.r_ddot, jnp.asarray(self.r_dddot), jnp.zeros_like(self.r))
 
 
 def reference_at(signal: Signal, t: Scalar) -> Reference:

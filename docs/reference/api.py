@@ -4,13 +4,14 @@ import inspect
 from typing import Any
 
 import ambjax
-from ambjax import ensemble, extend, paper
+from ambjax import ensemble, extend, linear, paper
 from reference.floors import ROOT, floors
 from reference.markdown import code, escaped, first_paragraph, table
 
 PUBLIC = {
     "ambjax": (ambjax, "Simulate: `from ambjax import ...`."),
     "ambjax.ensemble": (ensemble, "Ensembles."),
+    "ambjax.linear": (linear, "Linear analysis of the loop."),
     "ambjax.paper": (paper, "The paper's study."),
     "ambjax.extend": (extend, "What an extension needs."),
 }

@@ -14,6 +14,7 @@ from ambjax.control.guard import Guard
 from ambjax.control.processor import Processor
 from ambjax.ensemble.distributions import SHAPES
 from ambjax.ensemble.paths import places
+from ambjax.linear import Zones
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.faults import Dropouts, Outliers
 from ambjax.world.plant import Plant
@@ -25,7 +26,7 @@ from reference.parser import keys, remarks, rule
 
 TITLES = ("key", "unit", "default", "allowed", "meaning")
 RECORDS: dict[str, type] = {"plant": Plant, "processor": Processor, "initial": Initial, "sensor": Sensor}
-RECORDS |= {"actuator": Amplifier, "processor.guard": Guard}
+RECORDS |= {"actuator": Amplifier, "processor.guard": Guard, "sensitivity": Zones}
 RECORDS |= {"sensor.outliers": Outliers, "sensor.dropouts": Dropouts}
 SETTINGS: dict[str, dataclasses.Field] = {
     "actuator.u_max": FIELDS["u_max"],
@@ -37,7 +38,8 @@ SETTINGS: dict[str, dataclasses.Field] = {
 # What a table is for, and what stands if it is left out.
 WORDS = {
     "plant": "The true plant. Left out, or a key of it: Table 1 of the paper.",
-    "controller": "The cascade: a nominal plant and one law per stage. Kinds and gains: [laws](laws.md).",
+    "controller": "The cascade: a nominal plant and one law per stage. Kinds and gains: [laws](laws.md), or a "
+    "[law of your own](../own-laws.md).",
     "controller.model": "Parameters of the controller's model that differ from the plant: any key of `[plant]`.",
     "processor": "What the cascade runs on: one step of all laws a sample, its voltage held and late. Left out: "
     "continuous time, as in the paper. See [the processor](../processor.md).",
@@ -52,6 +54,7 @@ WORDS = {
     "initial": "The plant's state at t = 0. Left out: at rest, in the middle.",
     "clock": "Time: how long, how often a row is recorded and noise drawn, and how it is integrated between.",
     "run": "What belongs to a run and to no part of it.",
+    "sensitivity": "Frequency range and zones of `ambjax sensitivity`. See [sensitivity](../sensitivity.md).",
     "spread": "What varies from member to member of an ensemble. See [spreads](spread.md).",
     "tune": "What `ambjax tune` is to do; the other commands pass it by.",
     "tune.weights": "What counts, as weights of dimensionless terms.",
@@ -156,7 +159,8 @@ def _units() -> list[str]:
 
 
 def _laws() -> str:
-    lines = ["# Laws", "", "One law per stage, chosen by `kind`; the first of each stage is the default.", ""]
+    lines = ["# Laws", "", "One law per stage, chosen by `kind`; the first of each stage is the default."]
+    lines += ['`kind = "FILE.py:CLASS"` is a [law of your own](../own-laws.md).', ""]
     for stage, kinds in KINDS.items():
         lines += [f"## `[controller.{stage}]`", ""]
         for kind, law in kinds.items():

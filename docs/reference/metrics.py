@@ -3,19 +3,20 @@
 import re
 from typing import Any
 
-from ambjax.simulation import metrics
+from ambjax.simulation.folds import Count, Driven, Peak, Reaching, Rms, Variation
+from ambjax.simulation.metrics import Standard
 from ambjax.simulation.trajectory import NOT_SAVED, Row
 from reference.fields import attribute_docs
 from reference.markdown import code, escaped, table
 
 # How a fold makes one number of a signal.
 FOLDS = {
-    metrics.Peak: "largest size",
-    metrics.Rms: "root mean square over the samples",
-    metrics.Reaching: "start of the sample in which it first comes within its band",
-    metrics.Variation: "total variation",
-    metrics.Count: "number of samples for which it holds",
-    metrics.Driven: "mean over time, while the drive is on",
+    Peak: "largest size",
+    Rms: "root mean square over the samples",
+    Reaching: "start of the sample in which it first comes within its band",
+    Variation: "total variation",
+    Count: "number of samples for which it holds",
+    Driven: "mean over time, while the drive is on",
 }
 MEANINGS = {
     "e_z": "tracking error z - r",
@@ -26,7 +27,7 @@ MEANINGS = {
 }
 # What is not a fold of a signal.
 OTHERS = {
-    "lost": "whether the rotor was lost: touched down, or left the range in which the model means anything",
+    "lost": "whether the rotor was lost: touched down, or left the range in which the model is valid",
     "stalled": "whether the integrator could not meet its tolerance, so that nothing is decided",
     "lost_at_s": "when either happened; null: never",
     "singular_at_s": "when (z, i_ref) first crossed the singular curve C, Eq. (9); null: never",
@@ -59,7 +60,7 @@ def pages() -> dict[str, str]:
 
 def rows() -> list[tuple[str, str, str]]:
     """Return a row for each metric: name, unit and meaning."""
-    folds = metrics.Standard()._folds().folds
+    folds = Standard()._folds().folds
     told = {name: _meaning(name, fold) for name, fold in folds.items()} | OTHERS
     return [(code(name), escaped(_unit(name)), escaped(meaning)) for name, meaning in told.items()]
 

@@ -1,13 +1,11 @@
 """The goal: one number, minimised by the search, from the losses of the members and the gains."""
 
-import dataclasses
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from tuning.objective.limits import Limit
+from ambjax.extend import Scalar, record, static
+from tuning.objective.limits import LimitTerm
 from tuning.objective.loss import outcomes
 from tuning.objective.members import Members
 from tuning.objective.risk import Risk
@@ -15,21 +13,21 @@ from tuning.objective.shortfalls import Bound, shortfall
 from tuning.space import Space
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Goal:
-    """The function that a search minimises.
+    """The function that a search minimises, a pytree whose leaves are `weight`, `margin` and the limits' numbers.
 
-    goal = log(risk(losses) + mean(losses of stressed members)) + weight * shortfall(conditions) + sum(limit.pull).
+    goal = log(risk(losses) + mean(losses of stressed members)) + weight * shortfall(conditions) + sum(limits).
     The risk and the limits include ordinary members only. `margin` is the relative margin of the conditions.
     """
 
-    space: Space
-    weights: tuple[float, ...]
-    risk: Risk
-    conditions: tuple[Bound, ...]
-    weight: float
-    margin: float
-    limits: tuple[Limit, ...] = ()
+    space: Space = static()
+    weights: tuple[float, ...] = static()
+    risk: Risk = static()
+    conditions: tuple[Bound, ...] = static()
+    weight: Scalar
+    margin: Scalar
+    limits: tuple[LimitTerm, ...] = ()
 
     def __call__(self, outcomes: Array, x: Array, ordinary: int) -> Array:
         """Return the goal at coordinates x [m].
@@ -46,9 +44,9 @@ class Goal:
         """Return the shortfall of the theorem's conditions at coordinates x [m]."""
         return shortfall(dict(zip(self.space.paths, self.space.gains_at(x), strict=True)), self.conditions, self.margin)
 
-    def pull(self, held: Array) -> Any:
+    def pull(self, held: Array) -> Array | int:
         """Return the sum of the limits' terms for the limited quantities `held` [N, L] of the ordinary members."""
-        return sum(limit.pull(held[:, j]) for j, limit in enumerate(self.limits))
+        return sum(term(held[:, j]) for j, term in enumerate(self.limits))
 
     def score(self, x: np.ndarray, terms: dict[str, np.ndarray], members: Members) -> np.ndarray:
         """Return the goal [S] at x [S, m] from the terms [S, N] of members [N]; +inf where it is not finite."""

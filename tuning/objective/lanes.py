@@ -20,7 +20,8 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble import map_members
 from ambjax.extend import canonical
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.metrics import Named, standard_for
+from ambjax.simulation.folds import Named
+from ambjax.simulation.metrics import standard_for
 from ambjax.simulation.rollout import rollout
 from ambjax.world.scenario import Scenario
 from tuning.objective.loss import TERMS, Loss, outcomes
@@ -97,7 +98,7 @@ class LaneGradient:
         terms = Objective(self.space, *lane.world).run(x, lane.members, lane.world[-1])
         return jnp.stack(outcomes(lane.weights, terms, lane.members.stressed)), terms
 
-    def _along(self, outcomes: Callable[..., Any], lane: Lane) -> Any:
+    def _along(self, outcomes: Callable[..., object], lane: Lane) -> Any:
         """Return outcomes, derivatives along each coordinate, and terms, of one lane or of many."""
 
         def along(direction: Array) -> Any:
@@ -122,7 +123,7 @@ class Engine:
         mode: str = "forward",
         threads: int | None = None,
         lanes: int = LANES,
-    ):
+    ) -> None:
         self.objective, self.mode, self.settle, self.threads, self.lanes = objective, mode, settle, threads, lanes
         self.rollouts = 0
         self._world: Any = canonical((objective.cascade, objective.scenario, objective.clock, objective.loss))
@@ -146,7 +147,9 @@ class Engine:
             found.append(map_members(measured, world, threads=self.threads, call=self.lanes, block=block))
         return jax.tree.map(lambda *parts: np.stack(parts), *found)
 
-    def gradient(self, x: np.ndarray, members: Members, weights: Any) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    def gradient(
+        self, x: np.ndarray, members: Members, weights: object
+    ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         """Return outcomes [S, N, 1 + L], their derivatives [S, N, 1 + L, m] and the terms [S, N] at x [S, m].
 
         The outcomes are the weighted loss and the limited quantities. `weights`: of the terms, in the order of TERMS,

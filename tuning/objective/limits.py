@@ -1,4 +1,4 @@
-"""Limits on quantities of an ensemble: their measurement, and their terms of the goal.
+"""Limits on quantities of an ensemble, and their terms of the goal.
 
 A search minimises the error subject to the limits by an augmented Lagrangian (Nocedal and Wright, Numerical
 Optimization, 2006, 17.3). With g = log(reached / allowed), a limit adds (max(0, multiplier + penalty g)^2 -
@@ -8,200 +8,66 @@ the minimised quantity: a limit 1 % higher lowers it by `multiplier` %.
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.extend import Scalar, leaf, record, static
+from ambjax.extend import Scalar, record, static
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.metrics import Driven, Ending, Fold, Peak, Variation
-from ambjax.simulation.response import Overshoot, Settling
+from ambjax.simulation.folds import Fold
 from ambjax.world.scenario import Scenario
+from tuning.objective.quantities import KINDS, TINY, Kind, LimitContext
 
 # Initial penalty: at a multiplier of 0, an excess of 10 % adds 0.14 to the goal. Factor by which the penalty grows when
 # an update leaves more than the share SUFFICIENT_DECREASE of the excess (Nocedal and Wright, ch. 17); largest penalty.
 PENALTY, PENALTY_GROWTH, SUFFICIENT_DECREASE, MOST_PENALTY = 30.0, 4.0, 0.3, 2000.0
-# Exponent of the norms that approximate maxima.
-NORM = 16
 # Prefix of the names of limited quantities among the terms of a loss.
 PREFIX = "limit."
-# Lower bound of the argument of a logarithm.
-TINY = 1e-30
 # A limit with a multiplier above 0 is met from this share below the allowed value to half of the margin above it.
 TOLERANCE_BELOW = 0.01
 # Smallest margin. A search meets a limit to half of its margin only, so a smaller margin would not keep it held.
 LEAST_MARGIN = 0.002
-# Default limit of the rms voltage, as a share of actuator.u_max.
-DEFAULT_SHARE = 0.6
 # Intervals of the integral in `Limit.error_reduction`.
 PRICE_INTERVALS = 200
 
 
 @record
-class Typical:
-    """Fold: the 16-norm over samples of |row.`of`| in units of `size`, a smooth maximum.
+class LimitTerm:
+    """Term of a limit in the goal. Its numbers are leaves: other numbers do not recompile a search.
 
-    A saturated voltage has the derivative 0. The norm includes the unsaturated samples, which have another one.
+    `name`: of the quantity in KINDS. `log_allowed`: logarithm of the upper bound. `multiplier`, `penalty`, `ratio`: as
+    in `Limit`.
     """
 
-    of: str = static()
-    size: Scalar = leaf(above=0, at_most=1e30)
+    name: str = static()
+    log_allowed: Scalar
+    multiplier: Scalar
+    penalty: Scalar
+    ratio: Scalar
 
-    def init(self) -> tuple[Array, Array]:
-        zero = jnp.zeros((), jnp.result_type(float))
-        return zero, zero
+    def excess(self, values: Array) -> Array:
+        """Return g = log(reached / allowed) for the search's values [N], corrected by `ratio`."""
+        reached = self.ratio * KINDS[self.name].tuned(values)
+        return jnp.log(jnp.maximum(reached, TINY)) - self.log_allowed
 
-    def update(self, carry: tuple[Array, Array], row: Any, span: Any) -> tuple[Array, Array]:
-        total, count = carry
-        return total + (jnp.abs(getattr(row, self.of)) / self.size) ** NORM, count + row.alive
-
-    def result(self, carry: tuple[Array, Array], ending: Ending) -> Array:
-        total, count = carry
-        mean = total / jnp.maximum(count, 1.0)
-        some = mean > TINY
-        return self.size * jnp.where(some, jnp.where(some, mean, 1.0) ** (1 / NORM), 0.0)
-
-
-@record
-class Scaled:
-    """Fold: the result of another fold, divided by `by`."""
-
-    fold: Fold
-    by: Scalar = leaf(above=0, at_most=1e30)
-
-    def init(self) -> Any:
-        return self.fold.init()
-
-    def update(self, carry: Any, row: Any, span: Any) -> Any:
-        return self.fold.update(carry, row, span)
-
-    def result(self, carry: Any, ending: Ending) -> Array:
-        return self.fold.result(carry, ending) / self.by
-
-
-@dataclasses.dataclass(frozen=True)
-class LimitContext:
-    """Quantities of a case that the folds of limits depend on.
-
-    `settle` (s): start of the settled part. `duration` (s): of the run. `touchdown` (m): clearance. `band` (m): of the
-    settling time.
-    """
-
-    settle: float
-    duration: float
-    touchdown: float
-    band: float
-
-
-def pooled(values: Any) -> Any:
-    """Return the root mean square over members."""
-    return jnp.sqrt(jnp.mean(values**2) + TINY)
-
-
-def largest(values: Any) -> Any:
-    """Return the 16-norm over members: smooth, and not below the maximum."""
-    top = jax.lax.stop_gradient(jnp.maximum(jnp.max(values), TINY))
-    total = jnp.sum((values / top) ** NORM)
-    # 0 if all are 0: the derivative of the root is infinite there
-    return top * jnp.where(total > 0, total, 1.0) ** (1 / NORM)
-
-
-@dataclasses.dataclass(frozen=True)
-class Kind:
-    """A quantity that may be limited.
-
-    `words` describes the quantity of one member, `over` its reduction over members, both for the report. `fold` returns
-    the fold that measures it in the search, of a LimitContext and the limit. `exact` is the column of its exact value
-    in the judge's metrics; None: the fold's result. `tuned` reduces the members for the search, `judged` for the judge.
-    """
-
-    unit: str
-    words: str
-    over: str
-    fold: Callable[[LimitContext, float], Fold]
-    exact: str | None
-    tuned: Callable[[Any], Any]
-    judged: Callable[[np.ndarray], Any]
-    margin: float
-    """default margin: relative difference between two ensembles, smaller for means than for worst members"""
-    worst: bool = False
-    """whether the quantity is that of the worst member"""
-
-
-_POOLED = {"over": "root mean square over members", "tuned": pooled, "judged": pooled, "margin": 0.005}
-_MEAN = {"over": "mean over members", "tuned": jnp.mean, "judged": np.mean, "margin": 0.005}
-_WORST = {"over": "of the worst member", "tuned": largest, "judged": np.max, "margin": 0.03, "worst": True}
-
-KINDS: dict[str, Kind] = {
-    "rms_u_V": Kind(
-        "V",
-        "root mean square voltage from run.settle on",
-        fold=lambda context, asked: Driven("u_squared", context.settle, root=True),
-        exact="settled_rms_u_V",
-        **_POOLED,
-    ),
-    "max_u_V": Kind(
-        "V",
-        "largest voltage of the run",
-        fold=lambda context, asked: Typical("u_peak", asked),
-        exact="max_abs_u_V",
-        **_WORST,
-    ),
-    "max_abs_i_A": Kind(
-        "A", "largest current of the run", fold=lambda context, asked: Peak("i"), exact="max_abs_i_A", **_WORST
-    ),
-    "chatter_V_per_s": Kind(
-        "V/s",
-        "variation of the voltage, averaged over each sample, per second from run.settle on",
-        fold=lambda context, asked: Scaled(Variation(context.settle), context.duration - context.settle),
-        exact=None,
-        **_MEAN,
-    ),
-    "largest_error_m": Kind(
-        "m",
-        "largest |z - r| from run.settle on",
-        fold=lambda context, asked: Peak("e_z", context.settle),
-        exact="settled_max_abs_error_m",
-        **_WORST,
-    ),
-    "settling_s": Kind(
-        "s",
-        "time of the run from which |z - r|, at the samples, stays within settling_band_m",
-        fold=lambda context, asked: Settling(context.band),
-        exact=None,
-        **_WORST,
-    ),
-    "overshoot_m": Kind(
-        "m",
-        "how far z goes, at the samples, beyond where it began and where r has been",
-        fold=lambda context, asked: Overshoot(),
-        exact=None,
-        **_WORST,
-    ),
-    "clearance_used": Kind(
-        "",
-        "largest |z| as a share of the clearance",
-        fold=lambda context, asked: Scaled(Peak("z"), context.touchdown),
-        exact="clearance_used",
-        **_WORST,
-    ),
-}
+    def __call__(self, values: Array) -> Array:
+        """Return the term for the search's values [N]."""
+        force = jnp.maximum(self.multiplier + self.penalty * self.excess(values), 0.0)
+        return (force**2 - self.multiplier**2) / (2 * self.penalty)
 
 
 @dataclasses.dataclass(frozen=True)
 class Limit:
-    """Upper limit `asked` of the quantity KINDS[`name`], and the state of its augmented Lagrangian.
+    """Upper limit `threshold` of the quantity KINDS[`name`], and the state of its augmented Lagrangian.
 
     `source`: origin of the limit, for the report. `multiplier`, `penalty`: of the augmented Lagrangian. `ratio`: the
     judge's value over the search's. `missed`: g at the last update. `forces`: (reached, multiplier) of every update.
     """
 
     name: str
-    asked: float
+    threshold: float
     source: str = "tune.limits"
     margin: float = 0.0
     """share by which the search keeps the quantity below the limit"""
@@ -219,17 +85,12 @@ class Limit:
     @property
     def allowed(self) -> float:
         """Upper bound that the search uses: the limit less its margin."""
-        return (1 - self.margin) * self.asked
+        return (1 - self.margin) * self.threshold
 
-    def excess(self, values: Array) -> Array:
-        """Return g = log(reached / allowed) for the search's values [N], corrected by `ratio`."""
-        reached = self.ratio * self.kind.tuned(values)
-        return jnp.log(jnp.maximum(reached, TINY)) - math.log(self.allowed)
-
-    def pull(self, values: Array) -> Array:
-        """Return the limit's term of the goal for the search's values [N]."""
-        force = jnp.maximum(self.multiplier + self.penalty * self.excess(values), 0.0)
-        return (force**2 - self.multiplier**2) / (2 * self.penalty)
+    @property
+    def term(self) -> LimitTerm:
+        """The limit's term of the goal."""
+        return LimitTerm(self.name, math.log(self.allowed), self.multiplier, self.penalty, self.ratio)
 
     def log_excess(self, reached: float) -> float:
         """Return g = log(reached / allowed)."""
@@ -284,7 +145,9 @@ class Limit:
         return values[alive] if alive.any() else values
 
 
-def measures(limits: tuple[Limit, ...], scenario: Scenario, clock: Clock, settle: float, band: float) -> dict[str, Any]:
+def measures(
+    limits: tuple[Limit, ...], scenario: Scenario, clock: Clock, settle: float, band: float
+) -> dict[str, Fold]:
     """Return the fold of each limit by name. `settle` (s): start of the settled part; `band` (m): of settling_s."""
     context = LimitContext(settle, float(clock.duration), float(scenario.touchdown), band)
-    return {limit.name: limit.kind.fold(context, limit.asked) for limit in limits}
+    return {limit.name: limit.kind.fold(context, limit.threshold) for limit in limits}

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.extend import Scalar, leaf, record
-from ambjax.simulation.metrics import Ending, Fold, Named
-from ambjax.simulation.trajectory import ALIVE
+from ambjax.simulation.folds import Ending, Fold, Named
+from ambjax.simulation.span import Span
+from ambjax.simulation.trajectory import ALIVE, Row
 from ambjax.world.scenario import Scenario
 from tuning.objective.limits import PREFIX
 
@@ -64,7 +65,7 @@ class Loss:
         zeros = [jnp.zeros((), jnp.result_type(float))] * (len(Sums._fields) - 1)
         return Sums._make([*zeros, Named(self.measures).init()])
 
-    def update(self, carry: Sums, row: Any, span: Any) -> Sums:
+    def update(self, carry: Sums, row: Row, span: Span) -> Sums:
         on = row.alive
         weight = jnp.where(row.t >= self.settle, 1.0, self.early)
         square = ((row.z - row.r) / self.s_0) ** 2
@@ -115,7 +116,7 @@ def loss_for(scenario: Scenario, settle: float, early: float = 0.0, measures: Ma
     return Loss(settle, early, plant.s_0, float(u_scale), scenario.touchdown, dict(measures or {}))
 
 
-def weigh(weights: Any, terms: dict[str, Any], stressed: Any) -> Any:
+def weigh(weights: Any, terms: Mapping[str, Any], stressed: Any) -> Any:
     """Return the loss: clearance + survival + (tracking + peak) (1 + effort + chatter), each term times its weight.
 
     For a stressed member it is clearance + survival. Costs are relative to the error, whose size is unknown in advance:
@@ -128,6 +129,6 @@ def weigh(weights: Any, terms: dict[str, Any], stressed: Any) -> Any:
     return held + ordinary * sum(each.values()) * (1 + costs)
 
 
-def outcomes(weights: Any, terms: dict[str, Any], stressed: Any) -> list[Any]:
+def outcomes(weights: object, terms: dict[str, Any], stressed: object) -> list[Any]:
     """Return the weighted loss and the limited quantities, in the order of their names."""
     return [weigh(weights, terms, stressed), *(terms[name] for name in sorted(terms) if name.startswith(PREFIX))]

@@ -93,7 +93,7 @@ def _context(objective: Objective, conditions: tuple[Bound, ...]) -> SearchConte
     return SearchContext(model, w, float(objective.clock.sample_period), bounds, needed, stepped)
 
 
-def _interval(context: SearchContext, cascade: Any, gain: Gain, value: float) -> Interval:
+def _interval(context: SearchContext, cascade: object, gain: Gain, value: float) -> Interval:
     if gain.low > 0 and np.isfinite(gain.high):
         return Interval(gain.low, gain.high, "tune.bounds", True)
     _, stage, name = gain.path.split(".")

@@ -27,7 +27,7 @@ class CVaR:
     the worst members counts in part.
     """
 
-    alpha: float = 0.9
+    alpha: float
 
     def __call__(self, losses: Array) -> Array:
         count = losses.shape[0]

@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.cascade import Cascade
+from ambjax.extend import Scalar
 from ambjax.simulation.clock import Clock
 from ambjax.theorem.conditions import delta_1_on_reference, required
 from ambjax.world.scenario import Scenario
@@ -39,11 +40,11 @@ def bounds(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Bound, .
         "Q_i": lambda: largest(scenario.q_i),
         "Delta_1": lambda: delta_1_on_reference(cascade, scenario, clock)[0],
     }
-    asked = [one for one in required(cascade) if one.value is not None]
-    return tuple(Bound(one.path, sides[one.over](), one.over, one.unit) for one in asked)
+    valued = [one for one in required(cascade) if one.value is not None]
+    return tuple(Bound(one.path, sides[one.over](), one.over, one.unit) for one in valued)
 
 
-def shortfall(gains: Mapping[str, Array], bounds: tuple[Bound, ...], margin: float) -> Array:
+def shortfall(gains: Mapping[str, Array], bounds: tuple[Bound, ...], margin: Scalar) -> Array:
     """Return the sum of max(0, log((1 + margin) bound / gain))^2 over `gains` by path with a bound.
 
     It is 0 if every condition holds with the relative margin `margin`.

@@ -15,8 +15,8 @@ from ambjax.simulation.trajectory import Trajectory
 from tuning.judge import difference, metrics_of, summarise
 from tuning.problem import TuningProblem
 
-# Number of held-out members that are simulated again.
-AGAIN = 8
+# Number of held-out members that are simulated by accurate steps.
+COMPARED = 8
 # Relative error of the report's steps above which a number is marked.
 MARKED = 0.05
 
@@ -29,7 +29,7 @@ def compared(problem: TuningProblem, x: np.ndarray, seed: int, count: int, names
     `lost`, `stalled`: numbers with either steps. `refuted`: why accurate steps contradict the report; '' if not,
     or if no member survives in the report.
     """
-    numbers = np.arange(min(AGAIN, count))
+    numbers = np.arange(min(COMPARED, count))
     members = problem.objective.chosen(seed, numbers, count)
     both = metrics_of(problem.judging, x, members), metrics_of(problem.reference, x, members)
     error = difference(problem, *both, members)

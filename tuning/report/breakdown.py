@@ -48,7 +48,7 @@ def minimised(problem: TuningProblem, x: np.ndarray, members: Members) -> Facts:
     parts = {
         "ordinary": n,
         "risk": float(goal.risk(jnp.asarray(losses[:n]))),
-        "asked_to_be_held": len(losses) - n,
+        "survival_only": len(losses) - n,
         "held": float(losses[n:].mean()) if len(losses) > n else 0.0,
         "penalty": float(np.exp(goal.weight * penalty)),
         "limits": float(np.exp(pull)),

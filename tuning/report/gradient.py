@@ -1,7 +1,7 @@
 """Quality of the gradient: agreement of three ways to compute it, growth with the horizon, signal-to-noise ratio."""
 
 import dataclasses
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -9,6 +9,8 @@ from tuning.objective.lanes import Engine
 from tuning.objective.loss import weigh
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
+
+Number = TypeVar("Number", float, np.ndarray)
 
 # Samples over which the three ways are compared, members that take part, and the step of the differences.
 SAMPLES, FEW, STEP = 500, 4, 1e-3
@@ -30,7 +32,7 @@ def _shorter(problem: TuningProblem, samples: int) -> Any:
     return dataclasses.replace(objective, clock=clock, loss=dataclasses.replace(objective.loss, settle=settle))
 
 
-def three_ways(problem: TuningProblem, x: np.ndarray) -> dict[str, Any]:
+def three_ways(problem: TuningProblem, x: np.ndarray) -> dict[str, object]:
     """Compute the gradient [m] of the mean loss at x [m] by forward mode, reverse mode and extrapolated differences.
 
     Returns plain data. `coarse`, `fine`: central differences with the steps STEP and STEP / 2. `verdicts`: for each
@@ -63,7 +65,7 @@ def three_ways(problem: TuningProblem, x: np.ndarray) -> dict[str, Any]:
     }
 
 
-def extrapolated(coarse: Any, fine: Any) -> Any:
+def extrapolated(coarse: Number, fine: Number) -> Number:
     """Return Richardson's extrapolation of central differences with a step and with half of it."""
     return (4 * fine - coarse) / 3
 
@@ -113,7 +115,7 @@ def against_horizon(problem: TuningProblem, x: np.ndarray, members: Members) -> 
     return rows
 
 
-def signal_to_noise(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, Any]:
+def signal_to_noise(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, object]:
     """Return the mean of the members' gradients divided by its standard error, by gain."""
     outcomes, slopes, terms = problem.engine.gradient(x[None], members, problem.goal.weights)
     relative = slopes[0, :, 0] / outcomes[0, :, 0].mean()
@@ -126,7 +128,7 @@ def signal_to_noise(problem: TuningProblem, x: np.ndarray, members: Members) -> 
     }
 
 
-def report(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, Any]:
+def report(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, object]:
     """Return the data of the whole gradient report at coordinates x [m]."""
     return {
         "gains": problem.objective.space.paths,

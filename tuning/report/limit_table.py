@@ -13,11 +13,15 @@ Facts = dict[str, Any]
 MORE = 0.1
 # Verdicts on a limit.
 HELD, BROKEN, UNVERIFIED, UNJUDGED = "held", "NOT HELD", "not verified", "not judged"
-LOUD = (BROKEN, UNVERIFIED)
+EMPHASISED = (BROKEN, UNVERIFIED)
 
 
 def facts(
-    limits: tuple[Limit, ...], asked: LimitSettings, columns: dict[str, np.ndarray], summary: Facts, refuted: str = ""
+    limits: tuple[Limit, ...],
+    settings: LimitSettings,
+    columns: dict[str, np.ndarray],
+    summary: Facts,
+    refuted: str = "",
 ) -> list[Facts]:
     """Return a row for each limit and one for survival, from the held-out members' columns [N] and their summary.
 
@@ -30,7 +34,7 @@ def facts(
     survival = {
         "name": "survival",
         "unit": "",
-        "asked": asked.survival,
+        "threshold": settings.survival,
         "source": "tune.limits",
         "what": "share of members held",
         "reached": share,
@@ -39,7 +43,7 @@ def facts(
         "active": False,
         "multiplier": None,
         "price_m": None,
-    } | _verdict(None if share is None else members - held <= asked.may_lose(members), refuted)
+    } | _verdict(None if share is None else members - held <= settings.may_lose(members), refuted)
     return [*(_row(limit, columns, summary, refuted) for limit in limits), survival]
 
 
@@ -55,13 +59,13 @@ def _verdict(kept: bool | None, refuted: str) -> Facts:
 def _row(limit: Limit, columns: dict[str, np.ndarray], summary: Facts, refuted: str) -> Facts:
     judged = summary["held"] > 0
     reached = limit.reached(columns) if judged else None
-    kept = reached <= limit.asked if reached is not None else False if summary["members"] else None
+    kept = reached <= limit.threshold if reached is not None else False if summary["members"] else None
     active, found = limit.active(reached), _verdict(kept, refuted)
     price = summary["settled_rms_error_m"] * limit.error_reduction(MORE) if active and judged else 0.0
     return {
         "name": limit.name,
         "unit": limit.kind.unit,
-        "asked": limit.asked,
+        "threshold": limit.threshold,
         "source": limit.source,
         "what": f"{limit.kind.words}; {limit.kind.over}",
         "reached": reached,
@@ -76,7 +80,7 @@ def _row(limit: Limit, columns: dict[str, np.ndarray], summary: Facts, refuted: 
 def broken(rows: list[Facts]) -> list[str]:
     """Return a sentence for each limit that is not held, including survival."""
     return [
-        f"tune.limits.{row['name']} is {BROKEN}: {_reached(row)}, {_side(row)} {row['asked']:g} ({row['source']})"
+        f"tune.limits.{row['name']} is {BROKEN}: {_reached(row)}, {_side(row)} {row['threshold']:g} ({row['source']})"
         for row in rows
         if row["verdict"] == BROKEN
     ]
@@ -85,8 +89,8 @@ def broken(rows: list[Facts]) -> list[str]:
 def prices(rows: list[Facts]) -> list[str]:
     """Return a sentence for each limit that is active and held."""
     return [
-        f"{row['name']} = {row['reached']:.4g}{_unit(row)} is at its limit, {row['asked']:g}: {100 * MORE:g} % more "
-        f"would take about {row['price_m']:.2g} m off the settled rms error"
+        f"{row['name']} = {row['reached']:.4g}{_unit(row)} is at its limit, {row['threshold']:g}: {100 * MORE:g} % "
+        f"more would take about {row['price_m']:.2g} m off the settled rms error"
         for row in rows
         if row["active"] and row["held"]
     ]
@@ -99,18 +103,18 @@ def section(rows: list[Facts]) -> list[str]:
     cells = [
         [
             f"`{row['name']}`",
-            f"{_side(row)} {row['asked']:g}{_unit(row)}",
+            f"{_side(row)} {row['threshold']:g}{_unit(row)}",
             _number(row["reached"], row),
             _number(row["worst"], row),
-            f"**{row['verdict']}**" if row["verdict"] in LOUD else row["verdict"],
+            f"**{row['verdict']}**" if row["verdict"] in EMPHASISED else row["verdict"],
             "active" if row["active"] else "-",
             "-" if row["price_m"] is None or row["name"] == "survival" else f"{row['price_m']:.2g} m",
         ]
         for row in rows
     ]
-    head = ["limit", "asked", "reached", "worst member", "verdict", "at the optimum", f"{100 * MORE:g} % more buys"]
+    head = ["quantity", "limit", "reached", "worst member", "verdict", "at the optimum", f"{100 * MORE:g} % more buys"]
     lines = ["## Limits", "", *table(head, cells), ""]
-    lines += [f"- {row['name']}: {row['what']}; asked by {row['source']}." for row in rows]
+    lines += [f"- {row['name']}: {row['what']}; from {row['source']}." for row in rows]
     return [
         *lines,
         "",

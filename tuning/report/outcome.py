@@ -1,17 +1,16 @@
 """The outcome of a search: one record from which exit code, log, report and report.json derive; and the advice."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
+from tuning.report.facts import Row, TuningFacts
 from tuning.report.limit_table import BROKEN, UNJUDGED, UNVERIFIED, broken, prices
 
-Facts = dict[str, Any]
-YES, NO = "The tuned gains hold what is asked.", "The tuned gains do NOT hold what is asked:"
-NOBODY = "No held-out member judges the tuned gains (tune.held_out = 0)."
+ALL_MET, NOT_MET = "The tuned gains meet all requirements.", "The tuned gains do NOT meet all requirements:"
+NO_HELD_OUT = "The tuned gains are not judged on held-out members (tune.held_out = 0)."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,42 +56,42 @@ class TuningOutcome:
             words.append(UNVERIFIED)
         return words
 
-    def facts(self) -> Facts:
+    def facts(self) -> Row:
         """Return the outcome as plain data."""
         return dataclasses.asdict(self) | {"good": self.good, "rotors_held": self.rotors_held, "against": self.against}
 
 
-def outcome_of(facts: Facts, may_lose: int) -> TuningOutcome:
+def outcome_of(facts: TuningFacts, may_lose: int) -> TuningOutcome:
     """Return the outcome from the facts of a search: of the held-out members, else of the training members.
 
     `may_lose`: number of held-out members that may be lost. No training member may be lost.
     """
-    after, limits = facts["after"], {row["name"]: row["verdict"] for row in facts["limits"]}
+    after, limits = facts.after, {row["name"]: row["verdict"] for row in facts.limits}
     if not after["members"]:
-        return TuningOutcome(facts["trained_on"], facts["lost_in_training"], 0, 0, limits, facts["refuted"])
-    return TuningOutcome(after["members"], after["lost"], after["stalled"], may_lose, limits, facts["refuted"])
+        return TuningOutcome(facts.trained_on, facts.lost_in_training, 0, 0, limits, facts.refuted)
+    return TuningOutcome(after["members"], after["lost"], after["stalled"], may_lose, limits, facts.refuted)
 
 
-def verdict(facts: Facts, outcome: TuningOutcome) -> str:
+def verdict(facts: TuningFacts, outcome: TuningOutcome) -> str:
     """Return the verdict and the status of the judged members in a few sentences."""
     unjudged = [name for name, found in outcome.limits.items() if found == UNJUDGED]
-    answer = f"{NO} {'; '.join(outcome.against)}." if not outcome.good else NOBODY if unjudged else YES
-    words = [answer, _statuses(facts)]
+    met = NO_HELD_OUT if unjudged else ALL_MET
+    words = [met if outcome.good else f"{NOT_MET} {'; '.join(outcome.against)}.", _statuses(facts)]
     if outcome.refuted:
         words.append(f"That is {UNVERIFIED.upper()}: {outcome.refuted}.")
-    words += [f"{line}." for line in [*broken(facts["limits"]), *prices(facts["limits"])]]
+    words += [f"{line}." for line in [*broken(facts.limits), *prices(facts.limits)]]
     if unjudged:
         words.append(f"Limits {UNJUDGED}: {', '.join(unjudged)}.")
-    ends = [f"{row['path']} = {row['after']:.4g} ({row['at_bound']})" for row in facts["gains"] if row["at_bound"]]
+    ends = [f"{row['path']} = {row['after']:.4g} ({row['at_bound']})" for row in facts.gains if row["at_bound"]]
     if ends:
         words.append(f"At a bound: {', '.join(ends)}.")
     return " ".join(words)
 
 
-def _statuses(facts: Facts) -> str:
-    before, after = facts["before"], facts["after"]
+def _statuses(facts: TuningFacts) -> str:
+    before, after = facts.before, facts.after
     if not after["members"]:
-        return f"{facts['lost_in_training']} members of the training ensemble are lost under the tuned gains."
+        return f"{facts.lost_in_training} members of the training ensemble are lost under the tuned gains."
     undecided = f", {after['stalled']} not decided (their integration stalls)" if after["stalled"] else ""
     return (
         f"Of {after['members']} held-out members, {after['lost']} are lost under the tuned gains (before: "
@@ -101,15 +100,15 @@ def _statuses(facts: Facts) -> str:
     )
 
 
-def _error(summary: Facts) -> str:
+def _error(summary: Row) -> str:
     return f"{summary['settled_rms_error_m']:.3g} m" if summary["held"] else "none is held"
 
 
-def _largest(summary: Facts) -> str:
+def _largest(summary: Row) -> str:
     return f", largest {summary['settled_max_abs_error_m']:.3g} m" if summary["held"] else ""
 
 
-def advice(problem: TuningProblem, facts: Facts, outcome: TuningOutcome, x: np.ndarray, members: Members) -> str:
+def advice(problem: TuningProblem, facts: TuningFacts, outcome: TuningOutcome, x: np.ndarray, members: Members) -> str:
     """Return why requirements are not met and the remedies, the most important first; '' if all are met."""
     if outcome.good:
         return ""
@@ -120,7 +119,7 @@ def advice(problem: TuningProblem, facts: Facts, outcome: TuningOutcome, x: np.n
             "lower by tune.bounds."
         )
     if outcome.broken:
-        lines = [line for line in broken(facts["limits"]) if not line.startswith("tune.limits.survival ")]
+        lines = broken([row for row in facts.limits if row["name"] != "survival"])
         words.append(f"{'. '.join(lines)}. Allow more (inf: none), tune more gains, each p too, or raise tune.screen.")
     if outcome.stalled:
         words.append(f"Not decided: {outcome.stalled} held-out members, whose integration stalls. Raise tune.substeps.")
@@ -129,13 +128,12 @@ def advice(problem: TuningProblem, facts: Facts, outcome: TuningOutcome, x: np.n
     )
 
 
-def _of_the_lost(problem: TuningProblem, facts: Facts, x: np.ndarray, members: Members) -> list[str]:
+def _of_the_lost(problem: TuningProblem, facts: TuningFacts, x: np.ndarray, members: Members) -> list[str]:
     """Return the limits that are nearly reached, as possible causes of lost rotors."""
-    judged = f"{facts['after']['lost']} of {facts['after']['members']} held-out members, " * bool(
-        facts["after"]["members"]
-    )
-    words = [f"Rotors are lost: {judged}{facts['lost_in_training']} of {len(members.member)} in training."]
-    for row in facts["conditions"]:
+    after = facts.after
+    judged = f"{after['lost']} of {after['members']} held-out members, " if after["members"] else ""
+    words = [f"Rotors are lost: {judged}{facts.lost_in_training} of {len(members.member)} in training."]
+    for row in facts.conditions:
         if row["holds"] is False and row["gain"] is not None:
             words.append(f"{row['requires']} fails: {row['gain']:.3g} against {row['against']:.3g} {row['unit']}.")
     effort = problem.engine.terms(x[None], members)["effort"].mean()
@@ -145,7 +143,7 @@ def _of_the_lost(problem: TuningProblem, facts: Facts, x: np.ndarray, members: M
             f"The voltage is at {100 * np.sqrt(effort):.0f} % of its limit (rms): a supply above {u_max:g} V, less "
             "sensor noise, or an observer ([controller.observer] kind = 'complementary', its l tuned) would help."
         )
-    bound = [row["path"] for row in facts["gains"] if row["at_bound"]]
+    bound = [row["path"] for row in facts.gains if row["at_bound"]]
     if bound:
         words.append(f"At a bound: {', '.join(bound)}; widen tune.bounds.")
     return [

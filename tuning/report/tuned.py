@@ -1,5 +1,6 @@
 """tuned.toml: the user's case file, with its comments, and the tuned gains."""
 
+import pathlib
 import re
 import tomllib
 from collections.abc import Mapping
@@ -9,6 +10,9 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, InlineTable, Table
 
+from ambjax.cases.own_laws import relocated
+from ambjax.cases.reader import Case, case_from
+
 FIRST = "Tuned by ambjax tune from the case"
 # First line of such a file. It is removed when the file is tuned again.
 HEAD = re.compile(rf"\A# {FIRST} [^\n]*\n(#[^\n]*\n)?\n?")
@@ -16,8 +20,17 @@ HEAD = re.compile(rf"\A# {FIRST} [^\n]*\n(#[^\n]*\n)?\n?")
 CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
 
-def tuned(text: str, gains: Mapping[str, float], case: str, verdict: str) -> str:
-    """Return the text of a case file with the given numbers at these dotted paths; missing tables are added.
+def tuned_case(case: Case, gains: Mapping[str, float], verdict: str, out: pathlib.Path) -> tuple[str, Case]:
+    """Return the text of tuned.toml for the folder `out`, and its case. Raises ValueError for text that is no case.
+
+    The laws of one's own are those of `case`: a change of their files during the search does not matter.
+    """
+    text = tuned(case.text, {**gains, **relocated(case.own_laws, out)}, case.name, verdict)
+    return text, case_from(tomllib.loads(text), case.name, own=case.own_laws)
+
+
+def tuned(text: str, gains: Mapping[str, float | str], case: str, verdict: str) -> str:
+    """Return the text of a case file with the given gains and kinds at these dotted paths; missing tables are added.
 
     The text begins with a comment: the name of the case and the verdict. Raises ValueError if the text cannot be
     changed in this way.
@@ -26,7 +39,7 @@ def tuned(text: str, gains: Mapping[str, float], case: str, verdict: str) -> str
         document = tomlkit.parse(HEAD.sub("", text.replace("\r\n", "\n")))
         for path, value in gains.items():
             *tables, name = path.split(".")
-            _put(_table(document, tables), name, float(value))
+            _put(_table(document, tables), name, value if isinstance(value, str) else float(value))
         body = tomlkit.dumps(document)
         if tomllib.loads(body) != _wanted(text, gains):
             raise ValueError("what is written would be another case")
@@ -36,7 +49,7 @@ def tuned(text: str, gains: Mapping[str, float], case: str, verdict: str) -> str
     return "\n".join([*head, "", body.strip()]) + "\n"
 
 
-def _wanted(text: str, gains: Mapping[str, float]) -> dict[str, Any]:
+def _wanted(text: str, gains: Mapping[str, float | str]) -> dict[str, Any]:
     """Return the data that the changed text must parse to."""
     document = tomllib.loads(text)
     for path, value in gains.items():
@@ -87,8 +100,8 @@ def _append(document: tomlkit.TOMLDocument, path: list[str], word: str) -> None:
     document.append(path[0], table)
 
 
-def _put(table: Any, name: str, value: float) -> None:
-    """Set the number of this name; append a new one, and keep the text of an equal one."""
+def _put(table: Any, name: str, value: float | str) -> None:
+    """Set the value of this name; append a new one, and keep the text of an equal one."""
     if name in table:
         if table[name] != value:
             table[name] = value
@@ -108,7 +121,7 @@ def _behind(last: Table | None) -> Table:
     return table
 
 
-def _last(table: Any) -> Table | None:
+def _last(table: object) -> Table | None:
     """Return the innermost table at the end of a table of tables; None if there is none, or it has separate parts."""
     last = None
     while isinstance(table, Table):

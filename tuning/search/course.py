@@ -72,7 +72,7 @@ class Course:
     out: pathlib.Path | None = None
     facts: dict[str, Any] = dataclasses.field(default_factory=dict)
     resume: bool = False
-    tell: Callable[[SearchState, float], None] | None = None
+    on_iteration: Callable[[SearchState, float], None] | None = None
     """called after each iteration with the search and its duration in s; None: print a line"""
     past: list[SearchState] = dataclasses.field(default_factory=list)
     """the searches so far"""
@@ -91,7 +91,8 @@ class Course:
             self.problem.engine, self.problem.goal, self.members, points, keep=tune.budget.starts,
             iterations=tune.budget.iterations, name=tune.optimiser, rate=tune.learning_rate,
             seed=self.seed + len(self.past), settled=settled,
-            keeper=Keeper(path, self.facts, number), resume=self.resume, tell=self.tell or _progress_line(self.problem),
+            keeper=Keeper(path, self.facts, number), resume=self.resume,
+            on_iteration=self.on_iteration or _progress_line(self.problem),
         )  # fmt: skip
         if progress.ended:
             say(f"round {number}: the search is complete; its result is read from {path}")
@@ -180,7 +181,7 @@ def _joined(past: list[SearchState]) -> dict[str, np.ndarray]:
     """Concatenate the histories of all searches. A search with fewer starts repeats its first one."""
     width = max(len(one.active) for one in past)
 
-    def wide(rows: Any) -> np.ndarray:
+    def wide(rows: object) -> np.ndarray:
         rows = np.asarray(rows)
         return rows if rows.ndim < 2 or rows.shape[1] == width else np.repeat(rows[:, :1], width, axis=1)
 
@@ -193,7 +194,7 @@ def _progress_line(problem: TuningProblem) -> Callable[[SearchState, float], Non
     scale = float(np.asarray(problem.objective.loss.s_0))
     budget, spent = problem.tune.budget, []
 
-    def tell(progress: SearchState, seconds: float) -> None:
+    def print_line(progress: SearchState, seconds: float) -> None:
         spent.append(seconds)
         x, value = best_of(progress)
         gains = np.asarray(problem.objective.space.gains_at(jnp.asarray(x)))
@@ -211,4 +212,4 @@ def _progress_line(problem: TuningProblem) -> Callable[[SearchState, float], Non
             f"kept {count - int(last['lost'][best])}/{count}  {named}  ({going} starts{wait})"
         )
 
-    return tell
+    return print_line

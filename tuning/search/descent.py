@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from ambjax.extend import record, static
 from tuning.objective.goal import Goal
 from tuning.optimisers import Curvature, Retreat, optimiser
 
@@ -35,26 +36,36 @@ class Starts(NamedTuple):
         return self.state.value
 
 
+@record
 class Descent:
-    """Independent descents of several starts by the optimiser `name` with the learning rate `rate`; compiled once."""
+    """Independent descents of several starts by the optimiser `name` with the learning rate `rate`.
 
-    def __init__(self, goal: Goal, name: str, rate: float):
-        self.goal, self.method = goal, optimiser(name, rate)
+    Its functions are compiled once for all goals of the same structure: the numbers of the limits are leaves.
+    """
 
-    @functools.partial(jax.jit, static_argnums=0)
+    goal: Goal
+    name: str = static()
+    rate: float = static()
+
+    @property
+    def method(self) -> optax.GradientTransformationExtraArgs:
+        """The optimiser."""
+        return optimiser(self.name, self.rate)
+
+    @jax.jit
     def begin(self, x: Array) -> Starts:
         """Return the initial state at coordinates x [S, m]."""
         state: Any = jax.vmap(self.method.init)(x)
         infinite = jnp.full(len(x), jnp.inf, x.dtype)
         return Starts(x, state, infinite, infinite)
 
-    @functools.partial(jax.jit, static_argnums=0)
+    @jax.jit
     def restarted(self, x: Array, starts: Starts) -> Starts:
         """Return the initial state at coordinates x [S, m] with the curvature of `starts`, for a similar goal."""
         begun = self.begin(x)
         return begun._replace(state=jax.vmap(lambda old, fresh: old.restarted(fresh))(starts.state, begun.state))
 
-    @functools.partial(jax.jit, static_argnums=(0, 1))
+    @functools.partial(jax.jit, static_argnums=1)
     def step(self, ordinary: int, starts: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
         """Return the starts after one step of those that are `on` [S].
 

@@ -1,7 +1,6 @@
 """The neighbourhood of the optimum: slices of the goal, sensitivities, and the Pareto front of error and voltage."""
 
 import dataclasses
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -70,7 +69,7 @@ def slices(problem: TuningProblem, x: np.ndarray, members: Members) -> Slices:
 
 def pareto(
     problem: TuningProblem, x: np.ndarray, members: Members, *, points: int = 6, iterations: int = 8
-) -> list[dict[str, Any]]:
+) -> list[dict[str, object]]:
     """Return the Pareto front of settled rms error and rms voltage, from optima for several weights of the effort.
 
     The first point has the search's own weight, the others 1 to 1000. All are refined at once. Each is judged in the

@@ -54,11 +54,11 @@ class SearchState:
         """Whether each start uses CMA-ES [S]."""
         return self.clouds.drawn >= 0
 
-    def cloud(self, at: Any) -> Cloud:
+    def cloud(self, at: object) -> Cloud:
         """Return the distribution of one start."""
         return Cloud(*(leaf[at] for leaf in self.clouds))
 
-    def put(self, at: Any, cloud: Cloud) -> None:
+    def put(self, at: object, cloud: Cloud) -> None:
         """Set the distribution of one start."""
         for whole, part in zip(self.clouds, cloud, strict=True):
             whole[at] = part
@@ -75,7 +75,7 @@ class Keeper:
     `path`: of the file; None: no checkpoint. `facts`: nested settings that a checkpoint must match to be resumed.
     """
 
-    def __init__(self, path: pathlib.Path | None, facts: dict[str, Any], round: int = 1):
+    def __init__(self, path: pathlib.Path | None, facts: dict[str, Any], round: int = 1) -> None:
         self.path, self.round = path, round
         self.fingerprint = flat({**provenance(), **facts})
 

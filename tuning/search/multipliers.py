@@ -25,21 +25,22 @@ AVERAGING_MEMBERS = 256
 def limited(course: Course, x: np.ndarray) -> np.ndarray:
     """Search from x [m] until every limit is met, with updates of the multipliers. Return x itself if none is near."""
     for _ in range(MOST_UPDATES):
-        goal = course.problem.goal
+        before = course.problem.limits
         numbers = _numbers(course, x)
-        limits = tuple(limit.updated(*found) for limit, found in zip(goal.limits, numbers, strict=True))
-        stuck = [limit for limit, (_, judged) in zip(goal.limits, numbers, strict=True) if _stuck(limit, judged)]
+        limits = tuple(limit.updated(*found) for limit, found in zip(before, numbers, strict=True))
+        stuck = [limit for limit, (_, judged) in zip(before, numbers, strict=True) if _stuck(limit, judged)]
         if stuck:
             names = ", ".join(limit.name for limit in stuck)
             say(f"a larger penalty has not lowered {names}: its multiplier stays, and the held-out members judge it")
             break
         course.problem = course.problem.limited(limits)
         done = []
-        for before, after, (_, judged) in zip(goal.limits, limits, numbers, strict=True):
-            idle = before.multiplier == after.multiplier == 0
+        for old, after, (_, judged) in zip(before, limits, numbers, strict=True):
+            idle = old.multiplier == after.multiplier == 0
             done.append(_met(after, judged) or (idle and after.log_excess(judged) <= 0))
             if not (idle and done[-1]):
-                say(f"limit {after.name} = {after.asked:g} {after.kind.unit}: {judged:.4g} on members of another seed")
+                limit = f"limit {after.name} = {after.threshold:g} {after.kind.unit}"
+                say(f"{limit}: {judged:.4g} on members of another seed")
         if course.interrupted or all(done):
             break
         course.limit_searches += 1
@@ -65,7 +66,7 @@ def _met(limit: Limit, judged: float) -> bool:
 def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
     """Return each limited quantity at x [m] as (the search's value, the judge's value on members of another seed)."""
     problem, budget = course.problem, course.problem.tune.budget
-    limits, n = problem.goal.limits, course.members.ordinary
+    limits, n = problem.limits, course.members.ordinary
     if not limits:
         return []
     terms = problem.engine.terms(x[None], course.members)

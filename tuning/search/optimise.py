@@ -65,7 +65,7 @@ def search(
     settled: bool = False,
     keeper: Keeper | None = None,
     resume: bool = False,
-    tell: Callable[[SearchState, float], None] = lambda search, seconds: None,
+    on_iteration: Callable[[SearchState, float], None] = lambda search, seconds: None,
 ) -> SearchState:
     """Refine the best `keep` of these points, coordinates [K, m]. Ctrl-C ends the search early.
 
@@ -74,7 +74,7 @@ def search(
     A start descends by the optimiser `name` with the learning rate `rate`, or uses CMA-ES if its derivatives mislead.
 
     `settled`: an earlier search on all members ended at the first point, which is not refined again. `seed`: of the
-    populations. `tell`: called after each iteration with the search and the duration of the iteration in s.
+    populations. `on_iteration`: called after each iteration with the search and the duration of the iteration in s.
     """
     descent = Descent(goal, name, rate)
     keeper = keeper or Keeper(None, {})
@@ -104,7 +104,7 @@ def search(
                     _switch(progress, phase)
                 progress.seconds = progress.earlier + time.perf_counter() - began
                 keeper.save(progress)
-                tell(progress, progress.seconds - before)
+                on_iteration(progress, progress.seconds - before)
     except KeyboardInterrupt:
         progress.interrupted = True
     return progress

@@ -107,7 +107,7 @@ def finer(problem: TuningProblem) -> TuningProblem | None:
     """Return the problem with steps half as long and the same count of rollouts, or None after MOST_HALVINGS."""
     if problem.finer >= 2**MOST_HALVINGS:
         return None
-    fine = problem_of(problem.case, problem.tune, finer=2 * problem.finer).limited(problem.goal.limits)
+    fine = problem_of(problem.case, problem.tune, finer=2 * problem.finer).limited(problem.limits)
     fine.engine.rollouts = problem.engine.rollouts
     return fine
 

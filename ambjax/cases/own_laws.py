@@ -1,0 +1,154 @@
+"""Laws of one's own in a case file: `kind = "FILE.py:CLASS"` or `kind = "MODULE:CLASS"`."""
+
+import dataclasses
+import difflib
+import os
+import pathlib
+import types
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import jax
+
+from ambjax.cases.table import quoted, show
+from ambjax.cases.trial import try_law
+from ambjax.control.base import Law
+from ambjax.control.laws import STAGES
+from ambjax.host.imports import digest_of, line_of, module_of_file, module_of_name, pickle_with_source
+from ambjax.world.plant import Plant
+
+FORM = '"FILE.py:CLASS" or "MODULE:CLASS", a law of your own'
+
+# Makes the error of a law with this reason.
+Refuse = Callable[[str], ValueError]
+
+
+class OwnLaw(NamedTuple):
+    """A law of one's own that a case names: its stage, `kind` as written, its class, and the file or module.
+
+    `file`: absolute path of the file; None for an installed module. `digest`: SHA-256 of the source.
+    """
+
+    stage: str
+    kind: str
+    law: type[Law]
+    file: pathlib.Path | None
+    digest: str
+
+    def __str__(self) -> str:
+        source = self.kind.rpartition(":")[0] if self.file is None else self.file
+        return f"controller.{self.stage}.kind: imported {self.law.__name__} from {source}"
+
+
+def is_own(kind: object) -> bool:
+    """Return whether a value of `kind` names a law of one's own."""
+    return isinstance(kind, str) and ":" in kind
+
+
+def own_law(stage: str, kind: str, folder: pathlib.Path, model: Plant) -> OwnLaw:
+    """Import the law that `kind` names; a path is relative to `folder`, that of the case file.
+
+    Raises ValueError, with the dotted path, the value and the reason, if there is no such class, if its import raises,
+    or if the class is no law of this stage that can be called with `model`.
+    """
+    source, _, name = kind.rpartition(":")
+    file = (folder / source).resolve() if source.endswith(".py") else None
+
+    def refuse(why: str) -> ValueError:
+        return ValueError(f"controller.{stage}.kind = {show(kind)}: {why}")
+
+    if not source or not name.isidentifier():
+        raise refuse(f"write {FORM}.")
+    found = _class(_module(source, file, refuse), name, source, STAGES[stage], refuse)
+    _check_record(found, name, stage, refuse)
+    try:
+        try_law(found(), stage, model)
+    except Exception as error:
+        raise refuse(f"{name} {_said(error, file)}.") from error
+    if file is not None:
+        pickle_with_source(found)
+    return OwnLaw(stage, kind, found, file, digest_of(found))
+
+
+def relocated(laws: Iterable[OwnLaw], out: pathlib.Path) -> dict[str, str]:
+    """Return `kind` of each law by dotted path as a case file in the folder `out` must write it.
+
+    It is as written unless its relative path leads elsewhere from `out`.
+    """
+    kinds = {}
+    for law in laws:
+        kind, file = law.kind, law.file
+        if file is not None and (out / kind.rpartition(":")[0]).resolve() != file:
+            kind = f"{_relative(file, out)}:{law.law.__name__}"
+        kinds[f"controller.{law.stage}.kind"] = kind
+    return kinds
+
+
+def _relative(file: pathlib.Path, folder: pathlib.Path) -> str:
+    try:
+        return pathlib.Path(os.path.relpath(file, folder.resolve())).as_posix()
+    except ValueError:  # another drive of Windows
+        return file.as_posix()
+
+
+def _module(source: str, file: pathlib.Path | None, refuse: Refuse) -> types.ModuleType:
+    """Import a file or an installed module."""
+    try:
+        return module_of_name(source) if file is None else module_of_file(file)
+    except OSError as error:
+        if file is None or error.filename != str(file):
+            raise refuse(f"importing it {_said(error, file)}.") from error
+        why = f"{file} cannot be read ({error.strerror}). A path is relative to the folder of the case file"
+        raise refuse(f"{why}.") from None
+    except (Exception, SystemExit) as error:
+        missing = isinstance(error, ModuleNotFoundError) and file is None and error.name == source.partition(".")[0]
+        hint = ". Install it, set PYTHONPATH, or name a file" if missing else ""
+        raise refuse(f"importing it {_said(error, file)}{hint}.") from error
+
+
+def _said(error: BaseException, file: pathlib.Path | None) -> str:
+    line = None if file is None else line_of(error, file)
+    words = str(error).strip().partition("\n")[0] or "no message"
+    return f"raised {type(error).__name__}: {words.rstrip('.')}{'' if line is None else f' (line {line})'}"
+
+
+def _class(module: types.ModuleType, name: str, source: str, base: type[Law], refuse: Refuse) -> type[Law]:
+    """Return the class of this name. Raises ValueError unless it is a law of the stage."""
+    laws = [
+        one
+        for one, thing in vars(module).items()
+        if isinstance(thing, type) and issubclass(thing, base) and thing is not base
+    ]
+    found = getattr(module, name, None)
+    if found is None:
+        close = difflib.get_close_matches(name, laws, n=1)
+        hint = f" Did you mean '{close[0]}'?" if close else ""
+        listed = f"Its laws of this stage: {quoted(laws)}." if laws else f"It has no subclass of {_named(base)}."
+        raise refuse(f"{source} has no class '{name}'.{hint} {listed}")
+    if name not in laws:
+        raise refuse(f"{name} is no law of this stage: derive it from {_named(base)}.")
+    return found
+
+
+def _named(base: type[Law]) -> str:
+    return f"ambjax.extend.{base.__name__}"
+
+
+def _check_record(found: type[Law], name: str, stage: str, refuse: Refuse) -> None:
+    """Raise ValueError unless the class is a record whose fields all have defaults and names of their own."""
+    try:
+        law = found()
+    except TypeError as error:  # abstract methods, or fields without a default
+        words = str(error).strip().rstrip(".")
+        raise refuse(f"{words}. Define every method of the stage, and give every field a default.") from None
+    if (
+        not dataclasses.is_dataclass(found)
+        or "__dataclass_fields__" not in vars(found)
+        or jax.tree.leaves(law) == [law]
+    ):
+        raise refuse(f"{name} is no record: put @ambjax.extend.record above the class.")
+    for field in dataclasses.fields(found):
+        if not (field.metadata.get("leaf") or field.metadata.get("static")):
+            raise refuse(f"{name}.{field.name}: declare it by gain(...), leaf(...) or static(...) of ambjax.extend.")
+        if field.name == "kind":
+            raise refuse(f"{name}.kind: this name is that of the law in [controller.{stage}]. Choose another.")

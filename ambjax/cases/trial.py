@@ -1,0 +1,68 @@
+"""Trial of a law of one's own: its methods are traced once, so that a mistake is found before a simulation."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ambjax.control.base import Law
+from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand
+from ambjax.world.plant import Plant
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference
+
+# Outputs of the stages in words.
+OUTPUTS = {
+    "observer": "a Measurement",
+    "position": "the number v_star",
+    "inversion": "a CurrentDemand",
+    "current": "the number u",
+}
+
+
+def try_law(law: Law, stage: str, model: Plant) -> None:
+    """Trace the methods of a law at rest.
+
+    Raises TypeError if an output, a rate, a scale or a next state has another structure or shape than it must have, and
+    whatever the methods raise.
+    """
+    one: Any = law
+    motion, reference = Measurement(*_zeros(3)), Reference(*_zeros(3))
+    demand, force = CurrentDemand(*_zeros(2)), ForceDemand(_zero(), _zero(), _zero(), _zero())
+    inputs, wanted = {
+        "observer": (motion, motion),
+        "position": ((motion, reference), _zero()),
+        "inversion": (force, demand),
+        "current": (CurrentInputs(motion, demand, jnp.ones(())), _zero()),
+    }[stage]
+    first = (model, motion) if stage == "observer" else (model,)
+
+    def everything(inputs: Any) -> tuple[Any, ...]:
+        state = one.init(*first)
+        kept = state if stage == "observer" else one.init_sampled(model)
+        owns = any(one.has_own_step(implicit) for implicit in (True, False))
+        after = one.step(model, inputs, kept, 1e-4) if owns else one(model, inputs, kept)
+        return state, one(model, inputs, state), one.scale(model), kept, after, one.slope(model)
+
+    state, (output, rate), scale, kept, after, slope = jax.eval_shape(everything, inputs)
+    _same(output, wanted, f"{type(law).__name__} must return {OUTPUTS[stage]} and the rate of its state; the first is")
+    _same(rate, state, "the rate of the state must be like init(model); it is")
+    _same(scale, state, "scale(model) must be like init(model); it is")
+    _same(after, (wanted, kept), "on a processor, a step must return the output and the next state; they are")
+    _same(slope, _zero(), "slope(model) must be a number; it is")
+
+
+def _zero() -> jax.Array:
+    return jnp.zeros(())
+
+
+def _zeros(count: int) -> list[jax.Array]:
+    return [_zero()] * count
+
+
+def _same(found: Any, wanted: Any, words: str) -> None:
+    """Raise TypeError unless two pytrees have the same structure and shapes."""
+    first, second = (jax.tree.map(lambda x: jnp.shape(x), tree) for tree in (found, wanted))
+    if jax.tree.structure(found) != jax.tree.structure(wanted) or first != second:
+        shown = jax.tree.map(lambda x: x.shape, found)
+        raise TypeError(f"{words} {shown}")

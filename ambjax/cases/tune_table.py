@@ -1,0 +1,147 @@
+"""The keys of [tune] in a case file, with their defaults and meanings, for the reader and for the template."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from ambjax.numerics.records import leaf
+
+# Default optimiser, risk, and alpha of the risk "cvar".
+OPTIMISER, RISK, ALPHA = "bfgs", "mean", 0.9
+# Default limit of the rms voltage, as a share of actuator.u_max.
+VOLTAGE_SHARE = 0.6
+# Default share of the held-out members that must survive.
+SURVIVING = 1.0
+# Default band of the settling time, as a share of the clearance.
+SETTLING_BAND = 0.01
+# Default margins of limits on means over members and on worst members: the relative difference between two ensembles.
+MEAN_MARGIN, WORST_MARGIN = 0.005, 0.03
+
+# The numbers of [tune]. The bounds are decades wider than useful values.
+NUMBERS: dict[str, dataclasses.Field] = {
+    "conditions_margin": leaf(
+        0.1, at_least=0, at_most=1e3, doc="share by which each gain is to exceed its condition of Theorem 1"
+    ),
+    "early": leaf(0.0, at_least=0, at_most=1e6, doc="weight of errors before run.settle, relative to 1 after it"),
+    "stress": leaf(1.2, above=0, at_most=1e6, doc="factor on the noise of the stressed members"),
+    "gain_margin": leaf(1.25, above=0, at_most=1e6, doc="factor on each gain of the stressed members, up or down"),
+    "learning_rate": leaf(0.1, above=0, at_most=1e3, doc="step size of an optimiser of optax"),
+}
+
+
+def _weight(default: float, doc: str) -> dataclasses.Field:
+    return leaf(default, at_least=0, at_most=1e9, doc=doc)
+
+
+# The weights of the terms of the loss, in the order of the template, and of the conditions.
+WEIGHTS: dict[str, dataclasses.Field] = {
+    "tracking": _weight(
+        1.0, "each weight multiplies a dimensionless term: here the mean square error after run.settle"
+    ),
+    "peak": _weight(0.0, "largest error after run.settle"),
+    "effort": _weight(0.1, "mean square voltage"),
+    "chatter": _weight(0.1, "mean square step of the voltage"),
+    "clearance": _weight(1e-3, "closeness to the stop"),
+    "survival": _weight(1.0, "loss of the rotor, the earlier the more"),
+    "conditions": _weight(1.0, "conditions of Theorem 1 that fail, or hold by less than the margin"),
+}
+SURVIVAL: dataclasses.Field = leaf(SURVIVING, above=0, at_most=1, doc="share of the held-out members that must survive")
+# Largest whole numbers; smaller for members and points, which are in memory at once.
+MOST_WHOLE, MOST_MEMBERS = 2**31 - 1, 2**20
+
+
+def _members(default: int, at_least: int, doc: str) -> int:
+    return leaf(default, at_least=at_least, at_most=MOST_MEMBERS, whole=True, doc=doc)
+
+
+def _whole(default: int, at_least: int, doc: str) -> int:
+    return leaf(default, at_least=at_least, at_most=MOST_WHOLE, whole=True, doc=doc)
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """Size of the search."""
+
+    members: int = _members(32, 1, "members of the training ensemble, each with its own noise and [spread]")
+    stressed: int = _members(8, 0, "further members that only have to survive, with more noise and with other gains")
+    validation: int = _members(2000, 0, "further members; those lost with the tuned gains join the stressed ones")
+    held_out: int = _members(1000, 0, "further members, on which the tuned gains are judged")
+    seed: int = _whole(1, 0, "seed of the members and of the screen; the other ensembles' seeds are far from it")
+    screen: int = _members(128, 0, "points at which the search begins; 0: only at the gains above")
+    starts: int = _whole(4, 1, "number of the best of these points, which are refined")
+    iterations: int = _whole(40, 1, "largest number of iterations in each phase of the refinement")
+    substeps: int = _whole(3, 1, "integration steps per sample")
+
+
+BUDGET: dict[str, dataclasses.Field] = {field.name: field for field in dataclasses.fields(Budget)}
+
+
+class Line(NamedTuple):
+    """A line of the template: the key with its value, and a comment."""
+
+    text: str
+    comment: str
+
+
+def lines() -> Iterator[Line]:
+    """Yield the lines of [tune] for the template: each default, or an example of a key that has none."""
+    yield Line(
+        'gains = ["controller.position.c", "controller.position.k"]',
+        "gains to tune; left out: all gains of the laws but p",
+    )
+    yield Line(
+        "bounds.controller.position.c = [1.0, 500.0]",
+        "bounds of one gain; left out: from plant and theory, see the report; c",
+    )
+    yield Line("", "is then at most a fifth of the sample rate, others 3 times their range or start")
+    yield from _defaults("weights.", WEIGHTS)
+    yield from _limits()
+    yield from _defaults("", {name: NUMBERS[name] for name in ("conditions_margin", "early")})
+    yield Line(
+        'risk = "cvar"', f'how the members\' losses are combined: "cvar", "soft-worst" or "mean"; left out: "{RISK}"'
+    )
+    yield Line(f"alpha = {ALPHA}", f'for "cvar": the mean of the worst 1 - alpha; left out: {ALPHA}')
+    yield from _defaults("", {name: BUDGET[name] for name in ("members", "stressed")})
+    yield from _defaults("", {name: NUMBERS[name] for name in ("stress", "gain_margin")})
+    yield from _defaults("", {name: field for name, field in BUDGET.items() if name not in ("members", "stressed")})
+    yield Line(f'optimiser = "{OPTIMISER}"', 'or one of optax, such as "adam"')
+    yield from _defaults("", {"learning_rate": NUMBERS["learning_rate"]})
+
+
+def _defaults(prefix: str, fields: dict[str, dataclasses.Field]) -> Iterator[Line]:
+    for name, field in fields.items():
+        yield Line(f"{prefix}{name} = {field.default!r}", field.metadata["doc"])
+
+
+def _limits() -> Iterator[Line]:
+    """Yield the lines of [tune.limits]. Its limits have no defaults but that of the rms voltage."""
+    voltage, means, worst = (f"{x:g}" for x in (100 * VOLTAGE_SHARE, MEAN_MARGIN, WORST_MARGIN))
+    examples = [
+        (
+            "rms_u_V = 120.0",
+            f"V; root mean square voltage after run.settle, over members (left out: {voltage} % of u_max)",
+        ),
+        ("max_u_V = 150.0", "V; largest voltage of any member; inf, here and below: no limit (left out: none)"),
+        ("max_abs_i_A = 5.0", "A; largest current of any member (left out: none)"),
+        ("chatter_V_per_s = 1e5", "V/s; variation of the voltage after run.settle, mean over members (left out: none)"),
+        ("largest_error_m = 1e-5", "m; largest error after run.settle, of any member (left out: none)"),
+        (
+            "settling_s = 0.2",
+            "s; time of the run after which every error stays within the band (left out: none)",
+        ),
+        (
+            "settling_band_m = 45e-6",
+            f"m; half-width of the settling band (left out: {100 * SETTLING_BAND:g} % of the clearance)",
+        ),
+        (
+            "overshoot_m = 1e-4",
+            "m; how far z goes beyond its start and beyond the range of r so far (left out: none)",
+        ),
+        ("clearance_used = 0.8", "largest |z| of any member as a share of the clearance (left out: none)"),
+        (f"survival = {SURVIVAL.default}", SURVIVAL.metadata["doc"]),
+        (
+            "margin = 0.01",
+            f"share by which the search stays below a limit; left out: {means} of means, {worst} of maxima",
+        ),
+    ]
+    return (Line(f"limits.{text}", comment) for text, comment in examples)

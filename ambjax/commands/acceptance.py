@@ -1,0 +1,87 @@
+"""The first part of `ambjax check`: sensitivity, margins and reserves of the loop that will run."""
+
+import math
+from typing import NamedTuple
+
+from ambjax.cases.reader import Case
+from ambjax.commands.outputs import table
+from ambjax.control.base import hard_signs
+from ambjax.control.cascade import USUAL
+from ambjax.linear import Analysis, analyse, linearise
+
+
+class Fact(NamedTuple):
+    """A number of the machine: its key in the JSON summary, what it is, its value (None: not applicable), its unit."""
+
+    key: str
+    words: str
+    value: float | None
+    unit: str
+
+
+def acceptance(case: Case) -> tuple[dict[str, object], str]:
+    """Return the summary and the text: zone and margins of the linearised loop at r = 0, and the plant's reserves."""
+    try:
+        system = linearise(case.cascade, case.scenario, case.clock)
+        loop = analyse(system, case.scenario.plant.m, case.clock.sample_period, case.zones)
+    except ValueError as error:
+        return {"zone": None, "stable": False}, f"{error} {_facts_table(machine(case))}"
+    facts = [*_loop_facts(loop), *machine(case)]
+    summary = {"stable": loop.stable, "zone": loop.zone, **{fact.key: fact.value for fact in facts}}
+    return summary, "\n".join([_verdict(case, loop), "", _facts_table(facts)])
+
+
+def _verdict(case: Case, loop: Analysis) -> str:
+    if not loop.stable:
+        return "The linearised loop is not stable at r = 0."
+    signs = any(hard_signs(getattr(case.cascade, stage)) for stage in USUAL)
+    inside = " while the set-valued signs stay inside their bands" if signs else ""
+    return f"Sensitivity: zone {loop.zone}, a peak of {loop.S.height:.4g} at {loop.S.frequency:.4g} Hz{inside}."
+
+
+def _loop_facts(loop: Analysis) -> list[Fact]:
+    if not loop.stable:
+        return []
+    return [
+        Fact("peak", "peak of |S|", loop.S.height, "1"),
+        Fact("gain_margin", "gain margin, nearest to 1", loop.margins.gain, "1"),
+        Fact("phase_margin_deg", "phase margin", loop.margins.phase_deg, "degrees"),
+        Fact("delay_margin_s", "delay margin", loop.margins.delay, "s"),
+        Fact("disk_margin", "disk margin", loop.margins.disk, "1"),
+    ]
+
+
+def machine(case: Case) -> list[Fact]:
+    """Return the numbers of the plant, its supply and its converters.
+
+    The largest force is that at z = 0 with the current i_0, or the amplifier's limit if that is smaller: beyond i_0 one
+    magnet is off. The flux density is mu_0 n i_0/(2 s_0): two gaps in series.
+    """
+    plant, sensor, amplifier = case.scenario.plant, case.scenario.sensor, case.scenario.amplifier
+    m, s_0, i_0 = (float(x) for x in (plant.m, plant.s_0, plant.i_0))
+    most = i_0 if amplifier is None or amplifier.i_max is None else min(i_0, float(amplifier.i_max))
+    weight, force = m * abs(float(plant.g)), float(plant.k_i) * most
+    u_max, slew, step = float(case.scenario.u_max), None, None
+    if math.isfinite(u_max):
+        slew = u_max / float(plant.L)
+    if sensor is not None and sensor.bits is not None:
+        step = 2 * float(sensor.ends(plant.s_0)) / 2 ** float(sensor.bits)
+    std = None if sensor is None else float(sensor.std)
+    return [
+        Fact("force_reserve", "largest force per weight", force / weight if weight else None, "1"),
+        Fact("k_s_N_per_m", "negative stiffness k_s", float(plant.k_s), "N/m"),
+        Fact("k_i_N_per_A", "force per current k_i", float(plant.k_i), "N/A"),
+        Fact("unstable_pole_per_s", "unstable pole sqrt(k_s/m)", float(plant.pole), "1/s"),
+        Fact("bias_flux_T", "bias flux density", float(plant.mu_0) * float(plant.n) * i_0 / (2 * s_0), "T"),
+        Fact("current_slew_A_per_s", "supply's slew of the current, u_max/L", slew, "A/s"),
+        Fact("converter_step_m", "converter step of z", step, "m"),
+        Fact("step_per_noise", "converter step per noise std", step / std if step and std else None, "1"),
+    ]
+
+
+def _facts_table(facts: list[Fact]) -> str:
+    def number(x: float) -> str:
+        return "none" if math.isinf(x) else f"{x:.4g}"
+
+    rows = [(fact.words, number(fact.value), fact.unit) for fact in facts if fact.value is not None]
+    return table(("loop and machine", "value", "unit"), rows)

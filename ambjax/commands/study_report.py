@@ -1,0 +1,132 @@
+"""The report of a finished study: its summary, its pictures and the text on the terminal."""
+
+import argparse
+import pathlib
+from typing import Any
+
+import numpy as np
+
+from ambjax.cases.reader import Case
+from ambjax.commands.outputs import files, plain, say, table, write_json, written
+from ambjax.commands.warnings import reversal
+from ambjax.ensemble import statistics
+from ambjax.ensemble.study import Study
+from ambjax.host.words import one_line
+
+# Files written with members.npz; the last one only if the case has a spread.
+WRITTEN = ("summary.json", "fan.png", "histograms.png", "tornado.png")
+# Members and instants in the fan chart, for a study of any size.
+FAN_MEMBERS, FAN_TIMES = 256, 500
+# If every member is lost, the fan chart ends at this multiple of the last loss time.
+BEYOND = 1.15
+BANDS = (0.0, 5.0, 25.0, 50.0, 75.0, 95.0, 100.0)
+METRICS = ("settled_max_abs_error_m", "settled_rms_error_m", "max_abs_error_m", "max_abs_u_V", "rms_u_V", "max_abs_i_A")
+
+
+def report(
+    case: Case, study: Study, args: argparse.Namespace, out: pathlib.Path, error: dict[str, Any] | None
+) -> tuple[int, dict[str, object]]:
+    """Write and print the results of a finished study. `error`: result of `sliding_error`, or None."""
+    with np.load(out / "members.npz") as file:
+        columns = {name: file[name] for name in file.files}
+    summary = _summary(case, study, columns, str(args.case))
+    if error is not None:
+        summary["sliding_step_error"] = error
+    with files(out) as part:
+        write_json(part / "summary.json", summary)
+        _pictures(case, study, columns, summary, part)
+    if not args.json:
+        print(text(summary))
+        written(out, ", ".join(["members.npz", *WRITTEN[: None if study.spread.entries else -1]]))
+    held = ~np.isfinite(columns["lost_at"])
+    for warning in reversal(case, float(np.max(columns["max_abs_i_A"], initial=0.0, where=held))):
+        say(warning)
+    return int(summary["survivors"] < study.members), plain(summary) | {"out": str(out)}
+
+
+def _summary(case: Case, study: Study, columns: dict[str, np.ndarray], path: str) -> dict[str, Any]:
+    facts = {
+        "case": case.name,
+        "method": str(case.clock.method),
+        "settle_s": case.settle,
+        "design": study.spread.design,
+    }
+    numbers = statistics.summary(columns, study.spread.paths, study.seed)
+    for worst in numbers["worst"]:
+        worst["replay"] = study.command(path, worst["index"])
+    return facts | numbers
+
+
+def _pictures(
+    case: Case, study: Study, columns: dict[str, np.ndarray], summary: dict[str, Any], out: pathlib.Path
+) -> None:
+    from ambjax.pictures import ensembles as pictures
+    from ambjax.pictures import tornado
+
+    lost_at = columns["lost_at"]
+    # End the fan chart soon after the last loss if every member is lost.
+    bands = study.bands(FAN_MEMBERS, FAN_TIMES, BEYOND * float(np.max(lost_at)))
+    shown = {name: _quantiles(x, bands.extremes.get(name)) for name, x in bands.signals.items()}
+    few = np.size(bands.trajectory.lost_at)
+    title = case.name if few == study.members else f"{case.name}: bands of {few} of {study.members} members"
+    limits = {"z - r": float(np.min(study.scenario.touchdown)), "u": float(np.min(study.scenario.u_max))}
+    pictures.fan(bands.t, shown, limits, title, out / "fan.png", lost_at=lost_at, stalled=columns["stalled"])
+    pictures.histograms(columns, out / "histograms.png")
+    if study.spread.entries:
+        deciding = statistics.DECIDING
+        bars = [tornado.Bar(*(d[k] for k in tornado.Bar._fields)) for d in summary["drivers"][deciding]]
+        tornado.tornado(bars, deciding, summary["explained"][deciding]["says"], out / "tornado.png")
+
+
+def _quantiles(x: np.ndarray, extremes: tuple[np.ndarray, np.ndarray] | None) -> dict[float, np.ndarray]:
+    """Compute quantiles [T] of x [members, T] over the surviving members at each instant, keyed by per cent.
+
+    NaN where no member survives. `extremes`, if given, replace the 0 and 100 % quantiles: minimum and maximum between
+    neighbouring instants.
+    """
+    left = np.isfinite(x).any(axis=0)
+    quantiles = np.full((len(BANDS), x.shape[1]), np.nan)
+    quantiles[:, left] = np.nanquantile(x[:, left], np.array(BANDS) / 100, axis=0)
+    if extremes is not None:
+        quantiles[[0, -1]] = extremes
+    return dict(zip(BANDS, quantiles, strict=True))
+
+
+def text(summary: dict[str, Any]) -> str:
+    """Return the tables that the command prints."""
+    share, low, high = (100 * summary["survival"][key] for key in ("estimate", "low", "high"))
+    sure = f"{100 * summary['confidence']:g} % interval"
+    held = f"{summary['survivors']} of {summary['members']} members survive"
+    lines = [f"{held}: {share:.4g} % ({sure} {low:.4g} to {high:.4g} %)"]
+    if summary["stalled"]:
+        why = "the integrator stalled, so whether the rotor survives is not known"
+        lines += [f"{summary['lost']} lost, {summary['stalled']} not decided: {why}"]
+    lines += [f"note: {note}" for note in summary["notes"]]
+
+    def number(x: float | None) -> str:
+        return "-" if x is None else f"{x:.4g}"
+
+    rows = []
+    for name in METRICS:
+        metric = summary["metrics"][name]
+        rows.append(
+            (name, *(number(metric[key]["estimate"]) for key in ("median", "q95", "cvar_95")), number(metric["max"]))
+        )
+    head = f"metric over the {summary['survivors']} {summary['metrics_of']}"
+    lines += ["", table((head, "median", "95 % quantile", "mean of worst 5 %", "largest"), rows)]
+    drivers, account = summary["drivers"][statistics.DECIDING][:5], summary["explained"][statistics.DECIDING]
+    if drivers:
+        lines += ["", f"Quantities that drive {statistics.DECIDING} of the {summary['metrics_of']}: {account['says']}."]
+    if account["alone"]:
+        bars = [
+            (
+                d["path"],
+                f"{100 * d['share']:.1f} %",
+                f"{100 * d['low']:.1f} to {100 * d['high']:.1f} %",
+                f"{d['rho']:+.2f}",
+            )
+            for d in drivers
+        ]
+        lines += [table(("quantity", "share explained alone", sure, "rank correlation"), bars)]
+    worst = summary["worst"][0]
+    return "\n".join([*lines, "", f"To simulate the worst member: {one_line(worst['replay'])}"])

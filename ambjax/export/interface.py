@@ -1,0 +1,66 @@
+"""The interface of a step: its inputs, outputs and status bits, with their units and meanings."""
+
+from typing import NamedTuple
+
+from jax import Array
+
+
+class StepInputs(NamedTuple):
+    """Inputs of a step: the sensors, and the reference at the instant at which the step's voltage takes effect."""
+
+    z: Array
+    z_dot: Array
+    i: Array
+    r: Array
+    r_dot: Array
+    r_ddot: Array
+    r_dddot: Array
+
+
+class Status(NamedTuple):
+    """Status of a step, one bit each; BITS has their meanings."""
+
+    saturated: Array
+    refused: Array
+    failed: Array
+    singular: Array
+    safe: Array
+    invalid: Array
+
+
+class StepOutputs(NamedTuple):
+    """Outputs of a step; OUTPUTS has their units and meanings."""
+
+    u: Array
+    i_ref: Array
+    v_star: Array
+    v_tilde: Array
+
+
+INPUTS = {
+    "z": ("m", "rotor displacement, measured"),
+    "z_dot": ("m/s", "rotor velocity, measured"),
+    "i": ("A", "current deviation, measured"),
+    "r": ("m", "reference of z at the instant at which this step's voltage takes effect"),
+    "r_dot": ("m/s", "first derivative of r"),
+    "r_ddot": ("m/s^2", "second derivative of r"),
+    "r_dddot": ("m/s^3", "third derivative of r"),
+}
+
+
+OUTPUTS = {
+    "u": ("V", "voltage to apply, within the supply's limit"),
+    "i_ref": ("A", "current reference"),
+    "v_star": ("A^2/m^2", "demanded scaled force"),
+    "v_tilde": ("A^2/m^2", "input error v_star - v(z, i_ref)"),
+}
+
+
+BITS = {
+    "saturated": "u is at the supply's limit",
+    "refused": "a reading is NaN, beyond its limit or too far from the prediction, which replaces it",
+    "failed": "a law returned no finite number: its state is kept, u is held",
+    "singular": "(z, i_ref) is near the singular curve of Eq. (9)",
+    "safe": "u is 0, the laws wait: more than guard.samples readings in a row, or all so far, are refused",
+    "invalid": "the reference, params->processor.delay or a steepness p is NaN or out of range: u is held",
+}

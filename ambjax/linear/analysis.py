@@ -1,0 +1,174 @@
+"""Linearisation of a case, and its analysis: sensitivity with its zone, margins, stiffness, noise, poles."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from ambjax.control.cascade import Cascade
+from ambjax.ensemble.batching import map_members
+from ambjax.linear.loop_matrices import loop_matrices
+from ambjax.linear.margins import STATIC, Margins, ResponsePeak, margins_of, noise_gain, peak, poles_in_s
+from ambjax.linear.state_space import StateSpace
+from ambjax.numerics.records import Scalar, canonical, leaf, record
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.rollout import prepare
+from ambjax.world.scenario import Scenario
+
+# XLA spends most of its time on optimisations that a program which runs once does not repay.
+_matrices = jax.jit(loop_matrices, compiler_options={"xla_backend_optimization_level": 0})
+
+
+@record
+class Zones:
+    """Frequency range of the sensitivity, and the limits of zones.
+
+    The defaults are those of ISO 14839-3 (peak of |S|) and ISO 14839-2 (largest |z| as a share of the clearance), as
+    secondary sources cite them.
+    """
+
+    f_low: Scalar = leaf(default=1.0, unit="Hz", above=0, at_most=1e6, doc="lowest frequency; 0 is always included")
+    f_high: Scalar | None = leaf(
+        default=None,
+        unit="Hz",
+        above=0,
+        at_most=1e6,
+        optional=True,
+        doc="highest frequency; none: 2 kHz, or 0.45 of the sample rate if that is lower",
+    )
+    zone_a: Scalar = leaf(default=3.0, unit="1", at_least=1, at_most=1e3, doc="peak of |S| below which zone A holds")
+    zone_b: Scalar = leaf(default=4.0, unit="1", at_least=1, at_most=1e3, doc="likewise, zone B")
+    zone_c: Scalar = leaf(default=5.0, unit="1", at_least=1, at_most=1e3, doc="likewise, zone C; above it: zone D")
+    clearance_a: Scalar = leaf(default=0.3, unit="1", above=0, at_most=1, doc="share of the clearance used, zone A")
+    clearance_b: Scalar = leaf(default=0.4, unit="1", above=0, at_most=1, doc="likewise, zone B")
+    clearance_c: Scalar = leaf(default=0.5, unit="1", above=0, at_most=1, doc="likewise, zone C; above it: zone D")
+
+    def check(self, period: Scalar | None) -> None:
+        """Raise ValueError if the limits do not ascend, or as `range` does."""
+        self.range(period)
+        for names in (("zone_a", "zone_b", "zone_c"), ("clearance_a", "clearance_b", "clearance_c")):
+            limits = [float(getattr(self, name)) for name in names]
+            if sorted(limits) != limits:
+                raise ValueError(f"sensitivity.{names[0]} to {names[2]} = {limits}: they must ascend. Reorder them.")
+
+    def zone(self, peak: float) -> str:
+        """Return the zone of a peak of |S|: A, B, C or D."""
+        return _zone(peak, self.zone_a, self.zone_b, self.zone_c)
+
+    def clearance_zone(self, share: float) -> str:
+        """Return the zone of the largest |z| as a share of the clearance: A, B, C or D."""
+        return _zone(share, self.clearance_a, self.clearance_b, self.clearance_c)
+
+    def range(self, period: Scalar | None) -> tuple[float, float]:
+        """Return lowest and highest frequency, Hz. `period`: sample period, s; None in continuous time.
+
+        Raises ValueError if the range is empty, or reaches beyond half the sample rate.
+        """
+        high = self.f_high
+        if high is None:
+            high = 2000.0 if period is None else min(2000.0, 0.45 / float(period))
+        low, high = float(self.f_low), float(high)
+        if period is not None and high > 0.5 / float(period):
+            raise ValueError(
+                f"sensitivity.f_high = {high:g}: it must be at most half the sample rate, {0.5 / float(period):g} Hz."
+            )
+        if not low < high:
+            raise ValueError(f"sensitivity.f_low = {low:g}: it must be below f_high, {high:g} Hz. Lower it.")
+        return low, high
+
+
+def _zone(x: float, a: Scalar, b: Scalar, c: Scalar) -> str:
+    return next((name for name, limit in zip("ABC", (a, b, c), strict=True) if x < float(limit)), "D")
+
+
+class Analysis(NamedTuple):
+    """Linear analysis of a loop at one equilibrium.
+
+    - `stable`: whether all poles are stable; if not, the other numbers describe a loop that does not run.
+    - `S`, `T`, `KS`: peaks of |S|, |T| (1) and |KS| (V/m).
+    - `zone`: zone of the peak of |S|; D if the loop is unstable.
+    - `S_velocity`: peak of |S| for numbers added to the velocity sensor; None if the velocity is not measured.
+    - `margins`: see `Margins`; all are 0 if the loop is unstable.
+    - `stiffness`: static stiffness, N/m; inf with integral action.
+    - `noise`: rms of z per rms of noise on the reading of z, one draw a sample; inf if the loop is unstable.
+    - `poles`: poles in 1/s, the slowest first.
+    """
+
+    stable: bool
+    S: ResponsePeak
+    T: ResponsePeak
+    KS: ResponsePeak
+    zone: str
+    S_velocity: ResponsePeak | None
+    margins: Margins
+    stiffness: float
+    noise: float
+    poles: np.ndarray
+
+
+def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.0) -> StateSpace:
+    """Linearise the loop at the equilibrium of the constant reference r (m).
+
+    Noise, disturbances, converters, faults and limits are left out; gain, offset and bandwidth of the sensor and the
+    bandwidth of the amplifier stay. On a processor the result is the exact map of one sample period. Returns matrices
+    of NumPy.
+
+    Raises ValueError as `rollout` does, and if there is no equilibrium at r.
+    """
+    system, found = _matrices(*canonical((*_prepared(cascade, scenario, clock), r)))
+    if not found:
+        raise ValueError(f"no equilibrium at r = {float(r):g} m: the laws do not hold the rotor there.")
+    return StateSpace(*(None if x is None else np.asarray(x) for x in system))  # pyright: ignore[reportArgumentType]
+
+
+def linearise_members(
+    cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.0
+) -> tuple[StateSpace, np.ndarray]:
+    """Linearise every member of an ensemble, whose varying leaves are arrays [N].
+
+    Returns the matrices, each with a leading axis [N], and whether each member has an equilibrium [N]. Raises
+    ValueError as `rollout` does.
+    """
+    return map_members(_member, canonical((*_prepared(cascade, scenario, clock), r)), plain=True)
+
+
+def _member(tree: Any) -> tuple[StateSpace, Any]:
+    return loop_matrices(*tree)
+
+
+def _prepared(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Cascade, Scenario, Scalar]:
+    system, clock = prepare(cascade, scenario, clock)
+    if cascade.processor is not None:
+        cascade = system.loop.cascade  # pyright: ignore[reportAttributeAccessIssue]
+    return dataclasses.replace(cascade), scenario, clock.sample_period
+
+
+def analyse(
+    system: StateSpace, m: Scalar, period: Scalar, zones: Zones | None = None, velocity: bool = False
+) -> Analysis:
+    """Analyse a linearised loop of a rotor of mass m (kg).
+
+    `period`: time for which a noise sample is held, s. `velocity`: whether the velocity has a sensor of its own.
+    """
+    zones = Zones() if zones is None else zones
+    low, high = zones.range(system.period)
+
+    def largest(output: int, source: int, less: float = 0.0) -> ResponsePeak:
+        return peak(system, lambda f: np.abs(system.response(f)[:, output, source] - less), low, high)
+
+    stable, S = system.stable, largest(0, 0)
+    poles = poles_in_s(system)
+    static = float(np.abs(system.response(np.array([STATIC * low]))[0, 3, 2]))
+    return Analysis(
+        stable,
+        S,
+        largest(0, 0, 1.0),
+        largest(2, 0),
+        zones.zone(S.height) if stable else "D",
+        largest(1, 1) if velocity else None,
+        margins_of(system) if stable else Margins(*[0.0] * 6),
+        float(m) / static if static > 0 else np.inf,
+        noise_gain(system, float(period)) if stable else np.inf,
+        poles[np.argsort(-np.real(poles))],
+    )

@@ -1,0 +1,94 @@
+"""The linearised plant with the lags of its sensor and amplifier, integrated exactly between two samples.
+
+The plant rests at the equilibrium, so that the equations of small deviations have constant coefficients, and the matrix
+exponential solves them without error.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.flatten_util import ravel_pytree
+from jax.scipy.linalg import expm
+
+from ambjax.linear.equilibrium import Point, reading
+from ambjax.numerics.records import Scalar
+from ambjax.world.scenario import Scenario
+from ambjax.world.sensor import Measurement
+
+
+class HeldPlant(NamedTuple):
+    """The map of one sample, for the state x [N] of plant, sensor's low-pass (m) and amplifier (V).
+
+    x_{n+1} = transition x_n + now u_n + before u_{n-1} + first u_{n-2} + disturbed q_z
+    """
+
+    transition: Array
+    now: Array
+    before: Array
+    first: Array
+    disturbed: Array
+
+
+class Lagged:
+    """The plant of a scenario with its lags, whose state is one vector [N]."""
+
+    def __init__(self, scenario: Scenario, point: Point):
+        self.scenario = scenario
+        self.low_passed = scenario.sensor is not None and scenario.sensor.bandwidth is not None
+        z = scenario.plant.measurement(point.plant).z
+        lags = [z] * self.low_passed + [point.u] * (scenario.amplifier is not None)
+        self.start, self.restore = ravel_pytree((point.plant, lags))
+
+    def motion(self, x: Array) -> Measurement:
+        """Return the true motion."""
+        return self.scenario.plant.measurement(self.restore(x)[0])
+
+    def read(self, x: Array, injected: tuple[Scalar, Scalar]) -> Measurement:
+        """Return what the controller reads, with numbers added to z (m) and z_dot (m/s)."""
+        plant, lags = self.restore(x)
+        motion = self.scenario.plant.measurement(plant)
+        return reading(self.scenario, motion._replace(z=lags[0]) if self.low_passed else motion, injected)
+
+    def rates(self, x: Array, u: Scalar, q_z: Scalar) -> Array:
+        """Return the time derivative of the state under a commanded voltage u (V) and a disturbance q_z (m/s^2)."""
+        (plant, lags), sensor, amplifier, lag_rates = self.restore(x), self.scenario.sensor, self.scenario.amplifier, []
+        if sensor is not None and sensor.bandwidth is not None:
+            z = self.scenario.plant.measurement(plant).z
+            lag_rates.append(2 * jnp.pi * sensor.bandwidth * (z - lags[0]))
+        if amplifier is not None:
+            lag_rates.append(amplifier.slope() * (u - lags[-1]))
+            u = lags[-1]
+        return ravel_pytree((self.scenario.plant.rates(plant, u, q_z), lag_rates))[0]
+
+    def sizes(self, sizes: Point) -> Array:
+        """Return the characteristic sizes [N] of the state, from those of a point."""
+        z = self.scenario.plant.measurement(sizes.plant).z
+        lags = [z] * self.low_passed + [sizes.u] * (self.scenario.amplifier is not None)
+        return ravel_pytree((sizes.plant, lags))[0]
+
+    def held(self, point: Point, period: Scalar, delay: Scalar) -> HeldPlant:
+        """Integrate over one sample; each voltage acts from `delay` samples after its own sample on."""
+        A, B = jax.jacfwd(lambda x, w: self.rates(x, w[0], w[1]), (0, 1))(
+            self.start, jnp.stack([point.u, 0.0 * point.u])
+        )
+        delay = jnp.asarray(delay)
+        part = (delay - jnp.floor(delay)) * period
+        (early, early_in), (late, late_in) = _integrated(A, B, part), _integrated(A, B, period - part)
+        old, new = late @ early_in[:, 0], late_in[:, 0]
+        now, before, first = (_at(jnp.ceil(delay), k) * old + _at(jnp.floor(delay), k) * new for k in range(3))
+        return HeldPlant(late @ early, now, before, first, late @ early_in[:, 1] + late_in[:, 1])
+
+
+def _at(lag: Array, number: int) -> Array:
+    """Return 1 if the lag is this number of samples, else 0."""
+    return jnp.where(jnp.abs(lag - number) < 0.5, 1.0, 0.0)
+
+
+def _integrated(A: Array, B: Array, h: Scalar) -> tuple[Array, Array]:
+    """Return exp(A h) and the integral of exp(A s) B over 0 to h."""
+    n, inputs = B.shape
+    table: Any = jnp.zeros((n + inputs, n + inputs), A.dtype).at[:n].set(jnp.concatenate([A, B], 1) * h)
+    whole = expm(table)
+    return whole[:n, :n], whole[:n, n:]

@@ -1,0 +1,211 @@
+"""The measured sensitivity, by injection into the nonlinear simulation, as on a machine.
+
+A periodic multi-sine e is added to the reading of the position sensor, after converter and filter. After settling, over
+whole periods, S at each line is the quotient of the Fourier coefficients of what the controller reads and of e
+(ISO 14839-3, as secondary sources cite it). Converter, noise, limits and true signs are in the simulation.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax.control.cascade import Cascade
+from ambjax.ensemble.batching import map_members
+from ambjax.linear.analysis import Zones
+from ambjax.linear.multisine import MultiSine, Response, multisine, with_wave
+from ambjax.numerics.records import canonical
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.rollout import prepare, run
+from ambjax.simulation.sliding import Slide
+from ambjax.simulation.trajectory import ALIVE
+from ambjax.world.scenario import Initial, Scenario
+from ambjax.world.signals import Constant
+
+# Default amplitude of e, as a share of the gap s_0.
+AMPLITUDE = 0.01
+# Lines on a logarithmic axis, and lines near a peak between these multiples of its frequency.
+LINES, NEAR, AROUND = 30, 11, (0.75, 1.33)
+
+
+class Injection(NamedTuple):
+    """Measured sensitivity of a loop.
+
+    - `frequency` [L]: Hz.
+    - `S`, `T`, `KS` [L]: complex; S = (what the controller reads)/e (1), T = S - 1, KS = u/e (V/m). The mean over the
+      members that kept the rotor; None if none did.
+    - `peak`: largest |S| over the lines; None without S.
+    - `peak_low`, `peak_high`: confidence interval of |S| at that line, from the members; equal to `peak` if nothing is
+      random, None with one member.
+    - `peak_frequency`: Hz.
+    - `lost`, `members`: members that lost the rotor, and all.
+    - `amplitude`: largest |e|, m.
+    - `saturated`: share of samples with |u| at the limit of the supply; None without S.
+    """
+
+    frequency: np.ndarray
+    S: np.ndarray | None
+    T: np.ndarray | None
+    KS: np.ndarray | None
+    peak: float | None
+    peak_low: float | None
+    peak_high: float | None
+    peak_frequency: float | None
+    lost: int
+    members: int
+    amplitude: float
+    saturated: float | None
+
+
+def lines(zones: Zones, clock: Clock, peak: float | None = None) -> np.ndarray:
+    """Return frequencies [L] in Hz for `injected`: logarithmic over the range of `zones`, denser near `peak` (Hz).
+
+    `clock.samples` is one period of the multi-sine. All lines are whole multiples of 1/duration, the lowest possible
+    frequency. Raises ValueError as `Zones.range` does.
+    """
+    low, high = zones.range(clock.sample_period)
+    f = np.geomspace(low, high, LINES)
+    if peak:
+        near = peak * np.linspace(*AROUND, NEAR)
+        f = np.concatenate([f, near[(near > low) & (near < high)]])
+    harmonics = np.round(f * float(clock.duration)).astype(int)
+    return np.unique(np.clip(harmonics, 1, (clock.samples - 1) // 2)) / float(clock.duration)
+
+
+def injected(
+    cascade: Cascade,
+    scenario: Scenario,
+    clock: Clock,
+    frequencies: Sequence[float] | np.ndarray,
+    *,
+    amplitude: float | None = None,
+    members: int = 1,
+    seed: int = 0,
+    r: float = 0.0,
+    settle: int = 1,
+    periods: int = 1,
+    confidence: float = 0.95,
+) -> Injection:
+    """Measure the sensitivity of the loop at rest at the constant reference r (m), without disturbances.
+
+    - `clock`: its samples are one period of the multi-sine; `settle` periods are simulated before the `periods` that
+      are measured. In place of the method `Slide`, which does not apply, one is chosen.
+    - `frequencies`: Hz, rounded to whole multiples of 1/clock.duration (see `lines`).
+    - `amplitude`: largest |e|, m; None: 1 % of s_0.
+    - `members`, `seed`: members differ in the noise.
+
+    In continuous time e(t) is continuous, and the laws read its value but not its rate: the velocity that they read is
+    that of the rotor. Sums are over samples.
+
+    Raises ValueError as `rollout` does, and for a frequency that the period or the samples cannot resolve.
+    """
+    amplitude = AMPLITUDE * float(scenario.plant.s_0) if amplitude is None else float(amplitude)
+    if not amplitude > 0:
+        raise ValueError(f"injection.amplitude = {amplitude:g} m: it must be above 0.")
+    if members < 1 or settle < 0 or periods < 1:
+        raise ValueError(
+            f"injection: members = {members}, settle = {settle}, periods = {periods}: members and periods must be at "
+            "least 1, settle at least 0."
+        )
+    wave = multisine(_harmonics(frequencies, clock), clock.samples, float(clock.sample_period), amplitude)
+    random = scenario.random
+    cascade, scenario = _at_rest(cascade, scenario, r)
+    scenario = dataclasses.replace(scenario, seed=seed, member=np.arange(members))
+    skip = settle * clock.samples
+    method = None if isinstance(clock.method, Slide) else clock.method
+    longer = dataclasses.replace(clock, samples=skip + periods * clock.samples, method=method)
+    system, longer = prepare(cascade, scenario, longer)
+    sums, code = map_members(
+        _member, canonical((system, longer, Response(_tiled(wave, members), scenario.u_max, skip)))
+    )
+    kept = code == ALIVE
+    e = float(wave.size) * np.exp(1j * np.asarray(wave.phases))
+    S, KS = ((x[kept, 0] + 1j * x[kept, 1]) / e for x in (sums.read, sums.u))
+    frequency = np.asarray(wave.harmonics) / float(clock.duration)
+    return _summary(frequency, S, KS, sums.saturated[kept], members, amplitude, confidence, random)
+
+
+def _member(tree: Any) -> tuple[Any, Any]:
+    """Return the sums and the status code of one member."""
+    system, clock, response = tree
+    outcome = run(with_wave(system, response.wave), clock, response, 0)
+    return outcome.measured, outcome.trajectory.lost_code
+
+
+def _tiled(wave: MultiSine, members: int) -> MultiSine:
+    """Return the wave with its arrays repeated for each member [N, L]."""
+    harmonics, phases = (np.tile(x, (members, 1)) for x in (wave.harmonics, wave.phases))
+    return dataclasses.replace(wave, harmonics=harmonics, phases=phases)
+
+
+def _at_rest(cascade: Cascade, scenario: Scenario, r: float) -> tuple[Cascade, Scenario]:
+    """Return plant and laws at rest at r (m), under a constant reference and without disturbances."""
+    i, none = float(scenario.plant.equilibrium(r)[0]), Constant()
+    quiet = {"q_z": none, "q_v": none, "q_i": none}
+    scenario = dataclasses.replace(scenario, reference=Constant(r), initial=Initial(r, 0.0, i), **quiet)
+    inversion = cascade.inversion.started(cascade.model.equilibrium(r)[0])
+    return dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started()), scenario
+
+
+def _harmonics(frequencies: Sequence[float] | np.ndarray, clock: Clock) -> np.ndarray:
+    """Return the harmonics [L] of 1/duration nearest to the frequencies (Hz), sorted, each once."""
+    f, base = np.asarray(frequencies, float), 1 / float(clock.duration)
+    harmonics = np.unique(np.round(f / base))
+    if not harmonics.size or not np.isfinite(f).all() or harmonics[0] < 1 or harmonics[-1] >= clock.samples / 2:
+        raise ValueError(
+            f"injection.frequencies: from {base:g} Hz, one period of {clock.samples} samples, to below half the sample "
+            f"rate, {0.5 / float(clock.sample_period):g} Hz. Give those, or a longer period (clock.samples)."
+        )
+    if harmonics[-1] * clock.samples > np.iinfo(jnp.result_type(int)).max:
+        raise ValueError(
+            f"clock.samples = {clock.samples}: a period is too long for the integers of JAX. Set JAX_ENABLE_X64=1."
+        )
+    return harmonics.astype(int)
+
+
+def _summary(
+    frequency: np.ndarray,
+    S: np.ndarray,
+    KS: np.ndarray,
+    saturated: np.ndarray,
+    members: int,
+    amplitude: float,
+    confidence: float,
+    random: bool,
+) -> Injection:
+    """Return the mean over the members that kept the rotor: S, KS [M, L], saturated [M]."""
+    lost = members - len(S)
+    if not len(S):
+        return Injection(frequency, None, None, None, None, None, None, None, lost, members, amplitude, None)
+    mean = np.mean(S, axis=0)
+    k = int(np.argmax(np.abs(mean)))
+    peak = float(np.abs(mean[k]))
+    # the component of each member's S along the mean's direction: its mean is |mean S|, without the bias of |S|
+    along = np.real(S[:, k] * np.conj(mean[k])) / peak
+    low, high = _interval(along, confidence) if random else (peak, peak)
+    return Injection(
+        frequency,
+        mean,
+        mean - 1,
+        np.mean(KS, axis=0),
+        peak,
+        low,
+        high,
+        float(frequency[k]),
+        lost,
+        members,
+        amplitude,
+        float(np.mean(saturated)),
+    )
+
+
+def _interval(x: np.ndarray, confidence: float) -> tuple[float | None, float | None]:
+    """Return the interval of the mean of independent x [M] by Student's t; None, None for M = 1."""
+    from scipy.stats import t
+
+    if len(x) == 1:
+        return None, None
+    half = float(t.ppf(0.5 + 0.5 * confidence, len(x) - 1) * np.std(x, ddof=1) / np.sqrt(len(x)))
+    return float(np.mean(x)) - half, float(np.mean(x)) + half

@@ -1,0 +1,73 @@
+"""The closed loop, linearised at an equilibrium: the exact map of one sample period, or the vector field."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.flatten_util import ravel_pytree
+
+from ambjax.control.cascade import Cascade, Sample
+from ambjax.linear.equilibrium import Point, at_rest, equilibrium, ideal, reading, sizes_of
+from ambjax.linear.held_plant import Lagged
+from ambjax.linear.state_space import StateSpace
+from ambjax.numerics.records import Scalar
+from ambjax.world.scenario import Scenario
+
+
+def loop_matrices(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> tuple[StateSpace, Array]:
+    """Linearise the loop at the equilibrium of the constant reference r (m).
+
+    `cascade`: resolved for its processor (`Cascade.on_processor`), if it has one. Pure; works under jit and vmap, and
+    is differentiable in all gains and parameters. Returns the state space, and whether an equilibrium was found.
+    """
+    scenario = ideal(scenario)
+    if cascade.processor is not None:
+        cascade = dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=None))
+    point, found = equilibrium(cascade, scenario, period, r)
+    build = _continuous if cascade.processor is None else _sampled
+    return build(cascade, scenario, period, r, point), found
+
+
+def _continuous(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, point: Point) -> StateSpace:
+    """Return the state space in continuous time, with the state (plant, laws)."""
+    plant, reference = scenario.plant, at_rest(r)
+    x, restore = ravel_pytree((point.plant, point.control))
+
+    def system(x: Array, w: Array) -> tuple[Array, Array]:
+        state, control = restore(x)
+        measured = reading(scenario, plant.measurement(state), (w[0], w[1]))
+        command, rates = cascade(measured, control, reference, jnp.asarray(jnp.inf))
+        moved = plant.rates(state, command.u, w[2])
+        outputs = jnp.stack([measured.z, measured.z_dot, command.u, plant.measurement(state).z])
+        return ravel_pytree((moved, rates))[0], outputs
+
+    (A, B), (C, D) = jax.jacfwd(system, (0, 1))(x, jnp.zeros(3, x.dtype))
+    sizes = sizes_of(cascade, scenario, point)
+    return StateSpace(A, B, C, D, ravel_pytree((sizes.plant, sizes.control))[0])
+
+
+def _sampled(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, point: Point) -> StateSpace:
+    """Return the state space of one sample period, with the state (plant and lags, laws, u_{n-1}, u_{n-2})."""
+    processor: Any = cascade.processor
+    plant, reference = Lagged(scenario, point), at_rest(r)
+    held = plant.held(point, period, processor.delay)
+    laws, restore = ravel_pytree(point.control)
+    nx, nl = plant.start.size, laws.size
+
+    def step(x: Array, w: Array) -> tuple[Array, Array]:
+        at, laws, past = x[:nx], x[nx : nx + nl], x[nx + nl :]
+        measured = plant.read(at, (w[0], w[1]))
+        sample = Sample(reference, period, jnp.asarray(jnp.inf), (past[0], past[1]))
+        command, after, _ = cascade.step(measured, restore(laws), sample)
+        moved = held.transition @ at + held.now * command.u + held.before * past[0] + held.first * past[1]
+        moved = moved + held.disturbed * w[2]
+        after = jnp.concatenate([moved, ravel_pytree(after)[0], jnp.stack([command.u, past[0]])])
+        return after, jnp.stack([measured.z, measured.z_dot, command.u, plant.motion(at).z])
+
+    x = jnp.concatenate([plant.start, laws, jnp.stack([point.u, point.u])])
+    (A, B), (C, D) = jax.jacfwd(step, (0, 1))(x, jnp.zeros(3, x.dtype))
+    sizes = sizes_of(cascade, scenario, point)
+    scale = jnp.concatenate([plant.sizes(sizes), ravel_pytree(sizes.control)[0], jnp.stack([sizes.u, sizes.u])])
+    return StateSpace(A, B, C, D, scale, jnp.asarray(period))

@@ -1,0 +1,148 @@
+"""Peaks of the sensitivity functions and stability margins of a linearised loop, in NumPy.
+
+The loop is cut at the reading of the position sensor: with S from `StateSpace.sensitivity`, the loop transfer is
+L = 1/S - 1.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from ambjax.linear.state_space import StateSpace
+
+# Points of the first scan on a logarithmic axis; the frequency of each pole is added to them.
+POINTS = 600
+# A peak is refined until its bracket is this narrow, relative; its height is then known far better than 1e-3.
+NARROW = 1e-6
+# Frequency that stands for 0, as a fraction of the lowest one: at 0 itself an integrator has no finite response.
+STATIC = 1e-6
+GOLDEN = (math.sqrt(5) - 1) / 2
+
+
+class ResponsePeak(NamedTuple):
+    """Largest magnitude of a response, and its frequency, Hz; 0 if the static value is the largest."""
+
+    height: float
+    frequency: float
+
+
+class Margins(NamedTuple):
+    """Margins of the loop transfer L = 1/S - 1, broken at the reading of the position sensor.
+
+    - `gain`: factor on L, of those that make the loop unstable, that is nearest to 1 on a logarithmic scale.
+    - `gain_low`, `gain_high`: largest such factor below 1 (0: none) and smallest above 1 (inf: none).
+    - `phase_deg`: smallest phase lag, degrees (inf: |L| never is 1).
+    - `delay`: smallest additional delay that makes the loop unstable, s (inf: none).
+    - `disk`: disk margin 1/max|S - 1/2| (P. Seiler, A. Packard and P. Gahinet, IEEE Control Systems 40:5 (2020)); for
+      every factor between (2 - disk)/(2 + disk) and its inverse the loop stays stable.
+    """
+
+    gain: float
+    gain_low: float
+    gain_high: float
+    phase_deg: float
+    delay: float
+    disk: float
+
+
+Magnitude = Callable[[np.ndarray], np.ndarray]
+
+
+def peak(system: StateSpace, magnitude: Magnitude, low: float, high: float) -> ResponsePeak:
+    """Return the largest value of `magnitude`, a function of frequencies [F] in Hz, at 0 and between low and high."""
+    f = scan(system, low, high)
+    size = magnitude(f)
+    k = int(np.argmax(size))
+    if k == 0:
+        return ResponsePeak(float(size[0]), 0.0)
+    left, right = f[max(k - 1, 1)], f[min(k + 1, len(f) - 1)]
+    while right > left * (1 + NARROW):
+        a, b = right - GOLDEN * (right - left), left + GOLDEN * (right - left)
+        at_a, at_b = magnitude(np.array([a, b]))
+        left, right = (left, b) if at_a > at_b else (a, right)
+    tried = np.array([f[k], 0.5 * (left + right)])
+    best = magnitude(tried)
+    return ResponsePeak(float(best.max()), float(tried[best.argmax()]))
+
+
+def scan(system: StateSpace, low: float, high: float) -> np.ndarray:
+    """Return frequencies (Hz) from low to high, preceded by one that stands for 0, dense around each pole's."""
+    grid = np.geomspace(low, high, POINTS)
+    s = poles_in_s(system)
+    own = np.abs(np.imag(s)) / (2 * np.pi)
+    widths = np.maximum(np.abs(np.real(s)) / (2 * np.pi), 1e-9 * own)
+    near = (own[:, None] + widths[:, None] * np.linspace(-3, 3, 13)).ravel()
+    near = near[(near > low) & (near < high)]
+    return np.concatenate([[STATIC * low], np.unique(np.concatenate([grid, near]))])
+
+
+def poles_in_s(system: StateSpace) -> np.ndarray:
+    """Return the poles in 1/s, with s = log(z)/T on a processor; poles at z = 0, which only delay, are left out."""
+    poles = system.poles()
+    if system.period is None:
+        return poles
+    return np.log(poles[np.abs(poles) > 1e-9] + 0j) / float(system.period)
+
+
+def margins_of(system: StateSpace) -> Margins:
+    """Compute the margins over all frequencies: up to half the sample rate, or far beyond the fastest pole."""
+    fastest = float(np.max(np.abs(poles_in_s(system)), initial=1.0)) / (2 * math.pi)
+    high = 100 * fastest if system.period is None else 0.5 / float(system.period)
+    low = min(1e-3, 1e-6 * high)
+
+    def S(f: np.ndarray) -> np.ndarray:
+        return np.asarray(system.sensitivity(f))
+
+    def L(f: np.ndarray) -> np.ndarray:
+        return 1 / S(f) - 1
+
+    f = scan(system, low, high)[1:]
+    along = L(f)
+    gains = [-1 / L(np.array([x]))[0].real for x in _crossings(lambda x: np.imag(L(x)), f, np.imag(along))]
+    if system.period is not None:
+        gains.append(-1 / along[-1].real)  # L is real at half the sample rate
+    gains.append(-1 / along[0].real)  # and at 0
+    gains = [float(x) for x in gains if math.isfinite(x) and x > 1e-9]
+    phases, delays = [], []
+    for x in _crossings(lambda x: np.log(np.abs(L(x))), f, np.log(np.abs(along))):
+        lag = math.pi + float(np.angle(L(np.array([x]))[0]))
+        phases.append(math.degrees(min(lag, 2 * math.pi - lag)))
+        delays.append(lag / (2 * math.pi * x))
+    disk = peak(system, lambda f: np.abs(S(f) - 0.5), low, high).height
+    return Margins(
+        min(gains, key=lambda x: abs(math.log(x)), default=math.inf),
+        max((x for x in gains if x < 1), default=0.0),
+        min((x for x in gains if x >= 1), default=math.inf),
+        min(phases, default=math.inf),
+        min(delays, default=math.inf),
+        1 / disk,
+    )
+
+
+def _crossings(function: Magnitude, f: np.ndarray, values: np.ndarray) -> list[float]:
+    """Return the frequencies (Hz) at which a continuous function changes sign, from its values at the scan f."""
+    from scipy.optimize import brentq
+
+    def one(x: float) -> float:
+        return float(function(np.array([x]))[0])
+
+    changes = np.flatnonzero(values[:-1] * values[1:] < 0)
+    found = [float(brentq(one, f[k], f[k + 1], xtol=1e-300, rtol=1e-14)) for k in changes]  # pyright: ignore
+    # a sign that changes through a pole is no crossing
+    return [x for x, k in zip(found, changes, strict=True) if abs(one(x)) <= 1e-3 * max(abs(values[k]), 1e-30)]
+
+
+def noise_gain(system: StateSpace, period: float) -> float:
+    """Return the rms of z per rms of white noise on the reading of z, held over samples of `period` (s)."""
+    from scipy.linalg import expm, solve_discrete_lyapunov
+
+    scaled = system.scaled()
+    A, b, c = np.asarray(scaled.A), np.asarray(scaled.B)[:, :1], np.asarray(scaled.C)[3]
+    if system.period is None:
+        n = len(A)
+        whole = expm(np.block([[A, b], [np.zeros((1, n + 1))]]) * period)
+        A, b = whole[:n, :n], whole[:n, n:]
+    covariance = solve_discrete_lyapunov(A, b @ b.T)
+    return float(np.sqrt(max(c @ covariance @ c, 0.0)))

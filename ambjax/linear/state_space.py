@@ -1,0 +1,75 @@
+"""A linear state space with the inputs and outputs of the closed loop, its frequency response and its poles."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+# Inputs: numbers added to the readings of z (m) and z_dot (m/s), and a disturbance q_z (m/s^2).
+INPUTS = ("e_z", "e_z_dot", "q_z")
+# Outputs: what the controller reads of z (m) and z_dot (m/s), the voltage u (V), and the rotor's position z (m).
+OUTPUTS = ("z_read", "z_dot_read", "u", "z")
+
+
+class StateSpace(NamedTuple):
+    """The linear system x' = A x + B w, y = C x + D w, or x_{n+1} = A x_n + B w_n on a processor.
+
+    - `A` [N, N], `B` [N, 3], `C` [4, N], `D` [4, 3]: matrices in SI units, with the inputs INPUTS and the outputs
+      OUTPUTS. On a processor the disturbance q_z is held over a sample.
+    - `sizes` [N]: characteristic sizes of the states, used to scale the matrices for numerical work.
+    - `period`: sample period, s; None in continuous time.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    sizes: Array
+    period: Array | None = None
+
+    def scaled(self) -> "StateSpace":
+        """Return the same system with states relative to their sizes."""
+        s = self.sizes
+        return self._replace(A=self.A * s / s[:, None], B=self.B / s[:, None], C=self.C * s, sizes=s / s)
+
+    def response(self, frequency: Array | np.ndarray) -> Array:
+        """Return the frequency response [F, 4, 3], complex: outputs, inputs; at frequencies [F] in Hz.
+
+        Arrays of NumPy are computed by NumPy, without compilation; those of JAX are differentiable.
+        """
+        np_ = np if isinstance(self.A, np.ndarray) else jnp
+        A, B, C, D, *_ = self.scaled()
+        s = 2j * np.pi * np_.asarray(frequency)[:, None, None]
+        at = s if self.period is None else np_.exp(s * self.period)
+        x = np_.linalg.solve(at * np.eye(len(A)) - A, np_.broadcast_to(B + 0j, (at.shape[0], *B.shape)))
+        return C @ x + D
+
+    def sensitivity(self, frequency: Array | np.ndarray) -> Array:
+        """Return S [F], complex: what the controller reads of z per number added to the reading."""
+        return self.response(frequency)[:, 0, 0]
+
+    def poles(self) -> np.ndarray:
+        """Return the poles [N], complex: in the z-plane on a processor, else in 1/s."""
+        return np.linalg.eigvals(np.asarray(self.scaled().A))
+
+    @property
+    def stable(self) -> bool:
+        """Whether all poles lie inside the unit circle, or in the left half-plane in continuous time."""
+        poles = self.poles()
+        return bool(np.all(np.real(poles) < 0) if self.period is None else np.all(np.abs(poles) < 1))
+
+    def to_control(self) -> Any:
+        """Return the system as a StateSpace of python-control, with named inputs and outputs.
+
+        Raises ValueError if python-control is not installed.
+        """
+        try:
+            import control
+        except ImportError:
+            raise ValueError(
+                "to_control: python-control is not installed. Install it with: pip install 'ambjax[control]'."
+            ) from None
+        matrices = [np.asarray(x) for x in (self.A, self.B, self.C, self.D)]
+        step = 0 if self.period is None else float(self.period)
+        return control.StateSpace(*matrices, step, inputs=list(INPUTS), outputs=list(OUTPUTS))

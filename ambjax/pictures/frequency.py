@@ -1,0 +1,114 @@
+"""Pictures over frequency: sensitivity functions with zones, Nyquist curve with the disk, Bode plot, stiffness."""
+
+import pathlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from ambjax.linear.state_space import StateSpace
+from ambjax.pictures.figures import BLUE, GREEN, INK, ORANGE, RED
+from ambjax.pictures.style import own_style
+
+# Colour and style of each loop; later ones are dashed, so that equal curves stay visible.
+LINES = ((BLUE, "-"), (ORANGE, "--"), (GREEN, ":"), (RED, "-."))
+ZONES = (("A", "#e5f2ea"), ("B", "#f6f3d8"), ("C", "#fae3cf"), ("D", "#f6d5d5"))
+POINTS = 1200
+# Lowest |S| shown.
+LOWEST = 0.01
+# Half width of the Nyquist panel around the point -1.
+WINDOW = 3.0
+
+
+class NamedLoop(NamedTuple):
+    """A linearised loop with its name, its mass (kg) and its disk margin."""
+
+    name: str
+    system: StateSpace
+    m: float
+    disk: float
+
+
+@own_style
+def sensitivity(
+    title: str, loops: Sequence[NamedLoop], limits: Sequence[float], span: tuple[float, float], path: pathlib.Path
+) -> None:
+    """Write the picture of `figure_of` to a file."""
+    figure_of(title, loops, limits, span).savefig(path, dpi=110)
+
+
+@own_style
+def figure_of(title: str, loops: Sequence[NamedLoop], limits: Sequence[float], span: tuple[float, float]) -> Figure:
+    """Return a picture: |S| with zones, |T|, |KS|, dynamic stiffness, Nyquist curve with the disk, Bode plot of L.
+
+    `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz.
+    """
+    figure = Figure(figsize=(12, 11), layout="constrained")
+    left = figure.add_gridspec(4, 2)
+    S_axes, T_axes, KS_axes, stiffness_axes = (figure.add_subplot(left[row, 0]) for row in range(4))
+    nyquist_axes = figure.add_subplot(left[:2, 1])
+    gain_axes, phase_axes = (figure.add_subplot(left[row, 1]) for row in (2, 3))
+    f = np.geomspace(*span, POINTS)
+    for loop, (colour, line) in zip(loops, LINES, strict=False):
+        H = np.asarray(loop.system.response(f))
+        S = H[:, 0, 0]
+        L = 1 / S - 1
+        style = {"color": colour, "linestyle": line, "linewidth": 1.4, "label": loop.name}
+        S_axes.loglog(f, np.abs(S), **style)
+        T_axes.loglog(f, np.abs(S - 1), **style)
+        KS_axes.loglog(f, np.abs(H[:, 2, 0]), **style)
+        stiffness_axes.loglog(f, loop.m / np.abs(H[:, 3, 2]), **style)
+        nyquist_axes.plot(L.real, L.imag, **style)
+        gain_axes.loglog(f, np.abs(L), **style)
+        phase_axes.semilogx(f, np.degrees(np.unwrap(np.angle(L))), **style)
+    _zones(S_axes, limits)
+    _nyquist(nyquist_axes, loops)
+    gain_axes.axhline(1.0, color=INK, linewidth=0.8)
+    labels = {
+        S_axes: "|S|",
+        T_axes: "|T|",
+        KS_axes: "|KS|, V/m",
+        stiffness_axes: "dynamic stiffness, N/m",
+        gain_axes: "|L|",
+        phase_axes: "phase of L, degrees",
+    }
+    for ax, label in labels.items():
+        ax.set_ylabel(label)
+        ax.set_xlim(span)
+        ax.grid(True, which="major", color="#dddddd", linewidth=0.6)
+    for ax in (stiffness_axes, phase_axes):
+        ax.set_xlabel("frequency, Hz")
+    S_axes.legend(fontsize=8, loc="best")
+    figure.suptitle(f"{title}: sensitivity at the position sensor", fontsize=12)
+    return figure
+
+
+def _zones(ax: Axes, limits: Sequence[float]) -> None:
+    """Shade the zones of |S|, and name each at the right edge."""
+    low, high = max(ax.get_ylim()[0], LOWEST), max(ax.get_ylim()[1], 1.6 * limits[-1])
+    edges = [low, *limits, high]
+    for (name, colour), bottom, top in zip(ZONES, edges, edges[1:], strict=False):
+        ax.axhspan(bottom, top, color=colour, zorder=0)
+        middle = np.sqrt(max(bottom, top / 2) * top)
+        ax.text(1.01, middle, name, transform=ax.get_yaxis_transform(), fontsize=8, va="center", color=INK)
+    ax.set_ylim(low, high)
+
+
+def _nyquist(ax: Axes, loops: Sequence[NamedLoop]) -> None:
+    """Mark -1 and the disk that the Nyquist curve of the first loop must not enter."""
+    if loops:
+        # the disk with the diameter from -(2 + d)/(2 - d) to its inverse
+        d = min(loops[0].disk, 1.999)
+        far, near = (2 + d) / (2 - d), (2 - d) / (2 + d)
+        ax.add_patch(Circle((-(far + near) / 2, 0), (far - near) / 2, color="#f6d5d5", zorder=0, linewidth=0))
+    ax.plot([-1], [0], marker="+", color=INK, markersize=10)
+    ax.set_xlim(-1 - WINDOW, -1 + WINDOW)
+    ax.set_ylim(-WINDOW, WINDOW)
+    ax.set_aspect("equal", adjustable="box")
+    ax.grid(True, color="#dddddd", linewidth=0.6)
+    ax.set_xlabel("real part of L")
+    ax.set_ylabel("imaginary part of L")
+    ax.set_title("Nyquist curve; shaded: disk margin of the first loop", fontsize=9)

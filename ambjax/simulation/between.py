@@ -1,0 +1,131 @@
+"""The plant between two samples of a processor: the voltages that act, and the initial value problems under them."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.control.cascade import Command
+from ambjax.numerics.records import Scalar
+from ambjax.simulation.edges import NO_EDGES, Edges
+from ambjax.simulation.integrate import InitialValueProblem
+from ambjax.simulation.loop import SHOWN, ClosedLoop, Densities, ExternalInputs, Sizes
+from ambjax.simulation.span import Instant
+from ambjax.world.amplifier import Amplifier
+
+Voltage = Callable[[Scalar], Array]
+
+
+def acting(voltages: tuple[Array, ...], delay: Array, period: Scalar, whole: bool) -> list[tuple[Array, Scalar]]:
+    """Return the commanded voltages (V) that act during a sample, each with its duration (s).
+
+    `voltages`: of this sample and of the two before it, V. `delay`: in samples. `whole`: the delay is a whole number,
+    so that one voltage acts during the whole sample.
+    """
+    late = (delay - jnp.floor(delay)) * period
+    last = _one_of(voltages, jnp.floor(delay))
+    return [(last, period)] if whole else [(_one_of(voltages, jnp.ceil(delay)), late), (last, period - late)]
+
+
+def _one_of(voltages: tuple[Array, ...], lag: Array) -> Array:
+    """Return the voltage of the sample `lag` samples ago, lag = 0, 1 or 2."""
+    now, before, first = voltages
+    return jnp.where(lag < 0.5, now, jnp.where(lag < 1.5, before, first))
+
+
+def amplified(
+    amplifier: Amplifier | None, t: Array, u_a: Any, commanded: Sequence[tuple[Array, Scalar]]
+) -> tuple[list[tuple[Voltage, Scalar]], Any]:
+    """Return the amplifier's voltage as functions of time with their durations (s), and the voltage at the end.
+
+    `commanded`: voltages (V) from t on, each with its duration (s). With a slew-rate limit each is divided at the end
+    of its ramp, where the voltage has a corner.
+    """
+    if amplifier is None or not amplifier.slow:
+        return [(lambda _, u=u: u, time) for u, time in commanded], u_a
+    given = []
+    for u, time in commanded:
+        voltage = lambda now, u_a=u_a, u=u, t=t: amplifier.followed(u_a, u, now - t)  # noqa: E731
+        ramp = jnp.minimum(amplifier.ramp(u_a, u), time)
+        given += [(voltage, time)] if amplifier.slew is None else [(voltage, ramp), (voltage, time - ramp)]
+        u_a, t = amplifier.followed(u_a, u, jnp.asarray(time)), t + time
+    return given, u_a
+
+
+def stretches(
+    loop: ClosedLoop,
+    state: object,
+    command: Command,
+    t: Array,
+    voltages: list[tuple[Voltage, Scalar]],
+    cuts: int | None,
+) -> list[tuple[InitialValueProblem, Scalar]]:
+    """Return the initial value problems from t (s) on, with their durations (s), for the voltages that act.
+
+    `state`: of the plant at t. `cuts`: largest number of edges inside one sample; None: the number of all edges.
+    """
+    at = loop.scenario.edges()
+    edges = Edges(at, len(at) if cuts is None else min(cuts, len(at)))
+    if not edges.most:
+        edges = NO_EDGES
+    if not lags(loop):
+        return [(_under(loop, state, command, voltage, edges), time) for voltage, time in voltages]
+    # The solution of the sensor's low-pass requires a motion that is smooth over each part, so divide at edges too.
+    cut = []
+    for voltage, time in voltages:
+        problem = _under(loop, state, command, voltage, NO_EDGES)
+        cut += [(problem, length) for length in edges.pieces(t, time)]
+        t = t + time
+    return cut
+
+
+def lags(loop: ClosedLoop) -> bool:
+    """Return whether the position sensor has a low-pass."""
+    sensor = loop.scenario.sensor
+    return sensor is not None and sensor.bandwidth is not None
+
+
+def plant_status(loop: ClosedLoop, state: object) -> Array:
+    """Return the status code of the plant's state."""
+    return loop.status_of(state, loop.scenario.plant.scale(), state)
+
+
+def _under(loop: ClosedLoop, state: object, command: Command, voltage: Voltage, edges: Edges) -> InitialValueProblem:
+    """Return the initial value problem of the plant, with `voltage` (V) as a function of time."""
+    plant = loop.scenario.plant
+    e = plant.measurement(state).i - command.i_ref
+
+    def inputs(t: Scalar) -> tuple[ExternalInputs, Array]:
+        return loop.inputs(t), voltage(t)
+
+    def rates(inputs: tuple[ExternalInputs, Array], x: object) -> object:
+        outside, u = inputs
+        return plant.rates(x, _at_coil(loop, outside, u, x), outside.q_z, outside.q_i)
+
+    def observed(inputs: tuple[ExternalInputs, Array], x: object) -> tuple[object, Instant]:
+        (outside, u), motion, heat = inputs, plant.measurement(x), plant.signals(x).heat
+        u = _at_coil(loop, outside, u, x)
+        sigma = loop.cascade.position.sigma(motion, outside.reference)
+        sizes = Sizes(motion.z, motion.z - outside.reference.r, sigma, u, motion.i, e, command.v_tilde)
+        return rates(inputs, x), Instant(sizes, Densities(u, u * u, heat))
+
+    def status(x: object) -> Array:
+        return plant_status(loop, x)
+
+    scale = jax.tree.map(jnp.asarray, plant.scale())
+    return InitialValueProblem(inputs, rates, scale, status, None, observed, SHOWN, edges=edges)
+
+
+def _at_coil(loop: ClosedLoop, outside: ExternalInputs, u: Array, x: object) -> Array:
+    """Return the voltage at the coils, V, for the amplifier's voltage u."""
+    plant, amplifier = loop.scenario.plant, loop.scenario.amplifier
+    if amplifier is None:
+        return u
+
+    def holding_voltage() -> Array:
+        still, driven = (plant.measurement(plant.rates(x, volt, outside.q_z, outside.q_i)).i for volt in (0.0, 1.0))
+        return still / (still - driven)  # i' is linear in u
+
+    return amplifier.at_coil(u, plant.measurement(x).i, loop.scenario.u_max, holding_voltage)

@@ -1,0 +1,211 @@
+"""Folds, which process one row at a time and keep a few numbers for a run of any length.
+
+A fold is a record with `init() -> carry`, `update(carry, row, span) -> carry` and `result(carry, ending) -> numbers`.
+`row` holds the signals at the start of a sample, and `span` the extremes and integrals from there to the next sample
+(`span`, `loop.Sizes`, `loop.Densities`).
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple, Protocol, TypeVar
+
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.numerics.records import Scalar, leaf, record, static
+from ambjax.numerics.smooth import safe_sqrt
+from ambjax.simulation.span import Span
+from ambjax.simulation.trajectory import Row, first_time
+
+# What a fold keeps from one sample to the next, and its result: pytrees of numbers.
+Carry = TypeVar("Carry")
+Result = TypeVar("Result", covariant=True)
+
+
+class Ending(NamedTuple):
+    """The end of a rollout.
+
+    - `lost_code`: status code; 0 if the rotor survives.
+    - `lost_at`: time of the loss, s; +inf: never.
+    - `singular_at`: time of the first crossing of the singular curve C, s; +inf: never.
+    - `duration`: horizon of the run, s.
+    """
+
+    lost_code: Array
+    lost_at: Array
+    singular_at: Array
+    duration: Array
+
+
+class Fold(Protocol[Carry, Result]):
+    """Interface of a streaming metric."""
+
+    def init(self) -> Carry: ...
+    def update(self, carry: Carry, row: Row, span: Span) -> Carry: ...
+    def result(self, carry: Carry, ending: Ending) -> Result: ...
+
+
+def _zero() -> Array:
+    return jnp.zeros((), jnp.result_type(float))
+
+
+@record
+class Peak:
+    """Largest absolute value of a signal; between samples too, if the span records its extremes.
+
+    - `of`: name of the signal, a field of a Row.
+    - `after`: start of the evaluation, s.
+    - `timed`: return (value, time), with the start of the sample that contains the maximum, instead of the value.
+    """
+
+    of: str = static()
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
+    timed: bool = static(default=False)
+
+    def init(self) -> tuple[Array, Array]:
+        return _zero(), _zero()
+
+    def update(self, carry: tuple[Array, Array], row: Row, span: Span) -> tuple[Array, Array]:
+        peak, when = carry
+        value = jnp.abs(getattr(row, self.of))
+        if self.of in getattr(span.most, "_fields", ()):
+            value = jnp.maximum(value, getattr(span.most, self.of))
+        larger = (value > peak) & (row.t >= self.after)
+        return jnp.where(larger, value, peak), jnp.where(larger, row.t, when)
+
+    def result(self, carry: tuple[Array, Array], ending: Ending) -> Array | tuple[Array, Array]:
+        return carry if self.timed else carry[0]
+
+
+@record
+class Lowest:
+    """Smallest value of the signal `of` at a sample while the rotor is alive, and its time: (value, time)."""
+
+    of: str = static()
+
+    def init(self) -> tuple[Array, Array]:
+        return _zero() + jnp.inf, _zero()
+
+    def update(self, carry: tuple[Array, Array], row: Row, span: Span) -> tuple[Array, Array]:
+        least, when = carry
+        value = getattr(row, self.of)
+        smaller = (value < least) & row.alive
+        return jnp.where(smaller, value, least), jnp.where(smaller, row.t, when)
+
+    def result(self, carry: tuple[Array, Array], ending: Ending) -> tuple[Array, Array]:
+        return carry
+
+
+@record
+class Rms:
+    """Root mean square of the signal `of` over the samples from `after` (s) on."""
+
+    of: str = static()
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
+
+    def init(self) -> tuple[Array, Array]:
+        return _zero(), _zero()
+
+    def update(self, carry: tuple[Array, Array], row: Row, span: Span) -> tuple[Array, Array]:
+        total, count = carry
+        counts = row.t >= self.after
+        return total + jnp.where(counts, getattr(row, self.of) ** 2, 0.0), count + counts
+
+    def result(self, carry: tuple[Array, Array], ending: Ending) -> Array:
+        return safe_sqrt(carry[0] / jnp.maximum(carry[1], 1))
+
+
+@record
+class Driven:
+    """Mean over time of the density `of`, from `after` (s) on, while the drive is on; its square root if `root`."""
+
+    of: str = static()
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
+    root: bool = static(default=False)
+
+    def init(self) -> tuple[Array, Array]:
+        return _zero(), _zero()
+
+    def update(self, carry: tuple[Array, Array], row: Row, span: Span) -> tuple[Array, Array]:
+        counts = row.t >= self.after
+        more = getattr(span.densities, self.of), span.time
+        total, time = (old + jnp.where(counts, new, 0.0) for old, new in zip(carry, more, strict=True))
+        return total, time
+
+    def result(self, carry: tuple[Array, Array], ending: Ending) -> Array:
+        total, time = carry
+        mean = total / jnp.where(time > 0, time, 1.0)
+        return safe_sqrt(mean) if self.root else mean
+
+
+@record
+class Variation:
+    """Chatter: total variation, V, of the sample means of the voltage, from `after` (s) on, while the drive is on.
+
+    The variation of the voltage itself would include spikes from the signs of the laws, which are shorter than the rise
+    time of any drive. With a set-valued sign their number is unbounded.
+    """
+
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
+
+    def init(self) -> tuple[Array, Array, Array]:
+        return _zero(), _zero(), jnp.asarray(False)
+
+    def update(self, carry: tuple[Array, Array, Array], row: Row, span: Span) -> tuple[Array, Array, Array]:
+        total, before, counting = carry
+        value, counts = row.u_mean, row.alive & (row.t >= self.after)
+        return total + jnp.where(counts & counting, jnp.abs(value - before), 0.0), value, counts
+
+    def result(self, carry: tuple[Array, Array, Array], ending: Ending) -> Array:
+        return carry[0]
+
+
+@record
+class Count:
+    """Number of samples at which the boolean signal `of` is true."""
+
+    of: str = static()
+
+    def init(self) -> Array:
+        return _zero()
+
+    def update(self, carry: Array, row: Row, span: Span) -> Array:
+        return carry + getattr(row, self.of)
+
+    def result(self, carry: Array, ending: Ending) -> Array:
+        return carry
+
+
+@record
+class Reaching:
+    """Start of the first sample in which the absolute value of the signal `of` is within `band`, s; +inf: never."""
+
+    of: str = static()
+    band: Scalar = leaf(above=0, at_most=1e30)
+
+    def init(self) -> Array:
+        return _zero() + jnp.inf
+
+    def update(self, carry: Array, row: Row, span: Span) -> Array:
+        value = jnp.abs(getattr(row, self.of))
+        if self.of in getattr(span.least, "_fields", ()):
+            value = jnp.minimum(value, getattr(span.least, self.of))
+        return first_time((value <= self.band) & row.alive, row.t, carry)
+
+    def result(self, carry: Array, ending: Ending) -> Array:
+        return carry
+
+
+@record
+class Named:
+    """Several folds by name; the result is a dict."""
+
+    folds: Mapping[str, Fold]
+
+    def init(self) -> dict[str, object]:
+        return {name: fold.init() for name, fold in self.folds.items()}
+
+    def update(self, carry: dict[str, object], row: Row, span: Span) -> dict[str, object]:
+        return {name: fold.update(carry[name], row, span) for name, fold in self.folds.items()}
+
+    def result(self, carry: dict[str, object], ending: Ending) -> dict[str, Array]:
+        return {name: fold.result(carry[name], ending) for name, fold in self.folds.items()}

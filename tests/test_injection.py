@@ -1,0 +1,180 @@
+"""The measured sensitivity: against the linear one, and against an independent simulator driven by the same signal."""
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import sampled_oracle
+from sampled_oracle import Lumped, World, current_for, simulate
+from test_oracle import adaptive, current, smc
+from test_sampled import loop_of
+
+from ambjax import Cascade, Clock, Scenario, Sensor
+from ambjax.control import current as current_laws
+from ambjax.control import inversion, position
+from ambjax.control.processor import Processor
+from ambjax.linear import Zones, injected, linearise, lines, peak
+from ambjax.linear.multisine import multisine
+from ambjax.simulation.sliding import Slide
+
+T = 1e-4
+# A peak of |S| of 8 to 25 near 30 Hz. Smooth at an amplitude of 1e-6 m: the signs' arguments stay below 1 % of 1/p.
+LAWS = {"position": smc(200.0, 63.0, 5.0), "inversion": adaptive(2e6, 1e-3), "current": current(600.0, 20.0)}
+SMOOTH = {
+    "position": position.SlidingMode(c=200.0, k=63.0, p=5.0),
+    "inversion": inversion.Adaptive(gamma=2e6, p=1e-3),
+    "current": current_laws.SlidingMode(k_i=600.0, p=20.0),
+}
+SIGNS = {
+    "position": position.SlidingMode(c=200.0, k=30.0, p=np.inf),
+    "inversion": inversion.Adaptive(gamma=1e7, p=np.inf),
+    "current": current_laws.SlidingMode(k_i=2000.0, p=np.inf),
+}
+WORLDS = {
+    "complementary": {"observer": ("complementary", {"l": 300.0}), "delay": 0.0},
+    "Kalman": {"observer": ("kalman", {"w": 3000.0}), "delay": 1.0},
+    "one and a half": {"delay": 1.5, "predict": False},
+    "two coils": {"kind": "two-coil", "delay": 1.0},
+    "slow sensor": {"bandwidth": 3e3, "gain": 1.02, "delay": 0.0},
+    "slow amplifier": {"amplifier": {"bandwidth": 3e3}, "delay": 1.0},
+}
+SLOWEST = ("two coils", "slow amplifier")
+INJECTED = ("complementary", "slow amplifier")  # each is another program to compile
+
+
+def largest(system):
+    return peak(system, lambda f: np.abs(system.sensitivity(f)), 1.0, 2000.0)
+
+
+def top(f, size):
+    """Height and frequency of the parabola through the largest of the points and its neighbours."""
+    k = int(np.clip(np.argmax(size), 1, len(f) - 2))
+    a, b, c = np.polyfit(f[k - 1 : k + 2] - f[k], size[k - 1 : k + 2], 2)
+    return c - b * b / (4 * a), f[k] - b / (2 * a)
+
+
+def measured_by_the_oracle(world, harmonics, samples, amplitude, monkeypatch):
+    """S at the harmonics of 1/(samples T), over the second period; the start is the rotor at rest."""
+    body = Lumped(world).body
+    i = current_for(body, 0.0, body.g / body.a)
+    world = dataclasses.replace(world, initial=(0.0, 0.0, i), inversion=adaptive(2e6, 1e-3, i_ref=i))
+    turns = 2 * np.pi / samples * np.outer(harmonics, np.arange(2 * samples))
+    e = amplitude * np.cos(turns + np.arange(len(harmonics))[:, None] ** 2).sum(axis=0)
+    readings, measurement = [], sampled_oracle._measurement
+
+    def recorded(*args):
+        readings.append(measurement(*args))
+        return readings[-1]
+
+    monkeypatch.setattr(sampled_oracle, "_measurement", recorded)
+    run = simulate(world, 2 * samples, np.stack([e, 0 * e, 0 * e], axis=1), fast=True)
+    assert run.lost_at == math.inf
+    read, e = (np.exp(-1j * turns[:, samples:]) @ x[samples:] for x in (np.array(readings)[:, 0], e))
+    return read / e
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow if x in SLOWEST else ()) for x in WORLDS])
+def test_the_peak_is_that_of_the_independent_simulator(name, monkeypatch):
+    """Driven at nine lines around the peak. The parabola through three of them is within 0.2 % of the peak."""
+    world = World(**LAWS, **WORLDS[name])
+    cascade, scenario, _ = loop_of(world, 1, (0.0, 0.0, 0.0))
+    system = linearise(cascade, scenario, Clock(1, T))
+    expected = largest(system)
+    harmonics = np.arange(6, 15)
+    samples = round(10 / (expected.frequency * T))
+    f = harmonics / (samples * T)
+    S = measured_by_the_oracle(world, harmonics, samples, 1e-7, monkeypatch)
+    assert np.abs(S / system.sensitivity(f) - 1).max() < 1e-3
+    height, at = top(f, np.abs(S))
+    assert height == pytest.approx(expected.height, rel=1e-3)
+    assert at == pytest.approx(expected.frequency, rel=0.01)
+    if name in INJECTED:
+        found = injected(cascade, scenario, Clock(samples, T), f, amplitude=1e-6)
+        assert np.abs(found.S / S - 1).max() < 1e-3
+        assert found.peak == pytest.approx(np.abs(S).max(), rel=1e-3)
+
+
+SLOW = Clock(1000, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("cascade", "amplitude", "r"),
+    [(Cascade(**SMOOTH), 1e-6, 0.0), (Cascade(**SMOOTH), 1e-6, 1e-3), (Cascade(), 1e-7, 0.0)],
+    ids=["smooth", "at 1 mm", "repaired"],
+)
+def test_continuous_time_is_the_linear_analysis(cascade, amplitude, r):
+    """All share a program. S: the size of the signs' arguments squared; u: the integration error in the stiff i."""
+    found = injected(cascade, Scenario(), SLOW, [1.0, 2.0, 5.0, 17.0, 31.0, 100.0], amplitude=amplitude, r=r)
+    system = linearise(cascade, Scenario(), SLOW, r)
+    expected = system.response(found.frequency)
+    assert np.abs(found.S / expected[:, 0, 0] - 1).max() < 1e-3
+    assert pytest.approx(expected[:, 2, 0], rel=1e-2) == found.KS
+    assert pytest.approx(found.S - 1) == found.T
+    assert (found.peak, found.peak) == (found.peak_low, found.peak_high)
+    assert (found.lost, found.members, found.saturated, found.amplitude) == (0, 1, 0.0, amplitude)
+    # another method is chosen in place of one that evaluates the laws without e
+    sliding = injected(cascade, Scenario(), SLOW.with_method(Slide(10)), found.frequency, amplitude=amplitude, r=r)
+    assert np.array_equal(sliding.S, found.S)
+
+
+def noisy(std, **more):
+    return Scenario(sensor=Sensor(std=std, std_z_dot=0.0, std_i=0.0), **more)
+
+
+def test_true_signs_under_noise_and_a_lost_rotor():
+    """Within their bands the implicit signs act as linear gains, those of the linear analysis."""
+    cascade = Cascade(**SIGNS, processor=Processor(0.0))
+    clock, f = Clock(500, T), [20.0, 40.0, 80.0, 160.0]
+    found = injected(cascade, noisy(1e-8), clock, f, amplitude=1e-7, members=8, settle=4)
+    system = linearise(cascade, noisy(0.0), clock)
+    assert found.lost == 0
+    at = np.abs(system.sensitivity(np.array([found.peak_frequency])))[0]
+    assert found.peak_low < at < found.peak_high
+    assert found.peak_low < found.peak < found.peak_high
+    assert found.peak_high - found.peak_low < 0.1 * found.peak
+    assert found.saturated == 0
+    limited = injected(cascade, noisy(1e-8, u_max=8.0), clock, f, amplitude=1e-7, members=8, settle=4)
+    assert 0 < limited.saturated < 0.1
+    lost = injected(cascade, noisy(1e-8, u_max=1e-3), clock, f, amplitude=1e-7, members=8, settle=4)
+    assert (lost.lost, lost.members) == (8, 8)
+    assert lost.S is lost.T is lost.KS is lost.peak is lost.peak_low is None
+
+
+def test_the_wave_repeats_exactly_and_has_the_stated_amplitude():
+    wave = multisine(np.array([1, 7, 333]), 1000, T, 2e-5)
+    e = np.array([wave.at(jnp.asarray(n)) for n in range(0, 3000, 10)])
+    assert np.array_equal(e[:100], e[200:])
+    every = np.cos(2 * np.pi / 1000 * np.outer(np.arange(1000), [1, 7, 333]) + wave.phases).sum(axis=1)
+    assert np.abs(wave.size * every).max() == pytest.approx(2e-5, rel=1e-12)
+    assert e[:100] == pytest.approx(wave.size * every[::10], abs=1e-17)
+    assert float(wave(7 * T)) == pytest.approx(wave.size * every[7], abs=1e-16)
+
+
+def test_schroeder_phases_keep_the_wave_low():
+    """The largest value of 30 lines is below 2.5 times the effective value; with equal phases it is 7.7 times."""
+    wave = multisine(np.arange(1, 31), 1000, T, 1.0)
+    assert 1 / (wave.size * np.sqrt(15)) < 2.5
+
+
+def test_lines_are_dense_near_the_peak_and_whole_harmonics():
+    clock = Clock(10_000, T)
+    f = lines(Zones(), clock, 40.0)
+    assert f[0] == 1.0
+    assert f[-1] == 2000.0
+    assert f == pytest.approx(np.round(f))
+    near = (f > 29) & (f < 54)
+    assert near.sum() >= 11
+    assert len(lines(Zones(), clock)) < len(f) <= 41
+
+
+def test_what_cannot_be_measured_is_refused_in_one_line():
+    clock = Clock(100, T)
+    for f in ([20.0], [5000.0], [], [math.nan]):
+        with pytest.raises(ValueError, match=r"injection.frequencies: from 100 Hz, .* to below half .* 5000 Hz"):
+            injected(Cascade(), Scenario(), clock, f)
+    with pytest.raises(ValueError, match=r"injection.amplitude = 0 m"):
+        injected(Cascade(), Scenario(), clock, [100.0], amplitude=0.0)
+    with pytest.raises(ValueError, match="members = 0"):
+        injected(Cascade(), Scenario(), clock, [100.0], members=0)

@@ -1,0 +1,244 @@
+"""Linear analysis: matrices against the simulation, margins against python-control, gradients, equilibria."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from ambjax import Cascade, Clock, Plant, Scenario, Sensor
+from ambjax.control import current, inversion, observer, position
+from ambjax.control.processor import Processor
+from ambjax.linear import StateSpace, Zones, analyse, linearise, linearise_members, margins_of, noise_gain, peak
+from ambjax.linear.equilibrium import ideal
+from ambjax.linear.loop_matrices import loop_matrices
+from ambjax.numerics.records import canonical
+from ambjax.simulation.explicit import DOP853
+from ambjax.simulation.rollout import prepare
+from ambjax.world.amplifier import Amplifier
+from ambjax.world.coils import TwoCoil
+from ambjax.world.sensor import Errors
+
+T = 1e-4
+QUICK = {"xla_backend_optimization_level": 0}  # each program runs once
+CLOCK = Clock(samples=10, sample_period=T)
+SMOOTH = {
+    "position": position.SlidingMode(c=200.0, k=63.0, p=5.0),
+    "inversion": inversion.Adaptive(gamma=2e6, p=1e-3),
+    "current": current.SlidingMode(k_i=600.0, p=20.0),
+}
+SLOW = Sensor(bandwidth=2000.0, gain=1.05, offset=1e-5)
+# name: cascade's processor and laws, scenario, reference (m)
+LOOPS = {
+    "true signs": (Processor(0.0), {"position": position.SlidingMode(c=200.0, k=30.0, p=np.inf)}, Scenario(), 0.0),
+    "two coils off the model": (Processor(0.5), {"current": current.ProportionalIntegral()},
+                                Scenario(plant=TwoCoil(m=0.6, A=0.12)), 1e-3),
+    "not predicted": (Processor(1.5, predict=False), {"observer": observer.Complementary(l=300.0, z_hat=0.0)},
+                      Scenario(sensor=Sensor()), -1e-3),
+    "lags": (Processor(1.0), {"observer": observer.Kalman(w=1000.0)},
+             Scenario(sensor=SLOW, amplifier=Amplifier(bandwidth=1500.0, slew=1e6, dead_band=0.1)), 5e-4),
+}  # fmt: skip
+
+
+def loop_of(name):
+    processor, laws, scenario, r = LOOPS[name]
+    return Cascade(**(SMOOTH | laws), processor=processor), scenario, r
+
+
+def simulated_map(cascade, scenario, r):
+    """S(f) of the map that the simulation makes of one sample, at the equilibrium, with DOP853 in 4 parts."""
+    from ambjax.linear.equilibrium import equilibrium
+
+    quiet = ideal(scenario)
+    quiet = dataclasses.replace(quiet, sensor=quiet.sensor or Sensor())
+    cascade = dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=None))
+    system, clock = prepare(cascade, quiet, CLOCK.with_method(DOP853(4)))
+    quiet = dataclasses.replace(quiet, reference=dataclasses.replace(quiet.reference, value=r))
+    system = dataclasses.replace(system, loop=dataclasses.replace(system.loop, scenario=quiet))
+    point, found = equilibrium(system.loop.cascade, quiet, T, r)
+    assert found
+    start = system.start()
+    z, zero = quiet.plant.measurement(point.plant).z, jnp.zeros(())
+    start = start._replace(
+        plant=point.plant, control=point.control, command=start.command._replace(u=point.u), past=(point.u, point.u),
+        z_filtered=start.z_filtered if isinstance(start.z_filtered, tuple) else z,
+        u_a=start.u_a if isinstance(start.u_a, tuple) else point.u + 1e-9,  # off |u_a - u| = 0, which has no slope
+    )  # fmt: skip
+    x, restore = ravel_pytree(start)
+
+    def step(x, e):
+        state = restore(x)
+        errors = Errors(e, zero, zero)
+        read = system.measured(state.plant, state.z_filtered, errors).z
+        state = system.jump(0.0, state, errors)
+        after = system.advance(clock.integrator, errors, 0.0, T, state, clock.integrator.start(T), jnp.asarray(0))
+        return ravel_pytree(after.state)[0], jnp.stack([read, state.command.u])
+
+    assert np.allclose(step(x, 0.0)[0][: len(point.plant)], x[: len(point.plant)], atol=1e-12)  # it rests
+    (A, B), (C, D) = jax.jit(jax.jacfwd(step, (0, 1)), compiler_options=QUICK)(x, 0.0)
+    return StateSpace(*(np.asarray(m) for m in (A, B[:, None], C, D[:, None], jnp.ones_like(x))), np.asarray(T))
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_the_matrices_are_those_of_the_simulation(name):
+    cascade, scenario, r = loop_of(name)
+    f = np.geomspace(1.0, 0.45 / T, 40)
+    expected = simulated_map(cascade, scenario, r).response(f)
+    found = linearise(cascade, scenario, CLOCK, r).response(f)
+    # the simulation's low-pass of the sensor is exact only for a cubic motion within a sample
+    error = 1e-6 if name == "lags" else 1e-9
+    assert np.all(np.abs(found[:, 0, 0] / expected[:, 0, 0] - 1) < error)
+    assert np.all(np.abs(found[:, 2, 0] / expected[:, 1, 0] - 1) < 10 * error)
+
+
+def test_the_repaired_gains_amplify_sensor_errors_41_times():
+    """In continuous time: at 0 the force per error, 2.8e5 1/s^2, against the loop's stiffness c k 2p/pi = 6.8e3."""
+    analysis = analyse(linearise(Cascade(), Scenario(), CLOCK), Plant().m, T, velocity=True)
+    k_s, stiffness = 2.817e5 - 1282.0 * 2, 17 * 25 * 2 * 25 / np.pi
+    assert pytest.approx(41, rel=0.02) == analysis.S.height
+    assert analysis.S.height == pytest.approx(k_s / stiffness, rel=0.02)
+    assert analysis.S.frequency == 0.0
+    assert analysis.zone == "D"
+    assert analysis.stiffness == pytest.approx(Plant().m * stiffness, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["two coils off the model", "continuous"])
+def test_margins_are_those_of_python_control(name):
+    import control
+
+    if name == "continuous":
+        system = linearise(Cascade(**SMOOTH), Scenario(), CLOCK)
+    else:
+        cascade, scenario, r = loop_of(name)
+        system = linearise(cascade, scenario, CLOCK, r)
+    scaled = system.scaled()
+    A, B, C = scaled.A, scaled.B[:, :1], scaled.C[:1]
+    S = control.StateSpace(A, B, C, np.eye(1), 0 if system.period is None else T)
+    L = control.StateSpace(A - B @ C, B, -C, 0, S.dt)  # 1/S - 1
+    f = np.geomspace(1.0, 0.45 / T, 50)
+    at = 2j * np.pi * f if system.period is None else np.exp(2j * np.pi * f * T)
+    assert system.sensitivity(f) == pytest.approx(S(at), rel=1e-9)
+    assert 1 / system.sensitivity(f) - 1 == pytest.approx(L(at), rel=1e-9)
+    # python-control takes the least over a grid of frequencies; ours lies below, by the grid's spacing at most
+    found, fine = margins_of(system), np.geomspace(1e-3, 0.4999 / T, 40_000)
+    disk = np.min(control.disk_margins(L, 2 * np.pi * fine, skew=0.0)[0])
+    assert disk == pytest.approx(np.min(1 / np.abs(system.sensitivity(fine) - 0.5)), rel=1e-9)
+    assert disk * (1 - 1e-3) < found.disk <= disk * (1 + 1e-9)
+    if name == "continuous":  # of a sampled loop python-control finds roots of polynomials that it warns about
+        gain, phase, *_ = control.stability_margins(L)
+        assert found.gain == pytest.approx(gain, rel=1e-9)
+        assert found.phase_deg == pytest.approx(abs(phase), rel=1e-9)
+
+
+def test_python_control_gets_the_same_system():
+    cascade, scenario, r = loop_of("true signs")
+    system = linearise(cascade, scenario, CLOCK, r)
+    exported, f = system.to_control(), np.array([10.0, 300.0])
+    assert exported.input_labels == ["e_z", "e_z_dot", "q_z"]
+    assert exported.dt == T
+    response = exported(np.exp(2j * np.pi * f * T)).transpose(2, 0, 1)
+    assert response == pytest.approx(np.asarray(system.response(f)), rel=1e-8)
+
+
+def test_the_delay_margin_is_where_the_loop_turns_unstable():
+    """Delay added at the sensor; up to the margin the Nyquist curve does not reach -1. At it, a pole is on the axis."""
+    system = linearise(Cascade(**SMOOTH), Scenario(), CLOCK)
+    found = margins_of(system)
+    f = np.geomspace(1.0, 1e4, 20_001)
+    L = 1 / system.sensitivity(f) - 1
+    late = np.abs(1 + L * np.exp(-2j * np.pi * f * found.delay))
+    # the curve passes -1 within the spacing of the frequencies
+    assert late.min() < 2e-3
+    early = np.abs(1 + L * np.exp(-2j * np.pi * f * 0.5 * found.delay))
+    assert early.min() > 0.02
+
+
+def test_a_narrow_peak_is_found_and_refined():
+    """x'' + 2 d w x' + w^2 x = w^2 e, read as x + e: |S| has its peak near w, with a width of 2 d w."""
+    w, d = 2 * np.pi * 123.4, 1e-5
+    A = np.array([[0.0, 1.0], [-w * w, -2 * d * w]])
+    B, C, D = np.zeros((2, 3)), np.zeros((4, 2)), np.zeros((4, 3))
+    B[1, 0], C[0, 0], D[0, 0] = w * w, 1.0, 1.0
+    system = StateSpace(A, B, C, D, np.array([1.0, w]))
+    found = peak(system, lambda f: np.abs(system.sensitivity(f)), 1.0, 2000.0)
+    assert found.height == pytest.approx(1 / (2 * d), rel=1e-3)
+    assert found.frequency == pytest.approx(123.4, rel=1e-4)
+
+
+def test_noise_gain_is_that_of_a_long_run():
+    """White noise through the matrices, sample by sample, for 200,000 samples: 3 of their standard errors."""
+    cascade, scenario, r = loop_of("true signs")
+    system = linearise(cascade, scenario, CLOCK, r).scaled()
+    e, x, z = np.random.default_rng(1).normal(size=200_000), np.zeros(len(system.A)), []
+    A, b, c = np.asarray(system.A), np.asarray(system.B)[:, 0], np.asarray(system.C)[3]
+    for one in e:
+        z.append(c @ x)
+        x = A @ x + b * one
+    assert np.std(z) == pytest.approx(noise_gain(system, T), rel=0.03)
+
+
+def peak_of(cascade, scenario):
+    system, _ = loop_matrices(cascade, scenario, jnp.asarray(T), jnp.asarray(5e-4))
+    return jnp.max(jnp.abs(system.sensitivity(jnp.geomspace(1.0, 2000.0, 50))))
+
+
+def test_the_peak_is_differentiable_in_the_gains_and_the_plant():
+    """Forward = reverse = central difference along one direction, the shift of the equilibrium (off the model) too."""
+    cascade = Cascade(**SMOOTH, processor=Processor(1.0)).on_processor()
+    scenario = Scenario(plant=Plant(m=0.6, A=0.12))
+    x, restore = ravel_pytree(canonical((cascade.position, cascade.inversion.gamma, scenario.plant.A)))
+    direction = x * jnp.asarray([0.3, -0.2, 0.5, 1.0, 0.1])
+
+    def loss(x):
+        law, gamma, A = restore(x)
+        moved = dataclasses.replace(cascade.inversion, gamma=gamma)
+        world = dataclasses.replace(scenario, plant=dataclasses.replace(scenario.plant, A=A))
+        return peak_of(dataclasses.replace(cascade, position=law, inversion=moved), world)
+
+    forward = jax.jit(lambda x: jax.jvp(loss, (x,), (direction,)), compiler_options=QUICK)
+    reverse = jax.jit(jax.grad(loss), compiler_options=QUICK)
+    slope, h = float(forward(x)[1]), 1e-4
+    assert slope == pytest.approx(float(reverse(x) @ direction), rel=1e-9)
+    # central differences: h^2 = 1e-8 of the third derivative, rounding 1e-12
+    high, low = (float(forward(x + sign * h * direction)[0]) for sign in (1, -1))
+    assert (high - low) / (2 * h) == pytest.approx(slope, rel=1e-5)
+
+
+def test_members_are_linearised_as_one_by_one():
+    scenario = Scenario(plant=Plant(m=np.array([0.55, 0.65])))
+    systems, found = linearise_members(Cascade(**SMOOTH), scenario, CLOCK)
+    assert found.all()
+    for k, m in enumerate((0.55, 0.65)):
+        alone = linearise(Cascade(**SMOOTH), Scenario(plant=Plant(m=m)), CLOCK)
+        for a, b in zip(systems[:5], alone[:5], strict=True):
+            assert a[k] == pytest.approx(b, rel=1e-7, abs=1e-12)
+
+
+def test_no_equilibrium_is_said_in_one_line():
+    """The rotor is heavier than the model by 6 m/s^2 of force, and the switching gain gives 5."""
+    heavy, laws = Scenario(plant=Plant(m=1.5)), SMOOTH | {"position": position.SlidingMode(c=200.0, k=5.0, p=5.0)}
+    with pytest.raises(ValueError, match=r"no equilibrium at r = 0\.001 m"):
+        linearise(Cascade(**laws), heavy, CLOCK, 1e-3)
+
+
+def test_ranges_and_zones():
+    zones = Zones()
+    assert [zones.zone(x) for x in (2.9, 3.0, 4.5, 5.0)] == ["A", "B", "C", "D"]
+    assert [zones.clearance_zone(x) for x in (0.29, 0.35, 0.45, 0.6)] == ["A", "B", "C", "D"]
+    assert zones.range(None) == (1.0, 2000.0)
+    assert zones.range(1e-3) == (1.0, 450.0)
+    with pytest.raises(ValueError, match="at most half the sample rate, 500 Hz"):
+        Zones(f_high=600.0).range(1e-3)
+    with pytest.raises(ValueError, match="must be below f_high"):
+        Zones(f_low=10.0, f_high=5.0).range(1e-3)
+
+
+def test_an_unstable_loop_has_no_margins():
+    system = StateSpace(np.array([[1.01]]), np.eye(1, 3), np.ones((4, 1)), np.zeros((4, 3)), np.ones(1), np.asarray(T))
+    analysis = analyse(system, 0.588, T)
+    assert not analysis.stable
+    assert analysis.zone == "D"
+    assert analysis.margins.phase_deg == 0
+    assert analysis.noise == np.inf

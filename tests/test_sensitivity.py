@@ -1,0 +1,152 @@
+"""`ambjax sensitivity`: its numbers against the analysis, its picture against its data, its answers to bad input."""
+
+import json
+
+import numpy as np
+import pytest
+
+from ambjax.__main__ import main
+from ambjax.cases.reader import read_case
+from ambjax.linear import analyse, linearise
+from ambjax.pictures.frequency import NamedLoop, figure_of
+
+CASE = """
+[reference]
+kind = "sine"
+amplitude = 1e-3
+frequency = 2.0
+[sensitivity]
+f_high = 500.0
+"""
+SPREAD = """
+[controller.position]
+k = 5.0
+[spread]
+plant.m = { choices = [0.588, 1.5] }
+"""
+KEYS = {"peak", "frequency_hz", "zone", "t_peak", "ks_peak", "gain_margin", "phase_margin_deg", "delay_margin_s"}
+
+
+def answered(tmp_path, capsys, text, *flags):
+    path = tmp_path / "case.toml"
+    path.write_text(text)
+    code = main(["sensitivity", str(path), "--out", str(tmp_path / "out"), *flags])
+    return code, *capsys.readouterr(), path
+
+
+def test_the_summary_is_that_of_the_analysis(tmp_path, capsys):
+    code, out, _, path = answered(tmp_path, capsys, CASE, "--json")
+    summary = json.loads(out)
+    assert code == 0
+    assert {*KEYS, "disk_margin"} <= set(summary)
+    case = read_case(path)
+    for r, row in zip((0.0, 1e-3, -1e-3), summary["points"], strict=True):
+        one = analyse(linearise(case.cascade, case.scenario, case.clock, r), 0.588, 1e-4, case.zones)
+        found = [one.S.height, one.S.frequency, one.T.height, one.margins.phase_deg, one.margins.disk]
+        assert [row[k] for k in ("peak", "frequency_hz", "t_peak", "phase_margin_deg", "disk_margin")] == found
+        assert row["reference_m"] == pytest.approx(r, rel=1e-3)
+        assert row["zone"] == "D"
+    assert summary["peak"] == summary["points"][0]["peak"]
+    written = json.loads((tmp_path / "out" / "sensitivity.json").read_text())
+    assert written == {key: value for key, value in summary.items() if key != "out"}
+    assert (tmp_path / "out" / "sensitivity.png").stat().st_size > 20_000
+
+
+def test_a_member_without_an_equilibrium_is_the_worst(tmp_path, capsys):
+    """A rotor of 1.5 kg needs 6 m/s^2 more than the model's, and k gives 5: exit code 1."""
+    code, out, _, _ = answered(tmp_path, capsys, SPREAD, "--members", "8", "--seed", "1")
+    assert code == 1
+    counted = next(line for line in out.splitlines() if line.startswith("Of 8 members"))
+    stable = int(counted.split()[5])
+    assert 0 < stable < 8
+    assert "0 are in zone A" in counted
+
+
+def test_the_picture_shows_the_response(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(CASE)
+    case = read_case(path)
+    system = linearise(case.cascade, case.scenario, case.clock)
+    axes = figure_of("x", [NamedLoop("nominal", system, 0.588, 0.02)], [3.0, 4.0, 5.0], (1.0, 500.0)).axes
+    curves = {ax.get_ylabel(): ax.get_lines()[0].get_xydata() for ax in axes}
+    f = curves["|S|"][:, 0]
+    assert f[[0, -1]] == pytest.approx([1.0, 500.0])
+    H = system.response(f)
+    assert curves["|S|"][:, 1] == pytest.approx(np.abs(H[:, 0, 0]))
+    assert curves["|T|"][:, 1] == pytest.approx(np.abs(H[:, 0, 0] - 1))
+    assert curves["|KS|, V/m"][:, 1] == pytest.approx(np.abs(H[:, 2, 0]))
+    assert curves["dynamic stiffness, N/m"][:, 1] == pytest.approx(0.588 / np.abs(H[:, 3, 2]))
+    L = curves["imaginary part of L"]
+    assert L[:, 0] + 1j * L[:, 1] == pytest.approx(1 / H[:, 0, 0] - 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "flags", "message"),
+    [
+        ("[sensitivity]\nzone_a = 4.5\n", [], "sensitivity.zone_a to zone_c = [4.5, 4.0, 5.0]"),
+        ("[sensitivity]\nf_low = 3e3\n", [], "sensitivity.f_low = 3000: it must be below f_high"),
+        ("[processor]\n[sensitivity]\nf_high = 6e3\n", [], "at most half the sample rate, 5000 Hz"),
+        ("[sensitivity]\nzone = 3\n", [], "zone_"),
+        ("", ["--members", "5"], "all members of this case are the same"),
+        ("[controller.position]\nk = 5.0\n[controller.model]\nm = 0.1\n", [], "no equilibrium at r = 0 m"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(tmp_path, capsys, text, flags, message):
+    code, out, err, _ = answered(tmp_path, capsys, text, *flags)
+    assert code == 2
+    assert out == ""
+    assert err.count("\n") == 1
+    assert message in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_check_begins_with_the_numbers_of_the_machine(tmp_path, capsys):
+    """By hand for the plant of Table 1: kappa = mu_0 n^2 A, k_s = kappa i_0^2/s_0^3, k_i = kappa i_0/s_0^2."""
+    path = tmp_path / "case.toml"
+    path.write_text("[controller]\n[clock]\nduration = 0.02\n[actuator]\nu_max = 200.0\n")
+    main(["check", str(path), "--json"])
+    loop = json.loads(capsys.readouterr().out)["loop"]
+    kappa = 1.25e-6 * 1480**2 * 0.121
+    expected = {
+        "k_s_N_per_m": kappa * 0.25**2 / 5e-3**3,
+        "k_i_N_per_A": kappa * 0.25 / 5e-3**2,
+        "unstable_pole_per_s": (kappa * 0.25**2 / 5e-3**3 / 0.588) ** 0.5,
+        "force_reserve": kappa * 0.25**2 / 5e-3**2 / (0.588 * 9.81),
+        "bias_flux_T": 1.25e-6 * 1480 * 0.25 / 0.01,
+        "current_slew_A_per_s": 200 / (kappa / 0.01),
+    }
+    assert {key: loop[key] for key in expected} == pytest.approx(expected, rel=1e-12)
+    assert loop["zone"] == "D"
+    assert loop["converter_step_m"] is None
+    main(["check", str(path)])
+    assert capsys.readouterr().out.startswith("Sensitivity: zone D, a peak of 41.27 at 0 Hz.")
+
+
+PROCESSOR = """
+[controller.position]
+c = 200.0
+k = 63.0
+p = 5.0
+[controller.inversion]
+gamma = 2e6
+p = 1e-3
+[controller.current]
+k_i = 600.0
+p = 20.0
+[processor]
+[sensitivity]
+f_low = 20.0
+"""
+
+
+@pytest.mark.slow
+def test_the_injected_peak_stands_beside_the_linear_one(tmp_path, capsys):
+    """A smooth loop without noise: one member, whose interval is the value; 1 % of the gap is small for it."""
+    code, out, _, _ = answered(tmp_path, capsys, PROCESSOR, "--json")
+    summary = json.loads(out)
+    assert code == 0
+    assert summary["injected_members"] == 1
+    assert summary["injected_low"] == summary["injected_high"] == summary["injected_peak"]
+    assert summary["injected_peak"] == pytest.approx(summary["injected_linear_there"], rel=0.02)
+    code, out, _, _ = answered(tmp_path, capsys, PROCESSOR)
+    assert "Injected into the simulation (multi-sine of 5e-05 m)" in out

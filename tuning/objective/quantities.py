@@ -1,0 +1,173 @@
+"""Quantities of an ensemble that may be limited: their folds, and how they combine members."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.cases.tune_table import MEAN_MARGIN, WORST_MARGIN
+from ambjax.extend import Scalar, leaf, record, static
+from ambjax.simulation.folds import Driven, Ending, Fold, Peak, Variation
+from ambjax.simulation.response import Overshoot, Settling
+from ambjax.simulation.span import Span
+from ambjax.simulation.trajectory import Row
+
+# Exponent of the norms that approximate maxima.
+NORM = 16
+# Lower bound of the argument of a logarithm.
+TINY = 1e-30
+
+
+@record
+class Typical:
+    """Fold: the 16-norm over samples of |row.`of`| in units of `size`, a smooth maximum.
+
+    A saturated voltage has the derivative 0. The norm includes the unsaturated samples, which have another one.
+    """
+
+    of: str = static()
+    size: Scalar = leaf(above=0, at_most=1e30)
+
+    def init(self) -> tuple[Array, Array]:
+        zero = jnp.zeros((), jnp.result_type(float))
+        return zero, zero
+
+    def update(self, carry: tuple[Array, Array], row: Row, span: Span) -> tuple[Array, Array]:
+        total, count = carry
+        return total + (jnp.abs(getattr(row, self.of)) / self.size) ** NORM, count + row.alive
+
+    def result(self, carry: tuple[Array, Array], ending: Ending) -> Array:
+        total, count = carry
+        mean = total / jnp.maximum(count, 1.0)
+        some = mean > TINY
+        return self.size * jnp.where(some, jnp.where(some, mean, 1.0) ** (1 / NORM), 0.0)
+
+
+@record
+class Scaled:
+    """Fold: the result of another fold, divided by `by`."""
+
+    fold: Fold
+    by: Scalar = leaf(above=0, at_most=1e30)
+
+    def init(self) -> object:
+        return self.fold.init()
+
+    def update(self, carry: object, row: Row, span: Span) -> object:
+        return self.fold.update(carry, row, span)
+
+    def result(self, carry: object, ending: Ending) -> Array:
+        return self.fold.result(carry, ending) / self.by
+
+
+@dataclasses.dataclass(frozen=True)
+class LimitContext:
+    """Quantities of a case that the folds of limits depend on.
+
+    `settle` (s): start of the settled part. `duration` (s): of the run. `touchdown` (m): clearance. `band` (m): of the
+    settling time.
+    """
+
+    settle: float
+    duration: float
+    touchdown: float
+    band: float
+
+
+def pooled(values: Array) -> Array:
+    """Return the root mean square over members."""
+    return jnp.sqrt(jnp.mean(values**2) + TINY)
+
+
+def largest(values: Array) -> Array:
+    """Return the 16-norm over members: smooth, and not below the maximum."""
+    top = jax.lax.stop_gradient(jnp.maximum(jnp.max(values), TINY))
+    total = jnp.sum((values / top) ** NORM)
+    # 0 if all are 0: the derivative of the root is infinite there
+    return top * jnp.where(total > 0, total, 1.0) ** (1 / NORM)
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """A quantity that may be limited.
+
+    `words` describes the quantity of one member, `over` its reduction over members, both for the report. `fold` returns
+    the fold that measures it in the search, of a LimitContext and the limit. `exact` is the column of its exact value
+    in the judge's metrics; None: the fold's result. `tuned` reduces the members for the search, `judged` for the judge.
+    """
+
+    unit: str
+    words: str
+    over: str
+    fold: Callable[[LimitContext, float], Fold]
+    exact: str | None
+    tuned: Callable[[Any], Any]
+    judged: Callable[[np.ndarray], Any]
+    margin: float
+    """default margin"""
+    worst: bool = False
+    """whether the quantity is that of the worst member"""
+
+
+_POOLED = {"over": "root mean square over members", "tuned": pooled, "judged": pooled, "margin": MEAN_MARGIN}
+_MEAN = {"over": "mean over members", "tuned": jnp.mean, "judged": np.mean, "margin": MEAN_MARGIN}
+_WORST = {"over": "of the worst member", "tuned": largest, "judged": np.max, "margin": WORST_MARGIN, "worst": True}
+
+KINDS: dict[str, Kind] = {
+    "rms_u_V": Kind(
+        "V",
+        "root mean square voltage from run.settle on",
+        fold=lambda context, threshold: Driven("u_squared", context.settle, root=True),
+        exact="settled_rms_u_V",
+        **_POOLED,
+    ),
+    "max_u_V": Kind(
+        "V",
+        "largest voltage of the run",
+        fold=lambda context, threshold: Typical("u_peak", threshold),
+        exact="max_abs_u_V",
+        **_WORST,
+    ),
+    "max_abs_i_A": Kind(
+        "A", "largest current of the run", fold=lambda context, threshold: Peak("i"), exact="max_abs_i_A", **_WORST
+    ),
+    "chatter_V_per_s": Kind(
+        "V/s",
+        "variation of the voltage, averaged over each sample, per second from run.settle on",
+        fold=lambda context, threshold: Scaled(Variation(context.settle), context.duration - context.settle),
+        exact=None,
+        **_MEAN,
+    ),
+    "largest_error_m": Kind(
+        "m",
+        "largest |z - r| from run.settle on",
+        fold=lambda context, threshold: Peak("e_z", context.settle),
+        exact="settled_max_abs_error_m",
+        **_WORST,
+    ),
+    "settling_s": Kind(
+        "s",
+        "time of the run from which |z - r|, at the samples, stays within settling_band_m",
+        fold=lambda context, threshold: Settling(context.band),
+        exact=None,
+        **_WORST,
+    ),
+    "overshoot_m": Kind(
+        "m",
+        "how far z goes, at the samples, beyond where it began and where r has been",
+        fold=lambda context, threshold: Overshoot(),
+        exact=None,
+        **_WORST,
+    ),
+    "clearance_used": Kind(
+        "",
+        "largest |z| as a share of the clearance",
+        fold=lambda context, threshold: Scaled(Peak("z"), context.touchdown),
+        exact="clearance_used",
+        **_WORST,
+    ),
+}

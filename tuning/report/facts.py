@@ -1,0 +1,68 @@
+"""The facts of a search: the record from which the verdict, the report and report.json derive."""
+
+import dataclasses
+from typing import Any
+
+# A row, or a nested table, of report.json.
+Row = dict[str, Any]
+# Metrics shown before and after; all others are in report.json.
+SHOWN = (
+    "settled_rms_error_m",
+    "settled_rms_error_worst_member_m",
+    "settled_max_abs_error_m",
+    "settled_rms_u_V.mean",
+    "max_abs_u_V.largest",
+    "max_abs_i_A.largest",
+    "chatter_V.mean",
+    "clearance_used.largest",
+)
+# Fields that report.json leaves out if they are None.
+OPTIONAL = ("accurate", "gradient", "pareto")
+
+
+@dataclasses.dataclass(frozen=True)
+class TuningFacts:
+    """What a search found. Each field is a key of report.json.
+
+    `before`, `after`: the held-out members under the case's gains and the tuned ones. `refuted`: why accurate steps
+    contradict the answer; '' if they confirm it. `accurate`: some members with accurate steps. `gradient`, `pareto`:
+    None if not requested. `beside`: the lowest point of the slices through the answer.
+    """
+
+    case: str
+    weights: list[float]
+    before: Row
+    after: Row
+    held_out_seed: int
+    trained_on: int
+    lost_in_training: int
+    limits: list[Row]
+    loss: Row
+    minimised: Row
+    conditions: list[Row]
+    advice_on_conditions: list[str]
+    step_error: Row | None
+    worst_step_error: Row | None
+    worst_member: Row | None
+    accurate_steps: str
+    nominal_steps: str
+    refuted: str
+    verified: bool
+    verified_reason: str
+    lost_in_validation: int
+    search: Row
+    accurate: Row | None
+    gains: list[Row]
+    gradient: Row | None
+    pareto: list[Row] | None
+    beside: Row
+    slices: Row
+    outcome: Row = dataclasses.field(default_factory=dict)
+    verdict: str = ""
+    advice: str = ""
+
+    @property
+    def table(self) -> Row:
+        """The content of report.json."""
+        rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: value for name, value in rows.items() if value is not None or name not in OPTIONAL}

@@ -1,0 +1,174 @@
+"""The facts of a search, from its answer: the gains are judged on members that the search has not seen."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax.commands.outputs import say
+from ambjax.theorem.advice import advice as on_conditions
+from ambjax.theorem.conditions import Report as Check
+from ambjax.theorem.conditions import check
+from tuning.config import seeds, settings
+from tuning.judge import StepError, describe, held, judge, step_error, summarise, worst, worst_of
+from tuning.problem import TuningProblem
+from tuning.report import accurate, breakdown, gradient, limit_table, outcome
+from tuning.report.facts import SHOWN, Row, TuningFacts
+from tuning.search import explore
+from tuning.search.course import SearchResult
+
+
+def examined(answer: SearchResult, gradients: bool, front: bool) -> tuple[TuningFacts, explore.Slices]:
+    """Return the facts of an answer, and the slices of the goal through it.
+
+    `gradients`: whether to compute derivatives in three ways. `front`: whether to compute the front of error and
+    voltage.
+    """
+    problem, x, members = answer.problem, answer.x, answer.members
+    held_out, rollouts = seeds(problem.tune.budget)[2], problem.engine.rollouts
+    judged = _judged(problem, x, held_out)
+    steps = _checked(answer, judged["after"], held_out)
+    found = {
+        "case": problem.case.name,
+        "weights": list(problem.tune.weights),
+        "held_out_seed": held_out,
+        "trained_on": len(members.member),
+        "lost_in_validation": answer.lost,
+        **_ensembles(answer, judged, steps[2], held_out),
+        **_steps(answer, *steps),
+        **_conditions(problem, x),
+        "minimised": breakdown.minimised(problem, x, members),
+        "search": settings(problem.tune)
+        | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
+        "gradient": _gradient(answer) if gradients else None,
+        "pareto": _front(answer) if front else None,
+    }
+    slices = explore.slices(problem, x, members)
+    facts = TuningFacts(**found, **_neighbourhood(problem, x, slices))
+    what = outcome.outcome_of(facts, problem.tune.limits.may_lose(problem.tune.budget.held_out))
+    words = {"verdict": outcome.verdict(facts, what), "advice": outcome.advice(problem, facts, what, x, members)}
+    return dataclasses.replace(facts, outcome=what.facts(), **words), slices
+
+
+def _judged(problem: TuningProblem, x: np.ndarray, held_out: int) -> dict[str, dict[str, np.ndarray]]:
+    """Return the metrics of the held-out members [N] under the gains of the case and at x [m]; empty if none."""
+    space, count = problem.objective.space, problem.tune.budget.held_out
+    say(f"judging on {count} members of another seed ...")
+    start = space.encode(space.clip(space.values(problem.case.cascade)))
+    return {
+        name: judge(problem, at, held_out, count) if count else {} for name, at in (("before", start), ("after", x))
+    }
+
+
+def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_out: int) -> Row:
+    """Return the fields on the training members and the held-out members `judged`."""
+    problem = answer.problem
+    none = {"members": 0, "held": 0, "lost": 0, "stalled": 0}
+    found: Row = {name: summarise(one) if one else dict(none) for name, one in judged.items()}
+    after = judged["after"]
+    found["limits"] = limit_table.facts(problem.limits, problem.tune.limits, after, found["after"], refuted)
+    if refuted and after:
+        found["after"] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
+    found["loss"] = {name: breakdown.table(problem.goal, one) for name, one in judged.items() if one}
+    found["worst_member"] = worst(problem, after, held_out) if after else None
+    lost = problem.engine.terms(answer.x[None], answer.members)["survival"] > 0
+    return found | {"lost_in_training": int(lost.sum())}
+
+
+def _steps(answer: SearchResult, unlucky: StepError | None, again: Row | None, refuted: str) -> Row:
+    """Return the fields on the step errors, those of `_checked`."""
+    problem = answer.problem
+    return {
+        "step_error": answer.error.facts() if answer.error else None,
+        "worst_step_error": unlucky.facts() if unlucky else None,
+        "accurate_steps": problem.accurate,
+        "nominal_steps": "in the steps of `ambjax simulate`" if problem.replays else "by accurate steps",
+        "refuted": refuted,
+        "verified": not refuted,
+        "verified_reason": refuted or _confirmed(unlucky, answer.error),
+        "accurate": again or None,
+    }
+
+
+def _conditions(problem: TuningProblem, x: np.ndarray) -> Row:
+    """Return the fields on the theorem's conditions at x [m]."""
+    case = problem.case
+    cascade = problem.objective.space.decode(jnp.asarray(x), case.cascade)
+    line: Check = check(cascade, case.scenario, dataclasses.replace(case.clock, method=None))
+    rows = [dataclasses.asdict(one) | {"margin": one.margin} for one in line.conditions]
+    return {"conditions": rows, "advice_on_conditions": on_conditions(line)}
+
+
+def _gradient(answer: SearchResult) -> Row:
+    say("gradient report ...")
+    return gradient.report(answer.problem, answer.x, answer.members)
+
+
+def _front(answer: SearchResult) -> list[Row]:
+    say("front of error against voltage ...")
+    return explore.pareto(answer.problem, answer.x, answer.members)
+
+
+def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: explore.Slices) -> Row:
+    """Return the fields on the gains at x [m], and on the goal around them."""
+    space = problem.objective.space
+    ends = zip(space.values(problem.case.cascade), np.asarray(space.gains_at(jnp.asarray(x))), strict=True)
+    sensitivity = zip(slices.sensitivity(), slices.more_lost(), strict=True)
+    gains = [
+        {
+            "path": gain.path,
+            "before": float(before),
+            "after": float(after),
+            "least": gain.low,
+            "most": gain.high,
+            "at_bound": gain.at_bound(float(after)),
+            "sensitivity_percent": None if lost else float(grows),
+            "sensitivity_lost": int(lost),
+        }
+        | dataclasses.asdict(where)
+        for gain, (before, after), (grows, lost), where in zip(
+            space.gains, ends, sensitivity, problem.ranges, strict=True
+        )
+    ]
+    j, k, drop = slices.lowest()
+    return {
+        "gains": gains,
+        "beside": {"path": space.paths[j], "gain": slices.gains[j, k], "lower": -np.expm1(-drop)},
+        "slices": {"gains": slices.gains, "log_risk": slices.goals, "lost": slices.lost},
+    }
+
+
+def _checked(
+    answer: SearchResult, judged: dict[str, np.ndarray] | None, held_out: int
+) -> tuple[StepError | None, dict[str, Any] | None, str]:
+    """Simulate the worst and the first of the held-out members `judged` [N] again by accurate steps.
+
+    Returns the step error on the worst members, the comparison on the first ones, and the reason why accurate steps do
+    not confirm the answer ('' if they confirm it).
+    """
+    problem, again, error = answer.problem, None, None
+    if judged and not problem.sampled:
+        error = _worst_checked(answer, judged, held_out) if answer.confirmed else None
+        count = problem.tune.budget.held_out
+        say(f"{min(accurate.COMPARED, count)} of them again by accurate steps ...")
+        again = accurate.compared(problem, answer.x, held_out, count, SHOWN)
+    refuted = (error or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
+    return error, again, refuted or (again["refuted"] if again else "")
+
+
+def _confirmed(*errors: StepError | None) -> str:
+    return "; ".join(f"accurate steps: {describe(error)}" for error in errors if error)
+
+
+def _worst_checked(answer: SearchResult, judged: dict[str, np.ndarray], held_out: int) -> StepError | None:
+    """Return the step error on the worst held-out members that are held; None if none is held."""
+    those = np.flatnonzero(held(judged))
+    if not those.size:
+        return None
+    those = those[worst_of(judged["settled_max_abs_error_m"][those])]
+    error = step_error(
+        answer.problem, answer.x, answer.problem.objective.chosen(held_out, those, len(judged["lost_at_s"]))
+    )
+    say(f"accurate steps on the worst of them: {describe(error)}")
+    return error
