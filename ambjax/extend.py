@@ -6,6 +6,7 @@ frozen dataclasses whose leaves are declared by `gain`, `leaf` or `static`.
 
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.control.base import Law, Requirement
+from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.laws import (
     CurrentDemand,
     CurrentInputs,
@@ -16,7 +17,6 @@ from ambjax.control.laws import (
     PositionLaw,
     Relaxation,
 )
-from ambjax.control.position import force_for, sliding_variable
 from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, SearchContext, manifold, rate
 from ambjax.numerics.records import GAINS, Scalar, canonical, gain, leaf, record, static, validate

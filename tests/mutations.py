@@ -65,15 +65,30 @@ PLANT = [
 ]
 LAWS = [
     M(
+        "the optimal gains forget the weight of the integral",
+        "ambjax/control/regulator.py",
+        "(INTEGRAL * w / error) ** 2, 1 / error**2, 0.0",
+        "0.0, 1 / error**2, 0.0",
+        "tests/test_structures.py::test_the_written_gains_of_state_feedback_are_optimal_for_the_paper_s_plant",
+    ),
+    M(
+        "the rotor at rest on the reference needs no current against the magnets",
+        "ambjax/control/force.py",
+        "model.g - s * reference.r)",
+        "model.g)",
+        "tests/test_structures.py::test_a_state_feedback_at_rest_on_the_reference_demands_the_equilibrium_of_the"
+        "_linearised_magnets",
+    ),
+    M(
         "the position law forgets the second passive bearing",
-        "ambjax/control/position.py",
+        "ambjax/control/force.py",
         "wanted = -2 * model.k_z",
         "wanted = -model.k_z",
         "tests/test_laws.py::test_equation_5_sets_the_rate_of_sigma",
     ),
     M(
         "the position law forgets the reference's acceleration",
-        "ambjax/control/position.py",
+        "ambjax/control/force.py",
         "(wanted + reference.r_ddot + model.g + robust)",
         "(wanted + model.g + robust)",
         "tests/test_laws.py::test_equation_5_sets_the_rate_of_sigma",
@@ -108,14 +123,14 @@ LAWS = [
     ),
     M(
         "the integral of the PID law winds up",
-        "ambjax/control/position.py",
+        "ambjax/control/pid.py",
         "self.k_int * e + self.k_aw * lacking",
         "self.k_int * e",
         "tests/test_laws.py::test_a_pid_steps_its_filter_and_its_anti_windup_by_backward_euler",
     ),
     M(
         "the integral of the PID law winds up on a processor",
-        "ambjax/control/position.py",
+        "ambjax/control/pid.py",
         "+ leak * lacking) / (1 + leak)",
         ")",
         "tests/test_laws.py::test_the_integral_of_a_pid_follows_the_force_while_the_current_cannot",

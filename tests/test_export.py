@@ -21,8 +21,8 @@ from ambjax.__main__ import main
 from ambjax.cases.template_text import template
 from ambjax.commands.export import VERIFIED
 from ambjax.control import current, inversion, observer, position
+from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.guard import Guard
-from ambjax.control.position import force_for, sliding_variable
 from ambjax.control.processor import Processor
 from ambjax.export import machine
 from ambjax.export.controller import controller_of
@@ -104,6 +104,7 @@ CASCADES = {
     ),
     "super-twisting, the sign itself": hard(position=position.SuperTwisting(p=INF)),
     "a law of one's own": hard(position=Layered()),
+    "state feedback, linearised": hard(position=position.StateFeedback(), inversion=inversion.Linearised()),
     "Kalman": hard(observer=observer.Kalman()),
     "a difference": hard(observer=observer.Difference(), inversion=inversion.ClosedForm()),
     "a differentiator": hard(observer=observer.IRED1(), processor=Processor(0.5)),

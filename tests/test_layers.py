@@ -91,14 +91,18 @@ def test_no_cycles():
     list(graphlib.TopologicalSorter(graph).static_order())
 
 
+# Ensembles, linear analysis, and the design of default gains.
+SCIPY = ("ambjax.ensemble", "ambjax.linear", "ambjax.control.regulator")
+
+
 @pytest.mark.parametrize("module", [m for m in MODULES if m.startswith("ambjax")])
 def test_ambjax_stands_alone(module):
-    # optax belongs to tuning; diffrax to benchmarks; scipy, imported where it is used, to ensembles and linear analysis
+    # optax belongs to tuning; diffrax to benchmarks; scipy is imported where it is used
     roots = {name.split(".")[0] for name in imports(module)}
     at_once = {name.split(".")[0] for name in imports(module, top_level=True)}
     assert not roots & {"tuning", "optax", "diffrax", "ross", "equinox"}
     assert "control" not in (roots if module != "ambjax.linear.state_space" else at_once)
-    assert "scipy" not in (roots if not module.startswith(("ambjax.ensemble", "ambjax.linear")) else at_once)
+    assert "scipy" not in (roots if not module.startswith(SCIPY) else at_once)
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if m.startswith("tuning")])
@@ -111,7 +115,7 @@ def test_tuning_uses_public_names_only(module):
             assert private in ([], ["__version__"]), f"{module} imports {private} from {node.module}"
 
 
-LAWS = [f"ambjax.control.{stage}" for stage in ("observer", "position", "inversion", "current")]
+LAWS = [f"ambjax.control.{file}" for file in ("observer", "position", "pid", "state_feedback", "inversion", "current")]
 # Who may know which laws there are: those who make them of names, the paper's own, and a user's imports.
 MAKERS = ("ambjax.control.", "ambjax.cases.reader", "ambjax.paper.", "ambjax", "ambjax.extend")
 

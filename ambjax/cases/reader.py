@@ -23,7 +23,7 @@ from ambjax.control.processor import Processor
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.host.words import one_line
 from ambjax.linear.analysis import Zones
-from ambjax.numerics.records import leaf
+from ambjax.numerics.records import Scalar, leaf
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sliding import Slide, slides
@@ -52,6 +52,8 @@ KINDS: dict[str, dict[str, type[Law]]] = {
         "sliding-mode": position.SlidingMode,
         "super-twisting": position.SuperTwisting,
         "pid": position.PID,
+        "feedback-linearisation": position.FeedbackLinearisation,
+        "state-feedback": position.StateFeedback,
     },
     "inversion": {
         "adaptive": inversion.Adaptive,
@@ -154,10 +156,11 @@ def case_from(
     top.only([*TABLES, *OTHERS])
     plant = _plant(top.table("plant"))
     processor = _processor(top.table("processor")) if "processor" in top.raw else None
-    cascade, own = _cascade(top.table("controller"), plant, processor, folder, own)
+    clock, duration = clock_from(top.table("clock"))
+    period = None if processor is None else clock.sample_period
+    cascade, own = _cascade(top.table("controller"), plant, processor, period, folder, own)
     scenario, settle = _scenario(top, plant)
     check_parts(cascade, scenario)
-    clock, duration = clock_from(top.table("clock"))
     if isinstance(clock.method, Slide) and not slides(cascade, scenario.plant):
         made = " or ".join(f'"{kind}"' for kind, law in KINDS["inversion"].items() if law.slides)
         raise ValueError(
@@ -198,7 +201,12 @@ def _left_out(table: Table, plant: Bearing) -> tuple[str, ...]:
 
 
 def _cascade(
-    table: Table, plant: Bearing, processor: Processor | None, folder: pathlib.Path, known: tuple[OwnLaw, ...]
+    table: Table,
+    plant: Bearing,
+    processor: Processor | None,
+    period: Scalar | None,
+    folder: pathlib.Path,
+    known: tuple[OwnLaw, ...],
 ) -> tuple[Cascade, tuple[OwnLaw, ...]]:
     table.only(["model", *KINDS])
     model = table.table("model").record(Plant, base=plant)  # always lumped, even for a two-coil plant
@@ -211,8 +219,19 @@ def _cascade(
             kind = own[-1].law
         else:
             kind = kinds[law.choice("kind", list(kinds), next(iter(kinds)), FORM)]
-        laws[stage] = law.record(kind, extra=("kind",), base=default_law(kind, model))
+        laws[stage] = law.record(kind, extra=("kind",), base=_defaults(law, kind, model, period))
     return Cascade(model=model, processor=processor, **laws), tuple(own)
+
+
+def _defaults(table: Table, kind: Any, model: Plant, period: Scalar | None) -> Law | None:
+    """Return the law of this kind with its default gains; None if the table gives every gain."""
+    names = {field.name for field in dataclasses.fields(kind) if field.metadata.get("leaf")}
+    if names <= set(table.raw):
+        return None
+    try:
+        return default_law(kind, model, None if period is None else float(period))
+    except ValueError as error:
+        raise ValueError(f"{table.path}: {error}. Give all of {', '.join(sorted(names))}.") from None
 
 
 def _signal(table: Table, extra: tuple[str, ...] = ()) -> Any:

@@ -89,18 +89,25 @@ class Law:
         law: Any = self
         return law.scale(model)
 
+    def designed(self, model: Plant, period: float | None) -> "Law":
+        """Return the law with its default gains designed for a model of numbers; itself if they suit every model.
+
+        `period`: sample period of the processor, s; None in continuous time.
+        """
+        return self
+
     def has_own_step(self, implicit: bool) -> bool:
         """Whether a processor with implicit (or explicit) steps uses the method `step` of this law."""
         return ("implicit" if implicit else "explicit") in self.own_steps
 
 
-def default_law(kind: type[L], model: Plant) -> L:
-    """Return the law of this kind with its default gains, and with steepnesses scaled to the model.
+def default_law(kind: type[L], model: Plant, period: float | None = None) -> L:
+    """Return the law of this kind with its default gains (`Law.designed`), and with steepnesses scaled to the model.
 
     The default steepness suits the plant of Table 1. It scales with the inverse size of the sign's argument: for
     p = 25 m^2/A^2 a sign of v is soft where v is about 2500 A^2/m^2, as in Table 1, and hard where v is about 1e7.
     """
-    law: Any = kind()
+    law: Any = kind().designed(model, period)
     size = law.size(model)
     if size is None:
         return law
@@ -158,5 +165,7 @@ def unhardened(law: L) -> L:
 def softened(law: L, model: Plant) -> L:
     """Return the law with the default steepness for the model in place of every inf or None."""
     given: Any = law
+    if not hard_signs(law):
+        return law
     usual = default_law(type(law), model)
     return dataclasses.replace(given, **{name: getattr(usual, name) for name in hard_signs(law)})

@@ -1,31 +1,24 @@
 """Position laws: the scaled force that moves the rotor onto the reference."""
 
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.base import Requirement
+from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.laws import PositionLaw
+from ambjax.control.pid import PID as PID
+from ambjax.control.pid import FeedbackLinearisation as FeedbackLinearisation
 from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, SearchContext, authority, manifold, rate, steepness, switch
+from ambjax.control.state_feedback import StateFeedback as StateFeedback
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share, twist
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_root, smooth_sign
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
-
-
-def sliding_variable(c: Scalar, motion: Measurement, reference: Reference) -> Array:
-    """Return the sliding variable sigma = e_z_dot + c e_z (m/s), with e_z = z - r (Section 3.2)."""
-    return motion.z_dot - reference.r_dot + c * (motion.z - reference.r)
-
-
-def force_for(c: Scalar, model: Plant, motion: Measurement, reference: Reference, robust: Scalar) -> Array:
-    """Return the scaled force (A^2/m^2) that gives sigma_dot = `robust` (m/s^2) on the nominal plant. Eqs. (4), (5)."""
-    wanted = -2 * model.k_z / model.m * motion.z - c * (motion.z_dot - reference.r_dot)
-    return (wanted + reference.r_ddot + model.g + robust) * (1 / model.a)
 
 
 @record
@@ -168,89 +161,3 @@ class SuperTwisting(PositionLaw[Array]):
         after = state - period * self.k_2 * sign
         robust = 2 * after - state - self.k_1 * root
         return force_for(self.c, model, motion, reference, robust), after
-
-
-class PIDState(NamedTuple):
-    """State of `PID`: filtered rate of the error (m/s), and its integral term (m/s^2)."""
-
-    rate: Array
-    integral: Array
-
-
-@record
-class PID(PositionLaw[PIDState]):
-    """v_star = (-2 k_z z/m + r_ddot + g - k_p e - k_d d - x)/a, e = z - r, d' = w_f (e_dot - d), x' = k_int e + ...
-
-    A PID controller with a filtered derivative and with the nominal plant's stiffness and weight fed forward, so that
-    e_ddot = -k_p e - k_d d - x where v = v_star: the gains do not depend on the plant. Astrom and Murray, Feedback
-    Systems (2008), 10.1 and 10.4; the feed-forward is that of Eq. (5). e_dot is that of the observer: with "difference"
-    d is the textbook's filtered derivative of the position.
-
-    The whole integral is x' = k_int e + k_aw (a v_star - a v(z, i)), back-calculation: while the supply limits u, the
-    force v(z, i) of the measured current is not the demanded one, and x follows it at the rate k_aw.
-
-    k_d = 2 w, k_p = 2 w^2, k_int = w^3 are the optimal gains (LQR) for the cost w^6 (int e)^2 + e_ddot^2: its poles are
-    those of a Butterworth filter of bandwidth w.
-    """
-
-    k_p: Scalar = gain(default=1e4, unit="1/s^2", doc="proportional gain")
-    k_int: Scalar = gain(default=1e5, unit="1/s^3", doc="integral gain")
-    k_d: Scalar = gain(default=400.0, unit="1/s", doc="derivative gain")
-    w_f: Scalar = gain(default=1e4, unit="1/s", doc="bandwidth of the filter of the derivative")
-    k_aw: Scalar = gain(default=10.0, unit="1/s", doc="anti-windup rate")
-    memory = (("rate", "m/s", "filtered rate of the error"), ("integral", "m/s^2", "integral term"))
-
-    def init(self, model: Plant) -> PIDState:
-        return PIDState(jnp.zeros(()), jnp.zeros(()))
-
-    def scale(self, model: Plant) -> PIDState:
-        return PIDState(jnp.asarray(model.sigma_size), jnp.abs(model.g) / 50 + 1e-3)
-
-    def slope(self, model: Plant) -> Scalar:
-        """Return the largest of the rates w_f, k_d, k_aw, sqrt(k_p) and cbrt(k_int)."""
-        rates = jnp.stack([jnp.asarray(x) for x in (self.w_f, self.k_d, self.k_aw)])
-        return jnp.maximum(jnp.max(rates), jnp.maximum(jnp.sqrt(self.k_p), jnp.cbrt(self.k_int)))
-
-    def sigma(self, motion: Measurement, reference: Reference) -> Array:
-        """Return e_dot + (k_p/k_d) e: without filter and integral, e_ddot = -k_d sigma."""
-        return sliding_variable(self.k_p / self.k_d, motion, reference)
-
-    def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: PIDState) -> tuple[Array, PIDState]:
-        motion, reference = inputs
-        e, e_dot = motion.z - reference.r, motion.z_dot - reference.r_dot
-        v_star = self._force(model, inputs, state.rate, state.integral)
-        lacking = model.a * (v_star - model.v(motion.z, motion.i))
-        return v_star, PIDState(self.w_f * (e_dot - state.rate), self.k_int * e + self.k_aw * lacking)
-
-    def _force(self, model: Plant, inputs: tuple[Measurement, Reference], rate: Array, integral: Scalar) -> Array:
-        motion, reference = inputs
-        wanted = -self.k_p * (motion.z - reference.r) - self.k_d * rate - integral
-        return force_for(0.0, model, motion, reference, wanted)
-
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of k_d and sqrt(k_p): the demanded force is that at the start of the sample."""
-        return jnp.maximum(self.k_d, jnp.sqrt(self.k_p))
-
-    def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        return {
-            "k_p": rate(context, 1 / 30, 3, "corner sqrt(k_p) from w/30 to 3 w", power=2),
-            "k_int": rate(context, 1 / 100, 1, "corner cbrt(k_int) from w/100 to w", power=3),
-            "k_d": rate(context, 1 / 10, 10, "rate k_d from w/10 to 10 w"),
-            "w_f": rate(context, 1, 100, "bandwidth from w to 100 w"),
-            "k_aw": rate(context, 1e-3, 1, "rate from w/1000 to w"),
-        }
-
-    def step(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: PIDState, period: Scalar
-    ) -> tuple[Array, PIDState]:
-        """Step the filter and the anti-windup by backward Euler: both are stable for any rate.
-
-        d+ = d + T w_f (e_dot - d+); v_star uses d+ and x; x+ = x + T (k_int e + k_aw (a v_star(x+) - a v(z, i))).
-        """
-        motion, reference = inputs
-        e, e_dot = motion.z - reference.r, motion.z_dot - reference.r_dot
-        follow, leak = period * self.w_f, period * self.k_aw
-        after = (state.rate + follow * e_dot) / (1 + follow)
-        lacking = model.a * (self._force(model, inputs, after, 0.0) - model.v(motion.z, motion.i))
-        integral = (state.integral + period * self.k_int * e + leak * lacking) / (1 + leak)
-        return self._force(model, inputs, after, state.integral), PIDState(after, integral)

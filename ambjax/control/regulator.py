@@ -1,0 +1,71 @@
+"""Optimal gains (LQR) of a state feedback with integral action, for the mechanics linearised at the origin."""
+
+import numpy as np
+
+from ambjax.control.force import linear_mechanics
+from ambjax.world.plant import Plant
+
+# Weights: the error, as a share of s_0, and the current, as a share of i_0, that cost the same.
+ERROR, CURRENT = 0.1, 0.1
+# The integral of the error costs as much as the error if it grows to the error in the time 1/(INTEGRAL w).
+INTEGRAL = 0.2
+# Longest sample period for which gains are designed, times the fastest rate of the mechanics.
+LONGEST = 0.5
+
+
+def state_space(model: Plant) -> tuple[np.ndarray, np.ndarray]:
+    """Return A [3, 3] and B [3, 1] of x' = A x + B i for x = (integral of the error, error, its rate), SI units."""
+    s, b = map(float, linear_mechanics(model))
+    return np.array([[0, 1, 0], [0, 0, 1], [0, s, 0.0]]), np.array([[0], [0], [b]])
+
+
+def weights(model: Plant) -> tuple[np.ndarray, float]:
+    """Return Q [3, 3] and R of the cost of x'Q x + R i^2, x as in `state_space`, by Bryson's rule.
+
+    A. E. Bryson and Y.-C. Ho, Applied Optimal Control (1975), 5.2.
+    """
+    error, current, w = ERROR * float(model.s_0), CURRENT * float(model.i_0), float(model.pole)
+    return np.diag([(INTEGRAL * w / error) ** 2, 1 / error**2, 0.0]), 1 / current**2
+
+
+def sampled(A: np.ndarray, B: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the map of one period (s) with the input held; the integral takes a step of explicit Euler."""
+    import scipy.linalg
+
+    whole = scipy.linalg.expm(np.block([[A[1:, 1:], B[1:]], [np.zeros((1, 3))]]) * period)
+    F, G = np.eye(3), np.zeros((3, 1))
+    F[0, 1], F[1:, 1:], G[1:] = period, whole[:2, :2], whole[:2, 2:]
+    return F, G
+
+
+def optimal_gains(model: Plant, period: float | None = None) -> np.ndarray:
+    """Return the K [3] for which i = -K x has the smallest cost of `weights`, for a model of numbers.
+
+    `period`: of the sampled feedback, s; at most LONGEST over the fastest rate. None: in continuous time. Raises
+    ValueError if the Riccati equation has no solution in floating-point numbers, or if a gain is not positive, as for
+    a rotor on springs much stiffer than the magnets.
+    """
+    import scipy.linalg
+
+    A, B = state_space(model)
+    Q, _ = weights(model)
+    # unit of time 1/w and units of error and current from the weights: R is 1, all numbers are of order one
+    w = float(model.pole)
+    units = np.array([1 / w, 1.0, w]) * ERROR * float(model.s_0)
+    scaled_A, scaled_B = A * units / units[:, None] / w, B / units[:, None] / w * CURRENT * float(model.i_0)
+    cost = Q * units * units[:, None]
+    try:
+        if period is None:
+            P = scipy.linalg.solve_continuous_are(scaled_A, scaled_B, cost, np.eye(1))
+            K = scaled_B.T @ P
+        else:
+            fastest = max(1.0, abs(scaled_A[2, 1]) ** 0.5)
+            F, G = sampled(scaled_A, scaled_B, min(period * w, LONGEST / fastest))
+            P = scipy.linalg.solve_discrete_are(F, G, cost, np.eye(1))
+            K = np.linalg.solve(np.eye(1) + G.T @ P @ G, G.T @ P @ F)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ValueError(f"the model has no optimal gains ({error.args[0].partition('.')[0]})") from None
+    gains = K[0] / units * CURRENT * float(model.i_0)
+    if not np.all((gains > 0) & np.isfinite(gains)):
+        raise ValueError(f"the model has no positive optimal gains: {', '.join(f'{x:.3g}' for x in gains)}")
+    return gains

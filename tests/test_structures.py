@@ -1,0 +1,137 @@
+"""Position laws other than the paper's, each against what its theory promises."""
+
+import dataclasses
+import tomllib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+from ambjax import Plant, position
+from ambjax.cases.reader import case_from
+from ambjax.control import regulator
+from ambjax.control.base import default_law
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference
+
+RIG = Plant(1.64, 0.0, 1.2566e-6, 208.0, 2.68e-4, 5e-4, 2.5, 1.0)
+MODELS = pytest.mark.parametrize("model", [Plant(), RIG], ids=["paper", "rig"])
+STILL = Reference(0.0, 0.0, 0.0)
+
+
+# --- state feedback ---
+
+
+def linear(model):
+    """s and b of z_ddot = s z + b i, by differentiation of Eq. (1)."""
+    return (float(jax.grad(model.z_ddot, k)(0.0, 0.0)) for k in (0, 1))
+
+
+@MODELS
+def test_state_feedback_has_the_poles_of_the_symmetric_root_locus(model):
+    """The stable roots of p^2 (p^2 - s)^2 = b^2 (q_I - q_e p^2)/r, which need no Riccati equation."""
+    law, (s, b) = default_law(position.StateFeedback, model), linear(model)
+    law = dataclasses.replace(law, k_aw=0.0)
+
+    def rates(x):  # integral term, z, z_dot; the magnets are linear, and the current is the demanded one
+        v_star, rate = law(model, (Measurement(x[1], x[2], 0.0), STILL), x[0])
+        i = (v_star - model.dv_dz(0.0, 0.0) * x[1]) / model.dv_di(0.0, 0.0)
+        return jnp.stack([rate, x[2], s * x[1] + b * i])
+
+    found = np.sort_complex(np.linalg.eigvals(jax.jacfwd(rates)(jnp.zeros(3))))
+    (q_I, q_e, _), r = np.diag(regulator.weights(model)[0]), regulator.weights(model)[1]
+    mu = np.roots([1.0, -2 * s, s**2 + b**2 * q_e / r, -(b**2) * q_I / r])
+    # 1e-8: the Riccati solver's accuracy, with numbers of order one
+    np.testing.assert_allclose(found, np.sort_complex(-np.sqrt(mu.astype(complex))), rtol=1e-8)
+
+
+@MODELS
+def test_sampled_state_feedback_has_the_least_cost(model):
+    """The cost-to-go of the law's own map is that of value iteration, which needs no Riccati solver."""
+    T = 5e-5 if model is RIG else 2e-4
+    law = dataclasses.replace(default_law(position.StateFeedback, model, T), k_aw=0.0)
+    K = np.array([law.k_int, law.k_p, law.k_d])
+    A, B = regulator.state_space(model)
+    s, b = linear(model)
+    np.testing.assert_allclose([A[2, 1], B[2, 0]], [s, b], rtol=1e-12)
+    # the map of one period by integration: independent of the matrix exponential
+    F, G = np.eye(3), np.zeros((3, 1))
+    F[0, 1] = T
+    w = np.sqrt(s)
+    F[1:, 1:] = [[np.cosh(w * T), np.sinh(w * T) / w], [w * np.sinh(w * T), np.cosh(w * T)]]
+    G[1:, 0] = b * (np.cosh(w * T) - 1) / w**2, b * np.sinh(w * T) / w
+    Q, R = regulator.weights(model)
+    units = np.diag([model.s_0 / w, model.s_0, model.s_0 * w])
+    F, G, Q, K = np.linalg.solve(units, F @ units), np.linalg.solve(units, G), units @ Q @ units, K @ units
+    P = np.zeros((3, 3))
+    for _ in range(20_000):
+        gain = np.linalg.solve(G.T @ P @ G + R, G.T @ P @ F)
+        P = Q + F.T @ P @ (F - G @ gain)
+    # the iteration has converged to 1e-9
+    np.testing.assert_allclose(K, gain[0], rtol=1e-7)
+    closed = scipy.linalg.solve_discrete_lyapunov((F - G * K).T, Q + R * np.outer(K, K))
+    np.testing.assert_allclose(closed, P, rtol=1e-6, atol=1e-9 * np.abs(P).max())
+
+    # and a step of the law is this feedback
+    def step(x):
+        v_star, after = law.step(model, (Measurement(x[1], x[2], 0.0), STILL), x[0] * law.k_int, T)
+        i = (v_star - model.dv_dz(0.0, 0.0) * x[1]) / model.dv_di(0.0, 0.0)
+        return jnp.stack([i, after / law.k_int])
+
+    found = jax.jacfwd(step)(jnp.zeros(3))
+    np.testing.assert_allclose(found[0], [-law.k_int, -law.k_p, -law.k_d], rtol=1e-9)
+    np.testing.assert_allclose(found[1], [1, T, 0], atol=1e-12)
+
+
+def test_the_written_gains_of_state_feedback_are_optimal_for_the_paper_s_plant():
+    written, designed = position.StateFeedback(), default_law(position.StateFeedback, Plant())
+    for field in dataclasses.fields(written):  # three digits are written
+        assert getattr(written, field.name) == pytest.approx(getattr(designed, field.name), rel=5e-3)
+
+
+# its springs are 1e9 times stiffer than its magnets
+SPRINGS = "[plant]\nmu_0 = 9.8e-6\nn = 359.0\nA = 1.7e-7\ni_0 = 1e-6\n"
+
+
+def test_a_case_without_optimal_gains_asks_for_gains():
+    case = SPRINGS + '[controller.position]\nkind = "state-feedback"\n'
+    wanted = r"controller\.position: the model has no .*optimal gains.*Give all of k_aw, k_d, k_int, k_p\."
+    with pytest.raises(ValueError, match=wanted):
+        case_from(tomllib.loads(case))
+    given = case_from(tomllib.loads(case + "k_p = 1.0\nk_d = 1.0\nk_int = 1.0\nk_aw = 1.0\n"))
+    assert given.cascade.position == position.StateFeedback(1.0, 1.0, 1.0, 1.0)
+
+
+def test_a_case_has_the_gains_of_its_own_period():
+    case = '[controller.position]\nkind = "state-feedback"\nk_p = 200.0\n[clock]\nsample_period = 2e-4\n[processor]\n'
+    found, wanted = case_from(tomllib.loads(case)).cascade.position, regulator.optimal_gains(Plant(), 2e-4)
+    assert (found.k_int, found.k_p, found.k_d) == (wanted[0], 200.0, wanted[2])
+
+
+def test_a_state_feedback_at_rest_on_the_reference_demands_the_equilibrium_of_the_linearised_magnets():
+    law, model, r = position.StateFeedback(), Plant(), Reference(1e-3, 0.02, 0.3)
+    v_star, _ = law(model, (Measurement(r.r, r.r_dot, 0.0), r), 0.0)
+    rest = 2 * model.k_z / model.m * r.r + model.a * v_star - model.g
+    np.testing.assert_allclose(rest, r.r_ddot, rtol=1e-10)
+
+
+# --- feedback linearisation ---
+
+
+@MODELS
+def test_feedback_linearisation_makes_the_mechanics_linear(model):
+    law = default_law(position.FeedbackLinearisation, model)
+    random = np.random.default_rng(1)
+    for z, z_dot, r, r_dot, r_ddot in random.uniform(-0.5, 0.5, (50, 5)) * model.s_0 * [1, 100, 1, 100, 1e4]:
+        inputs = Measurement(z, z_dot, 0.0), Reference(r, r_dot, r_ddot)
+        v_star, _ = law(model, inputs, ())
+        if 4 * model.i_0**2 + 4 * model.s_0 * z * v_star <= 0:
+            continue  # no current gives this force
+        i = model.current_for(z, v_star)  # exact inversion
+        e_ddot = model.z_ddot(z, i) - r_ddot
+        # rounding of terms of some 1e3 m/s^2
+        np.testing.assert_allclose(e_ddot, -law.k_p * (z - r) - law.k_d * (z_dot - r_dot), rtol=1e-9, atol=1e-9)
+    # two poles at w/3
+    np.testing.assert_allclose(np.roots([1, law.k_d, law.k_p]), -model.pole / 3, rtol=1e-6)
