@@ -23,8 +23,6 @@ ambjax simulates, checks, tunes and exports the controller of a rotor in an acti
   ambjax export tuned/tuned.toml      write the controller as C
 
 'ambjax --help' lists all commands; 'ambjax COMMAND --help' lists the options of one."""
-# Entry-point group in which a package that depends on ambjax, such as the tuner, declares its command.
-EXTENSIONS = "ambjax.commands"
 
 
 class Parser(argparse.ArgumentParser):
@@ -58,7 +56,8 @@ def parser() -> Parser:
 
     command("reproduce", "run the paper: both scenarios, Figures 3 to 6 and the ledger of claims", out=True)
     template = command("template", "print an annotated case file")
-    template.add_argument("scenario", nargs="?", default="tracking", choices=["tracking", "regulation", "rig"])
+    cases = ["tracking", "regulation", "rig", "bearing"]
+    template.add_argument("scenario", nargs="?", default=cases[0], choices=cases)
     simulate = command("simulate", "simulate a case: trajectory.npz, metrics.json, overview.png", case=True, out=True)
     simulate.add_argument(
         "--member", type=int, metavar="K", help="simulate member K of the ensemble, with its values drawn from [spread]"
@@ -96,6 +95,14 @@ def parser() -> Parser:
         "--inject", action="store_true", help="also inject a multi-sine in continuous time; on a processor it always is"
     )
     _seed_option(sensitivity)
+    summary = "compare cases on the same members: compare.html, compare.json, compare.png"
+    compare = command("compare", summary, out=True)
+    compare.add_argument("cases", metavar="CASE.toml", nargs="+", help="two to eight case files")
+    compare.add_argument("--members", type=int, metavar="N", default=200, help="number of members (default: 200)")
+    compare.add_argument(
+        "--tune", action="store_true", help="first tune each case, with limits, loss and budget of the first's [tune]"
+    )
+    _seed_option(compare)
     export = command("export", "write the controller of a case with [processor] as C", case=True, out=True)
     export.add_argument("--verify", action="store_true", help="compare the C with JAX; exit code 1 if they differ")
     export.add_argument("--precision", choices=["float", "double"], default="float", help="C type of all numbers")
@@ -119,20 +126,21 @@ def main(argv: list[str] | None = None) -> int:
     """
     words = sys.argv[1:] if argv is None else argv
     if words[:1] == ["tune"]:
-        return _extension("tune")(words[1:], "ambjax tune")
+        return _tune(words[1:])
     open_streams()
     with exit_on_interrupt("ambjax"):
         return answer(parser(), words, _run)
 
 
-def _extension(name: str) -> Callable[[list[str], str], int]:
-    """Return the command that another package declares under `name`, or one that reports the missing package."""
-    import importlib.metadata
+def _tune(words: list[str]) -> int:
+    """Run the tuner's command, or report that it is missing."""
+    from ambjax.host.extensions import extension
 
-    found = tuple(importlib.metadata.entry_points(group=EXTENSIONS, name=name))
-    if found:
-        return found[0].load()
-    return lambda *_: complain(f"{name}: this command is not installed. Reinstall ambjax with pip.")
+    try:
+        tune = extension("tune")
+    except ValueError as error:
+        return complain(str(error))
+    return tune(words, "ambjax tune")
 
 
 def _run(args: argparse.Namespace) -> tuple[int, object]:

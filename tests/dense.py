@@ -14,18 +14,19 @@ GAUSS, WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
 class Integrals(Loop):
-    """The loop with the integrals of u, u^2 and the copper loss behind its states."""
+    """The loop with the integrals of u, u^2, the copper loss and i^2 behind its states."""
 
     def __init__(self, world):
         super().__init__(world)
-        self.scale = np.append(self.scale, [1e-2, 1.0, 1e-3])
+        self.scale = np.append(self.scale, [1e-2, 1.0, 1e-3, 1e-5])
 
     def start(self, noise):
-        return np.append(super().start(noise), [0.0, 0.0, 0.0])
+        return np.append(super().start(noise), [0.0, 0.0, 0.0, 0.0])
 
     def _rates(self, t, *y):
-        rates, signals = super()._rates(t, *y[:-3])
-        return (*rates, signals[0], signals[0] ** 2, 2 * self.true.R * (self.true.i_0**2 + y[2] ** 2)), signals
+        rates, signals = super()._rates(t, *y[:-4])
+        heat = 2 * self.true.R * (self.true.i_0**2 + y[2] ** 2)
+        return (*rates, signals[0], signals[0] ** 2, heat, y[2] ** 2), signals
 
 
 def metrics(world, samples, period, settle, noise=None, rtol=1e-9, numbers=None):
@@ -46,7 +47,7 @@ def metrics(world, samples, period, settle, noise=None, rtol=1e-9, numbers=None)
         return abs(y[0]) - stop
 
     touched.terminal = True
-    rows, squares, integrals, lost_at = [], [], {0.0: y[-3:]}, math.inf
+    rows, squares, integrals, lost_at = [], [], {0.0: y[-4:]}, math.inf
     for a, b in itertools.pairwise(cuts):
         middle = (a + b) / 2
         loop.held = noise[min(np.searchsorted(t, middle) - 1, samples - 1)].tolist()
@@ -63,13 +64,13 @@ def metrics(world, samples, period, settle, noise=None, rtol=1e-9, numbers=None)
             r = np.array([_reference(world.reference, at)[0] for at in nodes])
             squares.append((left, (right - left) / 2 * np.sum(WEIGHTS * (run.sol(nodes)[0] - r) ** 2)))
         y = run.y[:, -1]
-        integrals[b] = y[-3:]
+        integrals[b] = y[-4:]
         if run.status == 1:
             lost_at = float(run.t[-1])
             rest, y = math.copysign(stop, y[0]), y
             times = np.append(t[t > lost_at], t[-1])
             gone = np.array([rest - _reference(world.reference, at)[0] for at in times])
-            integrals = {at: x for at, x in integrals.items() if at < lost_at} | {lost_at: y[-3:]}
+            integrals = {at: x for at, x in integrals.items() if at < lost_at} | {lost_at: y[-4:]}
             return numbers(np.array(rows), squares, integrals, t, settle, stop, lost_at, (times, gone))
     return numbers(np.array(rows), squares, integrals, t, settle, stop, lost_at, None)
 
@@ -120,8 +121,10 @@ def _numbers(rows, squares, integrals, samples, settle, stop, lost_at, gone):
         "settled_rms_u_V": math.sqrt(max(total[1] - settled[1], 0.0) / max(driven - settle, 1e-30)),
         "chatter_V": float(np.abs(np.diff(means[edges[:-1] >= settle])).sum()),
         "max_abs_i_A": peak(i),
+        "rms_i_A": math.sqrt(total[3] / driven),
         "copper_loss_W": total[2] / driven,
         "clearance_used": max(peak(z), stop if gone is not None else 0.0) / stop,
+        "settled_clearance_used": max(peak(z, late), stop if gone is not None else 0.0) / stop,
         "refused": 0,
         "lost": gone is not None,
         "stalled": False,

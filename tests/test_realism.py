@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 import ambjax as amb
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
+from ambjax.commands.acceptance import machine
 from ambjax.commands.ensemble import study_of
 from ambjax.commands.warnings import warnings_of
 from ambjax.control.processor import Processor
@@ -278,6 +279,28 @@ def test_the_rig_holds_its_rotors_with_the_velocity_estimated():
     found = run_ensemble(case.cascade, dataclasses.replace(spread, plant=heavy), clock, fold=fold).measured
     assert np.isinf(found["lost_at_s"]).all()
     assert np.max(found["settled_rms_error_m"]) < 5e-7  # 0.25 um on average over 1,000, of which none is lost
+
+
+def test_the_bearing_of_the_data_sheet_is_plausible_and_without_warnings():
+    """The numbers of the sheet, a bias flux below 1.2 T, and a force of more than twice the weight."""
+    case = case_from(tomllib.loads(template("bearing")))
+    plant, scenario = case.scenario.plant, case.scenario
+    assert warnings_of(case) == []
+    assert (plant.m, plant.s_0, plant.i_0, scenario.u_max, scenario.sensor.bits) == (2.4, 5e-4, 2.0, 72.0, 14)
+    assert 1 / case.clock.sample_period == pytest.approx(16e3)
+    assert not scenario.sensor.velocity
+    assert [plant.m * term.amplitude for term in scenario.q_z.terms] == pytest.approx([20.0, 8.0], rel=1e-3)
+    facts = {fact.key: fact.value for fact in machine(case)}
+    assert facts["bias_flux_T"] < 1.2
+    assert facts["force_reserve"] > 2
+    clock = dataclasses.replace(case.clock, samples=2000)
+    spread = dataclasses.replace(scenario, initial=amb.Initial(z=np.array([-1e-4, 1e-4])), member=np.arange(2))
+    heavy = dataclasses.replace(spread.plant, m=plant.m * np.array([0.9, 1.1]))
+    found = run_ensemble(
+        case.cascade, dataclasses.replace(spread, plant=heavy), clock, fold=amb.Standard(0.05)
+    ).measured
+    assert np.isinf(found["lost_at_s"]).all()
+    assert np.max(found["settled_rms_error_m"]) < 2e-6  # 1.3 um on average
 
 
 def test_parts_can_be_spread():

@@ -8,7 +8,9 @@ import pytest
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
 from ambjax.linear import analyse, linearise
-from ambjax.pictures.frequency import NamedLoop, figure_of
+from ambjax.pictures.frequency import MeasuredPoints, NamedLoop, figure_of
+from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.rollout import rollout
 
 CASE = """
 [reference]
@@ -150,3 +152,43 @@ def test_the_injected_peak_stands_beside_the_linear_one(tmp_path, capsys):
     assert summary["injected_peak"] == pytest.approx(summary["injected_linear_there"], rel=0.02)
     code, out, _, _ = answered(tmp_path, capsys, PROCESSOR)
     assert "Injected into the simulation (multi-sine of 5e-05 m)" in out
+
+
+def test_the_picture_shows_the_injected_points(tmp_path):
+    """A phase that is whole turns away from the curve's is drawn beside the curve."""
+    path = tmp_path / "case.toml"
+    path.write_text(CASE)
+    case = read_case(path)
+    system = linearise(case.cascade, case.scenario, case.clock)
+    f = np.array([10.0, 50.0, 200.0])
+    H = system.response(f)
+    measured = MeasuredPoints(f, H[:, 0, 0], H[:, 0, 0] - 1, H[:, 2, 0])
+    loop = NamedLoop("nominal", system, 0.588, 0.02)
+    axes = figure_of("x", [loop], [3.0, 4.0, 5.0], (1.0, 500.0), measured).axes
+    points = {
+        ax.get_ylabel(): next((line for line in ax.get_lines() if line.get_label() == "injected"), None) for ax in axes
+    }
+    assert points.pop("dynamic stiffness, N/m") is None
+    shown = {label: line.get_xydata() for label, line in points.items()}
+    assert shown["|S|"][:, 1] == pytest.approx(np.abs(measured.S))
+    assert shown["|KS|, V/m"][:, 1] == pytest.approx(np.abs(measured.KS))
+    L = 1 / measured.S - 1
+    assert shown["imaginary part of L"] == pytest.approx(np.stack([L.real, L.imag], axis=1))
+    curve = next(ax for ax in axes if ax.get_ylabel() == "phase of L, degrees").get_lines()[0].get_xydata()
+    # the curve has 1200 points: between two of them its phase is linear to 0.01 degrees
+    assert shown["phase of L, degrees"][:, 1] == pytest.approx(np.interp(f, *curve.T), abs=0.01)
+
+
+def test_check_gives_the_zone_of_the_clearance(tmp_path, capsys):
+    """The reference moves the rotor by 1 mm of the 4.5 mm, 22 %: above clearance_b, below clearance_c."""
+    path = tmp_path / "case.toml"
+    limits = "clearance_a = 0.1\nclearance_b = 0.2\n"
+    path.write_text(f"{CASE}{limits}[clock]\nduration = 0.4\n[run]\nsettle = 0.3\n")
+    main(["check", str(path), "--json"])
+    found = json.loads(capsys.readouterr().out)
+    case = read_case(path)
+    fold = standard_for(case.settle, case.scenario)
+    used = rollout(case.cascade, case.scenario, case.clock, fold=fold, every=0).measured["settled_clearance_used"]
+    assert found["clearance_used"] == pytest.approx(float(used), rel=1e-3)  # extremes of other steps
+    assert found["clearance_used"] == pytest.approx(1 / 4.5, rel=0.03)  # the error of tracking
+    assert found["clearance_zone"] == "C"

@@ -8,7 +8,7 @@ import pytest
 from texts import case_and_tune
 
 from ambjax.cases.tune_table import NUMBERS, WEIGHTS, Budget
-from tuning.config import LIMIT, SHARES
+from tuning.config import LIMIT, SHARES, read_tune
 from tuning.objective.loss import TERMS
 from tuning.objective.quantities import KINDS
 
@@ -72,3 +72,22 @@ def test_whole_numbers_and_bounds_of_tune_have_both_ends():
     ):
         with pytest.raises(ValueError, match=r"^tune\.bounds\.controller\.position\.c = .*0 <= low < high <= 1e\+30"):
             parsed(bounds(*ends))
+
+
+def test_settings_are_those_of_another_case_but_for_its_gains(tmp_path):
+    """Gains and bounds belong to the laws of a case; limits, loss and budget may be another's."""
+    own, other = tmp_path / "own.toml", tmp_path / "other.toml"
+    own.write_text(
+        '[tune]\ngains = ["controller.position.c"]\nmembers = 5\nbounds.controller.position.c = [1.0, 9.0]\n'
+        "[tune.limits]\nmax_u_V = 1.0\n"
+    )
+    other.write_text("[tune]\nseed = 7\nweights.effort = 2.0\n[tune.limits]\nrms_u_V = 8.0\n")
+    _, tune, raw = read_tune(own, other)
+    assert [(gain.path, gain.low, gain.high) for gain in tune.space.gains] == [("controller.position.c", 1.0, 9.0)]
+    assert [(limit.name, limit.threshold) for limit in tune.limits.each] == [("rms_u_V", 8.0)]
+    assert (tune.budget.seed, tune.budget.members, tune.weights[TERMS.index("effort")]) == (7, Budget().members, 2.0)
+    assert raw["tune"]["seed"] == 7  # as a checkpoint records it
+    assert len(read_tune(other, own)[1].space.gains) > 1
+    own.write_text("tune = 3\n")
+    with pytest.raises(ValueError, match=r"own\.toml: tune = 3"):
+        read_tune(own, other)

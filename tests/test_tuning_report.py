@@ -17,6 +17,7 @@ from texts import problem_from
 
 from ambjax import rollout
 from ambjax.cases.reader import safe_name
+from ambjax.host.web_page import literal, page
 from ambjax.simulation.metrics import Standard
 from ambjax.simulation.trajectory import STALLED, TOUCHED
 from tuning.__main__ import main
@@ -27,7 +28,6 @@ from tuning.objective.loss import TERMS, weigh
 from tuning.report import accurate, breakdown, extras, gradient, held_out, pictures
 from tuning.report import document as report
 from tuning.report.facts import SHOWN
-from tuning.report.page import literal, page
 from tuning.search.explore import REACH, Slices, slices
 from tuning.search.rounds import training
 

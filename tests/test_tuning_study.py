@@ -294,7 +294,7 @@ def command(monkeypatch, tmp_path, world, *flags, **tune):
     path.write_text(dumps(document(**tune)))
     names = ("--gradients", "--pareto")
     given = {name.removeprefix("--"): name in flags for name in names}
-    args = argparse.Namespace(case=str(path), out=str(out), resume=False, json=True, **given)
+    args = argparse.Namespace(case=str(path), out=str(out), settings_of=None, resume=False, json=True, **given)
     code, summary = tuning.command.run(args)
     assert json.loads(json.dumps(summary)) is not None
     return code, summary, out, made

@@ -22,6 +22,11 @@ def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
     top.add_argument("--resume", action="store_true", help="go on with the search whose checkpoint is in --out")
     top.add_argument("--gradients", action="store_true", help="report the gradient itself too: a minute more")
     top.add_argument("--pareto", action="store_true", help="trace the front of error against voltage too")
+    top.add_argument(
+        "--settings-of",
+        metavar="OTHER.toml",
+        help="limits, loss and budget are those of [tune] in OTHER.toml; gains and bounds stay those of the case",
+    )
     top.add_argument("--json", action="store_true", help="print report.json on stdout and nothing else there")
     top.add_argument("--version", action="version", version=f"ambjax {__version__}")
     return top

@@ -12,13 +12,13 @@ from ambjax.commands.warnings import print_warnings
 from ambjax.control.cascade import Cascade
 from ambjax.host.interrupts import reporting
 from ambjax.host.lock import locked
+from ambjax.host.web_page import page
 from tuning.config import read_tune, settings
 from tuning.problem import TuningProblem, problem_of
 from tuning.report import accurate, pictures
 from tuning.report import document as report
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.judging import examined
-from tuning.report.page import page
 from tuning.report.tuned import tuned_case
 from tuning.search.course import SearchResult
 from tuning.search.explore import Slices
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> tuple[int, Row]:
 
 def _plan(args: argparse.Namespace) -> TuningPlan:
     """Read the case and make the output directory. Raises ValueError for a case or option that cannot be met."""
-    case, tune, raw = read_tune(args.case)
+    case, tune, raw = read_tune(args.case, args.settings_of)
     if args.resume and not (args.out and begun(pathlib.Path(args.out))):
         raise ValueError(f"--resume: there is no search in --out {args.out}. Check --out, or leave out --resume.")
     print_warnings(case, args.case)

@@ -32,6 +32,8 @@ from tuning.optimisers import NAMES
 from tuning.space import CLOSEST, Gain, Space, tunable
 
 WORDS = ["gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
+# Keys of [tune] that depend on the laws of the case.
+LAWS_OWN = ("gains", "bounds")
 LIMIT: dataclasses.Field = leaf(at_least=1e-12, at_most=1e12, infinite=True)
 SHARES: dict[str, dataclasses.Field] = {"clearance_used": leaf(above=0, at_most=1), "survival": SURVIVAL}
 LENGTH: dataclasses.Field = leaf(at_least=1e-12, at_most=1.0, unit="m")
@@ -71,15 +73,31 @@ class Tune:
     budget: Budget
 
 
-def read_tune(path: str | pathlib.Path) -> tuple[Case, Tune, dict[str, Any]]:
-    """Return the case, [tune] and the raw document of a case file. Raises ValueError, one line, for an invalid file."""
+def read_tune(
+    path: str | pathlib.Path, settings_of: str | pathlib.Path | None = None
+) -> tuple[Case, Tune, dict[str, Any]]:
+    """Return the case, [tune] and the raw document of a case file.
+
+    `settings_of`: a case file whose [tune] applies instead of the case's own, except for its gains and bounds. Raises
+    ValueError, one line, for an invalid file.
+    """
     raw, text = load(path)
     name = pathlib.Path(path).stem
+    if settings_of is not None:
+        raw = {**raw, "tune": _merged(raw.get("tune", {}), load(settings_of)[0].get("tune", {}))}
     try:
         case = case_from(raw, name, text, pathlib.Path(path).parent)
         return case, tune_from(Table(raw).table("tune"), case), raw
     except ValueError as error:
         raise ValueError(one_line(f"{path}: {error}")) from None
+
+
+def _merged(own: Any, other: Any) -> Any:
+    """Return the table [tune] `other` with the gains and bounds of `own`; `own` if either is no table."""
+    if not (isinstance(own, dict) and isinstance(other, dict)):
+        return own
+    kept = {key: value for key, value in own.items() if key in LAWS_OWN}
+    return kept | {key: value for key, value in other.items() if key not in LAWS_OWN}
 
 
 def tune_from(table: Table, case: Case) -> Tune:

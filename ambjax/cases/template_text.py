@@ -4,14 +4,15 @@ import dataclasses
 import math
 
 from ambjax.cases import tune_table
+from ambjax.cases.data_sheet import BEARING
 from ambjax.cases.reader import KINDS, PLANTS, SIGNALS
 from ambjax.cases.rig import RIG
 from ambjax.ensemble.design import DESIGNS
 from ambjax.paper.readings import PULSE, REFERENCE, TABLE_2
 from ambjax.world.plant import Plant
 
-# The templates: the paper's two scenarios, and a laboratory bearing.
-SCENARIOS = ("tracking", "regulation", "rig")
+# Templates of machines other than the paper's, by name: a laboratory bearing, and a bearing from a data sheet.
+MACHINES = {"rig": RIG, "bearing": BEARING}
 HEAD = """\
 # A case for ambjax: {title}.
 # Units are SI. A key left out takes the value shown here unless its comment says otherwise.
@@ -145,9 +146,9 @@ def _number(value: float) -> str:
 
 
 def template(scenario: str) -> str:
-    """Return an annotated case file: the paper's "tracking" or "regulation" with repaired gains, or the "rig"."""
-    if scenario == "rig":
-        return RIG
+    """Return an annotated case file: the paper's "tracking" or "regulation" with repaired gains, or one of MACHINES."""
+    if scenario in MACHINES:
+        return MACHINES[scenario]
     tracking = scenario == "tracking"
     lines = [HEAD.format(title=f"the paper's {scenario} scenario, Table 2 with gamma = 7.5e4")]
     kinds = _with_note('# kind = "lumped"', f"Eqs. (1), (2); or {_others(PLANTS)}: each coil's own current")

@@ -5,6 +5,8 @@ import dataclasses
 import math
 from collections.abc import Mapping
 
+import numpy as np
+
 from ambjax.cases.reader import Case
 from ambjax.commands.acceptance import acceptance
 from ambjax.commands.outputs import plain, table
@@ -31,7 +33,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     from ambjax.theorem import advice
 
     case = read_with_warnings(args.case)
-    report = check(case.cascade, case.scenario, case.clock)
+    report = check(case.cascade, case.scenario, case.clock, case.settle)
     summary = {
         "holds": report.holds,
         "lost_at_s": report.lost_at,
@@ -47,6 +49,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         print(text)
     if case.cascade.processor is not None:
         summary |= _on_processor(case, args)
+    else:
+        summary |= _clearance(case, args, report.largest_z)
     if not args.json:
         print("\nTheorem 1:\n")
         _print_check(report.conditions, report.proof)
@@ -73,6 +77,7 @@ def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
         print("\n" + "\n".join(advice.on_processor(sampled, margin, unknown)))
     slopes = [dataclasses.asdict(slope) | {"holds": slope.holds} for slope in sampled.slopes]
     return {
+        **_clearance(case, args, sampled.largest_z),
         "holds": sampled.holds,
         "processor": {
             "lost_at_s": sampled.lost_at,
@@ -88,6 +93,21 @@ def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
             "delay_margin_unknown": None if unknown is None else _margin(unknown),
         },
     }
+
+
+def _clearance(case: Case, args: argparse.Namespace, largest: float | None) -> Summary:
+    """Print the zone of the largest |z| after run.settle (m), and return it; nothing for a rotor that is lost."""
+    if largest is None:
+        return {"clearance_used": None, "clearance_zone": "D"}
+    used = largest / float(np.min(np.asarray(case.scenario.touchdown)))
+    zone, zones = case.zones.clearance_zone(used), case.zones
+    if not args.json:
+        print(
+            f"\nClearance: zone {zone}. After run.settle |z| reaches {largest:.4g} m, {100 * used:.3g} % of the "
+            f"clearance (A below {100 * zones.clearance_a:g} %, B below {100 * zones.clearance_b:g} %, C below "
+            f"{100 * zones.clearance_c:g} %)."
+        )
+    return {"clearance_used": used, "clearance_zone": zone}
 
 
 def _margin(margin: Delays) -> Mapping[str, object]:

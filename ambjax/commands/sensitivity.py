@@ -4,56 +4,36 @@ import argparse
 import dataclasses
 import math
 import pathlib
-from typing import NamedTuple
 
 import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.commands.ensemble import study_of
+from ambjax.commands.operating import MEMBERS, OperatingPoint, SpreadPeaks, numbers_of, operating_point, spread_peaks
 from ambjax.commands.outputs import directory, files, plain, table, write_json, written
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.control.base import hard_signs
 from ambjax.control.cascade import USUAL
 from ambjax.ensemble.study import Study
-from ambjax.linear import Analysis, Injection, StateSpace, analyse, injected, linearise, linearise_members, lines
+from ambjax.linear import Injection, injected, lines
 
 WRITTEN = ("sensitivity.json", "sensitivity.png")
-# Members of [spread] that are analysed without --members; members of the injection, which differ in the noise.
-MEMBERS, INJECTED = 100, 8
-
-
-class OperatingPoint(NamedTuple):
-    """An analysed loop: its name, the reference r (m) of its equilibrium, its mass m (kg), matrices and analysis."""
-
-    name: str
-    r: float
-    m: float
-    system: StateSpace
-    analysis: Analysis
-
-
-class SpreadPeaks(NamedTuple):
-    """Members of the case's spread: their number, and how many are stable and in zone A; the worst of them."""
-
-    members: int
-    stable: int
-    zone_a: int
-    worst: int
-    point: OperatingPoint | None
+# Members of the injection, which differ in the noise.
+INJECTED = 8
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     """Analyse the loop of a case. Exit code 1 if the nominal loop, or one of its members, is not stable."""
     case = read_with_warnings(args.case)
     study = _study(case, args)
-    points = [_point(case, name, r) for name, r in references(case)]
-    spread = None if study is None else _spread(case, study)
+    points = [operating_point(case, name, r) for name, r in references(case)]
+    spread = None if study is None else spread_peaks(case, study)
     measured = _injected(case, points[0]) if args.inject or case.cascade.processor is not None else None
     out = directory(args.out, f"sensitivity-{case.name}", WRITTEN)
     summary = _summary(points, spread, measured)
     with files(out) as part:
         write_json(part / "sensitivity.json", summary)
-        _draw(case, points, spread, part / "sensitivity.png")
+        _draw(case, points, spread, measured, part / "sensitivity.png")
     if not args.json:
         print(_text(case, points, spread, measured))
         written(out, ", ".join(WRITTEN))
@@ -68,18 +48,6 @@ def references(case: Case) -> list[tuple[str, float]]:
     size = float(np.max(np.abs(r)))
     ends = [] if size == 0 else [("at +reference", size), ("at -reference", -size)]
     return [("nominal", 0.0), *ends]
-
-
-def _point(case: Case, name: str, r: float) -> OperatingPoint:
-    system = linearise(case.cascade, case.scenario, case.clock, r)
-    m = float(case.scenario.plant.m)
-    return OperatingPoint(name, r, m, system, _analysis(case, system, m))
-
-
-def _analysis(case: Case, system: StateSpace, m: float) -> Analysis:
-    sensor = case.scenario.sensor
-    measured = (sensor is None or sensor.velocity) and not case.cascade.observer.estimates_velocity
-    return analyse(system, m, case.clock.sample_period, case.zones, measured)
 
 
 def _injected(case: Case, point: OperatingPoint) -> Injection:
@@ -101,60 +69,15 @@ def _study(case: Case, args: argparse.Namespace) -> Study | None:
     return study_of(case, args.seed, MEMBERS if args.members is None else args.members)
 
 
-def _spread(case: Case, study: Study) -> SpreadPeaks:
-    """Analyse every member of the study, and return the counts and the member with the largest peak."""
-    cascade, scenario = study.batch(np.arange(study.members))
-    systems, found = linearise_members(cascade, scenario, study.clock)
-    peaks, good = np.full(study.members, math.inf), np.zeros(study.members, bool)
-    masses = np.broadcast_to(np.asarray(scenario.plant.m, float), (study.members,))
-    analyses: list[Analysis | None] = []
-    loops: list[StateSpace] = []
-    for k in range(study.members):
-        loops.append(StateSpace(*(None if x is None else np.asarray(x)[k] for x in systems)))  # pyright: ignore
-        one = _analysis(case, loops[k], float(masses[k])) if found[k] else None
-        analyses.append(one)
-        if one is not None and one.stable:
-            peaks[k], good[k] = one.S.height, True
-    worst, zone_a = int(np.argmax(peaks)), sum(one is not None and one.stable and one.zone == "A" for one in analyses)
-    one = analyses[worst]
-    point = None if one is None else OperatingPoint(f"member {worst}", 0.0, float(masses[worst]), loops[worst], one)
-    return SpreadPeaks(study.members, int(good.sum()), int(zone_a), worst, point)
-
-
-def _numbers(one: Analysis) -> dict[str, object]:
-    """Return the numbers of an analysis by their names in the JSON summary."""
-    margins = one.margins
-    return {
-        "stable": one.stable,
-        "peak": one.S.height,
-        "frequency_hz": one.S.frequency,
-        "zone": one.zone,
-        "t_peak": one.T.height,
-        "t_frequency_hz": one.T.frequency,
-        "ks_peak": one.KS.height,
-        "ks_frequency_hz": one.KS.frequency,
-        "velocity_peak": None if one.S_velocity is None else one.S_velocity.height,
-        "gain_margin": margins.gain,
-        "gain_margin_low": margins.gain_low,
-        "gain_margin_high": margins.gain_high,
-        "phase_margin_deg": margins.phase_deg,
-        "delay_margin_s": margins.delay,
-        "disk_margin": margins.disk,
-        "static_stiffness_N_per_m": one.stiffness,
-        "noise_gain": one.noise,
-        "poles_per_s": [[float(pole.real), float(pole.imag)] for pole in one.poles],
-    }
-
-
 def _summary(points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injection | None) -> dict[str, object]:
-    rows = [{"point": point.name, "reference_m": point.r, **_numbers(point.analysis)} for point in points]
+    rows = [{"point": point.name, "reference_m": point.r, **numbers_of(point.analysis)} for point in points]
     summary: dict[str, object] = {
-        **_numbers(points[0].analysis),
+        **numbers_of(points[0].analysis),
         **_injected_numbers(points[0], measured),
         "points": rows,
     }
     if spread is not None:
-        worst = {} if spread.point is None else _numbers(spread.point.analysis)
+        worst = {} if spread.point is None else numbers_of(spread.point.analysis)
         counts = {"members": spread.members, "stable": spread.stable, "zone_a": spread.zone_a}
         summary["spread"] = {**counts, "worst_member": spread.worst, **({"worst": worst} if worst else {})}
     return summary
@@ -255,7 +178,13 @@ def _number(x: float) -> str:
     return "none" if math.isinf(x) else f"{x:.4g}"
 
 
-def _draw(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None, path: pathlib.Path) -> None:
+def _draw(
+    case: Case,
+    points: list[OperatingPoint],
+    spread: SpreadPeaks | None,
+    measured: Injection | None,
+    path: pathlib.Path,
+) -> None:
     from ambjax.pictures import frequency
 
     shown = [point for point in points if point.analysis.stable]
@@ -264,4 +193,7 @@ def _draw(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None, 
     loops = [frequency.NamedLoop(point.name, point.system, point.m, point.analysis.margins.disk) for point in shown]
     limits = [float(x) for x in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
     low, high = case.zones.range(None if case.cascade.processor is None else case.clock.sample_period)
-    frequency.sensitivity(case.name, loops, limits, (low, high), path)
+    injected_points = None
+    if measured is not None and measured.S is not None and measured.T is not None and measured.KS is not None:
+        injected_points = frequency.MeasuredPoints(measured.frequency, measured.S, measured.T, measured.KS)
+    frequency.sensitivity(case.name, loops, limits, (low, high), path, injected_points)

@@ -23,6 +23,15 @@ LOWEST = 0.01
 WINDOW = 3.0
 
 
+class MeasuredPoints(NamedTuple):
+    """Responses measured at some frequencies [L] (Hz): S, T (1) and KS (V/m), complex [L]."""
+
+    frequency: np.ndarray
+    S: np.ndarray
+    T: np.ndarray
+    KS: np.ndarray
+
+
 class NamedLoop(NamedTuple):
     """A linearised loop with its name, its mass (kg) and its disk margin."""
 
@@ -34,17 +43,29 @@ class NamedLoop(NamedTuple):
 
 @own_style
 def sensitivity(
-    title: str, loops: Sequence[NamedLoop], limits: Sequence[float], span: tuple[float, float], path: pathlib.Path
+    title: str,
+    loops: Sequence[NamedLoop],
+    limits: Sequence[float],
+    span: tuple[float, float],
+    path: pathlib.Path,
+    measured: MeasuredPoints | None = None,
 ) -> None:
     """Write the picture of `figure_of` to a file."""
-    figure_of(title, loops, limits, span).savefig(path, dpi=110)
+    figure_of(title, loops, limits, span, measured).savefig(path, dpi=110)
 
 
 @own_style
-def figure_of(title: str, loops: Sequence[NamedLoop], limits: Sequence[float], span: tuple[float, float]) -> Figure:
+def figure_of(
+    title: str,
+    loops: Sequence[NamedLoop],
+    limits: Sequence[float],
+    span: tuple[float, float],
+    measured: MeasuredPoints | None = None,
+) -> Figure:
     """Return a picture: |S| with zones, |T|, |KS|, dynamic stiffness, Nyquist curve with the disk, Bode plot of L.
 
-    `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz.
+    `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz. `measured`: points that
+    are drawn with the curves, of the nominal loop.
     """
     figure = Figure(figsize=(12, 11), layout="constrained")
     left = figure.add_gridspec(4, 2)
@@ -64,7 +85,16 @@ def figure_of(title: str, loops: Sequence[NamedLoop], limits: Sequence[float], s
         nyquist_axes.plot(L.real, L.imag, **style)
         gain_axes.loglog(f, np.abs(L), **style)
         phase_axes.semilogx(f, np.degrees(np.unwrap(np.angle(L))), **style)
-    _zones(S_axes, limits)
+    if measured is not None:
+        L = 1 / measured.S - 1
+        points = {"color": INK, "marker": "o", "markersize": 3, "linestyle": "", "label": "injected"}
+        for ax, x in ((S_axes, measured.S), (T_axes, measured.T), (KS_axes, measured.KS), (gain_axes, L)):
+            ax.loglog(measured.frequency, np.abs(x), **points)
+        nyquist_axes.plot(L.real, L.imag, **points)
+        phase_axes.semilogx(
+            measured.frequency, _near(np.degrees(np.angle(L)), measured.frequency, phase_axes), **points
+        )
+    shade_zones(S_axes, limits)
     _nyquist(nyquist_axes, loops)
     gain_axes.axhline(1.0, color=INK, linewidth=0.8)
     labels = {
@@ -86,7 +116,15 @@ def figure_of(title: str, loops: Sequence[NamedLoop], limits: Sequence[float], s
     return figure
 
 
-def _zones(ax: Axes, limits: Sequence[float]) -> None:
+def _near(phase: np.ndarray, f: np.ndarray, ax: Axes) -> np.ndarray:
+    """Return phases [L] (degrees), shifted by whole turns to the first curve of the axes if it has one."""
+    if not (curves := ax.get_lines()):
+        return phase
+    there = np.interp(f, *np.asarray(curves[0].get_xydata()).T)
+    return phase + 360 * np.round((there - phase) / 360)
+
+
+def shade_zones(ax: Axes, limits: Sequence[float]) -> None:
     """Shade the zones of |S|, and name each at the right edge."""
     low, high = max(ax.get_ylim()[0], LOWEST), max(ax.get_ylim()[1], 1.6 * limits[-1])
     edges = [low, *limits, high]

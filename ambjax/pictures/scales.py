@@ -45,8 +45,8 @@ def size_of(values: np.ndarray, log: bool = False) -> float:
 
 def axis_of(metric: str, size: float) -> tuple[float, str, str]:
     """Return factor, label and unit of a metric's axis: (1e6, "rms error", "µm") for rms_error_m of size 2e-5."""
-    if metric == "clearance_used":
-        return 100.0, "clearance used", "%"
+    if metric.endswith("clearance_used"):
+        return 100.0, metric.replace("_", " "), "%"
     if metric == "refused":
         return 1.0, "refused readings", "samples"
     suffix = next((suffix for suffix in SUFFIXES if metric.endswith(suffix)), "")

@@ -97,17 +97,18 @@ class Lowest:
 
 @record
 class Rms:
-    """Root mean square of the signal `of` over the samples from `after` (s) on."""
+    """Root mean square of the signal `of` over the samples from `after` (s) on; if `driven`, while the drive is on."""
 
     of: str = static()
     after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
+    driven: bool = static(default=False)
 
     def init(self) -> tuple[Array, Array]:
         return _zero(), _zero()
 
     def update(self, carry: tuple[Array, Array], row: Row, span: Span) -> tuple[Array, Array]:
         total, count = carry
-        counts = row.t >= self.after
+        counts = (row.t >= self.after) & (row.alive if self.driven else True)
         return total + jnp.where(counts, getattr(row, self.of) ** 2, 0.0), count + counts
 
     def result(self, carry: tuple[Array, Array], ending: Ending) -> Array:

@@ -20,7 +20,7 @@ class Standard:
     """The metrics of metrics.json: a dict of numbers whose names include their units.
 
     - `settle`: start of the evaluation of the settled metrics, s.
-    - `touchdown`: clearance, m; the unit of `clearance_used`.
+    - `touchdown`: clearance, m; the unit of `clearance_used` and `settled_clearance_used`.
     - `sigma_band`, `v_tilde_band`, `e_band`: a signal within its band counts as having reached zero.
 
     The defaults are for the plant of Table 1; `standard_for` scales them to another plant.
@@ -54,8 +54,10 @@ class Standard:
                 "settled_rms_u_V": Driven("u_squared", late, root=True),
                 "chatter_V": Variation(late),
                 "max_abs_i_A": Peak("i"),
+                "rms_i_A": Rms("i", driven=True),
                 "copper_loss_W": Driven("heat"),
                 "clearance_used": Peak("z"),
+                "settled_clearance_used": Peak("z", late),
                 "refused": Count("refused"),
             }
         )
@@ -68,7 +70,8 @@ class Standard:
 
     def result(self, carry: dict[str, object], ending: Ending) -> dict[str, Array]:
         numbers = self._folds().result(carry, ending)
-        numbers["clearance_used"] = numbers["clearance_used"] / self.touchdown
+        for name in ("clearance_used", "settled_clearance_used"):
+            numbers[name] = numbers[name] / self.touchdown
         status = {
             "lost": (ending.lost_code != ALIVE) & (ending.lost_code != STALLED),
             "stalled": ending.lost_code == STALLED,

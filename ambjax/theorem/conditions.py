@@ -62,6 +62,8 @@ class Report:
     lost_why: str
     method: str
     stalled: bool = False
+    largest_z: float | None = None
+    """largest |z| after `settle`, m; None if the run ends early"""
 
     @property
     def lost(self) -> bool:
@@ -109,16 +111,19 @@ class Required(NamedTuple):
     value: Any
 
 
-MONITORS = Named(
-    {name: Peak(name, timed=True) for name in ("q_z", "q_i", "d", "q_z_plus_h", "sigma_off", "v_tilde_off", "e_off")}
-    | {name: Lowest(name) for name in ("distance", "V_margin")}
-)
+PEAKS = ("q_z", "q_i", "d", "q_z_plus_h", "sigma_off", "v_tilde_off", "e_off")
 
 
-def check(cascade: Cascade, scenario: Scenario, clock: Clock) -> Report:
+def _monitors(settle: float) -> Named:
+    """Return the folds of a run: extremes of the monitored signals, and the largest |z| from `settle` (s) on."""
+    peaks = {name: Peak(name, timed=True) for name in PEAKS} | {"z": Peak("z", settle, timed=True)}
+    return Named(peaks | {name: Lowest(name) for name in ("distance", "V_margin")})
+
+
+def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.0) -> Report:
     """Simulate the loop once in continuous time and evaluate the conditions of Theorem 1 along the run.
 
-    A processor is ignored. Raises ValueError as `rollout` does.
+    A processor is ignored. `settle`: start of the evaluation of |z|, s. Raises ValueError as `rollout` does.
     """
     check_inputs(cascade, scenario, clock)
     if cascade.processor is not None:
@@ -127,13 +132,14 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock) -> Report:
     loop: Any
     loop, clock = prepare(cascade, scenario, clock)
     method = str(clock.method)
-    system, clock, fold = canonical((Monitored(loop), clock, MONITORS))
+    system, clock, fold = canonical((Monitored(loop), clock, _monitors(settle)))
     trajectory, extremes = roll(system, clock, fold, every=0)
     worst = {name: (float(value), float(at)) for name, (value, at) in extremes.items()}
     on_reference = delta_1_on_reference(cascade, scenario, clock)
     conditions = _conditions(cascade, worst, on_reference)
-    code = int(trajectory.lost_code)
-    return Report(conditions, _proof(worst), float(trajectory.lost_at), STATUSES[code], method, code == STALLED)
+    code, lost_at = int(trajectory.lost_code), float(trajectory.lost_at)
+    largest = worst["z"][0] if math.isinf(lost_at) else None
+    return Report(conditions, _proof(worst), lost_at, STATUSES[code], method, code == STALLED, largest)
 
 
 def delta_1_on_reference(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[float, float]:

@@ -89,7 +89,8 @@ class SampledReport:
     `distance`: smallest distance of (z/s_0, i_ref/i_0) to the singular curve C at the samples (negative beyond C), and
     its time (s). `alternating`: share of the voltage's rms that changes sign from sample to sample, without noise,
     after `settle`; None if that run ends early. `bands`: of the runs that do not end early. `stalled`: whether the
-    integrator stalled at `lost_at`; the rotor's status is then unknown.
+    integrator stalled at `lost_at`; the rotor's status is then unknown. `largest_z`: largest |z| (m) at the samples
+    after `settle`; None if the run ends early.
     """
 
     slopes: list[SlopeCheck]
@@ -99,6 +100,7 @@ class SampledReport:
     stalled: bool = False
     distance: tuple[float, float] = (math.inf, 0.0)
     alternating: float | None = None
+    largest_z: float | None = None
 
     @property
     def alternates(self) -> bool:
@@ -165,6 +167,7 @@ def check(
         stalled,
         _least(outcome),
         alternating,
+        _peak(np.asarray(outcome.rows.z)[settled:]) if np.isinf(outcome.lost_at) else None,
     )
 
 

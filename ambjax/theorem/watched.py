@@ -22,7 +22,7 @@ class WatchedSignals(NamedTuple):
 
 
 class WatchedRow(NamedTuple):
-    """One sample: time (s), limited voltage (V), signals, and the signed distance of (z/s_0, i_ref/i_0) to C.
+    """One sample: time (s), limited voltage (V), z (m), signals, and the signed distance of (z/s_0, i_ref/i_0) to C.
 
     `computed`: signals that the laws compute from the estimate (with prediction: at the end of the delay). `true`:
     signals of the plant at the sample. The distance to the singular curve C is negative beyond it.
@@ -30,6 +30,7 @@ class WatchedRow(NamedTuple):
 
     t: Array
     u: Array
+    z: Array
     computed: WatchedSignals
     true: WatchedSignals
     distance: Array
@@ -93,6 +94,7 @@ class Watched:
         return WatchedRow(
             row.t,
             row.u,
+            row.z,
             state.computed,
             WatchedSignals(row.sigma, row.v_tilde, row.e),
             plant.signed_distance_to_C(row.z, row.i_ref),

@@ -37,7 +37,10 @@ OTHERS = {
     "trajectory_deviation": "with --member: largest relative difference between the ensemble's metrics and those of "
     "trajectory.npz",
 }
-SHARE = {"clearance_used": "z as a share of the clearance"}
+SHARE = {
+    "clearance_used": "z as a share of the clearance",
+    "settled_clearance_used": "z as a share of the clearance",
+}
 UNIT = re.compile(r"_(m_per_s|A2_per_m2|m|s|V|A|W)$")
 UNITS = {"m_per_s": "m/s", "A2_per_m2": "A^2/m^2"}
 
@@ -74,6 +77,7 @@ def _meaning(name: str, fold: Any) -> str:
     of = getattr(fold, "of", "u_mean")
     signal = SHARE.get(name) or MEANINGS.get(of) or attribute_docs(Row)[of].rpartition(", ")[0]
     how = f"root of the {FOLDS[type(fold)]}, of the square" if getattr(fold, "root", False) else FOLDS[type(fold)]
+    how += ", while the drive is on" * getattr(fold, "driven", False)
     return f"{how}: {signal}{', from `run.settle` on' if getattr(fold, 'after', 0.0) else ''}"
 
 

@@ -1,11 +1,11 @@
 """The report of a search in Markdown, from its facts."""
 
+from ambjax.host.web_page import literal, table
 from tuning.objective.loss import TERMS
 from tuning.report import extras, held_out, limit_table
 from tuning.report.breakdown import FORMULA
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.held_out import number
-from tuning.report.page import literal, table
 
 # Relative improvement below which a point of a slice counts as equal to the answer.
 AS_GOOD = 0.01

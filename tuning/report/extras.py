@@ -2,8 +2,8 @@
 
 from typing import Any
 
+from ambjax.host.web_page import table
 from tuning.report.gradient import AGREE, AGREED, MODES, STEADY, STEP
-from tuning.report.page import table
 
 Facts = dict[str, Any]
 

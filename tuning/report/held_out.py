@@ -2,8 +2,8 @@
 
 import math
 
+from ambjax.host.web_page import table
 from tuning.report.facts import SHOWN, Row, TuningFacts
-from tuning.report.page import table
 
 
 def number(x: float | None, form: str = ".5g") -> str:

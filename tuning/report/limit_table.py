@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
+from ambjax.host.web_page import table
 from tuning.config import LimitSettings
 from tuning.objective.limits import Limit
-from tuning.report.page import table
 
 Facts = dict[str, Any]
 # Relative increase of a limit for which the effect is computed.

@@ -1,0 +1,90 @@
+"""Annotated case file of a bearing from a data sheet: the numbers an engineer is given, and those to be assumed."""
+
+BEARING = """\
+# A case for ambjax: a radial magnetic bearing from a data sheet, on a 16 kHz processor, its rotor standing still.
+# Units are SI. 'ambjax template' lists every other key. Run it with 'ambjax simulate', tune it with 'ambjax tune'.
+# "Data sheet": a number that a bearing is specified by. "Assumed": one that the sheet leaves out, chosen so that the
+# magnet is plausible: a bias flux of 0.75 T, 15 times the rotor's weight, 23 mH. 'ambjax check' prints these.
+
+[plant]
+m = 2.4                       # kg; data sheet
+k_z = 0.0                     # N/m; no passive bearing
+mu_0 = 1.2566e-6              # N/A^2; air
+n = 300.0                     # 1; assumed: 2 x 150 turns
+A = 2.0e-4                    # m^2; assumed: 2.2 cm^2 per pole times cos(22.5 degrees), the angle of a pole to the axis
+s_0 = 5e-4                    # m; data sheet
+i_0 = 2.0                     # A; data sheet: bias
+R = 1.0                       # ohm; assumed: 300 turns of about 0.08 m of wire 0.8 mm thick, warm
+g = 9.81                      # m/s^2
+
+[controller.observer]         # data sheet: the velocity is not measured
+kind = "kalman"
+w = 1600.0                    # 1/s; 'ambjax tune' found this and the gains below under [tune.limits]; rounded
+
+[controller.position]
+kind = "sliding-mode"
+c = 3200.0                    # 1/s; the largest that the tuner allows, a fifth of the sample rate
+k = 38.0                      # m/s^2
+p = 285.0                     # s/m
+
+[controller.inversion]
+kind = "adaptive"
+gamma = 2.5e12                # A^2/m^2/s
+p = 3e-9                      # m^2/A^2
+
+[controller.current]
+kind = "sliding-mode"
+k_i = 4.0                     # A/s
+p = 0.18                      # 1/A
+
+[disturbance.q_z]
+kind = "sum"
+
+[[disturbance.q_z.terms]]     # data sheet: a step of 20 N
+kind = "step"
+amplitude = 8.333             # m/s^2; 20 N on 2.4 kg
+start = 0.1                   # s
+
+[[disturbance.q_z.terms]]     # data sheet: 8 N at 300 Hz
+kind = "sine"
+amplitude = 3.333             # m/s^2; 8 N on 2.4 kg
+frequency = 300.0             # Hz
+
+[processor]
+delay = 1.0                   # samples; data sheet
+
+[sensor]
+std = 3e-7                    # m; assumed: position sensors of this kind have 0.1 to 1 um rms
+std_i = 2e-3                  # A; assumed: 0.1 % of the bias
+velocity = false
+bits = 14                     # data sheet; over +-s_0 and +-2 i_0, so 61 nm a step
+
+[actuator]
+u_max = 72.0                  # V; data sheet
+i_max = 2.0                   # A; with the bias, the 4 A of an amplifier; assumed
+
+[initial]
+z = 5e-5                      # m; off centre, at rest
+
+[clock]
+duration = 0.3                # s
+sample_period = 6.25e-5       # s; data sheet: 16 kHz
+
+[run]
+settle = 0.05                 # s; time from which "settled" metrics count
+clearance = 2.5e-4            # m; touch-down bearings stand at about half the gap
+
+[spread]                      # data sheet: the plant is known to 10 %; the controller's model keeps the values above
+plant.m = { percent = 10 }    # uniform
+plant.A = { percent = 10 }
+plant.R = { percent = 10 }
+initial.z = { uniform = [-1e-4, 1e-4] }  # m
+
+[tune]                        # of 'ambjax tune': the steepnesses p too, which it leaves as they are by default
+gains = ["controller.observer.w", "controller.position.c", "controller.position.k", "controller.position.p",
+    "controller.inversion.gamma", "controller.inversion.p", "controller.current.k_i", "controller.current.p"]
+
+[tune.limits]
+rms_u_V = 8.0                 # V; root mean square voltage
+chatter_V_per_s = 5e4         # V/s; variation of the voltage
+"""

@@ -1,0 +1,179 @@
+"""`ambjax compare`: several cases on the same members: errors, voltages, losses, sensitivity, margins, cost."""
+
+import argparse
+import contextlib
+import dataclasses
+import pathlib
+import sys
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from tqdm import tqdm
+
+from ambjax.cases.reader import Case, read_case
+from ambjax.commands.comparison_report import Compared, markdown, summary_of, text
+from ambjax.commands.ensemble import study_of
+from ambjax.commands.export import guarded_for
+from ambjax.commands.operating import MEMBERS, OperatingPoint, SpreadPeaks, operating_point, spread_peaks
+from ambjax.commands.outputs import directory, files, plain, say, write_json, written
+from ambjax.commands.warnings import read_with_warnings
+from ambjax.ensemble.study import Study
+from ambjax.ensemble.worker import CALL, chunk
+from ambjax.export.controller import controller_of
+from ambjax.export.trace import trace
+from ambjax.host.extensions import extension
+from ambjax.host.web_page import page
+from ambjax.linear.state_space import StateSpace
+
+WRITTEN = ("compare.html", "compare.json", "compare.png")
+# Largest number of cases in a table and a picture.
+MOST_CASES = 8
+# Members per call, a whole number of calls of the compiled program.
+CHUNK = 16 * CALL
+# Facts of a study that may differ between the cases: the controller, and the integration method.
+OWN = ("controller.", "clock.method")
+
+
+def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
+    """Compare cases. Exit code 1 if one of them loses a member, or is not stable at rest."""
+    cases = _read(args.cases)
+    studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
+    notes = _differences(args.cases, cases, studies)
+    for note in notes:
+        say(note)
+    out = directory(args.out, f"compare-{'-'.join(case.name for case in cases)}"[:80], WRITTEN)
+    if args.tune:
+        cases = [_tuned(path, args.cases[0], case.name, out) for path, case in zip(args.cases, cases, strict=True)]
+        studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
+    compared = [_compared(case, study) for case, study in zip(cases, studies, strict=True)]
+    summary = summary_of(compared, studies[0], notes)
+    with files(out) as part:
+        _draw(cases, compared, part / "compare.png")
+        html = page(
+            markdown(summary), {"compare.png": (part / "compare.png").read_bytes()}, "Comparison of controllers"
+        )
+        (part / "compare.html").write_text(html, encoding="utf-8")
+        write_json(part / "compare.json", summary)
+    if not args.json:
+        print(text(summary))
+        written(out, ", ".join(WRITTEN))
+    good = all(one.held.all() and one.point is not None and one.point.analysis.stable for one in compared)
+    return int(not good), plain(summary | {"out": str(out)})
+
+
+def _seed(args: argparse.Namespace, cases: Sequence[Case]) -> int:
+    """Return the seed of all cases: --seed, or the first case's."""
+    return int(cases[0].scenario.seed) if args.seed is None else args.seed
+
+
+def _read(paths: Sequence[str]) -> list[Case]:
+    """Read the cases. Raises ValueError for a file that is none, or fewer than two or too many, or one given twice."""
+    if not 2 <= len(paths) <= MOST_CASES:
+        raise ValueError(f"{len(paths)} case file{'s' * (len(paths) > 1)}: give 2 to {MOST_CASES} of them.")
+    for path in paths:
+        same = [other for other in paths if pathlib.Path(other).resolve() == pathlib.Path(path).resolve()]
+        if len(same) > 1:
+            raise ValueError(f"{path}: this file is given {len(same)} times. Give each once.")
+    cases = [read_with_warnings(path) for path in paths]
+    names = [case.name for case in cases]
+    return [
+        case if names.count(case.name) == 1 else dataclasses.replace(case, name=f"{case.name} ({n})")
+        for n, case in enumerate(cases, 1)
+    ]
+
+
+def _differences(paths: Sequence[str], cases: Sequence[Case], studies: Sequence[Study]) -> list[str]:
+    """Return a note for each case whose machine or task differs from the first's.
+
+    Raises ValueError if its spread does, because the members would then not be the same.
+    """
+    first, notes = studies[0].fingerprint(), []
+    for path, case, study in zip(paths[1:], cases[1:], studies[1:], strict=True):
+        other = study.fingerprint()
+        names = [name for name in {**first, **other} if first.get(name) != other.get(name) and not name.startswith(OWN)]
+        spread = [name for name in names if name.startswith("spread.")]
+        if spread:
+            name = spread[0]
+            raise ValueError(
+                f"{path}: {name} = {other.get(name, 'none')}, and {paths[0]} has {first.get(name, 'none')}: the "
+                "members would not be the same. Give both cases the same [spread]."
+            )
+        if names:
+            shown = [f"{name} ({first.get(name, 'none')} and {other.get(name, 'none')})" for name in names[:6]]
+            shown += [f"{len(names) - 6} more"] * (len(names) > 6)
+            notes.append(f"{cases[0].name} and {case.name} differ in more than the laws: {', '.join(shown)}")
+    return notes
+
+
+def _tuned(path: str, first: str, name: str, out: pathlib.Path) -> Case:
+    """Tune a case with the settings of the first, and return the tuned case under the same name."""
+    folder = out / f"tuned-{name}"
+    say(f"tuning {name}; its report will be in {folder}")
+    with contextlib.redirect_stdout(sys.stderr):
+        code = extension("tune")([path, "--settings-of", first, "--out", str(folder)], "ambjax compare")
+    if code not in (0, 1):
+        raise ValueError(f"--tune: {path} could not be tuned. The line above gives the reason.")
+    return dataclasses.replace(read_case(folder / "tuned.toml"), name=name)
+
+
+def _compared(case: Case, study: Study) -> Compared:
+    """Simulate the members of a case, analyse its loop, and count the operations of a step."""
+    point, peaks = _linear(case, study)
+    return Compared(case, _columns(case, study), point, peaks, _flops(case))
+
+
+def _columns(case: Case, study: Study) -> dict[str, np.ndarray]:
+    """Simulate the members, with a progress bar, and return their columns [N] by name."""
+    size, parts = min(CHUNK, study.members), []
+    with tqdm(total=study.members, unit="member", unit_scale=True, delay=2, leave=False, desc=case.name) as bar:
+        for start in range(0, study.members, size):
+            stop = min(start + size, study.members)
+            parts.append(chunk(study, start, stop, size))
+            bar.update(stop - start)
+    return {name: np.concatenate([np.asarray(part[name]) for part in parts]) for name in parts[0]}
+
+
+def _linear(case: Case, study: Study) -> tuple[OperatingPoint | None, SpreadPeaks | None]:
+    """Analyse the nominal loop (None: no equilibrium) and, if they differ, its first members."""
+    try:
+        point = operating_point(case, "nominal", 0.0)
+    except ValueError as error:
+        say(f"{case.name}: {error}")
+        return None, None
+    return point, spread_peaks(case, study, MEMBERS) if case.spread.entries else None
+
+
+def _flops(case: Case) -> int | None:
+    """Return the operations of a step in single precision; None in continuous time, or for a law that is no C."""
+    if case.cascade.processor is None:
+        return None
+    try:
+        controller = controller_of(guarded_for(case), case.scenario.u_max, float(case.clock.sample_period))
+        return trace(controller, "float").flops()
+    except ValueError as error:
+        say(f"{case.name}: the cost of a step is unknown ({error})")
+        return None
+
+
+def _draw(cases: Sequence[Case], compared: Sequence[Compared], path: pathlib.Path) -> None:
+    from ambjax.pictures import comparison
+
+    first = cases[0]
+    shown = [
+        comparison.Contender(
+            one.case.name,
+            one.held,
+            np.asarray(one.columns["settled_rms_error_m"]),
+            np.asarray(one.columns["settled_rms_u_V"]),
+            _stable(one.point),
+        )
+        for one in compared
+    ]
+    limits = [float(x) for x in (first.zones.zone_a, first.zones.zone_b, first.zones.zone_c)]
+    spans = [case.zones.range(None if case.cascade.processor is None else case.clock.sample_period) for case in cases]
+    span = max(low for low, _ in spans), min(high for _, high in spans)
+    comparison.comparison(shown, limits, span if span[0] < span[1] else spans[0], path)
+
+
+def _stable(point: OperatingPoint | None) -> StateSpace | None:
+    return point.system if point is not None and point.analysis.stable else None

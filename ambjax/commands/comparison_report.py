@@ -1,0 +1,211 @@
+"""The report of a comparison: its summary, the table on the terminal, and the page."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ambjax.cases.reader import Case
+from ambjax.commands.operating import OperatingPoint, SpreadPeaks
+from ambjax.commands.outputs import table
+from ambjax.ensemble.paths import kinds, places
+from ambjax.ensemble.study import Study
+from ambjax.host import web_page
+
+
+@dataclasses.dataclass(frozen=True)
+class Compared:
+    """A case and its results: the members' columns [N], the nominal loop, its members' peaks, the flops of a step.
+
+    `point`, `peaks`, `flops`: None if there is no equilibrium, no spread, or no step on a processor.
+    """
+
+    case: Case
+    columns: Mapping[str, np.ndarray]
+    point: OperatingPoint | None
+    peaks: SpreadPeaks | None
+    flops: int | None
+
+    @property
+    def held(self) -> np.ndarray:
+        """Whether each member keeps its rotor to the end [N]."""
+        return ~np.isfinite(self.columns["lost_at"])
+
+    def of(self, name: str, reduce: Callable[[np.ndarray], Any]) -> float | None:
+        """Return a metric reduced over the members that are held; None without them."""
+        values = np.asarray(self.columns[name])[self.held]
+        return float(reduce(values)) if values.size else None
+
+
+class Quantity(NamedTuple):
+    """A row of the table: its key in the summary, its words, its unit, and whether less is better (None: neither)."""
+
+    key: str
+    words: str
+    unit: str
+    less: bool | None = True
+
+
+QUANTITIES = (
+    Quantity("lost", "members lost", "1"),
+    Quantity("stalled", "members not decided (the integrator stalled)", "1"),
+    Quantity("rms_error_median_m", "settled rms error, median", "m"),
+    Quantity("rms_error_worst_m", "settled rms error, worst member", "m"),
+    Quantity("max_error_m", "largest settled error", "m"),
+    Quantity("better_than_first", "members with a lower rms error than in the first case", "1", less=False),
+    Quantity("rms_u_V", "settled rms voltage, over members", "V"),
+    Quantity("max_u_V", "largest voltage", "V"),
+    Quantity("rms_i_A", "rms current, over members", "A"),
+    Quantity("max_i_A", "largest current", "A"),
+    Quantity("copper_loss_W", "copper loss, mean", "W"),
+    Quantity("chatter_V_per_s", "variation of the voltage, mean", "V/s"),
+    Quantity("clearance_used", "largest settled share of the clearance", "1"),
+    Quantity("clearance_zone", "its zone (ISO 14839-2)", "", None),
+    Quantity("peak", "peak of |S|", "1"),
+    Quantity("frequency_hz", "at", "Hz", None),
+    Quantity("zone", "its zone (ISO 14839-3)", "", None),
+    Quantity("unstable", "members not stable at rest, of the first 100", "1"),
+    Quantity("worst_peak", "peak of |S|, worst member", "1"),
+    Quantity("t_peak", "peak of |T|", "1"),
+    Quantity("ks_peak", "peak of |KS|", "V/m"),
+    Quantity("gain_margin_low", "gain margin below 1", "1"),
+    Quantity("gain_margin_high", "gain margin above 1", "1", less=False),
+    Quantity("phase_margin_deg", "phase margin", "degrees", less=False),
+    Quantity("delay_margin_s", "delay margin", "s", less=False),
+    Quantity("disk_margin", "disk margin", "1", less=False),
+    Quantity("stiffness_N_per_m", "static stiffness", "N/m", less=False),
+    Quantity("flops", "cost of a step", "flops"),
+)
+
+
+def summary_of(compared: Sequence[Compared], study: Study, notes: Sequence[str]) -> dict[str, Any]:
+    """Return the content of compare.json: the members, the notes on the cases, and the numbers of each case."""
+    rows = [{"case": one.case.name, **_values(one, compared[0]), "laws": _laws(one.case)} for one in compared]
+    return {"members": study.members, "seed": study.seed, "differences": list(notes), "cases": rows}
+
+
+def _values(one: Compared, first: Compared) -> dict[str, object]:
+    """Return the numbers of a case by the keys of QUANTITIES."""
+    case, stalled = one.case, np.asarray(one.columns["stalled"], bool)
+    settled = max(float(case.clock.duration) - float(case.settle), float(case.clock.sample_period))
+    chatter, used = one.of("chatter_V", np.mean), one.of("settled_clearance_used", np.max)
+    zone = "D" if used is None or not one.held.all() else case.zones.clearance_zone(used)
+    return {
+        "lost": int(np.sum(~one.held & ~stalled)),
+        "stalled": int(np.sum(stalled)),
+        "rms_error_median_m": one.of("settled_rms_error_m", np.median),
+        "rms_error_worst_m": one.of("settled_rms_error_m", np.max),
+        "max_error_m": one.of("settled_max_abs_error_m", np.max),
+        "better_than_first": None if one is first else _better(one, first),
+        "rms_u_V": one.of("settled_rms_u_V", _rms),
+        "max_u_V": one.of("max_abs_u_V", np.max),
+        "rms_i_A": one.of("rms_i_A", _rms),
+        "max_i_A": one.of("max_abs_i_A", np.max),
+        "copper_loss_W": one.of("copper_loss_W", np.mean),
+        "chatter_V_per_s": None if chatter is None else chatter / settled,
+        "clearance_used": used,
+        "clearance_zone": zone,
+        **_loop(one),
+        "flops": one.flops,
+    }
+
+
+def _better(one: Compared, first: Compared) -> int:
+    """Return the number of members that the first case loses or holds with a larger rms error, and this one holds."""
+    ours, theirs = (np.where(x.held, x.columns["settled_rms_error_m"], math.inf) for x in (one, first))
+    return int(np.sum(ours < theirs))
+
+
+def _loop(one: Compared) -> dict[str, object]:
+    """Return the numbers of the linearised loop; None each if it is not stable."""
+    keys = ("peak", "frequency_hz", "t_peak", "ks_peak", "gain_margin_low", "gain_margin_high", "phase_margin_deg")
+    keys += ("delay_margin_s", "disk_margin", "stiffness_N_per_m")
+    worst: dict[str, object] = {"unstable": None, "worst_peak": None}
+    if one.peaks is not None:
+        worst["unstable"] = one.peaks.members - one.peaks.stable
+        if not worst["unstable"] and one.peaks.point is not None:
+            worst["worst_peak"] = one.peaks.point.analysis.S.height
+    if one.point is None or not one.point.analysis.stable:
+        return {"stable": False, "zone": "D", **dict.fromkeys(keys), **worst}
+    loop = one.point.analysis
+    margins = loop.margins
+    found = (loop.S.height, loop.S.frequency, loop.T.height, loop.KS.height, margins.gain_low, margins.gain_high)
+    found += (margins.phase_deg, margins.delay, margins.disk, loop.stiffness)
+    return {"stable": True, "zone": loop.zone, **dict(zip(keys, found, strict=True)), **worst}
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _laws(case: Case) -> dict[str, dict[str, object]]:
+    """Return the kind and the numbers of each law, by stage."""
+    laws: dict[str, dict[str, object]] = {}
+    for path, kind in kinds(case.cascade, "controller."):
+        if path.endswith(".kind") and path.count(".") == 2:
+            laws[path.split(".")[1]] = {"kind": kind}
+    for path, place in places(case.cascade, case.scenario).items():
+        _, stage, *rest = path.split(".") if path.startswith("controller.") else ("", "")
+        if rest and place.value is not None and stage != "model":
+            laws[stage][".".join(rest)] = float(place.value)
+    return {stage: laws[stage] for stage in laws if stage not in ("model", "processor")}
+
+
+def text(summary: Mapping[str, Any]) -> str:
+    """Return the table that the command prints."""
+    names = [case["case"] for case in summary["cases"]]
+    rows = [(q.words, *(_cell(case[q.key]) for case in summary["cases"]), q.unit) for q in _shown(summary)]
+    return "\n".join([table(("", *names, "unit"), rows), "", _words(summary)])
+
+
+def markdown(summary: Mapping[str, Any]) -> str:
+    """Return the text of the page, which refers to compare.png. The best number of each row is bold."""
+    names = [web_page.literal(case["case"]) for case in summary["cases"]]
+    rows = [[q.words.replace("|", "\\|"), *_marked(q, summary), q.unit] for q in _shown(summary)]
+    lines = ["# Comparison of controllers", "", _words(summary), ""]
+    lines += [f"- {web_page.literal(note)}" for note in summary["differences"]] + [""]
+    lines += [*web_page.table(["", *names, "unit"], rows), "", "![Comparison](compare.png)", ""]
+    for name, case in zip(names, summary["cases"], strict=True):
+        numbers = [
+            [stage, str(law["kind"]), ", ".join(f"{key} = {value:.6g}" for key, value in law.items() if key != "kind")]
+            for stage, law in case["laws"].items()
+        ]
+        lines += [f"## {name}", "", *web_page.table(["stage", "law", "gains"], numbers), ""]
+    return "\n".join(lines) + "\n"
+
+
+def _words(summary: Mapping[str, Any]) -> str:
+    return (
+        f"{summary['members']} members, seed {summary['seed']}, the same in all cases. Errors, voltages, currents and "
+        "losses are of the members that are held. Sensitivity and margins are of the linearised loop at rest."
+    )
+
+
+def _shown(summary: Mapping[str, Any]) -> list[Quantity]:
+    """Return the quantities that at least one case has; stalled members only if there are some."""
+    return [
+        q
+        for q in QUANTITIES
+        if any(case[q.key] is not None for case in summary["cases"])
+        and (q.key != "stalled" or any(case[q.key] for case in summary["cases"]))
+    ]
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return "none" if math.isinf(value) else f"{value:.4g}"
+    return str(value)
+
+
+def _marked(quantity: Quantity, summary: Mapping[str, Any]) -> list[str]:
+    """Return the cells of a row, the best one bold if not all are equal."""
+    values = [case[quantity.key] for case in summary["cases"]]
+    known = [value for value in values if isinstance(value, (int, float))]
+    if quantity.less is None or len(set(known)) < 2:
+        return [_cell(value) for value in values]
+    best = min(known) if quantity.less else max(known)
+    return [f"**{_cell(value)}**" if value == best else _cell(value) for value in values]

@@ -1,0 +1,95 @@
+"""Operating points: the linearised loop of a case at an equilibrium, and those of the members of its spread."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ambjax.cases.reader import Case
+from ambjax.ensemble.study import Study
+from ambjax.linear import Analysis, StateSpace, analyse, linearise, linearise_members
+
+# Members of [spread] that are analysed unless another number is given.
+MEMBERS = 100
+
+
+class OperatingPoint(NamedTuple):
+    """An analysed loop: its name, the reference r (m) of its equilibrium, its mass m (kg), matrices and analysis."""
+
+    name: str
+    r: float
+    m: float
+    system: StateSpace
+    analysis: Analysis
+
+
+class SpreadPeaks(NamedTuple):
+    """Members of the case's spread: their number, and how many are stable and in zone A; the worst of them."""
+
+    members: int
+    stable: int
+    zone_a: int
+    worst: int
+    point: OperatingPoint | None
+
+
+def operating_point(case: Case, name: str, r: float) -> OperatingPoint:
+    """Linearise and analyse the loop of a case at a constant reference r (m). Raises ValueError as `linearise` does."""
+    system = linearise(case.cascade, case.scenario, case.clock, r)
+    m = float(case.scenario.plant.m)
+    return OperatingPoint(name, r, m, system, _analysis(case, system, m))
+
+
+def _analysis(case: Case, system: StateSpace, m: float) -> Analysis:
+    sensor = case.scenario.sensor
+    measured = (sensor is None or sensor.velocity) and not case.cascade.observer.estimates_velocity
+    return analyse(system, m, case.clock.sample_period, case.zones, measured)
+
+
+def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPeaks:
+    """Analyse the members of the study, and return the counts and the member with the largest peak.
+
+    `most`: number of members to analyse, the first of the study (None: all).
+    """
+    members = study.members if most is None else min(study.members, most)
+    cascade, scenario = study.batch(np.arange(members))
+    systems, found = linearise_members(cascade, scenario, study.clock)
+    peaks, good = np.full(members, math.inf), np.zeros(members, bool)
+    masses = np.broadcast_to(np.asarray(scenario.plant.m, float), (members,))
+    analyses: list[Analysis | None] = []
+    loops: list[StateSpace] = []
+    for k in range(members):
+        loops.append(StateSpace(*(None if x is None else np.asarray(x)[k] for x in systems)))  # pyright: ignore
+        one = _analysis(case, loops[k], float(masses[k])) if found[k] else None
+        analyses.append(one)
+        if one is not None and one.stable:
+            peaks[k], good[k] = one.S.height, True
+    worst, zone_a = int(np.argmax(peaks)), sum(one is not None and one.stable and one.zone == "A" for one in analyses)
+    one = analyses[worst]
+    point = None if one is None else OperatingPoint(f"member {worst}", 0.0, float(masses[worst]), loops[worst], one)
+    return SpreadPeaks(members, int(good.sum()), int(zone_a), worst, point)
+
+
+def numbers_of(one: Analysis) -> dict[str, object]:
+    """Return the numbers of an analysis by their names in the JSON summary."""
+    margins = one.margins
+    return {
+        "stable": one.stable,
+        "peak": one.S.height,
+        "frequency_hz": one.S.frequency,
+        "zone": one.zone,
+        "t_peak": one.T.height,
+        "t_frequency_hz": one.T.frequency,
+        "ks_peak": one.KS.height,
+        "ks_frequency_hz": one.KS.frequency,
+        "velocity_peak": None if one.S_velocity is None else one.S_velocity.height,
+        "gain_margin": margins.gain,
+        "gain_margin_low": margins.gain_low,
+        "gain_margin_high": margins.gain_high,
+        "phase_margin_deg": margins.phase_deg,
+        "delay_margin_s": margins.delay,
+        "disk_margin": margins.disk,
+        "static_stiffness_N_per_m": one.stiffness,
+        "noise_gain": one.noise,
+        "poles_per_s": [[float(pole.real), float(pole.imag)] for pole in one.poles],
+    }

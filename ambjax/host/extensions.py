@@ -1,0 +1,18 @@
+"""Commands that other packages declare, such as that of the tuner."""
+
+import importlib.metadata
+from collections.abc import Callable
+
+# Entry-point group in which a package that depends on ambjax declares its command.
+GROUP = "ambjax.commands"
+
+
+def extension(name: str) -> Callable[[list[str], str], int]:
+    """Return the command declared under `name`: a function of its arguments and of the program's name.
+
+    Raises ValueError if no installed package declares it.
+    """
+    found = tuple(importlib.metadata.entry_points(group=GROUP, name=name))
+    if not found:
+        raise ValueError(f"{name}: this command is not installed. Reinstall ambjax with pip.")
+    return found[0].load()

@@ -1,0 +1,84 @@
+"""The picture of a comparison: sensitivity, control effort, distribution of the error, and error against voltage."""
+
+import itertools
+import pathlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ambjax.linear.state_space import StateSpace
+from ambjax.pictures.figures import BLUE, GREEN, INK, ORANGE, RED
+from ambjax.pictures.frequency import POINTS, shade_zones
+from ambjax.pictures.scales import prefix_of
+from ambjax.pictures.style import own_style
+
+COLOURS, STYLES = (BLUE, ORANGE, GREEN, RED), ("-", "--")
+
+
+class Contender(NamedTuple):
+    """A case of a comparison.
+
+    - `held`: whether each member keeps its rotor [N].
+    - `error`, `voltage`: settled rms error (m) and settled rms voltage (V) of each member [N].
+    - `system`: the linearised loop; None if it is not stable.
+    """
+
+    name: str
+    held: np.ndarray
+    error: np.ndarray
+    voltage: np.ndarray
+    system: StateSpace | None
+
+
+@own_style
+def comparison(
+    cases: Sequence[Contender], limits: Sequence[float], span: tuple[float, float], path: pathlib.Path
+) -> None:
+    """Write the picture of `figure_of` to a file."""
+    figure_of(cases, limits, span).savefig(path, dpi=110)
+
+
+@own_style
+def figure_of(cases: Sequence[Contender], limits: Sequence[float], span: tuple[float, float]) -> Figure:
+    """Return a picture: |S| with zones, |KS|, share of members below an rms error, rms error against rms voltage.
+
+    `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz. A member that is lost has
+    no error: the curve of a case that loses members ends below 1.
+    """
+    figure = Figure(figsize=(12, 8.5), layout="constrained")
+    (S_axes, error_axes), (KS_axes, effort_axes) = figure.subplots(2, 2)
+    f = np.geomspace(*span, POINTS)
+    finite = [case.error[case.held] for case in cases if case.held.any()]
+    factor, unit = prefix_of("m", float(max((x.max() for x in finite), default=1e-6)))
+    looks = [(colour, style) for style, colour in itertools.product(STYLES, COLOURS)]
+    for case, (colour, style) in zip(cases, looks, strict=False):
+        look = {"color": colour, "linestyle": style, "linewidth": 1.5, "label": case.name}
+        if case.system is not None:
+            H = np.asarray(case.system.response(f))
+            S_axes.loglog(f, np.abs(H[:, 0, 0]), **look)
+            KS_axes.loglog(f, np.abs(H[:, 2, 0]), **look)
+        errors, lost = factor * np.sort(case.error[case.held]), int(np.sum(~case.held))
+        label = f"{case.name} ({lost} lost)" if lost else case.name
+        error_axes.step(errors, np.arange(1, errors.size + 1) / case.held.size, where="post", **look | {"label": label})
+        mark = {"color": colour, "marker": "o" if style == "-" else "x", "linestyle": "", "markersize": 3, "alpha": 0.4}
+        effort_axes.plot(case.voltage[case.held], factor * case.error[case.held], **mark)
+    shade_zones(S_axes, limits)
+    _label(S_axes, "frequency, Hz", "|S|", "sensitivity at the position sensor, with zones")
+    _label(KS_axes, "frequency, Hz", "|KS|, V/m", "voltage per error of the position sensor")
+    _label(error_axes, f"settled rms error, {unit}", "share of all members", "members with at most this error")
+    _label(effort_axes, "settled rms voltage, V", f"settled rms error, {unit}", "one point per member")
+    error_axes.set_ylim(0, 1.02)
+    error_axes.legend(fontsize=8, loc="lower right")
+    for ax in (S_axes, KS_axes):
+        ax.set_xlim(span)
+    return figure
+
+
+def _label(ax: Axes, x: str, y: str, title: str) -> None:
+    ax.set_xlabel(x)
+    ax.set_ylabel(y)
+    ax.set_title(title, fontsize=10, color=INK)
+    ax.grid(True, which="major", color="#dddddd", linewidth=0.6)
