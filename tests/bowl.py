@@ -140,11 +140,9 @@ BUDGET = {
 
 def document(tables=None, **tune):
     """A case file whose two gains are tuned, as read from TOML; `tables` replace those of CASE."""
-    return (
-        CASE
-        | (tables or {})
-        | {"tune": {"gains": PATHS, "bounds": BOUNDS, "weights": {"effort": 0.0}, **BUDGET, **tune}}
-    )
+    limits = {"sensitivity": math.inf} | tune.pop("limits", {})
+    told = {"gains": PATHS, "bounds": BOUNDS, "weights": {"effort": 0.0}, "limits": limits, **BUDGET, **tune}
+    return CASE | (tables or {}) | {"tune": told}
 
 
 def instead_of_engines(monkeypatch, world):

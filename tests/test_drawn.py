@@ -496,7 +496,7 @@ def test_the_slices_are_those_that_were_computed(kept):
     goals[0, 12] = np.inf
     lost = np.zeros((2, 13), int)
     lost[1, :3] = 2
-    axes = tuned.landscape(Slices(gains, goals, lost), ["controller.a", "controller.b"]).axes
+    axes = tuned.landscape(Slices(gains, goals, lost, goals), ["controller.a", "controller.b"]).axes
     for j, ax in enumerate(axes):
         line, held, *others = ax.lines
         relative = np.exp(goals[j] - goals[j, 6])

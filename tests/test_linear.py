@@ -11,7 +11,17 @@ from jax.flatten_util import ravel_pytree
 from ambjax import Cascade, Clock, Plant, Scenario, Sensor
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.processor import Processor
-from ambjax.linear import StateSpace, Zones, analyse, linearise, linearise_members, margins_of, noise_gain, peak
+from ambjax.linear import (
+    StateSpace,
+    Zones,
+    analyse,
+    linearise,
+    linearise_members,
+    loop_quantities,
+    margins_of,
+    noise_gain,
+    peak,
+)
 from ambjax.linear.equilibrium import ideal
 from ambjax.linear.loop_matrices import loop_matrices
 from ambjax.numerics.records import canonical
@@ -91,6 +101,23 @@ def test_the_matrices_are_those_of_the_simulation(name):
     error = 1e-6 if name == "lags" else 1e-9
     assert np.all(np.abs(found[:, 0, 0] / expected[:, 0, 0] - 1) < error)
     assert np.all(np.abs(found[:, 2, 0] / expected[:, 1, 0] - 1) < 10 * error)
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_the_differentiable_quantities_are_those_of_the_analysis(name):
+    cascade, scenario, r = loop_of(name)
+    system = linearise(cascade, scenario, CLOCK, r)
+    expected = analyse(system, Plant().m, T)
+    find = jax.jit(
+        lambda system: loop_quantities(system, jnp.asarray(True), 1.0, 2e3, 5e2, 1e6), compiler_options=QUICK
+    )
+    found = find(system)
+    # a peak's frequency is found to 1e-5; the zeros of a deadbeat loop, all at 0, to 1e-5 too, and KS from them to 3e-4
+    tolerance = 3e-4 if name == "true signs" else 1e-6
+    peaks = (expected.S.height, expected.T.height, expected.KS.height)
+    assert np.allclose(found[:3], peaks, rtol=tolerance)
+    assert found.delay_margin_s == pytest.approx(expected.margins.delay, rel=1e-7)
+    assert found.growth == pytest.approx(expected.poles[0].real, rel=1e-9)
 
 
 def test_the_repaired_gains_amplify_sensor_errors_41_times():

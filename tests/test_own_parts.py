@@ -6,6 +6,7 @@ of its own names. Nothing in the package knows either.
 
 import dataclasses
 import itertools
+import math
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -233,7 +234,16 @@ def test_tuned(tmp_path):
     paths = [f"controller.{path}" for path in ("position.decay", "position.rho", "position.width")]
     every = tune_from(Table({}), case).space.paths
     assert every == [*paths, "controller.inversion.gamma", "controller.current.k_i"]
-    asked = {"members": 4, "stressed": 2, "validation": 8, "held_out": 8, "screen": 4, "starts": 1, "iterations": 3}
+    asked = {
+        "limits": {"sensitivity": math.inf},
+        "members": 4,
+        "stressed": 2,
+        "validation": 8,
+        "held_out": 8,
+        "screen": 4,
+        "starts": 1,
+        "iterations": 3,
+    }
     tune = tune_from(Table({"gains": paths, **asked}), case)
     problem = problem_of(case, tune)
     assert (

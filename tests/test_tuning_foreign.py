@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import pathlib
 import tomllib
 
@@ -197,7 +198,13 @@ def test_without_a_screen_there_is_the_case_alone():
 
 def write(path, text, **tune):
     document = tomllib.loads(text)
-    document["tune"] = {"members": 8, "held_out": 100, "validation": 100, "screen": 32} | tune
+    document["tune"] = {
+        "members": 8,
+        "held_out": 100,
+        "validation": 100,
+        "screen": 32,
+        "limits": {"sensitivity": math.inf},
+    } | tune
     document["clock"] = {"duration": 0.2}
     document["run"] = {"settle": 0.05}
     if pulse := document.get("disturbance", {}).get("q_z"):

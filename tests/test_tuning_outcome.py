@@ -148,7 +148,7 @@ def test_a_gain_that_loses_rotors_when_it_is_off_says_how_many():
     goals[0, middle + 1], lost[0, middle + 1] = math.log(516.0), 2
     goals[1, middle - 1] = math.log(1.03)
     lost[2] = 1  # of the answer too
-    found = Slices(np.ones((3, len(REACH))), goals, lost)
+    found = Slices(np.ones((3, len(REACH))), np.full_like(goals, 700.0), lost, goals)
     assert found.more_lost().tolist() == [2, 0, 0]
     row = {"path": "controller.position.c", "before": 1.0, "after": 2.0, "least": 0.0, "most": 9.0, "at_bound": ""}
     rows = [
@@ -157,5 +157,5 @@ def test_a_gain_that_loses_rotors_when_it_is_off_says_how_many():
     ]
     text = report._gains(types.SimpleNamespace(gains=rows, trained_on=40, nominal_steps="by accurate steps"))
     assert [line.split("|")[-2].strip() for line in text if line.startswith("| controller")] == [
-        "**2 of 40 members lost**", "3 %", "0 %",
+        "**a gain off by 28 % loses a rotor (2 of 40 members)**", "3 %", "0 %",
     ]  # fmt: skip

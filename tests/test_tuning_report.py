@@ -51,6 +51,7 @@ settle = 0.01
 [spread]
 plant.m = { percent = 5 }
 [tune]
+limits.sensitivity = inf
 gains = ["controller.position.c", "controller.position.k"]
 screen = 4
 starts = 1
@@ -162,12 +163,12 @@ def test_the_lowest_point_of_slices_loses_no_more():
     goals[0, 3], goals[1, 9], goals[1, 2] = -0.5, -0.2, np.nan
     lost = np.zeros((2, len(REACH)), int)
     gains = np.arange(2 * len(REACH), dtype=float).reshape(2, -1)
-    assert Slices(gains, goals, lost).lowest() == (0, 3, 0.5)
+    assert Slices(gains, goals, lost, goals).lowest() == (0, 3, 0.5)
     lost[0, 3] = 1
-    assert Slices(gains, goals, lost).lowest() == (1, 9, 0.2)
+    assert Slices(gains, goals, lost, goals).lowest() == (1, 9, 0.2)
     lost[0, middle] = 1  # the answer loses one too
-    assert Slices(gains, goals, lost).lowest() == (0, 3, 0.5)
-    assert Slices(gains, np.abs(goals), lost).lowest()[2] == 0
+    assert Slices(gains, goals, lost, goals).lowest() == (0, 3, 0.5)
+    assert Slices(gains, np.abs(goals), lost, goals).lowest()[2] == 0
 
 
 def test_a_lower_point_beside_the_answer_is_said():

@@ -487,6 +487,7 @@ duration = 0.03
 [run]
 settle = 0.01
 [tune]
+limits.sensitivity = inf
 members = 4
 stressed = 2
 held_out = 8

@@ -35,7 +35,12 @@ WORDS = ["gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
 # Keys of [tune] that depend on the laws of the case.
 LAWS_OWN = ("gains", "bounds")
 LIMIT: dataclasses.Field = leaf(at_least=1e-12, at_most=1e12, infinite=True)
-SHARES: dict[str, dataclasses.Field] = {"clearance_used": leaf(above=0, at_most=1), "survival": SURVIVAL}
+SHARES: dict[str, dataclasses.Field] = {
+    "clearance_used": leaf(above=0, at_most=1),
+    "survival": SURVIVAL,
+    "sensitivity": leaf(at_least=1, at_most=1e12, infinite=True),
+    "delay_margin_s": leaf(above=0, at_most=1e6, unit="s"),
+}
 LENGTH: dataclasses.Field = leaf(at_least=1e-12, at_most=1.0, unit="m")
 
 
@@ -181,6 +186,8 @@ def _limits(table: Table, case: Case) -> LimitSettings:
             VOLTAGE_SHARE * u_max,
             f"default, {100 * VOLTAGE_SHARE:g} % of actuator.u_max",
         )
+    if "sensitivity" not in thresholds:
+        thresholds["sensitivity"], source["sensitivity"] = float(case.zones.zone_a), "default, zone A of [sensitivity]"
     clearance = float(np.min(np.asarray(case.scenario.touchdown)))
     band = table.leaf("settling_band_m", LENGTH, SETTLING_BAND * clearance)
     if "settling_band_m" in table.raw and "settling_s" not in thresholds:

@@ -4,6 +4,8 @@ import dataclasses
 import functools
 from typing import Any
 
+import numpy as np
+
 from ambjax.cases.reader import Case
 from ambjax.simulation.integrate import Integrator
 from ambjax.simulation.method import choose_method
@@ -14,7 +16,7 @@ from tuning.objective.goal import Goal
 from tuning.objective.lanes import Engine
 from tuning.objective.limits import Limit, measures
 from tuning.objective.loss import loss_for
-from tuning.objective.members import Objective
+from tuning.objective.members import LoopRange, Objective
 from tuning.objective.ranges import Range, bounded
 from tuning.objective.shortfalls import bounds
 
@@ -127,7 +129,9 @@ def problem_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = 
     limits = tune.limits
     measured = measures(limits.each, case.scenario, clock, case.settle, limits.band)
     loss = loss_for(case.scenario, case.settle, tune.early, measured)
-    objective = Objective(tune.space, case.cascade, case.scenario, clock, loss, case.spread)
+    objective = Objective(
+        tune.space, case.cascade, case.scenario, clock, loss, case.spread, _loop_range(case, limits.each)
+    )
     conditions = bounds(case.cascade, case.scenario, clock)
     space, box = bounded(objective, conditions, tune.space.values(case.cascade))
     objective = dataclasses.replace(objective, space=space)
@@ -135,3 +139,16 @@ def problem_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = 
     mode = "forward" if len(tune.space) <= MOST_FORWARD else "reverse"
     engine = Engine(objective, settle=case.settle, mode=mode, threads=threads)
     return TuningProblem(case, tune, objective, engine, goal, box, finer).limited(limits.each)
+
+
+def _loop_range(case: Case, limits: tuple[Limit, ...]) -> LoopRange | None:
+    """Return what the limits need of the linearised loops; None if they need nothing."""
+    names = tuple(limit.name for limit in limits if limit.kind.fold is None)
+    if not names:
+        return None
+    plant = case.scenario.plant
+    low, high = case.zones.range(None if case.cascade.processor is None else case.clock.sample_period)
+    size = (plant.R + plant.L * plant.pole) * plant.i_0 / plant.s_0
+    # a member's own plant does not matter for a unit
+    pole, size = (float(np.mean(np.asarray(one))) for one in (plant.pole, size))
+    return LoopRange(names, low, high, pole, size)

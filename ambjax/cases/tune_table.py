@@ -114,7 +114,7 @@ def _defaults(prefix: str, fields: dict[str, dataclasses.Field]) -> Iterator[Lin
 
 
 def _limits() -> Iterator[Line]:
-    """Yield the lines of [tune.limits]. Its limits have no defaults but that of the rms voltage."""
+    """Yield the lines of [tune.limits]. Only those of the rms voltage and of the sensitivity have defaults."""
     voltage, means, worst = (f"{x:g}" for x in (100 * VOLTAGE_SHARE, MEAN_MARGIN, WORST_MARGIN))
     examples = [
         (
@@ -138,6 +138,13 @@ def _limits() -> Iterator[Line]:
             "m; how far z goes beyond its start and beyond the range of r so far (left out: none)",
         ),
         ("clearance_used = 0.8", "largest |z| of any member as a share of the clearance (left out: none)"),
+        (
+            "sensitivity = 3.0",
+            "peak of |S| of any member, at r = 0; inf: no limit (left out: sensitivity.zone_a)",
+        ),
+        ("complementary = 3.0", "peak of |T| of any member (left out: none)"),
+        ("control_sensitivity = 1e8", "V/m; peak of |KS| of any member (left out: none)"),
+        ("delay_margin_s = 2e-4", "s; least delay margin of any member (left out: none)"),
         (f"survival = {SURVIVAL.default}", SURVIVAL.metadata["doc"]),
         (
             "margin = 0.01",

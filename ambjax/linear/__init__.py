@@ -12,8 +12,10 @@ At sample n a number e_n is added to what the position sensor reports, after con
 controller reads per e, T = S - 1 what the plant adds, and KS = u/e. In continuous time the same holds with e(t).
 """
 
-from ambjax.linear.analysis import Analysis, Zones, analyse, linearise, linearise_members
+from ambjax.linear.analysis import Analysis, Zones, analyse, linearise, linearise_members, prepared
 from ambjax.linear.injection import Injection, injected, lines
+from ambjax.linear.loop_matrices import loop_matrices
+from ambjax.linear.loop_quantities import LoopQuantities, loop_quantities
 from ambjax.linear.margins import Margins, ResponsePeak, margins_of, noise_gain, peak
 from ambjax.linear.state_space import INPUTS, OUTPUTS, StateSpace
 
@@ -22,6 +24,7 @@ __all__ = [
     "OUTPUTS",
     "Analysis",
     "Injection",
+    "LoopQuantities",
     "Margins",
     "ResponsePeak",
     "StateSpace",
@@ -31,7 +34,10 @@ __all__ = [
     "linearise",
     "linearise_members",
     "lines",
+    "loop_matrices",
+    "loop_quantities",
     "margins_of",
     "noise_gain",
     "peak",
+    "prepared",
 ]

@@ -116,7 +116,7 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
 
     Raises ValueError as `rollout` does, and if there is no equilibrium at r.
     """
-    system, found = _matrices(*canonical((*_prepared(cascade, scenario, clock), r)))
+    system, found = _matrices(*canonical((*prepared(cascade, scenario, clock), r)))
     if not found:
         raise ValueError(f"no equilibrium at r = {float(r):g} m: the laws do not hold the rotor there.")
     return StateSpace(*(None if x is None else np.asarray(x) for x in system))  # pyright: ignore[reportArgumentType]
@@ -130,14 +130,18 @@ def linearise_members(
     Returns the matrices, each with a leading axis [N], and whether each member has an equilibrium [N]. Raises
     ValueError as `rollout` does.
     """
-    return map_members(_member, canonical((*_prepared(cascade, scenario, clock), r)), plain=True)
+    return map_members(_member, canonical((*prepared(cascade, scenario, clock), r)), plain=True)
 
 
 def _member(tree: Any) -> tuple[StateSpace, Any]:
     return loop_matrices(*tree)
 
 
-def _prepared(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Cascade, Scenario, Scalar]:
+def prepared(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Cascade, Scenario, Scalar]:
+    """Return the first three arguments of `loop_matrices` for a case: cascade and scenario, checked, and the period.
+
+    On a processor the cascade is resolved for it. Raises ValueError as `rollout` does.
+    """
     system, clock = prepare(cascade, scenario, clock)
     if cascade.processor is not None:
         cascade = system.loop.cascade  # pyright: ignore[reportAttributeAccessIssue]

@@ -24,6 +24,8 @@ from ambjax.simulation.folds import Named
 from ambjax.simulation.metrics import standard_for
 from ambjax.simulation.rollout import rollout
 from ambjax.world.scenario import Scenario
+from tuning.objective.limits import PREFIX
+from tuning.objective.loops import loops
 from tuning.objective.loss import TERMS, Loss, outcomes
 from tuning.objective.members import Members, Objective
 from tuning.space import Space
@@ -132,7 +134,11 @@ class Engine:
     def terms(self, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:
         """Return the terms of the loss by name, each [S, N], at coordinates x [S, m] for members [N]."""
         self.rollouts += len(x) * len(members.member)
-        return self._lanes(LaneFold(self.objective.space), x, members, self.lanes, fold=self._world[-1])
+        terms = self._lanes(LaneFold(self.objective.space), x, members, self.lanes, fold=self._world[-1])
+        if self.objective.loop is not None:
+            values = loops(self.objective, x, members.searched, self.threads)[0]
+            terms |= {PREFIX + name: _wide(one, len(members.member)) for name, one in values.items()}
+        return terms
 
     def metrics(self, x: np.ndarray, members: Members) -> dict[str, Any]:
         """Return {"loss": terms, "metrics": the metrics of metrics.json}, each [S, N], at x [S, m] for members [N].
@@ -145,7 +151,11 @@ class Engine:
         for one in x:
             world = canonical((*self.objective.fixed(one, members), self.objective.clock, self._standard))
             found.append(map_members(measured, world, threads=self.threads, call=self.lanes, block=block))
-        return jax.tree.map(lambda *parts: np.stack(parts), *found)
+        metrics = jax.tree.map(lambda *parts: np.stack(parts), *found)
+        if self.objective.loop is not None:
+            values = loops(self.objective, x, members, self.threads)[0]
+            metrics["loss"] |= {PREFIX + name: one for name, one in values.items()}
+        return metrics
 
     def gradient(
         self, x: np.ndarray, members: Members, weights: object
@@ -158,7 +168,24 @@ class Engine:
         self.rollouts += len(x) * len(members.member) * (len(self.objective.space) + 1)
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS)))
         slope = LaneGradient(self.objective.space, self.mode == "reverse")
-        return self._lanes(slope, x, members, min(self.lanes, GRADIENT_LANES), weights=each)
+        found = self._lanes(slope, x, members, min(self.lanes, GRADIENT_LANES), weights=each)
+        return found if self.objective.loop is None else self._with_loops(found, x, members)
+
+    def _with_loops(
+        self, found: tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]], x: np.ndarray, members: Members
+    ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Insert the quantities of the linearised loops into the results of `gradient`, in the order of the names."""
+        outcomes, slopes, terms = found
+        names = sorted(self.objective.loss.measures)
+        values, moves = loops(self.objective, x, members.searched, self.threads)
+        more = {name: _wide(one, len(members.member)) for name, one in values.items()}
+        columns = {name: outcomes[..., 1 + k] for k, name in enumerate(names)} | more
+        along = {name: slopes[..., 1 + k, :] for k, name in enumerate(names)}
+        along |= {name: _wide(one, len(members.member), 0.0) for name, one in moves.items()}
+        ordered = sorted(columns)
+        outcomes = np.stack([outcomes[..., 0], *(columns[name] for name in ordered)], -1)
+        slopes = np.stack([slopes[..., 0, :], *(along[name] for name in ordered)], -2)
+        return outcomes, slopes, terms | {PREFIX + name: one for name, one in more.items()}
 
     def _lanes(
         self,
@@ -178,3 +205,10 @@ class Engine:
             function, lane, threads=self.threads, call=width, block=width, plain=self.mode == "reverse"
         )
         return jax.tree.map(lambda a: a.reshape(len(x), len(members.member), *a.shape[1:]), results)
+
+
+def _wide(values: np.ndarray, count: int, fill: float = 1.0) -> np.ndarray:
+    """Return values [S, n, ...] of the first members as [S, count, ...]; the others have the value `fill`."""
+    wide = np.full((len(values), count, *values.shape[2:]), fill)
+    wide[:, : values.shape[1]] = values
+    return wide

@@ -37,7 +37,7 @@ PRICE_INTERVALS = 200
 class LimitTerm:
     """Term of a limit in the goal. Its numbers are leaves: other numbers do not recompile a search.
 
-    `name`: of the quantity in KINDS. `log_allowed`: logarithm of the upper bound. `multiplier`, `penalty`, `ratio`: as
+    `name`: of the quantity in KINDS. `log_allowed`: logarithm of the bound. `multiplier`, `penalty`, `ratio`: as
     in `Limit`.
     """
 
@@ -48,9 +48,10 @@ class LimitTerm:
     ratio: Scalar
 
     def excess(self, values: Array) -> Array:
-        """Return g = log(reached / allowed) for the search's values [N], corrected by `ratio`."""
-        reached = self.ratio * KINDS[self.name].tuned(values)
-        return jnp.log(jnp.maximum(reached, TINY)) - self.log_allowed
+        """Return g = log(reached / allowed) for the search's values [N], corrected by `ratio`; -g of a lower limit."""
+        kind = KINDS[self.name]
+        excess = jnp.log(jnp.maximum(self.ratio * kind.tuned(values), TINY)) - self.log_allowed
+        return -excess if kind.at_least else excess
 
     def __call__(self, values: Array) -> Array:
         """Return the term for the search's values [N]."""
@@ -60,7 +61,7 @@ class LimitTerm:
 
 @dataclasses.dataclass(frozen=True)
 class Limit:
-    """Upper limit `threshold` of the quantity KINDS[`name`], and the state of its augmented Lagrangian.
+    """Limit `threshold` of the quantity KINDS[`name`], and the state of its augmented Lagrangian.
 
     `source`: origin of the limit, for the report. `multiplier`, `penalty`: of the augmented Lagrangian. `ratio`: the
     judge's value over the search's. `missed`: g at the last update. `forces`: (reached, multiplier) of every update.
@@ -70,7 +71,7 @@ class Limit:
     threshold: float
     source: str = "tune.limits"
     margin: float = 0.0
-    """share by which the search keeps the quantity below the limit"""
+    """share by which the search keeps the quantity below the limit, or above a lower one"""
     multiplier: float = 0.0
     ratio: float = 1.0
     penalty: float = PENALTY
@@ -84,8 +85,12 @@ class Limit:
 
     @property
     def allowed(self) -> float:
-        """Upper bound that the search uses: the limit less its margin."""
-        return (1 - self.margin) * self.threshold
+        """Bound that the search uses: the limit less its margin, or a lower limit and its margin."""
+        return (1 + self.margin if self.kind.at_least else 1 - self.margin) * self.threshold
+
+    def holds(self, reached: float) -> bool:
+        """Return whether a value keeps the limit."""
+        return reached >= self.threshold if self.kind.at_least else reached <= self.threshold
 
     @property
     def term(self) -> LimitTerm:
@@ -93,8 +98,9 @@ class Limit:
         return LimitTerm(self.name, math.log(self.allowed), self.multiplier, self.penalty, self.ratio)
 
     def log_excess(self, reached: float) -> float:
-        """Return g = log(reached / allowed)."""
-        return math.log(max(reached, TINY) / self.allowed)
+        """Return g = log(reached / allowed); -g for a lower limit."""
+        excess = math.log(max(reached, TINY) / self.allowed)
+        return -excess if self.kind.at_least else excess
 
     def active(self, reached: float | None) -> bool:
         """Return whether the limit is active: its multiplier is above 0, and the judge's value reaches it.
@@ -118,21 +124,26 @@ class Limit:
         return dataclasses.replace(self, multiplier=force, ratio=ratio, penalty=penalty, missed=excess, forces=forces)
 
     def error_reduction(self, more: float) -> float:
-        """Return the relative decrease of the rms error when the limit grows by the share `more`.
+        """Return the relative decrease of the rms error when the limit is looser by the share `more`.
 
         It is the integral of the multiplier over the logarithm of the limit. The multiplier is interpolated linearly
         between the optima of the updates, which belong to looser limits, and is constant outside of them.
         """
         if not self.multiplier:
             return 0.0
-        logs, forces = np.array(sorted((math.log(reached), force) for reached, force in self.forces)).T
-        begin = math.log(self.forces[-1][0])
+        side = -1.0 if self.kind.at_least else 1.0
+        logs, forces = np.array(sorted((side * math.log(reached), force) for reached, force in self.forces)).T
+        begin = side * math.log(self.forces[-1][0])
         at = np.linspace(begin, begin + math.log1p(more), PRICE_INTERVALS + 1)
         return -math.expm1(-float(np.trapezoid(np.interp(at, logs, forces), at)) / 2)
 
     def reached(self, columns: Mapping[str, np.ndarray]) -> float:
         """Return the judge's value. `columns`: every metric and term of an ensemble by name, each [N]."""
         return float(self.kind.judged(self.of_members(columns)))
+
+    def worst(self, columns: Mapping[str, np.ndarray]) -> float:
+        """Return the value of the worst member. `columns`: as for `reached`."""
+        return float((np.min if self.kind.at_least else np.max)(self.of_members(columns)))
 
     def of_members(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the quantity of each member that is held, or of all members if none is held.
@@ -148,6 +159,9 @@ class Limit:
 def measures(
     limits: tuple[Limit, ...], scenario: Scenario, clock: Clock, settle: float, band: float
 ) -> dict[str, Fold]:
-    """Return the fold of each limit by name. `settle` (s): start of the settled part; `band` (m): of settling_s."""
+    """Return the fold of each limit that has one, by name.
+
+    `settle` (s): start of the settled part. `band` (m): of settling_s.
+    """
     context = LimitContext(settle, float(clock.duration), float(scenario.touchdown), band)
-    return {limit.name: limit.kind.fold(context, limit.threshold) for limit in limits}
+    return {limit.name: limit.kind.fold(context, limit.threshold) for limit in limits if limit.kind.fold is not None}

@@ -14,10 +14,21 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import rollout
 from ambjax.world.scenario import Scenario
 from tuning.objective.loss import Loss
+from tuning.objective.quantities import LOOPS
 from tuning.space import Space
 
 # Fewest ordinary, and fewest stressed, members of a part.
 LEAST_PART = 4
+
+
+class LoopRange(NamedTuple):
+    """What `loop_quantities` needs beside a loop: `names` of the limited quantities, and its other arguments."""
+
+    names: tuple[str, ...]
+    low: float
+    high: float
+    pole: float
+    volts_per_metre: float
 
 
 class Members(NamedTuple):
@@ -39,6 +50,11 @@ class Members(NamedTuple):
     def ordinary(self) -> int:
         """The number of members that are not stressed."""
         return int(np.sum(~self.stressed))
+
+    @property
+    def searched(self) -> "Members":
+        """The members whose linearised loops the search evaluates: the first LOOPS that are not stressed."""
+        return jax.tree.map(lambda a: a[: min(self.ordinary, LOOPS)], self)
 
     @property
     def unstressed(self) -> "Members":
@@ -71,6 +87,8 @@ class Objective:
     clock: Clock
     loss: Loss
     spread: Spread = Spread()
+    loop: LoopRange | None = None
+    """the analysis of the linearised loops; None: no limit needs it"""
 
     def members(self, seed: int, count: int) -> Members:
         """Return the first `count` members of the ensemble with this seed."""

@@ -16,6 +16,8 @@ from ambjax.simulation.response import Overshoot, Settling
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import Row
 
+# Largest number of members whose loops the search linearises. The judge linearises all of them.
+LOOPS = 8
 # Exponent of the norms that approximate maxima.
 NORM = 16
 # Lower bound of the argument of a logarithm.
@@ -83,6 +85,16 @@ def pooled(values: Array) -> Array:
     return jnp.sqrt(jnp.mean(values**2) + TINY)
 
 
+def worst_loop(values: Array) -> Array:
+    """Return `largest` over the members whose loops the search linearises."""
+    return largest(values[:LOOPS])
+
+
+def smallest_loop(values: Array) -> Array:
+    """Return the inverse of the 16-norm of the inverses over the members whose loops the search linearises."""
+    return 1 / largest(1 / values[:LOOPS])
+
+
 def largest(values: Array) -> Array:
     """Return the 16-norm over members: smooth, and not below the maximum."""
     top = jax.lax.stop_gradient(jnp.maximum(jnp.max(values), TINY))
@@ -96,14 +108,15 @@ class Kind:
     """A quantity that may be limited.
 
     `words` describes the quantity of one member, `over` its reduction over members, both for the report. `fold` returns
-    the fold that measures it in the search, of a LimitContext and the limit. `exact` is the column of its exact value
-    in the judge's metrics; None: the fold's result. `tuned` reduces the members for the search, `judged` for the judge.
+    the fold that measures it in the search, of a LimitContext and the limit; None: it is a field of LoopQuantities, of
+    the linearised loop. `exact` is the column of its exact value in the judge's metrics; None: the value of the search.
+    `tuned` reduces the members for the search, `judged` for the judge.
     """
 
     unit: str
     words: str
     over: str
-    fold: Callable[[LimitContext, float], Fold]
+    fold: Callable[[LimitContext, float], Fold] | None
     exact: str | None
     tuned: Callable[[Any], Any]
     judged: Callable[[np.ndarray], Any]
@@ -111,11 +124,14 @@ class Kind:
     """default margin"""
     worst: bool = False
     """whether the quantity is that of the worst member"""
+    at_least: bool = False
+    """whether the limit is a lower one"""
 
 
 _POOLED = {"over": "root mean square over members", "tuned": pooled, "judged": pooled, "margin": MEAN_MARGIN}
 _MEAN = {"over": "mean over members", "tuned": jnp.mean, "judged": np.mean, "margin": MEAN_MARGIN}
 _WORST = {"over": "of the worst member", "tuned": largest, "judged": np.max, "margin": WORST_MARGIN, "worst": True}
+_LOOP = _WORST | {"tuned": worst_loop, "fold": None, "exact": None}
 
 KINDS: dict[str, Kind] = {
     "rms_u_V": Kind(
@@ -169,5 +185,13 @@ KINDS: dict[str, Kind] = {
         fold=lambda context, threshold: Scaled(Peak("z"), context.touchdown),
         exact="clearance_used",
         **_WORST,
+    ),
+    "sensitivity": Kind("", "peak of |S| of the loop linearised at r = 0", **_LOOP),
+    "complementary": Kind("", "peak of |T| of the loop linearised at r = 0", **_LOOP),
+    "control_sensitivity": Kind("V/m", "peak of |KS| of the loop linearised at r = 0", **_LOOP),
+    "delay_margin_s": Kind(
+        "s",
+        "smallest additional delay that makes the loop, linearised at r = 0, unstable",
+        **_LOOP | {"tuned": smallest_loop, "judged": np.min, "at_least": True},
     ),
 }

@@ -2,7 +2,7 @@
 
 from ambjax.host.web_page import literal, table
 from tuning.objective.loss import TERMS
-from tuning.report import extras, held_out, limit_table
+from tuning.report import extras, held_out, limit_table, sensitivity_table
 from tuning.report.breakdown import FORMULA
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.held_out import number
@@ -16,6 +16,7 @@ def markdown(facts: TuningFacts) -> str:
     lines = [f"# Tuning of {literal(facts.case)}", "", facts.verdict, ""]
     lines += (
         limit_table.section(facts.limits)
+        + sensitivity_table.section(facts.sensitivity)
         + _gains(facts)
         + held_out.section(facts)
         + _loss(facts)
@@ -70,7 +71,7 @@ def _gains(facts: TuningFacts) -> list[str]:
 def _sensitivity(row: Row, facts: TuningFacts) -> str:
     """Describe the growth of the risk, or the additional lost members, when a gain is off."""
     if row.get("sensitivity_lost"):
-        return f"**{row['sensitivity_lost']} of {facts.trained_on} members lost**"
+        return f"**a gain off by 28 % loses a rotor ({row['sensitivity_lost']} of {facts.trained_on} members)**"
     return "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
 
 

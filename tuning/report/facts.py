@@ -17,7 +17,7 @@ SHOWN = (
     "clearance_used.largest",
 )
 # Fields that report.json leaves out if they are None.
-OPTIONAL = ("accurate", "gradient", "pareto")
+OPTIONAL = ("accurate", "gradient", "pareto", "sensitivity")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +26,8 @@ class TuningFacts:
 
     `before`, `after`: the held-out members under the case's gains and the tuned ones. `refuted`: why accurate steps
     contradict the answer; '' if they confirm it. `accurate`: some members with accurate steps. `gradient`, `pareto`:
-    None if not requested. `beside`: the lowest point of the slices through the answer.
+    None if not requested. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it. `beside`:
+    the lowest point of the slices through the answer.
     """
 
     case: str
@@ -37,6 +38,7 @@ class TuningFacts:
     trained_on: int
     lost_in_training: int
     limits: list[Row]
+    sensitivity: Row | None
     loss: Row
     minimised: Row
     conditions: list[Row]

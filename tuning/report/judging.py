@@ -13,10 +13,11 @@ from ambjax.theorem.conditions import check
 from tuning.config import seeds, settings
 from tuning.judge import StepError, describe, held, judge, step_error, summarise, worst, worst_of
 from tuning.problem import TuningProblem
-from tuning.report import accurate, breakdown, gradient, limit_table, outcome
+from tuning.report import accurate, breakdown, gradient, limit_table, outcome, sensitivity_table
 from tuning.report.facts import SHOWN, Row, TuningFacts
 from tuning.search import explore
 from tuning.search.course import SearchResult
+from tuning.sensitivity import injections
 
 
 def examined(answer: SearchResult, gradients: bool, front: bool) -> tuple[TuningFacts, explore.Slices]:
@@ -67,7 +68,9 @@ def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_
     none = {"members": 0, "held": 0, "lost": 0, "stalled": 0}
     found: Row = {name: summarise(one) if one else dict(none) for name, one in judged.items()}
     after = judged["after"]
-    found["limits"] = limit_table.facts(problem.limits, problem.tune.limits, after, found["after"], refuted)
+    measured = injections(problem, answer.x, held_out, after) if after else None
+    found["sensitivity"] = None if measured is None else sensitivity_table.facts(problem, measured)
+    found["limits"] = limit_table.facts(problem.limits, problem.tune.limits, after, found["after"], refuted, measured)
     if refuted and after:
         found["after"] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
     found["loss"] = {name: breakdown.table(problem.goal, one) for name, one in judged.items() if one}

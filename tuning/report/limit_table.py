@@ -7,6 +7,7 @@ import numpy as np
 from ambjax.host.web_page import table
 from tuning.config import LimitSettings
 from tuning.objective.limits import Limit
+from tuning.sensitivity import MEASURED, Sensitivity, reached_of
 
 Facts = dict[str, Any]
 # Relative increase of a limit for which the effect is computed.
@@ -22,12 +23,14 @@ def facts(
     columns: dict[str, np.ndarray],
     summary: Facts,
     refuted: str = "",
+    measured: Sensitivity | None = None,
 ) -> list[Facts]:
     """Return a row for each limit and one for survival, from the held-out members' columns [N] and their summary.
 
-    `refuted`: why accurate steps contradict the judged members; '' if they confirm them. In a row, `held` is None if no
-    member was judged, or if the limit is held but accurate steps contradict it; `verdict` is its text. `price_m`: the
-    decrease of the settled rms error (m) for a limit 10 % higher (`Limit.error_reduction`); None if it is not held.
+    `refuted`: why accurate steps contradict the judged members; '' if they confirm them. `measured`: the injections
+    into some of the judged members. In a row, `held` is None if no member was judged, or if the limit is held but
+    accurate steps contradict it; `verdict` is its text. `price_m`: the decrease of the settled rms error (m) for a
+    limit 10 % looser (`Limit.error_reduction`); None if it is not held.
     """
     members, held = summary["members"], summary["held"]
     share = held / members if members else None
@@ -35,6 +38,7 @@ def facts(
         "name": "survival",
         "unit": "",
         "threshold": settings.survival,
+        "at_least": True,
         "source": "tune.limits",
         "what": "share of members held",
         "reached": share,
@@ -44,7 +48,7 @@ def facts(
         "multiplier": None,
         "price_m": None,
     } | _verdict(None if share is None else members - held <= settings.may_lose(members), refuted)
-    return [*(_row(limit, columns, summary, refuted) for limit in limits), survival]
+    return [*(_row(limit, columns, summary, refuted, measured) for limit in limits), survival]
 
 
 def _verdict(kept: bool | None, refuted: str) -> Facts:
@@ -56,25 +60,36 @@ def _verdict(kept: bool | None, refuted: str) -> Facts:
     return {"held": None, "verdict": UNVERIFIED} if refuted else {"held": True, "verdict": HELD}
 
 
-def _row(limit: Limit, columns: dict[str, np.ndarray], summary: Facts, refuted: str) -> Facts:
+def _row(
+    limit: Limit, columns: dict[str, np.ndarray], summary: Facts, refuted: str, measured: Sensitivity | None
+) -> Facts:
     judged = summary["held"] > 0
-    reached = limit.reached(columns) if judged else None
-    kept = reached <= limit.threshold if reached is not None else False if summary["members"] else None
+    reached = reached_of(limit, columns, measured) if judged else None
+    kept = limit.holds(reached) if reached is not None else False if summary["members"] else None
     active, found = limit.active(reached), _verdict(kept, refuted)
     price = summary["settled_rms_error_m"] * limit.error_reduction(MORE) if active and judged else 0.0
     return {
         "name": limit.name,
         "unit": limit.kind.unit,
         "threshold": limit.threshold,
+        "at_least": limit.kind.at_least,
         "source": limit.source,
-        "what": f"{limit.kind.words}; {limit.kind.over}",
+        "what": f"{limit.kind.words}; {limit.kind.over}" + _by_injection(limit, measured),
         "reached": reached,
-        "worst": float(np.max(limit.of_members(columns))) if judged else None,
+        "worst": reached if limit.kind.fold is None or not judged else limit.worst(columns),
         "margin": limit.margin,
         "active": active,
         "multiplier": limit.multiplier,
         "price_m": price if found["held"] else None,
     } | found
+
+
+def _by_injection(limit: Limit, measured: Sensitivity | None) -> str:
+    """Return the words on the injection, if it measures the quantity."""
+    if limit.name not in MEASURED or measured is None or not measured.peaks[0].repetitions:
+        return ""
+    those = f"injected into {len(measured.peaks)} of the worst members"
+    return f"; {those}" if measured.decides else f", or {those} if that is larger"
 
 
 def broken(rows: list[Facts]) -> list[str]:
@@ -90,7 +105,7 @@ def prices(rows: list[Facts]) -> list[str]:
     """Return a sentence for each limit that is active and held."""
     return [
         f"{row['name']} = {row['reached']:.4g}{_unit(row)} is at its limit, {row['threshold']:g}: {100 * MORE:g} % "
-        f"more would take about {row['price_m']:.2g} m off the settled rms error"
+        f"{'less' if row['at_least'] else 'more'} would take about {row['price_m']:.2g} m off the settled rms error"
         for row in rows
         if row["active"] and row["held"]
     ]
@@ -129,7 +144,7 @@ def _reached(row: Facts) -> str:
 
 
 def _side(row: Facts) -> str:
-    return "at least" if row["name"] == "survival" else "at most"
+    return "at least" if row["at_least"] else "at most"
 
 
 def _unit(row: Facts) -> str:

@@ -82,10 +82,20 @@ def verdict(facts: TuningFacts, outcome: TuningOutcome) -> str:
     words += [f"{line}." for line in [*broken(facts.limits), *prices(facts.limits)]]
     if unjudged:
         words.append(f"Limits {UNJUDGED}: {', '.join(unjudged)}.")
+    words += [f"{line}." for line in _cliffs(facts)]
     ends = [f"{row['path']} = {row['after']:.4g} ({row['at_bound']})" for row in facts.gains if row["at_bound"]]
     if ends:
         words.append(f"At a bound: {', '.join(ends)}.")
     return " ".join(words)
+
+
+def _cliffs(facts: TuningFacts) -> list[str]:
+    """Return a sentence for each gain whose change by 28 % loses members of the training ensemble."""
+    return [
+        f"{row['path']}: a gain off by 28 % loses a rotor ({row['sensitivity_lost']} of {facts.trained_on} members)"
+        for row in facts.gains
+        if row.get("sensitivity_lost")
+    ]
 
 
 def _statuses(facts: TuningFacts) -> str:

@@ -152,7 +152,7 @@ def landscape(slices: Slices, paths: list[str]) -> bytes:
     axes = np.atleast_1d(figure.subplots(1, m, sharey=True))
     middle = slices.goals.shape[1] // 2
     for ax, gains, goals, lost, path in zip(axes, slices.gains, slices.goals, slices.lost, paths, strict=True):
-        risk = np.minimum(np.exp(goals - goals[middle]), HIGHEST)
+        risk = np.exp(np.minimum(goals - goals[middle], np.log(HIGHEST)))
         ax.loglog(gains, risk, "C0-", lw=1.2)
         held = lost == 0
         ax.plot(gains[held], risk[held], "C0o", ms=3.5, label="all members held")

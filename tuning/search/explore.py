@@ -26,6 +26,8 @@ class Slices:
     gains: np.ndarray
     goals: np.ndarray
     lost: np.ndarray
+    risks: np.ndarray
+    """the goals without the terms of the limits"""
 
     def sensitivity(self) -> np.ndarray:
         """Return the growth of the risk in per cent when a gain is off by a factor e^0.25, the worse side, [m].
@@ -33,8 +35,8 @@ class Slices:
         It has no meaning for a gain with `more_lost` > 0: the loss of a rotor costs about 1e6 times an error.
         """
         middle = len(REACH) // 2
-        beside = np.maximum(self.goals[:, middle - 1], self.goals[:, middle + 1])
-        return 100 * np.expm1(beside - self.goals[:, middle])
+        beside = np.maximum(self.risks[:, middle - 1], self.risks[:, middle + 1])
+        return 100 * np.expm1(beside - self.risks[:, middle])
 
     def more_lost(self) -> np.ndarray:
         """Return the number of additional lost members when a gain is off by a factor e^0.25, the worse side, [m]."""
@@ -61,10 +63,11 @@ def slices(problem: TuningProblem, x: np.ndarray, members: Members) -> Slices:
     for j in range(m):
         at[j * len(REACH) : (j + 1) * len(REACH), j] += REACH
     terms = problem.engine.terms(at, members)
-    goals = problem.goal.score(at, terms, members).reshape(m, -1)
+    free = dataclasses.replace(problem.goal, limits=())
+    goals, risks = (goal.score(at, terms, members).reshape(m, -1) for goal in (problem.goal, free))
     gains = np.stack([np.asarray(space.gains_at(jnp.asarray(one))) for one in at])
     own = np.stack([gains[j * len(REACH) : (j + 1) * len(REACH), j] for j in range(m)])
-    return Slices(own, goals, (terms["survival"] > 0).sum(axis=1).reshape(m, -1))
+    return Slices(own, goals, (terms["survival"] > 0).sum(axis=1).reshape(m, -1), risks)
 
 
 def pareto(

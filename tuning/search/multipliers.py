@@ -11,6 +11,7 @@ from tuning.config import seeds
 from tuning.judge import judge
 from tuning.objective.limits import PENALTY, PREFIX, TOLERANCE_BELOW, Limit
 from tuning.search.course import Course
+from tuning.sensitivity import decides, injections, reached_of
 
 # Largest number of updates of the multipliers in one round.
 MOST_UPDATES = 6
@@ -81,4 +82,5 @@ def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
     if not any(limit.kind.worst for limit in limits):
         count = min(count, AVERAGING_MEMBERS)
     columns = judge(problem, x, seed, count)
-    return [(ours, limit.reached(columns)) for limit, ours in zip(limits, tuned, strict=True)]
+    measured = injections(problem, x, seed, columns) if decides(problem) else None
+    return [(ours, reached_of(limit, columns, measured)) for limit, ours in zip(limits, tuned, strict=True)]

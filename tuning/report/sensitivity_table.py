@@ -1,0 +1,68 @@
+"""The sensitivity in the report: linear and injected peaks of |S| of held-out members, and their zones."""
+
+import dataclasses
+from typing import Any
+
+from ambjax.host.web_page import table
+from tuning.problem import TuningProblem
+from tuning.sensitivity import Sensitivity, injects
+
+Facts = dict[str, Any]
+
+
+def facts(problem: TuningProblem, measured: Sensitivity) -> Facts:
+    """Return plain data: a row for each member, and the limits of the zones.
+
+    `zone` of a row is that of the linear peak, `injected_zone` that of the injected one.
+    """
+    zones = problem.case.zones
+    rows = []
+    for one in measured.peaks:
+        row = {name: value for name, value in dataclasses.asdict(one).items() if name != "largest"}
+        lost = one.repetitions > 0 and one.peak is None
+        row["injected_zone"] = "D" if lost else None if one.peak is None else zones.zone(one.peak)
+        rows.append(row)
+    limits = [float(x) for x in (zones.zone_a, zones.zone_b, zones.zone_c)]
+    return {"members": rows, "injected": injects(problem), "decides": measured.decides, "zones": limits}
+
+
+def section(found: Facts | None) -> list[str]:
+    """Return the section on the sensitivity."""
+    if found is None:
+        return []
+    cells = [
+        [
+            str(row["member"]),
+            _number(row["linear"]),
+            _number(row["frequency_hz"]),
+            row["zone"],
+            *(_injected(row) if found["injected"] else []),
+        ]
+        for row in found["members"]
+    ]
+    head = ["member", "linear peak of |S|", "at (Hz)", "zone"]
+    if found["injected"]:
+        head += ["injected peak", "95 % interval", "at (Hz)", "zone", "saturated"]
+    a, b, c = found["zones"]
+    words = [
+        f"The held-out members with the largest linear peaks. Zone A is below {a:g}, B below {b:g}, C below {c:g}."
+    ]
+    if found["decides"]:
+        words.append("A sign is set-valued: the injected peak decides, because no linear loop describes chattering.")
+    elif found["injected"]:
+        words.append("The larger of the linear and the injected peak decides.")
+    else:
+        words.append("In continuous time the linear peak decides; `ambjax sensitivity --inject` measures it.")
+    return ["## Sensitivity", "", *table(head, cells), "", " ".join(words), ""]
+
+
+def _injected(row: Facts) -> list[str]:
+    if row["peak"] is None:
+        return [f"lost: {row['lost']} of {row['repetitions']}", "-", "-", row["injected_zone"], "-"]
+    interval = "-" if row["low"] is None else f"{row['low']:.4g} to {row['high']:.4g}"
+    saturated = f"{100 * row['saturated']:.2g} %"
+    return [_number(row["peak"]), interval, _number(row["at_hz"]), row["injected_zone"], saturated]
+
+
+def _number(x: float | None) -> str:
+    return "unstable" if x is None else f"{x:.4g}"
