@@ -81,7 +81,7 @@ def test_settings_are_those_of_another_case_but_for_its_gains(tmp_path):
         '[tune]\ngains = ["controller.position.c"]\nmembers = 5\nbounds.controller.position.c = [1.0, 9.0]\n'
         "[tune.limits]\nmax_u_V = 1.0\n"
     )
-    other.write_text("[tune]\nseed = 7\nweights.effort = 2.0\n[tune.limits]\nrms_u_V = 8.0\n")
+    other.write_text("[tune]\nseed = 7\nweights.effort = 2.0\n[tune.limits]\nrms_u_V = 8.0\nsensitivity = inf\n")
     _, tune, raw = read_tune(own, other)
     assert [(gain.path, gain.low, gain.high) for gain in tune.space.gains] == [("controller.position.c", 1.0, 9.0)]
     assert [(limit.name, limit.threshold) for limit in tune.limits.each] == [("rms_u_V", 8.0)]
