@@ -12,12 +12,12 @@ from ambjax.theorem.conditions import Report as Check
 from ambjax.theorem.conditions import check
 from tuning.config import seeds, settings
 from tuning.judge import StepError, describe, held, judge, step_error, summarise, worst, worst_of
+from tuning.measured_peaks import injections
 from tuning.problem import TuningProblem
 from tuning.report import accurate, breakdown, gradient, limit_table, outcome, sensitivity_table
 from tuning.report.facts import SHOWN, Row, TuningFacts
 from tuning.search import explore
 from tuning.search.course import SearchResult
-from tuning.sensitivity import injections
 
 
 def examined(answer: SearchResult, gradients: bool, front: bool) -> tuple[TuningFacts, explore.Slices]:

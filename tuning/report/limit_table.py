@@ -6,8 +6,8 @@ import numpy as np
 
 from ambjax.host.web_page import table
 from tuning.config import LimitSettings
+from tuning.measured_peaks import MEASURED, Sensitivity, reached_of
 from tuning.objective.limits import Limit
-from tuning.sensitivity import MEASURED, Sensitivity, reached_of
 
 Facts = dict[str, Any]
 # Relative increase of a limit for which the effect is computed.

@@ -4,8 +4,8 @@ import dataclasses
 from typing import Any
 
 from ambjax.host.web_page import table
+from tuning.measured_peaks import Sensitivity, injects
 from tuning.problem import TuningProblem
-from tuning.sensitivity import Sensitivity, injects
 
 Facts = dict[str, Any]
 

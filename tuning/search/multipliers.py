@@ -9,9 +9,9 @@ import numpy as np
 from ambjax.commands.outputs import say
 from tuning.config import seeds
 from tuning.judge import judge
+from tuning.measured_peaks import decides, injections, reached_of
 from tuning.objective.limits import PENALTY, PREFIX, TOLERANCE_BELOW, Limit
 from tuning.search.course import Course
-from tuning.sensitivity import decides, injections, reached_of
 
 # Largest number of updates of the multipliers in one round.
 MOST_UPDATES = 6
