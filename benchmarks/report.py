@@ -33,6 +33,7 @@ all other times on an idle machine.
     .venv/bin/python benchmarks/tasks.py             # the five tuning tasks
     .venv/bin/python benchmarks/sampled_tasks.py     # the tuning tasks on a processor
     .venv/bin/python benchmarks/bearings.py          # other bearings, and the templates
+    .venv/bin/python benchmarks/laws.py              # control structures against each other
     .venv/bin/python benchmarks/search.py            # the search against derivative-free methods
     .venv/bin/python benchmarks/from_answer.py       # CMA-ES started from a tuned answer
     .venv/bin/python benchmarks/export.py            # a step of an exported controller, also on a Cortex-M4F

@@ -1,0 +1,159 @@
+"""Control structures against each other: each tuned by `ambjax compare --tune`, then judged on the same members.
+
+Cases: F20 and G20 of the tuning tasks on a processor, the templates `rig` and `bearing`. The structures of a case have
+the same members, loss, limits and budget, and each is tuned with every seed. Every gain is tuned, the steepnesses p
+included. A comparison that lies in DIR/CASE-SEED is not run again, and results of cases that are not asked for stay.
+`--quick` is one seed and a budget that only shows that the script works; its results are not written. Most of the time
+of a search is spent on compilation, which later seeds of a case do not repeat.
+Run: python benchmarks/laws.py [--out DIR] [--quick] [CASE ...]
+"""
+
+import argparse
+import json
+import math
+import pathlib
+import statistics
+import subprocess
+import sys
+import tomllib
+from typing import Any
+
+import _measure
+import tasks
+import tomlkit
+
+from ambjax.cases.reader import Case, case_from
+from ambjax.cases.template_text import template
+from tuning.space import Gain, Space, tunable
+
+SAMPLED = tasks.TASKS / "sampled"
+# Limits of each case (V, V/s): two thirds of the supply and less, where each structure has to give up something.
+LIMITS: dict[str, dict[str, float]] = {
+    "F20": {"rms_u_V": 120.0, "chatter_V_per_s": 1e6},
+    "G20": {"rms_u_V": 120.0, "chatter_V_per_s": 1e6},
+    "rig": {"rms_u_V": 16.0, "chatter_V_per_s": 1.5e5},
+    "bearing": {"rms_u_V": 8.0, "chatter_V_per_s": 5e4},
+}
+BUDGET = {"members": 16, "stressed": 4, "validation": 200, "held_out": 0, "screen": 48, "starts": 2, "iterations": 15}
+QUICK = {"members": 4, "stressed": 0, "validation": 0, "held_out": 0, "screen": 8, "starts": 1, "iterations": 2}
+SEEDS, JUDGED, JUDGED_SEED = 5, 500, 1000
+# Numbers of compare.json in the results; the median and the range over seeds of each.
+SHOWN = ("rms_error_median_m", "rms_error_worst_m", "max_error_m", "rms_u_V", "chatter_V_per_s", "peak", "worst_peak")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", default=list(LIMITS))
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out", "laws"))
+    parser.add_argument("--quick", action="store_true", help="one seed, a small budget, nothing written to results")
+    given = parser.parse_args()
+    path = _measure.RESULTS / "laws.json"
+    rows = json.loads(path.read_text())["cases"] if path.exists() else {}
+    for name in given.names:
+        budget, count, members = (QUICK, 1, 20) if given.quick else (BUDGET, SEEDS, JUDGED)
+        found = [compared(name, seed, budget, members, given.out) for seed in range(1, count + 1)]
+        rows[name] = {"title": title(name), "limits": LIMITS[name], "structures": summary(found)}
+        for law, row in rows[name]["structures"].items():
+            print(f"{name}, {law}: {text(row)}", flush=True)
+    if not given.quick:
+        facts = {"budget": BUDGET, "seeds": SEEDS, "members": JUDGED}
+        _measure.write("laws", {**facts, "cases": {name: rows[name] for name in LIMITS if name in rows}})
+
+
+def source(name: str) -> str:
+    """Return the text of a case."""
+    path = SAMPLED / f"{name}.toml"
+    return path.read_text() if path.exists() else template(name)
+
+
+def title(name: str) -> str:
+    """Return the description of a case in its first line."""
+    first = source(name).splitlines()[0].removeprefix("# ").removeprefix("A case for ambjax: ")
+    return first.removeprefix(f"Tuning task {name}: ").partition(". ")[0].rstrip(".")
+
+
+def structures(case: Case, laws: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the tables [controller] of all structures. `laws`: that of the case, whose observer all have.
+
+    The PI controller starts with three times the bandwidth of the plant's pole, the others with their defaults.
+    """
+    w, L = float(case.scenario.plant.pole), float(case.scenario.plant.L)
+    drive = {"kind": "pi", "k_p": 3 * w * L, "k_int": w * w * L, "k_aw": w / 3}
+    soft = {stage: _without(laws.get(stage, {}), "p") for stage in ("position", "inversion", "current")}
+    hard = {stage: law | {"p": math.inf} for stage, law in soft.items()}
+    found = {
+        "cascade": soft,
+        "cascade-signs": hard,
+        "super-twisting": soft | {"position": {"kind": "super-twisting"}},
+        "pid": {"position": {"kind": "pid"}, "inversion": {"kind": "linearised"}, "current": drive},
+        "linearisation": {
+            "position": {"kind": "feedback-linearisation"},
+            "inversion": {"kind": "closed-form"},
+            "current": drive,
+        },
+        "lqg": {"position": {"kind": "state-feedback"}, "inversion": {"kind": "linearised"}, "current": drive},
+    }
+    return {name: {"observer": laws.get("observer", {}), **found[name]} for name in found}
+
+
+def _without(table: dict[str, Any], key: str) -> dict[str, Any]:
+    return {name: value for name, value in table.items() if name != key}
+
+
+def written(name: str, seed: int, budget: dict[str, int], folder: pathlib.Path) -> list[pathlib.Path]:
+    """Write a case file for each structure of a case and return their paths."""
+    raw = tomllib.loads(source(name))
+    case, paths = case_from(raw), []
+    for law, controller in structures(case, raw["controller"]).items():
+        document = _without(raw, "tune") | {"controller": controller}
+        cascade = case_from(document).cascade
+        known = tunable(cascade)
+        values = Space(tuple(Gain(path) for path in known)).values(cascade)
+        gains = [path for path, value in zip(known, values, strict=True) if math.isfinite(value)]
+        document["tune"] = {"gains": gains, "seed": seed, **budget, "limits": LIMITS[name]}
+        paths.append(folder / f"{law}.toml")
+        folder.mkdir(parents=True, exist_ok=True)
+        paths[-1].write_text(tomlkit.dumps(document))
+    return paths
+
+
+def compared(name: str, seed: int, budget: dict[str, int], members: int, out: pathlib.Path) -> list[dict[str, Any]]:
+    """Return the rows of `ambjax compare --tune` of all structures of a case."""
+    folder = out / f"{name}-{seed}"
+    answer = folder / "compare.json"
+    if not answer.exists():
+        paths = map(str, written(name, seed, budget, folder))
+        words = ["compare", *paths, "--tune", "--members", str(members), "--seed", str(JUDGED_SEED)]
+        subprocess.run([sys.executable, "-m", "ambjax", *words, "--out", str(folder)], check=False)
+    return json.loads(answer.read_text())["cases"]
+
+
+def summary(seeds: list[list[dict[str, Any]]]) -> dict[str, Any]:
+    """Return for each structure the median, least and largest of each number over seeds; None where one has none."""
+    found = {}
+    for rows in zip(*seeds, strict=True):
+        row: dict[str, Any] = {"lost": [one["lost"] + one["stalled"] for one in rows], "flops": rows[0]["flops"]}
+        row["unstable"] = [one["unstable"] for one in rows]
+        for key in SHOWN:
+            values = [one[key] for one in rows]
+            known = None not in values
+            row[key] = [statistics.median(values), min(values), max(values)] if known else None
+        found[rows[0]["case"]] = row
+    return found
+
+
+def text(row: dict[str, Any]) -> str:
+    """Return a row as one line of text."""
+
+    def number(key: str) -> str:
+        return "-" if row[key] is None else "{:.3g} ({:.3g} to {:.3g})".format(*row[key])
+
+    return (
+        f"rms error {number('rms_error_median_m')} m, worst member {number('rms_error_worst_m')} m, "
+        f"lost {row['lost']}, {number('rms_u_V')} V, {number('chatter_V_per_s')} V/s, |S| {number('peak')}, "
+        f"{row['flops']} flops"
+    )
+
+
+if __name__ == "__main__":
+    main()
