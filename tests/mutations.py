@@ -65,6 +65,20 @@ PLANT = [
 ]
 LAWS = [
     M(
+        "the sampled notch is not prewarped",
+        "ambjax/numerics/biquad.py",
+        "K = 2 / period if self.centre is None else",
+        "K = 2 / period if True else",
+        "tests/test_structures.py::test_the_sampled_chain_is_scipy_s_bilinear_transform_of_each_part",
+    ),
+    M(
+        "the integral of the chain winds up",
+        "ambjax/control/chain.py",
+        "period * e + leak / (1 + leak) * (i_star - motion.i)",
+        "period * e",
+        "tests/test_structures.py::test_the_integral_of_the_chain_follows_the_current_while_the_supply_cannot",
+    ),
+    M(
         "the optimal gains forget the weight of the integral",
         "ambjax/control/regulator.py",
         "(INTEGRAL * w / error) ** 2, 1 / error**2, 0.0",

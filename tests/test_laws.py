@@ -35,6 +35,7 @@ LAWS = [
     ("position", position.SuperTwisting()),
     ("position", position.FeedbackLinearisation()),
     ("position", position.StateFeedback()),
+    ("position", position.FilterChain()),
     ("position", position.PID()),
     ("inversion", inversion.Adaptive()),
     ("inversion", inversion.Adaptive(gamma=1e9, p=25e-6, i_ref=0.01)),

@@ -115,7 +115,10 @@ def test_tuning_uses_public_names_only(module):
             assert private in ([], ["__version__"]), f"{module} imports {private} from {node.module}"
 
 
-LAWS = [f"ambjax.control.{file}" for file in ("observer", "position", "pid", "state_feedback", "inversion", "current")]
+LAWS = [
+    f"ambjax.control.{file}"
+    for file in ("observer", "position", "pid", "state_feedback", "chain", "inversion", "current")
+]
 # Who may know which laws there are: those who make them of names, the paper's own, and a user's imports.
 MAKERS = ("ambjax.control.", "ambjax.cases.reader", "ambjax.paper.", "ambjax", "ambjax.extend")
 

@@ -4,10 +4,12 @@ import dataclasses
 import tomllib
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.signal
 
 from ambjax import Plant, position
 from ambjax.cases.reader import case_from
@@ -135,3 +137,95 @@ def test_feedback_linearisation_makes_the_mechanics_linear(model):
         np.testing.assert_allclose(e_ddot, -law.k_p * (z - r) - law.k_d * (z_dot - r_dot), rtol=1e-9, atol=1e-9)
     # two poles at w/3
     np.testing.assert_allclose(np.roots([1, law.k_d, law.k_p]), -model.pole / 3, rtol=1e-6)
+
+
+# --- the chain of filters ---
+
+CHAIN = position.FilterChain(
+    k_p=300.0, k_int=2e4, k_d=0.5, w_f=2e4, k_aw=1e-30, w_z=900.0, w_p=4e3, w_1=3e3, width_1=0.4, depth_1=0.1, w_2=2e4,
+    width_2=0.7, depth_2=0.3, w_lp=1.5e4,
+)  # fmt: skip
+
+
+def transfer(law, state, T, j):
+    """The response of i_star to z at the points j (1/s, or z with a period T), from the law's differentiated map."""
+    flat, back = jax.flatten_util.ravel_pytree(jax.tree.map(jnp.asarray, state))
+
+    def f(x, z):
+        inputs = Measurement(z, 0.0, 0.0), STILL
+        v, after = law(Plant(), inputs, back(x)) if T is None else law.step(Plant(), inputs, back(x), T)
+        i = (v - Plant().dv_dz(0.0, 0.0) * z) / Plant().dv_di(0.0, 0.0)
+        return i, jax.flatten_util.ravel_pytree(after)[0]
+
+    (C, D), (A, B) = jax.jacfwd(f, (0, 1))(flat, 0.0)
+    return np.array([np.asarray(C) @ np.linalg.solve(x * np.eye(len(B)) - A, B) + D for x in j])
+
+
+def sections(law):
+    """The parts of the chain as numerator and denominator in s, and the frequency of the bilinear transform's match."""
+    k = law
+    return [
+        ([k.k_p + k.k_d * k.w_f, k.k_p * k.w_f + k.k_int, k.k_int * k.w_f], [1, k.w_f, 0], None),
+        ([1 / k.w_z, 1], [1 / k.w_p, 1], None),
+        *(([1, d * b * w, w**2], [1, b * w, w**2], w)
+          for w, b, d in ((k.w_1, k.width_1, k.depth_1), (k.w_2, k.width_2, k.depth_2))),
+        ([k.w_lp**2], [1, 2**0.5 * k.w_lp, k.w_lp**2], None),
+    ]  # fmt: skip
+
+
+FREQUENCIES = 2 * np.pi * np.array([1.0, 30.0, 100.0, 3e3 / (2 * np.pi), 700.0, 2e3, 4e3])
+
+
+def test_the_chain_is_the_product_of_its_transfer_functions():
+    found = transfer(CHAIN, CHAIN.init(Plant()), None, 1j * FREQUENCIES)
+    wanted = np.prod([scipy.signal.freqs(b, a, FREQUENCIES)[1] for b, a, _ in sections(CHAIN)], axis=0)
+    np.testing.assert_allclose(found, -wanted, rtol=1e-9)  # a product of a dozen numbers, and a linear system
+
+
+@pytest.mark.parametrize("T", [5e-5, 1e-4])
+def test_the_sampled_chain_is_scipy_s_bilinear_transform_of_each_part(T):
+    found = transfer(CHAIN, CHAIN.init(Plant()), T, np.exp(1j * FREQUENCIES * T))
+    wanted = 1.0
+    for b, a, w in sections(CHAIN):
+        fs = 1 / T if w is None else w / np.tan(w * T / 2) / 2
+        wanted = wanted * scipy.signal.freqz(*scipy.signal.bilinear(b, a, fs), FREQUENCIES * T)[1]
+    np.testing.assert_allclose(found, -wanted, rtol=1e-8)
+    # at its centre a notch has exactly its depth; without it the chain is 1/depth larger
+    at, off = np.exp([1j * CHAIN.w_1 * T]), dataclasses.replace(CHAIN, depth_1=1.0)
+    ratio = transfer(CHAIN, CHAIN.init(Plant()), T, at) / transfer(off, CHAIN.init(Plant()), T, at)
+    np.testing.assert_allclose(ratio, CHAIN.depth_1, rtol=1e-9)
+
+
+def test_a_notch_beyond_the_nyquist_frequency_stays_stable():
+    chain, T = dataclasses.replace(CHAIN, w_2=3e5), 1e-4
+    flat, back = jax.flatten_util.ravel_pytree(jax.tree.map(jnp.asarray, chain.init(Plant())))
+
+    def after(x):
+        moved = chain.step(Plant(), (Measurement(0.0, 0.0, 0.0), STILL), back(x), T)[1]
+        return jax.flatten_util.ravel_pytree(moved)[0]
+
+    poles = np.abs(np.linalg.eigvals(jax.jacfwd(after)(flat)))
+    assert np.sum(poles > 1 - 1e-9) == 1  # the integral
+    assert np.max(poles) < 1 + 1e-9
+
+
+def test_parts_of_the_chain_that_are_off_change_nothing():
+    chain = position.FilterChain()
+    state = jax.tree.map(lambda x: x + 0.01, chain.init(Plant()))
+    state = state._replace(lead_lag=(0.0, 0.0), notch_1=(0.0, 0.0), notch_2=(0.0, 0.0))
+    inputs = Measurement(1e-4, 0.0, 0.0), STILL
+    for _, moved in (chain(Plant(), inputs, state), chain.step(Plant(), inputs, state, 1e-4)):
+        for pair in (moved.notch_1, moved.notch_2):
+            assert pair == (0.0, 0.0)
+        np.testing.assert_allclose(moved.lead_lag, 0.0, atol=1e-12)
+
+
+def test_the_integral_of_the_chain_follows_the_current_while_the_supply_cannot():
+    chain, far = position.FilterChain(k_aw=300.0), Measurement(1e-3, 0.0, 0.05)
+    (_, state), T = chain.step(Plant(), (far, STILL), chain.init(Plant()), 1e-4), 1e-4
+    step = jax.jit(lambda state: chain.step(Plant(), (far, STILL), state, T))
+    for _ in range(3000):  # the error stays, the current does not move: the demand comes to rest beside it
+        v, state = step(state)
+    i_star = (v - Plant().dv_dz(0.0, 0.0) * far.z) / Plant().dv_di(0.0, 0.0)
+    leak = chain.k_aw * T / (1 + chain.k_aw * T)
+    assert float(i_star - far.i) == pytest.approx(-chain.k_int * T * far.z / leak, rel=1e-6)

@@ -54,6 +54,7 @@ KINDS: dict[str, dict[str, type[Law]]] = {
         "pid": position.PID,
         "feedback-linearisation": position.FeedbackLinearisation,
         "state-feedback": position.StateFeedback,
+        "chain": position.FilterChain,
     },
     "inversion": {
         "adaptive": inversion.Adaptive,

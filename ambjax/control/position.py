@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.base import Requirement
+from ambjax.control.chain import FilterChain as FilterChain
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.laws import PositionLaw
 from ambjax.control.pid import PID as PID

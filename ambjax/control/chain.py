@@ -1,0 +1,159 @@
+"""The controller of industrial magnetic bearings: PID, lead-lag, notches and low-pass in series."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.control.force import force_of_current, linear_mechanics, resting_current
+from ambjax.control.laws import PositionLaw
+from ambjax.control.regulator import optimal_gains
+from ambjax.control.search import Interval, SearchContext, rate
+from ambjax.numerics.biquad import Biquad, lead_lag, low_pass, notch
+from ambjax.numerics.records import Scalar, gain, record
+from ambjax.world.plant import Plant
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference
+
+
+class ChainState(NamedTuple):
+    """State of `FilterChain`: the derivative's filter and the integral (A), and two numbers of each biquad."""
+
+    derivative: Array
+    integral: Array
+    lead_lag: tuple[Array, Array]
+    notch_1: tuple[Array, Array]
+    notch_2: tuple[Array, Array]
+    low_pass: tuple[Array, Array]
+
+
+@record
+class FilterChain(PositionLaw[ChainState]):
+    """v_star = dv/dz z + dv/di i_star, i_star = i_r - H e: PID, lead-lag, two notches and a low-pass in series.
+
+    H(s) = (k_p + k_int/s + k_d s/(1 + s/w_f)) (1 + s/w_z)/(1 + s/w_p) N_1(s) N_2(s) w_lp^2/(s^2 + sqrt(2) w_lp s +
+    w_lp^2) with N(s) = (s^2 + depth width w s + w^2)/(s^2 + width w s + w^2), and e = z - r. It uses the position only.
+    i_star and i_r are those of `state_feedback.StateFeedback`; for inversion.Linearised i_ref is i_star. Schweitzer and
+    Maslen, Magnetic Bearings (2009), 8.2. The integral takes up k_aw (i_star - i) while the supply limits u.
+
+    On a processor each part is a bilinear transform, exact at the centre of a notch, which is at most 0.98 of the
+    Nyquist frequency. The lead-lag is off if w_z = w_p, and a notch if its depth is 1, as the defaults are.
+    """
+
+    k_p: Scalar = gain(default=135.0, unit="A/m", doc="proportional gain; left out: as state-feedback")
+    k_int: Scalar = gain(default=5310.0, unit="A/m/s", doc="integral gain; left out: as state-feedback")
+    k_d: Scalar = gain(default=0.219, unit="A s/m", doc="derivative gain; left out: as state-feedback")
+    w_f: Scalar = gain(default=1.06e4, unit="1/s", doc="bandwidth of the derivative; left out: 20 w")
+    k_aw: Scalar = gain(default=10.6, unit="1/s", doc="anti-windup rate; left out: w/50")
+    w_z: Scalar = gain(default=2650.0, unit="1/s", doc="zero of the lead-lag; left out: 5 w")
+    w_p: Scalar = gain(default=2650.0, unit="1/s", doc="pole of the lead-lag; left out: 5 w")
+    w_1: Scalar = gain(default=5310.0, unit="1/s", doc="centre of the first notch; left out: 10 w")
+    width_1: Scalar = gain(default=0.5, unit="1", doc="width of the first notch, as a share of its centre")
+    depth_1: Scalar = gain(default=1.0, unit="1", doc="gain of the first notch at its centre; 1: no notch")
+    w_2: Scalar = gain(default=10600.0, unit="1/s", doc="centre of the second notch; left out: 20 w")
+    width_2: Scalar = gain(default=0.5, unit="1", doc="width of the second notch, as a share of its centre")
+    depth_2: Scalar = gain(default=1.0, unit="1", doc="gain of the second notch at its centre; 1: no notch")
+    w_lp: Scalar = gain(default=1.06e4, unit="1/s", doc="corner of the low-pass; left out: 20 w")
+    memory = (
+        ("derivative", "A", "filter of the derivative"),
+        ("integral", "A", "integral term"),
+        *(
+            (f"{part}_{k}", "A", f"state of the {words}")
+            for part, words in (
+                ("lead_lag", "lead-lag"),
+                ("notch_1", "first notch"),
+                ("notch_2", "second notch"),
+                ("low_pass", "low-pass"),
+            )
+            for k in (1, 2)
+        ),
+    )
+
+    def init(self, model: Plant) -> ChainState:
+        return jax.tree.map(jnp.zeros_like, self.scale(model))
+
+    def scale(self, model: Plant) -> ChainState:
+        size = jnp.asarray(model.i_0 / 25)
+        return ChainState(size, size, *[(size, size)] * 4)
+
+    def designed(self, model: Plant, period: float | None) -> "FilterChain":
+        """Return the law with the gains of `optimal_gains` in continuous time. Raises ValueError as it does."""
+        (k_int, k_p, k_d), w = map(float, optimal_gains(model)), float(model.pole)
+        return dataclasses.replace(
+            self, k_p=k_p, k_d=k_d, k_int=k_int, k_aw=w / 50, w_f=20 * w, w_z=5 * w, w_p=5 * w, w_1=10 * w, w_2=20 * w,
+            w_lp=20 * w,
+        )  # fmt: skip
+
+    def slope(self, model: Plant) -> Scalar:
+        """Return the largest corner of a part, k_aw, or the rate of e_ddot = -b (k_p e + k_d e_dot)."""
+        corners = (self.w_f, self.k_aw, self.w_p, self.w_1, self.w_2, self.w_lp, self.explicit_rate(model))
+        return jnp.max(jnp.stack([jnp.asarray(x) for x in corners]))
+
+    def sigma(self, motion: Measurement, reference: Reference) -> Array:
+        """Return e_dot + (k_p/k_d) e, the error that the feedback of e and e_dot drives to zero."""
+        return motion.z_dot - reference.r_dot + self.k_p / self.k_d * (motion.z - reference.r)
+
+    def _biquads(self) -> tuple[Biquad, ...]:
+        return (
+            lead_lag(self.w_z, self.w_p),
+            notch(self.w_1, self.width_1, self.depth_1),
+            notch(self.w_2, self.width_2, self.depth_2),
+            low_pass(self.w_lp),
+        )
+
+    def __call__(
+        self, model: Plant, inputs: tuple[Measurement, Reference], state: ChainState
+    ) -> tuple[Array, ChainState]:
+        motion, reference = inputs
+        e = motion.z - reference.r
+        # k_d s/(1 + s/w_f) = k_d w_f (1 - w_f/(s + w_f)): the state is k_d w_f^2/(s + w_f) e
+        y = self.k_p * e + state.integral + self.k_d * self.w_f * e - state.derivative
+        derivative, rates = self.w_f * (self.k_d * self.w_f * e - state.derivative), []
+        for part, x in zip(self._biquads(), state[2:], strict=True):
+            y, moved = part.output(y, x)
+            rates.append(moved)
+        i_star = resting_current(model, reference) - y
+        integral = self.k_int * e + self.k_aw * (i_star - motion.i)
+        return force_of_current(model, motion.z, i_star), ChainState(derivative, integral, *rates)
+
+    def step(
+        self, model: Plant, inputs: tuple[Measurement, Reference], state: ChainState, period: Scalar
+    ) -> tuple[Array, ChainState]:
+        """Step each part by the bilinear transform, and the anti-windup with a share of at most 1."""
+        motion, reference = inputs
+        e = motion.z - reference.r
+        half, leak = self.w_f * period / 2, self.k_aw * period
+        # derivative: k_d w_f (1 - q)/(1 + half - (1 - half) q), q the backward shift
+        differentiated = self.k_d * self.w_f / (1 + half) * e + state.derivative
+        derivative = -self.k_d * self.w_f / (1 + half) * e + (1 - half) / (1 + half) * differentiated
+        y = self.k_p * e + state.integral + self.k_int * period / 2 * e + differentiated
+        after = []
+        for part, x in zip(self._biquads(), state[2:], strict=True):
+            y, moved = part.step(y, x, period)
+            after.append(moved)
+        i_star = resting_current(model, reference) - y
+        integral = state.integral + self.k_int * period * e + leak / (1 + leak) * (i_star - motion.i)
+        return force_of_current(model, motion.z, i_star), ChainState(derivative, integral, *after)
+
+    def explicit_rate(self, model: Plant) -> Scalar:
+        """Return the larger of b k_d and sqrt(b k_p): the demanded current is that at the start of the sample."""
+        b = linear_mechanics(model).b
+        return jnp.maximum(b * self.k_d, jnp.sqrt(b * self.k_p))
+
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        b = linear_mechanics(context.model).b
+        corners = {name: rate(context, 2, 100, "corner from 2 w to 100 w") for name in ("w_f", "w_lp")}
+        corners |= {name: rate(context, 1, 50, "corner from w to 50 w") for name in ("w_z", "w_p")}
+        corners |= {name: rate(context, 2, 50, "centre from 2 w to 50 w") for name in ("w_1", "w_2")}
+        shares = {f"width_{k}": Interval(0.1, 2.0, "a tenth to twice the centre") for k in (1, 2)}
+        shares |= {f"depth_{k}": Interval(0.03, 1.0, "30 dB to no notch", True) for k in (1, 2)}
+        return {
+            "k_p": rate(context, 1, 5, "corner sqrt(b k_p) from w to 5 w", b, 2),
+            "k_d": rate(context, 1 / 3, 10, "rate b k_d from w/3 to 10 w", b),
+            "k_int": rate(context, 1 / 30, 2, "corner cbrt(b k_int) from w/30 to 2 w", b, 3),
+            "k_aw": rate(context, 1e-3, 1, "rate from w/1000 to w"),
+            **corners,
+            **shares,
+        }
