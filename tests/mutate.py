@@ -1,10 +1,11 @@
 """Break the program on purpose, one line at a time, and demand that a named test notices.
 
-    python tests/mutate.py [--jobs N] [WORD ...]
+    python tests/mutate.py [--jobs N] [--share K] [WORD ...]
 
 Every mutation of tests/mutations.py (with WORDs: those whose text has one of them) is made in a temporary copy of the
 project, never in place, and the test that guards the line is run there: it must pass without the mutation and fail
-with it. Exit code 1 if one survives, if its text is no longer found exactly once, or if its test fails by itself.
+with it. With `--share K` a K-th of the mutations is made: which one depends on the text of the file that each of them
+changes, so that every change of the program has another sample. Exit code 1 if one survives, if its text is no longer found exactly once, or if its test fails by itself.
 """
 
 import argparse
@@ -15,6 +16,7 @@ import shutil
 import sys
 import tempfile
 import time
+import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -42,6 +44,12 @@ def mutated(mutation: Mutation, root: pathlib.Path = ROOT) -> str:
         raise ValueError(f"{where} changes nothing. Adapt it in tests/mutations.py.")
     compile(changed, mutation.file, "exec")
     return changed
+
+
+def sample(mutations: Sequence[Mutation], share: int, root: pathlib.Path = ROOT) -> list[Mutation]:
+    """A `share`-th of the mutations, on average, chosen by checksums of their names and of the files that they change."""
+    text = {name: (root / name).read_text(encoding="utf-8") for name in {m.file for m in mutations}}
+    return [m for m in mutations if zlib.crc32(f"{m.says}\n{text[m.file]}".encode()) % share == 0]
 
 
 def parent() -> Parent:
@@ -129,12 +137,13 @@ def _hunt(
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Break the program line by line; each time a named test must fail.")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="mutants at a time (default 2)")
+    parser.add_argument("--share", type=int, default=1, metavar="K", help="one in K mutations only (default 1: all)")
     parser.add_argument("words", nargs="*", metavar="WORD", help="only mutations whose text has one of these")
     args = parser.parse_args(argv)
     chosen = [m for m in MUTATIONS if not args.words or any(w in f"{m.says} {m.file} {m.test}" for w in args.words)]
     if not chosen:
         parser.error(f"no mutation has {' or '.join(args.words)} in its text.")
-    return hunt(chosen, jobs=args.jobs, say=lambda text: print(text, flush=True))
+    return hunt(sample(chosen, max(args.share, 1)), jobs=args.jobs, say=lambda text: print(text, flush=True))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import contextlib
 import pathlib
 
 import pytest
-from mutate import KILLED, SURVIVED, hunt, main, parent, verdict
+from mutate import KILLED, SURVIVED, hunt, main, parent, sample, verdict
 from mutate import mutated as applied
 from mutations import MUTATIONS, Mutation
 
@@ -77,6 +77,17 @@ def test_a_test_that_fails_by_itself_kills_nothing(project):
     assert "mend them first" in said[-1]
 
 
+def test_a_sample_depends_on_the_text_of_the_program(project):
+    mutations = [BREAK._replace(says=str(number)) for number in range(1000)]
+    before = sample(mutations, 10, project)
+    assert 60 <= len(before) <= 140  # binomial: 100 on average, four standard deviations of 9.5
+    (project / BREAK.file).write_text(PROGRAM + "\n")
+    after = sample(mutations, 10, project)
+    assert len(set(before) & set(after)) <= 40  # independent samples share 10 on average
+    assert sample(mutations, 1, project) == mutations
+
+
 @pytest.mark.slow
-def test_no_mutation_survives(capsys):
-    assert main([]) == 0, capsys.readouterr().out
+def test_no_mutation_of_a_sample_survives(capsys):
+    """`python tests/mutate.py` makes all of them, in a quarter of an hour."""
+    assert main(["--share", "12"]) == 0, capsys.readouterr().out
