@@ -4,8 +4,9 @@
 
 Every mutation of tests/mutations.py (with WORDs: those whose text has one of them) is made in a temporary copy of the
 project, never in place, and the test that guards the line is run there: it must pass without the mutation and fail
-with it. With `--share K` a K-th of the mutations is made: which one depends on the text of the file that each of them
-changes, so that every change of the program has another sample. Exit code 1 if one survives, if its text is no longer found exactly once, or if its test fails by itself.
+with it. With `--share K` one mutation in K is made. Which ones depends on the text of the files that they change, so
+every change of the program has another sample. Exit code 1 if one survives, if its text is no longer found exactly
+once, or if its test fails by itself.
 """
 
 import argparse
@@ -47,7 +48,7 @@ def mutated(mutation: Mutation, root: pathlib.Path = ROOT) -> str:
 
 
 def sample(mutations: Sequence[Mutation], share: int, root: pathlib.Path = ROOT) -> list[Mutation]:
-    """A `share`-th of the mutations, on average, chosen by checksums of their names and of the files that they change."""
+    """Return one mutation in `share`, by checksums of their names and of the files that they change."""
     text = {name: (root / name).read_text(encoding="utf-8") for name in {m.file for m in mutations}}
     return [m for m in mutations if zlib.crc32(f"{m.says}\n{text[m.file]}".encode()) % share == 0]
 

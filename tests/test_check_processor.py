@@ -366,6 +366,7 @@ settle = 0.01
 """
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("elsewhere")
 def test_check_says_no_where_an_explicit_slope_is_beyond_its_limit(capsys):
     # gamma 2 p/pi T is 318; nothing loses the rotor in this time, the theorem's conditions hold, and the answer is no

@@ -85,6 +85,7 @@ def test_edges_of_several_periods():
     assert most_inside(world(0.1001, 0.7), np.array([1e-4, 2e-4])) == 1
 
 
+@pytest.mark.slow
 def test_members_with_edges_of_their_own():
     """Each moves as it does alone, and where the edges are traced."""
     starts, clock = np.array([0.002, 0.00203, 0.00217]), amb.Clock(40, T, amb.RK4(1), cuts=1)

@@ -81,7 +81,7 @@ def test_results_do_not_depend_on_how_long_blocks_are_on_this_machine(cpu, monke
     same(run_ensemble(SMOOTH, members(300), SHORT, fold=FOLD, threads=1), here, 1e-12)
 
 
-@pytest.mark.parametrize("method", [RK4(2), AdaptiveRodas3()], ids=str)
+@pytest.mark.parametrize("method", [RK4(2), pytest.param(AdaptiveRodas3(), marks=pytest.mark.slow)], ids=str)
 def test_a_member_is_the_rollout_of_that_member_alone(method):
     clock = Clock(40, 1e-4, method)
     found = run_ensemble(SMOOTH, members(66), clock, fold=FOLD, every=10)
@@ -297,6 +297,7 @@ def test_another_jax_resumes_only_what_it_began(tmp_path, monkeypatch):
         run(STUDY, tmp_path, resume=True)
 
 
+@pytest.mark.slow
 def test_the_variation_of_the_voltage_over_parts_of_the_run_adds_up():
     study = Study(SMOOTH, NOISY, SHORT, 0.0, Spread((("plant.m", Percent(10.0)),)), 3, 5)
     bands = study.bands(5, 40)

@@ -160,6 +160,7 @@ def wrong(limit):
     return [np.nan, np.inf, -np.inf, 1.001 * limit, -1.001 * limit]
 
 
+@pytest.mark.slow
 def test_an_invalid_reference_leaves_no_trace():
     controller, step, memory, inputs, answer = stepping(hard())
     for name in StepInputs._fields[3:]:

@@ -192,6 +192,7 @@ def test_a_horizon_too_short_decides_nothing():
     assert _looped("float", closed_loop.LoopComparison(horizon(LEAST), 1.001 * closed_loop.TIMES)).verdict == "FAILS"
 
 
+@pytest.mark.slow
 @compiled
 def test_a_loop_that_amplifies_rounding_is_compared_until_it_does(tmp_path):
     """Correct C passes though rounding grows a thousandfold after the horizon, and C with another gain fails.

@@ -84,6 +84,7 @@ def three_ways(request):
     return by_reverse, by_forward, (4 * half - whole) / 3
 
 
+@pytest.mark.slow
 def test_forward_equals_reverse(three_ways):
     by_reverse, by_forward, _ = three_ways
     size = np.max(np.abs(by_reverse), axis=-1, keepdims=True)
@@ -196,6 +197,7 @@ for f, leaves in zip(transforms, fast):
 """
 
 
+@pytest.mark.slow
 def test_the_fast_path_differentiates():
     # reverse mode through a marked call aborts XLA, and would take pytest with it
     code = IN_A_PROCESS_OF_ITS_OWN.replace("{transforms}", ", ".join(TRANSFORMS.values()))

@@ -66,7 +66,7 @@ WORLDS = {
 }
 
 
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=() if x == "delay 1" else pytest.mark.slow) for x in WORLDS])
 def test_guard_and_faults_against_the_independent_simulator(name):
     """An outlier, a dropout that is bridged, and one that lasts until the safe command."""
     std = NOISE if "noise" in name else (0.0, 0.0, 0.0)
@@ -191,7 +191,8 @@ def test_what_is_read_in_a_dropout(value):
     assert np.asarray(rows.refused)[50:54].all() == (value != "hold")
 
 
-@pytest.mark.parametrize("guard", [Guard(), pytest.param(None, marks=pytest.mark.slow)], ids=["guard", "none"])
+@pytest.mark.parametrize("guard", [Guard(), None], ids=["guard", "none"])
+@pytest.mark.slow
 def test_derivatives_are_finite_whatever_is_read(guard):
     cascade, scenario = struck(guard, outliers=Outliers(at=1e-3, size=1e-3), dropouts=Dropouts(at=4e-3, value="nan"))
     cascade, clock = cascade.on_processor(), amb.Clock(60, T, amb.RK4(1))

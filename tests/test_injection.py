@@ -40,7 +40,6 @@ WORLDS = {
     "slow sensor": {"bandwidth": 3e3, "gain": 1.02, "delay": 0.0},
     "slow amplifier": {"amplifier": {"bandwidth": 3e3}, "delay": 1.0},
 }
-SLOWEST = ("two coils", "slow amplifier")
 INJECTED = ("complementary", "slow amplifier")  # each is another program to compile
 
 
@@ -75,7 +74,9 @@ def measured_by_the_oracle(world, harmonics, samples, amplitude, monkeypatch):
     return read / e
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow if x in SLOWEST else ()) for x in WORLDS])
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=() if x == "complementary" else pytest.mark.slow) for x in WORLDS]
+)
 def test_the_peak_is_that_of_the_independent_simulator(name, monkeypatch):
     """Driven at nine lines around the peak. The parabola through three of them is within 0.2 % of the peak."""
     world = World(**LAWS, **WORLDS[name])

@@ -91,7 +91,11 @@ def simulated_map(cascade, scenario, r):
     return StateSpace(*(np.asarray(m) for m in (A, B[:, None], C, D[:, None], jnp.ones_like(x))), np.asarray(T))
 
 
-@pytest.mark.parametrize("name", LOOPS)
+# the others of LOOPS with the slow tests
+FIRST = "two coils off the model"
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=() if x == FIRST else pytest.mark.slow) for x in LOOPS])
 def test_the_matrices_are_those_of_the_simulation(name):
     cascade, scenario, r = loop_of(name)
     f = np.geomspace(1.0, 0.45 / T, 40)
@@ -211,6 +215,7 @@ def peak_of(cascade, scenario):
     return jnp.max(jnp.abs(system.sensitivity(jnp.geomspace(1.0, 2000.0, 50))))
 
 
+@pytest.mark.slow
 def test_the_peak_is_differentiable_in_the_gains_and_the_plant():
     """Forward = reverse = central difference along one direction, the shift of the equilibrium (off the model) too."""
     cascade = Cascade(**SMOOTH, processor=Processor(1.0)).on_processor()

@@ -90,6 +90,7 @@ def test_stalled_runs_are_counted_apart():
     assert found.lost.sum() == 0
 
 
+@pytest.mark.slow
 def test_the_sample_period_is_an_axis_either_way():
     period, std = Axis(PERIOD, np.array([1e-4, 5e-4])), Axis("sensor.std", np.array([1e-8, 1e-7, 1e-6]))
     one, other = grid(SMALL, std, period), grid(SMALL, period, std)

@@ -88,7 +88,7 @@ def case(elsewhere):
     [
         "simulate case.toml --json",
         "ensemble case.toml --members 3 --json",
-        "check case.toml --json",
+        pytest.param("check case.toml --json", marks=pytest.mark.slow),
         "map case.toml --x controller.position.stiff=8e3:1e4:2 --y plant.m=-1%:1%:2 --json",
         "export case.toml --json",
     ],
@@ -252,6 +252,7 @@ def test_a_change_of_the_file_during_the_search_does_not_matter(case):
     assert type(tuned.cascade.position) is type(one.cascade.position)
 
 
+@pytest.mark.slow
 def test_it_is_tuned_and_a_search_is_not_resumed_with_another_law(case, monkeypatch, capsys):
     small = "members = 2\nstressed = 1\nvalidation = 2\nheld_out = 2\nscreen = 2\nstarts = 1\niterations = 1\n"
     write(CASE + small)

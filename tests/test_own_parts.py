@@ -227,13 +227,12 @@ def test_mapped():
     np.testing.assert_allclose(found.error[2], alone["settled_max_abs_error_m"], rtol=1e-9)
 
 
-def test_tuned(tmp_path):
+def tuning_problem():
+    """A tuning problem of the parts of one's own, its settings and its case."""
     scenario = dataclasses.replace(NOISY, q_v=Constant(), initial=Initial())
     slow = dataclasses.replace(CASCADE, position=BoundaryLayer(rho=5.0))
     case = Case("own", slow, scenario, Clock(200, 1e-4), 0.005, Spread(((SKEW, Normal(0.02)),)))
     paths = [f"controller.{path}" for path in ("position.decay", "position.rho", "position.width")]
-    every = tune_from(Table({}), case).space.paths
-    assert every == [*paths, "controller.inversion.gamma", "controller.current.k_i"]
     asked = {
         "limits": {"sensitivity": math.inf},
         "members": 4,
@@ -245,7 +244,13 @@ def test_tuned(tmp_path):
         "iterations": 3,
     }
     tune = tune_from(Table({"gains": paths, **asked}), case)
-    problem = problem_of(case, tune)
+    return problem_of(case, tune), tune, case
+
+
+def test_tuned():
+    problem, tune, case = tuning_problem()
+    every = tune_from(Table({}), case).space.paths
+    assert every == [*tune.space.paths, "controller.inversion.gamma", "controller.current.k_i"]
     assert (
         problem_of(case, tune, finer=2).objective.clock.method.substeps == 2 * problem.objective.clock.method.substeps
     )
@@ -254,6 +259,11 @@ def test_tuned(tmp_path):
     width = problem.ranges[2]  # of which the law says nothing
     assert (width.low, width.high) == pytest.approx((0.05 / 30, 0.05 * 30))
     assert next(bound for bound in problem.goal.conditions if bound.path == RHO).symbol == "Q_z"
+
+
+@pytest.mark.slow
+def test_searched(tmp_path):
+    problem, tune, case = tuning_problem()
     start = tune.space.values(case.cascade)
     answer = rounds(problem, start, tmp_path, {"case": "own parts"}, False)
     history = answer.history["value"]

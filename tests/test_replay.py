@@ -342,7 +342,9 @@ PRINTED = {
 }
 
 
-@pytest.mark.parametrize("what", PRINTED)
+@pytest.mark.parametrize(
+    "what", [pytest.param(x, marks=pytest.mark.slow if x == "a rotor is lost" else ()) for x in PRINTED]
+)
 def test_commands_in_messages_do_what_they_promise(what, monkeypatch, capsys):
     no_pictures(monkeypatch)
     monkeypatch.setattr("tuning.command.rounds", _stopped)

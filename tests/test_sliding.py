@@ -127,6 +127,7 @@ def test_values_and_derivatives_are_finite_over_six_decades_of_gains():
     assert np.all(np.isfinite(slope))
 
 
+@pytest.mark.slow
 def test_derivatives_are_slopes_and_not_those_of_cliffs():
     """Forward derivatives of each member's log rms error agree with differences over 1e-4 in the log of each gain."""
     scenario = dataclasses.replace(TRACKING, sensor=Sensor(1e-6, 1e-4, 1e-4))

@@ -377,6 +377,7 @@ def test_the_sliding_step_can_be_asked_for(dt, substeps):
     assert case.clock.method == Slide(substeps)
 
 
+@pytest.mark.slow
 def test_the_error_of_the_sliding_step_is_measured_and_told(no_pictures, capsys):
     write(HARD.replace("dt = 5e-5", 'method = "sliding"'))
     assert main(["ensemble", "case.toml", "--members", "20", "--seed", "3", "--out", "out", "--json"]) == 0

@@ -314,6 +314,7 @@ def command(monkeypatch, tmp_path, world=None, **tune):
     return code, summary, out
 
 
+@pytest.mark.slow
 def test_the_command_says_what_a_limit_costs(monkeypatch, tmp_path):
     code, summary, out = command(monkeypatch, tmp_path, limits={"rms_u_V": 10.0})
     assert code == 0

@@ -190,6 +190,7 @@ def test_the_picture_begins_at_what_the_table_says_was_minimised(study, x):
 # --- accurate steps ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_accurate_values_are_those_of_adaptive_rollouts():
     study = problem_from(CASE, substeps=1)  # so coarse that the two differ
     study.__dict__["judging"] = study.engine

@@ -53,6 +53,7 @@ def engines():
     return *made, problem.members(3, 4), SPACE.encode(SPACE.values(CASCADE))
 
 
+@pytest.mark.slow
 def test_gradient_three_ways(engines):
     forward, reverse, members, x = engines
     value, slopes, _ = forward.gradient(x[None], members, WEIGHTS)
