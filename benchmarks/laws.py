@@ -84,6 +84,7 @@ def structures(case: Case, laws: dict[str, Any]) -> dict[str, dict[str, Any]]:
     found = {
         "cascade": soft,
         "cascade-signs": hard,
+        "cascade-integral": soft | {"position": {"kind": "integral-sliding-mode"}},
         "super-twisting": soft | {"position": {"kind": "super-twisting"}},
         "pid": {"position": {"kind": "pid"}, "inversion": {"kind": "linearised"}, "current": drive},
         "linearisation": {

@@ -33,6 +33,7 @@ LAWS = [
     ("observer", observer.IRED2()),
     ("position", position.SlidingMode()),
     ("position", position.SuperTwisting()),
+    ("position", position.IntegralSlidingMode()),
     ("position", position.FeedbackLinearisation()),
     ("position", position.StateFeedback()),
     ("position", position.FilterChain()),

@@ -11,7 +11,7 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
-from ambjax import Plant, position
+from ambjax import Plant, position, rollout
 from ambjax.cases.reader import case_from
 from ambjax.control import regulator
 from ambjax.control.base import default_law
@@ -229,3 +229,47 @@ def test_the_integral_of_the_chain_follows_the_current_while_the_supply_cannot()
     i_star = (v - Plant().dv_dz(0.0, 0.0) * far.z) / Plant().dv_di(0.0, 0.0)
     leak = chain.k_aw * T / (1 + chain.k_aw * T)
     assert float(i_star - far.i) == pytest.approx(-chain.k_int * T * far.z / leak, rel=1e-6)
+
+
+# --- integral sliding mode ---
+
+
+def test_the_integral_sliding_variable_obeys_equation_12():
+    """s' = -k sgn(s) along any motion: the rate of s by the chain rule, with v = v_star and no disturbance."""
+    law, model = position.IntegralSlidingMode(), Plant()
+    rng = np.random.default_rng(3)
+    for z, z_dot, r, r_dot, r_ddot, x in rng.uniform(-1, 1, (50, 6)) * [3e-3, 0.05, 2e-3, 0.03, 0.4, 1e-3]:
+        motion, reference = Measurement(z, z_dot, 0.0), Reference(r, r_dot, r_ddot)
+        v_star, x_dot = law(model, (motion, reference), x)
+        z_ddot = 2 * model.k_z / model.m * z + model.a * v_star - model.g
+        s = z_dot - r_dot + law.c * (z - r) + law.c_int * x
+        s_dot = z_ddot - r_ddot + law.c * (z_dot - r_dot) + law.c_int * x_dot
+        # rounding of terms of some 10 m/s^2
+        np.testing.assert_allclose(s_dot, -law.k * 2 / np.pi * np.arctan(law.p * s), atol=1e-11)
+
+
+@pytest.mark.parametrize("kind", ["sliding-mode", "integral-sliding-mode"])
+def test_a_constant_force_leaves_no_offset_with_the_integral(kind):
+    """q_z = 5 m/s^2 inside the layer of the sign. Without the integral: e = tan(pi q_z/2k)/(p c), by Eqs. (5), (12)."""
+    raw = {
+        "controller": {"position": {"kind": kind, "k": 25.0, "p": 25.0}, "inversion": {"gamma": 1e6, "p": 2.0}},
+        "disturbance": {"q_z": {"kind": "constant", "value": 5.0}},
+        "clock": {"duration": 1.5},
+    }
+    case = case_from(raw)
+    rows = rollout(case.cascade, case.scenario, case.clock).trajectory.rows
+    offset = {"sliding-mode": np.tan(np.pi * 5 / 50) / (25 * 17), "integral-sliding-mode": 0.0}[kind]
+    # with the integral two poles at 8.4 1/s: (1 + 12.5) exp(-12.5) of 0.8 mm are left of the transient
+    np.testing.assert_allclose(rows.z[-1], offset, atol=2e-7, rtol=1e-3)
+
+
+def test_the_integral_sliding_mode_steps_the_sign_implicitly():
+    """p = inf (None here), within the band k T: the sign takes s to zero in one period, T s' = -s; x steps by T e."""
+    law, model, T = position.IntegralSlidingMode(p=None), Plant(), 1e-3
+    motion = Measurement(1e-4, 3e-3, 0.0)
+    v_star, x = law.step(model, (motion, STILL), 2e-5, T)
+    s = 3e-3 + 17 * 1e-4 + 70 * 2e-5
+    z_ddot = 2 * model.k_z / model.m * 1e-4 + model.a * v_star - model.g
+    assert abs(s) < law.k * T
+    np.testing.assert_allclose(z_ddot + 17 * 3e-3 + 70 * 1e-4, -s / T, rtol=1e-11)
+    assert x == 2e-5 + T * 1e-4

@@ -50,6 +50,7 @@ KINDS: dict[str, dict[str, type[Law]]] = {
     },
     "position": {
         "sliding-mode": position.SlidingMode,
+        "integral-sliding-mode": position.IntegralSlidingMode,
         "super-twisting": position.SuperTwisting,
         "pid": position.PID,
         "feedback-linearisation": position.FeedbackLinearisation,

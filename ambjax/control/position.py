@@ -8,6 +8,7 @@ from jax import Array
 from ambjax.control.base import Requirement
 from ambjax.control.chain import FilterChain as FilterChain
 from ambjax.control.force import force_for, sliding_variable
+from ambjax.control.integral_sliding import IntegralSlidingMode as IntegralSlidingMode
 from ambjax.control.laws import PositionLaw
 from ambjax.control.pid import PID as PID
 from ambjax.control.pid import FeedbackLinearisation as FeedbackLinearisation

@@ -1,0 +1,83 @@
+"""Sliding mode with the integral of the error on its manifold: the paper's position law with integral action."""
+
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.control.force import force_for, sliding_variable
+from ambjax.control.laws import PositionLaw
+from ambjax.control.search import Interval, SearchContext, authority, manifold, rate, steepness, switch
+from ambjax.numerics.records import Scalar, gain, record
+from ambjax.numerics.relax import share
+from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
+from ambjax.world.plant import Plant
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference
+
+
+@record
+class IntegralSlidingMode(PositionLaw[Array]):
+    """v_star = (-2 k_z z/m - c e_dot - c_int e + r_ddot + g - k sgn(s))/a, s = e_dot + c e + c_int x, x' = e = z - r.
+
+    Eq. (5) with the integral of the error in the sliding variable (Slotine and Li, Applied Nonlinear Control, 1991,
+    7.1): s' = -k sgn(s) + q_z as in Eq. (12), and e_ddot + c e_dot + c_int e = 0 on the manifold. The smoothed sign of
+    Eq. (5) leaves an offset under a constant force, because s is then not zero. Here e = 0 at rest for any constant s.
+    There is no anti-windup: the integral goes on while the supply limits u.
+    """
+
+    c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold")
+    c_int: Scalar = gain(default=70.0, unit="1/s^2", doc="gain of the integral of the error; c^2/4: two equal poles")
+    k: Scalar = gain(default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z")
+    p: Scalar = gain(
+        default=25.0,
+        unit="s/m",
+        doc="steepness of the smoothed sign; left out: scaled to the plant",
+        steepness=True,
+    )
+    memory = (("x", "m s", "integral of the error"),)
+
+    def init(self, model: Plant) -> Array:
+        return jnp.zeros(())
+
+    def scale(self, model: Plant) -> Scalar:
+        return model.s_0 / 500
+
+    def slope(self, model: Plant) -> Scalar:
+        return jnp.maximum(TWO_OVER_PI * self.k * self.p, self.explicit_rate(model))
+
+    def size(self, model: Plant) -> Scalar:
+        return model.sigma_size
+
+    def sigma(self, motion: Measurement, reference: Reference) -> Array:
+        """Return e_dot + c e, the sliding variable without its integral."""
+        return sliding_variable(self.c, motion, reference)
+
+    def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: Array) -> tuple[Array, Array]:
+        motion, reference = inputs
+        s = self.sigma(motion, reference) + self.c_int * state
+        return self._force(model, inputs, -self.k * smooth_sign(s, self.p)), motion.z - reference.r
+
+    def _force(self, model: Plant, inputs: tuple[Measurement, Reference], robust: Array) -> Array:
+        motion, reference = inputs
+        return force_for(self.c, model, motion, reference, robust - self.c_int * (motion.z - reference.r))
+
+    def explicit_rate(self, model: Plant) -> Scalar:
+        """Return the larger of c and sqrt(c_int): on the manifold the demanded force is that at the sample's start."""
+        return jnp.maximum(self.c, jnp.sqrt(self.c_int))
+
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        if context.stepped:
+            most = context.w**2 * float(context.model.s_0)
+            k = authority(context, most, (1e-3, 0.3), "w^2 s_0: what the magnets accelerate the rotor by", "Q_z")
+        else:
+            k = switch(context, "k", self.p, 100, "Q_z")
+        c_int = rate(context, 1 / 30, 2, "corner sqrt(c_int) from w/30 to 2 w", power=2)
+        return {"c": manifold(context), "c_int": c_int, "k": k, **steepness(context, "k")}
+
+    def step(
+        self, model: Plant, inputs: tuple[Measurement, Reference], state: Array, period: Scalar
+    ) -> tuple[Array, Array]:
+        """Step with the sign of s at the end of the step, as `SlidingMode` does; x+ = x + T e."""
+        motion, reference = inputs
+        s = self.sigma(motion, reference) + self.c_int * state
+        robust = -self.k * share(s, period * self.k, self.p)
+        return self._force(model, inputs, robust), state + period * (motion.z - reference.r)
