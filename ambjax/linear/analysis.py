@@ -130,7 +130,8 @@ def linearise_members(
     Returns the matrices, each with a leading axis [N], and whether each member has an equilibrium [N]. Raises
     ValueError as `rollout` does.
     """
-    return map_members(_member, canonical((*prepared(cascade, scenario, clock), r)), plain=True)
+    # one call at a time: XLA runs LAPACK on its own threads, and two calls may wait for each other for ever
+    return map_members(_member, canonical((*prepared(cascade, scenario, clock), r)), threads=1, plain=True)
 
 
 def _member(tree: Any) -> tuple[StateSpace, Any]:

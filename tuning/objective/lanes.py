@@ -136,7 +136,7 @@ class Engine:
         self.rollouts += len(x) * len(members.member)
         terms = self._lanes(LaneFold(self.objective.space), x, members, self.lanes, fold=self._world[-1])
         if self.objective.loop is not None:
-            values = loops(self.objective, x, members.searched, self.threads)[0]
+            values = loops(self.objective, x, members.searched)[0]
             terms |= {PREFIX + name: _wide(one, len(members.member)) for name, one in values.items()}
         return terms
 
@@ -153,7 +153,7 @@ class Engine:
             found.append(map_members(measured, world, threads=self.threads, call=self.lanes, block=block))
         metrics = jax.tree.map(lambda *parts: np.stack(parts), *found)
         if self.objective.loop is not None:
-            values = loops(self.objective, x, members, self.threads)[0]
+            values = loops(self.objective, x, members)[0]
             metrics["loss"] |= {PREFIX + name: one for name, one in values.items()}
         return metrics
 
@@ -177,7 +177,7 @@ class Engine:
         """Insert the quantities of the linearised loops into the results of `gradient`, in the order of the names."""
         outcomes, slopes, terms = found
         names = sorted(self.objective.loss.measures)
-        values, moves = loops(self.objective, x, members.searched, self.threads)
+        values, moves = loops(self.objective, x, members.searched)
         more = {name: _wide(one, len(members.member)) for name, one in values.items()}
         columns = {name: outcomes[..., 1 + k] for k, name in enumerate(names)} | more
         along = {name: slopes[..., 1 + k, :] for k, name in enumerate(names)}

@@ -46,9 +46,7 @@ class LaneLoop:
         return values, slopes
 
 
-def loops(
-    objective: Objective, x: np.ndarray, members: Members, threads: int | None = None
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def loops(objective: Objective, x: np.ndarray, members: Members) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return the limited quantities [S, N] by name at coordinates x [S, m] for members [N], and derivatives [S, N, m].
 
     The gains of stressed members are not shifted. Raises ValueError as `rollout` does.
@@ -63,7 +61,8 @@ def loops(
     lane = jax.tree.map(lambda a: np.asarray(a)[member] if np.ndim(a) else a, canonical(lane))
     lane = lane._replace(x=np.asarray(x, jnp.result_type(float))[start])
     function = LaneLoop(objective.space, objective.loop)
-    values, slopes = map_members(function, lane, threads=threads, call=LANES, block=LANES, plain=True)
+    # one call at a time: XLA runs LAPACK on its own threads, and two calls wait for each other for ever
+    values, slopes = map_members(function, lane, threads=1, call=LANES, block=LANES, plain=True)
     names = objective.loop.names
     return (
         {name: getattr(values, name).reshape(count, n) for name in names},
