@@ -65,6 +65,20 @@ PLANT = [
 ]
 LAWS = [
     M(
+        "the sliding mode of Utkin begins with a reaching phase",
+        "ambjax/control/manifolds.py",
+        "jnp.where(state.begun > 0.5, state.integral, self.begin(model, inputs))",
+        "state.integral",
+        "tests/test_manifolds.py::test_an_integral_sliding_mode_begins_on_its_manifold",
+    ),
+    M(
+        "the terminal sliding mode does not follow its manifold",
+        "ambjax/control/manifolds.py",
+        "-2 / 3 * self.c**2 * self.l * root",
+        "-1 / 3 * self.c**2 * self.l * root",
+        "tests/test_manifolds.py::test_the_terminal_manifold_is_driven_by_the_sign_only",
+    ),
+    M(
         "the sampled notch is not prewarped",
         "ambjax/numerics/biquad.py",
         "K = 2 / period if self.centre is None else",

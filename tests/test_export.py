@@ -107,6 +107,8 @@ CASCADES = {
     "state feedback, linearised": hard(position=position.StateFeedback(), inversion=inversion.Linearised()),
     "a chain": hard(position=position.FilterChain(depth_1=0.1, w_z=2000.0), inversion=inversion.Linearised()),
     "integral sliding mode": hard(position=position.IntegralSlidingMode(p=INF)),
+    "Utkin's sliding mode": hard(position=position.UtkinSlidingMode(k=2.3, p=INF)),
+    "terminal sliding mode": hard(position=position.TerminalSlidingMode()),
     "Kalman": hard(observer=observer.Kalman()),
     "a difference": hard(observer=observer.Difference(), inversion=inversion.ClosedForm()),
     "a differentiator": hard(observer=observer.IRED1(), processor=Processor(0.5)),

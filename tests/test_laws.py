@@ -34,6 +34,8 @@ LAWS = [
     ("position", position.SlidingMode()),
     ("position", position.SuperTwisting()),
     ("position", position.IntegralSlidingMode()),
+    ("position", position.UtkinSlidingMode()),
+    ("position", position.TerminalSlidingMode()),
     ("position", position.FeedbackLinearisation()),
     ("position", position.StateFeedback()),
     ("position", position.FilterChain()),

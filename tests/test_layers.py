@@ -117,7 +117,17 @@ def test_tuning_uses_public_names_only(module):
 
 LAWS = [
     f"ambjax.control.{file}"
-    for file in ("observer", "position", "integral_sliding", "pid", "state_feedback", "chain", "inversion", "current")
+    for file in (
+        "observer",
+        "position",
+        "integral_sliding",
+        "manifolds",
+        "pid",
+        "state_feedback",
+        "chain",
+        "inversion",
+        "current",
+    )
 ]
 # Who may know which laws there are: those who make them of names, the paper's own, and a user's imports.
 MAKERS = ("ambjax.control.", "ambjax.cases.reader", "ambjax.paper.", "ambjax", "ambjax.extend")

@@ -89,6 +89,7 @@ def case(elsewhere):
         "simulate case.toml --json",
         "ensemble case.toml --members 3 --json",
         pytest.param("check case.toml --json", marks=pytest.mark.slow),
+        pytest.param("sensitivity case.toml --json", marks=pytest.mark.slow),
         "map case.toml --x controller.position.stiff=8e3:1e4:2 --y plant.m=-1%:1%:2 --json",
         "export case.toml --json",
     ],

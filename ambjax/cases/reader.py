@@ -52,6 +52,8 @@ KINDS: dict[str, dict[str, type[Law]]] = {
         "sliding-mode": position.SlidingMode,
         "integral-sliding-mode": position.IntegralSlidingMode,
         "super-twisting": position.SuperTwisting,
+        "utkin-sliding-mode": position.UtkinSlidingMode,
+        "terminal-sliding-mode": position.TerminalSlidingMode,
         "pid": position.PID,
         "feedback-linearisation": position.FeedbackLinearisation,
         "state-feedback": position.StateFeedback,

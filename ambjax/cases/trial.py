@@ -42,13 +42,15 @@ def try_law(law: Law, stage: str, model: Plant) -> None:
         kept = state if stage == "observer" else one.init_sampled(model)
         owns = any(one.has_own_step(implicit) for implicit in (True, False))
         after = one.step(model, inputs, kept, 1e-4) if owns else one(model, inputs, kept)
-        return state, one(model, inputs, state), one.scale(model), kept, after, one.slope(model)
+        begun = one.begin(model, inputs) if stage == "position" else state
+        return state, one(model, inputs, state), one.scale(model), kept, after, one.slope(model), begun
 
-    state, (output, rate), scale, kept, after, slope = jax.eval_shape(everything, inputs)
+    state, (output, rate), scale, kept, after, slope, begun = jax.eval_shape(everything, inputs)
     _same(output, wanted, f"{type(law).__name__} must return {OUTPUTS[stage]} and the rate of its state; the first is")
     _same(rate, state, "the rate of the state must be like init(model); it is")
     _same(scale, state, "scale(model) must be like init(model); it is")
     _same(after, (wanted, kept), "on a processor, a step must return the output and the next state; they are")
+    _same(begun, state, "begin(model, inputs) must be like init(model); it is")
     _same(slope, _zero(), "slope(model) must be a number; it is")
 
 

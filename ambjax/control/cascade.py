@@ -96,14 +96,19 @@ class Cascade:
             if getattr(self, stage) is _LEFT_OUT:
                 object.__setattr__(self, stage, default_law(kind, self.model))
 
-    def init(self, measured: Measurement) -> CascadeState:
-        """Return the states of all laws at t = 0, in continuous time or on the processor."""
-        rest = self.position, self.inversion, self.current
-        if self.processor is None:
-            states = [law.init(self.model) for law in rest]
-        else:
-            states = [law.init_sampled(self.model) for law in rest]
-        return CascadeState(self.observer.init(self.model, measured), *states)
+    def init(self, measured: Measurement, reference: Reference | None = None) -> CascadeState:
+        """Return the states of all laws at t = 0, in continuous time or on the processor.
+
+        In continuous time a position law may begin at the first error, if the reference at t = 0 is given.
+        """
+        observed, rest = self.observer.init(self.model, measured), (self.position, self.inversion, self.current)
+        if self.processor is not None:
+            return CascadeState(observed, *(law.init_sampled(self.model) for law in rest))
+        states = [law.init(self.model) for law in rest]
+        if reference is not None:
+            estimate, _ = self.observer(self.model, measured, observed)
+            states[0] = self.position.begin(self.model, (estimate, reference))
+        return CascadeState(observed, *states)
 
     def scale(self) -> CascadeState:
         """Return the characteristic size of each number of the laws' states; integration errors are relative to it."""

@@ -98,6 +98,10 @@ class PositionLaw(Law, Generic[State], abc.ABC):
     @abc.abstractmethod
     def init(self, model: Plant) -> State: ...
 
+    def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> State:
+        """Return the state at t = 0 in continuous time for the first estimate and reference; `init` by default."""
+        return self.init(model)
+
     @abc.abstractmethod
     def scale(self, model: Plant) -> object: ...
 

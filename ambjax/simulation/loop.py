@@ -88,7 +88,8 @@ class ClosedLoop:
     def start(self) -> LoopState:
         """Return the state at t = 0."""
         plant = self.scenario.plant.start(self.scenario.initial.measurement())
-        return LoopState(plant, self.cascade.init(self.measured(plant, self.sensor_errors(0))))
+        measured = self.measured(plant, self.sensor_errors(0))
+        return LoopState(plant, self.cascade.init(measured, reference_at(self.scenario.reference, 0.0)))
 
     def measured(self, plant: object, errors: Errors) -> Measurement:
         """Return the readings of the sensors for this state of the plant."""

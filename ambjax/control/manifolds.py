@@ -1,0 +1,191 @@
+"""Sliding modes on other manifolds than the paper's: one from the start (Utkin), and a non-singular terminal one."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.control.force import force_for, sliding_variable
+from ambjax.control.laws import PositionLaw
+from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
+from ambjax.numerics.records import Scalar, gain, record
+from ambjax.numerics.relax import share
+from ambjax.numerics.smooth import TWO_OVER_PI, safe_sqrt, smooth_root, smooth_sign
+from ambjax.world.plant import Plant
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference
+
+# Speed below which the root of `TerminalSlidingMode` is smoothed, as a share of c l.
+WIDTH = 0.01
+
+
+def _switching(context: SearchContext, p: Scalar) -> Interval:
+    """Return the range of the switching gain k of a position law."""
+    if not context.stepped:
+        return switch(context, "k", p, 100, "Q_z")
+    most = context.w**2 * float(context.model.s_0)
+    return authority(context, most, (1e-3, 0.3), "w^2 s_0: what the magnets accelerate the rotor by", "Q_z")
+
+
+class UtkinState(NamedTuple):
+    """State of `UtkinSlidingMode` on a processor: the integral (m/s), and a flag: 0 before the first sample."""
+
+    integral: Array
+    begun: Array
+
+
+@record
+class UtkinSlidingMode(PositionLaw[Array]):
+    """v_star = (-2 k_z z/m + r_ddot + g - k_p e - k_d e_dot - k sgn(s))/a, s = e_dot + k_d e + x, x' = k_p e.
+
+    Integral sliding mode: feedback linearisation, and a sign that cancels the disturbance (V. Utkin and J. Shi, Proc.
+    35th IEEE Conf. Decision and Control, 1996, 4591-4596). x starts at -(e_dot + k_d e), so that s = 0 from the
+    beginning: there is no reaching phase, and for |q_z| < k the error follows e_ddot = -k_p e - k_d e_dot at all times.
+    `integral_sliding.IntegralSlidingMode` starts its integral at 0 instead. s is not part of a trajectory, which
+    reports e_dot + (k_p/k_d) e as sigma. The default k_p and k_d for a model place a double pole at w/3.
+    """
+
+    k_p: Scalar = gain(default=3.1e4, unit="1/s^2", doc="proportional gain; left out: (w/3)^2")
+    k_d: Scalar = gain(default=354.0, unit="1/s", doc="derivative gain; left out: 2 w/3")
+    k: Scalar = gain(default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z")
+    p: Scalar = gain(
+        default=25.0, unit="s/m", doc="steepness of the smoothed sign of s; left out: scaled to the plant",
+        steepness=True,
+    )  # fmt: skip
+    memory = (("integral", "m/s", "integral of k_p e"), ("begun", "1", "1 after the first sample"))
+    own_steps = ("implicit", "explicit")
+
+    def init(self, model: Plant) -> Array:
+        return jnp.zeros(())
+
+    def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> Array:
+        """Return the x with s = 0."""
+        return -sliding_variable(self.k_d, *inputs)
+
+    def init_sampled(self, model: Plant) -> UtkinState:
+        return UtkinState(jnp.zeros(()), jnp.zeros(()))
+
+    def scale(self, model: Plant) -> Scalar:
+        return model.sigma_size
+
+    def scale_sampled(self, model: Plant) -> UtkinState:
+        return UtkinState(jnp.asarray(model.sigma_size), jnp.ones(()))
+
+    def designed(self, model: Plant, period: float | None) -> "UtkinSlidingMode":
+        return dataclasses.replace(self, k_p=(model.pole / 3) ** 2, k_d=2 * model.pole / 3)
+
+    def slope(self, model: Plant) -> Scalar:
+        return jnp.maximum(TWO_OVER_PI * self.k * self.p, self.explicit_rate(model))
+
+    def size(self, model: Plant) -> Scalar:
+        return model.sigma_size
+
+    def sigma(self, motion: Measurement, reference: Reference) -> Array:
+        return sliding_variable(self.k_p / self.k_d, motion, reference)
+
+    def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: Array) -> tuple[Array, Array]:
+        s = sliding_variable(self.k_d, *inputs) + state
+        return self._force(model, inputs, smooth_sign(s, self.p)), self.k_p * (inputs[0].z - inputs[1].r)
+
+    def _force(self, model: Plant, inputs: tuple[Measurement, Reference], sign: Array) -> Array:
+        motion, reference = inputs
+        return force_for(0.0, model, motion, reference, -self.k_d * self.sigma(motion, reference) - self.k * sign)
+
+    def explicit_rate(self, model: Plant) -> Scalar:
+        """Return the larger of k_d and sqrt(k_p): the demanded force is that at the start of the sample."""
+        return jnp.maximum(self.k_d, jnp.sqrt(self.k_p))
+
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        return {
+            "k_p": rate(context, 1 / 30, 3, "corner sqrt(k_p) from w/30 to 3 w", power=2),
+            "k_d": rate(context, 1 / 10, 10, "rate k_d from w/10 to 10 w"),
+            "k": _switching(context, self.p),
+            **steepness(context, "k"),
+        }
+
+    def step(
+        self, model: Plant, inputs: tuple[Measurement, Reference], state: UtkinState, period: Scalar
+    ) -> tuple[Array, UtkinState]:
+        """Step with the sign of s at the end of the step, from s = 0 at the first sample."""
+        motion, reference = inputs
+        x = jnp.where(state.begun > 0.5, state.integral, self.begin(model, inputs))
+        sign = share(sliding_variable(self.k_d, *inputs) + x, period * self.k, self.p)
+        after = UtkinState(x + period * self.k_p * (motion.z - reference.r), jnp.ones(()))
+        return self._force(model, inputs, sign), after
+
+
+@record
+class TerminalSlidingMode(PositionLaw[tuple[()]]):
+    """v_star = (-2 k_z z/m + r_ddot + g - 2/3 c^2 l |y|^(1/2) sgn(y) - k sgn(sigma))/a, y = e_dot/(c l).
+
+    Non-singular terminal sliding mode (Y. Feng, X. Yu and Z. Man, Automatica 38 (2002) 2159-2167) with the exponent
+    3/2: sigma = c (e + l |y|^(3/2) sgn(y)). On sigma = 0 the rate of the error is -c l |e/l|^(2/3) sgn(e): the error
+    e_0 ends in the finite time 3 |e_0/l|^(1/3)/c. At |e| = l the error decays as on the manifold of Eq. (4), nearer to
+    the reference faster. The root is smoothed below |y| = 0.01, and the sign with p. There is no integral.
+    """
+
+    c: Scalar = gain(default=106.0, unit="1/s", doc="decay rate on the manifold where |e| = l; left out: w/5")
+    l: Scalar = gain(default=5e-4, unit="m", doc="error at which the decay rate is c; left out: s_0/10")
+    k: Scalar = gain(default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z")
+    p: Scalar = gain(
+        default=25.0, unit="s/m", doc="steepness of the smoothed sign of sigma; left out: scaled to the plant",
+        steepness=True,
+    )  # fmt: skip
+
+    def init(self, model: Plant) -> tuple[()]:
+        return ()
+
+    def scale(self, model: Plant) -> tuple[()]:
+        return ()
+
+    def designed(self, model: Plant, period: float | None) -> "TerminalSlidingMode":
+        return dataclasses.replace(self, c=model.pole / 5, l=model.s_0 / 10)
+
+    def slope(self, model: Plant) -> Scalar:
+        """Return the larger of the rates of the sign at |y| = 1, where d sigma/d e_dot is 3/2, and of the root."""
+        return jnp.maximum(1.5 * TWO_OVER_PI * self.k * self.p, self.explicit_rate(model))
+
+    def size(self, model: Plant) -> Scalar:
+        return model.sigma_size
+
+    def sigma(self, motion: Measurement, reference: Reference) -> Array:
+        y = self._speed(motion, reference)
+        return self.c * (motion.z - reference.r + self.l * y * safe_sqrt(jnp.abs(y)))
+
+    def _speed(self, motion: Measurement, reference: Reference) -> Array:
+        return (motion.z_dot - reference.r_dot) / (self.c * self.l)
+
+    def __call__(
+        self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()]
+    ) -> tuple[Array, tuple[()]]:
+        return self._force(model, inputs, smooth_sign(self.sigma(*inputs), self.p)), ()
+
+    def _force(self, model: Plant, inputs: tuple[Measurement, Reference], sign: Array) -> Array:
+        root = smooth_root(self._speed(*inputs), 1 / WIDTH)
+        return force_for(0.0, model, *inputs, -2 / 3 * self.c**2 * self.l * root - self.k * sign)
+
+    def explicit_rate(self, model: Plant) -> Scalar:
+        """Return the slope of the smoothed root at 0: the demanded force is that at the start of the sample."""
+        return 2 / 3 * self.c * WIDTH**-0.5
+
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        size = float(context.model.s_0)
+        return {
+            "c": rate(context, 1 / 30, 2, "rate from w/30 to 2 w"),
+            "l": Interval(1e-3 * size, size, "a thousandth of the gap to the gap"),
+            "k": _switching(context, self.p),
+            **steepness(context, "k"),
+        }
+
+    def step(
+        self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()], period: Scalar
+    ) -> tuple[Array, tuple[()]]:
+        """Step with the sign of sigma at the end of the step.
+
+        d sigma/d e_dot = 3/2 |y|^(1/2) is taken at the largest |y| that the sign reaches in the step.
+        """
+        reach = period * self.k
+        most = jnp.abs(self._speed(*inputs)) + reach / (self.c * self.l)
+        sign = share(self.sigma(*inputs), 1.5 * reach * safe_sqrt(most), self.p)
+        return self._force(model, inputs, sign), ()
