@@ -80,7 +80,10 @@ class Bowl:
         each = {"tracking": FLOOR * (1 + (away**2).sum(axis=1)), "effort": 0.01 * np.exp(2 * away[:, -1])}
         each = {name: term[:, None] + nothing for name, term in each.items()} | {"survival": 1 - np.exp(-beyond)}
         terms = {name: each.get(name, nothing) for name in TERMS}
-        return terms | {PREFIX + name: 200 * each["effort"] ** 0.5 for name in self.objective.loss.measures}
+        quantities = dict.fromkeys(self.objective.loss.measures, 200 * each["effort"] ** 0.5)
+        if "rms_error_m" in quantities:
+            quantities["rms_error_m"] = S_0 * each["tracking"] ** 0.5
+        return terms | {PREFIX + name: value for name, value in quantities.items()}
 
     def terms(self, x, members):
         self._note("terms", x, members)
@@ -141,7 +144,15 @@ BUDGET = {
 def document(tables=None, **tune):
     """A case file whose two gains are tuned, as read from TOML; `tables` replace those of CASE."""
     limits = {"sensitivity": math.inf} | tune.pop("limits", {})
-    told = {"gains": PATHS, "bounds": BOUNDS, "weights": {"effort": 0.0}, "limits": limits, **BUDGET, **tune}
+    told = {
+        "objective": "least_error",
+        "gains": PATHS,
+        "bounds": BOUNDS,
+        "weights": {"effort": 0.0},
+        "limits": limits,
+        **BUDGET,
+        **tune,
+    }
     return CASE | (tables or {}) | {"tune": told}
 
 

@@ -69,6 +69,7 @@ u_max = 200.0
 [clock]
 duration = 0.01
 [tune]
+objective = "least_error"
 limits.sensitivity = inf
 gains = ["controller.position.damp"]
 """

@@ -234,6 +234,7 @@ def tuning_problem():
     case = Case("own", slow, scenario, Clock(200, 1e-4), 0.005, Spread(((SKEW, Normal(0.02)),)))
     paths = [f"controller.{path}" for path in ("position.decay", "position.rho", "position.width")]
     asked = {
+        "objective": "least_error",
         "limits": {"sensitivity": math.inf},
         "members": 4,
         "stressed": 2,

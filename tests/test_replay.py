@@ -263,6 +263,7 @@ def test_check_on_a_processor_sees_the_run_of_simulate(monkeypatch, capsys):
 
 TUNE = """
 [tune]
+objective = "least_error"
 limits.sensitivity = inf
 gains = ["controller.position.c", "controller.position.k"]
 screen = 4

@@ -199,6 +199,7 @@ def test_without_a_screen_there_is_the_case_alone():
 def write(path, text, **tune):
     document = tomllib.loads(text)
     document["tune"] = {
+        "objective": "least_error",
         "members": 8,
         "held_out": 100,
         "validation": 100,

@@ -131,6 +131,7 @@ duration = 0.02
 [run]
 settle = 0.01
 [tune]
+objective = "least_error"
 members = 4
 stressed = 2
 validation = 8
@@ -139,6 +140,7 @@ screen = 0
 [tune.limits]
 rms_u_V = 80
 sensitivity = inf
+rms_error_m = 1e-6
 max_u_V = 150
 max_abs_i_A = 3
 chatter_V_per_s = 1e5

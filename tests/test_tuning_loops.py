@@ -29,6 +29,7 @@ DOCUMENT = {
     "run": {"settle": 0.002},
     "spread": {"plant": {"m": {"percent": 10}}},
     "tune": {
+        "objective": "least_error",
         "gains": PATHS,
         "bounds": {"controller.position.k": [1.0, 1e7]},
         "members": 12,

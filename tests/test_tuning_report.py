@@ -51,6 +51,7 @@ settle = 0.01
 [spread]
 plant.m = { percent = 5 }
 [tune]
+objective = "least_error"
 limits.sensitivity = inf
 gains = ["controller.position.c", "controller.position.k"]
 screen = 4

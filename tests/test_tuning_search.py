@@ -488,6 +488,7 @@ duration = 0.03
 [run]
 settle = 0.01
 [tune]
+objective = "least_error"
 limits.sensitivity = inf
 members = 4
 stressed = 2

@@ -21,7 +21,9 @@ def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
     top.add_argument("--out", metavar="DIR", help="where to write (default: a new directory under ./out)")
     top.add_argument("--resume", action="store_true", help="go on with the search whose checkpoint is in --out")
     top.add_argument("--gradients", action="store_true", help="report the gradient itself too: a minute more")
-    top.add_argument("--pareto", action="store_true", help="trace the front of error against voltage too")
+    top.add_argument(
+        "--pareto", action="store_true", help="write each point of the front of error against voltage as a case file"
+    )
     top.add_argument(
         "--settings-of",
         metavar="OTHER.toml",

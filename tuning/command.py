@@ -58,7 +58,7 @@ def _plan(args: argparse.Namespace) -> TuningPlan:
         raise ValueError(f"--resume: there is no search in --out {args.out}. Check --out, or leave out --resume.")
     print_warnings(case, args.case)
     try:
-        problem = problem_of(case, tune)
+        problem = problem_of(case, tune, front=args.pareto)
         start = tune.space.values(case.cascade)
         tune.space.encode(start)
         tuned_case(case, _laws(problem, {}), "", pathlib.Path())
@@ -73,6 +73,8 @@ def _tune(plan: TuningPlan, args: argparse.Namespace) -> tuple[int, Row]:
     facts, slices = examined(answer, args.gradients, args.pareto)
     with files(plan.out) as part:
         _write(part, plan.out, answer, facts, slices)
+        if args.pareto:
+            _write_front(part, plan.out, answer, facts)
     _print(plan.out, facts, quiet=args.json)
     return int(not facts.outcome["good"]), plain(facts.table) | {"out": str(plan.out)}
 
@@ -117,12 +119,24 @@ def _write(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: T
     history: dict[str, Any] = answer.history
     np.savez(part / "history.npz", **history)
     words = report.markdown(facts)
-    drawn = _pictures(problem, tuned.cascade, history, slices, facts.pareto)
+    drawn = _pictures(problem, tuned.cascade, history, slices, facts.front)
     for name, data in drawn.items():
         (part / name).write_bytes(data)
     (part / "report.md").write_text(words, encoding="utf-8")
     (part / "report.html").write_text(page(words, drawn, f"Tuning of {facts.case}"), encoding="utf-8")
     write_json(part / REPORT, facts.table)
+
+
+def _write_front(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts) -> None:
+    """Write a case file for each point of the front."""
+    case = answer.problem.case
+    for row in facts.front or []:
+        words = (
+            f"A point of the front: settled rms error {row['settled_rms_error_m']:.3g} m, settled rms voltage "
+            f"{row['settled_rms_u_V']:.3g} V. It is not judged on the held-out members."
+        )
+        text, _ = tuned_case(case, _laws(answer.problem, row["gains"]), words, out)
+        (part / row["file"]).write_text(text, encoding="utf-8")
 
 
 def _pictures(

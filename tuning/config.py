@@ -13,6 +13,7 @@ from ambjax.cases.tune_table import (
     ALPHA,
     BUDGET,
     NUMBERS,
+    OBJECTIVES,
     OPTIMISER,
     RISK,
     SETTLING_BAND,
@@ -31,7 +32,7 @@ from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.optimisers import NAMES
 from tuning.space import CLOSEST, Gain, Space, tunable
 
-WORDS = ["gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
+WORDS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
 # Keys of [tune] that depend on the laws of the case.
 LAWS_OWN = ("gains", "bounds")
 LIMIT: dataclasses.Field = leaf(at_least=1e-12, at_most=1e12, infinite=True)
@@ -64,6 +65,8 @@ class LimitSettings:
 class Tune:
     """The table [tune]. `weights` are in the order of TERMS; `conditions` is the weight of the conditions."""
 
+    objective: str
+    """"knee" or "least_error" """
     space: Space
     weights: tuple[float, ...]
     limits: LimitSettings
@@ -113,6 +116,7 @@ def tune_from(table: Table, case: Case) -> Tune:
     optimiser = table.choice("optimiser", list(NAMES), OPTIMISER)
     numbers = {name: table.leaf(name, field, field.default) for name, field in NUMBERS.items()}
     return Tune(
+        objective=table.choice("objective", list(OBJECTIVES), OBJECTIVES[0]),
         space=_space(table, case),
         weights=weights,
         limits=_limits(table.table("limits"), case),
@@ -225,6 +229,7 @@ def _risk(table: Table) -> Risk:
 def settings(tune: Tune) -> dict[str, Any]:
     """Return [tune] as plain data, for the report and the fingerprint of a checkpoint."""
     facts = {
+        "objective": tune.objective,
         "gains": tune.space.paths,
         "bounds": {gain.path: [gain.low, gain.high] for gain in tune.space.gains},
         "weights": dict(zip(TERMS, tune.weights, strict=True)) | {"conditions": tune.conditions},

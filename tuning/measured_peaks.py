@@ -61,10 +61,12 @@ def decides(problem: TuningProblem) -> bool:
     return injects(problem) and any(hard_signs(getattr(problem.case.cascade, stage)) for stage in USUAL)
 
 
-def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray]) -> Sensitivity | None:
+def injections(
+    problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray], most: int = INJECTED
+) -> Sensitivity | None:
     """Analyse and measure the members with the largest linear peak at coordinates x [m], of the judged `columns` [N].
 
-    Returns None if no limit needs it, or no member is held.
+    `most`: number of these members. Returns None if no limit needs it, or no member is held.
     """
     name = next((name for name in MEASURED if f"loss.{PREFIX}{name}" in columns), None)
     alive = np.flatnonzero(~np.isfinite(columns["lost_at_s"]))
@@ -72,7 +74,7 @@ def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
         return None
     order = np.argsort(-columns[f"loss.{PREFIX}{name}"][alive], kind="stable")
     count = len(columns["lost_at_s"])
-    peaks = tuple(_member(problem, x, seed, int(k), count) for k in alive[order[:INJECTED]])
+    peaks = tuple(_member(problem, x, seed, int(k), count) for k in alive[order[:most]])
     return Sensitivity(peaks, decides(problem))
 
 

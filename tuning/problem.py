@@ -14,9 +14,10 @@ from ambjax.simulation.sliding import Slide, slides
 from tuning.config import Tune
 from tuning.objective.goal import Goal
 from tuning.objective.lanes import Engine
-from tuning.objective.limits import Limit, measures
-from tuning.objective.loss import loss_for
+from tuning.objective.limits import FRONT, Limit, measures
+from tuning.objective.loss import HELD, TERMS, loss_for
 from tuning.objective.members import LoopRange, Objective
+from tuning.objective.quantities import KINDS, LimitContext
 from tuning.objective.ranges import Range, bounded
 from tuning.objective.shortfalls import bounds
 
@@ -25,6 +26,10 @@ from tuning.objective.shortfalls import bounds
 REFINEMENT = 8
 # Number of members, relative tolerance and largest number of step trials of the accurate reference.
 REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 10_000
+# Quantities that the front of error against voltage needs.
+TRACED = ("rms_error_m", "rms_u_V")
+# Initial multiplier of the limit on the error: with it, 1 % less error costs 1.5 % more voltage.
+EXCHANGE = 3.0
 # Largest number of gains for which forward mode is cheaper than reverse mode.
 MOST_FORWARD = 8
 
@@ -43,6 +48,9 @@ class TuningProblem:
     """ratio of the number of steps to that of tune.substeps"""
     limits: tuple[Limit, ...] = ()
     """the limits, and the state of their augmented Lagrangian"""
+
+    front: bool = False
+    """whether the front of error against voltage is to be traced"""
 
     @property
     def sampled(self) -> bool:
@@ -89,6 +97,26 @@ class TuningProblem:
             self, limits=limits, goal=dataclasses.replace(self.goal, limits=tuple(limit.term for limit in limits))
         )
 
+    def towards_voltage(self, error_m: float, volts: float, factor: float) -> "TuningProblem":
+        """Return the problem of the least rms voltage with an rms error of at most `factor` times `error_m` (m).
+
+        The other limits stay. `volts` (V): rms voltage at `error_m`. The unit of the voltage is such that its square
+        there equals that of the error in units of s_0: so the loss of a rotor costs as much as before.
+        """
+        weights = tuple(weight if name in HELD else 0.0 for name, weight in zip(TERMS, self.tune.weights, strict=True))
+        unit = error_m / float(np.asarray(self.objective.loss.s_0)) / volts
+        goal = dataclasses.replace(self.goal, weights=weights, minimised="rms_u_V", unit=unit)
+        own = [limit.restarted() for limit in self.limits if limit.name != "rms_error_m"]
+        asked = min([factor * error_m, *(one.threshold for one in self.tune.limits.each if one.name == "rms_error_m")])
+        nearly = Limit("rms_error_m", asked, FRONT, KINDS["rms_error_m"].margin, multiplier=EXCHANGE)
+        limits = tuple(sorted([*own, nearly], key=lambda limit: limit.name))
+        return dataclasses.replace(self, goal=goal).limited(limits)
+
+    @property
+    def error_goal(self) -> Goal:
+        """The goal of least error, without limits."""
+        return dataclasses.replace(self.goal, weights=self.tune.weights, minimised="", limits=())
+
     def _stepping(self, method: Integrator, **more: Any) -> Engine:
         objective = dataclasses.replace(self.objective, clock=dataclasses.replace(self.objective.clock, method=method))
         return Engine(objective, settle=self.case.settle, **more)
@@ -120,25 +148,30 @@ def method_for(case: Case, substeps: int, finer: int) -> Integrator:
     return dataclasses.replace(method, substeps=finer * method.substeps)
 
 
-def problem_of(case: Case, tune: Tune, *, finer: int = 1, threads: int | None = None) -> TuningProblem:
+def problem_of(
+    case: Case, tune: Tune, *, finer: int = 1, threads: int | None = None, front: bool = False
+) -> TuningProblem:
     """Return the tuning problem of a case, with `finer` times as many steps as tune.substeps.
 
-    `threads`: number of cores; None: all.
+    `threads`: number of cores; None: all. `front`: whether to trace the front of error against voltage even if
+    tune.objective does not need it.
     """
     clock = case.clock.with_method(method_for(case, tune.budget.substeps, finer))
     limits = tune.limits
-    measured = measures(limits.each, case.scenario, clock, case.settle, limits.band)
-    loss = loss_for(case.scenario, case.settle, tune.early, measured)
+    front = front or tune.objective == "knee"
+    names = sorted({limit.name for limit in limits.each} | set(TRACED if front else ()))
+    context = LimitContext(case.settle, float(clock.duration), float(case.scenario.touchdown), limits.band)
+    loss = loss_for(case.scenario, case.settle, tune.early, measures(names, limits.each, context))
     objective = Objective(
         tune.space, case.cascade, case.scenario, clock, loss, case.spread, _loop_range(case, limits.each)
     )
     conditions = bounds(case.cascade, case.scenario, clock)
     space, box = bounded(objective, conditions, tune.space.values(case.cascade))
     objective = dataclasses.replace(objective, space=space)
-    goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin)
+    goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin, measured=tuple(names))
     mode = "forward" if len(tune.space) <= MOST_FORWARD else "reverse"
     engine = Engine(objective, settle=case.settle, mode=mode, threads=threads)
-    return TuningProblem(case, tune, objective, engine, goal, box, finer).limited(limits.each)
+    return TuningProblem(case, tune, objective, engine, goal, box, finer, front=front).limited(limits.each)
 
 
 def _loop_range(case: Case, limits: tuple[Limit, ...]) -> LoopRange | None:

@@ -8,6 +8,8 @@ from ambjax.numerics.records import leaf
 
 # Default optimiser, risk, and alpha of the risk "cvar".
 OPTIMISER, RISK, ALPHA = "bfgs", "mean", 0.9
+# Objectives, the default first: least voltage at 1.25 times the least error, or the least error itself.
+OBJECTIVES = ("knee", "least_error")
 # Default limit of the rms voltage, as a share of actuator.u_max.
 VOLTAGE_SHARE = 0.6
 # Default share of the held-out members that must survive.
@@ -71,6 +73,9 @@ class Budget:
     starts: int = _whole(4, 1, "number of the best of these points, which are refined")
     iterations: int = _whole(40, 1, "largest number of iterations in each phase of the refinement")
     substeps: int = _whole(3, 1, "integration steps per sample")
+    front: int = leaf(
+        3, at_least=1, at_most=5, whole=True, doc="points of error against voltage beside that of the least error"
+    )
 
 
 BUDGET: dict[str, dataclasses.Field] = {field.name: field for field in dataclasses.fields(Budget)}
@@ -85,6 +90,10 @@ class Line(NamedTuple):
 
 def lines() -> Iterator[Line]:
     """Yield the lines of [tune] for the template: each default, or an example of a key that has none."""
+    yield Line(
+        f'objective = "{OBJECTIVES[0]}"',
+        'least rms voltage within 25 % of the least error; or "least_error"',
+    )
     yield Line(
         'gains = ["controller.position.c", "controller.position.k"]',
         "gains to tune; left out: all gains of the laws but p",
@@ -124,6 +133,7 @@ def _limits() -> Iterator[Line]:
         ("max_u_V = 150.0", "V; largest voltage of any member; inf, here and below: no limit (left out: none)"),
         ("max_abs_i_A = 5.0", "A; largest current of any member (left out: none)"),
         ("chatter_V_per_s = 1e5", "V/s; variation of the voltage after run.settle, mean over members (left out: none)"),
+        ("rms_error_m = 1e-6", "m; root mean square error after run.settle, over members (left out: none)"),
         ("largest_error_m = 1e-5", "m; largest error after run.settle, of any member (left out: none)"),
         (
             "settling_s = 0.2",

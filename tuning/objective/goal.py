@@ -8,6 +8,7 @@ from ambjax.extend import Scalar, record, static
 from tuning.objective.limits import LimitTerm
 from tuning.objective.loss import outcomes
 from tuning.objective.members import Members
+from tuning.objective.quantities import KINDS
 from tuning.objective.risk import Risk
 from tuning.objective.shortfalls import Bound, shortfall
 from tuning.space import Space
@@ -19,6 +20,8 @@ class Goal:
 
     goal = log(risk(losses) + mean(losses of stressed members)) + weight * shortfall(conditions) + sum(limits).
     The risk and the limits include ordinary members only. `margin` is the relative margin of the conditions.
+    `measured`: names of the quantities beside the losses, in order. If one of them is `minimised`, the square of its
+    value times `unit` is added to the risk; the losses are then without errors and costs.
     """
 
     space: Space = static()
@@ -28,6 +31,9 @@ class Goal:
     weight: Scalar
     margin: Scalar
     limits: tuple[LimitTerm, ...] = ()
+    measured: tuple[str, ...] = static(default=())
+    minimised: str = static(default="")
+    unit: Scalar = 1.0
 
     def __call__(self, outcomes: Array, x: Array, ordinary: int) -> Array:
         """Return the goal at coordinates x [m].
@@ -35,18 +41,25 @@ class Goal:
         `outcomes` [N, 1 + L]: the weighted loss and the limited quantities of each member. The first `ordinary` members
         are not stressed.
         """
-        losses = outcomes[:, 0]
-        risk, stressed = self.risk(losses[:ordinary]), losses[ordinary:]
-        loss = risk + (jnp.mean(stressed) if stressed.size else 0.0)
+        stressed = outcomes[ordinary:, 0]
+        loss = self.ordinary_risk(outcomes[:ordinary]) + (jnp.mean(stressed) if stressed.size else 0.0)
         return jnp.log(loss + 1e-30) + self.weight * self.penalty(x) + self.pull(outcomes[:ordinary, 1:])
+
+    def ordinary_risk(self, outcomes: Array) -> Array:
+        """Return the risk of the ordinary members' `outcomes` [N, 1 + L], and the square of the minimised quantity."""
+        risk = self.risk(outcomes[:, 0])
+        if not self.minimised:
+            return risk
+        values = outcomes[:, 1 + self.measured.index(self.minimised)]
+        return risk + (self.unit * KINDS[self.minimised].tuned(values)) ** 2
 
     def penalty(self, x: Array) -> Array:
         """Return the shortfall of the theorem's conditions at coordinates x [m]."""
         return shortfall(dict(zip(self.space.paths, self.space.gains_at(x), strict=True)), self.conditions, self.margin)
 
     def pull(self, held: Array) -> Array | int:
-        """Return the sum of the limits' terms for the limited quantities `held` [N, L] of the ordinary members."""
-        return sum(term(held[:, j]) for j, term in enumerate(self.limits))
+        """Return the sum of the limits' terms for the quantities `held` [N, L] of the ordinary members."""
+        return sum(term(held[:, self.measured.index(term.name)]) for term in self.limits)
 
     def score(self, x: np.ndarray, terms: dict[str, np.ndarray], members: Members) -> np.ndarray:
         """Return the goal [S] at x [S, m] from the terms [S, N] of members [N]; +inf where it is not finite."""

@@ -8,16 +8,14 @@ the minimised quantity: a limit 1 % higher lowers it by `multiplier` %.
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from ambjax.extend import Scalar, record, static
-from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
-from ambjax.world.scenario import Scenario
 from tuning.objective.quantities import KINDS, TINY, Kind, LimitContext
 
 # Initial penalty: at a multiplier of 0, an excess of 10 % adds 0.14 to the goal. Factor by which the penalty grows when
@@ -29,6 +27,8 @@ PREFIX = "limit."
 TOLERANCE_BELOW = 0.01
 # Smallest margin. A search meets a limit to half of its margin only, so a smaller margin would not keep it held.
 LEAST_MARGIN = 0.002
+# Source of the limit on the rms error with which the front of error against voltage is traced.
+FRONT = "the front"
 # Intervals of the integral in `Limit.error_reduction`.
 PRICE_INTERVALS = 200
 
@@ -123,8 +123,12 @@ class Limit:
         forces = (*self.forces, (max(judged, TINY), force))
         return dataclasses.replace(self, multiplier=force, ratio=ratio, penalty=penalty, missed=excess, forces=forces)
 
+    def restarted(self) -> "Limit":
+        """Return the limit for the minimum of another quantity: only `ratio` stays."""
+        return dataclasses.replace(self, multiplier=0.0, penalty=PENALTY, missed=math.inf, forces=())
+
     def error_reduction(self, more: float) -> float:
-        """Return the relative decrease of the rms error when the limit is looser by the share `more`.
+        """Return the relative decrease of the minimised rms value when the limit is looser by the share `more`.
 
         It is the integral of the multiplier over the logarithm of the limit. The multiplier is interpolated linearly
         between the optima of the updates, which belong to looser limits, and is constant outside of them.
@@ -156,12 +160,8 @@ class Limit:
         return values[alive] if alive.any() else values
 
 
-def measures(
-    limits: tuple[Limit, ...], scenario: Scenario, clock: Clock, settle: float, band: float
-) -> dict[str, Fold]:
-    """Return the fold of each limit that has one, by name.
-
-    `settle` (s): start of the settled part. `band` (m): of settling_s.
-    """
-    context = LimitContext(settle, float(clock.duration), float(scenario.touchdown), band)
-    return {limit.name: limit.kind.fold(context, limit.threshold) for limit in limits if limit.kind.fold is not None}
+def measures(names: Collection[str], limits: tuple[Limit, ...], context: LimitContext) -> dict[str, Fold]:
+    """Return the fold of each of the quantities that has one, by name. `limits`: those among them."""
+    thresholds = {limit.name: limit.threshold for limit in limits}
+    folds = {name: KINDS[name].fold for name in names}
+    return {name: fold(context, thresholds.get(name, 1.0)) for name, fold in folds.items() if fold is not None}

@@ -11,7 +11,7 @@ from jax import Array
 
 from ambjax.cases.tune_table import MEAN_MARGIN, WORST_MARGIN
 from ambjax.extend import Scalar, leaf, record, static
-from ambjax.simulation.folds import Driven, Ending, Fold, Peak, Variation
+from ambjax.simulation.folds import Driven, Ending, Fold, Peak, Rms, Variation
 from ambjax.simulation.response import Overshoot, Settling
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import Row
@@ -134,6 +134,13 @@ _WORST = {"over": "of the worst member", "tuned": largest, "judged": np.max, "ma
 _LOOP = _WORST | {"tuned": worst_loop, "fold": None, "exact": None}
 
 KINDS: dict[str, Kind] = {
+    "rms_error_m": Kind(
+        "m",
+        "root mean square of z - r from run.settle on",
+        fold=lambda context, threshold: Rms("e_z", context.settle),
+        exact="settled_rms_error_m",
+        **_POOLED,
+    ),
     "rms_u_V": Kind(
         "V",
         "root mean square voltage from run.settle on",

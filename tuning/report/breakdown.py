@@ -47,11 +47,18 @@ def minimised(problem: TuningProblem, x: np.ndarray, members: Members) -> Facts:
     pull = float(goal.pull(jnp.stack([jnp.asarray(one[:n]) for one in reached], -1))) if reached else 0.0
     parts = {
         "ordinary": n,
-        "risk": float(goal.risk(jnp.asarray(losses[:n]))),
+        "risk": float(goal.ordinary_risk(jnp.asarray(np.stack([losses, *reached], -1)[:n]))),
         "survival_only": len(losses) - n,
         "held": float(losses[n:].mean()) if len(losses) > n else 0.0,
         "penalty": float(np.exp(goal.weight * penalty)),
         "limits": float(np.exp(pull)),
     }
     total = (parts["risk"] + parts["held"]) * parts["penalty"] * parts["limits"]
-    return parts | {"total": total, "of": str(goal.risk)}
+    return parts | {"total": total, "of": _of(goal)}
+
+
+def _of(goal: Goal) -> str:
+    """Describe what the risk is."""
+    if not goal.minimised:
+        return f"{goal.risk} of the loss"
+    return f"mean square of {goal.minimised} in units of {1 / float(goal.unit):.4g} V, and {goal.risk} of what holds it"

@@ -2,7 +2,7 @@
 
 from ambjax.host.web_page import literal, table
 from tuning.objective.loss import TERMS
-from tuning.report import extras, held_out, limit_table, sensitivity_table
+from tuning.report import extras, front_table, held_out, limit_table, sensitivity_table
 from tuning.report.breakdown import FORMULA
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.held_out import number
@@ -15,7 +15,8 @@ def markdown(facts: TuningFacts) -> str:
     """Return the text of report.md. It refers to the pictures in the same folder."""
     lines = [f"# Tuning of {literal(facts.case)}", "", facts.verdict, ""]
     lines += (
-        limit_table.section(facts.limits)
+        front_table.section(facts.front, facts.front_written)
+        + limit_table.section(facts.limits)
         + sensitivity_table.section(facts.sensitivity)
         + _gains(facts)
         + held_out.section(facts)
@@ -24,8 +25,6 @@ def markdown(facts: TuningFacts) -> str:
         + _conditions(facts)
     )
     lines += ["## How the search went", "", *_how(facts), "", "![Goal and gains by iteration](convergence.png)", ""]
-    if facts.pareto:
-        lines += extras.pareto(facts.pareto)
     if facts.gradient:
         lines += extras.gradient(facts.gradient)
     return "\n".join(lines) + "\n"
@@ -105,7 +104,7 @@ def _minimised(facts: TuningFacts) -> list[str]:
     if not parts:
         return []
     words = f"over {parts['ordinary']} members (seed {facts.search['seed']})"
-    rows = [[f"risk: {parts['of']} of the loss {words}", f"{parts['risk']:.4e}"]]
+    rows = [[f"risk: {parts['of']} {words}", f"{parts['risk']:.4e}"]]
     if parts["survival_only"]:
         label = f"+ mean of clearance + survival over {parts['survival_only']} members that only have to be held"
         rows.append([label, f"{parts['held']:.4e}"])

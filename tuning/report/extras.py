@@ -1,4 +1,4 @@
-"""Optional sections of the report: --pareto and --gradients."""
+"""Optional section of the report: --gradients."""
 
 from typing import Any
 
@@ -6,31 +6,6 @@ from ambjax.host.web_page import table
 from tuning.report.gradient import AGREE, AGREED, MODES, STEADY, STEP
 
 Facts = dict[str, Any]
-
-
-def pareto(rows: list[Facts]) -> list[str]:
-    """Return the section on the front of error against voltage."""
-    cells = [
-        [
-            f"{row['effort_weight']:g}",
-            f"{row['settled_rms_error_m']:.3e}",
-            f"{row['settled_rms_u_V']:.4g}",
-            str(row["lost"]),
-            str(row["stalled"]),
-            ", ".join(f"{path.rpartition('.')[2]} {value:.4g}" for path, value in row["gains"].items()),
-        ]
-        for row in rows
-    ]
-    return [
-        "## Error against voltage",
-        "",
-        "On the training ensemble; u is averaged over time. More weight on effort buys less voltage with more error.",
-        "",
-        *table(["weights.effort", "settled rms error (m)", "settled rms u (V)", "lost", "stalled", "gains"], cells),
-        "",
-        "![Error against voltage](front.png)",
-        "",
-    ]
 
 
 def gradient(facts: Facts) -> list[str]:

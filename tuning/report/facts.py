@@ -17,7 +17,7 @@ SHOWN = (
     "clearance_used.largest",
 )
 # Fields that report.json leaves out if they are None.
-OPTIONAL = ("accurate", "gradient", "pareto", "sensitivity")
+OPTIONAL = ("accurate", "gradient", "front", "sensitivity")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,9 +25,10 @@ class TuningFacts:
     """What a search found. Each field is a key of report.json.
 
     `before`, `after`: the held-out members under the case's gains and the tuned ones. `refuted`: why accurate steps
-    contradict the answer; '' if they confirm it. `accurate`: some members with accurate steps. `gradient`, `pareto`:
-    None if not requested. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it. `beside`:
-    the lowest point of the slices through the answer.
+    contradict the answer; '' if they confirm it. `accurate`: some members with accurate steps. `gradient`: None if not
+    requested. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of its points
+    has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it. `beside`: the
+    lowest point of the slices through the answer.
     """
 
     case: str
@@ -56,9 +57,10 @@ class TuningFacts:
     accurate: Row | None
     gains: list[Row]
     gradient: Row | None
-    pareto: list[Row] | None
+    front: list[Row] | None
     beside: Row
     slices: Row
+    front_written: bool = False
     outcome: Row = dataclasses.field(default_factory=dict)
     verdict: str = ""
     advice: str = ""

@@ -14,17 +14,17 @@ from tuning.config import seeds, settings
 from tuning.judge import StepError, describe, held, judge, step_error, summarise, worst, worst_of
 from tuning.measured_peaks import injections
 from tuning.problem import TuningProblem
-from tuning.report import accurate, breakdown, gradient, limit_table, outcome, sensitivity_table
+from tuning.report import accurate, breakdown, front_table, gradient, limit_table, outcome, sensitivity_table
 from tuning.report.facts import SHOWN, Row, TuningFacts
 from tuning.search import explore
 from tuning.search.course import SearchResult
 
 
-def examined(answer: SearchResult, gradients: bool, front: bool) -> tuple[TuningFacts, explore.Slices]:
+def examined(answer: SearchResult, gradients: bool, front_written: bool) -> tuple[TuningFacts, explore.Slices]:
     """Return the facts of an answer, and the slices of the goal through it.
 
-    `gradients`: whether to compute derivatives in three ways. `front`: whether to compute the front of error and
-    voltage.
+    `gradients`: whether to compute derivatives in three ways. `front_written`: whether each point of the front has a
+    case file.
     """
     problem, x, members = answer.problem, answer.x, answer.members
     held_out, rollouts = seeds(problem.tune.budget)[2], problem.engine.rollouts
@@ -43,7 +43,8 @@ def examined(answer: SearchResult, gradients: bool, front: bool) -> tuple[Tuning
         "search": settings(problem.tune)
         | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
         "gradient": _gradient(answer) if gradients else None,
-        "pareto": _front(answer) if front else None,
+        "front_written": front_written,
+        "front": front_table.facts(answer) or None,
     }
     slices = explore.slices(problem, x, members)
     facts = TuningFacts(**found, **_neighbourhood(problem, x, slices))
@@ -70,10 +71,10 @@ def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_
     after = judged["after"]
     measured = injections(problem, answer.x, held_out, after) if after else None
     found["sensitivity"] = None if measured is None else sensitivity_table.facts(problem, measured)
-    found["limits"] = limit_table.facts(problem.limits, problem.tune.limits, after, found["after"], refuted, measured)
+    found["limits"] = limit_table.facts(problem, after, found["after"], refuted, measured)
     if refuted and after:
         found["after"] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
-    found["loss"] = {name: breakdown.table(problem.goal, one) for name, one in judged.items() if one}
+    found["loss"] = {name: breakdown.table(problem.error_goal, one) for name, one in judged.items() if one}
     found["worst_member"] = worst(problem, after, held_out) if after else None
     lost = problem.engine.terms(answer.x[None], answer.members)["survival"] > 0
     return found | {"lost_in_training": int(lost.sum())}
@@ -106,11 +107,6 @@ def _conditions(problem: TuningProblem, x: np.ndarray) -> Row:
 def _gradient(answer: SearchResult) -> Row:
     say("gradient report ...")
     return gradient.report(answer.problem, answer.x, answer.members)
-
-
-def _front(answer: SearchResult) -> list[Row]:
-    say("front of error against voltage ...")
-    return explore.pareto(answer.problem, answer.x, answer.members)
 
 
 def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: explore.Slices) -> Row:

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from ambjax.host.web_page import table
-from tuning.config import LimitSettings
 from tuning.measured_peaks import MEASURED, Sensitivity, reached_of
-from tuning.objective.limits import Limit
+from tuning.objective.limits import FRONT, Limit
+from tuning.problem import TuningProblem
 
 Facts = dict[str, Any]
 # Relative increase of a limit for which the effect is computed.
@@ -18,8 +18,7 @@ EMPHASISED = (BROKEN, UNVERIFIED)
 
 
 def facts(
-    limits: tuple[Limit, ...],
-    settings: LimitSettings,
+    problem: TuningProblem,
     columns: dict[str, np.ndarray],
     summary: Facts,
     refuted: str = "",
@@ -29,11 +28,12 @@ def facts(
 
     `refuted`: why accurate steps contradict the judged members; '' if they confirm them. `measured`: the injections
     into some of the judged members. In a row, `held` is None if no member was judged, or if the limit is held but
-    accurate steps contradict it; `verdict` is its text. `price_m`: the decrease of the settled rms error (m) for a
-    limit 10 % looser (`Limit.error_reduction`); None if it is not held.
+    accurate steps contradict it; `verdict` is its text. `price`: the decrease of the minimised settled rms error
+    (m) or voltage (V) for a limit 10 % looser (`Limit.error_reduction`); None if it is not held.
     """
-    members, held = summary["members"], summary["held"]
+    members, held, settings = summary["members"], summary["held"], problem.tune.limits
     share = held / members if members else None
+    price_unit = "V" if problem.goal.minimised else "m"
     survival = {
         "name": "survival",
         "unit": "",
@@ -46,9 +46,10 @@ def facts(
         "margin": 0.0,
         "active": False,
         "multiplier": None,
-        "price_m": None,
+        "price": None,
+        "price_unit": price_unit,
     } | _verdict(None if share is None else members - held <= settings.may_lose(members), refuted)
-    return [*(_row(limit, columns, summary, refuted, measured) for limit in limits), survival]
+    return [*(_row(limit, columns, summary, refuted, measured, price_unit) for limit in _asked(problem)), survival]
 
 
 def _verdict(kept: bool | None, refuted: str) -> Facts:
@@ -61,13 +62,19 @@ def _verdict(kept: bool | None, refuted: str) -> Facts:
 
 
 def _row(
-    limit: Limit, columns: dict[str, np.ndarray], summary: Facts, refuted: str, measured: Sensitivity | None
+    limit: Limit,
+    columns: dict[str, np.ndarray],
+    summary: Facts,
+    refuted: str,
+    measured: Sensitivity | None,
+    price_unit: str,
 ) -> Facts:
     judged = summary["held"] > 0
     reached = reached_of(limit, columns, measured) if judged else None
     kept = limit.holds(reached) if reached is not None else False if summary["members"] else None
     active, found = limit.active(reached), _verdict(kept, refuted)
-    price = summary["settled_rms_error_m"] * limit.error_reduction(MORE) if active and judged else 0.0
+    minimised = {"m": "settled_rms_error_m", "V": "settled_rms_u_V.mean"}[price_unit]
+    price = summary[minimised] * limit.error_reduction(MORE) if active and judged else 0.0
     return {
         "name": limit.name,
         "unit": limit.kind.unit,
@@ -80,8 +87,15 @@ def _row(
         "margin": limit.margin,
         "active": active,
         "multiplier": limit.multiplier,
-        "price_m": price if found["held"] else None,
+        "price": price if found["held"] else None,
+        "price_unit": price_unit,
     } | found
+
+
+def _asked(problem: TuningProblem) -> list[Limit]:
+    """Return the limits of [tune.limits]; without that by which the front of error against voltage is traced."""
+    found = {limit.name: limit for limit in problem.limits if limit.source != FRONT}
+    return [found.get(limit.name, limit) for limit in problem.tune.limits.each]
 
 
 def _by_injection(limit: Limit, measured: Sensitivity | None) -> str:
@@ -105,7 +119,8 @@ def prices(rows: list[Facts]) -> list[str]:
     """Return a sentence for each limit that is active and held."""
     return [
         f"{row['name']} = {row['reached']:.4g}{_unit(row)} is at its limit, {row['threshold']:g}: {100 * MORE:g} % "
-        f"{'less' if row['at_least'] else 'more'} would take about {row['price_m']:.2g} m off the settled rms error"
+        f"{'less' if row['at_least'] else 'more'} would take about {row['price']:.2g} {row['price_unit']} off "
+        f"the settled rms {'voltage' if row['price_unit'] == 'V' else 'error'}"
         for row in rows
         if row["active"] and row["held"]
     ]
@@ -123,7 +138,7 @@ def section(rows: list[Facts]) -> list[str]:
             _number(row["worst"], row),
             f"**{row['verdict']}**" if row["verdict"] in EMPHASISED else row["verdict"],
             "active" if row["active"] else "-",
-            "-" if row["price_m"] is None or row["name"] == "survival" else f"{row['price_m']:.2g} m",
+            "-" if row["price"] is None or row["name"] == "survival" else f"{row['price']:.2g} {row['price_unit']}",
         ]
         for row in rows
     ]
@@ -133,8 +148,9 @@ def section(rows: list[Facts]) -> list[str]:
     return [
         *lines,
         "",
-        "Reached by those held-out members that are held. An active limit costs error: the last column is by how much "
-        "the settled rms error would fall, from the multipliers of the optima that the search came by.",
+        "Reached by those held-out members that are held. An active limit costs error or voltage: the last column is "
+        "by how much the settled rms value that was minimised would fall, from the multipliers of the optima that the "
+        "search came by.",
         "",
     ]
 

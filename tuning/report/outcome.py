@@ -6,6 +6,7 @@ import numpy as np
 
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
+from tuning.report import front_table
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.limit_table import BROKEN, UNJUDGED, UNVERIFIED, broken, prices
 
@@ -77,6 +78,8 @@ def verdict(facts: TuningFacts, outcome: TuningOutcome) -> str:
     unjudged = [name for name, found in outcome.limits.items() if found == UNJUDGED]
     met = NO_HELD_OUT if unjudged else ALL_MET
     words = [met if outcome.good else f"{NOT_MET} {'; '.join(outcome.against)}.", _statuses(facts)]
+    if taken := front_table.sentence(facts.front or []):
+        words.append(taken)
     if outcome.refuted:
         words.append(f"That is {UNVERIFIED.upper()}: {outcome.refuted}.")
     words += [f"{line}." for line in [*broken(facts.limits), *prices(facts.limits)]]

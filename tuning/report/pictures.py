@@ -178,11 +178,17 @@ def front(rows: list[dict[str, Any]]) -> bytes:
 
     figure = Figure(figsize=(5, 3.4), layout="constrained")
     ax = figure.subplots()
-    errors = [r["settled_rms_error_m"] for r in rows]
-    ax.plot([r["settled_rms_u_V"] for r in rows], errors, "C0o-", ms=4)
-    if lost := [r for r in rows if r["lost"] or r["stalled"]]:
-        voltages = [r["settled_rms_u_V"] for r in lost]
-        ax.plot(voltages, [r["settled_rms_error_m"] for r in lost], "C3x", ms=8, label="members lost or not decided")
+    errors, volts = [r["settled_rms_error_m"] for r in rows], [r["settled_rms_u_V"] for r in rows]
+    ax.plot(volts, errors, "C0o-", ms=5, mfc="white")
+    marks = (
+        ("C3x", "members lost or not decided", lambda r: r["lost"] or r["stalled"]),
+        ("C0o", "answer taken", lambda r: r["taken"]),
+    )
+    for style, label, chosen in marks:
+        if those := [r for r in rows if chosen(r)]:
+            x, y = ([r[name] for r in those] for name in ("settled_rms_u_V", "settled_rms_error_m"))
+            ax.plot(x, y, style, ms=8, label=label)
+    if ax.get_legend_handles_labels()[0]:
         ax.legend(fontsize=8)
     # at least half a decade, for a front of a single point
     ax.set_ylim(min(min(errors) / 1.2, max(errors) / 2), max(max(errors) * 1.2, min(errors) * 2))

@@ -45,6 +45,8 @@ class SearchResult:
     """number of validation members that are lost, and of members that accurate steps do not hold"""
     seconds: float
     """duration of all searches in s, the time before a resume included"""
+    front: tuple[Any, ...] = ()
+    """points of the front of error against voltage (`front.FrontPoint`); empty if it was not traced"""
 
     @property
     def confirmed(self) -> bool:

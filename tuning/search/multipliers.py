@@ -4,13 +4,17 @@ The limited quantities are those of the judge. An optimum exceeds a limit by abo
 penalty, which an update corrects.
 """
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 
 from ambjax.commands.outputs import say
 from tuning.config import seeds
 from tuning.judge import judge
-from tuning.measured_peaks import decides, injections, reached_of
+from tuning.measured_peaks import MEASURED, decides, injections, reached_of
 from tuning.objective.limits import PENALTY, PREFIX, TOLERANCE_BELOW, Limit
+from tuning.problem import TuningProblem
 from tuning.search.course import Course
 
 # Largest number of updates of the multipliers in one round.
@@ -38,7 +42,7 @@ def limited(course: Course, x: np.ndarray) -> np.ndarray:
         done = []
         for old, after, (_, judged) in zip(before, limits, numbers, strict=True):
             idle = old.multiplier == after.multiplier == 0
-            done.append(_met(after, judged) or (idle and after.log_excess(judged) <= 0))
+            done.append(met(after, judged) or (idle and after.log_excess(judged) <= 0))
             if not (idle and done[-1]):
                 limit = f"limit {after.name} = {after.threshold:g} {after.kind.unit}"
                 say(f"{limit}: {judged:.4g} on members of another seed")
@@ -59,7 +63,7 @@ def _stuck(limit: Limit, judged: float) -> bool:
     )
 
 
-def _met(limit: Limit, judged: float) -> bool:
+def met(limit: Limit, judged: float) -> bool:
     """Return whether the limit holds and is used up."""
     return -TOLERANCE_BELOW <= limit.log_excess(judged) <= limit.margin / 2
 
@@ -67,11 +71,10 @@ def _met(limit: Limit, judged: float) -> bool:
 def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
     """Return each limited quantity at x [m] as (the search's value, the judge's value on members of another seed)."""
     problem, budget = course.problem, course.problem.tune.budget
-    limits, n = problem.limits, course.members.ordinary
+    limits = problem.limits
     if not limits:
         return []
-    terms = problem.engine.terms(x[None], course.members)
-    tuned = [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in limits]
+    tuned = searched(course, x)
     known = [limit.ratio * ours for limit, ours in zip(limits, tuned, strict=True)]
     if all(
         not limit.kind.worst and limit.log_excess(one) < -CLEARLY_BELOW
@@ -82,5 +85,31 @@ def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
     if not any(limit.kind.worst for limit in limits):
         count = min(count, AVERAGING_MEMBERS)
     columns = judge(problem, x, seed, count)
-    measured = injections(problem, x, seed, columns) if decides(problem) else None
-    return [(ours, reached_of(limit, columns, measured)) for limit, ours in zip(limits, tuned, strict=True)]
+    return list(zip(tuned, reached(problem, x, seed, columns, tuned), strict=True))
+
+
+def searched(course: Course, x: np.ndarray) -> list[float]:
+    """Return the search's value of each limit at x [m]."""
+    terms, n = course.problem.engine.terms(x[None], course.members), course.members.ordinary
+    return [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in course.problem.limits]
+
+
+def reached(
+    problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray], tuned: Sequence[float]
+) -> list[float]:
+    """Return the judge's value of each limit at x [m], from the `columns` [N] of the ensemble with this seed.
+
+    Where injections decide, one is done into the worst member, unless the search's values `tuned`, corrected by those
+    of an earlier injection, are clearly below their limits.
+    """
+    pairs = [(limit, ours) for limit, ours in zip(problem.limits, tuned, strict=True) if limit.name in MEASURED]
+    near = [
+        limit
+        for limit, ours in pairs
+        if math.isinf(limit.missed) or limit.log_excess(limit.ratio * ours) > -CLEARLY_BELOW
+    ]
+    if not decides(problem) or near:
+        measured = injections(problem, x, seed, columns, most=1) if decides(problem) else None
+        return [reached_of(limit, columns, measured) for limit in problem.limits]
+    known = {limit.name: limit.ratio * ours for limit, ours in pairs}
+    return [known.get(limit.name, limit.reached(columns)) for limit in problem.limits]

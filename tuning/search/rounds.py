@@ -1,7 +1,8 @@
 """Rounds of a search, repeated until its result is confirmed.
 
 The first search includes restarts. It is repeated with finer steps if its steps do not resolve the optimum, and with
-additional members: validation members that are lost, and members that accurate steps do not hold.
+additional members: validation members that are lost, and members that accurate steps do not hold. Then the front of
+error against voltage is traced, if the case asks for it.
 """
 
 import dataclasses
@@ -9,22 +10,18 @@ import itertools
 import pathlib
 from typing import Any
 
-import jax
 import numpy as np
 
 from ambjax.commands.outputs import say
-from tuning.config import seeds
-from tuning.judge import StepError, compared, describe, step_error, worst_of
-from tuning.objective.members import Members
+from tuning.judge import StepError, describe, step_error
 from tuning.problem import TuningProblem, problem_of
 from tuning.search.course import Course, SearchResult, points_of, search_and_restart, training
+from tuning.search.front import traced
 from tuning.search.multipliers import limited
+from tuning.search.validation import joining, validated
 
-# Largest numbers of rounds (restarts included), of halvings of the step, and of lost members that join in one round.
-MOST_ROUNDS, MOST_HALVINGS, MOST_JOINING = 12, 2, 16
-# Members that accurate steps do not hold join with the noise factor NOISE_GROWTH**round: the search's steps hold
-# them with their own noise.
-NOISE_GROWTH = 1.5
+# Largest numbers of rounds (restarts included), and of halvings of the step.
+MOST_ROUNDS, MOST_HALVINGS = 12, 2
 
 
 def rounds(
@@ -44,12 +41,12 @@ def rounds(
         x, error = resolved(course, x)
         held = limited(course, x)
         if held is not x:
-            x, error = held, step_error(course.problem, held)
+            x, error = held, None
         answer, error, lost = validated(course, x, error)
         answers.append(answer)
         if answer.good or course.interrupted or len(course.past) - course.limit_searches >= MOST_ROUNDS:
             break
-        course.members = course.members.joined(_joining(course.problem, lost, error, NOISE_GROWTH**refuted))
+        course.members = course.members.joined(joining(course.problem, lost, error, refuted))
         say("the search continues with members that are lost, or that accurate steps do not hold")
         x, _ = course.search(course.around(x))
     if not answers:
@@ -57,6 +54,9 @@ def rounds(
     best = min(answers, key=lambda one: (not one.confirmed, one.lost))
     if not best.confirmed and not course.interrupted:
         best = retreated(course, best)
+    if problem.front and best.good and not course.interrupted:
+        course.members = best.members
+        best = traced(course, best)
     return dataclasses.replace(best, seconds=course.answer(x, None, 0).seconds)
 
 
@@ -71,24 +71,6 @@ def resolved(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepError]:
         course.problem = substeps
         say(f"the step is too coarse; the search continues with {course.problem.objective.clock.method}")
         x, _ = course.search(x[None])
-
-
-def validated(course: Course, x: np.ndarray, error: StepError) -> tuple[SearchResult, StepError, np.ndarray]:
-    """Judge x [m] on the validation ensemble, and on its worst members by accurate steps.
-
-    Returns the result, the step error, and the numbers of the lost validation members.
-    """
-    budget = course.problem.tune.budget
-    if course.interrupted or not budget.validation:
-        return course.answer(x, error, error.unseen), error, np.zeros(0, int)
-    lost, worst = _lost(course.problem, x)
-    if not lost.size and not error.refuted and not course.problem.sampled:
-        worst = course.problem.objective.chosen(seeds(budget)[1], worst, budget.validation)
-        error = step_error(course.problem, x, compared(course.problem).joined(worst))
-        say(f"accurate steps, the worst of {budget.validation} members of another seed included: {describe(error)}")
-    if lost.size:
-        say(f"{lost.size} of {budget.validation} members of another seed are lost")
-    return course.answer(x, error, lost.size + error.unseen), error, lost
 
 
 def retreated(course: Course, best: SearchResult) -> SearchResult:
@@ -107,29 +89,6 @@ def finer(problem: TuningProblem) -> TuningProblem | None:
     """Return the problem with steps half as long and the same count of rollouts, or None after MOST_HALVINGS."""
     if problem.finer >= 2**MOST_HALVINGS:
         return None
-    fine = problem_of(problem.case, problem.tune, finer=2 * problem.finer).limited(problem.limits)
+    fine = problem_of(problem.case, problem.tune, finer=2 * problem.finer, front=problem.front).limited(problem.limits)
     fine.engine.rollouts = problem.engine.rollouts
     return fine
-
-
-def _joining(problem: TuningProblem, lost: np.ndarray, error: StepError, louder: float) -> Members:
-    """Return the members that join the training ensemble.
-
-    The first of the `lost` validation members join with half of the additional noise of stressed members, which leaves
-    a margin. Members that accurate steps do not hold join with `louder` times the noise.
-    """
-    budget = problem.tune.budget
-    those = problem.objective.chosen(seeds(budget)[1], lost[:MOST_JOINING], budget.validation)
-    those = those._replace(noise_factor=those.noise_factor * (1 + problem.tune.stress) / 2)
-    these = error.unheld._replace(noise_factor=error.unheld.noise_factor * louder)
-    return jax.tree.map(lambda a, b: np.concatenate([a, b]), those, these)
-
-
-def _lost(problem: TuningProblem, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the validation members lost at x [m], in order of loss, and of those with the largest peak."""
-    budget = problem.tune.budget
-    count = budget.validation
-    members = problem.objective.chosen(seeds(budget)[1], np.arange(count), count)
-    terms = problem.engine.terms(x[None], members)
-    share = terms["survival"][0]
-    return np.argsort(-share, kind="stable")[: int((share > 0).sum())], worst_of(terms["peak"][0])

@@ -1,0 +1,123 @@
+"""The front of error against voltage, and its knee: on formulas with a known answer, in the report and in case files."""
+
+import argparse
+import collections
+import json
+import math
+
+import numpy as np
+import pytest
+from bowl import FLOOR, S_0, World, document, study
+from texts import case_and_tune
+from tomlkit import dumps
+
+import tuning.command
+from ambjax.cases.reader import read_case
+from tuning.objective.limits import FRONT
+from tuning.problem import problem_of
+from tuning.report import front_table, limit_table
+from tuning.search.front import FrontPoint, chosen
+from tuning.search.rounds import rounds
+
+BOUNDLESS = {"controller": {"position": {"c": [1.0, 1000.0], "k": [0.1, 1000.0]}}}
+
+
+@pytest.fixture
+def ran(monkeypatch, tmp_path, capsys):
+    """Run the command on a Bowl without pictures: exit code, facts, the verdict printed, folder."""
+    monkeypatch.setattr(tuning.command, "_pictures", lambda *_: collections.defaultdict(bytes))
+
+    def run(pareto=True, **tune):
+        study(monkeypatch, World(), **tune)
+        path, out = tmp_path / "case.toml", tmp_path / "out"
+        path.write_text(dumps(document(**tune)))
+        flags = {"gradients": False, "resume": False, "json": False, "settings_of": None}
+        words = argparse.Namespace(case=str(path), out=str(out), pareto=pareto, **flags)
+        code, _ = tuning.command.run(words)
+        return code, json.loads((out / "report.json").read_text()), capsys.readouterr().out, out
+
+    return run
+
+
+def least_voltage(factor):
+    """Of a Bowl: the error is S_0 sqrt(FLOOR (1 + a^2 + b^2)) and the voltage 20 e^b, a and b logarithms of gains."""
+    return 20 * math.exp(-math.sqrt(factor**2 - 1))
+
+
+def test_the_knee_is_the_least_voltage_within_25_percent_of_the_least_error(ran):
+    code, facts, out, folder = ran(objective="knee", front=3, bounds=BOUNDLESS)
+    rows = {row["factor"]: row for row in facts["front"]}
+    least = S_0 * math.sqrt(FLOOR)
+    assert code == 0
+    assert sorted(rows) == [1, 1.1, 1.25, 1.5]
+    assert rows[1]["settled_rms_error_m"] == pytest.approx(least, rel=1e-3)
+    for factor in (1.1, 1.25, 1.5):
+        # the search meets a limit to 1 % below its margin of 0.5 %; the voltage follows with an elasticity up to 2.4
+        assert factor * least * 0.98 < rows[factor]["settled_rms_error_m"] <= factor * least
+        assert rows[factor]["settled_rms_u_V"] == pytest.approx(least_voltage(factor), rel=0.06)
+    assert [row["factor"] for row in facts["front"] if row["taken"]] == [1.25]
+    tuned = {row["path"]: row["after"] for row in facts["gains"]}
+    assert rows[1.25]["gains"] == pytest.approx(tuned, rel=1e-12)
+    assert read_case(folder / "tuned.toml").cascade.position.k == tuned["controller.position.k"]
+    # every place says the same
+    sentence = front_table.sentence(facts["front"])
+    assert sentence in facts["verdict"]
+    assert sentence in out
+    text = (folder / "report.md").read_text()
+    assert sentence in text
+    assert text.index("## Error against voltage") < text.index("## Limits")
+    assert text.count("**taken**") == 1
+    # the limit by which the front is traced is no requirement
+    assert [row["name"] for row in facts["limits"]] == ["rms_u_V", "survival"]
+    for row in facts["front"]:
+        law = read_case(folder / row["file"]).cascade.position
+        assert {"controller.position.c": law.c, "controller.position.k": law.k} == row["gains"]
+
+
+def test_least_error_traces_no_front_unless_it_is_asked_for(ran):
+    code, facts, _, folder = ran(pareto=False)
+    assert code == 0
+    assert "front" not in facts
+    assert not list(folder.glob("tuned_*"))
+
+
+def test_the_front_of_least_error_leaves_the_answer(ran):
+    _, facts, out, folder = ran(pareto=True, front=1, bounds=BOUNDLESS)
+    assert [(row["factor"], row["taken"]) for row in facts["front"]] == [(1, True), (1.25, False)]
+    assert "Taken: the answer of least error" in out
+    assert len(list(folder.glob("tuned_*V.toml"))) == 2
+
+
+def test_the_rest_of_the_limits_stays(monkeypatch, tmp_path):
+    """A limit of 15 V is met by the answer of least error already, at a voltage below which the knee may not end."""
+    study(monkeypatch, World(), objective="knee", bounds=BOUNDLESS, limits={"largest_error_m": 1.0})
+    problem = problem_of(
+        *case_and_tune(document(objective="knee", bounds=BOUNDLESS, limits={"rms_u_V": 15.0, "rms_error_m": 5.3e-5}))
+    )
+    towards = problem.towards_voltage(5e-5, 20.0, 1.25)
+    limits = {limit.name: limit for limit in towards.limits}
+    assert limits["rms_u_V"].threshold == 15.0
+    # the user's limit is the tighter one
+    assert (limits["rms_error_m"].threshold, limits["rms_error_m"].source) == (5.3e-5, FRONT)
+    assert towards.goal.minimised == "rms_u_V"
+    assert [limit.threshold for limit in limit_table._asked(towards)] == [5.3e-5, 15.0]
+    assert problem.towards_voltage(3e-5, 20.0, 1.25).limits[0].threshold == pytest.approx(1.25 * 3e-5)
+    assert problem.error_goal.weights == problem.tune.weights
+    answer = rounds(problem, problem.tune.space.values(problem.case.cascade), tmp_path, {}, False)
+    assert answer.front[0].volts <= 15.0
+    assert all(one.volts <= 15.0 for one in answer.front)
+
+
+def point(error, volts, lost=0, within=True):
+    return FrontPoint(1.0, np.zeros(2), error, volts, None, lost, 0, 100, within)
+
+
+def test_the_point_chosen_holds_as_many_members_and_limits_as_the_least_error():
+    seen = [point(1.0, 20.0), point(1.2, 10.0, lost=1), point(1.2, 11.0, within=False), point(1.26, 9.0)]
+    assert chosen(seen, 1.25) is seen[0]
+    assert chosen(seen, 1.3) is seen[3]
+    seen.append(point(1.24, 12.0))
+    assert chosen(seen, 1.25) is seen[4]
+    assert chosen([*seen[:3], point(math.nan, math.nan)], 1.25) is seen[0]
+    loses = [point(1.0, 20.0, lost=1, within=False), *seen[1:]]
+    assert chosen(loses, 1.25) is loses[1]

@@ -1,0 +1,84 @@
+"""The front of error against voltage in the report: its points, the answer taken, and the case file of each point."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax.host.web_page import table
+from tuning.search.course import SearchResult
+from tuning.search.front import KNEE, FrontPoint
+
+Facts = dict[str, Any]
+
+
+def facts(answer: SearchResult) -> list[Facts]:
+    """Return a row for each point of the front, in order of its error limit; `taken` marks the answer."""
+    space = answer.problem.objective.space
+    names = _names(answer.front)
+    return [
+        {
+            "factor": point.factor,
+            "settled_rms_error_m": point.error_m,
+            "settled_rms_u_V": point.volts,
+            "sensitivity": point.sensitivity,
+            "lost": point.lost,
+            "stalled": point.stalled,
+            "members": point.members,
+            "taken": bool(np.array_equal(point.x, answer.x)),
+            "file": name,
+            "gains": dict(zip(space.paths, np.asarray(space.gains_at(jnp.asarray(point.x))).tolist(), strict=True)),
+        }
+        for point, name in zip(answer.front, names, strict=True)
+    ]
+
+
+def _names(points: tuple[FrontPoint, ...]) -> list[str]:
+    """Return the file name of each point, from its voltage; a name that occurs before gets the error limit too."""
+    names = list[str]()
+    for point in points:
+        name = f"tuned_{point.volts:.3g}V.toml"
+        names.append(f"tuned_{point.volts:.3g}V_{point.factor:g}.toml" if name in names else name)
+    return names
+
+
+def sentence(rows: list[Facts]) -> str:
+    """Return which point is taken, for the verdict; '' without a front."""
+    taken = next((row for row in rows if row["taken"]), None)
+    if taken is None or len(rows) < 2:
+        return ""
+    least = rows[0]
+    words = f"least error {least['settled_rms_error_m']:.3g} m at {least['settled_rms_u_V']:.3g} V"
+    if taken is least:
+        return f"Taken: the answer of {words}."
+    return (
+        f"Taken: the least voltage within {100 * (KNEE - 1):g} % of the least error, "
+        f"{taken['settled_rms_error_m']:.3g} m at {taken['settled_rms_u_V']:.3g} V ({words})."
+    )
+
+
+def section(rows: list[Facts] | None, written: bool) -> list[str]:
+    """Return the section on the front. `written`: whether each point has a case file."""
+    if not rows:
+        return []
+    files = ["case file"] if written else []
+    cells = [
+        [
+            "least" if row["factor"] == 1 else f"{row['factor']:g} times the least",
+            f"{row['settled_rms_error_m']:.3g}",
+            f"{row['settled_rms_u_V']:.4g}",
+            "-" if row["sensitivity"] is None else f"{row['sensitivity']:.3g}",
+            f"{row['lost'] + row['stalled']} of {row['members']}",
+            "**taken**" if row["taken"] else "-",
+            *([f"`{row['file']}`"] if written else []),
+        ]
+        for row in rows
+    ]
+    head = ["error limit", "settled rms error (m)", "settled rms u (V)", "peak of \\|S\\|", "lost", "answer", *files]
+    words = (
+        "The least rms voltage for each limit of the settled rms error, within the other limits. On members of the "
+        "validation ensemble; the peak is the largest of their linear loops. Only the answer taken is judged on the "
+        "held-out members."
+    )
+    picture = "![Error against voltage; the answer taken is filled](front.png)"
+    return ["## Error against voltage", "", *table(head, cells), "", words, "", picture, ""]

@@ -1,0 +1,146 @@
+"""The front of error against voltage, and its knee: the least voltage of all answers nearly as good as the best.
+
+From the answer of least error e, searches minimise the rms voltage with the rms error limited to a factor times e; each
+begins at the best answer before. The factor of the knee is KNEE.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ambjax.commands.outputs import say
+from tuning.config import seeds
+from tuning.judge import held, judge, rms
+from tuning.objective.limits import FRONT
+from tuning.search.course import Course, SearchResult
+from tuning.search.multipliers import AVERAGING_MEMBERS, met, reached, searched
+from tuning.search.validation import validated
+
+# Error limit of the knee, and those of the front in the order in which tune.front adds them, relative to the least.
+KNEE = 1.25
+FACTORS = (KNEE, 1.1, 1.5, 1.05, 2.0)
+# Largest numbers of searches for a point, with an update of the multipliers between two, and of answers that are
+# validated.
+UPDATES, TRIES = 4, 4
+
+
+class FrontPoint(NamedTuple):
+    """An answer, judged on members of another seed than the training ensemble.
+
+    `factor`: limit of the rms error relative to the least; 1: the answer of least error. `x` [m]: coordinates.
+    `error_m`, `volts`: settled rms error (m) and voltage (V) of the members held, NaN without any. `sensitivity`:
+    peak of |S| as it is limited; None if it is not. `lost`, `stalled`: of `members` members. `within`: whether the
+    limits are held, that of the error apart.
+    """
+
+    factor: float
+    x: np.ndarray
+    error_m: float
+    volts: float
+    sensitivity: float | None
+    lost: int
+    stalled: int
+    members: int
+    within: bool
+
+
+def traced(course: Course, answer: SearchResult) -> SearchResult:
+    """Trace the front from the answer of least error. Return the knee if tune.objective asks for it and it is valid.
+
+    The result holds the points of the front in order of the error limit: for each limit the judged answer of least
+    voltage. Raises ValueError as `Course.search` does.
+    """
+    course.problem, x = answer.problem, answer.x
+    least, _ = _judged(course, 1.0, x)
+    if not (math.isfinite(least.error_m) and least.error_m > 0 and least.volts > 0):
+        say("no front: the answer of least error holds no member, or has no error or voltage")
+        return answer
+    seen, factors = [least], sorted(FACTORS[: answer.problem.tune.budget.front])
+    for factor in factors:
+        if course.interrupted:
+            break
+        say(f"front: least rms voltage with an rms error of at most {factor:g} times the least, {least.error_m:.3g} m")
+        course.problem = answer.problem.towards_voltage(least.error_m, least.volts, factor)
+        seen += _searched(course, factor, chosen(seen, factor).x)
+    taken = answer
+    if answer.problem.tune.objective == "knee" and not course.interrupted:
+        course.problem = answer.problem.towards_voltage(least.error_m, least.volts, KNEE)
+        taken = _valid(course, answer, seen)
+    points = [least, *(chosen(seen, factor)._replace(factor=factor) for factor in factors)]
+    kept = [point for k, point in enumerate(points) if not any(point.x is other.x for other in points[:k])]
+    return dataclasses.replace(taken, front=tuple(kept), history=course.answer(x, None, 0).history)
+
+
+def chosen(seen: Sequence[FrontPoint], factor: float) -> FrontPoint:
+    """Return the point of least voltage of those with an error of at most `factor` times that of the first point.
+
+    Points that lose more members than the first, or break a limit that it holds, do not count.
+    """
+    least = seen[0]
+    fit = [
+        point
+        for point in seen
+        if point.error_m <= factor * least.error_m
+        and point.lost + point.stalled <= least.lost + least.stalled
+        and (point.within or not least.within)
+    ]
+    return min(fit, key=lambda point: point.volts, default=least)
+
+
+def _searched(course: Course, factor: float, x: np.ndarray) -> list[FrontPoint]:
+    """Search from x [m] for the least voltage within the limits. Return the answers after each update."""
+    points = []
+    for _ in range(UPDATES):
+        course.limit_searches += 1
+        x, _ = course.search(x[None])
+        point, numbers = _judged(course, factor, x)
+        points.append(point)
+        limits = tuple(limit.updated(*pair) for limit, pair in zip(course.problem.limits, numbers, strict=True))
+        say(f"{point.volts:.4g} V at an rms error of {point.error_m:.3g} m, on members of another seed")
+        both = zip(limits, numbers, strict=True)
+        if course.interrupted or all(
+            met(limit, judged) or (not limit.multiplier and limit.log_excess(judged) <= 0)
+            for limit, (_, judged) in both
+        ):
+            break
+        course.problem = course.problem.limited(limits)
+    return points
+
+
+def _valid(course: Course, answer: SearchResult, seen: list[FrontPoint]) -> SearchResult:
+    """Return the knee if it is valid; else the next best of the judged answers, at last that of least error."""
+    left = list(seen)
+    for _ in range(TRIES):
+        knee = chosen(left, KNEE)
+        if knee is left[0]:
+            return answer
+        found, *_ = validated(course, knee.x)
+        if found.good:
+            return found
+        say(f"the answer of {knee.volts:.4g} V is not taken: it loses members, or accurate steps do not confirm it")
+        left = [point for point in left if point is not knee]
+        seen.remove(knee)
+    return answer
+
+
+def _judged(course: Course, factor: float, x: np.ndarray) -> tuple[FrontPoint, list[tuple[float, float]]]:
+    """Judge x [m] on members of the validation ensemble, or of the training ensemble without one.
+
+    Returns the point, and each limit's value of the search and of the judge.
+    """
+    problem, budget = course.problem, course.problem.tune.budget
+    seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
+    columns, tuned = judge(problem, x, seed, min(count, AVERAGING_MEMBERS)), searched(course, x)
+    values = reached(problem, x, seed, columns, tuned)
+    alive = held(columns)
+    error, volts = (
+        rms(columns[name][alive]) if alive.any() else math.nan for name in ("settled_rms_error_m", "settled_rms_u_V")
+    )
+    each = dict(zip((limit.name for limit in problem.limits), values, strict=True))
+    within = all(limit.holds(each[limit.name]) for limit in problem.limits if limit.source != FRONT)
+    lost, stalled = (int(columns[name].sum()) for name in ("lost", "stalled"))
+    point = FrontPoint(factor, x, error, volts, each.get("sensitivity"), lost, stalled, len(alive), within)
+    return point, list(zip(tuned, values, strict=True))
