@@ -313,7 +313,7 @@ STOPS = {
 def test_every_command_names_what_stays_the_paper_s(command, capsys, monkeypatch):
     argv, stop = STOPS[command]
 
-    def stopped(*_):
+    def stopped(*_, **more):
         raise ValueError("stopped here")
 
     monkeypatch.setattr(stop, stopped)

@@ -510,13 +510,14 @@ def test_the_slices_are_those_that_were_computed(kept):
 
 def test_the_front_crosses_out_what_loses_members(kept):
     rows = [
-        {"settled_rms_error_m": e, "settled_rms_u_V": u, "lost": lost, "stalled": 0}
+        {"settled_rms_error_m": e, "settled_rms_u_V": u, "lost": lost, "stalled": 0, "taken": e == 2e-7}
         for e, u, lost in ((3e-6, 20.0, 0), (1e-6, 30.0, 4), (2e-7, 90.0, 0))
     ]
     (ax,) = tuned.front(rows).axes
-    line, crosses = ax.lines
+    line, crosses, taken = ax.lines
     np.testing.assert_array_equal(line.get_data(), ([20, 30, 90], [3e-6, 1e-6, 2e-7]))
     np.testing.assert_array_equal(crosses.get_data(), ([30], [1e-6]))
+    np.testing.assert_array_equal(taken.get_data(), ([90], [2e-7]))
     assert len(tuned.front(rows[:1]).axes[0].lines) == 1
 
 

@@ -10,8 +10,9 @@ from test_oracle import Case, adaptive, current, in_ambjax, noise_of, pulse, sin
 
 from ambjax import AdaptiveRodas3, Clock, Sensor, rollout
 from ambjax.simulation.folds import Named
-from tuning.objective.limits import Limit, measures
+from tuning.objective.limits import measures
 from tuning.objective.loss import Loss
+from tuning.objective.quantities import LimitContext
 
 PERIOD, S_0, U = 1e-4, 5e-3, 200.0
 LOOPS = {
@@ -40,10 +41,9 @@ def both(name):
     if any(std):
         scenario = dataclasses.replace(scenario, sensor=Sensor(*std))
     clock = Clock(samples, PERIOD, AdaptiveRodas3())
-    limits = tuple(Limit(kind, 1.0) for kind in ("chatter_V_per_s", "settling_s", "overshoot_m"))
-    fold = Named(
-        {"loss": Loss(settle, 0.0, S_0, U, near), "limits": Named(measures(limits, scenario, clock, settle, band))}
-    )
+    context = LimitContext(settle, float(clock.duration), float(scenario.touchdown), band)
+    folds = measures(("chatter_V_per_s", "settling_s", "overshoot_m"), (), context)
+    fold = Named({"loss": Loss(settle, 0.0, S_0, U, near), "limits": Named(folds)})
     found = rollout(cascade, scenario, clock, fold=fold, every=0).measured
     ours = {key: float(value) for part in found.values() for key, value in part.items()}
     numbers = functools.partial(costs, s_0=S_0, u_scale=U, near=near, band=band)

@@ -11,6 +11,7 @@ from ambjax.cases.tune_table import NUMBERS, WEIGHTS, Budget
 from tuning.config import LIMIT, SHARES, read_tune
 from tuning.objective.loss import TERMS
 from tuning.objective.quantities import KINDS
+from tuning.search.front import FACTORS
 
 
 def parsed(tune):
@@ -51,7 +52,7 @@ def test_whole_numbers_and_bounds_of_tune_have_both_ends():
         return {"gains": ["controller.position.c"], "bounds": {"controller": {"position": {"c": list(ends)}}}}
 
     for field in dataclasses.fields(Budget):
-        most = 2**20 if field.name in IN_MEMORY else 2**31 - 1
+        most = 2**20 if field.name in IN_MEMORY else len(FACTORS) if field.name == "front" else 2**31 - 1
         assert getattr(parsed({field.name: most}).budget, field.name) == most
         with pytest.raises(
             ValueError, match=rf"^tune\.{field.name} = {most + 1}: it must be a whole number from [01] to {most}\.$"

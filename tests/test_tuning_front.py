@@ -1,4 +1,4 @@
-"""The front of error against voltage, and its knee: on formulas with a known answer, in the report and in case files."""
+"""The front of error against voltage, and its knee: on formulas with a known answer, in report and case files."""
 
 import argparse
 import collections
@@ -101,7 +101,9 @@ def test_the_rest_of_the_limits_stays(monkeypatch, tmp_path):
     assert (limits["rms_error_m"].threshold, limits["rms_error_m"].source) == (5.3e-5, FRONT)
     assert towards.goal.minimised == "rms_u_V"
     assert [limit.threshold for limit in limit_table._asked(towards)] == [5.3e-5, 15.0]
-    assert problem.towards_voltage(3e-5, 20.0, 1.25).limits[0].threshold == pytest.approx(1.25 * 3e-5)
+    tighter = problem.towards_voltage(3e-5, 20.0, 1.25)
+    assert tighter.limits[0].threshold == pytest.approx(1.25 * 3e-5)
+    assert [limit.threshold for limit in limit_table._asked(tighter)] == [5.3e-5, 15.0]
     assert problem.error_goal.weights == problem.tune.weights
     answer = rounds(problem, problem.tune.space.values(problem.case.cascade), tmp_path, {}, False)
     assert answer.front[0].volts <= 15.0

@@ -21,7 +21,7 @@ from ambjax.simulation.metrics import standard_for
 from tuning.config import LimitSettings, settings
 from tuning.objective.lanes import Engine
 from tuning.objective.limits import PENALTY, Limit, measures
-from tuning.objective.quantities import KINDS, largest
+from tuning.objective.quantities import KINDS, LimitContext, largest
 from tuning.objective.risk import Mean
 from tuning.problem import REFINEMENT, problem_of
 from tuning.report.limit_table import MORE
@@ -154,7 +154,8 @@ clearance_used = 0.6
 def test_the_search_measures_what_the_judge_does():
     made = problem_from(SAMPLED)
     case = made.case
-    folds = measures(made.limits, case.scenario, case.clock, case.settle, 45e-6)
+    context = LimitContext(case.settle, float(case.clock.duration), float(case.scenario.touchdown), 45e-6)
+    folds = measures([limit.name for limit in made.limits], made.limits, context)
     fold = Named({"ours": Named(folds), "theirs": standard_for(case.settle, case.scenario)})
     both = rollout(case.cascade, case.scenario, case.clock, fold=fold, every=0).measured
     ours, theirs = ({name: float(value) for name, value in both[part].items()} for part in ("ours", "theirs"))
@@ -323,7 +324,8 @@ def test_the_command_says_what_a_limit_costs(monkeypatch, tmp_path):
     row, survival = summary["limits"]
     assert (row["name"], row["threshold"], row["held"], row["active"]) == ("rms_u_V", 10.0, True, True)
     assert row["reached"] == pytest.approx(summary["after"]["settled_rms_u_V.mean"])
-    assert row["price_m"] > 0
+    assert row["price"] > 0
+    assert row["price_unit"] == "m"
     assert (survival["reached"], survival["held"]) == (1.0, True)
     assert "is at its limit, 10: 10 % more would take about" in summary["verdict"]
     text = (out / "report.md").read_text()

@@ -82,7 +82,7 @@ def test_every_place_says_the_same(kind, ran):
     assert [outcome["good"], code] == [good, int(not good)]
     for row in rows.values():
         assert row["held"] == {HELD: True, BROKEN: False}.get(row["verdict"])
-        assert (row["price_m"] is None) or row["held"]
+        assert (row["price"] is None) or row["held"]
     assert facts["verified"] == (not facts["refuted"])
     # its words
     words = facts["verdict"]

@@ -12,6 +12,7 @@ from texts import problem_from
 import tuning.report.judging
 import tuning.search.course
 import tuning.search.rounds
+import tuning.search.validation
 from ambjax.cases.reader import case_from
 from tuning.__main__ import main
 from tuning.judge import NEGLIGIBLE, StepError, compared, describe, step_error, worst_of
@@ -19,7 +20,8 @@ from tuning.optimisers import Retreat
 from tuning.problem import REFERENCE_MEMBERS
 from tuning.search.descent import Starts
 from tuning.search.keeper import SearchState
-from tuning.search.rounds import MOST_HALVINGS, NOISE_GROWTH, _joining, finer, rounds
+from tuning.search.rounds import MOST_HALVINGS, finer, rounds
+from tuning.search.validation import NOISE_GROWTH, joining
 
 ROTOR = (pathlib.Path(__file__).parent / "cases" / "rotor.toml").read_text()
 # Under noise on the velocity, hard signs of these gains drive i_ref onto the singular curve within milliseconds of
@@ -120,7 +122,7 @@ def test_the_worst_are_the_largest():
 def test_members_that_accurate_steps_do_not_hold_join_louder(small):
     unseen = small.objective.chosen(1, np.array([2, 3]), 4)
     error = error_of(small, lost=1, stalled=1, members=2, unheld=unseen)
-    joined = _joining(small, np.array([7, 5]), error, NOISE_GROWTH**2)
+    joined = joining(small, np.array([7, 5]), error, 2)
     assert joined.member.tolist() == [7, 5, 2, 3]
     np.testing.assert_allclose(joined.noise_factor, [1.1, 1.1, NOISE_GROWTH**2, NOISE_GROWTH**2])
 
@@ -157,9 +159,10 @@ def searched(engine, goal, members, points, **rest):
 def run(small, monkeypatch, tmp_path):
     def answer(*errors, most=4):
         verdicts = Verdicts(*errors)
-        monkeypatch.setattr(tuning.search.rounds, "step_error", verdicts)
+        for place in (tuning.search.rounds, tuning.search.validation):
+            monkeypatch.setattr(place, "step_error", verdicts)
         monkeypatch.setattr(tuning.search.course, "search", searched)
-        monkeypatch.setattr(tuning.search.rounds, "_lost", lambda study, x: (np.zeros(0, int), np.arange(4)))
+        monkeypatch.setattr(tuning.search.validation, "_lost", lambda study, x: (np.zeros(0, int), np.arange(4)))
         monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", most)
         start = small.tune.space.values(small.case.cascade)
         return rounds(small, start, tmp_path, {"case": "small"}, False), verdicts
@@ -205,7 +208,7 @@ def test_a_refuted_answer_is_a_failure_in_every_file(small, monkeypatch, tmp_pat
     refuted = Verdicts(
         error_of(small, stalled=4, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
     )
-    for place in (tuning.search.rounds, tuning.report.judging):
+    for place in (tuning.search.rounds, tuning.search.validation, tuning.report.judging):
         monkeypatch.setattr(place, "step_error", refuted)
     monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 1)
     monkeypatch.setattr(tuning.search.rounds, "MOST_HALVINGS", 0)
@@ -227,7 +230,8 @@ def test_a_refuted_answer_is_a_failure_in_every_file(small, monkeypatch, tmp_pat
 @pytest.mark.slow
 def test_an_answer_confirmed_in_training_is_still_refuted_by_held_out_members(small, monkeypatch, tmp_path):
     right = error_of(small)
-    monkeypatch.setattr(tuning.search.rounds, "step_error", Verdicts(right))
+    for place in (tuning.search.rounds, tuning.search.validation):
+        monkeypatch.setattr(place, "step_error", Verdicts(right))
     wrong = Verdicts(right._replace(lost=2, members=2))
     monkeypatch.setattr(tuning.report.judging, "step_error", wrong)
     path, out = tmp_path / "case.toml", tmp_path / "out"
