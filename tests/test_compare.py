@@ -12,6 +12,7 @@ from ambjax.commands.export import guarded_for
 from ambjax.ensemble.study import Study
 from ambjax.export.controller import controller_of
 from ambjax.export.trace import trace
+from ambjax.host import extensions
 from ambjax.linear import analyse, linearise
 from ambjax.pictures.comparison import Contender, figure_of
 
@@ -209,3 +210,9 @@ def test_the_picture_counts_every_member(two, cases):
     np.testing.assert_allclose(shares, [[1.0, 0.25], [2.0, 0.5], [3.0, 0.75]])
     np.testing.assert_allclose(points, [[0.0, 3.0], [1.0, 1.0], [3.0, 2.0]])
     assert axes[1].get_legend().get_texts()[0].get_text() == "x (1 lost)"
+
+
+def test_a_missing_tuner_is_reported(monkeypatch, capsys):
+    monkeypatch.setattr(extensions, "GROUP", "ambjax.none")
+    assert main(["tune", "case.toml"]) == 2
+    assert capsys.readouterr().err == "ambjax: tune: this command is not installed. Reinstall ambjax with pip.\n"

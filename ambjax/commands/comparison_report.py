@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.commands.operating import OperatingPoint, SpreadPeaks
+from ambjax.commands.operating import MEMBERS, OperatingPoint, SpreadPeaks
 from ambjax.commands.outputs import table
 from ambjax.ensemble.paths import kinds, places
 from ambjax.ensemble.study import Study
@@ -66,7 +66,7 @@ QUANTITIES = (
     Quantity("peak", "peak of |S|", "1"),
     Quantity("frequency_hz", "at", "Hz", None),
     Quantity("zone", "its zone (ISO 14839-3)", "", None),
-    Quantity("unstable", "members not stable at rest, of the first 100", "1"),
+    Quantity("unstable", f"members not stable at rest, of the first {MEMBERS}", "1"),
     Quantity("worst_peak", "peak of |S|, worst member", "1"),
     Quantity("t_peak", "peak of |T|", "1"),
     Quantity("ks_peak", "peak of |KS|", "V/m"),
