@@ -65,6 +65,20 @@ PLANT = [
 ]
 LAWS = [
     M(
+        "the dead-beat law forgets the decay of the current within a sample",
+        "ambjax/control/current.py",
+        "change * (1 / period) / _mean_decay(decay * period)",
+        "change * (1 / period)",
+        "tests/test_inner_laws.py::test_dead_beat_removes_its_share_of_the_error_in_one_sample",
+    ),
+    M(
+        "the adaptive law feeds the wrong rate of the force forward",
+        "ambjax/control/inversion.py",
+        "inputs.v_star_rate - model.dv_dz(inputs.z, state) * inputs.z_rate",
+        "inputs.v_star_rate",
+        "tests/test_inner_laws.py::test_feed_forward_leaves_only_the_sign_in_equation_8",
+    ),
+    M(
         "the sliding mode of Utkin begins with a reaching phase",
         "ambjax/control/manifolds.py",
         "jnp.where(state.begun > 0.5, state.integral, self.begin(model, inputs))",

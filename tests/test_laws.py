@@ -42,10 +42,12 @@ LAWS = [
     ("position", position.PID()),
     ("inversion", inversion.Adaptive()),
     ("inversion", inversion.Adaptive(gamma=1e9, p=25e-6, i_ref=0.01)),
+    ("inversion", inversion.FeedForwardAdaptive()),
     ("inversion", inversion.ClosedForm()),
     ("inversion", inversion.Linearised()),
     ("current", current.SlidingMode()),
     ("current", current.ProportionalIntegral()),
+    ("current", current.DeadBeat()),
 ]
 MODEL = Plant()
 TABLE = pytest.mark.parametrize(

@@ -61,10 +61,11 @@ KINDS: dict[str, dict[str, type[Law]]] = {
     },
     "inversion": {
         "adaptive": inversion.Adaptive,
+        "adaptive-feed-forward": inversion.FeedForwardAdaptive,
         "closed-form": inversion.ClosedForm,
         "linearised": inversion.Linearised,
     },
-    "current": {"sliding-mode": current.SlidingMode, "pi": current.ProportionalIntegral},
+    "current": {"sliding-mode": current.SlidingMode, "pi": current.ProportionalIntegral, "dead-beat": current.DeadBeat},
 }
 SIGNALS: dict[str, type] = {
     "constant": signals.Constant,

@@ -104,3 +104,59 @@ class ProportionalIntegral(CurrentLaw[Array]):
             "k_int": rate(context, 1 / 30, 30, "corner sqrt(k_int / L) from w/30 to 30 w", per, 2),
             "k_aw": rate(context, 1e-2, 10, "rate from w/100 to 10 w"),
         }
+
+
+@record
+class DeadBeat(CurrentLaw[tuple[()]]):
+    """i' = i_ref' - w (i - i_ref) by inversion of Eq. (2); on a processor i - i_ref shrinks to 1 - share in a sample.
+
+    u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - w (i - i_ref)) + R i in continuous time, where dead-beat does
+    not exist. On a processor u is the constant voltage that, with z and z_dot held, moves i in one sample from i to
+    i_ref + T i_ref' + (1 - share) (i - i_ref): with share = 1 the current is at its reference one sample after u acts,
+    if the supply suffices (Astrom and Wittenmark, Computer-Controlled Systems, 1997, 4.3). w has no effect there, and
+    share none in continuous time. There is no integral: a wrong resistance of the model leaves an offset.
+    """
+
+    w: Scalar = gain(default=1e4, unit="1/s", doc="decay rate of the current error in continuous time")
+    share: Scalar = gain(
+        default=1.0, unit="1", doc="share of the error removed in a sample of a processor; 1: dead-beat"
+    )
+
+    def init(self, model: Plant) -> tuple[()]:
+        return ()
+
+    def scale(self, model: Plant) -> tuple[()]:
+        return ()
+
+    def slope(self, model: Plant) -> Scalar:
+        return self.w
+
+    def __call__(self, model: Plant, inputs: CurrentInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
+        measured, demand = inputs.measured, inputs.demand
+        inverse = (inputs.gaps or model.gaps(measured.z)).inverses[1]
+        wanted = demand.i_ref_dot - self.w * (measured.i - demand.i_ref) - 2 * measured.z_dot * inverse * measured.i
+        return (model.kappa / 2) * inverse * wanted + model.R * measured.i, ()
+
+    def step(self, model: Plant, inputs: CurrentInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
+        """Return the voltage that ends at the wanted current, i' = b u - decay i with b = 2 (s_0+z)/kappa."""
+        measured, demand = inputs.measured, inputs.demand
+        gaps = inputs.gaps or model.gaps(measured.z)
+        per_volt = (2 / model.kappa) * gaps.lower
+        decay = per_volt * model.R - 2 * measured.z_dot * gaps.inverses[1]
+        i = measured.i
+        change = period * demand.i_ref_dot - self.share * (i - demand.i_ref)
+        return (change * (1 / period) / _mean_decay(decay * period) + decay * i) / per_volt, ()
+
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        return {
+            "w": rate(context, 1, 100, "rate from w to 100 w"),
+            "share": Interval(0.1, 1.0, "a tenth of the error to all of it", True),
+        }
+
+
+def _mean_decay(x: Array) -> Array:
+    """Return (1 - exp(-x))/x, 1 at x = 0, for |x| limited to 30; by its series near 0, where the quotient cancels."""
+    x = limited(x, 30.0)
+    near = jnp.abs(x) < 1e-3
+    far = jnp.where(near, 1.0, x)
+    return jnp.where(near, 1 - x / 2 + x * x / 6 - x * x * x / 24, -jnp.expm1(-far) / far)

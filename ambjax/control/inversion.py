@@ -104,6 +104,65 @@ class Adaptive(InversionLaw[Array]):
         return CurrentDemand(state, (after - state) * (1 / period)), after
 
 
+@record
+class FeedForwardAdaptive(InversionLaw[Array]):
+    """i_ref' = (gamma sgn(w) + v_star' - dv/dz z')/(dv/di), w = v_star - v(z, i_ref): Eq. (6) with d of Eq. (8) added.
+
+    The feed-forward of the rates of v_star and z cancels d, so that w' = -gamma sgn(w) on a known plant: gamma exceeds
+    only the error of these rates, not Delta_1 of Eq. (7). The rates are those of the nominal model. They contain the
+    noise of the velocity, which Eq. (6) does not.
+    """
+
+    gamma: Scalar = gain(default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above the error of the rates")
+    p: Scalar = gain(
+        default=25.0,
+        unit="m^2/A^2",
+        doc="steepness of the smoothed sign of v_tilde; left out: scaled to the plant",
+        steepness=True,
+    )
+    i_ref: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="initial current reference")
+    memory = (("i_ref", "A", "current reference of the next sample"),)
+
+    def init(self, model: Plant) -> Array:
+        return jnp.asarray(self.i_ref)
+
+    def started(self, i_ref: Array) -> "FeedForwardAdaptive":
+        return dataclasses.replace(self, i_ref=i_ref)
+
+    def scale(self, model: Plant) -> Scalar:
+        return model.i_0 / 25
+
+    def slope(self, model: Plant) -> Scalar:
+        return TWO_OVER_PI * self.gamma * self.p
+
+    def size(self, model: Plant) -> Scalar:
+        return model.v_size
+
+    def layer(self, model: Plant) -> Scalar:
+        """Return a third of the width of the smoothed sign in i_ref (A), as `Adaptive.layer`."""
+        return 0.3 / (self.p * model.dv_di(0.0, 0.0))
+
+    def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:
+        v, gradient = v_and_gradient(model, inputs, state)
+        ahead = inputs.v_star_rate - model.dv_dz(inputs.z, state) * inputs.z_rate
+        rate = self.gamma * smooth_sign(inputs.v_star - v, self.p, per=gradient) + ahead / gradient
+        return CurrentDemand(state, rate), rate
+
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        needed, words = context.delta_1
+        gamma = Interval(
+            needed / 100, 100 * needed, f"a hundredth to 100 times the bound without feed-forward: {words}"
+        )
+        return {"gamma": gamma, **steepness(context, "gamma")}
+
+    def step(self, model: Plant, inputs: ForceDemand, state: Array, period: Scalar) -> tuple[CurrentDemand, Array]:
+        """Step v towards v_star, both at the end of the sample, with the sign at the end of the step."""
+        w = materialised(inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0])
+        z, v_star = inputs.z + period * inputs.z_rate, inputs.v_star + period * inputs.v_star_rate
+        after = model.current_for(z, v_star - relax(w, period * self.gamma, self.p))
+        return CurrentDemand(state, (after - state) * (1 / period)), after
+
+
 class StaticInversionState(NamedTuple):
     """State of a static inversion on a processor: i_ref (A), and a flag that is 0 before the first sample, then 1."""
 
