@@ -78,8 +78,8 @@ class Observer(Law, Generic[State], abc.ABC):
     @abc.abstractmethod
     def init(self, model: Plant, measured: Measurement) -> State: ...
 
-    def started(self) -> "Observer":
-        """Return the observer with its estimate starting at the measurement; itself if no field sets it."""
+    def started(self, z: Array) -> "Observer":
+        """Return the observer with its estimate of the displacement starting at z (m); itself if no field sets it."""
         return self
 
     @abc.abstractmethod

@@ -53,8 +53,8 @@ class Complementary(Observer[Array]):
     def init(self, model: Plant, measured: Measurement) -> Array:
         return jnp.asarray(measured.z if self.z_hat is None else self.z_hat)
 
-    def started(self) -> "Complementary":
-        return dataclasses.replace(self, z_hat=None)
+    def started(self, z: Array) -> "Complementary":
+        return dataclasses.replace(self, z_hat=z)
 
     def scale(self, model: Plant) -> Scalar:
         return model.s_0 / 50

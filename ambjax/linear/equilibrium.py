@@ -136,8 +136,8 @@ def _start(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> P
     i, u = plant.equilibrium(r)
     zero = jnp.zeros_like(i)
     state = plant.start(Measurement(zero + r, zero, i))
-    cascade = dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started())
     measured = reading(scenario, plant.measurement(state), (0.0, 0.0))
+    cascade = dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started(measured.z))
     control = jax.tree.map(lambda x: jnp.asarray(x, zero.dtype), cascade.init(measured))
     return Point(state, control, zero + u)
 

@@ -15,6 +15,7 @@ import numpy as np
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
 from ambjax.linear.analysis import Zones
+from ambjax.linear.equilibrium import ideal, reading
 from ambjax.linear.multisine import MultiSine, Response, multisine, with_wave
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
@@ -22,6 +23,7 @@ from ambjax.simulation.rollout import prepare, run
 from ambjax.simulation.sliding import Slide
 from ambjax.simulation.trajectory import ALIVE
 from ambjax.world.scenario import Initial, Scenario
+from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Constant
 
 # Default amplitude of e, as a share of the gap s_0.
@@ -146,7 +148,9 @@ def _at_rest(cascade: Cascade, scenario: Scenario, r: float) -> tuple[Cascade, S
     quiet = {"q_z": none, "q_v": none, "q_i": none}
     scenario = dataclasses.replace(scenario, reference=Constant(r), initial=Initial(r, 0.0, i), **quiet)
     inversion = cascade.inversion.started(cascade.model.equilibrium(r)[0])
-    return dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started()), scenario
+    # not at the first measurement: its noise would be an initial error that a slow observer keeps
+    z = float(reading(ideal(scenario), Measurement(r, 0.0, i), (0.0, 0.0)).z)
+    return dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started(z)), scenario
 
 
 def _harmonics(frequencies: Sequence[float] | np.ndarray, clock: Clock) -> np.ndarray:
