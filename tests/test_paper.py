@@ -77,7 +77,7 @@ def test_a_stall_is_neither_held_nor_lost():
     verdicts = {row["says"]: row["findings"]["x"]["verdict"] for row in rows}
     others = {"The noise is about 20 % of the gap": findings.HOLDS, "The noise is specified": findings.OPEN}
     assert verdicts == dict.fromkeys(verdicts, findings.UNDECIDED) | others
-    page = markdown(rows, scans, sampled)
+    page = markdown(rows, scans, sampled, [])
     assert "not decided: stalled at 10 ms" in page
     assert "| none, not decided at 1.0e-08 m |" in page
     assert "rotor lost" not in page
@@ -140,6 +140,15 @@ def test_reproduce(tmp_path, monkeypatch):
     new, old = (coarse(imread(path)) for path in (out / "readings.png", DOCS / "readings.png"))
     assert new.shape == old.shape, "copy readings.png of 'ambjax reproduce' to docs/"
     assert np.abs(new - old).max() < 0.1, "copy readings.png of 'ambjax reproduce' to docs/"
+    # the velocity is measured: a controller that hardly reads the position has |S| = 1 there
+    peaks = {row["reading"]: (row["peak"], row["zone"], row["velocity_zone"]) for row in written["sensitivity"]}
+    assert peaks["repaired"][0] == pytest.approx(41.27, rel=1e-3)
+    assert {name: zones for name, (_, *zones) in peaks.items()} == {
+        "literal": ["D", "A"],
+        "repaired": ["D", "A"],
+        "tuned": ["A", "A"],
+        "sampled": ["A", "B"],
+    }
     page = (out / "ledger.md").read_text()
     assert all(dataclasses.asdict(c)["says"] in page for c in claims.CLAIMS)
 

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """Reproduce the paper and write its figures and the ledger of claims."""
     out = directory(args.out, "reproduce", _names())
     began = time.perf_counter()
-    stages = 2 * 8 + 1
+    stages = 2 * 8 + 2
     with (
         files(out) as part,
         tqdm(
@@ -68,8 +68,13 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         evidence, jobs = {}, []
         with _alive(), ThreadPoolExecutor(1) as artist, processes(1) as other:
             theirs = {reading: other.submit(gather, reading) for reading in paper.NOISY}
-            for reading in paper.READINGS:
-                evidence[reading] = theirs[reading].result() if reading in theirs else gather(reading, stage)
+            for reading in (reading for reading in paper.READINGS if reading not in theirs):
+                evidence[reading] = gather(reading, stage)
+                jobs.append(artist.submit(_paper_figures, reading, evidence[reading], part))
+            stage("sensitivity")  # while the second process goes on
+            sensitivity = ledger.sensitivity_table(paper.READINGS)
+            for reading, job in theirs.items():
+                evidence[reading] = job.result()
                 jobs.append(artist.submit(_paper_figures, reading, evidence[reading], part))
             stage("figures and ledger")
             for job in jobs:
@@ -81,12 +86,14 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         figures.readings(shown, words, paper.SETTLE, part / "readings.png")
         claims, noise = ledger.judge(evidence), ledger.noise_table(evidence)
         processor = ledger.processor_table(evidence)
-        (part / "ledger.md").write_text(ledger.markdown(claims, noise, processor), encoding="utf-8")
-        write_json(part / "ledger.json", plain({"claims": claims, "noise": noise, "processor": processor}))
+        page = ledger.markdown(claims, noise, processor, sensitivity)
+        (part / "ledger.md").write_text(page, encoding="utf-8")
+        summary = {"claims": claims, "noise": noise, "processor": processor, "sensitivity": sensitivity}
+        write_json(part / "ledger.json", plain(summary))
     if not args.json:
         rows = [(c["says"], c["paper"], *(f["verdict"] for f in c["findings"].values())) for c in claims]
         print(table(("claim", "paper", *paper.READINGS), rows))
         written(out, "figure_3.png to figure_6.png, the same under literal/, tuned/ and sampled/,")
         print("         readings.png, ledger.md, ledger.json")
     say(f"done in {time.perf_counter() - began:.1f} s")
-    return 0, plain({"claims": claims, "noise": noise, "processor": processor, "out": str(out)})
+    return 0, plain(summary | {"out": str(out)})

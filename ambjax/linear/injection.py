@@ -149,7 +149,8 @@ def _at_rest(cascade: Cascade, scenario: Scenario, r: float) -> tuple[Cascade, S
     scenario = dataclasses.replace(scenario, reference=Constant(r), initial=Initial(r, 0.0, i), **quiet)
     inversion = cascade.inversion.started(cascade.model.equilibrium(r)[0])
     # not at the first measurement: its noise would be an initial error that a slow observer keeps
-    z = float(reading(ideal(scenario), Measurement(r, 0.0, i), (0.0, 0.0)).z)
+    rest = Measurement(*map(jnp.asarray, (r, 0.0, i)))
+    z = reading(ideal(scenario), rest, (0.0, 0.0)).z
     return dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started(z)), scenario
 
 

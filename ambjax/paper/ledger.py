@@ -2,11 +2,13 @@
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from typing import Any
 
+from ambjax.linear import Zones, analyse, linearise
 from ambjax.paper.claims import CLAIMS, SIGMA_RADIUS
 from ambjax.paper.evidence import Evidence
-from ambjax.paper.readings import CLOCK, PROCESSOR, SAMPLED, SUPPLY, TABLE_2, TUNED, Tuned
+from ambjax.paper.readings import CLOCK, PROCESSOR, SAMPLED, SUPPLY, TABLE_2, TUNED, Tuned, cascade, scenario
 
 
 def _gains(gains: Tuned) -> str:
@@ -73,6 +75,41 @@ def processor_table(evidence: dict[str, Evidence]) -> list[dict[str, object]]:
     ]
 
 
+def sensitivity_table(readings: Iterable[str]) -> list[dict[str, object]]:
+    """Return the linear sensitivity of each reading at rest at r = 0, as plain data.
+
+    A row has the peak of |S| of the position sensor, its frequency (Hz) and its ISO 14839-3 zone; the same of the
+    velocity sensor, which all readings have; and the static stiffness, N/m. See `ambjax.linear.analyse`.
+    """
+    rows, zones = [], Zones()
+    for name in readings:
+        world = scenario("regulation", name, pulse=False)
+        system = linearise(cascade(name), world, CLOCK)
+        analysis = analyse(system, world.plant.m, CLOCK.sample_period, zones, velocity=True)
+        assert analysis.S_velocity is not None
+        row: dict[str, object] = {"reading": name}
+        for key, peak in (("", analysis.S), ("velocity_", analysis.S_velocity)):
+            height, frequency = float(peak.height), float(peak.frequency)
+            row |= {f"{key}peak": height, f"{key}frequency_hz": frequency, f"{key}zone": zones.zone(height)}
+        rows.append(row | {"static_stiffness_N_per_m": float(analysis.stiffness)})
+    return rows
+
+
+def _sensitivity_lines(rows: list[dict[str, Any]]) -> list[str]:
+    lines = ["", "## Sensitivity (linear, at rest at r = 0; zones of ISO 14839-3)", ""]
+    lines += [
+        "| reading | position sensor: peak of \\|S\\|, zone | velocity sensor | static stiffness |",
+        "|---|---|---|---|",
+    ]
+    for row in rows:
+        cells = [
+            f"{row[f'{key}peak']:.4g} at {row[f'{key}frequency_hz']:.3g} Hz, **{row[f'{key}zone']}**"
+            for key in ("", "velocity_")
+        ]
+        lines.append(f"| {row['reading']} | {' | '.join(cells)} | {row['static_stiffness_N_per_m']:.3g} N/m |")
+    return lines
+
+
 def _processor_lines(rows: list[dict[str, Any]]) -> list[str]:
     lines = ["", "## All readings on the processor of `sampled` (tracking, pulse included)", ""]
     lines += [
@@ -90,8 +127,16 @@ def _processor_lines(rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def markdown(rows: list[dict[str, Any]], noise: list[dict[str, Any]], processor: list[dict[str, Any]]) -> str:
-    """Return the ledger as a Markdown page, from the results of `judge`, `noise_table` and `processor_table`."""
+def markdown(
+    rows: list[dict[str, Any]],
+    noise: list[dict[str, Any]],
+    processor: list[dict[str, Any]],
+    sensitivity: list[dict[str, Any]],
+) -> str:
+    """Return the ledger as a Markdown page.
+
+    Its arguments are the results of `judge`, `noise_table`, `processor_table` and `sensitivity_table`.
+    """
     readings = list(rows[0]["findings"])
     lines = ["# Ledger: the paper's claims, per reading", ""]
     lines += [
@@ -118,4 +163,4 @@ def markdown(rows: list[dict[str, Any]], noise: list[dict[str, Any]], processor:
         if n["undecided_std_m"]:
             survived += f", not decided at {n['undecided_std_m']:.1e} m"
         lines.append(f"| {n['reading']} | {n['sample_period_s']:g} s | {n['horizon_s']:g} s | {survived} | {gives} |")
-    return "\n".join([*lines, *_processor_lines(processor)]) + "\n"
+    return "\n".join([*lines, *_processor_lines(processor), *_sensitivity_lines(sensitivity)]) + "\n"
