@@ -1,4 +1,4 @@
-"""Everything that a law, a plant or a package of your own needs besides the names of `ambjax` itself.
+"""Names that a custom law, plant or package needs besides those of `ambjax` itself.
 
 Laws subclass `Observer`, `PositionLaw`, `InversionLaw` or `CurrentLaw`; plants subclass `Bearing`. Both are records:
 frozen dataclasses whose leaves are declared by `gain`, `leaf` or `static`.

@@ -50,7 +50,7 @@ class Timed(NamedTuple):
         return statistics.median(a / b for a, b in zip(self.times, other.times, strict=True))
 
 
-# Processor seconds of this process: for one core of a machine on which others work too.
+# Processor seconds of this process, which other load changes least.
 own_seconds = time.process_time
 
 
@@ -60,10 +60,10 @@ def alternating(
     least: float = 0.02,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[Any, Timed]:
-    """Times of each run by this clock, taken in turn, round by round, so that all see the same machine.
+    """Return the times of each run by `clock`. The runs alternate, so that all meet the same load.
 
-    What takes less than `least` seconds is repeated within its turn until that is filled, as Python's timeit does:
-    a call among others pays for caches that they emptied.
+    A run shorter than `least` seconds is repeated within its turn, as by Python's timeit, because the runs before it
+    have displaced its data from the caches.
     """
     first, times, counts = {}, {name: [] for name in runs}, {}
 
@@ -91,7 +91,7 @@ def child(script: str, *arguments: Any, **environment: str) -> Any:
 
 @contextlib.contextmanager
 def server(script: str, name: str) -> Iterator[Callable[[], Any]]:
-    """A process of `script --serve NAME`: each call of what this yields sends it a line and takes its line of JSON."""
+    """Start `script --serve NAME` and yield a function that sends it a line and returns its answer, a line of JSON."""
     command = [sys.executable, script, "--serve", name]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         line: Any = process.stdin
@@ -111,9 +111,9 @@ def server(script: str, name: str) -> Iterator[Callable[[], Any]]:
 
 
 def peak_memory() -> int:
-    """Largest resident memory of this process so far, in bytes.
+    """Return the peak resident memory of this process, in bytes.
 
-    getrusage counts a parent's memory where the child was begun by vfork, so Linux's own count comes first.
+    getrusage includes the parent's memory after vfork, so Linux's VmHWM is used where it exists.
     """
     status = pathlib.Path("/proc/self/status")
     if status.exists():

@@ -1,6 +1,6 @@
 """Tune other bearings with a constant reference, and the two templates, by `ambjax tune` with its defaults.
 
-The rows are those of `tasks.py`: no manual intervention, 1,000 held-out members, verification by accurate steps.
+The rows are those of `tasks.py`: no manual intervention, 1,000 held-out members, verification with accurate steps.
 Run: python benchmarks/bearings.py [--out DIR] [NAME ...]
 """
 
@@ -14,7 +14,7 @@ from ambjax.cases.template_text import template
 
 CASES = pathlib.Path(__file__).parent.parent / "tests" / "cases"
 TEMPLATES = ("regulation", "tracking")
-# The objective of the figures: the least error, whatever it does to the voltage and the sensitivity.
+# The objective of the figures: the least error, without regard to voltage and sensitivity.
 LEAST_ERROR = '\n[tune]\nobjective = "least_error"\nlimits.sensitivity = inf\n'
 
 

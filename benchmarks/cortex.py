@@ -1,6 +1,6 @@
-"""A Cortex-M4F under QEMU: programs of an exported controller, compiled for it and run there.
+"""A Cortex-M4F under QEMU: compile programs with an exported controller and run them there.
 
-`missing()` returns the tools that are not installed, as text. Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi
+`missing()` returns the names of the tools that are not installed. Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi
 qemu-system-arm.
 """
 
@@ -11,7 +11,7 @@ import subprocess
 GCC, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
 TARGET = ["-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"]
 FLAGS = ["-std=gnu99", "-O2", "-Wall", "-Wextra", "-ffp-contract=off", *TARGET]
-# Vectors at 0; the floating-point unit on; then newlib's own start, whose output and exit code QEMU takes.
+# The vectors are at 0. The reset handler enables the floating-point unit and calls newlib's start code.
 START = """#include <stdint.h>
 extern void _start(void);
 void reset(void)

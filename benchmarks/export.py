@@ -83,7 +83,7 @@ int main(void)
     return 0;
 }}
 """
-# SysTick at 25 MHz, and with -icount shift=0 an instruction a nanosecond: 40 instructions a tick.
+# SysTick runs at 25 MHz. -icount shift=0 executes an instruction per nanosecond, so a tick is 40 instructions.
 THERE = f"""#include <stdio.h>
 #include <stdint.h>
 #include "amb.h"
@@ -126,10 +126,10 @@ def measured(cascade: Cascade, precision: str) -> dict[str, Any]:
         row |= {"cycles": float(cycles), "ns": float(nanoseconds), "state_bytes": traced.state_bytes()}
         if precision == "float" and not cortex.missing():
             (folder / "there.c").write_text(THERE)
-            code, told = cortex.run([folder / "amb.c", folder / "there.c"], folder, "-icount", "shift=0")
-            assert code == 0, told
+            code, output = cortex.run([folder / "amb.c", folder / "there.c"], folder, "-icount", "shift=0")
+            assert code == 0, output
             size, stack = cortex.size(folder / "amb.c")
-            row |= {"instructions": int(told), "code_bytes": size, "stack_bytes": stack}
+            row |= {"instructions": int(output), "code_bytes": size, "stack_bytes": stack}
     return row
 
 

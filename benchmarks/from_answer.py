@@ -1,9 +1,9 @@
 """Run CMA-ES from the tuner's answer, to check whether the search stopped short.
 
-Each task is tuned as in tasks.py. CMA-ES continues from the answer for `--evaluations` evaluations, on the training
-ensemble and the 16 validation members with the least clearance, on the tuner's goal; limits are penalties on what
-members reach, without a margin for smoothing. The best point and the last mean are judged on the 1,000 held-out
-members of the tuner: a point that loses more of them, or breaks a limit, is marked. Results of other tasks are kept.
+Each task is tuned as in tasks.py. CMA-ES then makes `--evaluations` evaluations of the tuner's objective, on the
+training ensemble and the 16 validation members with the least clearance. Limits are penalties on the values of the
+members, without a margin for smoothing. The best point and the last mean are evaluated on the tuner's 1,000 held-out
+members; a point that loses more of them, or breaks a limit, is marked. Results of other tasks are kept.
 Run: python benchmarks/from_answer.py [--out DIR] [--evaluations 300] [--size 0.2] [TASK ...]
 """
 
@@ -27,25 +27,25 @@ from tuning.problem import TuningProblem, problem_of
 from tuning.search.course import training
 
 TASKS = ("limited/light", "sampled/F10-signs", "D")
-# Validation members that join, with the loudness that the tuner gives them; steepness of the penalties.
-JOINED, LOUD, PENALTY = 16, 1.1, 300.0
+# Number of validation members that are added, the noise factor that the tuner gives them, weight of the penalties.
+JOINED, NOISE_FACTOR, PENALTY = 16, 1.1, 300.0
 
 
 def members(problem: TuningProblem, x: np.ndarray) -> Members:
     """Return the training ensemble plus the validation members with the least clearance at x [m]."""
     count, seed = problem.tune.budget.validation, seeds(problem.tune.budget)[1]
     terms = problem.engine.terms(x[None], problem.objective.chosen(seed, np.arange(count), count))
-    tight = np.argsort(-terms["clearance"][0] - terms["survival"][0], kind="stable")[:JOINED]
-    those = problem.objective.chosen(seed, tight, count)
-    return training(problem).joined(those._replace(noise_factor=LOUD * those.noise_factor))
+    order = np.argsort(-terms["clearance"][0] - terms["survival"][0], kind="stable")[:JOINED]
+    tightest = problem.objective.chosen(seed, order, count)
+    return training(problem).joined(tightest._replace(noise_factor=NOISE_FACTOR * tightest.noise_factor))
 
 
-def goals(problem: TuningProblem, x: np.ndarray, who: Members) -> np.ndarray:
+def goals(problem: TuningProblem, x: np.ndarray, ensemble: Members) -> np.ndarray:
     """Return the objective [S] at x [S, m], with limits as penalties on the values of ordinary members."""
-    terms, free = problem.engine.terms(x, who), dataclasses.replace(problem.goal, limits=())
-    values = free.score(x, {name: rows for name, rows in terms.items() if not name.startswith(PREFIX)}, who)
+    terms, free = problem.engine.terms(x, ensemble), dataclasses.replace(problem.goal, limits=())
+    values = free.score(x, {name: rows for name, rows in terms.items() if not name.startswith(PREFIX)}, ensemble)
     for limit in problem.limits:
-        rows = terms[PREFIX + limit.name][:, : who.ordinary]
+        rows = terms[PREFIX + limit.name][:, : ensemble.ordinary]
         excess = [max(limit.log_excess(float(limit.kind.judged(one))), 0.0) for one in rows]
         values = values + PENALTY * np.square(excess) / 2
     return np.where(np.isfinite(values), values, 10.0)
@@ -69,13 +69,13 @@ def measured(task: str, out: pathlib.Path, evaluations: int, size: float) -> dic
     problem = problem_of(case, tune)
     space = problem.objective.space
     x = space.encode(space.clip(space.values(case.cascade)))
-    who = members(problem, x)
-    first = lowest = goals(problem, x[None], who)[0]
+    ensemble = members(problem, x)
+    first = lowest = goals(problem, x[None], ensemble)[0]
     best, spent = x, 0
     strategy = cma.CMAEvolutionStrategy(x, size, {"seed": 7, "verbose": -9})
     while spent < evaluations:
         points = np.array(strategy.ask())
-        values = goals(problem, points, who)
+        values = goals(problem, points, ensemble)
         strategy.tell(list(points), values.tolist())
         spent += len(points)
         if values.min() < lowest:

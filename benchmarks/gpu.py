@@ -24,7 +24,7 @@ from ambjax.ensemble.gpu_kernel import run_whole
 MEMBERS = (4_096, 65_536, 262_144, 1_048_576)
 BLOCKS = (32, 64, 128, 256)
 SAMPLES = 100
-# Rounding over 1000 steps in z, a hundredth of the largest state; the noise's logarithms are rounded otherwise too
+# Rounding over 1,000 steps in z, a hundredth of the largest state; the noise has other rounding, too
 ALLOWED = {"float64": 1e-9, "float32": 1e-2}
 
 
@@ -33,7 +33,7 @@ def measure(dtype: str, members: tuple[int, ...], samples: int) -> list[dict[str
     for noise, n in itertools.product((False, True), members):
         work = workload.workload(n, samples, noise=noise)
         # one call of the engine for all members: its scan launches kernels per step whatever their number
-        runs: dict[str, Any] = {"scan": functools.partial(workload.ours, work, call=n)}
+        runs: dict[str, Any] = {"scan": functools.partial(workload.by_ambjax, work, call=n)}
         for block in BLOCKS:
             kernel = functools.partial(run_whole, *work, fold=workload.FOLD, block=block)
             runs[f"kernel, {block} members a program"] = lambda kernel=kernel: kernel().measured
@@ -63,7 +63,7 @@ def main() -> None:
     rows = []
     for dtype, x64 in (("float32", "0"), ("float64", "1")):
         arguments = ("--dtype", dtype, "--samples", given.samples, "--members", *given.members)
-        # this process holds the device too: leave memory to the other
+        # two processes share the device: limit the memory of each
         found = _measure.child(__file__, *arguments, JAX_ENABLE_X64=x64, XLA_PYTHON_CLIENT_PREALLOCATE="false")
         rows += found
         for row in found:

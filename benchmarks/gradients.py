@@ -1,9 +1,9 @@
-"""Cost of a gradient: time over one forward run of the same engine and step, and memory against the horizon.
+"""Cost of a gradient: time relative to a forward run of the same engine and step, and memory against the horizon.
 
-Two loops, float64, one core: the tuner's own on task A (sliding steps, held noise, its whole loss), and the common
-workload without noise (smooth gains, RK4, 10 us a step, mean square of e_z). Differentiated in c, k, gamma and
-k_i. Forward mode carries one tangent for each; reverse mode, on the second, recomputes each sample from its start.
-Memory is the peak of a separate process. Run: python benchmarks/gradients.py
+Two loops, float64, one core: the tuner's loop on task A (sliding steps, held noise, the whole loss), and the common
+workload without noise (smooth gains, RK4, 10 us a step, mean square of e_z). The gradient is with respect to c, k,
+gamma and k_i. Forward mode carries one tangent for each gain. Reverse mode, measured on the second loop, recomputes
+each sample from its start. Memory is the peak of a separate process. Run: python benchmarks/gradients.py
 """
 
 import argparse
@@ -35,7 +35,7 @@ MEMBERS, SAMPLES = (1, 64), 1_000
 TASK = pathlib.Path(__file__).parent / "tasks" / "A.toml"
 # Gains that hold task A's rotor.
 HELD = np.array([500.0, 100.0, 1e6, 150.0])
-# Steps of the runs whose memory is compared: ten to a sample.
+# Steps of the runs for the memory, ten per sample.
 HORIZONS = (20_000, 200_000)
 
 
@@ -79,19 +79,19 @@ def rk4(members: int, samples: int) -> tuple[Callable[..., Any], Any, Any, int]:
 
 
 def tuner(members: int, samples: int) -> tuple[Callable[..., Any], Any, Any, int]:
-    """Return the same for the tuner's lanes, around gains that hold the rotor."""
+    """Return the same for the tuner's lanes, at gains that hold the rotor."""
     case, tune, _ = read_tune(TASK)
     case = dataclasses.replace(case, clock=dataclasses.replace(case.clock, samples=samples))
     objective = problem_of(case, tune).objective
-    who, x_0 = objective.members(1, members), objective.space.encode(HELD)
+    lanes, x_0 = objective.members(1, members), objective.space.encode(HELD)
 
     def loss(logs: Any, member: Any) -> Any:
         return weigh(tune.weights, objective.run(x_0 + logs, member, objective.loss), member.stressed)
 
-    one = jax.tree.map(lambda a: a[0], who)
+    one = jax.tree.map(lambda a: a[0], lanes)
     return (
         loss,
-        who if members > 1 else one,
+        lanes if members > 1 else one,
         jax.tree.map(lambda _: 0, one),
         samples * workload.substeps(objective.clock),
     )
@@ -116,15 +116,15 @@ def measure(name: str, build: Callable[..., Any], members: int) -> dict[str, Any
     for mode in ("forward", "reverse"):
         row[mode] = found[mode].over(found["run"]) if mode in found else None
     each = 1e9 * row["run_s"] / members / steps
-    told = f"{name}, {members} members: run {each:.0f} ns a step; gradient in forward mode "
+    line = f"{name}, {members} members: run {each:.0f} ns a step; gradient in forward mode "
     if row["reverse"]:
         slopes = [np.asarray(runs[mode]()[1]) for mode in ("forward", "reverse")]
         slopes[0] = slopes[0].T if members > 1 else slopes[0]
         row["modes_differ"] = float(np.max(np.abs(slopes[0] - slopes[1])) / np.max(np.abs(slopes[0])))
-        told += f"{row['forward']:.2f}, in reverse {row['reverse']:.2f} runs; they differ by {row['modes_differ']:.0e}"
+        line += f"{row['forward']:.2f}, in reverse {row['reverse']:.2f} runs; they differ by {row['modes_differ']:.0e}"
     else:
-        told += f"{row['forward']:.2f} runs"
-    print(told, flush=True)
+        line += f"{row['forward']:.2f} runs"
+    print(line, flush=True)
     return row
 
 
@@ -141,8 +141,8 @@ def main() -> None:
     memory: dict[str, Any] = {}
     for mode in ("run", "forward", "reverse"):
         memory[mode] = [_measure.child(__file__, "--point", mode, steps) for steps in HORIZONS]
-        told = ", ".join(f"{r['steps']:,} steps {r['peak_bytes'] / 2**20:.0f} MiB" for r in memory[mode])
-        print(f"peak memory, {mode}: {told}", flush=True)
+        line = ", ".join(f"{r['steps']:,} steps {r['peak_bytes'] / 2**20:.0f} MiB" for r in memory[mode])
+        print(f"peak memory, {mode}: {line}", flush=True)
     _measure.write("gradients", {"samples": SAMPLES, "rows": rows, "memory": memory})
 
 

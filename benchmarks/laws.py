@@ -1,10 +1,10 @@
-"""Control structures against each other: each tuned by `ambjax compare --tune`, then judged on the same members.
+"""Control structures against each other: each tuned by `ambjax compare --tune`, then evaluated on the same members.
 
-Cases: F20 and G20 of the tuning tasks on a processor, the templates `rig` and `bearing`. The structures of a case have
-the same members, loss, limits and budget, and each is tuned with every seed. Every gain is tuned, the steepnesses p
-included. A comparison that lies in DIR/CASE-SEED is not run again, and results of cases that are not asked for stay.
-`--quick` is one seed and a budget that only shows that the script works; its results are not written. Most of the time
-of a search is spent on compilation, which later seeds of a case do not repeat.
+Cases: F20 and G20 of the tuning tasks on a processor, and the templates `rig` and `bearing`. All structures of a case
+have the same members, loss, limits and budget, and each is tuned with every seed. All gains are tuned, the steepnesses
+p included. A comparison that exists in DIR/CASE-SEED is not run again, and results of other cases are kept.
+`--quick` uses one seed and a small budget, to test the script; its results are not written. Compilation takes most of
+the time of a search; later seeds of a case reuse the compiled programs.
 Run: python benchmarks/laws.py [--out DIR] [--quick] [CASE ...]
 """
 

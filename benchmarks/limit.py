@@ -1,8 +1,8 @@
 """The machine's limit: limit.c, built with the system's compiler and called on a workload.
 
-`missing()` returns the reason if there is no C program. `agreement` compares the program with `rollout`: without noise
-to 1e-9 relative in float64; with noise, which it draws by another generator, by the motion of the rotor. Run: python
-benchmarks/limit.py
+`missing()` returns the reason if there is no C program. `agreement` compares the program with `rollout`. Without noise
+they agree to 1e-9 relative in float64. With noise they use different random generators, so it compares the standard
+deviation of the rotor's motion. Run: python benchmarks/limit.py
 """
 
 import concurrent.futures
@@ -29,7 +29,7 @@ from ambjax import Clock, rollout
 
 SOURCE = pathlib.Path(__file__).with_name("limit.c")
 FLAGS = "-O3 -march=native -mprefer-vector-width=512 -fschedule-insns -fsched-pressure -std=gnu11 -fPIC -shared"
-# float gains a fifth from approximate reciprocals, each refined by one Newton step; double has none
+# approximate reciprocals with one Newton step make float a fifth faster; double does not use them
 PRECISION = {"float64": "-fno-math-errno", "float32": "-DREAL=float -DSINGLE -ffast-math"}
 PLANT = "m k_z s_0 i_0 R g kappa a"
 DOUBLES = f"""{PLANT} touchdown c k p_sigma gamma p_v k_i p_e amplitude frequency force
@@ -71,7 +71,7 @@ def library(dtype: str, source: pathlib.Path = SOURCE) -> Any:
 
 
 def numbers(work: Workload) -> dict[str, Any]:
-    """The workload's numbers, read off its records: what struct problem begins with."""
+    """Return the numbers of the workload in the order of struct problem."""
     scenario, clock = work.scenario, work.clock
     plant, sensor = scenario.plant, scenario.sensor
     _, position, inversion, current = (vars(law) for law in work.cascade.laws)
@@ -113,7 +113,7 @@ def run(work: Workload, dtype: str = "float64", threads: int = 1) -> tuple[np.nd
     return peak, z
 
 
-def ours(work: Workload) -> tuple[np.ndarray, np.ndarray]:
+def by_ambjax(work: Workload) -> tuple[np.ndarray, np.ndarray]:
     """Return the same from jit(vmap(rollout)); the row of one additional sample contains the final z."""
     clock = Clock(work.clock.samples + 1, work.clock.sample_period, work.clock.method)
 
@@ -130,9 +130,9 @@ def ours(work: Workload) -> tuple[np.ndarray, np.ndarray]:
 
 
 def agreement() -> dict[str, float]:
-    """Agreement of the C program with our own rollout; AssertionError beyond what it is said to be."""
+    """Return the agreement of the C program with `rollout`; raise AssertionError beyond the stated tolerances."""
     odd, quiet, noisy = workload.workload(37, 300), workload.workload(256, 60), workload.workload(256, 60, noise=True)
-    expected, moved = ours(odd), np.std(ours(noisy)[1] - ours(quiet)[1])
+    expected, moved = by_ambjax(odd), np.std(by_ambjax(noisy)[1] - by_ambjax(quiet)[1])
     found = {}
     # float32: 6000 steps of rounding at 6e-8 relative to the largest state, in a z of a hundredth of that
     for dtype, allowed in (("float64", 1e-9), ("float32", 1e-3)):
@@ -140,7 +140,9 @@ def agreement() -> dict[str, float]:
         assert error <= allowed, f"limit.c in {dtype} is off by {error:.1e}"
         ratio = np.std(run(noisy, dtype)[1] - run(quiet, dtype)[1]) / moved
         # a standard deviation of 256 has a relative error of 1/sqrt(512) = 4.4 %, two of them 6.3 %: four times that
-        assert abs(ratio - 1) <= 0.25, f"limit.c in {dtype}: its noise moves the rotor {ratio:.2f} times as far as ours"
+        assert abs(ratio - 1) <= 0.25, (
+            f"limit.c in {dtype}: its noise moves the rotor {ratio:.2f} times as far as that of ambjax"
+        )
         found |= {f"{dtype}_error": float(error), f"{dtype}_noise_ratio": float(ratio)}
     return found
 

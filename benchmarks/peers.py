@@ -1,11 +1,10 @@
-"""One ensemble by ambjax and by others, on one core: time per member and 10 us simulated, and the error in z.
+"""One ensemble by ambjax and by other libraries, on one core: time per member and 10 us simulated, and error in z.
 
-The noise-free workload of workload.py. Error: the largest |z - reference| over eight of the members at ten instants;
-reference: SciPy's DOP853 at rtol 1e-12. Fixed-step peers take RK4 steps of 10 us like ours and are compared step for
-step. Adaptive ones get a relative tolerance of 1e-6, and are compared with the cheapest of our steps whose error is
-no more than a tenth above theirs; and with the cheapest whose error is below 1e-6 of the largest z, which is
-what they were asked for. A peer that takes seconds per member gets fewer members. Peers that are not
-installed are skipped.
+The workload is that of workload.py without noise. Error: the largest |z - reference| over eight members at ten
+instants; reference: SciPy's DOP853 at rtol 1e-12. Fixed-step peers take RK4 steps of 10 us and are compared with the
+same steps of ambjax. Adaptive peers have a relative tolerance of 1e-6. They are compared with the cheapest step of
+ambjax whose error is at most 1.1 times theirs, and with the cheapest whose error is below 1e-6 of the largest z. Peers
+that take seconds per member simulate fewer members. Peers that are not installed are skipped.
 Run: python benchmarks/peers.py
 """
 
@@ -38,7 +37,7 @@ from ambjax.ensemble import run_ensemble
 MEMBERS, SAMPLES, INSTANTS, CHECKED = 1024, 500, 10, 8
 TOLERANCE = 1e-6
 PLAIN = "ambjax, plain scan"
-# Methods, and how many samples of the workload they take as one.
+# Methods, and the number of samples of the workload per sample of the method.
 OURS = (
     (RK4(10), 1), (RK4(5), 1), (DOP853(1), 1), (RK4(2), 1), (DOP853(16), 25), (RK4(7), 5), (DOP853(2), 5), (RK4(1), 1),
     (DOP853(8), 25), (DOP853(7), 25),
@@ -48,7 +47,7 @@ Run = Callable[[Workload], Any]
 
 
 def spans(work: Workload) -> list[tuple[float, float, float]]:
-    """From one jump of the force to the next: begin, end, force."""
+    """Return the intervals between jumps of the force: begin, end, force."""
     start, stop = work.pulse
     edges = [0.0, start * PERIOD, stop * PERIOD, work.clock.samples * PERIOD]
     return [(*pair, force) for pair, force in zip(itertools.pairwise(edges), (0.0, 1.0, 0.0), strict=True)]
@@ -59,7 +58,7 @@ def instants(work: Workload) -> np.ndarray:
     return work.clock.samples // INSTANTS * np.arange(1, INSTANTS + 1)
 
 
-def ours(work: Workload) -> Any:
+def by_ambjax(work: Workload) -> Any:
     every = work.clock.samples // INSTANTS
     found = run_ensemble(*work.lasting(work.clock.samples + 1), fold=None, every=every, threads=1)
     return found.trajectory.rows.z[:, 1:].T
@@ -179,14 +178,14 @@ def per_member(work: Workload) -> float:
 def serve() -> None:
     """Run the ensemble once for each line on standard input; answer with z of a few members at the instants."""
     work = workload.workload(MEMBERS, SAMPLES)
-    z = json.dumps(ours(work.few(CHECKED)).tolist())
+    z = json.dumps(by_ambjax(work.few(CHECKED)).tolist())
     for _ in sys.stdin:
-        workload.ours(work)
+        workload.by_ambjax(work)
         print(z, flush=True)
 
 
 class Plain:
-    """Our own fall-back: the engine without its fast path, which a process has or has not for its whole life."""
+    """ambjax without the compiled fast path, in a process of its own because the choice holds for a whole process."""
 
     def __init__(self) -> None:
         command, environment = [sys.executable, __file__, "--serve"], os.environ | {"AMBJAX_PLAIN": "1"}
@@ -201,7 +200,7 @@ class Plain:
 
 
 def peers() -> dict[str, tuple[Run, int, Run]]:
-    """By name: what gives z at the instants, how many members it gets, and what is timed."""
+    """Return for each peer the function of z at the instants, the number of members, and the timed function."""
     fallback = Plain()
     found: dict[str, tuple[Run, int, Run]] = {PLAIN: (fallback, MEMBERS, fallback)}
     if why := limit.missing():
@@ -245,9 +244,9 @@ def main() -> None:
     rows, runs, scales = {}, {}, {}
     for each in OURS:
         name = ours_named(*each)
-        runs[name] = functools.partial(workload.ours, work.stepping(*each))
+        runs[name] = functools.partial(workload.by_ambjax, work.stepping(*each))
         scales[name] = per_member(work)
-        rows[name] = {"members": MEMBERS, "error_m": error(ours, few.stepping(*each))}
+        rows[name] = {"members": MEMBERS, "error_m": error(by_ambjax, few.stepping(*each))}
     for name, (run, members, clocked) in peers().items():
         given = work if members == work.members else work.few(members)
         runs[name], scales[name] = functools.partial(clocked, given), per_member(given)
@@ -269,7 +268,7 @@ def compare(rows: dict[str, dict[str, Any]], largest: float, ratio: Callable[[st
     steps = [ours_named(*each) for each in OURS]
 
     def fastest(error: float) -> str:
-        return min((who for who in steps if rows[who]["error_m"] <= error), key=lambda who: rows[who]["ns"])
+        return min((step for step in steps if rows[step]["error_m"] <= error), key=lambda step: rows[step]["ns"])
 
     for name, row in rows.items():
         row["against"] = steps[0]

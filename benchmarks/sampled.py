@@ -1,9 +1,10 @@
-"""An ensemble whose cascade runs on a processor, next to the machine's limit.
+"""An ensemble whose cascade runs on a processor, compared with the machine's limit.
 
-The workload of workload.py at 10 kHz with held noise, on a processor with one sample of delay, prediction and implicit
-steps, 200 V; with the sign itself (p = inf) and with a smoothed one (p = 25). sampled.c does the same in C:
-`agreement` holds it to our rollout, under the same errors of the sensors. Then the cost of a gradient in c, k, gamma
-and k_i. One core, float64; seconds of the process, taken in turn. Run: python benchmarks/sampled.py
+The workload is that of workload.py at 10 kHz with held noise, on a processor with one sample of delay, prediction,
+implicit steps and a supply of 200 V. It runs with set-valued signs (p = inf) and with smoothed signs (p = 25).
+`agreement` compares sampled.c with `rollout` under the same sensor errors. The script also measures the cost of a
+gradient with respect to c, k, gamma and k_i. One core, float64; processor seconds, measured alternately.
+Run: python benchmarks/sampled.py
 """
 
 import ctypes
@@ -63,14 +64,14 @@ def cascade(gains: Any, p: float) -> Cascade:
 def sampled(members: int, samples: int, p: float) -> Workload:
     """Return the common workload with that cascade and the default number of substeps of `rollout`."""
     work = workload.workload(members, samples, noise=True)
-    scenario, ours = dataclasses.replace(work.scenario, u_max=U_MAX), cascade(GAINS.tolist(), p)
-    return Workload(ours, scenario, with_method(Clock(samples, workload.PERIOD), ours, scenario))
+    scenario, loop = dataclasses.replace(work.scenario, u_max=U_MAX), cascade(GAINS.tolist(), p)
+    return Workload(loop, scenario, with_method(Clock(samples, workload.PERIOD), loop, scenario))
 
 
 def run(work: Workload, errors: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """By sampled.c: largest |z - r| of each member, seen at every substep, and its z at the end, m.
+    """Return the largest |z - r| of each member over all substeps and its final z, m, by sampled.c.
 
-    `errors` of the sensors [samples, 3, members]; None: C draws its own.
+    `errors`: sensor errors [samples, 3, members]; None: the C program draws them.
     """
     z = np.asarray(work.scenario.initial.z).astype(float)
     peak, problem = np.zeros_like(z), Problem(**limit.numbers(work), u_max=U_MAX)
@@ -94,9 +95,9 @@ def errors_of(work: Workload) -> np.ndarray:
 
 
 def agreement(p: float) -> float:
-    """Largest relative error of sampled.c in the largest |z - r| of 37 members; AssertionError beyond 1e-10."""
+    """Return the relative error of sampled.c in the largest |z - r| of 37 members; AssertionError beyond 1e-10."""
     work = sampled(37, 500, p)
-    error = float(np.max(np.abs(run(work, errors_of(work))[0] / workload.ours(work) - 1)))
+    error = float(np.max(np.abs(run(work, errors_of(work))[0] / workload.by_ambjax(work) - 1)))
     assert error <= 1e-10, f"sampled.c is off by {error:.1e}"
     return error
 
@@ -105,14 +106,14 @@ def gradient(p: float) -> float:
     """Return the cost of a gradient of the mean square of e_z, in forward runs."""
     work = sampled(TANGENTS_OF, SAMPLES // 2, p)
 
-    def loss(logs: Any, who: Any) -> Any:
-        z, member = who
+    def loss(logs: Any, lanes: Any) -> Any:
+        z, member = lanes
         alone = dataclasses.replace(work.scenario, initial=Initial(z=z), member=member)
         return (rollout(cascade(GAINS * jnp.exp(logs), p), alone, work.clock, fold=Rms("e_z"), every=0).measured) ** 2
 
-    who = np.asarray(work.scenario.initial.z), np.asarray(work.scenario.member)
+    lanes = np.asarray(work.scenario.initial.z), np.asarray(work.scenario.member)
     compiled = gradients.programs(loss, TANGENTS_OF, (0, 0))
-    runs = {mode: functools.partial(compiled[mode], np.zeros(len(GAINS)), who) for mode in ("run", "forward")}
+    runs = {mode: functools.partial(compiled[mode], np.zeros(len(GAINS)), lanes) for mode in ("run", "forward")}
     found = _measure.alternating(runs, REPEATS, clock=_measure.own_seconds)
     return found["forward"].over(found["run"])
 
@@ -124,7 +125,7 @@ def measure(name: str) -> dict[str, Any]:
     row: dict[str, Any] = {"p": name, "members": MEMBERS, "samples": SAMPLES, "substeps": workload.substeps(work.clock)}
     every = standard_for(0.05, work.scenario)
     runs = {
-        "ambjax": functools.partial(workload.ours, work),
+        "ambjax": functools.partial(workload.by_ambjax, work),
         "all_metrics": lambda: run_ensemble(*work, fold=every, threads=1),
         "C": functools.partial(run, work),
     }
@@ -135,10 +136,10 @@ def measure(name: str) -> dict[str, Any]:
     if "C" in found:
         row |= {"ratio": found["ambjax"].over(found["C"]), "error": agreement(p)}
     row["gradient"] = gradient(p)
-    told = f"p = {name}: {row['ambjax']:.1f} ns a sample, with all metrics {row['all_metrics']:.1f}"
+    line = f"p = {name}: {row['ambjax']:.1f} ns a sample, with all metrics {row['all_metrics']:.1f}"
     if "C" in row:
-        told += f"; C {row['C']:.1f}, ratio {row['ratio']:.2f}, agreement {row['error']:.0e}"
-    print(f"{told}; gradient {row['gradient']:.2f} runs", flush=True)
+        line += f"; C {row['C']:.1f}, ratio {row['ratio']:.2f}, agreement {row['error']:.0e}"
+    print(f"{line}; gradient {row['gradient']:.2f} runs", flush=True)
     return row
 
 

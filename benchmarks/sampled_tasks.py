@@ -1,8 +1,8 @@
 """The tuning tasks on a processor, as in tasks.py in continuous time, each with the error that it must reach.
 
-A bar is what another search, CMA-ES on an independent simulator, found for the same loop; a task without one, as that
-of the ledger's reading `sampled`, must lose no rotor. Where a task is one of tasks.py on a processor, that is run too:
-its processor seconds stand beside.
+A bar is the error that CMA-ES reached for the same loop on an independent simulator. A task without a bar, such as that
+of the ledger's reading `sampled`, must lose no rotor. If the same task exists in tasks.py in continuous time, it is run
+too, and the table gives its processor seconds.
 Run: python benchmarks/sampled_tasks.py [--out DIR] [TASK ...]
 """
 

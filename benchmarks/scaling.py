@@ -1,9 +1,9 @@
 """Cost and peak memory of an ensemble against the number of members and the horizon.
 
-The workload of workload.py with held noise, float64, one core; each point in a process of its own, so that its peak
-memory is its own. Linear means that the time per member-step is the same everywhere. The machine's is not: slow spells
-last longer than a point. So each point is run in turn with one reference ensemble, the median of their ratios is what
-is compared, and printed is its largest deviation from the median point. Run: python benchmarks/scaling.py [--full]
+The workload is that of workload.py with held noise, float64, on one core. Each point runs in its own process, so its
+peak memory is that of the point alone. Each point is timed alternately with one reference ensemble, because the speed
+of the machine drifts. The script compares the medians of these ratios and prints the largest deviation from the median
+point; equal ratios mean linear cost. Run: python benchmarks/scaling.py [--full]
 """
 
 import argparse
@@ -19,7 +19,7 @@ import workload
 
 MEMBERS, FULL = (1_000, 10_000, 100_000), 1_000_000
 SAMPLES = (20, 200, 2_000)
-# At these the other of the two is varied.
+# Held fixed while the other is varied.
 FIXED_SAMPLES, FIXED_MEMBERS = 200, 4_096
 # The reference, short enough to run under the same load as the shortest point; with a long point it runs for a tenth
 # of its time.
@@ -29,13 +29,16 @@ WORK, MOST_ROUNDS = 60_000_000, 45
 
 
 def point(members: int, samples: int) -> dict[str, Any]:
-    """Seconds of one run after a first one, per member-step also relative to the reference; peak memory."""
+    """Return seconds of a warm run, time per member-step also relative to the reference, and peak memory."""
     work = workload.workload(members, samples, noise=True)
     reference = workload.workload(*REFERENCE, noise=True)
     rounds = min(max(3, WORK // (members * samples)), MOST_ROUNDS)
     steps, reference_steps = (w.members * w.steps for w in (work, reference))
     calls = max(steps // reference_steps // SHARE, 1)
-    runs = {"point": lambda: workload.ours(work), "reference": lambda: [workload.ours(reference) for _ in range(calls)]}
+    runs = {
+        "point": lambda: workload.by_ambjax(work),
+        "reference": lambda: [workload.by_ambjax(reference) for _ in range(calls)],
+    }
     found = _measure.alternating(runs, rounds)
     return {
         "members": members,
@@ -67,7 +70,7 @@ def main() -> None:
         results[name] = {"rows": rows, "deviation": max(abs(row["relative"] / middle - 1) for row in rows)}
         for row in rows:
             named = f"{row['members']:>9} members, {row['samples']:>5} samples"
-            cost = f"{row['seconds']:8.3f} s, {row['ns']:6.2f} ns/step, {row['relative']:.3f} of the reference's"
+            cost = f"{row['seconds']:8.3f} s, {row['ns']:6.2f} ns/step, {row['relative']:.3f} times the reference"
             print(f"{named}: {cost}, {row['peak_bytes'] / 2**20:6.0f} MiB")
         print(f"against {name}: linear to within {100 * results[name]['deviation']:.1f} %", flush=True)
     _measure.write("scaling", results)

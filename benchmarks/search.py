@@ -1,15 +1,16 @@
 """The gradient search against derivative-free methods, on the same loss, members, coordinates and number of rollouts.
 
-One rollout is one member simulated once; a gradient of m gains counts m + 1. Every method moves in the same
-coordinates, in which a gain ends at its bound, and knows the ranges of the screen: CMA-ES, Nelder-Mead and Powell's
-method are unbounded in them and begin in their middle, TPE draws from them and half of them beyond either end, random
-search from them alone. The search by gradients begins with a screen of them, and of the case's gains, which lose the
-rotor in all these tasks. Each seed changes what is random in the method, not the members. The budget is what the
-search by gradients took in the median, and those of its seeds that took more are cut there too; `--times` runs the
-rivals with as many times that. Best so far is the loss over the training members, stressed ones included, at the
-search's own steps. Rollouts are not cost: lanes of a call that are not needed are computed all the same, and a
-derivative costs less than a run; so seconds are told too: processor time of the search, which runs on one core, two
-searches at once. Results of tasks and methods that are not asked for stay.
+One rollout simulates one member once; a gradient with respect to m gains counts m + 1 rollouts. All methods use the
+same coordinates, clipped at the bounds of the gains, and the ranges of the screen. CMA-ES, Nelder-Mead and Powell's
+method start in the middle of the ranges and are not limited to them. TPE may leave each range by half its width; random
+search stays inside. The gradient search starts with a screen of the ranges and of the case's gains, which lose the
+rotor in all these tasks. A seed changes the random numbers of a method, not the members.
+
+The budget is the median number of rollouts of the gradient search; longer gradient searches are cut there. `--times`
+multiplies the budget of the other methods. The reported loss is the best over the training members, stressed members
+included, at the integration steps of the search. Rollouts do not measure cost: padded lanes are computed too, and a
+derivative costs less than a run. The results therefore include processor seconds of the search on one core, with two
+searches at a time. Existing results of other tasks and methods are kept.
 Run: python benchmarks/search.py [--tasks A B C D E] [--seeds 5] [--times 1] [--methods CMA-ES ...] [--processes 2]
 """
 
@@ -37,9 +38,9 @@ from tuning.search.course import Course, search_and_restart, training
 from tuning.search.keeper import SearchState
 
 TASKS = pathlib.Path(__file__).parent / "tasks"
-# Evaluations whose results are asked for at once, by methods that have no population of their own.
+# Points per call for methods without a population.
 BATCH = 8
-# Worse than anything that is simulated: a loss of all members is about 1, its log 0.
+# Goal of a non-finite loss. The goal is a logarithm, about 0 where all members are lost.
 WORST = 10.0
 
 
@@ -47,60 +48,60 @@ class SpentError(Exception):
     """Raised when the budget of rollouts is spent."""
 
 
-class Judge:
-    """The goal at coordinates [S, m] in units of the screen's box, any real number; counted and clocked."""
+class CountedGoal:
+    """The goal at coordinates [S, m] in units of the screen's ranges. It counts rollouts and processor seconds."""
 
-    def __init__(self, problem: TuningProblem, who: Any, most: int):
-        self.problem, self.who, self.most = problem, who, most
+    def __init__(self, problem: TuningProblem, members: Any, most: int):
+        self.problem, self.members, self.most = problem, members, most
         start = problem.tune.space.values(problem.case.cascade)
         space, box = problem.objective.space, ranges(problem.objective, problem.goal.conditions, start)
         ends = ([r.low for r in box], [r.high for r in box])
         self.low, self.high = (space.encode(space.clip(np.array(gains))) for gains in ends)
         self.trace: list[tuple[int, float, float]] = []
-        self.spent, self.best, self.began = 0, np.inf, time.process_time()
+        self.spent, self.best, self.started = 0, np.inf, time.process_time()
 
     def __call__(self, units: np.ndarray) -> np.ndarray:
         if self.spent >= self.most:
             raise SpentError
         x = self.low + units * (self.high - self.low)
-        values = self.problem.goal.score(x, self.problem.engine.terms(x, self.who), self.who)
+        values = self.problem.goal.score(x, self.problem.engine.terms(x, self.members), self.members)
         values = np.where(np.isfinite(values), values, WORST)
-        self.spent += len(x) * len(self.who.member)
-        row = (self.spent, time.process_time() - self.began, min(self.best, float(values.min())))
+        self.spent += len(x) * len(self.members.member)
+        row = (self.spent, time.process_time() - self.started, min(self.best, float(values.min())))
         if len(self.trace) > 1 and self.trace[-1][2] == self.trace[-2][2] == row[2]:
-            self.trace.pop()  # of a plateau, its ends
+            self.trace.pop()  # a plateau keeps its two ends
         self.trace.append(row)
         self.best = row[2]
         return values
 
 
-def cma_es(judge: Judge, seed: int) -> None:
+def cma_es(goal_at: CountedGoal, seed: int) -> None:
     import cma
 
-    dice, quiet = np.random.default_rng(seed), {"seed": seed + 1, "verbose": -9}
-    strategy = cma.CMAEvolutionStrategy(np.full(len(judge.low), 0.5), 0.25, quiet)
-    while True:  # until the budget ends; CMA's own criteria may end it before, and then it begins again
+    rng, options = np.random.default_rng(seed), {"seed": seed + 1, "verbose": -9}
+    strategy = cma.CMAEvolutionStrategy(np.full(len(goal_at.low), 0.5), 0.25, options)
+    while True:  # until the budget ends; CMA-ES restarts when its own criteria stop it
         if strategy.stop():
-            quiet["seed"] += 1000
-            strategy = cma.CMAEvolutionStrategy(dice.uniform(size=len(judge.low)), 0.25, quiet)
-        asked = strategy.ask()
-        strategy.tell(asked, judge(np.array(asked)).tolist())
+            options["seed"] += 1000
+            strategy = cma.CMAEvolutionStrategy(rng.uniform(size=len(goal_at.low)), 0.25, options)
+        points = strategy.ask()
+        strategy.tell(points, goal_at(np.array(points)).tolist())
 
 
-def local(name: str) -> Callable[[Judge, int], None]:
+def local(name: str) -> Callable[[CountedGoal, int], None]:
     """SciPy's Nelder-Mead or Powell, restarted from random points when they converge."""
     from scipy.optimize import minimize
 
-    def run(judge: Judge, seed: int) -> None:
-        dice, x = np.random.default_rng(seed), np.full(len(judge.low), 0.5)
+    def run(goal_at: CountedGoal, seed: int) -> None:
+        rng, x = np.random.default_rng(seed), np.full(len(goal_at.low), 0.5)
         while True:
-            minimize(lambda x: judge(x[None])[0], x, method=name, options={"maxfev": 10**6, "xatol": 1e-3})
-            x = dice.uniform(size=len(x))
+            minimize(lambda x: goal_at(x[None])[0], x, method=name, options={"maxfev": 10**6, "xatol": 1e-3})
+            x = rng.uniform(size=len(x))
 
     return run
 
 
-def tpe(judge: Judge, seed: int) -> None:
+def tpe(goal_at: CountedGoal, seed: int) -> None:
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -108,18 +109,18 @@ def tpe(judge: Judge, seed: int) -> None:
     study = optuna.create_study(sampler=sampler)
     while True:
         trials = [study.ask() for _ in range(BATCH)]
-        x = [[trial.suggest_float(f"x{j}", -0.5, 1.5) for j in range(len(judge.low))] for trial in trials]
-        for trial, value in zip(trials, judge(np.array(x)), strict=True):
+        x = [[trial.suggest_float(f"x{j}", -0.5, 1.5) for j in range(len(goal_at.low))] for trial in trials]
+        for trial, value in zip(trials, goal_at(np.array(x)), strict=True):
             study.tell(trial, value)
 
 
-def random_search(judge: Judge, seed: int) -> None:
-    dice = np.random.default_rng(seed)
+def random_search(goal_at: CountedGoal, seed: int) -> None:
+    rng = np.random.default_rng(seed)
     while True:
-        judge(dice.uniform(size=(BATCH, len(judge.low))))
+        goal_at(rng.uniform(size=(BATCH, len(goal_at.low))))
 
 
-METHODS: dict[str, Callable[[Judge, int], None]] = {
+METHODS: dict[str, Callable[[CountedGoal, int], None]] = {
     "CMA-ES": cma_es,
     "Nelder-Mead": local("Nelder-Mead"),
     "Powell": local("Powell"),
@@ -128,20 +129,22 @@ METHODS: dict[str, Callable[[Judge, int], None]] = {
 }
 
 
-def ours(problem: TuningProblem, who: Any, seed: int) -> list[tuple[int, float, float]]:
-    """Return the trace of the gradient search on all members, repeated searches around its answer included."""
-    problem.engine.rollouts, trace, began = 0, [], time.process_time()
+def gradient_search(problem: TuningProblem, members: Any, seed: int) -> list[tuple[int, float, float]]:
+    """Return the trace of the gradient search on all members, including repeated searches around the answer."""
+    problem.engine.rollouts, trace, started = 0, [], time.process_time()
 
     def note(progress: SearchState, _: float) -> None:
-        if progress.history["members"][-1] == len(who.member):  # else its goal is that of a part of them
+        if progress.history["members"][-1] == len(members.member):  # else the goal is over a subset
             best = min(float(np.min(progress.history["value"][-1])), trace[-1][2] if trace else np.inf)
-            trace.append((problem.engine.rollouts, time.process_time() - began, best))
+            trace.append((problem.engine.rollouts, time.process_time() - started, best))
 
-    search_and_restart(Course(problem, who, seed, on_iteration=note), problem.tune.space.values(problem.case.cascade))
+    search_and_restart(
+        Course(problem, members, seed, on_iteration=note), problem.tune.space.values(problem.case.cascade)
+    )
     return trace
 
 
-class Told(NamedTuple):
+class SearchResult(NamedTuple):
     """Result of a search: logarithm of the loss, rollouts, seconds, and rollouts until a goal (None: never)."""
 
     final: float
@@ -150,9 +153,9 @@ class Told(NamedTuple):
     reached: int | None
 
 
-def told(trace: list[tuple[int, float, float]], goal: float) -> Told:
+def result_of(trace: list[tuple[int, float, float]], goal: float) -> SearchResult:
     reached = next((n for n, _, best in trace if best <= goal), None)
-    return Told(trace[-1][2], trace[-1][0], trace[-1][1], reached)
+    return SearchResult(trace[-1][2], trace[-1][0], trace[-1][1], reached)
 
 
 def prepared(name: str) -> tuple[TuningProblem, Any]:
@@ -164,36 +167,36 @@ def prepared(name: str) -> tuple[TuningProblem, Any]:
 
 def by_gradients(name: str, seeds: int) -> dict[str, Any]:
     """Run the gradient search on one task; return the budget, the goal, and a row for each seed."""
-    problem, who = prepared(name)
-    ours(problem, who, 0)  # compiles
-    traces = [ours(problem, who, seed) for seed in range(seeds)]
+    problem, members = prepared(name)
+    gradient_search(problem, members, 0)  # compiles
+    traces = [gradient_search(problem, members, seed) for seed in range(seeds)]
     goal = statistics.median(trace[-1][2] for trace in traces)
     budget = round(statistics.median(trace[-1][0] for trace in traces))
     within = [[step for step in trace if step[0] <= budget] for trace in traces]
     rows = {"gradients": within, "gradients, to their own end": traces}
     return {"budget": budget, "goal": goal} | {
-        name: [told(trace, goal)._asdict() for trace in each] for name, each in rows.items()
+        name: [result_of(trace, goal)._asdict() for trace in each] for name, each in rows.items()
     }
 
 
 def by_others(name: str, found: dict[str, Any], seeds: int, times: float, methods: list[str]) -> dict[str, Any]:
-    """Return the rows of the other methods on one task, with `times` the budget of the gradients."""
+    """Return the rows of the other methods on one task, with `times` the budget of the gradient search."""
     warnings.simplefilter("ignore")
-    problem, who = prepared(name)
+    problem, members = prepared(name)
     space = problem.objective.space
     problem.engine.terms(
-        space.encode(space.clip(problem.tune.space.values(problem.case.cascade)))[None], who
+        space.encode(space.clip(problem.tune.space.values(problem.case.cascade)))[None], members
     )  # compiles
     rows: dict[str, Any] = {}
     for method in methods:
         key = method if times == 1 else f"{method}, {times:g} times"
         rows[key] = []
         for seed in range(seeds):
-            judge = Judge(problem, who, round(times * found["budget"]))
+            goal_at = CountedGoal(problem, members, round(times * found["budget"]))
             try:
-                METHODS[method](judge, seed)
+                METHODS[method](goal_at, seed)
             except SpentError:
-                rows[key].append(told(judge.trace, found["goal"])._asdict())
+                rows[key].append(result_of(goal_at.trace, found["goal"])._asdict())
     return rows
 
 
@@ -218,7 +221,7 @@ def main() -> None:
     path = _measure.RESULTS / "search.json"
     tasks = json.loads(path.read_text())["tasks"] if path.exists() else {}
     with processes(given.processes) as pool:
-        if given.times == 1:  # else the budget and the goal are those that are there
+        if given.times == 1:  # else the budget and the goal are those in the file
             for name, found in zip(given.tasks, pool.map(by_gradients, given.tasks, [given.seeds] * 5), strict=True):
                 tasks[name] = tasks.get(name, {}) | found
                 for method in ("gradients", "gradients, to their own end"):
@@ -229,7 +232,7 @@ def main() -> None:
             for method in given.methods
             for name in given.tasks
         }
-        for job in concurrent.futures.as_completed(jobs):  # an hour in all: what is measured is written at once
+        for job in concurrent.futures.as_completed(jobs):  # takes about an hour: write each result at once
             tasks[jobs[job]] |= job.result()
             for method, rows in job.result().items():
                 show(jobs[job], method, rows)

@@ -1,9 +1,9 @@
 """One closed-loop run of 2 s, against SciPy's LSODA and Radau and diffrax, at equal accuracy.
 
-The paper's tracking scenario without noise, smooth gains (gamma = 1e9, p = 25e-6) and repaired gains
-(gamma = 7.5e4, p = 25), output every 10 ms, integration split at the pulse's edges for every peer. Of each
-solver's tolerances, the fastest whose largest error in z against a reference (LSODA, rtol 1e-12) is at
-most 1e-8 m counts. Medians of 9 rounds, compilation apart. Run: python benchmarks/single.py
+The workload is the paper's tracking scenario without noise, with smooth gains (gamma = 1e9, p = 25e-6) and repaired
+gains (gamma = 7.5e4, p = 25). Output is every 10 ms, and every peer splits the integration at the edges of the pulse.
+Each solver is timed at its cheapest tolerance with a largest error in z of at most 1e-8 m against a reference (LSODA,
+rtol 1e-12). Times are medians of 9 rounds, without compilation. Run: python benchmarks/single.py
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """Time of whole commands: new processes of `ambjax` with a warm compilation cache, against `import jax` alone.
 
-The commands take turns, so that whatever else the machine does meets all of them. CPU seconds (user and system) are
-what a busy machine falsifies least; seconds of the wall are what a user of an idle one waits.
+The commands run in turn, so that all of them meet the same load. CPU seconds (user and system) depend least on other
+load; wall seconds are the waiting time on an idle machine. Run: python benchmarks/startup.py
 """
 
 import os

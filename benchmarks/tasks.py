@@ -1,7 +1,7 @@
 """The five tuning tasks, each by `ambjax tune` with its defaults from the gains as printed, which lose the rotor.
 
-Every task is a case file in tasks/; its report stays in DIR/TASK, and a task whose report is there is not run
-again. The numbers are those of 1,000 held-out members; those of tasks that are not asked for stay.
+Every task is a case file in tasks/. Its report is written to DIR/TASK, and a task with an existing report is not run
+again. The figures are those of 1,000 held-out members. Results of other tasks are kept.
 Run: python benchmarks/tasks.py [--out DIR] [TASK ...]
 """
 
@@ -42,7 +42,7 @@ def kept(results: str) -> dict[str, Any]:
 
 
 def tuned(path: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
-    """What the tuner made of a case file, whose first line is its title; its report is, or will be, in `out`."""
+    """Tune a case file, whose first line is its title, or read an existing report in `out`; return the row."""
     spent = out / "processor_s"
     if not (out / "report.json").exists():
         began = _processor_seconds()

@@ -1,8 +1,8 @@
-"""Member-steps per second of an ensemble against the number of members, next to the machine's limit.
+"""Member-steps per second of an ensemble against the number of members, compared with the machine's limit.
 
-The workload of workload.py (RK4, 10 us a step), without and with held noise, float64 and float32 (a process of
-its own for each precision), one core and two. Our times and those of limit.c, on one core and on two, are taken
-in turn in the same process; ratios are medians over the rounds, compilation apart. One member alone is a `rollout`.
+The workload is that of workload.py (RK4, 10 us a step), without and with held noise, in float64 and float32 (one
+process per precision), on one core and on two. ambjax and limit.c are timed alternately in the same process. Ratios are
+medians over the rounds, without compilation. One member alone is a `rollout`.
 Run: python benchmarks/throughput.py
 """
 
@@ -31,7 +31,7 @@ def measure(dtype: str, members: tuple[int, ...], samples: int) -> list[dict[str
     for noise, n in itertools.product((False, True), members):
         work, runs = workload.workload(n, samples, noise=noise), {}
         for threads in (t for t in THREADS if t <= n):
-            runs["ambjax", threads] = functools.partial(workload.ours, work, threads)
+            runs["ambjax", threads] = functools.partial(workload.by_ambjax, work, threads)
             if not limit.missing():
                 runs["C", threads] = functools.partial(limit.run, work, dtype, threads)
         found = _measure.alternating(runs, REPEATS)

@@ -1,7 +1,7 @@
-"""Work against precision of the integrators: error in z against cost, table and plot.
+"""Work against precision of the integrators: error in z against cost, as table and plot.
 
-The repaired tracking scenario for 0.2 s at 10 kHz, on (a) smooth gains gamma = 1e9, p = 25e-6 in the inversion,
-(b) the repaired gains, (c) the repaired gains with noise of std 1e-6 m on z, held 100 us. Error: the largest
+The workload is the repaired tracking scenario for 0.2 s at 10 kHz, with (a) smooth gains gamma = 1e9, p = 25e-6 in the
+inversion, (b) the repaired gains, (c) the repaired gains and noise of std 1e-6 m on z, held 100 us. Error: the largest
 |z - reference| over all samples; reference: AdaptiveRodas3 at tolerance 1e-10, compared with RK4 at 0.2 us.
 Run: python benchmarks/work_precision.py
 """

@@ -1,10 +1,10 @@
 """Speed gain of each workaround for XLA's CPU compiler, with the version of jax of the measurement.
 
-One is turned off at a time, in a process of its own, and the same processes run in turn with one that keeps them all,
-so that whatever else the machine does meets both. Three jobs on one core: 1,024 members of the common workload under
-held noise (RK4), the gradient of task A's loss (sliding steps, 32 lanes), and 1,024 members on a processor with signs
-(sampled.py's workload). A gain is the time without the workaround
-over the time with it, a median over the rounds: where it is 1 under a newer jax, the workaround can go.
+Each process turns off one workaround; all run alternately with a process that keeps every workaround, so that both
+meet the same load. Three jobs on one core: 1,024 members of the common workload under held noise (RK4), the gradient of
+task A's loss (sliding steps, 32 lanes), and 1,024 members on a processor with signs (the workload of sampled.py). The
+gain is the time without the workaround over the time with it, a median over the rounds. A workaround whose gain is 1
+under a newer jax can be removed.
 Run: python benchmarks/workarounds.py [--rounds 5] [NAME ...]
 """
 
@@ -38,7 +38,7 @@ def without_mark() -> None:
 
 
 def without_width() -> None:
-    """XLA chooses the width of vectors."""
+    """XLA chooses the vector width."""
     from ambjax.compiler import fast_path
 
     fast_path.WIDE = {}
@@ -50,7 +50,7 @@ def without_apart() -> None:
 
 
 def without_stored() -> None:
-    """Intermediates are computed again wherever they are used."""
+    """Intermediates are recomputed at each use."""
     barrier.materialised = lambda tree, beside=(): tree
 
 
@@ -70,20 +70,20 @@ def without_sine() -> None:
 
 
 def without_refined() -> None:
-    """Divisions in float64."""
+    """Float64 divisions are not approximated."""
     from ambjax.numerics import smooth
 
     smooth.refined = lambda x: 1 / x
 
 
 def without_blocks() -> None:
-    """All members of a call at once."""
+    """A call simulates all its members at once."""
     from ambjax.compiler import fast_path
 
     fast_path.block_bytes = lambda members: members * jnp.result_type(float).itemsize
 
 
-# What is turned off by each, before the modules that use it are imported.
+# Function that turns each workaround off before the modules that use it are imported.
 WITHOUT: dict[str, Callable[[], None]] = {
     "none": lambda: None,
     "mark": without_mark,
@@ -105,17 +105,17 @@ def jobs() -> dict[str, Callable[[], Any]]:
 
     digital = sampled.sampled(MEMBERS, SAMPLES, math.inf)
     work = workload.workload(MEMBERS, SAMPLES, noise=True)
-    loss, who, axes, _ = gradients.tuner(LANES, SAMPLES)
+    loss, lanes, axes, _ = gradients.tuner(LANES, SAMPLES)
     slope = gradients.programs(loss, LANES, axes)["forward"]
     return {
-        "ensemble": lambda: workload.ours(work, threads=1),
-        "gradient": lambda: jax.block_until_ready(slope(np.zeros(len(gradients.GAINS)), who)),
-        "processor": lambda: workload.ours(digital, threads=1),
+        "ensemble": lambda: workload.by_ambjax(work, threads=1),
+        "gradient": lambda: jax.block_until_ready(slope(np.zeros(len(gradients.GAINS)), lanes)),
+        "processor": lambda: workload.by_ambjax(digital, threads=1),
     }
 
 
 def serve(name: str) -> None:
-    """Time every job whenever a line arrives; their seconds as a line of JSON."""
+    """Time every job once for each input line and print the seconds as a line of JSON."""
     _measure.one_core()
     WITHOUT[name]()
     runs = jobs()

@@ -1,9 +1,8 @@
 """The workload of every ensemble benchmark, and a second implementation of its right-hand side for the peers.
 
-The paper's tracking scenario with the disturbance as scaled force, smooth gains (inversion gamma = 1e9,
-p = 25e-6, else the paper's), members that differ in where the rotor starts, RK4 with a step of 1e-5 s, ten
-steps a sample. The pulse acts in the middle of the horizon, whatever its length. The fold is the largest
-|z - r| of each member.
+The paper's tracking scenario with the disturbance as scaled force and smooth gains (inversion gamma = 1e9, p = 25e-6,
+the others as in the paper). Members differ in the initial position. RK4 takes steps of 1e-5 s, ten steps a sample. The
+pulse acts in the middle of the horizon for every length. The fold is the largest |z - r| of each member.
 """
 
 import dataclasses
@@ -21,7 +20,7 @@ from ambjax.simulation.folds import Peak
 GAMMA, P_V = 1e9, 25e-6
 PERIOD, SUBSTEPS = 1e-4, 10
 NOISE = Sensor(std=1e-6, std_z_dot=1e-4, std_i=1e-4)
-# Members start at up to this distance from the middle, m.
+# Largest initial distance from the centre, m.
 SPREAD = 1e-4
 FOLD = Peak("e_z")
 
@@ -49,11 +48,11 @@ class Workload(NamedTuple):
         return round(force["start"] / PERIOD), round(force["stop"] / PERIOD)
 
     def lasting(self, samples: int) -> "Workload":
-        """The same, pulse included, over another horizon."""
+        """Return the workload, pulse included, over another horizon."""
         return self._replace(clock=dataclasses.replace(self.clock, samples=samples))
 
     def stepping(self, method: Any, samples: int = 1) -> "Workload":
-        """The same by another method, which takes so many samples as one. For noise-free workloads."""
+        """Return a noise-free workload with another method and each `samples` samples merged into one."""
         period = self.clock.sample_period * samples
         return self._replace(clock=Clock(self.clock.samples // samples, period, method))
 
@@ -84,8 +83,8 @@ def workload(members: int, samples: int, *, noise: bool = False) -> Workload:
     return Workload(cascade, scenario, Clock(samples, PERIOD, RK4(SUBSTEPS)))
 
 
-def ours(work: Workload, threads: int = 1, **options: Any) -> Any:
-    """The largest |z - r| of each member, by ambjax: the ensemble engine, or `rollout` where there is one member."""
+def by_ambjax(work: Workload, threads: int = 1, **options: Any) -> Any:
+    """Return the largest |z - r| of each member by ambjax: the ensemble engine, or `rollout` for one member."""
     if work.members > 1:
         return run_ensemble(*work, fold=FOLD, threads=threads, **options).measured
     first = float(np.ravel(work.scenario.initial.z)[0])

@@ -1859,14 +1859,14 @@ STATUSES = [
 ]
 SURROUNDINGS = [
     M(
-        "a law of one's own travels without its file",
+        "a custom law travels without its file",
         "ambjax/cases/own_laws.py",
         "        pickle_with_source(found)",
         "        pass",
         "tests/test_own_laws.py::test_a_law_travels_to_a_process_that_has_no_such_file",
     ),
     M(
-        "a study goes on with another law of one's own",
+        "a study goes on with another custom law",
         "ambjax/ensemble/paths.py",
         "if digest := digest_of(type(node)):",
         'if digest := "":',
@@ -1880,7 +1880,7 @@ SURROUNDINGS = [
         "tests/test_own_laws.py::test_tuned_toml_finds_the_law_from_its_own_folder[mine.py:PD-there/deep-../../mine.py:PD]",
     ),
     M(
-        "a mistake in a law of one's own is met in the simulation",
+        "a mistake in a custom law is met in the simulation",
         "ambjax/cases/own_laws.py",
         "        try_law(found(), stage, model)",
         "        pass",

@@ -1,4 +1,4 @@
-"""The controller as C: every law, one of one's own, what is refused, and what a wrong C would do to the proof."""
+"""The controller as C: every law, a custom law, what is refused, and what a wrong C would do to the proof."""
 
 import dataclasses
 import functools
@@ -46,7 +46,7 @@ ORIGIN = Origin("test", "0" * 64, [])
 
 @record
 class Layered(PositionLaw):
-    """A position law of a user: a boundary layer of two slopes, by a loop and a branch, with a state."""
+    """A custom position law: a boundary layer of two slopes, by a loop and a branch, with a state."""
 
     decay: Any = gain(default=17.0, unit="1/s", doc="decay rate on the manifold")
     auto: Any = gain(default=25.0, unit="m/s^2", doc="reaching gain, under a word of C")
@@ -103,7 +103,7 @@ CASCADES = {
         processor=Processor(1.0, predict=False),
     ),
     "super-twisting, the sign itself": hard(position=position.SuperTwisting(p=INF)),
-    "a law of one's own": hard(position=Layered()),
+    "a custom law": hard(position=Layered()),
     "state feedback, linearised": hard(position=position.StateFeedback(), inversion=inversion.Linearised()),
     "a chain": hard(position=position.FilterChain(depth_1=0.1, w_z=2000.0), inversion=inversion.Linearised()),
     "integral sliding mode": hard(position=position.IntegralSlidingMode(p=INF)),
@@ -117,7 +117,7 @@ CASCADES = {
     "a differentiator, explicit": hard(observer=observer.IRED2(), processor=Processor(2.0, implicit=False)),
 }
 # What the fast suite looks at; the slow one at all, in both precisions.
-FAST = [("one and a half", "double"), ("a law of one's own", "float")]
+FAST = [("one and a half", "double"), ("a custom law", "float")]
 
 
 def drafts(cascade, precisions=("float", "double"), count=10_000, u_max=200.0, scenario=None):

@@ -1,4 +1,4 @@
-"""A law of one's own that a case file names: `kind = "FILE.py:CLASS"`, in every command, in other processes, tuned."""
+"""A custom law that a case file names: `kind = "FILE.py:CLASS"`, in every command, in other processes, tuned."""
 
 import json
 import pathlib

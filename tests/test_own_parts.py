@@ -1,4 +1,4 @@
-"""A plant and a law of one's own, defined here and nowhere else: simulated, checked, spread, mapped and tuned.
+"""A custom plant and a custom law, defined here and nowhere else: simulated, checked, spread, mapped and tuned.
 
 The plant has a coil with its own current on each side; the law a boundary layer in place of a smoothed sign, and gains
 of its own names. Nothing in the package knows either.
@@ -228,7 +228,7 @@ def test_mapped():
 
 
 def tuning_problem():
-    """A tuning problem of the parts of one's own, its settings and its case."""
+    """A tuning problem with the custom parts, its settings and its case."""
     scenario = dataclasses.replace(NOISY, q_v=Constant(), initial=Initial())
     slow = dataclasses.replace(CASCADE, position=BoundaryLayer(rho=5.0))
     case = Case("own", slow, scenario, Clock(200, 1e-4), 0.005, Spread(((SKEW, Normal(0.02)),)))

@@ -1,4 +1,4 @@
-"""Laws of one's own in a case file: `kind = "FILE.py:CLASS"` or `kind = "MODULE:CLASS"`."""
+"""Custom laws in a case file: `kind = "FILE.py:CLASS"` or `kind = "MODULE:CLASS"`."""
 
 import dataclasses
 import difflib
@@ -17,14 +17,14 @@ from ambjax.control.laws import STAGES
 from ambjax.host.imports import digest_of, line_of, module_of_file, module_of_name, pickle_with_source
 from ambjax.world.plant import Plant
 
-FORM = '"FILE.py:CLASS" or "MODULE:CLASS", a law of your own'
+FORM = '"FILE.py:CLASS" or "MODULE:CLASS", a custom law'
 
 # Makes the error of a law with this reason.
 Refuse = Callable[[str], ValueError]
 
 
 class OwnLaw(NamedTuple):
-    """A law of one's own that a case names: its stage, `kind` as written, its class, and the file or module.
+    """A custom law that a case names: its stage, `kind` as written, its class, and the file or module.
 
     `file`: absolute path of the file; None for an installed module. `digest`: SHA-256 of the source.
     """
@@ -41,7 +41,7 @@ class OwnLaw(NamedTuple):
 
 
 def is_own(kind: object) -> bool:
-    """Return whether a value of `kind` names a law of one's own."""
+    """Return whether a value of `kind` names a custom law."""
     return isinstance(kind, str) and ":" in kind
 
 

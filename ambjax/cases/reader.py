@@ -153,7 +153,7 @@ def case_from(
 ) -> Case:
     """Return the case of a parsed TOML document `raw` with source `text`. Raises ValueError as `read_case` does.
 
-    `folder`: that of the case file, to which the file of a law of one's own is relative. `own`: such laws that are
+    `folder`: the folder of the case file; paths of custom laws are relative to it. `own`: such laws that are
     imported already; they are not imported again.
     """
     check_depth(raw)

@@ -1,4 +1,4 @@
-"""Trial of a law of one's own: its methods are traced once, so that a mistake is found before a simulation."""
+"""Trial of a custom law: trace each method once, to find mistakes before the simulation."""
 
 from typing import Any
 

@@ -28,7 +28,7 @@ def read_with_warnings(path: str | pathlib.Path) -> Case:
 
 
 def print_warnings(case: Case, path: str | pathlib.Path) -> None:
-    """Print the laws of one's own and the warnings of a case on stderr, one line each."""
+    """Print the custom laws and the warnings of a case on stderr, one line each."""
     for law in case.own_laws:
         say(one_line(f"{path}: {law}"))
     for warning in warnings_of(case):

@@ -1,4 +1,4 @@
-"""Import of a class of one's own, from a file or from an installed module, so that its instances can be pickled.
+"""Import of a custom class, from a file or from an installed module, so that its instances can be pickled.
 
 A file is no module that other processes find by name. An instance of its class is pickled with the text of the file, so
 that a worker process, or a machine of a cluster without that file, executes the same text.

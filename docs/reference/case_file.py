@@ -39,7 +39,7 @@ SETTINGS: dict[str, dataclasses.Field] = {
 WORDS = {
     "plant": "The true plant. Left out, or a key of it: Table 1 of the paper.",
     "controller": "The cascade: a nominal plant and one law per stage. Kinds and gains: [laws](laws.md), or a "
-    "[law of your own](../own-laws.md).",
+    "[custom law](../own-laws.md).",
     "controller.model": "Parameters of the controller's model that differ from the plant: any key of `[plant]`.",
     "processor": "What the cascade runs on: one step of all laws a sample, its voltage held and late. Left out: "
     "continuous time, as in the paper. See [the processor](../processor.md).",
@@ -160,7 +160,7 @@ def _units() -> list[str]:
 
 def _laws() -> str:
     lines = ["# Laws", "", "One law per stage, chosen by `kind`; the first of each stage is the default."]
-    lines += ['`kind = "FILE.py:CLASS"` is a [law of your own](../own-laws.md).', ""]
+    lines += ['`kind = "FILE.py:CLASS"` is a [custom law](../own-laws.md).', ""]
     for stage, kinds in KINDS.items():
         lines += [f"## `[controller.{stage}]`", ""]
         for kind, law in kinds.items():

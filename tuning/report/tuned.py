@@ -23,7 +23,7 @@ CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 def tuned_case(case: Case, gains: Mapping[str, float], verdict: str, out: pathlib.Path) -> tuple[str, Case]:
     """Return the text of tuned.toml for the folder `out`, and its case. Raises ValueError for text that is no case.
 
-    The laws of one's own are those of `case`: a change of their files during the search does not matter.
+    The custom laws are those of `case`: a change of their files during the search does not matter.
     """
     text = tuned(case.text, {**gains, **relocated(case.own_laws, out)}, case.name, verdict)
     return text, case_from(tomllib.loads(text), case.name, own=case.own_laws)
