@@ -166,8 +166,8 @@ LAWS = [
     M(
         "the adaptive law does not divide by dv/di",
         "ambjax/control/inversion.py",
-        "self.p, per=gradient)",
-        "self.p)",
+        "self.p, per=gradient)\n        return",
+        "self.p)\n        return",
         "tests/test_laws.py::test_equation_6_gives_the_error_dynamics_of_equation_8",
     ),
     M(
