@@ -77,7 +77,7 @@ def section(rows: list[Facts] | None, written: bool) -> list[str]:
     head = ["error limit", "settled rms error (m)", "settled rms u (V)", "peak of \\|S\\|", "lost", "answer", *files]
     words = (
         "The least rms voltage for each limit of the settled rms error, within the other limits. On members of the "
-        "validation ensemble; the peak is the largest of their linear loops. Only the answer taken is judged on the "
+        "validation ensemble; where a sign is set-valued, the peak is injected. Only the answer taken is judged on the "
         "held-out members."
     )
     picture = "![Error against voltage; the answer taken is filled](front.png)"
