@@ -51,7 +51,7 @@ def parser() -> Parser:
             added.add_argument("case", metavar="CASE.toml", help="a case file; 'ambjax template' prints one")
         if out:
             added.add_argument("--out", metavar="DIR", help="output directory (default: a new directory under ./out)")
-        added.add_argument("--json", action="store_true", help="print a machine-readable summary and nothing else")
+        added.add_argument("--json", action="store_true", help="print only a machine-readable summary")
         return added
 
     command("reproduce", "run the paper: both scenarios, Figures 3 to 6 and the ledger of claims", out=True)

@@ -1,3 +1,3 @@
-"""The version, in a module that needs nothing else."""
+"""The version, in a module without imports."""
 
 __version__ = "0.1.0"

@@ -175,11 +175,11 @@ def test_the_lowest_point_of_slices_loses_no_more():
 def test_a_lower_point_beside_the_answer_is_said():
     beside = {"path": "controller.position.c", "gain": 12.5, "lower": 0.2}
     assert "20 % lower, at controller.position.c = 12.5" in report._lower_point(beside)
-    assert "ended before it went there" in report._lower_point(beside)
+    assert "the search did not reach it" in report._lower_point(beside)
     beside["lower"] = 0.005
-    assert "as good as the answer" in report._lower_point(beside)
+    assert "within the tolerance of the search" in report._lower_point(beside)
     beside["lower"] = 0.0
-    assert "No point" in report._lower_point(beside)
+    assert "none is lower" in report._lower_point(beside)
 
 
 def test_the_picture_begins_at_what_the_table_says_was_minimised(study, x):
@@ -371,8 +371,8 @@ def test_ranges_and_their_sources_are_in_the_table():
     row = {"path": "controller.position.c", "before": 1.0, "after": 2.0, "least": 0.0, "most": 30.0, "at_bound": "",
            "sensitivity_percent": 3.0}  # fmt: skip
     bare = report._gains(types.SimpleNamespace(gains=[row], trained_on=40, nominal_steps="by accurate steps"))
-    assert "may end from" in bare[2]
-    assert "looked for" not in "".join(bare)
+    assert "allowed from" in bare[2]
+    assert "searched from" not in "".join(bare)
     ranged = row | {"low": 0.5, "high": 20.0, "source": "w/30 to 10 w"}
     facts = types.SimpleNamespace(gains=[ranged], trained_on=40, nominal_steps="by accurate steps")
     told = "\n".join(report._gains(facts))

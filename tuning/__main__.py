@@ -29,7 +29,7 @@ def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
         metavar="OTHER.toml",
         help="limits, loss and budget are those of [tune] in OTHER.toml; gains and bounds stay those of the case",
     )
-    top.add_argument("--json", action="store_true", help="print report.json on stdout and nothing else there")
+    top.add_argument("--json", action="store_true", help="print only report.json on stdout")
     top.add_argument("--version", action="version", version=f"ambjax {__version__}")
     return top
 

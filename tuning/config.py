@@ -173,7 +173,7 @@ def _weights(table: Table) -> tuple[tuple[float, ...], float]:
     given = {name: table.leaf(name, field, field.default) for name, field in WEIGHTS.items()}
     if not any(given[name] > 0 for name in ("tracking", "peak")):
         raise ValueError(
-            f"{table.path}.tracking = 0 and {table.path}.peak = 0: nothing asks the rotor to follow its reference, "
+            f"{table.path}.tracking = 0 and {table.path}.peak = 0: no term of the loss depends on the error, "
             "so every gain that keeps it is as good. Give one of them a weight above 0."
         )
     if given["survival"] == 0:
@@ -195,9 +195,7 @@ def _limits(table: Table, case: Case) -> LimitSettings:
     clearance = float(np.min(np.asarray(case.scenario.touchdown)))
     band = table.leaf("settling_band_m", LENGTH, SETTLING_BAND * clearance)
     if "settling_band_m" in table.raw and "settling_s" not in thresholds:
-        raise ValueError(
-            f"{table.at('settling_band_m')} has a meaning beside {table.at('settling_s')} only. Give both."
-        )
+        raise ValueError(f"{table.at('settling_band_m')} applies only with {table.at('settling_s')}. Give both.")
     if band >= clearance:
         raise ValueError(
             f"{table.at('settling_band_m')} = {band:g} m: it must be below the clearance, {clearance:g} m "
@@ -218,7 +216,7 @@ def _risk(table: Table) -> Risk:
     name = table.choice("risk", ["mean", "cvar", "soft-worst"], RISK)
     if name != "cvar":
         if "alpha" in table.raw:
-            raise ValueError(f'{table.at("alpha")} has a meaning for risk = "cvar" only; risk is "{name}". Remove one.')
+            raise ValueError(f'{table.at("alpha")} applies to risk = "cvar" only; risk is "{name}". Remove one.')
         return Mean() if name == "mean" else SoftWorst()
     alpha = table.number("alpha", ALPHA, "a number from 0 to below 1")
     if not 0 <= alpha < 1:

@@ -42,7 +42,7 @@ def load(path: str | pathlib.Path) -> tuple[dict[str, Any], str]:
     except tomllib.TOMLDecodeError as error:
         raise refuse(f"not valid TOML: {error}. See 'ambjax template' for a file to start from.") from None
     except RecursionError:
-        raise refuse(f"tables or lists are nested deeper than {DEEPEST} levels. Nest them less.") from None
+        raise refuse(f"tables or lists are nested deeper than {DEEPEST} levels. Use fewer.") from None
     except ValueError:  # Python refuses to convert thousands of digits
         raise refuse("a number has thousands of digits. Write it as in 1.5e3.") from None
 
@@ -54,7 +54,7 @@ def check_depth(raw: object) -> None:
         inner = (x.values() if isinstance(x, dict) else x for x in level if isinstance(x, (dict, list)))
         level = [x for values in inner for x in values]
     if level:
-        raise ValueError(f"tables or lists are nested deeper than {DEEPEST} levels. Nest them less.")
+        raise ValueError(f"tables or lists are nested deeper than {DEEPEST} levels. Use fewer.")
 
 
 class Table:

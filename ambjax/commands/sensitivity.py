@@ -152,7 +152,7 @@ def _text(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None, 
     if one.S_velocity is not None:
         larger = "velocity" if one.S_velocity.height > one.S.height else "position"
         rows += [
-            f"The velocity has a sensor of its own: for errors of that sensor |S| peaks at "
+            f"The velocity has its own sensor: for errors of that sensor |S| peaks at "
             f"{one.S_velocity.height:.4g}. The {larger} sensor gives the larger peak."
         ]
     return "\n".join(rows)

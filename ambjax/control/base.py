@@ -1,4 +1,4 @@
-"""The base class of all laws: optional methods with their defaults, so that no caller asks which law it has.
+"""The base class of all laws: optional methods with their defaults, so that no caller depends on the type of a law.
 
 The classes of `control.laws` add the inputs and outputs of each stage.
 """

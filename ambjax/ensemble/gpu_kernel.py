@@ -129,5 +129,5 @@ def _with_draws(scenario: Scenario, members: int) -> tuple[Scenario, tuple[Array
 
     draws, words = jax.vmap(one, in_axes=axes)(leaves, jnp.arange(members))
     scenario = draws or scenario  # without random signals, shared leaves stay shared
-    nobody = jnp.zeros((), jnp.result_type(int))
-    return dataclasses.replace(scenario, seed=nobody, member=nobody), words
+    unused = jnp.zeros((), jnp.result_type(int))
+    return dataclasses.replace(scenario, seed=unused, member=unused), words

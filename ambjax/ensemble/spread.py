@@ -77,7 +77,7 @@ def corners(spread: Spread, cascade: Cascade, scenario: Scenario) -> tuple[Casca
 
 
 def ends(spread: Spread, cascade: Cascade, scenario: Scenario, under: tuple[str, ...]) -> tuple[Cascade, Scenario]:
-    """Replace each spread number whose path begins with a prefix in `under` by its two ends, on an axis of its own."""
+    """Replace each spread number whose path has a prefix in `under` by its two ends, each on a separate axis."""
     known = places(cascade, scenario)
     supports = [(p, d.support(_nominal(known[p]))) for p, d in spread.entries if p.startswith(under)]
     shape = [1] * len(supports)

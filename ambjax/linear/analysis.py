@@ -154,7 +154,7 @@ def analyse(
 ) -> Analysis:
     """Analyse a linearised loop of a rotor of mass m (kg).
 
-    `period`: time for which a noise sample is held, s. `velocity`: whether the velocity has a sensor of its own.
+    `period`: time for which a noise sample is held, s. `velocity`: whether the velocity has its own sensor.
     """
     zones = Zones() if zones is None else zones
     low, high = zones.range(system.period)

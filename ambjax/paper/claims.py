@@ -35,7 +35,7 @@ CLAIMS: list[Claim] = []
 def claim(
     says: str, where: str, paper: str, criterion: str
 ) -> Callable[[Callable[[Evidence], Finding]], Callable[[Evidence], Finding]]:
-    """Decorator that enters a claim into CLAIMS, with the decorated function as its judge."""
+    """Decorator that adds a claim to CLAIMS; the decorated function judges it."""
 
     def enter(judge: Callable[[Evidence], Finding]) -> Callable[[Evidence], Finding]:
         CLAIMS.append(Claim(says, where, paper, criterion, judge))

@@ -165,7 +165,15 @@ def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray
     if len(at):
         ticks, _ = thin(at, at)
         where = ax.get_xaxis_transform()
-        ax.plot(ticks, np.full(len(ticks), 0.08), "|", color=RED, markersize=7, label="a member ends", transform=where)
+        ax.plot(
+            ticks,
+            np.full(len(ticks), 0.08),
+            "|",
+            color=RED,
+            markersize=7,
+            label="a member is lost or stalls",
+            transform=where,
+        )
     lost, open_ = int(ended.sum()), 0 if stalled is None else int(np.sum(np.asarray(stalled, bool) & ended))
     words = f"{len(lost_at) - lost} of {len(lost_at)} survive ({share[-1]:.4g} %)"
     words += f", {_statuses(lost - open_, open_)}" * bool(lost)

@@ -106,12 +106,12 @@ def prepare(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[ClosedL
 
 
 def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
-    """Raise ValueError, with the dotted path and the fix, for whatever concrete value is not allowed."""
+    """Raise ValueError, with the dotted path and the fix, for each concrete value that is not allowed."""
     for stage, base in STAGES.items():
         law = getattr(cascade, stage)
         if not isinstance(law, base):
             raise ValueError(
-                f"controller.{stage} = {type(law).__name__}: it is no law of this stage. Derive the class from "
+                f"controller.{stage} = {type(law).__name__}: it is not a law of this stage. Derive the class from "
                 f"ambjax.extend.{base.__name__}."
             )
     validate(dataclasses.replace(cascade, processor=None), "controller")
@@ -125,7 +125,7 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
 
 
 def run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:
-    """Do a whole rollout, without jit and without checks. `rollout` compiles it, and ensembles map it over members."""
+    """Simulate a whole rollout, without jit and checks. `rollout` compiles it, and ensembles map it over members."""
     progress, rows = segment(system, clock, fold, begin(system, clock, fold), 0, clock.samples, every)
     return finish(progress, rows, fold)
 

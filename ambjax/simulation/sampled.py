@@ -116,7 +116,7 @@ class Sampled:
         return sensor.converted(sensor.reading(motion, errors), true.s_0, true.i_0)
 
     def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
-        """Do the step of the laws: return the state with the new command, and with the laws' states at t + period."""
+        """Step the laws: return the state with the new command, and with the laws' states at t + period."""
         state, measured = self.read(state, errors)
         return self.with_command(measured, self.reference(t), state)
 

@@ -153,8 +153,8 @@ def _phi_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arra
 
 
 def slides(cascade: Cascade, plant: Bearing) -> bool:
-    """Whether this step is made for the cascade and the plant."""
-    slow = not cascade.observer.stiff  # it goes by Heun's method
+    """Return whether this step applies to the cascade and the plant."""
+    slow = not cascade.observer.stiff  # integrated by Heun's method
     return cascade.processor is None and cascade.inversion.slides and plant.lumped and slow
 
 

@@ -227,5 +227,5 @@ def _proof(worst: dict[str, tuple[float, float]]) -> list[Condition]:
     rows = [Condition(name, says, None, *worst[key], unit, None, "largest residual") for name, says, key, unit in lines]
     margin, at = worst["V_margin"]
     bound = "V' <= -2 (k |sgn(sigma)| - Q_z) |sigma| + 2 a |sigma| (L_v |e| + |v_tilde|)"
-    rows.append(Condition("V = sigma^2", bound, None, margin, at, "m^2/s^3", None, "smallest room below the bound"))
+    rows.append(Condition("V = sigma^2", bound, None, margin, at, "m^2/s^3", None, "smallest distance below the bound"))
     return rows

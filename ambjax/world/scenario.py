@@ -14,7 +14,7 @@ from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement, Sensor
 from ambjax.world.signals import Constant, Signal, edges_of, is_random, realised
 
-# Streams of a member's key other than the sensors'. Sensors fold in the sample number; these numbers lie beyond it.
+# Numbers folded into a member's key for the other streams. Sensors fold in the sample number, which is smaller.
 DESIGN_STREAM, SIGNAL_STREAM = np.uint32(2**32 - 1), np.uint32(2**32 - 2)
 SLOTS = ("reference", "q_z", "q_v", "q_i")
 
@@ -92,7 +92,7 @@ class Scenario:
         return self.q_z(t) + self.plant.a * self.q_v(t)
 
     def edges(self) -> tuple[Scalar, ...]:
-        """The times (s) at which the disturbances jump."""
+        """Return the times (s) at which the disturbances jump."""
         return tuple(edge for signal in (self.q_z, self.q_v, self.q_i) for edge in edges_of(signal))
 
     def key(self) -> Array:

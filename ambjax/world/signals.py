@@ -68,11 +68,11 @@ class Step:
         return _hull(np.where(start > 0, 0.0, self.amplitude), np.where(start <= end, self.amplitude, 0.0))
 
     def edges(self) -> tuple[Scalar, ...]:
-        """When it jumps, s."""
+        """Return the time of the jump, s."""
         return (self.start,)
 
     def shifted(self, by: Scalar) -> "Step":
-        """The same, `by` seconds later."""
+        """Return the signal, `by` seconds later."""
         return dataclasses.replace(self, start=self.start + by)
 
 
@@ -95,7 +95,7 @@ class Pulse:
         return _hull(np.where(on, self.amplitude, 0.0), np.where(off, 0.0, self.amplitude))
 
     def edges(self) -> tuple[Scalar, ...]:
-        """When it jumps, s."""
+        """Return the time of the jump, s."""
         return (self.start, self.stop)
 
     def shifted(self, by: Scalar) -> "Pulse":
@@ -137,13 +137,13 @@ class SmoothStep:
         return _hull(*(self.amplitude * s**3 * (10 - 15 * s + 6 * s**2) for s in shares))
 
     def shifted(self, by: Scalar) -> "SmoothStep":
-        """The same, `by` seconds later."""
+        """Return the signal, `by` seconds later."""
         return dataclasses.replace(self, start=self.start + by)
 
 
 @record
 class Chirp:
-    """A sine whose frequency moves linearly from `frequency` to `frequency_end` over `duration`, then stays."""
+    """A sine whose frequency changes linearly from `frequency` to `frequency_end` over `duration`, then stays."""
 
     amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="half the peak-to-peak height")
     frequency: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency at t = 0")
@@ -180,11 +180,11 @@ class Sum:
         return sum(low for low, _ in ends), sum(high for _, high in ends)
 
     def edges(self) -> tuple[Scalar, ...]:
-        """When a term jumps, s."""
+        """Return the times at which a term jumps, s."""
         return tuple(edge for term in self.terms for edge in edges_of(term))
 
     def realised(self, key: Array) -> "Sum":
-        """The sum with its random terms drawn, each from a key of its own."""
+        """Return the sum with its random terms drawn, each from a separate key."""
         return Sum(tuple(realised(term, jax.random.fold_in(key, n)) for n, term in enumerate(self.terms)))
 
 

@@ -11,7 +11,7 @@ from sphinx.application import Sphinx
 
 # Characters that mean something in reStructuredText but nothing in a docstring.
 SPECIAL = re.compile(r"([\\*|_])")
-# What NamedTuple says of a field about which nobody else says anything.
+# Text that NamedTuple gives an undocumented field.
 NOTHING = re.compile(r"Alias for field number \d+")
 
 
@@ -39,9 +39,10 @@ def _item(row: Facts) -> str:
 
 
 def elsewhere(app: Sphinx, env: Any, node: Any, text: Any) -> Any:
-    """What a name of ours without a place of its own leads to: where an inherited method is written, or mere text.
+    """Return the target of a name without its own entry: the base class of an inherited method, or plain text.
 
-    Mere text for what has no page, as a type variable in a signature. None for what does not exist: the build stops.
+    Plain text for a name without a page, such as a type variable in a signature. None for an
+    unknown name; the build stops.
     """
     thing, target = _named(node.get("reftarget", "")), node.get("reftarget")
     if thing is None:

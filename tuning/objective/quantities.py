@@ -181,7 +181,7 @@ KINDS: dict[str, Kind] = {
     ),
     "overshoot_m": Kind(
         "m",
-        "how far z goes, at the samples, beyond where it began and where r has been",
+        "largest distance of z, at the samples, beyond its initial value and the range of r so far",
         fold=lambda context, threshold: Overshoot(),
         exact=None,
         **_WORST,

@@ -24,7 +24,7 @@ def markdown(facts: TuningFacts) -> str:
         + _minimised(facts)
         + _conditions(facts)
     )
-    lines += ["## How the search went", "", *_how(facts), "", "![Goal and gains by iteration](convergence.png)", ""]
+    lines += ["## Course of the search", "", *_how(facts), "", "![Goal and gains by iteration](convergence.png)", ""]
     if facts.gradient:
         lines += extras.gradient(facts.gradient)
     return "\n".join(lines) + "\n"
@@ -32,8 +32,8 @@ def markdown(facts: TuningFacts) -> str:
 
 def _gains(facts: TuningFacts) -> list[str]:
     ranged = any(row.get("source") for row in facts.gains)
-    looked = ["looked for from", "to"] if ranged else []
-    head = ["gain", "before", "after", *looked, "may end from", "to", "at an end", "risk grows by"]
+    looked = ["searched from", "to"] if ranged else []
+    head = ["gain", "before", "after", *looked, "allowed from", "to", "at a bound", "risk increase"]
     rows = []
     for row in facts.gains:
         ends = [number(row.get(end), ".3g") for end in ("low", "high")] if ranged else []
@@ -42,25 +42,24 @@ def _gains(facts: TuningFacts) -> list[str]:
         rows.append([row["path"], *gains, *ends, *bounds, row["at_bound"] or "-", _sensitivity(row, facts)])
     lines = ["## Gains", "", *table(head, rows), ""]
     words = (
-        "The last column: where this gain alone is off by a factor of e^0.25 = 1.28, up or down, the worse of both. A "
-        "large number: set it with care. A small one: it hardly matters. Where that loses members of the training "
-        "ensemble that the answer holds, their number stands there, for the risk of a lost rotor is not that of an "
-        "error. "
-        "`tune.bounds` sets other ends."
+        "Last column: increase of the risk if this gain alone is larger or smaller by a factor of e^0.25 = 1.28, the "
+        "larger of both. A gain with a large number must be set accurately. If this change loses members of the "
+        "training ensemble that the answer holds, the column gives their number instead. `tune.bounds` sets other "
+        "bounds."
     )
     sources = [f"- {row['path']}: {literal(row['source'])}" for row in facts.gains if row.get("source")]
     return [
         *lines,
         words,
         "",
-        *(["Where these ranges come from:", "", *sources, ""] if sources else []),
+        *(["Sources of the ranges:", "", *sources, ""] if sources else []),
         "## One rotor before and after",
         "",
-        f"The case's own run, nothing spread, {facts.nominal_steps}; u averaged over each sample.",
+        f"The nominal run of the case, without `[spread]`, {facts.nominal_steps}. u is averaged over each sample.",
         "",
         "![z - r and u before and after tuning](nominal.png)",
         "",
-        "The voltage's amplitude spectrum (Hann window, from `run.settle` on): a sine of 1 V stands at 1 V.",
+        "The voltage's amplitude spectrum (Hann window, from `run.settle` on): a sine of 1 V has the height 1 V.",
         "",
         "![Amplitude spectrum of u before and after tuning](spectrum.png)",
         "",
@@ -91,8 +90,8 @@ def _loss(facts: TuningFacts) -> list[str]:
         "## The loss of the held-out members",
         "",
         f"`loss = {FORMULA}` of each member, each term times its weight. Means over members: what tracking, peak, "
-        "clearance and survival add is weight x mean. Costs multiply the error member by member, so what effort and "
-        "chatter add is the mean of weight x term x (tracking + peak), which is not the product of the means shown.",
+        "clearance and survival add is weight x mean. The costs effort and chatter multiply the error of each member. "
+        "They add the mean of weight x term x (tracking + peak), which is not the product of the means shown.",
         "",
         *table(["term", "weight", "mean before", "adds before", "mean after", "adds after"], rows),
         "",
@@ -110,18 +109,18 @@ def _minimised(facts: TuningFacts) -> list[str]:
         rows.append([label, f"{parts['held']:.4e}"])
     rows.append(["x penalty of the theorem's conditions", f"{parts['penalty']:.6g}"])
     if parts["limits"] != 1:
-        rows.append(["x pull of the limits", f"{parts['limits']:.6g}"])
-    rows.append(["**= what was minimised**", f"**{parts['total']:.4e}**"])
+        rows.append(["x factor of the limits", f"{parts['limits']:.6g}"])
+    rows.append(["**= objective**", f"**{parts['total']:.4e}**"])
     return [
-        "## What the search minimised",
+        "## Objective of the search",
         "",
         "Members that only have to be held are stressed (more noise, every gain off by a factor) or were found lost by "
-        "the validation ensemble or by accurate steps. So this is not the loss of the held-out members above. The "
-        "picture shows this quantity.",
+        "the validation ensemble or by accurate steps. The objective therefore differs from the loss of the held-out "
+        "members above. The picture shows the objective.",
         "",
         *table(["at the answer", "value"], rows),
         "",
-        "![What was minimised along each gain, through the answer](slices.png)",
+        "![Objective along each gain, through the answer](slices.png)",
         "",
         _lower_point(facts.beside),
         "",
@@ -131,16 +130,16 @@ def _minimised(facts: TuningFacts) -> list[str]:
 def _lower_point(beside: Row) -> str:
     """Describe a point of the slices with a lower risk than the answer, if there is one."""
     if beside["lower"] == 0:
-        return "No point of these slices that loses no more members is lower than the answer."
+        return "Among the points of these slices that lose no more members than the answer, none is lower."
     where = f"{100 * beside['lower']:.2g} % lower, at {beside['path']} = {beside['gain']:.4g}"
     if beside["lower"] <= AS_GOOD:
         return (
-            f"The lowest point of these slices is {where}, and loses no more members: as good as the answer, as far as "
-            "a search is carried."
+            f"The lowest point of these slices is {where}, and loses no more members. This difference is within the "
+            "tolerance of the search."
         )
     return (
-        f"**The lowest point of these slices is {where}**, and loses no more members: the search ended before it went "
-        "there. Neither the validation ensemble nor accurate steps have seen that point. To go on from there set the "
+        f"**The lowest point of these slices is {where}**, and loses no more members: the search did not reach it. "
+        "That point was not verified on the validation ensemble or with accurate steps. To continue from it, set the "
         "gain in tuned.toml and tune that file."
     )
 

@@ -161,5 +161,5 @@ def _of_the_lost(problem: TuningProblem, facts: TuningFacts, x: np.ndarray, memb
         words.append(f"At a bound: {', '.join(bound)}; widen tune.bounds.")
     return [
         *words,
-        "More members (tune.members), or risk = 'cvar', asks for more margin; more screen, for other starts.",
+        "Raise tune.members or set risk = 'cvar' for a larger margin; raise tune.screen for other starts.",
     ]
