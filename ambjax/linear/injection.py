@@ -161,7 +161,7 @@ def _harmonics(frequencies: Sequence[float] | np.ndarray, clock: Clock) -> np.nd
     if not harmonics.size or not np.isfinite(f).all() or harmonics[0] < 1 or harmonics[-1] >= clock.samples / 2:
         raise ValueError(
             f"injection.frequencies: they must be at least {base:g} Hz, one period of {clock.samples} samples, "
-            f"and below {0.5 / float(clock.sample_period):g} Hz, half the sample rate. Change them, or raise clock.samples."
+            f"and below {0.5 / float(clock.sample_period):g} Hz, half the sample rate. Change them or clock.samples."
         )
     if harmonics[-1] * clock.samples > np.iinfo(jnp.result_type(int)).max:
         raise ValueError(
