@@ -10,9 +10,9 @@ from matplotlib.text import Text
 
 from ambjax.pictures import ensembles as pictures
 from ambjax.pictures import heatmaps
-from ambjax.pictures.scales import axis_of, edges, label_of, log_ticks, prefix_of, size_of
+from ambjax.pictures.scales import LABELS, SHOWN, axis_of, edges, label_of, log_ticks, prefix_of, size_of
 from ambjax.pictures.tornado import Bar, tornado
-from ambjax.simulation.metrics import Standard
+from ambjax.simulation.metrics import UNITS, Standard
 
 PERCENTS = (0, 5, 25, 50, 75, 95, 100)
 
@@ -74,6 +74,10 @@ def test_prefix_brings_every_size_between_1_and_1000():
 
 def test_every_metric_has_its_unit():
     names = [*Standard()._folds().folds, "lost_at_s", "singular_at_s"]
+    assert set(names) == set(LABELS)
+    assert set(UNITS) | set(SHOWN) == {*names, "settle_s"}
+    for name, unit in UNITS.items():  # the name of a metric ends in its unit
+        assert name.endswith("_" + unit.replace("/", "_per_").replace("^", "")), name
     for name in names:
         _, words, unit = axis_of(name, 1.0)
         assert unit, name
@@ -122,8 +126,9 @@ def test_log_ticks_say_their_values(low, high):
     assert 2 <= len(at) <= 12
     assert np.all((at >= low) & (at <= high))
     for value in at:
-        words = axis.get_major_formatter()(value).replace("$", "").replace(r" \cdot ", "*")
-        words = words.replace("10^{", "1e").replace("}", "")
+        words = axis.get_major_formatter()(value)
+        words = words.removeprefix(r"$\mathdefault{").removesuffix("}$").replace(r"\times", "*")
+        words = words.replace("10^{", "1e").removesuffix("}")
         assert np.prod([float(part) for part in words.split("*")]) == pytest.approx(value, rel=1e-3)  # three digits
 
 

@@ -15,7 +15,7 @@ from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.replay import Replay, record, replay
 from ambjax.ensemble.study import Study
 from ambjax.host.words import command
-from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.metrics import UNITS, standard_for
 from ambjax.simulation.rollout import Outcome
 
 Summary = dict[str, object]
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 def _check(numbers: dict[str, Any], path: str) -> None:
     """Raise ValueError if a metric is not finite, which is a bug. Times may be infinite: the event never occurs."""
-    wrong = [name for name, x in numbers.items() if not (np.isfinite(x) or (name.endswith("_s") and x == math.inf))]
+    wrong = [name for name, x in numbers.items() if not (np.isfinite(x) or (UNITS.get(name) == "s" and x == math.inf))]
     if wrong:
         raise ValueError(
             f"{path}: {', '.join(wrong)}: this run gave no finite number, so nothing is written. This is a defect of "

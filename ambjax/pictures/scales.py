@@ -6,13 +6,48 @@ import re
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
+from matplotlib.ticker import (
+    EngFormatter,
+    FixedLocator,
+    FuncFormatter,
+    LogFormatterSciNotation,
+    LogLocator,
+    MaxNLocator,
+    NullFormatter,
+)
 
-# Units by the suffix of a metric's name, longest first, because _m_per_s ends in _s too.
-SUFFIXES = {"_A2_per_m2": "A²/m²", "_m_per_s": "m/s", "_m": "m", "_V": "V", "_A": "A", "_W": "W", "_s": "s"}
-SYMBOLS = {"v tilde": r"$\tilde v$", "sigma": r"$\sigma$", "u": "$u$", "i": "$i$"}
-SMALL = {1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
-LARGE = {1e9: "G", 1e6: "M", 1e3: "k"}
+from ambjax.simulation.metrics import UNITS
+
+# Labels of metrics without their units.
+LABELS = {
+    "max_abs_error_m": "max |error|",
+    "rms_error_m": "rms error",
+    "settled_max_abs_error_m": "settled max |error|",
+    "settled_rms_error_m": "settled rms error",
+    "settled_max_abs_sigma_m_per_s": r"settled max |$\sigma$|",
+    "settled_max_abs_v_tilde_A2_per_m2": r"settled max |$\tilde v$|",
+    "settled_max_abs_current_error_A": "settled max |current error|",
+    "sigma_reached_s": r"$\sigma$ reached",
+    "v_tilde_reached_s": r"$\tilde v$ reached",
+    "current_error_reached_s": "current error reached",
+    "max_abs_u_V": "max |$u$|",
+    "rms_u_V": "rms $u$",
+    "settled_rms_u_V": "settled rms $u$",
+    "chatter_V": "chatter",
+    "max_abs_i_A": "max |$i$|",
+    "rms_i_A": "rms $i$",
+    "copper_loss_W": "copper loss",
+    "clearance_used": "clearance used",
+    "settled_clearance_used": "settled clearance used",
+    "refused": "refused readings",
+    "lost_at_s": "lost at",
+    "singular_at_s": "singular at",
+}
+# Metrics that an axis shows in another unit than `UNITS`: the factor and this unit.
+SHOWN = {"clearance_used": (100.0, "%"), "settled_clearance_used": (100.0, "%"), "refused": (1.0, "samples")}
+# Units that take an SI prefix if they begin a compound unit; lengths and times take none above 1.
+PREFIXED = re.compile(r"(?P<length>m|s)(/.*)?|(V|A|W|N|H|T|Hz|Ω)(/.*)?")
+LEAST_POWER, MOST_POWER = -9, 9
 
 
 def prefix_of(unit: str, size: float) -> tuple[float, str]:
@@ -21,14 +56,13 @@ def prefix_of(unit: str, size: float) -> tuple[float, str]:
     For example, 2e-5 m is 20 µm. Only units that begin with a plain m, s, V, A, W, N, H, T, Hz or Ω take a prefix (not
     A²/m², kg, 1/s); lengths and times take no prefix above 1. A size that is zero or not finite keeps the unit.
     """
-    first = unit.split("/")[0]
-    small = first in ("m", "s", "V", "A", "W", "N", "H", "T", "Hz", "Ω")
-    if not small or not 0 < size < np.inf:
+    match = PREFIXED.fullmatch(unit)
+    if not match or not 0 < size < np.inf:
         return 1.0, unit
-    scales = (LARGE if first not in ("m", "s") else {}) | SMALL
     # 0.9995 prints as 1 with three digits
-    scale = next((scale for scale in scales if size >= 0.9995 * scale), 1e-9)
-    return 1 / scale, scales[scale] + unit
+    power = 3 * math.floor(math.log10(size / 0.9995) / 3)
+    power = max(LEAST_POWER, min(power, 0 if match["length"] else MOST_POWER))
+    return 1 / float(f"1e{power}"), EngFormatter.ENG_PREFIXES[power] + unit
 
 
 def size_of(values: np.ndarray, log: bool = False) -> float:
@@ -45,17 +79,13 @@ def size_of(values: np.ndarray, log: bool = False) -> float:
 
 def axis_of(metric: str, size: float) -> tuple[float, str, str]:
     """Return factor, label and unit of a metric's axis: (1e6, "rms error", "µm") for rms_error_m of size 2e-5."""
-    if metric.endswith("clearance_used"):
-        return 100.0, metric.replace("_", " "), "%"
-    if metric == "refused":
-        return 1.0, "refused readings", "samples"
-    suffix = next((suffix for suffix in SUFFIXES if metric.endswith(suffix)), "")
-    factor, unit = prefix_of(SUFFIXES.get(suffix, ""), size)
-    words = metric.removesuffix(suffix).replace("_", " ")
-    words = re.sub(r"max abs (.*)", r"max |\1|", words)
-    for word, symbol in SYMBOLS.items():
-        words = re.sub(rf"\b{word}\b", lambda _, symbol=symbol: symbol, words)
-    return factor, words, unit
+    factor, unit = SHOWN[metric] if metric in SHOWN else prefix_of(_typeset(UNITS.get(metric, "")), size)
+    return factor, LABELS.get(metric, metric), unit
+
+
+def _typeset(unit: str) -> str:
+    """Return a unit with raised powers and Ω: "m²" for "m^2"."""
+    return re.sub(r"\^(2|3)(?![.\d])", lambda power: "²³"[int(power[1]) - 2], unit).replace("ohm", "Ω")
 
 
 def label_of(label: str, size: float) -> tuple[float, str]:
@@ -69,8 +99,7 @@ def label_of(label: str, size: float) -> tuple[float, str]:
         return 1.0, label
     if match[2] == "1":
         return 1.0, match[1].rstrip()
-    unit = re.sub(r"\^(2|3)(?![.\d])", lambda power: "²³"[int(power[1]) - 2], match[2]).replace("ohm", "Ω")
-    factor, unit = prefix_of(unit, size)
+    factor, unit = prefix_of(_typeset(match[2]), size)
     return factor, f"{match[1]}({unit})"
 
 
@@ -109,19 +138,11 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
     """Set ticks in plain numbers on a logarithmic axis; fewer decades have more ticks each."""
     decades = math.log10(high / low)
     if decades < 0.8:
-        at = list(MaxNLocator(5).tick_values(low, high))
+        at = MaxNLocator(5).tick_values(low, high)
     else:
-        steps = (1, 2, 5) if decades < 2.2 else (1, 3) if decades < 4 else (1,)
-        powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1, max(1, round(decades / 5)))
-        at = [step * 10.0**power for power in powers for step in steps]
-    axis.set_major_locator(FixedLocator([value for value in at if low <= value <= high]))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: _plain(value)))
+        subs = (1, 2, 5) if decades < 2.2 else (1, 3) if decades < 4 else (1,)
+        at = LogLocator(subs=subs, numticks=8).tick_values(low, high)
+    axis.set_major_locator(FixedLocator([value for value in np.asarray(at) if low <= value <= high]))
+    powers = LogFormatterSciNotation(labelOnlyBase=False)
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if 1e-3 <= value < 1e5 else powers(value)))
     axis.set_minor_formatter(NullFormatter())
-
-
-def _plain(value: float) -> str:
-    if 1e-3 <= value < 1e5:
-        return f"{value:g}"
-    power = math.floor(math.log10(value) + 1e-9)
-    front = f"{value / 10.0**power:.3g}"
-    return f"$10^{{{power}}}$" if front == "1" else rf"${front} \cdot 10^{{{power}}}$"

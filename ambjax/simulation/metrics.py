@@ -14,6 +14,30 @@ from ambjax.simulation.trajectory import ALIVE, STALLED, Row
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
 
+# Unit of each metric that has one; shares and counts have none.
+UNITS = {
+    "max_abs_error_m": "m",
+    "rms_error_m": "m",
+    "settled_max_abs_error_m": "m",
+    "settled_rms_error_m": "m",
+    "settled_max_abs_sigma_m_per_s": "m/s",
+    "settled_max_abs_v_tilde_A2_per_m2": "A^2/m^2",
+    "settled_max_abs_current_error_A": "A",
+    "sigma_reached_s": "s",
+    "v_tilde_reached_s": "s",
+    "current_error_reached_s": "s",
+    "max_abs_u_V": "V",
+    "rms_u_V": "V",
+    "settled_rms_u_V": "V",
+    "chatter_V": "V",
+    "max_abs_i_A": "A",
+    "rms_i_A": "A",
+    "copper_loss_W": "W",
+    "lost_at_s": "s",
+    "singular_at_s": "s",
+    "settle_s": "s",
+}
+
 
 @record
 class Standard:

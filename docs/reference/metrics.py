@@ -1,10 +1,9 @@
 """Metrics of metrics.json, from the folds that compute them, and the arrays of trajectory.npz."""
 
-import re
 from typing import Any
 
 from ambjax.simulation.folds import Count, Driven, Peak, Reaching, Rms, Variation
-from ambjax.simulation.metrics import Standard
+from ambjax.simulation.metrics import UNITS, Standard
 from ambjax.simulation.trajectory import NOT_SAVED, Row
 from reference.fields import attribute_docs
 from reference.markdown import code, escaped, table
@@ -41,8 +40,6 @@ SHARE = {
     "clearance_used": "z as a share of the clearance",
     "settled_clearance_used": "z as a share of the clearance",
 }
-UNIT = re.compile(r"_(m_per_s|A2_per_m2|m|s|V|A|W)$")
-UNITS = {"m_per_s": "m/s", "A2_per_m2": "A^2/m^2"}
 
 
 def pages() -> dict[str, str]:
@@ -64,13 +61,8 @@ def pages() -> dict[str, str]:
 def rows() -> list[tuple[str, str, str]]:
     """Return a row for each metric: name, unit and meaning."""
     folds = Standard()._folds().folds
-    told = {name: _meaning(name, fold) for name, fold in folds.items()} | OTHERS
-    return [(code(name), escaped(_unit(name)), escaped(meaning)) for name, meaning in told.items()]
-
-
-def _unit(name: str) -> str:
-    found = UNIT.search(name)
-    return UNITS.get(found[1], found[1]) if found else ""
+    meanings = {name: _meaning(name, fold) for name, fold in folds.items()} | OTHERS
+    return [(code(name), escaped(UNITS.get(name, "")), escaped(meaning)) for name, meaning in meanings.items()]
 
 
 def _meaning(name: str, fold: Any) -> str:
