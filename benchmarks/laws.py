@@ -82,10 +82,12 @@ def structures(case: Case, laws: dict[str, Any]) -> dict[str, dict[str, Any]]:
     drive = {"kind": "pi", "k_p": 3 * w * L, "k_int": w * w * L, "k_aw": w / 3}
     soft = {stage: _without(laws.get(stage, {}), "p") for stage in ("position", "inversion", "current")}
     hard = {stage: law | {"p": math.inf} for stage, law in soft.items()}
+    kept = {name: value for name, value in soft["position"].items() if name in ("c", "k")}
+    cascade = {"position": {"kind": "sliding-mode"} | kept}
     found = {
-        "cascade": soft,
-        "cascade-signs": hard,
-        "cascade-integral": soft | {"position": {"kind": "integral-sliding-mode"}},
+        "cascade": soft | cascade,
+        "cascade-signs": hard | {"position": cascade["position"] | {"p": math.inf}},
+        "cascade-integral": soft | {"position": {"kind": "integral-sliding-mode"} | kept},
         "super-twisting": soft | {"position": {"kind": "super-twisting"}},
         "pid": {"position": {"kind": "pid"}, "inversion": {"kind": "linearised"}, "current": drive},
         "linearisation": {

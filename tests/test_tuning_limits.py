@@ -219,6 +219,10 @@ def test_the_pull_is_that_of_an_augmented_lagrangian():
     assert again.multiplier == pytest.approx(PENALTY * (0.1 + math.log(0.99)))
     assert again.penalty > PENALTY
     assert limit.updated(5.0, 5.0).multiplier == 0.0
+    # a rotor that an injection loses: ten times the limit, so that the search goes on
+    lost = limit.updated(5.0, math.inf)
+    assert lost.ratio == pytest.approx(10 * limit.threshold / 5.0)
+    assert lost.missed == pytest.approx(limit.log_excess(10 * limit.threshold))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,23 +19,24 @@ g = 9.81                      # m/s^2
 
 [controller.observer]         # data sheet: the velocity is not measured
 kind = "kalman"
-w = 1600.0                    # 1/s; 'ambjax tune' found this and the gains below under [tune.limits]; rounded
+w = 1700.0                    # 1/s; 'ambjax tune' found this and the gains below under [tune.limits]; rounded
 
 [controller.position]
-kind = "sliding-mode"
-c = 3200.0                    # 1/s; the largest that the tuner allows, a fifth of the sample rate
-k = 38.0                      # m/s^2
-p = 285.0                     # s/m
+kind = "integral-sliding-mode"  # its integral leaves no offset after the step
+c = 380.0                     # 1/s
+c_int = 1.3e5                 # 1/s^2
+k = 50.0                      # m/s^2
+p = 380.0                     # s/m
 
 [controller.inversion]
 kind = "adaptive"
-gamma = 2.5e12                # A^2/m^2/s
-p = 3e-9                      # m^2/A^2
+gamma = 1.8e12                # A^2/m^2/s
+p = 3.5e-9                    # m^2/A^2
 
 [controller.current]
 kind = "sliding-mode"
-k_i = 4.0                     # A/s
-p = 0.18                      # 1/A
+k_i = 3200.0                  # A/s
+p = 0.68                      # 1/A
 
 [disturbance.q_z]
 kind = "sum"
@@ -81,8 +82,9 @@ plant.R = { percent = 10 }
 initial.z = { uniform = [-1e-4, 1e-4] }  # m
 
 [tune]                        # of 'ambjax tune': the steepnesses p too, which it leaves as they are by default
-gains = ["controller.observer.w", "controller.position.c", "controller.position.k", "controller.position.p",
-    "controller.inversion.gamma", "controller.inversion.p", "controller.current.k_i", "controller.current.p"]
+gains = ["controller.observer.w", "controller.position.c", "controller.position.c_int", "controller.position.k",
+    "controller.position.p", "controller.inversion.gamma", "controller.inversion.p", "controller.current.k_i",
+    "controller.current.p"]
 
 [tune.limits]
 rms_u_V = 8.0                 # V; root mean square voltage

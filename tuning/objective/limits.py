@@ -29,6 +29,8 @@ TOLERANCE_BELOW = 0.01
 LEAST_MARGIN = 0.002
 # Source of the limit on the rms error with which the front of error against voltage is traced.
 FRONT = "the front"
+# Factor by which a quantity that is judged infinite exceeds its limit, or the search's value, in the search.
+LOST_FACTOR = 10.0
 # Intervals of the integral in `Limit.error_reduction`.
 PRICE_INTERVALS = 200
 
@@ -113,8 +115,10 @@ class Limit:
     def updated(self, tuned: float, judged: float) -> "Limit":
         """Return the limit after an update of its multiplier at an optimum of the goal.
 
-        `tuned` and `judged` are the values of the search and of the judge there.
+        `tuned` and `judged` are the values of the search and of the judge there. `judged` is infinite where an
+        injection loses the rotor: LOST_FACTOR times the larger of `tuned` and the limit stands for it.
         """
+        judged = judged if math.isfinite(judged) else LOST_FACTOR * max(tuned, self.threshold)
         excess = self.log_excess(judged)
         force = max(self.multiplier + self.penalty * self.log_excess(self.ratio * tuned), 0.0)
         slow = force > 0 and abs(excess) > SUFFICIENT_DECREASE * abs(self.missed)
