@@ -1888,9 +1888,9 @@ SURROUNDINGS = [
     ),
     M(
         "chunks are put together whosever they are",
-        "ambjax/ensemble/store.py",
-        "part = self._read(span)",
-        "part = unseal(self._path(span))[0]",
+        "ambjax/ensemble/chunks.py",
+        "part = self.read(span)",
+        "part = unseal(self.path(span))[0]",
         "tests/test_damage.py::test_a_chunk_that_was_replaced_while_the_study_ran_is_refused_by_name",
     ),
     M(
@@ -1902,7 +1902,7 @@ SURROUNDINGS = [
     ),
     M(
         "members.npz is read back by its columns' kinds alone",
-        "ambjax/ensemble/store.py",
+        "ambjax/ensemble/chunks.py",
         "there[name] = [kind, hashlib.sha256(np.ascontiguousarray(column).data).hexdigest(), shape]",
         "there[name] = [kind, columns[name].digest if name in columns else '', shape]",
         "tests/test_damage.py::test_chunks_stay_until_the_whole_was_read_back",

@@ -12,7 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tomlkit import dumps
 
-from ambjax.cases.reader import KINDS, SIGNALS, TABLES, read_case
+from ambjax.cases.reader import KINDS, TABLES, read_case
+from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.timing import DURATION, METHODS
 from ambjax.cases.tune_table import NUMBERS as TUNED
 from ambjax.commands import simulate

@@ -9,7 +9,8 @@ import pytest
 from texts import write
 
 from ambjax.__main__ import main
-from ambjax.cases.reader import KINDS, SIGNALS, case_from, read_case
+from ambjax.cases.reader import KINDS, case_from, read_case
+from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.template_text import template
 from ambjax.ensemble import replay
 from ambjax.paper.readings import CLOCK, SETTLE, cascade, scenario

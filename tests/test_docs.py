@@ -13,7 +13,8 @@ import pytest
 from reference import benchmarks, case_file, commands, fields, markdown, metrics, parser
 
 from ambjax.__main__ import main
-from ambjax.cases.reader import KINDS, OTHERS, SIGNALS, TABLES, case_from
+from ambjax.cases.reader import KINDS, OTHERS, TABLES, case_from
+from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.table import Table
 from tuning.config import tune_from
 

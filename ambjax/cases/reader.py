@@ -5,14 +5,14 @@ ValueError with one line: the dotted path, the value, what is allowed and the fi
 """
 
 import dataclasses
-import math
 import pathlib
 import re
 from typing import Any
 
 from ambjax.cases.own_laws import FORM, OwnLaw, is_own, own_law
 from ambjax.cases.reach import check_reference
-from ambjax.cases.table import Table, check_depth, load, show
+from ambjax.cases.scenario_tables import check_start, scenario_from
+from ambjax.cases.table import Table, check_depth, load
 from ambjax.cases.timing import clock_from, settled
 from ambjax.cases.variation import spread_from
 from ambjax.control import current, inversion, observer, position
@@ -23,20 +23,15 @@ from ambjax.control.processor import Processor
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.host.words import one_line
 from ambjax.linear.analysis import Zones
-from ambjax.numerics.records import Scalar, leaf
+from ambjax.numerics.records import Scalar
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sliding import Slide, slides
 from ambjax.simulation.system import check_parts
-from ambjax.world import signals
-from ambjax.world.amplifier import Amplifier
-from ambjax.world.band_noise import BandNoise
 from ambjax.world.bearing import Bearing
 from ambjax.world.coils import TwoCoil
-from ambjax.world.faults import VALUES, Dropouts, Outliers
 from ambjax.world.plant import Plant
-from ambjax.world.scenario import Initial, Scenario
-from ambjax.world.sensor import Sensor
+from ambjax.world.scenario import Scenario
 
 # The laws by stage and kind; the first of a stage is the default. A new law is one row here.
 KINDS: dict[str, dict[str, type[Law]]] = {
@@ -67,16 +62,6 @@ KINDS: dict[str, dict[str, type[Law]]] = {
     },
     "current": {"sliding-mode": current.SlidingMode, "pi": current.ProportionalIntegral, "dead-beat": current.DeadBeat},
 }
-SIGNALS: dict[str, type] = {
-    "constant": signals.Constant,
-    "step": signals.Step,
-    "pulse": signals.Pulse,
-    "sine": signals.Sine,
-    "smoothstep": signals.SmoothStep,
-    "chirp": signals.Chirp,
-    "band-noise": BandNoise,
-    "sum": signals.Sum,
-}
 PLANTS: dict[str, type] = {"lumped": Plant, "two-coil": TwoCoil}
 DISCRETISATIONS = ["implicit", "explicit"]
 TABLES = [
@@ -94,12 +79,7 @@ TABLES = [
     "sensitivity",
 ]
 OTHERS = ["tune"]  # read by the tuner, ignored by the other commands
-UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
-# Largest number of terms of a sum; each term is compiled.
-MOST_TERMS = 100
-SETTLE = leaf(default=0.5, unit="s", at_least=0, at_most=1e6, doc='time from which "settled" metrics count')
 (DELAY,) = (field for field in dataclasses.fields(Processor) if field.name == "delay")
-FIELDS = {field.name: field for kind in (Scenario, Clock) for field in dataclasses.fields(kind)}
 # Characters that are replaced in the name of a case, which appears in titles, paths, tables and pages; its length.
 UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
 
@@ -164,7 +144,7 @@ def case_from(
     clock, duration = clock_from(top.table("clock"))
     period = None if processor is None else clock.sample_period
     cascade, own = _cascade(top.table("controller"), plant, processor, period, folder, own)
-    scenario, settle = _scenario(top, plant)
+    scenario, settle = scenario_from(top, plant)
     check_parts(cascade, scenario)
     if isinstance(clock.method, Slide) and not slides(cascade, scenario.plant):
         made = " or ".join(f'"{kind}"' for kind, law in KINDS["inversion"].items() if law.slides)
@@ -172,7 +152,7 @@ def case_from(
             f'clock.method = "sliding": it needs controller.inversion.kind = {made}, continuous time, a lumped plant, '
             'and an observer other than "ired-1" and "ired-2". Use method = "adaptive".'
         )
-    _check_start(scenario)
+    check_start(scenario)
     settle = duration / 4 if settle is None else settled(settle, clock)
     spread = spread_from(top, cascade, scenario)
     check_reference(spread, cascade, scenario, clock)
@@ -237,78 +217,3 @@ def _defaults(table: Table, kind: Any, model: Plant, period: Scalar | None) -> L
         return default_law(kind, model, None if period is None else float(period))
     except ValueError as error:
         raise ValueError(f"{table.path}: {error}. Give all of {', '.join(sorted(names))}.") from None
-
-
-def _signal(table: Table, extra: tuple[str, ...] = ()) -> Any:
-    kind = table.choice("kind", list(SIGNALS))
-    if kind == "sum":
-        table.only(["kind", "terms", *extra])
-        terms = table.raw.get("terms")
-        if not isinstance(terms, list) or not terms:
-            raise ValueError(f"{table.at('terms')} = {show(terms)}: it must be a list of at least one signal table.")
-        if len(terms) > MOST_TERMS:
-            raise ValueError(f"{table.at('terms')}: {len(terms)} terms are too many; give at most {MOST_TERMS}.")
-        return signals.Sum(tuple(_signal(Table(t, f"{table.at('terms')}[{n}]")) for n, t in enumerate(terms)))
-    return table.record(SIGNALS[kind], extra=("kind", *extra))
-
-
-def _disturbances(table: Table) -> dict[str, Any]:
-    table.only(list(UNITS))
-    made = {}
-    for name in table.raw:
-        one, units = table.table(name), list(UNITS[name])
-        unit = one.choice("unit", units, units[0])
-        made["q_v" if unit == "A^2/m^2" else name] = _signal(one, extra=("unit",))
-    return made
-
-
-def _scenario(top: Table, plant: Bearing) -> tuple[Scenario, float | None]:
-    actuator, run = top.table("actuator"), top.table("run")
-    names = [field.name for field in dataclasses.fields(Amplifier)]
-    actuator.only(["u_max", *names])
-    run.only(["seed", "settle", "clearance"])
-    settle = run.leaf("settle", SETTLE)
-    scenario = Scenario(
-        plant=plant,
-        reference=_signal(top.table("reference")) if "reference" in top.raw else signals.Constant(),
-        sensor=_sensor(top.table("sensor")) if "sensor" in top.raw else None,
-        initial=top.table("initial").record(Initial),
-        u_max=actuator.leaf("u_max", FIELDS["u_max"], math.inf),
-        amplifier=actuator.record(Amplifier, extra=("u_max",)) if any(n in actuator.raw for n in names) else None,
-        clearance=run.leaf("clearance", FIELDS["clearance"]),
-        seed=_seed(run),
-        **_disturbances(top.table("disturbance")),
-    )
-    return scenario, settle
-
-
-def _sensor(table: Table) -> Sensor:
-    sensor, velocity = table.record(Sensor, extra=("velocity", "outliers", "dropouts")), table.switch("velocity")
-    faults = {
-        "outliers": table.table("outliers").record(Outliers) if "outliers" in table.raw else None,
-        "dropouts": _dropouts(table.table("dropouts")) if "dropouts" in table.raw else None,
-    }
-    return dataclasses.replace(sensor, velocity=velocity is not False, **faults)
-
-
-def _dropouts(table: Table) -> Dropouts:
-    value = table.choice("value", list(VALUES), VALUES[0])
-    return dataclasses.replace(table.record(Dropouts, extra=("value",)), value=value)
-
-
-def _seed(run: Table) -> int:
-    seed = run.raw.get("seed", 0)
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
-        raise ValueError(f"{run.at('seed')} = {show(seed)}: it must be a whole number from 0 to 4294967295.")
-    return seed
-
-
-def _check_start(scenario: Scenario) -> None:
-    gap, stop, z = scenario.plant.s_0, scenario.touchdown, scenario.initial.z
-    if not stop < gap:
-        raise ValueError(f"run.clearance = {stop:g} m: it must be less than the gap plant.s_0 = {gap:g} m.")
-    if not abs(z) < stop:
-        raise ValueError(
-            f"initial.z = {z:g} m: the rotor would touch its stop at the start; |z| must be less than {stop:g} m "
-            "(run.clearance, by default 0.9 of plant.s_0)."
-        )

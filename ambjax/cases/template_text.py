@@ -5,8 +5,9 @@ import math
 
 from ambjax.cases import tune_table
 from ambjax.cases.data_sheet import BEARING
-from ambjax.cases.reader import KINDS, PLANTS, SIGNALS
+from ambjax.cases.reader import KINDS, PLANTS
 from ambjax.cases.rig import RIG
+from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.ensemble.design import DESIGNS
 from ambjax.paper.readings import PULSE, REFERENCE, TABLE_2
 from ambjax.world.plant import Plant

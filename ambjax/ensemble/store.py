@@ -11,37 +11,13 @@ import json
 import os
 import pathlib
 import shutil
-import zipfile
-from collections.abc import Iterator
-from typing import IO, Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
-
-from ambjax.host.sealed import (
-    CHECKSUM,
-    Arrays,
-    DamagedError,
-    checksum_of,
-    difference,
-    seal,
-    shapes,
-    unseal,
-    write_whole,
-)
+from ambjax.ensemble.chunks import Chunks, Span, check_whole, kinds_of
+from ambjax.host.sealed import CHECKSUM, Arrays, DamagedError, checksum_of, difference, write_whole
 
 MANIFEST = "study.json"
 RESULT = "members.npz"
-# Time stamp of all entries. It is fixed, so that equal results give equal files.
-EPOCH = (1980, 1, 1, 0, 0, 0)
-
-Span = tuple[int, int]
-
-
-class Column(NamedTuple):
-    """A column of all members: its dtype in JSON form, and the SHA-256 of its numbers."""
-
-    kind: Any
-    digest: str
 
 
 class Survey(NamedTuple):
@@ -102,15 +78,15 @@ class Store:
 
     def survey(self) -> Survey:
         """Return the missing and damaged chunks. Reads every chunk and verifies its checksum and its columns."""
-        missing, remarks, layouts = [], list[str](), dict[Span, str]()
+        parts, missing, remarks, layouts = self.parts, [], list[str](), dict[Span, str]()
         if self.result:
             reason = "its checksum is wrong" if self.path.exists() else "the file is missing"
             remarks.append(f"{self.path}: {reason}; members that are not in {self.chunks} are computed again")
         for span in self.spans():
-            path = self._path(span)
+            path = parts.path(span)
             try:
                 if path.exists():
-                    layouts[span] = json.dumps(kinds_of(self._read(span)))
+                    layouts[span] = json.dumps(kinds_of(parts.read(span)))
                     continue
             except DamagedError as why:
                 remarks.append(f"{path}: {why}; members {span[0]} to {span[1] - 1} are computed again")
@@ -119,27 +95,31 @@ class Store:
         for span, kinds in layouts.items():
             if kinds != usual[0][0]:
                 remarks.append(
-                    f"{self._path(span)}: its columns are not those of the others; members {span[0]} to {span[1] - 1} "
+                    f"{parts.path(span)}: its columns are not those of the others; members {span[0]} to {span[1] - 1} "
                     "are computed again"
                 )
                 missing.append(span)
         return Survey(sorted(missing), remarks)
 
+    @property
+    def parts(self) -> Chunks:
+        """The chunks on disk."""
+        return Chunks(self.chunks, self.members, self.chunk, checksum_of(self.facts))
+
     def spans(self) -> list[Span]:
         """Return all chunks in order as (first member, last member + 1); an empty list before `cut`."""
-        if not self.chunk:
-            return []
-        return [(n, min(n + self.chunk, self.members)) for n in range(0, self.members, self.chunk)]
+        return self.parts.spans()
 
     def count(self) -> int:
         """Return the number of members on disk."""
         if self.path.exists() and not self.chunks.exists():
             return self.members
-        return sum(stop - start for start, stop in self.spans() if self._path((start, stop)).exists())
+        parts = self.parts
+        return sum(stop - start for start, stop in parts.spans() if parts.path((start, stop)).exists())
 
     def put(self, span: Span, columns: Arrays) -> None:
         """Write a finished chunk. Raises ValueError if it cannot be written."""
-        seal(self._path(span), columns, self._facts(span))
+        self.parts.put(span, columns)
 
     def finish(self) -> pathlib.Path:
         """Merge all chunks into members.npz, column by column, read it back, and then remove the chunks.
@@ -149,9 +129,10 @@ class Store:
         """
         if not self.finished():
             try:
-                columns = self._columns()
-                write_whole(self.path, lambda file: self._merge(file, columns))
-                self._read_back(columns)
+                parts = self.parts
+                columns = parts.columns()
+                write_whole(self.path, lambda file: parts.merge(file, columns))
+                check_whole(self.path, self.members, columns)
             except (DamagedError, OSError) as why:
                 raise ValueError(
                     f"{self.path}: the chunks could not be merged ({why}). They are kept: repeat the command with "
@@ -205,87 +186,6 @@ class Store:
                 f"--members {self.members}: their results need {need / 1e9:.3g} GB and {where} has "
                 f"{free / 1e9:.3g} GB free. At most {most:,} members fit; or choose another --out."
             )
-
-    def _facts(self, span: Span) -> dict[str, object]:
-        return {"study": checksum_of(self.facts), "first": span[0], "stop": span[1]}
-
-    def _read(self, span: Span) -> Arrays:
-        """Return the columns of a chunk. Raises DamagedError if they are incomplete, or of another chunk or study."""
-        columns, facts = unseal(self._path(span))
-        differs = difference(facts, self._facts(span))
-        if differs:
-            raise DamagedError(f"it is of another chunk or study: {differs}")
-        _check_rows(columns, *span)
-        return columns
-
-    def _columns(self) -> dict[str, Column]:
-        """Return the dtype and checksum of all columns, by name.
-
-        Reads every chunk again, because a file may have changed since it was written. Raises DamagedError if a chunk is
-        incomplete, of another study, or has other columns than the first chunk.
-        """
-        kinds, digests = dict[str, Any](), collections.defaultdict(hashlib.sha256)
-        for span in self.spans():
-            try:
-                part = self._read(span)
-            except DamagedError as why:
-                raise DamagedError(f"{self._path(span)}: {why}") from None
-            kinds = kinds or kinds_of(part)
-            if kinds != kinds_of(part):
-                raise DamagedError(f"{self._path(span)}: its columns are not those of the others")
-            for name, column in part.items():
-                digests[name].update(np.ascontiguousarray(column).data)
-        return {name: Column(kind, digests[name].hexdigest()) for name, kind in kinds.items()}
-
-    def _merge(self, file: IO[bytes], columns: dict[str, Column]) -> None:
-        """Write all columns to an .npz archive, chunk by chunk, to bound the memory."""
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
-            for name, column in columns.items():
-                head = {"descr": column.kind, "fortran_order": False, "shape": (self.members,)}
-                with archive.open(zipfile.ZipInfo(f"{name}.npy", EPOCH), "w", force_zip64=True) as out:
-                    np.lib.format.write_array_header_1_0(out, head)
-                    for part in self._column(name):
-                        out.write(np.ascontiguousarray(part).tobytes())
-
-    def _column(self, name: str) -> Iterator[np.ndarray]:
-        """Yield one column, chunk by chunk. Raises DamagedError for a chunk that cannot be read."""
-        for span in self.spans():
-            try:
-                with self._path(span).open("rb") as file, np.load(file) as chunk:
-                    yield chunk[name]
-            except Exception as error:  # as in unseal
-                raise DamagedError(f"{self._path(span)} cannot be read ({error})") from None
-
-    def _read_back(self, columns: dict[str, Column]) -> None:
-        """Raise DamagedError unless members.npz holds these columns, with one row for each member, in order."""
-        there = dict[str, Any]()
-        try:
-            with self.path.open("rb") as file, np.load(file) as whole:
-                for name in whole.files:  # column by column, to bound the memory
-                    column = whole[name]
-                    kind, shape = shapes({name: column})[name]
-                    there[name] = [kind, hashlib.sha256(np.ascontiguousarray(column).data).hexdigest(), shape]
-        except Exception as error:  # as in unseal
-            raise DamagedError(f"the written file cannot be read ({error})") from None
-        wrong = difference(there, {name: [*column, [self.members]] for name, column in columns.items()})
-        if wrong:
-            raise DamagedError(f"the written file differs from the data: {wrong}")
-
-    def _path(self, span: Span) -> pathlib.Path:
-        return self.chunks / f"{span[0]:012d}-{span[1]:012d}.npz"
-
-
-def kinds_of(columns: Arrays) -> dict[str, object]:
-    """Return the names and dtypes of columns, in order."""
-    return {name: kind for name, (kind, _) in shapes(columns).items()}
-
-
-def _check_rows(columns: Arrays, start: int, stop: int) -> None:
-    short = [name for name, column in columns.items() if column.shape != (stop - start,)]
-    if short:
-        raise DamagedError(f"its column {short[0]} does not have {stop - start} rows")
-    if "index" not in columns or not np.array_equal(columns["index"], np.arange(start, stop)):
-        raise DamagedError(f"its rows are not members {start} to {stop - 1}")
 
 
 def _digest(path: pathlib.Path) -> str:
