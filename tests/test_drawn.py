@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 import tuning.report.pictures as tuned
 from ambjax.commands import map as map_command
 from ambjax.ensemble.maps import PERIOD, Axis, Map
-from ambjax.pictures import ensembles, figures, heatmaps
+from ambjax.pictures import fans, figures, heatmaps, histograms
 from ambjax.pictures.overview import overview
 from ambjax.pictures.thinning import BINS, envelope, stretch_of, thin
 from ambjax.pictures.tornado import Bar, tornado
@@ -250,7 +250,7 @@ def bands_of(n, seed=0):
 @pytest.mark.parametrize("n", [2, 500, 9601])
 def test_a_fan_is_of_its_quantiles(n, drawn):
     t, bands = np.linspace(0, 0.9, n), bands_of(n)
-    ensembles.fan(t, {"z - r": bands}, {}, "", NOWHERE)
+    fans.fan(t, {"z - r": bands}, {}, "", NOWHERE)
     (ax,) = drawn[0].axes
     factor = factor_of(ax.get_ylabel())
     for k, (low, high) in enumerate(((0, 100), (5, 95), (25, 75))):
@@ -273,7 +273,7 @@ def test_a_fan_ends_where_nobody_is_left(drawn):
     t, bands = np.linspace(0, 1, 101), bands_of(101)
     for values in bands.values():
         values[31:] = np.nan
-    ensembles.fan(t, {"z - r": bands}, {}, "", NOWHERE, lost_at=np.array([0.302, 0.1]))
+    fans.fan(t, {"z - r": bands}, {}, "", NOWHERE, lost_at=np.array([0.302, 0.1]))
     ax = drawn[0].axes[0]
     assert all(box(band)[:, 0].max() == t[30] for band in ax.collections)
     x, y = ax.lines[0].get_data()
@@ -284,7 +284,7 @@ def test_a_smoothed_median_reaches_from_the_first_to_the_last_instant(drawn):
     t = np.linspace(0, 1, 499)
     values = 10.0 * (-1) ** np.arange(499)
     values[400:] = np.nan
-    ensembles.fan(t, {"u": {0: values - 1, 50: values, 100: values + 1}}, {}, "", NOWHERE)
+    fans.fan(t, {"u": {0: values - 1, 50: values, 100: values + 1}}, {}, "", NOWHERE)
     (line,) = drawn[0].axes[0].lines
     assert line.get_label() == "median, smoothed where it chatters"
     x, y = line.get_data()
@@ -300,7 +300,7 @@ def test_the_survivors_are_all_that_are_not_lost(members, drawn):
     lost_at[-1] = 0.9999  # between the last sample and the end of the run
     stalled = np.arange(members) == members - 1
     bands = {"u": {50: np.zeros(100)}}
-    ensembles.fan(t, bands, {}, "", NOWHERE, lost_at=lost_at, stalled=stalled)
+    fans.fan(t, bands, {}, "", NOWHERE, lost_at=lost_at, stalled=stalled)
     ax = drawn[0].axes[-1]
     step, rug = ax.lines
     x, share = step.get_data()
@@ -327,7 +327,7 @@ def test_a_histogram_is_of_all_members(log, drawn):
     lost = rng.uniform(size=500) < 0.3
     if log:
         values[7] = 0.0
-    ensembles.histograms({"rms_error_m": values, "lost_at": np.where(lost, 0.1, np.inf)}, NOWHERE)
+    histograms.histograms({"rms_error_m": values, "lost_at": np.where(lost, 0.1, np.inf)}, NOWHERE)
     ax = drawn[0].axes[0]
     assert ax.get_xscale() == ("log" if log else "linear")
     alive, dead = (patch.get_data() for patch in ax.patches)

@@ -8,8 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from ambjax.pictures import ensembles as pictures
-from ambjax.pictures import heatmaps
+from ambjax.pictures import fans, heatmaps, histograms
 from ambjax.pictures.scales import LABELS, SHOWN, axis_of, edges, label_of, log_ticks, prefix_of, size_of
 from ambjax.pictures.tornado import Bar, tornado
 from ambjax.simulation.metrics import UNITS, Standard
@@ -84,7 +83,7 @@ def test_every_metric_has_its_unit():
         assert "_" not in words, name
     assert axis_of("settled_max_abs_sigma_m_per_s", 2e-3)[1:] == (r"settled max |$\sigma$|", "mm/s")
     assert axis_of("clearance_used", 0.5) == (100.0, "clearance used", "%")
-    assert set(pictures.CHIEF) <= set(names)
+    assert set(histograms.CHIEF) <= set(names)
 
 
 def test_labels_keep_what_is_no_unit():
@@ -151,7 +150,7 @@ def test_fan_shows_bands_units_limit_and_survivors(tmp_path, drawn):
     lost_at[:4] = [0.1, 0.2, 0.3, 0.4]
     bands = {"z - r": quantiles(members), "u": quantiles(6e6 * members), "sigma": quantiles(members)}
     limits, stalled = {"u": 150.0, "z - r": 4.5e-3}, np.arange(50) == 2
-    pictures.fan(t, bands, limits, "a title", tmp_path / "fan.png", lost_at=lost_at, stalled=stalled)
+    fans.fan(t, bands, limits, "a title", tmp_path / "fan.png", lost_at=lost_at, stalled=stalled)
     assert is_png(tmp_path / "fan.png")
     (figure,) = drawn
     words = texts(figure)
@@ -175,7 +174,7 @@ def test_fan_keeps_extremes_of_long_runs(tmp_path, drawn):
     t = np.linspace(0, 1, 50_001)
     low, high = np.zeros(len(t)), np.ones(len(t))
     low[12_345], high[33_333] = -1.0, 2.0  # one sample each
-    pictures.fan(t, {"u": {0: low, 50: 0.5 * (low + high), 100: high}}, {}, "spikes", tmp_path / "fan.png")
+    fans.fan(t, {"u": {0: low, 50: 0.5 * (low + high), 100: high}}, {}, "spikes", tmp_path / "fan.png")
     heights = drawn[0].axes[0].collections[0].get_paths()[0].vertices[:, 1]
     assert heights.min() == -1.0
     assert heights.max() == 2.0
@@ -185,7 +184,7 @@ def test_fan_does_not_let_one_member_hide_the_rest(tmp_path, drawn):
     t = np.linspace(0, 1, 101)
     bands = quantiles(members_of(100, t))
     bands[100] = np.full(len(t), 4.5e-3)
-    pictures.fan(t, {"z - r": bands}, {}, "one went astray", tmp_path / "fan.png")
+    fans.fan(t, {"z - r": bands}, {}, "one went astray", tmp_path / "fan.png")
     ax = drawn[0].axes[0]
     assert ax.get_ylim()[1] < 60  # µm: the others reach 24
     assert "band reaches 4500 µm, beyond this axis" in texts(drawn[0])
@@ -194,7 +193,7 @@ def test_fan_does_not_let_one_member_hide_the_rest(tmp_path, drawn):
 def test_fan_does_not_let_a_brief_transient_hide_the_rest(tmp_path, drawn):
     t = np.linspace(0, 1, 1001)
     members = members_of(100, t) + 4e-3 * (t < 0.02)
-    pictures.fan(t, {"z - r": quantiles(members)}, {"z - r": 4.5e-3}, "it came down", tmp_path / "fan.png")
+    fans.fan(t, {"z - r": quantiles(members)}, {"z - r": 4.5e-3}, "it came down", tmp_path / "fan.png")
     ax = drawn[0].axes[0]
     assert ax.get_ylim()[1] < 60  # µm: settled, they reach 24
     assert "beyond this axis" in texts(drawn[0])
@@ -205,7 +204,7 @@ def test_fan_smooths_a_median_that_chatters(tmp_path, drawn):
     signs = np.sign(np.random.default_rng(0).normal(size=500))
     slow = np.sin(2 * np.pi * 5 * t)
     for values in (200 * signs + 20 * t, slow):
-        pictures.fan(t, {"u": {0: values - 1, 50: values, 100: values + 1}}, {}, "chatter", tmp_path / "fan.png")
+        fans.fan(t, {"u": {0: values - 1, 50: values, 100: values + 1}}, {}, "chatter", tmp_path / "fan.png")
     (chattering,), (smooth,) = (figure.axes[0].lines for figure in drawn)
     assert chattering.get_label() == "median, smoothed where it chatters"
     # a mean of ten signs is off by 63 V; the whole height once in 1,000
@@ -216,7 +215,7 @@ def test_fan_smooths_a_median_that_chatters(tmp_path, drawn):
 
 def test_fan_refuses_unknown_quantity(tmp_path):
     with pytest.raises(ValueError, match=r"'w'. Use one of z - r, z, sigma"):
-        pictures.fan(np.zeros(1), {"w": {50: np.zeros(1)}}, {}, "", tmp_path / "fan.png")
+        fans.fan(np.zeros(1), {"w": {50: np.zeros(1)}}, {}, "", tmp_path / "fan.png")
     assert not (tmp_path / "fan.png").exists()
 
 
@@ -225,12 +224,12 @@ def test_fan_refuses_unknown_quantity(tmp_path):
 def test_fan_of_hard_cases(tmp_path, values, lost_at):
     # one member: all bands alike; NaN: nobody left
     bands = {"u": dict.fromkeys(PERCENTS, values)}
-    pictures.fan(np.linspace(0, 1, 9), bands, {"u": 2.0}, "hard", tmp_path / "fan.png", lost_at=lost_at)
+    fans.fan(np.linspace(0, 1, 9), bands, {"u": 2.0}, "hard", tmp_path / "fan.png", lost_at=lost_at)
     assert is_png(tmp_path / "fan.png")
 
 
 def test_fan_of_one_instant_and_one_band(tmp_path):
-    pictures.fan(np.zeros(1), {"u": {50: np.ones(1)}}, {}, "", tmp_path / "fan.png", lost_at=np.zeros(2))
+    fans.fan(np.zeros(1), {"u": {50: np.ones(1)}}, {}, "", tmp_path / "fan.png", lost_at=np.zeros(2))
     assert is_png(tmp_path / "fan.png")
 
 
@@ -245,7 +244,7 @@ def test_histogram_counts_every_member_once(tmp_path, drawn):
     reached = np.where(lost, np.inf, 3e-3 + 1e-4 * rng.normal(size=n))
     columns = {"lost_at": np.where(lost, 0.1, np.inf), "rms_error_m": error, "v_tilde_reached_s": reached}
     columns["stalled"] = np.arange(n) < 10
-    pictures.histograms(columns, tmp_path / "h.png")
+    histograms.histograms(columns, tmp_path / "h.png")
     assert is_png(tmp_path / "h.png")
     assert "1000 members, 30 lost, 10 not decided" in texts(drawn[0])
     first, second = drawn[0].axes[:2]
@@ -281,7 +280,7 @@ def test_histogram_counts_every_member_once(tmp_path, drawn):
 @pytest.mark.parametrize("all_lost", [False, True])
 def test_histograms_of_hard_cases(tmp_path, drawn, values, all_lost):
     columns = {"lost_at": np.full(len(values), 0.1 if all_lost else np.inf), "rms_error_m": values}
-    pictures.histograms(columns, tmp_path / "h.png")
+    histograms.histograms(columns, tmp_path / "h.png")
     assert is_png(tmp_path / "h.png")
     shown = drawn[0].axes[0].patches[-1].get_data().values.sum()
     in_range = np.isfinite(values) & ((values > 0) | (drawn[0].axes[0].get_xscale() == "linear"))
@@ -290,7 +289,7 @@ def test_histograms_of_hard_cases(tmp_path, drawn, values, all_lost):
 
 def test_histograms_refuse_nothing_to_draw(tmp_path):
     with pytest.raises(ValueError, match="none of"):
-        pictures.histograms({"index": np.arange(3)}, tmp_path / "h.png")
+        histograms.histograms({"index": np.arange(3)}, tmp_path / "h.png")
 
 
 # ---------------------------------------------------------------- tornado

@@ -60,8 +60,7 @@ def _summary(case: Case, study: Study, columns: dict[str, np.ndarray], path: str
 def _pictures(
     case: Case, study: Study, columns: dict[str, np.ndarray], summary: dict[str, Any], out: pathlib.Path
 ) -> None:
-    from ambjax.pictures import ensembles as pictures
-    from ambjax.pictures import tornado
+    from ambjax.pictures import fans, histograms, tornado
 
     lost_at = columns["lost_at"]
     # End the fan chart soon after the last loss if every member is lost.
@@ -70,8 +69,8 @@ def _pictures(
     few = np.size(bands.trajectory.lost_at)
     title = case.name if few == study.members else f"{case.name}: bands of {few} of {study.members} members"
     limits = {"z - r": float(np.min(study.scenario.touchdown)), "u": float(np.min(study.scenario.u_max))}
-    pictures.fan(bands.t, shown, limits, title, out / "fan.png", lost_at=lost_at, stalled=columns["stalled"])
-    pictures.histograms(columns, out / "histograms.png")
+    fans.fan(bands.t, shown, limits, title, out / "fan.png", lost_at=lost_at, stalled=columns["stalled"])
+    histograms.histograms(columns, out / "histograms.png")
     if study.spread.entries:
         deciding = statistics.DECIDING
         bars = [tornado.Bar(*(d[k] for k in tornado.Bar._fields)) for d in summary["drivers"][deciding]]

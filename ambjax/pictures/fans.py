@@ -1,4 +1,4 @@
-"""Pictures of ensembles: fan charts and histograms, from arrays in SI units."""
+"""Fan charts of ensembles, from arrays in SI units."""
 
 import math
 import pathlib
@@ -9,12 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from ambjax.pictures.figures import BLUE, INK, RED
-from ambjax.pictures.scales import axis_of, digits, finish, log_ticks, prefix_of, size_of
+from ambjax.pictures.scales import digits, finish, prefix_of
 from ambjax.pictures.style import own_style
 from ambjax.pictures.thinning import envelope, smoothed, thin
 
@@ -28,24 +26,8 @@ QUANTITIES = {
     "variation of u": ("variation of $u$", "V/s"),
     "v_tilde": (r"force error $\tilde v$", "A²/m²"),
 }
-CHIEF = (
-    "settled_max_abs_error_m",
-    "settled_rms_error_m",
-    "max_abs_error_m",
-    "rms_error_m",
-    "clearance_used",
-    "settled_max_abs_sigma_m_per_s",
-    "v_tilde_reached_s",
-    "max_abs_i_A",
-    "max_abs_u_V",
-    "rms_u_V",
-    "chatter_V",
-    "copper_loss_W",
-)
 # Number of parts of the run over each of which a chattering median is averaged.
 SMOOTHED = 50
-LOST = {"facecolor": RED, "edgecolor": "white", "hatch": "////", "linewidth": 0.0}
-MARKS: dict[float, tuple[Any, str]] = {0.5: ("-", "median"), 0.95: ("--", "95 % quantile")}
 
 
 @own_style
@@ -176,99 +158,12 @@ def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray
         )
     lost, open_ = int(ended.sum()), 0 if stalled is None else int(np.sum(np.asarray(stalled, bool) & ended))
     words = f"{len(lost_at) - lost} of {len(lost_at)} survive ({share[-1]:.4g} %)"
-    words += f", {_statuses(lost - open_, open_)}" * bool(lost)
+    words += f", {statuses(lost - open_, open_)}" * bool(lost)
     ax.set_title(words, fontsize=8, loc="right", pad=2, color=INK)
     ax.yaxis.set_major_locator(MaxNLocator(3))
     finish(ax, "survivors\n(%)")
 
 
-def _statuses(lost: int, stalled: int) -> str:
+def statuses(lost: int, stalled: int) -> str:
     """Return in words the numbers of lost and of stalled members."""
     return f"{lost} lost" + f", {stalled} not decided" * bool(stalled)
-
-
-@own_style
-def histograms(columns: Mapping[str, np.ndarray], path: pathlib.Path, metrics: Sequence[str] = CHIEF) -> None:
-    """Write histograms of the `metrics` in `columns` (of members.npz, each [N]), with survivors and lost apart.
-
-    A member with a finite `lost_at` or `lost_at_s` does not survive; without these columns all survive. `stalled` marks
-    members at which the integrator stalled. Raises ValueError if `columns` has none of the metrics.
-    """
-    names = [name for name in metrics if name in columns]
-    if not names:
-        raise ValueError(f"histograms: none of {', '.join(metrics)} is a column. The columns are {', '.join(columns)}.")
-    lost = _lost(columns, len(columns[names[0]]))
-    open_ = int(np.sum(lost & np.asarray(columns.get("stalled", False), bool)))
-    across = min(3, len(names))
-    down = -(-len(names) // across)
-    figure = Figure(figsize=(max(4.0 * across, 5.5), 2.5 * down + 0.8), layout="constrained")
-    axes = figure.subplots(down, across, squeeze=False).ravel()
-    for ax, name in zip(axes, names, strict=False):
-        _histogram(ax, name, np.asarray(columns[name], float), lost)
-    for ax in axes[len(names) :]:
-        ax.set_axis_off()
-    others = "lost members" + " and those not decided" * bool(open_)
-    keys = [Patch(color=BLUE, label="survivors"), Patch(label=others, **LOST)]
-    keys += [Line2D([], [], color=INK, linestyle=s, label=f"{n} of survivors") for s, n in MARKS.values()]
-    figure.suptitle(f"{lost.size} members, {_statuses(int(lost.sum()) - open_, open_)}", fontsize=11)
-    figure.legend(handles=keys, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    figure.savefig(path, dpi=130)
-
-
-def _lost(columns: Mapping[str, object], members: int) -> np.ndarray:
-    for name in ("lost_at", "lost_at_s"):
-        if name in columns:
-            return np.isfinite(np.asarray(columns[name], float))
-    return np.zeros(members, bool)
-
-
-def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> None:
-    finite = values[np.isfinite(values)]
-    positive = finite[finite > 0]
-    log = positive.size > 0 and not np.any(finite < 0) and positive.max() > 30 * positive.min()
-    factor, label, unit = axis_of(name, size_of(finite, log))
-    mask = np.isfinite(values) & ((values > 0) | (not log))
-    bounds = _bins(factor * values[mask], log)
-    alive, _ = np.histogram(factor * values[mask & ~lost], bounds)
-    dead, _ = np.histogram(factor * values[mask & lost], bounds)
-    ax.stairs(alive, bounds, fill=True, color=BLUE)
-    if dead.any():
-        ax.stairs(alive + dead, bounds, baseline=alive, fill=True, **LOST)
-    if log:
-        ax.set_xscale("log")
-        log_ticks(ax.xaxis, bounds[0], bounds[-1])
-    notes, reached = [], "reached" in name
-    order = np.sort(values[~np.isnan(values) & ~lost])
-    for share, (style, words) in MARKS.items():
-        value = factor * order[math.ceil(share * order.size) - 1] if order.size else math.nan
-        if math.isfinite(value) and (value > 0 or not log):
-            ax.axvline(value, color=INK, linestyle=style, linewidth=1.2)
-        text = (
-            f"{digits(value)} {unit}".rstrip()
-            if math.isfinite(value)
-            else "never"
-            if reached and order.size
-            else "none"
-        )
-        notes.append(f"{words.removesuffix(' quantile')}: {text}")
-    for count, words in (
-        (np.sum(~np.isfinite(values)), "never" if reached else "not finite"),
-        (np.sum(finite == 0) * log, "at zero"),
-    ):
-        notes += [f"{count} {words}"] if count else []
-    ax.set_title(", ".join(notes), fontsize=8, pad=3)
-    ax.set_xlabel(f"{label} ({unit})" if unit else label, fontsize=9)
-    ax.set_ylim(0, 1.08 * max((alive + dead).max(), 1))
-    ax.yaxis.set_major_locator(MaxNLocator(4, integer=True))
-    finish(ax, "members")
-
-
-def _bins(values: np.ndarray, log: bool) -> np.ndarray:
-    """Return the edges of 40 bins over the values, or of 41 bins around a constant."""
-    low, high = (values.min(), values.max()) if values.size else (0.0, 1.0)
-    if log:
-        return np.geomspace(low / 1.001, 1.001 * high, 41)
-    if high - low <= 1e-9 * max(abs(low), abs(high)):
-        room = 0.1 * abs(high) or 1.0
-        return np.linspace(low - room, high + room, 42)  # an odd number of bins: the constant is inside one
-    return np.linspace(low, high, 41)
