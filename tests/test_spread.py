@@ -368,7 +368,7 @@ def test_bad_spread_is_one_clear_line(wrong):
         (
             'disturbance.q_z = { kind = "band-noise", std = 1, f_low = 5, f_high = 9 }\n'
             "spread.disturbance.q_z.f_low = { uniform = [1, 9] }",
-            ["spread.disturbance.q_z.f_low", "Narrow the spread."],
+            ["spread.disturbance.q_z.f_low", "Narrow the range."],
         ),
         (
             # the nominal 7.5e4 allows this step, 1.5 times it does not

@@ -11,7 +11,7 @@ from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.distributions import Choice, Distribution, Uniform
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.paths import places
-from ambjax.ensemble.spread import STEP, Spread, apply, check_spread, corners, ends, no_such_number
+from ambjax.ensemble.spread import STEP, Spread, SpreadError, apply, check_spread, corners, ends, no_such_number
 from ambjax.ensemble.study import Study
 from ambjax.simulation.method import choose_method
 from ambjax.simulation.metrics import standard_for
@@ -148,12 +148,12 @@ def _check(study: Study, x: Axis, y: Axis) -> None:
     entries = (*((path, values) for path, (_, values) in axes.items()), *_entries(study, (x.path, y.path)))
     try:
         check_spread(Spread(entries), study.cascade, study.scenario)
-    except ValueError as error:
-        words = str(error)
-        for path, (name, values) in axes.items():
-            low, high = values.support(0.0)
-            words = words.replace(f"spread.{path} = {values}", f"--{name} {path}={low:g}:{high:g}", 1)
-        raise ValueError(words.replace("Narrow the spread", "Narrow it")) from None
+    except SpreadError as error:
+        if error.path not in axes:
+            raise
+        name, values = axes[error.path]
+        low, high = values.support(0.0)
+        raise ValueError(f"--{name} {error.path}={low:g}:{high:g}: {error.reason}") from None
 
 
 def _at_period(study: Study, period: float) -> Study:

@@ -89,6 +89,14 @@ def _nominal(place: Place) -> float:
     return math.nan if place.value is None else float(np.asarray(place.value))
 
 
+class SpreadError(ValueError):
+    """A distribution that is not valid for the number at `path`; `reason` says why, and how to fix it."""
+
+    def __init__(self, path: str, kind: Distribution, reason: str) -> None:
+        super().__init__(f"spread.{path} = {kind}: {reason}")
+        self.path, self.reason = path, reason
+
+
 def check_spread(spread: Spread, cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     """Return the places of all paths, or raise ValueError if the spread is not valid for this cascade and scenario.
 
@@ -135,7 +143,7 @@ def _check_one(path: str, kind: Distribution, place: Place) -> None:
     """Raise ValueError for a distribution that is not valid for its number."""
 
     def refuse(text: str) -> ValueError:
-        return ValueError(f"spread.{path} = {kind}: {text}")
+        return SpreadError(path, kind, text)
 
     if fault := kind.fault():
         raise refuse(f"{fault}.")
@@ -149,7 +157,7 @@ def _check_one(path: str, kind: Distribution, place: Place) -> None:
     low, high = kind.support(nominal)
     if not within(place.field.metadata | {"whole": False}, np.array([low, high])):
         limit = numbers(place.field)
-        raise refuse(f"it reaches from {low:g} to {high:g}, but {path} must be {limit}. Narrow the spread.")
+        raise refuse(f"it reaches from {low:g} to {high:g}, but {path} must be {limit}. Narrow the range.")
     if place.field.metadata["whole"] and not (
         isinstance(kind, Choice) and within(place.field.metadata, np.array(kind.values))
     ):
@@ -168,20 +176,21 @@ def _check_together(
     def refuse(paths: tuple[str, ...], text: str) -> None:
         path = next((p for p in paths if p in kinds), None)
         if path is not None:
-            raise ValueError(f"spread.{path} = {kinds[path]}: {text}")
+            raise SpreadError(path, kinds[path], text)
 
     for low, high in order_pairs(cascade, scenario):
         if not reach(low)[1] < reach(high)[0]:
             move = f", or use {low.rpartition('.')[0]}.shift, which moves both" if low.endswith(".start") else ""
             overlap = f"{low} reaches {reach(low)[1]:g} and {high} comes down to {reach(high)[0]:g}"
-            refuse((low, high), f"{overlap}, but the first must stay below the second. Narrow the spread{move}.")
+            refuse((low, high), f"{overlap}, but the first must stay below the second. Narrow the range{move}.")
     gap, own = "plant.s_0", known["run.clearance"].value is not None or "run.clearance" in kinds
     stops = reach("run.clearance") if own else tuple(0.9 * x for x in reach(gap))
     if not stops[1] < reach(gap)[0] and own:
         refuse(
-            ("run.clearance", gap), f"run.clearance reaches {stops[1]:g} m, but must stay below plant.s_0. Narrow it."
+            ("run.clearance", gap),
+            f"run.clearance reaches {stops[1]:g} m, but must stay below plant.s_0. Narrow the range.",
         )
     far = max(map(abs, reach("initial.z")))
     if not far < stops[0]:
-        text = f"|initial.z| reaches {far:g} m, but must stay below the clearance, {stops[0]:g} m. Narrow the spread."
+        text = f"|initial.z| reaches {far:g} m, but must stay below the clearance, {stops[0]:g} m. Narrow the range."
         refuse(("initial.z", "run.clearance", gap), text)
