@@ -680,14 +680,14 @@ SEARCH = [
     ),
     M(
         "the growth of an unstable loop has no derivative",
-        "ambjax/linear/loop_quantities.py",
+        "ambjax/linear/differentiable.py",
         "pole = poles[k] + u @ ((system.A - A) @ v) / (u @ v)",
         "pole = poles[k]",
         "tests/test_tuning_loops.py::test_an_unstable_loop_has_a_finite_value_whose_derivative_points_to_stability",
     ),
     M(
         "a delay margin has the derivative at a fixed crossing",
-        "ambjax/linear/loop_quantities.py",
+        "ambjax/linear/differentiable.py",
         "shift = -jnp.log(jnp.abs(L[1])) / jnp.real(slope)",
         "shift = 0.0",
         "tests/test_tuning_loops.py::test_the_derivative_of_a_limit_is_that_of_differences",
