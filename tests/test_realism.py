@@ -300,7 +300,8 @@ def test_the_bearing_of_the_data_sheet_is_plausible_and_without_warnings():
         case.cascade, dataclasses.replace(spread, plant=heavy), clock, fold=amb.Standard(0.05)
     ).measured
     assert np.isinf(found["lost_at_s"]).all()
-    assert np.max(found["settled_rms_error_m"]) < 2e-6  # 1.3 um on average
+    # 1.5 um over the whole run; the transient of the step of force is a third of what is averaged here
+    assert np.max(found["settled_rms_error_m"]) < 3e-6
 
 
 def test_parts_can_be_spread():
