@@ -23,7 +23,7 @@ from ambjax.linear import (
     peak,
 )
 from ambjax.linear.equilibrium import ideal
-from ambjax.linear.loop_matrices import loop_matrices
+from ambjax.linear.matrices import loop_matrices
 from ambjax.numerics.records import canonical
 from ambjax.simulation.explicit import DOP853
 from ambjax.simulation.rollout import prepare

@@ -15,8 +15,8 @@ controller reads per e, T = S - 1 what the plant adds, and KS = u/e. In continuo
 from ambjax.linear.analysis import Analysis, Zones, analyse, linearise, linearise_members, prepared
 from ambjax.linear.differentiable import LoopQuantities, loop_quantities
 from ambjax.linear.injection import Injection, injected, lines
-from ambjax.linear.loop_matrices import loop_matrices
 from ambjax.linear.margins import Margins, ResponsePeak, margins_of, noise_gain, peak
+from ambjax.linear.matrices import loop_matrices
 from ambjax.linear.state_space import INPUTS, OUTPUTS, StateSpace
 
 __all__ = [

@@ -8,8 +8,8 @@ import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
-from ambjax.linear.loop_matrices import loop_matrices
 from ambjax.linear.margins import STATIC, Margins, ResponsePeak, margins_of, noise_gain, peak, poles_in_s
+from ambjax.linear.matrices import loop_matrices
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical, leaf, record
 from ambjax.simulation.clock import Clock
