@@ -50,4 +50,6 @@ def test_values_and_derivatives_are_finite_over_six_decades_of_every_gain(laws, 
         slopes, values = jax.jit(jax.vmap(mode(loss, has_aux=True)))(points)
         assert np.isfinite(values).all()
         assert np.isfinite(slopes).all()
-        assert np.abs(slopes).sum(axis=0).all()  # every gain matters somewhere
+        # every gain matters somewhere, but the rate of the dead-beat law, which only its form in continuous time has
+        unused = [laws["current"] == "dead-beat" and gain.name == "w" for gain in space.gains]
+        np.testing.assert_array_equal(np.abs(slopes).sum(axis=0) == 0, unused)

@@ -187,7 +187,7 @@ def test_slopes_of_what_limits_hold_three_ways():
     forward, reverse = (Engine(made.objective, settle=0.01, mode=mode, threads=1) for mode in ("forward", "reverse"))
     value, slopes, _ = forward.gradient(x[None], members, made.goal.weights)
     other, back, _ = reverse.gradient(x[None], members, made.goal.weights)
-    assert value.shape == (1, 2, 1 + len(KINDS))
+    assert value.shape == (1, 2, 1 + sum(kind.fold is not None for kind in KINDS.values()))
     np.testing.assert_allclose(value, other, rtol=1e-12)
     size = np.abs(slopes).max(axis=-1, keepdims=True)
     np.testing.assert_allclose(slopes / size, back / size, atol=1e-9)
