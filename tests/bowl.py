@@ -144,7 +144,7 @@ BUDGET = {
 def document(tables=None, **tune):
     """A case file whose two gains are tuned, as read from TOML; `tables` replace those of CASE."""
     limits = {"sensitivity": math.inf} | tune.pop("limits", {})
-    told = {
+    settings = {
         "objective": "least_error",
         "gains": PATHS,
         "bounds": BOUNDS,
@@ -153,7 +153,7 @@ def document(tables=None, **tune):
         **BUDGET,
         **tune,
     }
-    return CASE | (tables or {}) | {"tune": told}
+    return CASE | (tables or {}) | {"tune": settings}
 
 
 def instead_of_engines(monkeypatch, world):

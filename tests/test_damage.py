@@ -376,7 +376,7 @@ def test_a_study_that_ended_before_its_first_chunk_is_resumed(tmp_path, whole):
 
 # --- the checkpoints of a search ---
 
-TOLD = {"case": {"plant": {"m": 0.5}}, "tune": {"members": 4}}
+SEARCH_FACTS = {"case": {"plant": {"m": 0.5}}, "tune": {"members": 4}}
 STARTS, GAINS, ITERATIONS = 3, 4, 2
 
 
@@ -396,7 +396,7 @@ def search_of(descent, starts=STARTS, gains=GAINS):
 
 @pytest.fixture
 def checkpoint(tmp_path, descent):
-    keeper = Keeper(tmp_path / "checkpoint-2.npz", TOLD, 2)
+    keeper = Keeper(tmp_path / "checkpoint-2.npz", SEARCH_FACTS, 2)
     keeper.save(search_of(descent))
     return keeper
 
@@ -414,19 +414,19 @@ def test_a_checkpoint_is_the_search(checkpoint, descent):
 
 
 def fewer_starts(path):
-    Keeper(path, TOLD, 2).save(search_of(Descent(None, "bfgs", 0.1), starts=STARTS - 1))
+    Keeper(path, SEARCH_FACTS, 2).save(search_of(Descent(None, "bfgs", 0.1), starts=STARTS - 1))
 
 
 def fewer_gains(path):
-    Keeper(path, TOLD, 2).save(search_of(Descent(None, "bfgs", 0.1), gains=GAINS - 1))
+    Keeper(path, SEARCH_FACTS, 2).save(search_of(Descent(None, "bfgs", 0.1), gains=GAINS - 1))
 
 
 def another_optimiser(path):
-    Keeper(path, TOLD, 2).save(search_of(Descent(None, "adam", 0.1)))
+    Keeper(path, SEARCH_FACTS, 2).save(search_of(Descent(None, "adam", 0.1)))
 
 
 def of_another_round(path):
-    Keeper(path, TOLD, 1).save(search_of(Descent(None, "bfgs", 0.1)))
+    Keeper(path, SEARCH_FACTS, 1).save(search_of(Descent(None, "bfgs", 0.1)))
 
 
 def no_history(arrays, facts):
@@ -483,9 +483,9 @@ def test_a_folder_in_place_of_a_checkpoint_is_told_by_name_and_left(checkpoint, 
             "case.plant.m is 0.5 in the file and 0.6 in this run",
         ),
         ({"case": {"plant": {"m": 0.5}}, "tune": {"members": 5}}, "tune.members is 4 in the file and 5 in this run"),
-        (TOLD | {"version": "0"}, "in the file and 0 in this run"),
-        (TOLD | {"jax": "0"}, "in the file and 0 in this run"),
-        (TOLD | {"precision": "float32"}, "precision is float64 in the file and float32 in this run"),
+        (SEARCH_FACTS | {"version": "0"}, "in the file and 0 in this run"),
+        (SEARCH_FACTS | {"jax": "0"}, "in the file and 0 in this run"),
+        (SEARCH_FACTS | {"precision": "float32"}, "precision is float64 in the file and float32 in this run"),
     ],
 )
 def test_a_checkpoint_of_another_search_is_refused_in_words(other, words, checkpoint, descent):

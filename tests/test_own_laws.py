@@ -73,7 +73,7 @@ objective = "least_error"
 limits.sensitivity = inf
 gains = ["controller.position.damp"]
 """
-TOLD = "case.toml: controller.position.kind: imported PD from "
+IMPORTED = "case.toml: controller.position.kind: imported PD from "
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -99,7 +99,7 @@ def test_every_command_takes_it_and_says_what_it_imports(command, case, capsys):
     assert main([*command.split(), "--out", "there"] if "check" not in command else command.split()) in (0, 1)
     out, err = capsys.readouterr()
     json.loads(out)  # what the file prints does not stand on stdout
-    assert err.count(f"{TOLD}{pathlib.Path('mine.py').resolve()}\n") == 1
+    assert err.count(f"{IMPORTED}{pathlib.Path('mine.py').resolve()}\n") == 1
 
 
 def test_nothing_is_imported_unless_a_case_names_it(case, capsys):
@@ -259,7 +259,7 @@ def test_it_is_tuned_and_a_search_is_not_resumed_with_another_law(case, monkeypa
     small = "members = 2\nstressed = 1\nvalidation = 2\nheld_out = 2\nscreen = 2\nstarts = 1\niterations = 1\n"
     write(CASE + small)
     assert tune_main(["case.toml", "--out", "there"]) in (0, 1)
-    assert TOLD in capsys.readouterr().err
+    assert IMPORTED in capsys.readouterr().err
     tuned = read_case("there/tuned.toml")
     assert tuned.own_laws[0].kind == "../mine.py:PD"
     assert tuned.own_laws[0].law is read_case(case).own_laws[0].law

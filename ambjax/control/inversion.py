@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import functools
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -31,11 +31,8 @@ def v_and_gradient(model: Plant, inputs: ForceDemand, i_ref: Array) -> tuple[Arr
 
 
 @record
-class Adaptive(InversionLaw[Array]):
-    """i_ref' = gamma sgn(v_star - v(z, i_ref)) / (dv/di)(z, i_ref), with i_ref as its state. Eq. (6), sgn smoothed.
-
-    Deviation: the default gamma is 7.5e4; the printed 1000 violates the paper's own Eq. (7).
-    """
+class AdaptiveReference(InversionLaw[Array]):
+    """Base class of a law whose state is i_ref (A), moved by a smoothed sign of v_tilde with the gain gamma."""
 
     gamma: Scalar = gain(default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above Delta_1 of Eq. (7)")
     p: Scalar = gain(
@@ -45,13 +42,12 @@ class Adaptive(InversionLaw[Array]):
         steepness=True,
     )
     i_ref: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="initial current reference")
-    requirement: ClassVar = Requirement("gamma", "Delta_1")
     memory = (("i_ref", "A", "current reference of the next sample"),)
 
     def init(self, model: Plant) -> Array:
         return jnp.asarray(self.i_ref)
 
-    def started(self, i_ref: Array) -> "Adaptive":
+    def started(self, i_ref: Array) -> Self:
         return dataclasses.replace(self, i_ref=i_ref)
 
     def scale(self, model: Plant) -> Scalar:
@@ -66,6 +62,16 @@ class Adaptive(InversionLaw[Array]):
     def layer(self, model: Plant) -> Scalar:
         """Return a third of the width of the smoothed sign in i_ref (A): v_tilde = 1/p divided by dv/di(0, 0)."""
         return 0.3 / (self.p * model.dv_di(0.0, 0.0))
+
+
+@record
+class Adaptive(AdaptiveReference):
+    """i_ref' = gamma sgn(v_star - v(z, i_ref)) / (dv/di)(z, i_ref), with i_ref as its state. Eq. (6), sgn smoothed.
+
+    Deviation: the default gamma is 7.5e4; the printed 1000 violates the paper's own Eq. (7).
+    """
+
+    requirement: ClassVar = Requirement("gamma", "Delta_1")
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:
         v, gradient = v_and_gradient(model, inputs, state)
@@ -105,7 +111,7 @@ class Adaptive(InversionLaw[Array]):
 
 
 @record
-class FeedForwardAdaptive(InversionLaw[Array]):
+class FeedForwardAdaptive(AdaptiveReference):
     """i_ref' = (gamma sgn(w) + v_star' - dv/dz z')/(dv/di), w = v_star - v(z, i_ref): Eq. (6) with d of Eq. (8) added.
 
     The feed-forward of the rates of v_star and z cancels d, so that w' = -gamma sgn(w) on a known plant: gamma exceeds
@@ -114,33 +120,6 @@ class FeedForwardAdaptive(InversionLaw[Array]):
     """
 
     gamma: Scalar = gain(default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above the error of the rates")
-    p: Scalar = gain(
-        default=25.0,
-        unit="m^2/A^2",
-        doc="steepness of the smoothed sign of v_tilde; left out: scaled to the plant",
-        steepness=True,
-    )
-    i_ref: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="initial current reference")
-    memory = (("i_ref", "A", "current reference of the next sample"),)
-
-    def init(self, model: Plant) -> Array:
-        return jnp.asarray(self.i_ref)
-
-    def started(self, i_ref: Array) -> "FeedForwardAdaptive":
-        return dataclasses.replace(self, i_ref=i_ref)
-
-    def scale(self, model: Plant) -> Scalar:
-        return model.i_0 / 25
-
-    def slope(self, model: Plant) -> Scalar:
-        return TWO_OVER_PI * self.gamma * self.p
-
-    def size(self, model: Plant) -> Scalar:
-        return model.v_size
-
-    def layer(self, model: Plant) -> Scalar:
-        """Return a third of the width of the smoothed sign in i_ref (A), as `Adaptive.layer`."""
-        return 0.3 / (self.p * model.dv_di(0.0, 0.0))
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:
         v, gradient = v_and_gradient(model, inputs, state)
