@@ -16,13 +16,13 @@ from ambjax.host.words import one_line
 FIRST_DAY = """\
 ambjax simulates, checks, tunes and exports the controller of a rotor in an active magnetic bearing.
 
-  ambjax template rig > my.toml       print an annotated case file; put in the numbers of your bearing
+  ambjax template rig > my.toml       print a case file with comments; enter the numbers of your bearing
   ambjax simulate my.toml             simulate it: trajectory.npz, metrics.json, overview.png
-  ambjax check my.toml                check stability conditions, slopes and delay margin
+  ambjax check my.toml                check the sensitivity, margins and stability conditions
   ambjax tune my.toml --out tuned     tune the gains: tuned/tuned.toml, tuned/report.html
   ambjax export tuned/tuned.toml      write the controller as C
 
-'ambjax --help' lists all commands; 'ambjax COMMAND --help' lists the options of one."""
+'ambjax --help' lists all commands, 'ambjax COMMAND --help' the options of a command."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -41,7 +41,8 @@ def complain(message: str, program: str = "ambjax") -> int:
 
 def parser() -> Parser:
     """Return the argument parser with all commands and their options."""
-    top = Parser(prog="ambjax", description="Simulate and check a rotor in an active magnetic bearing.")
+    about = "Simulate, check, tune and export the controller of a rotor in an active magnetic bearing."
+    top = Parser(prog="ambjax", description=about)
     top.add_argument("--version", action="version", version=f"ambjax {__version__}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
 
@@ -51,19 +52,23 @@ def parser() -> Parser:
             added.add_argument("case", metavar="CASE.toml", help="a case file; 'ambjax template' prints one")
         if out:
             added.add_argument("--out", metavar="DIR", help="output directory (default: a new directory under ./out)")
+        if out and name not in ("ensemble", "export"):  # these refuse by themselves what is not theirs
+            added.add_argument("--force", action="store_true", help="overwrite the files of an earlier run in --out")
         added.add_argument("--json", action="store_true", help="print only a machine-readable summary")
         return added
 
-    command("reproduce", "run the paper: both scenarios, Figures 3 to 6 and the ledger of claims", out=True)
-    template = command("template", "print an annotated case file")
+    command("reproduce", "reproduce Section 4 of the paper: Figures 3 to 6, and a ledger of its claims", out=True)
+    template = command("template", "print a case file with comments")
     cases = ["tracking", "regulation", "rig", "bearing"]
-    template.add_argument("scenario", nargs="?", default=cases[0], choices=cases)
+    meaning = "the paper's tracking or regulation, a laboratory rig, or a bearing from a data sheet"
+    template.add_argument("scenario", nargs="?", default=cases[0], choices=cases, help=meaning)
     simulate = command("simulate", "simulate a case: trajectory.npz, metrics.json, overview.png", case=True, out=True)
     simulate.add_argument(
         "--member", type=int, metavar="K", help="simulate member K of the ensemble, with its values drawn from [spread]"
     )
     _seed_option(simulate)
-    simulate.add_argument("--members", type=int, metavar="N", help="size of the ensemble (for a Latin hypercube)")
+    meaning = "number of members of the ensemble; required if [spread] is a Latin hypercube"
+    simulate.add_argument("--members", type=int, metavar="N", help=meaning)
     simulate.add_argument("--from", dest="begin", type=float, metavar="T", help="plot the run from time T (s)")
     simulate.add_argument("--to", dest="end", type=float, metavar="T", help="plot the run up to time T (s)")
     ensemble = command("ensemble", "simulate many members: members.npz, summary.json, fan.png", case=True, out=True)
@@ -79,12 +84,15 @@ def parser() -> Parser:
     workers = ensemble.add_mutually_exclusive_group()
     workers.add_argument("--processes", type=int, metavar="P", help="run in P processes (default: threads of one)")
     workers.add_argument("--cluster", metavar="ADDRESS", help="run on the Dask cluster whose scheduler is at ADDRESS")
-    grid = command("map", "survival and error over a grid of two quantities: map.png, map.json", case=True, out=True)
+    summary = "map survival and error over a grid of two quantities: map.png, map.json"
+    grid = command("map", summary, case=True, out=True)
     for axis in ("--x", "--y"):
-        form = "PATH=LOW:HIGH[:COUNT][:log]"
-        grid.add_argument(axis, metavar=form, required=True, help="a quantity and its range, absolute or in per cent")
+        form, meaning = "PATH=LOW:HIGH[:COUNT][:log]", "quantity of this axis and its range, in SI units or per cent"
+        grid.add_argument(axis, metavar=form, required=True, help=meaning)
     grid.add_argument("--members", type=int, metavar="N", default=1, help="members per cell (default: 1)")
-    grid.add_argument("--against", metavar="OTHER.toml", action="append", help="a second case to compare (repeatable)")
+    grid.add_argument(
+        "--against", metavar="OTHER.toml", action="append", help="another case for the same grid (repeatable)"
+    )
     _seed_option(grid)
     summary = "check the conditions of Theorem 1, or those of the case's processor; exit code 1 if one fails"
     command("check", summary, case=True)
@@ -92,7 +100,7 @@ def parser() -> Parser:
     sensitivity = command("sensitivity", summary, case=True, out=True)
     sensitivity.add_argument("--members", type=int, metavar="N", help="members of [spread] to analyse (default: 100)")
     sensitivity.add_argument(
-        "--inject", action="store_true", help="also inject a multi-sine in continuous time; on a processor it always is"
+        "--inject", action="store_true", help="inject a multi-sine in continuous time too; always done on a processor"
     )
     _seed_option(sensitivity)
     summary = "compare cases on the same members: compare.html, compare.json, compare.png"
@@ -100,29 +108,29 @@ def parser() -> Parser:
     compare.add_argument("cases", metavar="CASE.toml", nargs="+", help="two to eight case files")
     compare.add_argument("--members", type=int, metavar="N", default=200, help="number of members (default: 200)")
     compare.add_argument(
-        "--tune", action="store_true", help="first tune each case, with limits, loss and budget of the first's [tune]"
+        "--tune", action="store_true", help="first tune each case, with limits, loss and budget of the first case"
     )
     _seed_option(compare)
     export = command("export", "write the controller of a case with [processor] as C", case=True, out=True)
     export.add_argument("--verify", action="store_true", help="compare the C with JAX; exit code 1 if they differ")
     export.add_argument("--precision", choices=["float", "double"], default="float", help="C type of all numbers")
-    export.add_argument("--prefix", metavar="NAME", help="prefix of all C names (default: the case's name)")
+    export.add_argument("--prefix", metavar="NAME", help="prefix of all names in the C code (default: the case's name)")
     # Listed for --help only; main passes the arguments of `tune` to the tuner's own parser.
-    command("tune", "tune the gains of a case by gradients: tuned.toml, report.html")
+    command("tune", "tune the gains of a case on an ensemble of rotors: tuned.toml, report.html")
     return top
 
 
 def _seed_option(command: Parser) -> None:
     command.add_argument(
-        "--seed", type=int, metavar="S", help="seed of noise and spread (default: run.seed of the case)"
+        "--seed", type=int, metavar="S", help="seed of the noise and of [spread] (default: run.seed of the case)"
     )
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command and return its exit code: 0 done, 1 done but the answer is no, 2 wrong input.
+    """Run a command and return its exit code. Without a command, print the commands that a new user runs first.
 
-    0: done. 1: done, and the answer is no. 2: bad input. Without a command, print the commands that a new user runs
-    first.
+    `argv`: the arguments; None: those of the process. Exit codes: 0 done; 1 done, and the answer is no (the rotor is
+    lost, a condition fails); 2 bad input; 130 interrupted.
     """
     words = sys.argv[1:] if argv is None else argv
     if words[:1] == ["tune"]:
@@ -133,7 +141,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _tune(words: list[str]) -> int:
-    """Run the tuner's command, or report that it is missing."""
+    """Run `ambjax tune` and return its exit code; report an error if the package `tuning` is missing."""
     from ambjax.host.extensions import extension
 
     try:
@@ -157,11 +165,11 @@ Run = Callable[[argparse.Namespace], tuple[int, object]]
 
 
 def answer(parser: argparse.ArgumentParser, words: list[str] | None, run: Run) -> int:
-    """Parse `words`, run the command, print its summary with --json, and return the exit code.
+    """Parse the arguments `words`, call `run`, print its summary with --json, and return the exit code.
 
-    An error is printed on one line of stderr. A stream that cannot be written does not stop the command. A pipe closed
-    by the reader (`| head`) is no error; any other failure of stdout gives exit code 2. Raises SystemExit for --help,
-    --version and wrong arguments, as argparse does.
+    `run` returns an exit code and a summary. An error is printed on one line of stderr. The command continues if stdout
+    cannot be written. A pipe that its reader has closed (`| head`) is no error; any other failure of stdout gives exit
+    code 2. Raises SystemExit for --help, --version and wrong arguments, as argparse does.
     """
     with lenient() as stdout:
         try:
@@ -180,7 +188,7 @@ def answer(parser: argparse.ArgumentParser, words: list[str] | None, run: Run) -
 
 
 def _code(run: Callable[[], tuple[int, object]], as_json: bool, program: str) -> int:
-    """Call `run` and return its exit code; convert the errors that a user can fix into one line and a code."""
+    """Call `run` and return its exit code. Print an error that a user can fix on one line, and return its code."""
     try:
         code, summary = run()
         if as_json:

@@ -11,11 +11,14 @@ import _measure
 HEAD = """# Benchmarks
 
 `python benchmarks/report.py` generates this page from the JSON files in `results/`. Do not edit it.
-Each ratio compares two times of the same run of a script. Absolute times depend on the machine and its load.
+Both times of a ratio come from the same run of a script. Absolute times depend on the machine and its load.
 
 The comparison with other libraries and the scaling were measured before metrics included substeps; ensembles with
-all metrics cost more now. The times of `ambjax tune` and of the search were measured on a machine with other load,
-all other times on an idle machine.
+all metrics are slower now. The times of `ambjax tune` and of the search were measured while other programs ran, all
+other times on an idle machine.
+
+The scenario is the paper's tracking scenario with the disturbance as a scaled force, unless a section names another.
+Smooth gains are gamma = 1e9 and p = 25e-6 in the inversion; repaired gains are gamma = 7.5e4 and p = 25.
 
     .venv/bin/pip install -e '.[bench]'
     .venv/bin/python benchmarks/single.py            # one run against SciPy and diffrax
@@ -35,6 +38,7 @@ all other times on an idle machine.
     .venv/bin/python benchmarks/bearings.py          # other bearings, and the templates
     .venv/bin/python benchmarks/laws.py              # control structures against each other
     .venv/bin/python benchmarks/search.py            # the search against derivative-free methods
+    .venv/bin/python benchmarks/schedules.py         # 24 scheduled gains: the search against CMA-ES
     .venv/bin/python benchmarks/from_answer.py       # CMA-ES started from a tuned answer
     .venv/bin/python benchmarks/export.py            # a step of an exported controller, also on a Cortex-M4F
     .venv/bin/python benchmarks/report.py
@@ -57,7 +61,8 @@ def single() -> list[str]:
     data = load("single")
     lines = ["## One run of 2 s, at equal accuracy (`single.py`)", "", facts(data["machine"])]
     lines += [
-        f"Each solver uses its cheapest tolerance with a largest error in z of at most {data['target_error_m']:g} m.",
+        "Each solver uses its cheapest tolerance for which the largest error in z is at most",
+        f"{data['target_error_m']:g} m.",
         "",
     ]
     for gains in ("smooth", "repaired"):
@@ -83,7 +88,7 @@ def work_precision() -> list[str]:
         "## Work against precision (`work_precision.py`)",
         "",
         facts(data["machine"]),
-        "0.2 s simulated at 10 kHz.",
+        "Each run simulates 0.2 s at 10 kHz. References are two solutions with much smaller errors.",
         "",
     ]
     lines += ["![work against precision](results/work_precision.png)", ""]
@@ -108,8 +113,8 @@ def throughput() -> list[str]:
     lines = ["## Ensembles against the machine's limit (`throughput.py`)", "", facts(data["machine"])]
     lines += [
         f"RK4 with steps of 10 us, {data['samples']} samples of 10 steps. Times are in ns per member and step,",
-        "without compilation. The limit is a C program with SIMD (`limit.c`), run alternately with ambjax. One",
-        "member alone is a `rollout`. Times one core: speed relative to one core; in brackets that of the limit.",
+        "without compilation. The limit is a C program with SIMD (`limit.c`); the two programs run alternately. A",
+        "single member is a `rollout`. Speed-up: speed relative to one core, in brackets that of the limit.",
         "",
     ]
     rows = []
@@ -118,7 +123,7 @@ def throughput() -> list[str]:
         limit = [f"{row['C']:.2f}", f"{row['ratio']:.2f}"] if "C" in row else ["", ""]
         gain = f"{row['times_one_core']:.2f}" + (f" ({row['C_times_one_core']:.2f})" if "C" in row else "")
         rows.append([*named, f"{row['ambjax']:.2f}", *limit, gain, f"{1e9 / row['ambjax']:.2e}"])
-    titles = "precision | noise | members | cores | ambjax (ns) | limit (ns) | ratio | times one core | member-steps/s"
+    titles = "precision | noise | members | cores | ambjax (ns) | limit (ns) | ratio | speed-up | member-steps/s"
     lines += table(titles, rows)
     return lines
 
@@ -127,10 +132,11 @@ def peers() -> list[str]:
     data = load("peers")
     lines = ["## Ensembles against other libraries (`peers.py`)", "", facts(data["machine"])]
     lines += [
-        "One core, no noise. Times are in ns per member and 10 us simulated. Fixed-step peers take RK4 steps of 10",
-        "us and are compared with the same steps. Adaptive peers (tolerance 1e-6) are compared with the cheapest",
-        "step of ambjax that reaches their measured error, and with the cheapest whose error is at most 1e-6 of the",
-        f"largest z ({data['largest_z_m']:.1e} m).",
+        "One core, no noise. Times are in ns per member and per 10 us of simulated time. Libraries with fixed steps",
+        "take RK4 steps of 10 us and are compared with the same steps of ambjax. Adaptive solvers (tolerance 1e-6) are",
+        "compared with the cheapest step of ambjax that reaches their measured error (column `with`), and with the",
+        "cheapest step whose error is at most 1e-6 of the largest z",
+        f"({data['largest_z_m']:.1e} m; column `at 1e-6 by`).",
         "",
     ]
     rows = []
@@ -145,8 +151,8 @@ def peers() -> list[str]:
 def scaling() -> list[str]:
     data = load("scaling")
     lines = ["## Cost and memory against size (`scaling.py`)", "", facts(data["machine"])]
-    lines += ["Held noise, float64, one core, one process per point. Relative: time per member and step relative to"]
-    lines += ["1,024 members and 200 samples, run alternately with the point.", ""]
+    lines += ["Held noise, float64, one core, one process per row. Relative: time per member and step over that of"]
+    lines += ["1,024 members and 200 samples, measured alternately.", ""]
     for name in ("members", "samples"):
         rows = []
         for row in data[name]["rows"]:
@@ -176,7 +182,8 @@ def gradients() -> list[str]:
     data = load("gradients")
     lines = ["## Cost of a gradient of four gains (`gradients.py`)", "", facts(data["machine"])]
     lines += [
-        "One core, float64. Costs are in forward runs with the same code and step. The tuner uses forward mode.",
+        "One core, float64. The cost of a gradient is its time over that of a forward run with the same code and",
+        "step. The tuner uses forward mode.",
         "",
     ]
     rows = []
@@ -195,9 +202,9 @@ def sampled() -> list[str]:
     first = data["rows"][0]
     lines += [
         f"{first['members']:,} members, float64, one core, held noise, 10 kHz, one sample of delay with prediction,",
-        f"{first['substeps']} substeps. Times are in ns per member and sample. C: `sampled.c`; its error is relative",
-        f"to a `rollout` under the same noise. Gradient: 4 gains, forward mode, {data['tangents_of']} members, in",
-        "forward runs.",
+        f"{first['substeps']} substeps. Times are in ns per member and sample. C: the program `sampled.c`. Error:",
+        "largest relative difference between C and a `rollout` under the same noise. Gradient: cost of a gradient",
+        f"of 4 gains in forward mode for {data['tangents_of']} members, in forward runs.",
         "",
     ]
     rows = []
@@ -213,9 +220,10 @@ def tasks() -> list[str]:
     lines = ["## The tuning tasks (`tasks.py`)", "", facts(data["machine"])]
     lines += [
         "`ambjax tune` runs with its defaults, from gains that lose the rotor. Exceptions: E minimises the mean of",
-        "the worst tenth of 64 members, and the pole of the observer ranges from 0.999 to 1e4. Figures are over the",
-        "held-out members. Steps: error of the settled rms error with the steps of the search, against adaptive",
-        "RODAS3. u: after settling. Seconds: processor time of the whole command, on a machine with other load.",
+        "the worst tenth of 64 members, and the pole of the observer ranges from 0.999 to 1e4. Errors and voltages are",
+        "those of the held-out members. Steps: relative error of the settled rms error due to the steps of the search,",
+        "compared with adaptive RODAS3. u rms: after settling. Processor: processor time of the whole command,",
+        "while other programs ran.",
         "",
     ]
     return lines + _tasks(data)
@@ -226,9 +234,9 @@ def bearings() -> list[str]:
     lines = ["## Other bearings and the templates (`bearings.py`)", "", facts(data["machine"])]
     verified = sum(row["verified"] for row in data["tasks"].values())
     lines += [
-        "As above, without manual intervention. The gains of the templates hold the rotor at the start. The",
-        f"reference is constant in all tasks but `tracking`. Accurate steps confirm {verified} of",
-        f"{len(data['tasks'])} answers.",
+        "`ambjax tune` runs as in the tuning tasks, without manual intervention. The initial gains of the templates",
+        "hold the rotor. The reference is constant in all tasks except `tracking`. Simulations with accurate steps",
+        f"confirm {verified} of {len(data['tasks'])} answers.",
         "",
     ]
     return lines + _tasks(data)
@@ -255,10 +263,11 @@ def sampled_tasks() -> list[str]:
     data = load("sampled_tasks")
     lines = ["## The tuning tasks on a processor (`sampled_tasks.py`)", "", facts(data["machine"])]
     lines += [
-        "As above, on a processor of 10 or 20 kHz with a delay of one sample. Bar: settled rms error that CMA-ES",
-        "reached in 2 x 900 evaluations on 6 members with an independent simulator of the same loop. Seconds in",
-        "brackets: the same task in continuous time. p: of the position, inversion and current laws. Bounds: at most",
-        "a fifth of the sample rate for c, at least 0.05 1/s for l.",
+        "`ambjax tune` runs as in the tuning tasks, on a processor of 10 or 20 kHz with a delay of one sample. CMA-ES:",
+        "settled rms error that CMA-ES reached in 2 x 900 evaluations on 6 members with an independent simulator of",
+        "the same loop. Variation of u: total variation of the voltage after settling. Processor, in brackets: the",
+        "same task in continuous time. The values of p are those of the position, inversion and current laws. c is",
+        "at most a fifth of the sample rate, l at least 0.05 1/s.",
         "",
     ]
     rows = []
@@ -270,8 +279,8 @@ def sampled_tasks() -> list[str]:
         continuous = row.get("continuous", {}).get("processor_s")
         cells += [f"{row['processor_s']:.0f}" + (f" ({continuous:.0f})" if continuous else ""), _gains(row)]
         rows.append(cells)
-    titles = "task | bar (m) | settled rms error (m) | largest (m) | lost | u rms (V) | u moves by (V) | rollouts | "
-    return lines + table(titles + "processor (s) | gains", rows)
+    titles = "task | CMA-ES (m) | settled rms error (m) | largest (m) | lost | u rms (V) | variation of u (V) | "
+    return lines + table(titles + "rollouts | processor (s) | gains", rows)
 
 
 def search() -> list[str]:
@@ -280,11 +289,12 @@ def search() -> list[str]:
     lines = ["## The search against derivative-free methods (`search.py`)", "", facts(data["machine"])]
     lines += [
         "All methods use the same loss, members, coordinates and ranges. TPE may leave the ranges by half their",
-        "width, random search may not. The budget of rollouts is the median that the gradient search takes over its",
-        "seeds, or a multiple of it. Loss: median and range over seeds. Powell's method is deterministic;",
-        "Nelder-Mead and CMA-ES have deterministic starting points. Reached: rollouts until the final median loss of",
-        "the gradient search, median over seeds; a dash: not within the budget. Rollouts do not measure cost,",
-        "because padded lanes are computed too; the time is processor time of one search on one core.",
+        "width, random search may not. The budget of rollouts is the median number of rollouts of the gradient search",
+        "over its seeds, or a multiple of it. Loss: median and range over seeds. Powell's method is deterministic;",
+        "Nelder-Mead and CMA-ES have deterministic starting points. Reached: number of rollouts until a method",
+        "reaches the final median loss of the gradient search, median over seeds; a dash: not within the budget.",
+        "The number of rollouts does not measure the cost, because a call always computes a full batch, of which",
+        "only the needed members count. Time: processor time of one search on one core.",
         "",
     ]
     rows = []
@@ -302,15 +312,56 @@ def _search(task: str, method: str, seeds: list[dict[str, Any]]) -> list[str]:
     return [task, method, loss, f"{spent:,}", f"{seconds:.0f}", f"{reached:,}" if math.isfinite(reached) else "-"]
 
 
+def schedules() -> list[str]:
+    """Return a table of the tuner's search against CMA-ES with scheduled gains, and the cost of their gradient."""
+    data = load("schedules")
+    each, seconds = data["cost"]["forward"], data["seconds"]
+    ends = {name: [rows[-1] for rows in seeds] for name, seeds in data["methods"].items()}
+    least = min(_rollouts(row, each) for rows in ends.values() for row in rows)
+    goal = statistics.median(row[3] for row in ends["CMA-ES"])
+    lines = ["## Scheduled gains (`schedules.py`)", "", facts(data["machine"])]
+    lines += [
+        f"Task G20, cut to {data['simulated_s']:g} s and {data['members']} members. {data['gains']} gains: three knots",
+        "for each of the eight. Both searches begin where the rotor is lost: CMA-ES in the middle of the ranges, the",
+        "tuner's search with a screen of constant gains. Where a descent stalls, the tuner's search continues with",
+        f"CMA-ES. A gradient of all gains costs {each:.1f} plain rollouts in forward mode, which the search uses, and",
+        f"{data['cost']['reverse']:.1f} in reverse mode (ratios of processor time); it is counted as {each:.1f}.",
+        f"Losses: median and range over {len(ends['CMA-ES'])} seeds, at {seconds:g} s of processor time on one core,",
+        f"without compilation, and at {least:,.0f} rollouts. Reached: rollouts until the median loss of CMA-ES at its",
+        "end, median over seeds. The machine had other load.",
+        "",
+    ]
+    rows = []
+    for name, seeds in data["methods"].items():
+        equal = [max((row for row in rows if _rollouts(row, each) <= least), key=lambda row: row[2]) for rows in seeds]
+        reached = [next((_rollouts(r, each) for r in rows if r[3] <= goal), math.inf) for rows in seeds]
+        median = statistics.median(reached)
+        spent = statistics.median(_rollouts(row, each) for row in ends[name])
+        found = [_losses([row[3] for row in some]) for some in (ends[name], equal)]
+        rows.append([name, *found, f"{spent:,.0f}", f"{median:,.0f}" if math.isfinite(median) else "-"])
+    titles = f"method | loss at {seconds:g} s | loss at equal rollouts | rollouts in {seconds:g} s | reached"
+    return lines + table(titles, rows)
+
+
+def _rollouts(row: list[float], each: float) -> float:
+    """Return the rollouts of a row of a trace; a gradient counts as `each`."""
+    return row[0] + each * row[1]
+
+
+def _losses(logs: list[float]) -> str:
+    low, middle, high = (math.exp(f(logs)) for f in (min, statistics.median, max))
+    return f"{middle:.3e} ({low:.3e} to {high:.3e})"
+
+
 def from_answer() -> list[str]:
     """Return a table with one row for each task."""
     data = load("from_answer")
     lines = ["## CMA-ES from the answer of a search (`from_answer.py`)", "", facts(data["machine"])]
     lines += [
-        "Each task is tuned with its defaults. CMA-ES then continues from the answer, on the training ensemble and",
-        "the 16 validation members with the least clearance, with limits as penalties. Lower by: reduction of the",
-        "settled rms error of the 1,000 held-out members at its best point and at its last mean, with the number of",
-        "lost members and the limits broken there.",
+        "Each task is tuned with its defaults. CMA-ES then continues from the tuned gains, on the training ensemble",
+        "and the 16 validation members with the least clearance; limits are penalties of its loss. The columns",
+        "`best` and `mean` give the reduction of the settled rms error of the 1,000 held-out members at the best",
+        "point and at the last mean of CMA-ES, and, if there are any, the lost members and the broken limits.",
         "",
     ]
     rows = []
@@ -322,34 +373,36 @@ def from_answer() -> list[str]:
             broken = [f"{found['lost']} lost"] * (found["lost"] > 0) + found["broken"]
             cells.append(", ".join([f"{100 * (1 - found['settled_rms_error_m'] / error):.2f} %", *broken]))
         rows.append([*cells, f"{row['rollouts']:,}", f"{row['processor_s']:.0f}"])
-    titles = "task | settled rms error (m) | lost | evaluations | best lower by | mean lower by | "
-    return lines + table(titles + "rollouts of the search | its processor (s)", rows)
+    titles = "task | settled rms error (m) | lost | evaluations | best | mean | "
+    return lines + table(titles + "rollouts of the search | processor time of the search (s)", rows)
 
 
 def startup() -> list[str]:
     data = load("startup")
     lines = ["## Time of whole commands (`startup.py`)", "", facts(data["machine"])]
     lines += [
-        f"New processes with a warm compilation cache, on the paper's tracking case; medians of {data['runs']}.",
+        "Each command runs in a new process with a warm compilation cache, on the paper's tracking case. Medians of",
+        f"{data['runs']} runs; least: the shortest of them. Relative: processor time over that of `import jax`.",
         "",
     ]
     rows = [
         [f"`{name}`", *(f"{row[key]:.2f}" for key in ("wall_s", "least_wall_s", "cpu_s", "cpu_over_import_jax"))]
         for name, row in data["rows"].items()
     ]
-    return lines + table("command | wall (s) | least (s) | processor (s) | in those of `import jax`", rows)
+    return lines + table("command | wall (s) | least wall (s) | processor (s) | relative", rows)
 
 
 def workarounds() -> list[str]:
     data = load("workarounds")
     lines = ["## Workarounds for XLA's compiler (`workarounds.py`)", "", facts(data["machine"])]
     lines += [
-        f"Ratio of the times without and with each workaround, in pairs of runs; medians of {data['rounds']}.",
+        f"Time without a workaround over the time with it, for three programs; medians of {data['rounds']} pairs of",
+        "runs.",
         "",
     ]
     jobs = [key for key in next(iter(data["rows"].values())) if key != "says"]
     rows = [[name, row["says"], *(f"{row[job]:.2f}" for job in jobs)] for name, row in data["rows"].items()]
-    return lines + table(" | ".join(["workaround", "without it", *jobs]), rows)
+    return lines + table(" | ".join(["workaround", "effect of its absence", *jobs]), rows)
 
 
 def gpu() -> list[str]:
@@ -366,7 +419,8 @@ def export() -> list[str]:
     data = load("export")
     lines = ["## A step of the exported controller (`export.py`)", "", facts(data["machine"])]
     lines += [
-        "Cycles: median of the time stamp counter. Cortex-M4F: instructions counted by QEMU, bytes of code and stack.",
+        "Cycles and ns: medians on this machine, from the time stamp counter. Instructions, code and stack: of a",
+        "Cortex-M4F; QEMU counts the instructions.",
         "",
     ]
     rows = []
@@ -395,6 +449,7 @@ SECTIONS = {
     "bearings": bearings,
     "sampled_tasks": sampled_tasks,
     "search": search,
+    "schedules": schedules,
     "from_answer": from_answer,
     "gpu": gpu,
     "export": export,

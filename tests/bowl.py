@@ -1,5 +1,5 @@
-"""An engine whose losses are formulas, in place of the compiled one: what the search does can then be told
-by hand, in milliseconds.
+"""An engine whose losses are formulas, in place of the compiled one. The result of a search is then known by hand,
+and the search takes milliseconds.
 
 A member's tracking error is least at the gains `best`; a member is lost, the earlier the further, where c is above a
 limit of its own. The search's own step reports an error that is too large by a factor of its own.
@@ -22,7 +22,7 @@ from tuning.objective.loss import TERMS, outcomes
 # Smallest tracking error, (m / s_0)^2, and the duration, s.
 FLOOR, DURATION = 1e-4, 0.02
 S_0 = 5e-3
-# By what share its gradient in reverse mode is too large, by which it is told from that in forward mode.
+# Relative excess of its gradient in reverse mode, so that a test can distinguish it from that in forward mode.
 REVERSE = 1e-9
 # Of the imaginary parts that carry derivatives, which are exact: they are never subtracted.
 TINY = 1e-30
@@ -30,24 +30,24 @@ TINY = 1e-30
 
 @dataclasses.dataclass
 class World:
-    """What is true, and what was asked: (kind, seed, numbers of the members, points) of every call of an engine."""
+    """The true loss, and `calls`: (kind, seed, numbers of the members, points) of every call of an engine."""
 
     best: tuple[float, ...] = (100.0, 60.0)
     limit: Callable[[int, int, bool, bool], float] = lambda seed, number, stressed, accurate: math.inf
-    """of c, 1/s, by seed and number of a member, whether it is asked only to be held, and by accurate steps"""
+    """largest c (1/s) at which a member is held: by seed, number, whether it is stressed, whether steps are accurate"""
     stalls: Callable[[int, int, bool], bool] = lambda seed, number, accurate: False
-    """whether the integration of a member stalls, by seed and number, and by accurate steps"""
+    """whether the integration of a member stalls: by seed, number, and whether steps are accurate"""
     bias: Callable[[int], float] = lambda substeps: 0.0
-    """relative error of the settled error in steps of so many per sample"""
+    """relative error of the settled error, by number of substeps"""
     chaos: float = 0.0
-    """size of what is added to every derivative, with a sign that changes from point to point"""
+    """size of an error of every derivative, with a sign that changes from point to point"""
     louder: float = 1.0
-    """by how much the judge finds more voltage than the search does"""
-    asked: list[tuple[str, int, tuple[int, ...], int]] = dataclasses.field(default_factory=list)
+    """ratio of the voltage of the final evaluation to that of the search"""
+    calls: list[tuple[str, int, tuple[int, ...], int]] = dataclasses.field(default_factory=list)
 
     def seeds(self, kind: str) -> set[int]:
-        """Seeds of the members that were asked for this."""
-        return {seed for what, seed, *_ in self.asked if what == kind}
+        """Seeds of the members in all calls of this kind."""
+        return {seed for what, seed, *_ in self.calls if what == kind}
 
 
 class Bowl:
@@ -62,7 +62,7 @@ class Bowl:
     def _note(self, kind, x, members):
         for seed in sorted(set(np.asarray(members.seed).tolist())):
             numbers = np.asarray(members.member)[np.asarray(members.seed) == seed]
-            self.world.asked.append((kind, seed, tuple(numbers.tolist()), len(x)))
+            self.world.calls.append((kind, seed, tuple(numbers.tolist()), len(x)))
         self.rollouts += len(x) * len(members.member)
 
     def _terms(self, x, members, along=None):

@@ -6,6 +6,7 @@ import shutil
 import sys
 
 import pytest
+from profiles import THOROUGH
 
 # One cache of compiled programs for all processes of a run, kept for the next run; removed when it is larger (bytes).
 CACHE = pathlib.Path(__file__).parent.parent / ".pytest_cache" / "programs"
@@ -23,6 +24,18 @@ gc.set_threshold(100_000, 20, 20)
 def pytest_configure(config):
     if not hasattr(config, "workerinput") and sum(file.stat().st_size for file in CACHE.glob("*")) > LARGEST:
         shutil.rmtree(CACHE)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config, items):
+    """A thorough test is slow, and runs in the thorough profile only."""
+    left_out = [] if THOROUGH else [item for item in items if item.get_closest_marker("thorough")]
+    for item in items:
+        if item.get_closest_marker("thorough"):
+            item.add_marker(pytest.mark.slow)
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if not item.get_closest_marker("thorough")]
 
 
 @pytest.fixture(autouse=True, scope="module")

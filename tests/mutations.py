@@ -229,7 +229,7 @@ LAWS = [
     M(
         "between samples the Kalman filter holds the model's acceleration",
         "ambjax/control/observer.py",
-        "z_dot = state.z + period**2 / 6 * more, state.z_dot + period / 2 * more",
+        "z_dot = state.z + period**2 / 6 * change, state.z_dot + period / 2 * change",
         "z_dot = state.z, state.z_dot",
         "tests/test_observers.py::test_kalman_knows_a_constant_disturbance",
     ),
@@ -264,8 +264,8 @@ LAWS = [
     M(
         "the position law stands before the observer",
         "ambjax/control/cascade.py",
-        "self.position(self.model, (estimate, reference), positioned)",
-        "self.position(self.model, (Measurement(z, z_dot, measured.i), reference), positioned)",
+        "self._demanded(estimate, reference, positioned)",
+        "self._demanded(Measurement(z, z_dot, measured.i), reference, positioned)",
         "tests/test_order.py",
     ),
     M(
@@ -274,6 +274,57 @@ LAWS = [
         "return (estimate.z, v_star), (estimate, observed_rate,",
         "return (z, v_star), (estimate, observed_rate,",
         "tests/test_order.py",
+    ),
+]
+LAWS += [
+    M(
+        "the switching gain of the terminal manifold does not follow the plant",
+        "ambjax/control/manifolds.py",
+        "k=model.pole**2 * model.s_0 / 5",
+        "k=model.pole**2 * model.s_0 / 500",
+        "tests/test_manifolds.py::test_the_default_gains_of_a_terminal_manifold_reach_zone_a[bearing]",
+    ),
+    M(
+        "the tuner searches gains without effect",
+        "tuning/space.py",
+        "() if idle else",
+        "() if True else",
+        "tests/test_tuning_space.py::test_gains_without_effect_are_left_out",
+    ),
+    M(
+        "positive feedback of a linear controller",
+        "ambjax/control/linear_controller.py",
+        "return [r - z]",
+        "return [z - r]",
+        "tests/test_linear_controller.py::test_the_law_is_python_control_s_system_with_negative_feedback[None]",
+    ),
+    M(
+        "the bilinear transform ends in the middle of the step",
+        "ambjax/control/realisation.py",
+        "tuple(2 * q - y for",
+        "tuple(q + 0 * y for",
+        "tests/test_linear_controller.py::test_the_law_is_python_control_s_system_with_negative_feedback[0.0001]",
+    ),
+    M(
+        "a discrete controller keeps its D when it is made continuous",
+        "ambjax/control/realisation.py",
+        "2 * C @ over, D - C @ over @ B",
+        "2 * C @ over, D",
+        "tests/test_linear_controller.py::test_a_discrete_controller_keeps_its_own_matrices",
+    ),
+    M(
+        "tuned.toml names the controller by the path in the case",
+        "ambjax/cases/controller_file.py",
+        "path_from(self.written, self.path, out)",
+        "self.written",
+        "tests/test_linear_controller.py::test_tuned_toml_finds_the_controller_from_its_own_folder",
+    ),
+    M(
+        "a voltage may meet any current law",
+        "ambjax/simulation/system.py",
+        "if demand not in law.accepts:",
+        "if False:",
+        "tests/test_linear_controller.py::test_a_voltage_passes_the_other_stages",
     ),
 ]
 LOOP = [
@@ -311,6 +362,83 @@ LOOP = [
         "self.q_z(t) + self.plant.a * self.q_v(t)",
         "self.q_z(t) + self.plant.a / 2 * self.q_v(t)",
         "tests/test_rollout.py::test_repaired_regulation_offset_in_the_pulse",
+    ),
+    M(
+        "a force in newtons is divided by twice the mass",
+        "ambjax/world/scenario.py",
+        "self.q_f(t) / self.plant.m",
+        "self.q_f(t) / self.plant.m / 2",
+        "tests/test_loads.py::test_a_force_in_newtons_is_divided_by_the_mass_of_each_member",
+    ),
+    M(
+        "the rotor moves with its housing, not against it",
+        "ambjax/world/scenario.py",
+        "else total - self.base(t)",
+        "else total + self.base(t)",
+        "tests/test_loads.py::test_disturbances_of_several_units_act_together",
+    ),
+    M(
+        "the force of an unbalance grows with the speed, not with its square",
+        "ambjax/world/rotation.py",
+        "GRAM_MM * self.unbalance * omega**2",
+        "GRAM_MM * self.unbalance * omega",
+        "tests/test_loads.py::test_unbalance_by_hand",
+    ),
+    M(
+        "a rotor that runs up has the angle of the speed of the instant",
+        "ambjax/world/rotation.py",
+        "gain * sweep**2 / 2",
+        "gain * sweep**2",
+        "tests/test_loads.py::test_the_phase_of_a_run_up_is_the_integral_of_the_speed",
+    ),
+    M(
+        "runout is not low-passed with the motion",
+        "ambjax/simulation/between.py",
+        "motion._replace(z=motion.z + runout, z_dot=motion.z_dot + rate)",
+        "motion._replace(z=motion.z + runout)",
+        "tests/test_loads.py::test_a_slow_sensor_low_passes_the_runout",
+    ),
+    M(
+        "a written case looks for its tables beside itself",
+        "ambjax/cases/recordings.py",
+        "path_from(one.written, one.file, out)",
+        "one.written",
+        "tests/test_loads.py::test_a_written_case_finds_its_tables",
+    ),
+    M(
+        "times of a table may fall",
+        "ambjax/cases/recordings.py",
+        "np.diff(times) <= 0",
+        "np.diff(times) == 0",
+        "tests/test_loads.py::test_wrong_tables_are_named",
+    ),
+    M(
+        "another word for a quantity is not known",
+        "ambjax/host/synonyms.py",
+        "if _plain(name) == plain or plain in",
+        "if _plain(name) == plain or word in",
+        "tests/test_names.py::test_the_message_suggests_the_right_name",
+    ),
+    M(
+        "the weight of the rotor is no load of the magnets",
+        "ambjax/commands/plausibility.py",
+        "weight <= largest < weight + load",
+        "weight <= largest < load",
+        "tests/test_names.py::test_numbers_that_do_not_fit_together_are_doubted",
+    ),
+    M(
+        "the stop damps a rotor that leaves it as one that comes",
+        "ambjax/world/touchdown.py",
+        "self.damping * share * (side * motion.z_dot)",
+        "self.damping * share * motion.z_dot",
+        "tests/test_touchdown.py::test_the_stop_pushes_and_never_pulls",
+    ),
+    M(
+        "a rotor on its stop is lost",
+        "ambjax/world/scenario.py",
+        "return self.touchdown if self.stop is None else POLE * self.plant.s_0",
+        "return self.touchdown",
+        "tests/test_touchdown.py::test_an_elastic_stop_conserves_energy_and_a_damped_one_loses_it",
     ),
     M(
         "noise is redrawn at each evaluation",
@@ -592,10 +720,10 @@ SEARCH = [
         "tuning/report/judging.py",
         "held_out, rollouts = seeds(problem.tune.budget)[2]",
         "held_out, rollouts = seeds(problem.tune.budget)[1]",
-        "tests/test_tuning_study.py::test_tuned_gains_are_judged_by_members_that_nothing_else_was_asked_of",
+        "tests/test_tuning_study.py::test_tuned_gains_are_evaluated_on_members_that_nothing_else_used",
     ),
     M(
-        "the validation ensemble is never asked",
+        "the validation ensemble is never used",
         "tuning/search/validation.py",
         "lost, worst = _lost(course.problem, x)",
         "lost, worst = np.zeros(0, int), np.arange(1)",
@@ -749,6 +877,13 @@ SEARCH = [
         "tests/test_tuning_report.py::test_three_ways_to_a_derivative_are_judged",
     ),
     M(
+        "the gradient report of a knee is of a loss without errors",
+        "tuning/report/gradient.py",
+        "    weights = problem.error_goal.weights\n",
+        "    weights = problem.goal.weights\n",
+        "tests/test_tuning_study.py::test_gradients_of_a_knee_are_those_of_the_loss",
+    ),
+    M(
         "differences are not extrapolated as they should be",
         "tuning/report/gradient.py",
         "return (4 * fine - coarse) / 3",
@@ -814,7 +949,7 @@ SEARCH = [
     M(
         "the log of the search says that a limit cannot be held",
         "tuning/search/multipliers.py",
-        "a larger penalty has not lowered {names}: its multiplier stays, and the held-out members judge it",
+        "a larger penalty makes no progress towards the limit of {names}; its multiplier is no longer updated",
         "a limit does not give way: it cannot be held here",
         "tests/test_tuning_outcome.py::test_every_place_says_the_same",
     ),
@@ -833,11 +968,11 @@ SEARCH = [
         "tests/test_tuning_outcome.py::test_a_gain_that_loses_rotors_when_it_is_off_says_how_many",
     ),
     M(
-        "a supply has no limit unless it is asked for",
+        "a supply has no voltage limit by default",
         "tuning/config.py",
         '"rms_u_V" not in thresholds and math.isfinite(u_max)',
         '"rms_u_V" not in thresholds and math.isnan(u_max)',
-        "tests/test_tuning_limits.py::test_a_supply_keeps_room_unless_it_is_told_not_to",
+        "tests/test_tuning_limits.py::test_a_supply_limits_the_voltage_by_default",
     ),
     M(
         "what the judge finds does not correct the search",
@@ -882,7 +1017,7 @@ SEARCH = [
         "tests/test_tuning_evolution.py::test_a_search_that_is_resumed_among_populations_ends_alike",
     ),
     M(
-        "a limit that pulls is active, though nobody comes near it",
+        "a limit that pulls is active, though no member comes near it",
         "tuning/objective/limits.py",
         "return self.multiplier > 0 and near",
         "return self.multiplier > 0",
@@ -917,7 +1052,7 @@ SEARCH = [
         "tests/test_tuning_space.py::test_cvar_is_the_mean_of_the_worst_share",
     ),
     M(
-        "stressed members are asked to follow too",
+        "stressed members enter the tracking error too",
         "tuning/objective/loss.py",
         "ordinary = 1.0 - 1.0 * stressed",
         "ordinary = 1.0 - 0.0 * stressed",
@@ -966,7 +1101,7 @@ SEARCH = [
         "tests/test_tuning_study.py::test_a_member_that_accurate_steps_alone_do_not_hold_is_no_survivor",
     ),
     M(
-        "members that stall are held, as far as limits are asked",
+        "members that stall count as held in the limits",
         "tuning/report/limit_table.py",
         'members, held, settings = summary["members"], summary["held"],',
         'members, held, settings = summary["members"], summary["members"] - summary["lost"],',
@@ -1354,7 +1489,7 @@ SAMPLED = [
         "tests/test_realism.py::test_the_current_stays_within_its_limit",
     ),
     M(
-        "the current limit asks for more than the supply has",
+        "the current limit demands more than the supply gives",
         "ambjax/world/amplifier.py",
         "kept = limited(holding_voltage(), u_max)",
         "kept = holding_voltage()",
@@ -1612,8 +1747,8 @@ EXPORT = [
     M(
         "a model number is folded",
         "ambjax/export/trace.py",
-        "keep = _alive(program",
-        "program.nodes[0] = program.nodes[0]._replace(text='1.0')\n    keep = _alive(program",
+        "keep = _used(program",
+        "program.nodes[0] = program.nodes[0]._replace(text='1.0')\n    keep = _used(program",
         "tests/test_export.py::test_one_step_is_jaxs[one and a half-double]",
     ),
     M(
@@ -1773,7 +1908,7 @@ STATUSES = [
         "tests/test_statistics.py::test_what_the_interval_of_a_heavy_tail_s_std_is_worth_is_said",
     ),
     M(
-        "a run that the integrator gave up is told as a lost rotor",
+        "a run in which the integrator stalled is reported as a lost rotor",
         "ambjax/theorem/advice.py",
         '    if not stalled:\n        return f"The rotor is lost',
         '    if True:\n        return f"The rotor is lost',
@@ -1789,8 +1924,8 @@ STATUSES = [
     M(
         "numbers that a case leaves to the paper are not named",
         "ambjax/commands/warnings.py",
-        "return [*_assumed(case), *_sizes(case),",
-        "return [*_sizes(case),",
+        "own = [*_assumed(case), *_sizes(case),",
+        "own = [*_sizes(case),",
         "tests/test_attacks.py::test_numbers_that_stay_the_paper_s_are_named",
     ),
     M(
@@ -1819,14 +1954,14 @@ STATUSES = [
         "tuning/search/keeper.py",
         "return bool(left) and not (",
         "return False and not (",
-        "tests/test_tuning_study.py::test_an_unfinished_search_is_neither_lost_nor_gone_on_with_unasked",
+        "tests/test_tuning_study.py::test_an_unfinished_search_is_neither_lost_nor_resumed_without_resume",
     ),
     M(
-        "a refuted survival is told as one where nobody judges",
+        "a refuted survival is not reported without held-out members",
         "tuning/report/outcome.py",
-        '    if outcome.refuted:\n        words.append(f"That',
-        "    if outcome.refuted and facts['after']['members']:\n        words.append(f\"That",
-        "tests/test_tuning_study.py::test_a_survival_that_accurate_steps_refute_says_so_where_nobody_judges",
+        '    if outcome.refuted:\n        words.append(f"This',
+        "    if outcome.refuted and facts['after']['members']:\n        words.append(f\"This",
+        "tests/test_tuning_study.py::test_a_survival_that_accurate_steps_refute_is_reported_without_held_out_members",
     ),
     M(
         "what settles behind the last sample is read",
@@ -1875,8 +2010,8 @@ SURROUNDINGS = [
     M(
         "tuned.toml names the law's file as the case does",
         "ambjax/cases/own_laws.py",
-        'kind = f"{_relative(file, out)}:{law.law.__name__}"',
-        "kind = law.kind",
+        "file, out)}:{law.law",
+        "file, file.parent)}:{law.law",
         "tests/test_own_laws.py::test_tuned_toml_finds_the_law_from_its_own_folder[mine.py:PD-there/deep-../../mine.py:PD]",
     ),
     M(
@@ -1954,16 +2089,23 @@ INJECTION = [
     M(
         "the injected wave is taken off the reading",
         "ambjax/linear/multisine.py",
-        "measured._replace(z=measured.z + self.injected(t))",
-        "measured._replace(z=measured.z - self.injected(t))",
+        "_added(measured, self.wave.reading, self.injected(t))",
+        "_added(measured, self.wave.reading, -self.injected(t))",
         "tests/test_injection.py::test_the_peak_is_that_of_the_independent_simulator[complementary]",
     ),
     M(
         "the injected wave enters the velocity",
         "ambjax/linear/multisine.py",
-        "measured._replace(z=measured.z + inputs.e)",
-        "measured._replace(z_dot=measured.z_dot + inputs.e)",
+        "_added(super().received(inputs, plant, errors), self.wave.reading, inputs.e)",
+        '_added(super().received(inputs, plant, errors), "z_dot", inputs.e)',
         "tests/test_injection.py::test_continuous_time_is_the_linear_analysis[smooth]",
+    ),
+    M(
+        "the row of an injected velocity shows the position",
+        "ambjax/linear/multisine.py",
+        'if self.wave.reading == "z_dot":',
+        "if False:",
+        "tests/test_injection.py::test_the_velocity_sensor_has_a_sensitivity_of_its_own[processor]",
     ),
     M(
         "an injected wave has no phases",
@@ -2008,6 +2150,36 @@ INJECTION = [
         "tests/test_injection.py::test_true_signs_under_noise_and_a_lost_rotor",
     ),
 ]
+SCHEDULES = [
+    M(
+        "a schedule continues its last slope beyond the last knot",
+        "ambjax/control/schedule.py",
+        "share = jnp.minimum(jnp.maximum((x - low) * (1 / (high - low)), 0.0), 1.0)",
+        "share = jnp.maximum((x - low) * (1 / (high - low)), 0.0)",
+        "tests/test_schedules.py::test_values_are_those_of_numpy_interp[error]",
+    ),
+    M(
+        "the derivative at the error 0 follows its rounding",
+        "ambjax/control/schedule.py",
+        "jnp.minimum(jnp.maximum(x * (1 / rounded), -1.0), 1.0) * dx",
+        "jnp.sign(x) * dx",
+        "tests/test_schedules.py::test_derivatives_are_exact_at_the_knots_and_zero_at_zero",
+    ),
+    M(
+        "the theorem is checked with the largest value of a schedule",
+        "ambjax/theorem/conditions.py",
+        "getattr(extremes(law)[0], requirement.gain)",
+        "getattr(extremes(law)[-1], requirement.gain)",
+        "tests/test_schedules.py::test_the_theorem_takes_the_smallest_value_and_a_constant_sigma",
+    ),
+    M(
+        "the screen draws each knot alone",
+        "tuning/objective/ranges.py",
+        "cube = cube[:, [stems.index(stem) for stem in stems]]",
+        "cube = cube[:, list(range(len(stems)))]",
+        "tests/test_schedules.py::test_knots_are_searched_in_the_range_of_their_gain",
+    ),
+]
 MUTATIONS = [
     *PLANT,
     *LAWS,
@@ -2022,4 +2194,5 @@ MUTATIONS = [
     *STATUSES,
     *SURROUNDINGS,
     *INJECTION,
+    *SCHEDULES,
 ]

@@ -1,4 +1,4 @@
-"""Case files near valid ones, by the thousand: each is refused in one line that names the file, or it runs."""
+"""Case files near valid ones, hundreds or thousands: each is refused in one line that names the file, or it runs."""
 
 import copy
 import dataclasses
@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from profiles import examples
 from tomlkit import dumps
 
+from ambjax import simulate
 from ambjax.cases.reader import KINDS, TABLES, read_case
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.timing import DURATION, METHODS
 from ambjax.cases.tune_table import NUMBERS as TUNED
-from ambjax.commands import simulate
 from ambjax.commands.warnings import warnings_of
 from ambjax.ensemble.design import DESIGNS
 from ambjax.ensemble.paths import places
@@ -31,7 +32,7 @@ from tuning.objective.loss import TERMS
 from tuning.objective.quantities import KINDS as LIMITS
 
 # Every run is of so few samples, and of so few structures, each of which is compiled once.
-SAMPLES, MOST_STRUCTURES = 4, 12
+SAMPLES, MOST_STRUCTURES = 4, examples(4, 12)
 # Of the cases that are read, one in so many is run.
 ONE_IN = 4
 FIELDS = {field.name: field for kind in (Scenario, Clock) for field in dataclasses.fields(kind)}
@@ -271,8 +272,8 @@ def hold(text, path, tally, run):
     if run and tally.read % ONE_IN == 0 and (known or len(tally.structures) < MOST_STRUCTURES):
         tally.structures.add(structure)
         tally.run += 1
-        outcome = simulate.simulate(short)
-        for name, value in {**outcome.trajectory.rows._asdict(), **outcome.measured}.items():
+        run_of_case = simulate(short)
+        for name, value in {**run_of_case.trajectory.rows._asdict(), **run_of_case.metrics}.items():
             assert not np.any(np.isnan(value)), name
 
 
@@ -298,14 +299,14 @@ def test_three_hundred_files_are_read_or_refused(path):
 
 
 @pytest.mark.slow
-def test_eight_thousand_files_run_or_are_refused(path):
-    tally = Tally()
+def test_files_run_or_are_refused(path):
+    tally, count = Tally(), examples(1_200, 8_000)
 
-    @settings(max_examples=8_000, **PROFILE)
+    @settings(max_examples=count, **PROFILE)
     @given(texts())
     def examine(text):
         hold(text, path, tally, run=True)
 
     examine()
-    assert min(tally.refused, tally.read) > 1200  # a sixth at least of either
-    assert tally.run > 150
+    assert min(tally.refused, tally.read) > count / 7  # many of either
+    assert tally.run > examples(3, 150)

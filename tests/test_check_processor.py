@@ -270,7 +270,7 @@ def test_the_margin_is_between_a_delay_that_holds_and_one_that_does_not():
     for delay, lost in zip(margin[:2], (False, True), strict=True):
         late = cascade_of(*HARD, delay=delay, predict=False)
         assert np.isfinite(amb.rollout(late, WORLD, clock, every=0).trajectory.lost_at) == lost
-    # a case whose own delay is lost is told what would hold
+    # if the rotor is lost at the delay of the case, the answer names the delays at which it is held
     beyond = delay_margin(cascade_of(*HARD, delay=1.5, predict=False), WORLD, clock)
     assert 0.5 < beyond.held < beyond.lost < 1.1
 
@@ -366,7 +366,7 @@ settle = 0.01
 """
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("elsewhere")
 def test_check_says_no_where_an_explicit_slope_is_beyond_its_limit(capsys):
     # gamma 2 p/pi T is 318; nothing loses the rotor in this time, the theorem's conditions hold, and the answer is no
@@ -385,12 +385,12 @@ def test_check_says_no_where_an_explicit_slope_is_beyond_its_limit(capsys):
 @pytest.mark.usefixtures("elsewhere")
 def test_check_says_yes_on_a_processor(capsys):
     assert main(["check", write(CASE), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["holds"]
-    assert [slope["stage"] for slope in told["processor"]["slopes"]] == ["position", "inversion", "current"]
-    assert set(told["processor"]) == {
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["holds"]
+    assert [slope["stage"] for slope in summary["processor"]["slopes"]] == ["position", "inversion", "current"]
+    assert set(summary["processor"]) == {
         *("lost_at_s", "lost_why", "stalled", "slopes", "bands", "distance_to_C", "distance_to_C_at_s"),
         *("alternating", "alternates", "delay_margin", "delay_margin_unknown"),
     }
     margin = {"held": 2.0, "lost": None, "undecided": None, "resolution": None, "step": 1 / 256}
-    assert told["processor"]["delay_margin"] == margin
+    assert summary["processor"]["delay_margin"] == margin

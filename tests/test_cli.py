@@ -12,6 +12,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import KINDS, case_from, read_case
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.template_text import template
+from ambjax.commands.outputs import directory
 from ambjax.ensemble import replay
 from ambjax.paper.readings import CLOCK, SETTLE, cascade, scenario
 
@@ -52,7 +53,7 @@ BAD = {
         ["disturbance.q_z.stop", "start = 0.5"],
     ),
     "unknown disturbance": ('[disturbance.q_x]\nkind = "constant"\n', ["disturbance.q_x", "q_z"]),
-    "wrong unit": ('[disturbance.q_z]\nkind = "constant"\nunit = "N"\n', ["disturbance.q_z.unit", "m/s^2"]),
+    "wrong unit": ('[disturbance.q_z]\nkind = "constant"\nunit = "kN"\n', ["disturbance.q_z.unit", "m/s^2"]),
     "negative noise": ("[sensor]\nstd = -1e-6\n", ["sensor.std", "from 0"]),
     "no supply": ("[actuator]\nu_max = 0.0\n", ["actuator.u_max", "from 1e-09", "inf"]),
     "NaN supply": ("[actuator]\nu_max = nan\n", ["actuator.u_max = nan", "from 1e-09"]),
@@ -168,9 +169,13 @@ def test_empty_file_gives_the_documented_defaults():
 
 
 def test_every_kind_can_be_written():
+    np.savez("k.npz", A=-1.0, B=1.0, C=1.0, D=1.0)
     for stage, kinds in KINDS.items():
         for kind, law in kinds.items():
-            assert isinstance(getattr(case_from({"controller": {stage: {"kind": kind}}}).cascade, stage), law)
+            table = {"kind": kind} | ({"file": "k.npz"} if kind == "linear" else {})
+            if kind == "open-loop":
+                continue  # for a linear controller whose output is a voltage: tests/test_linear_controller.py
+            assert isinstance(getattr(case_from({"controller": {stage: table}}).cascade, stage), law)
     numbers = {
         "amplitude": 1e-3,
         "start": 0.1,
@@ -182,13 +187,25 @@ def test_every_kind_can_be_written():
         "std": 1e-3,
         "f_low": 1.0,
         "f_high": 2.0,
+        "speed": 60.0,
+        "service_speed": 60.0,
+        "unbalance": 1.0,
+        "grade": 2.5,
     }
     for kind, signal in SIGNALS.items():
         names = getattr(signal, "__dataclass_fields__")  # noqa: B009
         table = {k: v for k, v in numbers.items() if k in names}
         if kind == "sum":
             table = {"terms": [{"kind": "constant"}]}
-        assert isinstance(case_from({"reference": {"kind": kind, **table}}).scenario.reference, signal)
+        if kind == "table":
+            pathlib.Path("table.csv").write_text("0,0\n1,1e-3\n")
+            table = {"file": "table.csv"}
+        if hasattr(signal, "unit"):
+            slot = {"N": "q_f", "m/s^2": "q_z"}[signal.unit]
+            made = getattr(case_from({"disturbance": {"q_z": {"kind": kind, **table}}}).scenario, slot)
+        else:
+            made = case_from({"reference": {"kind": kind, **table}}).scenario.reference
+        assert isinstance(made, signal)
 
 
 def test_simulate_writes_what_is_documented(capsys):
@@ -241,6 +258,19 @@ def test_simulate_in_strokes_is_simulate_at_once(monkeypatch, capsys):
     assert summary["max_abs_error_m"] == json.loads(pathlib.Path("b/metrics.json").read_text())["max_abs_error_m"]
 
 
+def test_files_of_an_earlier_run_are_overwritten_only_with_force(capsys, tmp_path):
+    (tmp_path / "metrics.json").write_text("old")
+    with pytest.raises(ValueError, match=r"it has metrics.json of an earlier run. Choose another .* with --force"):
+        directory(str(tmp_path), "run", ["a.png", "metrics.json"])
+    assert directory(str(tmp_path), "run", ["a.png"]) == tmp_path
+    assert directory(str(tmp_path), "run", ["metrics.json"], force=True) == tmp_path
+    pathlib.Path("out").mkdir()
+    pathlib.Path("out/metrics.json").write_text("old")
+    assert main(["simulate", write(SHORT), "--out", "out"]) == 2
+    assert "with --force" in capsys.readouterr().err
+    assert pathlib.Path("out/metrics.json").read_text() == "old"
+
+
 def test_lost_rotor_exits_1_and_says_so(capsys):
     path = write(SHORT + "[controller.inversion]\ngamma = 1000.0\n")
     assert main(["simulate", path]) == 1
@@ -258,8 +288,12 @@ def test_check_says_yes_and_no(capsys):
     sine = SHORT + '[reference]\nkind = "sine"\namplitude = 2.5e-3\nfrequency = 2.0\n'
     assert main(["check", write(sine), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["holds"] is True
-    assert main(["check", write(sine + "[controller.inversion]\ngamma = 1000.0\n"), "--json"]) == 1
-    summary = json.loads(capsys.readouterr().out)
+    no = write(sine + "[controller.inversion]\ngamma = 1000.0\n[initial]\ni = 0.3\n")
+    assert main(["check", no, "--json"]) == 1
+    out, err = capsys.readouterr()
+    summary = json.loads(out)
+    assert err.count("initial.i = 0.3 A") == 1  # a doubt is printed once, and stops nothing
+    assert no in err
     along = next(c for c in summary["conditions"] if "along the run" in c["requires"])
     assert along["gain"] == 1000
     assert along["against"] >= 6.3e4  # |dv/dz z_dot| alone, 2.0e6 * 0.0314, on the printed reference

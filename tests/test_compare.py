@@ -61,7 +61,7 @@ def run(cases):
     def compared(*names, flags=()):
         out = cases / "-".join(names)
         paths = [str(cases / f"{name}.toml") for name in names]
-        code = main(["compare", *paths, "--members", str(MEMBERS), "--out", str(out), *flags])
+        code = main(["compare", *paths, "--members", str(MEMBERS), "--out", str(out), "--force", *flags])
         return code, json.loads((out / "compare.json").read_text()), out
 
     return compared
@@ -141,8 +141,8 @@ def test_a_machine_that_differs_is_named(run, cases, capsys):
 @pytest.mark.parametrize(
     ("names", "flags", "message"),
     [
-        (["soft"], [], "1 case file: give 2 to 8 of them."),
-        (["soft"] * 9, [], "9 case files: give 2 to 8 of them."),
+        (["soft"], [], "1 case file: give 2 to 8 case files."),
+        (["soft"] * 9, [], "9 case files: give 2 to 8 case files."),
         (["soft", "soft"], [], "this file is given 2 times. Give each once."),
         (["soft", "none"], [], "none.toml"),
         (["soft", "stiff"], ["--members", "0"], "--members 0: it must be a whole number from 1"),
@@ -164,7 +164,7 @@ def test_bad_input_is_refused_in_one_line(cases, tmp_path, capsys, names, flags,
     assert not (tmp_path / "out").exists()
 
 
-def test_cases_of_one_name_are_told_apart(cases, tmp_path):
+def test_cases_of_one_name_get_different_names(cases, tmp_path):
     other = tmp_path / "soft.toml"
     other.write_text(CASE.format(c=60.0))
     assert [case.name for case in compare._read([str(cases / "soft.toml"), str(other)])] == ["soft (1)", "soft (2)"]

@@ -134,7 +134,7 @@ def test_no_byte_of_the_arrays_can_change_unseen(tmp_path):
             assert list(arrays) == ["x"]
             assert np.array_equal(arrays["x"], np.linspace(0.1, 1, 4))
             assert facts == FACTS
-    assert refused > len(content) / 2  # the others are headers: times, attributes, what is told twice
+    assert refused > len(content) / 2  # the others are headers: times, attributes, duplicated data
 
 
 def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
@@ -255,7 +255,7 @@ def test_a_chunk_that_does_not_belong_there_is_computed_again(kind, begun, whole
     assert str(path) in remark
 
 
-def test_a_folder_in_place_of_a_chunk_is_told_by_name_and_left(begun):
+def test_a_folder_in_place_of_a_chunk_is_named_and_kept(begun):
     path = chunk_file(begun, 1)
     path.unlink()
     path.mkdir()
@@ -350,7 +350,7 @@ def test_a_damaged_manifest_is_refused_by_name(kind, begun):
     assert len(list((begun / "chunks").glob("*.npz"))) == 3
 
 
-def test_the_chunk_is_the_directorys_unless_one_is_asked_for(begun, whole):
+def test_the_chunk_size_of_the_directory_is_the_default(begun, whole):
     store = store_in(begun, chunk=None)
     assert store.chunk == CHUNK
     assert compute(store) == ([], [])
@@ -465,7 +465,7 @@ def test_a_damaged_checkpoint_is_begun_again_with_one_line(kind, checkpoint, des
     assert checkpoint.load(descent, STARTS, GAINS) is not None
 
 
-def test_a_folder_in_place_of_a_checkpoint_is_told_by_name_and_left(checkpoint, descent, capsys):
+def test_a_folder_in_place_of_a_checkpoint_is_named_and_kept(checkpoint, descent, capsys):
     checkpoint.path.unlink()
     checkpoint.path.mkdir()
     assert checkpoint.load(descent, STARTS, GAINS) is None
@@ -505,10 +505,10 @@ def test_old_checkpoints_are_removed_and_nothing_else(checkpoint, tmp_path):
     assert remove_all(pathlib.Path(tmp_path, "nowhere")) == 0
 
 
-def test_what_is_told_of_a_study_is_plain_json(begun):
-    told = json.loads((begun / "study.json").read_text())
-    assert told["seed"] == 3
-    assert told["chunk"] == CHUNK
+def test_the_manifest_of_a_study_is_plain_json(begun):
+    manifest = json.loads((begun / "study.json").read_text())
+    assert manifest["seed"] == 3
+    assert manifest["chunk"] == CHUNK
 
 
 @pytest.mark.parametrize("kind", CHUNK_STRANGE)

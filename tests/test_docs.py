@@ -10,7 +10,7 @@ import re
 
 import numpy as np
 import pytest
-from reference import benchmarks, case_file, commands, fields, markdown, metrics, parser
+from reference import benchmarks, case_file, commands, fields, markdown, metrics, parser, site
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import KINDS, OTHERS, TABLES, case_from
@@ -111,10 +111,11 @@ def numbers_of(raw):
     """Every number in what a case file says."""
     raw = {table: keys | ({"risk": "cvar"} if table == "tune" else {}) for table, keys in raw.items()}  # alpha needs it
     case = case_from(raw)
-    told = f"{case} {tune_from(Table(raw).table('tune'), case)}"
-    return [float(x) for x in re.findall(r"-?\d+\.?\d*(?:e[+-]?\d+)?", told)]
+    words = f"{case} {tune_from(Table(raw).table('tune'), case)}"
+    return [float(x) for x in re.findall(r"-?\d+\.?\d*(?:e[+-]?\d+)?", words)]
 
 
+@pytest.mark.slow
 def test_metrics_and_arrays_are_those_of_the_files(tmp_path):
     case = tmp_path / "short.toml"
     case.write_text("[clock]\nduration = 0.01\n")
@@ -145,23 +146,30 @@ def test_a_text_is_not_taken_for_markup():
     assert markdown.table(("a", "b"), [("1", "2")], "keys")[2:5] == ["| a | b |", "|---|---|", "| 1 | 2 |"]
 
 
-def test_the_reader_is_asked_for_what_it_refuses():
+def test_allowed_values_are_those_of_the_reader():
     assert parser.rule("run.seed") == "a whole number from 0 to 4294967295"
     assert parser.keys("initial") == ["z", "z_dot", "i"]
     with pytest.raises(LookupError, match="allowed"):
         parser.complaint("initial.z", 0.0)
 
 
-def test_attributes_are_told_by_the_docstrings_below_them():
-    class Told:
+def test_attributes_are_documented_by_the_docstrings_below_them():
+    class Example:
         x: float = 0.0
         """a length, m"""
         y: float = 0.0
 
-    assert fields.attribute_docs(Told) == {"x": "a length, m"}
+    assert fields.attribute_docs(Example) == {"x": "a length, m"}
     assert [fields.value(x) for x in (None, 0.5, math.inf, "auto", 1e-30)] == ["", "0.5", "inf", "auto", "1e-30"]
 
 
 def test_no_page_mentions_a_script_of_the_network():
     for path in itertools.chain(PAGES, (ROOT / "docs").glob("_*/*.*")):
         assert "://" not in path.read_text(), path
+
+
+@pytest.mark.parametrize("name", site.tables())
+def test_the_committed_tables_are_current(name):
+    path = site.FOLDER / name
+    assert path.exists(), "run: python docs/reference/site.py"
+    assert path.read_text(encoding="utf-8") == site.tables()[name], "run: python docs/reference/site.py"

@@ -51,7 +51,7 @@ def test_a_v_is_seen(n):
     assert first["share"] > 0.9
     assert abs(first["rho"]) < 0.35  # three of its errors at 64 members: what was shown before
     assert second["high"] < 0.35
-    assert explained["error"]["says"].startswith("what is spread explains 9")
+    assert explained["error"]["says"].startswith("single quantities explain 9")
 
 
 def test_noise_is_called_noise():
@@ -59,7 +59,7 @@ def test_noise_is_called_noise():
     for _ in range(200):
         x = RNG.uniform(-1, 1, (5, 100))
         _, explained = drivers({str(k): column for k, column in enumerate(x)}, {"error": RNG.lognormal(size=100)})
-        said.append(explained["error"]["says"] == "no spread quantity or pair explains it: noise")
+        said.append(explained["error"]["says"] == "no quantity and no pair of quantities explains it; it is noise")
     # 95 %, and three times the error of 200 trials
     assert np.mean(said) > 0.95 - 0.047
 
@@ -89,14 +89,14 @@ def test_lost_members_and_choices_and_constants():
     assert ranked["error"][0]["path"] == "kinds"
     np.testing.assert_allclose(ranked["error"][0]["share"], 0.75, atol=0.05)
     assert explained["same"]["says"] == "it is the same for all members"
-    assert explained["rare"]["says"] == "too few members differ to identify its drivers"
+    assert explained["rare"]["says"] == "too few members differ to identify its causes"
     assert {row["share"] for row in ranked["same"]} == {0.0}
 
 
 def test_nothing_spread_and_few_members():
     ranked, explained = drivers({}, {"error": np.ones(3)})
     assert ranked == {"error": []}
-    assert explained["error"]["says"] == "nothing is spread"
+    assert explained["error"]["says"] == "the case has no spread"
     for n in (1, 2, 3, 8, 20):
         x = RNG.normal(size=n)
         ranked, explained = drivers({"x": x, "y": RNG.normal(size=n)}, {"error": x})

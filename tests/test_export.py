@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from profiles import THOROUGH, examples
 from texts import piped
 
 from ambjax import RK4, Cascade, Clock, Plant, Scenario, Sensor, Sine
@@ -116,8 +117,8 @@ CASCADES = {
     "a differentiator of order 2": hard(observer=observer.IRED2()),
     "a differentiator, explicit": hard(observer=observer.IRED2(), processor=Processor(2.0, implicit=False)),
 }
-# What the fast suite looks at; the slow one at all, in both precisions.
-FAST = [("one and a half", "double"), ("a custom law", "float")]
+# What the fast suite looks at; the slow one at all of them, the thorough profile in both precisions.
+FAST = [("one and a half", "double")]
 
 
 def drafts(cascade, precisions=("float", "double"), count=10_000, u_max=200.0, scenario=None):
@@ -171,9 +172,9 @@ def test_an_invalid_reference_leaves_no_trace():
         limit = getattr(controller.parameters.limits, name)
         for value in wrong(limit):
             bad = inputs._replace(**{name: jnp.asarray(value)})
-            after, held, told = step(memory, bad)
-            assert told.invalid
-            assert not told.refused
+            after, held, status = step(memory, bad)
+            assert status.invalid
+            assert not status.refused
             assert (after.laws, after.last, after.started) == (memory.laws, memory.last, True)
             assert after.before == memory.last.u  # the voltage that is held goes on acting
             assert after.watch.left == 0
@@ -184,7 +185,7 @@ def test_an_invalid_reference_leaves_no_trace():
         assert not step(memory, good)[2].invalid
 
 
-@pytest.mark.parametrize("name", ["z", "z_dot", "i"])
+@pytest.mark.parametrize("name", ["z", *(pytest.param(x, marks=pytest.mark.slow) for x in ("z_dot", "i"))])
 def test_a_refused_reading_is_as_if_the_expected_one_had_been_read(name):
     controller, step, memory, inputs, _ = stepping(hard())
     guard = controller.parameters.controller.processor.guard
@@ -193,9 +194,9 @@ def test_a_refused_reading_is_as_if_the_expected_one_had_been_read(name):
     assert not status.refused
     for value in wrong(getattr(guard, name)):
         bad = inputs._replace(**{name: jnp.asarray(value)})
-        after, found, told = step(memory, bad)
-        assert told.refused
-        assert not any((told.safe, told.failed, told.invalid))
+        after, found, status = step(memory, bad)
+        assert status.refused
+        assert not any((status.safe, status.failed, status.invalid))
         assert (after.laws, after.last, found) == (should.laws, should.last, answer)
         assert (after.watch.expected, after.watch.left) == (should.watch.expected, guard.samples - 1)
         first = step(controller.start(), bad)
@@ -206,13 +207,13 @@ def test_after_so_many_refused_samples_u_is_0_until_a_reading_is_accepted():
     _, step, memory, inputs, _ = stepping(hard(processor=Processor(1.0, guard=Guard(samples=3.0))))
     bad, good = inputs._replace(z=jnp.asarray(np.nan)), inputs._replace(z=jnp.asarray(1e-3))
     for n in range(6):
-        before, (memory, answer, told) = memory, step(memory, bad)
-        assert (told.refused, told.safe) == (True, n >= 3)
+        before, (memory, answer, status) = memory, step(memory, bad)
+        assert (status.refused, status.safe) == (True, n >= 3)
         assert (answer.u == 0) == (n >= 3)
         if n >= 3:
             assert memory.laws == before.laws
-    memory, answer, told = step(memory, good)  # however far the rotor has gone
-    assert not any((told.refused, told.safe))
+    memory, answer, status = step(memory, good)  # however far the rotor has gone
+    assert not any((status.refused, status.safe))
     assert answer.u != 0
     far = step(memory, good._replace(z=jnp.asarray(3e-3)))[2]
     assert far.refused  # 2 mm in a sample
@@ -221,11 +222,11 @@ def test_after_so_many_refused_samples_u_is_0_until_a_reading_is_accepted():
 def test_without_a_guard_a_reading_is_believed():
     plain = hard(observer=observer.Direct(), processor=Processor(1.0, guard=None))
     _, step, memory, inputs, answer = stepping(plain)
-    _, found, told = step(memory, inputs._replace(z=jnp.asarray(4e-3)))
-    assert not any((told.refused, told.failed))
+    _, found, status = step(memory, inputs._replace(z=jnp.asarray(4e-3)))
+    assert not any((status.refused, status.failed))
     assert found.u != answer.u
-    _, found, told = step(memory, inputs._replace(z=jnp.asarray(np.nan)))
-    assert told.failed
+    _, found, status = step(memory, inputs._replace(z=jnp.asarray(np.nan)))
+    assert status.failed
     assert found.u == answer.u
 
 
@@ -242,13 +243,13 @@ def test_a_delay_beyond_the_exported_one_is_refused(tmp_path):
     for delay, bit in {1.0: 0, 0.0: 0, 0.4: 0, 1.5: 32, np.nextafter(1, 2): 32, -1e-9: 32, np.nan: 32}.items():
         library.parameters[at] = delay
         assert library.step() & 32 == bit, delay
-    told = "params->processor.delay: from 0 to 1, else every step is invalid"
+    allowed = "params->processor.delay: from 0 to 1, else every step is invalid"
     assert "amb_real delay; /* [samples, from 0 to 1] " in made["amb.h"]
-    assert all(told in made[name] for name in ("amb.h", "README.md"))
+    assert all(allowed in made[name] for name in ("amb.h", "README.md"))
 
 
 @pytest.mark.parametrize(
-    ("processor", "told"),
+    ("processor", "allowed"),
     [
         (Processor(1.5), "from 0 to 2"),
         (Processor(0.0, predict=True), "from 0 to 0"),
@@ -257,23 +258,30 @@ def test_a_delay_beyond_the_exported_one_is_refused(tmp_path):
         (Processor(1.0, predict=False, guard=None), "not read"),
     ],
 )
-def test_the_header_says_what_delay_may_be_set(processor, told):
+def test_the_header_says_what_delay_may_be_set(processor, allowed):
     traced = trace(controller_of(hard(processor=processor), 200.0, PERIOD), "float")
     header = Writer(traced, "amb", ORIGIN).header()
-    assert f"amb_real delay; /* [samples, {told}] " in header
-    assert (f"processor.delay: {told}" in header) == (told != "not read")
+    assert f"amb_real delay; /* [samples, {allowed}] " in header
+    assert (f"processor.delay: {allowed}" in header) == (allowed != "not read")
 
 
 # --- what is written ---
 
 
-def text(cascade=None, to="double", u_max=200.0, **more):
-    controller = controller_of(cascade or hard(**more), u_max, PERIOD)
+def written(cascade, to, u_max):
+    controller = controller_of(cascade, u_max, PERIOD)
     return files(controller, to, "amb", Origin("test", "0" * 64, described(controller)))
 
 
+kept = functools.cache(written)  # many tests read the same text
+
+
+def text(cascade=None, to="double", u_max=200.0, **more):
+    return kept(cascade or hard(**more), to, u_max)
+
+
 def test_twice_the_same_bytes_and_a_gain_is_one_number():
-    once, again = text(), text()
+    once, again = text(), written(hard(), "double", 200.0)
     assert once == again
     other = text(current=current.SlidingMode(871.0, INF))
     assert once["amb.c"] == other["amb.c"]
@@ -327,8 +335,8 @@ def test_the_papers_cascade_costs_less_than_150_flops_and_its_guard_80():
     assert bare.flops() < 150
     plain = trace(controller_of(hard(processor=Processor(1.0, predict=False)), 200.0, PERIOD), "float")
     assert plain.flops() < bare.flops() + 80
-    told = text(to="float", processor=Processor(1.0, predict=False))["amb.h"]
-    assert f"A step: {plain.flops()} flops." in told
+    header = text(to="float", processor=Processor(1.0, predict=False))["amb.h"]
+    assert f"A step: {plain.flops()} flops." in header
     assert trace(controller_of(hard(), 200.0, PERIOD), "float").flops() < 330  # RK4 over the delay: 4 times the model
 
 
@@ -519,12 +527,12 @@ def test_what_cannot_be_exported_is_refused_in_one_line(case, tmp_path, capsys, 
 
 
 LAST = 'while [ "$1" != -o ]; do shift; done; '
-# What a compiler does, as a script, and what is told of it.
+# Compilers, as scripts, with the message about each.
 COMPILERS = {
     "it is no program": ("\0", "the C compiler {cc} cannot be run (Exec format error)"),
     "it compiles nothing": (
         "#!/bin/sh\necho error: sick >&2; exit 1",
-        "{cc} makes no program that works (sick)",
+        "{cc} cannot make a program that works (sick)",
     ),
     "nothing that it makes may run": (
         f'#!/bin/sh\ncc "$@" || exit 1; {LAST} chmod a-x "$2"',
@@ -532,12 +540,12 @@ COMPILERS = {
     ),
     "it has no sanitizers": (
         '#!/bin/sh\ncase "$*" in *sanitize*) echo "ld: cannot find -lasan" >&2; exit 1 ;; esac; exec cc "$@"',
-        "{cc} makes no sanitized program that works (cannot find -lasan). Install libasan",
+        "{cc} cannot make a sanitized program that works (cannot find -lasan). Install libasan",
     ),
     "its sanitizers fail": (
         f'#!/bin/sh\ncc "$@" || exit 1; case "$*" in *sanitize*) {LAST} echo "echo no ptrace; exit 1" | '
         'sed "1i #!/bin/sh" > "$2" ;; esac',
-        "{cc} makes no sanitized program that works (no ptrace)",
+        "{cc} cannot make a sanitized program that works (no ptrace)",
     ),
     "its libraries are none": (
         f'#!/bin/sh\ncc "$@" || exit 1; case "$*" in *-shared*) {LAST} echo > "$2" ;; esac',
@@ -547,19 +555,25 @@ COMPILERS = {
 
 
 @compiled
-@pytest.mark.parametrize(("does", "told"), COMPILERS.values(), ids=COMPILERS)
-def test_a_machine_that_decides_nothing_is_told_as_that(case, tmp_path, capsys, monkeypatch, does, told):
+@pytest.mark.parametrize(
+    ("does", "message"),
+    [
+        pytest.param(*x, id=name, marks=pytest.mark.slow if k > 1 else ())
+        for k, (name, x) in enumerate(COMPILERS.items())
+    ],
+)
+def test_a_compiler_that_does_not_work_is_reported(case, tmp_path, capsys, monkeypatch, does, message):
     (cc := tmp_path / "mycc").write_text(does)
     cc.chmod(0o755)
     monkeypatch.setenv("CC", str(cc))
-    assert f"--verify: {told.format(cc=cc)}" in refused(capsys, case, "--out", tmp_path / "c", "--verify")
+    assert f"--verify: {message.format(cc=cc)}" in refused(capsys, case, "--out", tmp_path / "c", "--verify")
     assert not (tmp_path / "c").exists()
 
 
 @compiled
 def test_programs_that_do_not_end_or_find_no_room_decide_nothing(case, tmp_path, capsys, monkeypatch):
     out = ("--out", tmp_path / "c", "--verify")
-    monkeypatch.setattr(machine, "PATIENCE", 1e-9)
+    monkeypatch.setattr(machine, "TIME_LIMIT", 1e-9)
     assert "did not end within 1e-09 s, so the check is not decided" in refused(capsys, case, *out)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
     assert "cannot write to the folder for temporary files (No such file" in refused(capsys, case, *out)
@@ -579,15 +593,17 @@ def test_a_law_that_is_no_scalar_code_is_named():
     with pytest.raises(ValueError, match=r"test_export\..*Table: the primitive .* cannot be written as scalar C"):
         text(cascade)
     with pytest.raises(ValueError, match=r"controller.current.k_i has the shape \(2,\): only scalars"):
-        text(current=current.SlidingMode(np.array([1.0, 2.0])))
+        written(hard(current=current.SlidingMode(np.array([1.0, 2.0]))), "double", 200.0)
 
 
 # --- slow: all of it ---
 
 
 @compiled
-@pytest.mark.slow
-@pytest.mark.parametrize("reading", readings.READINGS)
+@pytest.mark.parametrize(
+    "reading",
+    [pytest.param(x, marks=pytest.mark.slow if x == "sampled" else pytest.mark.thorough) for x in readings.READINGS],
+)
 def test_the_readings_cascades(reading):
     cascade = dataclasses.replace(readings.cascade(reading), processor=Processor(1.0))
     scenario = readings.scenario("tracking", reading)
@@ -599,15 +615,20 @@ def test_the_readings_cascades(reading):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASCADES)
 def test_all_of_it(name):
-    cascade = CASCADES[name]
+    cascade, number = CASCADES[name], list(CASCADES).index(name)
     scenario = Scenario(reference=Sine(1e-3, 2.0), sensor=Sensor(1e-6, 1e-4, 1e-4), u_max=200.0)
     case = LoopCase(cascade, scenario, Clock(1000, PERIOD, RK4(3)), 0.02)
-    assert not failed(verify(drafts(cascade, scenario=scenario), case))
+    if THOROUGH:
+        assert not failed(verify(drafts(cascade, scenario=scenario), case))
+        return
+    one = drafts(cascade, [("float", "double")[number % 2]], 3000, scenario=scenario)
+    assert not failed(verify(one, case if number % 6 == 0 else None))
 
 
 @compiled
-@pytest.mark.slow
-@pytest.mark.parametrize("to", ["float", "double"])
+@pytest.mark.parametrize(
+    "to", [pytest.param("float", marks=pytest.mark.slow), pytest.param("double", marks=pytest.mark.thorough)]
+)
 def test_the_rig(tmp_path, to):
     path = tmp_path / "rig.toml"
     path.write_text(
@@ -630,16 +651,17 @@ def test_random_controllers():
         steep = [f.name for f in gains if f.metadata["steepness"]]
         return dataclasses.replace(law, **values | {name: INF for name in steep if random.random() < share})
 
+    # by turns: the next law after so many controllers
     kinds = {
-        "observer": [observer.Direct, observer.Complementary],
-        "position": [position.SlidingMode, position.SuperTwisting, Layered],
-        "inversion": [inversion.Adaptive, inversion.ClosedForm],
-        "current": [current.SlidingMode, current.ProportionalIntegral],
+        "observer": (1, [observer.Direct, observer.Complementary]),
+        "position": (1, [position.SlidingMode, position.SuperTwisting, Layered]),
+        "inversion": (2, [inversion.Adaptive, inversion.ClosedForm]),
+        "current": (4, [current.SlidingMode, current.ProportionalIntegral]),
     }
-    for n in range(40):
-        laws = {stage: drawn(options[random.integers(len(options))]()) for stage, options in kinds.items()}
+    for n in range(examples(3, 40)):  # three: every position law
+        laws = {stage: drawn(options[n // step % len(options)]()) for stage, (step, options) in kinds.items()}
         numbers = {f.name: decades(getattr(Plant(), f.name), 0.5) for f in dataclasses.fields(Plant)}
-        processor = Processor(float(random.choice([0.0, 0.5, 1.0, 1.5, 2.0])), bool(random.random() < 0.7))
+        processor = Processor((0.0, 0.5, 1.0, 1.5, 2.0)[n % 5], bool(random.random() < 0.7))
         cascade = Cascade(**laws, model=Plant(**numbers), processor=processor)
-        made = drafts(cascade, [("float", "double")[n % 2]], 2000, float(random.choice([INF, 48.0, 200.0])))
+        made = drafts(cascade, [("float", "double")[n // 3 % 2]], 2000, float(random.choice([INF, 48.0, 200.0])))
         assert not failed(verify(made, None)), (n, cascade)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from profiles import examples
 from test_export import PERIOD, compiled, drafts, failed, hard
 
 from ambjax import RK4, Clock, Scenario, Sensor, Sine
@@ -117,8 +118,8 @@ def test_a_steepness_of_inf_is_refused_as_the_header_says(made):
     for p, refused in {25.0: False, 1e12: False, INF: True, np.nan: True}.items():
         kept, _, status = step(with_p(p))
         assert (bool(status.invalid), bool(status.failed), bool(kept.started)) == (refused, False, not refused), p
-    told = "finite: set p = inf in the case and export again"
-    assert f"amb_real p; /* [s/m, above 1e-30 and at most 1e+30, {told}] " in made.files["amb.h"]
+    allowed = "finite: set p = inf in the case and export again"
+    assert f"amb_real p; /* [s/m, above 1e-30 and at most 1e+30, {allowed}] " in made.files["amb.h"]
     assert "params->position.p: finite, else every step is invalid." in made.files["amb.h"]
 
 
@@ -206,10 +207,10 @@ def test_a_loop_that_amplifies_rounding_is_compared_until_it_does(tmp_path):
     sources["another"] = sources["correct"].replace("params->position.c", "((1 + 1e-9) * params->position.c)")
     rows = {}
     for name, source in sources.items():
-        controller, told = library(source, one, tmp_path, name), []
-        controller.step = lambda step=controller.step, told=told: told.append(step()) or told[-1]
+        controller, results = library(source, one, tmp_path, name), []
+        controller.step = lambda step=controller.step, results=results: results.append(step()) or results[-1]
         rows[name] = closed_loop.compare_loops(case, {"double": controller})["double"]
-        assert sum(bits & 2 > 0 for bits in told) == 11
+        assert sum(bits & 2 > 0 for bits in results) == 11
     found = rows["correct"].horizon
     assert LEAST < found.samples < 600
     assert found.parted["z"][-1] > 1e3 * PARTED * found.parted["z"][found.samples // 2]
@@ -301,8 +302,9 @@ TUNED = {
 
 
 @compiled
-@pytest.mark.slow
-@pytest.mark.parametrize("name", TUNED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.slow if x == "F10-signs" else pytest.mark.thorough) for x in TUNED]
+)
 def test_correct_c_passes_whatever_the_seed(name, tmp_path):
     text = (TASKS / f"{name}.toml").read_text().partition("[tune]")[0]
     text = text.replace('kind = "kalman"', 'kind = "kalman"\nw = 393.7')
@@ -312,7 +314,7 @@ def test_correct_c_passes_whatever_the_seed(name, tmp_path):
     case = read_case(tmp_path / "task.toml")
     made = drafts(case.cascade, count=100, scenario=case.scenario)
     machines = {to: library(one.files["amb.c"], one, tmp_path, to) for to, one in made.items()}
-    for seed in range(6):
+    for seed in range(examples(2, 6)):
         scenario = dataclasses.replace(case.scenario, seed=seed)
         found = closed_loop.compare_loops(
             LoopCase(case.cascade, scenario, case.clock.with_method(RK4(3)), case.settle), machines

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from profiles import examples
 
 from ambjax import (
     RK4,
@@ -110,7 +111,7 @@ def test_derivatives_equal_differences(three_ways):
         # measured: 5e-7 in c, k, gamma and 2e-4 in k_i; the fixed method is the more accurate
         ("smooth", RK4(4), 1e-3),
         # measured: 8e-6 without noise, 4.6e-3 (gamma) with it; both fall with the tolerance and with finer steps
-        ("repaired", Rodas3(320), 1e-2),
+        pytest.param("repaired", Rodas3(320), 1e-2, marks=pytest.mark.thorough),
     ],
 )
 def test_forward_through_the_adaptive_method_agrees_with_fixed_steps(case, method, rtol):
@@ -139,8 +140,9 @@ def everything(clock, mode):
     return lambda gains: (jax.grad if mode == "reverse" else jax.jacfwd)(loss, has_aux=True)(gains)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", ["reverse", "forward"])
+@pytest.mark.parametrize(
+    "mode", [pytest.param("reverse", marks=pytest.mark.slow), pytest.param("forward", marks=pytest.mark.thorough)]
+)
 def test_every_gradient_is_finite_over_six_decades(mode, monkeypatch):
     """1,000 gain vectors over six decades from 1 mm off the origin, from where most lose the rotor.
 
@@ -161,7 +163,7 @@ def test_forward_through_the_adaptive_method_is_finite_on_random_gains():
     # in small batches: a vectorised while loop runs as long as its slowest member
     clock = Clock(200, 1e-4, AdaptiveRodas3(most_steps=2000))
     mapped = one_kernel(lambda x: jax.lax.map(everything(clock, "forward"), x, batch_size=10))
-    gradient, (value, lost_at, _) = mapped(GAINS[:40])
+    gradient, (value, lost_at, _) = mapped(GAINS[: examples(10, 40)])
     assert np.mean(np.isfinite(lost_at)) > 0.2
     assert np.all(np.isfinite(value))
     assert np.all(np.isfinite(gradient))

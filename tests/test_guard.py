@@ -225,7 +225,7 @@ def test_a_case_file_has_guard_and_faults():
 
 
 @pytest.mark.parametrize(
-    ("raw", "told"),
+    ("raw", "message"),
     [
         ({"sensor": {"outliers": {"rate": 1.0}}}, r"sensor\.outliers is for a controller on a processor"),
         ({"sensor": {"dropouts": {}}}, r"sensor\.dropouts is for a controller on a processor"),
@@ -236,6 +236,6 @@ def test_a_case_file_has_guard_and_faults():
         (CASE | {"processor": {"guard": 3}}, r"processor\.guard = 3: it must be a table"),
     ],
 )
-def test_what_a_case_file_may_not_say_of_them(raw, told):
-    with pytest.raises(ValueError, match=told):
+def test_what_a_case_file_may_not_say_of_them(raw, message):
+    with pytest.raises(ValueError, match=message):
         case_from(raw)

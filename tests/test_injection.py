@@ -14,6 +14,7 @@ from test_sampled import loop_of
 from ambjax import Cascade, Clock, Scenario, Sensor, paper
 from ambjax.control import current as current_laws
 from ambjax.control import inversion, position
+from ambjax.control.observer import Kalman
 from ambjax.control.processor import Processor
 from ambjax.linear import Zones, injected, linearise, lines, peak
 from ambjax.linear.multisine import multisine
@@ -120,6 +121,21 @@ def test_continuous_time_is_the_linear_analysis(cascade, amplitude, r):
     assert np.array_equal(sliding.S, found.S)
 
 
+@pytest.mark.parametrize(
+    ("processor", "period"),
+    [(Processor(0.0), T), pytest.param(None, 1e-3, marks=pytest.mark.slow)],
+    ids=["processor", "continuous"],
+)
+def test_the_velocity_sensor_has_a_sensitivity_of_its_own(processor, period):
+    """Errors as in continuous time above: S 1e-3, u 1e-2."""
+    cascade, clock, f = Cascade(**SMOOTH, processor=processor), Clock(1000, period), [20.0, 50.0, 100.0]
+    found = injected(cascade, Scenario(), clock, f, reading="z_dot", amplitude=1e-5)
+    H = linearise(cascade, Scenario(), clock).response(found.frequency)
+    assert np.abs(found.S / H[:, 1, 1] - 1).max() < 1e-3
+    assert pytest.approx(H[:, 2, 1], rel=1e-2) == found.KS
+    assert np.abs(H[:, 1, 1] / H[:, 0, 0] - 1).max() > 0.1
+
+
 def noisy(std, **more):
     return Scenario(sensor=Sensor(std=std, std_z_dot=0.0, std_i=0.0), **more)
 
@@ -182,7 +198,10 @@ def test_what_cannot_be_measured_is_refused_in_one_line():
     for f in ([20.0], [5000.0], [], [math.nan]):
         with pytest.raises(ValueError, match=r"injection.frequencies: .* at least 100 Hz, .* below 5000 Hz"):
             injected(Cascade(), Scenario(), clock, f)
-    with pytest.raises(ValueError, match=r"injection.amplitude = 0 m"):
+    estimating = Cascade(observer=Kalman())
+    with pytest.raises(ValueError, match=r"injection.reading = 'z_dot': the observer Kalman estimates"):
+        injected(estimating, Scenario(), clock, [100.0], reading="z_dot")
+    with pytest.raises(ValueError, match=r"injection.amplitude = 0:"):
         injected(Cascade(), Scenario(), clock, [100.0], amplitude=0.0)
     with pytest.raises(ValueError, match="members = 0"):
         injected(Cascade(), Scenario(), clock, [100.0], members=0)

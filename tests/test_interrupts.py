@@ -52,12 +52,12 @@ CASES = {
         " interrupt()\n ever()",
         "",
     ),
-    "deferred, to nobody": (
+    "deferred, stderr closed": (
         "with exit_on_interrupt('p'), deferred('It ends.'):\n"
         " os.close(2)\n interrupt()\n time.sleep(0.2)\n interrupt()\n ever()",
         "",
     ),
-    "what is kept cannot be told": (
+    "the message itself fails": (
         "with exit_on_interrupt('p'), reporting(lambda: 1 / 0):\n interrupt()\n ever()",
         "p: interrupted; it is not known which results are kept (ZeroDivisionError).\n",
     ),
@@ -86,7 +86,7 @@ def test_it_ends_at_once_with_one_line(case):
     assert case == "below a bar" or done.stderr == said
 
 
-def test_a_gentle_one_is_heeded_once_asked():
+def test_a_deferred_interrupt_is_raised_when_polled():
     code = """
 with exit_on_interrupt("p"):
     with deferred("It ends."):
@@ -96,14 +96,14 @@ with exit_on_interrupt("p"):
         try:
             raise_if_interrupted()
         except KeyboardInterrupt:
-            print("heeded")
+            print("raised")
 with exit_on_interrupt("p"):
     raise_if_interrupted()
 print("anew", signal.getsignal(signal.SIGINT) is signal.default_int_handler)
 """
     done = run(code)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["heeded", "anew", "True"]
+    assert done.stdout.split() == ["raised", "anew", "True"]
 
 
 def test_where_it_is_ignored_it_stays_ignored():

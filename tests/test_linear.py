@@ -91,11 +91,15 @@ def simulated_map(cascade, scenario, r):
     return StateSpace(*(np.asarray(m) for m in (A, B[:, None], C, D[:, None], jnp.ones_like(x))), np.asarray(T))
 
 
-# the others of LOOPS with the slow tests
-FIRST = "two coils off the model"
+# the others of LOOPS with the slow and thorough tests
+FIRST, SECOND = "two coils off the model", "lags"
+NAMES = [
+    pytest.param(x, marks=() if x == FIRST else pytest.mark.slow if x == SECOND else pytest.mark.thorough)
+    for x in LOOPS
+]
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=() if x == FIRST else pytest.mark.slow) for x in LOOPS])
+@pytest.mark.parametrize("name", NAMES)
 def test_the_matrices_are_those_of_the_simulation(name):
     cascade, scenario, r = loop_of(name)
     f = np.geomspace(1.0, 0.45 / T, 40)
@@ -107,7 +111,7 @@ def test_the_matrices_are_those_of_the_simulation(name):
     assert np.all(np.abs(found[:, 2, 0] / expected[:, 1, 0] - 1) < 10 * error)
 
 
-@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize("name", NAMES)
 def test_the_differentiable_quantities_are_those_of_the_analysis(name):
     cascade, scenario, r = loop_of(name)
     system = linearise(cascade, scenario, CLOCK, r)
@@ -238,6 +242,7 @@ def test_the_peak_is_differentiable_in_the_gains_and_the_plant():
     assert (high - low) / (2 * h) == pytest.approx(slope, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_members_are_linearised_as_one_by_one():
     scenario = Scenario(plant=Plant(m=np.array([0.55, 0.65])))
     systems, found = linearise_members(Cascade(**SMOOTH), scenario, CLOCK)

@@ -1,6 +1,7 @@
 """Integral and terminal sliding modes against the motions that their theory promises."""
 
 import dataclasses
+import tomllib
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,9 @@ import pytest
 import scipy.linalg
 
 from ambjax import Cascade, Initial, Plant, Scenario, Sine, position
+from ambjax.cases.reader import case_from
+from ambjax.cases.template_text import template
+from ambjax.linear import linearise
 from ambjax.numerics.smooth import smooth_sign
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.world.sensor import Measurement
@@ -116,3 +120,15 @@ def test_a_terminal_sliding_mode_ends_in_the_finite_time_of_its_manifold():
     # a decay at the rate c leaves 4 % of the error at that time
     ended = round(3 * roots / law.c / T)
     assert np.max(np.abs(e[ended:])) < 1e-3 * e_0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bearing", "rig"])
+def test_the_default_gains_of_a_terminal_manifold_reach_zone_a(name):
+    raw = tomllib.loads(template(name))
+    raw["controller"]["position"] = {"kind": "terminal-sliding-mode"}
+    case = case_from({key: table for key, table in raw.items() if key != "tune"})
+    system = linearise(case.cascade, case.scenario, case.clock)
+    f = np.geomspace(1.0, 2000.0, 2000)  # a grid finer than any resonance of a loop in zone A
+    assert system.stable
+    assert np.max(np.abs(system.sensitivity(f))) < case.zones.zone_a

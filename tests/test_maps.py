@@ -67,7 +67,7 @@ def test_a_cell_is_the_members_of_its_case_run_alone():
 
 
 def test_one_member_is_the_nominal_case():
-    """A map of a case with [spread] shows the case, not a member at random, unless members are asked for."""
+    """A map of a case with [spread] shows the case, not a member at random, unless --members is given."""
     x, y = Axis("plant.m", np.array([0.5, 0.6])), Axis("sensor.std", np.array([1e-8, 1e-7]))
     wide = dataclasses.replace(SMALL, spread=Spread((("initial.z", Normal(1e-4)),)), members=1)
     bare = dataclasses.replace(wide, spread=Spread())
@@ -238,7 +238,7 @@ def test_the_command_draws_and_prints_two_cases_side_by_side(tmp_path, capsys):
 
 def test_the_command_says_what_is_drawn_and_what_is_not_decided(tmp_path, capsys, monkeypatch):
     (tmp_path / "case.toml").write_text(CASE + "[spread]\nplant.m = { percent = 1 }\n")
-    argv = ["map", str(tmp_path / "case.toml"), "--x", X, "--y", Y, "--out", str(tmp_path / "out")]
+    argv = ["map", str(tmp_path / "case.toml"), "--x", X, "--y", Y, "--out", str(tmp_path / "out"), "--force"]
     assert main(argv) == 0
     said = capsys.readouterr()
     assert "one member does not draw the [spread]; --members 2" in said.err

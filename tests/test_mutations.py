@@ -1,4 +1,4 @@
-"""The hunt for mutants: its table fits the code, it tells the killed from the survivors, and none survives."""
+"""Mutation tests: the table fits the code, killed and surviving mutants are distinguished, and none survives."""
 
 import contextlib
 import pathlib
@@ -7,6 +7,7 @@ import pytest
 from mutate import KILLED, SURVIVED, hunt, main, parent, sample, verdict
 from mutate import mutated as applied
 from mutations import MUTATIONS, Mutation
+from profiles import examples
 
 ROOT = pathlib.Path(__file__).parent.parent
 
@@ -47,7 +48,8 @@ def project(tmp_path):
     return tmp_path
 
 
-def test_the_killed_are_told_from_survivors(project):
+@pytest.mark.slow
+def test_killed_and_surviving_mutants_are_distinguished(project):
     with contextlib.closing(parent()) as forks:
         assert verdict(BREAK, project, forks) == KILLED
         assert verdict(BREAK._replace(test="tests/test_it.py::test_zero"), project, forks) == SURVIVED
@@ -70,6 +72,7 @@ def test_a_mutation_that_no_longer_fits_is_named(project, change, says):
     assert says in said[-1]
 
 
+@pytest.mark.slow
 def test_a_test_that_fails_by_itself_kills_nothing(project):
     said = []
     (project / "tests/test_it.py").write_text(TESTS.replace("== 2", "== 3"))
@@ -90,4 +93,4 @@ def test_a_sample_depends_on_the_text_of_the_program(project):
 @pytest.mark.slow
 def test_no_mutation_of_a_sample_survives(capsys):
     """`python tests/mutate.py` makes all of them, in a quarter of an hour."""
-    assert main(["--share", "12"]) == 0, capsys.readouterr().out
+    assert main(["--share", str(examples(48, 12))]) == 0, capsys.readouterr().out

@@ -12,7 +12,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from ambjax import Cascade, Clock, Plant, Scenario, Sensor, Sine, rollout
 from ambjax.cases.reader import case_from
 from ambjax.control import inversion
-from ambjax.control.cascade import Sample
+from ambjax.control.cascade_state import Sample
 from ambjax.control.exact import WIDTH
 from ambjax.control.inversion import StaticInversionState
 from ambjax.control.observer import IRED1, IRED2, Complementary, Difference, Direct, Kalman, Predicted
@@ -53,7 +53,7 @@ def current_of(z, z_ddot, q=0.0):
     return MODEL.current_for(z, (z_ddot - q + MODEL.g - 2 * MODEL.k_z / MODEL.m * z) / MODEL.a)
 
 
-# --- what they are told ---
+# --- inputs of the observers ---
 
 
 @EACH
@@ -295,7 +295,7 @@ def right(law, z, z_dot, sampled):
 @EACH
 @pytest.mark.parametrize("law_i", [inversion.Adaptive(), inversion.ClosedForm()], ids=lambda x: type(x).__name__)
 def test_an_estimate_that_is_right_gives_the_command_of_a_measured_velocity(law, law_i):
-    """i_ref' of the closed form among it: the estimate moves, not the velocity that nobody measures."""
+    """i_ref' of the closed form among it: the estimate moves, not the velocity, which is not measured."""
     z, z_dot, i, reference = 1e-3, 0.03, 0.02, reference_at(Sine(2.5e-3, 2.0), 0.11)
     seen, blind = (Measurement(jnp.asarray(z), jnp.asarray(v), jnp.asarray(i)) for v in (z_dot, 0.0))
 

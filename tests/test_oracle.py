@@ -82,7 +82,7 @@ SLOW = functools.partial(pytest.param, marks=pytest.mark.slow)
 CASES = [
     Case("repaired tracking", World(reference=sine(), q_v=BUMP)),
     SLOW(Case("repaired tracking, 2 s", World(reference=sine(), q_v=pulse(1.0, 0.7, 1.2)), samples=20_000)),
-    Case("repaired regulation", World(q_v=BUMP)),
+    SLOW(Case("repaired regulation", World(q_v=BUMP))),
     Case("smooth gains", World(inversion=adaptive(1e9, 25e-6), reference=sine(), q_v=BUMP)),
     Case("smooth gains, edges between samples", World(inversion=adaptive(1e9, 25e-6), reference=sine(), q_v=SHIFTED)),
     Case("edges between samples, q_z and q_i", World(
@@ -93,10 +93,10 @@ CASES = [
         plant=OTHER, position=smc(30.0, 40.0, 15.0), inversion=adaptive(8e5, 10.0), current=current(300.0, 10.0),
         reference=sine(1e-3, 5.0),
     )),
-    Case("light plant, weak gravity, smooth step", World(
+    SLOW(Case("light plant, weak gravity, smooth step", World(
         plant=LIGHT, position=smc(25.0, 30.0, 40.0), inversion=adaptive(5e5, 10.0), current=current(200.0, 40.0),
         reference=smoothstep(1e-3, 0.05, 0.1),
-    )),
+    ))),
     Case("all initial values", World(initial=(2e-4, -5e-3, 0.02), inversion=adaptive(1e6, i_ref=0.015))),
     Case("model off by 10 %", World(model=WRONG, inversion=adaptive(2e5), reference=sine())),
     Case("supply limited at the start", World(u_max=45.0)),
@@ -105,7 +105,7 @@ CASES = [
     Case("super-twisting", World(position=twisting(), reference=sine(), q_v=BUMP)),
     Case("closed form", World(inversion=CLOSED, reference=sine(), q_v=BUMP), tight=amb.RK4(4)),
     SLOW(Case("PI current", World(current=pi(), reference=sine(), q_v=BUMP))),
-    Case("PI current, wound up at the start", World(current=pi(k_aw=2000.0), u_max=45.0), samples=1000),
+    SLOW(Case("PI current, wound up at the start", World(current=pi(k_aw=2000.0), u_max=45.0), samples=1000)),
     Case("complementary observer", World(
         observer=("complementary", {"l": 10.0}), initial=(1e-4, 0.0, 0.0), inversion=adaptive(2e5), reference=sine(),
         q_v=BUMP,
@@ -113,9 +113,9 @@ CASES = [
     SLOW(Case("super-twisting, closed form and PI", World(
         position=twisting(), inversion=CLOSED, current=pi(), reference=smoothstep(1e-3, 0.05, 0.1), q_v=BUMP
     ))),
-    Case("observer and closed form", World(
+    SLOW(Case("observer and closed form", World(
         observer=("complementary", {"l": 100.0, "z_hat": 5e-5}), inversion=CLOSED, reference=sine()
-    ), tight=amb.RK4(4)),
+    ), tight=amb.RK4(4))),
 ]  # fmt: skip
 # z, gamma, p, position law, current law, reference, u_max; gamma p from 1e4 to 2e6. All but the fifth are among the
 # worst of 10,700 held ones drawn at random.
@@ -135,7 +135,14 @@ DROPS = [
     (4e-4, 1e8, 1e-4, twisting(17.0, 30.0, 50.0, 10.0), current(100.0, 5.0), sine(1e-3), 800.0),
     (6.5e-4, 5e6, 0.1, smc(12.0, 60.0, 25.0), current(300.0, 5.0), sine(1e-3), 400.0),
 ]
-CASES += [Case(f"drop {n}", drop(*numbers), samples=1000) for n, numbers in enumerate(DROPS, 1)]
+# the first is fast; slow are one of another current law, one of another position law, and one of both
+CASES += [
+    pytest.param(
+        Case(f"drop {n}", drop(*numbers), samples=1000),
+        marks=() if n == 1 else pytest.mark.slow if n in (2, 7, 12) else pytest.mark.thorough,
+    )
+    for n, numbers in enumerate(DROPS, 1)
+]
 
 
 def in_ambjax(case):

@@ -125,7 +125,7 @@ def case(tmp_path, monkeypatch):
     return "case.toml"
 
 
-def test_the_command_draws_the_stretch_that_is_asked_for(case, drawn, capsys):
+def test_the_command_draws_the_given_interval(case, drawn, capsys):
     assert main(["simulate", case, "--from", "0.01", "--to", "0.05", "--out", "a", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["max_abs_error_m"] > 0
     assert {ax.get_xlim() for ax in drawn[0].axes} == {(0.01, 0.05)}

@@ -88,10 +88,12 @@ def case(elsewhere):
     "command",
     [
         "simulate case.toml --json",
-        "ensemble case.toml --members 3 --json",
+        pytest.param("ensemble case.toml --members 3 --json", marks=pytest.mark.slow),
         pytest.param("check case.toml --json", marks=pytest.mark.slow),
-        pytest.param("sensitivity case.toml --json", marks=pytest.mark.slow),
-        "map case.toml --x controller.position.stiff=8e3:1e4:2 --y plant.m=-1%:1%:2 --json",
+        pytest.param("sensitivity case.toml --json", marks=pytest.mark.thorough),
+        pytest.param(
+            "map case.toml --x controller.position.stiff=8e3:1e4:2 --y plant.m=-1%:1%:2 --json", marks=pytest.mark.slow
+        ),
         "export case.toml --json",
     ],
 )
@@ -207,6 +209,7 @@ def test_a_law_travels_to_a_process_that_has_no_such_file(case):
     assert done.stdout.decode() == "PD 300.0 True\n"
 
 
+@pytest.mark.slow
 def test_workers_compute_what_this_process_computes(case):
     study = study_of(read_case(case), None, 3)
     here = study.columns(0, 3)
@@ -215,6 +218,7 @@ def test_workers_compute_what_this_process_computes(case):
     assert here["rms_error_m"].tolist() == there["rms_error_m"].tolist()
 
 
+@pytest.mark.slow
 def test_a_study_is_not_resumed_with_another_law(case, capsys):
     ensemble = ["ensemble", "case.toml", "--members", "3", "--out", "there"]
     facts = study_of(read_case(case), None, 3).fingerprint()
@@ -254,7 +258,7 @@ def test_a_change_of_the_file_during_the_search_does_not_matter(case):
     assert type(tuned.cascade.position) is type(one.cascade.position)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_it_is_tuned_and_a_search_is_not_resumed_with_another_law(case, monkeypatch, capsys):
     small = "members = 2\nstressed = 1\nvalidation = 2\nheld_out = 2\nscreen = 2\nstarts = 1\niterations = 1\n"
     write(CASE + small)

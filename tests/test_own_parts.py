@@ -177,6 +177,7 @@ def test_simulated():
         assert float(rows.heat[n]) == pytest.approx(p.R * (x[2] ** 2 + 1.05 * x[3] ** 2), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_lost_one_is_frozen():
     weak = dataclasses.replace(CASCADE, inversion=inversion.Adaptive(1e3, 25e-6))
     outcome = rollout(weak, SCENARIO, CLOCK.with_method(AdaptiveRodas3()), fold=standard_for(0.01, SCENARIO))
@@ -185,6 +186,7 @@ def test_a_lost_one_is_frozen():
     assert all(np.all(np.isfinite(x)) for x in outcome.trajectory.rows)
 
 
+@pytest.mark.slow
 def test_checked():
     report = check(CASCADE, SCENARIO, CLOCK)
     assert report.holds
@@ -215,6 +217,7 @@ def test_spread():
     assert study.fingerprint()["plant.kind"] == "TwoCoils"
 
 
+@pytest.mark.slow
 def test_mapped():
     study = Study(CASCADE, NOISY, Clock(200, 1e-4, METHOD), 0.01, Spread(), seed=3, members=1)
     found = grid(study, Axis(RHO, np.array([10.0, 40.0])), Axis(SKEW, np.array([-0.1, 0.0, 0.1])))
@@ -233,7 +236,7 @@ def tuning_problem():
     slow = dataclasses.replace(CASCADE, position=BoundaryLayer(rho=5.0))
     case = Case("own", slow, scenario, Clock(200, 1e-4), 0.005, Spread(((SKEW, Normal(0.02)),)))
     paths = [f"controller.{path}" for path in ("position.decay", "position.rho", "position.width")]
-    asked = {
+    budget = {
         "objective": "least_error",
         "limits": {"sensitivity": math.inf},
         "members": 4,
@@ -244,7 +247,7 @@ def tuning_problem():
         "starts": 1,
         "iterations": 3,
     }
-    tune = tune_from(Table({"gains": paths, **asked}), case)
+    tune = tune_from(Table({"gains": paths, **budget}), case)
     return problem_of(case, tune), tune, case
 
 

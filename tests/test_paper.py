@@ -12,7 +12,7 @@ from matplotlib.image import imread
 from ambjax import AdaptiveRodas3, paper, rollout
 from ambjax.__main__ import main
 from ambjax.paper import claims, findings
-from ambjax.paper.evidence import NOISE_STDS, STEPS, Evidence, Noise, Run, Survival, Uncertain, held
+from ambjax.paper.evidence import NOISE_STDS, STEPS, Evidence, Noise, Run, Survival, Uncertain, survival_of
 from ambjax.paper.ledger import judge, markdown, noise_table, processor_table
 from ambjax.simulation.trajectory import STALLED, Row, Trajectory
 from ambjax.theorem.conditions import Condition, Report
@@ -54,7 +54,7 @@ def test_verdicts_follow_the_evidence():
     assert lost.verdict == findings.FAILS
     assert "gamma = 1000 < Delta_1 = 6e+04" in lost.cause
 
-    judge = judges["All this under sensor noise of variance 1e-7"]
+    judge = judges["The rotor is held under sensor noise of variance 1e-7"]
     levels = len(NOISE_STDS)
     for scans, verdict in (([levels, levels], findings.HOLDS), ([3, 3], findings.FAILS), ([levels, 3], findings.OPEN)):
         assert judge(types.SimpleNamespace(noise=[noise(n) for n in scans])).verdict == verdict
@@ -92,11 +92,11 @@ def test_a_stall_is_neither_held_nor_lost():
 
 def test_what_is_held_ends_where_it_is_lost_or_not_known():
     tried, no = np.array([1.0, 2.0, 3.0]), np.zeros(3, bool)
-    assert held(tried, no, no) == (3.0, None)
-    assert held(tried, tried > 1, no) == (1.0, None)
-    assert held(tried, tried > 2, tried == 2) == (1.0, 2.0)
-    assert held(tried, tried > 1, tried == 2) == (1.0, None)  # of two seeds one is lost there
-    assert held(tried, no, tried > 0) == (0.0, 1.0)
+    assert survival_of(tried, no, no) == (3.0, None)
+    assert survival_of(tried, tried > 1, no) == (1.0, None)
+    assert survival_of(tried, tried > 2, tried == 2) == (1.0, 2.0)
+    assert survival_of(tried, tried > 1, tried == 2) == (1.0, None)  # of two seeds one is lost there
+    assert survival_of(tried, no, tried > 0) == (0.0, 1.0)
 
 
 @pytest.mark.slow
@@ -122,19 +122,19 @@ def test_reproduce(tmp_path, monkeypatch):
     error = found["Tracking: largest error 2.3e-5 m"]["tuned"]
     assert error["verdict"] == findings.HOLDS
     assert error["value"] < 1e-5
-    assert found["All this under sensor noise of variance 1e-7"]["tuned"]["verdict"] == findings.HOLDS
+    assert found["The rotor is held under sensor noise of variance 1e-7"]["tuned"]["verdict"] == findings.HOLDS
     # on the processor
-    told = {(row["reading"], row["noise"]): row for row in written["processor"]}
-    assert set(told) == {(one, True) for one in paper.READINGS} | {("literal", False), ("repaired", False)}
-    assert told["literal", False]["lost_at_s"] < 0.02
-    assert told["repaired", False]["lost_at_s"] is None
-    assert told["repaired", True]["lost_at_s"] < 0.02
+    processor = {(row["reading"], row["noise"]): row for row in written["processor"]}
+    assert set(processor) == {(one, True) for one in paper.READINGS} | {("literal", False), ("repaired", False)}
+    assert processor["literal", False]["lost_at_s"] < 0.02
+    assert processor["repaired", False]["lost_at_s"] is None
+    assert processor["repaired", True]["lost_at_s"] < 0.02
     ours = found["Tracking: largest error 2.3e-5 m"]["sampled"]
     assert ours["verdict"] == findings.HOLDS
     assert (
-        told["sampled", True]["settled_max_abs_error_m"]
+        processor["sampled", True]["settled_max_abs_error_m"]
         == ours["value"]
-        < told["tuned", True]["settled_max_abs_error_m"]
+        < processor["tuned", True]["settled_max_abs_error_m"]
     )
     # The README shows this picture. A curve that moves by 1 pixel changes a square by 0.06, by 3 pixels by 0.16.
     new, old = (coarse(imread(path)) for path in (out / "readings.png", DOCS / "readings.png"))

@@ -222,7 +222,7 @@ def test_fan_refuses_unknown_quantity(tmp_path):
 @pytest.mark.parametrize("lost_at", [None, np.array([np.inf]), np.zeros(3)])
 @pytest.mark.parametrize("values", [np.zeros(9), np.full(9, -2.0), np.full(9, np.nan), np.r_[1.0, 2.0, [np.nan] * 7]])
 def test_fan_of_hard_cases(tmp_path, values, lost_at):
-    # one member: all bands alike; NaN: nobody left
+    # one member: all bands alike; NaN: no member left
     bands = {"u": dict.fromkeys(PERCENTS, values)}
     fans.fan(np.linspace(0, 1, 9), bands, {"u": 2.0}, "hard", tmp_path / "fan.png", lost_at=lost_at)
     assert is_png(tmp_path / "fan.png")
@@ -284,7 +284,7 @@ def test_histograms_of_hard_cases(tmp_path, drawn, values, all_lost):
     assert is_png(tmp_path / "h.png")
     shown = drawn[0].axes[0].patches[-1].get_data().values.sum()
     in_range = np.isfinite(values) & ((values > 0) | (drawn[0].axes[0].get_xscale() == "linear"))
-    assert shown == in_range.sum()  # nobody falls out of the last bin
+    assert shown == in_range.sum()  # no value falls out of the last bin
 
 
 def test_histograms_refuse_nothing_to_draw(tmp_path):

@@ -198,8 +198,10 @@ LOOPS = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("loop", LOOPS)
+@pytest.mark.parametrize(
+    "loop",
+    [pytest.param(x, marks=pytest.mark.slow if x.startswith("two-coil") else pytest.mark.thorough) for x in LOOPS],
+)
 def test_members_of_other_loops_are_replayed_bit_by_bit(loop):
     study = study_of(changed(CASE, LOOPS[loop]))
     columns = chunk(study, 0, 64, 64)
@@ -314,7 +316,7 @@ frequency = 2.0
 
 
 def fails(capsys):
-    """What `ambjax check` promises: gains beside what the conditions ask of them, and which of them fails."""
+    """The table of `ambjax check`: each gain, the number that its condition requires, and the verdict."""
     answer = capsys.readouterr().out
     assert "condition " in answer
     assert "FAILS" in answer

@@ -359,7 +359,7 @@ def test_repaired_tracking_meets_the_paper_s_claims(tracking):
     # paper: zero within 10 ms. Below 0.1 in 2.2 ms; then tan(pi/2 d/gamma)/p, 0.21 at the largest d = 6.6e4
     assert np.any(np.abs(rows.v_tilde[rows.t <= 5e-3]) < 0.1)
     assert np.all(np.abs(rows.v_tilde[rows.t >= 5e-3]) < 0.22)
-    assert tracking.measured["settled_rms_u_V"] < 70  # the reference alone asks for L max|di_ref/dt|, 33 H * 2 A/s
+    assert tracking.measured["settled_rms_u_V"] < 70  # the reference alone requires L max|di_ref/dt|, 33 H * 2 A/s
 
 
 def test_repaired_regulation_offset_in_the_pulse(tracking):

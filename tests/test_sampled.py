@@ -124,7 +124,17 @@ CASES = [
     Case("closed form, wrong model, noise", World(**TRACKING | CLOSED, model=WRONG, delay=0.5), std=NOISE),
     Case("closed form, explicit", World(**EXPLICIT | CLOSED), 2000),
 ]
-# Each law, part and delay stands in a case of the fast run; these combine them otherwise.
+# Each law, part and delay stands in a case of the fast or slow tests; these combine them otherwise.
+FAST = {
+    "edges between samples",
+    "half a sample",
+    "explicit",
+    "two coils",
+    "a real position sensor",
+    "a real amplifier",
+    "Kalman under noise",
+    "closed form, explicit",
+}
 COMBINED = {
     "repaired, not predicted",
     "repaired, no delay",
@@ -185,10 +195,14 @@ def noise_of(scenario, samples):
     return np.stack(drawn, axis=-1)
 
 
+def how_slow(name):
+    return () if name in FAST else pytest.mark.thorough if name in COMBINED else pytest.mark.slow
+
+
 # The plant's integration is what differs: DOP853 at 1e-12 against the package's RK4.
 @pytest.mark.parametrize(
     "case",
-    [pytest.param(case, id=case.name, marks=pytest.mark.slow if case.name in COMBINED else ()) for case in CASES],
+    [pytest.param(case, id=case.name, marks=how_slow(case.name)) for case in CASES],
 )
 def test_against_the_independent_simulator(case):
     cascade, scenario, clock = loop_of(case.world, case.samples, case.std)
@@ -287,7 +301,11 @@ def loss_of(clock, p, closed=False):
 
 @pytest.mark.parametrize(
     ("p", "closed"),
-    [(INF, False), pytest.param(2.0, False, marks=pytest.mark.slow), pytest.param(INF, True, marks=pytest.mark.slow)],
+    [
+        (INF, False),
+        pytest.param(2.0, False, marks=pytest.mark.thorough),
+        pytest.param(INF, True, marks=pytest.mark.slow),
+    ],
 )
 def test_gradients_three_ways_and_finite_over_six_decades_of_gains(p, closed):
     """One program in reverse mode: tracing a derivative takes longer than all the rest."""
@@ -329,7 +347,7 @@ def test_a_loop_that_leaves_the_numbers_is_a_loss_and_no_nan():
 
 
 def test_a_gain_of_a_sign_without_a_layer_only_bounds():
-    """Stepped implicitly it is used no further than the error asks: 1e6 or 1e30 A/s, the same run."""
+    """An implicit step uses only the share of the gain that the error requires: 1e6 and 1e30 A/s give the same run."""
     scenario = dataclasses.replace(NOISY, u_max=math.inf)
     runs = [
         amb.rollout(dataclasses.replace(cascade_of(), current=amb.current.SlidingMode(k_i, INF)), scenario, SHORT)

@@ -223,8 +223,19 @@ FAST = {
     ("super-twisting, set-valued", "implicit"),
     ("limited supply, pi", "explicit"),
 }
+QUICK = {name for name, _ in FAST}
+
+
+def how_slow(name, discretisation):
+    """The mark of a case: each configuration is slow or fast in one of its discretisations at least."""
+    if (name, discretisation) in FAST:
+        return ()
+    first = CONFIGURATIONS[name].get("discretisation", "implicit")
+    return pytest.mark.slow if name not in QUICK and discretisation == first else pytest.mark.thorough
+
+
 ORDERS = [
-    pytest.param(name, discretisation, marks=() if (name, discretisation) in FAST else pytest.mark.slow)
+    pytest.param(name, discretisation, marks=how_slow(name, discretisation))
     for name, options in CONFIGURATIONS.items()
     for discretisation in ("implicit", "explicit")
     if options.get("discretisation", discretisation) == discretisation
@@ -303,7 +314,7 @@ def test_errors_are_added_and_the_observer_steps():
 
 @pytest.mark.parametrize(("delay", "predict"), [(0.0, True), (0.5, True), (1.5, True), (1.5, False)])
 def test_the_reference_is_that_of_the_instant_at_which_the_voltage_acts(delay, predict):
-    """With c = k = 0 the law asks for spring, weight and r_ddot; not predicted, for that of the sample itself."""
+    """With c = k = 0 the law demands spring, weight and r_ddot; without prediction, those at the sample itself."""
     world = World(
         delay=delay, predict=predict, reference=SINE, position=("sliding-mode", {"c": 0.0, "k": 0.0, "p": 25.0})
     )

@@ -32,7 +32,7 @@ KEYS = {"peak", "frequency_hz", "zone", "t_peak", "ks_peak", "gain_margin", "pha
 def answered(tmp_path, capsys, text, *flags):
     path = tmp_path / "case.toml"
     path.write_text(text)
-    code = main(["sensitivity", str(path), "--out", str(tmp_path / "out"), *flags])
+    code = main(["sensitivity", str(path), "--out", str(tmp_path / "out"), "--force", *flags])
     return code, *capsys.readouterr(), path
 
 
@@ -152,6 +152,9 @@ def test_the_injected_peak_stands_beside_the_linear_one(tmp_path, capsys):
     assert summary["injected_peak"] == pytest.approx(summary["injected_linear_there"], rel=0.02)
     code, out, _, _ = answered(tmp_path, capsys, PROCESSOR)
     assert "Injected into the simulation (multi-sine of 5e-05 m)" in out
+    assert "Injected at the velocity sensor into the simulation (multi-sine of 0.0265 m/s)" in out
+    assert "|S| peaks at 2.712 at 40 Hz; the linear value there is 2.694." in out
+    assert summary["injected_velocity_frequency_hz"] == 40.0
 
 
 def test_the_picture_shows_the_injected_points(tmp_path):

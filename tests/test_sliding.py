@@ -64,11 +64,12 @@ def test_the_exponential_step_and_its_derivative():
 
 
 def test_a_slide_reaches_its_end_and_no_further():
-    first, second, tau = relaxation(jnp.asarray(2.0), jnp.asarray(0.0), 1e6, 25.0, 1e-4)
+    first, second, tau, path = relaxation(jnp.asarray(2.0), jnp.asarray(0.0), 1e6, 25.0, 1e-4)
     assert float(tau) == pytest.approx(2e-6, rel=0.02)
     # what is left of w after the step: it moved by exactly what there was
     assert float(tau * first + (1e-4 - tau) * second) == pytest.approx(2.0, abs=1e-3)
-    first, _, tau = relaxation(jnp.asarray(2.0), jnp.asarray(0.0), 1e3, 25.0, 1e-4)
+    assert [float(w) for w in path] == pytest.approx([2.0, 2.0 - float(tau * first), 0.0], abs=1e-3)
+    first, _, tau, _ = relaxation(jnp.asarray(2.0), jnp.asarray(0.0), 1e3, 25.0, 1e-4)
     assert float(tau) == 1e-4
     assert float(tau * first) == pytest.approx(0.1, rel=0.02)
 

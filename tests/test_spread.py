@@ -237,7 +237,7 @@ def test_shifted_pulses_keep_their_length():
 
 
 def test_disturbance_paths_follow_the_case_file():
-    # the only disturbance of z is called q_z, in whatever unit; two at once are told apart
+    # the only disturbance of z is called q_z, in whatever unit; two at once have different names
     acceleration = dataclasses.replace(SCENARIO, q_z=Sine(1.0, 3.0), q_v=Constant())
     assert apply(CASCADE, acceleration, {"disturbance.q_z.phase": 0.5})[1].q_z.phase == 0.5
     assert apply(CASCADE, SCENARIO, {"disturbance.q_z.amplitude": 5.0})[1].q_v.amplitude == 5

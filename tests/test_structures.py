@@ -97,7 +97,7 @@ def test_the_written_gains_of_state_feedback_are_optimal_for_the_paper_s_plant()
 SPRINGS = "[plant]\nmu_0 = 9.8e-6\nn = 359.0\nA = 1.7e-7\ni_0 = 1e-6\n"
 
 
-def test_a_case_without_optimal_gains_asks_for_gains():
+def test_a_case_without_optimal_gains_needs_gains():
     case = SPRINGS + '[controller.position]\nkind = "state-feedback"\n'
     wanted = r"controller\.position: the model has no .*optimal gains.*Give all of k_aw, k_d, k_int, k_p\."
     with pytest.raises(ValueError, match=wanted):

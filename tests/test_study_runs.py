@@ -372,13 +372,13 @@ HARD = TINY.replace("gamma = 1e9\np = 25e-6", "gamma = 3.5e5\np = 25.0").replace
 
 
 @pytest.mark.parametrize(("dt", "substeps"), [("", 3), ("dt = 2.5e-5\n", 4)])
-def test_the_sliding_step_can_be_asked_for(dt, substeps):
+def test_the_sliding_step_can_be_chosen(dt, substeps):
     case = read_case(write(HARD.replace("dt = 5e-5\n", f'method = "sliding"\n{dt}')))
     assert case.clock.method == Slide(substeps)
 
 
 @pytest.mark.slow
-def test_the_error_of_the_sliding_step_is_measured_and_told(no_pictures, capsys):
+def test_the_error_of_the_sliding_step_is_measured_and_printed(no_pictures, capsys):
     write(HARD.replace("dt = 5e-5", 'method = "sliding"'))
     assert main(["ensemble", "case.toml", "--members", "20", "--seed", "3", "--out", "out", "--json"]) == 0
     out, err = capsys.readouterr()
@@ -402,7 +402,7 @@ def test_the_sliding_step_needs_its_inversion_law(capsys):
     assert 'clock.method = "sliding": it needs controller.inversion.kind = "adaptive"' in err
 
 
-def test_stalled_members_are_told_apart(capsys):
+def test_stalled_members_are_counted_separately(capsys):
     columns = {"index": np.arange(10), "lost_at": np.full(10, np.inf), "lost": np.zeros(10, bool)}
     columns |= {"stalled": np.arange(10) < 2}
     columns["lost"][5] = True
@@ -440,8 +440,8 @@ BAD = {
     "negative scale": ("ensemble --members 9", "plant.R = { normal = -1.0 }\n", ["spread.plant.R", "-1"]),
     "per cent of zero": ("ensemble --members 9", "initial.i = { percent = 1 }\n", ["spread.initial.i", "uniform"]),
     "spread simulated": ("simulate", "plant.k_z = { percent = -5 }\n", ["spread.plant.k_z", "-5"]),
-    "seed of nobody": ("simulate --seed 3", "", ["--seed and --members need --member"]),
-    "members of nobody": ("simulate --members 3", "", ["--seed and --members need --member"]),
+    "seed without member": ("simulate --seed 3", "", ["--seed and --members need --member"]),
+    "members without member": ("simulate --members 3", "", ["--seed and --members need --member"]),
     "member -1": ("simulate --member -1", "", ["--member -1", "from 0 to 2147483647"]),
     "member N": ("simulate --member 9 --members 9", "", ["--member 9", "from 0 to 8"]),
     "member huge": ("simulate --member 1099511627776", "", ["--member 1099511627776", "from 0 to 2147483647"]),

@@ -92,7 +92,7 @@ def test_a_stderr_that_takes_nothing_stops_no_work(number, monkeypatch):
     assert sorted(p.name for p in pathlib.Path("there").iterdir()) == sorted(simulate.WRITTEN)
 
 
-def test_a_stream_that_failed_is_not_asked_again(monkeypatch):
+def test_a_stream_that_failed_is_not_written_again(monkeypatch):
     """Not as Python ends either: what it holds would fail once more, and become the exit code."""
     stuck = Stuck(errno.ENOSPC)
     monkeypatch.setattr(sys, "stdout", stuck)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from profiles import examples
 
 import ambjax as amb
 from ambjax.ensemble import run_ensemble
@@ -103,7 +104,7 @@ def test_an_error_is_that_of_some_steps_carried_by_the_loop():
 
 @pytest.mark.slow
 def test_errors_of_many_loops():
-    loops = random_loops(300)
+    loops = random_loops(examples(100, 300))
     exact, z_dot = motion(loops, 1e-9)
     errors = far(motion(loops, QUIET_TOLERANCE)[0], exact)
     held = np.isfinite(exact).all(axis=1)
@@ -112,6 +113,6 @@ def test_errors_of_many_loops():
     print(f"\nheld {held.sum()}; error over that of a step {np.max(errors / step):.3g}; gain {gain.max():.3g} s")
     for most in (0.03, 0.1, 0.3, np.inf):
         print(f"gain up to {most} s: {(gain <= most).sum()} loops, error {errors[gain <= most].max():.1e} m")
-    assert held.sum() > 100
+    assert held.sum() > len(held) / 3
     assert (errors <= 100 * step).all()
     assert errors[gain <= 0.1].max() <= 1e-8

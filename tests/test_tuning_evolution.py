@@ -95,8 +95,8 @@ def test_three_limits_are_kept_where_derivatives_lead_elsewhere(monkeypatch, tmp
 
 
 def populations(world):
-    """How many populations were drawn; nothing else in two dimensions asks for as many points at once."""
-    return sum(kind == "terms" and points == population(2) for kind, _, _, points in world.asked)
+    """How many populations were drawn; no other call in two dimensions has as many points."""
+    return sum(kind == "terms" and points == population(2) for kind, _, _, points in world.calls)
 
 
 def test_a_descent_that_has_converged_is_left_alone(monkeypatch, tmp_path):
@@ -132,7 +132,7 @@ def test_a_search_that_is_resumed_among_populations_ends_alike(monkeypatch, tmp_
 
     world = World(chaos=1e30)
     whole, _ = found(monkeypatch, tmp_path / "whole", world)
-    world.asked = Counting()
+    world.calls = Counting()
     cut, _ = found(monkeypatch, tmp_path / "cut", world)
     assert len(cut.history["value"]) < len(whole.history["value"])
     made = study(monkeypatch, World(chaos=1e30))

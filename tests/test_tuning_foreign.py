@@ -68,7 +68,7 @@ def gamma(name, **tune):
     return found.ranges[[gain.name for gain in found.objective.space.gains].index("gamma")], found
 
 
-def test_gamma_is_looked_for_from_what_the_motion_asks():
+def test_the_range_of_gamma_starts_at_delta_1_of_the_motion():
     """From Delta_1 of a moving reference; at rest, from dv/dz z_dot of a rotor that falls from where it starts."""
     moving, found = gamma("tracking")
     assert moving.low == next(b.value for b in found.goal.conditions if b.symbol == "Delta_1") > 0
@@ -214,16 +214,17 @@ def write(path, text, **tune):
     return path
 
 
-def told(out):
+def report_of(out):
     return json.loads((out / "report.json").read_text())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", COMMON)
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.slow if x == "fan" else pytest.mark.thorough) for x in COMMON]
+)
 def test_common_bearings_tune_unattended(name, tmp_path):
     out = tmp_path / "out"
     assert main([str(write(tmp_path / "case.toml", COMMON[name])), "--out", str(out), "--json"]) == 0
-    facts = told(out)
+    facts = report_of(out)
     assert facts["verified"] is True
     assert facts["after"]["lost"] == 0
     assert facts["step_error"]["tried"] == 8
@@ -234,7 +235,7 @@ def test_common_bearings_tune_unattended(name, tmp_path):
         assert row["source"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_search_from_the_cases_gains_alone(tmp_path):
     """From gains that hold, as from those of an answer: with no screen it refines them."""
     first, second = tmp_path / "first", tmp_path / "second"
@@ -242,5 +243,5 @@ def test_a_search_from_the_cases_gains_alone(tmp_path):
     assert main([str(tmp_path / "case.toml"), "--out", str(first), "--json"]) == 0
     write(tmp_path / "again.toml", (first / "tuned.toml").read_text(), screen=0)
     assert main([str(tmp_path / "again.toml"), "--out", str(second), "--json"]) == 0
-    before, after = (told(out)["after"]["settled_rms_error_m"] for out in (first, second))
+    before, after = (report_of(out)["after"]["settled_rms_error_m"] for out in (first, second))
     assert after <= 1.01 * before  # the loss counts more than this error

@@ -74,7 +74,7 @@ def test_the_knee_is_the_least_voltage_within_25_percent_of_the_least_error(ran)
         assert {"controller.position.c": law.c, "controller.position.k": law.k} == row["gains"]
 
 
-def test_least_error_traces_no_front_unless_it_is_asked_for(ran):
+def test_least_error_traces_no_front_without_pareto(ran):
     code, facts, _, folder = ran(pareto=False)
     assert code == 0
     assert "front" not in facts
@@ -84,7 +84,7 @@ def test_least_error_traces_no_front_unless_it_is_asked_for(ran):
 def test_the_front_of_least_error_leaves_the_answer(ran):
     _, facts, out, folder = ran(pareto=True, front=1, bounds=BOUNDLESS)
     assert [(row["factor"], row["taken"]) for row in facts["front"]] == [(1, True), (1.25, False)]
-    assert "Taken: the answer of least error" in out
+    assert "This answer has the least error: " in out
     assert len(list(folder.glob("tuned_*V.toml"))) == 2
 
 

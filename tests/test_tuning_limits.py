@@ -1,4 +1,4 @@
-"""Limits: how they are asked for and measured, that the search keeps them, what they cost, and what is said of it."""
+"""Limits: how they are read and measured, whether the search respects them, their price, and their report."""
 
 import argparse
 import dataclasses
@@ -40,33 +40,33 @@ def found(monkeypatch, folder, world=None, **tune):
     return answer, np.asarray(answer.problem.objective.space.gains_at(answer.x))
 
 
-# --- what is asked ---
+# --- the limits of a case ---
 
 
-def asked(limits, **tables):
+def limits_of(limits, **tables):
     limits = {"sensitivity": math.inf} | limits
     document = {"sensor": {"std": 1e-6}, "clock": {"duration": 0.02}, **tables, "tune": {"limits": limits}}
     return case_and_tune(document)[1].limits
 
 
-def test_a_supply_keeps_room_unless_it_is_told_not_to():
+def test_a_supply_limits_the_voltage_by_default():
     supply = {"actuator": {"u_max": 200.0}}
-    assert asked({}).each == ()
-    (default,) = asked({}, **supply).each
+    assert limits_of({}).each == ()
+    (default,) = limits_of({}, **supply).each
     assert (default.name, default.threshold) == ("rms_u_V", 120.0)
     assert "60 %" in default.source
-    assert asked({"rms_u_V": math.inf}, **supply).each == ()
-    (given,) = asked({"rms_u_V": 150}, **supply).each
+    assert limits_of({"rms_u_V": math.inf}, **supply).each == ()
+    (given,) = limits_of({"rms_u_V": 150}, **supply).each
     assert (given.threshold, given.source) == (150.0, "tune.limits")
 
 
 def test_limits_are_in_order_and_in_the_fingerprint():
-    each = asked({"settling_s": 0.1, "max_u_V": 50.0, "margin": 0.1}).each
+    each = limits_of({"settling_s": 0.1, "max_u_V": 50.0, "margin": 0.1}).each
     assert [(one.name, one.margin) for one in each] == [("max_u_V", 0.1), ("settling_s", 0.1)]
     tune = case_and_tune({"tune": {"limits": {"max_u_V": 50.0, "sensitivity": math.inf, "survival": 0.99}}})[1]
     assert settings(tune)["limits"] == {"max_u_V": {"threshold": 50.0, "margin": KINDS["max_u_V"].margin}}
     assert settings(tune)["survival"] == 0.99
-    assert asked({"settling_s": 0.1}).band == pytest.approx(45e-6)  # 1 % of 4.5 mm
+    assert limits_of({"settling_s": 0.1}).band == pytest.approx(45e-6)  # 1 % of 4.5 mm
 
 
 WRONG = [0.0, math.nan, -math.inf, 1e13]
@@ -96,7 +96,7 @@ ENDS = {
 )
 def test_what_is_wrong_is_said_in_one_line(limits, path, words):
     with pytest.raises(ValueError, match=r".") as caught:
-        asked(limits)
+        limits_of(limits)
     message = str(caught.value)
     assert message.startswith(f"tune.limits.{path}")
     assert words in message
@@ -198,7 +198,7 @@ def test_the_largest_over_members_is_smooth_and_no_less():
     assert float(largest(values)) == pytest.approx(2 * (2 + 2**-16) ** (1 / 16))
     slopes = jax.grad(largest)(values)
     assert float(slopes @ values) == pytest.approx(float(largest(values)))  # twice the values, twice the largest
-    np.testing.assert_array_equal(jax.grad(largest)(0 * values), 0.0)  # nobody overshoots
+    np.testing.assert_array_equal(jax.grad(largest)(0 * values), 0.0)  # no member overshoots
     np.testing.assert_array_equal(jax.grad(largest)(jnp.asarray([0.0, 3.0])), [0.0, 1.0])
     assert float(largest(1e-200 * values)) >= 0.0  # neither under- nor overflow
     assert np.isfinite(float(largest(1e200 * values)))
@@ -210,12 +210,12 @@ def test_the_pull_is_that_of_an_augmented_lagrangian():
     assert float(limit.term(0.5 * values)) == 0.0
     # the multiplier is the force that acted at the optimum, which the search's own number makes
     assert limit.updated(10.0 * math.exp(0.05), 10.0 * math.exp(0.1)).multiplier == pytest.approx(PENALTY * 0.05)
-    told = limit.updated(10.0, 10.0 * math.exp(0.1))
-    assert told.multiplier == pytest.approx(0.0)
+    tighter = limit.updated(10.0, 10.0 * math.exp(0.1))
+    assert tighter.multiplier == pytest.approx(0.0)
     # the judge finds 10 % more than the search: from now on the search counts as he does
-    assert float(told.term.excess(jnp.full(3, 10.0))) == pytest.approx(0.1)
-    assert told.penalty == PENALTY
-    again = told.updated(9.9, 10.0 * math.exp(0.09))  # hardly less: it must be steeper
+    assert float(tighter.term.excess(jnp.full(3, 10.0))) == pytest.approx(0.1)
+    assert tighter.penalty == PENALTY
+    again = tighter.updated(9.9, 10.0 * math.exp(0.09))  # hardly less: it must be steeper
     assert again.multiplier == pytest.approx(PENALTY * (0.1 + math.log(0.99)))
     assert again.penalty > PENALTY
     assert limit.updated(5.0, 5.0).multiplier == 0.0
@@ -291,8 +291,8 @@ def test_a_limit_that_is_far_costs_nothing(monkeypatch, tmp_path):
     first, _ = found(monkeypatch, tmp_path, far, limits={"rms_u_V": 30.0})
     second, _ = found(monkeypatch, tmp_path / "free", free, limits={"rms_u_V": math.inf})
     np.testing.assert_array_equal(first.x, second.x)
-    assert [one for one in far.asked if one[0] != "terms"] == [one for one in free.asked if one[0] != "terms"]
-    assert len(far.asked) == len(free.asked) + 1  # the training members, once more
+    assert [one for one in far.calls if one[0] != "terms"] == [one for one in free.calls if one[0] != "terms"]
+    assert len(far.calls) == len(free.calls) + 1  # the training members, once more
 
 
 def test_what_the_judge_finds_counts(monkeypatch, tmp_path):

@@ -49,7 +49,7 @@ OUTCOMES = {
         {}, BROKEN, UNVERIFIED, False,
     ),
     "every one lost": (lambda: losing(*range(6)), {}, BROKEN, BROKEN, False),
-    "nobody judges": (World, {"held_out": 0}, UNJUDGED, UNJUDGED, True),
+    "no held-out members": (World, {"held_out": 0}, UNJUDGED, UNJUDGED, True),
 }  # fmt: skip
 
 
@@ -133,13 +133,13 @@ def test_a_lost_member_s_voltage_counts_in_no_limit():
     columns |= {"lost": np.array([False, True]), "stalled": np.zeros(2, bool)}
     columns |= {"settled_rms_error_m": np.array([1e-6, 4e-3]), "settled_max_abs_error_m": np.array([2e-6, 5e-3])}
     assert Limit("rms_u_V", 80.0).reached(columns) == pytest.approx(100.0)
-    told = summarise(columns)
-    assert (told["held"], told["lost"]) == (1, 1)
-    assert told["settled_rms_u_V.mean"] == 100.0
-    assert (told["settled_rms_error_m"], told["settled_max_abs_error_m"]) == (1e-6, 2e-6)
-    assert told["lost_at_s.mean"] == 0.1
-    nobody = summarise({name: x[1:] for name, x in columns.items()})
-    assert (nobody["held"], "settled_rms_error_m" in nobody) == (0, False)
+    summary = summarise(columns)
+    assert (summary["held"], summary["lost"]) == (1, 1)
+    assert summary["settled_rms_u_V.mean"] == 100.0
+    assert (summary["settled_rms_error_m"], summary["settled_max_abs_error_m"]) == (1e-6, 2e-6)
+    assert summary["lost_at_s.mean"] == 0.1
+    no_held = summarise({name: x[1:] for name, x in columns.items()})
+    assert (no_held["held"], "settled_rms_error_m" in no_held) == (0, False)
 
 
 def test_a_gain_that_loses_rotors_when_it_is_off_says_how_many():
@@ -157,5 +157,5 @@ def test_a_gain_that_loses_rotors_when_it_is_off_says_how_many():
     ]
     text = report._gains(types.SimpleNamespace(gains=rows, trained_on=40, nominal_steps="by accurate steps"))
     assert [line.split("|")[-2].strip() for line in text if line.startswith("| controller")] == [
-        "**a gain off by 28 % loses a rotor (2 of 40 members)**", "3 %", "0 %",
+        "**2 of 40 training members are lost**", "3 %", "0 %",
     ]  # fmt: skip

@@ -131,12 +131,12 @@ def test_the_loss_table_can_be_added_up_by_hand(written):
 
 def test_the_table_is_of_the_members_that_were_judged(study, x):
     found = judge(study, x, seeds(study.tune.budget)[2], 12)
-    told = breakdown.table(study.goal, found)
+    terms = breakdown.table(study.goal, found)
     losses = weigh(study.goal.weights, {name: found[f"loss.{name}"] for name in TERMS}, np.zeros(12, bool))
-    assert told["loss"] == pytest.approx(losses.mean(), rel=1e-12)
-    assert told["risk"] == pytest.approx(float(study.goal.risk(jnp.asarray(losses))), rel=1e-12)
+    assert terms["loss"] == pytest.approx(losses.mean(), rel=1e-12)
+    assert terms["risk"] == pytest.approx(float(study.goal.risk(jnp.asarray(losses))), rel=1e-12)
     # means of products are not products of means: what effort adds is not to be had from the row alone
-    assert told["adds"]["effort"] == pytest.approx(
+    assert terms["adds"]["effort"] == pytest.approx(
         np.mean(0.1 * found["loss.effort"] * (found["loss.tracking"] + 0.5 * found["loss.peak"])), rel=1e-12
     )
 
@@ -179,7 +179,7 @@ def test_a_lower_point_beside_the_answer_is_said():
     beside["lower"] = 0.005
     assert "within the tolerance of the search" in report._lower_point(beside)
     beside["lower"] = 0.0
-    assert "none is lower" in report._lower_point(beside)
+    assert "No point of these slices has a lower objective" in report._lower_point(beside)
 
 
 def test_the_picture_begins_at_what_the_table_says_was_minimised(study, x):
@@ -197,9 +197,9 @@ def test_accurate_values_are_those_of_adaptive_rollouts():
     study.__dict__["judging"] = study.engine
     x = study.objective.space.encode(study.tune.space.values(study.case.cascade))
     seed = seeds(study.tune.budget)[2]
-    told = accurate.compared(study, x, seed, 12, SHOWN)
-    assert (told["members"], told["held"]) == (accurate.COMPARED, accurate.COMPARED)
-    assert abs(told["metrics"]["settled_rms_error_m"]["relative"]) > 1e-3
+    compared = accurate.compared(study, x, seed, 12, SHOWN)
+    assert (compared["members"], compared["held"]) == (accurate.COMPARED, accurate.COMPARED)
+    assert abs(compared["metrics"]["settled_rms_error_m"]["relative"]) > 1e-3
     found = []
     for k in range(accurate.COMPARED):
         one = study.objective.chosen(seed, np.array([k]), 12)
@@ -212,9 +212,9 @@ def test_accurate_values_are_those_of_adaptive_rollouts():
     error = math.sqrt(np.mean([float(m["settled_rms_error_m"]) ** 2 for m in found]))
     chatter = np.mean([float(m["chatter_V"]) for m in found])
     # the same adaptive steps in another program: where a step ends depends on rounding, by less than its tolerance
-    assert told["metrics"]["settled_rms_error_m"]["accurate"] == pytest.approx(error, rel=1e-5)
-    assert told["metrics"]["chatter_V.mean"]["accurate"] == pytest.approx(chatter, rel=1e-5)
-    for row in told["metrics"].values():
+    assert compared["metrics"]["settled_rms_error_m"]["accurate"] == pytest.approx(error, rel=1e-5)
+    assert compared["metrics"]["chatter_V.mean"]["accurate"] == pytest.approx(chatter, rel=1e-5)
+    for row in compared["metrics"].values():
         assert row["relative"] == pytest.approx(row["report"] / row["accurate"] - 1, abs=1e-12)
 
 
@@ -224,10 +224,10 @@ def test_accurate_steps_against_themselves_are_off_by_nothing(study, x):
     engine = Engine(objective, settle=study.case.settle, lanes=4)
     same = dataclasses.replace(study)
     same.__dict__["judging"] = engine
-    told = accurate.compared(same, x, 5, 3, SHOWN)
-    assert told["members"] == 3
-    assert {row["relative"] for row in told["metrics"].values()} == {0.0}
-    assert told["lost"] == {"report": 0, "accurate": 0}
+    compared = accurate.compared(same, x, 5, 3, SHOWN)
+    assert compared["members"] == 3
+    assert {row["relative"] for row in compared["metrics"].values()} == {0.0}
+    assert compared["lost"] == {"report": 0, "accurate": 0}
 
 
 def test_what_is_off_by_much_is_marked():
@@ -255,9 +255,9 @@ def test_the_columns_of_accurate_steps_are_in_the_report(written):
     rows = [row for row in rows if row[0].strip("`") in metrics]
     assert len(rows) == len(metrics) > 3
     for row in rows:
-        told = metrics[row[0].strip("`")]
-        assert float(row[4]) == pytest.approx(told["accurate"], rel=1e-3)
-        assert row[5].startswith("**") == (abs(told["relative"]) > 0.05)
+        metric = metrics[row[0].strip("`")]
+        assert float(row[4]) == pytest.approx(metric["accurate"], rel=1e-3)
+        assert row[5].startswith("**") == (abs(metric["relative"]) > 0.05)
 
 
 # --- pages ---------------------------------------------------------------------------------------------------------
@@ -363,8 +363,8 @@ def test_rows_of_the_picture_are_of_the_run_that_they_name(study, monkeypatch):
         np.testing.assert_allclose(drawn / np.abs(drawn).max(), values / np.abs(values).max(), rtol=1e-12)
     stalled = dataclasses.replace(before, lost_code=STALLED, rows=rows._replace(alive=np.asarray(rows.t) < 0.005))
     lost = dataclasses.replace(stalled, lost_code=TOUCHED)
-    told = pictures.spectrum({"before": lost, "after": stalled}, 0.01).axes[0].get_legend().get_texts()
-    assert [one.get_text() for one in told] == ["before: lost before 0.01 s", "after: not decided before 0.01 s"]
+    entries = pictures.spectrum({"before": lost, "after": stalled}, 0.01).axes[0].get_legend().get_texts()
+    assert [one.get_text() for one in entries] == ["before: lost before 0.01 s", "after: not decided before 0.01 s"]
 
 
 def test_ranges_and_their_sources_are_in_the_table():
@@ -375,9 +375,9 @@ def test_ranges_and_their_sources_are_in_the_table():
     assert "searched from" not in "".join(bare)
     ranged = row | {"low": 0.5, "high": 20.0, "source": "w/30 to 10 w"}
     facts = types.SimpleNamespace(gains=[ranged], trained_on=40, nominal_steps="by accurate steps")
-    told = "\n".join(report._gains(facts))
-    assert "| controller.position.c | 1 | 2 | 0.5 | 20 | 0 | 30 | - | 3 % |" in told
-    assert "- controller.position.c: w/30 to 10 w" in told
+    table = "\n".join(report._gains(facts))
+    assert "| controller.position.c | 1 | 2 | 0.5 | 20 | 0 | 30 | - | 3 % |" in table
+    assert "- controller.position.c: w/30 to 10 w" in table
 
 
 def test_the_formula_names_every_term_once():

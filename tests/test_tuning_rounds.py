@@ -1,4 +1,4 @@
-"""The rounds of a study on losses that are formulas: whom they ask, what they go on with, and what they return."""
+"""The rounds of a study on losses that are formulas: the members they use, how they continue, what they return."""
 
 import math
 
@@ -12,7 +12,7 @@ from tuning.config import seeds
 from tuning.search.rounds import rounds
 
 TRAINING, VALIDATION, HELD_OUT = 0, 1, 2
-# What a checkpoint is told of the study that it belongs to.
+# Fingerprint of the study in a checkpoint.
 TOLD = {"case": "a bowl"}
 
 
@@ -47,7 +47,7 @@ def test_the_best_gains_are_found_and_nobody_is_lost(monkeypatch, tmp_path):
     assert found.error is not None
     assert found.error.resolved
     assert world.seeds("gradient") == {seed_of(TRAINING)}  # nothing else is descended
-    assert seed_of(HELD_OUT) not in world.seeds("terms") | world.seeds("metrics")  # who judges is not asked before
+    assert seed_of(HELD_OUT) not in world.seeds("terms") | world.seeds("metrics")  # held-out members are unused
 
 
 def test_members_of_another_seed_that_are_lost_join_and_are_held(monkeypatch, tmp_path):
@@ -58,7 +58,7 @@ def test_members_of_another_seed_that_are_lost_join_and_are_held(monkeypatch, tm
 
     world = World(limit=limit)
     found, (c, k) = tuned(monkeypatch, tmp_path, world)
-    assert ("terms", seed_of(VALIDATION), tuple(range(10)), 1) in world.asked
+    assert ("terms", seed_of(VALIDATION), tuple(range(10)), 1) in world.calls
     assert found.lost == 0
     assert c < 40.0 < world.best[0]  # without them c = 100 is best
     assert k == pytest.approx(world.best[1], rel=0.1)
@@ -68,7 +68,7 @@ def test_members_of_another_seed_that_are_lost_join_and_are_held(monkeypatch, tm
     np.testing.assert_allclose(found.members.noise_factor[joined], 1.1)
 
 
-def test_without_validation_nobody_is_asked(monkeypatch, tmp_path):
+def test_without_validation_there_are_no_validation_calls(monkeypatch, tmp_path):
     world = World(limit=lambda seed, number, *_: math.inf if seed == 1 else 40.0)
     found, gains = tuned(monkeypatch, tmp_path, world, validation=0)
     np.testing.assert_allclose(gains, world.best, rtol=0.05)
@@ -91,18 +91,18 @@ def test_of_several_answers_that_lose_members_the_one_that_loses_least_is_return
 
         @property
         def trial(self):
-            """Whether it is the whole validation ensemble that is asked."""
-            kind, seed, numbers, _ = self.asked[-1]
+            """Whether the last call was for the whole validation ensemble."""
+            kind, seed, numbers, _ = self.calls[-1]
             return kind == "terms" and seed == seed_of(VALIDATION) and len(numbers) == 10
 
     class Noticing(list):
-        def append(self, asked):
-            super().append(asked)
+        def append(self, call):
+            super().append(call)
             if world.trial:
                 world.now = next(lost)
 
     world = Moody()
-    world.asked = Noticing()
+    world.calls = Noticing()
     found, _ = tuned(monkeypatch, tmp_path, world)
     assert found.lost == 1
     assert len(found.members.member) == 6 + 3  # the second round's: the three that the first lost have joined
@@ -116,7 +116,7 @@ def test_steps_that_do_not_resolve_the_answer_are_halved(monkeypatch, tmp_path):
     assert found.error.relative == pytest.approx(0.05)
     assert found.error.resolved
     # rollouts in the coarse steps count too
-    everyone = sum(len(numbers) * points for kind, _, numbers, points in world.asked if kind == "gradient")
+    everyone = sum(len(numbers) * points for kind, _, numbers, points in world.calls if kind == "gradient")
     assert found.problem.engine.rollouts > everyone
 
 
@@ -141,7 +141,7 @@ def test_members_that_only_accurate_steps_lose_join_too(monkeypatch, tmp_path):
 
 def test_where_every_member_is_lost_there_is_nothing_to_go_on_with(monkeypatch, tmp_path):
     found, _ = tuned(monkeypatch, tmp_path, World(limit=lambda seed, number, *_: 1e-3))
-    assert found.lost == 10  # all that would have been asked
+    assert found.lost == 10  # the whole validation ensemble
     assert found.error is None
 
 
@@ -151,7 +151,7 @@ def test_an_interrupted_study_goes_on_where_it_was(monkeypatch, tmp_path):
 
     def limit(seed, number, stressed, accurate):
         fragile = seed == seed_of(VALIDATION) and number == 3
-        if stop and fragile and world.asked[-1][0] == "gradient":
+        if stop and fragile and world.calls[-1][0] == "gradient":
             raise KeyboardInterrupt
         return 40.0 if fragile else math.inf
 

@@ -93,7 +93,7 @@ LATE = {
 }
 
 
-@pytest.mark.parametrize("delays", [[0.5, 1.5], [1.0, 2.0]])
+@pytest.mark.parametrize("delays", [[0.5, 1.5], pytest.param([1.0, 2.0], marks=pytest.mark.slow)])
 def test_a_lane_has_the_delay_of_its_member(delays):
     """Delays that are spread are neither rounded to whole samples, as their ends may be, nor cut to the nominal one."""
     case, tune = case_and_tune(LATE | {"spread": {"processor": {"delay": {"uniform": delays}}}})
@@ -110,7 +110,7 @@ def test_a_lane_has_the_delay_of_its_member(delays):
         assert lane == pytest.approx(float(alone["tracking"]), rel=1e-9)  # the same operations, fused differently
 
 
-def test_members_do_not_depend_on_how_many_are_asked_for():
+def test_members_do_not_depend_on_their_number():
     problem = objective()
     many, few = problem.members(5, 6), problem.members(5, 2)
 
@@ -271,7 +271,7 @@ def test_looks_end_when_two_in_a_row_gain_little_or_at_their_number():
     assert not should_restart(gaining)
 
 
-def test_lost_members_join_and_are_asked_only_to_be_held():
+def test_lost_members_join_as_stressed_members():
     problem = objective()
     members = problem.training(5, 4, 2, 1.5, 1.25).joined(problem.chosen(9, np.array([7, 3]), 10))
     assert members.ordinary == 4
@@ -283,14 +283,14 @@ def test_lost_members_join_and_are_asked_only_to_be_held():
 
 
 @pytest.fixture
-def told_compilations():
-    """Compilations are told in the log, those of all threads."""
+def logged_compilations():
+    """Log all compilations, those of all threads."""
     jax.config.update("jax_log_compiles", True)
     yield
     jax.config.update("jax_log_compiles", False)
 
 
-def test_nothing_is_compiled_after_the_first_iteration(small, caplog, told_compilations):
+def test_nothing_is_compiled_after_the_first_iteration(small, caplog, logged_compilations):
     run(small)
     engine, goal, members, start = small
     x = SPACE.encode(start * 1.3)[None]
@@ -313,7 +313,7 @@ def test_nothing_is_compiled_after_the_first_iteration(small, caplog, told_compi
 
 def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):
     whole = run(small)
-    told = {"case": 1}
+    facts = {"case": 1}
 
     class StopError(Exception):
         pass
@@ -322,7 +322,7 @@ def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):
         if kept.iteration == 4:
             raise StopError
 
-    keeper = Keeper(tmp_path / "kept.npz", told)
+    keeper = Keeper(tmp_path / "kept.npz", facts)
     with pytest.raises(StopError):
         run(small, keeper=keeper, on_iteration=stop)
     resumed = run(small, keeper=keeper, resume=True)
@@ -511,17 +511,17 @@ def test_the_command_tunes_a_case_that_simulate_runs(tmp_path):
     path.write_text(CASE)
     done = command(path, "--out", out, "--json")
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert told["after"]["lost"] == 0
-    assert told["before"]["lost"] == 8
+    report = json.loads(done.stdout)
+    assert report["after"]["lost"] == 0
+    assert report["before"]["lost"] == 8
     assert {p.name for p in out.iterdir()} >= {"tuned.toml", "history.npz", "report.md", "report.html", "report.json"}
     run = [sys.executable, "-m", "ambjax", "simulate", str(out / "tuned.toml"), "--out", str(tmp_path / "run")]
     assert subprocess.run(run, capture_output=True).returncode == 0
     again = command(path, "--out", out, "--json", "--resume")
-    assert json.loads(again.stdout)["gains"] == told["gains"]
+    assert json.loads(again.stdout)["gains"] == report["gains"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_killed_tuning_goes_on_and_damage_is_found(tmp_path):
     path, whole, out = tmp_path / "case.toml", tmp_path / "whole", tmp_path / "out"
     path.write_text(CASE)
@@ -565,4 +565,4 @@ def test_bad_input_ends_with_2_and_writes_nothing(tmp_path):
     assert not out.exists()
     assert command(tmp_path / "none.toml").returncode == 2
     path.write_text(CASE)
-    assert f"there is no search in --out {out}" in command(path, "--out", out, "--resume").stderr
+    assert f"--resume: --out {out} contains no search" in command(path, "--out", out, "--resume").stderr

@@ -10,7 +10,20 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from ambjax import Cascade, Clock, Initial, Pulse, Scenario, Sine, Slide, inversion, position, rollout
+from ambjax import (
+    Cascade,
+    Clock,
+    Initial,
+    Processor,
+    Pulse,
+    Scenario,
+    Sine,
+    Slide,
+    current,
+    inversion,
+    position,
+    rollout,
+)
 from ambjax.cases.template_text import template
 from ambjax.simulation.folds import Rms
 from ambjax.simulation.loop import SHOWN, Densities
@@ -94,6 +107,15 @@ def test_tunable_gains_are_the_positive_ones():
     found = tunable(Cascade())
     assert {"controller.position.c", "controller.inversion.gamma", "controller.current.k_i"} <= set(found)
     assert "controller.inversion.i_ref" not in found
+
+
+def test_gains_without_effect_are_left_out():
+    """The dead-beat law uses share for implicit steps, and w for explicit ones and in continuous time."""
+    cascade = Cascade(current=current.DeadBeat())
+    for processor, used in ((None, "w"), (Processor(), "share"), (Processor(implicit=False), "w")):
+        found = tunable(dataclasses.replace(cascade, processor=processor))
+        assert [path for path in found if "current" in path] == [f"controller.current.{used}"]
+    assert len(tunable(cascade, idle=True)) == len(found) + 1
 
 
 @pytest.mark.parametrize("name", ["tracking", "regulation"])

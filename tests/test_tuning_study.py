@@ -1,6 +1,6 @@
 """What surrounds the search: ranges, the judge, the step's error, slices, the front, descent, and the command's flags.
 
-On losses that are formulas (`bowl.py`), so that each can be told by hand.
+On losses that are formulas (`bowl.py`), so that each is known by hand.
 """
 
 import argparse
@@ -100,7 +100,7 @@ def test_the_judge_sees_every_member_of_its_own_ensemble_once(monkeypatch):
     found = judge(made, x, 77, 10)
     np.testing.assert_array_equal(found["chatter_V"], 1 + np.arange(10))  # a Bowl's member k chatters by 1 + k
     assert found["lost"].tolist() == [k == 5 for k in range(10)]
-    assert [numbers for kind, seed, numbers, _ in world.asked if (kind, seed) == ("metrics", 77)] == [
+    assert [numbers for kind, seed, numbers, _ in world.calls if (kind, seed) == ("metrics", 77)] == [
         (0, 1, 2, 3), (4, 5, 6, 7), (8, 9)
     ]  # fmt: skip
     assert {f"loss.{name}" for name in TERMS} <= set(found)
@@ -118,21 +118,21 @@ def test_a_summary_is_pooled_and_counts_the_lost_and_the_stalled():
         "lost": lost_at == 0.01,
         "stalled": lost_at == 0.02,
     }
-    told = summarise(found)
-    # nobody knows of a stalled one: it is not lost, and has not survived
+    pooled = summarise(found)
+    # the status of a stalled member is not known: it counts neither as lost nor as a survivor
     assert (
-        told["members"],
-        told["lost"],
-        told["stalled"],
-        told["held"],
-        told["survival"],
+        pooled["members"],
+        pooled["lost"],
+        pooled["stalled"],
+        pooled["held"],
+        pooled["survival"],
     ) == (4, 1, 1, 2, 0.5)
     theirs = stats.binomtest(2, 4).proportion_ci(0.95, method="wilson")
-    assert (told["survival_low"], told["survival_high"]) == pytest.approx((theirs.low, theirs.high))
-    assert told["settled_rms_error_m"] == pytest.approx(math.sqrt(2.5) * 1e-6)  # of the two that are held
-    assert told["settled_rms_error_worst_member_m"] == 2e-6
-    assert told["settled_max_abs_error_m"] == 4e-6
-    assert (told["lost_at_s.mean"], told["lost_at_s.largest"]) == (0.015, 0.02)  # of those that are
+    assert (pooled["survival_low"], pooled["survival_high"]) == pytest.approx((theirs.low, theirs.high))
+    assert pooled["settled_rms_error_m"] == pytest.approx(math.sqrt(2.5) * 1e-6)  # of the two that are held
+    assert pooled["settled_rms_error_worst_member_m"] == 2e-6
+    assert pooled["settled_max_abs_error_m"] == 4e-6
+    assert (pooled["lost_at_s.mean"], pooled["lost_at_s.largest"]) == (0.015, 0.02)  # of those that are
 
 
 @pytest.mark.parametrize("bias", [0.0, 0.06, -0.5, 0.4])
@@ -156,7 +156,7 @@ def test_members_that_only_accurate_steps_lose_are_named(monkeypatch):
     assert error.lost == len(error.unheld.member) == 0
 
 
-def test_an_error_of_which_no_share_is_told_is_told_in_metres(monkeypatch):
+def test_an_error_without_a_relative_value_is_given_in_metres(monkeypatch):
     """Where the accurate one is 0, and where there is none."""
     error = step_error(study(monkeypatch, World()), np.zeros(2))
     zero = error._replace(search_m=1e-6, reference_m=0.0, relative=math.nan)
@@ -216,7 +216,7 @@ def test_the_worse_half_of_the_starts_is_left_behind(monkeypatch):
     begins = np.stack([at(made, c, k) for c, k in ((3.0, 3.0), (6.0, 500.0), (900.0, 2.0), (2.0, 700.0))])
     members = made.objective.training(1, 4, 2, 1.2, 1.25)
     found = search(made.engine, made.goal, members, begins, keep=4, iterations=12)
-    starts = [points for kind, *_, points in world.asked if kind == "gradient"]
+    starts = [points for kind, *_, points in world.calls if kind == "gradient"]
     assert starts[: HALVINGS[0]] == [4] * HALVINGS[0]
     assert max(starts[HALVINGS[0] : HALVINGS[1]]) == 2
     assert max(starts[HALVINGS[1] :], default=1) == 1
@@ -227,7 +227,7 @@ def test_the_worse_half_of_the_starts_is_left_behind(monkeypatch):
 
 
 def test_bfgs_takes_the_same_way_whatever_the_unit_of_the_loss():
-    """The first pair of points tells the scale of the curvature: from then on f and 1000 f are descended alike."""
+    """The first pair of points gives the scale of the curvature: from then on f and 1000 f are descended alike."""
     hessian, centre = jnp.diag(jnp.asarray([4.0, 60.0, 900.0])), jnp.asarray([0.5, -0.3, 0.2])
 
     def way(unit):
@@ -269,14 +269,14 @@ def everything(tmp_path_factory):
     return world, code, summary, out, made
 
 
-def test_tuned_gains_are_judged_by_members_that_nothing_else_was_asked_of(everything):
+def test_tuned_gains_are_evaluated_on_members_that_nothing_else_used(everything):
     world, code, summary, _, made = everything
     training, validation, held_out = seeds(made.tune.budget)
     assert summary["held_out_seed"] == held_out
-    judged = [numbers for kind, seed, numbers, _ in world.asked if (kind, seed) == ("metrics", held_out)]
+    judged = [numbers for kind, seed, numbers, _ in world.calls if (kind, seed) == ("metrics", held_out)]
     assert judged[:2] == [tuple(range(6))] * 2  # before and after; then by accurate steps
     assert held_out not in world.seeds("terms")
-    assert {seed for kind, seed, *_ in world.asked if kind == "gradient"} == {training}
+    assert {seed for kind, seed, *_ in world.calls if kind == "gradient"} == {training}
     assert validation in world.seeds("terms")
     assert code == 0
     assert summary["after"]["lost"] == 0
@@ -322,6 +322,18 @@ def test_horizons_have_samples_and_settled_ones_among_them(monkeypatch, samples,
     assert gradient.against_horizon(made, x, members) == []
 
 
+def test_gradients_of_a_knee_are_those_of_the_loss(monkeypatch):
+    """Near the knee the goal weighs clearance and survival only; both are 0 where no rotor is near its stop."""
+    made = study(monkeypatch, World(), objective="knee")
+    x, members = at(made, 80.0, 40.0), made.objective.training(1, 4, 2, 1.2, 1.25)
+    knee = made.towards_voltage(5e-5, 20.0, 1.25)
+    of_loss, of_knee = (np.array(gradient.three_ways(one, x)["forward"]) for one in (made, knee))
+    assert np.abs(of_loss).min() > 0
+    np.testing.assert_array_equal(of_knee, of_loss)
+    assert len(gradient.against_horizon(knee, x, members)) > 1
+    assert np.isfinite(np.array(gradient.signal_to_noise(knee, x, members)["gradient"])).all()
+
+
 def test_pareto_is_in_the_report_and_has_a_picture(everything):
     _, _, summary, out, _ = everything
     assert len(summary["front"]) > 1
@@ -349,7 +361,7 @@ def test_a_file_whose_gains_could_not_be_written_is_refused_at_the_start(monkeyp
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unfinished_search_is_neither_lost_nor_gone_on_with_unasked(monkeypatch, tmp_path):
+def test_an_unfinished_search_is_neither_lost_nor_resumed_without_resume(monkeypatch, tmp_path):
     *_, out, _ = command(monkeypatch, tmp_path, World())
     left = {path.name for path in out.glob("checkpoint-*.npz")}
     mine = out / "checkpoint-my-net.npz"
@@ -370,7 +382,7 @@ def test_a_search_killed_before_its_first_checkpoint_is_resumed(monkeypatch, tmp
     path.write_text(dumps(document()))
     flags = {"gradients": False, "pareto": False, "resume": True, "json": True, "settings_of": None}
     args = argparse.Namespace(case=str(path), out=str(out), **flags)
-    with pytest.raises(ValueError, match=r"--resume: there is no search in --out"):
+    with pytest.raises(ValueError, match=r"--resume: --out .* contains no search"):
         tuning.command.run(args)
 
     def killed(*_):
@@ -404,12 +416,12 @@ def test_a_member_that_accurate_steps_alone_do_not_hold_is_no_survivor(monkeypat
     assert f"| {status} | 0 | 0 | 0 of 6 | 1 of 6 | - |" in (out / "report.md").read_text()
 
 
-def test_a_survival_that_accurate_steps_refute_says_so_where_nobody_judges(monkeypatch, tmp_path):
+def test_a_survival_that_accurate_steps_refute_is_reported_without_held_out_members(monkeypatch, tmp_path):
     world = World(limit=lambda seed, number, _, accurate: 1e-3 if accurate else math.inf)
     monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 1)
     code, summary, out, _ = command(monkeypatch, tmp_path, world, held_out=0)
     assert code == 1
-    assert "0 members of the training ensemble are lost under the tuned gains. That is NOT" in summary["verdict"]
+    assert "0 members of the training ensemble are lost under the tuned gains. This result is NOT" in summary["verdict"]
     assert "NOT VERIFIED: accurate steps lose 4 of 4" in (out / "tuned.toml").read_text()
     for name in ("report.md", "report.html"):
         assert "NOT VERIFIED" in (out / name).read_text()

@@ -39,7 +39,7 @@ def answered(text, capsys):
 
 
 def advised(answer):
-    """Tables and values that the answer asks for, as TOML."""
+    """Tables and values that the answer advises, as TOML."""
     return re.findall(r"set \[(\S+)\] (\w+) above ([0-9.e-]+\d)", answer)
 
 
@@ -98,7 +98,7 @@ def test_no_gain_is_set_by_what_a_falling_rotor_does():
     (words,) = advice.advice(met)
     assert "while the rotor falls" in words
     assert not advised(words)
-    # with less than twice what the reference asks, gamma itself may be what is missing
+    # with less than twice what the reference requires, gamma itself may be what is missing
     narrow = Report([condition(15.0, 1e9), condition(15.0, 10.0, ideal=True)], [], 0.1, "touched down", "")
     assert advised(advice.advice(narrow)[0]) == [("controller.inversion", "gamma", "20")]
     # of a rotor that is held, the larger of both counts
@@ -153,9 +153,11 @@ def test_every_command_says_the_same_of_a_rotor(kind, capsys, monkeypatch):
     report = Report([condition(2.0, 1.0)], [], lost_at, "touched down", "", stalled)
     sampled = sampled_report.SampledReport([], [], lost_at, "touched down", stalled)
     assert report.holds == sampled.holds == (kind == "held")
-    told = {"check": "\n".join(advice.answer(report, "case.toml"))}
-    told["on a processor"] = "\n".join(advice.on_processor(sampled, sampled_report.Delays(None, None, None, 0.1), None))
-    genuine = simulate.simulate
+    messages = {"check": "\n".join(advice.answer(report, "case.toml"))}
+    messages["on a processor"] = "\n".join(
+        advice.on_processor(sampled, sampled_report.Delays(None, None, None, 0.1), None)
+    )
+    genuine = simulate._simulated
 
     def ended(case):
         trajectory, measured = genuine(case)
@@ -163,11 +165,11 @@ def test_every_command_says_the_same_of_a_rotor(kind, capsys, monkeypatch):
         trajectory = dataclasses.replace(trajectory, lost_at=lost_at, lost_code=code)
         return trajectory, {**measured, "lost": kind == "lost", "stalled": stalled, "lost_at_s": lost_at}
 
-    monkeypatch.setattr(simulate, "simulate", ended)
+    monkeypatch.setattr(simulate, "_simulated", ended)
     assert main(["simulate", write(SHORT.replace("0.05", "0.002")), "--out", "out"]) == int(kind != "held")
     if kind != "held":  # whose metrics are the answer
-        told["simulate"] = capsys.readouterr().err
-    for place, words in told.items():
+        messages["simulate"] = capsys.readouterr().err
+    for place, words in messages.items():
         assert words.count(WORDS[kind]) == 1, place
         assert not [other for other in others if other in words], place
 
@@ -177,7 +179,7 @@ def test_the_fall_is_the_last_tenth():
     assert advised(advice.advice(early)[0]) == [("controller.inversion", "gamma", "33")]
 
 
-def test_the_advised_gain_is_no_smaller_than_asked():
+def test_the_advised_gain_is_no_smaller_than_required():
     # rounded up to two digits, never down, and by less than a tenth
     for x in (0.011, 9.91, 10.0, 68542.1, 1.0001e9):
         assert x * (1 - 1e-12) <= advice._up(x) <= 1.1 * x

@@ -13,23 +13,25 @@ PROGRAM = "ambjax-tune"
 
 def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
     """Return the parser of the command line for the program name `program`."""
-    top = Parser(
-        prog=program,
-        description="Tune the gains of a case by gradients of an ensemble's loss: tuned.toml, history.npz, report.",
+    about = "Tune the gains of a case on an ensemble of rotors and judge them on others: tuned.toml, report.html."
+    top = Parser(prog=program, description=about)
+    top.add_argument(
+        "case", metavar="CASE.toml", help="a case file; its optional table [tune] sets gains, limits and budget"
     )
-    top.add_argument("case", metavar="CASE.toml", help="a case file; its table [tune] says what to tune, all optional")
-    top.add_argument("--out", metavar="DIR", help="where to write (default: a new directory under ./out)")
-    top.add_argument("--resume", action="store_true", help="go on with the search whose checkpoint is in --out")
-    top.add_argument("--gradients", action="store_true", help="report the gradient itself too: a minute more")
+    top.add_argument("--out", metavar="DIR", help="output directory (default: a new directory under ./out)")
+    top.add_argument("--resume", action="store_true", help="continue the interrupted search in --out")
+    top.add_argument(
+        "--gradients", action="store_true", help="compare forward mode, reverse mode and differences in the report"
+    )
     top.add_argument(
         "--pareto", action="store_true", help="write each point of the front of error against voltage as a case file"
     )
     top.add_argument(
         "--settings-of",
         metavar="OTHER.toml",
-        help="limits, loss and budget are those of [tune] in OTHER.toml; gains and bounds stay those of the case",
+        help="use limits, loss and budget of [tune] in OTHER.toml, but gains and bounds of the case",
     )
-    top.add_argument("--json", action="store_true", help="print only report.json on stdout")
+    top.add_argument("--json", action="store_true", help="print only the content of report.json")
     top.add_argument("--version", action="version", version=f"ambjax {__version__}")
     return top
 
@@ -37,8 +39,9 @@ def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None, program: str = PROGRAM) -> int:
     """Tune a case. Return 0 if accurate steps confirm that the gains meet [tune.limits], 1 if not, 2 for bad input.
 
-    Ctrl-C during the search ends the search, and its result is judged. A second Ctrl-C, or one at another time, ends
-    the process with 130.
+    `argv`: the arguments; None: those of the process. `program`: name of the command in messages. Ctrl-C during the
+    search ends the search, and its result is judged. A second Ctrl-C, or one at another time, ends the process with
+    exit code 130.
     """
     open_streams()
     with exit_on_interrupt(program):
@@ -54,7 +57,7 @@ def _run(args: argparse.Namespace) -> tuple[int, object]:
     try:
         return command.run(args)
     except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(str(stop) or "before there was anything to keep") from None
+        raise KeyboardInterrupt(str(stop) or "nothing is saved") from None
 
 
 if __name__ == "__main__":

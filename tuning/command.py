@@ -27,12 +27,16 @@ from tuning.search.rounds import rounds
 from tuning.space import Gain, Space, tunable
 
 WRITTEN = ("tuned.toml", "history.npz", "report.html", "report.md", "report.json")
-# The last file written: its presence marks a search that has ended.
+# Written last: a search has ended if none of its checkpoints is newer than this file.
 REPORT = "report.json"
 
 
 class TuningPlan(NamedTuple):
-    """A checked tuning: the document of the case file, the problem, its initial gains [m], and the directory."""
+    """A tuning whose input is valid.
+
+    `raw`: content of the case file. `problem`: the tuning problem. `start`: initial gains [m], SI units. `out`: output
+    directory.
+    """
 
     raw: dict[str, Any]
     problem: TuningProblem
@@ -41,7 +45,10 @@ class TuningPlan(NamedTuple):
 
 
 def run(args: argparse.Namespace) -> tuple[int, Row]:
-    """Run `ambjax tune`. Return the exit code and report.json. Raises ValueError for bad input, before any output."""
+    """Run `ambjax tune` with parsed arguments. Return the exit code and the content of report.json.
+
+    Raises ValueError for bad input, before anything is written.
+    """
     plan = _plan(args)
     with locked(plan.out):
         if not args.resume:
@@ -52,10 +59,10 @@ def run(args: argparse.Namespace) -> tuple[int, Row]:
 
 
 def _plan(args: argparse.Namespace) -> TuningPlan:
-    """Read the case and make the output directory. Raises ValueError for a case or option that cannot be met."""
+    """Read the case and make the output directory. Raises ValueError for an invalid case or option."""
     case, tune, raw = read_tune(args.case, args.settings_of)
     if args.resume and not (args.out and begun(pathlib.Path(args.out))):
-        raise ValueError(f"--resume: there is no search in --out {args.out}. Check --out, or leave out --resume.")
+        raise ValueError(f"--resume: --out {args.out} contains no search. Check --out, or leave out --resume.")
     print_warnings(case, args.case)
     try:
         problem = problem_of(case, tune, front=args.pareto)
@@ -64,11 +71,11 @@ def _plan(args: argparse.Namespace) -> TuningPlan:
         tuned_case(case, _laws(problem, {}), "", pathlib.Path())
     except ValueError as why:
         raise ValueError(one_line(f"{args.case}: {why}")) from None
-    return TuningPlan(raw, problem, start, directory(args.out, f"tune-{case.name}", WRITTEN))
+    return TuningPlan(raw, problem, start, directory(args.out, f"tune-{case.name}", WRITTEN, force=True))
 
 
 def _tune(plan: TuningPlan, args: argparse.Namespace) -> tuple[int, Row]:
-    """Search, judge, write and print. The input is valid."""
+    """Search, judge the result, and write and print the report. Return the exit code and the content of report.json."""
     answer = _searched(plan, args.resume)
     facts, slices = examined(answer, args.gradients, args.pareto)
     with files(plan.out) as part:
@@ -80,23 +87,23 @@ def _tune(plan: TuningPlan, args: argparse.Namespace) -> tuple[int, Row]:
 
 
 def _searched(plan: TuningPlan, resume: bool) -> SearchResult:
-    """Search. `resume`: whether to continue from the checkpoints."""
+    """Search and return the result. `resume`: whether to continue from the checkpoints."""
     problem, tune = plan.problem, plan.problem.tune
     say(
         f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {problem.objective.clock.method}"
     )
     laws = {law.stage: law.digest for law in problem.case.own_laws}
+    if problem.case.controller_file:
+        laws["position"] = problem.case.controller_file.contents.digest
+    laws |= {one.key: one.samples.digest for one in problem.case.recorded}
     return rounds(problem, plan.start, plan.out, {"case": plan.raw, "tune": settings(tune), "laws": laws}, resume)
 
 
 def _clear(out: pathlib.Path) -> None:
-    """Remove the checkpoints of a search that has ended, so that this search is not resumed with them.
-
-    Raises ValueError if that search has not ended.
-    """
+    """Remove the checkpoints of an earlier search from `out`. Raises ValueError if that search has not ended."""
     if unfinished(out, REPORT):
         raise ValueError(
-            f"--out {out}: it holds a search that has not ended. Add --resume to go on with it, or choose another."
+            f"--out {out}: it holds a search that has not ended. Add --resume, or choose another directory."
         )
     left = remove_all(out)
     if left:
@@ -106,12 +113,15 @@ def _clear(out: pathlib.Path) -> None:
 def _kept(out: pathlib.Path) -> str:
     """Return the message after an interruption: what is saved, and how to continue."""
     if not (out / checkpoint(1)).exists():
-        return "nothing is kept"
-    return f"the search so far is kept. To go on, give the same command with --out {out} --resume"
+        return "nothing is saved"
+    return f"the search so far is saved. To continue, repeat the command with --out {out} --resume"
 
 
 def _write(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts, slices: Slices) -> None:
-    """Write every file of the report into `part`, from which they move to `out`. The tuned case is read back first."""
+    """Write all files into the temporary folder `part`, from which they move to `out`.
+
+    The text of tuned.toml is read back first, to check that it is a valid case.
+    """
     problem = answer.problem
     gains = _laws(problem, {row["path"]: row["after"] for row in facts.gains})
     text, tuned = tuned_case(problem.case, gains, facts.verdict, out)
@@ -128,7 +138,7 @@ def _write(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: T
 
 
 def _write_front(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts) -> None:
-    """Write a case file for each point of the front."""
+    """Write a case file for each point of the front of error against voltage into `part`."""
     case = answer.problem.case
     for row in facts.front or []:
         words = (
@@ -142,7 +152,7 @@ def _write_front(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, fa
 def _pictures(
     problem: TuningProblem, tuned: Cascade, history: Any, slices: Slices, front: list[Row] | None
 ) -> dict[str, bytes]:
-    """Return the pictures of the report, PNG by file name."""
+    """Return the pictures of the report as PNG data by file name. `tuned`: the controller with the tuned gains."""
     paths, runs = problem.objective.space.paths, {"before": problem.case.cascade, "after": tuned}
     shown = {name: accurate.nominal(problem, one) for name, one in runs.items()}
     drawn = {
@@ -155,13 +165,16 @@ def _pictures(
 
 
 def _laws(problem: TuningProblem, tuned: dict[str, float]) -> dict[str, float]:
-    """Return every gain of the laws by path, untuned ones included, because a p that is left out follows the plant."""
-    everything = Space(tuple(Gain(path) for path in tunable(problem.case.cascade)))
+    """Return every gain of the laws by path: `tuned` where given, else that of the case.
+
+    tuned.toml lists all gains, because the default of a p depends on the plant.
+    """
+    everything = Space(tuple(Gain(path) for path in tunable(problem.case.cascade, idle=True)))
     return dict(zip(everything.paths, everything.values(problem.case.cascade).tolist(), strict=True)) | tuned
 
 
 def _print(out: pathlib.Path, facts: TuningFacts, *, quiet: bool) -> None:
-    """Print the verdict and the gains, unless `quiet`, and the advice."""
+    """Print the verdict, the gains and the files (not if `quiet`), and the advice if a requirement is not met."""
     if not quiet:
         print(facts.verdict)
         for row in facts.gains:

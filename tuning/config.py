@@ -30,7 +30,7 @@ from tuning.objective.loss import TERMS
 from tuning.objective.quantities import KINDS
 from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.optimisers import NAMES
-from tuning.space import CLOSEST, Gain, Space, tunable
+from tuning.space import CLOSEST, Gain, Space, knots, tunable
 
 WORDS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
 # Keys of [tune] that depend on the laws of the case.
@@ -136,6 +136,10 @@ def _space(table: Table, case: Case) -> Space:
     if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
         raise ValueError(f'{table.at("gains")} = {show(paths)}: give a list of paths, as in ["controller.position.c"].')
     bounds = _flat(table.table("bounds").raw)
+    stems = dict.fromkeys(path.rpartition(".")[0] for path in known if path.count(".") > 2)
+    whole = {stem: knots(case.cascade, stem) for stem in stems}  # the path of a scheduled gain names all of its knots
+    paths = [one for path in paths for one in whole.get(path, [path])]
+    bounds = {one: ends for path, ends in bounds.items() for one in whole.get(path, [path])}
     for path in [*paths, *bounds]:
         if path not in known:
             key = "gains" if path in paths else "bounds"

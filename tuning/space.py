@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.cascade import Cascade
+from ambjax.control.schedule import Schedule
 
 # A coordinate bends within 1/SHARP of a bound, in logarithms. A logistic curve over the whole interval would put the
 # bound at infinity, so that a search converges slowly to an optimum at the bound.
@@ -42,8 +43,8 @@ class Gain:
 
     @property
     def name(self) -> str:
-        """The last part of the path."""
-        return self.path.rpartition(".")[2]
+        """The path within the law: the name of the gain, and the number of its knot if it has a schedule."""
+        return self.path.split(".", 2)[2]
 
     def encode(self, gain: Any) -> Any:
         """Return the coordinate of a gain strictly within the bounds."""
@@ -136,29 +137,39 @@ class Space:
         return cascade
 
 
-def tunable(cascade: Cascade, *, steepness: bool = True) -> list[str]:
+def tunable(cascade: Cascade, *, steepness: bool = True, idle: bool = False) -> list[str]:
     """Return the dotted paths of the gains of a cascade that may be tuned: the positive leaves of its laws.
 
-    `steepness`: whether to include the steepness of smoothed signs.
+    `steepness`: whether to include the steepness of smoothed signs. `idle`: whether to include gains without effect
+    under the processor of the cascade, or without one.
     """
-    paths = []
+    paths, implicit = [], None if cascade.processor is None else cascade.processor.implicit
     for stage in STAGES:
         law = getattr(cascade, stage)
+        left_out = () if idle else law.idle_gains(implicit)
         for field in dataclasses.fields(law):
             meta = field.metadata
             positive = meta.get("leaf") and meta["above"] is not None and getattr(law, field.name) is not None
-            if positive and (steepness or not meta.get("steepness")):
-                paths.append(f"{ROOT}.{stage}.{field.name}")
+            if positive and field.name not in left_out and (steepness or not meta.get("steepness")):
+                paths += knots(cascade, f"{ROOT}.{stage}.{field.name}") or [f"{ROOT}.{stage}.{field.name}"]
     return paths
 
 
+def knots(cascade: Cascade, path: str) -> list[str]:
+    """Return the paths of the knots of the gain at a dotted path: path.0, path.1 and so on; none without a schedule."""
+    value = read(cascade, path)
+    return [f"{path}.{knot}" for knot in range(len(value.values))] if isinstance(value, Schedule) else []
+
+
 def read(cascade: Cascade, path: str) -> Any:
-    """Return the gain of a cascade at a dotted path."""
-    _, stage, name = path.split(".")
-    return getattr(getattr(cascade, stage), name)
+    """Return the gain of a cascade at a dotted path, or its schedule."""
+    _, stage, name, *knot = path.split(".")
+    value = getattr(getattr(cascade, stage), name)
+    return value.values[int(knot[0])] if knot else value
 
 
 def _write(cascade: Cascade, path: str, value: object) -> Cascade:
-    _, stage, name = path.split(".")
-    law = dataclasses.replace(getattr(cascade, stage), **{name: value})
+    _, stage, name, *knot = path.split(".")
+    law = getattr(cascade, stage)
+    law = dataclasses.replace(law, **{name: getattr(law, name).with_knot(int(knot[0]), value) if knot else value})
     return dataclasses.replace(cascade, **{stage: law})

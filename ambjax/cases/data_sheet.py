@@ -38,17 +38,16 @@ kind = "sliding-mode"
 k_i = 3200.0                  # A/s
 p = 0.68                      # 1/A
 
-[disturbance.q_z]
-kind = "sum"
-
-[[disturbance.q_z.terms]]     # data sheet: a step of 20 N
+[[disturbance.q_z]]           # data sheet: a step of 20 N
 kind = "step"
-amplitude = 8.333             # m/s^2; 20 N on 2.4 kg
+unit = "N"
+amplitude = 20.0              # N
 start = 0.1                   # s
 
-[[disturbance.q_z.terms]]     # data sheet: 8 N at 300 Hz
+[[disturbance.q_z]]           # data sheet: 8 N at 300 Hz
 kind = "sine"
-amplitude = 3.333             # m/s^2; 8 N on 2.4 kg
+unit = "N"
+amplitude = 8.0               # N
 frequency = 300.0             # Hz
 
 [processor]

@@ -78,13 +78,16 @@ def relocated(laws: Iterable[OwnLaw], out: pathlib.Path) -> dict[str, str]:
     kinds = {}
     for law in laws:
         kind, file = law.kind, law.file
-        if file is not None and (out / kind.rpartition(":")[0]).resolve() != file:
-            kind = f"{_relative(file, out)}:{law.law.__name__}"
+        if file is not None:
+            kind = f"{path_from(kind.rpartition(':')[0], file, out)}:{law.law.__name__}"
         kinds[f"controller.{law.stage}.kind"] = kind
     return kinds
 
 
-def _relative(file: pathlib.Path, folder: pathlib.Path) -> str:
+def path_from(written: str, file: pathlib.Path, folder: pathlib.Path) -> str:
+    """Return the path of a file for a case file in `folder`: as `written` if that leads to the file from there too."""
+    if (folder / written).resolve() == file:
+        return written
     try:
         return pathlib.Path(os.path.relpath(file, folder.resolve())).as_posix()
     except ValueError:  # another drive of Windows

@@ -7,10 +7,13 @@ ValueError with one line: the dotted path, the value, what is allowed and the fi
 import dataclasses
 import pathlib
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
+from ambjax.cases.controller_file import ControllerFile, controller_file
+from ambjax.cases.gain_tables import law_from
 from ambjax.cases.own_laws import FORM, OwnLaw, is_own, own_law
 from ambjax.cases.reach import check_reference
+from ambjax.cases.recordings import RecordedFile, Recordings
 from ambjax.cases.scenario_tables import check_start, scenario_from
 from ambjax.cases.table import Table, check_depth, load
 from ambjax.cases.timing import clock_from, settled
@@ -19,6 +22,7 @@ from ambjax.control import current, inversion, observer, position
 from ambjax.control.base import Law, default_law
 from ambjax.control.cascade import Cascade
 from ambjax.control.guard import Guard
+from ambjax.control.linear_controller import OUTPUTS
 from ambjax.control.processor import Processor
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.host.words import one_line
@@ -53,6 +57,7 @@ KINDS: dict[str, dict[str, type[Law]]] = {
         "feedback-linearisation": position.FeedbackLinearisation,
         "state-feedback": position.StateFeedback,
         "chain": position.FilterChain,
+        "linear": position.LinearController,
     },
     "inversion": {
         "adaptive": inversion.Adaptive,
@@ -60,7 +65,12 @@ KINDS: dict[str, dict[str, type[Law]]] = {
         "closed-form": inversion.ClosedForm,
         "linearised": inversion.Linearised,
     },
-    "current": {"sliding-mode": current.SlidingMode, "pi": current.ProportionalIntegral, "dead-beat": current.DeadBeat},
+    "current": {
+        "sliding-mode": current.SlidingMode,
+        "pi": current.ProportionalIntegral,
+        "dead-beat": current.DeadBeat,
+        "open-loop": current.OpenLoop,
+    },
 }
 PLANTS: dict[str, type] = {"lumped": Plant, "two-coil": TwoCoil}
 DISCRETISATIONS = ["implicit", "explicit"]
@@ -80,7 +90,7 @@ TABLES = [
 ]
 OTHERS = ["tune"]  # read by the tuner, ignored by the other commands
 (DELAY,) = (field for field in dataclasses.fields(Processor) if field.name == "delay")
-# Characters that are replaced in the name of a case, which appears in titles, paths, tables and pages; its length.
+# A case name appears in titles, paths, tables and pages: characters that are replaced, and the largest length.
 UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
 
 
@@ -88,10 +98,11 @@ UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
 class Case:
     """The contents of a case file.
 
-    `clock` has the integration method, given or chosen, that fits every end of the spread. `settle`: time from which
+    `clock`: its integration method is valid for all values of the spread. `settle`: time from which
     "settled" metrics count, s. `text`: the file as it was read. `assumed`: names of the plant's parameters that the
     file omits while it gives others; they keep the paper's values. Empty if the file gives all or none. `own_laws`: the
-    laws that the file names and that are no part of the package. `zones`: range and limits of the sensitivity.
+    custom laws that the file names. `controller_file`: the linear controller that the file names, or None. `zones`:
+    range and limits of the sensitivity. `recorded`: the files of recorded signals.
     """
 
     name: str
@@ -103,7 +114,9 @@ class Case:
     text: str = ""
     assumed: tuple[str, ...] = ()
     own_laws: tuple[OwnLaw, ...] = ()
+    controller_file: ControllerFile | None = None
     zones: Zones = Zones()
+    recorded: tuple[RecordedFile, ...] = ()
 
 
 def read_case(path: str | pathlib.Path) -> Case:
@@ -129,12 +142,12 @@ def case_from(
     name: str = "case",
     text: str = "",
     folder: pathlib.Path = pathlib.Path(),
-    own: tuple[OwnLaw, ...] = (),
+    known: Case | None = None,
 ) -> Case:
     """Return the case of a parsed TOML document `raw` with source `text`. Raises ValueError as `read_case` does.
 
-    `folder`: the folder of the case file; paths of custom laws are relative to it. `own`: such laws that are
-    imported already; they are not imported again.
+    `folder`: the folder of the case file; paths of custom laws, controllers and recorded signals are relative to it.
+    `known`: a case that names the same files; they are not read again.
     """
     check_depth(raw)
     top = Table(raw)
@@ -143,15 +156,19 @@ def case_from(
     processor = _processor(top.table("processor")) if "processor" in top.raw else None
     clock, duration = clock_from(top.table("clock"))
     period = None if processor is None else clock.sample_period
-    cascade, own = _cascade(top.table("controller"), plant, processor, period, folder, own)
-    scenario, settle = scenario_from(top, plant)
-    check_parts(cascade, scenario)
+    files = Files(folder, known.own_laws if known else (), known.controller_file if known else None)
+    cascade, own, matrices = _cascade(top.table("controller"), plant, processor, period, files)
+    recordings = Recordings(folder, known.recorded if known else ())
+    scenario, settle = scenario_from(top, plant, recordings)
+    check_parts(cascade, scenario, clock.sample_period)
     if isinstance(clock.method, Slide) and not slides(cascade, scenario.plant):
         made = " or ".join(f'"{kind}"' for kind, law in KINDS["inversion"].items() if law.slides)
         raise ValueError(
             f'clock.method = "sliding": it needs controller.inversion.kind = {made}, continuous time, a lumped plant, '
             'and an observer other than "ired-1" and "ired-2". Use method = "adaptive".'
         )
+    if isinstance(clock.method, Slide) and scenario.stop is not None:
+        raise ValueError('clock.method = "sliding": it does not resolve run.stop_stiffness. Use method = "adaptive".')
     check_start(scenario)
     settle = duration / 4 if settle is None else settled(settle, clock)
     spread = spread_from(top, cascade, scenario)
@@ -162,7 +179,16 @@ def case_from(
     assumed = _left_out(top.table("plant"), plant)
     zones = top.table("sensitivity").record(Zones)
     zones.check(None if cascade.processor is None else clock.sample_period)
-    return Case(safe_name(name), cascade, scenario, clock, settle, spread, text, assumed, own, zones)
+    read = tuple(recordings.read)
+    return Case(safe_name(name), cascade, scenario, clock, settle, spread, text, assumed, own, matrices, zones, read)
+
+
+class Files(NamedTuple):
+    """The folder of a case file, and what was read already of the files that it names."""
+
+    folder: pathlib.Path
+    own: tuple[OwnLaw, ...]
+    controller: ControllerFile | None
 
 
 def _processor(table: Table) -> Processor:
@@ -190,22 +216,39 @@ def _cascade(
     plant: Bearing,
     processor: Processor | None,
     period: Scalar | None,
-    folder: pathlib.Path,
-    known: tuple[OwnLaw, ...],
-) -> tuple[Cascade, tuple[OwnLaw, ...]]:
+    files: Files,
+) -> tuple[Cascade, tuple[OwnLaw, ...], ControllerFile | None]:
     table.only(["model", *KINDS])
     model = table.table("model").record(Plant, base=plant)  # always lumped, even for a two-coil plant
-    laws, own = {}, []
+    laws, own, matrices = {}, [], None
     for stage, kinds in KINDS.items():
         law = table.table(stage)
         if is_own(law.raw.get("kind")):
-            found = [one for one in known if one.stage == stage]
-            own += found or [own_law(stage, law.raw["kind"], folder, model)]
+            found = [one for one in files.own if one.stage == stage]
+            own += found or [own_law(stage, law.raw["kind"], files.folder, model)]
             kind = own[-1].law
         else:
-            kind = kinds[law.choice("kind", list(kinds), next(iter(kinds)), FORM)]
-        laws[stage] = law.record(kind, extra=("kind",), base=_defaults(law, kind, model, period))
-    return Cascade(model=model, processor=processor, **laws), tuple(own)
+            kind = kinds[law.choice("kind", list(kinds), _usual(kinds, laws.get("position")), FORM)]
+        if kind is position.LinearController:
+            laws[stage], matrices = _linear(law, files)
+        else:
+            laws[stage] = law_from(law, kind, _defaults(law, kind, model, period))
+    return Cascade(model=model, processor=processor, **laws), tuple(own), matrices
+
+
+def _usual(kinds: dict[str, type[Law]], demanding: Any) -> str:
+    """Return the kind of a law that is left out: the first that accepts the demand of the position law, if known."""
+    if demanding is None:
+        return next(iter(kinds))
+    return next(kind for kind, law in kinds.items() if demanding.demand in getattr(law, "accepts", (demanding.demand,)))
+
+
+def _linear(table: Table, files: Files) -> tuple[Law, ControllerFile]:
+    """Return the linear controller of a table, and its file."""
+    law = table.record(position.LinearController, extra=("kind", "file", "output"))
+    output = table.choice("output", list(OUTPUTS), OUTPUTS[0])
+    found = files.controller or controller_file(table, files.folder)
+    return dataclasses.replace(law, output=output, realisation=found.contents), found
 
 
 def _defaults(table: Table, kind: Any, model: Plant, period: Scalar | None) -> Law | None:

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from typing import Any
 
+from ambjax.cases.recordings import Recordings
 from ambjax.cases.table import Table, show
 from ambjax.numerics.records import leaf
 from ambjax.simulation.clock import Clock
@@ -12,8 +13,12 @@ from ambjax.world.amplifier import Amplifier
 from ambjax.world.band_noise import BandNoise
 from ambjax.world.bearing import Bearing
 from ambjax.world.faults import VALUES, Dropouts, Outliers
+from ambjax.world.ramps import Ramp, Trapezoid
+from ambjax.world.recorded import Recorded
+from ambjax.world.rotation import Harmonic, Runout, Unbalance, UnbalanceGrade
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Sensor
+from ambjax.world.touchdown import Stop
 
 # The signals by kind.
 SIGNALS: dict[str, type] = {
@@ -24,16 +29,26 @@ SIGNALS: dict[str, type] = {
     "smoothstep": signals.SmoothStep,
     "chirp": signals.Chirp,
     "band-noise": BandNoise,
+    "ramp": Ramp,
+    "trapezoid": Trapezoid,
+    "table": Recorded,
+    "unbalance": Unbalance,
+    "unbalance-grade": UnbalanceGrade,
     "sum": signals.Sum,
 }
-UNITS = {"q_z": ("m/s^2", "A^2/m^2"), "q_i": ("A/s",)}
-# Largest number of terms of a sum; each term is compiled.
+# Units of the signals that fix their unit.
+FIXED_UNITS = {kind: signal.unit for kind, signal in SIGNALS.items() if hasattr(signal, "unit")}
+# The units of each disturbance, and the field of the scenario for each unit; the first unit is the default.
+UNITS = {"q_z": {"m/s^2": "q_z", "N": "q_f", "A^2/m^2": "q_v"}, "q_i": {"A/s": "q_i"}, "base": {"m/s^2": "base"}}
+# Largest number of terms of a sum, and of signals that disturb the same quantity; each is compiled.
 MOST_TERMS = 100
 SETTLE = leaf(default=0.5, unit="s", at_least=0, at_most=1e6, doc='time from which "settled" metrics count')
+STOP = {field.name: field for field in dataclasses.fields(Stop)}
 FIELDS = {field.name: field for kind in (Scenario, Clock) for field in dataclasses.fields(kind)}
 
 
-def _signal(table: Table, extra: tuple[str, ...] = ()) -> Any:
+def _signal(table: Table, unit: str, recordings: Recordings, extra: tuple[str, ...] = ()) -> Any:
+    """Return the signal of a table, whose values are in `unit`. `extra`: further keys that the table may have."""
     kind = table.choice("kind", list(SIGNALS))
     if kind == "sum":
         table.only(["kind", "terms", *extra])
@@ -42,53 +57,104 @@ def _signal(table: Table, extra: tuple[str, ...] = ()) -> Any:
             raise ValueError(f"{table.at('terms')} = {show(terms)}: it must be a list of at least one signal table.")
         if len(terms) > MOST_TERMS:
             raise ValueError(f"{table.at('terms')}: {len(terms)} terms are too many; give at most {MOST_TERMS}.")
-        return signals.Sum(tuple(_signal(Table(t, f"{table.at('terms')}[{n}]")) for n, t in enumerate(terms)))
-    return table.record(SIGNALS[kind], extra=("kind", *extra))
-
-
-def _disturbances(table: Table) -> dict[str, Any]:
-    table.only(list(UNITS))
-    made = {}
-    for name in table.raw:
-        one, units = table.table(name), list(UNITS[name])
-        unit = one.choice("unit", units, units[0])
-        made["q_v" if unit == "A^2/m^2" else name] = _signal(one, extra=("unit",))
+        parts = [Table(term, f"{table.at('terms')}[{n}]") for n, term in enumerate(terms)]
+        return signals.Sum(tuple(_signal(part, unit, recordings) for part in parts))
+    if kind == "table":
+        return recordings.signal(table, extra)
+    made = table.record(SIGNALS[kind], extra=("kind", *extra))
+    if (own := FIXED_UNITS.get(kind, unit)) != unit:
+        raise ValueError(f'{table.at("kind")} = "{kind}": it gives {own}, but a signal in {unit} belongs here.')
     return made
 
 
-def scenario_from(top: Table, plant: Bearing) -> tuple[Scenario, float | None]:
+def _disturbances(table: Table, recordings: Recordings) -> dict[str, Any]:
+    """Return the disturbances by field of the scenario. Signals of one unit that act together become their sum."""
+    table.only(list(UNITS))
+    found: dict[str, list[Any]] = {}
+    for name, slots in UNITS.items():
+        for one in _each(table, name) if name in table.raw else ():
+            own = [unit for unit in slots if unit == FIXED_UNITS.get(str(one.raw.get("kind")))]
+            unit = one.choice("unit", list(slots), [*own, *slots][0])
+            found.setdefault(slots[unit], []).append(_signal(one, unit, recordings, extra=("unit",)))
+    return {slot: made[0] if len(made) == 1 else signals.Sum(tuple(made)) for slot, made in found.items()}
+
+
+def _each(table: Table, name: str) -> list[Table]:
+    """Return the tables of a key that has one table, or a list of tables as [[disturbance.q_z]] writes it."""
+    raw = table.raw[name]
+    if not isinstance(raw, list):
+        return [table.table(name)]
+    if not 0 < len(raw) <= MOST_TERMS:
+        raise ValueError(f"{table.at(name)}: {len(raw)} signals; give 1 to {MOST_TERMS}.")
+    return [Table(one, f"{table.at(name)}[{n}]") for n, one in enumerate(raw)]
+
+
+def scenario_from(top: Table, plant: Bearing, recordings: Recordings) -> tuple[Scenario, float | None]:
     """Return the scenario, and run.settle (s) or None. Raises ValueError for invalid tables."""
     actuator, run = top.table("actuator"), top.table("run")
     names = [field.name for field in dataclasses.fields(Amplifier)]
     actuator.only(["u_max", *names])
-    run.only(["seed", "settle", "clearance"])
+    run.only(["seed", "settle", "clearance", *(f"stop_{name}" for name in STOP)])
     settle = run.leaf("settle", SETTLE)
     scenario = Scenario(
         plant=plant,
-        reference=_signal(top.table("reference")) if "reference" in top.raw else signals.Constant(),
+        reference=_signal(top.table("reference"), "m", recordings) if "reference" in top.raw else signals.Constant(),
         sensor=_sensor(top.table("sensor")) if "sensor" in top.raw else None,
         initial=top.table("initial").record(Initial),
         u_max=actuator.leaf("u_max", FIELDS["u_max"], math.inf),
         amplifier=actuator.record(Amplifier, extra=("u_max",)) if any(n in actuator.raw for n in names) else None,
         clearance=run.leaf("clearance", FIELDS["clearance"]),
+        stop=_stop(run),
         seed=_seed(run),
-        **_disturbances(top.table("disturbance")),
+        **_disturbances(top.table("disturbance"), recordings),
     )
     return scenario, settle
 
 
 def _sensor(table: Table) -> Sensor:
-    sensor, velocity = table.record(Sensor, extra=("velocity", "outliers", "dropouts")), table.switch("velocity")
-    faults = {
+    sensor, velocity = (
+        table.record(Sensor, extra=("velocity", "outliers", "dropouts", "runout")),
+        table.switch("velocity"),
+    )
+    parts = {
         "outliers": table.table("outliers").record(Outliers) if "outliers" in table.raw else None,
         "dropouts": _dropouts(table.table("dropouts")) if "dropouts" in table.raw else None,
+        "runout": _runout(table.table("runout")) if "runout" in table.raw else None,
     }
-    return dataclasses.replace(sensor, velocity=velocity is not False, **faults)
+    return dataclasses.replace(sensor, velocity=velocity is not False, **parts)
+
+
+def _runout(table: Table) -> Runout:
+    raw = table.raw.get("harmonics")
+    names = [field.name for field in dataclasses.fields(Runout) if field.metadata.get("leaf")]
+    table.only([*names, "harmonics"])
+    if not isinstance(raw, list) or not 0 < len(raw) <= MOST_TERMS:
+        raise ValueError(
+            f"{table.at('harmonics')} = {show(raw)}: it must be a list of 1 to {MOST_TERMS} tables, "
+            "[{ number = 1, amplitude = 1e-6, phase = 0.0 }] for example."
+        )
+    waves = tuple(Table(one, f"{table.at('harmonics')}[{n}]").record(Harmonic) for n, one in enumerate(raw))
+    rest = {key: value for key, value in table.raw.items() if key != "harmonics"}
+    numbers = Table(rest, table.path).record(Runout)
+    return dataclasses.replace(numbers, harmonics=waves)
 
 
 def _dropouts(table: Table) -> Dropouts:
     value = table.choice("value", list(VALUES), VALUES[0])
     return dataclasses.replace(table.record(Dropouts, extra=("value",)), value=value)
+
+
+def _stop(run: Table) -> Stop | None:
+    """Return the stop of run.stop_stiffness and run.stop_damping; None if both are left out."""
+    given = [name for name in STOP if f"stop_{name}" in run.raw]
+    if not given:
+        return None
+    if "stiffness" not in given:
+        raise ValueError(
+            f"{run.at('stop_damping')} = {show(run.raw['stop_damping'])}: there is no stop to damp. Give "
+            "run.stop_stiffness (N/m) too."
+        )
+    return Stop(*(run.leaf(f"stop_{name}", field, field.default) for name, field in STOP.items()))
 
 
 def _seed(run: Table) -> int:
@@ -99,10 +165,22 @@ def _seed(run: Table) -> int:
 
 
 def check_start(scenario: Scenario) -> None:
-    """Raise ValueError unless the rotor starts within its clearance, and the clearance within the gap."""
+    """Raise ValueError unless the rotor starts within its clearance, and the clearance within the gap.
+
+    With a stop it may start on the stop, short of the pole.
+    """
     gap, stop, z = scenario.plant.s_0, scenario.touchdown, scenario.initial.z
     if not stop < gap:
         raise ValueError(f"run.clearance = {stop:g} m: it must be less than the gap plant.s_0 = {gap:g} m.")
+    if scenario.stop is not None:
+        if not stop < scenario.limit:
+            raise ValueError(f"run.clearance = {stop:g} m: with a stop it must be below {scenario.limit:g} m.")
+        if not abs(z) < scenario.limit:
+            raise ValueError(
+                f"initial.z = {z:g} m: the rotor would touch a magnet; |z| must be below {scenario.limit:g} m. On its "
+                f"stop it stands at {math.copysign(stop, z):g} m."
+            )
+        return
     if not abs(z) < stop:
         raise ValueError(
             f"initial.z = {z:g} m: the rotor would touch its stop at the start; |z| must be less than {stop:g} m "

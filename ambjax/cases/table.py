@@ -6,6 +6,7 @@ import pathlib
 import tomllib
 from typing import Any
 
+from ambjax.host.synonyms import hint
 from ambjax.host.words import one_line
 from ambjax.numerics.records import check_number, numbers, validate, within
 
@@ -70,14 +71,12 @@ class Table:
         return f"{self.path}.{cut(key)}" if self.path else cut(key)
 
     def only(self, allowed: list[str]) -> None:
-        """Raise ValueError for a key that is not in `allowed`, and suggest a similar one."""
+        """Raise ValueError for a key that is not in `allowed`, and suggest the one that is meant."""
         for key in self.raw:
             if key not in allowed:
-                close = difflib.get_close_matches(key[:LONGEST], allowed, n=1)
-                hint = f" Did you mean '{close[0]}'?" if close else ""
-                names = ", ".join(allowed) if allowed else "none"
+                names, other = ", ".join(allowed) if allowed else "none", hint(key[:LONGEST], allowed)
                 raise ValueError(
-                    f"{self.at(key)} = {show(self.raw[key])}: unknown key.{hint} Keys allowed here: {names}."
+                    f"{self.at(key)} = {show(self.raw[key])}: unknown key.{other} Keys allowed here: {names}."
                 )
 
     def table(self, key: str) -> "Table":
@@ -128,8 +127,8 @@ class Table:
             raise ValueError(f"{self.at(key)} is missing: it must be one of {words}.")
         if value not in allowed:
             close = difflib.get_close_matches(show(value).strip('"'), allowed, n=1)
-            hint = f" Did you mean '{close[0]}'?" if close else ""
-            raise ValueError(f"{self.at(key)} = {show(value)}: it must be one of {words}.{hint}")
+            other = f" Did you mean '{close[0]}'?" if close else ""
+            raise ValueError(f"{self.at(key)} = {show(value)}: it must be one of {words}.{other}")
         return value
 
     def record(self, kind: type, extra: tuple[str, ...] = (), base: object = None) -> Any:

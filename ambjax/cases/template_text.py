@@ -37,6 +37,8 @@ dt = "auto"                   # s, or "auto": method and step are chosen from th
 seed = 0                      # seed of all random numbers
 settle = 0.5                  # s; time from which "settled" metrics count (left out: a quarter of the duration)
 # clearance = 4.5e-3          # m; |z| at which the rotor touches down (left out: 0.9 s_0)
+# stop_stiffness = 1e7        # N/m; touchdown bearing at the clearance (left out: a rotor that touches down is lost)
+# stop_damping = 500.0        # N s/m; its damping (left out: 0)
 
 # [sensor]                    # Gaussian noise, held for a sample period, without delay (left out: none)
 # std = {paper_std:.3e}          # m; this is the paper's, which its printed gains do not survive
@@ -61,6 +63,12 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # duration = 5e-4             # s; duration of each dropout
 # at = 0.1                    # s; time of one more dropout (left out: none)
 # value = "hold"              # reading during a dropout: the last one ("hold"), "nan", "zero" or "full-scale"
+
+# [sensor.runout]             # of the surface that the position sensor reads (left out: none)
+# speed = 6000.0              # rpm
+# speed_end = 12000.0         # rpm; speed after a linear run-up (left out: constant speed)
+# duration = 1.0              # s; time of the run-up
+# harmonics = [{{ number = 1, amplitude = 1e-6, phase = 0.0 }}]  # 1, m and rad; a sine for each, that many per turn
 
 # [processor]                 # the laws run on a processor, one step per sample (left out: in continuous time)
 # delay = 1.0                 # samples from measurement to voltage, 0 to 2, fractions allowed
@@ -166,8 +174,14 @@ def template(scenario: str) -> str:
         lines += ['kind = "sine"', *_lines(type(REFERENCE), REFERENCE)]
     else:
         lines += ['kind = "constant"', "value = 0.0                   # m"]
-    lines += ["", "[disturbance.q_z]             # likewise [disturbance.q_i], in A/s; left out: none"]
-    lines += ['kind = "pulse"', _with_note('unit = "A^2/m^2"', 'scaled force; or "m/s^2", the default')]
+    lines += [
+        "",
+        "[disturbance.q_z]             # likewise [disturbance.q_i], in A/s, and [disturbance.base], the acceleration",
+    ]
+    lines += [
+        "#                               of the housing, m/s^2; several: [[disturbance.q_z]] each (left out: none)"
+    ]
+    lines += ['kind = "pulse"', _with_note('unit = "A^2/m^2"', 'scaled force; or "N", or "m/s^2", the default')]
     lines += _lines(type(PULSE), PULSE)
     designs = " or ".join(f'"{d}"' for d in list(DESIGNS)[1:])
     rest = REST.format(paper_std=TABLE_2.noise_std, designs=designs)

@@ -34,6 +34,11 @@ def clock_from(table: Table) -> tuple[Clock, float]:
     duration = table.leaf("duration", DURATION, DURATION.default)
     period = table.leaf("sample_period", SAMPLE_PERIOD, SAMPLE_PERIOD.default)
     samples = _whole(duration / period)
+    if period > duration and 1 / period < duration:
+        raise ValueError(
+            f"{table.at('sample_period')} = {period:g} s is longer than clock.duration = {duration:g} s. If it is a "
+            f"rate in Hz, give its inverse, {1 / period:g} s."
+        )
     if samples is None:
         nearest = max(round(duration / period), 1) * period
         raise ValueError(

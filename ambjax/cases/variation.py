@@ -90,8 +90,9 @@ def _distribution(raw: object, path: str) -> Distribution:
 
 
 def _refuse_nothing_in_two_units(spread: Spread, top: Table) -> None:
-    """Raise ValueError for a spread of a constant scaled force of 0: it reads as no disturbance, in another unit."""
+    """Raise ValueError for a spread of a constant force of 0: it reads as no disturbance, in another unit."""
     path = "disturbance.q_z.value"
     signal = top.raw.get("disturbance", {}).get("q_z", {})
-    if path in spread.paths and signal.get("unit") == "A^2/m^2" and signal.get("value", 0) == 0:
-        raise ValueError(f'spread.{path}: a value of 0 with unit = "A^2/m^2" cannot be spread. Use unit = "m/s^2".')
+    unit = signal.get("unit", "m/s^2") if isinstance(signal, dict) else "m/s^2"
+    if path in spread.paths and unit != "m/s^2" and signal.get("value", 0) == 0:
+        raise ValueError(f'spread.{path}: a value of 0 with unit = "{unit}" cannot be spread. Use unit = "m/s^2".')

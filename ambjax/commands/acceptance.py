@@ -19,6 +19,36 @@ class Fact(NamedTuple):
     unit: str
 
 
+class Forces(NamedTuple):
+    """Largest magnetic force, weight, and a bound on the disturbing force, all in N."""
+
+    largest: float
+    weight: float
+    load: float
+
+
+def forces(case: Case) -> Forces:
+    """Return the forces of a case, for the nominal plant.
+
+    The largest force is that at z = 0 with the current i_0, or the amplifier's limit if that is smaller: beyond i_0 one
+    magnet is off. The load is the sum of the bounds of all signals that disturb z.
+    """
+    scenario, plant, amplifier = case.scenario, case.scenario.plant, case.scenario.amplifier
+    m, i_0 = float(plant.m), float(plant.i_0)
+    most = i_0 if amplifier is None or amplifier.i_max is None else min(i_0, float(amplifier.i_max))
+    factors = {"q_z": m, "q_v": m * float(plant.a), "q_f": 1.0, "base": m}
+    signals = {slot: signal for slot in factors if (signal := getattr(scenario, slot)) is not None}
+    ends = {slot: signal.span(float(case.clock.duration)) for slot, signal in signals.items()}
+    load = sum(factors[slot] * max(abs(low), abs(high)) for slot, (low, high) in ends.items())
+    return Forces(float(plant.k_i) * most, m * abs(float(plant.g)), load)
+
+
+def bias_flux(case: Case) -> float:
+    """Return the flux density of the bias current, mu_0 n i_0/(2 s_0) for two gaps in series, T."""
+    plant = case.scenario.plant
+    return float(plant.mu_0) * float(plant.n) * float(plant.i_0) / (2 * float(plant.s_0))
+
+
 def acceptance(case: Case) -> tuple[dict[str, object], str]:
     """Return the summary and the text: zone and margins of the linearised loop at r = 0, and the plant's reserves."""
     try:
@@ -52,15 +82,9 @@ def _loop_facts(loop: Analysis) -> list[Fact]:
 
 
 def machine(case: Case) -> list[Fact]:
-    """Return the numbers of the plant, its supply and its converters.
-
-    The largest force is that at z = 0 with the current i_0, or the amplifier's limit if that is smaller: beyond i_0 one
-    magnet is off. The flux density is mu_0 n i_0/(2 s_0): two gaps in series.
-    """
-    plant, sensor, amplifier = case.scenario.plant, case.scenario.sensor, case.scenario.amplifier
-    m, s_0, i_0 = (float(x) for x in (plant.m, plant.s_0, plant.i_0))
-    most = i_0 if amplifier is None or amplifier.i_max is None else min(i_0, float(amplifier.i_max))
-    weight, force = m * abs(float(plant.g)), float(plant.k_i) * most
+    """Return the numbers of the plant, its supply and its converters."""
+    plant, sensor = case.scenario.plant, case.scenario.sensor
+    (force, weight, load), period = forces(case), float(case.clock.sample_period)
     u_max, slew, step = float(case.scenario.u_max), None, None
     if math.isfinite(u_max):
         slew = u_max / float(plant.L)
@@ -69,10 +93,14 @@ def machine(case: Case) -> list[Fact]:
     std = None if sensor is None else float(sensor.std)
     return [
         Fact("force_reserve", "largest force per weight", force / weight if weight else None, "1"),
+        Fact(
+            "load_reserve", "largest force per weight and largest load", force / (weight + load) if load else None, "1"
+        ),
         Fact("k_s_N_per_m", "negative stiffness k_s", float(plant.k_s), "N/m"),
         Fact("k_i_N_per_A", "force per current k_i", float(plant.k_i), "N/A"),
         Fact("unstable_pole_per_s", "unstable pole sqrt(k_s/m)", float(plant.pole), "1/s"),
-        Fact("bias_flux_T", "bias flux density", float(plant.mu_0) * float(plant.n) * i_0 / (2 * s_0), "T"),
+        Fact("samples_per_time_constant", "samples in its time constant", 1 / (period * float(plant.pole)), "1"),
+        Fact("bias_flux_T", "bias flux density", bias_flux(case), "T"),
         Fact("current_slew_A_per_s", "supply's slew of the current, u_max/L", slew, "A/s"),
         Fact("converter_step_m", "converter step of z", step, "m"),
         Fact("step_per_noise", "converter step per noise std", step / std if step and std else None, "1"),

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.commands.acceptance import acceptance
+from ambjax.commands.acceptance import acceptance, forces
 from ambjax.commands.outputs import plain, table
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.theorem.conditions import Condition, check
@@ -17,19 +17,19 @@ from ambjax.theorem.sampled_report import Delays, SampledReport
 Summary = dict[str, object]
 CONTINUOUS = (
     "The tables of Theorem 1 are for continuous time: without the case's [processor], converters and "
-    "amplifier, and with a boundary layer for each sign that has none. They do not set the verdict of this case."
+    "amplifier, and with a boundary layer for each sign that has none. They do not affect the verdict on this case."
 )
 
 BAND = (
-    "Evaluated at the samples after run.settle. Disturbed by: largest rate of the law's signal in excess of the rate "
-    "that its sign term commands. Band: the set in which the law keeps its signal under such disturbances. Off by: "
-    "largest difference between the law's signal and the plant's. Bound: band plus off by, a bound on the plant's "
-    "signal. Largest: largest value of the plant's signal."
+    "Evaluated at the samples after run.settle. Disturbance: largest rate of the law's signal minus the rate that its "
+    "sign commands. Band: largest |signal| that such disturbances can cause. Difference: largest difference between "
+    "the law's signal and the plant's. Bound: band plus difference; it bounds the plant's signal. Largest: largest "
+    "value of the plant's signal."
 )
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
-    """Check a case and print the answers, the loop that will run first. Exit code 1 if a condition fails."""
+    """Check a case and print the results, those of the loop as it will run first. Exit code 1 if a condition fails."""
     from ambjax.theorem import advice
 
     case = read_with_warnings(args.case)
@@ -47,6 +47,9 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     summary |= {"loop": loop}
     if not args.json:
         print(text)
+    largest, weight, _ = forces(case)
+    if not args.json and largest < weight:
+        print(f"\nThe magnets do not carry the rotor: they pull with at most {largest:.4g} N of its {weight:.4g} N.")
     if case.cascade.processor is not None:
         summary |= _on_processor(case, args)
     else:
@@ -57,11 +60,12 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         print("\n" + "\n".join(advice.answer(report, args.case)))
         if case.cascade.processor is not None:
             print(CONTINUOUS)
+    summary["holds"] = bool(summary["holds"]) and largest >= weight
     return int(not summary["holds"]), plain(summary)
 
 
 def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
-    """Check and print the conditions on the case's processor. Return their summary, whose "holds" is the verdict."""
+    """Check and print the conditions on the processor of the case. Return their summary; "holds" is the verdict."""
     from ambjax.ensemble.delays import delay_margin
     from ambjax.ensemble.replay import as_member, record_system
     from ambjax.theorem import advice, sampled_report
@@ -96,7 +100,7 @@ def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
 
 
 def _clearance(case: Case, args: argparse.Namespace, largest: float | None) -> Summary:
-    """Print the zone of the largest |z| after run.settle (m), and return it; nothing for a rotor that is lost."""
+    """Print and return the clearance zone for the largest |z| after run.settle, m; None: zone D, not printed."""
     if largest is None:
         return {"clearance_used": None, "clearance_zone": "D"}
     used = largest / float(np.min(np.asarray(case.scenario.touchdown)))
@@ -139,7 +143,7 @@ def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
     ]
     print(table(("condition", "left", "right", "margin", "unit", "at (s)", "verdict", "note"), rows))
     steps = [(c.name, c.requires, f"{c.against:.3g}", c.unit, f"{c.at_s:.5g}", c.note) for c in proof]
-    print("\n" + table(("proof", "statement", "worst", "unit", "at (s)", "what"), steps))
+    print("\n" + table(("proof", "statement", "worst", "unit", "at (s)", "meaning"), steps))
 
 
 def _print_sampled(sampled: SampledReport) -> None:
@@ -155,7 +159,7 @@ def _print_sampled(sampled: SampledReport) -> None:
         )
         for slope in sampled.slopes
     ]
-    head = ("law", "slope T", "its step", "as stepped", "stable below", "no oscillation below", "verdict")
+    head = ("law", "slope T", "step", "slope T of the step", "stable below", "no oscillation below", "verdict")
     print(table(head, rows))
 
     def number(x: float | None) -> str:
@@ -172,7 +176,7 @@ def _print_sampled(sampled: SampledReport) -> None:
         for b in sampled.bands
     ]
     if bands:
-        head = ("signal", "unit", "noise", "gain, per s", "disturbed by", "band", "off by", "bound", "largest", "note")
-        print("\n" + table(head, bands) + "\n" + BAND)
+        values = ("gain, per s", "disturbance", "band", "difference", "bound", "largest")
+        print("\n" + table(("signal", "unit", "noise", *values, "note"), bands) + "\n" + BAND)
     else:
-        print("\nNo bands: the rotor is lost, with and without noise.")
+        print("\nNo bands: every run ends early, with and without noise.")

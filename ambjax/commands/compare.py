@@ -14,7 +14,6 @@ from ambjax.cases.reader import Case, read_case
 from ambjax.commands.comparison_report import Compared, markdown, summary_of, text
 from ambjax.commands.ensemble import study_of
 from ambjax.commands.export import guarded_for
-from ambjax.commands.operating import MEMBERS, OperatingPoint, SpreadPeaks, operating_point, spread_peaks
 from ambjax.commands.outputs import directory, files, plain, say, write_json, written
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.study import Study
@@ -24,14 +23,15 @@ from ambjax.export.trace import trace
 from ambjax.host.extensions import extension
 from ambjax.host.web_page import page
 from ambjax.linear.state_space import StateSpace
+from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks, operating_point, spread_peaks
 
 WRITTEN = ("compare.html", "compare.json", "compare.png")
 # Largest number of cases in a table and a picture.
 MOST_CASES = 8
 # Members per call, a whole number of calls of the compiled program.
 CHUNK = 16 * CALL
-# Facts of a study that may differ between the cases: the controller, and the integration method.
-OWN = ("controller.", "clock.method")
+# Prefixes in a study's fingerprint that may differ between cases: the controller, and the integration method.
+MAY_DIFFER = ("controller.", "clock.method")
 
 
 def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     notes = _differences(args.cases, cases, studies)
     for note in notes:
         say(note)
-    out = directory(args.out, f"compare-{'-'.join(case.name for case in cases)}"[:80], WRITTEN)
+    out = directory(args.out, f"compare-{'-'.join(case.name for case in cases)}"[:80], WRITTEN, args.force)
     if args.tune:
         cases = [_tuned(path, args.cases[0], case.name, out) for path, case in zip(args.cases, cases, strict=True)]
         studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
@@ -67,9 +67,12 @@ def _seed(args: argparse.Namespace, cases: Sequence[Case]) -> int:
 
 
 def _read(paths: Sequence[str]) -> list[Case]:
-    """Read the cases. Raises ValueError for a file that is none, or fewer than two or too many, or one given twice."""
+    """Read the cases and number those of the same name.
+
+    Raises ValueError for fewer than 2 or too many files, a repeated file, or a file that `read_case` refuses.
+    """
     if not 2 <= len(paths) <= MOST_CASES:
-        raise ValueError(f"{len(paths)} case file{'s' * (len(paths) > 1)}: give 2 to {MOST_CASES} of them.")
+        raise ValueError(f"{len(paths)} case file{'s' * (len(paths) > 1)}: give 2 to {MOST_CASES} case files.")
     for path in paths:
         same = [other for other in paths if pathlib.Path(other).resolve() == pathlib.Path(path).resolve()]
         if len(same) > 1:
@@ -83,14 +86,15 @@ def _read(paths: Sequence[str]) -> list[Case]:
 
 
 def _differences(paths: Sequence[str], cases: Sequence[Case], studies: Sequence[Study]) -> list[str]:
-    """Return a note for each case whose machine or task differs from the first's.
+    """Return a note for each case that differs from the first in more than the controller and the integration method.
 
-    Raises ValueError if its spread does, because the members would then not be the same.
+    Raises ValueError if the spreads differ, because the members would then not be the same.
     """
     first, notes = studies[0].fingerprint(), []
     for path, case, study in zip(paths[1:], cases[1:], studies[1:], strict=True):
         other = study.fingerprint()
-        names = [name for name in {**first, **other} if first.get(name) != other.get(name) and not name.startswith(OWN)]
+        differing = [name for name in {**first, **other} if first.get(name) != other.get(name)]
+        names = [name for name in differing if not name.startswith(MAY_DIFFER)]
         spread = [name for name in names if name.startswith("spread.")]
         if spread:
             name = spread[0]
@@ -134,7 +138,7 @@ def _columns(case: Case, study: Study) -> dict[str, np.ndarray]:
 
 
 def _linear(case: Case, study: Study) -> tuple[OperatingPoint | None, SpreadPeaks | None]:
-    """Analyse the nominal loop (None: no equilibrium) and, if they differ, its first members."""
+    """Analyse the nominal loop (None: no equilibrium) and, if the case has a spread, its first members."""
     try:
         point = operating_point(case, "nominal", 0.0)
     except ValueError as error:
@@ -144,14 +148,17 @@ def _linear(case: Case, study: Study) -> tuple[OperatingPoint | None, SpreadPeak
 
 
 def _flops(case: Case) -> int | None:
-    """Return the operations of a step in single precision; None in continuous time, or for a law that is no C."""
+    """Return the number of floating-point operations of a step of the exported controller in single precision.
+
+    None in continuous time, or if a law cannot be exported.
+    """
     if case.cascade.processor is None:
         return None
     try:
         controller = controller_of(guarded_for(case), case.scenario.u_max, float(case.clock.sample_period))
         return trace(controller, "float").flops()
     except ValueError as error:
-        say(f"{case.name}: the cost of a step is unknown ({error})")
+        say(f"{case.name}: the cost of a step cannot be computed ({error})")
         return None
 
 

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.commands.operating import MEMBERS, OperatingPoint, SpreadPeaks
 from ambjax.commands.outputs import table
 from ambjax.ensemble.paths import kinds, places
 from ambjax.ensemble.study import Study
 from ambjax.host import web_page
+from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks
 
 
 @dataclasses.dataclass(frozen=True)

@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     for case, (x, y) in zip(cases, axes, strict=True):
         _check_samples(case, x, y, args.members)
     studies = [stepped(study, x, y) for study, (x, y) in zip(studies, axes, strict=True)]
-    out = directory(args.out, f"map-{cases[0].name}", WRITTEN)
+    out = directory(args.out, f"map-{cases[0].name}", WRITTEN, args.force)
     with files(out) as part:
         maps = []
         for case, study, (x, y) in zip(cases, studies, axes, strict=True):

@@ -21,13 +21,15 @@ from ambjax.host.interrupts import uninterrupted
 from ambjax.host.words import one_line
 
 
-def directory(out: str | None, name: str, names: Iterable[str] = ()) -> pathlib.Path:
+def directory(out: str | None, name: str, names: Iterable[str] = (), force: bool = False) -> pathlib.Path:
     """Make the output directory `out`, or a new one under ./out called `name`, and return it.
 
-    Raises ValueError if the directory cannot be made or written, if it holds the study of an ensemble, or if it has a
-    folder with one of `names`, which the command writes as files.
+    `names`: files that the command writes. `force`: whether it may overwrite them.
+
+    Raises ValueError if the directory cannot be made or written, if it holds the study of an ensemble or, without
+    `force`, one of `names`, or if a folder has one of `names`.
     """
-    path = target(out, name)
+    path, names = target(out, name), list(names)
     while out is None and not _make_new(path):  # another run has made it meanwhile
         path = target(out, name)
     for file in (MANIFEST, RESULT):
@@ -37,6 +39,11 @@ def directory(out: str | None, name: str, names: Iterable[str] = ()) -> pathlib.
             raise ValueError(f"--out {path}: it holds the study of an ensemble ({file}). Choose another directory.")
     make(path)
     check_places(path, names)
+    if old := [name for name in names if not force and (path / name).exists()]:
+        raise ValueError(
+            f"--out {path}: it has {', '.join(old)} of an earlier run. Choose another directory, or overwrite them "
+            "with --force."
+        )
     return path
 
 

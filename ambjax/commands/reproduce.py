@@ -50,7 +50,7 @@ def _alive() -> Iterator[None]:
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """Reproduce the paper and write its figures and the ledger of claims."""
-    out = directory(args.out, "reproduce", _names())
+    out = directory(args.out, "reproduce", _names(), args.force)
     began = time.perf_counter()
     stages = 2 * 8 + 2
     with (

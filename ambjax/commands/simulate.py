@@ -12,11 +12,12 @@ from ambjax.cases.reader import Case
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
 from ambjax.commands.warnings import read_with_warnings, reversal
 from ambjax.ensemble.design import MOST_MEMBERS
-from ambjax.ensemble.replay import Replay, record, replay
+from ambjax.ensemble.replay import Replay, replay
 from ambjax.ensemble.study import Study
 from ambjax.host.words import command
-from ambjax.simulation.metrics import UNITS, standard_for
-from ambjax.simulation.rollout import Outcome
+from ambjax.results.runs import simulate
+from ambjax.simulation.metrics import UNITS
+from ambjax.simulation.trajectory import Trajectory
 
 Summary = dict[str, object]
 WRITTEN = ("trajectory.npz", "metrics.json", "overview.png")
@@ -30,12 +31,12 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         cascade, scenario = study.member(args.member)
         case = dataclasses.replace(case, name=f"{case.name}-{args.member}", cascade=cascade, scenario=scenario)
     window = _window(case, args)
-    out = directory(args.out, f"simulate-{case.name}", WRITTEN)
+    out = directory(args.out, f"simulate-{case.name}", WRITTEN, args.force)
     say(f"method: {case.clock.method}")
     if case.cascade.processor is not None:
         say(f"on a processor: {case.cascade.processor}")
     replayed = None if study is None else _replay(case, study, args.member)
-    trajectory, numbers = simulate(case) if replayed is None else (replayed.trajectory, replayed.metrics)
+    trajectory, numbers = _simulated(case) if replayed is None else (replayed.trajectory, replayed.metrics)
     _check(numbers, args.case)
     if replayed is not None and replayed.deviation > replayed.rounding:
         say(
@@ -115,11 +116,11 @@ def _study(case: Case, args: argparse.Namespace) -> Study | None:
     return study
 
 
-def simulate(case: Case) -> Outcome:
-    """Simulate a case and record every sample, with a progress bar if it takes more than two seconds."""
+def _simulated(case: Case) -> tuple[Trajectory, dict[str, Any]]:
+    """Simulate a case, with a progress bar if it takes more than two seconds; return trajectory and metrics."""
     with _bar(case) as bar:
-        fold = standard_for(case.settle, case.scenario)
-        return record(case.cascade, case.scenario, case.clock, fold=fold, tell=bar.update)
+        done = simulate(case, bar.update)
+        return done.trajectory, done.metrics
 
 
 def _replay(case: Case, study: Study, member: int) -> Replay:

@@ -115,7 +115,8 @@ def text(summary: dict[str, Any]) -> str:
     lines += ["", table((head, "median", "95 % quantile", "mean of worst 5 %", "largest"), rows)]
     drivers, account = summary["drivers"][statistics.DECIDING][:5], summary["explained"][statistics.DECIDING]
     if drivers:
-        lines += ["", f"Quantities that drive {statistics.DECIDING} of the {summary['metrics_of']}: {account['says']}."]
+        where = f"{statistics.DECIDING} over the {summary['metrics_of']}"
+        lines += ["", f"Influence of the spread quantities on {where}: {account['says']}."]
     if account["alone"]:
         bars = [
             (

@@ -10,6 +10,7 @@ import numpy as np
 from ambjax.cases.reach import reach, widest
 from ambjax.cases.reader import Case, read_case
 from ambjax.commands.outputs import say
+from ambjax.commands.plausibility import implausible
 from ambjax.host.words import one_line
 
 # Plausible ranges of gap (m), pole area (m^2) and permeability (N/A^2); the paper's values are 5e-3, 0.121, 1.25e-6.
@@ -36,8 +37,9 @@ def print_warnings(case: Case, path: str | pathlib.Path) -> None:
 
 
 def warnings_of(case: Case) -> list[str]:
-    """Return one line for each doubtful value of a case: its path, the value, the reason and the likely intention."""
-    return [*_assumed(case), *_sizes(case), *_noise(case), *_velocity(case), *_currents(case), *_motion(case)]
+    """Return one line for each unlikely value of a case: its path, the value, the reason and a possible fix."""
+    own = [*_assumed(case), *_sizes(case), *_noise(case), *_velocity(case), *_currents(case), *_motion(case)]
+    return [*own, *implausible(case)]
 
 
 def _assumed(case: Case) -> Iterator[str]:
@@ -75,7 +77,7 @@ def _velocity(case: Case) -> Iterator[str]:
     perfect = sensor is None or (sensor.velocity and sensor.std_z_dot == 0)
     if perfect and not (sensor is None and case.cascade.processor is None):
         yield (
-            "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ANY ERROR, as no real sensor does. Set "
+            "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ANY ERROR, which no real sensor does. Set "
             "sensor.std_z_dot, or set sensor.velocity = false and use an observer that estimates the velocity."
         )
 
@@ -93,7 +95,8 @@ def reversal(case: Case, most_i: float) -> Iterator[str]:
 def _beyond(case: Case) -> str:
     i_0 = case.scenario.plant.i_0
     return (
-        f"above the bias plant.i_0 = {i_0:g} A: one coil's current, i_0 - |i|, is reversed; not every drive can do it."
+        f"above the bias plant.i_0 = {i_0:g} A: the current of one coil, i_0 - |i|, is reversed, which not every drive "
+        "can do."
     )
 
 
@@ -103,10 +106,10 @@ def _currents(case: Case) -> Iterator[str]:
         yield f"initial.i = {scenario.initial.i:g} A is {beyond}"
     weight = plant.m * plant.g / plant.k_i  # v = 4 i_0 i / s_0^2 at z = 0
     if abs(weight) > plant.i_0:
-        yield f"plant: carrying the rotor at z = 0 takes {abs(weight):.4g} A, {beyond} Check m, n, A, s_0 and i_0."
+        yield f"plant: holding the rotor at z = 0 takes {abs(weight):.4g} A, {beyond} Check m, n, A, s_0 and i_0."
     if plant.R * abs(weight) > scenario.u_max:
         least = plant.R * abs(weight)
-        yield f"actuator.u_max = {scenario.u_max:g} V is less than the {least:.4g} V that carry the rotor at z = 0."
+        yield f"actuator.u_max = {scenario.u_max:g} V is less than the {least:.4g} V that hold the rotor at z = 0."
 
 
 def _motion(case: Case) -> Iterator[str]:

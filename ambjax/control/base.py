@@ -1,4 +1,4 @@
-"""The base class of all laws: optional methods with their defaults, so that no caller depends on the type of a law.
+"""The base class of all laws, with default methods, so that no caller depends on the type of a law.
 
 The classes of `control.laws` add the inputs and outputs of each stage.
 """
@@ -13,14 +13,14 @@ from jax import Array
 
 from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, SearchContext
-from ambjax.numerics.records import Scalar, is_traced
+from ambjax.numerics.records import GainFunction, Scalar, is_traced
 from ambjax.world.plant import Plant
 
 L = TypeVar("L", bound="Law")
 
 
 class Requirement(NamedTuple):
-    """Requirement of Theorem 1 on a law: the gain of this name exceeds `over` (Q_z, Q_i or Delta_1)."""
+    """Condition of Theorem 1 on a law: the gain named `gain` exceeds the bound named `over` (Q_z, Q_i or Delta_1)."""
 
     gain: str
     over: str
@@ -29,12 +29,18 @@ class Requirement(NamedTuple):
 class Law:
     """Base class of a law; it has no fields. A subclass is a frozen record whose leaves are the gains.
 
-    `requirement`: what Theorem 1 requires of a gain, or None. `estimates_velocity`: whether an observer needs no
-    measured velocity. `memory`: name, unit and meaning of each leaf of the state on a processor; None: derived from the
-    structure of the state. `own_steps`: discretisations for which a processor uses the method `step`; a class that
-    defines `step` and does not set this has ("implicit",). For the others it makes an explicit Euler step. `stiff`:
-    whether a state stays inside the layer of a smoothed sign; true if the class defines `layer`. `slides`: whether an
-    inversion law defines `slide`, a step over the layer (`laws.Relaxation`).
+    Class attributes:
+
+    - `requirement`: condition of Theorem 1 on a gain; None: there is none.
+    - `estimates_velocity`: whether the law is an observer that does not use the measured velocity.
+    - `memory`: name, unit and meaning of each leaf of the state on a processor; None: the names are derived from the
+      structure of the state.
+    - `own_steps`: the discretisations, "implicit" or "explicit", for which a processor calls the method `step`. For the
+      others it makes an explicit Euler step. The default is ("implicit",) for a class that defines `step`.
+    - `stiff`: whether the law has a state that a smoothed sign keeps inside its layer, so that it changes fast; set for
+      a class that defines `layer`.
+    - `slides`: whether an inversion law has the method `slide`, which integrates across the layer (`laws.Relaxation`);
+      set for a class that defines it.
     """
 
     requirement: ClassVar[Requirement | None] = None
@@ -52,9 +58,9 @@ class Law:
         cls.stiff, cls.slides = cls.stiff or "layer" in written, cls.slides or "slide" in written
 
     def size(self, model: Plant) -> Scalar | None:
-        """Return the characteristic size of the argument of the smoothed sign; None if there is no such sign.
+        """Return the characteristic size of the argument of the law's smoothed sign; None if it has no such sign.
 
-        Default steepnesses scale with 1/size (`default_law`).
+        Default steepnesses are proportional to 1/size (`default_law`).
         """
         return None
 
@@ -64,15 +70,18 @@ class Law:
         return jax.tree.map(lambda _: jnp.inf, scale.scale(model))
 
     def robust(self, error: Array, /) -> Array:
-        """Return the term that the sign adds to the rate of the stage's error, Eqs. (12), (14)."""
+        """Return the term that the sign adds to the rate of the stage's error: -k sgn(sigma) in Eq. (12), for example.
+
+        `error`: sigma (m/s), v_tilde (A^2/m^2) or e (A). The default, for a law without a sign, is 0.
+        """
         return 0.0 * error
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        """Return the initial ranges of a search by gain name. A gain left out is searched around its value."""
+        """Return the ranges of a search for gains, by name. A gain without a range is searched around its value."""
         return {}
 
     def relay(self) -> Relay | None:
-        """Return the sign that alone drives the stage's error; None if there is none, or more than a sign."""
+        """Return the sign if the rate of the stage's error is that of one sign plus a disturbance, else None."""
         return None
 
     def explicit_rate(self, model: Plant) -> Scalar:
@@ -80,32 +89,49 @@ class Law:
         return 0.0
 
     def init_sampled(self, model: Plant) -> object:
-        """Return the state at t = 0 on a processor; not used for observers."""
+        """Return the state at t = 0 on a processor. Observers do not use it."""
         law: Any = self
         return law.init(model)
 
     def scale_sampled(self, model: Plant) -> object:
-        """Return the characteristic size of each number of the state on a processor."""
+        """Return the characteristic size of each component of the state on a processor."""
         law: Any = self
         return law.scale(model)
 
     def designed(self, model: Plant, period: float | None) -> "Law":
-        """Return the law with its default gains designed for a model of numbers; itself if they suit every model.
+        """Return the law with default gains designed for `model`, whose parameters are concrete numbers.
 
-        `period`: sample period of the processor, s; None in continuous time.
+        The default implementation returns the law itself. `period`: sample period of the processor, s; None in
+        continuous time.
         """
         return self
 
+    def idle_gains(self, implicit: bool | None) -> tuple[str, ...]:
+        """Return the names of gains that have no effect. `implicit`: steps of the processor; None: continuous time."""
+        return ()
+
+    def check_use(self, model: Plant, period: float | None) -> None:
+        """Raise ValueError if the law cannot run with this nominal model, or at this sample period of a processor (s).
+
+        `period` is None in continuous time.
+        """
+        return
+
+    def in_continuous_time(self: L) -> L:
+        """Return the law for a run in continuous time of a cascade that has a processor; by default itself."""
+        return self
+
     def has_own_step(self, implicit: bool) -> bool:
-        """Whether a processor with implicit (or explicit) steps uses the method `step` of this law."""
+        """Return whether a processor with implicit (or explicit) steps calls the method `step` of this law."""
         return ("implicit" if implicit else "explicit") in self.own_steps
 
 
 def default_law(kind: type[L], model: Plant, period: float | None = None) -> L:
-    """Return the law of this kind with its default gains (`Law.designed`), and with steepnesses scaled to the model.
+    """Return the law of type `kind` with its default gains (`Law.designed`), and with steepnesses scaled to `model`.
 
-    The default steepness suits the plant of Table 1. It scales with the inverse size of the sign's argument: for
-    p = 25 m^2/A^2 a sign of v is soft where v is about 2500 A^2/m^2, as in Table 1, and hard where v is about 1e7.
+    The default of a steepness p is for the plant of Table 1. It is scaled by the inverse size of the sign's argument,
+    so that the layer 1/p is the same share of this size for every plant. With p = 25 m^2/A^2, for example, the layer of
+    v_tilde is 1.6e-5 of the size of v in Table 1, 2500 A^2/m^2.
     """
     law: Any = kind().designed(model, period)
     size = law.size(model)
@@ -130,20 +156,20 @@ def memory_of(law: Law, state: object) -> list[tuple[str, str, str]]:
 
 
 def hard_signs(law: Law) -> list[str]:
-    """Return the names of the steepnesses that are inf or None: the sign is set-valued.
+    """Return the names of the steepnesses that are inf or None, which make a sign set-valued.
 
-    Raises ValueError if a steepness is inf for some members only.
+    Traced steepnesses are left out. Raises ValueError if a steepness is inf for some members only.
     """
     names = []
     for name in _steepnesses(law):
         value = getattr(law, name)
-        if is_traced(value):
+        if is_traced(value) or isinstance(value, GainFunction):
             continue
         infinite = np.array([True]) if value is None else np.isinf(np.asarray(value, float))
         if infinite.any() and not infinite.all():
             raise ValueError(
-                f"{name}: inf for some members and a number for others. A sign without a layer is another "
-                "program: give inf to all or to none."
+                f"{name}: inf for some members and a number for others. A sign without a layer needs another "
+                "program: give inf to all members or to none."
             )
         if infinite.all():
             names.append(name)

@@ -6,14 +6,16 @@ Each stage may take any of its laws, independently of the other stages (the pape
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from ambjax.compiler.barrier import materialised
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.base import default_law, hard_signs, hardened, softened
+from ambjax.control.cascade_state import CascadeState, Command, Sample
 from ambjax.control.laws import (
     CurrentInputs,
     CurrentLaw,
@@ -25,45 +27,13 @@ from ambjax.control.laws import (
     stepped,
 )
 from ambjax.control.processor import Processor, carried
+from ambjax.control.schedule import extremes, present
 from ambjax.numerics.records import Scalar, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 
-
-class CascadeState(NamedTuple):
-    """The state of each law, or its rate."""
-
-    observer: Any
-    position: Any
-    inversion: Any
-    current: Any
-
-
-class Command(NamedTuple):
-    """Outputs of the stages: v_star and v_tilde (A^2/m^2), i_ref (A), i_ref_dot (A/s), u (V, before the limit)."""
-
-    v_star: Array
-    v_tilde: Array
-    i_ref: Array
-    i_ref_dot: Array
-    u: Array
-
-
-class Sample(NamedTuple):
-    """Inputs of a cascade on a processor at a sample, apart from the measurement.
-
-    `reference`: at the instant from which the voltage of this sample acts. `period`: s. `u_max`: limit of the supply,
-    V. `past`: voltages of the last sample and of the one before it, V.
-    """
-
-    reference: Reference
-    period: Scalar
-    u_max: Scalar
-    past: tuple[Array, Array]
-
-
-# Marks a law that is left out. `Cascade.__post_init__` replaces it by the default law.
+# Marks a law that is not given. `Cascade.__post_init__` replaces it by the default law.
 _LEFT_OUT: Any = None
 # The default law of each stage.
 USUAL = {
@@ -78,10 +48,11 @@ USUAL = {
 class Cascade:
     """The controller: four laws, the nominal plant `model`, and the processor.
 
-    The laws compute with `model`; the true plant is `Scenario.plant`. A law left out is the paper's, with the gains of
-    Table 2 and a steepness p scaled to the model (`base.default_law`; 25 for the plant of Table 1).
-    `dataclasses.replace` with another model keeps the existing laws. `processor` is None in continuous time, as in the
-    paper.
+    The laws compute with `model`; the true plant is `Scenario.plant`. The default of each law is that of the paper,
+    with the gains of Table 2 (but gamma = 7.5e4, see `inversion.Adaptive`), and with a steepness p scaled to the model
+    (`base.default_law`; 25 for the plant of Table 1). `dataclasses.replace` with another model does not change the
+    laws. `processor` is None in continuous time, as in the paper. A `Schedule` may stand in a law in the place of
+    a gain.
     """
 
     observer: Observer = _LEFT_OUT
@@ -99,30 +70,39 @@ class Cascade:
     def init(self, measured: Measurement, reference: Reference | None = None) -> CascadeState:
         """Return the states of all laws at t = 0, in continuous time or on the processor.
 
-        In continuous time a position law may begin at the first error, if the reference at t = 0 is given.
+        `measured`: the first measurement, from which the observer starts. `reference`: at t = 0; in continuous time, a
+        position law may choose its initial state from it (`PositionLaw.begin`).
         """
-        observed, rest = self.observer.init(self.model, measured), (self.position, self.inversion, self.current)
+        observed = extremes(self.observer)[0].init(self.model, measured)
+        rest = [extremes(law)[0] for law in self.laws[1:]]
         if self.processor is not None:
             return CascadeState(observed, *(law.init_sampled(self.model) for law in rest))
         states = [law.init(self.model) for law in rest]
         if reference is not None:
-            estimate, _ = self.observer(self.model, measured, observed)
-            states[0] = self.position.begin(self.model, (estimate, reference))
+            estimate, _ = present(self.observer, measured.z, reference)(self.model, measured, observed)
+            position = present(self.position, estimate.z, reference)
+            states[0] = position.begin(self.model, (estimate, reference))
         return CascadeState(observed, *states)
 
     def scale(self) -> CascadeState:
-        """Return the characteristic size of each number of the laws' states; integration errors are relative to it."""
+        """Return the characteristic size of each state of the laws; integration errors are relative to it."""
         if self.processor is None:
-            return CascadeState(*(law.scale(self.model) for law in self.laws))
-        return CascadeState(*(law.scale_sampled(self.model) for law in self.laws))
+            return CascadeState(*(extremes(law)[0].scale(self.model) for law in self.laws))
+        return CascadeState(*(extremes(law)[0].scale_sampled(self.model) for law in self.laws))
 
     def layer(self) -> CascadeState:
         """Return, for each state, the largest integration error that keeps it inside the layer of a smoothed sign."""
-        return CascadeState(*(law.layer(self.model) for law in self.laws))
+        layers = ([one.layer(self.model) for one in extremes(law)] for law in self.laws)
+        return CascadeState(*(jax.tree.map(lambda *x: functools.reduce(jnp.minimum, x), *each) for each in layers))
 
     def slopes(self) -> dict[str, Scalar]:
-        """Return the largest slope of each law (1/s) by stage."""
-        return {stage: law.slope(self.model) for stage, law in zip(CascadeState._fields, self.laws, strict=True)}
+        """Return the largest slope of each law, 1/s, by the name of its stage."""
+        laws = zip(CascadeState._fields, map(extremes, self.laws), strict=True)
+        return {stage: functools.reduce(jnp.maximum, [one.slope(self.model) for one in ends]) for stage, ends in laws}
+
+    def sigma(self, motion: Measurement, reference: Reference) -> Array:
+        """Return the sliding variable of the position law (m/s) for a motion and a reference."""
+        return present(self.position, motion.z, reference).sigma(motion, reference)
 
     @property
     def laws(self) -> tuple[Observer, PositionLaw, InversionLaw, CurrentLaw]:
@@ -132,59 +112,64 @@ class Cascade:
     def demand(
         self, measured: Measurement, state: CascadeState, reference: Reference
     ) -> tuple[ForceDemand, Measurement, CascadeState]:
-        """Return the demanded force, the estimate it was computed from, and the rates of observer and position law.
+        """Return the demanded force, the observer's estimate, and the rates of the states of observer and position law.
 
-        The rates of z and v_star are total derivatives along the reference, z_dot, the nominal z_ddot and the law
-        states. An inversion law without a state needs them for i_ref'; XLA removes them where they are unused. If the
-        observer estimates the velocity, the derivative is taken along the estimate.
+        The rates of z and v_star in the demanded force are total derivatives in time: along the reference, z_dot, the
+        nominal z_ddot and the states of the laws. Only inversion laws without a state use them, for i_ref'; XLA removes
+        them for other laws. If the observer estimates the velocity, z_dot is its estimate.
         """
 
-        def wanted(
+        def demanded(
             reference: Reference, z: Array, z_dot: Array, observed: object, positioned: object
         ) -> tuple[tuple[Array, Array], tuple[Measurement, object, object]]:
-            estimate, observed_rate = self.observer(self.model, Measurement(z, z_dot, measured.i), observed)
+            observer = present(self.observer, z, reference)
+            estimate, observed_rate = observer(self.model, Measurement(z, z_dot, measured.i), observed)
             if self.observer.estimates_velocity:
                 # XLA aborts when it compiles a one-kernel rollout (`compiler.fast_path`) in which z_dot is unused
                 estimate = estimate._replace(z_dot=estimate.z_dot + 0.0 * z_dot)
-            v_star, positioned_rate = self.position(self.model, (estimate, reference), positioned)
+            v_star, positioned_rate = self._demanded(estimate, reference, positioned)
             return (estimate.z, v_star), (estimate, observed_rate, positioned_rate)
 
         point = (reference, measured.z, measured.z_dot, state.observer, state.position)
-        (z, v_star), (estimate, observed_rate, positioned_rate) = wanted(*point)
+        (z, v_star), (estimate, observed_rate, positioned_rate) = demanded(*point)
         gaps = self.model.gaps(estimate.z)
         z_ddot = self.model.z_ddot(estimate.z, estimate.i)
         if self.observer.estimates_velocity:
-            law = functools.partial(self.position, self.model)
-            z_rate, v_star_rate = _rates(law, estimate, z_ddot, reference, state.position, positioned_rate)
+            point = (estimate, z_ddot, reference, state.position, positioned_rate)
+            z_rate, v_star_rate = _rates(self._demanded, *point)
         else:
             along = (reference.rate(), measured.z_dot, z_ddot, observed_rate, positioned_rate)
-            z_rate, v_star_rate = jax.jvp(lambda *x: wanted(*x)[0], point, along)[1]
+            z_rate, v_star_rate = jax.jvp(lambda *x: demanded(*x)[0], point, along)[1]
         rates = CascadeState(observed_rate, positioned_rate, (), ())
         return ForceDemand(z, z_rate, v_star, v_star_rate, gaps), estimate, rates
 
-    def on_processor(self, *delays: Scalar, between: bool = False) -> "Cascade":
-        """Return the cascade with all choices made that determine its compiled program.
+    def _demanded(self, estimate: Measurement, reference: Reference, state: State) -> tuple[Array, State]:
+        """Return the output and the rate of the position law."""
+        return present(self.position, estimate.z, reference)(self.model, (estimate, reference), state)
 
-        A sign with steepness inf becomes set-valued. The processor also admits `delays` (samples), or with `between`
-        every delay between them. Raises ValueError as `Processor.resolved` does.
+    def on_processor(self, *delays: Scalar, between: bool = False) -> "Cascade":
+        """Return the cascade with the structure of its compiled program fixed, for use inside jit, grad or vmap.
+
+        A sign with steepness inf becomes set-valued. The program also supports the delays `delays` (samples) and, with
+        `between`, every delay between them. Raises ValueError as `Processor.resolved` does.
         """
         assert self.processor is not None
         laws = {stage: hardened(getattr(self, stage)) for stage in USUAL}
         return dataclasses.replace(self, **laws, processor=self.processor.resolved(*delays, between=between))
 
     def check_smooth(self) -> None:
-        """Raise ValueError for a steepness of inf: in continuous time a sign must be smoothed."""
+        """Raise ValueError for a law with a steepness of inf: in continuous time a sign must be smoothed."""
         for stage in USUAL:
             law = getattr(self, stage)
             for name in hard_signs(law):
                 raise ValueError(
-                    f"controller.{stage}.{name} = inf: in continuous time a sign must be smoothed. Give a number, or "
-                    "add [processor], on which the sign itself is stepped."
+                    f"controller.{stage}.{name} = inf: in continuous time a sign must be smoothed. Give a finite "
+                    "number, or add [processor], which allows the sign itself."
                 )
 
     def in_continuous_time(self) -> "Cascade":
-        """Return the cascade without its processor; a steepness of inf becomes the default one for the model."""
-        laws = {stage: softened(getattr(self, stage), self.model) for stage in USUAL}
+        """Return the cascade without its processor; the model's default steepness replaces a steepness of inf."""
+        laws = {stage: softened(getattr(self, stage), self.model).in_continuous_time() for stage in USUAL}
         return dataclasses.replace(self, **laws, processor=None)
 
     def _advance(self, sample: Sample) -> Callable[..., Any]:
@@ -193,13 +178,13 @@ class Cascade:
         return functools.partial(stepped, model=self.model, period=sample.period, implicit=implicit)
 
     def estimate(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State, Measurement]:
-        """Run the observer for one sample.
+        """Step the observer on a processor.
 
-        `state` is the observer's. Returns the estimate for the other laws (with prediction: at the end of the delay),
-        the observer's next state, and the estimate at the sample itself.
+        `state`: state of the observer. Returns the estimate for the other laws (with prediction: at the end of the
+        delay), the next state of the observer, and the estimate at the sample itself.
         """
         processor: Any = self.processor
-        now, state = self._advance(sample)(self.observer, measured, state)
+        now, state = self._advance(sample)(present(self.observer, measured.z, sample.reference), measured, state)
         estimate = now
         if processor.predicts:
             estimate = carried(self.model, now, sample.past, processor.stretches(sample.period))
@@ -208,36 +193,41 @@ class Cascade:
     def step(
         self, measured: Measurement, state: CascadeState, sample: Sample
     ) -> tuple[Command, CascadeState, Measurement]:
-        """Return the command of one sample on a processor, the laws' next states, and the observer's estimate.
+        """Step all laws on a processor.
 
-        With prediction, all laws but the observer use the estimate at the end of the delay.
+        With prediction, all laws but the observer use the estimate at the end of the delay. Returns the command, the
+        next states of the laws, and the observer's estimate at the sample itself.
         """
         advance = self._advance(sample)
 
-        def wanted(
+        def force_for(estimate: Measurement, reference: Reference, state: object) -> tuple[Array, Any]:
+            return advance(present(self.position, estimate.z, reference), (estimate, reference), state)
+
+        def demanded(
             reference: Reference, z: Array, z_dot: Array, observed: object, positioned: object
         ) -> tuple[tuple[Array, Array], tuple[Measurement, Measurement, object, object]]:
-            estimate, observed, now = self.estimate(Measurement(z, z_dot, measured.i), observed, sample)
-            v_star, positioned = advance(self.position, (estimate, reference), positioned)
+            reading, at = Measurement(z, z_dot, measured.i), sample._replace(reference=reference)
+            estimate, observed, now = self.estimate(reading, observed, at)
+            v_star, positioned = force_for(estimate, reference, positioned)
             return (estimate.z, v_star), (now, estimate, observed, positioned)
 
         point = (sample.reference, measured.z, measured.z_dot, state.observer, state.position)
-        (z, v_star), (now, estimate, observed, positioned) = wanted(*point)
-        # an inversion law without a state needs the rates for i_ref'; XLA removes them where they are unused
+        (z, v_star), (now, estimate, observed, positioned) = demanded(*point)
+        # only an inversion law without a state uses the rates, for i_ref'; XLA removes them for other laws
         z_ddot = self.model.z_ddot(estimate.z, estimate.i)
         rates = jax.tree.map(
             lambda a, b: (b - a) / sample.period, (state.observer, state.position), (observed, positioned)
         )
         if self.observer.estimates_velocity:
-            law = functools.partial(advance, self.position)
-            z_rate, v_star_rate = _rates(law, estimate, z_ddot, sample.reference, state.position, rates[1])
+            z_rate, v_star_rate = _rates(force_for, estimate, z_ddot, sample.reference, state.position, rates[1])
         else:
             along = (sample.reference.rate(), measured.z_dot, z_ddot, *rates)
-            z_rate, v_star_rate = jax.jvp(lambda *x: wanted(*x)[0], point, along)[1]
+            z_rate, v_star_rate = jax.jvp(lambda *x: demanded(*x)[0], point, along)[1]
         v_star = materialised(v_star)
         force = ForceDemand(z, z_rate, v_star, v_star_rate, self.model.gaps(z))
-        demand, inverted = advance(self.inversion, force, state.inversion)
-        u, driven = advance(self.current, CurrentInputs(estimate, demand, sample.u_max, force.gaps), state.current)
+        inversion, current = present(self.inversion, z, sample.reference), present(self.current, z, sample.reference)
+        demand, inverted = advance(inversion, force, state.inversion)
+        u, driven = advance(current, CurrentInputs(estimate, demand, sample.u_max, force.gaps), state.current)
         v_tilde = v_star - self.model.v_and_dv_di(z, demand.i_ref, force.gaps)[0]
         after = CascadeState(observed, positioned, inverted, driven)
         return Command(v_star, v_tilde, demand.i_ref, demand.i_ref_dot, u), after, now
@@ -245,12 +235,16 @@ class Cascade:
     def __call__(
         self, measured: Measurement, state: CascadeState, reference: Reference, u_max: Scalar
     ) -> tuple[Command, CascadeState]:
-        """Return the command and the rate of every law's state. `u_max`: limit of the supply, V (inf: none)."""
+        """Return the command in continuous time and the rates of the states of all laws.
+
+        `u_max`: limit of the supply, V; inf: none.
+        """
         force, estimate, rates = self.demand(measured, state, reference)
-        wanted, inversion_rate = self.inversion(self.model, force, state.inversion)
-        u, current_rate = self.current(self.model, CurrentInputs(estimate, wanted, u_max, force.gaps), state.current)
-        v_tilde = force.v_star - self.model.v_and_dv_di(force.z, wanted.i_ref, force.gaps)[0]
-        command = Command(force.v_star, v_tilde, wanted.i_ref, wanted.i_ref_dot, u)
+        inversion, current = present(self.inversion, force.z, reference), present(self.current, force.z, reference)
+        demand, inversion_rate = inversion(self.model, force, state.inversion)
+        u, current_rate = current(self.model, CurrentInputs(estimate, demand, u_max, force.gaps), state.current)
+        v_tilde = force.v_star - self.model.v_and_dv_di(force.z, demand.i_ref, force.gaps)[0]
+        command = Command(force.v_star, v_tilde, demand.i_ref, demand.i_ref_dot, u)
         return command, rates._replace(inversion=inversion_rate, current=current_rate)
 
 
@@ -262,10 +256,10 @@ def _rates(
     state: State,
     rate: State,
 ) -> tuple[Array, Array]:
-    """Return the rates of z and v_star along an estimate that moves with its own velocity and with z_ddot."""
+    """Return the rates of z (m/s) and v_star (A^2/m^2/s) along an estimate whose rates are its z_dot and `z_ddot`."""
 
     def v_star(reference: Reference, z: Array, z_dot: Array, state: State) -> Array:
-        return law((Measurement(z, z_dot, estimate.i), reference), state)[0]
+        return law(Measurement(z, z_dot, estimate.i), reference, state)[0]
 
     point = (reference, estimate.z, estimate.z_dot, state)
     return estimate.z_dot, jax.jvp(v_star, point, (reference.rate(), estimate.z_dot, z_ddot, rate))[1]

@@ -147,11 +147,44 @@ class DeadBeat(CurrentLaw[tuple[()]]):
         change = period * demand.i_ref_dot - self.share * (i - demand.i_ref)
         return (change * (1 / period) / _mean_decay(decay * period) + decay * i) / per_volt, ()
 
+    def idle_gains(self, implicit: bool | None) -> tuple[str, ...]:
+        """Return w for implicit steps of a processor, and share otherwise: an explicit step is that of the rate w."""
+        return ("w",) if implicit else ("share",)
+
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         return {
             "w": rate(context, 1, 100, "rate from w to 100 w"),
             "share": Interval(0.1, 1.0, "a tenth of the error to all of it", True),
         }
+
+
+@record
+class OpenLoop(CurrentLaw[tuple[()]]):
+    """u = R i_ref: the voltage that holds the reference current. The current is not fed back.
+
+    For a position law that demands a voltage, such as position.LinearController: with inversion.Linearised, u is the
+    voltage that it demands. On a processor u is that of the sample, u = R (i_ref + T i_ref').
+    """
+
+    accepts: ClassVar = ("voltage",)
+
+    def init(self, model: Plant) -> tuple[()]:
+        return ()
+
+    def scale(self, model: Plant) -> tuple[()]:
+        return ()
+
+    def slope(self, model: Plant) -> Scalar:
+        return 0.0
+
+    def __call__(self, model: Plant, inputs: CurrentInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
+        return model.R * inputs.demand.i_ref, ()
+
+    def step(self, model: Plant, inputs: CurrentInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
+        """Return the voltage for the reference that the inversion has computed at this sample."""
+        return model.R * (inputs.demand.i_ref + period * inputs.demand.i_ref_dot), ()
+
+    own_steps = ("implicit", "explicit")
 
 
 def _mean_decay(x: Array) -> Array:

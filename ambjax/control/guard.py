@@ -88,12 +88,13 @@ class Guard:
         The derivation uses the scenario's clearance as a share of the gap, and the gap and pole of `model`.
         """
         sensor = Sensor() if scenario.sensor is None else scenario.sensor
-        touchdown, clearance = scenario.touchdown, scenario.touchdown / scenario.plant.s_0 * model.s_0
+        limit, clearance = scenario.limit, scenario.limit / scenario.plant.s_0 * model.s_0
         step = 0.0 if sensor.bits is None else 2 * sensor.ends(scenario.plant.s_0) / 2.0**sensor.bits
-        error, fall = LARGEST_NORMAL * sensor.std + step / 2, model.pole * clearance
+        runout = 0.0 if sensor.runout is None else sum(abs(one.amplitude) for one in sensor.runout.harmonics)
+        error, fall = LARGEST_NORMAL * sensor.std + step / 2 + sensor.gain * runout, model.pole * clearance
         off = 1.0 if estimated or sensor.bandwidth is not None else abs(sensor.gain - 1)
         values = {
-            "z": sensor.gain * touchdown + abs(sensor.offset) + error,
+            "z": sensor.gain * limit + abs(sensor.offset) + error,
             "z_dot": GAPS * model.s_0 / period,
             "i": CURRENTS * model.i_0,
             "noise": 2 * error,

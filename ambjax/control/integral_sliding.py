@@ -22,6 +22,9 @@ class IntegralSlidingMode(PositionLaw[Array]):
     7.1): s' = -k sgn(s) + q_z as in Eq. (12), and e_ddot + c e_dot + c_int e = 0 on the manifold. The smoothed sign of
     Eq. (5) leaves an offset under a constant force, because s is then not zero. Here e = 0 at rest for any constant s.
     There is no anti-windup: the integral goes on while the supply limits u.
+
+    The integral starts at 0, and s reaches 0 later. In `manifolds.UtkinSlidingMode` s = 0 from the start, and the sign
+    only cancels the disturbance of a PD controller; there too, a constant force below k leaves no offset.
     """
 
     c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold")

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.compiler.barrier import materialised
 from ambjax.control.base import Requirement
 from ambjax.control.laws import CurrentDemand, ForceDemand, InversionLaw, Relaxation
 from ambjax.control.sampling import Relay
@@ -97,15 +96,12 @@ class Adaptive(AdaptiveReference):
         v_1, gradient_1 = v_and_gradient(model, end, i_ref)
         w = begin.v_star - v_0
         drift = (end.v_star - v_1 - w) * (1 / jnp.where(h > 0, h, 1.0))
-        w, drift = materialised((w, drift))
-        sliding, slaved, turn = relaxation(w, drift, self.gamma, self.p, h)
-        w_1 = w + turn * (drift - sliding)
-        w_2 = w_1 + (h - turn) * (drift - slaved)
-        return Relaxation(sliding / gradient_0, slaved / gradient_1, turn, (w, w_1, w_2))
+        sliding, slaved, turn, path = relaxation(w, drift, self.gamma, self.p, h)
+        return Relaxation(sliding / gradient_0, slaved / gradient_1, turn, path)
 
     def step(self, model: Plant, inputs: ForceDemand, state: Array, period: Scalar) -> tuple[CurrentDemand, Array]:
         """Step v(z, i_ref) towards v_star with the sign at the end of the step; gamma bounds the slew rate."""
-        w = materialised(inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0])
+        w = inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0]
         after = model.current_for(inputs.z, inputs.v_star - relax(w, period * self.gamma, self.p))
         return CurrentDemand(state, (after - state) * (1 / period)), after
 
@@ -136,7 +132,7 @@ class FeedForwardAdaptive(AdaptiveReference):
 
     def step(self, model: Plant, inputs: ForceDemand, state: Array, period: Scalar) -> tuple[CurrentDemand, Array]:
         """Step v towards v_star, both at the end of the sample, with the sign at the end of the step."""
-        w = materialised(inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0])
+        w = inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0]
         z, v_star = inputs.z + period * inputs.z_rate, inputs.v_star + period * inputs.v_star_rate
         after = model.current_for(z, v_star - relax(w, period * self.gamma, self.p))
         return CurrentDemand(state, (after - state) * (1 / period)), after
@@ -212,6 +208,8 @@ class Linearised(StaticInversion):
     Maslen, Magnetic Bearings, 2009, 2.1). With position.PID it is the loop of the textbook. The inversion error v_tilde
     is zero at z = 0, and for v_star = 0 at every z; elsewhere it is of third order in z and v_star.
     """
+
+    accepts: ClassVar = ("force", "voltage")
 
     def inverse(self, model: Plant, z: Array, v_star: Array) -> Array:
         return (v_star - model.dv_dz(0.0, 0.0) * z) / model.dv_di(0.0, 0.0)

@@ -3,17 +3,18 @@
 A law is a frozen record: its type is the algorithm, its leaves are the gains. Every law has these methods, where
 `model` is the nominal plant:
 
-- `init(model)`: the state at t = 0; a law without a state returns ().
-- `law(model, inputs, state)`: the output and the rate of the state.
-- `scale(model)`: the characteristic size of each state; integration errors are relative to it.
+- `init(model)`, for an observer `init(model, measured)`: the state at t = 0; () for a law without a state.
+- `law(model, inputs, state)`: the output, and the rate of the state.
+- `scale(model)`: the characteristic size of each component of the state; integration errors are relative to it.
 - `slope(model)`: the largest slope of the law, 1/s; the step size is chosen from it.
+- `sigma(motion, reference)`, for a position law: the sliding variable of a motion, m/s.
 
-`control.base.Law` has the optional methods with their defaults. To add a law: write a record in the file of its stage,
-add a row to `KINDS` of the case-file reader, and add a row to the conformance test.
+`control.base.Law` has the other methods with their defaults. To add a law, write a record in the file of its stage, and
+add it to `KINDS` in `ambjax/cases/reader.py` and to the conformance test in `tests/test_laws.py`.
 """
 
 import abc
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import jax
 from jax import Array
@@ -30,10 +31,13 @@ State = TypeVar("State")
 
 
 class ForceDemand(NamedTuple):
-    """Input of an inversion law: estimated position z (m), demanded scaled force v_star (A^2/m^2), and their rates.
+    """Input of an inversion law.
 
-    `z_rate` is the rate of the estimate z, which may differ from the estimated velocity. `gaps` are the model's gaps
-    at z if they are already computed, else None.
+    - `z`: estimated position, m.
+    - `z_rate`: rate of `z`, m/s; it may differ from the estimated velocity.
+    - `v_star`: demanded scaled force, A^2/m^2.
+    - `v_star_rate`: rate of `v_star`, A^2/m^2/s.
+    - `gaps`: gaps of the model at `z`; None: not computed yet.
     """
 
     z: Array
@@ -51,7 +55,13 @@ class CurrentDemand(NamedTuple):
 
 
 class CurrentInputs(NamedTuple):
-    """Input of a current law: the estimate, the demand, the limit of the supply (V), and the model's gaps or None."""
+    """Input of a current law.
+
+    - `measured`: estimated motion and current.
+    - `demand`: output of the inversion law.
+    - `u_max`: limit of the supply, V.
+    - `gaps`: gaps of the model at the estimated position; None: not computed yet.
+    """
 
     measured: Measurement
     demand: CurrentDemand
@@ -60,10 +70,13 @@ class CurrentInputs(NamedTuple):
 
 
 class Relaxation(NamedTuple):
-    """Output of `slide(model, begin, end, i_ref, h)` of an inversion law: its state i_ref over a step of h (s).
+    """Output of the method `slide(model, begin, end, i_ref, h)` of an inversion law: its motion over a step of h (s).
 
-    `begin` and `end` are the ForceDemand at both ends of the step. i_ref moves at the rate `first` (A/s) up to the time
-    `turn` (s), then at the rate `rest` (A/s). `v_tilde` (A^2/m^2): at the start, at `turn` and at the end.
+    `begin` and `end` are the ForceDemand at both ends of the step, `i_ref` is the state of the law at its start.
+
+    - `first`, `rest`: rates of i_ref (A/s) before and after the time `turn`.
+    - `turn`: time from the start of the step, s.
+    - `v_tilde`: inversion error (A^2/m^2) at the start, at `turn` and at the end.
     """
 
     first: Array
@@ -73,13 +86,13 @@ class Relaxation(NamedTuple):
 
 
 class Observer(Law, Generic[State], abc.ABC):
-    """Base class of an observer, which returns the estimated motion for a measurement."""
+    """Base class of an observer: its input is the measurement, its output the estimated motion and current."""
 
     @abc.abstractmethod
     def init(self, model: Plant, measured: Measurement) -> State: ...
 
     def started(self, z: Array) -> "Observer":
-        """Return the observer with its estimate of the displacement starting at z (m); itself if no field sets it."""
+        """Return the observer with z (m) as its initial estimate of the position; itself if no field sets it."""
         return self
 
     @abc.abstractmethod
@@ -93,13 +106,18 @@ class Observer(Law, Generic[State], abc.ABC):
 
 
 class PositionLaw(Law, Generic[State], abc.ABC):
-    """Base class of a position law, which returns the scaled force v_star (A^2/m^2) for an estimate and a reference."""
+    """Base class of a position law: its input is (estimate, reference), its output the scaled force v_star, A^2/m^2."""
+
+    @property
+    def demand(self) -> str:
+        """What the law demands: "force", or a "voltage" that the laws after it must pass on unchanged."""
+        return "force"
 
     @abc.abstractmethod
     def init(self, model: Plant) -> State: ...
 
     def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> State:
-        """Return the state at t = 0 in continuous time for the first estimate and reference; `init` by default."""
+        """Return the state at t = 0 in continuous time, from the first estimate and reference; by default `init`."""
         return self.init(model)
 
     @abc.abstractmethod
@@ -116,13 +134,18 @@ class PositionLaw(Law, Generic[State], abc.ABC):
 
 
 class InversionLaw(Law, Generic[State], abc.ABC):
-    """Base class of an inversion law, which returns the demanded current for a demanded force."""
+    """Base class of an inversion law: its input is the demanded force, its output the demanded current.
+
+    `accepts`: the demands of a position law (`PositionLaw.demand`) with which the law can be combined.
+    """
+
+    accepts: ClassVar[tuple[str, ...]] = ("force",)
 
     @abc.abstractmethod
     def init(self, model: Plant) -> State: ...
 
     def started(self, i_ref: Array) -> "InversionLaw":
-        """Return the law with its reference current starting at i_ref (A); the law itself if no field sets it."""
+        """Return the law with i_ref (A) as its initial current reference; the law itself if no field sets it."""
         return self
 
     @abc.abstractmethod
@@ -136,7 +159,12 @@ class InversionLaw(Law, Generic[State], abc.ABC):
 
 
 class CurrentLaw(Law, Generic[State], abc.ABC):
-    """Base class of a current law, which returns the voltage u (V) for a demanded current."""
+    """Base class of a current law: its input is the demanded current, its output the voltage u, V.
+
+    `accepts`: the demands of a position law (`PositionLaw.demand`) with which the law can be combined.
+    """
+
+    accepts: ClassVar[tuple[str, ...]] = ("force",)
 
     @abc.abstractmethod
     def init(self, model: Plant) -> State: ...
@@ -163,7 +191,11 @@ STAGES: dict[str, type[Law]] = {
 def stepped(
     law: Law, inputs: object, state: State, *, model: Plant, period: Scalar, implicit: bool
 ) -> tuple[Any, State]:
-    """Return the output of a law at a sample and its next state, by its own `step` or else by explicit Euler."""
+    """Step a law on a processor, by its method `step` or else by explicit Euler.
+
+    `period`: sample period, s. `implicit`: whether the processor uses implicit steps. Returns the output of the law at
+    the sample, and its next state.
+    """
     with jax.named_scope(f"law:{type(law).__module__.rpartition('.')[2]}.{type(law).__qualname__}"):
         if law.has_own_step(implicit):
             own: Any = law

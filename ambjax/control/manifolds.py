@@ -125,9 +125,11 @@ class TerminalSlidingMode(PositionLaw[tuple[()]]):
     the reference faster. The root is smoothed below |y| = 0.01, and the sign with p. There is no integral.
     """
 
-    c: Scalar = gain(default=106.0, unit="1/s", doc="decay rate on the manifold where |e| = l; left out: w/5")
-    l: Scalar = gain(default=5e-4, unit="m", doc="error at which the decay rate is c; left out: s_0/10")
-    k: Scalar = gain(default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z")
+    c: Scalar = gain(default=530.0, unit="1/s", doc="decay rate on the manifold where |e| = l; left out: w")
+    l: Scalar = gain(default=1e-4, unit="m", doc="error at which the decay rate is c; left out: s_0/50")
+    k: Scalar = gain(
+        default=280.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z; left out: w^2 s_0/5"
+    )
     p: Scalar = gain(
         default=25.0, unit="s/m", doc="steepness of the smoothed sign of sigma; left out: scaled to the plant",
         steepness=True,
@@ -140,7 +142,7 @@ class TerminalSlidingMode(PositionLaw[tuple[()]]):
         return ()
 
     def designed(self, model: Plant, period: float | None) -> "TerminalSlidingMode":
-        return dataclasses.replace(self, c=model.pole / 5, l=model.s_0 / 10)
+        return dataclasses.replace(self, c=model.pole, l=model.s_0 / 50, k=model.pole**2 * model.s_0 / 5)
 
     def slope(self, model: Plant) -> Scalar:
         """Return the larger of the rates of the sign at |y| = 1, where d sigma/d e_dot is 3/2, and of the root."""

@@ -1,4 +1,4 @@
-"""Observers: the estimate of the rotor's motion that the other laws use."""
+"""Observers, which estimate the motion of the rotor for the other laws."""
 
 import dataclasses
 from typing import ClassVar, NamedTuple
@@ -16,7 +16,7 @@ from ambjax.world.sensor import Measurement
 
 @record
 class Direct(Observer[tuple[()]]):
-    """The measurement itself, as in the paper."""
+    """No observer: the estimate is the measurement, as in the paper."""
 
     def init(self, model: Plant, measured: Measurement) -> tuple[()]:
         return ()
@@ -33,10 +33,10 @@ class Direct(Observer[tuple[()]]):
 
 @record
 class Complementary(Observer[Array]):
-    """Complementary filter: z_hat' = z_dot + l (z_measured - z_hat).
+    """Complementary filter of the measured position and velocity: z_hat' = z_dot + l (z_measured - z_hat).
 
-    The estimate integrates the velocity and follows the position slowly: it low-passes noise of the position sensor at
-    l (1/s), and integrates noise of the velocity with the time constant 1/l.
+    The estimate z_hat (m) integrates the velocity, and converges to the measured position at the rate l (1/s). Noise of
+    the position sensor passes through a low-pass of corner l, noise of the velocity through a low-pass of gain 1/l.
     """
 
     l: Scalar = gain(default=10.0, unit="1/s", doc="corner between velocity and position sensor")
@@ -71,10 +71,11 @@ class Complementary(Observer[Array]):
 
 @record
 class Difference(Observer[Array]):
-    """Filtered difference: z_dot = w (z - z_f), z_f' = w (z - z_f). The position z is not filtered.
+    """Filtered difference: the estimated velocity is w (z - z_f) with z_f' = w (z - z_f). z itself is not filtered.
 
-    On a processor: the backward difference (z_n - z_{n-1})/T through a low-pass with the pole exp(-w T). It is exact on
-    a ramp, and late by 1/w. Noise of the position appears in the velocity multiplied by w.
+    With implicit steps on a processor, it is the backward difference (z_n - z_{n-1})/T through a low-pass with the pole
+    exp(-w T). It is exact on a ramp after the initial transient, and lags by 1/w. Noise of the position is amplified by
+    w.
     """
 
     w: Scalar = gain(default=2000.0, unit="1/s", doc="corner of the low-pass on the differenced position")
@@ -95,7 +96,7 @@ class Difference(Observer[Array]):
         return inputs._replace(z_dot=z_dot), z_dot
 
     def step(self, model: Plant, inputs: Measurement, state: Array, period: Scalar) -> tuple[Measurement, Array]:
-        """Step z_f+ = exp(-w T) z_f + (1 - exp(-w T)) z; z_n - z_f is then the low-passed backward difference."""
+        """Step z_f+ = exp(-w T) z_f + (1 - exp(-w T)) z. The estimated velocity is (1 - exp(-w T))/T (z_n - z_f)."""
         z_dot = -jnp.expm1(-self.w * period) / period * (inputs.z - state)
         return inputs._replace(z_dot=z_dot), state + period * z_dot
 
@@ -104,10 +105,11 @@ class Difference(Observer[Array]):
 
 
 class Predicted(NamedTuple):
-    """State of `Kalman`: predictions for this sample from the earlier ones.
+    """State of `Kalman`: the estimate; on a processor, the estimate for a sample from the earlier ones.
 
-    Position (m), velocity (m/s), disturbance (m/s^2), and the model's acceleration at the last sample (m/s^2; unused in
-    continuous time).
+    - `z`, `z_dot`: position, m, and velocity, m/s.
+    - `d`: disturbance, m/s^2.
+    - `z_ddot`: acceleration of the model at the last sample, m/s^2; unused in continuous time.
     """
 
     z: Array
@@ -118,22 +120,26 @@ class Predicted(NamedTuple):
 
 @record
 class Kalman(Observer[Predicted]):
-    """Steady-state Kalman filter of the nominal model, driven by the measured current, with an unknown disturbance.
+    """Steady-state Kalman filter of the nominal model with an unknown disturbance d, driven by the measured current.
 
-    z_hat' = z_dot_hat + 3 w e, z_dot_hat' = z_ddot(z, i) + d_hat + 3 w^2 e, d_hat' = w^3 e, e = z - z_hat, with Eq. (1)
-    at the measured z and i. Errors decay with three equal poles at w, at any z (A. J. Krener and A. Isidori, Syst.
-    Control Lett. 3 (1983) 47-52). The gain w replaces both covariances. For white measurement noise of intensity S_r
-    (m^2 s; std^2 T on a processor) and a disturbance whose rate is white with S_q (m^2/s^5), the variance of the
-    velocity is 7/4 (S_r w^3 + S_q / w^3). It is smallest at w = (S_q/S_r)^(1/6): 8 % in rms above the optimal filter.
+    z_hat' = z_dot_hat + 3 w e, z_dot_hat' = z_ddot(z, i) + d_hat + 3 w^2 e, d_hat' = w^3 e, e = z - z_hat, with z_ddot
+    of Eq. (1) at the measured z and i. The estimation errors have three equal poles at -w, at any z (A. J. Krener and
+    A. Isidori, Syst. Control Lett. 3 (1983) 47-52). With implicit steps on a processor the poles are exp(-w T), so the
+    filter is stable for every w.
+
+    The gain w replaces both covariances. Let the position noise be white with intensity S_r (m^2 s; std^2 T on a
+    processor), and the rate of the disturbance white with intensity S_q (m^2/s^5). The variance of the velocity is then
+    7/4 (S_r w^3 + S_q / w^3). It is smallest at w = (S_q/S_r)^(1/6), where the rms error is 8 % above that of the
+    optimal filter.
     """
 
-    w: Scalar = gain(default=800.0, unit="1/s", doc="three equal poles of the estimation error")
+    w: Scalar = gain(default=800.0, unit="1/s", doc="decay rate of the estimation error, which has three poles at -w")
     estimates_velocity: ClassVar[bool] = True
     memory = (
-        ("z", "m", "position estimated for this sample from those before"),
-        ("z_dot", "m/s", "velocity, likewise"),
-        ("d", "m/s^2", "disturbance, likewise"),
-        ("z_ddot", "m/s^2", "the model's acceleration at the last sample"),
+        ("z", "m", "position predicted for the next sample"),
+        ("z_dot", "m/s", "velocity predicted for the next sample"),
+        ("d", "m/s^2", "disturbance predicted for the next sample"),
+        ("z_ddot", "m/s^2", "acceleration of the model at the last sample"),
     )
 
     def init(self, model: Plant, measured: Measurement) -> Predicted:
@@ -157,15 +163,15 @@ class Kalman(Observer[Predicted]):
     def step(
         self, model: Plant, inputs: Measurement, state: Predicted, period: Scalar
     ) -> tuple[Measurement, Predicted]:
-        """Update the estimate with this sample, with the triple pole q = exp(-w T).
+        """Update the estimate with the measurement of a sample; the errors have the triple pole q = exp(-w T).
 
         The gains 1 - q^3, 3/2 (1-q)^2 (1+q)/T and (1-q)^3/T^2 are those of the fading-memory filter (N. Morrison,
-        Introduction to Sequential Smoothing and Prediction, 1969). The model's acceleration is taken as linear between
-        samples: the last step held it constant, and this step adds the difference.
+        Introduction to Sequential Smoothing and Prediction, 1969). The acceleration of the model is interpolated
+        linearly between samples: the last step used a constant one, and this step corrects its prediction.
         """
         z_ddot = model.z_ddot(inputs.z, inputs.i)
-        more = z_ddot - state.z_ddot
-        z, z_dot = state.z + period**2 / 6 * more, state.z_dot + period / 2 * more
+        change = z_ddot - state.z_ddot
+        z, z_dot = state.z + period**2 / 6 * change, state.z_dot + period / 2 * change
         e, off = inputs.z - z, -jnp.expm1(-self.w * period)
         z = z + (1 - (1 - off) ** 3) * e
         z_dot = z_dot + 1.5 * off**2 * (2 - off) / period * e
@@ -180,10 +186,10 @@ class Kalman(Observer[Predicted]):
 
 @record
 class IRED1(ExactDifferentiator):
-    """Robust exact differentiator of order 1: z_dot is exact where |z_ddot| <= L. Implicit on a processor.
+    """Robust exact differentiator of order 1: without noise, z_dot is exact while |z_ddot| <= L.
 
-    `ambjax.numerics.differentiator` has the equations. The position z is not filtered. In continuous time the sign is
-    smoothed.
+    `ambjax.numerics.differentiator` has the equations. z itself is not filtered. The sign is smoothed in continuous
+    time, and evaluated at the end of the step with implicit steps on a processor.
     """
 
     L: Scalar = gain(default=50.0, unit="m/s^2", doc="bound on the acceleration")
@@ -193,7 +199,7 @@ class IRED1(ExactDifferentiator):
 
 @record
 class IRED2(ExactDifferentiator):
-    """Robust exact differentiator of order 2: as `IRED1`, exact where the rate of the acceleration is bounded by L."""
+    """Robust exact differentiator of order 2: as `IRED1`, but exact while the rate of the acceleration is at most L."""
 
     L: Scalar = gain(default=3e4, unit="m/s^3", doc="bound on the rate of the acceleration")
     order: ClassVar[int] = 2

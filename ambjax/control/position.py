@@ -10,6 +10,7 @@ from ambjax.control.chain import FilterChain as FilterChain
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.integral_sliding import IntegralSlidingMode as IntegralSlidingMode
 from ambjax.control.laws import PositionLaw
+from ambjax.control.linear_controller import LinearController as LinearController
 from ambjax.control.manifolds import TerminalSlidingMode as TerminalSlidingMode
 from ambjax.control.manifolds import UtkinSlidingMode as UtkinSlidingMode
 from ambjax.control.pid import PID as PID

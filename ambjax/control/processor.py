@@ -1,16 +1,16 @@
 """The processor of a cascade: all laws step once a sample, and the voltage is held from a delay later on."""
 
 import dataclasses
+import functools
 import math
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.compiler.barrier import materialised
 from ambjax.control.guard import Guard
 from ambjax.numerics.records import Scalar, is_traced, leaf, record, static
+from ambjax.numerics.runge_kutta import rk4_step
 from ambjax.world.plant import Plant, State
 from ambjax.world.sensor import Measurement
 
@@ -92,18 +92,11 @@ class Processor:
 def carried(model: Plant, estimate: Measurement, past: tuple[Array, Array], lengths: tuple[Array, ...]) -> Measurement:
     """Predict the estimate over these lengths (s), the last first, by one RK4 step of the model for each voltage."""
 
-    def rates(x: State, u: Array) -> State:
-        return materialised(model.rates(x, u), x)
-
     x = model.start(estimate)
     for u, h in reversed(list(zip(past, lengths, strict=False))):
-        k_1 = rates(x, u)
-        k_2 = rates(_moved(x, h / 2, k_1), u)
-        k_3 = rates(_moved(x, h / 2, k_2), u)
-        k_4 = rates(_moved(x, h, k_3), u)
-        x = materialised(_moved(x, h / 6, jax.tree.map(lambda a, b, c, d: a + 2 * (b + c) + d, k_1, k_2, k_3, k_4)))
+        x = rk4_step(functools.partial(_rates, model, u), x, h)
     return model.measurement(x)
 
 
-def _moved(x: State, h: Array, rates: State) -> State:
-    return jax.tree.map(lambda a, b: a + h * b, x, rates)
+def _rates(model: Plant, u: Array, x: State) -> State:
+    return model.rates(x, u)

@@ -23,10 +23,12 @@ from ambjax.simulation.folds import Fold
 from ambjax.simulation.rollout import Outcome, System, prepare, run
 from ambjax.world.scenario import Scenario
 
+# Largest number of members in one call of the compiled program, unless the caller gives it.
 MOST_CALL = 4096
+# Name of the mesh axis over which members are distributed.
 MEMBERS = "members"
 
-# An ensemble, or one of its members, and the result of a function of it.
+# A pytree of an ensemble or of one member, and the result of a function of a member.
 Tree = TypeVar("Tree")
 Result = TypeVar("Result")
 
@@ -51,7 +53,7 @@ def run_ensemble(
     """Simulate every member of an ensemble.
 
     Each leaf of `cascade`, `scenario` and `fold` is a number, shared by all members, or an array [N] with one entry per
-    member. At least one leaf must be an array, for example `scenario.member`; that number selects a member's noise.
+    member. At least one leaf must be an array, for example `scenario.member`, which selects the noise of a member.
     `fold` is updated at every sample. Rows are recorded at every `every`-th sample (0: none).
     `threads` and `call` are those of `map_members`.
 
@@ -136,14 +138,14 @@ class _Engine(Generic[Tree, Result]):
         self.moving = [np.asarray(x) for x in leaves if np.ndim(x)]
         self.shared = tuple(x for x in leaves if not np.ndim(x))
         self.function, self.devices = function, jax.devices()
-        alone = len(self.devices) == 1 and self.devices[0].platform == "cpu"
-        self.workers = (threads or cores()) if alone else 1
+        single_cpu = len(self.devices) == 1 and self.devices[0].platform == "cpu"
+        self.workers = (threads or cores()) if single_cpu else 1
         # All calls have the same length; the last call may hold fewer members than its length.
         calls = max(-(-self.members // (MOST_CALL * self.workers)), 1) * self.workers
-        share = call or -(-self.members // calls)
-        self.block = block or block_bytes(share) // jnp.result_type(float).itemsize
-        unit = self.block * len(self.devices)
-        self.call = -(-share // unit) * unit
+        per_call = call or -(-self.members // calls)
+        self.block = block or block_bytes(per_call) // jnp.result_type(float).itemsize
+        multiple = self.block * len(self.devices)
+        self.call = -(-per_call // multiple) * multiple
         self.program = _program(len(self.devices), plain)
 
     def results(self) -> Result:
@@ -179,7 +181,7 @@ def _blocks(
 
     def member(moving: tuple[Array, ...]) -> Result:
         own, common = iter(moving), iter(parts.shared)
-        return function(jax.tree.unflatten(tree, [next(own) if its else next(common) for its in moves]))
+        return function(jax.tree.unflatten(tree, [next(own) if varies else next(common) for varies in moves]))
 
     if jax.default_backend() != "cpu":
         return jax.vmap(member)(parts.moving)
@@ -190,28 +192,28 @@ def _blocks(
 
 STATIC = ("function", "moves", "tree", "block")
 _fast = one_kernel(_blocks, static_argnames=STATIC)
-_usual = jax.jit(_blocks, static_argnames=STATIC)
+_plain = jax.jit(_blocks, static_argnames=STATIC)
 
 
 @functools.cache
 def _program(devices: int, plain: bool) -> Callable[..., Any]:
     """Return the compiled program: for one device, or with members sharded over several devices."""
     if devices == 1:
-        return _usual if plain else _fast
+        return _plain if plain else _fast
     mesh = Mesh(np.asarray(jax.devices()[:devices]), (MEMBERS,))
-    over, everywhere = PartitionSpec(MEMBERS), PartitionSpec()
+    by_member, replicated = PartitionSpec(MEMBERS), PartitionSpec()
 
-    def spread(parts: Parts, **static: object) -> object:
+    def sharded(parts: Parts, **static: object) -> object:
         one = functools.partial(_blocks, **static)
         # Members exchange no data, so the check of replication is not needed, and constants may stay unsharded.
-        where = {"mesh": mesh, "in_specs": (Parts(over, everywhere),), "out_specs": over, "check_vma": False}
+        where = {"mesh": mesh, "in_specs": (Parts(by_member, replicated),), "out_specs": by_member, "check_vma": False}
         return jax.shard_map(one, **where)(parts)
 
     compiled = jax.jit if plain else one_kernel
-    kernel = compiled(spread, static_argnames=STATIC)
+    kernel = compiled(sharded, static_argnames=STATIC)
 
     def placed(parts: Parts, **static: object) -> object:
-        moving = jax.device_put(parts.moving, NamedSharding(mesh, over))
-        return kernel(Parts(moving, jax.device_put(parts.shared, NamedSharding(mesh, everywhere))), **static)
+        moving = jax.device_put(parts.moving, NamedSharding(mesh, by_member))
+        return kernel(Parts(moving, jax.device_put(parts.shared, NamedSharding(mesh, replicated))), **static)
 
     return placed

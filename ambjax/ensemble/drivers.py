@@ -1,10 +1,8 @@
 """Sensitivity of a metric: the share of its variation that each spread quantity explains.
 
-The share is Sobol's first-order index Var(E[y | x])/Var(y) of the metric's ranks: whatever the shape, a V as well as a
-line, and neither a few lost rotors nor times that are never reached (+inf) decide alone. E[y | x] is the least-squares
-fit of cosines of x's rank, as in Plischke's EASI (Reliab. Eng. Syst. Saf. 95, 2010, 354-360), freed of its bias as in
-Tissot and Prieur (Reliab. Eng. Syst. Saf. 107, 2012, 205-213). The sign of the trend is that of
-Spearman's rank correlation.
+The share is Sobol's first-order index Var(E[y | x])/Var(y), where y is the rank of the metric. The relation may have
+any shape, a V as well as a line. Ranks limit the influence of a few lost rotors and of times that are never reached
+(+inf).
 
 E[y | x] is a least-squares fit of cosines of the rank of x, as in Plischke's EASI (Reliab. Eng. Syst. Saf. 95, 2010,
 354-360). Its bias is removed as in Tissot and Prieur (Reliab. Eng. Syst. Saf. 107, 2012, 205-213). Spearman's rank
@@ -75,7 +73,7 @@ def drivers(
     1 - confidence for all tests of a metric together (Bonferroni's correction).
     """
     if not spread:
-        return {name: [] for name in metrics}, {name: _account(0.0, None, "nothing is spread") for name in metrics}
+        return {name: [] for name in metrics}, {name: _account(0.0, None, "the case has no spread") for name in metrics}
     x, ranks = list(spread.values()), list(_standard_ranks(list(metrics.values())))
     parts, rho, paths = shares(x, ranks, confidence), _correlation(_standard_ranks(x), np.stack(ranks)), list(spread)
     pairs = _pairs(dict(spread), ranks, confidence)
@@ -101,17 +99,17 @@ def _words(ranks: np.ndarray, alone: float, pair: dict[str, Any] | None, unknown
     if np.ptp(ranks) == 0:
         return "it is the same for all members"
     if unknown:
-        return "too few members differ to identify its drivers"
+        return "too few members differ to identify its causes"
     if not alone and pair is None:
-        return "no spread quantity or pair explains it: noise"
+        return "no quantity and no pair of quantities explains it; it is noise"
     together = ""
     if pair is not None:  # the sum of the estimates may exceed 1
         more = 100 * min(pair["share"], 1.0 - alone)
         amount = f"{more:.0f} % more" if more >= 1 else "a little more"
-        together = f", and {' with '.join(pair['paths'])} together {amount}"
+        together = f", {' with '.join(pair['paths'])} together {amount}"
     left = alone + (0.0 if pair is None else pair["share"]) < 0.995
-    rest = "; the rest is noise, or more than two quantities together" * left
-    return f"what is spread explains {100 * alone:.0f} % of how members rank, each quantity alone{together}{rest}"
+    rest = "; the rest is noise or an effect of three or more quantities" * left
+    return f"single quantities explain {100 * alone:.0f} % of the variation of its rank{together}{rest}"
 
 
 def _pairs(

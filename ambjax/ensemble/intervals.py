@@ -5,13 +5,13 @@
   for every distribution of the values. An end is infinite if the ensemble is too small (David and Nagaraja, Order
   Statistics, section 7.1).
 - Mean, standard deviation, CVaR: the studentised bootstrap (Efron and Tibshirani, An Introduction to the Bootstrap,
-  section 12.5), which divides the deviation of each resample by its own standard error. The simpler percentile
-  intervals do not, and are too short on the far side of a heavy tail.
+  section 12.5), which divides the deviation of each resample by the standard error of that resample. The simpler
+  percentile intervals omit this division, and end too low if the values have a heavy upper tail.
 
-The cost of the bootstrap is bounded for any N. The sorted values are divided into groups. The width of a group is about
-1/512 of its rank, counted from the nearer end: single values up to N = 2,048, and about 1,024 (2 + log(N/2,048)) groups
-beyond. The counts of a resample in the groups are multinomial, one draw serves all columns, and sums over a resample
-are matrix products.
+The cost of the bootstrap grows only with log N. The sorted values are divided into groups. The width of a group is
+about 1/512 of its rank, counted from the nearer end: each value is a group of its own up to N = 2,048, and there are
+about 1,024 (2 + log(N/2,048)) groups for larger N. The numbers of values of a resample in the groups are multinomial.
+The same draw is used for all columns, and sums over a resample are matrix products.
 """
 
 import math
@@ -59,8 +59,9 @@ def wilson(successes: Any, n: Any, confidence: float = 0.95) -> Estimate:
 def quantile(values: np.ndarray, q: object, confidence: float = 0.95) -> Estimate:
     """Compute the q-quantile of values [N], the value of rank ceil(q N), with its interval. q: a number or an array.
 
-    The number of values below the true quantile is binomial with N trials of probability q, which gives the ranks of
-    the two ends. An end is -inf or +inf if no rank is low or high enough. Values of +inf are allowed.
+    The number of values below the true quantile is binomial with N trials of probability q. Its quantiles are the
+    ranks of the two ends. An end is -inf or +inf if N is too small. Values of +inf are allowed. Raises ValueError as
+    `column_of` does.
     """
     from scipy.stats import binom
 
@@ -68,9 +69,9 @@ def quantile(values: np.ndarray, q: object, confidence: float = 0.95) -> Estimat
     n, tail = len(x), (1 - confidence) / 2
     # A product such as 0.1 * 30 may round to just above an integer.
     rank = np.clip(np.ceil(np.asarray(q) * n - 1e-9 * n), 1, n).astype(int)
-    fenced = np.concatenate([[-np.inf], x, [np.inf]])
+    padded = np.concatenate([[-np.inf], x, [np.inf]])
     low, high = binom.ppf(tail, n, q), binom.ppf(1 - tail, n, q) + 1
-    return Estimate(fenced[rank], fenced[low.astype(int)], fenced[high.astype(int)])
+    return Estimate(padded[rank], padded[low.astype(int)], padded[high.astype(int)])
 
 
 def cvar(values: np.ndarray, alpha: float = 0.95, confidence: float = 0.95, seed: int = 0) -> Estimate:
@@ -105,7 +106,7 @@ def bootstrap(
         raise ValueError(f"alpha = {alpha:g}: it must be at least 0 and below 1.")
     n = len(columns[0])
     edges, tail = _group_edges(n), (1 - alpha) * n
-    sizes, powers, places = np.diff(edges), [], []
+    sizes, powers, columnwise = np.diff(edges), [], []
     for column in columns:
         x = np.sort(column_of(column))
         if not np.isfinite(x[[0, -1]]).all():
@@ -115,20 +116,22 @@ def bootstrap(
         y = (x - centre) / scale
         powers.append([np.add.reduceat(y**k, edges[:-1]) / sizes for k in (1, 2, 3, 4)])
         worst = _tail_counts(np.ones((1, n)), tail)[0] @ x / tail
-        places.append((centre, scale, x.std(ddof=min(n - 1, 1)), worst, x[-1]))
+        columnwise.append((centre, scale, x.std(ddof=min(n - 1, 1)), worst, x[-1]))
     G = np.moveaxis(np.array(powers), 0, -1)
     batches = [_moments(counts, G, n, tail) for counts in _resamples(n, sizes, seed)]
     resamples = {kind: [np.concatenate([batch[kind][k] for batch in batches]) for k in (0, 1)] for kind in STATISTICS}
     whole = _moments(sizes[None].astype(float), G, n, tail)
-    centre, scale, std, worst, largest = np.array(places).T
+    centre, scale, std, worst, largest = np.array(columnwise).T
     ends = {kind: _studentised_ends(whole[kind], resamples[kind], confidence) for kind in STATISTICS}
     nothing = np.full(len(std), -np.inf), np.full(len(std), np.inf)
     ends |= {kind: nothing for kind in STATISTICS if n < 3 or (kind == "cvar" and tail <= 1)}  # no standard error
     unbiased = (n / max(n - 1, 1)) ** 0.5
     low, high = (scale * end + centre for end in ends["cvar"])
+    with np.errstate(over="ignore"):  # with few members the upper end may exceed every number: it is inf
+        stds = [scale * unbiased * np.exp(end) for end in ends["std"]]
     return {
         "mean": Estimate(centre, *(scale * end + centre for end in ends["mean"])),
-        "std": Estimate(std, *(scale * unbiased * np.exp(end) for end in ends["std"])),
+        "std": Estimate(std, *stds),
         "cvar": Estimate(worst, low, _bounded(high, largest, scale, tail)),
     }
 
@@ -200,7 +203,10 @@ def _resamples(n: int, sizes: np.ndarray, seed: int) -> Iterator[np.ndarray]:
 
 
 def _tail_counts(counts: np.ndarray, tail: float) -> np.ndarray:
-    """Return the part of each count that belongs to the largest `tail` values. Groups are in ascending order."""
+    """Return the part of each count that belongs to the largest `tail` values.
+
+    `counts` [replicates, groups]: numbers of values in groups of ascending value.
+    """
     above = np.cumsum(counts[:, ::-1], axis=1)[:, ::-1] - counts
     return np.clip(tail - above, 0.0, counts)
 

@@ -11,7 +11,7 @@ from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.distributions import Choice, Distribution, Uniform
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.paths import places
-from ambjax.ensemble.spread import STEP, Spread, SpreadError, apply, check_spread, corners, ends, no_such_number
+from ambjax.ensemble.spread import STEP_PATHS, Spread, SpreadError, apply, check_spread, corners, ends, no_such_number
 from ambjax.ensemble.study import Study
 from ambjax.simulation.method import choose_method
 from ambjax.simulation.metrics import standard_for
@@ -127,7 +127,7 @@ def stepped(study: Study, x: Axis, y: Axis) -> Study:
     period = axes.pop(PERIOD, (clock.sample_period,))[-1]
     others = [entry for entry in study.spread.entries if entry[0] not in axes]
     wide = Spread((*others, *((path, Uniform(*reach)) for path, reach in axes.items())))
-    method = choose_method(*ends(wide, cascade, scenario, STEP), float(period))
+    method = choose_method(*ends(wide, cascade, scenario, STEP_PATHS), float(period))
     return dataclasses.replace(study, clock=dataclasses.replace(clock, method=method))
 
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ambjax.control.cascade import Cascade
+from ambjax.control.schedule import Schedule
 from ambjax.host.imports import digest_of
 from ambjax.numerics.records import is_traced, leaf
 from ambjax.world.scenario import Scenario
@@ -32,9 +33,11 @@ class Place(NamedTuple):
 def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     """Return every number of the cascade and the scenario, by dotted path.
 
-    The paths plant.* refer to the true plant, and controller.model.* to the nominal one. The scaled force is
-    disturbance.q_z.* if it is the only disturbance of z, as in a case file; with both disturbances it is
-    disturbance.q_v.*. The path *.shift moves start and stop of a signal together in time; its value is 0.
+    The paths plant.* refer to the true plant, and controller.model.* to the nominal one. A disturbance of z is
+    disturbance.q_z.* if all disturbances of z have the same unit. Otherwise those in m/s^2 are disturbance.q_z.*,
+    scaled forces are disturbance.q_v.*, and forces are disturbance.q_f.*. The path *.shift moves start and stop of a
+    signal together in time; its value is 0. The values of a schedule have the number of the knot as the last part of
+    the path, from 0.
     """
     table: dict[str, Place] = {}
     for stage in ("model", "observer", "position", "inversion", "current"):
@@ -47,19 +50,22 @@ def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
         "sensor": "sensor",
         "actuator": "amplifier",
     }
-    names |= {"initial": "initial", "disturbance.q_z": "q_z"}
-    if not _absent(scenario.q_v):
-        names["disturbance.q_z" if _absent(scenario.q_z) else "disturbance.q_v"] = "q_v"
+    names |= {"initial": "initial", "disturbance.base": "base"}
+    acting = [slot for slot in ("q_z", "q_v", "q_f") if not _absent(getattr(scenario, slot))] or ["q_z"]
+    names |= {f"disturbance.{slot if len(acting) > 1 else 'q_z'}": slot for slot in acting}
     for path, name in names.items():
         table |= _below(getattr(scenario, name), path, (1, name))
     fields = {field.name: field for field in dataclasses.fields(scenario)}
     for path, name in (("actuator.u_max", "u_max"), ("run.clearance", "clearance")):
         table[path] = Place((1, name), fields[name], getattr(scenario, name))
+    for path, place in _below(scenario.stop, "run.stop", (1, "stop")):
+        table[path.replace("stop.", "stop_")] = place
     return table
 
 
 def _absent(signal: object) -> bool:
-    return isinstance(signal, Constant) and not is_traced(signal.value) and not np.any(signal.value)
+    """Return whether there is no such disturbance: None, or a constant 0."""
+    return signal is None or (isinstance(signal, Constant) and not is_traced(signal.value) and not np.any(signal.value))
 
 
 def _below(node: object, path: str, route: tuple[int | str, ...]) -> Iterator[tuple[str, Place]]:
@@ -71,7 +77,10 @@ def _below(node: object, path: str, route: tuple[int | str, ...]) -> Iterator[tu
         return
     for field in dataclasses.fields(node):
         value, at = getattr(node, field.name), (f"{path}.{field.name}", (*route, field.name))
-        if field.metadata.get("leaf"):
+        if isinstance(value, Schedule):
+            for knot, x in enumerate(value.values):
+                yield f"{at[0]}.{knot}", Place((*at[1], "values", knot), field, x)
+        elif field.metadata.get("leaf"):
             yield at[0], Place(at[1], field, value)
         else:
             yield from _below(value, *at)
@@ -96,10 +105,11 @@ def kinds(node: object, path: str = "") -> Iterator[tuple[str, str]]:
         yield f"{path}source", digest
     for field in dataclasses.fields(node):
         value, at = getattr(node, field.name), f"{path}{field.name}"
-        if field.metadata.get("static"):  # an object without a name is represented by its type
-            named = isinstance(value, (str, int, float, bool, type(None)))
-            yield at, str(value) if named else getattr(value, "__qualname__", type(value).__name__)
-        elif not field.metadata.get("leaf"):
+        if field.metadata.get("static"):  # samples by their digest, other objects by their type
+            named = isinstance(value, (str, int, float, bool, tuple, type(None)))
+            other = getattr(value, "digest", None) or getattr(value, "__qualname__", type(value).__name__)
+            yield at, str(value) if named else other
+        elif isinstance(value, Schedule) or not field.metadata.get("leaf"):
             yield from kinds(value, f"{at}.")
 
 

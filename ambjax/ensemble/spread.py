@@ -1,11 +1,11 @@
 """Spreads: which numbers of a case vary between the members of an ensemble, and their distributions.
 
-Every spread has bounds. A spread whose bounds exceed the allowed range of its number raises ValueError; it is never
-truncated. Examples are a negative mass, a pulse that ends before it starts, and a rotor outside its clearance.
+Every distribution has bounds. If they exceed the allowed range of the number, a ValueError is raised; a distribution is
+never truncated. Examples of refused spreads: those that allow a negative mass, a pulse that ends before it starts, or a
+rotor that starts outside its clearance.
 """
 
 import dataclasses
-import difflib
 import math
 from collections.abc import Iterable, Mapping
 
@@ -15,12 +15,13 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.design import DESIGNS, points
 from ambjax.ensemble.distributions import Choice, Distribution, Percent
 from ambjax.ensemble.paths import Place, order_pairs, places, with_values
+from ambjax.host.synonyms import hint_of_path
 from ambjax.numerics.records import numbers, within
-from ambjax.world.scenario import Scenario
+from ambjax.world.scenario import POLE, Scenario
 
 # Prefixes of the paths whose values affect the choice of the integration step. A disturbance is among them because
 # steps end at its edges. Sensors, and amplifiers apart from their bandwidth, are solved exactly.
-STEP = ("plant.", "controller.", "actuator.bandwidth", "run.clearance", "disturbance.")
+STEP_PATHS = ("plant.", "controller.", "actuator.bandwidth", "run.clearance", "run.stop", "disturbance.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,11 +74,14 @@ def corners(spread: Spread, cascade: Cascade, scenario: Scenario) -> tuple[Casca
     then holds for every member. Raises ValueError as `check_spread` does.
     """
     check_spread(spread, cascade, scenario)
-    return ends(spread, cascade, scenario, STEP)
+    return ends(spread, cascade, scenario, STEP_PATHS)
 
 
 def ends(spread: Spread, cascade: Cascade, scenario: Scenario, under: tuple[str, ...]) -> tuple[Cascade, Scenario]:
-    """Replace each spread number whose path has a prefix in `under` by its two ends, each on a separate axis."""
+    """Return the cascade and scenario with the two ends of each spread number whose path begins with one of `under`.
+
+    Each such number is an array with its own axis of length 2, so that together they give all combinations.
+    """
     known = places(cascade, scenario)
     supports = [(p, d.support(_nominal(known[p]))) for p, d in spread.entries if p.startswith(under)]
     shape = [1] * len(supports)
@@ -98,9 +102,10 @@ class SpreadError(ValueError):
 
 
 def check_spread(spread: Spread, cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
-    """Return the places of all paths, or raise ValueError if the spread is not valid for this cascade and scenario.
+    """Return all numbers of this cascade and scenario by dotted path.
 
-    The message is one line with the path, the value, the allowed range and the fix.
+    Raises ValueError, one line, if the spread is not valid for them: the path, the value, the allowed range and the
+    fix.
     """
     if spread.design not in DESIGNS:
         raise ValueError(f"spread.design = {spread.design!r}: it must be one of {', '.join(map(repr, DESIGNS))}.")
@@ -128,8 +133,7 @@ def require_path(path: str, known: Iterable[str], value: str = "") -> None:
 def no_such_number(path: str, known: Iterable[str], where: str = "in this case") -> str:
     """Return the message for a path that is not in `known`; it lists similar paths. `where`: scope of `known`."""
     known = list(known)
-    close = difflib.get_close_matches(path, known, n=1)
-    hint = f" Did you mean '{close[0]}'?" if close else ""
+    hint = hint_of_path(path, known)
     if path.split(".")[0] == "sensor":
         hint = " This case has no sensor noise; add the table [sensor], with std = 0.0 for example."
     stems = [path.rsplit(".", n)[0] for n in range(path.count(".") + 1)]
@@ -167,7 +171,10 @@ def _check_one(path: str, kind: Distribution, place: Place) -> None:
 def _check_together(
     kinds: dict[str, Distribution], known: dict[str, Place], cascade: Cascade, scenario: Scenario
 ) -> None:
-    """Check conditions between two numbers: start before stop, and the rotor inside its clearance."""
+    """Check conditions between two numbers: start before stop, and the rotor inside its clearance.
+
+    Raises SpreadError with the path of the number that is spread.
+    """
 
     def reach(path: str) -> tuple[float, float]:
         nominal = _nominal(known[path])
@@ -181,16 +188,17 @@ def _check_together(
     for low, high in order_pairs(cascade, scenario):
         if not reach(low)[1] < reach(high)[0]:
             move = f", or use {low.rpartition('.')[0]}.shift, which moves both" if low.endswith(".start") else ""
-            overlap = f"{low} reaches {reach(low)[1]:g} and {high} comes down to {reach(high)[0]:g}"
+            overlap = f"{low} reaches {reach(low)[1]:g} and {high} can be as small as {reach(high)[0]:g}"
             refuse((low, high), f"{overlap}, but the first must stay below the second. Narrow the range{move}.")
-    gap, own = "plant.s_0", known["run.clearance"].value is not None or "run.clearance" in kinds
-    stops = reach("run.clearance") if own else tuple(0.9 * x for x in reach(gap))
-    if not stops[1] < reach(gap)[0] and own:
+    gap, explicit = "plant.s_0", known["run.clearance"].value is not None or "run.clearance" in kinds
+    stops = reach("run.clearance") if explicit else tuple(0.9 * x for x in reach(gap))
+    if not stops[1] < reach(gap)[0] and explicit:
         refuse(
             ("run.clearance", gap),
             f"run.clearance reaches {stops[1]:g} m, but must stay below plant.s_0. Narrow the range.",
         )
     far = max(map(abs, reach("initial.z")))
-    if not far < stops[0]:
-        text = f"|initial.z| reaches {far:g} m, but must stay below the clearance, {stops[0]:g} m. Narrow the range."
+    what, limit = ("the clearance", stops[0]) if scenario.stop is None else ("the pole", POLE * reach(gap)[0])
+    if not far < limit:
+        text = f"|initial.z| reaches {far:g} m, but must stay below {what}, {limit:g} m. Narrow the range."
         refuse(("initial.z", "run.clearance", gap), text)

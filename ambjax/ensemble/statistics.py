@@ -9,7 +9,7 @@ import numpy as np
 from ambjax.ensemble.drivers import drivers
 from ambjax.ensemble.intervals import STATISTICS, TAIL, Estimate, bootstrap, column_of, quantile, wilson
 
-# Level of the CVaR: the share of members that it excludes.
+# Level of the CVaR, which is the mean of the largest share 1 - ALPHA.
 ALPHA = 0.95
 # HEAVY: kurtosis above which a tail counts as heavy. An exponential distribution has 9, a normal one 3.
 # COVERED: coverage, in per cent, of the 95 % interval of the standard deviation of a lognormal distribution, by number
@@ -20,7 +20,7 @@ DECIDING = "settled_max_abs_error_m"
 # Members that a summary's metrics and drivers describe.
 DESCRIBED = "survivors"
 # Columns that are not metrics.
-FATE = ("index", "lost_at", "lost", "stalled", "lost_at_s")
+STATUS_COLUMNS = ("index", "lost_at", "lost", "stalled", "lost_at_s")
 SPREAD = "spread."
 
 
@@ -33,7 +33,7 @@ def summary(
     deciding: str = DECIDING,
     worst: int = 10,
 ) -> dict[str, Any]:
-    """Compute the statistics of an ensemble, in a form that JSON can hold: no arrays; None if infinite or unknown.
+    """Compute the statistics of an ensemble, as a dict that JSON can hold: no arrays; None if infinite or unknown.
 
     - `columns`: the columns of members.npz, arrays [N]: index, lost_at (s; +inf if the run reached its end), stalled,
       the metrics, and "spread." + path for each path in `spread_names`.
@@ -43,9 +43,9 @@ def summary(
     - `worst`: length of that list.
 
     A member survives, is lost, or is stalled (its integration stopped early, so that its status is not known). Metrics
-    and their drivers are computed from the survivors (`metrics_of`), because a lost rotor is frozen, and its voltage,
-    current and chatter are 0 from then on. Lost and stalled members count in `survival`, in the drivers of lost_at_s
-    and in `worst`.
+    and their drivers (the spread numbers that explain them) are computed from the survivors (`metrics_of`), because a
+    lost rotor is frozen: its voltage, current and chatter are 0 from then on. Lost and stalled members count in
+    `survival`, in the drivers of lost_at_s and in `worst`.
 
     A metric that is infinite for some survivors (a time never reached) has quantiles, but no mean, standard deviation
     or CVaR; `finite` counts its finite values. Without survivors every statistic is None. `drivers` and `explained` are
@@ -55,7 +55,7 @@ def summary(
     Raises ValueError if there is no column `deciding`, or if a column is not one number for each member.
     """
     lost_at = column_of(columns["lost_at"])
-    metrics = {k: column_of(v) for k, v in columns.items() if k not in FATE and not k.startswith(SPREAD)}
+    metrics = {k: column_of(v) for k, v in columns.items() if k not in STATUS_COLUMNS and not k.startswith(SPREAD)}
     if deciding not in metrics:
         raise ValueError(f"there is no metric {deciding} to rank members by.")
     ended = np.isfinite(lost_at)
@@ -70,7 +70,7 @@ def summary(
         "survivors": survivors,
         "lost": int(np.sum(ended & ~stalled)),
         "stalled": int(np.sum(stalled)),
-        "survival": _plain(wilson(survivors, len(lost_at), confidence)),
+        "survival": _as_dict(wilson(survivors, len(lost_at), confidence)),
         "confidence": confidence,
         "seed": int(seed),
         "notes": _notes(survivors, held, confidence),
@@ -98,27 +98,27 @@ def _drivers(
 
 
 def _notes(n: int, metrics: Mapping[str, np.ndarray], confidence: float) -> list[str]:
-    """Return a note for each interval that n survivors do not support: of a CVaR, and of a heavy-tailed deviation."""
+    """Return notes on the intervals for which n survivors are too few: of a CVaR, and of a heavy-tailed deviation."""
     if not n:
         return ["no member survives: there are no statistics of the metrics"]
     notes, level, tail = [], f"{100 * confidence:g} %", (1 - ALPHA) * n
     if tail < TAIL:
         least = math.ceil(TAIL / (1 - ALPHA) - 1e-9)
         notes.append(
-            f"the mean of the worst 5 % is that of {tail:.3g} survivors: its {level} interval may cover less, or have "
-            f"no upper end; at least {least} survivors are needed"
+            f"the worst 5 % are {tail:.3g} survivors: the {level} interval of their mean may have a lower coverage or "
+            f"no upper end; use at least {least} survivors"
         )
     heavy = [name for name, x in metrics.items() if np.isfinite(x).all() and _kurtosis(x) > HEAVY]
     if heavy:
         which = ", ".join(heavy[:3]) + f" and {len(heavy) - 3} more" * (len(heavy) > 3)
         at = max((k for k in COVERED if k <= n), default=min(COVERED))
-        covered = f"{COVERED[at]} % instead of 95 % for a lognormal of {at:,} members"
-        notes.append(f"heavy tails ({which}): the {level} interval of a standard deviation may cover less, {covered}")
+        covered = f"a 95 % interval covers {COVERED[at]} % for lognormal values of {at:,} members"
+        notes.append(f"heavy tails ({which}): the interval of a standard deviation is too short; {covered}")
     return notes
 
 
 def _kurtosis(x: np.ndarray) -> float:
-    """Return the fourth central moment over the squared second; 0 if all values are equal."""
+    """Return the kurtosis of x [N], m_4/m_2^2 with the central moments m_k; 0 if all values are equal."""
     size = np.abs(x - x.mean()).max()
     if size <= 1e-14 * np.abs(x).max():
         return 0.0
@@ -127,10 +127,11 @@ def _kurtosis(x: np.ndarray) -> float:
 
 
 def _number(x: float | np.ndarray) -> float | None:
+    """Return x, or None if it is infinite or NaN."""
     return float(x) if np.isfinite(x) else None
 
 
-def _plain(estimate: Estimate) -> dict[str, float | None]:
+def _as_dict(estimate: Estimate) -> dict[str, float | None]:
     return {"estimate": _number(estimate.value), "low": _number(estimate.low), "high": _number(estimate.high)}
 
 
@@ -148,7 +149,7 @@ def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) ->
         some = quantile(x, [0.05, 0.5, 0.95], confidence) if x.size else Estimate(*np.full((3, 3), np.inf))
         q05, median, q95 = (Estimate(*row) for row in zip(*some, strict=True))
         estimates = {"mean": mean, "std": std, "median": median, "q05": q05, "q95": q95, "cvar_95": worst}
-        out[name] = {k: _plain(v) for k, v in estimates.items()}
+        out[name] = {k: _as_dict(v) for k, v in estimates.items()}
         out[name] |= {"max": _number(x.max(initial=-np.inf)), "finite": int(np.isfinite(x).sum())}
     return out
 
@@ -156,7 +157,7 @@ def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) ->
 def _worst(
     index: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray, name: str, values: np.ndarray, count: int
 ) -> list[dict[str, object]]:
-    """Return the `count` worst members: ended ones by time, then survivors by `values` in descending order."""
+    """Return the `count` worst members: lost and stalled ones by time, then survivors by `values`, largest first."""
 
     def status(k: int) -> str:
         return "survives" if np.isinf(lost_at[k]) else "stalled" if stalled[k] else "lost"

@@ -1,8 +1,9 @@
 """Storage of a study's results. Studies are resumable.
 
-Each finished chunk is written atomically to a file with a checksum. A run that is killed loses only the chunks that are
-being computed. Damaged chunks are found and computed again. At the end all chunks are merged into members.npz, which is
-byte for byte the same after an interruption. The chunks are removed only after members.npz has been read back.
+Each finished chunk is written atomically to a file with a checksum. A run that is killed loses only the chunks in
+progress. Damaged chunks are found and computed again. At the end all chunks are merged into members.npz. The file of a
+resumed study is the same, byte for byte, as that of an uninterrupted one. The chunks are removed after members.npz has
+been read back.
 """
 
 import collections
@@ -31,7 +32,8 @@ class Store:
     """A directory that holds a study of `members` members in chunks of `chunk` members.
 
     - `facts`: the fingerprint of the study, recorded in the manifest.
-    - `chunk`: None uses the size that the directory has recorded; it is 0 until `cut` sets it.
+    - `chunk`: members per chunk. None: the size recorded in the directory; without a record, the attribute `chunk` is 0
+      until `cut` sets it.
     """
 
     def __init__(self, directory: pathlib.Path, facts: dict[str, object], members: int, chunk: int | None) -> None:
@@ -41,7 +43,7 @@ class Store:
         self.chunks, self.manifest, self.path = directory / "chunks", directory / MANIFEST, directory / RESULT
 
     def check(self, columns: int, resume: bool) -> None:
-        """Check that the directory is free, or holds a part of this study. Does not change the directory.
+        """Check that the directory is unused, or holds a part of this study. The directory is not changed.
 
         Raises ValueError if the directory holds another study, if it holds a study and `resume` is False, if it holds
         none and `resume` is True, or if the disk has no room for `columns` numbers per member.
@@ -95,8 +97,8 @@ class Store:
         for span, kinds in layouts.items():
             if kinds != usual[0][0]:
                 remarks.append(
-                    f"{parts.path(span)}: its columns are not those of the others; members {span[0]} to {span[1] - 1} "
-                    "are computed again"
+                    f"{parts.path(span)}: its columns differ from those of the other chunks; members {span[0]} to "
+                    f"{span[1] - 1} are computed again"
                 )
                 missing.append(span)
         return Survey(sorted(missing), remarks)
@@ -157,7 +159,7 @@ class Store:
         write_whole(self.manifest, lambda file: file.write(text))
 
     def _compare(self) -> None:
-        """Read the manifest, and raise ValueError if it is damaged or of another study."""
+        """Read the manifest. Raises ValueError if it is damaged or if it belongs to another study."""
         try:
             record = dict(json.loads(self.manifest.read_text(encoding="utf-8")))
             if record.pop(CHECKSUM, None) != checksum_of(record):

@@ -1,4 +1,4 @@
-"""A study: one case, its spread, a seed and a number of members. Any part of a study can run on any machine."""
+"""A study: a case, its spread, a seed and a number of members. Its members can run in any order, on any machine."""
 
 import dataclasses
 import math
@@ -20,9 +20,9 @@ from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.scenario import Scenario
 
 SPREAD = "spread."
-# Largest number of columns of members.npz besides the spread quantities, to estimate the disk space of a study.
+# Upper bound on the columns of members.npz other than the spread numbers, to estimate the disk space of a study.
 COLUMNS = 28
-# Number of equal parts of a run; the variation of the voltage is one number for each part.
+# Number of equal parts of a run in each of which the variation of the voltage is computed.
 WINDOWS = 25
 # Signals of a fan chart, and the corresponding fields of a Row.
 SHOWN = {"z - r": "e_z", "u": "u_mean", "sigma": "sigma"}
@@ -50,8 +50,10 @@ class Bands(NamedTuple):
 class Study:
     """The definition of an ensemble. Member k depends on (seed, k) and, in a Latin hypercube, on `members`.
 
-    `clock.method` must be valid for every member. The method of a case file is, because it is chosen for the extremes
-    of the spread.
+    - `clock`: its method must be valid for every member. `cases.reader` chooses it for the extremes of the spread.
+    - `settle`: time from which "settled" metrics count, s.
+    - `seed`: seed of the spread and of the noise.
+    - `members`: number of members.
     """
 
     cascade: Cascade
@@ -97,13 +99,13 @@ class Study:
         """Simulate members start <= k < stop and return their columns, each [stop - start], by name.
 
         The columns are index, lost_at (s), every metric, and spread.PATH for each spread quantity. `call` and `threads`
-        are those of `map_members`. With `lost` every rotor starts outside its clearance and is lost at once: such a run
-        compiles the same program, and takes little more time than that.
+        are those of `map_members`. With `lost`, every rotor starts outside its clearance and is lost at once. Such a
+        run compiles the program of the study at almost no further cost.
         """
         members = np.arange(start, stop)
         cascade, scenario = self.batch(members)
         if lost:
-            far = np.full(np.shape(scenario.initial.z), 2 * np.max(np.asarray(scenario.touchdown)))
+            far = np.full(np.shape(scenario.initial.z), 2 * np.max(np.asarray(scenario.limit)))
             scenario = dataclasses.replace(scenario, initial=dataclasses.replace(scenario.initial, z=far))
         fold = standard_for(self.settle, scenario)
         outcome = run_ensemble(cascade, scenario, self.clock, fold=fold, threads=threads, call=call)
@@ -141,7 +143,7 @@ class Study:
         return Bands(t, outcome.trajectory, signals | {"variation of u": rate[:, part]}, extremes)
 
     def fingerprint(self) -> dict[str, object]:
-        """Return everything that the results of a member depend on, by name, in JSON form."""
+        """Return everything that determines the results of the study, by name, as values that JSON can hold."""
         facts: dict[str, object] = {**provenance(), "members": self.members, "seed": self.seed}
         facts |= {**dict(kinds(self.cascade, "controller.")), **dict(kinds(self.scenario))}
         facts |= {path: str(place.value) for path, place in places(self.cascade, self.scenario).items()}
@@ -152,7 +154,7 @@ class Study:
 
 
 def _beside(blocks: np.ndarray, combine: Callable[[np.ndarray, np.ndarray], np.ndarray], instants: int) -> np.ndarray:
-    """Combine, at each instant, the values [count] of the blocks that end and begin there; NaN if neither is finite."""
+    """Combine the values [count] of the two blocks that meet at each instant; NaN if neither is finite."""
     values = np.where(np.isfinite(blocks), blocks, np.nan)
     padded = np.concatenate([[np.nan], values, [np.nan]])
     return combine(padded[:-1], padded[1:])[:instants]

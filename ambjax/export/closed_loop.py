@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.control.cascade import Command
+from ambjax.control.cascade_state import Command
 from ambjax.export.interface import BITS, OUTPUTS
 from ambjax.export.machine import Compiled
 from ambjax.export.twins import Horizon, LoopCase, farthest, horizons

@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.cascade import Cascade, CascadeState, Command
+from ambjax.control.cascade import Cascade
+from ambjax.control.cascade_state import CascadeState, Command
 from ambjax.control.guard import GAPS, Watch, guarded
+from ambjax.control.schedule import OVER, Schedule, finite
 from ambjax.export.interface import Status, StepInputs, StepOutputs
 from ambjax.numerics.records import Scalar, leaf, numbers, record
 from ambjax.simulation.integrate import choose
@@ -177,7 +179,7 @@ def _steepnesses(cascade: Cascade) -> list[Scalar]:
     laws: tuple[Any, ...] = cascade.laws
     fields = [(law, field) for law in laws for field in dataclasses.fields(law)]
     found = [getattr(law, field.name) for law, field in fields if field.metadata.get("steepness")]
-    return [p for p in found if p is not None]
+    return jax.tree.leaves(found)
 
 
 def _numbers(node: Any, path: str) -> Iterator[Number]:
@@ -185,7 +187,12 @@ def _numbers(node: Any, path: str) -> Iterator[Number]:
         value, name = getattr(node, field.name), f"{path}{field.name}"
         if field.metadata.get("static") or value is None:
             continue
-        if dataclasses.is_dataclass(value):
+        if isinstance(value, Schedule):
+            unit, signal = OVER[value.over]
+            for knot, (at, x) in enumerate(zip(value.at, value.values, strict=True)):
+                number = _number(f"{name}.knot_{knot}", finite(field), float(x))
+                yield number._replace(doc=f"{number.doc}; at {signal} = {at:g} {unit}")
+        elif dataclasses.is_dataclass(value):
             yield from _numbers(value, f"{name}.")
         elif jnp.shape(value) == ():
             yield _number(name, field, float(value))

@@ -6,7 +6,10 @@ from jax import Array
 
 
 class StepInputs(NamedTuple):
-    """Inputs of a step: the sensors, and the reference at the instant at which the step's voltage takes effect."""
+    """Inputs of a step: the readings, and the reference.
+
+    With prediction, the reference is that at the end of the delay, otherwise that at the instant of the readings.
+    """
 
     z: Array
     z_dot: Array
@@ -41,7 +44,7 @@ INPUTS = {
     "z": ("m", "rotor displacement, measured"),
     "z_dot": ("m/s", "rotor velocity, measured"),
     "i": ("A", "current deviation, measured"),
-    "r": ("m", "reference of z at the instant at which this step's voltage takes effect"),
+    "r": ("m", "reference of z, at the instant given at the top of this file"),
     "r_dot": ("m/s", "first derivative of r"),
     "r_ddot": ("m/s^2", "second derivative of r"),
     "r_dddot": ("m/s^3", "third derivative of r"),

@@ -1,4 +1,4 @@
-"""The C compiler of this machine, and a compiled controller as a Python object."""
+"""The C compiler of this machine, and the Python interface of a compiled controller."""
 
 import contextlib
 import ctypes
@@ -23,7 +23,7 @@ EXACT = "-ffp-contract=off"
 SANITIZED = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 SHARED = ["-shared", "-fPIC"]
 # Time limit of a compiled program, s.
-PATIENCE = 60
+TIME_LIMIT = 60
 
 
 def compiler() -> str:
@@ -38,7 +38,10 @@ def compiler() -> str:
 
 
 def build(sources: list[pathlib.Path], target: pathlib.Path, *flags: str) -> str:
-    """Compile `sources` to `target`. Return the compiler's error message, empty if there is none."""
+    """Compile `sources` to `target` with STRICT, EXACT and `flags`.
+
+    Returns the compiler's error message, empty if there is none. Raises ValueError if the compiler cannot be run.
+    """
     command = [compiler(), *STRICT, EXACT, *flags, *map(str, sources), "-o", str(target), "-lm"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
@@ -51,18 +54,21 @@ def build(sources: list[pathlib.Path], target: pathlib.Path, *flags: str) -> str
 
 
 def execute(program: pathlib.Path) -> tuple[int, str]:
-    """Run a compiled program. Return its exit code and its output. Raises ValueError if it does not run, or not end."""
+    """Run a compiled program, and return its exit code and its output.
+
+    Raises ValueError if the program cannot be run, or does not end within TIME_LIMIT.
+    """
     try:
         done = subprocess.run(
-            [program], capture_output=True, text=True, errors="replace", check=False, timeout=PATIENCE
+            [program], capture_output=True, text=True, errors="replace", check=False, timeout=TIME_LIMIT
         )
     except subprocess.TimeoutExpired:
         raise ValueError(
-            f"--verify: the program {program.name} did not end within {PATIENCE:g} s, so the check is not decided. Try "
-            "again when the machine is less busy, or omit --verify."
+            f"--verify: the program {program.name} did not end within {TIME_LIMIT:g} s, so the check is not decided. "
+            "Try again when the machine is less busy, or omit --verify."
         ) from None
     except OSError as error:
-        raise ValueError(_unused("run", program, error.strerror or str(error))) from None
+        raise ValueError(_unusable("run", program, error.strerror or str(error))) from None
     return done.returncode, done.stdout + done.stderr
 
 
@@ -71,10 +77,11 @@ def load(library: pathlib.Path) -> ctypes.CDLL:
     try:
         return ctypes.CDLL(str(library))
     except OSError as error:
-        raise ValueError(_unused("loaded", library, str(error).removeprefix(f"{library}: "))) from None
+        raise ValueError(_unusable("loaded", library, str(error).removeprefix(f"{library}: "))) from None
 
 
-def _unused(verb: str, what: pathlib.Path, why: str) -> str:
+def _unusable(verb: str, what: pathlib.Path, why: str) -> str:
+    """Return the error message for a compiled file that cannot be run or loaded."""
     return (
         f"--verify: the output of {compiler()} cannot be {verb} in {what.parent} ({why}). Set TMPDIR to a folder that "
         "allows it, set CC to a compiler for this machine, or omit --verify."
@@ -95,9 +102,9 @@ def scratch() -> Iterator[pathlib.Path]:
 
 
 def check() -> None:
-    """Check that this machine compiles and runs programs, plain and sanitized, and compiles and loads libraries.
+    """Check that this machine can compile and run programs, plain and sanitized, and compile and load libraries.
 
-    Raises ValueError if it does not: a failure of the machine must not count as a failure of the C.
+    Raises ValueError if it cannot: a failure of the machine must not count as a failure of the C.
     """
     with scratch() as folder:
         source = folder / "empty.c"
@@ -116,12 +123,13 @@ def check() -> None:
                 messages = "" if code == 0 else output.strip() or f"exit code {code}"
             if messages:
                 raise ValueError(
-                    f"--verify: {compiler()} makes no {what} that works ({short(messages)}). {fix}, or omit --verify."
+                    f"--verify: {compiler()} cannot make a {what} that works ({short(messages)}). {fix}, or omit "
+                    "--verify."
                 )
 
 
 def short(text: str) -> str:
-    """Return the first error in a compiler's output, or the library that it misses; else the last line of the text."""
+    """Return one line of a compiler's output: a missing library, else the first error, else the last line."""
     lines = [line for line in text.strip().splitlines() if line]
     found = [line[line.index("cannot find") :] for line in lines if "cannot find" in line]
     found += [line.partition("error:")[2].strip() for line in lines if "error:" in line]
@@ -129,7 +137,11 @@ def short(text: str) -> str:
 
 
 class Compiled:
-    """A controller in a shared library. `state` is its memory: the numbers, then whether it has started."""
+    """The Python interface of a controller in a shared library.
+
+    `library`: the compiled C of `trace`, whose names begin with `prefix`. `parameters`, `state`, `inputs` and `outputs`
+    are the arrays that the C reads and writes; `state` consists of "numbers" and the flag "started".
+    """
 
     def __init__(self, library: pathlib.Path, trace: Trace, prefix: str) -> None:
         self.trace, real = trace, np.dtype(PRECISIONS[trace.precision])
@@ -143,14 +155,14 @@ class Compiled:
         self.state = np.zeros((), self.memory)
         self.inputs, self.outputs = np.zeros(len(INPUTS), real), np.zeros(len(trace.outputs), real)
         self._at = [x.ctypes.data_as(ctypes.c_void_p) for x in (self.parameters, self.state, self.inputs, self.outputs)]
-        self._keeps: Any = loaded
+        self._library: Any = loaded
 
     def step(self) -> int:
         """Compute one sample from `inputs`, update `state` and `outputs`, and return the status bits."""
         return self._step(*self._at)
 
     def results(self, at: Points) -> Results:
-        """Return the results of one step from each of these points."""
+        """Return the results of one step from each point. The own parameters are restored afterwards."""
         count = at.started.size
         state, started = np.empty_like(at.state), np.empty(count, bool)
         outputs, bits = np.empty((len(self.outputs), count), at.state.dtype), np.empty(count, np.int64)

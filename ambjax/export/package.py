@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ambjax.control.schedule import schedules
 from ambjax.export.controller import Controller
 from ambjax.export.interface import INPUTS, OUTPUTS
 from ambjax.export.points import Points, points
@@ -141,7 +142,7 @@ def _readme(writer: Writer) -> str:
         flops=t.flops(),
         precision=t.precision,
         period=f"{t.controller.period:g}",
-        ulps="1e-5 relative" if t.precision == "float" else f"{ULPS} units in the last place",
+        ulps="a relative 1e-5" if t.precision == "float" else f"{ULPS} units in the last place",
     )
 
 
@@ -160,5 +161,6 @@ def _described(controller: Controller) -> Iterator[str]:
     for stage, law in zip(("observer", "position", "inversion", "current"), cascade.laws, strict=True):
         hard = [f.name for f in dataclasses.fields(law) if f.metadata.get("steepness") and getattr(law, f.name) is None]
         ends = "".join(f", {name} = inf (the sign itself)" for name in hard)
-        yield f"{stage}: {type(law).__name__}{ends}"
+        over = "".join(f", {name} as a function of the {one.over}" for name, one in schedules(law).items())
+        yield f"{stage}: {type(law).__name__}{ends}{over}"
     yield f"processor: {cascade.processor}"

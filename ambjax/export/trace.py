@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.base import memory_of
-from ambjax.control.cascade import CascadeState
+from ambjax.control.cascade_state import CascadeState
 from ambjax.export.controller import Controller, Memory, Number, Parameters, parameters_of
 from ambjax.export.emitter import traced
 from ambjax.export.interface import BITS, INPUTS, OUTPUTS, StepInputs
@@ -20,12 +20,12 @@ from ambjax.export.program import Operand, Program, Ref
 from ambjax.export.statements import PERIOD, PRECISIONS, word
 from ambjax.numerics.records import canonical
 
-# Text that replaces the allowed values of a number that the step does not use.
+# Text in place of the allowed values of a number that the step does not use.
 UNREAD = "not read"
 
 
 def precision(name: str) -> AbstractContextManager[object]:
-    """Return a context manager that sets JAX to single ("float") or double precision."""
+    """Return a context manager in which JAX computes in single ("float") or double ("double") precision."""
     import jax.experimental
 
     home: Any = jax if hasattr(jax, "enable_x64") else jax.experimental
@@ -33,7 +33,7 @@ def precision(name: str) -> AbstractContextManager[object]:
 
 
 def arguments(controller: Controller) -> tuple[Parameters, Memory, StepInputs, Array]:
-    """Return parameters, memory, inputs and period as JAX values in its present precision."""
+    """Return parameters, memory, inputs and period of `Controller.step` as JAX values in the current precision."""
     zero = jnp.zeros(())
     inputs = StepInputs(*[zero] * len(StepInputs._fields))
     return (*canonical((controller.parameters,)), controller.start(), inputs, jnp.asarray(controller.period))
@@ -41,10 +41,17 @@ def arguments(controller: Controller) -> tuple[Parameters, Memory, StepInputs, A
 
 @dataclasses.dataclass(frozen=True)
 class Trace:
-    """The step as a program. `state` pairs each number with its next value; `outputs` and `bits`, with their values.
+    """The step of a controller as a program of scalar operations.
 
-    `read`: names of the inputs that the step uses. `keep`: indices of the leaves of the memory that the C keeps.
-    `refs`: operands of the parameters, the memory, the inputs and the period.
+    - `controller`, `precision`: the controller, and "float" or "double".
+    - `program`: the operations.
+    - `parameters`, `inputs`: the parameters and the inputs of the step.
+    - `state`: pairs of a state and the operand of its next value.
+    - `started`: operand of the next value of the flag `started`.
+    - `outputs`, `bits`: pairs of an output, or the name of a status bit, and its operand.
+    - `read`: names of the inputs that the step uses.
+    - `keep`: indices of the leaves of the memory that the C keeps.
+    - `refs`: operands of the parameters, the memory, the inputs and the period.
     """
 
     controller: Controller
@@ -65,11 +72,14 @@ class Trace:
         return [x for _, x in [*self.state, *self.outputs, *self.bits]] + [self.started]
 
     def order(self) -> list[int]:
-        """Return the numbers of the nodes that are written, in order."""
+        """Return the numbers of the nodes that become lines of code, in order."""
         return sorted(n for n in self.program.needed(self.roots()) if self.program.nodes[n].op != "input")
 
     def counts(self) -> Counter:
-        """Return the number of operations of each kind in a step, without those that depend on the period alone."""
+        """Return the number of operations of each kind in a step.
+
+        Operations on the period and constants alone are not counted, because a compiler computes them in advance.
+        """
         nodes = self.program.nodes
         fixed = {n for n, node in enumerate(nodes) if node.text == PERIOD}
         found: Counter = Counter()
@@ -82,7 +92,7 @@ class Trace:
         return found
 
     def state_bytes(self) -> int:
-        """Return the size of the state struct in bytes: its numbers and the flag `started`, aligned."""
+        """Return the size of the C's struct of states in bytes, with the flag `started`, aligned."""
         size = np.dtype(PRECISIONS[self.precision]).itemsize
         return (len(self.state) + 1) * size
 
@@ -93,9 +103,9 @@ class Trace:
 
 
 def trace(controller: Controller, to: str) -> Trace:
-    """Trace the step of a controller in a precision, `float` or `double`.
+    """Trace the step of a controller. `to`: the precision, "float" or "double".
 
-    Raises ValueError for a law that scalar C cannot express.
+    Raises ValueError for a law that C with scalars cannot express.
     """
     with precision(to):
         first = _traced(controller, to, frozenset())
@@ -114,11 +124,13 @@ def _traced(controller: Controller, to: str, read: frozenset[str]) -> Trace:
     results = traced(program, lambda *x: step(*x, read), given, refs)
     for x in results:
         if program.dtype(x).kind == "f" and program.dtype(x) != real:
-            raise ValueError(f"the step returns {program.dtype(x).name}, but must return {real.name}.")
+            raise ValueError(
+                f"the step returns {program.dtype(x).name}, but must return {real.name}. Do not set a dtype in a law."
+            )
     after, started = results[: len(states)], results[len(states)]
     outputs, bits = results[len(states) + 1 : -len(BITS)], results[-len(BITS) :]
     at = refs[len(parameters) :]
-    keep = _alive(program, at[: len(states)], after, [*outputs, *bits, started])
+    keep = _used(program, at[: len(states)], after, [*outputs, *bits, started])
     roots = [*outputs, *bits, started, *(after[k] for k in keep)]
     seen = program.needed(roots)
     input_refs = at[len(states) + 1 : -1]
@@ -143,8 +155,11 @@ def _output(name: str) -> tuple[str, str, str]:
     return unit, "", doc
 
 
-def _alive(program: Program, before: list[Ref], after: list[Operand], roots: list[Operand]) -> list[int]:
-    """Return the indices of the states on which a result, or another kept state, depends."""
+def _used(program: Program, before: list[Ref], after: list[Operand], roots: list[Operand]) -> list[int]:
+    """Return the indices of the states on which a result (`roots`), or the next value of another such state, depends.
+
+    `before`, `after`: operands of each state and of its next value.
+    """
     keep: set[int] = set()
     while True:
         seen = program.needed([*roots, *(after[k] for k in keep)])
@@ -155,7 +170,7 @@ def _alive(program: Program, before: list[Ref], after: list[Operand], roots: lis
 
 
 def _states(controller: Controller) -> list[Number]:
-    """Return every real number of the memory, in the order of its leaves. Raises ValueError for an array."""
+    """Return every state in the order of the memory's leaves, without `started`. Raises ValueError for an array."""
     cascade, memory = controller.parameters.controller, controller.start()
     found = []
     for stage, law, state in zip(CascadeState._fields, cascade.laws, memory.laws, strict=True):
@@ -174,6 +189,6 @@ def _states(controller: Controller) -> list[Number]:
     found.append(Number("before.u", "V", "", "voltage of the sample before the last", 0.0))
     if memory.watch:
         names = {**{f"watch.{name}": (INPUTS[name][0], "predicted reading") for name in memory.watch.expected._fields}}
-        names["watch.left"] = ("samples", "number for which a reading may still be replaced")
+        names["watch.left"] = ("samples", "number of samples for which a reading may still be replaced")
         found += [Number(name, unit, "", doc, 0.0) for name, (unit, doc) in names.items()]
     return found

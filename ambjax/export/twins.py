@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.control.cascade import Cascade, Command
+from ambjax.control.cascade import Cascade
+from ambjax.control.cascade_state import Command
 from ambjax.control.guard import Watch
 from ambjax.export.statements import PRECISIONS
 from ambjax.numerics.records import Scalar, canonical, record

@@ -1,15 +1,16 @@
 """Linear analysis of the closed loop at an equilibrium: sensitivity, margins, stiffness, poles.
 
-`injected` measures the sensitivity in the nonlinear simulation instead.
-
     from ambjax.linear import analyse, linearise
 
     system = linearise(cascade, scenario, clock)
     system.sensitivity(np.array([100.0]))  # S at 100 Hz, complex
-    analyse(system).margins.phase_deg
+    analyse(system, scenario.plant.m, clock.sample_period).margins.phase_deg
 
-At sample n a number e_n is added to what the position sensor reports, after converter and filter. S is what the
-controller reads per e, T = S - 1 what the plant adds, and KS = u/e. In continuous time the same holds with e(t).
+A test signal e is added to the reading of the position sensor, after low-pass and converter: e_n at sample n, or e(t)
+in continuous time. S is the transfer function from e to the reading that the controller receives, T = S - 1 that from e
+to the sensor's own reading, and KS that from e to u.
+
+`injected` measures S, T and KS in the nonlinear simulation.
 """
 
 from ambjax.linear.analysis import Analysis, Zones, analyse, linearise, linearise_members, prepared

@@ -16,16 +16,16 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare
 from ambjax.world.scenario import Scenario
 
-# XLA spends most of its time on optimisations that a program which runs once does not repay.
+# The program runs once or a few times, so that most optimisations of XLA would cost more time than they save.
 _matrices = jax.jit(loop_matrices, compiler_options={"xla_backend_optimization_level": 0})
 
 
 @record
 class Zones:
-    """Frequency range of the sensitivity, and the limits of zones.
+    """Frequency range of the sensitivity, and limits of the zones A to D.
 
-    The defaults are those of ISO 14839-3 (peak of |S|) and ISO 14839-2 (largest |z| as a share of the clearance), as
-    secondary sources cite them.
+    The default limits are those of ISO 14839-3 (peak of |S|) and ISO 14839-2 (largest |z| as a share of the clearance),
+    as secondary sources cite them.
     """
 
     f_low: Scalar = leaf(default=1.0, unit="Hz", above=0, at_most=1e6, doc="lowest frequency; 0 is always included")
@@ -37,33 +37,41 @@ class Zones:
         optional=True,
         doc="highest frequency; none: 2 kHz, or 0.45 of the sample rate if that is lower",
     )
-    zone_a: Scalar = leaf(default=3.0, unit="1", at_least=1, at_most=1e3, doc="peak of |S| below which zone A holds")
+    zone_a: Scalar = leaf(
+        default=3.0, unit="1", at_least=1, at_most=1e3, doc="upper limit of zone A for the peak of |S|"
+    )
     zone_b: Scalar = leaf(default=4.0, unit="1", at_least=1, at_most=1e3, doc="likewise, zone B")
     zone_c: Scalar = leaf(default=5.0, unit="1", at_least=1, at_most=1e3, doc="likewise, zone C; above it: zone D")
-    clearance_a: Scalar = leaf(default=0.3, unit="1", above=0, at_most=1, doc="share of the clearance used, zone A")
+    clearance_a: Scalar = leaf(
+        default=0.3,
+        unit="1",
+        above=0,
+        at_most=1,
+        doc="limit of zone A for the largest |z|, as a share of the clearance",
+    )
     clearance_b: Scalar = leaf(default=0.4, unit="1", above=0, at_most=1, doc="likewise, zone B")
     clearance_c: Scalar = leaf(default=0.5, unit="1", above=0, at_most=1, doc="likewise, zone C; above it: zone D")
 
     def check(self, period: Scalar | None) -> None:
-        """Raise ValueError if the limits do not ascend, or as `range` does."""
+        """Raise ValueError if the limits are not in ascending order, and as `range` does. `period`: see `range`."""
         self.range(period)
         for names in (("zone_a", "zone_b", "zone_c"), ("clearance_a", "clearance_b", "clearance_c")):
             limits = [float(getattr(self, name)) for name in names]
             if sorted(limits) != limits:
-                raise ValueError(f"sensitivity.{names[0]} to {names[2]} = {limits}: they must ascend. Reorder them.")
+                raise ValueError(f"sensitivity.{names[0]} to {names[2]} = {limits}: they must be in ascending order.")
 
     def zone(self, peak: float) -> str:
         """Return the zone of a peak of |S|: A, B, C or D."""
         return _zone(peak, self.zone_a, self.zone_b, self.zone_c)
 
     def clearance_zone(self, share: float) -> str:
-        """Return the zone of the largest |z| as a share of the clearance: A, B, C or D."""
+        """Return the zone of a share of the clearance that |z| reaches: A, B, C or D."""
         return _zone(share, self.clearance_a, self.clearance_b, self.clearance_c)
 
     def range(self, period: Scalar | None) -> tuple[float, float]:
-        """Return lowest and highest frequency, Hz. `period`: sample period, s; None in continuous time.
+        """Return the lowest and the highest frequency, Hz. `period`: sample period, s; None in continuous time.
 
-        Raises ValueError if the range is empty, or reaches beyond half the sample rate.
+        Raises ValueError if the range is empty or exceeds half the sample rate.
         """
         high = self.f_high
         if high is None:
@@ -85,14 +93,14 @@ def _zone(x: float, a: Scalar, b: Scalar, c: Scalar) -> str:
 class Analysis(NamedTuple):
     """Linear analysis of a loop at one equilibrium.
 
-    - `stable`: whether all poles are stable; if not, the other numbers describe a loop that does not run.
+    - `stable`: whether all poles are stable. If not, the peaks and the stiffness have no physical meaning.
     - `S`, `T`, `KS`: peaks of |S|, |T| (1) and |KS| (V/m).
     - `zone`: zone of the peak of |S|; D if the loop is unstable.
-    - `S_velocity`: peak of |S| for numbers added to the velocity sensor; None if the velocity is not measured.
+    - `S_velocity`: peak of |S| for a test signal on the velocity reading; None if the velocity is not measured.
     - `margins`: see `Margins`; all are 0 if the loop is unstable.
     - `stiffness`: static stiffness, N/m; inf with integral action.
-    - `noise`: rms of z per rms of noise on the reading of z, one draw a sample; inf if the loop is unstable.
-    - `poles`: poles in 1/s, the slowest first.
+    - `noise`: rms of z per rms of white noise on the reading of z, one value per sample; inf if the loop is unstable.
+    - `poles`: poles in 1/s, in the order of decreasing real part.
     """
 
     stable: bool
@@ -110,27 +118,27 @@ class Analysis(NamedTuple):
 def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.0) -> StateSpace:
     """Linearise the loop at the equilibrium of the constant reference r (m).
 
-    Noise, disturbances, converters, faults and limits are left out; gain, offset and bandwidth of the sensor and the
-    bandwidth of the amplifier stay. On a processor the result is the exact map of one sample period. Returns matrices
-    of NumPy.
+    The linear system contains the gain, offset and bandwidth of the sensor and the bandwidth of the amplifier. It does
+    not contain noise, disturbances, converters, faults, the guard, the limits of supply and amplifier, or the dead
+    band. On a processor it is the exact map of one sample period.
 
-    Raises ValueError as `rollout` does, and if there is no equilibrium at r.
+    Returns the state space with NumPy arrays. Raises ValueError as `rollout` does, and if there is no equilibrium at r.
     """
     system, found = _matrices(*canonical((*prepared(cascade, scenario, clock), r)))
     if not found:
-        raise ValueError(f"no equilibrium at r = {float(r):g} m: the laws do not hold the rotor there.")
+        raise ValueError(f"no equilibrium at r = {float(r):g} m: the laws cannot hold the rotor there.")
     return StateSpace(*(None if x is None else np.asarray(x) for x in system))  # pyright: ignore[reportArgumentType]
 
 
 def linearise_members(
     cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.0
 ) -> tuple[StateSpace, np.ndarray]:
-    """Linearise every member of an ensemble, whose varying leaves are arrays [N].
+    """Linearise the loop of every member of an ensemble, whose varying leaves are arrays [N], at the reference r (m).
 
     Returns the matrices, each with a leading axis [N], and whether each member has an equilibrium [N]. Raises
     ValueError as `rollout` does.
     """
-    # one call at a time: XLA runs LAPACK on its own threads, and two calls may wait for each other for ever
+    # one call at a time: XLA runs LAPACK on its own threads, and two calls may deadlock
     return map_members(_member, canonical((*prepared(cascade, scenario, clock), r)), threads=1, plain=True)
 
 
@@ -139,9 +147,9 @@ def _member(tree: Any) -> tuple[StateSpace, Any]:
 
 
 def prepared(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Cascade, Scenario, Scalar]:
-    """Return the first three arguments of `loop_matrices` for a case: cascade and scenario, checked, and the period.
+    """Check a case, and return the first three arguments of `loop_matrices`: cascade, scenario and sample period (s).
 
-    On a processor the cascade is resolved for it. Raises ValueError as `rollout` does.
+    A cascade on a processor is returned as `Cascade.on_processor` does. Raises ValueError as `rollout` does.
     """
     system, clock = prepare(cascade, scenario, clock)
     if cascade.processor is not None:
@@ -152,9 +160,14 @@ def prepared(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Cascad
 def analyse(
     system: StateSpace, m: Scalar, period: Scalar, zones: Zones | None = None, velocity: bool = False
 ) -> Analysis:
-    """Analyse a linearised loop of a rotor of mass m (kg).
+    """Analyse a linearised loop.
 
-    `period`: time for which a noise sample is held, s. `velocity`: whether the velocity has its own sensor.
+    - `m`: mass of the rotor, kg.
+    - `period`: sample period, s, for which a value of the noise is held.
+    - `zones`: frequency range and zones; None: the defaults.
+    - `velocity`: whether the velocity has its own sensor.
+
+    Raises ValueError as `Zones.range` does.
     """
     zones = Zones() if zones is None else zones
     low, high = zones.range(system.period)

@@ -1,6 +1,6 @@
-"""Peaks, delay margin and stability of a linearised loop as differentiable functions, for limits of the tuner.
+"""Peaks, delay margin and growth rate of a linearised loop as differentiable functions, for limits of the tuner.
 
-`analyse` computes the same numbers in NumPy, for reports. These run under jit and vmap and have derivatives.
+They work under jit and vmap. `analyse` computes the same numbers with NumPy, for reports.
 """
 
 from typing import NamedTuple
@@ -12,29 +12,30 @@ from ambjax.linear.margins import STATIC
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar
 
-# Points of the first scan on a logarithmic axis, for peaks and for crossings of |L| = 1.
+# Numbers of frequencies in the first scan, on a logarithmic axis: for peaks, and for crossings of |L| = 1.
 POINTS, CROSSING_POINTS = 120, 240
-# Rounds of refinement of a frequency; each divides the spacing of the scan by half of the number of points.
+# Rounds in which a frequency is refined, and points of a round. A round divides the spacing by half of LOCAL - 1.
 ROUNDS, LOCAL = 4, 17
-# Largest value of a stable loop, relative to the unit of the quantity. An unstable loop has this value or a larger one.
+# Upper bound of the quantities of a stable loop, in the unit of each. Those of an unstable loop are at least as large.
 MOST = 1e3
-# Value of a loop without an equilibrium, in units of MOST.
+# Quantities of a loop without an equilibrium, relative to MOST.
 NO_EQUILIBRIUM = 100.0
-# Step of the logarithm of the frequency in the slope of L at a crossing.
+# Step of the logarithm of the frequency in the difference quotient for the slope of L at a crossing.
 SLOPE_STEP = 1e-4
 
 
 class LoopQuantities(NamedTuple):
     """Quantities of a linearised loop, with finite values and derivatives for every loop.
 
-    - `sensitivity`, `complementary`: peaks of |S| and |T|. `control_sensitivity`: peak of |KS|, V/m.
+    - `sensitivity`, `complementary`: peaks of |S| and |T|.
+    - `control_sensitivity`: peak of |KS|, V/m.
     - `delay_margin_s`: smallest additional delay that makes the loop unstable, s.
-    - `growth`: largest real part of a pole, 1/s; below 0 if the loop is stable.
+    - `growth`: largest real part of a pole, 1/s; negative if the loop is stable, inf without an equilibrium.
 
-    A stable loop has the values of `analyse`, up to MOST. With the growth rate a, relative to the plant's pole, an
-    unstable loop has MOST (1 + a) times the unit: 1 for |S| and |T|, the voltage that moves the plant by its gap per
-    gap for |KS|, and its inverse times the time constant of the plant's pole for the delay margin. So the derivative
-    points to a stable loop.
+    For a stable loop, the peaks are those of `analyse`, smoothly limited to MOST times their unit, which is 1 for |S|
+    and |T| and `volts_per_metre` for |KS|. For an unstable loop they are MOST (1 + growth/pole) times their unit, so
+    that their derivatives point to a stable loop. The delay margin is treated in the same way by its inverse, in units
+    of the plant's pole.
     """
 
     sensitivity: Array
@@ -45,7 +46,15 @@ class LoopQuantities(NamedTuple):
 
 
 class _Loop(NamedTuple):
-    """A loop as poles and zeros [N]: S, and 1 + KS/`unit` - D; `poles_in_s` [N] in 1/s. Without derivatives."""
+    """S and KS of a loop by poles and zeros, without derivatives.
+
+    - `poles`, `zeros` [N]: of S.
+    - `zeros_u` [N]: zeros of 1 + (KS - `through`)/`unit`, whose poles are those of S.
+    - `through`: direct feedthrough of KS, V/m.
+    - `unit`: unit of KS, V/m.
+    - `period`: sample period, s; None in continuous time.
+    - `poles_in_s` [N]: poles in 1/s.
+    """
 
     poles: Array
     zeros: Array
@@ -72,10 +81,14 @@ def loop_quantities(
 ) -> LoopQuantities:
     """Return the quantities of a loop from the matrices of `loop_matrices`.
 
-    `found`: whether the loop has an equilibrium. `low`, `high` (Hz): range of the peaks; the static response is
-    included. `pole` (1/s): of the plant. `volts_per_metre`: unit of |KS|. Each peak is searched without derivatives,
-    from the poles and zeros of the loop; the derivative of a peak is that at its frequency (envelope theorem), and
-    that of a crossing is implicit.
+    - `found`: whether the loop has an equilibrium.
+    - `low`, `high`: frequency range of the peaks, Hz; the static response is always included.
+    - `pole`: unstable pole of the plant, 1/s.
+    - `volts_per_metre`: unit of |KS|, V/m.
+
+    The frequency of each peak is found without derivatives, from the poles and zeros of the loop. The derivative of a
+    peak is that of the response at this frequency (envelope theorem). The derivative of the delay margin is that of the
+    implicit equation |L| = 1.
     """
     fine = found & jnp.all(jnp.asarray([jnp.all(jnp.isfinite(x)) for x in system if x is not None]))
     n = len(system.A)
@@ -117,7 +130,7 @@ def _point(f: Array, period: Array | None) -> Array:
 
 
 def _capped(x: Array) -> Array:
-    """Return x, smoothly limited to MOST: at x = 3 the relative difference is 2e-11."""
+    """Return x > 0 smoothly limited to MOST. At x = 3 the relative change is 2e-11."""
     return (jnp.maximum(x, 1e-12) ** -4 + MOST**-4) ** -0.25
 
 
@@ -125,7 +138,8 @@ def _growth(system: StateSpace) -> tuple[Array, Array]:
     """Return the largest real part of the poles in 1/s, and the poles [N] without derivatives.
 
     The derivative of the dominant pole is that of a simple eigenvalue, from its left and right eigenvectors. JAX's
-    derivative needs the eigenvectors of all poles, which are not independent: delays have a defective pole at 0.
+    derivative of `eig` requires independent eigenvectors of all poles. A delay has a defective pole at 0 and no such
+    eigenvectors.
     """
     A = lax.stop_gradient(system.A)
     poles, left, right = lax.linalg.eig(A, compute_left_eigenvectors=True, compute_right_eigenvectors=True)
@@ -139,7 +153,7 @@ def _growth(system: StateSpace) -> tuple[Array, Array]:
 
 
 def _loop(system: StateSpace, poles: Array, unit: Array) -> _Loop:
-    """Return poles and zeros of a scaled system: det(zI - A + b c)/det(zI - A) = 1 + c (zI - A)^-1 b."""
+    """Return the poles and zeros of a scaled system, with det(zI - A + b c)/det(zI - A) = 1 + c (zI - A)^-1 b."""
     A, b = system.A, system.B[:, :1]
     zeros, zeros_u = (
         lax.linalg.eig(A - b * row[None], compute_left_eigenvectors=False, compute_right_eigenvectors=False)[0]
@@ -150,14 +164,17 @@ def _loop(system: StateSpace, poles: Array, unit: Array) -> _Loop:
 
 
 def _frequencies(loop: _Loop, low: Scalar, high: Scalar) -> Array:
-    """Return the frequencies (Hz) of the first scan: one that stands for 0, a logarithmic grid, and those of poles."""
+    """Return the frequencies (Hz) of the first scan: STATIC * low, which stands for 0, a grid, and those of poles."""
     grid = jnp.geomspace(low, high, POINTS)
     own = jnp.clip(jnp.abs(jnp.imag(loop.poles_in_s)) / (2 * jnp.pi), low, high)
     return jnp.concatenate([jnp.asarray([STATIC * low]), grid, own])
 
 
 def _refined(loop: _Loop, f: Array, size: Array, low: Scalar, high: Scalar, which: int) -> Array:
-    """Return the frequency of the peak near the largest of the sizes [F] at f [F]. `which`: 0: S, 1: T, 2: KS."""
+    """Return the frequency (Hz) of the peak near the largest `size` [F] at the frequencies `f` [F].
+
+    `which`: 0 for S, 1 for T, 2 for KS.
+    """
     best, reach = f[jnp.argmax(size)], jnp.log(high / low) / (POINTS - 1)
     for _ in range(ROUNDS):
         near = best * jnp.exp(reach * jnp.linspace(-1, 1, LOCAL))
@@ -170,7 +187,10 @@ def _refined(loop: _Loop, f: Array, size: Array, low: Scalar, high: Scalar, whic
 
 
 def _delay_margin(system: StateSpace, loop: _Loop, low: Scalar) -> Array:
-    """Return the smallest lag (rad) over 2 pi f at the frequencies with |L| = 1; 1e12/low without such a frequency."""
+    """Return the delay margin (s): the smallest lag/(2 pi f) over the frequencies f at which |L| = 1.
+
+    Without such a frequency it is 1e12/low.
+    """
     fastest = 100 * jnp.max(jnp.abs(loop.poles_in_s)) / (2 * jnp.pi)
     high = jnp.maximum(fastest, 2 * low) if system.period is None else 0.5 / system.period
     f = jnp.geomspace(low, high, CROSSING_POINTS)
@@ -195,5 +215,5 @@ def _delay_margin(system: StateSpace, loop: _Loop, low: Scalar) -> Array:
 
 
 def _lag(L: Array) -> Array:
-    """Return the phase lag (rad) that turns L to -1, from 0 to 2 pi."""
+    """Return the phase lag, from 0 to 2 pi rad, that rotates L to the negative real axis."""
     return jnp.pi + jnp.angle(L)

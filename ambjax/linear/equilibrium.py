@@ -1,7 +1,7 @@
-"""Equilibrium of the closed loop under a constant reference, and the loop's equations around it.
+"""Equilibrium of the closed loop under a constant reference.
 
-In equilibrium no state moves: the plant rests under a constant voltage, and the laws repeat their command. Noise,
-disturbances, converters, faults, the limits of the supply and of the amplifier, and its dead band are left out.
+In equilibrium no state changes: the plant rests under a constant voltage, and the laws return this voltage. Noise,
+disturbances, converters, faults, the guard, the limits of supply and amplifier, and the dead band are left out.
 """
 
 import dataclasses
@@ -12,22 +12,24 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 
-from ambjax.control.cascade import Cascade, CascadeState, Sample
+from ambjax.control.cascade import Cascade
+from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.numerics.records import Scalar
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.signals import Constant, Reference, reference_at
 
-# Newton steps. From a start near the equilibrium five suffice; a smoothed sign far from its layer needs more.
+# Largest number of Newton trials. Near the equilibrium five suffice; far outside the layer of a smoothed sign more are
+# necessary.
 STEPS = 60
-# A step is halved until the residual falls; the iteration ends with a step below this fraction.
+# A step is halved until the residual decreases. The iteration ends if the fraction of the full step is below this.
 SMALLEST = 1e-4
-# Largest residual of an equilibrium, relative to the sizes of the states, in units of the rounding error.
+# Largest residual that counts as 0, relative to the sizes of the states, in units of the rounding error.
 TOLERANCE = 1e7
 
 
 class Point(NamedTuple):
-    """State of the loop at an instant: of the plant and of the laws, and the voltage u (V) that acts."""
+    """State of the loop at an instant: state of the plant, states of the laws, and the voltage u (V) that acts."""
 
     plant: Any
     control: CascadeState
@@ -42,22 +44,22 @@ class Equilibrium(NamedTuple):
 
 
 def ideal(scenario: Scenario) -> Scenario:
-    """Return the scenario without noise, disturbance, converter, faults and limits; sensor and amplifier keep theirs.
+    """Return the scenario without noise, disturbances, converter, faults, limits and dead band.
 
-    What remains of the sensor is its gain, its offset and its bandwidth; of the amplifier its bandwidth.
+    The sensor keeps its gain, offset and bandwidth, the amplifier its bandwidth.
     """
-    sensor, amplifier, none = scenario.sensor, scenario.amplifier, Constant()
+    scenario = scenario.undisturbed()
+    sensor, amplifier = scenario.sensor, scenario.amplifier
     if sensor is not None:
         sensor = dataclasses.replace(sensor.louder(0.0), bits=None, outliers=None, dropouts=None)
     if amplifier is not None:
         amplifier = dataclasses.replace(amplifier, slew=None, dead_band=None, i_max=None)
         amplifier = None if amplifier.bandwidth is None else amplifier
-    quiet = {"q_z": none, "q_v": none, "q_i": none, "u_max": jnp.inf}
-    return dataclasses.replace(scenario, sensor=sensor, amplifier=amplifier, **quiet)
+    return dataclasses.replace(scenario, sensor=sensor, amplifier=amplifier, u_max=jnp.inf)
 
 
 def reading(scenario: Scenario, motion: Measurement, injected: tuple[Scalar, Scalar]) -> Measurement:
-    """Return what the controller reads of a motion, with numbers added to z (m) and z_dot (m/s)."""
+    """Return the readings of a motion without noise, plus `injected`: test signals on z (m) and z_dot (m/s)."""
     zero = jnp.zeros(())
     if scenario.sensor is not None:
         motion = scenario.sensor.reading(motion, Errors(zero, zero, zero))
@@ -75,8 +77,12 @@ def at_rest(r: Scalar) -> Reference:
 def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Equilibrium:
     """Compute the equilibrium at the constant reference r (m) by damped Newton steps.
 
-    `cascade`: resolved for its processor, without a guard. `scenario`: `ideal`. Derivatives with respect to gains and
-    parameters are those of the implicit function. Pure; works under jit and vmap.
+    - `cascade`: of `Cascade.on_processor` if it has a processor, and without a guard.
+    - `scenario`: of `ideal`.
+    - `period`: sample period, s; not used in continuous time.
+
+    The derivatives with respect to gains and parameters are those of the implicit function. The function is pure and
+    works under jit and vmap.
     """
     start = _start(cascade, scenario, period, r)
     flat, restore = ravel_pytree(start)
@@ -114,7 +120,13 @@ def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar)
 
 
 class _Newton(NamedTuple):
-    """State of Newton's method: best point, its error and Jacobian, the step from it, and the next trial."""
+    """State of Newton's method, relative to the sizes of the states.
+
+    - `y`, `error`, `J`: best point so far, the size of its residual, and its Jacobian.
+    - `direction`, `fraction`: the full step from `y`, and the fraction of it to try.
+    - `trial`: the next point to evaluate.
+    - `number`: trials so far.
+    """
 
     y: Array
     error: Array
@@ -131,7 +143,7 @@ def _size(G: Array) -> Array:
 
 
 def _start(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Point:
-    """Return the plant at rest at r (m), and the laws at their start, with the reference current of the model there."""
+    """Return the start of the iteration: the plant at rest at r (m), and the initial states of the laws there."""
     plant, inversion = scenario.plant, cascade.inversion.started(cascade.model.equilibrium(r)[0])
     i, u = plant.equilibrium(r)
     zero = jnp.zeros_like(i)
@@ -143,7 +155,7 @@ def _start(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> P
 
 
 def sizes_of(cascade: Cascade, scenario: Scenario, point: Point) -> Point:
-    """Return the characteristic size of each number of a point."""
+    """Return the characteristic size of each component of a point."""
     plant = scenario.plant
     u = jnp.asarray((plant.R + plant.L * plant.pole) * plant.i_0 / 25)
     sizes = Point(plant.scale(), cascade.scale(), u)
@@ -151,7 +163,11 @@ def sizes_of(cascade: Cascade, scenario: Scenario, point: Point) -> Point:
 
 
 def _residual(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, point: Point) -> Array:
-    """Return the rates, or on a processor the changes in a sample, relative to the sizes; all are 0 in equilibrium."""
+    """Return the residual, which is 0 in equilibrium, relative to the sizes of the states.
+
+    It consists of the rates of the plant, the rates of the laws (on a processor: their changes in a sample), and the
+    difference between the command and u. Rates are multiplied by the time constant of the plant's pole.
+    """
     plant, u_max = scenario.plant, jnp.asarray(jnp.inf)
     sizes = sizes_of(cascade, scenario, point)
     moved = jax.tree.map(lambda x: x / plant.pole, plant.rates(point.plant, point.u))

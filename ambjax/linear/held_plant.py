@@ -1,7 +1,6 @@
-"""The linearised plant with the lags of its sensor and amplifier, integrated exactly between two samples.
+"""The linearised plant with the lags of sensor and amplifier, integrated exactly over one sample.
 
-The plant rests at the equilibrium, so that the equations of small deviations have constant coefficients, and the matrix
-exponential solves them without error.
+At an equilibrium the linearised equations have constant coefficients, and the matrix exponential solves them exactly.
 """
 
 from typing import Any, NamedTuple
@@ -19,9 +18,10 @@ from ambjax.world.sensor import Measurement
 
 
 class HeldPlant(NamedTuple):
-    """The map of one sample, for the state x [N] of plant, sensor's low-pass (m) and amplifier (V).
+    """Linear map of one sample, x_{n+1} = transition x_n + now u_n + before u_{n-1} + first u_{n-2} + disturbed q_z.
 
-    x_{n+1} = transition x_n + now u_n + before u_{n-1} + first u_{n-2} + disturbed q_z
+    x [N] is the state of the plant, of the sensor's low-pass (m) and of the amplifier (V), `transition` is [N, N], and
+    the others are [N]. q_z (m/s^2) is constant during the sample.
     """
 
     transition: Array
@@ -32,7 +32,10 @@ class HeldPlant(NamedTuple):
 
 
 class Lagged:
-    """The plant of a scenario with its lags, whose state is one vector [N]."""
+    """The plant of a scenario with the lags of sensor and amplifier; its state is one vector [N].
+
+    `point`: the equilibrium, at which `held` linearises the plant.
+    """
 
     def __init__(self, scenario: Scenario, point: Point):
         self.scenario = scenario
@@ -42,11 +45,11 @@ class Lagged:
         self.start, self.restore = ravel_pytree((point.plant, lags))
 
     def motion(self, x: Array) -> Measurement:
-        """Return the true motion."""
+        """Return the true motion and current in a state."""
         return self.scenario.plant.measurement(self.restore(x)[0])
 
     def read(self, x: Array, injected: tuple[Scalar, Scalar]) -> Measurement:
-        """Return what the controller reads, with numbers added to z (m) and z_dot (m/s)."""
+        """Return the readings in a state plus `injected`: test signals on z (m) and z_dot (m/s)."""
         plant, lags = self.restore(x)
         motion = self.scenario.plant.measurement(plant)
         return reading(self.scenario, motion._replace(z=lags[0]) if self.low_passed else motion, injected)
@@ -63,13 +66,16 @@ class Lagged:
         return ravel_pytree((self.scenario.plant.rates(plant, u, q_z), lag_rates))[0]
 
     def sizes(self, sizes: Point) -> Array:
-        """Return the characteristic sizes [N] of the state, from those of a point."""
+        """Return the characteristic sizes [N] of the state. `sizes`: those of a `Point`."""
         z = self.scenario.plant.measurement(sizes.plant).z
         lags = [z] * self.low_passed + [sizes.u] * (self.scenario.amplifier is not None)
         return ravel_pytree((sizes.plant, lags))[0]
 
     def held(self, point: Point, period: Scalar, delay: Scalar) -> HeldPlant:
-        """Integrate over one sample; each voltage acts from `delay` samples after its own sample on."""
+        """Return the linear map of one sample at the equilibrium `point`.
+
+        `period`: sample period, s. `delay`: samples after which the voltage of a sample begins to act.
+        """
         A, B = jax.jacfwd(lambda x, w: self.rates(x, w[0], w[1]), (0, 1))(
             self.start, jnp.stack([point.u, 0.0 * point.u])
         )
@@ -82,12 +88,12 @@ class Lagged:
 
 
 def _at(lag: Array, number: int) -> Array:
-    """Return 1 if the lag is this number of samples, else 0."""
+    """Return 1 if `lag`, a whole number, is `number`, else 0."""
     return jnp.where(jnp.abs(lag - number) < 0.5, 1.0, 0.0)
 
 
 def _integrated(A: Array, B: Array, h: Scalar) -> tuple[Array, Array]:
-    """Return exp(A h) and the integral of exp(A s) B over 0 to h."""
+    """Return exp(A h), and the integral of exp(A s) B over s from 0 to h (s)."""
     n, inputs = B.shape
     table: Any = jnp.zeros((n + inputs, n + inputs), A.dtype).at[:n].set(jnp.concatenate([A, B], 1) * h)
     whole = expm(table)

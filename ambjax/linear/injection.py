@@ -1,8 +1,9 @@
-"""The measured sensitivity, by injection into the nonlinear simulation, as on a machine.
+"""Measurement of the sensitivity by injection into the nonlinear simulation, as on a machine.
 
-A periodic multi-sine e is added to the reading of the position sensor, after converter and filter. After settling, over
-whole periods, S at each line is the quotient of the Fourier coefficients of what the controller reads and of e
-(ISO 14839-3, as secondary sources cite it). Converter, noise, limits and true signs are in the simulation.
+A periodic multi-sine e is added to the reading of the position or velocity sensor, after low-pass and converter. When
+the loop has settled, S at each frequency of the multi-sine is the quotient of the Fourier coefficients of the reading,
+e included, and of e, over whole periods (ISO 14839-3, as secondary sources cite it). The simulation includes converter,
+noise, limits and the true signs.
 """
 
 import dataclasses
@@ -16,35 +17,35 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
 from ambjax.linear.analysis import Zones
 from ambjax.linear.equilibrium import ideal, reading
-from ambjax.linear.multisine import MultiSine, Response, multisine, with_wave
+from ambjax.linear.multisine import MultiSine, Reading, Response, multisine, with_wave
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare, run
 from ambjax.simulation.sliding import Slide
 from ambjax.simulation.trajectory import ALIVE
 from ambjax.world.scenario import Initial, Scenario
-from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Constant
 
-# Default amplitude of e, as a share of the gap s_0.
+# Default amplitude of e, as a share of the gap s_0; at the velocity sensor, of s_0 times the plant's pole.
 AMPLITUDE = 0.01
-# Lines on a logarithmic axis, and lines near a peak between these multiples of its frequency.
+# Number of lines on a logarithmic axis; number of lines near a peak, and their range as multiples of its frequency.
 LINES, NEAR, AROUND = 30, 11, (0.75, 1.33)
 
 
 class Injection(NamedTuple):
-    """Measured sensitivity of a loop.
+    """Measured sensitivity of a loop. The frequencies of the multi-sine are called lines.
 
-    - `frequency` [L]: Hz.
-    - `S`, `T`, `KS` [L]: complex; S = (what the controller reads)/e (1), T = S - 1, KS = u/e (V/m). The mean over the
-      members that kept the rotor; None if none did.
+    - `frequency` [L]: lines, Hz.
+    - `S`, `T`, `KS` [L]: complex means over the members that did not lose the rotor; None if all did. S = reading/e
+      (1), T = S - 1 (1), KS = u/e (V/m, or V s/m at the
+      velocity sensor).
     - `peak`: largest |S| over the lines; None without S.
-    - `peak_low`, `peak_high`: confidence interval of |S| at that line, from the members; equal to `peak` if nothing is
-      random, None with one member.
-    - `peak_frequency`: Hz.
-    - `lost`, `members`: members that lost the rotor, and all.
-    - `amplitude`: largest |e|, m.
-    - `saturated`: share of samples with |u| at the limit of the supply; None without S.
+    - `peak_low`, `peak_high`: confidence interval of |S| at the line of the peak, from the members. Equal to `peak` if
+      the scenario is not random; None with one member.
+    - `peak_frequency`: line of the peak, Hz; None without S.
+    - `lost`, `members`: number of members that lost the rotor, and of all members.
+    - `amplitude`: largest |e|, m, or m/s at the velocity sensor.
+    - `saturated`: share of the samples with |u| at the limit of the supply; None without S.
     """
 
     frequency: np.ndarray
@@ -62,10 +63,10 @@ class Injection(NamedTuple):
 
 
 def lines(zones: Zones, clock: Clock, peak: float | None = None) -> np.ndarray:
-    """Return frequencies [L] in Hz for `injected`: logarithmic over the range of `zones`, denser near `peak` (Hz).
+    """Return lines [L] in Hz for `injected`: logarithmic over the frequency range of `zones`, denser near `peak` (Hz).
 
-    `clock.samples` is one period of the multi-sine. All lines are whole multiples of 1/duration, the lowest possible
-    frequency. Raises ValueError as `Zones.range` does.
+    `clock.duration` is one period of the multi-sine, and the lines are whole multiples of its inverse. Raises
+    ValueError as `Zones.range` does.
     """
     low, high = zones.range(clock.sample_period)
     f = np.geomspace(low, high, LINES)
@@ -82,6 +83,7 @@ def injected(
     clock: Clock,
     frequencies: Sequence[float] | np.ndarray,
     *,
+    reading: Reading = "z",
     amplitude: float | None = None,
     members: int = 1,
     seed: int = 0,
@@ -92,26 +94,36 @@ def injected(
 ) -> Injection:
     """Measure the sensitivity of the loop at rest at the constant reference r (m), without disturbances.
 
-    - `clock`: its samples are one period of the multi-sine; `settle` periods are simulated before the `periods` that
-      are measured. In place of the method `Slide`, which does not apply, one is chosen.
-    - `frequencies`: Hz, rounded to whole multiples of 1/clock.duration (see `lines`).
-    - `amplitude`: largest |e|, m; None: 1 % of s_0.
-    - `members`, `seed`: members differ in the noise.
+    - `clock`: its samples are one period of the multi-sine. The integrator `Slide` is replaced, because it does not
+      apply to this loop.
+    - `frequencies`: lines, Hz, rounded to whole multiples of 1/clock.duration (see `lines`).
+    - `reading`: "z" adds e to the reading of the position sensor, "z_dot" to that of the velocity sensor.
+    - `amplitude`: largest |e|, m or m/s; None: 1 % of s_0, or of s_0 times the plant's unstable pole (1/s).
+    - `members`, `seed`: size and seed of an ensemble whose members differ in the noise.
+    - `settle`, `periods`: periods of the multi-sine before the measurement, and during it.
+    - `confidence`: level of the confidence interval of the peak.
 
-    In continuous time e(t) is continuous, and the laws read its value but not its rate: the velocity that they read is
-    that of the rotor. Sums are over samples.
+    In continuous time e(t) is continuous. It is added to one reading only: e on the position does not change the
+    velocity reading. The Fourier sums are over samples.
 
-    Raises ValueError as `rollout` does, and for a frequency that the period or the samples cannot resolve.
+    Returns an `Injection`. Raises ValueError as `rollout` does, for a frequency that the period or the samples cannot
+    resolve, and for `reading` = "z_dot" if the observer does not use the velocity reading.
     """
-    amplitude = AMPLITUDE * float(scenario.plant.s_0) if amplitude is None else float(amplitude)
+    if reading == "z_dot" and cascade.observer.estimates_velocity:
+        raise ValueError(
+            f"injection.reading = 'z_dot': the observer {type(cascade.observer).__name__} estimates the velocity and "
+            "reads no velocity sensor. Inject at 'z'."
+        )
+    usual = AMPLITUDE * float(scenario.plant.s_0) * (float(scenario.plant.pole) if reading == "z_dot" else 1.0)
+    amplitude = usual if amplitude is None else float(amplitude)
     if not amplitude > 0:
-        raise ValueError(f"injection.amplitude = {amplitude:g} m: it must be above 0.")
+        raise ValueError(f"injection.amplitude = {amplitude:g}: it must be above 0.")
     if members < 1 or settle < 0 or periods < 1:
         raise ValueError(
             f"injection: members = {members}, settle = {settle}, periods = {periods}: members and periods must be at "
             "least 1, settle at least 0."
         )
-    wave = multisine(_harmonics(frequencies, clock), clock.samples, float(clock.sample_period), amplitude)
+    wave = multisine(_harmonics(frequencies, clock), clock.samples, float(clock.sample_period), amplitude, reading)
     random = scenario.random
     cascade, scenario = _at_rest(cascade, scenario, r)
     scenario = dataclasses.replace(scenario, seed=seed, member=np.arange(members))
@@ -119,9 +131,8 @@ def injected(
     method = None if isinstance(clock.method, Slide) else clock.method
     longer = dataclasses.replace(clock, samples=skip + periods * clock.samples, method=method)
     system, longer = prepare(cascade, scenario, longer)
-    sums, code = map_members(
-        _member, canonical((system, longer, Response(_tiled(wave, members), scenario.u_max, skip)))
-    )
+    response = Response(_tiled(wave, members), scenario.u_max, skip)
+    sums, code = map_members(_member, canonical((system, longer, response)))
     kept = code == ALIVE
     e = float(wave.size) * np.exp(1j * np.asarray(wave.phases))
     S, KS = ((x[kept, 0] + 1j * x[kept, 1]) / e for x in (sums.read, sums.u))
@@ -130,26 +141,25 @@ def injected(
 
 
 def _member(tree: Any) -> tuple[Any, Any]:
-    """Return the sums and the status code of one member."""
+    """Return the `FourierSums` and the status code of one member."""
     system, clock, response = tree
     outcome = run(with_wave(system, response.wave), clock, response, 0)
     return outcome.measured, outcome.trajectory.lost_code
 
 
 def _tiled(wave: MultiSine, members: int) -> MultiSine:
-    """Return the wave with its arrays repeated for each member [N, L]."""
+    """Return the wave with its arrays [L] repeated for each member, [N, L]."""
     harmonics, phases = (np.tile(x, (members, 1)) for x in (wave.harmonics, wave.phases))
     return dataclasses.replace(wave, harmonics=harmonics, phases=phases)
 
 
 def _at_rest(cascade: Cascade, scenario: Scenario, r: float) -> tuple[Cascade, Scenario]:
-    """Return plant and laws at rest at r (m), under a constant reference and without disturbances."""
-    i, none = float(scenario.plant.equilibrium(r)[0]), Constant()
-    quiet = {"q_z": none, "q_v": none, "q_i": none}
-    scenario = dataclasses.replace(scenario, reference=Constant(r), initial=Initial(r, 0.0, i), **quiet)
+    """Return cascade and scenario that start at rest at the constant reference r (m), without disturbances."""
+    initial = Initial(r, 0.0, float(scenario.plant.equilibrium(r)[0]))
+    scenario = dataclasses.replace(scenario.undisturbed(), reference=Constant(r), initial=initial)
     inversion = cascade.inversion.started(cascade.model.equilibrium(r)[0])
     # not at the first measurement: its noise would be an initial error that a slow observer keeps
-    rest = Measurement(*map(jnp.asarray, (r, 0.0, i)))
+    rest = initial.measurement()
     z = reading(ideal(scenario), rest, (0.0, 0.0)).z
     return dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started(z)), scenario
 
@@ -180,7 +190,7 @@ def _summary(
     confidence: float,
     random: bool,
 ) -> Injection:
-    """Return the mean over the members that kept the rotor: S, KS [M, L], saturated [M]."""
+    """Return the means over the M members that did not lose the rotor: of S and KS [M, L], and saturated [M]."""
     lost = members - len(S)
     if not len(S):
         return Injection(frequency, None, None, None, None, None, None, None, lost, members, amplitude, None)

@@ -12,17 +12,17 @@ import numpy as np
 
 from ambjax.linear.state_space import StateSpace
 
-# Points of the first scan on a logarithmic axis; the frequency of each pole is added to them.
+# Number of frequencies in the first scan on a logarithmic axis, in addition to those near poles.
 POINTS = 600
-# A peak is refined until its bracket is this narrow, relative; its height is then known far better than 1e-3.
+# Relative width of the bracket of a peak's frequency at which its refinement ends.
 NARROW = 1e-6
-# Frequency that stands for 0, as a fraction of the lowest one: at 0 itself an integrator has no finite response.
+# Frequency that stands for 0, as a share of the lowest one. At 0 itself the response of an integrator is not finite.
 STATIC = 1e-6
 GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 class ResponsePeak(NamedTuple):
-    """Largest magnitude of a response, and its frequency, Hz; 0 if the static value is the largest."""
+    """Largest magnitude of a response, and its frequency, Hz, which is 0 if the static response is the largest."""
 
     height: float
     frequency: float
@@ -31,12 +31,12 @@ class ResponsePeak(NamedTuple):
 class Margins(NamedTuple):
     """Margins of the loop transfer L = 1/S - 1, broken at the reading of the position sensor.
 
-    - `gain`: factor on L, of those that make the loop unstable, that is nearest to 1 on a logarithmic scale.
-    - `gain_low`, `gain_high`: largest such factor below 1 (0: none) and smallest above 1 (inf: none).
-    - `phase_deg`: smallest phase lag, degrees (inf: |L| never is 1).
+    - `gain_low`, `gain_high`: the loop stays stable for every factor on L between these two (0, inf: no such end).
+    - `gain`: the one of these two that is nearer to 1 on a logarithmic scale.
+    - `phase_deg`: smallest phase change, lag or lead, that makes the loop unstable, degrees (inf: |L| is never 1).
     - `delay`: smallest additional delay that makes the loop unstable, s (inf: none).
-    - `disk`: disk margin 1/max|S - 1/2| (P. Seiler, A. Packard and P. Gahinet, IEEE Control Systems 40:5 (2020)); for
-      every factor between (2 - disk)/(2 + disk) and its inverse the loop stays stable.
+    - `disk`: disk margin 1/max|S - 1/2| (P. Seiler, A. Packard and P. Gahinet, IEEE Control Systems 40:5 (2020)). The
+      loop stays stable for every factor on L between (2 - disk)/(2 + disk) and its inverse.
     """
 
     gain: float
@@ -51,7 +51,10 @@ Magnitude = Callable[[np.ndarray], np.ndarray]
 
 
 def peak(system: StateSpace, magnitude: Magnitude, low: float, high: float) -> ResponsePeak:
-    """Return the largest value of `magnitude`, a function of frequencies [F] in Hz, at 0 and between low and high."""
+    """Return the largest value of a magnitude at frequency 0 and from `low` to `high` (Hz), with its frequency.
+
+    `magnitude`: function that returns magnitudes [F] for frequencies [F] in Hz.
+    """
     f = scan(system, low, high)
     size = magnitude(f)
     k = int(np.argmax(size))
@@ -68,7 +71,7 @@ def peak(system: StateSpace, magnitude: Magnitude, low: float, high: float) -> R
 
 
 def scan(system: StateSpace, low: float, high: float) -> np.ndarray:
-    """Return frequencies (Hz) from low to high, preceded by one that stands for 0, dense around each pole's."""
+    """Return frequencies (Hz) from `low` to `high`, dense near those of poles, after one that stands for 0."""
     grid = np.geomspace(low, high, POINTS)
     s = poles_in_s(system)
     own = np.abs(np.imag(s)) / (2 * np.pi)
@@ -79,7 +82,7 @@ def scan(system: StateSpace, low: float, high: float) -> np.ndarray:
 
 
 def poles_in_s(system: StateSpace) -> np.ndarray:
-    """Return the poles in 1/s, with s = log(z)/T on a processor; poles at z = 0, which only delay, are left out."""
+    """Return the poles in 1/s. On a processor s = log(z)/T, and poles at z = 0, which are pure delays, are left out."""
     poles = system.poles()
     if system.period is None:
         return poles
@@ -87,7 +90,7 @@ def poles_in_s(system: StateSpace) -> np.ndarray:
 
 
 def margins_of(system: StateSpace) -> Margins:
-    """Compute the margins over all frequencies: up to half the sample rate, or far beyond the fastest pole."""
+    """Return the margins of a stable loop, at frequencies up to half the sample rate or far beyond all poles."""
     fastest = float(np.max(np.abs(poles_in_s(system)), initial=1.0)) / (2 * math.pi)
     high = 100 * fastest if system.period is None else 0.5 / float(system.period)
     low = min(1e-3, 1e-6 * high)
@@ -100,11 +103,12 @@ def margins_of(system: StateSpace) -> Margins:
 
     f = scan(system, low, high)[1:]
     along = L(f)
-    gains = [-1 / L(np.array([x]))[0].real for x in _crossings(lambda x: np.imag(L(x)), f, np.imag(along))]
+    real = [L(np.array([x]))[0].real for x in _crossings(lambda x: np.imag(L(x)), f, np.imag(along))]
     if system.period is not None:
-        gains.append(-1 / along[-1].real)  # L is real at half the sample rate
-    gains.append(-1 / along[0].real)  # and at 0
-    gains = [float(x) for x in gains if math.isfinite(x) and x > 1e-9]
+        real.append(along[-1].real)  # L is real at half the sample rate
+    real.append(along[0].real)  # and at 0
+    # L is exactly 0 at half the sample rate if the controller has a zero there, as after a bilinear transform
+    gains = [float(-1 / x) for x in real if x and math.isfinite(x) and -1 / x > 1e-9]
     phases, delays = [], []
     for x in _crossings(lambda x: np.log(np.abs(L(x))), f, np.log(np.abs(along))):
         lag = math.pi + float(np.angle(L(np.array([x]))[0]))
@@ -130,12 +134,12 @@ def _crossings(function: Magnitude, f: np.ndarray, values: np.ndarray) -> list[f
 
     changes = np.flatnonzero(values[:-1] * values[1:] < 0)
     found = [float(brentq(one, f[k], f[k + 1], xtol=1e-300, rtol=1e-14)) for k in changes]  # pyright: ignore
-    # a sign that changes through a pole is no crossing
+    # at a pole of the function its sign changes, but its value does not cross 0
     return [x for x, k in zip(found, changes, strict=True) if abs(one(x)) <= 1e-3 * max(abs(values[k]), 1e-30)]
 
 
 def noise_gain(system: StateSpace, period: float) -> float:
-    """Return the rms of z per rms of white noise on the reading of z, held over samples of `period` (s)."""
+    """Return the rms of z per rms of white noise on the reading of z. Each noise value is held for `period` (s)."""
     from scipy.linalg import expm, solve_discrete_lyapunov
 
     scaled = system.scaled()

@@ -1,4 +1,4 @@
-"""The closed loop, linearised at an equilibrium: the exact map of one sample period, or the vector field."""
+"""Linearisation of the closed loop at an equilibrium: of the map of one sample period, or of the vector field."""
 
 import dataclasses
 from typing import Any
@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from ambjax.control.cascade import Cascade, Sample
+from ambjax.control.cascade import Cascade
+from ambjax.control.cascade_state import Sample
 from ambjax.linear.equilibrium import Point, at_rest, equilibrium, ideal, reading, sizes_of
 from ambjax.linear.held_plant import Lagged
 from ambjax.linear.state_space import StateSpace
@@ -19,8 +20,12 @@ from ambjax.world.scenario import Scenario
 def loop_matrices(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> tuple[StateSpace, Array]:
     """Linearise the loop at the equilibrium of the constant reference r (m).
 
-    `cascade`: resolved for its processor (`Cascade.on_processor`), if it has one. Pure; works under jit and vmap, and
-    is differentiable in all gains and parameters. Returns the state space, and whether an equilibrium was found.
+    - `cascade`: of `Cascade.on_processor` if it has a processor. The guard is left out.
+    - `scenario`: `ideal` removes what a linear system cannot contain.
+    - `period`: sample period, s; not used in continuous time.
+
+    The function is pure, works under jit and vmap, and is differentiable in all gains and parameters. Returns the state
+    space, and whether an equilibrium was found; if not, the matrices have no meaning.
     """
     scenario = ideal(scenario)
     if cascade.processor is not None:

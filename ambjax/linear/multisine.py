@@ -1,11 +1,12 @@
-"""A multi-sine, the systems that add it to the reading of the position sensor, and the Fourier sums of the response."""
+"""The multi-sine, the systems with it added to a sensor's reading, and the Fourier coefficients of the response."""
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.control.cascade_state import Command
 from ambjax.numerics.records import Scalar, leaf, record, static
 from ambjax.simulation.folds import Ending
 from ambjax.simulation.loop import ClosedLoop, Realised
@@ -14,66 +15,86 @@ from ambjax.simulation.trajectory import Row
 from ambjax.world.sensor import Errors, FaultyErrors, Measurement
 from ambjax.world.signals import Reference
 
+# Quantity of the sensor that e is added to: m or m/s.
+Reading = Literal["z", "z_dot"]
+
 
 @record
 class MultiSine:
-    """Sum of cosines at harmonics of a base frequency: e(t) = sum of size cos(2 pi harmonic t/(samples T) + phase).
+    """Sum of cosines, e(t) = sum_l size cos(2 pi harmonics_l t/(samples T) + phases_l).
 
-    - `harmonics` [L]: whole numbers below half of `samples`.
-    - `size`: amplitude of every cosine, m.
-    - `phases` [L]: rad.
+    - `harmonics` [L]: whole numbers from 1 to below `samples`/2.
+    - `size`: amplitude of every cosine, m or m/s.
+    - `phases` [L]: phases, rad.
     - `period`: sample period T, s.
-    - `samples`: samples in a period of the multi-sine.
+    - `samples`: number of samples in a period of the multi-sine.
+    - `reading`: the quantity whose reading e is added to.
     """
 
     harmonics: Array
-    size: Scalar = leaf(unit="m", at_least=0, at_most=1.0)
+    size: Scalar = leaf(unit="m or m/s", at_least=0, at_most=1e3)
     phases: Array
     period: Scalar = leaf(unit="s", at_least=1e-9, at_most=1e6)
     samples: int = static()
+    reading: Reading = static(default="z")
 
     def angles(self, sample: Array) -> Array:
-        """Return 2 pi harmonic n/samples [L] at sample n, rad, between 0 and 2 pi. The product is one of integers."""
+        """Return the angles 2 pi harmonics n/samples [L] at sample number n, between 0 and 2 pi rad.
+
+        The product is computed in integers, so that it has no rounding error.
+        """
         product = self.harmonics.astype(sample.dtype) * (sample % self.samples)
         return (2 * jnp.pi / self.samples) * (product % self.samples)
 
     def at(self, sample: Array) -> Array:
-        """Return e at a sample, m."""
+        """Return e (m or m/s) at a sample number."""
         return self.size * jnp.sum(jnp.cos(self.angles(sample) + self.phases))
 
     def __call__(self, t: Scalar) -> Array:
-        """Return e at time t (s), m."""
+        """Return e (m or m/s) at time t (s)."""
         turn = jnp.asarray(t) / (self.samples * self.period) % 1.0
         return self.size * jnp.sum(jnp.cos(2 * jnp.pi * self.harmonics * turn + self.phases))
 
 
-def multisine(harmonics: np.ndarray, samples: int, period: float, amplitude: float) -> MultiSine:
-    """Return the multi-sine with equal sizes and Schroeder phases, whose largest |e_n| is `amplitude` (m).
+def multisine(
+    harmonics: np.ndarray, samples: int, period: float, amplitude: float, reading: Reading = "z"
+) -> MultiSine:
+    """Return the multi-sine with the given harmonics [L] whose largest |e_n| is `amplitude` (m or m/s).
 
-    Schroeder phases -pi l (l - 1)/L keep the largest value low (M. R. Schroeder, IEEE Trans. Inf. Theory 16 (1970)).
+    `samples`: samples in a period. `period`: sample period, s. All cosines have the same size. Their Schroeder phases
+    -pi l (l - 1)/L, l = 1 to L, give a low ratio of the largest value to the size (M. R. Schroeder, IEEE Trans. Inf.
+    Theory 16 (1970)).
     """
     number = np.arange(len(harmonics))
     phases = -np.pi * number * (number + 1) / len(harmonics)
     spectrum = np.zeros(samples // 2 + 1, complex)
     spectrum[harmonics] = 0.5 * samples * np.exp(1j * phases)
     largest = np.max(np.abs(np.fft.irfft(spectrum, samples)))
-    return MultiSine(np.asarray(harmonics, float), amplitude / largest, phases, period, samples)  # pyright: ignore
+    size = amplitude / largest
+    return MultiSine(np.asarray(harmonics, float), size, phases, period, samples, reading)  # pyright: ignore
 
 
 class InjectedInputs(NamedTuple):
-    """`ExternalInputs` of the loop, and e (m)."""
+    """The `ExternalInputs` of the loop, and the test signal e (m or m/s)."""
 
     reference: Reference
     q_z: Array
     q_i: Array
+    runout: Array | tuple[()]
     e: Array
+
+
+def _added(measured: Measurement, reading: Reading, e: Array) -> Measurement:
+    """Return the readings with e added to one of them."""
+    return measured._replace(**{reading: getattr(measured, reading) + e})
 
 
 @record
 class InjectedLoop(Realised):
-    """The closed loop of one member in continuous time, with e(t) added to the reading of z.
+    """The closed loop of one member in continuous time, with e(t) added to a reading.
 
-    The sliding step does not apply: it evaluates the laws without e.
+    `z_measured` of its rows is that reading. The integrator `Slide` does not apply, because it evaluates the laws
+    without e.
     """
 
     wave: MultiSine
@@ -82,31 +103,42 @@ class InjectedLoop(Realised):
         return InjectedInputs(*super().inputs(t), self.wave(t))
 
     def received(self, inputs: Any, plant: Any, errors: Errors) -> Measurement:
-        measured = super().received(inputs, plant, errors)
-        return measured._replace(z=measured.z + inputs.e)
+        return _added(super().received(inputs, plant, errors), self.wave.reading, inputs.e)
+
+    def signals(
+        self, t: Scalar, inputs: Any, state: object, command: Command, measured: Measurement, alive: Array
+    ) -> Row:
+        row = super().signals(t, inputs, state, command, measured, alive)
+        return row._replace(z_measured=getattr(measured, self.wave.reading))
 
 
 @record
 class InjectedSampled(Sampled):
-    """The closed loop on a processor, with e_n added to the reading of z, after converter and faults."""
+    """The closed loop on a processor, with e_n added to a reading, after converter and faults.
+
+    `z_measured` of its rows is that reading.
+    """
 
     wave: MultiSine
 
     def injected(self, t: Scalar) -> Array:
-        """Return e (m) at the sample at t (s)."""
+        """Return e (m or m/s) at the sample that begins at t (s)."""
         return self.wave.at(jnp.round(jnp.asarray(t) / self.period).astype(int))
 
     def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
         state, measured = self.read(state, errors)
-        return self.with_command(measured._replace(z=measured.z + self.injected(t)), self.reference(t), state)
+        return self.with_command(_added(measured, self.wave.reading, self.injected(t)), self.reference(t), state)
 
     def row(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors, alive: Array) -> Row:
         row = super().row(t, state, errors, alive)
-        return row._replace(z_measured=row.z_measured + self.injected(t))
+        reads = row.z_measured
+        if self.wave.reading == "z_dot":
+            reads = self.measured(state.plant, state.z_filtered, errors).z_dot
+        return row._replace(z_measured=reads + self.injected(t))
 
 
 def with_wave(system: ClosedLoop | Sampled, wave: MultiSine) -> Any:
-    """Return the system of one member, for a rollout, with e added to the reading of z."""
+    """Return the system of one member, for a rollout, with e added to a reading."""
     system = system.realised()
     if isinstance(system, Sampled):
         return InjectedSampled(system.loop, system.period, system.cuts, wave)
@@ -115,7 +147,12 @@ def with_wave(system: ClosedLoop | Sampled, wave: MultiSine) -> Any:
 
 
 class FourierSums(NamedTuple):
-    """Sums of a `Response`: samples so far, of the reading (m) and of u (V) [2, L] each, and the samples at u_max."""
+    """Sums of a `Response`.
+
+    - `sample`: number of samples so far.
+    - `read`, `u` [2, L]: real and imaginary parts of the Fourier sums of the reading (m or m/s) and of u (V).
+    - `saturated`: number of samples with |u| at the limit of the supply.
+    """
 
     sample: Array
     read: Array
@@ -125,11 +162,14 @@ class FourierSums(NamedTuple):
 
 @record
 class Response:
-    """Fourier coefficients, at the lines of `wave`, of what the controller reads (m) and of u (V).
+    """Fold: Fourier coefficients, at the frequencies of `wave`, of the reading with e (m or m/s) and of u (V).
 
-    The sums are over the samples from number `skip` on, a whole number of periods of the wave. `u_max`: limit of the
-    supply, V. The result is a `FourierSums` with real and imaginary parts of the coefficients, and with the share of
-    samples at u_max.
+    - `wave`: the multi-sine.
+    - `u_max`: limit of the supply, V.
+    - `skip`: number of the first sample that counts. The samples from there on are whole periods of the wave.
+
+    The result is a `FourierSums` with the coefficients instead of the sums, and with `saturated` as a share of the
+    samples.
     """
 
     wave: MultiSine

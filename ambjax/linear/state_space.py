@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-# Inputs: numbers added to the readings of z (m) and z_dot (m/s), and a disturbance q_z (m/s^2).
+# Inputs: test signals added to the readings of z (m) and z_dot (m/s), and a disturbance q_z (m/s^2).
 INPUTS = ("e_z", "e_z_dot", "q_z")
-# Outputs: what the controller reads of z (m) and z_dot (m/s), the voltage u (V), and the rotor's position z (m).
+# Outputs: the readings of z (m) and z_dot (m/s), test signals included, the voltage u (V), and the true position z (m).
 OUTPUTS = ("z_read", "z_dot_read", "u", "z")
 
 
@@ -17,7 +17,7 @@ class StateSpace(NamedTuple):
 
     - `A` [N, N], `B` [N, 3], `C` [4, N], `D` [4, 3]: matrices in SI units, with the inputs INPUTS and the outputs
       OUTPUTS. On a processor the disturbance q_z is held over a sample.
-    - `sizes` [N]: characteristic sizes of the states, used to scale the matrices for numerical work.
+    - `sizes` [N]: characteristic sizes of the states, with which `scaled` improves the conditioning.
     - `period`: sample period, s; None in continuous time.
     """
 
@@ -29,14 +29,15 @@ class StateSpace(NamedTuple):
     period: Array | None = None
 
     def scaled(self) -> "StateSpace":
-        """Return the same system with states relative to their sizes."""
+        """Return the same system with each state divided by its size."""
         s = self.sizes
         return self._replace(A=self.A * s / s[:, None], B=self.B / s[:, None], C=self.C * s, sizes=s / s)
 
     def response(self, frequency: Array | np.ndarray) -> Array:
-        """Return the frequency response [F, 4, 3], complex: outputs, inputs; at frequencies [F] in Hz.
+        """Return the complex frequency response at frequencies [F] in Hz, as an array [F, 4 outputs, 3 inputs].
 
-        Arrays of NumPy are computed by NumPy, without compilation; those of JAX are differentiable.
+        If the matrices are NumPy arrays, NumPy computes the response, without compilation. If they are JAX arrays, it
+        is differentiable.
         """
         np_ = np if isinstance(self.A, np.ndarray) else jnp
         A, B, C, D, *_ = self.scaled()
@@ -46,7 +47,7 @@ class StateSpace(NamedTuple):
         return C @ x + D
 
     def sensitivity(self, frequency: Array | np.ndarray) -> Array:
-        """Return S [F], complex: what the controller reads of z per number added to the reading."""
+        """Return S [F] at frequencies [F] in Hz: the complex response of the reading of z to a test signal on it."""
         return self.response(frequency)[:, 0, 0]
 
     def poles(self) -> np.ndarray:
@@ -60,9 +61,9 @@ class StateSpace(NamedTuple):
         return bool(np.all(np.real(poles) < 0) if self.period is None else np.all(np.abs(poles) < 1))
 
     def to_control(self) -> Any:
-        """Return the system as a StateSpace of python-control, with named inputs and outputs.
+        """Return the system as a `StateSpace` of python-control, with the names INPUTS and OUTPUTS.
 
-        Raises ValueError if python-control is not installed.
+        Raises ValueError if python-control is not installed (extra `[control]`).
         """
         try:
             import control

@@ -1,8 +1,7 @@
-"""Records: frozen dataclasses that are JAX pytrees, with fields that declare unit and bounds.
+"""Records: frozen dataclasses that are JAX pytrees and whose fields declare their unit, bounds and meaning.
 
 The leaves of a record are numbers that may be traced, batched and differentiated. Its type and its static fields are
-part of the tree structure. Each field declares unit, bounds and meaning once, for the case-file reader, the template
-and `validate`.
+part of the tree structure. The case-file reader, the template, the reference and `validate` use the declarations.
 """
 
 import dataclasses
@@ -21,8 +20,8 @@ from jax.core import Tracer
 
 T = TypeVar("T")
 
-# A real number of one member, traced or not; an array of them for an ensemble. Arrays of NumPy work too, but are not in
-# the type: type checkers take the product of an array of NumPy and one of JAX for one of NumPy.
+# A real number of one member, traced or not, or an array of numbers for an ensemble. NumPy arrays work too, but are not
+# in the type, because type checkers take the product of a NumPy array and a JAX array for a NumPy array.
 Scalar: TypeAlias = Array | float
 
 
@@ -38,18 +37,19 @@ def leaf(
     whole: bool = False,
     optional: bool = False,
 ) -> Any:
-    """Declare a numeric field.
+    """Declare a numeric field of a record.
 
-    - `unit`: its unit.
-    - `doc`: its meaning.
+    - `default`: default value; without it the field is required.
+    - `unit`: unit of the value.
+    - `doc`: meaning of the value.
     - `above`, `at_least`: exclusive and inclusive lower bound.
     - `at_most`: inclusive upper bound.
-    - `infinite`: allow +inf too.
-    - `whole`: allow whole numbers only.
-    - `optional`: allow None.
+    - `infinite`: whether +inf is also allowed.
+    - `whole`: whether only whole numbers are allowed.
+    - `optional`: whether None is allowed.
 
     Bounds are decades beyond practical values. They ensure that a product of a few numbers neither overflows nor
-    underflows to 0.
+    underflows to 0. Returns the dataclass field.
     """
     metadata = {
         "unit": unit,
@@ -65,22 +65,24 @@ def leaf(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-# Bounds of all gains. They are wide, because the unit and the size of a gain depend on the law and the plant.
+# Lower (exclusive) and upper bound of all gains. They are wide, because the unit and the size of a gain depend on the
+# law and the plant.
 GAINS = 1e-30, 1e30
 
 
 def gain(*, default: object, unit: str, doc: str, steepness: bool = False) -> Any:
-    """Declare a gain: a positive numeric field, tuned on a logarithmic scale.
+    """Declare a gain: a positive numeric field of a law, which the tuner varies on a logarithmic scale.
 
-    `steepness`: whether it is the steepness of a smoothed sign, which is matched to the plant, and tuned only on
-    request. On a processor it may be inf, for the set-valued sign.
+    `default`, `unit` and `doc` are those of `leaf`. `steepness`: whether the gain is the steepness of a smoothed sign.
+    The default of a steepness is scaled to the plant, and the tuner varies it only on request. On a processor it may be
+    inf, which selects the set-valued sign. Returns the dataclass field.
     """
     plain = leaf(default=default, unit=unit, doc=doc, above=GAINS[0], at_most=GAINS[1], infinite=steepness)
     return dataclasses.field(default=default, metadata={**plain.metadata, "steepness": steepness})
 
 
 def static(default: object = dataclasses.MISSING, *, doc: str = "") -> Any:
-    """Declare a field that is part of the tree structure: hashable, never traced."""
+    """Declare a field that is part of the tree structure. Its value is hashable and never traced."""
     return dataclasses.field(default=default, metadata={"static": True, "doc": doc})
 
 
@@ -88,8 +90,8 @@ def static(default: object = dataclasses.MISSING, *, doc: str = "") -> Any:
 def record(cls: type[T]) -> type[T]:
     """Make `cls` a frozen dataclass and register it as a pytree.
 
-    The type is part of the tree structure. With JAX's `register_dataclass` the structures of two types with equal
-    static fields compare equal, so that the compiled program of one law could be used for another.
+    The type becomes part of the tree structure. With JAX's `register_dataclass`, the structures of two types with equal
+    static fields compare equal, so that JAX could run the compiled program of one law for another.
     """
     record_type = dataclasses.dataclass(frozen=True)(cls)
     fields = dataclasses.fields(record_type)  # pyright: ignore[reportArgumentType]
@@ -120,19 +122,30 @@ def record(cls: type[T]) -> type[T]:
 
 
 def _getter(names: list[str]) -> Callable[[object], tuple[object, ...]]:
-    """Return a fast function from an object to its attributes: a rollout flattens about twenty records three times."""
+    """Return a fast function from an object to the tuple of its attributes `names`.
+
+    Speed matters because a rollout flattens about twenty records three times.
+    """
     if len(names) > 1:
         return operator.attrgetter(*names)
     return lambda node: tuple(getattr(node, name) for name in names)
 
 
+class GainFunction:
+    """Base class of a record that stands in a law in the place of a gain, as a function of a signal."""
+
+    def check(self, field: dataclasses.Field, path: str) -> None:
+        """Raise ValueError unless the record may stand in the place of the number `field`, at a dotted path."""
+        raise NotImplementedError
+
+
 def is_traced(x: object) -> bool:
-    """Return whether x is traced by a JAX transformation, and has no concrete value."""
+    """Return whether a JAX transformation traces x, so that x has no concrete value."""
     return isinstance(x, Tracer)
 
 
 def numbers(field: dataclasses.Field) -> str:
-    """Describe the numbers that a field allows, in words."""
+    """Return the allowed values of a numeric field in words, with the unit."""
     meta = field.metadata
     above, at_least, at_most = meta["above"], meta["at_least"], meta["at_most"]
     unit = f" ({meta['unit']})" if meta["unit"] else ""
@@ -148,7 +161,7 @@ def numbers(field: dataclasses.Field) -> str:
 
 
 def within(meta: Mapping[str, Any], value: npt.ArrayLike) -> bool:
-    """Return whether a field with this metadata allows a number, or every number of an array."""
+    """Return whether a field with the metadata `meta` allows a number, or every number of an array."""
     if isinstance(value, (int, float)):
         if value == math.inf:
             return meta["infinite"]
@@ -166,26 +179,30 @@ def within(meta: Mapping[str, Any], value: npt.ArrayLike) -> bool:
 
 
 def _example(field: dataclasses.Field) -> str:
+    """Return a sentence that proposes the default of a field; empty if the default is not a finite number."""
     default = field.default
     usable = isinstance(default, (int, float)) and math.isfinite(default)
     return f" Use {default:g}, for example." if usable else ""
 
 
 def check_number(field: dataclasses.Field, name: str, value: object) -> None:
-    """Raise ValueError, with the dotted name, the value and the allowed range, for a number outside that range."""
+    """Raise ValueError if `field` does not allow `value`, a number or an array.
+
+    The message contains the dotted name, the value, the allowed range and, if there is one, the default.
+    """
     try:
         number = value if isinstance(value, (int, float)) else np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         number = math.nan
     if not within(field.metadata, number):
-        shown = f"{value:g}" if isinstance(value, (int, float)) else _worst(value, number)
+        shown = f"{value:g}" if isinstance(value, (int, float)) else _shown(value, number)
         raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.{_example(field)}")
 
 
 def validate(node: object, path: str = "") -> None:
-    """Check every concrete leaf under `node` against its field. Traced leaves are not checked.
+    """Check every leaf of the records in `node` against the bounds of its field. Traced leaves are not checked.
 
-    Raises ValueError with the dotted path, the value, the allowed range and an example.
+    `path`: dotted path of `node`, for messages. Raises ValueError as `check_number` does.
     """
     if isinstance(node, (tuple, list)):
         for index, item in enumerate(node):
@@ -195,6 +212,8 @@ def validate(node: object, path: str = "") -> None:
         value = getattr(node, field.name)
         if not is_leaf:
             validate(value, f"{path}.{field.name}".lstrip("."))
+        elif isinstance(value, GainFunction):
+            value.check(field, f"{path}.{field.name}".lstrip("."))
         elif not (
             is_traced(value) or (value is None and (field.metadata["optional"] or field.metadata.get("steepness")))
         ):
@@ -203,25 +222,25 @@ def validate(node: object, path: str = "") -> None:
 
 @functools.cache
 def _fields(kind: type) -> tuple[tuple[dataclasses.Field, bool], ...]:
-    """Return the fields of a record type, and whether each is a leaf; () for other types. Cached for speed."""
+    """Return the fields of a record type, and whether each is a leaf; () for a type that is no record. Cached."""
     fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
     return tuple((field, bool(field.metadata.get("leaf"))) for field in fields)
 
 
-def _worst(value: object, number: npt.ArrayLike) -> str:
-    """Return the text for an invalid value in a message; for an array, its range."""
+def _shown(value: object, number: npt.ArrayLike) -> str:
+    """Return the text of an invalid value for a message: the range of an array, or the value as Python shows it."""
     return f"{np.min(number):g} to {np.max(number):g}" if np.ndim(number) else repr(value)
 
 
-# Leaves that are integers. All other leaves become floating-point numbers, also if they are given as integers.
+# Names of the leaves that are integers. All other leaves become floating-point numbers, even if given as integers.
 WHOLE = ("seed", "member")
 
 
 def canonical(node: T) -> T:
-    """Return the pytree with every number as an array of the working precision, or of integers for leaves in WHOLE.
+    """Return the pytree with every leaf as an array of JAX's default floating-point type, or integer type for WHOLE.
 
-    Python numbers, NumPy scalars and arrays then trace alike, so that a change of a value or of its Python type never
-    recompiles.
+    Python numbers, NumPy scalars and arrays then have the same JAX type, so that a change of a value or of its Python
+    type does not cause a recompilation.
     """
     leaves, tree = jax.tree.flatten(node)
     kinds = jnp.result_type(float), jnp.result_type(int)

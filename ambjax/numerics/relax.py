@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.compiler.barrier import compiled_alone
+from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.numerics.records import Scalar
 from ambjax.numerics.smooth import TWO_OVER_PI, arctan_per, limited, refined, safe_sqrt, smooth_root, smooth_sign
 
@@ -33,6 +33,7 @@ def relax(w: Scalar, h: Scalar, p: Scalar | None) -> Array:
     """Return the w+ with w+ + h sgn_p(w+) = w. h >= 0 has the unit of w, and p its inverse."""
     w, h = jnp.asarray(w), jnp.asarray(h)
     if p is None:
+        w = materialised(w)
         return w - limited(w, h)
     return _relaxed(p * w, TWO_OVER_PI * p * h) / p
 
@@ -134,21 +135,27 @@ def _second_derivative(y: Array, a: Array, b: Array, p: Array) -> Array:
     return y * (a * root / 2 + b * TWO_OVER_PI * p * (p / flat) ** 2)
 
 
-def relaxation(w: Array, drift: Array, gain: Scalar, p: Scalar, h: Scalar) -> tuple[Array, Array, Array]:
+def relaxation(
+    w: Array, drift: Array, gain: Scalar, p: Scalar, h: Scalar
+) -> tuple[Array, Array, Array, tuple[Array, Array, Array]]:
     """Solve w' = drift - gain sgn(w) over h (s) approximately, with two constant values of gain sgn(w).
 
     First w slides at its initial rate until it reaches the boundary layer of the sign, or until the end. The rest is
     one backward Euler step.
 
-    Returns the first value, the second value, and the duration of the first, s.
+    Returns the first value, the second value, the duration of the first, s, and w at the start, at the end of the first
+    value and at the end of the step.
     """
+    w, drift = materialised((w, drift))
     first = gain * smooth_sign(w, p)
     closing = first - drift
     outside = jnp.sign(w) * jnp.maximum(jnp.abs(w) - EDGE / p, 0.0)
     safe = jnp.where(closing == 0, 1.0, closing)
     tau = jnp.where(outside * closing > 0, jnp.minimum(outside * (1 / safe), h), 0.0)
     left = h - tau
-    return first, gain * smooth_sign(_backward_euler(w - tau * closing + left * drift, left * gain, p), p), tau
+    second = gain * smooth_sign(_backward_euler(w - tau * closing + left * drift, left * gain, p), p)
+    between = w + tau * (drift - first)
+    return first, second, tau, (w, between, between + left * (drift - second))
 
 
 @jax.custom_jvp

@@ -20,7 +20,10 @@ GAP = float(Plant().s_0)
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """A claim: its statement, its section in the paper, the paper's number, the criterion, and its judge."""
+    """A claim: its statement, its section in the paper, the paper's number, the criterion, and its judge.
+
+    `judge`: the function that computes the finding from the evidence of a reading.
+    """
 
     says: str
     where: str
@@ -63,13 +66,12 @@ def _theorem(evidence: Evidence) -> Finding:
 
 @claim(
     "The origin is uniformly asymptotically stable", "abstract, 3.5", "proven",
-    "rotor returns from z(0) off the origin with currents in equilibrium, and from zero currents",
+    "rotor held after a start at rest off the origin, currents in equilibrium, and after a start with zero currents",
 )  # fmt: skip
 def _stable(evidence: Evidence) -> Finding:
     basin, unknown = evidence.basin
-    cause = (
-        f"returns from rest at |z(0)| up to {basin:.1e} m, {100 * basin / GAP:.2g} % of the gap ({len(BASIN)} tried)"
-    )
+    share = 100 * basin / GAP
+    cause = f"held after a start at |z(0)| up to {basin:.1e} m, {share:.2g} % of the gap ({len(BASIN)} values tried)"
     if unknown is not None:
         cause += f"; not decided at {unknown:.1e} m, where the integrator stalled"
     if ended := unfinished(evidence.regulation, evidence):
@@ -118,14 +120,14 @@ def _radius(evidence: Evidence) -> Finding:
     rows = evidence.regulation.trajectory.rows
     quiet, pulse = largest_in(rows, "sigma", SETTLE, PULSE.start), largest_in(rows, "sigma", PULSE.start, PULSE.stop)
     worst = max(quiet, pulse)
-    cause = f"{quiet:.1e} m/s before the pulse, {pulse:.1e} in it; without noise, k 2/pi arctan(p sigma) balances q_z"
+    cause = f"{quiet:.1e} m/s before the pulse, {pulse:.1e} in it; no noise, finite p: k 2/pi arctan(p sigma) = q_z"
     ended = unfinished(evidence.regulation, evidence)
     return ended or finding(f"{worst:.1e} m/s", worst, worst <= 1.05 * SIGMA_RADIUS, cause)
 
 
 @claim(
     "That radius is due to the noise of variance 1e-7", "4", f"std {TABLE_2.noise_std:.2e} m",
-    "radius reached at a std within 25 % of the printed one, at some sample period",
+    "radius reached at a std within 25 % of the printed one, at one of the sample periods tried",
 )  # fmt: skip
 def _radius_by_noise(evidence: Evidence) -> Finding:
     stds = {n.sample_period: n.std_for(SIGMA_RADIUS) for n in evidence.noise}
@@ -136,13 +138,13 @@ def _radius_by_noise(evidence: Evidence) -> Finding:
         return ended or Finding("at no std scanned", None, verdict, "see the noise table")
     nearest = max(hits.values())
     cause = f"the printed std is {TABLE_2.noise_std / nearest:.0f} times the largest that gives this radius"
-    words = "at std " + ", ".join(f"{std:.1e} m held {period:g} s" for period, std in hits.items())
+    words = "at std " + ", ".join(f"{std:.1e} m, period {period:g} s" for period, std in hits.items())
     return finding(words, nearest, 0.8 <= nearest / TABLE_2.noise_std <= 1.25, cause)
 
 
 def _pulse_effect(evidence: Evidence, run: Run) -> Finding:
     change = float(np.abs(run.trajectory.rows.z - run.quiet.rows.z).max())
-    cause = f"the pulse moves the rotor by {100 * change / GAP:.2g} % of the gap; without noise by q_z pi / (2 c k p)"
+    cause = f"the pulse moves the rotor by {100 * change / GAP:.2g} % of the gap; with finite p, by q_z pi / (2 c k p)"
     return unfinished(run, evidence) or finding(f"{change:.3e} m", change, change <= TRACKING_ERROR, cause)
 
 
@@ -175,7 +177,7 @@ def _inversion_tracking(evidence: Evidence) -> Finding:
 @claim("The current tracks its reference", "4", "-", "settled |i - i_ref| < 1e-3 A, both scenarios")
 def _current(evidence: Evidence) -> Finding:
     worst = max(r.metrics["settled_max_abs_current_error_A"] for r in (evidence.regulation, evidence.tracking))
-    cause = f"largest |i - i_ref| after {SETTLE} s, pulse included; q_i = 0, so Eq. (14) decays to 0 unless u saturates"
+    cause = f"largest |i - i_ref| after {SETTLE} s, pulse included; q_i = 0, so e decays by Eq. (14) unless u saturates"
     ended = unfinished(evidence.regulation, evidence) or unfinished(evidence.tracking, evidence)
     return ended or finding(f"{worst:.1e} A", worst, worst < 1e-3, cause)
 
@@ -195,7 +197,7 @@ def _rejection(evidence: Evidence) -> Finding:
 
 
 @claim(
-    "All this under sensor noise of variance 1e-7",
+    "The rotor is held under sensor noise of variance 1e-7",
     "4",
     f"std {TABLE_2.noise_std:.2e} m",
     "no member lost at the printed std",
@@ -204,12 +206,12 @@ def _noise(evidence: Evidence) -> Finding:
     largest = max(n.survived for n in evidence.noise)
     unknown = sum(bool(n.stalled.any()) and not n.lost.any() for n in evidence.noise)
     if largest == 0.0 and not unknown:
-        return Finding("survives none", 0.0, FAILS, "the rotor is lost at the smallest noise and without noise")
-    words = "survives std " + ", ".join(f"{n.survived:.1e} m held {n.sample_period:g} s" for n in evidence.noise)
+        return Finding("lost at every std", 0.0, FAILS, "the rotor is lost at the smallest noise and without noise")
+    words = "held up to std " + ", ".join(f"{n.survived:.1e} m, period {n.sample_period:g} s" for n in evidence.noise)
     survivors = sum(n.survived >= TABLE_2.noise_std * 0.999 for n in evidence.noise)
-    cause = f"the printed std is survived at {survivors} of {len(evidence.noise)} sample periods tried"
+    cause = f"held at the printed std with {survivors} of {len(evidence.noise)} sample periods of the noise"
     if unknown:
-        cause += f"; not decided at {unknown}, where the integrator stalled"
+        cause += f"; not decided with {unknown}, where the integrator stalled"
         return Finding(words, largest, UNDECIDED, cause)
     partial = 0 < survivors < len(evidence.noise)
     return Finding(words, largest, OPEN if partial else HOLDS if survivors else FAILS, cause)
@@ -219,15 +221,15 @@ def _noise(evidence: Evidence) -> Finding:
 def _specification(evidence: Evidence) -> Finding:
     if not any(n.survived for n in evidence.noise):
         return Finding(
-            "no survivor", None, OPEN, "the rotor survives none of the noise levels, so nothing can be compared"
+            "always lost", None, OPEN, "the rotor is lost at every noise level, so the radii cannot be compared"
         )
     if len(evidence.noise) == 1:
-        words = f"held {evidence.noise[0].sample_period:g} s"
-        return Finding(words, None, OPEN, "on a processor, noise is held for its period; the paper gives no period")
+        words = f"period {evidence.noise[0].sample_period:g} s"
+        return Finding(words, None, OPEN, "only the period of the processor was simulated; the paper gives no period")
     radii = [float(n.sigma[0]) for n in evidence.noise]
     spread = max(radii) / min(radii)
-    cause = f"at std {NOISE_STDS[0]:.0e} m the radius differs {spread:.1f}-fold between sample periods; none is given"
-    return Finding(f"radius varies {spread:.1f}-fold", spread, OPEN if spread > 1.1 else HOLDS, cause)
+    cause = f"at std {NOISE_STDS[0]:.0e} m, ratio of the radii at the sample periods tried; the paper gives no period"
+    return Finding(f"radius varies by a factor of {spread:.1f}", spread, OPEN if spread > 1.1 else HOLDS, cause)
 
 
 @claim("The noise is about 20 % of the gap", "4", "20 %", "3 std within 18 to 22 % of s_0")
@@ -244,10 +246,9 @@ def _robust(evidence: Evidence) -> Finding:
     lost, stalled, error = evidence.uncertain
     cases = f"{2 * len(UNCERTAIN)} cases"
     if lost:
-        return Finding(f"lost in {len(lost)} of {cases}", None, FAILS, "true " + ", ".join(lost))
+        return Finding(f"lost in {len(lost)} of {cases}", None, FAILS, "lost with the true " + ", ".join(lost))
     if stalled:
-        return Finding(f"stalled in {len(stalled)} of {cases}", None, UNDECIDED, "true " + ", ".join(stalled))
-    cause = (
-        f"one of {', '.join(UNCERTAIN)} off by 10 % up or down, controller unchanged; our choice, the paper tests none"
-    )
+        cause = "stalled with the true " + ", ".join(stalled)
+        return Finding(f"stalled in {len(stalled)} of {cases}", None, UNDECIDED, cause)
+    cause = f"one of {', '.join(UNCERTAIN)} 10 % larger or smaller, controller unchanged; the paper tests no such case"
     return finding(f"{error:.1e} m at worst", error, error < 0.01 * GAP, cause)

@@ -34,7 +34,7 @@ SEEDS = 2
 BASIN = np.logspace(-7, -3, 10)
 # The plant's parameters that are varied, one at a time.
 UNCERTAIN = ("m", "k_z", "R", "A")
-# Steps of a reading under held noise, instead of adaptive ones: half the cost, and within 4e-9 m of them (tested).
+# Fixed steps of a reading under held noise. They cost half as much as adaptive steps and agree to 4e-9 m (tested).
 STEPS = {"tuned": Slide(16)}
 
 
@@ -57,10 +57,10 @@ class Survival(NamedTuple):
     undecided: float | None
 
 
-def held(tried: np.ndarray, lost: np.ndarray, stalled: np.ndarray) -> Survival:
+def survival_of(tried: np.ndarray, lost: np.ndarray, stalled: np.ndarray) -> Survival:
     """Return the survival of a scan over the ascending values `tried` [N].
 
-    `lost`, `stalled`: bool [N], whether any member at this value is lost, or stalled.
+    `lost`, `stalled`: bool [N], whether a member at this value is lost or stalled.
     """
     ended = np.flatnonzero(lost | stalled)
     first = int(ended[0]) if ended.size else len(tried)
@@ -69,10 +69,10 @@ def held(tried: np.ndarray, lost: np.ndarray, stalled: np.ndarray) -> Survival:
 
 
 class Noise(NamedTuple):
-    """The noise scan at one sample period, s, over `horizon`, s.
+    """The noise scan at one sample period (s); each run takes `horizon` (s).
 
-    For each of NOISE_STDS: whether a member is lost, whether one is stalled, and the largest settled |sigma|, m/s, mean
-    over the seeds.
+    Arrays with one entry for each of NOISE_STDS: whether a member is lost, whether a member is stalled, and the mean
+    over the seeds of the largest settled |sigma|, m/s.
     """
 
     sample_period: float
@@ -83,13 +83,13 @@ class Noise(NamedTuple):
 
     @property
     def survived(self) -> float:
-        """Largest std, in m, up to which every member survives; 0 if one does not at the smallest."""
-        return held(NOISE_STDS, self.lost, self.stalled).upto
+        """Largest std, in m, up to which every member survives; 0 if a member is lost or stalled at the smallest."""
+        return survival_of(NOISE_STDS, self.lost, self.stalled).upto
 
     @property
     def undecided(self) -> float | None:
         """The next std, in m, if no member is lost there but one stalled; else None."""
-        return held(NOISE_STDS, self.lost, self.stalled).undecided
+        return survival_of(NOISE_STDS, self.lost, self.stalled).undecided
 
     def std_for(self, radius: float) -> float | None:
         """Return the std, m, at which sigma's neighbourhood has this radius, m/s; None if the scan does not reach it.
@@ -104,7 +104,7 @@ class Noise(NamedTuple):
 
 
 class Uncertain(NamedTuple):
-    """Tracking with one true parameter off: the lost cases, the stalled cases, and the largest settled error, m."""
+    """Tracking with one parameter of the plant changed: lost cases, stalled cases, and the largest settled error, m."""
 
     lost: list[str]
     stalled: list[str]
@@ -119,12 +119,12 @@ class Evidence(NamedTuple):
     noisy: Trajectory
     """tracking under the paper's noise and supply"""
     on_processor: dict[bool, Run]
-    """tracking on the processor of `sampled`: without noise, where the reading has none; under noise (True)"""
+    """tracking on the processor of `sampled`, under noise (True); for readings without noise also without it (False)"""
     check_regulation: Report
     check_tracking: Report
     noise: list[Noise]
     basin: Survival
-    """|z(0)| in m up to which the rotor returns from currents of equilibrium"""
+    """|z(0)| in m up to which the rotor is held after a start at rest with the equilibrium currents for z = 0"""
     uncertain: Uncertain
 
 
@@ -154,8 +154,8 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
     basin = _basin(cascade, reading)
     say(f"{reading}: uncertain plant")
     uncertain = _uncertain(cascade, reading)
-    judged = checks["regulation"], checks["tracking"]
-    return Evidence(runs["regulation"], runs["tracking"], noisy, on_processor, *judged, noise, basin, uncertain)
+    reports = checks["regulation"], checks["tracking"]
+    return Evidence(runs["regulation"], runs["tracking"], noisy, on_processor, *reports, noise, basin, uncertain)
 
 
 def _simulate(reading: str, cascade: Cascade, scenario: Scenario) -> Run:
@@ -180,7 +180,7 @@ def _run(cascade: Cascade, reading: str, name: str) -> Run:
 
 
 def _uncertain(cascade: Cascade, reading: str) -> Uncertain:
-    """Simulate tracking with one true parameter at a time 10 % off the controller's model."""
+    """Simulate tracking with one parameter of the plant at a time 10 % larger or smaller than in the model."""
     cases = [(name, factor) for name in UNCERTAIN for factor in (0.9, 1.1)]
 
     def one(case: tuple[str, float]) -> dict[str, float]:
@@ -199,7 +199,10 @@ def _uncertain(cascade: Cascade, reading: str) -> Uncertain:
 
 @one_kernel
 def _scan(cascade: Cascade, scenarios: Scenario, clock: Clock) -> dict[str, Any]:
-    """Return the metrics of each member. They run in sequence: in a batch, all would wait for the stiffest."""
+    """Return the metrics of each member.
+
+    Members run one by one, because every member of a batch would take as many steps as the stiffest one.
+    """
     fold = Standard(0.4 * clock.duration)
     return jax.lax.map(lambda s: rollout(cascade, s, clock, fold=fold, every=0).measured, scenarios)
 
@@ -241,4 +244,4 @@ def _basin(cascade: Cascade, reading: str) -> Survival:
     scenarios = _batch(dataclasses.replace(quiet, sensor=Sensor()), size, initial=initial)
     metrics = _scan(*canonical(_scanned(start, scenarios, float(paper.CLOCK.sample_period))))
     ended = [np.reshape(metrics[status], (2, -1)) for status in ("lost", "stalled")]
-    return held(BASIN, *(either[0] | either[1] for either in ended))
+    return survival_of(BASIN, *(either[0] | either[1] for either in ended))

@@ -16,13 +16,13 @@ def _gains(gains: Tuned) -> str:
 
 
 TUNED_WORDS = (
-    f"every run under the paper's noise (std {TABLE_2.noise_std:.2e} m on z, held {float(CLOCK.sample_period):g} s) "
-    f"and a supply of {SUPPLY:g} V, disturbance as scaled force, complementary observer, gains by gradients: "
-    + _gains(TUNED)
+    f"the paper's noise (std {TABLE_2.noise_std:.2e} m on z, held {float(CLOCK.sample_period):g} s) except in the "
+    f"scans of noise and basin, a supply of {SUPPLY:g} V, disturbance as scaled force, complementary observer, gains "
+    "found by `ambjax tune`: " + _gains(TUNED)
 )
 SAMPLED_WORDS = (
     f"as `tuned`, on a processor of {1 / float(CLOCK.sample_period):g} Hz: {PROCESSOR.resolved()}; signs without a "
-    f"boundary layer, gains tuned on this processor for plants off by up to 10 %: {_gains(SAMPLED)}"
+    f"boundary layer, gains tuned on this processor for plants that differ by up to 10 %: {_gains(SAMPLED)}"
 )
 
 
@@ -39,8 +39,8 @@ def judge(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
 def noise_table(evidence: dict[str, Evidence]) -> list[dict[str, object]]:
     """Return the noise scan as plain data, one row for each reading and sample period.
 
-    A row has the largest std survived, m; the next std if it is not decided (else None); and the std at which sigma's
-    neighbourhood has the radius 6e-6 m/s (None: not reached).
+    A row has the largest std (m) at which the rotor survives; the next std if it is not decided there (else None); and
+    the std at which sigma's neighbourhood has the radius 6e-6 m/s (None: not reached).
     """
     return [
         {
@@ -152,9 +152,9 @@ def markdown(
     for row in rows:
         lines.append(f"- **{row['says']}** ({row['criterion']})")
         lines += [f"  - {name}: {f['verdict']}; {f['cause']}" for name, f in row["findings"].items()]
-    lines += ["", "## Noise survived (regulation without the pulse, noise on z alone, two seeds)", ""]
+    lines += ["", "## Noise at which the rotor is held (regulation without the pulse, noise on z only, two seeds)", ""]
     lines += [
-        "| reading | held for | horizon | largest std survived | std that gives sigma 6e-6 m/s |",
+        "| reading | sample period | duration | largest std | std with max \\|sigma\\| = 6e-6 m/s |",
         "|---|---|---|---|---|",
     ]
     for n in noise:

@@ -38,7 +38,13 @@ MARKS: dict[float, tuple[Any, str]] = {0.5: ("-", "median"), 0.95: ("--", "95 % 
 
 @own_style
 def histograms(columns: Mapping[str, np.ndarray], path: pathlib.Path, metrics: Sequence[str] = CHIEF) -> None:
-    """Write histograms of the `metrics` in `columns` (of members.npz, each [N]), with survivors and lost apart.
+    """Write the picture of `histogram_figure` to a file."""
+    histogram_figure(columns, metrics).savefig(path, dpi=130)
+
+
+@own_style
+def histogram_figure(columns: Mapping[str, np.ndarray], metrics: Sequence[str] = CHIEF) -> Figure:
+    """Return histograms of the `metrics` in `columns` (of members.npz, each [N]), with survivors and lost apart.
 
     A member with a finite `lost_at` or `lost_at_s` does not survive; without these columns all survive. `stalled` marks
     members at which the integrator stalled. Raises ValueError if `columns` has none of the metrics.
@@ -61,7 +67,7 @@ def histograms(columns: Mapping[str, np.ndarray], path: pathlib.Path, metrics: S
     keys += [Line2D([], [], color=INK, linestyle=s, label=f"{n} of survivors") for s, n in MARKS.values()]
     figure.suptitle(f"{lost.size} members, {statuses(int(lost.sum()) - open_, open_)}", fontsize=11)
     figure.legend(handles=keys, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    figure.savefig(path, dpi=130)
+    return figure
 
 
 def _lost(columns: Mapping[str, object], members: int) -> np.ndarray:

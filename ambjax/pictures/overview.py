@@ -30,7 +30,13 @@ TURNS = 40
 
 @own_style
 def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tuple[float, float] | None = None) -> None:
-    """Write one page with every signal of a run, over the whole run, and enlarged at its start and at its end.
+    """Write the picture of `overview_figure` to a file."""
+    overview_figure(trajectory, title, window).savefig(path, dpi=130)
+
+
+@own_style
+def overview_figure(trajectory: Trajectory, title: str, window: tuple[float, float] | None = None) -> Figure:
+    """Return one page with every signal of a run, over the whole run, and enlarged at its start and at its end.
 
     `window`: begin and end, s; the page then shows only this stretch.
     """
@@ -64,7 +70,7 @@ def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tup
         lowest.set_xlabel("time (s)")
     figure.align_ylabels(axes[:, 0])
     figure.suptitle(title, fontsize=12, y=1 - 0.15 / height, va="top")
-    figure.savefig(path, dpi=130)
+    return figure
 
 
 def _panels(trajectory: Trajectory) -> tuple[Panel, ...]:

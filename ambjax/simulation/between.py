@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.cascade import Command
+from ambjax.control.cascade_state import Command
 from ambjax.numerics.records import Scalar
 from ambjax.simulation.edges import NO_EDGES, Edges
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.loop import SHOWN, ClosedLoop, Densities, ExternalInputs, Sizes
 from ambjax.simulation.span import Instant
 from ambjax.world.amplifier import Amplifier
+from ambjax.world.sensor import Measurement
 
 Voltage = Callable[[Scalar], Array]
 
@@ -87,6 +88,16 @@ def lags(loop: ClosedLoop) -> bool:
     return sensor is not None and sensor.bandwidth is not None
 
 
+def sensed_motion(loop: ClosedLoop, plant: Any, t: Scalar) -> Measurement:
+    """Return the motion of the surface that the position sensor reads at t (s): that of the plant, plus the runout."""
+    motion, sensor = loop.scenario.plant.measurement(plant), loop.scenario.sensor
+    if sensor is None or sensor.runout is None:
+        return motion
+    t = jnp.asarray(t, jnp.result_type(float))
+    runout, rate = jax.jvp(sensor.runout, (t,), (jnp.ones_like(t),))
+    return motion._replace(z=motion.z + runout, z_dot=motion.z_dot + rate)
+
+
 def plant_status(loop: ClosedLoop, state: object) -> Array:
     """Return the status code of the plant's state."""
     return loop.status_of(state, loop.scenario.plant.scale(), state)
@@ -102,12 +113,13 @@ def _under(loop: ClosedLoop, state: object, command: Command, voltage: Voltage, 
 
     def rates(inputs: tuple[ExternalInputs, Array], x: object) -> object:
         outside, u = inputs
-        return plant.rates(x, _at_coil(loop, outside, u, x), outside.q_z, outside.q_i)
+        q_z = loop.scenario.pushed(outside.q_z, plant.measurement(x))
+        return plant.rates(x, _at_coil(loop, outside, u, x), q_z, outside.q_i)
 
     def observed(inputs: tuple[ExternalInputs, Array], x: object) -> tuple[object, Instant]:
         (outside, u), motion, heat = inputs, plant.measurement(x), plant.signals(x).heat
         u = _at_coil(loop, outside, u, x)
-        sigma = loop.cascade.position.sigma(motion, outside.reference)
+        sigma = loop.cascade.sigma(motion, outside.reference)
         sizes = Sizes(motion.z, motion.z - outside.reference.r, sigma, u, motion.i, e, command.v_tilde)
         return rates(inputs, x), Instant(sizes, Densities(u, u * u, heat))
 

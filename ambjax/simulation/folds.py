@@ -1,8 +1,8 @@
-"""Folds, which process one row at a time and keep a few numbers for a run of any length.
+"""Folds, which accumulate metrics sample by sample and store a few numbers only, whatever the length of a run.
 
 A fold is a record with `init() -> carry`, `update(carry, row, span) -> carry` and `result(carry, ending) -> numbers`.
-`row` holds the signals at the start of a sample, and `span` the extremes and integrals from there to the next sample
-(`span`, `loop.Sizes`, `loop.Densities`).
+`row` contains the signals at the start of a sample; `span` contains extremes and integrals of signals from there to the
+next sample (`simulation.span`, `loop.Sizes`, `loop.Densities`).
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from ambjax.numerics.smooth import safe_sqrt
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import Row, first_time
 
-# What a fold keeps from one sample to the next, and its result: pytrees of numbers.
+# Types of the numbers that a fold carries from one sample to the next, and of its result: pytrees.
 Carry = TypeVar("Carry")
 Result = TypeVar("Result", covariant=True)
 
@@ -37,7 +37,7 @@ class Ending(NamedTuple):
 
 
 class Fold(Protocol[Carry, Result]):
-    """Interface of a streaming metric."""
+    """Interface of a fold."""
 
     def init(self) -> Carry: ...
     def update(self, carry: Carry, row: Row, span: Span) -> Carry: ...
@@ -50,11 +50,11 @@ def _zero() -> Array:
 
 @record
 class Peak:
-    """Largest absolute value of a signal; between samples too, if the span records its extremes.
+    """Largest absolute value of a signal, also between samples if the span contains its extremes.
 
     - `of`: name of the signal, a field of a Row.
     - `after`: start of the evaluation, s.
-    - `timed`: return (value, time), with the start of the sample that contains the maximum, instead of the value.
+    - `timed`: return (value, time), where time (s) is the start of the sample that contains the maximum.
     """
 
     of: str = static()
@@ -78,7 +78,7 @@ class Peak:
 
 @record
 class Lowest:
-    """Smallest value of the signal `of` at a sample while the rotor is alive, and its time: (value, time)."""
+    """Smallest value of the signal `of` over the samples at which the rotor is alive, with its time: (value, s)."""
 
     of: str = static()
 
@@ -97,7 +97,10 @@ class Lowest:
 
 @record
 class Rms:
-    """Root mean square of the signal `of` over the samples from `after` (s) on; if `driven`, while the drive is on."""
+    """Root mean square of the signal `of` over the samples from `after` (s) on.
+
+    `driven`: only over the samples at which the drive is on, which is until the rotor is lost.
+    """
 
     of: str = static()
     after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
@@ -117,7 +120,7 @@ class Rms:
 
 @record
 class Driven:
-    """Mean over time of the density `of`, from `after` (s) on, while the drive is on; its square root if `root`."""
+    """Mean over time of the density `of`, from `after` (s) until the rotor is lost; its square root if `root`."""
 
     of: str = static()
     after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
@@ -140,10 +143,10 @@ class Driven:
 
 @record
 class Variation:
-    """Chatter: total variation, V, of the sample means of the voltage, from `after` (s) on, while the drive is on.
+    """Chatter: total variation, V, of the sample means of the voltage, from `after` (s) until the rotor is lost.
 
-    The variation of the voltage itself would include spikes from the signs of the laws, which are shorter than the rise
-    time of any drive. With a set-valued sign their number is unbounded.
+    The variation of the voltage itself would include spikes that the signs of the laws cause and that are shorter than
+    the rise time of any drive.
     """
 
     after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
@@ -178,7 +181,7 @@ class Count:
 
 @record
 class Reaching:
-    """Start of the first sample in which the absolute value of the signal `of` is within `band`, s; +inf: never."""
+    """Start of the first sample in which the absolute value of the signal `of` is at most `band`, s; +inf: never."""
 
     of: str = static()
     band: Scalar = leaf(above=0, at_most=1e30)

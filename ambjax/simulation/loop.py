@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.cascade import Cascade, CascadeState, Command
+from ambjax.control.cascade import Cascade
+from ambjax.control.cascade_state import CascadeState, Command
 from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import limited
 from ambjax.simulation.integrate import InitialValueProblem
@@ -18,20 +19,25 @@ from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.signals import Reference, reference_at
 
-# A state above this many times its scale counts as diverged: the model is not valid there, and no number overflows yet.
+# A state that exceeds its scale by this factor counts as diverged: the model is not valid there, and no number has
+# overflowed yet.
 DIVERGENCE = 1e6
 
 
 class ExternalInputs(NamedTuple):
-    """External inputs of the loop at one instant: reference, and disturbances q_z (m/s^2) and q_i (A/s)."""
+    """External inputs of the loop at one instant.
+
+    The reference, the disturbances q_z (m/s^2) and q_i (A/s), and the runout (m), which is () for a sensor without one.
+    """
 
     reference: Reference
     q_z: Array
     q_i: Array
+    runout: Array | tuple[()]
 
 
 class Sizes(NamedTuple):
-    """Signals whose extremes between samples are recorded, named as in a Row: m, m, m/s, V, A, A, A^2/m^2."""
+    """Signals whose extremes between samples are recorded. Names and units are those of a `Row`."""
 
     z: Array
     e_z: Array
@@ -43,19 +49,19 @@ class Sizes(NamedTuple):
 
 
 class Densities(NamedTuple):
-    """Signals that are integrated over time: u (V), u^2 (V^2), and the copper loss in both coils (W)."""
+    """Signals that are integrated between samples: u (V), u^2 (V^2), and the copper loss in both coils (W)."""
 
     u: Array
     u_squared: Array
     heat: Array
 
 
-# An Instant with the structure of those of the loop.
+# An Instant with the same structure as those of the loop.
 SHOWN = Instant(Sizes(*[0.0] * 7), Densities(*[0.0] * 3))  # pyright: ignore[reportArgumentType]
 
 
 class LoopState(NamedTuple):
-    """State of the plant, then of the cascade. `linear.factor` relies on this order."""
+    """State of the plant, then of the cascade. `numerics.linear.factor` relies on this order."""
 
     plant: Any
     control: CascadeState
@@ -65,7 +71,7 @@ class LoopState(NamedTuple):
 class ClosedLoop:
     """The closed loop of a cascade in a scenario, in continuous time.
 
-    The argument `errors` of its methods holds the measurement errors, constant over a sample.
+    The argument `errors` of its methods contains the measurement errors, which are constant over a sample.
     """
 
     cascade: Cascade
@@ -88,34 +94,42 @@ class ClosedLoop:
     def start(self) -> LoopState:
         """Return the state at t = 0."""
         plant = self.scenario.plant.start(self.scenario.initial.measurement())
-        measured = self.measured(plant, self.sensor_errors(0))
-        return LoopState(plant, self.cascade.init(measured, reference_at(self.scenario.reference, 0.0)))
+        inputs = self.inputs(0.0)
+        measured = ClosedLoop.received(self, inputs, plant, self.sensor_errors(0))
+        return LoopState(plant, self.cascade.init(measured, inputs.reference))
 
     def measured(self, plant: object, errors: Errors) -> Measurement:
-        """Return the readings of the sensors for this state of the plant."""
+        """Return the readings of the sensors for a state of the plant."""
         motion, sensor = self.scenario.plant.measurement(plant), self.scenario.sensor
         return motion if sensor is None else sensor.reading(motion, errors)
 
     def scale(self) -> LoopState:
-        """Return the smallest relevant magnitude of each component of the state."""
+        """Return the characteristic size of each component of the state; integration errors are relative to it."""
         return jax.tree.map(jnp.asarray, LoopState(self.scenario.plant.scale(), self.cascade.scale()))
 
     def layer(self) -> LoopState:
-        """Return the width of the boundary layer of each component's smoothed sign; infinity for the plant."""
+        """Return, for each state, the largest integration error that keeps it inside the layer of a smoothed sign.
+
+        It is inf for the states of the plant.
+        """
         plant = jax.tree.map(lambda _: jnp.inf, self.scenario.plant.scale())
         return jax.tree.map(jnp.asarray, LoopState(plant, self.cascade.layer()))
 
     def inputs(self, t: Scalar) -> ExternalInputs:
-        """Return the reference and the disturbances at time t, s."""
-        scenario = self.scenario
-        return ExternalInputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t))
+        """Return the reference, the disturbances and the runout at time t, s."""
+        scenario, sensor = self.scenario, self.scenario.sensor
+        runout = () if sensor is None or sensor.runout is None else sensor.runout(t)
+        return ExternalInputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t), runout)
 
     def received(self, inputs: Any, plant: Any, errors: Errors) -> Measurement:
-        """Return what the controller reads; `inputs`: those of the instant, of the method `inputs`."""
-        return self.measured(plant, errors)
+        """Return the readings that the controller receives. `inputs`: result of the method `inputs` at this instant."""
+        measured, sensor = self.measured(plant, errors), self.scenario.sensor
+        if sensor is None or isinstance(inputs.runout, tuple):
+            return measured
+        return measured._replace(z=measured.z + sensor.gain * inputs.runout)
 
     def command(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> tuple[Command, CascadeState, Array]:
-        """Return the command of the cascade, the rates of its states, and the applied voltage, V."""
+        """Return the command of the cascade, the rates of its states, and the voltage within the supply's limit, V."""
         u_max = jnp.asarray(self.scenario.u_max)
         measured = self.received(inputs, state.plant, errors)
         command, rates = self.cascade(measured, state.control, inputs.reference, u_max)
@@ -127,30 +141,38 @@ class ClosedLoop:
         return self.moved(inputs, state, control, u)
 
     def observed(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> tuple[LoopState, Instant]:
-        """Return the rates, and the signals of the loop at one instant."""
+        """Return the rates of the state, and the signals to record at this instant."""
         command, control, u = self.command(inputs, state, errors)
         shown = self.shown(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
         return self.moved(inputs, state, control, u), shown
 
     def shown(self, reference: Reference, plant: object, i_ref: Array, v_tilde: Array, u: Array) -> Instant:
-        """Return the signals at one instant, from the plant's state, references, input error and voltage."""
+        """Return the signals to record at one instant.
+
+        `plant`: state of the plant. `i_ref` (A), `v_tilde` (A^2/m^2): of the command. `u`: applied voltage, V.
+        """
         motion, heat = self.scenario.plant.measurement(plant), self.scenario.plant.signals(plant).heat
-        sigma = self.cascade.position.sigma(motion, reference)
+        sigma = self.cascade.sigma(motion, reference)
         sizes = Sizes(motion.z, motion.z - reference.r, sigma, u, motion.i, motion.i - i_ref, v_tilde)
         return Instant(sizes, Densities(u, u * u, heat))
 
     def moved(self, inputs: ExternalInputs, state: LoopState, control: CascadeState, u: Array) -> LoopState:
-        """Return the time derivative of the state, from the rates of the cascade and the applied voltage."""
-        return LoopState(self.scenario.plant.rates(state.plant, u, inputs.q_z, inputs.q_i), control)
+        """Return the time derivative of the state. `control`: rates of the cascade. `u`: applied voltage, V."""
+        plant = self.scenario.plant
+        q_z = self.scenario.pushed(inputs.q_z, plant.measurement(state.plant))
+        return LoopState(plant.rates(state.plant, u, q_z, inputs.q_i), control)
 
     def status(self, state: LoopState) -> Array:
-        """Return the status code of the rotor: 0 while it is levitated."""
+        """Return the status code of the rotor, an index of `trajectory.STATUSES`: 0 while it is levitated."""
         return self.status_of(state, self.scale(), state.plant)
 
     def status_of(self, state: object, scale: object, plant: object) -> Array:
-        """Return the status code for a state, or a part of a state, with its scale and the state of the plant."""
+        """Return the status code for a state or a part of it.
+
+        `scale`: characteristic sizes, with the structure of `state`. `plant`: state of the plant.
+        """
         in_range = [jnp.abs(x) <= DIVERGENCE * s for x, s in zip(*map(jax.tree.leaves, (state, scale)), strict=True)]
-        touched = jnp.abs(self.scenario.plant.measurement(plant).z) >= self.scenario.touchdown
+        touched = jnp.abs(self.scenario.plant.measurement(plant).z) >= self.scenario.limit
         return jnp.where(
             functools.reduce(jnp.logical_and, in_range), jnp.where(touched, TOUCHED, ALIVE), DIVERGED
         ).astype(jnp.int32)
@@ -162,12 +184,13 @@ class ClosedLoop:
         """
         plant = self.scenario.plant
         z = plant.measurement(state.plant).z
-        stop = jnp.where(z < 0, -1.0, 1.0) * self.scenario.touchdown
+        stop = jnp.where(z < 0, -1.0, 1.0) * self.scenario.limit
         return state._replace(plant=plant.rest(state.plant, jnp.where(code == TOUCHED, stop, z)))
 
     def problem(self, errors: Errors) -> InitialValueProblem:
         """Return the initial value problem of one sample."""
-        step = functools.partial(slide, self, errors) if slides(self.cascade, self.scenario.plant) else None
+        sliding = slides(self.cascade, self.scenario.plant) and self.scenario.stop is None
+        step = functools.partial(slide, self, errors) if sliding else None
         rates = lambda inputs, x: self.rates(inputs, x, errors)  # noqa: E731
         observed = lambda inputs, x: self.observed(inputs, x, errors)  # noqa: E731
         jumps = self.scenario.sensor is not None
@@ -176,7 +199,7 @@ class ClosedLoop:
         )
 
     def row(self, t: Scalar, state: LoopState, errors: Errors, alive: Array) -> Row:
-        """Return all signals at one instant. The drive of a lost rotor is off: u = 0."""
+        """Return all signals at time t (s). The drive of a lost rotor is off: u = 0."""
         inputs = self.inputs(t)
         command, _, u = self.command(inputs, state, errors)
         measured = self.received(inputs, state.plant, errors)
@@ -185,7 +208,10 @@ class ClosedLoop:
     def signals(
         self, t: Scalar, inputs: ExternalInputs, state: object, command: Command, measured: Measurement, alive: Array
     ) -> Row:
-        """Return all signals, from the plant's state, the readings `measured` and the command; u is already limited."""
+        """Return all signals at time t (s).
+
+        `state`: of the plant. `command`: with u within the limit of the supply. `measured`: the readings.
+        """
         plant = self.scenario.plant
         motion, signals = plant.measurement(state), plant.signals(state)
         return Row(
@@ -200,7 +226,7 @@ class ClosedLoop:
             v=signals.v,
             v_star=command.v_star,
             v_tilde=command.v_tilde,
-            sigma=self.cascade.position.sigma(motion, inputs.reference),
+            sigma=self.cascade.sigma(motion, inputs.reference),
             r=inputs.reference.r,
             q_z=inputs.q_z,
             q_i=inputs.q_i,
@@ -211,12 +237,12 @@ class ClosedLoop:
         )
 
     def noted(self, row: Row, span: Span) -> Row:
-        """Return the row of a sample, with mean and peak voltage, which are known at its end."""
+        """Return the row of a sample with mean and peak voltage, which are known only at the end of the sample."""
         mean = span.densities.u / jnp.where(span.time > 0, span.time, 1.0)
         return row._replace(u_mean=mean, u_peak=jnp.maximum(jnp.abs(row.u), span.most.u))
 
     def singularity(self, row: Row) -> Array:
-        """Return a number that is 0 on the singular curve C, and positive on the admissible side of C. Eq. (9)."""
+        """Return a number that is 0 on the singular curve C and positive on its admissible side. Eq. (9)."""
         return self.scenario.plant.singularity(row.z, row.i_ref)
 
 

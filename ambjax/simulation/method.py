@@ -28,7 +28,7 @@ SETTLED, MOST_SETTLED = 0.5, 64
 # A.
 DRIVEN = 0.5
 # Names of the plant's slopes in messages.
-PLANT, COILS = "plant", "current in the coils"
+PLANT, COILS, STOP = "plant", "current in the coils", "rotor on its stop"
 # Number of RK4 substeps per sample above which the larger steps of the L-stable method are cheaper.
 MOST_SUBSTEPS = 4
 # Fixed L-stable steps: largest value of slope h^2. The error at the corner of a smoothed sign is an impulse
@@ -50,7 +50,8 @@ def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
     """
     # On a processor the laws have discrete steps, and only the plant is integrated.
     laws = {} if cascade.processor else {f"{stage} law": slope for stage, slope in cascade.slopes().items()}
-    named = laws | {PLANT: scenario.plant.slope(), COILS: scenario.plant.coil_slope(scenario.touchdown)}
+    named = laws | {PLANT: scenario.plant.slope(), COILS: scenario.plant.coil_slope(scenario.limit)}
+    named |= {} if scenario.stop is None else {STOP: scenario.stop.slope(scenario.plant.m)}
     if traced := [name for name, slope in named.items() if is_traced(slope)]:
         raise ValueError(
             f"clock.method is None (dt = 'auto'), but inside jit, grad or vmap the slope of the {traced[0]} is traced "
@@ -76,7 +77,8 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
     if cascade.processor is not None:
         settled = math.ceil(sample_period * named[COILS] / SETTLED)
         rate = 0.0 if (amplifier := scenario.amplifier) is None else float(np.max(np.asarray(amplifier.slope())))
-        driven = math.ceil(sample_period * max(named[PLANT] / SAMPLED, rate / DRIVEN))
+        fastest = max(named[PLANT], named.get(STOP, 0.0))
+        driven = math.ceil(sample_period * max(fastest / SAMPLED, rate / DRIVEN))
         substeps, fixed = max(driven, settled, 1), max(driven, MOST_SETTLED)
         explicit = settled <= MOST_SETTLED
     else:

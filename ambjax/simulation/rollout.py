@@ -1,4 +1,4 @@
-"""Rollout: simulation of a cascade in a scenario, sample by sample, to a trajectory, a fold, or both."""
+"""Rollout: the simulation of a cascade in a scenario, sample by sample, which returns a trajectory, a fold, or both."""
 
 import dataclasses
 import functools
@@ -23,7 +23,7 @@ from ambjax.simulation.system import check_parts, system_of
 from ambjax.simulation.trajectory import ALIVE, Row, Trajectory, first_time
 from ambjax.world.scenario import Scenario
 
-# State of a system, the errors of its sensors, and its row.
+# Types of the state of a system, of the errors of its sensors, and of its row.
 S = TypeVar("S")
 E = TypeVar("E")
 R = TypeVar("R")
@@ -32,7 +32,7 @@ R = TypeVar("R")
 class Outcome(NamedTuple):
     """Result of a rollout: the trajectory, and the result of the fold.
 
-    - `trajectory`: the trajectory; its rows are None if none were recorded.
+    - `trajectory`: rows and status of the rotor; the rows are None if none were recorded.
     - `measured`: result of the fold; None without a fold.
     """
 
@@ -42,6 +42,15 @@ class Outcome(NamedTuple):
 
 class System(Protocol[S, E, R]):
     """Interface of a system for a rollout: the closed loop, or the closed loop with an extended state.
+
+    - `realised()`: the system of one member, with its random signals drawn.
+    - `sensor_errors(sample)`: the errors of the sensors at sample number `sample`.
+    - `start()`: the state at t = 0.
+    - `status(state)`: the status code of the rotor, an index of `trajectory.STATUSES`.
+    - `rest(state, code)`: the state in which a rotor lost with this code is frozen.
+    - `row(t, state, errors, alive)`: the row at time t (s).
+    - `noted(row, span)`: the row with the signals that are known at the end of the sample only.
+    - `singularity(row)`: a number that is positive on the admissible side of the singular curve C. Eq. (9)
 
     A system whose state jumps at the start of a sample, such as a controller on a processor, also has
 
@@ -56,7 +65,7 @@ class System(Protocol[S, E, R]):
 
         advance(method, errors, t, period, state, memory, code) -> Advanced
 
-    which replaces `method.advance(problem(errors), ...)`. `integrate.in_turn` is useful for such a system.
+    which replaces `method.advance(problem(errors), ...)`, for example by means of `integrate.in_turn`.
     """
 
     def realised(self) -> Self: ...
@@ -81,22 +90,23 @@ class RolloutState(NamedTuple):
 def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | None = None, every: int = 1) -> Outcome:
     """Simulate `scenario.plant` under `cascade` for `clock.samples` sample periods.
 
-    Rows are recorded at the start of every `every`-th sample (0: none). `fold` is updated at every sample, so that
-    metrics need no stored trajectory.
+    - `fold`: accumulated at every sample, so that metrics need no stored trajectory; None: no metrics.
+    - `every`: a row is recorded at the start of every `every`-th sample; 0: no rows.
 
-    The function is pure and jitted. It works under vmap, jvp and grad; with an adaptive method in forward mode only.
-    If the rotor touches down, or a state leaves the range of the model, the state is frozen and the trajectory reports
-    the loss. Values and derivatives stay finite.
+    Returns an `Outcome`. If the rotor touches down, or a state leaves the range of the model, the state is frozen and
+    the trajectory reports the loss. Values and derivatives stay finite.
+
+    The function is pure and jitted. It works under vmap, jvp and grad; reverse mode requires a method with fixed steps.
 
     Raises ValueError for an invalid gain, parameter or clock, for an explicit step above its stability limit, and for a
-    clock without a method if gains are traced. In that case choose the method outside with `with_method`.
+    clock without a method if gains are traced. In the last case, call `with_method` outside the transformation.
     """
     loop, clock, fold = canonical((*prepare(cascade, scenario, clock), fold))
     return roll(loop, clock, fold, every=every)
 
 
 def prepare(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[ClosedLoop | Sampled, Clock]:
-    """Check a case, choose the method of a clock without one, and return the system for the rollout and its clock.
+    """Check a case, and return the system and the clock for `run`; a clock without a method gets one.
 
     Raises ValueError as `rollout` does.
     """
@@ -106,7 +116,10 @@ def prepare(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[ClosedL
 
 
 def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
-    """Raise ValueError, with the dotted path and the fix, for each concrete value that is not allowed."""
+    """Raise ValueError, with the dotted path and the fix, for a concrete value that is not allowed.
+
+    Traced values are not checked.
+    """
     for stage, base in STAGES.items():
         law = getattr(cascade, stage)
         if not isinstance(law, base):
@@ -117,7 +130,7 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     validate(dataclasses.replace(cascade, processor=None), "controller")
     if cascade.processor is not None:
         validate(cascade.processor, "processor")
-    check_parts(cascade, scenario)
+    check_parts(cascade, scenario, clock.sample_period)
     validate(scenario, "scenario")
     validate(clock, "clock")
     if clock.samples < 1:
@@ -125,7 +138,7 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
 
 
 def run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:
-    """Simulate a whole rollout, without jit and checks. `rollout` compiles it, and ensembles map it over members."""
+    """Simulate a whole rollout without checks. The function is not jitted; `roll` is its compiled form."""
     progress, rows = segment(system, clock, fold, begin(system, clock, fold), 0, clock.samples, every)
     return finish(progress, rows, fold)
 
@@ -148,7 +161,10 @@ def begin(system: System, clock: Clock, fold: Fold | None) -> RolloutState:
 def segment(
     system: System, clock: Clock, fold: Fold | None, progress: RolloutState, first: Scalar, count: int, every: int
 ) -> tuple[RolloutState, Row | None]:
-    """Simulate `count` samples from number `first` on. Returns the new state and the rows (None if every = 0)."""
+    """Simulate `count` samples from number `first` on, and record a row at every `every`-th of them.
+
+    Returns the new state and the rows; None if every = 0.
+    """
     step = functools.partial(_sample, system.realised(), clock, fold)
 
     def unrecorded(progress: RolloutState, first: Scalar, count: int) -> RolloutState:
@@ -175,7 +191,8 @@ def stretch(
 ) -> tuple[RolloutState, Row]:
     """Simulate `count` samples from number `first` on, and record every row. Returns the new state and the rows.
 
-    After the clock's last sample the state does not change, so that one compiled program serves every part of a run.
+    Samples after the last one of the clock do not change the state, so that one compiled program with a fixed `count`
+    can simulate every part of a run.
     """
     step = functools.partial(_sample, system.realised(), clock, fold)
 
@@ -187,7 +204,7 @@ def stretch(
 
 
 def finish(progress: RolloutState, rows: Row | None, fold: Fold | None) -> Outcome:
-    """Return the outcome, from the state after the last sample and the rows."""
+    """Return the outcome of a rollout from the state after the last sample and the rows."""
     lost_code, lost_at, singular_at, _ = progress.ending
     measured = None if fold is None else fold.result(progress.fold, progress.ending)
     return Outcome(Trajectory(cast(Row, rows), lost_at, lost_code, singular_at), measured)
@@ -216,7 +233,7 @@ def _sample(system: Any, clock: Clock, fold: Fold | None, progress: RolloutState
         t = k.astype(dtype) * clock.sample_period
         errors = system.sensor_errors(k)
         alive = ending.lost_code == ALIVE
-        # A jump at this instant belongs to this sample even if t was rounded to just before it.
+        # A signal that jumps at this instant has jumped in this sample, even if t was rounded to just before it.
         just_after = t * (1 + 4 * jnp.finfo(dtype).eps)
         if hasattr(system, "jump"):
             state = choose(alive, system.jump(just_after, state, errors), state)

@@ -1,11 +1,12 @@
 """The closed loop of a cascade on a processor: sampled measurements, discrete laws, and a held voltage.
 
-At t_n the plant is measured first, and then the laws make a step. The voltage u_n, within the supply's limit, acts from
-t_n + delay T until t_{n+1} + delay T; before the first voltage u = 0. Then the plant is integrated to t_{n+1}, under
-one voltage, or under two if the delay is not a whole number of samples.
+At t_n the sensors measure the plant, and then the laws make a step. The voltage u_n, within the limit of the supply,
+acts from t_n + delay T until t_{n+1} + delay T; before t_0 + delay T, u = 0. Then the plant is integrated to t_{n+1},
+under one voltage, or under two if the delay is not a whole number of samples.
 """
 
 import dataclasses
+import itertools
 from typing import Any, NamedTuple, Self
 
 import jax
@@ -13,12 +14,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.compiler.barrier import materialised
-from ambjax.control.cascade import CascadeState, Command, Sample
+from ambjax.control.cascade_state import CascadeState, Command, Sample
 from ambjax.control.guard import GuardResult, Watch, expected
 from ambjax.control.processor import Processor
 from ambjax.numerics.records import Scalar, record, static
 from ambjax.numerics.smooth import limited
-from ambjax.simulation.between import acting, amplified, lags, plant_status, stretches
+from ambjax.simulation.between import acting, amplified, lags, plant_status, sensed_motion, stretches
 from ambjax.simulation.integrate import Advanced, Integrator, choose, in_turn
 from ambjax.simulation.loop import ClosedLoop, LoopState
 from ambjax.simulation.span import Span
@@ -29,17 +30,17 @@ from ambjax.world.signals import Reference, reference_at
 
 
 class SampledState(NamedTuple):
-    """State of the closed loop on a processor. Optional parts are () if the loop does not have them.
+    """State of the closed loop on a processor. A part that the loop does not have is ().
 
-    - `plant`, `control`: state of the plant and of the laws.
-    - `command`: last command, with u within the supply's limit.
-    - `past`: the two voltages before it, V.
+    - `plant`, `control`: states of the plant and of the laws.
+    - `command`: last command, with u within the limit of the supply.
+    - `past`: the two voltages before that of `command`, V, the later one first.
     - `finite`: 1, or 0 after a law has returned a number that is not finite.
     - `z_filtered`: output of the low-pass of the position sensor, m.
-    - `u_a`: voltage of the amplifier, V.
+    - `u_a`: output voltage of the amplifier, V.
     - `watch`: state of the guard.
-    - `started`: 1, or 0 until the guard has accepted a reading, from which the laws are initialised.
-    - `sensed`: last reading of a sensor with faults.
+    - `started`: 0 until the guard has accepted all readings of a sample, which initialise the laws; then 1.
+    - `sensed`: state of a sensor with faults.
     """
 
     plant: Any
@@ -60,7 +61,7 @@ class Sampled:
 
     - `loop`: the closed loop in continuous time.
     - `period`: sample period, s.
-    - `cuts`: largest number of edges of disturbances inside one sample; None: the number of all edges.
+    - `cuts`: largest number of edges of disturbances inside one sample; None: bounded by the number of all edges.
     """
 
     loop: ClosedLoop
@@ -79,6 +80,9 @@ class Sampled:
 
     def sensor_errors(self, sample: Scalar) -> Errors | FaultyErrors:
         drawn, sensor = self.loop.sensor_errors(sample), self.loop.scenario.sensor
+        if sensor is not None and sensor.runout is not None and not lags(self.loop):
+            runout = sensor.runout(jnp.asarray(sample, jnp.result_type(float)) * self.period)
+            drawn = drawn._replace(z=drawn.z + sensor.gain * runout)
         if sensor is None or not sensor.faulty:
             return drawn
         return FaultyErrors(*drawn, sensor.fault_onsets(self.loop.words(), sample, self.period))
@@ -87,7 +91,7 @@ class Sampled:
         """Return the state at t = 0."""
         scenario, zero = self.loop.scenario, jnp.zeros(())
         plant = scenario.plant.start(scenario.initial.measurement())
-        z_filtered = scenario.plant.measurement(plant).z if lags(self.loop) else ()
+        z_filtered = sensed_motion(self.loop, plant, zero).z if lags(self.loop) else ()
         slow = scenario.amplifier is not None and scenario.amplifier.slow
         measured = self.measured(plant, z_filtered, self.sensor_errors(0))
         command, past, guard = Command(*[zero] * 5), (zero, zero), self.processor.guard
@@ -106,7 +110,10 @@ class Sampled:
         )
 
     def measured(self, plant: object, z_filtered: Array | tuple[()], errors: Errors | FaultyErrors) -> Measurement:
-        """Return the readings of sensors without faults; `z_filtered`: output of the position sensor's low-pass, m."""
+        """Return the readings of the sensors before faults.
+
+        `z_filtered`: output of the low-pass of the position sensor, m.
+        """
         true, sensor = self.loop.scenario.plant, self.loop.scenario.sensor
         motion = true.measurement(plant)
         if sensor is None:
@@ -116,23 +123,23 @@ class Sampled:
         return sensor.converted(sensor.reading(motion, errors), true.s_0, true.i_0)
 
     def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
-        """Step the laws: return the state with the new command, and with the laws' states at t + period."""
+        """Step the laws at time t (s): return the state with the new command and the next states of the laws."""
         state, measured = self.read(state, errors)
         return self.with_command(measured, self.reference(t), state)
 
     def read(self, state: SampledState, errors: Errors | FaultyErrors) -> tuple[SampledState, Measurement]:
-        """Return the readings of the sensors, faults included, and the state after them."""
+        """Return the state with that of the faulty sensor updated, and the readings of the sensors, faults included."""
         return self._with_faults(self.measured(state.plant, state.z_filtered, errors), state, errors)
 
     def reference(self, t: Scalar) -> Reference:
-        """Return the reference for the laws of the sample at t (s), which is that of t plus the predicted delay."""
+        """Return the reference for the laws at the sample at t (s): with prediction, that at the end of the delay."""
         late = self.processor.ahead * self.period if self.processor.predicts else 0.0
         return reference_at(self.loop.scenario.reference, t + late)
 
     def _with_faults(
         self, measured: Measurement, state: SampledState, errors: Errors | FaultyErrors
     ) -> tuple[SampledState, Measurement]:
-        """Apply the faults of the position sensor, and return the new state and measurement."""
+        """Apply the faults of the position sensor. Return the new state and the readings."""
         sensor, sensed = self.loop.scenario.sensor, state.sensed
         if sensor is None or not sensed or not isinstance(errors, FaultyErrors):
             return state, measured
@@ -145,9 +152,10 @@ class Sampled:
         return state, measured._replace(z=sensed.z)
 
     def with_command(self, measured: Measurement, reference: Reference, state: SampledState) -> SampledState:
-        """Compute the command from a measurement, and return the new state. The plant does not change.
+        """Compute the command from the readings, and return the state with it. The plant does not change.
 
-        The exported C code is generated from this function.
+        `measured`: the readings, before the guard. `reference`: see `Sample`. The exported C is traced from this
+        function.
         """
         cascade, past, checked, laws = self.loop.cascade, (state.command.u, state.past[0]), None, state.control
         if self.processor.guard is not None:
@@ -178,7 +186,7 @@ class Sampled:
     def _watched(
         self, checked: GuardResult | None, estimate: Measurement, voltages: tuple[Array, ...]
     ) -> Watch | tuple[()]:
-        """Return the guard's state at the next sample. `voltages`: of this sample and the two previous ones, V."""
+        """Return the guard's state for the next sample. `voltages`: of this sample and of the two before it, V."""
         if checked is None:
             return ()
         delay = jnp.asarray(self.processor.ahead)
@@ -198,24 +206,30 @@ class Sampled:
         memory: object,
         code: Array,
     ) -> Advanced:
-        """Integrate the plant to the next sample, under the voltages that act in between."""
+        """Integrate the plant to the next sample, under the voltages that act until then."""
         code = jnp.where((code == 0) & (state.finite == 0), DIVERGED, code)
         delay, whole = jnp.asarray(self.processor.delay), bool(self.processor.whole)
         commanded = acting((state.command.u, *state.past), delay, period, whole)
         voltages, u_a = amplified(self.loop.scenario.amplifier, jnp.asarray(t), state.u_a, commanded)
         parts = stretches(self.loop, state.plant, state.command, jnp.asarray(t), voltages, self.cuts)
         reached = in_turn(method, parts, t, state.plant, memory, code)
-        z_filtered = self._lagged(state, [after.state for after in reached], [time for _, time in parts])
+        z_filtered = self._lagged(t, state, [after.state for after in reached], [time for _, time in parts])
         after = reached[-1]
         return after._replace(state=state._replace(plant=after.state, z_filtered=z_filtered, u_a=u_a))
 
-    def _lagged(self, state: SampledState, reached: list[object], times: list[Scalar]) -> Array | tuple[()]:
-        """Return the output of the position sensor's low-pass, m, after the plant's motion through these states."""
+    def _lagged(self, t: Scalar, state: SampledState, reached: list[object], times: list[Scalar]) -> Array | tuple[()]:
+        """Return the output of the position sensor's low-pass at the next sample, m.
+
+        `t`: time of the sample, s. `reached`: the states of the plant at the end of each part of the sample. `times`:
+        the lengths of the parts, s.
+        """
         z_filtered: Any = state.z_filtered
         sensor = self.loop.scenario.sensor
         if sensor is None or not lags(self.loop):
             return z_filtered
-        motions = [self.loop.scenario.plant.measurement(plant) for plant in (state.plant, *reached)]
+        instants = itertools.accumulate(times, initial=t)
+        states = (state.plant, *reached)
+        motions = [sensed_motion(self.loop, *at) for at in zip(states, instants, strict=True)]
         for before, after, time in zip(motions, motions[1:], times, strict=False):
             z_filtered = sensor.lagged(z_filtered, before, after, time)
         return z_filtered

@@ -22,6 +22,7 @@ from jax import Array
 from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.control.cascade import Cascade
 from ambjax.control.laws import CurrentDemand, CurrentInputs
+from ambjax.control.schedule import present
 from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import limited
 from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, Times, axpy
@@ -43,43 +44,44 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     i_ref = control.inversion
     per_h = 1 / jnp.where(h > 0, h, 1.0)
 
-    force_0, estimate_0, rates_0 = cascade.demand(loop.measured(state.plant, errors), control, begin.reference)
+    force_0, estimate_0, rates_0 = cascade.demand(loop.received(begin, state.plant, errors), control, begin.reference)
     z_ddot_0 = scenario.plant.z_ddot(z, i, begin.q_z)
     ahead = State(z + h * z_dot + h * h / 2 * z_ddot_0, z_dot + h * z_ddot_0, i)
     control_1 = control._replace(
         observer=axpy(control.observer, (h, rates_0.observer)), position=axpy(control.position, (h, rates_0.position))
     )
     ahead, control_1, force_0 = materialised((ahead, control_1, force_0))
-    force_1, estimate_1, rates_1 = cascade.demand(loop.measured(ahead, errors), control_1, end.reference)
+    force_1, estimate_1, rates_1 = cascade.demand(loop.received(end, ahead, errors), control_1, end.reference)
 
-    inversion: Any = cascade.inversion
+    inversion: Any = present(cascade.inversion, estimate_0.z, begin.reference)
     sliding, slaved, tau, (w, w_1, w_2) = inversion.slide(model, force_0, force_1, i_ref, h)
     sliding, slaved, tau, force_1 = materialised((sliding, slaved, tau, force_1))
 
     def current(
-        plant: State, estimate: Measurement, i_ref: Array, rate: Array, inner: S, q_i: Array, h: Array
+        plant: State, estimate: Measurement, i_ref: Array, rate: Array, inner: S, outside: Any, h: Array
     ) -> tuple[Array, S, _Voltage]:
         """Return i - i_ref, the current law's state, and the voltage, over h (s) at constant i_ref' = rate."""
+        law = present(cascade.current, estimate.z, outside.reference)
 
         def rate_of(i: Array) -> tuple[Array, tuple[S, Array]]:
             inputs = CurrentInputs(estimate._replace(i=i + errors.i), CurrentDemand(i_ref, rate), scenario.u_max)
-            u, inner_rate = cascade.current(model, inputs, inner)
+            u, inner_rate = law(model, inputs, inner)
             u = limited(u, scenario.u_max)
-            return scenario.plant.i_dot(plant.z, plant.z_dot, i, u, q_i), (inner_rate, u)
+            return scenario.plant.i_dot(plant.z, plant.z_dot, i, u, outside.q_i), (inner_rate, u)
 
         i_dot, slope, (inner_rate, u) = jax.jvp(rate_of, (plant.i,), (jnp.ones_like(plant.i),), has_aux=True)
         phi, volts = _phi(h * slope), scenario.plant.u_per_i_dot(plant.z)
         e = plant.i - i_ref + h * phi * (i_dot - rate)
         return e, axpy(inner, (h, inner_rate)), _Voltage(u, (rate - i_dot) * volts, h * slope, phi)
 
-    e, inner, first = current(state.plant, estimate_0, i_ref, sliding, control.current, begin.q_i, tau)
+    e, inner, first = current(state.plant, estimate_0, i_ref, sliding, control.current, begin, tau)
     e, inner = materialised((e, inner))
     i_ref_0, i_ref = i_ref, i_ref + tau * sliding
     middle = State((z + ahead.z) / 2, (z_dot + ahead.z_dot) / 2, i_ref + e)
     estimate = jax.tree.map(lambda a, b: (a + b) / 2, estimate_0, estimate_1)
     # During the slide the current changes fast; the second part starts with the acceleration at the final current.
     z_ddot_0 += (1 - tau * per_h) * (scenario.plant.z_ddot(z, middle.i, begin.q_z) - z_ddot_0)
-    e, inner, second = current(middle, estimate, i_ref, slaved, inner, end.q_i, h - tau)
+    e, inner, second = current(middle, estimate, i_ref, slaved, inner, end, h - tau)
     e, inner = materialised((e, inner))
     i_ref = i_ref + (h - tau) * slaved
     z_ddot_1 = scenario.plant.z_ddot(ahead.z, i_ref + e, end.q_z)

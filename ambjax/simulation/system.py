@@ -1,15 +1,20 @@
 """The closed loop of a case, in continuous time or on a processor."""
 
+import numpy as np
+
 from ambjax.control.cascade import Cascade
+from ambjax.control.cascade_state import CascadeState
 from ambjax.control.guard import simulated
+from ambjax.numerics.records import Scalar, is_traced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled
 from ambjax.world.scenario import Scenario
 
 
-def check_parts(cascade: Cascade, scenario: Scenario) -> None:
-    """Raise ValueError, with the path and the fix, for parts of a loop that are not compatible."""
+def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> None:
+    """Raise ValueError, with the path and the fix, for parts of a loop that are not compatible. `sample_period`: s."""
+    _check_laws(cascade, sample_period)
     if cascade.processor is None:
         cascade.check_smooth()
         if (path := scenario.on_processor) is not None:
@@ -23,6 +28,25 @@ def check_parts(cascade: Cascade, scenario: Scenario) -> None:
             "sensor.velocity = false: the velocity is not measured, and controller.observer does not estimate it. "
             'Choose one that does: kind = "kalman", for example.'
         )
+
+
+def _check_laws(cascade: Cascade, sample_period: Scalar) -> None:
+    """Raise ValueError for laws that cannot run on the processor, or not together."""
+    known = cascade.processor is not None and not is_traced(sample_period)
+    period = float(np.max(np.asarray(sample_period))) if known else None
+    for stage, law in zip(CascadeState._fields, cascade.laws, strict=True):
+        try:
+            if known or cascade.processor is None:
+                law.check_use(cascade.model, period)
+        except ValueError as error:
+            raise ValueError(f"controller.{stage}: {error}") from None
+    demand = cascade.position.demand
+    for stage, law in (("inversion", cascade.inversion), ("current", cascade.current)):
+        if demand not in law.accepts:
+            raise ValueError(
+                f"controller.{stage} = {type(law).__name__}: it does not take the {demand} that "
+                f"{type(cascade.position).__name__} demands. Leave out [controller.{stage}], for the law that does."
+            )
 
 
 def system_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> ClosedLoop | Sampled:

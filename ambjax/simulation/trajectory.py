@@ -73,6 +73,15 @@ class Row(NamedTuple):
 
 
 NOT_SAVED = ("u_peak", "heat", "alive")
+# Unit of each saved signal.
+SIGNAL_UNITS = {
+    **dict.fromkeys(("z", "r", "z_measured"), "m"),
+    **dict.fromkeys(("z_dot", "sigma"), "m/s"),
+    **dict.fromkeys(("i", "i_ref"), "A"),
+    **dict.fromkeys(("u", "u_mean"), "V"),
+    **dict.fromkeys(("v", "v_star", "v_tilde"), "A^2/m^2"),
+    **{"t": "s", "q_z": "m/s^2", "q_i": "A/s", "refused": "bool"},
+}
 
 
 @record

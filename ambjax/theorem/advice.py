@@ -10,12 +10,12 @@ from ambjax.theorem.sampled_report import Delays, SampledReport
 QUESTION = "Do the conditions of Theorem 1 hold along this run?"
 # Ratio of an advised gain to the number that it must exceed; the result is rounded up to two digits.
 MARGIN = 1.1
-# Share of a lost run's time after which the rotor counts as falling.
+# The rotor of a lost run counts as falling after this share of the time to its loss.
 FALL_SHARE = 0.9
-# With gamma larger by this factor than the bound on the reference, transients are covered.
+# Ratio of gamma to Delta_1 along the reference that leaves room for transients.
 TRANSIENT_FACTOR = 2.0
 IMPLICIT = 'discretisation = "implicit"'
-# Remedy for a run in which the integrator stalled.
+# Advice for a run in which the integrator stalled.
 STALLED = (
     "Lower the steepness p of the laws ([controller.inversion] p first), "
     'or use a fixed step: [clock] dt = 1e-6 with method = "rodas3".'
@@ -50,12 +50,15 @@ def advice(report: Report) -> list[str]:
     fails = [line for line in report.conditions if line.holds is False]
     fall = FALL_SHARE * report.lost_at if report.lost else math.inf
     rows = [line for line in fails if line.path and (line.ideal or line.at_s < fall)]
-    lines = [_to_raise(max((r for r in rows if r.path == p), key=_right)) for p in dict.fromkeys(r.path for r in rows)]
+    paths = dict.fromkeys(row.path for row in rows)
+    lines = [_to_raise(max((row for row in rows if row.path == path), key=_against)) for path in paths]
     if not rows:
         ideal = {line.path: line for line in report.conditions if line.ideal}
-        lines = [_of_the_fall(line, ideal.get(line.path)) for line in fails if line.path]
+        lines = [_during_fall(line, ideal.get(line.path)) for line in fails if line.path]
     lines += [
-        f"{line.requires} fails at {line.at_s:.4g} s: choose a smaller reference, or an initial i_ref "
+        f"{line.requires} fails: {line.note}."
+        if line.note
+        else f"{line.requires} fails at {line.at_s:.4g} s: choose a smaller reference, or an initial i_ref "
         "([controller.inversion] i_ref) on the other side of the singular curve C."
         for line in fails
         if not line.path
@@ -66,8 +69,9 @@ def advice(report: Report) -> list[str]:
 def on_processor(sampled: SampledReport, margin: Delays, unknown: Delays | None) -> list[str]:
     """Return the lines below the tables of a cascade on a processor.
 
-    They report slopes, the distance to C, the rotor's status, an alternating voltage, and two delay margins: for a
-    delay that the prediction uses, and for one that it does not (None: nothing is predicted).
+    They report the slopes, the distance to C, the status of the rotor, an alternating voltage, and the delay margins.
+    `margin`: the prediction of the controller uses the actual delay. `unknown`: it uses the delay of the case (None:
+    the controller does not predict).
     """
     lines = [
         f"- {slope.stage}: slope T of the step is {number(slope.stepped)} and must be less than "
@@ -104,19 +108,19 @@ def _curve(distance: float, at: float) -> str:
 def _alternates(share: float) -> str:
     return (
         f"The voltage alternates: without noise, {100 * share:.0f} % of its rms value changes sign from sample to "
-        "sample. A law corrects more than its error in a sample, or acts later than it assumes: lower its gain or its "
-        f"p, set {IMPLICIT} or predict = true, or shorten clock.sample_period."
+        "sample. A law corrects more than its error in one sample, or its output acts later than it assumes: lower its "
+        f"gain or p, set {IMPLICIT} or predict = true, or shorten clock.sample_period."
     )
 
 
 def _margin(name: str, margin: Delays) -> str:
-    held, lost, open_ = margin.held, margin.lost, margin.undecided
+    held, lost, undecided = margin.held, margin.lost, margin.undecided
     tried = f"tried every {margin.step:.2g} samples"
-    if open_ is not None:
-        rests = [] if held is None else [f"held up to {_samples(held)} samples"]
-        rests += [f"not decided at {_samples(open_)}, where the integrator stalled"]
-        rests += [] if lost is None else [f"lost at {_samples(lost)}"]
-        return f"{name}: the rotor is {', '.join(rests)} ({tried})."
+    if undecided is not None:
+        parts = [] if held is None else [f"held up to {_samples(held)} samples"]
+        parts += [f"not decided at {_samples(undecided)}, where the integrator stalled"]
+        parts += [] if lost is None else [f"lost at {_samples(lost)}"]
+        return f"{name}: the rotor is {', '.join(parts)} ({tried})."
     if held is None:
         return f"{name}: none, because the rotor is lost even without a delay."
     if lost is None:
@@ -130,11 +134,12 @@ def _samples(delay: float) -> str:
     return f"{delay:.5f}".rstrip("0").rstrip(".")
 
 
-def _right(line: Condition) -> float:
+def _against(line: Condition) -> float:
     return line.against
 
 
 def _to_raise(line: Condition) -> str:
+    """Return the advice to raise the gain of a condition that fails."""
     if not math.isfinite(line.against):
         return f"{line.requires} cannot be evaluated: its right-hand side is not finite along this run."
     name, key, gain = _sides(line)
@@ -144,7 +149,8 @@ def _to_raise(line: Condition) -> str:
     )
 
 
-def _of_the_fall(line: Condition, ideal: Condition | None) -> str:
+def _during_fall(line: Condition, ideal: Condition | None) -> str:
+    """Return the advice on a gain whose condition fails only while the rotor falls."""
     name, key, gain = _sides(line)
     words = (
         f"{line.requires.partition(' > ')[2]} = {number(line.against)} {line.unit} exceeds {name} = {gain} at "
@@ -160,7 +166,7 @@ def _of_the_fall(line: Condition, ideal: Condition | None) -> str:
 
 
 def _sides(line: Condition) -> tuple[str, str, str]:
-    """Describe a gain: its name, its place in a case file, and its value."""
+    """Return the name of the gain of a condition, its key in a case file, and its value, as text."""
     _, stage, name = line.path.split(".")
     return name, f"[controller.{stage}] {name}", number(line.gain or 0.0)
 

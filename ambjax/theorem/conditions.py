@@ -1,7 +1,7 @@
 """The conditions of Theorem 1 along a run: margins, and the time of each worst value.
 
 The conditions are k > Q_z, k_i > Q_i, gamma > Delta_1 (Eq. 7), and (z, i_ref) off the singular curve C (Eq. 9). Each
-law names the gain that its condition bounds (`Requirement`). A condition without such a gain is reported as not
+law declares the gain that its condition bounds (`Requirement`). For a law without such a gain the condition is not
 applicable. The steps of the proof are reported as residuals (see `ambjax.theorem.proof`).
 """
 
@@ -15,6 +15,8 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.cascade import USUAL, Cascade
+from ambjax.control.laws import PositionLaw
+from ambjax.control.schedule import extremes, schedules
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Lowest, Named, Peak
@@ -23,16 +25,18 @@ from ambjax.simulation.trajectory import STALLED, STATUSES
 from ambjax.theorem.proof import Monitored
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
-from ambjax.world.signals import Signal, reference_at
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Constant, Signal, reference_at
 
 
 @dataclasses.dataclass(frozen=True)
 class Condition:
-    """One line of the check: the condition, its two sides, the margin, and the time of the worst value (s).
+    """One line of the check.
 
-    `holds` is None for a line that is only informative, or whose gain the law does not have. `path`: path of the gain
-    in a case file, if the line is about a gain. `ideal`: whether `against` depends on the reference only, not on the
-    run.
+    `requires`: the condition as text. `gain`, `against`: its left and right side, in `unit`; `gain` is None if the law
+    has no such gain. `at_s`: time of the worst value, s. `holds`: None for a line that is only informative, or if
+    `gain` is None. `path`: path of the gain in a case file, if the line is about a gain. `ideal`: whether `against`
+    depends on the reference only, not on the run.
     """
 
     name: str
@@ -77,9 +81,10 @@ class Report:
 
 
 class Side(NamedTuple):
-    """One definition of the right side of a condition: name, description, and the signal whose peak it is.
+    """One definition of the right side of a condition: the peak of `signal` along the run.
 
-    Without a signal the right side is computed on the ideal motion z = r.
+    `signal` None: the right side is computed for the ideal motion z = r. `name`: name of the condition. `where`: words
+    after the symbol of the right side.
     """
 
     name: str
@@ -99,9 +104,9 @@ SIDES = {
 
 
 class Required(NamedTuple):
-    """The requirement on one law: name, dotted path and unit of the gain, the right side, and the gain's value.
+    """The requirement on one law: name, dotted path and unit of the gain, symbol of the right side, value of the gain.
 
-    The value is None if the law has no requirement; the gain is then that of the paper's law.
+    If the law has no requirement, the value is None and the other fields are those of the paper's law.
     """
 
     gain: str
@@ -115,7 +120,7 @@ PEAKS = ("q_z", "q_i", "d", "q_z_plus_h", "sigma_off", "v_tilde_off", "e_off")
 
 
 def _monitors(settle: float) -> Named:
-    """Return the folds of a run: extremes of the monitored signals, and the largest |z| from `settle` (s) on."""
+    """Return the folds of a run: extremes of the monitored signals, and the largest |z| after `settle` (s)."""
     peaks = {name: Peak(name, timed=True) for name in PEAKS} | {"z": Peak("z", settle, timed=True)}
     return Named(peaks | {name: Lowest(name) for name in ("distance", "V_margin")})
 
@@ -170,7 +175,8 @@ def _drift(model: Plant, reference: Signal, times: Array) -> Array:
 def required(cascade: Cascade) -> list[Required]:
     """Return the requirement of Theorem 1 on each law, in the order of the conditions.
 
-    An observer is included only if it has a requirement. Raises ValueError for an unknown right side.
+    The value of a scheduled gain is the smallest of its schedule. An observer is included only if it has a
+    requirement. Raises ValueError for an unknown right side.
     """
     rows = []
     for stage in ("position", "current", "inversion", "observer"):
@@ -184,7 +190,7 @@ def required(cascade: Cascade) -> list[Required]:
                 f"{kind.__name__}.requirement.over = '{requirement.over}': it must be one of {', '.join(SIDES)}."
             )
         unit = next(field.metadata["unit"] for field in dataclasses.fields(kind) if field.name == requirement.gain)
-        value = getattr(law, requirement.gain) if own else None
+        value = getattr(extremes(law)[0], requirement.gain) if own else None
         rows.append(Required(requirement.gain, f"controller.{stage}.{requirement.gain}", unit, requirement.over, value))
     return rows
 
@@ -209,13 +215,29 @@ def _conditions(
         dataclasses.replace(
             line(one, "remark 3", "sup |q_z + h|", worst["q_z_plus_h"]),
             holds=None,
-            note=f"optional in the paper: {one.gain} would dominate the inversion's transients too",
+            note=f"optional in the paper: {one.gain} would then dominate the transients of the inversion",
         )
         for one in requirements
         if one.over == "Q_z"
     ]
     curve = "distance of (z/s_0, i_ref/i_0) to C > 0"
+    lines += constant_sigma(cascade.position)
     return [*lines, Condition("singular curve C", curve, distance, 0.0, at, "1", distance > 0), *remarks]
+
+
+def constant_sigma(law: PositionLaw) -> list[Condition]:
+    """Return a condition for each schedule that changes the sliding variable, which the theorem takes as fixed."""
+    plain: Any
+    rows, plain = [], extremes(law)[0]
+    motion, reference = Measurement(*map(jnp.asarray, (1.0, 1.0, 0.0))), reference_at(Constant(), 0.0)
+    for name, schedule in schedules(law).items():
+        low, high = (dataclasses.replace(plain, **{name: x}) for x in (1.0, 2.0))
+        if low.sigma(motion, reference) != high.sigma(motion, reference):
+            ratio = float(max(schedule.values) / min(schedule.values))
+            requires = f"{name} constant: 1 >= its largest value over its smallest"
+            note = f"the theorem holds for a constant {name} only; schedule another gain"
+            rows.append(Condition("sliding variable", requires, 1.0, ratio, 0.0, "1", ratio <= 1, note))
+    return rows
 
 
 def _proof(worst: dict[str, tuple[float, float]]) -> list[Condition]:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.control.schedule import present
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.loop import ClosedLoop, ExternalInputs, LoopState
@@ -29,7 +30,11 @@ class Identities(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """Quantities of the proof at one time."""
+    """Quantities of the proof at one time.
+
+    `moving`: rate of the state of the loop. `values`: sigma, v_tilde and e of the loop. `rates`: right-hand sides of
+    Eqs. (12)-(14). q_z and h in m/s^2, q_i and `i_ref_dot` in A/s, d in A^2/m^2/s.
+    """
 
     moving: LoopState
     values: Identities
@@ -44,7 +49,11 @@ class Terms(NamedTuple):
 
 
 class TheoremRow(NamedTuple):
-    """One sample of the monitored loop; margins are positive where a condition holds."""
+    """One sample of the monitored loop.
+
+    `distance`: signed distance of (z/s_0, i_ref/i_0) to the singular curve C. `*_off`: the signal of the loop minus the
+    integral of its right-hand side in the proof. `V_margin`: bound on V' minus V', m^2/s^3; positive where it holds.
+    """
 
     t: Array
     z: Array
@@ -64,7 +73,7 @@ class TheoremRow(NamedTuple):
 class MonitoredState(NamedTuple):
     """State of the closed loop, and the integrals of the proof's right-hand sides.
 
-    The integral for e is stored as i_ref + e: e alone decays below the smallest normal number, where arithmetic is a
+    The integral for e is stored as i_ref + e. By itself, e decays to subnormal numbers, with which arithmetic is a
     hundred times slower.
     """
 
@@ -120,18 +129,18 @@ class Monitored:
         return self.loop.scenario.plant.measurement(state.plant)
 
     def terms(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> Terms:
-        """Return the quantities of the proof. A law without a robust term contributes none."""
+        """Return the quantities of the proof. The robust term of a law without one is 0."""
         cascade, scenario = self.loop.cascade, self.loop.scenario
         plant, motion = scenario.plant, self.motion(state)
         z, _, i = motion
         command, control, u = self.loop.command(inputs, state, errors)
         moving = self.loop.moved(inputs, state, control, u)
         v_tilde, e = command.v_tilde, i - command.i_ref
-        sigma = cascade.position.sigma(motion, inputs.reference)
-        q_z, q_i = inputs.q_z, inputs.q_i
+        sigma = cascade.sigma(motion, inputs.reference)
+        q_z, q_i = scenario.pushed(inputs.q_z, motion), inputs.q_i
         d = self._drift(inputs, state, errors, command.i_ref, moving)
         h = plant.a * (plant.signals(state.plant).v - v_tilde - plant.v(z, command.i_ref))
-        laws = cascade.position, cascade.inversion, cascade.current
+        laws = (present(law, z, inputs.reference) for law in cascade.laws[1:])
         robust = Identities(*(law.robust(x) for law, x in zip(laws, (sigma, v_tilde, e), strict=True)))
         rates = Identities(robust.sigma + q_z + h, robust.v_tilde + d, robust.e + q_i)
         # |v(z, i) - v(z, i_ref)| <= L_v |e|: v is quadratic in i, so dv/di is largest at one end.
@@ -143,11 +152,14 @@ class Monitored:
     def _drift(
         self, inputs: ExternalInputs, state: LoopState, errors: Errors, i_ref: Array, moving: LoopState
     ) -> Array:
-        """Return d = v_star' - (dv/dz) z' along the true flow at constant i_ref: the left side of Eq. (7)."""
+        """Return d = v_star' - (dv/dz) z' along the true flow at constant i_ref: the left side of Eq. (7).
+
+        Errors of the sensors and runout are held.
+        """
         cascade, reference = self.loop.cascade, inputs.reference
 
         def demanded(reference: Reference, x: LoopState) -> Array:
-            force, _, _ = cascade.demand(self.loop.measured(x.plant, errors), x.control, reference)
+            force, _, _ = cascade.demand(self.loop.received(inputs, x.plant, errors), x.control, reference)
             return force.v_star - cascade.model.v(force.z, i_ref)
 
         return jax.jvp(demanded, (reference, state), (reference.rate(), moving))[1]
@@ -178,5 +190,5 @@ class Monitored:
         )
 
     def _sigma_dot(self, reference: Reference, state: LoopState, moving: LoopState) -> Array:
-        sigma = lambda r, x: self.loop.cascade.position.sigma(self.motion(x), r)  # noqa: E731
+        sigma = lambda r, x: self.loop.cascade.sigma(self.motion(x), r)  # noqa: E731
         return jax.jvp(sigma, (reference, state), (reference.rate(), moving))[1]

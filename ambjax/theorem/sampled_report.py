@@ -1,8 +1,8 @@
 """Checks of a cascade on a processor: slopes of laws times T, the distance to the singular curve C, the rotor's status.
 
-Theorem 1 is about continuous time, where sigma, v_tilde and e reach 0. With steps of length T they reach a band around
-0. Two quantities are measured along a run: W, the largest disturbance of the rate of the signal that a law computes,
-and the largest difference between this signal and that of the plant. W gives the band of the computed signal
+Theorem 1 applies in continuous time, where sigma, v_tilde and e reach 0. With steps of length T they reach a band
+around 0. Two quantities are measured along a run: W, the largest disturbance of the rate of the signal that a law
+computes, and the largest difference between this signal and that of the plant. W gives the band of the computed signal
 (`control.sampling.band`); the band plus the difference bounds the plant's signal.
 """
 
@@ -14,8 +14,10 @@ from typing import Any, NamedTuple, SupportsFloat
 import numpy as np
 
 from ambjax.control.base import unhardened
-from ambjax.control.cascade import Cascade, CascadeState
+from ambjax.control.cascade import Cascade
+from ambjax.control.cascade_state import CascadeState
 from ambjax.control.sampling import Sampling, band, disturbance, slope_limits
+from ambjax.control.schedule import extremes, schedules
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import Outcome, System, prepare, roll
@@ -35,10 +37,11 @@ ALTERNATING = 0.25
 
 @dataclasses.dataclass(frozen=True)
 class SlopeCheck:
-    """Slope of a law times T, its effective value in a discrete step, and the limits for stability and no oscillation.
+    """Slope of a law times T, and the limits for stability and for no oscillation.
 
-    An explicit step keeps the slope. An implicit step changes a = slope T of a sign to a/(1 + a), which is below both
-    limits unless the law is delayed.
+    `slope`: slope times T. `stepped`: its effective value in the discrete step of the law. An explicit step does not
+    change it; an implicit step of a sign changes a = slope T to a/(1 + a), which is below both limits unless the law is
+    delayed. `limit`: the law is stable below it. `quiet`: the law does not oscillate below it.
     """
 
     stage: str
@@ -109,16 +112,16 @@ class SampledReport:
 
     @property
     def holds(self) -> bool:
-        """Whether no slope is beyond its limit, C is not reached, and the rotor is levitated to the end."""
+        """Whether every slope is below its limit, C is not reached, and the rotor is held to the end."""
         return math.isinf(self.lost_at) and self.distance[0] > 0 and all(slope.holds for slope in self.slopes)
 
 
 class Delays(NamedTuple):
     """Result of runs with increasing delays (samples), `step` apart, from the delay of the case upwards.
 
-    The rotor survives every delay up to `held` and is lost at `lost`. `undecided` is the smallest delay above `held` at
-    which the integrator stalled, or None. If the rotor is lost at the delay of the case, the delays start at 0; `held`
-    is None if it is lost there too. `lost` is None if the rotor survives every delay.
+    `held`: the rotor survives every delay up to this one. `lost`: it is lost at this delay; None if it survives every
+    delay. `undecided`: the smallest delay above `held` at which the integrator stalled, or None. If the rotor is lost
+    at the delay of the case, the delays start at 0; `held` is None if the rotor is lost there too.
     """
 
     held: float | None
@@ -144,7 +147,7 @@ def check(
     settle: float,
     run: Callable[[System, Clock], Outcome] = rolled,
 ) -> SampledReport:
-    """Return slopes and bands of a cascade with a processor, from two runs: without noise and with it.
+    """Return the report on a cascade with a processor, from two runs: without noise and with it.
 
     `run` simulates a system; `ensemble.replay.record_system` has the rounding of `ambjax simulate`. `settle`: s.
     Raises ValueError as `rollout` does.
@@ -165,7 +168,7 @@ def check(
         float(outcome.lost_at),
         outcome.lost_why,
         stalled,
-        _least(outcome),
+        _smallest_distance(outcome),
         alternating,
         _peak(np.asarray(outcome.rows.z)[settled:]) if np.isinf(outcome.lost_at) else None,
     )
@@ -176,7 +179,7 @@ def _watched(loop: Any, clock: Clock, run: Callable[[System, Clock], Outcome]) -
     return run(Watched(loop), clock).trajectory
 
 
-def _least(run: Trajectory) -> tuple[float, float]:
+def _smallest_distance(run: Trajectory) -> tuple[float, float]:
     """Return the smallest signed distance to the singular curve C until the rotor is lost, and its time (s)."""
     rows: Any = run.rows
     t, distance = np.asarray(rows.t), np.asarray(rows.distance)
@@ -201,10 +204,12 @@ def slopes(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
     sampling, lines = sampling_of(cascade, clock), []
     for stage, law in zip(CascadeState._fields, map(unhardened, cascade.laws), strict=True):
         implicit = law.has_own_step(sampling.implicit)
-        slope = stepped = _steepest(law.slope(cascade.model)) * sampling.period
+        ends = extremes(law)
+        slope = stepped = max(_steepest(one.slope(cascade.model)) for one in ends) * sampling.period
         if implicit:
             relaxed = 1 / (1 + 1 / slope) if slope else 0.0
-            stepped = max(relaxed, float(law.explicit_rate(cascade.model)) * sampling.period)
+            rate = max(float(one.explicit_rate(cascade.model)) for one in ends)
+            stepped = max(relaxed, rate * sampling.period)
         if slope:
             lines.append(
                 SlopeCheck(stage, slope, stepped, *slope_limits(sampling.late if stage in DELAYED else 0.0), implicit)
@@ -213,7 +218,7 @@ def slopes(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
 
 
 def _steepest(slope: SupportsFloat) -> float:
-    """Convert a slope to float; NaN, from canceling infinities of a set-valued sign, becomes inf."""
+    """Convert a slope to float; NaN, from infinities of a set-valued sign that cancel, becomes inf."""
     return math.inf if math.isnan(float(slope)) else float(slope)
 
 
@@ -231,7 +236,10 @@ def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, row
     for stage, (signal, unit) in SIGNALS.items():
         law = getattr(cascade, stage)
         x, true = (np.asarray(getattr(part, signal))[settled:] for part in (rows.computed, rows.true))
-        relay, notes = law.relay(), ["the supply limits u"] * limited
+        scheduled, notes = schedules(law), ["the supply limits u"] * limited
+        relay = None if scheduled else law.relay()
+        if scheduled:
+            notes.append(f"no band: {', '.join(scheduled)} has a schedule")
         gain = W = limit = None
         if relay is not None:
             implicit = law.has_own_step(sampling.implicit)

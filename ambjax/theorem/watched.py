@@ -1,11 +1,11 @@
-"""The loop on a processor with rows that record the laws' own sigma, v_tilde and e at every sample."""
+"""The loop on a processor with rows that record the sigma, v_tilde and e that the laws compute at every sample."""
 
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.cascade import Sample
+from ambjax.control.cascade_state import Sample
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.integrate import Advanced, Integrator
 from ambjax.simulation.sampled import Sampled, SampledState
@@ -66,7 +66,7 @@ class Watched:
         sample = Sample(reference, loop.period, jnp.asarray(loop.loop.scenario.u_max), after.past)
         measured = loop.measured(before.plant, before.z_filtered, errors)
         estimate, *_ = cascade.estimate(measured, before.control.observer, sample)
-        sigma, command = cascade.position.sigma(estimate, reference), after.command
+        sigma, command = cascade.sigma(estimate, reference), after.command
         return WatchedState(after, WatchedSignals(sigma, command.v_tilde, estimate.i - command.i_ref))
 
     def advance(

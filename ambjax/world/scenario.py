@@ -13,10 +13,15 @@ from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement, Sensor
 from ambjax.world.signals import Constant, Signal, edges_of, is_random, realised
+from ambjax.world.touchdown import Stop
 
 # Numbers folded into a member's key for the other streams. Sensors fold in the sample number, which is smaller.
 DESIGN_STREAM, SIGNAL_STREAM = np.uint32(2**32 - 1), np.uint32(2**32 - 2)
-SLOTS = ("reference", "q_z", "q_v", "q_i")
+# Fields that are signals. A new one goes to the end: the position in this list selects the random key of a signal.
+SLOTS = ("reference", "q_z", "q_v", "q_i", "q_f", "base")
+
+# |z| at which a rotor on a stop is lost, as a share of s_0. The gaps of a plant are floored a little further.
+POLE = 0.99
 
 
 @record
@@ -44,6 +49,10 @@ class Scenario:
     """disturbance as scaled force, A^2/m^2: adds a q_v to q_z, with the true plant's a"""
     q_i: Signal = Constant()
     """disturbance of the current's rate, A/s"""
+    q_f: Signal | None = None
+    """disturbance as force, N: adds q_f / m to q_z, with the true plant's m; None: none"""
+    base: Signal | None = None
+    """acceleration of the housing, m/s^2: adds -base to q_z, because z is relative to the housing; None: none"""
     sensor: Sensor | None = None
     initial: Initial = Initial()
     u_max: Scalar = leaf(
@@ -54,6 +63,8 @@ class Scenario:
     clearance: Scalar | None = leaf(
         default=None, unit="m", at_least=1e-9, at_most=1.0, optional=True, doc="|z| of touch-down; none: 0.9 s_0"
     )
+    stop: Stop | None = None
+    """the touchdown bearing at the clearance; None: a rotor that reaches the clearance is lost"""
     seed: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, doc="seed of the noise")
     member: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, doc="member of an ensemble")
 
@@ -61,6 +72,15 @@ class Scenario:
     def touchdown(self) -> Scalar:
         """|z| at which the rotor touches down, m."""
         return 0.9 * self.plant.s_0 if self.clearance is None else self.clearance
+
+    @property
+    def limit(self) -> Scalar:
+        """|z| at which the rotor is lost, m: `touchdown`; with a stop, the pole of the magnet."""
+        return self.touchdown if self.stop is None else POLE * self.plant.s_0
+
+    def pushed(self, q_z: Array, motion: Measurement) -> Array:
+        """Return the disturbance q_z (m/s^2) plus the acceleration by the stop, for the true motion of the rotor."""
+        return q_z if self.stop is None else q_z + self.stop.force(motion, self.touchdown) / self.plant.m
 
     @property
     def random(self) -> bool:
@@ -88,12 +108,21 @@ class Scenario:
         return dataclasses.replace(self, sensor=sensor, amplifier=None)
 
     def acceleration(self, t: Scalar) -> Array:
-        """Return the total disturbance of Eq. (1) at time t: q_z + a q_v, m/s^2."""
-        return self.q_z(t) + self.plant.a * self.q_v(t)
+        """Return the total disturbance of Eq. (1) at time t: q_z + a q_v + q_f / m - base, m/s^2."""
+        total = self.q_z(t) + self.plant.a * self.q_v(t)
+        if self.q_f is not None:
+            total = total + self.q_f(t) / self.plant.m
+        return total if self.base is None else total - self.base(t)
 
     def edges(self) -> tuple[Scalar, ...]:
         """Return the times (s) at which the disturbances jump."""
-        return tuple(edge for signal in (self.q_z, self.q_v, self.q_i) for edge in edges_of(signal))
+        return tuple(edge for slot in SLOTS if slot != "reference" for edge in edges_of(getattr(self, slot)))
+
+    def undisturbed(self) -> "Scenario":
+        """Return the scenario without disturbances and runout."""
+        none = Constant()
+        sensor = self.sensor and dataclasses.replace(self.sensor, runout=None)
+        return dataclasses.replace(self, q_z=none, q_v=none, q_i=none, q_f=None, base=None, sensor=sensor)
 
     def key(self) -> Array:
         """The member's random key: fold_in(key(seed), member)."""

@@ -11,6 +11,7 @@ from ambjax.numerics.gaussian import normals
 from ambjax.numerics.records import Scalar, leaf, record, static
 from ambjax.numerics.smooth import polynomial
 from ambjax.world.faults import Dropouts, FaultOnsets, Outliers, Sensed
+from ambjax.world.rotation import Runout
 
 # m_3 of a low-pass over b = w h < 1 is b times the sum of 3! (-b)^j / (j + 4)!; the next term is below 1e-18.
 SERIES = tuple(math.factorial(3) * (-1) ** j / math.factorial(j + 4) for j in range(16))
@@ -45,9 +46,9 @@ class Measurement(NamedTuple):
 class Sensor:
     """Gaussian noise on each measurement, drawn once per sample period and held constant in it.
 
-    A position reading is low-passed (`bandwidth`), scaled, offset, disturbed by noise, rounded by the converter, and
-    then replaced by faults, in this order. Low-pass, converter and faults require a processor. In continuous time the
-    measurement is continuous.
+    The runout of the rotor adds to its position. A reading is low-passed (`bandwidth`), scaled, offset, disturbed by
+    noise, rounded by the converter, and then replaced by faults, in this order. Low-pass, converter and faults require
+    a processor. In continuous time the measurement is continuous.
     """
 
     std: Scalar = leaf(default=0.0, unit="m", at_least=0, at_most=1.0, doc="standard deviation on z")
@@ -80,6 +81,7 @@ class Sensor:
     velocity: bool = static(default=True, doc="whether z_dot is measured; else an observer must estimate it")
     outliers: Outliers | None = None
     dropouts: Dropouts | None = None
+    runout: Runout | None = None
 
     @property
     def faulty(self) -> bool:

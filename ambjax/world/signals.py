@@ -27,7 +27,7 @@ class Signal(Protocol):
     def span(self, end: float, /) -> tuple[float, float]: ...
 
 
-def _hull(*values: Scalar | np.ndarray) -> tuple[float, float]:
+def hull(*values: Scalar | np.ndarray) -> tuple[float, float]:
     """Return the minimum and maximum of several numbers or arrays."""
     return float(min(map(np.min, values))), float(max(map(np.max, values)))
 
@@ -37,7 +37,7 @@ def _swing(amplitude: Scalar, first: Scalar | np.ndarray, last: Scalar | np.ndar
     ends = [np.sin(TWO_PI * (x - np.floor(x))) for x in (first, last)]
     crest, trough = (np.ceil(first - at) <= last - at for at in (0.25, 0.75))
     high, low = np.where(crest, 1.0, np.maximum(*ends)), np.where(trough, -1.0, np.minimum(*ends))
-    return _hull(amplitude * low, amplitude * high)
+    return hull(amplitude * low, amplitude * high)
 
 
 @record
@@ -50,7 +50,7 @@ class Constant:
         return jnp.broadcast_to(jnp.asarray(self.value, jnp.result_type(float)), jnp.shape(t))
 
     def span(self, end: float) -> tuple[float, float]:
-        return _hull(self.value)
+        return hull(self.value)
 
 
 @record
@@ -65,7 +65,7 @@ class Step:
 
     def span(self, end: float) -> tuple[float, float]:
         start = np.asarray(self.start)
-        return _hull(np.where(start > 0, 0.0, self.amplitude), np.where(start <= end, self.amplitude, 0.0))
+        return hull(np.where(start > 0, 0.0, self.amplitude), np.where(start <= end, self.amplitude, 0.0))
 
     def edges(self) -> tuple[Scalar, ...]:
         """Return the time of the jump, s."""
@@ -92,7 +92,7 @@ class Pulse:
     def span(self, end: float) -> tuple[float, float]:
         start, stop = np.asarray(self.start), np.asarray(self.stop)
         on, off = (start <= end) & (stop > 0), (start > 0) | (stop <= end)
-        return _hull(np.where(on, self.amplitude, 0.0), np.where(off, 0.0, self.amplitude))
+        return hull(np.where(on, self.amplitude, 0.0), np.where(off, 0.0, self.amplitude))
 
     def edges(self) -> tuple[Scalar, ...]:
         """Return the time of the jump, s."""
@@ -134,7 +134,7 @@ class SmoothStep:
 
     def span(self, end: float) -> tuple[float, float]:
         shares = [np.clip((t - np.asarray(self.start)) / self.duration, 0.0, 1.0) for t in (0.0, end)]
-        return _hull(*(self.amplitude * s**3 * (10 - 15 * s + 6 * s**2) for s in shares))
+        return hull(*(self.amplitude * s**3 * (10 - 15 * s + 6 * s**2) for s in shares))
 
     def shifted(self, by: Scalar) -> "SmoothStep":
         """Return the signal, `by` seconds later."""

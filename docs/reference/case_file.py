@@ -6,7 +6,7 @@ import tomllib
 from typing import Any
 
 from ambjax.cases.reader import KINDS, OTHERS, TABLES, case_from
-from ambjax.cases.scenario_tables import FIELDS, SETTLE, SIGNALS
+from ambjax.cases.scenario_tables import FIELDS, SETTLE, SIGNALS, STOP
 from ambjax.cases.table import Table
 from ambjax.cases.template_text import template
 from ambjax.cases.timing import DURATION
@@ -19,6 +19,7 @@ from ambjax.linear import Zones
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.faults import Dropouts, Outliers
 from ambjax.world.plant import Plant
+from ambjax.world.rotation import Runout
 from ambjax.world.scenario import Initial
 from ambjax.world.sensor import Sensor
 from reference.fields import Facts, facts
@@ -28,29 +29,37 @@ from reference.parser import keys, remarks, rule
 TITLES = ("key", "unit", "default", "allowed", "meaning")
 RECORDS: dict[str, type] = {"plant": Plant, "processor": Processor, "initial": Initial, "sensor": Sensor}
 RECORDS |= {"actuator": Amplifier, "processor.guard": Guard, "sensitivity": Zones}
-RECORDS |= {"sensor.outliers": Outliers, "sensor.dropouts": Dropouts}
+RECORDS |= {"sensor.outliers": Outliers, "sensor.dropouts": Dropouts, "sensor.runout": Runout}
 SETTINGS: dict[str, dataclasses.Field] = {
     "actuator.u_max": FIELDS["u_max"],
     "clock.duration": DURATION,
     "clock.sample_period": FIELDS["sample_period"],
     "run.clearance": FIELDS["clearance"],
     "run.settle": SETTLE,
+    "run.stop_stiffness": STOP["stiffness"],
+    "run.stop_damping": STOP["damping"],
 }
 # What a table is for, and what stands if it is left out.
 WORDS = {
     "plant": "The true plant. Left out, or a key of it: Table 1 of the paper.",
     "controller": "The cascade: a nominal plant and one law per stage. Kinds and gains: [laws](laws.md), or a "
-    "[custom law](../own-laws.md).",
+    "[custom law](../own-laws.md). A table in the place of a gain is its [schedule](../schedules.md).",
+    "controller.position.file": "path of an .npz or .mat file with the arrays A, B, C, D and dt (s; 0: continuous), "
+    "relative to the folder of the case file",
+    "controller.position.output": "what the controller's output is: a current, A, or a voltage, V",
     "controller.model": "Parameters of the controller's model that differ from the plant: any key of `[plant]`.",
     "processor": "What the cascade runs on: one step of all laws a sample, its voltage held and late. Left out: "
     "continuous time, as in the paper. See [the processor](../processor.md).",
     "processor.guard": "Limits of the readings: one beyond them is refused and predicted. A key left out is derived "
     "from the case; `guard = false` in `[processor]`: none. See [the guard](../processor.md#the-guard).",
     "reference": "What z is to follow, in m. Left out: 0. See [signals](signals.md).",
-    "disturbance": "What disturbs the loop: a signal each, and its unit. Left out: none. See [signals](signals.md).",
+    "disturbance": "What disturbs the loop: a signal each, or a list of signals (`[[disturbance.q_z]]`) that add, and "
+    "their unit. `q_z` acts on the rotor, `q_i` on the current; `base` is the acceleration of the housing. Left out: "
+    "none. See [loads](../loads.md) and [signals](signals.md).",
     "sensor": "What is measured; noise is drawn once per sample period and held. Left out: everything, without error.",
     "sensor.outliers": "Single readings of the position that are far off. See [faults](../sensors.md#faults).",
     "sensor.dropouts": "Stretches without a reading of the position. See [faults](../sensors.md#faults).",
+    "sensor.runout": "Runout of the surface that the position sensor reads. See [runout](../loads.md#runout).",
     "actuator": "The supply and, on a processor, its amplifier. Left out: ideal.",
     "initial": "The plant's state at t = 0. Left out: at rest, in the middle.",
     "clock": "Time: how long, how often a row is recorded and noise drawn, and how it is integrated between.",
@@ -60,6 +69,12 @@ WORDS = {
     "tune": "What `ambjax tune` is to do; the other commands pass it by.",
     "tune.weights": "What counts, as weights of dimensionless terms.",
     "tune.limits": "What must not be exceeded, as judged by the held-out members. See [limits](../limits.md).",
+}
+# Meaning of the keys of signals that are no fields of a record.
+KEYS = {
+    "file": "path, relative to the case file",
+    "columns": "names of the columns of time and value; left out: the two that the file has",
+    "interpolation": "straight lines between the values, or each value until the next time",
 }
 LEFT_OUT = re.compile(r"[(;]? ?left out: (?P<default>[^;)]*)\)?")
 CHOICE = re.compile(r"one of '(?P<default>[^']*)'")
@@ -87,10 +102,10 @@ def _row(path: str, field: dataclasses.Field | None, beside: dict[str, Any] | No
     allowed = _allowed(path, beside)
     if field is not None and field.metadata.get("leaf"):
         row = facts(field)._replace(name=key)
-        if (row.default == "" and told.default == "") or field.default is dataclasses.MISSING:
+        known = path in SETTINGS and told.default
+        if (row.default == "" and told.default == "") or (field.default is dataclasses.MISSING and not known):
             return row._replace(default="none" if field.metadata["optional"] else "required")
-        own = told.default if path in SETTINGS and told.default else row.default
-        return row._replace(default=own)
+        return row._replace(default=told.default if known else row.default)
     first = CHOICE.search(allowed)
     return told._replace(name=key, allowed=allowed, default=first["default"] if first else told.default)
 
@@ -109,6 +124,8 @@ def _told(path: str) -> Facts:
     known = remarks()
     below = next((one for one in known if one.startswith(f"{path}.")), path)
     shown, meaning = ("", WORDS[path]) if path in WORDS else known.get(path, known.get(below, ("", "")))
+    if path.startswith("reference."):
+        meaning = KEYS.get(path.rpartition(".")[2], meaning)
     unit = ""
     if (begun := UNIT.fullmatch(meaning)) is not None:
         unit, meaning = begun["unit"], begun["rest"] or ""
@@ -176,8 +193,8 @@ def _signals() -> str:
     lines = [
         "# Signals",
         "",
-        "Functions of time: for `[reference]` (m), `[disturbance.q_z]` and `[disturbance.q_i]`. An amplitude, a value "
-        "or a standard deviation is in the unit of what the signal is for.",
+        "Functions of time: for `[reference]` (m) and the tables of `[disturbance]`. An amplitude, a value "
+        "or a standard deviation is in the unit of what the signal is for. See [loads](../loads.md).",
         "",
     ]
     for kind, signal in SIGNALS.items():

@@ -36,7 +36,7 @@ def value(default: Any) -> str:
     """Return a default as text; '' for none."""
     if default is dataclasses.MISSING or default is None:
         return ""
-    if isinstance(default, (str, bool)):
+    if isinstance(default, (str, bool)) or dataclasses.is_dataclass(default):
         return str(default)
     number = float(default)
     return f"{number:g}" if math.isfinite(number) else "inf"

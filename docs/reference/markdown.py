@@ -23,7 +23,7 @@ def code(text: str) -> str:
 def table(titles: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> list[str]:
     """Return a table of finished cells and an empty line; `kind`: its class in the style sheet."""
     lines = [f"| {' | '.join(titles)} |", "|" + "---|" * len(titles), *(f"| {' | '.join(row)} |" for row in rows)]
-    return [f":::{{container}} {kind}", "", *lines, "", ":::", ""] if kind else [*lines, ""]
+    return [f'<div class="{kind}">', "", *lines, "", "</div>", ""] if kind else [*lines, ""]
 
 
 def first_paragraph(thing: Any) -> str:

@@ -168,7 +168,8 @@ class Engine:
         self.rollouts += len(x) * len(members.member) * (len(self.objective.space) + 1)
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS)))
         slope = LaneGradient(self.objective.space, self.mode == "reverse")
-        found = self._lanes(slope, x, members, min(self.lanes, GRADIENT_LANES), weights=each)
+        width, plain = min(self.lanes, GRADIENT_LANES), self.mode == "reverse"
+        found = self._lanes(slope, x, members, width, weights=each, plain=plain)
         return found if self.objective.loop is None else self._with_loops(found, x, members)
 
     def _with_loops(
@@ -195,15 +196,17 @@ class Engine:
         width: int,
         weights: Any = None,
         fold: Any = None,
+        plain: bool = False,
     ) -> Any:
-        """Apply the function to every start x [S, m], with its weights [S, 6], and member [N]: leaves [S, N, ...]."""
+        """Apply the function to every start x [S, m], with its weights [S, 6], and member [N]: leaves [S, N, ...].
+
+        `plain`: as in `map_members`; reverse mode needs it.
+        """
         start, member = np.divmod(np.arange(len(x) * len(members.member)), len(members.member))
         at = np.asarray(x, jnp.result_type(float))[start]
         selected = jax.tree.map(lambda a: a[member], members)
         lane = Lane(at, selected, self._world, None if weights is None else weights[start], fold)
-        results = map_members(
-            function, lane, threads=self.threads, call=width, block=width, plain=self.mode == "reverse"
-        )
+        results = map_members(function, lane, threads=self.threads, call=width, block=width, plain=plain)
         return jax.tree.map(lambda a: a.reshape(len(x), len(members.member), *a.shape[1:]), results)
 
 

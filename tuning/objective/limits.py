@@ -1,9 +1,12 @@
-"""Limits on quantities of an ensemble, and their terms of the goal.
+"""Limits on quantities of an ensemble, and their terms in the goal.
 
 A search minimises the error subject to the limits by an augmented Lagrangian (Nocedal and Wright, Numerical
-Optimization, 2006, 17.3). With g = log(reached / allowed), a limit adds (max(0, multiplier + penalty g)^2 -
-multiplier^2) / (2 penalty) to the goal, which is a logarithm. At the optimum the multiplier is minus the elasticity of
-the minimised quantity: a limit 1 % higher lowers it by `multiplier` %.
+Optimization, 2006, 17.3). With g = log(reached / allowed), a limit adds
+
+    (max(0, multiplier + penalty g)^2 - multiplier^2) / (2 penalty)
+
+to the goal, which is a logarithm. At the optimum, a limit that is 1 % looser lowers the objective, exp(goal), by
+`multiplier` %.
 """
 
 import dataclasses
@@ -18,18 +21,19 @@ from ambjax.extend import Scalar, record, static
 from ambjax.simulation.folds import Fold
 from tuning.objective.quantities import KINDS, TINY, Kind, LimitContext
 
-# Initial penalty: at a multiplier of 0, an excess of 10 % adds 0.14 to the goal. Factor by which the penalty grows when
-# an update leaves more than the share SUFFICIENT_DECREASE of the excess (Nocedal and Wright, ch. 17); largest penalty.
+# Initial penalty: at a multiplier of 0, an excess of 10 % adds 0.14 to the goal. Factor by which the penalty grows if
+# an update leaves more than the share SUFFICIENT_DECREASE of the excess (Nocedal and Wright, ch. 17). Largest penalty.
 PENALTY, PENALTY_GROWTH, SUFFICIENT_DECREASE, MOST_PENALTY = 30.0, 4.0, 0.3, 2000.0
-# Prefix of the names of limited quantities among the terms of a loss.
+# Prefix that marks a limited quantity among the terms of a loss.
 PREFIX = "limit."
-# A limit with a multiplier above 0 is met from this share below the allowed value to half of the margin above it.
+# A limit with a multiplier above 0 is met if g lies between minus this number and half of the margin.
 TOLERANCE_BELOW = 0.01
-# Smallest margin. A search meets a limit to half of its margin only, so a smaller margin would not keep it held.
+# Smallest margin. The search accepts a judged value up to half of the margin above its bound, so a smaller margin would
+# leave too little reserve for the held-out ensemble.
 LEAST_MARGIN = 0.002
-# Source of the limit on the rms error with which the front of error against voltage is traced.
+# Value of `Limit.source` for the limit on the rms error that traces the front of error against voltage.
 FRONT = "the front"
-# Factor by which a quantity that is judged infinite exceeds its limit, or the search's value, in the search.
+# An infinite judged value is replaced by this factor times the larger of the limit and the search's value.
 LOST_FACTOR = 10.0
 # Intervals of the integral in `Limit.error_reduction`.
 PRICE_INTERVALS = 200
@@ -37,10 +41,10 @@ PRICE_INTERVALS = 200
 
 @record
 class LimitTerm:
-    """Term of a limit in the goal. Its numbers are leaves: other numbers do not recompile a search.
+    """Term of a limit in the goal. Its numbers are leaves, so that a change of them does not recompile a search.
 
-    `name`: of the quantity in KINDS. `log_allowed`: logarithm of the bound. `multiplier`, `penalty`, `ratio`: as
-    in `Limit`.
+    `name`: key of the quantity in KINDS. `log_allowed`: logarithm of `Limit.allowed`. `multiplier`, `penalty`, `ratio`:
+    as in `Limit`.
     """
 
     name: str = static()
@@ -50,23 +54,27 @@ class LimitTerm:
     ratio: Scalar
 
     def excess(self, values: Array) -> Array:
-        """Return g = log(reached / allowed) for the search's values [N], corrected by `ratio`; -g of a lower limit."""
+        """Return g = log(reached / allowed), or -g for a lower limit.
+
+        `values` [N]: the quantity of each member in the search. `ratio` corrects their reduction over members.
+        """
         kind = KINDS[self.name]
         excess = jnp.log(jnp.maximum(self.ratio * kind.tuned(values), TINY)) - self.log_allowed
         return -excess if kind.at_least else excess
 
     def __call__(self, values: Array) -> Array:
-        """Return the term for the search's values [N]."""
+        """Return the term in the goal for the members' values [N] in the search."""
         force = jnp.maximum(self.multiplier + self.penalty * self.excess(values), 0.0)
         return (force**2 - self.multiplier**2) / (2 * self.penalty)
 
 
 @dataclasses.dataclass(frozen=True)
 class Limit:
-    """Limit `threshold` of the quantity KINDS[`name`], and the state of its augmented Lagrangian.
+    """A limit, and the state of its augmented Lagrangian.
 
-    `source`: origin of the limit, for the report. `multiplier`, `penalty`: of the augmented Lagrangian. `ratio`: the
-    judge's value over the search's. `missed`: g at the last update. `forces`: (reached, multiplier) of every update.
+    `name`: key of the quantity in KINDS. `threshold`: the limit, in the unit of the quantity. `source`: origin of the
+    limit, for the report. `multiplier`, `penalty`: of the augmented Lagrangian. `ratio`: the judge's value divided by
+    the search's value. `missed`: g at the last update. `forces`: (judge's value, multiplier) at every update.
     """
 
     name: str
@@ -87,27 +95,28 @@ class Limit:
 
     @property
     def allowed(self) -> float:
-        """Bound that the search uses: the limit less its margin, or a lower limit and its margin."""
+        """Bound that the search uses: the limit minus its margin; a lower limit plus its margin."""
         return (1 + self.margin if self.kind.at_least else 1 - self.margin) * self.threshold
 
     def holds(self, reached: float) -> bool:
-        """Return whether a value keeps the limit."""
+        """Return whether the value `reached` is within the limit, without a margin."""
         return reached >= self.threshold if self.kind.at_least else reached <= self.threshold
 
     @property
     def term(self) -> LimitTerm:
-        """The limit's term of the goal."""
+        """The limit's term in the goal."""
         return LimitTerm(self.name, math.log(self.allowed), self.multiplier, self.penalty, self.ratio)
 
     def log_excess(self, reached: float) -> float:
-        """Return g = log(reached / allowed); -g for a lower limit."""
+        """Return g = log(reached / allowed), or -g for a lower limit."""
         excess = math.log(max(reached, TINY) / self.allowed)
         return -excess if self.kind.at_least else excess
 
     def active(self, reached: float | None) -> bool:
-        """Return whether the limit is active: its multiplier is above 0, and the judge's value reaches it.
+        """Return whether the limit is active: its multiplier is above 0, and the judge's value `reached` is at it.
 
-        If no member is judged, `reached` is None and the multiplier alone decides.
+        The tolerance is TOLERANCE_BELOW plus the margin. `reached`: None if no member is judged; the multiplier then
+        decides alone.
         """
         near = reached is None or self.log_excess(reached) >= -(TOLERANCE_BELOW + self.margin)
         return self.multiplier > 0 and near
@@ -115,8 +124,8 @@ class Limit:
     def updated(self, tuned: float, judged: float) -> "Limit":
         """Return the limit after an update of its multiplier at an optimum of the goal.
 
-        `tuned` and `judged` are the values of the search and of the judge there. `judged` is infinite where an
-        injection loses the rotor: LOST_FACTOR times the larger of `tuned` and the limit stands for it.
+        `tuned`, `judged`: values of the search and of the judge at the optimum. `judged` is infinite if an injection
+        loses the rotor; it is then replaced by LOST_FACTOR times the larger of `tuned` and the limit.
         """
         judged = judged if math.isfinite(judged) else LOST_FACTOR * max(tuned, self.threshold)
         excess = self.log_excess(judged)
@@ -128,14 +137,15 @@ class Limit:
         return dataclasses.replace(self, multiplier=force, ratio=ratio, penalty=penalty, missed=excess, forces=forces)
 
     def restarted(self) -> "Limit":
-        """Return the limit for the minimum of another quantity: only `ratio` stays."""
+        """Return the limit with a new augmented Lagrangian, to minimise another quantity. `ratio` is kept."""
         return dataclasses.replace(self, multiplier=0.0, penalty=PENALTY, missed=math.inf, forces=())
 
     def error_reduction(self, more: float) -> float:
-        """Return the relative decrease of the minimised rms value when the limit is looser by the share `more`.
+        """Return the relative decrease of the minimised rms value if the limit is looser by the share `more`.
 
-        It is the integral of the multiplier over the logarithm of the limit. The multiplier is interpolated linearly
-        between the optima of the updates, which belong to looser limits, and is constant outside of them.
+        The decrease is 1 - exp(-I/2), where I is the integral of the multiplier over the logarithm of the limit. The
+        optima of earlier updates belong to looser limits. Between them the multiplier is interpolated linearly, and
+        beyond them it is constant.
         """
         if not self.multiplier:
             return 0.0
@@ -146,18 +156,18 @@ class Limit:
         return -math.expm1(-float(np.trapezoid(np.interp(at, logs, forces), at)) / 2)
 
     def reached(self, columns: Mapping[str, np.ndarray]) -> float:
-        """Return the judge's value. `columns`: every metric and term of an ensemble by name, each [N]."""
+        """Return the judge's value over an ensemble. `columns`: its metrics and terms by name, each [N]."""
         return float(self.kind.judged(self.of_members(columns)))
 
     def worst(self, columns: Mapping[str, np.ndarray]) -> float:
-        """Return the value of the worst member. `columns`: as for `reached`."""
+        """Return the value of the worst member of an ensemble. `columns`: as for `reached`."""
         return float((np.min if self.kind.at_least else np.max)(self.of_members(columns)))
 
     def of_members(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the quantity of each member that is held, or of all members if none is held.
 
-        `columns`: every metric and term of an ensemble by name, each [N]. Lost rotors are left out: their voltage is 0
-        after the loss, which would lower a mean. The limit `survival` counts them.
+        `columns`: as for `reached`. Lost rotors are left out, because their voltage is 0 after the loss, which would
+        lower a mean. The limit `survival` counts them.
         """
         alive = ~np.isfinite(columns["lost_at_s"])
         values = np.asarray(columns[self.kind.exact or f"loss.{PREFIX}{self.name}"])
@@ -165,7 +175,11 @@ class Limit:
 
 
 def measures(names: Collection[str], limits: tuple[Limit, ...], context: LimitContext) -> dict[str, Fold]:
-    """Return the fold of each of the quantities that has one, by name. `limits`: those among them."""
+    """Return the folds that measure the quantities `names` in a rollout, by name.
+
+    A quantity of the linearised loop has no fold. `limits`: the limits on some of the quantities; their thresholds
+    scale the folds. `context`: numbers of the case on which the folds depend.
+    """
     thresholds = {limit.name: limit.threshold for limit in limits}
     folds = {name: KINDS[name].fold for name in names}
     return {name: fold(context, thresholds.get(name, 1.0)) for name, fold in folds.items() if fold is not None}

@@ -15,43 +15,58 @@ from ambjax.simulation.trajectory import ALIVE, Row
 from ambjax.world.scenario import Scenario
 from tuning.objective.limits import PREFIX
 
-# Exponent of the norm that approximates the maximum: over 1e4 samples of noise it is 1.2 to 1.6 times smaller.
+# Exponent of the norm that approximates a maximum. Over 1e4 samples of noise, the maximum is 1.2 to 1.6 times the norm.
 NORM = 16
+# Names of the terms, in the order of the weights.
 TERMS = ("tracking", "peak", "effort", "chatter", "clearance", "survival")
-# Terms that measure how close the rotor is to touchdown, and its loss.
+# Terms that measure the distance from touchdown and the loss of the rotor.
 HELD = ("clearance", "survival")
-# Terms that multiply the error.
+# Terms that count relative to the error (`weigh`).
 COSTS = ("effort", "chatter")
 
 
 class Sums(NamedTuple):
-    """Carry of the fold: sums over samples, and the carries of the limits' folds."""
+    """State of the fold: sums over samples, values of the last sample, and the states of the limits' folds."""
 
     square: Array
+    """weighted sum of the squared error, in units of s_0^2"""
     power: Array
+    """weighted sum of the error to the power NORM, in units of s_0^NORM"""
     weight: Array
+    """sum of the weights"""
     effort: Array
+    """integral of u^2, V^2 s"""
     chatter: Array
+    """sum of the squared steps of the averaged voltage, V^2"""
     u: Array
+    """average of u over the last sample, V"""
     clearance: Array
+    """sum of the clearance term"""
     driven: Array
+    """number of samples with the rotor held"""
     time: Array
+    """time with the drive on, s"""
     contact_time: Array
+    """extrapolated time at which |z| reaches the stop, s"""
     measured: Any
+    """states of the limits' folds"""
 
 
 @record
 class Loss:
-    """Fold: the terms of the loss of one member by name (TERMS), dimensionless and not negative.
+    """Fold that returns the terms of the loss of one member by name (TERMS), dimensionless and not negative.
+
+    With e_z = z - r:
 
     tracking: mean of (e_z / s_0)^2 from `settle` on; earlier samples have the weight `early`.
     peak: square of the 16-norm of e_z / s_0 over the same samples, a smooth maximum.
     effort: mean over time of (u / u_scale)^2 while the drive is on.
     chatter: mean over samples of ((u_k - u_{k-1}) / u_scale)^2, where u_k is the average of u over sample k.
     clearance: mean of max(0, (|z| - h) / (stop - h))^2, where h = (|r| + stop) / 2.
-    survival: share of the horizon after the loss of the rotor. Its derivative is that of the time at which |z| reaches
-    the stop at its last speed, so a descent step keeps the rotor for longer.
-    The result also holds the result of each fold of `measures`, under its name with PREFIX.
+    survival: share of the run after the loss of the rotor. Its derivative is that of the time at which |z| would reach
+    the stop with the speed at the last sample. So a descent step delays the loss.
+
+    The result also contains the result of each fold in `measures`, with PREFIX before its name.
     """
 
     settle: Scalar = leaf(default=0.2, unit="s", at_least=0, at_most=1e6)
@@ -107,9 +122,10 @@ class Loss:
 
 
 def loss_for(scenario: Scenario, settle: float, early: float = 0.0, measures: Mapping[str, Fold] | None = None) -> Loss:
-    """Return the loss of a scenario. u is scaled by the supply's limit, or by R i_0 without a limit.
+    """Return the loss of a scenario. The unit of u is the supply's limit, or R i_0 without a limit.
 
-    `settle` (s): start of the settled part. `early`: weight of the samples before it. `measures`: folds of limits.
+    `settle` (s): time from which errors count fully. `early`: weight of earlier errors. `measures`: folds of the
+    limited quantities by name.
     """
     plant = scenario.plant
     u_scale = jnp.where(jnp.isfinite(scenario.u_max), scenario.u_max, plant.R * plant.i_0)
@@ -119,8 +135,10 @@ def loss_for(scenario: Scenario, settle: float, early: float = 0.0, measures: Ma
 def weigh(weights: Any, terms: Mapping[str, Any], stressed: Any) -> Any:
     """Return the loss: clearance + survival + (tracking + peak) (1 + effort + chatter), each term times its weight.
 
-    For a stressed member it is clearance + survival. Costs are relative to the error, whose size is unknown in advance:
-    at a weight of 0.1, a voltage at its limit throughout adds a tenth of the error.
+    `weights`: in the order of TERMS. `terms`: the terms by name, numbers or arrays [N]. `stressed`: whether a member is
+    stressed; its loss is clearance + survival only. Effort and chatter count relative to the error, because the size of
+    the error is unknown in advance. With a weight of 0.1, a voltage that is always at its limit adds a tenth of the
+    error.
     """
     ordinary = 1.0 - 1.0 * stressed
     each = dict(zip(TERMS, (weights[k] * terms[name] for k, name in enumerate(TERMS)), strict=True))
@@ -130,5 +148,5 @@ def weigh(weights: Any, terms: Mapping[str, Any], stressed: Any) -> Any:
 
 
 def outcomes(weights: object, terms: dict[str, Any], stressed: object) -> list[Any]:
-    """Return the weighted loss and the limited quantities, in the order of their names."""
+    """Return the loss (`weigh`), then the limited quantities among `terms` in the order of their names."""
     return [weigh(weights, terms, stressed), *(terms[name] for name in sorted(terms) if name.startswith(PREFIX))]

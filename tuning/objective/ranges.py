@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from ambjax.control.schedule import extremes
 from ambjax.control.search import Interval, SearchContext
 from tuning.objective.members import Objective
 from tuning.objective.shortfalls import Bound
-from tuning.space import Gain, Space, read
+from tuning.space import Gain, Space
 
 # Least displacement assumed for a rotor that starts at rest, as a share of the clearance.
 LEAST_DISPLACEMENT = 0.01
@@ -52,7 +53,12 @@ def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarra
 
 
 def drawn(space: Space, box: list[Range], cube: np.ndarray) -> np.ndarray:
-    """Map points of the unit cube [n, m] to gains [n, m], log-uniform over the ranges `box`."""
+    """Map points of the unit cube [n, m] to gains [n, m], log-uniform over the ranges `box`.
+
+    All knots of a schedule have the value of the first: the search begins at constant gains.
+    """
+    stems = [".".join(path.split(".")[:3]) for path in space.paths]
+    cube = cube[:, [stems.index(stem) for stem in stems]]
     ends = np.log([one.product[1:] if one.product else (one.low, one.high) for one in box])
     gains = np.exp(ends[:, 0] + cube * (ends[:, 1] - ends[:, 0]))
     for j, one in enumerate(box):
@@ -96,18 +102,21 @@ def _context(objective: Objective, conditions: tuple[Bound, ...]) -> SearchConte
 def _interval(context: SearchContext, cascade: object, gain: Gain, value: float) -> Interval:
     if gain.low > 0 and np.isfinite(gain.high):
         return Interval(gain.low, gain.high, "tune.bounds", True)
-    _, stage, name = gain.path.split(".")
+    _, stage, name, *_ = gain.path.split(".")
     about = Interval(
         value / DEFAULT_FACTOR, value * DEFAULT_FACTOR, f"a factor of {DEFAULT_FACTOR:g} about the case's value"
     )
-    return getattr(cascade, stage).ranges(context).get(name, about)
+    return extremes(getattr(cascade, stage))[0].ranges(context).get(name, about)
 
 
 def _quotient(gain: Gain, value: float, interval: Interval, cascade: Any, found: dict[str, Range]) -> Range:
     """Return the range of a gain whose law defines the interval of its product with another gain."""
-    other = f"{gain.path.rpartition('.')[0]}.{interval.times}"
-    if other not in found:
-        size = float(read(cascade, other))
+    root, stage, _, *knot = gain.path.split(".")
+    stem = f"{root}.{stage}.{interval.times}"
+    # with schedules of both gains: the other one at the same knot
+    other = next((path for path in (".".join([stem, *knot]), stem) if path in found), None)
+    if other is None:
+        size = float(getattr(extremes(getattr(cascade, stage))[0], interval.times))
         return _range(gain, value, interval._replace(low=interval.low / size, high=interval.high / size))
     ends = interval.low / found[other].high, interval.high / found[other].low
     whole = _range(gain, value, interval._replace(low=ends[0], high=ends[1]))

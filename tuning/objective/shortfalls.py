@@ -47,10 +47,12 @@ def bounds(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Bound, .
 def shortfall(gains: Mapping[str, Array], bounds: tuple[Bound, ...], margin: Scalar) -> Array:
     """Return the sum of max(0, log((1 + margin) bound / gain))^2 over `gains` by path with a bound.
 
-    It is 0 if every condition holds with the relative margin `margin`.
+    The bound of a scheduled gain applies to each of its knots. The sum is 0 if every condition holds with the
+    relative margin `margin`.
     """
     total = jnp.zeros(())
     for bound in bounds:
-        if bound.path in gains and bound.value > 0:
-            total = total + jnp.maximum(jnp.log((1 + margin) * bound.value) - jnp.log(gains[bound.path]), 0.0) ** 2
+        own = [gain for path, gain in gains.items() if path == bound.path or path.startswith(f"{bound.path}.")]
+        for gain in own if bound.value > 0 else []:
+            total = total + jnp.maximum(jnp.log((1 + margin) * bound.value) - jnp.log(gain), 0.0) ** 2
     return total

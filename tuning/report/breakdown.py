@@ -61,4 +61,5 @@ def _of(goal: Goal) -> str:
     """Describe what the risk is."""
     if not goal.minimised:
         return f"{goal.risk} of the loss"
-    return f"mean square of {goal.minimised} in units of {1 / float(goal.unit):.4g} V, and {goal.risk} of what holds it"
+    square = f"mean square of {goal.minimised} in units of {1 / float(goal.unit):.4g} V"
+    return f"{square}, plus {goal.risk} of clearance + survival"

@@ -1,4 +1,4 @@
-"""The report of a search in Markdown, from its facts."""
+"""The report of `ambjax tune` in Markdown."""
 
 from ambjax.host.web_page import literal, table
 from tuning.objective.loss import TERMS
@@ -7,12 +7,12 @@ from tuning.report.breakdown import FORMULA
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.held_out import number
 
-# Relative improvement below which a point of a slice counts as equal to the answer.
+# Relative decrease of the objective below which a point of a slice counts as equal to the answer.
 AS_GOOD = 0.01
 
 
 def markdown(facts: TuningFacts) -> str:
-    """Return the text of report.md. It refers to the pictures in the same folder."""
+    """Return the text of report.md. Its pictures are files in the same folder."""
     lines = [f"# Tuning of {literal(facts.case)}", "", facts.verdict, ""]
     lines += (
         front_table.section(facts.front, facts.front_written)
@@ -31,6 +31,7 @@ def markdown(facts: TuningFacts) -> str:
 
 
 def _gains(facts: TuningFacts) -> list[str]:
+    """Return the sections on the gains and on the nominal run."""
     ranged = any(row.get("source") for row in facts.gains)
     looked = ["searched from", "to"] if ranged else []
     head = ["gain", "before", "after", *looked, "allowed from", "to", "at a bound", "risk increase"]
@@ -42,10 +43,10 @@ def _gains(facts: TuningFacts) -> list[str]:
         rows.append([row["path"], *gains, *ends, *bounds, row["at_bound"] or "-", _sensitivity(row, facts)])
     lines = ["## Gains", "", *table(head, rows), ""]
     words = (
-        "Last column: increase of the risk if this gain alone is larger or smaller by a factor of e^0.25 = 1.28, the "
-        "larger of both. A gain with a large number must be set accurately. If this change loses members of the "
-        "training ensemble that the answer holds, the column gives their number instead. `tune.bounds` sets other "
-        "bounds."
+        "Last column: increase of the risk if this gain alone is larger or smaller by a factor of e^0.25 = 1.28. The "
+        "larger of the two increases is shown. A gain with a large number must be set accurately. If this change loses "
+        "members of the training ensemble, the column shows how many more are lost than with the answer. "
+        "`tune.bounds` sets other bounds."
     )
     sources = [f"- {row['path']}: {literal(row['source'])}" for row in facts.gains if row.get("source")]
     return [
@@ -59,7 +60,8 @@ def _gains(facts: TuningFacts) -> list[str]:
         "",
         "![z - r and u before and after tuning](nominal.png)",
         "",
-        "The voltage's amplitude spectrum (Hann window, from `run.settle` on): a sine of 1 V has the height 1 V.",
+        "Amplitude spectrum of the voltage from `run.settle` on (Hann window). A sine with an amplitude of 1 V has the "
+        "height 1 V.",
         "",
         "![Amplitude spectrum of u before and after tuning](spectrum.png)",
         "",
@@ -67,13 +69,14 @@ def _gains(facts: TuningFacts) -> list[str]:
 
 
 def _sensitivity(row: Row, facts: TuningFacts) -> str:
-    """Describe the growth of the risk, or the additional lost members, when a gain is off."""
+    """Return the increase of the risk, or the number of members lost, if a gain is off by a factor of 1.28."""
     if row.get("sensitivity_lost"):
-        return f"**a gain off by 28 % loses a rotor ({row['sensitivity_lost']} of {facts.trained_on} members)**"
+        return f"**{row['sensitivity_lost']} of {facts.trained_on} training members are lost**"
     return "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
 
 
 def _loss(facts: TuningFacts) -> list[str]:
+    """Return the section on the terms of the loss of the held-out members."""
     if not facts.loss:
         return []
     before, after = facts.loss["before"], facts.loss["after"]
@@ -89,9 +92,9 @@ def _loss(facts: TuningFacts) -> list[str]:
     return [
         "## The loss of the held-out members",
         "",
-        f"`loss = {FORMULA}` of each member, each term times its weight. Means over members: what tracking, peak, "
-        "clearance and survival add is weight x mean. The costs effort and chatter multiply the error of each member. "
-        "They add the mean of weight x term x (tracking + peak), which is not the product of the means shown.",
+        f"Loss of a member: `{FORMULA}`, each term times its weight. The columns are means over members. Tracking, "
+        "peak, clearance and survival add weight x mean to the loss. Effort and chatter multiply the error of each "
+        "member: they add the mean of weight x term x (tracking + peak), which is not the product of the means shown.",
         "",
         *table(["term", "weight", "mean before", "adds before", "mean after", "adds after"], rows),
         "",
@@ -99,13 +102,14 @@ def _loss(facts: TuningFacts) -> list[str]:
 
 
 def _minimised(facts: TuningFacts) -> list[str]:
+    """Return the section on the objective that the search minimised."""
     parts = facts.minimised
     if not parts:
         return []
     words = f"over {parts['ordinary']} members (seed {facts.search['seed']})"
     rows = [[f"risk: {parts['of']} {words}", f"{parts['risk']:.4e}"]]
     if parts["survival_only"]:
-        label = f"+ mean of clearance + survival over {parts['survival_only']} members that only have to be held"
+        label = f"+ mean of clearance + survival over {parts['survival_only']} stressed members"
         rows.append([label, f"{parts['held']:.4e}"])
     rows.append(["x penalty of the theorem's conditions", f"{parts['penalty']:.6g}"])
     if parts["limits"] != 1:
@@ -114,9 +118,9 @@ def _minimised(facts: TuningFacts) -> list[str]:
     return [
         "## Objective of the search",
         "",
-        "Members that only have to be held are stressed (more noise, every gain off by a factor) or were found lost by "
-        "the validation ensemble or by accurate steps. The objective therefore differs from the loss of the held-out "
-        "members above. The picture shows the objective.",
+        "Stressed members have more noise, and every gain is off by a factor, or they joined after validation or "
+        "accurate steps lost them. They must be held, but their error does not count. So the objective differs from "
+        "the loss of the held-out members above. The picture shows the objective.",
         "",
         *table(["at the answer", "value"], rows),
         "",
@@ -128,9 +132,9 @@ def _minimised(facts: TuningFacts) -> list[str]:
 
 
 def _lower_point(beside: Row) -> str:
-    """Describe a point of the slices with a lower risk than the answer, if there is one."""
+    """Return a sentence on the point of the slices with the lowest objective."""
     if beside["lower"] == 0:
-        return "Among the points of these slices that lose no more members than the answer, none is lower."
+        return "No point of these slices has a lower objective without losing more members than the answer."
     where = f"{100 * beside['lower']:.2g} % lower, at {beside['path']} = {beside['gain']:.4g}"
     if beside["lower"] <= AS_GOOD:
         return (
@@ -145,6 +149,7 @@ def _lower_point(beside: Row) -> str:
 
 
 def _conditions(facts: TuningFacts) -> list[str]:
+    """Return the section on the conditions of Theorem 1, left > right."""
     rows = []
     for row in facts.conditions:
         gain, margin = (number(x) for x in (row["gain"], row["margin"]))
@@ -158,6 +163,7 @@ def _conditions(facts: TuningFacts) -> list[str]:
 
 
 def _how(facts: TuningFacts) -> list[str]:
+    """Return the list of the search's settings, its cost, and the error of its steps."""
     how = facts.search
     lines = [
         f"- risk: {how['risk']} over {how['members']} members (seed {how['seed']}), optimiser {how['optimiser']}",
@@ -166,7 +172,7 @@ def _how(facts: TuningFacts) -> list[str]:
     ]
     if error := facts.step_error:
         lines.append(
-            f"- step of the search at the optimum: settled rms error {error['search_m']:.4e} m, by "
-            f"{facts.accurate_steps} {error['reference_m']:.4e} m on {error['members']} members: {error['text']}"
+            f"- steps of the search compared with {facts.accurate_steps}, at the answer: {error['text']} "
+            f"({error['search_m']:.4e} m against {error['reference_m']:.4e} m)"
         )
     return lines

@@ -48,12 +48,12 @@ def sentence(rows: list[Facts]) -> str:
     if taken is None or len(rows) < 2:
         return ""
     least = rows[0]
-    words = f"least error {least['settled_rms_error_m']:.3g} m at {least['settled_rms_u_V']:.3g} V"
+    words = f"{least['settled_rms_error_m']:.3g} m at {least['settled_rms_u_V']:.3g} V"
     if taken is least:
-        return f"Taken: the answer of {words}."
+        return f"This answer has the least error: {words}."
     return (
-        f"Taken: the least voltage within {100 * (KNEE - 1):g} % of the least error, "
-        f"{taken['settled_rms_error_m']:.3g} m at {taken['settled_rms_u_V']:.3g} V ({words})."
+        f"This answer has the least rms voltage among those within {100 * (KNEE - 1):g} % of the least error: "
+        f"{taken['settled_rms_error_m']:.3g} m at {taken['settled_rms_u_V']:.3g} V. Least error: {words}."
     )
 
 
@@ -76,9 +76,9 @@ def section(rows: list[Facts] | None, written: bool) -> list[str]:
     ]
     head = ["error limit", "settled rms error (m)", "settled rms u (V)", "peak of \\|S\\|", "lost", "answer", *files]
     words = (
-        "The least rms voltage for each limit of the settled rms error, within the other limits. On members of the "
-        "validation ensemble; where a sign is set-valued, the peak is injected. Only the answer taken is judged on the "
-        "held-out members."
+        "The least rms voltage for each limit of the settled rms error, within the other limits. The values are those "
+        "of members of the validation ensemble. If a sign is set-valued, the peak is measured by injection. Only the "
+        "answer taken is judged on the held-out members."
     )
     picture = "![Error against voltage; the answer taken is filled](front.png)"
     return ["## Error against voltage", "", *table(head, cells), "", words, "", picture, ""]

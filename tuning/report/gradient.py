@@ -40,7 +40,7 @@ def three_ways(problem: TuningProblem, x: np.ndarray) -> dict[str, object]:
     """
     objective = _shorter(problem, min(SAMPLES, problem.objective.clock.samples))
     members = objective.members(problem.tune.budget.seed, min(FEW, problem.tune.budget.members))
-    weights = problem.goal.weights
+    weights = problem.error_goal.weights
     settle = float(np.asarray(objective.loss.settle))
     forward, reverse = (Engine(objective, settle=settle, mode=mode, lanes=16) for mode in ("forward", "reverse"))
     by_forward = forward.gradient(x[None], members, weights)[1][0, :, 0].mean(axis=0)
@@ -102,7 +102,7 @@ def against_horizon(problem: TuningProblem, x: np.ndarray, members: Members) -> 
         objective = _shorter(problem, samples)
         engine = problem.engine if samples == all_ else Engine(objective, settle=float(objective.loss.settle))
         few = members.part(4)
-        outcomes, slopes, terms = engine.gradient(x[None], few, problem.goal.weights)
+        outcomes, slopes, terms = engine.gradient(x[None], few, problem.error_goal.weights)
         if not outcomes[0, :, 0].mean():
             continue
         rows.append(
@@ -117,7 +117,7 @@ def against_horizon(problem: TuningProblem, x: np.ndarray, members: Members) -> 
 
 def signal_to_noise(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, object]:
     """Return the mean of the members' gradients divided by its standard error, by gain."""
-    outcomes, slopes, terms = problem.engine.gradient(x[None], members, problem.goal.weights)
+    outcomes, slopes, terms = problem.engine.gradient(x[None], members, problem.error_goal.weights)
     relative = slopes[0, :, 0] / outcomes[0, :, 0].mean()
     error = relative.std(axis=0, ddof=1) / np.sqrt(len(relative)) if len(relative) > 1 else np.full(len(x), np.nan)
     return {
@@ -129,7 +129,7 @@ def signal_to_noise(problem: TuningProblem, x: np.ndarray, members: Members) -> 
 
 
 def report(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, object]:
-    """Return the data of the whole gradient report at coordinates x [m]."""
+    """Return the data of the whole gradient report at coordinates x [m]: of the loss, also if the answer is a knee."""
     return {
         "gains": problem.objective.space.paths,
         "three_ways": three_ways(problem, x),

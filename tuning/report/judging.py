@@ -56,7 +56,7 @@ def examined(answer: SearchResult, gradients: bool, front_written: bool) -> tupl
 def _judged(problem: TuningProblem, x: np.ndarray, held_out: int) -> dict[str, dict[str, np.ndarray]]:
     """Return the metrics of the held-out members [N] under the gains of the case and at x [m]; empty if none."""
     space, count = problem.objective.space, problem.tune.budget.held_out
-    say(f"judging on {count} members of another seed ...")
+    say(f"judging on {count} held-out members ...")
     start = space.encode(space.clip(space.values(problem.case.cascade)))
     return {
         name: judge(problem, at, held_out, count) if count else {} for name, at in (("before", start), ("after", x))

@@ -1,4 +1,4 @@
-"""Limits in the report: allowed and reached values, verdicts, and the effect of a limit that is 10 % higher."""
+"""Limits in the report: allowed and reached values, verdicts, and the effect of a limit that is 10 % looser."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from tuning.objective.limits import FRONT, Limit
 from tuning.problem import TuningProblem
 
 Facts = dict[str, Any]
-# Relative increase of a limit for which the effect is computed.
+# Share by which a limit is loosened to compute the effect.
 MORE = 0.1
 # Verdicts on a limit.
 HELD, BROKEN, UNVERIFIED, UNJUDGED = "held", "NOT HELD", "not verified", "not judged"
@@ -93,7 +93,7 @@ def _row(
 
 
 def _asked(problem: TuningProblem) -> list[Limit]:
-    """Return the limits of [tune.limits]; without that by which the front of error against voltage is traced."""
+    """Return the limits of [tune.limits], without the limit that traces the front of error against voltage."""
     found = {limit.name: limit for limit in problem.limits if limit.source != FRONT}
     return [found.get(limit.name, limit) for limit in problem.tune.limits.each]
 
@@ -142,15 +142,23 @@ def section(rows: list[Facts]) -> list[str]:
         ]
         for row in rows
     ]
-    head = ["quantity", "limit", "reached", "worst member", "verdict", "at the optimum", f"{100 * MORE:g} % more buys"]
+    head = [
+        "quantity",
+        "limit",
+        "reached",
+        "worst member",
+        "verdict",
+        "at the optimum",
+        f"effect of {100 * MORE:g} % more",
+    ]
     lines = ["## Limits", "", *table(head, cells), ""]
-    lines += [f"- {row['name']}: {row['what']}; from {row['source']}." for row in rows]
+    lines += [f"- {row['name']}: {row['what']}. Source: {row['source']}." for row in rows]
     return [
         *lines,
         "",
-        "Reached by those held-out members that are held. An active limit costs error or voltage: the last column is "
-        "by how much the settled rms value that was minimised would fall, from the multipliers of the optima that the "
-        "search came by.",
+        "The values are those of the held-out members that are held. The last column shows by how much the minimised "
+        f"settled rms error or voltage would decrease if the limit were {100 * MORE:g} % looser. It is estimated from "
+        "the Lagrange multipliers of the optima along the search.",
         "",
     ]
 

@@ -1,4 +1,4 @@
-"""The outcome of a search: one record from which exit code, log, report and report.json derive; and the advice."""
+"""The outcome of tuning, from which exit code, log, report and report.json follow, and the advice."""
 
 import dataclasses
 
@@ -16,10 +16,11 @@ NO_HELD_OUT = "The tuned gains are not judged on held-out members (tune.held_out
 
 @dataclasses.dataclass(frozen=True)
 class TuningOutcome:
-    """Result of judging the tuned gains on `members` members.
+    """Result of judging the tuned gains on an ensemble.
 
-    `lost`, `stalled`: numbers of members lost and undecided. `may_lose`: number allowed. `limits`: the verdict of each
-    limit by name. `refuted`: why accurate steps contradict this result; '' if they confirm it.
+    `members`: number of members judged. `lost`, `stalled`: numbers of members that are lost, and whose integration
+    stalls. `may_lose`: largest number of members that may be lost or stalled. `limits`: the verdict on each limit by
+    name. `refuted`: why accurate steps do not confirm this result; '' if they confirm it.
     """
 
     members: int
@@ -31,12 +32,12 @@ class TuningOutcome:
 
     @property
     def rotors_held(self) -> bool:
-        """Whether at most the allowed number of rotors is lost or undecided."""
+        """Whether at most `may_lose` members are lost or stalled."""
         return self.lost + self.stalled <= self.may_lose
 
     @property
     def broken(self) -> list[str]:
-        """Names of the limits that are not held, without survival (`rotors_held`)."""
+        """Names of the limits that are not held, apart from survival, for which see `rotors_held`."""
         return [name for name, verdict in self.limits.items() if verdict == BROKEN and name != "survival"]
 
     @property
@@ -63,7 +64,7 @@ class TuningOutcome:
 
 
 def outcome_of(facts: TuningFacts, may_lose: int) -> TuningOutcome:
-    """Return the outcome from the facts of a search: of the held-out members, else of the training members.
+    """Return the outcome on the held-out members, or on the training members if tune.held_out is 0.
 
     `may_lose`: number of held-out members that may be lost. No training member may be lost.
     """
@@ -74,41 +75,43 @@ def outcome_of(facts: TuningFacts, may_lose: int) -> TuningOutcome:
 
 
 def verdict(facts: TuningFacts, outcome: TuningOutcome) -> str:
-    """Return the verdict and the status of the judged members in a few sentences."""
+    """Return the verdict, the status of the judged members, broken and active limits and gains at a bound, as text."""
     unjudged = [name for name, found in outcome.limits.items() if found == UNJUDGED]
     met = NO_HELD_OUT if unjudged else ALL_MET
     words = [met if outcome.good else f"{NOT_MET} {'; '.join(outcome.against)}.", _statuses(facts)]
     if taken := front_table.sentence(facts.front or []):
         words.append(taken)
     if outcome.refuted:
-        words.append(f"That is {UNVERIFIED.upper()}: {outcome.refuted}.")
+        words.append(f"This result is {UNVERIFIED.upper()}: {outcome.refuted}.")
     words += [f"{line}." for line in [*broken(facts.limits), *prices(facts.limits)]]
     if unjudged:
         words.append(f"Limits {UNJUDGED}: {', '.join(unjudged)}.")
     words += [f"{line}." for line in _cliffs(facts)]
     ends = [f"{row['path']} = {row['after']:.4g} ({row['at_bound']})" for row in facts.gains if row["at_bound"]]
     if ends:
-        words.append(f"At a bound: {', '.join(ends)}.")
+        words.append(f"Gains at a bound: {', '.join(ends)}.")
     return " ".join(words)
 
 
 def _cliffs(facts: TuningFacts) -> list[str]:
-    """Return a sentence for each gain whose change by 28 % loses members of the training ensemble."""
+    """Return a sentence for each gain that loses training members if it is off by a factor of 1.28."""
     return [
-        f"{row['path']}: a gain off by 28 % loses a rotor ({row['sensitivity_lost']} of {facts.trained_on} members)"
+        f"If {row['path']} is off by a factor of 1.28, {row['sensitivity_lost']} of {facts.trained_on} training "
+        "members are lost"
         for row in facts.gains
         if row.get("sensitivity_lost")
     ]
 
 
 def _statuses(facts: TuningFacts) -> str:
+    """Return the sentence on the members lost and on the settled error of the others."""
     before, after = facts.before, facts.after
     if not after["members"]:
         return f"{facts.lost_in_training} members of the training ensemble are lost under the tuned gains."
     undecided = f", {after['stalled']} not decided (their integration stalls)" if after["stalled"] else ""
     return (
         f"Of {after['members']} held-out members, {after['lost']} are lost under the tuned gains (before: "
-        f"{before['lost']}){undecided}; settled rms error of those that are held {_error(after)} (before: "
+        f"{before['lost']}){undecided}; settled rms error of the members held {_error(after)} (before: "
         f"{_error(before)}){_largest(after)}."
     )
 
@@ -122,18 +125,21 @@ def _largest(summary: Row) -> str:
 
 
 def advice(problem: TuningProblem, facts: TuningFacts, outcome: TuningOutcome, x: np.ndarray, members: Members) -> str:
-    """Return why requirements are not met and the remedies, the most important first; '' if all are met."""
+    """Return the requirements that are not met, with remedies, the most important first; '' if all are met.
+
+    `x` [m]: coordinates of the tuned gains. `members`: the training ensemble.
+    """
     if outcome.good:
         return ""
     words = []
     if outcome.refuted:
         words.append(
-            f"Not verified: {outcome.refuted}. Raise tune.substeps or tune.stress, or keep gains at a bound "
-            "lower by tune.bounds."
+            f"Not verified: {outcome.refuted}. Raise tune.substeps or tune.stress, or lower the upper "
+            "bounds of gains that end there (tune.bounds)."
         )
     if outcome.broken:
         lines = broken([row for row in facts.limits if row["name"] != "survival"])
-        words.append(f"{'. '.join(lines)}. Allow more (inf: none), tune more gains, each p too, or raise tune.screen.")
+        words.append(f"{'. '.join(lines)}. Loosen these limits, tune more gains (also each p), or raise tune.screen.")
     if outcome.stalled:
         words.append(f"Not decided: {outcome.stalled} held-out members, whose integration stalls. Raise tune.substeps.")
     return " ".join(
@@ -142,7 +148,7 @@ def advice(problem: TuningProblem, facts: TuningFacts, outcome: TuningOutcome, x
 
 
 def _of_the_lost(problem: TuningProblem, facts: TuningFacts, x: np.ndarray, members: Members) -> list[str]:
-    """Return the limits that are nearly reached, as possible causes of lost rotors."""
+    """Return possible causes of lost rotors, with remedies: failing conditions, the voltage limit, gains at a bound."""
     after = facts.after
     judged = f"{after['lost']} of {after['members']} held-out members, " if after["members"] else ""
     words = [f"Rotors are lost: {judged}{facts.lost_in_training} of {len(members.member)} in training."]
@@ -158,8 +164,8 @@ def _of_the_lost(problem: TuningProblem, facts: TuningFacts, x: np.ndarray, memb
         )
     bound = [row["path"] for row in facts.gains if row["at_bound"]]
     if bound:
-        words.append(f"At a bound: {', '.join(bound)}; widen tune.bounds.")
+        words.append(f"Gains at a bound: {', '.join(bound)}; widen tune.bounds.")
     return [
         *words,
-        "Raise tune.members or set risk = 'cvar' for a larger margin; raise tune.screen for other starts.",
+        "For a larger margin, raise tune.members or set risk = 'cvar'. For other starting points, raise tune.screen.",
     ]

@@ -12,6 +12,7 @@ from tomlkit.items import AoT, InlineTable, Table
 
 from ambjax.cases.own_laws import relocated
 from ambjax.cases.reader import Case, case_from
+from ambjax.cases.recordings import relocated_files
 
 FIRST = "Tuned by ambjax tune from the case"
 # First line of such a file. It is removed when the file is tuned again.
@@ -23,10 +24,13 @@ CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 def tuned_case(case: Case, gains: Mapping[str, float], verdict: str, out: pathlib.Path) -> tuple[str, Case]:
     """Return the text of tuned.toml for the folder `out`, and its case. Raises ValueError for text that is no case.
 
-    The custom laws are those of `case`: a change of their files during the search does not matter.
+    The custom laws, the linear controller and the recorded signals are those of `case`: a change of their files during
+    the search does not matter.
     """
-    text = tuned(case.text, {**gains, **relocated(case.own_laws, out)}, case.name, verdict)
-    return text, case_from(tomllib.loads(text), case.name, own=case.own_laws)
+    moved = relocated(case.own_laws, out) | relocated_files(case.recorded, out)
+    moved |= case.controller_file.relocated(out) if case.controller_file else {}
+    text = tuned(case.text, {**gains, **moved}, case.name, verdict)
+    return text, case_from(tomllib.loads(text), case.name, known=case)
 
 
 def tuned(text: str, gains: Mapping[str, float | str], case: str, verdict: str) -> str:
@@ -38,7 +42,7 @@ def tuned(text: str, gains: Mapping[str, float | str], case: str, verdict: str) 
     try:
         document = tomlkit.parse(HEAD.sub("", text.replace("\r\n", "\n")))
         for path, value in gains.items():
-            *tables, name = path.split(".")
+            *tables, name = _words(path)
             _put(_table(document, tables), name, value if isinstance(value, str) else float(value))
         body = tomlkit.dumps(document)
         if tomllib.loads(body) != _wanted(text, gains):
@@ -49,14 +53,23 @@ def tuned(text: str, gains: Mapping[str, float | str], case: str, verdict: str) 
     return "\n".join([*head, "", body.strip()]) + "\n"
 
 
+def _words(path: str) -> list[Any]:
+    """Return the words of a dotted path; the index of a list is a word, as in disturbance.q_z[1].file.
+
+    A knot leads to the list `values` of its schedule and an index.
+    """
+    *words, last = path.replace("[", ".").replace("]", "").split(".")
+    return [*words, "values", int(last)] if last.isdigit() else [*words, last]
+
+
 def _wanted(text: str, gains: Mapping[str, float | str]) -> dict[str, Any]:
     """Return the data that the changed text must parse to."""
     document = tomllib.loads(text)
     for path, value in gains.items():
-        table = document
-        *tables, name = path.split(".")
+        table: Any = document
+        *tables, name = _words(path)
         for word in tables:
-            table = table.setdefault(word, {})
+            table = table[int(word)] if isinstance(table, list) else table.setdefault(word, {})
         table[name] = value
     return document
 
@@ -73,6 +86,9 @@ def _table(table: Any, path: list[str]) -> Any:
     """
     document = table
     for depth, word in enumerate(path):
+        if isinstance(table, list):
+            table = table[int(word)]
+            continue
         if word not in table:
             if isinstance(table, InlineTable):
                 table[word] = tomlkit.inline_table()
@@ -100,9 +116,9 @@ def _append(document: tomlkit.TOMLDocument, path: list[str], word: str) -> None:
     document.append(path[0], table)
 
 
-def _put(table: Any, name: str, value: float | str) -> None:
-    """Set the value of this name; append a new one, and keep the text of an equal one."""
-    if name in table:
+def _put(table: Any, name: str | int, value: float | str) -> None:
+    """Set the value of this name or index; append a new one, and keep the text of an equal one."""
+    if isinstance(name, int) or name in table:
         if table[name] != value:
             table[name] = value
     elif isinstance(table, Table):

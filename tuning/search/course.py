@@ -1,6 +1,7 @@
-"""A course of searches, each from the result of the previous ones, and restarts around the best point so far.
+"""A sequence of searches, each of which starts from the result of earlier ones, and restarts around the best point.
 
-Restarts are needed because a search may end at a cliff of the goal, with lower values behind it.
+A search may end at a cliff of the goal although the goal is lower beyond it. A restart tries quasi-random points
+around the best point so far.
 """
 
 import dataclasses
@@ -25,16 +26,20 @@ from tuning.search.screen import around, initial_points
 
 # Largest number of searches in `search_and_restart`.
 MOST_SEARCHES = 5
-# Restarts end after two searches in a row that lower the loss by less than this share. One alone may be chance: its
-# random points may miss a better optimum.
+# Restarts end after two searches in a row that lower the goal by less than this share. After one alone they go on,
+# because its points may have missed a better optimum by chance.
 GAIN = 0.01
-# Number of earlier points tried with accurate steps if these confirm no answer.
+# Number of earlier points that are tried with accurate steps if these confirm none of the answers.
 RETREAT_POINTS = 12
 
 
 @dataclasses.dataclass(frozen=True)
 class SearchResult:
-    """Result of the rounds: coordinates x [m], the problem and members of the last search, the step error at x."""
+    """Result of the rounds.
+
+    `problem`, `members`: of the last search. `x` [m]: coordinates of the gains. `error`: step error at x; None if it
+    was not computed. `history`: arrays of all searches with a row for each iteration.
+    """
 
     problem: TuningProblem
     members: Members
@@ -42,7 +47,7 @@ class SearchResult:
     error: StepError | None
     history: dict[str, np.ndarray]
     lost: int
-    """number of validation members that are lost, and of members that accurate steps do not hold"""
+    """number of validation members that are lost, plus that of members that accurate steps do not hold"""
     seconds: float
     """duration of all searches in s, the time before a resume included"""
     front: tuple[Any, ...] = ()
@@ -50,22 +55,23 @@ class SearchResult:
 
     @property
     def confirmed(self) -> bool:
-        """Whether accurate steps confirm the result."""
+        """Whether the step error is known and accurate steps confirm the result."""
         return self.error is not None and not self.error.refuted
 
     @property
     def good(self) -> bool:
-        """Whether the result is confirmed, and no more validation members are lost than [tune.limits] allows."""
+        """Whether the result is confirmed, and `lost` is at most the number that tune.limits.survival allows."""
         tune = self.problem.tune
         return self.confirmed and self.lost <= tune.limits.may_lose(tune.budget.validation)
 
 
 @dataclasses.dataclass
 class Course:
-    """A sequence of searches, with the current problem and members.
+    """State of a sequence of searches. The functions that search change it.
 
-    `seed`: of all random numbers. `out`: directory of the checkpoints; None: no checkpoints. `facts`: the settings that
-    a checkpoint must match. `resume`: whether to continue from the checkpoints.
+    `problem`, `members`: the problem and the training ensemble of the next search. `seed`: of all random numbers.
+    `out`: directory of the checkpoints; None: no checkpoints. `facts`: settings that a checkpoint must match.
+    `resume`: whether to continue from the checkpoints.
     """
 
     problem: TuningProblem
@@ -75,17 +81,20 @@ class Course:
     facts: dict[str, Any] = dataclasses.field(default_factory=dict)
     resume: bool = False
     on_iteration: Callable[[SearchState, float], None] | None = None
-    """called after each iteration with the search and its duration in s; None: print a line"""
+    """called after each iteration with the search and the iteration's duration in s; None: print a line"""
     past: list[SearchState] = dataclasses.field(default_factory=list)
     """the searches so far"""
     limit_searches: int = 0
-    """number of searches that follow an update of the limits' multipliers, not counted as rounds"""
+    """number of searches that follow an update of the limits' multipliers; they do not count against MOST_ROUNDS"""
     began: float = dataclasses.field(default_factory=time.perf_counter)
+    """start of the first search, s"""
 
     def search(self, points: np.ndarray, *, settled: bool = False) -> tuple[np.ndarray, float]:
-        """Search from these points [K, m]. Return the best point [m] and its goal.
+        """Search from `points` [K, m] and append the search to `past`. Return the best point [m] and its goal.
 
-        `settled`: whether an earlier search on all members ended at the first point.
+        `settled`: whether an earlier search on all members ended at the first point; it is not refined again. Raises
+        KeyboardInterrupt if Ctrl-C ends the first search before its first iteration, and ValueError if the goal is not
+        finite at any point.
         """
         tune, number = self.problem.tune, len(self.past) + 1
         path = self.out / checkpoint(number) if self.out else None
@@ -106,7 +115,7 @@ class Course:
         return _best(progress)
 
     def around(self, x: np.ndarray) -> np.ndarray:
-        """Return points [K, m] around x [m] for the next search."""
+        """Return x [m] and tune.screen quasi-random points around it, [K, m], for the next search."""
         return around(x, self.problem.tune.budget.screen, self.seed + len(self.past))
 
     @property
@@ -121,15 +130,15 @@ class Course:
         return int(past["lost"][-1][int(np.argmin(past["value"][-1]))]) == past["members"][-1]
 
     def answer(self, x: np.ndarray, error: StepError | None, lost: int) -> SearchResult:
-        """Return the result x [m], with its step error and number of lost members."""
+        """Return the result at x [m]. `error`: step error at x, or None. `lost`: as in SearchResult."""
         seconds = time.perf_counter() - self.began + sum(progress.earlier for progress in self.past)
         return SearchResult(self.problem, self.members, x, error, _joined(self.past), lost, seconds)
 
 
 def search_and_restart(course: Course, start: np.ndarray) -> np.ndarray:
-    """Search from the gains `start` [m], then restart around the best point while that lowers the loss.
+    """Search from the gains `start` [m], SI units, then restart around the best point while that lowers the goal.
 
-    Returns the best point [m]. There are no restarts if all members are lost or tune.screen is 0.
+    Returns the coordinates [m] of the best point. There is no restart if all members are lost or tune.screen is 0.
     """
     problem, budget = course.problem, course.problem.tune.budget
     x, value = course.search(
@@ -137,16 +146,19 @@ def search_and_restart(course: Course, start: np.ndarray) -> np.ndarray:
     )
     if course.all_lost or not budget.screen:
         return x
-    seen = [(value, x)]  # on the same members, in the same steps
+    seen = [(value, x)]  # comparable: all searches use the same members and steps
     while should_restart([value for value, _ in seen]) and not course.interrupted:
         x, value = course.search(course.around(x), settled=True)
         seen.append((value, x))
-        x = min(seen, key=lambda look: look[0])[1]
+        x = min(seen, key=lambda one: one[0])[1]
     return x
 
 
 def should_restart(goals: Sequence[float]) -> bool:
-    """Return whether to restart after searches that ended at these goals (logarithms)."""
+    """Return whether to restart after searches that ended at these goals, which are logarithms.
+
+    True if one of the last two searches lowered the goal by more than GAIN, up to MOST_SEARCHES searches.
+    """
     best = [math.inf, *itertools.accumulate(goals, min)]
     gained = [before - after > GAIN for before, after in itertools.pairwise(best)]
     return len(goals) < MOST_SEARCHES and any(gained[-2:])
@@ -161,7 +173,7 @@ def training(problem: TuningProblem) -> Members:
 
 
 def points_of(past: list[SearchState]) -> np.ndarray:
-    """Return points [K, m] of the searches' paths, best first, denser among the better ones."""
+    """Return at most RETREAT_POINTS points [K, m] of the searches' paths, best first, denser among the better ones."""
     x = np.concatenate([np.asarray(one.history["x"]).reshape(-1, one.starts.best.shape[-1]) for one in past])
     value = np.concatenate([np.asarray(one.history["value"]).ravel() for one in past])
     _, first = np.unique(np.where(np.isfinite(value), value, np.inf), return_index=True)
@@ -170,6 +182,7 @@ def points_of(past: list[SearchState]) -> np.ndarray:
 
 
 def _best(progress: SearchState) -> tuple[np.ndarray, float]:
+    """Return the best point [m] and its goal. Raises ValueError if the goal is not finite."""
     x, value = best_of(progress)
     if not np.isfinite(value):
         raise ValueError(
@@ -180,7 +193,7 @@ def _best(progress: SearchState) -> tuple[np.ndarray, float]:
 
 
 def _joined(past: list[SearchState]) -> dict[str, np.ndarray]:
-    """Concatenate the histories of all searches. A search with fewer starts repeats its first one."""
+    """Concatenate the histories of all searches by name. Columns of missing starts repeat the first start."""
     width = max(len(one.active) for one in past)
 
     def wide(rows: object) -> np.ndarray:
@@ -210,8 +223,8 @@ def _progress_line(problem: TuningProblem) -> Callable[[SearchState, float], Non
         named = ", ".join(f"{g.name} {v:.4g}" for g, v in zip(problem.objective.space.gains, gains, strict=True))
         error = scale * np.sqrt(last["terms"][best][TERMS.index("tracking")])
         say(
-            f"{done:3d}/{budget.iterations}  loss {np.exp(value):.3e}  rms error {error:.2e} m  "
-            f"kept {count - int(last['lost'][best])}/{count}  {named}  ({going} starts{wait})"
+            f"{done:3d}/{budget.iterations}  objective {np.exp(value):.3e}  rms error {error:.2e} m  "
+            f"held {count - int(last['lost'][best])}/{count}  {named}  (starts: {going}{wait})"
         )
 
     return print_line

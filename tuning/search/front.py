@@ -99,7 +99,7 @@ def _searched(course: Course, factor: float, x: np.ndarray) -> list[FrontPoint]:
         point, numbers = _judged(course, factor, x)
         points.append(point)
         limits = tuple(limit.updated(*pair) for limit, pair in zip(course.problem.limits, numbers, strict=True))
-        say(f"{point.volts:.4g} V at an rms error of {point.error_m:.3g} m, on members of another seed")
+        say(f"judged {point.volts:.4g} V at an rms error of {point.error_m:.3g} m")
         both = zip(limits, numbers, strict=True)
         if course.interrupted or all(
             met(limit, judged) or (not limit.multiplier and limit.log_excess(judged) <= 0)

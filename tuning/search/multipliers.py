@@ -1,7 +1,7 @@
 """The method of multipliers: update the limits' multipliers at an optimum and search again until all limits are met.
 
-The limited quantities are those of the judge. An optimum exceeds a limit by about (required multiplier - multiplier) /
-penalty, which an update corrects.
+The judge evaluates the limited quantities at each optimum, on other members than the search. At an optimum, g of a
+limit is about (required multiplier - multiplier) / penalty; the update of the multiplier corrects this excess.
 """
 
 import math
@@ -19,16 +19,21 @@ from tuning.search.course import Course
 
 # Largest number of updates of the multipliers in one round.
 MOST_UPDATES = 6
-# Decrease of g below which an excess counts as unchanged.
+# Smallest decrease of g that counts as progress towards a limit.
 LEAST_DECREASE = 1e-3
-# Averages that are below their limits by this g or more are not judged, because they hardly vary over members.
+# Averages with g below minus this number are not judged again: two ensembles differ by far less.
 CLEARLY_BELOW = 0.1
-# Members of the ensemble that judges averages.
+# Largest number of members on which averages are judged.
 AVERAGING_MEMBERS = 256
 
 
 def limited(course: Course, x: np.ndarray) -> np.ndarray:
-    """Search from x [m] until every limit is met, with updates of the multipliers. Return x itself if none is near."""
+    """Update the multipliers at x [m] and search again until every limit is met. Return the last optimum [m].
+
+    Returns x itself if no search was needed. There are at most MOST_UPDATES updates. They end early if Ctrl-C
+    interrupts a search, or if a larger penalty makes no progress towards a limit; the held-out members then decide.
+    `course.problem` keeps the updated limits.
+    """
     for _ in range(MOST_UPDATES):
         before = course.problem.limits
         numbers = _numbers(course, x)
@@ -36,7 +41,7 @@ def limited(course: Course, x: np.ndarray) -> np.ndarray:
         stuck = [limit for limit, (_, judged) in zip(before, numbers, strict=True) if _stuck(limit, judged)]
         if stuck:
             names = ", ".join(limit.name for limit in stuck)
-            say(f"a larger penalty has not lowered {names}: its multiplier stays, and the held-out members judge it")
+            say(f"a larger penalty makes no progress towards the limit of {names}; its multiplier is no longer updated")
             break
         course.problem = course.problem.limited(limits)
         done = []
@@ -45,7 +50,7 @@ def limited(course: Course, x: np.ndarray) -> np.ndarray:
             done.append(met(after, judged) or (idle and after.log_excess(judged) <= 0))
             if not (idle and done[-1]):
                 limit = f"limit {after.name} = {after.threshold:g} {after.kind.unit}"
-                say(f"{limit}: {judged:.4g} on members of another seed")
+                say(f"{limit}: judged {judged:.4g}")
         if course.interrupted or all(done):
             break
         course.limit_searches += 1
@@ -54,7 +59,7 @@ def limited(course: Course, x: np.ndarray) -> np.ndarray:
 
 
 def _stuck(limit: Limit, judged: float) -> bool:
-    """Return whether a limit is exceeded as much as before its penalty grew."""
+    """Return whether a limit is exceeded by as much as before its penalty grew. `judged`: the judge's value."""
     excess = limit.log_excess(judged)
     return (
         limit.penalty > PENALTY
@@ -64,12 +69,18 @@ def _stuck(limit: Limit, judged: float) -> bool:
 
 
 def met(limit: Limit, judged: float) -> bool:
-    """Return whether the limit holds and is used up."""
+    """Return whether the judge's value is at the bound of an active limit.
+
+    It may lie below the bound by TOLERANCE_BELOW, and above it by half of the margin.
+    """
     return -TOLERANCE_BELOW <= limit.log_excess(judged) <= limit.margin / 2
 
 
 def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
-    """Return each limited quantity at x [m] as (the search's value, the judge's value on members of another seed)."""
+    """Return (the search's value, the judge's value) of each limit at x [m].
+
+    The judge uses the validation ensemble, or the training ensemble if tune.validation is 0.
+    """
     problem, budget = course.problem, course.problem.tune.budget
     limits = problem.limits
     if not limits:
@@ -97,10 +108,12 @@ def searched(course: Course, x: np.ndarray) -> list[float]:
 def reached(
     problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray], tuned: Sequence[float]
 ) -> list[float]:
-    """Return the judge's value of each limit at x [m], from the `columns` [N] of the ensemble with this seed.
+    """Return the judge's value of each limit at x [m].
 
-    Where injections decide, one is done into the worst member, unless the search's values `tuned`, corrected by those
-    of an earlier injection, are clearly below their limits.
+    `columns` [N]: result of `judge` for the ensemble with this `seed`. `tuned`: the search's value of each limit. If
+    injections decide on sensitivities (`measured_peaks.decides`), the worst member is measured by one injection. The
+    injection is left out if an earlier one has corrected `tuned` and all corrected values are clearly within their
+    limits.
     """
     pairs = [(limit, ours) for limit, ours in zip(problem.limits, tuned, strict=True) if limit.name in MEASURED]
     near = [

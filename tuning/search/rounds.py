@@ -1,8 +1,9 @@
-"""Rounds of a search, repeated until its result is confirmed.
+"""Rounds of searches, repeated until the answer is confirmed.
 
-The first search includes restarts. It is repeated with finer steps if its steps do not resolve the optimum, and with
-additional members: validation members that are lost, and members that accurate steps do not hold. Then the front of
-error against voltage is traced, if the case asks for it.
+The first round searches with restarts. If the integration steps do not resolve the optimum, the search continues with
+finer steps. If a limit is not met, it continues with other multipliers. The answer is then validated. Validation
+members that are lost, and members that accurate steps do not hold, join the training ensemble for the next round. At
+the end the front of error against voltage is traced, if tune.objective or --pareto requires it.
 """
 
 import dataclasses
@@ -20,22 +21,26 @@ from tuning.search.front import traced
 from tuning.search.multipliers import limited
 from tuning.search.validation import joining, validated
 
-# Largest numbers of rounds (restarts included), and of halvings of the step.
+# Largest number of searches, with restarts and without those that follow an update of the limits' multipliers, and
+# largest number of halvings of the step.
 MOST_ROUNDS, MOST_HALVINGS = 12, 2
 
 
 def rounds(
     problem: TuningProblem, start: np.ndarray, out: pathlib.Path, facts: dict[str, Any], resume: bool
 ) -> SearchResult:
-    """Tune from the gains `start` [m] and return the result.
+    """Tune from the gains `start` [m], SI units, and return the result.
 
     `out`: directory of the checkpoints. `facts`: settings that a checkpoint must match. `resume`: whether to continue
-    from the checkpoints. Raises ValueError if the goal is finite nowhere, or if a checkpoint belongs to another search.
+    from the checkpoints. The result is the confirmed answer that loses the fewest members; without a confirmed answer,
+    an earlier point of the searches that accurate steps confirm, if there is one. With a front it is the answer that
+    `traced` takes. Raises ValueError if the goal is not finite at any starting point, or if a checkpoint belongs to
+    another search.
     """
     budget, answers = problem.tune.budget, list[SearchResult]()
     course = Course(problem, training(problem), budget.seed, out, facts, resume)
     x = search_and_restart(course, start)
-    for refuted in itertools.count(1):
+    for number in itertools.count(1):
         if course.all_lost:  # no gains to continue with
             break
         x, error = resolved(course, x)
@@ -46,8 +51,8 @@ def rounds(
         answers.append(answer)
         if answer.good or course.interrupted or len(course.past) - course.limit_searches >= MOST_ROUNDS:
             break
-        course.members = course.members.joined(joining(course.problem, lost, error, refuted))
-        say("the search continues with members that are lost, or that accurate steps do not hold")
+        course.members = course.members.joined(joining(course.problem, lost, error, number))
+        say("lost members, and those that accurate steps do not hold, join the training ensemble; the search continues")
         x, _ = course.search(course.around(x))
     if not answers:
         return course.answer(x, None, budget.validation)
@@ -61,21 +66,24 @@ def rounds(
 
 
 def resolved(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepError]:
-    """Return x [m] and its step error, after a search in finer steps if the steps do not resolve x."""
+    """Return coordinates [m] and their step error: `x`, or the result of searches in finer steps that resolve it.
+
+    There are at most MOST_HALVINGS such searches, so the steps may not resolve the result.
+    """
     while True:
         error = step_error(course.problem, x)
-        say(f"step of the search against {course.problem.accurate}: {describe(error)}")
+        say(f"steps of the search compared with {course.problem.accurate}: {describe(error)}")
         substeps = finer(course.problem)
         if error.resolved or substeps is None or course.interrupted:
             return x, error
         course.problem = substeps
-        say(f"the step is too coarse; the search continues with {course.problem.objective.clock.method}")
+        say(f"these steps are too coarse; the search continues with {course.problem.objective.clock.method}")
         x, _ = course.search(x[None])
 
 
 def retreated(course: Course, best: SearchResult) -> SearchResult:
-    """Return an earlier point of the searches that accurate steps confirm, or `best` if there is none."""
-    say("accurate steps confirm no answer; earlier points of the search are tried")
+    """Return the first earlier point of the searches, best first, that is confirmed; `best` if there is none."""
+    say("accurate steps confirm none of the answers; earlier points of the searches are tried")
     for x in points_of(course.past):
         error = step_error(course.problem, x)
         if not error.refuted:
@@ -86,7 +94,7 @@ def retreated(course: Course, best: SearchResult) -> SearchResult:
 
 
 def finer(problem: TuningProblem) -> TuningProblem | None:
-    """Return the problem with steps half as long and the same count of rollouts, or None after MOST_HALVINGS."""
+    """Return the problem with steps half as long, or None after MOST_HALVINGS. The count of rollouts is kept."""
     if problem.finer >= 2**MOST_HALVINGS:
         return None
     fine = problem_of(problem.case, problem.tune, finer=2 * problem.finer, front=problem.front).limited(problem.limits)

@@ -33,9 +33,9 @@ def validated(
     if not lost.size and not error.refuted and not course.problem.sampled:
         worst = course.problem.objective.chosen(seeds(budget)[1], worst, budget.validation)
         error = step_error(course.problem, x, compared(course.problem).joined(worst))
-        say(f"accurate steps, the worst of {budget.validation} members of another seed included: {describe(error)}")
+        say(f"accurate steps, with the worst of {budget.validation} validation members: {describe(error)}")
     if lost.size:
-        say(f"{lost.size} of {budget.validation} members of another seed are lost")
+        say(f"{lost.size} of {budget.validation} validation members are lost")
     return course.answer(x, error, lost.size + error.unseen), error, lost
 
 

@@ -40,6 +40,15 @@ def operating_point(case: Case, name: str, r: float) -> OperatingPoint:
     return OperatingPoint(name, r, m, system, _analysis(case, system, m))
 
 
+def sensitivity(case: Case, r: float = 0.0) -> Analysis:
+    """Linearise the loop of a case at a constant reference r (m): peaks of |S|, |T|, |KS|, zone, margins, stiffness.
+
+    `ambjax.linear` has the steps one by one, and the injection into the simulation. Raises ValueError as `linearise`
+    does.
+    """
+    return operating_point(case, "nominal", r).analysis
+
+
 def _analysis(case: Case, system: StateSpace, m: float) -> Analysis:
     sensor = case.scenario.sensor
     measured = (sensor is None or sensor.velocity) and not case.cascade.observer.estimates_velocity

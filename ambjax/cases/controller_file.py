@@ -1,0 +1,102 @@
+"""Linear controllers in files: the keys of a position law that a case file takes from a file beside it."""
+
+import contextlib
+import pathlib
+import zipfile
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ambjax.cases.own_laws import path_from
+from ambjax.cases.table import Table, show
+from ambjax.control.realisation import Realisation, realisation
+
+NAMES, OPTIONAL = ("A", "B", "C", "D"), "dt"
+ENDINGS = (".npz", ".mat")
+KEY = "controller.position.file"
+
+
+class ControllerFile(NamedTuple):
+    """The file of a linear controller: its path as written in the case file, the absolute path, and its contents."""
+
+    written: str
+    path: pathlib.Path
+    contents: Realisation
+
+    def relocated(self, out: pathlib.Path) -> dict[str, str]:
+        """Return `file` by dotted path as a case file in the folder `out` must write it."""
+        return {KEY: path_from(self.written, self.path, out)}
+
+
+def controller_file(table: Table, folder: pathlib.Path) -> ControllerFile:
+    """Read the controller that the key `file` names; a relative path starts at `folder`, that of the case file.
+
+    Raises ValueError, one line with the dotted path, the file and the array, for anything that is no controller.
+    """
+    written = table.raw.get("file")
+    if written is None:
+        raise ValueError(f"{table.at('file')} is missing: give the path of an .npz or .mat file with {_needed()}.")
+    if not isinstance(written, str) or not written.endswith(ENDINGS):
+        raise ValueError(f"{table.at('file')} = {show(written)}: it must be the path of an .npz or .mat file.")
+    path = (folder / written).resolve()
+    try:
+        return ControllerFile(written, path, realisation(**read_controller(path)))
+    except ValueError as error:
+        raise ValueError(f"{table.at('file')} = {show(written)}: {error}") from None
+
+
+def read_controller(path: pathlib.Path) -> dict[str, Any]:
+    """Return the arrays A, B, C, D and, if the file has it, dt of an .npz or .mat file.
+
+    Raises ValueError if the file cannot be read or lacks an array.
+    """
+    try:
+        arrays = _of_npz(path) if path.suffix == ".npz" else _of_mat(path)
+    except OSError as error:
+        why = error.strerror or "is it a file?"
+        raise ValueError(f"{path} cannot be read ({why}). A path is relative to the folder of the case file.") from None
+    if missing := [name for name in NAMES if name not in arrays]:
+        found = ", ".join(name for name in arrays if not name.startswith("_")) or "none"
+        raise ValueError(f"the array {missing[0]} is missing. The file must contain {_needed()}; it has {found}.")
+    return {name: arrays[name] for name in (*NAMES, OPTIONAL) if name in arrays}
+
+
+def _needed() -> str:
+    return "the arrays A, B, C, D and, for a discrete controller, dt in s"
+
+
+def _of_npz(path: pathlib.Path) -> dict[str, Any]:
+    try:
+        with np.load(path) as file:
+            return {name: file[name] for name in file.files}
+    except (ValueError, EOFError, AttributeError, zipfile.BadZipFile):  # not an archive, or with pickled objects
+        raise ValueError("not an .npz file of plain numbers. Write it by save_controller, or numpy.savez.") from None
+
+
+def _of_mat(path: pathlib.Path) -> dict[str, Any]:
+    import scipy.io
+
+    try:
+        arrays = scipy.io.loadmat(path, appendmat=False)
+    except NotImplementedError:
+        raise ValueError("a .mat file of version 7.3, which is not supported. Save it with the option -v7.") from None
+    except OSError:
+        raise
+    except Exception:  # SciPy raises errors of many types for a damaged file
+        raise ValueError("not a .mat file. Save the arrays with: save FILE.mat A B C D dt -v7.") from None
+    with contextlib.suppress(KeyError):  # MATLAB has matrices only
+        arrays[OPTIONAL] = arrays[OPTIONAL].squeeze()
+    return arrays
+
+
+def save_controller(path: str | pathlib.Path, system: Any) -> None:
+    """Write a state space of python-control or SciPy into an .npz file that a case file may name.
+
+    `system`: an object with the matrices A, B, C, D and the period dt (s). Raises ValueError as `realisation` does.
+    """
+    dt = getattr(system, OPTIONAL, None)
+    arrays = {name: np.asarray(getattr(system, name)) for name in NAMES}
+    realisation(**arrays, dt=dt)
+    if pathlib.Path(path).suffix != ENDINGS[0]:
+        raise ValueError(f"{path}: the file must end in .npz.")
+    np.savez(path, **arrays, dt=np.asarray(0.0 if dt is None else dt))  # pyright: ignore[reportArgumentType]

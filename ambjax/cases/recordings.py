@@ -1,0 +1,183 @@
+"""Recorded signals of a case file: `kind = "table"` with a file of times and values (CSV, npz or Parquet)."""
+
+import csv
+import dataclasses
+import math
+import pathlib
+import zipfile
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from ambjax.cases.own_laws import path_from
+from ambjax.cases.table import Table, quoted, show
+from ambjax.world.recorded import Recorded, Samples
+
+INTERPOLATIONS = ["linear", "held"]
+KEYS = ["file", "columns", "interpolation", "scale", "start"]
+FIELDS = {field.name: field for field in dataclasses.fields(Recorded)}
+# Largest number of rows; they are constants of the compiled program.
+MOST_ROWS = 200_000
+
+
+class RecordedFile(NamedTuple):
+    """A file that a case names: the dotted path of its key, the path as written, the absolute path, the samples."""
+
+    key: str
+    written: str
+    file: pathlib.Path
+    samples: Samples
+
+
+class Recordings:
+    """Reader of the files of a case. `read` lists those that were read.
+
+    - `folder`: folder of the case file, to which paths are relative.
+    - `known`: files that are read already; they are not read again.
+    """
+
+    def __init__(self, folder: pathlib.Path = pathlib.Path(), known: Iterable[RecordedFile] = ()) -> None:
+        self.folder, self.known = folder, {one.key: one for one in known}
+        self.read: list[RecordedFile] = []
+
+    def signal(self, table: Table, extra: tuple[str, ...] = ()) -> Recorded:
+        """Return the signal of a table. Raises ValueError, with the path, the value and the fix, if it is invalid."""
+        table.only(["kind", *KEYS, *extra])
+        held = table.choice("interpolation", INTERPOLATIONS, INTERPOLATIONS[0]) == "held"
+        scale, start = (table.leaf(name, FIELDS[name], FIELDS[name].default) for name in ("scale", "start"))
+        columns, key = _columns(table), table.at("file")
+        one = self.known.get(key) or self._opened(key, table.raw.get("file"), columns)
+        self.read.append(one)
+        return Recorded(one.samples, held, scale, start)
+
+    def _opened(self, key: str, written: object, columns: tuple[str, str] | None) -> RecordedFile:
+        def refuse(why: str) -> ValueError:
+            return ValueError(f"{key} = {show(written)}: {why}")
+
+        if written is None:
+            raise ValueError(f"{key} is missing: give the path of a file, {quoted(list(READERS))}.")
+        if not isinstance(written, str) or pathlib.PurePath(written).suffix.lower() not in READERS:
+            raise refuse(f"it must be the path of a file, {quoted(list(READERS))}, relative to the case file.")
+        file = (self.folder / written).resolve()
+        try:
+            found = READERS[file.suffix.lower()](file)
+        except OSError as error:
+            why = (
+                f"{file} cannot be read ({error.strerror or error}). A path is relative to the folder of the case file"
+            )
+            raise refuse(f"{why}.") from None
+        except ValueError as error:
+            raise refuse(f"{error}") from None
+        try:
+            return RecordedFile(key, written, file, _checked(*_chosen(found, columns)))
+        except ValueError as error:
+            raise refuse(f"{error}") from None
+
+
+def relocated_files(files: Iterable[RecordedFile], out: pathlib.Path) -> dict[str, str]:
+    """Return each file by dotted path as a case file in the folder `out` must write it.
+
+    It is as written unless its relative path leads elsewhere from `out`.
+    """
+    return {one.key: path_from(one.written, one.file, out) for one in files}
+
+
+def _columns(table: Table) -> tuple[str, str] | None:
+    names = table.raw.get("columns")
+    if names is None:
+        return None
+    if not isinstance(names, list) or len(names) != 2 or not all(isinstance(one, str) for one in names):
+        raise ValueError(f'{table.at("columns")} = {show(names)}: it must be two names, ["t", "force"] for example.')
+    return names[0], names[1]
+
+
+def _chosen(found: dict[str, np.ndarray], columns: tuple[str, str] | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and values. Without `columns` the file must have exactly two."""
+    listed = ", ".join(found) or "none"
+    if columns is None:
+        if len(found) != 2:
+            raise ValueError(f"it has the columns {listed}; name those of time and value with columns = [.., ..].")
+        time, value = found
+        columns = time, value
+    for name in columns:
+        if name not in found:
+            raise ValueError(f"it has no column '{name}'. Its columns: {listed}.")
+    return found[columns[0]], found[columns[1]]
+
+
+def _checked(times: np.ndarray, values: np.ndarray) -> Samples:
+    """Return the samples. Raises ValueError for a wrong shape, a number that is not finite, or times out of order."""
+    shapes = np.shape(times), np.shape(values)
+    if any(len(shape) != 1 for shape in shapes) or shapes[0] != shapes[1]:
+        raise ValueError(
+            f"times and values must be two lists of one length; their shapes are {shapes[0]}, {shapes[1]}."
+        )
+    if not 2 <= times.size <= MOST_ROWS:
+        raise ValueError(f"it has {times.size:,} rows; give 2 to {MOST_ROWS:,}.")
+    for what, x in (("time", times), ("value", values)):
+        if not np.issubdtype(x.dtype, np.number) or np.iscomplexobj(x):
+            raise ValueError(f"its {what}s are no real numbers.")
+        if (wrong := np.flatnonzero(~np.isfinite(x))).size:
+            raise ValueError(f"the {what} of row {wrong[0] + 1} is {x[wrong[0]]}; each must be a finite number.")
+    if (wrong := np.flatnonzero(np.diff(times) <= 0)).size:
+        row = wrong[0] + 1
+        raise ValueError(f"times must increase: row {row + 1} has {times[row]:g} s after {times[row - 1]:g} s.")
+    return Samples(np.asarray(times, float), np.asarray(values, float))
+
+
+def _csv(file: pathlib.Path) -> dict[str, np.ndarray]:
+    """Read columns separated by commas; the first line may have their names, and # begins a comment."""
+    try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise ValueError("it is no text file in UTF-8.") from None
+    numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
+    if not numbered:
+        raise ValueError("it is empty.")
+    if ";" in numbered[0][1]:
+        raise ValueError("its columns are separated by ';'. Separate them by commas, with a point in decimal numbers.")
+    rows = list(csv.reader(line for _, line in numbered))
+    named = any(_float(cell) is None for cell in rows[0])
+    names = [cell.strip() for cell in rows[0]] if named else [str(n + 1) for n in range(len(rows[0]))]
+    if len(set(names)) < len(names):
+        raise ValueError(f"two of its columns have the same name: {', '.join(names)}.")
+    table = np.empty((len(rows) - named, len(names)))
+    for n, (row, (line, _)) in enumerate(zip(rows[named:], numbered[named:], strict=True)):
+        if len(row) != len(names):
+            raise ValueError(f"line {line} has {len(row)} columns, but the first line has {len(names)}.")
+        for k, cell in enumerate(row):
+            if (number := _float(cell)) is None:
+                raise ValueError(f"line {line}: {show(cell)} is no number.")
+            table[n, k] = number
+    return dict(zip(names, table.T, strict=True))
+
+
+def _float(cell: str) -> float | None:
+    try:
+        return float(cell) if cell.strip() else math.nan
+    except ValueError:
+        return None
+
+
+def _npz(file: pathlib.Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except (ValueError, zipfile.BadZipFile, EOFError):
+        raise ValueError("it is no npz file of numbers. numpy.savez writes one.") from None
+
+
+def _parquet(file: pathlib.Path) -> dict[str, np.ndarray]:
+    try:
+        from pyarrow import lib, parquet  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise ValueError("a Parquet file needs pyarrow. Install it with: pip install 'ambjax[tables]'.") from None
+    try:
+        table = parquet.read_table(file)
+    except lib.ArrowInvalid:
+        raise ValueError("it is no Parquet file.") from None
+    return {name: table[name].to_numpy() for name in table.column_names}
+
+
+READERS = {".csv": _csv, ".npz": _npz, ".parquet": _parquet}

@@ -1,0 +1,113 @@
+"""Warnings about a machine that its loads, its sampling or its bandwidths do not fit."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from ambjax.cases.reader import Case
+from ambjax.commands.acceptance import bias_flux, forces
+from ambjax.world.scenario import SLOTS
+
+# Flux density above which common silicon steel begins to saturate, T (Schweitzer and Maslen, Magnetic Bearings, 2009).
+MOST_FLUX = 1.2
+# Least number of samples in the time constant of the unstable rotor, and least ratio of a bandwidth to its pole. A loop
+# needs a bandwidth of twice the unstable pole (Skogestad and Postlethwaite, Multivariable Feedback Control, 5.9).
+LEAST_SAMPLES, LEAST_BANDWIDTH = 3.0, 2.0
+# Largest converter step per standard deviation of the noise at which the noise still dithers the converter.
+MOST_STEP = 4.0
+# Plausible ranges of mass (kg), bias (A) and resistance (ohm), the unit of each and the likely slip.
+RANGES = {
+    "m": ((1e-3, 1e5), "kg", "grams"),
+    "i_0": ((1e-3, 100.0), "A", "milliamperes"),
+    "R": ((1e-4, 1e4), "ohm", "milliohms"),
+}
+# Fields of signals that are a frequency, and their factor to Hz.
+FREQUENCIES = {"frequency": 1.0, "frequency_end": 1.0, "f_high": 1.0, "speed": 1 / 60, "speed_end": 1 / 60}
+
+
+def implausible(case: Case) -> list[str]:
+    """Return one line for each doubtful relation of two numbers of a case, and for each doubtful size."""
+    return [*_ranges(case), *_forces(case), *_flux(case), *_rates(case), *_converter(case), *_aliases(case)]
+
+
+def _ranges(case: Case) -> Iterator[str]:
+    for name, ((low, high), unit, slip) in RANGES.items():
+        value = float(getattr(case.scenario.plant, name))
+        if value and not low <= value <= high:
+            yield f"plant.{name} = {value:g} {unit}: usual values are {low:g} to {high:g} {unit}. Is it in {slip}?"
+
+
+def _forces(case: Case) -> Iterator[str]:
+    largest, weight, load = forces(case)
+    if weight <= largest < weight + load:
+        yield (
+            f"[disturbance]: weight and loads reach {weight + load:.4g} N, but the magnets pull with at most "
+            f"{largest:.4g} N at z = 0, where |i| reaches the bias or the limit. A load that stays needs more force."
+        )
+
+
+def _flux(case: Case) -> Iterator[str]:
+    if (flux := bias_flux(case)) > MOST_FLUX:
+        yield (
+            f"plant: the bias flux density mu_0 n i_0/(2 s_0) is {flux:.3g} T; iron saturates above about "
+            f"{MOST_FLUX:g} T, which this model does not contain. Check n, i_0 and s_0."
+        )
+
+
+def _rates(case: Case) -> Iterator[str]:
+    scenario, pole = case.scenario, float(case.scenario.plant.pole)
+    samples = 1 / (float(case.clock.sample_period) * pole)
+    if case.cascade.processor is not None and 1 <= samples < LEAST_SAMPLES:
+        yield (
+            f"clock.sample_period = {float(case.clock.sample_period):g} s: the unstable rotor's time constant has only "
+            f"{samples:.2g} samples; give at least {LEAST_SAMPLES:g}, 10 or more for usable margins."
+        )
+    for name, part in (("sensor", scenario.sensor), ("actuator", scenario.amplifier)):
+        bandwidth = getattr(part, "bandwidth", None)
+        if bandwidth is not None and 2 * math.pi * float(bandwidth) < LEAST_BANDWIDTH * pole:
+            yield (
+                f"{name}.bandwidth = {float(bandwidth):g} Hz is less than twice the unstable pole, {pole:.4g} 1/s = "
+                f"{pole / (2 * math.pi):.4g} Hz: a loop with usable margins needs more. Is it in kHz?"
+            )
+
+
+def _converter(case: Case) -> Iterator[str]:
+    sensor = case.scenario.sensor
+    if sensor is None or sensor.bits is None or not sensor.std:
+        return
+    step = 2 * float(sensor.ends(case.scenario.plant.s_0)) / 2 ** float(sensor.bits)
+    if step > MOST_STEP * float(sensor.std):
+        yield (
+            f"sensor.bits = {float(sensor.bits):g}: a step of {step:.3g} m is {step / float(sensor.std):.3g} times the "
+            "noise sensor.std, so that the reading rests on one step. Give more bits, or a smaller range_z."
+        )
+
+
+def _aliases(case: Case) -> Iterator[str]:
+    half = 0.5 / float(case.clock.sample_period)
+    parts = {f"{'' if slot == 'reference' else 'disturbance.'}{slot}": getattr(case.scenario, slot) for slot in SLOTS}
+    if case.scenario.sensor is not None:
+        parts["sensor.runout"] = case.scenario.sensor.runout
+    for path, signal in parts.items():
+        for name, high in _frequencies(signal):
+            if high > half:
+                yield (
+                    f"{path}: {name} gives {high:.4g} Hz, above half the sampling rate, {half:.4g} Hz: samples do not "
+                    "resolve it. Shorten clock.sample_period."
+                )
+
+
+def _frequencies(node: object) -> Iterator[tuple[str, float]]:
+    """Yield the name and the value (Hz) of each frequency in a signal and its parts."""
+    if isinstance(node, tuple):
+        for item in node:
+            yield from _frequencies(item)
+    elif dataclasses.is_dataclass(node):
+        for field in dataclasses.fields(node):
+            value = getattr(node, field.name)
+            if field.name in FREQUENCIES and value is not None:
+                yield field.name, FREQUENCIES[field.name] * float(np.max(np.asarray(value)))
+            elif isinstance(value, tuple):
+                yield from _frequencies(value)

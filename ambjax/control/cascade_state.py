@@ -1,0 +1,48 @@
+"""The state of a cascade, its outputs, and its inputs at a sample."""
+
+from typing import Any, NamedTuple
+
+from jax import Array
+
+from ambjax.numerics.records import Scalar
+from ambjax.world.signals import Reference
+
+
+class CascadeState(NamedTuple):
+    """The state of each law, or its rate."""
+
+    observer: Any
+    position: Any
+    inversion: Any
+    current: Any
+
+
+class Command(NamedTuple):
+    """Outputs of the stages.
+
+    - `v_star`: demanded scaled force, A^2/m^2. Eq. (5)
+    - `v_tilde`: inversion error v_star - v(z, i_ref), A^2/m^2.
+    - `i_ref`, `i_ref_dot`: current reference, A, and its rate, A/s.
+    - `u`: voltage, V, before the limit of the supply.
+    """
+
+    v_star: Array
+    v_tilde: Array
+    i_ref: Array
+    i_ref_dot: Array
+    u: Array
+
+
+class Sample(NamedTuple):
+    """Inputs of a cascade on a processor at a sample, apart from the measurement.
+
+    - `reference`: at the instant of the sample; with prediction, at the end of the delay.
+    - `period`: sample period, s.
+    - `u_max`: limit of the supply, V.
+    - `past`: voltages of the last sample and of the one before it, V.
+    """
+
+    reference: Reference
+    period: Scalar
+    u_max: Scalar
+    past: tuple[Array, Array]

@@ -1,0 +1,132 @@
+"""A linear controller designed elsewhere, such as by H-infinity synthesis, as a position law."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.control.force import force_of_current, linear_mechanics, sliding_variable
+from ambjax.control.laws import PositionLaw
+from ambjax.control.realisation import FREQUENCIES, Realisation, realisation
+from ambjax.control.search import Interval, SearchContext
+from ambjax.numerics import records
+from ambjax.numerics.records import Scalar, is_traced, record, static
+from ambjax.world.plant import Plant
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference
+
+# Default outputs, for messages; largest relative difference of the sample periods of controller and processor.
+OUTPUTS, SAME_PERIOD = ("current", "voltage"), 1e-6
+# Default controller: 135 + 0.219 s/(1 + s/10600) A/m, as `StateFeedback` for the plant of Table 1, without integral.
+LEAD = realisation(-10600.0, 1.0, -0.219 * 10600.0**2, 135 + 0.219 * 10600.0)
+
+
+@record
+class LinearController(PositionLaw[tuple[Array, ...]]):
+    """v_star = dv/dz z + dv/di i_star, i_star = g/b + gain K(s) (r - z): a linear controller in state space.
+
+    The input of K is r - z, or for a K with two inputs r and z. Its output is a current (A) or a voltage u (V); then
+    i_star = g/b + u/R. g/b is the current that carries the weight, b = a dv/di at z = 0, i = 0. For
+    inversion.Linearised i_ref is i_star; current.OpenLoop then applies R i_ref, which is the voltage itself.
+
+    A continuous K is discretised by the bilinear (Tustin) transform at the period of a processor. A discrete K requires
+    a processor with its own period. There is no anti-windup: the states of K do not depend on the supply's limit. The
+    reported sigma is the rate of the error. `of` makes the law of a state space of python-control or SciPy.
+    """
+
+    gain: Scalar = records.gain(default=1.0, unit="1", doc="factor of the controller's output")
+    output: str = static(default=OUTPUTS[0], doc="what the controller's output is: a current (A) or a voltage (V)")
+    realisation: Realisation = static(default=LEAD, doc="matrices of the controller")
+    own_steps = ("implicit", "explicit")
+
+    @classmethod
+    def of(cls, system: Any, output: str = OUTPUTS[0], gain: Scalar = 1.0) -> "LinearController":
+        """Return the law of a state space `system`: an object with matrices A, B, C, D and the period dt (s).
+
+        Raises ValueError if it has no such matrices, or as `realisation` does.
+        """
+        if not all(hasattr(system, name) for name in "ABCD"):
+            kind = type(system).__name__
+            raise ValueError(f"{kind} has no matrices A, B, C, D: convert it to a state space, as control.ss does.")
+        if output not in OUTPUTS:
+            raise ValueError(f"output = {output!r}: it must be one of {', '.join(map(repr, OUTPUTS))}.")
+        dt = getattr(system, "dt", None)
+        return cls(gain, output, realisation(system.A, system.B, system.C, system.D, dt))
+
+    @property
+    def demand(self) -> str:
+        return "voltage" if self.output == OUTPUTS[1] else "force"
+
+    @property
+    def memory(self) -> tuple[tuple[str, str, str], ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Name, unit and meaning of each state."""
+        return tuple((f"x_{k + 1}", "m", "state of the controller") for k in range(len(self.realisation.A)))
+
+    def check_use(self, model: Plant, period: float | None) -> None:
+        """Raise ValueError for a discrete controller at another period, and for a voltage without a resistance."""
+        dt = self.realisation.dt
+        if dt and period is None:
+            raise ValueError(
+                f"the controller is discrete, dt = {dt:g} s, and this case runs in continuous time. Add [processor], "
+                f"with clock.sample_period = {dt:g}, or give a continuous controller."
+            )
+        if dt and period is not None and not abs(period / dt - 1) < SAME_PERIOD:
+            raise ValueError(
+                f"the controller is discrete, dt = {dt:g} s, and the sample period is {period:g} s. Set "
+                f"clock.sample_period = {dt:g}, or resample the controller."
+            )
+        if self.demand == "voltage" and not is_traced(model.R) and not np.all(np.asarray(model.R) > 0):
+            raise ValueError('output = "voltage" needs a coil resistance above 0. Give plant.R, or controller.model.R.')
+
+    def in_continuous_time(self) -> "LinearController":
+        """Return the continuous controller that the bilinear transform turns into this one."""
+        return dataclasses.replace(self, realisation=dataclasses.replace(self.realisation, dt=0.0))
+
+    def init(self, model: Plant) -> tuple[Array, ...]:
+        return (jnp.zeros(()),) * len(self.realisation.A)
+
+    def scale(self, model: Plant) -> tuple[Scalar, ...]:
+        return (model.sizes().z,) * len(self.realisation.A)
+
+    def slope(self, model: Plant) -> Scalar:
+        """Return the larger of the fastest pole of the controller and the crossover of the loop."""
+        return jnp.maximum(self.realisation.fastest, self.explicit_rate(model))
+
+    def explicit_rate(self, model: Plant) -> Scalar:
+        """Return the largest w (1/s) at which the linearised mechanics' b |K| / w^2, or of a voltage /(L w^3), is 1."""
+        size = self.gain * linear_mechanics(model).b * np.abs(self.realisation.response(FREQUENCIES)[:, -1])
+        loop = size / FREQUENCIES**2 if self.demand == "force" else size / (model.L * FREQUENCIES**3)
+        return jnp.max(jnp.where(loop >= 1, FREQUENCIES, FREQUENCIES[0]))
+
+    def sigma(self, motion: Measurement, reference: Reference) -> Array:
+        """Return the rate of the error: a linear controller has no manifold."""
+        return sliding_variable(0.0, motion, reference)
+
+    def _inputs(self, inputs: tuple[Measurement, Reference]) -> list[Array]:
+        (motion, reference), count = inputs, len(self.realisation.D)
+        r, z = jnp.asarray(reference.r), jnp.asarray(motion.z)
+        return [r - z] if count == 1 else [r, z]
+
+    def _force(self, model: Plant, z: Array, y: Array) -> Array:
+        """Return v_star for an output y of the controller."""
+        i = self.gain * y if self.demand == "force" else self.gain * y / model.R
+        return force_of_current(model, z, model.g / linear_mechanics(model).b + i)
+
+    def __call__(
+        self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[Array, ...]
+    ) -> tuple[Array, tuple[Array, ...]]:
+        w = self._inputs(inputs)
+        y = self.realisation.output(state, w)
+        return self._force(model, inputs[0].z, y), self.realisation.rates(state, w)
+
+    def step(
+        self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[Array, ...], period: Scalar
+    ) -> tuple[Array, tuple[Array, ...]]:
+        """Step by the bilinear transform."""
+        y, after = self.realisation.step(state, self._inputs(inputs), period)
+        return self._force(model, inputs[0].z, y), after
+
+    def ranges(self, context: SearchContext) -> dict[str, Interval]:
+        return {"gain": Interval(0.3, 3.0, "a third to three times the controller")}

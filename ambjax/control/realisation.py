@@ -1,0 +1,206 @@
+"""A linear controller as numbers: matrices in real Schur form, from those of a state space of other tools."""
+
+import dataclasses
+import hashlib
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+from jax import Array
+
+from ambjax.numerics.records import Scalar
+
+# Largest number of states. In continuous time an implicit step eliminates all of them by scalar operations.
+MOST_STATES = 30
+# Frequencies (1/s) over which the response of each state is made at most 1, and the damping ratio of the exponentials
+# at which it is evaluated: undamped ones may be poles of the controller.
+FREQUENCIES, DAMPED = np.geomspace(10.0, 1e5, 81), 0.05
+# Largest condition number of A + 1 of a discrete controller: above it, a pole is too close to z = -1.
+MOST_CONDITION = 1e8
+
+Row = tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Realisation:
+    """The controller x' = A x + B w, y = C x + D w with n states and m = 1 or 2 inputs w; y is a scalar.
+
+    `A` [n, n]: upper quasi-triangular (real Schur form). `B` [n, m], `C` [n], `D` [m]. States are scaled so that each
+    is at most about w. `dt`: sample period of a discrete controller, s; 0: continuous. A discrete controller is stored
+    as the continuous one that the bilinear transform with period dt turns into it. `realisation` makes it of arrays.
+    """
+
+    A: tuple[Row, ...]
+    B: tuple[Row, ...]
+    C: Row
+    D: Row
+    dt: float = 0.0
+
+    def __repr__(self) -> str:
+        return f"Realisation({len(self.A)} states, {len(self.D)} inputs, dt = {self.dt:g})"
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the numbers."""
+        return hashlib.sha256(repr((self.A, self.B, self.C, self.D, self.dt)).encode()).hexdigest()
+
+    @property
+    def fastest(self) -> float:
+        """Largest magnitude of a pole, 1/s."""
+        return float(np.max(np.abs(np.linalg.eigvals(np.array(self.A))), initial=0.0)) if self.A else 0.0
+
+    def response(self, w: npt.ArrayLike) -> np.ndarray:
+        """Return the frequency response [F, m], complex, at angular frequencies w [F] in 1/s."""
+        n = len(self.A)
+        A, B = np.reshape(self.A, (n, n)), np.reshape(self.B, (n, len(self.D)))
+        s = 1j * np.asarray(w, float)[:, None, None]
+        states = np.linalg.solve(s * np.eye(n) - A, np.broadcast_to(B + 0j, (len(s), *B.shape)))
+        return np.array(self.C) @ states + np.array(self.D) if n else np.tile(np.array(self.D) + 0j, (len(s), 1))
+
+    def output(self, x: Sequence[Array], w: Sequence[Array]) -> Array:
+        """Return y for a state and inputs."""
+        return _sum(self.C, x) + _sum(self.D, w)
+
+    def rates(self, x: Sequence[Array], w: Sequence[Array]) -> tuple[Array, ...]:
+        """Return the rate of the state."""
+        return tuple(_sum(a, x) + _sum(b, w) for a, b in zip(self.A, self.B, strict=True))
+
+    def step(self, x: Sequence[Array], w: Sequence[Array], period: Scalar) -> tuple[Array, tuple[Array, ...]]:
+        """Return y and the next state of the bilinear (Tustin) transform with this period, s.
+
+        With h = T/2 and the state p of (1 - h A) p = x + h B w: y = C p + D w, x+ = 2 p - x. Back substitution solves
+        for p, by blocks of one row or, for a pair of complex poles, two.
+        """
+        h = jnp.asarray(period) / 2
+        p: list[Array] = [jnp.zeros(())] * len(self.A)
+        for rows in reversed(self._blocks()):
+            after = rows[-1] + 1
+            right = [x[k] + h * (_sum(self.B[k], w) + _sum(self.A[k][after:], p[after:])) for k in rows]
+            if len(rows) == 1:
+                p[rows[0]] = right[0] / (1 - h * self.A[rows[0]][rows[0]])
+                continue
+            (a, b), (c, d) = (self.A[k][rows[0] : after] for k in rows)
+            over = 1 / ((1 - h * a) * (1 - h * d) - h * h * (b * c))
+            p[rows[0]] = over * ((1 - h * d) * right[0] + h * b * right[1])
+            p[rows[1]] = over * ((1 - h * a) * right[1] + h * c * right[0])
+        return self.output(p, w), tuple(2 * q - y for q, y in zip(p, x, strict=True))
+
+    def _blocks(self) -> list[tuple[int, ...]]:
+        """Return the rows of each diagonal block of A."""
+        blocks, k = [], 0
+        while k < len(self.A):
+            size = 2 if k + 1 < len(self.A) and self.A[k + 1][k] else 1
+            blocks.append(tuple(range(k, k + size)))
+            k += size
+        return blocks
+
+
+def _sum(row: Row, x: Sequence[Array]) -> Array:
+    """Return the sum of the products; a coefficient of 0 costs nothing."""
+    total: Array | None = None
+    for factor, value in zip(row, x, strict=True):
+        if factor:
+            total = factor * value if total is None else total + factor * value
+    return jnp.zeros(()) if total is None else total
+
+
+def realisation(A: object, B: object, C: object, D: object, dt: object = 0.0) -> Realisation:
+    """Return the realisation of a state space: A [n, n], B [n, m], C [1, n], D [1, m] with m = 1 or 2 inputs.
+
+    `dt`: sample period, s; 0 or None: continuous. Raises ValueError, with the name of the array, for matrices that do
+    not fit together or are not finite, and for a discrete controller with a pole at z = -1.
+    """
+    step = _period(dt)
+    a, b, c, d = _shaped(*(_numbers(name, x) for name, x in zip("ABCD", (A, B, C, D), strict=True)))
+    a, b, c = _balanced(a, b, c)
+    if step:
+        a, b, c, d = _continued(a, b, c, d, step)
+    a, b, c = _scaled(*_triangular(a, b, c))
+    if not all(np.isfinite(x).all() for x in (a, b, c, d)):
+        raise ValueError("A, B, C: their numbers span too many decades. Balance the state space before saving it.")
+    rows = [tuple(map(tuple, x.tolist())) for x in (a, b)]
+    return Realisation(rows[0], rows[1], tuple(c[0].tolist()), tuple(d[0].tolist()), step)
+
+
+def _period(dt: object) -> float:
+    x = np.zeros(()) if dt is None else np.asarray(dt)
+    if x.dtype == bool:
+        raise ValueError("dt = True: a discrete controller without a sample period. Give dt in seconds; 0: continuous.")
+    if x.size != 1 or x.dtype.kind not in "iuf" or not 0 <= x.item() < np.inf:
+        raise ValueError(f"dt = {dt}: it must be the sample period in seconds, or 0 for a continuous controller.")
+    return float(x.item())
+
+
+def _numbers(name: str, given: object) -> np.ndarray:
+    x = np.asarray(given)
+    if x.dtype.kind not in "iuf":
+        raise ValueError(f"{name} has entries of type {x.dtype}: it must contain real numbers.")
+    if x.ndim > 2:
+        raise ValueError(f"{name} has the shape {x.shape}: it must be a matrix.")
+    if not np.isfinite(x).all():
+        raise ValueError(f"{name} contains NaN or inf: all numbers must be finite.")
+    return x.astype(float)
+
+
+def _shaped(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the four as matrices. Raises ValueError for shapes that do not fit together."""
+    D = np.atleast_2d(D)
+    if D.shape not in ((1, 1), (1, 2)):
+        raise ValueError(f"D has the shape {D.shape}: it must be (1, 1), for the input r - z, or (1, 2), for r and z.")
+    n = 0 if not A.size else len(np.atleast_2d(A))
+    if n > MOST_STATES:
+        raise ValueError(f"A has {n} rows: a controller may have at most {MOST_STATES} states. Reduce its order.")
+    made = []
+    for name, x, shape in (("A", A, (n, n)), ("B", B, (n, D.shape[1])), ("C", C, (1, n))):
+        if x.shape != shape and (x.size != shape[0] * shape[1] or (x.ndim == 2 and x.size)):
+            raise ValueError(f"{name} has the shape {x.shape}: with D {D.shape} and {n} rows of A it must be {shape}.")
+        made.append(x.reshape(shape))
+    return (*made, D)
+
+
+def _continued(
+    A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, dt: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the continuous state space that the bilinear transform with period dt (s) turns into this one."""
+    one = np.eye(len(A))
+    if len(A) and not np.linalg.cond(A + one) < MOST_CONDITION:
+        raise ValueError(
+            "A has an eigenvalue near -1: the bilinear transform has no pole there. Move the pole at z = -1."
+        )
+    over = np.linalg.inv(A + one)
+    return 2 / dt * (A - one) @ over, 2 / dt * over @ B, 2 * C @ over, D - C @ over @ B
+
+
+def _balanced(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the state space with its states scaled by powers of 2 for rows and columns of A of similar size.
+
+    A companion matrix, as of a transfer function, may span thirty decades.
+    """
+    if len(A) < 2:
+        return A, B, C
+    import scipy.linalg
+
+    _, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
+    return A * scale / scale[:, None], B / scale[:, None], C * scale
+
+
+def _triangular(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the state space with A in real Schur form."""
+    if len(A) < 2:
+        return A, B, C
+    import scipy.linalg
+
+    T, Q = scipy.linalg.schur(A, output="real")[:2]
+    return T, Q.T @ B, C @ Q
+
+
+def _scaled(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the state space with the largest response of each state near 1, by powers of 2."""
+    if not len(A):
+        return A, B, C
+    s = (FREQUENCIES * (1j + DAMPED))[:, None, None]
+    states = np.linalg.solve(s * np.eye(len(A)) - A, np.broadcast_to(B + 0j, (len(s), *B.shape)))
+    largest = np.max(np.abs(states), axis=(0, 2))
+    size = np.exp2(np.round(np.log2(np.where(largest > 0, largest, 1.0))))
+    return A * size / size[:, None], B / size[:, None], C * size

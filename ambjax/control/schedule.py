@@ -1,0 +1,142 @@
+"""Gain schedules: a gain as a piecewise-linear function of the error, the reference or its speed.
+
+A schedule stands in a law in the place of a gain. No law knows of it: the cascade evaluates the schedules of a law for
+the present position and reference, and calls the law with the resulting numbers.
+"""
+
+import dataclasses
+import functools
+import itertools
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.control.base import Law
+from ambjax.numerics.records import GainFunction, Scalar, check_number, is_traced, record, static
+from ambjax.world.signals import Reference
+
+L = TypeVar("L", bound=Law)
+
+# The signal of a schedule: its unit, and its meaning.
+OVER = {"error": ("m", "|z - r|"), "reference": ("m", "|r|"), "reference-speed": ("m/s", "|r_dot|")}
+# Largest number of knots, largest abscissa and least distance of two abscissae.
+MOST_KNOTS, LARGEST, CLOSEST = 50, 1e6, 1e-12
+# Share of the last abscissa below which the derivative of the signal's magnitude goes to 0 at 0.
+ROUNDED = 1e-9
+
+
+@record
+class Schedule(GainFunction):
+    """A gain as a piecewise-linear function of a signal, constant below the first knot and above the last.
+
+    The signal is |z - r| ("error"), |r| ("reference") or |r_dot| ("reference-speed"). z is the position that the law
+    reads: the measured one for an observer, the estimated one for the other laws. The numbers `values` are gains: they
+    are tuned, spread and exported. `at` and `over` belong to the compiled program.
+    """
+
+    values: tuple[Scalar, ...]
+    """gain at each knot, in its unit"""
+    at: tuple[float, ...] = static(doc="knots, increasing; m, or m/s for the speed of the reference")
+    over: str = static(default="error", doc="signal of the schedule")
+
+    def value(self, z: Scalar, reference: Reference) -> Array:
+        """Return the gain at a position z (m) and a reference.
+
+        The derivative with respect to the signal at a knot is the mean of those on both sides. At 0 it is 0, as the
+        magnitude has no other derivative there.
+        """
+        signal = {"error": z - reference.r, "reference": reference.r, "reference-speed": reference.r_dot}[self.over]
+        x, total = _magnitude(jnp.asarray(signal), ROUNDED * self.at[-1]), jnp.asarray(self.values[0])
+        for (low, high), (first, last) in zip(*map(itertools.pairwise, (self.at, self.values)), strict=True):
+            share = jnp.minimum(jnp.maximum((x - low) * (1 / (high - low)), 0.0), 1.0)
+            total = total + (last - first) * share
+        return total
+
+    def with_knot(self, knot: int, value: Scalar) -> "Schedule":
+        """Return the schedule with another value at one knot."""
+        return dataclasses.replace(self, values=(*self.values[:knot], value, *self.values[knot + 1 :]))
+
+    def check(self, field: dataclasses.Field, path: str) -> None:
+        """Raise ValueError for an invalid schedule in the place of the number `field`, which stands at `path`."""
+        if "steepness" not in field.metadata:
+            words = field.metadata.get("doc", "no gain")
+            raise ValueError(f"{path}: only a gain can have a schedule. Give a number ({words}).")
+        if self.over not in OVER:
+            raise ValueError(f"{path}.over = '{self.over}': it must be one of {', '.join(OVER)}.")
+        fine = isinstance(self.at, tuple) and all(isinstance(x, (int, float)) and 0 <= x <= LARGEST for x in self.at)
+        if not (fine and 2 <= len(self.at) <= MOST_KNOTS and np.all(np.diff(self.at) >= CLOSEST)):
+            unit, signal = OVER[self.over]
+            raise ValueError(
+                f"{path}.at = {_shown(self.at)}: it must be 2 to {MOST_KNOTS} increasing numbers from 0 to "
+                f"{LARGEST:g} {unit}, at least {CLOSEST:g} apart: where the gain is given as a function of {signal}."
+            )
+        if len(self.values) != len(self.at):
+            raise ValueError(
+                f"{path}.values has {len(self.values)} numbers and {path}.at has {len(self.at)}: give one value for "
+                "each knot."
+            )
+        for knot, value in enumerate(self.values):
+            if not is_traced(value):
+                check_number(finite(field), f"{path}.values[{knot}]", value)
+
+
+def finite(field: dataclasses.Field) -> dataclasses.Field:
+    """Return the field of a value of a schedule of the gain `field`: the same, but finite."""
+    return dataclasses.field(metadata={**field.metadata, "infinite": False, "steepness": False})
+
+
+def _shown(numbers: tuple[float, ...]) -> str:
+    more = ", ..." if len(numbers) > 6 else ""
+    return f"[{', '.join(f'{x:g}' if isinstance(x, (int, float)) else repr(x) for x in numbers[:6])}{more}]"
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _magnitude(x: Array, rounded: float) -> Array:
+    """Return |x|. Its derivative is sgn(x), and x/rounded where |x| < rounded.
+
+    An equilibrium is known up to rounding. With the derivative sgn(x) its linearisation would depend on that rounding.
+    """
+    return jnp.abs(x)
+
+
+@_magnitude.defjvp
+def _magnitude_jvp(rounded: float, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (dx,) = primals, tangents
+    return jnp.abs(x), jnp.minimum(jnp.maximum(x * (1 / rounded), -1.0), 1.0) * dx
+
+
+def schedules(law: Law) -> dict[str, Schedule]:
+    """Return the schedules of a law by the name of the gain."""
+    given: dict[str, object] = vars(law)
+    return {name: value for name, value in given.items() if isinstance(value, Schedule)}
+
+
+def present(law: L, z: Scalar, reference: Reference) -> L:
+    """Return the law with the present value of each schedule; the law itself if it has none."""
+    found = schedules(law)
+    return _with(law, {name: one.value(z, reference) for name, one in found.items()}) if found else law
+
+
+def extremes(law: L) -> tuple[L, ...]:
+    """Return the law with the lowest value of each schedule and with the highest; only itself if it has none."""
+    found = schedules(law)
+    if not found:
+        return (law,)
+    ends = (functools.partial(functools.reduce, least) for least in (_lower, _higher))
+    return tuple(_with(law, {name: end(one.values) for name, one in found.items()}) for end in ends)
+
+
+def _lower(a: Scalar, b: Scalar) -> Scalar:
+    return min(a, b) if isinstance(a, float) and isinstance(b, float) else jnp.minimum(a, b)
+
+
+def _higher(a: Scalar, b: Scalar) -> Scalar:
+    return max(a, b) if isinstance(a, float) and isinstance(b, float) else jnp.maximum(a, b)
+
+
+def _with(law: L, numbers: dict[str, Scalar]) -> L:
+    given: object = law
+    return dataclasses.replace(given, **numbers)  # pyright: ignore[reportArgumentType, reportReturnType]

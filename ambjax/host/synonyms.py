@@ -1,0 +1,105 @@
+"""The name that a user probably means: another word for the same quantity, or a similar spelling."""
+
+import difflib
+from collections.abc import Iterable
+
+# Names of the case file, and other words for them, without case, '_' and '-'. A name with a dot is in another table; it
+# is suggested only if the word stands where no allowed name is like it.
+OTHER_WORDS = {
+    "plant": "rotor machine magnet magnets bearing system motor",
+    "controller": "control gains regulator",
+    "processor": "dsp cpu microcontroller sampling discrete",
+    "reference": "setpoint target command desired",
+    "disturbance": "load loads disturbances perturbation excitation",
+    "sensor": "noise measurement probe",
+    "actuator": "amplifier supply drive inverter",
+    "initial": "start state x0 ic initialconditions",
+    "clock": "time simulation solver integration",
+    "run": "settings options",
+    "spread": "uncertainty montecarlo ensemble tolerances",
+    "tune": "tuning optimise optimize optimisation",
+    "m": "mass weight rotormass",
+    "k_z": "stiffness k kz springrate passivestiffness",
+    "mu_0": "permeability mu",
+    "n": "turns windings",
+    "A": "area polearea",
+    "s_0": "gap airgap nominalgap delta",
+    "i_0": "bias biascurrent ibias",
+    "R": "resistance coilresistance",
+    "g": "gravity",
+    "observer": "estimator filter kalman",
+    "inversion": "linearisation linearization force",
+    "position": "outer",
+    "current": "inner",
+    "sample_period": "samplerate samplingrate samplingperiod sampletime rate fs ts period",
+    "duration": "tend endtime stoptime length simulationtime",
+    "dt": "step stepsize timestep h",
+    "method": "integrator scheme",
+    "frequency": "freq f hz omega",
+    "amplitude": "amp height size magnitude",
+    "value": "constant level offset",
+    "start": "t0 begin from delay ton",
+    "stop": "end until t1 toff",
+    "speed": "rpm rotationalspeed",
+    "unit": "units",
+    "file": "path filename csv",
+    "std": "sigma rms standarddeviation noise variance",
+    "bits": "resolution adc",
+    "bandwidth": "cutoff cutofffrequency lowpass",
+    "u_max": "voltage umax vmax dclink limit voltagelimit supplyvoltage",
+    "i_max": "currentlimit maxcurrent",
+    "seed": "randomseed rng",
+    "settle": "settling settlingtime",
+    "clearance": "touchdown safetygap",
+    "stop_stiffness": "stop contactstiffness touchdownstiffness",
+    "stop_damping": "contactdamping touchdowndamping",
+    "z": "position x displacement",
+    "z_dot": "velocity v speed zdot",
+    "i": "current",
+    "q_z": "q force f load accel acceleration",
+    "q_i": "qi voltage",
+    "base": "housing foundation basemotion ground",
+    "kind": "type name",
+    "disturbance.q_z": "q qz force forces unbalance imbalance",
+    "disturbance.q_i": "qi",
+    "sensor.runout": "runout",
+    "actuator.u_max": "umax voltage vmax dclink",
+    "clock.sample_period": "fs samplerate sampleperiod",
+    "clock.duration": "duration",
+    "processor.delay": "delay deadtime latency",
+    "run.clearance": "clearance",
+    "run.seed": "seed",
+}
+
+
+def meant(word: str, allowed: Iterable[str]) -> str | None:
+    """Return the name that `word` probably means: one of `allowed`, or a name of another table; None if unknown."""
+    names, plain = list(allowed), _plain(word)
+    for name in names:
+        if _plain(name) == plain or plain in OTHER_WORDS.get(name, "").split():
+            return name
+    if close := difflib.get_close_matches(word, names, n=1):
+        return close[0]
+    return next((name for name, words in OTHER_WORDS.items() if "." in name and plain in words.split()), None)
+
+
+def hint(word: str, allowed: Iterable[str]) -> str:
+    """Return " Did you mean 'name'?" for the name that `word` probably means; "" if unknown."""
+    name = meant(word, allowed)
+    return f" Did you mean '{name}'?" if name else ""
+
+
+def hint_of_path(path: str, known: Iterable[str]) -> str:
+    """Return the hint for a dotted path: the same table and another word for its last name, or a similar spelling."""
+    known = list(known)
+    table, _, name = path.rpartition(".")
+    inside = [one.rpartition(".")[2] for one in known if one.rpartition(".")[0] == table]
+    other = next((one for one in inside if _plain(name) in OTHER_WORDS.get(one, "").split()), None)
+    if other:
+        return f" Did you mean '{table}.{other}'?"
+    close = difflib.get_close_matches(path, known, n=1)
+    return f" Did you mean '{close[0]}'?" if close else ""
+
+
+def _plain(word: str) -> str:
+    return word.lower().replace("_", "").replace("-", "").replace(" ", "")

@@ -1,0 +1,85 @@
+"""Simulate a case, and return the result as tables and pictures."""
+
+import dataclasses
+import html
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ambjax.cases.reader import Case
+from ambjax.ensemble.replay import record
+from ambjax.host.optional import extra
+from ambjax.simulation.metrics import UNITS, standard_for
+from ambjax.simulation.trajectory import SIGNAL_UNITS, Trajectory
+
+
+@dataclasses.dataclass(frozen=True)
+class CaseRun:
+    """The result of `simulate`: the case, its trajectory at every sample, and its metrics by name, numbers in SI units.
+
+    In a notebook it is shown as the table of its metrics.
+    """
+
+    case: Case
+    trajectory: Trajectory
+    metrics: dict[str, Any]
+
+    @property
+    def lost(self) -> bool:
+        """Whether the rotor is lost."""
+        return bool(self.metrics["lost"])
+
+    def to_pandas(self) -> Any:
+        """Return the signals as a pandas DataFrame: one row per sample, with the index t in s.
+
+        `attrs["units"]` has the unit of each column. Raises ValueError if pandas is not installed.
+        """
+        frame = extra("pandas").DataFrame(
+            self._signals(), index=extra("pandas").Index(np.asarray(self.trajectory.rows.t), name="t")
+        )
+        frame.attrs["units"] = {name: SIGNAL_UNITS[name] for name in frame.columns}
+        return frame
+
+    def to_xarray(self) -> Any:
+        """Return the signals as an xarray Dataset over t (s), each with its unit in `attrs`.
+
+        Raises ValueError if xarray is not installed.
+        """
+        xarray = extra("xarray")
+        signals = {name: ("t", x, {"units": SIGNAL_UNITS[name]}) for name, x in self._signals().items()}
+        t = ("t", np.asarray(self.trajectory.rows.t), {"units": "s"})
+        return xarray.Dataset(signals, {"t": t}, {"case": self.case.name, "lost_why": self.trajectory.lost_why})
+
+    def plot(self) -> Any:
+        """Return a matplotlib Figure with every signal: the whole run, its start and its end."""
+        from ambjax.pictures.overview import overview_figure
+
+        return overview_figure(self.trajectory, f"{self.case.name}: {self.case.clock.method}")
+
+    def _signals(self) -> dict[str, np.ndarray]:
+        """Return the saved signals [samples] by name, without the time."""
+        return {name: x for name, x in self.trajectory.arrays().items() if name in SIGNAL_UNITS and name != "t"}
+
+    def _repr_html_(self) -> str:
+        state = f"lost: {self.trajectory.lost_why}" if self.lost else "held"
+        head = f"{html.escape(self.case.name)}: the rotor is {html.escape(state)}"
+        rows = "".join(
+            f"<tr><td>{name}</td><td>{value:.6g}</td><td>{UNITS.get(name, '')}</td></tr>"
+            for name, value in self.metrics.items()
+        )
+        return f"<table><caption>{head}</caption><tr><th>metric</th><th>value</th><th>unit</th></tr>{rows}</table>"
+
+
+def simulate(case: Case, progress: Callable[[int], object] = lambda samples: None) -> CaseRun:
+    """Simulate a case, as `ambjax simulate` does, and record every sample.
+
+    - `case`: from `read_case`.
+    - `progress`: called with the number of new samples after each part of the run.
+
+    Raises ValueError as `rollout` does. A lost rotor is no error: see `CaseRun.lost`.
+    """
+    fold = standard_for(case.settle, case.scenario)
+    outcome = record(case.cascade, case.scenario, case.clock, fold=fold, tell=progress)
+    metrics = {name: np.asarray(x).item() for name, x in outcome.measured.items()}
+    return CaseRun(case, outcome.trajectory, metrics)

@@ -1,0 +1,70 @@
+"""Simulate members of the spread of a case, and return the results as tables and pictures."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from ambjax.cases.reader import Case
+from ambjax.ensemble import statistics
+from ambjax.ensemble.study import Study
+from ambjax.host.optional import extra
+from ambjax.simulation.metrics import UNITS
+
+
+@dataclasses.dataclass(frozen=True)
+class MembersRun:
+    """The result of `simulate_members`: the study and its columns by name, arrays [members] in SI units.
+
+    The columns are index, lost_at, every metric, and "spread." + path for each quantity of the spread.
+    """
+
+    study: Study
+    columns: dict[str, np.ndarray]
+
+    @property
+    def survivors(self) -> int:
+        """Number of members that are neither lost nor stalled."""
+        return int(np.isposinf(self.columns["lost_at"]).sum())
+
+    def summary(self) -> dict[str, Any]:
+        """Return the statistics of the study, with confidence intervals: see `ambjax.ensemble.summary`."""
+        return statistics.summary(self.columns, self.study.spread.paths, self.study.seed)
+
+    def to_pandas(self) -> Any:
+        """Return the columns as a pandas DataFrame, one row per member. Raises ValueError if pandas is not installed.
+
+        `attrs["units"]` has the unit of each metric. `DataFrame.to_parquet` writes the table to a file.
+        """
+        columns = {name: x for name, x in self.columns.items() if name != "index"}
+        index = extra("pandas").Index(self.columns["index"], name="member")
+        frame = extra("pandas").DataFrame(columns, index=index)
+        frame.attrs["units"] = {name: UNITS[name] for name in frame.columns if name in UNITS}
+        return frame
+
+    def plot(self, *metrics: str) -> Any:
+        """Return a matplotlib Figure with histograms of these metrics over the members. Default: the main ones.
+
+        Raises ValueError if no metric has one of the names.
+        """
+        from ambjax.pictures.histograms import CHIEF, histogram_figure
+
+        return histogram_figure(self.columns, metrics or CHIEF)
+
+
+def simulate_members(case: Case, members: int, *, seed: int | None = None, threads: int | None = None) -> MembersRun:
+    """Simulate members 0 to members - 1 of the spread of a case, as `ambjax ensemble` does.
+
+    - `members`: number of members.
+    - `seed`: of the spread and the noise; None: `run.seed` of the case.
+    - `threads`: CPU cores to use; None: all.
+
+    The results stay in memory; `ambjax ensemble` writes them in parts and can be resumed. Raises ValueError for a
+    number of members below 1, or a seed below 0.
+    """
+    seed = int(case.scenario.seed) if seed is None else seed
+    if members < 1 or seed < 0:
+        raise ValueError(f"members = {members}, seed = {seed}: members must be at least 1, seed at least 0.")
+    study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, members)
+    columns = {name: np.asarray(x) for name, x in study.columns(0, members, threads=threads).items()}
+    return MembersRun(study, columns)

@@ -1,0 +1,57 @@
+"""Signals of straight lines: ramp and trapezoid."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.world.signals import hull
+
+
+def _share(t: Scalar, start: Scalar, duration: Scalar) -> Array:
+    """Return (t - start)/duration, limited to 0..1; all in s."""
+    return jnp.clip((jnp.asarray(t) - start) / duration, 0.0, 1.0)
+
+
+@record
+class Ramp:
+    """0 until `start`, then a straight line to `amplitude` over `duration`, then `amplitude`."""
+
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height reached")
+    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="when it begins to rise")
+    duration: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="time it takes to rise")
+
+    def __call__(self, t: Scalar) -> Array:
+        return self.amplitude * _share(t, self.start, self.duration)
+
+    def span(self, end: float) -> tuple[float, float]:
+        ends = (np.clip((t - np.asarray(self.start)) / self.duration, 0.0, 1.0) for t in (0.0, end))
+        return hull(*(self.amplitude * share for share in ends))
+
+    def shifted(self, by: Scalar) -> "Ramp":
+        """Return the signal, `by` seconds later."""
+        return dataclasses.replace(self, start=self.start + by)
+
+
+@record
+class Trapezoid:
+    """0 until `start`, a straight line to `amplitude` over `rise`, `amplitude` for `hold`, a line to 0 over `fall`."""
+
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height")
+    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="when it begins to rise")
+    rise: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="time it takes to rise")
+    hold: Scalar = leaf(default=0.1, unit="s", at_least=0, at_most=1e9, doc="time at the height")
+    fall: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="time it takes to fall")
+
+    def __call__(self, t: Scalar) -> Array:
+        down = self.start + self.rise + self.hold
+        return self.amplitude * (_share(t, self.start, self.rise) - _share(t, down, self.fall))
+
+    def span(self, end: float) -> tuple[float, float]:
+        return hull(0.0, self.amplitude)
+
+    def shifted(self, by: Scalar) -> "Trapezoid":
+        """Return the signal, `by` seconds later."""
+        return dataclasses.replace(self, start=self.start + by)

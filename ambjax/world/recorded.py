@@ -1,0 +1,66 @@
+"""A signal that was recorded: values at instants, as a file gives them."""
+
+import dataclasses
+import functools
+import hashlib
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.numerics.records import Scalar, leaf, record, static
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Samples:
+    """Values [n] at increasing times [n] (s), float64, n >= 2. Two of them are equal if their numbers are."""
+
+    times: np.ndarray
+    values: np.ndarray
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """SHA-256 of the numbers."""
+        return hashlib.sha256(np.stack([self.times, self.values]).tobytes()).hexdigest()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Samples) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+
+@record
+class Recorded:
+    """The values of a file, scale times value(t - start): straight lines between them, or each held until the next.
+
+    Before the first time the value is the first one, after the last time the last one. The samples are a part of the
+    compiled program, so that another file compiles again. On a processor a step of the integrator does not end at a
+    held value; jumps at sample instants are exact.
+    """
+
+    samples: Samples = static(doc="times and values")
+    held: bool = static(default=False, doc="whether a value is held until the next time")
+    scale: Scalar = leaf(default=1.0, unit="1", at_least=-1e20, at_most=1e20, doc="factor of the values")
+    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time at which the file's time is 0")
+
+    def __call__(self, t: Scalar) -> Array:
+        dtype = jnp.result_type(float)
+        times, values = (jnp.asarray(x, dtype) for x in (self.samples.times, self.samples.values))
+        now = jnp.asarray(t, dtype) - self.start
+        last = times.size - 1
+        if self.held:
+            return self.scale * values[jnp.clip(jnp.searchsorted(times, now, side="right") - 1, 0, last)]
+        now = jnp.clip(now, times[0], times[-1])
+        left = jnp.clip(jnp.searchsorted(times, now, side="right") - 1, 0, last - 1)
+        share = (now - times[left]) / (times[left + 1] - times[left])
+        return self.scale * (values[left] + share * (values[left + 1] - values[left]))
+
+    def span(self, end: float) -> tuple[float, float]:
+        low, high = np.min(self.samples.values), np.max(self.samples.values)
+        ends = [np.asarray(self.scale) * x for x in (low, high)]
+        return float(np.min(ends)), float(np.max(ends))
+
+    def shifted(self, by: Scalar) -> "Recorded":
+        """Return the signal, `by` seconds later."""
+        return dataclasses.replace(self, start=self.start + by)

@@ -1,0 +1,295 @@
+"""Loads in newtons and their signals: against closed forms."""
+
+import dataclasses
+import importlib.util
+import re
+
+import jax
+import numpy as np
+import pytest
+
+import ambjax as amb
+from ambjax.cases.reader import case_from, read_case
+from ambjax.ensemble.paths import places
+from ambjax.ensemble.spread import apply
+from ambjax.linear import linearise
+from tuning.report.tuned import tuned_case
+
+STEP = {"kind": "step", "amplitude": 20.0, "start": 0.1}
+SINE = {"kind": "sine", "amplitude": 8.0, "frequency": 300.0}
+T = np.array([0.0, 0.05, 0.1, 0.123, 0.4])
+
+
+def world(**tables):
+    return case_from(tables).scenario
+
+
+def test_a_force_in_newtons_is_divided_by_the_mass_of_each_member():
+    case = case_from({"plant": {"m": 2.0}, "disturbance": {"q_z": STEP | {"unit": "N"}}})
+    np.testing.assert_array_equal(case.scenario.acceleration(T), 10.0 * (T >= 0.1))
+    m = np.array([1.0, 2.0, 4.0])
+    _, spread = apply(case.cascade, case.scenario, {"plant.m": m})
+    np.testing.assert_array_equal(spread.acceleration(0.2), 20.0 / m)
+    # likewise where the mass and the force are traced: the derivative of F/m in m is -F/m^2
+    slope = jax.grad(lambda m: apply(case.cascade, case.scenario, {"plant.m": m})[1].acceleration(0.2))(2.0)
+    assert slope == -5.0
+
+
+def test_disturbances_of_several_units_act_together():
+    mixed = [STEP | {"unit": "N"}, SINE, SINE | {"unit": "N"}, {"kind": "constant", "value": 3.0, "unit": "A^2/m^2"}]
+    one = world(plant={"m": 2.0}, disturbance={"q_z": mixed, "base": {"kind": "constant", "value": 0.7}})
+    wave = 8.0 * np.sin(2 * np.pi * 300 * T)
+    expected = 10.0 * (T >= 0.1) + wave + wave / 2 + 3.0 * one.plant.a - 0.7
+    # rounding of a few operations
+    np.testing.assert_allclose(one.acceleration(T), expected, rtol=1e-12, atol=1e-12)
+    assert one.edges() == (0.1,)
+    assert one.undisturbed().acceleration(0.2) == 0
+
+
+def test_paths_of_disturbances_in_one_unit_and_in_several():
+    def paths(q_z):
+        return {p for p in places(amb.Cascade(), world(disturbance={"q_z": q_z})) if p.startswith("disturbance.q_")}
+
+    assert {"disturbance.q_z.amplitude", "disturbance.q_z.shift"} <= paths(STEP | {"unit": "N"})
+    assert "disturbance.q_z.terms.1.frequency" in paths([STEP | {"unit": "N"}, SINE | {"unit": "N"}])
+    assert {"disturbance.q_z.frequency", "disturbance.q_f.start"} <= paths([STEP | {"unit": "N"}, SINE])
+
+
+@pytest.mark.parametrize(
+    ("disturbance", "said"),
+    [
+        ({"q_z": []}, "disturbance.q_z: 0 signals"),
+        ({"q_z": [STEP, 3]}, r"disturbance.q_z\[1\] = 3: it must be a table"),
+        ({"q_z": [STEP | {"unit": "kg"}]}, r"disturbance.q_z\[0\].unit = \"kg\": it must be one of 'm/s\^2', 'N' or"),
+        ({"base": STEP | {"unit": "N"}}, "disturbance.base.unit"),
+        ({"force": STEP}, "disturbance.force"),
+    ],
+)
+def test_wrong_disturbances_are_named(disturbance, said):
+    with pytest.raises(ValueError, match=said):
+        world(disturbance=disturbance)
+
+
+RPM = 2 * np.pi / 60
+
+
+@pytest.mark.parametrize(
+    ("signal", "knots"),
+    [
+        (amb.Ramp(3.0, 0.1, 0.2), [(0, 0), (0.1, 0), (0.3, 3), (9, 3)]),
+        (amb.Trapezoid(-2.0, 0.1, 0.05, 0.1, 0.2), [(0, 0), (0.1, 0), (0.15, -2), (0.25, -2), (0.45, 0), (9, 0)]),
+        (amb.Trapezoid(2.0, 0.1, 0.05, 0.0, 0.2), [(0, 0), (0.1, 0), (0.15, 2), (0.35, 0), (9, 0)]),
+    ],
+)
+def test_signals_of_straight_lines_go_through_their_corners(signal, knots):
+    t = np.linspace(0, 0.6, 61)
+    np.testing.assert_allclose(signal(t), np.interp(t, *np.array(knots).T), rtol=0, atol=1e-14)
+    low, high = signal.span(0.6)
+    assert low <= np.min(signal(t))
+    assert high >= np.max(signal(t))
+    np.testing.assert_allclose(signal.shifted(0.05)(t + 0.05), signal(t), rtol=0, atol=1e-13)
+
+
+def test_unbalance_by_hand():
+    # 120 g mm at 6000 rpm: 1.2e-4 kg m (628 1/s)^2 = 47.4 N
+    t = np.linspace(0, 0.05, 40)
+    force = amb.Unbalance(120.0, 6000.0, phase=0.4)(t)
+    np.testing.assert_allclose(force, 1.2e-4 * (6000 * RPM) ** 2 * np.sin(6000 * RPM * t + 0.4), rtol=0, atol=1e-10)
+    # G 2.5 at 6000 rpm: e = 2.5e-3/628 = 3.98 um, and twice the service speed is four times the acceleration
+    acceleration = amb.UnbalanceGrade(2.5, 6000.0, 12000.0)(t)
+    expected = 4 * 2.5e-3 * 6000 * RPM * np.sin(2 * 6000 * RPM * t)
+    np.testing.assert_allclose(acceleration, expected, rtol=0, atol=1e-11)
+
+
+def test_the_phase_of_a_run_up_is_the_integral_of_the_speed():
+    from scipy.integrate import quad
+
+    run_up = amb.Unbalance(120.0, 600.0, 3000.0, 0.2, 0.3)
+
+    def speed(t):  # 1/s
+        return RPM * (600 + (3000 - 600) * min(t / 0.2, 1.0))
+
+    for t in (0.0, 0.07, 0.2, 0.31):
+        angle = quad(speed, 0, t, points=[0.2], epsabs=1e-13)[0]
+        assert run_up(t) == pytest.approx(1.2e-4 * speed(t) ** 2 * np.sin(angle + 0.3), rel=1e-10, abs=1e-12)
+    assert run_up.span(1.0)[1] == pytest.approx(1.2e-4 * (3000 * RPM) ** 2)
+
+
+LINEAR = {
+    "position": {"kind": "pid", "k_p": 1e5, "k_d": 800.0, "k_int": 1e-3},
+    "inversion": {"kind": "closed-form"},
+    "current": {"kind": "pi"},
+}
+# Forces of 1e-4 of the weight and a runout of 5 nm: products of them are below 1e-6 of the response.
+ROTATING = {
+    "controller": LINEAR,
+    "disturbance": {"q_z": {"kind": "unbalance", "unbalance": 0.05, "speed": 3000.0, "phase": 0.2}},
+    "sensor": {"runout": {"speed": 3000.0, "harmonics": [{"number": 2, "amplitude": 5e-9, "phase": -0.5}]}},
+    "clock": {"duration": 0.2, "sample_period": 1e-4},
+}
+
+
+def lines(rows, name, settled=1000):
+    """Complex amplitude of a signal at one and two times the speed, over whole turns."""
+    t, x = np.asarray(rows.t)[settled:], np.asarray(getattr(rows, name))[settled:]
+    return np.array([2 * np.mean(x * np.exp(-1j * k * 3000 * RPM * t)) for k in (1, 2)])
+
+
+def test_unbalance_and_runout_move_the_rotor_as_the_linear_loop_says():
+    """Amplitude and phase of z at the speed and at twice the speed, against the frequency responses of the loop."""
+    case = case_from(ROTATING)
+    start = amb.Initial(i=float(case.scenario.plant.equilibrium(0.0)[0]))
+    rows = amb.rollout(case.cascade, dataclasses.replace(case.scenario, initial=start), case.clock).trajectory.rows
+    response = linearise(case.cascade, case.scenario, case.clock).response(np.array([50.0, 100.0]))
+    # sin(w t + phase) has the complex amplitude exp(j phase)/j
+    load = 0.05e-6 * (3000 * RPM) ** 2 / case.scenario.plant.m * np.exp(0.2j) / 1j
+    runout = 5e-9 * np.exp(-0.5j) / 1j
+    expected = np.array([response[0, 3, 2] * load, response[1, 3, 0] * runout])
+    # the start has decayed to exp(-15) of 30 nm; products of load and runout are 1e-6 of the smaller one
+    np.testing.assert_allclose(lines(rows, "z"), expected, rtol=1e-5)
+    # the sensor reads the sum; the true position does not contain it
+    np.testing.assert_allclose(lines(rows, "z_measured")[1], expected[1] + runout, rtol=1e-5)
+
+
+def test_a_slow_sensor_low_passes_the_runout():
+    raw = ROTATING | {"processor": {"delay": 0.0}, "sensor": ROTATING["sensor"] | {"bandwidth": 200.0}}
+    case = case_from(raw)
+    rows = amb.rollout(case.cascade, case.scenario, case.clock).trajectory.rows
+    surface = lines(rows, "z") + np.array([0, 5e-9 * np.exp(-0.5j) / 1j])
+    expected = surface / (1 + 1j * np.array([50.0, 100.0]) / 200.0)
+    # cubic through the ends of a sample: (w T)^4 / 384 = 4e-8
+    np.testing.assert_allclose(lines(rows, "z_measured"), expected, rtol=2e-7)
+
+
+def write(tmp_path, name, t, value):
+    file = tmp_path / name
+    if name.endswith("npz"):
+        np.savez(file, t=t, value=value)
+    else:
+        file.write_text(
+            "t,value\n" + "\n".join(f"{a!r},{b!r}" for a, b in zip(t.tolist(), value.tolist(), strict=True))
+        )
+    return file
+
+
+@pytest.mark.parametrize("name", ["load.csv", "load.npz"])
+def test_a_table_is_the_signal_that_it_was_sampled_from(name, tmp_path):
+    knots = np.array([0.0, 0.1, 0.3, 0.4])
+    write(tmp_path, name, knots, np.array([0.0, 0.0, 3.0, 3.0]))
+    load = {"kind": "table", "file": name, "unit": "N", "scale": 2.0, "start": 0.5}
+    case = case_from({"disturbance": {"q_z": load}}, folder=tmp_path)
+    t = np.linspace(0, 1.5, 151)
+    np.testing.assert_allclose(case.scenario.q_f(t), amb.Ramp(6.0, 0.6, 0.2)(t), rtol=0, atol=1e-13)
+    assert case.scenario.q_f.span(1.0) == (0, 6)
+    # held: each value until the next time, at which it jumps
+    held = case_from({"disturbance": {"q_z": load | {"interpolation": "held"}}}, folder=tmp_path).scenario.q_f
+    np.testing.assert_array_equal(held(0.5 + np.array([-1, 0.2, 0.2999, 0.3, 9])), [0, 0, 0, 6, 6])
+    # the file is a part of the structure: equal numbers give an equal tree, other numbers another
+    assert jax.tree.structure(held) == jax.tree.structure(held.shifted(1.0))
+    other = dataclasses.replace(held, samples=amb.Samples(knots, knots))
+    assert jax.tree.structure(held) != jax.tree.structure(other)
+
+
+def test_a_written_case_finds_its_tables(tmp_path):
+    write(tmp_path, "load.csv", np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    text = (
+        '[disturbance]\nbase = { kind = "table", file = "load.csv" }\n'
+        '[[disturbance.q_z]]\nkind = "table"\nunit = "N"\nfile = "load.csv"\n'
+        '[[disturbance.q_z]]\nkind = "sum"\nterms = [{ kind = "table", file = "./load.csv" }]\n'
+    )
+    (tmp_path / "case.toml").write_text(text)
+    case = read_case(tmp_path / "case.toml")
+    out = tmp_path / "out" / "tuned"
+    out.mkdir(parents=True)
+    written, again = tuned_case(case, {"controller.position.c": 20.0}, "", out)
+    (out / "tuned.toml").write_text(written)
+    found = read_case(out / "tuned.toml")
+    assert {one.written for one in found.recorded} == {"../../load.csv"}
+    assert [one.file for one in found.recorded] == [one.file for one in case.recorded]
+    assert found.scenario == again.scenario == case.scenario
+
+
+GOOD = "t,value\n0,1\n1,2\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "keys", "said"),
+    [
+        (None, {}, r"file = \"x.csv\": .*x.csv cannot be read \(No such file or directory\). A path is relative"),
+        (GOOD, {"file": "x.txt"}, "must be the path of a file, '.csv', '.npz' or '.parquet'"),
+        (GOOD, {"file": 3}, "must be the path of a file"),
+        (GOOD, {"columns": ["t"]}, r"columns = \[\"t\"\]: it must be two names"),
+        (GOOD, {"columns": ["t", "force"]}, "no column 'force'. Its columns: t, value"),
+        (GOOD, {"interpolation": "cubic"}, "interpolation = \"cubic\": it must be one of 'linear' or 'held'"),
+        (GOOD, {"amplitude": 2.0}, "amplitude = 2.0: unknown key"),
+        ("", {}, "it is empty"),
+        ("0;1\n1;2\n", {}, "separated by ';'"),
+        ("t,a,b\n0,1,2\n1,2,3\n", {}, "it has the columns t, a, b; name those"),
+        ("0,1\n", {}, "it has 1 rows; give 2 to"),
+        ("0,1\n1,\n", {}, "the value of row 2 is nan; each must be a finite number"),
+        ("0,1\n1,inf\n", {}, "the value of row 2 is inf"),
+        ("0,1\n2,1\n1,1\n", {}, "times must increase: row 3 has 1 s after 2 s"),
+        ("0,1\n1,x\n", {}, 'line 2: "x" is no number'),
+        ("0,1\n1\n", {}, "line 2 has 1 columns, but the first line has 2"),
+    ],
+)
+def test_wrong_tables_are_named(text, keys, said, tmp_path):
+    if text is not None:
+        (tmp_path / "x.csv").write_text(text)
+    with pytest.raises(ValueError, match=r"disturbance\.q_z\..*") as error:
+        case_from({"disturbance": {"q_z": {"kind": "table", "file": "x.csv"} | keys}}, folder=tmp_path)
+    assert re.search(said, str(error.value))
+    assert "\n" not in str(error.value)
+
+
+def test_wrong_arrays_are_named(tmp_path):
+    np.savez(tmp_path / "x.npz", t=np.zeros((2, 2)), value=np.zeros(2))
+    table = {"disturbance": {"q_z": {"kind": "table", "file": "x.npz"}}}
+    with pytest.raises(ValueError, match=r"two lists of one length; their shapes are \(2, 2\), \(2,\)"):
+        case_from(table, folder=tmp_path)
+    np.savez(tmp_path / "x.npz", t=np.arange(2), value=np.array(["a", "b"]))
+    with pytest.raises(ValueError, match="values are no real numbers"):
+        case_from(table, folder=tmp_path)
+    (tmp_path / "x.npz").write_text("no")
+    with pytest.raises(ValueError, match="no npz file"):
+        case_from(table, folder=tmp_path)
+
+
+def test_parquet_needs_its_extra(tmp_path):
+    table = {"disturbance": {"q_z": {"kind": "table", "file": "x.parquet"}}}
+    if importlib.util.find_spec("pyarrow") is None:
+        with pytest.raises(ValueError, match=r"needs pyarrow. Install it with: pip install 'ambjax\[tables\]'"):
+            case_from(table, folder=tmp_path)
+        return
+    from pyarrow import parquet
+    from pyarrow import table as arrow  # pyright: ignore
+
+    parquet.write_table(arrow({"t": [0.0, 1.0], "value": [1.0, 3.0]}), tmp_path / "x.parquet")
+    assert case_from(table, folder=tmp_path).scenario.q_z(0.5) == 2.0
+
+
+@pytest.mark.parametrize(
+    ("tables", "said"),
+    [
+        (
+            {"disturbance": {"q_i": {"kind": "unbalance", "unbalance": 1.0, "speed": 1.0}}},
+            "gives N, but a signal in A/s",
+        ),
+        ({"reference": {"kind": "unbalance", "unbalance": 1.0, "speed": 1.0}}, "gives N, but a signal in m belongs"),
+        (
+            {"disturbance": {"q_z": {"kind": "unbalance", "unbalance": 1.0, "speed": 1.0, "unit": "m/s^2"}}},
+            "gives N, but a signal in m/s\\^2",
+        ),
+        (
+            {"sensor": {"runout": {"speed": 1.0}}},
+            "sensor.runout.harmonics = None: it must be a list of 1 to 100 tables",
+        ),
+        (
+            {"sensor": {"runout": {"speed": 1.0, "harmonics": [{"number": 0.5, "amplitude": 1.0}]}}},
+            r"sensor.runout.harmonics\[0\].number = 0.5: it must be a whole number",
+        ),
+    ],
+)
+def test_wrong_loads_of_a_rotor_that_turns_are_named(tables, said):
+    with pytest.raises(ValueError, match=said):
+        world(**tables)

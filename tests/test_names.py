@@ -1,0 +1,117 @@
+"""The name that a message suggests, and warnings about numbers that do not fit together."""
+
+import json
+import pathlib
+import re
+
+import pytest
+
+from ambjax.__main__ import main
+from ambjax.cases.reader import TABLES, case_from
+from ambjax.commands.acceptance import forces
+from ambjax.commands.plausibility import implausible
+from ambjax.host.synonyms import OTHER_WORDS, meant
+
+
+@pytest.mark.parametrize(
+    ("tables", "said"),
+    [
+        ({"rotor": {"m": 1.0}}, "rotor = .*unknown key. Did you mean 'plant'"),
+        ({"plant": {"mass": 1.0}}, "plant.mass = 1.0: unknown key. Did you mean 'm'"),
+        ({"plant": {"gap": 1.0}}, "Did you mean 's_0'"),
+        ({"plant": {"s0": 1.0}}, "Did you mean 's_0'"),
+        ({"plant": {"Bias_Current": 1.0}}, "Did you mean 'i_0'"),
+        ({"plant": {"q": 1.0}}, "plant.q = 1.0: unknown key. Did you mean 'disturbance.q_z'"),
+        ({"plant": {"u_max": 1.0}}, "Did you mean 'actuator.u_max'"),
+        ({"clock": {"fs": 1e4}}, "Did you mean 'sample_period'"),
+        ({"clock": {"duratoin": 1.0}}, "Did you mean 'duration'"),
+        ({"disturbance": {"force": {}}}, "Did you mean 'q_z'"),
+        ({"disturbance": {"q_z": {"kind": "sine", "freq": 1.0}}}, "Did you mean 'frequency'"),
+        ({"sensor": {"sigma": 1.0}}, "Did you mean 'std'"),
+        ({"plant": {"xyzzy": 1.0}}, "xyzzy = 1.0: unknown key. Keys allowed here"),
+        ({"spread": {"plant": {"mass": {"percent": 10}}}}, "Did you mean 'plant.m'"),
+        ({"clock": {"sample_period": 1e4}}, "If it is a rate in Hz, give its inverse, 0.0001 s"),
+    ],
+)
+def test_the_message_suggests_the_right_name(tables, said):
+    with pytest.raises(ValueError, match=said):
+        case_from(tables)
+
+
+def test_every_word_leads_to_its_name():
+    assert set(TABLES) - {"sensitivity"} <= set(OTHER_WORDS)
+    for name, words in OTHER_WORDS.items():
+        for word in words.split():
+            assert word == word.lower().replace("_", "")
+            assert meant(word, [name]) == name
+
+
+# A bearing without doubt: 146 N/A, 364 N at the bias, 15.7 N of weight, a pole of 675 1/s.
+GOOD = {"m": 1.6, "k_z": 0.0, "mu_0": 1.2566e-6, "n": 208.0, "A": 2.68e-4, "s_0": 5e-4, "i_0": 2.5, "R": 1.0}
+
+
+def doubts(plant=None, **tables):
+    return implausible(case_from({"plant": GOOD | (plant or {}), "clock": {"duration": 0.1}, "run": {}} | tables))
+
+
+def sine(frequency, amplitude=1.0, unit="N"):
+    return {"disturbance": {"q_z": {"kind": "sine", "unit": unit, "amplitude": amplitude, "frequency": frequency}}}
+
+
+@pytest.mark.parametrize(
+    ("plant", "tables", "said"),
+    [
+        ({}, {}, None),
+        ({"m": 5e5}, {}, "plant.m = 500000 kg: usual values are 0.001 to 100000 kg. Is it in grams?"),
+        ({"i_0": 2500.0}, {}, "plant.i_0 = 2500 A: .* Is it in milliamperes?"),
+        ({"i_0": 5.0}, {}, "the bias flux density .* is 1.31 T; iron saturates above about 1.2 T"),
+        ({}, sine(50.0, 350.0), "weight and loads reach 365.7 N, but the magnets pull with at most 364.2 N"),
+        ({}, sine(50.0, 345.0), None),
+        ({}, sine(6000.0), "disturbance.q_f: frequency gives 6000 Hz, above half the sampling rate, 5000 Hz"),
+        ({}, sine(4000.0), None),
+        (
+            {},
+            {"disturbance": {"q_z": {"kind": "unbalance", "unbalance": 1e-6, "speed": 4e5}}},
+            "disturbance.q_f: speed gives 6667 Hz",
+        ),
+        (
+            {},
+            {"processor": {}, "clock": {"duration": 0.1, "sample_period": 1e-3}},
+            "has only 1.5 samples; give",
+        ),
+        (
+            {},
+            {"processor": {}, "sensor": {"bandwidth": 50.0}},
+            "sensor.bandwidth = 50 Hz is less than twice the",
+        ),
+        ({}, {"processor": {}, "sensor": {"bits": 8, "std": 1e-7}}, "a step of 3.91e-06 m is 39.1 times the noise"),
+        ({}, {"processor": {}, "sensor": {"bits": 14, "std": 1e-7}}, None),
+    ],
+)
+def test_numbers_that_do_not_fit_together_are_doubted(plant, tables, said):
+    found = doubts(plant, **tables)
+    if said is None:
+        assert found == []
+    else:
+        assert any(re.search(said, line) for line in found), found
+
+
+def test_the_forces_are_those_of_the_formulas():
+    case = case_from({"plant": GOOD, "clock": {"duration": 0.1}} | sine(50.0, 3.0))
+    k_i = 1.2566e-6 * 208**2 * 2.68e-4 * 2.5 / 5e-4**2
+    assert forces(case) == pytest.approx((k_i * 2.5, 1.6 * 9.81, 3.0))
+    load = {"disturbance": {"q_z": [{"kind": "constant", "value": 2.0}], "base": {"kind": "constant", "value": -1.0}}}
+    assert forces(case_from({"plant": GOOD} | load)).load == pytest.approx(1.6 * 3.0)
+
+
+@pytest.mark.slow
+def test_check_refuses_magnets_that_do_not_carry_the_rotor(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    heavy = "\n".join(f"{name} = {value}" for name, value in (GOOD | {"m": 40.0}).items())
+    pathlib.Path("case.toml").write_text(f"[plant]\n{heavy}\n[clock]\nduration = 0.001\n")
+    assert main(["check", "case.toml"]) == 1
+    assert (
+        "The magnets do not carry the rotor: they pull with at most 364.2 N of its 392.4 N." in capsys.readouterr().out
+    )
+    assert main(["check", "case.toml", "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["holds"] is False

@@ -1,0 +1,142 @@
+"""Results in Python: the same numbers as the commands', as tables with units, and pictures against their data."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import ambjax
+import tuning
+from ambjax.__main__ import main
+from ambjax.linear import linearise
+from ambjax.simulation.trajectory import NOT_SAVED, SIGNAL_UNITS, Row
+from tuning.__main__ import parser
+
+CASE = """
+[reference]
+kind = "sine"
+amplitude = 1e-4
+frequency = 5.0
+[clock]
+duration = 0.02
+[run]
+settle = 0.01
+[spread]
+plant.m = { percent = 5 }
+"""
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    path = tmp_path_factory.mktemp("results") / "case.toml"
+    path.write_text(CASE)
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(path):
+    return ambjax.simulate(ambjax.read_case(path))
+
+
+@pytest.fixture(scope="module")
+def members(path):
+    return ambjax.simulate_members(ambjax.read_case(path), 8, seed=3)
+
+
+def test_a_run_is_that_of_the_command(path, run, tmp_path, capsys):
+    main(["simulate", str(path), "--json", "--out", str(tmp_path / "out")])
+    printed = json.loads(capsys.readouterr().out)
+    finite = {name: value for name, value in run.metrics.items() if np.isfinite(value)}
+    assert {name: printed[name] for name in finite} == finite
+    with np.load(tmp_path / "out" / "trajectory.npz") as saved:
+        frame = run.to_pandas()
+        assert np.array_equal(frame.index, saved["t"])
+        for name in frame.columns:
+            assert np.array_equal(frame[name], saved[name])
+        assert {*frame.columns, "t", "lost_at", "lost_why", "singular_at"} == set(saved.files)
+    assert not run.lost
+
+
+def test_the_dataset_has_the_signals_with_units(run):
+    data = run.to_xarray()
+    assert data["z"].attrs["units"] == "m"
+    assert np.array_equal(data["z"].sel(t=0.01, method="nearest"), run.to_pandas()["z"].iloc[100])
+    assert {name: data[name].attrs["units"] for name in data} == run.to_pandas().attrs["units"]
+
+
+def test_every_saved_signal_has_the_unit_of_its_description():
+    from reference.fields import attribute_docs
+
+    words = {name: text.rpartition(", ")[2] for name, text in attribute_docs(Row).items() if name not in NOT_SAVED}
+    assert set(words) == set(SIGNAL_UNITS)
+    for name, unit in SIGNAL_UNITS.items():
+        assert words[name].split(". Eq.")[0] == unit
+
+
+def test_members_are_those_of_the_command(path, members, tmp_path):
+    main(["ensemble", str(path), "--members", "8", "--seed", "3", "--json", "--out", str(tmp_path / "out")])
+    frame = members.to_pandas()
+    with np.load(tmp_path / "out" / "members.npz") as saved:
+        assert np.array_equal(frame.index, saved["index"])
+        for name in frame.columns:
+            assert np.array_equal(frame[name], saved[name]), name
+    assert frame.attrs["units"]["settled_rms_error_m"] == "m"
+    assert members.survivors == 8
+    assert members.summary()["survivors"] == 8
+
+
+def test_the_pictures_show_the_results(run, members):
+    axes = run.plot().axes
+    assert any("position" in ax.get_ylabel() for ax in axes)
+    axes = members.plot("rms_u_V", "max_abs_i_A").axes
+    assert [ax.patches[0].get_data().values.sum() for ax in axes] == [8, 8]
+    with pytest.raises(ValueError, match=r"none of rms_u is a column. The columns are .*rms_u_V"):
+        members.plot("rms_u")
+
+
+def test_a_notebook_shows_the_metrics(run):
+    page = run._repr_html_()
+    assert "case: the rotor is held" in page
+    assert f"<td>rms_u_V</td><td>{run.metrics['rms_u_V']:.6g}</td><td>V</td>" in page
+
+
+def test_the_sensitivity_is_that_of_the_linear_analysis(path):
+    case = ambjax.read_case(path)
+    at = ambjax.sensitivity(case)
+    system = linearise(case.cascade, case.scenario, case.clock)
+    assert at.S.height == pytest.approx(abs(system.sensitivity(np.array([at.S.frequency]))[0]))
+
+
+def test_bad_input_is_named(path, run, monkeypatch):
+    case = ambjax.read_case(path)
+    with pytest.raises(ValueError, match="members = 0, seed = 0: members must be at least 1"):
+        ambjax.simulate_members(case, 0)
+    for name in ("pandas", "xarray"):
+        monkeypatch.setitem(sys.modules, name, None)
+        with pytest.raises(
+            ValueError, match=rf"{name} is not installed. Install it with: pip install 'ambjax\[tables\]'"
+        ):
+            getattr(run, f"to_{name}")()
+
+
+def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
+    """The search itself is that of the command, which tests/test_tuning_search.py runs."""
+    given = []
+
+    def searched(args):
+        given.append(args)
+        (tmp_path / "tuned.toml").write_text(CASE)
+        return 1, {"gains": [], "out": str(tmp_path)}
+
+    monkeypatch.setattr("tuning.command.run", searched)
+    tuned = tuning.tune(path, tmp_path, pareto=True)
+    assert tuned.case == ambjax.read_case(tmp_path / "tuned.toml")
+    assert (tuned.good, tuned.directory, tuned.report["gains"]) == (False, tmp_path, [])
+    parsed = vars(parser().parse_args([str(path), "--out", str(tmp_path), "--pareto", "--json"]))
+    assert vars(given[0]) == parsed
+
+
+def test_tune_names_bad_input(tmp_path):
+    with pytest.raises(ValueError, match=r"no\.toml"):
+        tuning.tune(tmp_path / "no.toml")

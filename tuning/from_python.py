@@ -1,0 +1,61 @@
+"""`tune`: the command `ambjax tune` as a function."""
+
+import argparse
+import dataclasses
+import pathlib
+from typing import Any
+
+from ambjax import Case, read_case
+
+
+@dataclasses.dataclass(frozen=True)
+class TunedCase:
+    """The result of `tune`.
+
+    - `case`: the case with the tuned gains, as read from tuned.toml.
+    - `good`: whether accurate steps confirm that the gains meet [tune.limits].
+    - `report`: the contents of report.json.
+    - `directory`: where tuned.toml, history.npz and the report are.
+    """
+
+    case: Case
+    good: bool
+    report: dict[str, Any]
+    directory: pathlib.Path
+
+
+def tune(
+    case: str | pathlib.Path,
+    out: str | pathlib.Path | None = None,
+    *,
+    resume: bool = False,
+    gradients: bool = False,
+    pareto: bool = False,
+    settings_of: str | pathlib.Path | None = None,
+) -> TunedCase:
+    """Tune the gains of a case file, as `ambjax tune` does, and write the same files.
+
+    - `case`: path of the case file; its table [tune] says what to tune.
+    - `out`: directory of the results; None: a new one under ./out.
+    - `resume`: continue the search whose checkpoints are in `out`.
+    - `gradients`: report the gradient of the loss too.
+    - `pareto`: write each point of the front of error against voltage as a case file.
+    - `settings_of`: path of a case file whose limits, loss and budget are used.
+
+    Progress goes to stderr. Raises ValueError for a case or option that cannot be met, before any search.
+    """
+    from tuning.command import run
+
+    code, report = run(
+        argparse.Namespace(
+            case=str(case),
+            out=None if out is None else str(out),
+            resume=resume,
+            gradients=gradients,
+            pareto=pareto,
+            settings_of=None if settings_of is None else str(settings_of),
+            json=True,
+        )
+    )
+    directory = pathlib.Path(str(report["out"]))
+    return TunedCase(read_case(directory / "tuned.toml"), code == 0, report, directory)
