@@ -4,7 +4,7 @@ docs/processor.md defines the rules.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 from jax import Array
@@ -13,6 +13,9 @@ from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.world.plant import Plant, State
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement, Sensor
+
+# A cascade: its module imports this one.
+C = TypeVar("C")
 
 # Largest simulated noise in standard deviations: the bound of `numerics.gaussian.normals`.
 LARGEST_NORMAL = 6.8
@@ -140,20 +143,22 @@ def expected(model: Plant, motion: Measurement, u: Array, period: Scalar) -> Mea
     return Measurement(z + period * period / 2 * rates.z_dot, z_dot, i)
 
 
-def guarded(cascade: Any, scenario: Scenario, period: Scalar) -> Any:
+def guarded(cascade: C, scenario: Scenario, period: Scalar) -> C:
     """Return the cascade with the numbers of its guard set for a scenario; unchanged if it has no guard."""
-    processor = cascade.processor
+    one: Any = cascade
+    processor = one.processor
     if processor is None or processor.guard is None:
         return cascade
-    estimated = cascade.observer.estimates_velocity
-    guard = processor.guard.settled(cascade.model, scenario, period, estimated)
-    return dataclasses.replace(cascade, processor=dataclasses.replace(processor, guard=guard))
+    estimated = one.observer.estimates_velocity
+    guard = processor.guard.settled(one.model, scenario, period, estimated)
+    return dataclasses.replace(one, processor=dataclasses.replace(processor, guard=guard))
 
 
-def simulated(cascade: Any, scenario: Scenario, period: Scalar) -> Any:
+def simulated(cascade: C, scenario: Scenario, period: Scalar) -> C:
     """The cascade as it is simulated: without its guard where no reading can be refused, by faults or limits given."""
-    processor = cascade.processor
+    one: Any = cascade
+    processor = one.processor
     idle = processor.guard is not None and processor.guard.derived
     if idle and not (scenario.sensor is not None and scenario.sensor.faulty):
-        return dataclasses.replace(cascade, processor=dataclasses.replace(processor, guard=None))
+        return dataclasses.replace(one, processor=dataclasses.replace(processor, guard=None))
     return guarded(cascade, scenario, period)

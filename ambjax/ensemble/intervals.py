@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 REPLICATES = 1000
 STATISTICS = ("mean", "std", "cvar")
@@ -40,7 +41,7 @@ class Estimate(NamedTuple):
     high: Any
 
 
-def wilson(successes: Any, n: Any, confidence: float = 0.95) -> Estimate:
+def wilson(successes: ArrayLike, n: ArrayLike, confidence: float = 0.95) -> Estimate:
     """Compute the share of `successes` in `n` trials, numbers or arrays, with Wilson's interval.
 
     Raises ValueError unless 0 <= successes <= n and n >= 1.

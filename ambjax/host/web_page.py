@@ -4,9 +4,11 @@ import base64
 import html
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from markdown_it import MarkdownIt
+from markdown_it.renderer import RendererHTML
+from markdown_it.token import Token
+from markdown_it.utils import EnvType, OptionsDict
 
 # Elements that are wider than a narrow screen scroll in a box, so that pictures stay legible.
 STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:72rem;margin:2rem auto;padding:0 1rem;color:#222}
@@ -37,9 +39,11 @@ def page(text: str, pictures: Mapping[str, bytes], title: str) -> str:
     markdown.add_render_rule("td_open", lambda _, tokens, at, *__: _cell(tokens[at + 1].content))
     markdown.add_render_rule("table_close", lambda *_: "</table></div>\n")
 
-    def image(renderer: Any, tokens: Any, at: int, options: Any, environment: Any) -> str:
+    def image(
+        renderer: RendererHTML, tokens: Sequence[Token], at: int, options: OptionsDict, environment: EnvType
+    ) -> str:
         words = html.escape(renderer.renderInlineAsText(tokens[at].children, options, environment))
-        data = base64.b64encode(pictures[tokens[at].attrs["src"]]).decode()
+        data = base64.b64encode(pictures[str(tokens[at].attrs["src"])]).decode()
         return f'<span class="wide"><img alt="{words}" src="data:image/png;base64,{data}"></span>'
 
     markdown.add_render_rule("image", image)

@@ -3,7 +3,6 @@
 import math
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -109,7 +108,7 @@ def _median(t: np.ndarray, y: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray]
     return smoothed(t[finite], y[finite], min(SMOOTHED, int(finite.sum()))), "median, smoothed where it chatters"
 
 
-def _tint(k: int, pairs: int) -> Any:
+def _tint(k: int, pairs: int) -> tuple[float, ...]:
     """Return the blue of the k-th of `pairs` nested bands, counted from outside. Inner bands are darker."""
     strength = 0.2 + 0.45 * k / max(pairs - 1, 1)
     return tuple(1 - strength * (1 - part) for part in to_rgb(BLUE))

@@ -2,7 +2,7 @@
 
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -69,8 +69,12 @@ def maps(
     figure.savefig(path, dpi=150)
 
 
+# Labels of x and y, and whether each axis is logarithmic.
+Labels: TypeAlias = tuple[str, str, bool, bool]
+
+
 def _errors(
-    figure: Figure, axes: Sequence[Axes], panels: Sequence[Mapping[str, Any]], metric: str, labels: Any
+    figure: Figure, axes: Sequence[Axes], panels: Sequence[Mapping[str, Any]], metric: str, labels: Labels
 ) -> None:
     """Draw the lower row: the errors, on one logarithmic scale."""
     errors = [panel["error"] for panel in panels if panel["error"] is not None]
@@ -93,7 +97,9 @@ def _errors(
         bar.ax.minorticks_off()
 
 
-def _cells(ax: Axes, panel: Mapping[str, Any], values: np.ndarray, norm: Normalize, colours: str, labels: Any) -> None:
+def _cells(
+    ax: Axes, panel: Mapping[str, Any], values: np.ndarray, norm: Normalize, colours: str, labels: Labels
+) -> None:
     """Draw one heat map with its axes and contours. Cells that are not finite show the hatched background."""
     x_label, y_label, x_log, y_log = labels
     x, y = np.asarray(panel["x"], float), np.asarray(panel["y"], float)
