@@ -229,7 +229,7 @@ GOOD = "t,value\n0,1\n1,2\n"
         ("0,1\n1,\n", {}, "the value of row 2 is nan; each must be a finite number"),
         ("0,1\n1,inf\n", {}, "the value of row 2 is inf"),
         ("0,1\n2,1\n1,1\n", {}, "times must increase: row 3 has 1 s after 2 s"),
-        ("0,1\n1,x\n", {}, 'line 2: "x" is no number'),
+        ("0,1\n1,x\n", {}, 'line 2: "x" is not a number'),
         ("0,1\n1\n", {}, "line 2 has 1 columns, but the first line has 2"),
     ],
 )
@@ -245,13 +245,13 @@ def test_wrong_tables_are_named(text, keys, said, tmp_path):
 def test_wrong_arrays_are_named(tmp_path):
     np.savez(tmp_path / "x.npz", t=np.zeros((2, 2)), value=np.zeros(2))
     table = {"disturbance": {"q_z": {"kind": "table", "file": "x.npz"}}}
-    with pytest.raises(ValueError, match=r"two lists of one length; their shapes are \(2, 2\), \(2,\)"):
+    with pytest.raises(ValueError, match=r"two lists of equal length; their shapes are \(2, 2\), \(2,\)"):
         case_from(table, folder=tmp_path)
     np.savez(tmp_path / "x.npz", t=np.arange(2), value=np.array(["a", "b"]))
-    with pytest.raises(ValueError, match="values are no real numbers"):
+    with pytest.raises(ValueError, match="values are not real numbers"):
         case_from(table, folder=tmp_path)
     (tmp_path / "x.npz").write_text("no")
-    with pytest.raises(ValueError, match="no npz file"):
+    with pytest.raises(ValueError, match="not an npz file"):
         case_from(table, folder=tmp_path)
 
 

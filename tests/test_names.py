@@ -77,7 +77,7 @@ def sine(frequency, amplitude=1.0, unit="N"):
         (
             {},
             {"processor": {}, "clock": {"duration": 0.1, "sample_period": 1e-3}},
-            "has only 1.5 samples; give",
+            "has only 1.5 samples. Give",
         ),
         (
             {},

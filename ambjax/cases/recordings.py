@@ -31,10 +31,10 @@ class RecordedFile(NamedTuple):
 
 
 class Recordings:
-    """Reader of the files of a case. `read` lists those that were read.
+    """Reads the recorded signals of a case. `read` lists the files that its signals use.
 
     - `folder`: folder of the case file, to which paths are relative.
-    - `known`: files that are read already; they are not read again.
+    - `known`: files that were read earlier; they are not opened again.
     """
 
     def __init__(self, folder: pathlib.Path = pathlib.Path(), known: Iterable[RecordedFile] = ()) -> None:
@@ -42,7 +42,10 @@ class Recordings:
         self.read: list[RecordedFile] = []
 
     def signal(self, table: Table, extra: tuple[str, ...] = ()) -> Recorded:
-        """Return the signal of a table. Raises ValueError, with the path, the value and the fix, if it is invalid."""
+        """Return the signal of a table with `kind = "table"`. `extra`: further keys that the table may have.
+
+        Raises ValueError, with the path, the value and the fix, if a key or the file is invalid.
+        """
         table.only(["kind", *KEYS, *extra])
         held = table.choice("interpolation", INTERPOLATIONS, INTERPOLATIONS[0]) == "held"
         scale, start = (table.leaf(name, FIELDS[name], FIELDS[name].default) for name in ("scale", "start"))
@@ -52,6 +55,8 @@ class Recordings:
         return Recorded(one.samples, held, scale, start)
 
     def _opened(self, key: str, written: object, columns: tuple[str, str] | None) -> RecordedFile:
+        """Read and check the file at the path `written`, the value of `key`. Raises ValueError if that fails."""
+
         def refuse(why: str) -> ValueError:
             return ValueError(f"{key} = {show(written)}: {why}")
 
@@ -76,14 +81,15 @@ class Recordings:
 
 
 def relocated_files(files: Iterable[RecordedFile], out: pathlib.Path) -> dict[str, str]:
-    """Return each file by dotted path as a case file in the folder `out` must write it.
+    """Return, by dotted key, the path of each file that a case file in the folder `out` must contain.
 
-    It is as written unless its relative path leads elsewhere from `out`.
+    A path is kept as written if it leads to the same file from `out`.
     """
     return {one.key: path_from(one.written, one.file, out) for one in files}
 
 
 def _columns(table: Table) -> tuple[str, str] | None:
+    """Return the names of the columns of time and value; None if the table does not give them."""
     names = table.raw.get("columns")
     if names is None:
         return None
@@ -93,11 +99,11 @@ def _columns(table: Table) -> tuple[str, str] | None:
 
 
 def _chosen(found: dict[str, np.ndarray], columns: tuple[str, str] | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return times and values. Without `columns` the file must have exactly two."""
+    """Return times and values. If `columns` is None, the file must have exactly two columns."""
     listed = ", ".join(found) or "none"
     if columns is None:
         if len(found) != 2:
-            raise ValueError(f"it has the columns {listed}; name those of time and value with columns = [.., ..].")
+            raise ValueError(f"it has the columns {listed}; name those of time and value with columns = [TIME, VALUE].")
         time, value = found
         columns = time, value
     for name in columns:
@@ -111,13 +117,13 @@ def _checked(times: np.ndarray, values: np.ndarray) -> Samples:
     shapes = np.shape(times), np.shape(values)
     if any(len(shape) != 1 for shape in shapes) or shapes[0] != shapes[1]:
         raise ValueError(
-            f"times and values must be two lists of one length; their shapes are {shapes[0]}, {shapes[1]}."
+            f"times and values must be two lists of equal length; their shapes are {shapes[0]}, {shapes[1]}."
         )
     if not 2 <= times.size <= MOST_ROWS:
         raise ValueError(f"it has {times.size:,} rows; give 2 to {MOST_ROWS:,}.")
     for what, x in (("time", times), ("value", values)):
         if not np.issubdtype(x.dtype, np.number) or np.iscomplexobj(x):
-            raise ValueError(f"its {what}s are no real numbers.")
+            raise ValueError(f"its {what}s are not real numbers.")
         if (wrong := np.flatnonzero(~np.isfinite(x))).size:
             raise ValueError(f"the {what} of row {wrong[0] + 1} is {x[wrong[0]]}; each must be a finite number.")
     if (wrong := np.flatnonzero(np.diff(times) <= 0)).size:
@@ -131,7 +137,7 @@ def _csv(file: pathlib.Path) -> dict[str, np.ndarray]:
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
-        raise ValueError("it is no text file in UTF-8.") from None
+        raise ValueError("it is not a text file in UTF-8.") from None
     numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
     if not numbered:
         raise ValueError("it is empty.")
@@ -148,12 +154,13 @@ def _csv(file: pathlib.Path) -> dict[str, np.ndarray]:
             raise ValueError(f"line {line} has {len(row)} columns, but the first line has {len(names)}.")
         for k, cell in enumerate(row):
             if (number := _float(cell)) is None:
-                raise ValueError(f"line {line}: {show(cell)} is no number.")
+                raise ValueError(f"line {line}: {show(cell)} is not a number.")
             table[n, k] = number
     return dict(zip(names, table.T, strict=True))
 
 
 def _float(cell: str) -> float | None:
+    """Return the number in a cell; NaN if it is empty, None if it is not a number."""
     try:
         return float(cell) if cell.strip() else math.nan
     except ValueError:
@@ -165,7 +172,7 @@ def _npz(file: pathlib.Path) -> dict[str, np.ndarray]:
         with np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except (ValueError, zipfile.BadZipFile, EOFError):
-        raise ValueError("it is no npz file of numbers. numpy.savez writes one.") from None
+        raise ValueError("it is not an npz file of numbers. Write it with numpy.savez.") from None
 
 
 def _parquet(file: pathlib.Path) -> dict[str, np.ndarray]:
@@ -176,7 +183,7 @@ def _parquet(file: pathlib.Path) -> dict[str, np.ndarray]:
     try:
         table = parquet.read_table(file)
     except lib.ArrowInvalid:
-        raise ValueError("it is no Parquet file.") from None
+        raise ValueError("it is not a Parquet file.") from None
     return {name: table[name].to_numpy() for name in table.column_names}
 
 

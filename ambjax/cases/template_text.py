@@ -38,7 +38,7 @@ seed = 0                      # seed of all random numbers
 settle = 0.5                  # s; time from which "settled" metrics count (left out: a quarter of the duration)
 # clearance = 4.5e-3          # m; |z| at which the rotor touches down (left out: 0.9 s_0)
 # stop_stiffness = 1e7        # N/m; touchdown bearing at the clearance (left out: a rotor that touches down is lost)
-# stop_damping = 500.0        # N s/m; its damping (left out: 0)
+# stop_damping = 500.0        # N s/m; damping of the touchdown bearing (left out: 0)
 
 # [sensor]                    # Gaussian noise, held for a sample period, without delay (left out: none)
 # std = {paper_std:.3e}          # m; this is the paper's, which its printed gains do not survive

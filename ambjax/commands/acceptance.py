@@ -1,4 +1,4 @@
-"""The first part of `ambjax check`: sensitivity, margins and reserves of the loop that will run."""
+"""The first part of `ambjax check`: sensitivity and margins of the linearised loop, and reserves of the machine."""
 
 import math
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from ambjax.linear import Analysis, analyse, linearise
 
 
 class Fact(NamedTuple):
-    """A number of the machine: its key in the JSON summary, what it is, its value (None: not applicable), its unit."""
+    """A number of the machine: its key in the JSON summary, its meaning, its value (None: not applicable), its unit."""
 
     key: str
     words: str
@@ -28,10 +28,10 @@ class Forces(NamedTuple):
 
 
 def forces(case: Case) -> Forces:
-    """Return the forces of a case, for the nominal plant.
+    """Return the forces of a case, for the plant without [spread].
 
-    The largest force is that at z = 0 with the current i_0, or the amplifier's limit if that is smaller: beyond i_0 one
-    magnet is off. The load is the sum of the bounds of all signals that disturb z.
+    The largest force is that at z = 0 with the current i_0, at which one magnet is off, or with the amplifier's limit
+    if that is smaller. The load is the sum of the bounds of all signals that disturb z.
     """
     scenario, plant, amplifier = case.scenario, case.scenario.plant, case.scenario.amplifier
     m, i_0 = float(plant.m), float(plant.i_0)
@@ -50,7 +50,7 @@ def bias_flux(case: Case) -> float:
 
 
 def acceptance(case: Case) -> tuple[dict[str, object], str]:
-    """Return the summary and the text: zone and margins of the linearised loop at r = 0, and the plant's reserves."""
+    """Return the JSON summary and the text: zone and margins of the loop linearised at r = 0, and the machine."""
     try:
         system = linearise(case.cascade, case.scenario, case.clock)
         loop = analyse(system, case.scenario.plant.m, case.clock.sample_period, case.zones)
@@ -74,7 +74,7 @@ def _loop_facts(loop: Analysis) -> list[Fact]:
         return []
     return [
         Fact("peak", "peak of |S|", loop.S.height, "1"),
-        Fact("gain_margin", "gain margin, nearest to 1", loop.margins.gain, "1"),
+        Fact("gain_margin", "gain margin (the one nearer to 1)", loop.margins.gain, "1"),
         Fact("phase_margin_deg", "phase margin", loop.margins.phase_deg, "degrees"),
         Fact("delay_margin_s", "delay margin", loop.margins.delay, "s"),
         Fact("disk_margin", "disk margin", loop.margins.disk, "1"),
@@ -92,24 +92,29 @@ def machine(case: Case) -> list[Fact]:
         step = 2 * float(sensor.ends(plant.s_0)) / 2 ** float(sensor.bits)
     std = None if sensor is None else float(sensor.std)
     return [
-        Fact("force_reserve", "largest force per weight", force / weight if weight else None, "1"),
-        Fact(
-            "load_reserve", "largest force per weight and largest load", force / (weight + load) if load else None, "1"
-        ),
+        Fact("force_reserve", "largest force / weight", force / weight if weight else None, "1"),
+        Fact("load_reserve", "largest force / (weight + largest load)", force / (weight + load) if load else None, "1"),
         Fact("k_s_N_per_m", "negative stiffness k_s", float(plant.k_s), "N/m"),
         Fact("k_i_N_per_A", "force per current k_i", float(plant.k_i), "N/A"),
         Fact("unstable_pole_per_s", "unstable pole sqrt(k_s/m)", float(plant.pole), "1/s"),
-        Fact("samples_per_time_constant", "samples in its time constant", 1 / (period * float(plant.pole)), "1"),
+        Fact(
+            "samples_per_time_constant", "samples per time constant of the pole", 1 / (period * float(plant.pole)), "1"
+        ),
         Fact("bias_flux_T", "bias flux density", bias_flux(case), "T"),
-        Fact("current_slew_A_per_s", "supply's slew of the current, u_max/L", slew, "A/s"),
+        Fact("current_slew_A_per_s", "slew rate of the current, u_max/L", slew, "A/s"),
         Fact("converter_step_m", "converter step of z", step, "m"),
-        Fact("step_per_noise", "converter step per noise std", step / std if step and std else None, "1"),
+        Fact(
+            "step_per_noise",
+            "converter step / standard deviation of the noise",
+            step / std if step and std else None,
+            "1",
+        ),
     ]
 
 
 def _facts_table(facts: list[Fact]) -> str:
     def number(x: float) -> str:
-        return "none" if math.isinf(x) else f"{x:.4g}"
+        return f"{x:.4g}"
 
     rows = [(fact.words, number(fact.value), fact.unit) for fact in facts if fact.value is not None]
     return table(("loop and machine", "value", "unit"), rows)

@@ -197,7 +197,7 @@ def _cell(value: object) -> str:
     if value is None:
         return "-"
     if isinstance(value, float):
-        return "none" if math.isinf(value) else f"{value:.4g}"
+        return f"{value:.4g}"
     return str(value)
 
 

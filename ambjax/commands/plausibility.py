@@ -1,4 +1,4 @@
-"""Warnings about a machine that its loads, its sampling or its bandwidths do not fit."""
+"""Warnings about unlikely values: quantities in a wrong unit, and loads or rates that the machine cannot follow."""
 
 import dataclasses
 import math
@@ -12,12 +12,12 @@ from ambjax.world.scenario import SLOTS
 
 # Flux density above which common silicon steel begins to saturate, T (Schweitzer and Maslen, Magnetic Bearings, 2009).
 MOST_FLUX = 1.2
-# Least number of samples in the time constant of the unstable rotor, and least ratio of a bandwidth to its pole. A loop
-# needs a bandwidth of twice the unstable pole (Skogestad and Postlethwaite, Multivariable Feedback Control, 5.9).
+# Smallest number of samples per time constant of the unstable pole, and smallest ratio of a bandwidth to this pole. A
+# loop needs a bandwidth of twice its unstable pole (Skogestad and Postlethwaite, Multivariable Feedback Control, 5.9).
 LEAST_SAMPLES, LEAST_BANDWIDTH = 3.0, 2.0
-# Largest converter step per standard deviation of the noise at which the noise still dithers the converter.
+# Largest ratio of a converter step to the standard deviation of the noise at which the noise dithers the converter.
 MOST_STEP = 4.0
-# Plausible ranges of mass (kg), bias (A) and resistance (ohm), the unit of each and the likely slip.
+# Plausible ranges of mass, bias current and resistance, their units, and the unit that a wrong value is probably in.
 RANGES = {
     "m": ((1e-3, 1e5), "kg", "grams"),
     "i_0": ((1e-3, 100.0), "A", "milliamperes"),
@@ -28,7 +28,7 @@ FREQUENCIES = {"frequency": 1.0, "frequency_end": 1.0, "f_high": 1.0, "speed": 1
 
 
 def implausible(case: Case) -> list[str]:
-    """Return one line for each doubtful relation of two numbers of a case, and for each doubtful size."""
+    """Return a warning, in one line, for each implausible number of a case and each implausible relation of two."""
     return [*_ranges(case), *_forces(case), *_flux(case), *_rates(case), *_converter(case), *_aliases(case)]
 
 
@@ -44,7 +44,8 @@ def _forces(case: Case) -> Iterator[str]:
     if weight <= largest < weight + load:
         yield (
             f"[disturbance]: weight and loads reach {weight + load:.4g} N, but the magnets pull with at most "
-            f"{largest:.4g} N at z = 0, where |i| reaches the bias or the limit. A load that stays needs more force."
+            f"{largest:.4g} N at z = 0, with |i| at the bias current or its limit. They cannot "
+            "carry a constant load of this size."
         )
 
 
@@ -61,8 +62,8 @@ def _rates(case: Case) -> Iterator[str]:
     samples = 1 / (float(case.clock.sample_period) * pole)
     if case.cascade.processor is not None and 1 <= samples < LEAST_SAMPLES:
         yield (
-            f"clock.sample_period = {float(case.clock.sample_period):g} s: the unstable rotor's time constant has only "
-            f"{samples:.2g} samples; give at least {LEAST_SAMPLES:g}, 10 or more for usable margins."
+            f"clock.sample_period = {float(case.clock.sample_period):g} s: the time constant of the unstable rotor has "
+            f"only {samples:.2g} samples. Give at least {LEAST_SAMPLES:g}; usable margins need 10 or more."
         )
     for name, part in (("sensor", scenario.sensor), ("actuator", scenario.amplifier)):
         bandwidth = getattr(part, "bandwidth", None)
@@ -81,7 +82,7 @@ def _converter(case: Case) -> Iterator[str]:
     if step > MOST_STEP * float(sensor.std):
         yield (
             f"sensor.bits = {float(sensor.bits):g}: a step of {step:.3g} m is {step / float(sensor.std):.3g} times the "
-            "noise sensor.std, so that the reading rests on one step. Give more bits, or a smaller range_z."
+            "noise sensor.std, so the reading stays at one step. Give more bits, or a smaller range_z."
         )
 
 
@@ -94,8 +95,8 @@ def _aliases(case: Case) -> Iterator[str]:
         for name, high in _frequencies(signal):
             if high > half:
                 yield (
-                    f"{path}: {name} gives {high:.4g} Hz, above half the sampling rate, {half:.4g} Hz: samples do not "
-                    "resolve it. Shorten clock.sample_period."
+                    f"{path}: {name} gives {high:.4g} Hz, above half the sampling rate, {half:.4g} Hz: samples cannot "
+                    "resolve it. Reduce clock.sample_period."
                 )
 
 

@@ -203,7 +203,7 @@ def _row(point: OperatingPoint) -> tuple[str, ...]:
 
 
 def _number(x: float) -> str:
-    return "none" if math.isinf(x) else f"{x:.4g}"
+    return f"{x:.4g}"
 
 
 def _draw(

@@ -1,6 +1,6 @@
 """The cascade: an observer, a position law, an inversion law and a current law in series, with a nominal plant.
 
-Each stage may take any of its laws, independently of the other stages (the paper's first contribution).
+The laws of the stages can be combined freely (the first contribution of the paper).
 """
 
 import dataclasses
@@ -51,8 +51,7 @@ class Cascade:
     The laws compute with `model`; the true plant is `Scenario.plant`. The default of each law is that of the paper,
     with the gains of Table 2 (but gamma = 7.5e4, see `inversion.Adaptive`), and with a steepness p scaled to the model
     (`base.default_law`; 25 for the plant of Table 1). `dataclasses.replace` with another model does not change the
-    laws. `processor` is None in continuous time, as in the paper. A `Schedule` may stand in a law in the place of
-    a gain.
+    laws. `processor` is None in continuous time, as in the paper. Any gain of a law may be a `Schedule`.
     """
 
     observer: Observer = _LEFT_OUT
@@ -70,8 +69,8 @@ class Cascade:
     def init(self, measured: Measurement, reference: Reference | None = None) -> CascadeState:
         """Return the states of all laws at t = 0, in continuous time or on the processor.
 
-        `measured`: the first measurement, from which the observer starts. `reference`: at t = 0; in continuous time, a
-        position law may choose its initial state from it (`PositionLaw.begin`).
+        `measured`: the first measurement, from which the observer starts. `reference`: its value and rates at t = 0; in
+        continuous time, a position law may choose its initial state from it (`PositionLaw.begin`).
         """
         observed = extremes(self.observer)[0].init(self.model, measured)
         rest = [extremes(law)[0] for law in self.laws[1:]]
@@ -96,12 +95,12 @@ class Cascade:
         return CascadeState(*(jax.tree.map(lambda *x: functools.reduce(jnp.minimum, x), *each) for each in layers))
 
     def slopes(self) -> dict[str, Scalar]:
-        """Return the largest slope of each law, 1/s, by the name of its stage."""
+        """Return the largest slope of each law, 1/s, by the name of its stage: its fastest rate in closed loop."""
         laws = zip(CascadeState._fields, map(extremes, self.laws), strict=True)
         return {stage: functools.reduce(jnp.maximum, [one.slope(self.model) for one in ends]) for stage, ends in laws}
 
     def sigma(self, motion: Measurement, reference: Reference) -> Array:
-        """Return the sliding variable of the position law (m/s) for a motion and a reference."""
+        """Return the sliding variable of the position law (m/s) for a motion (m, m/s, A) and a reference (m)."""
         return present(self.position, motion.z, reference).sigma(motion, reference)
 
     @property
@@ -114,9 +113,12 @@ class Cascade:
     ) -> tuple[ForceDemand, Measurement, CascadeState]:
         """Return the demanded force, the observer's estimate, and the rates of the states of observer and position law.
 
+        `measured`: readings of z (m), z_dot (m/s) and i (A). `state`: states of all laws. `reference`: r and its rates.
         The rates of z and v_star in the demanded force are total derivatives in time: along the reference, z_dot, the
-        nominal z_ddot and the states of the laws. Only inversion laws without a state use them, for i_ref'; XLA removes
-        them for other laws. If the observer estimates the velocity, z_dot is its estimate.
+        nominal z_ddot and the states of the laws. Only inversion laws without a state use them, to compute i_ref'; XLA
+        removes them for other laws. If the observer estimates the velocity, z_dot is its estimate.
+
+        In the returned states, those of the inversion and current laws are empty.
         """
 
         def demanded(
@@ -144,14 +146,14 @@ class Cascade:
         return ForceDemand(z, z_rate, v_star, v_star_rate, gaps), estimate, rates
 
     def _demanded(self, estimate: Measurement, reference: Reference, state: State) -> tuple[Array, State]:
-        """Return the output and the rate of the position law."""
+        """Return v_star (A^2/m^2) and the rate of the state of the position law."""
         return present(self.position, estimate.z, reference)(self.model, (estimate, reference), state)
 
     def on_processor(self, *delays: Scalar, between: bool = False) -> "Cascade":
         """Return the cascade with the structure of its compiled program fixed, for use inside jit, grad or vmap.
 
-        A sign with steepness inf becomes set-valued. The program also supports the delays `delays` (samples) and, with
-        `between`, every delay between them. Raises ValueError as `Processor.resolved` does.
+        A sign with steepness inf becomes set-valued. The program also supports the delays `delays` (samples) and, if
+        `between` is true, every delay between them. Raises ValueError as `Processor.resolved` does.
         """
         assert self.processor is not None
         laws = {stage: hardened(getattr(self, stage)) for stage in USUAL}
@@ -168,7 +170,7 @@ class Cascade:
                 )
 
     def in_continuous_time(self) -> "Cascade":
-        """Return the cascade without its processor; the model's default steepness replaces a steepness of inf."""
+        """Return the cascade without its processor. A steepness of inf becomes the default steepness for the model."""
         laws = {stage: softened(getattr(self, stage), self.model).in_continuous_time() for stage in USUAL}
         return dataclasses.replace(self, **laws, processor=None)
 
@@ -180,8 +182,9 @@ class Cascade:
     def estimate(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State, Measurement]:
         """Step the observer on a processor.
 
-        `state`: state of the observer. Returns the estimate for the other laws (with prediction: at the end of the
-        delay), the next state of the observer, and the estimate at the sample itself.
+        `measured`: the readings. `state`: state of the observer. `sample`: reference, period and delayed voltages.
+        Returns the estimate for the other laws (with prediction: at the end of the delay), the next state of the
+        observer, and the estimate at the sample itself.
         """
         processor: Any = self.processor
         now, state = self._advance(sample)(present(self.observer, measured.z, sample.reference), measured, state)
@@ -195,7 +198,8 @@ class Cascade:
     ) -> tuple[Command, CascadeState, Measurement]:
         """Step all laws on a processor.
 
-        With prediction, all laws but the observer use the estimate at the end of the delay. Returns the command, the
+        `measured`: the readings. `state`: states of all laws. `sample`: reference, period, supply and delayed voltages.
+        With prediction, all laws except the observer use the estimate at the end of the delay. Returns the command, the
         next states of the laws, and the observer's estimate at the sample itself.
         """
         advance = self._advance(sample)
@@ -213,7 +217,7 @@ class Cascade:
 
         point = (sample.reference, measured.z, measured.z_dot, state.observer, state.position)
         (z, v_star), (now, estimate, observed, positioned) = demanded(*point)
-        # only an inversion law without a state uses the rates, for i_ref'; XLA removes them for other laws
+        # Only inversion laws without a state use these rates, to compute i_ref'; XLA removes them for other laws.
         z_ddot = self.model.z_ddot(estimate.z, estimate.i)
         rates = jax.tree.map(
             lambda a, b: (b - a) / sample.period, (state.observer, state.position), (observed, positioned)
@@ -237,6 +241,7 @@ class Cascade:
     ) -> tuple[Command, CascadeState]:
         """Return the command in continuous time and the rates of the states of all laws.
 
+        `measured`: readings of z (m), z_dot (m/s) and i (A). `state`: states of all laws. `reference`: r and its rates.
         `u_max`: limit of the supply, V; inf: none.
         """
         force, estimate, rates = self.demand(measured, state, reference)
@@ -256,7 +261,7 @@ def _rates(
     state: State,
     rate: State,
 ) -> tuple[Array, Array]:
-    """Return the rates of z (m/s) and v_star (A^2/m^2/s) along an estimate whose rates are its z_dot and `z_ddot`."""
+    """Return the rates of z (m/s) and v_star (A^2/m^2/s) if the estimate moves with its own z_dot and with `z_ddot`."""
 
     def v_star(reference: Reference, z: Array, z_dot: Array, state: State) -> Array:
         return law(Measurement(z, z_dot, estimate.i), reference, state)[0]

@@ -17,9 +17,10 @@ from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 
-# Default outputs, for messages; largest relative difference of the sample periods of controller and processor.
+# Allowed values of `output`; largest relative difference between the sample periods of controller and processor.
 OUTPUTS, SAME_PERIOD = ("current", "voltage"), 1e-6
-# Default controller: 135 + 0.219 s/(1 + s/10600) A/m, as `StateFeedback` for the plant of Table 1, without integral.
+# Default controller: 135 + 0.219 s/(1 + s/10600) A/m, the gains of `StateFeedback` without integral for the plant of
+# Table 1.
 LEAD = realisation(-10600.0, 1.0, -0.219 * 10600.0**2, 135 + 0.219 * 10600.0)
 
 
@@ -27,17 +28,17 @@ LEAD = realisation(-10600.0, 1.0, -0.219 * 10600.0**2, 135 + 0.219 * 10600.0)
 class LinearController(PositionLaw[tuple[Array, ...]]):
     """v_star = dv/dz z + dv/di i_star, i_star = g/b + gain K(s) (r - z): a linear controller in state space.
 
-    The input of K is r - z, or for a K with two inputs r and z. Its output is a current (A) or a voltage u (V); then
-    i_star = g/b + u/R. g/b is the current that carries the weight, b = a dv/di at z = 0, i = 0. For
+    K has one input, r - z (m), or two inputs, r and z (m). Its output is a current (A) or a voltage u (V); for a
+    voltage, i_star = g/b + gain u/R. g/b is the current that carries the weight, b = a dv/di at z = 0, i = 0. For
     inversion.Linearised i_ref is i_star; current.OpenLoop then applies R i_ref, which is the voltage itself.
 
     A continuous K is discretised by the bilinear (Tustin) transform at the period of a processor. A discrete K requires
     a processor with its own period. There is no anti-windup: the states of K do not depend on the supply's limit. The
-    reported sigma is the rate of the error. `of` makes the law of a state space of python-control or SciPy.
+    reported sigma is the rate of the error, m/s. `of` constructs the law from a state space of python-control or SciPy.
     """
 
     gain: Scalar = records.gain(default=1.0, unit="1", doc="factor of the controller's output")
-    output: str = static(default=OUTPUTS[0], doc="what the controller's output is: a current (A) or a voltage (V)")
+    output: str = static(default=OUTPUTS[0], doc="quantity that the controller returns: a current (A) or a voltage (V)")
     realisation: Realisation = static(default=LEAD, doc="matrices of the controller")
     own_steps = ("implicit", "explicit")
 
@@ -45,11 +46,14 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
     def of(cls, system: Any, output: str = OUTPUTS[0], gain: Scalar = 1.0) -> "LinearController":
         """Return the law of a state space `system`: an object with matrices A, B, C, D and the period dt (s).
 
-        Raises ValueError if it has no such matrices, or as `realisation` does.
+        `output`: "current" or "voltage". `gain`: factor of the output. Raises ValueError if `system` lacks these
+        matrices, if `output` is not allowed, or as `realisation` does.
         """
         if not all(hasattr(system, name) for name in "ABCD"):
             kind = type(system).__name__
-            raise ValueError(f"{kind} has no matrices A, B, C, D: convert it to a state space, as control.ss does.")
+            raise ValueError(
+                f"{kind} has no matrices A, B, C, D: convert it to a state space, for example with control.ss."
+            )
         if output not in OUTPUTS:
             raise ValueError(f"output = {output!r}: it must be one of {', '.join(map(repr, OUTPUTS))}.")
         dt = getattr(system, "dt", None)
@@ -57,6 +61,7 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
 
     @property
     def demand(self) -> str:
+        """ "voltage" if the output is a voltage, otherwise "force"."""
         return "voltage" if self.output == OUTPUTS[1] else "force"
 
     @property
@@ -65,7 +70,7 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
         return tuple((f"x_{k + 1}", "m", "state of the controller") for k in range(len(self.realisation.A)))
 
     def check_use(self, model: Plant, period: float | None) -> None:
-        """Raise ValueError for a discrete controller at another period, and for a voltage without a resistance."""
+        """Raise ValueError for a discrete controller at another `period` (s; None: continuous), a voltage if R = 0."""
         dt = self.realisation.dt
         if dt and period is None:
             raise ValueError(
@@ -91,11 +96,15 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
         return (model.sizes().z,) * len(self.realisation.A)
 
     def slope(self, model: Plant) -> Scalar:
-        """Return the larger of the fastest pole of the controller and the crossover of the loop."""
+        """Return the larger of the fastest pole of the controller and the crossover frequency of the loop, 1/s."""
         return jnp.maximum(self.realisation.fastest, self.explicit_rate(model))
 
     def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the largest w (1/s) at which the linearised mechanics' b |K| / w^2, or of a voltage /(L w^3), is 1."""
+        """Return the crossover frequency w of the loop, 1/s: the largest at which its gain is 1 or more.
+
+        With the inertia of the linearised mechanics alone, the loop gain is b gain |K|/w^2; for a voltage, it is
+        b gain |K|/(L w^3).
+        """
         size = self.gain * linear_mechanics(model).b * np.abs(self.realisation.response(FREQUENCIES)[:, -1])
         loop = size / FREQUENCIES**2 if self.demand == "force" else size / (model.L * FREQUENCIES**3)
         return jnp.max(jnp.where(loop >= 1, FREQUENCIES, FREQUENCIES[0]))
@@ -110,7 +119,7 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
         return [r - z] if count == 1 else [r, z]
 
     def _force(self, model: Plant, z: Array, y: Array) -> Array:
-        """Return v_star for an output y of the controller."""
+        """Return v_star (A^2/m^2) for an output y (A or V) of the controller."""
         i = self.gain * y if self.demand == "force" else self.gain * y / model.R
         return force_of_current(model, z, model.g / linear_mechanics(model).b + i)
 

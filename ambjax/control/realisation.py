@@ -1,4 +1,4 @@
-"""A linear controller as numbers: matrices in real Schur form, from those of a state space of other tools."""
+"""The matrices of a linear controller in real Schur form, computed from a state space that another tool designed."""
 
 import dataclasses
 import hashlib
@@ -13,8 +13,8 @@ from ambjax.numerics.records import Scalar
 
 # Largest number of states. In continuous time an implicit step eliminates all of them by scalar operations.
 MOST_STATES = 30
-# Frequencies (1/s) over which the response of each state is made at most 1, and the damping ratio of the exponentials
-# at which it is evaluated: undamped ones may be poles of the controller.
+# The states are scaled by their largest response to the inputs at these angular frequencies (1/s). The response is
+# evaluated at s = w (j + DAMPED), to the right of the imaginary axis, because an undamped pole may lie on it.
 FREQUENCIES, DAMPED = np.geomspace(10.0, 1e5, 81), 0.05
 # Largest condition number of A + 1 of a discrete controller: above it, a pole is too close to z = -1.
 MOST_CONDITION = 1e8
@@ -26,9 +26,10 @@ Row = tuple[float, ...]
 class Realisation:
     """The controller x' = A x + B w, y = C x + D w with n states and m = 1 or 2 inputs w; y is a scalar.
 
-    `A` [n, n]: upper quasi-triangular (real Schur form). `B` [n, m], `C` [n], `D` [m]. States are scaled so that each
-    is at most about w. `dt`: sample period of a discrete controller, s; 0: continuous. A discrete controller is stored
-    as the continuous one that the bilinear transform with period dt turns into it. `realisation` makes it of arrays.
+    `A` [n, n]: upper quasi-triangular (real Schur form). `B` [n, m], `C` [n], `D` [m]. The states are scaled, so that
+    for inputs w of amplitude 1 their amplitudes are about 1 or less. `dt`: sample period of a discrete controller, s;
+    0: continuous. A discrete controller is stored as the continuous one that the bilinear transform with period dt
+    turns into it. `realisation` constructs it from arrays.
     """
 
     A: tuple[Row, ...]
@@ -59,18 +60,19 @@ class Realisation:
         return np.array(self.C) @ states + np.array(self.D) if n else np.tile(np.array(self.D) + 0j, (len(s), 1))
 
     def output(self, x: Sequence[Array], w: Sequence[Array]) -> Array:
-        """Return y for a state and inputs."""
+        """Return y (a current in A or a voltage in V) for a state x of n and inputs w of m scalars, in m."""
         return _sum(self.C, x) + _sum(self.D, w)
 
     def rates(self, x: Sequence[Array], w: Sequence[Array]) -> tuple[Array, ...]:
-        """Return the rate of the state."""
+        """Return the rates of the n states for a state x and inputs w (m)."""
         return tuple(_sum(a, x) + _sum(b, w) for a, b in zip(self.A, self.B, strict=True))
 
     def step(self, x: Sequence[Array], w: Sequence[Array], period: Scalar) -> tuple[Array, tuple[Array, ...]]:
-        """Return y and the next state of the bilinear (Tustin) transform with this period, s.
+        """Return y and the next state of the bilinear (Tustin) transform of the controller.
 
-        With h = T/2 and the state p of (1 - h A) p = x + h B w: y = C p + D w, x+ = 2 p - x. Back substitution solves
-        for p, by blocks of one row or, for a pair of complex poles, two.
+        `x`: n states. `w`: m inputs, m. `period`: T, s. With h = T/2 and the solution p of (1 - h A) p = x + h B w:
+        y = C p + D w, x+ = 2 p - x. Back substitution solves for p, in blocks of one row, or two rows for a pair of
+        complex poles.
         """
         h = jnp.asarray(period) / 2
         p: list[Array] = [jnp.zeros(())] * len(self.A)
@@ -97,7 +99,7 @@ class Realisation:
 
 
 def _sum(row: Row, x: Sequence[Array]) -> Array:
-    """Return the sum of the products; a coefficient of 0 costs nothing."""
+    """Return the sum of the products. Terms with a coefficient of 0 add no operations to the compiled program."""
     total: Array | None = None
     for factor, value in zip(row, x, strict=True):
         if factor:
@@ -108,8 +110,8 @@ def _sum(row: Row, x: Sequence[Array]) -> Array:
 def realisation(A: object, B: object, C: object, D: object, dt: object = 0.0) -> Realisation:
     """Return the realisation of a state space: A [n, n], B [n, m], C [1, n], D [1, m] with m = 1 or 2 inputs.
 
-    `dt`: sample period, s; 0 or None: continuous. Raises ValueError, with the name of the array, for matrices that do
-    not fit together or are not finite, and for a discrete controller with a pole at z = -1.
+    `dt`: sample period, s; 0 or None: continuous. Raises ValueError, with the name of the array, if the shapes of
+    the matrices do not match, if a number is not finite or if a discrete controller has a pole at z = -1.
     """
     step = _period(dt)
     a, b, c, d = _shaped(*(_numbers(name, x) for name, x in zip("ABCD", (A, B, C, D), strict=True)))
@@ -124,15 +126,17 @@ def realisation(A: object, B: object, C: object, D: object, dt: object = 0.0) ->
 
 
 def _period(dt: object) -> float:
+    """Return the sample period, s; 0: continuous. Raises ValueError for a value that is not one."""
     x = np.zeros(()) if dt is None else np.asarray(dt)
     if x.dtype == bool:
-        raise ValueError("dt = True: a discrete controller without a sample period. Give dt in seconds; 0: continuous.")
+        raise ValueError("dt = True: a discrete controller needs a sample period. Give dt in seconds; 0: continuous.")
     if x.size != 1 or x.dtype.kind not in "iuf" or not 0 <= x.item() < np.inf:
         raise ValueError(f"dt = {dt}: it must be the sample period in seconds, or 0 for a continuous controller.")
     return float(x.item())
 
 
 def _numbers(name: str, given: object) -> np.ndarray:
+    """Return the array as floats. Raises ValueError unless it is a matrix of finite real numbers."""
     x = np.asarray(given)
     if x.dtype.kind not in "iuf":
         raise ValueError(f"{name} has entries of type {x.dtype}: it must contain real numbers.")
@@ -144,7 +148,7 @@ def _numbers(name: str, given: object) -> np.ndarray:
 
 
 def _shaped(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the four as matrices. Raises ValueError for shapes that do not fit together."""
+    """Return A [n, n], B [n, m], C [1, n] and D [1, m]. Raises ValueError if the given shapes do not match."""
     D = np.atleast_2d(D)
     if D.shape not in ((1, 1), (1, 2)):
         raise ValueError(f"D has the shape {D.shape}: it must be (1, 1), for the input r - z, or (1, 2), for r and z.")
@@ -166,16 +170,16 @@ def _continued(
     one = np.eye(len(A))
     if len(A) and not np.linalg.cond(A + one) < MOST_CONDITION:
         raise ValueError(
-            "A has an eigenvalue near -1: the bilinear transform has no pole there. Move the pole at z = -1."
+            "A has an eigenvalue near -1: a bilinear transform has no pole at z = -1. Move this pole of the controller."
         )
     over = np.linalg.inv(A + one)
     return 2 / dt * (A - one) @ over, 2 / dt * over @ B, 2 * C @ over, D - C @ over @ B
 
 
 def _balanced(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the state space with its states scaled by powers of 2 for rows and columns of A of similar size.
+    """Return the state space with states scaled by powers of 2, so that rows and columns of A have similar norms.
 
-    A companion matrix, as of a transfer function, may span thirty decades.
+    The entries of a companion matrix, such as that of a transfer function, may span thirty decades.
     """
     if len(A) < 2:
         return A, B, C
@@ -196,7 +200,7 @@ def _triangular(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray
 
 
 def _scaled(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the state space with the largest response of each state near 1, by powers of 2."""
+    """Return the state space with its states scaled by powers of 2, so that the largest response of each is near 1."""
     if not len(A):
         return A, B, C
     s = (FREQUENCIES * (1j + DAMPED))[:, None, None]

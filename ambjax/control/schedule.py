@@ -1,7 +1,7 @@
 """Gain schedules: a gain as a piecewise-linear function of the error, the reference or its speed.
 
-A schedule stands in a law in the place of a gain. No law knows of it: the cascade evaluates the schedules of a law for
-the present position and reference, and calls the law with the resulting numbers.
+A gain of a law may be a schedule. The cascade evaluates the schedules of a law at the present position and reference,
+and calls the law with the resulting numbers, so laws contain no code for schedules.
 """
 
 import dataclasses
@@ -20,11 +20,11 @@ from ambjax.world.signals import Reference
 
 L = TypeVar("L", bound=Law)
 
-# The signal of a schedule: its unit, and its meaning.
+# Unit and formula of each signal.
 OVER = {"error": ("m", "|z - r|"), "reference": ("m", "|r|"), "reference-speed": ("m/s", "|r_dot|")}
-# Largest number of knots, largest abscissa and least distance of two abscissae.
+# Largest number of knots, largest value of the signal at a knot, and smallest distance between two knots.
 MOST_KNOTS, LARGEST, CLOSEST = 50, 1e6, 1e-12
-# Share of the last abscissa below which the derivative of the signal's magnitude goes to 0 at 0.
+# Signals below this share of the last knot use a smoothed derivative of |x|, which is 0 at 0 (`_magnitude`).
 ROUNDED = 1e-9
 
 
@@ -34,7 +34,7 @@ class Schedule(GainFunction):
 
     The signal is |z - r| ("error"), |r| ("reference") or |r_dot| ("reference-speed"). z is the position that the law
     reads: the measured one for an observer, the estimated one for the other laws. The numbers `values` are gains: they
-    are tuned, spread and exported. `at` and `over` belong to the compiled program.
+    can be tuned, varied and exported. `at` and `over` are constants of the compiled program.
     """
 
     values: tuple[Scalar, ...]
@@ -45,8 +45,8 @@ class Schedule(GainFunction):
     def value(self, z: Scalar, reference: Reference) -> Array:
         """Return the gain at a position z (m) and a reference.
 
-        The derivative with respect to the signal at a knot is the mean of those on both sides. At 0 it is 0, as the
-        magnitude has no other derivative there.
+        At a knot, the derivative with respect to the signal is the mean of those on both sides. Where the signal is 0,
+        it is 0.
         """
         signal = {"error": z - reference.r, "reference": reference.r, "reference-speed": reference.r_dot}[self.over]
         x, total = _magnitude(jnp.asarray(signal), ROUNDED * self.at[-1]), jnp.asarray(self.values[0])
@@ -60,9 +60,9 @@ class Schedule(GainFunction):
         return dataclasses.replace(self, values=(*self.values[:knot], value, *self.values[knot + 1 :]))
 
     def check(self, field: dataclasses.Field, path: str) -> None:
-        """Raise ValueError for an invalid schedule in the place of the number `field`, which stands at `path`."""
+        """Raise ValueError if this schedule is invalid for the gain `field`, whose dotted path is `path`."""
         if "steepness" not in field.metadata:
-            words = field.metadata.get("doc", "no gain")
+            words = field.metadata.get("doc", "not a gain")
             raise ValueError(f"{path}: only a gain can have a schedule. Give a number ({words}).")
         if self.over not in OVER:
             raise ValueError(f"{path}.over = '{self.over}': it must be one of {', '.join(OVER)}.")
@@ -71,7 +71,7 @@ class Schedule(GainFunction):
             unit, signal = OVER[self.over]
             raise ValueError(
                 f"{path}.at = {_shown(self.at)}: it must be 2 to {MOST_KNOTS} increasing numbers from 0 to "
-                f"{LARGEST:g} {unit}, at least {CLOSEST:g} apart: where the gain is given as a function of {signal}."
+                f"{LARGEST:g} {unit}, at least {CLOSEST:g} apart: the knots of the gain as a function of {signal}."
             )
         if len(self.values) != len(self.at):
             raise ValueError(
@@ -84,20 +84,21 @@ class Schedule(GainFunction):
 
 
 def finite(field: dataclasses.Field) -> dataclasses.Field:
-    """Return the field of a value of a schedule of the gain `field`: the same, but finite."""
+    """Return the field that checks the value at a knot: that of the gain `field`, without infinite values."""
     return dataclasses.field(metadata={**field.metadata, "infinite": False, "steepness": False})
 
 
 def _shown(numbers: tuple[float, ...]) -> str:
+    """Return the first six numbers as text."""
     more = ", ..." if len(numbers) > 6 else ""
     return f"[{', '.join(f'{x:g}' if isinstance(x, (int, float)) else repr(x) for x in numbers[:6])}{more}]"
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def _magnitude(x: Array, rounded: float) -> Array:
-    """Return |x|. Its derivative is sgn(x), and x/rounded where |x| < rounded.
+    """Return |x|. Its derivative is sgn(x) where |x| >= rounded, and x/rounded elsewhere.
 
-    An equilibrium is known up to rounding. With the derivative sgn(x) its linearisation would depend on that rounding.
+    At an equilibrium, x is 0 up to rounding errors. The linearisation must not depend on the sign of such an error.
     """
     return jnp.abs(x)
 
@@ -115,13 +116,13 @@ def schedules(law: Law) -> dict[str, Schedule]:
 
 
 def present(law: L, z: Scalar, reference: Reference) -> L:
-    """Return the law with the present value of each schedule; the law itself if it has none."""
+    """Return the law with a number for each schedule: its value at the position z (m) and the reference."""
     found = schedules(law)
     return _with(law, {name: one.value(z, reference) for name, one in found.items()}) if found else law
 
 
 def extremes(law: L) -> tuple[L, ...]:
-    """Return the law with the lowest value of each schedule and with the highest; only itself if it has none."""
+    """Return two laws, with the lowest and with the highest value of each schedule; (law,) if it has no schedule."""
     found = schedules(law)
     if not found:
         return (law,)

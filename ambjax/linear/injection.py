@@ -28,7 +28,7 @@ from ambjax.world.signals import Constant
 
 # Default amplitude of e, as a share of the gap s_0; at the velocity sensor, of s_0 times the plant's pole.
 AMPLITUDE = 0.01
-# Number of lines on a logarithmic axis; number of lines near a peak, and their range as multiples of its frequency.
+# Number of logarithmically spaced lines; number of lines near a peak, and their range as multiples of its frequency.
 LINES, NEAR, AROUND = 30, 11, (0.75, 1.33)
 
 
@@ -37,8 +37,7 @@ class Injection(NamedTuple):
 
     - `frequency` [L]: lines, Hz.
     - `S`, `T`, `KS` [L]: complex means over the members that did not lose the rotor; None if all did. S = reading/e
-      (1), T = S - 1 (1), KS = u/e (V/m, or V s/m at the
-      velocity sensor).
+      (1), T = S - 1 (1), KS = u/e (V/m, or V s/m at the velocity sensor).
     - `peak`: largest |S| over the lines; None without S.
     - `peak_low`, `peak_high`: confidence interval of |S| at the line of the peak, from the members. Equal to `peak` if
       the scenario is not random; None with one member.
@@ -158,7 +157,7 @@ def _at_rest(cascade: Cascade, scenario: Scenario, r: float) -> tuple[Cascade, S
     initial = Initial(r, 0.0, float(scenario.plant.equilibrium(r)[0]))
     scenario = dataclasses.replace(scenario.undisturbed(), reference=Constant(r), initial=initial)
     inversion = cascade.inversion.started(cascade.model.equilibrium(r)[0])
-    # not at the first measurement: its noise would be an initial error that a slow observer keeps
+    # The observer does not start at the first measurement: a slow observer would keep its noise as an initial error.
     rest = initial.measurement()
     z = reading(ideal(scenario), rest, (0.0, 0.0)).z
     return dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started(z)), scenario
@@ -171,7 +170,7 @@ def _harmonics(frequencies: Sequence[float] | np.ndarray, clock: Clock) -> np.nd
     if not harmonics.size or not np.isfinite(f).all() or harmonics[0] < 1 or harmonics[-1] >= clock.samples / 2:
         raise ValueError(
             f"injection.frequencies: they must be at least {base:g} Hz, one period of {clock.samples} samples, "
-            f"and below {0.5 / float(clock.sample_period):g} Hz, half the sample rate. Change them or clock.samples."
+            f"and below {0.5 / float(clock.sample_period):g} Hz, half the sampling rate. Change them or clock.samples."
         )
     if harmonics[-1] * clock.samples > np.iinfo(jnp.result_type(int)).max:
         raise ValueError(
@@ -197,7 +196,7 @@ def _summary(
     mean = np.mean(S, axis=0)
     k = int(np.argmax(np.abs(mean)))
     peak = float(np.abs(mean[k]))
-    # the component of each member's S along the mean's direction: its mean is |mean S|, without the bias of |S|
+    # The component of each member's S in the direction of the mean S. Its mean is |mean S|; the mean of |S| is biased.
     along = np.real(S[:, k] * np.conj(mean[k])) / peak
     low, high = _interval(along, confidence) if random else (peak, peak)
     return Injection(

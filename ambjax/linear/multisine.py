@@ -1,4 +1,4 @@
-"""The multi-sine, the systems with it added to a sensor's reading, and the Fourier coefficients of the response."""
+"""The multi-sine, the closed loops that add it to a sensor's reading, and the Fourier coefficients of the response."""
 
 from typing import Any, Literal, NamedTuple
 
@@ -15,7 +15,7 @@ from ambjax.simulation.trajectory import Row
 from ambjax.world.sensor import Errors, FaultyErrors, Measurement
 from ambjax.world.signals import Reference
 
-# Quantity of the sensor that e is added to: m or m/s.
+# Reading to which e is added: z (m) or z_dot (m/s).
 Reading = Literal["z", "z_dot"]
 
 
@@ -28,7 +28,7 @@ class MultiSine:
     - `phases` [L]: phases, rad.
     - `period`: sample period T, s.
     - `samples`: number of samples in a period of the multi-sine.
-    - `reading`: the quantity whose reading e is added to.
+    - `reading`: the reading to which e is added.
     """
 
     harmonics: Array
@@ -114,7 +114,7 @@ class InjectedLoop(Realised):
 
 @record
 class InjectedSampled(Sampled):
-    """The closed loop on a processor, with e_n added to a reading, after converter and faults.
+    """The closed loop on a processor, with e_n added to a reading after the converter and the faults.
 
     `z_measured` of its rows is that reading.
     """

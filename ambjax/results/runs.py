@@ -16,9 +16,13 @@ from ambjax.simulation.trajectory import SIGNAL_UNITS, Trajectory
 
 @dataclasses.dataclass(frozen=True)
 class CaseRun:
-    """The result of `simulate`: the case, its trajectory at every sample, and its metrics by name, numbers in SI units.
+    """The result of `simulate`.
 
-    In a notebook it is shown as the table of its metrics.
+    - `case`: the case that was simulated.
+    - `trajectory`: its signals at every sample, and the status of the rotor.
+    - `metrics`: each metric by name, in the SI unit of `UNITS`.
+
+    A notebook shows it as the table of its metrics.
     """
 
     case: Case
@@ -31,9 +35,9 @@ class CaseRun:
         return bool(self.metrics["lost"])
 
     def to_pandas(self) -> Any:
-        """Return the signals as a pandas DataFrame: one row per sample, with the index t in s.
+        """Return the signals as a pandas DataFrame with one row per sample; the index is the time t, s.
 
-        `attrs["units"]` has the unit of each column. Raises ValueError if pandas is not installed.
+        `attrs["units"]` contains the unit of each column. Raises ValueError if pandas is not installed.
         """
         frame = extra("pandas").DataFrame(
             self._signals(), index=extra("pandas").Index(np.asarray(self.trajectory.rows.t), name="t")
@@ -62,6 +66,7 @@ class CaseRun:
         return {name: x for name, x in self.trajectory.arrays().items() if name in SIGNAL_UNITS and name != "t"}
 
     def _repr_html_(self) -> str:
+        """Return the table of the metrics, with the status of the rotor as its caption."""
         state = f"lost: {self.trajectory.lost_why}" if self.lost else "held"
         head = f"{html.escape(self.case.name)}: the rotor is {html.escape(state)}"
         rows = "".join(
@@ -77,7 +82,7 @@ def simulate(case: Case, progress: Callable[[int], object] = lambda samples: Non
     - `case`: from `read_case`.
     - `progress`: called with the number of new samples after each part of the run.
 
-    Raises ValueError as `rollout` does. A lost rotor is no error: see `CaseRun.lost`.
+    Returns a `CaseRun`. Raises ValueError as `rollout` does. A lost rotor raises nothing: see `CaseRun.lost`.
     """
     fold = standard_for(case.settle, case.scenario)
     outcome = record(case.cascade, case.scenario, case.clock, fold=fold, tell=progress)

@@ -1,4 +1,4 @@
-"""Loads of a rotor that turns, unbalance and runout: functions of its angle, the integral of its speed."""
+"""Unbalance and runout of a turning rotor: functions of its angle, which is the integral of its speed."""
 
 from typing import Any, ClassVar, Protocol
 
@@ -30,7 +30,7 @@ def _speed_end() -> Any:
 
 
 def _duration() -> Any:
-    return leaf(default=1.0, unit="s", at_least=1e-9, at_most=1e9, doc="time of the run-up")
+    return leaf(default=1.0, unit="s", at_least=1e-9, at_most=1e9, doc="duration of the run-up")
 
 
 def _phase() -> Any:
@@ -38,7 +38,7 @@ def _phase() -> Any:
 
 
 class Turning(Protocol):
-    """Protocol of a signal of a rotor that turns: its speeds (rpm) and the time of its run-up (s)."""
+    """Protocol of a signal of a turning rotor: its speeds (rpm) and the duration of its run-up (s)."""
 
     @property
     def speed(self) -> Scalar: ...
@@ -68,7 +68,7 @@ def turns(rotor: Turning, t: Scalar) -> Array:
 
 
 def _bound(rotor: Turning, size: Scalar) -> tuple[float, float]:
-    """Return bounds of size omega^2 sin(...) for all speeds of the rotor; size >= 0."""
+    """Return bounds of `size` omega^2 sin(...) over all speeds of the rotor. `size`: at least 0, in kg m or m."""
     fastest = rotor.speed if rotor.speed_end is None else np.maximum(rotor.speed, rotor.speed_end)
     peak = np.asarray(size) * (TWO_PI * PER_MINUTE * np.asarray(fastest)) ** 2
     return hull(-peak, peak)
@@ -78,11 +78,13 @@ def _bound(rotor: Turning, size: Scalar) -> tuple[float, float]:
 class Unbalance:
     """Force of an unbalance U = m_u e, in N: U omega^2 sin(angle + phase).
 
-    omega is the speed in rad/s, and the angle its integral: constant speed, or a linear run-up from `speed` to
-    `speed_end` over `duration`. The angular acceleration itself contributes no force. The unit of the disturbance is N.
+    omega is the speed in rad/s, and the angle is its integral. The speed is constant, or rises linearly from `speed` to
+    `speed_end` in `duration`. The force from the angular acceleration is neglected.
     """
 
-    unbalance: Scalar = leaf(unit="g mm", at_least=0, at_most=1e9, doc="mass times its distance from the axis")
+    unbalance: Scalar = leaf(
+        unit="g mm", at_least=0, at_most=1e9, doc="unbalance mass times its distance from the axis"
+    )
     speed: Scalar = _speed()
     speed_end: Scalar | None = _speed_end()
     duration: Scalar = _duration()
@@ -103,7 +105,7 @@ class UnbalanceGrade:
 
     The grade G is the product of the eccentricity e and the service speed, so e = G / (2 pi `service_speed` / 60); the
     grade G 2.5 of ISO 21940-11 is 2.5 mm/s. The unbalance is e times the mass of the rotor, so the acceleration does
-    not depend on the mass. omega and the angle are those of `Unbalance`. The unit of the disturbance is m/s^2.
+    not depend on the mass. omega and the angle are those of `Unbalance`.
     """
 
     grade: Scalar = leaf(unit="mm/s", at_least=0, at_most=1e5, doc="balance quality grade; G 2.5 is 2.5 mm/s")
@@ -129,7 +131,7 @@ class UnbalanceGrade:
 
 @record
 class Harmonic:
-    """One harmonic of a runout: amplitude sin(number angle + phase)."""
+    """One harmonic of a runout, in m: amplitude sin(number angle + phase)."""
 
     amplitude: Scalar = leaf(unit="m", at_least=-1.0, at_most=1.0, doc="half the peak-to-peak height")
     number: Scalar = leaf(default=1.0, at_least=1, at_most=1000, whole=True, doc="waves in one turn")
@@ -140,7 +142,7 @@ class Harmonic:
 class Runout:
     """Runout of the surface that a position sensor reads, in m: a sum of harmonics of the rotor's angle.
 
-    It adds to what the sensor reads, before low-pass and gain, and not to the position of the rotor.
+    It is added to the reading of the sensor, before low-pass and gain. The true position does not contain it.
     """
 
     speed: Scalar = _speed()

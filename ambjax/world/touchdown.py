@@ -12,18 +12,18 @@ DAMPING_DEPTH = 1e-3
 
 @record
 class Stop:
-    """An elastic, damped stop at |z| = gap: it pushes the rotor back, and never pulls.
+    """An elastic, damped stop at |z| = gap. It pushes the rotor back and never pulls it.
 
     With the penetration d = |z| - gap > 0 its force is max(0, k d + c s d'). The share s of the damping rises from 0 to
-    1 as 3 x^2 - 2 x^3, x = d / (DAMPING_DEPTH gap), so that the force is continuous at the first touch. This is the
-    contact force of Kelvin and Voigt with the step of a multibody code (Ryan, ADAMS, 1990).
+    1 as 3 x^2 - 2 x^3, x = d / (DAMPING_DEPTH gap), so that the force is continuous at the first contact. This is a
+    Kelvin-Voigt contact force whose damping rises as in the multibody code ADAMS (Ryan, 1990).
     """
 
     stiffness: Scalar = leaf(unit="N/m", at_least=1.0, at_most=1e12, doc="stiffness of the touchdown bearing")
-    damping: Scalar = leaf(default=0.0, unit="N s/m", at_least=0, at_most=1e9, doc="its damping")
+    damping: Scalar = leaf(default=0.0, unit="N s/m", at_least=0, at_most=1e9, doc="damping of the touchdown bearing")
 
     def force(self, motion: Measurement, gap: Scalar) -> Array:
-        """Return the force on the rotor, N. `motion`: true motion. `gap`: |z| at which the stop stands, m."""
+        """Return the force on the rotor, N. `motion`: true motion. `gap`: |z| at which the stop begins, m."""
         side = jnp.where(motion.z < 0, -1.0, 1.0)
         depth = jnp.maximum(side * motion.z - gap, 0.0)
         x = jnp.minimum(depth / (DAMPING_DEPTH * gap), 1.0)
@@ -31,5 +31,5 @@ class Stop:
         return -side * jnp.maximum(self.stiffness * depth + self.damping * share * (side * motion.z_dot), 0.0)
 
     def slope(self, m: Scalar) -> Scalar:
-        """Return the fastest rate of a rotor of mass m (kg) on the stop, 1/s."""
+        """Return an upper bound of the magnitude of the poles of a rotor of mass m (kg) on the stop, 1/s."""
         return (self.stiffness / m) ** 0.5 + self.damping / m
