@@ -271,10 +271,10 @@ def test_a_limit_is_met_and_its_multiplier_is_the_price(monkeypatch, tmp_path):
 
 def test_the_price_falls_as_the_multiplier_does_on_the_way():
     """Where it is 20 at 10 V and, linear in the logarithm, 0 at 11 V, 10 % more takes off half of what 20 would."""
-    limit = Limit("rms_u_V", 10.0, multiplier=20.0, forces=((11.0, 0.0), (10.0, 20.0)))
+    limit = Limit("rms_u_V", 10.0, multiplier=20.0, history=((11.0, 0.0), (10.0, 20.0)))
     # 200 stretches of a straight line
     assert limit.error_reduction(0.1) == pytest.approx(1 - 1.1 ** (-20 / 2 / 2), rel=1e-9)
-    alone = Limit("rms_u_V", 10.0, multiplier=2.0, forces=((10.0, 2.0),))
+    alone = Limit("rms_u_V", 10.0, multiplier=2.0, history=((10.0, 2.0),))
     assert alone.error_reduction(0.1) == pytest.approx(1 - 1 / 1.1, rel=1e-9)
     assert Limit("rms_u_V", 10.0).error_reduction(0.1) == 0.0
 

@@ -13,9 +13,9 @@ class TunedCase:
     """The result of `tune`.
 
     - `case`: the case with the tuned gains, as read from tuned.toml.
-    - `good`: whether accurate steps confirm that the gains meet [tune.limits].
+    - `good`: whether the gains meet all requirements: [tune.limits], and confirmation by accurate steps.
     - `report`: the contents of report.json.
-    - `directory`: where tuned.toml, history.npz and the report are.
+    - `directory`: directory of tuned.toml, history.npz and the report.
     """
 
     case: Case
@@ -35,14 +35,15 @@ def tune(
 ) -> TunedCase:
     """Tune the gains of a case file, as `ambjax tune` does, and write the same files.
 
-    - `case`: path of the case file; its table [tune] says what to tune.
+    - `case`: path of the case file. Its table [tune] selects the gains, the limits and the budget.
     - `out`: directory of the results; None: a new one under ./out.
     - `resume`: continue the search whose checkpoints are in `out`.
-    - `gradients`: report the gradient of the loss too.
+    - `gradients`: also report the gradient of the loss.
     - `pareto`: write each point of the front of error against voltage as a case file.
-    - `settings_of`: path of a case file whose limits, loss and budget are used.
+    - `settings_of`: path of another case file, whose limits, loss and budget replace those of `case`.
 
-    Progress goes to stderr. Raises ValueError for a case or option that cannot be met, before any search.
+    Prints progress to stderr and returns a `TunedCase`. Raises ValueError for an invalid case or option, before any
+    search.
     """
     from tuning.command import run
 

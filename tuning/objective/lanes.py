@@ -3,7 +3,7 @@
 A lane is one rollout of one member under one vector of gains. A kernel processes a fixed number of lanes and is
 compiled once. There are three kernels: for the terms of the loss, for their derivatives (with fewer lanes), and for
 metrics. A new number of starts or members does not recompile them. The number of lanes does not depend on the number of
-cores, because it can change the last digit of a result. A different integration method, as that of the judge, needs
+cores, because it can change the last digit of a result. Another integration method, such as that of the judge, needs
 another engine.
 """
 
@@ -32,17 +32,18 @@ from tuning.space import Space
 
 # Lanes of one kernel call. With 32 lanes XLA unrolls the loops into scalar code, which takes 1.5 times as long.
 LANES = 64
-# Lanes of one kernel call with derivatives. Two calls of 32 lanes cost 14 % more than one of 64, but most iterations
-# need 16 to 64 lanes: 32 keeps two cores busy. 16 lanes cost 0.63 of 32: a second kernel for few lanes
-# would take longer to compile than it saves in a search.
+# Lanes of one kernel call with derivatives. Most iterations need 16 to 64 lanes, so 32 keep two cores busy, although
+# two calls of 32 lanes take 14 % longer than one of 64. A call of 16 lanes takes 0.63 of the time of one of 32; a
+# second kernel for few lanes would take longer to compile than it saves in a search.
 GRADIENT_LANES = 32
 
 
 class Lane(NamedTuple):
     """The inputs of one lane.
 
-    `x` [m]: coordinates. `members`: one member (scalar fields). `world`: the cascade, scenario, clock and loss, shared
-    by all lanes. `weights` [6]: of the terms, for derivatives only. `fold`: for values only.
+    `x` [m]: coordinates of the gains. `members`: one member (scalar fields). `world`: the cascade, scenario, clock and
+    loss, shared by all lanes. `weights` [6]: weights of the terms of the loss; None unless derivatives are computed.
+    `fold`: fold to evaluate; None if derivatives are computed.
     """
 
     x: Any
@@ -54,7 +55,7 @@ class Lane(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class LaneFold:
-    """Function of a lane that returns the result of its fold."""
+    """Function of a lane that returns the result of its fold. `space`: the gains that the tuner may change."""
 
     space: Space
 
@@ -63,7 +64,7 @@ class LaneFold:
 
 
 def measured(world: tuple[Cascade, Scenario, Clock, Any]) -> Any:
-    """Return the result of a fold over the rollout of one member."""
+    """Return the result of a fold over the rollout of one member. `world`: cascade, scenario, clock and fold."""
     cascade, scenario, clock, fold = world
     return rollout(cascade, scenario, clock, fold=fold, every=0).measured
 
@@ -72,8 +73,8 @@ def measured(world: tuple[Cascade, Scenario, Clock, Any]) -> Any:
 class LaneGradient:
     """Function of a lane that returns its outcomes, their derivatives and the terms of the loss.
 
-    The outcomes [1 + L] are the weighted loss and the limited quantities. The derivatives [1 + L, m] are computed in
-    forward or reverse mode.
+    The outcomes [1 + L] are the weighted loss and the L limited quantities. Their derivatives [1 + L, m] with respect
+    to the coordinates are computed in reverse mode if `reverse` is true, otherwise in forward mode.
     """
 
     space: Space
@@ -113,8 +114,9 @@ class LaneGradient:
 class Engine:
     """Compiled evaluation of an objective on `threads` cores (None: all). Each call blocks until its result is ready.
 
-    `settle` (s): the metrics count errors from this time on. `mode`: "forward" or "reverse" differentiation.
-    `lanes`: lanes of one kernel call.
+    `settle` (s): start of the settled part of the metrics. `mode`: "forward" or "reverse" differentiation. `lanes`:
+    lanes of one kernel call. `rollouts` counts the rollouts so far; `gradient` counts as 1 + m for each start and
+    member.
     """
 
     def __init__(
@@ -143,8 +145,8 @@ class Engine:
     def metrics(self, x: np.ndarray, members: Members) -> dict[str, Any]:
         """Return {"loss": terms, "metrics": the metrics of metrics.json}, each [S, N], at x [S, m] for members [N].
 
-        The gains are constants of the compiled program, as in `ambjax ensemble`. So, with LANES lanes, the same
-        integration method and members as drawn, the metrics equal those of members.npz bit by bit.
+        The gains are constants of the compiled program, as in `ambjax ensemble`. With LANES lanes, the same integration
+        method and members that are not stressed, the metrics therefore equal those of members.npz bit by bit.
         """
         self.rollouts += len(x) * len(members.member)
         found, block = [], None if self.lanes == LANES else self.lanes
@@ -162,8 +164,8 @@ class Engine:
     ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         """Return outcomes [S, N, 1 + L], their derivatives [S, N, 1 + L, m] and the terms [S, N] at x [S, m].
 
-        The outcomes are the weighted loss and the limited quantities. `weights`: of the terms, in the order of TERMS,
-        for all starts [6] or for each start [S, 6].
+        The outcomes are the weighted loss and the L limited quantities. `weights`: weights of the terms, in the order
+        of TERMS, for all starts [6] or for each start [S, 6].
         """
         self.rollouts += len(x) * len(members.member) * (len(self.objective.space) + 1)
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS)))
@@ -211,7 +213,7 @@ class Engine:
 
 
 def _wide(values: np.ndarray, count: int, fill: float = 1.0) -> np.ndarray:
-    """Return values [S, n, ...] of the first members as [S, count, ...]; the others have the value `fill`."""
+    """Return values [S, n, ...] of the first n members, extended to `count` members with the value `fill`."""
     wide = np.full((len(values), count, *values.shape[2:]), fill)
     wide[:, : values.shape[1]] = values
     return wide

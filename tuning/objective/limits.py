@@ -21,8 +21,9 @@ from ambjax.extend import Scalar, record, static
 from ambjax.simulation.folds import Fold
 from tuning.objective.quantities import KINDS, TINY, Kind, LimitContext
 
-# Initial penalty: at a multiplier of 0, an excess of 10 % adds 0.14 to the goal. Factor by which the penalty grows if
-# an update leaves more than the share SUFFICIENT_DECREASE of the excess (Nocedal and Wright, ch. 17). Largest penalty.
+# PENALTY: initial penalty; at a multiplier of 0, an excess of 10 % adds 0.14 to the goal. PENALTY_GROWTH: factor by
+# which the penalty grows if an update leaves more than the share SUFFICIENT_DECREASE of the excess (Nocedal and Wright,
+# ch. 17). MOST_PENALTY: largest penalty.
 PENALTY, PENALTY_GROWTH, SUFFICIENT_DECREASE, MOST_PENALTY = 30.0, 4.0, 0.3, 2000.0
 # Prefix that marks a limited quantity among the terms of a loss.
 PREFIX = "limit."
@@ -33,7 +34,7 @@ TOLERANCE_BELOW = 0.01
 LEAST_MARGIN = 0.002
 # Value of `Limit.source` for the limit on the rms error that traces the front of error against voltage.
 FRONT = "the front"
-# An infinite judged value is replaced by this factor times the larger of the limit and the search's value.
+# Replaces an infinite judged value: this factor times the larger of the limit and the search's value.
 LOST_FACTOR = 10.0
 # Intervals of the integral in `Limit.error_reduction`.
 PRICE_INTERVALS = 200
@@ -41,7 +42,7 @@ PRICE_INTERVALS = 200
 
 @record
 class LimitTerm:
-    """Term of a limit in the goal. Its numbers are leaves, so that a change of them does not recompile a search.
+    """Term of a limit in the goal. Its numbers are leaves, so a change of a number does not recompile the search.
 
     `name`: key of the quantity in KINDS. `log_allowed`: logarithm of `Limit.allowed`. `multiplier`, `penalty`, `ratio`:
     as in `Limit`.
@@ -56,7 +57,7 @@ class LimitTerm:
     def excess(self, values: Array) -> Array:
         """Return g = log(reached / allowed), or -g for a lower limit.
 
-        `values` [N]: the quantity of each member in the search. `ratio` corrects their reduction over members.
+        `values` [N]: the quantity of each member in the search. Their reduction over members is multiplied by `ratio`.
         """
         kind = KINDS[self.name]
         excess = jnp.log(jnp.maximum(self.ratio * kind.tuned(values), TINY)) - self.log_allowed
@@ -64,8 +65,8 @@ class LimitTerm:
 
     def __call__(self, values: Array) -> Array:
         """Return the term in the goal for the members' values [N] in the search."""
-        force = jnp.maximum(self.multiplier + self.penalty * self.excess(values), 0.0)
-        return (force**2 - self.multiplier**2) / (2 * self.penalty)
+        multiplier = jnp.maximum(self.multiplier + self.penalty * self.excess(values), 0.0)
+        return (multiplier**2 - self.multiplier**2) / (2 * self.penalty)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +75,8 @@ class Limit:
 
     `name`: key of the quantity in KINDS. `threshold`: the limit, in the unit of the quantity. `source`: origin of the
     limit, for the report. `multiplier`, `penalty`: of the augmented Lagrangian. `ratio`: the judge's value divided by
-    the search's value. `missed`: g at the last update. `forces`: (judge's value, multiplier) at every update.
+    the search's value. `missed`: g of the judge's value at the last update. `history`: (judge's value, multiplier) of
+    every update.
     """
 
     name: str
@@ -86,7 +88,7 @@ class Limit:
     ratio: float = 1.0
     penalty: float = PENALTY
     missed: float = math.inf
-    forces: tuple[tuple[float, float], ...] = ()
+    history: tuple[tuple[float, float], ...] = ()
 
     @property
     def kind(self) -> Kind:
@@ -113,10 +115,10 @@ class Limit:
         return -excess if self.kind.at_least else excess
 
     def active(self, reached: float | None) -> bool:
-        """Return whether the limit is active: its multiplier is above 0, and the judge's value `reached` is at it.
+        """Return whether the limit is active: its multiplier is above 0, and the judge's value `reached` is near it.
 
-        The tolerance is TOLERANCE_BELOW plus the margin. `reached`: None if no member is judged; the multiplier then
-        decides alone.
+        The tolerance is TOLERANCE_BELOW plus the margin. `reached`: None if no member is judged; then only the
+        multiplier decides.
         """
         near = reached is None or self.log_excess(reached) >= -(TOLERANCE_BELOW + self.margin)
         return self.multiplier > 0 and near
@@ -129,31 +131,33 @@ class Limit:
         """
         judged = judged if math.isfinite(judged) else LOST_FACTOR * max(tuned, self.threshold)
         excess = self.log_excess(judged)
-        force = max(self.multiplier + self.penalty * self.log_excess(self.ratio * tuned), 0.0)
-        slow = force > 0 and abs(excess) > SUFFICIENT_DECREASE * abs(self.missed)
+        multiplier = max(self.multiplier + self.penalty * self.log_excess(self.ratio * tuned), 0.0)
+        slow = multiplier > 0 and abs(excess) > SUFFICIENT_DECREASE * abs(self.missed)
         penalty = min(PENALTY_GROWTH * self.penalty, MOST_PENALTY) if slow else self.penalty
         ratio = max(judged, TINY) / max(tuned, TINY)
-        forces = (*self.forces, (max(judged, TINY), force))
-        return dataclasses.replace(self, multiplier=force, ratio=ratio, penalty=penalty, missed=excess, forces=forces)
+        history = (*self.history, (max(judged, TINY), multiplier))
+        return dataclasses.replace(
+            self, multiplier=multiplier, ratio=ratio, penalty=penalty, missed=excess, history=history
+        )
 
     def restarted(self) -> "Limit":
         """Return the limit with a new augmented Lagrangian, to minimise another quantity. `ratio` is kept."""
-        return dataclasses.replace(self, multiplier=0.0, penalty=PENALTY, missed=math.inf, forces=())
+        return dataclasses.replace(self, multiplier=0.0, penalty=PENALTY, missed=math.inf, history=())
 
     def error_reduction(self, more: float) -> float:
         """Return the relative decrease of the minimised rms value if the limit is looser by the share `more`.
 
         The decrease is 1 - exp(-I/2), where I is the integral of the multiplier over the logarithm of the limit. The
-        optima of earlier updates belong to looser limits. Between them the multiplier is interpolated linearly, and
-        beyond them it is constant.
+        optima of earlier updates are those of looser limits. The multiplier is interpolated linearly between them, and
+        is constant beyond them.
         """
         if not self.multiplier:
             return 0.0
         side = -1.0 if self.kind.at_least else 1.0
-        logs, forces = np.array(sorted((side * math.log(reached), force) for reached, force in self.forces)).T
-        begin = side * math.log(self.forces[-1][0])
+        logs, multipliers = np.array(sorted((side * math.log(reached), one) for reached, one in self.history)).T
+        begin = side * math.log(self.history[-1][0])
         at = np.linspace(begin, begin + math.log1p(more), PRICE_INTERVALS + 1)
-        return -math.expm1(-float(np.trapezoid(np.interp(at, logs, forces), at)) / 2)
+        return -math.expm1(-float(np.trapezoid(np.interp(at, logs, multipliers), at)) / 2)
 
     def reached(self, columns: Mapping[str, np.ndarray]) -> float:
         """Return the judge's value over an ensemble. `columns`: its metrics and terms by name, each [N]."""

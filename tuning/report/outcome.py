@@ -1,4 +1,4 @@
-"""The outcome of tuning, from which exit code, log, report and report.json follow, and the advice."""
+"""The outcome of tuning, which determines exit code, log, report and report.json, and the advice."""
 
 import dataclasses
 
@@ -20,7 +20,7 @@ class TuningOutcome:
 
     `members`: number of members judged. `lost`, `stalled`: numbers of members that are lost, and whose integration
     stalls. `may_lose`: largest number of members that may be lost or stalled. `limits`: the verdict on each limit by
-    name. `refuted`: why accurate steps do not confirm this result; '' if they confirm it.
+    name. `refuted`: the reason why accurate steps do not confirm the result; '' if they do.
     """
 
     members: int
@@ -51,7 +51,7 @@ class TuningOutcome:
         words = []
         if not self.rotors_held:
             ended = f"{self.lost} lost" + f" and {self.stalled} not decided" * bool(self.stalled)
-            words.append(f"{ended} of {self.members} members, at most {self.may_lose} may be")
+            words.append(f"{ended} of {self.members} members (allowed: {self.may_lose})")
         if self.broken:
             words.append(f"{BROKEN}: {', '.join(self.broken)}")
         if self.refuted:
@@ -59,7 +59,7 @@ class TuningOutcome:
         return words
 
     def facts(self) -> Row:
-        """Return the outcome as plain data."""
+        """Return the outcome as a dict for report.json."""
         return dataclasses.asdict(self) | {"good": self.good, "rotors_held": self.rotors_held, "against": self.against}
 
 
@@ -75,7 +75,7 @@ def outcome_of(facts: TuningFacts, may_lose: int) -> TuningOutcome:
 
 
 def verdict(facts: TuningFacts, outcome: TuningOutcome) -> str:
-    """Return the verdict, the status of the judged members, broken and active limits and gains at a bound, as text."""
+    """Return the outcome as text: verdict, lost members, error, limits, sensitive gains and gains at a bound."""
     unjudged = [name for name, found in outcome.limits.items() if found == UNJUDGED]
     met = NO_HELD_OUT if unjudged else ALL_MET
     words = [met if outcome.good else f"{NOT_MET} {'; '.join(outcome.against)}.", _statuses(facts)]
@@ -86,14 +86,14 @@ def verdict(facts: TuningFacts, outcome: TuningOutcome) -> str:
     words += [f"{line}." for line in [*broken(facts.limits), *prices(facts.limits)]]
     if unjudged:
         words.append(f"Limits {UNJUDGED}: {', '.join(unjudged)}.")
-    words += [f"{line}." for line in _cliffs(facts)]
+    words += [f"{line}." for line in _sensitive(facts)]
     ends = [f"{row['path']} = {row['after']:.4g} ({row['at_bound']})" for row in facts.gains if row["at_bound"]]
     if ends:
         words.append(f"Gains at a bound: {', '.join(ends)}.")
     return " ".join(words)
 
 
-def _cliffs(facts: TuningFacts) -> list[str]:
+def _sensitive(facts: TuningFacts) -> list[str]:
     """Return a sentence for each gain that loses training members if it is off by a factor of 1.28."""
     return [
         f"If {row['path']} is off by a factor of 1.28, {row['sensitivity_lost']} of {facts.trained_on} training "
@@ -111,7 +111,7 @@ def _statuses(facts: TuningFacts) -> str:
     undecided = f", {after['stalled']} not decided (their integration stalls)" if after["stalled"] else ""
     return (
         f"Of {after['members']} held-out members, {after['lost']} are lost under the tuned gains (before: "
-        f"{before['lost']}){undecided}; settled rms error of the members held {_error(after)} (before: "
+        f"{before['lost']}){undecided}; settled rms error of the held members: {_error(after)} (before: "
         f"{_error(before)}){_largest(after)}."
     )
 
@@ -121,7 +121,7 @@ def _error(summary: Row) -> str:
 
 
 def _largest(summary: Row) -> str:
-    return f", largest {summary['settled_max_abs_error_m']:.3g} m" if summary["held"] else ""
+    return f"; largest error {summary['settled_max_abs_error_m']:.3g} m" if summary["held"] else ""
 
 
 def advice(problem: TuningProblem, facts: TuningFacts, outcome: TuningOutcome, x: np.ndarray, members: Members) -> str:
@@ -135,7 +135,7 @@ def advice(problem: TuningProblem, facts: TuningFacts, outcome: TuningOutcome, x
     if outcome.refuted:
         words.append(
             f"Not verified: {outcome.refuted}. Raise tune.substeps or tune.stress, or lower the upper "
-            "bounds of gains that end there (tune.bounds)."
+            "bounds of the gains that end at them (tune.bounds)."
         )
     if outcome.broken:
         lines = broken([row for row in facts.limits if row["name"] != "survival"])
@@ -143,11 +143,11 @@ def advice(problem: TuningProblem, facts: TuningFacts, outcome: TuningOutcome, x
     if outcome.stalled:
         words.append(f"Not decided: {outcome.stalled} held-out members, whose integration stalls. Raise tune.substeps.")
     return " ".join(
-        [*words, *(_of_the_lost(problem, facts, x, members) if not outcome.rotors_held and outcome.lost else [])]
+        [*words, *(_causes_of_loss(problem, facts, x, members) if not outcome.rotors_held and outcome.lost else [])]
     )
 
 
-def _of_the_lost(problem: TuningProblem, facts: TuningFacts, x: np.ndarray, members: Members) -> list[str]:
+def _causes_of_loss(problem: TuningProblem, facts: TuningFacts, x: np.ndarray, members: Members) -> list[str]:
     """Return possible causes of lost rotors, with remedies: failing conditions, the voltage limit, gains at a bound."""
     after = facts.after
     judged = f"{after['lost']} of {after['members']} held-out members, " if after["members"] else ""

@@ -1,7 +1,7 @@
 """The method of multipliers: update the limits' multipliers at an optimum and search again until all limits are met.
 
-The judge evaluates the limited quantities at each optimum, on other members than the search. At an optimum, g of a
-limit is about (required multiplier - multiplier) / penalty; the update of the multiplier corrects this excess.
+The judge evaluates the limited quantities at each optimum, on members that the search does not use. There, g of a limit
+is about (required multiplier - multiplier) / penalty. The update of the multiplier reduces this excess.
 """
 
 import math
@@ -21,7 +21,7 @@ from tuning.search.course import Course
 MOST_UPDATES = 6
 # Smallest decrease of g that counts as progress towards a limit.
 LEAST_DECREASE = 1e-3
-# Averages with g below minus this number are not judged again: two ensembles differ by far less.
+# A limit with g below minus this number is clearly met and not judged again, because two ensembles differ by far less.
 CLEARLY_BELOW = 0.1
 # Largest number of members on which averages are judged.
 AVERAGING_MEMBERS = 256
@@ -30,9 +30,9 @@ AVERAGING_MEMBERS = 256
 def limited(course: Course, x: np.ndarray) -> np.ndarray:
     """Update the multipliers at x [m] and search again until every limit is met. Return the last optimum [m].
 
-    Returns x itself if no search was needed. There are at most MOST_UPDATES updates. They end early if Ctrl-C
-    interrupts a search, or if a larger penalty makes no progress towards a limit; the held-out members then decide.
-    `course.problem` keeps the updated limits.
+    Returns x itself if no search was needed. There are at most MOST_UPDATES updates. They end early after Ctrl-C, or
+    if a larger penalty makes no progress towards a limit; whether the limit holds is then judged on the held-out
+    members. `course.problem` receives the updated limits.
     """
     for _ in range(MOST_UPDATES):
         before = course.problem.limits
@@ -59,7 +59,7 @@ def limited(course: Course, x: np.ndarray) -> np.ndarray:
 
 
 def _stuck(limit: Limit, judged: float) -> bool:
-    """Return whether a limit is exceeded by as much as before its penalty grew. `judged`: the judge's value."""
+    """Return whether a limit is exceeded by no less than before its penalty grew. `judged`: the judge's value."""
     excess = limit.log_excess(judged)
     return (
         limit.penalty > PENALTY
@@ -69,9 +69,9 @@ def _stuck(limit: Limit, judged: float) -> bool:
 
 
 def met(limit: Limit, judged: float) -> bool:
-    """Return whether the judge's value is at the bound of an active limit.
+    """Return whether the judge's value is at the bound `Limit.allowed` of an active limit.
 
-    It may lie below the bound by TOLERANCE_BELOW, and above it by half of the margin.
+    g may lie between -TOLERANCE_BELOW and half of the margin.
     """
     return -TOLERANCE_BELOW <= limit.log_excess(judged) <= limit.margin / 2
 
@@ -111,8 +111,8 @@ def reached(
     """Return the judge's value of each limit at x [m].
 
     `columns` [N]: result of `judge` for the ensemble with this `seed`. `tuned`: the search's value of each limit. If
-    injections decide on sensitivities (`measured_peaks.decides`), the worst member is measured by one injection. The
-    injection is left out if an earlier one has corrected `tuned` and all corrected values are clearly within their
+    injections decide on sensitivities (`measured_peaks.decides`), one injection measures the member with the largest
+    peak. It is omitted if an earlier injection has corrected `tuned` and all corrected values are clearly within their
     limits.
     """
     pairs = [(limit, ours) for limit, ours in zip(problem.limits, tuned, strict=True) if limit.name in MEASURED]

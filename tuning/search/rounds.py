@@ -1,9 +1,9 @@
-"""Rounds of searches, repeated until the answer is confirmed.
+"""Rounds of a search and its validation, repeated until the answer is confirmed.
 
-The first round searches with restarts. If the integration steps do not resolve the optimum, the search continues with
-finer steps. If a limit is not met, it continues with other multipliers. The answer is then validated. Validation
-members that are lost, and members that accurate steps do not hold, join the training ensemble for the next round. At
-the end the front of error against voltage is traced, if tune.objective or --pareto requires it.
+The first round searches with restarts. If the error of the integration steps at the optimum is too large, the search
+continues with finer steps. If a limit is not met, it continues with other multipliers. The answer is then validated.
+Validation members that are lost, and members that accurate steps do not hold, join the training ensemble for the next
+round. At the end the front of error against voltage is traced, if tune.objective or --pareto requires it.
 """
 
 import dataclasses
@@ -21,8 +21,8 @@ from tuning.search.front import traced
 from tuning.search.multipliers import limited
 from tuning.search.validation import joining, validated
 
-# Largest number of searches, with restarts and without those that follow an update of the limits' multipliers, and
-# largest number of halvings of the step.
+# Largest number of searches, and of halvings of the step. Restarts count as searches; searches after an update of the
+# multipliers do not.
 MOST_ROUNDS, MOST_HALVINGS = 12, 2
 
 
@@ -33,15 +33,15 @@ def rounds(
 
     `out`: directory of the checkpoints. `facts`: settings that a checkpoint must match. `resume`: whether to continue
     from the checkpoints. The result is the confirmed answer that loses the fewest members; without a confirmed answer,
-    an earlier point of the searches that accurate steps confirm, if there is one. With a front it is the answer that
-    `traced` takes. Raises ValueError if the goal is not finite at any starting point, or if a checkpoint belongs to
-    another search.
+    an earlier point of the searches that accurate steps confirm, if there is one. If a front is traced, the result is
+    the answer that `traced` selects. Raises ValueError if the goal is not finite at any starting point, or if a
+    checkpoint belongs to another search.
     """
     budget, answers = problem.tune.budget, list[SearchResult]()
     course = Course(problem, training(problem), budget.seed, out, facts, resume)
     x = search_and_restart(course, start)
     for number in itertools.count(1):
-        if course.all_lost:  # no gains to continue with
+        if course.all_lost:  # no gains hold any member
             break
         x, error = resolved(course, x)
         held = limited(course, x)
@@ -66,9 +66,10 @@ def rounds(
 
 
 def resolved(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepError]:
-    """Return coordinates [m] and their step error: `x`, or the result of searches in finer steps that resolve it.
+    """Return coordinates [m] whose step error is small enough, and this error.
 
-    There are at most MOST_HALVINGS such searches, so the steps may not resolve the result.
+    The first candidate is `x`; the others are the results of searches that continue from it in finer steps. There are
+    at most MOST_HALVINGS such searches. The error of the last result is returned even if it is too large.
     """
     while True:
         error = step_error(course.problem, x)
