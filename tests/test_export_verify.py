@@ -16,11 +16,13 @@ from ambjax.cases.reader import read_case
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.guard import guarded
 from ambjax.control.processor import Processor
-from ambjax.export import closed_loop, machine
+from ambjax.export import closed_loop
+from ambjax.export.c99 import machine
+from ambjax.export.c99.machine import Compiled
 from ambjax.export.interface import INPUTS
-from ambjax.export.machine import Compiled
+from ambjax.export.numbering import UNREAD
 from ambjax.export.points import evaluated
-from ambjax.export.trace import UNREAD, arguments
+from ambjax.export.trace import arguments
 from ambjax.export.twins import LEAST, PARTED, SIGNALS, Horizon, LoopCase, Twin, _count, farthest
 from ambjax.export.verify import Check, _looped, _stepped, holds, summary, table, verify
 from ambjax.simulation.loop import ClosedLoop
@@ -107,7 +109,7 @@ def test_each_parameter_is_seen_by_the_points(made):
 
 
 def test_a_steepness_of_inf_is_refused_as_the_header_says(made):
-    controller = made.trace.controller
+    controller = made.trace.block
     parameters, memory, inputs, period = arguments(controller)
     step = jax.jit(lambda p: controller.step(p, memory, inputs, period, frozenset(INPUTS)))
 

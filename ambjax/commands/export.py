@@ -16,10 +16,12 @@ from ambjax.commands.warnings import print_warnings
 from ambjax.control.cascade import Cascade
 from ambjax.control.guard import guarded
 from ambjax.ensemble.spread import ends
-from ambjax.export import machine, package, texts, verify
+from ambjax.export import verify
+from ambjax.export.c99 import machine, package, texts
+from ambjax.export.c99.source import Origin
+from ambjax.export.c99.statements import RESERVED
 from ambjax.export.controller import Controller, controller_of
-from ambjax.export.source import Origin
-from ambjax.export.statements import PRECISIONS, RESERVED
+from ambjax.export.program import PRECISIONS
 from ambjax.export.twins import LoopCase
 
 Summary = dict[str, object]
@@ -67,7 +69,7 @@ def _plan(case: Case, args: argparse.Namespace) -> Plan:
     if args.verify:
         machine.check()
     digest = hashlib.sha256(case.text.encode()).hexdigest()
-    origin = Origin(case.name, digest, package.described(controller))
+    origin = Origin(case.name, digest, controller.described())
     out = directory(args.out, f"export-{case.name}")
     mark = texts.MARK.format(p=prefix)
     spare(out, [*(name.format(p=prefix) for name in package.NAMES), *VERIFIED], mark)

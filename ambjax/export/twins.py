@@ -17,7 +17,7 @@ from jax import Array
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import Command
 from ambjax.control.guard import Watch
-from ambjax.export.statements import PRECISIONS
+from ambjax.export.program import PRECISIONS
 from ambjax.numerics.records import Scalar, canonical, record
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import run

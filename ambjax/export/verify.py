@@ -8,13 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ambjax.export import closed_loop
-from ambjax.export.controller import SPAN, Controller
-from ambjax.export.machine import EXACT, SANITIZED, SHARED, STRICT, Compiled, build, execute, scratch, short
-from ambjax.export.package import SHARE, ULPS, tolerance, written
+from ambjax.export.block import Block
+from ambjax.export.c99.machine import EXACT, SANITIZED, SHARED, STRICT, Compiled, build, execute, scratch, short
+from ambjax.export.c99.package import SHARE, ULPS, tolerance, written
+from ambjax.export.c99.source import Origin
+from ambjax.export.numbering import SPAN
 from ambjax.export.points import Points, points, varied
+from ambjax.export.program import PRECISIONS
 from ambjax.export.reference import Results, results
-from ambjax.export.source import Origin
-from ambjax.export.statements import PRECISIONS
 from ambjax.export.trace import Trace, trace
 from ambjax.export.twins import LEAST, PARTED, TWINS, LoopCase
 
@@ -42,7 +43,7 @@ class Check(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Draft:
-    """The files of a controller in one precision, and JAX's results of its step.
+    """The files of a block in one precision, and JAX's results of its step.
 
     `steps`: by check, points and results; one check has the case's parameters, the other has varied ones.
     """
@@ -53,9 +54,9 @@ class Draft:
     steps: Mapping[str, tuple[Points, Results]]
 
 
-def draft(controller: Controller, precision: str, prefix: str, origin: Origin, count: int = COUNT) -> Draft:
-    """Return the files of a controller and JAX's results. Raises ValueError for a law that scalar C cannot express."""
-    traced = trace(controller, precision)
+def draft(block: Block, precision: str, prefix: str, origin: Origin, count: int = COUNT) -> Draft:
+    """Return the files of a block and JAX's results. Raises ValueError for a law that scalar code cannot express."""
+    traced = trace(block, precision)
     at = {"one step": points(traced, count), "parameters": varied(traced, count)}
     steps = {name: (x, results(traced, x)) for name, x in at.items()}
     return Draft(traced, prefix, written(traced, prefix, origin), steps)
@@ -74,7 +75,7 @@ def verify(drafts: Mapping[str, Draft], case: LoopCase | None) -> list[Check]:
             for name, text in one.files.items():
                 (at / name).write_text(text, encoding="utf-8")
             checks += _built(one, precision, at)
-            if checks[-1].ok and (library := at / "controller.so").exists():
+            if checks[-1].ok and (library := at / "block.so").exists():
                 machines[precision] = Compiled(library, one.trace, one.prefix)
                 for name in one.steps:
                     checks += _stepped(name, one, precision, machines[precision])
@@ -95,7 +96,7 @@ def _built(one: Draft, precision: str, at: pathlib.Path) -> Iterator[Check]:
         if not messages:
             code, output = execute(program)
             yield Check(f"test program{how}", precision, short(output), "exit code 0", code == 0)
-    messages = build([source], at / "controller.so", *SHARED)
+    messages = build([source], at / "block.so", *SHARED)
     yield Check("library", precision, short(messages) or "no warning", EXACT, not messages)
 
 
