@@ -111,7 +111,9 @@ def parser() -> Parser:
         "--tune", action="store_true", help="first tune each case, with limits, loss and budget of the first case"
     )
     _seed_option(compare)
-    export = command("export", "write the controller of a case with [processor] as C", case=True, out=True)
+    export = command("export", "write controller, plant or loop of a case with [processor] as C", case=True, out=True)
+    parts = ["controller", "plant", "loop"]
+    export.add_argument("--what", choices=parts, default="controller", help="part of the loop (default: controller)")
     export.add_argument("--verify", action="store_true", help="compare the C with JAX; exit code 1 if they differ")
     export.add_argument("--precision", choices=["float", "double"], default="float", help="C type of all numbers")
     export.add_argument("--prefix", metavar="NAME", help="prefix of all names in the C code (default: the case's name)")

@@ -171,12 +171,12 @@ def horizon(samples, of=100):
 
 def test_a_loop_is_judged_against_its_twins_within_the_horizon_only():
     one, twins = horizon(50), np.linspace(0, 1e-6, 100)
-    assert closed_loop._times(0.5 * twins, one) == pytest.approx(0.5, abs=1e-12)
-    assert closed_loop._times(np.where(np.arange(100) < 50, twins, 1.0), one) == pytest.approx(1, abs=1e-12)
-    assert closed_loop._times(np.where(np.arange(100) < 49, twins, 1.0), one) > 1e5
-    assert closed_loop._times(np.full(100, 1e-30), one) == INF  # off where no twin is
-    assert closed_loop._times(np.full(100, np.nan), one) == INF
-    assert np.isnan(closed_loop._times(twins, horizon(LEAST - 1)))
+    assert closed_loop.times_of(0.5 * twins, one) == pytest.approx(0.5, abs=1e-12)
+    assert closed_loop.times_of(np.where(np.arange(100) < 50, twins, 1.0), one) == pytest.approx(1, abs=1e-12)
+    assert closed_loop.times_of(np.where(np.arange(100) < 49, twins, 1.0), one) > 1e5
+    assert closed_loop.times_of(np.full(100, 1e-30), one) == INF  # off where no twin is
+    assert closed_loop.times_of(np.full(100, np.nan), one) == INF
+    assert np.isnan(closed_loop.times_of(twins, horizon(LEAST - 1)))
 
 
 def test_a_horizon_too_short_decides_nothing():

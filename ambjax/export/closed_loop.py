@@ -107,11 +107,13 @@ def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, Lo
     host, found = Machines(*machines.values()), {}
     for which, (precision, horizon) in enumerate(horizons(case, list(machines)).items()):
         looped = CompiledLoop(ClosedLoop(given.loop.cascade, case.scenario), given.period, given.cuts, which, host)
-        found[precision] = LoopComparison(horizon, _times(_displacement(looped, case.clock, horizon.samples), horizon))
+        found[precision] = LoopComparison(
+            horizon, times_of(_displacement(looped, case.clock, horizon.samples), horizon)
+        )
     return found
 
 
-def _times(z: np.ndarray, horizon: Horizon) -> float:
+def times_of(z: np.ndarray, horizon: Horizon) -> float:
     """Return the distance of z from JAX's divided by that of the twins, the largest over the horizon."""
     n = horizon.samples
     if not horizon.decisive:

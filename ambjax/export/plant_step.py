@@ -208,7 +208,7 @@ class PlantStep(Block):
 
     def numbers(self) -> list[Number]:
         found = list(numbers_of(self.parameters))
-        assert [x.value for x in found] == scales(self.parameters)
+        assert [x.value for x in found] == [float(x) for x in jax.tree.leaves(self.parameters)]
         whole: Any = self.cascade.processor
         most, words = whole.most, "whole: rounded down" if whole.whole else ""
         allowed = ", ".join(filter(None, (f"from 0 to {MOST_DELAY:g}", words)))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ambjax.export import closed_loop
+from ambjax.export import closed_loop, plant_loop
 from ambjax.export.block import Block
 from ambjax.export.c99.machine import EXACT, SANITIZED, SHARED, STRICT, Compiled, build, execute, scratch, short
 from ambjax.export.c99.package import SHARE, ULPS, tolerance, written
@@ -80,8 +80,9 @@ def verify(drafts: Mapping[str, Draft], case: LoopCase | None) -> list[Check]:
                 for name in one.steps:
                     checks += _stepped(name, one, precision, machines[precision])
         if case is not None and len(machines) == len(drafts):
-            for precision, found in closed_loop.compare_loops(case, machines).items():
-                checks.append(_looped(precision, found))
+            whole = any(one.trace.block.noun != "controller" for one in drafts.values())
+            compare = plant_loop.compare_blocks if whole else closed_loop.compare_loops
+            checks += [_looped(precision, found) for precision, found in compare(case, machines).items()]
     return checks
 
 
@@ -140,13 +141,13 @@ def _looped(precision: str, found: closed_loop.LoopComparison) -> Check:
     return Check(name, precision, result, allowed, found.times <= closed_loop.TIMES)
 
 
-def table(checks: list[Check], case: str, mark: str) -> str:
+def table(checks: list[Check], case: str, mark: str, noun: str = "controller") -> str:
     """Return the checks as a Markdown page that ends with the line `mark`."""
     rows = [f"| {x.name} | {x.precision} | {x.found} | {x.allowed} | {x.verdict} |" for x in checks]
     verdict = summary(checks)
     head = "| check | precision | found | allowed | verdict |\n|---|---|---|---|---|"
     return (
-        f"# The controller of case '{case}' as C, compared with JAX\n\n{verdict}\n\n{head}\n"
+        f"# The {noun} of case '{case}' as C, compared with JAX\n\n{verdict}\n\n{head}\n"
         + "\n".join(rows)
         + f"\n\n{NOTES}\n{mark}\n"
     )
@@ -176,11 +177,13 @@ parameter that the step reads is set to {1 / SPAN:g} and {SPAN:g} times the case
 header, first alone, then with the others at random ends of their ranges. Alone, it is also set to NaN, u_max and a
 steepness p to inf, and processor.delay to values outside its range: the C must reject what JAX rejects.
 
-Closed loop: JAX's plant and sensors with the compiled C, compared with the same loop in JAX in double precision. Signs
-and converters amplify rounding errors, so the loops are compared only while these errors are small. {TWINS} twins of
-JAX's loop measure them: in each, every state of plant and laws and the voltage is changed by one unit in the last place
-of the precision, up or down at random, at every sample. The horizon ends before the first sample at which a twin
-differs by more than {PARTED:g} of the rms of z - r, or of the rms of u, or at which the rotor is lost. Within the
-horizon, z of the C's loop may differ by at most {closed_loop.TIMES:g} times the difference of the farthest twin, at
-every sample. With a horizon of fewer than {LEAST} samples the row is not decisive.
+Closed loop: the compiled C with the rest of the loop in JAX (a controller with JAX's plant and sensors, a plant with
+JAX's controller), compared with the same loop in JAX in double precision. An exported plant or loop has disturbances
+that are constant over each sample, and so has JAX's loop in this comparison. Signs and converters amplify rounding
+errors, so the loops are compared only while these errors are small. {TWINS} twins of JAX's loop measure them: in
+each, every state of plant and laws and the voltage is changed by one unit in the last place of the precision, up or
+down at random, at every sample. The horizon ends before the first sample at which a twin differs by more than
+{PARTED:g} of the rms of z - r, or of the rms of u, or at which the rotor is lost. Within the horizon, z of the C's
+loop may differ by at most {closed_loop.TIMES:g} times the difference of the farthest twin, at every sample. With a
+horizon of fewer than {LEAST} samples the row is not decisive.
 """
