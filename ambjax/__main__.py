@@ -21,6 +21,7 @@ ambjax simulates, checks, tunes and exports the controller of a rotor in an acti
   ambjax check my.toml                check the sensitivity, margins and stability conditions
   ambjax tune my.toml --out tuned     tune the gains: tuned/tuned.toml, tuned/report.html
   ambjax export tuned/tuned.toml      write the controller as C
+  ambjax page my.toml                 write one HTML file with sliders that runs the loop in a browser
 
 'ambjax --help' lists all commands, 'ambjax COMMAND --help' the options of a command."""
 
@@ -117,6 +118,12 @@ def parser() -> Parser:
     export.add_argument("--verify", action="store_true", help="compare the C with JAX; exit code 1 if they differ")
     export.add_argument("--precision", choices=["float", "double"], default="float", help="C type of all numbers")
     export.add_argument("--prefix", metavar="NAME", help="prefix of all names in the C code (default: the case's name)")
+    page = command("page", "write one HTML file with sliders in which the sampled loop of a case runs", case=True)
+    page.add_argument(
+        "--also", metavar="OTHER.toml", action="append", help="a case that differs in numbers, as a preset (repeatable)"
+    )
+    page.add_argument("--out", metavar="FILE.html", help="the file (default: page.html in a new directory under ./out)")
+    page.add_argument("--force", action="store_true", help="overwrite the file of an earlier run")
     # Listed for --help only; main passes the arguments of `tune` to the tuner's own parser.
     command("tune", "tune the gains of a case on an ensemble of rotors: tuned.toml, report.html")
     return top
