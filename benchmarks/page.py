@@ -12,8 +12,7 @@ import sys
 import tempfile
 
 os.environ["JAX_ENABLE_X64"] = "1"
-ROOT = pathlib.Path(__file__).parent.parent
-sys.path.append(str(ROOT / "tests"))
+sys.path.append(str(pathlib.Path(__file__).parent.parent / "tests"))
 
 import _measure
 import browser

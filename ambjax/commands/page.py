@@ -15,8 +15,10 @@ Summary = dict[str, object]
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """Write the page of a case."""
     case = read_with_warnings(args.case)
+    given = _target(args.out, args.force)
     text = page(case, [read_case(path) for path in args.also or []], args.case)
-    out = _target(args.out, args.force) or directory(None, f"page-{case.name}") / NAME
+    out = given or directory(None, f"page-{case.name}") / NAME
+    make(out.parent)
     with files(out.parent) as part:
         (part / out.name).write_text(text, encoding="utf-8")
     if not args.json:
@@ -25,7 +27,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 
 def _target(given: str | None, force: bool) -> pathlib.Path | None:
-    """Return the file that --out names, in a folder that exists, or None. Raises ValueError if it is in use."""
+    """Return the file that --out names, or None. Raises ValueError if it is in use."""
     if given is None:
         return None
     out = pathlib.Path(given)
@@ -33,5 +35,4 @@ def _target(given: str | None, force: bool) -> pathlib.Path | None:
         raise ValueError(f"--out {given}: it must be the name of an HTML file. Use --out {NAME}, for example.")
     if out.exists() and not force:
         raise ValueError(f"--out {given}: the file exists. Choose another name, or overwrite it with --force.")
-    make(out.parent)
     return out

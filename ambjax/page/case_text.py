@@ -13,6 +13,9 @@ from ambjax.page.sliders import Slider
 # Numbers that mark the places of the sliders; no case contains them.
 MARK = "1{:05d}e207"
 
+# Prefixes of the tables of signals, which name their kind.
+SIGNALS = "reference", "disturbance"
+
 
 class Line(NamedTuple):
     """A line of the case file.
@@ -55,6 +58,8 @@ def template(text: str, given: Sequence[Slider]) -> tuple[list[Line], list[int]]
         placed = [k for k in placed if k not in keep.values()]
     for table, names in added.items():
         rows = [([f"{name} = ", (k, ""), ""], [k]) for name, k in names.items()]
+        if _find(document, table.split(".")) is None and table.startswith(SIGNALS):
+            rows = [(['kind = "constant"'], sorted(names.values())), *rows]
         _insert(lines, table, _find(document, table.split(".")) is not None, rows)
     return lines, placed
 

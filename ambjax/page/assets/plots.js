@@ -42,7 +42,7 @@ function addPlot({ id, title, y, unit, lines, x = "time in s", range = null, hei
     const tip = log ? `${name}: @y{0.000e} ${unit} at @x{0.00} Hz` : `${name}: @y{0.0000} ${unit} at @x{0.00000} s`;
     figure.add_tools(new Bokeh.HoverTool({ renderers: [line], tooltips: [["", tip]], mode: "mouse", line_policy: "nearest" }));
   });
-  Object.assign(figure.legend, { click_policy: "hide", background_fill_alpha: 0.7, label_text_font_size: "11px", padding: 4, margin: 4 });
+  Object.assign(figure.legend, { click_policy: "hide", background_fill_alpha: 0.85, label_text_font_size: "11px", padding: 4, margin: 4 });
   return { id, title, figure, sources, lines };
 }
 
@@ -71,6 +71,7 @@ async function buildPlots(parent) {
   const zones = (figure) => data.linear.zones.forEach((limit, k) => figure.add_layout(new Bokeh.Span({ location: limit, dimension: "width", line_color: ["#2f7d32", "#b07a00", "#a30000"][k], line_dash: "dashed" })));
   const sensitivityPlot = addPlot({ id: "sensitivity", title: "Sensitivity |S|", y: "|S|", unit: "", lines: [["|S|", null]], heights: new Bokeh.Range1d({ start: 0.01, end: 10 }), more: zones, ...hertz });
   await showPlots(parent, [...timed, members, spectrumPlot, sensitivityPlot]);
+  parent.append(byId("machine"));
   let shown = null;
   const drawTimes = () => {
     if (shown === null) return;

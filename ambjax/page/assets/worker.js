@@ -72,8 +72,17 @@ function slice(state) {
   while (state.member < setup.members.count && performance.now() < until) addMember(state);
   if (state.member < setup.members.count) return soon(() => slice(state));
   const { low, high, alive, kept, began, job } = state;
-  busy = false;
+  if (job.id === 1) soon(() => warmed(job.P, 4));
+  else busy = false;
   postMessage({ kind: "members", id: job.id, low, high, alive, kept, count: setup.members.count, took: performance.now() - began });
+}
+
+// Run the loop a few times while the page is idle, so that the browser compiles it before the first drag.
+function warmed(P, times) {
+  if (latest !== null) return work();
+  simulated(P);
+  if (times > 1) return soon(() => warmed(P, times - 1));
+  busy = false;
 }
 
 function work() {
