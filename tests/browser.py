@@ -2,12 +2,13 @@
 
 import base64
 import contextlib
+import fcntl
 import itertools
 import json
 import os
 import pathlib
 import shutil
-import subprocess
+import signal
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -118,27 +119,19 @@ KEYS = {"ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, "Tab"
 def browser(folder: pathlib.Path) -> Iterator[Tab]:
     """Start Chromium with its profile in `folder`, and yield a tab. No name of a host resolves."""
     assert CHROMIUM, MISSING
-    to_read, send = os.pipe()
-    receive, to_write = os.pipe()
-
-    def descriptors() -> None:
-        # 3 and 4 may be among the four: duplicate them first
-        low, high = os.dup(to_read), os.dup(to_write)
-        os.dup2(low, 3)
-        os.dup2(high, 4)
-
-    process = subprocess.Popen(
-        [CHROMIUM, *FLAGS, f"--user-data-dir={folder}/profile"],
-        preexec_fn=descriptors,
-        close_fds=False,
-        stderr=subprocess.DEVNULL,
-    )
-    os.close(to_read)
-    os.close(to_write)
+    pipes = [*os.pipe(), *os.pipe()]
+    to_read, send, receive, to_write = (fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10) for end in pipes)
+    # not subprocess with preexec_fn: JAX warns of a fork
+    actions = [(os.POSIX_SPAWN_DUP2, to_read, 3), (os.POSIX_SPAWN_DUP2, to_write, 4)]
+    actions.append((os.POSIX_SPAWN_OPEN, 2, os.devnull, os.O_WRONLY, 0))
+    words = [CHROMIUM, *FLAGS, f"--user-data-dir={folder}/profile"]
+    process = os.posix_spawn(CHROMIUM, words, os.environ, file_actions=actions)
+    for end in (*pipes, to_read, to_write):
+        os.close(end)
     try:
         yield Tab(send, receive)
     finally:
-        process.kill()
-        process.wait()
+        os.kill(process, signal.SIGKILL)
+        os.waitpid(process, 0)
         os.close(send)
         os.close(receive)

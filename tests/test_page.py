@@ -177,13 +177,15 @@ class TestInABrowser:
 
     def test_members_are_those_of_the_ensemble(self, fresh, case):
         study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, MEMBERS)
-        errors = np.asarray(run_ensemble(*study.batch(np.arange(MEMBERS)), case.clock, every=1).trajectory.rows.e_z)
+        errors = np.asarray(
+            run_ensemble(*study.batch(np.arange(MEMBERS)), case.clock, fold=None, every=1).trajectory.rows.e_z
+        )
         low, high = (np.array(fresh.run(f"Array.from(ambjax.state.envelope.{end})")) for end in ("low", "high"))
         np.testing.assert_allclose([low, high], [errors.min(axis=0), errors.max(axis=0)], rtol=0, atol=1e-12)
         assert fresh.run("ambjax.state.envelope.kept") == MEMBERS
 
     def test_sensitivity_is_that_of_the_linear_analysis(self, fresh, case):
-        for delay in ("1", "0.5", "1.25"):
+        for delay in ("1", "1.25"):
             typed(fresh, "processor.delay", delay)
             other = rig(re.sub(r"delay = 1.0", f"delay = {delay}", RIG))
             system = linearise(other.cascade, other.scenario, other.clock)
