@@ -72,6 +72,7 @@ def parser() -> Parser:
     simulate.add_argument("--members", type=int, metavar="N", help=meaning)
     simulate.add_argument("--from", dest="begin", type=float, metavar="T", help="plot the run from time T (s)")
     simulate.add_argument("--to", dest="end", type=float, metavar="T", help="plot the run up to time T (s)")
+    _page_option(simulate)
     ensemble = command("ensemble", "simulate many members: members.npz, summary.json, fan.png", case=True, out=True)
     ensemble.add_argument("--members", type=int, metavar="N", required=True, help="number of members")
     _seed_option(ensemble)
@@ -112,6 +113,7 @@ def parser() -> Parser:
         "--tune", action="store_true", help="first tune each case, with limits, loss and budget of the first case"
     )
     _seed_option(compare)
+    _page_option(compare)
     export = command("export", "write controller, plant or loop of a case with [processor] as C", case=True, out=True)
     parts = ["controller", "plant", "loop"]
     export.add_argument("--what", choices=parts, default="controller", help="part of the loop (default: controller)")
@@ -133,6 +135,10 @@ def _seed_option(command: Parser) -> None:
     command.add_argument(
         "--seed", type=int, metavar="S", help="seed of the noise and of [spread] (default: run.seed of the case)"
     )
+
+
+def _page_option(command: Parser) -> None:
+    command.add_argument("--page", action="store_true", help="also write page.html, with sliders (needs [processor])")
 
 
 def main(argv: list[str] | None = None) -> int:

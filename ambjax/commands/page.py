@@ -6,9 +6,8 @@ import pathlib
 from ambjax.cases.reader import read_case
 from ambjax.commands.outputs import directory, files, make, written
 from ambjax.commands.warnings import read_with_warnings
-from ambjax.page.document import page
+from ambjax.page.document import NAME, page
 
-NAME = "page.html"
 Summary = dict[str, object]
 
 

@@ -24,6 +24,8 @@ from ambjax.page.sliders import GROUPS, SEED, Slider, changed, parameter_values,
 from ambjax.simulation.metrics import UNITS
 from ambjax.simulation.trajectory import STATUSES
 
+# Name of the file.
+NAME = "page.html"
 # Number of members of the envelope.
 MEMBERS = 64
 # Scripts of the worker and of the page, in order.
@@ -57,6 +59,30 @@ def page(case: Case, others: Sequence[Case] = (), path: str = "case.toml") -> st
     return head + "\n".join(blocks) + scripts + body
 
 
+def pages(cases: Sequence[Case], paths: Sequence[str]) -> dict[str, str]:
+    """Return pages by file name: page.html, page-2.html, ..., one for all cases that differ in numbers only.
+
+    `paths`: the case files. Raises ValueError as `page` does.
+    """
+    groups: list[list[int]] = []
+    for k, case in enumerate(cases):
+        check_processor(case, paths[k])
+        group = next((group for group in groups if _alike(cases[group[0]], case)), None)
+        if group is None:
+            groups.append(group := [])
+        group.append(k)
+    texts = [page(cases[first], [cases[k] for k in others], paths[first]) for first, *others in groups]
+    return {NAME if k == 1 else NAME.replace(".", f"-{k}."): text for k, text in enumerate(texts, 1)}
+
+
+def check_processor(case: Case, path: str) -> None:
+    """Raise ValueError for a case without a processor."""
+    if case.cascade.processor is None:
+        raise ValueError(
+            f"{path}: the page runs a controller on a processor, and this case has none. Add the table [processor]."
+        )
+
+
 def _block(name: str, text: str) -> str:
     """Return JSON as an element that scripts read; no text in it can end the element."""
     safe = text.replace("<", "\\u003c")
@@ -75,10 +101,7 @@ def _library() -> list[str]:
 
 def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str, Any]]:
     """Return the script of the worker, and the data of the page."""
-    if case.cascade.processor is None:
-        raise ValueError(
-            f"{path}: the page runs a controller on a processor, and this case has none. Add the table [processor]."
-        )
+    check_processor(case, path)
     for other in others:
         _check_structure(case, other, path)
     case = _finest(case, others)
@@ -148,12 +171,17 @@ def _preset(case: Case, lines: list[Line]) -> dict[str, Any]:
 
 
 def _check_structure(case: Case, other: Case, path: str) -> None:
-    same = other.cascade.processor is not None and other.clock.samples == case.clock.samples
-    if not same or jax.tree.structure(numbers_of(other)) != jax.tree.structure(numbers_of(case)):
+    if not _alike(case, other):
         raise ValueError(
             f"--also {other.name}: it differs from {path} in more than numbers. Give a case with the same laws, plant, "
             "signals, sensors and number of samples, such as tuned.toml."
         )
+
+
+def _alike(case: Case, other: Case) -> bool:
+    """Return whether two cases differ in numbers only."""
+    same = other.cascade.processor is not None and other.clock.samples == case.clock.samples
+    return same and jax.tree.structure(numbers_of(other)) == jax.tree.structure(numbers_of(case))
 
 
 def _finest(case: Case, others: list[Case]) -> Case:

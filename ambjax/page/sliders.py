@@ -77,7 +77,18 @@ def sliders(case: Case, others: list[Case]) -> list[Slider]:
         words = meta["unit"] or UNITS.get(str(place.route[1]), ""), meta["doc"]
         excluded = meta["above"] is not None
         one = Slider(
-            path, *words, index[path], values[0], low, high, log, least, most, excluded, path == SEED or bool(meta["whole"]), grid
+            path,
+            *words,
+            index[path],
+            values[0],
+            low,
+            high,
+            log,
+            least,
+            most,
+            excluded,
+            path == SEED or bool(meta["whole"]),
+            grid,
         )
         found.append(one)
     order = list(GROUPS)
