@@ -21,6 +21,7 @@ ambjax simulates, checks, tunes and exports the controller of a rotor in an acti
   ambjax check my.toml                check the sensitivity, margins and stability conditions
   ambjax tune my.toml --out tuned     tune the gains: tuned/tuned.toml, tuned/report.html
   ambjax export tuned/tuned.toml      write the controller as C
+  ambjax page my.toml                 write one HTML file with sliders that runs the loop in a browser
 
 'ambjax --help' lists all commands, 'ambjax COMMAND --help' the options of a command."""
 
@@ -71,6 +72,7 @@ def parser() -> Parser:
     simulate.add_argument("--members", type=int, metavar="N", help=meaning)
     simulate.add_argument("--from", dest="begin", type=float, metavar="T", help="plot the run from time T (s)")
     simulate.add_argument("--to", dest="end", type=float, metavar="T", help="plot the run up to time T (s)")
+    _page_option(simulate)
     ensemble = command("ensemble", "simulate many members: members.npz, summary.json, fan.png", case=True, out=True)
     ensemble.add_argument("--members", type=int, metavar="N", required=True, help="number of members")
     _seed_option(ensemble)
@@ -111,10 +113,19 @@ def parser() -> Parser:
         "--tune", action="store_true", help="first tune each case, with limits, loss and budget of the first case"
     )
     _seed_option(compare)
-    export = command("export", "write the controller of a case with [processor] as C", case=True, out=True)
+    _page_option(compare)
+    export = command("export", "write controller, plant or loop of a case with [processor] as C", case=True, out=True)
+    parts = ["controller", "plant", "loop"]
+    export.add_argument("--what", choices=parts, default="controller", help="part of the loop (default: controller)")
     export.add_argument("--verify", action="store_true", help="compare the C with JAX; exit code 1 if they differ")
     export.add_argument("--precision", choices=["float", "double"], default="float", help="C type of all numbers")
     export.add_argument("--prefix", metavar="NAME", help="prefix of all names in the C code (default: the case's name)")
+    page = command("page", "write one HTML file with sliders in which the sampled loop of a case runs", case=True)
+    page.add_argument(
+        "--also", metavar="OTHER.toml", action="append", help="a case that differs in numbers, as a preset (repeatable)"
+    )
+    page.add_argument("--out", metavar="FILE.html", help="the file (default: page.html in a new directory under ./out)")
+    page.add_argument("--force", action="store_true", help="overwrite the file of an earlier run")
     # Listed for --help only; main passes the arguments of `tune` to the tuner's own parser.
     command("tune", "tune the gains of a case on an ensemble of rotors: tuned.toml, report.html")
     return top
@@ -124,6 +135,10 @@ def _seed_option(command: Parser) -> None:
     command.add_argument(
         "--seed", type=int, metavar="S", help="seed of the noise and of [spread] (default: run.seed of the case)"
     )
+
+
+def _page_option(command: Parser) -> None:
+    command.add_argument("--page", action="store_true", help="also write page.html, with sliders (needs [processor])")
 
 
 def main(argv: list[str] | None = None) -> int:

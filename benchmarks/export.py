@@ -19,10 +19,10 @@ import numpy as np
 
 from ambjax import Cascade, current, inversion, observer, position
 from ambjax.control.processor import Processor
-from ambjax.export import machine
+from ambjax.export.c99 import machine
+from ambjax.export.c99.package import written
+from ambjax.export.c99.source import Origin
 from ambjax.export.controller import controller_of
-from ambjax.export.package import described, written
-from ambjax.export.source import Origin
 from ambjax.export.trace import trace
 
 HARD = np.inf
@@ -113,7 +113,7 @@ def measured(cascade: Cascade, precision: str) -> dict[str, Any]:
     traced = trace(controller, precision)
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
-        for file, text in written(traced, "amb", Origin("benchmark", "-", described(controller))).items():
+        for file, text in written(traced, "amb", Origin("benchmark", "-", controller.described())).items():
             (folder / file).write_text(text)
         (folder / "here.c").write_text(HERE)
         said = machine.build([folder / "amb.c", folder / "here.c"], folder / "here", "-std=gnu99")

@@ -25,13 +25,13 @@ from ambjax.control import current, inversion, observer, position
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.guard import Guard
 from ambjax.control.processor import Processor
-from ambjax.export import machine
+from ambjax.export.c99 import machine
+from ambjax.export.c99.machine import Compiled, build
+from ambjax.export.c99.package import files
+from ambjax.export.c99.source import Origin, Writer
+from ambjax.export.c99.texts import MARK
 from ambjax.export.controller import controller_of
 from ambjax.export.interface import StepInputs
-from ambjax.export.machine import Compiled, build
-from ambjax.export.package import described, files
-from ambjax.export.source import Origin, Writer
-from ambjax.export.texts import MARK
 from ambjax.export.trace import arguments, trace
 from ambjax.export.twins import LoopCase
 from ambjax.export.verify import draft, verify
@@ -123,7 +123,7 @@ FAST = [("one and a half", "double")]
 
 def drafts(cascade, precisions=("float", "double"), count=10_000, u_max=200.0, scenario=None):
     controller = controller_of(cascade, u_max, PERIOD, scenario)
-    origin = Origin("test", "0" * 64, described(controller))
+    origin = Origin("test", "0" * 64, controller.described())
     return {name: draft(controller, name, "amb", origin, count) for name in precisions}
 
 
@@ -270,7 +270,7 @@ def test_the_header_says_what_delay_may_be_set(processor, allowed):
 
 def written(cascade, to, u_max):
     controller = controller_of(cascade, u_max, PERIOD)
-    return files(controller, to, "amb", Origin("test", "0" * 64, described(controller)))
+    return files(controller, to, "amb", Origin("test", "0" * 64, controller.described()))
 
 
 kept = functools.cache(written)  # many tests read the same text
@@ -590,7 +590,7 @@ def test_a_law_that_is_no_scalar_code_is_named():
             return jnp.interp(wanted, jnp.arange(3.0), jnp.arange(3.0)), state
 
     cascade = hard(position=Table(), processor=Processor(1.0, implicit=False))
-    with pytest.raises(ValueError, match=r"test_export\..*Table: the primitive .* cannot be written as scalar C"):
+    with pytest.raises(ValueError, match=r"test_export\..*Table: the primitive .* cannot be written as scalar code"):
         text(cascade)
     with pytest.raises(ValueError, match=r"controller.current.k_i has the shape \(2,\): only scalars"):
         written(hard(current=current.SlidingMode(np.array([1.0, 2.0]))), "double", 200.0)

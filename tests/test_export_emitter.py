@@ -12,10 +12,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from jax import lax
 
+from ambjax.export.c99.statements import Statements
 from ambjax.export.emitter import traced
 from ambjax.export.primitives import OPS, SAME
-from ambjax.export.program import Program, Ref
-from ambjax.export.statements import PRECISIONS, Statements
+from ambjax.export.program import PRECISIONS, Location, Program, Ref
 from ambjax.export.trace import precision
 
 UNARY = {
@@ -58,12 +58,12 @@ def compiled(function, to, folder, count):
     """A function of two scalars that gives a tuple, as C: of rows of points."""
     dtype, program = np.dtype(PRECISIONS[to]), Program()
     with precision(to):
-        refs = [program.input(text, dtype) for text in ("x[0]", "x[1]")]
+        refs = [program.input(Location("input", name), dtype) for name in "ab"]
         results = traced(program, function, (jnp.ones((), dtype), jnp.ones((), dtype)), refs)
     order = sorted(n for n in program.needed(results) if program.nodes[n].op != "input")
     text = Statements(program, order, to, "amb")
-    lines = ["#include <math.h>", f"typedef {to} amb_real;", *text.helpers()]
-    lines += ["void amb(const amb_real *x, amb_real *y) {", *text.body()]
+    lines = ["#include <math.h>", f"typedef {to} amb_real;", "typedef struct { amb_real a, b; } amb_input;"]
+    lines += [*text.helpers(), "void amb(const amb_input *input, amb_real *y) {", *text.body()]
     lines += [f"    y[{k}] = {text.operand(x)};" for k, x in enumerate(results)] + ["}"]
     (folder / "amb.c").write_text("\n".join(lines))
     flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic", "-Werror"]
@@ -105,7 +105,7 @@ def test_every_primitive_against_jax(to, tmp_path):
 
 def test_no_primitive_is_untested():
     program, one = Program(), np.ones(())
-    refs = [program.input(name, float) for name in "xy"]
+    refs = [program.input(Location("input", name), float) for name in "xy"]
     traced(program, lambda x, y: tuple(f(x, y) for f in listed().values()), (one, one), refs)
     assert {node.op for node in program.nodes} == {*OPS, "input"}
 
@@ -146,7 +146,7 @@ def test_any_expression_is_what_jax_makes_of_it(tree, x, y):
         return OPERATIONS[tree[0]](*(value(branch, x, y) for branch in tree[1:]))
 
     program, one = Program(), np.ones(())
-    refs = [program.input(name, float) for name in "xy"]
+    refs = [program.input(Location("input", name), float) for name in "xy"]
     (result,) = traced(program, lambda x, y: jnp.asarray(value(tree, x, y)), (one, one), refs)
     values = program.evaluate({0: np.asarray(x), 1: np.asarray(y)})
     found = values[result.node] if isinstance(result, Ref) else result
@@ -157,7 +157,9 @@ def test_any_expression_is_what_jax_makes_of_it(tree, x, y):
 def count(function, *shapes):
     program = Program()
     args = [jnp.zeros(shape) for shape in shapes]
-    results = traced(program, function, args, [program.input(f"x{n}", float) for n in range(len(args))])
+    results = traced(
+        program, function, args, [program.input(Location("input", f"x{n}"), float) for n in range(len(args))]
+    )
     return program, results, [program.nodes[n].op for n in sorted(program.needed(results)) if program.nodes[n].args]
 
 

@@ -16,11 +16,13 @@ from ambjax.cases.reader import read_case
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.guard import guarded
 from ambjax.control.processor import Processor
-from ambjax.export import closed_loop, machine
+from ambjax.export import closed_loop
+from ambjax.export.c99 import machine
+from ambjax.export.c99.machine import Compiled
 from ambjax.export.interface import INPUTS
-from ambjax.export.machine import Compiled
+from ambjax.export.numbering import UNREAD
 from ambjax.export.points import evaluated
-from ambjax.export.trace import UNREAD, arguments
+from ambjax.export.trace import arguments
 from ambjax.export.twins import LEAST, PARTED, SIGNALS, Horizon, LoopCase, Twin, _count, farthest
 from ambjax.export.verify import Check, _looped, _stepped, holds, summary, table, verify
 from ambjax.simulation.loop import ClosedLoop
@@ -107,7 +109,7 @@ def test_each_parameter_is_seen_by_the_points(made):
 
 
 def test_a_steepness_of_inf_is_refused_as_the_header_says(made):
-    controller = made.trace.controller
+    controller = made.trace.block
     parameters, memory, inputs, period = arguments(controller)
     step = jax.jit(lambda p: controller.step(p, memory, inputs, period, frozenset(INPUTS)))
 
@@ -169,12 +171,12 @@ def horizon(samples, of=100):
 
 def test_a_loop_is_judged_against_its_twins_within_the_horizon_only():
     one, twins = horizon(50), np.linspace(0, 1e-6, 100)
-    assert closed_loop._times(0.5 * twins, one) == pytest.approx(0.5, abs=1e-12)
-    assert closed_loop._times(np.where(np.arange(100) < 50, twins, 1.0), one) == pytest.approx(1, abs=1e-12)
-    assert closed_loop._times(np.where(np.arange(100) < 49, twins, 1.0), one) > 1e5
-    assert closed_loop._times(np.full(100, 1e-30), one) == INF  # off where no twin is
-    assert closed_loop._times(np.full(100, np.nan), one) == INF
-    assert np.isnan(closed_loop._times(twins, horizon(LEAST - 1)))
+    assert closed_loop.times_of(0.5 * twins, one) == pytest.approx(0.5, abs=1e-12)
+    assert closed_loop.times_of(np.where(np.arange(100) < 50, twins, 1.0), one) == pytest.approx(1, abs=1e-12)
+    assert closed_loop.times_of(np.where(np.arange(100) < 49, twins, 1.0), one) > 1e5
+    assert closed_loop.times_of(np.full(100, 1e-30), one) == INF  # off where no twin is
+    assert closed_loop.times_of(np.full(100, np.nan), one) == INF
+    assert np.isnan(closed_loop.times_of(twins, horizon(LEAST - 1)))
 
 
 def test_a_horizon_too_short_decides_nothing():

@@ -16,7 +16,7 @@ ROOT = pathlib.Path(__file__).parent.parent
 # An import points to an earlier one, or stays within its own without a cycle.
 FLOORS = {
     "ambjax": "_version compiler numerics host world control simulation extend export theorem ensemble linear paper "
-    "pictures cases results commands __init__ __main__",
+    "pictures cases results page commands __init__ __main__",
     "tuning": "space optimisers objective config problem measured_peaks judge search report command from_python "
     "__init__ __main__",
 }

@@ -31,6 +31,9 @@ def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
         metavar="OTHER.toml",
         help="use limits, loss and budget of [tune] in OTHER.toml, but gains and bounds of the case",
     )
+    top.add_argument(
+        "--page", action="store_true", help="also write page.html, with sliders and presets (needs [processor])"
+    )
     top.add_argument("--json", action="store_true", help="print only the content of report.json")
     top.add_argument("--version", action="version", version=f"ambjax {__version__}")
     return top

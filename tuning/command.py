@@ -2,10 +2,12 @@
 
 import argparse
 import pathlib
+import tomllib
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ambjax.cases.reader import Case, case_from
 from ambjax.cases.table import one_line
 from ambjax.commands.outputs import directory, files, plain, say, write_json, written
 from ambjax.commands.warnings import print_warnings
@@ -13,6 +15,8 @@ from ambjax.control.cascade import Cascade
 from ambjax.host.interrupts import reporting
 from ambjax.host.lock import locked
 from ambjax.host.web_page import page
+from ambjax.page.document import NAME
+from ambjax.page.document import page as sliders_page
 from tuning.config import read_tune, settings
 from tuning.problem import TuningProblem, problem_of
 from tuning.report import accurate, pictures
@@ -64,6 +68,8 @@ def _plan(args: argparse.Namespace) -> TuningPlan:
     if args.resume and not (args.out and begun(pathlib.Path(args.out))):
         raise ValueError(f"--resume: --out {args.out} contains no search. Check --out, or leave out --resume.")
     print_warnings(case, args.case)
+    if args.page:  # refuse it before the search
+        sliders_page(case, (), args.case)
     try:
         problem = problem_of(case, tune, front=args.pareto)
         start = tune.space.values(case.cascade)
@@ -82,6 +88,8 @@ def _tune(plan: TuningPlan, args: argparse.Namespace) -> tuple[int, Row]:
         _write(part, plan.out, answer, facts, slices)
         if args.pareto:
             _write_front(part, plan.out, answer, facts)
+        if args.page:
+            _write_page(part, answer.problem.case, args.case)
     _print(plan.out, facts, quiet=args.json)
     return int(not facts.outcome["good"]), plain(facts.table) | {"out": str(plan.out)}
 
@@ -147,6 +155,13 @@ def _write_front(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, fa
         )
         text, _ = tuned_case(case, _laws(answer.problem, row["gains"]), words, out)
         (part / row["file"]).write_text(text, encoding="utf-8")
+
+
+def _write_page(part: pathlib.Path, case: Case, path: str) -> None:
+    """Write the page with sliders into `part`; its presets are the case and the case files in `part`."""
+    files = sorted(part.glob("*.toml"), key=lambda file: (file.name != "tuned.toml", file.name))
+    found = [case_from(tomllib.loads(text := file.read_text()), file.stem, text, known=case) for file in files]
+    (part / NAME).write_text(sliders_page(case, found, path), encoding="utf-8")
 
 
 def _pictures(

@@ -23,6 +23,7 @@ from ambjax.export.trace import trace
 from ambjax.host.extensions import extension
 from ambjax.host.web_page import page
 from ambjax.linear.state_space import StateSpace
+from ambjax.page.document import check_processor, pages
 from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks, operating_point, spread_peaks
 
 WRITTEN = ("compare.html", "compare.json", "compare.png")
@@ -41,10 +42,14 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     notes = _differences(args.cases, cases, studies)
     for note in notes:
         say(note)
+    for path, case in zip(args.cases, cases, strict=True):
+        if args.page:
+            check_processor(case, path)
     out = directory(args.out, f"compare-{'-'.join(case.name for case in cases)}"[:80], WRITTEN, args.force)
     if args.tune:
         cases = [_tuned(path, args.cases[0], case.name, out) for path, case in zip(args.cases, cases, strict=True)]
         studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
+    html_pages = pages(cases, args.cases) if args.page else {}
     compared = [_compared(case, study) for case, study in zip(cases, studies, strict=True)]
     summary = summary_of(compared, studies[0], notes)
     with files(out) as part:
@@ -54,9 +59,11 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
         )
         (part / "compare.html").write_text(html, encoding="utf-8")
         write_json(part / "compare.json", summary)
+        for name, html in html_pages.items():
+            (part / name).write_text(html, encoding="utf-8")
     if not args.json:
         print(text(summary))
-        written(out, ", ".join(WRITTEN))
+        written(out, ", ".join([*WRITTEN, *html_pages]))
     good = all(one.held.all() and one.point is not None and one.point.analysis.stable for one in compared)
     return int(not good), plain(summary | {"out": str(out)})
 

@@ -1,4 +1,4 @@
-"""`ambjax export`: write the controller of a case as C and, with --verify, compare the C with JAX."""
+"""`ambjax export`: write controller, plant or loop of a case as C and, with --verify, compare the C with JAX."""
 
 import argparse
 import dataclasses
@@ -16,10 +16,13 @@ from ambjax.commands.warnings import print_warnings
 from ambjax.control.cascade import Cascade
 from ambjax.control.guard import guarded
 from ambjax.ensemble.spread import ends
-from ambjax.export import machine, package, texts, verify
-from ambjax.export.controller import Controller, controller_of
-from ambjax.export.source import Origin
-from ambjax.export.statements import PRECISIONS, RESERVED
+from ambjax.export import verify
+from ambjax.export.block import Block
+from ambjax.export.c99 import machine, package, texts
+from ambjax.export.c99.source import Origin
+from ambjax.export.c99.statements import RESERVED
+from ambjax.export.of_case import block_of
+from ambjax.export.program import PRECISIONS
 from ambjax.export.twins import LoopCase
 
 Summary = dict[str, object]
@@ -34,7 +37,7 @@ HEADER_NAMES = {
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
-    """Export the controller of a case. Exit code 1 if --verify finds a difference between the C and JAX."""
+    """Export a block of a case. Exit code 1 if --verify finds a difference between the C and JAX."""
     case = read_case(args.case)
     plan = _plan(case, args)
     print_warnings(case, args.case)
@@ -50,9 +53,9 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 
 class Plan(NamedTuple):
-    """A checked export: the controller, the C type and prefix of the package, its origin, mark and directory."""
+    """A checked export: the block, the C type and prefix of the package, its origin, mark and directory."""
 
-    controller: Controller
+    block: Block
     precision: str
     prefix: str
     origin: Origin
@@ -61,22 +64,22 @@ class Plan(NamedTuple):
 
 
 def _plan(case: Case, args: argparse.Namespace) -> Plan:
-    """Build the controller and make the output directory. Raises ValueError for a case or option that cannot be met."""
-    controller = controller_of(guarded_for(case), case.scenario.u_max, float(case.clock.sample_period))
+    """Build the block and make the output directory. Raises ValueError for a case or option that cannot be met."""
+    block = block_of(args.what, guarded_for(case), case.scenario, case.clock)
     prefix = _prefix(args.prefix, case.name)
     if args.verify:
         machine.check()
     digest = hashlib.sha256(case.text.encode()).hexdigest()
-    origin = Origin(case.name, digest, package.described(controller))
+    origin = Origin(case.name, digest, block.described())
     out = directory(args.out, f"export-{case.name}")
     mark = texts.MARK.format(p=prefix)
     spare(out, [*(name.format(p=prefix) for name in package.NAMES), *VERIFIED], mark)
-    return Plan(controller, args.precision, prefix, origin, mark, out)
+    return Plan(block, args.precision, prefix, origin, mark, out)
 
 
 def _built(plan: Plan) -> dict[str, str]:
     """Return the text of each file of the package, unverified."""
-    return package.files(plan.controller, plan.precision, plan.prefix, plan.origin)
+    return package.files(plan.block, plan.precision, plan.prefix, plan.origin)
 
 
 def _write(
@@ -86,7 +89,7 @@ def _write(
     for name, text in sources.items():
         (folder / name).write_text(text, encoding="utf-8")
     if checks:
-        (folder / VERIFIED[0]).write_text(verify.table(checks, case_name, plan.mark), encoding="utf-8")
+        (folder / VERIFIED[0]).write_text(verify.table(checks, case_name, plan.mark, plan.block.noun), encoding="utf-8")
         rows = [check._asdict() for check in checks]
         write_json(folder / VERIFIED[1], {"from": plan.mark, "ok": verify.holds(checks), "checks": rows})
 
@@ -121,7 +124,7 @@ def _verified(case: Case, plan: Plan) -> tuple[dict[str, str], list[verify.Check
         "verify: in both precisions, one step at 10,000 points, one step at 10,000 points with other parameters, "
         "and the closed loop"
     )
-    drafts = {name: verify.draft(plan.controller, name, plan.prefix, plan.origin) for name in PRECISIONS}
+    drafts = {name: verify.draft(plan.block, name, plan.prefix, plan.origin) for name in PRECISIONS}
     checks = verify.verify(drafts, LoopCase(case.cascade, case.scenario, case.clock, case.settle))
     return dict(drafts[plan.precision].files), checks
 

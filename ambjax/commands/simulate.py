@@ -30,8 +30,9 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     if study is not None:
         cascade, scenario = study.member(args.member)
         case = dataclasses.replace(case, name=f"{case.name}-{args.member}", cascade=cascade, scenario=scenario)
-    window = _window(case, args)
-    out = directory(args.out, f"simulate-{case.name}", WRITTEN, args.force)
+    window, html = _window(case, args), _pages(case, args)
+    names = (*WRITTEN, *html)
+    out = directory(args.out, f"simulate-{case.name}", names, args.force)
     say(f"method: {case.clock.method}")
     if case.cascade.processor is not None:
         say(f"on a processor: {case.cascade.processor}")
@@ -58,9 +59,11 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         trajectory.save(part / "trajectory.npz")
         write_json(part / "metrics.json", metrics)
         overview(trajectory, f"{case.name}: {case.clock.method}", part / "overview.png", window)
+        for name, page in html.items():
+            (part / name).write_text(page, encoding="utf-8")
     if not args.json:
         print(_metrics_text(metrics))
-        written(out, ", ".join(WRITTEN))
+        written(out, ", ".join(names))
     ended = metrics["lost_at_s"] is not None
     if ended:
         from ambjax.theorem import advice
@@ -74,6 +77,17 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         )
         say(words if metrics["stalled"] else words + look)
     return int(ended), metrics | {"out": str(out)}
+
+
+def _pages(case: Case, args: argparse.Namespace) -> dict[str, str]:
+    """Return the page with sliders by file name, or nothing without --page. Raises ValueError as `page` does."""
+    if not args.page:
+        return {}
+    if args.member is not None:
+        raise ValueError("--page shows the case, not a member of its ensemble. Leave out --member or --page.")
+    from ambjax.page.document import pages
+
+    return pages([case], [args.case])
 
 
 def _check(numbers: dict[str, Any], path: str) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.cascade_state import Command
+from ambjax.export.c99.machine import Compiled
 from ambjax.export.interface import BITS, OUTPUTS
-from ambjax.export.machine import Compiled
 from ambjax.export.twins import Horizon, LoopCase, farthest, horizons
 from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.clock import Clock
@@ -37,14 +37,14 @@ class Machines:
 
     def __init__(self, *machines: Compiled) -> None:
         self.machines = machines
-        self.room = max(machine.state["numbers"].size for machine in machines)
+        self.room = max(len(machine.trace.state) for machine in machines)
 
     def step(
         self, which: np.ndarray, numbers: np.ndarray, started: np.ndarray, inputs: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Compute one sample of controller `which`. Return its state, padded, and started, bits and outputs."""
         machine = self.machines[int(which)]
-        count = machine.state["numbers"].size
+        count = len(machine.trace.state)
         machine.state["numbers"], machine.state["started"] = np.asarray(numbers)[:count], int(started)
         machine.inputs[:] = np.asarray(inputs)
         bits = machine.step()
@@ -107,11 +107,13 @@ def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, Lo
     host, found = Machines(*machines.values()), {}
     for which, (precision, horizon) in enumerate(horizons(case, list(machines)).items()):
         looped = CompiledLoop(ClosedLoop(given.loop.cascade, case.scenario), given.period, given.cuts, which, host)
-        found[precision] = LoopComparison(horizon, _times(_displacement(looped, case.clock, horizon.samples), horizon))
+        found[precision] = LoopComparison(
+            horizon, times_of(_displacement(looped, case.clock, horizon.samples), horizon)
+        )
     return found
 
 
-def _times(z: np.ndarray, horizon: Horizon) -> float:
+def times_of(z: np.ndarray, horizon: Horizon) -> float:
     """Return the distance of z from JAX's divided by that of the twins, the largest over the horizon."""
     n = horizon.samples
     if not horizon.decisive:

@@ -7,19 +7,20 @@ guard of the readings.
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.control.base import memory_of
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
 from ambjax.control.guard import GAPS, Watch, guarded
-from ambjax.control.schedule import OVER, Schedule, finite
-from ambjax.export.interface import Status, StepInputs, StepOutputs
-from ambjax.numerics.records import Scalar, leaf, numbers, record
+from ambjax.export.block import Block, Ports, law_lines, scales
+from ambjax.export.interface import BITS, INPUTS, OUTPUTS, Status, StepInputs, StepOutputs
+from ambjax.export.numbering import Number, numbers_of
+from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.simulation.integrate import choose
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled, SampledState
@@ -32,8 +33,6 @@ T = TypeVar("T")
 (U_MAX,) = (field for field in dataclasses.fields(Scenario) if field.name == "u_max")
 # Singularity function of Eq. (9) below which a step reports the singular curve as near.
 NEAR = 0.1
-# Factor by which a parameter is divided and multiplied to reach the ends at which the C is compared with JAX.
-SPAN = 100.0
 
 
 def _end(of: str, unit: str) -> Any:
@@ -69,21 +68,6 @@ class Memory(NamedTuple):
     started: Array
 
 
-class Number(NamedTuple):
-    """A parameter or a state: dotted name, unit, allowed values, meaning, value.
-
-    `ends`: further values of a parameter at which the C is compared with JAX: the lowest and the highest first, then
-    those that are not finite or that a step must reject.
-    """
-
-    name: str
-    unit: str
-    allowed: str
-    doc: str
-    value: float
-    ends: tuple[float, ...] = ()
-
-
 class Parameters(NamedTuple):
     """All numbers that a user of the C may change: the parameters of the cascade, and the limits."""
 
@@ -92,11 +76,17 @@ class Parameters(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Controller:
+class Controller(Block):
     """A cascade on its processor as it is exported: its parameters and the sample period, s."""
 
     parameters: Parameters
-    period: float
+
+    noun: ClassVar[str] = "controller"
+    ports: ClassVar[Any] = StepInputs
+    inputs: ClassVar[Ports] = INPUTS
+    outputs: ClassVar[Ports] = OUTPUTS
+    bits = BITS
+    crowded = ("saturated", "refused")
 
     def step(
         self, parameters: Parameters, memory: Memory, inputs: StepInputs, period: Scalar, read: frozenset[str]
@@ -144,6 +134,57 @@ class Controller:
         guard = cascade.processor.guard if cascade.processor else None
         return Memory(laws, Command(*[zero] * 5), zero, guard.start() if guard else (), jnp.asarray(False))
 
+    def numbers(self) -> list[Number]:
+        found = [
+            *numbers_of(self.parameters.controller, home="controller."),
+            *numbers_of(self.parameters.limits, "limits."),
+        ]
+        assert [x.value for x in found] == [float(x) for x in jax.tree.leaves(self.parameters)]
+        processor: Any = self.parameters.controller.processor
+        most = float(processor.most)
+        delay = {"allowed": f"from 0 to {processor.most}", "ends": (0.0, most, most + 0.5, -0.5, math.nan)}
+        return [x._replace(**delay) if x.name == "processor.delay" else x for x in found]
+
+    def states(self) -> list[Number]:
+        cascade, memory = self.parameters.controller, self.start()
+        found = []
+        for stage, law, state in zip(CascadeState._fields, cascade.laws, memory.laws, strict=True):
+            entries = memory_of(law, state)
+            assert len(entries) == len(jax.tree.leaves(state)), f"{type(law).__name__}.memory: one entry for each state"
+            if any(jnp.shape(x) != () for x in jax.tree.leaves(state)):
+                raise ValueError(
+                    f"controller.{stage}: a state of {type(law).__name__} is an array; only scalars can be exported."
+                )
+            words = f"state of {type(law).__name__}"
+            found += [Number(f"{stage}.{name}", unit, "", doc or words, 0.0) for name, unit, doc in entries]
+        commands = {**OUTPUTS, "i_ref_dot": ("A/s", "rate of i_ref")}
+        for name in memory.last._fields:
+            found.append(Number(f"last.{name}", commands[name][0], "", f"last {commands[name][1]}", 0.0))
+        found.append(Number("before.u", "V", "", "voltage of the sample before the last", 0.0))
+        if memory.watch:
+            names = {f"watch.{name}": (INPUTS[name][0], "predicted reading") for name in memory.watch.expected._fields}
+            names["watch.left"] = ("samples", "number of samples for which a reading may still be replaced")
+            found += [Number(name, unit, "", doc, 0.0) for name, (unit, doc) in names.items()]
+        return found
+
+    def sizes(self) -> tuple[list[float], list[float]]:
+        cascade, limits = self.parameters
+        model = cascade.model
+        z, z_dot, i = scales(model.sizes())
+        pole, weight, v = float(model.pole), float(model.R) * float(model.i_0), float(model.v_size)
+        u = float(limits.u_max) if math.isfinite(limits.u_max) else 10 * weight + 1.0
+        guard: Any = cascade.processor.guard if cascade.processor else None
+        watch = [z, z_dot, i, float(guard.samples)] if guard else []
+        # commands are in the order of their pytree
+        states = [*scales(cascade.scale()), v, v, i, i * pole, u, u, *watch]
+        return states, [z, z_dot, i, z, z * pole, z * pole**2, z * pole**3]
+
+    def bounds(self) -> dict[str, int]:
+        return {f"{of}.{name}": k for k, name in enumerate(INPUTS) for of in ("limits", "processor.guard")}
+
+    def described(self) -> list[str]:
+        return law_lines(self.parameters.controller)
+
 
 def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scenario | None = None) -> Controller:
     """Return the controller of a case. Raises ValueError for a cascade in continuous time.
@@ -164,62 +205,9 @@ def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scen
     return Controller(plain, period)
 
 
-def parameters_of(parameters: Parameters) -> list[Number]:
-    """Return every number of the parameters, in the order of their leaves. Raises ValueError for an array."""
-    found = [*_numbers(parameters.controller, ""), *_numbers(parameters.limits, "limits.")]
-    assert [x.value for x in found] == [float(x) for x in jax.tree.leaves(parameters)]
-    processor: Any = parameters.controller.processor
-    most = float(processor.most)
-    delay = {"allowed": f"from 0 to {processor.most}", "ends": (0.0, most, most + 0.5, -0.5, math.nan)}
-    return [x._replace(**delay) if x.name == "processor.delay" else x for x in found]
-
-
 def _steepnesses(cascade: Cascade) -> list[Scalar]:
     """Return the steepnesses of the smoothed signs of all laws."""
     laws: tuple[Any, ...] = cascade.laws
     fields = [(law, field) for law in laws for field in dataclasses.fields(law)]
     found = [getattr(law, field.name) for law, field in fields if field.metadata.get("steepness")]
     return jax.tree.leaves(found)
-
-
-def _numbers(node: Any, path: str) -> Iterator[Number]:
-    for field in dataclasses.fields(node):
-        value, name = getattr(node, field.name), f"{path}{field.name}"
-        if field.metadata.get("static") or value is None:
-            continue
-        if isinstance(value, Schedule):
-            unit, signal = OVER[value.over]
-            for knot, (at, x) in enumerate(zip(value.at, value.values, strict=True)):
-                number = _number(f"{name}.knot_{knot}", finite(field), float(x))
-                yield number._replace(doc=f"{number.doc}; at {signal} = {at:g} {unit}")
-        elif dataclasses.is_dataclass(value):
-            yield from _numbers(value, f"{name}.")
-        elif jnp.shape(value) == ():
-            yield _number(name, field, float(value))
-        else:
-            raise ValueError(f"controller.{name} has the shape {jnp.shape(value)}: only scalars can be exported.")
-
-
-def _number(name: str, field: dataclasses.Field, value: float) -> Number:
-    meta = field.metadata
-    unit, doc = meta.get("unit", ""), meta.get("doc", "")
-    allowed = numbers(field) if meta.get("leaf") else ""
-    for word in (f" ({unit})", "a finite number ", "a number "):
-        allowed = allowed.replace(word, "")
-    if meta.get("steepness"):
-        allowed = allowed.replace(", or inf", ", finite: set p = inf in the case and export again")
-    return Number(name, unit, allowed, doc, value, _ends(meta, value))
-
-
-def _ends(meta: Mapping[str, Any], value: float) -> tuple[float, ...]:
-    """Return the further values of a parameter for the comparison: 1/SPAN and SPAN times `value`, within its bounds.
-
-    A parameter that is 0 is set to -1 and 1 in its unit; one that is inf, to 1 and SPAN.
-    """
-    low, high = sorted((value / SPAN, value * SPAN)) if value else (-1.0, 1.0)
-    if math.isinf(value):
-        low, high = 1.0, SPAN
-    floors = [x for x in (meta.get("above"), meta.get("at_least")) if x is not None]
-    ceiling = meta.get("at_most")
-    low, high = max([low, *floors]), high if ceiling is None else min(high, ceiling)
-    return (low, high, math.inf, math.nan) if meta.get("infinite") else (low, high, math.nan)

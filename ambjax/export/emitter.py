@@ -1,7 +1,7 @@
 """Translate a JAX trace to straight-line scalar code: inline calls, unroll loops, turn branches into selections.
 
-The order of operations stays that of the trace, so that C compiled without contraction rounds as JAX does operation by
-operation.
+The order of operations stays that of the trace, so that exported code (C without contraction) rounds as JAX does
+operation by operation.
 """
 
 import re
@@ -17,6 +17,8 @@ from ambjax.export.program import Operand, Program, Ref, of
 
 LOOPS = ("scan", "while")
 COMPOSED = ("rsqrt", "exp2", "logistic")
+# Primitives that whole numbers which depend on data may have.
+CODES = ("select_n", "eq", "ne", "lt", "le", "gt", "ge")
 
 
 def traced(
@@ -74,7 +76,8 @@ class _Reader:
             raise ValueError(refusal(name, law, f"of {dtype.name}"))
         if name == "convert_element_type":
             return self._converted(args[0], dtype, law)
-        if any(self.program.dtype(x).kind in "iu" and isinstance(x, Ref) for x in args):
+        counted = any(self.program.dtype(x).kind in "iu" and isinstance(x, Ref) for x in args)
+        if counted and name not in CODES:  # a status code is compared and chosen
             raise ValueError(refusal(name, law, "of whole numbers"))
         if name == "select_n":
             if len(args) != 3:
@@ -95,7 +98,7 @@ class _Reader:
         return apply(name, args, dtype, law)
 
     def _composed(self, name: str, x: Operand, dtype: np.dtype, law: str) -> Operand:
-        """Compose a primitive that C lacks from others, as XLA does."""
+        """Compose a primitive that the languages lack from others, as XLA does."""
         apply, one = self.program.apply, np.ones((), dtype)[()]
         if name == "rsqrt":
             return apply("div", (one, apply("sqrt", (x,), dtype, law)), dtype, law)
@@ -120,7 +123,7 @@ class _Reader:
         before = self.program.dtype(x)
         if not isinstance(x, Ref):
             return x.astype(dtype)
-        if before == dtype or (before.kind == "b" and dtype.kind in "iu"):  # the index of one of two branches
+        if before == dtype or (before.kind in "biu" and dtype.kind in "iu"):  # the index of a branch, or a code
             return x
         if "f" not in (before.kind, dtype.kind) or {before.kind, dtype.kind} & set("iu"):
             raise ValueError(refusal("convert_element_type", law, f"from {before.name} to {dtype.name}"))
@@ -160,7 +163,7 @@ class _Reader:
 
 def refusal(name: str, law: str, how: str = "") -> str:
     """Return the error message for a primitive that cannot be exported, and the fix."""
-    reason = f"the primitive {name!r}{f' {how}' if how else ''} cannot be written as scalar C"
+    reason = f"the primitive {name!r}{f' {how}' if how else ''} cannot be written as scalar code"
     return f"{law or 'the step'}: {reason}. Write the law with real scalars and loops of a fixed length."
 
 

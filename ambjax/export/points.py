@@ -5,13 +5,11 @@
 
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
-from ambjax.export.interface import INPUTS
-from ambjax.export.program import Ref
-from ambjax.export.statements import PRECISIONS
-from ambjax.export.trace import UNREAD, Trace
+from ambjax.export.numbering import UNREAD
+from ambjax.export.program import PRECISIONS, Ref
+from ambjax.export.trace import Trace
 
 # Decades around the scale of each number; the probabilities that a number is an edge and that a point is a first step.
 DECADES, EDGY, FIRST = (-7.0, 1.7), 0.02, 0.05
@@ -45,7 +43,7 @@ def points(trace: Trace, count: int, seed: int = 0) -> Points:
     borders = _borders(trace, x[:, started & np.isfinite(x[own.size :]).all(axis=0)][:, :POOL])
     borders = borders[:, _seen(trace, borders, np.ones(borders.shape[1], bool))[1]]
     borders = borders[:, random.permutation(borders.shape[1])[: count // 2]]
-    # most random states saturate the voltage: add some that do not
+    # most random states saturate the voltage, or lose the rotor: add some that do not
     far, normal = _seen(trace, x, started)
     calm = np.flatnonzero(started & normal & ~far)[: int(CALM * count)]
     rest = np.setdiff1d(np.flatnonzero(normal), calm)[: count - calm.size - borders.shape[1]]
@@ -68,7 +66,8 @@ def varied(trace: Trace, count: int, seed: int = 2) -> Points:
     for row, x in zip(parameters, trace.parameters, strict=True):
         row[alone.size :] = random.choice([x.value, *x.ends[:2]], count - alone.size)
     x = _drawn(trace, random, parameters)
-    limited = {k: INPUTS_AT[x.name] for k, x in enumerate(trace.parameters) if x.name in INPUTS_AT}
+    bounds = trace.block.bounds()
+    limited = {k: bounds[x.name] for k, x in enumerate(trace.parameters) if x.name in bounds}
     for n in np.flatnonzero(random.random(alone.size) < AT_LIMIT):
         if which[n] in limited:
             side = random.choice([-1.0, 1.0]) * (1 + random.choice(BESIDE))
@@ -79,10 +78,6 @@ def varied(trace: Trace, count: int, seed: int = 2) -> Points:
     return _split(trace, x[:, normal], started[normal])
 
 
-# Index of the input that each limit bounds.
-INPUTS_AT = {f"{of}.{name}": k for k, name in enumerate(INPUTS) for of in ("limits", "processor.guard")}
-
-
 def _split(trace: Trace, x: np.ndarray, started: np.ndarray) -> Points:
     at = len(trace.parameters), len(trace.parameters) + len(trace.state)
     parameters, state, inputs = np.split(x, at)
@@ -90,15 +85,16 @@ def _split(trace: Trace, x: np.ndarray, started: np.ndarray) -> Points:
 
 
 def _seen(trace: Trace, x: np.ndarray, started: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether the voltage is at its limit or held, and whether no intermediate number is subnormal.
+    """Return whether a bit of `Block.crowded` is set, and whether no intermediate number is subnormal.
 
-    On CPUs, JAX replaces a subnormal number by 0, and C does not.
+    On CPUs, JAX replaces a subnormal number by 0, and exported code does not.
     """
     values, normal = evaluated(trace, x, started), np.ones(x.shape[1], bool)
     for value in values:
         if value.dtype.kind == "f":
             normal &= (value == 0) | ~(np.abs(value) < np.finfo(value.dtype).tiny)
-    far = [values[bit.node] if isinstance(bit, Ref) else np.full(x.shape[1], bit) for _, bit in trace.bits[:2]]
+    set_ = [bit for name, bit in trace.bits if name in trace.block.crowded]
+    far = [values[bit.node] if isinstance(bit, Ref) else np.full(x.shape[1], bit) for bit in set_]
     return np.any(far, axis=0), normal
 
 
@@ -106,9 +102,10 @@ def _drawn(trace: Trace, random: np.random.Generator, parameters: np.ndarray) ->
     """Return random states and inputs of either sign, over decades, with zeros, limits and non-finite numbers."""
     sizes, count = np.array(_sizes(trace)), parameters.shape[1]
     limits = np.ones((sizes.size, count))  # without a guard, readings have no limit
+    bounds = trace.block.bounds()
     for k, x in enumerate(trace.parameters):
-        if x.name in INPUTS_AT:
-            limits[len(trace.state) + INPUTS_AT[x.name]] = parameters[k]
+        if x.name in bounds:
+            limits[len(trace.state) + bounds[x.name]] = parameters[k]
     shape = sizes.size, count
     x = sizes[:, None] * 10.0 ** random.uniform(*DECADES, shape) * random.choice([-1.0, 1.0], shape)
     x *= (np.arange(count) % 7 > 0) | (random.random(shape) < 0.5)  # in every seventh point, half of the numbers are 0
@@ -116,6 +113,9 @@ def _drawn(trace: Trace, random: np.random.Generator, parameters: np.ndarray) ->
     edges += [sign * limits * (1 + off) for sign in (1, -1) for off in (0, 4e-16, -2e-16, 2e-7, -1e-7)]
     edge = np.take_along_axis(np.array(edges), random.integers(len(edges), size=(1, *shape)), axis=0)[0]
     x = np.where(random.random(shape) < EDGY, edge, x)
+    for row, (state, _) in zip(x, trace.state, strict=False):
+        if state.among:
+            row[:] = random.choice(state.among, count)
     wild = random.choice([np.nan, np.inf, -np.inf], shape)
     inputs = np.arange(sizes.size)[:, None] >= len(trace.state)
     return np.where(inputs & (random.random(shape) < EDGY / 10), wild, x)
@@ -123,17 +123,8 @@ def _drawn(trace: Trace, random: np.random.Generator, parameters: np.ndarray) ->
 
 def _sizes(trace: Trace) -> list[float]:
     """Return the scale of each state and input."""
-    controller = trace.controller
-    cascade, limits = controller.parameters
-    model = cascade.model
-    z, z_dot, i = (float(x) for x in model.sizes())
-    pole, weight = float(model.pole), float(model.R) * float(model.i_0)
-    u = float(limits.u_max) if np.isfinite(limits.u_max) else 10 * weight + 1.0
-    laws = [float(x) for x in jax.tree.leaves(cascade.scale())]
-    v = float(model.v_size)
-    guard: Any = cascade.processor.guard if cascade.processor else None
-    states = [*laws, v, v, i, i * pole, u, u, *([z, z_dot, i, float(guard.samples)] if guard else [])]
-    return [states[k] for k in trace.keep] + [z, z_dot, i, z, z * pole, z * pole**2, z * pole**3]
+    states, inputs = trace.block.sizes()
+    return [states[k] for k in trace.keep] + inputs
 
 
 def _borders(trace: Trace, x: np.ndarray) -> np.ndarray:
@@ -161,9 +152,9 @@ def evaluated(trace: Trace, x: np.ndarray, started: np.ndarray) -> list[np.ndarr
     count, program, dtype = x.shape[1], trace.program, PRECISIONS[trace.precision]
     rows: Any = iter(x)
     values: list[Any] = [next(rows) for _ in trace.parameters]
-    memory = [np.zeros(count, dtype)] * (len(trace.refs) - len(trace.parameters) - len(INPUTS) - 2)
+    memory = [np.zeros(count, dtype)] * (len(trace.refs) - len(trace.parameters) - len(trace.inputs) - 2)
     for k in trace.keep:
         memory[k] = next(rows)
-    values += [*memory, started, *rows, np.full(count, trace.controller.period, dtype)]
+    values += [*memory, started, *rows, np.full(count, trace.block.period, dtype)]
     given = {ref.node: value for ref, value in zip(trace.refs, values, strict=True)}
     return [np.broadcast_to(v, count) for v in program.evaluate(given)]

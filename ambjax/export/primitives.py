@@ -1,7 +1,7 @@
-"""Scalar primitives: the C expression, the NumPy function and the cost of each.
+"""Scalar primitives: one row each, with its text in every language, its NumPy function and its cost.
 
-`{0}`, `{1}` are operands, `{f}` is the suffix of float functions. The NumPy function folds constants and finds the
-thresholds of comparisons; the verification compares the C with JAX, not with NumPy.
+The NumPy function folds constants and finds the thresholds of comparisons; the verification compares the exported code
+with JAX, not with NumPy.
 """
 
 from collections.abc import Callable
@@ -14,9 +14,15 @@ from ambjax.numerics.smooth import RECIPROCAL
 
 
 class Op(NamedTuple):
-    """C text; NumPy function; kind of cost; whether the operands commute, and whether the result is a bool."""
+    """Texts in C and JavaScript; NumPy function; kind of cost; whether operands commute, whether the result is a bool.
 
-    text: str
+    In both texts `{0}`, `{1}`, `{2}` are the operands. In C, `{f}` is the suffix of float functions, `{name}` the
+    prefix of all names, `{to}` the type of the result, `{one}` and `{zero}` are numbers of that type. A function of
+    JavaScript that is not of `Math` or `Number` is one of `HELPERS` of the back end.
+    """
+
+    c99: str
+    javascript: str
     numpy: Callable[..., Any]
     cost: str = "call"
     commutes: bool = False
@@ -30,31 +36,32 @@ def _erf(name: str) -> Callable[..., Any]:
 
 
 def _function(name: str, numpy: Callable[..., object] | None = None) -> Op:
-    return Op(f"{name}{{f}}({{0}})", numpy or getattr(np, name))
+    return Op(f"{name}{{f}}({{0}})", f"Math.{name}({{0}})", numpy or getattr(np, name))
 
 
 def _compare(sign: str, numpy: Callable[..., object]) -> Op:
-    return Op(f"{{0}} {sign} {{1}}", numpy, "comparison", sign in ("==", "!="), True)
+    strict = f"{sign}=" if sign in ("==", "!=") else sign
+    return Op(f"{{0}} {sign} {{1}}", f"{{0}} {strict} {{1}}", numpy, "comparison", sign in ("==", "!="), True)
 
 
 # For bools, `&` and `|` give the same result as `&&` and `||`, because both operands are computed already.
 OPS: dict[str, Op] = {
-    "add": Op("{0} + {1}", np.add, "add", True),
-    "sub": Op("{0} - {1}", np.subtract, "add"),
-    "mul": Op("{0} * {1}", np.multiply, "multiply", True),
-    "div": Op("{0} / {1}", np.divide, "divide"),
-    "neg": Op("-{0}", np.negative, "sign"),
-    "abs": Op("fabs{f}({0})", np.abs, "sign"),
-    "sign": Op("{name}_sign({0})", np.sign, "comparison"),
-    "max": Op("{name}_max({0}, {1})", np.maximum, "comparison", True),
-    "min": Op("{name}_min({0}, {1})", np.minimum, "comparison", True),
-    "select": Op("{0} ? {1} : {2}", np.where, "comparison"),
-    "sqrt": Op("sqrt{f}({0})", np.sqrt, "root"),
-    "pow": Op("pow{f}({0}, {1})", np.power),
-    "atan2": Op("atan2{f}({0}, {1})", np.arctan2),
-    "rem": Op("fmod{f}({0}, {1})", np.fmod),
-    "round_away": Op("round{f}({0})", lambda x: np.copysign(np.floor(np.abs(x) + 0.5), x)),
-    "round_even": Op("rint{f}({0})", np.rint),
+    "add": Op("{0} + {1}", "{0} + {1}", np.add, "add", True),
+    "sub": Op("{0} - {1}", "{0} - {1}", np.subtract, "add"),
+    "mul": Op("{0} * {1}", "{0} * {1}", np.multiply, "multiply", True),
+    "div": Op("{0} / {1}", "{0} / {1}", np.divide, "divide"),
+    "neg": Op("-{0}", "-{0}", np.negative, "sign"),
+    "abs": Op("fabs{f}({0})", "Math.abs({0})", np.abs, "sign"),
+    "sign": Op("{name}_sign({0})", "Math.sign({0})", np.sign, "comparison"),
+    "max": Op("{name}_max({0}, {1})", "max({0}, {1})", np.maximum, "comparison", True),
+    "min": Op("{name}_min({0}, {1})", "min({0}, {1})", np.minimum, "comparison", True),
+    "select": Op("{0} ? {1} : {2}", "{0} ? {1} : {2}", np.where, "comparison"),
+    "sqrt": Op("sqrt{f}({0})", "Math.sqrt({0})", np.sqrt, "root"),
+    "pow": Op("pow{f}({0}, {1})", "pow({0}, {1})", np.power),
+    "atan2": Op("atan2{f}({0}, {1})", "Math.atan2({0}, {1})", np.arctan2),
+    "rem": Op("fmod{f}({0}, {1})", "{0} % {1}", np.fmod),
+    "round_away": Op("round{f}({0})", "roundAway({0})", lambda x: np.copysign(np.floor(np.abs(x) + 0.5), x)),
+    "round_even": Op("rint{f}({0})", "roundEven({0})", np.rint),
     "asin": _function("asin", np.arcsin),
     "acos": _function("acos", np.arccos),
     "atan": _function("atan", np.arctan),
@@ -63,21 +70,21 @@ OPS: dict[str, Op] = {
     "atanh": _function("atanh", np.arctanh),
     **{name: _function(name) for name in ("exp", "expm1", "log", "log1p", "cbrt", "floor", "ceil")},
     **{name: _function(name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
-    "erf": _function("erf", _erf("erf")),
-    "erfc": _function("erfc", _erf("erfc")),
+    "erf": Op("erf{f}({0})", "erf({0})", _erf("erf")),
+    "erfc": Op("erfc{f}({0})", "erfc({0})", _erf("erfc")),
     "eq": _compare("==", np.equal),
     "ne": _compare("!=", np.not_equal),
     "lt": _compare("<", np.less),
     "le": _compare("<=", np.less_equal),
     "gt": _compare(">", np.greater),
     "ge": _compare(">=", np.greater_equal),
-    "is_finite": Op("isfinite({0})", np.isfinite, "comparison", False, True),
-    "and": Op("{0} && {1}", np.logical_and, "logic", True, True),
-    "or": Op("{0} || {1}", np.logical_or, "logic", True, True),
-    "xor": Op("{0} != {1}", np.logical_xor, "logic", True, True),
-    "not": Op("!{0}", np.logical_not, "logic", False, True),
-    "real": Op("({to}){0}", lambda x: x, "conversion"),
-    "flag": Op("{0} ? {one} : {zero}", lambda x: np.where(x, 1.0, 0.0), "conversion"),
+    "is_finite": Op("isfinite({0})", "Number.isFinite({0})", np.isfinite, "comparison", False, True),
+    "and": Op("{0} && {1}", "{0} && {1}", np.logical_and, "logic", True, True),
+    "or": Op("{0} || {1}", "{0} || {1}", np.logical_or, "logic", True, True),
+    "xor": Op("{0} != {1}", "{0} !== {1}", np.logical_xor, "logic", True, True),
+    "not": Op("!{0}", "!{0}", np.logical_not, "logic", False, True),
+    "real": Op("({to}){0}", "{0}", lambda x: x, "conversion"),
+    "flag": Op("{0} ? {one} : {zero}", "{0} ? 1 : 0", lambda x: np.where(x, 1.0, 0.0), "conversion"),
 }
 # Primitives that return a scalar operand unchanged.
 SAME = ("broadcast_in_dim", "copy", "copy_p", "optimization_barrier", "reshape", "squeeze", "stop_gradient")

@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from ambjax.export.primitives import OPS
 
-# Largest number of operations of a step. A longer step comes from an unrolled loop that is too long for a controller.
-MOST = 20_000
+# Largest number of operations of a step. A longer step comes from an unrolled loop that is too long for a processor.
+MOST = 40_000
+PRECISIONS = {"float": "float32", "double": "float64"}
 
 
 class Ref(NamedTuple):
@@ -26,14 +27,27 @@ class Ref(NamedTuple):
 Operand: TypeAlias = Ref | np.ndarray | np.number | np.bool_
 
 
+class Location(NamedTuple):
+    """Where an input of a program is read: a group and the dotted name of a number in it.
+
+    The groups are params, state and input; `STARTED` is the flag of the state and `PERIOD` the sample period.
+    """
+
+    group: str
+    name: str = ""
+
+
+STARTED, PERIOD = Location("started"), Location("period")
+
+
 class Node(NamedTuple):
-    """One operation: of OPS, or `input` with the C text that reads it; dtype and the law that it is of."""
+    """One operation: of OPS, or `input` with the location that it reads; dtype and the law that it is of."""
 
     op: str
     args: tuple[Operand, ...]
     dtype: np.dtype
     law: str = ""
-    text: str = ""
+    location: Location | None = None
 
 
 class Program:
@@ -43,9 +57,9 @@ class Program:
         self.nodes: list[Node] = []
         self._known: dict[Any, Ref] = {}
 
-    def input(self, text: str, dtype: npt.DTypeLike) -> Ref:
-        """Add an input node, which the C expression `text` reads."""
-        self.nodes.append(Node("input", (), np.dtype(dtype), text=text))
+    def input(self, location: Location, dtype: npt.DTypeLike) -> Ref:
+        """Add an input node, which reads `location`."""
+        self.nodes.append(Node("input", (), np.dtype(dtype), location=location))
         return Ref(len(self.nodes) - 1)
 
     def dtype(self, x: Operand) -> np.dtype:

@@ -1,4 +1,4 @@
-"""Results of a step computed with JAX operation by operation: the reference of the exported C.
+"""Results of a step computed with JAX operation by operation: the reference of the exported code.
 
 If XLA compiles a whole step, it may fuse a product and a sum into one rounding. Operation by operation it does not, and
 two programs with the same operations in the same order agree to the last bits. `closed_loop` compares the C with the
@@ -15,7 +15,6 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 from jax.typing import ArrayLike
 
-from ambjax.export.interface import BITS
 from ambjax.export.points import Points
 from ambjax.export.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal
 from ambjax.export.trace import Trace, arguments, precision
@@ -34,17 +33,17 @@ def results(trace: Trace, at: Points) -> Results:
     """Return the results of the step at these points, computed with JAX operation by operation."""
     count = at.started.size
     with precision(trace.precision):
-        given: Any = arguments(trace.controller)
-        step: Any = trace.controller.step
+        given: Any = arguments(trace.block)
+        step: Any = trace.block.step
         closed = jax.make_jaxpr(lambda *x: step(*x, trace.read))(*given)
         rows: list[Any] = [np.zeros(count, at.state.dtype)] * (len(jax.tree.leaves(given[1])) - 1) + [at.started]
         for row, k in zip(at.state, trace.keep, strict=True):
             rows[k] = row
         found = one_by_one(closed, [*at.parameters, *rows, *at.inputs, given[3]], count)
     spread = [np.broadcast_to(x, count) for x in found]
-    begun, bits = len(rows), sum(np.where(x, 1 << k, 0) for k, x in enumerate(spread[-len(BITS) :]))
+    begun, bits = len(rows), sum(np.where(x, 1 << k, 0) for k, x in enumerate(spread[-len(trace.bits) :]))
     kept = np.array([spread[k] for k in trace.keep]).reshape(len(trace.keep), count)
-    return Results(kept, spread[begun - 1], np.array(spread[begun : -len(BITS)]), np.asarray(bits))
+    return Results(kept, spread[begun - 1], np.array(spread[begun : -len(trace.bits)]), np.asarray(bits))
 
 
 def one_by_one(closed: ClosedJaxpr, args: list[ArrayLike], count: int) -> list[ArrayLike]:
@@ -90,7 +89,7 @@ def _one(eqn: JaxprEqn, args: list[ArrayLike], count: int) -> list[ArrayLike]:
             carry = one_by_one(params["body_jaxpr"], fixed + carry, count)
         return carry
     if name in OPS and OPS[name].cost == "call":
-        return [_of_library(OPS[name].text.partition("{f}")[0], args, dtype_of(eqn.outvars[0]), count)]
+        return [_of_library(OPS[name].c99.partition("{f}")[0], args, dtype_of(eqn.outvars[0]), count)]
     rows = [jnp.broadcast_to(jnp.asarray(x, dtype_of(v)), (count,)) for x, v in zip(args, eqn.invars, strict=True)]
     return [eqn.primitive.bind(*rows, **params)]
 

@@ -17,14 +17,17 @@ from jax import Array
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import Command
 from ambjax.control.guard import Watch
-from ambjax.export.statements import PRECISIONS
-from ambjax.numerics.records import Scalar, canonical, record
+from ambjax.export.program import PRECISIONS
+from ambjax.export.series import just_after
+from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.clock import Clock
+from ambjax.simulation.integrate import Advanced, Integrator
 from ambjax.simulation.rollout import run
 from ambjax.simulation.sampled import Sampled, SampledState
 from ambjax.simulation.system import system_of
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, FaultyErrors
+from ambjax.world.signals import Constant
 
 T = TypeVar("T")
 
@@ -68,6 +71,7 @@ class Twin(Sampled):
 
     seed: Scalar
     unit: Scalar
+    held: bool = static(default=False, doc="disturbances are constant over each sample")
 
     def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
         """Compute the laws' step from the changed states, and change its command."""
@@ -80,6 +84,25 @@ class Twin(Sampled):
         state = moved._replace(finite=state.finite, watch=watch, started=state.started, sensed=state.sensed)
         stepped = super().jump(t, state, errors)
         return stepped._replace(command=self._moved(after, stepped.command, self._sizes(stepped).command))
+
+    def advance(
+        self,
+        method: Integrator,
+        errors: Errors | FaultyErrors,
+        t: Scalar,
+        period: Scalar,
+        state: SampledState,
+        memory: object,
+        code: Array,
+    ) -> Advanced:
+        if not self.held:
+            return super().advance(method, errors, t, period, state, memory, code)
+        outside, none = self.loop.inputs(just_after(t)), self.loop.scenario.undisturbed()
+        scenario = dataclasses.replace(none, q_z=Constant(outside.q_z), q_i=Constant(outside.q_i))
+        loop = dataclasses.replace(self.loop, scenario=scenario)
+        # the exported plant has no time: t = 0 at the start of each sample
+        after = Sampled(loop, period, 0).advance(method, errors, jnp.zeros(()), period, state, memory, code)
+        return after._replace(t=t + after.t)
 
     def _moved(self, key: Array, state: T, sizes: T) -> T:
         """Return every number changed by one unit of its scale, up or down."""
@@ -114,10 +137,13 @@ class Twin(Sampled):
         )
 
 
-def horizons(case: LoopCase, precisions: list[str]) -> dict[str, Horizon]:
-    """Simulate JAX's loop and its twins. Return the horizon of each precision."""
+def horizons(case: LoopCase, precisions: list[str], *, held: bool = False) -> dict[str, Horizon]:
+    """Simulate JAX's loop and its twins. Return the horizon of each precision.
+
+    `held`: hold the disturbances over each sample.
+    """
     given: Any = system_of(case.cascade, case.scenario, case.clock)
-    twin, clock = canonical((Twin(given.loop, given.period, given.cuts, 0.0, 0.0), case.clock))
+    twin, clock = canonical((Twin(given.loop, given.period, given.cuts, 0.0, 0.0, held), case.clock))
     units = [0.0] + [float(np.finfo(PRECISIONS[x]).eps) for x in precisions for _ in range(TWINS)]
     signals, r, lost_at = _together(twin, clock, jnp.asarray(units), jnp.arange(len(units)))
     z_and_u = {name: np.asarray(x) for name, x in zip(SIGNALS, signals, strict=True)}

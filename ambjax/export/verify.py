@@ -7,14 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ambjax.export import closed_loop
-from ambjax.export.controller import SPAN, Controller
-from ambjax.export.machine import EXACT, SANITIZED, SHARED, STRICT, Compiled, build, execute, scratch, short
-from ambjax.export.package import SHARE, ULPS, tolerance, written
+from ambjax.export import closed_loop, plant_loop
+from ambjax.export.block import Block
+from ambjax.export.c99.machine import EXACT, SANITIZED, SHARED, STRICT, Compiled, build, execute, scratch, short
+from ambjax.export.c99.package import SHARE, ULPS, tolerance, written
+from ambjax.export.c99.source import Origin
+from ambjax.export.numbering import SPAN
 from ambjax.export.points import Points, points, varied
+from ambjax.export.program import PRECISIONS
 from ambjax.export.reference import Results, results
-from ambjax.export.source import Origin
-from ambjax.export.statements import PRECISIONS
 from ambjax.export.trace import Trace, trace
 from ambjax.export.twins import LEAST, PARTED, TWINS, LoopCase
 
@@ -42,7 +43,7 @@ class Check(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Draft:
-    """The files of a controller in one precision, and JAX's results of its step.
+    """The files of a block in one precision, and JAX's results of its step.
 
     `steps`: by check, points and results; one check has the case's parameters, the other has varied ones.
     """
@@ -53,9 +54,9 @@ class Draft:
     steps: Mapping[str, tuple[Points, Results]]
 
 
-def draft(controller: Controller, precision: str, prefix: str, origin: Origin, count: int = COUNT) -> Draft:
-    """Return the files of a controller and JAX's results. Raises ValueError for a law that scalar C cannot express."""
-    traced = trace(controller, precision)
+def draft(block: Block, precision: str, prefix: str, origin: Origin, count: int = COUNT) -> Draft:
+    """Return the files of a block and JAX's results. Raises ValueError for a law that scalar code cannot express."""
+    traced = trace(block, precision)
     at = {"one step": points(traced, count), "parameters": varied(traced, count)}
     steps = {name: (x, results(traced, x)) for name, x in at.items()}
     return Draft(traced, prefix, written(traced, prefix, origin), steps)
@@ -74,13 +75,14 @@ def verify(drafts: Mapping[str, Draft], case: LoopCase | None) -> list[Check]:
             for name, text in one.files.items():
                 (at / name).write_text(text, encoding="utf-8")
             checks += _built(one, precision, at)
-            if checks[-1].ok and (library := at / "controller.so").exists():
+            if checks[-1].ok and (library := at / "block.so").exists():
                 machines[precision] = Compiled(library, one.trace, one.prefix)
                 for name in one.steps:
                     checks += _stepped(name, one, precision, machines[precision])
         if case is not None and len(machines) == len(drafts):
-            for precision, found in closed_loop.compare_loops(case, machines).items():
-                checks.append(_looped(precision, found))
+            whole = any(one.trace.block.noun != "controller" for one in drafts.values())
+            compare = plant_loop.compare_blocks if whole else closed_loop.compare_loops
+            checks += [_looped(precision, found) for precision, found in compare(case, machines).items()]
     return checks
 
 
@@ -95,7 +97,7 @@ def _built(one: Draft, precision: str, at: pathlib.Path) -> Iterator[Check]:
         if not messages:
             code, output = execute(program)
             yield Check(f"test program{how}", precision, short(output), "exit code 0", code == 0)
-    messages = build([source], at / "controller.so", *SHARED)
+    messages = build([source], at / "block.so", *SHARED)
     yield Check("library", precision, short(messages) or "no warning", EXACT, not messages)
 
 
@@ -139,13 +141,13 @@ def _looped(precision: str, found: closed_loop.LoopComparison) -> Check:
     return Check(name, precision, result, allowed, found.times <= closed_loop.TIMES)
 
 
-def table(checks: list[Check], case: str, mark: str) -> str:
+def table(checks: list[Check], case: str, mark: str, noun: str = "controller") -> str:
     """Return the checks as a Markdown page that ends with the line `mark`."""
     rows = [f"| {x.name} | {x.precision} | {x.found} | {x.allowed} | {x.verdict} |" for x in checks]
     verdict = summary(checks)
     head = "| check | precision | found | allowed | verdict |\n|---|---|---|---|---|"
     return (
-        f"# The controller of case '{case}' as C, compared with JAX\n\n{verdict}\n\n{head}\n"
+        f"# The {noun} of case '{case}' as C, compared with JAX\n\n{verdict}\n\n{head}\n"
         + "\n".join(rows)
         + f"\n\n{NOTES}\n{mark}\n"
     )
@@ -175,11 +177,13 @@ parameter that the step reads is set to {1 / SPAN:g} and {SPAN:g} times the case
 header, first alone, then with the others at random ends of their ranges. Alone, it is also set to NaN, u_max and a
 steepness p to inf, and processor.delay to values outside its range: the C must reject what JAX rejects.
 
-Closed loop: JAX's plant and sensors with the compiled C, compared with the same loop in JAX in double precision. Signs
-and converters amplify rounding errors, so the loops are compared only while these errors are small. {TWINS} twins of
-JAX's loop measure them: in each, every state of plant and laws and the voltage is changed by one unit in the last place
-of the precision, up or down at random, at every sample. The horizon ends before the first sample at which a twin
-differs by more than {PARTED:g} of the rms of z - r, or of the rms of u, or at which the rotor is lost. Within the
-horizon, z of the C's loop may differ by at most {closed_loop.TIMES:g} times the difference of the farthest twin, at
-every sample. With a horizon of fewer than {LEAST} samples the row is not decisive.
+Closed loop: the compiled C with the rest of the loop in JAX (a controller with JAX's plant and sensors, a plant with
+JAX's controller), compared with the same loop in JAX in double precision. An exported plant or loop has disturbances
+that are constant over each sample, and so has JAX's loop in this comparison. Signs and converters amplify rounding
+errors, so the loops are compared only while these errors are small. {TWINS} twins of JAX's loop measure them: in
+each, every state of plant and laws and the voltage is changed by one unit in the last place of the precision, up or
+down at random, at every sample. The horizon ends before the first sample at which a twin differs by more than
+{PARTED:g} of the rms of z - r, or of the rms of u, or at which the rotor is lost. Within the horizon, z of the C's
+loop may differ by at most {closed_loop.TIMES:g} times the difference of the farthest twin, at every sample. With a
+horizon of fewer than {LEAST} samples the row is not decisive.
 """

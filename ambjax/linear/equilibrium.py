@@ -84,7 +84,7 @@ def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar)
     The derivatives with respect to gains and parameters are those of the implicit function. The function is pure and
     works under jit and vmap.
     """
-    start = _start(cascade, scenario, period, r)
+    start = start_of(cascade, scenario, period, r)
     flat, restore = ravel_pytree(start)
     sizes = ravel_pytree(sizes_of(cascade, scenario, start))[0]
 
@@ -142,7 +142,7 @@ def _size(G: Array) -> Array:
     return jnp.where(jnp.all(jnp.isfinite(G)), jnp.max(jnp.abs(G)), jnp.inf)
 
 
-def _start(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Point:
+def start_of(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Point:
     """Return the start of the iteration: the plant at rest at r (m), and the initial states of the laws there."""
     plant, inversion = scenario.plant, cascade.inversion.started(cascade.model.equilibrium(r)[0])
     i, u = plant.equilibrium(r)

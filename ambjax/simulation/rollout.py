@@ -165,7 +165,7 @@ def segment(
 
     Returns the new state and the rows; None if every = 0.
     """
-    step = functools.partial(_sample, system.realised(), clock, fold)
+    step = functools.partial(one_sample, system.realised(), clock, fold)
 
     def unrecorded(progress: RolloutState, first: Scalar, count: int) -> RolloutState:
         return lax.fori_loop(0, count, lambda n, progress: step(progress, first + n)[0], progress)
@@ -194,7 +194,7 @@ def stretch(
     Samples after the last one of the clock do not change the state, so that one compiled program with a fixed `count`
     can simulate every part of a run.
     """
-    step = functools.partial(_sample, system.realised(), clock, fold)
+    step = functools.partial(one_sample, system.realised(), clock, fold)
 
     def sample(progress: RolloutState, k: Array) -> tuple[RolloutState, Row]:
         after, row = step(progress, k)
@@ -220,7 +220,9 @@ def _advanced(
     return method.advance(system.problem(errors), t, period, state, memory, code)
 
 
-def _sample(system: Any, clock: Clock, fold: Fold | None, progress: RolloutState, k: Array) -> tuple[RolloutState, Row]:
+def one_sample(
+    system: Any, clock: Clock, fold: Fold | None, progress: RolloutState, k: Array
+) -> tuple[RolloutState, Row]:
     """Record the row at the start of sample k, then integrate to its end with the measurement errors held.
 
     Reverse mode recomputes a sample (checkpoint), so that its memory grows with the samples, not with the substeps.

@@ -113,6 +113,11 @@ class Bearing(Generic[S]):
         """Return the scaled force and the copper loss in this state."""
         raise NotImplementedError
 
+    def coil_currents(self, state: S) -> tuple[Array, Array]:
+        """Return the currents of the upper and the lower coil, A."""
+        i = self.measurement(state).i
+        return self.i_0 + i, self.i_0 - i
+
     def slope(self) -> Scalar:
         """The fastest rate of the plant's motion, 1/s; the step size is chosen from it."""
         return self.pole

@@ -53,6 +53,9 @@ class TwoCoil(Bearing[Currents]):
     def measurement(self, state: Currents) -> Measurement:
         return Measurement(state.z, state.z_dot, (state.i_1 - state.i_2) / 2)
 
+    def coil_currents(self, state: Currents) -> tuple[Array, Array]:
+        return state.i_1, state.i_2
+
     def signals(self, state: Currents) -> Signals:
         above, below = self.gaps(state.z).inverses
         heat = self.R * (state.i_1**2 + state.i_2**2)

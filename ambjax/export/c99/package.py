@@ -1,19 +1,24 @@
-"""All files of an exported controller, as text: header, source, test program, its vectors, Makefile and README."""
-
-import dataclasses
-from collections.abc import Iterator
-from typing import Any
+"""All files of an exported block, as text: header, source, test program, its vectors, Makefile and README."""
 
 import numpy as np
 
-from ambjax.control.schedule import schedules
-from ambjax.export.controller import Controller
-from ambjax.export.interface import INPUTS, OUTPUTS
+from ambjax.export.block import Block
+from ambjax.export.c99.notes import fixed, notes_of, order_of_work
+from ambjax.export.c99.source import Origin, Writer
+from ambjax.export.c99.statements import literal, word
+from ambjax.export.c99.texts import (
+    BLOCK_FAULT_TEST,
+    BLOCK_START_TEST,
+    FAULT_TEST,
+    MAKEFILE,
+    MARK,
+    README,
+    START_TEST,
+    TEST,
+)
 from ambjax.export.points import Points, points
+from ambjax.export.program import PRECISIONS
 from ambjax.export.reference import Results, results
-from ambjax.export.source import Origin, Writer, fixed, order_of_work
-from ambjax.export.statements import PRECISIONS, literal, word
-from ambjax.export.texts import MAKEFILE, MARK, README, TEST
 from ambjax.export.trace import Trace, trace
 from ambjax.world.sensor import Measurement
 
@@ -25,14 +30,14 @@ NAMES = ("{p}.h", "{p}.c", "{p}_test.c", "{p}_vectors.h", "Makefile", "README.md
 ULPS, SHARE = 4, 1e-5
 
 
-def files(controller: Controller, precision: str, prefix: str, origin: Origin) -> dict[str, str]:
-    """Return the text of each file by name. Raises ValueError for a law that scalar C cannot express."""
-    traced = trace(controller, precision)
+def files(block: Block, precision: str, prefix: str, origin: Origin) -> dict[str, str]:
+    """Return the text of each file by name. Raises ValueError for a law that scalar code cannot express."""
+    traced = trace(block, precision)
     return written(traced, prefix, origin)
 
 
 def written(traced: Trace, prefix: str, origin: Origin) -> dict[str, str]:
-    """Return the files of a traced controller, texts by name."""
+    """Return the files of a traced block, texts by name."""
     writer, at = Writer(traced, prefix, origin), points(traced, VECTORS, seed=1)
     vectors, makefile = _vectors(writer, at, results(traced, at)), MAKEFILE.format(p=prefix)
     texts = (writer.header(), writer.source(), _test(writer), vectors, makefile, _readme(writer))
@@ -52,10 +57,10 @@ def _vectors(writer: Writer, at: Points, given: Results) -> str:
     for n in range(at.started.size):
         lines = _initialisers(writer, "before", [x.name for x, _ in t.state], at.state[:, n])
         lines.append(f".before.started = {int(at.started[n])}u")
-        lines += _initialisers(writer, "input", list(INPUTS), at.inputs[:, n])
+        lines += _initialisers(writer, "input", list(t.block.inputs), at.inputs[:, n])
         lines += _initialisers(writer, "after", [x.name for x, _ in t.state], given.state[:, n])
         lines.append(f".after.started = {int(given.started[n])}u")
-        lines += _initialisers(writer, "output", list(OUTPUTS), given.outputs[:, n])
+        lines += _initialisers(writer, "output", list(t.block.outputs), given.outputs[:, n])
         rows.append("    {" + ", ".join([*lines, f".status = {int(given.bits[n])}u"]) + "}")
     guard = f"{p.upper()}_VECTORS_H"
     return "\n".join(
@@ -96,52 +101,84 @@ def _initialisers(writer: Writer, struct: str, names: list[str], values: np.ndar
 def _test(writer: Writer) -> str:
     p, t = writer.prefix, writer.trace
     share, small = tolerance(t.precision)
-    guard = any(x.name == "watch.left" for x, _ in t.state)
-    unseen = f"(status & {p}_REFUSED) == 0u || isnan(output.u) || ((status & {p}_SAFE) != 0u && differs(output.u, 0))"
-    if not guard:
-        unseen = f"(status & {p}_FAILED) == 0u || differs(output.u, u) || differs(state->last.u, u)"
-    abs_ = "fabsf" if t.precision == "float" else "fabs"
     checks = []
     for struct, there, names in (
         ("state", "after", [x.name for x, _ in t.state]),
         ("output", "output", [x.name for x, _ in t.outputs]),
     ):
         checks += [f"        wrong += differs({struct}.{word(x)}, one->{there}.{word(x)});" for x in names]
+    inputs = list(t.block.inputs)
+    fault = {
+        "p": p,
+        "faults": "\n".join(f"    faults += refused(&state, {k});" for k, name in enumerate(inputs) if name in t.read),
+        "fields": "\n".join(
+            f"    case {k}:\n        input.{name} = {literal(np.nan, t.precision)};\n        break;"
+            for k, name in enumerate(inputs)
+        ),
+        "zeros": "\n".join(f"    input.{name} = {literal(0, t.precision)};" for name in inputs),
+    }
+    texts = _controller_faults(writer, fault) if t.block.noun == "controller" else _block_faults(writer, fault)
     return TEST.format(
         banner=writer.banner(f"{p}_test.c"),
         p=p,
         P=p.upper(),
-        abs=abs_,
-        readings=len(Measurement._fields),
-        effect="refused" if guard else "accepted and make a law fail",
-        unseen=unseen,
+        abs="fabsf" if t.precision == "float" else "fabs",
         share=literal(share, t.precision),
         small=literal(small, t.precision),
         checks="\n".join(checks),
-        faults="\n".join(f"    faults += refused(&state, {k});" for k, name in enumerate(INPUTS) if name in t.read),
-        fields="\n".join(
-            f"    case {k}:\n        input.{name} = {literal(np.nan, t.precision)};\n        break;"
-            for k, name in enumerate(INPUTS)
-        ),
-        zeros="\n".join(f"    input.{name} = {literal(0, t.precision)};" for name in INPUTS),
+        fault_test=texts[0],
+        start_test=texts[1],
     )
+
+
+def _controller_faults(writer: Writer, fault: dict[str, str]) -> tuple[str, str]:
+    """Return the parts of the test program for bad inputs and for the start of a controller."""
+    p, t = writer.prefix, writer.trace
+    guard = any(x.name == "watch.left" for x, _ in t.state)
+    unseen = f"(status & {p}_REFUSED) == 0u || isnan(output.u) || ((status & {p}_SAFE) != 0u && differs(output.u, 0))"
+    if not guard:
+        unseen = f"(status & {p}_FAILED) == 0u || differs(output.u, u) || differs(state->last.u, u)"
+    more = {
+        "readings": len(Measurement._fields),
+        "effect": "refused" if guard else "accepted and make a law fail",
+        "unseen": unseen,
+    }
+    return FAULT_TEST.format(**fault, **more), START_TEST.format(**fault)
+
+
+def _block_faults(writer: Writer, fault: dict[str, str]) -> tuple[str, str]:
+    """Return the parts of the test program for bad inputs and for the start of a plant or a loop."""
+    finite = "".join(f" || !isfinite(output.{word(x.name)})" for x, _ in writer.trace.outputs)
+    return BLOCK_FAULT_TEST.format(**fault, finite=finite), BLOCK_START_TEST.format(**fault)
 
 
 def _readme(writer: Writer) -> str:
     t, p = writer.trace, writer.prefix
+    controller = t.block.noun == "controller"
+    read = [name for name in t.block.inputs if name in t.read]
+    source = _source if controller else "input_{}".format
+    written_ = {"voltage": "u"} if controller else {name: name for name in t.block.outputs}
+    bits = ("SAFE", "FAILED", "INVALID") if controller else ("INVALID", "TOUCHED", "DIVERGED")
+    notes = order_of_work(t) if controller else notes_of(t)
     return README.format(
         p=p,
         P=p.upper(),
         mark=MARK.format(p=p),
         case=writer.origin.case,
-        cascade="\n".join(f"- {line}" for line in writer.origin.cascade),
-        order="\n".join(order_of_work(t)),
-        fixed="\n".join(fixed(t)),
-        yours="\n".join(f"{p}_real {_source(name)}(void);" for name in INPUTS if name in t.read),
-        reads="\n".join(f"    input.{name} = {_source(name)}();" for name in INPUTS if name in t.read),
+        noun=t.block.noun,
+        numbers="gains" if controller else "numbers",
+        cascade="\n".join(f"- {line}" for line in writer.origin.parts),
+        notes="\n".join(notes),
+        fixed="\n".join([*fixed(t), "", ""]) if controller else "",
+        yours="\n".join(f"{p}_real {source(name)}(void);" for name in read),
+        reads="\n".join(f"    input.{name} = {source(name)}();" for name in read),
+        writers="\n".join(f"void write_{name}({p}_real {port});" for name, port in written_.items()),
+        writes="\n".join(f"    write_{name}(output.{port});" for name, port in written_.items()),
+        faults=" | ".join(f"{p}_{bit}" for bit in bits),
+        fault_note="SAFE: u is 0; FAILED, INVALID: the last u is held" if controller else "the rotor is lost, or NaN",
         flops=t.flops(),
         precision=t.precision,
-        period=f"{t.controller.period:g}",
+        period=f"{t.block.period:g}",
         ulps="a relative 1e-5" if t.precision == "float" else f"{ULPS} units in the last place",
     )
 
@@ -149,18 +186,3 @@ def _readme(writer: Writer) -> str:
 def _source(name: str) -> str:
     """Return the name of the function that reads an input in the README's example: read_z, reference_r_dot."""
     return f"{'reference' if name.startswith('r') else 'read'}_{name}"
-
-
-def described(controller: Controller) -> list[str]:
-    """Return the cascade in words: the law of each stage, and its signs without a boundary layer."""
-    return list(_described(controller))
-
-
-def _described(controller: Controller) -> Iterator[str]:
-    cascade: Any = controller.parameters.controller
-    for stage, law in zip(("observer", "position", "inversion", "current"), cascade.laws, strict=True):
-        hard = [f.name for f in dataclasses.fields(law) if f.metadata.get("steepness") and getattr(law, f.name) is None]
-        ends = "".join(f", {name} = inf (the sign itself)" for name in hard)
-        over = "".join(f", {name} as a function of the {one.over}" for name, one in schedules(law).items())
-        yield f"{stage}: {type(law).__name__}{ends}{over}"
-    yield f"processor: {cascade.processor}"

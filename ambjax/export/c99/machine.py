@@ -1,4 +1,4 @@
-"""The C compiler of this machine, and the Python interface of a compiled controller."""
+"""The C compiler of this machine, and the Python interface of a compiled block."""
 
 import contextlib
 import ctypes
@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.export.interface import INPUTS
 from ambjax.export.points import Points
+from ambjax.export.program import PRECISIONS
 from ambjax.export.reference import Results
-from ambjax.export.statements import PRECISIONS
 from ambjax.export.trace import Trace
 
 STRICT = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic", "-Werror"]
@@ -137,7 +136,7 @@ def short(text: str) -> str:
 
 
 class Compiled:
-    """The Python interface of a controller in a shared library.
+    """The Python interface of a block in a shared library.
 
     `library`: the compiled C of `trace`, whose names begin with `prefix`. `parameters`, `state`, `inputs` and `outputs`
     are the arrays that the C reads and writes; `state` consists of "numbers" and the flag "started".
@@ -153,7 +152,7 @@ class Compiled:
         default = (ctypes.c_char * (count * real.itemsize)).in_dll(loaded, f"{prefix}_default")
         self.parameters = np.frombuffer(bytes(default), real).copy()
         self.state = np.zeros((), self.memory)
-        self.inputs, self.outputs = np.zeros(len(INPUTS), real), np.zeros(len(trace.outputs), real)
+        self.inputs, self.outputs = np.zeros(len(trace.inputs), real), np.zeros(len(trace.outputs), real)
         self._at = [x.ctypes.data_as(ctypes.c_void_p) for x in (self.parameters, self.state, self.inputs, self.outputs)]
         self._library: Any = loaded
 

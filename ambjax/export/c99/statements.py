@@ -6,7 +6,7 @@ from typing import SupportsFloat
 import numpy as np
 
 from ambjax.export.primitives import OPS
-from ambjax.export.program import Operand, Program, Ref
+from ambjax.export.program import PERIOD, PRECISIONS, STARTED, Operand, Program, Ref
 
 # Keywords of C or C++ that are valid names in Python.
 RESERVED = {
@@ -24,8 +24,7 @@ HELPERS = {
     "min": "a < b || a != a ? a : b",
     "sign": "a > 0 ? 1 : a < 0 ? -1 : a",
 }
-PERIOD = "SAMPLE_PERIOD"
-PRECISIONS = {"float": "float32", "double": "float64"}
+SAMPLE_PERIOD = "SAMPLE_PERIOD"
 
 
 def word(name: str) -> str:
@@ -60,17 +59,19 @@ class Statements:
             node = self.program.nodes[x.node]
             if node.op != "input":
                 return f"v{self.number[x.node]}"
-            if node.text == PERIOD:
-                return f"{self.prefix}_{PERIOD}"
-            return f"({node.text} != 0u)" if node.dtype.kind == "b" else node.text
-        if x.dtype.kind == "b":
+            location = node.location
+            assert location is not None  # of an input
+            if location == PERIOD:
+                return f"{self.prefix}_{SAMPLE_PERIOD}"
+            return "(state->started != 0u)" if location == STARTED else f"{location.group}->{word(location.name)}"
+        if x.dtype.kind in "biu":
             return str(int(x))
         text = literal(x, "float" if x.dtype == np.float32 else "double")
         return f"({text})" if text.startswith("-") else text
 
     def kind(self, dtype: np.dtype) -> str:
         """Return the C type of a dtype."""
-        if dtype.kind == "b":
+        if dtype.kind in "biu":
             return "int"
         return f"{self.prefix}_real" if dtype == self.real else "float"
 
@@ -78,7 +79,7 @@ class Statements:
         """Return one node as a declaration."""
         node = self.program.nodes[number]
         single = self.precision == "float" or any(self.program.dtype(x) == np.float32 for x in node.args)
-        text = OPS[node.op].text.format(
+        text = OPS[node.op].c99.format(
             *map(self.operand, node.args),
             name=self.prefix,
             f="f" if single else "",

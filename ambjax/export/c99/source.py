@@ -7,21 +7,21 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ambjax._version import __version__
-from ambjax.export.controller import Number
-from ambjax.export.interface import BITS, INPUTS
-from ambjax.export.statements import Statements, literal, word
-from ambjax.export.texts import HEADER, MARK, SOURCE
-from ambjax.export.trace import UNREAD, Trace
+from ambjax.export.c99.notes import ABOUT, notes_of
+from ambjax.export.c99.statements import Statements, literal, word
+from ambjax.export.c99.texts import HEADER, MARK, SOURCE
+from ambjax.export.numbering import UNREAD, Number
+from ambjax.export.trace import Trace
 
 SLACK = 256  # bytes of a stack frame in addition to its numbers: saved registers, padding
 
 
 class Origin(NamedTuple):
-    """The origin of a controller: name of the case, SHA-256 of its file, and the cascade in words."""
+    """The origin of a block: name of the case, SHA-256 of its file, and the block in words."""
 
     case: str
     digest: str
-    cascade: Sequence[str]
+    parts: Sequence[str]
 
 
 class Writer:
@@ -117,7 +117,9 @@ class Writer:
 
     def banner(self, file: str) -> str:
         """Return the first comment of a file: its contents and its origin."""
-        lines = [f"{file}: the controller of case '{self.origin.case}' as C99, written by ambjax {__version__}."]
+        lines = [
+            f"{file}: the {self.trace.block.noun} of case '{self.origin.case}' as C99, written by ambjax {__version__}."
+        ]
         lines += [MARK.format(p=self.prefix), f"SHA-256 of the case: {self.origin.digest}"]
         return "/* " + "\n * ".join(lines) + " */"
 
@@ -134,33 +136,33 @@ class Writer:
             notes="\n".join(f" * {line}".rstrip() for line in self.notes()),
             real=t.precision,
             maths="#include <math.h>\n" if any(np.isinf(x.value) for x in t.parameters) else "",
-            period=literal(t.controller.period, t.precision),
-            bits="\n".join(f"#define {p}_{x.upper()} {1 << k}u /* {BITS[x]} */" for k, (x, _) in enumerate(t.bits)),
+            period=literal(t.block.period, t.precision),
+            bits="\n".join(
+                f"#define {p}_{x.upper()} {1 << k}u /* {t.block.bits[x]} */" for k, (x, _) in enumerate(t.bits)
+            ),
             params=self.struct("params", t.parameters),
             state=self.struct(
                 "state",
                 [x for x, _ in t.state],
-                ["uint32_t started; /* 0: the laws start at the next accepted readings */"],
+                [f"uint32_t started; /* {ABOUT[t.block.noun].started} */"],
             ),
             input=self.struct("input", inputs),
             output=self.struct("output", [x for x, _ in t.outputs]),
             gains=self.values(t.parameters),
+            about=ABOUT[t.block.noun],
             **{name: self.signature(name) for name in ("init", "step", "reset")},
         )
 
     def notes(self) -> list[str]:
-        """Return the description in the header: cascade, order of work, cost."""
+        """Return the description in the header: parts, order of work, cost."""
         t, counts = self.trace, self.trace.counts()
         size = 4 if t.precision == "float" else 8
-        order = "\n".join(order_of_work(t)).splitlines()
         cost = ", ".join(f"{counts[name]} {words}" for name, words in COSTS.items() if counts[name])
         stack = len(self.text.order) * size + SLACK
         return [
-            *self.origin.cascade,
+            *self.origin.parts,
             "",
-            *order,
-            "",
-            *fixed(t),
+            *notes_of(t),
             "",
             f"A step: {t.flops()} flops. {cost}.",
             f"State: {t.state_bytes()} bytes. Stack: at most {stack} bytes, if every intermediate number is kept.",
@@ -179,56 +181,3 @@ COSTS = {
     "conversion": "conversions",
     "logic": "logical operations",
 }
-
-
-def order_of_work(trace: Trace) -> list[str]:
-    """Return the order of work of every sample, in words."""
-    controller = trace.controller
-    processor: Any = controller.parameters.controller.processor
-    delay = processor.delay
-    lines = [
-        f"Every T = {controller.period:g} s: read the sensors, call the step at once, and apply output->u",
-        f"{delay:g} T after the reading, until the u of the next sample replaces it; before the first u, apply 0 V.",
-    ]
-    ahead = f"{delay:g} T after the reading" if processor.predicts else "of the reading"
-    lines.append(f"The reference is that of the instant {ahead}.")
-    return lines
-
-
-def fixed(trace: Trace) -> list[str]:
-    """Return in words what the export fixes, what params can set, what a step checks, and how long it predicts."""
-    parameters = {x.name: x for x in trace.parameters}
-    u_max, delay = parameters["limits.u_max"].value, parameters["processor.delay"].allowed
-    lines = [
-        f"Fixed at export: T = {trace.controller.period:g} s, the laws, which signs have no layer, and whether the",
-        "delay is predicted. Export again to change one of these. Any value in params may change between two steps.",
-        f"params->limits.u_max: u is {'not limited' if np.isinf(u_max) else f'limited to +-{u_max:g} V'}.",
-    ]
-    if samples := parameters.get("processor.guard.samples"):
-        time = samples.value * trace.controller.period
-        lines += [
-            f"params->processor.guard: a reading is refused beyond {_ends(trace, 'processor.guard')}, or if it",
-            "cannot follow from the last one. The model's prediction replaces it for at most",
-            f"{samples.value:g} samples in a row ({time:g} s); then u = 0.",
-        ]
-    else:
-        lines += ["No guard: readings are not checked."]
-    lines += [f"params->limits: a step is invalid beyond {_ends(trace, 'limits')}."]
-    if delay == UNREAD:
-        lines += ["params->processor.delay is not read: nothing is predicted."]
-    else:
-        lines += [f"params->processor.delay: {delay}, else every step is invalid; for a longer one export again."]
-    for x in (x for x in trace.parameters if "export again" in x.allowed):
-        lines += [f"params->{word(x.name)}: finite, else every step is invalid."]
-    return [
-        *lines,
-        "No other parameter is checked. A law that returns no finite number sets the bit FAILED.",
-        "An invalid or failed step holds u. There is no timeout: the caller decides for how many steps u may be held.",
-    ]
-
-
-def _ends(trace: Trace, of: str) -> str:
-    """Return the limits of the inputs in a struct of params, in words."""
-    parameters = {x.name: x for x in trace.parameters}
-    found = {name: parameters.get(f"{of}.{name}") for name in INPUTS if name in trace.read}
-    return ", ".join(f"|{name}| = {x.value:g} {x.unit}" for name, x in found.items() if x)

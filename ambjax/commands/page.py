@@ -1,0 +1,37 @@
+"""`ambjax page`: write one HTML file in which the sampled loop of a case runs with sliders."""
+
+import argparse
+import pathlib
+
+from ambjax.cases.reader import read_case
+from ambjax.commands.outputs import directory, files, make, written
+from ambjax.commands.warnings import read_with_warnings
+from ambjax.page.document import NAME, page
+
+Summary = dict[str, object]
+
+
+def run(args: argparse.Namespace) -> tuple[int, Summary]:
+    """Write the page of a case."""
+    case = read_with_warnings(args.case)
+    given = _target(args.out, args.force)
+    text = page(case, [read_case(path) for path in args.also or []], args.case)
+    out = given or directory(None, f"page-{case.name}") / NAME
+    make(out.parent)
+    with files(out.parent) as part:
+        (part / out.name).write_text(text, encoding="utf-8")
+    if not args.json:
+        written(out.parent, out.name)
+    return 0, {"out": str(out), "bytes": len(text.encode())}
+
+
+def _target(given: str | None, force: bool) -> pathlib.Path | None:
+    """Return the file that --out names, or None. Raises ValueError if it is in use."""
+    if given is None:
+        return None
+    out = pathlib.Path(given)
+    if out.suffix not in (".html", ".htm") or out.is_dir():
+        raise ValueError(f"--out {given}: it must be the name of an HTML file. Use --out {NAME}, for example.")
+    if out.exists() and not force:
+        raise ValueError(f"--out {given}: the file exists. Choose another name, or overwrite it with --force.")
+    return out

@@ -1,0 +1,87 @@
+"""A block: a part of the loop that is exported. Its step is traced, written in a language, and compared with JAX."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from ambjax.control.cascade import Cascade
+from ambjax.control.schedule import schedules
+from ambjax.export.numbering import Number
+from ambjax.numerics.records import Scalar
+
+# Input or output: name, then unit and meaning.
+Ports = Mapping[str, tuple[str, str]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """Base class of the controller, the plant and the loop.
+
+    - `parameters`: pytree of all numbers that a user of the exported code may change.
+    - `period`: sample period, s.
+    - `noun`: name of the block in texts. `ports`: type of its inputs, a NamedTuple. `inputs`, `outputs`, `bits`: names
+      with their meanings.
+    - `crowded`: status bits that most random points set; the comparison adds points without them.
+    """
+
+    parameters: Any
+    period: float
+
+    noun: ClassVar[str]
+    ports: ClassVar[Any]
+    inputs: ClassVar[Ports]
+    outputs: ClassVar[Ports]
+    bits: ClassVar[Mapping[str, str]]
+    crowded: ClassVar[tuple[str, ...]]
+
+    def step(self, parameters: Any, memory: Any, inputs: Any, period: Scalar, read: frozenset[str]) -> Any:
+        """Compute one sample. Return the memory for the next one, the outputs and the status.
+
+        The last leaf of the memory is the flag `started`, the other leaves are real numbers. `read`: names of the
+        inputs that the step uses.
+        """
+        raise NotImplementedError
+
+    def start(self) -> Any:
+        """Return the memory before the first step."""
+        raise NotImplementedError
+
+    def numbers(self) -> list[Number]:
+        """Return every number of the parameters, in the order of their leaves. Raises ValueError for an array."""
+        raise NotImplementedError
+
+    def states(self) -> list[Number]:
+        """Return every state in the order of the memory's leaves, without `started`. Raises ValueError for an array."""
+        raise NotImplementedError
+
+    def sizes(self) -> tuple[list[float], list[float]]:
+        """Return the scales of the states, in the order of `states`, and of the inputs."""
+        raise NotImplementedError
+
+    def bounds(self) -> dict[str, int]:
+        """Return, for the dotted name of each parameter that limits an input, the index of that input."""
+        return {}
+
+    def described(self) -> list[str]:
+        """Return the block in words, one part per line."""
+        raise NotImplementedError
+
+
+def scales(tree: Any) -> list[float]:
+    """Return the leaves of a pytree of characteristic sizes as numbers."""
+    return [float(jnp.asarray(x)) for x in jax.tree.leaves(tree)]
+
+
+def law_lines(cascade: Cascade) -> list[str]:
+    """Return the cascade in words: the law of each stage, its signs without a boundary layer, and the processor."""
+    laws: tuple[Any, ...] = cascade.laws
+    lines = []
+    for stage, law in zip(("observer", "position", "inversion", "current"), laws, strict=True):
+        hard = [f.name for f in dataclasses.fields(law) if f.metadata.get("steepness") and getattr(law, f.name) is None]
+        ends = "".join(f", {name} = inf (the sign itself)" for name in hard)
+        over = "".join(f", {name} as a function of the {one.over}" for name, one in schedules(law).items())
+        lines.append(f"{stage}: {type(law).__name__}{ends}{over}")
+    return [*lines, f"processor: {cascade.processor}"]

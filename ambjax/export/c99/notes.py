@@ -1,0 +1,131 @@
+"""Texts about a block for the header and the README: order of work, what is fixed, what a step checks."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ambjax.export.c99.statements import word
+from ambjax.export.interface import INPUTS
+from ambjax.export.numbering import UNREAD
+from ambjax.export.trace import Trace
+
+
+class About(NamedTuple):
+    """Comments of a header: on the flag `started`, the inputs, and the functions `init`, `step` and `reset`."""
+
+    started: str
+    inputs: str
+    init: str
+    step: str
+    reset: str
+
+
+ABOUT = {
+    "controller": About(
+        "0: the laws start at the next accepted readings",
+        "inputs of a step: the readings, which params->processor.guard limits if there is a guard, and the reference, "
+        "which\n * params->limits limits",
+        "Initialise the state before the first step: no voltage; the first accepted readings will start the laws.",
+        "Compute one sample. Returns the status bits above.",
+        "Restart the laws at the next accepted readings. The delayed voltages are kept.",
+    ),
+    "plant": About(
+        "0: the next step reads the sensors in the initial state",
+        "inputs of a step, constant over the sample that ends with it, and the noise of its readings",
+        "Initialise the state before the first step.",
+        "Advance the plant to the next sample, then read the sensors; the first step reads them in the initial state.\n"
+        " * Returns the status bits above.",
+        "Begin again: the next step reads the sensors in the initial state, params->initial.",
+    ),
+    "loop": About(
+        "0: the next step begins with the plant in the initial state",
+        "inputs of a step: disturbances, constant over the sample that ends with it, then noise and reference",
+        "Initialise the state before the first step.",
+        "Advance the plant to the next sample under the last voltage, read the sensors, and step the controller; the\n"
+        " * first step reads the sensors in the initial state. Returns the status bits above.",
+        "Begin again: the next step reads the sensors in the initial state, params->initial.",
+    ),
+}
+
+
+def notes_of(trace: Trace) -> list[str]:
+    """Return the order of work of every sample, then what the export fixes and what a step checks, in words."""
+    if trace.block.noun == "controller":
+        return [*order_of_work(trace), "", *fixed(trace)]
+    return _of_plant(trace)
+
+
+def _of_plant(trace: Trace) -> list[str]:
+    """Return the order of work of a plant or a loop, in words."""
+    block: Any = trace.block
+    lines = [
+        f"Step n ends at t = n T, T = {block.period:g} s. It advances the plant by T under the voltages that act, with",
+        "the simulator's own steps, and reads the sensors. Step 0 only reads them, in the initial state.",
+    ]
+    if block.noun == "plant":
+        lines += [
+            "input->u of step n is the voltage that the controller computed from the readings of step n - 1;",
+            "params->delay delays it further.",
+        ]
+    else:
+        lines += ["Then the controller computes output->u from these readings. Step n + 1 applies it."]
+    return [
+        *lines,
+        "",
+        f"Fixed at export: T = {block.period:g} s, the parts, the steps between samples. Export again to change one.",
+        "An input that is not finite sets the bit INVALID. A lost rotor is frozen until the next reset.",
+        "params are not checked: a value beyond its range may lose the rotor at once.",
+    ]
+
+
+def order_of_work(trace: Trace) -> list[str]:
+    """Return the order of work of every sample, in words."""
+    block = trace.block
+    processor: Any = block.parameters.controller.processor
+    delay = processor.delay
+    lines = [
+        f"Every T = {block.period:g} s: read the sensors, call the step at once, and apply output->u",
+        f"{delay:g} T after the reading, until the u of the next sample replaces it; before the first u, apply 0 V.",
+    ]
+    ahead = f"{delay:g} T after the reading" if processor.predicts else "of the reading"
+    lines.append(f"The reference is that of the instant {ahead}.")
+    return lines
+
+
+def fixed(trace: Trace) -> list[str]:
+    """Return in words what the export fixes, what params can set, what a step checks, and how long it predicts."""
+    parameters = {x.name: x for x in trace.parameters}
+    u_max, delay = parameters["limits.u_max"].value, parameters["processor.delay"].allowed
+    lines = [
+        f"Fixed at export: T = {trace.block.period:g} s, the laws, which signs have no layer, and whether the",
+        "delay is predicted. Export again to change one of these. Any value in params may change between two steps.",
+        f"params->limits.u_max: u is {'not limited' if np.isinf(u_max) else f'limited to +-{u_max:g} V'}.",
+    ]
+    if samples := parameters.get("processor.guard.samples"):
+        time = samples.value * trace.block.period
+        lines += [
+            f"params->processor.guard: a reading is refused beyond {_ends(trace, 'processor.guard')}, or if it",
+            "cannot follow from the last one. The model's prediction replaces it for at most",
+            f"{samples.value:g} samples in a row ({time:g} s); then u = 0.",
+        ]
+    else:
+        lines += ["No guard: readings are not checked."]
+    lines += [f"params->limits: a step is invalid beyond {_ends(trace, 'limits')}."]
+    if delay == UNREAD:
+        lines += ["params->processor.delay is not read: nothing is predicted."]
+    else:
+        lines += [f"params->processor.delay: {delay}, else every step is invalid; for a longer one export again."]
+    for x in (x for x in trace.parameters if "export again" in x.allowed):
+        lines += [f"params->{word(x.name)}: finite, else every step is invalid."]
+    return [
+        *lines,
+        "No other parameter is checked. A law that returns no finite number sets the bit FAILED.",
+        "An invalid or failed step holds u. There is no timeout: the caller decides for how many steps u may be held.",
+    ]
+
+
+def _ends(trace: Trace, of: str) -> str:
+    """Return the limits of the inputs in a struct of params, in words."""
+    parameters = {x.name: x for x in trace.parameters}
+    found = {name: parameters.get(f"{of}.{name}") for name in INPUTS if name in trace.read}
+    return ", ".join(f"|{name}| = {x.value:g} {x.unit}" for name, x in found.items() if x)

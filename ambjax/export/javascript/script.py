@@ -1,0 +1,171 @@
+"""Write a traced step as JavaScript: an object with names, values and a pure function `step`."""
+
+import json
+import re
+from typing import SupportsFloat
+
+import numpy as np
+
+from ambjax.export.block import Block
+from ambjax.export.numbering import Number
+from ambjax.export.primitives import OPS
+from ambjax.export.program import PERIOD, STARTED, Operand, Ref
+from ambjax.export.trace import Trace, trace
+
+# Functions that the rows of OPS use and `Math` lacks. They treat NaN and the sign of 0 as JAX does.
+HELPERS = {
+    "max": "(a, b) => a > b || a !== a ? a : b",
+    "min": "(a, b) => a < b || a !== a ? a : b",
+    "pow": "(a, b) => a === 1 || (a === -1 && (b === Infinity || b === -Infinity)) ? 1 : Math.pow(a, b)",
+    "roundAway": "x => {\n  const a = Math.abs(x), f = Math.floor(a), r = a - f >= 0.5 ? f + 1 : f;\n"
+    "  return x > 0 ? r : x < 0 ? -r : x;\n}",
+    "roundEven": "x => {\n  const big = 4503599627370496, a = Math.abs(x);\n"
+    "  return x === 0 || !(a < big) ? x : x > 0 ? a + big - big : -(a + big - big);\n}",
+    # the series of erf, all terms of one sign; the continued fraction of erfc
+    "erf": "x => {\n  const a = Math.abs(x);\n  if (!(a < 3)) return x !== x ? x : Math.sign(x) * (1 - erfc(a));\n"
+    "  let term = x, sum = x;\n"
+    "  for (let n = 1; n < 200; n++) { term *= 2 * x * x / (2 * n + 1); sum += term; }\n"
+    "  return 2 / Math.sqrt(Math.PI) * Math.exp(-x * x) * sum;\n}",
+    "erfc": "x => {\n  if (x !== x) return x;\n  if (x < 1) return 1 - erf(x);\n  if (x > 27) return 0;\n  let f = 0;\n"
+    "  for (let n = 300; n > 0; n--) f = n / 2 / (x + f);\n"
+    "  return Math.exp(-x * x) / Math.sqrt(Math.PI) / (x + f);\n}",
+}
+# Helpers that another one uses.
+NEEDS = {"erf": ("erfc",), "erfc": ("erf",)}
+
+
+def script_of(block: Block, name: str) -> str:
+    """Return `const NAME = {...};` for a block, in double precision. Raises ValueError as `trace` does.
+
+    `docs/export.md` describes the object.
+    """
+    return script(trace(block, "double"), name)
+
+
+def script(traced: Trace, name: str) -> str:
+    """Return `const NAME = {...};` for a step that is traced in double precision."""
+    body = Body(traced)
+    block = traced.block
+    lists = {
+        "parameters": traced.parameters,
+        "states": [x for x, _ in traced.state],
+        "inputs": traced.inputs,
+        "outputs": [x for x, _ in traced.outputs],
+    }
+    bits = {bit: 1 << k for k, (bit, _) in enumerate(traced.bits)}
+    return "\n".join(
+        [
+            f"const {name} = (() => {{",
+            '"use strict";',
+            f"const period = {number(block.period)};",
+            *body.helpers(),
+            *body.step(),
+            "return {",
+            f"  noun: {_json(block.noun)}, period, step,",
+            *(f"  {kind}: [\n{_entries(xs, kind, traced.read)}\n  ]," for kind, xs in lists.items()),
+            f"  bits: {_json(bits)},",
+            f"  values: () => Float64Array.of({', '.join(number(x.value) for x in traced.parameters)}),",
+            f"  start: () => new Float64Array({len(traced.state) + 1}),",
+            "};",
+            "})();",
+            "",
+        ]
+    )
+
+
+def number(x: SupportsFloat) -> str:
+    """Return a number as a JavaScript literal with the same value."""
+    value = float(x)
+    if np.isinf(value):
+        return "Infinity" if value > 0 else "-Infinity"
+    return "NaN" if np.isnan(value) else repr(value)
+
+
+def _json(x: object) -> str:
+    """Return a string or a mapping as a literal that is also safe inside a script element."""
+    return json.dumps(x).replace("<", "\\u003c")
+
+
+def _entries(numbers: list[Number], kind: str, read: frozenset[str]) -> str:
+    rows = []
+    for x in numbers:
+        more = f", value: {number(x.value)}, allowed: {_json(x.allowed)}" if kind == "parameters" else ""
+        more += f", read: {_json(x.name in read)}" if kind == "inputs" else ""
+        rows.append(f"    {{name: {_json(x.name)}, unit: {_json(x.unit)}, doc: {_json(x.doc)}{more}}},")
+    return "\n".join(rows)
+
+
+class Body:
+    """The step of a trace as statements of JavaScript.
+
+    Numbers are read from arrays: `p` has the parameters, `s` the states and the flag `started`, `x` the inputs, and `y`
+    takes the outputs.
+    """
+
+    def __init__(self, traced: Trace) -> None:
+        self.trace, self.program, self.order = traced, traced.program, traced.order()
+        self.names = {n: f"v{k}" for k, n in enumerate(self.order)}
+        groups = {"params": traced.parameters, "state": [x for x, _ in traced.state], "input": traced.inputs}
+        arrays = {"params": "p", "state": "s", "input": "x"}
+        self.locations = {
+            (group, one.name): f"{arrays[group]}[{k}]" for group, xs in groups.items() for k, one in enumerate(xs)
+        }
+
+    def operand(self, x: Operand) -> str:
+        """Return an operand as text."""
+        if isinstance(x, Ref):
+            location = self.program.nodes[x.node].location
+            if location is None:
+                return self.names[x.node]
+            if location == PERIOD:
+                return "period"
+            return f"(s[{len(self.trace.state)}] !== 0)" if location == STARTED else self.locations[location]
+        if x.dtype.kind == "b":
+            return "true" if x else "false"
+        text = number(x)
+        return f"({text})" if text.startswith("-") else text
+
+    def statement(self, n: int) -> str:
+        """Return one node as a declaration."""
+        node = self.program.nodes[n]
+        text = OPS[node.op].javascript.format(*map(self.operand, node.args))
+        rounded = f"Math.fround({text})" if node.dtype == np.float32 else text
+        return f"  const {self.names[n]} = {rounded};"
+
+    def statements(self) -> list[str]:
+        """Return all statements; those of each law follow a comment with its name."""
+        lines, law = [], ""
+        for n in self.order:
+            if (node := self.program.nodes[n]).law != law:
+                law = node.law
+                lines.append(f"  // {re.sub(r'[^ -~]', '?', law) or 'the cascade'}")
+            lines.append(self.statement(n))
+        return lines
+
+    def step(self) -> list[str]:
+        """Return the function `step`."""
+        given = [(f"s[{k}]", self.operand(after)) for k, (_, after) in enumerate(self.trace.state)]
+        given += [(f"y[{k}]", self.operand(value)) for k, (_, value) in enumerate(self.trace.outputs)]
+        # state that is copied to another location is read before it is written
+        old = {value: f"old{k}" for k, value in enumerate(dict.fromkeys(v for _, v in given if v.startswith("s[")))}
+        bits = [f"({self.operand(bit)} ? {1 << k} : 0)" for k, (_, bit) in enumerate(self.trace.bits)]
+        started = f"const started = {self.operand(self.trace.started)} ? 1 : 0;"
+        return [
+            "// Computes one sample: updates s, writes y, returns the status bits.",
+            "function step(p, s, x, y) {",
+            *self.statements(),
+            *(f"  const {name} = {value};" for value, name in old.items()),
+            f"  {started}",
+            f"  const status = {' | '.join(bits)};",
+            *(f"  {place} = {old.get(value, value)};" for place, value in given),
+            f"  s[{len(self.trace.state)}] = started;",
+            "  return status;",
+            "}",
+        ]
+
+    def helpers(self) -> list[str]:
+        """Return the functions that the step uses and JavaScript lacks."""
+        texts = {OPS[self.program.nodes[n].op].javascript for n in self.order}
+        used = [name for name in HELPERS if any(re.search(rf"(?<![.\w]){name}\(", text) for text in texts)]
+        used += [more for name in used for more in NEEDS.get(name, ()) if more not in used]
+        return [f"const {name} = {HELPERS[name]};" for name in used]

@@ -1,0 +1,81 @@
+"""The numbers of an exported block: names, units, ranges and values of its parameters and states."""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from ambjax.control.schedule import OVER, Schedule, finite
+from ambjax.numerics.records import numbers
+
+# Factor by which a parameter is divided and multiplied to reach the ends at which exported code is compared with JAX.
+SPAN = 100.0
+# Text in place of the allowed values of a number that the step does not use.
+UNREAD = "not read"
+
+
+class Number(NamedTuple):
+    """A parameter, a state, an input or an output: dotted name, unit, allowed values, meaning, value.
+
+    `ends`: further values of a parameter at which exported code is compared with JAX: the lowest and the highest first,
+    then those that are not finite or that a step must reject. `among`: the only values of a state that is a flag or a
+    code; () for a real number.
+    """
+
+    name: str
+    unit: str
+    allowed: str
+    doc: str
+    value: float
+    ends: tuple[float, ...] = ()
+    among: tuple[float, ...] = ()
+
+
+def numbers_of(node: Any, path: str = "", home: str = "") -> Iterator[Number]:
+    """Yield every number of a record, in the order of its leaves, with its dotted name below `path`. `home`: text
+    before the name in a message.
+
+    Raises ValueError for an array.
+    """
+    for field in dataclasses.fields(node):
+        value, name = getattr(node, field.name), f"{path}{field.name}"
+        if field.metadata.get("static") or value is None:
+            continue
+        if isinstance(value, Schedule):
+            unit, signal = OVER[value.over]
+            for knot, (at, x) in enumerate(zip(value.at, value.values, strict=True)):
+                number = _number(f"{name}.knot_{knot}", finite(field), float(x))
+                yield number._replace(doc=f"{number.doc}; at {signal} = {at:g} {unit}")
+        elif dataclasses.is_dataclass(value):
+            yield from numbers_of(value, f"{name}.", home)
+        elif jnp.shape(value) == ():
+            yield _number(name, field, float(value))
+        else:
+            raise ValueError(f"{home}{name} has the shape {jnp.shape(value)}: only scalars can be exported.")
+
+
+def _number(name: str, field: dataclasses.Field, value: float) -> Number:
+    meta = field.metadata
+    unit, doc = meta.get("unit", ""), meta.get("doc", "")
+    allowed = numbers(field) if meta.get("leaf") else ""
+    for word in (f" ({unit})", "a finite number ", "a number "):
+        allowed = allowed.replace(word, "")
+    if meta.get("steepness"):
+        allowed = allowed.replace(", or inf", ", finite: set p = inf in the case and export again")
+    return Number(name, unit, allowed, doc, value, _ends(meta, value))
+
+
+def _ends(meta: Mapping[str, Any], value: float) -> tuple[float, ...]:
+    """Return the further values of a parameter for the comparison: 1/SPAN and SPAN times `value`, within its bounds.
+
+    A parameter that is 0 is set to -1 and 1 in its unit; one that is inf, to 1 and SPAN.
+    """
+    low, high = sorted((value / SPAN, value * SPAN)) if value else (-1.0, 1.0)
+    if math.isinf(value):
+        low, high = 1.0, SPAN
+    floors = [x for x in (meta.get("above"), meta.get("at_least")) if x is not None]
+    ceiling = meta.get("at_most")
+    low, high = max([low, *floors]), high if ceiling is None else min(high, ceiling)
+    return (low, high, math.inf, math.nan) if meta.get("infinite") else (low, high, math.nan)

@@ -1,0 +1,34 @@
+"""The blocks of a case: its controller, its plant, and both as one loop."""
+
+from ambjax.control.cascade import Cascade
+from ambjax.export.block import Block
+from ambjax.export.controller import controller_of
+from ambjax.export.loop_step import loop_of
+from ambjax.export.plant_step import plant_of
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.integrate import FixedSteps
+from ambjax.simulation.method import choose_method
+from ambjax.world.scenario import Scenario
+
+WHAT = ("controller", "plant", "loop")
+
+
+def block_of(what: str, cascade: Cascade, scenario: Scenario, clock: Clock) -> Block:
+    """Return a block of a case: one of WHAT. Raises ValueError for a case that cannot be exported.
+
+    The plant of a clock without a method of fixed steps gets the simulator's choice among these.
+    """
+    period = float(clock.sample_period)
+    controller = controller_of(cascade, scenario.u_max, period, scenario)
+    if what == "controller":
+        return controller
+    method = clock.method
+    if not isinstance(method, FixedSteps):
+        method = choose_method(cascade, scenario, period, reverse=True)
+    plant = plant_of(cascade, scenario, period, method)
+    return plant if what == "plant" else loop_of(controller, plant)
+
+
+def blocks_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> dict[str, Block]:
+    """Return all blocks of a case by name. Raises ValueError as `block_of` does."""
+    return {what: block_of(what, cascade, scenario, clock) for what in WHAT}

@@ -1,0 +1,295 @@
+"""The exported plant: motion, coils, amplifier and sensors over one sample period, in the simulator's own steps.
+
+A step advances the plant from the last sample to the next under the voltage of the last sample, and then reads the
+sensors. The first step reads the sensors in the initial state. `Sampled.advance` and `Sampled.measured`, the functions
+of the simulator, do the work. The random numbers of the sensors and the disturbances are inputs, constant over the
+sample.
+"""
+
+import dataclasses
+import functools
+import math
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.control.cascade import Cascade
+from ambjax.control.cascade_state import Command
+from ambjax.control.processor import MOST_DELAY, Processor
+from ambjax.export.block import Block, Ports, scales
+from ambjax.export.numbering import Number, numbers_of
+from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.smooth import limited
+from ambjax.simulation.between import lags, plant_status
+from ambjax.simulation.integrate import FixedSteps, choose
+from ambjax.simulation.loop import ClosedLoop
+from ambjax.simulation.sampled import Sampled, SampledState
+from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED
+from ambjax.world.amplifier import Amplifier
+from ambjax.world.bearing import Bearing
+from ambjax.world.scenario import Initial, Scenario
+from ambjax.world.sensor import Errors, Sensor
+from ambjax.world.signals import Constant
+from ambjax.world.touchdown import Stop
+
+FIELDS = {field.name: field.metadata for field in dataclasses.fields(Scenario)}
+
+
+class PlantInputs(NamedTuple):
+    """Inputs of a step of the plant, constant over the sample that it advances."""
+
+    u: Array
+    q_z: Array
+    q_i: Array
+    w_z: Array
+    w_z_dot: Array
+    w_i: Array
+
+
+class PlantStatus(NamedTuple):
+    """Status of a step of the plant, one bit each."""
+
+    touched: Array
+    diverged: Array
+    invalid: Array
+
+
+class PlantOutputs(NamedTuple):
+    """Outputs of a step of the plant: the readings, then the true motion and current."""
+
+    z: Array
+    z_dot: Array
+    i: Array
+    z_true: Array
+    z_dot_true: Array
+    i_true: Array
+
+
+DISTURBANCES = {
+    "q_z": ("m/s^2", "disturbance of the acceleration; a force divided by plant.m"),
+    "q_i": ("A/s", "disturbance of the current's rate"),
+    "w_z": ("1", "standard normal number: noise of z, divided by sensor.std"),
+    "w_z_dot": ("1", "standard normal number: noise of z_dot, divided by sensor.std_z_dot"),
+    "w_i": ("1", "standard normal number: noise of i, divided by sensor.std_i"),
+}
+READINGS = {
+    "z": ("m", "rotor displacement, measured"),
+    "z_dot": ("m/s", "rotor velocity, measured"),
+    "i": ("A", "current deviation, measured"),
+    "z_true": ("m", "rotor displacement"),
+    "z_dot_true": ("m/s", "rotor velocity"),
+    "i_true": ("A", "current deviation"),
+}
+LOSSES = {
+    "touched": "the rotor has reached the clearance: it is frozen there",
+    "diverged": "a state has left the range of the model: the plant is frozen",
+}
+COORDINATES = {
+    "z": ("m", "rotor displacement"),
+    "z_dot": ("m/s", "rotor velocity"),
+    "i": ("A", "current deviation"),
+    "i_1": ("A", "current of the upper coil"),
+    "i_2": ("A", "current of the lower coil"),
+}
+
+
+class PlantMemory(NamedTuple):
+    """State that a step keeps for the next: that of a `SampledState`, without the laws.
+
+    `lost`: 0, or the status code with which the rotor is lost. `started`: False before the first step.
+    """
+
+    motion: Any
+    last: Array
+    before: Array
+    z_filtered: Array | tuple[()]
+    u_a: Array | tuple[()]
+    lost: Array
+    started: Array
+
+
+@record
+class Machine:
+    """Parameters of the exported plant, under the names of the case file."""
+
+    plant: Bearing
+    sensor: Sensor | None
+    actuator: Amplifier | None
+    stop: Stop | None
+    initial: Initial
+    u_max: Scalar = dataclasses.field(metadata=FIELDS["u_max"])
+    clearance: Scalar | None = dataclasses.field(metadata=FIELDS["clearance"])
+    delay: Scalar = leaf(unit="samples", at_least=0, at_most=MOST_DELAY, doc="from reading to voltage")
+
+    def scenario(self, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Scenario:
+        """Return the scenario with these parameters and constant disturbances, m/s^2 and A/s."""
+        return Scenario(
+            plant=self.plant,
+            q_z=Constant(q_z),
+            q_i=Constant(q_i),
+            sensor=self.sensor,
+            initial=self.initial,
+            u_max=self.u_max,
+            amplifier=self.actuator,
+            clearance=self.clearance,
+            stop=self.stop,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class PlantStep(Block):
+    """The plant of a case as it is exported, with a method of fixed steps.
+
+    `cascade` gives the structure of the loop.
+    """
+
+    parameters: Machine
+    cascade: Cascade
+    method: FixedSteps
+
+    noun: ClassVar[str] = "plant"
+    ports: ClassVar[Any] = PlantInputs
+    inputs: ClassVar[Ports] = {"u": ("V", "voltage commanded at the last sample"), **DISTURBANCES}
+    outputs: ClassVar[Ports] = READINGS
+    bits = LOSSES | {"invalid": "an input or the delay is NaN or out of range: 0 replaces an input"}
+    crowded = ("touched", "diverged")
+
+    def system(self, machine: Machine, period: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Sampled:
+        """Return the simulator's loop with the parameters `machine` and constant disturbances (m/s^2, A/s)."""
+        given: Any = self.cascade.processor
+        processor = Processor(machine.delay, predict=False, guard=None, whole=given.whole, most=given.most)
+        cascade = dataclasses.replace(self.cascade, processor=processor)
+        return Sampled(ClosedLoop(cascade, machine.scenario(q_z, q_i)), period, 0)
+
+    def step(
+        self, parameters: Machine, memory: PlantMemory, inputs: PlantInputs, period: Scalar, read: frozenset[str]
+    ) -> tuple[PlantMemory, PlantOutputs, PlantStatus]:
+        fine = [jnp.isfinite(getattr(inputs, name)) for name in PlantInputs._fields if name in read]
+        delay = jnp.asarray(parameters.delay)
+        fine += [delay >= 0, delay <= MOST_DELAY]
+        u, q_z, q_i, *w = (jnp.where(jnp.isfinite(x), x, 0.0) for x in inputs)
+        system = self.system(parameters, period, q_z, q_i)
+        kept = choose(memory.started, self._advanced(system, memory, limited(u, parameters.u_max)), self._begun(system))
+        sensor, true = parameters.sensor, parameters.plant.measurement(kept.motion)
+        stds = (0.0, 0.0, 0.0) if sensor is None else (sensor.std, sensor.std_z_dot, sensor.std_i)
+        errors = Errors(*(jnp.asarray(std) * x for std, x in zip(stds, w, strict=True)))
+        measured = system.measured(kept.motion, kept.z_filtered, errors)
+        invalid = ~functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
+        status = PlantStatus(kept.lost == TOUCHED, kept.lost == DIVERGED, invalid)
+        return kept, PlantOutputs(*measured, *true), status
+
+    def _advanced(self, system: Sampled, memory: PlantMemory, u: Array) -> PlantMemory:
+        """Return the memory at the next sample. `u`: commanded at the last sample, V."""
+        zero = jnp.zeros(())
+        control: Any = ()
+        command, past = Command(zero, zero, zero, zero, u), (memory.last, memory.before)
+        state = SampledState(memory.motion, control, command, past, jnp.ones(()), memory.z_filtered, memory.u_a)
+        code = jnp.where(memory.lost == TOUCHED, TOUCHED, jnp.where(memory.lost == ALIVE, ALIVE, DIVERGED))
+        method: Any = self.method
+        after = system.advance(method, Errors(zero, zero, zero), 0.0, system.period, state, (), code)
+        lost_now = (code == ALIVE) & (after.code != ALIVE)
+        new = choose(lost_now, system.rest(after.state, after.code), after.state)
+        return PlantMemory(new.plant, u, memory.last, new.z_filtered, new.u_a, _real(after.code), jnp.asarray(True))
+
+    def _begun(self, system: Sampled) -> PlantMemory:
+        """Return the memory at the first sample."""
+        scenario, zero = system.loop.scenario, jnp.zeros(())
+        motion = scenario.plant.start(scenario.initial.measurement())
+        slow = scenario.amplifier is not None and scenario.amplifier.slow
+        z_filtered = scenario.plant.measurement(motion).z if lags(system.loop) else ()
+        lost = _real(plant_status(system.loop, motion))
+        return PlantMemory(motion, zero, zero, z_filtered, zero if slow else (), lost, jnp.asarray(True))
+
+    def start(self) -> PlantMemory:
+        begun = self._begun(self.system(self.parameters, self.period))
+        return jax.tree.map(jnp.zeros_like, begun)
+
+    def numbers(self) -> list[Number]:
+        found = list(numbers_of(self.parameters))
+        assert [x.value for x in found] == [float(x) for x in jax.tree.leaves(self.parameters)]
+        whole: Any = self.cascade.processor
+        most, words = whole.most, "whole: rounded down" if whole.whole else ""
+        allowed = ", ".join(filter(None, (f"from 0 to {MOST_DELAY:g}", words)))
+        delay = {"allowed": allowed, "ends": (0.0, float(most), MOST_DELAY + 0.5, -0.5, math.nan)}
+        return [x._replace(**delay) if x.name == "delay" else x for x in found]
+
+    def states(self) -> list[Number]:
+        memory = self.start()
+        found = [
+            Number(name, unit, "", doc, 0.0) for name in memory.motion._fields for unit, doc in [COORDINATES[name]]
+        ]
+        found.append(Number("last.u", "V", "", "voltage of the sample before the last", 0.0))
+        found.append(Number("before.u", "V", "", "voltage of the sample before that", 0.0))
+        if not isinstance(memory.z_filtered, tuple):
+            found.append(Number("z_filtered", "m", "", "output of the position sensor's low-pass", 0.0))
+        if not isinstance(memory.u_a, tuple):
+            found.append(Number("u_a", "V", "", "output voltage of the amplifier", 0.0))
+        codes = f"0, {TOUCHED} after touch-down, {DIVERGED} after divergence"
+        lost = Number("lost", "", "", codes, 0.0, among=(*[float(ALIVE)] * 8, float(TOUCHED), float(DIVERGED)))
+        return [*found, lost]
+
+    def sizes(self) -> tuple[list[float], list[float]]:
+        plant, memory = self.parameters.plant, self.start()
+        z, _, i = scales(plant.sizes())
+        weight, pole = float(plant.R) * float(plant.i_0), float(plant.pole)
+        u = float(self.parameters.u_max) if math.isfinite(self.parameters.u_max) else 10 * weight + 1.0
+        extra = [
+            *([] if isinstance(memory.z_filtered, tuple) else [z]),
+            *([] if isinstance(memory.u_a, tuple) else [u]),
+        ]
+        return [*scales(plant.scale()), u, u, *extra, 1.0], [u, z * pole**2, i * pole, 1.0, 1.0, 1.0]
+
+    def described(self) -> list[str]:
+        parts = self.parameters
+        sensor = "sensors: exact" if parts.sensor is None else f"sensors: {_given(parts.sensor)}"
+        amplifier = "amplifier: ideal" if parts.actuator is None else f"amplifier: {_given(parts.actuator)}"
+        return [f"plant: {type(parts.plant).__name__}, {self.method} per period", sensor, amplifier]
+
+
+def _given(part: Any) -> str:
+    """Return the parameters of a part that a case sets, in words."""
+    return ", ".join(x.name for x in numbers_of(part))
+
+
+def _real(code: Array) -> Array:
+    """Return a status code as a real number."""
+    one = jnp.ones(())
+    return jnp.where(code == ALIVE, 0 * one, jnp.where(code == TOUCHED, TOUCHED * one, DIVERGED * one))
+
+
+def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object) -> PlantStep:
+    """Return the plant of a case. Raises ValueError for a cascade in continuous time and for what cannot be exported.
+
+    `period`: sample period, s. `method`: the case's method between samples; it must have fixed steps.
+    """
+    if cascade.processor is None:
+        raise ValueError(
+            "[processor] is missing: the exported plant takes a voltage that is held over a sample, and this case "
+            "is in continuous time. Add [processor], tune the gains for it, and export the tuned case."
+        )
+    sensor = scenario.sensor
+    for part in ("outliers", "dropouts", "runout"):
+        if getattr(sensor, part, None) is not None:
+            raise ValueError(
+                f"sensor.{part}: the exported plant has no such fault. Leave it out, and add it to z outside."
+            )
+    if not isinstance(method, FixedSteps):
+        raise ValueError(
+            f"clock: {method} has no fixed number of steps, and exported code needs one. Set clock.dt or "
+            "clock.method = 'rk4'."
+        )
+    resolved = cascade.on_processor()
+    machine = Machine(
+        scenario.plant,
+        sensor,
+        scenario.amplifier,
+        scenario.stop,
+        scenario.initial,
+        scenario.u_max,
+        scenario.clearance,
+        resolved.processor.delay if resolved.processor else 0.0,
+    )
+    plain = jax.tree.map(lambda x: float(x) if jnp.shape(x) == () else x, machine)
+    return PlantStep(plain, float(period), resolved, method)

@@ -1,0 +1,124 @@
+"""The case file as a template in which the page fills the numbers of its sliders."""
+
+import re
+import tomllib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import tomlkit
+from tomlkit.items import Table
+
+from ambjax.page.sliders import Slider
+
+# Numbers that mark the places of the sliders; no case contains them.
+MARK = "1{:05d}e207"
+
+# Prefixes of the tables of signals, which name their kind.
+SIGNALS = "reference", "disturbance"
+
+
+class Line(NamedTuple):
+    """A line of the case file.
+
+    - `parts`: its texts and, between two texts, the place of a slider: its number, and the text of the case's value.
+    - `only`: sliders of which one must differ from the case's value, or the line is left out; empty: always present.
+    """
+
+    parts: list[str | tuple[int, str]]
+    only: list[int]
+
+
+def template(text: str, given: Sequence[Slider]) -> tuple[list[Line], list[int]]:
+    """Return the lines of a case file, and the numbers of the sliders that have a place in it.
+
+    A number that the file leaves out gets a line that is present only if the slider has moved. A change of a number of
+    the plant adds a line that keeps the controller's model as it is.
+    """
+    document, written = tomlkit.parse(text), {}
+    added: dict[str, dict[str, int]] = {}
+    placed = []
+    for k, slider in enumerate(given):
+        tables, name = _route(slider.path)
+        found = _find(document, tables)
+        if found is not None and name in found:
+            written[k] = found[name].as_string()
+            found[name] = tomlkit.value(MARK.format(k))
+            placed.append(k)
+        elif found is None or isinstance(found, Table):
+            added.setdefault(".".join(tables), {})[name] = k
+            placed.append(k)
+    lines = [_line(line, written) for line in tomlkit.dumps(document).split("\n")]
+    kept = _find(document, ["controller", "model"])
+    names = {given[k].path.rpartition(".")[2]: k for k in placed if given[k].path.startswith("plant.")}
+    keep = {name: k for name, k in names.items() if kept is None or name not in kept}
+    if kept is None or isinstance(kept, Table):
+        rows = [([f"{name} = {given[k].value!r}"], [k]) for name, k in keep.items()]
+        _insert(lines, "controller.model", kept is not None, rows)
+    else:
+        placed = [k for k in placed if k not in keep.values()]
+    for table, names in added.items():
+        rows = [([f"{name} = ", (k, ""), ""], [k]) for name, k in names.items()]
+        if _find(document, table.split(".")) is None and table.startswith(SIGNALS):
+            rows = [(['kind = "constant"'], sorted(names.values())), *rows]
+        _insert(lines, table, _find(document, table.split(".")) is not None, rows)
+    return lines, placed
+
+
+def _insert(lines: list[Line], table: str, there: bool, rows: Sequence[tuple[Any, list[int]]]) -> None:
+    """Insert optional lines below the header of a table; a table that is not there goes to the end."""
+    new = [Line(*row) for row in rows]
+    if there:
+        at = next(
+            k for k, line in enumerate(lines) if line.parts and str(line.parts[0]).strip().startswith(f"[{table}]")
+        )
+        lines[at + 1 : at + 1] = new
+    elif new:
+        every = sorted({k for line in new for k in line.only})
+        lines += [Line([""], every), Line([f"[{table}]"], every), *new]
+
+
+def _route(path: str) -> tuple[list[str], str]:
+    *tables, name = path.split(".")
+    return tables, name
+
+
+def _find(document: Any, tables: list[str]) -> Any:
+    """Return the table at this path, or None."""
+    for word in tables:
+        if not hasattr(document, "get") or (document := document.get(word)) is None:
+            return None
+    return document if hasattr(document, "get") else None
+
+
+def _line(text: str, written: dict[int, str]) -> Line:
+    """Split a line at the marks of its sliders. `written`: the text of each value in the case."""
+    pieces = re.split(r"1(\d{5})e207", text)
+    parts = [(int(x), written[int(x)]) if n % 2 else x for n, x in enumerate(pieces)]
+    return Line(parts, [])
+
+
+def filled(lines: Sequence[Line], given: Sequence[Slider], values: Sequence[float]) -> str:
+    """Return the case file with these values. The page does the same in JavaScript."""
+    texts = []
+    for line in lines:
+        if line.only and all(values[k] == given[k].value for k in line.only):
+            continue
+        texts.append("".join(part if isinstance(part, str) else _number(*part, given, values) for part in line.parts))
+    return "\n".join(texts)
+
+
+def _number(k: int, written: str, given: Sequence[Slider], values: Sequence[float]) -> str:
+    """Return the text of a slider's value; that of the case if it is the case's value."""
+    if written and values[k] == given[k].value:
+        return written
+    return str(round(values[k])) if given[k].whole else repr(float(values[k]))
+
+
+def checked(lines: Sequence[Line], given: Sequence[Slider]) -> bool:
+    """Return whether the template with the case's own values, and with all values changed, is valid TOML."""
+    try:
+        for factor in (1.0, 1.5):
+            tomllib.loads(filled(lines, given, [x.value * factor + (factor - 1) for x in given]))
+    except tomllib.TOMLDecodeError:
+        return False
+    return True

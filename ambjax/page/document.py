@@ -1,0 +1,212 @@
+"""The page as one HTML file: the loop as JavaScript, its data, the plotting library, the style and the scripts."""
+
+import dataclasses
+import html
+import importlib.resources
+import json
+import pathlib
+import shlex
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from ambjax.cases.reader import Case
+from ambjax.ensemble.study import Study
+from ambjax.host.optional import extra
+from ambjax.page.case_text import Line, checked, template
+from ambjax.page.functions import PRELUDE
+from ambjax.page.linear_script import linear_script
+from ambjax.page.loop_functions import numbers_of
+from ambjax.page.loop_script import COILS, SIGNALS, loop_script
+from ambjax.page.sliders import GROUPS, SEED, Slider, changed, parameter_values, parameters, sliders
+from ambjax.simulation.metrics import UNITS
+from ambjax.simulation.trajectory import STATUSES
+
+# Name of the file.
+NAME = "page.html"
+# Number of members of the envelope.
+MEMBERS = 64
+# Scripts of the worker and of the page, in order.
+WORKER, PAGE = (
+    ("noise.js", "spectrum.js", "sensitivity.js", "worker.js"),
+    ("controls.js", "plots.js", "machine.js", "app.js"),
+)
+BOKEH = "bokeh.min.js", "bokeh-api.min.js"
+
+
+def page(case: Case, others: Sequence[Case] = (), path: str = "case.toml") -> str:
+    """Return the page of a case as HTML.
+
+    - `others`: cases that differ from it in numbers only; each is a preset.
+    - `path`: name of the case file, for messages and the command that tunes.
+
+    Raises ValueError, one line, for a case without a processor or with a part that the page cannot compute, for another
+    case with another structure, and if Bokeh is missing.
+    """
+    library = _library()
+    worker, data = _computed(case, list(others), path)
+    title = f"{case.name}: ambjax"
+    scripts = "".join(f"<script>{text}</script>\n" for text in (*library, *map(_asset, PAGE)))
+    blocks = [
+        f"<style>{_asset('style.css')}</style>",
+        _block("data", json.dumps(data, allow_nan=False)),
+        _block("worker", json.dumps(worker)),
+    ]
+    shell = _asset("page.html").replace("{title}", html.escape(title)).replace("{name}", html.escape(case.name))
+    head, body = shell.split("{scripts}")
+    return head + "\n".join(blocks) + scripts + body
+
+
+def pages(cases: Sequence[Case], paths: Sequence[str]) -> dict[str, str]:
+    """Return pages by file name: page.html, page-2.html, ..., one for all cases that differ in numbers only.
+
+    `paths`: the case files. Raises ValueError as `page` does.
+    """
+    groups: list[list[int]] = []
+    for k, case in enumerate(cases):
+        check_processor(case, paths[k])
+        group = next((group for group in groups if _alike(cases[group[0]], case)), None)
+        if group is None:
+            groups.append(group := [])
+        group.append(k)
+    texts = [page(cases[first], [cases[k] for k in others], paths[first]) for first, *others in groups]
+    return {NAME if k == 1 else NAME.replace(".", f"-{k}."): text for k, text in enumerate(texts, 1)}
+
+
+def check_processor(case: Case, path: str) -> None:
+    """Raise ValueError for a case without a processor."""
+    if case.cascade.processor is None:
+        raise ValueError(
+            f"{path}: the page runs a controller on a processor, and this case has none. Add the table [processor]."
+        )
+
+
+def _block(name: str, text: str) -> str:
+    """Return JSON as an element that scripts read; no text in it can end the element."""
+    safe = text.replace("<", "\\u003c")
+    return f'<script type="application/json" id="{name}">{safe}</script>\n'
+
+
+def _asset(name: str) -> str:
+    return (importlib.resources.files("ambjax.page") / "assets" / name).read_text(encoding="utf-8")
+
+
+def _library() -> list[str]:
+    """Return Bokeh's JavaScript. Raises ValueError if Bokeh is not installed."""
+    folder = pathlib.Path(extra("bokeh", "page").__file__).parent / "server" / "static" / "js"
+    return [(folder / name).read_text(encoding="utf-8") for name in BOKEH]
+
+
+def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str, Any]]:
+    """Return the script of the worker, and the data of the page."""
+    check_processor(case, path)
+    for other in others:
+        _check_structure(case, other, path)
+    case = _finest(case, others)
+    try:
+        loop, moving = loop_script(case), loop_script(case, any_delay=True)
+        linear = linear_script(case)
+    except ValueError as why:
+        raise ValueError(f"{path}: the page cannot compute this case: {why}") from None
+    given, lines = _written(case, others)
+    presets = [_preset(one, text) for one, text in zip((case, *others), lines, strict=True)]
+    clearance = [] if case.scenario.clearance is None else ["run.clearance"]
+    data = {
+        "name": case.name,
+        "from": pathlib.Path(path).name,
+        "command": shlex.join(["ambjax", "tune", pathlib.Path(path).name, "--out", "tuned"]),
+        "presets": presets,
+        "sliders": [_finite(one._asdict()) for one in given],
+        "groups": list(GROUPS.items()),
+        "metrics": loop.metrics,
+        "units": UNITS,
+        "statuses": STATUSES,
+        "signals": [*SIGNALS, *COILS],
+        "states": loop.states,
+        "samples": case.clock.samples,
+        "delay": parameters(case, ["processor.delay"])["processor.delay"],
+        "seed": parameters(case, [SEED])[SEED],
+        "settle": float(case.settle),
+        "period": float(case.clock.sample_period),
+        "members": _members(case),
+        "linear": linear.facts,
+        "lost": loop.lost,
+        "places": parameters(case, ["plant.s_0", "plant.i_0", *clearance]),
+    }
+    generated = [PRELUDE, loop.source, moving.source.replace("function ", "function any_"), linear.source]
+    return "\n".join([*generated, *map(_asset, WORKER)]), data
+
+
+def _written(case: Case, others: list[Case]) -> tuple[list[Slider], list[list[Line]]]:
+    """Return the sliders that have a place in all case files, and the template of each file.
+
+    If the lines that are added do not fit a file, only numbers that the file of the case contains have a slider.
+    """
+    cases, given = (case, *others), sliders(case, others)
+    for kept in (given, [one for one in given if _in_file(one, case)]):
+        placed = set.intersection(*(set(template(one.text, _own(kept, one))[1]) for one in cases))
+        kept = [one for k, one in enumerate(kept) if k in placed]
+        found = [template(one.text, _own(kept, one))[0] for one in cases]
+        if all(checked(lines, _own(kept, one)) for lines, one in zip(found, cases, strict=True)):
+            return kept, found
+    return [], [[] for _ in cases]
+
+
+def _in_file(slider: Slider, case: Case) -> bool:
+    lines, _ = template(case.text, [slider])
+    return any(not line.only and len(line.parts) > 1 for line in lines)
+
+
+def _own(given: list[Slider], case: Case) -> list[Slider]:
+    """Return the sliders with the values of another case."""
+    values = parameter_values(case)
+    return [one._replace(value=float(values[one.parameter])) for one in given]
+
+
+def _preset(case: Case, lines: list[Line]) -> dict[str, Any]:
+    values = [float(x) for x in parameter_values(case)]
+    return {"name": case.name, "P": [x if np.isfinite(x) else "Infinity" for x in values], "lines": lines}
+
+
+def _check_structure(case: Case, other: Case, path: str) -> None:
+    if not _alike(case, other):
+        raise ValueError(
+            f"--also {other.name}: it differs from {path} in more than numbers. Give a case with the same laws, plant, "
+            "signals, sensors and number of samples, such as tuned.toml."
+        )
+
+
+def _alike(case: Case, other: Case) -> bool:
+    """Return whether two cases differ in numbers only."""
+    same = other.cascade.processor is not None and other.clock.samples == case.clock.samples
+    return same and jax.tree.structure(numbers_of(other)) == jax.tree.structure(numbers_of(case))
+
+
+def _finest(case: Case, others: list[Case]) -> Case:
+    """Return the case with the smallest step of all cases."""
+    period = float(case.clock.sample_period)
+    steps = [one.clock for one in (case, *others) if one.clock.integrator.step_size(period) is not None]
+    clock = min(steps, key=lambda clock: clock.integrator.step_size(period) or 0.0, default=case.clock)
+    return dataclasses.replace(case, clock=dataclasses.replace(case.clock, method=clock.method))
+
+
+def _members(case: Case) -> dict[str, Any]:
+    """Return the members of the ensemble: the parameters that vary, whether as a factor, and their values."""
+    study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, MEMBERS)
+    study = dataclasses.replace(study, seed=int(case.scenario.seed))
+    own, drawn = parameter_values(case), study.drawn(np.arange(MEMBERS))
+    relative = {path for path, kind in case.spread.entries if kind.relative}
+    rows = []
+    for path, values in drawn.items():
+        moved = [parameter_values(changed(case, {path: float(x)})) for x in values]
+        for k in np.flatnonzero(np.any([one != own for one in moved], axis=0)):
+            factor = path in relative and own[k] != 0
+            rows.append([int(k), bool(factor), [float(one[k] / own[k] if factor else one[k]) for one in moved]])
+    return {"count": MEMBERS, "rows": rows}
+
+
+def _finite(entries: dict[str, Any]) -> dict[str, Any]:
+    """Return the entries with None instead of an infinite number, which JSON lacks."""
+    return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in entries.items()}

@@ -1,0 +1,164 @@
+"""Functions of a trace as JavaScript: of arrays, and the loop over the samples."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from ambjax.export.emitter import traced
+from ambjax.export.javascript.script import HELPERS, number
+from ambjax.export.primitives import OPS
+from ambjax.export.program import Location, Operand, Program, Ref
+
+# Functions that the statements use and JavaScript lacks.
+PRELUDE = "\n".join(f"const {name} = {text};" for name, text in HELPERS.items())
+
+
+class Script:
+    """The nodes of a program as JavaScript; the name of an input is that of its location."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+
+    def operand(self, x: Operand) -> str:
+        """Return an operand as JavaScript."""
+        if isinstance(x, Ref):
+            location = self.program.nodes[x.node].location
+            return f"v{x.node}" if location is None else location.name
+        if x.dtype.kind == "b":
+            return "true" if x else "false"
+        text = number(x)
+        return f"({text})" if text.startswith("-") else text
+
+    def statements(self, order: Sequence[int]) -> list[str]:
+        """Return the nodes `order` as declarations."""
+        nodes = self.program.nodes
+        return [f"const v{n} = {OPS[nodes[n].op].javascript.format(*map(self.operand, nodes[n].args))};" for n in order]
+
+
+class Piece(NamedTuple):
+    """A traced function: its program, the operands of its arguments and of its results, as pytrees."""
+
+    program: Program
+    arguments: Any
+    results: Any
+
+
+def piece_of(function: Callable[..., object], names: Sequence[str], arguments: Sequence[Any]) -> Piece:
+    """Trace a function. `names`: the prefix of the JavaScript names of each argument's leaves."""
+    program = Program()
+    operands = []
+    for name, argument in zip(names, arguments, strict=True):
+        leaves, tree = jax.tree.flatten(argument)
+        refs = [program.input(Location("page", f"{name}{n}"), np.asarray(x).dtype) for n, x in enumerate(leaves)]
+        operands.append(jax.tree.unflatten(tree, refs))
+    flat = traced(program, function, arguments, jax.tree.leaves(operands, is_leaf=_is_ref))
+    tree = jax.tree.structure(jax.eval_shape(function, *arguments))
+    return Piece(program, operands, jax.tree.unflatten(tree, flat))
+
+
+def _is_ref(x: object) -> bool:
+    return isinstance(x, Ref)
+
+
+def operands_of(tree: object) -> list[Any]:
+    """Return the operands in a pytree; a Ref is itself a pytree."""
+    return jax.tree.leaves(tree, is_leaf=_is_ref)
+
+
+def _order(program: Program, roots: Sequence[Operand]) -> list[int]:
+    return sorted(n for n in program.needed(roots) if program.nodes[n].op != "input")
+
+
+def _fixed(program: Program, order: Sequence[int], given: Sequence[Operand]) -> set[int]:
+    """Return the nodes of `order` that depend on the inputs `given` and constants only."""
+    known = {x.node for x in given if isinstance(x, Ref)}
+    fixed = set()
+    for n in order:
+        if all(x.node in known for x in program.nodes[n].args if isinstance(x, Ref)):
+            known.add(n)
+            fixed.add(n)
+    return fixed
+
+
+def function_source(piece: Piece, name: str, arrays: Sequence[str], results: object) -> str:
+    """Return a JavaScript function `name(ARRAYS..., out)` that writes the results into the array `out`.
+
+    `arrays`: the name of the array that contains the leaves of each argument.
+    """
+    script, roots = Script(piece.program), operands_of(results)
+    order = _order(piece.program, roots)
+    needed = piece.program.needed(roots)
+    lines = [f"function {name}({', '.join(arrays)}, out) {{"]
+    for array, argument in zip(arrays, piece.arguments, strict=True):
+        lines += _loads(piece.program, array, operands_of(argument), needed)
+    lines += script.statements(order)
+    lines += [f"out[{k}] = {script.operand(x)};" for k, x in enumerate(roots)]
+    return "\n".join([*lines, "return out;", "}"])
+
+
+def _loads(program: Program, array: str, refs: Sequence[Ref], needed: set[int]) -> list[str]:
+    """Return the declarations of the inputs that are needed, read from an array."""
+    lines = []
+    for k, ref in enumerate(refs):
+        if ref.node in needed:
+            lines.append(f"const {_name(program, ref)} = {array}[{k}]{_truth(program, ref)};")
+    return lines
+
+
+def loop_source(piece: Piece, name: str, shown: Sequence[Operand], always: Sequence[Operand]) -> str:
+    """Return a JavaScript function `name(P)` that returns `run(S, from, to, W, rows)`.
+
+    - `piece`: of `LoopFunctions.step`.
+    - `shown`: the operands that a row contains.
+    - `always`: results of the step, without which the loop ends before its last sample; the other states are kept if
+      something in `shown` or `always` depends on them.
+
+    `run` computes the samples `from` <= n < `to` with the parameters P, the state S, which it updates, and the normal
+    numbers W, three for each sample. It writes the rows into `rows`, unless that is null. Numbers that depend on
+    parameters only are computed once.
+    """
+    program, script = piece.program, Script(piece.program)
+    parameters, before = operands_of(piece.arguments[0]), operands_of(piece.arguments[1])
+    after = operands_of(piece.results[0])
+    kept = _kept(program, before, after, [*shown, *always])
+    roots = [*shown, *(after[k] for k in kept)]
+    order, needed = _order(program, roots), program.needed(roots)
+    fixed = _fixed(program, order, parameters)
+    normals = [_name(program, x) for x in piece.arguments[2]]
+    lines = [f"function {name}(P) {{", *_loads(program, "P", parameters, needed)]
+    lines += script.statements([n for n in order if n in fixed])
+    lines += ["return function run(S, from, to, W, rows) {"]
+    lines += [f"let {_name(program, before[k])} = S[{k}]{_truth(program, before[k])};" for k in kept]
+    lines += ["for (let n0 = from; n0 < to; n0++) {"]
+    lines += [f"const {text} = W[3 * n0 + {k}];" for k, text in enumerate(normals)]
+    lines += script.statements([n for n in order if n not in fixed])
+    if shown:
+        writes = [f"rows[at + {k}] = {script.operand(x)};" for k, x in enumerate(shown)]
+        lines += ["if (rows !== null) {", f"const at = {len(shown)} * n0;", *writes, "}"]
+    lines += [f"const t{k} = {script.operand(after[k])};" for k in kept]
+    lines += [f"{_name(program, before[k])} = t{k};" for k in kept]
+    lines += ["}", *(f"S[{k}] = {_name(program, before[k])};" for k in kept), "};", "}"]
+    return "\n".join(lines)
+
+
+def _name(program: Program, x: Ref) -> str:
+    location = program.nodes[x.node].location
+    assert location is not None
+    return location.name
+
+
+def _truth(program: Program, x: Ref) -> str:
+    return " !== 0" if program.nodes[x.node].dtype.kind == "b" else ""
+
+
+def _kept(program: Program, before: Sequence[Ref], after: Sequence[Operand], roots: Sequence[Operand]) -> list[int]:
+    """Return the indices of the states on which the roots depend, now or in a later sample."""
+    kept: set[int] = set()
+    while True:
+        needed = program.needed([*roots, *(after[k] for k in kept)])
+        more = {k for k, ref in enumerate(before) if ref.node in needed}
+        if more == kept:
+            return sorted(kept)
+        kept = more

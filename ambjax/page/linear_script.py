@@ -1,0 +1,149 @@
+"""The linearised loop as JavaScript: the step of the laws and the rates of the plant, with their derivatives.
+
+The page finds the equilibrium by Newton's method, and assembles the map of one sample as `ambjax.linear` does.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.cases.reader import Case
+from ambjax.control.cascade_state import CascadeState, Sample
+from ambjax.export.trace import precision
+from ambjax.linear.equilibrium import Point, at_rest, ideal, reading, sizes_of, start_of
+from ambjax.numerics.records import canonical
+from ambjax.page.functions import function_source, piece_of
+from ambjax.page.loop_functions import Numbers, numbers_of
+from ambjax.world.scenario import Scenario
+
+
+class LagState(NamedTuple):
+    """State of the plant, of the sensor's low-pass (m, or ()) and of the amplifier (V, or ())."""
+
+    plant: Any
+    z_filtered: Array | tuple[()]
+    u_a: Array | tuple[()]
+
+
+class LoopPoint(NamedTuple):
+    """A point at which the loop is linearised.
+
+    The state of the plant and its lags, the voltage u (V) that acts, the states of the laws, the two last voltages (V),
+    and the test signal e (m).
+    """
+
+    lagged: LagState
+    acting: Array
+    control: CascadeState
+    past: tuple[Array, Array]
+    e: Array
+
+
+class PointValues(NamedTuple):
+    """The rates of the plant and its lags, the next states of the laws, the command u (V), the reading of z (m)."""
+
+    rates: LagState
+    control: CascadeState
+    u: Array
+    z: Array
+
+
+# State of the plant and lags, voltage and states of the laws at an equilibrium.
+EquilibriumPoint: TypeAlias = tuple[LagState, Array, CascadeState]
+
+
+class LinearScript(NamedTuple):
+    """The linear loop as JavaScript.
+
+    - `source`: the functions `linearStart(P, out)` and `linearPoint(P, X, out)`. The first writes the first trial of
+      the equilibrium and the sizes of its components. The second writes the values at a point and their derivatives.
+    - `facts`: sizes of the parts of a point, zones, range of frequencies.
+    """
+
+    source: str
+    facts: dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearFunctions:
+    """The functions of the linear loop, which JAX traces. `numbers`: the numbers of the case, as JAX values."""
+
+    numbers: Numbers
+
+    def start(self, numbers: Numbers) -> tuple[EquilibriumPoint, EquilibriumPoint]:
+        """Return the first trial of the equilibrium, and the sizes of its components: (lagged, u, control)."""
+        numbers = _ideal(numbers)
+        point = start_of(numbers.cascade, numbers.scenario, numbers.period, 0.0)
+        sizes = sizes_of(numbers.cascade, numbers.scenario, point)
+        return _with_lags(numbers.scenario, point), _with_lags(numbers.scenario, sizes)
+
+    def columns(self, numbers: Numbers, x: LoopPoint) -> tuple[PointValues, list[PointValues]]:
+        """Return the values at a point, and their derivatives with respect to each component of the point."""
+        leaves, tree = jax.tree.flatten(x)
+
+        def values(x: LoopPoint) -> PointValues:
+            return self._values(_ideal(numbers), x)
+
+        found = []
+        for k in range(len(leaves)):
+            unit = jax.tree.unflatten(tree, [jnp.ones(()) if j == k else jnp.zeros(()) for j in range(len(leaves))])
+            found.append(jax.jvp(values, (x,), (unit,))[1])
+        return values(x), found
+
+    def _values(self, numbers: Numbers, x: LoopPoint) -> PointValues:
+        scenario: Any = numbers.scenario
+        lagged: Any = x.lagged
+        motion = scenario.plant.measurement(lagged.plant)
+        sensor, amplifier, lags = scenario.sensor, scenario.amplifier, LagState((), (), ())
+        u: Any = x.acting
+        read = motion
+        if sensor is not None and sensor.bandwidth is not None:
+            lags = lags._replace(z_filtered=2 * jnp.pi * sensor.bandwidth * (motion.z - lagged.z_filtered))
+            read = motion._replace(z=jnp.asarray(lagged.z_filtered))
+        if amplifier is not None:
+            lags = lags._replace(u_a=amplifier.slope() * (u - lagged.u_a))
+            u = lagged.u_a
+        measured = reading(scenario, read, (x.e, 0.0))
+        sample = Sample(at_rest(0.0), jnp.asarray(numbers.period), jnp.asarray(jnp.inf), x.past)
+        command, control, _ = numbers.cascade.step(measured, x.control, sample)
+        return PointValues(lags._replace(plant=scenario.plant.rates(lagged.plant, u)), control, command.u, measured.z)
+
+
+def _ideal(numbers: Numbers) -> Numbers:
+    """Return the numbers without what a linear system cannot contain: limits, noise, converter, guard."""
+    processor: Any = numbers.cascade.processor
+    cascade = dataclasses.replace(numbers.cascade, processor=dataclasses.replace(processor, guard=None))
+    return numbers._replace(cascade=cascade, scenario=ideal(numbers.scenario))
+
+
+def _with_lags(scenario: Scenario, point: Point) -> EquilibriumPoint:
+    """Return a point of the equilibrium with the states of the lags, at rest."""
+    sensor, z = scenario.sensor, scenario.plant.measurement(point.plant).z
+    low_passed = sensor is not None and sensor.bandwidth is not None
+    lags = z if low_passed else (), point.u if scenario.amplifier is not None else ()
+    return LagState(point.plant, *lags), point.u, point.control
+
+
+def linear_script(case: Case) -> LinearScript:
+    """Return the linear loop of a case as JavaScript, for any delay."""
+    with precision("double"):
+        numbers = canonical(numbers_of(case, any_delay=True))
+        functions = LinearFunctions(numbers)
+        (lagged, u, control), _ = jax.eval_shape(functions.start, numbers)
+        zero = jnp.zeros(())
+        x = LoopPoint(lagged, u, control, (zero, zero), zero)
+        x = jax.tree.map(lambda _: zero, x)
+        start = piece_of(functions.start, "p", (numbers,))
+        point = piece_of(functions.columns, "px", (numbers, x))
+    low, high = case.zones.range(case.clock.sample_period)
+    zones = [float(z) for z in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
+    sizes = {"lagged": len(jax.tree.leaves(x.lagged)), "control": len(jax.tree.leaves(x.control))}
+    facts = {**sizes, "zones": zones, "low": low, "high": high}
+    sources = [
+        function_source(start, "linearStart", "P", start.results),
+        function_source(point, "linearPoint", "PX", point.results),
+    ]
+    return LinearScript("\n".join(sources), facts)

@@ -1,0 +1,87 @@
+"""The functions of the sampled loop that the page traces, with every number of the case as an argument."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.cases.reader import Case
+from ambjax.control.cascade import Cascade
+from ambjax.control.processor import MOST_DELAY
+from ambjax.numerics.records import Scalar, record
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.loop import Realised
+from ambjax.simulation.metrics import Standard, standard_for
+from ambjax.simulation.rollout import RolloutState, begin, one_sample
+from ambjax.simulation.sampled import Sampled
+from ambjax.simulation.system import system_of
+from ambjax.simulation.trajectory import Row
+from ambjax.world.scenario import Scenario
+from ambjax.world.sensor import Errors
+
+
+class Numbers(NamedTuple):
+    """All numbers of a case that the loop uses; each leaf is a parameter of the JavaScript."""
+
+    cascade: Cascade
+    scenario: Scenario
+    settle: Scalar
+    period: Scalar
+
+
+@record
+class GivenNoise(Realised):
+    """The closed loop of one member, with its three normal numbers of the sample given instead of drawn."""
+
+    normals: tuple[Array, Array, Array]
+
+    def sensor_errors(self, sample: Scalar) -> Errors:
+        sensor = self.scenario.sensor
+        if sensor is None:
+            return super().sensor_errors(sample)
+        stds = sensor.std, sensor.std_z_dot, sensor.std_i
+        return Errors(*(std * normal for std, normal in zip(stds, self.normals, strict=True)))
+
+
+@dataclasses.dataclass(frozen=True)
+class LoopFunctions:
+    """The functions of the loop, which JAX traces.
+
+    - `clock`: number of samples and integrator.
+    - `numbers`: the numbers of the case, as JAX values.
+    """
+
+    clock: Clock
+    numbers: Numbers
+
+    def _system(self, numbers: Numbers, normals: Any) -> tuple[Sampled, Clock, Standard]:
+        clock = dataclasses.replace(self.clock, sample_period=numbers.period)
+        built: Any = system_of(numbers.cascade, numbers.scenario, clock)
+        word = jnp.zeros((), jnp.uint32)
+        loop = GivenNoise(built.loop.cascade, numbers.scenario, (word, word), normals)
+        return dataclasses.replace(built, loop=loop), clock, standard_for(numbers.settle, numbers.scenario)
+
+    def start(self, numbers: Numbers, normals: Any) -> RolloutState:
+        """Return the state before the first sample."""
+        return begin(*self._system(numbers, normals))
+
+    def step(
+        self, numbers: Numbers, progress: RolloutState, normals: Any, k: Array
+    ) -> tuple[RolloutState, Row, tuple[Array, Array]]:
+        """Return the state after sample k, its row, and the currents of both coils at its start, A."""
+        system, clock, fold = self._system(numbers, normals)
+        after, row = one_sample(system, clock, fold, progress, k)
+        return after, row, numbers.scenario.plant.coil_currents(progress.state.plant)
+
+    def result(self, numbers: Numbers, progress: RolloutState) -> dict[str, Array]:
+        """Return the metrics of a run that ended in this state."""
+        fold = standard_for(numbers.settle, numbers.scenario)
+        return fold.result(progress.fold, progress.ending)
+
+
+def numbers_of(case: Case, any_delay: bool = False) -> Numbers:
+    """Return the numbers of a case. Its program admits the case's delay, or any delay."""
+    assert case.cascade.processor is not None
+    cascade = case.cascade.on_processor(0.0, MOST_DELAY, between=True) if any_delay else case.cascade.on_processor()
+    return Numbers(cascade, case.scenario, case.settle, case.clock.sample_period)

@@ -1,0 +1,66 @@
+"""The sampled loop as JavaScript, traced from the simulator's own sample: laws, plant, spans and folds.
+
+Every number of the case is a parameter, so that the page changes it without tracing again.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from ambjax.cases.reader import Case
+from ambjax.export.trace import precision
+from ambjax.numerics.records import canonical
+from ambjax.page.functions import function_source, loop_source, operands_of, piece_of
+from ambjax.page.loop_functions import LoopFunctions, numbers_of
+
+# Signals that the page draws; the currents of both coils follow them in a row. The members need the first two only.
+SIGNALS = ("z", "alive", "r", "u", "u_mean", "i_ref", "q_z", "z_measured", "sigma", "v_tilde", "i")
+COILS = ("i_1", "i_2")
+
+
+class LoopScript(NamedTuple):
+    """The loop as JavaScript.
+
+    - `source`: the functions `startLoop(P, W, out)`, `makeLoop(P)`, `makeMember(P)` and `loopMetrics(P, S, out)`.
+    - `parameters`: values of the parameters P of the case.
+    - `metrics`: names of the metrics in the order of `out`.
+    - `states`: number of states S; `lost`: the state that is the status code of the rotor.
+    """
+
+    source: str
+    parameters: list[float]
+    metrics: list[str]
+    states: int
+    lost: int
+
+
+def loop_script(case: Case, any_delay: bool = False) -> LoopScript:
+    """Return the loop of a case as JavaScript, for the case's delay or for any delay.
+
+    Raises ValueError for a part that scalars cannot express.
+    """
+    with precision("double"):
+        numbers = canonical(numbers_of(case, any_delay))
+        functions = LoopFunctions(case.clock, numbers)
+        zero = jnp.zeros(())
+        normals = (zero, zero, zero)
+        start = piece_of(functions.start, "pw", (numbers, normals))
+        shapes = jax.eval_shape(functions.start, numbers, normals)
+        progress = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        step = piece_of(functions.step, "pswn", (numbers, progress, normals, zero))
+        result = piece_of(functions.result, "ps", (numbers, progress))
+    _, row, coils = step.results
+    shown = [getattr(row, name) for name in SIGNALS] + list(coils)
+    every = operands_of(step.results[0])
+    source = "\n".join(
+        [
+            function_source(start, "startLoop", "PW", start.results),
+            loop_source(step, "makeLoop", shown, every),
+            loop_source(step, "makeMember", shown[:3], []),
+            function_source(result, "loopMetrics", "PS", result.results),
+        ]
+    )
+    values = [float(x) for x in jax.tree.leaves(numbers)]
+    lost = jax.tree.leaves(jax.tree.map(lambda x: x is shapes.ending.lost_code, shapes)).index(True)
+    return LoopScript(source, values, list(result.results), len(every), lost)

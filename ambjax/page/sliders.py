@@ -1,0 +1,173 @@
+"""The numbers that the page offers: each with its path, unit, meaning and range, and the parameter that it sets."""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from ambjax.cases.reader import Case
+from ambjax.ensemble.paths import SHIFT, Place, places, with_values
+from ambjax.page.loop_functions import numbers_of
+
+# A gain is searched over its value divided and multiplied by this factor; a number of the plant changes by this share.
+FACTOR, SHARE = 30.0, 0.5
+# Largest value of other positive numbers, as a multiple of their value.
+TIMES = 5.0
+SEED = "run.seed"
+# Unit of the values of a signal, by the field of the scenario.
+UNITS = {"reference": "m", "q_z": "m/s^2", "q_v": "A^2/m^2", "q_i": "A/s", "q_f": "N", "base": "m/s^2"}
+# Prefix of the paths, and title, of each group, in the order of the page.
+GROUPS = {
+    "controller.": "Gains",
+    "processor.": "Processor",
+    "sensor.": "Sensors",
+    "actuator.": "Supply and amplifier",
+    "disturbance.": "Disturbance",
+    "reference.": "Reference",
+    "initial.": "Start",
+    "run.": "Clearance and seed",
+    "plant.": "Plant, off the controller's model",
+}
+
+
+class Slider(NamedTuple):
+    """A number of the page.
+
+    - `path`, `unit`, `doc`: dotted path of the case file, unit and meaning.
+    - `parameter`: its number among the parameters P of the JavaScript.
+    - `value`: the case's value.
+    - `low`, `high`: ends of the slider.
+    - `log`: whether the slider is logarithmic.
+    - `least`, `most`, `open`: ends of the allowed numbers, and whether the lower one is excluded.
+    - `whole`: whether only whole numbers are allowed.
+    - `grid`: whether the number is a time at which a disturbance jumps, which the page rounds to a whole sample.
+    """
+
+    path: str
+    unit: str
+    doc: str
+    parameter: int
+    value: float
+    low: float
+    high: float
+    log: bool
+    least: float
+    most: float
+    open: bool
+    whole: bool
+    grid: bool
+
+
+def sliders(case: Case, others: list[Case]) -> list[Slider]:
+    """Return the sliders of a case. Their ranges contain the values of the other cases."""
+    known = {path: place for path, place in _places(case).items() if _offered(path, place)}
+    index = parameters(case, list(known))
+    tables = [_places(other) for other in others]
+    edges = {float(x) for x in case.scenario.edges()}
+    found = []
+    for path, place in known.items():
+        values = [float(place.value), *(float(t[path].value) for t in tables if _number(t.get(path)))]
+        low, high, log = _range(path, place, values, case)
+        meta = place.field.metadata
+        least = next((x for x in (meta["above"], meta["at_least"]) if x is not None), -math.inf)
+        most = math.inf if meta["at_most"] is None else meta["at_most"]
+        grid = values[0] in edges and path.rpartition(".")[2] in ("start", "stop")
+        words = meta["unit"] or UNITS.get(str(place.route[1]), ""), meta["doc"]
+        excluded = meta["above"] is not None
+        one = Slider(
+            path,
+            *words,
+            index[path],
+            values[0],
+            low,
+            high,
+            log,
+            least,
+            most,
+            excluded,
+            path == SEED or bool(meta["whole"]),
+            grid,
+        )
+        found.append(one)
+    order = list(GROUPS)
+    return sorted(found, key=lambda one: next(k for k, prefix in enumerate(order) if one.path.startswith(prefix)))
+
+
+def _places(case: Case) -> dict[str, Place]:
+    """Return every number of a case by path, the seed included."""
+    (field,) = (field for field in dataclasses.fields(case.scenario) if field.name == "seed")
+    return {**places(case.cascade, case.scenario), SEED: Place((1, "seed"), field, case.scenario.seed)}
+
+
+def parameters(case: Case, paths: list[str]) -> dict[str, int]:
+    """Return the index of the parameter that each of these paths sets, found by setting it alone."""
+    own, found = parameter_values(case), {}
+    for path in paths:
+        (found[path],) = np.flatnonzero(parameter_values(changed(case, {path: math.pi})) != own)
+    return {path: int(k) for path, k in found.items()}
+
+
+def changed(case: Case, values: dict[str, float]) -> Case:
+    """Return the case with other values of the numbers at these paths."""
+    values, seed = dict(values), values.get(SEED, case.scenario.seed)
+    values.pop(SEED, None)
+    cascade, scenario = with_values(case.cascade, case.scenario, values)
+    return dataclasses.replace(case, cascade=cascade, scenario=dataclasses.replace(scenario, seed=seed))
+
+
+def parameter_values(case: Case) -> np.ndarray:
+    """Return the parameters of the JavaScript, in order."""
+    return np.array([float(x) for x in jax.tree.leaves(numbers_of(case))])
+
+
+def _number(place: Place | None) -> bool:
+    return place is not None and place.value is not None and bool(np.isfinite(place.value))
+
+
+def _offered(path: str, place: Place) -> bool:
+    model = path.startswith("controller.model.")
+    return path.startswith(tuple(GROUPS)) and not model and place.route[-1] != SHIFT and _number(place)
+
+
+def _range(path: str, place: Place, values: list[float], case: Case) -> tuple[float, float, bool]:
+    """Return the ends of a slider that contain these values, and whether it is logarithmic."""
+    meta, name = place.field.metadata, path.rpartition(".")[2]
+    small, large = min(values), max(values)
+    wide = path.startswith(("controller.", "actuator.")) or name == "bandwidth" or name.startswith("range_")
+    if wide and small > 0:
+        low, high, log = small / FACTOR, large * FACTOR, True
+    elif path.startswith("plant.") or path == "sensor.gain":
+        ends = [x * (1 + side * SHARE) for x in values for side in (-1, 1)]
+        low, high, log = (min(ends), max(ends), False) if any(values) else (-10.0, 10.0, False)
+    elif meta["unit"] == "s" and name in ("start", "stop"):
+        low, high, log = min(0.0, small), max(float(case.clock.duration), large), False
+    elif path.startswith("processor."):
+        low, high, log = 0.0, float(meta["at_most"]), False
+    elif path == SEED:
+        low, high, log = 0.0, max(100.0, large), False
+    elif path == "run.clearance":
+        low, high, log = 0.2 * small, 0.95 * float(case.scenario.plant.s_0), False
+    elif path == "initial.z":
+        most = 0.95 * float(case.scenario.limit)
+        low, high, log = -most, most, False
+    elif meta["whole"]:
+        low, high, log = float(meta["at_least"]), float(meta["at_most"]), False
+    else:
+        size = max(abs(small), abs(large)) or _size(meta["unit"] or UNITS.get(str(place.route[1]), ""), case)
+        low, high, log = (0.0 if meta["at_least"] == 0 or small > 0 else -TIMES * size), TIMES * size, False
+    least = meta["at_least"] if meta["at_least"] is not None else meta["above"]
+    if least is not None:
+        low = max(low, least)
+    if meta["at_most"] is not None:
+        high = min(high, meta["at_most"])
+    return low, high, log
+
+
+def _size(unit: str, case: Case) -> float:
+    """Return a typical size of a quantity that is 0 in the case, from its unit."""
+    plant = case.scenario.plant
+    z, z_dot, i = (float(x) for x in plant.sizes())
+    sizes = {"m": z, "m/s": z_dot, "A": i, "m/s^2": 1.0, "A/s": i * float(plant.pole), "Hz": 10.0}
+    return sizes.get(unit, 1.0)

@@ -1,0 +1,115 @@
+"""The JavaScript back end: every primitive, every block, and the loop, run by node and compared with JAX."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from javascript import run_rows, with_node
+from test_export_blocks import CASES
+from test_export_emitter import EDGES, LOOSE, listed
+
+from ambjax import rollout
+from ambjax.export.block import Block
+from ambjax.export.javascript.script import HELPERS, script, script_of
+from ambjax.export.of_case import blocks_of
+from ambjax.export.points import points
+from ambjax.export.reference import results
+from ambjax.export.series import series
+from ambjax.export.trace import trace
+
+pytestmark = with_node
+
+
+class Functions(Block):
+    """All functions of two numbers as the outputs of a block."""
+
+    noun = "test"
+    ports = staticmethod(lambda *x: x)
+    inputs = dict.fromkeys("ab", ("1", ""))
+    outputs = dict.fromkeys(listed(), ("1", ""))
+    bits = dict.fromkeys(["never"], "")
+    crowded = ()
+
+    def step(self, parameters, memory, inputs, period, read):
+        return memory, tuple(f(*inputs) for f in listed().values()), jnp.asarray(False)
+
+    def start(self):
+        return jnp.asarray(False)
+
+    def numbers(self):
+        return []
+
+    def states(self):
+        return []
+
+
+# Units in the last place by which JavaScript's functions are off XLA's, where that is more than those of <math.h> are.
+LOOSER = {"erf": 32, "erfc": 512, "sinh": 64, "cosh": 64, "arctanh": 256, "logistic": 8, "exp2": 8, "arcsinh": 16}
+
+
+def test_every_primitive_against_jax(tmp_path):
+    random = np.random.default_rng(1)
+    x = random.choice([-1.0, 1.0], (1500, 2)) * 10.0 ** random.uniform(-3, 1.5, (1500, 2))
+    x = np.concatenate([x, [(a, b) for a in EDGES for b in EDGES]])
+    text = script_of(Functions((), 1.0), "all")
+    run = "const s = all.start(), y = new Float64Array(all.outputs.length);\n"
+    found = run_rows(text + run + "const run = x => { all.step([], s, x, y); return y; };\n", x, tmp_path)
+    for k, (name, f) in enumerate(listed().items()):
+        with jax.disable_jit():
+            should = np.asarray(f(jnp.asarray(x[:, 0]), jnp.asarray(x[:, 1])))
+        with np.errstate(all="ignore"):
+            off = np.abs(found[:, k] - should) / np.maximum(np.spacing(np.abs(should)), 1e-35)
+        allowed = max(LOOSE.get(name, 4), LOOSER.get(name, 0))
+        wrong = ~((found[:, k] == should) | (np.isnan(found[:, k]) & np.isnan(should)) | (off <= allowed))
+        at = np.flatnonzero(wrong)[:3]
+        assert not wrong.any(), (name, x[at], found[at, k], should[at], off[at])
+    assert all(re.search(rf"const {name} = ", text) for name in HELPERS)
+
+
+STEP = """
+const y = new Float64Array(block.outputs.length), np = block.parameters.length, ns = block.states.length + 1;
+const run = row => {
+  const s = Float64Array.from(row.subarray(np, np + ns));
+  const bits = block.step(row.subarray(0, np), s, row.subarray(np + ns), y);
+  return [...s, ...y, bits];
+};
+"""
+
+
+@pytest.mark.parametrize("what", ["controller", "plant", pytest.param("loop", marks=pytest.mark.slow)])
+def test_one_step_is_jaxs(what, tmp_path):
+    traced = trace(blocks_of(*CASES["rig"])[what], "double")
+    at = points(traced, 1000)
+    found = run_rows(
+        script(traced, "block") + STEP, np.concatenate([at.parameters, at.state, [at.started], at.inputs]).T, tmp_path
+    ).T
+    should = results(traced, at)
+    numbers = np.concatenate([should.state, [should.started], should.outputs])
+    with np.errstate(all="ignore"):
+        off = np.abs(found[:-1] - numbers) / np.maximum(np.abs(numbers), 1e-290)
+    same = (found[:-1] == numbers) | (np.isnan(found[:-1]) & np.isnan(numbers))
+    # the same operations in the same order: what differs are exp and its like, by units in the last place
+    assert np.all(same | (off < 1e-14))
+    np.testing.assert_array_equal(found[-1], should.bits)
+
+
+LOOP = """
+const s = block.start(), p = block.values(), y = new Float64Array(block.outputs.length);
+const run = x => { const bits = block.step(p, s, x, y); return [...y, bits]; };
+"""
+
+
+@pytest.mark.parametrize("name", ["rig", pytest.param("two coils", marks=pytest.mark.slow)])
+def test_the_loop_is_the_simulators(name, tmp_path):
+    cascade, scenario, clock = CASES[name]
+    block, count = blocks_of(cascade, scenario, clock)["loop"], 200
+    x = series(cascade, scenario, clock, count)
+    found = run_rows(script_of(block, "block") + LOOP, np.array([x[name] for name in block.inputs]).T, tmp_path).T
+    rows = rollout(cascade, scenario, clock).trajectory.rows
+    z, u = (found[list(block.outputs).index(name)] for name in ("z_true", "u"))
+    # 200 samples of hard signs: rounding (1e-16 of 5e-5 m) grows by a few decades; see ambjax/export/twins.py
+    np.testing.assert_allclose(z, rows.z[:count], rtol=0, atol=1e-12)
+    assert np.ptp(z) > 1e-6
+    np.testing.assert_allclose(u, rows.u[:count], rtol=0, atol=1e-5)

@@ -1,0 +1,288 @@
+"""The page with sliders: its loop, metrics and sensitivity equal the simulator's, in a real browser, from disk."""
+
+import dataclasses
+import json
+import pathlib
+import re
+import tomllib
+
+import browser
+import numpy as np
+import pytest
+
+from ambjax.__main__ import main
+from ambjax.cases.reader import case_from
+from ambjax.cases.template_text import template as case_template
+from ambjax.ensemble.batching import run_ensemble
+from ambjax.ensemble.study import Study
+from ambjax.linear.analysis import analyse, linearise
+from ambjax.page.case_text import checked, filled, template
+from ambjax.page.document import MEMBERS, page
+from ambjax.page.sliders import SEED, parameter_values, sliders
+from ambjax.results.runs import simulate
+
+# 200 samples: rounding has not grown yet. Two runs of the rig one unit in the last place apart are 1e-16 m apart there.
+RIG = case_template("rig").replace("duration = 0.3 ", "duration = 0.01").replace("settle = 0.05", "settle = 0.005")
+RIG = RIG.replace("start = 0.1 ", "start = 0.002").replace("stop = 0.2 ", "stop = 0.004")
+
+
+def rig(text=RIG, name="rig"):
+    return case_from(tomllib.loads(text), name, text)
+
+
+@pytest.fixture(scope="module")
+def case():
+    return rig()
+
+
+def moved(one):
+    """Return another allowed value of a slider."""
+    away = one.value * 1.25 if one.value else (one.low + one.high) / 3 or one.high / 4
+    return float(round(one.value + 1)) if one.whole else min(away, one.most)
+
+
+def test_every_number_reads_back_from_the_case_file(case):
+    given = sliders(case, [])
+    lines, placed = template(case.text, given)
+    assert sorted(placed) == list(range(len(given)))
+    assert checked(lines, given)
+    assert filled(lines, given, [one.value for one in given]) == case.text
+    assert {"controller.position.c", "plant.m", "sensor.std", "processor.delay", "reference.value", SEED} <= {
+        one.path for one in given
+    }
+    # a delay between two samples would be another structure
+    values = [one.value if one.path == "processor.delay" else moved(one) for one in given]
+    expected = parameter_values(case)
+    for one, value in zip(given, values, strict=True):
+        expected[one.parameter] = value
+    np.testing.assert_array_equal(parameter_values(rig(filled(lines, given, values))), expected)
+    for k, one in enumerate(given):
+        alone = [other.value if j != k else values[j] for j, other in enumerate(given)]
+        document = tomllib.loads(filled(lines, given, alone))
+        for word in one.path.split("."):
+            document = document[word]
+        assert document == values[k], one.path
+
+
+def test_a_changed_plant_leaves_the_controller_s_model(case):
+    (mass,) = (one for one in sliders(case, []) if one.path == "plant.m")
+    lines, _ = template(case.text, [mass])
+    document = tomllib.loads(filled(lines, [mass], [2.0]))
+    assert document["plant"]["m"] == 2.0
+    assert document["controller"]["model"] == {"m": mass.value}
+
+
+def test_ranges_contain_the_values_of_every_preset(case):
+    louder = rig(RIG.replace("c = 2900.0", "c = 9e5").replace("u_max = 48.0", "u_max = 1.0"))
+    for one in sliders(case, [louder]):
+        for value in (one.value, parameter_values(louder)[one.parameter]):
+            assert one.low <= value <= one.high, one.path
+
+
+def test_a_case_without_a_processor_is_refused_in_one_line(tmp_path, capsys):
+    path = tmp_path / "paper.toml"
+    path.write_text(case_template("tracking"))
+    assert main(["page", str(path), "--out", str(tmp_path / "page.html")]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said[-1].endswith("and this case has none. Add the table [processor].")
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_another_structure_is_no_preset(tmp_path, capsys):
+    one, other = tmp_path / "rig.toml", tmp_path / "other.toml"
+    one.write_text(RIG)
+    other.write_text(RIG.replace('kind = "kalman"\nw = 1000.0', 'kind = "ired-1"'))
+    assert main(["page", str(one), "--also", str(other), "--out", str(tmp_path / "page.html")]) == 2
+    assert "--also other: it differs from" in capsys.readouterr().err
+
+
+def test_the_file_of_the_page_is_named_and_not_overwritten(tmp_path, capsys):
+    one, out = tmp_path / "rig.toml", tmp_path / "page.html"
+    one.write_text(RIG)
+    out.write_text("mine")
+    for wrong in (out, tmp_path, tmp_path / "page.txt"):
+        assert main(["page", str(one), "--out", str(wrong)]) == 2
+        assert len(capsys.readouterr().err.splitlines()) == 1
+    assert out.read_text() == "mine"
+
+
+HOSTILE = "</script><img src=x onerror=\"document.title='owned'\">"
+pytestmark_browser = [pytest.mark.slow, pytest.mark.skipif(not browser.CHROMIUM, reason=browser.MISSING)]
+
+
+@pytest.fixture(scope="module")
+def tuned():
+    """A second preset, with other gains; its name and a comment try to break out of the page."""
+    text = RIG.replace("c = 2900.0", "c = 2000.0").replace("[plant]", f"# {HOSTILE}\n[plant]", 1)
+    return dataclasses.replace(rig(text), name=HOSTILE)
+
+
+@pytest.fixture(scope="module")
+def tab(case, tuned, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("page")
+    (folder / "page.html").write_text(page(case, [tuned], f"{HOSTILE}.toml"), encoding="utf-8")
+    with browser.browser(folder) as tab:
+        tab.size(1280)
+        tab.open(folder / "page.html")
+        settled(tab)
+        yield tab
+
+
+def settled(tab):
+    """Wait until the page shows the newest run and its members."""
+    tab.wait("window.ambjax && ambjax.state.sent > 0 && ambjax.state.members === ambjax.state.sent", 60)
+
+
+@pytest.fixture
+def fresh(tab):
+    """The tab with the numbers of the case."""
+    tab.run("document.getElementById('preset').value = 0")
+    tab.run("document.getElementById('preset').dispatchEvent(new Event('change'))")
+    settled(tab)
+    yield tab
+    assert tab.errors == []
+
+
+def signal(tab, name):
+    return np.array(tab.run(f"Array.from(ambjax.state.run.of('{name}'))"))
+
+
+def typed(tab, path, text):
+    """Type a number as a user does, and wait for the run."""
+    number = f"document.querySelector('[data-path=\"{path}\"]').parentElement.querySelector('input[type=text]')"
+    tab.run(f"{number}.value = {json.dumps(text)}; {number}.dispatchEvent(new Event('change'))")
+    settled(tab)
+
+
+class TestInABrowser:
+    pytestmark = pytestmark_browser
+
+    def test_the_trajectory_is_the_simulator_s_with_its_noise(self, fresh, case):
+        rows = simulate(case).trajectory.rows
+        # equal to the order of rounding; the issue of an error would be at least the noise, 5e-7 m
+        for name, tolerance in (("z", 1e-13), ("z_measured", 1e-13), ("u", 1e-6), ("i", 1e-9), ("r", 0)):
+            np.testing.assert_allclose(signal(fresh, name), getattr(rows, name), rtol=0, atol=tolerance, err_msg=name)
+        upper = float(case.scenario.plant.i_0) + np.asarray(rows.i)
+        np.testing.assert_allclose(signal(fresh, "i_1"), upper, rtol=0, atol=1e-9)
+
+    def test_metrics_are_the_simulator_s(self, fresh, case):
+        metrics = simulate(case).metrics
+        found = fresh.run("ambjax.state.metrics")
+        assert set(found) == set(metrics)
+        for name, value in metrics.items():
+            # JSON has no infinity: null
+            assert (np.inf if found[name] is None else found[name]) == pytest.approx(float(value), rel=1e-6), name
+        shown = fresh.run("document.getElementById('metrics').innerText")
+        assert all(name in shown for name in metrics)
+
+    def test_members_are_those_of_the_ensemble(self, fresh, case):
+        study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, MEMBERS)
+        errors = np.asarray(
+            run_ensemble(*study.batch(np.arange(MEMBERS)), case.clock, fold=None, every=1).trajectory.rows.e_z
+        )
+        low, high = (np.array(fresh.run(f"Array.from(ambjax.state.envelope.{end})")) for end in ("low", "high"))
+        np.testing.assert_allclose([low, high], [errors.min(axis=0), errors.max(axis=0)], rtol=0, atol=1e-12)
+        assert fresh.run("ambjax.state.envelope.kept") == MEMBERS
+
+    def test_sensitivity_is_that_of_the_linear_analysis(self, fresh, case):
+        for delay in ("1", "1.25"):
+            typed(fresh, "processor.delay", delay)
+            other = rig(re.sub(r"delay = 1.0", f"delay = {delay}", RIG))
+            system = linearise(other.cascade, other.scenario, other.clock)
+            expected = analyse(system, other.scenario.plant.m, other.clock.sample_period, other.zones)
+            S = fresh.run("({...ambjax.state.answer.S})")
+            size = np.abs(np.asarray(system.sensitivity(np.array(S["f"]))))
+            np.testing.assert_allclose(S["size"], size, rtol=1e-7)
+            assert S["peak"] == pytest.approx(expected.S.height, rel=1e-6)
+            assert (S["stable"], S["zone"]) == (expected.stable, expected.zone)
+
+    def test_a_fractional_delay_is_the_simulator_s(self, fresh):
+        typed(fresh, "processor.delay", "0.5")
+        other = rig(RIG.replace("delay = 1.0", "delay = 0.5"))
+        np.testing.assert_allclose(signal(fresh, "z"), simulate(other).trajectory.rows.z, rtol=0, atol=1e-12)
+
+    def test_a_slider_moves_the_response_and_the_preset_restores_it(self, fresh):
+        before = signal(fresh, "z")
+        fresh.run("document.querySelector('[data-path=\"controller.position.k\"]').focus()")
+        for _ in range(50):
+            fresh.key("ArrowRight")
+        settled(fresh)
+        assert np.max(np.abs(signal(fresh, "z") - before)) > 1e-6
+        fresh.click("#reset")
+        settled(fresh)
+        np.testing.assert_array_equal(signal(fresh, "z"), before)
+
+    def test_the_second_preset_has_its_own_numbers(self, fresh, tuned):
+        fresh.run("document.getElementById('preset').value = 1")
+        fresh.run("document.getElementById('preset').dispatchEvent(new Event('change'))")
+        settled(fresh)
+        np.testing.assert_allclose(signal(fresh, "z"), simulate(tuned).trajectory.rows.z, rtol=0, atol=1e-12)
+        assert HOSTILE in fresh.run("ambjax.caseFile()")
+
+    def test_an_extreme_value_loses_the_rotor_and_says_so(self, fresh):
+        typed(fresh, "controller.position.k", "0.01")
+        typed(fresh, "plant.m", "16")
+        said = fresh.run("document.getElementById('status').textContent")
+        assert said.startswith("The rotor is lost at ")
+        assert "touched down" in said
+        assert fresh.run("document.getElementById('status').classList.contains('lost')")
+        assert fresh.run("ambjax.state.envelope.kept") < MEMBERS
+        assert fresh.run("ambjax.state.metrics.lost") == 1
+
+    def test_a_wrong_number_is_refused_in_words(self, fresh):
+        before = fresh.run("ambjax.state.sent")
+        box = "document.querySelector('[data-path=\"plant.m\"]').parentElement"
+        for text, words in (("-1", "at least"), ("heavy", "Type a number"), ("", "Type a number"), ("1e99", "at most")):
+            typed(fresh, "plant.m", text)
+            assert words in fresh.run(f"{box}.querySelector('.fault').textContent")
+        assert fresh.run(f"{box}.querySelector('input[type=text]').getAttribute('aria-invalid')") == "true"
+        assert fresh.run("ambjax.state.sent") == before
+
+    def test_the_case_file_with_these_numbers_simulates_to_the_same_run(self, fresh):
+        for path, text in (("controller.position.c", "1500"), ("plant.m", "1.7"), ("sensor.std", "1e-6"), (SEED, "3")):
+            typed(fresh, path, text)
+        fresh.click("#write")
+        text = fresh.run("document.getElementById('text').value")
+        np.testing.assert_allclose(
+            signal(fresh, "z"), simulate(rig(text)).trajectory.rows.z, rtol=0, atol=1e-12, err_msg=text
+        )
+        assert "m = 1.64" in text.split("[controller.model]")[1]
+        fresh.click("#tune")
+        assert fresh.run("document.getElementById('text').value").startswith("ambjax tune ")
+
+    def test_nothing_of_the_case_is_markup_and_nothing_is_loaded(self, fresh):
+        assert fresh.run("document.title") != "owned"
+        assert fresh.run("document.querySelectorAll('img').length") == 0
+        assert {url.partition(":")[0] for url in fresh.requests} <= {"file", "blob", "data"}
+
+    def test_the_machine_follows_the_time(self, fresh):
+        drawing = "document.querySelector('#drawing svg').getAttribute('aria-label')"
+        begin = fresh.run(drawing)
+        fresh.run("document.getElementById('time').focus()")
+        fresh.key("End")
+        assert fresh.run(drawing) != begin
+        z = 1e6 * signal(fresh, "z")[-1]
+        assert f"Rotor at {z:.2f} micrometres" in fresh.run(drawing)
+
+    def test_every_input_has_a_label(self, fresh):
+        unnamed = "[...document.querySelectorAll('input, select, textarea')].filter("
+        unnamed += "e => !e.labels.length && !e.ariaLabel).length"
+        assert fresh.run(unnamed) == 0
+
+    @pytest.mark.parametrize("width", [390, 1280])
+    def test_the_page_does_not_scroll_sideways(self, fresh, width):
+        fresh.size(width)
+        try:
+            fresh.wait(f"innerWidth === {width}")
+            assert fresh.run("document.documentElement.scrollWidth") <= width
+        finally:
+            fresh.size(1280)
+
+
+@pytest.mark.slow
+def test_the_command_writes_the_page(tmp_path, capsys):
+    one = tmp_path / "rig.toml"
+    one.write_text(RIG)
+    assert main(["page", str(one), "--also", str(one), "--out", str(tmp_path / "new" / "p.html"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert pathlib.Path(found["out"]).stat().st_size == found["bytes"]
