@@ -429,7 +429,7 @@ def kept(monkeypatch):
 
 @pytest.mark.parametrize("n", [9600, 20_001, 200])
 def test_before_and_after_are_of_their_runs(n, kept):
-    runs = {"before": a_run(n, 0.7 * n * 1e-4), "after": a_run(n)}
+    runs = {"before": a_run(n), "after": a_run(n, 0.7 * n * 1e-4)}
     axes = np.reshape(tuned.before_after(runs).axes, (4, 3))
     shown = [(name, signal) for signal in ("e_z", "u_mean") for name in runs]
     for (name, signal), line in zip(shown, axes, strict=True):
