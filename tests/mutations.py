@@ -1173,8 +1173,8 @@ SEARCH = [
     M(
         "measured positions are not drawn where q_i is zero",
         "ambjax/pictures/overview.py",
-        "return (*panels, MEASUREMENT) if np.any(",
-        "return (*panels, MEASUREMENT) if np.any(np.asarray(rows.q_i)) and np.any(",
+        "return (*panels, measured) if np.any(",
+        "return (*panels, measured) if np.any(np.asarray(rows.q_i)) and np.any(",
         "tests/test_drawn.py::test_an_overview_is_of_its_run",
     ),
     M(

@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     with files(out) as part:
         trajectory.save(part / "trajectory.npz")
         write_json(part / "metrics.json", metrics)
-        overview(trajectory, f"{case.name}: {case.clock.method}", part / "overview.png", window)
+        overview(trajectory, f"{case.name}: {case.clock.method}", part / "overview.png", window, case.settle)
     if not args.json:
         print(_metrics_text(metrics))
         written(out, ", ".join(WRITTEN))
