@@ -14,19 +14,20 @@ GAUSS, WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
 class Integrals(Loop):
-    """The loop with the integrals of u, u^2, the copper loss and i^2 behind its states."""
+    """The loop with the integrals of u, u^2, the copper loss, i^2 and both squared coil currents behind its states."""
 
     def __init__(self, world):
         super().__init__(world)
-        self.scale = np.append(self.scale, [1e-2, 1.0, 1e-3, 1e-5])
+        self.scale = np.append(self.scale, [1e-2, 1.0, 1e-3, 1e-5, 1e-3, 1e-3])
 
     def start(self, noise):
-        return np.append(super().start(noise), [0.0, 0.0, 0.0, 0.0])
+        return np.append(super().start(noise), [0.0] * 6)
 
     def _rates(self, t, *y):
-        rates, signals = super()._rates(t, *y[:-4])
+        rates, signals = super()._rates(t, *y[:-6])
         heat = 2 * self.true.R * (self.true.i_0**2 + y[2] ** 2)
-        return (*rates, signals[0], signals[0] ** 2, heat, y[2] ** 2), signals
+        coils = (self.true.i_0 + y[2]) ** 2, (self.true.i_0 - y[2]) ** 2
+        return (*rates, signals[0], signals[0] ** 2, heat, y[2] ** 2, *coils), signals
 
 
 def metrics(world, samples, period, settle, noise=None, rtol=1e-9, numbers=None):
@@ -47,7 +48,7 @@ def metrics(world, samples, period, settle, noise=None, rtol=1e-9, numbers=None)
         return abs(y[0]) - stop
 
     touched.terminal = True
-    rows, squares, integrals, lost_at = [], [], {0.0: y[-4:]}, math.inf
+    rows, squares, integrals, lost_at = [], [], {0.0: y[-6:]}, math.inf
     for a, b in itertools.pairwise(cuts):
         middle = (a + b) / 2
         loop.held = noise[min(np.searchsorted(t, middle) - 1, samples - 1)].tolist()
@@ -58,19 +59,20 @@ def metrics(world, samples, period, settle, noise=None, rtol=1e-9, numbers=None)
         for at, x in zip(run.t, run.y.T, strict=True):
             u, e, v_tilde, r = loop.signals(at, x)
             beyond = _singular(loop.true, x[0], x[2] - e)
-            rows.append((at, x[0], x[0] - r, x[2], u, e, v_tilde, _sigma(world, at, x), beyond))
+            magnet = _magnet(loop.true, x[0], x[2])
+            rows.append((at, x[0], x[0] - r, x[2], u, e, v_tilde, _sigma(world, at, x), beyond, *magnet))
         for left, right in itertools.pairwise(run.t):  # z is smooth: a rule of order 6 in every step
             nodes = (left + right) / 2 + (right - left) / 2 * GAUSS
             r = np.array([_reference(world.reference, at)[0] for at in nodes])
             squares.append((left, (right - left) / 2 * np.sum(WEIGHTS * (run.sol(nodes)[0] - r) ** 2)))
         y = run.y[:, -1]
-        integrals[b] = y[-4:]
+        integrals[b] = y[-6:]
         if run.status == 1:
             lost_at = float(run.t[-1])
             rest, y = math.copysign(stop, y[0]), y
             times = np.append(t[t > lost_at], t[-1])
             gone = np.array([rest - _reference(world.reference, at)[0] for at in times])
-            integrals = {at: x for at, x in integrals.items() if at < lost_at} | {lost_at: y[-4:]}
+            integrals = {at: x for at, x in integrals.items() if at < lost_at} | {lost_at: y[-6:]}
             return numbers(np.array(rows), squares, integrals, t, settle, stop, lost_at, (times, gone))
     return numbers(np.array(rows), squares, integrals, t, settle, stop, lost_at, None)
 
@@ -85,8 +87,18 @@ def _singular(plant, z, i_ref):
     return z * z + 2 * plant.s_0 * i_ref * z / plant.i_0 + plant.s_0 * plant.s_0
 
 
+def _magnet(plant, z, i):
+    """The larger flux density of the two cores (T), and the force (N): mu_0 n i/(2 gap), and A B^2/mu_0 of each."""
+    densities = [
+        plant.mu_0 * plant.n * current / (2 * gap)
+        for current, gap in ((plant.i_0 + i, plant.s_0 - z), (plant.i_0 - i, plant.s_0 + z))
+    ]
+    upper, lower = (plant.A * b * b / plant.mu_0 for b in densities)
+    return max(map(abs, densities)), upper - lower
+
+
 def _numbers(rows, squares, integrals, samples, settle, stop, lost_at, gone):
-    t, z, e_z, i, u, e, v_tilde, sigma, beyond = rows.T
+    t, z, e_z, i, u, e, v_tilde, sigma, beyond, flux, force = rows.T
     end = samples[-1]
     late, driven = t >= settle, min(end, lost_at)
     # per sample: the mean of u
@@ -122,7 +134,12 @@ def _numbers(rows, squares, integrals, samples, settle, stop, lost_at, gone):
         "chatter_V": float(np.abs(np.diff(means[edges[:-1] >= settle])).sum()),
         "max_abs_i_A": peak(i),
         "rms_i_A": math.sqrt(total[3] / driven),
+        "rms_i_1_A": math.sqrt(total[4] / driven),
+        "rms_i_2_A": math.sqrt(total[5] / driven),
         "copper_loss_W": total[2] / driven,
+        "max_flux_T": peak(flux),
+        "max_abs_force_N": peak(force),
+        "force_used": 0.0,
         "clearance_used": max(peak(z), stop if gone is not None else 0.0) / stop,
         "settled_clearance_used": max(peak(z, late), stop if gone is not None else 0.0) / stop,
         "refused": 0,

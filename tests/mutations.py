@@ -1173,8 +1173,8 @@ SEARCH = [
     M(
         "measured positions are not drawn where q_i is zero",
         "ambjax/pictures/overview.py",
-        "return (*panels, MEASUREMENT) if np.any(",
-        "return (*panels, MEASUREMENT) if np.any(np.asarray(rows.q_i)) and np.any(",
+        "return (*panels, measured) if np.any(",
+        "return (*panels, measured) if np.any(np.asarray(rows.q_i)) and np.any(",
         "tests/test_drawn.py::test_an_overview_is_of_its_run",
     ),
     M(
@@ -1232,6 +1232,27 @@ SEARCH = [
         "gains[steps - 1, best, j]",
         "gains[steps - 1, 0, j]",
         "tests/test_drawn.py::test_the_convergence_is_of_its_history",
+    ),
+    M(
+        "a lost run before tuning fills a page of panels",
+        "tuning/report/pictures.py",
+        "if run is not lost}",
+        "}",
+        "tests/test_tuning_report.py::test_a_run_lost_before_tuning_is_one_line",
+    ),
+    M(
+        "the report folds the front too",
+        "tuning/command.py",
+        "unfolded=(front_table.TITLE,)",
+        "unfolded=()",
+        "tests/test_tuning_report.py::test_the_page_opens_with_the_answer_and_the_front_and_folds_the_rest",
+    ),
+    M(
+        "the report calls lost rotors held",
+        "tuning/report/answer.py",
+        'word = "NOT held" if not outcome["rotors_held"] else',
+        "word =",
+        "tests/test_tuning_outcome.py::test_every_place_says_the_same",
     ),
     M(
         "points that lose members look like the others",

@@ -103,10 +103,17 @@ def test_every_metric_is_what_a_dense_solution_says(name, method):
             settled = key.startswith("settled")
             most = expected["settled_max_abs_error_m" if settled else "max_abs_error_m"]
             assert_rectangular(ours, theirs, most, SAMPLES - 50 * settled)
-        elif key == "rms_i_A":  # read at the samples, as the errors are; a fall ends within one
+        elif key in ("max_flux_T", "max_abs_force_N"):  # read at the samples, between which they move by 1 %
+            assert ours == pytest.approx(theirs, rel=0.03), key
+        elif key in (
+            "rms_i_A",
+            "rms_i_1_A",
+            "rms_i_2_A",
+        ):  # read at the samples, as the errors are; a fall ends within one
             driven = min(expected["lost_at_s"] / PERIOD, SAMPLES)
             slack = least_tolerance(name, method) * theirs**2
-            assert abs(ours**2 - theirs**2) <= expected["max_abs_i_A"] ** 2 / driven + slack, key
+            most = expected["max_abs_i_A"] + (0.0 if key == "rms_i_A" else 0.25)
+            assert abs(ours**2 - theirs**2) <= most**2 / driven + slack, key
         elif key == "lost_at_s":
             assert ours == pytest.approx(theirs, abs=1e-5), key  # at the end of the step that touches down
         else:

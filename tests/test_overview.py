@@ -109,6 +109,19 @@ def test_runs_of_few_samples_are_drawn(tmp_path, samples, lost_at):
     assert (tmp_path / "o.png").stat().st_size > 1000
 
 
+def test_the_whole_run_has_the_scale_of_what_is_settled(tmp_path, drawn):
+    t = 1e-4 * np.arange(20_000)
+    z = 1e-4 * np.exp(-t / 1e-3) + 2e-7 * np.sin(300 * t)
+    overview(a_run(z=z), "lift-off", tmp_path / "o.png", settle=0.1)
+    whole, start, _ = columns(drawn[0])[0]
+    assert whole.get_title(loc="left") == "the whole run, scaled to what follows 0.1 s"
+    assert whole.get_ylim() == (pytest.approx(-0.2 * 1.24, rel=1e-3), pytest.approx(0.2 * 1.24, rel=1e-3))  # um
+    assert start.get_ylim()[1] > 99.0
+    lost = a_run(z=z, lost_at=1.0, code=TOUCHED)
+    overview(lost, "lost", tmp_path / "o.png", settle=0.1)
+    assert columns(drawn[1])[0, 0].get_ylim()[1] > 99.0
+
+
 def test_what_is_settled_looks_settled(tmp_path, drawn):
     overview(a_run(i=1.0 + 1e-12 * np.arange(20_000), i_ref=np.linspace(0, 1, 20_000)), "flat", tmp_path / "o.png")
     end = columns(drawn[0])[4, 2]

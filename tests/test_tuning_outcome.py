@@ -95,7 +95,14 @@ def test_every_place_says_the_same(kind, ran):
     assert (UNJUDGED in outcome["limits"].values()) == (f"Limits {UNJUDGED}: rms_u_V, survival." in words)
     # where they stand
     text = (folder / "report.md").read_text()
-    assert text.splitlines()[2] == words
+    assert text.partition("## Verdict in full\n\n")[2].splitlines()[0] == words
+    first, sizes, _, limited, after_that = text.splitlines()[2:7]
+    assert first.startswith("- **Held:**") == (survival != BROKEN and not facts["refuted"])
+    assert first.startswith("- **NOT held:**") == (not outcome["rotors_held"])
+    assert ("All requirements are met." in first) == good
+    assert (f"{facts['after'].get('settled_rms_error_m', math.nan):.3g} m" in sizes) == (facts["after"]["held"] > 0)
+    assert ("NOT HELD" in limited) == (BROKEN in (survival, limit))
+    assert after_that == f"- **Next:** in this folder, {facts['next']}" if good else "Next" in after_that
     assert words in (folder / "tuned.toml").read_text()
     assert words in out
     assert bool(facts["advice"]) == (not good)

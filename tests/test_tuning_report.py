@@ -306,12 +306,23 @@ def test_what_is_wide_scrolls_in_its_own_box(written):
     assert "http" not in shown  # needs nothing else
 
 
+def test_the_page_opens_with_the_answer_and_the_front_and_folds_the_rest(written):
+    shown = (written / "report.html").read_text()
+    opened, *folded = shown.split("<details>")
+    assert opened.partition("<ul>")[2].partition("</ul>")[0].count("<li>") == 5
+    assert re.findall(r"<h2>(.*?)</h2>", opened) == ["Error against voltage"]
+    headings = re.findall(r"^## (.*)$", (written / "report.md").read_text(), re.MULTILINE)
+    assert [re.search(r"<summary><h2>(.*?)</h2>", part)[1] for part in folded] == headings[1:]
+
+
 @pytest.mark.skipif(not shutil.which("chromium"), reason="needs a browser")
 @pytest.mark.parametrize("width", [390, 1280])
 def test_the_page_does_not_scroll_sideways(written, tmp_path, width):
     say = "<script>parent.postMessage(document.documentElement.scrollWidth+' of '+innerWidth,'*')</script>"
     shown = (written / "report.html").read_text()
-    (tmp_path / "page.html").write_text(shown.replace("</html>", say + "</html>"))
+    (tmp_path / "page.html").write_text(
+        shown.replace("</html>", say + "</html>").replace("<details>", "<details open>")
+    )
     frame = (
         f"<script>onmessage=e=>document.title=e.data</script><iframe width={width} height=900 src=page.html></iframe>"
     )
@@ -345,6 +356,18 @@ def test_the_picture_takes_lost_rotors(study):
         alive = np.asarray(run.rows.t) < at
         lost = dataclasses.replace(run, lost_at=at, lost_code=TOUCHED, rows=run.rows._replace(alive=alive))
         assert pictures.before_after({"before": lost, "after": run}).startswith(b"\x89PNG")
+
+
+def test_a_run_lost_before_tuning_is_one_line(study, monkeypatch):
+    run = accurate.nominal(study, study.case.cascade)
+    held = dataclasses.replace(run, lost_at=math.inf, lost_code=0)
+    lost = dataclasses.replace(run, lost_at=0.003, lost_code=TOUCHED)
+    monkeypatch.setattr(pictures, "_png", lambda figure: figure)
+    figure = pictures.before_after({"before": lost, "after": held})
+    assert figure.get_suptitle() == "before tuning: touched down at 0.003 s"
+    assert len(figure.axes) == 2 * 3
+    figure = pictures.before_after({"before": held, "after": lost})  # why the answer is lost must be seen
+    assert len(figure.axes) == 4 * 3
 
 
 def test_rows_of_the_picture_are_of_the_run_that_they_name(study, monkeypatch):

@@ -19,7 +19,7 @@ from ambjax.page.document import NAME
 from ambjax.page.document import page as sliders_page
 from tuning.config import read_tune, settings
 from tuning.problem import TuningProblem, problem_of
-from tuning.report import accurate, pictures
+from tuning.report import accurate, front_table, pictures
 from tuning.report import document as report
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.judging import examined
@@ -141,7 +141,9 @@ def _write(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: T
     for name, data in drawn.items():
         (part / name).write_bytes(data)
     (part / "report.md").write_text(words, encoding="utf-8")
-    (part / "report.html").write_text(page(words, drawn, f"Tuning of {facts.case}"), encoding="utf-8")
+    (part / "report.html").write_text(
+        page(words, drawn, f"Tuning of {facts.case}", unfolded=(front_table.TITLE,)), encoding="utf-8"
+    )
     write_json(part / REPORT, facts.table)
 
 

@@ -34,6 +34,7 @@ from ambjax.simulation.sliding import Slide, slides
 from ambjax.simulation.system import check_parts
 from ambjax.world.bearing import Bearing
 from ambjax.world.coils import TwoCoil
+from ambjax.world.iron import Iron
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
 
@@ -164,7 +165,8 @@ def case_from(
     if isinstance(clock.method, Slide) and not slides(cascade, scenario.plant):
         made = " or ".join(f'"{kind}"' for kind, law in KINDS["inversion"].items() if law.slides)
         raise ValueError(
-            f'clock.method = "sliding": it needs controller.inversion.kind = {made}, continuous time, a lumped plant, '
+            f'clock.method = "sliding": it needs controller.inversion.kind = {made}, continuous time, a lumped plant '
+            "without [plant.iron], "
             'and an observer other than "ired-1" and "ired-2". Use method = "adaptive".'
         )
     if isinstance(clock.method, Slide) and scenario.stop is not None:
@@ -201,7 +203,10 @@ def _processor(table: Table) -> Processor:
 
 def _plant(table: Table) -> Bearing:
     kind = table.choice("kind", list(PLANTS), next(iter(PLANTS)))
-    return table.record(PLANTS[kind], extra=("kind",))
+    plant = table.record(PLANTS[kind], extra=("kind", "iron"))
+    if "iron" not in table.raw:
+        return plant
+    return dataclasses.replace(plant, iron=table.table("iron").record(Iron))
 
 
 def _left_out(table: Table, plant: Bearing) -> tuple[str, ...]:

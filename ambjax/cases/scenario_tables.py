@@ -129,8 +129,9 @@ def _runout(table: Table) -> Runout:
     names = [field.name for field in dataclasses.fields(Runout) if field.metadata.get("leaf")]
     table.only([*names, "harmonics"])
     if not isinstance(raw, list) or not 0 < len(raw) <= MOST_TERMS:
+        given = "is missing" if raw is None else f"= {show(raw)}"
         raise ValueError(
-            f"{table.at('harmonics')} = {show(raw)}: it must be a list of 1 to {MOST_TERMS} tables, "
+            f"{table.at('harmonics')} {given}: it must be a list of 1 to {MOST_TERMS} tables, "
             "[{ number = 1, amplitude = 1e-6, phase = 0.0 }] for example."
         )
     waves = tuple(Table(one, f"{table.at('harmonics')}[{n}]").record(Harmonic) for n, one in enumerate(raw))

@@ -126,7 +126,9 @@ class Table:
         if value is None:
             raise ValueError(f"{self.at(key)} is missing: it must be one of {words}.")
         if value not in allowed:
-            close = difflib.get_close_matches(show(value).strip('"'), allowed, n=1)
+            word = show(value).strip('"')
+            same = [name for name in allowed if name.lower() == word.lower()]
+            close = same or difflib.get_close_matches(word, allowed, n=1)
             other = f" Did you mean '{close[0]}'?" if close else ""
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be one of {words}.{other}")
         return value

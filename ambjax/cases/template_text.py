@@ -124,6 +124,14 @@ def _lines(kind: type, values: object) -> list[str]:
     return lines
 
 
+IRON = """\
+# [plant.iron]                # of the true plant's magnets; each key left out: ideal iron (left out: none)
+# saturation = 1.4            # T; flux density limit of the core
+# leakage = 1.1               # flux of a coil over the flux of its gap, at z = 0
+# eddy = 5e-5                 # s; lag of the flux behind the current by eddy currents
+"""
+
+
 def _law(kind: type) -> list[str]:
     """Return the lines of a law; a steepness p that scales with the plant becomes a comment."""
     law = kind()
@@ -161,7 +169,14 @@ def template(scenario: str) -> str:
     tracking = scenario == "tracking"
     lines = [HEAD.format(title=f"the paper's {scenario} scenario, Table 2 with gamma = 7.5e4")]
     kinds = _with_note('# kind = "lumped"', f"Eqs. (1), (2); or {_others(PLANTS)}: each coil's own current")
-    lines += ["[plant]                       # the true plant, Table 1", kinds, *_lines(Plant, Plant()), ""]
+    lines += [
+        "[plant]                       # the true plant, Table 1",
+        kinds,
+        *_lines(Plant, Plant()),
+        "",
+        *IRON.splitlines(),
+        "",
+    ]
     lines += [
         "[controller]",
         "model = {}                    # the controller's model, where it differs from the plant: { m = 0.6 }",

@@ -34,13 +34,13 @@ def forces(case: Case) -> Forces:
     if that is smaller. The load is the sum of the bounds of all signals that disturb z.
     """
     scenario, plant, amplifier = case.scenario, case.scenario.plant, case.scenario.amplifier
-    m, i_0 = float(plant.m), float(plant.i_0)
-    most = i_0 if amplifier is None or amplifier.i_max is None else min(i_0, float(amplifier.i_max))
+    m = float(plant.m)
+    largest = float(plant.largest_force(None if amplifier is None else amplifier.i_max))
     factors = {"q_z": m, "q_v": m * float(plant.a), "q_f": 1.0, "base": m}
     signals = {slot: signal for slot in factors if (signal := getattr(scenario, slot)) is not None}
     ends = {slot: signal.span(float(case.clock.duration)) for slot, signal in signals.items()}
     load = sum(factors[slot] * max(abs(low), abs(high)) for slot, (low, high) in ends.items())
-    return Forces(float(plant.k_i) * most, m * abs(float(plant.g)), load)
+    return Forces(largest, m * abs(float(plant.g)), load)
 
 
 def bias_flux(case: Case) -> float:

@@ -50,10 +50,11 @@ def _forces(case: Case) -> Iterator[str]:
 
 
 def _flux(case: Case) -> Iterator[str]:
-    if (flux := bias_flux(case)) > MOST_FLUX:
+    iron = case.scenario.plant.iron
+    if (flux := bias_flux(case)) > MOST_FLUX and (iron is None or iron.saturation is None):
         yield (
             f"plant: the bias flux density mu_0 n i_0/(2 s_0) is {flux:.3g} T; iron saturates above about "
-            f"{MOST_FLUX:g} T, which this model does not contain. Check n, i_0 and s_0."
+            f"{MOST_FLUX:g} T. Check n, i_0 and s_0, or give plant.iron.saturation."
         )
 
 

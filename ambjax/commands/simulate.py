@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     with files(out) as part:
         trajectory.save(part / "trajectory.npz")
         write_json(part / "metrics.json", metrics)
-        overview(trajectory, f"{case.name}: {case.clock.method}", part / "overview.png", window)
+        overview(trajectory, f"{case.name}: {case.clock.method}", part / "overview.png", window, case.settle)
         for name, page in html.items():
             (part / name).write_text(page, encoding="utf-8")
     if not args.json:

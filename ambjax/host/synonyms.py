@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Iterable
 
 # Names of the case file, and other words for them, without case, '_' and '-'. A name with a dot is in another table; it
-# is suggested only if the word stands where no allowed name is like it.
+# is suggested only if the word is no other word for an allowed name.
 OTHER_WORDS = {
     "plant": "rotor machine magnet magnets bearing system motor",
     "controller": "control gains regulator",
@@ -45,8 +45,11 @@ OTHER_WORDS = {
     "file": "path filename csv",
     "std": "sigma rms standarddeviation noise variance",
     "bits": "resolution adc",
+    "saturation": "bsat bs bmax saturationflux",
+    "leakage": "leakagefactor stray",
+    "eddy": "eddycurrents lamination tau",
     "bandwidth": "cutoff cutofffrequency lowpass",
-    "u_max": "voltage umax vmax dclink limit voltagelimit supplyvoltage",
+    "u_max": "supply voltage umax vmax dclink limit voltagelimit supplyvoltage",
     "i_max": "currentlimit maxcurrent",
     "seed": "randomseed rng",
     "settle": "settling settlingtime",
@@ -64,11 +67,30 @@ OTHER_WORDS = {
     "disturbance.q_i": "qi",
     "sensor.runout": "runout",
     "actuator.u_max": "umax voltage vmax dclink",
-    "clock.sample_period": "fs samplerate sampleperiod",
+    "clock.sample_period": "fs samplerate sampleperiod samplingrate rate period ts",
     "clock.duration": "duration",
     "processor.delay": "delay deadtime latency",
+    "plant.m": "m mass weight rotormass",
+    "plant.s_0": "s0 gap airgap nominalgap",
+    "plant.i_0": "i0 bias biascurrent ibias",
+    "plant.R": "resistance coilresistance",
+    "plant.n": "turns windings",
+    "plant.A": "polearea area",
+    "plant.iron.saturation": "saturation bsat bs bmax saturationflux",
+    "plant.iron.leakage": "leakage leakagefactor stray",
+    "plant.iron.eddy": "eddy eddycurrents lamination",
     "run.clearance": "clearance",
     "run.seed": "seed",
+}
+
+
+# Numbers of a plant that follow from others.
+DERIVED = {
+    "ks": "mu_0, n, A, s_0 and i_0 (kappa i_0^2/s_0^3); 'ambjax check' prints it",
+    "ki": "mu_0, n, A, s_0 and i_0 (kappa i_0/s_0^2); 'ambjax check' prints it",
+    "l": "mu_0, n, A and s_0 (kappa/(2 s_0))",
+    "inductance": "mu_0, n, A and s_0 (kappa/(2 s_0))",
+    "kappa": "mu_0, n and A (mu_0 n^2 A)",
 }
 
 
@@ -78,13 +100,19 @@ def meant(word: str, allowed: Iterable[str]) -> str | None:
     for name in names:
         if _plain(name) == plain or plain in OTHER_WORDS.get(name, "").split():
             return name
-    if close := difflib.get_close_matches(word, names, n=1):
-        return close[0]
-    return next((name for name, words in OTHER_WORDS.items() if "." in name and plain in words.split()), None)
+    elsewhere = (name for name, words in OTHER_WORDS.items() if "." in name and plain in words.split())
+    close = difflib.get_close_matches(word, names, n=1)
+    return next(elsewhere, close[0] if close else None)
 
 
 def hint(word: str, allowed: Iterable[str]) -> str:
-    """Return " Did you mean 'name'?" for the name that `word` probably means; "" if unknown."""
+    """Return " Did you mean 'name'?" for the name that `word` probably means; "" if unknown.
+
+    For a number of a plant that follows from others, the text names these.
+    """
+    allowed = list(allowed)
+    if _plain(word) in DERIVED and "mu_0" in allowed:
+        return f" It follows from {DERIVED[_plain(word)]}."
     name = meant(word, allowed)
     return f" Did you mean '{name}'?" if name else ""
 

@@ -3,7 +3,7 @@
 import base64
 import html
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from markdown_it import MarkdownIt
 from markdown_it.renderer import RendererHTML
@@ -14,7 +14,8 @@ from markdown_it.utils import EnvType, OptionsDict
 STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:72rem;margin:2rem auto;padding:0 1rem;color:#222}
 body{overflow-wrap:anywhere}p,li{max-width:60rem}.wide{display:block;overflow-x:auto;margin:.6rem 0}
 table{border-collapse:collapse;overflow-wrap:normal}td,th{border:1px solid #ccc;padding:.2rem .6rem;text-align:left}
-th{background:#f3f3f3}.short{white-space:nowrap}img{display:block;max-width:max(100%,44rem)}"""
+th{background:#f3f3f3}.short{white-space:nowrap}img{display:block;max-width:max(100%,44rem)}
+details{border-top:1px solid #ccc;padding:.4rem 0}summary{cursor:pointer}summary h2{display:inline;font-size:1.1rem}"""
 # Cells of at most this many characters are not wrapped: a number must not break at the sign of its exponent.
 SHORT = 48
 PUNCTUATION = re.compile(r"([\\`*_\[\]<>|~&#!$])")
@@ -32,8 +33,11 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return ["| " + " | ".join(cell.replace("\\|", "|").replace("|", "\\|") for cell in line) + " |" for line in lines]
 
 
-def page(text: str, pictures: Mapping[str, bytes], title: str) -> str:
-    """Return the HTML page. `pictures`: PNG data by file name; images with these names are embedded."""
+def page(text: str, pictures: Mapping[str, bytes], title: str, unfolded: Collection[str] | None = None) -> str:
+    """Return the HTML page. `pictures`: PNG data by file name; images with these names are embedded.
+
+    `unfolded`: headings of level 2 whose sections are open; all other sections are folded. None: all are open.
+    """
     markdown = MarkdownIt("commonmark", {"html": False}).enable("table")
     markdown.add_render_rule("table_open", lambda *_: '<div class="wide"><table>\n')
     markdown.add_render_rule("td_open", lambda _, tokens, at, *__: _cell(tokens[at + 1].content))
@@ -52,7 +56,17 @@ def page(text: str, pictures: Mapping[str, bytes], title: str) -> str:
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         f"<title>{html.escape(title)}</title><style>{STYLE}</style>"
     )
-    return f"{head}\n{markdown.render(text)}</html>\n"
+    first, *sections = [text] if unfolded is None else re.split(r"^(?=## )", text, flags=re.MULTILINE)
+    parts = [markdown.render(first)]
+    for section in sections:
+        heading, _, below = section.partition("\n")
+        if heading.removeprefix("## ") in (unfolded or ()):
+            parts.append(markdown.render(section))
+        else:
+            parts.append(
+                f"<details><summary>{markdown.render(heading)}</summary>\n{markdown.render(below)}</details>\n"
+            )
+    return f"{head}\n{''.join(parts)}</html>\n"
 
 
 def _cell(text: str) -> str:

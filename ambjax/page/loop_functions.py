@@ -72,7 +72,7 @@ class LoopFunctions:
         """Return the state after sample k, its row, and the currents of both coils at its start, A."""
         system, clock, fold = self._system(numbers, normals)
         after, row = one_sample(system, clock, fold, progress, k)
-        return after, row, numbers.scenario.plant.coil_currents(progress.state.plant)
+        return after, row, numbers.scenario.plant.currents(progress.state.plant)
 
     def result(self, numbers: Numbers, progress: RolloutState) -> dict[str, Array]:
         """Return the metrics of a run that ended in this state."""

@@ -43,6 +43,8 @@ CURRENT = Panel("current", "A", 1.0, (Curve("i", "$i$"), Curve("i_ref", "$i_{ref
 SLIDING = Panel("sliding variable $\\sigma$", "m/s", 1.0, (Curve("sigma", "$\\sigma$"),))
 DISTURBANCE = Panel("disturbance $q_z$", "m/s²", 1.0, (Curve("q_z", "$q_z$"),))
 FORCE = Panel("scaled force", "A²/m²", 1.0, (Curve("v", "$v$"), Curve("v_star", "$v^*$", ORANGE, "--")))
+COILS = Panel("coil currents", "A", 1.0, (Curve("i_1", "$i_1$"), Curve("i_2", "$i_2$", ORANGE)))
+MAGNETIC = Panel("magnetic force", "N", 1.0, (Curve("force", "$F$"),))
 FORCE_ERROR = Panel("force error $\\tilde v$", "A²/m²", 1.0, (Curve("v_tilde", "$\\tilde v$"),))
 VOLTAGE = Panel("voltage $u$", "V", 1.0, (Curve("u", "$u$"),))
 # Under noise u jumps at each sample; the voltage of a drive is close to the average over the sample.

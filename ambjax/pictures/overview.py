@@ -4,16 +4,18 @@ import itertools
 import pathlib
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ambjax.pictures.figures import (
     AVERAGED,
+    COILS,
     CURRENT,
     CURRENT_DISTURBANCE,
     DISTURBANCE,
     ERROR,
-    FORCE,
     FORCE_ERROR,
+    MAGNETIC,
     MEASUREMENT,
     POSITION,
     SLIDING,
@@ -21,6 +23,7 @@ from ambjax.pictures.figures import (
     draw,
     signal_of,
 )
+from ambjax.pictures.scales import prefix_of
 from ambjax.pictures.style import own_style
 from ambjax.simulation.trajectory import STALLED, Trajectory
 
@@ -29,20 +32,29 @@ TURNS = 40
 
 
 @own_style
-def overview(trajectory: Trajectory, title: str, path: pathlib.Path, window: tuple[float, float] | None = None) -> None:
+def overview(
+    trajectory: Trajectory,
+    title: str,
+    path: pathlib.Path,
+    window: tuple[float, float] | None = None,
+    settle: float = 0.0,
+) -> None:
     """Write the picture of `overview_figure` to a file."""
-    overview_figure(trajectory, title, window).savefig(path, dpi=130)
+    overview_figure(trajectory, title, window, settle).savefig(path, dpi=130)
 
 
 @own_style
-def overview_figure(trajectory: Trajectory, title: str, window: tuple[float, float] | None = None) -> Figure:
+def overview_figure(
+    trajectory: Trajectory, title: str, window: tuple[float, float] | None = None, settle: float = 0.0
+) -> Figure:
     """Return one page with every signal of a run, over the whole run, and enlarged at its start and at its end.
 
-    `window`: begin and end, s; the page then shows only this stretch.
+    `window`: begin and end, s; the page then shows only this stretch. `settle`: time (s) from which the vertical scales
+    of the whole run are those of its signals, unless the rotor is lost: the lift-off has panels of its own.
     """
     panels = _panels(trajectory)
     if window is None:
-        columns, grid = _stretches(trajectory), [[panel] * 3 for panel in panels]
+        columns, grid = _stretches(trajectory, settle), [[panel] * 3 for panel in panels]
     else:
         half = -(-len(panels) // 2)
         columns = [(_status(trajectory), *window), ("", *window)]
@@ -60,6 +72,8 @@ def overview_figure(trajectory: Trajectory, title: str, window: tuple[float, flo
                 ax.set_axis_off()
                 continue
             draw(ax, panel, trajectory, stretch=(stretch[0], stretch[1]))
+            if window is None and n == 0 and _scales_late(trajectory, settle):
+                _fit(ax, panel, trajectory, settle)
             if window is None and n:
                 ax.set_ylabel("")
             if row == 0:
@@ -75,14 +89,40 @@ def overview_figure(trajectory: Trajectory, title: str, window: tuple[float, flo
 
 def _panels(trajectory: Trajectory) -> tuple[Panel, ...]:
     """Return the panels of a run; those of q_i and of the measured position only if they differ from 0 and from z."""
-    panels = (POSITION, ERROR, SLIDING, DISTURBANCE, CURRENT, FORCE, FORCE_ERROR, AVERAGED)
     rows = trajectory.rows
+    panels = (_prefixed(POSITION, trajectory), _prefixed(ERROR, trajectory), SLIDING, DISTURBANCE)
+    panels = (*panels, CURRENT, COILS, MAGNETIC, FORCE_ERROR, AVERAGED)
     if np.any(np.asarray(rows.q_i)):
         panels = (*panels, CURRENT_DISTURBANCE)
-    return (*panels, MEASUREMENT) if np.any(np.asarray(rows.z_measured) != np.asarray(rows.z)) else panels
+    measured = _prefixed(MEASUREMENT, trajectory)
+    return (*panels, measured) if np.any(np.asarray(rows.z_measured) != np.asarray(rows.z)) else panels
 
 
-def _stretches(trajectory: Trajectory) -> list[tuple[str, float, float]]:
+def _prefixed(panel: Panel, trajectory: Trajectory) -> Panel:
+    """Return a panel of lengths in the prefix of metres that suits its first signal."""
+    held = np.asarray(trajectory.rows.t) < float(trajectory.lost_at)
+    values = np.abs(signal_of(trajectory.rows, panel.curves[0].signal)[held])
+    factor, unit = prefix_of("m", float(values.max(initial=0.0)))
+    return panel._replace(unit=unit, factor=factor)
+
+
+def _scales_late(trajectory: Trajectory, settle: float) -> bool:
+    """Return whether the vertical scales of the whole run are those from `settle` (s) on."""
+    t = np.asarray(trajectory.rows.t, float)
+    return not np.isfinite(float(trajectory.lost_at)) and t[0] < settle < t[-1]
+
+
+def _fit(ax: Axes, panel: Panel, trajectory: Trajectory, settle: float) -> None:
+    """Set the vertical scale of a panel to its signals from `settle` (s) on, with a margin of 12 %."""
+    late = np.asarray(trajectory.rows.t) >= settle
+    values = [panel.factor * signal_of(trajectory.rows, curve.signal)[late] for curve in panel.curves]
+    low, high = float(np.min(values)), float(np.max(values))
+    if high > low:
+        margin = 0.12 * (high - low)
+        ax.set_ylim(low - margin, high + margin)
+
+
+def _stretches(trajectory: Trajectory, settle: float) -> list[tuple[str, float, float]]:
     """Return title, begin and end (s) of each column: the run up to shortly after a loss, its start, and its end."""
     t, lost_at = np.asarray(trajectory.rows.t, float), float(trajectory.lost_at)
     loss = bool(np.isfinite(lost_at))
@@ -92,10 +132,14 @@ def _stretches(trajectory: Trajectory) -> list[tuple[str, float, float]]:
     last = max(_last_moments(trajectory, end), least)
     beyond = end + 0.15 * (end - begin) * loss
     return [
-        (_status(trajectory), begin, max(beyond, begin + least)),
+        (_status(trajectory) or _scale_words(trajectory, settle), begin, max(beyond, begin + least)),
         (f"the first {_short(start)}", begin, begin + start),
         (f"the last {_short(last)}", end - last, end + 0.15 * last * loss),
     ]
+
+
+def _scale_words(trajectory: Trajectory, settle: float) -> str:
+    return f"the whole run, scaled to what follows {settle:g} s" if _scales_late(trajectory, settle) else ""
 
 
 def _status(trajectory: Trajectory) -> str:

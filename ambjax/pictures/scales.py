@@ -36,7 +36,12 @@ LABELS = {
     "chatter_V": "chatter",
     "max_abs_i_A": "max |$i$|",
     "rms_i_A": "rms $i$",
+    "rms_i_1_A": "rms $i_1$",
+    "rms_i_2_A": "rms $i_2$",
     "copper_loss_W": "copper loss",
+    "max_flux_T": "max flux density",
+    "max_abs_force_N": "max |force|",
+    "force_used": "force used",
     "clearance_used": "clearance used",
     "settled_clearance_used": "settled clearance used",
     "refused": "refused readings",
@@ -44,7 +49,12 @@ LABELS = {
     "singular_at_s": "singular at",
 }
 # Metrics that an axis shows in another unit than `UNITS`: the factor and this unit.
-SHOWN = {"clearance_used": (100.0, "%"), "settled_clearance_used": (100.0, "%"), "refused": (1.0, "samples")}
+SHOWN = {
+    "clearance_used": (100.0, "%"),
+    "settled_clearance_used": (100.0, "%"),
+    "force_used": (100.0, "%"),
+    "refused": (1.0, "samples"),
+}
 # Units that take an SI prefix if they begin a compound unit; lengths and times take none above 1.
 PREFIXED = re.compile(r"(?P<length>m|s)(/.*)?|(V|A|W|N|H|T|Hz|Ω)(/.*)?")
 LEAST_POWER, MOST_POWER = -9, 9

@@ -59,7 +59,7 @@ class CaseRun:
         """Return a matplotlib Figure with every signal: the whole run, its start and its end."""
         from ambjax.pictures.overview import overview_figure
 
-        return overview_figure(self.trajectory, f"{self.case.name}: {self.case.clock.method}")
+        return overview_figure(self.trajectory, f"{self.case.name}: {self.case.clock.method}", settle=self.case.settle)
 
     def _signals(self) -> dict[str, np.ndarray]:
         """Return the saved signals [samples] by name, without the time."""

@@ -213,7 +213,7 @@ class ClosedLoop:
         `state`: of the plant. `command`: with u within the limit of the supply. `measured`: the readings.
         """
         plant = self.scenario.plant
-        motion, signals = plant.measurement(state), plant.signals(state)
+        motion, signals, (i_1, i_2) = plant.measurement(state), plant.signals(state), plant.currents(state)
         return Row(
             t=jnp.asarray(t),
             z=motion.z,
@@ -223,6 +223,10 @@ class ClosedLoop:
             u=jnp.where(alive, command.u, 0.0),
             u_mean=jnp.zeros_like(command.u),
             u_peak=jnp.zeros_like(command.u),
+            i_1=i_1,
+            i_2=i_2,
+            force=plant.m * plant.a * signals.v,
+            B=plant.flux_density(state),
             v=signals.v,
             v_star=command.v_star,
             v_tilde=command.v_tilde,

@@ -32,7 +32,12 @@ UNITS = {
     "chatter_V": "V",
     "max_abs_i_A": "A",
     "rms_i_A": "A",
+    "rms_i_1_A": "A",
+    "rms_i_2_A": "A",
     "copper_loss_W": "W",
+    "max_flux_T": "T",
+    "max_abs_force_N": "N",
+    "force_used": "1",
     "lost_at_s": "s",
     "singular_at_s": "s",
     "settle_s": "s",
@@ -45,6 +50,7 @@ class Standard:
 
     - `settle`: start of the evaluation of the settled metrics, s.
     - `touchdown`: clearance, m; the unit of `clearance_used` and `settled_clearance_used`.
+    - `largest_force`: N; the unit of `force_used`; inf: unknown.
     - `sigma_band`, `v_tilde_band`, `e_band`: a signal within its band counts as having reached zero.
 
     The defaults are for the plant of Table 1; `standard_for` scales them to another plant.
@@ -57,6 +63,7 @@ class Standard:
     sigma_band: Scalar = leaf(default=1e-3, unit="m/s", above=0, at_most=1e30)
     v_tilde_band: Scalar = leaf(default=0.1, unit="A^2/m^2", above=0, at_most=1e30)
     e_band: Scalar = leaf(default=1e-3, unit="A", above=0, at_most=1e6)
+    largest_force: Scalar = leaf(default=float("inf"), unit="N", above=0, at_most=1e30, infinite=True)
 
     def _folds(self) -> Named:
         """Return the fold of each metric by name."""
@@ -79,7 +86,11 @@ class Standard:
                 "chatter_V": Variation(late),
                 "max_abs_i_A": Peak("i"),
                 "rms_i_A": Rms("i", driven=True),
+                "rms_i_1_A": Rms("i_1", driven=True),
+                "rms_i_2_A": Rms("i_2", driven=True),
                 "copper_loss_W": Driven("heat"),
+                "max_flux_T": Peak("B"),
+                "max_abs_force_N": Peak("force"),
                 "clearance_used": Peak("z"),
                 "settled_clearance_used": Peak("z", late),
                 "refused": Count("refused"),
@@ -96,6 +107,7 @@ class Standard:
         numbers = self._folds().result(carry, ending)
         for name in ("clearance_used", "settled_clearance_used"):
             numbers[name] = numbers[name] / self.touchdown
+        numbers["force_used"] = numbers["max_abs_force_N"] / self.largest_force
         status = {
             "lost": (ending.lost_code != ALIVE) & (ending.lost_code != STALLED),
             "stalled": ending.lost_code == STALLED,
@@ -117,4 +129,5 @@ def standard_for(settle: Scalar, scenario: Scenario) -> Standard:
         usual.sigma_band * (plant.sigma_size / paper.sigma_size),
         usual.v_tilde_band * (plant.v_size / paper.v_size),
         usual.e_band * (plant.i_0 / paper.i_0),
+        plant.largest_force(None if scenario.amplifier is None else scenario.amplifier.i_max),
     )

@@ -40,7 +40,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     `begin`, `end`: external inputs at the start and at the end of the step. Returns the new state and span.
     """
     cascade, scenario = loop.cascade, loop.scenario
-    model, (z, z_dot, i), control = cascade.model, state.plant, state.control
+    model, (z, z_dot, i, _), control = cascade.model, state.plant, state.control
     i_ref = control.inversion
     per_h = 1 / jnp.where(h > 0, h, 1.0)
 

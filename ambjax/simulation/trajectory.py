@@ -38,6 +38,14 @@ class Row(NamedTuple):
     """mean of the applied voltage over the sample that begins at t (spikes shorter than a sample included), V"""
     u_peak: Array
     """largest |voltage| at the coils over the sample (with an amplifier, u is its command), V"""
+    i_1: Array
+    """current of the upper coil, A"""
+    i_2: Array
+    """current of the lower coil, A"""
+    force: Array
+    """magnetic force, N"""
+    B: Array
+    """flux density of the core with the larger one, T"""
     v: Array
     """scaled magnetic force v(z, i), A^2/m^2. Eq. (3)"""
     v_star: Array
@@ -77,10 +85,10 @@ NOT_SAVED = ("u_peak", "heat", "alive")
 SIGNAL_UNITS = {
     **dict.fromkeys(("z", "r", "z_measured"), "m"),
     **dict.fromkeys(("z_dot", "sigma"), "m/s"),
-    **dict.fromkeys(("i", "i_ref"), "A"),
+    **dict.fromkeys(("i", "i_ref", "i_1", "i_2"), "A"),
     **dict.fromkeys(("u", "u_mean"), "V"),
     **dict.fromkeys(("v", "v_star", "v_tilde"), "A^2/m^2"),
-    **{"t": "s", "q_z": "m/s^2", "q_i": "A/s", "refused": "bool"},
+    **{"t": "s", "q_z": "m/s^2", "q_i": "A/s", "refused": "bool", "force": "N", "B": "T"},
 }
 
 

@@ -9,6 +9,7 @@ from jax import Array
 from ambjax.compiler.barrier import compiled_alone
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.numerics.smooth import refined, safe_sqrt
+from ambjax.world.iron import Iron
 from ambjax.world.sensor import Measurement
 
 # Lower bound of a gap as a share of s_0. Accepted states stay far above it, since the rotor touches down before. It
@@ -86,8 +87,21 @@ class Bearing(Generic[S]):
     R: Scalar = leaf(default=41.44, unit="ohm", at_least=0, at_most=1e6, doc="coil resistance")
     g: Scalar = leaf(default=9.81, unit="m/s^2", at_least=-1e4, at_most=1e4, doc="gravitational acceleration")
 
-    lumped: ClassVar[bool] = False
-    """Whether the state is (z, z_dot, i) and i_dot is linear in u, as in `Plant`. The sliding step requires it."""
+    iron: Iron | None = None
+    """saturation, leakage and eddy currents of the true plant; None: ideal iron. The laws' formulas never contain it"""
+
+    one_current: ClassVar[bool] = False
+    """Whether the state is (z, z_dot, i), as in `Plant`."""
+
+    @property
+    def delays(self) -> bool:
+        """Whether the flux follows the current with a lag, so that the state contains the delayed currents."""
+        return self.iron is not None and self.iron.eddy is not None
+
+    @property
+    def lumped(self) -> bool:
+        """Whether the state is (z, z_dot, i) and i_dot is linear in u, as the sliding step requires."""
+        return self.one_current and self.iron is None
 
     def start(self, measurement: Measurement) -> S:
         """Return the state with this motion and current."""
@@ -113,18 +127,48 @@ class Bearing(Generic[S]):
         """Return the scaled force and the copper loss in this state."""
         raise NotImplementedError
 
-    def coil_currents(self, state: S) -> tuple[Array, Array]:
+    def slope(self) -> Scalar:
+        """The fastest rate of the plant's motion and flux, 1/s; the step size is chosen from it."""
+        if self.iron is None or self.iron.eddy is None:
+            return self.pole
+        return jnp.maximum(self.pole, 1 / self.iron.eddy)
+
+    def coil_slope(self, z: Scalar) -> Scalar:
+        """Return the fastest rate R/L of a coil's current (1/s) for |z| at most `z`: 2 R (s_0 + z)/kappa. Eq. (2)."""
+        slope = 2 * self.R * (self.s_0 + z) / self.kappa
+        return slope if self.iron is None else self.iron.fastest() * slope
+
+    def currents(self, state: S) -> tuple[Array, Array]:
         """Return the currents of the upper and the lower coil, A."""
         i = self.measurement(state).i
         return self.i_0 + i, self.i_0 - i
 
-    def slope(self) -> Scalar:
-        """The fastest rate of the plant's motion, 1/s; the step size is chosen from it."""
-        return self.pole
+    def fluxing(self, state: S) -> tuple[Array, Array]:
+        """Return the currents (A) to which the fluxes of both coils belong: with eddy currents, the delayed ones."""
+        return self.currents(state)
 
-    def coil_slope(self, z: Scalar) -> Scalar:
-        """Return the fastest rate R/L of a coil's current (1/s) for |z| at most `z`: 2 R (s_0 + z)/kappa. Eq. (2)."""
-        return 2 * self.R * (self.s_0 + z) / self.kappa
+    def pull(self, fluxing: tuple[Array, Array], z: Scalar, gaps: Gaps | None = None) -> Array:
+        """Return the scaled force (A^2/m^2) of the two coils: the difference of (i/gap)^2, with the iron if any.
+
+        `fluxing`: as the method of this name returns.
+        """
+        pulls = []
+        for i, inverse in zip(fluxing, (gaps or self.gaps(z)).inverses, strict=True):
+            share = 1.0 if self.iron is None else self.iron.share(self.iron.core(self, i, inverse))
+            pulls.append((i * inverse * share) ** 2)
+        return pulls[0] - pulls[1]
+
+    def flux_density(self, state: S) -> Array:
+        """Return the larger of the flux densities of the two cores, T."""
+        iron, inverses = self.iron or Iron(), self.gaps(self.measurement(state).z).inverses
+        cores = [iron.core(self, i, inverse) for i, inverse in zip(self.fluxing(state), inverses, strict=True)]
+        upper, lower = (jnp.abs(b * iron.share(b)) for b in cores)
+        return jnp.maximum(upper, lower)
+
+    def largest_force(self, i_max: Scalar | None = None) -> Scalar:
+        """Return the largest force at z = 0, N: with |i| = i_0 (beyond it one magnet is off) or i_max, A, if less."""
+        most = jnp.asarray(self.i_0) if i_max is None else jnp.minimum(self.i_0, i_max)
+        return self.m * self.a * self.pull((self.i_0 + most, self.i_0 - most), 0.0 * most)
 
     def sizes(self) -> Measurement:
         """Return characteristic sizes of z, z_dot, i: 2 % of the gap, the same per 0.1 s, 4 % of the bias current."""

@@ -7,16 +7,21 @@ from jax import Array
 
 from ambjax.numerics.records import Scalar, record
 from ambjax.world.bearing import Bearing, Signals
+from ambjax.world.iron import Iron
 from ambjax.world.sensor import Measurement
 
 
 class Currents(NamedTuple):
-    """State of `TwoCoil`: displacement (m), velocity (m/s), currents of the upper and lower coil (A); or the rates."""
+    """State of `TwoCoil`: displacement (m), velocity (m/s), currents of the upper and lower coil (A); or the rates.
+
+    `delayed`: the currents of the fluxes (A), with eddy currents; () without.
+    """
 
     z: Array
     z_dot: Array
     i_1: Array
     i_2: Array
+    delayed: tuple[Array, Array] | tuple[()] = ()
 
 
 @record
@@ -30,33 +35,52 @@ class TwoCoil(Bearing[Currents]):
 
     def start(self, measurement: Measurement) -> Currents:
         z, z_dot, i = measurement
-        return Currents(z, z_dot, self.i_0 + i, self.i_0 - i)
+        currents = self.i_0 + i, self.i_0 - i
+        return Currents(z, z_dot, *currents, currents if self.delays else ())
 
     def rates(self, state: Currents, u: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Currents:
         """Return the rates as `Plant.rates` does; q_i (A/s) disturbs the measured current."""
-        z, z_dot, i_1, i_2 = state
+        z, z_dot, i_1, i_2, delayed = state
         gaps = self.gaps(z)
         above, below = gaps.inverses
-        z_ddot = 2 * self.k_z / self.m * z + self.a * ((i_1 * above) ** 2 - (i_2 * below) ** 2) - self.g + q_z
+        v = self.pull(self.fluxing(state), z, gaps)
+        z_ddot = 2 * self.k_z / self.m * z + self.a * v - self.g + q_z
         up, down = u + self.R * (self.i_0 - i_1), self.R * (self.i_0 - i_2) - u
-        i_1_dot = (2 / self.kappa) * gaps.upper * up - i_1 * z_dot * above + q_i
-        i_2_dot = (2 / self.kappa) * gaps.lower * down + i_2 * z_dot * below - q_i
-        return Currents(z_dot, z_ddot, i_1_dot, i_2_dot)
+        if self.iron is None:
+            i_1_dot = (2 / self.kappa) * gaps.upper * up - i_1 * z_dot * above + q_i
+            i_2_dot = (2 / self.kappa) * gaps.lower * down + i_2 * z_dot * below - q_i
+            return Currents(z_dot, z_ddot, i_1_dot, i_2_dot)
+        i_1_dot = self._current_rate(self.iron, i_1, above, z_dot, up) + q_i
+        i_2_dot = self._current_rate(self.iron, i_2, below, -z_dot, down) - q_i
+        slow = (self.iron.following(i_1, delayed[0]), self.iron.following(i_2, delayed[1])) if delayed else ()
+        return Currents(z_dot, z_ddot, i_1_dot, i_2_dot, slow)
+
+    def _current_rate(self, iron: Iron, i: Array, inverse: Array, closing: Array, voltage: Array) -> Array:
+        """Return the rate of a coil's current, A/s, from its flux linkage n A b(i, gap), where b is that of the core.
+
+        `inverse`: 1 / gap, 1/m. `closing`: rate at which the gap closes, m/s. `voltage`: the one that changes the flux,
+        V.
+        """
+        permeance = inverse + iron.beside(self)
+        slope = iron.slope(iron.core(self, i, inverse))
+        return (2 / self.kappa) * voltage / (slope * permeance) - i * closing * inverse * inverse / permeance
 
     def rest(self, state: Currents, z: Array) -> Currents:
         return state._replace(z=z, z_dot=jnp.zeros_like(z))
 
     def scale(self) -> Currents:
         z, z_dot, i = self.sizes()
-        return Currents(z, z_dot, i, i)
+        return Currents(z, z_dot, i, i, (i, i) if self.delays else ())
 
     def measurement(self, state: Currents) -> Measurement:
         return Measurement(state.z, state.z_dot, (state.i_1 - state.i_2) / 2)
 
-    def coil_currents(self, state: Currents) -> tuple[Array, Array]:
+    def currents(self, state: Currents) -> tuple[Array, Array]:
         return state.i_1, state.i_2
 
+    def fluxing(self, state: Currents) -> tuple[Array, Array]:
+        return state.delayed or (state.i_1, state.i_2)
+
     def signals(self, state: Currents) -> Signals:
-        above, below = self.gaps(state.z).inverses
         heat = self.R * (state.i_1**2 + state.i_2**2)
-        return Signals((state.i_1 * above) ** 2 - (state.i_2 * below) ** 2, heat)
+        return Signals(self.pull(self.fluxing(state), state.z), heat)

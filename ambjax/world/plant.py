@@ -7,45 +7,75 @@ from jax import Array
 
 from ambjax.numerics.records import Scalar, record
 from ambjax.world.bearing import Bearing, Signals
+from ambjax.world.iron import Iron
 from ambjax.world.sensor import Measurement
 
 
 class State(NamedTuple):
-    """Displacement (m), velocity (m/s) and current deviation (A); or their rates."""
+    """Displacement (m), velocity (m/s) and current deviation (A); or their rates.
+
+    `delayed`: the current deviation of the flux (A), with eddy currents; () without.
+    """
 
     z: Array
     z_dot: Array
     i: Array
+    delayed: Array | tuple[()] = ()
 
 
 @record
 class Plant(Bearing[State]):
     """Rotor and magnets with the parameters of Table 1, in the state (z, z_dot, i)."""
 
-    lumped = True
+    one_current = True
 
     def start(self, measurement: Measurement) -> State:
-        return State(*measurement)
+        return State(*measurement, delayed=measurement.i if self.delays else ())
 
     def rates(self, state: State, u: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> State:
         """z_dot, `z_ddot` and `i_dot`. Eqs. (1), (2)."""
-        z, z_dot, i = state
+        if self.iron is not None:
+            return self._iron_rates(self.iron, state, u, q_z, q_i)
+        z, z_dot, i, _ = state
         gaps = self.gaps(z)
         z_ddot = 2 * self.k_z / self.m * z + self.a * self.v_and_dv_di(z, i, gaps)[0] - self.g + q_z
         i_dot = 2 * z_dot * gaps.inverses[1] * i + (2 / self.kappa) * gaps.lower * (u - self.R * i) + q_i
         return State(z_dot, z_ddot, i_dot)
 
+    def _iron_rates(self, iron: Iron, state: State, u: Scalar, q_z: Scalar, q_i: Scalar) -> State:
+        """Return the rates with iron: the voltages of Eq. (2) over its inductance, which leakage and saturation change.
+
+        One current describes both coils, so the inductance contains the mean of the slopes of both cores.
+        """
+        z, z_dot, i, delayed = state
+        gaps = self.gaps(z)
+        z_ddot = 2 * self.k_z / self.m * z + self.a * self.pull(self.fluxing(state), z, gaps) - self.g + q_z
+        below = gaps.inverses[1]
+        cores = (
+            iron.core(self, current, inverse)
+            for current, inverse in zip(self.currents(state), gaps.inverses, strict=True)
+        )
+        slope = sum(iron.slope(b) for b in cores) / 2
+        motional = self.kappa * z_dot * i * below * below
+        i_dot = (motional + u - self.R * i) / (self.kappa / 2 * slope * (below + iron.beside(self))) + q_i
+        return State(z_dot, z_ddot, i_dot, () if isinstance(delayed, tuple) else iron.following(i, delayed))
+
     def rest(self, state: State, z: Array) -> State:
-        return State(z, jnp.zeros_like(z), state.i)
+        return state._replace(z=z, z_dot=jnp.zeros_like(z))
 
     def scale(self) -> State:
-        return State(*self.sizes())
+        return self.start(self.sizes())
 
     def measurement(self, state: State) -> Measurement:
-        return Measurement(*state)
+        return Measurement(*state[:3])
+
+    def fluxing(self, state: State) -> tuple[Array, Array]:
+        i = state.i if isinstance(state.delayed, tuple) else state.delayed
+        return self.i_0 + i, self.i_0 - i
 
     def signals(self, state: State) -> Signals:
-        return Signals(self.v(state.z, state.i), self.copper_loss(state.i))
+        v = self.v(state.z, state.i) if self.iron is None else self.pull(self.fluxing(state), state.z)
+        return Signals(v, self.copper_loss(state.i))
 
     def z_ddot(self, z: Scalar, i: Scalar, q_z: Scalar = 0.0) -> Array:
         """Acceleration, in m/s^2: 2 k_z z/m + a v(z, i) - g + q_z. Eq. (1)."""

@@ -18,6 +18,7 @@ from ambjax.ensemble.paths import places
 from ambjax.linear import Zones
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.faults import Dropouts, Outliers
+from ambjax.world.iron import Iron
 from ambjax.world.plant import Plant
 from ambjax.world.rotation import Runout
 from ambjax.world.scenario import Initial
@@ -29,7 +30,7 @@ from reference.parser import keys, remarks, rule
 TITLES = ("key", "unit", "default", "allowed", "meaning")
 RECORDS: dict[str, type] = {"plant": Plant, "processor": Processor, "initial": Initial, "sensor": Sensor}
 RECORDS |= {"actuator": Amplifier, "processor.guard": Guard, "sensitivity": Zones}
-RECORDS |= {"sensor.outliers": Outliers, "sensor.dropouts": Dropouts, "sensor.runout": Runout}
+RECORDS |= {"plant.iron": Iron, "sensor.outliers": Outliers, "sensor.dropouts": Dropouts, "sensor.runout": Runout}
 SETTINGS: dict[str, dataclasses.Field] = {
     "actuator.u_max": FIELDS["u_max"],
     "clock.duration": DURATION,
@@ -42,6 +43,8 @@ SETTINGS: dict[str, dataclasses.Field] = {
 # What a table is for, and what stands if it is left out.
 WORDS = {
     "plant": "The true plant. Left out, or a key of it: Table 1 of the paper.",
+    "plant.iron": "Saturation, leakage and eddy currents of the magnets. Left out: ideal iron. See "
+    "[the magnet](../magnet.md#iron).",
     "controller": "The cascade: a nominal plant and one law per stage. Kinds and gains: [laws](laws.md), or a "
     "[custom law](../own-laws.md). A table in the place of a gain is its [schedule](../schedules.md).",
     "controller.position.file": "path of an .npz or .mat file with the arrays A, B, C, D and dt (s; 0: continuous), "

@@ -26,6 +26,8 @@ MEANINGS = {
 }
 # What is not a fold of a signal.
 OTHERS = {
+    "force_used": "largest magnetic force as a share of that at z = 0 with |i| = i_0 or `actuator.i_max`; the rest is "
+    "the reserve",
     "lost": "whether the rotor was lost: touched down, or left the range in which the model is valid",
     "stalled": "whether the integrator could not meet its tolerance, so that nothing is decided",
     "lost_at_s": "when either happened; null: never",

@@ -1,8 +1,10 @@
 """The report of `ambjax tune` in Markdown."""
 
+import itertools
+
 from ambjax.host.web_page import literal, table
 from tuning.objective.loss import TERMS
-from tuning.report import extras, front_table, held_out, limit_table, sensitivity_table
+from tuning.report import answer, extras, front_table, held_out, limit_table, sensitivity_table
 from tuning.report.breakdown import FORMULA
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.held_out import number
@@ -12,18 +14,23 @@ AS_GOOD = 0.01
 
 
 def markdown(facts: TuningFacts) -> str:
-    """Return the text of report.md. Its pictures are files in the same folder."""
-    lines = [f"# Tuning of {literal(facts.case)}", "", facts.verdict, ""]
-    lines += (
-        front_table.section(facts.front, facts.front_written)
-        + limit_table.section(facts.limits)
-        + sensitivity_table.section(facts.sensitivity)
-        + _gains(facts)
-        + held_out.section(facts)
-        + _loss(facts)
-        + _minimised(facts)
-        + _conditions(facts)
+    """Return the text of report.md: the answer in five lines, the front, and all details.
+
+    Its pictures are files in the same folder.
+    """
+    lines = [f"# Tuning of {literal(facts.case)}", "", *answer.lines(facts)]
+    sections = (
+        front_table.section(facts.front, facts.front_written),
+        ["## Verdict in full", "", facts.verdict, ""],
+        limit_table.section(facts.limits),
+        sensitivity_table.section(facts.sensitivity),
+        _gains(facts),
+        held_out.section(facts),
+        _loss(facts),
+        _minimised(facts),
+        _conditions(facts),
     )
+    lines += itertools.chain.from_iterable(sections)
     lines += ["## Course of the search", "", *_how(facts), "", "![Goal and gains by iteration](convergence.png)", ""]
     if facts.gradient:
         lines += extras.gradient(facts.gradient)

@@ -28,7 +28,7 @@ class TuningFacts:
     contradict the answer; '' if they confirm it. `accurate`: some members with accurate steps. `gradient`: None if not
     requested. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of its points
     has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it. `beside`: the
-    lowest point of the slices through the answer.
+    lowest point of the slices through the answer. `next`: the next command, in words.
     """
 
     case: str
@@ -64,6 +64,7 @@ class TuningFacts:
     outcome: Row = dataclasses.field(default_factory=dict)
     verdict: str = ""
     advice: str = ""
+    next: str = ""
 
     @property
     def table(self) -> Row:

@@ -10,6 +10,7 @@ from tuning.search.course import SearchResult
 from tuning.search.front import KNEE, FrontPoint
 
 Facts = dict[str, Any]
+TITLE = "Error against voltage"
 
 
 def facts(answer: SearchResult) -> list[Facts]:
@@ -57,6 +58,11 @@ def sentence(rows: list[Facts]) -> str:
     )
 
 
+def letter(n: int) -> str:
+    """Return the label of the n-th point of a front, in the table and in the picture."""
+    return chr(ord("A") + n)
+
+
 def section(rows: list[Facts] | None, written: bool) -> list[str]:
     """Return the section on the front. `written`: whether each point has a case file."""
     if not rows:
@@ -64,6 +70,7 @@ def section(rows: list[Facts] | None, written: bool) -> list[str]:
     files = ["case file"] if written else []
     cells = [
         [
+            letter(n),
             "least" if row["factor"] == 1 else f"{row['factor']:g} times the least",
             f"{row['settled_rms_error_m']:.3g}",
             f"{row['settled_rms_u_V']:.4g}",
@@ -72,13 +79,22 @@ def section(rows: list[Facts] | None, written: bool) -> list[str]:
             "**taken**" if row["taken"] else "-",
             *([f"`{row['file']}`"] if written else []),
         ]
-        for row in rows
+        for n, row in enumerate(rows)
     ]
-    head = ["error limit", "settled rms error (m)", "settled rms u (V)", "peak of \\|S\\|", "lost", "answer", *files]
+    head = [
+        "point",
+        "error limit",
+        "settled rms error (m)",
+        "settled rms u (V)",
+        "peak of \\|S\\|",
+        "lost",
+        "answer",
+        *files,
+    ]
     words = (
         "The least rms voltage for each limit of the settled rms error, within the other limits. The values are those "
         "of members of the validation ensemble. If a sign is set-valued, the peak is measured by injection. Only the "
         "answer taken is judged on the held-out members."
     )
     picture = "![Error against voltage; the answer taken is filled](front.png)"
-    return ["## Error against voltage", "", *table(head, cells), "", words, "", picture, ""]
+    return [f"## {TITLE}", "", *table(head, cells), "", words, "", picture, ""]

@@ -50,6 +50,7 @@ def examined(answer: SearchResult, gradients: bool, front_written: bool) -> tupl
     facts = TuningFacts(**found, **_neighbourhood(problem, x, slices))
     what = outcome.outcome_of(facts, problem.tune.limits.may_lose(problem.tune.budget.held_out))
     words = {"verdict": outcome.verdict(facts, what), "advice": outcome.advice(problem, facts, what, x, members)}
+    words["next"] = outcome.next_command(problem)
     return dataclasses.replace(facts, outcome=what.facts(), **words), slices
 
 

@@ -147,6 +147,16 @@ def advice(problem: TuningProblem, facts: TuningFacts, outcome: TuningOutcome, x
     )
 
 
+def next_command(problem: TuningProblem) -> str:
+    """Return the command that follows a search whose requirements are met, in backticks, with its purpose."""
+    if problem.sampled:
+        return "`ambjax export tuned.toml --verify --out firmware` writes the controller as C and verifies it."
+    return (
+        "`ambjax sensitivity tuned.toml` computes the margins. For a controller that can be exported as C, add "
+        "`[processor]` to the case and tune again."
+    )
+
+
 def _causes_of_loss(problem: TuningProblem, facts: TuningFacts, x: np.ndarray, members: Members) -> list[str]:
     """Return possible causes of lost rotors, with remedies: failing conditions, the voltage limit, gains at a bound."""
     after = facts.after

@@ -10,6 +10,7 @@ from ambjax.pictures.scales import digits, prefix_of
 from ambjax.pictures.style import own_style
 from ambjax.pictures.thinning import stretch_of, thin
 from ambjax.simulation.trajectory import STALLED, Trajectory
+from tuning.report.front_table import letter
 from tuning.search.explore import Slices
 
 # Upper end of the axis of the risk: a lost member costs about 1e6 times an error.
@@ -28,10 +29,13 @@ FAINTEST, FEWEST = 1e-5, 16
 def before_after(runs: dict[str, Trajectory]) -> bytes:
     """Draw z - r and u (averaged over each sample) of runs by name, as PNG: columns are the whole run, start and end.
 
-    A lost run is cut shortly after the loss.
+    A lost run is cut shortly after the loss. A run "before" that is lost has one line of text and no panels.
     """
     from matplotlib.figure import Figure
 
+    before = runs.get("before")
+    lost = before if before is not None and len(runs) > 1 and np.isfinite(float(before.lost_at)) else None
+    runs = {name: run for name, run in runs.items() if run is not lost}
     rows = [(name, run, signal) for signal in ("z - r", "u") for name, run in runs.items()]
     figure = Figure(figsize=(10, 1.75 * len(rows) + 0.4), layout="constrained")
     axes = figure.subplots(len(rows), 3, squeeze=False)
@@ -62,7 +66,7 @@ def before_after(runs: dict[str, Trajectory]) -> bytes:
             if ended <= high:
                 ax.axvspan(max(ended, low), high, color=RED, alpha=0.12, lw=0)
         if np.isfinite(ended) and signal == "z - r":
-            words = f"{run.lost_why.partition(':')[0]} at {ended:.4g} s"
+            words = _ended(run)
             paper = {
                 "facecolor": "white",
                 "alpha": 0.7,
@@ -76,7 +80,14 @@ def before_after(runs: dict[str, Trajectory]) -> bytes:
     for ax in axes[-1]:
         ax.set_xlabel("time (s)", fontsize=9)
     figure.align_ylabels(axes)
+    if lost is not None:
+        figure.suptitle(f"before tuning: {_ended(lost)}", fontsize=10, x=0.01, ha="left", color=RED)
     return _png(figure)
+
+
+def _ended(run: Trajectory) -> str:
+    """Return how and when a run ended."""
+    return f"{run.lost_why.partition(':')[0]} at {float(run.lost_at):.4g} s"
 
 
 @own_style
@@ -173,13 +184,20 @@ def landscape(slices: Slices, paths: list[str]) -> bytes:
 
 @own_style
 def front(rows: list[dict[str, Any]]) -> bytes:
-    """Draw settled rms error over settled rms voltage, as PNG; points with lost members are crossed out."""
+    """Draw settled rms error over settled rms voltage, as PNG; points with lost members are crossed out.
+
+    Each point has its letter of the table, its error and its voltage.
+    """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5, 3.4), layout="constrained")
+    figure = Figure(figsize=(6.4, 3.8), layout="constrained")
     ax = figure.subplots()
     errors, volts = [r["settled_rms_error_m"] for r in rows], [r["settled_rms_u_V"] for r in rows]
-    ax.plot(volts, errors, "C0o-", ms=5, mfc="white")
+    ax.plot(*zip(*sorted(zip(volts, errors, strict=True)), strict=True), "C0o-", ms=5, mfc="white")
+    factor, unit = prefix_of("m", min(errors))
+    for n, (x, y) in enumerate(zip(volts, errors, strict=True)):
+        words = f"{letter(n)}: {digits(factor * y)} {unit}, {digits(x)} V"
+        ax.annotate(words, (x, y), (6, 6), textcoords="offset points", fontsize=8)
     marks = (
         ("C3x", "members lost or not decided", lambda r: r["lost"] or r["stalled"]),
         ("C0o", "answer taken", lambda r: r["taken"]),
@@ -193,6 +211,8 @@ def front(rows: list[dict[str, Any]]) -> bytes:
     # at least half a decade, for a front of a single point
     ax.set_ylim(min(min(errors) / 1.2, max(errors) / 2), max(max(errors) * 1.2, min(errors) * 2))
     ax.set(xlabel="settled rms voltage (V)", ylabel="settled rms error (m)", yscale="log")
+    low, high = ax.get_xlim()
+    ax.set_xlim(low, high + 0.3 * (high - low))  # room for the words beside the last point
     ax.grid(alpha=0.3, which="both")
     return _png(figure)
 

@@ -1,0 +1,125 @@
+"""The magnet's iron against closed forms: saturation at three points, leakage, the lag of the flux, and energy."""
+
+import dataclasses
+import tomllib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ambjax import Plant
+from ambjax.cases.reader import case_from
+from ambjax.world.coils import TwoCoil
+from ambjax.world.iron import AIR, Iron
+from ambjax.world.sensor import Measurement
+
+# A laboratory bearing: its cores have 0.65 T at the bias.
+RIG = {"m": 1.64, "k_z": 0.0, "mu_0": 1.2566e-6, "n": 208.0, "A": 2.68e-4, "s_0": 5e-4, "i_0": 2.5, "R": 1.0}
+LIMIT = 1.2
+PLANTS = pytest.mark.parametrize("kind", [Plant, TwoCoil])
+
+
+def made(kind, **iron):
+    return kind(**RIG, iron=Iron(**iron))
+
+
+@pytest.mark.parametrize(
+    ("x", "share"),
+    # (1 - a) (1 + x^4)^(-1/4) + a at x = 0.5, 1 and 2: 17^(-1/4) = 0.492479, 2^(-1/4) = 0.840896, (17/16)^(-1/4)
+    [(0.5, 0.98 * (17 / 16) ** -0.25 + 0.02), (1.0, 0.98 * 0.8408964 + 0.02), (2.0, 0.98 * 0.4924790 + 0.02)],
+)
+def test_the_saturation_curve_at_three_points(x, share):
+    # tolerance: the decimals above have seven digits
+    assert float(Iron(saturation=LIMIT).share(jnp.asarray(x * LIMIT))) == pytest.approx(share, rel=1e-6)
+    assert AIR == 0.02
+
+
+@PLANTS
+def test_the_force_follows_the_flux_densities(kind):
+    plant = made(kind, saturation=LIMIT, leakage=1.2)
+    z, i = 1e-4, 1.5
+    forces, densities = [], []
+    for current, gap in ((2.5 + i, 5e-4 - z), (2.5 - i, 5e-4 + z)):
+        ideal = 1.2566e-6 * 208 * current / (2 * gap)
+        core = 1.2566e-6 * 208 * current / 2 * (1 / gap + 0.2 / 5e-4)
+        share = 0.98 * (1 + (core / LIMIT) ** 4) ** -0.25 + 0.02
+        densities.append(core * share)
+        forces.append(2.68e-4 * (ideal * share) ** 2 / 1.2566e-6)  # A B^2/mu_0: both poles
+    state = plant.start(Measurement(*map(jnp.asarray, (z, 0.0, i))))
+    assert float(plant.m * plant.a * plant.signals(state).v) == pytest.approx(forces[0] - forces[1], rel=1e-12)
+    assert float(plant.flux_density(state)) == pytest.approx(max(densities), rel=1e-12)
+    assert max(densities) > 0.9 * LIMIT
+    # Eq. (1)
+    assert float(plant.rates(state, 0.0).z_dot) == pytest.approx((forces[0] - forces[1]) / 1.64 - 9.81, rel=1e-11)
+
+
+def test_the_voltage_of_a_coil_is_the_rate_of_its_flux_linkage():
+    plant = made(TwoCoil, saturation=LIMIT, leakage=1.1)
+    z, z_dot, i_1, i_2, u = 1e-4, 0.3, 4.0, 1.2, 20.0
+    state = plant.start(Measurement(*map(jnp.asarray, (z, z_dot, 0.0))))._replace(
+        i_1=jnp.asarray(i_1), i_2=jnp.asarray(i_2)
+    )
+    rates = plant.rates(state, u)
+
+    def linkage(z, i, side):
+        b = plant.iron.core(plant, i, 1 / (plant.s_0 - side * z))
+        return plant.n * plant.A * b * plant.iron.share(b)
+
+    for side, i, rate in ((1, i_1, rates.i_1), (-1, i_2, rates.i_2)):
+        _, moved = jax.jvp(lambda z, i, side=side: linkage(z, i, side), (z, i), (z_dot, float(rate)))
+        assert float(moved) == pytest.approx(side * u + plant.R * (plant.i_0 - i), rel=1e-11)
+
+
+@PLANTS
+def test_leakage_lengthens_the_time_constant_and_leaves_the_force(kind):
+    bare, leaky = kind(**RIG), made(kind, leakage=1.25)
+    state = bare.start(Measurement(*map(jnp.asarray, (0.0, 0.0, 0.7))))
+    ours, theirs = (jax.grad(lambda u, p=p: p.measurement(p.rates(state, u)).i)(3.0) for p in (leaky, bare))
+    assert float(theirs / ours) == pytest.approx(1.25, rel=1e-12)
+    assert float(leaky.signals(state).v) == pytest.approx(float(bare.signals(state).v), rel=1e-14)
+
+
+@PLANTS
+def test_ideal_iron_changes_nothing(kind):
+    bare, ideal = kind(**RIG), made(kind)
+    state = bare.start(Measurement(*map(jnp.asarray, (1e-4, 0.2, 0.7))))
+    for ours, theirs in zip(ideal.rates(state, 5.0), bare.rates(state, 5.0), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12)
+
+
+@PLANTS
+def test_the_flux_follows_a_held_current_exponentially(kind):
+    plant, tau = made(kind, eddy=2e-4), 2e-4
+    state = plant.start(Measurement(*map(jnp.asarray, (0.0, 0.0, 0.5))))
+    delayed = jax.tree.map(lambda x: 0.4 * x, state.delayed)
+    rates = plant.rates(state._replace(delayed=delayed), 0.0).delayed
+    for rate, whole in zip(jax.tree.leaves(rates), jax.tree.leaves(state.delayed), strict=True):
+        assert float(rate) == pytest.approx(0.6 * float(whole) / tau, rel=1e-12)
+    assert float(plant.slope()) == pytest.approx(1 / tau)
+
+
+def test_a_case_reads_the_iron_and_its_controller_s_model_has_none():
+    raw = tomllib.loads("[plant.iron]\nsaturation = 1.2\n[spread]\nplant.iron.saturation = { percent = 5 }\n")
+    case = case_from(raw)
+    assert case.scenario.plant.iron == Iron(saturation=1.2)
+    assert case.cascade.model.iron is None
+    assert case.spread.paths == ("plant.iron.saturation",)
+    for text, words in (
+        ("saturation = 0.0", "plant.iron.saturation = 0: it must be a finite number from 0.001 to 1000 (T)"),
+        ("leakage = 0.9", "plant.iron.leakage = 0.9"),
+        ("hysteresis = 1.0", "plant.iron.hysteresis = 1.0: unknown key. Keys allowed here: saturation, leakage, eddy."),
+    ):
+        with pytest.raises(ValueError, match=r"plant\.iron") as error:
+            case_from(tomllib.loads(f"[plant.iron]\n{text}\n"))
+        assert words in str(error.value)
+
+
+def test_the_largest_force_is_that_at_the_bias_or_the_limit():
+    plant = Plant(**RIG)
+    assert float(plant.largest_force()) == pytest.approx(float(plant.k_i) * 2.5, rel=1e-12)
+    assert float(plant.largest_force(1.0)) == pytest.approx(float(plant.k_i) * 1.0, rel=1e-12)
+    saturated = dataclasses.replace(plant, iron=Iron(saturation=LIMIT))
+    b = 1.2566e-6 * 208 * 5.0 / (2 * 5e-4)
+    share = 0.98 * (1 + (b / LIMIT) ** 4) ** -0.25 + 0.02
+    assert float(saturated.largest_force()) == pytest.approx(2.68e-4 * (b * share) ** 2 / 1.2566e-6, rel=1e-12)

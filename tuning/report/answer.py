@@ -1,0 +1,85 @@
+"""The answer of a search in five lines, with which the report begins."""
+
+import math
+
+from ambjax.host.web_page import literal
+from tuning.report.facts import Row, TuningFacts
+from tuning.report.limit_table import broken, prices
+
+
+def lines(facts: TuningFacts) -> list[str]:
+    """Return the list of five items: held or not, error and voltage, sensitivity, what limits it, the next command."""
+    items = [_held(facts), _sizes(facts), _sensitivity(facts), _limiting(facts), _next(facts)]
+    return [*(f"- {item}" for item in items), ""]
+
+
+def _held(facts: TuningFacts) -> str:
+    """Return whether the rotors are held and the requirements met."""
+    outcome, after = facts.outcome, facts.after
+    word = "NOT held" if not outcome["rotors_held"] else "Not verified" if facts.refuted else "Held"
+    which = "held-out members" if after["members"] else "training members"
+    kept = outcome["members"] - outcome["lost"] - outcome["stalled"]
+    words = f"**{word}:** {kept} of {outcome['members']} {which} are held"
+    if facts.before["members"]:
+        words += f" (before tuning: {facts.before['held']})"
+    met = "All requirements are met." if outcome["good"] else f"Not met: {'; '.join(outcome['against'])}."
+    return f"{words}. {met}"
+
+
+def _sizes(facts: TuningFacts) -> str:
+    """Return the error and the voltage after tuning, and before it."""
+    after, before = facts.after, facts.before
+    if not after["held"]:
+        return "**Error and voltage:** no held-out member is held."
+
+    def change(name: str, unit: str) -> str:
+        was = f" (before: {before[name]:.3g})" if before["held"] else ""
+        return f"{after[name]:.3g} {unit}{was}"
+
+    most = after.get("max_abs_u_V.largest")
+    return (
+        f"**Error:** {change('settled_rms_error_m', 'm')} rms after settling, largest "
+        f"{after['settled_max_abs_error_m']:.3g} m. **Voltage:** {change('settled_rms_u_V.mean', 'V')} rms"
+        f"{'' if most is None else f', largest {most:.3g} V'}."
+    )
+
+
+def _sensitivity(facts: TuningFacts) -> str:
+    """Return the largest peak of |S| of the held-out members and its zone."""
+    found = facts.sensitivity
+    if not found or not found["members"]:
+        return "**Sensitivity:** not limited here; `ambjax sensitivity tuned.toml` computes |S| and the zone."
+    rows = [(_peak(row, found), row) for row in found["members"]]
+    peak, row = max(rows, key=lambda one: one[0])
+    zone = max(one["injected_zone"] or one["zone"] for one in found["members"])
+    if not math.isfinite(peak):
+        return f"**Sensitivity:** a member is lost when a test signal is injected: zone {zone}."
+    at = row["frequency_hz"] if row["peak"] is None else row["at_hz"]
+    return f"**Sensitivity:** |S| is at most {peak:.3g} (at {at:.3g} Hz) over the worst members: zone {zone}."
+
+
+def _peak(row: Row, found: Row) -> float:
+    """Return the peak of a member that decides: the injected one, or the larger of both."""
+    if row["repetitions"] and row["peak"] is None:
+        return math.inf
+    if row["peak"] is None:
+        return row["linear"]
+    return row["peak"] if found["decides"] else max(row["peak"], row["linear"])
+
+
+def _limiting(facts: TuningFacts) -> str:
+    """Return the limits that are broken or active and the gains at a bound."""
+    words = [literal(line) for line in (*broken(facts.limits), *prices(facts.limits))]
+    if ends := [row["path"] for row in facts.gains if row["at_bound"]]:
+        words.append(f"gains at a bound of `[tune.bounds]`: {', '.join(ends)}")
+    if not words:
+        front = "the exchange of error for voltage below; " if len(facts.front or ()) > 1 else ""
+        words = [f"{front}no limit of `[tune.limits]` is active, and no gain is at a bound"]
+    return f"**Limited by:** {'; '.join(words)}."
+
+
+def _next(facts: TuningFacts) -> str:
+    """Return the next command, or the advice if a requirement is not met."""
+    if facts.advice:
+        return f"**Next:** {literal(facts.advice)}"
+    return f"**Next:** in this folder, {facts.next}"
