@@ -10,13 +10,31 @@ sys.path[:0] = [str(HERE), str(HERE / "_ext"), str(HERE.parent)]
 for name, folder in (("PATH", pathlib.Path(sys.executable).parent), ("PYTHONPATH", HERE / "_ext")):
     os.environ[name] = os.pathsep.join(filter(None, [str(folder), os.environ.get(name)]))
 
+# Pages share the compiled programs of the cells and of the commands in them.
+os.environ |= {"JAX_COMPILATION_CACHE_DIR": str(HERE / "_build" / "programs")}
+os.environ |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05", "JAX_COMPILATION_CACHE_MAX_SIZE": str(2**30)}
+os.environ |= {"PYTHONWARNINGS": "ignore:Error reading persistent,ignore:Error writing persistent"}
+
+from execution import source_checksum  # noqa: E402
+
 from ambjax import __version__  # noqa: E402
 
 project = "ambjax"
 author = copyright = "The ambjax maintainers"
 release = version = __version__
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "mathml", "docstrings", "cells", "pages"]
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.viewcode",
+    "mathml",
+    "docstrings",
+    "cells",
+    "pages",
+    "execution",
+    "printed_tables",
+    "gallery",
+]
 exclude_patterns = ["_build", "_ext", "reference"]
 
 smartquotes = False
@@ -32,10 +50,11 @@ math_eqref_format = "Eq. ({number})"
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
 myst_update_mathjax = False
 myst_heading_anchors = 3
-nb_execution_mode = "force"
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(HERE / "_build" / "executed" / source_checksum())
 nb_execution_in_temp = True
 nb_execution_raise_on_error = True
-nb_execution_timeout = 300
+nb_execution_timeout = 900  # s for one cell, beside other work too
 nb_merge_streams = True
 
 add_module_names = False

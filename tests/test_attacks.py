@@ -25,7 +25,7 @@ from ambjax.cases.template_text import template
 from ambjax.cases.tune_table import Budget
 from ambjax.commands import simulate
 from ambjax.commands.outputs import files
-from ambjax.commands.warnings import reversal, warnings_of
+from ambjax.commands.warnings import idealised, reversal, warnings_of
 from ambjax.control.processor import Processor
 from ambjax.ensemble import LogUniform
 from ambjax.numerics.records import validate, within
@@ -297,6 +297,17 @@ def test_numbers_that_stay_the_paper_s_are_named():
     # all of them, all but gravity, or none: nothing is left to the paper unsaid
     for text in (f"[plant]\n{given}mu_0 = 1.257e-6\nA = 4e-4\n", "[plant]\nkind = 'two-coil'\n", ""):
         assert not any("the paper's values" in line for line in warnings_of(read_case(write(text))))
+
+
+def test_what_no_real_bearing_has_is_named():
+    coils, measured = (
+        "[plant]\nkind = 'two-coil'\n",
+        "[sensor]\nvelocity = false\n[controller.observer]\nkind = 'kalman'\n",
+    )
+    said = [idealised(read_case(write(text))) for text in ("", coils, measured, coils + measured)]
+    assert ["plant.kind" in line for line in said] == [True, False, True, False]
+    assert ["sensor.velocity" in line for line in said] == [True, True, False, False]
+    assert said[-1] == ""
 
 
 # For each command: its arguments, and what comes after its case file is read.

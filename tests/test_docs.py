@@ -16,6 +16,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import KINDS, OTHERS, TABLES, case_from
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.table import Table
+from ambjax.commands.outputs import table
 from tuning.config import tune_from
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -173,3 +174,22 @@ def test_the_committed_tables_are_current(name):
     path = site.FOLDER / name
     assert path.exists(), "run: python docs/reference/site.py"
     assert path.read_text(encoding="utf-8") == site.tables()[name], "run: python docs/reference/site.py"
+
+
+def test_a_printed_table_is_read_back(monkeypatch):
+    """What a cell prints with `outputs.table` has the same cells in the page, and the text around it stays."""
+    pytest.importorskip("sphinx")
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
+    split = importlib.import_module("printed_tables").split
+    titles, rows = (
+        ["loop", "rms error", "note"],
+        [["A, explicit", "", "lost"], ["b", "1.2 um", "two  spaces, at the end"]],
+    )
+    printed = table(titles, rows)
+    assert split(f"before\n\n{printed}\n\nafter: one two three") == [
+        "before\n",
+        [titles, *rows],
+        "\nafter: one two three",
+    ]
+    assert split(printed) == [[titles, *rows]]
+    assert split("a list\n- one\n--\n") == ["a list\n- one\n--"]

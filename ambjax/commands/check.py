@@ -10,7 +10,7 @@ import numpy as np
 from ambjax.cases.reader import Case
 from ambjax.commands.acceptance import acceptance, forces
 from ambjax.commands.outputs import plain, table
-from ambjax.commands.warnings import read_with_warnings
+from ambjax.commands.warnings import idealised, read_with_warnings
 from ambjax.theorem.conditions import Condition, check
 from ambjax.theorem.sampled_report import Delays, SampledReport
 
@@ -47,6 +47,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     summary |= {"loop": loop}
     if not args.json:
         print(text)
+        if ideal := idealised(case):
+            print(f"\n{ideal}")
     largest, weight, _ = forces(case)
     if not args.json and largest < weight:
         print(f"\nThe magnets do not carry the rotor: they pull with at most {largest:.4g} N of its {weight:.4g} N.")

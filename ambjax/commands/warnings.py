@@ -82,6 +82,16 @@ def _velocity(case: Case) -> Iterator[str]:
         )
 
 
+def idealised(case: Case) -> str:
+    """Return a line that names the idealisations of a case which no real bearing has, and their keys; '' for none."""
+    sensor, parts = case.scenario.sensor, []
+    if case.scenario.plant.lumped:
+        parts.append("one current for both coils (plant.kind = 'two-coil' gives each its own)")
+    if sensor is None or sensor.velocity:
+        parts.append("a measured velocity (sensor.velocity = false, and an observer that estimates it)")
+    return f"Idealised, unlike a real bearing: {' and '.join(parts)}." if parts else ""
+
+
 def reversal(case: Case, most_i: float) -> Iterator[str]:
     """Yield a warning if the largest |i| of a run, `most_i` in A, reverses the current of one coil.
 

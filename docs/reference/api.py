@@ -15,6 +15,17 @@ PUBLIC = {
     "ambjax.paper": (paper, "The paper's study."),
     "ambjax.extend": (extend, "What an extension needs."),
 }
+# Names without a docstring of their own.
+CONSTANTS = {
+    "INPUTS": "inputs of a linearised loop, in order",
+    "OUTPUTS": "outputs of a linearised loop, in order",
+    "NOISY": "readings with the paper's noise and a finite supply",
+    "READINGS": "interpretations of the paper's parameters",
+    "GAINS": "open lower and upper bound of every gain",
+    "Scalar": "a number or an array: the type of a leaf",
+    "TWO_OVER_PI": "2/pi, the factor of the smooth sign",
+    "__version__": "version of the package",
+}
 
 
 def pages() -> dict[str, str]:
@@ -46,7 +57,7 @@ def _public(floor_pages: list[str]) -> str:
     ]
     for name, (module, words) in PUBLIC.items():
         rows = [
-            (_link(getattr(module, one), one), escaped(_says(getattr(module, one))))
+            (_link(getattr(module, one), one), escaped(_says(getattr(module, one), one)))
             for one in module.__all__
             if not one.startswith("_")
         ]
@@ -65,11 +76,12 @@ def _link(thing: Any, name: str) -> str:
     return code(name)
 
 
-def _says(thing: Any) -> str:
-    """Return the first paragraph of the docstring of a name; for a number, its value."""
-    if isinstance(thing, (int, float)):
-        return f"{thing:g}"
-    return "" if type(thing).__module__ in ("builtins", "typing") and not callable(thing) else first_paragraph(thing)
+def _says(thing: Any, name: str) -> str:
+    """Return the first paragraph of the docstring of a name; for a constant, its meaning and its value."""
+    if name not in CONSTANTS:
+        return f"{thing:g}" if isinstance(thing, float) else first_paragraph(thing)
+    shown = f"{thing:g}" if isinstance(thing, float) else ", ".join(map(str, thing)) if isinstance(thing, tuple) else ""
+    return f"{CONSTANTS[name]}: {shown}" if shown else CONSTANTS[name]
 
 
 def _floor(room: str, found: list[str]) -> str:

@@ -6,12 +6,16 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 SPECIAL = re.compile(r"([\\|*<$\[\]])")
+# An escaped link, [text](target).
+LINK = re.compile(r"\\\[([^\[\]]+)\\\]\(")
 
 
 def escaped(text: str) -> str:
-    """Return the text with its `names` as code and all other markup escaped."""
+    """Return the text with its `names` as code, its links as links, and all other markup escaped."""
     parts = re.split(r"`+([^`]+)`+", text)
-    return "".join(code(part) if n % 2 else SPECIAL.sub(r"\\\1", part) for n, part in enumerate(parts))
+    return "".join(
+        code(part) if n % 2 else LINK.sub(r"[\1](", SPECIAL.sub(r"\\\1", part)) for n, part in enumerate(parts)
+    )
 
 
 def code(text: str) -> str:

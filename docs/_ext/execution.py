@@ -1,0 +1,78 @@
+"""Execute the pages with cells side by side before Sphinx reads them, into the cache from which it reads them.
+
+A page whose cells have not changed is not executed again, unless the package has changed: the name of the cache
+contains a checksum of its source files.
+"""
+
+import concurrent.futures
+import contextlib
+import hashlib
+import logging
+import os
+import pathlib
+import shutil
+import tempfile
+from typing import Any
+
+from jupyter_cache import get_cache
+from jupyter_cache.base import CacheBundleIn
+from jupyter_cache.executors.utils import ExecutionResult, single_nb_execution
+from myst_nb.core.read import create_nb_reader
+from sphinx.application import Sphinx
+from sphinx.errors import ExtensionError
+from sphinx.util import logging as sphinx_logging
+
+ROOT = pathlib.Path(__file__).parent.parent.parent
+# Each page has a process of its own, with up to 2 GB of memory.
+AT_ONCE = min(os.cpu_count() or 1, 4)
+
+logger = sphinx_logging.getLogger(__name__)
+
+
+def source_checksum() -> str:
+    """Return a checksum of every source file on which the output of a cell depends."""
+    total = hashlib.sha256()
+    modules = [path for package in ("ambjax", "tuning") for path in sorted((ROOT / package).rglob("*.py"))]
+    for path in [*modules, pathlib.Path(__file__).with_name("cells.py")]:
+        total.update(f"{path.relative_to(ROOT)}\0".encode() + path.read_bytes() + b"\0")
+    return total.hexdigest()[:16]
+
+
+def execute(app: Sphinx, env: Any, docnames: list[str]) -> None:
+    """Execute the pages that are about to be read, except those in the cache. Raises ExtensionError if a cell fails."""
+    folder = pathlib.Path(app.config.nb_execution_cache_path)
+    for old in set(folder.parent.glob("*")) - {folder}:
+        shutil.rmtree(old)
+    cache = get_cache(str(folder))
+    logging.getLogger("traitlets").setLevel(logging.WARNING)  # one line per page otherwise
+    with concurrent.futures.ThreadPoolExecutor(AT_ONCE) as pool:
+        running = {}
+        for name in docnames:
+            path = pathlib.Path(env.doc2path(name))
+            reader = create_nb_reader(str(path), env.myst_config, env.mystnb_config, path.read_text(encoding="utf-8"))
+            if reader is None or path.suffix != ".md" or not reader.read_fmt:
+                continue
+            notebook = reader.read(path.read_text(encoding="utf-8"))
+            with contextlib.suppress(KeyError):
+                cache.match_cache_notebook(notebook)
+                continue
+            running[pool.submit(_run, notebook, app.config.nb_execution_timeout)] = path
+        for done in concurrent.futures.as_completed(running):
+            result, path = done.result(), running[done]
+            if result.err is not None:
+                raise ExtensionError(f"{path}: {result.exc_string}")
+            logger.info("executed %s in %.1f s", path.name, result.time)
+            bundle = CacheBundleIn(result.nb, str(path), data={"execution_seconds": result.time})
+            cache.cache_notebook_bundle(bundle, check_validity=False, overwrite=True)
+
+
+def _run(notebook: Any, timeout: int) -> ExecutionResult:
+    """Execute the cells of a page in an empty folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        return single_nb_execution(notebook, cwd=folder, timeout=timeout, allow_errors=False)
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Register the extension."""
+    app.connect("env-before-read-docs", execute)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
