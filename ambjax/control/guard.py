@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.world.plant import Plant, State
+from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement, Sensor
 
@@ -138,8 +138,8 @@ class Guard:
 
 def expected(model: Plant, motion: Measurement, u: Array, period: Scalar) -> Measurement:
     """Predict the readings of the next sample from `motion` under a mean voltage u (V)."""
-    rates = model.rates(State(*motion), u)
-    z, z_dot, i = (x + period * rate for x, rate in zip(motion, rates, strict=True))
+    rates = model.rates(model.start(motion), u)
+    z, z_dot, i = (x + period * rate for x, rate in zip(motion, (rates.z, rates.z_dot, rates.i), strict=True))
     return Measurement(z + period * period / 2 * rates.z_dot, z_dot, i)
 
 
