@@ -128,6 +128,7 @@ def test_a_steepness_of_inf_is_refused_as_the_header_says(made):
 # --- the horizon ---
 
 
+@pytest.mark.slow
 def test_a_twin_without_a_unit_is_jaxs_loop_and_one_with_it_differs_in_every_state():
     sensor = Sensor(1e-6, 0.0, 1e-4, velocity=False, bandwidth=2e3)  # a converter would hide a unit
     scenario = dataclasses.replace(WORLD, sensor=sensor, u_max=INF)

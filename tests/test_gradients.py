@@ -93,6 +93,7 @@ def test_forward_equals_reverse(three_ways):
     assert np.all(np.abs(by_forward - by_reverse) <= 1e-10 * np.abs(by_reverse) + 1e-14 * size)
 
 
+@pytest.mark.slow
 def test_derivatives_equal_differences(three_ways):
     by_reverse, _, differences = three_ways
     quiet, noisy = by_reverse[0]
@@ -228,6 +229,7 @@ for name, function in functions.items():
 """
 
 
+@pytest.mark.slow
 def test_the_fast_path_takes_whatever_is_closed_over():
     """What XLA cannot compile as one function runs as usual, with a line that says so, once each."""
     environment = os.environ | {"JAX_ENABLE_X64": "1"}

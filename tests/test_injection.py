@@ -140,6 +140,7 @@ def noisy(std, **more):
     return Scenario(sensor=Sensor(std=std, std_z_dot=0.0, std_i=0.0), **more)
 
 
+@pytest.mark.slow
 def test_true_signs_under_noise_and_a_lost_rotor():
     """Within their bands the implicit signs act as linear gains, those of the linear analysis."""
     cascade = Cascade(**SIGNS, processor=Processor(0.0))

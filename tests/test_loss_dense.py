@@ -50,6 +50,7 @@ def both(name):
     return ours, metrics(world, samples, PERIOD, settle, noise_of(case, scenario), numbers=numbers)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOOPS)
 def test_costs_and_limits_are_those_of_a_dense_solution(name):
     ours, theirs = both(name)

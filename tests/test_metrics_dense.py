@@ -85,6 +85,7 @@ def least_tolerance(name, method):
 
 
 # `simulate` measures in adaptive steps, what a report of the tuner prints in eight times its 3 a sample.
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [AdaptiveRodas3(), Slide(3 * REFINEMENT)], ids=["adaptive", "sliding"])
 @pytest.mark.parametrize("name", LOOPS)
 def test_every_metric_is_what_a_dense_solution_says(name, method):

@@ -61,6 +61,7 @@ LAWS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("laws", "x64"), [("paper", True), ("others", False)])
 def test_lowers_for_a_gpu(laws, x64, monkeypatch):
     # No GPU is needed to make its program: a primitive that kernels cannot have would raise here. What is done for

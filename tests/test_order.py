@@ -10,6 +10,7 @@ from ambjax.world.sensor import Measurement
 from ambjax.world.signals import reference_at
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [inversion.Adaptive(), inversion.ClosedForm()], ids=lambda law: type(law).__name__)
 def test_the_laws_see_the_rotor_where_the_observer_says_it_is(law):
     """Behind an observer with an estimate of its own the measured position changes nothing at once but rates."""

@@ -203,6 +203,7 @@ def test_checked():
 SPREAD = Spread(((SKEW, Normal(0.02)), (RHO, Percent(20.0)), ("plant.m", Percent(2.0))))
 
 
+@pytest.mark.slow
 def test_spread():
     study = Study(CASCADE, NOISY, Clock(200, 1e-4, METHOD), 0.01, SPREAD, seed=3, members=12)
     columns = study.columns(0, 12)

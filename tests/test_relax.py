@@ -32,6 +32,7 @@ def test_relax_solves_its_equation_to_rounding(size, side, h, p):
     assert abs(y) <= size * (1 + 1e-15)
 
 
+@pytest.mark.slow
 @given(DECADES, SIDES, DECADES, DECADES, DECADES)
 @settings(max_examples=300, deadline=None)
 def test_twist_solves_its_equation_to_rounding(size, side, a, b, p):
@@ -69,6 +70,7 @@ def test_the_hard_twist_is_the_published_controller():
 
 
 # Central differences with steps of 1e-6: their own error is 1e-9 or so of the value, more where the sign turns.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "function", [share, lambda w, h, p: twist(w, h, 0.3 * h, p)[0], lambda w, h, p: relax(w, h, p)]
 )

@@ -85,6 +85,7 @@ NOISY = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", NOISY)
 def test_stiff_gains_under_held_noise_agree_with_error_control(case):
     gains, sensor, u_max = NOISY[case]
@@ -98,6 +99,7 @@ def test_stiff_gains_under_held_noise_agree_with_error_control(case):
     assert found[1] == pytest.approx(found[0], rel=0.03)
 
 
+@pytest.mark.slow
 def test_the_slow_motion_is_of_second_order():
     gains = cascade(60.0, 1.0, 1e8, 20.0, p=1.0)
     scenario = Scenario(reference=Sine(1e-3, 10.0), initial=Initial(1e-4), u_max=1e9)
@@ -115,6 +117,7 @@ def test_another_inversion_law_is_refused():
         rollout(Cascade(inversion=inversion.ClosedForm()), Scenario(), Clock(2, 1e-4, Slide(1)))
 
 
+@pytest.mark.slow
 def test_values_and_derivatives_are_finite_over_six_decades_of_gains():
     gains = np.array([17.0, 25.0, 7.5e4, 152.0]) * 10 ** np.random.default_rng(0).uniform(-3, 3, (200, 4))
     scenario = dataclasses.replace(TRACKING, initial=Initial(1e-3))

@@ -106,6 +106,7 @@ def result(out):
 # --- where it runs ---
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_file(capsys, monkeypatch):
     write(TINY)
     # a chunk is several calls of the compiled program, and the last one is no whole chunk
@@ -273,6 +274,7 @@ def test_what_was_damaged_is_computed_again_with_a_line(no_pictures, capsys):
     assert result("out") == result("whole")
 
 
+@pytest.mark.slow
 def test_a_chunk_damaged_after_a_kill_is_computed_again(no_pictures, capsys):
     write(LONGER)
     assert main([*RUN, "--out", "whole"]) == 0

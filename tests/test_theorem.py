@@ -35,6 +35,7 @@ def test_repaired_holds_and_literal_does_not():
     assert literal.lost_at < 0.02
 
 
+@pytest.mark.slow
 def test_suprema_and_their_times():
     cascade, scenario = short(q_i=Pulse(0.05, 0.02, 0.03))
     report = lines(check(cascade, scenario, CLOCK))
@@ -45,6 +46,7 @@ def test_suprema_and_their_times():
     assert report["disturbance of i"].at_s == pytest.approx(0.02, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_delta_1_is_the_derivative_seen_in_a_trajectory():
     """d = v_star' - dv/dz z_dot, against central differences of the recorded v_star (error ~ h^2 v_star'''/6)."""
     cascade, scenario = short()

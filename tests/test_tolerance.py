@@ -88,6 +88,7 @@ def carried(loops, exact, z_dot):
     return (gain * allowed).max(axis=0), gain.max(axis=0)
 
 
+@pytest.mark.slow
 def test_an_error_is_that_of_some_steps_carried_by_the_loop():
     exact, z_dot = motion(HARD, 1e-10)
     assert np.isfinite(exact).all()

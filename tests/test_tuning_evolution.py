@@ -84,6 +84,7 @@ def test_a_minimum_is_found_where_derivatives_lead_elsewhere(monkeypatch, tmp_pa
     assert answer.lost == 0
 
 
+@pytest.mark.slow
 def test_three_limits_are_kept_where_derivatives_lead_elsewhere(monkeypatch, tmp_path):
     answer, (c, k) = found(monkeypatch, tmp_path, World(chaos=1e30), limits=LIMITS)
     limits = {limit.name: limit for limit in answer.problem.limits}

@@ -88,6 +88,7 @@ def test_the_front_of_least_error_leaves_the_answer(ran):
     assert len(list(folder.glob("tuned_*V.toml"))) == 2
 
 
+@pytest.mark.slow
 def test_the_rest_of_the_limits_stays(monkeypatch, tmp_path):
     """A limit of 15 V is met by the answer of least error already, at a voltage below which the knee may not end."""
     study(monkeypatch, World(), objective="knee", bounds=BOUNDLESS, limits={"largest_error_m": 1.0})

@@ -47,6 +47,7 @@ def made():
     return problem, x, problem.objective.training(1, 12, 2, 1.2, 1.25)
 
 
+@pytest.mark.slow
 def test_the_derivative_of_a_limit_is_that_of_differences(made):
     """Of each limit's term of the goal, along each gain."""
     problem, x, members = made

@@ -220,6 +220,7 @@ def run(small, **more):
     return search(engine, goal, members, points, keep=2, **{"iterations": 9, **more})
 
 
+@pytest.mark.slow
 def test_the_search_descends_and_keeps_the_best(small):
     found = run(small)
     engine, goal, members, _ = small

@@ -95,6 +95,7 @@ def test_what_refutes_an_answer(small):
     assert json.dumps(stalled.facts())
 
 
+@pytest.mark.slow
 def test_a_negligible_error_is_that_of_the_reference_for_its_gap(small):
     error = step_error(small, at(small))
     assert error.negligible_m == NEGLIGIBLE * 4e-4
@@ -103,6 +104,7 @@ def test_a_negligible_error_is_that_of_the_reference_for_its_gap(small):
     assert error.refuted == "no member compared is held by both"
 
 
+@pytest.mark.slow
 def test_false_survival_is_refuted():
     """The search's own steps hold every member; accurate steps none."""
     found = problem_from(FALSE)
@@ -170,6 +172,7 @@ def run(small, monkeypatch, tmp_path):
     return answer
 
 
+@pytest.mark.slow
 def test_an_answer_is_confirmed_on_the_worst_members_too(run, small):
     answer, verdicts = run(error_of(small))
     assert answer.good
@@ -185,6 +188,7 @@ def test_the_search_goes_on_with_members_that_are_not_confirmed(run, small):
     assert [count for _, count, _ in verdicts.calls] == [4, 4, 8]
 
 
+@pytest.mark.slow
 def test_what_nothing_confirms_is_not_taken_for_an_answer(run, small):
     """Finer steps first, then earlier points of the search; then it says so."""
     nothing = error_of(small, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
