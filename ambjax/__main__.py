@@ -117,6 +117,8 @@ def parser() -> Parser:
     export = command("export", "write controller, plant or loop of a case with [processor] as C", case=True, out=True)
     parts = ["controller", "plant", "loop"]
     export.add_argument("--what", choices=parts, default="controller", help="part of the loop (default: controller)")
+    export.add_argument("--format", choices=["c", "fmu"], default="c", help="C package or FMU (default: c)")
+    export.add_argument("--fmi", type=int, choices=[2, 3], help="version of FMI of an FMU (default: 3)")
     export.add_argument("--verify", action="store_true", help="compare the C with JAX; exit code 1 if they differ")
     export.add_argument("--precision", choices=["float", "double"], default="float", help="C type of all numbers")
     export.add_argument("--prefix", metavar="NAME", help="prefix of all names in the C code (default: the case's name)")

@@ -21,13 +21,17 @@ from ambjax.export.block import Block
 from ambjax.export.c99 import machine, package, texts
 from ambjax.export.c99.source import Origin
 from ambjax.export.c99.statements import RESERVED
+from ambjax.export.fmi import archive, cross_check
 from ambjax.export.of_case import block_of
 from ambjax.export.program import PRECISIONS
+from ambjax.export.trace import trace
 from ambjax.export.twins import LoopCase
 
 Summary = dict[str, object]
 # Files that --verify adds to the package.
 VERIFIED = ("verify.md", "verify.json")
+# Names of the files of an FMU, by their prefix: the FMU, and its reference input and output.
+FMU_NAMES = ("{p}.fmu", "{p}_in.csv", "{p}_ref.csv", "{p}_ref.opt")
 # Names of the standard C headers, which a prefix must not repeat: the package contains PREFIX.h.
 HEADER_NAMES = {
     *("assert", "complex", "ctype", "errno", "fenv", "inttypes", "iso646", "limits", "locale", "math", "setjmp"),
@@ -42,7 +46,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     plan = _plan(case, args)
     print_warnings(case, args.case)
     with files(plan.out) as part:
-        sources, checks = _verified(case, plan) if args.verify else (_built(plan), [])
+        sources, checks = _verified(case, plan) if args.verify else (_built(case, plan), [])
         _write(part, plan, case.name, sources, checks)
     if not checks:
         _remove_verification(plan.out)
@@ -53,9 +57,13 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 
 class Plan(NamedTuple):
-    """A checked export: the block, the C type and prefix of the package, its origin, mark and directory."""
+    """A checked export: the block, the C type and prefix of the package, its origin, mark and directory.
+
+    `fmi`: version of FMI, 2 or 3; 0: the package is C.
+    """
 
     block: Block
+    fmi: int
     precision: str
     prefix: str
     origin: Origin
@@ -67,27 +75,42 @@ def _plan(case: Case, args: argparse.Namespace) -> Plan:
     """Build the block and make the output directory. Raises ValueError for a case or option that cannot be met."""
     block = block_of(args.what, guarded_for(case), case.scenario, case.clock)
     prefix = _prefix(args.prefix, case.name)
+    if args.fmi is not None and args.format != "fmu":
+        raise ValueError(f"--fmi {args.fmi}: it is for --format fmu. Add --format fmu, or omit --fmi.")
+    fmi = (args.fmi or 3) if args.format == "fmu" else 0
     if args.verify:
         machine.check()
     digest = hashlib.sha256(case.text.encode()).hexdigest()
     origin = Origin(case.name, digest, block.described())
     out = directory(args.out, f"export-{case.name}")
     mark = texts.MARK.format(p=prefix)
-    spare(out, [*(name.format(p=prefix) for name in package.NAMES), *VERIFIED], mark)
-    return Plan(block, args.precision, prefix, origin, mark, out)
+    names = FMU_NAMES[: 1 if _holds_fmu(out, prefix, mark) else None] if fmi else package.NAMES
+    spare(out, [*(name.format(p=prefix) for name in names), *VERIFIED], mark)
+    return Plan(block, fmi, args.precision, prefix, origin, mark, out)
 
 
-def _built(plan: Plan) -> dict[str, str]:
-    """Return the text of each file of the package, unverified."""
-    return package.files(plan.block, plan.precision, plan.prefix, plan.origin)
+def _holds_fmu(out: pathlib.Path, prefix: str, mark: str) -> bool:
+    """Return whether `out` has an FMU of an earlier export, whose reference data have no mark of their own."""
+    path = out / f"{prefix}.fmu"
+    return path.is_file() and path.read_bytes().endswith(mark.encode())
+
+
+def _built(case: Case, plan: Plan) -> dict[str, str | bytes]:
+    """Return the content of each file of the package, unverified."""
+    if not plan.fmi:
+        return {**package.files(plan.block, plan.precision, plan.prefix, plan.origin)}
+    traced = trace(plan.block, "double")
+    fmu = {f"{plan.prefix}.fmu": archive.packed(traced, plan.prefix, plan.origin, plan.fmi)}
+    cascade = guarded_for(case)
+    return fmu | cross_check.files_of(plan.block, plan.prefix, traced.read, cascade, case.scenario, case.clock)
 
 
 def _write(
-    folder: pathlib.Path, plan: Plan, case_name: str, sources: dict[str, str], checks: list[verify.Check]
+    folder: pathlib.Path, plan: Plan, case_name: str, sources: dict[str, str | bytes], checks: list[verify.Check]
 ) -> None:
     """Write the package and, if there are checks, the files that record them."""
-    for name, text in sources.items():
-        (folder / name).write_text(text, encoding="utf-8")
+    for name, content in sources.items():
+        (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     if checks:
         (folder / VERIFIED[0]).write_text(verify.table(checks, case_name, plan.mark, plan.block.noun), encoding="utf-8")
         rows = [check._asdict() for check in checks]
@@ -100,7 +123,7 @@ def _remove_verification(out: pathlib.Path) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-def _print(out: pathlib.Path, sources: dict[str, str], checks: list[verify.Check]) -> None:
+def _print(out: pathlib.Path, sources: dict[str, str | bytes], checks: list[verify.Check]) -> None:
     if checks:
         rows = [(check.name, check.precision, check.found, check.allowed, check.verdict) for check in checks]
         print(table(("check", "precision", "found", "allowed", "verdict"), rows))
@@ -118,7 +141,7 @@ def guarded_for(case: Case) -> Cascade:
     return dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=guard))
 
 
-def _verified(case: Case, plan: Plan) -> tuple[dict[str, str], list[verify.Check]]:
+def _verified(case: Case, plan: Plan) -> tuple[dict[str, str | bytes], list[verify.Check]]:
     """Return the files of the package and the checks of both precisions."""
     say(
         "verify: in both precisions, one step at 10,000 points, one step at 10,000 points with other parameters, "
@@ -126,7 +149,7 @@ def _verified(case: Case, plan: Plan) -> tuple[dict[str, str], list[verify.Check
     )
     drafts = {name: verify.draft(plan.block, name, plan.prefix, plan.origin) for name in PRECISIONS}
     checks = verify.verify(drafts, LoopCase(case.cascade, case.scenario, case.clock, case.settle))
-    return dict(drafts[plan.precision].files), checks
+    return _built(case, plan) if plan.fmi else {**drafts[plan.precision].files}, checks
 
 
 def _prefix(option: str | None, name: str) -> str:

@@ -1,0 +1,115 @@
+"""An FMU as a file: description, sources, binary; and the reference data beside it."""
+
+import importlib.resources
+import io
+import platform
+import sys
+import zipfile
+
+from ambjax.export.c99 import machine
+from ambjax.export.c99.source import Origin, Writer
+from ambjax.export.c99.texts import MARK
+from ambjax.export.fmi.description import build_description, description, token
+from ambjax.export.trace import Trace
+
+SHARED_FILES = ("fmu_core.h", "fmi{}_interface.h", "fmi{}.c")
+# Names of the folders of binaries for each system: FMI 2.0, FMI 3.0, and the ending of a library.
+SYSTEMS = {
+    "linux": ("linux", "linux", ".so"),
+    "darwin": ("darwin", "darwin", ".dylib"),
+    "win32": ("win", "windows", ".dll"),
+}
+MODEL = """/* The block of this FMU, for fmu_core.h. */
+
+#ifndef MODEL_H
+#define MODEL_H
+
+#include "{p}.h"
+
+#define MODEL_TOKEN "{token}"
+#define MODEL_INPUTS {inputs}
+#define MODEL_OUTPUTS {outputs}
+#define MODEL_PARAMETERS {parameters}
+#define MODEL_STATES {states}
+#define MODEL_PERIOD {p}_SAMPLE_PERIOD
+/* whether the outputs at the start time are those of a step: a plant reads its sensors */
+#define MODEL_READS_AT_START {reads}
+
+typedef {p}_params model_params;
+typedef {p}_state model_state;
+typedef {p}_input model_input;
+typedef {p}_output model_output;
+
+#define model_default {p}_default
+#define model_init {p}_init
+#define model_step {p}_step
+
+/* for each parameter, whether it may be infinite */
+static const unsigned char model_infinite[MODEL_PARAMETERS] = {{{infinite}}};
+
+#endif
+"""
+
+
+def sources(traced: Trace, identifier: str, origin: Origin, version: int) -> tuple[dict[str, str], str]:
+    """Return the text of each source file by name, and the identity of the FMU. `traced`: in double precision."""
+    writer = Writer(traced, identifier, origin)
+    home = importlib.resources.files("ambjax.export.fmi")
+    names = [name.format(version) for name in SHARED_FILES]
+    found = {f"{identifier}.h": writer.header(), f"{identifier}.c": writer.source()}
+    found |= {name: (home / name).read_text(encoding="utf-8") for name in names}
+    guid = token(traced, identifier, found)
+    found["model.h"] = MODEL.format(
+        p=identifier,
+        token=guid,
+        inputs=len(traced.inputs),
+        outputs=len(traced.outputs),
+        parameters=len(traced.parameters),
+        states=len(traced.state),
+        reads=int(traced.block.noun != "controller"),
+        infinite=", ".join(str(int("or inf" in x.allowed)) for x in traced.parameters),
+    )
+    return found, guid
+
+
+def binary_name(identifier: str, version: int) -> str:
+    """Return the path of the binary for this machine inside an FMU."""
+    old, new, ending = SYSTEMS.get(sys.platform, SYSTEMS["linux"])
+    wide = sys.maxsize > 2**32
+    architecture = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower(), platform.machine().lower())
+    folder = f"{old}{'64' if wide else '32'}" if version == 2 else f"{architecture}-{new}"
+    return f"binaries/{folder}/{identifier}{ending}"
+
+
+def compiled(files: dict[str, str], identifier: str) -> bytes:
+    """Return the library of an FMU's sources, compiled on this machine. Raises ValueError if that is not possible."""
+    with machine.scratch() as folder:
+        for name, text in files.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        library = folder / f"{identifier}.so"
+        units = [folder / name for name in files if name.endswith(".c")]
+        if messages := machine.build(units, library, *machine.SHARED, "-fvisibility=hidden"):
+            raise ValueError(f"--format fmu: {machine.compiler()} cannot compile the FMU ({machine.short(messages)}).")
+        return library.read_bytes()
+
+
+def packed(traced: Trace, identifier: str, origin: Origin, version: int) -> bytes:
+    """Return an FMU of FMI `version`, 2 or 3. Its comment is the mark of an export.
+
+    Raises ValueError if there is no compiler, or if it cannot compile the sources.
+    """
+    files, guid = sources(traced, identifier, origin, version)
+    units = [name for name in files if name.endswith(".c")]
+    members: dict[str, str | bytes] = {f"sources/{name}": text for name, text in files.items()}
+    members["modelDescription.xml"] = description(traced, identifier, origin.case, guid, units, version)
+    if version == 3:
+        members["sources/buildDescription.xml"] = build_description(identifier, units)
+    members[binary_name(identifier, version)] = compiled(files, identifier)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.comment = MARK.format(p=identifier).encode()
+        for name, content in members.items():
+            entry = zipfile.ZipInfo(name)  # a fixed date: the same case gives the same sources and description
+            entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
+            archive.writestr(entry, content)
+    return buffer.getvalue()

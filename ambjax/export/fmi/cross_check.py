@@ -1,0 +1,82 @@
+"""Reference input and output of an FMU, as FMI's cross-check defines them: a case's signals and JAX's results."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.control.cascade import Cascade
+from ambjax.export.block import Block
+from ambjax.export.of_case import block_of
+from ambjax.export.series import series
+from ambjax.export.trace import arguments, precision
+from ambjax.simulation.clock import Clock
+from ambjax.world.scenario import Scenario
+
+# Samples of the reference, at most. The signs of a loop amplify rounding. A plant alone is unstable: its reference ends
+# when an error has grown by GROWTH.
+SAMPLES = {"controller": 1000, "loop": 200, "plant": 1000}
+GROWTH = 1e4
+
+
+def stepped(block: Block, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return outputs [samples, outputs] and status bits [samples] of JAX's steps for inputs [samples, inputs]."""
+    parameters, memory, _, period = arguments(block)
+    read = frozenset(block.inputs)
+
+    def one(memory: Any, x: Array) -> tuple[Any, tuple[Array, Array]]:
+        memory, outputs, status = block.step(parameters, memory, block.ports(*x), period, read)
+        bits = sum(jnp.where(bit, 1 << k, 0) for k, bit in enumerate(jax.tree.leaves(status)))
+        return memory, (jnp.stack(jax.tree.leaves(outputs)), jnp.asarray(bits))
+
+    outputs, bits = jax.jit(lambda rows: jax.lax.scan(one, memory, rows)[1])(jnp.asarray(rows))
+    return np.asarray(outputs), np.asarray(bits)
+
+
+def reference(block: Block, cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[np.ndarray, np.ndarray]:
+    """Return inputs and outputs of a block's FMU in the case's loop, [instants, time and numbers].
+
+    The inputs of a row act in the communication step that begins at its time. For a plant and a loop the first row is
+    also that of the initial readings.
+    """
+    count = min(clock.samples, SAMPLES[block.noun])
+    if block.noun == "plant":
+        pole = float(scenario.plant.pole) * block.period
+        count = max(min(count, int(math.log(GROWTH) / pole)), 1)
+    loop = block if block.noun == "loop" else block_of("loop", cascade, scenario, clock)
+    given = series(cascade, scenario, clock, count + 1)
+    plain = np.array([given[name] for name in loop.inputs]).T
+    outputs = dict(zip(loop.outputs, stepped(loop, plain)[0].T, strict=True))
+    signals = {**given, **outputs}
+    if block.noun == "controller":
+        rows = np.array([signals[name] for name in block.inputs]).T[:count]
+        found = np.concatenate([np.zeros((1, len(block.outputs))), stepped(block, rows)[0]])
+    else:
+        late = [outputs[name][:count] if name == "u" else given[name][1:] for name in block.inputs]
+        rows = np.array(late).T
+        found = stepped(block, np.concatenate([rows[:1], rows]))[0]
+    t = np.arange(count + 1) * block.period
+    return np.column_stack([t[:-1], rows]), np.column_stack([t, found])
+
+
+def files_of(
+    block: Block, name: str, read: frozenset[str], cascade: Cascade, scenario: Scenario, clock: Clock
+) -> dict[str, str]:
+    """Return NAME_in.csv, NAME_ref.csv and NAME_ref.opt. `read`: names of the inputs that the FMU has."""
+    with precision("double"):
+        inputs, outputs = reference(block, cascade, scenario, clock)
+    named = {x: inputs[:, 1 + k] for k, x in enumerate(block.inputs) if x in read}
+    options = {"StartTime": 0.0, "StopTime": float(outputs[-1, 0]), "StepSize": block.period, "RelTol": 1e-9}
+    return {
+        f"{name}_in.csv": _csv(["time", *named], np.column_stack([inputs[:, 0], *named.values()])),
+        f"{name}_ref.csv": _csv(["time", *block.outputs], outputs),
+        f"{name}_ref.opt": "".join(f"{key},{value!r}\n" for key, value in options.items()),
+    }
+
+
+def _csv(names: list[str], rows: np.ndarray) -> str:
+    head = ",".join(f'"{name}"' for name in names)
+    return "\n".join([head, *(",".join(map(repr, map(float, row))) for row in rows), ""])

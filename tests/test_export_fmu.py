@@ -1,0 +1,298 @@
+"""FMUs, run by fmpy: controller and plant in a loop are the simulator's; parameters, reset, NaN, instances, sources."""
+
+import contextlib
+import functools
+import pathlib
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+from test_export import compiled
+from test_export_blocks import rig
+
+from ambjax import Cascade, Processor, Scenario, rollout
+from ambjax.__main__ import main
+from ambjax.cases.reader import read_case
+from ambjax.export.c99.source import Origin
+from ambjax.export.fmi.archive import packed, sources
+from ambjax.export.fmi.cross_check import files_of
+from ambjax.export.fmi.description import description, variables
+from ambjax.export.fmi.si_units import exponents
+from ambjax.export.of_case import block_of, blocks_of
+from ambjax.export.series import series
+from ambjax.export.trace import trace
+from ambjax.export.twins import LoopCase, horizons
+from ambjax.simulation.clock import Clock
+
+ORIGIN = Origin("test", "0" * 64, [])
+F20 = pathlib.Path(__file__).parents[1] / "benchmarks" / "tasks" / "sampled" / "F20.toml"
+
+
+def test_units_are_products_of_base_units():
+    assert exponents("A^2/m^2/s") == {"m": -2, "s": -1, "A": 2}
+    assert exponents("N/A^2") == {"kg": 1, "m": 1, "s": -2, "A": -2}  # henry per metre
+    assert exponents("V s") == {"kg": 1, "m": 2, "s": -2, "A": -1}  # weber
+    assert exponents("ohm") == {"kg": 1, "m": 2, "s": -3, "A": -2}
+    assert exponents("1") == exponents("samples") == {}
+    assert exponents("furlong") is None
+
+
+@functools.cache
+def traced(what):
+    return trace(block_of(what, *rig()), "double")
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_description_names_every_number_that_the_block_reads(version):
+    one = traced("controller")
+    root = ET.fromstring(description(one, "amb", "rig", "{1}", ["amb.c"], version))
+    assert root.get("fmiVersion") == f"{version}.0"
+    rows = root.find("ModelVariables")
+    found = {row.get("name"): row for row in rows}
+    assert len(found) == len(rows)
+    values = [(row.find("Real") if version == 2 else row) for row in found.values()]
+    starts = {row.get("name"): x.get("start") for row, x in zip(found.values(), values, strict=True) if x is not None}
+    own = {x.name: x.value for x in one.parameters if x.allowed != "not read"}
+    assert {name: float(starts[name]) for name in own} == own
+    assert {name for name, row in found.items() if row.get("causality") == "input"} == one.read
+    assert {found[name].get("variability") for name in own} == {"tunable"}
+    units = {unit.get("name") for unit in root.find("UnitDefinitions")}
+    assert {x.unit for x in variables(one) if x.unit} - units <= {"s"}
+    assert all(exponents(unit) is not None for unit in units)
+    references = [row.get("valueReference") for row in rows]
+    assert len(set(references)) == len(references)
+
+
+def test_an_infinite_start_value_is_written_as_xml_allows():
+    cascade = Cascade(processor=Processor(1.0))
+    one = trace(block_of("controller", cascade, Scenario(), Clock(10)), "double")
+    assert 'start="INF"' in description(one, "amb", "x", "{1}", [], 3)
+    assert 'start="1e300"' in description(one, "amb", "x", "{1}", [], 2)
+
+
+def test_every_input_of_the_reference_acts_in_the_step_that_begins_at_its_time():
+    """The plant's reference repeated by hand: row k acts from t_k on, and its result is in row k + 1."""
+    cascade, scenario, clock = rig()
+    block = block_of("loop", cascade, scenario, clock)
+    files = files_of(block, "amb", frozenset(block.inputs), cascade, scenario, clock)
+    given, found = (np.genfromtxt(files[f"amb_{x}.csv"].splitlines()[1:], delimiter=",") for x in ("in", "ref"))
+    assert len(found) == len(given) + 1 == 201
+    np.testing.assert_array_equal(found[:-1, 0], given[:, 0])
+    rows = rollout(cascade, scenario, clock).trajectory.rows
+    # noise of the first reading is that of the first row, so that one sample differs; its force is felt for a while
+    column = 1 + list(block.outputs).index("z_true")
+    np.testing.assert_allclose(found[:2, column], rows.z[:2], rtol=0, atol=1e-15)
+    w = series(cascade, scenario, clock, 201)["w_z"]
+    np.testing.assert_array_equal(given[:, 1 + list(block.inputs).index("w_z")], w[1:])
+
+
+# --- run by fmpy ---
+
+
+def written(folder, block, version=3, name="amb"):
+    path = folder / f"{name}.fmu"
+    path.write_bytes(packed(trace(block, "double"), name, ORIGIN, version))
+    return path
+
+
+class Unit:
+    """An instance of an FMU, with numbers by name."""
+
+    def __init__(self, path, folder, name="one"):
+        import fmpy
+        from fmpy.fmi2 import FMU2Slave
+        from fmpy.fmi3 import FMU3Slave
+
+        self.about = fmpy.read_model_description(path)
+        self.at = {x.name: x.valueReference for x in self.about.modelVariables}
+        self.three = self.about.fmiVersion == "3.0"
+        if not folder.exists():
+            fmpy.extract(str(path), str(folder))
+        kind = FMU3Slave if self.three else FMU2Slave
+        given = {"unzipDirectory": str(folder), "modelIdentifier": self.about.coSimulation.modelIdentifier}
+        self.fmu = kind(guid=self.about.guid, instanceName=name, **given)
+        self.fmu.instantiate()
+
+    def begin(self, **inputs):
+        if not self.three:
+            self.fmu.setupExperiment()
+        self.fmu.enterInitializationMode()
+        self.set(**inputs)
+        self.fmu.exitInitializationMode()
+        self.t, self.n = 0.0, 0
+        return self
+
+    def set(self, values=None, **more):
+        values = {**(values or {}), **more}
+        put = self.fmu.setFloat64 if self.three else self.fmu.setReal
+        put([self.at[name] for name in values], list(values.values()))
+
+    def get(self, *names):
+        take = self.fmu.getFloat64 if self.three else self.fmu.getReal
+        return dict(zip(names, take([self.at[name] for name in names]), strict=True))
+
+    @property
+    def status(self):
+        take = self.fmu.getUInt32 if self.three else self.fmu.getInteger
+        return take([self.at["status"]])[0]
+
+    def step(self, period, **inputs):
+        self.set(**inputs)
+        self.fmu.doStep(self.n * period, period)
+        self.n += 1
+        return self
+
+
+def close(*units):
+    for unit in units:
+        with contextlib.suppress(Exception):
+            unit.fmu.terminate()
+        unit.fmu.freeInstance()
+
+
+def looped(controller, plant, x, count, period):
+    """z and u of a loop of two FMUs: in each sample the controller steps first, then the plant."""
+    noise = [name for name in ("w_z", "w_z_dot", "w_i") if name in plant.at]
+    references = [name for name in ("r", "r_dot", "r_ddot", "r_dddot") if name in controller.at]
+    readings = [name for name in ("z", "z_dot", "i") if controller.about and name in controller.at]
+    controller.begin()
+    plant.begin(**{name: x[name][0] for name in noise})
+    z, u = np.empty(count), np.empty(count)
+    for n in range(count):
+        z[n] = plant.get("z_true")["z_true"]
+        controller.step(period, **plant.get(*readings), **{name: x[name][n] for name in references})
+        u[n] = controller.get("u")["u"]
+        late = {name: x[name][n + 1] for name in (*noise, "q_z", "q_i")}
+        plant.step(period, u=u[n], **late)
+    return z, u
+
+
+@pytest.mark.slow
+@compiled
+@pytest.mark.parametrize(("version", "name"), [(3, "F20"), (2, "F20"), (3, "rig")])
+def test_controller_and_plant_in_a_loop_are_simulates(version, name, tmp_path):
+    pytest.importorskip("fmpy")
+    if name == "F20":
+        case = read_case(F20)
+        cascade, scenario, clock = case.cascade, case.scenario, case.clock
+    else:
+        cascade, scenario, clock = rig()
+        clock = clock.with_method(block_of("plant", *rig()).method)
+    blocks, period = blocks_of(cascade, scenario, clock), float(clock.sample_period)
+    units = [Unit(written(tmp_path, blocks[what], version, what), tmp_path / what) for what in ("controller", "plant")]
+    horizon = horizons(LoopCase(cascade, scenario, clock, 0.0), ["double"])["double"]
+    count = horizon.samples
+    assert count > 50
+    z, u = looped(*units, series(cascade, scenario, clock, count + 1), count, period)
+    rows = rollout(cascade, scenario, clock).trajectory.rows
+    close(*units)
+    # the farthest of eight twins, one unit in the last place apart, bounds what rounding does (ambjax/export/twins.py)
+    assert np.all(np.abs(z - rows.z[:count]) <= 2 * horizon.parted["z"][:count] + 1e-18)
+    assert np.all(np.abs(u - rows.u[:count]) <= 2 * horizon.parted["u"][:count] + 1e-12)
+    assert np.ptp(rows.z[:count]) > 1e-6
+
+
+@pytest.mark.slow
+@compiled
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_gain_at_run_time_reset_nan_and_a_second_instance(version, tmp_path):
+    pytest.importorskip("fmpy")
+    block = block_of("controller", *rig())
+    path, period = written(tmp_path, block, version), block.period
+    one, other = (Unit(path, tmp_path / "there", name) for name in ("one", "other"))
+    given = {"z": 4e-5, "i": 0.1}
+
+    def run(unit, count=5, **more):
+        return [unit.step(period, **given, **more).get("u", "i_ref")["u"] for _ in range(count)]
+
+    first = run(one.begin())
+    assert len(set(first)) > 1
+    # a second instance is another controller, whatever the first has done
+    assert run(other.begin()) == first
+    # reset: the values of the case, and the first step again; a gain that was changed is forgotten
+    one.set({"position.c": 1000.0})
+    changed = run(one)
+    assert changed != run(other)
+    one.fmu.reset()
+    assert run(one.begin()) == first
+    # a gain changed between two steps acts from the next on
+    one.set({"position.c": 1000.0})
+    assert one.get("position.c")["position.c"] == 1000.0
+    other.fmu.reset()
+    assert run(other.begin()) == first
+    assert run(one, 1) != run(other, 1)
+    # NaN: a reading is refused, a reference is invalid; u stays a number. A parameter may not be NaN, nor be infinite
+    bits = {name: 1 << k for k, name in enumerate(block.bits)}
+    u = one.step(period, z=np.nan, i=0.1).get("u")["u"]
+    assert one.status & bits["refused"]
+    assert np.isfinite(u)
+    held = one.step(period, z=4e-5, r=np.nan).get("u")["u"]
+    assert one.status & bits["invalid"]
+    assert held == u
+    for wrong in (np.nan, np.inf):
+        with pytest.raises(Exception, match=r"rror|status 3"):
+            one.set({"position.c": wrong})
+    with pytest.raises(Exception, match=r"rror|status 3"):
+        one.set(u=1.0)  # an output
+    with pytest.raises(Exception, match=r"rror|status 3"):
+        one.step(0.7 * period, z=0.0, r=0.0)
+    close(one, other)
+
+
+@pytest.mark.slow
+@compiled
+@pytest.mark.parametrize("version", [2, 3])
+def test_compiled_again_from_its_sources_it_gives_the_reference(version, tmp_path):
+    """What a real-time target does: the sources alone, with another build system."""
+    fmpy = pytest.importorskip("fmpy")
+    from fmpy.build import build_platform_binary
+    from fmpy.validation import validate_fmu
+
+    cascade, scenario, clock = rig()
+    block = block_of("plant", cascade, scenario, clock)
+    path, folder = written(tmp_path, block, version), tmp_path / "there"
+    assert validate_fmu(str(path)) == []
+    fmpy.extract(str(path), str(folder))
+    (old,) = (folder / "binaries").glob("*/amb.*")
+    old.unlink()
+    with pytest.raises(Exception, match="amb"):
+        Unit(path, folder)
+    (tmp_path / "build").mkdir()
+    build_platform_binary(folder, tmp_path / "build")
+    files = files_of(block, "amb", trace(block, "double").read, cascade, scenario, clock)
+    texts = (files[f"amb_{x}.csv"].replace('"', "").splitlines() for x in ("in", "ref"))
+    given, should = (np.genfromtxt(text, delimiter=",", names=True) for text in texts)
+    names = [name for name in given.dtype.names if name != "time"]
+    unit = Unit(path, folder)
+    unit.begin(**{name: given[name][0] for name in names})
+    found = [unit.get("z_true")["z_true"]]
+    for row in given:
+        unit.step(block.period, **{name: row[name] for name in names})
+        found.append(unit.get("z_true")["z_true"])
+    close(unit)
+    # an error of 1e-20 m grows by 1e4 (GROWTH)
+    np.testing.assert_allclose(found, should["z_true"], rtol=0, atol=1e-15)
+
+
+def test_a_command_writes_the_fmu_and_its_reference(elsewhere, tmp_path, capsys, monkeypatch):
+    case = tmp_path / "rotor.toml"
+    case.write_text("[processor]\n[clock]\nduration = 0.01\n")
+    out = tmp_path / "fmu"
+    with pytest.raises(SystemExit):
+        main(["export", str(case), "--out", str(out), "--format", "fmu", "--fmi", "4"])
+    assert main(["export", str(case), "--out", str(out), "--fmi", "2"]) == 2
+    assert "--fmi 2: it is for --format fmu" in capsys.readouterr().err
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert main(["export", str(case), "--out", str(out), "--format", "fmu"]) == 2
+    assert "there is no C compiler (no-such-compiler)" in capsys.readouterr().err
+
+
+def test_the_sources_are_the_same_twice_and_name_the_block():
+    one = traced("plant")
+    files, guid = sources(one, "amb", ORIGIN, 3)
+    again = sources(one, "amb", ORIGIN, 3)
+    assert (files, guid) == again
+    assert f'#define MODEL_TOKEN "{guid}"' in files["model.h"]
+    assert "#define MODEL_READS_AT_START 1" in files["model.h"]
+    other = trace(block_of("plant", *rig(clearance=2e-4)), "double")
+    assert sources(other, "amb", ORIGIN, 3)[1] != guid
