@@ -1,13 +1,34 @@
 """The plant and the loop as blocks: their steps are the simulator's, and what cannot be exported is refused."""
 
 import dataclasses
+import functools
 import tomllib
 
-from ambjax import Clock
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_export import compiled
+
+from ambjax import RK4, Clock, Sensor, rollout
+from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
+from ambjax.export.c99.source import Origin
+from ambjax.export.fmi.cross_check import stepped
+from ambjax.export.of_case import block_of, blocks_of
+from ambjax.export.plant_step import plant_of
+from ambjax.export.series import series
+from ambjax.export.trace import arguments
+from ambjax.export.twins import LoopCase
+from ambjax.export.verify import draft, verify
+from ambjax.simulation.integrate import FixedSteps
+from ambjax.simulation.rosenbrock import AdaptiveRodas3
+from ambjax.simulation.trajectory import TOUCHED
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
+from ambjax.world.faults import Dropouts, Outliers
+from ambjax.world.rotation import Runout
 
 
 def rig(**more):
@@ -24,3 +45,147 @@ CASES = {
         amplifier=Amplifier(bandwidth=5e3, slew=2e6, dead_band=0.1),
     ),
 }
+
+
+@functools.cache
+def blocks(name):
+    return blocks_of(*CASES[name])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(CASES))
+def test_the_loops_steps_are_the_simulators(name):
+    cascade, scenario, clock = CASES[name]
+    block, count = blocks(name)["loop"], 100
+    x = series(cascade, scenario, clock, count)
+    outputs, bits = stepped(block, np.array([x[port] for port in block.inputs]).T)
+    rows = rollout(cascade, scenario, clock.with_method(block.plant.method)).trajectory.rows
+    found = dict(zip(block.outputs, outputs.T, strict=True))
+    # 100 samples of hard signs, in which rounding (1e-20 m) grows by a few decades (ambjax/export/twins.py)
+    np.testing.assert_allclose(found["z_true"], rows.z[:count], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found["z"], rows.z_measured[:count], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found["u"], rows.u[:count], rtol=0, atol=1e-6)
+    assert np.ptp(rows.z[:count]) > 1e-6
+    assert not np.any(bits & ~1)  # nothing but a voltage at its limit
+
+
+@functools.cache
+def stepping(sensor=None):
+    """The rig's plant, or the rig's with another sensor, and its step, compiled."""
+    block = blocks("rig")["plant"] if sensor is None else block_of("plant", *rig(sensor=sensor))
+    parameters, memory, inputs, period = arguments(block)
+    read = frozenset(block.inputs)
+    return jax.jit(lambda p, memory, x: block.step(p, memory, x, period, read)), parameters, memory, inputs
+
+
+def plant_step(machine=None, sensor=None, **inputs):
+    """One step of the plant after the first one: memory before, first outputs and status, result of the step."""
+    step, parameters, memory, ports = stepping(sensor)
+    parameters = dataclasses.replace(parameters, **{k: jnp.asarray(x) for k, x in (machine or {}).items()})
+    memory, *first = step(parameters, memory, ports)
+    return memory, first, step(parameters, memory, ports._replace(**{k: jnp.asarray(x) for k, x in inputs.items()}))
+
+
+def test_the_first_step_reads_the_initial_state_and_the_second_moves():
+    memory, (outputs, status), (after, later, _) = plant_step(u=10.0)
+    assert outputs.z_true == memory.motion.z == 5e-5
+    assert bool(memory.started)
+    assert not any(status)
+    assert later.z_true != outputs.z_true
+    assert after.last == 10.0  # applied one sample late, so that it has not moved the current yet
+    assert after.before == 0.0
+    _, _, (_, without, _) = plant_step(u=0.0)
+    assert without.i_true == later.i_true
+
+
+def test_a_rotor_beyond_the_clearance_is_lost_and_frozen_there():
+    _, (_, first), (after, outputs, status) = plant_step({"clearance": 1e-5}, u=10.0)
+    assert bool(first.touched)
+    assert bool(status.touched)
+    assert not bool(status.diverged)
+    assert outputs.z_true == 5e-5  # as it began
+    assert after.lost == TOUCHED
+
+
+@pytest.mark.parametrize("name", ["u", "q_z", "w_z"])
+def test_a_number_that_is_not_finite_is_reported_and_taken_as_0(name):
+    _, _, (_, outputs, status) = plant_step(**{name: np.nan})
+    _, _, (_, plain, fine) = plant_step(**{name: 0.0})
+    assert bool(status.invalid)
+    assert not bool(fine.invalid)
+    assert outputs == plain
+    assert bool(plant_step({"delay": 3.0})[2][2].invalid)
+
+
+@pytest.mark.slow
+def test_noise_and_disturbances_are_in_their_units():
+    sensor = Sensor(std=1e-6, std_i=1e-3, velocity=False)
+    _, _, (_, quiet, _) = plant_step(sensor=sensor)
+    _, _, (_, noisy, _) = plant_step(sensor=sensor, w_z=2.0, w_i=-1.0, w_z_dot=5.0)
+    assert noisy.z - quiet.z == pytest.approx(2e-6, rel=1e-9)
+    assert noisy.i - quiet.i == pytest.approx(-1e-3, rel=1e-9)
+    assert noisy.z_dot == 0.0  # not measured
+    period = blocks("rig")["plant"].period
+    _, _, (_, pushed, _) = plant_step(sensor=sensor, q_z=3.0, q_i=7.0)
+    # in a period of 50 us, the plant's own forces change a constant acceleration by (pole T)^2 = 5e-4 of it
+    assert pushed.z_dot_true - quiet.z_dot_true == pytest.approx(3.0 * period, rel=1e-3)
+    assert pushed.i_true - quiet.i_true == pytest.approx(7.0 * period, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"sensor": Sensor(outliers=Outliers(at=1e-3))}, "sensor.outliers: the exported plant"),
+        ({"sensor": Sensor(dropouts=Dropouts(at=1e-3))}, "sensor.dropouts: the exported plant"),
+        ({"sensor": Sensor(runout=Runout(100.0))}, "sensor.runout: the exported plant"),
+    ],
+)
+def test_what_a_plant_cannot_have_is_refused_in_one_line(change, says):
+    cascade, scenario, clock = rig(**change)
+    for what in ("plant", "loop"):
+        with pytest.raises(ValueError, match=says) as error:
+            block_of(what, cascade, scenario, clock)
+        assert "\n" not in str(error.value)
+    assert block_of("controller", cascade, scenario, clock).noun == "controller"
+
+
+def test_a_plant_needs_a_processor_and_fixed_steps():
+    cascade, scenario, clock = rig()
+    with pytest.raises(ValueError, match=r"\[processor\] is missing: the exported plant takes a voltage"):
+        plant_of(dataclasses.replace(cascade, processor=None), scenario, 5e-5, RK4(1))
+    with pytest.raises(ValueError, match=r"has no fixed number of steps.*clock.method = 'rk4'"):
+        plant_of(cascade, scenario, 5e-5, AdaptiveRodas3(1e-6))
+    # a case whose method is adaptive gets the simulator's choice among those with fixed steps
+    assert isinstance(block_of("plant", cascade, scenario, clock.with_method(AdaptiveRodas3(1e-6))).method, FixedSteps)
+
+
+@pytest.mark.slow
+@compiled
+@pytest.mark.parametrize("name", list(CASES))
+@pytest.mark.parametrize("what", ["plant", "loop"])
+def test_the_c_is_proven(name, what):
+    cascade, scenario, clock = CASES[name]
+    block = blocks(name)[what]
+    one = draft(block, "double", "amb", Origin("test", "0" * 64, block.described()), 2000)
+    checks = verify({"double": one}, LoopCase(cascade, scenario, clock, 0.0))
+    assert len(checks) == 10
+    assert [x for x in checks if not x.ok] == []
+    # the points are no formality: the rotor is levitated, lost, and an input is not finite, at some of each
+    bits = one.steps["one step"][1].bits
+    counts = {bit: np.sum(bits & (1 << k) > 0) for k, bit in enumerate(block.bits)}
+    assert all(counts[bit] > 5 for bit in ("touched", "diverged", "invalid"))
+    assert np.sum(bits == 0) > 200
+    mutant = one.files["amb.c"].replace("params->plant.m", "(1.0000001 * params->plant.m)")
+    broken = verify({"double": dataclasses.replace(one, files={**one.files, "amb.c": mutant})}, None)
+    assert {x.name for x in broken if not x.ok} >= {"one step, numbers", "test program"}
+
+
+@pytest.mark.slow
+def test_the_command_names_the_part(elsewhere, tmp_path):
+    (tmp_path / "rig.toml").write_text(template("rig"))
+    out = tmp_path / "c"
+    assert main(["export", str(tmp_path / "rig.toml"), "--what", "plant", "--out", str(out), "--json"]) == 0
+    text, header = ((out / name).read_text() for name in ("README.md", "rig.h"))
+    assert text.startswith("# rig: the plant of case 'rig' as C99")
+    assert "input.w_z_dot" not in text  # a velocity that is not measured
+    assert "rig_real w_z; /* [1] standard normal number: noise of z, divided by sensor.std */" in header

@@ -150,8 +150,13 @@ def close(*units):
         unit.fmu.freeInstance()
 
 
-def looped(controller, plant, x, count, period):
-    """z and u of a loop of two FMUs: in each sample the controller steps first, then the plant."""
+def looped(controller, plant, x, count, period, at_once=False):
+    """z and u of a loop of two FMUs: in each sample the controller steps first, then the plant.
+
+    `at_once`: all inputs are exchanged before both step, as Simulink does; the plant's delay is one sample less.
+    """
+    if at_once:
+        plant.set(delay=plant.get("delay")["delay"] - 1)
     noise = [name for name in ("w_z", "w_z_dot", "w_i") if name in plant.at]
     references = [name for name in ("r", "r_dot", "r_ddot", "r_dddot") if name in controller.at]
     readings = [name for name in ("z", "z_dot", "i") if controller.about and name in controller.at]
@@ -162,14 +167,15 @@ def looped(controller, plant, x, count, period):
         z[n] = plant.get("z_true")["z_true"]
         controller.step(period, **plant.get(*readings), **{name: x[name][n] for name in references})
         u[n] = controller.get("u")["u"]
+        now = u[n - 1] if at_once and n else 0.0 if at_once else u[n]
         late = {name: x[name][n + 1] for name in (*noise, "q_z", "q_i")}
-        plant.step(period, u=u[n], **late)
+        plant.step(period, u=now, **late)
     return z, u
 
 
 @pytest.mark.slow
 @compiled
-@pytest.mark.parametrize(("version", "name"), [(3, "F20"), (2, "F20"), (3, "rig")])
+@pytest.mark.parametrize(("version", "name"), [(3, "F20"), (2, "F20"), (3, "rig"), (3, "rig, at once")])
 def test_controller_and_plant_in_a_loop_are_simulates(version, name, tmp_path):
     pytest.importorskip("fmpy")
     if name == "F20":
@@ -183,7 +189,8 @@ def test_controller_and_plant_in_a_loop_are_simulates(version, name, tmp_path):
     horizon = horizons(LoopCase(cascade, scenario, clock, 0.0), ["double"])["double"]
     count = horizon.samples
     assert count > 50
-    z, u = looped(*units, series(cascade, scenario, clock, count + 1), count, period)
+    x = series(cascade, scenario, clock, count + 1)
+    z, u = looped(*units, x, count, period, at_once="at once" in name)
     rows = rollout(cascade, scenario, clock).trajectory.rows
     close(*units)
     # the farthest of eight twins, one unit in the last place apart, bounds what rounding does (ambjax/export/twins.py)

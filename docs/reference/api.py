@@ -43,7 +43,9 @@ def modules(package: str, room: str) -> list[str]:
         return []
     if not path.is_dir():
         return [f"{package}.{room}"]
-    inner = sorted(file.stem for file in path.glob("*.py") if file.stem != "__init__")
+    files = sorted(file.relative_to(path).with_suffix("") for file in path.rglob("*.py") if file.stem != "__init__")
+    folders = {file.parent for file in files if file.parent.parts}
+    inner = [".".join(name.parts) for name in sorted([*files, *folders])]
     return [f"{package}.{room}", *(f"{package}.{room}.{name}" for name in inner)]
 
 

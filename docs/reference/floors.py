@@ -32,9 +32,9 @@ def floors() -> dict[str, str]:
 def _room(path: pathlib.Path) -> list[str]:
     if not path.is_dir():
         return [f"**{code(_shown(path.with_suffix('.py')))}**", f": {_says(path.with_suffix('.py'))}", ""]
-    files = [file for file in sorted(path.glob("*.py")) if file.name != "__init__.py"]
+    files = [file for file in sorted(path.rglob("*.py")) if file.name != "__init__.py"]
     lines = [f"**{code(_shown(path) + '/')}**", f": {_says(path / '__init__.py')}", ""]
-    return [*lines, *(f"  - {code(file.name)}: {_says(file)}" for file in files), ""]
+    return [*lines, *(f"  - {code(file.relative_to(path).as_posix())}: {_says(file)}" for file in files), ""]
 
 
 def _shown(path: pathlib.Path) -> str:
