@@ -92,6 +92,9 @@ COORDINATES = {
     "i": ("A", "current deviation"),
     "i_1": ("A", "current of the upper coil"),
     "i_2": ("A", "current of the lower coil"),
+    "delayed": ("A", "current deviation of the flux, behind the eddy currents"),
+    "delayed_1": ("A", "current of the upper coil's flux, behind the eddy currents"),
+    "delayed_2": ("A", "current of the lower coil's flux, behind the eddy currents"),
 }
 
 
@@ -216,10 +219,11 @@ class PlantStep(Block):
         return [x._replace(**delay) if x.name == "delay" else x for x in found]
 
     def states(self) -> list[Number]:
-        memory = self.start()
-        found = [
-            Number(name, unit, "", doc, 0.0) for name in memory.motion._fields for unit, doc in [COORDINATES[name]]
-        ]
+        memory, found = self.start(), []
+        for field, value in memory.motion._asdict().items():
+            count = len(jax.tree.leaves(value))  # `delayed` of a plant with eddy currents: none, one or two
+            names = [field] if count == 1 else [f"{field}_{k + 1}" for k in range(count)]
+            found += [Number(name, COORDINATES[name][0], "", COORDINATES[name][1], 0.0) for name in names]
         found.append(Number("last.u", "V", "", "voltage of the sample before the last", 0.0))
         found.append(Number("before.u", "V", "", "voltage of the sample before that", 0.0))
         if not isinstance(memory.z_filtered, tuple):
