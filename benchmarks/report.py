@@ -14,8 +14,8 @@ HEAD = """# Benchmarks
 Both times of a ratio come from the same run of a script. Absolute times depend on the machine and its load.
 
 The comparison with other libraries and the scaling were measured before metrics included substeps; ensembles with
-all metrics are slower now. The times of `ambjax tune` and of the search were measured while other programs ran, all
-other times on an idle machine.
+all metrics are slower now. The times of `ambjax tune`, of the search and of the page were measured while other programs
+ran, all other times on an idle machine.
 
 The scenario is the paper's tracking scenario with the disturbance as a scaled force, unless a section names another.
 Smooth gains are gamma = 1e9 and p = 25e-6 in the inversion; repaired gains are gamma = 7.5e4 and p = 25.
@@ -41,6 +41,7 @@ Smooth gains are gamma = 1e9 and p = 25e-6 in the inversion; repaired gains are 
     .venv/bin/python benchmarks/schedules.py         # 24 scheduled gains: the search against CMA-ES
     .venv/bin/python benchmarks/from_answer.py       # CMA-ES started from a tuned answer
     .venv/bin/python benchmarks/export.py            # a step of an exported controller, also on a Cortex-M4F
+    .venv/bin/python benchmarks/page.py              # latency of the page with sliders
     .venv/bin/python benchmarks/report.py
 """
 
@@ -434,6 +435,27 @@ def export() -> list[str]:
     return lines + table(titles, rows)
 
 
+def sliders() -> list[str]:
+    data = load("page")
+    lines = ["## The page with sliders (`page.py`)", "", facts(data["machine"])]
+    lines += [
+        f"The rig, {data['samples']:,} samples at 20 kHz, in headless Chromium, without a GPU. The file has "
+        f"{data['page_kB']:,} kB.",
+        f"Other programs ran: the load was {data['load']:.0f} on {data['machine']['cores']} cores.",
+        "The CPU time is that of the thread that draws; the loop runs in a worker.",
+        "",
+    ]
+    rows = [
+        ["a drag, from the event to the drawn frame", f"{data['drag_ms']:.0f}", f"{data['drag_fastest_ms']:.0f}"],
+        ["CPU time of a drag, drawing", f"{data['drag_cpu_ms']:.0f}", ""],
+        ["the loop and |S| in the worker", f"{data['loop_ms']:.0f}", f"{data['loop_fastest_ms']:.0f}"],
+        ["a drag with the envelope of 64 members", f"{data['members_ms']:.0f}", f"{data['members_fastest_ms']:.0f}"],
+    ]
+    return lines + table(
+        "what | median (ms) | fastest (ms)", [[cell.replace("|", "\\|") for cell in row] for row in rows]
+    )
+
+
 SECTIONS = {
     "single": single,
     "work_precision": work_precision,
@@ -453,6 +475,7 @@ SECTIONS = {
     "from_answer": from_answer,
     "gpu": gpu,
     "export": export,
+    "page": sliders,
 }
 
 

@@ -14,13 +14,19 @@ function readRun(array) {
 
 function showMetrics(metrics) {
   state.metrics = Object.fromEntries(data.metrics.map((name, k) => [name, metrics[k]]));
-  const body = byId("metrics").tBodies[0];
-  body.replaceChildren(...data.metrics.map((name, k) => {
+  data.metrics.forEach((name, k) => {
     const x = metrics[k], flag = name === "lost" || name === "stalled";
     const shown = flag ? String(Boolean(x)) : Number.isFinite(x) ? text(x, 6) : "never";
-    return element("tr", {}, element("th", { scope: "row" }, name), element("td", {}, shown), element("td", {}, data.units[name] || ""));
-  }));
+    if (cells[k].textContent !== shown) cells[k].textContent = shown;
+  });
 }
+
+// The rows of the table of metrics; the cells take the values.
+const cells = data.metrics.map((name) => {
+  const cell = element("td", {});
+  byId("metrics").tBodies[0].append(element("tr", {}, element("th", { scope: "row" }, name), cell, element("td", {}, data.units[name] || "")));
+  return cell;
+});
 
 function showStatus({ lost, lost_at_s: at, max_abs_u_V: u }, code) {
   const words = lost ? `The rotor is lost at ${at.toPrecision(4)} s: ${data.statuses[code]}.` : `The rotor is held. Largest voltage: ${u.toPrecision(4)} V.`;

@@ -1,5 +1,5 @@
 // The plots, drawn with Bokeh. All plots over time share their range; each draws the extremes of every pixel column.
-const COLUMNS = 500;
+const COLUMNS = 300;
 const COLORS = ["#0b5cad", "#c2571a", "#2f7d32", "#6b3fa0"];
 
 // Plots over time: title, axis, unit and lines [name, function of a run, whether the line begins hidden].
@@ -31,7 +31,7 @@ function thinned(y, from, to) {
 // Add a plot to the document of all plots; `x`: label of the abscissa, `range`: its range, `more`: further parts.
 function addPlot({ id, title, y, unit, lines, x = "time in s", range = null, heights = null, log = false, more }) {
   const ends = log ? [1, 10] : [0, data.samples * data.period];
-  const sources = lines.map(() => new Bokeh.ColumnDataSource({ data: { x: ends, y: log ? [1e-3, 1] : [0, 0] } }));
+  const drawn = [], sources = lines.map(() => new Bokeh.ColumnDataSource({ data: { x: ends, y: log ? [1e-3, 1] : [0, 0] } }));
   const axes = log ? { x_axis_type: "log", y_axis_type: "log" } : { x_range: range };
   const figure = Bokeh.Plotting.figure({ height: 230, sizing_mode: "stretch_width", tools: "pan,box_zoom,wheel_zoom,reset,save", x_axis_label: x, y_axis_label: y, ...axes, ...(heights ? { y_range: heights } : {}) });
   figure.toolbar.logo = null;
@@ -39,11 +39,12 @@ function addPlot({ id, title, y, unit, lines, x = "time in s", range = null, hei
   lines.forEach(([name, , hidden], k) => {
     const line = figure.line({ field: "x" }, { field: "y" }, { source: sources[k], color: COLORS[k], line_width: 1.4, legend_label: name });
     line.visible = !hidden;
+    drawn.push(line);
     const tip = log ? `${name}: @y{0.000e} ${unit} at @x{0.00} Hz` : `${name}: @y{0.0000} ${unit} at @x{0.00000} s`;
     figure.add_tools(new Bokeh.HoverTool({ renderers: [line], tooltips: [["", tip]], mode: "mouse", line_policy: "nearest" }));
   });
   Object.assign(figure.legend, { click_policy: "hide", background_fill_alpha: 0.85, label_text_font_size: "11px", padding: 4, margin: 4 });
-  return { id, title, figure, sources, lines };
+  return { id, title, figure, sources, lines, drawn };
 }
 
 // Show all plots, each in an element of its own.
@@ -55,6 +56,31 @@ async function showPlots(parent, plots) {
     return box;
   });
   await Bokeh.embed.add_document_standalone(all, parent, roots);
+}
+
+// Run `task`, which draws a plot: now if the plot is in the window, else when the page is idle or the plot comes into it.
+const waiting = new Map();
+let idle = 0;
+function refresh(plot, task) {
+  waiting.set(plot, task);
+  if (plot.inWindow) drawWaiting(plot);
+  clearTimeout(idle);
+  idle = setTimeout(() => [...waiting.keys()].forEach(drawWaiting), 300);
+}
+
+function drawWaiting(plot) {
+  const task = waiting.get(plot);
+  waiting.delete(plot);
+  if (task) task();
+}
+
+function watchWindow(plots) {
+  const boxes = new Map(plots.map((plot) => [byId(`plot-${plot.id}`), plot]));
+  const watcher = new IntersectionObserver((entries) => entries.forEach(({ target, isIntersecting }) => {
+    boxes.get(target).inWindow = isIntersecting;
+    if (isIntersecting) drawWaiting(boxes.get(target));
+  }));
+  boxes.forEach((_, box) => watcher.observe(box));
 }
 
 function retitle({ id }, title) { document.querySelector(`#plot-${id} h2`).textContent = title; }
@@ -72,16 +98,18 @@ async function buildPlots(parent) {
   const sensitivityPlot = addPlot({ id: "sensitivity", title: "Sensitivity |S|", y: "|S|", unit: "", lines: [["|S|", null]], heights: new Bokeh.Range1d({ start: 0.01, end: 10 }), more: zones, ...hertz });
   await showPlots(parent, [...timed, members, spectrumPlot, sensitivityPlot]);
   parent.append(byId("machine"));
+  watchWindow([...timed, members, spectrumPlot, sensitivityPlot]);
   let shown = null;
   const drawTimes = () => {
     if (shown === null) return;
     const { start, end } = range, { t, columns } = shown, zoomed = shown.zoomed;
     const at = (x, other) => (zoomed && Number.isFinite(x) ? Math.min(Math.max(Math.round(x / data.period), 0), t.length) : other);
     const from = at(start, 0), to = Math.max(at(end, t.length), from + 2);
-    timed.forEach(({ sources }, k) => columns[k].forEach((y, j) => {
+    timed.forEach((plot, k) => refresh(plot, () => columns[k].forEach((y, j) => {
+      if (!plot.drawn[j].visible) return;
       const chosen = thinned(y, from, Math.min(to, t.length));
-      sources[j].data = { x: chosen.map((n) => t[n]), y: chosen.map((n) => y[n]) };
-    }));
+      plot.sources[j].data = { x: chosen.map((n) => t[n]), y: chosen.map((n) => y[n]) };
+    })));
   };
   const finite = (xs) => xs.map((x) => (Number.isFinite(x) && x > 0 ? x : NaN));
   return {
@@ -90,19 +118,23 @@ async function buildPlots(parent) {
       const columns = timed.map(({ lines }) => lines.map(([, of]) => of(run)));
       shown = { t: Array.from(run.error, (_, n) => n * data.period), columns, zoomed };
       drawTimes();
-      spectrumPlot.sources[0].data = { x: spectrum.f, y: finite(spectrum.amplitude.map(micro)) };
-      sensitivityPlot.sources[0].data = S === null ? { x: [1, 10], y: [NaN, NaN] } : { x: S.f, y: finite(S.size) };
-      const top = data.linear.zones[2] * 1.5, sizes = S === null ? [1] : S.size;
-      sensitivityPlot.figure.y_range.setv({ start: Math.max(Math.min(...sizes) / 2, 1e-6), end: Math.max(top, ...sizes) });
+      refresh(spectrumPlot, () => { spectrumPlot.sources[0].data = { x: spectrum.f, y: finite(spectrum.amplitude.map(micro)) }; });
+      refresh(sensitivityPlot, () => {
+        sensitivityPlot.sources[0].data = S === null ? { x: [1, 10], y: [NaN, NaN] } : { x: S.f, y: finite(S.size) };
+        const top = data.linear.zones[2] * 1.5, sizes = S === null ? [1] : S.size;
+        sensitivityPlot.figure.y_range.setv({ start: Math.max(Math.min(...sizes) / 2, 1e-6), end: Math.max(top, ...sizes) });
+      });
       const unstable = S === null ? "no equilibrium" : `peak ${S.peak.toPrecision(4)} at ${S.frequency.toPrecision(4)} Hz, zone ${S.zone}${S.stable ? "" : ", unstable"}`;
       retitle(sensitivityPlot, `Sensitivity |S|: ${unstable}`);
     },
     members({ low, high, kept, count }) {
       const length = low.length, x = Array.from(low, (_, k) => ((k + 0.5) / length) * data.samples * data.period);
       const lows = Array.from(low, micro), highs = Array.from(high, micro);
-      members.sources[0].data = { x, y: highs };
-      members.sources[1].data = { x, y: lows };
-      band.data = { x, low: lows, high: highs };
+      refresh(members, () => {
+        members.sources[0].data = { x, y: highs };
+        members.sources[1].data = { x, y: lows };
+        band.data = { x, low: lows, high: highs };
+      });
       retitle(members, `Envelope of ${count} members: ${kept} of ${count} hold the rotor`);
     },
     onZoom() {
@@ -114,6 +146,7 @@ async function buildPlots(parent) {
         if (!waiting) { waiting = true; setTimeout(redraw, 100); }
       };
       range.properties.start.change.connect(moved);
+      timed.forEach(({ drawn }) => drawn.forEach((line) => line.properties.visible.change.connect(drawTimes)));
     },
   };
 }
