@@ -21,7 +21,7 @@ import numpy as np
 
 from ambjax.cases.reader import read_case
 from ambjax.cases.template_text import template
-from ambjax.page.document import page
+from ambjax.page.html_page import page
 
 STEPS, PAUSES = 60, 6
 # Waits until the newest request is drawn: the nominal run, or also the members.

@@ -2343,49 +2343,48 @@ SCHEDULES = [
         "tests/test_schedules.py::test_knots_are_searched_in_the_range_of_their_gain",
     ),
 ]
-BROWSER = "tests/test_page.py::TestInABrowser::"
 PAGE = [
     M(
         "the page rotates the words of its noise otherwise",
         "ambjax/page/assets/noise.js",
         "[13, 15, 26, 6]",
         "[13, 15, 26, 7]",
-        BROWSER + "test_the_trajectory_is_the_simulator_s_with_its_noise",
+        "tests/test_page.py::test_the_trajectory_is_the_simulator_s_with_its_noise",
     ),
     M(
         "the page takes the factor of a member for its value",
         "ambjax/page/assets/worker.js",
         "factor ? P[index] * values[member] : values[member]",
         "values[member]",
-        BROWSER + "test_members_are_those_of_the_ensemble",
+        "tests/test_page.py::test_members_are_those_of_the_ensemble",
     ),
     M(
         "the page forgets the voltage on its way in the map of a sample",
         "ambjax/page/assets/sensitivity.js",
         "(k === n - 2 ? before : 0)",
         "0",
-        BROWSER + "test_sensitivity_is_that_of_the_linear_analysis",
+        "tests/test_page.py::test_sensitivity_is_that_of_the_linear_analysis",
     ),
     M(
         "the page takes any number",
         "ambjax/page/assets/controls.js",
         "(open ? x <= least : x < least)",
         "false",
-        BROWSER + "test_a_wrong_number_is_refused_in_words",
+        "tests/test_page.py::test_a_wrong_number_is_refused_in_words",
     ),
     M(
         "a text of the case can end its element in the page",
-        "ambjax/page/document.py",
+        "ambjax/page/html_page.py",
         'text.replace("<",',
         'text.replace("absent",',
-        BROWSER + "test_nothing_of_the_case_is_markup_and_nothing_is_loaded",
+        "tests/test_page.py::test_nothing_of_the_case_is_markup_and_nothing_is_loaded",
     ),
     M(
         "states of the loop that others need are dropped",
         "ambjax/page/functions.py",
         "if more == kept:",
         "if more:",
-        BROWSER + "test_members_are_those_of_the_ensemble",
+        "tests/test_page.py::test_members_are_those_of_the_ensemble",
     ),
     M(
         "the case file of the page changes the controller's model with the plant",

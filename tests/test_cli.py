@@ -137,7 +137,7 @@ def test_bad_flags(argv, words, capsys):
 def test_without_a_command_the_first_ones_are_listed_in_order(capsys):
     assert main([]) == 0
     listed = re.findall(r"^  ambjax (\w+)", capsys.readouterr().out, re.MULTILINE)
-    assert listed == ["template", "simulate", "check", "tune", "export"]
+    assert listed == ["template", "simulate", "check", "tune", "export", "page"]
 
 
 def test_the_tuner_is_a_command_of_its_own_package(capsys):

@@ -17,7 +17,7 @@ from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.study import Study
 from ambjax.linear.analysis import analyse, linearise
 from ambjax.page.case_text import checked, filled, template
-from ambjax.page.document import MEMBERS, page
+from ambjax.page.html_page import MEMBERS, page
 from ambjax.page.sliders import SEED, parameter_values, sliders
 from ambjax.results.runs import simulate
 
@@ -107,7 +107,10 @@ def test_the_file_of_the_page_is_named_and_not_overwritten(tmp_path, capsys):
 
 
 HOSTILE = "</script><img src=x onerror=\"document.title='owned'\">"
-pytestmark_browser = [pytest.mark.slow, pytest.mark.skipif(not browser.CHROMIUM, reason=browser.MISSING)]
+
+
+def in_browser(test):
+    return pytest.mark.slow(pytest.mark.skipif(not browser.CHROMIUM, reason=browser.MISSING)(test))
 
 
 @pytest.fixture(scope="module")
@@ -154,129 +157,153 @@ def typed(tab, path, text):
     settled(tab)
 
 
-class TestInABrowser:
-    pytestmark = pytestmark_browser
+@in_browser
+def test_the_trajectory_is_the_simulator_s_with_its_noise(fresh, case):
+    rows = simulate(case).trajectory.rows
+    # equal to the order of rounding; the issue of an error would be at least the noise, 5e-7 m
+    for name, tolerance in (("z", 1e-13), ("z_measured", 1e-13), ("u", 1e-6), ("i", 1e-9), ("r", 0)):
+        np.testing.assert_allclose(signal(fresh, name), getattr(rows, name), rtol=0, atol=tolerance, err_msg=name)
+    upper = float(case.scenario.plant.i_0) + np.asarray(rows.i)
+    np.testing.assert_allclose(signal(fresh, "i_1"), upper, rtol=0, atol=1e-9)
 
-    def test_the_trajectory_is_the_simulator_s_with_its_noise(self, fresh, case):
-        rows = simulate(case).trajectory.rows
-        # equal to the order of rounding; the issue of an error would be at least the noise, 5e-7 m
-        for name, tolerance in (("z", 1e-13), ("z_measured", 1e-13), ("u", 1e-6), ("i", 1e-9), ("r", 0)):
-            np.testing.assert_allclose(signal(fresh, name), getattr(rows, name), rtol=0, atol=tolerance, err_msg=name)
-        upper = float(case.scenario.plant.i_0) + np.asarray(rows.i)
-        np.testing.assert_allclose(signal(fresh, "i_1"), upper, rtol=0, atol=1e-9)
 
-    def test_metrics_are_the_simulator_s(self, fresh, case):
-        metrics = simulate(case).metrics
-        found = fresh.run("ambjax.state.metrics")
-        assert set(found) == set(metrics)
-        for name, value in metrics.items():
-            # JSON has no infinity: null
-            assert (np.inf if found[name] is None else found[name]) == pytest.approx(float(value), rel=1e-6), name
-        shown = fresh.run("document.getElementById('metrics').innerText")
-        assert all(name in shown for name in metrics)
+@in_browser
+def test_metrics_are_the_simulator_s(fresh, case):
+    metrics = simulate(case).metrics
+    found = fresh.run("ambjax.state.metrics")
+    assert set(found) == set(metrics)
+    for name, value in metrics.items():
+        # JSON has no infinity: null
+        assert (np.inf if found[name] is None else found[name]) == pytest.approx(float(value), rel=1e-6), name
+    shown = fresh.run("document.getElementById('metrics').innerText")
+    assert all(name in shown for name in metrics)
 
-    def test_members_are_those_of_the_ensemble(self, fresh, case):
-        study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, MEMBERS)
-        errors = np.asarray(
-            run_ensemble(*study.batch(np.arange(MEMBERS)), case.clock, fold=None, every=1).trajectory.rows.e_z
-        )
-        low, high = (np.array(fresh.run(f"Array.from(ambjax.state.envelope.{end})")) for end in ("low", "high"))
-        np.testing.assert_allclose([low, high], [errors.min(axis=0), errors.max(axis=0)], rtol=0, atol=1e-12)
-        assert fresh.run("ambjax.state.envelope.kept") == MEMBERS
 
-    def test_sensitivity_is_that_of_the_linear_analysis(self, fresh, case):
-        for delay in ("1", "1.25"):
-            typed(fresh, "processor.delay", delay)
-            other = rig(re.sub(r"delay = 1.0", f"delay = {delay}", RIG))
-            system = linearise(other.cascade, other.scenario, other.clock)
-            expected = analyse(system, other.scenario.plant.m, other.clock.sample_period, other.zones)
-            S = fresh.run("({...ambjax.state.answer.S})")
-            size = np.abs(np.asarray(system.sensitivity(np.array(S["f"]))))
-            np.testing.assert_allclose(S["size"], size, rtol=1e-7)
-            assert S["peak"] == pytest.approx(expected.S.height, rel=1e-6)
-            assert (S["stable"], S["zone"]) == (expected.stable, expected.zone)
+@in_browser
+def test_members_are_those_of_the_ensemble(fresh, case):
+    study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, MEMBERS)
+    errors = np.asarray(
+        run_ensemble(*study.batch(np.arange(MEMBERS)), case.clock, fold=None, every=1).trajectory.rows.e_z
+    )
+    low, high = (np.array(fresh.run(f"Array.from(ambjax.state.envelope.{end})")) for end in ("low", "high"))
+    np.testing.assert_allclose([low, high], [errors.min(axis=0), errors.max(axis=0)], rtol=0, atol=1e-12)
+    assert fresh.run("ambjax.state.envelope.kept") == MEMBERS
 
-    def test_a_fractional_delay_is_the_simulator_s(self, fresh):
-        typed(fresh, "processor.delay", "0.5")
-        other = rig(RIG.replace("delay = 1.0", "delay = 0.5"))
-        np.testing.assert_allclose(signal(fresh, "z"), simulate(other).trajectory.rows.z, rtol=0, atol=1e-12)
 
-    def test_a_slider_moves_the_response_and_the_preset_restores_it(self, fresh):
-        before = signal(fresh, "z")
-        fresh.run("document.querySelector('[data-path=\"controller.position.k\"]').focus()")
-        for _ in range(50):
-            fresh.key("ArrowRight")
-        settled(fresh)
-        assert np.max(np.abs(signal(fresh, "z") - before)) > 1e-6
-        fresh.click("#reset")
-        settled(fresh)
-        np.testing.assert_array_equal(signal(fresh, "z"), before)
+@in_browser
+def test_sensitivity_is_that_of_the_linear_analysis(fresh, case):
+    for delay in ("1", "1.25"):
+        typed(fresh, "processor.delay", delay)
+        other = rig(re.sub(r"delay = 1.0", f"delay = {delay}", RIG))
+        system = linearise(other.cascade, other.scenario, other.clock)
+        expected = analyse(system, other.scenario.plant.m, other.clock.sample_period, other.zones)
+        S = fresh.run("({...ambjax.state.answer.S})")
+        size = np.abs(np.asarray(system.sensitivity(np.array(S["f"]))))
+        np.testing.assert_allclose(S["size"], size, rtol=1e-7)
+        assert S["peak"] == pytest.approx(expected.S.height, rel=1e-6)
+        assert (S["stable"], S["zone"]) == (expected.stable, expected.zone)
 
-    def test_the_second_preset_has_its_own_numbers(self, fresh, tuned):
-        fresh.run("document.getElementById('preset').value = 1")
-        fresh.run("document.getElementById('preset').dispatchEvent(new Event('change'))")
-        settled(fresh)
-        np.testing.assert_allclose(signal(fresh, "z"), simulate(tuned).trajectory.rows.z, rtol=0, atol=1e-12)
-        assert HOSTILE in fresh.run("ambjax.caseFile()")
 
-    def test_an_extreme_value_loses_the_rotor_and_says_so(self, fresh):
-        typed(fresh, "controller.position.k", "0.01")
-        typed(fresh, "plant.m", "16")
-        said = fresh.run("document.getElementById('status').textContent")
-        assert said.startswith("The rotor is lost at ")
-        assert "touched down" in said
-        assert fresh.run("document.getElementById('status').classList.contains('lost')")
-        assert fresh.run("ambjax.state.envelope.kept") < MEMBERS
-        assert fresh.run("ambjax.state.metrics.lost") == 1
+@in_browser
+def test_a_fractional_delay_is_the_simulator_s(fresh):
+    typed(fresh, "processor.delay", "0.5")
+    other = rig(RIG.replace("delay = 1.0", "delay = 0.5"))
+    np.testing.assert_allclose(signal(fresh, "z"), simulate(other).trajectory.rows.z, rtol=0, atol=1e-12)
 
-    def test_a_wrong_number_is_refused_in_words(self, fresh):
-        before = fresh.run("ambjax.state.sent")
-        box = "document.querySelector('[data-path=\"plant.m\"]').parentElement"
-        for text, words in (("-1", "at least"), ("heavy", "Type a number"), ("", "Type a number"), ("1e99", "at most")):
-            typed(fresh, "plant.m", text)
-            assert words in fresh.run(f"{box}.querySelector('.fault').textContent")
-        assert fresh.run(f"{box}.querySelector('input[type=text]').getAttribute('aria-invalid')") == "true"
-        assert fresh.run("ambjax.state.sent") == before
 
-    def test_the_case_file_with_these_numbers_simulates_to_the_same_run(self, fresh):
-        for path, text in (("controller.position.c", "1500"), ("plant.m", "1.7"), ("sensor.std", "1e-6"), (SEED, "3")):
-            typed(fresh, path, text)
-        fresh.click("#write")
-        text = fresh.run("document.getElementById('text').value")
-        np.testing.assert_allclose(
-            signal(fresh, "z"), simulate(rig(text)).trajectory.rows.z, rtol=0, atol=1e-12, err_msg=text
-        )
-        assert "m = 1.64" in text.split("[controller.model]")[1]
-        fresh.click("#tune")
-        assert fresh.run("document.getElementById('text').value").startswith("ambjax tune ")
+@in_browser
+def test_a_slider_moves_the_response_and_the_preset_restores_it(fresh):
+    before = signal(fresh, "z")
+    fresh.run("document.querySelector('[data-path=\"controller.position.k\"]').focus()")
+    for _ in range(50):
+        fresh.key("ArrowRight")
+    settled(fresh)
+    assert np.max(np.abs(signal(fresh, "z") - before)) > 1e-6
+    fresh.click("#reset")
+    settled(fresh)
+    np.testing.assert_array_equal(signal(fresh, "z"), before)
 
-    def test_nothing_of_the_case_is_markup_and_nothing_is_loaded(self, fresh):
-        assert fresh.run("document.title") != "owned"
-        assert fresh.run("document.querySelectorAll('img').length") == 0
-        assert {url.partition(":")[0] for url in fresh.requests} <= {"file", "blob", "data"}
 
-    def test_the_machine_follows_the_time(self, fresh):
-        drawing = "document.querySelector('#drawing svg').getAttribute('aria-label')"
-        begin = fresh.run(drawing)
-        fresh.run("document.getElementById('time').focus()")
-        fresh.key("End")
-        assert fresh.run(drawing) != begin
-        z = 1e6 * signal(fresh, "z")[-1]
-        assert f"Rotor at {z:.2f} micrometres" in fresh.run(drawing)
+@in_browser
+def test_the_second_preset_has_its_own_numbers(fresh, tuned):
+    fresh.run("document.getElementById('preset').value = 1")
+    fresh.run("document.getElementById('preset').dispatchEvent(new Event('change'))")
+    settled(fresh)
+    np.testing.assert_allclose(signal(fresh, "z"), simulate(tuned).trajectory.rows.z, rtol=0, atol=1e-12)
+    assert HOSTILE in fresh.run("ambjax.caseFile()")
 
-    def test_every_input_has_a_label(self, fresh):
-        unnamed = "[...document.querySelectorAll('input, select, textarea')].filter("
-        unnamed += "e => !e.labels.length && !e.ariaLabel).length"
-        assert fresh.run(unnamed) == 0
 
-    @pytest.mark.parametrize("width", [390, 1280])
-    def test_the_page_does_not_scroll_sideways(self, fresh, width):
-        fresh.size(width)
-        try:
-            fresh.wait(f"innerWidth === {width}")
-            assert fresh.run("document.documentElement.scrollWidth") <= width
-        finally:
-            fresh.size(1280)
+@in_browser
+def test_an_extreme_value_loses_the_rotor_and_says_so(fresh):
+    typed(fresh, "controller.position.k", "0.01")
+    typed(fresh, "plant.m", "16")
+    said = fresh.run("document.getElementById('status').textContent")
+    assert said.startswith("The rotor is lost at ")
+    assert "touched down" in said
+    assert fresh.run("document.getElementById('status').classList.contains('lost')")
+    assert fresh.run("ambjax.state.envelope.kept") < MEMBERS
+    assert fresh.run("ambjax.state.metrics.lost") == 1
+
+
+@in_browser
+def test_a_wrong_number_is_refused_in_words(fresh):
+    before = fresh.run("ambjax.state.sent")
+    box = "document.querySelector('[data-path=\"plant.m\"]').parentElement"
+    for text, words in (("-1", "at least"), ("heavy", "Type a number"), ("", "Type a number"), ("1e99", "at most")):
+        typed(fresh, "plant.m", text)
+        assert words in fresh.run(f"{box}.querySelector('.fault').textContent")
+    assert fresh.run(f"{box}.querySelector('input[type=text]').getAttribute('aria-invalid')") == "true"
+    assert fresh.run("ambjax.state.sent") == before
+
+
+@in_browser
+def test_the_case_file_with_these_numbers_simulates_to_the_same_run(fresh):
+    for path, text in (("controller.position.c", "1500"), ("plant.m", "1.7"), ("sensor.std", "1e-6"), (SEED, "3")):
+        typed(fresh, path, text)
+    fresh.click("#write")
+    text = fresh.run("document.getElementById('text').value")
+    np.testing.assert_allclose(
+        signal(fresh, "z"), simulate(rig(text)).trajectory.rows.z, rtol=0, atol=1e-12, err_msg=text
+    )
+    assert "m = 1.64" in text.split("[controller.model]")[1]
+    fresh.click("#tune")
+    assert fresh.run("document.getElementById('text').value").startswith("ambjax tune ")
+
+
+@in_browser
+def test_nothing_of_the_case_is_markup_and_nothing_is_loaded(fresh):
+    assert fresh.run("document.title") != "owned"
+    assert fresh.run("document.querySelectorAll('img').length") == 0
+    assert {url.partition(":")[0] for url in fresh.requests} <= {"file", "blob", "data"}
+
+
+@in_browser
+def test_the_machine_follows_the_time(fresh):
+    drawing = "document.querySelector('#drawing svg').getAttribute('aria-label')"
+    begin = fresh.run(drawing)
+    fresh.run("document.getElementById('time').focus()")
+    fresh.key("End")
+    assert fresh.run(drawing) != begin
+    z = 1e6 * signal(fresh, "z")[-1]
+    assert f"Rotor at {z:.2f} micrometres" in fresh.run(drawing)
+
+
+@in_browser
+def test_every_input_has_a_label(fresh):
+    unnamed = "[...document.querySelectorAll('input, select, textarea')].filter("
+    unnamed += "e => !e.labels.length && !e.ariaLabel).length"
+    assert fresh.run(unnamed) == 0
+
+
+@in_browser
+@pytest.mark.parametrize("width", [390, 1280])
+def test_the_page_does_not_scroll_sideways(fresh, width):
+    fresh.size(width)
+    try:
+        fresh.wait(f"innerWidth === {width}")
+        assert fresh.run("document.documentElement.scrollWidth") <= width
+    finally:
+        fresh.size(1280)
 
 
 @pytest.mark.slow

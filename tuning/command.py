@@ -15,8 +15,8 @@ from ambjax.control.cascade import Cascade
 from ambjax.host.interrupts import reporting
 from ambjax.host.lock import locked
 from ambjax.host.web_page import page
-from ambjax.page.document import NAME
-from ambjax.page.document import page as sliders_page
+from ambjax.page.html_page import NAME
+from ambjax.page.html_page import page as sliders_page
 from tuning.config import read_tune, settings
 from tuning.problem import TuningProblem, problem_of
 from tuning.report import accurate, front_table, pictures

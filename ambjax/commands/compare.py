@@ -23,7 +23,7 @@ from ambjax.export.trace import trace
 from ambjax.host.extensions import extension
 from ambjax.host.web_page import page
 from ambjax.linear.state_space import StateSpace
-from ambjax.page.document import check_processor, pages
+from ambjax.page.html_page import check_processor, pages
 from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks, operating_point, spread_peaks
 
 WRITTEN = ("compare.html", "compare.json", "compare.png")

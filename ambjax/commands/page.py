@@ -6,7 +6,7 @@ import pathlib
 from ambjax.cases.reader import read_case
 from ambjax.commands.outputs import directory, files, make, written
 from ambjax.commands.warnings import read_with_warnings
-from ambjax.page.document import NAME, page
+from ambjax.page.html_page import NAME, page
 
 Summary = dict[str, object]
 

@@ -85,7 +85,7 @@ def _pages(case: Case, args: argparse.Namespace) -> dict[str, str]:
         return {}
     if args.member is not None:
         raise ValueError("--page shows the case, not a member of its ensemble. Leave out --member or --page.")
-    from ambjax.page.document import pages
+    from ambjax.page.html_page import pages
 
     return pages([case], [args.case])
 

@@ -17,7 +17,7 @@ MARK = "1{:05d}e207"
 SIGNALS = "reference", "disturbance"
 
 
-class Line(NamedTuple):
+class TemplateLine(NamedTuple):
     """A line of the case file.
 
     - `parts`: its texts and, between two texts, the place of a slider: its number, and the text of the case's value.
@@ -28,7 +28,7 @@ class Line(NamedTuple):
     only: list[int]
 
 
-def template(text: str, given: Sequence[Slider]) -> tuple[list[Line], list[int]]:
+def template(text: str, given: Sequence[Slider]) -> tuple[list[TemplateLine], list[int]]:
     """Return the lines of a case file, and the numbers of the sliders that have a place in it.
 
     A number that the file leaves out gets a line that is present only if the slider has moved. A change of a number of
@@ -64,9 +64,9 @@ def template(text: str, given: Sequence[Slider]) -> tuple[list[Line], list[int]]
     return lines, placed
 
 
-def _insert(lines: list[Line], table: str, there: bool, rows: Sequence[tuple[Any, list[int]]]) -> None:
+def _insert(lines: list[TemplateLine], table: str, there: bool, rows: Sequence[tuple[Any, list[int]]]) -> None:
     """Insert optional lines below the header of a table; a table that is not there goes to the end."""
-    new = [Line(*row) for row in rows]
+    new = [TemplateLine(*row) for row in rows]
     if there:
         at = next(
             k for k, line in enumerate(lines) if line.parts and str(line.parts[0]).strip().startswith(f"[{table}]")
@@ -74,7 +74,7 @@ def _insert(lines: list[Line], table: str, there: bool, rows: Sequence[tuple[Any
         lines[at + 1 : at + 1] = new
     elif new:
         every = sorted({k for line in new for k in line.only})
-        lines += [Line([""], every), Line([f"[{table}]"], every), *new]
+        lines += [TemplateLine([""], every), TemplateLine([f"[{table}]"], every), *new]
 
 
 def _route(path: str) -> tuple[list[str], str]:
@@ -90,14 +90,14 @@ def _find(document: Any, tables: list[str]) -> Any:
     return document if hasattr(document, "get") else None
 
 
-def _line(text: str, written: dict[int, str]) -> Line:
+def _line(text: str, written: dict[int, str]) -> TemplateLine:
     """Split a line at the marks of its sliders. `written`: the text of each value in the case."""
     pieces = re.split(r"1(\d{5})e207", text)
     parts = [(int(x), written[int(x)]) if n % 2 else x for n, x in enumerate(pieces)]
-    return Line(parts, [])
+    return TemplateLine(parts, [])
 
 
-def filled(lines: Sequence[Line], given: Sequence[Slider], values: Sequence[float]) -> str:
+def filled(lines: Sequence[TemplateLine], given: Sequence[Slider], values: Sequence[float]) -> str:
     """Return the case file with these values. The page does the same in JavaScript."""
     texts = []
     for line in lines:
@@ -114,7 +114,7 @@ def _number(k: int, written: str, given: Sequence[Slider], values: Sequence[floa
     return str(round(values[k])) if given[k].whole else repr(float(values[k]))
 
 
-def checked(lines: Sequence[Line], given: Sequence[Slider]) -> bool:
+def checked(lines: Sequence[TemplateLine], given: Sequence[Slider]) -> bool:
     """Return whether the template with the case's own values, and with all values changed, is valid TOML."""
     try:
         for factor in (1.0, 1.5):

@@ -15,7 +15,7 @@ import numpy as np
 from ambjax.cases.reader import Case
 from ambjax.ensemble.study import Study
 from ambjax.host.optional import extra
-from ambjax.page.case_text import Line, checked, template
+from ambjax.page.case_text import TemplateLine, checked, template
 from ambjax.page.functions import PRELUDE
 from ambjax.page.linear_script import linear_script
 from ambjax.page.loop_functions import numbers_of
@@ -139,7 +139,7 @@ def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str,
     return "\n".join([*generated, *map(_asset, WORKER)]), data
 
 
-def _written(case: Case, others: list[Case]) -> tuple[list[Slider], list[list[Line]]]:
+def _written(case: Case, others: list[Case]) -> tuple[list[Slider], list[list[TemplateLine]]]:
     """Return the sliders that have a place in all case files, and the template of each file.
 
     If the lines that are added do not fit a file, only numbers that the file of the case contains have a slider.
@@ -165,7 +165,7 @@ def _own(given: list[Slider], case: Case) -> list[Slider]:
     return [one._replace(value=float(values[one.parameter])) for one in given]
 
 
-def _preset(case: Case, lines: list[Line]) -> dict[str, Any]:
+def _preset(case: Case, lines: list[TemplateLine]) -> dict[str, Any]:
     values = [float(x) for x in parameter_values(case)]
     return {"name": case.name, "P": [x if np.isfinite(x) else "Infinity" for x in values], "lines": lines}
 
