@@ -14,11 +14,15 @@ from ambjax.control.cascade import Cascade as Cascade
 from ambjax.control.processor import Processor as Processor
 from ambjax.control.schedule import Schedule as Schedule
 from ambjax.ensemble.batching import run_ensemble as run_ensemble
+from ambjax.results.gains import gains_of as gains_of
+from ambjax.results.gains import with_gains as with_gains
 from ambjax.results.operating import sensitivity as sensitivity
 from ambjax.results.runs import CaseRun as CaseRun
 from ambjax.results.runs import simulate as simulate
 from ambjax.results.spread_runs import MembersRun as MembersRun
 from ambjax.results.spread_runs import simulate_members as simulate_members
+from ambjax.results.tuning_run import tune as tune
+from ambjax.results.vector_field import vector_field as vector_field
 from ambjax.simulation.clock import Clock as Clock
 from ambjax.simulation.explicit import DOP853 as DOP853
 from ambjax.simulation.explicit import RK4 as RK4
@@ -36,6 +40,7 @@ from ambjax.simulation.trajectory import Trajectory as Trajectory
 from ambjax.world.amplifier import Amplifier as Amplifier
 from ambjax.world.band_noise import BandNoise as BandNoise
 from ambjax.world.coils import TwoCoil as TwoCoil
+from ambjax.world.iron import Iron as Iron
 from ambjax.world.plant import Plant as Plant
 from ambjax.world.ramps import Ramp as Ramp
 from ambjax.world.ramps import Trapezoid as Trapezoid

@@ -93,7 +93,7 @@ def test_no_cycles():
 
 
 # Ensembles, linear analysis, the design of default gains, and controllers in files.
-SCIPY = ("ambjax.ensemble", "ambjax.linear", "ambjax.control.regulator")
+SCIPY = ("ambjax.ensemble", "ambjax.linear", "ambjax.control.regulator", "ambjax.results.runs")
 SCIPY += ("ambjax.control.realisation", "ambjax.cases.controller_file")
 
 

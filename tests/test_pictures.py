@@ -395,6 +395,7 @@ def test_a_map_without_confidence_bounds_names_none(tmp_path, drawn):
     heatmaps.maps([a_panel(ALL) | {"low": None, "high": None}], "x", "y", False, False, tmp_path / "without.png")
     assert ["confidence interval" in texts(figure) for figure in drawn] == [True, False]
     assert "all runs survive in" in texts(drawn[1])
+    assert ["95 %" in texts(figure) for figure in drawn] == [True, False]
 
 
 def test_maps_refuse(tmp_path):

@@ -206,8 +206,9 @@ def test_distance_to_C_has_a_finite_derivative_on_C():
 
 def test_thresholds_follow_the_plant():
     """Bands are the same share of what sigma, v and i amount to, whatever the plant; Table 1's are its own exactly."""
-    bands = standard_for(0.5, Scenario(clearance=4.5e-3))
-    assert dataclasses.replace(bands, largest_force=np.inf) == Standard()
+    paper = standard_for(0.5, Scenario(clearance=4.5e-3))
+    assert dataclasses.replace(paper, largest_force=np.inf) == Standard()
+    assert float(paper.largest_force) == pytest.approx(PLANT.k_i * PLANT.i_0, rel=1e-12)
     small = Plant(m=1.2, s_0=4e-4, i_0=1.5, n=180.0, A=4e-4, R=0.9, k_z=0.0)
     bands = standard_for(0.5, Scenario(plant=small))
     assert bands.touchdown == 0.9 * small.s_0

@@ -3,13 +3,17 @@
 import json
 import sys
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import ambjax
 import tuning
 from ambjax.__main__ import main
+from ambjax.cases.reader import case_from
 from ambjax.linear import linearise
+from ambjax.simulation.metrics import standard_for
 from ambjax.simulation.trajectory import NOT_SAVED, SIGNAL_UNITS, Row
 from tuning.__main__ import parser
 
@@ -131,7 +135,7 @@ def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
         return 1, {"gains": [], "out": str(tmp_path)}
 
     monkeypatch.setattr("tuning.command.run", searched)
-    tuned = tuning.tune(path, tmp_path, pareto=True)
+    tuned = ambjax.tune(path, tmp_path, pareto=True)
     assert tuned.case == ambjax.read_case(tmp_path / "tuned.toml")
     assert (tuned.good, tuned.directory, tuned.report["gains"]) == (False, tmp_path, [])
     parsed = vars(parser().parse_args([str(path), "--out", str(tmp_path), "--pareto", "--json"]))
@@ -141,3 +145,71 @@ def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
 def test_tune_names_bad_input(tmp_path):
     with pytest.raises(ValueError, match=r"no\.toml"):
         tuning.tune(tmp_path / "no.toml")
+
+
+def test_the_vector_field_is_the_loop_of_simulate():
+    """SciPy's solution of the equations against our own adaptive steps: both to 1e-8 of the sizes of the states."""
+    from scipy.integrate import solve_ivp
+
+    case = case_from({"initial": {"z": 1e-4}, "clock": {"duration": 0.005, "method": "adaptive"}})
+    field = ambjax.vector_field(case)
+    ends = solve_ivp(field.f, (0.0, 0.0049), np.asarray(field.y_0), "Radau", rtol=1e-8, atol=1e-11).y[:, -1]
+    rows = ambjax.simulate(case).trajectory.rows
+    motion = field.named(jnp.asarray(ends)).plant
+    # our steps keep errors below 1e-4 of 2 % of the gap and of 4 % of the bias
+    assert float(motion.z) == pytest.approx(float(rows.z[49]), abs=1e-8)
+    assert float(motion.i) == pytest.approx(float(rows.i[49]), abs=1e-5)
+    with pytest.raises(ValueError, match="vector_field: this controller runs on a processor"):
+        ambjax.vector_field(case_from({"processor": {"delay": 1.0}}))
+
+
+def test_the_vector_field_has_no_noise():
+    noisy, quiet = (
+        ambjax.vector_field(case_from({"sensor": {"std": std, "offset": 1e-6}, "initial": {"z": 1e-4}}))
+        for std in (1e-4, 0.0)
+    )
+    # the same numbers in the same program
+    assert np.array_equal(noisy.f(0.0, noisy.y_0), quiet.f(0.0, quiet.y_0))
+
+
+def test_derivatives_with_respect_to_named_gains_only():
+    cascade = ambjax.Cascade()
+    paths = ["controller.position.c", "controller.current.k_i"]
+    found = ambjax.gains_of(cascade, paths)
+
+    def product(gains):
+        laws = ambjax.with_gains(cascade, gains)
+        return laws.position.c**2 * laws.current.k_i
+
+    slopes = jax.grad(product)(found)
+    c, k_i = float(cascade.position.c), float(cascade.current.k_i)
+    assert {path: float(x) for path, x in slopes.items()} == {paths[0]: pytest.approx(2 * c * k_i), paths[1]: c**2}
+    with pytest.raises(ValueError, match=r"controller\.position\.cc.*Did you mean 'controller\.position\.c'"):
+        ambjax.gains_of(cascade, ["controller.position.cc"])
+
+
+def test_a_run_is_saved_for_other_programs(run, tmp_path):
+    import scipy.io
+
+    for name in ("run.mat", "run.csv", "run.npz"):
+        run.save(tmp_path / name)
+    z = np.asarray(run.trajectory.rows.z)
+    np.testing.assert_array_equal(scipy.io.loadmat(tmp_path / "run.mat")["z"][:, 0], z)
+    table = np.genfromtxt(tmp_path / "run.csv", delimiter=",", names=True)
+    np.testing.assert_array_equal(table["z"], z)
+    with np.load(tmp_path / "run.npz") as saved:
+        np.testing.assert_array_equal(saved["z"], z)
+    with pytest.raises(ValueError, match=r"must end in \.npz, \.mat, \.csv or \.parquet"):
+        run.save(tmp_path / "run.txt")
+
+
+def test_a_notebook_shows_the_members(members):
+    page = members._repr_html_()
+    assert "8 of 8 members are held" in page
+    largest = members.columns["rms_u_V"].max()
+    assert f"<td>{largest:.6g}</td><td>V</td>" in page
+
+
+def test_the_metrics_of_a_case_are_those_of_its_scenario(path):
+    case = ambjax.read_case(path)
+    assert ambjax.Standard.for_case(case) == standard_for(case.settle, case.scenario)

@@ -113,6 +113,8 @@ def _clear(out: pathlib.Path) -> None:
         raise ValueError(
             f"--out {out}: it holds a search that has not ended. Add --resume, or choose another directory."
         )
+    if (out / REPORT).exists():
+        say(f"{out}: the results of an earlier search will be replaced")
     left = remove_all(out)
     if left:
         say(f"{out}: {left} checkpoints of an earlier search are removed")

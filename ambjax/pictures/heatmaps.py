@@ -57,7 +57,7 @@ def maps(
     if rows == 2:
         _errors(figure, axes[1], panels, error_metric, labels)
     keys: list[Any] = [
-        Line2D([], [], color=INK, linewidth=LINES["survival"], label="95 % survival"),
+        Line2D([], [], color=INK, linewidth=LINES["survival"], label=_contour_words(panels)),
     ]
     if any(panel["low"] is not None for panel in panels):
         words = "bounds of the confidence interval at 95 %"
@@ -113,7 +113,8 @@ def _cells(
     for name, width in LINES.items():
         if panel[name] is None:
             continue
-        _outline(ax, x_edges, y_edges, np.asarray(panel[name], float) >= CONTOUR, width)
+        level = 1.0 if panel["low"] is None else CONTOUR
+        _outline(ax, x_edges, y_edges, np.asarray(panel[name], float) >= level, width)
     ax.set_xlim(x_edges[0], x_edges[-1])
     ax.set_ylim(y_edges[0], y_edges[-1])
     for axis, ends, log in ((ax.xaxis, x_edges, x_log), (ax.yaxis, y_edges, y_log)):
@@ -139,6 +140,14 @@ def _outline(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, inside: np.ndar
     for colour, stroke in (("white", width + 1.4), (INK, width)):
         lines = LineCollection([*upright, *level], colors=colour, linewidths=stroke, capstyle="projecting")
         ax.add_collection(lines, autolim=False)
+
+
+def _contour_words(panels: Sequence[Mapping[str, Any]]) -> str:
+    """Return what the contour of survival shows: too few runs a cell say nothing about 95 %."""
+    decisive = [panel["low"] is not None for panel in panels]
+    if all(decisive):
+        return "95 % survival"
+    return "95 % survival, or all runs survive" if any(decisive) else "all runs survive"
 
 
 def _range(panel: Mapping[str, object]) -> str:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import html
+import pathlib
 from collections.abc import Callable
 from typing import Any
 
@@ -54,6 +55,27 @@ class CaseRun:
         signals = {name: ("t", x, {"units": SIGNAL_UNITS[name]}) for name, x in self._signals().items()}
         t = ("t", np.asarray(self.trajectory.rows.t), {"units": "s"})
         return xarray.Dataset(signals, {"t": t}, {"case": self.case.name, "lost_why": self.trajectory.lost_why})
+
+    def save(self, path: str | pathlib.Path) -> None:
+        """Write the signals to a file: .npz, .mat (MATLAB version 5), .csv or .parquet (extra `[tables]`).
+
+        Each signal is an array by its name, in SI units. Raises ValueError for another ending.
+        """
+        path = pathlib.Path(path)
+        arrays = {name: x for name, x in self.trajectory.arrays().items() if name in SIGNAL_UNITS}
+        if path.suffix == ".npz":
+            self.trajectory.save(path)
+        elif path.suffix == ".mat":
+            import scipy.io
+
+            scipy.io.savemat(path, arrays, oned_as="column")
+        elif path.suffix == ".csv":
+            table = np.column_stack(list(arrays.values()))
+            np.savetxt(path, table, "%.17g", ",", header=",".join(arrays), comments="")
+        elif path.suffix == ".parquet":
+            self.to_pandas().reset_index().to_parquet(path)
+        else:
+            raise ValueError(f"save: {path}: the file must end in .npz, .mat, .csv or .parquet.")
 
     def plot(self) -> Any:
         """Return a matplotlib Figure with every signal: the whole run, its start and its end."""

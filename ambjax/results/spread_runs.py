@@ -42,6 +42,19 @@ class MembersRun:
         frame.attrs["units"] = {name: UNITS[name] for name in frame.columns if name in UNITS}
         return frame
 
+    def _repr_html_(self) -> str:
+        """Return the table of the main metrics over the members that are held, for notebooks."""
+        held = np.isposinf(self.columns["lost_at"])
+        head = f"{self.survivors} of {held.size} members are held (seed {self.study.seed})"
+        rows = "".join(
+            f"<tr><td>{name}</td><td>{np.median(x[held]):.6g}</td><td>{x[held].max():.6g}</td>"
+            f"<td>{UNITS.get(name, '')}</td></tr>"
+            for name, x in self.columns.items()
+            if name in UNITS and held.any() and np.isfinite(x[held]).all()
+        )
+        titles = "<tr><th>metric</th><th>median</th><th>largest</th><th>unit</th></tr>"
+        return f"<table><caption>{head}</caption>{titles}{rows}</table>"
+
     def plot(self, *metrics: str) -> Any:
         """Return a matplotlib Figure with histograms of these metrics over the members. Default: the main ones.
 

@@ -5,6 +5,8 @@ the start of each sample, where their values are not typical. Extremes of these 
 integrator's substeps. Effort, chatter and copper loss are computed over the time during which the drive is on.
 """
 
+from typing import Any
+
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record
@@ -64,6 +66,11 @@ class Standard:
     v_tilde_band: Scalar = leaf(default=0.1, unit="A^2/m^2", above=0, at_most=1e30)
     e_band: Scalar = leaf(default=1e-3, unit="A", above=0, at_most=1e6)
     largest_force: Scalar = leaf(default=float("inf"), unit="N", above=0, at_most=1e30, infinite=True)
+
+    @classmethod
+    def for_case(cls, case: Any) -> "Standard":
+        """Return the metrics for a case of `read_case`: `standard_for` with its settling time and its scenario."""
+        return standard_for(case.settle, case.scenario)
 
     def _folds(self) -> Named:
         """Return the fold of each metric by name."""

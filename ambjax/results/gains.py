@@ -1,0 +1,36 @@
+"""Named numbers of a case: read and replaced by their dotted paths, for derivatives with respect to a few of them."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.control.cascade import Cascade
+from ambjax.ensemble.paths import places, with_values
+from ambjax.ensemble.spread import require_path
+from ambjax.world.scenario import Scenario
+
+
+def gains_of(cascade: Cascade, paths: Iterable[str]) -> dict[str, Array]:
+    """Return the numbers of a cascade at dotted paths, such as "controller.position.c", as a dict of scalars.
+
+    The dict is a pytree: `jax.grad(lambda gains: f(with_gains(cascade, gains)))(gains_of(cascade, paths))` returns the
+    derivative with respect to these gains only. Raises ValueError for a path that does not exist.
+    """
+    known = places(cascade, Scenario())
+    own = [path for path in known if path.startswith(("controller.", "processor."))]
+    found = {}
+    for path in paths:
+        require_path(path, own, "")
+        found[path] = jnp.asarray(known[path].value, jnp.result_type(float))
+    return found
+
+
+def with_gains(cascade: Cascade, gains: Mapping[str, Any]) -> Cascade:
+    """Return the cascade with the numbers at these dotted paths replaced. The values may be traced.
+
+    Raises ValueError for a path that does not exist.
+    """
+    gains_of(cascade, gains)
+    return with_values(cascade, Scenario(), gains)[0]

@@ -1,0 +1,53 @@
+"""The closed loop as a function of time and state, for solvers of other packages."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+from jax import Array
+from jax.flatten_util import ravel_pytree
+
+from ambjax.cases.reader import Case
+from ambjax.numerics.records import canonical
+from ambjax.simulation.loop import ClosedLoop, LoopState
+
+
+class VectorField(NamedTuple):
+    """The equations y' = f(t, y) of a closed loop in continuous time.
+
+    - `f`: returns the rate [N] of the state at time t (s) in the state y [N]; a third argument is ignored, as diffrax
+      passes one. It is compiled, and can be differentiated.
+    - `y_0`: state at t = 0 [N].
+    - `named`: returns the state as a tree: `plant` with z (m), z_dot (m/s) and the currents (A), and `control`.
+    """
+
+    f: Callable[..., Array]
+    y_0: Array
+    named: Callable[[Array], LoopState]
+
+
+def vector_field(case: Case) -> VectorField:
+    """Return the equations of the closed loop of a case, for scipy.integrate.solve_ivp or a diffrax.ODETerm.
+
+    Sensor noise is left out, because it is held over samples. A solver does not stop where the rotor touches down.
+    Raises ValueError for a controller on a processor, whose loop is no differential equation.
+    """
+    if case.cascade.processor is not None:
+        raise ValueError(
+            "vector_field: this controller runs on a processor, and its loop is no differential equation. Remove "
+            "[processor] from the case, or use ambjax.simulate."
+        )
+    scenario = case.scenario.in_continuous_time()
+    cascade, scenario = canonical((case.cascade, scenario))
+    sensor = scenario.sensor
+    quiet = None if sensor is None else sensor.louder(0.0)
+    loop = ClosedLoop(cascade, dataclasses.replace(scenario, sensor=quiet)).realised()
+    errors = loop.sensor_errors(0)
+    y_0, named = ravel_pytree(loop.start())
+
+    @jax.jit
+    def f(t: Any, y: Any, args: Any = None) -> Array:
+        return ravel_pytree(loop.rates(loop.inputs(t), named(y), errors))[0]
+
+    return VectorField(f, y_0, named)
