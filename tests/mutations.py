@@ -329,10 +329,38 @@ LAWS += [
 ]
 LOOP = [
     M(
+        "the amplifier's current loop ignores the limit of its supply",
+        "ambjax/world/amplifier.py",
+        "limited(response().voltage(self.slope() * (command - i)), u_max)",
+        "response().voltage(self.slope() * (command - i))",
+        "tests/test_current_drive.py::test_the_current_follows_the_command_with_one_pole",
+    ),
+    M(
+        "the limit of a commanded current is that of the voltage",
+        "ambjax/world/amplifier.py",
+        "return jnp.inf if self.i_max is None else self.i_max",
+        "return u_max",
+        "tests/test_current_drive.py::test_the_command_is_limited",
+    ),
+    M(
+        "the linear loop takes a commanded current as a voltage",
+        "ambjax/linear/matrices.py",
+        "u = scenario.coil_voltage(command.u, state)",
+        "u = command.u",
+        "tests/test_current_drive.py::test_the_poles_in_continuous_time_are_those_of_the_textbook",
+    ),
+    M(
+        "a law and an amplifier with different commands are accepted",
+        "ambjax/simulation/system.py",
+        "if cascade.current.commands != scenario.drive:",
+        "if False:",
+        "tests/test_current_drive.py::test_what_does_not_fit_is_refused_in_one_line",
+    ),
+    M(
         "the supply's limit is ignored",
         "ambjax/simulation/loop.py",
-        "return command, rates, limited(command.u, u_max)",
-        "return command, rates, command.u",
+        "self.scenario.coil_voltage(limited(command.u, u_max), state.plant",
+        "self.scenario.coil_voltage(command.u, state.plant",
         "tests/test_rollout.py::test_the_supply_limits_the_voltage_that_is_applied",
     ),
     M(

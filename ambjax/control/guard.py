@@ -4,6 +4,7 @@ docs/processor.md defines the rules.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
@@ -136,9 +137,9 @@ class Guard:
         return refused, refused & (before.left <= 0)
 
 
-def expected(model: Plant, motion: Measurement, u: Array, period: Scalar) -> Measurement:
-    """Predict the readings of the next sample from `motion` under a mean voltage u (V)."""
-    rates = model.rates(State(*motion), u)
+def expected(driven: Callable[[Array, State], State], motion: Measurement, u: Array, period: Scalar) -> Measurement:
+    """Predict the readings of the next sample from `motion` under a mean command u. `driven`: `Cascade.driven`."""
+    rates = driven(u, State(*motion))
     z, z_dot, i = (x + period * rate for x, rate in zip(motion, rates, strict=True))
     return Measurement(z + period * period / 2 * rates.z_dot, z_dot, i)
 

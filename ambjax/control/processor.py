@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,7 @@ from jax import Array
 from ambjax.control.guard import Guard
 from ambjax.numerics.records import Scalar, is_traced, leaf, record, static
 from ambjax.numerics.runge_kutta import rk4_step
-from ambjax.world.plant import Plant, State
+from ambjax.world.plant import State
 from ambjax.world.sensor import Measurement
 
 # Largest delay, samples.
@@ -89,14 +90,17 @@ class Processor:
         return (jnp.minimum(ahead, 1.0) * period, jnp.maximum(ahead - 1.0, 0.0) * period)[: self.most]
 
 
-def carried(model: Plant, estimate: Measurement, past: tuple[Array, Array], lengths: tuple[Array, ...]) -> Measurement:
-    """Predict the estimate over these lengths (s), the last first, by one RK4 step of the model for each voltage."""
+def carried(
+    driven: Callable[[Array, State], State],
+    estimate: Measurement,
+    past: tuple[Array, Array],
+    lengths: tuple[Array, ...],
+) -> Measurement:
+    """Predict the estimate over these lengths (s), the last first, by one RK4 step of the model for each command.
 
-    x = model.start(estimate)
+    `driven`: `Cascade.driven`.
+    """
+    x = State(*estimate)
     for u, h in reversed(list(zip(past, lengths, strict=False))):
-        x = rk4_step(functools.partial(_rates, model, u), x, h)
-    return model.measurement(x)
-
-
-def _rates(model: Plant, u: Array, x: State) -> State:
-    return model.rates(x, u)
+        x = rk4_step(functools.partial(driven, u), x, h)
+    return Measurement(*x)

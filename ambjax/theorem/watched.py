@@ -63,7 +63,7 @@ class Watched:
         loop, before = self.loop, state.loop
         cascade, after = loop.loop.cascade, loop.jump(t, before, errors)
         reference = loop.reference(t)
-        sample = Sample(reference, loop.period, jnp.asarray(loop.loop.scenario.u_max), after.past)
+        sample = Sample(reference, loop.period, jnp.asarray(loop.loop.scenario.command_limit), after.past)
         measured = loop.measured(before.plant, before.z_filtered, errors)
         estimate, *_ = cascade.estimate(measured, before.control.observer, sample)
         sigma, command = cascade.sigma(estimate, reference), after.command
