@@ -9,7 +9,7 @@ import pytest
 from ambjax import Cascade, Clock, Initial, Plant, Processor, Scenario, rollout
 from ambjax.cases.reader import case_from
 from ambjax.control import current, inversion, observer, position
-from ambjax.export.controller import controller_of, parameters_of
+from ambjax.export.controller import controller_of
 from ambjax.linear import injected, linearise, loop_matrices
 from ambjax.world.amplifier import CurrentAmplifier
 from ambjax.world.coils import TwoCoil
@@ -107,8 +107,8 @@ def test_the_injected_sensitivity_is_the_linear_one(kind):
 
 def test_the_export_commands_a_current():
     controller = controller_of(sampled(), 1.5, PERIOD)
-    found = {x.name: x for x in parameters_of(controller.parameters)}
-    assert controller.commands == "current"
+    found = {x.name: x for x in controller.numbers()}
+    assert controller.outputs["u"][0] == "A"
     assert (found["limits.u_max"].unit, found["limits.u_max"].value) == ("A", 1.5)
 
 

@@ -97,7 +97,7 @@ def lines() -> Iterator[Line]:
     )
     yield Line(
         'gains = ["controller.position.c", "controller.position.k"]',
-        "gains to tune; left out: all gains of the laws but p",
+        "gains to tune; left out: all, p only where it is finite on a processor",
     )
     yield Line(
         "bounds.controller.position.c = [1.0, 500.0]",

@@ -195,7 +195,7 @@ class Cascade:
         now, state = self._advance(sample)(present(self.observer, measured.z, sample.reference), measured, state)
         estimate = now
         if processor.predicts:
-            estimate = carried(self.driven, now, sample.past, processor.stretches(sample.period))
+            estimate = carried(self.model, self.driven, now, sample.past, processor.stretches(sample.period))
         return estimate, state, now
 
     def step(

@@ -139,7 +139,7 @@ class Guard:
 
 def expected(driven: Callable[[Array, State], State], motion: Measurement, u: Array, period: Scalar) -> Measurement:
     """Predict the readings of the next sample from `motion` under a mean command u. `driven`: `Cascade.driven`."""
-    rates = driven(u, State(*motion))
+    rates = Measurement(*driven(u, State(*motion))[:3])
     z, z_dot, i = (x + period * rate for x, rate in zip(motion, rates, strict=True))
     return Measurement(z + period * period / 2 * rates.z_dot, z_dot, i)
 

@@ -12,7 +12,7 @@ from jax import Array
 from ambjax.control.guard import Guard
 from ambjax.numerics.records import Scalar, is_traced, leaf, record, static
 from ambjax.numerics.runge_kutta import rk4_step
-from ambjax.world.plant import State
+from ambjax.world.plant import Plant, State
 from ambjax.world.sensor import Measurement
 
 # Largest delay, samples.
@@ -91,6 +91,7 @@ class Processor:
 
 
 def carried(
+    model: Plant,
     driven: Callable[[Array, State], State],
     estimate: Measurement,
     past: tuple[Array, Array],
@@ -100,7 +101,7 @@ def carried(
 
     `driven`: `Cascade.driven`.
     """
-    x = State(*estimate)
+    x = model.start(estimate)
     for u, h in reversed(list(zip(past, lengths, strict=False))):
         x = rk4_step(functools.partial(driven, u), x, h)
-    return Measurement(*x)
+    return model.measurement(x)
