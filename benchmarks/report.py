@@ -38,6 +38,7 @@ Smooth gains are gamma = 1e9 and p = 25e-6 in the inversion; repaired gains are 
     .venv/bin/python benchmarks/bearings.py          # other bearings, and the templates
     .venv/bin/python benchmarks/laws.py              # control structures against each other
     .venv/bin/python benchmarks/search.py            # the search against derivative-free methods
+    .venv/bin/python benchmarks/laws.py              # control structures, each tuned; hours; resumable
     .venv/bin/python benchmarks/schedules.py         # 24 scheduled gains: the search against CMA-ES
     .venv/bin/python benchmarks/from_answer.py       # CMA-ES started from a tuned answer
     .venv/bin/python benchmarks/export.py            # a step of an exported controller, also on a Cortex-M4F
@@ -434,6 +435,37 @@ def export() -> list[str]:
     return lines + table(titles, rows)
 
 
+def laws() -> list[str]:
+    """Return a table of the control structures for each case: errors, voltage, |S| and cost."""
+    data = load("laws")
+    lines = ["## Control structures (`laws.py`)", "", facts(data["machine"])]
+    lines += ["Median and range over the seeds; the rms error is the median over the members.", ""]
+    for name, case in data["cases"].items():
+        limits = ", ".join(f"{key} {value:g}" for key, value in case["limits"].items())
+        budget = ", ".join(f"{key} {value}" for key, value in case["budget"].items())
+        lines += [
+            f"**{name}**: {case['title']}. Limits: {limits}. Seeds: {case['seeds']}. Budget: {budget}. Compared on "
+            f"{case['members']} members.",
+            "",
+        ]
+        rows = []
+        for law, row in case["structures"].items():
+            scaled = (("rms_error_median_m", 1e6), ("rms_error_worst_m", 1e6), ("rms_u_V", 1.0), ("worst_peak", 1.0))
+            numbers = [_middle(row[key], times) for key, times in scaled]
+            rows.append([law, *numbers, str(max(row["lost"])), "-" if row["flops"] is None else str(row["flops"])])
+        titles = "structure | rms error (µm) | worst member (µm) | rms voltage (V) | worst peak of S | lost | flops"
+        lines += [*table(titles, rows), ""]
+    return lines
+
+
+def _middle(values: list[float] | None, times: float) -> str:
+    """Return the median with the range, or the only value; `values`: median, least and largest, or None."""
+    if values is None:
+        return "-"
+    middle, low, high = (times * x for x in values)
+    return f"{middle:.3g}" if low == high else f"{middle:.3g} ({low:.3g} to {high:.3g})"
+
+
 SECTIONS = {
     "single": single,
     "work_precision": work_precision,
@@ -449,6 +481,7 @@ SECTIONS = {
     "bearings": bearings,
     "sampled_tasks": sampled_tasks,
     "search": search,
+    "laws": laws,
     "schedules": schedules,
     "from_answer": from_answer,
     "gpu": gpu,

@@ -730,6 +730,20 @@ ENSEMBLE = [
 ]
 SEARCH = [
     M(
+        "a steepness is tuned in continuous time too",
+        "tuning/config.py",
+        "    if cascade.processor is None:\n        return tunable(cascade, steepness=False)",
+        "    if False:\n        return tunable(cascade, steepness=False)",
+        "tests/test_tuning_space.py::test_a_processor_tunes_finite_steepnesses_by_default",
+    ),
+    M(
+        "the test of the delay margin adds no delay",
+        "tuning/delay_test.py",
+        "delay=delay, assumed",
+        "delay=processor.delay, assumed",
+        "tests/test_tuning_delay.py::test_members_are_lost_beyond_the_linear_margin_and_not_below",
+    ),
+    M(
         "who validates is who trained",
         "tuning/config.py",
         "int(np.uint32(budget.seed + 2_000_003))",
