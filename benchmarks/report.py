@@ -38,7 +38,6 @@ Smooth gains are gamma = 1e9 and p = 25e-6 in the inversion; repaired gains are 
     .venv/bin/python benchmarks/bearings.py          # other bearings, and the templates
     .venv/bin/python benchmarks/laws.py              # control structures against each other
     .venv/bin/python benchmarks/search.py            # the search against derivative-free methods
-    .venv/bin/python benchmarks/laws.py              # control structures, each tuned; hours; resumable
     .venv/bin/python benchmarks/schedules.py         # 24 scheduled gains: the search against CMA-ES
     .venv/bin/python benchmarks/from_answer.py       # CMA-ES started from a tuned answer
     .venv/bin/python benchmarks/export.py            # a step of an exported controller, also on a Cortex-M4F

@@ -1545,17 +1545,17 @@ SAMPLED = [
         "tests/test_realism.py::test_dead_band_and_current_limit",
     ),
     M(
-        "the current limit holds against Eq. (2)'s resistance alone",
-        "ambjax/simulation/between.py",
-        "return still / (still - driven)  # i' is linear in u",
-        "return plant.R * plant.measurement(x).i",
+        "the voltage that holds a current has the wrong sign",
+        "ambjax/world/amplifier.py",
+        "return (rate - self.still) / self.per_volt",
+        "return (rate + self.still) / self.per_volt",
         "tests/test_realism.py::test_the_current_stays_within_its_limit",
     ),
     M(
         "the current limit demands more than the supply gives",
         "ambjax/world/amplifier.py",
-        "kept = limited(holding_voltage(), u_max)",
-        "kept = holding_voltage()",
+        "kept = limited(response().voltage(0.0), u_max)",
+        "kept = response().voltage(0.0)",
         "tests/test_realism.py::test_dead_band_and_current_limit",
     ),
     M(
