@@ -1,11 +1,12 @@
-"""Control structures against each other: each tuned by `ambjax compare --tune`, then evaluated on the same members.
+"""Control structures against each other: each tuned by `ambjax tune`, then evaluated on the same members.
 
 Cases: F20 and G20 of the tuning tasks on a processor, and the templates `rig` and `bearing`. All structures of a case
-have the same members, loss, limits and budget, and each is tuned with every seed. All gains are tuned, the steepnesses
-p included. A comparison that exists in DIR/CASE-SEED is not run again, and results of other cases are kept.
-`--quick` uses one seed and a small budget, to test the script; its results are not written. Compilation takes most of
-the time of a search; later seeds of a case reuse the compiled programs.
-Run: python benchmarks/laws.py [--out DIR] [--quick] [CASE ...]
+have the same members, loss, limits and budget, and each is tuned with every seed for the least error within the limits.
+All gains are tuned, the steepnesses p included. The results contain the seeds and the budget of each case. What exists
+in DIR/CASE-SEED is not run again: a benchmark that was stopped goes on at the structure where it stopped. Results of
+other cases are kept. `--quick` uses one seed and a tiny budget, to test the script; its results are not written.
+Compilation takes most of the time of a search; later seeds of a case reuse the compiled programs.
+Run: python benchmarks/laws.py [CASE ...] [--out DIR] [--quick] [--seeds N] [--budget full|small] [--only NAME ...]
 """
 
 import argparse
@@ -35,8 +36,20 @@ LIMITS: dict[str, dict[str, float]] = {
     "rig": {"sensitivity": 3.0, "rms_u_V": 16.0, "chatter_V_per_s": 1.5e5},
     "bearing": {"sensitivity": 3.0, "rms_u_V": 8.0, "chatter_V_per_s": 5e4},
 }
-BUDGET = {"members": 16, "stressed": 4, "validation": 200, "held_out": 0, "screen": 48, "starts": 2, "iterations": 15}
-QUICK = {"members": 4, "stressed": 0, "validation": 0, "held_out": 0, "screen": 8, "starts": 1, "iterations": 2}
+# Budgets of a search. `tiny` only tests the script.
+BUDGETS = {
+    "full": {
+        "members": 16,
+        "stressed": 4,
+        "validation": 200,
+        "held_out": 0,
+        "screen": 48,
+        "starts": 2,
+        "iterations": 15,
+    },
+    "small": {"members": 8, "stressed": 2, "validation": 0, "held_out": 0, "screen": 32, "starts": 2, "iterations": 10},
+    "tiny": {"members": 4, "stressed": 0, "validation": 0, "held_out": 0, "screen": 8, "starts": 1, "iterations": 2},
+}
 SEEDS, JUDGED, JUDGED_SEED = 5, 500, 1000
 # Numbers of compare.json in the results; the median and the range over seeds of each.
 SHOWN = ("rms_error_median_m", "rms_error_worst_m", "max_error_m", "rms_u_V", "chatter_V_per_s", "peak", "worst_peak")
@@ -46,19 +59,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", default=list(LIMITS))
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out", "laws"))
-    parser.add_argument("--quick", action="store_true", help="one seed, a small budget, nothing written to results")
+    parser.add_argument("--quick", action="store_true", help="one seed, a tiny budget, nothing written to results")
+    parser.add_argument("--seeds", type=int, default=SEEDS, help="number of searches of each structure")
+    parser.add_argument("--only", nargs="+", metavar="STRUCTURE", help="structures to compare; left out: all")
+    parser.add_argument("--budget", choices=["full", "small"], default="full", help="size of each search")
     given = parser.parse_args()
     path = _measure.RESULTS / "laws.json"
     rows = json.loads(path.read_text())["cases"] if path.exists() else {}
     for name in given.names:
-        budget, count, members = (QUICK, 1, 20) if given.quick else (BUDGET, SEEDS, JUDGED)
-        found = [compared(name, seed, budget, members, given.out) for seed in range(1, count + 1)]
-        rows[name] = {"title": title(name), "limits": LIMITS[name], "structures": summary(found)}
+        budget, count, members = ("tiny", 1, 20) if given.quick else (given.budget, given.seeds, JUDGED)
+        found = [compared(name, seed, BUDGETS[budget], members, given) for seed in range(1, count + 1)]
+        rows[name] = {
+            "title": title(name),
+            "limits": LIMITS[name],
+            "budget": BUDGETS[budget],
+            "seeds": count,
+            "members": members,
+            "structures": summary(found),
+        }
         for law, row in rows[name]["structures"].items():
             print(f"{name}, {law}: {text(row)}", flush=True)
-    if not given.quick:
-        facts = {"budget": BUDGET, "seeds": SEEDS, "members": JUDGED}
-        _measure.write("laws", {**facts, "cases": {name: rows[name] for name in LIMITS if name in rows}})
+        if not given.quick:
+            _measure.write("laws", {"cases": {name: rows[name] for name in LIMITS if name in rows}})
 
 
 def source(name: str) -> str:
@@ -76,6 +98,7 @@ def title(name: str) -> str:
 def structures(case: Case, laws: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the tables [controller] of all structures. `laws`: that of the case, whose observer all have.
 
+    LQG is state feedback with a Kalman filter, which is that of the case if it has one.
     The PI controller starts with three times the bandwidth of the plant's pole, the others with their defaults.
     """
     w, L = float(case.scenario.plant.pole), float(case.scenario.plant.L)
@@ -97,7 +120,9 @@ def structures(case: Case, laws: dict[str, Any]) -> dict[str, dict[str, Any]]:
         },
         "lqg": {"position": {"kind": "state-feedback"}, "inversion": {"kind": "linearised"}, "current": drive},
     }
-    return {name: {"observer": laws.get("observer", {}), **found[name]} for name in found}
+    observer = laws.get("observer", {})
+    kalman = observer if observer.get("kind") == "kalman" else {"kind": "kalman"}
+    return {name: {"observer": kalman if name == "lqg" else observer, **found[name]} for name in found}
 
 
 def _without(table: dict[str, Any], key: str) -> dict[str, Any]:
@@ -114,22 +139,50 @@ def written(name: str, seed: int, budget: dict[str, int], folder: pathlib.Path) 
         known = tunable(cascade)
         values = Space(tuple(Gain(path) for path in known)).values(cascade)
         gains = [path for path, value in zip(known, values, strict=True) if math.isfinite(value)]
-        document["tune"] = {"gains": gains, "seed": seed, **budget, "limits": LIMITS[name]}
+        document["tune"] = {
+            "objective": "least_error",
+            "gains": gains,
+            "seed": seed,
+            **budget,
+            "limits": LIMITS[name],
+        }
         paths.append(folder / f"{law}.toml")
         folder.mkdir(parents=True, exist_ok=True)
         paths[-1].write_text(tomlkit.dumps(document))
     return paths
 
 
-def compared(name: str, seed: int, budget: dict[str, int], members: int, out: pathlib.Path) -> list[dict[str, Any]]:
-    """Return the rows of `ambjax compare --tune` of all structures of a case."""
-    folder = out / f"{name}-{seed}"
+def compared(
+    name: str, seed: int, budget: dict[str, int], members: int, given: argparse.Namespace
+) -> list[dict[str, Any]]:
+    """Tune the structures of a case with one seed and return the rows of `ambjax compare` of the tuned cases."""
+    folder = given.out / f"{name}-{seed}"
     answer = folder / "compare.json"
     if not answer.exists():
-        paths = map(str, written(name, seed, budget, folder))
-        words = ["compare", *paths, "--tune", "--members", str(members), "--seed", str(JUDGED_SEED)]
-        subprocess.run([sys.executable, "-m", "ambjax", *words, "--out", str(folder)], check=False)
+        paths = [
+            tuned(path, folder / "tuned")
+            for path in written(name, seed, budget, folder)
+            if not given.only or path.stem in given.only
+        ]
+        command(
+            "compare", *map(str, paths), "--members", str(members), "--seed", str(JUDGED_SEED), "--out", str(folder)
+        )
     return json.loads(answer.read_text())["cases"]
+
+
+def tuned(path: pathlib.Path, folder: pathlib.Path) -> pathlib.Path:
+    """Tune a case file unless this was done, and return the path of the tuned case, which has the name of the law."""
+    answer, search = folder / path.name, folder / path.stem
+    if not answer.exists():
+        command("tune", str(path), "--out", str(search), *["--resume"] * any(search.glob("checkpoint-*.npz")))
+        folder.mkdir(exist_ok=True)
+        answer.write_text((search / "tuned.toml").read_text())
+    return answer
+
+
+def command(*words: str) -> None:
+    """Run a command of ambjax. Exit code 1 means that a limit is missed or a member is lost: the results say so."""
+    subprocess.run([sys.executable, "-m", "ambjax", *words], check=False)
 
 
 def summary(seeds: list[list[dict[str, Any]]]) -> dict[str, Any]:

@@ -456,6 +456,37 @@ def sliders() -> list[str]:
     )
 
 
+def laws() -> list[str]:
+    """Return a table of the control structures for each case: errors, voltage, |S| and cost."""
+    data = load("laws")
+    lines = ["## Control structures (`laws.py`)", "", facts(data["machine"])]
+    lines += ["Median and range over the seeds; the rms error is the median over the members.", ""]
+    for name, case in data["cases"].items():
+        limits = ", ".join(f"{key} {value:g}" for key, value in case["limits"].items())
+        budget = ", ".join(f"{key} {value}" for key, value in case["budget"].items())
+        lines += [
+            f"**{name}**: {case['title']}. Limits: {limits}. Seeds: {case['seeds']}. Budget: {budget}. Compared on "
+            f"{case['members']} members.",
+            "",
+        ]
+        rows = []
+        for law, row in case["structures"].items():
+            scaled = (("rms_error_median_m", 1e6), ("rms_error_worst_m", 1e6), ("rms_u_V", 1.0), ("worst_peak", 1.0))
+            numbers = [_middle(row[key], times) for key, times in scaled]
+            rows.append([law, *numbers, str(max(row["lost"])), "-" if row["flops"] is None else str(row["flops"])])
+        titles = "structure | rms error (µm) | worst member (µm) | rms voltage (V) | worst peak of S | lost | flops"
+        lines += [*table(titles, rows), ""]
+    return lines
+
+
+def _middle(values: list[float] | None, times: float) -> str:
+    """Return the median with the range, or the only value; `values`: median, least and largest, or None."""
+    if values is None:
+        return "-"
+    middle, low, high = (times * x for x in values)
+    return f"{middle:.3g}" if low == high else f"{middle:.3g} ({low:.3g} to {high:.3g})"
+
+
 SECTIONS = {
     "single": single,
     "work_precision": work_precision,
@@ -471,6 +502,7 @@ SECTIONS = {
     "bearings": bearings,
     "sampled_tasks": sampled_tasks,
     "search": search,
+    "laws": laws,
     "schedules": schedules,
     "from_answer": from_answer,
     "gpu": gpu,

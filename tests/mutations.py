@@ -329,10 +329,38 @@ LAWS += [
 ]
 LOOP = [
     M(
+        "the amplifier's current loop ignores the limit of its supply",
+        "ambjax/world/amplifier.py",
+        "limited(response().voltage(self.slope() * (command - i)), u_max)",
+        "response().voltage(self.slope() * (command - i))",
+        "tests/test_current_drive.py::test_the_current_follows_the_command_with_one_pole",
+    ),
+    M(
+        "the limit of a commanded current is that of the voltage",
+        "ambjax/world/amplifier.py",
+        "return jnp.inf if self.i_max is None else self.i_max",
+        "return u_max",
+        "tests/test_current_drive.py::test_the_command_is_limited",
+    ),
+    M(
+        "the linear loop takes a commanded current as a voltage",
+        "ambjax/linear/matrices.py",
+        "u = scenario.coil_voltage(command.u, state)",
+        "u = command.u",
+        "tests/test_current_drive.py::test_the_poles_in_continuous_time_are_those_of_the_textbook",
+    ),
+    M(
+        "a law and an amplifier with different commands are accepted",
+        "ambjax/simulation/system.py",
+        "if cascade.current.commands != scenario.drive:",
+        "if False:",
+        "tests/test_current_drive.py::test_what_does_not_fit_is_refused_in_one_line",
+    ),
+    M(
         "the supply's limit is ignored",
         "ambjax/simulation/loop.py",
-        "return command, rates, limited(command.u, u_max)",
-        "return command, rates, command.u",
+        "self.scenario.coil_voltage(limited(command.u, u_max), state.plant",
+        "self.scenario.coil_voltage(command.u, state.plant",
         "tests/test_rollout.py::test_the_supply_limits_the_voltage_that_is_applied",
     ),
     M(
@@ -701,6 +729,20 @@ ENSEMBLE = [
     ),
 ]
 SEARCH = [
+    M(
+        "a steepness is tuned in continuous time too",
+        "tuning/config.py",
+        "    if cascade.processor is None:\n        return tunable(cascade, steepness=False)",
+        "    if False:\n        return tunable(cascade, steepness=False)",
+        "tests/test_tuning_space.py::test_a_processor_tunes_finite_steepnesses_by_default",
+    ),
+    M(
+        "the test of the delay margin adds no delay",
+        "tuning/delay_test.py",
+        "delay=delay, assumed",
+        "delay=processor.delay, assumed",
+        "tests/test_tuning_delay.py::test_members_are_lost_beyond_the_linear_margin_and_not_below",
+    ),
     M(
         "who validates is who trained",
         "tuning/config.py",
@@ -1538,17 +1580,17 @@ SAMPLED = [
         "tests/test_realism.py::test_dead_band_and_current_limit",
     ),
     M(
-        "the current limit holds against Eq. (2)'s resistance alone",
-        "ambjax/simulation/between.py",
-        "return still / (still - driven)  # i' is linear in u",
-        "return plant.R * plant.measurement(x).i",
+        "the voltage that holds a current has the wrong sign",
+        "ambjax/world/amplifier.py",
+        "return (rate - self.still) / self.per_volt",
+        "return (rate + self.still) / self.per_volt",
         "tests/test_realism.py::test_the_current_stays_within_its_limit",
     ),
     M(
         "the current limit demands more than the supply gives",
         "ambjax/world/amplifier.py",
-        "kept = limited(holding_voltage(), u_max)",
-        "kept = holding_voltage()",
+        "kept = limited(response().voltage(0.0), u_max)",
+        "kept = response().voltage(0.0)",
         "tests/test_realism.py::test_dead_band_and_current_limit",
     ),
     M(

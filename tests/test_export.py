@@ -111,6 +111,7 @@ CASCADES = {
     "Utkin's sliding mode": hard(position=position.UtkinSlidingMode(k=2.3, p=INF)),
     "terminal sliding mode": hard(position=position.TerminalSlidingMode()),
     "feed-forward, dead-beat": hard(inversion=inversion.FeedForwardAdaptive(8e5, INF), current=current.DeadBeat()),
+    "an amplifier's current": hard(inversion=inversion.Linearised(), current=current.AmplifierCurrent(500.0)),
     "Kalman": hard(observer=observer.Kalman()),
     "a difference": hard(observer=observer.Difference(), inversion=inversion.ClosedForm()),
     "a differentiator": hard(observer=observer.IRED1(), processor=Processor(0.5)),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from texts import case_and_tune
 
 from ambjax import (
     Cascade,
@@ -116,6 +117,16 @@ def test_gains_without_effect_are_left_out():
         found = tunable(dataclasses.replace(cascade, processor=processor))
         assert [path for path in found if "current" in path] == [f"controller.current.{used}"]
     assert len(tunable(cascade, idle=True)) == len(found) + 1
+
+
+def test_a_processor_tunes_finite_steepnesses_by_default():
+    """In continuous time no steepness, and on a processor no sign that has none."""
+    text = {"controller": {"inversion": {"p": math.inf}}, "actuator": {"u_max": 200.0}}
+    continuous = case_and_tune({"actuator": {"u_max": 200.0}})[1].space.paths
+    assert not [path for path in continuous if path.endswith(".p")]
+    sampled = case_and_tune(text | {"processor": {}})[1].space.paths
+    assert [path for path in sampled if path.endswith(".p")] == ["controller.position.p", "controller.current.p"]
+    assert set(continuous) < set(sampled)
 
 
 @pytest.mark.parametrize("name", ["tracking", "regulation"])

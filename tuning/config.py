@@ -30,7 +30,7 @@ from tuning.objective.loss import TERMS
 from tuning.objective.quantities import KINDS
 from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.optimisers import NAMES
-from tuning.space import CLOSEST, Gain, Space, knots, tunable
+from tuning.space import CLOSEST, Gain, Space, knots, read, tunable
 
 WORDS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
 # Keys of [tune] that depend on the laws of the case.
@@ -131,7 +131,7 @@ def tune_from(table: Table, case: Case) -> Tune:
 
 def _space(table: Table, case: Case) -> Space:
     known = tunable(case.cascade)
-    default = tunable(case.cascade, steepness=False) or known
+    default = _default_gains(case) or known
     paths = table.raw.get("gains", default)
     if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
         raise ValueError(f'{table.at("gains")} = {show(paths)}: give a list of paths, as in ["controller.position.c"].')
@@ -151,6 +151,17 @@ def _space(table: Table, case: Case) -> Space:
     if clash:
         raise ValueError(f"spread.{clash[0]} is in tune.gains too. Remove it from one of them.")
     return Space(tuple(Gain(path, *_bound(bounds.get(path), path, table)) for path in paths))
+
+
+def _default_gains(case: Case) -> list[str]:
+    """Return the gains to tune if tune.gains is left out: all gains, and on a processor the finite steepnesses.
+
+    In continuous time a steeper sign makes the equations stiffer, and the steepness is not searched unless it is named.
+    """
+    cascade = case.cascade
+    if cascade.processor is None:
+        return tunable(cascade, steepness=False)
+    return [path for path in tunable(cascade) if math.isfinite(float(np.max(np.asarray(read(cascade, path)))))]
 
 
 def _flat(raw: dict[str, Any], prefix: str = "") -> dict[str, Any]:

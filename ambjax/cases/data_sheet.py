@@ -80,12 +80,7 @@ plant.A = { percent = 10 }
 plant.R = { percent = 10 }
 initial.z = { uniform = [-1e-4, 1e-4] }  # m
 
-[tune]                        # of 'ambjax tune': the steepnesses p too, which it leaves as they are by default
-gains = ["controller.observer.w", "controller.position.c", "controller.position.c_int", "controller.position.k",
-    "controller.position.p", "controller.inversion.gamma", "controller.inversion.p", "controller.current.k_i",
-    "controller.current.p"]
-
-[tune.limits]
+[tune.limits]                 # of 'ambjax tune'
 rms_u_V = 8.0                 # V; root mean square voltage
 chatter_V_per_s = 5e4         # V/s; variation of the voltage
 """

@@ -14,7 +14,7 @@ from ambjax.cases.gain_tables import law_from
 from ambjax.cases.own_laws import FORM, OwnLaw, is_own, own_law
 from ambjax.cases.reach import check_reference
 from ambjax.cases.recordings import RecordedFile, Recordings
-from ambjax.cases.scenario_tables import check_start, scenario_from
+from ambjax.cases.scenario_tables import check_start, drive, scenario_from
 from ambjax.cases.table import Table, check_depth, load
 from ambjax.cases.timing import clock_from, settled
 from ambjax.cases.variation import spread_from
@@ -71,6 +71,7 @@ KINDS: dict[str, dict[str, type[Law]]] = {
         "pi": current.ProportionalIntegral,
         "dead-beat": current.DeadBeat,
         "open-loop": current.OpenLoop,
+        "amplifier": current.AmplifierCurrent,
     },
 }
 PLANTS: dict[str, type] = {"lumped": Plant, "two-coil": TwoCoil}
@@ -158,7 +159,7 @@ def case_from(
     clock, duration = clock_from(top.table("clock"))
     period = None if processor is None else clock.sample_period
     files = Files(folder, known.own_laws if known else (), known.controller_file if known else None)
-    cascade, own, matrices = _cascade(top.table("controller"), plant, processor, period, files)
+    cascade, own, matrices = _cascade(top, plant, processor, period, files)
     recordings = Recordings(folder, known.recorded if known else ())
     scenario, settle = scenario_from(top, plant, recordings)
     check_parts(cascade, scenario, clock.sample_period)
@@ -217,12 +218,14 @@ def _left_out(table: Table, plant: Bearing) -> tuple[str, ...]:
 
 
 def _cascade(
-    table: Table,
+    top: Table,
     plant: Bearing,
     processor: Processor | None,
     period: Scalar | None,
     files: Files,
 ) -> tuple[Cascade, tuple[OwnLaw, ...], ControllerFile | None]:
+    table, actuator = top.table("controller"), top.table("actuator")
+    command = drive(actuator)
     table.only(["model", *KINDS])
     model = table.table("model").record(Plant, base=plant)  # always lumped, even for a two-coil plant
     laws, own, matrices = {}, [], None
@@ -233,19 +236,32 @@ def _cascade(
             own += found or [own_law(stage, law.raw["kind"], files.folder, model)]
             kind = own[-1].law
         else:
-            kind = kinds[law.choice("kind", list(kinds), _usual(kinds, laws.get("position")), FORM)]
+            kind = kinds[law.choice("kind", list(kinds), _usual(kinds, laws.get("position"), command), FORM)]
         if kind is position.LinearController:
             laws[stage], matrices = _linear(law, files)
         else:
-            laws[stage] = law_from(law, kind, _defaults(law, kind, model, period))
+            laws[stage] = law_from(_nominal(law, kind, actuator), kind, _defaults(law, kind, model, period))
     return Cascade(model=model, processor=processor, **laws), tuple(own), matrices
 
 
-def _usual(kinds: dict[str, type[Law]], demanding: Any) -> str:
-    """Return the kind of a law that is left out: the first that accepts the demand of the position law, if known."""
+def _usual(kinds: dict[str, type[Law]], demanding: Any, command: str) -> str:
+    """Return the kind of a law that is left out.
+
+    It is the first that accepts the demand of the position law, if that is known, and commands what the amplifier
+    follows, a "voltage" or a "current". If there is none, it is the first that commands this.
+    """
+    fitting = [kind for kind, law in kinds.items() if getattr(law, "commands", command) == command]
     if demanding is None:
-        return next(iter(kinds))
-    return next(kind for kind, law in kinds.items() if demanding.demand in getattr(law, "accepts", (demanding.demand,)))
+        return fitting[0]
+    accepting = [kind for kind in fitting if demanding.demand in getattr(kinds[kind], "accepts", (demanding.demand,))]
+    return [*accepting, *fitting][0]
+
+
+def _nominal(law: Table, kind: Any, actuator: Table) -> Table:
+    """Return the table of a law; one that commands a current has the amplifier's bandwidth by default."""
+    if getattr(kind, "commands", "") != "current" or "bandwidth" not in actuator.raw:
+        return law
+    return Table({"bandwidth": actuator.raw["bandwidth"], **law.raw}, law.path)
 
 
 def _linear(table: Table, files: Files) -> tuple[Law, ControllerFile]:

@@ -9,7 +9,7 @@ from ambjax.cases.table import Table, show
 from ambjax.numerics.records import leaf
 from ambjax.simulation.clock import Clock
 from ambjax.world import signals
-from ambjax.world.amplifier import Amplifier
+from ambjax.world.amplifier import Amplifier, CurrentAmplifier
 from ambjax.world.band_noise import BandNoise
 from ambjax.world.bearing import Bearing
 from ambjax.world.faults import VALUES, Dropouts, Outliers
@@ -42,6 +42,8 @@ FIXED_UNITS = {kind: signal.unit for kind, signal in SIGNALS.items() if hasattr(
 UNITS = {"q_z": {"m/s^2": "q_z", "N": "q_f", "A^2/m^2": "q_v"}, "q_i": {"A/s": "q_i"}, "base": {"m/s^2": "base"}}
 # Largest number of terms of a sum, and of signals that disturb the same quantity; each is compiled.
 MOST_TERMS = 100
+# The amplifiers by actuator.mode, the default first.
+AMPLIFIERS: dict[str, type] = {kind.mode: kind for kind in (Amplifier, CurrentAmplifier)}
 SETTLE = leaf(default=0.5, unit="s", at_least=0, at_most=1e6, doc='time from which "settled" metrics count')
 STOP = {field.name: field for field in dataclasses.fields(Stop)}
 FIELDS = {field.name: field for kind in (Scenario, Clock) for field in dataclasses.fields(kind)}
@@ -92,8 +94,6 @@ def _each(table: Table, name: str) -> list[Table]:
 def scenario_from(top: Table, plant: Bearing, recordings: Recordings) -> tuple[Scenario, float | None]:
     """Return the scenario, and run.settle (s) or None. Raises ValueError for invalid tables."""
     actuator, run = top.table("actuator"), top.table("run")
-    names = [field.name for field in dataclasses.fields(Amplifier)]
-    actuator.only(["u_max", *names])
     run.only(["seed", "settle", "clearance", *(f"stop_{name}" for name in STOP)])
     settle = run.leaf("settle", SETTLE)
     scenario = Scenario(
@@ -102,13 +102,39 @@ def scenario_from(top: Table, plant: Bearing, recordings: Recordings) -> tuple[S
         sensor=_sensor(top.table("sensor")) if "sensor" in top.raw else None,
         initial=top.table("initial").record(Initial),
         u_max=actuator.leaf("u_max", FIELDS["u_max"], math.inf),
-        amplifier=actuator.record(Amplifier, extra=("u_max",)) if any(n in actuator.raw for n in names) else None,
+        amplifier=_amplifier(actuator),
         clearance=run.leaf("clearance", FIELDS["clearance"]),
         stop=_stop(run),
         seed=_seed(run),
         **_disturbances(top.table("disturbance"), recordings),
     )
     return scenario, settle
+
+
+def drive(actuator: Table) -> str:
+    """Return actuator.mode: "voltage" or "current". Raises ValueError for another one."""
+    return actuator.choice("mode", list(AMPLIFIERS), next(iter(AMPLIFIERS)))
+
+
+def _amplifier(actuator: Table) -> Amplifier | CurrentAmplifier | None:
+    """Return the amplifier of a table; None for an ideal source of voltage. Raises ValueError for a wrong key."""
+    mode = drive(actuator)
+    kind, other = AMPLIFIERS[mode], [one for name, one in AMPLIFIERS.items() if name != mode]
+    names = [field.name for field in dataclasses.fields(kind)]
+    foreign = {field.name for one in other for field in dataclasses.fields(one)} - set(names)
+    if mine := [name for name in actuator.raw if name in foreign]:
+        raise ValueError(
+            f'{actuator.at(mine[0])}: an amplifier with mode = "{mode}" has no such number; it has '
+            f"{', '.join(names)}. Leave it out."
+        )
+    actuator.only(["mode", "u_max", *names])
+    if mode == "current" and "bandwidth" not in actuator.raw:
+        raise ValueError(
+            f'{actuator.at("mode")} = "current": {actuator.at("bandwidth")} is missing. Give the bandwidth of the '
+            "amplifier's current loop, Hz: bandwidth = 1e3, for example."
+        )
+    given = any(name in actuator.raw for name in names)
+    return actuator.record(kind, extra=("mode", "u_max")) if given else None
 
 
 def _sensor(table: Table) -> Sensor:

@@ -85,8 +85,9 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # samples = 18                # largest number of predictions in a row (left out: until an error grows e-fold)
 
 # [actuator]
+# mode = "voltage"            # what the controller commands; or "current", with bandwidth and i_max only
 # u_max = 200.0               # V; limit of the supply (left out: none)
-#                             # and with [processor]:
+#                             # and with [processor], or with mode = "current" (bandwidth: of the current loop):
 # bandwidth = 1e3             # Hz; bandwidth of the amplifier, first order (left out: no lag)
 # slew = 1e7                  # V/s; largest rate of its voltage (left out: no limit)
 # dead_band = 0.5             # V; subtracted from the size of its voltage (left out: none)

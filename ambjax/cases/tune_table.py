@@ -17,7 +17,8 @@ SURVIVING = 1.0
 # Default band of the settling time, as a share of the clearance.
 SETTLING_BAND = 0.01
 # Default margins of limits on means over members and on worst members: the relative difference between two ensembles.
-MEAN_MARGIN, WORST_MARGIN = 0.005, 0.03
+# LOOP_MARGIN: of the sensitivity of the worst member, which an injection measures with an error of a few per cent.
+MEAN_MARGIN, WORST_MARGIN, LOOP_MARGIN = 0.005, 0.03, 0.05
 
 # The numbers of [tune]. The bounds are decades wider than useful values.
 NUMBERS: dict[str, dataclasses.Field] = {
@@ -96,7 +97,7 @@ def lines() -> Iterator[Line]:
     )
     yield Line(
         'gains = ["controller.position.c", "controller.position.k"]',
-        "gains to tune; left out: all gains of the laws but p",
+        "gains to tune; left out: all, p only where it is finite on a processor",
     )
     yield Line(
         "bounds.controller.position.c = [1.0, 500.0]",
@@ -124,7 +125,8 @@ def _defaults(prefix: str, fields: dict[str, dataclasses.Field]) -> Iterator[Lin
 
 def _limits() -> Iterator[Line]:
     """Yield the lines of [tune.limits]. Only those of the rms voltage and of the sensitivity have defaults."""
-    voltage, means, worst = (f"{x:g}" for x in (100 * VOLTAGE_SHARE, MEAN_MARGIN, WORST_MARGIN))
+    shares = (100 * VOLTAGE_SHARE, MEAN_MARGIN, WORST_MARGIN, LOOP_MARGIN)
+    voltage, means, worst, loops = (f"{x:g}" for x in shares)
     examples = [
         (
             "rms_u_V = 120.0",
@@ -158,7 +160,8 @@ def _limits() -> Iterator[Line]:
         (f"survival = {SURVIVAL.default}", SURVIVAL.metadata["doc"]),
         (
             "margin = 0.01",
-            f"share by which the search stays below a limit; left out: {means} of means, {worst} of maxima",
+            f"share by which the search keeps from a limit; left out: {means} for means, {worst} for maxima, {loops} "
+            "for loops",
         ),
     ]
     return (Line(f"limits.{text}", comment) for text, comment in examples)

@@ -162,7 +162,7 @@ def _flops(case: Case) -> int | None:
     if case.cascade.processor is None:
         return None
     try:
-        controller = controller_of(guarded_for(case), case.scenario.u_max, float(case.clock.sample_period))
+        controller = controller_of(guarded_for(case), case.scenario.command_limit, float(case.clock.sample_period))
         return trace(controller, "float").flops()
     except ValueError as error:
         say(f"{case.name}: the cost of a step cannot be computed ({error})")

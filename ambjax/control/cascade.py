@@ -30,6 +30,7 @@ from ambjax.control.processor import Processor, carried
 from ambjax.control.schedule import extremes, present
 from ambjax.numerics.records import Scalar, record
 from ambjax.world.plant import Plant
+from ambjax.world.plant import State as NominalState
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 
@@ -107,6 +108,10 @@ class Cascade:
     def laws(self) -> tuple[Observer, PositionLaw, InversionLaw, CurrentLaw]:
         """The four laws in order."""
         return self.observer, self.position, self.inversion, self.current
+
+    def driven(self, u: Array, state: NominalState) -> NominalState:
+        """Return the rates of the nominal plant under the command u, V or A."""
+        return self.current.driven(self.model, u, state)
 
     def demand(
         self, measured: Measurement, state: CascadeState, reference: Reference
@@ -190,7 +195,7 @@ class Cascade:
         now, state = self._advance(sample)(present(self.observer, measured.z, sample.reference), measured, state)
         estimate = now
         if processor.predicts:
-            estimate = carried(self.model, now, sample.past, processor.stretches(sample.period))
+            estimate = carried(self.model, self.driven, now, sample.past, processor.stretches(sample.period))
         return estimate, state, now
 
     def step(

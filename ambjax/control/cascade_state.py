@@ -23,7 +23,7 @@ class Command(NamedTuple):
     - `v_star`: demanded scaled force, A^2/m^2. Eq. (5)
     - `v_tilde`: inversion error v_star - v(z, i_ref), A^2/m^2.
     - `i_ref`, `i_ref_dot`: current reference, A, and its rate, A/s.
-    - `u`: voltage, V, before the limit of the supply.
+    - `u`: voltage, V, or current, A, before its limit.
     """
 
     v_star: Array
@@ -38,8 +38,8 @@ class Sample(NamedTuple):
 
     - `reference`: at the instant of the sample; with prediction, at the end of the delay.
     - `period`: sample period, s.
-    - `u_max`: limit of the supply, V.
-    - `past`: voltages of the last sample and of the one before it, V.
+    - `u_max`: limit of u, V or A.
+    - `past`: u of the last sample and of the one before it, V or A.
     """
 
     reference: Reference

@@ -1,4 +1,4 @@
-"""Current laws: the voltage that drives the current to its reference."""
+"""Current laws: the voltage that drives the current to its reference, or the current that an amplifier follows."""
 
 from typing import ClassVar
 
@@ -9,10 +9,10 @@ from ambjax.control.base import Requirement
 from ambjax.control.laws import CurrentInputs, CurrentLaw
 from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
-from ambjax.numerics.records import Scalar, gain, record
+from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, limited, smooth_sign
-from ambjax.world.plant import Plant
+from ambjax.world.plant import Plant, State
 
 
 @record
@@ -185,6 +185,39 @@ class OpenLoop(CurrentLaw[tuple[()]]):
         return model.R * (inputs.demand.i_ref + period * inputs.demand.i_ref_dot), ()
 
     own_steps = ("implicit", "explicit")
+
+
+@record
+class AmplifierCurrent(CurrentLaw[tuple[()]]):
+    """u = i_ref in A, for an amplifier that controls the current (`actuator.mode = "current"`).
+
+    On a processor u is the i_ref that the inversion has computed at this sample. The prediction over the delay and the
+    guard use the nominal amplifier, i' = 2 pi bandwidth (u - i).
+    """
+
+    bandwidth: Scalar = leaf(
+        default=1e3, unit="Hz", at_least=1, at_most=1e6, doc="nominal bandwidth; left out: actuator.bandwidth"
+    )
+    commands = "current"
+    own_steps = ("implicit", "explicit")
+
+    def init(self, model: Plant) -> tuple[()]:
+        return ()
+
+    def scale(self, model: Plant) -> tuple[()]:
+        return ()
+
+    def slope(self, model: Plant) -> Scalar:
+        return 0.0
+
+    def __call__(self, model: Plant, inputs: CurrentInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
+        return inputs.demand.i_ref, ()
+
+    def step(self, model: Plant, inputs: CurrentInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
+        return inputs.demand.i_ref + period * inputs.demand.i_ref_dot, ()
+
+    def driven(self, model: Plant, u: Array, state: State) -> State:
+        return model.rates(state, 0.0)._replace(i=2 * jnp.pi * self.bandwidth * (u - state.i))
 
 
 def _mean_decay(x: Array) -> Array:

@@ -4,13 +4,14 @@ docs/processor.md defines the rules.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.world.plant import Plant
+from ambjax.world.plant import Plant, State
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement, Sensor
 
@@ -136,10 +137,10 @@ class Guard:
         return refused, refused & (before.left <= 0)
 
 
-def expected(model: Plant, motion: Measurement, u: Array, period: Scalar) -> Measurement:
-    """Predict the readings of the next sample from `motion` under a mean voltage u (V)."""
-    rates = model.rates(model.start(motion), u)
-    z, z_dot, i = (x + period * rate for x, rate in zip(motion, (rates.z, rates.z_dot, rates.i), strict=True))
+def expected(driven: Callable[[Array, State], State], at: State, u: Array, period: Scalar) -> Measurement:
+    """Predict the readings of the next sample from the state `at` under a mean command u. `driven`: `Cascade.driven`."""
+    rates = driven(u, at)
+    z, z_dot, i = (x + period * rate for x, rate in zip(at[:3], rates[:3], strict=True))
     return Measurement(z + period * period / 2 * rates.z_dot, z_dot, i)
 
 

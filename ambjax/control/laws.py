@@ -23,6 +23,7 @@ from ambjax.control.base import Law
 from ambjax.numerics.records import Scalar
 from ambjax.world.bearing import Gaps
 from ambjax.world.plant import Plant
+from ambjax.world.plant import State as NominalState
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 
@@ -59,7 +60,7 @@ class CurrentInputs(NamedTuple):
 
     - `measured`: estimated motion and current.
     - `demand`: output of the inversion law.
-    - `u_max`: limit of the supply, V.
+    - `u_max`: limit of the command: that of the supply, V, or that of the commanded current, A.
     - `gaps`: gaps of the model at the estimated position; None: not computed yet.
     """
 
@@ -159,12 +160,14 @@ class InversionLaw(Law, Generic[State], abc.ABC):
 
 
 class CurrentLaw(Law, Generic[State], abc.ABC):
-    """Base class of a current law: its input is the demanded current, its output the voltage u, V.
+    """Base class of a current law: its input is the demanded current, its output the command u.
 
-    `accepts`: the demands of a position law (`PositionLaw.demand`) with which the law can be combined.
+    `accepts`: the demands of a position law (`PositionLaw.demand`) with which the law can be combined. `commands`: what
+    u is, a "voltage" (V), or a "current" (A) for an amplifier that controls the current.
     """
 
     accepts: ClassVar[tuple[str, ...]] = ("force",)
+    commands: ClassVar[str] = "voltage"
 
     @abc.abstractmethod
     def init(self, model: Plant) -> State: ...
@@ -177,6 +180,10 @@ class CurrentLaw(Law, Generic[State], abc.ABC):
 
     @abc.abstractmethod
     def __call__(self, model: Plant, inputs: CurrentInputs, state: State, /) -> tuple[Array, State]: ...
+
+    def driven(self, model: Plant, u: Array, state: NominalState) -> NominalState:
+        """Return the rates of the nominal plant under the command u, for predictions."""
+        return model.rates(state, u)
 
 
 # Base class of the laws of each stage, by the stage's name.

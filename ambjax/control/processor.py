@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
@@ -89,14 +90,18 @@ class Processor:
         return (jnp.minimum(ahead, 1.0) * period, jnp.maximum(ahead - 1.0, 0.0) * period)[: self.most]
 
 
-def carried(model: Plant, estimate: Measurement, past: tuple[Array, Array], lengths: tuple[Array, ...]) -> Measurement:
-    """Predict the estimate over these lengths (s), the last first, by one RK4 step of the model for each voltage."""
+def carried(
+    model: Plant,
+    driven: Callable[[Array, State], State],
+    estimate: Measurement,
+    past: tuple[Array, Array],
+    lengths: tuple[Array, ...],
+) -> Measurement:
+    """Predict the estimate over these lengths (s), the last first, by one RK4 step of the model for each command.
 
+    `driven`: `Cascade.driven`.
+    """
     x = model.start(estimate)
     for u, h in reversed(list(zip(past, lengths, strict=False))):
-        x = rk4_step(functools.partial(_rates, model, u), x, h)
+        x = rk4_step(functools.partial(driven, u), x, h)
     return model.measurement(x)
-
-
-def _rates(model: Plant, u: Array, x: State) -> State:
-    return model.rates(x, u)

@@ -18,7 +18,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
 from ambjax.control.guard import GAPS, Watch, guarded
 from ambjax.export.block import Block, Ports, law_lines, scales
-from ambjax.export.interface import BITS, INPUTS, OUTPUTS, Status, StepInputs, StepOutputs
+from ambjax.export.interface import BITS, INPUTS, Status, StepInputs, StepOutputs, outputs_of
 from ambjax.export.numbering import Number, numbers_of
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.simulation.integrate import choose
@@ -62,7 +62,7 @@ class Memory(NamedTuple):
     laws: CascadeState
     last: Command
     before: Array
-    """voltage of the sample before the last, V"""
+    """command of the sample before the last, V or A"""
     watch: Watch | tuple[()]
     """state of the guard"""
     started: Array
@@ -84,9 +84,17 @@ class Controller(Block):
     noun: ClassVar[str] = "controller"
     ports: ClassVar[Any] = StepInputs
     inputs: ClassVar[Ports] = INPUTS
-    outputs: ClassVar[Ports] = OUTPUTS
     bits = BITS
     crowded = ("saturated", "refused")
+
+    @property
+    def commands(self) -> str:
+        """What the output u is: a "voltage" or a "current"."""
+        return self.parameters.controller.current.commands
+
+    @property
+    def outputs(self) -> Ports:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return outputs_of(self.commands)
 
     def step(
         self, parameters: Parameters, memory: Memory, inputs: StepInputs, period: Scalar, read: frozenset[str]
@@ -141,6 +149,9 @@ class Controller(Block):
         ]
         assert [x.value for x in found] == [float(x) for x in jax.tree.leaves(self.parameters)]
         processor: Any = self.parameters.controller.processor
+        if self.commands == "current":
+            u_max = {"unit": "A", "doc": "limit of the commanded current; inf: none"}
+            found = [x._replace(**u_max) if x.name == "limits.u_max" else x for x in found]
         most = float(processor.most)
         delay = {"allowed": f"from 0 to {processor.most}", "ends": (0.0, most, most + 0.5, -0.5, math.nan)}
         return [x._replace(**delay) if x.name == "processor.delay" else x for x in found]
@@ -157,10 +168,10 @@ class Controller(Block):
                 )
             words = f"state of {type(law).__name__}"
             found += [Number(f"{stage}.{name}", unit, "", doc or words, 0.0) for name, unit, doc in entries]
-        commands = {**OUTPUTS, "i_ref_dot": ("A/s", "rate of i_ref")}
+        commands = {**self.outputs, "i_ref_dot": ("A/s", "rate of i_ref")}
         for name in memory.last._fields:
             found.append(Number(f"last.{name}", commands[name][0], "", f"last {commands[name][1]}", 0.0))
-        found.append(Number("before.u", "V", "", "voltage of the sample before the last", 0.0))
+        found.append(Number("before.u", commands["u"][0], "", "u of the sample before the last", 0.0))
         if memory.watch:
             names = {f"watch.{name}": (INPUTS[name][0], "predicted reading") for name in memory.watch.expected._fields}
             names["watch.left"] = ("samples", "number of samples for which a reading may still be replaced")
@@ -171,7 +182,9 @@ class Controller(Block):
         cascade, limits = self.parameters
         model = cascade.model
         z, z_dot, i = scales(model.sizes())
-        pole, weight, v = float(model.pole), float(model.R) * float(model.i_0), float(model.v_size)
+        pole, weight, v = float(model.pole), float(model.i_0), float(model.v_size)
+        if self.commands == "voltage":
+            weight *= float(model.R)
         u = float(limits.u_max) if math.isfinite(limits.u_max) else 10 * weight + 1.0
         guard: Any = cascade.processor.guard if cascade.processor else None
         watch = [z, z_dot, i, float(guard.samples)] if guard else []
@@ -189,8 +202,9 @@ class Controller(Block):
 def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scenario | None = None) -> Controller:
     """Return the controller of a case. Raises ValueError for a cascade in continuous time.
 
-    `u_max`: limit of the supply, V. `period`: sample period, s. `scenario`: clearance and sensors, from which the
-    limits of the guard are derived that the case does not give. None: the model's clearance, and sensors without error.
+    `u_max`: limit of the command (`Scenario.command_limit`), V or A. `period`: sample period, s. `scenario`: clearance
+    and sensors, from which the limits of the guard are derived that the case does not give. None: the model's
+    clearance, and sensors without error.
     """
     if cascade.processor is None:
         raise ValueError(

@@ -51,16 +51,26 @@ INPUTS = {
 }
 
 
+# The output u by what the controller commands (`CurrentLaw.commands`).
+COMMANDS = {
+    "voltage": ("V", "voltage to apply, within the supply's limit"),
+    "current": ("A", "current to command to the amplifier, within its limit"),
+}
 OUTPUTS = {
-    "u": ("V", "voltage to apply, within the supply's limit"),
+    "u": COMMANDS["voltage"],
     "i_ref": ("A", "current reference"),
     "v_star": ("A^2/m^2", "demanded scaled force"),
     "v_tilde": ("A^2/m^2", "input error v_star - v(z, i_ref)"),
 }
 
 
+def outputs_of(commands: str) -> dict[str, tuple[str, str]]:
+    """Return unit and meaning of each output of a controller that commands a "voltage" or a "current"."""
+    return OUTPUTS | {"u": COMMANDS[commands]}
+
+
 BITS = {
-    "saturated": "u is at the supply's limit",
+    "saturated": "u is at its limit",
     "refused": "a reading is NaN, beyond its limit or too far from the prediction, which replaces it",
     "failed": "a law returned no finite number: its state is kept, u is held",
     "singular": "(z, i_ref) is near the singular curve of Eq. (9)",

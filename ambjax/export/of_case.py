@@ -19,7 +19,7 @@ def block_of(what: str, cascade: Cascade, scenario: Scenario, clock: Clock) -> B
     The plant of a clock without a method of fixed steps gets the simulator's choice among these.
     """
     period = float(clock.sample_period)
-    controller = controller_of(cascade, scenario.u_max, period, scenario)
+    controller = controller_of(cascade, scenario.command_limit, period, scenario)
     if what == "controller":
         return controller
     method = clock.method

@@ -27,7 +27,7 @@ from ambjax.simulation.integrate import FixedSteps, choose
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled, SampledState
 from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED
-from ambjax.world.amplifier import Amplifier
+from ambjax.world.amplifier import Amplifier, CurrentAmplifier
 from ambjax.world.bearing import Bearing
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Errors, Sensor
@@ -272,6 +272,11 @@ def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object
         raise ValueError(
             "[processor] is missing: the exported plant takes a voltage that is held over a sample, and this case "
             "is in continuous time. Add [processor], tune the gains for it, and export the tuned case."
+        )
+    if isinstance(scenario.amplifier, CurrentAmplifier):
+        raise ValueError(
+            'actuator.mode = "current": the exported plant takes a voltage. Export the controller, or use '
+            'mode = "voltage".'
         )
     sensor = scenario.sensor
     for part in ("outliers", "dropouts", "runout"):

@@ -115,14 +115,14 @@ class Twin(Sampled):
         """Return the scale of each state. A number below its scale changes by the unit in the last place of the scale.
 
         The scale of a voltage is that which drives the coil's current reference within one sample, because the laws
-        divide the difference of two references by the period.
+        divide the difference of two references by the period. That of a commanded current is that of i_ref.
         """
         cascade, plant = self.loop.cascade, self.loop.scenario.plant
         model = cascade.model
         i, v = jnp.asarray(model.i_0) / 25, jnp.asarray(model.v_size)
         gap = jnp.maximum(model.s_0 - jnp.abs(plant.measurement(state.plant).z), 0.01 * model.s_0)
         driven = model.L * model.s_0 / gap * jnp.maximum(jnp.abs(state.command.i_ref), i) / self.period
-        volt = jnp.abs(model.R * model.i_0) + driven
+        volt = i if cascade.current.commands == "current" else jnp.abs(model.R * model.i_0) + driven
         return SampledState(
             plant=plant.scale(),
             control=cascade.scale(),

@@ -1,6 +1,6 @@
 """Equilibrium of the closed loop under a constant reference.
 
-In equilibrium no state changes: the plant rests under a constant voltage, and the laws return this voltage. Noise,
+In equilibrium no state changes: the plant rests under a constant command, and the laws return this command. Noise,
 disturbances, converters, faults, the guard, the limits of supply and amplifier, and the dead band are left out.
 """
 
@@ -15,6 +15,7 @@ from jax.flatten_util import ravel_pytree
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.numerics.records import Scalar
+from ambjax.world.amplifier import Amplifier
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.signals import Constant, Reference, reference_at
@@ -29,7 +30,7 @@ TOLERANCE = 1e7
 
 
 class Point(NamedTuple):
-    """State of the loop at an instant: state of the plant, states of the laws, and the voltage u (V) that acts."""
+    """State of the loop at an instant: state of the plant, states of the laws, and the command u (V or A) that acts."""
 
     plant: Any
     control: CascadeState
@@ -52,9 +53,11 @@ def ideal(scenario: Scenario) -> Scenario:
     sensor, amplifier = scenario.sensor, scenario.amplifier
     if sensor is not None:
         sensor = dataclasses.replace(sensor.louder(0.0), bits=None, outliers=None, dropouts=None)
-    if amplifier is not None:
+    if isinstance(amplifier, Amplifier):
         amplifier = dataclasses.replace(amplifier, slew=None, dead_band=None, i_max=None)
         amplifier = None if amplifier.bandwidth is None else amplifier
+    elif amplifier is not None:
+        amplifier = dataclasses.replace(amplifier, i_max=None)
     return dataclasses.replace(scenario, sensor=sensor, amplifier=amplifier, u_max=jnp.inf)
 
 
@@ -151,13 +154,15 @@ def start_of(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) ->
     measured = reading(scenario, plant.measurement(state), (0.0, 0.0))
     cascade = dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started(measured.z))
     control = jax.tree.map(lambda x: jnp.asarray(x, zero.dtype), cascade.init(measured))
-    return Point(state, control, zero + u)
+    return Point(state, control, zero + (i if scenario.drive == "current" else u))
 
 
 def sizes_of(cascade: Cascade, scenario: Scenario, point: Point) -> Point:
     """Return the characteristic size of each component of a point."""
     plant = scenario.plant
-    u = jnp.asarray((plant.R + plant.L * plant.pole) * plant.i_0 / 25)
+    u = jnp.asarray(plant.i_0 / 25)
+    if scenario.drive == "voltage":
+        u = (plant.R + plant.L * plant.pole) * u
     sizes = Point(plant.scale(), cascade.scale(), u)
     return jax.tree.map(lambda x, size: jnp.zeros_like(x) + size, point, sizes)
 
@@ -170,7 +175,8 @@ def _residual(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, p
     """
     plant, u_max = scenario.plant, jnp.asarray(jnp.inf)
     sizes = sizes_of(cascade, scenario, point)
-    moved = jax.tree.map(lambda x: x / plant.pole, plant.rates(point.plant, point.u))
+    u = scenario.coil_voltage(point.u, point.plant) if scenario.drive == "current" else point.u
+    moved = jax.tree.map(lambda x: x / plant.pole, plant.rates(point.plant, u))
     measured, reference = reading(scenario, plant.measurement(point.plant), (0.0, 0.0)), at_rest(r)
     if cascade.processor is None:
         command, rates = cascade(measured, point.control, reference, u_max)

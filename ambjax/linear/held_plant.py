@@ -40,8 +40,9 @@ class Lagged:
     def __init__(self, scenario: Scenario, point: Point):
         self.scenario = scenario
         self.low_passed = scenario.sensor is not None and scenario.sensor.bandwidth is not None
+        self.lagged = scenario.amplifier is not None and scenario.amplifier.slow
         z = scenario.plant.measurement(point.plant).z
-        lags = [z] * self.low_passed + [point.u] * (scenario.amplifier is not None)
+        lags = [z] * self.low_passed + [point.u] * self.lagged
         self.start, self.restore = ravel_pytree((point.plant, lags))
 
     def motion(self, x: Array) -> Measurement:
@@ -55,20 +56,25 @@ class Lagged:
         return reading(self.scenario, motion._replace(z=lags[0]) if self.low_passed else motion, injected)
 
     def rates(self, x: Array, u: Scalar, q_z: Scalar) -> Array:
-        """Return the time derivative of the state under a commanded voltage u (V) and a disturbance q_z (m/s^2)."""
+        """Return the time derivative of the state under a command u (V or A) and a disturbance q_z (m/s^2)."""
         (plant, lags), sensor, amplifier, lag_rates = self.restore(x), self.scenario.sensor, self.scenario.amplifier, []
         if sensor is not None and sensor.bandwidth is not None:
             z = self.scenario.plant.measurement(plant).z
             lag_rates.append(2 * jnp.pi * sensor.bandwidth * (z - lags[0]))
-        if amplifier is not None:
+        if amplifier is not None and self.lagged:
             lag_rates.append(amplifier.slope() * (u - lags[-1]))
             u = lags[-1]
+        u = self.scenario.coil_voltage(jnp.asarray(u), plant)
         return ravel_pytree((self.scenario.plant.rates(plant, u, q_z), lag_rates))[0]
+
+    def voltage(self, x: Array, u: Array) -> Array:
+        """Return the voltage (V) for a command: the command itself, or that by which the amplifier follows it."""
+        return self.scenario.coil_voltage(u, self.restore(x)[0]) if self.scenario.drive == "current" else u
 
     def sizes(self, sizes: Point) -> Array:
         """Return the characteristic sizes [N] of the state. `sizes`: those of a `Point`."""
         z = self.scenario.plant.measurement(sizes.plant).z
-        lags = [z] * self.low_passed + [sizes.u] * (self.scenario.amplifier is not None)
+        lags = [z] * self.low_passed + [sizes.u] * self.lagged
         return ravel_pytree((sizes.plant, lags))[0]
 
     def held(self, point: Point, period: Scalar, delay: Scalar) -> HeldPlant:

@@ -44,8 +44,9 @@ def _continuous(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar,
         state, control = restore(x)
         measured = reading(scenario, plant.measurement(state), (w[0], w[1]))
         command, rates = cascade(measured, control, reference, jnp.asarray(jnp.inf))
-        moved = plant.rates(state, command.u, w[2])
-        outputs = jnp.stack([measured.z, measured.z_dot, command.u, plant.measurement(state).z])
+        u = scenario.coil_voltage(command.u, state)
+        outputs = jnp.stack([measured.z, measured.z_dot, u, plant.measurement(state).z])
+        moved = plant.rates(state, u, w[2])
         return ravel_pytree((moved, rates))[0], outputs
 
     (A, B), (C, D) = jax.jacfwd(system, (0, 1))(x, jnp.zeros(3, x.dtype))
@@ -69,7 +70,7 @@ def _sampled(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, po
         moved = held.transition @ at + held.now * command.u + held.before * past[0] + held.first * past[1]
         moved = moved + held.disturbed * w[2]
         after = jnp.concatenate([moved, ravel_pytree(after)[0], jnp.stack([command.u, past[0]])])
-        return after, jnp.stack([measured.z, measured.z_dot, command.u, plant.motion(at).z])
+        return after, jnp.stack([measured.z, measured.z_dot, plant.voltage(at, command.u), plant.motion(at).z])
 
     x = jnp.concatenate([plant.start, laws, jnp.stack([point.u, point.u])])
     (A, B), (C, D) = jax.jacfwd(step, (0, 1))(x, jnp.zeros(3, x.dtype))

@@ -13,7 +13,7 @@ from ambjax.simulation.edges import NO_EDGES, Edges
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.loop import SHOWN, ClosedLoop, Densities, ExternalInputs, Sizes
 from ambjax.simulation.span import Instant
-from ambjax.world.amplifier import Amplifier
+from ambjax.world.amplifier import Amplifier, CurrentAmplifier
 from ambjax.world.sensor import Measurement
 
 Voltage = Callable[[Scalar], Array]
@@ -37,14 +37,14 @@ def _one_of(voltages: tuple[Array, ...], lag: Array) -> Array:
 
 
 def amplified(
-    amplifier: Amplifier | None, t: Array, u_a: Any, commanded: Sequence[tuple[Array, Scalar]]
+    amplifier: Amplifier | CurrentAmplifier | None, t: Array, u_a: Any, commanded: Sequence[tuple[Array, Scalar]]
 ) -> tuple[list[tuple[Voltage, Scalar]], Any]:
     """Return the amplifier's voltage as functions of time with their durations (s), and the voltage at the end.
 
     `commanded`: voltages (V) from t on, each with its duration (s). With a slew-rate limit each is divided at the end
     of its ramp, where the voltage has a corner.
     """
-    if amplifier is None or not amplifier.slow:
+    if not isinstance(amplifier, Amplifier) or not amplifier.slow:
         return [(lambda _, u=u: u, time) for u, time in commanded], u_a
     given = []
     for u, time in commanded:
@@ -114,11 +114,11 @@ def _under(loop: ClosedLoop, state: object, command: Command, voltage: Voltage, 
     def rates(inputs: tuple[ExternalInputs, Array], x: object) -> object:
         outside, u = inputs
         q_z = loop.scenario.pushed(outside.q_z, plant.measurement(x))
-        return plant.rates(x, _at_coil(loop, outside, u, x), q_z, outside.q_i)
+        return plant.rates(x, loop.scenario.coil_voltage(u, x, outside.q_i), q_z, outside.q_i)
 
     def observed(inputs: tuple[ExternalInputs, Array], x: object) -> tuple[object, Instant]:
         (outside, u), motion, heat = inputs, plant.measurement(x), plant.signals(x).heat
-        u = _at_coil(loop, outside, u, x)
+        u = loop.scenario.coil_voltage(u, x, outside.q_i)
         sigma = loop.cascade.sigma(motion, outside.reference)
         sizes = Sizes(motion.z, motion.z - outside.reference.r, sigma, u, motion.i, e, command.v_tilde)
         return rates(inputs, x), Instant(sizes, Densities(u, u * u, heat))
@@ -128,16 +128,3 @@ def _under(loop: ClosedLoop, state: object, command: Command, voltage: Voltage, 
 
     scale = jax.tree.map(jnp.asarray, plant.scale())
     return InitialValueProblem(inputs, rates, scale, status, None, observed, SHOWN, edges=edges)
-
-
-def _at_coil(loop: ClosedLoop, outside: ExternalInputs, u: Array, x: object) -> Array:
-    """Return the voltage at the coils, V, for the amplifier's voltage u."""
-    plant, amplifier = loop.scenario.plant, loop.scenario.amplifier
-    if amplifier is None:
-        return u
-
-    def holding_voltage() -> Array:
-        still, driven = (plant.measurement(plant.rates(x, volt, outside.q_z, outside.q_i)).i for volt in (0.0, 1.0))
-        return still / (still - driven)  # i' is linear in u
-
-    return amplifier.at_coil(u, plant.measurement(x).i, loop.scenario.u_max, holding_voltage)

@@ -129,11 +129,11 @@ class ClosedLoop:
         return measured._replace(z=measured.z + sensor.gain * inputs.runout)
 
     def command(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> tuple[Command, CascadeState, Array]:
-        """Return the command of the cascade, the rates of its states, and the voltage within the supply's limit, V."""
-        u_max = jnp.asarray(self.scenario.u_max)
+        """Return the command of the cascade, the rates of its states, and the voltage at the coils, V."""
+        u_max = jnp.asarray(self.scenario.command_limit)
         measured = self.received(inputs, state.plant, errors)
         command, rates = self.cascade(measured, state.control, inputs.reference, u_max)
-        return command, rates, limited(command.u, u_max)
+        return command, rates, self.scenario.coil_voltage(limited(command.u, u_max), state.plant, inputs.q_i)
 
     def rates(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> LoopState:
         """Return the time derivative of the state: Eqs. (1), (2) and the laws."""

@@ -50,7 +50,7 @@ def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
     """
     # On a processor the laws have discrete steps, and only the plant is integrated.
     laws = {} if cascade.processor else {f"{stage} law": slope for stage, slope in cascade.slopes().items()}
-    named = laws | {PLANT: scenario.plant.slope(), COILS: scenario.plant.coil_slope(scenario.limit)}
+    named = laws | {PLANT: scenario.plant.slope(), COILS: scenario.current_slope}
     named |= {} if scenario.stop is None else {STOP: scenario.stop.slope(scenario.plant.m)}
     if traced := [name for name, slope in named.items() if is_traced(slope)]:
         raise ValueError(
@@ -76,7 +76,9 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
     slope = max(named.values())
     if cascade.processor is not None:
         settled = math.ceil(sample_period * named[COILS] / SETTLED)
-        rate = 0.0 if (amplifier := scenario.amplifier) is None else float(np.max(np.asarray(amplifier.slope())))
+        amplifier = scenario.amplifier
+        slow = amplifier is not None and amplifier.slow
+        rate = float(np.max(np.asarray(amplifier.slope()))) if amplifier is not None and slow else 0.0
         fastest = max(named[PLANT], named.get(STOP, 0.0))
         driven = math.ceil(sample_period * max(fastest / SAMPLED, rate / DRIVEN))
         substeps, fixed = max(driven, settled, 1), max(driven, MOST_SETTLED)

@@ -164,7 +164,7 @@ class Sampled:
             measured = checked.reading
         if not isinstance(state.started, tuple):
             laws = choose(state.started.astype(bool), laws, cascade.init(measured))
-        sample = Sample(reference, self.period, jnp.asarray(self.loop.scenario.u_max), past)
+        sample = Sample(reference, self.period, jnp.asarray(self.loop.scenario.command_limit), past)
         command, control, estimate = cascade.step(measured, laws, sample)
         command = command._replace(u=limited(command.u, sample.u_max))
         new = materialised((control, command, self._watched(checked, estimate, (command.u, *past))))
@@ -189,12 +189,12 @@ class Sampled:
         """Return the guard's state for the next sample. `voltages`: of this sample and of the two before it, V."""
         if checked is None:
             return ()
-        delay = jnp.asarray(self.processor.ahead)
+        cascade, delay = self.loop.cascade, jnp.asarray(self.processor.ahead)
         # Each voltage is weighted by the fraction of the sample during which it acts.
         (u, before, first), share = voltages, 1 - jnp.abs(delay - 1)
         u = jnp.maximum(1 - delay, 0.0) * u + share * before + jnp.maximum(delay - 1, 0.0) * first
         motion = checked.reading._replace(z_dot=estimate.z_dot)
-        return Watch(expected(self.loop.cascade.model, motion, u, self.period), checked.left)
+        return Watch(expected(cascade.driven, cascade.model.start(motion), u, self.period), checked.left)
 
     def advance(
         self,
@@ -246,11 +246,17 @@ class Sampled:
         return off._replace(plant=plant, z_filtered=z_filtered, u_a=jax.tree.map(jnp.zeros_like, state.u_a))
 
     def row(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors, alive: Array) -> Row:
-        """Return the signals of sample n: the plant's state, u_n, and i_ref before the step of the laws."""
+        """Return the signals of sample n: the plant's state, u_n, and i_ref before the step of the laws.
+
+        If the command is a current, u_n is the voltage by which the amplifier follows it in this state.
+        """
         measured = self.measured(state.plant, state.z_filtered, errors)
         if state.sensed:
             measured = measured._replace(z=state.sensed.z)
-        row = self.loop.signals(t, self.loop.inputs(t), state.plant, state.command, measured, alive)
+        inputs, command = self.loop.inputs(t), state.command
+        if self.loop.scenario.drive == "current":
+            command = command._replace(u=self.loop.scenario.coil_voltage(command.u, state.plant, inputs.q_i))
+        row = self.loop.signals(t, inputs, state.plant, command, measured, alive)
         guard = self.processor.guard
         return row if guard is None else row._replace(refused=alive & guard.refused(state.watch, state.watch)[0])
 

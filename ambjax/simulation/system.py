@@ -22,6 +22,12 @@ def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> 
                 f"{path} is for a controller on a processor, and this one runs in continuous time. Add [processor], or "
                 "leave it out."
             )
+    if cascade.current.commands != scenario.drive:
+        raise ValueError(
+            f'actuator.mode = "{scenario.drive}": controller.current = {type(cascade.current).__name__} commands a '
+            f"{cascade.current.commands}. Leave out [controller.current], for a law that commands a {scenario.drive}, "
+            "or change the mode."
+        )
     sensor = scenario.sensor
     if sensor is not None and not sensor.velocity and not cascade.observer.estimates_velocity:
         raise ValueError(

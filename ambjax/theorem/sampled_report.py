@@ -11,6 +11,8 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, SupportsFloat
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ambjax.control.base import unhardened
@@ -24,8 +26,11 @@ from ambjax.simulation.rollout import Outcome, System, prepare, roll
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
 from ambjax.theorem.watched import Watched
+from ambjax.world.bearing import Bearing
 from ambjax.world.scenario import Scenario
 
+# Samples whose distances to the singular curve are computed together.
+BATCH = 4096
 # Stages whose output acts after the delay. Observers and inversion laws act on states of their own, without delay.
 DELAYED = ("position", "current")
 # Signal that the law of each stage drives to zero, and its unit.
@@ -168,7 +173,7 @@ def check(
         float(outcome.lost_at),
         outcome.lost_why,
         stalled,
-        _smallest_distance(outcome),
+        _smallest_distance(outcome, scenario.plant),
         alternating,
         _peak(np.asarray(outcome.rows.z)[settled:]) if np.isinf(outcome.lost_at) else None,
     )
@@ -179,10 +184,15 @@ def _watched(loop: Any, clock: Clock, run: Callable[[System, Clock], Outcome]) -
     return run(Watched(loop), clock).trajectory
 
 
-def _smallest_distance(run: Trajectory) -> tuple[float, float]:
-    """Return the smallest signed distance to the singular curve C until the rotor is lost, and its time (s)."""
+def _smallest_distance(run: Trajectory, plant: Bearing) -> tuple[float, float]:
+    """Return the smallest signed distance to the singular curve C until the rotor is lost, and its time (s).
+
+    It is computed after the run, because XLA does not compile it within the loop as one kernel.
+    """
     rows: Any = run.rows
-    t, distance = np.asarray(rows.t), np.asarray(rows.distance)
+    t, points = np.asarray(rows.t), (jnp.asarray(rows.z), jnp.asarray(rows.i_ref))
+    far = jax.lax.map(lambda at: plant.signed_distance_to_C(*at), points, batch_size=BATCH)
+    distance = np.asarray(far)
     worst = int(np.argmin(np.where(t <= float(run.lost_at), distance, np.inf)))
     return float(distance[worst]), float(t[worst])
 

@@ -22,18 +22,18 @@ class WatchedSignals(NamedTuple):
 
 
 class WatchedRow(NamedTuple):
-    """One sample: time (s), limited voltage (V), z (m), signals, and the signed distance of (z/s_0, i_ref/i_0) to C.
+    """One sample: time (s), limited voltage (V), z (m), i_ref (A), and signals.
 
     `computed`: signals that the laws compute from the estimate (with prediction: at the end of the delay). `true`:
-    signals of the plant at the sample. The distance to the singular curve C is negative beyond it.
+    signals of the plant at the sample.
     """
 
     t: Array
     u: Array
     z: Array
+    i_ref: Array
     computed: WatchedSignals
     true: WatchedSignals
-    distance: Array
 
 
 class WatchedState(NamedTuple):
@@ -63,7 +63,7 @@ class Watched:
         loop, before = self.loop, state.loop
         cascade, after = loop.loop.cascade, loop.jump(t, before, errors)
         reference = loop.reference(t)
-        sample = Sample(reference, loop.period, jnp.asarray(loop.loop.scenario.u_max), after.past)
+        sample = Sample(reference, loop.period, jnp.asarray(loop.loop.scenario.command_limit), after.past)
         measured = loop.measured(before.plant, before.z_filtered, errors)
         estimate, *_ = cascade.estimate(measured, before.control.observer, sample)
         sigma, command = cascade.sigma(estimate, reference), after.command
@@ -90,18 +90,11 @@ class Watched:
 
     def row(self, t: Scalar, state: WatchedState, errors: Errors, alive: Array) -> WatchedRow:
         row = self.loop.row(t, state.loop, errors, alive)
-        plant = self.loop.loop.scenario.plant
-        return WatchedRow(
-            row.t,
-            row.u,
-            row.z,
-            state.computed,
-            WatchedSignals(row.sigma, row.v_tilde, row.e),
-            plant.signed_distance_to_C(row.z, row.i_ref),
-        )
+        true = WatchedSignals(row.sigma, row.v_tilde, row.e)
+        return WatchedRow(row.t, row.u, row.z, row.i_ref, state.computed, true)
 
     def noted(self, row: WatchedRow, span: Span) -> WatchedRow:
         return row
 
     def singularity(self, row: WatchedRow) -> Array:
-        return row.distance
+        return self.loop.loop.scenario.plant.singularity(row.z, row.i_ref)

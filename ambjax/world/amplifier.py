@@ -1,12 +1,24 @@
-"""The amplifier between the commanded voltage and the coils: bandwidth, slew rate, dead band and current limit."""
+"""The amplifier between the command and the coils: one that applies a voltage, or one that controls the current."""
 
 from collections.abc import Callable
+from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.numerics.smooth import limited
+
+
+class CoilResponse(NamedTuple):
+    """Rate of the measured current at an instant: i' = still + per_volt u, in A/s and A/(V s)."""
+
+    still: Array
+    per_volt: Array
+
+    def voltage(self, rate: Scalar) -> Array:
+        """Return the voltage (V) for which the current has this rate (A/s)."""
+        return (rate - self.still) / self.per_volt
 
 
 @record
@@ -30,6 +42,12 @@ class Amplifier:
     i_max: Scalar | None = leaf(
         default=None, unit="A", at_least=1e-9, at_most=1e6, optional=True, doc="limit of |i|; none: no limit"
     )
+
+    mode: ClassVar[str] = "voltage"
+
+    def command_limit(self, u_max: Scalar) -> Scalar:
+        """Return the limit of the commanded voltage (V), that of the supply."""
+        return u_max
 
     @property
     def slow(self) -> bool:
@@ -59,16 +77,44 @@ class Amplifier:
         """Return the duration (s) of the final first-order part, in which the rate is below the slew rate."""
         return 0.0 if self.bandwidth is None else 1 / self.slope()
 
-    def at_coil(self, u_a: Array, i: Array, u_max: Scalar, holding_voltage: Callable[[], Array]) -> Array:
-        """Return the voltage (V) at the coils for a current i (A), within the supply's u_max (V).
-
-        `holding_voltage`: returns the voltage (V) that holds that current.
-        """
+    def at_coil(self, u_a: Array, i: Array, u_max: Scalar, response: Callable[[], CoilResponse]) -> Array:
+        """Return the voltage (V) at the coils for the output u_a (V) and a current i (A), within u_max (V)."""
         if self.dead_band is not None:
             size = jnp.maximum(jnp.abs(u_a) - self.dead_band, 0.0)
             u_a = jnp.where(u_a < 0, -size, size)
         if self.i_max is None:
             return u_a
-        kept = limited(holding_voltage(), u_max)
+        kept = limited(response().voltage(0.0), u_max)
         u_a = jnp.where((i >= self.i_max) & (u_a > kept), kept, u_a)
         return jnp.where((i <= -self.i_max) & (u_a < kept), kept, u_a)
+
+
+@record
+class CurrentAmplifier:
+    """An amplifier that controls the current: i' = w (i_command - i), w = 2 pi bandwidth, within the supply's voltage.
+
+    Its current loop measures the true current and applies the voltage for this rate: u is the sum of R i, of the
+    voltage that the motion induces, and of the inductive voltage of w (i_command - i), limited to the supply's u_max. A
+    saturated supply slews the current. In the two-coil plant i is half the difference of both currents.
+    """
+
+    bandwidth: Scalar = leaf(
+        default=1e3, unit="Hz", at_least=1, at_most=1e6, doc="bandwidth of the current loop, first order"
+    )
+    i_max: Scalar | None = leaf(
+        default=None, unit="A", at_least=1e-9, at_most=1e6, optional=True, doc="limit of the command; none: no limit"
+    )
+    mode: ClassVar[str] = "current"
+    slow: ClassVar[bool] = False
+
+    def slope(self) -> Scalar:
+        """The rate w of the current, 1/s."""
+        return 2 * jnp.pi * self.bandwidth
+
+    def command_limit(self, u_max: Scalar) -> Scalar:
+        """Return the limit of the commanded current (A)."""
+        return jnp.inf if self.i_max is None else self.i_max
+
+    def at_coil(self, command: Array, i: Array, u_max: Scalar, response: Callable[[], CoilResponse]) -> Array:
+        """Return the voltage (V) at the coils for a commanded current (A) and a current i (A), within u_max (V)."""
+        return limited(response().voltage(self.slope() * (command - i)), u_max)

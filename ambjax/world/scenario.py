@@ -1,6 +1,7 @@
 """The scenario: true plant, initial state, reference, disturbances, sensors and amplifier."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.world.amplifier import Amplifier
+from ambjax.world.amplifier import Amplifier, CoilResponse, CurrentAmplifier
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement, Sensor
@@ -58,8 +59,8 @@ class Scenario:
     u_max: Scalar = leaf(
         default=jnp.inf, unit="V", at_least=1e-9, at_most=1e12, infinite=True, doc="limit of the supply; inf: none"
     )
-    amplifier: Amplifier | None = None
-    """between the voltage commanded and the coils; None: ideal"""
+    amplifier: Amplifier | CurrentAmplifier | None = None
+    """between the command and the coils; None: an ideal source of the commanded voltage"""
     clearance: Scalar | None = leaf(
         default=None, unit="m", at_least=1e-9, at_most=1.0, optional=True, doc="|z| of touch-down; none: 0.9 s_0"
     )
@@ -78,6 +79,39 @@ class Scenario:
         """|z| at which the rotor is lost, m: `touchdown`; with a stop, the pole of the magnet."""
         return self.touchdown if self.stop is None else POLE * self.plant.s_0
 
+    @property
+    def drive(self) -> str:
+        """What the controller commands: "voltage" or "current"."""
+        return "voltage" if self.amplifier is None else self.amplifier.mode
+
+    @property
+    def command_limit(self) -> Scalar:
+        """Limit of the command: of the voltage (V) or of the current (A)."""
+        return self.u_max if self.amplifier is None else self.amplifier.command_limit(self.u_max)
+
+    def coil_voltage(self, command: Array, state: Any, q_i: Scalar = 0.0) -> Array:
+        """Return the voltage (V) at the coils for the output of the amplifier's lag, or the commanded current.
+
+        `command`: V or A. `state`: of the plant. `q_i`: disturbance of the current's rate, A/s.
+        """
+        plant = self.plant
+        if self.amplifier is None:
+            return command
+
+        def response() -> CoilResponse:
+            still, driven = (plant.measurement(plant.rates(state, volt, 0.0, q_i)).i for volt in (0.0, 1.0))
+            return CoilResponse(still, driven - still)  # i' is linear in u
+
+        return self.amplifier.at_coil(command, plant.measurement(state).i, self.u_max, response)
+
+    @property
+    def current_slope(self) -> Scalar:
+        """The fastest rate of the current, 1/s: R/L of a coil, or that of the amplifier's current loop if greater."""
+        coils = self.plant.coil_slope(self.limit)
+        if self.amplifier is None or self.drive == "voltage":
+            return coils
+        return jnp.maximum(jnp.asarray(coils), self.amplifier.slope())
+
     def pushed(self, q_z: Array, motion: Measurement) -> Array:
         """Return the disturbance q_z (m/s^2) plus the acceleration by the stop, for the true motion of the rotor."""
         return q_z if self.stop is None else q_z + self.stop.force(motion, self.touchdown) / self.plant.m
@@ -94,7 +128,7 @@ class Scenario:
     @property
     def on_processor(self) -> str | None:
         """The dotted path of a part that requires a processor; None if there is none."""
-        if self.amplifier is not None:
+        if self.amplifier is not None and self.drive == "voltage":
             given = (field.name for field in dataclasses.fields(self.amplifier))
             return f"actuator.{next((name for name in given if getattr(self.amplifier, name) is not None), '')}"
         names = ("bits", "bandwidth", "outliers", "dropouts")
@@ -102,10 +136,13 @@ class Scenario:
         return f"sensor.{named[0]}" if named else None
 
     def in_continuous_time(self) -> "Scenario":
-        """Return the scenario without the parts that require a processor: low-pass, converter, faults, amplifier."""
+        """Return the scenario without the parts that require a processor: low-pass, converter, faults, amplifier.
+
+        An amplifier that controls the current remains.
+        """
         none = {"bits": None, "bandwidth": None, "outliers": None, "dropouts": None}
         sensor = self.sensor and dataclasses.replace(self.sensor, **none)
-        return dataclasses.replace(self, sensor=sensor, amplifier=None)
+        return dataclasses.replace(self, sensor=sensor, amplifier=self.amplifier if self.drive == "current" else None)
 
     def acceleration(self, t: Scalar) -> Array:
         """Return the total disturbance of Eq. (1) at time t: q_z + a q_v + q_f / m - base, m/s^2."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.cases.tune_table import MEAN_MARGIN, WORST_MARGIN
+from ambjax.cases.tune_table import LOOP_MARGIN, MEAN_MARGIN, WORST_MARGIN
 from ambjax.extend import Scalar, leaf, record, static
 from ambjax.simulation.folds import Driven, Ending, Fold, Peak, Rms, Variation
 from ambjax.simulation.response import Overshoot, Settling
@@ -131,7 +131,7 @@ class Kind:
 _POOLED = {"over": "root mean square over members", "tuned": pooled, "judged": pooled, "margin": MEAN_MARGIN}
 _MEAN = {"over": "mean over members", "tuned": jnp.mean, "judged": np.mean, "margin": MEAN_MARGIN}
 _WORST = {"over": "of the worst member", "tuned": largest, "judged": np.max, "margin": WORST_MARGIN, "worst": True}
-_LOOP = _WORST | {"tuned": worst_loop, "fold": None, "exact": None}
+_LOOP = _WORST | {"tuned": worst_loop, "fold": None, "exact": None, "margin": LOOP_MARGIN}
 
 KINDS: dict[str, Kind] = {
     "rms_error_m": Kind(

@@ -11,6 +11,7 @@ from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import Report as Check
 from ambjax.theorem.conditions import check
 from tuning.config import seeds, settings
+from tuning.delay_test import delay_test
 from tuning.judge import StepError, describe, held, judge, step_error, summarise, worst, worst_of
 from tuning.measured_peaks import injections
 from tuning.problem import TuningProblem
@@ -72,7 +73,8 @@ def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_
     after = judged["after"]
     measured = injections(problem, answer.x, held_out, after) if after else None
     found["sensitivity"] = None if measured is None else sensitivity_table.facts(problem, measured)
-    found["limits"] = limit_table.facts(problem, after, found["after"], refuted, measured)
+    late = delay_test(problem, answer.x, held_out, after) if after else None
+    found["limits"] = limit_table.facts(problem, after, found["after"], refuted, measured, late)
     if refuted and after:
         found["after"] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
     found["loss"] = {name: breakdown.table(problem.error_goal, one) for name, one in judged.items() if one}

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.host.web_page import table
+from tuning.delay_test import DELAY_MARGIN, DelayTest
 from tuning.measured_peaks import MEASURED, Sensitivity, reached_of
 from tuning.objective.limits import FRONT, Limit
 from tuning.problem import TuningProblem
@@ -23,13 +24,15 @@ def facts(
     summary: Facts,
     refuted: str = "",
     measured: Sensitivity | None = None,
+    delayed: DelayTest | None = None,
 ) -> list[Facts]:
     """Return a row for each limit and one for survival, from the held-out members' columns [N] and their summary.
 
     `refuted`: why accurate steps contradict the judged members; '' if they confirm them. `measured`: the injections
-    into some of the judged members. In a row, `held` is None if no member was judged, or if the limit is held but
-    accurate steps contradict it; `verdict` is its text. `price`: the decrease of the minimised settled rms error
-    (m) or voltage (V) for a limit 10 % looser (`Limit.error_reduction`); None if it is not held.
+    into some of the judged members. `delayed`: the test of the limit on the delay margin. In a row, `held` is None if
+    no member was judged, or if the limit is held but accurate steps contradict it; `verdict` is its text. `price`: the
+    decrease of the minimised settled rms error (m) or voltage (V) for a limit 10 % looser (`Limit.error_reduction`);
+    None if it is not held.
     """
     members, held, settings = summary["members"], summary["held"], problem.tune.limits
     share = held / members if members else None
@@ -49,7 +52,8 @@ def facts(
         "price": None,
         "price_unit": price_unit,
     } | _verdict(None if share is None else members - held <= settings.may_lose(members), refuted)
-    return [*(_row(limit, columns, summary, refuted, measured, price_unit) for limit in _asked(problem)), survival]
+    rows = [_row(limit, columns, summary, refuted, measured, price_unit) for limit in _asked(problem)]
+    return [*(_tested(row, delayed, refuted) for row in rows), survival]
 
 
 def _verdict(kept: bool | None, refuted: str) -> Facts:
@@ -90,6 +94,16 @@ def _row(
         "price": price if found["held"] else None,
         "price_unit": price_unit,
     } | found
+
+
+def _tested(row: Facts, delayed: DelayTest | None, refuted: str) -> Facts:
+    """Return the row with the result of the test of the delay margin; unchanged if it is of another limit."""
+    if row["name"] != DELAY_MARGIN or delayed is None:
+        return row
+    words = (
+        f"{row['what']}; with this additional delay {delayed.lost} of {delayed.members} of the worst members are lost"
+    )
+    return row | {"what": words} | (_verdict(False, refuted) if delayed.lost else {})
 
 
 def _asked(problem: TuningProblem) -> list[Limit]:

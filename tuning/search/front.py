@@ -16,7 +16,7 @@ from tuning.config import seeds
 from tuning.judge import held, judge, rms
 from tuning.objective.limits import FRONT
 from tuning.search.course import Course, SearchResult
-from tuning.search.multipliers import AVERAGING_MEMBERS, met, reached, searched
+from tuning.search.multipliers import judged_members, met, reached, searched
 from tuning.search.validation import validated
 
 # Error limit of the knee, and those of the front in the order in which tune.front adds them, relative to the least.
@@ -133,7 +133,7 @@ def _judged(course: Course, factor: float, x: np.ndarray) -> tuple[FrontPoint, l
     """
     problem, budget = course.problem, course.problem.tune.budget
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
-    columns, tuned = judge(problem, x, seed, min(count, AVERAGING_MEMBERS)), searched(course, x)
+    columns, tuned = judge(problem, x, seed, judged_members(problem.limits, count)), searched(course, x)
     values = reached(problem, x, seed, columns, tuned)
     alive = held(columns)
     error, volts = (

@@ -12,7 +12,7 @@ import numpy as np
 from ambjax.commands.outputs import say
 from tuning.config import seeds
 from tuning.judge import judge
-from tuning.measured_peaks import MEASURED, decides, injections, reached_of
+from tuning.measured_peaks import MEASURED, decides, injections, injects, reached_of
 from tuning.objective.limits import PENALTY, PREFIX, TOLERANCE_BELOW, Limit
 from tuning.problem import TuningProblem
 from tuning.search.course import Course
@@ -23,7 +23,9 @@ MOST_UPDATES = 6
 LEAST_DECREASE = 1e-3
 # A limit with g below minus this number is clearly met and not judged again, because two ensembles differ by far less.
 CLEARLY_BELOW = 0.1
-# Largest number of members on which averages are judged.
+# A linear value with g above minus this number is measured by an injection, which exceeds it by up to a fifth.
+INJECTED_FROM = 0.2
+# Largest number of members on which averages are judged; limits of worst members need the whole ensemble.
 AVERAGING_MEMBERS = 256
 
 
@@ -93,10 +95,13 @@ def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
     ):
         return list(zip(tuned, known, strict=True))
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
-    if not any(limit.kind.worst for limit in limits):
-        count = min(count, AVERAGING_MEMBERS)
-    columns = judge(problem, x, seed, count)
+    columns = judge(problem, x, seed, judged_members(limits, count))
     return list(zip(tuned, reached(problem, x, seed, columns, tuned), strict=True))
+
+
+def judged_members(limits: Sequence[Limit], count: int) -> int:
+    """Return how many of `count` members the limits are judged on: all if one of them is on the worst member."""
+    return count if any(limit.kind.worst for limit in limits) else min(count, AVERAGING_MEMBERS)
 
 
 def searched(course: Course, x: np.ndarray) -> list[float]:
@@ -110,19 +115,24 @@ def reached(
 ) -> list[float]:
     """Return the judge's value of each limit at x [m].
 
-    `columns` [N]: result of `judge` for the ensemble with this `seed`. `tuned`: the search's value of each limit. If
-    injections decide on sensitivities (`measured_peaks.decides`), one injection measures the member with the largest
-    peak. It is omitted if an earlier injection has corrected `tuned` and all corrected values are clearly within their
-    limits.
+    `columns` [N]: result of `judge` for the ensemble with this `seed`. `tuned`: the search's value of each limit.
+
+    On a processor the member with the largest linear peak is measured by one injection if it may break a limit, because
+    the held-out members are measured in this way too. If injections decide alone (`measured_peaks.decides`), values
+    that an earlier injection has corrected, and that are clearly within their limits, replace another injection.
     """
+    if not injects(problem):
+        return [limit.reached(columns) for limit in problem.limits]
     pairs = [(limit, ours) for limit, ours in zip(problem.limits, tuned, strict=True) if limit.name in MEASURED]
-    near = [
-        limit
-        for limit, ours in pairs
-        if math.isinf(limit.missed) or limit.log_excess(limit.ratio * ours) > -CLEARLY_BELOW
-    ]
-    if not decides(problem) or near:
-        measured = injections(problem, x, seed, columns, most=1) if decides(problem) else None
+    if decides(problem):
+        near = any(
+            math.isinf(limit.missed) or limit.log_excess(limit.ratio * ours) > -CLEARLY_BELOW for limit, ours in pairs
+        )
+        known = {limit.name: limit.ratio * ours for limit, ours in pairs}
+    else:
+        near = any(limit.log_excess(limit.reached(columns)) > -INJECTED_FROM for limit, _ in pairs)
+        known = {}
+    if near:
+        measured = injections(problem, x, seed, columns, most=1)
         return [reached_of(limit, columns, measured) for limit in problem.limits]
-    known = {limit.name: limit.ratio * ours for limit, ours in pairs}
     return [known.get(limit.name, limit.reached(columns)) for limit in problem.limits]

@@ -25,9 +25,9 @@ ABOUT = {
         "0: the laws start at the next accepted readings",
         "inputs of a step: the readings, which params->processor.guard limits if there is a guard, and the reference, "
         "which\n * params->limits limits",
-        "Initialise the state before the first step: no voltage; the first accepted readings will start the laws.",
+        "Initialise the state before the first step: u is 0; the first accepted readings will start the laws.",
         "Compute one sample. Returns the status bits above.",
-        "Restart the laws at the next accepted readings. The delayed voltages are kept.",
+        "Restart the laws at the next accepted readings. The delayed commands are kept.",
     ),
     "plant": About(
         "0: the next step reads the sensors in the initial state",
@@ -82,10 +82,11 @@ def order_of_work(trace: Trace) -> list[str]:
     """Return the order of work of every sample, in words."""
     block = trace.block
     processor: Any = block.parameters.controller.processor
-    delay = processor.delay
+    delay, unit = processor.delay, block.outputs["u"][0]
     lines = [
         f"Every T = {block.period:g} s: read the sensors, call the step at once, and apply output->u",
-        f"{delay:g} T after the reading, until the u of the next sample replaces it; before the first u, apply 0 V.",
+        f"{delay:g} T after the reading, until the u of the next sample replaces it; before the first u, apply 0 "
+        f"{unit}.",
     ]
     ahead = f"{delay:g} T after the reading" if processor.predicts else "of the reading"
     lines.append(f"The reference is that of the instant {ahead}.")
@@ -95,11 +96,12 @@ def order_of_work(trace: Trace) -> list[str]:
 def fixed(trace: Trace) -> list[str]:
     """Return in words what the export fixes, what params can set, what a step checks, and how long it predicts."""
     parameters = {x.name: x for x in trace.parameters}
+    unit = trace.block.outputs["u"][0]
     u_max, delay = parameters["limits.u_max"].value, parameters["processor.delay"].allowed
     lines = [
         f"Fixed at export: T = {trace.block.period:g} s, the laws, which signs have no layer, and whether the",
         "delay is predicted. Export again to change one of these. Any value in params may change between two steps.",
-        f"params->limits.u_max: u is {'not limited' if np.isinf(u_max) else f'limited to +-{u_max:g} V'}.",
+        f"params->limits.u_max: u is {'not limited' if np.isinf(u_max) else f'limited to +-{u_max:g} {unit}'}.",
     ]
     if samples := parameters.get("processor.guard.samples"):
         time = samples.value * trace.block.period

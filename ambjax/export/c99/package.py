@@ -157,7 +157,8 @@ def _readme(writer: Writer) -> str:
     controller = t.block.noun == "controller"
     read = [name for name in t.block.inputs if name in t.read]
     source = _source if controller else "input_{}".format
-    written_ = {"voltage": "u"} if controller else {name: name for name in t.block.outputs}
+    command = getattr(t.block, "commands", "voltage")
+    written_ = {command: "u"} if controller else {name: name for name in t.block.outputs}
     bits = ("SAFE", "FAILED", "INVALID") if controller else ("INVALID", "TOUCHED", "DIVERGED")
     notes = order_of_work(t) if controller else notes_of(t)
     return README.format(

@@ -1,0 +1,64 @@
+"""The test of the limit on the delay margin: an additional delay in the simulation against the linear margin."""
+
+import math
+
+import numpy as np
+import pytest
+from texts import case_and_tune
+
+from ambjax.linear import analyse, linearise
+from tuning.delay_test import DELAY_MARGIN, DelayTest, delay_test
+from tuning.objective.limits import PREFIX
+from tuning.problem import problem_of
+from tuning.report import limit_table
+
+PERIOD = 6e-4
+# a current amplifier on a slow processor: the linear delay margin is 0.68 of a sample
+CASE = {
+    "plant": {"m": 2.4, "k_z": 0.0, "mu_0": 1.2566e-6, "n": 300.0, "A": 2e-4, "s_0": 5e-4, "i_0": 2.0, "R": 1.0},
+    "controller": {
+        "observer": {"kind": "kalman", "w": 1700.0},
+        "position": {"kind": "state-feedback"},
+        "inversion": {"kind": "linearised"},
+    },
+    "processor": {"delay": 0.5},
+    "actuator": {"mode": "current", "bandwidth": 1500.0},
+    "sensor": {"std": 3e-7, "velocity": False},
+    "initial": {"z": 2e-5},
+    "clock": {"duration": 0.3, "sample_period": PERIOD},
+}
+
+
+def problem(limit):
+    return problem_of(*case_and_tune(CASE | {"tune": {"limits": {DELAY_MARGIN: limit}, "members": 4}}))
+
+
+@pytest.mark.slow
+def test_members_are_lost_beyond_the_linear_margin_and_not_below():
+    made = problem(1e-4)
+    case = made.case
+    margin = analyse(linearise(case.cascade, case.scenario, case.clock), 2.4, PERIOD, case.zones).margins.delay
+    assert 0.6 * PERIOD < margin < 0.75 * PERIOD
+    x = made.tune.space.encode(made.tune.space.values(case.cascade))
+    columns = {
+        f"loss.{PREFIX}{DELAY_MARGIN}": np.array([3.0, 1.0, 2.0]),
+        "lost_at_s": np.array([math.inf, math.inf, 1.0]),
+    }
+    found = {share: delay_test(problem(share * margin), x, 1, columns) for share in (0.8, 2.0)}
+    # up to 1.4 times the margin the unstable loop ends in an oscillation that holds the rotor
+    assert found == {0.8: DelayTest(2, 0), 2.0: DelayTest(2, 2)}
+    # beyond two samples nothing can be simulated, and a case in continuous time has no such delay
+    assert delay_test(problem(1.6 * PERIOD), x, 1, columns) is None
+    lost = columns | {"lost_at_s": np.zeros(3)}
+    assert delay_test(problem(1e-4), x, 1, lost) is None
+
+
+def test_a_lost_member_breaks_the_limit():
+    row = {"name": DELAY_MARGIN, "what": "delay margin", "held": True, "verdict": limit_table.HELD}
+    assert limit_table._tested(row, None, "") == row
+    kept = limit_table._tested(row, DelayTest(16, 0), "")
+    assert kept["verdict"] == limit_table.HELD
+    assert "0 of 16" in kept["what"]
+    assert limit_table._tested(row, DelayTest(16, 1), "")["verdict"] == limit_table.BROKEN
+    other = row | {"name": "sensitivity"}
+    assert limit_table._tested(other, DelayTest(16, 1), "") == other

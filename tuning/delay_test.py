@@ -1,0 +1,46 @@
+"""Test of the limit on the delay margin: members run with the limit as an additional delay."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ambjax.control.processor import MOST_DELAY
+from ambjax.ensemble import run_ensemble
+from tuning.objective.limits import PREFIX
+from tuning.problem import TuningProblem
+
+DELAY_MARGIN = "delay_margin_s"
+# Members tested, those with the smallest linear margins.
+TESTED = 16
+
+
+class DelayTest(NamedTuple):
+    """Number of members tested, and how many of them are lost with the additional delay."""
+
+    members: int
+    lost: int
+
+
+def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mapping[str, np.ndarray]) -> DelayTest | None:
+    """Simulate the members of least linear delay margin at x [m] with the limit on it as an additional delay.
+
+    The prediction of the controller keeps the delay of the case. `columns` [N]: result of `judge` for the ensemble with
+    this `seed`. Returns None without such a limit, without a processor, if the sum of the delays is longer than a
+    processor allows, or if no member is held.
+    """
+    limit = next((limit for limit in problem.limits if limit.name == DELAY_MARGIN), None)
+    alive = np.flatnonzero(~np.isfinite(columns["lost_at_s"]))
+    if limit is None or not problem.sampled or not alive.size:
+        return None
+    order = np.argsort(columns[f"loss.{PREFIX}{DELAY_MARGIN}"][alive], kind="stable")
+    members = problem.objective.chosen(seed, alive[order[:TESTED]], len(columns["lost_at_s"]))
+    cascade, scenario = problem.objective.fixed(x, members)
+    processor: Any = cascade.processor
+    delay = np.asarray(processor.delay) + limit.threshold / float(problem.case.clock.sample_period)
+    if np.max(delay) > MOST_DELAY:
+        return None
+    late = dataclasses.replace(processor, delay=delay, assumed=processor.ahead, predict=processor.predicts)
+    ended = run_ensemble(dataclasses.replace(cascade, processor=late), scenario, problem.case.clock, fold=None, every=0)
+    return DelayTest(len(members.member), int(np.isfinite(ended.trajectory.lost_at).sum()))
