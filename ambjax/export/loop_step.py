@@ -10,16 +10,8 @@ from ambjax.export.block import Block, Ports
 from ambjax.export.controller import Controller, Memory, Parameters
 from ambjax.export.interface import BITS, INPUTS, OUTPUTS, Status, StepInputs, StepOutputs
 from ambjax.export.numbering import Number
-from ambjax.export.plant_step import (
-    DISTURBANCES,
-    LOSSES,
-    READINGS,
-    Machine,
-    PlantInputs,
-    PlantMemory,
-    PlantOutputs,
-    PlantStep,
-)
+from ambjax.export.plant_ports import DISTURBANCES, LOSSES, READINGS, PlantInputs, PlantOutputs
+from ambjax.export.plant_step import Machine, PlantMemory, PlantStep
 from ambjax.numerics.records import Scalar
 from ambjax.simulation.integrate import choose
 from ambjax.simulation.trajectory import ALIVE
