@@ -138,7 +138,7 @@ class Guard:
 
 
 def expected(driven: Callable[[Array, State], State], at: State, u: Array, period: Scalar) -> Measurement:
-    """Predict the readings of the next sample from the state `at` under a mean command u. `driven`: `Cascade.driven`."""
+    """Predict the readings of the next sample from the state `at` under a mean command u. `driven`: of `Cascade`."""
     rates = driven(u, at)
     z, z_dot, i = (x + period * rate for x, rate in zip(at[:3], rates[:3], strict=True))
     return Measurement(z + period * period / 2 * rates.z_dot, z_dot, i)
