@@ -16,6 +16,7 @@ from ambjax.cases.template_text import template as case_template
 from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.study import Study
 from ambjax.linear.analysis import analyse, linearise
+from ambjax.page import html_page
 from ambjax.page.case_text import checked, filled, template
 from ambjax.page.html_page import MEMBERS, page
 from ambjax.page.sliders import SEED, parameter_values, sliders
@@ -313,3 +314,20 @@ def test_the_command_writes_the_page(tmp_path, capsys):
     assert main(["page", str(one), "--also", str(one), "--out", str(tmp_path / "new" / "p.html"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert pathlib.Path(found["out"]).stat().st_size == found["bytes"]
+
+
+def test_cases_that_differ_in_numbers_share_a_page(case, monkeypatch):
+    other = case_from(tomllib.loads(RIG.replace('kind = "kalman"\nw = 1000.0', 'kind = "ired-1"')), "other", RIG)
+    louder = rig(RIG.replace("std = 5e-7", "std = 1e-6"), "louder")
+    shown = lambda case, others, path: f"{path}: {[one.name for one in (case, *others)]}"  # noqa: E731
+    monkeypatch.setattr(html_page, "page", shown)
+    found = html_page.pages([case, other, louder], ["a.toml", "b.toml", "c.toml"])
+    assert found == {"page.html": "a.toml: ['rig', 'louder']", "page-2.html": "b.toml: ['other']"}
+
+
+def test_a_member_has_no_page(tmp_path, capsys):
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG)
+    assert main(["simulate", str(path), "--page", "--member", "1", "--out", str(tmp_path / "out")]) == 2
+    assert "--page shows the case, not a member" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

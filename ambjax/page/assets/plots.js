@@ -55,7 +55,7 @@ async function showPlots(parent, plots) {
     parent.append(element("section", { class: "plot", id: `plot-${id}` }, element("h2", {}, title), box));
     return box;
   });
-  await Bokeh.embed.add_document_standalone(all, parent, roots);
+  await Bokeh.embed.add_document_standalone(all, element("div", {}), roots);
 }
 
 // Run `task`, which draws a plot: now if the plot is in the window, else when the page is idle or the plot comes into it.
