@@ -37,8 +37,8 @@ PLANT = [
     M(
         "one passive bearing instead of two",
         "ambjax/world/plant.py",
-        "z_ddot = 2 * self.k_z / self.m * z",
-        "z_ddot = self.k_z / self.m * z",
+        "z_ddot = 2 * self.k_z / self.m * z + self.a * self.v_and_dv_di",
+        "z_ddot = self.k_z / self.m * z + self.a * self.v_and_dv_di",
         "tests/test_plant.py::test_rates_are_equations_1_and_2_written_out",
     ),
     M(
