@@ -40,6 +40,8 @@ def source_checksum() -> str:
 
 def execute(app: Sphinx, env: Any, docnames: list[str]) -> None:
     """Execute the pages that are about to be read, except those in the cache. Raises ExtensionError if a cell fails."""
+    if app.config.nb_execution_mode != "cache":
+        return
     folder = pathlib.Path(app.config.nb_execution_cache_path)
     for old in set(folder.parent.glob("*")) - {folder}:
         shutil.rmtree(old)
