@@ -23,7 +23,7 @@ from ambjax.ensemble import run_ensemble
 from ambjax.ensemble.maps import Axis, stepped
 from ambjax.simulation.folds import Named
 from ambjax.simulation.method import DRIVEN, choose_method
-from ambjax.world.amplifier import Amplifier
+from ambjax.world.amplifier import Amplifier, CoilResponse
 from ambjax.world.sensor import Errors, Measurement, Sensor, converted
 from tuning.objective.quantities import Typical
 
@@ -136,7 +136,8 @@ def test_dead_band_and_current_limit():
 
     def at(u, i, hold=None):
         u, i = jnp.asarray(u), jnp.asarray(i)
-        return float(drive.at_coil(u, i, 60.0, lambda: 50.0 * i if hold is None else jnp.asarray(hold)))
+        held = 50.0 * i if hold is None else jnp.asarray(hold)
+        return float(drive.at_coil(u, i, 60.0, lambda: CoilResponse(-held, jnp.ones(()))))
 
     assert [at(u, 0.1) for u in (5.0, 1.0, -1.5, -9.0)] == [3.0, 0.0, 0.0, -7.0]
     assert [at(30.0, 0.4), at(30.0, -0.5), at(-30.0, -0.5), at(10.0, 0.4)] == [20.0, 28.0, -25.0, 8.0]
