@@ -320,7 +320,8 @@ def test_coils_that_settle_within_a_sample_are_resolved(kind):
 
 
 def _matrix(jacobian):
-    return np.array([[float(x) for x in row] for row in jacobian])
+    """Matrix of the derivatives; an absent state has neither a row nor a column."""
+    return np.array([[float(x) for x in row if not isinstance(x, tuple)] for row in jacobian if len(row)])
 
 
 @pytest.mark.parametrize("gamma", np.geomspace(1e7, 1e11, 9))

@@ -282,7 +282,7 @@ def test_parquet_needs_its_extra(tmp_path):
         ),
         (
             {"sensor": {"runout": {"speed": 1.0}}},
-            "sensor.runout.harmonics = None: it must be a list of 1 to 100 tables",
+            "sensor.runout.harmonics is missing: it must be a list of 1 to 100 tables",
         ),
         (
             {"sensor": {"runout": {"speed": 1.0, "harmonics": [{"number": 0.5, "amplitude": 1.0}]}}},

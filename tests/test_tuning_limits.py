@@ -317,7 +317,9 @@ def command(monkeypatch, tmp_path, world=None, **tune):
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(dumps(document(**tune)))
     flags = {"gradients": False, "pareto": False, "resume": False, "json": True}
-    code, summary = tuning.command.run(argparse.Namespace(case=str(path), out=str(out), settings_of=None, **flags))
+    code, summary = tuning.command.run(
+        argparse.Namespace(page=False, case=str(path), out=str(out), settings_of=None, **flags)
+    )
     return code, summary, out
 
 

@@ -64,7 +64,9 @@ def ran(monkeypatch, tmp_path, capsys):
         path, out = tmp_path / "case.toml", tmp_path / "out"
         path.write_text(dumps(document(**tune)))
         flags = {"gradients": False, "pareto": False, "resume": False, "json": False}
-        code, _ = tuning.command.run(argparse.Namespace(case=str(path), out=str(out), settings_of=None, **flags))
+        code, _ = tuning.command.run(
+            argparse.Namespace(page=False, case=str(path), out=str(out), settings_of=None, **flags)
+        )
         said = capsys.readouterr()
         return code, json.loads((out / "report.json").read_text()), said.out, said.err, out
 

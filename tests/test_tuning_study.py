@@ -254,7 +254,9 @@ def command(monkeypatch, tmp_path, world, *flags, **tune):
     path.write_text(dumps(document(**tune)))
     names = ("--gradients", "--pareto")
     given = {name.removeprefix("--"): name in flags for name in names}
-    args = argparse.Namespace(case=str(path), out=str(out), settings_of=None, resume=False, json=True, **given)
+    args = argparse.Namespace(
+        page=False, case=str(path), out=str(out), settings_of=None, resume=False, json=True, **given
+    )
     code, summary = tuning.command.run(args)
     assert json.loads(json.dumps(summary)) is not None
     return code, summary, out, made
@@ -348,7 +350,7 @@ def test_a_case_from_a_pipe_is_read_once(monkeypatch, tmp_path):
     monkeypatch.setattr(tuning.command, "_tune", lambda plan, args: (plan.raw, plan.problem.case.text))
     text = dumps(document())
     flags = {"settings_of": None, "pareto": False, "resume": False, "json": True}
-    args = argparse.Namespace(case=piped(text), out=str(tmp_path / "out"), **flags)
+    args = argparse.Namespace(page=False, case=piped(text), out=str(tmp_path / "out"), **flags)
     assert tuning.command.run(args) == (tomllib.loads(text), text)
 
 
@@ -381,7 +383,7 @@ def test_a_search_killed_before_its_first_checkpoint_is_resumed(monkeypatch, tmp
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(dumps(document()))
     flags = {"gradients": False, "pareto": False, "resume": True, "json": True, "settings_of": None}
-    args = argparse.Namespace(case=str(path), out=str(out), **flags)
+    args = argparse.Namespace(page=False, case=str(path), out=str(out), **flags)
     with pytest.raises(ValueError, match=r"--resume: --out .* contains no search"):
         tuning.command.run(args)
 

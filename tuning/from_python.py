@@ -31,6 +31,7 @@ def tune(
     resume: bool = False,
     gradients: bool = False,
     pareto: bool = False,
+    page: bool = False,
     settings_of: str | pathlib.Path | None = None,
 ) -> TunedCase:
     """Tune the gains of a case file, as `ambjax tune` does, and write the same files.
@@ -40,6 +41,7 @@ def tune(
     - `resume`: continue the search whose checkpoints are in `out`.
     - `gradients`: also report the gradient of the loss.
     - `pareto`: write each point of the front of error against voltage as a case file.
+    - `page`: also write page.html, in which sliders move the tuned gains (extra `[page]`).
     - `settings_of`: path of another case file, whose limits, loss and budget replace those of `case`.
 
     Prints progress to stderr and returns a `TunedCase`. Raises ValueError for an invalid case or option, before any
@@ -54,6 +56,7 @@ def tune(
             resume=resume,
             gradients=gradients,
             pareto=pareto,
+            page=page,
             settings_of=None if settings_of is None else str(settings_of),
             json=True,
         )

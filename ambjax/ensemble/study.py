@@ -21,7 +21,7 @@ from ambjax.world.scenario import Scenario
 
 SPREAD = "spread."
 # Upper bound on the columns of members.npz other than the spread numbers, to estimate the disk space of a study.
-COLUMNS = 28
+COLUMNS = 34
 # Number of equal parts of a run in each of which the variation of the voltage is computed.
 WINDOWS = 25
 # Signals of a fan chart, and the corresponding fields of a Row.

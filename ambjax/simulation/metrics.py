@@ -39,7 +39,6 @@ UNITS = {
     "copper_loss_W": "W",
     "max_flux_T": "T",
     "max_abs_force_N": "N",
-    "force_used": "1",
     "lost_at_s": "s",
     "singular_at_s": "s",
     "settle_s": "s",
