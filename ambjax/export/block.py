@@ -1,4 +1,4 @@
-"""A block: a part of the loop that is exported. Its step is traced, written in a language, and compared with JAX."""
+"""A block: an exported part of the loop. Its step is traced, written in another language, and compared with JAX."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -22,8 +22,10 @@ class Block:
 
     - `parameters`: pytree of all numbers that a user of the exported code may change.
     - `period`: sample period, s.
-    - `noun`: name of the block in texts. `ports`: type of its inputs, a NamedTuple. `inputs`, `outputs`, `bits`: names
-      with their meanings.
+    - `noun`: name of the block in texts.
+    - `ports`: type of its inputs, a NamedTuple of scalars.
+    - `inputs`, `outputs`: unit and meaning of each input and output, by name.
+    - `bits`: meaning of each status bit, by name, the lowest bit first.
     - `crowded`: status bits that most random points set; the comparison adds points without them.
     """
 
@@ -38,10 +40,13 @@ class Block:
     crowded: ClassVar[tuple[str, ...]]
 
     def step(self, parameters: Any, memory: Any, inputs: Any, period: Scalar, read: frozenset[str]) -> Any:
-        """Compute one sample. Return the memory for the next one, the outputs and the status.
+        """Compute one sample. Return the memory for the next one, the outputs and the status bits, all scalars.
 
-        The last leaf of the memory is the flag `started`, the other leaves are real numbers. `read`: names of the
-        inputs that the step uses.
+        - `parameters`: a pytree like the field `parameters`.
+        - `memory`: the states before the step, real numbers; its last leaf is the flag `started`.
+        - `inputs`: an instance of `ports`, in the units of `inputs`.
+        - `period`: sample period, s.
+        - `read`: names of the inputs that the step uses; the step checks only these.
         """
         raise NotImplementedError
 
@@ -58,7 +63,7 @@ class Block:
         raise NotImplementedError
 
     def sizes(self) -> tuple[list[float], list[float]]:
-        """Return the scales of the states, in the order of `states`, and of the inputs."""
+        """Return the characteristic size of each state, in the order of `states`, and of each input, in their units."""
         raise NotImplementedError
 
     def bounds(self) -> dict[str, int]:
@@ -66,17 +71,17 @@ class Block:
         return {}
 
     def described(self) -> list[str]:
-        """Return the block in words, one part per line."""
+        """Return a description of the block, one line per part."""
         raise NotImplementedError
 
 
 def scales(tree: Any) -> list[float]:
-    """Return the leaves of a pytree of characteristic sizes as numbers."""
+    """Return the leaves of a pytree of characteristic sizes as floats, in the units of the leaves."""
     return [float(jnp.asarray(x)) for x in jax.tree.leaves(tree)]
 
 
 def law_lines(cascade: Cascade) -> list[str]:
-    """Return the cascade in words: the law of each stage, its signs without a boundary layer, and the processor."""
+    """Return one line per stage, with its law, signs without a layer and schedules, then a line on the processor."""
     laws: tuple[Any, ...] = cascade.laws
     lines = []
     for stage, law in zip(("observer", "position", "inversion", "current"), laws, strict=True):

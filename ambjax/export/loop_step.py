@@ -1,4 +1,4 @@
-"""The exported loop: the plant's step, then the controller's, in the order of the simulator."""
+"""The exported loop: a step of the plant, then a step of the controller, as in the simulator."""
 
 import dataclasses
 from typing import Any, ClassVar, NamedTuple
@@ -20,7 +20,7 @@ REFERENCES = {name: port for name, port in INPUTS.items() if name not in READING
 
 
 class LoopInputs(NamedTuple):
-    """Inputs of a step of the loop: those of the plant over the sample before, and the reference."""
+    """Inputs of a step: those of the plant except u, over the sample that ends with the step, and the reference."""
 
     q_z: Array
     q_i: Array
@@ -34,28 +34,28 @@ class LoopInputs(NamedTuple):
 
 
 class LoopMemory(NamedTuple):
-    """State of controller and plant; `control.started` is a real number, 0 or 1."""
+    """State of the controller and of the plant; here `control.started` is a real number, 0 or 1, not a flag."""
 
     control: Memory
     plant: PlantMemory
 
 
 class LoopParameters(NamedTuple):
-    """Parameters of controller and plant."""
+    """Parameters of the controller and of the plant."""
 
     controller: Parameters
     machine: Machine
 
 
 class LoopOutputs(NamedTuple):
-    """Outputs of a step of the loop."""
+    """Outputs of a step of the loop: those of the controller, then those of the plant."""
 
     command: StepOutputs
     motion: PlantOutputs
 
 
 class LoopStatus(NamedTuple):
-    """Status of the controller, and whether the rotor is lost."""
+    """Status bits of the controller, and two bits of the plant that report a lost rotor."""
 
     controller: Status
     touched: Array
@@ -64,7 +64,7 @@ class LoopStatus(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class LoopStep(Block):
-    """Controller and plant of a case as one block."""
+    """The controller and the plant of a case as one block."""
 
     parameters: LoopParameters
     controller: Controller
@@ -75,14 +75,19 @@ class LoopStep(Block):
     inputs: ClassVar[Ports] = DISTURBANCES | REFERENCES
     outputs: ClassVar[Ports] = OUTPUTS | READINGS
     bits = (
-        BITS | {"invalid": "an input or a parameter is NaN or out of range: u is held, or a disturbance is 0"} | LOSSES
+        BITS
+        | {"invalid": "an input or a parameter is NaN or out of range: u is held, or 0 replaces a disturbance"}
+        | LOSSES
     )
     crowded = ("saturated", "refused", "touched", "diverged")
 
     def step(
         self, parameters: LoopParameters, memory: LoopMemory, inputs: LoopInputs, period: Scalar, read: frozenset[str]
     ) -> tuple[LoopMemory, LoopOutputs, LoopStatus]:
-        """Advance and read the plant under the last voltage, then step the controller. A lost rotor's voltage is 0."""
+        """Advance the plant under the commanded voltages, read its sensors, and step the controller.
+
+        Once the rotor is lost, u is 0 and the controller keeps its state.
+        """
         before = choose(memory.plant.started, memory.control, self.start().control)
         given = PlantInputs._make([before.last.u, *inputs[: len(DISTURBANCES)]])
         plant, motion, lost = self.plant.step(parameters.machine, memory.plant, given, period, read)
@@ -122,5 +127,5 @@ class LoopStep(Block):
 
 
 def loop_of(controller: Controller, plant: PlantStep) -> LoopStep:
-    """Return the loop of an exported controller and an exported plant of one case."""
+    """Return the loop of an exported controller and an exported plant, both of one case."""
     return LoopStep(LoopParameters(controller.parameters, plant.parameters), controller.period, controller, plant)

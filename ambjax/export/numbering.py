@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from ambjax.control.schedule import OVER, Schedule, finite
 from ambjax.numerics.records import numbers
 
-# Factor by which a parameter is divided and multiplied to reach the ends at which exported code is compared with JAX.
+# Exported code is compared with JAX also at each parameter's value divided and multiplied by this factor.
 SPAN = 100.0
 # Text in place of the allowed values of a number that the step does not use.
 UNREAD = "not read"
@@ -19,9 +19,10 @@ UNREAD = "not read"
 class Number(NamedTuple):
     """A parameter, a state, an input or an output: dotted name, unit, allowed values, meaning, value.
 
-    `ends`: further values of a parameter at which exported code is compared with JAX: the lowest and the highest first,
-    then those that are not finite or that a step must reject. `among`: the only values of a state that is a flag or a
-    code; () for a real number.
+    - `ends`: further values of a parameter at which exported code is compared with JAX: the lowest and the highest
+      first, then values that are not finite or that a step must reject.
+    - `among`: values of a state that is a flag or a code, each as often as the comparison shall draw it; () for a real
+      number.
     """
 
     name: str
@@ -34,8 +35,10 @@ class Number(NamedTuple):
 
 
 def numbers_of(node: Any, path: str = "", home: str = "") -> Iterator[Number]:
-    """Yield every number of a record, in the order of its leaves, with its dotted name below `path`. `home`: text
-    before the name in a message.
+    """Yield every number of a record, in the order of its leaves.
+
+    - `path`: beginning of each dotted name, such as "position."; the name of a field follows.
+    - `home`: text before the name in an error message.
 
     Raises ValueError for an array.
     """
@@ -57,6 +60,7 @@ def numbers_of(node: Any, path: str = "", home: str = "") -> Iterator[Number]:
 
 
 def _number(name: str, field: dataclasses.Field, value: float) -> Number:
+    """Return the number of a field, with the unit, range and meaning that the field declares."""
     meta = field.metadata
     unit, doc = meta.get("unit", ""), meta.get("doc", "")
     allowed = numbers(field) if meta.get("leaf") else ""
@@ -70,7 +74,8 @@ def _number(name: str, field: dataclasses.Field, value: float) -> Number:
 def _ends(meta: Mapping[str, Any], value: float) -> tuple[float, ...]:
     """Return the further values of a parameter for the comparison: 1/SPAN and SPAN times `value`, within its bounds.
 
-    A parameter that is 0 is set to -1 and 1 in its unit; one that is inf, to 1 and SPAN.
+    For a parameter that is 0 they are -1 and 1 in its unit; for one that is inf, 1 and SPAN. NaN, and inf if it is
+    allowed, follow.
     """
     low, high = sorted((value / SPAN, value * SPAN)) if value else (-1.0, 1.0)
     if math.isinf(value):

@@ -14,9 +14,11 @@ WHAT = ("controller", "plant", "loop")
 
 
 def block_of(what: str, cascade: Cascade, scenario: Scenario, clock: Clock) -> Block:
-    """Return a block of a case: one of WHAT. Raises ValueError for a case that cannot be exported.
+    """Return a block of a case. `what`: the block, one of WHAT.
 
-    The plant of a clock without a method of fixed steps gets the simulator's choice among these.
+    If the clock's method has no fixed number of steps, `choose_method` selects one for the plant.
+
+    Raises ValueError for a case that cannot be exported.
     """
     period = float(clock.sample_period)
     controller = controller_of(cascade, scenario.command_limit, period, scenario)

@@ -1,9 +1,9 @@
 """The exported plant: motion, coils, amplifier and sensors over one sample period, in the simulator's own steps.
 
-A step advances the plant from the last sample to the next under the voltage of the last sample, and then reads the
-sensors. The first step reads the sensors in the initial state. `Sampled.advance` and `Sampled.measured`, the functions
-of the simulator, do the work. The random numbers of the sensors and the disturbances are inputs, constant over the
-sample.
+A step advances the plant from the last sample to the next under the voltages commanded so far, and then reads the
+sensors. The first step only reads the sensors, in the initial state. The steps are those of the simulator's functions
+`Sampled.advance` and `Sampled.measured`. The inputs are the voltage commanded at the last sample, the disturbances,
+which are constant over the sample, and the random numbers of the sensors.
 """
 
 import dataclasses
@@ -49,7 +49,12 @@ FIELDS = {field.name: field.metadata for field in dataclasses.fields(Scenario)}
 class PlantMemory(NamedTuple):
     """State that a step keeps for the next: that of a `SampledState`, without the laws.
 
-    `lost`: 0, or the status code with which the rotor is lost. `started`: False before the first step.
+    - `motion`: state of the plant, in its units.
+    - `last`, `before`: voltages commanded at the last two samples, the later one first, V.
+    - `z_filtered`: output of the position sensor's low-pass, m; () without one.
+    - `u_a`: output voltage of a slow amplifier, V; () without one.
+    - `lost`: 0, or the status code with which the rotor is lost.
+    - `started`: False before the first step.
     """
 
     motion: Any
@@ -63,7 +68,10 @@ class PlantMemory(NamedTuple):
 
 @record
 class Machine:
-    """Parameters of the exported plant, under the names of the case file."""
+    """Parameters of the exported plant: true plant, sensors, amplifier, stop, initial state, limits and delay.
+
+    Their names and units are those of the case file; None: the case has no such part.
+    """
 
     plant: Bearing
     sensor: Sensor | None
@@ -91,9 +99,10 @@ class Machine:
 
 @dataclasses.dataclass(frozen=True)
 class PlantStep(Block):
-    """The plant of a case as it is exported, with a method of fixed steps.
+    """The plant of a case as it is exported.
 
-    `cascade` gives the structure of the loop.
+    - `cascade`: the controller, on a processor; it determines how many samples the delay spans.
+    - `method`: integrator between samples, with a fixed number of steps.
     """
 
     parameters: Machine
@@ -104,7 +113,7 @@ class PlantStep(Block):
     ports: ClassVar[Any] = PlantInputs
     inputs: ClassVar[Ports] = {"u": ("V", "voltage commanded at the last sample"), **DISTURBANCES}
     outputs: ClassVar[Ports] = READINGS
-    bits = LOSSES | {"invalid": "an input or the delay is NaN or out of range: 0 replaces an input"}
+    bits = LOSSES | {"invalid": "the delay is out of range, or an input is not finite: 0 replaces this input"}
     crowded = ("touched", "diverged")
 
     def system(self, machine: Machine, period: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Sampled:
@@ -132,7 +141,7 @@ class PlantStep(Block):
         return kept, PlantOutputs(*measured, *true), status
 
     def _advanced(self, system: Sampled, memory: PlantMemory, u: Array) -> PlantMemory:
-        """Return the memory at the next sample. `u`: commanded at the last sample, V."""
+        """Return the memory at the next sample. `u`: voltage commanded at the last sample, V."""
         zero = jnp.zeros(())
         control: Any = ()
         command, past = Command(zero, zero, zero, zero, u), (memory.last, memory.before)
@@ -201,20 +210,24 @@ class PlantStep(Block):
 
 
 def _given(part: Any) -> str:
-    """Return the parameters of a part that a case sets, in words."""
+    """Return the names of the parameters that a case sets for a part, separated by commas."""
     return ", ".join(x.name for x in numbers_of(part))
 
 
 def _real(code: Array) -> Array:
-    """Return a status code as a real number."""
+    """Return a status code as a real number, the type of a state of exported code."""
     one = jnp.ones(())
     return jnp.where(code == ALIVE, 0 * one, jnp.where(code == TOUCHED, TOUCHED * one, DIVERGED * one))
 
 
 def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object) -> PlantStep:
-    """Return the plant of a case. Raises ValueError for a cascade in continuous time and for what cannot be exported.
+    """Return the plant of a case as it is exported.
 
-    `period`: sample period, s. `method`: the case's method between samples; it must have fixed steps.
+    - `period`: sample period, s.
+    - `method`: integrator between samples; it must have a fixed number of steps.
+
+    Raises ValueError for a cascade in continuous time, an amplifier that controls the current, faults or a runout of
+    the sensor, and an adaptive method.
     """
     if cascade.processor is None:
         raise ValueError(
@@ -234,8 +247,8 @@ def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object
             )
     if not isinstance(method, FixedSteps):
         raise ValueError(
-            f"clock: {method} has no fixed number of steps, and exported code needs one. Set clock.dt or "
-            "clock.method = 'rk4'."
+            f"clock: {method} has no fixed number of steps, and exported code needs one. Set clock.dt: its "
+            "method is RK4 unless clock.method names another."
         )
     resolved = cascade.on_processor()
     machine = Machine(

@@ -37,13 +37,13 @@ class Trace:
 
     - `block`, `precision`: the block, and "float" or "double".
     - `program`: the operations.
-    - `parameters`, `inputs`: the parameters and the inputs of the step.
-    - `state`: pairs of a state and the operand of its next value.
+    - `parameters`, `inputs`: the parameters and the inputs of the step, with names, units and values.
+    - `state`: pairs of a state and the operand of its next value, without states on which nothing depends.
     - `started`: operand of the next value of the flag `started`.
     - `outputs`, `bits`: pairs of an output, or the name of a status bit, and its operand.
     - `read`: names of the inputs that the step uses.
-    - `keep`: indices of the leaves of the memory that the exported code keeps.
-    - `refs`: operands of the parameters, the memory, the inputs and the period.
+    - `keep`: indices of the memory's leaves that are in `state`.
+    - `refs`: operands of the parameters, the memory, the inputs and the period, in this order.
     """
 
     block: Block
@@ -64,7 +64,7 @@ class Trace:
         return [x for _, x in [*self.state, *self.outputs, *self.bits]] + [self.started]
 
     def order(self) -> list[int]:
-        """Return the numbers of the nodes that become lines of code, in order."""
+        """Return the numbers of the nodes that become statements, in ascending order."""
         return sorted(n for n in self.program.needed(self.roots()) if self.program.nodes[n].op != "input")
 
     def counts(self) -> Counter:
@@ -84,7 +84,7 @@ class Trace:
         return found
 
     def state_bytes(self) -> int:
-        """Return the size of the C's struct of states in bytes, with the flag `started`, aligned."""
+        """Return the size of the C struct of states in bytes, with the flag `started` and the padding after it."""
         size = np.dtype(PRECISIONS[self.precision]).itemsize
         return (len(self.state) + 1) * size
 
@@ -97,6 +97,8 @@ class Trace:
 def trace(block: Block, to: str) -> Trace:
     """Trace the step of a block. `to`: the precision, "float" or "double".
 
+    The step is traced twice: the first trace shows which inputs it uses, and the second checks these only.
+
     Raises ValueError for a law, a plant or a method that scalar code cannot express.
     """
     with precision(to):
@@ -105,6 +107,7 @@ def trace(block: Block, to: str) -> Trace:
 
 
 def _traced(block: Block, to: str, read: frozenset[str]) -> Trace:
+    """Trace the step of a block that checks the inputs `read`, and drop states on which no result depends."""
     given, program, real = arguments(block), Program(), np.dtype(PRECISIONS[to])
     parameters, states, step = block.numbers(), block.states(), block.step
     locations = [
@@ -146,9 +149,9 @@ def _traced(block: Block, to: str, read: frozenset[str]) -> Trace:
 
 
 def _used(program: Program, before: list[Ref], after: list[Operand], roots: list[Operand]) -> list[int]:
-    """Return the indices of the states on which a result (`roots`), or the next value of another such state, depends.
+    """Return the indices of the states on which `roots` depend, in this step or in a later one.
 
-    `before`, `after`: operands of each state and of its next value.
+    `before`, `after`: operand of each state, and of its next value.
     """
     keep: set[int] = set()
     while True:

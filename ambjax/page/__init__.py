@@ -1,1 +1,1 @@
-"""A page with sliders: the sampled loop as JavaScript, traced from the simulator's own sample, in one HTML file."""
+"""A page with sliders: one HTML file whose JavaScript is generated from the simulator's sampled loop."""

@@ -1,4 +1,4 @@
-"""The case file as a template in which the page fills the numbers of its sliders."""
+"""The case file as a template into which the page writes the values of its sliders."""
 
 import re
 import tomllib
@@ -10,18 +10,20 @@ from tomlkit.items import Table
 
 from ambjax.page.sliders import Slider
 
-# Numbers that mark the places of the sliders; no case contains them.
+# Numbers that mark the places of the sliders while the file is split into lines. No case contains them.
 MARK = "1{:05d}e207"
 
-# Prefixes of the tables of signals, which name their kind.
+# Prefixes of the tables of signals. Such a table needs the key `kind`.
 SIGNALS = "reference", "disturbance"
 
 
 class TemplateLine(NamedTuple):
     """A line of the case file.
 
-    - `parts`: its texts and, between two texts, the place of a slider: its number, and the text of the case's value.
-    - `only`: sliders of which one must differ from the case's value, or the line is left out; empty: always present.
+    - `parts`: texts and places of sliders, which alternate. A place is the index of the slider, and the text of its
+      value in the case file.
+    - `only`: indices of sliders. The line is present if one of them differs from the case's value; if `only` is empty,
+      the line is always present.
     """
 
     parts: list[str | tuple[int, str]]
@@ -29,10 +31,13 @@ class TemplateLine(NamedTuple):
 
 
 def template(text: str, given: Sequence[Slider]) -> tuple[list[TemplateLine], list[int]]:
-    """Return the lines of a case file, and the numbers of the sliders that have a place in it.
+    """Return the lines of a case file, and the indices of the sliders that have a place in it.
 
-    A number that the file leaves out gets a line that is present only if the slider has moved. A change of a number of
-    the plant adds a line that keeps the controller's model as it is.
+    - `text`: the case file.
+    - `given`: the sliders, with the values of this case.
+
+    For a number that the file does not contain, a line is added that is present only if its slider has moved. If a
+    number of the plant changes, a further line in [controller.model] keeps the old value for the controller.
     """
     document, written = tomlkit.parse(text), {}
     added: dict[str, dict[str, int]] = {}
@@ -65,7 +70,7 @@ def template(text: str, given: Sequence[Slider]) -> tuple[list[TemplateLine], li
 
 
 def _insert(lines: list[TemplateLine], table: str, there: bool, rows: Sequence[tuple[Any, list[int]]]) -> None:
-    """Insert optional lines below the header of a table; a table that is not there goes to the end."""
+    """Insert optional lines below the header of a table. If the file lacks the table (`there`), add it at the end."""
     new = [TemplateLine(*row) for row in rows]
     if there:
         at = next(
@@ -78,6 +83,7 @@ def _insert(lines: list[TemplateLine], table: str, there: bool, rows: Sequence[t
 
 
 def _route(path: str) -> tuple[list[str], str]:
+    """Return the names of the tables in a dotted path, and the key."""
     *tables, name = path.split(".")
     return tables, name
 
@@ -91,14 +97,14 @@ def _find(document: Any, tables: list[str]) -> Any:
 
 
 def _line(text: str, written: dict[int, str]) -> TemplateLine:
-    """Split a line at the marks of its sliders. `written`: the text of each value in the case."""
+    """Split a line at the marks of its sliders. `written`: text of each slider's value in the case file, by index."""
     pieces = re.split(r"1(\d{5})e207", text)
     parts = [(int(x), written[int(x)]) if n % 2 else x for n, x in enumerate(pieces)]
     return TemplateLine(parts, [])
 
 
 def filled(lines: Sequence[TemplateLine], given: Sequence[Slider], values: Sequence[float]) -> str:
-    """Return the case file with these values. The page does the same in JavaScript."""
+    """Return the case file with the values `values` of the sliders `given`, as `caseFile` in controls.js does."""
     texts = []
     for line in lines:
         if line.only and all(values[k] == given[k].value for k in line.only):
@@ -108,14 +114,14 @@ def filled(lines: Sequence[TemplateLine], given: Sequence[Slider], values: Seque
 
 
 def _number(k: int, written: str, given: Sequence[Slider], values: Sequence[float]) -> str:
-    """Return the text of a slider's value; that of the case if it is the case's value."""
+    """Return the text of the value of slider `k`, or `written` if the value is that of the case."""
     if written and values[k] == given[k].value:
         return written
     return str(round(values[k])) if given[k].whole else repr(float(values[k]))
 
 
 def checked(lines: Sequence[TemplateLine], given: Sequence[Slider]) -> bool:
-    """Return whether the template with the case's own values, and with all values changed, is valid TOML."""
+    """Return whether the template gives valid TOML, both with the case's values and with every value changed."""
     try:
         for factor in (1.0, 1.5):
             tomllib.loads(filled(lines, given, [x.value * factor + (factor - 1) for x in given]))

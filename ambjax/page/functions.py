@@ -1,4 +1,4 @@
-"""Functions of a trace as JavaScript: of arrays, and the loop over the samples."""
+"""Write traced functions as JavaScript: a function of arrays, or a step inside a loop over samples."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -11,18 +11,18 @@ from ambjax.export.javascript.script import HELPERS, number
 from ambjax.export.primitives import OPS
 from ambjax.export.program import Location, Operand, Program, Ref
 
-# Functions that the statements use and JavaScript lacks.
+# Definitions of the functions that the statements use and JavaScript lacks.
 PRELUDE = "\n".join(f"const {name} = {text};" for name, text in HELPERS.items())
 
 
 class Script:
-    """The nodes of a program as JavaScript; the name of an input is that of its location."""
+    """The nodes of a program as JavaScript. The name of an input is that of its location; node n is `vN`."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
 
     def operand(self, x: Operand) -> str:
-        """Return an operand as JavaScript."""
+        """Return an operand as a JavaScript expression."""
         if isinstance(x, Ref):
             location = self.program.nodes[x.node].location
             return f"v{x.node}" if location is None else location.name
@@ -32,13 +32,13 @@ class Script:
         return f"({text})" if text.startswith("-") else text
 
     def statements(self, order: Sequence[int]) -> list[str]:
-        """Return the nodes `order` as declarations."""
+        """Return the declarations of the values of the nodes `order`."""
         nodes = self.program.nodes
         return [f"const v{n} = {OPS[nodes[n].op].javascript.format(*map(self.operand, nodes[n].args))};" for n in order]
 
 
 class Piece(NamedTuple):
-    """A traced function: its program, the operands of its arguments and of its results, as pytrees."""
+    """A traced function: its program, and the pytrees of the operands of its arguments and of its results."""
 
     program: Program
     arguments: Any
@@ -46,7 +46,12 @@ class Piece(NamedTuple):
 
 
 def piece_of(function: Callable[..., object], names: Sequence[str], arguments: Sequence[Any]) -> Piece:
-    """Trace a function. `names`: the prefix of the JavaScript names of each argument's leaves."""
+    """Trace a function of pytrees of scalars.
+
+    `names`: for each argument, the prefix of the JavaScript names of its leaves; "p" gives p0, p1, ...
+
+    Raises ValueError for a primitive that is not scalar arithmetic.
+    """
     program = Program()
     operands = []
     for name, argument in zip(names, arguments, strict=True):
@@ -63,16 +68,17 @@ def _is_ref(x: object) -> bool:
 
 
 def operands_of(tree: object) -> list[Any]:
-    """Return the operands in a pytree; a Ref is itself a pytree."""
+    """Return the operands in a pytree. A Ref is a pytree itself, but counts as one operand."""
     return jax.tree.leaves(tree, is_leaf=_is_ref)
 
 
 def _order(program: Program, roots: Sequence[Operand]) -> list[int]:
+    """Return the nodes on which the roots depend, without inputs, in order of computation."""
     return sorted(n for n in program.needed(roots) if program.nodes[n].op != "input")
 
 
 def _fixed(program: Program, order: Sequence[int], given: Sequence[Operand]) -> set[int]:
-    """Return the nodes of `order` that depend on the inputs `given` and constants only."""
+    """Return the nodes of `order` that depend only on the inputs `given` and on constants."""
     known = {x.node for x in given if isinstance(x, Ref)}
     fixed = set()
     for n in order:
@@ -83,9 +89,10 @@ def _fixed(program: Program, order: Sequence[int], given: Sequence[Operand]) -> 
 
 
 def function_source(piece: Piece, name: str, arrays: Sequence[str], results: object) -> str:
-    """Return a JavaScript function `name(ARRAYS..., out)` that writes the results into the array `out`.
+    """Return a JavaScript function `name(ARRAYS..., out)` that writes results into the array `out` and returns it.
 
-    `arrays`: the name of the array that contains the leaves of each argument.
+    - `arrays`: for each argument of the traced function, the name of the array with its leaves.
+    - `results`: pytree of the operands to write.
     """
     script, roots = Script(piece.program), operands_of(results)
     order = _order(piece.program, roots)
@@ -99,7 +106,7 @@ def function_source(piece: Piece, name: str, arrays: Sequence[str], results: obj
 
 
 def _loads(program: Program, array: str, refs: Sequence[Ref], needed: set[int]) -> list[str]:
-    """Return the declarations of the inputs that are needed, read from an array."""
+    """Return declarations that read the inputs `refs`, as far as they are needed, from an array."""
     lines = []
     for k, ref in enumerate(refs):
         if ref.node in needed:
@@ -110,14 +117,14 @@ def _loads(program: Program, array: str, refs: Sequence[Ref], needed: set[int]) 
 def loop_source(piece: Piece, name: str, shown: Sequence[Operand], always: Sequence[Operand]) -> str:
     """Return a JavaScript function `name(P)` that returns `run(S, from, to, W, rows)`.
 
-    - `piece`: of `LoopFunctions.step`.
+    - `piece`: the traced `LoopFunctions.step`.
     - `shown`: the operands that a row contains.
-    - `always`: results of the step, without which the loop ends before its last sample; the other states are kept if
-      something in `shown` or `always` depends on them.
+    - `always`: results of the step whose states are kept although no row needs them. `run` updates only the states on
+      which an operand in `shown` or `always` depends, in the same sample or in a later one.
 
-    `run` computes the samples `from` <= n < `to` with the parameters P, the state S, which it updates, and the normal
-    numbers W, three for each sample. It writes the rows into `rows`, unless that is null. Numbers that depend on
-    parameters only are computed once.
+    `run` computes the samples `from` <= n < `to`. P: parameters; S: the state, which `run` updates; W: three normal
+    numbers per sample. `run` writes one row per sample into `rows`, unless that is null. Values that depend only on
+    parameters are computed once, in `name(P)`.
     """
     program, script = piece.program, Script(piece.program)
     parameters, before = operands_of(piece.arguments[0]), operands_of(piece.arguments[1])
@@ -144,12 +151,14 @@ def loop_source(piece: Piece, name: str, shown: Sequence[Operand], always: Seque
 
 
 def _name(program: Program, x: Ref) -> str:
+    """Return the JavaScript name of an input."""
     location = program.nodes[x.node].location
     assert location is not None
     return location.name
 
 
 def _truth(program: Program, x: Ref) -> str:
+    """Return the text after a number of an array that makes it a boolean if the input `x` is one."""
     return " !== 0" if program.nodes[x.node].dtype.kind == "b" else ""
 
 

@@ -1,4 +1,4 @@
-"""The page as one HTML file: the loop as JavaScript, its data, the plotting library, the style and the scripts."""
+"""The page as one HTML file, with the loop as JavaScript, its data, the plotting library, the style and the scripts."""
 
 import dataclasses
 import html
@@ -28,7 +28,7 @@ from ambjax.simulation.trajectory import STATUSES
 NAME = "page.html"
 # Number of members of the envelope.
 MEMBERS = 64
-# Scripts of the worker and of the page, in order.
+# Files of the scripts of the worker and of the page, in the order of execution.
 WORKER, PAGE = (
     ("noise.js", "spectrum.js", "sensitivity.js", "worker.js"),
     ("controls.js", "plots.js", "machine.js", "app.js"),
@@ -39,11 +39,11 @@ BOKEH = "bokeh.min.js", "bokeh-api.min.js"
 def page(case: Case, others: Sequence[Case] = (), path: str = "case.toml") -> str:
     """Return the page of a case as HTML.
 
-    - `others`: cases that differ from it in numbers only; each is a preset.
-    - `path`: name of the case file, for messages and the command that tunes.
+    - `others`: cases that differ from it in numbers only; each becomes a preset.
+    - `path`: name of the case file, for messages and for the tuning command on the page.
 
-    Raises ValueError, one line, for a case without a processor or with a part that the page cannot compute, for another
-    case with another structure, and if Bokeh is missing.
+    Raises ValueError with a message of one line if the case has no processor or has a part that the page cannot
+    compute, if one of `others` differs in structure, or if Bokeh is missing.
     """
     library = _library()
     worker, data = _computed(case, list(others), path)
@@ -60,9 +60,9 @@ def page(case: Case, others: Sequence[Case] = (), path: str = "case.toml") -> st
 
 
 def pages(cases: Sequence[Case], paths: Sequence[str]) -> dict[str, str]:
-    """Return pages by file name: page.html, page-2.html, ..., one for all cases that differ in numbers only.
+    """Return the pages of several cases by file name: page.html, page-2.html, ...
 
-    `paths`: the case files. Raises ValueError as `page` does.
+    Cases that differ in numbers only share a page. `paths`: names of the case files. Raises ValueError as `page` does.
     """
     groups: list[list[int]] = []
     for k, case in enumerate(cases):
@@ -76,7 +76,7 @@ def pages(cases: Sequence[Case], paths: Sequence[str]) -> dict[str, str]:
 
 
 def check_processor(case: Case, path: str) -> None:
-    """Raise ValueError for a case without a processor."""
+    """Raise ValueError if the case has no processor. `path`: name of the case file, for the message."""
     if case.cascade.processor is None:
         raise ValueError(
             f"{path}: the page runs a controller on a processor, and this case has none. Add the table [processor]."
@@ -84,7 +84,7 @@ def check_processor(case: Case, path: str) -> None:
 
 
 def _block(name: str, text: str) -> str:
-    """Return JSON as an element that scripts read; no text in it can end the element."""
+    """Return a script element with JSON, in which every "<" is escaped, so that no text can end the element."""
     safe = text.replace("<", "\\u003c")
     return f'<script type="application/json" id="{name}">{safe}</script>\n'
 
@@ -100,7 +100,7 @@ def _library() -> list[str]:
 
 
 def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str, Any]]:
-    """Return the script of the worker, and the data of the page."""
+    """Return the script of the worker, and the data of the page for JSON."""
     check_processor(case, path)
     for other in others:
         _check_structure(case, other, path)
@@ -142,7 +142,8 @@ def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str,
 def _written(case: Case, others: list[Case]) -> tuple[list[Slider], list[list[TemplateLine]]]:
     """Return the sliders that have a place in all case files, and the template of each file.
 
-    If the lines that are added do not fit a file, only numbers that the file of the case contains have a slider.
+    If added lines make a file invalid, only numbers that the case file contains have a slider. If that is invalid too,
+    there are no sliders.
     """
     cases, given = (case, *others), sliders(case, others)
     for kept in (given, [one for one in given if _in_file(one, case)]):
@@ -155,22 +156,25 @@ def _written(case: Case, others: list[Case]) -> tuple[list[Slider], list[list[Te
 
 
 def _in_file(slider: Slider, case: Case) -> bool:
+    """Return whether the case file contains the number of a slider."""
     lines, _ = template(case.text, [slider])
     return any(not line.only and len(line.parts) > 1 for line in lines)
 
 
 def _own(given: list[Slider], case: Case) -> list[Slider]:
-    """Return the sliders with the values of another case."""
+    """Return the sliders `given` with the values of a case."""
     values = parameter_values(case)
     return [one._replace(value=float(values[one.parameter])) for one in given]
 
 
 def _preset(case: Case, lines: list[TemplateLine]) -> dict[str, Any]:
+    """Return a preset for JSON: name, parameters and template of a case."""
     values = [float(x) for x in parameter_values(case)]
     return {"name": case.name, "P": [x if np.isfinite(x) else "Infinity" for x in values], "lines": lines}
 
 
 def _check_structure(case: Case, other: Case, path: str) -> None:
+    """Raise ValueError if two cases differ in more than numbers. `path`: case file of the first."""
     if not _alike(case, other):
         raise ValueError(
             f"--also {other.name}: it differs from {path} in more than numbers. Give a case with the same laws, plant, "
@@ -185,7 +189,7 @@ def _alike(case: Case, other: Case) -> bool:
 
 
 def _finest(case: Case, others: list[Case]) -> Case:
-    """Return the case with the smallest step of all cases."""
+    """Return the case, with the integrator of that case which has the smallest step."""
     period = float(case.clock.sample_period)
     steps = [one.clock for one in (case, *others) if one.clock.integrator.step_size(period) is not None]
     clock = min(steps, key=lambda clock: clock.integrator.step_size(period) or 0.0, default=case.clock)
@@ -193,7 +197,10 @@ def _finest(case: Case, others: list[Case]) -> Case:
 
 
 def _members(case: Case) -> dict[str, Any]:
-    """Return the members of the ensemble: the parameters that vary, whether as a factor, and their values."""
+    """Return the members of the ensemble for JSON: their number, and a row for each parameter that varies.
+
+    A row is the index of the parameter, whether its values are factors of the page's value, and its values [members].
+    """
     study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, MEMBERS)
     study = dataclasses.replace(study, seed=int(case.scenario.seed))
     own, drawn = parameter_values(case), study.drawn(np.arange(MEMBERS))

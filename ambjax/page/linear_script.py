@@ -1,6 +1,7 @@
 """The linearised loop as JavaScript: the step of the laws and the rates of the plant, with their derivatives.
 
-The page finds the equilibrium by Newton's method, and assembles the map of one sample as `ambjax.linear` does.
+From these, sensitivity.js computes the equilibrium by Newton's method, and the map of one sample as `ambjax.linear`
+does.
 """
 
 import dataclasses
@@ -31,8 +32,11 @@ class LagState(NamedTuple):
 class LoopPoint(NamedTuple):
     """A point at which the loop is linearised.
 
-    The state of the plant and its lags, the voltage u (V) that acts, the states of the laws, the two last voltages (V),
-    and the test signal e (m).
+    - `lagged`: state of the plant and its lags.
+    - `acting`: the voltage that acts, V.
+    - `control`: states of the laws.
+    - `past`: the last two commanded voltages, V.
+    - `e`: test signal that is added to the reading of z, m.
     """
 
     lagged: LagState
@@ -43,7 +47,7 @@ class LoopPoint(NamedTuple):
 
 
 class PointValues(NamedTuple):
-    """The rates of the plant and its lags, the next states of the laws, the command u (V), the reading of z (m)."""
+    """Rates of the plant and its lags, next states of the laws, commanded voltage u (V), and reading of z (m)."""
 
     rates: LagState
     control: CascadeState
@@ -51,16 +55,17 @@ class PointValues(NamedTuple):
     z: Array
 
 
-# State of the plant and lags, voltage and states of the laws at an equilibrium.
+# An equilibrium: state of the plant and its lags, voltage (V), states of the laws.
 EquilibriumPoint: TypeAlias = tuple[LagState, Array, CascadeState]
 
 
 class LinearScript(NamedTuple):
     """The linear loop as JavaScript.
 
-    - `source`: the functions `linearStart(P, out)` and `linearPoint(P, X, out)`. The first writes the first trial of
-      the equilibrium and the sizes of its components. The second writes the values at a point and their derivatives.
-    - `facts`: sizes of the parts of a point, zones, range of frequencies.
+    - `source`: the functions `linearStart(P, out)` and `linearPoint(P, X, out)`. The first writes the initial guess of
+      the equilibrium and the characteristic sizes of its components. The second writes the values at the point X and
+      their derivatives.
+    - `facts`: number of components of the parts of a point, limits of the ISO zones, range of frequencies (Hz).
     """
 
     source: str
@@ -74,14 +79,14 @@ class LinearFunctions:
     numbers: Numbers
 
     def start(self, numbers: Numbers) -> tuple[EquilibriumPoint, EquilibriumPoint]:
-        """Return the first trial of the equilibrium, and the sizes of its components: (lagged, u, control)."""
+        """Return the initial guess of the equilibrium, and the characteristic sizes of its components."""
         numbers = _ideal(numbers)
         point = start_of(numbers.cascade, numbers.scenario, numbers.period, 0.0)
         sizes = sizes_of(numbers.cascade, numbers.scenario, point)
         return _with_lags(numbers.scenario, point), _with_lags(numbers.scenario, sizes)
 
     def columns(self, numbers: Numbers, x: LoopPoint) -> tuple[PointValues, list[PointValues]]:
-        """Return the values at a point, and their derivatives with respect to each component of the point."""
+        """Return the values at a point, and a list of their derivatives with respect to each component of the point."""
         leaves, tree = jax.tree.flatten(x)
 
         def values(x: LoopPoint) -> PointValues:
@@ -94,6 +99,7 @@ class LinearFunctions:
         return values(x), found
 
     def _values(self, numbers: Numbers, x: LoopPoint) -> PointValues:
+        """Return the values at a point. `numbers`: those of `_ideal`."""
         scenario: Any = numbers.scenario
         lagged: Any = x.lagged
         motion = scenario.plant.measurement(lagged.plant)
@@ -113,14 +119,14 @@ class LinearFunctions:
 
 
 def _ideal(numbers: Numbers) -> Numbers:
-    """Return the numbers without what a linear system cannot contain: limits, noise, converter, guard."""
+    """Return the numbers without parts that cannot be linearised: limits, noise, converters, guard."""
     processor: Any = numbers.cascade.processor
     cascade = dataclasses.replace(numbers.cascade, processor=dataclasses.replace(processor, guard=None))
     return numbers._replace(cascade=cascade, scenario=ideal(numbers.scenario))
 
 
 def _with_lags(scenario: Scenario, point: Point) -> EquilibriumPoint:
-    """Return a point of the equilibrium with the states of the lags, at rest."""
+    """Return an equilibrium with the states of the lags added, at rest."""
     sensor, z = scenario.sensor, scenario.plant.measurement(point.plant).z
     low_passed = sensor is not None and sensor.bandwidth is not None
     lags = z if low_passed else (), point.u if scenario.amplifier is not None else ()
@@ -128,7 +134,10 @@ def _with_lags(scenario: Scenario, point: Point) -> EquilibriumPoint:
 
 
 def linear_script(case: Case) -> LinearScript:
-    """Return the linear loop of a case as JavaScript, for any delay."""
+    """Return the linear loop of a case as JavaScript, for any delay.
+
+    Raises ValueError for a part of the case that scalar code cannot express.
+    """
     with precision("double"):
         numbers = canonical(numbers_of(case, any_delay=True))
         functions = LinearFunctions(numbers)

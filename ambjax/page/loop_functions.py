@@ -1,4 +1,4 @@
-"""The functions of the sampled loop that the page traces, with every number of the case as an argument."""
+"""Functions of the sampled loop that JAX traces for the page. Every number of the case is an argument."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -22,7 +22,10 @@ from ambjax.world.sensor import Errors
 
 
 class Numbers(NamedTuple):
-    """All numbers of a case that the loop uses; each leaf is a parameter of the JavaScript."""
+    """All numbers of a case that the loop uses. Each leaf is a parameter of the JavaScript.
+
+    `settle`: start of the settled metrics, s. `period`: sample period, s.
+    """
 
     cascade: Cascade
     scenario: Scenario
@@ -32,7 +35,7 @@ class Numbers(NamedTuple):
 
 @record
 class GivenNoise(Realised):
-    """The closed loop of one member, with its three normal numbers of the sample given instead of drawn."""
+    """The closed loop of one member, in which the three normal numbers of a sample are given instead of drawn."""
 
     normals: tuple[Array, Array, Array]
 
@@ -50,6 +53,8 @@ class LoopFunctions:
 
     - `clock`: number of samples and integrator.
     - `numbers`: the numbers of the case, as JAX values.
+
+    The argument `normals` of the methods is a tuple of three scalars, the normal numbers of the sample.
     """
 
     clock: Clock
@@ -63,7 +68,7 @@ class LoopFunctions:
         return dataclasses.replace(built, loop=loop), clock, standard_for(numbers.settle, numbers.scenario)
 
     def start(self, numbers: Numbers, normals: Any) -> RolloutState:
-        """Return the state before the first sample."""
+        """Return the state of the run before the first sample."""
         return begin(*self._system(numbers, normals))
 
     def step(
@@ -81,7 +86,10 @@ class LoopFunctions:
 
 
 def numbers_of(case: Case, any_delay: bool = False) -> Numbers:
-    """Return the numbers of a case. Its program admits the case's delay, or any delay."""
+    """Return the numbers of a case on a processor.
+
+    `any_delay`: the program admits any delay up to MOST_DELAY, not only that of the case.
+    """
     assert case.cascade.processor is not None
     cascade = case.cascade.on_processor(0.0, MOST_DELAY, between=True) if any_delay else case.cascade.on_processor()
     return Numbers(cascade, case.scenario, case.settle, case.clock.sample_period)

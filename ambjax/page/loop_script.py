@@ -1,6 +1,6 @@
-"""The sampled loop as JavaScript, traced from the simulator's own sample: laws, plant, spans and folds.
+"""The sampled loop as JavaScript, generated from a trace of one sample of the simulator: laws, plant and metrics.
 
-Every number of the case is a parameter, so that the page changes it without tracing again.
+Every number of the case is a parameter, so the page can change it without a new trace.
 """
 
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from ambjax.numerics.records import canonical
 from ambjax.page.functions import function_source, loop_source, operands_of, piece_of
 from ambjax.page.loop_functions import LoopFunctions, numbers_of
 
-# Signals that the page draws; the currents of both coils follow them in a row. The members need the first two only.
+# Signals in a row, which the page draws; the currents of both coils follow. A row of a member has the first three only.
 SIGNALS = ("z", "alive", "r", "u", "u_mean", "i_ref", "q_z", "z_measured", "sigma", "v_tilde", "i")
 COILS = ("i_1", "i_2")
 
@@ -23,9 +23,10 @@ class LoopScript(NamedTuple):
     """The loop as JavaScript.
 
     - `source`: the functions `startLoop(P, W, out)`, `makeLoop(P)`, `makeMember(P)` and `loopMetrics(P, S, out)`.
-    - `parameters`: values of the parameters P of the case.
-    - `metrics`: names of the metrics in the order of `out`.
-    - `states`: number of states S; `lost`: the state that is the status code of the rotor.
+    - `parameters`: the case's values of the parameters P.
+    - `metrics`: names of the metrics, in the order of `out` of `loopMetrics`.
+    - `states`: number of states S.
+    - `lost`: index of the state that contains the status code of the rotor.
     """
 
     source: str
@@ -36,9 +37,9 @@ class LoopScript(NamedTuple):
 
 
 def loop_script(case: Case, any_delay: bool = False) -> LoopScript:
-    """Return the loop of a case as JavaScript, for the case's delay or for any delay.
+    """Return the loop of a case as JavaScript. `any_delay`: for any delay, not only that of the case.
 
-    Raises ValueError for a part that scalars cannot express.
+    Raises ValueError for a part of the case that scalar code cannot express.
     """
     with precision("double"):
         numbers = canonical(numbers_of(case, any_delay))

@@ -1,4 +1,4 @@
-"""The numbers that the page offers: each with its path, unit, meaning and range, and the parameter that it sets."""
+"""The sliders of the page: path, unit, meaning and range of each, and the parameter of the JavaScript that it sets."""
 
 import dataclasses
 import math
@@ -11,12 +11,12 @@ from ambjax.cases.reader import Case
 from ambjax.ensemble.paths import SHIFT, Place, places, with_values
 from ambjax.page.loop_functions import numbers_of
 
-# A gain is searched over its value divided and multiplied by this factor; a number of the plant changes by this share.
+# The slider of a gain covers its value divided and multiplied by FACTOR; that of the plant's numbers, +-SHARE of them.
 FACTOR, SHARE = 30.0, 0.5
-# Largest value of other positive numbers, as a multiple of their value.
+# The slider of another number ends at this multiple of its value.
 TIMES = 5.0
 SEED = "run.seed"
-# Unit of the values of a signal, by the field of the scenario.
+# Unit of a signal's values, by the field of the scenario, for fields of signals that declare no unit.
 UNITS = {"reference": "m", "q_z": "m/s^2", "q_v": "A^2/m^2", "q_i": "A/s", "q_f": "N", "base": "m/s^2"}
 # Prefix of the paths, and title, of each group, in the order of the page.
 GROUPS = {
@@ -26,21 +26,21 @@ GROUPS = {
     "actuator.": "Supply and amplifier",
     "disturbance.": "Disturbance",
     "reference.": "Reference",
-    "initial.": "Start",
+    "initial.": "Initial state",
     "run.": "Clearance and seed",
-    "plant.": "Plant, off the controller's model",
+    "plant.": "True plant (the controller keeps its model)",
 }
 
 
 class Slider(NamedTuple):
-    """A number of the page.
+    """A slider of the page: a number of the case.
 
-    - `path`, `unit`, `doc`: dotted path of the case file, unit and meaning.
-    - `parameter`: its number among the parameters P of the JavaScript.
+    - `path`, `unit`, `doc`: dotted path in the case file, unit and meaning.
+    - `parameter`: its index among the parameters P of the JavaScript.
     - `value`: the case's value.
     - `low`, `high`: ends of the slider.
     - `log`: whether the slider is logarithmic.
-    - `least`, `most`, `open`: ends of the allowed numbers, and whether the lower one is excluded.
+    - `least`, `most`: smallest and largest allowed value; `open`: whether `least` itself is excluded.
     - `whole`: whether only whole numbers are allowed.
     - `grid`: whether the number is a time at which a disturbance jumps, which the page rounds to a whole sample.
     """
@@ -61,7 +61,7 @@ class Slider(NamedTuple):
 
 
 def sliders(case: Case, others: list[Case]) -> list[Slider]:
-    """Return the sliders of a case. Their ranges contain the values of the other cases."""
+    """Return the sliders of a case, in the order of GROUPS. Their ranges contain the values of the `others` too."""
     known = {path: place for path, place in _places(case).items() if _offered(path, place)}
     index = parameters(case, list(known))
     tables = [_places(other) for other in others]
@@ -96,13 +96,13 @@ def sliders(case: Case, others: list[Case]) -> list[Slider]:
 
 
 def _places(case: Case) -> dict[str, Place]:
-    """Return every number of a case by path, the seed included."""
+    """Return every number of a case and the seed, by path."""
     (field,) = (field for field in dataclasses.fields(case.scenario) if field.name == "seed")
     return {**places(case.cascade, case.scenario), SEED: Place((1, "seed"), field, case.scenario.seed)}
 
 
 def parameters(case: Case, paths: list[str]) -> dict[str, int]:
-    """Return the index of the parameter that each of these paths sets, found by setting it alone."""
+    """Return, by path, the index of the parameter that a number sets: the only one that changes with the number."""
     own, found = parameter_values(case), {}
     for path in paths:
         (found[path],) = np.flatnonzero(parameter_values(changed(case, {path: math.pi})) != own)
@@ -110,7 +110,7 @@ def parameters(case: Case, paths: list[str]) -> dict[str, int]:
 
 
 def changed(case: Case, values: dict[str, float]) -> Case:
-    """Return the case with other values of the numbers at these paths."""
+    """Return the case with the numbers at these paths replaced. `values`: new values by path."""
     values, seed = dict(values), values.get(SEED, case.scenario.seed)
     values.pop(SEED, None)
     cascade, scenario = with_values(case.cascade, case.scenario, values)
@@ -118,7 +118,7 @@ def changed(case: Case, values: dict[str, float]) -> Case:
 
 
 def parameter_values(case: Case) -> np.ndarray:
-    """Return the parameters of the JavaScript, in order."""
+    """Return the case's values of the parameters P of the JavaScript [parameters]."""
     return np.array([float(x) for x in jax.tree.leaves(numbers_of(case))])
 
 
@@ -127,6 +127,7 @@ def _number(place: Place | None) -> bool:
 
 
 def _offered(path: str, place: Place) -> bool:
+    """Return whether a number has a slider: a finite number of a group, except the controller's model and SHIFT."""
     model = path.startswith("controller.model.")
     return path.startswith(tuple(GROUPS)) and not model and place.route[-1] != SHIFT and _number(place)
 

@@ -1,4 +1,4 @@
-"""Texts about a block for the header and the README: order of work, what is fixed, what a step checks."""
+"""Texts about a block for the header and the README: order of operations, what the export fixes, what a step checks."""
 
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from ambjax.export.trace import Trace
 
 
 class About(NamedTuple):
-    """Comments of a header: on the flag `started`, the inputs, and the functions `init`, `step` and `reset`."""
+    """Comments of a header on the flag `started`, the inputs, and the functions `init`, `step` and `reset`."""
 
     started: str
     inputs: str
@@ -23,15 +23,16 @@ class About(NamedTuple):
 ABOUT = {
     "controller": About(
         "0: the laws start at the next accepted readings",
-        "inputs of a step: the readings, which params->processor.guard limits if there is a guard, and the reference, "
-        "which\n * params->limits limits",
+        "inputs of a step: the readings, checked against params->processor.guard if there is a guard, and the "
+        "reference,\n * checked against params->limits",
         "Initialise the state before the first step: u is 0; the first accepted readings will start the laws.",
         "Compute one sample. Returns the status bits above.",
         "Restart the laws at the next accepted readings. The delayed commands are kept.",
     ),
     "plant": About(
         "0: the next step reads the sensors in the initial state",
-        "inputs of a step, constant over the sample that ends with it, and the noise of its readings",
+        "inputs of a step: u and the disturbances, constant over the sample that ends with the step, and the noise of\n"
+        " * its readings",
         "Initialise the state before the first step.",
         "Advance the plant to the next sample, then read the sensors; the first step reads them in the initial state.\n"
         " * Returns the status bits above.",
@@ -39,7 +40,7 @@ ABOUT = {
     ),
     "loop": About(
         "0: the next step begins with the plant in the initial state",
-        "inputs of a step: disturbances, constant over the sample that ends with it, then noise and reference",
+        "inputs of a step: disturbances, constant over the sample that ends with the step, then noise and reference",
         "Initialise the state before the first step.",
         "Advance the plant to the next sample under the last voltage, read the sensors, and step the controller; the\n"
         " * first step reads the sensors in the initial state. Returns the status bits above.",
@@ -49,14 +50,14 @@ ABOUT = {
 
 
 def notes_of(trace: Trace) -> list[str]:
-    """Return the order of work of every sample, then what the export fixes and what a step checks, in words."""
+    """Return lines on the order of operations in a sample, on what the export fixes, and on what a step checks."""
     if trace.block.noun == "controller":
         return [*order_of_work(trace), "", *fixed(trace)]
     return _of_plant(trace)
 
 
 def _of_plant(trace: Trace) -> list[str]:
-    """Return the order of work of a plant or a loop, in words."""
+    """Return these lines for a plant or a loop."""
     block: Any = trace.block
     lines = [
         f"Step n ends at t = n T, T = {block.period:g} s. It advances the plant by T under the voltages that act, with",
@@ -79,7 +80,7 @@ def _of_plant(trace: Trace) -> list[str]:
 
 
 def order_of_work(trace: Trace) -> list[str]:
-    """Return the order of work of every sample, in words."""
+    """Return lines on the order of operations of a controller in every sample."""
     block = trace.block
     processor: Any = block.parameters.controller.processor
     delay, unit = processor.delay, block.outputs["u"][0]
@@ -94,7 +95,7 @@ def order_of_work(trace: Trace) -> list[str]:
 
 
 def fixed(trace: Trace) -> list[str]:
-    """Return in words what the export fixes, what params can set, what a step checks, and how long it predicts."""
+    """Return lines on what the export of a controller fixes, what params set, and what a step checks and predicts."""
     parameters = {x.name: x for x in trace.parameters}
     unit = trace.block.outputs["u"][0]
     u_max, delay = parameters["limits.u_max"].value, parameters["processor.delay"].allowed
@@ -127,7 +128,7 @@ def fixed(trace: Trace) -> list[str]:
 
 
 def _ends(trace: Trace, of: str) -> str:
-    """Return the limits of the inputs in a struct of params, in words."""
+    """Return the limits of the inputs in the struct `of` of params, such as "|z| = 0.001 m"."""
     parameters = {x.name: x for x in trace.parameters}
     found = {name: parameters.get(f"{of}.{name}") for name in INPUTS if name in trace.read}
     return ", ".join(f"|{name}| = {x.value:g} {x.unit}" for name, x in found.items() if x)

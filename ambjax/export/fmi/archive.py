@@ -1,4 +1,4 @@
-"""An FMU as a file: description, sources, binary; and the reference data beside it."""
+"""An FMU as a file: a zip archive of the model description, the C sources and the compiled library."""
 
 import importlib.resources
 import io
@@ -13,7 +13,7 @@ from ambjax.export.fmi.description import build_description, description, token
 from ambjax.export.trace import Trace
 
 SHARED_FILES = ("fmu_core.h", "fmi{}_interface.h", "fmi{}.c")
-# Names of the folders of binaries for each system: FMI 2.0, FMI 3.0, and the ending of a library.
+# For each system: its name in the folders of binaries of FMI 2.0 and of FMI 3.0, and the ending of a library.
 SYSTEMS = {
     "linux": ("linux", "linux", ".so"),
     "darwin": ("darwin", "darwin", ".dylib"),
@@ -52,7 +52,12 @@ static const unsigned char model_infinite[MODEL_PARAMETERS] = {{{infinite}}};
 
 
 def sources(traced: Trace, identifier: str, origin: Origin, version: int) -> tuple[dict[str, str], str]:
-    """Return the text of each source file by name, and the identity of the FMU. `traced`: in double precision."""
+    """Return the text of each source file by name, and the GUID of the FMU.
+
+    - `traced`: trace of the block, in double precision.
+    - `identifier`: the modelIdentifier of the FMU, and the prefix of all C names.
+    - `version`: of FMI, 2 or 3.
+    """
     writer = Writer(traced, identifier, origin)
     home = importlib.resources.files("ambjax.export.fmi")
     names = [name.format(version) for name in SHARED_FILES]
@@ -82,7 +87,10 @@ def binary_name(identifier: str, version: int) -> str:
 
 
 def compiled(files: dict[str, str], identifier: str) -> bytes:
-    """Return the library of an FMU's sources, compiled on this machine. Raises ValueError if that is not possible."""
+    """Return the library that the C compiler of this machine makes of an FMU's sources. `files`: their texts by name.
+
+    Raises ValueError if there is no compiler, or if it reports an error.
+    """
     with machine.scratch() as folder:
         for name, text in files.items():
             (folder / name).write_text(text, encoding="utf-8")
@@ -94,7 +102,9 @@ def compiled(files: dict[str, str], identifier: str) -> bytes:
 
 
 def packed(traced: Trace, identifier: str, origin: Origin, version: int) -> bytes:
-    """Return an FMU of FMI `version`, 2 or 3. Its comment is the mark of an export.
+    """Return the bytes of an FMU; the comment of the archive is the mark of an export.
+
+    The arguments are those of `sources`.
 
     Raises ValueError if there is no compiler, or if it cannot compile the sources.
     """

@@ -1,4 +1,4 @@
-"""Reference input and output of an FMU, as FMI's cross-check defines them: a case's signals and JAX's results."""
+"""Reference data of an FMU in the format of FMI's cross-check: the signals of a case, and the outputs of JAX."""
 
 import math
 from typing import Any
@@ -16,14 +16,17 @@ from ambjax.export.trace import arguments, precision
 from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import Scenario
 
-# Samples of the reference, at most. The signs of a loop amplify rounding. A plant alone is unstable: its reference ends
-# when an error has grown by GROWTH.
+# Largest number of samples of the reference data of each block. Those of a loop are few, because its signs amplify
+# rounding errors. A plant alone is unstable: its data also end when an error has grown by the factor GROWTH.
 SAMPLES = {"controller": 1000, "loop": 200, "plant": 1000}
 GROWTH = 1e4
 
 
 def stepped(block: Block, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return outputs [samples, outputs] and status bits [samples] of JAX's steps for inputs [samples, inputs]."""
+    """Run a block in JAX. Return its outputs [samples, outputs] and status [samples], the bits as an integer.
+
+    `rows`: inputs [samples, inputs]. Units and order are those of `block.inputs` and `block.outputs`.
+    """
     parameters, memory, _, period = arguments(block)
     read = frozenset(block.inputs)
 
@@ -37,10 +40,11 @@ def stepped(block: Block, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reference(block: Block, cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[np.ndarray, np.ndarray]:
-    """Return inputs and outputs of a block's FMU in the case's loop, [instants, time and numbers].
+    """Return inputs and outputs of a block's FMU in the loop of the case.
 
-    The inputs of a row act in the communication step that begins at its time. For a plant and a loop the first row is
-    also that of the initial readings.
+    Each is an array [instants, 1 + numbers] with the time (s) in the first column. The inputs of a row act in the
+    communication step that begins at its time. For a plant and a loop, the first row is also the input of the step that
+    reads the sensors at the start.
     """
     count = min(clock.samples, SAMPLES[block.noun])
     if block.noun == "plant":
@@ -65,7 +69,10 @@ def reference(block: Block, cascade: Cascade, scenario: Scenario, clock: Clock) 
 def files_of(
     block: Block, name: str, read: frozenset[str], cascade: Cascade, scenario: Scenario, clock: Clock
 ) -> dict[str, str]:
-    """Return NAME_in.csv, NAME_ref.csv and NAME_ref.opt. `read`: names of the inputs that the FMU has."""
+    """Return the texts of NAME_in.csv, NAME_ref.csv and NAME_ref.opt by file name.
+
+    `read`: names of the inputs that the FMU has. Raises ValueError for a case that cannot be exported.
+    """
     with precision("double"):
         inputs, outputs = reference(block, cascade, scenario, clock)
     named = {x: inputs[:, 1 + k] for k, x in enumerate(block.inputs) if x in read}
@@ -78,5 +85,6 @@ def files_of(
 
 
 def _csv(names: list[str], rows: np.ndarray) -> str:
+    """Return the text of a CSV file: a line of quoted names, then the rows."""
     head = ",".join(f'"{name}"' for name in names)
     return "\n".join([head, *(",".join(map(repr, map(float, row))) for row in rows), ""])

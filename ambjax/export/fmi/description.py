@@ -14,7 +14,12 @@ STATUS = "status"
 
 
 class Variable(NamedTuple):
-    """A variable of an FMU. `whole`: an integer. `start`: None for a variable that is computed."""
+    """A variable of an FMU, with the attributes of the FMI standard.
+
+    - `reference`: its value reference.
+    - `start`: its start value; None for a variable that the FMU computes.
+    - `whole`: whether it is an integer.
+    """
 
     name: str
     reference: int
@@ -27,7 +32,10 @@ class Variable(NamedTuple):
 
 
 def variables(traced: Trace) -> list[Variable]:
-    """Return the variables of an exported block. Their value references are those of fmu_core.h."""
+    """Return the variables of an exported block, except those that it does not read.
+
+    Their value references are those of fmu_core.h: time, inputs, outputs, parameters, states, status.
+    """
     outputs, states = ([x for x, _ in group] for group in (traced.outputs, traced.state))
     groups: tuple[tuple[Sequence[Number], str, str], ...] = (
         (traced.inputs, "input", "discrete"),
@@ -50,14 +58,19 @@ def variables(traced: Trace) -> list[Variable]:
 
 
 def token(traced: Trace, identifier: str, files: dict[str, str]) -> str:
-    """Return the identity of an FMU: a digest of its sources as text of a GUID."""
+    """Return the GUID of an FMU, a digest of its sources. `files`: their texts by name."""
     text = "\n".join([identifier, traced.block.noun, *(files[name] for name in sorted(files))])
     digest = hashlib.sha256(text.encode()).hexdigest()
     return "{" + "-".join([digest[:8], digest[8:12], digest[12:16], digest[16:20], digest[20:32]]) + "}"
 
 
 def description(traced: Trace, identifier: str, case: str, guid: str, sources: list[str], version: int) -> str:
-    """Return modelDescription.xml of FMI `version`, 2 or 3. `case`: its name. `sources`: names of the C files."""
+    """Return the text of modelDescription.xml.
+
+    - `case`: name of the case.
+    - `sources`: names of the C files.
+    - `version`: of FMI, 2 or 3.
+    """
     words = f"{traced.block.noun} of case {case}: one sample per communication step"
     lines = _three(traced, identifier, guid) if version == 3 else _two(traced, identifier, guid, sources)
     head = f" modelName={quoteattr(f'{identifier} ({traced.block.noun})')} description={quoteattr(words)}"
@@ -66,6 +79,7 @@ def description(traced: Trace, identifier: str, case: str, guid: str, sources: l
 
 
 def _units(found: list[Variable]) -> list[str]:
+    """Return the lines that define the units in base units of SI."""
     rows = []
     for unit in sorted({x.unit for x in found if x.unit}):
         powers = exponents(unit) or {}
@@ -75,6 +89,7 @@ def _units(found: list[Variable]) -> list[str]:
 
 
 def _experiment(traced: Trace) -> str:
+    """Return the line of the default experiment: 1,000 sample periods."""
     period = traced.block.period
     return f'  <DefaultExperiment startTime="0" stopTime="{1000 * period!r}" stepSize="{period!r}"/>'
 
@@ -87,6 +102,7 @@ def _number(x: float, version: int) -> str:
 
 
 def _three(traced: Trace, identifier: str, guid: str) -> Iterator[str]:
+    """Yield the lines of the description for FMI 3.0; `description` fills in @HEAD@."""
     found, period = variables(traced), traced.block.period
     yield f'<fmiModelDescription fmiVersion="3.0" instantiationToken={quoteattr(guid)}@HEAD@>'
     yield (
@@ -114,6 +130,7 @@ def _three(traced: Trace, identifier: str, guid: str) -> Iterator[str]:
 
 
 def _two(traced: Trace, identifier: str, guid: str, sources: list[str]) -> Iterator[str]:
+    """Yield the lines of the description for FMI 2.0; `description` fills in @HEAD@."""
     found = [x for x in variables(traced) if x.causality != "independent"]
     yield (
         f'<fmiModelDescription fmiVersion="2.0" guid={quoteattr(guid)}@HEAD@ '
@@ -149,7 +166,10 @@ def _two(traced: Trace, identifier: str, guid: str, sources: list[str]) -> Itera
 
 
 def build_description(identifier: str, sources: list[str]) -> str:
-    """Return buildDescription.xml of FMI 3.0: how to compile the sources."""
+    """Return the text of buildDescription.xml of FMI 3.0, which tells a tool how to compile the sources.
+
+    `sources`: names of the C files.
+    """
     files = "".join(f'\n      <SourceFile name="{name}"/>' for name in sources)
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n<fmiBuildDescription fmiVersion="3.0">\n'

@@ -3,7 +3,7 @@
 import re
 from collections import Counter
 
-# Derived units, in base units.
+# Exponents of the base units in each derived unit.
 DERIVED = {
     "V": {"kg": 1, "m": 2, "s": -3, "A": -1},
     "ohm": {"kg": 1, "m": 2, "s": -3, "A": -2},
@@ -13,12 +13,15 @@ DERIVED = {
     "rad": {"rad": 1},
 }
 BASE = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-# Units that count something.
+# Units without a dimension.
 COUNTS = ("", "1", "samples", "turns")
 
 
 def exponents(unit: str) -> dict[str, int] | None:
-    """Return the exponent of each base unit, such as {"A": 2, "m": -2} for "A^2/m^2"; None for an unknown unit."""
+    """Return the exponents of the base units in a unit, or None for an unknown unit.
+
+    Example: {"m": -2, "A": 2} for "A^2/m^2". A factor after a "/" is in the denominator.
+    """
     total: Counter[str] = Counter()
     for k, part in enumerate(unit.split("/")):
         for factor in part.split():

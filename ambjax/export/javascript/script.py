@@ -1,4 +1,4 @@
-"""Write a traced step as JavaScript: an object with names, values and a pure function `step`."""
+"""Write a traced step as JavaScript: an object with the function `step` and with names, units and values."""
 
 import json
 import re
@@ -21,7 +21,7 @@ HELPERS = {
     "  return x > 0 ? r : x < 0 ? -r : x;\n}",
     "roundEven": "x => {\n  const big = 4503599627370496, a = Math.abs(x);\n"
     "  return x === 0 || !(a < big) ? x : x > 0 ? a + big - big : -(a + big - big);\n}",
-    # the series of erf, all terms of one sign; the continued fraction of erfc
+    # erf: a series whose terms have one sign, for |x| < 3; erfc: a continued fraction, for x >= 1
     "erf": "x => {\n  const a = Math.abs(x);\n  if (!(a < 3)) return x !== x ? x : Math.sign(x) * (1 - erfc(a));\n"
     "  let term = x, sum = x;\n"
     "  for (let n = 1; n < 200; n++) { term *= 2 * x * x / (2 * n + 1); sum += term; }\n"
@@ -30,20 +30,20 @@ HELPERS = {
     "  for (let n = 300; n > 0; n--) f = n / 2 / (x + f);\n"
     "  return Math.exp(-x * x) / Math.sqrt(Math.PI) / (x + f);\n}",
 }
-# Helpers that another one uses.
+# For each helper, the other helpers that it calls.
 NEEDS = {"erf": ("erfc",), "erfc": ("erf",)}
 
 
 def script_of(block: Block, name: str) -> str:
-    """Return `const NAME = {...};` for a block, in double precision. Raises ValueError as `trace` does.
+    """Return JavaScript that defines the constant `name`, an object with the step of a block in double precision.
 
-    `docs/export.md` describes the object.
+    `docs/export.md` describes the object. Raises ValueError as `trace` does.
     """
     return script(trace(block, "double"), name)
 
 
 def script(traced: Trace, name: str) -> str:
-    """Return `const NAME = {...};` for a step that is traced in double precision."""
+    """Return JavaScript that defines this constant for a step that is traced in double precision."""
     body = Body(traced)
     block = traced.block
     lists = {
@@ -87,6 +87,7 @@ def _json(x: object) -> str:
 
 
 def _entries(numbers: list[Number], kind: str, read: frozenset[str]) -> str:
+    """Return the entries of a list, one object per number. `kind`: name of the list."""
     rows = []
     for x in numbers:
         more = f", value: {number(x.value)}, allowed: {_json(x.allowed)}" if kind == "parameters" else ""
@@ -96,10 +97,10 @@ def _entries(numbers: list[Number], kind: str, read: frozenset[str]) -> str:
 
 
 class Body:
-    """The step of a trace as statements of JavaScript.
+    """The step of a trace as JavaScript statements.
 
-    Numbers are read from arrays: `p` has the parameters, `s` the states and the flag `started`, `x` the inputs, and `y`
-    takes the outputs.
+    The step reads the parameters from the array `p` and the inputs from `x`, updates the states and the flag `started`
+    in `s`, and writes the outputs into `y`.
     """
 
     def __init__(self, traced: Trace) -> None:
@@ -112,7 +113,7 @@ class Body:
         }
 
     def operand(self, x: Operand) -> str:
-        """Return an operand as text."""
+        """Return an operand as a JavaScript expression."""
         if isinstance(x, Ref):
             location = self.program.nodes[x.node].location
             if location is None:
@@ -126,14 +127,14 @@ class Body:
         return f"({text})" if text.startswith("-") else text
 
     def statement(self, n: int) -> str:
-        """Return one node as a declaration."""
+        """Return the declaration of the value of node `n`."""
         node = self.program.nodes[n]
         text = OPS[node.op].javascript.format(*map(self.operand, node.args))
         rounded = f"Math.fround({text})" if node.dtype == np.float32 else text
         return f"  const {self.names[n]} = {rounded};"
 
     def statements(self) -> list[str]:
-        """Return all statements; those of each law follow a comment with its name."""
+        """Return all statements. A comment with the name of a law precedes the statements of that law."""
         lines, law = [], ""
         for n in self.order:
             if (node := self.program.nodes[n]).law != law:
@@ -143,10 +144,10 @@ class Body:
         return lines
 
     def step(self) -> list[str]:
-        """Return the function `step`."""
+        """Return the lines of the function `step`."""
         given = [(f"s[{k}]", self.operand(after)) for k, (_, after) in enumerate(self.trace.state)]
         given += [(f"y[{k}]", self.operand(value)) for k, (_, value) in enumerate(self.trace.outputs)]
-        # state that is copied to another location is read before it is written
+        # a state that is copied to another location is read before any state is written
         old = {value: f"old{k}" for k, value in enumerate(dict.fromkeys(v for _, v in given if v.startswith("s[")))}
         bits = [f"({self.operand(bit)} ? {1 << k} : 0)" for k, (_, bit) in enumerate(self.trace.bits)]
         started = f"const started = {self.operand(self.trace.started)} ? 1 : 0;"
@@ -164,7 +165,7 @@ class Body:
         ]
 
     def helpers(self) -> list[str]:
-        """Return the functions that the step uses and JavaScript lacks."""
+        """Return the definitions of the functions that the step uses and JavaScript lacks."""
         texts = {OPS[self.program.nodes[n].op].javascript for n in self.order}
         used = [name for name in HELPERS if any(re.search(rf"(?<![.\w]){name}\(", text) for text in texts)]
         used += [more for name in used for more in NEEDS.get(name, ()) if more not in used]

@@ -1,8 +1,8 @@
-// The page: it sends every change to the worker, and shows the newest answer.
+// The page. It sends the parameters to the worker after every change, and shows the newest results.
 const state = { sent: 0, shown: 0, members: 0, began: new Map(), timing: { nominal: [], members: [] }, run: null, metrics: {} };
 window.ambjax = { state, data, parameters, caseFile };
 
-// The signals of a run by name, as columns, and its error z - r.
+// Read an array of rows: `of(name)` returns a signal [samples]; `error` is z - r in m.
 function readRun(array) {
   const width = data.signals.length, length = array.length / width, columns = {};
   const of = (name) => {
@@ -21,7 +21,7 @@ function showMetrics(metrics) {
   });
 }
 
-// The rows of the table of metrics; the cells take the values.
+// Cells for the values of the metrics, in new rows of the table.
 const cells = data.metrics.map((name) => {
   const cell = element("td", {});
   byId("metrics").tBodies[0].append(element("tr", {}, element("th", { scope: "row" }, name), cell, element("td", {}, data.units[name] || "")));

@@ -1,10 +1,10 @@
 "use strict";
-// The sliders: labels, typed numbers, presets, and the case file with these numbers.
+// The controls: sliders with typed numbers, presets, and the case file with the chosen numbers.
 const STEPS = 1000;
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (name) => document.getElementById(name);
 
-// Parameters of a preset; infinite ones are strings.
+// Parameters of each preset. In the data, infinite ones are strings.
 const presets = data.presets.map(({ P }) => Float64Array.from(P, Number));
 let base = 0;
 let values = data.sliders.map(({ parameter }) => presets[0][parameter]);
@@ -21,7 +21,7 @@ function toPosition(slider, x) {
   return Math.round(STEPS * Math.min(Math.max(share, 0), 1));
 }
 
-// The value at a position: on three digits, on a whole sample or a whole number where the number needs it.
+// The value at a position of a slider, rounded: to a whole number, to a whole sample, or to a few digits.
 function toValue(slider, position) {
   const { low, high, log, whole, grid } = slider, share = position / STEPS;
   const x = log ? low * (high / low) ** share : low + share * (high - low);
@@ -31,6 +31,7 @@ function toValue(slider, position) {
   return Math.abs(x) < 1e-9 * (high - low) ? 0 : Number(x.toPrecision(digits));
 }
 
+// A time in s, rounded to a whole sample.
 function onGrid(x) { return Number((Math.round(x / data.period) * data.period).toPrecision(12)); }
 
 // The shortest text of a number, with `digits` significant digits if they are given.
@@ -39,7 +40,7 @@ function text(x, digits) {
   return plain.length > Math.max(short.length, 8) ? short : plain;
 }
 
-// Why a typed number is refused; empty if it is allowed.
+// The message for a typed number that is not allowed; empty if it is allowed.
 function fault(slider, x) {
   const { least, most, open, whole } = slider;
   if (!Number.isFinite(x)) return "Type a number, for example 2.5e-3.";
@@ -55,6 +56,7 @@ function element(tag, attributes, ...children) {
   return made;
 }
 
+// Build a slider with its label and typed number. `k`: its index; `changed`: called after each change.
 function addSlider(slider, k, changed) {
   const unit = slider.unit ? ` in ${slider.unit}` : "";
   const range = element("input", { type: "range", min: 0, max: STEPS, step: 1, id: `range-${k}`, "data-path": slider.path });
@@ -104,13 +106,13 @@ function buildControls(changed) {
   boxes.forEach((_, k) => show(k));
 }
 
-// A number as TOML; a float has a point or an exponent.
+// A number as TOML. A float needs a point or an exponent.
 function toml(x, whole) {
   const shortest = text(x);
   return whole ? String(x) : /[.e]/.test(shortest) ? shortest : `${shortest}.0`;
 }
 
-// The case file of the preset with the values of the sliders.
+// The case file of the preset with the values of the sliders, as `filled` in case_text.py writes it.
 function caseFile() {
   const own = (k) => presets[base][data.sliders[k].parameter], moved = (k) => values[k] !== own(k);
   const lines = data.presets[base].lines.filter(([, only]) => !only.length || only.some(moved));

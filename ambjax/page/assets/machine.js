@@ -1,4 +1,4 @@
-// The machine: the rotor between its two magnets, with the currents of the coils, at one instant.
+// The drawing of the machine at one instant: the rotor between its two magnets, and the currents of the coils.
 const SVG = "http://www.w3.org/2000/svg";
 
 function shape(tag, attributes, text) {
@@ -8,7 +8,7 @@ function shape(tag, attributes, text) {
   return made;
 }
 
-// Draw the magnets and return a function that shows one instant: z (m), r (m), both currents (A), and the parameters.
+// Draw the magnets. Return a function that shows one instant: z, r, gap s0 and clearance in m, both currents and bias i0 in A.
 function machine(parent) {
   const svg = shape("svg", { viewBox: "0 -4 360 308", role: "img", "aria-label": "Rotor in its gap" });
   const core = { fill: "#d7dbe0", stroke: "#555", "stroke-width": 1.5 }, middle = 150, gap = 45, half = 38;

@@ -4,7 +4,7 @@ const ROTATIONS = [[13, 15, 26, 6], [17, 29, 16, 24]];
 const SINE = [6.283185307179586, -41.341702240399755, 81.60524927607362, -76.70585975282492, 42.058693925428685,
   -15.0946416761179, 3.8199280942271643, -0.7177337921413454, 0.10089695501646812];
 
-// Two random words from the key (a, b) and the counter (x, y), written into out.
+// Write two random 32-bit words from the key (a, b) and the counter (x, y) into out.
 function threefry(a, b, x, y, out) {
   const schedule = [a, b, a ^ b ^ 0x1BD11BDA];
   x = (x + a) | 0;
@@ -37,7 +37,9 @@ function quarter(y) {
   return y * total;
 }
 
+// x minus the nearest whole number of turns.
 function turned(x) { return x - Math.floor(x + 0.5); }
+// cos(2 pi x) and sin(2 pi x).
 function cosine(x) { return quarter(0.25 - Math.abs(turned(x))); }
 function sine(x) {
   const y = turned(x);
@@ -47,7 +49,7 @@ function sine(x) {
 // sqrt(-2 ln((word + 1/2) / 2^32))
 function radius(word) { return Math.sqrt(-2 * Math.log((word + 0.5) / 4294967296)); }
 
-// Three normal numbers for each sample of a member, in a new array.
+// Standard normal numbers of a member, three per sample [3 * samples], in a new array.
 function normals(seed, member, samples) {
   const [a, b] = memberKey(seed, member), W = new Float64Array(3 * samples), first = [0, 0], second = [0, 0];
   for (let n = 0; n < samples; n++) {

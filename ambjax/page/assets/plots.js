@@ -1,8 +1,8 @@
-// The plots, drawn with Bokeh. All plots over time share their range; each draws the extremes of every pixel column.
+// The plots, drawn with Bokeh. All plots over time share a range. Each draws the extremes of the samples in COLUMNS columns.
 const COLUMNS = 300;
 const COLORS = ["#0b5cad", "#c2571a", "#2f7d32", "#6b3fa0"];
 
-// Plots over time: title, axis, unit and lines [name, function of a run, whether the line begins hidden].
+// Plots over time: title, axis, unit and lines [name, function of a run, whether the line is hidden at first].
 const micro = (x) => 1e6 * x;
 const TIME_PLOTS = [
   { id: "error", title: "Error z − r", y: "error in µm", unit: "µm", lines: [["z − r", (run) => run.error.map(micro)]] },
@@ -11,7 +11,7 @@ const TIME_PLOTS = [
   { id: "voltage", title: "Voltage", y: "voltage in V", unit: "V", lines: [["u", (run) => run.of("u")], ["mean of each sample", (run) => run.of("u_mean"), true]] },
 ];
 
-// Indices of the samples to draw between two times: of each column the lowest and the highest value, in order.
+// Indices of the samples to draw from index `from` to `to`: the lowest and the highest value of each column, in order.
 function thinned(y, from, to) {
   const count = to - from;
   if (count <= 2 * COLUMNS) return Array.from({ length: count }, (_, k) => from + k);
@@ -28,7 +28,7 @@ function thinned(y, from, to) {
   return found;
 }
 
-// Add a plot to the document of all plots; `x`: label of the abscissa, `range`: its range, `more`: further parts.
+// Build a plot. `x`: label of the horizontal axis; `range`: its range; `heights`: range of y; `more`: a function that adds parts.
 function addPlot({ id, title, y, unit, lines, x = "time in s", range = null, heights = null, log = false, more }) {
   const ends = log ? [1, 10] : [0, data.samples * data.period];
   const drawn = [], sources = lines.map(() => new Bokeh.ColumnDataSource({ data: { x: ends, y: log ? [1e-3, 1] : [0, 0] } }));
@@ -47,7 +47,7 @@ function addPlot({ id, title, y, unit, lines, x = "time in s", range = null, hei
   return { id, title, figure, sources, lines, drawn };
 }
 
-// Show all plots, each in an element of its own.
+// Show all plots, each in its own section of the page.
 async function showPlots(parent, plots) {
   const all = new Bokeh.Document(), roots = plots.map(({ id, title, figure }) => {
     all.add_root(figure);
@@ -58,7 +58,7 @@ async function showPlots(parent, plots) {
   await Bokeh.embed.add_document_standalone(all, element("div", {}), roots);
 }
 
-// Run `task`, which draws a plot: now if the plot is in the window, else when the page is idle or the plot comes into it.
+// Run `task`, which draws a plot: now if the plot is visible, else when it becomes visible or after 300 ms without a change.
 const waiting = new Map();
 let idle = 0;
 function refresh(plot, task) {
@@ -135,7 +135,7 @@ async function buildPlots(parent) {
         members.sources[1].data = { x, y: lows };
         band.data = { x, low: lows, high: highs };
       });
-      retitle(members, `Envelope of ${count} members: ${kept} of ${count} hold the rotor`);
+      retitle(members, `Envelope of ${count} members: the rotor is held in ${kept}`);
     },
     onZoom() {
       let waiting = false;

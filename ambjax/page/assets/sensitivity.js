@@ -1,4 +1,4 @@
-// The linear loop: equilibrium by Newton's method, the map of one sample, and |S| as ambjax.linear computes it.
+// The linear loop: its equilibrium by Newton's method, the map of one sample, and |S|, as ambjax.linear computes them.
 
 // Solve A x = b for a real matrix (rows of numbers), by Gaussian elimination with scaled partial pivoting.
 function solveReal(A, b) {
@@ -25,6 +25,7 @@ function solveReal(A, b) {
   return x;
 }
 
+// The product of two matrices.
 function times(A, B) {
   return A.map((row) => B[0].map((_, j) => row.reduce((total, x, k) => total + x * B[k][j], 0)));
 }
@@ -52,7 +53,7 @@ function pointAt(P, X, facts) {
   return { value: out.subarray(0, rows), column: (k) => out.subarray(rows * (k + 1), rows * (k + 2)) };
 }
 
-// The equilibrium: the arguments X of linearPoint there, with the sizes of its components; null if there is none.
+// The equilibrium as the argument X of linearPoint, and the sizes of its components; null if the method finds none.
 function equilibrium(P, facts) {
   const { lagged, control } = facts, n = lagged + control + 1;
   const begin = linearStart(P, new Float64Array(2 * n));
@@ -86,7 +87,7 @@ function equilibrium(P, facts) {
   return null;
 }
 
-// Matrices A, B, C of the map of one sample, scaled: x = (plant and lags, laws, u_{n-1}, u_{n-2}), input e, output z.
+// Matrices A, B, C of the map of one sample, scaled. State: (plant and lags, laws, u_{n-1}, u_{n-2}); input: e; output: reading of z.
 function sampleMap(P, facts, period, delay) {
   const point = equilibrium(P, facts);
   if (point === null) return null;
@@ -97,7 +98,7 @@ function sampleMap(P, facts, period, delay) {
   const [early, earlyIn] = held(A, B, part), [late, lateIn] = held(A, B, period - part);
   const old = times(late, earlyIn.map((x) => [x])).map((row) => row[0]), whole = times(late, early);
   const weight = (lag) => (i) => (lag === Math.ceil(delay) ? old[i] : 0) + (lag === Math.floor(delay) ? lateIn[i] : 0);
-  // derivatives with respect to x and e of the laws' outputs: columns of the plant, the laws, both voltages, e
+  // derivatives of all values of a point with respect to the plant and lags, the laws, both voltages, and e
   const inputs = [];
   for (let k = 0; k < lagged; k++) inputs.push(column(k));
   for (let k = 0; k < control; k++) inputs.push(column(lagged + 1 + k));
@@ -149,7 +150,7 @@ function sizeOfS({ A, B, C }, f, period) {
   return Math.hypot(sr, si);
 }
 
-// Whether all poles lie inside the unit circle: the powers A^(2^k) decrease.
+// Whether all eigenvalues of A lie inside the unit circle: then the powers A^(2^k) tend to 0.
 function stable(A) {
   let M = A, logSize = 0;
   for (let k = 0; k < 24; k++) {
@@ -163,7 +164,7 @@ function stable(A) {
   return logSize < 0;
 }
 
-// |S| over frequencies, its peak and zone; null without an equilibrium.
+// |S| at 300 frequencies (Hz), its peak and the ISO 14839-3 zone; null without an equilibrium.
 function sensitivity(P, facts, period, delay) {
   const map = sampleMap(P, facts, period, delay), count = 300, f = [], size = [];
   if (map === null) return null;

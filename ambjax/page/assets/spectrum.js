@@ -1,4 +1,4 @@
-// Amplitudes of a signal by frequency: Hann window, the largest power of two of samples from index `from` on.
+// Amplitudes of a signal over frequency (Hz), with a Hann window over a power of two of samples, from index `from` on.
 function spectrum(signal, from, period) {
   const n = 2 ** Math.floor(Math.log2(signal.length - from)), re = new Float64Array(n), im = new Float64Array(n);
   let mean = 0;
@@ -13,7 +13,7 @@ function spectrum(signal, from, period) {
   return { f, amplitude };
 }
 
-// Discrete Fourier transform in place, by Cooley and Tukey.
+// Discrete Fourier transform in place, by the algorithm of Cooley and Tukey.
 function transform(re, im) {
   const n = re.length;
   for (let i = 1, j = 0; i < n; i++) {

@@ -1,14 +1,17 @@
-// The worker: it runs the newest request, first the nominal loop, then the members in slices between messages.
+// The worker. It computes the newest request: first the nominal loop, then the members in time slices, so that it sees new
+// requests soon.
 let setup = null, latest = null, busy = false, known = new Map();
 const channel = new MessageChannel();
 let next = () => {};
 channel.port1.onmessage = () => next();
 
+// Run `task` after the messages that wait.
 function soon(task) {
   next = task;
   channel.port2.postMessage(0);
 }
 
+// The normal numbers of a member, computed once for each seed.
 function noiseOf(seed, member) {
   const key = `${seed} ${member}`;
   if (known.size > 256) known = new Map();
@@ -16,11 +19,12 @@ function noiseOf(seed, member) {
   return known.get(key);
 }
 
-// The functions of the loop: those for the delay of the case are faster.
+// The functions of the loop. Those for the delay of the case are faster, those for any delay slower.
 function functionsFor(P) {
   return P[setup.delay] === setup.presets[0].P[setup.delay] ? [makeLoop, makeMember] : [any_makeLoop, any_makeMember];
 }
 
+// Rows, status code and metrics of the nominal run.
 function simulated(P) {
   const { samples, states } = setup, width = setup.signals.length, W = noiseOf(P[setup.seed], 0), S = startLoop(P, W, new Float64Array(states));
   const rows = new Float64Array(samples * width);
@@ -38,7 +42,7 @@ function answer(job) {
   postMessage({ kind: "nominal", ...found, took: performance.now() - began }, [rows.buffer]);
 }
 
-// Parameters of a member: its drawn values, as factors of the page's values or in their place.
+// Parameters of a member. Its drawn values multiply the page's values, or replace them.
 function memberParameters(P, member) {
   const own = Float64Array.from(P);
   for (const [index, factor, values] of setup.members.rows) own[index] = factor ? P[index] * values[member] : values[member];
@@ -51,6 +55,7 @@ function study(job) {
   return { job, member: 0, bins, low, high, alive, kept: 0, began };
 }
 
+// Simulate the next member and include its error in the envelope.
 function addMember(state) {
   const { samples } = setup, P = memberParameters(state.job.P, state.member), W = noiseOf(P[setup.seed], state.member);
   const S = startLoop(P, W, new Float64Array(setup.states)), rows = new Float64Array(3 * samples);
@@ -66,6 +71,7 @@ function addMember(state) {
   state.member += 1;
 }
 
+// Simulate members for 12 ms, unless a new request waits.
 function slice(state) {
   if (latest !== null) return work();
   const until = performance.now() + 12;
