@@ -53,7 +53,7 @@ def parser() -> Parser:
             added.add_argument("case", metavar="CASE.toml", help="a case file; 'ambjax template' prints one")
         if out:
             added.add_argument("--out", metavar="DIR", help="output directory (default: a new directory under ./out)")
-        if out and name not in ("ensemble", "export"):  # these refuse by themselves what is not theirs
+        if out and name not in ("ensemble", "export"):  # these two check existing files themselves
             added.add_argument("--force", action="store_true", help="overwrite the files of an earlier run in --out")
         added.add_argument("--json", action="store_true", help="print only a machine-readable summary")
         return added
@@ -84,25 +84,26 @@ def parser() -> Parser:
     )
     ensemble.add_argument("--resume", action="store_true", help="continue the interrupted study in --out")
     workers = ensemble.add_mutually_exclusive_group()
-    workers.add_argument("--processes", type=int, metavar="P", help="run in P processes (default: threads of one)")
+    meaning = "run in P processes (default: in threads of one process)"
+    workers.add_argument("--processes", type=int, metavar="P", help=meaning)
     workers.add_argument("--cluster", metavar="ADDRESS", help="run on the Dask cluster whose scheduler is at ADDRESS")
     summary = "map survival and error over a grid of two quantities: map.png, map.json"
     grid = command("map", summary, case=True, out=True)
     for axis in ("--x", "--y"):
-        form, meaning = "PATH=LOW:HIGH[:COUNT][:log]", "quantity of this axis and its range, in SI units or per cent"
+        form, meaning = "PATH=LOW:HIGH[:COUNT][:log]", "quantity on this axis and its range, in SI units or per cent"
         grid.add_argument(axis, metavar=form, required=True, help=meaning)
     grid.add_argument("--members", type=int, metavar="N", default=1, help="members per cell (default: 1)")
     grid.add_argument(
-        "--against", metavar="OTHER.toml", action="append", help="another case for the same grid (repeatable)"
+        "--against", metavar="OTHER.toml", action="append", help="another case, mapped over the same grid (repeatable)"
     )
     _seed_option(grid)
-    summary = "check the conditions of Theorem 1, or those of the case's processor; exit code 1 if one fails"
+    summary = "check sensitivity, margins and the stability conditions of a case; exit code 1 if a condition fails"
     command("check", summary, case=True)
     summary = "sensitivity peaks with ISO 14839-3 zones, margins, stiffness: sensitivity.json, sensitivity.png"
     sensitivity = command("sensitivity", summary, case=True, out=True)
     sensitivity.add_argument("--members", type=int, metavar="N", help="members of [spread] to analyse (default: 100)")
     sensitivity.add_argument(
-        "--inject", action="store_true", help="inject a multi-sine in continuous time too; always done on a processor"
+        "--inject", action="store_true", help="inject a multi-sine also in continuous time; always done on a processor"
     )
     _seed_option(sensitivity)
     summary = "compare cases on the same members: compare.html, compare.json, compare.png"
@@ -110,23 +111,26 @@ def parser() -> Parser:
     compare.add_argument("cases", metavar="CASE.toml", nargs="+", help="two to eight case files")
     compare.add_argument("--members", type=int, metavar="N", default=200, help="number of members (default: 200)")
     compare.add_argument(
-        "--tune", action="store_true", help="first tune each case, with limits, loss and budget of the first case"
+        "--tune", action="store_true", help="first tune each case, with the limits, loss and budget of the first case"
     )
     _seed_option(compare)
     _page_option(compare)
-    export = command("export", "write controller, plant or loop of a case with [processor] as C", case=True, out=True)
+    summary = "write the controller, the plant or the loop of a case with [processor] as C or as an FMU"
+    export = command("export", summary, case=True, out=True)
     parts = ["controller", "plant", "loop"]
-    export.add_argument("--what", choices=parts, default="controller", help="part of the loop (default: controller)")
-    export.add_argument("--format", choices=["c", "fmu"], default="c", help="C package or FMU (default: c)")
-    export.add_argument("--fmi", type=int, choices=[2, 3], help="version of FMI of an FMU (default: 3)")
-    export.add_argument("--verify", action="store_true", help="compare the C with JAX; exit code 1 if they differ")
-    export.add_argument("--precision", choices=["float", "double"], default="float", help="C type of all numbers")
+    export.add_argument("--what", choices=parts, default="controller", help="part to export (default: controller)")
+    export.add_argument("--format", choices=["c", "fmu"], default="c", help="a C package or an FMU (default: c)")
+    export.add_argument("--fmi", type=int, choices=[2, 3], help="version of FMI, with --format fmu (default: 3)")
+    meaning = "compile the C and compare it with JAX; exit code 1 if they differ"
+    export.add_argument("--verify", action="store_true", help=meaning)
+    meaning = "C type of all numbers of a C package (default: float); an FMU always has double"
+    export.add_argument("--precision", choices=["float", "double"], default="float", help=meaning)
     export.add_argument("--prefix", metavar="NAME", help="prefix of all names in the C code (default: the case's name)")
-    page = command("page", "write one HTML file with sliders in which the sampled loop of a case runs", case=True)
-    page.add_argument(
-        "--also", metavar="OTHER.toml", action="append", help="a case that differs in numbers, as a preset (repeatable)"
-    )
-    page.add_argument("--out", metavar="FILE.html", help="the file (default: page.html in a new directory under ./out)")
+    page = command("page", "write one HTML file with sliders that runs the loop of a case in a browser", case=True)
+    meaning = "another preset: a case that differs in numbers only (repeatable)"
+    page.add_argument("--also", metavar="OTHER.toml", action="append", help=meaning)
+    meaning = "HTML file (default: page.html in a new directory under ./out)"
+    page.add_argument("--out", metavar="FILE.html", help=meaning)
     page.add_argument("--force", action="store_true", help="overwrite the file of an earlier run")
     # Listed for --help only; main passes the arguments of `tune` to the tuner's own parser.
     command("tune", "tune the gains of a case on an ensemble of rotors: tuned.toml, report.html")
@@ -140,13 +144,14 @@ def _seed_option(command: Parser) -> None:
 
 
 def _page_option(command: Parser) -> None:
-    command.add_argument("--page", action="store_true", help="also write page.html, with sliders (needs [processor])")
+    meaning = "also write a page with sliders, page.html (needs [processor])"
+    command.add_argument("--page", action="store_true", help=meaning)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command and return its exit code. Without a command, print the commands that a new user runs first.
 
-    `argv`: the arguments; None: those of the process. Exit codes: 0 done; 1 done, and the answer is no (the rotor is
+    `argv`: the arguments; None: those of the process. Exit codes: 0 done; 1 done with a negative result (a rotor is
     lost, a condition fails); 2 bad input; 130 interrupted.
     """
     words = sys.argv[1:] if argv is None else argv
@@ -169,6 +174,7 @@ def _tune(words: list[str]) -> int:
 
 
 def _run(args: argparse.Namespace) -> tuple[int, object]:
+    """Run the module of a command and return its exit code and summary."""
     if args.command is None:
         print(FIRST_DAY)
         return 0, None
@@ -205,7 +211,7 @@ def answer(parser: argparse.ArgumentParser, words: list[str] | None, run: Run) -
 
 
 def _code(run: Callable[[], tuple[int, object]], as_json: bool, program: str) -> int:
-    """Call `run` and return its exit code. Print an error that a user can fix on one line, and return its code."""
+    """Call `run` and return its exit code. Print an error that a user can fix on one line, and return code 2."""
     try:
         code, summary = run()
         if as_json:

@@ -1,4 +1,4 @@
-"""`ambjax export`: write controller, plant or loop of a case as C and, with --verify, compare the C with JAX."""
+"""`ambjax export`: write the controller, plant or loop of a case as C or as an FMU, and verify the C against JAX."""
 
 import argparse
 import dataclasses
@@ -28,9 +28,9 @@ from ambjax.export.trace import trace
 from ambjax.export.twins import LoopCase
 
 Summary = dict[str, object]
-# Files that --verify adds to the package.
+# Files that --verify adds.
 VERIFIED = ("verify.md", "verify.json")
-# Names of the files of an FMU, by their prefix: the FMU, and its reference input and output.
+# Names of the files of an FMU export, with the prefix p: the FMU, and its reference input, output and options.
 FMU_NAMES = ("{p}.fmu", "{p}_in.csv", "{p}_ref.csv", "{p}_ref.opt")
 # Names of the standard C headers, which a prefix must not repeat: the package contains PREFIX.h.
 HEADER_NAMES = {
@@ -57,9 +57,15 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 
 class Plan(NamedTuple):
-    """A checked export: the block, the C type and prefix of the package, its origin, mark and directory.
+    """A checked export.
 
-    `fmi`: version of FMI, 2 or 3; 0: the package is C.
+    - `block`: what is exported.
+    - `fmi`: version of FMI, 2 or 3; 0 for a C package.
+    - `precision`: C type of a C package, "float" or "double".
+    - `prefix`: prefix of all C names.
+    - `origin`: name and checksum of the case, and the description of the block.
+    - `mark`: line by which a later export recognises the files.
+    - `out`: output directory.
     """
 
     block: Block
@@ -72,7 +78,7 @@ class Plan(NamedTuple):
 
 
 def _plan(case: Case, args: argparse.Namespace) -> Plan:
-    """Build the block and make the output directory. Raises ValueError for a case or option that cannot be met."""
+    """Build the block and make the output directory. Raises ValueError if the case or an option does not allow it."""
     block = block_of(args.what, guarded_for(case), case.scenario, case.clock)
     prefix = _prefix(args.prefix, case.name)
     if args.fmi is not None and args.format != "fmu":
@@ -90,13 +96,13 @@ def _plan(case: Case, args: argparse.Namespace) -> Plan:
 
 
 def _holds_fmu(out: pathlib.Path, prefix: str, mark: str) -> bool:
-    """Return whether `out` has an FMU of an earlier export, whose reference data have no mark of their own."""
+    """Return whether `out` contains an FMU of an earlier export. Its reference data may then be overwritten."""
     path = out / f"{prefix}.fmu"
     return path.is_file() and path.read_bytes().endswith(mark.encode())
 
 
 def _built(case: Case, plan: Plan) -> dict[str, str | bytes]:
-    """Return the content of each file of the package, unverified."""
+    """Return the content of each file by name, without verification."""
     if not plan.fmi:
         return {**package.files(plan.block, plan.precision, plan.prefix, plan.origin)}
     traced = trace(plan.block, "double")
@@ -108,7 +114,7 @@ def _built(case: Case, plan: Plan) -> dict[str, str | bytes]:
 def _write(
     folder: pathlib.Path, plan: Plan, case_name: str, sources: dict[str, str | bytes], checks: list[verify.Check]
 ) -> None:
-    """Write the package and, if there are checks, the files that record them."""
+    """Write all files and, if there are checks, their results."""
     for name, content in sources.items():
         (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     if checks:
@@ -118,7 +124,7 @@ def _write(
 
 
 def _remove_verification(out: pathlib.Path) -> None:
-    """Remove the verification of an earlier export, which does not apply to the new package."""
+    """Remove the verification files of an earlier export, which do not apply to the new files."""
     for name in VERIFIED:
         (out / name).unlink(missing_ok=True)
 
@@ -132,7 +138,7 @@ def _print(out: pathlib.Path, sources: dict[str, str | bytes], checks: list[veri
 
 
 def guarded_for(case: Case) -> Cascade:
-    """Return the cascade of a case with guard limits wide enough for the sensor at both ends of every spread."""
+    """Return the cascade of a case whose guard limits are wide enough for the sensor at both ends of every spread."""
     widest = ends(case.spread, case.cascade, case.scenario, ("sensor.", "run.clearance", "plant.s_0"))[1]
     cascade = guarded(case.cascade, widest, float(case.clock.sample_period))
     if cascade.processor is None or cascade.processor.guard is None:
@@ -142,7 +148,7 @@ def guarded_for(case: Case) -> Cascade:
 
 
 def _verified(case: Case, plan: Plan) -> tuple[dict[str, str | bytes], list[verify.Check]]:
-    """Return the files of the package and the checks of both precisions."""
+    """Return the content of each file by name, and the results of the checks in both precisions."""
     say(
         "verify: in both precisions, one step at 10,000 points, one step at 10,000 points with other parameters, "
         "and the closed loop"
@@ -166,5 +172,6 @@ def _prefix(option: str | None, name: str) -> str:
 
 
 def _is_name(text: str) -> bool:
+    """Return whether a text can be the prefix: a C identifier that is no keyword and no name of a C header."""
     words = RESERVED | HEADER_NAMES | {"break", "continue", "else", "for", "if", "return", "while"}
     return re.fullmatch(r"[A-Za-z]\w{0,60}", text, flags=re.ASCII) is not None and text not in words

@@ -14,8 +14,8 @@ def pages() -> dict[str, str]:
     lines = [
         "# Commands",
         "",
-        "Exit codes: 0 done; 1 done, and the answer is no (a rotor is lost, a condition fails); 2 the input is wrong, "
-        "and one line on stderr says how; 130 interrupted. `ambjax-tune` is another name of `ambjax tune`.",
+        "Exit codes: 0 done; 1 done with a negative result (a rotor is lost, a condition fails); 2 bad input, reported "
+        "on one line of stderr; 130 interrupted. `ambjax-tune` is another name of `ambjax tune`.",
         "",
     ]
     for command in commands().values():
@@ -51,6 +51,7 @@ def _written(action: argparse.Action) -> str:
 
 
 def _meaning(action: argparse.Action) -> str:
-    choices = f"one of {', '.join(map(str, action.choices))} (default: {action.default})" if action.choices else ""
+    default = "" if action.default is None or "(default" in (action.help or "") else f" (default: {action.default})"
+    choices = f"one of {', '.join(map(str, action.choices))}{default}" if action.choices else ""
     needed = "required" if action.option_strings and action.required else ""
     return "; ".join(filter(None, (action.help, choices, needed)))
