@@ -73,9 +73,10 @@ def _of_plant(trace: Trace) -> list[str]:
     return [
         *lines,
         "",
-        f"Fixed at export: T = {block.period:g} s, the parts, the steps between samples. Export again to change one.",
-        "An input that is not finite sets the bit INVALID. A lost rotor is frozen until the next reset.",
-        "params are not checked: a value beyond its range may lose the rotor at once.",
+        f"Fixed at export: T = {block.period:g} s, the parts of the plant, the integration steps in a sample. Export",
+        "again to change one. An input that is not finite, or a delay out of range, sets the bit INVALID. A lost",
+        "rotor is frozen until the next reset.",
+        "No other parameter of the plant is checked: a value beyond its range may lose the rotor at once.",
     ]
 
 

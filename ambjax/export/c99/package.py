@@ -180,7 +180,7 @@ def _readme(writer: Writer) -> str:
         flops=t.flops(),
         precision=t.precision,
         period=f"{t.block.period:g}",
-        ulps="a relative 1e-5" if t.precision == "float" else f"{ULPS} units in the last place",
+        ulps="a relative difference of 1e-5" if t.precision == "float" else f"{ULPS} units in the last place",
     )
 
 

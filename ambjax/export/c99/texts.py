@@ -256,9 +256,9 @@ set the number in it, and pass `&mine` to the step.
 
 {fixed}A step takes {flops} flops in {precision}.
 
-`ambjax export --verify` compares one step with JAX, which executes one
-operation at a time. The tolerance is {ulps}, at 10,000 states and inputs, and at as many with other
-parameters. Compile with `-ffp-contract=off`. With `-ffast-math` or `-ffinite-math-only` the source does not compile.
+`ambjax export --verify` compares one step with JAX at 10,000 states and inputs, and at 10,000 more with other
+parameters. JAX executes one operation at a time in this comparison. The tolerance is {ulps}.
+Compile with `-ffp-contract=off`. With `-ffast-math` or `-ffinite-math-only` the source does not compile.
 
 {mark}
 """

@@ -111,8 +111,8 @@ static int core_get(numbers *x, uint32_t reference, double *value)
     return 1;
 }
 
-/* Write an input or a parameter. Return 0 if that is not allowed: another number, or a parameter that is NaN, or
- * infinite where the parameter has no such value. An input may be NaN: the block reports it in its status. */
+/* Write an input or a parameter. Return 0 for any other number, for a parameter that is NaN, and for a parameter that
+ * is infinite but must be finite. An input may be NaN: the block reports it in its status. */
 static int core_set(numbers *x, uint32_t reference, double value)
 {
     if (reference >= FIRST_INPUT && reference < FIRST_OUTPUT) {
