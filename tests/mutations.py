@@ -1262,7 +1262,7 @@ SEARCH = [
         "tests/test_drawn.py::test_before_and_after_are_of_their_runs",
     ),
     M(
-        "half the sample rate has twice its amplitude",
+        "half the sampling rate has twice its amplitude",
         "tuning/report/pictures.py",
         "lines[-1] /= 2",
         "lines[-1] /= 1",

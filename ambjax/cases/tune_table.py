@@ -103,7 +103,7 @@ def lines() -> Iterator[Line]:
         "bounds.controller.position.c = [1.0, 500.0]",
         "bounds of one gain; left out: from plant and theory, see the report; c",
     )
-    yield Line("", "is then at most a fifth of the sample rate, others 3 times their range or start")
+    yield Line("", "is then at most a fifth of the sampling rate, others 3 times their range or start")
     yield from _defaults("weights.", WEIGHTS)
     yield from _limits()
     yield from _defaults("", {name: NUMBERS[name] for name in ("conditions_margin", "early")})

@@ -114,7 +114,7 @@ def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
 def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Return frequencies (Hz) above 0 and amplitudes of a signal with this sample period (s), under a Hann window.
 
-    The amplitude of a sine is that of its peak, also at half the sample rate. Both arrays are empty for fewer than
+    The amplitude of a sine is that of its peak, also at half the sampling rate. Both arrays are empty for fewer than
     FEWEST samples.
     """
     n = len(values)
@@ -123,7 +123,7 @@ def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarra
     window = np.hanning(n)
     lines = 2 * np.abs(np.fft.rfft(window * (values - values.mean()))) / window.sum()
     if n % 2 == 0:
-        lines[-1] /= 2  # half the sample rate is the only line without a mirror image
+        lines[-1] /= 2  # half the sampling rate is the only line without a mirror image
     return np.fft.rfftfreq(n, period)[1:], lines[1:]
 
 
