@@ -1,4 +1,4 @@
-"""The guard of readings and the faults of a position sensor: what is refused, what is survived, what is drawn."""
+"""The guard and the faults of a position sensor: refused readings, survival of faults, and their random numbers."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""The magnet's iron against closed forms: saturation at three points, leakage, the lag of the flux, and energy."""
+"""The iron against closed forms: saturation at three points, leakage, the lag of the flux, and energy."""
 
 import dataclasses
 import tomllib

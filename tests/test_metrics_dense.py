@@ -1,4 +1,4 @@
-"""Every metric against the same quantity of an independent, densely integrated solution (tests/dense.py)."""
+"""Every metric against that of an independent, densely integrated solution (tests/dense.py)."""
 
 import dataclasses
 import functools

@@ -1,4 +1,4 @@
-"""Sensors and amplifiers as they are: each part against what defines it, and what a case file may say of them."""
+"""Imperfect sensors and amplifiers: each part against its definition, and the keys of the case file."""
 
 import dataclasses
 import decimal

@@ -1,4 +1,4 @@
-"""The loop on a processor against an independent simulator of it, which shares no code: the same world solved twice."""
+"""The loop on a processor against an independent simulator, which shares no code with ambjax."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""`ambjax sensitivity`: its numbers against the analysis, its picture against its data, its answers to bad input."""
+"""`ambjax sensitivity`: numbers against the analysis, the picture against its data, and messages for bad input."""
 
 import json
 

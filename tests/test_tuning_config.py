@@ -1,4 +1,4 @@
-"""Numbers of [tune]: each has both ends, and says so."""
+"""Numbers of [tune]: each has a lower and an upper bound, and the message states both."""
 
 import dataclasses
 import math

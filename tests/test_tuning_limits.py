@@ -333,7 +333,7 @@ def test_the_command_says_what_a_limit_costs(monkeypatch, tmp_path):
     assert row["price"] > 0
     assert row["price_unit"] == "m"
     assert (survival["reached"], survival["held"]) == (1.0, True)
-    assert "is at its limit, 10: 10 % more would take about" in summary["verdict"]
+    assert "is at its limit, 10: a limit 10 % higher would reduce the settled rms error by about" in summary["verdict"]
     text = (out / "report.md").read_text()
     assert "## Limits" in text
     assert "| `rms_u_V` | at most 10 V |" in text

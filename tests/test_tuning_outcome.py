@@ -1,4 +1,4 @@
-"""One answer in every place: exit code, log, report, JSON and tuned.toml say the same of each kind of outcome."""
+"""Exit code, log, report, JSON and tuned.toml agree for each kind of outcome."""
 
 import argparse
 import collections

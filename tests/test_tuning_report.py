@@ -1,4 +1,4 @@
-"""The tuner's report: what a reader can add up, what accurate steps say, and a page that shows it as it is."""
+"""The tuner's report: consistent sums, the results of accurate steps, and the HTML page."""
 
 import dataclasses
 import html

@@ -1,4 +1,4 @@
-"""What surrounds the search: ranges, the judge, the step's error, slices, the front, descent, and the command's flags.
+"""Parts around the search: ranges, the judge, the step's error, slices, the front, descent, and the command's flags.
 
 On losses that are formulas (`bowl.py`), so that each is known by hand.
 """

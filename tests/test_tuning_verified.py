@@ -1,4 +1,4 @@
-"""An answer is what accurate steps confirm: what refutes one, what then happens, and what the command says of it."""
+"""Verification of an answer with accurate steps: what refutes it, the next actions, and the messages."""
 
 import json
 import math

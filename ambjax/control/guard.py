@@ -80,7 +80,7 @@ class Guard:
         at_most=1_000_000,
         whole=True,
         optional=True,
-        doc="most predicted in a row; none: 1/(pole T), in which an error grows by the factor e",
+        doc="largest number predicted in a row; none: 1/(pole T), in which an error grows by the factor e",
     )
 
     @property
