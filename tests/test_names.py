@@ -57,7 +57,7 @@ def test_every_word_leads_to_its_name():
             assert meant(word, [name]) == name
 
 
-# A bearing without doubt: 146 N/A, 364 N at the bias, 15.7 N of weight, a pole of 675 1/s.
+# A plausible bearing: 146 N/A, 364 N at the bias, a weight of 15.7 N, a pole of 675 1/s.
 GOOD = {"m": 1.6, "k_z": 0.0, "mu_0": 1.2566e-6, "n": 208.0, "A": 2.68e-4, "s_0": 5e-4, "i_0": 2.5, "R": 1.0}
 
 
