@@ -153,7 +153,7 @@ def own_gains():
 
 @pytest.mark.parametrize("module", [m for m in MODULES if not (m in MAKERS or m.startswith(MAKERS[:3]))])
 def test_laws_answer_for_themselves(module):
-    # no isinstance of a law without its class; and no gain by its name
+    # without importing a law's class, isinstance is impossible; what remains is access to a gain by its name
     assert not imports(module) & set(LAWS), f"{module} knows a law: call a method of the law (ambjax/control/base.py)"
     used = set()
     for node in ast.walk(tree_of(module)):
@@ -216,21 +216,21 @@ ANY_SHARE = 0.05
 
 @functools.cache
 def meanings(module):
-    """What each name of a module stands for, as a dotted name: imported names, and variables of its top level."""
+    """Return the dotted name for each name of a module: imported names, and variables of its top level."""
     nodes = [node for node in ast.walk(tree_of(module)) if isinstance(node, ast.ImportFrom)]
     imported = {alias.asname or alias.name: f"{node.module}.{alias.name}" for node in nodes for alias in node.names}
     return imported | {name: f"{module}.{name}" for name, _ in variables(module)}
 
 
 def variables(module):
-    """Name and value of each variable of a module's top level."""
+    """Return name and value of each variable of a module's top level."""
     for node in tree_of(module).body:
         targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
         yield from ((target.id, node.value) for target in targets if isinstance(target, ast.Name) and node.value)
 
 
 def contains(annotation, module, loose):
-    """Whether an annotation is missing, or contains a name that stands for one of `loose`."""
+    """Return whether an annotation is missing, or contains a name of one of `loose`."""
     names = meanings(module)
     used = (node.id for node in ast.walk(annotation or ast.Name("Any")) if isinstance(node, ast.Name))
     return annotation is None or any(names.get(name) in loose for name in used)
@@ -261,7 +261,7 @@ def annotations_of(module):
 
 
 def test_few_annotations_are_any():
-    # pyright checks nothing that is Any
+    # pyright does not check expressions of type Any
     loose = [contains(x, module, any_likes()) for module in MODULES for x in annotations_of(module)]
     assert len(loose) > 3000
     assert sum(loose) / len(loose) < ANY_SHARE, "give the new parameters and results types: a TypeVar, a record, object"
