@@ -153,7 +153,7 @@ def own_gains():
 
 @pytest.mark.parametrize("module", [m for m in MODULES if not (m in MAKERS or m.startswith(MAKERS[:3]))])
 def test_laws_answer_for_themselves(module):
-    # without importing a law's class, isinstance is impossible; what remains is access to a gain by its name
+    # a module that does not import a law's class cannot test for it, but it could still read a gain by its name
     assert not imports(module) & set(LAWS), f"{module} knows a law: call a method of the law (ambjax/control/base.py)"
     used = set()
     for node in ast.walk(tree_of(module)):

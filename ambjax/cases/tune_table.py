@@ -75,7 +75,7 @@ class Budget:
     iterations: int = _whole(40, 1, "largest number of iterations in each phase of the refinement")
     substeps: int = _whole(3, 1, "integration steps per sample")
     front: int = leaf(
-        3, at_least=1, at_most=5, whole=True, doc="points of error against voltage beside that of the least error"
+        3, at_least=1, at_most=5, whole=True, doc="points of error against voltage, besides that of least error"
     )
 
 

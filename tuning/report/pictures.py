@@ -212,7 +212,7 @@ def front(rows: list[dict[str, Any]]) -> bytes:
     ax.set_ylim(min(min(errors) / 1.2, max(errors) / 2), max(max(errors) * 1.2, min(errors) * 2))
     ax.set(xlabel="settled rms voltage (V)", ylabel="settled rms error (m)", yscale="log")
     low, high = ax.get_xlim()
-    ax.set_xlim(low, high + 0.3 * (high - low))  # room for the words beside the last point
+    ax.set_xlim(low, high + 0.3 * (high - low))  # space for the text next to the last point
     ax.grid(alpha=0.3, which="both")
     return _png(figure)
 
