@@ -1,9 +1,9 @@
-"""Control structures against each other: each tuned by `ambjax tune`, then evaluated on the same members.
+"""Comparison of control structures: each is tuned by `ambjax tune`, then evaluated on the same members.
 
 Cases: F20 and G20 of the tuning tasks on a processor, and the templates `rig` and `bearing`. All structures of a case
 have the same members, loss, limits and budget, and each is tuned with every seed for the least error within the limits.
-All gains are tuned, the steepnesses p included. The results contain the seeds and the budget of each case. What exists
-in DIR/CASE-SEED is not run again: a benchmark that was stopped goes on at the structure where it stopped. Results of
+All gains are tuned, the steepnesses p included. The results contain the seeds and the budget of each case. Results
+in DIR/CASE-SEED are not computed again, so a benchmark that was stopped continues at the next structure. Results of
 other cases are kept. `--quick` uses one seed and a tiny budget, to test the script; its results are not written.
 Compilation takes most of the time of a search; later seeds of a case reuse the compiled programs.
 Run: python benchmarks/laws.py [CASE ...] [--out DIR] [--quick] [--seeds N] [--budget full|small] [--only NAME ...]
@@ -28,8 +28,8 @@ from ambjax.cases.template_text import template
 from tuning.space import Gain, Space, tunable
 
 SAMPLED = tasks.TASKS / "sampled"
-# Limits of each case: peak of |S| in zone A, and voltages (V, V/s) of two thirds of the supply and less, where each
-# structure has to give up something.
+# Limits of each case: a peak of |S| in zone A, an rms voltage (V) of at most 60 % of the supply, and the chatter (V/s).
+# They are so low that each structure loses accuracy by them.
 LIMITS: dict[str, dict[str, float]] = {
     "F20": {"sensitivity": 3.0, "rms_u_V": 120.0, "chatter_V_per_s": 1e6},
     "G20": {"sensitivity": 3.0, "rms_u_V": 120.0, "chatter_V_per_s": 1e6},
@@ -96,10 +96,10 @@ def title(name: str) -> str:
 
 
 def structures(case: Case, laws: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the tables [controller] of all structures. `laws`: that of the case, whose observer all have.
+    """Return the tables [controller] of all structures. `laws`: that of the case. All structures have its observer.
 
-    LQG is state feedback with a Kalman filter, which is that of the case if it has one.
-    The PI controller starts with three times the bandwidth of the plant's pole, the others with their defaults.
+    LQG is state feedback with a Kalman filter, which is that of the case if it has one. The PI controller starts with a
+    bandwidth of three times the plant's pole, the other laws with their defaults.
     """
     w, L = float(case.scenario.plant.pole), float(case.scenario.plant.L)
     drive = {"kind": "pi", "k_p": 3 * w * L, "k_int": w * w * L, "k_aw": w / 3}
@@ -181,7 +181,7 @@ def tuned(path: pathlib.Path, folder: pathlib.Path) -> pathlib.Path:
 
 
 def command(*words: str) -> None:
-    """Run a command of ambjax. Exit code 1 means that a limit is missed or a member is lost: the results say so."""
+    """Run a command of ambjax. Exit code 1 is ignored: it means that a limit is missed or a member is lost."""
     subprocess.run([sys.executable, "-m", "ambjax", *words], check=False)
 
 

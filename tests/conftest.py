@@ -17,7 +17,7 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
 
 
-# Tracing allocates millions of objects that stay, and the collector visits all of them again and again.
+# Tracing allocates millions of long-lived objects, which the garbage collector would visit repeatedly.
 gc.set_threshold(100_000, 20, 20)
 
 

@@ -1,12 +1,12 @@
-"""Break the program on purpose, one line at a time, and demand that a named test notices.
+"""Break the program on purpose, one line at a time, and check that a named test fails.
 
     python tests/mutate.py [--jobs N] [--share K] [WORD ...]
 
-Every mutation of tests/mutations.py (with WORDs: those whose text has one of them) is made in a temporary copy of the
-project, never in place, and the test that guards the line is run there: it must pass without the mutation and fail
-with it. With `--share K` one mutation in K is made. Which ones depends on the text of the files that they change, so
-every change of the program has another sample. Exit code 1 if one survives, if its text is no longer found exactly
-once, or if its test fails by itself.
+Each mutation of tests/mutations.py (with WORDs: each whose text contains one of them) is applied to a temporary copy of
+the project, and its test runs there. The test must pass without the mutation and fail with it. With `--share K` about
+one mutation in K is applied. The choice depends on the text of the changed files, so each change of the program gives
+another sample. The exit code is 1 if a mutant survives, if the text of a mutation is not found exactly once, or if its
+test fails without the mutation.
 """
 
 import argparse
@@ -33,7 +33,7 @@ KILLED, SURVIVED = "killed", "SURVIVED"
 
 
 def mutated(mutation: Mutation, root: pathlib.Path = ROOT) -> str:
-    """The text of the mutated file. Raises ValueError where the mutation no longer fits it."""
+    """Return the text of the mutated file. Raises ValueError if the mutation does not fit the file."""
     path, where = root / mutation.file, f"{mutation.file}: '{mutation.says}'"
     if not path.exists():
         raise ValueError(f"{where}: there is no such file. Adapt it in tests/mutations.py.")
@@ -60,7 +60,7 @@ def parent() -> Parent:
 
 
 def run(forks: Parent, root: pathlib.Path, change: Mutation | None, *words: str) -> tuple[int, str]:
-    """Exit code and output of pytest in a copy of the project, one file of it changed."""
+    """Run pytest in a copy of the project in which one file is changed. Return its exit code and output."""
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
         copy = pathlib.Path(folder).resolve()
         for name in COPIED:
@@ -79,7 +79,7 @@ def run(forks: Parent, root: pathlib.Path, change: Mutation | None, *words: str)
 
 
 def verdict(mutation: Mutation, root: pathlib.Path, forks: Parent) -> str:
-    """KILLED, SURVIVED, or why neither can be said."""
+    """Return KILLED, SURVIVED, or a text that says why the test gave no verdict."""
     code, output = run(forks, root, mutation, "-n", "0", mutation.test)
     if code in (PASSED, FAILED):
         return SURVIVED if code == PASSED else KILLED
@@ -89,7 +89,7 @@ def verdict(mutation: Mutation, root: pathlib.Path, forks: Parent) -> str:
 def hunt(
     mutations: Sequence[Mutation], root: pathlib.Path = ROOT, jobs: int = 2, say: Callable[[str], None] = print
 ) -> int:
-    """The whole hunt; the exit code."""
+    """Test all mutations and print the verdicts. Return the exit code."""
     try:
         for mutation in mutations:
             mutated(mutation, root)
@@ -107,7 +107,7 @@ def hunt(
 def _hunt(
     mutations: Sequence[Mutation], root: pathlib.Path, parents: Sequence[Parent], say: Callable[[str], None]
 ) -> int:
-    """The hunt, one mutant at a time for each parent."""
+    """Test the mutations, one at a time in each process of `parents`. Return the exit code."""
     tests = sorted({mutation.test for mutation in mutations})
     say(f"{len(tests)} tests without mutations ...")
     code, output = run(parents[0], root, None, "-n", str(len(parents)), "--dist", "loadscope", *tests)

@@ -1,15 +1,19 @@
-"""Mutations: one line of the program broken, and the test that must notice. See tests/mutate.py.
+"""Mutations: each breaks one line of the program, and names the test that must fail. See tests/mutate.py.
 
-To add one: what the mutant does wrong, the file, a piece of its text that is found there exactly once, what stands
-there instead, and the smallest test that fails then. Pieces are short, so that a change of the code beside them
-leaves them alone; where the code itself changes, the mutation is adapted with it.
+To add a mutation, give a description of the fault, the file, a piece of its text that occurs there exactly once, the
+replacement, and the smallest test that fails with it. Keep the piece short, so that changes of the surrounding code do
+not affect it. If the piece itself changes, adapt the mutation.
 """
 
 from typing import NamedTuple
 
 
 class Mutation(NamedTuple):
-    """`says` in words, `file` from the project's root, `old` and `new` text, `test` as pytest names it."""
+    """A mutation.
+
+    `says`: the fault in words. `file`: path from the root of the project. `old`, `new`: the text and its replacement.
+    `test`: node id of the test that must fail, as in pytest.
+    """
 
     says: str
     file: str
@@ -1262,7 +1266,7 @@ SEARCH = [
         "tests/test_drawn.py::test_before_and_after_are_of_their_runs",
     ),
     M(
-        "half the sample rate has twice its amplitude",
+        "half the sampling rate has twice its amplitude",
         "tuning/report/pictures.py",
         "lines[-1] /= 2",
         "lines[-1] /= 1",

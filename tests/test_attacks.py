@@ -1,4 +1,4 @@
-"""Hostile case files, arguments, folders and streams: one line that says what is wrong, and nothing half done."""
+"""Hostile case files, arguments, folders and streams: one line states the error, and no partial result is written."""
 
 import dataclasses
 import errno

@@ -1,4 +1,4 @@
-"""What decides on a processor: slopes, bands and the delay margin, against recursions and the loop itself."""
+"""Conditions on a processor: slopes, bands and the delay margin, compared with recursions and simulated loops."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: outputs, exit codes, and what it says to bad input."""
+"""The command line: outputs, exit codes, and messages for bad input."""
 
 import json
 import pathlib

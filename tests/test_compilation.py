@@ -1,4 +1,4 @@
-"""Other numbers in the same structure are neither traced nor compiled again; what is stored is computed once."""
+"""Other numbers in the same structure are neither traced nor compiled again; stored values are computed once."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Files that were damaged: every kind is found, what they held is computed again, and what is whole stays."""
+"""Damaged files: each kind of damage is found, the lost results are recomputed, and intact files are kept."""
 
 import json
 import pathlib

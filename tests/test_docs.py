@@ -1,4 +1,4 @@
-"""The documentation against the code: what pages say is there, and what is there they say. Sphinx is not needed."""
+"""The documentation agrees with the code: each link has a target, and each key has an entry. Sphinx is not needed."""
 
 import ast
 import importlib
@@ -22,7 +22,7 @@ from tuning.config import tune_from
 ROOT = pathlib.Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 ROLE = re.compile(r"\{py:(\w+)\}`(?:[^`<]*<)?~?([\w.]+)>?`")
-# Tables of the case file whose keys are rows of a page, with what must stand beside a key for the reader to get there.
+# Tables of the case file whose keys are rows of a page, with the other keys that the reader needs to accept a key.
 ELSEWHERE = ("controller", "reference", "disturbance", "spread")
 ROWS = [(name, {}) for name in [*TABLES, *OTHERS, "tune.weights", "tune.limits"] if name not in ELSEWHERE]
 ROWS += [("reference", {"kind": kind}) for kind in SIGNALS]
@@ -30,7 +30,7 @@ ROWS += [(f"controller.{stage}", {"kind": kind}) for stage, kinds in KINDS.items
 
 
 def found(dotted):
-    """What a dotted name stands for; raises if there is no such thing."""
+    """Return the object with this dotted name. Raises AttributeError if there is none."""
     parts = dotted.split(".")
     for count in range(len(parts), 0, -1):
         try:
@@ -65,7 +65,7 @@ def test_every_equation_of_the_paper_is_linked_to_its_code():
 
 
 def record_of(table, kind):
-    """The record whose fields are a table's keys, if one is."""
+    """Return the record whose fields are the keys of a table; None if there is none."""
     if table == "reference":
         return SIGNALS[kind]
     stage = table.partition(".")[2]
@@ -86,7 +86,7 @@ def test_no_key_is_without_range_and_meaning(table, beside):
     "table", ["plant", "sensor", "initial", "actuator", "clock", "tune", "tune.weights", "tune.limits"]
 )
 def test_defaults_are_those_of_the_reader(table):
-    """A case with every number set to the default on the page is the case without: to six digits, as printed."""
+    """A case with each number set to the default on the page equals the case without these numbers, to six digits."""
     rows = case_file.rows_of(table, case_file.RECORDS.get(table))
     given = {row.name: number for row in rows if (number := as_number(row.default)) is not None}
     assert given or table == "actuator"
@@ -96,7 +96,7 @@ def test_defaults_are_those_of_the_reader(table):
 
 
 def as_number(text):
-    """A default as the case file would have it: whole, real, or None for words."""
+    """Return a default as an int or a float; None if it is no finite number."""
     try:
         return int(text)
     except ValueError:
@@ -109,7 +109,7 @@ def as_number(text):
 
 
 def numbers_of(raw):
-    """Every number in what a case file says."""
+    """Return all numbers of a case and its table [tune]."""
     raw = {table: keys | ({"risk": "cvar"} if table == "tune" else {}) for table, keys in raw.items()}  # alpha needs it
     case = case_from(raw)
     words = f"{case} {tune_from(Table(raw).table('tune'), case)}"
@@ -177,7 +177,7 @@ def test_the_committed_tables_are_current(name):
 
 
 def test_a_printed_table_is_read_back(monkeypatch):
-    """What a cell prints with `outputs.table` has the same cells in the page, and the text around it stays."""
+    """A table printed with `outputs.table` has the same cells in the page; the text around it is kept."""
     pytest.importorskip("sphinx")
     monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
     split = importlib.import_module("printed_tables").split

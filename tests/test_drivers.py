@@ -1,4 +1,4 @@
-"""What drives a metric: functions whose indices are known, a V that a rank correlation does not see, and noise."""
+"""Shares of the variation of a metric: functions with known indices, a V-shaped function, and noise."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The engine and the store: a member is the same whoever runs beside it; nothing finished is ever lost."""
+"""Ensembles: a member does not depend on the other members, and finished chunks are never lost."""
 
 import dataclasses
 import itertools

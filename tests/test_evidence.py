@@ -1,4 +1,4 @@
-"""The runs behind the ledger: which plants are tried, on runs that are stood in for."""
+"""The runs of the ledger: which plants are simulated. The runs themselves are replaced by stubs."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The controller as C: every law, a custom law, what is refused, and what a wrong C would do to the proof."""
+"""The controller as C: every law, a custom law, refused cases, and the verification of faulty C programs."""
 
 import dataclasses
 import functools

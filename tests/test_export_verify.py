@@ -1,4 +1,4 @@
-"""What proves the exported C: each check fails for a program made for it, and none for a correct one."""
+"""Verification of the exported C: each check fails for a program with a matching fault, none for a correct one."""
 
 import dataclasses
 import pathlib

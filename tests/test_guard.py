@@ -1,4 +1,4 @@
-"""The guard of readings and the faults of a position sensor: what is refused, what is survived, what is drawn."""
+"""The guard and the faults of a position sensor: refused readings, survival of faults, and their random numbers."""
 
 import dataclasses
 import math
@@ -28,7 +28,7 @@ SHARES = np.concatenate([[0.98, 1.2, 1.5, 1.98], [-1.2, -1.5, -1.98]])
 
 
 def struck(guard=Guard(), observer=None, **faults):
-    """Gains of the page about exported C, or those behind a Kalman filter, with a faulty sensor."""
+    """Return a case with a faulty sensor: the gains of docs/export.md, or gains for a Kalman filter."""
     laws = amb.position.SlidingMode(1440.0, 2.307, math.inf), amb.inversion.Adaptive(7.97e5, math.inf)
     cascade = amb.Cascade(
         observer or amb.observer.Direct(),
@@ -42,7 +42,7 @@ def struck(guard=Guard(), observer=None, **faults):
 
 @pytest.mark.parametrize("observer", [None, amb.observer.Kalman(500.0)], ids=["direct", "Kalman"])
 def test_one_impossible_reading_is_refused_and_survived(observer):
-    """At some samples each, of both signs; without a guard the same readings lose rotors."""
+    """Outliers of both signs at several samples; without a guard, the same readings lose rotors."""
     found = {}
     for guard in (Guard(), None):
         at = T * (60 + np.arange(SHARES.size))
@@ -54,7 +54,7 @@ def test_one_impossible_reading_is_refused_and_survived(observer):
     assert not found[False]["lost"].any()
     np.testing.assert_array_equal(found[False]["refused"], 1.0)
     assert not found[True]["refused"].any()
-    # no further off than while it comes to its reference
+    # the error is at most that of the transient to the reference
     assert found[False]["max_abs_error_m"].max() < 6e-5
 
 
@@ -98,7 +98,7 @@ def test_guard_and_faults_against_the_independent_simulator(name):
 
 @pytest.mark.parametrize("delay", [0.0, 0.5, 1.0, 1.5, 2.0])
 def test_the_expected_current_follows_the_voltages_that_act_within_the_sample(delay):
-    """By Eq. (2) written out, under the mean of u_n from n + delay on and of the two voltages before it."""
+    """Eq. (2), written out, under the mean of u_n, which acts after the delay, and of the two voltages before it."""
     cascade, scenario, clock = loop_of(World(**TRACKING, delay=delay, **soft()), 5, (0.0, 0.0, 0.0))
     cascade = dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=Guard()))
     system = system_of(guarded(cascade, scenario, T), scenario, clock).realised()
@@ -158,7 +158,7 @@ def test_a_first_reading_that_is_none_is_waited_for():
 
 
 def test_faults_are_those_of_the_member_and_the_sample():
-    """Rates within 5 standard deviations of a binomial; both signs; one at a given time; whoever runs beside."""
+    """Rates within 5 standard deviations of a binomial; both signs; one at a given time; no effect of other members."""
     sensor = Sensor(outliers=Outliers(500.0, 1e-3, 0.0205), dropouts=Dropouts(200.0, 3e-4, 0.0305))
     _, scenario = struck()
     draw = jax.jit(jax.vmap(lambda n: sensor.fault_onsets(scenario.words(), n, T)))
@@ -187,7 +187,7 @@ def test_what_is_read_in_a_dropout(value):
     np.testing.assert_array_equal(seen[50:54], read)
     assert not np.any(np.delete(seen, np.s_[49:54]) == read)
     assert np.asarray(rows.alive).all()
-    # 0 is 157 um off; what is held is what the rotor might do
+    # the reading 0 is wrong by 157 um; a held reading is plausible
     assert np.asarray(rows.refused)[50:54].all() == (value != "hold")
 
 

@@ -1,4 +1,4 @@
-"""Ctrl-C: one line and exit code 130, whatever runs; deferred where there is something to end."""
+"""Ctrl-C gives one line and exit code 130 in every command; it is deferred where a step has to be completed."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The magnet's iron against closed forms: saturation at three points, leakage, the lag of the flux, and energy."""
+"""The iron against closed forms: saturation at three points, leakage, the lag of the flux, and energy."""
 
 import dataclasses
 import tomllib
@@ -14,7 +14,7 @@ from ambjax.world.coils import TwoCoil
 from ambjax.world.iron import AIR, Iron
 from ambjax.world.sensor import Measurement
 
-# A laboratory bearing: its cores have 0.65 T at the bias.
+# A laboratory bearing. At the bias current, the flux density of its cores is 0.65 T.
 RIG = {"m": 1.64, "k_z": 0.0, "mu_0": 1.2566e-6, "n": 208.0, "A": 2.68e-4, "s_0": 5e-4, "i_0": 2.5, "R": 1.0}
 LIMIT = 1.2
 PLANTS = pytest.mark.parametrize("kind", [Plant, TwoCoil])

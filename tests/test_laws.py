@@ -59,7 +59,7 @@ TABLE = pytest.mark.parametrize(
 )
 
 TAME = np.array([1e-4, 2e-3, 0.01, 0.02, 0.3, 4e3])
-# finite numbers that no sane loop produces: a displacement of metres, a current of kiloamperes
+# finite numbers that no real loop produces: a displacement of metres, a current of kiloamperes
 WILD = np.array(
     [np.where(np.arange(6) == j, s * 1e4, s * x) for j in range(6) for s in (1, -1) for x in (0.0, 1e-3, 10.0)]
 )
@@ -135,10 +135,10 @@ def test_slope_is_what_it_says(stage, law):
     slope = law.slope(MODEL)
     assert np.isfinite(slope)
     assert slope >= 0
-    # the only numbers of a law without a slope are those of a model, which no tuner may change
+    # the only numbers of a law that need no slope are those of a model, which the tuner does not change
     positive = [f.name for f in dataclasses.fields(law) if f.metadata.get("leaf") and f.metadata["above"] is not None]
     assert (slope > 0) == bool(positive)
-    # a traced gain gives a traced slope, so that a step can be refused with words and not with a crash
+    # a traced gain gives a traced slope, so that a step can be refused with a message
     assert np.isfinite(jax.jit(lambda law: jnp.asarray(law.slope(MODEL)))(law))
 
 
@@ -204,7 +204,7 @@ def test_the_optional_methods_of_a_law(stage, law):
     assert all(x > 0 for x in jax.tree.leaves(law.layer(MODEL)))
     robust = np.asarray(law.robust(ERRORS))
     required = law.requirement
-    # a law of whose gain the theorem requires something has a robust term of that size at most, which opposes the error
+    # a law with a requirement of the theorem has a robust term of at most this gain, which opposes the error
     assert (required is None) == (not robust.any())
     if required:
         assert required.gain in gains(law)
@@ -256,7 +256,7 @@ STAGES = ("observer", "position", "inversion", "current")
 
 # the paper's gamma suits the paper's position law: laws of a faster start demand forces that change ten times faster
 def accepted(law):
-    """Whether a law stands with laws of any other stage: one that takes a voltage only does not."""
+    """Return whether a law can be combined with all laws of other stages; a law that accepts only a voltage cannot."""
     return "force" in getattr(law, "accepts", ("force",))
 
 
@@ -268,7 +268,7 @@ LAWS_BY_STAGE = [
 
 
 def pairwise(stages):
-    """Combinations of a law of each stage in which any two laws of different stages stand together: a greedy cover."""
+    """Return combinations of one law per stage that contain every pair of laws of different stages: a greedy cover."""
     product = list(itertools.product(*map(range, map(len, stages))))
     pairs = {c: set(itertools.combinations(enumerate(c), 2)) for c in product}
     left, chosen = set().union(*pairs.values()), []
@@ -280,7 +280,7 @@ def pairwise(stages):
 
 
 def how_slow(combinations):
-    """The mark of each: two are fast, slow are those with a law that no earlier one has, and the others thorough."""
+    """Return the mark of each: two are fast, those with a law that no earlier one has are slow, the others thorough."""
     seen = set()
     for k, laws in enumerate(combinations):
         new = set(map(type, laws)) - seen
@@ -334,7 +334,7 @@ def samples(n=200, seed=5):
 
 
 def close(a, b, size):
-    """Equal to rounding of terms of the given size: a dozen operations, 1e-14 each at most."""
+    """Check equality up to the rounding of terms of the given size: a dozen operations, each at most 1e-14."""
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-13 * size)
 
 
@@ -494,7 +494,7 @@ def test_pid_places_the_poles_of_the_error_on_the_nominal_plant():
             e_ddot = 2 * model.k_z / model.m * z + model.a * v_star - model.g - r_ddot
             close(e_ddot, -law.k_p * (z - r) - law.k_d * d - x, 100.0)
             close(rate.rate, law.w_f * (z_dot - r_dot - d), 1e4)
-            # where the force is out of reach, the current gives another one: that is the anti-windup's part
+            # if the force cannot be reached, the current gives another one, and the anti-windup adds this difference
             reached = law.k_aw * model.a * (v_star - model.v(z, i))
             close(rate.integral, law.k_int * (z - r) + reached, 1e6)
             close(law.sigma(motion, reference), z_dot - r_dot + law.k_p / law.k_d * (z - r), 1.0)

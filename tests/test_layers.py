@@ -1,4 +1,4 @@
-"""The house: imports only point down, and heavy ones stay where they belong."""
+"""Layers of the code: imports only point down, and heavy libraries are imported only where they are needed."""
 
 import ast
 import collections
@@ -12,8 +12,8 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parent.parent
 
-# Floors from the ground up: a folder of a package, or a module beside such folders, stands on those before it.
-# An import points to an earlier one, or stays within its own without a cycle.
+# The layers (floors) of each package, the lowest first: each is a folder, or a module beside these folders. A module
+# imports only from lower layers or from its own, without a cycle.
 FLOORS = {
     "ambjax": "_version compiler numerics host world control simulation extend export theorem ensemble linear paper "
     "pictures cases results page commands __init__ __main__",
@@ -35,7 +35,7 @@ MODULES = {module_of(path): path for path in FILES}
 
 
 def floor_of(module):
-    """Floor of a module, or None if the table does not know it: tuning's are above all of ambjax's."""
+    """Return the layer of a module, None if it is not in the table. All layers of tuning are above those of ambjax."""
     package, _, rest = module.partition(".")
     room = rest.partition(".")[0] or "__init__"
     floors = [(one, name) for one, names in FLOORS.items() for name in names.split()]
@@ -43,7 +43,7 @@ def floor_of(module):
 
 
 def targets_of(node, module):
-    """Dotted names that an import statement brings in; of `from a import b`, a.b if that is a module, else a."""
+    """Return the modules that an import statement names: for `from a import b`, a.b if that is a module, else a."""
     if isinstance(node, ast.Import):
         return [alias.name for alias in node.names]
     base = node.module or ""
@@ -62,7 +62,7 @@ def tree_of(module):
 
 @functools.cache
 def imports(module, *, top_level=False):
-    """Everything that a module imports, wherever in the file; or only what its import executes."""
+    """Return the names of all modules that a module imports; with `top_level`, without imports inside functions."""
     tree = tree_of(module)
     nodes = tree.body if top_level else ast.walk(tree)
     found = [node for node in nodes if isinstance(node, (ast.Import, ast.ImportFrom))]
@@ -132,13 +132,13 @@ LAWS = [
         "current",
     )
 ]
-# Who may know which laws there are: those who make them of names, the paper's own, and a user's imports.
+# Modules that may import the modules of laws: the reader of case files, the paper's parameters and the public API.
 MAKERS = ("ambjax.control.", "ambjax.cases.reader", "ambjax.paper.", "ambjax", "ambjax.extend")
 
 
 @functools.cache
 def own_gains():
-    """Names of the numbers of laws, without those that a module other than the paper's tables defines too."""
+    """Return the names of the gains of laws, without names that other modules define too."""
     classes = {m: [node for node in tree_of(m).body if isinstance(node, ast.ClassDef)] for m in MODULES}
 
     def numbers(kind):
@@ -153,7 +153,7 @@ def own_gains():
 
 @pytest.mark.parametrize("module", [m for m in MODULES if not (m in MAKERS or m.startswith(MAKERS[:3]))])
 def test_laws_answer_for_themselves(module):
-    # no isinstance of a law without its class; and no gain by its name
+    # a module that does not import a law's class cannot test for it, but it could still read a gain by its name
     assert not imports(module) & set(LAWS), f"{module} knows a law: call a method of the law (ambjax/control/base.py)"
     used = set()
     for node in ast.walk(tree_of(module)):
@@ -216,21 +216,21 @@ ANY_SHARE = 0.05
 
 @functools.cache
 def meanings(module):
-    """What each name of a module stands for, as a dotted name: imported names, and variables of its top level."""
+    """Return the dotted name for each name of a module: imported names, and variables of its top level."""
     nodes = [node for node in ast.walk(tree_of(module)) if isinstance(node, ast.ImportFrom)]
     imported = {alias.asname or alias.name: f"{node.module}.{alias.name}" for node in nodes for alias in node.names}
     return imported | {name: f"{module}.{name}" for name, _ in variables(module)}
 
 
 def variables(module):
-    """Name and value of each variable of a module's top level."""
+    """Return name and value of each variable of a module's top level."""
     for node in tree_of(module).body:
         targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
         yield from ((target.id, node.value) for target in targets if isinstance(target, ast.Name) and node.value)
 
 
 def contains(annotation, module, loose):
-    """Whether an annotation is missing, or contains a name that stands for one of `loose`."""
+    """Return whether an annotation is missing, or contains a name of one of `loose`."""
     names = meanings(module)
     used = (node.id for node in ast.walk(annotation or ast.Name("Any")) if isinstance(node, ast.Name))
     return annotation is None or any(names.get(name) in loose for name in used)
@@ -261,7 +261,7 @@ def annotations_of(module):
 
 
 def test_few_annotations_are_any():
-    # pyright checks nothing that is Any
+    # pyright does not check expressions of type Any
     loose = [contains(x, module, any_likes()) for module in MODULES for x in annotations_of(module)]
     assert len(loose) > 3000
     assert sum(loose) / len(loose) < ANY_SHARE, "give the new parameters and results types: a TypeVar, a record, object"

@@ -266,7 +266,7 @@ def test_ranges_and_zones():
     assert [zones.clearance_zone(x) for x in (0.29, 0.35, 0.45, 0.6)] == ["A", "B", "C", "D"]
     assert zones.range(None) == (1.0, 2000.0)
     assert zones.range(1e-3) == (1.0, 450.0)
-    with pytest.raises(ValueError, match="at most half the sample rate, 500 Hz"):
+    with pytest.raises(ValueError, match="at most half the sampling rate, 500 Hz"):
         Zones(f_high=600.0).range(1e-3)
     with pytest.raises(ValueError, match="must be below f_high"):
         Zones(f_low=10.0, f_high=5.0).range(1e-3)

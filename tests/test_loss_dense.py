@@ -1,4 +1,4 @@
-"""What the tuner counts and limits against the same of an independent, densely integrated solution (tests/dense.py)."""
+"""The tuner's loss and limits against those of an independent, densely integrated solution (tests/dense.py)."""
 
 import dataclasses
 import functools

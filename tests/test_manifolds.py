@@ -1,4 +1,4 @@
-"""Integral and terminal sliding modes against the motions that their theory promises."""
+"""Integral and terminal sliding modes against the motions that their theory predicts."""
 
 import dataclasses
 import tomllib

@@ -1,4 +1,4 @@
-"""Maps: the basin's known law, cells against ensembles of their own, and refusals."""
+"""Maps: a basin with a known formula, cells compared with separate ensembles, and refused input."""
 
 import dataclasses
 import json

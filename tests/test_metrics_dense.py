@@ -1,4 +1,4 @@
-"""Every metric against the same quantity of an independent, densely integrated solution (tests/dense.py)."""
+"""Every metric against that of an independent, densely integrated solution (tests/dense.py)."""
 
 import dataclasses
 import functools
@@ -17,7 +17,7 @@ from tuning.problem import REFINEMENT
 
 PERIOD = 1e-4
 SAMPLES, SETTLE = 200, 50 * PERIOD
-# Two sets of gains that the tuner once found: a hard sign under noise, and behind an observer.
+# Two sets of gains from the tuner: with a steep sign under noise, and with an observer.
 STIFF = {"position": smc(140.5, 1158.0), "inversion": adaptive(1.869e7), "current": current(92.3)}
 BEHIND = {"position": smc(1743.0, 291.6), "inversion": adaptive(1.467e6), "current": current(18.15)}
 OBSERVER = ("complementary", {"l": 1.02, "z_hat": 0.0})
@@ -35,7 +35,7 @@ LOOPS = {
         World(inversion=adaptive(1e9, 25e-6), initial=(2e-4, 0.0, 0.0), q_v=BUMP), (0.0, 0.0, 0.0)
     ),
     "lost": (World(inversion=adaptive(1e3), reference=sine()), (1e-6, 1e-4, 1e-4)),
-    # i_ref and i as good as constant, beside each other; the rotor drifts off, and over C
+    # i_ref and i are nearly constant and differ; the rotor drifts away and crosses C
     "lost across C": (
         World(inversion=adaptive(1e-9, i_ref=-0.4), current=current(1e-9), initial=(5.5e-5, 0.0, 0.0), u_max=45.0),
         (0.0, 0.0, 0.0),
@@ -51,7 +51,7 @@ TOLERANCES = {
     # its layer's width is what errors are kept within
     "settled_max_abs_v_tilde_A2_per_m2": 0.02,
 }
-# All others are extremes: of jumps, which a row has, or of smooth signals, whose peaks may fall between two steps.
+# All others are extremes: of jumps, which a row contains, or of smooth signals, whose peaks may lie between two steps.
 SMOOTH = 3e-3
 REACHED = ("sigma_reached_s", "v_tilde_reached_s", "current_error_reached_s")
 
@@ -147,7 +147,7 @@ def test_tuned_gains_of_the_benchmarks_measure_so_once_settled(name):
 
 
 def test_the_start_of_a_sample_says_nothing_of_the_voltage():
-    """What the metrics were before: read where the noise has just jumped, u is the supply's limit and nothing else."""
+    """Metrics that are read only at the samples, where the noise has just jumped: u is always at the supply's limit."""
     world, std = LOOPS["stiff under noise, limited supply"]
     cascade, scenario, _ = in_ambjax(Case("", world, samples=200))
     scenario = dataclasses.replace(scenario, sensor=Sensor(*std))

@@ -1,4 +1,4 @@
-"""Observers that estimate the velocity: what each is exact for, its poles and noise, what the cascade makes of it."""
+"""Observers that estimate the velocity: motions with exact estimates, poles, noise, and the loop with each of them."""
 
 import dataclasses
 

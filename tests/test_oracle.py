@@ -1,4 +1,4 @@
-"""ambjax against an independent oracle: the same world solved twice, with no code in common."""
+"""ambjax against an independent solver of the same problem, which shares no code with it."""
 
 import functools
 import math

@@ -1,4 +1,4 @@
-"""The order of the stages: what is measured reaches the laws through the observer, and only so."""
+"""The order of the stages: measurements reach the laws only through the observer."""
 
 import jax
 import jax.numpy as jnp

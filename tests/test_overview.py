@@ -1,4 +1,4 @@
-"""The overview of a run: what is enlarged, that extremes stay, and that a chattering voltage does not hide its mean."""
+"""The overview of a run: its enlarged parts, kept extremes, and the visible mean of a chattering voltage."""
 
 import json
 import pathlib

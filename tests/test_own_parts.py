@@ -1,4 +1,4 @@
-"""A custom plant and a custom law, defined here and nowhere else: simulated, checked, spread, mapped and tuned.
+"""A custom plant and a custom law, defined in this file: simulated, checked, spread, mapped and tuned.
 
 The plant has a coil with its own current on each side; the law a boundary layer in place of a smoothed sign, and gains
 of its own names. Nothing in the package knows either.

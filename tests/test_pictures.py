@@ -1,4 +1,4 @@
-"""Pictures of ensembles: what they say (numbers, units, edges) by closed forms, and that hard cases are drawn at all.
+"""Pictures of ensembles: numbers, units and edges against closed forms, and cases that are hard to draw.
 
 Warnings are errors here, so a picture that is written was written without one.
 """

@@ -44,7 +44,7 @@ def test_linearisation_at_the_origin(plant):
 def test_closed_form_derivatives_equal_autodiff(plant):
     z, i = points(plant)
     by_z, by_i = jax.vmap(jax.grad(plant.v, (0, 1)))(z, i)
-    # dv_di is a difference of two terms: measured against the larger of them
+    # dv_di is a difference of two terms; its error is relative to the larger of them
     terms = 2 * (plant.i_0 + np.abs(i)) / (plant.s_0 - np.abs(z)) ** 2
     np.testing.assert_allclose(plant.dv_dz(z, i), by_z, rtol=1e-12)
     assert np.all(np.abs(plant.dv_di(z, i) - by_i) <= 1e-13 * terms)
@@ -55,7 +55,7 @@ def test_closed_form_derivatives_equal_autodiff(plant):
 def test_equilibrium_holds_the_rotor_still(plant, share):
     z = share * plant.s_0
     i, u = plant.equilibrium(z)
-    # against the largest term: a v is some 1e4 m/s^2 per magnet at 0.9 s_0
+    # relative to the largest term: a v is about 1e4 m/s^2 per magnet at 0.9 s_0
     terms = plant.a * ((plant.i_0 + abs(i)) / (plant.s_0 - abs(z))) ** 2 + plant.g
     assert abs(plant.z_ddot(z, i)) <= 1e-13 * terms
     assert abs(plant.i_dot(z, 0.0, i, u)) <= 1e-13 * 2 * (plant.s_0 + z) / plant.kappa * abs(u)
@@ -81,7 +81,7 @@ def test_current_for_inverts_v_on_the_branch_through_zero_current(plant):
     on_branch = plant.singularity(z, i) > 0.02
     z, i = z[on_branch], i[on_branch]
     assert on_branch.sum() > 1000
-    # conditioning: di = dv / (dv/di), and dv/di is down to 1/50 of its size this near to C
+    # conditioning: di = dv / (dv/di), and this near to C, dv/di is as small as 1/50 of its usual size
     np.testing.assert_allclose(plant.current_for(z, plant.v(z, i)), i, rtol=1e-11, atol=1e-12 * plant.i_0)
 
 
@@ -113,7 +113,7 @@ def test_out_of_reach_the_nearest_force_is_given(share):
     z = share * PLANT.s_0
     on_C = -(share + 1 / share) / 2 * PLANT.i_0
     nearest = PLANT.v(z, on_C)
-    # at C dv/di = 0, so v is right to rounding while i is right to its square root
+    # at C dv/di = 0, so the error of v is rounding, and the error of i is the square root of rounding
     for excess in (1.0, 1.5, 10.0, 1e3):
         i = PLANT.current_for(z, excess * nearest)
         np.testing.assert_allclose(i, on_C, rtol=1e-6)
@@ -137,7 +137,7 @@ def test_dv_di_vanishes_exactly_where_singularity_does(plant):
 
 
 def brute_force(zeta, iota, rounds=4):
-    """Distance to i = -(x + 1/x)/2 by dense samples of both branches, then denser ones about the best."""
+    """Return the distance to i = -(x + 1/x)/2 by dense samples of both branches, then denser ones near the best."""
     log = np.linspace(-9, 9, 5_001)
     best = np.inf
     for sign in (1, -1):
@@ -205,7 +205,7 @@ def test_distance_to_C_has_a_finite_derivative_on_C():
 
 
 def test_thresholds_follow_the_plant():
-    """Bands are the same share of what sigma, v and i amount to, whatever the plant; Table 1's are its own exactly."""
+    """The bands are the same share of the sizes of sigma, v and i for every plant; Table 1 has the defaults."""
     paper = standard_for(0.5, Scenario(clearance=4.5e-3))
     assert dataclasses.replace(paper, largest_force=np.inf) == Standard()
     assert float(paper.largest_force) == pytest.approx(PLANT.k_i * PLANT.i_0, rel=1e-12)
@@ -222,7 +222,7 @@ def test_thresholds_follow_the_plant():
 
 @PLANTS
 def test_the_two_coils_in_half_their_difference_and_half_their_sum(plant):
-    """As docs/magnet.md derives it: i = (i_1 - i_2)/2 and j = (i_1 + i_2)/2 - i_0, each with its own equation."""
+    """The equations of docs/magnet.md for i = (i_1 - i_2)/2 and j = (i_1 + i_2)/2 - i_0."""
     coils = TwoCoil(**dataclasses.asdict(plant))
     z, i = points(plant)
     j, z_dot, u = np.random.default_rng(2).uniform(-1, 1, (3, z.size)) * [[0.1], [0.1], [200.0]]
@@ -231,7 +231,7 @@ def test_the_two_coils_in_half_their_difference_and_half_their_sum(plant):
     over = z_dot / (s_0**2 - z**2)
     i_dot = 2 * s_0 / kappa * (u - R * i) + 2 * z / kappa * R * j - over * ((i_0 + j) * s_0 + i * z)
     j_dot = -2 * z / kappa * (u - R * i) - 2 * s_0 / kappa * R * j - over * ((i_0 + j) * z + i * s_0)
-    # sums of terms that cancel: against the largest of them
+    # sums of terms that cancel; the error is relative to the largest of them
     size = 1e-12 * (np.abs(rates.i_1) + np.abs(rates.i_2)).max()
     np.testing.assert_allclose((rates.i_1 - rates.i_2) / 2, i_dot, rtol=0, atol=size)
     np.testing.assert_allclose((rates.i_1 + rates.i_2) / 2, j_dot, rtol=0, atol=size)

@@ -1,4 +1,4 @@
-"""Sensors and amplifiers as they are: each part against what defines it, and what a case file may say of them."""
+"""Imperfect sensors and amplifiers: each part against its definition, and the keys of the case file."""
 
 import dataclasses
 import decimal
@@ -68,7 +68,7 @@ def test_the_low_pass_is_exact_for_a_cubic(bandwidth):
     w, y_0 = 2 * np.pi * bandwidth, 1.2e-3
     run = solve_ivp(lambda s, y: w * (z(s) - y), (0, h), [y_0], "Radau", jac=[[-w]], rtol=1e-11, atol=1e-17)
     got = Sensor(bandwidth=bandwidth).lagged(jnp.asarray(y_0), *ends, h)
-    # SciPy's tolerance, of 1e-3 m
+    # the tolerance of SciPy, relative to 1e-3 m
     np.testing.assert_allclose(got, run.y[0, -1], rtol=0, atol=1e-13)
 
 
@@ -76,7 +76,7 @@ SHORTNESS = np.concatenate([[0.0], np.geomspace(1e-18, 1e3, 64), [0.999, 1.001]]
 
 
 def low_pass(y, before, after, h, bandwidth):
-    """The same in decimals of 150 digits, by the moments of exp(-b (1 - s)), b = w h."""
+    """Return the same with 150 digits, from the moments of exp(-b (1 - s)), b = w h."""
     exact = decimal.Context(prec=150)
     c_1, end, rise = (exact.create_decimal(x) for x in (h * before[1], h * after[1], after[0] - before[0]))
     b = exact.create_decimal(2 * np.pi * bandwidth * h)
@@ -91,7 +91,7 @@ def low_pass(y, before, after, h, bandwidth):
 
 @pytest.mark.parametrize("kind", ["float64", "float32"])
 def test_the_low_pass_is_exact_and_has_derivatives_over_any_time(kind):
-    """From none on: 1e-15 s is what is left of a sample after a ramp, or of a delay just below a whole number."""
+    """Times from 0 s on: 1e-15 s may remain of a sample after a ramp, or of a delay just below a whole number."""
     bandwidth, y, slope = 1e4, 2e-3, 2 * np.pi * 1e4
     with jax.enable_x64(kind == "float64"):
         h = (SHORTNESS / slope).astype(kind).astype(float)
@@ -141,7 +141,7 @@ def test_dead_band_and_current_limit():
 
     assert [at(u, 0.1) for u in (5.0, 1.0, -1.5, -9.0)] == [3.0, 0.0, 0.0, -7.0]
     assert [at(30.0, 0.4), at(30.0, -0.5), at(-30.0, -0.5), at(10.0, 0.4)] == [20.0, 28.0, -25.0, 8.0]
-    # what would keep the current is beyond the supply
+    # the voltage that holds the current exceeds that of the supply
     assert [at(30.0, 0.5, -78.0), at(-30.0, -0.5, 78.0), at(-30.0, -0.5, -78.0)] == [-60.0, 60.0, -28.0]
 
 
@@ -169,7 +169,7 @@ def test_the_current_stays_within_its_limit():
     rows = run()
     assert np.abs(rows.i).max() > 0.055
     held = run(amplifier=Amplifier(i_max=0.05))
-    # beyond the limit by what a step of RK4 begins below it: L di/dt = 200 V for 33 us is 2e-4 A
+    # overshoot of a step of RK4 that begins below the limit: L di/dt = 200 V for 33 us is 2e-4 A
     assert 0.05 <= np.abs(held.i).max() < 0.0502
 
 
@@ -191,7 +191,7 @@ def test_the_largest_voltage_is_that_at_the_coils_and_within_the_supply():
 
 
 def test_more_steps_of_the_plant_change_nothing_that_matters():
-    """The corner of the slew rate lies on a step's edge, and the voltage between is known exactly."""
+    """A step ends at the corner of the slew rate, and the voltage inside the step is exact."""
     amplifier = Amplifier(bandwidth=2e3, slew=4e6)
     steps = choose_method(laws().on_processor(), dataclasses.replace(WORLD, amplifier=amplifier), 1e-4).substeps
     assert steps == math.ceil(2 * np.pi * 2e3 * 1e-4 / DRIVEN)
@@ -222,7 +222,7 @@ def test_gradients_forward_and_reverse(name, delay):
         fold = amb.simulation.folds.Rms("e_z")
         return 1e9 * amb.rollout(cascade, scenario, amb.Clock(60, 1e-4, amb.RK4(2)), fold=fold, every=0).measured
 
-    # compiled as a whole: differentiated call by call, tracing takes twice as long as the rest
+    # compiled as a whole, because tracing each call separately takes twice as long as the rest
     forward, reverse = jax.jit(lambda x: jax.jvp(loss, (x,), (1.0,))[1])(0.1), jax.jit(jax.grad(loss))(0.1)
     assert forward != 0
     np.testing.assert_allclose(forward, reverse, rtol=1e-10)

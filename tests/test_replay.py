@@ -1,4 +1,4 @@
-"""A member by itself is that of the ensemble, bit by bit, and printed commands give what they promise.
+"""A replayed member equals that of the ensemble, bit by bit; printed commands give the stated results.
 
 The loops have converters and signs without a layer: a difference in the last bit grows until two runs have nothing in
 common. So a replay in other arithmetic, even if that is as exact, is another run.

@@ -1,4 +1,4 @@
-"""When a rotor has settled and how far it overshoots, on motions that are formulas."""
+"""Settling time and overshoot of motions that are given by formulas."""
 
 import math
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Results in Python: the same numbers as the commands', as tables with units, and pictures against their data."""
+"""Results in Python: numbers equal those of the commands, tables have units, and pictures match their data."""
 
 import json
 import sys

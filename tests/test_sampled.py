@@ -1,4 +1,4 @@
-"""The loop on a processor against an independent simulator of it, which shares no code: the same world solved twice."""
+"""The loop on a processor against an independent simulator, which shares no code with ambjax."""
 
 import dataclasses
 import math
@@ -170,7 +170,7 @@ def sensor_of(world, std):
 
 
 def loop_of(world, samples, std):
-    """The same world in the package's words."""
+    """Return the same scenario as objects of ambjax."""
     laws = {stage: record_of(kinds, getattr(world, stage)) for stage, kinds in KINDS.items()}
     plant = {"lumped": amb.Plant, "two-coil": TwoCoil}[world.kind](**world.plant)
     model = amb.Plant(**(world.plant | world.model))
@@ -259,7 +259,7 @@ def test_a_member_is_the_rollout_of_it_whatever_the_delays_of_others(inversion):
         one = dataclasses.replace(NOISY, member=member)
         cascade = dataclasses.replace(cascade_of(delay=delay, predict=True), inversion=inversion)
         alone = amb.rollout(cascade, one, SHORT, fold=fold).measured
-        # with two stretches of a sample, of which one is empty, instead of one: rounding
+        # a sample is integrated in two parts, one of them empty, instead of in one: rounding
         np.testing.assert_allclose(together[member], alone, rtol=1e-9)
 
 
@@ -275,7 +275,7 @@ def test_a_part_of_an_ensemble_runs_the_program_of_the_whole():
 
 
 def test_a_delay_that_is_set_later_is_predicted():
-    """A map over the delay of a case that has none."""
+    """A map over the delay of a case without a delay."""
     none = cascade_of(delay=0.0).on_processor()
     late = dataclasses.replace(none, processor=dataclasses.replace(none.processor, delay=1.0))
     fold = amb.simulation.folds.Rms("e_z")
@@ -308,7 +308,7 @@ def loss_of(clock, p, closed=False):
     ],
 )
 def test_gradients_three_ways_and_finite_over_six_decades_of_gains(p, closed):
-    """One program in reverse mode: tracing a derivative takes longer than all the rest."""
+    """All cases share one program in reverse mode, because tracing a derivative takes longer than all the rest."""
     loss, at, step = loss_of(amb.Clock(100, 1e-4, amb.RK4(2)), p, closed), np.array([0.1, -0.2, 0.05, 0.1]), 1e-5
     near = at + step * np.concatenate([0 * np.eye(4)[:1], np.eye(4), -np.eye(4)])
     points = np.concatenate([near, np.random.default_rng(4).uniform(-6.9, 6.9, (491, 4))])

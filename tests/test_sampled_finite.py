@@ -1,4 +1,4 @@
-"""On a processor values and derivatives are numbers whatever the gains: every law, by smoothed signs and by signs."""
+"""On a processor, values and derivatives are finite for all gains: every law, with smoothed and set-valued signs."""
 
 import dataclasses
 import math

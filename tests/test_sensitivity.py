@@ -1,4 +1,4 @@
-"""`ambjax sensitivity`: its numbers against the analysis, its picture against its data, its answers to bad input."""
+"""`ambjax sensitivity`: numbers against the analysis, the picture against its data, and messages for bad input."""
 
 import json
 
@@ -87,7 +87,7 @@ def test_the_picture_shows_the_response(tmp_path):
     [
         ("[sensitivity]\nzone_a = 4.5\n", [], "sensitivity.zone_a to zone_c = [4.5, 4.0, 5.0]"),
         ("[sensitivity]\nf_low = 3e3\n", [], "sensitivity.f_low = 3000: it must be below f_high"),
-        ("[processor]\n[sensitivity]\nf_high = 6e3\n", [], "at most half the sample rate, 5000 Hz"),
+        ("[processor]\n[sensitivity]\nf_high = 6e3\n", [], "at most half the sampling rate, 5000 Hz"),
         ("[sensitivity]\nzone = 3\n", [], "zone_"),
         ("", ["--members", "5"], "all members of this case are the same"),
         ("[controller.position]\nk = 5.0\n[controller.model]\nm = 0.1\n", [], "no equilibrium at r = 0 m"),

@@ -1,4 +1,4 @@
-"""The loop's own step: against accurate references where it is meant for, its order, and the scalar it solves."""
+"""The sliding step: comparison with accurate references, its order, and the scalar equation that it solves."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Smooth stand-ins: their limits, their slopes at 0, and derivatives that stay finite there."""
+"""Smooth replacements of signs and roots: limits, slopes at 0, and finite derivatives there."""
 
 import jax
 import jax.numpy as jnp

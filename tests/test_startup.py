@@ -1,4 +1,4 @@
-"""What a command waits for before it begins: modules are counted, for times depend on who else uses the machine."""
+"""Start of a command: the imported modules are counted, because times depend on the load of the machine."""
 
 import pathlib
 import subprocess

@@ -1,4 +1,4 @@
-"""Random streams that must not meet: of one sensor and another, of sensors and keys, of designs and signals."""
+"""Independent random streams: of different sensors, of sensors and keys, of designs and signals."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Position laws other than the paper's, each against what its theory promises."""
+"""Position laws other than the paper's, each against the results of its theory."""
 
 import dataclasses
 import tomllib

@@ -1,4 +1,4 @@
-"""`ambjax ensemble` as it runs: on processes, on a cluster, interrupted, killed, resumed; and what it refuses."""
+"""Runs of `ambjax ensemble`: on processes, on a cluster, interrupted, killed, resumed; and refused input."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""What surrounds a run and is none of its business: streams, links, other runs, a matplotlibrc, no home."""
+"""The environment does not affect a run: streams, links, other runs, a matplotlibrc, a missing home folder."""
 
 import argparse
 import ast

@@ -1,4 +1,4 @@
-"""What the error control of the adaptive method holds: an error in proportion to how far the loop carries a kick.
+"""Error control of the adaptive method: the error is in proportion to the loop's amplification of a disturbance.
 
 One step may leave an error of `tolerance` (scale + |z_dot|) in the velocity. From there on it is a kick, and no method
 controls how far a loop carries that: near the edge of losing the rotor, without bound. So no tolerance per step gives

@@ -1,4 +1,4 @@
-"""Numbers of [tune]: each has both ends, and says so."""
+"""Numbers of [tune]: each has a lower and an upper bound, and the message states both."""
 
 import dataclasses
 import math
@@ -43,7 +43,7 @@ def test_every_number_of_tune_has_both_ends(path):
         assert read(math.inf)
 
 
-# Whose numbers of members or points are made all at once.
+# Budgets whose members or points are in memory at once.
 IN_MEMORY = ("members", "stressed", "validation", "held_out", "screen")
 
 
@@ -76,7 +76,7 @@ def test_whole_numbers_and_bounds_of_tune_have_both_ends():
 
 
 def test_settings_are_those_of_another_case_but_for_its_gains(tmp_path):
-    """Gains and bounds belong to the laws of a case; limits, loss and budget may be another's."""
+    """Gains and bounds come from the case; limits, loss and budget may come from another file."""
     own, other = tmp_path / "own.toml", tmp_path / "other.toml"
     own.write_text(
         '[tune]\ngains = ["controller.position.c"]\nmembers = 5\nbounds.controller.position.c = [1.0, 9.0]\n'

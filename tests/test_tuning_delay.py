@@ -47,7 +47,7 @@ def test_members_are_lost_beyond_the_linear_margin_and_not_below():
     found = {share: delay_test(problem(share * margin), x, 1, columns) for share in (0.8, 2.0)}
     # up to 1.4 times the margin the unstable loop ends in an oscillation that holds the rotor
     assert found == {0.8: DelayTest(2, 0), 2.0: DelayTest(2, 2)}
-    # beyond two samples nothing can be simulated, and a case in continuous time has no such delay
+    # a delay beyond two samples cannot be simulated, and a case in continuous time has no delay
     assert delay_test(problem(1.6 * PERIOD), x, 1, columns) is None
     lost = columns | {"lost_at_s": np.zeros(3)}
     assert delay_test(problem(1e-4), x, 1, lost) is None

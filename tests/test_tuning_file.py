@@ -1,4 +1,4 @@
-"""tuned.toml: the author's own text with the tuned gains in it."""
+"""tuned.toml: the text of the case file with the tuned gains."""
 
 import tomllib
 

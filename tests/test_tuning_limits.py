@@ -28,7 +28,7 @@ from tuning.report.limit_table import MORE
 from tuning.report.pictures import amplitudes
 from tuning.search.rounds import rounds
 
-# A Bowl's voltage is 20 V where k is best, at 60, and goes as k: 10 V is at k = 30.
+# The voltage of a Bowl is proportional to k: 20 V at the best k, 60, and 10 V at k = 30.
 TEN = {"limits": {"rms_u_V": 10.0, "margin": 0.002}}
 
 
@@ -208,18 +208,18 @@ def test_the_pull_is_that_of_an_augmented_lagrangian():
     limit, values = Limit("rms_u_V", 10.0), jnp.full(3, 10.0 * math.exp(0.1))
     assert float(limit.term(values)) == pytest.approx(PENALTY * 0.1**2 / 2)
     assert float(limit.term(0.5 * values)) == 0.0
-    # the multiplier is the force that acted at the optimum, which the search's own number makes
+    # the multiplier follows from the value that the search computed at the optimum
     assert limit.updated(10.0 * math.exp(0.05), 10.0 * math.exp(0.1)).multiplier == pytest.approx(PENALTY * 0.05)
     tighter = limit.updated(10.0, 10.0 * math.exp(0.1))
     assert tighter.multiplier == pytest.approx(0.0)
-    # the judge finds 10 % more than the search: from now on the search counts as he does
+    # the judged value is 10 % larger than that of the search: from now on the search corrects its values by this ratio
     assert float(tighter.term.excess(jnp.full(3, 10.0))) == pytest.approx(0.1)
     assert tighter.penalty == PENALTY
     again = tighter.updated(9.9, 10.0 * math.exp(0.09))  # hardly less: it must be steeper
     assert again.multiplier == pytest.approx(PENALTY * (0.1 + math.log(0.99)))
     assert again.penalty > PENALTY
     assert limit.updated(5.0, 5.0).multiplier == 0.0
-    # a rotor that an injection loses: ten times the limit, so that the search goes on
+    # an injection loses the rotor: the value is ten times the limit, so that the search continues
     lost = limit.updated(5.0, math.inf)
     assert lost.ratio == pytest.approx(10 * limit.threshold / 5.0)
     assert lost.missed == pytest.approx(limit.log_excess(10 * limit.threshold))
@@ -227,7 +227,7 @@ def test_the_pull_is_that_of_an_augmented_lagrangian():
 
 @dataclasses.dataclass(frozen=True)
 class Counting(Mean):
-    """The mean, counting how often it is traced."""
+    """Return the mean, and count the traces of this function."""
 
     traces = 0
 
@@ -237,7 +237,7 @@ class Counting(Mean):
 
 
 def test_other_limits_do_not_trace_the_step_again(monkeypatch, tmp_path):
-    """Two tunings, each of several searches with multipliers of their own."""
+    """Two tunings, each of several searches with different multipliers."""
     counts = []
     for volts in (10.0, 11.0):
         made = study(monkeypatch, World(), limits={"rms_u_V": volts, "margin": 0.002})
@@ -270,9 +270,9 @@ def test_a_limit_is_met_and_its_multiplier_is_the_price(monkeypatch, tmp_path):
 
 
 def test_the_price_falls_as_the_multiplier_does_on_the_way():
-    """Where it is 20 at 10 V and, linear in the logarithm, 0 at 11 V, 10 % more takes off half of what 20 would."""
+    """A multiplier that falls from 20 at 10 V to 0 at 11 V, linearly in ln b, gives half the price of a constant 20."""
     limit = Limit("rms_u_V", 10.0, multiplier=20.0, history=((11.0, 0.0), (10.0, 20.0)))
-    # 200 stretches of a straight line
+    # 200 segments of a straight line
     assert limit.error_reduction(0.1) == pytest.approx(1 - 1.1 ** (-20 / 2 / 2), rel=1e-9)
     alone = Limit("rms_u_V", 10.0, multiplier=2.0, history=((10.0, 2.0),))
     assert alone.error_reduction(0.1) == pytest.approx(1 - 1 / 1.1, rel=1e-9)
@@ -280,7 +280,7 @@ def test_the_price_falls_as_the_multiplier_does_on_the_way():
 
 
 def test_a_limit_is_active_where_it_pulls_and_is_reached():
-    """Its margin is 3 % of 10, and it is met from 1 % below: from 9.7 e^-0.04 = 9.32 on."""
+    """The limit 10 has a margin of 3 %. With a tolerance of 1 % plus the margin, it is active from 9.7 e^-0.04 on."""
     pulls = Limit("max_u_V", 10.0, margin=0.03, multiplier=0.2)
     assert [pulls.active(reached) for reached in (9.3, 9.35, 10.5, None)] == [False, True, True, True]
     assert not Limit("max_u_V", 10.0, margin=0.03).active(10.0)
@@ -333,7 +333,7 @@ def test_the_command_says_what_a_limit_costs(monkeypatch, tmp_path):
     assert row["price"] > 0
     assert row["price_unit"] == "m"
     assert (survival["reached"], survival["held"]) == (1.0, True)
-    assert "is at its limit, 10: 10 % more would take about" in summary["verdict"]
+    assert "is at its limit, 10: a limit 10 % higher would reduce the settled rms error by about" in summary["verdict"]
     text = (out / "report.md").read_text()
     assert "## Limits" in text
     assert "| `rms_u_V` | at most 10 V |" in text

@@ -1,4 +1,4 @@
-"""One answer in every place: exit code, log, report, JSON and tuned.toml say the same of each kind of outcome."""
+"""Exit code, log, report, JSON and tuned.toml agree for each kind of outcome."""
 
 import argparse
 import collections
@@ -27,7 +27,7 @@ HELD_OUT = seeds(Budget())[2]
 
 
 def losing(*numbers, accurate=False):
-    """A world in which these held-out members are lost; by accurate steps alone, if `accurate`."""
+    """Return a world in which these held-out members are lost; with `accurate`, only in accurate steps."""
     return World(
         limit=lambda seed, number, _, fine: (
             40.0 if seed == HELD_OUT and number in numbers and (fine or not accurate) else math.inf
@@ -35,8 +35,8 @@ def losing(*numbers, accurate=False):
     )
 
 
-# Of each outcome: the world, [tune], and the verdicts that it must have: on survival, on the limit of the voltage, and
-# whether the gains meet all requirements. A Bowl's voltage is 0.33 V at the least k that its bounds allow.
+# For each outcome: the world, [tune], and the expected verdicts: on survival, on the limit of the voltage, and whether
+# the gains meet all requirements. The voltage of a Bowl is 0.33 V at the lower bound of k.
 OUTCOMES = {
     "held": (World, {}, HELD, HELD, True),
     "lost": (lambda: losing(2), {}, BROKEN, HELD, False),
@@ -55,7 +55,7 @@ OUTCOMES = {
 
 @pytest.fixture
 def ran(monkeypatch, tmp_path, capsys):
-    """Run the command on a Bowl without pictures: exit code, facts, stdout, stderr, folder."""
+    """Run the command on a Bowl without pictures. Return exit code, facts, stdout, stderr and folder."""
     monkeypatch.setattr(tuning.command, "_pictures", lambda *_: collections.defaultdict(bytes))
     monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 1)
 
@@ -120,7 +120,7 @@ def test_every_place_says_the_same(kind, ran):
     assert (f"{after['stalled']} not decided (their integration stalls)" in words) == (after["stalled"] > 0)
     assert ("tune.limits.rms_u_V" in advice) == (limit == BROKEN)
     assert "tune.limits.survival" not in advice
-    # and nothing that is said on the way is an answer
+    # and no message before the end states a result
     assert not re.search(r"cannot be held|is held|not held", err.replace(facts["advice"], ""), re.IGNORECASE)
 
 
@@ -137,7 +137,7 @@ def test_what_speaks_against_the_gains_decides_alone():
 
 
 def test_a_lost_member_s_voltage_counts_in_no_limit():
-    """It is frozen, at 0 V: the mean square over all would be half of what the survivors take."""
+    """A lost rotor is frozen at 0 V: the mean square over all members would be half of that over the survivors."""
     columns = {"settled_rms_u_V": np.array([100.0, 0.0]), "lost_at_s": np.array([np.inf, 0.1])}
     columns |= {"lost": np.array([False, True]), "stalled": np.zeros(2, bool)}
     columns |= {"settled_rms_error_m": np.array([1e-6, 4e-3]), "settled_max_abs_error_m": np.array([2e-6, 5e-3])}

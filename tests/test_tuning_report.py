@@ -1,4 +1,4 @@
-"""The tuner's report: what a reader can add up, what accurate steps say, and a page that shows it as it is."""
+"""The tuner's report: consistent sums, the results of accurate steps, and the HTML page."""
 
 import dataclasses
 import html
@@ -78,7 +78,7 @@ def x(study):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """The folder of a whole run of the command, its engine a Bowl; the case's name is an attack on its readers."""
+    """Return the folder of a run of the command with a Bowl as its engine. The name of the case contains markup."""
     folder = tmp_path_factory.mktemp("written")
     path = folder / "<img src=x onerror=alert(1)> a|b *c* [d](e).toml"
     path.write_text(CASE, encoding="utf-8")
@@ -135,7 +135,7 @@ def test_the_table_is_of_the_members_that_were_judged(study, x):
     losses = weigh(study.goal.weights, {name: found[f"loss.{name}"] for name in TERMS}, np.zeros(12, bool))
     assert terms["loss"] == pytest.approx(losses.mean(), rel=1e-12)
     assert terms["risk"] == pytest.approx(float(study.goal.risk(jnp.asarray(losses))), rel=1e-12)
-    # means of products are not products of means: what effort adds is not to be had from the row alone
+    # the mean of a product is not the product of the means, so the row alone does not determine what effort adds
     assert terms["adds"]["effort"] == pytest.approx(
         np.mean(0.1 * found["loss.effort"] * (found["loss.tracking"] + 0.5 * found["loss.peak"])), rel=1e-12
     )
@@ -278,7 +278,7 @@ def test_the_name_of_a_case_is_shown_as_it_is(written):
     assert f"<h1>Tuning of {html.escape(name)}</h1>" in shown
     assert f"<title>Tuning of {html.escape(name)}</title>" in shown
     assert "<img src=x" not in shown
-    # nor does another program that renders report.md see HTML in it
+    # another program that renders report.md finds no HTML in it either
     assert not re.search(r"(?<!\\)<", (written / "report.md").read_text())
 
 
@@ -422,7 +422,7 @@ def test_the_section_on_gradients_is_three_whole_tables():
     assert "Differences compare two runs" not in "".join(extras.gradient(facts))
 
 
-# Derivatives by forward and reverse mode and by differences with two steps, and what is said of them.
+# Derivatives by forward mode, reverse mode and differences with two step sizes, and the expected text.
 WAYS = {
     "agree": (1.0, 1.0 + 1e-9, 1.04, 1.01, gradient.AGREED),
     "a loop that is chaotic": (2.83e-2, 2.83e-2, -2.31e-2, 0.4e-2, "differences decide nothing: -2.31e-02 with a step"),

@@ -61,7 +61,7 @@ def test_gradient_three_ways(engines):
     assert value.shape == (1, 4, 1)  # the loss, and no limits
     np.testing.assert_allclose(value, other, rtol=1e-12)
     size = np.abs(slopes).max()
-    # one chain of 240 steps multiplied from either end
+    # the product of 240 step matrices, multiplied from either end
     np.testing.assert_allclose(slopes, back, rtol=1e-9, atol=1e-12 * size)
     h = 1e-3
     points = x + np.concatenate([s * h * np.eye(4) for s in (1, -1, 0.5, -0.5)])
@@ -73,7 +73,7 @@ def test_gradient_three_ways(engines):
 
 
 def test_lanes_are_rollouts(engines):
-    """A lane, its noise drawn beforehand, is the very rollout of that member."""
+    """A lane, whose noise is drawn beforehand, equals the rollout of its member."""
     forward, _, members, x = engines
     problem = forward.objective
     terms = forward.terms(x[None], members)
@@ -95,7 +95,7 @@ LATE = {
 
 @pytest.mark.parametrize("delays", [[0.5, 1.5], pytest.param([1.0, 2.0], marks=pytest.mark.slow)])
 def test_a_lane_has_the_delay_of_its_member(delays):
-    """Delays that are spread are neither rounded to whole samples, as their ends may be, nor cut to the nominal one."""
+    """Spread delays are not rounded to whole samples and not limited to the nominal delay."""
     case, tune = case_and_tune(LATE | {"spread": {"processor": {"delay": {"uniform": delays}}}})
     problem = problem_of(case, tune)
     members = problem.objective.members(4, 8)
@@ -115,7 +115,7 @@ def test_members_do_not_depend_on_their_number():
     many, few = problem.members(5, 6), problem.members(5, 2)
 
     def errors(members, m):
-        """What member m's sensors add to its first sample."""
+        """Return the errors of member m's sensors in its first sample."""
         scenario = problem.world(jax.tree.map(lambda a: a[m], members))[1]
         return np.array(scenario.sensor.noise(scenario.words(), 0))
 
@@ -146,7 +146,7 @@ def test_stressed_members_hear_more_and_count_by_being_held():
 
 
 def minimise(steps, method):
-    """The loss after so many steps of an optimiser, and before."""
+    """Return the loss after this number of steps of an optimiser, and before."""
     centre, scales = jnp.asarray([0.7, -0.4, 0.2]), jnp.asarray([1.0, 9.0, 0.3])
 
     def loss(x):
@@ -183,7 +183,7 @@ def test_a_refused_trial_of_bfgs_teaches_curvature():
     again, after = tried(state, trial, 0.5 + 0.9 * CLIFF)
     np.testing.assert_allclose(again, 0.0, atol=1e-12)
     assert (float(after.best[0]), float(after.value)) == (0.1, 0.5)
-    # behind a cliff it teaches nothing but to keep short: a quarter of the step; where there is no number, too
+    # a trial beyond a cliff, or with a loss that is not finite, only shortens the step, to a quarter
     for value in (0.5 + 1.1 * CLIFF, np.nan):
         np.testing.assert_allclose(tried(state, trial, value)[0], 0.1 - 0.3 / 4)
 
@@ -193,7 +193,7 @@ def test_every_optimiser_descends_and_steps_back(name):
     method = optimiser(name, 0.02)
     last, first = minimise(60, method)
     assert last < 0.9 * first
-    # of the right size after a step: the best point and a refused trial, whose gradient changes nothing
+    # after a step of the right size: the best point, and a refused trial, whose gradient has no effect
     best, trial = jnp.asarray([1.0, 2.0]), jnp.asarray([1.4, 2.4])
     _, state = method.update(jnp.ones(2), method.init(best), best, value=jnp.asarray(0.3))
     for gradient, value in ((jnp.ones(2), np.inf), (jnp.asarray([1.0, np.nan]), 0.1)):
@@ -236,7 +236,7 @@ def test_the_search_descends_and_keeps_the_best(small):
 
 
 def test_the_screen_keeps_the_best_of_all_that_hold(small):
-    """On so few points nothing is left out before all members are seen but what was worse on some."""
+    """With this few points, only points that were worse on some members are discarded before all members are used."""
     engine, goal, members, start = small
     points = initial_points(engine.objective, goal.conditions, start, 8, seed=1)
     assert points.shape == (10, 4)
@@ -307,7 +307,7 @@ def test_nothing_is_compiled_after_the_first_iteration(small, caplog, logged_com
         other = dataclasses.replace(SCENARIO, u_max=250.0)
         Engine(dataclasses.replace(engine.objective, scenario=other), settle=0.002).terms(x, members)  # nor for others
         assert not kernels()
-        # what is not seen above is there to be seen
+        # the log does record compilations
         Engine(objective(7, method=Slide(3)), settle=0.0).terms(x, members)
         assert len(kernels()) == 1
 
@@ -365,7 +365,7 @@ def test_the_second_phase_goes_back_to_what_was_given_where_the_path_is_worse(sm
 
 @pytest.mark.parametrize("phase", [0, 1])
 def test_a_phase_goes_on_by_values_where_derivatives_are_no_numbers(small, phase):
-    """Where a loop chatters, losses are finite and derivatives overflow."""
+    """If a loop chatters, losses are finite but derivatives overflow."""
     engine, goal, members, start = small
     whole = run(small)
     first = [0, whole.since][phase]
@@ -472,7 +472,7 @@ def test_a_gain_is_not_both_spread_and_tuned():
         parsed({}, spread={"controller.position.c": {"percent": 5}})
 
 
-# Steps as fine as so short a search needs for its answer to be confirmed.
+# Steps that are fine enough for accurate steps to confirm the answer of a search this short.
 CASE = """
 [controller.inversion]
 gamma = 1000.0
@@ -540,7 +540,7 @@ def test_a_killed_tuning_goes_on_and_damage_is_found(tmp_path):
     assert done.returncode == 0, done.stderr
     assert f"{first}: it is an incomplete archive; round 1 is begun again\n" in done.stderr
     assert (out / "tuned.toml").read_bytes() == (whole / "tuned.toml").read_bytes()
-    # a finished search is judged again, in words; another one is refused by what differs
+    # a finished search is judged again, with a message; a different search is refused, with the difference
     again = command(path, "--out", whole, "--resume")
     assert "round 1: the search is complete; its result is read from" in again.stderr
     assert (out / "tuned.toml").read_bytes() == (whole / "tuned.toml").read_bytes()
@@ -548,7 +548,7 @@ def test_a_killed_tuning_goes_on_and_damage_is_found(tmp_path):
     other = command(path, "--out", whole, "--resume")
     assert other.returncode == 2
     assert "belongs to another search: case.actuator.u_max is 400.0 in the file and 300.0 in this run" in other.stderr
-    # begun anew in the same directory, nothing of the old search is left to be resumed with
+    # a new search in the same directory removes the checkpoints of the old one
     old = len(list(whole.glob("checkpoint-*.npz")))
     fresh = command(path, "--out", whole)
     assert f"{whole}: {old} checkpoints of an earlier search are removed\n" in fresh.stderr

@@ -1,4 +1,4 @@
-"""What surrounds the search: ranges, the judge, the step's error, slices, the front, descent, and the command's flags.
+"""Parts around the search: ranges, the judge, the step's error, slices, the front, descent, and the command's flags.
 
 On losses that are formulas (`bowl.py`), so that each is known by hand.
 """
@@ -446,7 +446,7 @@ def test_gains_end_where_the_template_says(monkeypatch):
     beyond = study(monkeypatch, World(), {"controller": {"position": {"c": 3000.0}}}, gains=paths, bounds={})
     assert beyond.objective.space.gains[0].high == 3000.0
     words = " ".join(template("tracking").replace("#", " ").split())
-    assert f"c is then at most a fifth of the sample rate, others {END_FACTOR:g} times their range or start" in words
+    assert f"c is then at most a fifth of the sampling rate, others {END_FACTOR:g} times their range or start" in words
 
 
 def test_the_pictures_are_of_the_case_and_of_the_tuned_laws(monkeypatch):

@@ -1,4 +1,4 @@
-"""An answer is what accurate steps confirm: what refutes one, what then happens, and what the command says of it."""
+"""Verification of an answer with accurate steps: what refutes it, the next actions, and the messages."""
 
 import json
 import math
@@ -69,7 +69,7 @@ def at(found, gains=None):
 
 
 def error_of(found, **changes):
-    """A StepError of four members that are held, and agree; changed."""
+    """Return a StepError of four members that are held and agree, with some fields replaced."""
     members = compared(found)
     none = found.objective.chosen(1, np.arange(0), 4)
     right = StepError(1e-6, 1e-6, 0.0, len(members.member), len(members.member), 0, 0, none, 1e-10)
@@ -89,7 +89,7 @@ def test_what_refutes_an_answer(small):
     assert not nothing.resolved
     coarse = error_of(small, search_m=1.2e-6, relative=0.2)
     assert "off by 20 %" in coarse.refuted
-    # errors so small that the reference itself does not resolve them
+    # errors below the resolution of the reference
     tiny = error_of(small, search_m=2e-11, reference_m=1e-11, relative=1.0)
     assert tiny.refuted == ""
     assert json.dumps(stalled.facts())
@@ -99,14 +99,14 @@ def test_what_refutes_an_answer(small):
 def test_a_negligible_error_is_that_of_the_reference_for_its_gap(small):
     error = step_error(small, at(small))
     assert error.negligible_m == NEGLIGIBLE * 4e-4
-    # these gains lose the rotor by either step: neither lost by accurate steps alone, nor held by both
+    # these gains lose the rotor with both kinds of steps, so no member is held or lost in accurate steps alone
     assert (error.members, error.lost, error.stalled, error.tried) == (0, 0, 0, 4)
     assert error.refuted == "no member compared is held by both"
 
 
 @pytest.mark.slow
 def test_false_survival_is_refuted():
-    """The search's own steps hold every member; accurate steps none."""
+    """In the steps of the search every member is held; in accurate steps every member is lost."""
     found = problem_from(FALSE)
     x = at(found)
     members = compared(found)
@@ -138,7 +138,7 @@ def test_steps_are_halved_so_often_and_no_more(small):
 
 
 class Verdicts:
-    """In place of accurate steps: the errors to be given, the last again and again; and at which points, on whom."""
+    """A replacement of accurate steps: returns the given errors, the last one repeatedly, and records each call."""
 
     def __init__(self, *errors):
         self.errors, self.calls = list(errors), []
@@ -149,7 +149,7 @@ class Verdicts:
 
 
 def searched(engine, goal, members, points, **rest):
-    """In place of a search: the first point is the answer, the others lie on the way to it."""
+    """A replacement of a search: the first point is the answer, the others are earlier points."""
     count = min(len(points), 8)
     x, value = np.array(points[:count]), np.arange(float(count)) / 100
     starts = Starts(x, Retreat(x, value, None), value, value)
@@ -190,7 +190,7 @@ def test_the_search_goes_on_with_members_that_are_not_confirmed(run, small):
 
 @pytest.mark.slow
 def test_what_nothing_confirms_is_not_taken_for_an_answer(run, small):
-    """Finer steps first, then earlier points of the search; then it says so."""
+    """The tuner tries finer steps, then earlier points of the search, and then states that no answer is confirmed."""
     nothing = error_of(small, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
     answer, verdicts = run(nothing)
     assert not answer.confirmed
@@ -249,7 +249,7 @@ def test_an_answer_confirmed_in_training_is_still_refuted_by_held_out_members(sm
 
 @pytest.mark.thorough
 def test_the_search_goes_on_to_where_it_is_confirmed(tmp_path, capsys):
-    """From the bearing whose first answers survive in the search's own steps alone, under noise on the velocity."""
+    """A bearing with velocity noise, whose first answers survive only in the steps of the search."""
     path, out = tmp_path / "case.toml", tmp_path / "out"
     hard = FALSE.replace("duration = 0.02", "duration = 0.2").replace("[clock]", "[run]\nsettle = 0.05\n[clock]")
     # the limit by default, 60 % of the supply, is not tested here: such noise needs 1 % more
@@ -270,7 +270,7 @@ def test_the_search_goes_on_to_where_it_is_confirmed(tmp_path, capsys):
 
 
 def test_steps_are_compared_without_the_converter(small):
-    """Two runs whose converter rounds otherwise once go different ways, however fine their steps."""
+    """Two runs diverge after one different rounding of the converter, however fine their steps are."""
     assert small.steps == (small.engine, small.reference)
     converted = problem_from(SMALL.replace("std = 2e-7", "std = 2e-7\nbits = 12") + "[processor]\n")
     assert [engine.objective.scenario.sensor.bits for engine in converted.steps] == [None, None]

@@ -1,4 +1,4 @@
-"""What `ambjax check` and `ambjax simulate` answer: the gain to change, to what, and whether it helps."""
+"""The advice of `ambjax check` and `ambjax simulate`: the gain to change, its new value, and whether that helps."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""The text of a case file: written where a test runs, and read with its [tune]."""
+"""Helpers for the text of a case file: write it to the folder of a test, and read it with its [tune]."""
 
 import os
 import pathlib
@@ -11,7 +11,7 @@ from tuning.problem import problem_of
 
 
 def write(text, name="case.toml"):
-    """The name of a file of this text, in the folder where the test runs."""
+    """Write the text to a file in the folder where the test runs. Return its name."""
     pathlib.Path(name).write_text(text, encoding="utf-8")
     return name
 

@@ -35,6 +35,7 @@ from tuning.space import CLOSEST, Gain, Space, knots, read, tunable
 WORDS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
 # Keys of [tune] that depend on the laws of the case.
 LAWS_OWN = ("gains", "bounds")
+# Ranges of the limits: LIMIT, except for those in SHARES. LENGTH: range of settling_band_m.
 LIMIT: dataclasses.Field = leaf(at_least=1e-12, at_most=1e12, infinite=True)
 SHARES: dict[str, dataclasses.Field] = {
     "clearance_used": leaf(above=0, at_most=1),
@@ -63,7 +64,15 @@ class LimitSettings:
 
 @dataclasses.dataclass(frozen=True)
 class Tune:
-    """The table [tune]. `weights` are in the order of TERMS; `conditions` is the weight of the conditions."""
+    """The table [tune].
+
+    - `space`: the gains to tune, with their bounds.
+    - `weights`: of the terms of the loss, in the order of TERMS. `conditions`: weight of the conditions of Theorem 1.
+    - `margin`: share by which each gain is to exceed its condition.
+    - `early`: weight of errors before run.settle, relative to 1 after it.
+    - `stress`, `gain_margin`: factors on the noise and on each gain of the stressed members.
+    - `learning_rate`: step size of an optimiser of optax.
+    """
 
     objective: str
     """"knee" or "least_error" """
@@ -178,7 +187,7 @@ def _bound(raw: Any, path: str, table: Table) -> tuple[float, float]:
     pair = isinstance(raw, list) and len(raw) == 2 and all(type(x) in (int, float) for x in raw)
     ends = pair and 0 <= raw[0] <= GAINS[1] and (raw[1] <= GAINS[1] or raw[1] == math.inf)
     if not ends or not (1 + CLOSEST) * raw[0] < raw[1]:
-        words = f"give [low, high] with 0 <= low < high <= {GAINS[1]:g}, apart by a share of {CLOSEST:g} of low or more"
+        words = f"give [low, high] with 0 <= low < high <= {GAINS[1]:g} and high above {1 + CLOSEST:.7g} times low"
         raise ValueError(f"{table.at('bounds')}.{path} = {show(raw)}: {words}; inf means no upper bound.")
     return float(raw[0]), float(raw[1])
 
@@ -189,7 +198,7 @@ def _weights(table: Table) -> tuple[tuple[float, ...], float]:
     if not any(given[name] > 0 for name in ("tracking", "peak")):
         raise ValueError(
             f"{table.path}.tracking = 0 and {table.path}.peak = 0: no term of the loss depends on the error, "
-            "so every gain that keeps it is as good. Give one of them a weight above 0."
+            "so all gains that hold the rotor are equally good. Give one of them a weight above 0."
         )
     if given["survival"] == 0:
         raise ValueError(f"{table.path}.survival = 0: losing the rotor would cost nothing. Give it a weight above 0.")

@@ -24,11 +24,11 @@ class DelayTest(NamedTuple):
 
 
 def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mapping[str, np.ndarray]) -> DelayTest | None:
-    """Simulate the members of least linear delay margin at x [m] with the limit on it as an additional delay.
+    """Simulate the held members of least linear delay margin, with the limit on this margin as an additional delay.
 
-    The prediction of the controller keeps the delay of the case. `columns` [N]: result of `judge` for the ensemble with
-    this `seed`. Returns None without such a limit, without a processor, if the sum of the delays is longer than a
-    processor allows, or if no member is held.
+    The prediction of the controller assumes the delay of the case. `x`: coordinates of the m gains [m]. `columns` [N]:
+    result of `judge` for the ensemble with this `seed`. Returns None without such a limit, without a processor, if the
+    sum of the delays is longer than a processor allows, or if no member is held.
     """
     limit = next((limit for limit in problem.limits if limit.name == DELAY_MARGIN), None)
     alive = np.flatnonzero(~np.isfinite(columns["lost_at_s"]))

@@ -95,7 +95,7 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 
 # [sensitivity]               # range and zones of 'ambjax sensitivity' (ISO 14839, from secondary sources)
 # f_low = 1.0                 # Hz; lowest frequency; 0 is always included
-# f_high = 2e3                # Hz; highest (left out: 2 kHz, or 0.45 of the sample rate if that is lower)
+# f_high = 2e3                # Hz; highest (left out: 2 kHz, or 0.45 of the sampling rate if that is lower)
 # zone_a = 3.0                # peak of |S| below which zone A holds
 # zone_b = 4.0                # likewise, zone B
 # zone_c = 5.0                # likewise, zone C; above it zone D

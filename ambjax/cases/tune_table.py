@@ -75,7 +75,7 @@ class Budget:
     iterations: int = _whole(40, 1, "largest number of iterations in each phase of the refinement")
     substeps: int = _whole(3, 1, "integration steps per sample")
     front: int = leaf(
-        3, at_least=1, at_most=5, whole=True, doc="points of error against voltage beside that of the least error"
+        3, at_least=1, at_most=5, whole=True, doc="points of error against voltage, besides that of least error"
     )
 
 
@@ -103,7 +103,7 @@ def lines() -> Iterator[Line]:
         "bounds.controller.position.c = [1.0, 500.0]",
         "bounds of one gain; left out: from plant and theory, see the report; c",
     )
-    yield Line("", "is then at most a fifth of the sample rate, others 3 times their range or start")
+    yield Line("", "is then at most a fifth of the sampling rate, others 3 times their range or start")
     yield from _defaults("weights.", WEIGHTS)
     yield from _limits()
     yield from _defaults("", {name: NUMBERS[name] for name in ("conditions_margin", "early")})

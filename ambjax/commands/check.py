@@ -29,7 +29,10 @@ BAND = (
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
-    """Check a case and print the results, those of the loop as it will run first. Exit code 1 if a condition fails."""
+    """Check a case and print the results, first those of the loop as it will run. Return the exit code and the summary.
+
+    The exit code is 1 if a condition fails or the magnets cannot carry the rotor.
+    """
     from ambjax.theorem import advice
 
     case = read_with_warnings(args.case)
@@ -51,7 +54,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
             print(f"\n{ideal}")
     largest, weight, _ = forces(case)
     if not args.json and largest < weight:
-        print(f"\nThe magnets do not carry the rotor: they pull with at most {largest:.4g} N of its {weight:.4g} N.")
+        words = f"their largest force is {largest:.4g} N, below its weight of {weight:.4g} N"
+        print(f"\nThe magnets cannot carry the rotor: {words}.")
     if case.cascade.processor is not None:
         summary |= _on_processor(case, args)
     else:

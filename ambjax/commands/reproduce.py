@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
             for reading in (reading for reading in paper.READINGS if reading not in theirs):
                 evidence[reading] = gather(reading, stage)
                 jobs.append(artist.submit(_paper_figures, reading, evidence[reading], part))
-            stage("sensitivity")  # while the second process goes on
+            stage("sensitivity")  # while the second process runs
             sensitivity = ledger.sensitivity_table(paper.READINGS)
             for reading, job in theirs.items():
                 evidence[reading] = job.result()

@@ -37,7 +37,7 @@ def print_warnings(case: Case, path: str | pathlib.Path) -> None:
 
 
 def warnings_of(case: Case) -> list[str]:
-    """Return one line for each unlikely value of a case: its path, the value, the reason and a possible fix."""
+    """Return one line for each implausible value of a case: its path, the value, the reason and a possible fix."""
     own = [*_assumed(case), *_sizes(case), *_noise(case), *_velocity(case), *_currents(case), *_motion(case)]
     return [*own, *implausible(case)]
 
@@ -83,7 +83,7 @@ def _velocity(case: Case) -> Iterator[str]:
 
 
 def idealised(case: Case) -> str:
-    """Return a line that names the idealisations of a case which no real bearing has, and their keys; '' for none."""
+    """Return a line that lists the idealisations of a case and the keys that remove them; '' if there are none."""
     sensor, parts = case.scenario.sensor, []
     if case.scenario.plant.lumped:
         parts.append("one current for both coils (plant.kind = 'two-coil' gives each its own)")
@@ -95,8 +95,8 @@ def idealised(case: Case) -> str:
 def reversal(case: Case, most_i: float) -> Iterator[str]:
     """Yield a warning if the largest |i| of a run, `most_i` in A, reverses the current of one coil.
 
-    Applies to the paper's plant only. With two coils, i is half the difference of their currents and does not determine
-    either of them.
+    It applies to the paper's plant only. With two coils, i is half the difference of their currents and does not
+    determine either of them.
     """
     if case.scenario.plant.lumped and most_i > case.scenario.plant.i_0:
         yield f"|i| reaches {most_i:.4g} A, {_beyond(case)} plant.kind = 'two-coil' simulates each coil's current."

@@ -1,4 +1,4 @@
-"""The base class of all laws, with default methods, so that no caller depends on the type of a law.
+"""The base class of all laws, with default methods, so that callers do not depend on the type of a law.
 
 The classes of `control.laws` add the inputs and outputs of each stage.
 """
@@ -65,7 +65,10 @@ class Law:
         return None
 
     def layer(self, model: Plant) -> object:
-        """Return, for each state, the largest integration error that keeps it inside the layer of a smoothed sign."""
+        """Return, for each component of the state, the largest integration error that keeps it in the sign's layer.
+
+        inf for a component without a layer, which is the default.
+        """
         scale: Any = self
         return jax.tree.map(lambda _: jnp.inf, scale.scale(model))
 
@@ -77,11 +80,14 @@ class Law:
         return 0.0 * error
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        """Return the ranges of a search for gains, by name. A gain without a range is searched around its value."""
+        """Return the ranges of the tuner's search, by the names of the gains.
+
+        A gain that is not in the dict is searched around its value.
+        """
         return {}
 
     def relay(self) -> Relay | None:
-        """Return the sign if the rate of the stage's error is that of one sign plus a disturbance, else None."""
+        """Return the sign of the law if the rate of the stage's error is one sign plus a disturbance; else None."""
         return None
 
     def explicit_rate(self, model: Plant) -> Scalar:
@@ -107,7 +113,10 @@ class Law:
         return self
 
     def idle_gains(self, implicit: bool | None) -> tuple[str, ...]:
-        """Return the names of gains that have no effect. `implicit`: steps of the processor; None: continuous time."""
+        """Return the names of gains that have no effect.
+
+        `implicit`: whether the processor uses implicit steps; None: continuous time.
+        """
         return ()
 
     def check_use(self, model: Plant, period: float | None) -> None:

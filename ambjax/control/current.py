@@ -70,11 +70,11 @@ class SlidingMode(CurrentLaw[tuple[()]]):
 
 @record
 class ProportionalIntegral(CurrentLaw[Array]):
-    """u = k_p (i_ref - i) + L i_ref' + x, x' = k_int (i_ref - i) + k_aw (clip(u) - u): x in V.
+    """u = k_p (i_ref - i) + L i_ref' + x, x' = k_int (i_ref - i) + k_aw (clip(u) - u), with x in V.
 
-    The linear baseline: the inductance is that at z = 0, and there is no motional term. While the supply limits u,
-    back-calculation drives the integral back at the rate k_aw (Astrom and Murray, Feedback Systems, 2008, 10.4).
-    With the default gains the rotor survives the paper's tracking scenario; with much lower ones it is lost.
+    The linear baseline: the inductance L is that at z = 0, and there is no motional term. While the supply limits u to
+    clip(u), back-calculation limits the integral x at the rate k_aw (Astrom and Murray, Feedback Systems, 2008, 10.4).
+    In the paper's tracking scenario, the default gains hold the rotor, and much lower gains lose it.
     """
 
     k_p: Scalar = gain(default=3e5, unit="V/A", doc="proportional gain")
@@ -108,13 +108,14 @@ class ProportionalIntegral(CurrentLaw[Array]):
 
 @record
 class DeadBeat(CurrentLaw[tuple[()]]):
-    """i' = i_ref' - w (i - i_ref) by inversion of Eq. (2); on a processor i - i_ref shrinks to 1 - share in a sample.
+    """i' = i_ref' - w (i - i_ref) by inversion of Eq. (2); a sample of a processor multiplies i - i_ref by 1 - share.
 
-    u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - w (i - i_ref)) + R i in continuous time, where dead-beat does
-    not exist. On a processor u is the constant voltage that, with z and z_dot held, moves i in one sample from i to
-    i_ref + T i_ref' + (1 - share) (i - i_ref): with share = 1 the current is at its reference one sample after u acts,
-    if the supply suffices (Astrom and Wittenmark, Computer-Controlled Systems, 1997, 4.3). w has no effect there, and
-    share none in continuous time. There is no integral: a wrong resistance of the model leaves an offset.
+    In continuous time u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - w (i - i_ref)) + R i. On a processor with
+    implicit steps u is the constant voltage that, for constant z and z_dot, changes the current in one sample from i to
+    i_ref + T i_ref' + (1 - share) (i - i_ref). With share = 1, dead-beat, the current is at its reference one sample
+    after u acts, unless the supply limits u (Astrom and Wittenmark, Computer-Controlled Systems, 1997, 4.3). These
+    steps do not use w; continuous time and explicit steps do not use share. There is no integral: a wrong resistance of
+    the model leaves an offset.
     """
 
     w: Scalar = gain(default=1e4, unit="1/s", doc="decay rate of the current error in continuous time")
@@ -138,7 +139,7 @@ class DeadBeat(CurrentLaw[tuple[()]]):
         return (model.kappa / 2) * inverse * wanted + model.R * measured.i, ()
 
     def step(self, model: Plant, inputs: CurrentInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
-        """Return the voltage that ends at the wanted current, i' = b u - decay i with b = 2 (s_0+z)/kappa."""
+        """Return the voltage for the wanted current at the end, from i' = b u - decay i with b = 2 (s_0+z)/kappa."""
         measured, demand = inputs.measured, inputs.demand
         gaps = inputs.gaps or model.gaps(measured.z)
         per_volt = (2 / model.kappa) * gaps.lower
@@ -148,7 +149,7 @@ class DeadBeat(CurrentLaw[tuple[()]]):
         return (change * (1 / period) / _mean_decay(decay * period) + decay * i) / per_volt, ()
 
     def idle_gains(self, implicit: bool | None) -> tuple[str, ...]:
-        """Return w for implicit steps of a processor, and share otherwise: an explicit step is that of the rate w."""
+        """Return w for implicit steps of a processor, otherwise share: explicit steps use the continuous-time law."""
         return ("w",) if implicit else ("share",)
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
@@ -162,8 +163,8 @@ class DeadBeat(CurrentLaw[tuple[()]]):
 class OpenLoop(CurrentLaw[tuple[()]]):
     """u = R i_ref: the voltage that holds the reference current. The current is not fed back.
 
-    For a position law that demands a voltage, such as position.LinearController: with inversion.Linearised, u is the
-    voltage that it demands. On a processor u is that of the sample, u = R (i_ref + T i_ref').
+    It is for a position law that demands a voltage, such as position.LinearController: with inversion.Linearised, u is
+    the demanded voltage. On a processor u = R (i_ref + T i_ref'), from the reference computed at this sample.
     """
 
     accepts: ClassVar = ("voltage",)
@@ -221,7 +222,7 @@ class AmplifierCurrent(CurrentLaw[tuple[()]]):
 
 
 def _mean_decay(x: Array) -> Array:
-    """Return (1 - exp(-x))/x, 1 at x = 0, for |x| limited to 30; by its series near 0, where the quotient cancels."""
+    """Return (1 - exp(-x))/x with |x| limited to 30; near 0, where the difference loses digits, by its series."""
     x = limited(x, 30.0)
     near = jnp.abs(x) < 1e-3
     far = jnp.where(near, 1.0, x)

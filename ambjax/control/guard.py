@@ -1,4 +1,4 @@
-"""The guard of a controller on a processor: refuses impossible readings and replaces them by predictions.
+"""The guard of a controller on a processor: it refuses implausible readings and replaces them by predictions.
 
 docs/processor.md defines the rules.
 """
@@ -31,8 +31,8 @@ def _limit(unit: str, doc: str, least: float = 1e-30) -> Any:
 class Watch(NamedTuple):
     """State of a guard.
 
-    `expected`: predicted readings of the next sample. `left`: number of successive samples for which a reading may
-    still be replaced; 0 before the first accepted reading.
+    `expected`: predicted readings of the next sample (m, m/s, A). `left`: number of successive samples for which a
+    reading may still be replaced; 0 before the first accepted reading.
     """
 
     expected: Measurement
@@ -54,7 +54,7 @@ class GuardResult(NamedTuple):
 
 @record
 class Guard:
-    """Refuse a reading that is NaN, beyond its limit, or farther from the prediction than the rotor can have moved.
+    """Refuse a reading that is NaN, beyond its limit, or farther from the prediction than the rotor can be.
 
     The nominal model's prediction replaces a refused reading for up to `samples` successive samples. After that u = 0
     until a reading is within its limits. `settled` derives each number that is left out (None).
@@ -64,11 +64,13 @@ class Guard:
     z_dot: Scalar | None = _limit("m/s", "largest |z_dot|; none: two gaps in a sample, 2 s_0/T")
     i: Scalar | None = _limit("A", "largest |i|; none: 100 i_0")
     noise: Scalar | None = _limit(
-        "m", "largest difference of two readings of one z; none: 13.6 sensor.std and a step of the converter", 0
+        "m",
+        "largest difference of two readings of one z; none: 13.6 sensor.std, a step of the converter, twice the runout",
+        0,
     )
     speed: Scalar | None = _limit(
         "m/s",
-        "error of the predicted speed; none: 6.8 sensor.std_z_dot, and pole times clearance where z_dot is estimated",
+        "error of the predicted speed; none: 6.8 sensor.std_z_dot, plus pole times clearance if z_dot is estimated",
         0,
     )
     samples: Scalar | None = leaf(
@@ -78,7 +80,7 @@ class Guard:
         at_most=1_000_000,
         whole=True,
         optional=True,
-        doc="in a row that are predicted; none: 1/(pole T), in which an error grows e-fold",
+        doc="largest number predicted in a row; none: 1/(pole T), in which an error grows by the factor e",
     )
 
     @property
@@ -87,9 +89,11 @@ class Guard:
         return all(getattr(self, field.name) is None for field in dataclasses.fields(type(self)))
 
     def settled(self, model: Plant, scenario: Scenario, period: Scalar, estimated: bool) -> "Guard":
-        """Return the guard with every number set. `estimated`: whether the velocity is estimated, not measured.
+        """Return the guard with every number set; those that are None are derived (docs/processor.md).
 
-        The derivation uses the scenario's clearance as a share of the gap, and the gap and pole of `model`.
+        `period`: sample period, s. `estimated`: whether an observer estimates the velocity.
+
+        The derivation uses |z| at which the rotor is lost, as a share of the gap, and the gap and pole of `model`.
         """
         sensor = Sensor() if scenario.sensor is None else scenario.sensor
         limit, clearance = scenario.limit, scenario.limit / scenario.plant.s_0 * model.s_0
@@ -114,8 +118,12 @@ class Guard:
         return Watch(Measurement(zero, zero, zero), zero)
 
     def check(self, model: Plant, measured: Measurement, watch: Watch, period: Scalar, estimated: bool) -> GuardResult:
-        """Accept or replace the readings of a sample. `period`: s."""
-        guard: Any = self  # settled
+        """Accept or replace the readings of a sample.
+
+        `measured`: the readings. `watch`: state of the guard at this sample. `period`: sample period, s. `estimated`:
+        whether an observer estimates the velocity, so that z_dot is not checked.
+        """
+        guard: Any = self  # its numbers are set (`settled`)
         (z, _, i), time = watch.expected, (guard.samples - watch.left + 1) * period
         # bound of the model's error in acceleration, m/s^2: the full pull of one magnet at the expected z and i
         share = (model.i_0 + jnp.abs(i)) / (model.s_0 - jnp.abs(z))
@@ -138,7 +146,11 @@ class Guard:
 
 
 def expected(driven: Callable[[Array, State], State], at: State, u: Array, period: Scalar) -> Measurement:
-    """Predict the readings of the next sample from a state under a mean command u. `driven`: `Cascade.driven`."""
+    """Return the predicted readings of the next sample.
+
+    `driven`: `Cascade.driven`. `at`: state of the nominal model at this sample. `u`: mean command over the sample, V or
+    A. `period`: sample period, s.
+    """
     rates = driven(u, at)
     z, z_dot, i = (x + period * rate for x, rate in zip(at[:3], rates[:3], strict=True))
     return Measurement(z + period * period / 2 * rates.z_dot, z_dot, i)
@@ -156,7 +168,11 @@ def guarded(cascade: C, scenario: Scenario, period: Scalar) -> C:
 
 
 def simulated(cascade: C, scenario: Scenario, period: Scalar) -> C:
-    """The cascade as it is simulated: without its guard where no reading can be refused, by faults or limits given."""
+    """Return the cascade for a simulation.
+
+    If all limits of its guard are derived and the sensor has no faults, no reading is refused, and the guard is
+    removed. Otherwise the numbers of the guard are set (`guarded`).
+    """
     one: Any = cascade
     processor = one.processor
     idle = processor.guard is not None and processor.guard.derived

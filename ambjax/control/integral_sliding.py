@@ -21,7 +21,7 @@ class IntegralSlidingMode(PositionLaw[Array]):
     Eq. (5) with the integral of the error in the sliding variable (Slotine and Li, Applied Nonlinear Control, 1991,
     7.1): s' = -k sgn(s) + q_z as in Eq. (12), and e_ddot + c e_dot + c_int e = 0 on the manifold. The smoothed sign of
     Eq. (5) leaves an offset under a constant force, because s is then not zero. Here e = 0 at rest for any constant s.
-    There is no anti-windup: the integral goes on while the supply limits u.
+    There is no anti-windup: the law continues to integrate while the supply limits u.
 
     The integral starts at 0, and s reaches 0 later. In `manifolds.UtkinSlidingMode` s = 0 from the start, and the sign
     only cancels the disturbance of a PD controller; there too, a constant force below k leaves no offset.

@@ -71,9 +71,9 @@ class CurrentInputs(NamedTuple):
 
 
 class Relaxation(NamedTuple):
-    """Output of the method `slide(model, begin, end, i_ref, h)` of an inversion law: its motion over a step of h (s).
+    """Output of the method `slide(model, begin, end, i_ref, h)` of an inversion law: i_ref over a step of h (s).
 
-    `begin` and `end` are the ForceDemand at both ends of the step, `i_ref` is the state of the law at its start.
+    `begin` and `end` are the ForceDemand at both ends of the step, `i_ref` (A) is the state of the law at its start.
 
     - `first`, `rest`: rates of i_ref (A/s) before and after the time `turn`.
     - `turn`: time from the start of the step, s.
@@ -111,7 +111,7 @@ class PositionLaw(Law, Generic[State], abc.ABC):
 
     @property
     def demand(self) -> str:
-        """What the law demands: "force", or a "voltage" that the laws after it must pass on unchanged."""
+        """The demanded quantity: "force", or a "voltage", which the inversion and current laws pass on unchanged."""
         return "force"
 
     @abc.abstractmethod
@@ -200,8 +200,8 @@ def stepped(
 ) -> tuple[Any, State]:
     """Step a law on a processor, by its method `step` or else by explicit Euler.
 
-    `period`: sample period, s. `implicit`: whether the processor uses implicit steps. Returns the output of the law at
-    the sample, and its next state.
+    `inputs`, `state`: as the law's `__call__` takes them. `period`: sample period, s. `implicit`: whether the processor
+    uses implicit steps. Returns the output of the law at the sample, and its next state.
     """
     with jax.named_scope(f"law:{type(law).__module__.rpartition('.')[2]}.{type(law).__qualname__}"):
         if law.has_own_step(implicit):

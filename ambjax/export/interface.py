@@ -60,7 +60,7 @@ OUTPUTS = {
     "u": COMMANDS["voltage"],
     "i_ref": ("A", "current reference"),
     "v_star": ("A^2/m^2", "demanded scaled force"),
-    "v_tilde": ("A^2/m^2", "input error v_star - v(z, i_ref)"),
+    "v_tilde": ("A^2/m^2", "inversion error v_star - v(z, i_ref)"),
 }
 
 

@@ -3,8 +3,8 @@
 import difflib
 from collections.abc import Iterable
 
-# Names of the case file, and other words for them, without case, '_' and '-'. A name with a dot is in another table; it
-# is suggested only if the word is no other word for an allowed name.
+# Other words for the names of the case file, in lower case, without '_' and '-'. A key with a dot is the full path of a
+# name. It is suggested where that name is not allowed, if no allowed name has the same other word.
 OTHER_WORDS = {
     "plant": "rotor machine magnet magnets bearing system motor",
     "controller": "control gains regulator",
@@ -84,7 +84,7 @@ OTHER_WORDS = {
 }
 
 
-# Numbers of a plant that follow from others.
+# Quantities of a plant, and the numbers of the case file from which they follow.
 DERIVED = {
     "ks": "mu_0, n, A, s_0 and i_0 (kappa i_0^2/s_0^3); 'ambjax check' prints it",
     "ki": "mu_0, n, A, s_0 and i_0 (kappa i_0/s_0^2); 'ambjax check' prints it",
@@ -108,7 +108,7 @@ def meant(word: str, allowed: Iterable[str]) -> str | None:
 def hint(word: str, allowed: Iterable[str]) -> str:
     """Return " Did you mean 'name'?" for the name that `word` probably means; "" if unknown.
 
-    For a number of a plant that follows from others, the text names these.
+    For a quantity that follows from other numbers of the plant, the text names these instead.
     """
     allowed = list(allowed)
     if _plain(word) in DERIVED and "mu_0" in allowed:

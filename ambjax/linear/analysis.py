@@ -35,7 +35,7 @@ class Zones:
         above=0,
         at_most=1e6,
         optional=True,
-        doc="highest frequency; none: 2 kHz, or 0.45 of the sample rate if that is lower",
+        doc="highest frequency; none: 2 kHz, or 0.45 of the sampling rate if that is lower",
     )
     zone_a: Scalar = leaf(
         default=3.0, unit="1", at_least=1, at_most=1e3, doc="upper limit of zone A for the peak of |S|"
@@ -71,7 +71,7 @@ class Zones:
     def range(self, period: Scalar | None) -> tuple[float, float]:
         """Return the lowest and the highest frequency, Hz. `period`: sample period, s; None in continuous time.
 
-        Raises ValueError if the range is empty or exceeds half the sample rate.
+        Raises ValueError if the range is empty or exceeds half the sampling rate.
         """
         high = self.f_high
         if high is None:
@@ -79,7 +79,7 @@ class Zones:
         low, high = float(self.f_low), float(high)
         if period is not None and high > 0.5 / float(period):
             raise ValueError(
-                f"sensitivity.f_high = {high:g}: it must be at most half the sample rate, {0.5 / float(period):g} Hz."
+                f"sensitivity.f_high = {high:g}: it must be at most half the sampling rate, {0.5 / float(period):g} Hz."
             )
         if not low < high:
             raise ValueError(f"sensitivity.f_low = {low:g}: it must be below f_high, {high:g} Hz. Lower it.")

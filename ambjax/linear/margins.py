@@ -90,7 +90,7 @@ def poles_in_s(system: StateSpace) -> np.ndarray:
 
 
 def margins_of(system: StateSpace) -> Margins:
-    """Return the margins of a stable loop, at frequencies up to half the sample rate or far beyond all poles."""
+    """Return the margins of a stable loop, at frequencies up to half the sampling rate or far beyond all poles."""
     fastest = float(np.max(np.abs(poles_in_s(system)), initial=1.0)) / (2 * math.pi)
     high = 100 * fastest if system.period is None else 0.5 / float(system.period)
     low = min(1e-3, 1e-6 * high)
@@ -105,9 +105,9 @@ def margins_of(system: StateSpace) -> Margins:
     along = L(f)
     real = [L(np.array([x]))[0].real for x in _crossings(lambda x: np.imag(L(x)), f, np.imag(along))]
     if system.period is not None:
-        real.append(along[-1].real)  # L is real at half the sample rate
+        real.append(along[-1].real)  # L is real at half the sampling rate
     real.append(along[0].real)  # and at 0
-    # L is exactly 0 at half the sample rate if the controller has a zero there, as after a bilinear transform
+    # L is exactly 0 at half the sampling rate if the controller has a zero there, as after a bilinear transform
     gains = [float(-1 / x) for x in real if x and math.isfinite(x) and -1 / x > 1e-9]
     phases, delays = [], []
     for x in _crossings(lambda x: np.log(np.abs(L(x))), f, np.log(np.abs(along))):

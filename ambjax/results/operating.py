@@ -14,7 +14,7 @@ MEMBERS = 100
 
 
 class OperatingPoint(NamedTuple):
-    """An analysed loop: its name, the reference r (m) of its equilibrium, its mass m (kg), matrices and analysis."""
+    """An analysed loop: its name, the reference r (m) of its equilibrium, mass m (kg), matrices and analysis."""
 
     name: str
     r: float
@@ -24,7 +24,12 @@ class OperatingPoint(NamedTuple):
 
 
 class SpreadPeaks(NamedTuple):
-    """Members of the case's spread: their number, and how many are stable and in zone A; the worst of them."""
+    """Result of `spread_peaks`.
+
+    `members`: number of members analysed. `stable`, `zone_a`: how many of them are stable, and stable in zone A.
+    `worst`: index of the member with the largest peak, or of the first one that is not stable. `point`: its loop; None
+    if it has no equilibrium.
+    """
 
     members: int
     stable: int
@@ -41,10 +46,10 @@ def operating_point(case: Case, name: str, r: float) -> OperatingPoint:
 
 
 def sensitivity(case: Case, r: float = 0.0) -> Analysis:
-    """Linearise the loop of a case at a constant reference r (m): peaks of |S|, |T|, |KS|, zone, margins, stiffness.
+    """Return peaks of |S|, |T|, |KS|, zone, margins and stiffness of a case, linearised at a constant reference r (m).
 
-    `ambjax.linear` has the steps one by one, and the injection into the simulation. Raises ValueError as `linearise`
-    does.
+    `ambjax.linear` contains the single steps, and the injection into the simulation. Returns the `Analysis`. Raises
+    ValueError as `linearise` does.
     """
     return operating_point(case, "nominal", r).analysis
 

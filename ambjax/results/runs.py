@@ -104,7 +104,7 @@ def simulate(case: Case, progress: Callable[[int], object] = lambda samples: Non
     - `case`: from `read_case`.
     - `progress`: called with the number of new samples after each part of the run.
 
-    Returns a `CaseRun`. Raises ValueError as `rollout` does. A lost rotor raises nothing: see `CaseRun.lost`.
+    Returns a `CaseRun`. Raises ValueError as `rollout` does. A lost rotor is no error: see `CaseRun.lost`.
     """
     fold = standard_for(case.settle, case.scenario)
     outcome = record(case.cascade, case.scenario, case.clock, fold=fold, tell=progress)

@@ -1,4 +1,4 @@
-"""The tuner as a function of `ambjax`, found among the installed packages."""
+"""The tuner as a function of `ambjax`. It is loaded through its entry point, so `ambjax` does not import it."""
 
 import importlib
 import importlib.metadata
@@ -11,7 +11,7 @@ from ambjax.host.extensions import GROUP
 def tune(case: str | pathlib.Path, out: str | pathlib.Path | None = None, **options: Any) -> Any:
     """Tune the gains of a case file, as `ambjax tune` does. Return the result of `tuning.tune`, a `TunedCase`.
 
-    - `case`: path of the case file; its table [tune] says what to tune.
+    - `case`: path of the case file; its table [tune] sets what is tuned.
     - `out`: directory of the results; None: a new one under ./out.
     - `options`: see `tuning.tune`.
 

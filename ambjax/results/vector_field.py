@@ -31,11 +31,11 @@ def vector_field(case: Case) -> VectorField:
     """Return the equations of the closed loop of a case, for scipy.integrate.solve_ivp or a diffrax.ODETerm.
 
     Sensor noise is left out, because it is held over samples. A solver does not stop where the rotor touches down.
-    Raises ValueError for a controller on a processor, whose loop is no differential equation.
+    Raises ValueError for a controller on a processor, because its loop is not a differential equation.
     """
     if case.cascade.processor is not None:
         raise ValueError(
-            "vector_field: this controller runs on a processor, and its loop is no differential equation. Remove "
+            "vector_field: this controller runs on a processor, so its loop is not a differential equation. Remove "
             "[processor] from the case, or use ambjax.simulate."
         )
     scenario = case.scenario.in_continuous_time()

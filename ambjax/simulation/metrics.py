@@ -1,8 +1,9 @@
 """The metrics of metrics.json, as folds (`ambjax.simulation.folds`).
 
-Errors include every sample, also those of a lost rotor, which is frozen. Under held noise u, i, e and v_tilde jump at
-the start of each sample, where their values are not typical. Extremes of these are therefore taken over the
-integrator's substeps. Effort, chatter and copper loss are computed over the time during which the drive is on.
+Errors are evaluated at every sample, also after the rotor is lost, where its state is frozen. Measurement noise is held
+over a sample, so u and v_tilde jump at its start, and i and e respond within it. Values at the samples are therefore
+not typical, and extremes of these signals are taken over the integrator's substeps. Effort, chatter and copper loss are
+computed over the time during which the drive is on.
 """
 
 from typing import Any
@@ -16,7 +17,7 @@ from ambjax.simulation.trajectory import ALIVE, STALLED, Row
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
 
-# Unit of each metric that has one; shares and counts have none.
+# Unit of each metric by name. Other metrics are shares and counts.
 UNITS = {
     "max_abs_error_m": "m",
     "rms_error_m": "m",
@@ -50,9 +51,9 @@ class Standard:
     """The metrics of metrics.json: a dict of numbers whose names include their units.
 
     - `settle`: start of the evaluation of the settled metrics, s.
-    - `touchdown`: clearance, m; the unit of `clearance_used` and `settled_clearance_used`.
-    - `largest_force`: N; the unit of `force_used`; inf: unknown.
-    - `sigma_band`, `v_tilde_band`, `e_band`: a signal within its band counts as having reached zero.
+    - `touchdown`: clearance, m; `clearance_used` and `settled_clearance_used` are |z| as a share of it.
+    - `largest_force`: largest magnetic force, N; `force_used` is |force| as a share of it; inf: unknown.
+    - `sigma_band` (m/s), `v_tilde_band` (A^2/m^2), `e_band` (A): a signal within its band counts as zero.
 
     The defaults are for the plant of Table 1; `standard_for` scales them to another plant.
     """
@@ -104,12 +105,15 @@ class Standard:
         )
 
     def init(self) -> dict[str, object]:
+        """Return the initial value of the fold of each metric."""
         return self._folds().init()
 
     def update(self, carry: dict[str, object], row: Row, span: Span) -> dict[str, object]:
+        """Return the folds after one more sample: its row, and the span up to the next sample."""
         return self._folds().update(carry, row, span)
 
     def result(self, carry: dict[str, object], ending: Ending) -> dict[str, Array]:
+        """Return each metric by name, in the units of UNITS."""
         numbers = self._folds().result(carry, ending)
         for name in ("clearance_used", "settled_clearance_used"):
             numbers[name] = numbers[name] / self.touchdown
@@ -124,9 +128,10 @@ class Standard:
 
 
 def standard_for(settle: Scalar, scenario: Scenario) -> Standard:
-    """Return the metrics for a scenario, with its clearance and with bands in proportion to the sizes of its plant.
+    """Return the metrics for a scenario: its clearance and largest force, and bands in proportion to its plant's sizes.
 
-    The ratios are those of the plant of Table 1: 4e-4 of the size of sigma, 4e-5 of the size of v, and 4e-3 of i_0.
+    `settle`: start of the evaluation of the settled metrics, s. The ratios of the bands are those of the plant of Table
+    1: 4e-4 of the size of sigma, 4e-5 of the size of v, and 4e-3 of i_0.
     """
     plant, usual, paper = scenario.plant, Standard(), Plant()
     return Standard(

@@ -35,11 +35,11 @@ class SampledState(NamedTuple):
     - `plant`, `control`: states of the plant and of the laws.
     - `command`: last command, with u within the limit of the supply.
     - `past`: the two voltages before that of `command`, V, the later one first.
-    - `finite`: 1, or 0 after a law has returned a number that is not finite.
+    - `finite`: 1, or 0 after a law has returned, or the sensor reported, a number that is not finite.
     - `z_filtered`: output of the low-pass of the position sensor, m.
     - `u_a`: output voltage of the amplifier, V.
     - `watch`: state of the guard.
-    - `started`: 0 until the guard has accepted all readings of a sample, which initialise the laws; then 1.
+    - `started`: 0 until the guard has accepted all readings of one sample, which initialise the laws; then 1.
     - `sensed`: state of a sensor with faults.
     """
 
@@ -76,9 +76,11 @@ class Sampled:
         return processor
 
     def realised(self) -> Self:
+        """Return the loop of one member, with its random signals drawn."""
         return dataclasses.replace(self, loop=self.loop.realised())
 
     def sensor_errors(self, sample: Scalar) -> Errors | FaultyErrors:
+        """Return the errors of all sensors in sample number `sample`: noise, runout and the onsets of faults."""
         drawn, sensor = self.loop.sensor_errors(sample), self.loop.scenario.sensor
         if sensor is not None and sensor.runout is not None and not lags(self.loop):
             runout = sensor.runout(jnp.asarray(sample, jnp.result_type(float)) * self.period)
@@ -206,7 +208,7 @@ class Sampled:
         memory: object,
         code: Array,
     ) -> Advanced:
-        """Integrate the plant to the next sample, under the voltages that act until then."""
+        """Integrate the plant from the sample at t (s) to the next one, under the voltages that act until then."""
         code = jnp.where((code == 0) & (state.finite == 0), DIVERGED, code)
         delay, whole = jnp.asarray(self.processor.delay), bool(self.processor.whole)
         commanded = acting((state.command.u, *state.past), delay, period, whole)
@@ -235,6 +237,7 @@ class Sampled:
         return z_filtered
 
     def status(self, state: SampledState) -> Array:
+        """Return the status code of the rotor, an index of `trajectory.STATUSES`."""
         return plant_status(self.loop, state.plant)
 
     def rest(self, state: SampledState, code: Array) -> SampledState:
@@ -261,8 +264,10 @@ class Sampled:
         return row if guard is None else row._replace(refused=alive & guard.refused(state.watch, state.watch)[0])
 
     def noted(self, row: Row, span: Span) -> Row:
+        """Return the row with mean and peak voltage; with an amplifier, the peak is that at the coils."""
         noted = self.loop.noted(row, span)
         return noted if self.loop.scenario.amplifier is None else noted._replace(u_peak=span.most.u)
 
     def singularity(self, row: Row) -> Array:
+        """Return `ClosedLoop.singularity`: 0 on the singular curve C. Eq. (9)."""
         return self.loop.singularity(row)

@@ -35,7 +35,7 @@ class Row(NamedTuple):
     u: Array
     """applied voltage (after the supply's limit; 0 after the rotor is lost), V"""
     u_mean: Array
-    """mean of the applied voltage over the sample that begins at t (spikes shorter than a sample included), V"""
+    """mean of the applied voltage over the sample that begins at t, including spikes shorter than a sample, V"""
     u_peak: Array
     """largest |voltage| at the coils over the sample (with an amplifier, u is its command), V"""
     i_1: Array
@@ -45,13 +45,13 @@ class Row(NamedTuple):
     force: Array
     """magnetic force, N"""
     B: Array
-    """flux density of the core with the larger one, T"""
+    """larger of the flux densities of the two cores, T"""
     v: Array
     """scaled magnetic force v(z, i), A^2/m^2. Eq. (3)"""
     v_star: Array
     """demanded scaled force, A^2/m^2. Eq. (5)"""
     v_tilde: Array
-    """input error v_star - v(z, i_ref) as the controller computed it, A^2/m^2"""
+    """inversion error v_star - v(z, i_ref) as the controller computed it, A^2/m^2"""
     sigma: Array
     """sliding variable of the true motion, m/s"""
     r: Array
@@ -67,7 +67,7 @@ class Row(NamedTuple):
     refused: Array
     """whether the guard of the processor refused the reading, bool"""
     alive: Array
-    """whether the rotor is levitated, bool"""
+    """whether the rotor is held, bool"""
 
     @property
     def e_z(self) -> Array:

@@ -26,8 +26,8 @@ class Amplifier:
     """Response of an amplifier to a held voltage: u_a' = w (u - u_a), w = 2 pi bandwidth, |u_a'| at most `slew`.
 
     The dead band (from the dead time of a bridge) is subtracted from |u_a|. At the current limit, a voltage that would
-    increase |i| is reduced to the voltage that holds i, or to the limit of the supply if that is smaller; |i| then
-    exceeds its limit. A parameter left out is ideal.
+    increase |i| is replaced by the voltage that holds i. If the supply cannot provide that voltage, its limit acts, and
+    |i| exceeds `i_max`. The default of each parameter is ideal.
     """
 
     bandwidth: Scalar | None = leaf(
@@ -55,7 +55,7 @@ class Amplifier:
         return self.bandwidth is not None or self.slew is not None
 
     def slope(self) -> Scalar:
-        """The rate w of the output voltage, 1/s; 0 if it follows immediately."""
+        """Return the rate w of the output voltage, 1/s; 0 if the bandwidth is not limited."""
         return 0.0 if self.bandwidth is None else 2 * jnp.pi * self.bandwidth
 
     def ramp(self, u_a: Array, u: Array) -> Array:
@@ -78,7 +78,10 @@ class Amplifier:
         return 0.0 if self.bandwidth is None else 1 / self.slope()
 
     def at_coil(self, u_a: Array, i: Array, u_max: Scalar, response: Callable[[], CoilResponse]) -> Array:
-        """Return the voltage (V) at the coils for the output u_a (V) and a current i (A), within u_max (V)."""
+        """Return the voltage (V) at the coils for the output u_a (V) and a current i (A), within u_max (V).
+
+        `response`: returns the response of the current at this instant; it is called only if there is a current limit.
+        """
         if self.dead_band is not None:
             size = jnp.maximum(jnp.abs(u_a) - self.dead_band, 0.0)
             u_a = jnp.where(u_a < 0, -size, size)
@@ -94,8 +97,9 @@ class CurrentAmplifier:
     """An amplifier that controls the current: i' = w (i_command - i), w = 2 pi bandwidth, within the supply's voltage.
 
     Its current loop measures the true current and applies the voltage for this rate: u is the sum of R i, of the
-    voltage that the motion induces, and of the inductive voltage of w (i_command - i), limited to the supply's u_max. A
-    saturated supply slews the current. In the two-coil plant i is half the difference of both currents.
+    voltage that the motion induces, and of the inductive voltage of w (i_command - i), limited to the supply's u_max.
+    While the supply limits u, the current follows more slowly. In the two-coil plant i is half the difference of both
+    currents.
     """
 
     bandwidth: Scalar = leaf(
@@ -108,7 +112,7 @@ class CurrentAmplifier:
     slow: ClassVar[bool] = False
 
     def slope(self) -> Scalar:
-        """The rate w of the current, 1/s."""
+        """Return the rate w of the current, 1/s."""
         return 2 * jnp.pi * self.bandwidth
 
     def command_limit(self, u_max: Scalar) -> Scalar:
@@ -116,5 +120,8 @@ class CurrentAmplifier:
         return jnp.inf if self.i_max is None else self.i_max
 
     def at_coil(self, command: Array, i: Array, u_max: Scalar, response: Callable[[], CoilResponse]) -> Array:
-        """Return the voltage (V) at the coils for a commanded current (A) and a current i (A), within u_max (V)."""
+        """Return the voltage (V) at the coils for a commanded current (A) and a current i (A), within u_max (V).
+
+        `response`: returns the response of the current at this instant.
+        """
         return limited(response().voltage(self.slope() * (command - i)), u_max)

@@ -12,8 +12,8 @@ from ambjax.numerics.smooth import refined, safe_sqrt
 from ambjax.world.iron import Iron
 from ambjax.world.sensor import Measurement
 
-# Lower bound of a gap as a share of s_0. Accepted states stay far above it, since the rotor touches down before. It
-# keeps the trial stages of an integrator, and their derivatives, finite.
+# Lower bound of a gap in the divisions, as a share of s_0. The rotor is lost at a larger gap, so the bound acts only on
+# trial stages of an integrator. It keeps these and their derivatives finite.
 GAP_FLOOR = 0.005
 
 # State of a plant, or its rates: a NamedTuple of scalars.
@@ -21,7 +21,7 @@ S = TypeVar("S")
 
 
 class Gaps(NamedTuple):
-    """Upper gap (m), lower gap (m), and 1 / (upper lower) (1/m^2). One division serves all uses: divisions are slow."""
+    """Upper gap (m), lower gap (m), and 1 / (upper lower) (1/m^2). All inverses use this one division."""
 
     upper: Array
     lower: Array
@@ -34,7 +34,7 @@ class Gaps(NamedTuple):
 
 
 def _product(z: Array, s_0: Array) -> Array:
-    """Return the product of the gaps, bounded from below by GAP_FLOOR."""
+    """Return the product of the gaps (m^2), at least that for which one gap is about GAP_FLOOR s_0."""
     product, least = s_0 * s_0 - z * z, 2 * GAP_FLOOR * s_0 * s_0
     return jnp.where(product > least, product, least)
 
@@ -42,7 +42,7 @@ def _product(z: Array, s_0: Array) -> Array:
 @jax.custom_jvp
 @compiled_alone
 def _inverse(z: Array, s_0: Array) -> Array:
-    """Return 1 / (upper lower), computed from z so that the gaps need not be stored."""
+    """Return 1 / (upper lower), 1/m^2, with the lower bound of `_product`."""
     return refined(_product(z, s_0))
 
 
@@ -134,7 +134,7 @@ class Bearing(Generic[S]):
         return jnp.maximum(self.pole, 1 / self.iron.eddy)
 
     def coil_slope(self, z: Scalar) -> Scalar:
-        """Return the fastest rate R/L of a coil's current (1/s) for |z| at most `z`: 2 R (s_0 + z)/kappa. Eq. (2)."""
+        """Return the fastest rate R/L of a coil's current (1/s) for |z| <= `z` (m): 2 R (s_0 + z)/kappa. Eq. (2)."""
         slope = 2 * self.R * (self.s_0 + z) / self.kappa
         return slope if self.iron is None else self.iron.fastest() * slope
 
@@ -144,13 +144,13 @@ class Bearing(Generic[S]):
         return self.i_0 + i, self.i_0 - i
 
     def fluxing(self, state: S) -> tuple[Array, Array]:
-        """Return the currents (A) to which the fluxes of both coils belong: with eddy currents, the delayed ones."""
+        """Return the currents (A) of the upper and lower coil that determine the fluxes: the delayed ones, if any."""
         return self.currents(state)
 
     def pull(self, fluxing: tuple[Array, Array], z: Scalar, gaps: Gaps | None = None) -> Array:
-        """Return the scaled force (A^2/m^2) of the two coils: the difference of (i/gap)^2, with the iron if any.
+        """Return the scaled force of the two coils (A^2/m^2): the difference of (i/gap)^2, with saturation if any.
 
-        `fluxing`: as the method of this name returns.
+        `fluxing`: result of the method `fluxing`, A. `z`: displacement, m. `gaps`: those at z; None: not computed yet.
         """
         pulls = []
         for i, inverse in zip(fluxing, (gaps or self.gaps(z)).inverses, strict=True):
@@ -166,12 +166,12 @@ class Bearing(Generic[S]):
         return jnp.maximum(upper, lower)
 
     def largest_force(self, i_max: Scalar | None = None) -> Scalar:
-        """Return the largest force at z = 0, N: with |i| = i_0 (beyond it one magnet is off) or i_max, A, if less."""
+        """Return the magnetic force (N) at z = 0 for i = i_0, where one coil is off, or for i_max (A) if it is less."""
         most = jnp.asarray(self.i_0) if i_max is None else jnp.minimum(self.i_0, i_max)
         return self.m * self.a * self.pull((self.i_0 + most, self.i_0 - most), 0.0 * most)
 
     def sizes(self) -> Measurement:
-        """Return characteristic sizes of z, z_dot, i: 2 % of the gap, the same per 0.1 s, 4 % of the bias current."""
+        """Return characteristic sizes: s_0/50 for z (m), s_0/5 per second for z_dot (m/s), i_0/25 for i (A)."""
         offset = jnp.asarray(self.s_0) / 50
         return Measurement(offset, 10 * offset, jnp.asarray(self.i_0) / 25)
 
@@ -216,7 +216,7 @@ class Bearing(Generic[S]):
         return (self.i_0 / self.s_0) * (self.i_0 / self.s_0)
 
     def gaps(self, z: Scalar) -> Gaps:
-        """Upper gap s_0 - z and lower gap s_0 + z, floored at 0.5 % of s_0."""
+        """Return the gaps s_0 - z and s_0 + z (m). Only their inverses are bounded (GAP_FLOOR)."""
         z, s_0 = jnp.asarray(z), jnp.asarray(self.s_0)
         return Gaps(s_0 - z, s_0 + z, _inverse(z, s_0))
 
@@ -237,7 +237,7 @@ class Bearing(Generic[S]):
         return self.v_and_dv_di(z, i)[1]
 
     def v_and_dv_di(self, z: Scalar, i: Scalar, gaps: Gaps | None = None) -> tuple[Array, Array]:
-        """Return v and dv/di. `gaps` are those at z if they are already computed."""
+        """Return v (A^2/m^2) and dv/di (A/m^2). `gaps`: those at z; None: not computed yet."""
         gaps = gaps or self.gaps(z)
         along = (self.i_0 * z + self.s_0 * i) * gaps.inverse
         across = (self.i_0 * self.s_0 + i * z) * gaps.inverse
@@ -249,7 +249,8 @@ class Bearing(Generic[S]):
         The formula has no cancellation, so it is smooth through z = 0, where the quadratic degenerates. If v has no
         real root, the result is the point of C at that z, where v is nearest.
         """
-        # all times the square of the gaps' product
+        # Eq. (3) times the squared product of the gaps: difference i^2 + 2 total i - above = 0. The root is written
+        # without cancellation.
         upper, lower, _ = self.gaps(z)
         product = upper * lower
         total, difference = 2 * self.i_0 * (self.s_0 * self.s_0 + z * z), 4 * self.s_0 * z
@@ -264,7 +265,7 @@ class Bearing(Generic[S]):
         return i, self.R * i
 
     def copper_loss(self, i: Scalar) -> Array:
-        """Heat in both coils, in W: R ((i_0+i)^2 + (i_0-i)^2)."""
+        """Return the heat in both coils, in W: R ((i_0+i)^2 + (i_0-i)^2)."""
         return 2 * self.R * (self.i_0**2 + jnp.asarray(i) ** 2)
 
     def singularity(self, z: Scalar, i: Scalar) -> Array:
@@ -282,13 +283,13 @@ class Bearing(Generic[S]):
         x = jnp.exp(jnp.linspace(-5.0, 5.0, 41))
         x = jnp.concatenate([x, -x])
         for _ in range(4):
-            # d(distance^2)/dx times x^3, a quartic; kept on its branch by a bounded relative step.
+            # d(distance^2)/dx times 2 x^3, a quartic in x. The bound on the relative step keeps x on its branch.
             value = 5 * x**4 + (2 * iota - 4 * zeta) * x**3 - 2 * iota * x - 1
             slope = 20 * x**3 + 3 * (2 * iota - 4 * zeta) * x**2 - 2 * iota
             x = x * (1 - jnp.clip(value / jnp.where(slope == 0, 1.0, slope) / x, -0.5, 0.5))
         return safe_sqrt(jnp.min((x - zeta) ** 2 + (iota + (x + 1 / x) / 2) ** 2))
 
     def signed_distance_to_C(self, z: Scalar, i: Scalar) -> Array:
-        """`distance_to_C` with a sign: negative where `singularity` is negative, beyond the curve."""
+        """Return `distance_to_C`, negative beyond the curve, where `singularity` is negative. Dimensionless."""
         distance = self.distance_to_C(z, i)
         return jnp.where(self.singularity(z, i) > 0, distance, -distance)

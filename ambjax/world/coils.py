@@ -14,7 +14,7 @@ from ambjax.world.sensor import Measurement
 class Currents(NamedTuple):
     """State of `TwoCoil`: displacement (m), velocity (m/s), currents of the upper and lower coil (A); or the rates.
 
-    `delayed`: the currents of the fluxes (A), with eddy currents; () without.
+    `delayed`: with eddy currents, the delayed currents that determine the fluxes (A); () without.
     """
 
     z: Array
@@ -26,7 +26,7 @@ class Currents(NamedTuple):
 
 @record
 class TwoCoil(Bearing[Currents]):
-    """Rotor and magnets with the parameters of Table 1, in the state (z, z_dot, i_1, i_2).
+    """The plant with two circuits, with the parameters of Table 1. Its state is (z, z_dot, i_1, i_2).
 
     The upper coil (gap s_0 - z) has the voltage R i_0 + u, the lower one (gap s_0 + z) R i_0 - u. The measured i is
     half the difference of the currents. The flux linkage kappa i_1 / (2 (s_0 - z)) of the upper coil has the rate
@@ -56,10 +56,10 @@ class TwoCoil(Bearing[Currents]):
         return Currents(z_dot, z_ddot, i_1_dot, i_2_dot, slow)
 
     def _current_rate(self, iron: Iron, i: Array, inverse: Array, closing: Array, voltage: Array) -> Array:
-        """Return the rate of a coil's current, A/s, from its flux linkage n A b(i, gap), where b is that of the core.
+        """Return the rate of a coil's current, A/s. The flux linkage is n A b, with the flux density b of the core.
 
-        `inverse`: 1 / gap, 1/m. `closing`: rate at which the gap closes, m/s. `voltage`: the one that changes the flux,
-        V.
+        `i`: current, A. `inverse`: 1 / gap, 1/m. `closing`: rate at which the gap closes, m/s. `voltage`: rate of the
+        flux linkage, V.
         """
         permeance = inverse + iron.beside(self)
         slope = iron.slope(iron.core(self, i, inverse))

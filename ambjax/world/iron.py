@@ -7,21 +7,21 @@ from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record
 
-# Share of the unsaturated flux that a coil keeps at any current: that of the air around the saturated core.
+# Smallest slope of the saturation curve: at large currents only the flux through the air still increases.
 AIR = 0.02
 
 
 @record
 class Iron:
-    """What the iron adds to a plant. A number left out: ideal iron in this respect.
+    """Saturation, leakage and eddy currents of the iron. The default of each, None, is ideal iron in this respect.
 
-    - Saturation. With the flux density b of ideal iron and x = b / saturation, the core has the flux density
-      b (AIR + (1 - AIR) (1 + x^4)^(-1/4)): ideal below about 0.6, 15 % less at x = 1, and close to `saturation` above.
-      This is a smooth minimum of both asymptotes, in place of the measured curve of a material (Schweitzer and Maslen,
-      Magnetic Bearings, 2009, section 3.1). The gap has the same share of its ideal flux as the core.
-    - Leakage. A coil also drives flux past the gap, in a path of constant reluctance. `leakage` is the ratio of the
-      flux of the coil to that of the gap at z = 0 (Meeker, Maslen and Noh, IEEE Trans. Magn. 32(5), 1996). It increases
-      the inductance and the flux of the core, not the force of a current.
+    - Saturation. With the flux density b of ideal iron and x = b / saturation, the flux density of the core is
+      b (AIR + (1 - AIR) (1 + x^4)^(-1/4)): 3 % below b at x = 0.6, 16 % at x = 1, and close to `saturation` above.
+      This smooth minimum of b and `saturation` replaces the measured curve of a material (Schweitzer and Maslen,
+      Magnetic Bearings, 2009, section 3.1). Saturation reduces the flux of the gap by the same factor.
+    - Leakage. A part of a coil's flux does not cross the gap, in a path of constant reluctance. `leakage` is the ratio
+      of the flux of the coil to that of the gap at z = 0 (Meeker, Maslen and Noh, IEEE Trans. Magn. 32(5), 1996). It
+      increases the inductance and the flux of the core. It changes the force of a current only by saturation.
     - Eddy currents. The flux of a coil follows its current with the time constant `eddy`: the first-order term of the
       diffusion of flux into a lamination of thickness d, d^2 sigma mu / 12 (Zmood, Anand and Kirk, 1987). The voltage
       equations do not change.
@@ -38,33 +38,33 @@ class Iron:
     )
 
     def core(self, plant: Any, i: Scalar, inverse: Scalar) -> Array:
-        """Return the flux density of the core of ideal iron, T: mu_0 n i/2 (1/gap + (leakage - 1)/s_0).
+        """Return the flux density of a core without saturation, T: mu_0 n i/2 (1/gap + (leakage - 1)/s_0).
 
         `i`: current of the coil, A. `inverse`: 1 / gap, 1/m.
         """
         return plant.mu_0 * plant.n / 2 * i * (inverse + self.beside(plant))
 
     def beside(self, plant: Any) -> Scalar:
-        """Return the permeance of the leakage path relative to that of a gap, times 1 / gap: (leakage - 1)/s_0, 1/m."""
+        """Return the term that the leakage path adds to 1 / gap in the flux of the core: (leakage - 1)/s_0, 1/m."""
         return 0.0 if self.leakage is None else (self.leakage - 1) / plant.s_0
 
     def share(self, b: Array) -> Array:
-        """Return the flux as a share of that in ideal iron, whose flux density is b (T)."""
+        """Return the flux as a share of the flux without saturation, whose density is b (T)."""
         return jnp.ones_like(b) if self.saturation is None else AIR + (1 - AIR) / _root(b / self.saturation)
 
     def slope(self, b: Array) -> Array:
-        """Return the derivative of the flux density with respect to that in ideal iron, b (T)."""
+        """Return the derivative of the flux density with respect to b (T), that without saturation. Dimensionless."""
         if self.saturation is None:
             return jnp.ones_like(b)
         x = b / self.saturation
         return AIR + (1 - AIR) / (_root(x) * (1 + x * x * x * x))
 
     def following(self, i: Array, late: Array) -> Array:
-        """Return the rate (A/s) of a delayed current `late` (A) behind the current i (A)."""
+        """Return the rate (A/s) of the delayed current `late` (A), which follows the current i (A)."""
         return jnp.zeros_like(i) if self.eddy is None else (i - late) / self.eddy
 
     def fastest(self) -> Scalar:
-        """Return the largest factor by which the iron makes a coil faster than its inductance without iron."""
+        """Return the largest factor by which saturation increases the rate R/L of a coil's current."""
         return 1.0 if self.saturation is None else 1 / AIR
 
 

@@ -14,7 +14,7 @@ from ambjax.world.sensor import Measurement
 class State(NamedTuple):
     """Displacement (m), velocity (m/s) and current deviation (A); or their rates.
 
-    `delayed`: the current deviation of the flux (A), with eddy currents; () without.
+    `delayed`: with eddy currents, the delayed current deviation that determines the flux (A); () without.
     """
 
     z: Array
@@ -25,7 +25,7 @@ class State(NamedTuple):
 
 @record
 class Plant(Bearing[State]):
-    """Rotor and magnets with the parameters of Table 1, in the state (z, z_dot, i)."""
+    """The plant of the paper, with the parameters of Table 1. Its state is (z, z_dot, i). Eqs. (1), (2)."""
 
     one_current = True
 
@@ -33,7 +33,7 @@ class Plant(Bearing[State]):
         return State(*measurement, delayed=measurement.i if self.delays else ())
 
     def rates(self, state: State, u: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> State:
-        """z_dot, `z_ddot` and `i_dot`. Eqs. (1), (2)."""
+        """Return z_dot (m/s), `z_ddot` and `i_dot` under u (V), q_z (m/s^2) and q_i (A/s). Eqs. (1), (2)."""
         if self.iron is not None:
             return self._iron_rates(self.iron, state, u, q_z, q_i)
         z, z_dot, i, _ = state
@@ -43,9 +43,9 @@ class Plant(Bearing[State]):
         return State(z_dot, z_ddot, i_dot)
 
     def _iron_rates(self, iron: Iron, state: State, u: Scalar, q_z: Scalar, q_i: Scalar) -> State:
-        """Return the rates with iron: the voltages of Eq. (2) over its inductance, which leakage and saturation change.
+        """Return the rates with iron: Eq. (2) with an inductance that leakage increases and saturation reduces.
 
-        One current describes both coils, so the inductance contains the mean of the slopes of both cores.
+        One current describes both coils, so the inductance contains the mean of `Iron.slope` over both cores.
         """
         z, z_dot, i, delayed = state
         gaps = self.gaps(z)

@@ -51,8 +51,8 @@ def _gains(facts: TuningFacts) -> list[str]:
     lines = ["## Gains", "", *table(head, rows), ""]
     words = (
         "Last column: increase of the risk if this gain alone is larger or smaller by a factor of e^0.25 = 1.28. The "
-        "larger of the two increases is shown. A gain with a large number must be set accurately. If this change loses "
-        "members of the training ensemble, the column shows how many more are lost than with the answer. "
+        "larger of the two increases is shown. A gain with a large increase must be set accurately. If this change "
+        "loses members of the training ensemble, the column shows how many more are lost than with the answer. "
         "`tune.bounds` sets other bounds."
     )
     sources = [f"- {row['path']}: {literal(row['source'])}" for row in facts.gains if row.get("source")]
@@ -67,8 +67,8 @@ def _gains(facts: TuningFacts) -> list[str]:
         "",
         "![z - r and u before and after tuning](nominal.png)",
         "",
-        "Amplitude spectrum of the voltage from `run.settle` on (Hann window). A sine with an amplitude of 1 V has the "
-        "height 1 V.",
+        "Amplitude spectrum of the voltage from `run.settle` on (Hann window). A sine with an amplitude of 1 V has a "
+        "peak of 1 V.",
         "",
         "![Amplitude spectrum of u before and after tuning](spectrum.png)",
         "",
@@ -125,9 +125,10 @@ def _minimised(facts: TuningFacts) -> list[str]:
     return [
         "## Objective of the search",
         "",
-        "Stressed members have more noise, and every gain is off by a factor, or they joined after validation or "
-        "accurate steps lost them. They must be held, but their error does not count. So the objective differs from "
-        "the loss of the held-out members above. The picture shows the objective.",
+        "Stressed members have more noise, and gains that are off by a factor. Members that were lost in the "
+        "validation or with accurate steps have joined them. All of these must be held, but their error does not "
+        "count. The objective therefore differs from the loss of the held-out members above. The picture shows the "
+        "objective.",
         "",
         *table(["at the answer", "value"], rows),
         "",

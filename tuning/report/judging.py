@@ -1,4 +1,4 @@
-"""The facts of a search, from its answer: the gains are judged on members that the search has not seen."""
+"""The facts of the report: the answer of a search is evaluated on held-out members, which the search did not use."""
 
 import dataclasses
 from typing import Any
@@ -22,7 +22,7 @@ from tuning.search.course import SearchResult
 
 
 def examined(answer: SearchResult, gradients: bool, front_written: bool) -> tuple[TuningFacts, explore.Slices]:
-    """Return the facts of an answer, and the slices of the goal through it.
+    """Return the facts of an answer, and the slices of the goal through it. [m]: one value for each of the m gains.
 
     `gradients`: whether to compute derivatives in three ways. `front_written`: whether each point of the front has a
     case file.
@@ -56,7 +56,10 @@ def examined(answer: SearchResult, gradients: bool, front_written: bool) -> tupl
 
 
 def _judged(problem: TuningProblem, x: np.ndarray, held_out: int) -> dict[str, dict[str, np.ndarray]]:
-    """Return the metrics of the held-out members [N] under the gains of the case and at x [m]; empty if none."""
+    """Return the metrics of the held-out members [N] with the gains of the case (`before`) and at x [m] (`after`).
+
+    Both are empty if there are no held-out members.
+    """
     space, count = problem.objective.space, problem.tune.budget.held_out
     say(f"judging on {count} held-out members ...")
     start = space.encode(space.clip(space.values(problem.case.cascade)))
@@ -66,7 +69,10 @@ def _judged(problem: TuningProblem, x: np.ndarray, held_out: int) -> dict[str, d
 
 
 def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_out: int) -> Row:
-    """Return the fields on the training members and the held-out members `judged`."""
+    """Return the fields on the training members and on the held-out members.
+
+    `judged`: from `_judged`. `refuted`: why accurate steps do not confirm the answer; '' if they do.
+    """
     problem = answer.problem
     none = {"members": 0, "held": 0, "lost": 0, "stalled": 0}
     found: Row = {name: summarise(one) if one else dict(none) for name, one in judged.items()}
@@ -84,7 +90,7 @@ def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_
 
 
 def _steps(answer: SearchResult, unlucky: StepError | None, again: Row | None, refuted: str) -> Row:
-    """Return the fields on the step errors, those of `_checked`."""
+    """Return the fields on the errors of the search's steps. `unlucky`, `again`, `refuted`: from `_checked`."""
     problem = answer.problem
     return {
         "step_error": answer.error.facts() if answer.error else None,
@@ -144,7 +150,7 @@ def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: explore.Slices
 def _checked(
     answer: SearchResult, judged: dict[str, np.ndarray] | None, held_out: int
 ) -> tuple[StepError | None, dict[str, Any] | None, str]:
-    """Simulate the worst and the first of the held-out members `judged` [N] again by accurate steps.
+    """Repeat the simulation of the worst and the first of the held-out members `judged` [N] with accurate steps.
 
     Returns the step error on the worst members, the comparison on the first ones, and the reason why accurate steps do
     not confirm the answer ('' if they confirm it).

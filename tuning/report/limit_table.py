@@ -28,11 +28,13 @@ def facts(
 ) -> list[Facts]:
     """Return a row for each limit and one for survival, from the held-out members' columns [N] and their summary.
 
-    `refuted`: why accurate steps contradict the judged members; '' if they confirm them. `measured`: the injections
-    into some of the judged members. `delayed`: the test of the limit on the delay margin. In a row, `held` is None if
-    no member was judged, or if the limit is held but accurate steps contradict it; `verdict` is its text. `price`: the
-    decrease of the minimised settled rms error (m) or voltage (V) for a limit 10 % looser (`Limit.error_reduction`);
-    None if it is not held.
+    `refuted`: why accurate steps do not confirm the answer; '' if they do. `measured`: the injections into some of the
+    held-out members. `delayed`: the test of the limit on the delay margin. Fields of a row:
+
+    - `held`: whether the limit is held; None if no member was judged, or if the limit is held but accurate steps do not
+      confirm the answer. `verdict`: the same in words.
+    - `price`: decrease of the minimised settled rms error (m) or voltage (V) for a limit 10 % looser
+      (`Limit.error_reduction`); None if the limit is not held.
     """
     members, held, settings = summary["members"], summary["held"], problem.tune.limits
     share = held / members if members else None
@@ -132,9 +134,9 @@ def broken(rows: list[Facts]) -> list[str]:
 def prices(rows: list[Facts]) -> list[str]:
     """Return a sentence for each limit that is active and held."""
     return [
-        f"{row['name']} = {row['reached']:.4g}{_unit(row)} is at its limit, {row['threshold']:g}: {100 * MORE:g} % "
-        f"{'less' if row['at_least'] else 'more'} would take about {row['price']:.2g} {row['price_unit']} off "
-        f"the settled rms {'voltage' if row['price_unit'] == 'V' else 'error'}"
+        f"{row['name']} = {row['reached']:.4g}{_unit(row)} is at its limit, {row['threshold']:g}: a limit "
+        f"{100 * MORE:g} % {'lower' if row['at_least'] else 'higher'} would reduce the settled rms "
+        f"{'voltage' if row['price_unit'] == 'V' else 'error'} by about {row['price']:.2g} {row['price_unit']}"
         for row in rows
         if row["active"] and row["held"]
     ]
@@ -163,7 +165,7 @@ def section(rows: list[Facts]) -> list[str]:
         "worst member",
         "verdict",
         "at the optimum",
-        f"effect of {100 * MORE:g} % more",
+        f"effect if {100 * MORE:g} % looser",
     ]
     lines = ["## Limits", "", *table(head, cells), ""]
     lines += [f"- {row['name']}: {row['what']}. Source: {row['source']}." for row in rows]

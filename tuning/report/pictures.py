@@ -114,7 +114,7 @@ def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
 def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Return frequencies (Hz) above 0 and amplitudes of a signal with this sample period (s), under a Hann window.
 
-    The amplitude of a sine is that of its peak, also at half the sample rate. Both arrays are empty for fewer than
+    The amplitude of a sine is that of its peak, also at half the sampling rate. Both arrays are empty for fewer than
     FEWEST samples.
     """
     n = len(values)
@@ -123,7 +123,7 @@ def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarra
     window = np.hanning(n)
     lines = 2 * np.abs(np.fft.rfft(window * (values - values.mean()))) / window.sum()
     if n % 2 == 0:
-        lines[-1] /= 2  # half the sample rate is the only line without a mirror image
+        lines[-1] /= 2  # half the sampling rate is the only line without a mirror image
     return np.fft.rfftfreq(n, period)[1:], lines[1:]
 
 
@@ -212,7 +212,7 @@ def front(rows: list[dict[str, Any]]) -> bytes:
     ax.set_ylim(min(min(errors) / 1.2, max(errors) / 2), max(max(errors) * 1.2, min(errors) * 2))
     ax.set(xlabel="settled rms voltage (V)", ylabel="settled rms error (m)", yscale="log")
     low, high = ax.get_xlim()
-    ax.set_xlim(low, high + 0.3 * (high - low))  # room for the words beside the last point
+    ax.set_xlim(low, high + 0.3 * (high - low))  # space for the text next to the last point
     ax.grid(alpha=0.3, which="both")
     return _png(figure)
 

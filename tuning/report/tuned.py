@@ -22,10 +22,10 @@ CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
 
 def tuned_case(case: Case, gains: Mapping[str, float], verdict: str, out: pathlib.Path) -> tuple[str, Case]:
-    """Return the text of tuned.toml for the folder `out`, and its case. Raises ValueError for text that is no case.
+    """Return the text of tuned.toml for the folder `out`, and its case. Raises ValueError if the text is no valid case.
 
     The custom laws, the linear controller and the recorded signals are those of `case`: a change of their files during
-    the search does not matter.
+    the search has no effect.
     """
     moved = relocated(case.own_laws, out) | relocated_files(case.recorded, out)
     moved |= case.controller_file.relocated(out) if case.controller_file else {}
@@ -81,8 +81,8 @@ def _escaped(character: re.Match[str]) -> str:
 def _table(table: Any, path: list[str]) -> Any:
     """Return the table at this path; add it if it is missing.
 
-    A table inside an inline table is inline. Others follow the last table of the same kind, or stand at the end of the
-    document if root keys follow there, which would otherwise become keys of the new table.
+    A table inside an inline table is inline. Other tables follow the last table of the same kind. If root keys follow
+    there, which would become keys of the new table, it is added at the end of the document.
     """
     document = table
     for depth, word in enumerate(path):
@@ -117,7 +117,7 @@ def _append(document: tomlkit.TOMLDocument, path: list[str], word: str) -> None:
 
 
 def _put(table: Any, name: str | int, value: float | str) -> None:
-    """Set the value of this name or index; append a new one, and keep the text of an equal one."""
+    """Set the value of this name or index. A missing name is appended; an equal value keeps its text."""
     if isinstance(name, int) or name in table:
         if table[name] != value:
             table[name] = value
@@ -130,7 +130,7 @@ def _put(table: Any, name: str | int, value: float | str) -> None:
 
 
 def _behind(last: Table | None) -> Table:
-    """Return a new table that takes over the comments at the end of the preceding table: they refer to what follows."""
+    """Return a new table with the comments at the end of the preceding table, because these refer to what follows."""
     table = tomlkit.table()
     rest = [] if last is None else _cut(last)
     table.value.body.extend(rest or [(None, tomlkit.nl())])

@@ -48,7 +48,7 @@ class FrontPoint(NamedTuple):
 
 
 def traced(course: Course, answer: SearchResult) -> SearchResult:
-    """Trace the front from the answer of least error. Return the knee if tune.objective asks for it and it is valid.
+    """Trace the front from the answer of least error. Return the knee if tune.objective selects it and it is valid.
 
     The result holds the points of the front in order of the error limit: for each limit the judged answer of least
     voltage. Raises ValueError as `Course.search` does.
