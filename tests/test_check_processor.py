@@ -133,6 +133,7 @@ def random_loop(name, draw):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["estimated, two coils", "late, amplifier", "explicit"])
 def test_no_bound_is_exceeded_by_what_stands_beside_it(name):
     """And words and verdict are of one fact. What is measured and what is bounded differ by rounding: 1e-12."""

@@ -49,6 +49,7 @@ def test_the_current_follows_the_command_with_one_pole(kind):
         assert float(weak.coil_voltage(jnp.asarray(c), x, q)) == np.clip(float(u), -5.0, 5.0)
 
 
+@pytest.mark.slow
 def test_the_poles_in_continuous_time_are_those_of_the_textbook():
     """State feedback of z, z_dot and int z with i' = w (i_star - i): the matrix written out, without the package."""
     law = cascade().position

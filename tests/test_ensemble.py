@@ -60,6 +60,7 @@ def same(a, b, rtol):
         np.testing.assert_allclose(x, y, rtol=rtol, atol=absolute.get(name, 1e-15), err_msg=str(name))
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_calls_threads_or_who_runs_beside():
     n = 150  # no multiple of a block
     whole = run_ensemble(SMOOTH, members(n), SHORT, fold=FOLD, threads=1)

@@ -601,10 +601,8 @@ def test_a_law_that_is_no_scalar_code_is_named():
 
 
 @compiled
-@pytest.mark.parametrize(
-    "reading",
-    [pytest.param(x, marks=pytest.mark.slow if x == "sampled" else pytest.mark.thorough) for x in readings.READINGS],
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("reading", readings.READINGS)
 def test_the_readings_cascades(reading):
     cascade = dataclasses.replace(readings.cascade(reading), processor=Processor(1.0))
     scenario = readings.scenario("tracking", reading)

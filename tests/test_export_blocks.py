@@ -172,7 +172,7 @@ def test_a_plant_needs_a_processor_and_fixed_steps():
 @pytest.mark.slow
 @compiled
 @pytest.mark.parametrize("name", list(CASES))
-@pytest.mark.parametrize("what", ["plant", "loop"])
+@pytest.mark.parametrize("what", [pytest.param("plant", marks=pytest.mark.thorough), "loop"])
 def test_the_c_is_proven(name, what):
     cascade, scenario, clock = CASES[name]
     block = blocks(name)[what]

@@ -69,7 +69,7 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=["smooth", pytest.param("repaired", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=["smooth", pytest.param("repaired", marks=pytest.mark.thorough)])
 def three_ways(request):
     """Reverse, forward and Richardson-extrapolated central differences, without and with noise: arrays [2, 4]."""
     nominal, p, method, steps = CASES[request.param]
@@ -142,7 +142,7 @@ def everything(clock, mode):
 
 
 @pytest.mark.parametrize(
-    "mode", [pytest.param("reverse", marks=pytest.mark.slow), pytest.param("forward", marks=pytest.mark.thorough)]
+    "mode", [pytest.param("reverse", marks=pytest.mark.thorough), pytest.param("forward", marks=pytest.mark.slow)]
 )
 def test_every_gradient_is_finite_over_six_decades(mode, monkeypatch):
     """1,000 gain vectors over six decades from 1 mm off the origin, from where most lose the rotor.
@@ -159,7 +159,7 @@ def test_every_gradient_is_finite_over_six_decades(mode, monkeypatch):
     assert np.all(np.isfinite(gradient))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_forward_through_the_adaptive_method_is_finite_on_random_gains():
     # in small batches: a vectorised while loop runs as long as its slowest member
     clock = Clock(200, 1e-4, AdaptiveRodas3(most_steps=2000))

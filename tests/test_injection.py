@@ -101,6 +101,7 @@ def test_the_peak_is_that_of_the_independent_simulator(name, monkeypatch):
 SLOW = Clock(1000, 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cascade", "amplitude", "r"),
     [(Cascade(**SMOOTH), 1e-6, 0.0), (Cascade(**SMOOTH), 1e-6, 1e-3), (Cascade(), 1e-7, 0.0)],
@@ -121,6 +122,7 @@ def test_continuous_time_is_the_linear_analysis(cascade, amplitude, r):
     assert np.array_equal(sliding.S, found.S)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("processor", "period"),
     [(Processor(0.0), T), pytest.param(None, 1e-3, marks=pytest.mark.slow)],

@@ -29,6 +29,7 @@ def basin(reading):
     return Study(cascade, quiet, Clock(800, 1e-4, AdaptiveRodas3()), 0.05, Spread(), 0, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reading", ["literal", "repaired"])
 def test_the_basin_is_a_strip_of_known_width(reading):
     """While v_tilde is saturated, z + z_dot/pole runs away unless gamma outweighs dv/dz pole |z + z_dot/pole|."""

@@ -125,8 +125,8 @@ def test_every_metric_is_what_a_dense_solution_says(name, method):
 TASKS = pathlib.Path(__file__).parents[1] / "benchmarks"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [pytest.param("A", marks=pytest.mark.thorough), "C"])
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", ["A", "C"])
 def test_tuned_gains_of_the_benchmarks_measure_so_once_settled(name):
     """The gains of results/tasks.json as they are, and where their tables begin to measure: from 0.2 s on."""
     gains = json.loads((TASKS / "results" / "tasks.json").read_text())["tasks"][name]["gains"]

@@ -102,6 +102,7 @@ def test_a_figure_of_the_paper_says_which_of_both(tmp_path, drawn, code, words):
     assert said == [words]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("samples", [1, 2, 3, 30])
 @pytest.mark.parametrize("lost_at", [np.inf, 0.0, 1e-4, 1.5e-4])
 def test_runs_of_few_samples_are_drawn(tmp_path, samples, lost_at):

@@ -209,6 +209,7 @@ PARTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "delay"), [("sensor", 1.0), pytest.param("amplifier", 0.5, marks=pytest.mark.slow)])
 def test_gradients_forward_and_reverse(name, delay):
     sensor, amplifier = PARTS[name]

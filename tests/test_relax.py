@@ -86,6 +86,7 @@ def test_derivatives_are_those_of_the_equation(function):
     np.testing.assert_allclose(forward, slope, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("p", [25.0, None])
 def test_odd_and_finite_at_the_edges(p):
     values = jnp.array([0.0, 1e-300, 1.0, 1e12])

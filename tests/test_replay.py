@@ -120,6 +120,7 @@ def belongs(metrics, out, settle):
         assert metrics["trajectory_deviation"] <= len(error) * np.finfo(float).eps
 
 
+@pytest.mark.slow
 def test_the_printed_command_replays_the_worst_member(printed, monkeypatch, capsys):
     folder, said, columns, summary = printed
     monkeypatch.chdir(folder)

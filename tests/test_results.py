@@ -147,6 +147,7 @@ def test_tune_names_bad_input(tmp_path):
         tuning.tune(tmp_path / "no.toml")
 
 
+@pytest.mark.slow
 def test_the_vector_field_is_the_loop_of_simulate():
     """SciPy's solution of the equations against our own adaptive steps: both to 1e-8 of the sizes of the states."""
     from scipy.integrate import solve_ivp

@@ -244,6 +244,7 @@ def test_the_voltage_of_a_sample_acts_late(delay):
     np.testing.assert_allclose(mean, expected, atol=1e-12 * 200)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "inversion",
     [amb.inversion.Adaptive(8e5, INF), pytest.param(amb.inversion.ClosedForm(), marks=pytest.mark.slow)],
@@ -299,6 +300,7 @@ def loss_of(clock, p, closed=False):
     return loss
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("p", "closed"),
     [

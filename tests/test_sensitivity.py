@@ -54,6 +54,7 @@ def test_the_summary_is_that_of_the_analysis(tmp_path, capsys):
     assert (tmp_path / "out" / "sensitivity.png").stat().st_size > 20_000
 
 
+@pytest.mark.slow
 def test_a_member_without_an_equilibrium_is_the_worst(tmp_path, capsys):
     """A rotor of 1.5 kg needs 6 m/s^2 more than the model's, and k gives 5: exit code 1."""
     code, out, _, _ = answered(tmp_path, capsys, SPREAD, "--members", "8", "--seed", "1")

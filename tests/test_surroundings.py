@@ -185,6 +185,7 @@ def test_a_study_that_another_run_began_meanwhile_is_refused(monkeypatch, capsys
     assert os.listdir("out") == ["study.json"]  # noqa: PTH208
 
 
+@pytest.mark.slow
 def test_the_death_of_a_worker_is_one_line(monkeypatch, capsys):
     class Dead:
         def submit(self, *_):

@@ -67,6 +67,7 @@ def test_the_derivative_of_a_limit_is_that_of_differences(made):
         assert np.any(np.abs(differences) > 0.1), name
 
 
+@pytest.mark.slow
 def test_the_engine_puts_the_loops_among_the_limits_by_name(made, monkeypatch):
     """For 12 ordinary and 2 stressed members; the rollouts themselves are not simulated here."""
     problem, x, members = made

@@ -109,6 +109,7 @@ def test_what_the_terms_add_is_the_loss():
         np.testing.assert_allclose(sum(breakdown.contributions(weights, terms).values()), whole, rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_the_loss_table_can_be_added_up_by_hand(written):
     text = (written / "report.md").read_text()
     facts = json.loads((written / "report.json").read_text())

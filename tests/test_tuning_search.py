@@ -93,6 +93,7 @@ LATE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delays", [[0.5, 1.5], pytest.param([1.0, 2.0], marks=pytest.mark.slow)])
 def test_a_lane_has_the_delay_of_its_member(delays):
     """Spread delays are not rounded to whole samples and not limited to the nominal delay."""
@@ -291,6 +292,7 @@ def logged_compilations():
     jax.config.update("jax_log_compiles", False)
 
 
+@pytest.mark.slow
 def test_nothing_is_compiled_after_the_first_iteration(small, caplog, logged_compilations):
     run(small)
     engine, goal, members, start = small
