@@ -6,11 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import Cascade, Clock, Initial, Plant, Processor, Scenario, rollout
+from ambjax import AdaptiveRodas3, Cascade, Clock, Initial, Plant, Processor, Scenario, rollout, with_method
 from ambjax.cases.reader import case_from
 from ambjax.control import current, inversion, observer, position
 from ambjax.export.controller import controller_of
 from ambjax.linear import injected, linearise, loop_matrices
+from ambjax.simulation.integrate import FixedSteps
 from ambjax.world.amplifier import CurrentAmplifier
 from ambjax.world.coils import TwoCoil
 from ambjax.world.sensor import Measurement
@@ -145,3 +146,9 @@ def test_a_case_file_gives_the_amplifier_and_its_nominal_bandwidth():
 def test_what_does_not_fit_is_refused_in_one_line(actuator, laws, words):
     with pytest.raises(ValueError, match=words):
         read(actuator, controller={"current": laws} if laws else {})
+
+
+def test_adaptive_steps_are_refused_in_continuous_time():
+    assert isinstance(with_method(Clock(10, PERIOD), cascade(), world()).method, FixedSteps)
+    with pytest.raises(ValueError, match=r"controls the current requires fixed steps.*dt = 'auto'"):
+        rollout(cascade(), world(), Clock(10, PERIOD, AdaptiveRodas3()))

@@ -659,7 +659,9 @@ def test_random_controllers():
     }
     for n in range(examples(3, 40)):  # three: every position law
         laws = {stage: drawn(options[n // step % len(options)]()) for stage, (step, options) in kinds.items()}
-        numbers = {f.name: decades(getattr(Plant(), f.name), 0.5) for f in dataclasses.fields(Plant)}
+        numbers = {
+            f.name: decades(getattr(Plant(), f.name), 0.5) for f in dataclasses.fields(Plant) if f.metadata.get("leaf")
+        }
         processor = Processor((0.0, 0.5, 1.0, 1.5, 2.0)[n % 5], bool(random.random() < 0.7))
         cascade = Cascade(**laws, model=Plant(**numbers), processor=processor)
         made = drafts(cascade, [("float", "double")[n // 3 % 2]], 2000, float(random.choice([INF, 48.0, 200.0])))

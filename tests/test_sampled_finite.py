@@ -12,6 +12,7 @@ from ambjax.cases.reader import KINDS as EVERY
 from ambjax.control.base import default_law
 from ambjax.control.processor import Processor
 from ambjax.simulation.folds import Rms
+from ambjax.world.amplifier import CurrentAmplifier
 from tuning.space import Gain, Space, tunable
 
 # Three decades up and down of the law's own gains.
@@ -55,9 +56,11 @@ def test_values_and_derivatives_are_finite_over_six_decades_of_every_gain(laws, 
     steep = any(gain.name == "p" for gain in space.gains)
     assert steep == smooth or (laws in MIXED and not steep)  # some of these have no sign
     start = space.encode(space.values(cascade))
+    amplifier = CurrentAmplifier(1e3) if cascade.current.commands == "current" else None
+    world = dataclasses.replace(WORLD, amplifier=amplifier)
 
     def loss(x):
-        value = amb.rollout(space.decode(x, cascade), WORLD, CLOCK, fold=Rms("e_z"), every=0).measured
+        value = amb.rollout(space.decode(x, cascade), world, CLOCK, fold=Rms("e_z"), every=0).measured
         return value, value
 
     points = start + np.random.default_rng(4).uniform(-DECADES, DECADES, (POINTS, len(space)))

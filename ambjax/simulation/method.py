@@ -68,12 +68,14 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
     which jumps at every sample, they cannot, and the explicit method is cheaper.
 
     `reverse`: choose a method with a fixed number of steps, which supports reverse mode: RK4, or RODAS3 with equal
-    substeps. A jump of a disturbance inside such a step causes an error of about 3e-8 m per m/s^2 on smooth gains.
+    substeps. A jump of a disturbance inside such a step causes an error of about 3e-8 m per m/s^2 on smooth gains. An
+    amplifier that controls the current, in continuous time, always gets such a method.
 
     Raises ValueError as `slopes` does.
     """
     named = slopes(cascade, scenario)
     slope = max(named.values())
+    reverse = reverse or _fixed_only(cascade, scenario)
     if cascade.processor is not None:
         settled = math.ceil(sample_period * named[COILS] / SETTLED)
         amplifier = scenario.amplifier
@@ -96,6 +98,11 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
     return AdaptiveRodas3(max(tolerance, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps)))
 
 
+def _fixed_only(cascade: Cascade, scenario: Scenario) -> bool:
+    """Return whether the loop requires a fixed number of steps: XLA aborts when it compiles the adaptive method."""
+    return cascade.processor is None and scenario.drive == "current"
+
+
 def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: bool = False) -> Clock:
     """Return `clock` with an integration method that is valid for the cascade and the scenario.
 
@@ -107,6 +114,11 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
     """
     if clock.method is None:
         clock = clock.with_method(choose_method(cascade, scenario, float(clock.sample_period), reverse=reverse))
+    elif isinstance(clock.method, AdaptiveRodas3) and _fixed_only(cascade, scenario):
+        raise ValueError(
+            f"clock.method = {clock.method}: an amplifier that controls the current requires fixed steps in continuous "
+            "time. Use dt = 'auto', or method = 'rodas3' with a dt."
+        )
     elif clock.method.limit is not None:
         _check_limit(clock, clock.method.limit, cascade, scenario)
     if cascade.processor is None or (cuts := most_inside(scenario, clock.sample_period)) is None:
