@@ -124,7 +124,7 @@ def parser() -> Parser:
     meaning = "compile the C and compare it with JAX; exit code 1 if they differ"
     export.add_argument("--verify", action="store_true", help=meaning)
     meaning = "C type of all numbers of a C package (default: float); an FMU always has double"
-    export.add_argument("--precision", choices=["float", "double"], default="float", help=meaning)
+    export.add_argument("--precision", choices=["float", "double"], help=meaning)
     export.add_argument("--prefix", metavar="NAME", help="prefix of all names in the C code (default: the case's name)")
     page = command("page", "write one HTML file with sliders that runs the loop of a case in a browser", case=True)
     meaning = "another preset: a case that differs in numbers only (repeatable)"

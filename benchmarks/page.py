@@ -67,7 +67,7 @@ def measure(tab: browser.Tab, path: pathlib.Path) -> dict[str, object]:
 
 
 def busy(tab: browser.Tab) -> float:
-    """Return the CPU time of the tasks of the page's main thread, s."""
+    """Return the CPU time (s) that the main thread of the page has used."""
     metrics = tab.call("Performance.getMetrics")["metrics"]
     return next(one["value"] for one in metrics if one["name"] == "TaskDuration")
 

@@ -289,6 +289,8 @@ def test_a_command_writes_the_fmu_and_its_reference(elsewhere, tmp_path, capsys,
         main(["export", str(case), "--out", str(out), "--format", "fmu", "--fmi", "4"])
     assert main(["export", str(case), "--out", str(out), "--fmi", "2"]) == 2
     assert "--fmi 2: it is for --format fmu" in capsys.readouterr().err
+    assert main(["export", str(case), "--out", str(out), "--format", "fmu", "--precision", "float"]) == 2
+    assert "--precision float: an FMU computes in double" in capsys.readouterr().err
     monkeypatch.setenv("CC", "no-such-compiler")
     assert main(["export", str(case), "--out", str(out), "--format", "fmu"]) == 2
     assert "there is no C compiler (no-such-compiler)" in capsys.readouterr().err

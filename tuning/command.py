@@ -3,6 +3,7 @@
 import argparse
 import pathlib
 import tomllib
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -90,7 +91,7 @@ def _tune(plan: TuningPlan, args: argparse.Namespace) -> tuple[int, Row]:
             _write_front(part, plan.out, answer, facts)
         if args.page:
             _write_page(part, answer.problem.case, args.case)
-    _print(plan.out, facts, quiet=args.json)
+    _print(plan.out, facts, (*WRITTEN, NAME) if args.page else WRITTEN, quiet=args.json)
     return int(not facts.outcome["good"]), plain(facts.table) | {"out": str(plan.out)}
 
 
@@ -192,13 +193,13 @@ def _laws(problem: TuningProblem, tuned: dict[str, float]) -> dict[str, float]:
     return dict(zip(everything.paths, everything.values(problem.case.cascade).tolist(), strict=True)) | tuned
 
 
-def _print(out: pathlib.Path, facts: TuningFacts, *, quiet: bool) -> None:
+def _print(out: pathlib.Path, facts: TuningFacts, names: Sequence[str], *, quiet: bool) -> None:
     """Print the verdict, the gains and the files (not if `quiet`), and the advice if a requirement is not met."""
     if not quiet:
         print(facts.verdict)
         for row in facts.gains:
             bound = f" ({row['at_bound']})" if row["at_bound"] else ""
             print(f"  {row['path']}: {row['before']:.6g} -> {row['after']:.6g}{bound}")
-        written(out, f"{', '.join(WRITTEN)}, *.png")
+        written(out, f"{', '.join(names)}, *.png")
     if not facts.outcome["good"]:
         say(facts.advice)

@@ -83,6 +83,8 @@ def _plan(case: Case, args: argparse.Namespace) -> Plan:
     prefix = _prefix(args.prefix, case.name)
     if args.fmi is not None and args.format != "fmu":
         raise ValueError(f"--fmi {args.fmi}: it is for --format fmu. Add --format fmu, or omit --fmi.")
+    if args.precision == "float" and args.format == "fmu":
+        raise ValueError("--precision float: an FMU computes in double. Omit --precision, or use --format c.")
     fmi = (args.fmi or 3) if args.format == "fmu" else 0
     if args.verify:
         machine.check()
@@ -92,7 +94,7 @@ def _plan(case: Case, args: argparse.Namespace) -> Plan:
     mark = texts.MARK.format(p=prefix)
     names = FMU_NAMES[: 1 if _holds_fmu(out, prefix, mark) else None] if fmi else package.NAMES
     spare(out, [*(name.format(p=prefix) for name in names), *VERIFIED], mark)
-    return Plan(block, fmi, args.precision, prefix, origin, mark, out)
+    return Plan(block, fmi, args.precision or "float", prefix, origin, mark, out)
 
 
 def _holds_fmu(out: pathlib.Path, prefix: str, mark: str) -> bool:
