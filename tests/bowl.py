@@ -24,6 +24,8 @@ FLOOR, DURATION = 1e-4, 0.02
 S_0 = 5e-3
 # Relative excess of its gradient in reverse mode, so that a test can distinguish it from that in forward mode.
 REVERSE = 1e-9
+# Logarithm of the last gain, relative to the best one, below which rare members have large errors.
+RARE_FROM = 0.3
 # Of the imaginary parts that carry derivatives, which are exact: they are never subtracted.
 TINY = 1e-30
 
@@ -39,6 +41,8 @@ class World:
     """whether the integration of a member stalls: by seed, number, and whether steps are accurate"""
     bias: Callable[[int], float] = lambda substeps: 0.0
     """relative error of the settled error, by number of substeps"""
+    rare: Callable[[int, int], float] = lambda seed, number: 0.0
+    """slope of the error of a member below a logarithm of -RARE_FROM of the last gain: by seed and number"""
     chaos: float = 0.0
     """size of an error of every derivative, with a sign that changes from point to point"""
     louder: float = 1.0
@@ -71,14 +75,18 @@ class Bowl:
         if along is not None:
             logs = logs + 1j * TINY * np.where(np.arange(x.shape[1]) == along, slopes, 0.0)
         away = logs - np.log(self.world.best)
-        each = zip(*(np.asarray(one).tolist() for one in (members.seed, members.member, members.stressed)), strict=True)
-        limits = np.log([self.world.limit(*one, self.accurate) for one in each])
+        which = (members.seed, members.member, members.stressed)
+        numbered = list(zip(*(np.asarray(one).tolist() for one in which), strict=True))
+        limits = np.log([self.world.limit(*one, self.accurate) for one in numbered])
         beyond = logs[:, :1] - limits
         beyond = np.where(beyond.real > 0, beyond, 0.0)
         nothing = 0.0 * beyond
         # voltage grows with the last gain, and is a tenth of the limit where that is best
         each = {"tracking": FLOOR * (1 + (away**2).sum(axis=1)), "effort": 0.01 * np.exp(2 * away[:, -1])}
         each = {name: term[:, None] + nothing for name, term in each.items()} | {"survival": 1 - np.exp(-beyond)}
+        slope = np.array([self.world.rare(*one[:2]) for one in numbered])
+        below = -RARE_FROM - away[:, -1:]
+        each["tracking"] = each["tracking"] + FLOOR * (slope * np.where(below.real > 0, below, 0.0)) ** 2
         terms = {name: each.get(name, nothing) for name in TERMS}
         quantities = dict.fromkeys(self.objective.loss.measures, 200 * each["effort"] ** 0.5)
         if "rms_error_m" in quantities:

@@ -895,6 +895,20 @@ SEARCH = [
         "tests/test_tuning_front.py::test_the_point_chosen_holds_as_many_members_and_limits_as_the_least_error",
     ),
     M(
+        "members of rare large errors do not join",
+        "tuning/search/front.py",
+        "more = _rare(course, numbers, columns)",
+        "more = None",
+        "tests/test_tuning_front.py::test_members_of_rare_large_errors_join_the_search",
+    ),
+    M(
+        "the search goes on from where members of large errors were unknown",
+        "tuning/search/front.py",
+        "x = chosen([*seen, *points], factor).x",
+        "pass",
+        "tests/test_tuning_front.py::test_members_of_rare_large_errors_join_the_search",
+    ),
+    M(
         "the limit by which the front is traced is a requirement",
         "tuning/report/limit_table.py",
         "for limit in problem.limits if limit.source != FRONT}",

@@ -7,16 +7,17 @@ import math
 
 import numpy as np
 import pytest
-from bowl import FLOOR, S_0, World, document, study
+from bowl import FLOOR, RARE_FROM, S_0, World, document, study
 from texts import case_and_tune
 from tomlkit import dumps
 
 import tuning.command
 from ambjax.cases.reader import read_case
+from tuning.config import seeds
 from tuning.objective.limits import FRONT
 from tuning.problem import problem_of
 from tuning.report import front_table, limit_table
-from tuning.search.front import FrontPoint, chosen
+from tuning.search.front import KNEE, FrontPoint, chosen
 from tuning.search.rounds import rounds
 
 BOUNDLESS = {"controller": {"position": {"c": [1.0, 1000.0], "k": [0.1, 1000.0]}}}
@@ -72,6 +73,21 @@ def test_the_knee_is_the_least_voltage_within_25_percent_of_the_least_error(ran)
     for row in facts["front"]:
         law = read_case(folder / row["file"]).cascade.position
         assert {"controller.position.c": law.c, "controller.position.k": law.k} == row["gains"]
+
+
+def test_members_of_rare_large_errors_join_the_search(monkeypatch, tmp_path):
+    """One of ten validation members limits the voltage, and none of the training members do."""
+    slope, validation = 100.0, seeds(case_and_tune(document())[1].budget)[1]
+    world = World(rare=lambda seed, number: slope if (seed, number) == (validation, 3) else 0.0)
+    problem = study(monkeypatch, world, objective="knee", front=1, bounds=BOUNDLESS)
+    answer = rounds(problem, problem.tune.space.values(problem.case.cascade), tmp_path, {}, False)
+    # at the knee b^2 + slope^2 (-b - RARE_FROM)^2 / 10 = KNEE^2 - 1, where b is the logarithm of the last gain
+    share = slope**2 / 10
+    roots = np.roots([1 + share, 2 * share * RARE_FROM, share * RARE_FROM**2 - KNEE**2 + 1])
+    knee = min(answer.front, key=lambda one: one.volts)
+    # the tolerances of the test above
+    assert knee.volts == pytest.approx(20 * math.exp(roots.min()), rel=0.06)
+    assert knee.error_m <= KNEE * answer.front[0].error_m
 
 
 def test_least_error_traces_no_front_without_pareto(ran):

@@ -61,9 +61,9 @@ class Members(NamedTuple):
         """The members that are not stressed."""
         return jax.tree.map(lambda a: a[: self.ordinary], self)
 
-    def joined(self, others: "Members") -> "Members":
-        """Return these members and `others`. The others become stressed, and come before the stressed members here."""
-        more, n = others._replace(stressed=np.ones(len(others.stressed), bool)), self.ordinary
+    def joined(self, others: "Members", stressed: bool = True) -> "Members":
+        """Return these members and `others`, which become `stressed` or not, and come before the stressed ones here."""
+        more, n = others._replace(stressed=np.full(len(others.stressed), stressed)), self.ordinary
         return jax.tree.map(lambda a, b: np.concatenate([a[:n], b, a[n:]]), self, more)
 
     def part(self, share: int, held: int | None = None) -> "Members":

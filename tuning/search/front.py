@@ -1,12 +1,13 @@
 """The front of error against voltage, and its knee: the least voltage of all answers nearly as good as the best.
 
 From the answer of least error e, searches minimise the rms voltage with the rms error limited to a factor times e; each
-begins at the best answer before. The factor of the knee is KNEE.
+begins at the best answer before. The factor of the knee is KNEE. At a low voltage the error of a few members may be
+many times that of the others. Such validation members join the training ensemble, and the search is repeated.
 """
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from ambjax.commands.outputs import say
 from tuning.config import seeds
 from tuning.judge import held, judge, rms
 from tuning.objective.limits import FRONT
+from tuning.objective.members import Members
 from tuning.search.course import Course, SearchResult
 from tuning.search.multipliers import judged_members, met, reached, searched
 from tuning.search.validation import validated
@@ -22,9 +24,12 @@ from tuning.search.validation import validated
 # Error limit of the knee, and those of the front in the order in which tune.front adds them, relative to the least.
 KNEE = 1.25
 FACTORS = (KNEE, 1.1, 1.5, 1.05, 2.0)
-# Largest numbers of searches for a point, with an update of the multipliers between two, and of answers that are
-# validated.
-UPDATES, TRIES = 4, 4
+# Largest numbers of searches for a point, with an update of the multipliers or new members between two, and of answers
+# that are validated.
+UPDATES, TRIES = 6, 4
+# If the error of the judge exceeds the one that the search expects by more than the share RARE, the training ensemble
+# lacks the members of large errors, and the MOST_JOINING worst ones join it.
+RARE, MOST_JOINING = 0.1, 8
 
 
 class FrontPoint(NamedTuple):
@@ -54,7 +59,7 @@ def traced(course: Course, answer: SearchResult) -> SearchResult:
     voltage. Raises ValueError as `Course.search` does.
     """
     course.problem, x = answer.problem, answer.x
-    least, _ = _judged(course, 1.0, x)
+    least, *_ = _judged(course, 1.0, x)
     if not (math.isfinite(least.error_m) and least.error_m > 0 and least.volts > 0):
         say("no front: the answer of least error holds no member, or has no error or voltage")
         return answer
@@ -64,7 +69,7 @@ def traced(course: Course, answer: SearchResult) -> SearchResult:
             break
         say(f"front: least rms voltage with an rms error of at most {factor:g} times the least, {least.error_m:.3g} m")
         course.problem = answer.problem.towards_voltage(least.error_m, least.volts, factor)
-        seen += _searched(course, factor, chosen(seen, factor).x)
+        seen += _searched(course, factor, seen)
     taken = answer
     if answer.problem.tune.objective == "knee" and not course.interrupted:
         course.problem = answer.problem.towards_voltage(least.error_m, least.volts, KNEE)
@@ -90,13 +95,17 @@ def chosen(seen: Sequence[FrontPoint], factor: float) -> FrontPoint:
     return min(fit, key=lambda point: point.volts, default=least)
 
 
-def _searched(course: Course, factor: float, x: np.ndarray) -> list[FrontPoint]:
-    """Search from x [m] for the least voltage within the limits. Return the answers after each update."""
-    points = []
+def _searched(course: Course, factor: float, seen: Sequence[FrontPoint]) -> list[FrontPoint]:
+    """Search for the least voltage within the limits from the best point in `seen`. Return the answer of each search.
+
+    After each search either the multipliers are updated, or members join the training ensemble; then the next search
+    begins at the best point so far.
+    """
+    points, x = list[FrontPoint](), chosen(seen, factor).x
     for _ in range(UPDATES):
         course.limit_searches += 1
         x, _ = course.search(x[None])
-        point, numbers = _judged(course, factor, x)
+        point, numbers, columns = _judged(course, factor, x)
         points.append(point)
         limits = tuple(limit.updated(*pair) for limit, pair in zip(course.problem.limits, numbers, strict=True))
         say(f"judged {point.volts:.4g} V at an rms error of {point.error_m:.3g} m")
@@ -106,8 +115,32 @@ def _searched(course: Course, factor: float, x: np.ndarray) -> list[FrontPoint]:
             for limit, (_, judged) in both
         ):
             break
-        course.problem = course.problem.limited(limits)
+        more = _rare(course, numbers, columns)
+        if more is None:
+            course.problem = course.problem.limited(limits)
+        else:
+            say("validation members of large errors join the training ensemble; the search is repeated")
+            course.members = course.members.joined(more, stressed=False)
+            x = chosen([*seen, *points], factor).x
     return points
+
+
+def _rare(course: Course, numbers: Sequence[tuple[float, float]], columns: Mapping[str, np.ndarray]) -> Members | None:
+    """Return the validation members of the largest errors that are to join; None if the search expects such errors.
+
+    `numbers`: the values of the search and of the judge for each limit. `columns` [N]: metrics of the judged members.
+    """
+    problem, budget = course.problem, course.problem.tune.budget
+    limit, (tuned, judged) = next(
+        (limit, pair) for limit, pair in zip(problem.limits, numbers, strict=True) if limit.name == "rms_error_m"
+    )
+    if not budget.validation or limit.holds(judged) or judged <= (1 + RARE) * limit.ratio * tuned:
+        return None
+    seed, error = seeds(budget)[1], np.where(held(columns), columns["settled_rms_error_m"], -math.inf)
+    error[course.members.member[course.members.seed == seed]] = -math.inf
+    worst = np.argsort(-error, kind="stable")[:MOST_JOINING]
+    worst = worst[np.isfinite(error[worst])]
+    return problem.objective.chosen(seed, worst, len(error)) if worst.size else None
 
 
 def _valid(course: Course, answer: SearchResult, seen: list[FrontPoint]) -> SearchResult:
@@ -126,10 +159,12 @@ def _valid(course: Course, answer: SearchResult, seen: list[FrontPoint]) -> Sear
     return answer
 
 
-def _judged(course: Course, factor: float, x: np.ndarray) -> tuple[FrontPoint, list[tuple[float, float]]]:
+def _judged(
+    course: Course, factor: float, x: np.ndarray
+) -> tuple[FrontPoint, list[tuple[float, float]], dict[str, np.ndarray]]:
     """Judge x [m] on members of the validation ensemble, or of the training ensemble without one.
 
-    Returns the point, and each limit's value of the search and of the judge.
+    Returns the point, each limit's value of the search and of the judge, and the metrics of the members judged.
     """
     problem, budget = course.problem, course.problem.tune.budget
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
@@ -143,4 +178,4 @@ def _judged(course: Course, factor: float, x: np.ndarray) -> tuple[FrontPoint, l
     within = all(limit.holds(each[limit.name]) for limit in problem.limits if limit.source != FRONT)
     lost, stalled = (int(columns[name].sum()) for name in ("lost", "stalled"))
     point = FrontPoint(factor, x, error, volts, each.get("sensitivity"), lost, stalled, len(alive), within)
-    return point, list(zip(tuned, values, strict=True))
+    return point, list(zip(tuned, values, strict=True)), columns
