@@ -895,6 +895,13 @@ SEARCH = [
         "tests/test_tuning_front.py::test_the_point_chosen_holds_as_many_members_and_limits_as_the_least_error",
     ),
     M(
+        "a search that stays within the limits is repeated",
+        "tuning/search/multipliers.py",
+        "or (not moved and holding(limits, numbers))",
+        "",
+        "tests/test_tuning_limits.py::test_a_search_that_stays_at_an_optimum_within_the_limits_ends",
+    ),
+    M(
         "members of rare large errors do not join",
         "tuning/search/front.py",
         "more = _rare(course, numbers, columns)",

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import math
 import tomllib
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,8 @@ from tuning.objective.risk import Mean
 from tuning.problem import REFINEMENT, problem_of
 from tuning.report.limit_table import MORE
 from tuning.report.pictures import amplitudes
+from tuning.search.course import Course, training
+from tuning.search.multipliers import limited
 from tuning.search.rounds import rounds
 
 # The voltage of a Bowl is proportional to k: 20 V at the best k, 60, and 10 V at k = 30.
@@ -298,6 +301,17 @@ def test_a_limit_that_is_far_costs_nothing(monkeypatch, tmp_path):
 def test_what_the_judge_finds_counts(monkeypatch, tmp_path):
     _, (_, k) = found(monkeypatch, tmp_path, World(louder=1.25), **TEN)
     assert k == pytest.approx(30.0 / 1.25, rel=0.012)
+
+
+def test_a_search_that_stays_at_an_optimum_within_the_limits_ends(monkeypatch):
+    """The judged voltage of 20 V is within the limit, but nearer than the margin; another search changes nothing."""
+    problem = study(monkeypatch, World(), limits={"rms_u_V": 20 / 0.9995, "margin": 0.002})
+    course, starts = Course(problem, training(problem), 1), []
+    course.past.append(SimpleNamespace(interrupted=False))
+    monkeypatch.setattr(course, "search", lambda points: (starts.append(points) or points[0], 0.0))
+    best = np.asarray(problem.objective.space.encode(np.array(World.best)))
+    np.testing.assert_array_equal(limited(course, best), best)
+    assert len(starts) == 1
 
 
 def test_a_limited_study_that_is_resumed_ends_alike(monkeypatch, tmp_path):

@@ -18,7 +18,7 @@ from tuning.judge import held, judge, rms
 from tuning.objective.limits import FRONT
 from tuning.objective.members import Members
 from tuning.search.course import Course, SearchResult
-from tuning.search.multipliers import judged_members, met, reached, searched
+from tuning.search.multipliers import holding, judged_members, met, reached, searched
 from tuning.search.validation import validated
 
 # Error limit of the knee, and those of the front in the order in which tune.front adds them, relative to the least.
@@ -104,7 +104,8 @@ def _searched(course: Course, factor: float, seen: Sequence[FrontPoint]) -> list
     points, x = list[FrontPoint](), chosen(seen, factor).x
     for _ in range(UPDATES):
         course.limit_searches += 1
-        x, _ = course.search(x[None])
+        start = x
+        x, _ = course.search(start[None])
         point, numbers, columns = _judged(course, factor, x)
         points.append(point)
         limits = tuple(limit.updated(*pair) for limit, pair in zip(course.problem.limits, numbers, strict=True))
@@ -114,6 +115,8 @@ def _searched(course: Course, factor: float, seen: Sequence[FrontPoint]) -> list
             met(limit, judged) or (not limit.multiplier and limit.log_excess(judged) <= 0)
             for limit, (_, judged) in both
         ):
+            break
+        if np.array_equal(x, start) and holding(limits, numbers):
             break
         more = _rare(course, numbers, columns)
         if more is None:

@@ -32,10 +32,11 @@ AVERAGING_MEMBERS = 256
 def limited(course: Course, x: np.ndarray) -> np.ndarray:
     """Update the multipliers at x [m] and search again until every limit is met. Return the last optimum [m].
 
-    Returns x itself if no search was needed. There are at most MOST_UPDATES updates. They end early after Ctrl-C, or
-    if a larger penalty makes no progress towards a limit; whether the limit holds is then judged on the held-out
-    members. `course.problem` receives the updated limits.
+    Returns x itself if no search was needed. There are at most MOST_UPDATES updates. They end early after Ctrl-C, if
+    the search does not leave an optimum that is within all limits, or if a larger penalty makes no progress towards a
+    limit; whether the limit holds is then judged on the held-out members. `course.problem` receives the updated limits.
     """
+    moved = True
     for _ in range(MOST_UPDATES):
         before = course.problem.limits
         numbers = _numbers(course, x)
@@ -53,11 +54,18 @@ def limited(course: Course, x: np.ndarray) -> np.ndarray:
             if not (idle and done[-1]):
                 limit = f"limit {after.name} = {after.threshold:g} {after.kind.unit}"
                 say(f"{limit}: judged {judged:.4g}")
-        if course.interrupted or all(done):
+        if course.interrupted or all(done) or (not moved and holding(limits, numbers)):
             break
         course.limit_searches += 1
-        x, _ = course.search(x[None])
+        start = x
+        x, _ = course.search(start[None])
+        moved = not np.array_equal(x, start)
     return x
+
+
+def holding(limits: Sequence[Limit], numbers: Sequence[tuple[float, float]]) -> bool:
+    """Return whether the judge's values are within all limits, without margins. `numbers`: as of `_numbers`."""
+    return all(limit.holds(judged) for limit, (_, judged) in zip(limits, numbers, strict=True))
 
 
 def _stuck(limit: Limit, judged: float) -> bool:
