@@ -2402,16 +2402,16 @@ INJECTION = [
     ),
     M(
         "the sliding step takes the injected wave for none",
-        "ambjax/linear/injection.py",
+        "ambjax/linear/member_responses.py",
         "None if isinstance(clock.method, Slide) else clock.method",
         "clock.method",
         "tests/test_injection.py::test_continuous_time_is_the_linear_analysis[smooth]",
     ),
     M(
         "members that are lost under the injected wave count",
-        "ambjax/linear/injection.py",
-        "kept = code == ALIVE",
-        "kept = code >= ALIVE",
+        "ambjax/linear/member_responses.py",
+        "code == ALIVE, amplitude",
+        "code >= ALIVE, amplitude",
         "tests/test_injection.py::test_true_signs_under_noise_and_a_lost_rotor",
     ),
 ]

@@ -16,7 +16,7 @@ from ambjax.control import current as current_laws
 from ambjax.control import inversion, position
 from ambjax.control.observer import Kalman
 from ambjax.control.processor import Processor
-from ambjax.linear import Zones, injected, linearise, lines, peak
+from ambjax.linear import Zones, injected, injected_members, linearise, lines, peak
 from ambjax.linear.multisine import multisine
 from ambjax.simulation.sliding import Slide
 
@@ -160,6 +160,23 @@ def test_true_signs_under_noise_and_a_lost_rotor():
     lost = injected(cascade, noisy(1e-8, u_max=1e-3), clock, f, amplitude=1e-7, members=8, settle=4)
     assert (lost.lost, lost.members) == (8, 8)
     assert lost.S is lost.T is lost.KS is lost.peak is lost.peak_low is None
+
+
+@pytest.mark.slow
+def test_each_member_of_a_spread_has_its_own_peak():
+    """Errors as in continuous time above. The last member has no voltage and loses the rotor."""
+    cascade, clock, f = Cascade(**SMOOTH, processor=Processor(0.0)), Clock(4000, T), [20.0, 50.0, 100.0]
+    masses = np.array([0.5, 0.588, 0.7, 0.588])
+    plants = [dataclasses.replace(Scenario().plant, m=m) for m in (masses, *masses[:3])]
+    scenario = Scenario(plant=plants[0], member=np.arange(4), u_max=np.array([200.0, 200.0, 200.0, 1e-9]))
+    found = injected_members(cascade, scenario, clock, f, amplitude=1e-6)
+    assert found.lost.tolist() == [False, False, False, True]
+    assert found.peak[3] == math.inf
+    for k, plant in enumerate(plants[1:]):
+        S = np.abs(linearise(cascade, Scenario(plant=plant), clock).sensitivity(np.asarray(f)))
+        assert found.peak[k] == pytest.approx(S.max(), rel=1e-3)
+        assert found.frequency[k] == f[S.argmax()]
+    assert np.ptp(found.peak[:3]) > 0.1
 
 
 def test_a_slow_observer_starts_at_rest_whatever_the_noise():

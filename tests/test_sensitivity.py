@@ -7,7 +7,8 @@ import pytest
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
-from ambjax.linear import analyse, linearise
+from ambjax.commands.sensitivity_report import _measured_numbers, _measured_text
+from ambjax.linear import MemberPeaks, Zones, analyse, linearise
 from ambjax.pictures.frequency import MeasuredPoints, NamedLoop, figure_of
 from ambjax.simulation.metrics import standard_for
 from ambjax.simulation.rollout import rollout
@@ -156,6 +157,24 @@ def test_the_injected_peak_stands_beside_the_linear_one(tmp_path, capsys):
     assert "Injected at the velocity sensor into the simulation (multi-sine of 0.0265 m/s)" in out
     assert "|S| peaks at 2.712 at 40 Hz; the linear value there is 2.694." in out
     assert summary["injected_velocity_frequency_hz"] == 40.0
+
+
+def test_the_measured_members_are_counted_by_zone():
+    """A peak at the limit of zone A is not in it; a lost rotor is the worst member and has no peak."""
+    held = MemberPeaks(np.array([2.9, 3.0, 2.5]), np.full(3, 40.0), np.zeros(3, bool))
+    assert _measured_numbers(held, Zones()) == {
+        "injected_zone_a": 2,
+        "injected_lost": 0,
+        "injected_worst_member": 1,
+        "injected_worst_peak": 3.0,
+        "injected_worst_frequency_hz": 40.0,
+    }
+    text = "Injected into each of the 3 members: 2 are in zone A; the largest peak is 3 at 40 Hz, of member 1."
+    assert _measured_text(held, Zones()) == text
+    lost = MemberPeaks(np.array([2.9, np.inf, 2.5]), np.full(3, 40.0), np.array([False, True, False]))
+    assert _measured_numbers(lost, Zones())["injected_worst_peak"] is None
+    text = "Injected into each of the 3 members: 2 are in zone A; 1 lose the rotor, first member 1."
+    assert _measured_text(lost, Zones()) == text
 
 
 def test_the_picture_shows_the_injected_points(tmp_path):

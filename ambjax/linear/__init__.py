@@ -10,12 +10,12 @@ A test signal e is added to the reading of the position sensor, after low-pass a
 in continuous time. S is the transfer function from e to the reading that the controller receives, T = S - 1 that from e
 to the sensor's own reading, and KS that from e to u.
 
-`injected` measures S, T and KS in the nonlinear simulation.
+`injected` measures S, T and KS in the nonlinear simulation, `injected_members` the peak of |S| of each member.
 """
 
 from ambjax.linear.analysis import Analysis, Zones, analyse, linearise, linearise_members, prepared
 from ambjax.linear.differentiable import LoopQuantities, loop_quantities
-from ambjax.linear.injection import Injection, injected, lines
+from ambjax.linear.injection import Injection, MemberPeaks, injected, injected_members, lines
 from ambjax.linear.margins import Margins, ResponsePeak, margins_of, noise_gain, peak
 from ambjax.linear.matrices import loop_matrices
 from ambjax.linear.state_space import INPUTS, OUTPUTS, StateSpace
@@ -27,11 +27,13 @@ __all__ = [
     "Injection",
     "LoopQuantities",
     "Margins",
+    "MemberPeaks",
     "ResponsePeak",
     "StateSpace",
     "Zones",
     "analyse",
     "injected",
+    "injected_members",
     "linearise",
     "linearise_members",
     "lines",

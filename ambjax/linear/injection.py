@@ -8,26 +8,17 @@ noise, limits and the true signs.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble.batching import map_members
 from ambjax.linear.analysis import Zones
-from ambjax.linear.equilibrium import ideal, reading
-from ambjax.linear.multisine import MultiSine, Reading, Response, multisine, with_wave
-from ambjax.numerics.records import canonical
+from ambjax.linear.member_responses import Responses, member_responses
+from ambjax.linear.multisine import Reading
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.rollout import prepare, run
-from ambjax.simulation.sliding import Slide
-from ambjax.simulation.trajectory import ALIVE
-from ambjax.world.scenario import Initial, Scenario
-from ambjax.world.signals import Constant
+from ambjax.world.scenario import Scenario
 
-# Default amplitude of e, as a share of the gap s_0; at the velocity sensor, of s_0 times the plant's pole.
-AMPLITUDE = 0.01
 # Number of logarithmically spaced lines; number of lines near a peak, and their range as multiples of its frequency.
 LINES, NEAR, AROUND = 30, 11, (0.75, 1.33)
 
@@ -113,83 +104,46 @@ def injected(
             f"injection.reading = 'z_dot': the observer {type(cascade.observer).__name__} estimates the velocity and "
             "reads no velocity sensor. Inject at 'z'."
         )
-    usual = AMPLITUDE * float(scenario.plant.s_0) * (float(scenario.plant.pole) if reading == "z_dot" else 1.0)
-    amplitude = usual if amplitude is None else float(amplitude)
-    if not amplitude > 0:
-        raise ValueError(f"injection.amplitude = {amplitude:g}: it must be above 0.")
-    if members < 1 or settle < 0 or periods < 1:
-        raise ValueError(
-            f"injection: members = {members}, settle = {settle}, periods = {periods}: members and periods must be at "
-            "least 1, settle at least 0."
-        )
-    wave = multisine(_harmonics(frequencies, clock), clock.samples, float(clock.sample_period), amplitude, reading)
-    random = scenario.random
-    cascade, scenario = _at_rest(cascade, scenario, r)
+    if members < 1:
+        raise ValueError(f"injection: members = {members}: it must be at least 1.")
     scenario = dataclasses.replace(scenario, seed=seed, member=np.arange(members))
-    skip = settle * clock.samples
-    method = None if isinstance(clock.method, Slide) else clock.method
-    longer = dataclasses.replace(clock, samples=skip + periods * clock.samples, method=method)
-    system, longer = prepare(cascade, scenario, longer)
-    response = Response(_tiled(wave, members), scenario.u_max, skip)
-    sums, code = map_members(_member, canonical((system, longer, response)))
-    kept = code == ALIVE
-    e = float(wave.size) * np.exp(1j * np.asarray(wave.phases))
-    S, KS = ((x[kept, 0] + 1j * x[kept, 1]) / e for x in (sums.read, sums.u))
-    frequency = np.asarray(wave.harmonics) / float(clock.duration)
-    return _summary(frequency, S, KS, sums.saturated[kept], members, amplitude, confidence, random)
+    one = member_responses(cascade, scenario, clock, frequencies, reading, amplitude, r, settle, periods)
+    return _summary(one, members, confidence, scenario.random)
 
 
-def _member(tree: Any) -> tuple[Any, Any]:
-    """Return the `FourierSums` and the status code of one member."""
-    system, clock, response = tree
-    outcome = run(with_wave(system, response.wave), clock, response, 0)
-    return outcome.measured, outcome.trajectory.lost_code
+class MemberPeaks(NamedTuple):
+    """Measured peaks of |S| of the members of an ensemble [N]: `peak` (inf if lost), `frequency` (Hz), `lost`."""
+
+    peak: np.ndarray
+    frequency: np.ndarray
+    lost: np.ndarray
 
 
-def _tiled(wave: MultiSine, members: int) -> MultiSine:
-    """Return the wave with its arrays [L] repeated for each member, [N, L]."""
-    harmonics, phases = (np.tile(x, (members, 1)) for x in (wave.harmonics, wave.phases))
-    return dataclasses.replace(wave, harmonics=harmonics, phases=phases)
+def injected_members(
+    cascade: Cascade,
+    scenario: Scenario,
+    clock: Clock,
+    frequencies: Sequence[float] | np.ndarray,
+    *,
+    amplitude: float | None = None,
+    r: float = 0.0,
+    periods: int = 4,
+) -> MemberPeaks:
+    """Measure the peak of |S| of each member of an ensemble at rest at the constant reference r (m).
+
+    The other arguments are those of `member_responses`. Each member is measured once, with its own noise, over
+    `periods` periods of the multi-sine. The noise makes the peak of a member too large rather than too small. Raises
+    ValueError as `injected` does.
+    """
+    one = member_responses(cascade, scenario, clock, frequencies, amplitude=amplitude, r=r, periods=periods)
+    size = np.where(one.held[:, None], np.abs(one.S), np.inf)
+    return MemberPeaks(size.max(axis=1), one.frequency[size.argmax(axis=1)], ~one.held)
 
 
-def _at_rest(cascade: Cascade, scenario: Scenario, r: float) -> tuple[Cascade, Scenario]:
-    """Return cascade and scenario that start at rest at the constant reference r (m), without disturbances."""
-    initial = Initial(r, 0.0, float(scenario.plant.equilibrium(r)[0]))
-    scenario = dataclasses.replace(scenario.undisturbed(), reference=Constant(r), initial=initial)
-    inversion = cascade.inversion.started(cascade.model.equilibrium(r)[0])
-    # The observer does not start at the first measurement: a slow observer would keep its noise as an initial error.
-    rest = initial.measurement()
-    z = reading(ideal(scenario), rest, (0.0, 0.0)).z
-    return dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started(z)), scenario
-
-
-def _harmonics(frequencies: Sequence[float] | np.ndarray, clock: Clock) -> np.ndarray:
-    """Return the harmonics [L] of 1/duration nearest to the frequencies (Hz), sorted, each once."""
-    f, base = np.asarray(frequencies, float), 1 / float(clock.duration)
-    harmonics = np.unique(np.round(f / base))
-    if not harmonics.size or not np.isfinite(f).all() or harmonics[0] < 1 or harmonics[-1] >= clock.samples / 2:
-        raise ValueError(
-            f"injection.frequencies: they must be at least {base:g} Hz, one period of {clock.samples} samples, "
-            f"and below {0.5 / float(clock.sample_period):g} Hz, half the sampling rate. Change them or clock.samples."
-        )
-    if harmonics[-1] * clock.samples > np.iinfo(jnp.result_type(int)).max:
-        raise ValueError(
-            f"clock.samples = {clock.samples}: a period is too long for the integers of JAX. Set JAX_ENABLE_X64=1."
-        )
-    return harmonics.astype(int)
-
-
-def _summary(
-    frequency: np.ndarray,
-    S: np.ndarray,
-    KS: np.ndarray,
-    saturated: np.ndarray,
-    members: int,
-    amplitude: float,
-    confidence: float,
-    random: bool,
-) -> Injection:
-    """Return the means over the M members that did not lose the rotor: of S and KS [M, L], and saturated [M]."""
+def _summary(one: Responses, members: int, confidence: float, random: bool) -> Injection:
+    """Return the means over the members that did not lose the rotor."""
+    frequency, amplitude = one.frequency, one.amplitude
+    S, KS, saturated = (x[one.held] for x in (one.S, one.KS, one.saturated))
     lost = members - len(S)
     if not len(S):
         return Injection(frequency, None, None, None, None, None, None, None, lost, members, amplitude, None)

@@ -1,5 +1,6 @@
 """Operating points: the linearised loop of a case at an equilibrium, and those of the members of its spread."""
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -7,7 +8,17 @@ import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.ensemble.study import Study
-from ambjax.linear import Analysis, StateSpace, analyse, linearise, linearise_members
+from ambjax.linear import (
+    Analysis,
+    MemberPeaks,
+    StateSpace,
+    analyse,
+    injected_members,
+    linearise,
+    linearise_members,
+    lines,
+)
+from ambjax.simulation.clock import Clock
 
 # Members of [spread] that are analysed unless another number is given.
 MEMBERS = 100
@@ -28,7 +39,7 @@ class SpreadPeaks(NamedTuple):
 
     `members`: number of members analysed. `stable`, `zone_a`: how many of them are stable, and stable in zone A.
     `worst`: index of the member with the largest peak, or of the first one that is not stable. `point`: its loop; None
-    if it has no equilibrium.
+    if it has no equilibrium. `measured`: the peaks of all members by injection; None if they were not measured.
     """
 
     members: int
@@ -36,6 +47,7 @@ class SpreadPeaks(NamedTuple):
     zone_a: int
     worst: int
     point: OperatingPoint | None
+    measured: MemberPeaks | None = None
 
 
 def operating_point(case: Case, name: str, r: float) -> OperatingPoint:
@@ -82,6 +94,19 @@ def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPea
     one = analyses[worst]
     point = None if one is None else OperatingPoint(f"member {worst}", 0.0, float(masses[worst]), loops[worst], one)
     return SpreadPeaks(members, int(good.sum()), int(zone_a), worst, point)
+
+
+def measured_peaks(case: Case, study: Study, peak: float) -> MemberPeaks:
+    """Measure the peak of |S| of each member of the study by injection, at lines denser near `peak` (Hz)."""
+    cascade, scenario = study.batch(np.arange(study.members))
+    clock = one_period(case)
+    return injected_members(cascade, scenario, clock, lines(case.zones, clock, peak))
+
+
+def one_period(case: Case) -> Clock:
+    """Return the clock of one period of the multi-sine of an injection: it contains the lowest frequency once."""
+    period = float(case.clock.sample_period)
+    return dataclasses.replace(case.clock, samples=math.ceil(1 / (float(case.zones.f_low) * period)))
 
 
 def numbers_of(one: Analysis) -> dict[str, object]:

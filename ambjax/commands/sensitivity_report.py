@@ -1,0 +1,176 @@
+"""The summary of `ambjax sensitivity` as plain data, and as text."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ambjax.cases.reader import Case
+from ambjax.commands.outputs import table
+from ambjax.control.base import hard_signs
+from ambjax.control.cascade import USUAL
+from ambjax.linear import Injection, MemberPeaks, Zones
+from ambjax.results.operating import OperatingPoint, SpreadPeaks, numbers_of
+
+
+class Injections(NamedTuple):
+    """The measured sensitivity at the position sensor, and at the velocity sensor; None without that sensor."""
+
+    position: Injection
+    velocity: Injection | None
+
+
+def set_valued(case: Case) -> list[str]:
+    """Return the tables of the laws with set-valued signs on a processor, whose linear loops do not describe them."""
+    if case.cascade.processor is None:
+        return []
+    return [f"controller.{stage}" for stage in USUAL if hard_signs(getattr(case.cascade, stage))]
+
+
+def summary_of(
+    points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injections | None, zones: Zones
+) -> dict[str, object]:
+    """Return the numbers of sensitivity.json: of the equilibria `points`, the spread, and the injection."""
+    rows = [{"point": point.name, "reference_m": point.r, **numbers_of(point.analysis)} for point in points]
+    summary: dict[str, object] = {
+        **numbers_of(points[0].analysis),
+        **_injected_numbers(points[0], measured),
+        "points": rows,
+    }
+    if spread is not None:
+        worst = {} if spread.point is None else numbers_of(spread.point.analysis)
+        counts = {"members": spread.members, "stable": spread.stable, "zone_a": spread.zone_a}
+        summary["spread"] = {**counts, "worst_member": spread.worst, **({"worst": worst} if worst else {})}
+        if spread.measured is not None:
+            summary["spread"] |= _measured_numbers(spread.measured, zones)
+    return summary
+
+
+def _measured_numbers(peaks: MemberPeaks, zones: Zones) -> dict[str, object]:
+    """Return the numbers of the measured peaks of the members; the peak is None if the worst member is lost."""
+    worst = int(np.argmax(peaks.peak))
+    lost = bool(peaks.lost[worst])
+    return {
+        "injected_zone_a": int((peaks.peak < float(zones.zone_a)).sum()),
+        "injected_lost": int(peaks.lost.sum()),
+        "injected_worst_member": worst,
+        "injected_worst_peak": None if lost else float(peaks.peak[worst]),
+        "injected_worst_frequency_hz": None if lost else float(peaks.frequency[worst]),
+    }
+
+
+def _injected_numbers(point: OperatingPoint, measured: Injections | None) -> dict[str, object]:
+    """Return the numbers of the measured sensitivity; None each if it was not measured."""
+    if measured is None:
+        return {"injected_peak": None, "injected_low": None, "injected_high": None}
+    one = measured.position
+    return {
+        "injected_peak": one.peak,
+        "injected_low": one.peak_low,
+        "injected_high": one.peak_high,
+        "injected_frequency_hz": one.peak_frequency,
+        "injected_linear_there": _linear_there(point, one),
+        "injected_amplitude_m": one.amplitude,
+        "injected_members": one.members,
+        "injected_lost": one.lost,
+        "injected_saturated": one.saturated,
+        "injected_velocity_peak": None if measured.velocity is None else measured.velocity.peak,
+        "injected_velocity_frequency_hz": None if measured.velocity is None else measured.velocity.peak_frequency,
+    }
+
+
+def _linear_there(point: OperatingPoint, measured: Injection, channel: int = 0) -> float | None:
+    """Return the linear |S| at the frequency of the injected peak. `channel`: 0 position sensor, 1 velocity sensor."""
+    if measured.peak_frequency is None:
+        return None
+    return float(np.abs(point.system.response(np.array([measured.peak_frequency])))[0, channel, channel])
+
+
+def _injection_text(point: OperatingPoint, measured: Injection, channel: int = 0) -> str:
+    """Describe the measured sensitivity at one sensor in one line. `channel` as in `_linear_there`."""
+    unit, sensor = (("m", ""), ("m/s", " at the velocity sensor"))[channel]
+    how = f"Injected{sensor} into the simulation (multi-sine of {measured.amplitude:.3g} {unit}"
+    how += f", {measured.members} members)" if measured.members > 1 else ")"
+    if measured.peak is None:
+        return f"{how}: the rotor is lost, so no sensitivity can be measured."
+    text = f"{how}: |S| peaks at {measured.peak:.4g} at {measured.peak_frequency:.4g} Hz"
+    if measured.peak_low is not None and measured.members > 1:
+        text += f" (95 % interval {measured.peak_low:.4g} to {measured.peak_high:.4g})"
+    text += f"; the linear value there is {_linear_there(point, measured, channel):.4g}."
+    if measured.lost:
+        text += f" {measured.lost} of {measured.members} members lose the rotor and are left out."
+    if measured.saturated:
+        text += (
+            f" The supply limits u in {100 * measured.saturated:.2g} % of the samples, where the linear values do not"
+        )
+        text += " apply."
+    return text
+
+
+def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injections | None) -> str:
+    """Return the numbers of `summary_of` as a table and sentences."""
+    worst = [spread.point] if spread is not None and spread.point is not None else []
+    head = ("loop", "peak |S|", "at (Hz)", "zone", "peak |T|", "peak |KS| (V/m)", "gain margins")
+    margins = ("phase margin (deg)", "delay margin (s)", "disk margin")
+    rows = [table((*head, *margins), [_row(point) for point in [*points, *worst]]), ""]
+    one, zones = points[0].analysis, case.zones
+    rows += [
+        f"Zones of the peak of |S|: A below {zones.zone_a:g}, B below {zones.zone_b:g}, C below {zones.zone_c:g}, D "
+        "above.",
+        f"Static stiffness: {_number(one.stiffness)} N/m. Rms of z per rms of position noise: {_number(one.noise)}. "
+        f"Largest real part of the poles: {_number(one.poles[0].real)} 1/s.",
+    ]
+    if not one.stable:
+        rows += ["The nominal loop is not stable: the rotor does not stay at this equilibrium."]
+    if measured is not None:
+        rows += [_injection_text(points[0], measured.position)]
+        rows += [] if measured.velocity is None else [_injection_text(points[0], measured.velocity, channel=1)]
+    if spread is not None:
+        rows += [
+            f"Of {spread.members} members of [spread], {spread.stable} are stable and {spread.zone_a} are in zone A; "
+            f"the worst is member {spread.worst}."
+        ]
+        rows += [] if spread.measured is None else [_measured_text(spread.measured, case.zones)]
+    if signs := set_valued(case):
+        rows += [
+            f"{', '.join(signs)}: the signs are set-valued. The linear analysis applies while the signal of each law "
+            "stays inside its band, that is, without chattering."
+        ]
+    if one.S_velocity is not None:
+        larger = "velocity" if one.S_velocity.height > one.S.height else "position"
+        rows += [
+            "The velocity has its own sensor, whose errors |S| of the position sensor leaves out: for them |S| peaks "
+            f"at {one.S_velocity.height:.4g}. The {larger} sensor gives the larger peak."
+        ]
+    return "\n".join(rows)
+
+
+def _measured_text(peaks: MemberPeaks, zones: Zones) -> str:
+    """Describe the measured peaks of the members of the spread in one line."""
+    numbers, members = _measured_numbers(peaks, zones), len(peaks.peak)
+    text = f"Injected into each of the {members} members: {numbers['injected_zone_a']} are in zone A"
+    if peaks.lost.any():
+        return f"{text}; {numbers['injected_lost']} lose the rotor, first member {numbers['injected_worst_member']}."
+    return (
+        f"{text}; the largest peak is {numbers['injected_worst_peak']:.4g} at "
+        f"{numbers['injected_worst_frequency_hz']:.4g} Hz, of member {numbers['injected_worst_member']}."
+    )
+
+
+def _row(point: OperatingPoint) -> tuple[str, ...]:
+    one = point.analysis
+    if not one.stable:
+        return (point.name, "unstable", "-", "D", *["-"] * 6)
+    margins = one.margins
+    gains = f"{_number(margins.gain_low)} to {_number(margins.gain_high)}"
+    return (
+        point.name,
+        *map(_number, (one.S.height, one.S.frequency)),
+        one.zone,
+        *map(_number, (one.T.height, one.KS.height)),
+        gains,
+        *map(_number, (margins.phase_deg, margins.delay, margins.disk)),
+    )
+
+
+def _number(x: float) -> str:
+    return f"{x:.4g}"

@@ -1,0 +1,119 @@
+"""The response of each member of an ensemble to a multi-sine that is injected into the nonlinear simulation."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax.control.cascade import Cascade
+from ambjax.ensemble.batching import map_members
+from ambjax.linear.equilibrium import ideal, reading
+from ambjax.linear.multisine import MultiSine, Reading, Response, multisine, with_wave
+from ambjax.numerics.records import canonical
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.rollout import prepare, run
+from ambjax.simulation.sliding import Slide
+from ambjax.simulation.trajectory import ALIVE
+from ambjax.world.scenario import Initial, Scenario
+from ambjax.world.signals import Constant
+
+# Default amplitude of e, as a share of the gap s_0; at the velocity sensor, of s_0 times the plant's pole.
+AMPLITUDE = 0.01
+
+
+class Responses(NamedTuple):
+    """Measured responses of the members of an ensemble [N] at L lines.
+
+    - `frequency` [L]: lines, Hz.
+    - `S`, `KS` [N, L]: complex; meaningless for members that lost the rotor.
+    - `saturated` [N]: share of the samples with |u| at the limit of the supply.
+    - `held` [N]: whether the rotor was held.
+    - `amplitude`: largest |e|, m or m/s.
+    """
+
+    frequency: np.ndarray
+    S: np.ndarray
+    KS: np.ndarray
+    saturated: np.ndarray
+    held: np.ndarray
+    amplitude: float
+
+
+def member_responses(
+    cascade: Cascade,
+    scenario: Scenario,
+    clock: Clock,
+    frequencies: Sequence[float] | np.ndarray,
+    channel: Reading = "z",
+    amplitude: float | None = None,
+    r: float = 0.0,
+    settle: int = 1,
+    periods: int = 1,
+) -> Responses:
+    """Inject the same multi-sine into each member of an ensemble, whose varying leaves are arrays [N].
+
+    The arguments are those of `injected`, `channel` its `reading`. `scenario.member` [N] are the numbers of the
+    members. Raises ValueError as `injected` does.
+    """
+    gap, pole = (float(np.mean(np.asarray(x))) for x in (scenario.plant.s_0, scenario.plant.pole))
+    amplitude = AMPLITUDE * gap * (pole if channel == "z_dot" else 1.0) if amplitude is None else float(amplitude)
+    if not amplitude > 0:
+        raise ValueError(f"injection.amplitude = {amplitude:g}: it must be above 0.")
+    if settle < 0 or periods < 1:
+        raise ValueError(
+            f"injection: settle = {settle}, periods = {periods}: settle must be at least 0, periods at least 1."
+        )
+    wave = multisine(_harmonics(frequencies, clock), clock.samples, float(clock.sample_period), amplitude, channel)
+    members, skip = len(np.asarray(scenario.member)), settle * clock.samples
+    method = None if isinstance(clock.method, Slide) else clock.method
+    longer = dataclasses.replace(clock, samples=skip + periods * clock.samples, method=method)
+    system, longer = prepare(*_at_rest(cascade, scenario, r), longer)
+    response = Response(_tiled(wave, members), scenario.u_max, skip)
+    sums, code = map_members(_member, canonical((system, longer, response)))
+    e = float(wave.size) * np.exp(1j * np.asarray(wave.phases))
+    S, KS = ((x[:, 0] + 1j * x[:, 1]) / e for x in (sums.read, sums.u))
+    frequency = np.asarray(wave.harmonics) / float(clock.duration)
+    return Responses(frequency, S, KS, sums.saturated, code == ALIVE, amplitude)
+
+
+def _member(tree: Any) -> tuple[Any, Any]:
+    """Return the `FourierSums` and the status code of one member."""
+    system, clock, response = tree
+    outcome = run(with_wave(system, response.wave), clock, response, 0)
+    return outcome.measured, outcome.trajectory.lost_code
+
+
+def _tiled(wave: MultiSine, members: int) -> MultiSine:
+    """Return the wave with its arrays [L] repeated for each member, [N, L]."""
+    harmonics, phases = (np.tile(x, (members, 1)) for x in (wave.harmonics, wave.phases))
+    return dataclasses.replace(wave, harmonics=harmonics, phases=phases)
+
+
+def _at_rest(cascade: Cascade, scenario: Scenario, r: float) -> tuple[Cascade, Scenario]:
+    """Return cascade and scenario that start at rest at the constant reference r (m), without disturbances."""
+    i = scenario.plant.equilibrium(r)[0]
+    initial = Initial(r, 0.0, float(i) if np.ndim(i) == 0 else i)
+    scenario = dataclasses.replace(scenario.undisturbed(), reference=Constant(r), initial=initial)
+    inversion = cascade.inversion.started(cascade.model.equilibrium(r)[0])
+    # The observer does not start at the first measurement: a slow observer would keep its noise as an initial error.
+    rest = initial.measurement()
+    z = reading(ideal(scenario), rest, (0.0, 0.0)).z
+    return dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started(z)), scenario
+
+
+def _harmonics(frequencies: Sequence[float] | np.ndarray, clock: Clock) -> np.ndarray:
+    """Return the harmonics [L] of 1/duration nearest to the frequencies (Hz), sorted, each once."""
+    f, base = np.asarray(frequencies, float), 1 / float(clock.duration)
+    harmonics = np.unique(np.round(f / base))
+    if not harmonics.size or not np.isfinite(f).all() or harmonics[0] < 1 or harmonics[-1] >= clock.samples / 2:
+        raise ValueError(
+            f"injection.frequencies: they must be at least {base:g} Hz, one period of {clock.samples} samples, "
+            f"and below {0.5 / float(clock.sample_period):g} Hz, half the sampling rate. Change them or clock.samples."
+        )
+    if harmonics[-1] * clock.samples > np.iinfo(jnp.result_type(int)).max:
+        raise ValueError(
+            f"clock.samples = {clock.samples}: a period is too long for the integers of JAX. Set JAX_ENABLE_X64=1."
+        )
+    return harmonics.astype(int)
