@@ -66,11 +66,11 @@ def member_responses(
             f"injection: settle = {settle}, periods = {periods}: settle must be at least 0, periods at least 1."
         )
     wave = multisine(_harmonics(frequencies, clock), clock.samples, float(clock.sample_period), amplitude, channel)
-    members, skip = len(np.asarray(scenario.member)), settle * clock.samples
+    skip = settle * clock.samples
     method = None if isinstance(clock.method, Slide) else clock.method
     longer = dataclasses.replace(clock, samples=skip + periods * clock.samples, method=method)
     system, longer = prepare(*_at_rest(cascade, scenario, r), longer)
-    response = Response(_tiled(wave, members), scenario.u_max, skip)
+    response = Response(_split(wave), scenario.u_max, skip)
     sums, code = map_members(_member, canonical((system, longer, response)))
     e = float(wave.size) * np.exp(1j * np.asarray(wave.phases))
     S, KS = ((x[:, 0] + 1j * x[:, 1]) / e for x in (sums.read, sums.u))
@@ -81,14 +81,22 @@ def member_responses(
 def _member(tree: Any) -> tuple[Any, Any]:
     """Return the `FourierSums` and the status code of one member."""
     system, clock, response = tree
+    response = dataclasses.replace(response, wave=_whole(response.wave))
     outcome = run(with_wave(system, response.wave), clock, response, 0)
     return outcome.measured, outcome.trajectory.lost_code
 
 
-def _tiled(wave: MultiSine, members: int) -> MultiSine:
-    """Return the wave with its arrays [L] repeated for each member, [N, L]."""
-    harmonics, phases = (np.tile(x, (members, 1)) for x in (wave.harmonics, wave.phases))
-    return dataclasses.replace(wave, harmonics=harmonics, phases=phases)
+def _split(wave: MultiSine) -> MultiSine:
+    """Return the wave with its arrays [L] as tuples of numbers, which all members of an ensemble share.
+
+    The cosines of the wave are then computed once for all members of a block.
+    """
+    return dataclasses.replace(wave, harmonics=tuple(wave.harmonics), phases=tuple(wave.phases))
+
+
+def _whole(wave: Any) -> MultiSine:
+    """Return the wave of `_split` with arrays [L] again."""
+    return dataclasses.replace(wave, harmonics=jnp.stack(wave.harmonics), phases=jnp.stack(wave.phases))
 
 
 def _at_rest(cascade: Cascade, scenario: Scenario, r: float) -> tuple[Cascade, Scenario]:
