@@ -902,6 +902,20 @@ SEARCH = [
         "tests/test_tuning_limits.py::test_a_search_that_stays_at_an_optimum_within_the_limits_ends",
     ),
     M(
+        "a set-valued sign without a slope needs one for its range",
+        "ambjax/control/current.py",
+        "if context.stepped or self.p is None:",
+        "if context.stepped:",
+        "tests/test_tuning_config.py::test_the_gains_of_explicit_set_valued_signs_have_ranges[sliding-mode]",
+    ),
+    M(
+        "injections take the members with the largest linear peaks though signs are set-valued",
+        "tuning/measured_peaks.py",
+        "order = alive[np.argsort(-size",
+        "order = order[np.argsort(0 * size",
+        "tests/test_tuning_loops.py::test_injections_find_the_members_with_the_largest_measured_peak",
+    ),
+    M(
         "members of rare large errors do not join",
         "tuning/search/front.py",
         "more = _rare(course, numbers, columns)",

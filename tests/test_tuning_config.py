@@ -11,7 +11,9 @@ from ambjax.cases.tune_table import NUMBERS, WEIGHTS, Budget
 from tuning.config import LIMIT, SHARES, read_tune
 from tuning.objective.loss import TERMS
 from tuning.objective.quantities import KINDS
+from tuning.problem import problem_of
 from tuning.search.front import FACTORS
+from tuning.space import tunable
 
 
 def parsed(tune):
@@ -92,3 +94,21 @@ def test_settings_are_those_of_another_case_but_for_its_gains(tmp_path):
     own.write_text("tune = 3\n")
     with pytest.raises(ValueError, match=r"own\.toml: tune = 3"):
         read_tune(own, other)
+
+
+@pytest.mark.parametrize("kind", ["sliding-mode", "integral-sliding-mode", "super-twisting", "utkin-sliding-mode"])
+def test_the_gains_of_explicit_set_valued_signs_have_ranges(kind):
+    """A sign without a slope, on a processor that steps it explicitly; its gains are those of implicit signs."""
+    laws = {"position": {"kind": kind, "p": math.inf}, "inversion": {"p": math.inf}, "current": {"p": math.inf}}
+
+    def found(discretisation):
+        processor = {"delay": 1.0, "discretisation": discretisation}
+        document = {"controller": laws, "processor": processor, "sensor": {"std": 1e-6}, "clock": {"duration": 0.004}}
+        gains = {"gains": [path for path in tunable(case_and_tune(document)[0].cascade) if not path.endswith(".p")]}
+        problem = problem_of(*case_and_tune(document, **gains))
+        return dict(zip(gains["gains"], ((one.low, one.high) for one in problem.ranges), strict=True))
+
+    explicit, implicit = found("explicit"), found("implicit")
+    assert all(0 < low < high < math.inf for low, high in explicit.values())
+    others = explicit.keys() - {"controller.inversion.gamma"}  # whose range is wider for implicit signs
+    assert {path: explicit[path] for path in others} == {path: implicit[path] for path in others}

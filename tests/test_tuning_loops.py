@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 from texts import case_and_tune
 
+from ambjax.linear import analyse, injected, linearise, lines
+from ambjax.results.operating import one_period
+from tuning.measured_peaks import injections
 from tuning.objective.limits import PREFIX
 from tuning.objective.loops import loops
 from tuning.objective.quantities import KINDS, LOOPS
@@ -120,6 +123,50 @@ def test_a_lower_limit_holds_above_it():
     assert term.excess(jnp.full(8, 2e-4)) < 0 < term.excess(jnp.full(8, 0.9e-4))
     # the 16-norm of the inverses is not above the least value
     assert float(term.excess(jnp.array([1e-4] + [1e-3] * 7))) == pytest.approx(limit.log_excess(1e-4), abs=1e-9)
+
+
+@pytest.mark.slow
+def test_injections_find_the_members_with_the_largest_measured_peak():
+    """Set-valued signs without noise: one measurement of each plant, whose order the linear peaks do not tell."""
+    signs = {"position": {"c": 200.0, "k": 30.0}, "inversion": {"gamma": 1e7}, "current": {"k_i": 2000.0}}
+    document = DOCUMENT | {
+        "controller": {stage: law | {"p": math.inf} for stage, law in signs.items()},
+        "processor": {"delay": 1.0},
+        "sensor": {"std": 0.0},
+        "sensitivity": {"f_low": 20.0},
+        "spread": {"plant": {"m": {"percent": 30}}},
+        "tune": DOCUMENT["tune"] | {"gains": PATHS[:1], "bounds": {}},
+    }
+    problem = problem_of(*case_and_tune(document), threads=1)
+    x = problem.objective.space.encode(problem.objective.space.values(problem.case.cascade))
+    count = 6
+    columns = {"loss.limit.sensitivity": np.arange(count)[::-1] + 1.0, "lost_at_s": np.full(count, np.inf)}
+    found = injections(problem, x, 1, columns, most=2)
+    assert found.decides
+    case, masses = problem.case, problem.objective.chosen(1, np.arange(count), count).values["plant.m"]
+    clock = one_period(case)
+    at = lines(case.zones, clock, found_frequency(problem, masses[0]))
+    each = [
+        injected(
+            case.cascade,
+            dataclasses.replace(case.scenario, plant=dataclasses.replace(case.scenario.plant, m=m)),
+            clock,
+            at,
+        )
+        for m in masses
+    ]
+    expected = sorted(range(count), key=lambda k: -each[k].peak)[:2]
+    assert [one.member for one in found.peaks] == expected
+    # the same signal, amplitude and plant, in another program
+    assert [one.peak for one in found.peaks] == pytest.approx([each[k].peak for k in expected], rel=1e-6)
+
+
+def found_frequency(problem, m):
+    """The frequency of the linear peak of a member."""
+    case = problem.case
+    scenario = dataclasses.replace(case.scenario, plant=dataclasses.replace(case.scenario.plant, m=m))
+    system = linearise(case.cascade, scenario, case.clock)
+    return analyse(system, m, float(case.clock.sample_period), case.zones).S.frequency
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +11,18 @@ import numpy as np
 
 from ambjax.control.base import hard_signs
 from ambjax.control.cascade import USUAL
-from ambjax.linear import Analysis, Injection, analyse, injected, linearise, lines
+from ambjax.linear import Analysis, Injection, analyse, linearise, lines
+from ambjax.linear.injection import injection_of
+from ambjax.linear.member_responses import Responses, member_responses
+from ambjax.results.operating import one_period
 from tuning.objective.limits import PREFIX, Limit
 from tuning.problem import TuningProblem
 
-# Members of an ensemble, those with the largest linear peak, into which is injected; repetitions with other noise.
+# Members of an ensemble, those with the largest peak, into which is injected; repetitions with other noise.
 INJECTED, REPETITIONS = 3, 8
+# Members, the first ones, that are measured once to find those with the largest peak, if injections decide. Linear
+# peaks do not tell which these are. One call computes as many in the time of one.
+SCREENED = 64
 # Limited quantities that an injection measures.
 MEASURED = {"sensitivity": "S", "complementary": "T", "control_sensitivity": "KS"}
 
@@ -64,18 +70,34 @@ def decides(problem: TuningProblem) -> bool:
 def injections(
     problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray], most: int = INJECTED
 ) -> Sensitivity | None:
-    """Analyse and measure the members with the largest linear peak at coordinates x [m], of the judged `columns` [N].
+    """Analyse and measure the members with the largest peak at coordinates x [m], of the judged `columns` [N].
 
-    `most`: number of these members. Returns None if no limit needs it, or no member is held.
+    `most`: number of these members. They are those with the largest linear peak or, if injections decide, with the
+    largest peak of one measurement each. Returns None if no limit needs it, or no member is held.
     """
     name = next((name for name in MEASURED if f"loss.{PREFIX}{name}" in columns), None)
     alive = np.flatnonzero(~np.isfinite(columns["lost_at_s"]))
     if name is None or not alive.size:
         return None
-    order = np.argsort(-columns[f"loss.{PREFIX}{name}"][alive], kind="stable")
-    count = len(columns["lost_at_s"])
-    peaks = tuple(_member(problem, x, seed, int(k), count) for k in alive[order[:most]])
-    return Sensitivity(peaks, decides(problem))
+    order = alive[np.argsort(-columns[f"loss.{PREFIX}{name}"][alive], kind="stable")]
+    of = _Judged(problem, x, seed, len(columns["lost_at_s"]))
+    if not injects(problem):
+        return Sensitivity(tuple(_summary(int(k), of.analysis(k), None) for k in order[:most]), False)
+    first = of.analysis(order[0])
+    peak = None if first is None else first.S.frequency
+    if decides(problem):
+        once = of.responses(alive[:SCREENED], 1, peak)
+        size = np.where(once.held, np.abs(once.S).max(axis=1), np.inf)
+        order = alive[np.argsort(-size, kind="stable")]
+    random = problem.objective.scenario.random
+    repetitions = REPETITIONS if random else 1
+    every = of.responses(order[:most], repetitions, peak)
+    peaks = []
+    for at, k in enumerate(order[:most]):
+        own = slice(at * repetitions, (at + 1) * repetitions)
+        parts = {name: getattr(every, name)[own] for name in ("S", "KS", "saturated", "held")}
+        peaks.append(_summary(int(k), of.analysis(k), injection_of(every._replace(**parts), random)))
+    return Sensitivity(tuple(peaks), decides(problem))
 
 
 def reached_of(limit: Limit, columns: Mapping[str, np.ndarray], measured: Sensitivity | None) -> float:
@@ -92,23 +114,38 @@ def reached_of(limit: Limit, columns: Mapping[str, np.ndarray], measured: Sensit
     return max(largest) if measured.decides else max(linear, *largest)
 
 
-def _member(problem: TuningProblem, x: np.ndarray, seed: int, number: int, total: int) -> MeasuredPeak:
-    objective, case, clock = problem.objective, problem.case, problem.case.clock
-    member = jax.tree.map(lambda a: a[0], objective.chosen(seed, np.array([number]), total))
-    cascade, scenario = objective.world(member)
-    cascade = objective.space.decode(jnp.asarray(x), cascade)
-    scenario = dataclasses.replace(scenario, seed=case.scenario.seed, member=case.scenario.member)
-    period = float(clock.sample_period)
-    try:
-        analysis = analyse(linearise(cascade, scenario, clock), scenario.plant.m, period, case.zones)
-    except ValueError:  # no equilibrium
-        analysis = None
-    one: Any = None
-    if injects(problem):
-        longer = dataclasses.replace(clock, samples=math.ceil(1 / (float(case.zones.f_low) * period)))
-        at = lines(case.zones, longer, None if analysis is None else analysis.S.frequency)
-        one = injected(cascade, scenario, longer, at, members=REPETITIONS if scenario.random else 1)
-    return _summary(number, analysis, one)
+class _Judged(NamedTuple):
+    """The members of a judged ensemble of `total` members with this `seed`, at coordinates x [m]."""
+
+    problem: TuningProblem
+    x: np.ndarray
+    seed: int
+    total: int
+
+    def analysis(self, number: int) -> Analysis | None:
+        """Analyse the linearised loop of one member; None if it has no equilibrium."""
+        objective, case = self.problem.objective, self.problem.case
+        member = jax.tree.map(lambda a: a[0], objective.chosen(self.seed, np.array([number]), self.total))
+        cascade, scenario = objective.world(member)
+        cascade = objective.space.decode(jnp.asarray(self.x), cascade)
+        scenario = dataclasses.replace(scenario, seed=case.scenario.seed, member=case.scenario.member)
+        try:
+            system = linearise(cascade, scenario, case.clock)
+        except ValueError:  # no equilibrium
+            return None
+        return analyse(system, scenario.plant.m, float(case.clock.sample_period), case.zones)
+
+    def responses(self, numbers: np.ndarray, repetitions: int, peak: float | None) -> Responses:
+        """Inject into the members `numbers` [n], each `repetitions` times with other noise.
+
+        The lines are denser near `peak` (Hz). The results are in the order of the members.
+        """
+        objective, case = self.problem.objective, self.problem.case
+        members = objective.chosen(self.seed, np.repeat(numbers, repetitions), self.total)
+        cascade, scenario = objective.fixed(self.x, members)
+        scenario = dataclasses.replace(scenario, seed=0, member=np.arange(len(numbers) * repetitions))
+        clock = one_period(case)
+        return member_responses(cascade, scenario, clock, lines(case.zones, clock, peak))
 
 
 def _summary(number: int, analysis: Analysis | None, one: Injection | None) -> MeasuredPeak:

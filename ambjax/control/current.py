@@ -61,7 +61,7 @@ class SlidingMode(CurrentLaw[tuple[()]]):
         return Relay(self.k_i, self.p)
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        if context.stepped:
+        if context.stepped or self.p is None:
             fast = context.w * float(context.model.i_0)
             k_i = authority(context, fast, (0.1, 1e3), "w i_0: the bias current at the pole", "Q_i")
             return {"k_i": k_i, **steepness(context, "k_i")}

@@ -5,7 +5,7 @@ from jax import Array
 
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.laws import PositionLaw
-from ambjax.control.search import Interval, SearchContext, authority, manifold, rate, steepness, switch
+from ambjax.control.search import Interval, SearchContext, manifold, position_switch, rate, steepness
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
@@ -68,11 +68,7 @@ class IntegralSlidingMode(PositionLaw[Array]):
         return jnp.maximum(self.c, jnp.sqrt(self.c_int))
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        if context.stepped:
-            most = context.w**2 * float(context.model.s_0)
-            k = authority(context, most, (1e-3, 0.3), "w^2 s_0: what the magnets accelerate the rotor by", "Q_z")
-        else:
-            k = switch(context, "k", self.p, 100, "Q_z")
+        k = position_switch(context, self.p)
         c_int = rate(context, 1 / 30, 2, "corner sqrt(c_int) from w/30 to 2 w", power=2)
         return {"c": manifold(context), "c_int": c_int, "k": k, **steepness(context, "k")}
 

@@ -8,7 +8,7 @@ from jax import Array
 
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.laws import PositionLaw
-from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
+from ambjax.control.search import Interval, SearchContext, position_switch, rate, steepness
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, safe_sqrt, smooth_root, smooth_sign
@@ -18,14 +18,6 @@ from ambjax.world.signals import Reference
 
 # Speed below which the root of `TerminalSlidingMode` is smoothed, as a share of c l.
 WIDTH = 0.01
-
-
-def _switching(context: SearchContext, p: Scalar) -> Interval:
-    """Return the range of the switching gain k of a position law."""
-    if not context.stepped:
-        return switch(context, "k", p, 100, "Q_z")
-    most = context.w**2 * float(context.model.s_0)
-    return authority(context, most, (1e-3, 0.3), "w^2 s_0: what the magnets accelerate the rotor by", "Q_z")
 
 
 class UtkinState(NamedTuple):
@@ -100,7 +92,7 @@ class UtkinSlidingMode(PositionLaw[Array]):
         return {
             "k_p": rate(context, 1 / 30, 3, "corner sqrt(k_p) from w/30 to 3 w", power=2),
             "k_d": rate(context, 1 / 10, 10, "rate k_d from w/10 to 10 w"),
-            "k": _switching(context, self.p),
+            "k": position_switch(context, self.p),
             **steepness(context, "k"),
         }
 
@@ -176,7 +168,7 @@ class TerminalSlidingMode(PositionLaw[tuple[()]]):
         return {
             "c": rate(context, 1 / 30, 2, "rate from w/30 to 2 w"),
             "l": Interval(1e-3 * size, size, "a thousandth of the gap to the gap"),
-            "k": _switching(context, self.p),
+            "k": position_switch(context, self.p),
             **steepness(context, "k"),
         }
 

@@ -16,7 +16,7 @@ from ambjax.control.manifolds import UtkinSlidingMode as UtkinSlidingMode
 from ambjax.control.pid import PID as PID
 from ambjax.control.pid import FeedbackLinearisation as FeedbackLinearisation
 from ambjax.control.sampling import Relay
-from ambjax.control.search import Interval, SearchContext, authority, manifold, rate, steepness, switch
+from ambjax.control.search import Interval, SearchContext, authority, manifold, position_switch, rate, steepness
 from ambjax.control.state_feedback import StateFeedback as StateFeedback
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share, twist
@@ -73,11 +73,7 @@ class SlidingMode(PositionLaw[tuple[()]]):
         return self.c
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        if context.stepped:
-            most = context.w**2 * float(context.model.s_0)
-            k = authority(context, most, (1e-3, 0.3), "w^2 s_0: what the magnets accelerate the rotor by", "Q_z")
-        else:
-            k = switch(context, "k", self.p, 100, "Q_z")
+        k = position_switch(context, self.p)
         return {"c": manifold(context), "k": k, **steepness(context, "k")}
 
     def step(
@@ -138,7 +134,7 @@ class SuperTwisting(PositionLaw[Array]):
         return self.c
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        if context.stepped:
+        if context.stepped or self.p is None:
             return {"c": manifold(context), **self._authorities(context)}
         root, integral = float(self.p) ** 0.5, TWO_OVER_PI * float(self.p)
         return {

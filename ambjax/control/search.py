@@ -78,6 +78,14 @@ def authority(context: SearchContext, size: Scalar, share: tuple[float, float], 
     return Interval(max(low, 2 * below), max(high, 200 * below), words)
 
 
+def position_switch(context: SearchContext, p: Scalar | None) -> Interval:
+    """Return the range of the switching gain k of a position law. `p`: steepness of its sign; None: set-valued."""
+    if p is not None and not context.stepped:
+        return switch(context, "k", p, 100, "Q_z")
+    most = context.w**2 * float(context.model.s_0)
+    return authority(context, most, (1e-3, 0.3), "w^2 s_0: what the magnets accelerate the rotor by", "Q_z")
+
+
 def steepness(context: SearchContext, name: str) -> dict[str, Interval]:
     """Return the range of the steepness p of a sign with the gain `name`, on a processor; in continuous time none."""
     if not context.stepped:

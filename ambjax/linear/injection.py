@@ -108,7 +108,7 @@ def injected(
         raise ValueError(f"injection: members = {members}: it must be at least 1.")
     scenario = dataclasses.replace(scenario, seed=seed, member=np.arange(members))
     one = member_responses(cascade, scenario, clock, frequencies, reading, amplitude, r, settle, periods)
-    return _summary(one, members, confidence, scenario.random)
+    return injection_of(one, scenario.random, confidence)
 
 
 class MemberPeaks(NamedTuple):
@@ -140,8 +140,12 @@ def injected_members(
     return MemberPeaks(size.max(axis=1), one.frequency[size.argmax(axis=1)], ~one.held)
 
 
-def _summary(one: Responses, members: int, confidence: float, random: bool) -> Injection:
-    """Return the means over the members that did not lose the rotor."""
+def injection_of(one: Responses, random: bool, confidence: float = 0.95) -> Injection:
+    """Return the means over the members that did not lose the rotor.
+
+    `random`: whether the members differ in the noise. `confidence`: as in `injected`.
+    """
+    members = len(one.held)
     frequency, amplitude = one.frequency, one.amplitude
     S, KS, saturated = (x[one.held] for x in (one.S, one.KS, one.saturated))
     lost = members - len(S)

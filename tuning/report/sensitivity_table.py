@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 from ambjax.host.web_page import table
-from tuning.measured_peaks import Sensitivity, injects
+from tuning.measured_peaks import SCREENED, Sensitivity, injects
 from tuning.problem import TuningProblem
 
 Facts = dict[str, Any]
@@ -44,9 +44,10 @@ def section(found: Facts | None) -> list[str]:
     if found["injected"]:
         head += ["injected peak", "95 % interval", "at (Hz)", "zone", "saturated"]
     a, b, c = found["zones"]
-    words = [
-        f"The held-out members with the largest linear peaks. Zone A is below {a:g}, B below {b:g}, C below {c:g}."
-    ]
+    which = "The held-out members with the largest linear peaks."
+    if found["decides"]:
+        which = f"Of up to {SCREENED} held-out members, those with the largest peak of one injection each."
+    words = [f"{which} Zone A is below {a:g}, B below {b:g}, C below {c:g}."]
     if found["decides"]:
         words.append("A sign is set-valued: the injected peak decides, because no linear loop describes chattering.")
     elif found["injected"]:
