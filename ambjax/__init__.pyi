@@ -6,6 +6,8 @@ from ambjax._version import __version__ as __version__
 from ambjax.cases.controller_file import save_controller as save_controller
 from ambjax.cases.reader import Case as Case
 from ambjax.cases.reader import read_case as read_case
+from ambjax.commands.case_export import ExportedCase as ExportedCase
+from ambjax.commands.case_export import export as export
 from ambjax.control import current as current
 from ambjax.control import inversion as inversion
 from ambjax.control import observer as observer

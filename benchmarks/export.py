@@ -18,12 +18,12 @@ import cortex
 import numpy as np
 
 from ambjax import Cascade, current, inversion, observer, position
+from ambjax.codegen.c99 import machine
+from ambjax.codegen.c99.package import written
+from ambjax.codegen.c99.source import Origin
+from ambjax.codegen.controller import controller_of
+from ambjax.codegen.trace import trace
 from ambjax.control.processor import Processor
-from ambjax.export.c99 import machine
-from ambjax.export.c99.package import written
-from ambjax.export.c99.source import Origin
-from ambjax.export.controller import controller_of
-from ambjax.export.trace import trace
 
 HARD = np.inf
 NOW, LATER = Processor(1.0, predict=False), Processor(1.0)

@@ -7,11 +7,11 @@ import pytest
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
+from ambjax.codegen.controller import controller_of
+from ambjax.codegen.trace import trace
 from ambjax.commands import compare
-from ambjax.commands.export import guarded_for
+from ambjax.commands.case_export import guarded_for
 from ambjax.ensemble.study import Study
-from ambjax.export.controller import controller_of
-from ambjax.export.trace import trace
 from ambjax.host import extensions
 from ambjax.linear import analyse, linearise
 from ambjax.pictures.comparison import Contender, figure_of

@@ -8,8 +8,8 @@ import pytest
 
 from ambjax import AdaptiveRodas3, Cascade, Clock, Initial, Plant, Processor, Scenario, rollout, with_method
 from ambjax.cases.reader import case_from
+from ambjax.codegen.controller import controller_of
 from ambjax.control import current, inversion, observer, position
-from ambjax.export.controller import controller_of
 from ambjax.linear import injected, linearise, loop_matrices
 from ambjax.simulation.integrate import FixedSteps
 from ambjax.world.amplifier import CurrentAmplifier

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+import types
 from typing import Any
 
 import jax
@@ -17,24 +18,25 @@ import pytest
 from profiles import THOROUGH, examples
 from texts import piped
 
+import ambjax
 from ambjax import RK4, Cascade, Clock, Plant, Scenario, Sensor, Sine
 from ambjax.__main__ import main
 from ambjax.cases.template_text import template
-from ambjax.commands.export import VERIFIED
+from ambjax.codegen.c99 import machine
+from ambjax.codegen.c99.machine import Compiled, build
+from ambjax.codegen.c99.package import files
+from ambjax.codegen.c99.source import Origin, Writer
+from ambjax.codegen.c99.texts import MARK
+from ambjax.codegen.controller import controller_of
+from ambjax.codegen.interface import StepInputs
+from ambjax.codegen.trace import arguments, trace
+from ambjax.codegen.twins import LoopCase
+from ambjax.codegen.verify import Check, draft, verify
+from ambjax.commands.case_export import VERIFIED
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.guard import Guard
 from ambjax.control.processor import Processor
-from ambjax.export.c99 import machine
-from ambjax.export.c99.machine import Compiled, build
-from ambjax.export.c99.package import files
-from ambjax.export.c99.source import Origin, Writer
-from ambjax.export.c99.texts import MARK
-from ambjax.export.controller import controller_of
-from ambjax.export.interface import StepInputs
-from ambjax.export.trace import arguments, trace
-from ambjax.export.twins import LoopCase
-from ambjax.export.verify import draft, verify
 from ambjax.extend import PositionLaw
 from ambjax.numerics.records import gain, record
 from ambjax.paper import readings
@@ -453,6 +455,35 @@ def test_the_directory_compiles_and_tests_itself(case, tmp_path, capsys):
     done = subprocess.run(["make", "test"], cwd=tmp_path / "c", capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "100 of 100 steps agree with JAX" in done.stdout
+
+
+def test_export_is_the_command_as_a_function(case, tmp_path, capsys):
+    assert main(["export", str(case), "--out", str(tmp_path / "c")]) == 0
+    exported = ambjax.export(ambjax.read_case(case))
+    assert exported.ok is None
+    assert contents(exported.write(tmp_path / "python")) == contents(tmp_path / "c")
+    assert "written: " + str(tmp_path / "c") + "/" + ", ".join(exported.files) in capsys.readouterr().out
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "Makefile").write_text("all:")
+    with pytest.raises(ValueError, match="Makefile exists, is not from an export"):
+        exported.write(tmp_path / "mine")
+    for option, message in (({"what": "loops"}, "what = 'loops'"), ({"fmi": 4}, "fmi = 4"), ({"fmi": 2}, "--fmi 2")):
+        with pytest.raises(ValueError, match=message):
+            ambjax.export(exported.plan.case, **option)
+
+
+def test_an_export_has_the_record_of_its_verification(case, tmp_path, monkeypatch):
+    """The checks themselves are those of tests/test_export_verify.py."""
+    bad = Check("one step, numbers", "float", "0.1 at 2 points", "<1e-5", False)
+    monkeypatch.setattr("ambjax.commands.case_export.verify.draft", lambda *_: types.SimpleNamespace(files={"a": "b"}))
+    monkeypatch.setattr("ambjax.commands.case_export.verify.verify", lambda *_: [bad])
+    exported = ambjax.export(ambjax.read_case(case), verify=True)
+    assert (exported.ok, exported.checks) == (False, [bad])
+    assert list(exported.files) == ["a", *VERIFIED]
+    assert json.loads(exported.files["verify.json"])["checks"] == [bad._asdict()]
+    assert "<td>&lt;1e-5</td><td>FAILS</td>" in exported._repr_html_()
+    assert main(["export", str(case), "--verify", "--out", str(tmp_path / "c")]) == 1
+    assert contents(tmp_path / "c") == {name: text.encode() for name, text in exported.files.items()}
 
 
 def contents(out):

@@ -15,14 +15,14 @@ from ambjax import RK4, Clock, Constant, Pulse, Sensor, Sine, rollout
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
-from ambjax.export.c99.source import Origin
-from ambjax.export.fmi.cross_check import stepped
-from ambjax.export.of_case import block_of, blocks_of
-from ambjax.export.plant_step import plant_of
-from ambjax.export.series import series
-from ambjax.export.trace import arguments
-from ambjax.export.twins import LoopCase
-from ambjax.export.verify import draft, verify
+from ambjax.codegen.c99.source import Origin
+from ambjax.codegen.fmi.cross_check import stepped
+from ambjax.codegen.of_case import block_of, blocks_of
+from ambjax.codegen.plant_step import plant_of
+from ambjax.codegen.series import series
+from ambjax.codegen.trace import arguments
+from ambjax.codegen.twins import LoopCase
+from ambjax.codegen.verify import draft, verify
 from ambjax.simulation.integrate import FixedSteps
 from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.trajectory import TOUCHED
@@ -62,7 +62,7 @@ def test_the_loops_steps_are_the_simulators(name):
     outputs, bits = stepped(block, np.array([x[port] for port in block.inputs]).T)
     rows = rollout(cascade, scenario, clock.with_method(block.plant.method)).trajectory.rows
     found = dict(zip(block.outputs, outputs.T, strict=True))
-    # 100 samples of hard signs, in which rounding (1e-20 m) grows by a few decades (ambjax/export/twins.py)
+    # 100 samples of hard signs, in which rounding (1e-20 m) grows by a few decades (ambjax/codegen/twins.py)
     np.testing.assert_allclose(found["z_true"], rows.z[:count], rtol=0, atol=1e-13)
     np.testing.assert_allclose(found["z"], rows.z_measured[:count], rtol=0, atol=1e-13)
     np.testing.assert_allclose(found["u"], rows.u[:count], rtol=0, atol=1e-6)

@@ -12,11 +12,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from jax import lax
 
-from ambjax.export.c99.statements import Statements
-from ambjax.export.emitter import traced
-from ambjax.export.primitives import OPS, SAME
-from ambjax.export.program import PRECISIONS, Location, Program, Ref
-from ambjax.export.trace import precision
+from ambjax.codegen.c99.statements import Statements
+from ambjax.codegen.emitter import traced
+from ambjax.codegen.primitives import OPS, SAME
+from ambjax.codegen.program import PRECISIONS, Location, Program, Ref
+from ambjax.codegen.trace import precision
 
 UNARY = {
     **{name: getattr(jnp, name) for name in ("exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "floor", "ceil")},

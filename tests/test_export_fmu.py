@@ -13,15 +13,15 @@ from test_export_blocks import rig
 from ambjax import Cascade, Processor, Scenario, rollout
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
-from ambjax.export.c99.source import Origin
-from ambjax.export.fmi.archive import packed, sources
-from ambjax.export.fmi.cross_check import files_of
-from ambjax.export.fmi.description import description, variables
-from ambjax.export.fmi.si_units import exponents
-from ambjax.export.of_case import block_of, blocks_of
-from ambjax.export.series import series
-from ambjax.export.trace import trace
-from ambjax.export.twins import LoopCase, horizons
+from ambjax.codegen.c99.source import Origin
+from ambjax.codegen.fmi.archive import packed, sources
+from ambjax.codegen.fmi.cross_check import files_of
+from ambjax.codegen.fmi.description import description, variables
+from ambjax.codegen.fmi.si_units import exponents
+from ambjax.codegen.of_case import block_of, blocks_of
+from ambjax.codegen.series import series
+from ambjax.codegen.trace import trace
+from ambjax.codegen.twins import LoopCase, horizons
 from ambjax.simulation.clock import Clock
 
 ORIGIN = Origin("test", "0" * 64, [])
@@ -193,7 +193,7 @@ def test_controller_and_plant_in_a_loop_are_simulates(version, name, tmp_path):
     z, u = looped(*units, x, count, period, at_once="at once" in name)
     rows = rollout(cascade, scenario, clock).trajectory.rows
     close(*units)
-    # the farthest of eight twins, one unit in the last place apart, bounds what rounding does (ambjax/export/twins.py)
+    # the farthest of eight twins, one unit in the last place apart, bounds what rounding does (ambjax/codegen/twins.py)
     assert np.all(np.abs(z - rows.z[:count]) <= 2 * horizon.parted["z"][:count] + 1e-18)
     assert np.all(np.abs(u - rows.u[:count]) <= 2 * horizon.parted["u"][:count] + 1e-12)
     assert np.ptp(rows.z[:count]) > 1e-6

@@ -11,13 +11,13 @@ from test_export_blocks import CASES
 from test_export_emitter import EDGES, LOOSE, listed
 
 from ambjax import rollout
-from ambjax.export.block import Block
-from ambjax.export.javascript.script import HELPERS, script, script_of
-from ambjax.export.of_case import blocks_of
-from ambjax.export.points import points
-from ambjax.export.reference import results
-from ambjax.export.series import series
-from ambjax.export.trace import trace
+from ambjax.codegen.block import Block
+from ambjax.codegen.javascript.script import HELPERS, script, script_of
+from ambjax.codegen.of_case import blocks_of
+from ambjax.codegen.points import points
+from ambjax.codegen.reference import results
+from ambjax.codegen.series import series
+from ambjax.codegen.trace import trace
 
 pytestmark = with_node
 
@@ -109,7 +109,7 @@ def test_the_loop_is_the_simulators(name, tmp_path):
     found = run_rows(script_of(block, "block") + LOOP, np.array([x[name] for name in block.inputs]).T, tmp_path).T
     rows = rollout(cascade, scenario, clock).trajectory.rows
     z, u = (found[list(block.outputs).index(name)] for name in ("z_true", "u"))
-    # 200 samples of hard signs: rounding (1e-16 of 5e-5 m) grows by a few decades; see ambjax/export/twins.py
+    # 200 samples of hard signs: rounding (1e-16 of 5e-5 m) grows by a few decades; see ambjax/codegen/twins.py
     np.testing.assert_allclose(z, rows.z[:count], rtol=0, atol=1e-12)
     assert np.ptp(z) > 1e-6
     np.testing.assert_allclose(u, rows.u[:count], rtol=0, atol=1e-5)

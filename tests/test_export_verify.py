@@ -13,18 +13,18 @@ from test_export import PERIOD, compiled, drafts, failed, hard
 
 from ambjax import RK4, Clock, Scenario, Sensor, Sine
 from ambjax.cases.reader import read_case
+from ambjax.codegen import closed_loop
+from ambjax.codegen.c99 import machine
+from ambjax.codegen.c99.machine import Compiled
+from ambjax.codegen.interface import INPUTS
+from ambjax.codegen.numbering import UNREAD
+from ambjax.codegen.points import evaluated
+from ambjax.codegen.trace import arguments
+from ambjax.codegen.twins import LEAST, PARTED, SIGNALS, Horizon, LoopCase, Twin, _count, farthest
+from ambjax.codegen.verify import Check, _looped, _stepped, holds, summary, table, verify
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.guard import guarded
 from ambjax.control.processor import Processor
-from ambjax.export import closed_loop
-from ambjax.export.c99 import machine
-from ambjax.export.c99.machine import Compiled
-from ambjax.export.interface import INPUTS
-from ambjax.export.numbering import UNREAD
-from ambjax.export.points import evaluated
-from ambjax.export.trace import arguments
-from ambjax.export.twins import LEAST, PARTED, SIGNALS, Horizon, LoopCase, Twin, _count, farthest
-from ambjax.export.verify import Check, _looped, _stepped, holds, summary, table, verify
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled
 from ambjax.world.faults import Dropouts, Outliers

@@ -15,7 +15,7 @@ ROOT = pathlib.Path(__file__).parent.parent
 # The layers (floors) of each package, the lowest first: each is a folder, or a module beside these folders. A module
 # imports only from lower layers or from its own, without a cycle.
 FLOORS = {
-    "ambjax": "_version compiler numerics host world control simulation extend export theorem ensemble linear paper "
+    "ambjax": "_version compiler numerics host world control simulation extend codegen theorem ensemble linear paper "
     "pictures cases results page commands __init__ __main__",
     "tuning": "space optimisers objective config problem delay_test measured_peaks judge search report command "
     "from_python __init__ __main__",

@@ -11,15 +11,15 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.reader import Case, read_case
+from ambjax.codegen.controller import controller_of
+from ambjax.codegen.trace import trace
+from ambjax.commands.case_export import guarded_for
 from ambjax.commands.comparison_report import Compared, markdown, summary_of, text
 from ambjax.commands.ensemble import study_of
-from ambjax.commands.export import guarded_for
 from ambjax.commands.outputs import directory, files, plain, say, write_json, written
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
-from ambjax.export.controller import controller_of
-from ambjax.export.trace import trace
 from ambjax.host.extensions import extension
 from ambjax.host.web_page import page
 from ambjax.linear.state_space import StateSpace

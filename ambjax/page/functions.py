@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ambjax.export.emitter import traced
-from ambjax.export.javascript.script import HELPERS, number
-from ambjax.export.primitives import OPS
-from ambjax.export.program import Location, Operand, Program, Ref
+from ambjax.codegen.emitter import traced
+from ambjax.codegen.javascript.script import HELPERS, number
+from ambjax.codegen.primitives import OPS
+from ambjax.codegen.program import Location, Operand, Program, Ref
 
 # Definitions of the functions that the statements use and JavaScript lacks.
 PRELUDE = "\n".join(f"const {name} = {text};" for name, text in HELPERS.items())

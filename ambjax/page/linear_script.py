@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.cases.reader import Case
+from ambjax.codegen.trace import precision
 from ambjax.control.cascade_state import CascadeState, Sample
-from ambjax.export.trace import precision
 from ambjax.linear.equilibrium import Point, at_rest, ideal, reading, sizes_of, start_of
 from ambjax.numerics.records import canonical
 from ambjax.page.functions import function_source, piece_of

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from ambjax.cases.reader import Case
-from ambjax.export.trace import precision
+from ambjax.codegen.trace import precision
 from ambjax.numerics.records import canonical
 from ambjax.page.functions import function_source, loop_source, operands_of, piece_of
 from ambjax.page.loop_functions import LoopFunctions, numbers_of

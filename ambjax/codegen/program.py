@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ambjax.export.primitives import OPS
+from ambjax.codegen.primitives import OPS
 
 # Largest number of operations of a step. A longer step comes from an unrolled loop that is too long for a processor.
 MOST = 40_000

@@ -6,9 +6,9 @@ from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 from ambjax._version import __version__
-from ambjax.export.fmi.si_units import exponents
-from ambjax.export.numbering import UNREAD, Number
-from ambjax.export.trace import Trace
+from ambjax.codegen.fmi.si_units import exponents
+from ambjax.codegen.numbering import UNREAD, Number
+from ambjax.codegen.trace import Trace
 
 STATUS = "status"
 

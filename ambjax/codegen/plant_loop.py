@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.export.c99.machine import Compiled
-from ambjax.export.closed_loop import LoopComparison, times_of
-from ambjax.export.controller import Controller, controller_of
-from ambjax.export.series import series
-from ambjax.export.trace import arguments
-from ambjax.export.twins import LoopCase, horizons
+from ambjax.codegen.c99.machine import Compiled
+from ambjax.codegen.closed_loop import LoopComparison, times_of
+from ambjax.codegen.controller import Controller, controller_of
+from ambjax.codegen.series import series
+from ambjax.codegen.trace import arguments
+from ambjax.codegen.twins import LoopCase, horizons
 
 # Computes the controller's voltage (V) from readings and reference, [7], and keeps its state.
 Law = Callable[[np.ndarray], float]

@@ -12,8 +12,8 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
-from ambjax.export.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal
-from ambjax.export.program import Operand, Program, Ref, of
+from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal
+from ambjax.codegen.program import Operand, Program, Ref, of
 
 LOOPS = ("scan", "while")
 COMPOSED = ("rsqrt", "exp2", "logistic")

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.codegen.block import Block
+from ambjax.codegen.of_case import block_of
+from ambjax.codegen.series import series
+from ambjax.codegen.trace import arguments, precision
 from ambjax.control.cascade import Cascade
-from ambjax.export.block import Block
-from ambjax.export.of_case import block_of
-from ambjax.export.series import series
-from ambjax.export.trace import arguments, precision
 from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import Scenario
 

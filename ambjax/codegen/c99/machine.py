@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.export.points import Points
-from ambjax.export.program import PRECISIONS
-from ambjax.export.reference import Results
-from ambjax.export.trace import Trace
+from ambjax.codegen.points import Points
+from ambjax.codegen.program import PRECISIONS
+from ambjax.codegen.reference import Results
+from ambjax.codegen.trace import Trace
 
 STRICT = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic", "-Werror"]
 EXACT = "-ffp-contract=off"

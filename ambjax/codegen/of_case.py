@@ -1,10 +1,10 @@
 """The blocks of a case: its controller, its plant, and both as one loop."""
 
+from ambjax.codegen.block import Block
+from ambjax.codegen.controller import controller_of
+from ambjax.codegen.loop_step import loop_of
+from ambjax.codegen.plant_step import plant_of
 from ambjax.control.cascade import Cascade
-from ambjax.export.block import Block
-from ambjax.export.controller import controller_of
-from ambjax.export.loop_step import loop_of
-from ambjax.export.plant_step import plant_of
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.integrate import FixedSteps
 from ambjax.simulation.method import choose_method

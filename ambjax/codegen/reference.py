@@ -15,9 +15,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 from jax.typing import ArrayLike
 
-from ambjax.export.points import Points
-from ambjax.export.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal
-from ambjax.export.trace import Trace, arguments, precision
+from ambjax.codegen.points import Points
+from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal
+from ambjax.codegen.trace import Trace, arguments, precision
 
 
 class Results(NamedTuple):

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ambjax.export.numbering import UNREAD
-from ambjax.export.program import PRECISIONS, Ref
-from ambjax.export.trace import Trace
+from ambjax.codegen.numbering import UNREAD
+from ambjax.codegen.program import PRECISIONS, Ref
+from ambjax.codegen.trace import Trace
 
 # Decades around the scale of each number; the probabilities that a number is an edge and that a point is a first step.
 DECADES, EDGY, FIRST = (-7.0, 1.7), 0.02, 0.05

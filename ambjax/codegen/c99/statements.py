@@ -5,8 +5,8 @@ from typing import SupportsFloat
 
 import numpy as np
 
-from ambjax.export.primitives import OPS
-from ambjax.export.program import PERIOD, PRECISIONS, STARTED, Operand, Program, Ref
+from ambjax.codegen.primitives import OPS
+from ambjax.codegen.program import PERIOD, PRECISIONS, STARTED, Operand, Program, Ref
 
 # Keywords of C or C++ that are valid names in Python.
 RESERVED = {

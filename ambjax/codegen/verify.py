@@ -7,17 +7,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ambjax.export import closed_loop, plant_loop
-from ambjax.export.block import Block
-from ambjax.export.c99.machine import EXACT, SANITIZED, SHARED, STRICT, Compiled, build, execute, scratch, short
-from ambjax.export.c99.package import SHARE, ULPS, tolerance, written
-from ambjax.export.c99.source import Origin
-from ambjax.export.numbering import SPAN
-from ambjax.export.points import Points, points, varied
-from ambjax.export.program import PRECISIONS
-from ambjax.export.reference import Results, results
-from ambjax.export.trace import Trace, trace
-from ambjax.export.twins import LEAST, PARTED, TWINS, LoopCase
+from ambjax.codegen import closed_loop, plant_loop
+from ambjax.codegen.block import Block
+from ambjax.codegen.c99.machine import EXACT, SANITIZED, SHARED, STRICT, Compiled, build, execute, scratch, short
+from ambjax.codegen.c99.package import SHARE, ULPS, tolerance, written
+from ambjax.codegen.c99.source import Origin
+from ambjax.codegen.numbering import SPAN
+from ambjax.codegen.points import Points, points, varied
+from ambjax.codegen.program import PRECISIONS
+from ambjax.codegen.reference import Results, results
+from ambjax.codegen.trace import Trace, trace
+from ambjax.codegen.twins import LEAST, PARTED, TWINS, LoopCase
 
 # Number of points (states and inputs) at which one step is compared.
 COUNT = 10_000

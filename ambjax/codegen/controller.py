@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.codegen.block import Block, Ports, law_lines, scales
+from ambjax.codegen.interface import BITS, INPUTS, Status, StepInputs, StepOutputs, outputs_of
+from ambjax.codegen.numbering import Number, numbers_of
 from ambjax.control.base import memory_of
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
 from ambjax.control.guard import GAPS, Watch, guarded
-from ambjax.export.block import Block, Ports, law_lines, scales
-from ambjax.export.interface import BITS, INPUTS, Status, StepInputs, StepOutputs, outputs_of
-from ambjax.export.numbering import Number, numbers_of
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.simulation.integrate import choose
 from ambjax.simulation.loop import ClosedLoop

@@ -4,10 +4,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ambjax.export.c99.statements import word
-from ambjax.export.interface import INPUTS
-from ambjax.export.numbering import UNREAD
-from ambjax.export.trace import Trace
+from ambjax.codegen.c99.statements import word
+from ambjax.codegen.interface import INPUTS
+from ambjax.codegen.numbering import UNREAD
+from ambjax.codegen.trace import Trace
 
 
 class About(NamedTuple):

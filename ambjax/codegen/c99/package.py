@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from ambjax.export.block import Block
-from ambjax.export.c99.notes import fixed, notes_of, order_of_work
-from ambjax.export.c99.source import Origin, Writer
-from ambjax.export.c99.statements import literal, word
-from ambjax.export.c99.texts import (
+from ambjax.codegen.block import Block
+from ambjax.codegen.c99.notes import fixed, notes_of, order_of_work
+from ambjax.codegen.c99.source import Origin, Writer
+from ambjax.codegen.c99.statements import literal, word
+from ambjax.codegen.c99.texts import (
     BLOCK_FAULT_TEST,
     BLOCK_START_TEST,
     FAULT_TEST,
@@ -16,10 +16,10 @@ from ambjax.export.c99.texts import (
     START_TEST,
     TEST,
 )
-from ambjax.export.points import Points, points
-from ambjax.export.program import PRECISIONS
-from ambjax.export.reference import Results, results
-from ambjax.export.trace import Trace, trace
+from ambjax.codegen.points import Points, points
+from ambjax.codegen.program import PRECISIONS
+from ambjax.codegen.reference import Results, results
+from ambjax.codegen.trace import Trace, trace
 from ambjax.world.sensor import Measurement
 
 # Points of the test program.

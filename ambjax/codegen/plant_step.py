@@ -15,12 +15,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.cascade import Cascade
-from ambjax.control.cascade_state import Command
-from ambjax.control.processor import MOST_DELAY, Processor
-from ambjax.export.block import Block, Ports, scales
-from ambjax.export.numbering import Number, numbers_of
-from ambjax.export.plant_ports import (
+from ambjax.codegen.block import Block, Ports, scales
+from ambjax.codegen.numbering import Number, numbers_of
+from ambjax.codegen.plant_ports import (
     COORDINATES,
     DISTURBANCES,
     LOSSES,
@@ -29,6 +26,9 @@ from ambjax.export.plant_ports import (
     PlantOutputs,
     PlantStatus,
 )
+from ambjax.control.cascade import Cascade
+from ambjax.control.cascade_state import Command
+from ambjax.control.processor import MOST_DELAY, Processor
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.numerics.smooth import limited
 from ambjax.simulation.between import lags, plant_status

@@ -6,11 +6,11 @@ import platform
 import sys
 import zipfile
 
-from ambjax.export.c99 import machine
-from ambjax.export.c99.source import Origin, Writer
-from ambjax.export.c99.texts import MARK
-from ambjax.export.fmi.description import build_description, description, token
-from ambjax.export.trace import Trace
+from ambjax.codegen.c99 import machine
+from ambjax.codegen.c99.source import Origin, Writer
+from ambjax.codegen.c99.texts import MARK
+from ambjax.codegen.fmi.description import build_description, description, token
+from ambjax.codegen.trace import Trace
 
 SHARED_FILES = ("fmu_core.h", "fmi{}_interface.h", "fmi{}.c")
 # For each system: its name in the folders of binaries of FMI 2.0 and of FMI 3.0, and the ending of a library.
@@ -59,7 +59,7 @@ def sources(traced: Trace, identifier: str, origin: Origin, version: int) -> tup
     - `version`: of FMI, 2 or 3.
     """
     writer = Writer(traced, identifier, origin)
-    home = importlib.resources.files("ambjax.export.fmi")
+    home = importlib.resources.files("ambjax.codegen.fmi")
     names = [name.format(version) for name in SHARED_FILES]
     found = {f"{identifier}.h": writer.header(), f"{identifier}.c": writer.source()}
     found |= {name: (home / name).read_text(encoding="utf-8") for name in names}

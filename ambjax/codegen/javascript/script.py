@@ -6,11 +6,11 @@ from typing import SupportsFloat
 
 import numpy as np
 
-from ambjax.export.block import Block
-from ambjax.export.numbering import Number
-from ambjax.export.primitives import OPS
-from ambjax.export.program import PERIOD, STARTED, Operand, Ref
-from ambjax.export.trace import Trace, trace
+from ambjax.codegen.block import Block
+from ambjax.codegen.numbering import Number
+from ambjax.codegen.primitives import OPS
+from ambjax.codegen.program import PERIOD, STARTED, Operand, Ref
+from ambjax.codegen.trace import Trace, trace
 
 # Functions that the rows of OPS use and `Math` lacks. They treat NaN and the sign of 0 as JAX does.
 HELPERS = {

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.export.block import Block
-from ambjax.export.emitter import traced
-from ambjax.export.numbering import UNREAD, Number
-from ambjax.export.primitives import COUNTED, OPS
-from ambjax.export.program import PERIOD, PRECISIONS, STARTED, Location, Operand, Program, Ref
+from ambjax.codegen.block import Block
+from ambjax.codegen.emitter import traced
+from ambjax.codegen.numbering import UNREAD, Number
+from ambjax.codegen.primitives import COUNTED, OPS
+from ambjax.codegen.program import PERIOD, PRECISIONS, STARTED, Location, Operand, Program, Ref
 from ambjax.numerics.records import canonical
 
 

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ambjax._version import __version__
-from ambjax.export.c99.notes import ABOUT, notes_of
-from ambjax.export.c99.statements import Statements, literal, word
-from ambjax.export.c99.texts import HEADER, MARK, SOURCE
-from ambjax.export.numbering import UNREAD, Number
-from ambjax.export.trace import Trace
+from ambjax.codegen.c99.notes import ABOUT, notes_of
+from ambjax.codegen.c99.statements import Statements, literal, word
+from ambjax.codegen.c99.texts import HEADER, MARK, SOURCE
+from ambjax.codegen.numbering import UNREAD, Number
+from ambjax.codegen.trace import Trace
 
 SLACK = 256  # bytes of a stack frame in addition to its numbers: saved registers, padding
 

@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.codegen.program import PRECISIONS
+from ambjax.codegen.series import just_after
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import Command
 from ambjax.control.guard import Watch
-from ambjax.export.program import PRECISIONS
-from ambjax.export.series import just_after
 from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.integrate import Advanced, Integrator

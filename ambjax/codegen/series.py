@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.codegen.loop_step import LoopInputs
 from ambjax.control.cascade import Cascade
-from ambjax.export.loop_step import LoopInputs
 from ambjax.numerics.gaussian import normals
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.simulation.clock import Clock

@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
+from ambjax.codegen.numbering import Number
 from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import schedules
-from ambjax.export.numbering import Number
 from ambjax.numerics.records import Scalar
 
 # Input or output: name, then unit and meaning.

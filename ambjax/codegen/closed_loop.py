@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.codegen.c99.machine import Compiled
+from ambjax.codegen.interface import BITS, OUTPUTS
+from ambjax.codegen.twins import Horizon, LoopCase, farthest, horizons
 from ambjax.control.cascade_state import Command
-from ambjax.export.c99.machine import Compiled
-from ambjax.export.interface import BITS, OUTPUTS
-from ambjax.export.twins import Horizon, LoopCase, farthest, horizons
 from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop

@@ -6,12 +6,12 @@ from typing import Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.export.block import Block, Ports
-from ambjax.export.controller import Controller, Memory, Parameters
-from ambjax.export.interface import BITS, INPUTS, OUTPUTS, Status, StepInputs, StepOutputs
-from ambjax.export.numbering import Number
-from ambjax.export.plant_ports import DISTURBANCES, LOSSES, READINGS, PlantInputs, PlantOutputs
-from ambjax.export.plant_step import Machine, PlantMemory, PlantStep
+from ambjax.codegen.block import Block, Ports
+from ambjax.codegen.controller import Controller, Memory, Parameters
+from ambjax.codegen.interface import BITS, INPUTS, OUTPUTS, Status, StepInputs, StepOutputs
+from ambjax.codegen.numbering import Number
+from ambjax.codegen.plant_ports import DISTURBANCES, LOSSES, READINGS, PlantInputs, PlantOutputs
+from ambjax.codegen.plant_step import Machine, PlantMemory, PlantStep
 from ambjax.numerics.records import Scalar
 from ambjax.simulation.integrate import choose
 from ambjax.simulation.trajectory import ALIVE

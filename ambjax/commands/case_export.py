@@ -1,0 +1,242 @@
+"""`export`: the files of the command `ambjax export`, and the results of its verification, as a Python object."""
+
+import contextlib
+import dataclasses
+import hashlib
+import html
+import json
+import pathlib
+import re
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from ambjax.cases.reader import Case
+from ambjax.codegen import verify
+from ambjax.codegen.block import Block
+from ambjax.codegen.c99 import machine, package, texts
+from ambjax.codegen.c99.source import Origin
+from ambjax.codegen.c99.statements import RESERVED
+from ambjax.codegen.fmi import archive, cross_check
+from ambjax.codegen.of_case import WHAT, block_of
+from ambjax.codegen.program import PRECISIONS
+from ambjax.codegen.trace import trace
+from ambjax.codegen.twins import LoopCase
+from ambjax.commands.outputs import directory, files, plain, spare
+from ambjax.control.cascade import Cascade
+from ambjax.control.guard import guarded
+from ambjax.ensemble.spread import ends
+
+# Files of the verification.
+VERIFIED = ("verify.md", "verify.json")
+# Names of the files of an FMU export, with the prefix p: the FMU, and its reference input, output and options.
+FMU_NAMES = ("{p}.fmu", "{p}_in.csv", "{p}_ref.csv", "{p}_ref.opt")
+# Names of the standard C headers, which a prefix must not repeat: the package contains PREFIX.h.
+HEADER_NAMES = {
+    *("assert", "complex", "ctype", "errno", "fenv", "inttypes", "iso646", "limits", "locale", "math", "setjmp"),
+    *("signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time", "wchar"),
+    "wctype",
+}
+
+
+class Plan(NamedTuple):
+    """A checked export.
+
+    - `case`: the case.
+    - `block`: what is exported.
+    - `fmi`: version of FMI, 2 or 3; 0 for a C package.
+    - `precision`: C type of a C package, "float" or "double".
+    - `prefix`: prefix of all C names.
+    - `verified`: whether the C is compared with JAX.
+    """
+
+    case: Case
+    block: Block
+    fmi: int
+    precision: str
+    prefix: str
+    verified: bool
+
+    @property
+    def mark(self) -> str:
+        """Line by which a later export recognises the files."""
+        return texts.MARK.format(p=self.prefix)
+
+    @property
+    def origin(self) -> Origin:
+        """Name and checksum of the case, and the description of the block."""
+        digest = hashlib.sha256(self.case.text.encode()).hexdigest()
+        return Origin(self.case.name, digest, self.block.described())
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportedCase:
+    """The result of `export`. A notebook shows it as the table of its checks.
+
+    - `plan`: what was exported, and how.
+    - `files`: content of each file by its name, text or (an FMU) bytes. Verification adds verify.md and verify.json.
+    - `checks`: results of the verification; empty without it. Each has the fields name, precision, found, allowed, ok.
+    """
+
+    plan: Plan
+    files: Mapping[str, str | bytes]
+    checks: list[verify.Check]
+
+    @property
+    def ok(self) -> bool | None:
+        """Whether no check fails; None without verification."""
+        return verify.holds(self.checks) if self.checks else None
+
+    def write(self, folder: str | pathlib.Path) -> pathlib.Path:
+        """Write all files into a folder, which is made if it does not exist, and return the folder.
+
+        Files of an earlier export with the same prefix are overwritten. Raises ValueError, and writes nothing, if the
+        folder cannot be written, or if another file in it has one of the names.
+        """
+        with destination(str(folder), "", self.plan) as (out, part):
+            self.put(part)
+        return out
+
+    def put(self, part: pathlib.Path) -> None:
+        """Write all files into the folder `part`, without any check."""
+        for name, content in self.files.items():
+            (part / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+
+    def _repr_html_(self) -> str:
+        """Return the names of the files, and the table of the checks."""
+        names = html.escape(f"{self.plan.block.noun} of {self.plan.case.name}: {', '.join(self.files)}")
+        rows = "".join(
+            "<tr>" + "".join(f"<td>{html.escape(x)}</td>" for x in (*check[:4], check.verdict)) + "</tr>"
+            for check in self.checks
+        )
+        titles = "<tr><th>check</th><th>precision</th><th>found</th><th>allowed</th><th>verdict</th></tr>"
+        return f"<table><caption>{names}</caption>{titles if rows else ''}{rows}</table>"
+
+
+def export(
+    case: Case,
+    what: str = "controller",
+    *,
+    format: str = "c",
+    fmi: int | None = None,
+    precision: str | None = None,
+    prefix: str | None = None,
+    verify: bool = False,
+) -> ExportedCase:
+    """Return the controller, the plant or the loop of a case as C or as an FMU, as `ambjax export` writes it.
+
+    - `case`: from `read_case`, with the table [processor].
+    - `what`: part to export, "controller", "plant" or "loop".
+    - `format`: "c" for a C package, "fmu" for an FMU.
+    - `fmi`: version of FMI of an FMU, 2 or 3; None: 3.
+    - `precision`: C type of all numbers of a C package, "float" or "double"; None: "float". An FMU has double.
+    - `prefix`: prefix of all names in the C code, a C identifier; None: the name of the case.
+    - `verify`: compile the C in both precisions and compare it with JAX. Takes about a minute; needs a C compiler.
+
+    Writes no files: see `ExportedCase.write`. Returns an `ExportedCase`; a failed check is a result, see its `ok`.
+    Raises ValueError for an option that is not allowed, a case that cannot be exported, and a missing compiler.
+    """
+    return generated(planned(case, what, format, fmi, precision, prefix, verify))
+
+
+def planned(
+    case: Case, what: str, format: str, fmi: int | None, precision: str | None, prefix: str | None, verified: bool
+) -> Plan:
+    """Check the options of `export` and build the block. Raises ValueError as `export` does."""
+    _choice("what", what, WHAT)
+    _choice("format", format, ("c", "fmu"))
+    _choice("fmi", fmi, (None, 2, 3))
+    _choice("precision", precision, (None, *PRECISIONS))
+    block = block_of(what, guarded_for(case), case.scenario, case.clock)
+    name = _prefix(prefix, case.name)
+    if fmi is not None and format != "fmu":
+        raise ValueError(f"--fmi {fmi}: it is for --format fmu. Add --format fmu, or omit --fmi.")
+    if precision == "float" and format == "fmu":
+        raise ValueError("--precision float: an FMU computes in double. Omit --precision, or use --format c.")
+    if verified:
+        machine.check()
+    return Plan(case, block, (fmi or 3) if format == "fmu" else 0, precision or "float", name, verified)
+
+
+def _choice(name: str, value: object, allowed: tuple[object, ...]) -> None:
+    """Raise ValueError unless an option has one of the allowed values."""
+    if value not in allowed:
+        raise ValueError(f"{name} = {value!r}: it must be one of {', '.join(map(repr, allowed))}.")
+
+
+def generated(plan: Plan) -> ExportedCase:
+    """Generate the files of a plan, in both precisions if it is verified, and run the checks."""
+    if not plan.verified:
+        return ExportedCase(plan, _built(plan), [])
+    case = plan.case
+    drafts = {name: verify.draft(plan.block, name, plan.prefix, plan.origin) for name in PRECISIONS}
+    checks = verify.verify(drafts, LoopCase(case.cascade, case.scenario, case.clock, case.settle))
+    built = _built(plan) if plan.fmi else {**drafts[plan.precision].files}
+    record = {"from": plan.mark, "ok": verify.holds(checks), "checks": [check._asdict() for check in checks]}
+    page = verify.table(checks, case.name, plan.mark, plan.block.noun)
+    text = json.dumps(plain(record), indent=2) + "\n"
+    return ExportedCase(plan, {**built, VERIFIED[0]: page, VERIFIED[1]: text}, checks)
+
+
+def _built(plan: Plan) -> dict[str, str | bytes]:
+    """Return the content of each file by name, without verification."""
+    if not plan.fmi:
+        return {**package.files(plan.block, plan.precision, plan.prefix, plan.origin)}
+    case, traced = plan.case, trace(plan.block, "double")
+    fmu = {f"{plan.prefix}.fmu": archive.packed(traced, plan.prefix, plan.origin, plan.fmi)}
+    cascade = guarded_for(case)
+    return fmu | cross_check.files_of(plan.block, plan.prefix, traced.read, cascade, case.scenario, case.clock)
+
+
+@contextlib.contextmanager
+def destination(out: str | None, name: str, plan: Plan) -> Iterator[tuple[pathlib.Path, pathlib.Path]]:
+    """Yield the output directory and a folder whose files move into it at the end of the block, as `files` does.
+
+    `out` and `name` are those of `directory`. Without verification, the verification of an earlier export is removed,
+    because it does not apply to the new files. Raises ValueError if a file that is not of an export would be replaced.
+    """
+    path = directory(out, name)
+    names = FMU_NAMES[: 1 if _holds_fmu(path, plan) else None] if plan.fmi else package.NAMES
+    spare(path, [*(name.format(p=plan.prefix) for name in names), *VERIFIED], plan.mark)
+    with files(path) as part:
+        yield path, part
+    if not plan.verified:
+        for name in VERIFIED:
+            (path / name).unlink(missing_ok=True)
+
+
+def _holds_fmu(out: pathlib.Path, plan: Plan) -> bool:
+    """Return whether `out` contains an FMU of an earlier export. Its reference data may then be overwritten."""
+    path = out / f"{plan.prefix}.fmu"
+    return path.is_file() and path.read_bytes().endswith(plan.mark.encode())
+
+
+def guarded_for(case: Case) -> Cascade:
+    """Return the cascade of a case whose guard limits are wide enough for the sensor at both ends of every spread."""
+    widest = ends(case.spread, case.cascade, case.scenario, ("sensor.", "run.clearance", "plant.s_0"))[1]
+    cascade = guarded(case.cascade, widest, float(case.clock.sample_period))
+    if cascade.processor is None or cascade.processor.guard is None:
+        return cascade
+    guard = jax.tree.map(lambda x: float(np.max(x)), cascade.processor.guard)
+    return dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=guard))
+
+
+def _prefix(option: str | None, name: str) -> str:
+    """Return the prefix of all C names: the option, or the case's name. Raises ValueError for an invalid C name."""
+    if option is None:
+        derived = re.sub(r"\W", "_", name, flags=re.ASCII)
+        return derived if _is_name(derived) else f"amb_{derived}"
+    if not _is_name(option):
+        raise ValueError(
+            f"--prefix {option}: it must be a C identifier (a letter, then letters, digits or '_'), and neither a C "
+            "keyword nor the name of a C header. Use --prefix controller, for example."
+        )
+    return option
+
+
+def _is_name(text: str) -> bool:
+    """Return whether a text can be the prefix: a C identifier that is no keyword and no name of a C header."""
+    words = RESERVED | HEADER_NAMES | {"break", "continue", "else", "for", "if", "return", "while"}
+    return re.fullmatch(r"[A-Za-z]\w{0,60}", text, flags=re.ASCII) is not None and text not in words
