@@ -8,6 +8,8 @@ from ambjax.cases.reader import Case as Case
 from ambjax.cases.reader import read_case as read_case
 from ambjax.commands.case_export import ExportedCase as ExportedCase
 from ambjax.commands.case_export import export as export
+from ambjax.commands.case_map import CaseMap as CaseMap
+from ambjax.commands.case_map import survival_map as survival_map
 from ambjax.control import current as current
 from ambjax.control import inversion as inversion
 from ambjax.control import observer as observer

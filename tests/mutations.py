@@ -1987,6 +1987,20 @@ EXPORT = [
         "tests/test_export.py::test_only_files_of_an_earlier_export_of_the_same_prefix_are_replaced",
     ),
     M(
+        "the constructor of a record takes any number",
+        "ambjax/numerics/records.py",
+        "if isinstance(value, (int, float, str, np.number)) or value is None:",
+        "if value is None:",
+        "tests/test_rollout.py::test_a_record_refuses_a_number_outside_its_range",
+    ),
+    M(
+        "the help of a record omits the ranges",
+        "ambjax/numerics/declared.py",
+        'told = [default and f"default {default}", "" if unit == "1" else unit, allowed(field)]',
+        'told = [default and f"default {default}", "" if unit == "1" else unit]',
+        "tests/test_rollout.py::test_the_help_of_a_law_is_that_of_its_declarations",
+    ),
+    M(
         "a failed check of an export is no failure",
         "ambjax/commands/case_export.py",
         "return verify.holds(self.checks) if self.checks else None",

@@ -28,7 +28,8 @@ from ambjax.commands.outputs import files
 from ambjax.commands.warnings import idealised, reversal, warnings_of
 from ambjax.control.processor import Processor
 from ambjax.ensemble import LogUniform
-from ambjax.numerics.records import validate, within
+from ambjax.numerics.declared import within
+from ambjax.numerics.records import validate
 from ambjax.pictures import overview
 from ambjax.simulation.clock import Clock
 from ambjax.world.amplifier import Amplifier
@@ -316,7 +317,7 @@ STOPS = {
     "simulate": ([], "ambjax.commands.simulate._window"),
     "check": ([], "ambjax.commands.check.check"),
     "ensemble": (["--members", "2"], "ambjax.commands.ensemble.study_of"),
-    "map": (["--x", "plant.m=-1%:1%", "--y", "plant.R=-1%:1%"], "ambjax.commands.map.study_of"),
+    "map": (["--x", "plant.m=-1%:1%", "--y", "plant.R=-1%:1%"], "ambjax.commands.case_map.study_of"),
     "export": ([], "ambjax.commands.case_export.package.files"),
     "tune": ([], "tuning.command.problem_of"),
 }

@@ -1,6 +1,7 @@
 """The documentation agrees with the code: each link has a target, and each key has an entry. Sphinx is not needed."""
 
 import ast
+import dataclasses
 import importlib
 import itertools
 import json
@@ -12,11 +13,17 @@ import numpy as np
 import pytest
 from reference import benchmarks, case_file, commands, fields, markdown, metrics, parser, site
 
+import ambjax
 from ambjax.__main__ import main
 from ambjax.cases.reader import KINDS, OTHERS, TABLES, case_from
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.table import Table
 from ambjax.commands.outputs import table
+from ambjax.control.guard import Guard
+from ambjax.numerics import declared
+from ambjax.numerics.declared import default_text
+from ambjax.world.amplifier import CurrentAmplifier
+from ambjax.world.faults import Dropouts, Outliers
 from tuning.config import tune_from
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -24,6 +31,14 @@ PAGES = sorted((ROOT / "docs").glob("*.md"))
 ROLE = re.compile(r"\{py:(\w+)\}`(?:[^`<]*<)?~?([\w.]+)>?`")
 # Tables of the case file whose keys are rows of a page, with the other keys that the reader needs to accept a key.
 ELSEWHERE = ("controller", "reference", "disturbance", "spread")
+# Records that a user of the Python interface constructs.
+LAWS = {kind for kinds in KINDS.values() for kind in kinds.values()}
+PUBLIC = {getattr(ambjax, name) for name in ambjax.__all__ if isinstance(getattr(ambjax, name), type)}
+RECORDS = sorted(
+    {kind for kind in PUBLIC if hasattr(kind, "__post_init__")}
+    | {Guard, CurrentAmplifier, Outliers, Dropouts, *LAWS, *SIGNALS.values()},
+    key=lambda kind: f"{kind.__module__}.{kind.__qualname__}",
+)
 ROWS = [(name, {}) for name in [*TABLES, *OTHERS, "tune.weights", "tune.limits"] if name not in ELSEWHERE]
 ROWS += [("reference", {"kind": kind}) for kind in SIGNALS]
 ROWS += [(f"controller.{stage}", {"kind": kind}) for stage, kinds in KINDS.items() for kind in kinds]
@@ -41,6 +56,16 @@ def found(dotted):
             thing = getattr(thing, name)
         return thing
     raise AttributeError(dotted)
+
+
+def test_the_help_of_a_record_lists_its_fields():
+    assert len(RECORDS) > 50
+    for kind in RECORDS:
+        items = {item.partition("`")[0]: " ".join(item.split()) for item in str(kind.__doc__).split("\n- `")[1:]}
+        for field in dataclasses.fields(kind):
+            unit = field.metadata.get("unit", "")
+            words = default_text(field.default), "" if unit == "1" else unit, declared.allowed(field)
+            assert all(word in items[field.name] for word in words), f"{kind.__qualname__}.{field.name}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -161,7 +186,7 @@ def test_attributes_are_documented_by_the_docstrings_below_them():
         y: float = 0.0
 
     assert fields.attribute_docs(Example) == {"x": "a length, m"}
-    assert [fields.value(x) for x in (None, 0.5, math.inf, "auto", 1e-30)] == ["", "0.5", "inf", "auto", "1e-30"]
+    assert [default_text(x) for x in (None, 0.5, math.inf, "auto", 1e-30)] == ["", "0.5", "inf", "auto", "1e-30"]
 
 
 def test_no_page_mentions_a_script_of_the_network():

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+import ambjax
 from ambjax import RK4, AdaptiveRodas3, Cascade, Clock, Initial, Plant, Scenario, Sensor, inversion, paper, rollout
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
@@ -235,6 +236,18 @@ def test_the_command_draws_and_prints_two_cases_side_by_side(tmp_path, capsys):
     assert "two" in text
     assert "one: nominal: no quantity is drawn" in text
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"map.png", "map.json"}
+    # the function gives the same numbers
+    written = json.loads((tmp_path / "out" / "map.json").read_text())["cases"][0]
+    found = ambjax.survival_map(ambjax.read_case(one), X, Y)
+    table = found.to_xarray()
+    for name in maps.GRIDS:
+        np.testing.assert_array_equal(table[name], np.array(written[name], float))
+        assert table[name].dims == (written["y"]["path"], written["x"]["path"])
+    assert table["initial.z_dot"].attrs["units"] == "m/s"
+    assert table["error"].attrs["units"] == "m"
+    assert f"<td>{found.map.survival.min():.6g}</td>" in found._repr_html_()
+    with pytest.raises(ValueError, match=r"--x plant\.m=2:1: LOW must be less than HIGH"):
+        ambjax.survival_map(found.case, "plant.m=2:1", Y)
 
 
 def test_the_command_says_what_is_drawn_and_what_is_not_decided(tmp_path, capsys, monkeypatch):

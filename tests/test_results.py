@@ -204,6 +204,15 @@ def test_a_run_is_saved_for_other_programs(run, tmp_path):
         run.save(tmp_path / "run.txt")
 
 
+def test_a_notebook_shows_the_case(path):
+    page = ambjax.read_case(path)._repr_html_()
+    assert "<td>plant</td><td>Plant: m = 0.588 kg," in page
+    assert "<td>reference (m)</td><td>Sine: amplitude = 0.0001, frequency = 5 Hz, phase = 0 rad</td>" in page
+    assert "<td>spread</td><td>plant.m</td>" in page
+    assert "model" not in page  # that of the plant
+    assert "q_z" not in page  # zero
+
+
 def test_a_notebook_shows_the_members(members):
     page = members._repr_html_()
     assert "8 of 8 members are held" in page

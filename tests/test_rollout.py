@@ -408,11 +408,11 @@ def test_save_writes_the_named_arrays_as_float64(short, lost, tmp_path):
 @pytest.mark.parametrize(
     ("change", "path"),
     [
-        ({"cascade": Cascade(position=position.SlidingMode(c=-1.0))}, r"controller\.position\.c"),
-        ({"scenario": Scenario(plant=Plant(m=0.0))}, r"scenario\.plant\.m"),
-        ({"scenario": Scenario(reference=Sine(np.nan, 2.0))}, r"scenario\.reference\.amplitude"),
+        ({"cascade": Cascade(position=position.SlidingMode(c=np.array(-1.0)))}, r"controller\.position\.c"),
+        ({"scenario": Scenario(plant=Plant(m=np.zeros(2)))}, r"scenario\.plant\.m"),
+        ({"scenario": Scenario(reference=Sine(np.array(np.nan), 2.0))}, r"scenario\.reference\.amplitude"),
         ({"clock": Clock(0, 1e-4)}, r"clock\.samples"),
-        ({"clock": Clock(10, -1e-4)}, r"clock\.sample_period"),
+        ({"clock": Clock(10, np.array(-1e-4))}, r"clock\.sample_period"),
         ({"clock": Clock(10, 1e-4, RK4(1))}, r"clock\.dt"),
         ({"clock": Clock(10, 1e-4, Euler(4))}, r"clock\.dt"),
     ],
@@ -421,6 +421,35 @@ def test_bad_input_is_refused_with_its_path(change, path):
     given = {"cascade": REPAIRED, "scenario": TRACKING, "clock": Clock(10, 1e-4)} | change
     with pytest.raises(ValueError, match=path):
         rollout(**given)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: Plant(m=0.0), r"^Plant\.m = 0: it must be .* \(kg\)\. Use 0\.588, for example\.$"),
+        (lambda: Plant(m="4"), r"^Plant\.m = '4': it must be"),
+        (lambda: dataclasses.replace(Plant(), n=np.float32(-1.0)), r"^Plant\.n = .*-1.*: it must be"),
+        (lambda: Scenario(u_max=None), r"^Scenario\.u_max = None: it must be"),
+        (lambda: Sine(np.nan, 2.0), r"^Sine\.amplitude = nan: it must be"),
+        (lambda: Pulse(1.0, 2.0, 2.0), r"^Pulse\.stop = 2: it must be more than start = 2\.$"),
+    ],
+)
+def test_a_record_refuses_a_number_outside_its_range(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+def test_a_record_holds_arrays_and_traced_values_without_checks():
+    """JAX's transformations rebuild records with whatever they compute: masks, signs, batches."""
+    masses = jnp.array([-1.0, 1.0])
+    assert jax.vmap(lambda m: Plant(m=m).m)(masses).tolist() == [-1.0, 1.0]
+    assert Plant(m=masses).m is masses
+    assert jax.tree.map(lambda x: -x, Plant()).m == -Plant().m
+
+
+def test_the_help_of_a_law_is_that_of_its_declarations():
+    lines = str(position.SlidingMode.__doc__).splitlines()
+    assert "- `c`: decay rate on the sliding manifold (default 17; 1/s; above 1e-30 and at most 1e+30)" in lines
 
 
 def test_the_method_is_not_chosen_from_traced_gains():

@@ -192,7 +192,7 @@ def test_terms_have_no_dimension():
     row, found = rollout(SMOOTH, TRACKING, CLOCK).trajectory.rows, []
     span = blank(SHOWN)._replace(time=jnp.asarray(1e-4), densities=Densities(*map(jnp.asarray, (10.0, 400.0, 5.0))))
     for factor in (1.0, 1000.0):
-        fold = Loss(0.01, 0.0, 5e-3 * factor, 200.0, 4.5e-3 * factor)
+        fold = Loss(0.01, 0.0, jnp.asarray(5e-3 * factor), 200.0, jnp.asarray(4.5e-3 * factor))
         scaled = row._replace(**{name: factor * getattr(row, name) for name in ("z", "z_dot", "r")})
         carry, _ = jax.lax.scan(lambda c, r, fold=fold: (fold.update(c, r, span), None), fold.init(), scaled)
         found.append([float(carry.square), float(carry.power), float(carry.effort), float(carry.clearance)])

@@ -9,6 +9,7 @@ import pathlib
 import re
 from typing import Any, NamedTuple
 
+from ambjax.cases.case_table import case_table, parts_of
 from ambjax.cases.controller_file import ControllerFile, controller_file
 from ambjax.cases.gain_tables import law_from
 from ambjax.cases.own_laws import FORM, OwnLaw, is_own, own_law
@@ -119,6 +120,10 @@ class Case:
     controller_file: ControllerFile | None = None
     zones: Zones = Zones()
     recorded: tuple[RecordedFile, ...] = ()
+
+    def _repr_html_(self) -> str:
+        """Return the table of the parts of the case and their numbers, for notebooks."""
+        return case_table(self.name, parts_of(self.cascade, self.scenario, self.clock), self.spread.paths)
 
 
 def read_case(path: str | pathlib.Path) -> Case:

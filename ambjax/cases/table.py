@@ -8,7 +8,8 @@ from typing import Any
 
 from ambjax.host.synonyms import hint
 from ambjax.host.words import one_line
-from ambjax.numerics.records import check_number, numbers, validate, within
+from ambjax.numerics.declared import check_number, check_order, numbers, within
+from ambjax.numerics.records import check_leaf
 
 # Characters of a key or a value that a message shows.
 LONGEST = 60
@@ -147,17 +148,9 @@ class Table:
             if field.name not in self.raw and default is dataclasses.MISSING:
                 raise ValueError(f"{self.at(field.name)} is missing: give {numbers(field)}; {field.metadata['doc']}.")
             values[field.name] = self.number(field.name, default, numbers(field))
-        one = kind(**values)
-        validate(one, self.path)
-        self._check_order(one)
-        return one
-
-    def _check_order(self, record: object) -> None:
-        """Raise ValueError if the two leaves that the record orders, such as start and stop, are not in that order."""
-        if pair := getattr(record, "ordered", None):
-            low, high = (getattr(record, name) for name in pair)
-            if not low < high:
-                raise ValueError(f"{self.at(pair[1])} = {high:g}: it must be more than {pair[0]} = {low:g}.")
+            check_leaf(field, self.at(field.name), values[field.name])
+        check_order(kind, values, self.path)
+        return kind(**values)
 
 
 def show(value: object) -> str:

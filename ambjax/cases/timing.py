@@ -4,7 +4,8 @@ import dataclasses
 import math
 
 from ambjax.cases.table import Table, show
-from ambjax.numerics.records import leaf, numbers
+from ambjax.numerics.declared import numbers
+from ambjax.numerics.records import leaf
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
 from ambjax.simulation.integrate import Integrator

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from ambjax.control.schedule import OVER, Schedule, finite
-from ambjax.numerics.records import numbers
+from ambjax.numerics.declared import numbers
 
 # Exported code is compared with JAX also at each parameter's value divided and multiplied by this factor.
 SPAN = 100.0

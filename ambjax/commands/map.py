@@ -2,7 +2,6 @@
 
 import argparse
 import itertools
-import math
 import pathlib
 from collections.abc import Mapping
 from typing import Any
@@ -10,41 +9,24 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.cases.timing import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
-from ambjax.commands.ensemble import study_of
+from ambjax.commands.case_map import prepared, unit_of
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.intervals import wilson
-from ambjax.ensemble.maps import CERTAIN, GRIDS, PERIOD, Axis, Map, grid, stepped
-from ambjax.ensemble.paths import Place, places
-from ambjax.numerics.records import numbers, within
+from ambjax.ensemble.maps import CERTAIN, GRIDS, Axis, Map, grid
 
 WRITTEN = ("map.png", "map.json")
-COUNT = 21
-MOST_CELLS = 1_000_000
-# Most samples of all runs in a map over clock.sample_period, some hours of computation.
-MOST_TOTAL = 10_000_000_000
-FORM = "PATH=LOW:HIGH[:COUNT][:log], as in initial.z=-1e-3:1e-3:41 or plant.m=-20%:20%"
 
 
 def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     """Simulate the cells of a map for each case and write map.png and map.json."""
     cases = [read_with_warnings(path) for path in [args.case, *(args.against or [])]]
-    studies = [study_of(case, args.seed, args.members) for case in cases]
-    axes = [(_axis("--x", args.x, case), _axis("--y", args.y, case)) for case in cases]
-    cells = len(axes[0][0].values) * len(axes[0][1].values)
-    if cells * args.members > MOST_CELLS:
-        raise ValueError(
-            f"--members {args.members}: times {cells} cells, it exceeds {MOST_CELLS:,} runs. Reduce either."
-        )
-    for case, (x, y) in zip(cases, axes, strict=True):
-        _check_samples(case, x, y, args.members)
-    studies = [stepped(study, x, y) for study, (x, y) in zip(studies, axes, strict=True)]
+    ready = [prepared(case, args.x, args.y, args.members, args.seed) for case in cases]
     out = directory(args.out, f"map-{cases[0].name}", WRITTEN, args.force)
     with files(out) as part:
         maps = []
-        for case, study, (x, y) in zip(cases, studies, axes, strict=True):
-            say(f"{case.name}: {cells} cells of {args.members}; method: {study.clock.method}")
+        for case, (study, x, y) in zip(cases, ready, strict=True):
+            say(f"{case.name}: {len(x.values) * len(y.values)} cells of {args.members}; method: {study.clock.method}")
             if args.members == 1 and case.spread.entries:
                 say(f"{case.name}: nominal: one member does not draw the [spread]; --members 2 or more does.")
             maps.append(grid(study, x, y))
@@ -55,81 +37,6 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
         print(_text(cases, maps))
         written(out, ", ".join(WRITTEN))
     return 0, plain(summary)
-
-
-def _axis(flag: str, text: str, case: Case) -> Axis:
-    """Parse the value of --x or --y. Raises ValueError with the option, its text and the valid form."""
-
-    def refuse(why: str) -> ValueError:
-        return ValueError(f"{flag} {text}: {why}. Write {FORM}.")
-
-    path, _, rest = text.partition("=")
-    parts = rest.split(":")
-    log = parts[-1] == "log"
-    parts = parts[:-1] if log else parts
-    if len(parts) not in (2, 3):
-        raise refuse("it must be a path, '=' and a range")
-    known = places(case.cascade, case.scenario)
-    nominal = float(case.clock.sample_period) if path == PERIOD else _nominal(known.get(path))
-    try:
-        low, high = (_value(part, nominal) for part in parts[:2])
-        count = int(parts[2]) if len(parts) == 3 else COUNT
-    except ValueError as error:
-        raise refuse(str(error)) from None
-    if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise refuse(f"LOW must be less than HIGH, both finite; they are {low:g} and {high:g}")
-    if not 2 <= count <= MOST_CELLS:
-        raise refuse(f"COUNT must be 2 to {MOST_CELLS:,}, and it is {count}")
-    field = SAMPLE_PERIOD if path == PERIOD else known[path].field if path in known else None
-    if field is not None and not within(field.metadata, np.array([low, high])):
-        raise refuse(f"{path} must be {numbers(field)}, and the range is {low:g} to {high:g}")
-    if log and low <= 0:
-        raise refuse(f"a logarithmic range must begin above 0, and it begins at {low:g}")
-    return Axis(path, np.geomspace(low, high, count) if log else np.linspace(low, high, count), log)
-
-
-def _check_samples(case: Case, x: Axis, y: Axis, members: int) -> None:
-    """Raise ValueError for sample periods too long for the run, or a map with too many samples."""
-    for flag, axis, other in (("--x", x, y), ("--y", y, x)):
-        if axis.path != PERIOD:
-            continue
-        duration, low, high = float(case.clock.duration), float(axis.values[0]), float(axis.values[-1])
-        total = np.sum(duration / axis.values) * len(other.values) * members
-        samples = np.round(duration / axis.values)
-        if samples.min() < FEWEST_SAMPLES:
-            raise ValueError(
-                f"{flag} {PERIOD}: it reaches {high:g} s, but clock.duration is {duration:g} s, and a run needs "
-                f"{FEWEST_SAMPLES} samples. Set HIGH to at most {duration / FEWEST_SAMPLES:g} s."
-            )
-        unsettled = axis.values[(samples - 1) * axis.values < case.settle]
-        if unsettled.size:
-            raise ValueError(
-                f"{flag} {PERIOD}: with {unsettled[0]:g} s no sample is at or after run.settle = {case.settle:g} s. "
-                "Lower HIGH or run.settle."
-            )
-        if duration / low > MOST_SAMPLES or total > MOST_TOTAL:
-            raise ValueError(
-                f"{flag} {PERIOD}: from {low:g} s on, it makes runs of up to {duration / low:.3g} samples, {total:.3g} "
-                f"in all; at most {MOST_SAMPLES:,} a run and {MOST_TOTAL:.0e} in all are allowed. Raise LOW, or "
-                "shorten clock.duration."
-            )
-
-
-def _nominal(place: Place | None) -> float | None:
-    return None if place is None or place.value is None else float(place.value)
-
-
-def _value(text: str, nominal: float | None) -> float:
-    if not text.endswith("%"):
-        return float(text)
-    if nominal is None or not math.isfinite(nominal) or nominal == 0:
-        raise ValueError("per cent need a number other than 0 in the case, and the case has none at this path")
-    return nominal * (1 + float(text[:-1]) / 100)
-
-
-def _summary(case: Case, one: Map) -> Mapping[str, object]:
-    facts: dict[str, Any] = {"case": case.name, "x": one.x._asdict(), "y": one.y._asdict()}
-    return facts | {key: getattr(one, key) for key in (*GRIDS, "members", "drawn", "decisive")} | {"reach": one.reach()}
 
 
 def _text(cases: list[Case], maps: list[Map]) -> str:
@@ -199,7 +106,11 @@ def _short(one: Map) -> str:
     return words + f"; {int(one.stalled.sum())} runs not decided" * bool(one.stalled.any())
 
 
+def _summary(case: Case, one: Map) -> Mapping[str, object]:
+    facts: dict[str, Any] = {"case": case.name, "x": one.x._asdict(), "y": one.y._asdict()}
+    return facts | {key: getattr(one, key) for key in (*GRIDS, "members", "drawn", "decisive")} | {"reach": one.reach()}
+
+
 def _label(case: Case, axis: Axis) -> str:
-    place = places(case.cascade, case.scenario).get(axis.path)
-    unit = "s" if place is None else place.field.metadata["unit"]
+    unit = unit_of(case, axis)
     return f"{axis.path} ({unit})" if unit else axis.path

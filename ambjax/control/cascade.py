@@ -28,7 +28,7 @@ from ambjax.control.laws import (
 )
 from ambjax.control.processor import Processor, carried
 from ambjax.control.schedule import extremes, present
-from ambjax.numerics.records import Scalar, record
+from ambjax.numerics.records import Scalar, part, record
 from ambjax.world.plant import Plant
 from ambjax.world.plant import State as NominalState
 from ambjax.world.sensor import Measurement
@@ -55,12 +55,12 @@ class Cascade:
     laws. `processor` is None in continuous time, as in the paper. Any gain of a law may be a `Schedule`.
     """
 
-    observer: Observer = _LEFT_OUT
-    position: PositionLaw = _LEFT_OUT
-    inversion: InversionLaw = _LEFT_OUT
-    current: CurrentLaw = _LEFT_OUT
-    model: Plant = Plant()
-    processor: Processor | None = None
+    observer: Observer = part(default=_LEFT_OUT, doc="law that estimates z, z_dot and i; left out: `Direct`")
+    position: PositionLaw = part(default=_LEFT_OUT, doc="law of v_star; left out: `SlidingMode`")
+    inversion: InversionLaw = part(default=_LEFT_OUT, doc="law of i_ref; left out: `Adaptive`")
+    current: CurrentLaw = part(default=_LEFT_OUT, doc="law of u; left out: `SlidingMode`")
+    model: Plant = part(default=Plant(), doc="the nominal plant")
+    processor: Processor | None = part(default=None, doc="how the laws are sampled; None: continuous time")
 
     def __post_init__(self) -> None:
         for stage, kind in USUAL.items():

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.guard import Guard
-from ambjax.numerics.records import Scalar, is_traced, leaf, record, static
+from ambjax.numerics.records import Scalar, is_traced, leaf, part, record, static
 from ambjax.numerics.runge_kutta import rk4_step
 from ambjax.world.plant import Plant, State
 from ambjax.world.sensor import Measurement
@@ -45,8 +45,7 @@ class Processor:
         optional=True,
         doc="delay that the prediction assumes; none: the actual delay",
     )
-    guard: Guard | None = Guard()
-    """guard of the readings; None: every reading is accepted"""
+    guard: Guard | None = part(default=Guard(), doc="guard of the readings; None: every reading is accepted")
     whole: bool | None = static(default=None, doc="every delay is a whole number of samples; None: to be seen")
     most: int | None = static(default=None, doc="samples that the longest prediction reaches into; None: to be seen")
 

@@ -15,7 +15,8 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.base import Law
-from ambjax.numerics.records import GainFunction, Scalar, check_number, is_traced, record, static
+from ambjax.numerics.declared import check_number
+from ambjax.numerics.records import GainFunction, Scalar, is_traced, part, record, static
 from ambjax.world.signals import Reference
 
 L = TypeVar("L", bound=Law)
@@ -37,8 +38,7 @@ class Schedule(GainFunction):
     can be tuned, varied and exported. `at` and `over` are constants of the compiled program.
     """
 
-    values: tuple[Scalar, ...]
-    """gain at each knot, in its unit"""
+    values: tuple[Scalar, ...] = part(doc="gain at each knot, in its unit")
     at: tuple[float, ...] = static(doc="knots, increasing; m, or m/s for the speed of the reference")
     over: str = static(default="error", doc="signal of the schedule")
 

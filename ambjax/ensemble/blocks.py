@@ -44,18 +44,12 @@ class Carry(NamedTuple):
 
 @record
 class Blocks:
-    """Fold that reduces signals over `count` blocks of `every` samples each.
+    """Fold that reduces signals over `count` blocks of `every` samples each."""
 
-    - `of`: names of the signals, which are fields of a Row.
-    - `every`: samples in a block.
-    - `count`: number of blocks.
-    - `period`: sample period, s.
-    """
-
-    of: tuple[str, ...] = static()
-    every: int = static()
-    count: int = static()
-    period: Scalar = leaf(unit="s", above=0, at_most=1e6)
+    of: tuple[str, ...] = static(doc="names of the signals, which are fields of a Row")
+    every: int = static(doc="samples in a block")
+    count: int = static(doc="number of blocks")
+    period: Scalar = leaf(unit="s", above=0, at_most=1e6, doc="sample period")
 
     def init(self) -> Carry:
         dtype = jnp.result_type(float)

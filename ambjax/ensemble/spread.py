@@ -16,7 +16,7 @@ from ambjax.ensemble.design import DESIGNS, points
 from ambjax.ensemble.distributions import Choice, Distribution, Percent
 from ambjax.ensemble.paths import Place, order_pairs, places, with_values
 from ambjax.host.synonyms import hint_of_path
-from ambjax.numerics.records import numbers, within
+from ambjax.numerics.declared import numbers, within
 from ambjax.world.scenario import POLE, Scenario
 
 # Prefixes of the paths whose values affect the choice of the integration step. A disturbance is among them because

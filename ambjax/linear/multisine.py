@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.cascade_state import Command
-from ambjax.numerics.records import Scalar, leaf, record, static
+from ambjax.numerics.records import Scalar, leaf, part, record, static
 from ambjax.simulation.folds import Ending
 from ambjax.simulation.loop import ClosedLoop, Realised
 from ambjax.simulation.sampled import Sampled, SampledState
@@ -21,22 +21,14 @@ Reading = Literal["z", "z_dot"]
 
 @record
 class MultiSine:
-    """Sum of cosines, e(t) = sum_l size cos(2 pi harmonics_l t/(samples T) + phases_l).
+    """Sum of cosines, e(t) = sum_l size cos(2 pi harmonics_l t/(samples T) + phases_l)."""
 
-    - `harmonics` [L]: whole numbers from 1 to below `samples`/2.
-    - `size`: amplitude of every cosine, m or m/s.
-    - `phases` [L]: phases, rad.
-    - `period`: sample period T, s.
-    - `samples`: number of samples in a period of the multi-sine.
-    - `reading`: the reading to which e is added.
-    """
-
-    harmonics: Array
-    size: Scalar = leaf(unit="m or m/s", at_least=0, at_most=1e3)
-    phases: Array
-    period: Scalar = leaf(unit="s", at_least=1e-9, at_most=1e6)
-    samples: int = static()
-    reading: Reading = static(default="z")
+    harmonics: Array = part(doc="whole numbers [L] from 1 to below `samples`/2")
+    size: Scalar = leaf(unit="m or m/s", at_least=0, at_most=1e3, doc="amplitude of every cosine")
+    phases: Array = part(doc="phases [L], rad")
+    period: Scalar = leaf(unit="s", at_least=1e-9, at_most=1e6, doc="sample period T")
+    samples: int = static(doc="number of samples in a period of the multi-sine")
+    reading: Reading = static(default="z", doc="the reading to which e is added")
 
     def angles(self, sample: Array) -> Array:
         """Return the angles 2 pi harmonics n/samples [L] at sample number n, between 0 and 2 pi rad.

@@ -6,9 +6,10 @@ part of the tree structure. The case-file reader, the template, the reference an
 
 import dataclasses
 import functools
+import inspect
 import math
 import operator
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable
 from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
@@ -17,6 +18,8 @@ import numpy as np
 import numpy.typing as npt
 from jax import Array
 from jax.core import Tracer
+
+from ambjax.numerics.declared import check_number, check_order, item
 
 T = TypeVar("T")
 
@@ -86,15 +89,26 @@ def static(default: object = dataclasses.MISSING, *, doc: str = "") -> Any:
     return dataclasses.field(default=default, metadata={"static": True, "doc": doc})
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(leaf, gain, static, dataclasses.field))
+def part(*, default: object = dataclasses.MISSING, doc: str) -> Any:
+    """Declare a field that is itself a record, or another pytree of numbers. `doc`: its meaning."""
+    return dataclasses.field(default=default, metadata={"doc": doc})
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(leaf, gain, static, part, dataclasses.field))
 def record(cls: type[T]) -> type[T]:
     """Make `cls` a frozen dataclass and register it as a pytree.
 
     The type becomes part of the tree structure. With JAX's `register_dataclass`, the structures of two types with equal
     static fields compare equal, so that JAX could run the compiled program of one law for another.
+
+    The constructor checks each leaf that is a plain number. It checks no traced values and no arrays, which `validate`
+    checks before a rollout, and JAX does not call it to rebuild a record. The docstring lists the fields.
     """
+    _check_at_construction(cls)
     record_type = dataclasses.dataclass(frozen=True)(cls)
     fields = dataclasses.fields(record_type)  # pyright: ignore[reportArgumentType]
+    items = [item(field) for field in fields if field.metadata.get("doc")]
+    record_type.__doc__ = "\n".join([inspect.cleandoc(record_type.__doc__ or ""), "", *items]).rstrip()
     fixed = [f.name for f in fields if f.metadata.get("static")]
     names = [f.name for f in fields if not f.metadata.get("static")]
     keys = [jax.tree_util.GetAttrKey(name) for name in names]
@@ -121,6 +135,29 @@ def record(cls: type[T]) -> type[T]:
     return record_type
 
 
+def _check_at_construction(cls: type) -> None:
+    """Give a class, before it becomes a dataclass, a `__post_init__` that checks its plain numbers.
+
+    A `__post_init__` in the body of the class runs first.
+    """
+    own = cls.__dict__.get("__post_init__")
+
+    def check(self: object) -> None:
+        """Check the numbers. Raise ValueError for a number outside its range."""
+        if own is not None:
+            own(self)
+        given = self.__dict__
+        for field, low, high in _leaves(type(self)):
+            value = given[field.name]
+            if value is field.default or (type(value) is float and low < value < high):
+                continue  # fast, because tracing constructs many records
+            if isinstance(value, (int, float, str, np.number)) or value is None:
+                check_leaf(field, f"{type(self).__name__}.{field.name}", value)
+        check_order(type(self), given, type(self).__name__)
+
+    cls.__post_init__ = check  # pyright: ignore[reportAttributeAccessIssue]
+
+
 def _getter(names: list[str]) -> Callable[[object], tuple[object, ...]]:
     """Return a fast function from an object to the tuple of its attributes `names`.
 
@@ -144,61 +181,6 @@ def is_traced(x: object) -> bool:
     return isinstance(x, Tracer)
 
 
-def numbers(field: dataclasses.Field) -> str:
-    """Return the allowed values of a numeric field in words, with the unit."""
-    meta = field.metadata
-    above, at_least, at_most = meta["above"], meta["at_least"], meta["at_most"]
-    unit = f" ({meta['unit']})" if meta["unit"] else ""
-    end = f"{unit}, or inf" if meta["infinite"] else unit
-    kind = "a number" if meta["infinite"] else "a finite number"
-    if meta["whole"]:
-        return f"a whole number from {at_least} to {at_most}{end}"
-    if above is not None:
-        return f"{kind} above {above:g}{'' if at_most is None else f' and at most {at_most:g}'}{end}"
-    if at_least is not None:
-        return f"{kind} {f'of at least {at_least:g}' if at_most is None else f'from {at_least:g} to {at_most:g}'}{end}"
-    return f"{kind}{end}"
-
-
-def within(meta: Mapping[str, Any], value: npt.ArrayLike) -> bool:
-    """Return whether a field with the metadata `meta` allows a number, or every number of an array."""
-    if isinstance(value, (int, float)):
-        if value == math.inf:
-            return meta["infinite"]
-        above, at_least, at_most = meta["above"], meta["at_least"], meta["at_most"]
-        return (  # False for NaN
-            -math.inf < value
-            and not (meta["whole"] and value % 1)
-            and (above is None or value > above)
-            and (at_least is None or value >= at_least)
-            and (at_most is None or value <= at_most)
-        )
-    low, high = np.min(value), np.max(value)  # both are NaN if a value is
-    whole = not meta["whole"] or not np.any(np.asarray(value) % 1)
-    return whole and all(within(meta, float(x)) for x in (low, high))
-
-
-def _example(field: dataclasses.Field) -> str:
-    """Return a sentence that proposes the default of a field; empty if the default is not a finite number."""
-    default = field.default
-    usable = isinstance(default, (int, float)) and math.isfinite(default)
-    return f" Use {default:g}, for example." if usable else ""
-
-
-def check_number(field: dataclasses.Field, name: str, value: object) -> None:
-    """Raise ValueError if `field` does not allow `value`, a number or an array.
-
-    The message contains the dotted name, the value, the allowed range and, if there is one, the default.
-    """
-    try:
-        number = value if isinstance(value, (int, float)) else np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not within(field.metadata, number):
-        shown = f"{value:g}" if isinstance(value, (int, float)) else _shown(value, number)
-        raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.{_example(field)}")
-
-
 def validate(node: object, path: str = "") -> None:
     """Check every leaf of the records in `node` against the bounds of its field. Traced leaves are not checked.
 
@@ -210,14 +192,22 @@ def validate(node: object, path: str = "") -> None:
         return
     for field, is_leaf in _fields(type(node)):
         value = getattr(node, field.name)
-        if not is_leaf:
+        if is_leaf:
+            check_leaf(field, f"{path}.{field.name}".lstrip("."), value)
+        else:
             validate(value, f"{path}.{field.name}".lstrip("."))
-        elif isinstance(value, GainFunction):
-            value.check(field, f"{path}.{field.name}".lstrip("."))
-        elif not (
-            is_traced(value) or (value is None and (field.metadata["optional"] or field.metadata.get("steepness")))
-        ):
-            check_number(field, f"{path}.{field.name}".lstrip("."), value)
+
+
+def check_leaf(field: dataclasses.Field, name: str, value: object) -> None:
+    """Raise ValueError if the leaf `field` does not allow `value`, as `check_number` does. Traced values are allowed.
+
+    `name`: dotted name, for messages. A value may also be a `GainFunction`, and None for an optional field or a
+    steepness.
+    """
+    if isinstance(value, GainFunction):
+        value.check(field, name)
+    elif not (is_traced(value) or (value is None and (field.metadata["optional"] or field.metadata.get("steepness")))):
+        check_number(field, name, value)
 
 
 @functools.cache
@@ -227,9 +217,16 @@ def _fields(kind: type) -> tuple[tuple[dataclasses.Field, bool], ...]:
     return tuple((field, bool(field.metadata.get("leaf"))) for field in fields)
 
 
-def _shown(value: object, number: npt.ArrayLike) -> str:
-    """Return the text of an invalid value for a message: the range of an array, or the value as Python shows it."""
-    return f"{np.min(number):g} to {np.max(number):g}" if np.ndim(number) else repr(value)
+@functools.cache
+def _leaves(kind: type) -> tuple[tuple[dataclasses.Field, float, float], ...]:
+    """Return the leaves among the fields of a record type, each with an open interval of allowed numbers. Cached."""
+    found = []
+    for field in (field for field, is_leaf in _fields(kind) if is_leaf):
+        lows = [x for x in (field.metadata["above"], field.metadata["at_least"]) if x is not None]
+        high = field.metadata["at_most"]
+        high = -math.inf if field.metadata["whole"] else math.inf if high is None else high
+        found.append((field, max(lows, default=-math.inf), high))
+    return tuple(found)
 
 
 # Names of the leaves that are integers. All other leaves become floating-point numbers, even if given as integers.

@@ -2,25 +2,24 @@
 
 import dataclasses
 
-from ambjax.numerics.records import Scalar, leaf, record, static
+from ambjax.numerics.records import Scalar, leaf, part, record, static
 from ambjax.simulation.integrate import Integrator
 
 
 @record
 class Clock:
-    """Number of samples, sample period, and the integrator between samples.
-
-    - `method`: the integrator; None: `ambjax.with_method` chooses it.
-    - `cuts`: largest number of edges of disturbances inside one sample, for a cascade on a processor.
-      `ambjax.with_method` computes it; None: the number of all edges.
-    """
+    """Number of samples, sample period, and the integrator between samples."""
 
     samples: int = static(default=20_000, doc="number of sample periods")
     sample_period: Scalar = leaf(
         default=1e-4, unit="s", at_least=1e-9, at_most=1e6, doc="time for which a measurement's error is held"
     )
-    method: Integrator | None = None
-    cuts: int | None = static(default=None, doc="edges of disturbances inside one sample, at most")
+    method: Integrator | None = part(default=None, doc="the integrator; None: `ambjax.with_method` chooses it")
+    cuts: int | None = static(
+        default=None,
+        doc="largest number of edges of disturbances inside one sample, on a processor. `ambjax.with_method` computes "
+        "it; None: the number of all edges",
+    )
 
     @property
     def duration(self) -> Scalar:

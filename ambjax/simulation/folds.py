@@ -50,16 +50,11 @@ def _zero() -> Array:
 
 @record
 class Peak:
-    """Largest absolute value of a signal, also between samples if the span contains its extremes.
+    """Largest absolute value of a signal, also between samples if the span contains its extremes."""
 
-    - `of`: name of the signal, a field of a Row.
-    - `after`: start of the evaluation, s.
-    - `timed`: return (value, time), where time (s) is the start of the sample that contains the maximum.
-    """
-
-    of: str = static()
-    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
-    timed: bool = static(default=False)
+    of: str = static(doc="name of the signal, a field of a Row")
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6, doc="start of the evaluation")
+    timed: bool = static(default=False, doc="return (value, time): the start (s) of the sample with the maximum")
 
     def init(self) -> tuple[Array, Array]:
         return _zero(), _zero()
@@ -80,7 +75,7 @@ class Peak:
 class Lowest:
     """Smallest value of the signal `of` over the samples at which the rotor is alive, with its time: (value, s)."""
 
-    of: str = static()
+    of: str = static(doc="name of the signal, a field of a Row")
 
     def init(self) -> tuple[Array, Array]:
         return _zero() + jnp.inf, _zero()
@@ -102,8 +97,8 @@ class Rms:
     `driven`: only over the samples at which the drive is on, which is until the rotor is lost.
     """
 
-    of: str = static()
-    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
+    of: str = static(doc="name of the signal, a field of a Row")
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6, doc="start of the evaluation")
     driven: bool = static(default=False)
 
     def init(self) -> tuple[Array, Array]:
@@ -122,8 +117,8 @@ class Rms:
 class Driven:
     """Mean over time of the density `of`, from `after` (s) until the rotor is lost; its square root if `root`."""
 
-    of: str = static()
-    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
+    of: str = static(doc="name of the signal, a field of a Row")
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6, doc="start of the evaluation")
     root: bool = static(default=False)
 
     def init(self) -> tuple[Array, Array]:
@@ -149,7 +144,7 @@ class Variation:
     the rise time of any drive.
     """
 
-    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6)
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6, doc="start of the evaluation")
 
     def init(self) -> tuple[Array, Array, Array]:
         return _zero(), _zero(), jnp.asarray(False)
@@ -167,7 +162,7 @@ class Variation:
 class Count:
     """Number of samples at which the boolean signal `of` is true."""
 
-    of: str = static()
+    of: str = static(doc="name of the signal, a field of a Row")
 
     def init(self) -> Array:
         return _zero()
@@ -183,8 +178,8 @@ class Count:
 class Reaching:
     """Start of the first sample in which the absolute value of the signal `of` is at most `band`, s; +inf: never."""
 
-    of: str = static()
-    band: Scalar = leaf(above=0, at_most=1e30)
+    of: str = static(doc="name of the signal, a field of a Row")
+    band: Scalar = leaf(above=0, at_most=1e30, doc="the band, in the unit of the signal")
 
     def init(self) -> Array:
         return _zero() + jnp.inf

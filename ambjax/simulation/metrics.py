@@ -50,22 +50,26 @@ UNITS = {
 class Standard:
     """The metrics of metrics.json: a dict of numbers whose names include their units.
 
-    - `settle`: start of the evaluation of the settled metrics, s.
-    - `touchdown`: clearance, m; `clearance_used` and `settled_clearance_used` are |z| as a share of it.
-    - `largest_force`: largest magnetic force, N; `force_used` is |force| as a share of it; inf: unknown.
-    - `sigma_band` (m/s), `v_tilde_band` (A^2/m^2), `e_band` (A): a signal within its band counts as zero.
-
     The defaults are for the plant of Table 1; `standard_for` scales them to another plant.
     """
 
     settle: Scalar = leaf(
         default=0.5, unit="s", at_least=0, at_most=1e6, doc="time from which metrics count as settled"
     )
-    touchdown: Scalar = leaf(default=4.5e-3, unit="m", above=0, at_most=1.0)
-    sigma_band: Scalar = leaf(default=1e-3, unit="m/s", above=0, at_most=1e30)
-    v_tilde_band: Scalar = leaf(default=0.1, unit="A^2/m^2", above=0, at_most=1e30)
-    e_band: Scalar = leaf(default=1e-3, unit="A", above=0, at_most=1e6)
-    largest_force: Scalar = leaf(default=float("inf"), unit="N", above=0, at_most=1e30, infinite=True)
+    touchdown: Scalar = leaf(
+        default=4.5e-3, unit="m", above=0, at_most=1.0, doc="clearance; `clearance_used` is |z| as a share of it"
+    )
+    sigma_band: Scalar = leaf(default=1e-3, unit="m/s", above=0, at_most=1e30, doc="|sigma| that counts as zero")
+    v_tilde_band: Scalar = leaf(default=0.1, unit="A^2/m^2", above=0, at_most=1e30, doc="|v_tilde| that counts as zero")
+    e_band: Scalar = leaf(default=1e-3, unit="A", above=0, at_most=1e6, doc="|current error| that counts as zero")
+    largest_force: Scalar = leaf(
+        default=float("inf"),
+        unit="N",
+        above=0,
+        at_most=1e30,
+        infinite=True,
+        doc="largest magnetic force; `force_used` is |force| as a share of it; inf: unknown",
+    )
 
     @classmethod
     def for_case(cls, case: Any) -> "Standard":

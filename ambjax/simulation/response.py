@@ -38,7 +38,7 @@ class Settling:
     there, and therefore longer than the run.
     """
 
-    band: Scalar = leaf(unit="m", above=0, at_most=1.0)
+    band: Scalar = leaf(unit="m", above=0, at_most=1.0, doc="the band")
 
     def init(self) -> Crossing:
         zero = jnp.zeros((), jnp.result_type(float))

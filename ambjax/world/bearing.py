@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.compiler.barrier import compiled_alone
-from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.records import Scalar, leaf, part, record
 from ambjax.numerics.smooth import refined, safe_sqrt
 from ambjax.world.iron import Iron
 from ambjax.world.sensor import Measurement
@@ -87,8 +87,11 @@ class Bearing(Generic[S]):
     R: Scalar = leaf(default=41.44, unit="ohm", at_least=0, at_most=1e6, doc="coil resistance")
     g: Scalar = leaf(default=9.81, unit="m/s^2", at_least=-1e4, at_most=1e4, doc="gravitational acceleration")
 
-    iron: Iron | None = None
-    """saturation, leakage and eddy currents of the true plant; None: ideal iron. The laws' formulas never contain it"""
+    iron: Iron | None = part(
+        default=None,
+        doc="saturation, leakage and eddy currents of the true plant; None: ideal iron. "
+        "The laws' formulas never contain it",
+    )
 
     one_current: ClassVar[bool] = False
     """Whether the state is (z, z_dot, i), as in `Plant`."""

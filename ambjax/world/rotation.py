@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.records import Scalar, leaf, part, record
 from ambjax.numerics.smooth import TWO_PI, sine
 from ambjax.world.signals import hull
 
@@ -146,7 +146,7 @@ class Runout:
     """
 
     speed: Scalar = _speed()
-    harmonics: tuple[Harmonic, ...] = ()
+    harmonics: tuple[Harmonic, ...] = part(default=(), doc="the harmonics")
     speed_end: Scalar | None = _speed_end()
     duration: Scalar = _duration()
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.records import Scalar, leaf, part, record
 from ambjax.world.amplifier import Amplifier, CoilResponse, CurrentAmplifier
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant
@@ -42,30 +42,34 @@ class Initial:
 class Scenario:
     """All inputs of a rollout besides the controller. Member k of seed s always draws the same noise."""
 
-    plant: Bearing = Plant()
-    reference: Signal = Constant()
-    q_z: Signal = Constant()
-    """disturbance acceleration, m/s^2"""
-    q_v: Signal = Constant()
-    """disturbance as scaled force, A^2/m^2: adds a q_v to q_z, with the true plant's a"""
-    q_i: Signal = Constant()
-    """disturbance of the current's rate, A/s"""
-    q_f: Signal | None = None
-    """disturbance as force, N: adds q_f / m to q_z, with the true plant's m; None: none"""
-    base: Signal | None = None
-    """acceleration of the housing, m/s^2: adds -base to q_z, because z is relative to the housing; None: none"""
-    sensor: Sensor | None = None
-    initial: Initial = Initial()
+    plant: Bearing = part(default=Plant(), doc="the true plant")
+    reference: Signal = part(default=Constant(), doc="position that the rotor must follow, m")
+    q_z: Signal = part(default=Constant(), doc="disturbance acceleration, m/s^2")
+    q_v: Signal = part(
+        default=Constant(), doc="disturbance as scaled force, A^2/m^2: adds a q_v to q_z, with the true plant's a"
+    )
+    q_i: Signal = part(default=Constant(), doc="disturbance of the current's rate, A/s")
+    q_f: Signal | None = part(
+        default=None, doc="disturbance as force, N: adds q_f / m to q_z, with the true plant's m; None: none"
+    )
+    base: Signal | None = part(
+        default=None,
+        doc="acceleration of the housing, m/s^2: adds -base to q_z, because z is relative to the housing; None: none",
+    )
+    sensor: Sensor | None = part(default=None, doc="errors of the sensors; None: none")
+    initial: Initial = part(default=Initial(), doc="state of the plant at t = 0")
     u_max: Scalar = leaf(
         default=jnp.inf, unit="V", at_least=1e-9, at_most=1e12, infinite=True, doc="limit of the supply; inf: none"
     )
-    amplifier: Amplifier | CurrentAmplifier | None = None
-    """between the command and the coils; None: an ideal source of the commanded voltage"""
+    amplifier: Amplifier | CurrentAmplifier | None = part(
+        default=None, doc="between the command and the coils; None: an ideal source of the commanded voltage"
+    )
     clearance: Scalar | None = leaf(
         default=None, unit="m", at_least=1e-9, at_most=1.0, optional=True, doc="|z| of touch-down; none: 0.9 s_0"
     )
-    stop: Stop | None = None
-    """the touchdown bearing at the clearance; None: a rotor that reaches the clearance is lost"""
+    stop: Stop | None = part(
+        default=None, doc="the touchdown bearing at the clearance; None: a rotor that reaches the clearance is lost"
+    )
     seed: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, doc="seed of the noise")
     member: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, doc="member of an ensemble")
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ambjax.numerics.gaussian import normals
-from ambjax.numerics.records import Scalar, leaf, record, static
+from ambjax.numerics.records import Scalar, leaf, part, record, static
 from ambjax.numerics.smooth import polynomial
 from ambjax.world.faults import Dropouts, FaultOnsets, Outliers, Sensed
 from ambjax.world.rotation import Runout
@@ -79,9 +79,9 @@ class Sensor:
         default=None, unit="A", at_least=1e-9, at_most=1e6, optional=True, doc="ends of the converter; none: 2 i_0"
     )
     velocity: bool = static(default=True, doc="whether z_dot is measured; else an observer must estimate it")
-    outliers: Outliers | None = None
-    dropouts: Dropouts | None = None
-    runout: Runout | None = None
+    outliers: Outliers | None = part(default=None, doc="wrong readings of the position; None: none")
+    dropouts: Dropouts | None = part(default=None, doc="lost readings of the position; None: none")
+    runout: Runout | None = part(default=None, doc="runout of the surface that the sensor reads; None: none")
 
     @property
     def faulty(self) -> bool:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.records import Scalar, leaf, part, record
 from ambjax.numerics.smooth import TWO_PI, sine
 
 
@@ -167,7 +167,7 @@ class Chirp:
 class Sum:
     """The sum of several signals."""
 
-    terms: tuple[Signal, ...]
+    terms: tuple[Signal, ...] = part(doc="the signals that are added")
 
     def __call__(self, t: Scalar) -> Array:
         total = Constant(0.0)(t)

@@ -1,12 +1,10 @@
-"""Convert plain-text docstrings with `names` in backticks for autodoc, and list the fields of records."""
+"""Convert plain-text docstrings with `names` in backticks for autodoc, and resolve links."""
 
-import dataclasses
 import operator
 import re
 import sys
 from typing import Any
 
-from reference.fields import Facts, facts
 from sphinx.application import Sphinx
 
 # Characters that mean something in reStructuredText but nothing in a docstring.
@@ -26,16 +24,6 @@ def process(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: li
     if len(lines) and NOTHING.fullmatch(lines[0]):
         lines.clear()
     lines[:] = [plain(line) for line in lines]
-    if what == "class" and dataclasses.is_dataclass(obj):
-        rows = [facts(field) for field in dataclasses.fields(obj) if field.metadata.get("doc")]
-        lines += ["", *map(_item, rows)]
-        lines.append("")
-
-
-def _item(row: Facts) -> str:
-    """Return a field as an item of a list."""
-    told = [row.default and f"default {row.default}", row.unit, row.allowed]
-    return f"- ``{row.name}``: {plain(row.doc)} ({'; '.join(filter(None, told))})"
 
 
 def elsewhere(app: Sphinx, env: Any, node: Any, text: Any) -> Any:

@@ -3,12 +3,10 @@
 import ast
 import dataclasses
 import inspect
-import math
-import re
 import textwrap
 from typing import Any, NamedTuple
 
-from ambjax.numerics.records import numbers
+from ambjax.numerics.declared import allowed, default_text
 
 
 class Facts(NamedTuple):
@@ -23,23 +21,9 @@ class Facts(NamedTuple):
 
 def facts(field: dataclasses.Field, default: Any = None) -> Facts:
     """Return the declaration of a numeric field; `default` replaces its default if that of the case file differs."""
-    meta = field.metadata
-    unit, allowed = "", ""
-    if meta.get("leaf"):
-        unit = meta["unit"]
-        allowed = re.sub(r"^a (finite )?number ", "", numbers(field).replace(f" ({unit})", ""))
-    shown = field.default if default is None else default
-    return Facts(field.name, "" if unit == "1" else unit, value(shown), allowed, meta["doc"])
-
-
-def value(default: Any) -> str:
-    """Return a default as text; '' for none."""
-    if default is dataclasses.MISSING or default is None:
-        return ""
-    if isinstance(default, (str, bool)) or dataclasses.is_dataclass(default):
-        return str(default)
-    number = float(default)
-    return f"{number:g}" if math.isfinite(number) else "inf"
+    unit = field.metadata.get("unit", "")
+    shown = default_text(field.default if default is None else default)
+    return Facts(field.name, "" if unit == "1" else unit, shown, allowed(field), field.metadata["doc"])
 
 
 def attribute_docs(kind: type) -> dict[str, str]:

@@ -36,6 +36,6 @@ def first_paragraph(thing: Any) -> str:
 
 
 def paragraphs(thing: Any) -> list[str]:
-    """Return a docstring as Markdown, with an empty line after each paragraph."""
-    found = (inspect.getdoc(thing) or "").split("\n\n")
+    """Return a docstring as Markdown, with an empty line after each paragraph, without the list of fields."""
+    found = [text for text in (inspect.getdoc(thing) or "").split("\n\n") if not text.startswith("- `")]
     return [line for text in found for line in (escaped(" ".join(text.split())), "")]

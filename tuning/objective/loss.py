@@ -69,11 +69,11 @@ class Loss:
     The result also contains the result of each fold in `measures`, with PREFIX before its name.
     """
 
-    settle: Scalar = leaf(default=0.2, unit="s", at_least=0, at_most=1e6)
-    early: Scalar = leaf(default=0.0, at_least=0, at_most=1e6)
-    s_0: Scalar = leaf(default=5e-3, unit="m", above=0, at_most=1.0)
-    u_scale: Scalar = leaf(default=200.0, unit="V", above=0, at_most=1e30)
-    stop: Scalar = leaf(default=4.5e-3, unit="m", above=0, at_most=1.0)
+    settle: Scalar = leaf(default=0.2, unit="s", at_least=0, at_most=1e6, doc="time from which errors count")
+    early: Scalar = leaf(default=0.0, at_least=0, at_most=1e6, doc="weight of the errors before `settle`")
+    s_0: Scalar = leaf(default=5e-3, unit="m", above=0, at_most=1.0, doc="gap, the unit of errors")
+    u_scale: Scalar = leaf(default=200.0, unit="V", above=0, at_most=1e30, doc="unit of voltages")
+    stop: Scalar = leaf(default=4.5e-3, unit="m", above=0, at_most=1.0, doc="clearance")
     measures: Mapping[str, Fold] = dataclasses.field(default_factory=dict)
 
     def init(self) -> Sums:

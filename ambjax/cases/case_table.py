@@ -1,0 +1,53 @@
+"""The parts of a case and their numbers as rows of a table, for notebooks."""
+
+import dataclasses
+import html
+
+import numpy as np
+
+from ambjax.control.cascade import Cascade
+from ambjax.numerics.records import GainFunction
+from ambjax.simulation.clock import Clock
+from ambjax.world.scenario import SLOTS, Scenario
+from ambjax.world.signals import Constant
+
+# Unit of each signal of a scenario.
+UNITS = {"reference": "m", "q_z": "m/s^2", "q_v": "A^2/m^2", "q_i": "A/s", "q_f": "N", "base": "m/s^2"}
+
+
+def parts_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> dict[str, str]:
+    """Return the numbers of each part by its name, with units; parts that are absent, and zero signals, are omitted."""
+    laws = {stage: getattr(cascade, stage) for stage in ("observer", "position", "inversion", "current")}
+    given = {slot: getattr(scenario, slot) for slot in SLOTS}
+    signals = {f"{slot} ({UNITS[slot]})": one for slot, one in given.items() if one != Constant()}
+    same = _numbers_of(cascade.model).partition(":")[2] == _numbers_of(scenario.plant).partition(":")[2]
+    model = None if same else cascade.model
+    world = {"sensor": scenario.sensor, "actuator": scenario.amplifier, "stop": scenario.stop}
+    parts = {"plant": scenario.plant, "model": model, **laws, "processor": cascade.processor, **signals, **world}
+    told = {name: _numbers_of(one) for name, one in parts.items() if one is not None}
+    supply, period = float(np.max(scenario.u_max)), float(clock.sample_period)
+    limit = {"supply": f"{supply:g} V"} if np.isfinite(supply) else {}
+    return told | limit | {"clock": f"{clock.samples} samples of {period:g} s, {clock.method}"}
+
+
+def _numbers_of(part: object) -> str:
+    """Return the type of a record and its numbers with their units; a nested record in parentheses."""
+    words = []
+    for field in dataclasses.fields(part) if dataclasses.is_dataclass(part) else ():
+        value, unit = getattr(part, field.name), field.metadata.get("unit", "")
+        if isinstance(value, GainFunction):
+            words.append(f"{field.name} scheduled")
+        elif field.metadata.get("leaf") and value is not None:
+            shown = f"{float(value):g}" if np.ndim(value) == 0 else f"{np.size(value)} values"
+            words.append(f"{field.name} = {shown}{f' {unit}' if unit not in ('', '1') else ''}")
+        elif dataclasses.is_dataclass(value):
+            words.append(f"{field.name} ({_numbers_of(value)})")
+    return f"{type(part).__name__}{': ' if words else ''}{', '.join(words)}"
+
+
+def case_table(name: str, parts: dict[str, str], spread: tuple[str, ...]) -> str:
+    """Return an HTML table of the parts of a case called `name`. `spread`: paths of the quantities of its spread."""
+    shown = parts | ({"spread": ", ".join(spread)} if spread else {})
+    rows = "".join(f"<tr><td>{part}</td><td>{html.escape(words)}</td></tr>" for part, words in shown.items())
+    titles = "<tr><th>part</th><th>numbers</th></tr>"
+    return f"<table><caption>{html.escape(name)}</caption>{titles}{rows}</table>"

@@ -1,0 +1,170 @@
+"""`survival_map`: the map of the command `ambjax map` as a Python object."""
+
+import dataclasses
+import html
+import math
+from typing import Any
+
+import numpy as np
+
+from ambjax.cases.reader import Case
+from ambjax.cases.timing import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
+from ambjax.commands.ensemble import study_of
+from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, stepped
+from ambjax.ensemble.paths import Place, places
+from ambjax.ensemble.study import Study
+from ambjax.host.optional import extra
+from ambjax.numerics.declared import numbers, within
+
+COUNT = 21
+MOST_CELLS = 1_000_000
+# Most samples of all runs in a map over clock.sample_period, some hours of computation.
+MOST_TOTAL = 10_000_000_000
+FORM = "PATH=LOW:HIGH[:COUNT][:log], as in initial.z=-1e-3:1e-3:41 or plant.m=-20%:20%"
+# Unit and meaning of each grid of a map.
+MEANINGS = {
+    "survival": ("1", "share of survivors"),
+    "low": ("1", "lower end of the 95 % interval of the survival"),
+    "high": ("1", "upper end of the 95 % interval of the survival"),
+    "error": ("m", "median over the survivors of the largest settled |z - r|"),
+    "lost": ("1", "number of members whose rotor is lost"),
+    "stalled": ("1", "number of members whose integration stopped early"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class CaseMap:
+    """The result of `survival_map`: the case, and the `Map` with arrays [ny, nx] in SI units.
+
+    A notebook shows the smallest and largest values of each array.
+    """
+
+    case: Case
+    map: Map
+
+    def to_xarray(self) -> Any:
+        """Return the arrays as an xarray Dataset over both quantities, by their dotted paths, with units in `attrs`.
+
+        Raises ValueError if xarray is not installed.
+        """
+        one, dims = self.map, (self.map.y.path, self.map.x.path)
+        grids = {name: (dims, getattr(one, name), {"units": u, "long_name": w}) for name, (u, w) in MEANINGS.items()}
+        axes = {axis.path: (axis.path, axis.values, {"units": unit_of(self.case, axis)}) for axis in (one.y, one.x)}
+        facts = {"case": self.case.name, "members": one.members, "drawn": ", ".join(one.drawn)}
+        return extra("xarray").Dataset(grids, axes, facts)
+
+    def _repr_html_(self) -> str:
+        """Return the table of the ranges of the arrays."""
+        one = self.map
+        head = f"{self.case.name}: {one.members} member(s) in each cell of {one.x.path} and {one.y.path}"
+        grids = {name: getattr(one, name)[np.isfinite(getattr(one, name))] for name in GRIDS}
+        rows = "".join(
+            f"<tr><td>{MEANINGS[name][1]}</td><td>{x.min():.6g}</td><td>{x.max():.6g}</td>"
+            f"<td>{MEANINGS[name][0].strip('1')}</td></tr>"
+            for name, x in grids.items()
+            if x.size
+        )
+        titles = "<tr><th>quantity</th><th>smallest</th><th>largest</th><th>unit</th></tr>"
+        return f"<table><caption>{html.escape(head)}</caption>{titles}{rows}</table>"
+
+
+def survival_map(case: Case, x: str, y: str, *, members: int = 1, seed: int | None = None) -> CaseMap:
+    """Return survival and error over a grid of two quantities of a case, as `ambjax map` computes them.
+
+    - `case`: from `read_case`.
+    - `x`, `y`: quantity and range of each axis, as the options of the command: "PATH=LOW:HIGH[:COUNT][:log]", in SI
+      units or per cent of the case's value; 21 values by default.
+    - `members`: number of members in each cell; 1 is the nominal case, and 2 or more draw the spread of the case.
+    - `seed`: of the spread and the noise; None: `run.seed` of the case.
+
+    Raises ValueError for an unknown quantity, a range that the case does not allow, and too many runs.
+    """
+    study, *axes = prepared(case, x, y, members, seed)
+    return CaseMap(case, grid(study, *axes))
+
+
+def prepared(case: Case, x: str, y: str, members: int, seed: int | None) -> tuple[Study, Axis, Axis]:
+    """Return the study and the axes of a map. Raises ValueError as `survival_map` does."""
+    study = study_of(case, seed, members)
+    first, second = _axis("--x", x, case), _axis("--y", y, case)
+    cells = len(first.values) * len(second.values)
+    if cells * members > MOST_CELLS:
+        raise ValueError(f"--members {members}: times {cells} cells, it exceeds {MOST_CELLS:,} runs. Reduce either.")
+    _check_samples(case, first, second, members)
+    return stepped(study, first, second), first, second
+
+
+def unit_of(case: Case, axis: Axis) -> str:
+    """Return the unit of the quantity on an axis."""
+    place = places(case.cascade, case.scenario).get(axis.path)
+    return "s" if place is None else place.field.metadata["unit"]
+
+
+def _axis(flag: str, text: str, case: Case) -> Axis:
+    """Parse the value of --x or --y. Raises ValueError with the option, its text and the valid form."""
+
+    def refuse(why: str) -> ValueError:
+        return ValueError(f"{flag} {text}: {why}. Write {FORM}.")
+
+    path, _, rest = text.partition("=")
+    parts = rest.split(":")
+    log = parts[-1] == "log"
+    parts = parts[:-1] if log else parts
+    if len(parts) not in (2, 3):
+        raise refuse("it must be a path, '=' and a range")
+    known = places(case.cascade, case.scenario)
+    nominal = float(case.clock.sample_period) if path == PERIOD else _nominal(known.get(path))
+    try:
+        low, high = (_value(part, nominal) for part in parts[:2])
+        count = int(parts[2]) if len(parts) == 3 else COUNT
+    except ValueError as error:
+        raise refuse(str(error)) from None
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise refuse(f"LOW must be less than HIGH, both finite; they are {low:g} and {high:g}")
+    if not 2 <= count <= MOST_CELLS:
+        raise refuse(f"COUNT must be 2 to {MOST_CELLS:,}, and it is {count}")
+    field = SAMPLE_PERIOD if path == PERIOD else known[path].field if path in known else None
+    if field is not None and not within(field.metadata, np.array([low, high])):
+        raise refuse(f"{path} must be {numbers(field)}, and the range is {low:g} to {high:g}")
+    if log and low <= 0:
+        raise refuse(f"a logarithmic range must begin above 0, and it begins at {low:g}")
+    return Axis(path, np.geomspace(low, high, count) if log else np.linspace(low, high, count), log)
+
+
+def _check_samples(case: Case, x: Axis, y: Axis, members: int) -> None:
+    """Raise ValueError for sample periods too long for the run, or a map with too many samples."""
+    for flag, axis, other in (("--x", x, y), ("--y", y, x)):
+        if axis.path != PERIOD:
+            continue
+        duration, low, high = float(case.clock.duration), float(axis.values[0]), float(axis.values[-1])
+        total = np.sum(duration / axis.values) * len(other.values) * members
+        samples = np.round(duration / axis.values)
+        if samples.min() < FEWEST_SAMPLES:
+            raise ValueError(
+                f"{flag} {PERIOD}: it reaches {high:g} s, but clock.duration is {duration:g} s, and a run needs "
+                f"{FEWEST_SAMPLES} samples. Set HIGH to at most {duration / FEWEST_SAMPLES:g} s."
+            )
+        unsettled = axis.values[(samples - 1) * axis.values < case.settle]
+        if unsettled.size:
+            raise ValueError(
+                f"{flag} {PERIOD}: with {unsettled[0]:g} s no sample is at or after run.settle = {case.settle:g} s. "
+                "Lower HIGH or run.settle."
+            )
+        if duration / low > MOST_SAMPLES or total > MOST_TOTAL:
+            raise ValueError(
+                f"{flag} {PERIOD}: from {low:g} s on, it makes runs of up to {duration / low:.3g} samples, {total:.3g} "
+                f"in all; at most {MOST_SAMPLES:,} a run and {MOST_TOTAL:.0e} in all are allowed. Raise LOW, or "
+                "shorten clock.duration."
+            )
+
+
+def _nominal(place: Place | None) -> float | None:
+    return None if place is None or place.value is None else float(place.value)
+
+
+def _value(text: str, nominal: float | None) -> float:
+    if not text.endswith("%"):
+        return float(text)
+    if nominal is None or not math.isfinite(nominal) or nominal == 0:
+        raise ValueError("per cent need a number other than 0 in the case, and the case has none at this path")
+    return nominal * (1 + float(text[:-1]) / 100)

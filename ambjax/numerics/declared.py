@@ -1,0 +1,111 @@
+"""What the fields of records declare, as text for messages and docstrings, and as checks of values."""
+
+import dataclasses
+import math
+import re
+import textwrap
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+def numbers(field: dataclasses.Field) -> str:
+    """Return the allowed values of a numeric field in words, with the unit."""
+    meta = field.metadata
+    above, at_least, at_most = meta["above"], meta["at_least"], meta["at_most"]
+    unit = f" ({meta['unit']})" if meta["unit"] else ""
+    end = f"{unit}, or inf" if meta["infinite"] else unit
+    kind = "a number" if meta["infinite"] else "a finite number"
+    if meta["whole"]:
+        return f"a whole number from {at_least} to {at_most}{end}"
+    if above is not None:
+        return f"{kind} above {above:g}{'' if at_most is None else f' and at most {at_most:g}'}{end}"
+    if at_least is not None:
+        return f"{kind} {f'of at least {at_least:g}' if at_most is None else f'from {at_least:g} to {at_most:g}'}{end}"
+    return f"{kind}{end}"
+
+
+def allowed(field: dataclasses.Field) -> str:
+    """Return the range of a numeric field in words, without its unit; '' for a field of another kind."""
+    if not field.metadata.get("leaf"):
+        return ""
+    return re.sub(r"^a (finite )?number ?", "", numbers(field).replace(f" ({field.metadata['unit']})", ""))
+
+
+def default_text(default: object) -> str:
+    """Return a default as text; '' for none."""
+    if default is dataclasses.MISSING or default is None:
+        return ""
+    if dataclasses.is_dataclass(default):
+        return f"{type(default).__name__}()"
+    if isinstance(default, bool) or not isinstance(default, (int, float)):
+        return str(default)
+    return f"{default:g}" if math.isfinite(default) else "inf"
+
+
+def item(field: dataclasses.Field) -> str:
+    """Return the meaning, default, unit and range of a field as an item of the list in a docstring."""
+    default, unit = default_text(field.default), field.metadata.get("unit", "")
+    told = [default and f"default {default}", "" if unit == "1" else unit, allowed(field)]
+    words = "; ".join(filter(None, told))
+    text = f"- `{field.name}`: {field.metadata['doc']}{words and f' ({words})'}"
+    return textwrap.fill(text, 100, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+
+
+def check_order(kind: type, values: Mapping[str, object], path: str) -> None:
+    """Raise ValueError if two leaves that `kind.ordered` names, such as start and stop, are numbers in another order.
+
+    `values`: the leaves by name. `path`: dotted path of the record, for the message.
+    """
+    pair: tuple[str, str] | None = getattr(kind, "ordered", None)
+    if pair is not None:
+        low, high = (values[name] for name in pair)
+        if isinstance(low, (int, float)) and isinstance(high, (int, float)) and not low < high:
+            raise ValueError(f"{path}.{pair[1]} = {high:g}: it must be more than {pair[0]} = {low:g}.")
+
+
+def within(meta: Mapping[str, Any], value: npt.ArrayLike) -> bool:
+    """Return whether a field with the metadata `meta` allows a number, or every number of an array."""
+    if isinstance(value, (int, float)):
+        if value == math.inf:
+            return meta["infinite"]
+        above, at_least, at_most = meta["above"], meta["at_least"], meta["at_most"]
+        return (  # False for NaN
+            -math.inf < value
+            and not (meta["whole"] and value % 1)
+            and (above is None or value > above)
+            and (at_least is None or value >= at_least)
+            and (at_most is None or value <= at_most)
+        )
+    low, high = np.min(value), np.max(value)  # both are NaN if a value is
+    whole = not meta["whole"] or not np.any(np.asarray(value) % 1)
+    return whole and all(within(meta, float(x)) for x in (low, high))
+
+
+def _example(field: dataclasses.Field) -> str:
+    """Return a sentence that proposes the default of a field; empty if the default is not a finite number."""
+    default = field.default
+    usable = isinstance(default, (int, float)) and math.isfinite(default)
+    return f" Use {default:g}, for example." if usable else ""
+
+
+def check_number(field: dataclasses.Field, name: str, value: object) -> None:
+    """Raise ValueError if `field` does not allow `value`, a number or an array.
+
+    The message contains the dotted name, the value, the allowed range and, if there is one, the default.
+    """
+    try:
+        number = value if isinstance(value, (int, float)) else np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        number = math.nan
+    number = math.nan if isinstance(value, str) else number
+    if not within(field.metadata, number):
+        shown = f"{value:g}" if isinstance(value, (int, float)) else _shown(value, number)
+        raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.{_example(field)}")
+
+
+def _shown(value: object, number: npt.ArrayLike) -> str:
+    """Return the text of an invalid value for a message: the range of an array, or the value as Python shows it."""
+    return f"{np.min(number):g} to {np.max(number):g}" if np.ndim(number) else repr(value)
