@@ -94,6 +94,12 @@ def test_members_are_those_of_the_command(path, members, tmp_path):
 def test_the_pictures_show_the_results(run, members):
     axes = run.plot().axes
     assert any("position" in ax.get_ylabel() for ax in axes)
+    rows, whole = run.trajectory.rows, run.plot_phase().axes[0]
+    (line,) = whole.collections
+    _, rate = (label.rpartition("(")[2] for label in (whole.get_xlabel(), whole.get_ylabel()))
+    factors = {"µm)": 1e6, "mm/s)": 1e3}
+    ends = np.array([factors["µm)"] * rows.z[-1], factors[rate] * rows.z_dot[-1]])
+    np.testing.assert_allclose(line.get_segments()[-1][-1], ends)
     axes = members.plot("rms_u_V", "max_abs_i_A").axes
     assert [ax.patches[0].get_data().values.sum() for ax in axes] == [8, 8]
     with pytest.raises(ValueError, match=r"none of rms_u is a column. The columns are .*rms_u_V"):

@@ -142,7 +142,7 @@ def test_feedback_linearisation_makes_the_mechanics_linear(model):
 # --- the chain of filters ---
 
 CHAIN = position.FilterChain(
-    k_p=300.0, k_int=2e4, k_d=0.5, w_f=2e4, k_aw=1e-30, w_z=900.0, w_p=4e3, w_1=3e3, width_1=0.4, depth_1=0.1, w_2=2e4,
+    k_p=300.0, k_int=2e4, k_d=0.5, w_f=2e4, k_aw=2e-30, w_z=900.0, w_p=4e3, w_1=3e3, width_1=0.4, depth_1=0.1, w_2=2e4,
     width_2=0.7, depth_2=0.3, w_lp=1.5e4,
 )  # fmt: skip
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from ambjax.host.synonyms import hint
 from ambjax.host.words import one_line
-from ambjax.numerics.declared import check_number, check_order, numbers, within
+from ambjax.numerics.declared import check_number, numbers, within
 from ambjax.numerics.records import check_leaf
 
 # Characters of a key or a value that a message shows.
@@ -149,8 +149,16 @@ class Table:
                 raise ValueError(f"{self.at(field.name)} is missing: give {numbers(field)}; {field.metadata['doc']}.")
             values[field.name] = self.number(field.name, default, numbers(field))
             check_leaf(field, self.at(field.name), values[field.name])
-        check_order(kind, values, self.path)
-        return kind(**values)
+        one = kind(**values)
+        self._check_order(one)
+        return one
+
+    def _check_order(self, record: object) -> None:
+        """Raise ValueError if the two leaves that the record orders, such as start and stop, are not in that order."""
+        if pair := getattr(record, "ordered", None):
+            low, high = (getattr(record, name) for name in pair)
+            if not low < high:
+                raise ValueError(f"{self.at(pair[1])} = {high:g}: it must be more than {pair[0]} = {low:g}.")
 
 
 def show(value: object) -> str:

@@ -54,18 +54,6 @@ def item(field: dataclasses.Field) -> str:
     return textwrap.fill(text, 100, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
-def check_order(kind: type, values: Mapping[str, object], path: str) -> None:
-    """Raise ValueError if two leaves that `kind.ordered` names, such as start and stop, are numbers in another order.
-
-    `values`: the leaves by name. `path`: dotted path of the record, for the message.
-    """
-    pair: tuple[str, str] | None = getattr(kind, "ordered", None)
-    if pair is not None:
-        low, high = (values[name] for name in pair)
-        if isinstance(low, (int, float)) and isinstance(high, (int, float)) and not low < high:
-            raise ValueError(f"{path}.{pair[1]} = {high:g}: it must be more than {pair[0]} = {low:g}.")
-
-
 def within(meta: Mapping[str, Any], value: npt.ArrayLike) -> bool:
     """Return whether a field with the metadata `meta` allows a number, or every number of an array."""
     if isinstance(value, (int, float)):

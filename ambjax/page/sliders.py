@@ -105,7 +105,7 @@ def parameters(case: Case, paths: list[str]) -> dict[str, int]:
     """Return, by path, the index of the parameter that a number sets: the only one that changes with the number."""
     own, found = parameter_values(case), {}
     for path in paths:
-        (found[path],) = np.flatnonzero(parameter_values(changed(case, {path: math.pi})) != own)
+        (found[path],) = np.flatnonzero(parameter_values(changed(case, {path: np.array(math.pi)})) != own)
     return {path: int(k) for path, k in found.items()}
 
 

@@ -83,6 +83,12 @@ class CaseRun:
 
         return overview_figure(self.trajectory, f"{self.case.name}: {self.case.clock.method}", settle=self.case.settle)
 
+    def plot_phase(self) -> Any:
+        """Return a matplotlib Figure of the velocity against the displacement, of the whole run and its settled part."""
+        from ambjax.pictures.phase_plane import phase_plane
+
+        return phase_plane(self.trajectory, self.case.name, self.case.settle)
+
     def _signals(self) -> dict[str, np.ndarray]:
         """Return the saved signals [samples] by name, without the time."""
         return {name: x for name, x in self.trajectory.arrays().items() if name in SIGNAL_UNITS and name != "t"}
