@@ -35,7 +35,7 @@ def linear(model):
 def test_state_feedback_has_the_poles_of_the_symmetric_root_locus(model):
     """The stable roots of p^2 (p^2 - s)^2 = b^2 (q_I - q_e p^2)/r, which need no Riccati equation."""
     law, (s, b) = default_law(position.StateFeedback, model), linear(model)
-    law = dataclasses.replace(law, k_aw=0.0)
+    law = dataclasses.replace(law, k_aw=np.zeros(()))  # an array is not checked
 
     def rates(x):  # integral term, z, z_dot; the magnets are linear, and the current is the demanded one
         v_star, rate = law(model, (Measurement(x[1], x[2], 0.0), STILL), x[0])
@@ -53,7 +53,9 @@ def test_state_feedback_has_the_poles_of_the_symmetric_root_locus(model):
 def test_sampled_state_feedback_has_the_least_cost(model):
     """The cost-to-go of the law's own map is that of value iteration, which needs no Riccati solver."""
     T = 5e-5 if model is RIG else 2e-4
-    law = dataclasses.replace(default_law(position.StateFeedback, model, T), k_aw=0.0)
+    law = dataclasses.replace(
+        default_law(position.StateFeedback, model, T), k_aw=np.zeros(())
+    )  # an array is not checked
     K = np.array([law.k_int, law.k_p, law.k_d])
     A, B = regulator.state_space(model)
     s, b = linear(model)

@@ -86,10 +86,7 @@ def _distribution(raw: object, path: str) -> Distribution:
     table.only(["percent", "shape"] if kinds == ["percent"] else kinds or list(DISTRIBUTIONS))
     if len(kinds) != 1:
         raise ValueError(f"{where} = {show(raw)}: give exactly one of {quoted(list(DISTRIBUTIONS))}.")
-    try:
-        return DISTRIBUTIONS[kinds[0]](table)
-    except ValueError as error:  # the constructor of a distribution does not know the path
-        raise ValueError(str(error) if str(error).startswith(where) else f"{where}: {error}") from None
+    return DISTRIBUTIONS[kinds[0]](table)
 
 
 def _refuse_nothing_in_two_units(spread: Spread, top: Table) -> None:

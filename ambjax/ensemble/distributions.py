@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ambjax.numerics.records import leaf, record, static
+from ambjax.numerics.records import part, record, static
 
 # Standard deviations at which normal shapes are truncated.
 CUT = 6.0
@@ -45,7 +45,7 @@ def cut_normal(u: np.ndarray) -> np.ndarray:
 class Normal:
     """Normal distribution: nominal + std z, z standard normal."""
 
-    std: float = leaf(at_least=0, doc="standard deviation, in the unit of the number")
+    std: float = part(doc="standard deviation, in the unit of the number")
     relative = True
 
     def __str__(self) -> str:
@@ -69,7 +69,7 @@ class Normal:
 class Percent:
     """Relative distribution: nominal + |nominal| percent/100 x, with x uniform in -1..1 or standard normal."""
 
-    percent: float = leaf(at_least=0, doc="half width, or standard deviation, in per cent of nominal")
+    percent: float = part(doc="half width, or standard deviation, in per cent of nominal")
     shape: str = static(default="uniform")
     relative = True
 
@@ -95,8 +95,8 @@ class Percent:
 class Uniform:
     """Uniform distribution from low to high. It does not depend on the nominal value."""
 
-    low: float = leaf(doc="least value")
-    high: float = leaf(doc="largest value")
+    low: float = part(doc="least value")
+    high: float = part(doc="largest value")
     relative = False
 
     def __str__(self) -> str:
@@ -116,8 +116,8 @@ class Uniform:
 class LogUniform:
     """Log-uniform distribution: the logarithm of the number is uniform from log(low) to log(high)."""
 
-    low: float = leaf(above=0, doc="least value")
-    high: float = leaf(above=0, doc="largest value")
+    low: float = part(doc="least value")
+    high: float = part(doc="largest value")
     relative = False
 
     def __str__(self) -> str:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -109,7 +110,7 @@ def parameters(case: Case, paths: list[str]) -> dict[str, int]:
     return {path: int(k) for path, k in found.items()}
 
 
-def changed(case: Case, values: dict[str, float]) -> Case:
+def changed(case: Case, values: Mapping[str, float | np.ndarray]) -> Case:
     """Return the case with the numbers at these paths replaced. `values`: new values by path."""
     values, seed = dict(values), values.get(SEED, case.scenario.seed)
     values.pop(SEED, None)

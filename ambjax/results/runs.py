@@ -84,7 +84,7 @@ class CaseRun:
         return overview_figure(self.trajectory, f"{self.case.name}: {self.case.clock.method}", settle=self.case.settle)
 
     def plot_phase(self) -> Any:
-        """Return a matplotlib Figure of the velocity against the displacement, of the whole run and its settled part."""
+        """Return a matplotlib Figure of the velocity against the displacement, in the whole run and when settled."""
         from ambjax.pictures.phase_plane import phase_plane
 
         return phase_plane(self.trajectory, self.case.name, self.case.settle)
