@@ -1,5 +1,6 @@
 import ctypes
 import gc
+import importlib.metadata
 import os
 import pathlib
 import shutil
@@ -11,6 +12,18 @@ from profiles import THOROUGH
 # One cache of compiled programs for all processes of a run, kept for the next run; removed when it is larger (bytes).
 CACHE = pathlib.Path(__file__).parent.parent / ".pytest_cache" / "programs"
 LARGEST = 512 * 2**20
+# Resident memory above which the programs of a module are released when it ends (bytes).
+MUCH = 700 * 2**20
+
+# Compilation takes most of the tests' time: half as much with fewer optimisations, which change roundings only.
+# XLA aborts on a flag that it does not know, so each version has its own. The thorough profile compiles as users do.
+QUICK = {
+    "0.10": "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
+    "--xla_cpu_opt_preset=CPU_OPT_PRESET_FAST_COMPILE"
+}
+if not THOROUGH:
+    version = ".".join(importlib.metadata.version("jaxlib").split(".")[:2])
+    os.environ.setdefault("XLA_FLAGS", QUICK.get(version, ""))
 
 os.environ.setdefault("JAX_ENABLE_X64", "1")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
@@ -38,10 +51,19 @@ def pytest_collection_modifyitems(config, items):
         items[:] = [item for item in items if not item.get_closest_marker("thorough")]
 
 
+def _resident() -> float:
+    """Return the resident memory of this process (bytes); infinity where it is not known."""
+    if sys.platform != "linux":
+        return float("inf")
+    return int(pathlib.Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _release_programs():
-    """Release the compiled programs of a module when it ends: memory does not grow with the number of modules."""
+    """Release compiled programs at the end of a module if memory is above MUCH. Other modules use them otherwise."""
     yield
+    if _resident() < MUCH:
+        return
     import jax
 
     jax.clear_caches()

@@ -44,8 +44,9 @@ BINARY = {
     "or": lambda x, y: jnp.where((x > 0) | (y > 1), x, y),
     "xor": lambda x, y: jnp.where((x > 0) ^ (y > 1), x, y),
 }
-# Units in the last place by which XLA's own functions are off those of <math.h>; all others: 4.
-LOOSE = {"log1p": 128, "arctanh": 128, "sinh": 32, "cosh": 32, "tanh": 8, "expm1": 8, "erfc": 64}
+# Units in the last place by which XLA's own functions are off those of <math.h>; all others: 4. XLA's cbrt is a power
+# with the few optimisations of the tests.
+LOOSE = {"log1p": 128, "arctanh": 128, "sinh": 32, "cosh": 32, "tanh": 8, "expm1": 8, "erfc": 64, "cbrt": 16}
 EDGES = [0.0, -0.0, 0.5, -0.5, 1.0, -1.0, 1.5, 2.5, 2.0, -2.0, 1e-9, 1e9, -1e9, 1e-30, np.inf, -np.inf, np.nan]
 
 
