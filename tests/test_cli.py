@@ -75,6 +75,15 @@ BAD = {
     "settle after the end": ("[run]\nsettle = 5.0\n", ["run.settle", "clock.duration"]),
     "settle behind the last sample": ("[run]\nsettle = 1.99995\n", ["run.settle = 1.99995", "at most 1.9999 s"]),
     "one sample": ("[clock]\nduration = 1e-4\n", ["clock.duration = 0.0001", "one sample", "at least 2", "Lengthen"]),
+    "decimal comma": ("[plant]\nm = 2,4\n", ["line 2", "m = 2,4", "decimal number with a point"]),
+    "a key twice": ("[plant]\nm = 1\nm = 2\n", ["line 3", "m = 2", "each key once"]),
+    "a table twice": ("[plant]\nm = 1\n[plant]\n", ["[plant]", "each table once"]),
+    "period in ms": ("[clock]\nduration = 0.02\nsample_period = 0.0625\n", ["longer than", "milliseconds"]),
+    "a grade in N": (
+        "[disturbance.q_z]\nkind = 'unbalance-grade'\nunit = 'N'\ngrade = 2.5\nservice_speed = 1e3\nspeed = 1e3\n",
+        ["disturbance.q_z.kind", "m/s^2", "Omit `unit`"],
+    ),
+    "a kind in capitals": ("[controller.position]\nkind = 'PD'\n", ["controller.position.kind", "mean 'pid'"]),
     "not TOML": ("[plant\nm = 1\n", ["not valid TOML", "line 1"]),
 }  # fmt: skip
 

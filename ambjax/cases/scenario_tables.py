@@ -65,7 +65,8 @@ def _signal(table: Table, unit: str, recordings: Recordings, extra: tuple[str, .
         return recordings.signal(table, extra)
     made = table.record(SIGNALS[kind], extra=("kind", *extra))
     if (own := FIXED_UNITS.get(kind, unit)) != unit:
-        raise ValueError(f'{table.at("kind")} = "{kind}": it gives {own}, but a signal in {unit} belongs here.')
+        fix = " Omit `unit`." if "unit" in table.raw else ""
+        raise ValueError(f'{table.at("kind")} = "{kind}": it gives {own}, but a signal in {unit} belongs here.{fix}')
     return made
 
 

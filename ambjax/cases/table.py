@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import pathlib
+import re
 import tomllib
 from typing import Any
 
@@ -38,15 +39,32 @@ def load(path: str | pathlib.Path) -> tuple[dict[str, Any], str]:
         raise refuse(f"a case file has at most {MOST_BYTES:,} bytes, and this file has more. See 'ambjax template'.")
     try:
         text = content.decode("utf-8")
-        return tomllib.loads(text), text
     except UnicodeDecodeError:
         raise refuse("not a text file in UTF-8. A case file is TOML; see 'ambjax template'.") from None
+    try:
+        return tomllib.loads(text), text
     except tomllib.TOMLDecodeError as error:
-        raise refuse(f"not valid TOML: {error}. See 'ambjax template' for a file to start from.") from None
+        raise refuse(f"not valid TOML: {error}.{_place(text, str(error))}") from None
     except RecursionError:
         raise refuse(f"tables or lists are nested deeper than {DEEPEST} levels. Use fewer.") from None
     except ValueError:  # Python refuses to convert thousands of digits
         raise refuse("a number has thousands of digits. Write it as in 1.5e3.") from None
+
+
+def _place(text: str, error: str) -> str:
+    """Return the line that an error of `tomllib` names, and the probable mistake in it."""
+    found, lines = re.search(r"\(at line (\d+), ", error), text.splitlines()
+    if found is None or not 0 < int(found[1]) <= len(lines):
+        return " See 'ambjax template' for a file to start from."
+    line = lines[int(found[1]) - 1]
+    shown = f" The line is: {cut(line.strip())}."
+    if re.match(r"[^#\[\"']*=\s*[-+]?\d+,\d", line):
+        return f"{shown} Write a decimal number with a point."
+    if "twice" in error:
+        return f"{shown} Write each table once; for several loads, write [[disturbance.q_z]] above each."
+    if "overwrite" in error:
+        return f"{shown} Write each key once."
+    return f"{shown} See 'ambjax template' for a file to start from."
 
 
 def check_depth(raw: object) -> None:
@@ -90,7 +108,7 @@ class Table:
         if value is default:
             return default
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise ValueError(f"{self.at(key)} = {show(value)}: it must be {allowed}, without quotes.")
+            raise ValueError(f"{self.at(key)} = {show(value)}: it must be {allowed}{_unquoted(value)}.")
         try:
             return float(value)
         except OverflowError:  # a whole number of hundreds of digits
@@ -114,7 +132,7 @@ class Table:
         """Return a Boolean; None if left out."""
         value = self.raw.get(key)
         if value is not None and not isinstance(value, bool):
-            raise ValueError(f"{self.at(key)} = {show(value)}: it must be true or false, without quotes.")
+            raise ValueError(f"{self.at(key)} = {show(value)}: it must be true or false{_unquoted(value)}.")
         return value
 
     def choice(self, key: str, allowed: list[str], default: str | None = None, other: str = "") -> str:
@@ -129,7 +147,7 @@ class Table:
         if value not in allowed:
             word = show(value).strip('"')
             same = [name for name in allowed if name.lower() == word.lower()]
-            close = same or difflib.get_close_matches(word, allowed, n=1)
+            close = same or difflib.get_close_matches(word.lower(), allowed, n=1)
             other = f" Did you mean '{close[0]}'?" if close else ""
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be one of {words}.{other}")
         return value
@@ -159,6 +177,10 @@ class Table:
             low, high = (getattr(record, name) for name in pair)
             if not low < high:
                 raise ValueError(f"{self.at(pair[1])} = {high:g}: it must be more than {pair[0]} = {low:g}.")
+
+
+def _unquoted(value: object) -> str:
+    return ", without quotes" if isinstance(value, str) else ""
 
 
 def show(value: object) -> str:

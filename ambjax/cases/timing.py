@@ -35,10 +35,11 @@ def clock_from(table: Table) -> tuple[Clock, float]:
     duration = table.leaf("duration", DURATION, DURATION.default)
     period = table.leaf("sample_period", SAMPLE_PERIOD, SAMPLE_PERIOD.default)
     samples = _whole(duration / period)
-    if period > duration and 1 / period < duration:
+    if period > duration:
+        rate = f" If it is a rate in Hz, give its inverse, {1 / period:g} s." if 1 / period < duration else ""
         raise ValueError(
-            f"{table.at('sample_period')} = {period:g} s is longer than clock.duration = {duration:g} s. If it is a "
-            f"rate in Hz, give its inverse, {1 / period:g} s."
+            f"{table.at('sample_period')} = {period:g} s is longer than clock.duration = {duration:g} s.{rate} If it "
+            "is in milliseconds or microseconds, give it in seconds."
         )
     if samples is None:
         nearest = max(round(duration / period), 1) * period

@@ -31,7 +31,7 @@ OTHER_WORDS = {
     "inversion": "linearisation linearization force",
     "position": "outer",
     "current": "inner",
-    "sample_period": "samplerate samplingrate samplingperiod sampletime rate fs ts period",
+    "sample_period": "samplerate samplingrate samplingperiod sampletime samplingfrequency frequency rate fs ts period",
     "duration": "tend endtime stoptime length simulationtime",
     "dt": "step stepsize timestep h",
     "method": "integrator scheme",
