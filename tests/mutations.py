@@ -1705,6 +1705,34 @@ SAMPLED = [
 ]
 CHECK = [
     M(
+        "a delay in seconds is not doubted",
+        "ambjax/commands/plausibility.py",
+        "0 < float(processor.delay) < LEAST_DELAY",
+        "0 < float(processor.delay) < 0",
+        "tests/test_names.py::test_numbers_that_do_not_fit_together_are_doubted",
+    ),
+    M(
+        "a load after the end of the run is not doubted",
+        "ambjax/commands/plausibility.py",
+        "if start >= duration:",
+        "if start > duration:",
+        "tests/test_names.py::test_numbers_that_do_not_fit_together_are_doubted",
+    ),
+    M(
+        "a runout of half the clearance is not doubted",
+        "ambjax/commands/plausibility.py",
+        "if most > MOST_RUNOUT * stop:",
+        "if most > 2 * MOST_RUNOUT * stop:",
+        "tests/test_names.py::test_numbers_that_do_not_fit_together_are_doubted",
+    ),
+    M(
+        "a page accepts a signal from a file",
+        "ambjax/page/html_page.py",
+        "    _check_recorded(case, path)\n",
+        "",
+        "tests/test_page.py::test_a_signal_from_a_file_is_refused_in_one_line",
+    ),
+    M(
         "the closed form commands the step of its root that it has made",
         "ambjax/control/inversion.py",
         "return CurrentDemand(i_ref, (after - i_ref) * (1 / period)), StaticInversionState(after",

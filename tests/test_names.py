@@ -41,6 +41,8 @@ from ambjax.host.synonyms import OTHER_WORDS, meant
         ({"sensor": {"runout": {"speed": 100.0}}}, "sensor.runout.harmonics is missing: it must be a list"),
         ({"plant": {"xyzzy": 1.0}}, "xyzzy = 1.0: unknown key. Keys allowed here"),
         ({"spread": {"plant": {"mass": {"percent": 10}}}}, "Did you mean 'plant.m'"),
+        ({"clock": {"frequency": 1e4}}, "Did you mean 'sample_period'"),
+        ({"plant": {"m": True}}, r"plant.m = true: it must be .* \(kg\)\.$"),
         ({"clock": {"sample_period": 1e4}}, "If it is a rate in Hz, give its inverse, 0.0001 s"),
     ],
 )
@@ -67,6 +69,19 @@ def doubts(plant=None, **tables):
 
 def sine(frequency, amplitude=1.0, unit="N"):
     return {"disturbance": {"q_z": {"kind": "sine", "unit": unit, "amplitude": amplitude, "frequency": frequency}}}
+
+
+def step(start):
+    return {"disturbance": {"q_z": {"kind": "step", "unit": "N", "amplitude": 1.0, "start": start}}}
+
+
+def graded(grade):
+    load = {"kind": "unbalance-grade", "grade": grade, "service_speed": 1e3, "speed": 1e3}
+    return {"disturbance": {"q_z": [load, {"kind": "constant"}]}}
+
+
+def runout(amplitude):
+    return {"sensor": {"runout": {"speed": 100.0, "harmonics": [{"number": 2, "amplitude": amplitude}]}}}
 
 
 @pytest.mark.parametrize(
@@ -97,6 +112,14 @@ def sine(frequency, amplitude=1.0, unit="N"):
         ),
         ({}, {"processor": {}, "sensor": {"bits": 8, "std": 1e-7}}, "a step of 3.91e-06 m is 39.1 times the noise"),
         ({}, {"processor": {}, "sensor": {"bits": 14, "std": 1e-7}}, None),
+        ({}, {"processor": {"delay": 5e-5}}, "processor.delay = 5e-05 samples is close to 0. Is it in seconds"),
+        ({}, {"processor": {"delay": 0.0}}, None),
+        ({}, runout(2.3e-4), "the harmonics reach 0.00023 m, 51.1 % of run.clearance"),
+        ({}, runout(2e-6), None),
+        ({}, step(0.1), "disturbance.q_f: start = 0.1 s, but the run ends at clock.duration = 0.1 s"),
+        ({}, step(0.09), None),
+        ({}, graded(0.0025), "disturbance.q_z: grade = 0.0025 mm/s: ISO 21940-11 has G 0.4 to G 4000"),
+        ({}, graded(2.5), None),
     ],
 )
 def test_numbers_that_do_not_fit_together_are_doubted(plant, tables, said):

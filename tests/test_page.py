@@ -89,6 +89,15 @@ def test_a_case_without_a_processor_is_refused_in_one_line(tmp_path, capsys):
     assert not (tmp_path / "page.html").exists()
 
 
+def test_a_signal_from_a_file_is_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / "force.csv").write_text("0,1\n1,2\n")
+    load = '[[disturbance.q_z]]\nkind = "table"\nfile = "force.csv"\n[[disturbance.q_z]]\nkind = "constant"\n'
+    (tmp_path / "case.toml").write_text(f"{load}[clock]\nduration = 0.01\n[processor]\n")
+    assert main(["page", str(tmp_path / "case.toml")]) == 2
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ambjax")]
+    assert 'disturbance.q_z: kind = "table": a page cannot contain a signal from a file.' in said
+
+
 def test_another_structure_is_no_preset(tmp_path, capsys):
     one, other = tmp_path / "rig.toml", tmp_path / "other.toml"
     one.write_text(RIG)

@@ -23,13 +23,18 @@ RANGES = {
     "i_0": ((1e-3, 100.0), "A", "milliamperes"),
     "R": ((1e-4, 1e4), "ohm", "milliohms"),
 }
+# Largest plausible runout, as a share of the clearance.
+MOST_RUNOUT = 0.5
+# Smallest plausible delay that is not 0, in samples; balance quality grades of ISO 21940-11, mm/s.
+LEAST_DELAY, GRADES = 0.01, (0.4, 4000.0)
 # Fields of signals that are a frequency, and their factor to Hz.
 FREQUENCIES = {"frequency": 1.0, "frequency_end": 1.0, "f_high": 1.0, "speed": 1 / 60, "speed_end": 1 / 60}
 
 
 def implausible(case: Case) -> list[str]:
     """Return a warning, in one line, for each implausible number of a case and each implausible relation of two."""
-    return [*_ranges(case), *_forces(case), *_flux(case), *_rates(case), *_converter(case), *_aliases(case)]
+    machine = [*_ranges(case), *_forces(case), *_flux(case), *_rates(case), *_converter(case)]
+    return [*machine, *_delay(case), *_runout(case), *_aliases(case), *_loads(case)]
 
 
 def _ranges(case: Case) -> Iterator[str]:
@@ -87,9 +92,45 @@ def _converter(case: Case) -> Iterator[str]:
         )
 
 
+def _delay(case: Case) -> Iterator[str]:
+    processor = case.cascade.processor
+    if processor is not None and 0 < float(processor.delay) < LEAST_DELAY:
+        yield f"processor.delay = {float(processor.delay):g} samples is close to 0. Is it in seconds?"
+
+
+def _runout(case: Case) -> Iterator[str]:
+    sensor, stop = case.scenario.sensor, float(case.scenario.touchdown)
+    if sensor is None or sensor.runout is None:
+        return
+    most = max(abs(float(one)) for one in sensor.runout.span(float(case.clock.duration)))
+    if most > MOST_RUNOUT * stop:
+        yield (
+            f"sensor.runout: the harmonics reach {most:.3g} m, {100 * most / stop:.3g} % of run.clearance. Are the "
+            "amplitudes in another unit?"
+        )
+
+
+def _signals(case: Case) -> dict[str, object]:
+    return {f"{'' if slot == 'reference' else 'disturbance.'}{slot}": getattr(case.scenario, slot) for slot in SLOTS}
+
+
+def _loads(case: Case) -> Iterator[str]:
+    """Yield a warning for each signal that begins after the run, and for each grade that ISO 21940-11 does not have."""
+    duration = float(case.clock.duration)
+    for path, signal in _signals(case).items():
+        for part in getattr(signal, "terms", (signal,)):
+            start = float(np.min(getattr(part, "start", 0.0)))
+            if start >= duration:
+                yield f"{path}: start = {start:g} s, but the run ends at clock.duration = {duration:g} s."
+            grade = float(np.max(getattr(part, "grade", GRADES[0])))
+            if grade and not GRADES[0] <= grade <= GRADES[1]:
+                low, high = GRADES
+                yield f"{path}: grade = {grade:g} mm/s: ISO 21940-11 has G {low:g} to G {high:g}. Is it in m/s?"
+
+
 def _aliases(case: Case) -> Iterator[str]:
     half = 0.5 / float(case.clock.sample_period)
-    parts = {f"{'' if slot == 'reference' else 'disturbance.'}{slot}": getattr(case.scenario, slot) for slot in SLOTS}
+    parts = _signals(case)
     if case.scenario.sensor is not None:
         parts["sensor.runout"] = case.scenario.sensor.runout
     for path, signal in parts.items():

@@ -23,6 +23,8 @@ from ambjax.page.loop_script import COILS, SIGNALS, loop_script
 from ambjax.page.sliders import GROUPS, SEED, Slider, changed, parameter_values, parameters, sliders
 from ambjax.simulation.metrics import UNITS
 from ambjax.simulation.trajectory import STATUSES
+from ambjax.world.recorded import Recorded
+from ambjax.world.scenario import SLOTS
 
 # Name of the file.
 NAME = "page.html"
@@ -99,9 +101,22 @@ def _library() -> list[str]:
     return [(folder / name).read_text(encoding="utf-8") for name in BOKEH]
 
 
+def _check_recorded(case: Case, path: str) -> None:
+    """Raise ValueError for a signal from a file, which the page's program cannot contain."""
+    for slot in SLOTS:
+        signal = getattr(case.scenario, slot)
+        if any(isinstance(one, Recorded) for one in getattr(signal, "terms", (signal,))):
+            where = slot if slot == "reference" else f"disturbance.{slot}"
+            raise ValueError(
+                f'{path}: {where}: kind = "table": a page cannot contain a signal from a file. Remove it, or '
+                "replace it by another signal."
+            )
+
+
 def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str, Any]]:
     """Return the script of the worker, and the data of the page for JSON."""
     check_processor(case, path)
+    _check_recorded(case, path)
     for other in others:
         _check_structure(case, other, path)
     case = _finest(case, others)
