@@ -1,7 +1,9 @@
 """Results in Python: numbers equal those of the commands, tables have units, and pictures match their data."""
 
+import dataclasses
 import json
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -121,8 +123,35 @@ def test_the_sensitivity_is_that_of_the_linear_analysis(path):
 
 def test_bad_input_is_named(path, run, monkeypatch):
     case = ambjax.read_case(path)
-    with pytest.raises(ValueError, match="members = 0, seed = 0: members must be at least 1"):
-        ambjax.simulate_members(case, 0)
+    wrong: Any = "case.toml"
+    members: tuple[tuple[Any, int, str], ...] = (
+        (0, 0, "members = 0: it must be a whole number of at least 1"),
+        (2.5, 0, "members = 2.5: it"),
+        ("ten", 0, "members = 'ten': it"),
+        (1, -1, "seed = -1: it must be a whole number of at least 0"),
+    )
+    for given, seed, said in members:
+        with pytest.raises(ValueError, match=said):
+            ambjax.simulate_members(case, given, seed=seed)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r"x = .*: it must be text. Write PATH=LOW:HIGH"):
+        ambjax.survival_map(case, ("plant.m", 1, 2), "plant.R=1:2")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r'it must be a list. Write \["controller.position.c"\]'):
+        ambjax.gains_of(case.cascade, "controller.position.c")
+    for function in (
+        ambjax.simulate,
+        ambjax.sensitivity,
+        ambjax.vector_field,
+        ambjax.export,
+        lambda given: ambjax.simulate_members(given, 1),
+        lambda given: ambjax.survival_map(given, "plant.m=1:2", "plant.R=1:2"),
+    ):
+        with pytest.raises(ValueError, match=r"case = 'case.toml': it must be a Case, as ambjax.read_case"):
+            function(wrong)
+    with pytest.raises(ValueError, match="cascade = Scenario: it must be a Cascade"):
+        ambjax.rollout(case.scenario, case.cascade, case.clock)  # pyright: ignore[reportArgumentType]
+    for samples in (0, 10.5):
+        with pytest.raises(ValueError, match=f"clock.samples = {samples}: it must be a whole number of at least 1"):
+            ambjax.rollout(case.cascade, case.scenario, dataclasses.replace(case.clock, samples=samples))
     for name in ("pandas", "xarray"):
         monkeypatch.setitem(sys.modules, name, None)
         with pytest.raises(
@@ -191,7 +220,7 @@ def test_derivatives_with_respect_to_named_gains_only():
     slopes = jax.grad(product)(found)
     c, k_i = float(cascade.position.c), float(cascade.current.k_i)
     assert {path: float(x) for path, x in slopes.items()} == {paths[0]: pytest.approx(2 * c * k_i), paths[1]: c**2}
-    with pytest.raises(ValueError, match=r"controller\.position\.cc.*Did you mean 'controller\.position\.c'"):
+    with pytest.raises(ValueError, match=r"^controller\.position\.cc: .*Did you mean 'controller\.position\.c'"):
         ambjax.gains_of(cascade, ["controller.position.cc"])
 
 

@@ -16,7 +16,7 @@ from ambjax.cases.own_laws import FORM, OwnLaw, is_own, own_law
 from ambjax.cases.reach import check_reference
 from ambjax.cases.recordings import RecordedFile, Recordings
 from ambjax.cases.scenario_tables import check_start, drive, scenario_from
-from ambjax.cases.table import Table, check_depth, load
+from ambjax.cases.table import Table, check_depth, cut, load
 from ambjax.cases.timing import clock_from, settled
 from ambjax.cases.variation import spread_from
 from ambjax.control import current, inversion, observer, position
@@ -137,6 +137,12 @@ def read_case(path: str | pathlib.Path) -> Case:
         return case_from(raw, path.stem, text, path.parent)
     except ValueError as error:
         raise ValueError(one_line(f"{path}: {error}")) from None
+
+
+def require_case(case: object) -> None:
+    """Raise ValueError for anything but a `Case`, such as a path."""
+    if not isinstance(case, Case):
+        raise ValueError(f"case = {cut(repr(case))}: it must be a Case, as ambjax.read_case(PATH) returns it.")
 
 
 def safe_name(text: str) -> str:

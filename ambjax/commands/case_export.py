@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from ambjax.cases.reader import Case
+from ambjax.cases.reader import Case, require_case
 from ambjax.codegen import verify
 from ambjax.codegen.block import Block
 from ambjax.codegen.c99 import machine, package, texts
@@ -138,6 +138,7 @@ def export(
     Writes no files: see `ExportedCase.write`. Returns an `ExportedCase`; a failed check is a result, see its `ok`.
     Raises ValueError for an option that is not allowed, a case that cannot be exported, and a missing compiler.
     """
+    require_case(case)
     return generated(planned(case, what, format, fmi, precision, prefix, verify))
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.cases.reader import Case
+from ambjax.cases.reader import Case, require_case
 from ambjax.cases.timing import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
 from ambjax.commands.ensemble import study_of
 from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, stepped
@@ -79,6 +79,10 @@ def survival_map(case: Case, x: str, y: str, *, members: int = 1, seed: int | No
 
     Raises ValueError for an unknown quantity, a range that the case does not allow, and too many runs.
     """
+    require_case(case)
+    for name, axis in (("x", x), ("y", y)):
+        if not isinstance(axis, str):
+            raise ValueError(f"{name} = {axis!r}: it must be text. Write {FORM}.")
     study, *axes = prepared(case, x, y, members, seed)
     return CaseMap(case, grid(study, *axes))
 

@@ -8,7 +8,7 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.paths import places, with_values
-from ambjax.ensemble.spread import require_path
+from ambjax.ensemble.spread import no_such_number
 from ambjax.world.scenario import Scenario
 
 
@@ -18,11 +18,14 @@ def gains_of(cascade: Cascade, paths: Iterable[str]) -> dict[str, Array]:
     The dict is a pytree: `jax.grad(lambda gains: f(with_gains(cascade, gains)))(gains_of(cascade, paths))` returns the
     derivative with respect to these gains only. Raises ValueError for a path that does not exist.
     """
+    if isinstance(paths, str):
+        raise ValueError(f'paths = "{paths}": it must be a list. Write ["{paths}"].')
     known = places(cascade, Scenario())
     own = [path for path in known if path.startswith(("controller.", "processor."))]
     found = {}
     for path in paths:
-        require_path(path, own, "")
+        if path not in own:
+            raise ValueError(f"{path}: {no_such_number(path, own)}")
         found[path] = jnp.asarray(known[path].value, jnp.result_type(float))
     return found
 

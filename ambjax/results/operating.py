@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ambjax.cases.reader import Case
+from ambjax.cases.reader import Case, require_case
 from ambjax.ensemble.study import Study
 from ambjax.linear import (
     Analysis,
@@ -63,6 +63,7 @@ def sensitivity(case: Case, r: float = 0.0) -> Analysis:
     `ambjax.linear` contains the single steps, and the injection into the simulation. Returns the `Analysis`. Raises
     ValueError as `linearise` does.
     """
+    require_case(case)
     return operating_point(case, "nominal", r).analysis
 
 

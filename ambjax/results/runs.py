@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.cases.reader import Case
+from ambjax.cases.reader import Case, require_case
 from ambjax.ensemble.replay import record
 from ambjax.host.optional import extra
 from ambjax.simulation.metrics import UNITS, standard_for
@@ -110,8 +110,10 @@ def simulate(case: Case, progress: Callable[[int], object] = lambda samples: Non
     - `case`: from `read_case`.
     - `progress`: called with the number of new samples after each part of the run.
 
-    Returns a `CaseRun`. Raises ValueError as `rollout` does. A lost rotor is no error: see `CaseRun.lost`.
+    Returns a `CaseRun`. Raises ValueError for anything but a case, and as `rollout` does. A lost rotor is no error: see
+    `CaseRun.lost`.
     """
+    require_case(case)
     fold = standard_for(case.settle, case.scenario)
     outcome = record(case.cascade, case.scenario, case.clock, fold=fold, tell=progress)
     metrics = {name: np.asarray(x).item() for name, x in outcome.measured.items()}

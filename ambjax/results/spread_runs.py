@@ -1,11 +1,12 @@
 """Simulate members of the spread of a case, and return the results as tables and pictures."""
 
 import dataclasses
+import numbers
 from typing import Any
 
 import numpy as np
 
-from ambjax.cases.reader import Case
+from ambjax.cases.reader import Case, require_case
 from ambjax.ensemble import statistics
 from ambjax.ensemble.study import Study
 from ambjax.host.optional import extra
@@ -72,12 +73,14 @@ def simulate_members(case: Case, members: int, *, seed: int | None = None, threa
     - `seed`: of the spread and the noise; None: `run.seed` of the case.
     - `threads`: CPU cores to use; None: all.
 
-    The results stay in memory; `ambjax ensemble` writes them in parts and can be resumed. Raises ValueError for a
-    number of members below 1, or a seed below 0.
+    The results stay in memory; `ambjax ensemble` writes them in parts and can be resumed. Raises ValueError for
+    anything but a case, a number of members below 1, or a seed below 0.
     """
+    require_case(case)
     seed = int(case.scenario.seed) if seed is None else seed
-    if members < 1 or seed < 0:
-        raise ValueError(f"members = {members}, seed = {seed}: members must be at least 1, seed at least 0.")
+    for name, value, least in (("members", members, 1), ("seed", seed, 0)):
+        if not isinstance(value, numbers.Integral) or value < least:
+            raise ValueError(f"{name} = {value!r}: it must be a whole number of at least {least}.")
     study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, members)
     columns = {name: np.asarray(x) for name, x in study.columns(0, members, threads=threads).items()}
     return MembersRun(study, columns)

@@ -8,7 +8,7 @@ import jax
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from ambjax.cases.reader import Case
+from ambjax.cases.reader import Case, require_case
 from ambjax.numerics.records import canonical
 from ambjax.simulation.loop import ClosedLoop, LoopState
 
@@ -33,6 +33,7 @@ def vector_field(case: Case) -> VectorField:
     Sensor noise is left out, because it is held over samples. A solver does not stop where the rotor touches down.
     Raises ValueError for a controller on a processor, because its loop is not a differential equation.
     """
+    require_case(case)
     if case.cascade.processor is not None:
         raise ValueError(
             "vector_field: this controller runs on a processor, so its loop is not a differential equation. Remove "

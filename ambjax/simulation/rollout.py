@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import numbers
 from typing import Any, NamedTuple, Protocol, Self, TypeVar, cast
 
 import jax
@@ -120,6 +121,9 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
 
     Traced values are not checked.
     """
+    for name, value, kind in (("cascade", cascade, Cascade), ("scenario", scenario, Scenario), ("clock", clock, Clock)):
+        if not isinstance(value, kind):
+            raise ValueError(f"{name} = {type(value).__name__}: it must be a {kind.__name__}.")
     for stage, base in STAGES.items():
         law = getattr(cascade, stage)
         if not isinstance(law, base):
@@ -133,8 +137,8 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     check_parts(cascade, scenario, clock.sample_period)
     validate(scenario, "scenario")
     validate(clock, "clock")
-    if clock.samples < 1:
-        raise ValueError(f"clock.samples = {clock.samples}: there must be at least 1 sample.")
+    if not isinstance(clock.samples, numbers.Integral) or clock.samples < 1:
+        raise ValueError(f"clock.samples = {clock.samples}: it must be a whole number of at least 1.")
 
 
 def run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:
