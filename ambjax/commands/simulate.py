@@ -148,7 +148,8 @@ def _bar(case: Case) -> tqdm:
 
 
 def _metrics_text(metrics: Summary) -> str:
+    given = {name: value for name, value in metrics.items() if value != ""}
     rows = [
-        (name, "never" if v is None else f"{v:.6g}" if isinstance(v, float) else str(v)) for name, v in metrics.items()
+        (name, "never" if v is None else f"{v:.6g}" if isinstance(v, float) else str(v)) for name, v in given.items()
     ]
     return table(("metric", "value"), rows)
