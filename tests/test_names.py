@@ -130,6 +130,15 @@ def test_numbers_that_do_not_fit_together_are_doubted(plant, tables, said):
         assert any(re.search(said, line) for line in found), found
 
 
+@pytest.mark.parametrize(("end", "doubted"), [(9.9, False), (10.1, True)])
+def test_a_file_in_milliseconds_is_doubted(tmp_path, end, doubted):
+    """A run of 0.1 s, and a file 100 times as long."""
+    (tmp_path / "force.csv").write_text(f"0,1\n{end},2\n")
+    load = {"kind": "table", "unit": "N", "file": str(tmp_path / "force.csv")}
+    said = f"disturbance.q_f: the file lasts {end:g} s, the run 0.1 s. Are its times in milliseconds?"
+    assert (said in doubts(disturbance={"q_z": load})) == doubted
+
+
 def test_the_forces_are_those_of_the_formulas():
     case = case_from({"plant": GOOD, "clock": {"duration": 0.1}} | sine(50.0, 3.0))
     k_i = 1.2566e-6 * 208**2 * 2.68e-4 * 2.5 / 5e-4**2

@@ -8,6 +8,7 @@ import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.commands.acceptance import bias_flux, forces
+from ambjax.world.recorded import Recorded
 from ambjax.world.scenario import SLOTS
 
 # Flux density above which common silicon steel begins to saturate, T (Schweitzer and Maslen, Magnetic Bearings, 2009).
@@ -23,6 +24,8 @@ RANGES = {
     "i_0": ((1e-3, 100.0), "A", "milliamperes"),
     "R": ((1e-4, 1e4), "ohm", "milliohms"),
 }
+# Largest plausible length of a recorded signal, in lengths of the run.
+LONGEST_FILE = 100.0
 # Largest plausible runout, as a share of the clearance.
 MOST_RUNOUT = 0.5
 # Smallest plausible delay that is not 0, in samples; balance quality grades of ISO 21940-11, mm/s.
@@ -115,11 +118,14 @@ def _signals(case: Case) -> dict[str, object]:
 
 
 def _loads(case: Case) -> Iterator[str]:
-    """Yield a warning for each signal that begins after the run, and for each grade that ISO 21940-11 does not have."""
+    """Yield a warning for each signal that begins after the run or lasts far longer, and for each unknown grade."""
     duration = float(case.clock.duration)
     for path, signal in _signals(case).items():
         for part in getattr(signal, "terms", (signal,)):
             start = float(np.min(getattr(part, "start", 0.0)))
+            length = float(np.ptp(part.samples.times)) if isinstance(part, Recorded) else 0.0
+            if length > LONGEST_FILE * duration:
+                yield f"{path}: the file lasts {length:g} s, the run {duration:g} s. Are its times in milliseconds?"
             if start >= duration:
                 yield f"{path}: start = {start:g} s, but the run ends at clock.duration = {duration:g} s."
             grade = float(np.max(getattr(part, "grade", GRADES[0])))
