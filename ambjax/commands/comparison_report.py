@@ -178,7 +178,7 @@ def markdown(summary: Mapping[str, Any]) -> str:
 
 def _words(summary: Mapping[str, Any]) -> str:
     poor = [case["case"] for case in summary["cases"] if case["lost"] or case["peak"] is None]
-    why = f" {', '.join(poor)}: loses members or is not stable at rest; 'ambjax check' says why." if poor else ""
+    why = f" Lost members, or a loop not stable at rest: {', '.join(poor)}; 'ambjax check' says why." if poor else ""
     return (
         f"{summary['members']} members, seed {summary['seed']}, the same in all cases. Errors, voltages, currents and "
         f"losses are of the members that are held. Sensitivity and margins are of the linearised loop at rest.{why}"
