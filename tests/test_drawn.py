@@ -381,7 +381,6 @@ class _Case:
 
 @pytest.mark.parametrize("path", ["initial.z", PERIOD])
 def test_the_cells_of_a_map_are_where_they_were_run(path, drawn, monkeypatch):
-    monkeypatch.setattr(map_command, "places", lambda *_: {})
     monkeypatch.setattr(map_command, "_label", lambda _, axis: f"{axis.path} ({'s' if axis.path == PERIOD else 'm'})")
     x, y = Axis(path, np.geomspace(1e-5, 1e-3, 3), True), Axis("initial.z_dot", np.array([1.0, 2.0, 3.0, 4.0]))
     survival = np.arange(12.0).reshape(4, 3) / 11

@@ -199,8 +199,8 @@ def validate(node: object, path: str = "") -> None:
             validate(value, f"{path}.{field.name}".lstrip("."))
     if pair := getattr(type(node), "ordered", None):
         low, high = (getattr(node, name) for name in pair)
-        if not (is_traced(low) or is_traced(high)) and not np.all(np.less(low, high)):
-            raise ValueError(f"{path}.{pair[1]} = {high}: it must be more than {pair[0]} = {low}.".lstrip("."))
+        if not (is_traced(low) or is_traced(high)) and np.any(np.greater(low, high)):
+            raise ValueError(f"{path}.{pair[1]} = {high}: it must not be less than {pair[0]} = {low}.".lstrip("."))
 
 
 def check_leaf(field: dataclasses.Field, name: str, value: object) -> None:
