@@ -883,14 +883,14 @@ SEARCH = [
     M(
         "an answer beyond the error limit is taken",
         "tuning/search/front.py",
-        "if point.error_m <= factor * least.error_m",
-        "if point.error_m <= 2 * factor * least.error_m",
+        "if point.error_m <= factor * least)",
+        "if point.error_m <= 2 * factor * least)",
         "tests/test_tuning_front.py::test_the_point_chosen_holds_as_many_members_and_limits_as_the_least_error",
     ),
     M(
         "an answer that loses more members is taken",
         "tuning/search/front.py",
-        "and point.lost + point.stalled <= least.lost + least.stalled",
+        "and point.lost + point.stalled <= first.lost + first.stalled",
         "",
         "tests/test_tuning_front.py::test_the_point_chosen_holds_as_many_members_and_limits_as_the_least_error",
     ),

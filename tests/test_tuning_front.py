@@ -17,7 +17,7 @@ from tuning.config import seeds
 from tuning.objective.limits import FRONT
 from tuning.problem import problem_of
 from tuning.report import front_table, limit_table
-from tuning.search.front import KNEE, FrontPoint, chosen
+from tuning.search.front import KNEE, FrontPoint, chosen, least_of
 from tuning.search.rounds import rounds
 
 BOUNDLESS = {"controller": {"position": {"c": [1.0, 1000.0], "k": [0.1, 1000.0]}}}
@@ -140,3 +140,7 @@ def test_the_point_chosen_holds_as_many_members_and_limits_as_the_least_error():
     assert chosen([*seen[:3], point(math.nan, math.nan)], 1.25) is seen[0]
     loses = [point(1.0, 20.0, lost=1, within=False), *seen[1:]]
     assert chosen(loses, 1.25) is loses[1]
+    # a search for less voltage has found a smaller error than the first answer's
+    better = [point(2.0, 20.0), point(0.5, 15.0, lost=1), point(1.0, 15.0), point(1.2, 10.0), point(2.4, 5.0)]
+    assert least_of(better) is better[2]
+    assert chosen(better, 1.25) is better[3]

@@ -56,43 +56,61 @@ def traced(course: Course, answer: SearchResult) -> SearchResult:
     """Trace the front from the answer of least error. Return the knee if tune.objective selects it and it is valid.
 
     The result holds the points of the front in order of the error limit: for each limit the judged answer of least
-    voltage. Raises ValueError as `Course.search` does.
+    voltage. A search for less voltage may find a smaller error than the answer's; it is then the least error. Raises
+    ValueError as `Course.search` does.
     """
     course.problem, x = answer.problem, answer.x
-    least, *_ = _judged(course, 1.0, x)
-    if not (math.isfinite(least.error_m) and least.error_m > 0 and least.volts > 0):
+    first, *_ = _judged(course, 1.0, x)
+    if not (math.isfinite(first.error_m) and first.error_m > 0 and first.volts > 0):
         say("no front: the answer of least error holds no member, or has no error or voltage")
         return answer
-    seen, factors = [least], sorted(FACTORS[: answer.problem.tune.budget.front])
+    seen, factors = [first], sorted(FACTORS[: answer.problem.tune.budget.front])
     for factor in factors:
         if course.interrupted:
             break
+        least = least_of(seen)
         say(f"front: least rms voltage with an rms error of at most {factor:g} times the least, {least.error_m:.3g} m")
         course.problem = answer.problem.towards_voltage(least.error_m, least.volts, factor)
         seen += _searched(course, factor, seen)
     taken = answer
-    if answer.problem.tune.objective == "knee" and not course.interrupted:
-        course.problem = answer.problem.towards_voltage(least.error_m, least.volts, KNEE)
+    if not course.interrupted:
+        least, course.problem = least_of(seen), answer.problem
+        if answer.problem.tune.objective == "knee":
+            course.problem = answer.problem.towards_voltage(least.error_m, least.volts, KNEE)
         taken = _valid(course, answer, seen)
-    points = [least, *(chosen(seen, factor)._replace(factor=factor) for factor in factors)]
+    least = least_of(seen)
+    points = [least._replace(factor=1.0), *(chosen(seen, factor)._replace(factor=factor) for factor in factors)]
+    if not any(point.x is taken.x for point in points):
+        points.append(first._replace(factor=round(first.error_m / least.error_m, 3)))
     kept = [point for k, point in enumerate(points) if not any(point.x is other.x for other in points[:k])]
     return dataclasses.replace(taken, front=tuple(kept), history=course.answer(x, None, 0).history)
 
 
+def least_of(seen: Sequence[FrontPoint]) -> FrontPoint:
+    """Return the point of least error of those that lose no more members, and hold the limits, like the first."""
+    return min(_fit(seen), key=lambda point: point.error_m)
+
+
 def chosen(seen: Sequence[FrontPoint], factor: float) -> FrontPoint:
-    """Return the point of least voltage of those with an error of at most `factor` times that of the first point.
+    """Return the point of least voltage of those with an error of at most `factor` times the least.
 
     Points that lose more members than the first, or break a limit that it holds, do not count.
     """
-    least = seen[0]
-    fit = [
+    fit = _fit(seen)
+    least = min(point.error_m for point in fit)
+    return min((point for point in fit if point.error_m <= factor * least), key=lambda point: point.volts)
+
+
+def _fit(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
+    """Return the points that lose no more members than the first, and hold the limits that it holds."""
+    first = seen[0]
+    return [
         point
         for point in seen
-        if point.error_m <= factor * least.error_m
-        and point.lost + point.stalled <= least.lost + least.stalled
-        and (point.within or not least.within)
+        if math.isfinite(point.error_m)
+        and point.lost + point.stalled <= first.lost + first.stalled
+        and (point.within or not first.within)
     ]
-    return min(fit, key=lambda point: point.volts, default=least)
 
 
 def _searched(course: Course, factor: float, seen: Sequence[FrontPoint]) -> list[FrontPoint]:
@@ -147,18 +165,20 @@ def _rare(course: Course, numbers: Sequence[tuple[float, float]], columns: Mappi
 
 
 def _valid(course: Course, answer: SearchResult, seen: list[FrontPoint]) -> SearchResult:
-    """Return the knee if it is valid; else the next best of the judged answers, at last that of least error."""
-    left = list(seen)
+    """Return the point that tune.objective selects if it is valid; else the next best, at last the given answer.
+
+    Points that are not valid are removed from `seen`.
+    """
+    knee = answer.problem.tune.objective == "knee"
     for _ in range(TRIES):
-        knee = chosen(left, KNEE)
-        if knee is left[0]:
+        best = chosen(seen, KNEE) if knee else least_of(seen)
+        if best is seen[0]:
             return answer
-        found, *_ = validated(course, knee.x)
+        found, *_ = validated(course, best.x)
         if found.good:
             return found
-        say(f"the answer of {knee.volts:.4g} V is not taken: it loses members, or accurate steps do not confirm it")
-        left = [point for point in left if point is not knee]
-        seen.remove(knee)
+        say(f"the answer of {best.volts:.4g} V is not taken: it loses members, or accurate steps do not confirm it")
+        seen[:] = [point for point in seen if point is not best]
     return answer
 
 
