@@ -916,6 +916,13 @@ SEARCH = [
         "tests/test_tuning_loops.py::test_injections_find_the_members_with_the_largest_measured_peak",
     ),
     M(
+        "the front measures from the first answer though a search finds a smaller error",
+        "tuning/search/front.py",
+        "least = min(point.error_m for point in fit)",
+        "least = seen[0].error_m",
+        "tests/test_tuning_front.py::test_the_point_chosen_holds_as_many_members_and_limits_as_the_least_error",
+    ),
+    M(
         "members of rare large errors do not join",
         "tuning/search/front.py",
         "more = _rare(course, numbers, columns)",
@@ -2024,8 +2031,8 @@ EXPORT = [
     M(
         "the help of a record omits the ranges",
         "ambjax/numerics/declared.py",
-        'told = [default and f"default {default}", "" if unit == "1" else unit, allowed(field)]',
-        'told = [default and f"default {default}", "" if unit == "1" else unit]',
+        'facts = [default and f"default {default}", "" if unit == "1" else unit, allowed(field)]',
+        'facts = [default and f"default {default}", "" if unit == "1" else unit]',
         "tests/test_rollout.py::test_the_help_of_a_law_is_that_of_its_declarations",
     ),
     M(

@@ -24,10 +24,10 @@ def parts_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> dict[str, st
     model = None if same else cascade.model
     world = {"sensor": scenario.sensor, "actuator": scenario.amplifier, "stop": scenario.stop}
     parts = {"plant": scenario.plant, "model": model, **laws, "processor": cascade.processor, **signals, **world}
-    told = {name: _numbers_of(one) for name, one in parts.items() if one is not None}
+    parts_text = {name: _numbers_of(one) for name, one in parts.items() if one is not None}
     supply, period = float(np.max(scenario.u_max)), float(clock.sample_period)
     limit = {"supply": f"{supply:g} V"} if np.isfinite(supply) else {}
-    return told | limit | {"clock": f"{clock.samples} samples of {period:g} s, {clock.method}"}
+    return parts_text | limit | {"clock": f"{clock.samples} samples of {period:g} s, {clock.method}"}
 
 
 def _numbers_of(part: object) -> str:

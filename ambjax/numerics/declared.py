@@ -48,8 +48,8 @@ def default_text(default: object) -> str:
 def item(field: dataclasses.Field) -> str:
     """Return the meaning, default, unit and range of a field as an item of the list in a docstring."""
     default, unit = default_text(field.default), field.metadata.get("unit", "")
-    told = [default and f"default {default}", "" if unit == "1" else unit, allowed(field)]
-    words = "; ".join(filter(None, told))
+    facts = [default and f"default {default}", "" if unit == "1" else unit, allowed(field)]
+    words = "; ".join(filter(None, facts))
     text = f"- `{field.name}`: {field.metadata['doc']}{words and f' ({words})'}"
     return textwrap.fill(text, 100, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 

@@ -53,7 +53,7 @@ class FrontPoint(NamedTuple):
 
 
 def traced(course: Course, answer: SearchResult) -> SearchResult:
-    """Trace the front from the answer of least error. Return the knee if tune.objective selects it and it is valid.
+    """Trace the front from the answer of least error. Return the answer that tune.objective selects.
 
     The result holds the points of the front in order of the error limit: for each limit the judged answer of least
     voltage. A search for less voltage may find a smaller error than the answer's; it is then the least error. Raises
