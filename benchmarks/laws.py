@@ -23,7 +23,7 @@ import _measure
 import tasks
 import tomlkit
 
-from ambjax.cases.reader import Case, case_from
+from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from tuning.space import Gain, Space, tunable
 
@@ -95,14 +95,13 @@ def title(name: str) -> str:
     return first.removeprefix(f"Tuning task {name}: ").partition(". ")[0].rstrip(".")
 
 
-def structures(case: Case, laws: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def structures(laws: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the tables [controller] of all structures. `laws`: that of the case. All structures have its observer.
 
-    LQG is state feedback with a Kalman filter, which is that of the case if it has one. The PI controller starts with a
-    bandwidth of three times the plant's pole, the other laws with their defaults.
+    LQG is state feedback with a Kalman filter, which is that of the case if it has one. The laws that the case does not
+    have start with their default gains for its plant.
     """
-    w, L = float(case.scenario.plant.pole), float(case.scenario.plant.L)
-    drive = {"kind": "pi", "k_p": 3 * w * L, "k_int": w * w * L, "k_aw": w / 3}
+    drive = {"kind": "pi"}
     soft = {stage: _without(laws.get(stage, {}), "p") for stage in ("position", "inversion", "current")}
     hard = {stage: law | {"p": math.inf} for stage, law in soft.items()}
     kept = {name: value for name, value in soft["position"].items() if name in ("c", "k")}
@@ -132,8 +131,8 @@ def _without(table: dict[str, Any], key: str) -> dict[str, Any]:
 def written(name: str, seed: int, budget: dict[str, int], folder: pathlib.Path) -> list[pathlib.Path]:
     """Write a case file for each structure of a case and return their paths."""
     raw = tomllib.loads(source(name))
-    case, paths = case_from(raw), []
-    for law, controller in structures(case, raw["controller"]).items():
+    paths = []
+    for law, controller in structures(raw["controller"]).items():
         document = _without(raw, "tune") | {"controller": controller}
         cascade = case_from(document).cascade
         known = tunable(cascade)
