@@ -29,6 +29,7 @@ def tune(
     out: str | pathlib.Path | None = None,
     *,
     resume: bool = False,
+    force: bool = False,
     gradients: bool = False,
     pareto: bool = False,
     page: bool = False,
@@ -39,6 +40,7 @@ def tune(
     - `case`: path of the case file. Its table [tune] selects the gains, the limits and the budget.
     - `out`: directory of the results; None: a new one under ./out.
     - `resume`: continue the search whose checkpoints are in `out`.
+    - `force`: overwrite the files of an earlier search in `out`.
     - `gradients`: also report the gradient of the loss.
     - `pareto`: write each point of the front of error against voltage as a case file.
     - `page`: also write page.html, in which sliders move the tuned gains (extra `[page]`).
@@ -54,6 +56,7 @@ def tune(
             case=str(case),
             out=None if out is None else str(out),
             resume=resume,
+            force=force,
             gradients=gradients,
             pareto=pareto,
             page=page,
