@@ -66,7 +66,9 @@ def run(args: argparse.Namespace) -> tuple[int, Row]:
 def _plan(args: argparse.Namespace) -> TuningPlan:
     """Read the case and make the output directory. Raises ValueError for an invalid case or option."""
     case, tune, raw = read_tune(args.case, args.settings_of)
-    if args.resume and not (args.out and begun(pathlib.Path(args.out))):
+    if args.resume and args.out is None:
+        raise ValueError("--resume: the directory of the search is missing. Give it as --out.")
+    if args.resume and not begun(pathlib.Path(args.out)):
         raise ValueError(f"--resume: --out {args.out} contains no search. Check --out, or leave out --resume.")
     print_warnings(case, args.case)
     if args.page:  # refuse it before the search

@@ -6,6 +6,8 @@ import pathlib
 from typing import Any
 
 from ambjax import Case, read_case
+from ambjax.cases.reader import require_file
+from ambjax.host.arguments import names_arguments
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,6 +26,7 @@ class TunedCase:
     directory: pathlib.Path
 
 
+@names_arguments()
 def tune(
     case: str | pathlib.Path,
     out: str | pathlib.Path | None = None,
@@ -51,6 +54,9 @@ def tune(
     """
     from tuning.command import run
 
+    for name, path in (("case", case), ("out", out), ("settings_of", settings_of)):
+        if path is not None or name == "case":
+            require_file(name, path)
     code, report = run(
         argparse.Namespace(
             case=str(case),
