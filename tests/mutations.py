@@ -1649,9 +1649,16 @@ SAMPLED = [
     M(
         "a step on a processor is chosen for the motion alone, however fast the coils",
         "ambjax/simulation/method.py",
-        "settled = math.ceil(sample_period * named[COILS] / SETTLED)",
+        "settled = math.ceil(sample_period * max(named[COILS] / SETTLED, named[FLUX] / LAGGED))",
         "settled = 1",
         "tests/test_integrate.py::test_coils_that_settle_within_a_sample_are_resolved[Plant]",
+    ),
+    M(
+        "a step on a processor is chosen without the lag of the flux",
+        "ambjax/simulation/method.py",
+        "named[FLUX] / LAGGED",
+        "0.0",
+        "tests/test_iron.py::test_the_chosen_step_resolves_the_lag_of_the_flux[1e-05-20]",
     ),
     M(
         "the step of an ensemble is that of the nominal amplifier",
@@ -2283,6 +2290,27 @@ STATUSES = [
         "elif depth and _followed(document, path[0]):",
         "elif False:",
         "tests/test_tuning_file.py::test_gains_are_written_wherever_the_laws_stand[keys of the root]",
+    ),
+    M(
+        "the results of an earlier search are overwritten without --force",
+        "tuning/command.py",
+        "    if not force:\n        check_new(out, WRITTEN)",
+        "    if False:\n        check_new(out, WRITTEN)",
+        "tests/test_tuning_study.py::test_an_unfinished_search_is_neither_lost_nor_resumed_without_resume",
+    ),
+    M(
+        "a message to Python names options of the command line",
+        "ambjax/host/arguments.py",
+        "name + OPTION.sub(argument, text)",
+        "name + text",
+        "tests/test_results.py::test_messages_name_arguments_and_not_options",
+    ),
+    M(
+        "the left margin of the overview cuts a label",
+        "ambjax/pictures/overview.py",
+        "subplots_adjust(1.25 / width",
+        "subplots_adjust(0.95 / width",
+        "tests/test_overview.py::test_no_label_is_cut",
     ),
     M(
         "a search that has not ended is removed",

@@ -303,6 +303,7 @@ def test_check_says_yes_and_no(capsys):
     out, err = capsys.readouterr()
     summary = json.loads(out)
     assert err.count("initial.i = 0.3 A") == 1  # a doubt is printed once, and stops nothing
+    assert "simulating 0.0" in err  # progress
     assert no in err
     along = next(c for c in summary["conditions"] if "along the run" in c["requires"])
     assert along["gain"] == 1000

@@ -467,7 +467,8 @@ def test_export_is_the_command_as_a_function(case, tmp_path, capsys):
     (tmp_path / "mine" / "Makefile").write_text("all:")
     with pytest.raises(ValueError, match="Makefile exists, is not from an export"):
         exported.write(tmp_path / "mine")
-    for option, message in (({"what": "loops"}, "what = 'loops'"), ({"fmi": 4}, "fmi = 4"), ({"fmi": 2}, "--fmi 2")):
+    version = "fmi = 2: it is the version of an FMU. Omit fmi, or set format to fmu."  # no options of the command line
+    for option, message in (({"what": "loops"}, "what = 'loops'"), ({"fmi": 4}, "fmi = 4"), ({"fmi": 2}, version)):
         with pytest.raises(ValueError, match=message):
             ambjax.export(exported.plan.case, **option)
 

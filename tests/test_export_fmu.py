@@ -288,7 +288,7 @@ def test_a_command_writes_the_fmu_and_its_reference(elsewhere, tmp_path, capsys,
     with pytest.raises(SystemExit):
         main(["export", str(case), "--out", str(out), "--format", "fmu", "--fmi", "4"])
     assert main(["export", str(case), "--out", str(out), "--fmi", "2"]) == 2
-    assert "--fmi 2: it is for --format fmu" in capsys.readouterr().err
+    assert "--fmi 2: it is the version of an FMU" in capsys.readouterr().err
     assert main(["export", str(case), "--out", str(out), "--format", "fmu", "--precision", "float"]) == 2
     assert "--precision float: an FMU computes in double" in capsys.readouterr().err
     monkeypatch.setenv("CC", "no-such-compiler")

@@ -53,6 +53,13 @@ def test_a_short_transient_is_enlarged(tmp_path, drawn):
     assert titles == ["", "the first 12 ms", "the last 20 ms"]
 
 
+def test_no_label_is_cut(tmp_path, drawn):
+    t = 1e-4 * np.arange(20_000)
+    overview(a_run(sigma=3e-3 * np.sin(100 * t)), "wide tick labels", tmp_path / "o.png", settle=0.1)
+    assert any("0.002" in label.get_text() for label in columns(drawn[0])[2, 0].get_yticklabels())
+    assert drawn[0].get_tightbbox().x0 >= 0
+
+
 def test_the_start_is_a_twentieth_at_most(tmp_path, drawn):
     t = 1e-4 * np.arange(20_000)
     overview(a_run(z=1e-4 * np.exp(-t / 0.2)), "slow", tmp_path / "o.png")

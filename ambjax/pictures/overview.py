@@ -63,7 +63,7 @@ def overview_figure(
     width, height = 13.0, 1.55 * len(grid) + 1.2
     figure = Figure(figsize=(width, height))
     # Fixed margins, in inches: a layout engine would double the time.
-    figure.subplots_adjust(1.05 / width, 0.5 / height, 1 - 0.2 / width, 1 - 0.85 / height, wspace=0.24, hspace=0.24)
+    figure.subplots_adjust(1.25 / width, 0.5 / height, 1 - 0.2 / width, 1 - 0.85 / height, wspace=0.24, hspace=0.24)
     ratios = [2, 1, 1] if window is None else [1, 1]
     axes = figure.subplots(len(grid), len(columns), sharex="col", squeeze=False, width_ratios=ratios)
     for row, (line, column) in enumerate(zip(axes, grid, strict=True)):
