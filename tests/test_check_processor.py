@@ -382,7 +382,7 @@ def test_check_says_no_where_an_explicit_slope_is_beyond_its_limit(capsys):
     assert "Delay margin" in said
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("elsewhere")
 def test_check_says_yes_on_a_processor(capsys):
     assert main(["check", write(CASE), "--json"]) == 0

@@ -255,7 +255,7 @@ def test_simulate_writes_what_is_documented(capsys):
     assert "written: there/" in capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_simulate_in_strokes_is_simulate_at_once(monkeypatch, capsys):
     """Neither the stroke of the progress bar nor --json changes a bit of the result."""
     path = write(SHORT + "[sensor]\nstd = 1e-6\n")

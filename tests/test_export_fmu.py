@@ -173,9 +173,14 @@ def looped(controller, plant, x, count, period, at_once=False):
     return z, u
 
 
-@pytest.mark.slow
 @compiled
-@pytest.mark.parametrize(("version", "name"), [(3, "F20"), (2, "F20"), (3, "rig"), (3, "rig, at once")])
+@pytest.mark.parametrize(
+    ("version", "name"),
+    [
+        pytest.param(version, name, marks=pytest.mark.slow if usual else pytest.mark.thorough)
+        for version, name, usual in ((3, "F20", 0), (2, "F20", 1), (3, "rig", 0), (3, "rig, at once", 1))
+    ],
+)
 def test_controller_and_plant_in_a_loop_are_simulates(version, name, tmp_path):
     pytest.importorskip("fmpy")
     if name == "F20":

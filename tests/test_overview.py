@@ -1,5 +1,6 @@
 """The overview of a run: its enlarged parts, kept extremes, and the visible mean of a chattering voltage."""
 
+import itertools
 import json
 import pathlib
 
@@ -109,9 +110,17 @@ def test_a_figure_of_the_paper_says_which_of_both(tmp_path, drawn, code, words):
     assert said == [words]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("samples", [1, 2, 3, 30])
-@pytest.mark.parametrize("lost_at", [np.inf, 0.0, 1e-4, 1.5e-4])
+# each number of samples and each end once; the thorough tests combine them otherwise
+USUAL = [(1, 0.0), (1, np.inf), (2, 1e-4), (3, 1.5e-4), (30, np.inf)]
+
+
+@pytest.mark.parametrize(
+    ("samples", "lost_at"),
+    [
+        pytest.param(*both, marks=pytest.mark.slow if both in USUAL else pytest.mark.thorough)
+        for both in itertools.product([1, 2, 3, 30], [np.inf, 0.0, 1e-4, 1.5e-4])
+    ],
+)
 def test_runs_of_few_samples_are_drawn(tmp_path, samples, lost_at):
     overview(a_run(samples=samples, lost_at=lost_at, code=TOUCHED), "tiny", tmp_path / "o.png")
     assert (tmp_path / "o.png").stat().st_size > 1000
