@@ -56,11 +56,11 @@ class Cascade:
     """
 
     observer: Observer = part(default=_LEFT_OUT, doc="law that estimates z, z_dot and i; left out: `Direct`")
-    position: PositionLaw = part(default=_LEFT_OUT, doc="law of v_star; left out: `SlidingMode`")
-    inversion: InversionLaw = part(default=_LEFT_OUT, doc="law of i_ref; left out: `Adaptive`")
-    current: CurrentLaw = part(default=_LEFT_OUT, doc="law of u; left out: `SlidingMode`")
+    position: PositionLaw = part(default=_LEFT_OUT, doc="law that computes v_star; left out: `SlidingMode`")
+    inversion: InversionLaw = part(default=_LEFT_OUT, doc="law that computes i_ref; left out: `Adaptive`")
+    current: CurrentLaw = part(default=_LEFT_OUT, doc="law that computes u; left out: `SlidingMode`")
     model: Plant = part(default=Plant(), doc="the nominal plant")
-    processor: Processor | None = part(default=None, doc="how the laws are sampled; None: continuous time")
+    processor: Processor | None = part(default=None, doc="processor of the controller; None: continuous time")
 
     def __post_init__(self) -> None:
         for stage, kind in USUAL.items():

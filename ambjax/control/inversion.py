@@ -37,7 +37,7 @@ class AdaptiveReference(InversionLaw[Array]):
     p: Scalar = gain(
         default=25.0,
         unit="m^2/A^2",
-        doc="steepness of the smoothed sign of v_tilde; left out: scaled to the plant",
+        doc="steepness of the smoothed sign of v_tilde; left out: scaled to the nominal plant",
         steepness=True,
     )
     i_ref: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="initial current reference")
