@@ -91,7 +91,7 @@ class Cascade:
         return CascadeState(*(extremes(law)[0].scale_sampled(self.model) for law in self.laws))
 
     def layer(self) -> CascadeState:
-        """Return, for each state, the largest integration error that keeps it inside the layer of a smoothed sign."""
+        """Return, for each state, the largest integration error that keeps it inside the boundary layer of its sign."""
         layers = ([one.layer(self.model) for one in extremes(law)] for law in self.laws)
         return CascadeState(*(jax.tree.map(lambda *x: functools.reduce(jnp.minimum, x), *each) for each in layers))
 
