@@ -12,9 +12,9 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parent.parent
 
-# The layers (floors) of each package, the lowest first: each is a folder, or a module beside these folders. A module
+# The layers of each package, the lowest first: each is a folder, or a module beside these folders. A module
 # imports only from lower layers or from its own, without a cycle.
-FLOORS = {
+LAYERS = {
     "ambjax": "_version compiler numerics host world control simulation extend codegen theorem ensemble linear paper "
     "pictures cases results page commands __init__ __main__",
     "tuning": "space optimisers objective config problem delay_test measured_peaks judge search report command "
@@ -34,12 +34,12 @@ def module_of(path):
 MODULES = {module_of(path): path for path in FILES}
 
 
-def floor_of(module):
+def layer_of(module):
     """Return the layer of a module, None if it is not in the table. All layers of tuning are above those of ambjax."""
     package, _, rest = module.partition(".")
-    room = rest.partition(".")[0] or "__init__"
-    floors = [(one, name) for one, names in FLOORS.items() for name in names.split()]
-    return floors.index((package, room)) if (package, room) in floors else None
+    layer = rest.partition(".")[0] or "__init__"
+    layers = [(one, name) for one, names in LAYERS.items() for name in names.split()]
+    return layers.index((package, layer)) if (package, layer) in layers else None
 
 
 def targets_of(node, module):
@@ -74,16 +74,16 @@ def ours(names):
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_every_module_has_a_floor(module):
-    assert floor_of(module) is not None, f"{module}: give it a floor in the table FLOORS of tests/test_layers.py"
+def test_every_module_has_a_layer(module):
+    assert layer_of(module) is not None, f"{module}: give it a layer in the table LAYERS of tests/test_layers.py"
 
 
 @pytest.mark.parametrize("module", MODULES)
 def test_imports_point_down(module):
     for target in ours(imports(module)) - {module}:
         assert target in MODULES, f"{module} imports {target}, which is no file of ours"
-        here, there = floor_of(module), floor_of(target)
-        assert there <= here, f"{module} (floor {here}) imports {target} (floor {there}): imports only point down"
+        here, there = layer_of(module), layer_of(target)
+        assert there <= here, f"{module} (layer {here}) imports {target} (layer {there}): imports only point down"
 
 
 def test_no_cycles():

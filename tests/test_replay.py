@@ -257,7 +257,7 @@ def test_check_on_a_processor_sees_the_run_of_simulate(monkeypatch, capsys):
     main(["check", "case.toml", "--json"])
     summary = json.loads(capsys.readouterr().out)["processor"]
     bands = summary["bands"]
-    assert [slope["stage"] for slope in summary["slopes"]] == ["position", "inversion", "current"]
+    assert [slope["stage"] for slope in summary["slopes"]] == ["observer", "position", "inversion", "current"]
     assert set(summary["delay_margin"]) == {"held", "lost", "undecided", "resolution", "step"}
     assert main(["simulate", "case.toml", "--out", "out"]) == 0
     with np.load("out/trajectory.npz") as rows:

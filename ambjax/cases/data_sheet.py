@@ -1,10 +1,10 @@
 """Annotated case file of a bearing from a data sheet: the numbers an engineer is given, and those to be assumed."""
 
 BEARING = """\
-# A case for ambjax: a radial magnetic bearing from a data sheet, on a 16 kHz processor, its rotor standing still.
+# A case for ambjax: a radial magnetic bearing from a data sheet, on a 16 kHz processor, its rotor at rest.
 # Units are SI. 'ambjax template' lists every other key. Run it with 'ambjax simulate', tune it with 'ambjax tune'.
-# "Data sheet": a number that a bearing is specified by. "Assumed": one that the sheet leaves out, chosen so that the
-# magnet is plausible: a bias flux of 0.75 T, 15 times the rotor's weight, 23 mH. 'ambjax check' prints these.
+# "Data sheet": the number is usually specified. "Assumed": the data sheet omits the number; it is chosen so that the
+# magnet is plausible: a bias flux of 0.75 T, a force of 15 times the weight, 23 mH. 'ambjax check' prints these.
 
 [plant]
 m = 2.4                       # kg; data sheet
@@ -72,7 +72,7 @@ sample_period = 6.25e-5       # s; data sheet: 16 kHz
 
 [run]
 settle = 0.05                 # s; time from which "settled" metrics count
-clearance = 2.5e-4            # m; touch-down bearings stand at about half the gap
+clearance = 2.5e-4            # m; touchdown bearings usually limit |z| to half of the gap
 
 [spread]                      # data sheet: the plant is known to 10 %; the controller's model keeps the values above
 plant.m = { percent = 10 }    # uniform

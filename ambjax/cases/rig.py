@@ -1,7 +1,7 @@
 """Annotated case file of a laboratory bearing, whose coils have 15 mH (the paper's have 33 H)."""
 
 RIG = """\
-# A case for ambjax: a laboratory's radial magnetic bearing on a 20 kHz processor, its rotor standing still.
+# A case for ambjax: a laboratory's radial magnetic bearing on a 20 kHz processor, its rotor at rest.
 # Units are SI. 'ambjax template' lists every other key. Run it with 'ambjax simulate', tune it with 'ambjax tune'.
 # Sources: [1] AMrotor, Technical University of Munich, the bearing of TU Darmstadt in Config_Sim_Mag1.m. [2] MALTA, ETH
 # Zurich, firmware of bearingless machines. [3] Math. Probl. Eng. 2011, 414286, Table 1: a rotor of 2.3 kg, gap 0.38 mm.
@@ -68,7 +68,7 @@ sample_period = 5e-5          # s; position and current control at 20 kHz [2]
 
 [run]
 settle = 0.05                 # s; time from which "settled" metrics count
-clearance = 2.5e-4            # m; touch-down bearings stand at about half the gap
+clearance = 2.5e-4            # m; touchdown bearings usually limit |z| to half of the gap
 
 [spread]
 plant.m = { percent = 10 }    # uniform; the controller's model keeps the values above

@@ -16,7 +16,7 @@ from ambjax.world.plant import Plant
 MACHINES = {"rig": RIG, "bearing": BEARING}
 HEAD = """\
 # A case for ambjax: {title}.
-# Units are SI. A key left out takes the value shown here unless its comment says otherwise.
+# Units are SI. A key that is left out has the value shown here, unless its comment says otherwise.
 # Check it with 'ambjax check', run it with 'ambjax simulate'.
 """
 
@@ -31,7 +31,7 @@ duration = 2.0                # s; a whole number of sample periods
 sample_period = 1e-4          # s; period of the recorded rows, for which each measurement error is held
 dt = "auto"                   # s, or "auto": method and step are chosen from the loop's slopes
 # method = "rk4"              # with a number for dt: "rk4", "dop853", "euler", "rodas3" (L-stable) or "sliding", which
-#                               is fast under noise where gamma p is large; with dt = "auto": "adaptive" or "sliding"
+#                               is fast under noise if gamma p is large; with dt = "auto": "adaptive" or "sliding"
 
 [run]
 seed = 0                      # seed of all random numbers
@@ -41,7 +41,7 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # stop_damping = 500.0        # N s/m; damping of the touchdown bearing (left out: 0)
 
 # [sensor]                    # Gaussian noise, held for a sample period, without delay (left out: none)
-# std = {paper_std:.3e}          # m; this is the paper's, which its printed gains do not survive
+# std = {paper_std:.3e}          # m; as in the paper, whose printed gains lose the rotor under it
 # std_z_dot = 0.0             # m/s
 # std_i = 0.0                 # A
 # offset = 0.0                # m; offset of the position sensor
@@ -55,20 +55,20 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 #
 # [sensor.outliers]           # faults of the position sensor, with [processor]: single readings (left out: none)
 # rate = 1.0                  # 1/s; mean number of outliers per second
-# size = 5e-3                 # m; error of an outlier, up or down
-# at = 0.1                    # s; time of one more outlier (left out: none)
+# size = 5e-3                 # m; error of an outlier, of either sign
+# at = 0.1                    # s; time of an additional outlier (left out: none)
 #
-# [sensor.dropouts]           # stretches without a reading (left out: none)
+# [sensor.dropouts]           # intervals without a reading (left out: none)
 # rate = 1.0                  # 1/s; mean number of dropouts per second
 # duration = 5e-4             # s; duration of each dropout
-# at = 0.1                    # s; time of one more dropout (left out: none)
+# at = 0.1                    # s; time of an additional dropout (left out: none)
 # value = "hold"              # reading during a dropout: the last one ("hold"), "nan", "zero" or "full-scale"
 
-# [sensor.runout]             # of the surface that the position sensor reads (left out: none)
+# [sensor.runout]             # runout of the surface that the position sensor reads (left out: none)
 # speed = 6000.0              # rpm
 # speed_end = 12000.0         # rpm; speed after a linear run-up (left out: constant speed)
 # duration = 1.0              # s; time of the run-up
-# harmonics = [{{ number = 1, amplitude = 1e-6, phase = 0.0 }}]  # 1, m and rad; a sine for each, that many per turn
+# harmonics = [{{ number = 1, amplitude = 1e-6, phase = 0.0 }}]  # waves per turn, m, rad
 
 # [processor]                 # the laws run on a processor, one step per sample (left out: in continuous time)
 # delay = 1.0                 # samples from measurement to voltage, 0 to 2, fractions allowed
@@ -82,28 +82,28 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # i = 25.0                    # A; largest |i| (left out: 100 i_0)
 # noise = 1.4e-5              # m; largest difference of two readings of one z (left out: from the sensor's errors)
 # speed = 1e-3                # m/s; error of the predicted velocity (left out: from the sensor or the observer)
-# samples = 18                # largest number of predictions in a row (left out: until an error grows e-fold)
+# samples = 18                # largest number of successive predictions (left out: until an error grows e times)
 
 # [actuator]
-# mode = "voltage"            # what the controller commands; or "current", with bandwidth and i_max only
+# mode = "voltage"            # the controller commands a voltage; or "current", with bandwidth and i_max only
 # u_max = 200.0               # V; limit of the supply (left out: none)
 #                             # and with [processor], or with mode = "current" (bandwidth: of the current loop):
 # bandwidth = 1e3             # Hz; bandwidth of the amplifier, first order (left out: no lag)
 # slew = 1e7                  # V/s; largest rate of its voltage (left out: no limit)
-# dead_band = 0.5             # V; subtracted from the size of its voltage (left out: none)
+# dead_band = 0.5             # V; subtracted from the absolute value of its voltage (left out: none)
 # i_max = 1.0                 # A; above it, the voltage does not increase |i| (left out: no limit)
 
 # [sensitivity]               # range and zones of 'ambjax sensitivity' (ISO 14839, from secondary sources)
 # f_low = 1.0                 # Hz; lowest frequency; 0 is always included
 # f_high = 2e3                # Hz; highest (left out: 2 kHz, or 0.45 of the sampling rate if that is lower)
-# zone_a = 3.0                # peak of |S| below which zone A holds
-# zone_b = 4.0                # likewise, zone B
-# zone_c = 5.0                # likewise, zone C; above it zone D
-# clearance_a = 0.3           # share of the clearance that is used, zone A
-# clearance_b = 0.4           # likewise, zone B
-# clearance_c = 0.5           # likewise, zone C; above it zone D
+# zone_a = 3.0                # upper limit of zone A for the peak of |S|
+# zone_b = 4.0                # upper limit of zone B
+# zone_c = 5.0                # upper limit of zone C; above it is zone D
+# clearance_a = 0.3           # upper limit of zone A for the largest |z|, as a share of the clearance
+# clearance_b = 0.4           # upper limit of zone B
+# clearance_c = 0.5           # upper limit of zone C; above it is zone D
 
-# [spread]                    # what varies over an ensemble, by dotted path; 'ambjax simulate' ignores it
+# [spread]                    # distributions of numbers over an ensemble; 'ambjax simulate' ignores this table
 # design = "random"           # or {designs}
 # plant.m = {{ percent = 10 }}  # uniform, +-10 % of the value above; the controller's model keeps that value
 # plant.k_z = {{ percent = 10, shape = "normal" }}         # standard deviation 10 %, cut off at 6 standard deviations
@@ -126,7 +126,7 @@ def _lines(kind: type, values: object) -> list[str]:
 
 
 IRON = """\
-# [plant.iron]                # of the true plant's magnets; each key left out: ideal iron (left out: none)
+# [plant.iron]                # iron of the true plant; a key that is left out: ideal in this respect (left out: ideal)
 # saturation = 1.4            # T; flux density limit of the core
 # leakage = 1.1               # flux of a coil over the flux of its gap, at z = 0
 # eddy = 5e-5                 # s; lag of the flux behind the current by eddy currents
@@ -180,7 +180,7 @@ def template(scenario: str) -> str:
     ]
     lines += [
         "[controller]",
-        "model = {}                    # the controller's model, where it differs from the plant: { m = 0.6 }",
+        "model = {}                    # numbers of the controller's model that differ from the plant: { m = 0.6 }",
     ]
     for stage, kinds in KINDS.items():
         kind, law = next(iter(kinds.items()))

@@ -25,9 +25,11 @@ NUMBERS: dict[str, dataclasses.Field] = {
     "conditions_margin": leaf(
         0.1, at_least=0, at_most=1e3, doc="share by which each gain is to exceed its condition of Theorem 1"
     ),
-    "early": leaf(0.0, at_least=0, at_most=1e6, doc="weight of errors before run.settle, relative to 1 after it"),
+    "early": leaf(0.0, at_least=0, at_most=1e6, doc="weight of errors before run.settle; after it, the weight is 1"),
     "stress": leaf(1.2, above=0, at_most=1e6, doc="factor on the noise of the stressed members"),
-    "gain_margin": leaf(1.25, above=0, at_most=1e6, doc="factor on each gain of the stressed members, up or down"),
+    "gain_margin": leaf(
+        1.25, above=0, at_most=1e6, doc="each gain of a stressed member is multiplied or divided by this factor"
+    ),
     "learning_rate": leaf(0.1, above=0, at_most=1e3, doc="step size of an optimiser of optax"),
 }
 
@@ -38,14 +40,12 @@ def _weight(default: float, doc: str) -> dataclasses.Field:
 
 # The weights of the terms of the loss, in the order of the template, and of the conditions.
 WEIGHTS: dict[str, dataclasses.Field] = {
-    "tracking": _weight(
-        1.0, "each weight multiplies a dimensionless term: here the mean square error after run.settle"
-    ),
+    "tracking": _weight(1.0, "mean square error after run.settle; all terms are dimensionless"),
     "peak": _weight(0.0, "largest error after run.settle"),
     "effort": _weight(0.1, "mean square voltage"),
     "chatter": _weight(0.1, "mean square step of the voltage"),
     "clearance": _weight(1e-3, "closeness to the stop"),
-    "survival": _weight(1.0, "loss of the rotor, the earlier the more"),
+    "survival": _weight(1.0, "loss of the rotor; it counts more if it is earlier"),
     "conditions": _weight(1.0, "conditions of Theorem 1 that fail, or hold by less than the margin"),
 }
 SURVIVAL: dataclasses.Field = leaf(SURVIVING, above=0, at_most=1, doc="share of the held-out members that must survive")
@@ -66,16 +66,24 @@ class Budget:
     """Size of the search."""
 
     members: int = _members(32, 1, "members of the training ensemble, each with its own noise and [spread]")
-    stressed: int = _members(8, 0, "further members that only have to survive, with more noise and with other gains")
-    validation: int = _members(2000, 0, "further members; those lost with the tuned gains join the stressed ones")
-    held_out: int = _members(1000, 0, "further members, on which the tuned gains are judged")
-    seed: int = _whole(1, 0, "seed of the members and of the screen; the other ensembles' seeds are far from it")
-    screen: int = _members(128, 0, "points at which the search begins; 0: only at the gains above")
-    starts: int = _whole(4, 1, "number of the best of these points, which are refined")
+    stressed: int = _members(
+        8, 0, "members with more noise and changed gains, which must be held but whose error does not count"
+    )
+    validation: int = _members(
+        2000, 0, "members of the validation; those lost with the tuned gains join the stressed ones"
+    )
+    held_out: int = _members(1000, 0, "held-out members, on which the tuned gains are judged")
+    seed: int = _whole(1, 0, "seed of the training members and of the screen; the other ensembles have other seeds")
+    screen: int = _members(128, 0, "number of starting points that are screened; 0: only the gains of the case")
+    starts: int = _whole(4, 1, "number of the best of these points that are refined")
     iterations: int = _whole(40, 1, "largest number of iterations in each phase of the refinement")
     substeps: int = _whole(3, 1, "integration steps per sample")
     front: int = leaf(
-        3, at_least=1, at_most=5, whole=True, doc="points of error against voltage, besides that of least error"
+        3,
+        at_least=1,
+        at_most=5,
+        whole=True,
+        doc="number of points of the front of error against voltage, without that of least error",
     )
 
 
@@ -147,7 +155,7 @@ def _limits() -> Iterator[Line]:
         ),
         (
             "overshoot_m = 1e-4",
-            "m; how far z goes beyond its start and beyond the range of r so far (left out: none)",
+            "m; largest distance of z beyond its initial value and the range of r so far (left out: none)",
         ),
         ("clearance_used = 0.8", "largest |z| of any member as a share of the clearance (left out: none)"),
         (
@@ -160,8 +168,8 @@ def _limits() -> Iterator[Line]:
         (f"survival = {SURVIVAL.default}", SURVIVAL.metadata["doc"]),
         (
             "margin = 0.01",
-            f"share by which the search keeps from a limit; left out: {means} for means, {worst} for maxima, {loops} "
-            "for loops",
+            f"distance that the search keeps from a limit, as a share of it; left out: {means} for means, {worst} for "
+            f"maxima, {loops} for loops",
         ),
     ]
     return (Line(f"limits.{text}", comment) for text, comment in examples)

@@ -81,7 +81,7 @@ def scales(tree: Any) -> list[float]:
 
 
 def law_lines(cascade: Cascade) -> list[str]:
-    """Return one line per stage, with its law, signs without a layer and schedules, then a line on the processor."""
+    """Return one line per stage, with its law, set-valued signs and schedules, then a line on the processor."""
     laws: tuple[Any, ...] = cascade.laws
     lines = []
     for stage, law in zip(("observer", "position", "inversion", "current"), laws, strict=True):

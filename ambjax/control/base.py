@@ -37,9 +37,9 @@ class Law:
       structure of the state.
     - `own_steps`: the discretisations, "implicit" or "explicit", for which a processor calls the method `step`. For the
       others it makes an explicit Euler step. The default is ("implicit",) for a class that defines `step`.
-    - `stiff`: whether the law has a state that a smoothed sign keeps inside its layer, so that it changes fast; set for
+    - `stiff`: whether the law has a state that a smoothed sign keeps inside its boundary layer, so that it changes fast; set for
       a class that defines `layer`.
-    - `slides`: whether an inversion law has the method `slide`, which integrates across the layer (`laws.Relaxation`);
+    - `slides`: whether an inversion law has the method `slide`, which integrates across the boundary layer (`laws.Relaxation`);
       set for a class that defines it.
     """
 
@@ -65,9 +65,9 @@ class Law:
         return None
 
     def layer(self, model: Plant) -> object:
-        """Return, for each component of the state, the largest integration error that keeps it in the sign's layer.
+        """Return, for each component of the state, the integration error that keeps it in the sign's boundary layer.
 
-        inf for a component without a layer, which is the default.
+        The default is inf, for a component that no sign moves.
         """
         scale: Any = self
         return jax.tree.map(lambda _: jnp.inf, scale.scale(model))
@@ -139,8 +139,8 @@ def default_law(kind: type[L], model: Plant, period: float | None = None) -> L:
     """Return the law of type `kind` with its default gains (`Law.designed`), and with steepnesses scaled to `model`.
 
     The default of a steepness p is for the plant of Table 1. It is scaled by the inverse size of the sign's argument,
-    so that the layer 1/p is the same share of this size for every plant. With p = 25 m^2/A^2, for example, the layer of
-    v_tilde is 1.6e-5 of the size of v in Table 1, 2500 A^2/m^2.
+    so that the boundary layer 1/p is the same share of this size for every plant. With p = 25 m^2/A^2, for example,
+    that of v_tilde is 1.6e-5 of the size of v in Table 1, 2500 A^2/m^2.
     """
     law: Any = kind().designed(model, period)
     size = law.size(model)
@@ -177,7 +177,7 @@ def hard_signs(law: Law) -> list[str]:
         infinite = np.array([True]) if value is None else np.isinf(np.asarray(value, float))
         if infinite.any() and not infinite.all():
             raise ValueError(
-                f"{name}: inf for some members and a number for others. A sign without a layer needs another "
+                f"{name}: inf for some members and a number for others. A set-valued sign needs another "
                 "program: give inf to all members or to none."
             )
         if infinite.all():

@@ -56,11 +56,11 @@ class Cascade:
     """
 
     observer: Observer = part(default=_LEFT_OUT, doc="law that estimates z, z_dot and i; left out: `Direct`")
-    position: PositionLaw = part(default=_LEFT_OUT, doc="law of v_star; left out: `SlidingMode`")
-    inversion: InversionLaw = part(default=_LEFT_OUT, doc="law of i_ref; left out: `Adaptive`")
-    current: CurrentLaw = part(default=_LEFT_OUT, doc="law of u; left out: `SlidingMode`")
+    position: PositionLaw = part(default=_LEFT_OUT, doc="law that computes v_star; left out: `SlidingMode`")
+    inversion: InversionLaw = part(default=_LEFT_OUT, doc="law that computes i_ref; left out: `Adaptive`")
+    current: CurrentLaw = part(default=_LEFT_OUT, doc="law that computes u; left out: `SlidingMode`")
     model: Plant = part(default=Plant(), doc="the nominal plant")
-    processor: Processor | None = part(default=None, doc="how the laws are sampled; None: continuous time")
+    processor: Processor | None = part(default=None, doc="processor of the controller; None: continuous time")
 
     def __post_init__(self) -> None:
         for stage, kind in USUAL.items():
@@ -91,7 +91,7 @@ class Cascade:
         return CascadeState(*(extremes(law)[0].scale_sampled(self.model) for law in self.laws))
 
     def layer(self) -> CascadeState:
-        """Return, for each state, the largest integration error that keeps it inside the layer of a smoothed sign."""
+        """Return, for each state, the largest integration error that keeps it inside the boundary layer of its sign."""
         layers = ([one.layer(self.model) for one in extremes(law)] for law in self.laws)
         return CascadeState(*(jax.tree.map(lambda *x: functools.reduce(jnp.minimum, x), *each) for each in layers))
 

@@ -23,7 +23,7 @@ class SlidingMode(CurrentLaw[tuple[()]]):
     p: Scalar = gain(
         default=25.0,
         unit="1/A",
-        doc="steepness of the smoothed sign of the current error; left out: scaled to the plant",
+        doc="steepness of the smoothed sign of the current error; left out: scaled to the nominal plant",
         steepness=True,
     )
     requirement: ClassVar = Requirement("k_i", "Q_i")

@@ -60,17 +60,21 @@ class Guard:
     until a reading is within its limits. `settled` derives each number that is left out (None).
     """
 
-    z: Scalar | None = _limit("m", "largest |z|; none: clearance times gain, plus offset and largest error")
-    z_dot: Scalar | None = _limit("m/s", "largest |z_dot|; none: two gaps in a sample, 2 s_0/T")
+    z: Scalar | None = _limit(
+        "m", "largest |z|; none: clearance times sensor gain, plus |offset|, plus the largest error of the sensor"
+    )
+    z_dot: Scalar | None = _limit("m/s", "largest |z_dot|; none: two gaps per sample, 2 s_0/T")
     i: Scalar | None = _limit("A", "largest |i|; none: 100 i_0")
     noise: Scalar | None = _limit(
         "m",
-        "largest difference of two readings of one z; none: 13.6 sensor.std, a step of the converter, twice the runout",
+        "largest difference of two readings of one position; none: 13.6 sensor.std, plus a step of the converter, plus "
+        "twice the runout",
         0,
     )
     speed: Scalar | None = _limit(
         "m/s",
-        "error of the predicted speed; none: 6.8 sensor.std_z_dot, plus pole times clearance if z_dot is estimated",
+        "largest error of the predicted velocity; none: 6.8 sensor.std_z_dot, plus pole times clearance if z_dot is "
+        "estimated",
         0,
     )
     samples: Scalar | None = leaf(
@@ -80,7 +84,7 @@ class Guard:
         at_most=1_000_000,
         whole=True,
         optional=True,
-        doc="largest number predicted in a row; none: 1/(pole T), in which an error grows by the factor e",
+        doc="largest number of successive predictions; none: 1/(pole T), in which an error grows by the factor e",
     )
 
     @property

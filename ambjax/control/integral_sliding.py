@@ -33,7 +33,7 @@ class IntegralSlidingMode(PositionLaw[Array]):
     p: Scalar = gain(
         default=25.0,
         unit="s/m",
-        doc="steepness of the smoothed sign; left out: scaled to the plant",
+        doc="steepness of the smoothed sign; left out: scaled to the nominal plant",
         steepness=True,
     )
     memory = (("x", "m s", "integral of the error"),)

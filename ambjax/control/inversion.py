@@ -37,7 +37,7 @@ class AdaptiveReference(InversionLaw[Array]):
     p: Scalar = gain(
         default=25.0,
         unit="m^2/A^2",
-        doc="steepness of the smoothed sign of v_tilde; left out: scaled to the plant",
+        doc="steepness of the smoothed sign of v_tilde; left out: scaled to the nominal plant",
         steepness=True,
     )
     i_ref: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="initial current reference")
@@ -59,7 +59,7 @@ class AdaptiveReference(InversionLaw[Array]):
         return model.v_size
 
     def layer(self, model: Plant) -> Scalar:
-        """Return a third of the width of the smoothed sign in i_ref (A): v_tilde = 1/p divided by dv/di(0, 0)."""
+        """Return a third of the boundary layer in i_ref (A): v_tilde = 1/p divided by dv/di(0, 0)."""
         return 0.3 / (self.p * model.dv_di(0.0, 0.0))
 
 
@@ -91,7 +91,7 @@ class Adaptive(AdaptiveReference):
         return {"gamma": gamma, **steepness(context, "gamma")}
 
     def slide(self, model: Plant, begin: ForceDemand, end: ForceDemand, i_ref: Array, h: Scalar) -> Relaxation:
-        """Integrate i_ref over a step: at the rate gamma up to the layer of the sign, then along v_star. Eq. (14a)."""
+        """Integrate i_ref over a step: at the rate gamma up to the boundary layer, then along v_star. Eq. (14a)."""
         v_0, gradient_0 = v_and_gradient(model, begin, i_ref)
         v_1, gradient_1 = v_and_gradient(model, end, i_ref)
         w = begin.v_star - v_0

@@ -42,7 +42,7 @@ class UtkinSlidingMode(PositionLaw[Array]):
     k_d: Scalar = gain(default=354.0, unit="1/s", doc="derivative gain; left out: 2 w/3")
     k: Scalar = gain(default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z")
     p: Scalar = gain(
-        default=25.0, unit="s/m", doc="steepness of the smoothed sign of s; left out: scaled to the plant",
+        default=25.0, unit="s/m", doc="steepness of the smoothed sign of s; left out: scaled to the nominal plant",
         steepness=True,
     )  # fmt: skip
     memory = (("integral", "m/s", "integral of k_p e"), ("begun", "1", "1 after the first sample"))
@@ -123,7 +123,7 @@ class TerminalSlidingMode(PositionLaw[tuple[()]]):
         default=280.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z; left out: w^2 s_0/5"
     )
     p: Scalar = gain(
-        default=25.0, unit="s/m", doc="steepness of the smoothed sign of sigma; left out: scaled to the plant",
+        default=25.0, unit="s/m", doc="steepness of the smoothed sign of sigma; left out: scaled to the nominal plant",
         steepness=True,
     )  # fmt: skip
 

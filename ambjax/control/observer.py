@@ -46,7 +46,7 @@ class Complementary(Observer[Array]):
         at_least=-1.0,
         at_most=1.0,
         optional=True,
-        doc="initial estimate; none: first measurement",
+        doc="initial estimate; none: the first measurement",
     )
     memory = (("z_hat", "m", "estimate of the displacement"),)
 

@@ -35,7 +35,7 @@ class SlidingMode(PositionLaw[tuple[()]]):
     p: Scalar = gain(
         default=25.0,
         unit="s/m",
-        doc="steepness of the smoothed sign of sigma; left out: scaled to the plant",
+        doc="steepness of the smoothed sign of sigma; left out: scaled to the nominal plant",
         steepness=True,
     )
     requirement: ClassVar = Requirement("k", "Q_z")
@@ -100,7 +100,7 @@ class SuperTwisting(PositionLaw[Array]):
     p: Scalar = gain(
         default=100.0,
         unit="s/m",
-        doc="steepness of the smoothed root and sign of sigma; left out: scaled to the plant",
+        doc="steepness of the smoothed root and sign of sigma; left out: scaled to the nominal plant",
         steepness=True,
     )
     memory = (("w", "m/s^2", "integral of the sign of sigma"),)

@@ -1,4 +1,4 @@
-"""The processor of a cascade: all laws step once a sample, and the voltage is held from a delay later on."""
+"""The processor of a cascade: all laws make one step per sample, and their voltage acts after a delay."""
 
 import dataclasses
 import functools
@@ -33,21 +33,29 @@ class Processor:
         unit="samples",
         at_least=0,
         at_most=MOST_DELAY,
-        doc="from measurement to voltage, computing and output",
+        doc="time from the measurement until the voltage acts",
     )
-    implicit: bool = static(default=True, doc="signs act on the step's end; else explicit Euler")
-    predict: bool | None = static(default=None, doc="carry the estimate over the delay; None: where there is one")
+    implicit: bool = static(
+        default=True, doc="implicit steps, with the signs at the end of the step; otherwise explicit Euler steps"
+    )
+    predict: bool | None = static(
+        default=None, doc="the laws use the estimate predicted over the delay; None: if there is a delay"
+    )
     assumed: Scalar | None = leaf(
         default=None,
         unit="samples",
         at_least=0,
         at_most=MOST_DELAY,
         optional=True,
-        doc="delay that the prediction assumes; none: the actual delay",
+        doc="delay that the prediction assumes; none: the true delay",
     )
     guard: Guard | None = part(default=Guard(), doc="guard of the readings; None: every reading is accepted")
-    whole: bool | None = static(default=None, doc="every delay is a whole number of samples; None: to be seen")
-    most: int | None = static(default=None, doc="samples that the longest prediction reaches into; None: to be seen")
+    whole: bool | None = static(
+        default=None, doc="whether every delay is a whole number of samples; None: not determined yet"
+    )
+    most: int | None = static(
+        default=None, doc="number of samples over which the longest prediction extends; None: not determined yet"
+    )
 
     def __str__(self) -> str:
         ahead = "with" if self.predicts else "without"

@@ -95,7 +95,7 @@ class Percent:
 class Uniform:
     """Uniform distribution from low to high. It does not depend on the nominal value."""
 
-    low: float = part(doc="least value")
+    low: float = part(doc="smallest value")
     high: float = part(doc="largest value")
     relative = False
 
@@ -116,7 +116,7 @@ class Uniform:
 class LogUniform:
     """Log-uniform distribution: the logarithm of the number is uniform from log(low) to log(high)."""
 
-    low: float = part(doc="least value")
+    low: float = part(doc="smallest value")
     high: float = part(doc="largest value")
     relative = False
 

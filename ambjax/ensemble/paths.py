@@ -14,7 +14,7 @@ from ambjax.world.scenario import Scenario
 from ambjax.world.signals import Constant
 
 SHIFT = "shift"
-TIME = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time by which start and stop move together")
+TIME = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time by which start and stop are shifted together")
 
 
 class Place(NamedTuple):

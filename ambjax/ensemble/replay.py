@@ -2,7 +2,7 @@
 
 XLA compiles a rollout of one member into scalar code, and a block of members into vector code. The two contract
 products and sums into fused operations at different places, so their results differ in the last bit. In a loop with a
-converter, or with a sign without a boundary layer, that difference grows until the two runs are unrelated. A member
+converter, or with a set-valued sign, that difference grows until the two runs are unrelated. A member
 that is simulated alone therefore runs in a block of the same size as in an ensemble, and fills every lane of the block.
 """
 

@@ -40,17 +40,21 @@ class Zones:
     zone_a: Scalar = leaf(
         default=3.0, unit="1", at_least=1, at_most=1e3, doc="upper limit of zone A for the peak of |S|"
     )
-    zone_b: Scalar = leaf(default=4.0, unit="1", at_least=1, at_most=1e3, doc="likewise, zone B")
-    zone_c: Scalar = leaf(default=5.0, unit="1", at_least=1, at_most=1e3, doc="likewise, zone C; above it: zone D")
+    zone_b: Scalar = leaf(default=4.0, unit="1", at_least=1, at_most=1e3, doc="upper limit of zone B")
+    zone_c: Scalar = leaf(
+        default=5.0, unit="1", at_least=1, at_most=1e3, doc="upper limit of zone C; above it is zone D"
+    )
     clearance_a: Scalar = leaf(
         default=0.3,
         unit="1",
         above=0,
         at_most=1,
-        doc="limit of zone A for the largest |z|, as a share of the clearance",
+        doc="upper limit of zone A for the largest |z|, as a share of the clearance",
     )
-    clearance_b: Scalar = leaf(default=0.4, unit="1", above=0, at_most=1, doc="likewise, zone B")
-    clearance_c: Scalar = leaf(default=0.5, unit="1", above=0, at_most=1, doc="likewise, zone C; above it: zone D")
+    clearance_b: Scalar = leaf(default=0.4, unit="1", above=0, at_most=1, doc="upper limit of zone B")
+    clearance_c: Scalar = leaf(
+        default=0.5, unit="1", above=0, at_most=1, doc="upper limit of zone C; above it is zone D"
+    )
 
     def check(self, period: Scalar | None) -> None:
         """Raise ValueError if the limits are not in ascending order, and as `range` does. `period`: see `range`."""

@@ -21,8 +21,8 @@ TUNED_WORDS = (
     "found by `ambjax tune`: " + _gains(TUNED)
 )
 SAMPLED_WORDS = (
-    f"as `tuned`, on a processor of {1 / float(CLOCK.sample_period):g} Hz: {PROCESSOR.resolved()}; signs without a "
-    f"boundary layer, gains tuned on this processor for plants that differ by up to 10 %: {_gains(SAMPLED)}"
+    f"as `tuned`, on a processor of {1 / float(CLOCK.sample_period):g} Hz: {PROCESSOR.resolved()}; set-valued "
+    f"signs, gains tuned on this processor for plants that differ by up to 10 %: {_gains(SAMPLED)}"
 )
 
 

@@ -7,7 +7,7 @@ repaired: gamma = 7.5e4 instead of 1000, so that Eq. (7) holds, and the disturba
 force of 1 A^2/m^2, as the text words it, so q_z = a Q_z = 0.141 m/s^2.
 tuned: the disturbance of `repaired`, the paper's noise on z (held for 100 us), and a supply of 200 V. The observer and
 the gains are those that `ambjax tune benchmarks/tasks/C.toml` found; a search today may find others.
-sampled: as `tuned`, on a processor of 10 kHz whose voltage acts one sample late, with signs without a boundary layer.
+sampled: as `tuned`, on a processor of 10 kHz whose voltage acts one sample late, with set-valued signs.
 `ambjax tune benchmarks/tasks/sampled/C10-robust.toml` found the gains, for plants off by up to 10 %.
 
 The paper does not give the times of the pulse, the initial state or the sample time of the noise. Here the pulse acts

@@ -108,7 +108,7 @@ class ClosedLoop:
         return jax.tree.map(jnp.asarray, LoopState(self.scenario.plant.scale(), self.cascade.scale()))
 
     def layer(self) -> LoopState:
-        """Return, for each state, the largest integration error that keeps it inside the layer of a smoothed sign.
+        """Return, for each state, the largest integration error that keeps it inside the boundary layer of its sign.
 
         It is inf for the states of the plant.
         """

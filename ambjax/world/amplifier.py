@@ -31,7 +31,12 @@ class Amplifier:
     """
 
     bandwidth: Scalar | None = leaf(
-        default=None, unit="Hz", at_least=1, at_most=1e6, optional=True, doc="first order; none: no lag"
+        default=None,
+        unit="Hz",
+        at_least=1,
+        at_most=1e6,
+        optional=True,
+        doc="bandwidth of the voltage, first order; none: no lag",
     )
     slew: Scalar | None = leaf(
         default=None, unit="V/s", at_least=1e-3, at_most=1e15, optional=True, doc="largest rate of u; none: no limit"

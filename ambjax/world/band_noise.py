@@ -39,7 +39,7 @@ class BandNoise:
 
     std: Scalar = leaf(at_least=0, at_most=1e20, doc="standard deviation")
     f_low: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="lower end of the band")
-    f_high: Scalar = leaf(unit="Hz", above=0, at_most=1e9, doc="upper end of the band; above f_low")
+    f_high: Scalar = leaf(unit="Hz", above=0, at_most=1e9, doc="upper end of the band, above f_low")
     ordered: ClassVar = ("f_low", "f_high")
 
     def realised(self, key: Array) -> Lines:

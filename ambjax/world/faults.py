@@ -33,7 +33,7 @@ def _rate() -> Any:
         unit="1/s",
         at_least=0,
         at_most=1e9,
-        doc="mean number per second, with equal probability at each sample",
+        doc="mean number per second; the probability is the same at every sample",
     )
 
 
@@ -44,7 +44,7 @@ def _at() -> Any:
         at_least=0,
         at_most=1e6,
         optional=True,
-        doc="time of one more, at the nearest sample; none: no other",
+        doc="time of one more fault, rounded to the nearest sample; none: no other fault",
     )
 
 
@@ -71,10 +71,10 @@ class Dropouts:
 
     rate: Scalar = _rate()
     duration: Scalar = leaf(
-        default=5e-4, unit="s", at_least=0, at_most=1e6, doc="of each, to the nearest sample and at least one"
+        default=5e-4, unit="s", at_least=0, at_most=1e6, doc="duration, rounded to whole samples, at least one"
     )
     at: Scalar | None = _at()
-    value: str = static(default=VALUES[0], doc="what is read meanwhile")
+    value: str = static(default=VALUES[0], doc="reading during a dropout")
 
     def onset(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Array:
         """Return whether a dropout begins at a sample."""

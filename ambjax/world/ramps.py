@@ -19,9 +19,9 @@ def _share(t: Scalar, start: Scalar, duration: Scalar) -> Array:
 class Ramp:
     """0 until `start`, then a straight line to `amplitude` over `duration`, then `amplitude`."""
 
-    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height reached")
-    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="when it begins to rise")
-    duration: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="time it takes to rise")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="final value")
+    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="start of the rise")
+    duration: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="duration of the rise")
 
     def __call__(self, t: Scalar) -> Array:
         return self.amplitude * _share(t, self.start, self.duration)
@@ -39,11 +39,11 @@ class Ramp:
 class Trapezoid:
     """0 until `start`, a straight line to `amplitude` over `rise`, `amplitude` for `hold`, a line to 0 over `fall`."""
 
-    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height")
-    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="when it begins to rise")
-    rise: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="time it takes to rise")
-    hold: Scalar = leaf(default=0.1, unit="s", at_least=0, at_most=1e9, doc="time at the height")
-    fall: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="time it takes to fall")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="largest value")
+    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="start of the rise")
+    rise: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="duration of the rise")
+    hold: Scalar = leaf(default=0.1, unit="s", at_least=0, at_most=1e9, doc="time at the largest value")
+    fall: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="duration of the fall")
 
     def __call__(self, t: Scalar) -> Array:
         down = self.start + self.rise + self.hold

@@ -42,7 +42,9 @@ class Recorded:
     samples: Samples = static(doc="times and values")
     held: bool = static(default=False, doc="whether a value is held until the next time")
     scale: Scalar = leaf(default=1.0, unit="1", at_least=-1e20, at_most=1e20, doc="factor of the values")
-    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time at which the file's time is 0")
+    start: Scalar = leaf(
+        default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time of the run at which the time of the file is 0"
+    )
 
     def __call__(self, t: Scalar) -> Array:
         dtype = jnp.result_type(float)

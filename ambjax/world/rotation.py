@@ -133,7 +133,7 @@ class UnbalanceGrade:
 class Harmonic:
     """One harmonic of a runout, in m: amplitude sin(number angle + phase)."""
 
-    amplitude: Scalar = leaf(unit="m", at_least=-1.0, at_most=1.0, doc="half the peak-to-peak height")
+    amplitude: Scalar = leaf(unit="m", at_least=-1.0, at_most=1.0, doc="amplitude, half of the peak-to-peak value")
     number: Scalar = leaf(default=1.0, at_least=1, at_most=1000, whole=True, doc="waves in one turn")
     phase: Scalar = _phase()
 

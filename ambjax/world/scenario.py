@@ -29,8 +29,8 @@ POLE = 0.99
 class Initial:
     """State of the plant at t = 0."""
 
-    z: Scalar = leaf(default=0.0, unit="m", at_least=-1.0, at_most=1.0, doc="displacement; within the clearance")
-    z_dot: Scalar = leaf(default=0.0, unit="m/s", at_least=-1e6, at_most=1e6, doc="its rate")
+    z: Scalar = leaf(default=0.0, unit="m", at_least=-1.0, at_most=1.0, doc="displacement, within the clearance")
+    z_dot: Scalar = leaf(default=0.0, unit="m/s", at_least=-1e6, at_most=1e6, doc="velocity")
     i: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="current deviation")
 
     def measurement(self) -> Measurement:
@@ -46,26 +46,31 @@ class Scenario:
     reference: Signal = part(default=Constant(), doc="position that the rotor must follow, m")
     q_z: Signal = part(default=Constant(), doc="disturbance acceleration, m/s^2")
     q_v: Signal = part(
-        default=Constant(), doc="disturbance as scaled force, A^2/m^2: adds a q_v to q_z, with the true plant's a"
+        default=Constant(), doc="disturbance as scaled force, A^2/m^2: adds a q_v to q_z, with the a of the true plant"
     )
     q_i: Signal = part(default=Constant(), doc="disturbance of the current's rate, A/s")
     q_f: Signal | None = part(
-        default=None, doc="disturbance as force, N: adds q_f / m to q_z, with the true plant's m; None: none"
+        default=None, doc="disturbance as force, N: adds q_f / m to q_z, with the m of the true plant; None: no force"
     )
     base: Signal | None = part(
         default=None,
-        doc="acceleration of the housing, m/s^2: adds -base to q_z, because z is relative to the housing; None: none",
+        doc="acceleration of the housing, m/s^2: adds -base to q_z, because z is relative to the housing; None: 0",
     )
-    sensor: Sensor | None = part(default=None, doc="errors of the sensors; None: none")
+    sensor: Sensor | None = part(default=None, doc="errors of the sensors; None: no errors")
     initial: Initial = part(default=Initial(), doc="state of the plant at t = 0")
     u_max: Scalar = leaf(
-        default=jnp.inf, unit="V", at_least=1e-9, at_most=1e12, infinite=True, doc="limit of the supply; inf: none"
+        default=jnp.inf, unit="V", at_least=1e-9, at_most=1e12, infinite=True, doc="limit of the supply; inf: no limit"
     )
     amplifier: Amplifier | CurrentAmplifier | None = part(
-        default=None, doc="between the command and the coils; None: an ideal source of the commanded voltage"
+        default=None, doc="amplifier; None: the coils receive the commanded voltage"
     )
     clearance: Scalar | None = leaf(
-        default=None, unit="m", at_least=1e-9, at_most=1.0, optional=True, doc="|z| of touch-down; none: 0.9 s_0"
+        default=None,
+        unit="m",
+        at_least=1e-9,
+        at_most=1.0,
+        optional=True,
+        doc="|z| at which the rotor touches down; none: 0.9 s_0",
     )
     stop: Stop | None = part(
         default=None, doc="the touchdown bearing at the clearance; None: a rotor that reaches the clearance is lost"

@@ -51,18 +51,20 @@ class Sensor:
     a processor. In continuous time the measurement is continuous.
     """
 
-    std: Scalar = leaf(default=0.0, unit="m", at_least=0, at_most=1.0, doc="standard deviation on z")
-    std_z_dot: Scalar = leaf(default=0.0, unit="m/s", at_least=0, at_most=1e6, doc="standard deviation on z_dot")
-    std_i: Scalar = leaf(default=0.0, unit="A", at_least=0, at_most=1e6, doc="standard deviation on i")
-    offset: Scalar = leaf(default=0.0, unit="m", at_least=-1.0, at_most=1.0, doc="of the position sensor")
-    gain: Scalar = leaf(default=1.0, unit="1", at_least=0.01, at_most=100, doc="of the position sensor, ideally 1")
+    std: Scalar = leaf(default=0.0, unit="m", at_least=0, at_most=1.0, doc="standard deviation of the noise of z")
+    std_z_dot: Scalar = leaf(
+        default=0.0, unit="m/s", at_least=0, at_most=1e6, doc="standard deviation of the noise of z_dot"
+    )
+    std_i: Scalar = leaf(default=0.0, unit="A", at_least=0, at_most=1e6, doc="standard deviation of the noise of i")
+    offset: Scalar = leaf(default=0.0, unit="m", at_least=-1.0, at_most=1.0, doc="offset of the position sensor")
+    gain: Scalar = leaf(default=1.0, unit="1", at_least=0.01, at_most=100, doc="gain of the position sensor, ideally 1")
     bandwidth: Scalar | None = leaf(
         default=None,
         unit="Hz",
         at_least=1,
         at_most=1e9,
         optional=True,
-        doc="of the position sensor, first order; none: no lag",
+        doc="bandwidth of the position sensor, first order; none: no lag",
     )
     bits: Scalar | None = leaf(
         default=None,
@@ -70,18 +72,32 @@ class Sensor:
         at_most=32,
         whole=True,
         optional=True,
-        doc="of the converter of z and i; none: not rounded",
+        doc="resolution of the converter of z and i; none: not rounded",
     )
     range_z: Scalar | None = leaf(
-        default=None, unit="m", at_least=1e-9, at_most=1.0, optional=True, doc="ends of the converter; none: s_0"
+        default=None,
+        unit="m",
+        at_least=1e-9,
+        at_most=1.0,
+        optional=True,
+        doc="the converter reads z from -range_z to range_z; none: s_0",
     )
     range_i: Scalar | None = leaf(
-        default=None, unit="A", at_least=1e-9, at_most=1e6, optional=True, doc="ends of the converter; none: 2 i_0"
+        default=None,
+        unit="A",
+        at_least=1e-9,
+        at_most=1e6,
+        optional=True,
+        doc="the converter reads i from -range_i to range_i; none: 2 i_0",
     )
-    velocity: bool = static(default=True, doc="whether z_dot is measured; else an observer must estimate it")
-    outliers: Outliers | None = part(default=None, doc="wrong readings of the position; None: none")
-    dropouts: Dropouts | None = part(default=None, doc="lost readings of the position; None: none")
-    runout: Runout | None = part(default=None, doc="runout of the surface that the sensor reads; None: none")
+    velocity: bool = static(default=True, doc="whether z_dot is measured; if not, an observer must estimate it")
+    outliers: Outliers | None = part(default=None, doc="single wrong readings of the position; None: no such fault")
+    dropouts: Dropouts | None = part(
+        default=None, doc="intervals without a reading of the position; None: no such fault"
+    )
+    runout: Runout | None = part(
+        default=None, doc="runout of the surface that the position sensor reads; None: no runout"
+    )
 
     @property
     def faulty(self) -> bool:

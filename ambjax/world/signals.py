@@ -57,8 +57,8 @@ class Constant:
 class Step:
     """0 before `start`, `amplitude` from then on."""
 
-    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height")
-    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="when it rises")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="value after the jump")
+    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time of the jump to `amplitude`")
 
     def __call__(self, t: Scalar) -> Array:
         return jnp.where(jnp.asarray(t) >= self.start, self.amplitude, 0.0)
@@ -80,9 +80,9 @@ class Step:
 class Pulse:
     """`amplitude` in start <= t < stop, 0 elsewhere."""
 
-    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height")
-    start: Scalar = leaf(unit="s", at_least=-1e9, at_most=1e9, doc="when it rises")
-    stop: Scalar = leaf(unit="s", at_least=-1e9, at_most=1e9, doc="when it falls; later than start")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="value from `start` to `stop`")
+    start: Scalar = leaf(unit="s", at_least=-1e9, at_most=1e9, doc="time of the jump to `amplitude`")
+    stop: Scalar = leaf(unit="s", at_least=-1e9, at_most=1e9, doc="time of the jump back to 0; later than `start`")
     ordered: ClassVar = ("start", "stop")
 
     def __call__(self, t: Scalar) -> Array:
@@ -107,7 +107,7 @@ class Pulse:
 class Sine:
     """amplitude sin(2 pi frequency t + phase)."""
 
-    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="half the peak-to-peak height")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="amplitude, half of the peak-to-peak value")
     frequency: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency")
     phase: Scalar = leaf(default=0.0, unit="rad", at_least=-1e9, at_most=1e9, doc="phase at t = 0")
 
@@ -123,9 +123,9 @@ class Sine:
 class SmoothStep:
     """0 until `start`, then amplitude (10 s^3 - 15 s^4 + 6 s^5) with s = (t - start)/duration, then amplitude (C2)."""
 
-    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="height reached")
-    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="when it begins to rise")
-    duration: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="time it takes to rise")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="final value")
+    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="start of the rise")
+    duration: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="duration of the rise")
 
     def __call__(self, t: Scalar) -> Array:
         s = (jnp.asarray(t) - self.start) / self.duration
@@ -145,10 +145,10 @@ class SmoothStep:
 class Chirp:
     """A sine whose frequency changes linearly from `frequency` to `frequency_end` over `duration`, then stays."""
 
-    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="half the peak-to-peak height")
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="amplitude, half of the peak-to-peak value")
     frequency: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency at t = 0")
     frequency_end: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency from t = duration on")
-    duration: Scalar = leaf(unit="s", at_least=1e-9, at_most=1e9, doc="time of the sweep")
+    duration: Scalar = leaf(unit="s", at_least=1e-9, at_most=1e9, doc="duration of the sweep")
 
     def __call__(self, t: Scalar) -> Array:
         t = jnp.asarray(t)

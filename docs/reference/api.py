@@ -5,15 +5,15 @@ from typing import Any
 
 import ambjax
 from ambjax import ensemble, extend, linear, paper
-from reference.floors import ROOT, floors
+from reference.layers import ROOT, layers
 from reference.markdown import code, escaped, first_paragraph, table
 
 PUBLIC = {
-    "ambjax": (ambjax, "Simulate: `from ambjax import ...`."),
+    "ambjax": (ambjax, "Cases, simulation, tuning and export."),
     "ambjax.ensemble": (ensemble, "Ensembles."),
     "ambjax.linear": (linear, "Linear analysis of the loop."),
-    "ambjax.paper": (paper, "The paper's study."),
-    "ambjax.extend": (extend, "What an extension needs."),
+    "ambjax.paper": (paper, "The simulation study of the paper."),
+    "ambjax.extend": (extend, "Names for custom laws and plants."),
 }
 # Names without a docstring of their own.
 CONSTANTS = {
@@ -30,31 +30,31 @@ CONSTANTS = {
 
 def pages() -> dict[str, str]:
     """Return the page of public names and one page for each layer."""
-    floor = [(package, room) for package, order in floors().items() for room in order.split()]
-    rooms = {f"{package}.{room}": modules(package, room) for package, room in floor}
-    made = {f"api-{room}.rst": _floor(room, found) for room, found in rooms.items() if found}
+    names = [(package, layer) for package, order in layers().items() for layer in order.split()]
+    found = {f"{package}.{layer}": modules(package, layer) for package, layer in names}
+    made = {f"api-{layer}.rst": _layer(layer, files) for layer, files in found.items() if files}
     return {"api.md": _public(sorted(made))} | made
 
 
-def modules(package: str, room: str) -> list[str]:
+def modules(package: str, layer: str) -> list[str]:
     """Return the dotted names of the modules of a layer, the layer first; none for a package's own files."""
-    path = ROOT / package / room
-    if room.startswith("_"):
+    path = ROOT / package / layer
+    if layer.startswith("_"):
         return []
     if not path.is_dir():
-        return [f"{package}.{room}"]
+        return [f"{package}.{layer}"]
     files = sorted(file.relative_to(path).with_suffix("") for file in path.rglob("*.py") if file.stem != "__init__")
     folders = {file.parent for file in files if file.parent.parts}
     inner = [".".join(name.parts) for name in sorted([*files, *folders])]
-    return [f"{package}.{room}", *(f"{package}.{room}.{name}" for name in inner)]
+    return [f"{package}.{layer}", *(f"{package}.{layer}.{name}" for name in inner)]
 
 
-def _public(floor_pages: list[str]) -> str:
+def _public(layer_pages: list[str]) -> str:
     lines = [
         "# Python API",
         "",
-        "Shapes are those of one member: `vmap` and `ambjax.ensemble.run_ensemble` add the axis of members. "
-        "Units are SI and stand with each name.",
+        "Shapes are those of one member; `vmap` and `ambjax.ensemble.run_ensemble` add the axis of members. All units "
+        "are SI.",
         "",
     ]
     for name, (module, words) in PUBLIC.items():
@@ -63,9 +63,9 @@ def _public(floor_pages: list[str]) -> str:
             for one in module.__all__
             if not one.startswith("_")
         ]
-        lines += [f"## `{name}`", "", words, "", *table(("name", "what it is"), rows, "keys")]
-    lines += ["## Floor by floor", "", "```{toctree}", ":maxdepth: 1", ""]
-    return "\n".join([*lines, *(page.removesuffix(".rst") for page in floor_pages), "```", ""])
+        lines += [f"## `{name}`", "", words, "", *table(("name", "meaning"), rows, "keys")]
+    lines += ["## Modules by layer", "", "```{toctree}", ":maxdepth: 1", ""]
+    return "\n".join([*lines, *(page.removesuffix(".rst") for page in layer_pages), "```", ""])
 
 
 def _link(thing: Any, name: str) -> str:
@@ -86,9 +86,9 @@ def _says(thing: Any, name: str) -> str:
     return f"{CONSTANTS[name]}: {shown}" if shown else CONSTANTS[name]
 
 
-def _floor(room: str, found: list[str]) -> str:
-    lines = [room, "=" * len(room), ""]
+def _layer(layer: str, found: list[str]) -> str:
+    lines = [layer, "=" * len(layer), ""]
     for module in found:
-        head = [] if module == room else [module, "-" * len(module), ""]
+        head = [] if module == layer else [module, "-" * len(module), ""]
         lines += [*head, f".. automodule:: {module}", ""]
     return "\n".join(lines)

@@ -2,7 +2,7 @@
 
 import sys
 
-from reference.floors import ROOT
+from reference.layers import ROOT
 
 FOLDER = ROOT / "benchmarks"
 # Paths of the pictures, relative to benchmarks/README.md and to the generated page.

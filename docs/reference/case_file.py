@@ -40,44 +40,48 @@ SETTINGS: dict[str, dataclasses.Field] = {
     "run.stop_stiffness": STOP["stiffness"],
     "run.stop_damping": STOP["damping"],
 }
-# What a table is for, and what stands if it is left out.
+# Meaning of each table, and its default.
 WORDS = {
-    "plant": "The true plant. Left out, or a key of it: Table 1 of the paper.",
-    "plant.iron": "Saturation, leakage and eddy currents of the magnets. Left out: ideal iron. See "
+    "plant": "The true plant. A key that is left out has its value in Table 1 of the paper.",
+    "plant.iron": "Saturation, leakage and eddy currents of the magnets. Default: ideal iron. See "
     "[the magnet](../magnet.md#iron).",
-    "controller": "The cascade: a nominal plant and one law per stage. Kinds and gains: [laws](laws.md), or a "
-    "[custom law](../own-laws.md). A table in the place of a gain is its [schedule](../schedules.md).",
+    "controller": "The cascade: a nominal plant and one law per stage. [Laws](laws.md) lists kinds and gains; a law "
+    "may also be a [custom law](../own-laws.md). A table instead of the number of a gain is a "
+    "[schedule](../schedules.md).",
     "controller.position.file": "path of an .npz or .mat file with the arrays A, B, C, D and dt (s; 0: continuous), "
     "relative to the folder of the case file",
-    "controller.position.output": "what the controller's output is: a current, A, or a voltage, V",
+    "controller.position.output": "quantity that the controller returns: a current (A) or a voltage (V)",
     "controller.model": "Parameters of the controller's model that differ from the plant: any key of `[plant]`.",
-    "processor": "What the cascade runs on: one step of all laws a sample, its voltage held and late. Left out: "
-    "continuous time, as in the paper. See [the processor](../processor.md).",
-    "processor.guard": "Limits of the readings: one beyond them is refused and predicted. A key left out is derived "
-    "from the case; `guard = false` in `[processor]`: none. See [the guard](../processor.md#the-guard).",
-    "reference": "What z is to follow, in m. Left out: 0. See [signals](signals.md).",
-    "disturbance": "What disturbs the loop: a signal each, or a list of signals (`[[disturbance.q_z]]`) that add, and "
-    "their unit. `q_z` acts on the rotor, `q_i` on the current; `base` is the acceleration of the housing. Left out: "
-    "none. See [loads](../loads.md) and [signals](signals.md).",
-    "sensor": "What is measured; noise is drawn once per sample period and held. Left out: everything, without error.",
-    "sensor.outliers": "Single readings of the position that are far off. See [faults](../sensors.md#faults).",
-    "sensor.dropouts": "Stretches without a reading of the position. See [faults](../sensors.md#faults).",
+    "processor": "The processor of the controller: all laws make one step per sample. Their voltage acts after "
+    "a delay and is held for one sample. Default: continuous time, as in the paper. See "
+    "[the processor](../processor.md).",
+    "processor.guard": "Limits of the readings. A reading beyond its limit is replaced by a prediction. A limit that "
+    "is left out is derived from the case. `guard = false` in `[processor]` accepts every reading. See "
+    "[the guard](../processor.md#the-guard).",
+    "reference": "The position that z must follow, in m. Default: 0. See [signals](signals.md).",
+    "disturbance": "The disturbances. Each is a signal, or a list of signals (`[[disturbance.q_z]]`), which are added. "
+    "`q_z` acts on the rotor, `q_i` on the current; `base` is the acceleration of the housing. Default: none. See "
+    "[loads](../loads.md) and [signals](signals.md).",
+    "sensor": "Errors of the sensors. The noise is drawn once per sample period and held. Default: z, z_dot and i are "
+    "measured without error.",
+    "sensor.outliers": "Single wrong readings of the position. See [faults](../sensors.md#faults).",
+    "sensor.dropouts": "Intervals without a reading of the position. See [faults](../sensors.md#faults).",
     "sensor.runout": "Runout of the surface that the position sensor reads. See [runout](../loads.md#runout).",
-    "actuator": "The supply and, on a processor, its amplifier. Left out: ideal.",
-    "initial": "The plant's state at t = 0. Left out: at rest, in the middle.",
-    "clock": "Time: how long, how often a row is recorded and noise drawn, and how it is integrated between.",
-    "run": "What belongs to a run and to no part of it.",
+    "actuator": "The supply and the amplifier. Default: both are ideal.",
+    "initial": "State of the plant at t = 0. Default: at rest at z = 0.",
+    "clock": "Duration, sample period and integrator.",
+    "run": "Seed, settling time, and clearance with its stop.",
     "sensitivity": "Frequency range and zones of `ambjax sensitivity`. See [sensitivity](../sensitivity.md).",
-    "spread": "What varies from member to member of an ensemble. See [spreads](spread.md).",
-    "tune": "What `ambjax tune` is to do; the other commands pass it by.",
-    "tune.weights": "What counts, as weights of dimensionless terms.",
-    "tune.limits": "What must not be exceeded, as judged by the held-out members. See [limits](../limits.md).",
+    "spread": "The numbers that vary between the members of an ensemble. See [spreads](spread.md).",
+    "tune": "Settings of `ambjax tune`. The other commands ignore this table. See [tuning](../tuning.md).",
+    "tune.weights": "Weights of the terms of the loss, which are dimensionless.",
+    "tune.limits": "Limits that the held-out members must meet. See [limits](../limits.md).",
 }
-# Meaning of the keys of signals that are no fields of a record.
+# Meaning of the keys of signals that are not fields of a record.
 KEYS = {
     "file": "path, relative to the case file",
-    "columns": "names of the columns of time and value; left out: the two that the file has",
-    "interpolation": "straight lines between the values, or each value until the next time",
+    "columns": "names of the columns of time and value; left out: the two columns of the file",
+    "interpolation": "linear between the values, or each value held until the next time",
 }
 LEFT_OUT = re.compile(r"[(;]? ?left out: (?P<default>[^;)]*)\)?")
 CHOICE = re.compile(r"one of '(?P<default>[^']*)'")
@@ -94,23 +98,23 @@ def rows_of(path: str, record: type | None = None, beside: dict[str, Any] | None
     known = {field.name: field for field in dataclasses.fields(record)} if record else {}
     order = list(remarks())
     paths = [f"{path}.{key}" for key in keys(path, beside)]
-    if not record:  # in the order of the template, for some meanings build on others
+    if not record:  # in the order of the template, because some meanings refer to earlier ones
         paths.sort(key=lambda one: next((n for n, known in enumerate(order) if f"{known}.".startswith(f"{one}.")), -1))
     return [_row(one, known.get(one.rpartition(".")[2]), beside) for one in paths]
 
 
 def _row(path: str, field: dataclasses.Field | None, beside: dict[str, Any] | None) -> Facts:
-    key, told = path.rpartition(".")[2], _told(path)
+    key, described = path.rpartition(".")[2], _described(path)
     field = field or SETTINGS.get(path)
     allowed = _allowed(path, beside)
     if field is not None and field.metadata.get("leaf"):
         row = facts(field)._replace(name=key)
-        known = path in SETTINGS and told.default
-        if (row.default == "" and told.default == "") or (field.default is dataclasses.MISSING and not known):
+        known = path in SETTINGS and described.default
+        if (row.default == "" and described.default == "") or (field.default is dataclasses.MISSING and not known):
             return row._replace(default="none" if field.metadata["optional"] else "required")
-        return row._replace(default=told.default if known else row.default)
+        return row._replace(default=described.default if known else row.default)
     first = CHOICE.search(allowed)
-    return told._replace(name=key, allowed=allowed, default=first["default"] if first else told.default)
+    return described._replace(name=key, allowed=allowed, default=first["default"] if first else described.default)
 
 
 def _allowed(path: str, beside: dict[str, Any] | None) -> str:
@@ -122,7 +126,7 @@ def _allowed(path: str, beside: dict[str, Any] | None) -> str:
     return rule(path, beside)
 
 
-def _told(path: str) -> Facts:
+def _described(path: str) -> Facts:
     """Return unit, default and meaning of a key from the template."""
     known = remarks()
     below = next((one for one in known if one.startswith(f"{path}.")), path)
@@ -149,8 +153,9 @@ def _case_file() -> str:
     lines = [
         "# The case file",
         "",
-        "TOML, in SI units. An unknown key, a wrong type or a number out of range is refused in one line. "
-        "`ambjax template` prints a file with all of it. Of words, the first is the default.",
+        "A case file is TOML, in SI units. An unknown key, a wrong type or a number out of range gives an error "
+        "message of one line. `ambjax template` prints a file with all keys. If a key allows several words, the first "
+        "is the default.",
         "",
     ]
     for name in [*TABLES, *OTHERS]:
@@ -176,7 +181,7 @@ def _units() -> list[str]:
         (code(f"disturbance.{name}"), escaped(rule(f"disturbance.{name}.unit", {"kind": "constant"})))
         for name in keys("disturbance")
     ]
-    return table(("table", "its key `unit`; the first is the default"), rows, "keys")
+    return table(("table", "allowed values of its key `unit`; the first is the default"), rows, "keys")
 
 
 def _laws() -> str:
@@ -196,8 +201,9 @@ def _signals() -> str:
     lines = [
         "# Signals",
         "",
-        "Functions of time: for `[reference]` (m) and the tables of `[disturbance]`. An amplitude, a value "
-        "or a standard deviation is in the unit of what the signal is for. See [loads](../loads.md).",
+        "A signal is a function of time. `[reference]` (in m) and the tables of `[disturbance]` contain signals. An "
+        "amplitude, a value or a standard deviation has the unit of the reference or of the disturbance. See "
+        "[loads](../loads.md).",
         "",
     ]
     for kind, signal in SIGNALS.items():
@@ -211,11 +217,12 @@ def _spread() -> str:
     lines = [
         "# Spreads",
         "",
-        "`[spread]` says what varies from member to member: `path = { how }`. Where members stand is the `design`: "
+        "A line `PATH = DISTRIBUTION` in `[spread]` gives a number of the case a distribution over the members of an "
+        "ensemble. The key `design` selects the design of experiments, the first being the default: "
         + escaped(rule("spread.design"))
         + ".",
         "",
-        "## How a number varies",
+        "## Distributions",
         "",
     ]
     rows = []
@@ -223,9 +230,9 @@ def _spread() -> str:
         made = _example(kind, make)
         shapes = [dataclasses.replace(made, shape=shape) for shape in SHAPES] if hasattr(made, "shape") else [made]
         rows += [(code(str(one)), escaped(first_paragraph(type(one)))) for one in shapes]
-    lines += table(("form", "meaning"), rows, "keys")
+    lines += table(("distribution", "meaning"), rows, "keys")
     case = case_from(tomllib.loads(template("tracking")))
-    lines += ["## What may vary", "", "In the case that `ambjax template` prints, and likewise in any other:", ""]
+    lines += ["## Paths", "", "These numbers of the case that `ambjax template` prints can vary:", ""]
     lines += [f"- {code(path)}" for path in places(case.cascade, case.scenario)]
     return "\n".join([*lines, ""])
 

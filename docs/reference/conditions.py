@@ -12,16 +12,16 @@ def pages() -> dict[str, str]:
     found = report()
     lines = ["# Conditions of `ambjax check`", ""]
     lines += paragraphs(conditions)
-    lines += ["## The conditions", "", "Margin: left side minus right side, in this unit, at its worst time.", ""]
+    lines += ["## The conditions", "", "The margin is the left side minus the right side, at the worst time.", ""]
     rows = [
         (escaped(c.name), escaped(c.requires), escaped(c.unit), code(c.path), escaped(c.note)) for c in found.conditions
     ]
-    lines += table(("condition", "must hold", "unit", "gain", "note"), rows, "keys")
-    lines += ["## The steps of the proof", "", "Residuals: they inform, and decide nothing.", ""]
+    lines += table(("condition", "inequality", "unit", "gain", "note"), rows, "keys")
+    lines += ["## The steps of the proof", "", "These residuals do not affect the verdict.", ""]
     steps = [(escaped(c.name), escaped(c.requires), escaped(c.unit), escaped(c.note)) for c in found.proof]
-    lines += table(("step", "statement", "unit", "what is shown"), steps, "keys")
+    lines += table(("step", "statement", "unit", "number shown"), steps, "keys")
     lines += ["## On a processor", "", *paragraphs(sampled_report)]
-    lines += ["What it decides, and how to read it: [the processor](../processor.md).", ""]
+    lines += ["[The processor](../processor.md#checking-it) explains the output.", ""]
     return {"conditions.md": "\n".join(lines)}
 
 

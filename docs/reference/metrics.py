@@ -8,13 +8,13 @@ from ambjax.simulation.trajectory import NOT_SAVED, Row
 from reference.fields import attribute_docs
 from reference.markdown import code, escaped, table
 
-# How a fold makes one number of a signal.
+# The number that a fold computes from a signal.
 FOLDS = {
-    Peak: "largest size",
+    Peak: "largest absolute value",
     Rms: "root mean square over the samples",
-    Reaching: "start of the sample in which it first comes within its band",
+    Reaching: "start of the first sample in which the signal is within its band",
     Variation: "total variation",
-    Count: "number of samples for which it holds",
+    Count: "number of samples",
     Driven: "mean over time, while the drive is on",
 }
 MEANINGS = {
@@ -23,18 +23,20 @@ MEANINGS = {
     "u_squared": "voltage u",
     "heat": "copper loss in both coils",
     "u_mean": "voltage u, averaged over each sample",
+    "u_peak": "voltage at the coils, also between samples",
+    "refused": "reading refused by the guard",
 }
-# What is not a fold of a signal.
+# Metrics that are not folds of a signal.
 OTHERS = {
-    "force_used": "largest magnetic force as a share of that at z = 0 with |i| = i_0 or `actuator.i_max`; the rest is "
-    "the reserve",
-    "lost": "whether the rotor was lost: touched down, or left the range in which the model is valid",
-    "stalled": "whether the integrator could not meet its tolerance, so that nothing is decided",
-    "lost_at_s": "when either happened; null: never",
-    "singular_at_s": "when (z, i_ref) first crossed the singular curve C, Eq. (9); null: never",
-    "lost_why": "why it ended, in words; empty if it did not",
+    "force_used": "largest magnetic force, divided by the largest that the magnets can exert at z = 0 (with |i| = i_0 "
+    "or `actuator.i_max`)",
+    "lost": "whether the rotor was lost: it touched down, or a state left the range in which the model is valid",
+    "stalled": "whether the integrator stalled, so that it is not known whether the rotor is held",
+    "lost_at_s": "time at which the rotor was lost or the integrator stalled; null: never",
+    "singular_at_s": "time at which (z, i_ref) first crossed the singular curve C, Eq. (9); null: never",
+    "lost_why": "reason why the run ended early, in words; empty if it did not",
     "method": "the integrator and its step",
-    "settle_s": 'when "settled" begins: `run.settle`',
+    "settle_s": "start of the evaluation of the settled metrics: `run.settle`",
     "trajectory_deviation": "with --member: largest relative difference between the ensemble's metrics and those of "
     "trajectory.npz",
 }
@@ -47,15 +49,15 @@ SHARE = {
 def pages() -> dict[str, str]:
     """Return the page."""
     lines = ["# Metrics and arrays", "", "## `metrics.json`", ""]
-    lines += ["Written by `ambjax simulate`; of each member by `ambjax ensemble`.", ""]
     lines += [
-        "Errors count every sample, a lost rotor's too, frozen where it was lost. Under held noise u, i, e and "
-        "v_tilde jump at the samples: so extremes are taken over the integrator's substeps, and voltage and heat over "
-        "time.",
+        "`ambjax simulate` writes the metrics of a run, `ambjax ensemble` those of every member (`members.npz`). "
+        "Errors are evaluated at every sample. A lost rotor is frozen, and its error counts until the end. Under held "
+        "noise, u, i, e and v_tilde jump at the samples. Their extremes are therefore taken over the substeps of the "
+        "integrator; voltage and copper loss are averaged over time.",
         "",
     ]
     lines += table(("metric", "unit", "meaning"), rows(), "keys")
-    lines += ["## `trajectory.npz`", "", "One number per recorded sample in each array, float64, SI units.", ""]
+    lines += ["## `trajectory.npz`", "", "Each array has one number per sample, float64, in SI units.", ""]
     lines += table(("array", "meaning"), [(code(k), escaped(v)) for k, v in arrays().items()], "keys")
     return {"metrics.md": "\n".join(lines)}
 
@@ -70,17 +72,17 @@ def rows() -> list[tuple[str, str, str]]:
 def _meaning(name: str, fold: Any) -> str:
     of = getattr(fold, "of", "u_mean")
     signal = SHARE.get(name) or MEANINGS.get(of) or attribute_docs(Row)[of].rpartition(", ")[0]
-    how = f"root of the {FOLDS[type(fold)]}, of the square" if getattr(fold, "root", False) else FOLDS[type(fold)]
+    how = "root mean square over time, while the drive is on" if getattr(fold, "root", False) else FOLDS[type(fold)]
     how += ", while the drive is on" * getattr(fold, "driven", False)
-    return f"{how}: {signal}{', from `run.settle` on' if getattr(fold, 'after', 0.0) else ''}"
+    return f"{signal}: {how}{', from `run.settle` on' if getattr(fold, 'after', 0.0) else ''}"
 
 
 def arrays() -> dict[str, str]:
     """Return the meaning of each array of trajectory.npz."""
-    told = {name: text for name, text in attribute_docs(Row).items() if name not in NOT_SAVED}
+    signals = {name: text for name, text in attribute_docs(Row).items() if name not in NOT_SAVED}
     status = {
-        "lost_at": "when the rotor was lost, s; inf: never. One number",
-        "lost_why": "why, in words; empty if it was not",
-        "singular_at": "when (z, i_ref) first crossed C, s; inf: never. One number",
+        "lost_at": "one number: time at which the rotor was lost, s; inf: never",
+        "lost_why": "one text: the reason; empty if the rotor was not lost",
+        "singular_at": "one number: time at which (z, i_ref) first crossed C, s; inf: never",
     }
-    return told | status
+    return signals | status

@@ -9,12 +9,12 @@ import sys
 if __name__ == "__main__":
     sys.path[:0] = [str(pathlib.Path(__file__).parent.parent)]
 
-from reference import api, benchmarks, case_file, commands, conditions, floors, metrics
+from reference import api, benchmarks, case_file, commands, conditions, layers, metrics
 
 FOLDER = pathlib.Path(__file__).parent.parent / "generated"
 # Writers of the committed tables, and of the other pages.
 COMMITTED = (case_file, commands, metrics, conditions, benchmarks)
-OTHERS = (api, floors)
+OTHERS = (api, layers)
 
 
 def tables() -> dict[str, str]:

@@ -101,7 +101,7 @@ def fixed(trace: Trace) -> list[str]:
     unit = trace.block.outputs["u"][0]
     u_max, delay = parameters["limits.u_max"].value, parameters["processor.delay"].allowed
     lines = [
-        f"Fixed at export: T = {trace.block.period:g} s, the laws, which signs have no layer, and whether the",
+        f"Fixed at export: T = {trace.block.period:g} s, the laws, which signs are set-valued, and whether the",
         "delay is predicted. Export again to change one of these. Any value in params may change between two steps.",
         f"params->limits.u_max: u is {'not limited' if np.isinf(u_max) else f'limited to +-{u_max:g} {unit}'}.",
     ]

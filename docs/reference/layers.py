@@ -11,25 +11,25 @@ ROOT = pathlib.Path(__file__).parents[2]
 def pages() -> dict[str, str]:
     """Return the list that the architecture page includes."""
     lines: list[str] = []
-    for package, order in floors().items():
-        for room in reversed(order.split()):
-            if room.startswith("__"):
+    for package, order in layers().items():
+        for layer in reversed(order.split()):
+            if layer.startswith("__"):
                 continue
-            lines += _room(ROOT / package / room)
-    return {"floors.txt": "\n".join(lines)}
+            lines += _entry(ROOT / package / layer)
+    return {"layers.txt": "\n".join(lines)}
 
 
-def floors() -> dict[str, str]:
+def layers() -> dict[str, str]:
     """Return the table of tests/test_layers.py, from the bottom up, with `tuning` first."""
     tree = ast.parse((ROOT / "tests" / "test_layers.py").read_text())
     for node in tree.body:
-        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "FLOORS":
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "LAYERS":
             table = ast.literal_eval(node.value)
             return {name: table[name] for name in reversed(table)}
-    raise LookupError("tests/test_layers.py has no table FLOORS")
+    raise LookupError("tests/test_layers.py has no table LAYERS")
 
 
-def _room(path: pathlib.Path) -> list[str]:
+def _entry(path: pathlib.Path) -> list[str]:
     if not path.is_dir():
         return [f"**{code(_shown(path.with_suffix('.py')))}**", f": {_says(path.with_suffix('.py'))}", ""]
     files = [file for file in sorted(path.rglob("*.py")) if file.name != "__init__.py"]
