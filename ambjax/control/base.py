@@ -37,10 +37,10 @@ class Law:
       structure of the state.
     - `own_steps`: the discretisations, "implicit" or "explicit", for which a processor calls the method `step`. For the
       others it makes an explicit Euler step. The default is ("implicit",) for a class that defines `step`.
-    - `stiff`: whether the law has a state that a smoothed sign keeps inside its boundary layer, so that it changes fast; set for
-      a class that defines `layer`.
-    - `slides`: whether an inversion law has the method `slide`, which integrates across the boundary layer (`laws.Relaxation`);
-      set for a class that defines it.
+    - `stiff`: whether the law has a state that a smoothed sign keeps inside its boundary layer, so that it changes
+      fast; set for a class that defines `layer`.
+    - `slides`: whether an inversion law has the method `slide`, which integrates across the boundary layer
+      (`laws.Relaxation`); set for a class that defines it.
     """
 
     requirement: ClassVar[Requirement | None] = None

@@ -6,7 +6,8 @@ import re
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 # An option of the command line, such as --settings-of.
 OPTION = re.compile(r"--([a-z][a-z-]*)")
 
