@@ -143,7 +143,7 @@ LAWS = [
         "ambjax/control/regulator.py",
         "(INTEGRAL * w / error) ** 2, 1 / error**2, 0.0",
         "0.0, 1 / error**2, 0.0",
-        "tests/test_structures.py::test_the_written_gains_of_state_feedback_are_optimal_for_the_paper_s_plant",
+        "tests/test_structures.py::test_the_written_gains_of_linear_laws_are_those_designed_for_the_paper_s_plant",
     ),
     M(
         "the rotor at rest on the reference needs no current against the magnets",

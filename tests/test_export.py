@@ -411,7 +411,7 @@ def test_the_example_of_the_readme_compiles_and_reads_what_the_step_reads(tmp_pa
 def test_the_header_says_what_is_fixed_and_what_is_checked():
     header = text(cascade=CASCADES["the paper's"])["amb.h"]
     for line in (
-        "Fixed at export: T = 0.0001 s, the laws, which signs have no layer, and whether the",
+        "Fixed at export: T = 0.0001 s, the laws, which signs are set-valued, and whether the",
         "params->limits.u_max: u is limited to +-200 V.",
         "params->processor.guard: a reading is refused beyond |z| = 0.0045 m, |z_dot| = 100 m/s, |i| = 25 A, or if it",
         "18 samples in a row (0.0018 s); then u = 0.",

@@ -153,8 +153,8 @@ def planned(
     _choice("format", format, ("c", "fmu"))
     _choice("fmi", fmi, (None, 2, 3))
     _choice("precision", precision, (None, *PRECISIONS))
-    block = block_of(what, guarded_for(case), case.scenario, case.clock)
     name = _prefix(prefix, case.name)
+    block = block_of(what, guarded_for(case), case.scenario, case.clock)
     if fmi is not None and format != "fmu":
         raise ValueError(f"--fmi {fmi}: it is the version of an FMU. Omit --fmi, or set --format to fmu.")
     if precision == "float" and format == "fmu":
