@@ -46,6 +46,8 @@ exclude_patterns = ["_build", "_ext", "reference"]
 smartquotes = False
 
 html_theme = "furo"
+# Thousands of classes and functions in the navigation of every page would take half of the time of a build.
+toc_object_entries = False
 html_title = f"ambjax {release}"
 html_static_path = ["_static"]
 html_css_files = ["ambjax.css"]
