@@ -46,7 +46,7 @@ exclude_patterns = ["_build", "_ext", "reference"]
 smartquotes = False
 
 html_theme = "furo"
-# Thousands of classes and functions in the navigation of every page would take half of the time of a build.
+# Thousands of classes and functions in the navigation of every page double the time of a build without execution.
 toc_object_entries = False
 html_title = f"ambjax {release}"
 html_static_path = ["_static"]
