@@ -146,6 +146,27 @@ LAWS = [
         "tests/test_structures.py::test_the_written_gains_of_linear_laws_are_those_designed_for_the_paper_s_plant",
     ),
     M(
+        "a PID designed for a plant is slower than the plant requires",
+        "ambjax/control/pid.py",
+        "w = model.pole / 2",
+        "w = model.pole / 5",
+        "tests/test_structures.py::test_a_pid_with_default_gains_holds_the_machines_of_the_templates",
+    ),
+    M(
+        "a current loop designed for a processor ignores the sample period",
+        "ambjax/control/current.py",
+        "w = min(w, 1 / (4 * period))",
+        "w = min(w, 1 / (1e-9 * period))",
+        "tests/test_structures.py::test_the_default_current_loop_has_fifty_degrees_of_phase_margin_with_a_sample_of_delay",
+    ),
+    M(
+        "the goal is scored without its multipliers",
+        "tuning/objective/goal.py",
+        "    return goal(outcomes, x, ordinary)",
+        "    return goal.ordinary_risk(outcomes[:ordinary])",
+        "tests/test_tuning_search.py",
+    ),
+    M(
         "the rotor at rest on the reference needs no current against the magnets",
         "ambjax/control/force.py",
         "model.g - s * reference.r)",
