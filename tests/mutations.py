@@ -1882,8 +1882,8 @@ CHECK = [
     M(
         "a prediction knows every delay",
         "ambjax/ensemble/delays.py",
-        "assumed=processor.ahead)",
-        "assumed=None)",
+        "assumed = delays if known else np.full(DELAYS, float(processor.ahead))",
+        "assumed = delays",
         "tests/test_check_processor.py::test_a_delay_that_the_prediction_does_not_know_has_a_margin_of_its_own",
     ),
     M(

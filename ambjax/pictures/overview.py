@@ -6,6 +6,7 @@ import pathlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from ambjax.pictures.figures import (
     AVERAGED,
@@ -78,8 +79,10 @@ def overview_figure(
                 ax.set_ylabel("")
             if row == 0:
                 ax.set_title(words, fontsize=10, loc="left", pad=16)
-    for line in axes.T:
+    for n, line in enumerate(axes.T):
         lowest = [ax for ax in line if ax.axison][-1]
+        if window is None and n:
+            lowest.xaxis.set_major_locator(MaxNLocator(4))  # more labels than that touch each other
         lowest.tick_params(labelbottom=True)
         lowest.set_xlabel("time (s)")
     figure.align_ylabels(axes[:, 0])
