@@ -90,7 +90,7 @@ def test_a_coil_at_its_limit_keeps_its_current_while_the_rotor_moves(side, iron)
         for coil in ("i_1", "i_2"):
             expected = 0.0 if kept else float(getattr(unlimited, coil))
             assert float(getattr(rates, coil)) == pytest.approx(expected, abs=1e-11 * scale)
-    after = driven(scenario, side * 60.0, state, 40, clamped=False)
+    after = driven(scenario, side * 60.0, state, 10, clamped=False)
     assert [float(i) for i in after[2:4]] == pytest.approx([float(i) for i in state[2:4]], abs=1e-11)
     assert abs(float(after.z - state.z)) > 1e-5
 
