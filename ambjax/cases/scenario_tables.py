@@ -12,6 +12,7 @@ from ambjax.world import signals
 from ambjax.world.amplifier import Amplifier, CurrentAmplifier
 from ambjax.world.band_noise import BandNoise
 from ambjax.world.bearing import Bearing
+from ambjax.world.coil_limits import CoilLimits
 from ambjax.world.faults import VALUES, Dropouts, Outliers
 from ambjax.world.ramps import Ramp, Trapezoid
 from ambjax.world.recorded import Recorded
@@ -135,7 +136,15 @@ def _amplifier(actuator: Table) -> Amplifier | CurrentAmplifier | None:
             "amplifier's current loop, Hz: bandwidth = 1e3, for example."
         )
     given = any(name in actuator.raw for name in names)
-    return actuator.record(kind, extra=("mode", "u_max")) if given else None
+    if not given:
+        return None
+    amplifier = actuator.record(kind, extra=("mode", "u_max", "coil"))
+    return dataclasses.replace(amplifier, coil=_coil(actuator.table("coil"))) if "coil" in actuator.raw else amplifier
+
+
+def _coil(table: Table) -> CoilLimits:
+    limits, one_way = table.record(CoilLimits, extra=("unidirectional",)), table.switch("unidirectional")
+    return dataclasses.replace(limits, unidirectional=one_way is True)
 
 
 def _sensor(table: Table) -> Sensor:
@@ -195,8 +204,9 @@ def _seed(run: Table) -> int:
 def check_start(scenario: Scenario) -> None:
     """Raise ValueError unless the rotor starts within its clearance, and the clearance within the gap.
 
-    With a stop it may start on the stop, short of the pole.
+    With a stop it may start on the stop, short of the pole. Limits of the coils must contain their currents.
     """
+    _check_coils(scenario)
     gap, stop, z = scenario.plant.s_0, scenario.touchdown, scenario.initial.z
     if not stop < gap:
         raise ValueError(f"run.clearance = {stop:g} m: it must be less than the gap plant.s_0 = {gap:g} m.")
@@ -213,4 +223,27 @@ def check_start(scenario: Scenario) -> None:
         raise ValueError(
             f"initial.z = {z:g} m: the rotor would touch its stop at the start; |z| must be less than {stop:g} m "
             "(run.clearance, by default 0.9 of plant.s_0)."
+        )
+
+
+def _check_coils(scenario: Scenario) -> None:
+    """Raise ValueError unless the limits of a coil contain its bias and its current at the start."""
+    coil = None if scenario.amplifier is None else scenario.amplifier.coil
+    if coil is None:
+        return
+    i_0, bias, i = scenario.plant.i_0, scenario.plant.R * scenario.plant.i_0, scenario.initial.i
+    if coil.i_max is not None and not coil.i_max > i_0:
+        raise ValueError(
+            f"actuator.coil.i_max = {coil.i_max:g} A: it must be more than the bias current of each coil, "
+            f"plant.i_0 = {i_0:g} A."
+        )
+    if coil.u_max is not None and not coil.u_max > bias:
+        raise ValueError(
+            f"actuator.coil.u_max = {coil.u_max:g} V: it must be more than the {bias:g} V of the bias current, R i_0."
+        )
+    most = min(math.inf if coil.i_max is None else coil.i_max - i_0, i_0 if coil.unidirectional else math.inf)
+    if abs(i) > most:
+        raise ValueError(
+            f"initial.i = {i:g} A: the current of a coil, i_0 + i or i_0 - i, would be outside actuator.coil; |i| "
+            f"must be at most {most:g} A."
         )

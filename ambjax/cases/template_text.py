@@ -92,6 +92,11 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # slew = 1e7                  # V/s; largest rate of its voltage (left out: no limit)
 # dead_band = 0.5             # V; subtracted from the absolute value of its voltage (left out: none)
 # i_max = 1.0                 # A; above it, the voltage does not increase |i| (left out: no limit)
+#
+# [actuator.coil]             # limits of each coil, for plant.kind = "two-coil" and [processor] (left out: none)
+# u_max = 200.0               # V; limit of the |voltage| of a coil, which contains R i_0 (left out: no limit)
+# i_max = 0.5                 # A; above it, the voltage does not increase the current of a coil (left out: no limit)
+# unidirectional = true       # the current of a coil cannot become negative (left out: false)
 
 # [sensitivity]               # range and zones of 'ambjax sensitivity' (ISO 14839, from secondary sources)
 # f_low = 1.0                 # Hz; lowest frequency; 0 is always included

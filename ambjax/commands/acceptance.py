@@ -3,11 +3,14 @@
 import math
 from typing import NamedTuple
 
+import jax.numpy as jnp
+
 from ambjax.cases.reader import Case
 from ambjax.commands.outputs import table
 from ambjax.control.base import hard_signs
 from ambjax.control.cascade import USUAL
 from ambjax.linear import Analysis, analyse, linearise
+from ambjax.world.coil_limits import difference
 
 
 class Fact(NamedTuple):
@@ -30,12 +33,11 @@ class Forces(NamedTuple):
 def forces(case: Case) -> Forces:
     """Return the forces of a case, for the plant without [spread].
 
-    The largest force is that at z = 0 with the current i_0, at which one magnet is off, or with the amplifier's limit
-    if that is smaller. The load is the sum of the bounds of all signals that disturb z.
+    The largest force is that at z = 0 with the current i_0, at which one magnet is off, or with the limit of the
+    amplifier or of a coil if that is smaller. The load is the sum of the bounds of all signals that disturb z.
     """
-    scenario, plant, amplifier = case.scenario, case.scenario.plant, case.scenario.amplifier
-    m = float(plant.m)
-    largest = float(plant.largest_force(None if amplifier is None else amplifier.i_max))
+    scenario, plant = case.scenario, case.scenario.plant
+    m, largest = float(plant.m), float(scenario.largest_force)
     factors = {"q_z": m, "q_v": m * float(plant.a), "q_f": 1.0, "base": m}
     signals = {slot: signal for slot in factors if (signal := getattr(scenario, slot)) is not None}
     ends = {slot: signal.span(float(case.clock.duration)) for slot, signal in signals.items()}
@@ -85,9 +87,8 @@ def machine(case: Case) -> list[Fact]:
     """Return the numbers of the plant, its supply and its converters."""
     plant, sensor = case.scenario.plant, case.scenario.sensor
     (force, weight, load), period = forces(case), float(case.clock.sample_period)
-    u_max, slew, step = float(case.scenario.u_max), None, None
-    if math.isfinite(u_max):
-        slew = u_max / float(plant.L)
+    (u_max, reserve), step = _voltages(case), None
+    slew = None if u_max is None else u_max / float(plant.L)
     if sensor is not None and sensor.bits is not None:
         step = 2 * float(sensor.ends(plant.s_0)) / 2 ** float(sensor.bits)
     std = None if sensor is None else float(sensor.std)
@@ -102,6 +103,7 @@ def machine(case: Case) -> list[Fact]:
         ),
         Fact("bias_flux_T", "bias flux density", bias_flux(case), "T"),
         Fact("current_slew_A_per_s", "slew rate of the current, u_max/L", slew, "A/s"),
+        Fact("coil_voltage_reserve_V", "voltage of a coil above the bias, coil.u_max - R i_0", reserve, "V"),
         Fact("converter_step_m", "converter step of z", step, "m"),
         Fact(
             "step_per_noise",
@@ -110,6 +112,21 @@ def machine(case: Case) -> list[Fact]:
             "1",
         ),
     ]
+
+
+def _voltages(case: Case) -> tuple[float | None, float | None]:
+    """Return the largest u at the bias, and the voltage of a coil above the bias, V; None: no limit.
+
+    The largest u is half the difference of the voltages of the coils, each within its limit, for a command of u_max.
+    """
+    scenario, bias = case.scenario, case.scenario.plant.R * case.scenario.plant.i_0
+    coil = None if scenario.amplifier is None else scenario.amplifier.coil
+    u_max, reserve = float(scenario.u_max), math.inf
+    if coil is not None:
+        u_max = float(difference(coil.supplied(jnp.asarray(u_max), bias)))
+        reserve = float(coil.reserve(bias))
+    most, beyond = (x if math.isfinite(x) else None for x in (u_max, reserve))
+    return most, beyond
 
 
 def _facts_table(facts: list[Fact]) -> str:

@@ -12,6 +12,7 @@ from ambjax.cases.reader import Case, read_case
 from ambjax.commands.outputs import say
 from ambjax.commands.plausibility import implausible
 from ambjax.host.words import one_line
+from ambjax.world.scenario import Scenario
 
 # Plausible ranges of gap (m), pole area (m^2) and permeability (N/A^2); the paper's values are 5e-3, 0.121, 1.25e-6.
 GAPS, AREAS, PERMEABILITIES = (2e-5, 2e-2), (1e-6, 1.0), (6e-7, 2.5e-6)
@@ -120,6 +121,27 @@ def _currents(case: Case) -> Iterator[str]:
     if plant.R * abs(weight) > scenario.u_max:
         least = plant.R * abs(weight)
         yield f"actuator.u_max = {scenario.u_max:g} V is less than the {least:.4g} V that hold the rotor at z = 0."
+    yield from _coil_voltage(scenario, float(plant.R * abs(weight)))
+
+
+def _coil_voltage(scenario: Scenario, least: float) -> Iterator[str]:
+    """Yield a warning for a limit of a coil's voltage below what holds the rotor, `least` in V, or of no use."""
+    coil = None if scenario.amplifier is None else scenario.amplifier.coil
+    if coil is None or coil.u_max is None:
+        return
+    bias = float(scenario.plant.R * scenario.plant.i_0)
+    if least > (reserve := float(coil.reserve(bias))):
+        yield (
+            f"actuator.coil.u_max = {coil.u_max:g} V leaves {reserve:.4g} V above the bias, less than the {least:.4g} "
+            "V that hold the rotor at z = 0."
+        )
+    if scenario.u_max > coil.u_max + bias:
+        given = "is left out" if math.isinf(scenario.u_max) else f"= {scenario.u_max:g} V"
+        yield (
+            f"actuator.u_max {given}: the controller commands up to this voltage, but beyond {coil.u_max + bias:.4g} V "
+            f"both coils are at actuator.coil.u_max. Set u_max to {reserve:.4g} V, at which the first coil is at its "
+            "limit."
+        )
 
 
 def _motion(case: Case) -> Iterator[str]:

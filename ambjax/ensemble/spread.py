@@ -7,7 +7,7 @@ rotor that starts outside its clearance.
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
@@ -202,3 +202,18 @@ def _check_together(
     if not far < limit:
         text = f"|initial.z| reaches {far:g} m, but must stay below {what}, {limit:g} m. Narrow the range."
         refuse(("initial.z", "run.clearance", gap), text)
+    if "actuator.coil.i_max" in known:
+        _check_coils(reach, refuse)
+
+
+def _check_coils(reach: Callable[[str], tuple[float, float]], refuse: Callable[[tuple[str, ...], str], None]) -> None:
+    """Check that the limits of each coil contain its bias. `reach`: ends of the number at a path. NaN: no limit."""
+    i_max, u_max, i_0, R = "actuator.coil.i_max", "actuator.coil.u_max", "plant.i_0", "plant.R"
+    least, most = reach(i_max)[0], reach(i_0)[1]
+    if least <= most:
+        text = f"{i_max} can be as small as {least:g} A, and {i_0} reaches {most:g} A, but must stay below it."
+        refuse((i_max, i_0), f"{text} Narrow the range.")
+    least, most = reach(u_max)[0], reach(R)[1] * reach(i_0)[1]
+    if least <= most:
+        text = f"{u_max} can be as small as {least:g} V, and R i_0 reaches {most:g} V, but must stay below it."
+        refuse((u_max, R, i_0), f"{text} Narrow the range.")

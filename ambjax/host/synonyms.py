@@ -51,6 +51,8 @@ OTHER_WORDS = {
     "bandwidth": "cutoff cutofffrequency lowpass",
     "u_max": "supply voltage umax vmax dclink limit voltagelimit supplyvoltage",
     "i_max": "currentlimit maxcurrent",
+    "coil": "coils channel halfbridge percoil",
+    "unidirectional": "oneway unipolar singlequadrant diode",
     "seed": "randomseed rng",
     "settle": "settling settlingtime",
     "clearance": "touchdown safetygap",

@@ -54,7 +54,7 @@ def ideal(scenario: Scenario) -> Scenario:
     if sensor is not None:
         sensor = dataclasses.replace(sensor.louder(0.0), bits=None, outliers=None, dropouts=None)
     if isinstance(amplifier, Amplifier):
-        amplifier = dataclasses.replace(amplifier, slew=None, dead_band=None, i_max=None)
+        amplifier = dataclasses.replace(amplifier, slew=None, dead_band=None, i_max=None, coil=None)
         amplifier = None if amplifier.bandwidth is None else amplifier
     elif amplifier is not None:
         amplifier = dataclasses.replace(amplifier, i_max=None)

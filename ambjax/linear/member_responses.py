@@ -70,7 +70,7 @@ def member_responses(
     method = None if isinstance(clock.method, Slide) else clock.method
     longer = dataclasses.replace(clock, samples=skip + periods * clock.samples, method=method)
     system, longer = prepare(*_at_rest(cascade, scenario, r), longer)
-    response = Response(_split(wave), scenario.u_max, skip)
+    response = Response(_split(wave), scenario.voltage_limit, skip)
     sums, code = map_members(_member, canonical((system, longer, response)))
     e = float(wave.size) * np.exp(1j * np.asarray(wave.phases))
     S, KS = ((x[:, 0] + 1j * x[:, 1]) / e for x in (sums.read, sums.u))

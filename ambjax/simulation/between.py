@@ -14,6 +14,7 @@ from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.loop import SHOWN, ClosedLoop, Densities, ExternalInputs, Sizes
 from ambjax.simulation.span import Instant
 from ambjax.world.amplifier import Amplifier, CurrentAmplifier
+from ambjax.world.coil_limits import difference
 from ambjax.world.sensor import Measurement
 
 Voltage = Callable[[Scalar], Array]
@@ -113,12 +114,13 @@ def _under(loop: ClosedLoop, state: object, command: Command, voltage: Voltage, 
 
     def rates(inputs: tuple[ExternalInputs, Array], x: object) -> object:
         outside, u = inputs
+        applied: Any = loop.scenario.applied(u, x, outside.q_i)
         q_z = loop.scenario.pushed(outside.q_z, plant.measurement(x))
-        return plant.rates(x, loop.scenario.coil_voltage(u, x, outside.q_i), q_z, outside.q_i)
+        return plant.rates(x, applied, q_z, outside.q_i)
 
     def observed(inputs: tuple[ExternalInputs, Array], x: object) -> tuple[object, Instant]:
         (outside, u), motion, heat = inputs, plant.measurement(x), plant.signals(x).heat
-        u = loop.scenario.coil_voltage(u, x, outside.q_i)
+        u = difference(loop.scenario.applied(u, x, outside.q_i))
         sigma = loop.cascade.sigma(motion, outside.reference)
         sizes = Sizes(motion.z, motion.z - outside.reference.r, sigma, u, motion.i, e, command.v_tilde)
         return rates(inputs, x), Instant(sizes, Densities(u, u * u, heat))

@@ -144,5 +144,5 @@ def standard_for(settle: Scalar, scenario: Scenario) -> Standard:
         usual.sigma_band * (plant.sigma_size / paper.sigma_size),
         usual.v_tilde_band * (plant.v_size / paper.v_size),
         usual.e_band * (plant.i_0 / paper.i_0),
-        plant.largest_force(None if scenario.amplifier is None else scenario.amplifier.i_max),
+        scenario.largest_force,
     )

@@ -28,11 +28,29 @@ def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> 
             f"{cascade.current.commands}. Leave out [controller.current], for a law that commands a {scenario.drive}, "
             "or change the mode."
         )
+    _check_coils(scenario)
     sensor = scenario.sensor
     if sensor is not None and not sensor.velocity and not cascade.observer.estimates_velocity:
         raise ValueError(
             "sensor.velocity = false: the velocity is not measured, and controller.observer does not estimate it. "
             'Choose one that does: kind = "kalman", for example.'
+        )
+
+
+def _check_coils(scenario: Scenario) -> None:
+    """Raise ValueError for limits of each coil with a plant that has one current, or with a limit of |i|."""
+    amplifier = scenario.amplifier
+    if amplifier is None or amplifier.coil is None:
+        return
+    if not scenario.plant.two_voltages:
+        raise ValueError(
+            f"actuator.coil: {type(scenario.plant).__name__} has one current for both coils, so a coil has no limit of "
+            'its own. Use plant.kind = "two-coil".'
+        )
+    if amplifier.i_max is not None:
+        raise ValueError(
+            "actuator.i_max: it limits half the difference of the currents, and actuator.coil limits each current. "
+            "Leave i_max out, and give actuator.coil.i_max = plant.i_0 + i_max instead."
         )
 
 

@@ -242,7 +242,7 @@ def sampling_of(cascade: Cascade, clock: Clock) -> Sampling:
 def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, rows: Any, noise: bool) -> list[Band]:
     """Return the bands of one run, from sample number `settled` on."""
     sampling, lines = sampling_of(cascade, clock), []
-    limited = _peak(rows.u[settled:]) >= float(scenario.u_max)
+    limited = _peak(rows.u[settled:]) >= float(scenario.voltage_limit)
     for stage, (signal, unit) in SIGNALS.items():
         law = getattr(cascade, stage)
         x, true = (np.asarray(getattr(part, signal))[settled:] for part in (rows.computed, rows.true))

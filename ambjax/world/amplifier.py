@@ -6,8 +6,9 @@ from typing import ClassVar, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.records import Scalar, leaf, part, record
 from ambjax.numerics.smooth import limited
+from ambjax.world.coil_limits import CoilLimits
 
 
 class CoilResponse(NamedTuple):
@@ -27,7 +28,7 @@ class Amplifier:
 
     The dead band (from the dead time of a bridge) is subtracted from |u_a|. At the current limit, a voltage that would
     increase |i| is replaced by the voltage that holds i. If the supply cannot provide that voltage, its limit acts, and
-    |i| exceeds `i_max`. The default of each parameter is ideal.
+    |i| exceeds `i_max`. The limits of each coil act last, and exclude `i_max`. The default of each parameter is ideal.
     """
 
     bandwidth: Scalar | None = leaf(
@@ -47,12 +48,17 @@ class Amplifier:
     i_max: Scalar | None = leaf(
         default=None, unit="A", at_least=1e-9, at_most=1e6, optional=True, doc="limit of |i|; none: no limit"
     )
+    coil: CoilLimits | None = part(default=None, doc="limits of each coil of a `TwoCoil`; None: no limits")
 
     mode: ClassVar[str] = "voltage"
 
     def command_limit(self, u_max: Scalar) -> Scalar:
         """Return the limit of the commanded voltage (V), that of the supply."""
         return u_max
+
+    def current_limit(self, i_0: Scalar) -> Scalar | None:
+        """Return the limit of |i| (A) for the bias current i_0 (A); None: no limit."""
+        return self.i_max if self.coil is None else self.coil.differential(i_0)
 
     @property
     def slow(self) -> bool:
@@ -115,6 +121,7 @@ class CurrentAmplifier:
     )
     mode: ClassVar[str] = "current"
     slow: ClassVar[bool] = False
+    coil: ClassVar[None] = None
 
     def slope(self) -> Scalar:
         """Return the rate w of the current, 1/s."""
@@ -123,6 +130,10 @@ class CurrentAmplifier:
     def command_limit(self, u_max: Scalar) -> Scalar:
         """Return the limit of the commanded current (A)."""
         return jnp.inf if self.i_max is None else self.i_max
+
+    def current_limit(self, i_0: Scalar) -> Scalar | None:
+        """Return the limit of |i| (A); None: no limit."""
+        return self.i_max
 
     def at_coil(self, command: Array, i: Array, u_max: Scalar, response: Callable[[], CoilResponse]) -> Array:
         """Return the voltage (V) at the coils for a commanded current (A) and a current i (A), within u_max (V).

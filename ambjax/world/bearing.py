@@ -96,6 +96,9 @@ class Bearing(Generic[S]):
     one_current: ClassVar[bool] = False
     """Whether the state is (z, z_dot, i), as in `Plant`."""
 
+    two_voltages: ClassVar[bool] = False
+    """Whether `rates` also takes the voltage of each coil, `CoilVoltages`, as in `TwoCoil`."""
+
     @property
     def delays(self) -> bool:
         """Whether the flux follows the current with a lag, so that the state contains the delayed currents."""

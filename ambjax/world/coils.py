@@ -7,6 +7,7 @@ from jax import Array
 
 from ambjax.numerics.records import Scalar, record
 from ambjax.world.bearing import Bearing, Signals
+from ambjax.world.coil_limits import CoilVoltages
 from ambjax.world.iron import Iron
 from ambjax.world.sensor import Measurement
 
@@ -33,19 +34,25 @@ class TwoCoil(Bearing[Currents]):
     u + R (i_0 - i_1); the lower coil likewise. Deviation: Eq. (2) has one current, that of the lower gap.
     """
 
+    two_voltages = True
+
     def start(self, measurement: Measurement) -> Currents:
         z, z_dot, i = measurement
         currents = self.i_0 + i, self.i_0 - i
         return Currents(z, z_dot, *currents, currents if self.delays else ())
 
-    def rates(self, state: Currents, u: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Currents:
-        """Return the rates as `Plant.rates` does; q_i (A/s) disturbs the measured current."""
+    def rates(self, state: Currents, u: Scalar | CoilVoltages, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Currents:
+        """Return the rates as `Plant.rates` does; q_i (A/s) disturbs the measured current.
+
+        `u`: one voltage for both coils, or those of `CoilVoltages`, V.
+        """
         z, z_dot, i_1, i_2, delayed = state
         gaps = self.gaps(z)
         above, below = gaps.inverses
         v = self.pull(self.fluxing(state), z, gaps)
         z_ddot = 2 * self.k_z / self.m * z + self.a * v - self.g + q_z
-        up, down = u + self.R * (self.i_0 - i_1), self.R * (self.i_0 - i_2) - u
+        upper, lower = u if isinstance(u, CoilVoltages) else (u, u)
+        up, down = upper + self.R * (self.i_0 - i_1), self.R * (self.i_0 - i_2) - lower
         if self.iron is None:
             i_1_dot = (2 / self.kappa) * gaps.upper * up - i_1 * z_dot * above + q_i
             i_2_dot = (2 / self.kappa) * gaps.lower * down + i_2 * z_dot * below - q_i

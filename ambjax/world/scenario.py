@@ -11,6 +11,7 @@ from jax import Array
 from ambjax.numerics.records import Scalar, leaf, part, record
 from ambjax.world.amplifier import Amplifier, CoilResponse, CurrentAmplifier
 from ambjax.world.bearing import Bearing
+from ambjax.world.coil_limits import CoilVoltages
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement, Sensor
 from ambjax.world.signals import Constant, Signal, edges_of, is_random, realised
@@ -112,6 +113,24 @@ class Scenario:
             return CoilResponse(still, driven - still)  # i' is linear in u
 
         return self.amplifier.at_coil(command, plant.measurement(state).i, self.u_max, response)
+
+    def applied(self, u: Array, state: Any, q_i: Scalar = 0.0) -> Array | CoilVoltages:
+        """Return the result of `coil_voltage`; with limits of each coil, the voltages of both coils within these."""
+        u = self.coil_voltage(u, state, q_i)
+        coil = None if self.amplifier is None else self.amplifier.coil
+        return u if coil is None else coil.applied(self.plant, state, u, q_i)
+
+    @property
+    def voltage_limit(self) -> Scalar:
+        """The |u| (V) at which the supply or the voltage of a coil is at its limit."""
+        if self.amplifier is None or self.amplifier.coil is None:
+            return self.u_max
+        return jnp.minimum(self.u_max, self.amplifier.coil.reserve(self.plant.R * self.plant.i_0))
+
+    @property
+    def largest_force(self) -> Scalar:
+        """The magnetic force (N) at z = 0 for i = i_0, where one coil is off, or for the limit of |i| if it is less."""
+        return self.plant.largest_force(self.amplifier and self.amplifier.current_limit(self.plant.i_0))
 
     @property
     def current_slope(self) -> Scalar:

@@ -17,6 +17,7 @@ from ambjax.ensemble.distributions import SHAPES
 from ambjax.ensemble.paths import places
 from ambjax.linear import Zones
 from ambjax.world.amplifier import Amplifier
+from ambjax.world.coil_limits import CoilLimits
 from ambjax.world.faults import Dropouts, Outliers
 from ambjax.world.iron import Iron
 from ambjax.world.plant import Plant
@@ -29,7 +30,7 @@ from reference.parser import keys, remarks, rule
 
 TITLES = ("key", "unit", "default", "allowed", "meaning")
 RECORDS: dict[str, type] = {"plant": Plant, "processor": Processor, "initial": Initial, "sensor": Sensor}
-RECORDS |= {"actuator": Amplifier, "processor.guard": Guard, "sensitivity": Zones}
+RECORDS |= {"actuator": Amplifier, "actuator.coil": CoilLimits, "processor.guard": Guard, "sensitivity": Zones}
 RECORDS |= {"plant.iron": Iron, "sensor.outliers": Outliers, "sensor.dropouts": Dropouts, "sensor.runout": Runout}
 SETTINGS: dict[str, dataclasses.Field] = {
     "actuator.u_max": FIELDS["u_max"],
@@ -68,6 +69,8 @@ WORDS = {
     "sensor.dropouts": "Intervals without a reading of the position. See [faults](../sensors.md#faults).",
     "sensor.runout": "Runout of the surface that the position sensor reads. See [runout](../loads.md#runout).",
     "actuator": "The supply and the amplifier. Default: both are ideal.",
+    "actuator.coil": "Limits of the voltage and of the current of each coil. Default: none. See "
+    "[limits of each coil](../magnet.md#coil-limits).",
     "initial": "State of the plant at t = 0. Default: at rest at z = 0.",
     "clock": "Duration, sample period and integrator.",
     "run": "Seed, settling time, and clearance with its stop.",

@@ -29,7 +29,7 @@ MEANINGS = {
 # Metrics that are not folds of a signal.
 OTHERS = {
     "force_used": "largest magnetic force, divided by the largest that the magnets can exert at z = 0 (with |i| = i_0 "
-    "or `actuator.i_max`)",
+    "or its limit by `actuator.i_max` or `actuator.coil.i_max`)",
     "lost": "whether the rotor was lost: it touched down, or a state left the range in which the model is valid",
     "stalled": "whether the integrator stalled, so that it is not known whether the rotor is held",
     "lost_at_s": "time at which the rotor was lost or the integrator stalled; null: never",

@@ -1,0 +1,91 @@
+"""Limits of the voltage and of the current of each coil, for a bearing with one switching amplifier per coil."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.numerics.records import Scalar, leaf, record, static
+from ambjax.numerics.smooth import limited
+
+
+class CoilVoltages(NamedTuple):
+    """The voltages of the coils, in V: R i_0 + `upper` at the upper coil, R i_0 - `lower` at the lower coil."""
+
+    upper: Scalar
+    lower: Scalar
+
+
+def difference(u: Array | CoilVoltages) -> Array:
+    """Return half the difference of the voltages of the coils, V."""
+    return jnp.asarray(u.upper + u.lower) / 2 if isinstance(u, CoilVoltages) else u
+
+
+@record
+class CoilLimits:
+    """Limits of the amplifier of each coil; both coils have the same.
+
+    The voltage of a coil is limited to +-u_max. At a limit of its current, a voltage that would move the current
+    further beyond the limit is replaced by the voltage that holds the current. If that voltage is outside +-u_max, its
+    limit acts, and the current moves beyond the limit.
+    """
+
+    u_max: Scalar | None = leaf(
+        default=None,
+        unit="V",
+        at_least=1e-9,
+        at_most=1e12,
+        optional=True,
+        doc="limit of the |voltage| of a coil, which contains R i_0; none: no limit",
+    )
+    i_max: Scalar | None = leaf(
+        default=None,
+        unit="A",
+        at_least=1e-9,
+        at_most=1e6,
+        optional=True,
+        doc="limit of the |current| of a coil, which contains i_0; none: no limit",
+    )
+    unidirectional: bool = static(default=False, doc="whether the current of a coil cannot become negative")
+
+    def differential(self, i_0: Scalar) -> Scalar | None:
+        """Return the |i| (A) at which the current of a coil, i_0 + |i|, is at its limit; None: no limit."""
+        return None if self.i_max is None else self.i_max - i_0
+
+    def reserve(self, bias: Scalar) -> Scalar:
+        """Return the |u| (V) at which the voltage of a coil is at its limit. `bias`: R i_0, V."""
+        return jnp.inf if self.u_max is None else self.u_max - bias
+
+    def applied(self, plant: Any, state: Any, u: Array, q_i: Scalar = 0.0) -> CoilVoltages:
+        """Return the voltages at the coils for the voltages R i_0 + u and R i_0 - u (V).
+
+        `plant`: a `TwoCoil`. `state`: of the plant. `q_i`: disturbance of the current's rate, A/s.
+        """
+        bias = plant.R * plant.i_0
+        voltages = self._limited(u, bias), self._limited(-u, bias)
+        if self.i_max is not None or self.unidirectional:
+            # the rate of each current is linear in its own voltage
+            still, driven = (
+                plant.currents(plant.rates(state, CoilVoltages(volt, -volt), 0.0, q_i)) for volt in (0.0, 1.0)
+            )
+            kept = (self._limited(-a / (b - a), bias) for a, b in zip(still, driven, strict=True))
+            coils = zip(voltages, kept, plant.currents(state), strict=True)
+            voltages = tuple(self._current_limited(*coil) for coil in coils)
+        return CoilVoltages(voltages[0], -voltages[1])
+
+    def supplied(self, u: Array, bias: Scalar) -> CoilVoltages:
+        """Return the voltages R i_0 + u and R i_0 - u (V) within +-u_max. `bias`: R i_0, V."""
+        return CoilVoltages(self._limited(u, bias), -self._limited(-u, bias))
+
+    def _limited(self, volt: Array, bias: Scalar) -> Array:
+        """Return the voltage of a coil less `bias`, its R i_0 (V), limited so that the whole is within +-u_max."""
+        if self.u_max is None:
+            return volt
+        return jnp.where(jnp.abs(volt + bias) > self.u_max, limited(volt + bias, self.u_max) - bias, volt)
+
+    def _current_limited(self, volt: Array, kept: Array, i: Array) -> Array:
+        """Return the voltage of a coil with a current i (A). `kept`: voltage that holds the current, V."""
+        if self.i_max is not None:
+            volt = jnp.where((i >= self.i_max) & (volt > kept), kept, volt)
+        least = 0.0 if self.unidirectional else -self.i_max if self.i_max is not None else -jnp.inf
+        return jnp.where((i <= least) & (volt < kept), kept, volt)
