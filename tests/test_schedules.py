@@ -15,7 +15,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
 from ambjax.control.cascade_state import Sample
-from ambjax.control.schedule import OVER, extremes, present
+from ambjax.control.schedule import OVER, extremes, with_gains_at
 from ambjax.ensemble.paths import kinds, places
 from ambjax.linear import loop_matrices
 from ambjax.numerics.records import validate
@@ -127,7 +127,7 @@ def test_a_constant_schedule_is_the_plain_gain(more):
 
 def test_a_law_without_a_schedule_is_itself():
     law = loop().cascade.position
-    assert present(law, 0.0, Reference(*[jnp.zeros(())] * 3)) is law
+    assert with_gains_at(law, 0.0, Reference(*[jnp.zeros(())] * 3)) is law
     assert extremes(law) == (law,)
     law = loop(k=table(25.0, 10.0, 60.0)).cascade.position
     assert [one.k for one in extremes(law)] == [10.0, 60.0]

@@ -24,9 +24,9 @@ from tuning.objective.risk import CVaR, Mean
 from tuning.objective.shortfalls import bounds
 from tuning.optimisers import CLIFF, NAMES, SHORTER, bfgs, optimiser
 from tuning.problem import problem_of
+from tuning.search.checkpoint import CheckpointFile, SearchState
 from tuning.search.course import GAIN, MOST_SEARCHES, should_restart
 from tuning.search.descent import Descent
-from tuning.search.keeper import Keeper, SearchState
 from tuning.search.optimise import _begin_full_phase, best_of, search
 from tuning.search.screen import FAR, NEAR, around, initial_points, screen
 from tuning.space import Gain, Space
@@ -325,32 +325,32 @@ def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):
         if kept.iteration == 4:
             raise StopError
 
-    keeper = Keeper(tmp_path / "kept.npz", facts)
+    checkpoint_file = CheckpointFile(tmp_path / "kept.npz", facts)
     with pytest.raises(StopError):
-        run(small, keeper=keeper, on_iteration=stop)
-    resumed = run(small, keeper=keeper, resume=True)
+        run(small, checkpoint_file=checkpoint_file, on_iteration=stop)
+    resumed = run(small, checkpoint_file=checkpoint_file, resume=True)
     for a, b in zip(jax.tree.leaves(whole.starts), jax.tree.leaves(resumed.starts), strict=True):
         np.testing.assert_array_equal(a, b)
     assert 0 < resumed.earlier < resumed.seconds  # what it took before counts
     assert not list(tmp_path.glob("*.part*"))
     with pytest.raises(ValueError, match="another search: case is 1 in the file and 2 in this run"):
-        run(small, keeper=Keeper(tmp_path / "kept.npz", {"case": 2}), resume=True)
+        run(small, checkpoint_file=CheckpointFile(tmp_path / "kept.npz", {"case": 2}), resume=True)
 
 
 def test_a_search_whose_checkpoint_was_damaged_is_the_uninterrupted_one(small, tmp_path, capsys):
     whole = run(small)
-    keeper = Keeper(tmp_path / "kept.npz", {"case": 1}, 3)
-    run(small, keeper=keeper, iterations=2)
-    content = bytearray(keeper.path.read_bytes())
+    checkpoint_file = CheckpointFile(tmp_path / "kept.npz", {"case": 1}, 3)
+    run(small, checkpoint_file=checkpoint_file, iterations=2)
+    content = bytearray(checkpoint_file.path.read_bytes())
     content[len(content) // 2] ^= 1
-    keeper.path.write_bytes(content)
-    again = run(small, keeper=keeper, resume=True)
+    checkpoint_file.path.write_bytes(content)
+    again = run(small, checkpoint_file=checkpoint_file, resume=True)
     said = capsys.readouterr().err
-    assert said.startswith(f"{keeper.path}: ")
+    assert said.startswith(f"{checkpoint_file.path}: ")
     assert said.endswith("; round 3 is begun again\n")
     for a, b in zip(jax.tree.leaves(whole.starts), jax.tree.leaves(again.starts), strict=True):
         np.testing.assert_array_equal(a, b)
-    assert run(small, keeper=keeper, resume=True).ended
+    assert run(small, checkpoint_file=checkpoint_file, resume=True).ended
 
 
 def test_the_second_phase_goes_back_to_what_was_given_where_the_path_is_worse(small):

@@ -18,8 +18,8 @@ from tuning.__main__ import main
 from tuning.judge import NEGLIGIBLE, StepError, compared, describe, step_error, worst_of
 from tuning.optimisers import Retreat
 from tuning.problem import REFERENCE_MEMBERS
+from tuning.search.checkpoint import SearchState
 from tuning.search.descent import Starts
-from tuning.search.keeper import SearchState
 from tuning.search.rounds import MOST_HALVINGS, finer, rounds
 from tuning.search.validation import NOISE_GROWTH, joining
 

@@ -86,10 +86,8 @@ def test_a_pulse_that_breaks_the_loop_is_what_a_gain_is_set_by(capsys):
 
 
 def condition(gain, against, path="controller.inversion.gamma", ideal=False, at=0.1):
-    where = "reference" if ideal else "run"
-    return Condition(
-        "x", f"gamma > Delta_1 along the {where}", gain, against, at, "u", gain > against, path=path, ideal=ideal
-    )
+    over = f"Delta_1 along the {'reference' if ideal else 'run'}"
+    return Condition("x", f"gamma > {over}", gain, against, at, "u", gain > against, "", path, over, ideal)
 
 
 def test_no_gain_is_set_by_what_a_falling_rotor_does():

@@ -25,9 +25,9 @@ from tuning.report import document as report
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.judging import examined
 from tuning.report.tuned import tuned_case
+from tuning.search.checkpoint import begin, begun, checkpoint, remove_all, unfinished
 from tuning.search.course import SearchResult
 from tuning.search.explore import Slices
-from tuning.search.keeper import begin, begun, checkpoint, remove_all, unfinished
 from tuning.search.rounds import rounds
 from tuning.space import Gain, Space, tunable
 

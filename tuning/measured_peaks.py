@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.control.base import hard_signs
+from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import USUAL
 from ambjax.linear import Analysis, Injection, analyse, linearise, lines
 from ambjax.linear.injection import injection_of
@@ -64,7 +64,7 @@ def injects(problem: TuningProblem) -> bool:
 
 def decides(problem: TuningProblem) -> bool:
     """Return whether the injection decides alone: a sign is set-valued, so that no linear loop describes chattering."""
-    return injects(problem) and any(hard_signs(getattr(problem.case.cascade, stage)) for stage in USUAL)
+    return injects(problem) and any(set_valued_signs(getattr(problem.case.cascade, stage)) for stage in USUAL)
 
 
 def injections(

@@ -7,7 +7,6 @@ outside of the space stay the same objects in `Space.decode`.
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +15,7 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import Schedule
+from ambjax.extend import Scalar
 
 # A coordinate bends within 1/SHARP of a bound, in logarithms. A logistic curve over the whole interval would put the
 # bound at infinity, so that a search converges slowly to an optimum at the bound.
@@ -46,7 +46,7 @@ class Gain:
         """The path within the law: the name of the gain, and the number of its knot if it has a schedule."""
         return self.path.split(".", 2)[2]
 
-    def encode(self, gain: Any) -> Any:
+    def encode(self, gain: float) -> float:
         """Return the coordinate of a gain strictly within the bounds."""
         if math.isinf(self.high):
             return np.log(gain - self.low)
@@ -161,14 +161,14 @@ def knots(cascade: Cascade, path: str) -> list[str]:
     return [f"{path}.{knot}" for knot in range(len(value.values))] if isinstance(value, Schedule) else []
 
 
-def read(cascade: Cascade, path: str) -> Any:
+def read(cascade: Cascade, path: str) -> Scalar | Schedule:
     """Return the gain of a cascade at a dotted path, or its schedule."""
     _, stage, name, *knot = path.split(".")
     value = getattr(getattr(cascade, stage), name)
     return value.values[int(knot[0])] if knot else value
 
 
-def _write(cascade: Cascade, path: str, value: object) -> Cascade:
+def _write(cascade: Cascade, path: str, value: Scalar) -> Cascade:
     _, stage, name, *knot = path.split(".")
     law = getattr(cascade, stage)
     law = dataclasses.replace(law, **{name: getattr(law, name).with_knot(int(knot[0]), value) if knot else value})

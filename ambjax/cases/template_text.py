@@ -4,8 +4,9 @@ import dataclasses
 import math
 
 from ambjax.cases import tune_table
+from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.data_sheet import BEARING
-from ambjax.cases.reader import KINDS, PLANTS
+from ambjax.cases.reader import PLANTS
 from ambjax.cases.rig import RIG
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.ensemble.design import DESIGNS

@@ -83,15 +83,15 @@ def _draw(cases: list[Case], maps: list[Map], path: pathlib.Path) -> None:
     from ambjax.pictures import heatmaps
 
     panels = [
-        {
-            "title": f"{case.name}\n{_short(m)}",
-            "x": m.x.values,
-            "y": m.y.values,
-            "survival": m.survival,
-            "low": m.low if m.decisive else None,
-            "high": m.high if m.decisive else None,
-            "error": m.error,
-        }
+        heatmaps.MapPanel(
+            title=f"{case.name}\n{_short(m)}",
+            x=m.x.values,
+            y=m.y.values,
+            survival=m.survival,
+            low=m.low if m.decisive else None,
+            high=m.high if m.decisive else None,
+            error=m.error,
+        )
         for case, m in zip(cases, maps, strict=True)
     ]
     x, y = maps[0].x, maps[0].y

@@ -10,7 +10,7 @@ A law is a frozen record: its type is the algorithm, its leaves are the gains. E
 - `sigma(motion, reference)`, for a position law: the sliding variable of a motion, m/s.
 
 `control.base.Law` has the other methods with their defaults. To add a law, write a record in the file of its stage, and
-add it to `KINDS` in `ambjax/cases/reader.py` and to the conformance test in `tests/test_laws.py`.
+add it to `KINDS` in `ambjax/cases/controller_tables.py` and to the conformance test in `tests/test_laws.py`.
 """
 
 import abc

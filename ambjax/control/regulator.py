@@ -63,8 +63,8 @@ def optimal_gains(model: Plant, period: float | None = None) -> np.ndarray:
             F, G = sampled(scaled_A, scaled_B, min(period * w, LONGEST / fastest))
             P = scipy.linalg.solve_discrete_are(F, G, cost, np.eye(1))
             K = np.linalg.solve(np.eye(1) + G.T @ P @ G, G.T @ P @ F)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise ValueError(f"the model has no optimal gains ({error.args[0].partition('.')[0]})") from None
+    except (np.linalg.LinAlgError, ValueError):
+        raise ValueError("the model has no optimal gains: its Riccati equation has no finite solution") from None
     gains = K[0] / units * CURRENT * float(model.i_0)
     if not np.all((gains > 0) & np.isfinite(gains)):
         raise ValueError(f"the model has no positive optimal gains: {', '.join(f'{x:.3g}' for x in gains)}")

@@ -22,12 +22,12 @@ from ambjax.numerics.records import Scalar, canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
 from ambjax.simulation.metrics import standard_for
-from ambjax.simulation.rollout import Outcome, RolloutState, System, begin, finish, prepare, stretch
+from ambjax.simulation.rollout import Outcome, RolloutState, System, begin, finish, prepare, recorded_segment
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.scenario import Scenario
 
 # Samples in one call of the compiled program: the rows of all lanes take 20 MB.
-STRETCH = 2048
+SEGMENT = 2048
 
 
 class Replay(NamedTuple):
@@ -77,10 +77,10 @@ def record_system(
 ) -> Outcome:
     """Do the work of `record` for a `rollout.System`, without checks. At least one leaf must be an array [1]."""
     tree = canonical((system, clock, fold))
-    count = min(STRETCH, clock.samples)
+    count = min(SEGMENT, clock.samples)
     progress, rows, outcomes = map_members(_begun, tree, threads=1, call=1), [], list[Outcome]()
     for first in range(0, clock.samples, count):
-        progress, outcome = map_members(_stretched(count), (*tree, progress, first), threads=1, call=1)
+        progress, outcome = map_members(_recorded_segment(count), (*tree, progress, first), threads=1, call=1)
         outcomes = [jax.tree.map(lambda x: x[0], outcome)]
         left = min(count, clock.samples - first)
         # Copy, because the slice would keep the rows of all lanes in memory.
@@ -118,14 +118,14 @@ def _begun(tree: tuple[System, Clock, Fold | None]) -> RolloutState:
 
 
 @functools.cache
-def _stretched(
+def _recorded_segment(
     count: int,
 ) -> Callable[[tuple[System, Clock, Fold | None, RolloutState, Scalar]], tuple[RolloutState, Outcome]]:
     """Return the simulation of `count` samples. The function is cached, so that it compiles once."""
 
     def one(tree: tuple[System, Clock, Fold | None, RolloutState, Scalar]) -> tuple[RolloutState, Outcome]:
         system, clock, fold, progress, first = tree
-        progress, rows = stretch(system, clock, fold, progress, first, count)
+        progress, rows = recorded_segment(system, clock, fold, progress, first, count)
         return progress, finish(progress, rows, fold)
 
     return one

@@ -1,6 +1,7 @@
 """Pictures of trajectories: panels of signals, the paper's Figures 3 to 6, and the comparison of readings."""
 
 import pathlib
+import textwrap
 from typing import NamedTuple
 
 import numpy as np
@@ -176,9 +177,9 @@ def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:
     ax.axvspan(lost_at, max(end, ax.get_xlim()[1]), color=RED, alpha=0.12, linewidth=0)
     ax.axvline(lost_at, color=RED, linewidth=1.0)
     if first:
-        why = trajectory.lost_why.replace(": ", ":\n").replace(" reached ", "\nreached ")
         status = "not decided from" if trajectory.lost_code == STALLED else "lost at"
-        words = f"{status} {lost_at:.4g} s\n{why}"
+        reason = textwrap.fill(trajectory.lost_reason, 24)
+        words = f"{status} {lost_at:.4g} s\n{trajectory.lost_event}:\n{reason}"
         paper = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1}  # a curve may pass behind the text
         ax.text(0.99, 0.06, words, transform=ax.transAxes, ha="right", va="bottom", fontsize=7, color=INK, bbox=paper)
 

@@ -45,7 +45,7 @@ def tornado(drivers: Sequence[Bar], metric: str, says: str, path: pathlib.Path) 
         ax.plot([100 * one.low, 100 * one.high], [row, row], color=INK, linewidth=1.2, marker="|", markersize=7)
         words = f"{100 * one.share:.0f} %"
         ax.text(100 * max(one.share, one.high) + 1.5, row, words, fontsize=8, va="center", color=INK)
-    ax.set_yticks(range(len(bars)), [one.path.removeprefix("spread.") for one in bars])
+    ax.set_yticks(range(len(bars)), [one.path for one in bars])
     ax.set_ylim(len(bars) - 0.4, -0.6)
     ax.set_xlim(0, 112)
     ax.set_xticks(np.linspace(0, 100, 6))

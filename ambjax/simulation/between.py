@@ -37,8 +37,11 @@ def _one_of(voltages: tuple[Array, ...], lag: Array) -> Array:
 
 
 def amplified(
-    amplifier: Amplifier | CurrentAmplifier | None, t: Array, u_a: Any, commanded: Sequence[tuple[Array, Scalar]]
-) -> tuple[list[tuple[Voltage, Scalar]], Any]:
+    amplifier: Amplifier | CurrentAmplifier | None,
+    t: Array,
+    u_a: Array | tuple[()],
+    commanded: Sequence[tuple[Array, Scalar]],
+) -> tuple[list[tuple[Voltage, Scalar]], Array | tuple[()]]:
     """Return the amplifier's voltage as functions of time with their durations (s), and the voltage at the end.
 
     `commanded`: voltages (V) from t on, each with its duration (s). With a slew-rate limit each is divided at the end
@@ -55,7 +58,7 @@ def amplified(
     return given, u_a
 
 
-def stretches(
+def subproblems(
     loop: ClosedLoop,
     state: object,
     command: Command,

@@ -144,7 +144,7 @@ def _to_raise(line: Condition) -> str:
         return f"{line.requires} cannot be evaluated: its right-hand side is not finite along this run."
     name, key, gain = _sides(line)
     return (
-        f"{name} = {gain} must exceed {number(line.against)} {line.unit} ({line.requires.partition(' > ')[2]}, at "
+        f"{name} = {gain} must exceed {number(line.against)} {line.unit} ({line.over}, at "
         f"{line.at_s:.4g} s): set {key} above {number(_up(MARGIN * line.against))}."
     )
 
@@ -153,7 +153,7 @@ def _during_fall(line: Condition, ideal: Condition | None) -> str:
     """Return the advice on a gain whose condition fails only while the rotor falls."""
     name, key, gain = _sides(line)
     words = (
-        f"{line.requires.partition(' > ')[2]} = {number(line.against)} {line.unit} exceeds {name} = {gain} at "
+        f"{line.over} = {number(line.against)} {line.unit} exceeds {name} = {gain} at "
         f"{line.at_s:.4g} s, while the rotor falls. Do not choose {name} by this value: another gain, a disturbance, "
         "noise or the supply may cause the fall."
     )

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.control.base import unhardened
+from ambjax.control.base import with_infinite_steepness
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState
 from ambjax.control.sampling import Sampling, band, disturbance, slope_limits
@@ -23,9 +23,10 @@ from ambjax.control.schedule import extremes, schedules
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import Outcome, System, prepare, roll
+from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
-from ambjax.theorem.watched import Watched
+from ambjax.theorem.watched import Watched, WatchedRow
 from ambjax.world.bearing import Bearing
 from ambjax.world.scenario import Scenario
 
@@ -140,7 +141,7 @@ class Delays(NamedTuple):
         return None if self.held is None or self.lost is None else self.lost - self.held
 
 
-def rolled(system: object, clock: Clock) -> Outcome:
+def rolled(system: System, clock: Clock) -> Outcome:
     """Roll out a system and record every sample."""
     return roll(*canonical((system, clock)), None, every=1)
 
@@ -158,6 +159,7 @@ def check(
     Raises ValueError as `rollout` does.
     """
     loop, clock = prepare(cascade, scenario, clock)
+    assert isinstance(loop, Sampled)
     cascade, quiet = cascade.on_processor(), _without_noise(scenario)
     outcome = _watched(loop, clock, run)
     calm = outcome if quiet is scenario else _watched(system_of(cascade, quiet, clock), clock, run)
@@ -179,7 +181,7 @@ def check(
     )
 
 
-def _watched(loop: Any, clock: Clock, run: Callable[[System, Clock], Outcome]) -> Trajectory:
+def _watched(loop: Sampled, clock: Clock, run: Callable[[System, Clock], Outcome]) -> Trajectory:
     """Simulate a loop and record the rows of `Watched`."""
     return run(Watched(loop), clock).trajectory
 
@@ -212,7 +214,7 @@ def _without_noise(scenario: Scenario) -> Scenario:
 def slopes(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
     """Return slope times T and its limits for every law with a slope. `cascade`: of one member."""
     sampling, lines = sampling_of(cascade, clock), []
-    for stage, law in zip(CascadeState._fields, map(unhardened, cascade.laws), strict=True):
+    for stage, law in zip(CascadeState._fields, map(with_infinite_steepness, cascade.laws), strict=True):
         implicit = law.has_own_step(sampling.implicit)
         ends = extremes(law)
         slope = stepped = max(_steepest(one.slope(cascade.model)) for one in ends) * sampling.period
@@ -239,7 +241,9 @@ def sampling_of(cascade: Cascade, clock: Clock) -> Sampling:
     return Sampling(float(clock.sample_period), max(late, 0.0), processor.implicit)
 
 
-def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, rows: Any, noise: bool) -> list[Band]:
+def _bands(
+    cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, rows: WatchedRow, noise: bool
+) -> list[Band]:
     """Return the bands of one run, from sample number `settled` on."""
     sampling, lines = sampling_of(cascade, clock), []
     limited = _peak(rows.u[settled:]) >= float(scenario.u_max)

@@ -1,5 +1,6 @@
 """Breakdown of the loss: the contribution of each term, and the parts of the minimised goal."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ FORMULA = f"{' + '.join(HELD)} + (tracking + peak) x (1 + {' + '.join(COSTS)})"
 Facts = dict[str, Any]
 
 
-def contributions(weights: Any, terms: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def contributions(weights: Sequence[float], terms: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the contribution of each term to the loss of each unstressed member [N]; the sum is `weigh`."""
     each = {name: weights[k] * np.asarray(terms[name]) for k, name in enumerate(TERMS)}
     error = sum(values for name, values in each.items() if name not in (*COSTS, *HELD))

@@ -1,13 +1,13 @@
 """Quality of the gradient: agreement of three ways to compute it, growth with the horizon, signal-to-noise ratio."""
 
 import dataclasses
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from tuning.objective.lanes import Engine
 from tuning.objective.loss import weigh
-from tuning.objective.members import Members
+from tuning.objective.members import Members, Objective
 from tuning.problem import TuningProblem
 
 Number = TypeVar("Number", float, np.ndarray)
@@ -23,7 +23,7 @@ AGREED = "agree"
 HORIZONS = (0.125, 0.25, 0.5)
 
 
-def _shorter(problem: TuningProblem, samples: int) -> Any:
+def _shorter(problem: TuningProblem, samples: int) -> Objective:
     """Return the objective over fewer samples; the settled part starts at the same share of them."""
     objective = problem.objective
     clock = dataclasses.replace(objective.clock, samples=samples)

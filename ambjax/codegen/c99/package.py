@@ -21,6 +21,7 @@ from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.reference import Results, results
 from ambjax.codegen.trace import Trace, trace
 from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference
 
 # Points of the test program.
 VECTORS = 100
@@ -186,4 +187,4 @@ def _readme(writer: Writer) -> str:
 
 def _source(name: str) -> str:
     """Return the name of the function that reads an input in the README's example: read_z, reference_r_dot."""
-    return f"{'reference' if name.startswith('r') else 'read'}_{name}"
+    return f"{'reference' if name in Reference._fields else 'read'}_{name}"
