@@ -77,7 +77,7 @@ class Counter:
             self.values += len(x) * len(members.member)
             return terms(engine, x, members)
 
-        def counted_gradient(x: np.ndarray, members: Any, weights: object) -> Any:
+        def counted_gradient(x: np.ndarray, members: Any, weights: Any) -> Any:
             self.gradients += len(x) * len(members.member)
             return gradient(engine, x, members, weights)
 

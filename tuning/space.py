@@ -7,6 +7,7 @@ outside of the space stay the same objects in `Space.decode`.
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -161,7 +162,7 @@ def knots(cascade: Cascade, path: str) -> list[str]:
     return [f"{path}.{knot}" for knot in range(len(value.values))] if isinstance(value, Schedule) else []
 
 
-def read(cascade: Cascade, path: str) -> Scalar | Schedule:
+def read(cascade: Cascade, path: str) -> Any:
     """Return the gain of a cascade at a dotted path, or its schedule."""
     _, stage, name, *knot = path.split(".")
     value = getattr(getattr(cascade, stage), name)

@@ -138,7 +138,8 @@ def _linear(table: Table, files: Files) -> tuple[Law, ControllerFile]:
 
 def _defaults(table: Table, kind: type[Law], model: Plant, period: Scalar | None) -> Law | None:
     """Return the law of this kind with its default gains; None if the table gives every gain."""
-    names = {field.name for field in dataclasses.fields(kind) if field.metadata.get("leaf")}
+    fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
+    names = {field.name for field in fields if field.metadata.get("leaf")}
     if names <= set(table.raw):
         return None
     try:

@@ -84,7 +84,7 @@ class Adaptive(AdaptiveReference):
         return Relay(self.gamma, self.p)
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        needed, symbol, source = context.gamma
+        needed, symbol, source = context.delta_1
         times = 1000 if context.stepped else 100
         gamma = Interval(needed, times * needed, f"{symbol} to {times} {symbol}, {source}")
         return {"gamma": gamma, **steepness(context, "gamma")}
@@ -123,7 +123,7 @@ class FeedForwardAdaptive(AdaptiveReference):
         return CurrentDemand(state, rate), rate
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        needed, _, source = context.gamma
+        needed, _, source = context.delta_1
         words = f"a hundredth to 100 times the bound without feed-forward: {source}"
         gamma = Interval(needed / 100, 100 * needed, words)
         return {"gamma": gamma, **steepness(context, "gamma")}

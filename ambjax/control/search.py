@@ -8,8 +8,8 @@ from ambjax.numerics.smooth import TWO_OVER_PI
 from ambjax.world.plant import Plant
 
 
-class GammaBound(NamedTuple):
-    """Lower bound of gamma (A^2/m^2/s), its symbol, and a description of its source."""
+class LowerBound(NamedTuple):
+    """Lower bound of a gain, its symbol, and a description of its source."""
 
     value: float
     symbol: str
@@ -20,15 +20,15 @@ class SearchContext(NamedTuple):
     """Context of a search for gains.
 
     `model`: nominal plant. `w`: pole of the true plant, 1/s. `period`: sample period, s. `bounds`: lower bounds of
-    Theorem 1 on gains, by symbol (Q_z, Q_i, Delta_1). `gamma`: the larger of the bounds of Eq. (7) on the reference
-    and in a fall. `stepped`: whether the laws run on a processor with implicit signs.
+    Theorem 1 on gains, by symbol (Q_z, Q_i, Delta_1). `delta_1`: the larger of the bounds of Eq. (7) on the reference
+    and in a fall, A^2/m^2/s. `stepped`: whether the laws run on a processor with implicit signs.
     """
 
     model: Plant
     w: float
     period: float
     bounds: Mapping[str, float]
-    gamma: GammaBound
+    delta_1: LowerBound
     stepped: bool = False
 
     @property

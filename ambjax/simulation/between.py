@@ -49,6 +49,7 @@ def amplified(
     """
     if not isinstance(amplifier, Amplifier) or not amplifier.slow:
         return [(lambda _, u=u: u, time) for u, time in commanded], u_a
+    assert not isinstance(u_a, tuple)  # a slow amplifier has a voltage
     given = []
     for u, time in commanded:
         voltage = lambda now, u_a=u_a, u=u, t=t: amplifier.followed(u_a, u, now - t)  # noqa: E731

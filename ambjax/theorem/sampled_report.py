@@ -26,7 +26,7 @@ from ambjax.simulation.rollout import Outcome, System, prepare, roll
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
-from ambjax.theorem.watched import Watched, WatchedRow
+from ambjax.theorem.watched import Watched
 from ambjax.world.bearing import Bearing
 from ambjax.world.scenario import Scenario
 
@@ -159,7 +159,6 @@ def check(
     Raises ValueError as `rollout` does.
     """
     loop, clock = prepare(cascade, scenario, clock)
-    assert isinstance(loop, Sampled)
     cascade, quiet = cascade.on_processor(), _without_noise(scenario)
     outcome = _watched(loop, clock, run)
     calm = outcome if quiet is scenario else _watched(system_of(cascade, quiet, clock), clock, run)
@@ -181,8 +180,9 @@ def check(
     )
 
 
-def _watched(loop: Sampled, clock: Clock, run: Callable[[System, Clock], Outcome]) -> Trajectory:
-    """Simulate a loop and record the rows of `Watched`."""
+def _watched(loop: System, clock: Clock, run: Callable[[System, Clock], Outcome]) -> Trajectory:
+    """Simulate a loop on a processor and record the rows of `Watched`."""
+    assert isinstance(loop, Sampled)
     return run(Watched(loop), clock).trajectory
 
 
@@ -241,9 +241,7 @@ def sampling_of(cascade: Cascade, clock: Clock) -> Sampling:
     return Sampling(float(clock.sample_period), max(late, 0.0), processor.implicit)
 
 
-def _bands(
-    cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, rows: WatchedRow, noise: bool
-) -> list[Band]:
+def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, rows: Any, noise: bool) -> list[Band]:
     """Return the bands of one run, from sample number `settled` on."""
     sampling, lines = sampling_of(cascade, clock), []
     limited = _peak(rows.u[settled:]) >= float(scenario.u_max)

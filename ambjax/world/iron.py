@@ -1,6 +1,6 @@
 """The iron of the magnets: saturation, leakage, and the lag of the flux by eddy currents in the laminations."""
 
-from typing import Protocol
+from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
@@ -9,17 +9,6 @@ from ambjax.numerics.records import Scalar, leaf, record
 
 # Smallest slope of the saturation curve: at large currents only the flux through the air still increases.
 AIR = 0.02
-
-
-class Coils(Protocol):
-    """The parameters of a plant that the flux density of a core depends on; see `Bearing`."""
-
-    @property
-    def mu_0(self) -> Scalar: ...
-    @property
-    def n(self) -> Scalar: ...
-    @property
-    def s_0(self) -> Scalar: ...
 
 
 @record
@@ -48,14 +37,14 @@ class Iron:
         default=None, unit="s", at_least=1e-7, at_most=1.0, optional=True, doc="lag of the flux behind the current"
     )
 
-    def core(self, plant: Coils, i: Scalar, inverse: Scalar) -> Array:
+    def core(self, plant: Any, i: Scalar, inverse: Scalar) -> Array:
         """Return the flux density of a core without saturation, T: mu_0 n i/2 (1/gap + (leakage - 1)/s_0).
 
         `i`: current of the coil, A. `inverse`: 1 / gap, 1/m.
         """
         return plant.mu_0 * plant.n / 2 * i * (inverse + self.beside(plant))
 
-    def beside(self, plant: Coils) -> Scalar:
+    def beside(self, plant: Any) -> Scalar:
         """Return the term that the leakage path adds to 1 / gap in the flux of the core: (leakage - 1)/s_0, 1/m."""
         return 0.0 if self.leakage is None else (self.leakage - 1) / plant.s_0
 

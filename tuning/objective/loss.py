@@ -144,8 +144,8 @@ def weigh(weights: Weights, terms: Mapping[str, Values], stressed: Values) -> Va
     the error is unknown in advance. With a weight of 0.1, a voltage that is always at its limit adds a tenth of the
     error.
     """
-    ordinary = 1.0 - 1.0 * stressed
-    each = dict(zip(TERMS, (weights[k] * terms[name] for k, name in enumerate(TERMS)), strict=True))
+    ordinary: Any = 1.0 - 1.0 * stressed
+    each: dict[str, Any] = dict(zip(TERMS, (weights[k] * terms[name] for k, name in enumerate(TERMS)), strict=True))
     costs = sum(each.pop(name) for name in COSTS)
     held = sum(each.pop(name) for name in HELD)
     return held + ordinary * sum(each.values()) * (1 + costs)

@@ -10,7 +10,6 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble import Spread, apply, draw
-from ambjax.extend import Scalar
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import rollout
 from ambjax.world.scenario import Scenario
@@ -139,7 +138,7 @@ class Objective:
         return rollout(self.space.decode(x + members.shift, cascade), scenario, self.clock, fold=fold, every=0).measured
 
 
-def _with_noise(scenario: Scenario, noise_factor: Scalar | np.ndarray) -> Scenario:
+def _with_noise(scenario: Scenario, noise_factor: Any) -> Scenario:
     """Return the scenario with `noise_factor` times the sensor noise."""
     sensor = scenario.sensor
     return scenario if sensor is None else dataclasses.replace(scenario, sensor=sensor.louder(noise_factor))

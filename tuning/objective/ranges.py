@@ -6,7 +6,7 @@ import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import extremes
-from ambjax.control.search import GammaBound, Interval, SearchContext
+from ambjax.control.search import Interval, LowerBound, SearchContext
 from tuning.objective.members import Objective
 from tuning.objective.shortfalls import Bound
 from tuning.space import Gain, Space
@@ -91,9 +91,9 @@ def _context(objective: Objective, conditions: tuple[Bound, ...]) -> SearchConte
     z, where = max(places)
     delta, fall = bounds.get("Delta_1", 0.0), growth * z
     needed = (
-        GammaBound(delta, "Delta_1", f"Delta_1 = {delta:.3g} A^2/m^2/s along the reference, Eq. (7)")
+        LowerBound(delta, "Delta_1", f"Delta_1 = {delta:.3g} A^2/m^2/s along the reference, Eq. (7)")
         if delta >= fall
-        else GammaBound(fall, "D", f"D = dv/dz w z = {fall:.3g} A^2/m^2/s, required by Eq. (7) for a fall from {where}")
+        else LowerBound(fall, "D", f"D = dv/dz w z = {fall:.3g} A^2/m^2/s, required by Eq. (7) for a fall from {where}")
     )
     processor = objective.cascade.processor
     stepped = processor is not None and processor.implicit

@@ -54,11 +54,11 @@ class SearchState:
         """Whether each start uses CMA-ES [S]."""
         return self.cma_states.drawn >= 0
 
-    def cma_state(self, at: int) -> CmaState:
+    def cma_state(self, at: int | np.integer) -> CmaState:
         """Return the distribution of one start."""
         return CmaState(*(leaf[at] for leaf in self.cma_states))
 
-    def put(self, at: int, state: CmaState) -> None:
+    def put(self, at: int | np.integer, state: CmaState) -> None:
         """Set the distribution of one start."""
         for whole, part in zip(self.cma_states, state, strict=True):
             whole[at] = part
