@@ -32,8 +32,8 @@ from ambjax.ensemble.worker import processes
 from tuning.config import tune_from
 from tuning.objective.lanes import GRADIENT_LANES, Engine
 from tuning.problem import TuningProblem, problem_of
+from tuning.search.checkpoint import SearchState
 from tuning.search.course import Course, search_and_restart, training
-from tuning.search.keeper import SearchState
 
 SECONDS, MEMBERS, STRESSED = 0.25, 12, 4
 ERRORS, REFERENCES = [0.0, 2e-6, 1e-5], [0.0, 1.25e-3, 2.5e-3]
@@ -77,7 +77,7 @@ class Counter:
             self.values += len(x) * len(members.member)
             return terms(engine, x, members)
 
-        def counted_gradient(x: np.ndarray, members: Any, weights: object) -> Any:
+        def counted_gradient(x: np.ndarray, members: Any, weights: Any) -> Any:
             self.gradients += len(x) * len(members.member)
             return gradient(engine, x, members, weights)
 

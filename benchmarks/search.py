@@ -34,8 +34,8 @@ from ambjax.ensemble.worker import processes
 from tuning.config import read_tune
 from tuning.objective.ranges import ranges
 from tuning.problem import TuningProblem, problem_of
+from tuning.search.checkpoint import SearchState
 from tuning.search.course import Course, search_and_restart, training
-from tuning.search.keeper import SearchState
 
 TASKS = pathlib.Path(__file__).parent / "tasks"
 # Points per call for methods without a population.

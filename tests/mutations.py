@@ -748,8 +748,8 @@ ENSEMBLE = [
     M(
         "a condition of the theorem holds where it fails",
         "ambjax/theorem/conditions.py",
-        "one.unit, gain > against, path",
-        "one.unit, gain < against, path",
+        'one.unit, gain > against, ""',
+        'one.unit, gain < against, ""',
         "tests/test_theorem.py::test_repaired_holds_and_literal_does_not",
     ),
 ]
@@ -974,8 +974,8 @@ SEARCH = [
     M(
         "--gradients raises",
         "tuning/report/judging.py",
-        "gradient.report(answer.problem, answer.x, answer.members)",
-        "gradient.report(answer.problem, answer.x)",
+        "gradient.gradient_report(answer.problem, answer.x, answer.members)",
+        "gradient.gradient_report(answer.problem, answer.x)",
         "tests/test_tuning_study.py::test_gradients_reports_three_ways_to_the_same_number",
     ),
     M(
@@ -1120,9 +1120,9 @@ SEARCH = [
     ),
     M(
         "the populations of a checkpoint are begun again",
-        "tuning/search/keeper.py",
-        "clouds=drawn)",
-        "clouds=clouds(starts, m))",
+        "tuning/search/checkpoint.py",
+        "cma_states=drawn)",
+        "cma_states=idle_states(starts, m))",
         "tests/test_tuning_evolution.py::test_a_search_that_is_resumed_among_populations_ends_alike",
     ),
     M(
@@ -1163,8 +1163,8 @@ SEARCH = [
     M(
         "stressed members enter the tracking error too",
         "tuning/objective/loss.py",
-        "ordinary = 1.0 - 1.0 * stressed",
-        "ordinary = 1.0 - 0.0 * stressed",
+        "ordinary: Any = 1.0 - 1.0 * stressed",
+        "ordinary: Any = 1.0 - 0.0 * stressed",
         "tests/test_tuning_search.py::test_stressed_members_hear_more_and_count_by_being_held",
     ),
     M(
@@ -1705,8 +1705,8 @@ SAMPLED = [
     M(
         "the largest voltage is that commanded, whatever the amplifier makes of it",
         "ambjax/simulation/sampled.py",
-        "noted if self.loop.scenario.amplifier is None else noted._replace(u_peak=span.most.u)",
-        "noted",
+        "completed if self.loop.scenario.amplifier is None else completed._replace(u_peak=span.most.u)",
+        "completed",
         "tests/test_realism.py::test_the_largest_voltage_is_that_at_the_coils_and_within_the_supply",
     ),
     M(
@@ -2322,7 +2322,7 @@ STATUSES = [
     M(
         "the folder of a search is not marked before its first checkpoint",
         "tuning/command.py",
-        "        begin(plan.out)\n",
+        "        mark_directory(plan.out)\n",
         "",
         "tests/test_tuning_study.py::test_a_search_killed_before_its_first_checkpoint_is_resumed",
     ),
@@ -2377,7 +2377,7 @@ STATUSES = [
     ),
     M(
         "a search that has not ended is removed",
-        "tuning/search/keeper.py",
+        "tuning/search/checkpoint.py",
         "return bool(left) and not (",
         "return False and not (",
         "tests/test_tuning_study.py::test_an_unfinished_search_is_neither_lost_nor_resumed_without_resume",

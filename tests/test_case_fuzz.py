@@ -14,7 +14,8 @@ from profiles import examples
 from tomlkit import dumps
 
 from ambjax import simulate
-from ambjax.cases.reader import KINDS, TABLES, read_case
+from ambjax.cases.controller_tables import KINDS
+from ambjax.cases.reader import TABLES, read_case
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.timing import DURATION, METHODS
 from ambjax.cases.tune_table import NUMBERS as TUNED

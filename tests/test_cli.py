@@ -9,7 +9,8 @@ import pytest
 from texts import write
 
 from ambjax.__main__ import main
-from ambjax.cases.reader import KINDS, case_from, read_case
+from ambjax.cases.controller_tables import KINDS
+from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.template_text import template
 from ambjax.commands.outputs import directory

@@ -12,8 +12,8 @@ import pytest
 from ambjax.ensemble.store import Store
 from ambjax.host import sealed
 from ambjax.host.sealed import DamagedError, difference, flat, seal, unseal, write_whole
+from tuning.search.checkpoint import CheckpointFile, SearchState, remove_all
 from tuning.search.descent import Descent
-from tuning.search.keeper import Keeper, SearchState, remove_all
 
 FACTS = {"seed": 3, "plant.m": "0.588"}
 MEMBERS, CHUNK = 50, 20
@@ -396,9 +396,9 @@ def search_of(descent, starts=STARTS, gains=GAINS):
 
 @pytest.fixture
 def checkpoint(tmp_path, descent):
-    keeper = Keeper(tmp_path / "checkpoint-2.npz", SEARCH_FACTS, 2)
-    keeper.save(search_of(descent))
-    return keeper
+    checkpoint_file = CheckpointFile(tmp_path / "checkpoint-2.npz", SEARCH_FACTS, 2)
+    checkpoint_file.save(search_of(descent))
+    return checkpoint_file
 
 
 def test_a_checkpoint_is_the_search(checkpoint, descent):
@@ -414,19 +414,19 @@ def test_a_checkpoint_is_the_search(checkpoint, descent):
 
 
 def fewer_starts(path):
-    Keeper(path, SEARCH_FACTS, 2).save(search_of(Descent(None, "bfgs", 0.1), starts=STARTS - 1))
+    CheckpointFile(path, SEARCH_FACTS, 2).save(search_of(Descent(None, "bfgs", 0.1), starts=STARTS - 1))
 
 
 def fewer_gains(path):
-    Keeper(path, SEARCH_FACTS, 2).save(search_of(Descent(None, "bfgs", 0.1), gains=GAINS - 1))
+    CheckpointFile(path, SEARCH_FACTS, 2).save(search_of(Descent(None, "bfgs", 0.1), gains=GAINS - 1))
 
 
 def another_optimiser(path):
-    Keeper(path, SEARCH_FACTS, 2).save(search_of(Descent(None, "adam", 0.1)))
+    CheckpointFile(path, SEARCH_FACTS, 2).save(search_of(Descent(None, "adam", 0.1)))
 
 
 def of_another_round(path):
-    Keeper(path, SEARCH_FACTS, 1).save(search_of(Descent(None, "bfgs", 0.1)))
+    CheckpointFile(path, SEARCH_FACTS, 1).save(search_of(Descent(None, "bfgs", 0.1)))
 
 
 def no_history(arrays, facts):
@@ -490,7 +490,7 @@ def test_a_folder_in_place_of_a_checkpoint_is_named_and_kept(checkpoint, descent
 )
 def test_a_checkpoint_of_another_search_is_refused_in_words(other, words, checkpoint, descent):
     with pytest.raises(ValueError, match=r"checkpoint-2.npz belongs to another search") as raised:
-        Keeper(checkpoint.path, other, 2).load(descent, STARTS, GAINS)
+        CheckpointFile(checkpoint.path, other, 2).load(descent, STARTS, GAINS)
     assert words in str(raised.value)
     assert checkpoint.path.exists()
 

@@ -15,7 +15,8 @@ from reference import benchmarks, case_file, commands, fields, markdown, metrics
 
 import ambjax
 from ambjax.__main__ import main
-from ambjax.cases.reader import KINDS, OTHERS, TABLES, case_from
+from ambjax.cases.controller_tables import KINDS
+from ambjax.cases.reader import OTHERS, TABLES, case_from
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.table import Table
 from ambjax.commands.outputs import table

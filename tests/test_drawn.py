@@ -413,7 +413,7 @@ def test_the_cells_of_a_map_are_where_they_were_run(path, drawn, monkeypatch):
 def test_the_outlines_of_a_map_are_those_of_the_bounds_of_its_interval(drawn):
     x, y = np.arange(4.0), np.arange(3.0)
     survival, low, high = (np.tile(np.arange(4) >= k, (3, 1)).astype(float) for k in (2, 3, 1))
-    panel = {"title": "", "x": x, "y": y, "survival": survival, "low": low, "high": high, "error": None}
+    panel = heatmaps.MapPanel("", x, y, survival, low, high, None)
     heatmaps.maps([panel], "x", "y", False, False, NOWHERE)
     outlines = [c for c in drawn[0].axes[0].collections if isinstance(c, LineCollection)]
     places = [{float(segment[0, 0]) for segment in one.get_segments()} for one in outlines]

@@ -99,7 +99,7 @@ class Sampled:
     def row(self, t, state, errors, alive):
         return Line(t, state.plant.x, state.u, state.steps, 0.0 * t, alive)
 
-    def noted(self, row, span):
+    def completed(self, row, span):
         return row._replace(u_mean=span.densities.u / jnp.where(span.time > 0, span.time, 1.0))
 
     def singularity(self, row):

@@ -132,8 +132,8 @@ LAWS = [
         "current",
     )
 ]
-# Modules that may import the modules of laws: the reader of case files, the paper's parameters and the public API.
-MAKERS = ("ambjax.control.", "ambjax.cases.reader", "ambjax.paper.", "ambjax", "ambjax.extend")
+# Modules that may import the modules of laws: the reader of [controller], the paper's parameters, the public API.
+MAKERS = ("ambjax.control.", "ambjax.cases.controller_tables", "ambjax.paper.", "ambjax", "ambjax.extend")
 
 
 @functools.cache

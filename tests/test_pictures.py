@@ -332,15 +332,10 @@ def test_tornado_of_hard_cases(tmp_path, drawn):
 def a_panel(survival, error=None, x=None, y=None):
     survival = np.asarray(survival, float)
     ny, nx = survival.shape
-    return {
-        "title": "repaired",
-        "x": np.geomspace(1e-6, 1e-3, nx) if x is None else x,
-        "y": np.geomspace(1e-5, 1e-3, ny) if y is None else y,
-        "survival": survival,
-        "low": np.clip(survival - 0.02, 0, 1),
-        "high": np.clip(survival + 0.02, 0, 1),
-        "error": error,
-    }
+    x = np.geomspace(1e-6, 1e-3, nx) if x is None else x
+    y = np.geomspace(1e-5, 1e-3, ny) if y is None else y
+    low, high = np.clip(survival - 0.02, 0, 1), np.clip(survival + 0.02, 0, 1)
+    return heatmaps.MapPanel("repaired", x, y, survival, low, high, error)
 
 
 def test_maps_outline_the_cells_that_survive(tmp_path, drawn):
@@ -394,7 +389,7 @@ def test_maps_of_hard_cases(tmp_path, survival, error):
 
 def test_a_map_without_confidence_bounds_names_none(tmp_path, drawn):
     heatmaps.maps([a_panel(ALL)], "x", "y", False, False, tmp_path / "with.png")
-    heatmaps.maps([a_panel(ALL) | {"low": None, "high": None}], "x", "y", False, False, tmp_path / "without.png")
+    heatmaps.maps([a_panel(ALL)._replace(low=None, high=None)], "x", "y", False, False, tmp_path / "without.png")
     assert ["confidence interval" in texts(figure) for figure in drawn] == [True, False]
     assert "all runs survive in" in texts(drawn[1])
     assert ["95 %" in texts(figure) for figure in drawn] == [True, False]

@@ -125,7 +125,7 @@ def test_the_printed_command_replays_the_worst_member(printed, monkeypatch, caps
     folder, said, columns, summary = printed
     monkeypatch.chdir(folder)
     no_pictures(monkeypatch)
-    monkeypatch.setattr(replaying, "STRETCH", 300)  # four stretches, the last of which the run does not fill
+    monkeypatch.setattr(replaying, "SEGMENT", 300)  # four stretches, the last of which the run does not fill
     (line,) = commands(said)
     assert line == summary["worst"][0]["replay"]
     assert run(f"{line} --json --out alone") == 0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ambjax as amb
-from ambjax.cases.reader import KINDS as EVERY
+from ambjax.cases.controller_tables import KINDS as EVERY
 from ambjax.control.base import default_law
 from ambjax.control.processor import Processor
 from ambjax.simulation.folds import Rms

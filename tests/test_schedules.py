@@ -15,7 +15,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
 from ambjax.control.cascade_state import Sample
-from ambjax.control.schedule import OVER, extremes, present
+from ambjax.control.schedule import OVER, extremes, with_gains_at
 from ambjax.ensemble.paths import kinds, places
 from ambjax.linear import loop_matrices
 from ambjax.numerics.records import validate
@@ -23,7 +23,7 @@ from ambjax.theorem.conditions import constant_sigma, required
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 from tuning.config import tune_from
-from tuning.objective.ranges import drawn
+from tuning.objective.ranges import from_unit_cube
 from tuning.objective.shortfalls import Bound, shortfall
 from tuning.problem import problem_of
 from tuning.report.tuned import tuned
@@ -127,7 +127,7 @@ def test_a_constant_schedule_is_the_plain_gain(more):
 
 def test_a_law_without_a_schedule_is_itself():
     law = loop().cascade.position
-    assert present(law, 0.0, Reference(*[jnp.zeros(())] * 3)) is law
+    assert with_gains_at(law, 0.0, Reference(*[jnp.zeros(())] * 3)) is law
     assert extremes(law) == (law,)
     law = loop(k=table(25.0, 10.0, 60.0)).cascade.position
     assert [one.k for one in extremes(law)] == [10.0, 60.0]
@@ -235,7 +235,9 @@ def test_knots_are_searched_in_the_range_of_their_gain():
     one, many = ([(row.low, row.high, row.most) for row in problem.ranges] for problem in problems)
     assert many == [one[0]] * 3 + [one[1]]
     # the screen begins at constant gains
-    points = drawn(problems[1].objective.space, problems[1].ranges, np.random.default_rng(0).uniform(size=(3, 4)))
+    points = from_unit_cube(
+        problems[1].objective.space, problems[1].ranges, np.random.default_rng(0).uniform(size=(3, 4))
+    )
     assert np.all(points[:, :3] == points[:, :1])
     assert np.any(points[:, 3] != points[:, 2])
     # the condition k > Q_z applies to each knot

@@ -15,7 +15,9 @@ import pytest
 from texts import case_and_tune
 
 from ambjax import Cascade, Clock, Initial, Scenario, Sensor, Sine, Slide, inversion, rollout
+from ambjax.__main__ import main as simulated
 from ambjax.ensemble import Percent, Spread
+from tuning.__main__ import main
 from tuning.objective.goal import Goal
 from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS, loss_for, weigh
@@ -24,9 +26,9 @@ from tuning.objective.risk import CVaR, Mean
 from tuning.objective.shortfalls import bounds
 from tuning.optimisers import CLIFF, NAMES, SHORTER, bfgs, optimiser
 from tuning.problem import problem_of
+from tuning.search.checkpoint import CheckpointFile, SearchState
 from tuning.search.course import GAIN, MOST_SEARCHES, should_restart
 from tuning.search.descent import Descent
-from tuning.search.keeper import Keeper, SearchState
 from tuning.search.optimise import _begin_full_phase, best_of, search
 from tuning.search.screen import FAR, NEAR, around, initial_points, screen
 from tuning.space import Gain, Space
@@ -325,32 +327,32 @@ def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):
         if kept.iteration == 4:
             raise StopError
 
-    keeper = Keeper(tmp_path / "kept.npz", facts)
+    checkpoint_file = CheckpointFile(tmp_path / "kept.npz", facts)
     with pytest.raises(StopError):
-        run(small, keeper=keeper, on_iteration=stop)
-    resumed = run(small, keeper=keeper, resume=True)
+        run(small, checkpoint_file=checkpoint_file, on_iteration=stop)
+    resumed = run(small, checkpoint_file=checkpoint_file, resume=True)
     for a, b in zip(jax.tree.leaves(whole.starts), jax.tree.leaves(resumed.starts), strict=True):
         np.testing.assert_array_equal(a, b)
     assert 0 < resumed.earlier < resumed.seconds  # what it took before counts
     assert not list(tmp_path.glob("*.part*"))
     with pytest.raises(ValueError, match="another search: case is 1 in the file and 2 in this run"):
-        run(small, keeper=Keeper(tmp_path / "kept.npz", {"case": 2}), resume=True)
+        run(small, checkpoint_file=CheckpointFile(tmp_path / "kept.npz", {"case": 2}), resume=True)
 
 
 def test_a_search_whose_checkpoint_was_damaged_is_the_uninterrupted_one(small, tmp_path, capsys):
     whole = run(small)
-    keeper = Keeper(tmp_path / "kept.npz", {"case": 1}, 3)
-    run(small, keeper=keeper, iterations=2)
-    content = bytearray(keeper.path.read_bytes())
+    checkpoint_file = CheckpointFile(tmp_path / "kept.npz", {"case": 1}, 3)
+    run(small, checkpoint_file=checkpoint_file, iterations=2)
+    content = bytearray(checkpoint_file.path.read_bytes())
     content[len(content) // 2] ^= 1
-    keeper.path.write_bytes(content)
-    again = run(small, keeper=keeper, resume=True)
+    checkpoint_file.path.write_bytes(content)
+    again = run(small, checkpoint_file=checkpoint_file, resume=True)
     said = capsys.readouterr().err
-    assert said.startswith(f"{keeper.path}: ")
+    assert said.startswith(f"{checkpoint_file.path}: ")
     assert said.endswith("; round 3 is begun again\n")
     for a, b in zip(jax.tree.leaves(whole.starts), jax.tree.leaves(again.starts), strict=True):
         np.testing.assert_array_equal(a, b)
-    assert run(small, keeper=keeper, resume=True).ended
+    assert run(small, checkpoint_file=checkpoint_file, resume=True).ended
 
 
 def test_the_second_phase_goes_back_to_what_was_given_where_the_path_is_worse(small):
@@ -509,7 +511,7 @@ def command(*words):
 
 
 @pytest.mark.slow
-def test_the_command_tunes_a_case_that_simulate_runs(tmp_path):
+def test_the_command_tunes_a_case_that_simulate_runs(tmp_path, capsys):
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(CASE)
     done = command(path, "--out", out, "--json")
@@ -518,10 +520,10 @@ def test_the_command_tunes_a_case_that_simulate_runs(tmp_path):
     assert report["after"]["lost"] == 0
     assert report["before"]["lost"] == 8
     assert {p.name for p in out.iterdir()} >= {"tuned.toml", "history.npz", "report.md", "report.html", "report.json"}
-    run = [sys.executable, "-m", "ambjax", "simulate", str(out / "tuned.toml"), "--out", str(tmp_path / "run")]
-    assert subprocess.run(run, capture_output=True).returncode == 0
-    again = command(path, "--out", out, "--json", "--resume")
-    assert json.loads(again.stdout)["gains"] == report["gains"]
+    assert simulated(["simulate", str(out / "tuned.toml"), "--out", str(tmp_path / "run")]) == 0
+    capsys.readouterr()
+    assert main([str(path), "--out", str(out), "--json", "--resume"]) == 0
+    assert json.loads(capsys.readouterr().out)["gains"] == report["gains"]
 
 
 @pytest.mark.thorough
@@ -558,15 +560,15 @@ def test_a_killed_tuning_goes_on_and_damage_is_found(tmp_path):
     assert command(path, "--out", whole, "--resume").returncode == fresh.returncode
 
 
-@pytest.mark.slow
-def test_bad_input_ends_with_2_and_writes_nothing(tmp_path):
+def test_bad_input_ends_with_2_and_writes_nothing(tmp_path, capsys):
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(CASE + 'optimiser = "best"\n')
-    done = command(path, "--out", out)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-    assert "Traceback" not in done.stderr
+    assert main([str(path), "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert "Traceback" not in said
     assert not out.exists()
-    assert command(tmp_path / "none.toml").returncode == 2
+    assert main([str(tmp_path / "none.toml")]) == 2
     path.write_text(CASE)
-    assert f"--resume: --out {out} contains no search" in command(path, "--out", out, "--resume").stderr
+    assert main([str(path), "--out", str(out), "--resume"]) == 2
+    assert f"--resume: --out {out} contains no search" in capsys.readouterr().err

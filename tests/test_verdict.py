@@ -86,10 +86,8 @@ def test_a_pulse_that_breaks_the_loop_is_what_a_gain_is_set_by(capsys):
 
 
 def condition(gain, against, path="controller.inversion.gamma", ideal=False, at=0.1):
-    where = "reference" if ideal else "run"
-    return Condition(
-        "x", f"gamma > Delta_1 along the {where}", gain, against, at, "u", gain > against, path=path, ideal=ideal
-    )
+    over = f"Delta_1 along the {'reference' if ideal else 'run'}"
+    return Condition("x", f"gamma > {over}", gain, against, at, "u", gain > against, "", path, over, ideal)
 
 
 def test_no_gain_is_set_by_what_a_falling_rotor_does():
@@ -154,9 +152,9 @@ def test_every_command_says_the_same_of_a_rotor(kind, capsys, monkeypatch):
     report = Report([condition(2.0, 1.0)], [], lost_at, "touched down", "", stalled)
     sampled = sampled_report.SampledReport([], [], lost_at, "touched down", stalled)
     assert report.holds == sampled.holds == (kind == "held")
-    messages = {"check": "\n".join(advice.answer(report, "case.toml"))}
+    messages = {"check": "\n".join(advice.theorem_lines(report, "case.toml"))}
     messages["on a processor"] = "\n".join(
-        advice.on_processor(sampled, sampled_report.Delays(None, None, None, 0.1), None)
+        advice.processor_lines(sampled, sampled_report.Delays(None, None, None, 0.1), None)
     )
     genuine = simulate._simulated
 

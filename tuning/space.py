@@ -17,6 +17,7 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import Schedule
+from ambjax.extend import Scalar
 
 # A coordinate bends within 1/SHARP of a bound, in logarithms. A logistic curve over the whole interval would put the
 # bound at infinity, so that a search converges slowly to an optimum at the bound.
@@ -47,7 +48,7 @@ class Gain:
         """The path within the law: the name of the gain, and the number of its knot if it has a schedule."""
         return self.path.split(".", 2)[2]
 
-    def encode(self, gain: Any) -> Any:
+    def encode(self, gain: float) -> float:
         """Return the coordinate of a gain strictly within the bounds."""
         if math.isinf(self.high):
             return np.log(gain - self.low)
@@ -170,7 +171,7 @@ def read(cascade: Cascade, path: str) -> Any:
     return value.values[int(knot[0])] if knot else value
 
 
-def _write(cascade: Cascade, path: str, value: object) -> Cascade:
+def _write(cascade: Cascade, path: str, value: Scalar) -> Cascade:
     _, stage, name, *knot = path.split(".")
     law = getattr(cascade, stage)
     law = dataclasses.replace(law, **{name: getattr(law, name).with_knot(int(knot[0]), value) if knot else value})

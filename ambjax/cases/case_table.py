@@ -20,18 +20,23 @@ def parts_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> dict[str, st
     laws = {stage: getattr(cascade, stage) for stage in ("observer", "position", "inversion", "current")}
     given = {slot: getattr(scenario, slot) for slot in SLOTS}
     signals = {f"{slot} ({UNITS[slot]})": one for slot, one in given.items() if one != Constant()}
-    same = _numbers_of(cascade.model).partition(":")[2] == _numbers_of(scenario.plant).partition(":")[2]
+    same = _numbers_of(cascade.model) == _numbers_of(scenario.plant)
     model = None if same else cascade.model
     world = {"sensor": scenario.sensor, "actuator": scenario.amplifier, "stop": scenario.stop}
     parts = {"plant": scenario.plant, "model": model, **laws, "processor": cascade.processor, **signals, **world}
-    parts_text = {name: _numbers_of(one) for name, one in parts.items() if one is not None}
+    parts_text = {name: _described(one) for name, one in parts.items() if one is not None}
     supply, period = float(np.max(scenario.u_max)), float(clock.sample_period)
     limit = {"supply": f"{supply:g} V"} if np.isfinite(supply) else {}
     return parts_text | limit | {"clock": f"{clock.samples} samples of {period:g} s, {clock.method}"}
 
 
+def _described(part: object) -> str:
+    """Return the type of a record and its numbers."""
+    return ": ".join(filter(None, (type(part).__name__, _numbers_of(part))))
+
+
 def _numbers_of(part: object) -> str:
-    """Return the type of a record and its numbers with their units; a nested record in parentheses."""
+    """Return the numbers of a record with their units, separated by commas; nested records in parentheses."""
     words = []
     for field in dataclasses.fields(part) if dataclasses.is_dataclass(part) else ():
         value, unit = getattr(part, field.name), field.metadata.get("unit", "")
@@ -41,8 +46,8 @@ def _numbers_of(part: object) -> str:
             shown = f"{float(value):g}" if np.ndim(value) == 0 else f"{np.size(value)} values"
             words.append(f"{field.name} = {shown}{f' {unit}' if unit not in ('', '1') else ''}")
         elif dataclasses.is_dataclass(value):
-            words.append(f"{field.name} ({_numbers_of(value)})")
-    return f"{type(part).__name__}{': ' if words else ''}{', '.join(words)}"
+            words.append(f"{field.name} ({_described(value)})")
+    return ", ".join(words)
 
 
 def case_table(name: str, parts: dict[str, str], spread: tuple[str, ...]) -> str:

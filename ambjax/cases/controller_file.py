@@ -3,13 +3,13 @@
 import contextlib
 import pathlib
 import zipfile
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ambjax.cases.own_laws import path_from
 from ambjax.cases.table import Table, show
-from ambjax.control.realisation import Realisation, realisation
+from ambjax.control.realisation import Matrices, Realisation, realisation
 
 NAMES, OPTIONAL = ("A", "B", "C", "D"), "dt"
 ENDINGS = (".npz", ".mat")
@@ -45,7 +45,7 @@ def controller_file(table: Table, folder: pathlib.Path) -> ControllerFile:
         raise ValueError(f"{table.at('file')} = {show(written)}: {error}") from None
 
 
-def read_controller(path: pathlib.Path) -> dict[str, Any]:
+def read_controller(path: pathlib.Path) -> dict[str, np.ndarray]:
     """Return the arrays A, B, C, D and, if the file has it, dt of an .npz or .mat file.
 
     Raises ValueError if the file cannot be read or lacks an array.
@@ -65,7 +65,7 @@ def _needed() -> str:
     return "the arrays A, B, C, D and, for a discrete controller, dt in s"
 
 
-def _of_npz(path: pathlib.Path) -> dict[str, Any]:
+def _of_npz(path: pathlib.Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path) as file:
             return {name: file[name] for name in file.files}
@@ -73,7 +73,7 @@ def _of_npz(path: pathlib.Path) -> dict[str, Any]:
         raise ValueError("not an .npz file of plain numbers. Write it by save_controller, or numpy.savez.") from None
 
 
-def _of_mat(path: pathlib.Path) -> dict[str, Any]:
+def _of_mat(path: pathlib.Path) -> dict[str, np.ndarray]:
     import scipy.io
 
     try:
@@ -89,7 +89,7 @@ def _of_mat(path: pathlib.Path) -> dict[str, Any]:
     return arrays
 
 
-def save_controller(path: str | pathlib.Path, system: Any) -> None:
+def save_controller(path: str | pathlib.Path, system: Matrices) -> None:
     """Write a state space of python-control or SciPy into an .npz file that a case file may name.
 
     `system`: an object with the matrices A, B, C, D and the period dt (s). Raises ValueError as `realisation` does.

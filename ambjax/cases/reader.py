@@ -7,28 +7,22 @@ ValueError with one line: the dotted path, the value, what is allowed and the fi
 import dataclasses
 import pathlib
 import re
-from typing import Any, NamedTuple
+from typing import Any
 
 from ambjax.cases.case_table import case_table, parts_of
-from ambjax.cases.controller_file import ControllerFile, controller_file
-from ambjax.cases.gain_tables import law_from
-from ambjax.cases.own_laws import FORM, OwnLaw, is_own, own_law
+from ambjax.cases.controller_file import ControllerFile
+from ambjax.cases.controller_tables import KINDS, Files, cascade_from, processor_from
+from ambjax.cases.own_laws import OwnLaw
 from ambjax.cases.reach import check_reference
 from ambjax.cases.recordings import RecordedFile, Recordings
-from ambjax.cases.scenario_tables import check_start, drive, scenario_from
+from ambjax.cases.scenario_tables import check_start, scenario_from
 from ambjax.cases.table import Table, check_depth, cut, load
 from ambjax.cases.timing import clock_from, settled
 from ambjax.cases.variation import spread_from
-from ambjax.control import current, inversion, observer, position
-from ambjax.control.base import Law, default_law
 from ambjax.control.cascade import Cascade
-from ambjax.control.guard import Guard
-from ambjax.control.linear_controller import OUTPUTS
-from ambjax.control.processor import Processor
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.host.words import one_line
 from ambjax.linear.analysis import Zones
-from ambjax.numerics.records import Scalar
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sliding import Slide, slides
@@ -39,44 +33,7 @@ from ambjax.world.iron import Iron
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
 
-# The laws by stage and kind; the first of a stage is the default. A new law is one row here.
-KINDS: dict[str, dict[str, type[Law]]] = {
-    "observer": {
-        "direct": observer.Direct,
-        "complementary": observer.Complementary,
-        "difference": observer.Difference,
-        "kalman": observer.Kalman,
-        "ired-1": observer.IRED1,
-        "ired-2": observer.IRED2,
-    },
-    "position": {
-        "sliding-mode": position.SlidingMode,
-        "integral-sliding-mode": position.IntegralSlidingMode,
-        "super-twisting": position.SuperTwisting,
-        "utkin-sliding-mode": position.UtkinSlidingMode,
-        "terminal-sliding-mode": position.TerminalSlidingMode,
-        "pid": position.PID,
-        "feedback-linearisation": position.FeedbackLinearisation,
-        "state-feedback": position.StateFeedback,
-        "chain": position.FilterChain,
-        "linear": position.LinearController,
-    },
-    "inversion": {
-        "adaptive": inversion.Adaptive,
-        "adaptive-feed-forward": inversion.FeedForwardAdaptive,
-        "closed-form": inversion.ClosedForm,
-        "linearised": inversion.Linearised,
-    },
-    "current": {
-        "sliding-mode": current.SlidingMode,
-        "pi": current.ProportionalIntegral,
-        "dead-beat": current.DeadBeat,
-        "open-loop": current.OpenLoop,
-        "amplifier": current.AmplifierCurrent,
-    },
-}
 PLANTS: dict[str, type] = {"lumped": Plant, "two-coil": TwoCoil}
-DISCRETISATIONS = ["implicit", "explicit"]
 TABLES = [
     "plant",
     "controller",
@@ -92,7 +49,6 @@ TABLES = [
     "sensitivity",
 ]
 OTHERS = ["tune"]  # read by the tuner, ignored by the other commands
-(DELAY,) = (field for field in dataclasses.fields(Processor) if field.name == "delay")
 # A case name appears in titles, paths, tables and pages: characters that are replaced, and the largest length.
 UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
 
@@ -173,11 +129,11 @@ def case_from(
     top = Table(raw)
     top.only([*TABLES, *OTHERS])
     plant = _plant(top.table("plant"))
-    processor = _processor(top.table("processor")) if "processor" in top.raw else None
+    processor = processor_from(top.table("processor")) if "processor" in top.raw else None
     clock, duration = clock_from(top.table("clock"))
     period = None if processor is None else clock.sample_period
     files = Files(folder, known.own_laws if known else (), known.controller_file if known else None)
-    cascade, own, matrices = _cascade(top, plant, processor, period, files)
+    cascade, own, matrices = cascade_from(top, plant, processor, period, files)
     recordings = Recordings(folder, known.recorded if known else ())
     scenario, settle = scenario_from(top, plant, recordings)
     check_parts(cascade, scenario, clock.sample_period)
@@ -204,22 +160,6 @@ def case_from(
     return Case(safe_name(name), cascade, scenario, clock, settle, spread, text, assumed, own, matrices, zones, read)
 
 
-class Files(NamedTuple):
-    """The folder of a case file, and what was read already of the files that it names."""
-
-    folder: pathlib.Path
-    own: tuple[OwnLaw, ...]
-    controller: ControllerFile | None
-
-
-def _processor(table: Table) -> Processor:
-    table.only(["delay", "discretisation", "predict", "guard"])
-    delay = table.leaf("delay", DELAY, DELAY.default)
-    implicit = table.choice("discretisation", DISCRETISATIONS, DISCRETISATIONS[0]) == DISCRETISATIONS[0]
-    guard = None if table.raw.get("guard") is False else table.table("guard").record(Guard)
-    return Processor(delay, implicit, table.switch("predict"), guard=guard)
-
-
 def _plant(table: Table) -> Bearing:
     kind = table.choice("kind", list(PLANTS), next(iter(PLANTS)))
     plant = table.record(PLANTS[kind], extra=("kind", "iron"))
@@ -233,69 +173,3 @@ def _left_out(table: Table, plant: Bearing) -> tuple[str, ...]:
     names = [field.name for field in dataclasses.fields(plant) if field.metadata.get("leaf")]
     left = tuple(name for name in names if name not in table.raw)
     return left if len(left) < len(names) else ()
-
-
-def _cascade(
-    top: Table,
-    plant: Bearing,
-    processor: Processor | None,
-    period: Scalar | None,
-    files: Files,
-) -> tuple[Cascade, tuple[OwnLaw, ...], ControllerFile | None]:
-    table, actuator = top.table("controller"), top.table("actuator")
-    command = drive(actuator)
-    table.only(["model", *KINDS])
-    model = table.table("model").record(Plant, base=plant)  # always lumped, even for a two-coil plant
-    laws, own, matrices = {}, [], None
-    for stage, kinds in KINDS.items():
-        law = table.table(stage)
-        if is_own(law.raw.get("kind")):
-            found = [one for one in files.own if one.stage == stage]
-            own += found or [own_law(stage, law.raw["kind"], files.folder, model)]
-            kind = own[-1].law
-        else:
-            kind = kinds[law.choice("kind", list(kinds), _usual(kinds, laws.get("position"), command), FORM)]
-        if kind is position.LinearController:
-            laws[stage], matrices = _linear(law, files)
-        else:
-            laws[stage] = law_from(_nominal(law, kind, actuator), kind, _defaults(law, kind, model, period))
-    return Cascade(model=model, processor=processor, **laws), tuple(own), matrices
-
-
-def _usual(kinds: dict[str, type[Law]], demanding: Any, command: str) -> str:
-    """Return the kind of a law that is left out.
-
-    It is the first that accepts the demand of the position law, if that is known, and commands what the amplifier
-    follows, a "voltage" or a "current". If there is none, it is the first that commands this.
-    """
-    fitting = [kind for kind, law in kinds.items() if getattr(law, "commands", command) == command]
-    if demanding is None:
-        return fitting[0]
-    accepting = [kind for kind in fitting if demanding.demand in getattr(kinds[kind], "accepts", (demanding.demand,))]
-    return [*accepting, *fitting][0]
-
-
-def _nominal(law: Table, kind: Any, actuator: Table) -> Table:
-    """Return the table of a law; one that commands a current has the amplifier's bandwidth by default."""
-    if getattr(kind, "commands", "") != "current" or "bandwidth" not in actuator.raw:
-        return law
-    return Table({"bandwidth": actuator.raw["bandwidth"], **law.raw}, law.path)
-
-
-def _linear(table: Table, files: Files) -> tuple[Law, ControllerFile]:
-    """Return the linear controller of a table, and its file."""
-    law = table.record(position.LinearController, extra=("kind", "file", "output"))
-    output = table.choice("output", list(OUTPUTS), OUTPUTS[0])
-    found = files.controller or controller_file(table, files.folder)
-    return dataclasses.replace(law, output=output, realisation=found.contents), found
-
-
-def _defaults(table: Table, kind: Any, model: Plant, period: Scalar | None) -> Law | None:
-    """Return the law of this kind with its default gains; None if the table gives every gain."""
-    names = {field.name for field in dataclasses.fields(kind) if field.metadata.get("leaf")}
-    if names <= set(table.raw):
-        return None
-    try:
-        return default_law(kind, model, None if period is None else float(period))
-    except ValueError as error:
-        raise ValueError(f"{table.path}: {error}. Give all of {', '.join(sorted(names))}.") from None

@@ -4,8 +4,9 @@ import dataclasses
 import math
 
 from ambjax.cases import tune_table
+from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.data_sheet import BEARING
-from ambjax.cases.reader import KINDS, PLANTS
+from ambjax.cases.reader import PLANTS
 from ambjax.cases.rig import RIG
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.ensemble.design import DESIGNS
@@ -159,7 +160,7 @@ def _with_note(text: str, comment: str) -> str:
 def _tune() -> list[str]:
     """Return the lines of [tune], all of them comments."""
     head = ("# [tune]", "for 'ambjax tune', which starts at the gains above. Each key has its default here")
-    rows = [(f"# {line.text}" if line.text else "#", line.comment) for line in tune_table.lines()]
+    rows = [(f"# {line.text}" if line.text else "#", line.comment) for line in tune_table.template_lines()]
     return [_with_note(*row) if len(row[0]) < 30 else f"{row[0]}  # {row[1]}" for row in [head, *rows]]
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from ambjax.control.schedule import OVER, Schedule, finite
-from ambjax.numerics.declared import numbers
+from ambjax.numerics.declared import allowed
 
 # Exported code is compared with JAX also at each parameter's value divided and multiplied by this factor.
 SPAN = 100.0
@@ -63,12 +63,8 @@ def _number(name: str, field: dataclasses.Field, value: float) -> Number:
     """Return the number of a field, with the unit, range and meaning that the field declares."""
     meta = field.metadata
     unit, doc = meta.get("unit", ""), meta.get("doc", "")
-    allowed = numbers(field) if meta.get("leaf") else ""
-    for word in (f" ({unit})", "a finite number ", "a number "):
-        allowed = allowed.replace(word, "")
-    if meta.get("steepness"):
-        allowed = allowed.replace(", or inf", ", finite: set p = inf in the case and export again")
-    return Number(name, unit, allowed, doc, value, _ends(meta, value))
+    infinity = "finite: set p = inf in the case and export again" if meta.get("steepness") else "or inf"
+    return Number(name, unit, allowed(field, infinity), doc, value, _ends(meta, value))
 
 
 def _ends(meta: Mapping[str, Any], value: float) -> tuple[float, ...]:

@@ -1,6 +1,6 @@
 """The points at which the exported step is compared with JAX: parameters, states and inputs.
 
-`points` keeps the case's parameters; `varied` sets each of them to the ends of its range.
+`verification_points` keeps the case's parameters; `varied` sets each of them to the ends of its range.
 """
 
 from typing import Any, NamedTuple
@@ -32,7 +32,7 @@ class Points(NamedTuple):
     inputs: np.ndarray
 
 
-def points(trace: Trace, count: int, seed: int = 0) -> Points:
+def verification_points(trace: Trace, count: int, seed: int = 0) -> Points:
     """Return points with the case's parameters: random over decades, edges, and both sides of every comparison."""
     random, dtype = np.random.default_rng(seed), PRECISIONS[trace.precision]
     drawn = max(DRAWS * count, POOL)

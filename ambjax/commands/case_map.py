@@ -10,7 +10,7 @@ import numpy as np
 from ambjax.cases.reader import Case, require_case
 from ambjax.cases.timing import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
 from ambjax.commands.ensemble import study_of
-from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, stepped
+from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, with_method_for_axes
 from ambjax.ensemble.paths import Place, places
 from ambjax.ensemble.study import Study
 from ambjax.host.arguments import names_arguments
@@ -91,11 +91,11 @@ def survival_map(case: Case, x: str, y: str, *, members: int = 1, seed: int | No
     for name, axis in (("x", x), ("y", y)):
         if not isinstance(axis, str):
             raise ValueError(f"{name} = {axis!r}: it must be text. Write {FORM}.")
-    study, *axes = prepared(case, x, y, members, seed)
+    study, *axes = study_and_axes(case, x, y, members, seed)
     return CaseMap(case, grid(study, *axes))
 
 
-def prepared(case: Case, x: str, y: str, members: int, seed: int | None) -> tuple[Study, Axis, Axis]:
+def study_and_axes(case: Case, x: str, y: str, members: int, seed: int | None) -> tuple[Study, Axis, Axis]:
     """Return the study and the axes of a map. Raises ValueError as `survival_map` does."""
     study = study_of(case, seed, members)
     first, second = _axis("--x", x, case), _axis("--y", y, case)
@@ -103,7 +103,7 @@ def prepared(case: Case, x: str, y: str, members: int, seed: int | None) -> tupl
     if cells * members > MOST_CELLS:
         raise ValueError(f"--members {members}: times {cells} cells, it exceeds {MOST_CELLS:,} runs. Reduce either.")
     _check_samples(case, first, second, members)
-    return stepped(study, first, second), first, second
+    return with_method_for_axes(study, first, second), first, second
 
 
 def unit_of(case: Case, axis: Axis) -> str:
@@ -112,17 +112,19 @@ def unit_of(case: Case, axis: Axis) -> str:
     return "s" if place is None else place.field.metadata["unit"]
 
 
-def panel(case: Case, one: Map) -> dict[str, Any]:
-    """Return the contents of a panel of `heatmaps.map_figure`."""
-    return {
-        "title": f"{case.name}\n{_subtitle(one)}",
-        "x": one.x.values,
-        "y": one.y.values,
-        "survival": one.survival,
-        "low": one.low if one.decisive else None,
-        "high": one.high if one.decisive else None,
-        "error": one.error,
-    }
+def panel(case: Case, one: Map) -> Any:
+    """Return the panel of a map, a `heatmaps.MapPanel`."""
+    from ambjax.pictures.heatmaps import MapPanel
+
+    return MapPanel(
+        title=f"{case.name}\n{_subtitle(one)}",
+        x=one.x.values,
+        y=one.y.values,
+        survival=one.survival,
+        low=one.low if one.decisive else None,
+        high=one.high if one.decisive else None,
+        error=one.error,
+    )
 
 
 def _subtitle(one: Map) -> str:

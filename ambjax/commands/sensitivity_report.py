@@ -6,10 +6,10 @@ import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.commands.outputs import table
-from ambjax.control.base import hard_signs
+from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import USUAL
 from ambjax.linear import Injection, MemberPeaks, Zones
-from ambjax.results.operating import OperatingPoint, SpreadPeaks, numbers_of
+from ambjax.results.operating import OperatingPoint, SpreadPeaks, analysis_summary
 
 
 class Injections(NamedTuple):
@@ -23,21 +23,21 @@ def set_valued(case: Case) -> list[str]:
     """Return the tables of the laws with set-valued signs on a processor, whose linear loops do not describe them."""
     if case.cascade.processor is None:
         return []
-    return [f"controller.{stage}" for stage in USUAL if hard_signs(getattr(case.cascade, stage))]
+    return [f"controller.{stage}" for stage in USUAL if set_valued_signs(getattr(case.cascade, stage))]
 
 
-def summary_of(
+def sensitivity_summary(
     points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injections | None, zones: Zones
 ) -> dict[str, object]:
     """Return the numbers of sensitivity.json: of the equilibria `points`, the spread, and the injection."""
-    rows = [{"point": point.name, "reference_m": point.r, **numbers_of(point.analysis)} for point in points]
+    rows = [{"point": point.name, "reference_m": point.r, **analysis_summary(point.analysis)} for point in points]
     summary: dict[str, object] = {
-        **numbers_of(points[0].analysis),
+        **analysis_summary(points[0].analysis),
         **_injected_numbers(points[0], measured),
         "points": rows,
     }
     if spread is not None:
-        worst = {} if spread.point is None else numbers_of(spread.point.analysis)
+        worst = {} if spread.point is None else analysis_summary(spread.point.analysis)
         counts = {"members": spread.members, "stable": spread.stable, "zone_a": spread.zone_a}
         summary["spread"] = {**counts, "worst_member": spread.worst, **({"worst": worst} if worst else {})}
         if spread.measured is not None:
@@ -107,7 +107,7 @@ def _injection_text(point: OperatingPoint, measured: Injection, channel: int = 0
 
 
 def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injections | None) -> str:
-    """Return the numbers of `summary_of` as a table and sentences."""
+    """Return the numbers of `sensitivity_summary` as a table and sentences."""
     worst = [spread.point] if spread is not None and spread.point is not None else []
     head = ("loop", "peak |S|", "at (Hz)", "zone", "peak |T|", "peak |KS| (V/m)", "gain margins")
     margins = ("phase margin (deg)", "delay margin (s)", "disk margin")

@@ -46,9 +46,8 @@ def warnings_of(case: Case) -> list[str]:
 def _assumed(case: Case) -> Iterator[str]:
     plant = case.scenario.plant
     fields = [field for field in dataclasses.fields(plant) if field.name in case.assumed and field.name != GRAVITY]
-    left = [
-        f"{field.name} = {getattr(plant, field.name):g} {field.metadata['unit']}".removesuffix(" 1") for field in fields
-    ]
+    units = {field.name: "" if field.metadata["unit"] == "1" else f" {field.metadata['unit']}" for field in fields}
+    left = [f"{name} = {getattr(plant, name):g}{unit}" for name, unit in units.items()]
     if left:
         yield f"[plant] omits numbers, which keep the paper's values: {', '.join(left)}. Give those that differ."
 

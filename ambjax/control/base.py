@@ -164,7 +164,7 @@ def memory_of(law: Law, state: object) -> list[tuple[str, str, str]]:
     return [(f"x_{path}" if path.isdigit() else path or "x", "", "") for path in paths]
 
 
-def hard_signs(law: Law) -> list[str]:
+def set_valued_signs(law: Law) -> list[str]:
     """Return the names of the steepnesses that are inf or None, which make a sign set-valued.
 
     Traced steepnesses are left out. Raises ValueError if a steepness is inf for some members only.
@@ -185,22 +185,22 @@ def hard_signs(law: Law) -> list[str]:
     return names
 
 
-def hardened(law: L) -> L:
-    """Return the law with None for every steepness that is inf. Raises ValueError as `hard_signs` does."""
+def with_set_valued_signs(law: L) -> L:
+    """Return the law with None for every steepness that is inf. Raises ValueError as `set_valued_signs` does."""
     given: Any = law
-    return dataclasses.replace(given, **dict.fromkeys(hard_signs(law)))
+    return dataclasses.replace(given, **dict.fromkeys(set_valued_signs(law)))
 
 
-def unhardened(law: L) -> L:
+def with_infinite_steepness(law: L) -> L:
     """Return the law with inf for every steepness that is None, so that its slope is a number."""
     given: Any = law
-    return dataclasses.replace(given, **dict.fromkeys(hard_signs(law), np.inf))
+    return dataclasses.replace(given, **dict.fromkeys(set_valued_signs(law), np.inf))
 
 
-def softened(law: L, model: Plant) -> L:
+def with_default_steepness(law: L, model: Plant) -> L:
     """Return the law with the default steepness for the model in place of every inf or None."""
     given: Any = law
-    if not hard_signs(law):
+    if not set_valued_signs(law):
         return law
     usual = default_law(type(law), model)
-    return dataclasses.replace(given, **{name: getattr(usual, name) for name in hard_signs(law)})
+    return dataclasses.replace(given, **{name: getattr(usual, name) for name in set_valued_signs(law)})

@@ -14,7 +14,7 @@ from jax import Array
 
 from ambjax.compiler.barrier import materialised
 from ambjax.control import current, inversion, observer, position
-from ambjax.control.base import default_law, hard_signs, hardened, softened
+from ambjax.control.base import default_law, set_valued_signs, with_default_steepness, with_set_valued_signs
 from ambjax.control.cascade_state import CascadeState, Command, Sample
 from ambjax.control.laws import (
     CurrentInputs,
@@ -24,10 +24,10 @@ from ambjax.control.laws import (
     Observer,
     PositionLaw,
     State,
-    stepped,
+    step_law,
 )
-from ambjax.control.processor import Processor, carried
-from ambjax.control.schedule import extremes, present
+from ambjax.control.processor import Processor, predicted_over_delay
+from ambjax.control.schedule import extremes, with_gains_at
 from ambjax.numerics.records import Scalar, part, record
 from ambjax.world.plant import Plant
 from ambjax.world.plant import State as NominalState
@@ -79,8 +79,8 @@ class Cascade:
             return CascadeState(observed, *(law.init_sampled(self.model) for law in rest))
         states = [law.init(self.model) for law in rest]
         if reference is not None:
-            estimate, _ = present(self.observer, measured.z, reference)(self.model, measured, observed)
-            position = present(self.position, estimate.z, reference)
+            estimate, _ = with_gains_at(self.observer, measured.z, reference)(self.model, measured, observed)
+            position = with_gains_at(self.position, estimate.z, reference)
             states[0] = position.begin(self.model, (estimate, reference))
         return CascadeState(observed, *states)
 
@@ -102,7 +102,7 @@ class Cascade:
 
     def sigma(self, motion: Measurement, reference: Reference) -> Array:
         """Return the sliding variable of the position law (m/s) for a motion (m, m/s, A) and a reference (m)."""
-        return present(self.position, motion.z, reference).sigma(motion, reference)
+        return with_gains_at(self.position, motion.z, reference).sigma(motion, reference)
 
     @property
     def laws(self) -> tuple[Observer, PositionLaw, InversionLaw, CurrentLaw]:
@@ -129,7 +129,7 @@ class Cascade:
         def demanded(
             reference: Reference, z: Array, z_dot: Array, observed: object, positioned: object
         ) -> tuple[tuple[Array, Array], tuple[Measurement, object, object]]:
-            observer = present(self.observer, z, reference)
+            observer = with_gains_at(self.observer, z, reference)
             estimate, observed_rate = observer(self.model, Measurement(z, z_dot, measured.i), observed)
             if self.observer.estimates_velocity:
                 # XLA aborts when it compiles a one-kernel rollout (`compiler.fast_path`) in which z_dot is unused
@@ -152,7 +152,7 @@ class Cascade:
 
     def _demanded(self, estimate: Measurement, reference: Reference, state: State) -> tuple[Array, State]:
         """Return v_star (A^2/m^2) and the rate of the state of the position law."""
-        return present(self.position, estimate.z, reference)(self.model, (estimate, reference), state)
+        return with_gains_at(self.position, estimate.z, reference)(self.model, (estimate, reference), state)
 
     def on_processor(self, *delays: Scalar, between: bool = False) -> "Cascade":
         """Return the cascade with the structure of its compiled program fixed, for use inside jit, grad or vmap.
@@ -161,28 +161,28 @@ class Cascade:
         `between` is true, every delay between them. Raises ValueError as `Processor.resolved` does.
         """
         assert self.processor is not None
-        laws = {stage: hardened(getattr(self, stage)) for stage in USUAL}
+        laws = {stage: with_set_valued_signs(getattr(self, stage)) for stage in USUAL}
         return dataclasses.replace(self, **laws, processor=self.processor.resolved(*delays, between=between))
 
     def check_smooth(self) -> None:
         """Raise ValueError for a law with a steepness of inf: in continuous time a sign must be smoothed."""
         for stage in USUAL:
             law = getattr(self, stage)
-            for name in hard_signs(law):
+            for name in set_valued_signs(law):
                 raise ValueError(
                     f"controller.{stage}.{name} = inf: in continuous time a sign must be smoothed. Give a finite "
-                    "number, or add [processor], which allows the sign itself."
+                    "number, or add [processor], which allows the set-valued sign."
                 )
 
     def in_continuous_time(self) -> "Cascade":
         """Return the cascade without its processor. A steepness of inf becomes the default steepness for the model."""
-        laws = {stage: softened(getattr(self, stage), self.model).in_continuous_time() for stage in USUAL}
+        laws = {stage: with_default_steepness(getattr(self, stage), self.model).in_continuous_time() for stage in USUAL}
         return dataclasses.replace(self, **laws, processor=None)
 
     def _advance(self, sample: Sample) -> Callable[..., Any]:
-        """Return `laws.stepped` with the model, the period and the discretisation of this cascade."""
+        """Return `laws.step_law` with the model, the period and the discretisation of this cascade."""
         implicit = self.processor is not None and self.processor.implicit
-        return functools.partial(stepped, model=self.model, period=sample.period, implicit=implicit)
+        return functools.partial(step_law, model=self.model, period=sample.period, implicit=implicit)
 
     def estimate(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State, Measurement]:
         """Step the observer on a processor.
@@ -192,10 +192,12 @@ class Cascade:
         observer, and the estimate at the sample itself.
         """
         processor: Any = self.processor
-        now, state = self._advance(sample)(present(self.observer, measured.z, sample.reference), measured, state)
+        now, state = self._advance(sample)(with_gains_at(self.observer, measured.z, sample.reference), measured, state)
         estimate = now
         if processor.predicts:
-            estimate = carried(self.model, self.driven, now, sample.past, processor.stretches(sample.period))
+            estimate = predicted_over_delay(
+                self.model, self.driven, now, sample.past, processor.prediction_steps(sample.period)
+            )
         return estimate, state, now
 
     def step(
@@ -210,7 +212,7 @@ class Cascade:
         advance = self._advance(sample)
 
         def force_for(estimate: Measurement, reference: Reference, state: object) -> tuple[Array, Any]:
-            return advance(present(self.position, estimate.z, reference), (estimate, reference), state)
+            return advance(with_gains_at(self.position, estimate.z, reference), (estimate, reference), state)
 
         def demanded(
             reference: Reference, z: Array, z_dot: Array, observed: object, positioned: object
@@ -234,7 +236,8 @@ class Cascade:
             z_rate, v_star_rate = jax.jvp(lambda *x: demanded(*x)[0], point, along)[1]
         v_star = materialised(v_star)
         force = ForceDemand(z, z_rate, v_star, v_star_rate, self.model.gaps(z))
-        inversion, current = present(self.inversion, z, sample.reference), present(self.current, z, sample.reference)
+        inversion = with_gains_at(self.inversion, z, sample.reference)
+        current = with_gains_at(self.current, z, sample.reference)
         demand, inverted = advance(inversion, force, state.inversion)
         u, driven = advance(current, CurrentInputs(estimate, demand, sample.u_max, force.gaps), state.current)
         v_tilde = v_star - self.model.v_and_dv_di(z, demand.i_ref, force.gaps)[0]
@@ -250,7 +253,8 @@ class Cascade:
         `u_max`: limit of the supply, V; inf: none.
         """
         force, estimate, rates = self.demand(measured, state, reference)
-        inversion, current = present(self.inversion, force.z, reference), present(self.current, force.z, reference)
+        inversion = with_gains_at(self.inversion, force.z, reference)
+        current = with_gains_at(self.current, force.z, reference)
         demand, inversion_rate = inversion(self.model, force, state.inversion)
         u, current_rate = current(self.model, CurrentInputs(estimate, demand, u_max, force.gaps), state.current)
         v_tilde = force.v_star - self.model.v_and_dv_di(force.z, demand.i_ref, force.gaps)[0]

@@ -39,7 +39,7 @@ class FilterChain(PositionLaw[ChainState]):
     Maslen, Magnetic Bearings (2009), 8.2. The integral takes up k_aw (i_star - i) while the supply limits u.
 
     On a processor each part is a bilinear transform, exact at the centre of a notch, which is at most 0.98 of the
-    Nyquist frequency. The lead-lag is off if w_z = w_p, and a notch if its depth is 1, as the defaults are.
+    Nyquist frequency. The lead-lag is off if w_z = w_p, and a notch is off if its depth is 1. By default all are off.
     """
 
     k_p: Scalar = gain(default=135.0, unit="A/m", doc="proportional gain; left out: as state-feedback")

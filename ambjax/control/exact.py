@@ -1,4 +1,4 @@
-"""What the robust exact differentiators of each order have in common as observers."""
+"""Base class of the observers that are robust exact differentiators."""
 
 from typing import ClassVar
 

@@ -57,7 +57,7 @@ class Guard:
     """Refuse a reading that is NaN, beyond its limit, or farther from the prediction than the rotor can be.
 
     The nominal model's prediction replaces a refused reading for up to `samples` successive samples. After that u = 0
-    until a reading is within its limits. `settled` derives each number that is left out (None).
+    until a reading is within its limits. `with_limits` derives each number that is left out (None).
     """
 
     z: Scalar | None = _limit(
@@ -92,12 +92,12 @@ class Guard:
         """Whether every number is left out. Derived limits accept every reading of a sensor without faults."""
         return all(getattr(self, field.name) is None for field in dataclasses.fields(type(self)))
 
-    def settled(self, model: Plant, scenario: Scenario, period: Scalar, estimated: bool) -> "Guard":
+    def with_limits(self, model: Plant, scenario: Scenario, period: Scalar, estimated: bool) -> "Guard":
         """Return the guard with every number set; those that are None are derived (docs/processor.md).
 
         `period`: sample period, s. `estimated`: whether an observer estimates the velocity.
 
-        The derivation uses |z| at which the rotor is lost, as a share of the gap, and the gap and pole of `model`.
+        The derivation uses the gap and the pole of `model`, and the share of the gap at which the rotor is lost.
         """
         sensor = Sensor() if scenario.sensor is None else scenario.sensor
         limit, clearance = scenario.limit, scenario.limit / scenario.plant.s_0 * model.s_0
@@ -127,7 +127,7 @@ class Guard:
         `measured`: the readings. `watch`: state of the guard at this sample. `period`: sample period, s. `estimated`:
         whether an observer estimates the velocity, so that z_dot is not checked.
         """
-        guard: Any = self  # its numbers are set (`settled`)
+        guard: Any = self  # its numbers are set (`with_limits`)
         (z, _, i), time = watch.expected, (guard.samples - watch.left + 1) * period
         # bound of the model's error in acceleration, m/s^2: the full pull of one magnet at the expected z and i
         share = (model.i_0 + jnp.abs(i)) / (model.s_0 - jnp.abs(z))
@@ -167,7 +167,7 @@ def guarded(cascade: C, scenario: Scenario, period: Scalar) -> C:
     if processor is None or processor.guard is None:
         return cascade
     estimated = one.observer.estimates_velocity
-    guard = processor.guard.settled(one.model, scenario, period, estimated)
+    guard = processor.guard.with_limits(one.model, scenario, period, estimated)
     return dataclasses.replace(one, processor=dataclasses.replace(processor, guard=guard))
 
 

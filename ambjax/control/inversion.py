@@ -84,10 +84,9 @@ class Adaptive(AdaptiveReference):
         return Relay(self.gamma, self.p)
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        needed, words = context.delta_1
-        name = words.partition(" ")[0]
+        needed, symbol, source = context.delta_1
         times = 1000 if context.stepped else 100
-        gamma = Interval(needed, times * needed, f"{name} to {times} {name}, {words}")
+        gamma = Interval(needed, times * needed, f"{symbol} to {times} {symbol}, {source}")
         return {"gamma": gamma, **steepness(context, "gamma")}
 
     def slide(self, model: Plant, begin: ForceDemand, end: ForceDemand, i_ref: Array, h: Scalar) -> Relaxation:
@@ -124,10 +123,9 @@ class FeedForwardAdaptive(AdaptiveReference):
         return CurrentDemand(state, rate), rate
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        needed, words = context.delta_1
-        gamma = Interval(
-            needed / 100, 100 * needed, f"a hundredth to 100 times the bound without feed-forward: {words}"
-        )
+        needed, _, source = context.delta_1
+        words = f"a hundredth to 100 times the bound without feed-forward: {source}"
+        gamma = Interval(needed / 100, 100 * needed, words)
         return {"gamma": gamma, **steepness(context, "gamma")}
 
     def step(self, model: Plant, inputs: ForceDemand, state: Array, period: Scalar) -> tuple[CurrentDemand, Array]:

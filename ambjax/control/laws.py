@@ -10,7 +10,7 @@ A law is a frozen record: its type is the algorithm, its leaves are the gains. E
 - `sigma(motion, reference)`, for a position law: the sliding variable of a motion, m/s.
 
 `control.base.Law` has the other methods with their defaults. To add a law, write a record in the file of its stage, and
-add it to `KINDS` in `ambjax/cases/reader.py` and to the conformance test in `tests/test_laws.py`.
+add it to `KINDS` in `ambjax/cases/controller_tables.py` and to the conformance test in `tests/test_laws.py`.
 """
 
 import abc
@@ -195,7 +195,7 @@ STAGES: dict[str, type[Law]] = {
 }
 
 
-def stepped(
+def step_law(
     law: Law, inputs: object, state: State, *, model: Plant, period: Scalar, implicit: bool
 ) -> tuple[Any, State]:
     """Step a law on a processor, by its method `step` or else by explicit Euler.

@@ -1,7 +1,6 @@
 """A linear controller designed elsewhere, such as by H-infinity synthesis, as a position law."""
 
 import dataclasses
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +8,7 @@ from jax import Array
 
 from ambjax.control.force import force_of_current, linear_mechanics, sliding_variable
 from ambjax.control.laws import PositionLaw
-from ambjax.control.realisation import FREQUENCIES, Realisation, realisation
+from ambjax.control.realisation import FREQUENCIES, Matrices, Realisation, realisation
 from ambjax.control.search import Interval, SearchContext
 from ambjax.numerics import records
 from ambjax.numerics.records import Scalar, is_traced, record, static
@@ -43,7 +42,7 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
     own_steps = ("implicit", "explicit")
 
     @classmethod
-    def of(cls, system: Any, output: str = OUTPUTS[0], gain: Scalar = 1.0) -> "LinearController":
+    def of(cls, system: Matrices, output: str = OUTPUTS[0], gain: Scalar = 1.0) -> "LinearController":
         """Return the law of a state space `system`: an object with matrices A, B, C, D and the period dt (s).
 
         `output`: "current" or "voltage". `gain`: factor of the output. Raises ValueError if `system` lacks these

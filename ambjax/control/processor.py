@@ -91,13 +91,13 @@ class Processor:
         most = max(self.most or 0, math.ceil(longest))
         return dataclasses.replace(self, whole=whole, most=most)
 
-    def stretches(self, period: Scalar) -> tuple[Array, ...]:
+    def prediction_steps(self, period: Scalar) -> tuple[Array, ...]:
         """Return the lengths (s) of the parts of the prediction in which u_{n-1} and, before it, u_{n-2} act."""
         ahead = jnp.asarray(self.ahead)
         return (jnp.minimum(ahead, 1.0) * period, jnp.maximum(ahead - 1.0, 0.0) * period)[: self.most]
 
 
-def carried(
+def predicted_over_delay(
     model: Plant,
     driven: Callable[[Array, State], State],
     estimate: Measurement,

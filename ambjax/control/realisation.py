@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 from collections.abc import Sequence
+from typing import Protocol
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +21,15 @@ FREQUENCIES, DAMPED = np.geomspace(10.0, 1e5, 81), 0.05
 MOST_CONDITION = 1e8
 
 Row = tuple[float, ...]
+
+
+class Matrices(Protocol):
+    """A state space of another package, such as python-control or SciPy; its period `dt` (s) is optional."""
+
+    A: npt.ArrayLike
+    B: npt.ArrayLike
+    C: npt.ArrayLike
+    D: npt.ArrayLike
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -107,7 +117,9 @@ def _sum(row: Row, x: Sequence[Array]) -> Array:
     return jnp.zeros(()) if total is None else total
 
 
-def realisation(A: object, B: object, C: object, D: object, dt: object = 0.0) -> Realisation:
+def realisation(
+    A: npt.ArrayLike, B: npt.ArrayLike, C: npt.ArrayLike, D: npt.ArrayLike, dt: npt.ArrayLike | None = 0.0
+) -> Realisation:
     """Return the realisation of a state space: A [n, n], B [n, m], C [1, n], D [1, m] with m = 1 or 2 inputs.
 
     `dt`: sample period, s; 0 or None: continuous. Raises ValueError, with the name of the array, if the shapes of
@@ -125,7 +137,7 @@ def realisation(A: object, B: object, C: object, D: object, dt: object = 0.0) ->
     return Realisation(rows[0], rows[1], tuple(c[0].tolist()), tuple(d[0].tolist()), step)
 
 
-def _period(dt: object) -> float:
+def _period(dt: npt.ArrayLike | None) -> float:
     """Return the sample period, s; 0: continuous. Raises ValueError for a value that is not one."""
     x = np.zeros(()) if dt is None else np.asarray(dt)
     if x.dtype == bool:
@@ -135,7 +147,7 @@ def _period(dt: object) -> float:
     return float(x.item())
 
 
-def _numbers(name: str, given: object) -> np.ndarray:
+def _numbers(name: str, given: npt.ArrayLike) -> np.ndarray:
     """Return the array as floats. Raises ValueError unless it is a matrix of finite real numbers."""
     x = np.asarray(given)
     if x.dtype.kind not in "iuf":

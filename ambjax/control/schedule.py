@@ -115,7 +115,7 @@ def schedules(law: Law) -> dict[str, Schedule]:
     return {name: value for name, value in given.items() if isinstance(value, Schedule)}
 
 
-def present(law: L, z: Scalar, reference: Reference) -> L:
+def with_gains_at(law: L, z: Scalar, reference: Reference) -> L:
     """Return the law with a number for each schedule: its value at the position z (m) and the reference."""
     found = schedules(law)
     return _with(law, {name: one.value(z, reference) for name, one in found.items()}) if found else law

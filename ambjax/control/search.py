@@ -8,19 +8,27 @@ from ambjax.numerics.smooth import TWO_OVER_PI
 from ambjax.world.plant import Plant
 
 
+class LowerBound(NamedTuple):
+    """Lower bound of a gain, its symbol, and a description of its source."""
+
+    value: float
+    symbol: str
+    source: str
+
+
 class SearchContext(NamedTuple):
     """Context of a search for gains.
 
     `model`: nominal plant. `w`: pole of the true plant, 1/s. `period`: sample period, s. `bounds`: lower bounds of
     Theorem 1 on gains, by symbol (Q_z, Q_i, Delta_1). `delta_1`: the larger of the bounds of Eq. (7) on the reference
-    and in a fall (A^2/m^2/s), and its description. `stepped`: whether the laws run on a processor with implicit signs.
+    and in a fall, A^2/m^2/s. `stepped`: whether the laws run on a processor with implicit signs.
     """
 
     model: Plant
     w: float
     period: float
     bounds: Mapping[str, float]
-    delta_1: tuple[float, str]
+    delta_1: LowerBound
     stepped: bool = False
 
     @property
@@ -83,7 +91,9 @@ def position_switch(context: SearchContext, p: Scalar | None) -> Interval:
     if p is not None and not context.stepped:
         return switch(context, "k", p, 100, "Q_z")
     most = context.w**2 * float(context.model.s_0)
-    return authority(context, most, (1e-3, 0.3), "w^2 s_0: what the magnets accelerate the rotor by", "Q_z")
+    return authority(
+        context, most, (1e-3, 0.3), "w^2 s_0: the acceleration by the negative stiffness over one gap", "Q_z"
+    )
 
 
 def steepness(context: SearchContext, name: str) -> dict[str, Interval]:
@@ -91,7 +101,7 @@ def steepness(context: SearchContext, name: str) -> dict[str, Interval]:
     if not context.stepped:
         return {}
     low, high = (slope / TWO_OVER_PI for slope in (context.w / 3, 10 / context.period))
-    words = f"slope 2/pi {name} p from w/3 to 10/T, hardly less than the sign itself; {context.pole}"
+    words = f"slope 2/pi {name} p from w/3 to 10/T, which is nearly set-valued; {context.pole}"
     return {"p": Interval(low, high, words, times=name)}
 
 

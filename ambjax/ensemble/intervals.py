@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from numpy.typing import ArrayLike
 
 REPLICATES = 1000
@@ -57,7 +58,7 @@ def wilson(successes: ArrayLike, n: ArrayLike, confidence: float = 0.95) -> Esti
     return Estimate(share, np.where(k == 0, 0.0, centre - half)[()], np.where(k == n, 1.0, centre + half)[()])
 
 
-def quantile(values: np.ndarray, q: object, confidence: float = 0.95) -> Estimate:
+def quantile(values: np.ndarray, q: npt.ArrayLike, confidence: float = 0.95) -> Estimate:
     """Compute the q-quantile of values [N], the value of rank ceil(q N), with its interval. q: a number or an array.
 
     The number of values below the true quantile is binomial with N trials of probability q. Its quantiles are the
@@ -212,7 +213,7 @@ def _tail_counts(counts: np.ndarray, tail: float) -> np.ndarray:
     return np.clip(tail - above, 0.0, counts)
 
 
-def column_of(values: object) -> np.ndarray:
+def column_of(values: npt.ArrayLike) -> np.ndarray:
     """Return the values as floats [N]. Raises ValueError unless they are one-dimensional, non-empty and free of NaN."""
     x = np.asarray(values, float)
     if x.ndim != 1 or not x.size or np.isnan(x).any():

@@ -22,12 +22,12 @@ from ambjax.numerics.records import Scalar, canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
 from ambjax.simulation.metrics import standard_for
-from ambjax.simulation.rollout import Outcome, RolloutState, System, begin, finish, prepare, stretch
+from ambjax.simulation.rollout import Outcome, RolloutState, System, begin, finish, prepare, recorded_segment
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.scenario import Scenario
 
 # Samples in one call of the compiled program: the rows of all lanes take 20 MB.
-STRETCH = 2048
+SEGMENT = 2048
 
 
 class Replay(NamedTuple):
@@ -50,7 +50,7 @@ def as_member(scenario: Scenario) -> Scenario:
     return dataclasses.replace(scenario, member=np.atleast_1d(np.asarray(scenario.member)))
 
 
-def record(
+def record_member(
     cascade: Cascade,
     scenario: Scenario,
     clock: Clock,
@@ -75,12 +75,12 @@ def record(
 def record_system(
     system: System, clock: Clock, *, fold: Fold | None = None, tell: Callable[[int], object] = lambda _: None
 ) -> Outcome:
-    """Do the work of `record` for a `rollout.System`, without checks. At least one leaf must be an array [1]."""
+    """Do the work of `record_member` for a `rollout.System`, without checks. At least one leaf must be an array [1]."""
     tree = canonical((system, clock, fold))
-    count = min(STRETCH, clock.samples)
+    count = min(SEGMENT, clock.samples)
     progress, rows, outcomes = map_members(_begun, tree, threads=1, call=1), [], list[Outcome]()
     for first in range(0, clock.samples, count):
-        progress, outcome = map_members(_stretched(count), (*tree, progress, first), threads=1, call=1)
+        progress, outcome = map_members(_recorded_segment(count), (*tree, progress, first), threads=1, call=1)
         outcomes = [jax.tree.map(lambda x: x[0], outcome)]
         left = min(count, clock.samples - first)
         # Copy, because the slice would keep the rows of all lanes in memory.
@@ -93,12 +93,12 @@ def record_system(
 def replay(study: Study, index: int, tell: Callable[[int], object] = lambda _: None) -> Replay:
     """Simulate one member of a study again.
 
-    The metrics come from the compiled program of the study, the trajectory from `record`. `tell` is that of `record`.
+    The metrics come from the compiled program of the study, the trajectory from `record_member`. `tell`: see there.
     Raises ValueError as `rollout` does.
     """
     columns = chunk(study, index, index + 1, CALL, threads=1)
     cascade, scenario = study.batch(np.array([index]))
-    outcome = record(cascade, scenario, study.clock, fold=standard_for(study.settle, scenario), tell=tell)
+    outcome = record_member(cascade, scenario, study.clock, fold=standard_for(study.settle, scenario), tell=tell)
     metrics = {name: columns[name][0] for name in outcome.measured}
     deviation = max(_relative(metrics[name], x) for name, x in outcome.measured.items())
     eps = float(np.finfo(np.asarray(metrics["rms_error_m"]).dtype).eps)
@@ -118,14 +118,14 @@ def _begun(tree: tuple[System, Clock, Fold | None]) -> RolloutState:
 
 
 @functools.cache
-def _stretched(
+def _recorded_segment(
     count: int,
 ) -> Callable[[tuple[System, Clock, Fold | None, RolloutState, Scalar]], tuple[RolloutState, Outcome]]:
     """Return the simulation of `count` samples. The function is cached, so that it compiles once."""
 
     def one(tree: tuple[System, Clock, Fold | None, RolloutState, Scalar]) -> tuple[RolloutState, Outcome]:
         system, clock, fold, progress, first = tree
-        progress, rows = stretch(system, clock, fold, progress, first, count)
+        progress, rows = recorded_segment(system, clock, fold, progress, first, count)
         return progress, finish(progress, rows, fold)
 
     return one

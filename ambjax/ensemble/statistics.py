@@ -55,7 +55,8 @@ def summary(
     Raises ValueError if there is no column `deciding`, or if a column is not one number for each member.
     """
     lost_at = column_of(columns["lost_at"])
-    metrics = {k: column_of(v) for k, v in columns.items() if k not in STATUS_COLUMNS and not k.startswith(SPREAD)}
+    others = {*STATUS_COLUMNS, *(SPREAD + path for path in spread_names)}
+    metrics = {name: column_of(column) for name, column in columns.items() if name not in others}
     if deciding not in metrics:
         raise ValueError(f"there is no metric {deciding} to rank members by.")
     ended = np.isfinite(lost_at)

@@ -69,7 +69,7 @@ class Study:
         """Whether the members differ."""
         return bool(self.spread.entries) or self.scenario.random
 
-    def drawn(self, members: np.ndarray) -> dict[str, Any]:
+    def drawn(self, members: np.ndarray) -> dict[str, np.ndarray]:
         """Draw the spread quantities of these members (integers [n]); arrays [n] by dotted path."""
         return draw(self.spread, self.cascade, self.scenario, self.seed, members, self.members)
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import re
 import textwrap
 from collections.abc import Mapping
 from typing import Any
@@ -14,24 +13,34 @@ import numpy.typing as npt
 def numbers(field: dataclasses.Field) -> str:
     """Return the allowed values of a numeric field in words, with the unit."""
     meta = field.metadata
-    above, at_least, at_most = meta["above"], meta["at_least"], meta["at_most"]
-    unit = f" ({meta['unit']})" if meta["unit"] else ""
-    end = f"{unit}, or inf" if meta["infinite"] else unit
-    kind = "a number" if meta["infinite"] else "a finite number"
-    if meta["whole"]:
-        return f"a whole number from {at_least} to {at_most}{end}"
-    if above is not None:
-        return f"{kind} above {above:g}{'' if at_most is None else f' and at most {at_most:g}'}{end}"
-    if at_least is not None:
-        return f"{kind} {f'of at least {at_least:g}' if at_most is None else f'from {at_least:g} to {at_most:g}'}{end}"
-    return f"{kind}{end}"
+    kind = "a whole number" if meta["whole"] else "a number" if meta["infinite"] else "a finite number"
+    unit = f"({meta['unit']})" if meta["unit"] else ""
+    return " ".join(filter(None, (kind, _interval(meta), unit))) + (", or inf" if meta["infinite"] else "")
 
 
-def allowed(field: dataclasses.Field) -> str:
-    """Return the range of a numeric field in words, without its unit; '' for a field of another kind."""
-    if not field.metadata.get("leaf"):
+def allowed(field: dataclasses.Field, infinity: str = "or inf") -> str:
+    """Return the range of a numeric field in words, without its unit; '' for a field of another kind.
+
+    `infinity`: words that follow the range if inf is allowed too.
+    """
+    meta = field.metadata
+    if not meta.get("leaf"):
         return ""
-    return re.sub(r"^a (finite )?number ?", "", numbers(field).replace(f" ({field.metadata['unit']})", ""))
+    words = " ".join(filter(None, ("a whole number" if meta["whole"] else "", _interval(meta))))
+    return f"{words}, {infinity}" if meta["infinite"] else words
+
+
+def _interval(meta: Mapping[str, Any]) -> str:
+    """Return the interval of the allowed numbers in words; '' if it is not bounded from below."""
+    above, at_least, at_most = meta["above"], meta["at_least"], meta["at_most"]
+    form = "" if meta["whole"] else "g"
+    if above is not None:
+        return f"above {above:g}" + ("" if at_most is None else f" and at most {at_most:g}")
+    if at_least is None:
+        return ""
+    if at_most is None:
+        return f"of at least {at_least:g}"
+    return f"from {at_least:{form}} to {at_most:{form}}"
 
 
 def default_text(default: object) -> str:

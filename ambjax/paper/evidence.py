@@ -198,7 +198,7 @@ def _uncertain(cascade: Cascade, reading: str) -> Uncertain:
 
 
 @one_kernel
-def _scan(cascade: Cascade, scenarios: Scenario, clock: Clock) -> dict[str, Any]:
+def _scan(cascade: Cascade, scenarios: Scenario, clock: Clock) -> dict[str, np.ndarray]:
     """Return the metrics of each member.
 
     Members run one by one, because every member of a batch would take as many steps as the stiffest one.

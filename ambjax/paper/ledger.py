@@ -26,7 +26,7 @@ SAMPLED_WORDS = (
 )
 
 
-def judge(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
+def judge_claims(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
     """Return every claim with its finding in each reading, as plain data. `evidence`: by reading."""
     rows = []
     for entry in CLAIMS:
@@ -127,7 +127,7 @@ def _processor_lines(rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def markdown(
+def ledger_markdown(
     rows: list[dict[str, Any]],
     noise: list[dict[str, Any]],
     processor: list[dict[str, Any]],
@@ -135,7 +135,7 @@ def markdown(
 ) -> str:
     """Return the ledger as a Markdown page.
 
-    Its arguments are the results of `judge`, `noise_table`, `processor_table` and `sensitivity_table`.
+    Its arguments are the results of `judge_claims`, `noise_table`, `processor_table` and `sensitivity_table`.
     """
     readings = list(rows[0]["findings"])
     lines = ["# Ledger: the paper's claims, per reading", ""]

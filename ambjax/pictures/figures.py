@@ -1,6 +1,7 @@
 """Pictures of trajectories: panels of signals, the paper's Figures 3 to 6, and the comparison of readings."""
 
 import pathlib
+import textwrap
 from typing import NamedTuple
 
 import numpy as np
@@ -73,7 +74,7 @@ def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.
     # Fixed margins (in inches over the height): because a layout engine draws everything twice.
     figure.subplots_adjust(0.15, 0.5 / height, 0.97, 1 - 0.5 / height, hspace=0.2)
     for ax, panel in zip(axes, panels, strict=True):
-        draw(ax, panel, trajectory)
+        draw_panel(ax, panel, trajectory)
         if panel is FORCE_ERROR and not np.isfinite(trajectory.lost_at):
             _first_moments(ax, trajectory)
     axes[-1].set_xlabel("time (s)")
@@ -89,8 +90,8 @@ def readings(trajectories: dict[str, Trajectory], title: str, settle: float, pat
     axes = figure.subplots(2, len(trajectories), squeeze=False)
     position = POSITION._replace(curves=(Curve("z_measured", "$z$ measured", "#bbbbbb"), *POSITION.curves))
     for (name, trajectory), (upper, lower) in zip(trajectories.items(), axes.T, strict=True):
-        draw(upper, position, trajectory, first=True)
-        draw(lower, ERROR, trajectory)
+        draw_panel(upper, position, trajectory, first=True)
+        draw_panel(lower, ERROR, trajectory)
         upper.set_title(name, loc="left", fontsize=10, fontweight="bold", pad=18)  # above the legend
         lower.set_xlabel("time (s)", fontsize=9)
         if not np.isfinite(trajectory.lost_at):
@@ -101,7 +102,7 @@ def readings(trajectories: dict[str, Trajectory], title: str, settle: float, pat
     figure.savefig(path, dpi=130)
 
 
-def draw(
+def draw_panel(
     ax: Axes,
     panel: Panel,
     trajectory: Trajectory,
@@ -176,9 +177,9 @@ def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:
     ax.axvspan(lost_at, max(end, ax.get_xlim()[1]), color=RED, alpha=0.12, linewidth=0)
     ax.axvline(lost_at, color=RED, linewidth=1.0)
     if first:
-        why = trajectory.lost_why.replace(": ", ":\n").replace(" reached ", "\nreached ")
         status = "not decided from" if trajectory.lost_code == STALLED else "lost at"
-        words = f"{status} {lost_at:.4g} s\n{why}"
+        reason = textwrap.fill(trajectory.lost_reason, 24)
+        words = f"{status} {lost_at:.4g} s\n{trajectory.lost_event}:\n{reason}"
         paper = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1}  # a curve may pass behind the text
         ax.text(0.99, 0.06, words, transform=ax.transAxes, ha="right", va="bottom", fontsize=7, color=INK, bbox=paper)
 

@@ -1,8 +1,8 @@
 """Heat maps of survival and error over a grid of two quantities."""
 
 import pathlib
-from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,9 +25,27 @@ SURVIVAL, ERROR = "cividis", "viridis_r"
 EMPTY_CELL = {"facecolor": "#d4d4d4", "edgecolor": "#8a8a8a", "hatch": "////", "linewidth": 0.0}
 
 
+class MapPanel(NamedTuple):
+    """One map of a picture.
+
+    - `x` [nx], `y` [ny]: values of the axes, ascending.
+    - `survival` [ny, nx]: shares 0 to 1; NaN: not run.
+    - `low`, `high` [ny, nx]: bounds of the confidence interval of the survival; None: not drawn.
+    - `error` [ny, nx]: in the unit of the error metric; not finite: no survivor. None: no map of errors.
+    """
+
+    title: str
+    x: np.ndarray
+    y: np.ndarray
+    survival: np.ndarray
+    low: np.ndarray | None
+    high: np.ndarray | None
+    error: np.ndarray | None
+
+
 @own_style
 def maps(
-    panels: Sequence[Mapping[str, Any]],
+    panels: Sequence[MapPanel],
     x_label: str,
     y_label: str,
     x_log: bool,
@@ -41,7 +59,7 @@ def maps(
 
 @own_style
 def map_figure(
-    panels: Sequence[Mapping[str, Any]],
+    panels: Sequence[MapPanel],
     x_label: str,
     y_label: str,
     x_log: bool,
@@ -50,32 +68,30 @@ def map_figure(
 ) -> Figure:
     """Return heat maps side by side: survival above, and the error below if a panel has one.
 
-    A panel has a title; x [nx] and y [ny], ascending; survival with the bounds low and high of its confidence interval,
-    [ny, nx] (shares 0..1; NaN: not run; bounds of None are not drawn); and error [ny, nx] (in the unit of
-    `error_metric`; not finite: no survivor) or None. A label that ends in an SI unit, such as "z (m)", gets a prefix.
-    All panels of a row share the colours. Raises ValueError if there are no panels, or if a log axis has values that
-    are not positive.
+    `error_metric`: the metric of the errors, which gives their unit. A label that ends in an SI unit, such as "z (m)",
+    gets a prefix. All panels of a row share the colours. Raises ValueError if there are no panels, or if a log axis has
+    values that are not positive.
     """
     if not panels:
         raise ValueError("maps: no panels to draw")
-    rows = 2 if any(panel["error"] is not None for panel in panels) else 1
+    rows = 2 if any(panel.error is not None for panel in panels) else 1
     figure = Figure(figsize=(max(3.9 * len(panels) + 1.4, 6.5), 3.4 * rows + 0.9), layout="constrained")
     axes = figure.subplots(rows, len(panels), squeeze=False)
     labels = (x_label, y_label, x_log, y_log)
     norm = Normalize(0, 100)
     for ax, panel in zip(axes[0], panels, strict=True):
-        _cells(ax, panel, 100 * np.asarray(panel["survival"], float), norm, SURVIVAL, labels)
-        ax.set_title(f"{panel['title']}\n{_range(panel)}", fontsize=10)
+        _cells(ax, panel, 100 * np.asarray(panel.survival, float), norm, SURVIVAL, labels)
+        ax.set_title(f"{panel.title}\n{_range(panel)}", fontsize=10)
     figure.colorbar(ScalarMappable(norm, SURVIVAL), ax=list(axes[0]), label="survival (%)", pad=0.02)
     if rows == 2:
         _errors(figure, axes[1], panels, error_metric, labels)
     keys: list[Any] = [
         Line2D([], [], color=INK, linewidth=LINES["survival"], label=_contour_words(panels)),
     ]
-    if any(panel["low"] is not None for panel in panels):
+    if any(panel.low is not None for panel in panels):
         words = "bounds of the confidence interval at 95 %"
         keys.append(Line2D([], [], color=INK, linewidth=LINES["low"], label=words))
-    grids = [grid for panel in panels for grid in (panel["survival"], panel["error"]) if grid is not None]
+    grids = [grid for panel in panels for grid in (panel.survival, panel.error) if grid is not None]
     if not all(np.isfinite(grid).all() for grid in grids):
         keys.append(Patch(label="no survivor" if rows == 2 else "not run", **EMPTY_CELL))
     figure.legend(handles=keys, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
@@ -86,11 +102,9 @@ def map_figure(
 Labels: TypeAlias = tuple[str, str, bool, bool]
 
 
-def _errors(
-    figure: Figure, axes: Sequence[Axes], panels: Sequence[Mapping[str, Any]], metric: str, labels: Labels
-) -> None:
+def _errors(figure: Figure, axes: Sequence[Axes], panels: Sequence[MapPanel], metric: str, labels: Labels) -> None:
     """Draw the lower row: the errors, on one logarithmic scale."""
-    errors = [panel["error"] for panel in panels if panel["error"] is not None]
+    errors = [panel.error for panel in panels if panel.error is not None]
     values = np.concatenate([np.ravel(np.asarray(error, float)) for error in errors])
     values = values[np.isfinite(values) & (values > 0)]
     factor, words, unit = axis_of(metric, size_of(values, log=True))
@@ -99,10 +113,10 @@ def _errors(
         low, high = low / 1.5, high * 1.5
     norm = LogNorm(low, high)
     for ax, panel in zip(axes, panels, strict=True):
-        if panel["error"] is None:
+        if panel.error is None:
             ax.set_axis_off()
             continue
-        error = factor * np.asarray(panel["error"], float)
+        error = factor * np.asarray(panel.error, float)
         _cells(ax, panel, np.where(error == 0, low, error), norm, ERROR, labels)
     if values.size:
         bar = figure.colorbar(ScalarMappable(norm, ERROR), ax=list(axes), label=f"{words} ({unit})", pad=0.02)
@@ -110,12 +124,10 @@ def _errors(
         bar.ax.minorticks_off()
 
 
-def _cells(
-    ax: Axes, panel: Mapping[str, Any], values: np.ndarray, norm: Normalize, colours: str, labels: Labels
-) -> None:
+def _cells(ax: Axes, panel: MapPanel, values: np.ndarray, norm: Normalize, colours: str, labels: Labels) -> None:
     """Draw one heat map with its axes and contours. Cells that are not finite show the hatched background."""
     x_label, y_label, x_log, y_log = labels
-    x, y = np.asarray(panel["x"], float), np.asarray(panel["y"], float)
+    x, y = np.asarray(panel.x, float), np.asarray(panel.y, float)
     x_factor, x_label = label_of(x_label, size_of(x, x_log))
     y_factor, y_label = label_of(y_label, size_of(y, y_log))
     x_edges, y_edges = edges(x_factor * x, x_log), edges(y_factor * y, y_log)
@@ -124,10 +136,11 @@ def _cells(
     ax.set_yscale("log" if y_log else "linear")
     ax.pcolormesh(x_edges, y_edges, np.ma.masked_invalid(values), norm=norm, cmap=colours)
     for name, width in LINES.items():
-        if panel[name] is None:
+        values = getattr(panel, name)
+        if values is None:
             continue
-        level = 1.0 if panel["low"] is None else CONTOUR
-        _outline(ax, x_edges, y_edges, np.asarray(panel[name], float) >= level, width)
+        level = 1.0 if panel.low is None else CONTOUR
+        _outline(ax, x_edges, y_edges, np.asarray(values, float) >= level, width)
     ax.set_xlim(x_edges[0], x_edges[-1])
     ax.set_ylim(y_edges[0], y_edges[-1])
     for axis, ends, log in ((ax.xaxis, x_edges, x_log), (ax.yaxis, y_edges, y_log)):
@@ -155,20 +168,20 @@ def _outline(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, inside: np.ndar
         ax.add_collection(lines, autolim=False)
 
 
-def _contour_words(panels: Sequence[Mapping[str, Any]]) -> str:
+def _contour_words(panels: Sequence[MapPanel]) -> str:
     """Return what the contour of survival shows: too few runs a cell say nothing about 95 %."""
-    decisive = [panel["low"] is not None for panel in panels]
+    decisive = [panel.low is not None for panel in panels]
     if all(decisive):
         return "95 % survival"
     return "95 % survival, or all runs survive" if any(decisive) else "all runs survive"
 
 
-def _range(panel: Mapping[str, object]) -> str:
+def _range(panel: MapPanel) -> str:
     """Return in words how much of the grid survives, because a missing contour means all of it or none."""
-    share = np.asarray(panel["survival"], float)
+    share = np.asarray(panel.survival, float)
     cells = share[np.isfinite(share)]
     if not cells.size:
         return "no cell was run"
-    if panel["low"] is None:
+    if panel.low is None:
         return f"all runs survive in {int(np.sum(cells == 1))} of {cells.size} cells"
     return f"95 % or more survive in {int(np.sum(cells >= CONTOUR))} of {cells.size} cells"

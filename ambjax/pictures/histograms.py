@@ -14,8 +14,9 @@ from matplotlib.ticker import MaxNLocator
 
 from ambjax.pictures.fans import statuses
 from ambjax.pictures.figures import BLUE, INK, RED
-from ambjax.pictures.scales import axis_of, digits, finish, log_ticks, size_of
+from ambjax.pictures.scales import axis_of, digits, log_ticks, size_of, style_axes
 from ambjax.pictures.style import own_style
+from ambjax.simulation.metrics import REACHED
 
 # Metrics that are drawn by default.
 CHIEF = (
@@ -33,7 +34,7 @@ CHIEF = (
     "copper_loss_W",
 )
 LOST = {"facecolor": RED, "edgecolor": "white", "hatch": "////", "linewidth": 0.0}
-MARKS: dict[float, tuple[Any, str]] = {0.5: ("-", "median"), 0.95: ("--", "95 % quantile")}
+MARKS: dict[float, tuple[Any, str, str]] = {0.5: ("-", "median", "median"), 0.95: ("--", "95 %", "95 % quantile")}
 
 
 @own_style
@@ -64,7 +65,7 @@ def histogram_figure(columns: Mapping[str, np.ndarray], metrics: Sequence[str] =
         ax.set_axis_off()
     others = "lost members" + " and those not decided" * bool(open_)
     keys = [Patch(color=BLUE, label="survivors"), Patch(label=others, **LOST)]
-    keys += [Line2D([], [], color=INK, linestyle=s, label=f"{n} of survivors") for s, n in MARKS.values()]
+    keys += [Line2D([], [], color=INK, linestyle=s, label=f"{n} of survivors") for s, _, n in MARKS.values()]
     figure.suptitle(f"{lost.size} members, {statuses(int(lost.sum()) - open_, open_)}", fontsize=11)
     figure.legend(handles=keys, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return figure
@@ -92,9 +93,9 @@ def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> Non
     if log:
         ax.set_xscale("log")
         log_ticks(ax.xaxis, bounds[0], bounds[-1])
-    notes, reached = [], "reached" in name
+    notes, reached = [], name in REACHED
     order = np.sort(values[~np.isnan(values) & ~lost])
-    for share, (style, words) in MARKS.items():
+    for share, (style, words, _) in MARKS.items():
         value = factor * order[math.ceil(share * order.size) - 1] if order.size else math.nan
         if math.isfinite(value) and (value > 0 or not log):
             ax.axvline(value, color=INK, linestyle=style, linewidth=1.2)
@@ -105,7 +106,7 @@ def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> Non
             if reached and order.size
             else "none"
         )
-        notes.append(f"{words.removesuffix(' quantile')}: {text}")
+        notes.append(f"{words}: {text}")
     for count, words in (
         (np.sum(~np.isfinite(values)), "never" if reached else "not finite"),
         (np.sum(finite == 0) * log, "at zero"),
@@ -115,7 +116,7 @@ def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> Non
     ax.set_xlabel(f"{label} ({unit})" if unit else label, fontsize=9)
     ax.set_ylim(0, 1.08 * max((alive + dead).max(), 1))
     ax.yaxis.set_major_locator(MaxNLocator(4, integer=True))
-    finish(ax, "members")
+    style_axes(ax, "members")
 
 
 def _bins(values: np.ndarray, log: bool) -> np.ndarray:

@@ -38,8 +38,11 @@ def _one_of(voltages: tuple[Array, ...], lag: Array) -> Array:
 
 
 def amplified(
-    amplifier: Amplifier | CurrentAmplifier | None, t: Array, u_a: Any, commanded: Sequence[tuple[Array, Scalar]]
-) -> tuple[list[tuple[Voltage, Scalar]], Any]:
+    amplifier: Amplifier | CurrentAmplifier | None,
+    t: Array,
+    u_a: Array | tuple[()],
+    commanded: Sequence[tuple[Array, Scalar]],
+) -> tuple[list[tuple[Voltage, Scalar]], Array | tuple[()]]:
     """Return the amplifier's voltage as functions of time with their durations (s), and the voltage at the end.
 
     `commanded`: voltages (V) from t on, each with its duration (s). With a slew-rate limit each is divided at the end
@@ -47,6 +50,7 @@ def amplified(
     """
     if not isinstance(amplifier, Amplifier) or not amplifier.slow:
         return [(lambda _, u=u: u, time) for u, time in commanded], u_a
+    assert not isinstance(u_a, tuple)  # a slow amplifier has a voltage
     given = []
     for u, time in commanded:
         voltage = lambda now, u_a=u_a, u=u, t=t: amplifier.followed(u_a, u, now - t)  # noqa: E731
@@ -56,7 +60,7 @@ def amplified(
     return given, u_a
 
 
-def stretches(
+def subproblems(
     loop: ClosedLoop,
     state: object,
     command: Command,

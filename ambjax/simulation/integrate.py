@@ -108,7 +108,7 @@ class Integrator(Protocol):
 
 def in_turn(
     method: Integrator,
-    stretches: Sequence[tuple[InitialValueProblem[Inputs, State], Scalar]],
+    parts: Sequence[tuple[InitialValueProblem[Inputs, State], Scalar]],
     t: Scalar,
     state: State,
     memory: object,
@@ -116,11 +116,11 @@ def in_turn(
 ) -> list[Advanced[State]]:
     """Integrate problems one after another, for a sample in which the rates jump at known instants.
 
-    `stretches`: pairs of a problem and its duration, s; the duration may be 0.
+    `parts`: pairs of a problem and its duration, s; the duration may be 0.
 
     Returns the results after each problem, accumulated from the start of the first.
     """
-    (problem, time), *others = stretches
+    (problem, time), *others = parts
     reached = [method.advance(problem, t, time, state, memory, code)]
     for problem, following in others:
         t, time, so_far = t + time, following, reached[-1]

@@ -240,7 +240,7 @@ class ClosedLoop:
             alive=alive,
         )
 
-    def noted(self, row: Row, span: Span) -> Row:
+    def completed(self, row: Row, span: Span) -> Row:
         """Return the row of a sample with mean and peak voltage, which are known only at the end of the sample."""
         mean = span.densities.u / jnp.where(span.time > 0, span.time, 1.0)
         return row._replace(u_mean=mean, u_peak=jnp.maximum(jnp.abs(row.u), span.most.u))

@@ -6,7 +6,7 @@ not typical, and extremes of these signals are taken over the integrator's subst
 computed over the time during which the drive is on.
 """
 
-from typing import Any
+from typing import Protocol
 
 from jax import Array
 
@@ -44,6 +44,17 @@ UNITS = {
     "singular_at_s": "s",
     "settle_s": "s",
 }
+# Times at which a signal first comes within its band; inf: never.
+REACHED = ("sigma_reached_s", "v_tilde_reached_s", "current_error_reached_s")
+
+
+class SettledCase(Protocol):
+    """A case with a scenario and a settling time (s), such as that of `read_case`."""
+
+    @property
+    def settle(self) -> Scalar: ...
+    @property
+    def scenario(self) -> Scenario: ...
 
 
 @record
@@ -72,7 +83,7 @@ class Standard:
     )
 
     @classmethod
-    def for_case(cls, case: Any) -> "Standard":
+    def for_case(cls, case: SettledCase) -> "Standard":
         """Return the metrics for a case of `read_case`: `standard_for` with its settling time and its scenario."""
         return standard_for(case.settle, case.scenario)
 

@@ -50,7 +50,7 @@ class System(Protocol[S, E, R]):
     - `status(state)`: the status code of the rotor, an index of `trajectory.STATUSES`.
     - `rest(state, code)`: the state in which a rotor lost with this code is frozen.
     - `row(t, state, errors, alive)`: the row at time t (s).
-    - `noted(row, span)`: the row with the signals that are known at the end of the sample only.
+    - `completed(row, span)`: the row with the signals that are known at the end of the sample only.
     - `singularity(row)`: a number that is positive on the admissible side of the singular curve C. Eq. (9)
 
     A system whose state jumps at the start of a sample, such as a controller on a processor, also has
@@ -75,7 +75,7 @@ class System(Protocol[S, E, R]):
     def status(self, state: S) -> Array: ...
     def rest(self, state: S, code: Array) -> S: ...
     def row(self, t: Scalar, state: S, errors: E, alive: Array) -> R: ...
-    def noted(self, row: R, span: Span) -> R: ...
+    def completed(self, row: R, span: Span) -> R: ...
     def singularity(self, row: R) -> Array: ...
 
 
@@ -190,7 +190,7 @@ def segment(
     return progress, rows
 
 
-def stretch(
+def recorded_segment(
     system: System, clock: Clock, fold: Fold | None, progress: RolloutState, first: Scalar, count: int
 ) -> tuple[RolloutState, Row]:
     """Simulate `count` samples from number `first` on, and record every row. Returns the new state and the rows.
@@ -245,7 +245,7 @@ def one_sample(
             state = choose(alive, system.jump(just_after, state, errors), state)
         row = system.row(just_after, state, errors, alive)._replace(t=t)
         after = _advanced(system, clock, errors, t, state, memory, ending.lost_code)
-        row = system.noted(row, after.span)
+        row = system.completed(row, after.span)
         folded = folded if fold is None else fold.update(folded, row, after.span)
         lost_now = alive & (after.code != ALIVE)
         resting = system.rest(after.state, after.code)

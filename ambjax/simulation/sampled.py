@@ -19,7 +19,7 @@ from ambjax.control.guard import GuardResult, Watch, expected
 from ambjax.control.processor import Processor
 from ambjax.numerics.records import Scalar, record, static
 from ambjax.numerics.smooth import limited
-from ambjax.simulation.between import acting, amplified, lags, plant_status, sensed_motion, stretches
+from ambjax.simulation.between import acting, amplified, lags, plant_status, sensed_motion, subproblems
 from ambjax.simulation.integrate import Advanced, Integrator, choose, in_turn
 from ambjax.simulation.loop import ClosedLoop, LoopState
 from ambjax.simulation.span import Span
@@ -213,7 +213,7 @@ class Sampled:
         delay, whole = jnp.asarray(self.processor.delay), bool(self.processor.whole)
         commanded = acting((state.command.u, *state.past), delay, period, whole)
         voltages, u_a = amplified(self.loop.scenario.amplifier, jnp.asarray(t), state.u_a, commanded)
-        parts = stretches(self.loop, state.plant, state.command, jnp.asarray(t), voltages, self.cuts)
+        parts = subproblems(self.loop, state.plant, state.command, jnp.asarray(t), voltages, self.cuts)
         reached = in_turn(method, parts, t, state.plant, memory, code)
         z_filtered = self._lagged(t, state, [after.state for after in reached], [time for _, time in parts])
         after = reached[-1]
@@ -263,10 +263,10 @@ class Sampled:
         guard = self.processor.guard
         return row if guard is None else row._replace(refused=alive & guard.refused(state.watch, state.watch)[0])
 
-    def noted(self, row: Row, span: Span) -> Row:
+    def completed(self, row: Row, span: Span) -> Row:
         """Return the row with mean and peak voltage; with an amplifier, the peak is that at the coils."""
-        noted = self.loop.noted(row, span)
-        return noted if self.loop.scenario.amplifier is None else noted._replace(u_peak=span.most.u)
+        completed = self.loop.completed(row, span)
+        return completed if self.loop.scenario.amplifier is None else completed._replace(u_peak=span.most.u)
 
     def singularity(self, row: Row) -> Array:
         """Return `ClosedLoop.singularity`: 0 on the singular curve C. Eq. (9)."""

@@ -22,7 +22,7 @@ from jax import Array
 from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.control.cascade import Cascade
 from ambjax.control.laws import CurrentDemand, CurrentInputs
-from ambjax.control.schedule import present
+from ambjax.control.schedule import with_gains_at
 from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import limited
 from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, Times, axpy
@@ -53,7 +53,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     ahead, control_1, force_0 = materialised((ahead, control_1, force_0))
     force_1, estimate_1, rates_1 = cascade.demand(loop.received(end, ahead, errors), control_1, end.reference)
 
-    inversion: Any = present(cascade.inversion, estimate_0.z, begin.reference)
+    inversion: Any = with_gains_at(cascade.inversion, estimate_0.z, begin.reference)
     sliding, slaved, tau, (w, w_1, w_2) = inversion.slide(model, force_0, force_1, i_ref, h)
     sliding, slaved, tau, force_1 = materialised((sliding, slaved, tau, force_1))
 
@@ -61,7 +61,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
         plant: State, estimate: Measurement, i_ref: Array, rate: Array, inner: S, outside: Any, h: Array
     ) -> tuple[Array, S, _Voltage]:
         """Return i - i_ref, the current law's state, and the voltage, over h (s) at constant i_ref' = rate."""
-        law = present(cascade.current, estimate.z, outside.reference)
+        law = with_gains_at(cascade.current, estimate.z, outside.reference)
 
         def rate_of(i: Array) -> tuple[Array, tuple[S, Array]]:
             inputs = CurrentInputs(estimate._replace(i=i + errors.i), CurrentDemand(i_ref, rate), scenario.u_max)
@@ -176,7 +176,7 @@ class Slide(FixedSteps):
     ) -> tuple[S, Span]:
         if problem.slide is None:
             raise ValueError(
-                "clock.method = Slide(...): it steps lumped plants under an 'adaptive' inversion law. Use Rodas3."
+                "clock.method = Slide(...): it requires a lumped plant and the 'adaptive' inversion law. Use Rodas3."
             )
         return problem.slide(problem.inputs(at(0.0)), problem.inputs(at(1.0)), h, state, span)
 

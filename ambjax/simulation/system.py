@@ -25,15 +25,15 @@ def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> 
     if cascade.current.commands != scenario.drive:
         raise ValueError(
             f'actuator.mode = "{scenario.drive}": controller.current = {type(cascade.current).__name__} commands a '
-            f"{cascade.current.commands}. Leave out [controller.current], for a law that commands a {scenario.drive}, "
-            "or change the mode."
+            f"{cascade.current.commands}. Leave out [controller.current] to get a law that commands a "
+            f"{scenario.drive}, or change the mode."
         )
     _check_coils(scenario)
     sensor = scenario.sensor
     if sensor is not None and not sensor.velocity and not cascade.observer.estimates_velocity:
         raise ValueError(
             "sensor.velocity = false: the velocity is not measured, and controller.observer does not estimate it. "
-            'Choose one that does: kind = "kalman", for example.'
+            'Choose an observer that estimates it, for example kind = "kalman".'
         )
 
 
@@ -69,7 +69,7 @@ def _check_laws(cascade: Cascade, sample_period: Scalar) -> None:
         if demand not in law.accepts:
             raise ValueError(
                 f"controller.{stage} = {type(law).__name__}: it does not take the {demand} that "
-                f"{type(cascade.position).__name__} demands. Leave out [controller.{stage}], for the law that does."
+                f"{type(cascade.position).__name__} demands. Leave out [controller.{stage}] to get a law that takes it."
             )
 
 

@@ -9,14 +9,16 @@ from jax import Array
 
 from ambjax.numerics.records import Scalar, record
 
-# Status codes of a rotor, for compiled code, and their descriptions.
+# Status codes of a rotor, for compiled code; the event of each status, its reason, and both as one text.
 ALIVE, TOUCHED, DIVERGED, STALLED = range(4)
-STATUSES = (
+EVENTS = ("", "touched down", "diverged", "stalled")
+REASONS = (
     "",
-    "touched down: |z| reached the clearance",
-    "diverged: a state left the range in which the model is valid",
-    "stalled: the integrator could not meet its tolerance",
+    "|z| reached the clearance",
+    "a state left the range in which the model is valid",
+    "the integrator could not meet its tolerance",
 )
+STATUSES = tuple(f"{event}: {reason}" if event else "" for event, reason in zip(EVENTS, REASONS, strict=True))
 
 
 class Row(NamedTuple):
@@ -109,8 +111,18 @@ class Trajectory:
 
     @property
     def lost_why(self) -> str:
-        """The reason of the loss, in words; empty if the rotor survives. For one member only."""
+        """The event that ended the run and its reason, in words; empty if the rotor survives. For one member only."""
         return STATUSES[int(self.lost_code)]
+
+    @property
+    def lost_event(self) -> str:
+        """The event that ended the run; empty if the rotor survives. For one member only."""
+        return EVENTS[int(self.lost_code)]
+
+    @property
+    def lost_reason(self) -> str:
+        """The reason of this event; empty if the rotor survives. For one member only."""
+        return REASONS[int(self.lost_code)]
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the saved arrays by name, float64, with the status."""

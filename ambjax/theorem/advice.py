@@ -24,7 +24,7 @@ STALLED = (
 STALLED_PLANT = 'Use fixed steps of the plant, which cannot stall: [clock] dt = 1e-6 with method = "rodas3".'
 
 
-def answer(report: Report, case: str) -> list[str]:
+def theorem_lines(report: Report, case: str) -> list[str]:
     """Return the lines below the table of `ambjax check`. `case`: file name as given by the user."""
     deciding = [line for line in report.conditions if line.holds is not None]
     fails = [line for line in deciding if not line.holds]
@@ -66,7 +66,7 @@ def advice(report: Report) -> list[str]:
     return lines
 
 
-def on_processor(sampled: SampledReport, margin: Delays, unknown: Delays | None) -> list[str]:
+def processor_lines(sampled: SampledReport, margin: Delays, unknown: Delays | None) -> list[str]:
     """Return the lines below the tables of a cascade on a processor.
 
     They report the slopes, the distance to C, the status of the rotor, an alternating voltage, and the delay margins.
@@ -144,7 +144,7 @@ def _to_raise(line: Condition) -> str:
         return f"{line.requires} cannot be evaluated: its right-hand side is not finite along this run."
     name, key, gain = _sides(line)
     return (
-        f"{name} = {gain} must exceed {number(line.against)} {line.unit} ({line.requires.partition(' > ')[2]}, at "
+        f"{name} = {gain} must exceed {number(line.against)} {line.unit} ({line.over}, at "
         f"{line.at_s:.4g} s): set {key} above {number(_up(MARGIN * line.against))}."
     )
 
@@ -153,7 +153,7 @@ def _during_fall(line: Condition, ideal: Condition | None) -> str:
     """Return the advice on a gain whose condition fails only while the rotor falls."""
     name, key, gain = _sides(line)
     words = (
-        f"{line.requires.partition(' > ')[2]} = {number(line.against)} {line.unit} exceeds {name} = {gain} at "
+        f"{line.over} = {number(line.against)} {line.unit} exceeds {name} = {gain} at "
         f"{line.at_s:.4g} s, while the rotor falls. Do not choose {name} by this value: another gain, a disturbance, "
         "noise or the supply may cause the fall."
     )

@@ -35,8 +35,8 @@ class Condition:
 
     `requires`: the condition as text. `gain`, `against`: its left and right side, in `unit`; `gain` is None if the law
     has no such gain. `at_s`: time of the worst value, s. `holds`: None for a line that is only informative, or if
-    `gain` is None. `path`: path of the gain in a case file, if the line is about a gain. `ideal`: whether `against`
-    depends on the reference only, not on the run.
+    `gain` is None. `path`, `over`: path of the gain in a case file and name of the right side, if the line is about a
+    gain. `ideal`: whether `against` depends on the reference only, not on the run.
     """
 
     name: str
@@ -48,6 +48,7 @@ class Condition:
     holds: bool | None
     note: str = ""
     path: str = ""
+    over: str = ""
     ideal: bool = False
 
     @property
@@ -203,7 +204,7 @@ def _conditions(
         if one.value is None:
             return Condition(name, requires, None, against, at, one.unit, None, "the law in use has no such gain")
         gain, path = float(one.value), one.path
-        return Condition(name, requires, gain, against, at, one.unit, gain > against, path=path, ideal=ideal)
+        return Condition(name, requires, gain, against, at, one.unit, gain > against, "", path, over, ideal)
 
     requirements, lines = required(cascade), []
     for one in requirements:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.schedule import present
+from ambjax.control.schedule import with_gains_at
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.loop import ClosedLoop, ExternalInputs, LoopState
@@ -118,7 +118,7 @@ class Monitored:
     def rest(self, state: MonitoredState, code: Array) -> MonitoredState:
         return MonitoredState(self.loop.rest(state.loop, code), state.integrals)
 
-    def noted(self, row: TheoremRow, span: Span) -> TheoremRow:
+    def completed(self, row: TheoremRow, span: Span) -> TheoremRow:
         return row
 
     def singularity(self, row: TheoremRow) -> Array:
@@ -140,7 +140,7 @@ class Monitored:
         q_z, q_i = scenario.pushed(inputs.q_z, motion), inputs.q_i
         d = self._drift(inputs, state, errors, command.i_ref, moving)
         h = plant.a * (plant.signals(state.plant).v - v_tilde - plant.v(z, command.i_ref))
-        laws = (present(law, z, inputs.reference) for law in cascade.laws[1:])
+        laws = (with_gains_at(law, z, inputs.reference) for law in cascade.laws[1:])
         robust = Identities(*(law.robust(x) for law, x in zip(laws, (sigma, v_tilde, e), strict=True)))
         rates = Identities(robust.sigma + q_z + h, robust.v_tilde + d, robust.e + q_i)
         # |v(z, i) - v(z, i_ref)| <= L_v |e|: v is quadratic in i, so dv/di is largest at one end.

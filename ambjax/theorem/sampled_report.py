@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.control.base import unhardened
+from ambjax.control.base import with_infinite_steepness
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState
 from ambjax.control.sampling import Sampling, band, disturbance, slope_limits
@@ -23,6 +23,7 @@ from ambjax.control.schedule import extremes, schedules
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import Outcome, System, prepare, roll
+from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
 from ambjax.theorem.watched import Watched
@@ -140,12 +141,12 @@ class Delays(NamedTuple):
         return None if self.held is None or self.lost is None else self.lost - self.held
 
 
-def rolled(system: object, clock: Clock) -> Outcome:
+def rolled(system: System, clock: Clock) -> Outcome:
     """Roll out a system and record every sample."""
     return roll(*canonical((system, clock)), None, every=1)
 
 
-def check(
+def check_sampled(
     cascade: Cascade,
     scenario: Scenario,
     clock: Clock,
@@ -168,7 +169,7 @@ def check(
     alternating = alternation(np.asarray(calm.rows.u)[settled:]) if np.isinf(calm.lost_at) else None
     stalled = int(outcome.lost_code) == STALLED
     return SampledReport(
-        slopes(cascade, clock),
+        slope_checks(cascade, clock),
         bands,
         float(outcome.lost_at),
         outcome.lost_why,
@@ -179,8 +180,9 @@ def check(
     )
 
 
-def _watched(loop: Any, clock: Clock, run: Callable[[System, Clock], Outcome]) -> Trajectory:
-    """Simulate a loop and record the rows of `Watched`."""
+def _watched(loop: System, clock: Clock, run: Callable[[System, Clock], Outcome]) -> Trajectory:
+    """Simulate a loop on a processor and record the rows of `Watched`."""
+    assert isinstance(loop, Sampled)
     return run(Watched(loop), clock).trajectory
 
 
@@ -209,10 +211,10 @@ def _without_noise(scenario: Scenario) -> Scenario:
     return scenario if quiet in (None, scenario.sensor) else dataclasses.replace(scenario, sensor=quiet)
 
 
-def slopes(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
+def slope_checks(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
     """Return slope times T and its limits for every law with a slope. `cascade`: of one member."""
     sampling, lines = sampling_of(cascade, clock), []
-    for stage, law in zip(CascadeState._fields, map(unhardened, cascade.laws), strict=True):
+    for stage, law in zip(CascadeState._fields, map(with_infinite_steepness, cascade.laws), strict=True):
         implicit = law.has_own_step(sampling.implicit)
         ends = extremes(law)
         slope = stepped = max(_steepest(one.slope(cascade.model)) for one in ends) * sampling.period

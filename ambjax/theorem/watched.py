@@ -1,6 +1,6 @@
 """The loop on a processor with rows that record the sigma, v_tilde and e that the laws compute at every sample."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -10,7 +10,7 @@ from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.integrate import Advanced, Integrator
 from ambjax.simulation.sampled import Sampled, SampledState
 from ambjax.simulation.span import Span
-from ambjax.world.sensor import Errors
+from ambjax.world.sensor import Errors, FaultyErrors
 
 
 class WatchedSignals(NamedTuple):
@@ -52,13 +52,13 @@ class Watched:
     def realised(self) -> "Watched":
         return Watched(self.loop.realised())
 
-    def sensor_errors(self, sample: Scalar) -> Any:
+    def sensor_errors(self, sample: Scalar) -> Errors | FaultyErrors:
         return self.loop.sensor_errors(sample)
 
     def start(self) -> WatchedState:
         return WatchedState(self.loop.start(), WatchedSignals(*[jnp.zeros(())] * 3))
 
-    def jump(self, t: Scalar, state: WatchedState, errors: Errors) -> WatchedState:
+    def jump(self, t: Scalar, state: WatchedState, errors: Errors | FaultyErrors) -> WatchedState:
         """Step the laws and store the signals that they computed."""
         loop, before = self.loop, state.loop
         cascade, after = loop.loop.cascade, loop.jump(t, before, errors)
@@ -72,7 +72,7 @@ class Watched:
     def advance(
         self,
         method: Integrator,
-        errors: Errors,
+        errors: Errors | FaultyErrors,
         t: Scalar,
         period: Scalar,
         state: WatchedState,
@@ -88,12 +88,12 @@ class Watched:
     def rest(self, state: WatchedState, code: Array) -> WatchedState:
         return state._replace(loop=self.loop.rest(state.loop, code))
 
-    def row(self, t: Scalar, state: WatchedState, errors: Errors, alive: Array) -> WatchedRow:
+    def row(self, t: Scalar, state: WatchedState, errors: Errors | FaultyErrors, alive: Array) -> WatchedRow:
         row = self.loop.row(t, state.loop, errors, alive)
         true = WatchedSignals(row.sigma, row.v_tilde, row.e)
         return WatchedRow(row.t, row.u, row.z, row.i_ref, state.computed, true)
 
-    def noted(self, row: WatchedRow, span: Span) -> WatchedRow:
+    def completed(self, row: WatchedRow, span: Span) -> WatchedRow:
         return row
 
     def singularity(self, row: WatchedRow) -> Array:

@@ -188,7 +188,7 @@ class Sum:
         return Sum(tuple(realised(term, jax.random.fold_in(key, n)) for n, term in enumerate(self.terms)))
 
 
-def is_random(signal: object) -> bool:
+def is_random(signal: Signal | None) -> bool:
     """Return whether the signal, or a term of it, is random."""
     return any(map(is_random, signal.terms)) if isinstance(signal, Sum) else hasattr(signal, "realised")
 

@@ -5,7 +5,8 @@ import re
 import tomllib
 from typing import Any
 
-from ambjax.cases.reader import KINDS, OTHERS, TABLES, case_from
+from ambjax.cases.controller_tables import KINDS
+from ambjax.cases.reader import OTHERS, TABLES, case_from
 from ambjax.cases.scenario_tables import FIELDS, SETTLE, SIGNALS, STOP
 from ambjax.cases.table import Table
 from ambjax.cases.template_text import template

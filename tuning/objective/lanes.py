@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jax import Array
 
 from ambjax.control.cascade import Cascade
@@ -160,7 +161,7 @@ class Engine:
         return metrics
 
     def gradient(
-        self, x: np.ndarray, members: Members, weights: object
+        self, x: np.ndarray, members: Members, weights: npt.ArrayLike
     ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         """Return outcomes [S, N, 1 + L], their derivatives [S, N, 1 + L, m] and the terms [S, N] at x [S, m].
 

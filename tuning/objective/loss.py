@@ -1,11 +1,12 @@
 """The loss of one rollout: a fold that returns dimensionless terms, and their weighted sum."""
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ambjax.extend import Scalar, leaf, record
@@ -17,6 +18,9 @@ from tuning.objective.limits import PREFIX
 
 # Exponent of the norm that approximates a maximum. Over 1e4 samples of noise, the maximum is 1.2 to 1.6 times the norm.
 NORM = 16
+# Weights of the terms, in the order of TERMS; values of a term, for one member or for many [N].
+Weights = Sequence[float] | np.ndarray | Array
+Values = TypeVar("Values", Array, np.ndarray)
 # Names of the terms, in the order of the weights.
 TERMS = ("tracking", "peak", "effort", "chatter", "clearance", "survival")
 # Terms that measure the distance from touchdown and the loss of the rotor.
@@ -132,7 +136,7 @@ def loss_for(scenario: Scenario, settle: float, early: float = 0.0, measures: Ma
     return Loss(settle, early, plant.s_0, float(u_scale), scenario.touchdown, dict(measures or {}))
 
 
-def weigh(weights: Any, terms: Mapping[str, Any], stressed: Any) -> Any:
+def weigh(weights: Weights, terms: Mapping[str, Values], stressed: Values) -> Values:
     """Return the loss: clearance + survival + (tracking + peak) (1 + effort + chatter), each term times its weight.
 
     `weights`: in the order of TERMS. `terms`: the terms by name, numbers or arrays [N]. `stressed`: whether a member is
@@ -140,13 +144,13 @@ def weigh(weights: Any, terms: Mapping[str, Any], stressed: Any) -> Any:
     the error is unknown in advance. With a weight of 0.1, a voltage that is always at its limit adds a tenth of the
     error.
     """
-    ordinary = 1.0 - 1.0 * stressed
-    each = dict(zip(TERMS, (weights[k] * terms[name] for k, name in enumerate(TERMS)), strict=True))
+    ordinary: Any = 1.0 - 1.0 * stressed
+    each: dict[str, Any] = dict(zip(TERMS, (weights[k] * terms[name] for k, name in enumerate(TERMS)), strict=True))
     costs = sum(each.pop(name) for name in COSTS)
     held = sum(each.pop(name) for name in HELD)
     return held + ordinary * sum(each.values()) * (1 + costs)
 
 
-def outcomes(weights: object, terms: dict[str, Any], stressed: object) -> list[Any]:
+def outcomes(weights: Weights, terms: dict[str, Values], stressed: Values) -> list[Values]:
     """Return the loss (`weigh`), then the limited quantities among `terms` in the order of their names."""
-    return [weigh(weights, terms, stressed), *(terms[name] for name in sorted(terms) if name.startswith(PREFIX))]
+    return [weigh(weights, terms, stressed), *(terms[name] for name in sorted(terms.keys() - set(TERMS)))]

@@ -1,12 +1,12 @@
 """Initial search ranges of the gains, from the plant, the clock and the theorem's conditions."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
+from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import extremes
-from ambjax.control.search import Interval, SearchContext
+from ambjax.control.search import Interval, LowerBound, SearchContext
 from tuning.objective.members import Objective
 from tuning.objective.shortfalls import Bound
 from tuning.space import Gain, Space
@@ -52,7 +52,7 @@ def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarra
     return [found[gain.path] for gain in gains]
 
 
-def drawn(space: Space, box: list[Range], cube: np.ndarray) -> np.ndarray:
+def from_unit_cube(space: Space, box: list[Range], cube: np.ndarray) -> np.ndarray:
     """Map points of the unit cube [n, m] to gains [n, m], log-uniform over the ranges `box`.
 
     All knots of a schedule have the value of the first: the search begins at constant gains.
@@ -89,17 +89,18 @@ def _context(objective: Objective, conditions: tuple[Bound, ...]) -> SearchConte
         (LEAST_DISPLACEMENT * float(scenario.touchdown), f"{100 * LEAST_DISPLACEMENT:g} % of the clearance"),
     ]
     z, where = max(places)
-    delta = bounds.get("Delta_1", 0.0)
-    if delta >= growth * z:
-        needed = delta, f"Delta_1 = {delta:.3g} A^2/m^2/s along the reference, Eq. (7)"
-    else:
-        needed = growth * z, f"D = dv/dz w z = {growth * z:.3g} A^2/m^2/s, required by Eq. (7) for a fall from {where}"
+    delta, fall = bounds.get("Delta_1", 0.0), growth * z
+    needed = (
+        LowerBound(delta, "Delta_1", f"Delta_1 = {delta:.3g} A^2/m^2/s along the reference, Eq. (7)")
+        if delta >= fall
+        else LowerBound(fall, "D", f"D = dv/dz w z = {fall:.3g} A^2/m^2/s, required by Eq. (7) for a fall from {where}")
+    )
     processor = objective.cascade.processor
     stepped = processor is not None and processor.implicit
     return SearchContext(model, w, float(objective.clock.sample_period), bounds, needed, stepped)
 
 
-def _interval(context: SearchContext, cascade: object, gain: Gain, value: float) -> Interval:
+def _interval(context: SearchContext, cascade: Cascade, gain: Gain, value: float) -> Interval:
     if gain.low > 0 and np.isfinite(gain.high):
         return Interval(gain.low, gain.high, "tune.bounds", True)
     _, stage, name, *_ = gain.path.split(".")
@@ -109,7 +110,7 @@ def _interval(context: SearchContext, cascade: object, gain: Gain, value: float)
     return extremes(getattr(cascade, stage))[0].ranges(context).get(name, about)
 
 
-def _quotient(gain: Gain, value: float, interval: Interval, cascade: Any, found: dict[str, Range]) -> Range:
+def _quotient(gain: Gain, value: float, interval: Interval, cascade: Cascade, found: dict[str, Range]) -> Range:
     """Return the range of a gain whose law defines the interval of its product with another gain."""
     root, stage, _, *knot = gain.path.split(".")
     stem = f"{root}.{stage}.{interval.times}"

@@ -1,5 +1,6 @@
 """Breakdown of the loss: the contribution of each term, and the parts of the minimised goal."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,14 +16,14 @@ FORMULA = f"{' + '.join(HELD)} + (tracking + peak) x (1 + {' + '.join(COSTS)})"
 Facts = dict[str, Any]
 
 
-def contributions(weights: Any, terms: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def contributions(weights: Sequence[float], terms: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the contribution of each term to the loss of each unstressed member [N]; the sum is `weigh`."""
     each = {name: weights[k] * np.asarray(terms[name]) for k, name in enumerate(TERMS)}
     error = sum(values for name, values in each.items() if name not in (*COSTS, *HELD))
     return {name: error * values if name in COSTS else values for name, values in each.items()}
 
 
-def table(goal: Goal, columns: dict[str, np.ndarray]) -> Facts:
+def loss_breakdown(goal: Goal, columns: dict[str, np.ndarray]) -> Facts:
     """Return, for an ensemble, the mean value and mean contribution of each term, the mean loss, and the risk.
 
     `columns`: the columns of `judge`; the terms [N] are named "loss.tracking" and so on.

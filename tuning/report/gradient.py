@@ -1,13 +1,13 @@
 """Quality of the gradient: agreement of three ways to compute it, growth with the horizon, signal-to-noise ratio."""
 
 import dataclasses
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from tuning.objective.lanes import Engine
 from tuning.objective.loss import weigh
-from tuning.objective.members import Members
+from tuning.objective.members import Members, Objective
 from tuning.problem import TuningProblem
 
 Number = TypeVar("Number", float, np.ndarray)
@@ -23,7 +23,7 @@ AGREED = "agree"
 HORIZONS = (0.125, 0.25, 0.5)
 
 
-def _shorter(problem: TuningProblem, samples: int) -> Any:
+def _shorter(problem: TuningProblem, samples: int) -> Objective:
     """Return the objective over fewer samples; the settled part starts at the same share of them."""
     objective = problem.objective
     clock = dataclasses.replace(objective.clock, samples=samples)
@@ -36,7 +36,7 @@ def three_ways(problem: TuningProblem, x: np.ndarray) -> dict[str, object]:
     """Compute the gradient [m] of the mean loss at x [m] by forward mode, reverse mode and extrapolated differences.
 
     Returns plain data. `coarse`, `fine`: central differences with the steps STEP and STEP / 2. `verdicts`: for each
-    gain, whether the three agree (`verdict`). `agree`: whether they agree for every gain.
+    gain, whether the three agree (`agreement`). `agree`: whether they agree for every gain.
     """
     objective = _shorter(problem, min(SAMPLES, problem.objective.clock.samples))
     members = objective.members(problem.tune.budget.seed, min(FEW, problem.tune.budget.members))
@@ -52,7 +52,7 @@ def three_ways(problem: TuningProblem, x: np.ndarray) -> dict[str, object]:
     coarse, fine = (up - down) / (2 * STEP), (half_up - half_down) / STEP
     floor = float(max(NOTHING * np.abs([by_forward, by_reverse]).max(), ROUNDING * np.abs(values).max()))
     columns = zip(by_forward, by_reverse, coarse, fine, strict=True)
-    verdicts = [verdict(a, b, c, d, floor) for a, b, c, d in columns]
+    verdicts = [agreement(a, b, c, d, floor) for a, b, c, d in columns]
     return {
         "forward": by_forward,
         "reverse": by_reverse,
@@ -70,7 +70,7 @@ def extrapolated(coarse: Number, fine: Number) -> Number:
     return (4 * fine - coarse) / 3
 
 
-def verdict(forward: float, reverse: float, coarse: float, fine: float, floor: float) -> str:
+def agreement(forward: float, reverse: float, coarse: float, fine: float, floor: float) -> str:
     """Return AGREED if three ways to a derivative agree, else a description of the difference.
 
     `coarse`, `fine`: central differences with the steps STEP and STEP / 2. Differences below `floor` are ignored.
@@ -81,11 +81,11 @@ def verdict(forward: float, reverse: float, coarse: float, fine: float, floor: f
         return max(abs(a - b) - floor, 0.0) / max(abs(a), abs(b), floor)
 
     if not np.isfinite([forward, reverse, coarse, fine]).all():
-        return "no finite number by every way"
+        return "not every way gives a finite number"
     if apart(forward, reverse) > MODES:
         return f"forward and reverse mode differ by {100 * apart(forward, reverse):.2g} %: rounding grows along the run"
     if apart(coarse, fine) > STEADY:
-        return f"differences decide nothing: {coarse:.2e} with a step of {STEP:g}, {fine:.2e} with {STEP / 2:g}"
+        return f"differences are inconclusive: {coarse:.2e} with a step of {STEP:g}, {fine:.2e} with {STEP / 2:g}"
     found = extrapolated(coarse, fine)
     if apart(found, forward) > AGREE:
         return f"differences differ from both modes by {100 * apart(found, forward):.2g} %, whatever their step"
@@ -128,7 +128,7 @@ def signal_to_noise(problem: TuningProblem, x: np.ndarray, members: Members) -> 
     }
 
 
-def report(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, object]:
+def gradient_report(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, object]:
     """Return the data of the whole gradient report at coordinates x [m]: of the loss, also if the answer is a knee."""
     return {
         "gains": problem.objective.space.paths,

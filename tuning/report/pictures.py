@@ -87,7 +87,7 @@ def before_after(runs: dict[str, Trajectory]) -> bytes:
 
 def _ended(run: Trajectory) -> str:
     """Return how and when a run ended."""
-    return f"{run.lost_why.partition(':')[0]} at {float(run.lost_at):.4g} s"
+    return f"{run.lost_event} at {float(run.lost_at):.4g} s"
 
 
 @own_style
@@ -128,7 +128,7 @@ def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarra
 
 
 @own_style
-def convergence(history: dict[str, Any], paths: list[str]) -> bytes:
+def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
     """Draw the minimised goal and the gains of the best start over the iterations, as PNG."""
     from matplotlib.figure import Figure
 

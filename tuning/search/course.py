@@ -1,6 +1,6 @@
 """A sequence of searches, each of which starts from the result of earlier ones, and restarts around the best point.
 
-A search may end at a cliff of the goal although the goal is lower beyond it. A restart tries quasi-random points
+A search may end at a jump of the goal although the goal is lower beyond it. A restart tries quasi-random points
 around the best point so far.
 """
 
@@ -14,23 +14,24 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 
 from ambjax.commands.outputs import say
 from tuning.judge import StepError
 from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
-from tuning.search.keeper import Keeper, SearchState, checkpoint
+from tuning.search.checkpoint import CheckpointFile, SearchState, checkpoint
 from tuning.search.optimise import best_of, search
 from tuning.search.screen import around, initial_points
 
 # Largest number of searches in `search_and_restart`.
 MOST_SEARCHES = 5
-# Restarts end after two searches in a row that lower the goal by less than this share. After one alone they go on,
+# Restarts end after two searches in a row that lower the goal by less than this share. One such search is not enough,
 # because its points may have missed a better optimum by chance.
 GAIN = 0.01
 # Number of earlier points that are tried with accurate steps if these confirm none of the answers.
-RETREAT_POINTS = 12
+FALLBACK_POINTS = 12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +48,7 @@ class SearchResult:
     error: StepError | None
     history: dict[str, np.ndarray]
     lost: int
-    """number of validation members that are lost, plus that of members that accurate steps do not hold"""
+    """number of validation members that are lost, plus that of members that are lost with accurate steps"""
     seconds: float
     """duration of all searches in s, the time before a resume included"""
     front: tuple[Any, ...] = ()
@@ -89,10 +90,10 @@ class Course:
     began: float = dataclasses.field(default_factory=time.perf_counter)
     """start of the first search, s"""
 
-    def search(self, points: np.ndarray, *, settled: bool = False) -> tuple[np.ndarray, float]:
+    def search(self, points: np.ndarray, *, at_optimum: bool = False) -> tuple[np.ndarray, float]:
         """Search from `points` [K, m] and append the search to `past`. Return the best point [m] and its goal.
 
-        `settled`: whether an earlier search on all members ended at the first point; it is not refined again. Raises
+        `at_optimum`: whether an earlier search on all members ended at the first point; it is not refined again. Raises
         KeyboardInterrupt if Ctrl-C ends the first search before its first iteration, and ValueError if the goal is not
         finite at any point.
         """
@@ -101,8 +102,8 @@ class Course:
         progress = search(
             self.problem.engine, self.problem.goal, self.members, points, keep=tune.budget.starts,
             iterations=tune.budget.iterations, name=tune.optimiser, rate=tune.learning_rate,
-            seed=self.seed + len(self.past), settled=settled,
-            keeper=Keeper(path, self.facts, number), resume=self.resume,
+            seed=self.seed + len(self.past), at_optimum=at_optimum,
+            checkpoint_file=CheckpointFile(path, self.facts, number), resume=self.resume,
             on_iteration=self.on_iteration or _progress_line(self.problem),
         )  # fmt: skip
         if progress.ended:
@@ -148,7 +149,7 @@ def search_and_restart(course: Course, start: np.ndarray) -> np.ndarray:
         return x
     seen = [(value, x)]  # comparable: all searches use the same members and steps
     while should_restart([value for value, _ in seen]) and not course.interrupted:
-        x, value = course.search(course.around(x), settled=True)
+        x, value = course.search(course.around(x), at_optimum=True)
         seen.append((value, x))
         x = min(seen, key=lambda one: one[0])[1]
     return x
@@ -173,11 +174,11 @@ def training(problem: TuningProblem) -> Members:
 
 
 def points_of(past: list[SearchState]) -> np.ndarray:
-    """Return at most RETREAT_POINTS points [K, m] of the searches' paths, best first, denser among the better ones."""
+    """Return at most FALLBACK_POINTS points [K, m] of the searches' paths, best first, denser among the better ones."""
     x = np.concatenate([np.asarray(one.history["x"]).reshape(-1, one.starts.best.shape[-1]) for one in past])
     value = np.concatenate([np.asarray(one.history["value"]).ravel() for one in past])
     _, first = np.unique(np.where(np.isfinite(value), value, np.inf), return_index=True)
-    chosen = np.unique((np.linspace(0, np.sqrt(len(first) - 1), RETREAT_POINTS).round(6) ** 2).astype(int))
+    chosen = np.unique((np.linspace(0, np.sqrt(len(first) - 1), FALLBACK_POINTS).round(6) ** 2).astype(int))
     return x[first[chosen]]
 
 
@@ -196,7 +197,7 @@ def _joined(past: list[SearchState]) -> dict[str, np.ndarray]:
     """Concatenate the histories of all searches by name. Columns of missing starts repeat the first start."""
     width = max(len(one.active) for one in past)
 
-    def wide(rows: object) -> np.ndarray:
+    def wide(rows: npt.ArrayLike) -> np.ndarray:
         rows = np.asarray(rows)
         return rows if rows.ndim < 2 or rows.shape[1] == width else np.repeat(rows[:, :1], width, axis=1)
 

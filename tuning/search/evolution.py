@@ -16,7 +16,7 @@ SIZE = 0.3
 STALL, PATIENCE = 0.01, 6
 
 
-class Cloud(NamedTuple):
+class CmaState(NamedTuple):
     """State of the distribution: mean [m], step size, covariance [m, m] in units of size^2, evolution paths [m]."""
 
     mean: Any
@@ -75,46 +75,48 @@ def population(m: int) -> int:
     return 4 + int(3 * math.log(m))
 
 
-def begun(mean: np.ndarray) -> Cloud:
+def initial_state(mean: np.ndarray) -> CmaState:
     """Return the initial distribution around a point [m]."""
     m = len(mean)
-    return Cloud(mean, np.array(SIZE), np.eye(m), np.zeros(m), np.zeros(m), np.array(0), np.array(np.inf), np.array(0))
+    return CmaState(
+        mean, np.array(SIZE), np.eye(m), np.zeros(m), np.zeros(m), np.array(0), np.array(np.inf), np.array(0)
+    )
 
 
-def clouds(starts: int, m: int) -> Cloud:
+def idle_states(starts: int, m: int) -> CmaState:
     """Return the distributions of several starts in m dimensions, leaves [starts, ...], none of them in use."""
-    one = begun(np.zeros(m))._replace(drawn=np.array(-1))
-    return Cloud(*(np.repeat(np.asarray(leaf)[None], starts, axis=0) for leaf in one))
+    one = initial_state(np.zeros(m))._replace(drawn=np.array(-1))
+    return CmaState(*(np.repeat(np.asarray(leaf)[None], starts, axis=0) for leaf in one))
 
 
-def drawn(cloud: Cloud, seed: int) -> np.ndarray:
+def next_population(state: CmaState, seed: int) -> np.ndarray:
     """Return the next population [n, m]."""
-    m = len(cloud.mean)
-    normal = np.random.default_rng([seed, int(cloud.drawn)]).standard_normal((population(m), m))
-    return cloud.mean + cloud.size * normal @ _root(cloud.covariance).T
+    m = len(state.mean)
+    normal = np.random.default_rng([seed, int(state.drawn)]).standard_normal((population(m), m))
+    return state.mean + state.size * normal @ _root(state.covariance).T
 
 
-def moved(cloud: Cloud, points: np.ndarray, values: np.ndarray) -> Cloud:
+def moved(state: CmaState, points: np.ndarray, values: np.ndarray) -> CmaState:
     """Return the distribution updated with the values [n] at its last population `points` [n, m]."""
-    m, now = len(cloud.mean), int(cloud.drawn) + 1
+    m, now = len(state.mean), int(state.drawn) + 1
     r = rates(m)
     order = np.argsort(values, kind="stable")[: len(r.weights)]
-    steps = (points[order] - cloud.mean) / cloud.size
+    steps = (points[order] - state.mean) / state.size
     step = r.weights @ steps
-    unit = np.linalg.solve(_root(cloud.covariance), step)
-    path = (1 - r.size) * cloud.path + math.sqrt(r.size * (2 - r.size) * r.effective) * unit
+    unit = np.linalg.solve(_root(state.covariance), step)
+    path = (1 - r.size) * state.path + math.sqrt(r.size * (2 - r.size) * r.effective) * unit
     expected = math.sqrt(m) * (1 - 1 / (4 * m) + 1 / (21 * m**2))
     length = float(np.linalg.norm(path))
     steady = length / math.sqrt(1 - (1 - r.size) ** (2 * now)) < (1.4 + 2 / (m + 1)) * expected
-    drift = (1 - r.drift) * cloud.drift + steady * math.sqrt(r.drift * (2 - r.drift) * r.effective) * step
+    drift = (1 - r.drift) * state.drift + steady * math.sqrt(r.drift * (2 - r.drift) * r.effective) * step
     kept = 1 - r.one - r.many + (not steady) * r.one * r.drift * (2 - r.drift)
-    covariance = kept * cloud.covariance + r.one * np.outer(drift, drift) + r.many * (steps.T * r.weights) @ steps
-    size = cloud.size * math.exp(min(1.0, (r.size / r.damping) * (length / expected - 1)))
+    covariance = kept * state.covariance + r.one * np.outer(drift, drift) + r.many * (steps.T * r.weights) @ steps
+    size = state.size * math.exp(min(1.0, (r.size / r.damping) * (length / expected - 1)))
     level = float(r.weights @ values[order])
-    better = level < cloud.level - STALL
-    level, stale = (level, 0) if better else (cloud.level, cloud.stale + 1)
-    mean = cloud.mean + cloud.size * step
-    return Cloud(mean, np.array(size), covariance, path, drift, np.array(now), np.array(level), np.array(stale))
+    better = level < state.level - STALL
+    level, stale = (level, 0) if better else (state.level, state.stale + 1)
+    mean = state.mean + state.size * step
+    return CmaState(mean, np.array(size), covariance, path, drift, np.array(now), np.array(level), np.array(stale))
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:

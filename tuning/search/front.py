@@ -18,7 +18,7 @@ from tuning.judge import held, judge, rms
 from tuning.objective.limits import FRONT
 from tuning.objective.members import Members
 from tuning.search.course import Course, SearchResult
-from tuning.search.multipliers import holding, judged_members, met, reached, searched
+from tuning.search.multipliers import holding, judged_members, judged_values, met, search_values
 from tuning.search.validation import validated
 
 # Error limit of the knee, and those of the front in the order in which tune.front adds them, relative to the least.
@@ -37,8 +37,8 @@ class FrontPoint(NamedTuple):
 
     `factor`: limit of the rms error relative to the least; 1: the answer of least error. `x` [m]: coordinates.
     `error_m`, `volts`: settled rms error (m) and voltage (V) of the members held, NaN without any. `sensitivity`:
-    peak of |S| as it is limited; None if it is not. `lost`, `stalled`: of `members` members. `within`: whether the
-    limits are held, that of the error apart.
+    peak of |S| as it is limited; None if it is not. `lost`, `stalled`: of `members` members. `within`: whether
+    all limits except that of the error are met.
     """
 
     factor: float
@@ -52,7 +52,7 @@ class FrontPoint(NamedTuple):
     within: bool
 
 
-def traced(course: Course, answer: SearchResult) -> SearchResult:
+def trace_front(course: Course, answer: SearchResult) -> SearchResult:
     """Trace the front from the answer of least error. Return the answer that tune.objective selects.
 
     The result holds the points of the front in order of the error limit: for each limit the judged answer of least
@@ -71,7 +71,7 @@ def traced(course: Course, answer: SearchResult) -> SearchResult:
         least = least_of(seen)
         say(f"front: least rms voltage with an rms error of at most {factor:g} times the least, {least.error_m:.3g} m")
         course.problem = answer.problem.towards_voltage(least.error_m, least.volts, factor)
-        seen += _searched(course, factor, seen)
+        seen += _search_least_voltage(course, factor, seen)
     taken = answer
     if not course.interrupted:
         least, course.problem = least_of(seen), answer.problem
@@ -87,14 +87,14 @@ def traced(course: Course, answer: SearchResult) -> SearchResult:
 
 
 def least_of(seen: Sequence[FrontPoint]) -> FrontPoint:
-    """Return the point of least error of those that lose no more members, and hold the limits, like the first."""
+    """Return the point of least error of those that `_fit` returns."""
     return min(_fit(seen), key=lambda point: point.error_m)
 
 
 def chosen(seen: Sequence[FrontPoint], factor: float) -> FrontPoint:
     """Return the point of least voltage of those with an error of at most `factor` times the least.
 
-    Points that lose more members than the first, or break a limit that it holds, do not count.
+    Only points that `_fit` returns count.
     """
     fit = _fit(seen)
     least = min(point.error_m for point in fit)
@@ -102,7 +102,7 @@ def chosen(seen: Sequence[FrontPoint], factor: float) -> FrontPoint:
 
 
 def _fit(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
-    """Return the points that lose no more members than the first, and hold the limits that it holds."""
+    """Return the points that lose no more members than the first, and that meet all limits if the first does."""
     first = seen[0]
     return [
         point
@@ -113,7 +113,7 @@ def _fit(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
     ]
 
 
-def _searched(course: Course, factor: float, seen: Sequence[FrontPoint]) -> list[FrontPoint]:
+def _search_least_voltage(course: Course, factor: float, seen: Sequence[FrontPoint]) -> list[FrontPoint]:
     """Search for the least voltage within the limits from the best point in `seen`. Return the answer of each search.
 
     After each search either the multipliers are updated, or members join the training ensemble; then the next search
@@ -165,7 +165,7 @@ def _rare(course: Course, numbers: Sequence[tuple[float, float]], columns: Mappi
 
 
 def _valid(course: Course, answer: SearchResult, seen: list[FrontPoint]) -> SearchResult:
-    """Return the point that tune.objective selects if it is valid; else the next best, at last the given answer.
+    """Return the point that tune.objective selects if it is valid, else the next best; the given answer if none is.
 
     Points that are not valid are removed from `seen`.
     """
@@ -191,8 +191,8 @@ def _judged(
     """
     problem, budget = course.problem, course.problem.tune.budget
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
-    columns, tuned = judge(problem, x, seed, judged_members(problem.limits, count)), searched(course, x)
-    values = reached(problem, x, seed, columns, tuned)
+    columns, tuned = judge(problem, x, seed, judged_members(problem.limits, count)), search_values(course, x)
+    values = judged_values(problem, x, seed, columns, tuned)
     alive = held(columns)
     error, volts = (
         rms(columns[name][alive]) if alive.any() else math.nan for name in ("settled_rms_error_m", "settled_rms_u_V")

@@ -8,9 +8,9 @@ from tuning.objective.goal import Goal
 from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
+from tuning.search.checkpoint import SearchState
 from tuning.search.descent import Descent
-from tuning.search.evolution import drawn, moved
-from tuning.search.keeper import SearchState
+from tuning.search.evolution import moved, next_population
 
 
 def iterate(
@@ -30,7 +30,7 @@ def iterate(
     better = _descended(engine, goal, members, progress, descent, weights) | _evolved(
         engine, goal, members, progress, seed
     )
-    record(engine, members, progress, better, fresh=fresh)
+    append_history(engine, members, progress, better, fresh=fresh)
 
 
 def _descended(
@@ -65,8 +65,8 @@ def _evolved(
     active = np.flatnonzero(progress.active & progress.evolving)
     if not active.size:
         return {}
-    own = [progress.cloud(at) for at in active]
-    points = [drawn(cloud, seed + int(at)) for cloud, at in zip(own, active, strict=True)]
+    own = [progress.cma_state(at) for at in active]
+    points = [next_population(cma, seed + int(at)) for cma, at in zip(own, active, strict=True)]
     terms = engine.terms(np.concatenate(points), members)
     values = goal.score(np.concatenate(points), terms, members).reshape(len(points), -1)
     best, value, length = (np.array(x) for x in (progress.starts.best, progress.starts.value, progress.starts.length))
@@ -76,15 +76,15 @@ def _evolved(
         if values[row, first] < value[at]:
             best[at], value[at] = points[row][first], values[row, first]
             better[int(at)] = {name: terms[name][row * len(values[row]) + first] for name in TERMS}
-        cloud = moved(own[row], points[row], values[row])
-        length[at] = cloud.reach
-        progress.put(at, cloud)
+        cma = moved(own[row], points[row], values[row])
+        length[at] = cma.reach
+        progress.put(at, cma)
     state = progress.starts.state._replace(best=jnp.asarray(best), value=jnp.asarray(value))
     progress.starts = progress.starts._replace(state=state, length=jnp.asarray(length))
     return better
 
 
-def record(
+def append_history(
     engine: Engine,
     members: Members,
     progress: SearchState,

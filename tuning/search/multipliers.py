@@ -29,7 +29,7 @@ INJECTED_FROM = 0.2
 AVERAGING_MEMBERS = 256
 
 
-def limited(course: Course, x: np.ndarray) -> np.ndarray:
+def search_within_limits(course: Course, x: np.ndarray) -> np.ndarray:
     """Update the multipliers at x [m] and search again until every limit is met. Return the last optimum [m].
 
     Returns x itself if no search was needed. There are at most MOST_UPDATES updates. They end early after Ctrl-C, if
@@ -95,7 +95,7 @@ def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
     limits = problem.limits
     if not limits:
         return []
-    tuned = searched(course, x)
+    tuned = search_values(course, x)
     known = [limit.ratio * ours for limit, ours in zip(limits, tuned, strict=True)]
     if all(
         not limit.kind.worst and limit.log_excess(one) < -CLEARLY_BELOW
@@ -104,7 +104,7 @@ def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
         return list(zip(tuned, known, strict=True))
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
     columns = judge(problem, x, seed, judged_members(limits, count))
-    return list(zip(tuned, reached(problem, x, seed, columns, tuned), strict=True))
+    return list(zip(tuned, judged_values(problem, x, seed, columns, tuned), strict=True))
 
 
 def judged_members(limits: Sequence[Limit], count: int) -> int:
@@ -112,13 +112,13 @@ def judged_members(limits: Sequence[Limit], count: int) -> int:
     return count if any(limit.kind.worst for limit in limits) else min(count, AVERAGING_MEMBERS)
 
 
-def searched(course: Course, x: np.ndarray) -> list[float]:
+def search_values(course: Course, x: np.ndarray) -> list[float]:
     """Return the search's value of each limit at x [m]."""
     terms, n = course.problem.engine.terms(x[None], course.members), course.members.ordinary
     return [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in course.problem.limits]
 
 
-def reached(
+def judged_values(
     problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray], tuned: Sequence[float]
 ) -> list[float]:
     """Return the judge's value of each limit at x [m].

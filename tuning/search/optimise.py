@@ -13,10 +13,10 @@ from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
 from tuning.optimisers import BFGS
+from tuning.search.checkpoint import CheckpointFile, SearchState
 from tuning.search.descent import Descent
-from tuning.search.evolution import begun, clouds
-from tuning.search.iteration import iterate, record
-from tuning.search.keeper import Keeper, SearchState
+from tuning.search.evolution import idle_states, initial_state
+from tuning.search.iteration import append_history, iterate
 from tuning.search.screen import screen
 
 # A start has converged if its next step is shorter than this, in coordinates.
@@ -30,9 +30,9 @@ PATH = 12
 class Phase(NamedTuple):
     """A phase of the search.
 
-    It simulates one ordinary member in `part` and all stressed ones, because their loss is a cliff of the goal. A
-    descent has converged if the goal falls by less than `stall` over `patience` iterations. If the norm of its gradient
-    then exceeds `rise`, the start continues with CMA-ES.
+    It simulates one in `part` of the ordinary members, and all stressed members, because the goal jumps where one of
+    these is lost. A descent has converged if the goal falls by less than `stall` over `patience` iterations. If the
+    norm of its gradient then exceeds `rise`, the start continues with CMA-ES.
     """
 
     part: int
@@ -41,7 +41,8 @@ class Phase(NamedTuple):
     rise: float
 
 
-# A start with a larger gradient does not descend: it predicts a factor e of the goal within the shortest step.
+# A start with a larger gradient does not descend: such a gradient predicts that the goal changes by a factor e within
+# the shortest step.
 STEEP = 1 / SHORTEST
 # The first phase uses few members: their optimum is close to that of all, at less than half of the cost. The gradient
 # of the goal, a logarithm, vanishes at a minimum: converged descents of benchmarks/tasks end at norms of 0.001 to 0.02
@@ -62,8 +63,8 @@ def search(
     name: str = BFGS,
     rate: float = 0.1,
     seed: int = 0,
-    settled: bool = False,
-    keeper: Keeper | None = None,
+    at_optimum: bool = False,
+    checkpoint_file: CheckpointFile | None = None,
     resume: bool = False,
     on_iteration: Callable[[SearchState, float], None] = lambda search, seconds: None,
 ) -> SearchState:
@@ -73,14 +74,14 @@ def search(
     of their paths, or the first of `points`, is then refined on all members. Each phase takes at most `iterations`.
     A start descends by the optimiser `name` with the learning rate `rate`, or uses CMA-ES if its derivatives mislead.
 
-    `settled`: an earlier search on all members ended at the first point, which is not refined again. `seed`: of the
+    `at_optimum`: an earlier search on all members ended at the first point, which is not refined again. `seed`: of the
     populations. `on_iteration`: called after each iteration with the search and the duration of the iteration in s.
     """
     descent = Descent(goal, name, rate)
-    keeper = keeper or Keeper(None, {})
+    checkpoint_file = checkpoint_file or CheckpointFile(None, {})
     phases = [FEW, ALL] if len(points) > keep else [ALL]
     given, began = points[0], time.perf_counter()
-    progress = keeper.load(descent, min(keep, len(points)), points.shape[1]) if resume else None
+    progress = checkpoint_file.load(descent, min(keep, len(points)), points.shape[1]) if resume else None
     if progress is not None:
         engine.rollouts = int(progress.history["rollouts"][-1])
     else:
@@ -97,13 +98,13 @@ def search(
                 if not progress.active.any() or progress.iteration - progress.since >= iterations:
                     if progress.phase + 1 == len(phases):
                         break
-                    _begin_full_phase(engine, goal, members, progress, descent, given, settled)
+                    _begin_full_phase(engine, goal, members, progress, descent, given, at_optimum)
                 if progress.active.any():
                     phase = phases[progress.phase]
                     iterate(engine, goal, members.part(phase.part, 1), progress, descent, seed=seed)
                     _switch(progress, phase)
                 progress.seconds = progress.earlier + time.perf_counter() - began
-                keeper.save(progress)
+                checkpoint_file.save(progress)
                 on_iteration(progress, progress.seconds - before)
     except KeyboardInterrupt:
         progress.interrupted = True
@@ -115,13 +116,13 @@ def _switch(progress: SearchState, phase: Phase) -> None:
 
     A start ends if its step is shorter than SHORTEST or its goal stalls. The worse half ends after the iterations
     HALVINGS. A descent with a large gradient switches to CMA-ES: the derivatives of a chaotic loop grow with time and
-    do not describe the goal, and a descent stops early at a cliff beyond which members are lost.
+    do not describe the goal, and a descent stops early at a jump of the goal, beyond which members are lost.
     """
     starts, count = progress.starts, progress.iteration - progress.since
     value, rise, active = np.asarray(starts.value), np.asarray(starts.rise), progress.active
     evolving = progress.evolving
     ended = np.asarray(starts.length) <= SHORTEST
-    converged = np.array([progress.cloud(at).converged for at in range(len(active))])
+    converged = np.array([progress.cma_state(at).converged for at in range(len(active))])
     # in the first phase populations only choose among starts
     chosen = phase.part > 1 and count >= HALVINGS[-1]
     ended |= np.where(evolving, converged | chosen, _stalled(progress, phase.patience, phase.stall))
@@ -131,7 +132,7 @@ def _switch(progress: SearchState, phase: Phase) -> None:
         order = np.argsort(np.where(active, value, np.inf), kind="stable")
         active[order[max((int(active.sum()) + 1) // 2, 1) :]] = False
     for at in np.flatnonzero(turns & active):
-        progress.put(at, begun(np.asarray(starts.best)[at]))
+        progress.put(at, initial_state(np.asarray(starts.best)[at]))
     progress.active = active
 
 
@@ -150,12 +151,12 @@ def _begin_full_phase(
     progress: SearchState,
     descent: Descent,
     given: np.ndarray,
-    settled: bool = False,
+    at_optimum: bool = False,
 ) -> None:
     """Begin the next phase at the best point, for all members, of the paths of all starts and `given`.
 
     The optimum for a part of the members may lose other members; then an earlier point of its path is better. If
-    `given` is the best point and `settled`, the phase ends at once.
+    `given` is the best point and `at_optimum`, the phase ends at once.
     """
     x, value = (np.array(progress.history[name][progress.since :]) for name in ("x", "value"))
     starts = value.shape[1]
@@ -171,14 +172,14 @@ def _begin_full_phase(
     at = np.array(progress.starts.best)
     at[start] = tried[best]
     progress.starts = descent.restarted(jnp.asarray(at), progress.starts)
-    progress.clouds = clouds(*at.shape)
+    progress.cma_states = idle_states(*at.shape)
     progress.active = np.arange(starts) == start
     progress.phase, progress.since = progress.phase + 1, progress.iteration
-    if settled and best == len(chosen):
+    if at_optimum and best == len(chosen):
         value = np.where(progress.active, values[best], np.inf)
         progress.starts = progress.starts._replace(state=progress.starts.state._replace(value=jnp.asarray(value)))
         progress.active = np.zeros(starts, bool)
-        record(engine, members, progress, {start: {name: terms[name][best] for name in TERMS}}, fresh=True)
+        append_history(engine, members, progress, {start: {name: terms[name][best] for name in TERMS}}, fresh=True)
 
 
 def best_of(progress: SearchState) -> tuple[np.ndarray, float]:

@@ -2,7 +2,7 @@
 
 The first round searches with restarts. If the error of the integration steps at the optimum is too large, the search
 continues with finer steps. If a limit is not met, it continues with other multipliers. The answer is then validated.
-Validation members that are lost, and members that accurate steps do not hold, join the training ensemble for the next
+Validation members that are lost, and members that are lost with accurate steps, join the training ensemble for the next
 round. At the end the front of error against voltage is traced, if tune.objective or --pareto requires it.
 """
 
@@ -17,8 +17,8 @@ from ambjax.commands.outputs import say
 from tuning.judge import StepError, describe, step_error
 from tuning.problem import TuningProblem, problem_of
 from tuning.search.course import Course, SearchResult, points_of, search_and_restart, training
-from tuning.search.front import traced
-from tuning.search.multipliers import limited
+from tuning.search.front import trace_front
+from tuning.search.multipliers import search_within_limits
 from tuning.search.validation import joining, validated
 
 # Largest number of searches, and of halvings of the step. Restarts count as searches; searches after an update of the
@@ -34,7 +34,7 @@ def rounds(
     `out`: directory of the checkpoints. `facts`: settings that a checkpoint must match. `resume`: whether to continue
     from the checkpoints. The result is the confirmed answer that loses the fewest members; without a confirmed answer,
     an earlier point of the searches that accurate steps confirm, if there is one. If a front is traced, the result is
-    the answer that `traced` selects. Raises ValueError if the goal is not finite at any starting point, or if a
+    the answer that `trace_front` selects. Raises ValueError if the goal is not finite at any starting point, or if a
     checkpoint belongs to another search.
     """
     budget, answers = problem.tune.budget, list[SearchResult]()
@@ -43,8 +43,8 @@ def rounds(
     for number in itertools.count(1):
         if course.all_lost:  # no gains hold any member
             break
-        x, error = resolved(course, x)
-        held = limited(course, x)
+        x, error = with_fine_steps(course, x)
+        held = search_within_limits(course, x)
         if held is not x:
             x, error = held, None
         answer, error, lost = validated(course, x, error)
@@ -52,20 +52,20 @@ def rounds(
         if answer.good or course.interrupted or len(course.past) - course.limit_searches >= MOST_ROUNDS:
             break
         course.members = course.members.joined(joining(course.problem, lost, error, number))
-        say("lost members, and those that accurate steps do not hold, join the training ensemble; the search continues")
+        say("lost members, and members lost with accurate steps, join the training ensemble; the search continues")
         x, _ = course.search(course.around(x))
     if not answers:
         return course.answer(x, None, budget.validation)
     best = min(answers, key=lambda one: (not one.confirmed, one.lost))
     if not best.confirmed and not course.interrupted:
-        best = retreated(course, best)
+        best = earlier_confirmed(course, best)
     if problem.front and best.good and not course.interrupted:
         course.members = best.members
-        best = traced(course, best)
+        best = trace_front(course, best)
     return dataclasses.replace(best, seconds=course.answer(x, None, 0).seconds)
 
 
-def resolved(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepError]:
+def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepError]:
     """Return coordinates [m] whose step error is small enough, and this error.
 
     The first candidate is `x`; the others are the results of searches that continue from it in finer steps. There are
@@ -82,7 +82,7 @@ def resolved(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepError]:
         x, _ = course.search(x[None])
 
 
-def retreated(course: Course, best: SearchResult) -> SearchResult:
+def earlier_confirmed(course: Course, best: SearchResult) -> SearchResult:
     """Return the first earlier point of the searches, best first, that is confirmed; `best` if there is none."""
     say("accurate steps confirm none of the answers; earlier points of the searches are tried")
     for x in points_of(course.past):

@@ -5,15 +5,15 @@ import numpy as np
 
 from ambjax.commands.outputs import say
 from tuning.config import seeds
-from tuning.judge import StepError, compared, describe, step_error, worst_of
+from tuning.judge import StepError, comparison_members, describe, step_error, worst_of
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
 from tuning.search.course import Course, SearchResult
 
 # Largest number of lost members that join at once.
 MOST_JOINING = 16
-# Members that accurate steps do not hold join with the noise factor NOISE_GROWTH**number: the search's steps hold
-# them with their own noise.
+# Members that are lost with accurate steps join with the noise factor NOISE_GROWTH**number, because with their own
+# noise they are held in the steps of the search.
 NOISE_GROWTH = 1.5
 
 
@@ -32,7 +32,7 @@ def validated(
     lost, worst = _lost(course.problem, x)
     if not lost.size and not error.refuted and not course.problem.sampled:
         worst = course.problem.objective.chosen(seeds(budget)[1], worst, budget.validation)
-        error = step_error(course.problem, x, compared(course.problem).joined(worst))
+        error = step_error(course.problem, x, comparison_members(course.problem).joined(worst))
         say(f"accurate steps, with the worst of {budget.validation} validation members: {describe(error)}")
     if lost.size:
         say(f"{lost.size} of {budget.validation} validation members are lost")
@@ -43,7 +43,7 @@ def joining(problem: TuningProblem, lost: np.ndarray, error: StepError, number: 
     """Return the members that join the training ensemble.
 
     The first of the `lost` validation members join with half of the additional noise of stressed members, which leaves
-    a margin. Members that accurate steps do not hold join with NOISE_GROWTH**number times the noise.
+    a margin. Members that are lost with accurate steps join with NOISE_GROWTH**number times the noise.
     """
     budget = problem.tune.budget
     those = problem.objective.chosen(seeds(budget)[1], lost[:MOST_JOINING], budget.validation)

@@ -14,7 +14,7 @@ from ambjax.commands.outputs import say
 from ambjax.host.sealed import DamagedError, difference, flat, provenance, seal, shapes, unseal, write_whole
 from tuning.objective.loss import TERMS
 from tuning.search.descent import Descent, Starts
-from tuning.search.evolution import Cloud, clouds
+from tuning.search.evolution import CmaState, idle_states
 
 # Scalar fields of SearchState in a checkpoint.
 COUNTS = ("iteration", "phase", "since", "seconds")
@@ -42,25 +42,25 @@ class SearchState:
     seconds: float = 0.0
     earlier: float = 0.0
     interrupted: bool = False
-    clouds: Cloud = None  # pyright: ignore[reportAssignmentType]
+    cma_states: CmaState = None  # pyright: ignore[reportAssignmentType]
     """CMA-ES distributions of the starts, leaves [S, ...]"""
 
     def __post_init__(self) -> None:
-        if self.clouds is None:
-            self.clouds = clouds(*self.starts.best.shape)
+        if self.cma_states is None:
+            self.cma_states = idle_states(*self.starts.best.shape)
 
     @property
     def evolving(self) -> np.ndarray:
         """Whether each start uses CMA-ES [S]."""
-        return self.clouds.drawn >= 0
+        return self.cma_states.drawn >= 0
 
-    def cloud(self, at: object) -> Cloud:
+    def cma_state(self, at: int | np.integer) -> CmaState:
         """Return the distribution of one start."""
-        return Cloud(*(leaf[at] for leaf in self.clouds))
+        return CmaState(*(leaf[at] for leaf in self.cma_states))
 
-    def put(self, at: object, cloud: Cloud) -> None:
+    def put(self, at: int | np.integer, state: CmaState) -> None:
         """Set the distribution of one start."""
-        for whole, part in zip(self.clouds, cloud, strict=True):
+        for whole, part in zip(self.cma_states, state, strict=True):
             whole[at] = part
 
     @property
@@ -69,7 +69,7 @@ class SearchState:
         return self.earlier > 0 and self.seconds == self.earlier
 
 
-class Keeper:
+class CheckpointFile:
     """Reads and writes the checkpoint of round number `round`. It is replaced atomically.
 
     `path`: of the file; None: no checkpoint. `facts`: nested settings that a checkpoint must match to be resumed.
@@ -84,7 +84,8 @@ class Keeper:
         if self.path is None:
             return
         leaves = {
-            f"{LEAF}{n}": np.asarray(leaf) for n, leaf in enumerate(jax.tree.leaves((progress.starts, progress.clouds)))
+            f"{LEAF}{n}": np.asarray(leaf)
+            for n, leaf in enumerate(jax.tree.leaves((progress.starts, progress.cma_states)))
         }
         past = {f"{PAST}{name}": np.asarray(rows) for name, rows in progress.history.items()}
         counts = {name: getattr(progress, name) for name in COUNTS}
@@ -117,7 +118,7 @@ class Keeper:
             return None
 
 
-def begin(directory: pathlib.Path) -> None:
+def mark_directory(directory: pathlib.Path) -> None:
     """Mark a directory as that of a search, so that the search can be resumed even before its first checkpoint.
 
     Raises ValueError if the mark cannot be written.
@@ -126,7 +127,7 @@ def begin(directory: pathlib.Path) -> None:
     write_whole(directory / MARK, lambda file: file.write(text.encode()))
 
 
-def begun(directory: pathlib.Path) -> bool:
+def can_resume(directory: pathlib.Path) -> bool:
     """Return whether a search has begun in this directory and can be resumed."""
     return (directory / MARK).exists()
 
@@ -141,7 +142,7 @@ def checkpoints(directory: pathlib.Path) -> list[pathlib.Path]:
     return sorted(path for path in directory.glob("checkpoint-*.npz") if NAME.fullmatch(path.name) and path.is_file())
 
 
-def unfinished(directory: pathlib.Path, report: str) -> bool:
+def has_unfinished_search(directory: pathlib.Path, report: str) -> bool:
     """Return whether a directory holds a search that has not ended: checkpoints newer than the file `report`."""
     left, ended = checkpoints(directory), directory / report
     return bool(left) and not (
@@ -162,7 +163,7 @@ def _progress(
 ) -> SearchState:
     """Return the search in these arrays. Raises DamagedError if their names, types or shapes do not fit."""
     there = shapes(arrays)
-    kinds = jax.eval_shape(descent.begin, jnp.zeros((starts, m))), clouds(starts, m)
+    kinds = jax.eval_shape(descent.begin, jnp.zeros((starts, m))), idle_states(starts, m)
     leaves, tree = jax.tree.flatten(kinds)
     wanted = {f"{LEAF}{n}": [np.dtype(leaf.dtype).str, list(leaf.shape)] for n, leaf in enumerate(leaves)}
     rows = {"value": (starts,), "x": (starts, m), "gains": (starts, m), "lost": (starts,), "members": ()}
@@ -177,4 +178,4 @@ def _progress(
     history = {name.removeprefix(PAST): list(rows) for name, rows in arrays.items() if name.startswith(PAST)}
     state, drawn = jax.tree.unflatten(tree, [arrays[f"{LEAF}{n}"] for n in range(len(leaves))])
     state = jax.tree.map(jnp.asarray, state)
-    return SearchState(state, arrays[ACTIVE], history, **counts, earlier=counts["seconds"], clouds=drawn)
+    return SearchState(state, arrays[ACTIVE], history, **counts, earlier=counts["seconds"], cma_states=drawn)

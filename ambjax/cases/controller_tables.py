@@ -1,0 +1,148 @@
+"""Readers of [processor] and of the [controller] tables: the cascade of a case."""
+
+import dataclasses
+import pathlib
+from typing import Any, NamedTuple
+
+from ambjax.cases.controller_file import ControllerFile, controller_file
+from ambjax.cases.gain_tables import law_from
+from ambjax.cases.own_laws import FORM, OwnLaw, is_own, own_law
+from ambjax.cases.scenario_tables import drive
+from ambjax.cases.table import Table
+from ambjax.control import current, inversion, observer, position
+from ambjax.control.base import Law, default_law
+from ambjax.control.cascade import Cascade
+from ambjax.control.guard import Guard
+from ambjax.control.linear_controller import OUTPUTS
+from ambjax.control.processor import Processor
+from ambjax.numerics.records import Scalar
+from ambjax.world.bearing import Bearing
+from ambjax.world.plant import Plant
+
+# The laws by stage and kind; the first of a stage is the default. A new law is one row here.
+KINDS: dict[str, dict[str, type[Law]]] = {
+    "observer": {
+        "direct": observer.Direct,
+        "complementary": observer.Complementary,
+        "difference": observer.Difference,
+        "kalman": observer.Kalman,
+        "ired-1": observer.IRED1,
+        "ired-2": observer.IRED2,
+    },
+    "position": {
+        "sliding-mode": position.SlidingMode,
+        "integral-sliding-mode": position.IntegralSlidingMode,
+        "super-twisting": position.SuperTwisting,
+        "utkin-sliding-mode": position.UtkinSlidingMode,
+        "terminal-sliding-mode": position.TerminalSlidingMode,
+        "pid": position.PID,
+        "feedback-linearisation": position.FeedbackLinearisation,
+        "state-feedback": position.StateFeedback,
+        "chain": position.FilterChain,
+        "linear": position.LinearController,
+    },
+    "inversion": {
+        "adaptive": inversion.Adaptive,
+        "adaptive-feed-forward": inversion.FeedForwardAdaptive,
+        "closed-form": inversion.ClosedForm,
+        "linearised": inversion.Linearised,
+    },
+    "current": {
+        "sliding-mode": current.SlidingMode,
+        "pi": current.ProportionalIntegral,
+        "dead-beat": current.DeadBeat,
+        "open-loop": current.OpenLoop,
+        "amplifier": current.AmplifierCurrent,
+    },
+}
+DISCRETISATIONS = ["implicit", "explicit"]
+(DELAY,) = (field for field in dataclasses.fields(Processor) if field.name == "delay")
+
+
+class Files(NamedTuple):
+    """The folder of a case file, and what was read already of the files that it names."""
+
+    folder: pathlib.Path
+    own: tuple[OwnLaw, ...]
+    controller: ControllerFile | None
+
+
+def processor_from(table: Table) -> Processor:
+    """Return the processor of [processor]. Raises ValueError, one line, for an invalid entry."""
+    table.only(["delay", "discretisation", "predict", "guard"])
+    delay = table.leaf("delay", DELAY, DELAY.default)
+    implicit = table.choice("discretisation", DISCRETISATIONS, DISCRETISATIONS[0]) == DISCRETISATIONS[0]
+    guard = None if table.raw.get("guard") is False else table.table("guard").record(Guard)
+    return Processor(delay, implicit, table.switch("predict"), guard=guard)
+
+
+def cascade_from(
+    top: Table,
+    plant: Bearing,
+    processor: Processor | None,
+    period: Scalar | None,
+    files: Files,
+) -> tuple[Cascade, tuple[OwnLaw, ...], ControllerFile | None]:
+    """Return the cascade of the [controller] tables, its custom laws, and the file of its linear controller or None.
+
+    `top`: the whole case. `period`: sample period of the processor, s; None in continuous time. Raises ValueError, one
+    line, for an invalid entry.
+    """
+    table, actuator = top.table("controller"), top.table("actuator")
+    command = drive(actuator)
+    table.only(["model", *KINDS])
+    model = table.table("model").record(Plant, base=plant)  # always lumped, even for a two-coil plant
+    laws, own, matrices = {}, [], None
+    for stage, kinds in KINDS.items():
+        law = table.table(stage)
+        if is_own(law.raw.get("kind")):
+            found = [one for one in files.own if one.stage == stage]
+            own += found or [own_law(stage, law.raw["kind"], files.folder, model)]
+            kind = own[-1].law
+        else:
+            kind = kinds[law.choice("kind", list(kinds), _usual(kinds, laws.get("position"), command), FORM)]
+        if kind is position.LinearController:
+            laws[stage], matrices = _linear(law, files)
+        else:
+            laws[stage] = law_from(_nominal(law, kind, actuator), kind, _defaults(law, kind, model, period))
+    return Cascade(model=model, processor=processor, **laws), tuple(own), matrices
+
+
+def _usual(kinds: dict[str, type[Law]], demanding: Any, command: str) -> str:
+    """Return the kind of a law that is left out.
+
+    It is the first that accepts the demand of the position law, if that is known, and commands what the amplifier
+    follows, a "voltage" or a "current". If there is none, it is the first that commands this.
+    """
+    fitting = [kind for kind, law in kinds.items() if getattr(law, "commands", command) == command]
+    if demanding is None:
+        return fitting[0]
+    accepting = [kind for kind in fitting if demanding.demand in getattr(kinds[kind], "accepts", (demanding.demand,))]
+    return [*accepting, *fitting][0]
+
+
+def _nominal(law: Table, kind: type[Law], actuator: Table) -> Table:
+    """Return the table of a law; one that commands a current has the amplifier's bandwidth by default."""
+    if getattr(kind, "commands", "") != "current" or "bandwidth" not in actuator.raw:
+        return law
+    return Table({"bandwidth": actuator.raw["bandwidth"], **law.raw}, law.path)
+
+
+def _linear(table: Table, files: Files) -> tuple[Law, ControllerFile]:
+    """Return the linear controller of a table, and its file."""
+    law = table.record(position.LinearController, extra=("kind", "file", "output"))
+    output = table.choice("output", list(OUTPUTS), OUTPUTS[0])
+    found = files.controller or controller_file(table, files.folder)
+    return dataclasses.replace(law, output=output, realisation=found.contents), found
+
+
+def _defaults(table: Table, kind: type[Law], model: Plant, period: Scalar | None) -> Law | None:
+    """Return the law of this kind with its default gains; None if the table gives every gain."""
+    fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
+    names = {field.name for field in fields if field.metadata.get("leaf")}
+    if names <= set(table.raw):
+        return None
+    try:
+        return default_law(kind, model, None if period is None else float(period))
+    except ValueError as error:
+        raise ValueError(f"{table.path}: {error}. Give all of {', '.join(sorted(names))}.") from None
