@@ -159,7 +159,7 @@ def main(argv: list[str] | None = None) -> int:
         return _tune(words[1:])
     open_streams()
     with exit_on_interrupt("ambjax"):
-        return answer(parser(), words, _run)
+        return run_command(parser(), words, _run)
 
 
 def _tune(words: list[str]) -> int:
@@ -180,14 +180,14 @@ def _run(args: argparse.Namespace) -> tuple[int, object]:
         return 0, None
     from ambjax.ensemble import worker
 
-    worker.prepare()
+    worker.configure_jax()
     return importlib.import_module(f"ambjax.commands.{args.command}").run(args)
 
 
 Run = Callable[[argparse.Namespace], tuple[int, object]]
 
 
-def answer(parser: argparse.ArgumentParser, words: list[str] | None, run: Run) -> int:
+def run_command(parser: argparse.ArgumentParser, words: list[str] | None, run: Run) -> int:
     """Parse the arguments `words`, call `run`, print its summary with --json, and return the exit code.
 
     `run` returns an exit code and a summary. An error is printed on one line of stderr. The command continues if stdout

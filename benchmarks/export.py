@@ -19,7 +19,7 @@ import numpy as np
 
 from ambjax import Cascade, current, inversion, observer, position
 from ambjax.codegen.c99 import machine
-from ambjax.codegen.c99.package import written
+from ambjax.codegen.c99.package import files_of_trace
 from ambjax.codegen.c99.source import Origin
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
@@ -113,7 +113,7 @@ def measured(cascade: Cascade, precision: str) -> dict[str, Any]:
     traced = trace(controller, precision)
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
-        for file, text in written(traced, "amb", Origin("benchmark", "-", controller.described())).items():
+        for file, text in files_of_trace(traced, "amb", Origin("benchmark", "-", controller.described())).items():
             (folder / file).write_text(text)
         (folder / "here.c").write_text(HERE)
         said = machine.build([folder / "amb.c", folder / "here.c"], folder / "here", "-std=gnu99")

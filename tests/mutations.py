@@ -1142,8 +1142,8 @@ SEARCH = [
     M(
         "stressed members enter the tracking error too",
         "tuning/objective/loss.py",
-        "ordinary = 1.0 - 1.0 * stressed",
-        "ordinary = 1.0 - 0.0 * stressed",
+        "ordinary: Any = 1.0 - 1.0 * stressed",
+        "ordinary: Any = 1.0 - 0.0 * stressed",
         "tests/test_tuning_search.py::test_stressed_members_hear_more_and_count_by_being_held",
     ),
     M(

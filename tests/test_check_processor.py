@@ -140,13 +140,13 @@ def test_no_bound_is_exceeded_by_what_stands_beside_it(name):
     draw, bounds = np.random.default_rng(7), 0
     for _ in range(10):
         cascade, world = random_loop(name, draw)
-        sampled = sampled_report.check(cascade, world, CLOCK, 0.02)
+        sampled = sampled_report.check_sampled(cascade, world, CLOCK, 0.02)
         for line in sampled.bands:
             assert line.computed <= line.band * (1 + 1e-12), line
             assert line.seen <= line.bound * (1 + 1e-12), line
             assert math.isinf(line.band) == (line.gain <= line.disturbance)
             bounds += not math.isinf(line.band)
-        said = advice.on_processor(sampled, Delays(2.0, None, None, 0.1), None)
+        said = advice.processor_lines(sampled, Delays(2.0, None, None, 0.1), None)
         assert sampled.holds == ("The rotor is held." in said and not any(" No" in line for line in said)), said
     assert bounds >= 5
 
@@ -154,7 +154,7 @@ def test_no_bound_is_exceeded_by_what_stands_beside_it(name):
 def test_bounds_are_close_where_nothing_is_estimated():
     """The sign itself, implicit: what is left is what disturbs it in a sample; of a smoothed one no less than half."""
     for gains, share in ((HARD, 0.999), (SOFT, 0.5)):
-        lines = sampled_report.check(cascade_of(*gains, delay=0.0), WORLD, LONG, 0.1).bands
+        lines = sampled_report.check_sampled(cascade_of(*gains, delay=0.0), WORLD, LONG, 0.1).bands
         assert [line.signal for line in lines] == ["sigma", "v_tilde", "e"]
         for line in lines:
             # u is 0 before the first sample, so the sensors' signals are the plant's: nothing is off but i_ref's sample
@@ -166,7 +166,7 @@ def test_bounds_are_close_where_nothing_is_estimated():
 
 def test_a_signal_that_has_not_reached_its_band_is_bounded_by_where_it_is():
     world = dataclasses.replace(WORLD, initial=amb.Initial(1e-3))
-    (line, *_) = sampled_report.check(cascade_of(*HARD, delay=0.0), world, LONG, 0.004).bands
+    (line, *_) = sampled_report.check_sampled(cascade_of(*HARD, delay=0.0), world, LONG, 0.004).bands
     assert "not reached" in line.note
     assert line.computed == line.band
 
@@ -175,21 +175,21 @@ def test_an_implicit_step_is_no_steeper_than_one():
     """a/(1 + a): stable unless the sign itself is a sample late."""
     hard, soft = cascade_of(*HARD, delay=1.0), cascade_of(*SOFT, delay=1.0, predict=False)
     late = dataclasses.replace(hard, processor=Processor(1.0, predict=False))
-    assert [slope.stepped for slope in sampled_report.slopes(hard, CLOCK)] == [1.0, 1.0, 1.0]
-    assert [slope.holds for slope in sampled_report.slopes(hard, CLOCK)] == [True, True, True]
-    assert [slope.holds for slope in sampled_report.slopes(late, CLOCK)] == [False, True, False]
-    for slope in sampled_report.slopes(soft, CLOCK):
+    assert [slope.stepped for slope in sampled_report.slope_checks(hard, CLOCK)] == [1.0, 1.0, 1.0]
+    assert [slope.holds for slope in sampled_report.slope_checks(hard, CLOCK)] == [True, True, True]
+    assert [slope.holds for slope in sampled_report.slope_checks(late, CLOCK)] == [False, True, False]
+    for slope in sampled_report.slope_checks(soft, CLOCK):
         assert slope.holds
         assert slope.stepped == pytest.approx(slope.slope / (1 + slope.slope))
     # what stays explicit in the position law, c T, may be all that is steep
-    (position, *_) = sampled_report.slopes(cascade_of(3e4, 25.0, 2e6, 2000.0, 25.0), CLOCK)
+    (position, *_) = sampled_report.slope_checks(cascade_of(3e4, 25.0, 2e6, 2000.0, 25.0), CLOCK)
     assert position.stepped == pytest.approx(3.0)
     assert not position.holds
 
 
 def test_noise_disturbs_and_its_lines_stand_beside_those_without():
     noisy = dataclasses.replace(WORLD, sensor=amb.Sensor(1e-6, 1e-4, 1e-4))
-    lines = sampled_report.check(cascade_of(*HARD, delay=1.0), noisy, CLOCK, 0.02).bands
+    lines = sampled_report.check_sampled(cascade_of(*HARD, delay=1.0), noisy, CLOCK, 0.02).bands
     assert [line.noise for line in lines] == [False] * 3 + [True] * 3
     for one, other in zip(lines[:3], lines[3:], strict=True):
         assert other.seen > 5 * one.seen
@@ -221,11 +221,11 @@ def test_a_voltage_that_alternates_is_remarked_on():
     found = {}
     for name, law in laws.items():
         cascade = dataclasses.replace(cascade_of(*HARD, delay=0.0), inversion=law)
-        found[name] = sampled_report.check(cascade, world, amb.Clock(1500, 1e-4), 0.05)
+        found[name] = sampled_report.check_sampled(cascade, world, amb.Clock(1500, 1e-4), 0.05)
     assert found["chatters"].alternating > 0.8
     assert found["steps"].alternating < 0.01
     for name, sampled in found.items():
-        said = " ".join(advice.on_processor(sampled, Delays(2.0, None, None, 0.1), None))
+        said = " ".join(advice.processor_lines(sampled, Delays(2.0, None, None, 0.1), None))
         assert ("The voltage alternates" in said) == (name == "chatters")
 
 
@@ -245,18 +245,18 @@ BEYOND = amb.Scenario(reference=amb.Constant(2e-3), initial=amb.Initial(2e-3, 0.
 def test_the_singular_curve_is_judged_on_the_processor_s_run():
     clock, world = amb.Clock(300, 1e-4), dataclasses.replace(BEYOND, u_max=500.0)
     crossing = cascade_of(200.0, 1000.0, 1e8, 2000.0, INF, delay=0.0)
-    sampled = sampled_report.check(crossing, world, clock, 0.005)
+    sampled = sampled_report.check_sampled(crossing, world, clock, 0.005)
     trajectory = amb.rollout(crossing, world, clock).trajectory
     assert np.isfinite(trajectory.singular_at)
     assert math.isinf(sampled.lost_at)
     assert sampled.distance[0] < 0
     assert not sampled.holds
-    said = advice.on_processor(sampled, Delays(2.0, None, None, 0.1), None)
+    said = advice.processor_lines(sampled, Delays(2.0, None, None, 0.1), None)
     assert any(
         line.startswith("Does (z/s_0, i_ref/i_0) stay off the singular curve C") and " No: " in line for line in said
     )
     world = dataclasses.replace(world, sensor=amb.Sensor(0.0, 1e-4))
-    calm = sampled_report.check(crossing, world, clock, 0.005)
+    calm = sampled_report.check_sampled(crossing, world, clock, 0.005)
     assert calm.holds
     assert calm.distance[0] > 0
 
@@ -321,9 +321,9 @@ def test_a_delay_whose_run_stalls_is_neither_held_nor_lost(monkeypatch):
     assert margin(0.75)[:3] == (pytest.approx(0.6, abs=near), None, pytest.approx(0.6, abs=near))
     delays.stalled, delays.lost = (0.0, 3.0), (3.0, INF)
     assert margin(0.0)[:3] == (None, None, 0.0)
-    words = advice.on_processor(SampledReport([], [], math.inf, ""), margin(0.0), None)[-1]
+    words = advice.processor_lines(SampledReport([], [], math.inf, ""), margin(0.0), None)[-1]
     assert words.startswith("Delay margin: the rotor is not decided at 0, where the integrator stalled (tried")
-    words = advice.on_processor(SampledReport([], [], math.inf, ""), Delays(0.5, 1.5, 0.75, 0.1), None)[-1]
+    words = advice.processor_lines(SampledReport([], [], math.inf, ""), Delays(0.5, 1.5, 0.75, 0.1), None)[-1]
     assert "held up to 0.5 samples, not decided at 0.75, where the integrator stalled, lost at 1.5" in words
 
 
@@ -338,13 +338,13 @@ def delays(cascade, scenario, clock, *, fold):
 def test_a_stalled_run_on_a_processor_decides_nothing():
     sampled = SampledReport([], [], 0.01, "stalled: ...", stalled=True)
     assert not sampled.holds
-    said = " ".join(advice.on_processor(sampled, Delays(None, None, 0.0, 0.1), None))
+    said = " ".join(advice.processor_lines(sampled, Delays(None, None, 0.0, 0.1), None))
     assert "not decided: at 0.01 s the integrator stalled" in said
     assert "lost" not in said
     assert "gamma" not in said  # laws that are stepped stall no integrator
     # one trial step a sample, where the tolerance takes more
     stalling = amb.Clock(10, 1e-4, amb.AdaptiveRodas3(1e-12, most_steps=1))
-    found = sampled_report.check(cascade_of(*HARD, delay=1.0), WORLD, stalling, 0.0)
+    found = sampled_report.check_sampled(cascade_of(*HARD, delay=1.0), WORLD, stalling, 0.0)
     assert found.stalled
     assert not found.bands
 

@@ -14,7 +14,7 @@ from ambjax.commands.case_export import guarded_for
 from ambjax.ensemble.study import Study
 from ambjax.host import extensions
 from ambjax.linear import analyse, linearise
-from ambjax.pictures.comparison import Contender, figure_of
+from ambjax.pictures.comparison import Contender, comparison_figure
 
 # A smooth loop on a processor, 0.2 s of it.
 CASE = """
@@ -204,7 +204,7 @@ def test_the_picture_counts_every_member(two, cases):
     case = read_case(cases / "soft.toml")
     system = linearise(case.cascade, case.scenario, case.clock)
     error, held = np.array([3e-6, 1e-6, 9.0, 2e-6]), np.array([True, True, False, True])
-    axes = figure_of([Contender("x", held, error, np.arange(4.0), system)], [3.0, 4.0, 5.0], (1.0, 2e3)).axes
+    axes = comparison_figure([Contender("x", held, error, np.arange(4.0), system)], [3.0, 4.0, 5.0], (1.0, 2e3)).axes
     S, shares, KS, points = (ax.get_lines()[0].get_xydata() for ax in axes)
     np.testing.assert_allclose(S[:, 1], np.abs(system.sensitivity(S[:, 0])))
     np.testing.assert_allclose(KS[:, 1], np.abs(system.response(KS[:, 0])[:, 2, 0]))

@@ -24,7 +24,7 @@ from ambjax.__main__ import main
 from ambjax.cases.template_text import template
 from ambjax.codegen.c99 import machine
 from ambjax.codegen.c99.machine import Compiled, build
-from ambjax.codegen.c99.package import files
+from ambjax.codegen.c99.package import package_files
 from ambjax.codegen.c99.source import Origin, Writer
 from ambjax.codegen.c99.texts import MARK
 from ambjax.codegen.controller import controller_of
@@ -273,7 +273,7 @@ def test_the_header_says_what_delay_may_be_set(processor, allowed):
 
 def written(cascade, to, u_max):
     controller = controller_of(cascade, u_max, PERIOD)
-    return files(controller, to, "amb", Origin("test", "0" * 64, controller.described()))
+    return package_files(controller, to, "amb", Origin("test", "0" * 64, controller.described()))
 
 
 kept = functools.cache(written)  # many tests read the same text

@@ -16,7 +16,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.codegen.c99.source import Origin
-from ambjax.codegen.fmi.cross_check import stepped
+from ambjax.codegen.fmi.cross_check import run_block
 from ambjax.codegen.of_case import block_of, blocks_of
 from ambjax.codegen.plant_step import plant_of
 from ambjax.codegen.series import series
@@ -59,7 +59,7 @@ def test_the_loops_steps_are_the_simulators(name):
     cascade, scenario, clock = CASES[name]
     block, count = blocks(name)["loop"], 100
     x = series(cascade, scenario, clock, count)
-    outputs, bits = stepped(block, np.array([x[port] for port in block.inputs]).T)
+    outputs, bits = run_block(block, np.array([x[port] for port in block.inputs]).T)
     rows = rollout(cascade, scenario, clock.with_method(block.plant.method)).trajectory.rows
     found = dict(zip(block.outputs, outputs.T, strict=True))
     # 100 samples of hard signs, in which rounding (1e-20 m) grows by a few decades (ambjax/codegen/twins.py)

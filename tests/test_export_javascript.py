@@ -14,7 +14,7 @@ from ambjax import rollout
 from ambjax.codegen.block import Block
 from ambjax.codegen.javascript.script import HELPERS, script, script_of
 from ambjax.codegen.of_case import blocks_of
-from ambjax.codegen.points import points
+from ambjax.codegen.points import verification_points
 from ambjax.codegen.reference import results
 from ambjax.codegen.series import series
 from ambjax.codegen.trace import trace
@@ -81,7 +81,7 @@ const run = row => {
 @pytest.mark.parametrize("what", ["controller", "plant", pytest.param("loop", marks=pytest.mark.slow)])
 def test_one_step_is_jaxs(what, tmp_path):
     traced = trace(blocks_of(*CASES["rig"])[what], "double")
-    at = points(traced, 1000)
+    at = verification_points(traced, 1000)
     found = run_rows(
         script(traced, "block") + STEP, np.concatenate([at.parameters, at.state, [at.started], at.inputs]).T, tmp_path
     ).T

@@ -21,7 +21,7 @@ from ambjax.codegen.numbering import UNREAD
 from ambjax.codegen.points import evaluated
 from ambjax.codegen.trace import arguments
 from ambjax.codegen.twins import LEAST, PARTED, SIGNALS, Horizon, LoopCase, Twin, _count, farthest
-from ambjax.codegen.verify import Check, _looped, _stepped, holds, summary, table, verify
+from ambjax.codegen.verify import Check, _looped, _stepped, checks_page, checks_verdict, holds, verify
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.guard import guarded
 from ambjax.control.processor import Processor
@@ -187,11 +187,11 @@ def test_a_horizon_too_short_decides_nothing():
     assert (row.ok, row.verdict) == (None, "not decisive")
     assert row.found == f"twins of JAX's loop differ too much after {LEAST - 1} of 100 samples"
     assert holds([good, row])
-    assert summary([good, row]) == "No check fails; 1 of 2 are not decisive."
-    assert "| not decisive |" in table([good, row], "case", "")
+    assert checks_verdict([good, row]) == "No check fails; 1 of 2 are not decisive."
+    assert "| not decisive |" in checks_page([good, row], "case", "")
     assert not holds([good, row, bad])
-    assert summary([good, row, bad]) == "Some checks FAIL."
-    assert summary([good]) == "All checks hold."
+    assert checks_verdict([good, row, bad]) == "Some checks FAIL."
+    assert checks_verdict([good]) == "All checks hold."
     row = _looped("float", closed_loop.LoopComparison(horizon(LEAST), closed_loop.TIMES))
     assert (row.ok, row.verdict) == (True, "holds")
     assert _looped("float", closed_loop.LoopComparison(horizon(LEAST), 1.001 * closed_loop.TIMES)).verdict == "FAILS"

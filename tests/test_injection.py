@@ -16,7 +16,7 @@ from ambjax.control import current as current_laws
 from ambjax.control import inversion, position
 from ambjax.control.observer import Kalman
 from ambjax.control.processor import Processor
-from ambjax.linear import Zones, injected, injected_members, linearise, lines, peak
+from ambjax.linear import Zones, frequency_lines, injected, injected_members, linearise, peak
 from ambjax.linear.multisine import multisine
 from ambjax.simulation.sliding import Slide
 
@@ -204,13 +204,13 @@ def test_schroeder_phases_keep_the_wave_low():
 
 def test_lines_are_dense_near_the_peak_and_whole_harmonics():
     clock = Clock(10_000, T)
-    f = lines(Zones(), clock, 40.0)
+    f = frequency_lines(Zones(), clock, 40.0)
     assert f[0] == 1.0
     assert f[-1] == 2000.0
     assert f == pytest.approx(np.round(f))
     near = (f > 29) & (f < 54)
     assert near.sum() >= 11
-    assert len(lines(Zones(), clock)) < len(f) <= 41
+    assert len(frequency_lines(Zones(), clock)) < len(f) <= 41
 
 
 def test_what_cannot_be_measured_is_refused_in_one_line():

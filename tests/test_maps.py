@@ -12,7 +12,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.commands import map as commands
 from ambjax.ensemble import Normal, Spread, maps, wilson
-from ambjax.ensemble.maps import PERIOD, Axis, grid, stepped
+from ambjax.ensemble.maps import PERIOD, Axis, grid, with_method_for_axes
 from ambjax.ensemble.store import MANIFEST
 from ambjax.ensemble.study import Study
 from ambjax.simulation.folds import Peak
@@ -188,9 +188,9 @@ def test_a_folder_that_cannot_take_a_map_is_refused_before_anything_is_run(kind,
 def test_a_whole_number_may_be_an_axis_of_whole_numbers():
     study = dataclasses.replace(SMALL, scenario=dataclasses.replace(NOISY, sensor=Sensor(1e-7, bits=12.0)))
     mass = Axis("plant.m", np.array([0.588]))
-    assert stepped(study, Axis("sensor.bits", np.linspace(2, 14, 13)), mass) == study
+    assert with_method_for_axes(study, Axis("sensor.bits", np.linspace(2, 14, 13)), mass) == study
     with pytest.raises(ValueError, match=r"sensor.bits must be a whole number"):
-        stepped(study, Axis("sensor.bits", np.linspace(2, 14, 12)), mass)
+        with_method_for_axes(study, Axis("sensor.bits", np.linspace(2, 14, 12)), mass)
 
 
 def made(survival, members, **changes):

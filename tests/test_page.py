@@ -17,7 +17,7 @@ from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.study import Study
 from ambjax.linear.analysis import analyse, linearise
 from ambjax.page import html_page
-from ambjax.page.case_text import checked, filled, template
+from ambjax.page.case_text import checked, editable_lines, filled
 from ambjax.page.html_page import MEMBERS, page
 from ambjax.page.sliders import SEED, parameter_values, sliders
 from ambjax.results.runs import simulate
@@ -44,7 +44,7 @@ def moved(one):
 
 def test_every_number_reads_back_from_the_case_file(case):
     given = sliders(case, [])
-    lines, placed = template(case.text, given)
+    lines, placed = editable_lines(case.text, given)
     assert sorted(placed) == list(range(len(given)))
     assert checked(lines, given)
     assert filled(lines, given, [one.value for one in given]) == case.text
@@ -67,7 +67,7 @@ def test_every_number_reads_back_from_the_case_file(case):
 
 def test_a_changed_plant_leaves_the_controller_s_model(case):
     (mass,) = (one for one in sliders(case, []) if one.path == "plant.m")
-    lines, _ = template(case.text, [mass])
+    lines, _ = editable_lines(case.text, [mass])
     document = tomllib.loads(filled(lines, [mass], [2.0]))
     assert document["plant"]["m"] == 2.0
     assert document["controller"]["model"] == {"m": mass.value}

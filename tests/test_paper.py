@@ -13,7 +13,7 @@ from ambjax import AdaptiveRodas3, paper, rollout
 from ambjax.__main__ import main
 from ambjax.paper import claims, findings
 from ambjax.paper.evidence import NOISE_STDS, STEPS, Evidence, Noise, Run, Survival, Uncertain, survival_of
-from ambjax.paper.ledger import judge, markdown, noise_table, processor_table
+from ambjax.paper.ledger import judge_claims, ledger_markdown, noise_table, processor_table
 from ambjax.simulation.trajectory import STALLED, Row, Trajectory
 from ambjax.theorem.conditions import Condition, Report
 
@@ -73,11 +73,15 @@ def test_a_stall_is_neither_held_nor_lost():
     evidence = Evidence(
         run, run, trajectory, {True: run}, report, report, [nothing] * 3, Survival(0.0, 1e-7), uncertain
     )
-    (rows, scans, sampled) = judge({"x": evidence}), noise_table({"x": evidence}), processor_table({"x": evidence})
+    (rows, scans, sampled) = (
+        judge_claims({"x": evidence}),
+        noise_table({"x": evidence}),
+        processor_table({"x": evidence}),
+    )
     verdicts = {row["says"]: row["findings"]["x"]["verdict"] for row in rows}
     others = {"The noise is about 20 % of the gap": findings.HOLDS, "The noise is specified": findings.OPEN}
     assert verdicts == dict.fromkeys(verdicts, findings.UNDECIDED) | others
-    page = markdown(rows, scans, sampled, [])
+    page = ledger_markdown(rows, scans, sampled, [])
     assert "not decided: stalled at 10 ms" in page
     assert "| none, not decided at 1.0e-08 m |" in page
     assert "rotor lost" not in page

@@ -20,7 +20,7 @@ from ambjax.commands.ensemble import study_of
 from ambjax.commands.warnings import warnings_of
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
-from ambjax.ensemble.maps import Axis, stepped
+from ambjax.ensemble.maps import Axis, with_method_for_axes
 from ambjax.simulation.folds import Named
 from ambjax.simulation.method import DRIVEN, choose_method
 from ambjax.world.amplifier import Amplifier, CoilResponse
@@ -323,10 +323,14 @@ def test_the_step_holds_for_the_ends_of_an_amplifier_s_spread():
     case = case_from(raw)
     study, bandwidth = study_of(case, None, 1), Axis("actuator.bandwidth", np.array([500.0, 2e4]))
     assert case.clock.method == amb.RK4(3)
-    assert stepped(study, bandwidth, Axis("initial.z", np.zeros(2))).clock.method == wide
-    assert stepped(study, bandwidth, Axis("clock.sample_period", np.array([5e-5, 2e-4]))).clock.method == amb.RK4(51)
+    assert with_method_for_axes(study, bandwidth, Axis("initial.z", np.zeros(2))).clock.method == wide
+    assert with_method_for_axes(
+        study, bandwidth, Axis("clock.sample_period", np.array([5e-5, 2e-4]))
+    ).clock.method == amb.RK4(51)
     given = case_from(CASE | raw | {"clock": {"duration": 0.01, "dt": 2e-5}})
-    assert stepped(study_of(given, None, 1), bandwidth, Axis("initial.z", np.zeros(2))).clock.method == amb.RK4(5)
+    assert with_method_for_axes(
+        study_of(given, None, 1), bandwidth, Axis("initial.z", np.zeros(2))
+    ).clock.method == amb.RK4(5)
 
 
 @pytest.mark.parametrize(

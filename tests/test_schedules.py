@@ -23,7 +23,7 @@ from ambjax.theorem.conditions import constant_sigma, required
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 from tuning.config import tune_from
-from tuning.objective.ranges import drawn
+from tuning.objective.ranges import from_unit_cube
 from tuning.objective.shortfalls import Bound, shortfall
 from tuning.problem import problem_of
 from tuning.report.tuned import tuned
@@ -235,7 +235,9 @@ def test_knots_are_searched_in_the_range_of_their_gain():
     one, many = ([(row.low, row.high, row.most) for row in problem.ranges] for problem in problems)
     assert many == [one[0]] * 3 + [one[1]]
     # the screen begins at constant gains
-    points = drawn(problems[1].objective.space, problems[1].ranges, np.random.default_rng(0).uniform(size=(3, 4)))
+    points = from_unit_cube(
+        problems[1].objective.space, problems[1].ranges, np.random.default_rng(0).uniform(size=(3, 4))
+    )
     assert np.all(points[:, :3] == points[:, :1])
     assert np.any(points[:, 3] != points[:, 2])
     # the condition k > Q_z applies to each knot

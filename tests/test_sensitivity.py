@@ -9,7 +9,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
 from ambjax.commands.sensitivity_report import _measured_numbers, _measured_text
 from ambjax.linear import MemberPeaks, Zones, analyse, linearise
-from ambjax.pictures.frequency import MeasuredPoints, NamedLoop, figure_of
+from ambjax.pictures.frequency import MeasuredPoints, NamedLoop, frequency_figure
 from ambjax.simulation.metrics import standard_for
 from ambjax.simulation.rollout import rollout
 
@@ -71,7 +71,7 @@ def test_the_picture_shows_the_response(tmp_path):
     path.write_text(CASE)
     case = read_case(path)
     system = linearise(case.cascade, case.scenario, case.clock)
-    axes = figure_of("x", [NamedLoop("nominal", system, 0.588, 0.02)], [3.0, 4.0, 5.0], (1.0, 500.0)).axes
+    axes = frequency_figure("x", [NamedLoop("nominal", system, 0.588, 0.02)], [3.0, 4.0, 5.0], (1.0, 500.0)).axes
     curves = {ax.get_ylabel(): ax.get_lines()[0].get_xydata() for ax in axes}
     f = curves["|S|"][:, 0]
     assert f[[0, -1]] == pytest.approx([1.0, 500.0])
@@ -187,7 +187,7 @@ def test_the_picture_shows_the_injected_points(tmp_path):
     H = system.response(f)
     measured = MeasuredPoints(f, H[:, 0, 0], H[:, 0, 0] - 1, H[:, 2, 0])
     loop = NamedLoop("nominal", system, 0.588, 0.02)
-    axes = figure_of("x", [loop], [3.0, 4.0, 5.0], (1.0, 500.0), measured).axes
+    axes = frequency_figure("x", [loop], [3.0, 4.0, 5.0], (1.0, 500.0), measured).axes
     points = {
         ax.get_ylabel(): next((line for line in ax.get_lines() if line.get_label() == "injected"), None) for ax in axes
     }

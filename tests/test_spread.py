@@ -26,7 +26,7 @@ from ambjax import (
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.ensemble import Choice, LogUniform, Normal, Percent, Spread, Uniform, apply, draw
-from ambjax.ensemble.design import DESIGNS, MOST_LATIN, points
+from ambjax.ensemble.design import DESIGNS, MOST_LATIN, design_points
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import check_spread, corners
 from ambjax.simulation.explicit import Euler
@@ -136,7 +136,7 @@ def test_draws_are_the_same_in_float32(design):
 @pytest.mark.parametrize("name", CONTINUOUS)
 def test_marginals_by_kolmogorov_and_smirnov(design, name):
     kind, nominal, theirs = CONTINUOUS[name]
-    x = kind.quantile(points(design, 5, 3, np.arange(1024), 1024)[:, 1], nominal)
+    x = kind.quantile(design_points(design, 5, 3, np.arange(1024), 1024)[:, 1], nominal)
     found = stats.kstest(x, theirs.cdf)
     if design == "random":
         assert found.pvalue > 1e-3  # one seed, which passes; a wrong law of this many fails by far
@@ -147,19 +147,19 @@ def test_marginals_by_kolmogorov_and_smirnov(design, name):
 
 @pytest.mark.parametrize(("design", "total"), [("latin-hypercube", 1000), ("latin-hypercube", 7), ("sobol", 256)])
 def test_every_stratum_holds_exactly_one_member(design, total):
-    u = points(design, 11, 5, np.arange(total), total)
+    u = design_points(design, 11, 5, np.arange(total), total)
     for column in u.T:
         np.testing.assert_array_equal(np.sort((column * total).astype(int)), np.arange(total))
 
 
 def test_sobol_is_even_in_pairs_of_dimensions():
     # a scrambled (t, m, s)-net: the first two dimensions have one point in each of the 16 x 16 squares
-    u = points("sobol", 2, 2, np.arange(256), 256)
+    u = design_points("sobol", 2, 2, np.arange(256), 256)
     assert len({(int(a), int(b)) for a, b in 16 * u}) == 256
 
 
 def test_random_members_are_independent_of_each_other_and_of_the_noise():
-    u = points("random", 0, 3, np.arange(4000), 4000)
+    u = design_points("random", 0, 3, np.arange(4000), 4000)
     world = dataclasses.replace(SCENARIO, seed=0)
 
     def noise(member):
@@ -174,11 +174,11 @@ def test_random_members_are_independent_of_each_other_and_of_the_noise():
 
 @pytest.mark.parametrize("design", DESIGNS)
 def test_points_are_inside_the_open_cube(design):
-    u = points(design, 1, 2, np.arange(5000), 5000)
+    u = design_points(design, 1, 2, np.arange(5000), 5000)
     assert u.shape == (5000, 2)
     assert u.min() > 0
     assert u.max() < 1
-    assert points(design, 1, 2, np.arange(0), 5).shape == (0, 2)
+    assert design_points(design, 1, 2, np.arange(0), 5).shape == (0, 2)
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_points_are_inside_the_open_cube(design):
 def test_points_refuse(change, words):
     given = {"design": "random", "seed": 0, "dims": 2, "members": [0], "total": 10} | change
     with pytest.raises(ValueError, match=words):
-        points(**given)
+        design_points(**given)
 
 
 # --- what is moved ---

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ambjax import Scenario, Sensor
-from ambjax.ensemble.design import BITS, points
+from ambjax.ensemble.design import BITS, design_points
 from ambjax.numerics.gaussian import normals, threefry
 from ambjax.world.scenario import SLOTS
 
@@ -50,7 +50,7 @@ class Listening:
 @pytest.mark.parametrize("slot", SLOTS)
 def test_designs_and_signals_share_no_random_words(slot):
     """What a signal's key would give as a coordinate of a design is no coordinate of the design of that member."""
-    design = points("random", 5, len(SLOTS) + 2, np.arange(MEMBERS), MEMBERS)
+    design = design_points("random", 5, len(SLOTS) + 2, np.arange(MEMBERS), MEMBERS)
     for member in range(MEMBERS):
         scenario = Scenario(seed=5, member=member, **{slot: Listening()})
         key = jax.random.wrap_key_data(getattr(scenario.realised(), slot))

@@ -414,7 +414,7 @@ def test_stalled_members_are_counted_separately(capsys):
     summary = statistics.summary(columns, [], 1)
     summary["worst"][0]["replay"] = "ambjax simulate"
     assert (summary["survivors"], summary["lost"], summary["stalled"]) == (7, 1, 2)
-    lines = study_report.text(summary).splitlines()
+    lines = study_report.study_tables(summary).splitlines()
     assert lines[0].startswith("7 of 10 members survive: ")
     assert lines[1].startswith("1 lost, 2 not decided")
 

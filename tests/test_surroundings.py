@@ -19,7 +19,7 @@ import pytest
 from texts import write
 from tqdm import tqdm
 
-from ambjax.__main__ import answer, main, parser
+from ambjax.__main__ import main, parser, run_command
 from ambjax.commands import ensemble, outputs, reproduce, simulate
 from ambjax.ensemble import worker
 from ambjax.host import interrupts
@@ -51,7 +51,7 @@ class Stuck(io.StringIO):
 
 
 def answered(words, run):
-    return answer(parser(), words, run)
+    return run_command(parser(), words, run)
 
 
 @pytest.mark.parametrize(("number", "code"), [(None, 1), (errno.EPIPE, 1), (errno.ENOSPC, 2)])
@@ -273,11 +273,11 @@ def test_without_a_home_nothing_is_kept_and_nothing_fails(monkeypatch):
 
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     monkeypatch.setattr(platformdirs, "user_cache_dir", homeless)
-    worker.prepare()
+    worker.configure_jax()
 
 
 def test_a_cache_that_is_full_is_not_worth_a_word():
-    worker.prepare()
+    worker.configure_jax()
     for act in ("reading", "writing"):
         warnings.warn(f"Error {act} persistent compilation cache entry for 'jit_f': OSError: full", stacklevel=1)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bowl import World, study
 
-from tuning.search.evolution import PATIENCE, STALL, begun, drawn, moved, population, rates
+from tuning.search.evolution import PATIENCE, STALL, initial_state, moved, next_population, population, rates
 from tuning.search.rounds import rounds
 
 # Derivatives of a loop that is chaotic; those of a Bowl's loss are about 1e-4.
@@ -15,9 +15,9 @@ CHAOS = {"chaotic": 1e30, "of moderate size": 1e-2}
 
 def least(f, m, populations, seed=0):
     """The least value of f on populations from the origin of m dimensions, and the last distribution."""
-    cloud, best = begun(np.zeros(m)), math.inf
+    cloud, best = initial_state(np.zeros(m)), math.inf
     for _ in range(populations):
-        points = drawn(cloud, seed)
+        points = next_population(cloud, seed)
         values = f(points)
         best, cloud = min(best, values.min()), moved(cloud, points, values)
     return best, cloud
@@ -110,13 +110,13 @@ def test_a_descent_that_has_converged_is_left_alone(monkeypatch, tmp_path):
 
 def test_it_has_converged_when_whole_populations_stall():
     """One point far below all others, which is chance, changes nothing."""
-    cloud = begun(np.zeros(2))
+    cloud = initial_state(np.zeros(2))
     for n, level in enumerate([0.0, -2 * STALL, *[-2.5 * STALL] * PATIENCE]):
         assert not cloud.converged
         values = np.full(6, level)
-        cloud = moved(cloud, drawn(cloud, n), values)
+        cloud = moved(cloud, next_population(cloud, n), values)
     assert cloud.converged
-    assert not moved(cloud, drawn(cloud, 0), np.full(6, -4 * STALL)).converged
+    assert not moved(cloud, next_population(cloud, 0), np.full(6, -4 * STALL)).converged
 
 
 def test_a_search_that_is_resumed_among_populations_ends_alike(monkeypatch, tmp_path):

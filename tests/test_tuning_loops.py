@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from texts import case_and_tune
 
-from ambjax.linear import analyse, injected, linearise, lines
+from ambjax.linear import analyse, frequency_lines, injected, linearise
 from ambjax.results.operating import one_period
 from tuning.measured_peaks import injections
 from tuning.objective.limits import PREFIX
@@ -145,7 +145,7 @@ def test_injections_find_the_members_with_the_largest_measured_peak():
     assert found.decides
     case, masses = problem.case, problem.objective.chosen(1, np.arange(count), count).values["plant.m"]
     clock = one_period(case)
-    at = lines(case.zones, clock, found_frequency(problem, masses[0]))
+    at = frequency_lines(case.zones, clock, found_frequency(problem, masses[0]))
     each = [
         injected(
             case.cascade,

@@ -17,7 +17,7 @@ from texts import problem_from
 
 from ambjax import rollout
 from ambjax.cases.reader import safe_name
-from ambjax.host.web_page import literal, page
+from ambjax.host.web_page import escape_markdown, render_page
 from ambjax.simulation.metrics import Standard
 from ambjax.simulation.trajectory import STALLED, TOUCHED
 from tuning.__main__ import main
@@ -132,7 +132,7 @@ def test_the_loss_table_can_be_added_up_by_hand(written):
 
 def test_the_table_is_of_the_members_that_were_judged(study, x):
     found = judge(study, x, seeds(study.tune.budget)[2], 12)
-    terms = breakdown.table(study.goal, found)
+    terms = breakdown.loss_breakdown(study.goal, found)
     losses = weigh(study.goal.weights, {name: found[f"loss.{name}"] for name in TERMS}, np.zeros(12, bool))
     assert terms["loss"] == pytest.approx(losses.mean(), rel=1e-12)
     assert terms["risk"] == pytest.approx(float(study.goal.risk(jnp.asarray(losses))), rel=1e-12)
@@ -198,7 +198,7 @@ def test_accurate_values_are_those_of_adaptive_rollouts():
     study.__dict__["judging"] = study.engine
     x = study.objective.space.encode(study.tune.space.values(study.case.cascade))
     seed = seeds(study.tune.budget)[2]
-    compared = accurate.compared(study, x, seed, 12, SHOWN)
+    compared = accurate.compare_steps(study, x, seed, 12, SHOWN)
     assert (compared["members"], compared["held"]) == (accurate.COMPARED, accurate.COMPARED)
     assert abs(compared["metrics"]["settled_rms_error_m"]["relative"]) > 1e-3
     found = []
@@ -225,7 +225,7 @@ def test_accurate_steps_against_themselves_are_off_by_nothing(study, x):
     engine = Engine(objective, settle=study.case.settle, lanes=4)
     same = dataclasses.replace(study)
     same.__dict__["judging"] = engine
-    compared = accurate.compared(same, x, 5, 3, SHOWN)
+    compared = accurate.compare_steps(same, x, 5, 3, SHOWN)
     assert compared["members"] == 3
     assert {row["relative"] for row in compared["metrics"].values()} == {0.0}
     assert compared["lost"] == {"report": 0, "accurate": 0}
@@ -286,7 +286,7 @@ def test_the_name_of_a_case_is_shown_as_it_is(written):
 def test_text_is_literal_in_every_place():
     text = "\\<b>x</b> & | *a* _b_ `c` ~d~ ![e](f) #g\n# h\x00"
     for frame in ("{}", "# {}", "| a |\n|---|\n| {} |", "- {}"):
-        shown = page(frame.format(literal(text)), {}, "t").partition("</style>")[2]
+        shown = render_page(frame.format(escape_markdown(text)), {}, "t").partition("</style>")[2]
         words = re.sub(r"\s+", " ", html.unescape(re.sub(r"<[^>]*>", "", shown))).strip().removeprefix("a ")
         assert words == "\\<b>x</b> & | *a* _b_ `c` ~d~ ![e](f) #g\ufffd# h\ufffd"
 
@@ -414,7 +414,7 @@ def test_the_section_on_gradients_is_three_whole_tables():
     noise = {name: [1.0, 2.0] for name in ("gradient", "standard_error", "ratio")}
     horizons = [{"horizon_s": 0.1, "norm": 2.0, "lost": 0.0}]
     facts = {"gains": ["c", "k"], "three_ways": three, "noise": noise, "horizons": horizons}
-    shown = page("\n".join(extras.gradient(facts)), {}, "t")
+    shown = render_page("\n".join(extras.gradient(facts)), {}, "t")
     assert shown.count("<table>") == 3
     assert shown.count("<td") == 2 * 5 + 3 + 2 * 4
     assert "The three agree on 1 of 2 gains" in shown
@@ -437,4 +437,4 @@ WAYS = {
 @pytest.mark.parametrize("kind", WAYS)
 def test_three_ways_to_a_derivative_are_judged(kind):
     *ways, words = WAYS[kind]
-    assert gradient.verdict(*ways, floor=1e-7).startswith(words)
+    assert gradient.agreement(*ways, floor=1e-7).startswith(words)

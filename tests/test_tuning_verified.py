@@ -15,7 +15,7 @@ import tuning.search.rounds
 import tuning.search.validation
 from ambjax.cases.reader import case_from
 from tuning.__main__ import main
-from tuning.judge import NEGLIGIBLE, StepError, compared, describe, step_error, worst_of
+from tuning.judge import NEGLIGIBLE, StepError, comparison_members, describe, step_error, worst_of
 from tuning.optimisers import Retreat
 from tuning.problem import REFERENCE_MEMBERS
 from tuning.search.checkpoint import SearchState
@@ -70,7 +70,7 @@ def at(found, gains=None):
 
 def error_of(found, **changes):
     """Return a StepError of four members that are held and agree, with some fields replaced."""
-    members = compared(found)
+    members = comparison_members(found)
     none = found.objective.chosen(1, np.arange(0), 4)
     right = StepError(1e-6, 1e-6, 0.0, len(members.member), len(members.member), 0, 0, none, 1e-10)
     return right._replace(**changes)
@@ -109,7 +109,7 @@ def test_false_survival_is_refuted():
     """In the steps of the search every member is held; in accurate steps every member is lost."""
     found = problem_from(FALSE)
     x = at(found)
-    members = compared(found)
+    members = comparison_members(found)
     assert not np.any(found.engine.terms(x[None], members)["survival"])
     error = step_error(found, x, members)
     assert error.refuted
@@ -144,7 +144,7 @@ class Verdicts:
         self.errors, self.calls = list(errors), []
 
     def __call__(self, study, x, members=None):
-        self.calls.append((x, len((compared(study) if members is None else members).member), study.finer))
+        self.calls.append((x, len((comparison_members(study) if members is None else members).member), study.finer))
         return self.errors.pop(0) if len(self.errors) > 1 else self.errors[0]
 
 

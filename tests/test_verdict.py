@@ -152,9 +152,9 @@ def test_every_command_says_the_same_of_a_rotor(kind, capsys, monkeypatch):
     report = Report([condition(2.0, 1.0)], [], lost_at, "touched down", "", stalled)
     sampled = sampled_report.SampledReport([], [], lost_at, "touched down", stalled)
     assert report.holds == sampled.holds == (kind == "held")
-    messages = {"check": "\n".join(advice.answer(report, "case.toml"))}
+    messages = {"check": "\n".join(advice.theorem_lines(report, "case.toml"))}
     messages["on a processor"] = "\n".join(
-        advice.on_processor(sampled, sampled_report.Delays(None, None, None, 0.1), None)
+        advice.processor_lines(sampled, sampled_report.Delays(None, None, None, 0.1), None)
     )
     genuine = simulate._simulated
 

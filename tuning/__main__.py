@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from ambjax import __version__
-from ambjax.__main__ import Parser, answer
+from ambjax.__main__ import Parser, run_command
 from ambjax.host.interrupts import exit_on_interrupt
 from ambjax.host.streams import open_streams
 
@@ -48,13 +48,13 @@ def main(argv: list[str] | None = None, program: str = PROGRAM) -> int:
     """
     open_streams()
     with exit_on_interrupt(program):
-        return answer(parser(program), argv, _run)
+        return run_command(parser(program), argv, _run)
 
 
 def _run(args: argparse.Namespace) -> tuple[int, object]:
-    from ambjax.ensemble.worker import prepare
+    from ambjax.ensemble.worker import configure_jax
 
-    prepare()
+    configure_jax()
     from tuning import command
 
     try:

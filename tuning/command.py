@@ -15,7 +15,7 @@ from ambjax.commands.warnings import print_warnings
 from ambjax.control.cascade import Cascade
 from ambjax.host.interrupts import reporting
 from ambjax.host.lock import locked
-from ambjax.host.web_page import page
+from ambjax.host.web_page import render_page
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
 from tuning.config import read_tune, settings
@@ -25,7 +25,7 @@ from tuning.report import document as report
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.judging import examined
 from tuning.report.tuned import tuned_case
-from tuning.search.checkpoint import begin, begun, checkpoint, remove_all, unfinished
+from tuning.search.checkpoint import can_resume, checkpoint, has_unfinished_search, mark_directory, remove_all
 from tuning.search.course import SearchResult
 from tuning.search.explore import Slices
 from tuning.search.rounds import rounds
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> tuple[int, Row]:
     with locked(plan.out):
         if not args.resume:
             _clear(plan.out)
-        begin(plan.out)
+        mark_directory(plan.out)
         with reporting(lambda: _kept(plan.out)):
             return _tune(plan, args)
 
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> tuple[int, Row]:
 def _plan(args: argparse.Namespace) -> TuningPlan:
     """Read the case and make the output directory. Raises ValueError for an invalid case or option."""
     case, tune, raw = read_tune(args.case, args.settings_of)
-    if args.resume and not (args.out and begun(pathlib.Path(args.out))):
+    if args.resume and not (args.out and can_resume(pathlib.Path(args.out))):
         raise ValueError(f"--resume: --out {args.out} contains no search. Check --out, or leave out --resume.")
     print_warnings(case, args.case)
     if args.page:  # refuse it before the search
@@ -110,7 +110,7 @@ def _searched(plan: TuningPlan, resume: bool) -> SearchResult:
 
 def _clear(out: pathlib.Path) -> None:
     """Remove the checkpoints of an earlier search from `out`. Raises ValueError if that search has not ended."""
-    if unfinished(out, REPORT):
+    if has_unfinished_search(out, REPORT):
         raise ValueError(
             f"--out {out}: it holds a search that has not ended. Add --resume, or choose another directory."
         )
@@ -139,13 +139,13 @@ def _write(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: T
     (part / "tuned.toml").write_text(text, encoding="utf-8")
     history: dict[str, Any] = answer.history
     np.savez(part / "history.npz", **history)
-    words = report.markdown(facts)
+    words = report.report_markdown(facts)
     drawn = _pictures(problem, tuned.cascade, history, slices, facts.front)
     for name, data in drawn.items():
         (part / name).write_bytes(data)
     (part / "report.md").write_text(words, encoding="utf-8")
     (part / "report.html").write_text(
-        page(words, drawn, f"Tuning of {facts.case}", unfolded=(front_table.TITLE,)), encoding="utf-8"
+        render_page(words, drawn, f"Tuning of {facts.case}", unfolded=(front_table.TITLE,)), encoding="utf-8"
     )
     write_json(part / REPORT, facts.table)
 

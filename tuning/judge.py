@@ -115,7 +115,7 @@ def describe(error: StepError) -> str:
     return f"settled rms error {error.off} on {error.members} members" if described else error.refuted
 
 
-def compared(problem: TuningProblem) -> Members:
+def comparison_members(problem: TuningProblem) -> Members:
     """Return the members used to compare steps: the first REFERENCE_MEMBERS of the training ensemble."""
     count = problem.tune.budget.members
     return problem.objective.chosen(seeds(problem.tune.budget)[0], np.arange(min(REFERENCE_MEMBERS, count)), count)
@@ -128,9 +128,9 @@ def worst_of(values: np.ndarray) -> np.ndarray:
 
 def step_error(problem: TuningProblem, x: np.ndarray, members: Members | None = None) -> StepError:
     """Compare the search's steps with accurate ones at x [m], on `members` (default: those of `compared`)."""
-    members = compared(problem) if members is None else members
+    members = comparison_members(problem) if members is None else members
     ours, theirs = (metrics_of(engine, x, members) for engine in problem.steps)
-    return difference(problem, ours, theirs, members)
+    return compare_metrics(problem, ours, theirs, members)
 
 
 def metrics_of(engine: Engine, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:
@@ -138,7 +138,7 @@ def metrics_of(engine: Engine, x: np.ndarray, members: Members) -> dict[str, np.
     return {name: values[0] for name, values in engine.metrics(x[None], members)["metrics"].items()}
 
 
-def difference(
+def compare_metrics(
     problem: TuningProblem, ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], members: Members
 ) -> StepError:
     """Compare the members' metrics [n] by coarse steps (`ours`) with those by accurate steps (`theirs`)."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import USUAL
-from ambjax.linear import Analysis, Injection, analyse, linearise, lines
+from ambjax.linear import Analysis, Injection, analyse, frequency_lines, linearise
 from ambjax.linear.injection import injection_of
 from ambjax.linear.member_responses import Responses, member_responses
 from ambjax.results.operating import one_period
@@ -145,7 +145,7 @@ class _Judged(NamedTuple):
         cascade, scenario = objective.fixed(self.x, members)
         scenario = dataclasses.replace(scenario, seed=0, member=np.arange(len(numbers) * repetitions))
         clock = one_period(case)
-        return member_responses(cascade, scenario, clock, lines(case.zones, clock, peak))
+        return member_responses(cascade, scenario, clock, frequency_lines(case.zones, clock, peak))
 
 
 def _summary(number: int, analysis: Analysis | None, one: Injection | None) -> MeasuredPeak:

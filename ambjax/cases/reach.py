@@ -49,7 +49,7 @@ def check_reference(spread: Spread, cascade: Cascade, scenario: Scenario, clock:
 def _compare(what: str, scenario: Scenario, clock: Clock) -> None:
     far, stop = reach(scenario, clock), float(np.min(scenario.touchdown))
     if far >= stop and isinstance(scenario.reference, (Sum, BandNoise)):
-        far = sampled(scenario, clock)
+        far = largest_at_samples(scenario, clock)
     if not far < stop:
         raise ValueError(
             f"{what} reaches {far:.6g} m within clock.duration = {float(clock.duration):g} s, but the rotor "
@@ -58,7 +58,7 @@ def _compare(what: str, scenario: Scenario, clock: Clock) -> None:
         )
 
 
-def sampled(scenario: Scenario, clock: Clock) -> float:
+def largest_at_samples(scenario: Scenario, clock: Clock) -> float:
     """Return the largest |r| at the samples of the run, m."""
     signal, far = scenario.realised().reference, 0.0
     for first in range(0, clock.samples, BLOCK):

@@ -155,7 +155,7 @@ def _with_note(text: str, comment: str) -> str:
 def _tune() -> list[str]:
     """Return the lines of [tune], all of them comments."""
     head = ("# [tune]", "for 'ambjax tune', which starts at the gains above. Each key has its default here")
-    rows = [(f"# {line.text}" if line.text else "#", line.comment) for line in tune_table.lines()]
+    rows = [(f"# {line.text}" if line.text else "#", line.comment) for line in tune_table.template_lines()]
     return [_with_note(*row) if len(row[0]) < 30 else f"{row[0]}  # {row[1]}" for row in [head, *rows]]
 
 

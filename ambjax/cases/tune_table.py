@@ -97,7 +97,7 @@ class Line(NamedTuple):
     comment: str
 
 
-def lines() -> Iterator[Line]:
+def template_lines() -> Iterator[Line]:
     """Yield the lines of [tune] for the template: each default, or an example of a key that has none."""
     yield Line(
         f'objective = "{OBJECTIVES[0]}"',

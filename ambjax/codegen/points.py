@@ -32,7 +32,7 @@ class Points(NamedTuple):
     inputs: np.ndarray
 
 
-def points(trace: Trace, count: int, seed: int = 0) -> Points:
+def verification_points(trace: Trace, count: int, seed: int = 0) -> Points:
     """Return points with the case's parameters: random over decades, edges, and both sides of every comparison."""
     random, dtype = np.random.default_rng(seed), PRECISIONS[trace.precision]
     drawn = max(DRAWS * count, POOL)

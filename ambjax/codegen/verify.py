@@ -10,10 +10,10 @@ import numpy as np
 from ambjax.codegen import closed_loop, plant_loop
 from ambjax.codegen.block import Block
 from ambjax.codegen.c99.machine import EXACT, SANITIZED, SHARED, STRICT, Compiled, build, execute, scratch, short
-from ambjax.codegen.c99.package import SHARE, ULPS, tolerance, written
+from ambjax.codegen.c99.package import SHARE, ULPS, files_of_trace, tolerance
 from ambjax.codegen.c99.source import Origin
 from ambjax.codegen.numbering import SPAN
-from ambjax.codegen.points import Points, points, varied
+from ambjax.codegen.points import Points, varied, verification_points
 from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.reference import Results, results
 from ambjax.codegen.trace import Trace, trace
@@ -57,9 +57,9 @@ class Draft:
 def draft(block: Block, precision: str, prefix: str, origin: Origin, count: int = COUNT) -> Draft:
     """Return the files of a block and JAX's results. Raises ValueError for a law that scalar code cannot express."""
     traced = trace(block, precision)
-    at = {"one step": points(traced, count), "parameters": varied(traced, count)}
+    at = {"one step": verification_points(traced, count), "parameters": varied(traced, count)}
     steps = {name: (x, results(traced, x)) for name, x in at.items()}
-    return Draft(traced, prefix, written(traced, prefix, origin), steps)
+    return Draft(traced, prefix, files_of_trace(traced, prefix, origin), steps)
 
 
 def verify(drafts: Mapping[str, Draft], case: LoopCase | None) -> list[Check]:
@@ -141,10 +141,10 @@ def _looped(precision: str, found: closed_loop.LoopComparison) -> Check:
     return Check(name, precision, result, allowed, found.times <= closed_loop.TIMES)
 
 
-def table(checks: list[Check], case: str, mark: str, noun: str = "controller") -> str:
+def checks_page(checks: list[Check], case: str, mark: str, noun: str = "controller") -> str:
     """Return the checks as a Markdown page that ends with the line `mark`."""
     rows = [f"| {x.name} | {x.precision} | {x.found} | {x.allowed} | {x.verdict} |" for x in checks]
-    verdict = summary(checks)
+    verdict = checks_verdict(checks)
     head = "| check | precision | found | allowed | verdict |\n|---|---|---|---|---|"
     return (
         f"# The {noun} of case '{case}' as C, compared with JAX\n\n{verdict}\n\n{head}\n"
@@ -158,7 +158,7 @@ def holds(checks: list[Check]) -> bool:
     return all(x.ok is not False for x in checks)
 
 
-def summary(checks: list[Check]) -> str:
+def checks_verdict(checks: list[Check]) -> str:
     """Return the verdict of all checks in one sentence."""
     open_ = sum(x.ok is None for x in checks)
     if not holds(checks):

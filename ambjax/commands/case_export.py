@@ -157,7 +157,7 @@ def planned(
     if precision == "float" and format == "fmu":
         raise ValueError("--precision float: an FMU computes in double. Omit --precision, or use --format c.")
     if verified:
-        machine.check()
+        machine.check_compiler()
     return Plan(case, block, (fmi or 3) if format == "fmu" else 0, precision or "float", name, verified)
 
 
@@ -176,7 +176,7 @@ def generated(plan: Plan) -> ExportedCase:
     checks = verify.verify(drafts, LoopCase(case.cascade, case.scenario, case.clock, case.settle))
     built = _built(plan) if plan.fmi else {**drafts[plan.precision].files}
     record = {"from": plan.mark, "ok": verify.holds(checks), "checks": [check._asdict() for check in checks]}
-    page = verify.table(checks, case.name, plan.mark, plan.block.noun)
+    page = verify.checks_page(checks, case.name, plan.mark, plan.block.noun)
     text = json.dumps(plain(record), indent=2) + "\n"
     return ExportedCase(plan, {**built, VERIFIED[0]: page, VERIFIED[1]: text}, checks)
 
@@ -184,7 +184,7 @@ def generated(plan: Plan) -> ExportedCase:
 def _built(plan: Plan) -> dict[str, str | bytes]:
     """Return the content of each file by name, without verification."""
     if not plan.fmi:
-        return {**package.files(plan.block, plan.precision, plan.prefix, plan.origin)}
+        return {**package.package_files(plan.block, plan.precision, plan.prefix, plan.origin)}
     case, traced = plan.case, trace(plan.block, "double")
     fmu = {f"{plan.prefix}.fmu": archive.packed(traced, plan.prefix, plan.origin, plan.fmi)}
     cascade = guarded_for(case)

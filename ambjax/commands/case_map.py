@@ -10,7 +10,7 @@ import numpy as np
 from ambjax.cases.reader import Case, require_case
 from ambjax.cases.timing import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
 from ambjax.commands.ensemble import study_of
-from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, stepped
+from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, with_method_for_axes
 from ambjax.ensemble.paths import Place, places
 from ambjax.ensemble.study import Study
 from ambjax.host.optional import extra
@@ -83,11 +83,11 @@ def survival_map(case: Case, x: str, y: str, *, members: int = 1, seed: int | No
     for name, axis in (("x", x), ("y", y)):
         if not isinstance(axis, str):
             raise ValueError(f"{name} = {axis!r}: it must be text. Write {FORM}.")
-    study, *axes = prepared(case, x, y, members, seed)
+    study, *axes = study_and_axes(case, x, y, members, seed)
     return CaseMap(case, grid(study, *axes))
 
 
-def prepared(case: Case, x: str, y: str, members: int, seed: int | None) -> tuple[Study, Axis, Axis]:
+def study_and_axes(case: Case, x: str, y: str, members: int, seed: int | None) -> tuple[Study, Axis, Axis]:
     """Return the study and the axes of a map. Raises ValueError as `survival_map` does."""
     study = study_of(case, seed, members)
     first, second = _axis("--x", x, case), _axis("--y", y, case)
@@ -95,7 +95,7 @@ def prepared(case: Case, x: str, y: str, members: int, seed: int | None) -> tupl
     if cells * members > MOST_CELLS:
         raise ValueError(f"--members {members}: times {cells} cells, it exceeds {MOST_CELLS:,} runs. Reduce either.")
     _check_samples(case, first, second, members)
-    return stepped(study, first, second), first, second
+    return with_method_for_axes(study, first, second), first, second
 
 
 def unit_of(case: Case, axis: Axis) -> str:

@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     if not args.json:
         print("\nTheorem 1:\n")
         _print_check(report.conditions, report.proof)
-        print("\n" + "\n".join(advice.answer(report, args.case)))
+        print("\n" + "\n".join(advice.theorem_lines(report, args.case)))
         if case.cascade.processor is not None:
             print(CONTINUOUS)
     summary["holds"] = bool(summary["holds"]) and largest >= weight
@@ -77,14 +77,14 @@ def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
     from ambjax.theorem import advice, sampled_report
 
     scenario = as_member(case.scenario)
-    sampled = sampled_report.check(case.cascade, scenario, case.clock, case.settle, record_system)
+    sampled = sampled_report.check_sampled(case.cascade, scenario, case.clock, case.settle, record_system)
     margin, unknown = delay_margin(case.cascade, case.scenario, case.clock), None
     if (processor := case.cascade.processor) is not None and processor.predict is not False:
         unknown = delay_margin(case.cascade, case.scenario, case.clock, known=False)
     if not args.json:
         print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")
         _print_sampled(sampled)
-        print("\n" + "\n".join(advice.on_processor(sampled, margin, unknown)))
+        print("\n" + "\n".join(advice.processor_lines(sampled, margin, unknown)))
     slopes = [dataclasses.asdict(slope) | {"holds": slope.holds} for slope in sampled.slopes]
     return {
         **_clearance(case, args, sampled.largest_z),

@@ -14,14 +14,14 @@ from ambjax.cases.reader import Case, read_case
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
 from ambjax.commands.case_export import guarded_for
-from ambjax.commands.comparison_report import Compared, markdown, summary_of, text
+from ambjax.commands.comparison_report import Compared, comparison_markdown, comparison_summary, comparison_table
 from ambjax.commands.ensemble import study_of
 from ambjax.commands.outputs import directory, files, plain, say, write_json, written
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
 from ambjax.host.extensions import extension
-from ambjax.host.web_page import page
+from ambjax.host.web_page import render_page
 from ambjax.linear.state_space import StateSpace
 from ambjax.page.html_page import check_processor, pages
 from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks, operating_point, spread_peaks
@@ -51,18 +51,20 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
         studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
     html_pages = pages(cases, args.cases) if args.page else {}
     compared = [_compared(case, study) for case, study in zip(cases, studies, strict=True)]
-    summary = summary_of(compared, studies[0], notes)
+    summary = comparison_summary(compared, studies[0], notes)
     with files(out) as part:
         _draw(cases, compared, part / "compare.png")
-        html = page(
-            markdown(summary), {"compare.png": (part / "compare.png").read_bytes()}, "Comparison of controllers"
+        html = render_page(
+            comparison_markdown(summary),
+            {"compare.png": (part / "compare.png").read_bytes()},
+            "Comparison of controllers",
         )
         (part / "compare.html").write_text(html, encoding="utf-8")
         write_json(part / "compare.json", summary)
         for name, html in html_pages.items():
             (part / name).write_text(html, encoding="utf-8")
     if not args.json:
-        print(text(summary))
+        print(comparison_table(summary))
         written(out, ", ".join([*WRITTEN, *html_pages]))
     good = all(one.held.all() and one.point is not None and one.point.analysis.stable for one in compared)
     return int(not good), plain(summary | {"out": str(out)})

@@ -80,7 +80,7 @@ QUANTITIES = (
 )
 
 
-def summary_of(compared: Sequence[Compared], study: Study, notes: Sequence[str]) -> dict[str, Any]:
+def comparison_summary(compared: Sequence[Compared], study: Study, notes: Sequence[str]) -> dict[str, Any]:
     """Return the content of compare.json: the members, the notes on the cases, and the numbers of each case."""
     rows = [{"case": one.case.name, **_values(one, compared[0]), "laws": _laws(one.case)} for one in compared]
     return {"members": study.members, "seed": study.seed, "differences": list(notes), "cases": rows}
@@ -153,26 +153,26 @@ def _laws(case: Case) -> dict[str, dict[str, object]]:
     return {stage: laws[stage] for stage in laws if stage not in ("model", "processor")}
 
 
-def text(summary: Mapping[str, Any]) -> str:
+def comparison_table(summary: Mapping[str, Any]) -> str:
     """Return the table that the command prints."""
     names = [case["case"] for case in summary["cases"]]
     rows = [(q.words, *(_cell(case[q.key]) for case in summary["cases"]), q.unit) for q in _shown(summary)]
     return "\n".join([table(("", *names, "unit"), rows), "", _words(summary)])
 
 
-def markdown(summary: Mapping[str, Any]) -> str:
+def comparison_markdown(summary: Mapping[str, Any]) -> str:
     """Return the text of the page, which refers to compare.png. The best number of each row is bold."""
-    names = [web_page.literal(case["case"]) for case in summary["cases"]]
+    names = [web_page.escape_markdown(case["case"]) for case in summary["cases"]]
     rows = [[q.words.replace("|", "\\|"), *_marked(q, summary), q.unit] for q in _shown(summary)]
     lines = ["# Comparison of controllers", "", _words(summary), ""]
-    lines += [f"- {web_page.literal(note)}" for note in summary["differences"]] + [""]
-    lines += [*web_page.table(["", *names, "unit"], rows), "", "![Comparison](compare.png)", ""]
+    lines += [f"- {web_page.escape_markdown(note)}" for note in summary["differences"]] + [""]
+    lines += [*web_page.markdown_table(["", *names, "unit"], rows), "", "![Comparison](compare.png)", ""]
     for name, case in zip(names, summary["cases"], strict=True):
         numbers = [
             [stage, str(law["kind"]), ", ".join(f"{key} = {value:.6g}" for key, value in law.items() if key != "kind")]
             for stage, law in case["laws"].items()
         ]
-        lines += [f"## {name}", "", *web_page.table(["stage", "law", "gains"], numbers), ""]
+        lines += [f"## {name}", "", *web_page.markdown_table(["stage", "law", "gains"], numbers), ""]
     return "\n".join(lines) + "\n"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from ambjax.cases.reader import Case
 from ambjax.commands.outputs import check_places, make, say, target
 from ambjax.commands.pace import Pace, error_words, pilot, print_estimate, sliding_error
-from ambjax.commands.study_report import WRITTEN, report
+from ambjax.commands.study_report import WRITTEN, write_report
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.commands.workers import AHEAD, compute, executor_of
 from ambjax.ensemble.design import MOST_MEMBERS
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
                     _pilot(study, store, executor)
                 compute(study, store, executor)
         store.finish()
-        return report(case, study, args, out, error)
+        return write_report(case, study, args, out, error)
 
 
 def _study_and_store(case: Case, args: argparse.Namespace) -> tuple[Study, Store]:

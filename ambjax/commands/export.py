@@ -27,7 +27,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         if checks:
             rows = [(check.name, check.precision, check.found, check.allowed, check.verdict) for check in checks]
             print(table(("check", "precision", "found", "allowed", "verdict"), rows))
-            print(verify.summary(checks))
+            print(verify.checks_verdict(checks))
         written(out, ", ".join(exported.files))
     summary = {"ok": exported.ok, "checks": [check._asdict() for check in checks], "out": str(out)}
     return int(exported.ok is False), summary

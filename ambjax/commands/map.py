@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.commands.case_map import prepared, unit_of
+from ambjax.commands.case_map import study_and_axes, unit_of
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.intervals import wilson
@@ -21,7 +21,7 @@ WRITTEN = ("map.png", "map.json")
 def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     """Simulate the cells of a map for each case and write map.png and map.json."""
     cases = [read_with_warnings(path) for path in [args.case, *(args.against or [])]]
-    ready = [prepared(case, args.x, args.y, args.members, args.seed) for case in cases]
+    ready = [study_and_axes(case, args.x, args.y, args.members, args.seed) for case in cases]
     out = directory(args.out, f"map-{cases[0].name}", WRITTEN, args.force)
     with files(out) as part:
         maps = []

@@ -84,9 +84,9 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         words = f"Tracking on a 10 kHz processor, a sample late, under {words}"
         shown = {str(SHOWN_AS.get(name, name)): one.on_processor[True].trajectory for name, one in evidence.items()}
         figures.readings(shown, words, paper.SETTLE, part / "readings.png")
-        claims, noise = ledger.judge(evidence), ledger.noise_table(evidence)
+        claims, noise = ledger.judge_claims(evidence), ledger.noise_table(evidence)
         processor = ledger.processor_table(evidence)
-        page = ledger.markdown(claims, noise, processor, sensitivity)
+        page = ledger.ledger_markdown(claims, noise, processor, sensitivity)
         (part / "ledger.md").write_text(page, encoding="utf-8")
         summary = {"claims": claims, "noise": noise, "processor": processor, "sensitivity": sensitivity}
         write_json(part / "ledger.json", plain(summary))

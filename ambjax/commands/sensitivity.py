@@ -8,10 +8,10 @@ import numpy as np
 from ambjax.cases.reader import Case
 from ambjax.commands.ensemble import study_of
 from ambjax.commands.outputs import directory, files, plain, write_json, written
-from ambjax.commands.sensitivity_report import Injections, set_valued, summary_of, text_of
+from ambjax.commands.sensitivity_report import Injections, sensitivity_summary, set_valued, text_of
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.study import Study
-from ambjax.linear import Injection, injected, lines
+from ambjax.linear import Injection, frequency_lines, injected
 from ambjax.linear.multisine import Reading
 from ambjax.results.operating import (
     MEMBERS,
@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         spread = spread._replace(measured=measured_peaks(case, study, points[0].analysis.S.frequency))
     measured = _injections(case, points[0]) if args.inject or case.cascade.processor is not None else None
     out = directory(args.out, f"sensitivity-{case.name}", WRITTEN, args.force)
-    summary = summary_of(points, spread, measured, case.zones)
+    summary = sensitivity_summary(points, spread, measured, case.zones)
     with files(out) as part:
         write_json(part / "sensitivity.json", summary)
         _draw(case, points, spread, measured, part / "sensitivity.png")
@@ -69,7 +69,7 @@ def _injections(case: Case, point: OperatingPoint) -> Injections:
 def _injected(case: Case, peak: float, reading: Reading) -> Injection:
     """Inject at one sensor, over one period of the lines, which are denser near `peak` (Hz)."""
     clock, members = one_period(case), INJECTED if case.scenario.random else 1
-    at = lines(case.zones, clock, peak)
+    at = frequency_lines(case.zones, clock, peak)
     return injected(case.cascade, case.scenario, clock, at, reading=reading, members=members)
 
 
@@ -101,4 +101,4 @@ def _draw(
     one = None if measured is None else measured.position
     if one is not None and one.S is not None and one.T is not None and one.KS is not None:
         injected_points = frequency.MeasuredPoints(one.frequency, one.S, one.T, one.KS)
-    frequency.sensitivity(case.name, loops, limits, (low, high), path, injected_points)
+    frequency.sensitivity_picture(case.name, loops, limits, (low, high), path, injected_points)

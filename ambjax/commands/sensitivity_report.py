@@ -9,7 +9,7 @@ from ambjax.commands.outputs import table
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import USUAL
 from ambjax.linear import Injection, MemberPeaks, Zones
-from ambjax.results.operating import OperatingPoint, SpreadPeaks, numbers_of
+from ambjax.results.operating import OperatingPoint, SpreadPeaks, analysis_summary
 
 
 class Injections(NamedTuple):
@@ -26,18 +26,18 @@ def set_valued(case: Case) -> list[str]:
     return [f"controller.{stage}" for stage in USUAL if set_valued_signs(getattr(case.cascade, stage))]
 
 
-def summary_of(
+def sensitivity_summary(
     points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injections | None, zones: Zones
 ) -> dict[str, object]:
     """Return the numbers of sensitivity.json: of the equilibria `points`, the spread, and the injection."""
-    rows = [{"point": point.name, "reference_m": point.r, **numbers_of(point.analysis)} for point in points]
+    rows = [{"point": point.name, "reference_m": point.r, **analysis_summary(point.analysis)} for point in points]
     summary: dict[str, object] = {
-        **numbers_of(points[0].analysis),
+        **analysis_summary(points[0].analysis),
         **_injected_numbers(points[0], measured),
         "points": rows,
     }
     if spread is not None:
-        worst = {} if spread.point is None else numbers_of(spread.point.analysis)
+        worst = {} if spread.point is None else analysis_summary(spread.point.analysis)
         counts = {"members": spread.members, "stable": spread.stable, "zone_a": spread.zone_a}
         summary["spread"] = {**counts, "worst_member": spread.worst, **({"worst": worst} if worst else {})}
         if spread.measured is not None:

@@ -23,7 +23,7 @@ BANDS = (0.0, 5.0, 25.0, 50.0, 75.0, 95.0, 100.0)
 METRICS = ("settled_max_abs_error_m", "settled_rms_error_m", "max_abs_error_m", "max_abs_u_V", "rms_u_V", "max_abs_i_A")
 
 
-def report(
+def write_report(
     case: Case, study: Study, args: argparse.Namespace, out: pathlib.Path, error: dict[str, Any] | None
 ) -> tuple[int, dict[str, object]]:
     """Write and print the results of a finished study. `error`: result of `sliding_error`, or None."""
@@ -36,7 +36,7 @@ def report(
         write_json(part / "summary.json", summary)
         _pictures(case, study, columns, summary, part)
     if not args.json:
-        print(text(summary))
+        print(study_tables(summary))
         written(out, ", ".join(["members.npz", *WRITTEN[: None if study.spread.entries else -1]]))
     held = ~np.isfinite(columns["lost_at"])
     for warning in reversal(case, float(np.max(columns["max_abs_i_A"], initial=0.0, where=held))):
@@ -91,7 +91,7 @@ def _quantiles(x: np.ndarray, extremes: tuple[np.ndarray, np.ndarray] | None) ->
     return dict(zip(BANDS, quantiles, strict=True))
 
 
-def text(summary: dict[str, Any]) -> str:
+def study_tables(summary: dict[str, Any]) -> str:
     """Return the tables that the command prints."""
     share, low, high = (100 * summary["survival"][key] for key in ("estimate", "low", "high"))
     sure = f"{100 * summary['confidence']:g} % interval"

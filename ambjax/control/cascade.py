@@ -24,7 +24,7 @@ from ambjax.control.laws import (
     Observer,
     PositionLaw,
     State,
-    stepped,
+    step_law,
 )
 from ambjax.control.processor import Processor, predicted_over_delay
 from ambjax.control.schedule import extremes, with_gains_at
@@ -182,7 +182,7 @@ class Cascade:
     def _advance(self, sample: Sample) -> Callable[..., Any]:
         """Return `laws.stepped` with the model, the period and the discretisation of this cascade."""
         implicit = self.processor is not None and self.processor.implicit
-        return functools.partial(stepped, model=self.model, period=sample.period, implicit=implicit)
+        return functools.partial(step_law, model=self.model, period=sample.period, implicit=implicit)
 
     def estimate(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State, Measurement]:
         """Step the observer on a processor.

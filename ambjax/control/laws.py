@@ -195,7 +195,7 @@ STAGES: dict[str, type[Law]] = {
 }
 
 
-def stepped(
+def step_law(
     law: Law, inputs: object, state: State, *, model: Plant, period: Scalar, implicit: bool
 ) -> tuple[Any, State]:
     """Step a law on a processor, by its method `step` or else by explicit Euler.

@@ -28,7 +28,7 @@ def weights(model: Plant) -> tuple[np.ndarray, float]:
     return np.diag([(INTEGRAL * w / error) ** 2, 1 / error**2, 0.0]), 1 / current**2
 
 
-def sampled(A: np.ndarray, B: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+def discretised(A: np.ndarray, B: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the map of one period (s) with the input held; the integral takes a step of explicit Euler."""
     import scipy.linalg
 
@@ -60,7 +60,7 @@ def optimal_gains(model: Plant, period: float | None = None) -> np.ndarray:
             K = scaled_B.T @ P
         else:
             fastest = max(1.0, abs(scaled_A[2, 1]) ** 0.5)
-            F, G = sampled(scaled_A, scaled_B, min(period * w, LONGEST / fastest))
+            F, G = discretised(scaled_A, scaled_B, min(period * w, LONGEST / fastest))
             P = scipy.linalg.solve_discrete_are(F, G, cost, np.eye(1))
             K = np.linalg.solve(np.eye(1) + G.T @ P @ G, G.T @ P @ F)
     except (np.linalg.LinAlgError, ValueError):

@@ -28,7 +28,7 @@ MOST_MEMBERS = 2**31
 DOMAIN = 0x616D626A
 
 
-def points(design: str, seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
+def design_points(design: str, seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
     """Compute the points [n, dims] of `members` in the open unit cube.
 
     - `design`: a key of DESIGNS.

@@ -112,7 +112,7 @@ def grid(study: Study, x: Axis, y: Axis) -> Map:
     )
 
 
-def stepped(study: Study, x: Axis, y: Axis) -> Study:
+def with_method_for_axes(study: Study, x: Axis, y: Axis) -> Study:
     """Return the study with an integration method that holds for all values of the axes.
 
     Applies to a cascade on a processor whose method is the automatic choice for the spread; any other study is returned

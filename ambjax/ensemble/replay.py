@@ -50,7 +50,7 @@ def as_member(scenario: Scenario) -> Scenario:
     return dataclasses.replace(scenario, member=np.atleast_1d(np.asarray(scenario.member)))
 
 
-def record(
+def record_member(
     cascade: Cascade,
     scenario: Scenario,
     clock: Clock,
@@ -98,7 +98,7 @@ def replay(study: Study, index: int, tell: Callable[[int], object] = lambda _: N
     """
     columns = chunk(study, index, index + 1, CALL, threads=1)
     cascade, scenario = study.batch(np.array([index]))
-    outcome = record(cascade, scenario, study.clock, fold=standard_for(study.settle, scenario), tell=tell)
+    outcome = record_member(cascade, scenario, study.clock, fold=standard_for(study.settle, scenario), tell=tell)
     metrics = {name: columns[name][0] for name in outcome.measured}
     deviation = max(_relative(metrics[name], x) for name, x in outcome.measured.items())
     eps = float(np.finfo(np.asarray(metrics["rms_error_m"]).dtype).eps)

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble.design import DESIGNS, points
+from ambjax.ensemble.design import DESIGNS, design_points
 from ambjax.ensemble.distributions import Choice, Distribution, Percent
 from ambjax.ensemble.paths import Place, order_pairs, places, with_values
 from ambjax.host.synonyms import hint_of_path
@@ -51,7 +51,7 @@ def draw(
     hypercube on the total. Raises ValueError as `check_spread` does.
     """
     known = check_spread(spread, cascade, scenario)
-    u = points(spread.design, seed, len(spread.entries), members, total)
+    u = design_points(spread.design, seed, len(spread.entries), members, total)
     return {path: kind.quantile(u[:, n], _nominal(known[path])) for n, (path, kind) in enumerate(spread.entries)}
 
 

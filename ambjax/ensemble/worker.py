@@ -21,7 +21,7 @@ CALL = 64
 CACHE_SIZE = 256 * 2**20
 
 
-def prepare() -> None:
+def configure_jax() -> None:
     """Configure JAX for a command: float64 unless JAX_ENABLE_X64 is set, and a cache of compiled programs.
 
     Processes share the cache, and its size is bounded. JAX_COMPILATION_CACHE_DIR sets another directory.
@@ -65,7 +65,7 @@ def chunk(
 
 def work(study: Study, start: int, stop: int, size: int) -> dict[str, np.ndarray]:
     """Simulate a chunk of a study in a worker process, on one core, and return its columns."""
-    prepare()
+    configure_jax()
     return chunk(study, start, stop, size, threads=1)
 
 
@@ -100,7 +100,7 @@ def ignore_sigint() -> Iterator[None]:
 
 def _begin() -> None:
     """Configure a worker process, which then ends when its parent ends."""
-    prepare()
+    configure_jax()
 
     def wait() -> None:
         parent = multiprocessing.parent_process()

@@ -21,19 +21,19 @@ SHORT = 48
 PUNCTUATION = re.compile(r"([\\`*_\[\]<>|~&#!$])")
 
 
-def literal(text: str) -> str:
+def escape_markdown(text: str) -> str:
     """Escape a text so that Markdown shows it literally on one line, in tables too."""
     visible = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
     return PUNCTUATION.sub(r"\\\1", visible)
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Return a Markdown table. Cells are Markdown; `|` is escaped."""
     lines = [head, ["---"] * len(head), *rows]
     return ["| " + " | ".join(cell.replace("\\|", "|").replace("|", "\\|") for cell in line) + " |" for line in lines]
 
 
-def page(text: str, pictures: Mapping[str, bytes], title: str, unfolded: Collection[str] | None = None) -> str:
+def render_page(text: str, pictures: Mapping[str, bytes], title: str, unfolded: Collection[str] | None = None) -> str:
     """Return the HTML page. `pictures`: PNG data by file name; images with these names are embedded.
 
     `unfolded`: headings of level 2 whose sections are open; all other sections are folded. None: all are open.

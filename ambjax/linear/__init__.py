@@ -13,9 +13,9 @@ to the sensor's own reading, and KS that from e to u.
 `injected` measures S, T and KS in the nonlinear simulation, `injected_members` the peak of |S| of each member.
 """
 
-from ambjax.linear.analysis import Analysis, Zones, analyse, linearise, linearise_members, prepared
+from ambjax.linear.analysis import Analysis, Zones, analyse, linearisation_inputs, linearise, linearise_members
 from ambjax.linear.differentiable import LoopQuantities, loop_quantities
-from ambjax.linear.injection import Injection, MemberPeaks, injected, injected_members, lines
+from ambjax.linear.injection import Injection, MemberPeaks, frequency_lines, injected, injected_members
 from ambjax.linear.margins import Margins, ResponsePeak, margins_of, noise_gain, peak
 from ambjax.linear.matrices import loop_matrices
 from ambjax.linear.state_space import INPUTS, OUTPUTS, StateSpace
@@ -32,15 +32,15 @@ __all__ = [
     "StateSpace",
     "Zones",
     "analyse",
+    "frequency_lines",
     "injected",
     "injected_members",
+    "linearisation_inputs",
     "linearise",
     "linearise_members",
-    "lines",
     "loop_matrices",
     "loop_quantities",
     "margins_of",
     "noise_gain",
     "peak",
-    "prepared",
 ]

@@ -128,7 +128,7 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
 
     Returns the state space with NumPy arrays. Raises ValueError as `rollout` does, and if there is no equilibrium at r.
     """
-    system, found = _matrices(*canonical((*prepared(cascade, scenario, clock), r)))
+    system, found = _matrices(*canonical((*linearisation_inputs(cascade, scenario, clock), r)))
     if not found:
         raise ValueError(f"no equilibrium at r = {float(r):g} m: the laws cannot hold the rotor there.")
     return StateSpace(*(None if x is None else np.asarray(x) for x in system))  # pyright: ignore[reportArgumentType]
@@ -143,14 +143,14 @@ def linearise_members(
     ValueError as `rollout` does.
     """
     # one call at a time: XLA runs LAPACK on its own threads, and two calls may deadlock
-    return map_members(_member, canonical((*prepared(cascade, scenario, clock), r)), threads=1, plain=True)
+    return map_members(_member, canonical((*linearisation_inputs(cascade, scenario, clock), r)), threads=1, plain=True)
 
 
 def _member(tree: Any) -> tuple[StateSpace, Any]:
     return loop_matrices(*tree)
 
 
-def prepared(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Cascade, Scenario, Scalar]:
+def linearisation_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Cascade, Scenario, Scalar]:
     """Check a case, and return the first three arguments of `loop_matrices`: cascade, scenario and sample period (s).
 
     A cascade on a processor is returned as `Cascade.on_processor` does. Raises ValueError as `rollout` does.

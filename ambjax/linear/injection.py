@@ -52,7 +52,7 @@ class Injection(NamedTuple):
     saturated: float | None
 
 
-def lines(zones: Zones, clock: Clock, peak: float | None = None) -> np.ndarray:
+def frequency_lines(zones: Zones, clock: Clock, peak: float | None = None) -> np.ndarray:
     """Return lines [L] in Hz for `injected`: logarithmic over the frequency range of `zones`, denser near `peak` (Hz).
 
     `clock.duration` is one period of the multi-sine, and the lines are whole multiples of its inverse. Raises

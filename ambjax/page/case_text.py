@@ -30,7 +30,7 @@ class TemplateLine(NamedTuple):
     only: list[int]
 
 
-def template(text: str, given: Sequence[Slider]) -> tuple[list[TemplateLine], list[int]]:
+def editable_lines(text: str, given: Sequence[Slider]) -> tuple[list[TemplateLine], list[int]]:
     """Return the lines of a case file, and the indices of the sliders that have a place in it.
 
     - `text`: the case file.

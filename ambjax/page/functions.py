@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from ambjax.codegen.emitter import traced
-from ambjax.codegen.javascript.script import HELPERS, number
+from ambjax.codegen.javascript.script import HELPERS, js_constant
 from ambjax.codegen.primitives import OPS
 from ambjax.codegen.program import Location, Operand, Program, Ref
 
@@ -28,7 +28,7 @@ class Script:
             return f"v{x.node}" if location is None else location.name
         if x.dtype.kind == "b":
             return "true" if x else "false"
-        text = number(x)
+        text = js_constant(x)
         return f"({text})" if text.startswith("-") else text
 
     def statements(self, order: Sequence[int]) -> list[str]:

@@ -15,10 +15,10 @@ import numpy as np
 from ambjax.cases.reader import Case
 from ambjax.ensemble.study import Study
 from ambjax.host.optional import extra
-from ambjax.page.case_text import TemplateLine, checked, template
+from ambjax.page.case_text import TemplateLine, checked, editable_lines
 from ambjax.page.functions import PRELUDE
 from ambjax.page.linear_script import linear_script
-from ambjax.page.loop_functions import numbers_of
+from ambjax.page.loop_functions import loop_parameters
 from ambjax.page.loop_script import COILS, SIGNALS, loop_script
 from ambjax.page.sliders import GROUPS, SEED, Slider, changed, parameter_values, parameters, sliders
 from ambjax.simulation.metrics import UNITS
@@ -162,9 +162,9 @@ def _written(case: Case, others: list[Case]) -> tuple[list[Slider], list[list[Te
     """
     cases, given = (case, *others), sliders(case, others)
     for kept in (given, [one for one in given if _in_file(one, case)]):
-        placed = set.intersection(*(set(template(one.text, _own(kept, one))[1]) for one in cases))
+        placed = set.intersection(*(set(editable_lines(one.text, _own(kept, one))[1]) for one in cases))
         kept = [one for k, one in enumerate(kept) if k in placed]
-        found = [template(one.text, _own(kept, one))[0] for one in cases]
+        found = [editable_lines(one.text, _own(kept, one))[0] for one in cases]
         if all(checked(lines, _own(kept, one)) for lines, one in zip(found, cases, strict=True)):
             return kept, found
     return [], [[] for _ in cases]
@@ -172,7 +172,7 @@ def _written(case: Case, others: list[Case]) -> tuple[list[Slider], list[list[Te
 
 def _in_file(slider: Slider, case: Case) -> bool:
     """Return whether the case file contains the number of a slider."""
-    lines, _ = template(case.text, [slider])
+    lines, _ = editable_lines(case.text, [slider])
     return any(not line.only and len(line.parts) > 1 for line in lines)
 
 
@@ -200,7 +200,7 @@ def _check_structure(case: Case, other: Case, path: str) -> None:
 def _alike(case: Case, other: Case) -> bool:
     """Return whether two cases differ in numbers only."""
     same = other.cascade.processor is not None and other.clock.samples == case.clock.samples
-    return same and jax.tree.structure(numbers_of(other)) == jax.tree.structure(numbers_of(case))
+    return same and jax.tree.structure(loop_parameters(other)) == jax.tree.structure(loop_parameters(case))
 
 
 def _finest(case: Case, others: list[Case]) -> Case:

@@ -17,7 +17,7 @@ from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.linear.equilibrium import Point, at_rest, ideal, reading, sizes_of, start_of
 from ambjax.numerics.records import canonical
 from ambjax.page.functions import function_source, piece_of
-from ambjax.page.loop_functions import Numbers, numbers_of
+from ambjax.page.loop_functions import Numbers, loop_parameters
 from ambjax.world.scenario import Scenario
 
 
@@ -139,7 +139,7 @@ def linear_script(case: Case) -> LinearScript:
     Raises ValueError for a part of the case that scalar code cannot express.
     """
     with precision("double"):
-        numbers = canonical(numbers_of(case, any_delay=True))
+        numbers = canonical(loop_parameters(case, any_delay=True))
         functions = LinearFunctions(numbers)
         (lagged, u, control), _ = jax.eval_shape(functions.start, numbers)
         zero = jnp.zeros(())

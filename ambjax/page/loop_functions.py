@@ -85,7 +85,7 @@ class LoopFunctions:
         return fold.result(progress.fold, progress.ending)
 
 
-def numbers_of(case: Case, any_delay: bool = False) -> Numbers:
+def loop_parameters(case: Case, any_delay: bool = False) -> Numbers:
     """Return the numbers of a case on a processor.
 
     `any_delay`: the program admits any delay up to MOST_DELAY, not only that of the case.

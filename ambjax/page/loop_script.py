@@ -12,7 +12,7 @@ from ambjax.cases.reader import Case
 from ambjax.codegen.trace import precision
 from ambjax.numerics.records import canonical
 from ambjax.page.functions import function_source, loop_source, operands_of, piece_of
-from ambjax.page.loop_functions import LoopFunctions, numbers_of
+from ambjax.page.loop_functions import LoopFunctions, loop_parameters
 
 # Signals in a row, which the page draws; the currents of both coils follow. A row of a member has the first three only.
 SIGNALS = ("z", "alive", "r", "u", "u_mean", "i_ref", "q_z", "z_measured", "sigma", "v_tilde", "i")
@@ -42,7 +42,7 @@ def loop_script(case: Case, any_delay: bool = False) -> LoopScript:
     Raises ValueError for a part of the case that scalar code cannot express.
     """
     with precision("double"):
-        numbers = canonical(numbers_of(case, any_delay))
+        numbers = canonical(loop_parameters(case, any_delay))
         functions = LoopFunctions(case.clock, numbers)
         zero = jnp.zeros(())
         normals = (zero, zero, zero)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.ensemble.paths import SHIFT, Place, places, with_values
-from ambjax.page.loop_functions import numbers_of
+from ambjax.page.loop_functions import loop_parameters
 
 # The slider of a gain covers its value divided and multiplied by FACTOR; that of the plant's numbers, +-SHARE of them.
 FACTOR, SHARE = 30.0, 0.5
@@ -120,7 +120,7 @@ def changed(case: Case, values: Mapping[str, float | np.ndarray]) -> Case:
 
 def parameter_values(case: Case) -> np.ndarray:
     """Return the case's values of the parameters P of the JavaScript [parameters]."""
-    return np.array([float(x) for x in jax.tree.leaves(numbers_of(case))])
+    return np.array([float(x) for x in jax.tree.leaves(loop_parameters(case))])
 
 
 def _number(place: Place | None) -> bool:

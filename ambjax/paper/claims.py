@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ambjax.paper.evidence import BASIN, NOISE_STDS, UNCERTAIN, Evidence, Run
-from ambjax.paper.findings import FAILS, HOLDS, OPEN, STALLED, UNDECIDED, Finding, finding, largest_in, unfinished
+from ambjax.paper.findings import FAILS, HOLDS, OPEN, STALLED, UNDECIDED, Finding, finding, finding_if_lost, largest_in
 from ambjax.paper.readings import PULSE, SETTLE, TABLE_2
 from ambjax.world.plant import Plant
 
@@ -74,7 +74,7 @@ def _stable(evidence: Evidence) -> Finding:
     cause = f"held after a start at |z(0)| up to {basin:.1e} m, {share:.2g} % of the gap ({len(BASIN)} values tried)"
     if unknown is not None:
         cause += f"; not decided at {unknown:.1e} m, where the integrator stalled"
-    if ended := unfinished(evidence.regulation, evidence):
+    if ended := finding_if_lost(evidence.regulation, evidence):
         cause += f"; from i = i_ref = 0: {ended.ours}"
     verdict = HOLDS if basin > 0 and ended is None else UNDECIDED
     if (basin == 0 and unknown is None) or (ended is not None and ended.verdict == FAILS):
@@ -90,7 +90,7 @@ def _converges(evidence: Evidence) -> Finding:
     rows = evidence.regulation.trajectory.rows
     z, e = largest_in(rows, "e_z", 1.9, 2.0), largest_in(rows, "e", 1.9, 2.0)
     cause = "over the last 0.1 s, 0.6 s after the pulse"
-    return unfinished(evidence.regulation, evidence) or finding(
+    return finding_if_lost(evidence.regulation, evidence) or finding(
         f"{z:.1e} m, {e:.1e} A", z, z < 1e-6 and e < 1e-3, cause
     )
 
@@ -107,7 +107,7 @@ def _finite_time(evidence: Evidence) -> Finding:
     outside = np.flatnonzero(np.abs(rows.sigma[early]) > SIGMA_RADIUS)
     at = float(rows.t[early][outside[-1]]) if outside.size else 0.0
     cause = "last time before the pulse that |sigma| > 6e-6 m/s"
-    return unfinished(evidence.regulation, evidence) or finding(f"{at:.4g} s", at, at < 0.1, cause)
+    return finding_if_lost(evidence.regulation, evidence) or finding(f"{at:.4g} s", at, at < 0.1, cause)
 
 
 @claim(
@@ -121,7 +121,7 @@ def _radius(evidence: Evidence) -> Finding:
     quiet, pulse = largest_in(rows, "sigma", SETTLE, PULSE.start), largest_in(rows, "sigma", PULSE.start, PULSE.stop)
     worst = max(quiet, pulse)
     cause = f"{quiet:.1e} m/s before the pulse, {pulse:.1e} in it; no noise, finite p: k 2/pi arctan(p sigma) = q_z"
-    ended = unfinished(evidence.regulation, evidence)
+    ended = finding_if_lost(evidence.regulation, evidence)
     return ended or finding(f"{worst:.1e} m/s", worst, worst <= 1.05 * SIGMA_RADIUS, cause)
 
 
@@ -134,7 +134,7 @@ def _radius_by_noise(evidence: Evidence) -> Finding:
     hits = {period: std for period, std in stds.items() if std is not None}
     if not hits:
         verdict = UNDECIDED if any(n.undecided for n in evidence.noise) else FAILS
-        ended = unfinished(evidence.regulation, evidence)
+        ended = finding_if_lost(evidence.regulation, evidence)
         return ended or Finding("at no std scanned", None, verdict, "see the noise table")
     nearest = max(hits.values())
     cause = f"the printed std is {TABLE_2.noise_std / nearest:.0f} times the largest that gives this radius"
@@ -145,7 +145,7 @@ def _radius_by_noise(evidence: Evidence) -> Finding:
 def _pulse_effect(evidence: Evidence, run: Run) -> Finding:
     change = float(np.abs(run.trajectory.rows.z - run.quiet.rows.z).max())
     cause = f"the pulse moves the rotor by {100 * change / GAP:.2g} % of the gap; with finite p, by q_z pi / (2 c k p)"
-    return unfinished(run, evidence) or finding(f"{change:.3e} m", change, change <= TRACKING_ERROR, cause)
+    return finding_if_lost(run, evidence) or finding(f"{change:.3e} m", change, change <= TRACKING_ERROR, cause)
 
 
 @claim(
@@ -159,7 +159,7 @@ def _inversion(evidence: Evidence, run: Run) -> Finding:
     at = run.metrics["v_tilde_reached_s"]
     late = run.metrics["settled_max_abs_v_tilde_A2_per_m2"]
     cause = f"first |v_tilde| <= 0.1 A^2/m^2; after {SETTLE} s it stays within {late:.2g}"
-    return unfinished(run, evidence) or finding(f"{at:.4g} s", at, at < INVERSION_TIME, cause)
+    return finding_if_lost(run, evidence) or finding(f"{at:.4g} s", at, at < INVERSION_TIME, cause)
 
 
 @claim(
@@ -178,7 +178,7 @@ def _inversion_tracking(evidence: Evidence) -> Finding:
 def _current(evidence: Evidence) -> Finding:
     worst = max(r.metrics["settled_max_abs_current_error_A"] for r in (evidence.regulation, evidence.tracking))
     cause = f"largest |i - i_ref| after {SETTLE} s, pulse included; q_i = 0, so e decays by Eq. (14) unless u saturates"
-    ended = unfinished(evidence.regulation, evidence) or unfinished(evidence.tracking, evidence)
+    ended = finding_if_lost(evidence.regulation, evidence) or finding_if_lost(evidence.tracking, evidence)
     return ended or finding(f"{worst:.1e} A", worst, worst < 1e-3, cause)
 
 
@@ -186,7 +186,7 @@ def _current(evidence: Evidence) -> Finding:
 def _tracking(evidence: Evidence) -> Finding:
     error = evidence.tracking.metrics["settled_max_abs_error_m"]
     cause = f"largest |z - r| after {SETTLE} s, pulse included"
-    return unfinished(evidence.tracking, evidence) or finding(f"{error:.3e} m", error, error < 2.35e-5, cause)
+    return finding_if_lost(evidence.tracking, evidence) or finding(f"{error:.3e} m", error, error < 2.35e-5, cause)
 
 
 @claim(

@@ -30,7 +30,7 @@ def finding(ours: str, value: float, condition: bool, cause: str) -> Finding:
     return Finding(ours, value, HOLDS if condition else FAILS, cause)
 
 
-def unfinished(run: Run, evidence: Evidence) -> Finding | None:
+def finding_if_lost(run: Run, evidence: Evidence) -> Finding | None:
     """Return the finding on a claim about a run that is lost or stalled; None if the run reached its end."""
     if math.isinf(run.metrics["lost_at_s"]):
         return None

@@ -26,7 +26,7 @@ SAMPLED_WORDS = (
 )
 
 
-def judge(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
+def judge_claims(evidence: dict[str, Evidence]) -> list[dict[str, Any]]:
     """Return every claim with its finding in each reading, as plain data. `evidence`: by reading."""
     rows = []
     for entry in CLAIMS:
@@ -127,7 +127,7 @@ def _processor_lines(rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def markdown(
+def ledger_markdown(
     rows: list[dict[str, Any]],
     noise: list[dict[str, Any]],
     processor: list[dict[str, Any]],

@@ -38,11 +38,11 @@ def comparison(
     cases: Sequence[Contender], limits: Sequence[float], span: tuple[float, float], path: pathlib.Path
 ) -> None:
     """Write the picture of `figure_of` to a file."""
-    figure_of(cases, limits, span).savefig(path, dpi=110)
+    comparison_figure(cases, limits, span).savefig(path, dpi=110)
 
 
 @own_style
-def figure_of(cases: Sequence[Contender], limits: Sequence[float], span: tuple[float, float]) -> Figure:
+def comparison_figure(cases: Sequence[Contender], limits: Sequence[float], span: tuple[float, float]) -> Figure:
     """Return a picture: |S| with zones, |KS|, share of members below an rms error, rms error against rms voltage.
 
     `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz. A member that is lost has

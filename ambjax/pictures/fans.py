@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ambjax.pictures.figures import BLUE, INK, RED
-from ambjax.pictures.scales import digits, finish, prefix_of
+from ambjax.pictures.scales import digits, prefix_of, style_axes
 from ambjax.pictures.style import own_style
 from ambjax.pictures.thinning import envelope, smoothed, thin
 
@@ -95,7 +95,7 @@ def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float,
             f"the {percents[0]:g} to {percents[-1]:g} % band reaches {digits(factor * beyond)} {unit}, beyond this axis"
         )
         ax.set_title(words, fontsize=7, loc="right", pad=2, color=INK)
-    finish(ax, f"{label}\n({unit})")
+    style_axes(ax, f"{label}\n({unit})")
 
 
 def _median(t: np.ndarray, y: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], str]:
@@ -160,7 +160,7 @@ def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray
     words += f", {statuses(lost - open_, open_)}" * bool(lost)
     ax.set_title(words, fontsize=8, loc="right", pad=2, color=INK)
     ax.yaxis.set_major_locator(MaxNLocator(3))
-    finish(ax, "survivors\n(%)")
+    style_axes(ax, "survivors\n(%)")
 
 
 def statuses(lost: int, stalled: int) -> str:

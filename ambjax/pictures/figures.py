@@ -74,7 +74,7 @@ def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.
     # Fixed margins (in inches over the height): because a layout engine draws everything twice.
     figure.subplots_adjust(0.15, 0.5 / height, 0.97, 1 - 0.5 / height, hspace=0.2)
     for ax, panel in zip(axes, panels, strict=True):
-        draw(ax, panel, trajectory)
+        draw_panel(ax, panel, trajectory)
         if panel is FORCE_ERROR and not np.isfinite(trajectory.lost_at):
             _first_moments(ax, trajectory)
     axes[-1].set_xlabel("time (s)")
@@ -90,8 +90,8 @@ def readings(trajectories: dict[str, Trajectory], title: str, settle: float, pat
     axes = figure.subplots(2, len(trajectories), squeeze=False)
     position = POSITION._replace(curves=(Curve("z_measured", "$z$ measured", "#bbbbbb"), *POSITION.curves))
     for (name, trajectory), (upper, lower) in zip(trajectories.items(), axes.T, strict=True):
-        draw(upper, position, trajectory, first=True)
-        draw(lower, ERROR, trajectory)
+        draw_panel(upper, position, trajectory, first=True)
+        draw_panel(lower, ERROR, trajectory)
         upper.set_title(name, loc="left", fontsize=10, fontweight="bold", pad=18)  # above the legend
         lower.set_xlabel("time (s)", fontsize=9)
         if not np.isfinite(trajectory.lost_at):
@@ -102,7 +102,7 @@ def readings(trajectories: dict[str, Trajectory], title: str, settle: float, pat
     figure.savefig(path, dpi=130)
 
 
-def draw(
+def draw_panel(
     ax: Axes,
     panel: Panel,
     trajectory: Trajectory,

@@ -42,7 +42,7 @@ class NamedLoop(NamedTuple):
 
 
 @own_style
-def sensitivity(
+def sensitivity_picture(
     title: str,
     loops: Sequence[NamedLoop],
     limits: Sequence[float],
@@ -51,11 +51,11 @@ def sensitivity(
     measured: MeasuredPoints | None = None,
 ) -> None:
     """Write the picture of `figure_of` to a file."""
-    figure_of(title, loops, limits, span, measured).savefig(path, dpi=110)
+    frequency_figure(title, loops, limits, span, measured).savefig(path, dpi=110)
 
 
 @own_style
-def figure_of(
+def frequency_figure(
     title: str,
     loops: Sequence[NamedLoop],
     limits: Sequence[float],

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ambjax.pictures.fans import statuses
 from ambjax.pictures.figures import BLUE, INK, RED
-from ambjax.pictures.scales import axis_of, digits, finish, log_ticks, size_of
+from ambjax.pictures.scales import axis_of, digits, log_ticks, size_of, style_axes
 from ambjax.pictures.style import own_style
 from ambjax.simulation.metrics import REACHED
 
@@ -116,7 +116,7 @@ def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> Non
     ax.set_xlabel(f"{label} ({unit})" if unit else label, fontsize=9)
     ax.set_ylim(0, 1.08 * max((alive + dead).max(), 1))
     ax.yaxis.set_major_locator(MaxNLocator(4, integer=True))
-    finish(ax, "members")
+    style_axes(ax, "members")
 
 
 def _bins(values: np.ndarray, log: bool) -> np.ndarray:

@@ -20,7 +20,7 @@ from ambjax.pictures.figures import (
     POSITION,
     SLIDING,
     Panel,
-    draw,
+    draw_panel,
     signal_of,
 )
 from ambjax.pictures.scales import prefix_of
@@ -71,7 +71,7 @@ def overview_figure(
             if panel is None:
                 ax.set_axis_off()
                 continue
-            draw(ax, panel, trajectory, stretch=(stretch[0], stretch[1]))
+            draw_panel(ax, panel, trajectory, stretch=(stretch[0], stretch[1]))
             if window is None and n == 0 and _scales_late(trajectory, settle):
                 _fit(ax, panel, trajectory, settle)
             if window is None and n:

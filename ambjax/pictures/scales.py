@@ -136,7 +136,7 @@ def edges(centres: np.ndarray, log: bool) -> np.ndarray:
     return np.exp(bounds) if log else bounds
 
 
-def finish(ax: Axes, y_label: str) -> None:
+def style_axes(ax: Axes, y_label: str) -> None:
     """Set the label and the style that all charts share."""
     ax.set_ylabel(y_label, fontsize=9)
     ax.tick_params(labelsize=8)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from ambjax.pictures.figures import BLUE, INK, ORANGE
-from ambjax.pictures.scales import axis_of, finish
+from ambjax.pictures.scales import axis_of, style_axes
 from ambjax.pictures.style import own_style
 
 MOST_DRIVERS = 12
@@ -54,7 +54,7 @@ def tornado(drivers: Sequence[Bar], metric: str, says: str, path: pathlib.Path) 
     ax.set_xlabel(words + (f"; {more} weaker not shown" if more else ""), fontsize=9)
     figure.suptitle(f"Drivers of {axis_of(metric, 0.0)[1]}", fontsize=11)
     ax.set_title(textwrap.fill(says, 95), fontsize=8)
-    finish(ax, "")
+    style_axes(ax, "")
     trends = dict.fromkeys(_trend(one) for one in bars)
     keys = [Patch(color=TRENDS[trend], label=trend) for trend in TRENDS if trend in trends]
     figure.legend(handles=keys, loc="outside lower center", ncols=3, fontsize=8, frameon=False)

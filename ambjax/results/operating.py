@@ -13,10 +13,10 @@ from ambjax.linear import (
     MemberPeaks,
     StateSpace,
     analyse,
+    frequency_lines,
     injected_members,
     linearise,
     linearise_members,
-    lines,
 )
 from ambjax.simulation.clock import Clock
 
@@ -101,7 +101,7 @@ def measured_peaks(case: Case, study: Study, peak: float) -> MemberPeaks:
     """Measure the peak of |S| of each member of the study by injection, at lines denser near `peak` (Hz)."""
     cascade, scenario = study.batch(np.arange(study.members))
     clock = one_period(case)
-    return injected_members(cascade, scenario, clock, lines(case.zones, clock, peak))
+    return injected_members(cascade, scenario, clock, frequency_lines(case.zones, clock, peak))
 
 
 def one_period(case: Case) -> Clock:
@@ -110,7 +110,7 @@ def one_period(case: Case) -> Clock:
     return dataclasses.replace(case.clock, samples=math.ceil(1 / (float(case.zones.f_low) * period)))
 
 
-def numbers_of(one: Analysis) -> dict[str, object]:
+def analysis_summary(one: Analysis) -> dict[str, object]:
     """Return the numbers of an analysis by their names in the JSON summary."""
     margins = one.margins
     return {

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.reader import Case, require_case
-from ambjax.ensemble.replay import record
+from ambjax.ensemble.replay import record_member
 from ambjax.host.optional import extra
 from ambjax.simulation.metrics import UNITS, standard_for
 from ambjax.simulation.trajectory import SIGNAL_UNITS, Trajectory
@@ -115,6 +115,6 @@ def simulate(case: Case, progress: Callable[[int], object] = lambda samples: Non
     """
     require_case(case)
     fold = standard_for(case.settle, case.scenario)
-    outcome = record(case.cascade, case.scenario, case.clock, fold=fold, tell=progress)
+    outcome = record_member(case.cascade, case.scenario, case.clock, fold=fold, tell=progress)
     metrics = {name: np.asarray(x).item() for name, x in outcome.measured.items()}
     return CaseRun(case, outcome.trajectory, metrics)

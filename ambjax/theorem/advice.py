@@ -24,7 +24,7 @@ STALLED = (
 STALLED_PLANT = 'Use fixed steps of the plant, which cannot stall: [clock] dt = 1e-6 with method = "rodas3".'
 
 
-def answer(report: Report, case: str) -> list[str]:
+def theorem_lines(report: Report, case: str) -> list[str]:
     """Return the lines below the table of `ambjax check`. `case`: file name as given by the user."""
     deciding = [line for line in report.conditions if line.holds is not None]
     fails = [line for line in deciding if not line.holds]
@@ -66,7 +66,7 @@ def advice(report: Report) -> list[str]:
     return lines
 
 
-def on_processor(sampled: SampledReport, margin: Delays, unknown: Delays | None) -> list[str]:
+def processor_lines(sampled: SampledReport, margin: Delays, unknown: Delays | None) -> list[str]:
     """Return the lines below the tables of a cascade on a processor.
 
     They report the slopes, the distance to C, the status of the rotor, an alternating voltage, and the delay margins.

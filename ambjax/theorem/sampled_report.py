@@ -146,7 +146,7 @@ def rolled(system: System, clock: Clock) -> Outcome:
     return roll(*canonical((system, clock)), None, every=1)
 
 
-def check(
+def check_sampled(
     cascade: Cascade,
     scenario: Scenario,
     clock: Clock,
@@ -169,7 +169,7 @@ def check(
     alternating = alternation(np.asarray(calm.rows.u)[settled:]) if np.isinf(calm.lost_at) else None
     stalled = int(outcome.lost_code) == STALLED
     return SampledReport(
-        slopes(cascade, clock),
+        slope_checks(cascade, clock),
         bands,
         float(outcome.lost_at),
         outcome.lost_why,
@@ -211,7 +211,7 @@ def _without_noise(scenario: Scenario) -> Scenario:
     return scenario if quiet in (None, scenario.sensor) else dataclasses.replace(scenario, sensor=quiet)
 
 
-def slopes(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
+def slope_checks(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
     """Return slope times T and its limits for every law with a slope. `cascade`: of one member."""
     sampling, lines = sampling_of(cascade, clock), []
     for stage, law in zip(CascadeState._fields, map(with_infinite_steepness, cascade.laws), strict=True):

@@ -11,7 +11,7 @@ from jax import Array
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble import apply, map_members
 from ambjax.extend import Scalar, canonical
-from ambjax.linear import LoopQuantities, loop_matrices, loop_quantities, prepared
+from ambjax.linear import LoopQuantities, linearisation_inputs, loop_matrices, loop_quantities
 from ambjax.world.scenario import Scenario
 from tuning.objective.members import LoopRange, Members, Objective
 from tuning.space import Space
@@ -56,7 +56,7 @@ def loops(objective: Objective, x: np.ndarray, members: Members) -> tuple[dict[s
     cascade, scenario = objective.cascade, objective.scenario
     if members.values:
         cascade, scenario = apply(cascade, scenario, members.values)
-    lane = LoopLane(None, *prepared(cascade, scenario, objective.clock))
+    lane = LoopLane(None, *linearisation_inputs(cascade, scenario, objective.clock))
     start, member = np.divmod(np.arange(count * n), n)
     lane = jax.tree.map(lambda a: np.asarray(a)[member] if np.ndim(a) else a, canonical(lane))
     lane = lane._replace(x=np.asarray(x, jnp.result_type(float))[start])

@@ -52,7 +52,7 @@ def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarra
     return [found[gain.path] for gain in gains]
 
 
-def drawn(space: Space, box: list[Range], cube: np.ndarray) -> np.ndarray:
+def from_unit_cube(space: Space, box: list[Range], cube: np.ndarray) -> np.ndarray:
     """Map points of the unit cube [n, m] to gains [n, m], log-uniform over the ranges `box`.
 
     All knots of a schedule have the value of the first: the search begins at constant gains.

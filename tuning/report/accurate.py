@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble.replay import record
+from ambjax.ensemble.replay import record_member
 from ambjax.simulation.rollout import rollout
 from ambjax.simulation.trajectory import Trajectory
-from tuning.judge import difference, metrics_of, summarise
+from tuning.judge import compare_metrics, metrics_of, summarise
 from tuning.problem import TuningProblem
 
 # Number of held-out members that are simulated by accurate steps.
@@ -21,7 +21,9 @@ COMPARED = 8
 MARKED = 0.05
 
 
-def compared(problem: TuningProblem, x: np.ndarray, seed: int, count: int, names: tuple[str, ...]) -> dict[str, Any]:
+def compare_steps(
+    problem: TuningProblem, x: np.ndarray, seed: int, count: int, names: tuple[str, ...]
+) -> dict[str, Any]:
     """Compare the report's steps with accurate steps on the first members of an ensemble, at coordinates x [m].
 
     Returns plain data. `members`: number of members simulated. `held`: number that survive with both steps; over these,
@@ -32,7 +34,7 @@ def compared(problem: TuningProblem, x: np.ndarray, seed: int, count: int, names
     numbers = np.arange(min(COMPARED, count))
     members = problem.objective.chosen(seed, numbers, count)
     both = metrics_of(problem.judging, x, members), metrics_of(problem.reference, x, members)
-    error = difference(problem, *both, members)
+    error = compare_metrics(problem, *both, members)
     held = np.logical_and.reduce([~np.isfinite(metrics["lost_at_s"]) for metrics in both])
     ways = ("report", "accurate")
     facts: dict[str, Any] = {"members": len(numbers), "held": int(held.sum()), "marked_beyond": MARKED}
@@ -64,6 +66,6 @@ def nominal(problem: TuningProblem, cascade: Cascade) -> Trajectory:
     """
     case = problem.case
     if problem.replays:
-        return record(cascade, case.scenario, case.clock).trajectory
+        return record_member(cascade, case.scenario, case.clock).trajectory
     clock = dataclasses.replace(case.clock, method=problem.reference.objective.clock.method)
     return rollout(cascade, case.scenario, clock).trajectory

@@ -2,12 +2,12 @@
 
 import math
 
-from ambjax.host.web_page import literal
+from ambjax.host.web_page import escape_markdown
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.limit_table import broken, prices
 
 
-def lines(facts: TuningFacts) -> list[str]:
+def answer_lines(facts: TuningFacts) -> list[str]:
     """Return the list of five items: held or not, error and voltage, sensitivity, what limits it, the next command."""
     items = [_held(facts), _sizes(facts), _sensitivity(facts), _limiting(facts), _next(facts)]
     return [*(f"- {item}" for item in items), ""]
@@ -69,7 +69,7 @@ def _peak(row: Row, found: Row) -> float:
 
 def _limiting(facts: TuningFacts) -> str:
     """Return the limits that are broken or active and the gains at a bound."""
-    words = [literal(line) for line in (*broken(facts.limits), *prices(facts.limits))]
+    words = [escape_markdown(line) for line in (*broken(facts.limits), *prices(facts.limits))]
     if ends := [row["path"] for row in facts.gains if row["at_bound"]]:
         words.append(f"gains at a bound of `[tune.bounds]`: {', '.join(ends)}")
     if not words:
@@ -81,5 +81,5 @@ def _limiting(facts: TuningFacts) -> str:
 def _next(facts: TuningFacts) -> str:
     """Return the next command, or the advice if a requirement is not met."""
     if facts.advice:
-        return f"**Next:** {literal(facts.advice)}"
+        return f"**Next:** {escape_markdown(facts.advice)}"
     return f"**Next:** in this folder, {facts.next}"

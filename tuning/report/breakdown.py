@@ -23,7 +23,7 @@ def contributions(weights: Sequence[float], terms: dict[str, np.ndarray]) -> dic
     return {name: error * values if name in COSTS else values for name, values in each.items()}
 
 
-def table(goal: Goal, columns: dict[str, np.ndarray]) -> Facts:
+def loss_breakdown(goal: Goal, columns: dict[str, np.ndarray]) -> Facts:
     """Return, for an ensemble, the mean value and mean contribution of each term, the mean loss, and the risk.
 
     `columns`: the columns of `judge`; the terms [N] are named "loss.tracking" and so on.

@@ -2,23 +2,23 @@
 
 import itertools
 
-from ambjax.host.web_page import literal, table
+from ambjax.host.web_page import escape_markdown, markdown_table
 from tuning.objective.loss import TERMS
 from tuning.report import answer, extras, front_table, held_out, limit_table, sensitivity_table
 from tuning.report.breakdown import FORMULA
 from tuning.report.facts import Row, TuningFacts
-from tuning.report.held_out import number
+from tuning.report.held_out import number_text
 
 # Relative decrease of the objective below which a point of a slice counts as equal to the answer.
 AS_GOOD = 0.01
 
 
-def markdown(facts: TuningFacts) -> str:
+def report_markdown(facts: TuningFacts) -> str:
     """Return the text of report.md: the answer in five lines, the front, and all details.
 
     Its pictures are files in the same folder.
     """
-    lines = [f"# Tuning of {literal(facts.case)}", "", *answer.lines(facts)]
+    lines = [f"# Tuning of {escape_markdown(facts.case)}", "", *answer.answer_lines(facts)]
     sections = (
         front_table.section(facts.front, facts.front_written),
         ["## Verdict in full", "", facts.verdict, ""],
@@ -44,18 +44,18 @@ def _gains(facts: TuningFacts) -> list[str]:
     head = ["gain", "before", "after", *looked, "allowed from", "to", "at a bound", "risk increase"]
     rows = []
     for row in facts.gains:
-        ends = [number(row.get(end), ".3g") for end in ("low", "high")] if ranged else []
-        bounds = [number(row.get(end), ".3g") for end in ("least", "most")]
+        ends = [number_text(row.get(end), ".3g") for end in ("low", "high")] if ranged else []
+        bounds = [number_text(row.get(end), ".3g") for end in ("least", "most")]
         gains = f"{row['before']:.6g}", f"{row['after']:.6g}"
         rows.append([row["path"], *gains, *ends, *bounds, row["at_bound"] or "-", _sensitivity(row, facts)])
-    lines = ["## Gains", "", *table(head, rows), ""]
+    lines = ["## Gains", "", *markdown_table(head, rows), ""]
     words = (
         "Last column: increase of the risk if this gain alone is larger or smaller by a factor of e^0.25 = 1.28. The "
         "larger of the two increases is shown. A gain with a large increase must be set accurately. If this change "
         "loses members of the training ensemble, the column shows how many more are lost than with the answer. "
         "`tune.bounds` sets other bounds."
     )
-    sources = [f"- {row['path']}: {literal(row['source'])}" for row in facts.gains if row.get("source")]
+    sources = [f"- {row['path']}: {escape_markdown(row['source'])}" for row in facts.gains if row.get("source")]
     return [
         *lines,
         words,
@@ -103,7 +103,7 @@ def _loss(facts: TuningFacts) -> list[str]:
         "peak, clearance and survival add weight x mean to the loss. Effort and chatter multiply the error of each "
         "member: they add the mean of weight x term x (tracking + peak), which is not the product of the means shown.",
         "",
-        *table(["term", "weight", "mean before", "adds before", "mean after", "adds after"], rows),
+        *markdown_table(["term", "weight", "mean before", "adds before", "mean after", "adds after"], rows),
         "",
     ]
 
@@ -130,7 +130,7 @@ def _minimised(facts: TuningFacts) -> list[str]:
         "count. The objective therefore differs from the loss of the held-out members above. The picture shows the "
         "objective.",
         "",
-        *table(["at the answer", "value"], rows),
+        *markdown_table(["at the answer", "value"], rows),
         "",
         "![Objective along each gain, through the answer](slices.png)",
         "",
@@ -160,13 +160,13 @@ def _conditions(facts: TuningFacts) -> list[str]:
     """Return the section on the conditions of Theorem 1, left > right."""
     rows = []
     for row in facts.conditions:
-        gain, margin = (number(x) for x in (row["gain"], row["margin"]))
+        gain, margin = (number_text(x) for x in (row["gain"], row["margin"]))
         verdict = {True: "holds", False: "FAILS", None: "-"}[row["holds"]]
-        rows.append([row["requires"], gain, number(row["against"]), margin, row["unit"], verdict])
+        rows.append([row["requires"], gain, number_text(row["against"]), margin, row["unit"], verdict])
     head = ["condition", "left", "right", "margin", "unit", "verdict"]
-    lines = ["## Conditions of Theorem 1 along the nominal run", "", *table(head, rows), ""]
+    lines = ["## Conditions of Theorem 1 along the nominal run", "", *markdown_table(head, rows), ""]
     if facts.advice_on_conditions:
-        lines += [f"- {literal(line)}" for line in facts.advice_on_conditions] + [""]
+        lines += [f"- {escape_markdown(line)}" for line in facts.advice_on_conditions] + [""]
     return lines
 
 

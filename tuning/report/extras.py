@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ambjax.host.web_page import table
+from ambjax.host.web_page import markdown_table
 from tuning.report.gradient import AGREE, AGREED, MODES, STEADY, STEP
 
 Facts = dict[str, Any]
@@ -15,16 +15,18 @@ def gradient(facts: Facts) -> list[str]:
     lines += [f"Over {ways['samples']} samples, of the mean loss:", ""]
     rows = zip(facts["gains"], ways["forward"], ways["reverse"], ways["differences"], ways["verdicts"], strict=True)
     cells = [[path, f"{one:.10e}", f"{two:.10e}", f"{three:.8e}", said] for path, one, two, three, said in rows]
-    lines += table(["gain", "forward", "reverse", "central differences", "verdict"], cells)
+    lines += markdown_table(["gain", "forward", "reverse", "central differences", "verdict"], cells)
     lines += ["", *_verdict(ways)]
     head = ["horizon (s)", "norm of the gradient of the log loss", "share of members lost"]
     lines += [
         "",
-        *table(head, [[f"{r['horizon_s']:g}", f"{r['norm']:.3g}", f"{r['lost']:.3g}"] for r in facts["horizons"]]),
+        *markdown_table(
+            head, [[f"{r['horizon_s']:g}", f"{r['norm']:.3g}", f"{r['lost']:.3g}"] for r in facts["horizons"]]
+        ),
     ]
     rows = zip(facts["gains"], noise["gradient"], noise["standard_error"], noise["ratio"], strict=True)
     cells = [[path, f"{slope:.3e}", f"{error:.1e}", f"{ratio:.3g}"] for path, slope, error, ratio in rows]
-    lines += ["", *table(["gain", "gradient of the log loss", "standard error over members", "ratio"], cells)]
+    lines += ["", *markdown_table(["gain", "gradient of the log loss", "standard error over members", "ratio"], cells)]
     return [*lines, ""]
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.host.web_page import table
+from ambjax.host.web_page import markdown_table
 from tuning.search.course import SearchResult
 from tuning.search.front import KNEE, FrontPoint
 
@@ -97,4 +97,4 @@ def section(rows: list[Facts] | None, written: bool) -> list[str]:
         "answer taken is judged on the held-out members."
     )
     picture = "![Error against voltage; the answer taken is filled](front.png)"
-    return [f"## {TITLE}", "", *table(head, cells), "", words, "", picture, ""]
+    return [f"## {TITLE}", "", *markdown_table(head, cells), "", words, "", picture, ""]

@@ -52,7 +52,7 @@ def three_ways(problem: TuningProblem, x: np.ndarray) -> dict[str, object]:
     coarse, fine = (up - down) / (2 * STEP), (half_up - half_down) / STEP
     floor = float(max(NOTHING * np.abs([by_forward, by_reverse]).max(), ROUNDING * np.abs(values).max()))
     columns = zip(by_forward, by_reverse, coarse, fine, strict=True)
-    verdicts = [verdict(a, b, c, d, floor) for a, b, c, d in columns]
+    verdicts = [agreement(a, b, c, d, floor) for a, b, c, d in columns]
     return {
         "forward": by_forward,
         "reverse": by_reverse,
@@ -70,7 +70,7 @@ def extrapolated(coarse: Number, fine: Number) -> Number:
     return (4 * fine - coarse) / 3
 
 
-def verdict(forward: float, reverse: float, coarse: float, fine: float, floor: float) -> str:
+def agreement(forward: float, reverse: float, coarse: float, fine: float, floor: float) -> str:
     """Return AGREED if three ways to a derivative agree, else a description of the difference.
 
     `coarse`, `fine`: central differences with the steps STEP and STEP / 2. Differences below `floor` are ignored.
@@ -128,7 +128,7 @@ def signal_to_noise(problem: TuningProblem, x: np.ndarray, members: Members) -> 
     }
 
 
-def report(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, object]:
+def gradient_report(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, object]:
     """Return the data of the whole gradient report at coordinates x [m]: of the loss, also if the answer is a knee."""
     return {
         "gains": problem.objective.space.paths,

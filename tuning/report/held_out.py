@@ -2,11 +2,11 @@
 
 import math
 
-from ambjax.host.web_page import table
+from ambjax.host.web_page import markdown_table
 from tuning.report.facts import SHOWN, Row, TuningFacts
 
 
-def number(x: float | None, form: str = ".5g") -> str:
+def number_text(x: float | None, form: str = ".5g") -> str:
     """Return a number as text; '-' for None and NaN."""
     return "-" if x is None or math.isnan(x) else format(x, form)
 
@@ -21,13 +21,18 @@ def section(facts: TuningFacts) -> list[str]:
     if again:
         head += [f"after, {again['held']} of them", "by accurate steps", "off by"]
     rows = [
-        [f"`{name}`", number(before.get(name), ".4g"), number(after.get(name), ".4g"), *_again(again, name)]
+        [f"`{name}`", number_text(before.get(name), ".4g"), number_text(after.get(name), ".4g"), *_again(again, name)]
         for name in SHOWN
         if name in after or name in before
     ]
     rows += [[name, str(before[name]), str(after[name]), *_statuses(again, name)] for name in ("lost", "stalled")]
     rows.append(["survival, 95 % interval", *map(_survival, (before, after)), *(["-"] * 3 if again else [])])
-    lines = [f"## {after['members']} held-out members (seed {facts.held_out_seed})", "", *table(head, rows), ""]
+    lines = [
+        f"## {after['members']} held-out members (seed {facts.held_out_seed})",
+        "",
+        *markdown_table(head, rows),
+        "",
+    ]
     words = ["Metrics are of the members that are held.", *_accurate(again), *_worst(facts.worst_member), ""]
     return [*lines, *words]
 

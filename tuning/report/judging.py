@@ -50,7 +50,7 @@ def examined(answer: SearchResult, gradients: bool, front_written: bool) -> tupl
     slices = explore.slices(problem, x, members)
     facts = TuningFacts(**found, **_neighbourhood(problem, x, slices))
     what = outcome.outcome_of(facts, problem.tune.limits.may_lose(problem.tune.budget.held_out))
-    words = {"verdict": outcome.verdict(facts, what), "advice": outcome.advice(problem, facts, what, x, members)}
+    words = {"verdict": outcome.outcome_text(facts, what), "advice": outcome.remedies(problem, facts, what, x, members)}
     words["next"] = outcome.next_command(problem)
     return dataclasses.replace(facts, outcome=what.facts(), **words), slices
 
@@ -83,7 +83,7 @@ def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_
     found["limits"] = limit_table.facts(problem, after, found["after"], refuted, measured, late)
     if refuted and after:
         found["after"] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
-    found["loss"] = {name: breakdown.table(problem.error_goal, one) for name, one in judged.items() if one}
+    found["loss"] = {name: breakdown.loss_breakdown(problem.error_goal, one) for name, one in judged.items() if one}
     found["worst_member"] = worst(problem, after, held_out) if after else None
     lost = problem.engine.terms(answer.x[None], answer.members)["survival"] > 0
     return found | {"lost_in_training": int(lost.sum())}
@@ -115,7 +115,7 @@ def _conditions(problem: TuningProblem, x: np.ndarray) -> Row:
 
 def _gradient(answer: SearchResult) -> Row:
     say("gradient report ...")
-    return gradient.report(answer.problem, answer.x, answer.members)
+    return gradient.gradient_report(answer.problem, answer.x, answer.members)
 
 
 def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: explore.Slices) -> Row:
@@ -160,7 +160,7 @@ def _checked(
         error = _worst_checked(answer, judged, held_out) if answer.confirmed else None
         count = problem.tune.budget.held_out
         say(f"{min(accurate.COMPARED, count)} of them again by accurate steps ...")
-        again = accurate.compared(problem, answer.x, held_out, count, SHOWN)
+        again = accurate.compare_steps(problem, answer.x, held_out, count, SHOWN)
     refuted = (error or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
     return error, again, refuted or (again["refuted"] if again else "")
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.host.web_page import table
+from ambjax.host.web_page import markdown_table
 from tuning.delay_test import DELAY_MARGIN, DelayTest
 from tuning.measured_peaks import MEASURED, Sensitivity, reached_of
 from tuning.objective.limits import FRONT, Limit
@@ -167,7 +167,7 @@ def section(rows: list[Facts]) -> list[str]:
         "at the optimum",
         f"effect if {100 * MORE:g} % looser",
     ]
-    lines = ["## Limits", "", *table(head, cells), ""]
+    lines = ["## Limits", "", *markdown_table(head, cells), ""]
     lines += [f"- {row['name']}: {row['what']}. Source: {row['source']}." for row in rows]
     return [
         *lines,

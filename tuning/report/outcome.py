@@ -74,7 +74,7 @@ def outcome_of(facts: TuningFacts, may_lose: int) -> TuningOutcome:
     return TuningOutcome(after["members"], after["lost"], after["stalled"], may_lose, limits, facts.refuted)
 
 
-def verdict(facts: TuningFacts, outcome: TuningOutcome) -> str:
+def outcome_text(facts: TuningFacts, outcome: TuningOutcome) -> str:
     """Return the outcome as text: verdict, lost members, error, limits, sensitive gains and gains at a bound."""
     unjudged = [name for name, found in outcome.limits.items() if found == UNJUDGED]
     met = NO_HELD_OUT if unjudged else ALL_MET
@@ -124,7 +124,9 @@ def _largest(summary: Row) -> str:
     return f"; largest error {summary['settled_max_abs_error_m']:.3g} m" if summary["held"] else ""
 
 
-def advice(problem: TuningProblem, facts: TuningFacts, outcome: TuningOutcome, x: np.ndarray, members: Members) -> str:
+def remedies(
+    problem: TuningProblem, facts: TuningFacts, outcome: TuningOutcome, x: np.ndarray, members: Members
+) -> str:
     """Return the requirements that are not met, with remedies, the most important first; '' if all are met.
 
     `x` [m]: coordinates of the tuned gains. `members`: the training ensemble.

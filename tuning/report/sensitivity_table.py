@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-from ambjax.host.web_page import table
+from ambjax.host.web_page import markdown_table
 from tuning.measured_peaks import SCREENED, Sensitivity, injects
 from tuning.problem import TuningProblem
 
@@ -54,7 +54,7 @@ def section(found: Facts | None) -> list[str]:
         words.append("The larger of the linear and the injected peak decides.")
     else:
         words.append("In continuous time the linear peak decides; `ambjax sensitivity --inject` measures it.")
-    return ["## Sensitivity", "", *table(head, cells), "", " ".join(words), ""]
+    return ["## Sensitivity", "", *markdown_table(head, cells), "", " ".join(words), ""]
 
 
 def _injected(row: Facts) -> list[str]:

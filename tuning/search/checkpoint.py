@@ -118,7 +118,7 @@ class CheckpointFile:
             return None
 
 
-def begin(directory: pathlib.Path) -> None:
+def mark_directory(directory: pathlib.Path) -> None:
     """Mark a directory as that of a search, so that the search can be resumed even before its first checkpoint.
 
     Raises ValueError if the mark cannot be written.
@@ -127,7 +127,7 @@ def begin(directory: pathlib.Path) -> None:
     write_whole(directory / MARK, lambda file: file.write(text.encode()))
 
 
-def begun(directory: pathlib.Path) -> bool:
+def can_resume(directory: pathlib.Path) -> bool:
     """Return whether a search has begun in this directory and can be resumed."""
     return (directory / MARK).exists()
 
@@ -142,7 +142,7 @@ def checkpoints(directory: pathlib.Path) -> list[pathlib.Path]:
     return sorted(path for path in directory.glob("checkpoint-*.npz") if NAME.fullmatch(path.name) and path.is_file())
 
 
-def unfinished(directory: pathlib.Path, report: str) -> bool:
+def has_unfinished_search(directory: pathlib.Path, report: str) -> bool:
     """Return whether a directory holds a search that has not ended: checkpoints newer than the file `report`."""
     left, ended = checkpoints(directory), directory / report
     return bool(left) and not (

@@ -75,7 +75,7 @@ def population(m: int) -> int:
     return 4 + int(3 * math.log(m))
 
 
-def begun(mean: np.ndarray) -> CmaState:
+def initial_state(mean: np.ndarray) -> CmaState:
     """Return the initial distribution around a point [m]."""
     m = len(mean)
     return CmaState(
@@ -85,11 +85,11 @@ def begun(mean: np.ndarray) -> CmaState:
 
 def idle_states(starts: int, m: int) -> CmaState:
     """Return the distributions of several starts in m dimensions, leaves [starts, ...], none of them in use."""
-    one = begun(np.zeros(m))._replace(drawn=np.array(-1))
+    one = initial_state(np.zeros(m))._replace(drawn=np.array(-1))
     return CmaState(*(np.repeat(np.asarray(leaf)[None], starts, axis=0) for leaf in one))
 
 
-def drawn(state: CmaState, seed: int) -> np.ndarray:
+def next_population(state: CmaState, seed: int) -> np.ndarray:
     """Return the next population [n, m]."""
     m = len(state.mean)
     normal = np.random.default_rng([seed, int(state.drawn)]).standard_normal((population(m), m))

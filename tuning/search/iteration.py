@@ -10,7 +10,7 @@ from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
 from tuning.search.checkpoint import SearchState
 from tuning.search.descent import Descent
-from tuning.search.evolution import drawn, moved
+from tuning.search.evolution import moved, next_population
 
 
 def iterate(
@@ -30,7 +30,7 @@ def iterate(
     better = _descended(engine, goal, members, progress, descent, weights) | _evolved(
         engine, goal, members, progress, seed
     )
-    record(engine, members, progress, better, fresh=fresh)
+    append_history(engine, members, progress, better, fresh=fresh)
 
 
 def _descended(
@@ -66,7 +66,7 @@ def _evolved(
     if not active.size:
         return {}
     own = [progress.cma_state(at) for at in active]
-    points = [drawn(cma, seed + int(at)) for cma, at in zip(own, active, strict=True)]
+    points = [next_population(cma, seed + int(at)) for cma, at in zip(own, active, strict=True)]
     terms = engine.terms(np.concatenate(points), members)
     values = goal.score(np.concatenate(points), terms, members).reshape(len(points), -1)
     best, value, length = (np.array(x) for x in (progress.starts.best, progress.starts.value, progress.starts.length))
@@ -84,7 +84,7 @@ def _evolved(
     return better
 
 
-def record(
+def append_history(
     engine: Engine,
     members: Members,
     progress: SearchState,

@@ -15,8 +15,8 @@ from tuning.objective.members import Members
 from tuning.optimisers import BFGS
 from tuning.search.checkpoint import CheckpointFile, SearchState
 from tuning.search.descent import Descent
-from tuning.search.evolution import begun, idle_states
-from tuning.search.iteration import iterate, record
+from tuning.search.evolution import idle_states, initial_state
+from tuning.search.iteration import append_history, iterate
 from tuning.search.screen import screen
 
 # A start has converged if its next step is shorter than this, in coordinates.
@@ -131,7 +131,7 @@ def _switch(progress: SearchState, phase: Phase) -> None:
         order = np.argsort(np.where(active, value, np.inf), kind="stable")
         active[order[max((int(active.sum()) + 1) // 2, 1) :]] = False
     for at in np.flatnonzero(turns & active):
-        progress.put(at, begun(np.asarray(starts.best)[at]))
+        progress.put(at, initial_state(np.asarray(starts.best)[at]))
     progress.active = active
 
 
@@ -178,7 +178,7 @@ def _begin_full_phase(
         value = np.where(progress.active, values[best], np.inf)
         progress.starts = progress.starts._replace(state=progress.starts.state._replace(value=jnp.asarray(value)))
         progress.active = np.zeros(starts, bool)
-        record(engine, members, progress, {start: {name: terms[name][best] for name in TERMS}}, fresh=True)
+        append_history(engine, members, progress, {start: {name: terms[name][best] for name in TERMS}}, fresh=True)
 
 
 def best_of(progress: SearchState) -> tuple[np.ndarray, float]:

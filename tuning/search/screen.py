@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from ambjax.ensemble.design import points
+from ambjax.ensemble.design import design_points
 from tuning.objective.goal import Goal
 from tuning.objective.lanes import Engine
 from tuning.objective.members import Members, Objective
-from tuning.objective.ranges import drawn, ranges
+from tuning.objective.ranges import from_unit_cube, ranges
 from tuning.objective.shortfalls import Bound
 
 # Rounds of successive halving (a, b): one member in a is simulated, and one point in b is kept.
@@ -26,9 +26,9 @@ def initial_points(
     if not count:
         return space.encode(space.clip(start))[None]
     box = ranges(objective, conditions, start)
-    cube = points("sobol", seed, len(space), np.arange(count), count)
+    cube = design_points("sobol", seed, len(space), np.arange(count), count)
     middle = np.full((1, len(space)), 0.5)
-    gains = np.concatenate([start[None], drawn(space, box, np.concatenate([middle, cube]))])
+    gains = np.concatenate([start[None], from_unit_cube(space, box, np.concatenate([middle, cube]))])
     return np.stack([space.encode(space.clip(g)) for g in gains])
 
 
@@ -36,7 +36,7 @@ def around(x: np.ndarray, count: int, seed: int) -> np.ndarray:
     """Return coordinates [count + 1, m]: x [m], and quasi-random points within NEAR and FAR of it in turn."""
     if not count:
         return x[None]
-    cube = points("sobol", seed, len(x), np.arange(count), count)
+    cube = design_points("sobol", seed, len(x), np.arange(count), count)
     reach = np.where(np.arange(count) % 2, FAR, NEAR)[:, None]
     return np.concatenate([x[None], x + reach * (2 * cube - 1)])
 

@@ -5,7 +5,7 @@ import numpy as np
 
 from ambjax.commands.outputs import say
 from tuning.config import seeds
-from tuning.judge import StepError, compared, describe, step_error, worst_of
+from tuning.judge import StepError, comparison_members, describe, step_error, worst_of
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
 from tuning.search.course import Course, SearchResult
@@ -32,7 +32,7 @@ def validated(
     lost, worst = _lost(course.problem, x)
     if not lost.size and not error.refuted and not course.problem.sampled:
         worst = course.problem.objective.chosen(seeds(budget)[1], worst, budget.validation)
-        error = step_error(course.problem, x, compared(course.problem).joined(worst))
+        error = step_error(course.problem, x, comparison_members(course.problem).joined(worst))
         say(f"accurate steps, with the worst of {budget.validation} validation members: {describe(error)}")
     if lost.size:
         say(f"{lost.size} of {budget.validation} validation members are lost")

@@ -71,7 +71,7 @@ def execute(program: pathlib.Path) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
-def load(library: pathlib.Path) -> ctypes.CDLL:
+def load_library(library: pathlib.Path) -> ctypes.CDLL:
     """Load a compiled library. Raises ValueError if this machine cannot load it."""
     try:
         return ctypes.CDLL(str(library))
@@ -100,7 +100,7 @@ def scratch() -> Iterator[pathlib.Path]:
         ) from None
 
 
-def check() -> None:
+def check_compiler() -> None:
     """Check that this machine can compile and run programs, plain and sanitized, and compile and load libraries.
 
     Raises ValueError if it cannot: a failure of the machine must not count as a failure of the C.
@@ -116,7 +116,7 @@ def check() -> None:
             binary = folder / f"empty{len(flags)}"
             messages = build([source], binary, *flags)
             if not messages and flags is SHARED:
-                load(binary)
+                load_library(binary)
             elif not messages:
                 code, output = execute(binary)
                 messages = "" if code == 0 else output.strip() or f"exit code {code}"
@@ -144,7 +144,7 @@ class Compiled:
 
     def __init__(self, library: pathlib.Path, trace: Trace, prefix: str) -> None:
         self.trace, real = trace, np.dtype(PRECISIONS[trace.precision])
-        loaded = load(library)
+        loaded = load_library(library)
         self._step = getattr(loaded, f"{prefix}_step")
         self._step.restype = ctypes.c_uint32
         self.memory = np.dtype([("numbers", real, (len(trace.state),)), ("started", np.uint32)], align=True)

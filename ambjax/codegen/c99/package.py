@@ -5,7 +5,7 @@ import numpy as np
 from ambjax.codegen.block import Block
 from ambjax.codegen.c99.notes import fixed, notes_of, order_of_work
 from ambjax.codegen.c99.source import Origin, Writer
-from ambjax.codegen.c99.statements import literal, word
+from ambjax.codegen.c99.statements import c_constant, word
 from ambjax.codegen.c99.texts import (
     BLOCK_FAULT_TEST,
     BLOCK_START_TEST,
@@ -16,7 +16,7 @@ from ambjax.codegen.c99.texts import (
     START_TEST,
     TEST,
 )
-from ambjax.codegen.points import Points, points
+from ambjax.codegen.points import Points, verification_points
 from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.reference import Results, results
 from ambjax.codegen.trace import Trace, trace
@@ -31,15 +31,15 @@ NAMES = ("{p}.h", "{p}.c", "{p}_test.c", "{p}_vectors.h", "Makefile", "README.md
 ULPS, SHARE = 4, 1e-5
 
 
-def files(block: Block, precision: str, prefix: str, origin: Origin) -> dict[str, str]:
+def package_files(block: Block, precision: str, prefix: str, origin: Origin) -> dict[str, str]:
     """Return the text of each file by name. Raises ValueError for a law that scalar code cannot express."""
     traced = trace(block, precision)
-    return written(traced, prefix, origin)
+    return files_of_trace(traced, prefix, origin)
 
 
-def written(traced: Trace, prefix: str, origin: Origin) -> dict[str, str]:
+def files_of_trace(traced: Trace, prefix: str, origin: Origin) -> dict[str, str]:
     """Return the files of a traced block, texts by name."""
-    writer, at = Writer(traced, prefix, origin), points(traced, VECTORS, seed=1)
+    writer, at = Writer(traced, prefix, origin), verification_points(traced, VECTORS, seed=1)
     vectors, makefile = _vectors(writer, at, results(traced, at)), MAKEFILE.format(p=prefix)
     texts = (writer.header(), writer.source(), _test(writer), vectors, makefile, _readme(writer))
     return dict(zip((name.format(p=prefix) for name in NAMES), texts, strict=True))
@@ -95,7 +95,7 @@ def _vectors(writer: Writer, at: Points, given: Results) -> str:
 
 
 def _initialisers(writer: Writer, struct: str, names: list[str], values: np.ndarray) -> list[str]:
-    texts = [literal(v, writer.trace.precision) for v in values]
+    texts = [c_constant(v, writer.trace.precision) for v in values]
     return [f".{struct}.{word(name)} = {text}" for name, text in zip(names, texts, strict=True)]
 
 
@@ -113,10 +113,10 @@ def _test(writer: Writer) -> str:
         "p": p,
         "faults": "\n".join(f"    faults += refused(&state, {k});" for k, name in enumerate(inputs) if name in t.read),
         "fields": "\n".join(
-            f"    case {k}:\n        input.{name} = {literal(np.nan, t.precision)};\n        break;"
+            f"    case {k}:\n        input.{name} = {c_constant(np.nan, t.precision)};\n        break;"
             for k, name in enumerate(inputs)
         ),
-        "zeros": "\n".join(f"    input.{name} = {literal(0, t.precision)};" for name in inputs),
+        "zeros": "\n".join(f"    input.{name} = {c_constant(0, t.precision)};" for name in inputs),
     }
     texts = _controller_faults(writer, fault) if t.block.noun == "controller" else _block_faults(writer, fault)
     return TEST.format(
@@ -124,8 +124,8 @@ def _test(writer: Writer) -> str:
         p=p,
         P=p.upper(),
         abs="fabsf" if t.precision == "float" else "fabs",
-        share=literal(share, t.precision),
-        small=literal(small, t.precision),
+        share=c_constant(share, t.precision),
+        small=c_constant(small, t.precision),
         checks="\n".join(checks),
         fault_test=texts[0],
         start_test=texts[1],

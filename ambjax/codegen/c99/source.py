@@ -8,7 +8,7 @@ import numpy as np
 
 from ambjax._version import __version__
 from ambjax.codegen.c99.notes import ABOUT, notes_of
-from ambjax.codegen.c99.statements import Statements, literal, word
+from ambjax.codegen.c99.statements import Statements, c_constant, word
 from ambjax.codegen.c99.texts import HEADER, MARK, SOURCE
 from ambjax.codegen.numbering import UNREAD, Number
 from ambjax.codegen.trace import Trace
@@ -67,7 +67,9 @@ class Writer:
         def lines(node: dict[str, Any], depth: int) -> Iterator[str]:
             yield "{"
             for k, (name, value) in enumerate(node.items()):
-                inner = lines(value, depth + 1) if isinstance(value, dict) else [literal(value, self.trace.precision)]
+                inner = (
+                    lines(value, depth + 1) if isinstance(value, dict) else [c_constant(value, self.trace.precision)]
+                )
                 text = f" \\\n{'    ' * depth}".join(inner)
                 yield f"    /* {name} */ {text}{',' if k < len(node) - 1 else ''}"
             yield "}"
@@ -103,7 +105,7 @@ class Writer:
 
     def source(self) -> str:
         """Return the source file, PREFIX.c."""
-        zeros = [f"    state->{word(x.name)} = {literal(0, self.trace.precision)};" for x, _ in self.trace.state]
+        zeros = [f"    state->{word(x.name)} = {c_constant(0, self.trace.precision)};" for x, _ in self.trace.state]
         return SOURCE.format(
             p=self.prefix,
             P=self.prefix.upper(),
@@ -136,7 +138,7 @@ class Writer:
             notes="\n".join(f" * {line}".rstrip() for line in self.notes()),
             real=t.precision,
             maths="#include <math.h>\n" if any(np.isinf(x.value) for x in t.parameters) else "",
-            period=literal(t.block.period, t.precision),
+            period=c_constant(t.block.period, t.precision),
             bits="\n".join(
                 f"#define {p}_{x.upper()} {1 << k}u /* {t.block.bits[x]} */" for k, (x, _) in enumerate(t.bits)
             ),

@@ -33,7 +33,7 @@ def word(name: str) -> str:
     return ".".join(re.sub(r"[^\x00-\x7f]", lambda found: f"_u{ord(found[0]):04x}", part) for part in parts)
 
 
-def literal(x: SupportsFloat, precision: str) -> str:
+def c_constant(x: SupportsFloat, precision: str) -> str:
     """Return a number as a C constant of a precision: the shortest text with the same value."""
     suffix, kind = ("f", np.float32) if precision == "float" else ("", np.float64)
     value = kind(x)
@@ -66,7 +66,7 @@ class Statements:
             return "(state->started != 0u)" if location == STARTED else f"{location.group}->{word(location.name)}"
         if x.dtype.kind in "biu":
             return str(int(x))
-        text = literal(x, "float" if x.dtype == np.float32 else "double")
+        text = c_constant(x, "float" if x.dtype == np.float32 else "double")
         return f"({text})" if text.startswith("-") else text
 
     def kind(self, dtype: np.dtype) -> str:
@@ -84,8 +84,8 @@ class Statements:
             name=self.prefix,
             f="f" if single else "",
             to=self.kind(node.dtype),
-            one=literal(1, "float" if node.dtype == np.float32 else "double"),
-            zero=literal(0, "float" if node.dtype == np.float32 else "double"),
+            one=c_constant(1, "float" if node.dtype == np.float32 else "double"),
+            zero=c_constant(0, "float" if node.dtype == np.float32 else "double"),
         )
         return f"    const {self.kind(node.dtype)} v{self.number[number]} = {text};"
 
@@ -108,6 +108,6 @@ class Statements:
             if name in used:
                 taken = f"{real} a" if name == "sign" else f"{real} a, {real} b"
                 for digit in ("0", "1"):
-                    text = re.sub(rf"(?<![\w.]){digit}(?![\w.])", literal(float(digit), self.precision), text)
+                    text = re.sub(rf"(?<![\w.]){digit}(?![\w.])", c_constant(float(digit), self.precision), text)
                 lines += [f"static {real} {self.prefix}_{name}({taken})", "{", f"    return {text};", "}", ""]
         return lines

@@ -22,7 +22,7 @@ SAMPLES = {"controller": 1000, "loop": 200, "plant": 1000}
 GROWTH = 1e4
 
 
-def stepped(block: Block, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def run_block(block: Block, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Run a block in JAX. Return its outputs [samples, outputs] and status [samples], the bits as an integer.
 
     `rows`: inputs [samples, inputs]. Units and order are those of `block.inputs` and `block.outputs`.
@@ -53,15 +53,15 @@ def reference(block: Block, cascade: Cascade, scenario: Scenario, clock: Clock) 
     loop = block if block.noun == "loop" else block_of("loop", cascade, scenario, clock)
     given = series(cascade, scenario, clock, count + 1)
     plain = np.array([given[name] for name in loop.inputs]).T
-    outputs = dict(zip(loop.outputs, stepped(loop, plain)[0].T, strict=True))
+    outputs = dict(zip(loop.outputs, run_block(loop, plain)[0].T, strict=True))
     signals = {**given, **outputs}
     if block.noun == "controller":
         rows = np.array([signals[name] for name in block.inputs]).T[:count]
-        found = np.concatenate([np.zeros((1, len(block.outputs))), stepped(block, rows)[0]])
+        found = np.concatenate([np.zeros((1, len(block.outputs))), run_block(block, rows)[0]])
     else:
         late = [outputs[name][:count] if name == "u" else given[name][1:] for name in block.inputs]
         rows = np.array(late).T
-        found = stepped(block, np.concatenate([rows[:1], rows]))[0]
+        found = run_block(block, np.concatenate([rows[:1], rows]))[0]
     t = np.arange(count + 1) * block.period
     return np.column_stack([t[:-1], rows]), np.column_stack([t, found])
 

@@ -57,14 +57,14 @@ def script(traced: Trace, name: str) -> str:
         [
             f"const {name} = (() => {{",
             '"use strict";',
-            f"const period = {number(block.period)};",
+            f"const period = {js_constant(block.period)};",
             *body.helpers(),
             *body.step(),
             "return {",
             f"  noun: {_json(block.noun)}, period, step,",
             *(f"  {kind}: [\n{_entries(xs, kind, traced.read)}\n  ]," for kind, xs in lists.items()),
             f"  bits: {_json(bits)},",
-            f"  values: () => Float64Array.of({', '.join(number(x.value) for x in traced.parameters)}),",
+            f"  values: () => Float64Array.of({', '.join(js_constant(x.value) for x in traced.parameters)}),",
             f"  start: () => new Float64Array({len(traced.state) + 1}),",
             "};",
             "})();",
@@ -73,7 +73,7 @@ def script(traced: Trace, name: str) -> str:
     )
 
 
-def number(x: SupportsFloat) -> str:
+def js_constant(x: SupportsFloat) -> str:
     """Return a number as a JavaScript literal with the same value."""
     value = float(x)
     if np.isinf(value):
@@ -90,7 +90,7 @@ def _entries(numbers: list[Number], kind: str, read: frozenset[str]) -> str:
     """Return the entries of a list, one object per number. `kind`: name of the list."""
     rows = []
     for x in numbers:
-        more = f", value: {number(x.value)}, allowed: {_json(x.allowed)}" if kind == "parameters" else ""
+        more = f", value: {js_constant(x.value)}, allowed: {_json(x.allowed)}" if kind == "parameters" else ""
         more += f", read: {_json(x.name in read)}" if kind == "inputs" else ""
         rows.append(f"    {{name: {_json(x.name)}, unit: {_json(x.unit)}, doc: {_json(x.doc)}{more}}},")
     return "\n".join(rows)
@@ -123,7 +123,7 @@ class Body:
             return f"(s[{len(self.trace.state)}] !== 0)" if location == STARTED else self.locations[location]
         if x.dtype.kind == "b":
             return "true" if x else "false"
-        text = number(x)
+        text = js_constant(x)
         return f"({text})" if text.startswith("-") else text
 
     def statement(self, n: int) -> str:
