@@ -953,8 +953,8 @@ SEARCH = [
     M(
         "--gradients raises",
         "tuning/report/judging.py",
-        "gradient.report(answer.problem, answer.x, answer.members)",
-        "gradient.report(answer.problem, answer.x)",
+        "gradient.gradient_report(answer.problem, answer.x, answer.members)",
+        "gradient.gradient_report(answer.problem, answer.x)",
         "tests/test_tuning_study.py::test_gradients_reports_three_ways_to_the_same_number",
     ),
     M(
@@ -2252,7 +2252,7 @@ STATUSES = [
     M(
         "the folder of a search is not marked before its first checkpoint",
         "tuning/command.py",
-        "        begin(plan.out)\n",
+        "        mark_directory(plan.out)\n",
         "",
         "tests/test_tuning_study.py::test_a_search_killed_before_its_first_checkpoint_is_resumed",
     ),

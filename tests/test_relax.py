@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from profiles import examples
 
 from ambjax.numerics.relax import _twisted, relax, share, twist
 
@@ -34,7 +35,7 @@ def test_relax_solves_its_equation_to_rounding(size, side, h, p):
 
 @pytest.mark.slow
 @given(DECADES, SIDES, DECADES, DECADES, DECADES)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(100, 300), deadline=None)
 def test_twist_solves_its_equation_to_rounding(size, side, a, b, p):
     x = side * size
     y = float(_twisted(*(jnp.asarray(number) for number in (x, a, b, p))))

@@ -105,7 +105,7 @@ def test_an_error_is_that_of_some_steps_carried_by_the_loop():
 
 @pytest.mark.slow
 def test_errors_of_many_loops():
-    loops = random_loops(examples(100, 300))
+    loops = random_loops(examples(40, 300))
     exact, z_dot = motion(loops, 1e-9)
     errors = far(motion(loops, QUIET_TOLERANCE)[0], exact)
     held = np.isfinite(exact).all(axis=1)

@@ -15,7 +15,9 @@ import pytest
 from texts import case_and_tune
 
 from ambjax import Cascade, Clock, Initial, Scenario, Sensor, Sine, Slide, inversion, rollout
+from ambjax.__main__ import main as simulated
 from ambjax.ensemble import Percent, Spread
+from tuning.__main__ import main
 from tuning.objective.goal import Goal
 from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS, loss_for, weigh
@@ -509,7 +511,7 @@ def command(*words):
 
 
 @pytest.mark.slow
-def test_the_command_tunes_a_case_that_simulate_runs(tmp_path):
+def test_the_command_tunes_a_case_that_simulate_runs(tmp_path, capsys):
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(CASE)
     done = command(path, "--out", out, "--json")
@@ -518,10 +520,10 @@ def test_the_command_tunes_a_case_that_simulate_runs(tmp_path):
     assert report["after"]["lost"] == 0
     assert report["before"]["lost"] == 8
     assert {p.name for p in out.iterdir()} >= {"tuned.toml", "history.npz", "report.md", "report.html", "report.json"}
-    run = [sys.executable, "-m", "ambjax", "simulate", str(out / "tuned.toml"), "--out", str(tmp_path / "run")]
-    assert subprocess.run(run, capture_output=True).returncode == 0
-    again = command(path, "--out", out, "--json", "--resume")
-    assert json.loads(again.stdout)["gains"] == report["gains"]
+    assert simulated(["simulate", str(out / "tuned.toml"), "--out", str(tmp_path / "run")]) == 0
+    capsys.readouterr()
+    assert main([str(path), "--out", str(out), "--json", "--resume"]) == 0
+    assert json.loads(capsys.readouterr().out)["gains"] == report["gains"]
 
 
 @pytest.mark.thorough
@@ -557,15 +559,15 @@ def test_a_killed_tuning_goes_on_and_damage_is_found(tmp_path):
     assert command(path, "--out", whole, "--resume").returncode == fresh.returncode
 
 
-@pytest.mark.slow
-def test_bad_input_ends_with_2_and_writes_nothing(tmp_path):
+def test_bad_input_ends_with_2_and_writes_nothing(tmp_path, capsys):
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(CASE + 'optimiser = "best"\n')
-    done = command(path, "--out", out)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-    assert "Traceback" not in done.stderr
+    assert main([str(path), "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert "Traceback" not in said
     assert not out.exists()
-    assert command(tmp_path / "none.toml").returncode == 2
+    assert main([str(tmp_path / "none.toml")]) == 2
     path.write_text(CASE)
-    assert f"--resume: --out {out} contains no search" in command(path, "--out", out, "--resume").stderr
+    assert main([str(path), "--out", str(out), "--resume"]) == 2
+    assert f"--resume: --out {out} contains no search" in capsys.readouterr().err

@@ -1,6 +1,6 @@
 """The points at which the exported step is compared with JAX: parameters, states and inputs.
 
-`points` keeps the case's parameters; `varied` sets each of them to the ends of its range.
+`verification_points` keeps the case's parameters; `varied` sets each of them to the ends of its range.
 """
 
 from typing import Any, NamedTuple

@@ -107,7 +107,7 @@ def _injection_text(point: OperatingPoint, measured: Injection, channel: int = 0
 
 
 def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injections | None) -> str:
-    """Return the numbers of `summary_of` as a table and sentences."""
+    """Return the numbers of `sensitivity_summary` as a table and sentences."""
     worst = [spread.point] if spread is not None and spread.point is not None else []
     head = ("loop", "peak |S|", "at (Hz)", "zone", "peak |T|", "peak |KS| (V/m)", "gain margins")
     margins = ("phase margin (deg)", "delay margin (s)", "disk margin")

@@ -171,7 +171,7 @@ class Cascade:
             for name in set_valued_signs(law):
                 raise ValueError(
                     f"controller.{stage}.{name} = inf: in continuous time a sign must be smoothed. Give a finite "
-                    "number, or add [processor], which allows the sign itself."
+                    "number, or add [processor], which allows the set-valued sign."
                 )
 
     def in_continuous_time(self) -> "Cascade":
@@ -180,7 +180,7 @@ class Cascade:
         return dataclasses.replace(self, **laws, processor=None)
 
     def _advance(self, sample: Sample) -> Callable[..., Any]:
-        """Return `laws.stepped` with the model, the period and the discretisation of this cascade."""
+        """Return `laws.step_law` with the model, the period and the discretisation of this cascade."""
         implicit = self.processor is not None and self.processor.implicit
         return functools.partial(step_law, model=self.model, period=sample.period, implicit=implicit)
 

@@ -75,7 +75,7 @@ def record_member(
 def record_system(
     system: System, clock: Clock, *, fold: Fold | None = None, tell: Callable[[int], object] = lambda _: None
 ) -> Outcome:
-    """Do the work of `record` for a `rollout.System`, without checks. At least one leaf must be an array [1]."""
+    """Do the work of `record_member` for a `rollout.System`, without checks. At least one leaf must be an array [1]."""
     tree = canonical((system, clock, fold))
     count = min(SEGMENT, clock.samples)
     progress, rows, outcomes = map_members(_begun, tree, threads=1, call=1), [], list[Outcome]()
@@ -93,7 +93,7 @@ def record_system(
 def replay(study: Study, index: int, tell: Callable[[int], object] = lambda _: None) -> Replay:
     """Simulate one member of a study again.
 
-    The metrics come from the compiled program of the study, the trajectory from `record`. `tell` is that of `record`.
+    The metrics come from the compiled program of the study, the trajectory from `record_member`. `tell`: see there.
     Raises ValueError as `rollout` does.
     """
     columns = chunk(study, index, index + 1, CALL, threads=1)

@@ -86,7 +86,7 @@ def injected(
 
     - `clock`: its samples are one period of the multi-sine. The integrator `Slide` is replaced, because it does not
       apply to this loop.
-    - `frequencies`: lines, Hz, rounded to whole multiples of 1/clock.duration (see `lines`).
+    - `frequencies`: lines, Hz, rounded to whole multiples of 1/clock.duration (see `frequency_lines`).
     - `reading`: "z" adds e to the reading of the position sensor, "z_dot" to that of the velocity sensor.
     - `amplitude`: largest |e|, m or m/s; None: 1 % of s_0, or of s_0 times the plant's unstable pole (1/s).
     - `members`, `seed`: size and seed of an ensemble whose members differ in the noise.

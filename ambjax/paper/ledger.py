@@ -135,7 +135,7 @@ def ledger_markdown(
 ) -> str:
     """Return the ledger as a Markdown page.
 
-    Its arguments are the results of `judge`, `noise_table`, `processor_table` and `sensitivity_table`.
+    Its arguments are the results of `judge_claims`, `noise_table`, `processor_table` and `sensitivity_table`.
     """
     readings = list(rows[0]["findings"])
     lines = ["# Ledger: the paper's claims, per reading", ""]

@@ -37,7 +37,7 @@ class Contender(NamedTuple):
 def comparison(
     cases: Sequence[Contender], limits: Sequence[float], span: tuple[float, float], path: pathlib.Path
 ) -> None:
-    """Write the picture of `figure_of` to a file."""
+    """Write the picture of `comparison_figure` to a file."""
     comparison_figure(cases, limits, span).savefig(path, dpi=110)
 
 

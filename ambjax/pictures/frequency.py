@@ -50,7 +50,7 @@ def sensitivity_picture(
     path: pathlib.Path,
     measured: MeasuredPoints | None = None,
 ) -> None:
-    """Write the picture of `figure_of` to a file."""
+    """Write the picture of `frequency_figure` to a file."""
     frequency_figure(title, loops, limits, span, measured).savefig(path, dpi=110)
 
 
