@@ -3,9 +3,9 @@
 Cases: F20 and G20 of the tuning tasks on a processor, and the templates `rig` and `bearing`. All structures of a case
 have the same members, loss, limits and budget, and each is tuned with every seed for the least error within the limits.
 All gains are tuned, the steepnesses p included. The results contain the seeds and the budget of each case. Results
-in DIR/CASE-SEED are not computed again, so a benchmark that was stopped continues at the next structure. Results of
+in DIR/CASE-SEED are not computed again, so a benchmark that was stopped continues at the next search. Results of
 other cases are kept. `--quick` uses one seed and a tiny budget, to test the script; its results are not written.
-Compilation takes most of the time of a search; later seeds of a case reuse the compiled programs.
+Compilation takes most of the time of a search; the searches of a structure with other seeds reuse the programs.
 Run: python benchmarks/laws.py [CASE ...] [--out DIR] [--quick] [--seeds N] [--budget full|small] [--only NAME ...]
 """
 
@@ -14,16 +14,16 @@ import json
 import math
 import pathlib
 import statistics
-import subprocess
-import sys
 import tomllib
 from typing import Any
 
 import _measure
+import jax
 import tasks
 import tomlkit
 
-from ambjax.cases.reader import Case, case_from
+from ambjax.__main__ import main as ambjax
+from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from tuning.space import Gain, Space, tunable
 
@@ -68,7 +68,7 @@ def main() -> None:
     rows = json.loads(path.read_text())["cases"] if path.exists() else {}
     for name in given.names:
         budget, count, members = ("tiny", 1, 20) if given.quick else (given.budget, given.seeds, JUDGED)
-        found = [compared(name, seed, BUDGETS[budget], members, given) for seed in range(1, count + 1)]
+        found = compared(name, count, BUDGETS[budget], members, given)
         rows[name] = {
             "title": title(name),
             "limits": LIMITS[name],
@@ -95,14 +95,13 @@ def title(name: str) -> str:
     return first.removeprefix(f"Tuning task {name}: ").partition(". ")[0].rstrip(".")
 
 
-def structures(case: Case, laws: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def structures(laws: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the tables [controller] of all structures. `laws`: that of the case. All structures have its observer.
 
-    LQG is state feedback with a Kalman filter, which is that of the case if it has one. The PI controller starts with a
-    bandwidth of three times the plant's pole, the other laws with their defaults.
+    LQG is state feedback with a Kalman filter, which is that of the case if it has one. The laws that the case does not
+    have start with their default gains for its plant.
     """
-    w, L = float(case.scenario.plant.pole), float(case.scenario.plant.L)
-    drive = {"kind": "pi", "k_p": 3 * w * L, "k_int": w * w * L, "k_aw": w / 3}
+    drive = {"kind": "pi"}
     soft = {stage: _without(laws.get(stage, {}), "p") for stage in ("position", "inversion", "current")}
     hard = {stage: law | {"p": math.inf} for stage, law in soft.items()}
     kept = {name: value for name, value in soft["position"].items() if name in ("c", "k")}
@@ -132,8 +131,8 @@ def _without(table: dict[str, Any], key: str) -> dict[str, Any]:
 def written(name: str, seed: int, budget: dict[str, int], folder: pathlib.Path) -> list[pathlib.Path]:
     """Write a case file for each structure of a case and return their paths."""
     raw = tomllib.loads(source(name))
-    case, paths = case_from(raw), []
-    for law, controller in structures(case, raw["controller"]).items():
+    paths = []
+    for law, controller in structures(raw["controller"]).items():
         document = _without(raw, "tune") | {"controller": controller}
         cascade = case_from(document).cascade
         known = tunable(cascade)
@@ -153,21 +152,22 @@ def written(name: str, seed: int, budget: dict[str, int], folder: pathlib.Path) 
 
 
 def compared(
-    name: str, seed: int, budget: dict[str, int], members: int, given: argparse.Namespace
-) -> list[dict[str, Any]]:
-    """Tune the structures of a case with one seed and return the rows of `ambjax compare` of the tuned cases."""
-    folder = given.out / f"{name}-{seed}"
-    answer = folder / "compare.json"
-    if not answer.exists():
-        paths = [
-            tuned(path, folder / "tuned")
-            for path in written(name, seed, budget, folder)
-            if not given.only or path.stem in given.only
-        ]
-        command(
-            "compare", *map(str, paths), "--members", str(members), "--seed", str(JUDGED_SEED), "--out", str(folder)
-        )
-    return json.loads(answer.read_text())["cases"]
+    name: str, seeds: int, budget: dict[str, int], members: int, given: argparse.Namespace
+) -> list[list[dict[str, Any]]]:
+    """Tune the structures of a case with each seed; return for each seed the rows of `ambjax compare`."""
+    folders = [given.out / f"{name}-{seed}" for seed in range(1, seeds + 1)]
+    asked = [written(name, seed, budget, folder) for seed, folder in enumerate(folders, 1)]
+    cases = [paths for paths in zip(*asked, strict=True) if not given.only or paths[0].stem in given.only]
+    answers = [[] for _ in folders]
+    for paths in cases:
+        for path, folder, found in zip(paths, folders, answers, strict=True):
+            found.append(tuned(path, folder / "tuned"))
+        jax.clear_caches()
+    for folder, found in zip(folders, answers, strict=True):
+        if not (folder / "compare.json").exists():
+            options = ["--members", str(members), "--seed", str(JUDGED_SEED), "--out", str(folder)]
+            command("compare", *map(str, found), *options)
+    return [json.loads((folder / "compare.json").read_text())["cases"] for folder in folders]
 
 
 def tuned(path: pathlib.Path, folder: pathlib.Path) -> pathlib.Path:
@@ -181,8 +181,10 @@ def tuned(path: pathlib.Path, folder: pathlib.Path) -> pathlib.Path:
 
 
 def command(*words: str) -> None:
-    """Run a command of ambjax. Exit code 1 is ignored: it means that a limit is missed or a member is lost."""
-    subprocess.run([sys.executable, "-m", "ambjax", *words], check=False)
+    """Run a command of ambjax in this process. Exit code 1 is ignored: a limit is missed, or a member is lost."""
+    code = ambjax(list(words))
+    if code not in (0, 1):
+        raise SystemExit(code)
 
 
 def summary(seeds: list[list[dict[str, Any]]]) -> dict[str, Any]:

@@ -475,7 +475,8 @@ def laws() -> list[str]:
             numbers = [_middle(row[key], times) for key, times in scaled]
             rows.append([law, *numbers, str(max(row["lost"])), "-" if row["flops"] is None else str(row["flops"])])
         titles = "structure | rms error (µm) | worst member (µm) | rms voltage (V) | worst peak of S | lost | flops"
-        lines += [*table(titles, rows), ""]
+        # a page of docs includes the table between these comments
+        lines += [f"<!-- {name}: -->", *table(titles, rows), f"<!-- end of {name} -->", ""]
     return lines
 
 

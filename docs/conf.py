@@ -5,19 +5,25 @@ import pathlib
 import sys
 
 HERE = pathlib.Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE / "_ext"), str(HERE.parent)]
+sys.path[:0] = [str(HERE), str(HERE / "_ext"), str(HERE.parent), str(HERE.parent / "tests")]
 # The cells find the commands of the environment that builds, and the magic word that runs them.
 for name, folder in (("PATH", pathlib.Path(sys.executable).parent), ("PYTHONPATH", HERE / "_ext")):
     os.environ[name] = os.pathsep.join(filter(None, [str(folder), os.environ.get(name)]))
 
 # Pages share the compiled programs of the cells and of the commands in them.
-os.environ |= {"JAX_COMPILATION_CACHE_DIR": str(HERE / "_build" / "programs")}
-os.environ |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05", "JAX_COMPILATION_CACHE_MAX_SIZE": str(2**30)}
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    os.environ |= {"JAX_COMPILATION_CACHE_DIR": str(HERE / "_build" / "programs")}
+    os.environ |= {"JAX_COMPILATION_CACHE_MAX_SIZE": str(2**30)}
+os.environ |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
 os.environ |= {"PYTHONWARNINGS": "ignore:Error reading persistent,ignore:Error writing persistent"}
 
+import quick  # noqa: E402
 from execution import source_checksum  # noqa: E402
 
 from ambjax import __version__  # noqa: E402
+
+# Compilation takes most of a build's time.
+os.environ.setdefault("XLA_FLAGS", quick.flags())
 
 project = "ambjax"
 author = copyright = "The ambjax maintainers"
@@ -40,6 +46,8 @@ exclude_patterns = ["_build", "_ext", "reference"]
 smartquotes = False
 
 html_theme = "furo"
+# Thousands of classes and functions in the navigation of every page double the time of a build without execution.
+toc_object_entries = False
 html_title = f"ambjax {release}"
 html_static_path = ["_static"]
 html_css_files = ["ambjax.css"]

@@ -1,12 +1,12 @@
 import ctypes
 import gc
-import importlib.metadata
 import os
 import pathlib
 import shutil
 import sys
 
 import pytest
+import quick
 from profiles import THOROUGH
 
 # One cache of compiled programs for all processes of a run, kept for the next run; removed when it is larger (bytes).
@@ -15,15 +15,9 @@ LARGEST = 512 * 2**20
 # Resident memory above which the programs of a module are released when it ends (bytes).
 MUCH = 700 * 2**20
 
-# Compilation takes most of the tests' time: half as much with fewer optimisations, which change roundings only.
-# XLA aborts on a flag that it does not know, so each version has its own. The thorough profile compiles as users do.
-QUICK = {
-    "0.10": "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
-    "--xla_cpu_opt_preset=CPU_OPT_PRESET_FAST_COMPILE"
-}
+# Compilation takes most of the tests' time. The thorough profile compiles as users do.
 if not THOROUGH:
-    version = ".".join(importlib.metadata.version("jaxlib").split(".")[:2])
-    os.environ.setdefault("XLA_FLAGS", QUICK.get(version, ""))
+    os.environ.setdefault("XLA_FLAGS", quick.flags())
 
 os.environ.setdefault("JAX_ENABLE_X64", "1")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))

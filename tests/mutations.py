@@ -143,7 +143,28 @@ LAWS = [
         "ambjax/control/regulator.py",
         "(INTEGRAL * w / error) ** 2, 1 / error**2, 0.0",
         "0.0, 1 / error**2, 0.0",
-        "tests/test_structures.py::test_the_written_gains_of_state_feedback_are_optimal_for_the_paper_s_plant",
+        "tests/test_structures.py::test_the_written_gains_of_linear_laws_are_those_designed_for_the_paper_s_plant",
+    ),
+    M(
+        "a PID designed for a plant is slower than the plant requires",
+        "ambjax/control/pid.py",
+        "w = model.pole / 2",
+        "w = model.pole / 5",
+        "tests/test_structures.py::test_a_pid_with_default_gains_holds_the_machines_of_the_templates",
+    ),
+    M(
+        "a current loop designed for a processor ignores the sample period",
+        "ambjax/control/current.py",
+        "w = min(w, 1 / (4 * period))",
+        "w = min(w, 1 / (1e-9 * period))",
+        "tests/test_structures.py::test_the_default_current_loop_has_fifty_degrees_of_phase_margin_with_a_sample_of_delay",
+    ),
+    M(
+        "the goal is scored without its multipliers",
+        "tuning/objective/goal.py",
+        "    return goal(outcomes, x, ordinary)",
+        "    return goal.ordinary_risk(outcomes[:ordinary])",
+        "tests/test_tuning_search.py",
     ),
     M(
         "the rotor at rest on the reference needs no current against the magnets",
@@ -1649,9 +1670,16 @@ SAMPLED = [
     M(
         "a step on a processor is chosen for the motion alone, however fast the coils",
         "ambjax/simulation/method.py",
-        "settled = math.ceil(sample_period * named[COILS] / SETTLED)",
+        "settled = math.ceil(sample_period * max(named[COILS] / SETTLED, named[FLUX] / LAGGED))",
         "settled = 1",
         "tests/test_integrate.py::test_coils_that_settle_within_a_sample_are_resolved[Plant]",
+    ),
+    M(
+        "a step on a processor is chosen without the lag of the flux",
+        "ambjax/simulation/method.py",
+        "named[FLUX] / LAGGED",
+        "0.0",
+        "tests/test_iron.py::test_the_chosen_step_resolves_the_lag_of_the_flux[1e-05-20]",
     ),
     M(
         "the step of an ensemble is that of the nominal amplifier",
@@ -1854,8 +1882,8 @@ CHECK = [
     M(
         "a prediction knows every delay",
         "ambjax/ensemble/delays.py",
-        "assumed=processor.ahead)",
-        "assumed=None)",
+        "assumed = delays if known else np.full(DELAYS, float(processor.ahead))",
+        "assumed = delays",
         "tests/test_check_processor.py::test_a_delay_that_the_prediction_does_not_know_has_a_margin_of_its_own",
     ),
     M(
@@ -2283,6 +2311,27 @@ STATUSES = [
         "elif depth and _followed(document, path[0]):",
         "elif False:",
         "tests/test_tuning_file.py::test_gains_are_written_wherever_the_laws_stand[keys of the root]",
+    ),
+    M(
+        "the results of an earlier search are overwritten without --force",
+        "tuning/command.py",
+        "    if not force:\n        check_new(out, WRITTEN)",
+        "    if False:\n        check_new(out, WRITTEN)",
+        "tests/test_tuning_study.py::test_an_unfinished_search_is_neither_lost_nor_resumed_without_resume",
+    ),
+    M(
+        "a message to Python names options of the command line",
+        "ambjax/host/arguments.py",
+        "name + OPTION.sub(argument, text)",
+        "name + text",
+        "tests/test_results.py::test_messages_name_arguments_and_not_options",
+    ),
+    M(
+        "the left margin of the overview cuts a label",
+        "ambjax/pictures/overview.py",
+        "subplots_adjust(1.25 / width",
+        "subplots_adjust(0.95 / width",
+        "tests/test_overview.py::test_no_label_is_cut",
     ),
     M(
         "a search that has not ended is removed",

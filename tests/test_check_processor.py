@@ -382,11 +382,13 @@ def test_check_says_no_where_an_explicit_slope_is_beyond_its_limit(capsys):
     assert "Delay margin" in said
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("elsewhere")
 def test_check_says_yes_on_a_processor(capsys):
     assert main(["check", write(CASE), "--json"]) == 0
-    summary = json.loads(capsys.readouterr().out)
+    out, progress = capsys.readouterr()
+    assert [progress.count(part) for part in ("Theorem 1", "on the processor", "delay margin")] == [1, 1, 2]
+    summary = json.loads(out)
     assert summary["holds"]
     assert [slope["stage"] for slope in summary["processor"]["slopes"]] == ["position", "inversion", "current"]
     assert set(summary["processor"]) == {

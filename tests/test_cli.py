@@ -256,7 +256,7 @@ def test_simulate_writes_what_is_documented(capsys):
     assert "written: there/" in capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_simulate_in_strokes_is_simulate_at_once(monkeypatch, capsys):
     """Neither the stroke of the progress bar nor --json changes a bit of the result."""
     path = write(SHORT + "[sensor]\nstd = 1e-6\n")
@@ -304,6 +304,7 @@ def test_check_says_yes_and_no(capsys):
     out, err = capsys.readouterr()
     summary = json.loads(out)
     assert err.count("initial.i = 0.3 A") == 1  # a doubt is printed once, and stops nothing
+    assert "simulating 0.0" in err  # progress
     assert no in err
     along = next(c for c in summary["conditions"] if "along the run" in c["requires"])
     assert along["gain"] == 1000

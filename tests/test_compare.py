@@ -72,7 +72,6 @@ def two(run):
     return run("soft", "stiff")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("k", [0, 1])
 def test_the_numbers_are_those_of_the_study_and_of_the_analysis(two, cases, k):
     row = two[1]["cases"][k]

@@ -96,8 +96,9 @@ def test_the_command_is_limited():
     assert np.max(np.abs(np.asarray(outcome.trajectory.rows.i))) <= 0.6 + 1e-9
 
 
-@pytest.mark.slow
-@EACH
+@pytest.mark.parametrize(
+    "kind", [pytest.param("lumped", marks=pytest.mark.thorough), pytest.param("two-coil", marks=pytest.mark.slow)]
+)
 def test_the_injected_sensitivity_is_the_linear_one(kind):
     clock, scenario = Clock(1600, PERIOD), world(kind)
     linear = linearise(sampled(), scenario, clock)

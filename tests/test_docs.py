@@ -168,6 +168,16 @@ def test_the_benchmark_pages_are_one():
     assert page == (ROOT / "benchmarks" / "README.md").read_text(), "run python benchmarks/report.py"
 
 
+def test_the_readme_states_the_measured_errors_and_voltages_of_the_structures():
+    cases = json.loads((ROOT / "benchmarks" / "results" / "laws.json").read_text())["cases"]
+    text = (ROOT / "README.md").read_text()
+    for law, title in (("cascade-integral", "cascade with an integral"), ("pid", "PID"), ("lqg", "LQG")):
+        rows = [cases[name]["structures"][law] for name in ("bearing", "rig")]
+        cells = [f"{1e6 * row['rms_error_median_m'][0]:.3g} µm, {row['rms_u_V'][0]:.3g} V" for row in rows]
+        assert f"| {title} | {' | '.join(cells)} |\n" in text
+    assert cases["bearing"]["seeds"] == cases["rig"]["seeds"] == 5  # as the text says
+
+
 def test_a_text_is_not_taken_for_markup():
     assert markdown.escaped("|z| < s_0 [m] $ `a|b`") == r"\|z\| \< s_0 \[m\] \$ `a\|b`"
     assert markdown.table(("a", "b"), [("1", "2")], "keys")[2:5] == ["| a | b |", "|---|---|", "| 1 | 2 |"]

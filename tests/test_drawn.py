@@ -16,6 +16,7 @@ from matplotlib.collections import LineCollection, PolyQuadMesh, QuadMesh
 from matplotlib.figure import Figure
 
 import tuning.report.pictures as tuned
+from ambjax.commands import case_map
 from ambjax.commands import map as map_command
 from ambjax.ensemble.maps import PERIOD, Axis, Map
 from ambjax.pictures import fans, figures, heatmaps, histograms
@@ -381,7 +382,7 @@ class _Case:
 
 @pytest.mark.parametrize("path", ["initial.z", PERIOD])
 def test_the_cells_of_a_map_are_where_they_were_run(path, drawn, monkeypatch):
-    monkeypatch.setattr(map_command, "_label", lambda _, axis: f"{axis.path} ({'s' if axis.path == PERIOD else 'm'})")
+    monkeypatch.setattr(case_map, "unit_of", lambda _, axis: "s" if axis.path == PERIOD else "m")
     x, y = Axis(path, np.geomspace(1e-5, 1e-3, 3), True), Axis("initial.z_dot", np.array([1.0, 2.0, 3.0, 4.0]))
     survival = np.arange(12.0).reshape(4, 3) / 11
     error = np.where(survival > 0, 1e-6 * (1 + np.arange(12.0).reshape(4, 3)), np.nan)

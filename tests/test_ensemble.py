@@ -89,7 +89,7 @@ def test_results_do_not_depend_on_how_long_blocks_are_on_this_machine(cpu, monke
     same(run_ensemble(SMOOTH, members(300), SHORT, fold=FOLD, threads=1), here, 1e-12)
 
 
-@pytest.mark.parametrize("method", [RK4(2), pytest.param(AdaptiveRodas3(), marks=pytest.mark.slow)], ids=str)
+@pytest.mark.parametrize("method", [RK4(2), pytest.param(AdaptiveRodas3(), marks=pytest.mark.thorough)], ids=str)
 def test_a_member_is_the_rollout_of_that_member_alone(method):
     clock = Clock(40, 1e-4, method)
     found = run_ensemble(SMOOTH, members(66), clock, fold=FOLD, every=10)

@@ -173,9 +173,14 @@ def looped(controller, plant, x, count, period, at_once=False):
     return z, u
 
 
-@pytest.mark.slow
 @compiled
-@pytest.mark.parametrize(("version", "name"), [(3, "F20"), (2, "F20"), (3, "rig"), (3, "rig, at once")])
+@pytest.mark.parametrize(
+    ("version", "name"),
+    [
+        pytest.param(version, name, marks=pytest.mark.slow if usual else pytest.mark.thorough)
+        for version, name, usual in ((3, "F20", 0), (2, "F20", 1), (3, "rig", 0), (3, "rig, at once", 1))
+    ],
+)
 def test_controller_and_plant_in_a_loop_are_simulates(version, name, tmp_path):
     pytest.importorskip("fmpy")
     if name == "F20":
@@ -288,7 +293,7 @@ def test_a_command_writes_the_fmu_and_its_reference(elsewhere, tmp_path, capsys,
     with pytest.raises(SystemExit):
         main(["export", str(case), "--out", str(out), "--format", "fmu", "--fmi", "4"])
     assert main(["export", str(case), "--out", str(out), "--fmi", "2"]) == 2
-    assert "--fmi 2: it is for --format fmu" in capsys.readouterr().err
+    assert "--fmi 2: it is the version of an FMU" in capsys.readouterr().err
     assert main(["export", str(case), "--out", str(out), "--format", "fmu", "--precision", "float"]) == 2
     assert "--precision float: an FMU computes in double" in capsys.readouterr().err
     monkeypatch.setenv("CC", "no-such-compiler")

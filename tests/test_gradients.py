@@ -145,7 +145,7 @@ def everything(clock, mode):
     "mode", [pytest.param("reverse", marks=pytest.mark.thorough), pytest.param("forward", marks=pytest.mark.slow)]
 )
 def test_every_gradient_is_finite_over_six_decades(mode, monkeypatch):
-    """1,000 gain vectors over six decades from 1 mm off the origin, from where most lose the rotor.
+    """Gain vectors over six decades from 1 mm off the origin, from where most lose the rotor.
 
     These steps are coarse for the stiffest: the loop chatters numerically and the derivative of the
     computed map grows, here to 1e149 in 12 ms; it is finite, and says that the steps are too coarse.
@@ -153,7 +153,7 @@ def test_every_gradient_is_finite_over_six_decades(mode, monkeypatch):
     monkeypatch.setattr(sys.modules[__name__], "TRACKING", dataclasses.replace(TRACKING, initial=Initial(1e-3)))
     clock = Clock(120, 1e-4, Rodas3(12))
     mapped = one_kernel(lambda x: jax.lax.map(everything(clock, mode), x, batch_size=50))
-    gradient, (value, lost_at, _) = mapped(GAINS)
+    gradient, (value, lost_at, _) = mapped(GAINS[: examples(250, 1000)])
     assert np.mean(np.isfinite(lost_at)) > 0.5
     assert np.all(np.isfinite(value))
     assert np.all(np.isfinite(gradient))

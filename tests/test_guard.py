@@ -64,9 +64,11 @@ WORLDS = {
     "Kalman, half a sample": World(**TRACKING, observer=KALMAN, delay=0.5, **soft()),
     "difference, no delay": World(**TRACKING, observer=DIFFERENCE, delay=0.0, **soft()),
 }
+MARKS = {"delay 1": (), "difference, no delay": pytest.mark.thorough}
+EACH_WORLD = [pytest.param(x, marks=MARKS.get(x, pytest.mark.slow)) for x in WORLDS]
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=() if x == "delay 1" else pytest.mark.slow) for x in WORLDS])
+@pytest.mark.parametrize("name", EACH_WORLD)
 def test_guard_and_faults_against_the_independent_simulator(name):
     """An outlier, a dropout that is bridged, and one that lasts until the safe command."""
     std = NOISE if "noise" in name else (0.0, 0.0, 0.0)

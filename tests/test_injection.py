@@ -42,6 +42,8 @@ WORLDS = {
     "slow amplifier": {"amplifier": {"bandwidth": 3e3}, "delay": 1.0},
 }
 INJECTED = ("complementary", "slow amplifier")  # each is another program to compile
+# The matrices of the thorough two are compared with the simulation in tests/test_linear.py.
+MARKS = {"complementary": ()} | dict.fromkeys(("two coils", "slow sensor"), pytest.mark.thorough)
 
 
 def largest(system):
@@ -75,9 +77,7 @@ def measured_by_the_oracle(world, harmonics, samples, amplitude, monkeypatch):
     return read / e
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=() if x == "complementary" else pytest.mark.slow) for x in WORLDS]
-)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=MARKS.get(x, pytest.mark.slow)) for x in WORLDS])
 def test_the_peak_is_that_of_the_independent_simulator(name, monkeypatch):
     """Driven at nine lines around the peak. The parabola through three of them is within 0.2 % of the peak."""
     world = World(**LAWS, **WORLDS[name])
@@ -125,7 +125,7 @@ def test_continuous_time_is_the_linear_analysis(cascade, amplitude, r):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("processor", "period"),
-    [(Processor(0.0), T), pytest.param(None, 1e-3, marks=pytest.mark.slow)],
+    [(Processor(0.0), T), pytest.param(None, 1e-3, marks=pytest.mark.thorough)],
     ids=["processor", "continuous"],
 )
 def test_the_velocity_sensor_has_a_sensitivity_of_its_own(processor, period):

@@ -245,8 +245,10 @@ def test_the_command_draws_and_prints_two_cases_side_by_side(tmp_path, capsys):
         assert table[name].dims == (written["y"]["path"], written["x"]["path"])
     assert table["initial.z_dot"].attrs["units"] == "m/s"
     assert table["error"].attrs["units"] == "m"
+    shown = found.plot().axes[0].collections[0]
+    np.testing.assert_array_equal(np.ravel(shown.get_array()), 100 * np.ravel(found.map.survival))
     assert f"<td>{found.map.survival.min():.6g}</td>" in found._repr_html_()
-    with pytest.raises(ValueError, match=r"--x plant\.m=2:1: LOW must be less than HIGH"):
+    with pytest.raises(ValueError, match=r"^x = plant\.m=2:1: LOW must be less than HIGH"):
         ambjax.survival_map(found.case, "plant.m=2:1", Y)
 
 

@@ -84,10 +84,25 @@ def least_tolerance(name, method):
     return 0.0 if isinstance(method, AdaptiveRodas3) else 0.03 if name.startswith("smooth") else 6e-3
 
 
+# The slow tests measure half of the loops in either method.
+SLIDING = ["noise-free", "stiff under noise, limited supply", "supply limited at the start", "lost"]
+SLOW = {"adaptive": [name for name in LOOPS if name not in SLIDING], "sliding": SLIDING}
+
+
 # `simulate` measures in adaptive steps, what a report of the tuner prints in eight times its 3 a sample.
-@pytest.mark.slow
-@pytest.mark.parametrize("method", [AdaptiveRodas3(), Slide(3 * REFINEMENT)], ids=["adaptive", "sliding"])
-@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        pytest.param(
+            name,
+            method,
+            id=f"{name}-{said}",
+            marks=pytest.mark.slow if name in SLOW[said] else pytest.mark.thorough,
+        )
+        for name in LOOPS
+        for said, method in (("adaptive", AdaptiveRodas3()), ("sliding", Slide(3 * REFINEMENT)))
+    ],
+)
 def test_every_metric_is_what_a_dense_solution_says(name, method):
     found, expected = numbers(*LOOPS[name], SAMPLES, SETTLE, method)[0], dense(name)
     assert found.keys() == expected.keys()

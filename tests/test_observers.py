@@ -321,7 +321,8 @@ def test_an_estimate_that_is_right_gives_the_command_of_a_measured_velocity(law,
 
 
 @pytest.mark.parametrize(
-    "law", [pytest.param(x, id=type(x).__name__, marks=pytest.mark.slow if n else ()) for n, x in enumerate(ESTIMATORS)]
+    "law",
+    [pytest.param(x, id=type(x).__name__, marks=pytest.mark.thorough if n else ()) for n, x in enumerate(ESTIMATORS)],
 )
 def test_in_continuous_time_behind_sensors(law):
     """The compiler, which aborts where nothing reads a measurement, takes it; the rotor is held."""

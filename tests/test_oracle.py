@@ -79,10 +79,12 @@ BUMP = pulse(1.0, 0.1, 0.2)  # the paper's: 1 A^2/m^2
 SHIFTED = pulse(1.0, 0.10003, 0.20007)  # its edges inside sample periods
 
 SLOW = functools.partial(pytest.param, marks=pytest.mark.slow)
+# What the others combine otherwise.
+COMBINED = functools.partial(pytest.param, marks=pytest.mark.thorough)
 CASES = [
     Case("repaired tracking", World(reference=sine(), q_v=BUMP)),
-    SLOW(Case("repaired tracking, 2 s", World(reference=sine(), q_v=pulse(1.0, 0.7, 1.2)), samples=20_000)),
-    SLOW(Case("repaired regulation", World(q_v=BUMP))),
+    COMBINED(Case("repaired tracking, 2 s", World(reference=sine(), q_v=pulse(1.0, 0.7, 1.2)), samples=20_000)),
+    COMBINED(Case("repaired regulation", World(q_v=BUMP))),
     Case("smooth gains", World(inversion=adaptive(1e9, 25e-6), reference=sine(), q_v=BUMP)),
     Case("smooth gains, edges between samples", World(inversion=adaptive(1e9, 25e-6), reference=sine(), q_v=SHIFTED)),
     Case("edges between samples, q_z and q_i", World(
@@ -93,7 +95,7 @@ CASES = [
         plant=OTHER, position=smc(30.0, 40.0, 15.0), inversion=adaptive(8e5, 10.0), current=current(300.0, 10.0),
         reference=sine(1e-3, 5.0),
     )),
-    SLOW(Case("light plant, weak gravity, smooth step", World(
+    COMBINED(Case("light plant, weak gravity, smooth step", World(
         plant=LIGHT, position=smc(25.0, 30.0, 40.0), inversion=adaptive(5e5, 10.0), current=current(200.0, 40.0),
         reference=smoothstep(1e-3, 0.05, 0.1),
     ))),
@@ -104,7 +106,7 @@ CASES = [
     Case("held noise", World(reference=sine()), samples=200, std=1e-6, solver="DOP853"),
     Case("super-twisting", World(position=twisting(), reference=sine(), q_v=BUMP)),
     Case("closed form", World(inversion=CLOSED, reference=sine(), q_v=BUMP), tight=amb.RK4(4)),
-    SLOW(Case("PI current", World(current=pi(), reference=sine(), q_v=BUMP))),
+    COMBINED(Case("PI current", World(current=pi(), reference=sine(), q_v=BUMP))),
     SLOW(Case("PI current, wound up at the start", World(current=pi(k_aw=2000.0), u_max=45.0), samples=1000)),
     Case("complementary observer", World(
         observer=("complementary", {"l": 10.0}), initial=(1e-4, 0.0, 0.0), inversion=adaptive(2e5), reference=sine(),
@@ -113,7 +115,7 @@ CASES = [
     SLOW(Case("super-twisting, closed form and PI", World(
         position=twisting(), inversion=CLOSED, current=pi(), reference=smoothstep(1e-3, 0.05, 0.1), q_v=BUMP
     ))),
-    SLOW(Case("observer and closed form", World(
+    COMBINED(Case("observer and closed form", World(
         observer=("complementary", {"l": 100.0, "z_hat": 5e-5}), inversion=CLOSED, reference=sine()
     ), tight=amb.RK4(4))),
 ]  # fmt: skip
@@ -135,11 +137,11 @@ DROPS = [
     (4e-4, 1e8, 1e-4, twisting(17.0, 30.0, 50.0, 10.0), current(100.0, 5.0), sine(1e-3), 800.0),
     (6.5e-4, 5e6, 0.1, smc(12.0, 60.0, 25.0), current(300.0, 5.0), sine(1e-3), 400.0),
 ]
-# the first is fast; slow are one of another current law, one of another position law, and one of both
+# the first is fast; slow is one of another position law and another current law
 CASES += [
     pytest.param(
         Case(f"drop {n}", drop(*numbers), samples=1000),
-        marks=() if n == 1 else pytest.mark.slow if n in (2, 7, 12) else pytest.mark.thorough,
+        marks=() if n == 1 else pytest.mark.slow if n == 12 else pytest.mark.thorough,
     )
     for n, numbers in enumerate(DROPS, 1)
 ]

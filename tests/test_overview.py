@@ -1,5 +1,6 @@
 """The overview of a run: its enlarged parts, kept extremes, and the visible mean of a chattering voltage."""
 
+import itertools
 import json
 import pathlib
 
@@ -53,6 +54,13 @@ def test_a_short_transient_is_enlarged(tmp_path, drawn):
     assert titles == ["", "the first 12 ms", "the last 20 ms"]
 
 
+def test_no_label_is_cut(tmp_path, drawn):
+    t = 1e-4 * np.arange(20_000)
+    overview(a_run(sigma=3e-3 * np.sin(100 * t)), "wide tick labels", tmp_path / "o.png", settle=0.1)
+    assert any("0.002" in label.get_text() for label in columns(drawn[0])[2, 0].get_yticklabels())
+    assert drawn[0].get_tightbbox().x0 >= 0
+
+
 def test_the_start_is_a_twentieth_at_most(tmp_path, drawn):
     t = 1e-4 * np.arange(20_000)
     overview(a_run(z=1e-4 * np.exp(-t / 0.2)), "slow", tmp_path / "o.png")
@@ -102,9 +110,17 @@ def test_a_figure_of_the_paper_says_which_of_both(tmp_path, drawn, code, words):
     assert said == [words]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("samples", [1, 2, 3, 30])
-@pytest.mark.parametrize("lost_at", [np.inf, 0.0, 1e-4, 1.5e-4])
+# each number of samples and each end once; the thorough tests combine them otherwise
+USUAL = [(1, 0.0), (1, np.inf), (2, 1e-4), (3, 1.5e-4), (30, np.inf)]
+
+
+@pytest.mark.parametrize(
+    ("samples", "lost_at"),
+    [
+        pytest.param(*both, marks=pytest.mark.slow if both in USUAL else pytest.mark.thorough)
+        for both in itertools.product([1, 2, 3, 30], [np.inf, 0.0, 1e-4, 1.5e-4])
+    ],
+)
 def test_runs_of_few_samples_are_drawn(tmp_path, samples, lost_at):
     overview(a_run(samples=samples, lost_at=lost_at, code=TOUCHED), "tiny", tmp_path / "o.png")
     assert (tmp_path / "o.png").stat().st_size > 1000

@@ -210,7 +210,9 @@ PARTS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "delay"), [("sensor", 1.0), pytest.param("amplifier", 0.5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("name", "delay"), [pytest.param("sensor", 1.0, marks=pytest.mark.thorough), ("amplifier", 0.5)]
+)
 def test_gradients_forward_and_reverse(name, delay):
     sensor, amplifier = PARTS[name]
     scenario = dataclasses.replace(

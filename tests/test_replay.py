@@ -255,7 +255,10 @@ def test_check_on_a_processor_sees_the_run_of_simulate(monkeypatch, capsys):
     no_pictures(monkeypatch)
     write(CASE)
     main(["check", "case.toml", "--json"])
-    bands = json.loads(capsys.readouterr().out)["processor"]["bands"]
+    summary = json.loads(capsys.readouterr().out)["processor"]
+    bands = summary["bands"]
+    assert [slope["stage"] for slope in summary["slopes"]] == ["observer", "position", "inversion", "current"]
+    assert set(summary["delay_margin"]) == {"held", "lost", "undecided", "resolution", "step"}
     assert main(["simulate", "case.toml", "--out", "out"]) == 0
     with np.load("out/trajectory.npz") as rows:
         largest = np.abs(rows["sigma"][rows["t"] >= 0.02]).max()

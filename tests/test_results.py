@@ -125,14 +125,27 @@ def test_bad_input_is_named(path, run, monkeypatch):
     case = ambjax.read_case(path)
     wrong: Any = "case.toml"
     members: tuple[tuple[Any, int, str], ...] = (
-        (0, 0, "members = 0: it must be a whole number of at least 1"),
+        (0, 0, "members = 0: it must be a whole number from 1 to"),
         (2.5, 0, "members = 2.5: it"),
         ("ten", 0, "members = 'ten': it"),
-        (1, -1, "seed = -1: it must be a whole number of at least 0"),
+        (1, -1, "seed = -1: it must be a whole number from 0 to"),
     )
     for given, seed, said in members:
         with pytest.raises(ValueError, match=said):
             ambjax.simulate_members(case, given, seed=seed)  # pyright: ignore[reportArgumentType]
+    numbers: tuple[tuple[Any, Any, str], ...] = (
+        (ambjax.read_case, 3, "path = 3: it must be the path of a file"),
+        (ambjax.tune, 3, "case = 3: it must be the path of a file"),
+        (lambda r: ambjax.sensitivity(case, r), "a", "r = 'a': it must be a number"),
+        (lambda paths: ambjax.gains_of(case.cascade, paths), 3, "paths = 3: it must be a list"),
+        (lambda gains: ambjax.with_gains(case.cascade, gains), 3, "gains = 3: it must be a dict"),
+        (lambda cascade: ambjax.gains_of(cascade, []), case, "cascade = Case: it must be a Cascade"),
+        (lambda progress: ambjax.simulate(case, progress), 3, "progress = 3: it must be a function"),
+        (lambda prefix: ambjax.export(case, prefix=prefix), 3, "prefix = 3: it must be a C identifier"),
+    )
+    for function, value, said in numbers:
+        with pytest.raises(ValueError, match=said):
+            function(value)
     with pytest.raises(ValueError, match=r"x = .*: it must be text. Write PATH=LOW:HIGH"):
         ambjax.survival_map(case, ("plant.m", 1, 2), "plant.R=1:2")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match=r'it must be a list. Write \["controller.position.c"\]'):
@@ -178,6 +191,30 @@ def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
     assert (tuned.good, tuned.directory, tuned.report["gains"]) == (False, tmp_path, [])
     parsed = vars(parser().parse_args([str(path), "--out", str(tmp_path), "--pareto", "--json"]))
     assert vars(given[0]) == parsed
+
+
+def test_messages_name_arguments_and_not_options(path, tmp_path):
+    """Each message is that of the command, in which an option stands for each argument."""
+    case, folder = ambjax.read_case(path), tmp_path / "none"
+    X, Y = "plant.m=0.5:0.6:2", "plant.R=1:2:2"
+    for call, said in (
+        (lambda: ambjax.survival_map(case, X, "plant.q=1:2"), "y = plant.q: "),
+        (lambda: ambjax.survival_map(case, X, X), "y = plant.m: x has the same quantity"),
+        (lambda: ambjax.survival_map(case, X, Y, members=0), "members = 0: it must be a whole number"),
+        (lambda: ambjax.survival_map(case, X, Y, seed=-1), "seed = -1: it must be a whole number"),
+        (
+            lambda: ambjax.tune(path, resume=True),
+            "resume=True: the directory of the search is missing. Give it as out.",
+        ),
+        (
+            lambda: ambjax.tune(path, folder, resume=True),
+            f"resume=True: out {folder} contains no search. Check out, or leave out resume=True.",
+        ),
+        (lambda: ambjax.tune(path, ""), "out: the name of the directory is empty. Give a name, '.' for this"),
+    ):
+        with pytest.raises(ValueError) as refused:  # noqa: PT011 - the whole message is compared
+            call()
+        assert str(refused.value).startswith(said)
 
 
 def test_tune_names_bad_input(tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 import oracle
 import pytest
 import sampled_oracle
+from profiles import THOROUGH
 from sampled_oracle import QUIET, TABLE_1, Lumped, TwoCoil, World, conversion, current_for, relax, sgn, simulate, twist
 from scipy.integrate import solve_ivp
 
@@ -365,7 +366,8 @@ def test_known_errors_of_the_repaired_gains(monkeypatch):
     """As another simulator found them, to its two digits; the position law explicit, the others implicit."""
     explicit = {"discretisation": "explicit", "delay": 0.0}
     assert repaired(10_000, **explicit) == pytest.approx(8.4e-5, abs=0.05e-5)
-    assert repaired(50_000, **explicit) == pytest.approx(1.2e-5, abs=0.05e-5)
+    if THOROUGH:
+        assert repaired(50_000, **explicit) == pytest.approx(1.2e-5, abs=0.05e-5)
     delayed = {"delay": 1.0, "predict": False}
     # all laws implicit: the share of sigma is smaller by 1 + T k sgn_p'(0) = 1.04, and the error larger
     assert repaired(10_000, delay=0.0) == pytest.approx(8.5e-5 * 1.04, abs=0.06e-5)

@@ -149,9 +149,13 @@ TAILS = {
 
 
 @pytest.mark.parametrize(
-    "n", [pytest.param(200, marks=pytest.mark.slow), pytest.param(1000, marks=pytest.mark.thorough)]
+    ("tail", "n"),
+    [
+        pytest.param(tail, n, marks=pytest.mark.slow if n == 200 and tail != "bounded" else pytest.mark.thorough)
+        for tail in TAILS
+        for n in (200, 1000)
+    ],
 )
-@pytest.mark.parametrize("tail", TAILS)
 def test_coverage_over_1000_repetitions(tail, n):
     """95 %, to three times the binomial error of 1,000 repetitions, 0.7 %; and 1 % for what the method has left."""
     kind, covered = TAILS[tail]

@@ -33,7 +33,7 @@ def ran(monkeypatch, tmp_path, capsys):
         path, out = tmp_path / "case.toml", tmp_path / "out"
         path.write_text(dumps(document(**tune)))
         flags = {"gradients": False, "resume": False, "json": False, "settings_of": None}
-        words = argparse.Namespace(page=False, case=str(path), out=str(out), pareto=pareto, **flags)
+        words = argparse.Namespace(page=False, force=False, case=str(path), out=str(out), pareto=pareto, **flags)
         code, _ = tuning.command.run(words)
         return code, json.loads((out / "report.json").read_text()), capsys.readouterr().out, out
 

@@ -330,7 +330,7 @@ def command(monkeypatch, tmp_path, world=None, **tune):
     study(monkeypatch, world or World(), **tune)
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(dumps(document(**tune)))
-    flags = {"gradients": False, "pareto": False, "resume": False, "json": True}
+    flags = {"gradients": False, "pareto": False, "resume": False, "force": True, "json": True}
     code, summary = tuning.command.run(
         argparse.Namespace(page=False, case=str(path), out=str(out), settings_of=None, **flags)
     )

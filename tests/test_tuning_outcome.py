@@ -63,7 +63,7 @@ def ran(monkeypatch, tmp_path, capsys):
         study(monkeypatch, world, **tune)
         path, out = tmp_path / "case.toml", tmp_path / "out"
         path.write_text(dumps(document(**tune)))
-        flags = {"gradients": False, "pareto": False, "resume": False, "json": False}
+        flags = {"gradients": False, "pareto": False, "resume": False, "force": True, "json": False}
         code, _ = tuning.command.run(
             argparse.Namespace(page=False, case=str(path), out=str(out), settings_of=None, **flags)
         )

@@ -554,7 +554,8 @@ def test_a_killed_tuning_goes_on_and_damage_is_found(tmp_path):
     assert "belongs to another search: case.actuator.u_max is 400.0 in the file and 300.0 in this run" in other.stderr
     # a new search in the same directory removes the checkpoints of the old one
     old = len(list(whole.glob("checkpoint-*.npz")))
-    fresh = command(path, "--out", whole)
+    assert "--force" in command(path, "--out", whole).stderr
+    fresh = command(path, "--out", whole, "--force")
     assert f"{whole}: {old} checkpoints of an earlier search are removed\n" in fresh.stderr
     assert command(path, "--out", whole, "--resume").returncode == fresh.returncode
 

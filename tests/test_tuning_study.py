@@ -247,7 +247,7 @@ def test_bfgs_takes_the_same_way_whatever_the_unit_of_the_loss():
 # --- the command ---
 
 
-def command(monkeypatch, tmp_path, world, *flags, **tune):
+def command(monkeypatch, tmp_path, world, *flags, force=False, **tune):
     """`ambjax tune` in this process, its engine a Bowl: exit code, summary, output directory."""
     made = study(monkeypatch, world, **tune)
     path, out = tmp_path / "case.toml", tmp_path / "out"
@@ -255,7 +255,7 @@ def command(monkeypatch, tmp_path, world, *flags, **tune):
     names = ("--gradients", "--pareto")
     given = {name.removeprefix("--"): name in flags for name in names}
     args = argparse.Namespace(
-        page=False, case=str(path), out=str(out), settings_of=None, resume=False, json=True, **given
+        page=False, case=str(path), out=str(out), settings_of=None, resume=False, force=force, json=True, **given
     )
     code, summary = tuning.command.run(args)
     assert json.loads(json.dumps(summary)) is not None
@@ -349,7 +349,7 @@ def test_a_case_from_a_pipe_is_read_once(monkeypatch, tmp_path):
     study(monkeypatch, World())
     monkeypatch.setattr(tuning.command, "_tune", lambda plan, args: (plan.raw, plan.problem.case.text))
     text = dumps(document())
-    flags = {"settings_of": None, "pareto": False, "resume": False, "json": True}
+    flags = {"settings_of": None, "pareto": False, "resume": False, "force": False, "json": True}
     args = argparse.Namespace(page=False, case=piped(text), out=str(tmp_path / "out"), **flags)
     assert tuning.command.run(args) == (tomllib.loads(text), text)
 
@@ -368,13 +368,19 @@ def test_an_unfinished_search_is_neither_lost_nor_resumed_without_resume(monkeyp
     left = {path.name for path in out.glob("checkpoint-*.npz")}
     mine = out / "checkpoint-my-net.npz"
     mine.touch()
-    command(monkeypatch, tmp_path, World())  # it has ended: its checkpoints go
+    with pytest.raises(ValueError, match=r"it has tuned.toml, .* of an earlier run. .* overwrite them with --force"):
+        command(monkeypatch, tmp_path, World())
+    assert {path.name for path in out.glob("checkpoint-*.npz")} == left | {mine.name}
+    command(monkeypatch, tmp_path, World(), force=True)  # it has ended: its checkpoints go
     os.utime(out / "report.json", (0, 0))  # of the search before the one whose checkpoints these are
-    with pytest.raises(ValueError, match=r"holds a search that has not ended. Add --resume"):
+    with pytest.raises(ValueError, match=r"not ended. Continue it with --resume, discard it with --force"):
         command(monkeypatch, tmp_path, World())
     (out / "report.json").unlink()
-    with pytest.raises(ValueError, match=r"holds a search that has not ended. Add --resume"):
+    with pytest.raises(ValueError, match=r"not ended. Continue it with --resume, discard it with --force"):
         command(monkeypatch, tmp_path, World())
+    assert {path.name for path in out.glob("checkpoint-*.npz")} == left | {mine.name}
+    (out / "checkpoint-99.npz").touch()
+    command(monkeypatch, tmp_path, World(), force=True)
     assert {path.name for path in out.glob("checkpoint-*.npz")} == left | {mine.name}
 
 
@@ -382,7 +388,7 @@ def test_a_search_killed_before_its_first_checkpoint_is_resumed(monkeypatch, tmp
     study(monkeypatch, World())
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(dumps(document()))
-    flags = {"gradients": False, "pareto": False, "resume": True, "json": True, "settings_of": None}
+    flags = {"gradients": False, "pareto": False, "resume": True, "force": False, "json": True, "settings_of": None}
     args = argparse.Namespace(page=False, case=str(path), out=str(out), **flags)
     with pytest.raises(ValueError, match=r"--resume: --out .* contains no search"):
         tuning.command.run(args)

@@ -20,6 +20,7 @@ def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
     )
     top.add_argument("--out", metavar="DIR", help="output directory (default: a new directory under ./out)")
     top.add_argument("--resume", action="store_true", help="continue the interrupted search in --out")
+    top.add_argument("--force", action="store_true", help="overwrite the files of an earlier search in --out")
     top.add_argument(
         "--gradients", action="store_true", help="compare forward mode, reverse mode and differences in the report"
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from ambjax.cases.reader import Case, case_from
 from ambjax.cases.table import one_line
-from ambjax.commands.outputs import directory, files, plain, say, write_json, written
+from ambjax.commands.outputs import check_new, directory, files, plain, say, write_json, written
 from ambjax.commands.warnings import print_warnings
 from ambjax.control.cascade import Cascade
 from ambjax.host.interrupts import reporting
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> tuple[int, Row]:
     plan = _plan(args)
     with locked(plan.out):
         if not args.resume:
-            _clear(plan.out)
+            _clear(plan.out, args.force)
         mark_directory(plan.out)
         with reporting(lambda: _kept(plan.out)):
             return _tune(plan, args)
@@ -66,7 +66,9 @@ def run(args: argparse.Namespace) -> tuple[int, Row]:
 def _plan(args: argparse.Namespace) -> TuningPlan:
     """Read the case and make the output directory. Raises ValueError for an invalid case or option."""
     case, tune, raw = read_tune(args.case, args.settings_of)
-    if args.resume and not (args.out and can_resume(pathlib.Path(args.out))):
+    if args.resume and args.out is None:
+        raise ValueError("--resume: the directory of the search is missing. Give it as --out.")
+    if args.resume and not can_resume(pathlib.Path(args.out)):
         raise ValueError(f"--resume: --out {args.out} contains no search. Check --out, or leave out --resume.")
     print_warnings(case, args.case)
     if args.page:  # refuse it before the search
@@ -108,14 +110,18 @@ def _searched(plan: TuningPlan, resume: bool) -> SearchResult:
     return rounds(problem, plan.start, plan.out, {"case": plan.raw, "tune": settings(tune), "laws": laws}, resume)
 
 
-def _clear(out: pathlib.Path) -> None:
-    """Remove the checkpoints of an earlier search from `out`. Raises ValueError if that search has not ended."""
-    if has_unfinished_search(out, REPORT):
+def _clear(out: pathlib.Path, force: bool) -> None:
+    """Remove the checkpoints of an earlier search from `out`.
+
+    Raises ValueError, without `force`, if that search has not ended or if its results would be overwritten.
+    """
+    if not force and has_unfinished_search(out, REPORT):
         raise ValueError(
-            f"--out {out}: it holds a search that has not ended. Add --resume, or choose another directory."
+            f"--out {out}: it holds a search that has not ended. Continue it with --resume, discard it with --force, "
+            "or choose another directory."
         )
-    if (out / REPORT).exists():
-        say(f"{out}: the results of an earlier search will be replaced")
+    if not force:
+        check_new(out, WRITTEN)
     left = remove_all(out)
     if left:
         say(f"{out}: {left} checkpoints of an earlier search are removed")

@@ -6,6 +6,8 @@ import pathlib
 from typing import Any
 
 from ambjax import Case, read_case
+from ambjax.cases.reader import require_file
+from ambjax.host.arguments import names_arguments
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,11 +26,13 @@ class TunedCase:
     directory: pathlib.Path
 
 
+@names_arguments()
 def tune(
     case: str | pathlib.Path,
     out: str | pathlib.Path | None = None,
     *,
     resume: bool = False,
+    force: bool = False,
     gradients: bool = False,
     pareto: bool = False,
     page: bool = False,
@@ -39,6 +43,7 @@ def tune(
     - `case`: path of the case file. Its table [tune] selects the gains, the limits and the budget.
     - `out`: directory of the results; None: a new one under ./out.
     - `resume`: continue the search whose checkpoints are in `out`.
+    - `force`: overwrite the files of an earlier search in `out`.
     - `gradients`: also report the gradient of the loss.
     - `pareto`: write each point of the front of error against voltage as a case file.
     - `page`: also write page.html, in which sliders move the tuned gains (extra `[page]`).
@@ -49,11 +54,15 @@ def tune(
     """
     from tuning.command import run
 
+    for name, path in (("case", case), ("out", out), ("settings_of", settings_of)):
+        if path is not None or name == "case":
+            require_file(name, path)
     code, report = run(
         argparse.Namespace(
             case=str(case),
             out=None if out is None else str(out),
             resume=resume,
+            force=force,
             gradients=gradients,
             pareto=pareto,
             page=page,

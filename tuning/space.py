@@ -7,6 +7,7 @@ outside of the space stay the same objects in `Space.decode`.
 import dataclasses
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -113,6 +114,7 @@ class Space:
         """Return the gains [m] of a cascade, in order."""
         return np.array([float(read(cascade, gain.path)) for gain in self.gains])
 
+    @partial(jax.jit, static_argnums=0)
     def gains_at(self, x: Array) -> Array:
         """Return the gains [m] at coordinates x [m]."""
         return jnp.stack([gain.decode(x[j]) for j, gain in enumerate(self.gains)])

@@ -85,14 +85,21 @@ class Case:
 def read_case(path: str | pathlib.Path) -> Case:
     """Read and check the case file at `path`, and return the case.
 
-    Raises ValueError, one line, if the file cannot be read or any part of it is invalid.
+    Raises ValueError, one line, if the file cannot be read or any part of it is invalid, or if `path` is no path.
     """
+    require_file("path", path)
     path = pathlib.Path(path)
     raw, text = load(path)
     try:
         return case_from(raw, path.stem, text, path.parent)
     except ValueError as error:
         raise ValueError(one_line(f"{path}: {error}")) from None
+
+
+def require_file(name: str, path: object) -> None:
+    """Raise ValueError unless the argument `name` is the path of a file: text or a pathlib.Path."""
+    if not isinstance(path, str | pathlib.PurePath):
+        raise ValueError(f"{name} = {cut(repr(path))}: it must be the path of a file, as text or a pathlib.Path.")
 
 
 def require_case(case: object) -> None:

@@ -28,6 +28,7 @@ from ambjax.commands.outputs import directory, files, plain, spare
 from ambjax.control.cascade import Cascade
 from ambjax.control.guard import guarded
 from ambjax.ensemble.spread import ends
+from ambjax.host.arguments import names_arguments
 
 # Files of the verification.
 VERIFIED = ("verify.md", "verify.json")
@@ -89,6 +90,7 @@ class ExportedCase:
         """Whether no check fails; None without verification."""
         return verify.holds(self.checks) if self.checks else None
 
+    @names_arguments(out="folder")
     def write(self, folder: str | pathlib.Path) -> pathlib.Path:
         """Write all files into a folder, which is made if it does not exist, and return the folder.
 
@@ -115,6 +117,7 @@ class ExportedCase:
         return f"<table><caption>{names}</caption>{titles if rows else ''}{rows}</table>"
 
 
+@names_arguments()
 def export(
     case: Case,
     what: str = "controller",
@@ -150,12 +153,12 @@ def planned(
     _choice("format", format, ("c", "fmu"))
     _choice("fmi", fmi, (None, 2, 3))
     _choice("precision", precision, (None, *PRECISIONS))
-    block = block_of(what, guarded_for(case), case.scenario, case.clock)
     name = _prefix(prefix, case.name)
+    block = block_of(what, guarded_for(case), case.scenario, case.clock)
     if fmi is not None and format != "fmu":
-        raise ValueError(f"--fmi {fmi}: it is for --format fmu. Add --format fmu, or omit --fmi.")
+        raise ValueError(f"--fmi {fmi}: it is the version of an FMU. Omit --fmi, or set --format to fmu.")
     if precision == "float" and format == "fmu":
-        raise ValueError("--precision float: an FMU computes in double. Omit --precision, or use --format c.")
+        raise ValueError("--precision float: an FMU computes in double. Omit --precision, or set --format to c.")
     if verified:
         machine.check_compiler()
     return Plan(case, block, (fmi or 3) if format == "fmu" else 0, precision or "float", name, verified)
@@ -229,10 +232,10 @@ def _prefix(option: str | None, name: str) -> str:
     if option is None:
         derived = re.sub(r"\W", "_", name, flags=re.ASCII)
         return derived if _is_name(derived) else f"amb_{derived}"
-    if not _is_name(option):
+    if not isinstance(option, str) or not _is_name(option):
         raise ValueError(
             f"--prefix {option}: it must be a C identifier (a letter, then letters, digits or '_'), and neither a C "
-            "keyword nor the name of a C header. Use --prefix controller, for example."
+            "keyword nor the name of a C header, such as controller."
         )
     return option
 

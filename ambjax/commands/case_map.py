@@ -13,6 +13,7 @@ from ambjax.commands.ensemble import study_of
 from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, with_method_for_axes
 from ambjax.ensemble.paths import Place, places
 from ambjax.ensemble.study import Study
+from ambjax.host.arguments import names_arguments
 from ambjax.host.optional import extra
 from ambjax.numerics.declared import numbers, within
 
@@ -53,6 +54,12 @@ class CaseMap:
         facts = {"case": self.case.name, "members": one.members, "drawn": ", ".join(one.drawn)}
         return extra("xarray").Dataset(grids, axes, facts)
 
+    def plot(self) -> Any:
+        """Return a matplotlib Figure with heat maps of the survival and of the error, as map.png shows them."""
+        from ambjax.pictures.heatmaps import map_figure
+
+        return map_figure([panel(self.case, self.map)], *labels(self.case, self.map))
+
     def _repr_html_(self) -> str:
         """Return the table of the ranges of the arrays."""
         one = self.map
@@ -68,6 +75,7 @@ class CaseMap:
         return f"<table><caption>{html.escape(head)}</caption>{titles}{rows}</table>"
 
 
+@names_arguments()
 def survival_map(case: Case, x: str, y: str, *, members: int = 1, seed: int | None = None) -> CaseMap:
     """Return survival and error over a grid of two quantities of a case, as `ambjax map` computes them.
 
@@ -102,6 +110,39 @@ def unit_of(case: Case, axis: Axis) -> str:
     """Return the unit of the quantity on an axis."""
     place = places(case.cascade, case.scenario).get(axis.path)
     return "s" if place is None else place.field.metadata["unit"]
+
+
+def panel(case: Case, one: Map) -> Any:
+    """Return the panel of a map, a `heatmaps.MapPanel`."""
+    from ambjax.pictures.heatmaps import MapPanel
+
+    return MapPanel(
+        title=f"{case.name}\n{_subtitle(one)}",
+        x=one.x.values,
+        y=one.y.values,
+        survival=one.survival,
+        low=one.low if one.decisive else None,
+        high=one.high if one.decisive else None,
+        error=one.error,
+    )
+
+
+def _subtitle(one: Map) -> str:
+    """Return the subtitle of a panel: the spread quantities, or their number if there are more than three."""
+    few = len(one.drawn) <= 3
+    what = ", ".join(one.drawn) if few else f"{len(one.drawn)} quantities"
+    words = f"spread: {what}" if what else "nominal"
+    return words + f"; {int(one.stalled.sum())} runs not decided" * bool(one.stalled.any())
+
+
+def labels(case: Case, one: Map) -> tuple[str, str, bool, bool]:
+    """Return the labels of x and y with their units, and whether each axis is logarithmic."""
+
+    def label(axis: Axis) -> str:
+        unit = unit_of(case, axis)
+        return f"{axis.path} ({unit})" if unit else axis.path
+
+    return label(one.x), label(one.y), one.x.log, one.y.log
 
 
 def _axis(flag: str, text: str, case: Case) -> Axis:

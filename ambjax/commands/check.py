@@ -9,7 +9,7 @@ import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.commands.acceptance import acceptance, forces
-from ambjax.commands.outputs import plain, table
+from ambjax.commands.outputs import plain, say, table
 from ambjax.commands.warnings import idealised, read_with_warnings
 from ambjax.theorem.conditions import Condition, check
 from ambjax.theorem.sampled_report import Delays, SampledReport
@@ -36,6 +36,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     from ambjax.theorem import advice
 
     case = read_with_warnings(args.case)
+    duration = float(case.clock.duration)
+    say(f"checking Theorem 1: simulating {duration:g} s in continuous time")
     report = check(case.cascade, case.scenario, case.clock, case.settle)
     summary = {
         "holds": report.holds,
@@ -46,6 +48,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         "conditions": [_condition(c) for c in report.conditions],
         "proof": [_condition(c) for c in report.proof],
     }
+    say("linearising the loop")
     loop, text = acceptance(case)
     summary |= {"loop": loop}
     if not args.json:
@@ -72,14 +75,17 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
     """Check and print the conditions on the processor of the case. Return their summary; "holds" is the verdict."""
-    from ambjax.ensemble.delays import delay_margin
+    from ambjax.ensemble.delays import DELAYS, delay_margin
     from ambjax.ensemble.replay import as_member, record_system
     from ambjax.theorem import advice, sampled_report
 
+    say("simulating on the processor, with and without noise")
     scenario = as_member(case.scenario)
     sampled = sampled_report.check_sampled(case.cascade, scenario, case.clock, case.settle, record_system)
+    say(f"finding the delay margin: simulating {DELAYS} delays, twice if the rotor is lost at one of them")
     margin, unknown = delay_margin(case.cascade, case.scenario, case.clock), None
     if (processor := case.cascade.processor) is not None and processor.predict is not False:
+        say("finding the delay margin once more, for delays that the prediction does not know")
         unknown = delay_margin(case.cascade, case.scenario, case.clock, known=False)
     if not args.json:
         print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")

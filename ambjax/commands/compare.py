@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
             check_processor(case, path)
     out = directory(args.out, f"compare-{'-'.join(case.name for case in cases)}"[:80], WRITTEN, args.force)
     if args.tune:
-        cases = [_tuned(path, args.cases[0], case.name, out) for path, case in zip(args.cases, cases, strict=True)]
+        cases = [_tuned(path, case.name, out, args) for path, case in zip(args.cases, cases, strict=True)]
         studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
     html_pages = pages(cases, args.cases) if args.page else {}
     compared = [_compared(case, study) for case, study in zip(cases, studies, strict=True)]
@@ -118,12 +118,13 @@ def _differences(paths: Sequence[str], cases: Sequence[Case], studies: Sequence[
     return notes
 
 
-def _tuned(path: str, first: str, name: str, out: pathlib.Path) -> Case:
+def _tuned(path: str, name: str, out: pathlib.Path, args: argparse.Namespace) -> Case:
     """Tune a case with the settings of the first, and return the tuned case under the same name."""
     folder = out / f"tuned-{name}"
     say(f"tuning {name}; its report will be in {folder}")
     with contextlib.redirect_stdout(sys.stderr):
-        code = extension("tune")([path, "--settings-of", first, "--out", str(folder)], "ambjax compare")
+        words = [path, "--settings-of", args.cases[0], "--out", str(folder), *["--force"] * args.force]
+        code = extension("tune")(words, "ambjax compare")
     if code not in (0, 1):
         raise ValueError(f"--tune: {path} could not be tuned. The line above gives the reason.")
     return dataclasses.replace(read_case(folder / "tuned.toml"), name=name)

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import numbers
 from concurrent.futures import Executor
 
 import numpy as np
@@ -25,10 +26,10 @@ MOST_PROCESSES = 1024
 
 def study_of(case: Case, seed: int | None, members: int) -> Study:
     """Return the study of a case. Raises ValueError for a member count or seed out of range."""
-    if not 1 <= members <= MOST_MEMBERS:
+    if not isinstance(members, numbers.Integral) or not 1 <= members <= MOST_MEMBERS:
         raise ValueError(f"--members {members}: it must be a whole number from 1 to {MOST_MEMBERS:,}.")
     seed = int(case.scenario.seed) if seed is None else seed
-    if not 0 <= seed < 2**32:
+    if not isinstance(seed, numbers.Integral) or not 0 <= seed < 2**32:
         raise ValueError(f"--seed {seed}: it must be a whole number from 0 to 4294967295.")
     return Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, members)
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.commands.case_map import study_and_axes, unit_of
+from ambjax.commands.case_map import labels, panel, study_and_axes
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.intervals import wilson
-from ambjax.ensemble.maps import CERTAIN, GRIDS, Axis, Map, grid
+from ambjax.ensemble.maps import CERTAIN, GRIDS, Map, grid
 
 WRITTEN = ("map.png", "map.json")
 
@@ -82,35 +82,10 @@ def _spread_words(one: Map) -> str:
 def _draw(cases: list[Case], maps: list[Map], path: pathlib.Path) -> None:
     from ambjax.pictures import heatmaps
 
-    panels = [
-        heatmaps.MapPanel(
-            title=f"{case.name}\n{_short(m)}",
-            x=m.x.values,
-            y=m.y.values,
-            survival=m.survival,
-            low=m.low if m.decisive else None,
-            high=m.high if m.decisive else None,
-            error=m.error,
-        )
-        for case, m in zip(cases, maps, strict=True)
-    ]
-    x, y = maps[0].x, maps[0].y
-    heatmaps.maps(panels, _label(cases[0], x), _label(cases[0], y), x.log, y.log, path)
-
-
-def _short(one: Map) -> str:
-    """Return the subtitle of a panel: the spread quantities, or their number if there are more than three."""
-    few = len(one.drawn) <= 3
-    what = ", ".join(one.drawn) if few else f"{len(one.drawn)} quantities"
-    words = f"spread: {what}" if what else "nominal"
-    return words + f"; {int(one.stalled.sum())} runs not decided" * bool(one.stalled.any())
+    panels = [panel(case, one) for case, one in zip(cases, maps, strict=True)]
+    heatmaps.maps(panels, *labels(cases[0], maps[0]), path)
 
 
 def _summary(case: Case, one: Map) -> Mapping[str, object]:
     facts: dict[str, Any] = {"case": case.name, "x": one.x._asdict(), "y": one.y._asdict()}
     return facts | {key: getattr(one, key) for key in (*GRIDS, "members", "drawn", "decisive")} | {"reach": one.reach()}
-
-
-def _label(case: Case, axis: Axis) -> str:
-    unit = unit_of(case, axis)
-    return f"{axis.path} ({unit})" if unit else axis.path

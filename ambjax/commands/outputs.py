@@ -39,12 +39,18 @@ def directory(out: str | None, name: str, names: Iterable[str] = (), force: bool
             raise ValueError(f"--out {path}: it holds the study of an ensemble ({file}). Choose another directory.")
     make(path)
     check_places(path, names)
-    if old := [name for name in names if not force and (path / name).exists()]:
+    if not force:
+        check_new(path, names)
+    return path
+
+
+def check_new(out: pathlib.Path, names: Iterable[str]) -> None:
+    """Raise ValueError if `out` has a file with one of these names."""
+    if old := [name for name in names if (out / name).exists()]:
         raise ValueError(
-            f"--out {path}: it has {', '.join(old)} of an earlier run. Choose another directory, or overwrite them "
+            f"--out {out}: it has {', '.join(old)} of an earlier run. Choose another directory, or overwrite them "
             "with --force."
         )
-    return path
 
 
 def check_places(out: pathlib.Path, names: Iterable[str | pathlib.PurePath]) -> None:

@@ -34,14 +34,15 @@ class PID(PositionLaw[PIDState]):
     force v(z, i) of the measured current is not the demanded one, and x follows it at the rate k_aw.
 
     k_d = 2 w, k_p = 2 w^2, k_int = w^3 are the optimal gains (LQR) for the cost w^6 (int e)^2 + e_ddot^2: its poles are
-    those of a Butterworth filter of bandwidth w.
+    those of a Butterworth filter of bandwidth w. The default gains for a model have w = w_m/2, w_m the pole of the
+    magnets.
     """
 
-    k_p: Scalar = gain(default=1e4, unit="1/s^2", doc="proportional gain")
-    k_int: Scalar = gain(default=1e5, unit="1/s^3", doc="integral gain")
-    k_d: Scalar = gain(default=400.0, unit="1/s", doc="derivative gain")
-    w_f: Scalar = gain(default=1e4, unit="1/s", doc="bandwidth of the filter of the derivative")
-    k_aw: Scalar = gain(default=10.0, unit="1/s", doc="anti-windup rate")
+    k_p: Scalar = gain(default=1.41e5, unit="1/s^2", doc="proportional gain; left out: w_m^2/2")
+    k_int: Scalar = gain(default=1.87e7, unit="1/s^3", doc="integral gain; left out: w_m^3/8")
+    k_d: Scalar = gain(default=531.0, unit="1/s", doc="derivative gain; left out: w_m")
+    w_f: Scalar = gain(default=5310.0, unit="1/s", doc="bandwidth of the filter of the derivative; left out: 10 w_m")
+    k_aw: Scalar = gain(default=26.5, unit="1/s", doc="anti-windup rate; left out: w_m/20")
     memory = (("rate", "m/s", "filtered rate of the error"), ("integral", "m/s^2", "integral term"))
 
     def init(self, model: Plant) -> PIDState:
@@ -49,6 +50,10 @@ class PID(PositionLaw[PIDState]):
 
     def scale(self, model: Plant) -> PIDState:
         return PIDState(jnp.asarray(model.sigma_size), jnp.abs(model.g) / 50 + 1e-3)
+
+    def designed(self, model: Plant, period: float | None) -> "PID":
+        w = model.pole / 2
+        return PID(k_p=2 * w**2, k_int=w**3, k_d=2 * w, w_f=20 * w, k_aw=w / 10)
 
     def slope(self, model: Plant) -> Scalar:
         """Return the largest of the rates w_f, k_d, k_aw, sqrt(k_p) and cbrt(k_int)."""

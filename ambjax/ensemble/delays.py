@@ -34,12 +34,12 @@ def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: b
     """
     processor: Any = cascade.on_processor(0.0, MOST_DELAY).processor
     processor, own = dataclasses.replace(processor, predict=processor.predict is not False), float(processor.delay)
-    if not known:
-        processor = dataclasses.replace(processor, assumed=processor.ahead)
 
     def tried(low: float, high: float) -> Delays:
         delays = np.linspace(low, high, DELAYS)
-        late = dataclasses.replace(cascade, processor=dataclasses.replace(processor, delay=delays))
+        # an array in both cases, so that both use the same compiled program
+        assumed = delays if known else np.full(DELAYS, float(processor.ahead))
+        late = dataclasses.replace(cascade, processor=dataclasses.replace(processor, delay=delays, assumed=assumed))
         ending = run_ensemble(late, scenario, clock, fold=None).trajectory
         return _read(delays, np.asarray(ending.lost_at), np.asarray(ending.lost_code))
 

@@ -10,12 +10,15 @@ from markdown_it.renderer import RendererHTML
 from markdown_it.token import Token
 from markdown_it.utils import EnvType, OptionsDict
 
-# Elements that are wider than a narrow screen scroll in a box, so that pictures stay legible.
+# Elements that are wider than a narrow screen scroll in a box, so that pictures stay legible. The first column of a
+# table, its labels, is narrow and stays in view.
 STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:72rem;margin:2rem auto;padding:0 1rem;color:#222}
 body{overflow-wrap:anywhere}p,li{max-width:60rem}.wide{display:block;overflow-x:auto;margin:.6rem 0}
 table{border-collapse:collapse;overflow-wrap:normal}td,th{border:1px solid #ccc;padding:.2rem .6rem;text-align:left}
 th{background:#f3f3f3}.short{white-space:nowrap}img{display:block;max-width:max(100%,44rem)}
-details{border-top:1px solid #ccc;padding:.4rem 0}summary{cursor:pointer}summary h2{display:inline;font-size:1.1rem}"""
+details{border-top:1px solid #ccc;padding:.4rem 0}summary{cursor:pointer}summary h2{display:inline;font-size:1.1rem}
+@media(max-width:44rem){td:first-child,th:first-child{position:sticky;left:0;max-width:9rem;white-space:normal}
+td:first-child{background:#fff}}"""
 # Cells of at most this many characters are not wrapped: a number must not break at the sign of its exponent.
 SHORT = 48
 PUNCTUATION = re.compile(r"([\\`*_\[\]<>|~&#!$])")

@@ -53,7 +53,20 @@ def maps(
     path: pathlib.Path,
     error_metric: str = "settled_max_abs_error_m",
 ) -> None:
-    """Write heat maps side by side: survival above, and the error below if a panel has one.
+    """Write the picture of `map_figure` to a file."""
+    map_figure(panels, x_label, y_label, x_log, y_log, error_metric).savefig(path, dpi=150)
+
+
+@own_style
+def map_figure(
+    panels: Sequence[MapPanel],
+    x_label: str,
+    y_label: str,
+    x_log: bool,
+    y_log: bool,
+    error_metric: str = "settled_max_abs_error_m",
+) -> Figure:
+    """Return heat maps side by side: survival above, and the error below if a panel has one.
 
     `error_metric`: the metric of the errors, which gives their unit. A label that ends in an SI unit, such as "z (m)",
     gets a prefix. All panels of a row share the colours. Raises ValueError if there are no panels, or if a log axis has
@@ -82,7 +95,7 @@ def maps(
     if not all(np.isfinite(grid).all() for grid in grids):
         keys.append(Patch(label="no survivor" if rows == 2 else "not run", **EMPTY_CELL))
     figure.legend(handles=keys, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-    figure.savefig(path, dpi=150)
+    return figure
 
 
 # Labels of x and y, and whether each axis is logarithmic.

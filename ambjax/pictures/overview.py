@@ -6,6 +6,7 @@ import pathlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from ambjax.pictures.figures import (
     AVERAGED,
@@ -63,7 +64,7 @@ def overview_figure(
     width, height = 13.0, 1.55 * len(grid) + 1.2
     figure = Figure(figsize=(width, height))
     # Fixed margins, in inches: a layout engine would double the time.
-    figure.subplots_adjust(1.05 / width, 0.5 / height, 1 - 0.2 / width, 1 - 0.85 / height, wspace=0.24, hspace=0.24)
+    figure.subplots_adjust(1.25 / width, 0.5 / height, 1 - 0.2 / width, 1 - 0.85 / height, wspace=0.24, hspace=0.24)
     ratios = [2, 1, 1] if window is None else [1, 1]
     axes = figure.subplots(len(grid), len(columns), sharex="col", squeeze=False, width_ratios=ratios)
     for row, (line, column) in enumerate(zip(axes, grid, strict=True)):
@@ -78,8 +79,10 @@ def overview_figure(
                 ax.set_ylabel("")
             if row == 0:
                 ax.set_title(words, fontsize=10, loc="left", pad=16)
-    for line in axes.T:
+    for n, line in enumerate(axes.T):
         lowest = [ax for ax in line if ax.axison][-1]
+        if window is None and n:
+            lowest.xaxis.set_major_locator(MaxNLocator(4))  # more labels than that touch each other
         lowest.tick_params(labelbottom=True)
         lowest.set_xlabel("time (s)")
     figure.align_ylabels(axes[:, 0])

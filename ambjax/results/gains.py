@@ -20,6 +20,10 @@ def gains_of(cascade: Cascade, paths: Iterable[str]) -> dict[str, Array]:
     """
     if isinstance(paths, str):
         raise ValueError(f'paths = "{paths}": it must be a list. Write ["{paths}"].')
+    if not isinstance(cascade, Cascade):
+        raise ValueError(f"cascade = {type(cascade).__name__}: it must be a Cascade, such as `case.cascade`.")
+    if not isinstance(paths, Iterable):
+        raise ValueError(f"paths = {paths!r}: it must be a list of dotted paths, such as controller.position.c.")
     known = places(cascade, Scenario())
     own = [path for path in known if path.startswith(("controller.", "processor."))]
     found = {}
@@ -35,5 +39,7 @@ def with_gains(cascade: Cascade, gains: Mapping[str, Any]) -> Cascade:
 
     Raises ValueError for a path that does not exist.
     """
+    if not isinstance(gains, Mapping):
+        raise ValueError(f"gains = {gains!r}: it must be a dict of values by dotted path.")
     gains_of(cascade, gains)
     return with_values(cascade, Scenario(), gains)[0]

@@ -114,6 +114,8 @@ def simulate(case: Case, progress: Callable[[int], object] = lambda samples: Non
     `CaseRun.lost`.
     """
     require_case(case)
+    if not callable(progress):
+        raise ValueError(f"progress = {progress!r}: it must be a function of the number of new samples.")
     fold = standard_for(case.settle, case.scenario)
     outcome = record_member(case.cascade, case.scenario, case.clock, fold=fold, tell=progress)
     metrics = {name: np.asarray(x).item() for name, x in outcome.measured.items()}

@@ -8,6 +8,7 @@ import numpy as np
 
 from ambjax.cases.reader import Case, require_case
 from ambjax.ensemble import statistics
+from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.study import Study
 from ambjax.host.optional import extra
 from ambjax.simulation.metrics import UNITS
@@ -74,13 +75,13 @@ def simulate_members(case: Case, members: int, *, seed: int | None = None, threa
     - `threads`: CPU cores to use; None: all.
 
     The results stay in memory; `ambjax ensemble` writes them in parts and can be resumed. Raises ValueError for
-    anything but a case, a number of members below 1, or a seed below 0.
+    anything but a case, and for a number of members or a seed out of range.
     """
     require_case(case)
     seed = int(case.scenario.seed) if seed is None else seed
-    for name, value, least in (("members", members, 1), ("seed", seed, 0)):
-        if not isinstance(value, numbers.Integral) or value < least:
-            raise ValueError(f"{name} = {value!r}: it must be a whole number of at least {least}.")
+    for name, value, least, most in (("members", members, 1, MOST_MEMBERS), ("seed", seed, 0, 2**32 - 1)):
+        if not isinstance(value, numbers.Integral) or not least <= value <= most:
+            raise ValueError(f"{name} = {value!r}: it must be a whole number from {least} to {most:,}.")
     study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, members)
     columns = {name: np.asarray(x) for name, x in study.columns(0, members, threads=threads).items()}
     return MembersRun(study, columns)

@@ -131,10 +131,12 @@ class Bearing(Generic[S]):
         raise NotImplementedError
 
     def slope(self) -> Scalar:
-        """The fastest rate of the plant's motion and flux, 1/s; the step size is chosen from it."""
-        if self.iron is None or self.iron.eddy is None:
-            return self.pole
-        return jnp.maximum(self.pole, 1 / self.iron.eddy)
+        """The fastest rate of the plant's motion, 1/s; the step size is chosen from it."""
+        return self.pole
+
+    def flux_slope(self) -> Scalar:
+        """Return the rate at which the flux follows the current, 1/s; 0 if there is no lag."""
+        return 0.0 if self.iron is None or self.iron.eddy is None else 1 / self.iron.eddy
 
     def coil_slope(self, z: Scalar) -> Scalar:
         """Return the fastest rate R/L of a coil's current (1/s) for |z| <= `z` (m): 2 R (s_0 + z)/kappa. Eq. (2)."""

@@ -1,5 +1,8 @@
 """The goal: one number, minimised by the search, from the losses of the members and the gains."""
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -64,5 +67,10 @@ class Goal:
     def score(self, x: np.ndarray, terms: dict[str, np.ndarray], members: Members) -> np.ndarray:
         """Return the goal [S] at x [S, m] from the terms [S, N] of members [N]; +inf where it is not finite."""
         each = zip(np.stack(outcomes(self.weights, terms, members.stressed), -1), x, strict=True)
-        values = np.array([self(jnp.asarray(one), jnp.asarray(at), members.ordinary) for one, at in each])
+        values = np.array([_compiled(self, one, at, members.ordinary) for one, at in each])
         return np.where(np.isfinite(values), values, np.inf)
+
+
+@partial(jax.jit, static_argnames="ordinary")
+def _compiled(goal: Goal, outcomes: Array, x: Array, ordinary: int) -> Array:
+    return goal(outcomes, x, ordinary)

@@ -29,6 +29,8 @@ def _held(facts: TuningFacts) -> str:
 def _sizes(facts: TuningFacts) -> str:
     """Return the error and the voltage after tuning, and before it."""
     after, before = facts.after, facts.before
+    if not after["members"]:
+        return "**Error and voltage:** not measured on held-out members (tune.held_out = 0)."
     if not after["held"]:
         return "**Error and voltage:** no held-out member is held."
 
