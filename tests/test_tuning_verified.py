@@ -259,7 +259,7 @@ def test_the_search_goes_on_to_where_it_is_confirmed(tmp_path, capsys):
     said = capsys.readouterr().err.splitlines()
     steps = [n for n, line in enumerate(said) if line.startswith("steps of the search compared with")]
     on = said.index(
-        "lost members, and those that accurate steps do not hold, join the training ensemble; the search continues"
+        "lost members, and members lost with accurate steps, join the training ensemble; the search continues"
     )
     assert steps[0] < on < steps[-1]
     assert "settled rms error" not in said[steps[0]]  # no member is held by accurate steps either

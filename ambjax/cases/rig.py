@@ -25,7 +25,7 @@ w = 1000.0                    # 1/s; 'ambjax tune' found this and the gains belo
 kind = "sliding-mode"
 c = 2900.0                    # 1/s
 k = 9.0                       # m/s^2
-p = inf                       # s/m; the sign itself, stepped implicitly
+p = inf                       # s/m; set-valued sign, implicit steps
 
 [controller.inversion]
 kind = "adaptive"

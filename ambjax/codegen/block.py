@@ -86,7 +86,7 @@ def law_lines(cascade: Cascade) -> list[str]:
     lines = []
     for stage, law in zip(("observer", "position", "inversion", "current"), laws, strict=True):
         hard = [f.name for f in dataclasses.fields(law) if f.metadata.get("steepness") and getattr(law, f.name) is None]
-        ends = "".join(f", {name} = inf (the sign itself)" for name in hard)
+        ends = "".join(f", {name} = inf (a set-valued sign)" for name in hard)
         over = "".join(f", {name} as a function of the {one.over}" for name, one in schedules(law).items())
         lines.append(f"{stage}: {type(law).__name__}{ends}{over}")
     return [*lines, f"processor: {cascade.processor}"]

@@ -172,7 +172,7 @@ def _cosine_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, A
 def smooth_sign(x: Scalar, p: Scalar | None, per: Scalar = 1.0) -> Array:
     """Return the smoothed sign 2/pi arctan(p x), divided by `per`. Remark 3 of the paper.
 
-    `p` has the inverse unit of `x`; the slope at 0 is 2p/pi. p = None gives the sign itself, 0 at 0.
+    `p` has the inverse unit of `x`; the slope at 0 is 2p/pi. p = None gives the sign without smoothing, 0 at 0.
     """
     if p is None:
         return jnp.sign(jnp.asarray(x)) / per

@@ -36,7 +36,7 @@ def three_ways(problem: TuningProblem, x: np.ndarray) -> dict[str, object]:
     """Compute the gradient [m] of the mean loss at x [m] by forward mode, reverse mode and extrapolated differences.
 
     Returns plain data. `coarse`, `fine`: central differences with the steps STEP and STEP / 2. `verdicts`: for each
-    gain, whether the three agree (`verdict`). `agree`: whether they agree for every gain.
+    gain, whether the three agree (`agreement`). `agree`: whether they agree for every gain.
     """
     objective = _shorter(problem, min(SAMPLES, problem.objective.clock.samples))
     members = objective.members(problem.tune.budget.seed, min(FEW, problem.tune.budget.members))
@@ -81,11 +81,11 @@ def agreement(forward: float, reverse: float, coarse: float, fine: float, floor:
         return max(abs(a - b) - floor, 0.0) / max(abs(a), abs(b), floor)
 
     if not np.isfinite([forward, reverse, coarse, fine]).all():
-        return "no finite number by every way"
+        return "not every way gives a finite number"
     if apart(forward, reverse) > MODES:
         return f"forward and reverse mode differ by {100 * apart(forward, reverse):.2g} %: rounding grows along the run"
     if apart(coarse, fine) > STEADY:
-        return f"differences decide nothing: {coarse:.2e} with a step of {STEP:g}, {fine:.2e} with {STEP / 2:g}"
+        return f"differences are inconclusive: {coarse:.2e} with a step of {STEP:g}, {fine:.2e} with {STEP / 2:g}"
     found = extrapolated(coarse, fine)
     if apart(found, forward) > AGREE:
         return f"differences differ from both modes by {100 * apart(found, forward):.2g} %, whatever their step"

@@ -1,6 +1,6 @@
 """A sequence of searches, each of which starts from the result of earlier ones, and restarts around the best point.
 
-A search may end at a cliff of the goal although the goal is lower beyond it. A restart tries quasi-random points
+A search may end at a jump of the goal although the goal is lower beyond it. A restart tries quasi-random points
 around the best point so far.
 """
 
@@ -27,7 +27,7 @@ from tuning.search.screen import around, initial_points
 
 # Largest number of searches in `search_and_restart`.
 MOST_SEARCHES = 5
-# Restarts end after two searches in a row that lower the goal by less than this share. After one alone they go on,
+# Restarts end after two searches in a row that lower the goal by less than this share. One such search is not enough,
 # because its points may have missed a better optimum by chance.
 GAIN = 0.01
 # Number of earlier points that are tried with accurate steps if these confirm none of the answers.
@@ -48,7 +48,7 @@ class SearchResult:
     error: StepError | None
     history: dict[str, np.ndarray]
     lost: int
-    """number of validation members that are lost, plus that of members that accurate steps do not hold"""
+    """number of validation members that are lost, plus that of members that are lost with accurate steps"""
     seconds: float
     """duration of all searches in s, the time before a resume included"""
     front: tuple[Any, ...] = ()

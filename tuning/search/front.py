@@ -37,8 +37,8 @@ class FrontPoint(NamedTuple):
 
     `factor`: limit of the rms error relative to the least; 1: the answer of least error. `x` [m]: coordinates.
     `error_m`, `volts`: settled rms error (m) and voltage (V) of the members held, NaN without any. `sensitivity`:
-    peak of |S| as it is limited; None if it is not. `lost`, `stalled`: of `members` members. `within`: whether the
-    limits are held, that of the error apart.
+    peak of |S| as it is limited; None if it is not. `lost`, `stalled`: of `members` members. `within`: whether
+    all limits except that of the error are met.
     """
 
     factor: float
@@ -87,14 +87,14 @@ def trace_front(course: Course, answer: SearchResult) -> SearchResult:
 
 
 def least_of(seen: Sequence[FrontPoint]) -> FrontPoint:
-    """Return the point of least error of those that lose no more members, and hold the limits, like the first."""
+    """Return the point of least error of those that `_fit` returns."""
     return min(_fit(seen), key=lambda point: point.error_m)
 
 
 def chosen(seen: Sequence[FrontPoint], factor: float) -> FrontPoint:
     """Return the point of least voltage of those with an error of at most `factor` times the least.
 
-    Points that lose more members than the first, or break a limit that it holds, do not count.
+    Only points that `_fit` returns count.
     """
     fit = _fit(seen)
     least = min(point.error_m for point in fit)
@@ -102,7 +102,7 @@ def chosen(seen: Sequence[FrontPoint], factor: float) -> FrontPoint:
 
 
 def _fit(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
-    """Return the points that lose no more members than the first, and hold the limits that it holds."""
+    """Return the points that lose no more members than the first, and that meet all limits if the first does."""
     first = seen[0]
     return [
         point
@@ -165,7 +165,7 @@ def _rare(course: Course, numbers: Sequence[tuple[float, float]], columns: Mappi
 
 
 def _valid(course: Course, answer: SearchResult, seen: list[FrontPoint]) -> SearchResult:
-    """Return the point that tune.objective selects if it is valid; else the next best, at last the given answer.
+    """Return the point that tune.objective selects if it is valid, else the next best; the given answer if none is.
 
     Points that are not valid are removed from `seen`.
     """

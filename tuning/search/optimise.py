@@ -30,9 +30,9 @@ PATH = 12
 class Phase(NamedTuple):
     """A phase of the search.
 
-    It simulates one ordinary member in `part` and all stressed ones, because their loss is a cliff of the goal. A
-    descent has converged if the goal falls by less than `stall` over `patience` iterations. If the norm of its gradient
-    then exceeds `rise`, the start continues with CMA-ES.
+    It simulates one in `part` of the ordinary members, and all stressed members, because the goal jumps where one of
+    these is lost. A descent has converged if the goal falls by less than `stall` over `patience` iterations. If the
+    norm of its gradient then exceeds `rise`, the start continues with CMA-ES.
     """
 
     part: int
@@ -41,7 +41,8 @@ class Phase(NamedTuple):
     rise: float
 
 
-# A start with a larger gradient does not descend: it predicts a factor e of the goal within the shortest step.
+# A start with a larger gradient does not descend: such a gradient predicts that the goal changes by a factor e within
+# the shortest step.
 STEEP = 1 / SHORTEST
 # The first phase uses few members: their optimum is close to that of all, at less than half of the cost. The gradient
 # of the goal, a logarithm, vanishes at a minimum: converged descents of benchmarks/tasks end at norms of 0.001 to 0.02
@@ -115,7 +116,7 @@ def _switch(progress: SearchState, phase: Phase) -> None:
 
     A start ends if its step is shorter than SHORTEST or its goal stalls. The worse half ends after the iterations
     HALVINGS. A descent with a large gradient switches to CMA-ES: the derivatives of a chaotic loop grow with time and
-    do not describe the goal, and a descent stops early at a cliff beyond which members are lost.
+    do not describe the goal, and a descent stops early at a jump of the goal, beyond which members are lost.
     """
     starts, count = progress.starts, progress.iteration - progress.since
     value, rise, active = np.asarray(starts.value), np.asarray(starts.rise), progress.active

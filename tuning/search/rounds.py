@@ -2,7 +2,7 @@
 
 The first round searches with restarts. If the error of the integration steps at the optimum is too large, the search
 continues with finer steps. If a limit is not met, it continues with other multipliers. The answer is then validated.
-Validation members that are lost, and members that accurate steps do not hold, join the training ensemble for the next
+Validation members that are lost, and members that are lost with accurate steps, join the training ensemble for the next
 round. At the end the front of error against voltage is traced, if tune.objective or --pareto requires it.
 """
 
@@ -52,7 +52,7 @@ def rounds(
         if answer.good or course.interrupted or len(course.past) - course.limit_searches >= MOST_ROUNDS:
             break
         course.members = course.members.joined(joining(course.problem, lost, error, number))
-        say("lost members, and those that accurate steps do not hold, join the training ensemble; the search continues")
+        say("lost members, and members lost with accurate steps, join the training ensemble; the search continues")
         x, _ = course.search(course.around(x))
     if not answers:
         return course.answer(x, None, budget.validation)

@@ -12,8 +12,8 @@ from tuning.search.course import Course, SearchResult
 
 # Largest number of lost members that join at once.
 MOST_JOINING = 16
-# Members that accurate steps do not hold join with the noise factor NOISE_GROWTH**number: the search's steps hold
-# them with their own noise.
+# Members that are lost with accurate steps join with the noise factor NOISE_GROWTH**number, because with their own
+# noise they are held in the steps of the search.
 NOISE_GROWTH = 1.5
 
 
@@ -43,7 +43,7 @@ def joining(problem: TuningProblem, lost: np.ndarray, error: StepError, number: 
     """Return the members that join the training ensemble.
 
     The first of the `lost` validation members join with half of the additional noise of stressed members, which leaves
-    a margin. Members that accurate steps do not hold join with NOISE_GROWTH**number times the noise.
+    a margin. Members that are lost with accurate steps join with NOISE_GROWTH**number times the noise.
     """
     budget = problem.tune.budget
     those = problem.objective.chosen(seeds(budget)[1], lost[:MOST_JOINING], budget.validation)
