@@ -28,7 +28,7 @@ from tuning.problem import REFINEMENT, problem_of
 from tuning.report.limit_table import MORE
 from tuning.report.pictures import amplitudes
 from tuning.search.course import Course, training
-from tuning.search.multipliers import limited
+from tuning.search.multipliers import search_within_limits
 from tuning.search.rounds import rounds
 
 # The voltage of a Bowl is proportional to k: 20 V at the best k, 60, and 10 V at k = 30.
@@ -310,7 +310,7 @@ def test_a_search_that_stays_at_an_optimum_within_the_limits_ends(monkeypatch):
     course.past.append(SimpleNamespace(interrupted=False))
     monkeypatch.setattr(course, "search", lambda points: (starts.append(points) or points[0], 0.0))
     best = np.asarray(problem.objective.space.encode(np.array(World.best)))
-    np.testing.assert_array_equal(limited(course, best), best)
+    np.testing.assert_array_equal(search_within_limits(course, best), best)
     assert len(starts) == 1
 
 
