@@ -303,7 +303,7 @@ def a_bar(path, share, rho=0.0):
 
 def test_tornado_ranks_by_share_and_colours_by_trend(tmp_path, drawn):
     bars = [a_bar(f"plant.{k}", share) for k, share in enumerate(np.linspace(0.0, 0.6, 13))]
-    bars += [a_bar("spread.rising", 0.9, 0.94), a_bar("falling", 0.7, -0.8), a_bar("turning", 0.8, 0.1)]
+    bars += [a_bar("rising", 0.9, 0.94), a_bar("falling", 0.7, -0.8), a_bar("turning", 0.8, 0.1)]
     tornado(bars, "settled_max_abs_error_m", "what it says", tmp_path / "t.png")
     assert is_png(tmp_path / "t.png")
     ax = drawn[0].axes[0]
