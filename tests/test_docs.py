@@ -171,11 +171,30 @@ def test_the_benchmark_pages_are_one():
 def test_the_readme_states_the_measured_errors_and_voltages_of_the_structures():
     cases = json.loads((ROOT / "benchmarks" / "results" / "laws.json").read_text())["cases"]
     text = (ROOT / "README.md").read_text()
-    for law, title in (("cascade-integral", "cascade with an integral"), ("pid", "PID"), ("lqg", "LQG")):
-        rows = [cases[name]["structures"][law] for name in ("bearing", "rig")]
+    names = ("bearing", "rig", "F20", "G20")
+    titles = {
+        "cascade-integral": "cascade with an integral",
+        "super-twisting": "cascade with super-twisting",
+        "pid": "PID",
+        "lqg": "LQG",
+    }
+    for law, title in titles.items():
+        rows = [cases[name]["structures"][law] for name in names]
         cells = [f"{1e6 * row['rms_error_median_m'][0]:.3g} µm, {row['rms_u_V'][0]:.3g} V" for row in rows]
         assert f"| {title} | {' | '.join(cells)} |\n" in text
-    assert cases["bearing"]["seeds"] == cases["rig"]["seeds"] == 5  # as the text says
+    assert {case["seeds"] for case in cases.values()} == {5}  # as the text says
+    # the sentences below the table
+    medians = {
+        name: {law: row["rms_error_median_m"] for law, row in cases[name]["structures"].items()} for name in names
+    }
+    best = [min(medians[name], key=lambda law: medians[name][law][0]) for name in names]
+    assert best == ["cascade-integral", "cascade-integral", "super-twisting", "cascade-integral"]
+    assert f"{1 - medians['F20']['super-twisting'][0] / medians['F20']['cascade-integral'][0]:.0%}" == "6%"
+    for name in ("bearing", "rig"):
+        three = [medians[name][law] for law in ("cascade-integral", "super-twisting", "pid")]
+        assert max(low for _, low, _ in three) < min(high for *_, high in three)
+    _, low, high = medians["G20"]["pid"]
+    assert f"{high / low:.0f}" == "11"
 
 
 def test_a_text_is_not_taken_for_markup():
