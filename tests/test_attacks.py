@@ -318,7 +318,7 @@ STOPS = {
     "check": ([], "ambjax.commands.check.check"),
     "ensemble": (["--members", "2"], "ambjax.commands.ensemble.study_of"),
     "map": (["--x", "plant.m=-1%:1%", "--y", "plant.R=-1%:1%"], "ambjax.commands.case_map.study_of"),
-    "export": ([], "ambjax.commands.case_export.package.files"),
+    "export": ([], "ambjax.commands.case_export.package.package_files"),
     "tune": ([], "tuning.command.problem_of"),
 }
 

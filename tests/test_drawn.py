@@ -352,9 +352,7 @@ def test_a_histogram_is_of_all_members(log, drawn):
 
 
 def test_a_tornado_has_its_shares_and_intervals(drawn):
-    bars = [
-        Bar(f"spread.plant.{k}", share, share / 2, min(1.3 * share, 1), 0.0) for k, share in enumerate((0.2, 1.0, 0.05))
-    ]
+    bars = [Bar(f"plant.{k}", share, share / 2, min(1.3 * share, 1), 0.0) for k, share in enumerate((0.2, 1.0, 0.05))]
     tornado(bars, "rms_u_V", "", NOWHERE)
     (ax,) = drawn[0].axes
     names = [label.get_text() for label in ax.get_yticklabels()]

@@ -17,7 +17,7 @@ from ambjax.control.base import default_law, memory_of
 from ambjax.control.force import linear_mechanics
 from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand
 from ambjax.control.pid import PIDState
-from ambjax.control.search import SearchContext
+from ambjax.control.search import LowerBound, SearchContext
 from ambjax.numerics.records import validate
 from ambjax.numerics.smooth import smooth_sign
 from ambjax.world.amplifier import CurrentAmplifier
@@ -194,7 +194,13 @@ def test_output_is_finite_for_wild_states(stage, law):
             assert all(np.isfinite(x) for x in jax.tree.leaves(call(stage, law, TAME, signed)))
 
 
-SITE = SearchContext(MODEL, 500.0, 1e-4, {"Q_z": 0.1, "Q_i": 2.0, "Delta_1": 6e4}, (6e4, "Delta_1 along the reference"))
+SITE = SearchContext(
+    MODEL,
+    500.0,
+    1e-4,
+    {"Q_z": 0.1, "Q_i": 2.0, "Delta_1": 6e4},
+    LowerBound(6e4, "Delta_1", "along the reference"),
+)
 # sigma, v_tilde or e: the error of the stage; the last so large that any sign is saturated
 ERRORS = jnp.asarray([-1e9, -1e-3, 0.0, 1e-3, 1e9])
 
