@@ -19,7 +19,7 @@ from tuning.objective.limits import FRONT
 from tuning.objective.members import Members
 from tuning.search.course import Course, SearchResult
 from tuning.search.multipliers import holding, judged_members, judged_values, met, search_values
-from tuning.search.validation import validated
+from tuning.search.validation import largest_unseen, validated
 
 # Error limit of the knee, and those of the front in the order in which tune.front adds them, relative to the least.
 KNEE = 1.25
@@ -27,9 +27,9 @@ FACTORS = (KNEE, 1.1, 1.5, 1.05, 2.0)
 # Largest numbers of searches for a point, with an update of the multipliers or new members between two, and of answers
 # that are validated.
 UPDATES, TRIES = 6, 4
-# If the error of the judge exceeds the one that the search expects by more than the share RARE, the training ensemble
-# lacks the members of large errors, and the MOST_JOINING worst ones join it.
-RARE, MOST_JOINING = 0.1, 8
+# If the error of the judge exceeds the one that the search expects by more than this share, the training ensemble lacks
+# the members of large errors. The share is smaller than `validation.LARGER`, because the error is limited here.
+RARE = 0.1
 
 
 class FrontPoint(NamedTuple):
@@ -157,11 +157,9 @@ def _rare(course: Course, numbers: Sequence[tuple[float, float]], columns: Mappi
     )
     if not budget.validation or limit.holds(judged) or judged <= (1 + RARE) * limit.ratio * tuned:
         return None
-    seed, error = seeds(budget)[1], np.where(held(columns), columns["settled_rms_error_m"], -math.inf)
-    error[course.members.member[course.members.seed == seed]] = -math.inf
-    worst = np.argsort(-error, kind="stable")[:MOST_JOINING]
-    worst = worst[np.isfinite(error[worst])]
-    return problem.objective.chosen(seed, worst, len(error)) if worst.size else None
+    errors = np.where(held(columns), columns["settled_rms_error_m"], -math.inf)
+    worst = largest_unseen(course, errors)
+    return problem.objective.chosen(seeds(budget)[1], worst, len(errors)) if worst.size else None
 
 
 def _valid(course: Course, answer: SearchResult, seen: list[FrontPoint]) -> SearchResult:
@@ -174,7 +172,7 @@ def _valid(course: Course, answer: SearchResult, seen: list[FrontPoint]) -> Sear
         best = chosen(seen, KNEE) if knee else least_of(seen)
         if best is seen[0]:
             return answer
-        found, *_ = validated(course, best.x)
+        found = validated(course, best.x).result
         if found.good:
             return found
         say(f"the answer of {best.volts:.4g} V is not taken: it loses members, or accurate steps do not confirm it")
