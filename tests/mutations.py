@@ -951,6 +951,20 @@ SEARCH = [
         "tests/test_tuning_rounds.py::test_members_of_another_seed_with_large_errors_join_and_count",
     ),
     M(
+        "the tuner injects with the default amplitude",
+        "tuning/measured_peaks.py",
+        "amplitude=case.zones.amplitude",
+        "amplitude=None",
+        "tests/test_tuning_loops.py::test_injections_find_the_members_with_the_largest_measured_peak",
+    ),
+    M(
+        "the amplitude at the velocity sensor is that at the position sensor",
+        "ambjax/commands/sensitivity.py",
+        "float(amplitude) * float(case.scenario.plant.pole)",
+        "float(amplitude)",
+        "tests/test_sensitivity.py::test_the_injected_peak_stands_beside_the_linear_one",
+    ),
+    M(
         "the front measures from the first answer though a search finds a smaller error",
         "tuning/search/front.py",
         "least = min(point.error_m for point in fit)",

@@ -91,6 +91,7 @@ def test_the_picture_shows_the_response(tmp_path):
         ("[sensitivity]\nf_low = 3e3\n", [], "sensitivity.f_low = 3000: it must be below f_high"),
         ("[processor]\n[sensitivity]\nf_high = 6e3\n", [], "at most half the sampling rate, 5000 Hz"),
         ("[sensitivity]\nzone = 3\n", [], "zone_"),
+        ("[sensitivity]\namplitude = 0\n", [], "sensitivity.amplitude = 0: it must be a finite number above 0"),
         ("", ["--members", "5"], "all members of this case are the same"),
         ("[controller.position]\nk = 5.0\n[controller.model]\nm = 0.1\n", [], "no equilibrium at r = 0 m"),
     ],
@@ -157,6 +158,10 @@ def test_the_injected_peak_stands_beside_the_linear_one(tmp_path, capsys):
     assert "Injected at the velocity sensor into the simulation (multi-sine of 0.0265 m/s)" in out
     assert "|S| peaks at 2.712 at 40 Hz; the linear value there is 2.694." in out
     assert summary["injected_velocity_frequency_hz"] == 40.0
+    # half the amplitude, at both sensors: half the pole times the gap
+    _, out, _, _ = answered(tmp_path, capsys, f"{PROCESSOR}amplitude = 2.5e-5\n")
+    assert "Injected into the simulation (multi-sine of 2.5e-05 m)" in out
+    assert "Injected at the velocity sensor into the simulation (multi-sine of 0.0133 m/s)" in out
 
 
 def test_the_measured_members_are_counted_by_zone():

@@ -133,7 +133,7 @@ def test_injections_find_the_members_with_the_largest_measured_peak():
         "controller": {stage: law | {"p": math.inf} for stage, law in signs.items()},
         "processor": {"delay": 1.0},
         "sensor": {"std": 0.0},
-        "sensitivity": {"f_low": 20.0},
+        "sensitivity": {"f_low": 20.0, "amplitude": 2e-5},
         "spread": {"plant": {"m": {"percent": 30}}},
         "tune": DOCUMENT["tune"] | {"gains": PATHS[:1], "bounds": {}},
     }
@@ -152,6 +152,7 @@ def test_injections_find_the_members_with_the_largest_measured_peak():
             dataclasses.replace(case.scenario, plant=dataclasses.replace(case.scenario.plant, m=m)),
             clock,
             at,
+            amplitude=2e-5,
         )
         for m in masses
     ]

@@ -145,7 +145,8 @@ class _Judged(NamedTuple):
         cascade, scenario = objective.fixed(self.x, members)
         scenario = dataclasses.replace(scenario, seed=0, member=np.arange(len(numbers) * repetitions))
         clock = one_period(case)
-        return member_responses(cascade, scenario, clock, frequency_lines(case.zones, clock, peak))
+        lines = frequency_lines(case.zones, clock, peak)
+        return member_responses(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
 
 
 def _summary(number: int, analysis: Analysis | None, one: Injection | None) -> MeasuredPeak:

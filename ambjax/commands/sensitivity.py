@@ -70,7 +70,10 @@ def _injected(case: Case, peak: float, reading: Reading) -> Injection:
     """Inject at one sensor, over one period of the lines, which are denser near `peak` (Hz)."""
     clock, members = one_period(case), INJECTED if case.scenario.random else 1
     at = frequency_lines(case.zones, clock, peak)
-    return injected(case.cascade, case.scenario, clock, at, reading=reading, members=members)
+    amplitude = case.zones.amplitude
+    if amplitude is not None and reading == "z_dot":
+        amplitude = float(amplitude) * float(case.scenario.plant.pole)
+    return injected(case.cascade, case.scenario, clock, at, reading=reading, amplitude=amplitude, members=members)
 
 
 def _study(case: Case, args: argparse.Namespace) -> Study | None:

@@ -102,7 +102,7 @@ def _injection_text(point: OperatingPoint, measured: Injection, channel: int = 0
         text += (
             f" The supply limits u in {100 * measured.saturated:.2g} % of the samples, where the linear values do not"
         )
-        text += " apply."
+        text += " apply. A smaller sensitivity.amplitude measures the loop without this limit."
     return text
 
 

@@ -22,7 +22,7 @@ _matrices = jax.jit(loop_matrices, compiler_options={"xla_backend_optimization_l
 
 @record
 class Zones:
-    """Frequency range of the sensitivity, and limits of the zones A to D.
+    """Frequency range of the sensitivity, amplitude of its measurement, and limits of the zones A to D.
 
     The default limits are those of ISO 14839-3 (peak of |S|) and ISO 14839-2 (largest |z| as a share of the clearance),
     as secondary sources cite them.
@@ -36,6 +36,14 @@ class Zones:
         at_most=1e6,
         optional=True,
         doc="highest frequency; none: 2 kHz, or 0.45 of the sampling rate if that is lower",
+    )
+    amplitude: Scalar | None = leaf(
+        default=None,
+        unit="m",
+        above=0,
+        at_most=1,
+        optional=True,
+        doc="amplitude of the multi-sine of an injection; none: 1 % of the gap s_0",
     )
     zone_a: Scalar = leaf(
         default=3.0, unit="1", at_least=1, at_most=1e3, doc="upper limit of zone A for the peak of |S|"

@@ -103,7 +103,8 @@ def measured_peaks(case: Case, study: Study, peak: float) -> MemberPeaks:
     """Measure the peak of |S| of each member of the study by injection, at lines denser near `peak` (Hz)."""
     cascade, scenario = study.batch(np.arange(study.members))
     clock = one_period(case)
-    return injected_members(cascade, scenario, clock, frequency_lines(case.zones, clock, peak))
+    lines = frequency_lines(case.zones, clock, peak)
+    return injected_members(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
 
 
 def one_period(case: Case) -> Clock:

@@ -54,6 +54,11 @@ def section(found: Facts | None) -> list[str]:
         words.append("The larger of the linear and the injected peak decides.")
     else:
         words.append("In continuous time the linear peak decides; `ambjax sensitivity --inject` measures it.")
+    if any(row["saturated"] for row in found["members"]):
+        words.append(
+            "The supply limits the voltage during the injection, so the measured peak describes the limited loop. A "
+            "smaller `sensitivity.amplitude` measures the loop without this limit."
+        )
     return ["## Sensitivity", "", *markdown_table(head, cells), "", " ".join(words), ""]
 
 
