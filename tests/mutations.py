@@ -756,7 +756,7 @@ ENSEMBLE = [
 SEARCH = [
     M(
         "a steepness is tuned in continuous time too",
-        "tuning/config.py",
+        "tuning/gains_table.py",
         "    if cascade.processor is None:\n        return tunable(cascade, steepness=False)",
         "    if False:\n        return tunable(cascade, steepness=False)",
         "tests/test_tuning_space.py::test_a_processor_tunes_finite_steepnesses_by_default",
@@ -1902,7 +1902,7 @@ CHECK = [
     ),
     M(
         "an implicit step is as steep as its sign",
-        "ambjax/theorem/sampled_report.py",
+        "ambjax/theorem/slopes.py",
         "relaxed = 1 / (1 + 1 / slope) if slope else 0.0",
         "relaxed = slope",
         "tests/test_check_processor.py::test_an_implicit_step_is_no_steeper_than_one",
@@ -1937,7 +1937,7 @@ CHECK = [
     ),
     M(
         "a law beyond its limit decides nothing",
-        "ambjax/theorem/sampled_report.py",
+        "ambjax/theorem/slopes.py",
         "return self.stepped < self.limit",
         "return True",
         "tests/test_check_processor.py::test_an_implicit_step_is_no_steeper_than_one",

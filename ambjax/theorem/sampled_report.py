@@ -9,58 +9,33 @@ computes, and the largest difference between this signal and that of the plant. 
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, SupportsFloat
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.control.base import with_infinite_steepness
 from ambjax.control.cascade import Cascade
-from ambjax.control.cascade_state import CascadeState
-from ambjax.control.sampling import Sampling, band, disturbance, slope_limits
-from ambjax.control.schedule import extremes, schedules
+from ambjax.control.sampling import band, disturbance
+from ambjax.control.schedule import schedules
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import Outcome, System, prepare, roll
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
+from ambjax.theorem.slopes import SlopeCheck, sampling_of, slope_checks
 from ambjax.theorem.watched import Watched
 from ambjax.world.bearing import Bearing
 from ambjax.world.scenario import Scenario
 
 # Samples whose distances to the singular curve are computed together.
 BATCH = 4096
-# Stages whose output acts after the delay. Observers and inversion laws act on states of their own, without delay.
-DELAYED = ("position", "current")
 # Signal that the law of each stage drives to zero, and its unit.
 SIGNALS = {"position": ("sigma", "m/s"), "inversion": ("v_tilde", "A^2/m^2"), "current": ("e", "A")}
 # A voltage counts as alternating if the rms of (u_{n+1} - 2 u_n + u_{n-1})/4 is more than this share of the rms of u.
 # An oscillation at a sixth of the sampling rate has this share; white noise has 0.61.
 ALTERNATING = 0.25
-
-
-@dataclasses.dataclass(frozen=True)
-class SlopeCheck:
-    """Slope of a law times T, and the limits for stability and for no oscillation.
-
-    `slope`: slope times T. `stepped`: its effective value in the discrete step of the law. An explicit step does not
-    change it; an implicit step of a sign changes a = slope T to a/(1 + a), which is below both limits unless the law is
-    delayed. `limit`: the law is stable below it. `quiet`: the law does not oscillate below it.
-    """
-
-    stage: str
-    slope: float
-    stepped: float
-    limit: float
-    quiet: float
-    implicit: bool
-
-    @property
-    def holds(self) -> bool:
-        """Whether the law alone is stable."""
-        return self.stepped < self.limit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,36 +184,6 @@ def _without_noise(scenario: Scenario) -> Scenario:
     """Return the scenario without noise; the same object if it has none."""
     quiet = None if scenario.sensor is None else scenario.sensor.louder(0.0)
     return scenario if quiet in (None, scenario.sensor) else dataclasses.replace(scenario, sensor=quiet)
-
-
-def slope_checks(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
-    """Return slope times T and its limits for every law with a slope. `cascade`: of one member."""
-    sampling, lines = sampling_of(cascade, clock), []
-    for stage, law in zip(CascadeState._fields, map(with_infinite_steepness, cascade.laws), strict=True):
-        implicit = law.has_own_step(sampling.implicit)
-        ends = extremes(law)
-        slope = stepped = max(_steepest(one.slope(cascade.model)) for one in ends) * sampling.period
-        if implicit:
-            relaxed = 1 / (1 + 1 / slope) if slope else 0.0
-            rate = max(float(one.explicit_rate(cascade.model)) for one in ends)
-            stepped = max(relaxed, rate * sampling.period)
-        if slope:
-            lines.append(
-                SlopeCheck(stage, slope, stepped, *slope_limits(sampling.late if stage in DELAYED else 0.0), implicit)
-            )
-    return lines
-
-
-def _steepest(slope: SupportsFloat) -> float:
-    """Convert a slope to float; NaN, from infinities of a set-valued sign that cancel, becomes inf."""
-    return math.inf if math.isnan(float(slope)) else float(slope)
-
-
-def sampling_of(cascade: Cascade, clock: Clock) -> Sampling:
-    """Return the sampling of the laws of a cascade with a processor."""
-    processor: Any = cascade.on_processor().processor
-    late = float(processor.delay) - (float(processor.ahead) if processor.predicts else 0.0)
-    return Sampling(float(clock.sample_period), max(late, 0.0), processor.implicit)
 
 
 def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, rows: Any, noise: bool) -> list[Band]:
