@@ -134,7 +134,7 @@ LAWS = [
     M(
         "the tuner takes the limits of the case instead of the other's",
         "tuning/config.py",
-        "return kept | {key: value for key, value in other.items() if key not in LAWS_OWN}",
+        "return kept | {key: value for key, value in other.items() if key not in KEYS_OF_LAWS}",
         "return other | own",
         "tests/test_tuning_config.py::test_settings_are_those_of_another_case_but_for_its_gains",
     ),
@@ -946,7 +946,7 @@ SEARCH = [
     M(
         "members of rare large errors do not join",
         "tuning/search/front.py",
-        "more = _rare(course, numbers, columns)",
+        "more = _members_to_join(course, numbers, columns)",
         "more = None",
         "tests/test_tuning_front.py::test_members_of_rare_large_errors_join_the_search",
     ),
@@ -1107,8 +1107,8 @@ SEARCH = [
     M(
         "CMA-ES goes on where a descent has converged",
         "tuning/search/optimise.py",
-        "((rise < STEEP) & ((rise < phase.rise) | ~ended))",
-        "((rise < STEEP) & ~ended)",
+        "((norm < STEEP) & ((norm < phase.gradient_limit) | ~ended))",
+        "((norm < STEEP) & ~ended)",
         "tests/test_tuning_evolution.py::test_a_descent_that_has_converged_is_left_alone",
     ),
     M(
@@ -1119,7 +1119,7 @@ SEARCH = [
         "tests/test_tuning_evolution.py::test_a_valley_is_followed_whichever_way_it_lies",
     ),
     M(
-        "the populations of a checkpoint are begun again",
+        "the populations of a checkpoint are not restored",
         "tuning/search/checkpoint.py",
         "cma_states=drawn)",
         "cma_states=idle_states(starts, m))",
@@ -1607,8 +1607,8 @@ SAMPLED = [
     M(
         "a step on a processor does not end at the edges of a disturbance",
         "ambjax/simulation/between.py",
-        "status, None, observed, SHOWN, edges=edges)",
-        "status, None, observed, SHOWN)",
+        "status, None, observed, INSTANT_TREE, edges=edges)",
+        "status, None, observed, INSTANT_TREE)",
         "tests/test_sampled.py::test_against_the_independent_simulator[edges between samples]",
     ),
     M(

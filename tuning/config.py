@@ -32,18 +32,19 @@ from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.optimisers import NAMES
 from tuning.space import Space
 
-WORDS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
+# Keys of [tune] that are neither in NUMBERS nor in BUDGET.
+OTHER_KEYS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
 # Keys of [tune] that depend on the laws of the case.
-LAWS_OWN = ("gains", "bounds")
-# Ranges of the limits: LIMIT, except for those in SHARES. LENGTH: range of settling_band_m.
-LIMIT: dataclasses.Field = leaf(at_least=1e-12, at_most=1e12, infinite=True)
-SHARES: dict[str, dataclasses.Field] = {
+KEYS_OF_LAWS = ("gains", "bounds")
+# Allowed range of each limit: that in OTHER_RANGES, or LIMIT_RANGE. BAND_RANGE: that of settling_band_m.
+LIMIT_RANGE: dataclasses.Field = leaf(at_least=1e-12, at_most=1e12, infinite=True)
+OTHER_RANGES: dict[str, dataclasses.Field] = {
     "clearance_used": leaf(above=0, at_most=1),
     "survival": SURVIVAL,
     "sensitivity": leaf(at_least=1, at_most=1e12, infinite=True),
     "delay_margin_s": leaf(above=0, at_most=1e6, unit="s"),
 }
-LENGTH: dataclasses.Field = leaf(at_least=1e-12, at_most=1.0, unit="m")
+BAND_RANGE: dataclasses.Field = leaf(at_least=1e-12, at_most=1.0, unit="m")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,8 +69,8 @@ class Tune:
 
     - `space`: the gains to tune, with their bounds.
     - `weights`: of the terms of the loss, in the order of TERMS. `conditions`: weight of the conditions of Theorem 1.
-    - `margin`: share by which each gain is to exceed its condition.
-    - `early`: weight of errors before run.settle, relative to 1 after it.
+    - `margin`: share by which each gain should exceed its condition of Theorem 1.
+    - `early`: weight of errors before run.settle. Errors after it have the weight 1.
     - `stress`, `gain_margin`: factors on the noise and on each gain of the stressed members.
     - `learning_rate`: step size of an optimiser of optax.
     """
@@ -95,7 +96,7 @@ def read_tune(
 ) -> tuple[Case, Tune, dict[str, Any]]:
     """Return the case, [tune] and the raw document of a case file.
 
-    `settings_of`: a case file whose [tune] applies instead of the case's own, except for its gains and bounds. Raises
+    `settings_of`: a case file whose [tune] replaces that of the case, except for the keys `gains` and `bounds`. Raises
     ValueError, one line, for an invalid file.
     """
     raw, text = load(path)
@@ -110,16 +111,16 @@ def read_tune(
 
 
 def _merged(own: Any, other: Any) -> Any:
-    """Return the table [tune] `other` with the gains and bounds of `own`; `own` if either is no table."""
+    """Return [tune] of `other` with the gains and bounds of `own`. If one of them is not a table, return `own`."""
     if not (isinstance(own, dict) and isinstance(other, dict)):
         return own
-    kept = {key: value for key, value in own.items() if key in LAWS_OWN}
-    return kept | {key: value for key, value in other.items() if key not in LAWS_OWN}
+    kept = {key: value for key, value in own.items() if key in KEYS_OF_LAWS}
+    return kept | {key: value for key, value in other.items() if key not in KEYS_OF_LAWS}
 
 
 def tune_from(table: Table, case: Case) -> Tune:
     """Return [tune] of a case. Missing keys have defaults. Raises ValueError for an invalid table."""
-    table.only([*WORDS, *NUMBERS, *BUDGET])
+    table.only([*OTHER_KEYS, *NUMBERS, *BUDGET])
     budget = Budget(**{name: table.whole(name, field) for name, field in BUDGET.items()})
     weights, conditions = _weights(table.table("weights"))
     optimiser = table.choice("optimiser", list(NAMES), OPTIMISER)
@@ -153,7 +154,7 @@ def _weights(table: Table) -> tuple[tuple[float, ...], float]:
 
 def _limits(table: Table, case: Case) -> LimitSettings:
     table.only([*KINDS, "survival", "margin", "settling_band_m"])
-    thresholds = {name: table.leaf(name, SHARES.get(name, LIMIT)) for name in KINDS if name in table.raw}
+    thresholds = {name: table.leaf(name, OTHER_RANGES.get(name, LIMIT_RANGE)) for name in KINDS if name in table.raw}
     u_max, source = float(np.max(np.asarray(case.scenario.u_max))), dict.fromkeys(thresholds, table.path)
     if "rms_u_V" not in thresholds and math.isfinite(u_max):
         thresholds["rms_u_V"], source["rms_u_V"] = (
@@ -163,7 +164,7 @@ def _limits(table: Table, case: Case) -> LimitSettings:
     if "sensitivity" not in thresholds:
         thresholds["sensitivity"], source["sensitivity"] = float(case.zones.zone_a), "default, zone A of [sensitivity]"
     clearance = float(np.min(np.asarray(case.scenario.touchdown)))
-    band = table.leaf("settling_band_m", LENGTH, SETTLING_BAND * clearance)
+    band = table.leaf("settling_band_m", BAND_RANGE, SETTLING_BAND * clearance)
     if "settling_band_m" in table.raw and "settling_s" not in thresholds:
         raise ValueError(f"{table.at('settling_band_m')} applies only with {table.at('settling_s')}. Give both.")
     if band >= clearance:
@@ -173,7 +174,7 @@ def _limits(table: Table, case: Case) -> LimitSettings:
         )
     share = f"from {LEAST_MARGIN:g} to below 0.5"
     if not LEAST_MARGIN <= table.number("margin", LEAST_MARGIN, f"a number {share}") < 0.5:
-        raise ValueError(f"{table.at('margin')} = {table.raw['margin']:g}: it must be {share}, of each limit.")
+        raise ValueError(f"{table.at('margin')} = {table.raw['margin']:g}: it must be a share of each limit, {share}.")
     each = tuple(
         Limit(name, thresholds[name], source[name], table.number("margin", KINDS[name].margin))
         for name in sorted(thresholds)

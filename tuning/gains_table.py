@@ -25,7 +25,7 @@ def space_from(table: Table, case: Case) -> Space:
         raise ValueError(f'{table.at("gains")} = {show(paths)}: give a list of paths, as in ["controller.position.c"].')
     bounds = _flat(table.table("bounds").raw)
     stems = dict.fromkeys(path.rpartition(".")[0] for path in known if path.count(".") > 2)
-    whole = {stem: knots(case.cascade, stem) for stem in stems}  # the path of a scheduled gain names all of its knots
+    whole = {stem: knots(case.cascade, stem) for stem in stems}  # the path of a scheduled gain stands for all its knots
     paths = [one for path in paths for one in whole.get(path, [path])]
     bounds = {one: ends for path, ends in bounds.items() for one in whole.get(path, [path])}
     for path in [*paths, *bounds]:
@@ -42,9 +42,9 @@ def space_from(table: Table, case: Case) -> Space:
 
 
 def _default_gains(case: Case) -> list[str]:
-    """Return the gains to tune if tune.gains is left out: all gains, and on a processor the finite steepnesses.
+    """Return the default of tune.gains: all gains except steepnesses, and on a processor the finite steepnesses too.
 
-    In continuous time a steeper sign makes the equations stiffer, and the steepness is not searched unless it is named.
+    In continuous time a steeper sign makes the equations stiffer, so a steepness is tuned only if tune.gains names it.
     """
     cascade = case.cascade
     if cascade.processor is None:
@@ -53,7 +53,7 @@ def _default_gains(case: Case) -> list[str]:
 
 
 def _flat(raw: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested tables with dotted keys, because TOML reads controller.position.c = [1, 2] as nested tables."""
+    """Flatten nested tables to dotted keys. TOML reads controller.position.c = [1, 2] as nested tables."""
     flat: dict[str, Any] = {}
     for key, value in raw.items():
         flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}

@@ -3,7 +3,7 @@
 The first round searches with restarts. If the error of the integration steps at the optimum is too large, the search
 continues with finer steps. If a limit is not met, it continues with other multipliers. The answer is then validated.
 Validation members that are lost, and members that are lost with accurate steps, join the training ensemble for the next
-round. At the end the front of error against voltage is traced, if tune.objective or --pareto requires it.
+round. If tune.objective or --pareto requires it, the front of error against voltage is traced at the end.
 """
 
 import dataclasses
@@ -32,10 +32,11 @@ def rounds(
     """Tune from the gains `start` [m], SI units, and return the result.
 
     `out`: directory of the checkpoints. `facts`: settings that a checkpoint must match. `resume`: whether to continue
-    from the checkpoints. The result is the confirmed answer that loses the fewest members; without a confirmed answer,
-    an earlier point of the searches that accurate steps confirm, if there is one. If a front is traced, the result is
-    the answer that `trace_front` selects. Raises ValueError if the goal is not finite at any starting point, or if a
-    checkpoint belongs to another search.
+    from the checkpoints. The result is the confirmed answer that loses the fewest members. If no answer is confirmed,
+    it is an earlier point of the searches that accurate steps confirm, or, without such a point, the answer that loses
+    the fewest members. If a front is traced, the result is the answer that `trace_front` selects.
+
+    Raises ValueError if the goal is not finite at any starting point, or if a checkpoint belongs to another search.
     """
     budget, answers = problem.tune.budget, list[SearchResult]()
     course = Course(problem, training(problem), budget.seed, out, facts, resume)
@@ -69,7 +70,7 @@ def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepErro
     """Return coordinates [m] whose step error is small enough, and this error.
 
     The first candidate is `x`; the others are the results of searches that continue from it in finer steps. There are
-    at most MOST_HALVINGS such searches. The error of the last result is returned even if it is too large.
+    at most MOST_HALVINGS such searches. If the last step error is still too large, it is returned all the same.
     """
     while True:
         error = step_error(course.problem, x)
@@ -83,7 +84,7 @@ def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepErro
 
 
 def earlier_confirmed(course: Course, best: SearchResult) -> SearchResult:
-    """Return the first earlier point of the searches, best first, that is confirmed; `best` if there is none."""
+    """Return the best earlier point of the searches that is confirmed, or `best` if there is none."""
     say("accurate steps confirm none of the answers; earlier points of the searches are tried")
     for x in points_of(course.past):
         error = step_error(course.problem, x)

@@ -12,8 +12,8 @@ from tuning.search.course import Course, SearchResult
 
 # Largest number of lost members that join at once.
 MOST_JOINING = 16
-# Members that are lost with accurate steps join with the noise factor NOISE_GROWTH**number, because with their own
-# noise they are held in the steps of the search.
+# Members that are lost with accurate steps are held with the steps of the search. They therefore join with more noise,
+# by the factor NOISE_GROWTH**number in round number `number`.
 NOISE_GROWTH = 1.5
 
 
@@ -43,7 +43,8 @@ def joining(problem: TuningProblem, lost: np.ndarray, error: StepError, number: 
     """Return the members that join the training ensemble.
 
     The first of the `lost` validation members join with half of the additional noise of stressed members, which leaves
-    a margin. Members that are lost with accurate steps join with NOISE_GROWTH**number times the noise.
+    a margin. Members that are lost with accurate steps join with NOISE_GROWTH**number times their noise. `number`: of
+    the round, from 1.
     """
     budget = problem.tune.budget
     those = problem.objective.chosen(seeds(budget)[1], lost[:MOST_JOINING], budget.validation)
@@ -53,7 +54,10 @@ def joining(problem: TuningProblem, lost: np.ndarray, error: StepError, number: 
 
 
 def _lost(problem: TuningProblem, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the validation members lost at x [m], in order of loss, and of those with the largest peak."""
+    """Return the numbers of the validation members that are lost at x [m], and of those with the largest peak error.
+
+    The lost members are in the order in which they are lost.
+    """
     budget = problem.tune.budget
     count = budget.validation
     members = problem.objective.chosen(seeds(budget)[1], np.arange(count), count)
