@@ -19,8 +19,8 @@ from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.signals import Reference, reference_at
 
-# A state that exceeds its scale by this factor counts as diverged: the model is not valid there, and no number has
-# overflowed yet.
+# A state that exceeds its scale by this factor counts as diverged. The model is not valid for such a state, and no
+# number has overflowed yet.
 DIVERGENCE = 1e6
 
 
@@ -56,7 +56,7 @@ class Densities(NamedTuple):
     heat: Array
 
 
-# An Instant with the same structure as those of the loop.
+# An Instant with the structure of those that the loop records.
 INSTANT_TREE = Instant(Sizes(*[0.0] * 7), Densities(*[0.0] * 3))  # pyright: ignore[reportArgumentType]
 
 

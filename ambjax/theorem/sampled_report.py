@@ -1,9 +1,10 @@
 """Checks of a cascade on a processor: slopes of laws times T, the distance to the singular curve C, the rotor's status.
 
-Theorem 1 applies in continuous time, where sigma, v_tilde and e reach 0. With steps of length T they reach a band
-around 0. Two quantities are measured along a run: W, the largest disturbance of the rate of the signal that a law
-computes, and the largest difference between this signal and that of the plant. W gives the band of the computed signal
-(`control.sampling.band`); the band plus the difference bounds the plant's signal.
+Theorem 1 applies in continuous time, where sigma, v_tilde and e reach 0. With steps of length T they only reach a band
+around 0. A law computes its signal from an estimate, so the computed signal differs from that of the plant. Along a
+run, two numbers are measured for each signal: W, the largest disturbance of the rate of the computed signal, and the
+largest difference between the computed signal and that of the plant. The band of the computed signal follows from W
+(`control.sampling.band`). The band plus the difference bounds the signal of the plant.
 """
 
 import dataclasses
@@ -33,8 +34,8 @@ from ambjax.world.scenario import Scenario
 BATCH = 4096
 # Signal that the law of each stage drives to zero, and its unit.
 SIGNALS = {"position": ("sigma", "m/s"), "inversion": ("v_tilde", "A^2/m^2"), "current": ("e", "A")}
-# A voltage counts as alternating if the rms of (u_{n+1} - 2 u_n + u_{n-1})/4 is more than this share of the rms of u.
-# An oscillation at a sixth of the sampling rate has this share; white noise has 0.61.
+# The voltage alternates if the rms of (u_{n+1} - 2 u_n + u_{n-1})/4 is more than this share of the rms of u. The share
+# is 0.25 for an oscillation at a sixth of the sampling rate, and 0.61 for white noise.
 ALTERNATING = 0.25
 
 
@@ -46,7 +47,7 @@ class Band:
     from the estimate (with prediction: at the end of the delay). `seen`: largest magnitude of the plant's signal.
     `off`: largest difference of the two signals. `gain`: that of the law's sign. `disturbance`: W, the largest
     disturbance of the rate of the computed signal, per s. `band`: bound of `computed` for disturbances up to W; inf if
-    the gain does not exceed W. The last three are None for a law that is not a single sign.
+    the gain does not exceed W. `gain`, `disturbance` and `band` are None for a law that is not a single sign.
     """
 
     signal: str
@@ -70,11 +71,12 @@ class Band:
 class SampledReport:
     """Slopes and bands of a cascade on its processor, and the rotor's status under the case's noise.
 
-    `distance`: smallest distance of (z/s_0, i_ref/i_0) to the singular curve C at the samples (negative beyond C), and
-    its time (s). `alternating`: share of the voltage's rms that changes sign from sample to sample, without noise,
-    after `settle`; None if that run ends early. `bands`: of the runs that do not end early. `stalled`: whether the
-    integrator stalled at `lost_at`; the rotor's status is then unknown. `largest_z`: largest |z| (m) at the samples
-    after `settle`; None if the run ends early.
+    `bands`: of the runs that do not end early. `lost_at`: time at which the run with noise ends early, s; inf if it
+    does not. `lost_why`: the reason. `stalled`: whether the integrator stalled at `lost_at`; the rotor's status is then
+    unknown. `distance`: smallest distance of (z/s_0, i_ref/i_0) to the singular curve C at the samples (negative beyond
+    C), and its time (s). `alternating`: share of the voltage's rms that changes sign from sample to sample after
+    `settle`, in the run without noise; None if that run ends early. `largest_z`: largest |z| (m) at the samples after
+    `settle`, in the run with noise; None if that run ends early.
     """
 
     slopes: list[SlopeCheck]
@@ -98,11 +100,11 @@ class SampledReport:
 
 
 class Delays(NamedTuple):
-    """Result of runs with increasing delays (samples), `step` apart, from the delay of the case upwards.
+    """Result of runs whose delays increase in steps of `step` (samples), from the delay of the case on.
 
-    `held`: the rotor survives every delay up to this one. `lost`: it is lost at this delay; None if it survives every
-    delay. `undecided`: the smallest delay above `held` at which the integrator stalled, or None. If the rotor is lost
-    at the delay of the case, the delays start at 0; `held` is None if the rotor is lost there too.
+    `held`: the largest delay up to which the rotor survives every delay. `lost`: the delay at which it is lost first;
+    None if it survives every delay. `undecided`: the smallest delay above `held` at which the integrator stalled, or
+    None. If the rotor is lost at the delay of the case, the delays start at 0; if it is lost there too, `held` is None.
     """
 
     held: float | None
@@ -130,8 +132,8 @@ def check_sampled(
 ) -> SampledReport:
     """Return the report on a cascade with a processor, from two runs: without noise and with it.
 
-    `run` simulates a system; `ensemble.replay.record_system` has the rounding of `ambjax simulate`. `settle`: s.
-    Raises ValueError as `rollout` does.
+    `run`: function that simulates a system; `ensemble.replay.record_system` rounds as `ambjax simulate` does. `settle`:
+    s. Raises ValueError as `rollout` does.
     """
     loop, clock = prepare(cascade, scenario, clock)
     cascade, quiet = cascade.on_processor(), _without_noise(scenario)

@@ -19,9 +19,10 @@ DELAYED = ("position", "current")
 class SlopeCheck:
     """Slope of a law times T, and the limits for stability and for no oscillation.
 
-    `slope`: slope times T. `stepped`: its effective value in the discrete step of the law. An explicit step does not
-    change it; an implicit step of a sign changes a = slope T to a/(1 + a), which is below both limits unless the law is
-    delayed. `limit`: the law is stable below it. `quiet`: the law does not oscillate below it.
+    `slope`: slope times T. `stepped`: its effective value in the discrete step of the law. For an explicit step it
+    equals `slope`. For an implicit step of a sign it is a/(1 + a) with a = `slope`, which is below both limits unless
+    the law is delayed. `limit`: the law is stable if `stepped` is below it. `quiet`: the law does not oscillate if
+    `stepped` is below it.
     """
 
     stage: str
@@ -33,7 +34,7 @@ class SlopeCheck:
 
     @property
     def holds(self) -> bool:
-        """Whether the law alone is stable."""
+        """Whether the law, without the other laws, is stable."""
         return self.stepped < self.limit
 
 
@@ -56,7 +57,7 @@ def slope_checks(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
 
 
 def _steepest(slope: SupportsFloat) -> float:
-    """Convert a slope to float; NaN, from infinities of a set-valued sign that cancel, becomes inf."""
+    """Convert a slope to float. NaN, which results if infinite slopes of set-valued signs cancel, becomes inf."""
     return math.inf if math.isnan(float(slope)) else float(slope)
 
 
