@@ -792,8 +792,8 @@ SEARCH = [
     M(
         "the validation ensemble is never used",
         "tuning/search/validation.py",
-        "lost, worst = _lost(course.problem, x)",
-        "lost, worst = np.zeros(0, int), np.arange(1)",
+        'share = terms["survival"]',
+        'share = 0 * terms["survival"]',
         "tests/test_tuning_rounds.py::test_members_of_another_seed_that_are_lost_join_and_are_held",
     ),
     M(
@@ -935,6 +935,20 @@ SEARCH = [
         "order = alive[np.argsort(-size",
         "order = order[np.argsort(0 * size",
         "tests/test_tuning_loops.py::test_injections_find_the_members_with_the_largest_measured_peak",
+    ),
+    M(
+        "validation members of large errors do not join the search of least error",
+        "tuning/search/validation.py",
+        "> LARGER * _overall(training)",
+        "< 0 * _overall(training)",
+        "tests/test_tuning_rounds.py::test_members_of_another_seed_with_large_errors_join_and_count",
+    ),
+    M(
+        "validation members of large errors join as stressed members, whose errors do not count",
+        "tuning/search/rounds.py",
+        "course.members.joined(more, stressed=False)",
+        "course.members.joined(more)",
+        "tests/test_tuning_rounds.py::test_members_of_another_seed_with_large_errors_join_and_count",
     ),
     M(
         "the front measures from the first answer though a search finds a smaller error",

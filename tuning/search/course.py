@@ -51,6 +51,8 @@ class SearchResult:
     """number of lost validation members, plus the number of members that are lost with accurate steps"""
     seconds: float
     """duration of all searches, s, including the time before the search was resumed"""
+    validation_error: float = math.inf
+    """rms error of the validation members that are held, relative to s_0; inf if it was not computed"""
     front: tuple[Any, ...] = ()
     """points of the front of error against voltage (`front.FrontPoint`); empty if it was not traced"""
 
@@ -130,10 +132,13 @@ class Course:
         past = self.past[-1].history
         return int(past["lost"][-1][int(np.argmin(past["value"][-1]))]) == past["members"][-1]
 
-    def answer(self, x: np.ndarray, error: StepError | None, lost: int) -> SearchResult:
-        """Return the result at x [m]. `error`: step error at x, or None. `lost`: as in SearchResult."""
+    def answer(
+        self, x: np.ndarray, error: StepError | None, lost: int, validation_error: float = math.inf
+    ) -> SearchResult:
+        """Return the result at x [m]. `error`: step error at x, or None. The others are as in SearchResult."""
         seconds = time.perf_counter() - self.began + sum(progress.earlier for progress in self.past)
-        return SearchResult(self.problem, self.members, x, error, _joined(self.past), lost, seconds)
+        history = _joined(self.past)
+        return SearchResult(self.problem, self.members, x, error, history, lost, seconds, validation_error)
 
 
 def search_and_restart(course: Course, start: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from tuning.objective.limits import FRONT
 from tuning.objective.members import Members
 from tuning.search.course import Course, SearchResult
 from tuning.search.multipliers import holding, judged_members, judged_values, met, search_values
-from tuning.search.validation import validated
+from tuning.search.validation import largest_unseen, validated
 
 # Limits of the rms error relative to the least error: KNEE for the knee, FACTORS for the points of the front. The first
 # tune.front factors are used.
@@ -30,8 +30,9 @@ FACTORS = (KNEE, 1.1, 1.5, 1.05, 2.0)
 # Largest number of answers that are validated.
 MOST_SEARCHES_PER_POINT, MOST_VALIDATIONS = 6, 4
 # If the judge's error exceeds the error that the search expects by more than the share UNEXPECTED, the training
-# ensemble lacks members of large errors. Up to MOST_JOINING of the worst validation members then join it.
-UNEXPECTED, MOST_JOINING = 0.1, 8
+# ensemble lacks members of large errors. The share is smaller than `validation.LARGER`, because the error is limited
+# here.
+UNEXPECTED = 0.1
 
 
 class FrontPoint(NamedTuple):
@@ -158,11 +159,9 @@ def _members_to_join(
     )
     if not budget.validation or limit.holds(judged) or judged <= (1 + UNEXPECTED) * limit.ratio * tuned:
         return None
-    seed, error = seeds(budget)[1], np.where(held(columns), columns["settled_rms_error_m"], -math.inf)
-    error[course.members.member[course.members.seed == seed]] = -math.inf
-    worst = np.argsort(-error, kind="stable")[:MOST_JOINING]
-    worst = worst[np.isfinite(error[worst])]
-    return problem.objective.chosen(seed, worst, len(error)) if worst.size else None
+    errors = np.where(held(columns), columns["settled_rms_error_m"], -math.inf)
+    worst = largest_unseen(course, errors)
+    return problem.objective.chosen(seeds(budget)[1], worst, len(errors)) if worst.size else None
 
 
 def _validated_point(course: Course, answer: SearchResult, seen: list[FrontPoint]) -> SearchResult:
@@ -175,7 +174,7 @@ def _validated_point(course: Course, answer: SearchResult, seen: list[FrontPoint
         best = chosen(seen, KNEE) if knee else least_of(seen)
         if best is seen[0]:
             return answer
-        found, *_ = validated(course, best.x)
+        found = validated(course, best.x).result
         if found.good:
             return found
         say(f"the answer of {best.volts:.4g} V is rejected: it loses members, or accurate steps do not confirm it")

@@ -2,8 +2,9 @@
 
 The first round searches with restarts. If the error of the integration steps at the optimum is too large, the search
 continues with finer steps. If a limit is not met, it continues with other multipliers. The answer is then validated.
-Validation members that are lost, and members that are lost with accurate steps, join the training ensemble for the next
-round. If tune.objective or --pareto requires it, the front of error against voltage is traced at the end.
+These members join the training ensemble for the next round: validation members that are lost, members that are lost
+with accurate steps, and validation members with errors that the training members do not have. If tune.objective or
+--pareto requires it, the front of error against voltage is traced at the end.
 """
 
 import dataclasses
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.commands.outputs import say
+from tuning.config import seeds
 from tuning.judge import StepError, describe, step_error
 from tuning.problem import TuningProblem, problem_of
 from tuning.search.course import Course, SearchResult, points_of, search_and_restart, training
@@ -32,9 +34,10 @@ def rounds(
     """Tune from the gains `start` [m], SI units, and return the result.
 
     `out`: directory of the checkpoints. `facts`: settings that a checkpoint must match. `resume`: whether to continue
-    from the checkpoints. The result is the confirmed answer that loses the fewest members. If no answer is confirmed,
-    it is an earlier point of the searches that accurate steps confirm, or, without such a point, the answer that loses
-    the fewest members. If a front is traced, the result is the answer that `trace_front` selects.
+    from the checkpoints. The result is the confirmed answer that loses the fewest members; of several such answers, the
+    one of least error on the validation ensemble. If no answer is confirmed, the result is an earlier point of the
+    searches that accurate steps confirm, or, without such a point, the answer that loses the fewest members. If a front
+    is traced, the result is the answer that `trace_front` selects.
 
     Raises ValueError if the goal is not finite at any starting point, or if a checkpoint belongs to another search.
     """
@@ -48,22 +51,32 @@ def rounds(
         held = search_within_limits(course, x)
         if held is not x:
             x, error = held, None
-        answer, error, lost = validated(course, x, error)
+        answer, error, lost, large = validated(course, x, error)
         answers.append(answer)
-        if answer.good or course.interrupted or len(course.past) - course.limit_searches >= MOST_ROUNDS:
+        if (answer.good and not large.size) or course.interrupted or _is_exhausted(course):
             break
-        course.members = course.members.joined(joining(course.problem, lost, error, number))
-        say("lost members, and members lost with accurate steps, join the training ensemble; the search continues")
+        if answer.good:
+            more = course.problem.objective.chosen(seeds(budget)[1], large, budget.validation)
+            course.members = course.members.joined(more, stressed=False)
+            say("validation members of large errors join the training ensemble; the search continues")
+        else:
+            course.members = course.members.joined(joining(course.problem, lost, error, number))
+            say("lost members, and members lost with accurate steps, join the training ensemble; the search continues")
         x, _ = course.search(course.around(x))
     if not answers:
         return course.answer(x, None, budget.validation)
-    best = min(answers, key=lambda one: (not one.confirmed, one.lost))
+    best = min(answers, key=lambda one: (not one.confirmed, one.lost, one.validation_error))
     if not best.confirmed and not course.interrupted:
         best = earlier_confirmed(course, best)
     if problem.front and best.good and not course.interrupted:
         course.members = best.members
         best = trace_front(course, best)
     return dataclasses.replace(best, seconds=course.answer(x, None, 0).seconds)
+
+
+def _is_exhausted(course: Course) -> bool:
+    """Return whether MOST_ROUNDS searches are done. Those after an update of the multipliers do not count."""
+    return len(course.past) - course.limit_searches >= MOST_ROUNDS
 
 
 def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepError]:
@@ -89,7 +102,7 @@ def earlier_confirmed(course: Course, best: SearchResult) -> SearchResult:
     for x in points_of(course.past):
         error = step_error(course.problem, x)
         if not error.refuted:
-            answer, *_ = validated(course, x, error)
+            answer = validated(course, x, error).result
             if answer.good:
                 return answer
     return best

@@ -1,42 +1,97 @@
 """Validation of an answer on members that the search has not seen, and the members that join the search after it."""
 
+import math
+from typing import NamedTuple
+
 import jax
 import numpy as np
 
 from ambjax.commands.outputs import say
 from tuning.config import seeds
-from tuning.judge import StepError, comparison_members, describe, step_error, worst_of
+from tuning.judge import StepError, comparison_members, describe, rms, step_error, worst_of
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
 from tuning.search.course import Course, SearchResult
 
-# Largest number of lost members that join at once.
-MOST_JOINING = 16
+# Largest numbers of lost members, and of members of large errors, that join at once.
+MOST_LOST, MOST_LARGE = 16, 8
+# If the rms error of the validation members exceeds that of the training members by more than this factor, the training
+# ensemble lacks the members of large errors.
+LARGER = 1.5
 # Members that are lost with accurate steps are held with the steps of the search. They therefore join with more noise,
 # by the factor NOISE_GROWTH**number in round number `number`.
 NOISE_GROWTH = 1.5
 
 
-def validated(
-    course: Course, x: np.ndarray, error: StepError | None = None
-) -> tuple[SearchResult, StepError, np.ndarray]:
+class Validation(NamedTuple):
+    """Result of `validated`.
+
+    `result`: the answer. `error`: its step error. `lost`: numbers of the validation members that are lost, the earliest
+    loss first. `large`: numbers of those that join the training ensemble because of their large errors.
+    """
+
+    result: SearchResult
+    error: StepError
+    lost: np.ndarray
+    large: np.ndarray
+
+
+def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> Validation:
     """Judge x [m] on the validation ensemble, and on its worst members by accurate steps.
 
-    `error`: the step error at x, if it is known. Returns the result, the step error, and the numbers of the lost
-    validation members.
+    `error`: the step error at x, if it is known.
     """
-    budget = course.problem.tune.budget
-    error = step_error(course.problem, x) if error is None else error
+    problem, budget = course.problem, course.problem.tune.budget
+    error = step_error(problem, x) if error is None else error
     if course.interrupted or not budget.validation:
-        return course.answer(x, error, error.unseen), error, np.zeros(0, int)
-    lost, worst = _lost(course.problem, x)
-    if not lost.size and not error.refuted and not course.problem.sampled:
-        worst = course.problem.objective.chosen(seeds(budget)[1], worst, budget.validation)
-        error = step_error(course.problem, x, comparison_members(course.problem).joined(worst))
-        say(f"accurate steps, with the worst of {budget.validation} validation members: {describe(error)}")
+        return Validation(course.answer(x, error, error.unseen), error, np.zeros(0, int), np.zeros(0, int))
+    count = budget.validation
+    terms = _terms(problem, x, problem.objective.chosen(seeds(budget)[1], np.arange(count), count))
+    share = terms["survival"]
+    lost = np.argsort(-share, kind="stable")[: int((share > 0).sum())]
+    if not lost.size and not error.refuted and not problem.sampled:
+        worst = problem.objective.chosen(seeds(budget)[1], worst_of(terms["peak"]), count)
+        error = step_error(problem, x, comparison_members(problem).joined(worst))
+        say(f"accurate steps, with the worst of {count} validation members: {describe(error)}")
     if lost.size:
-        say(f"{lost.size} of {budget.validation} validation members are lost")
-    return course.answer(x, error, lost.size + error.unseen), error, lost
+        say(f"{lost.size} of {count} validation members are lost")
+    errors = _rms_errors(terms)
+    found = course.answer(x, error, lost.size + error.unseen, _overall(errors))
+    return Validation(found, error, lost, _large(course, x, errors))
+
+
+def largest_unseen(course: Course, errors: np.ndarray) -> np.ndarray:
+    """Return the numbers of the validation members of the largest errors that are not in the training ensemble.
+
+    `errors` [N]: of the validation members; -inf for a member that is lost. At most MOST_LARGE numbers.
+    """
+    members, seed = course.members, seeds(course.problem.tune.budget)[1]
+    errors = errors.copy()
+    errors[members.unstressed.member[members.unstressed.seed == seed]] = -math.inf
+    worst = np.argsort(-errors, kind="stable")[:MOST_LARGE]
+    return worst[np.isfinite(errors[worst])]
+
+
+def _large(course: Course, x: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Return `largest_unseen` if the rms of `errors` [N] exceeds that of the training members by LARGER, else none."""
+    training = _rms_errors(_terms(course.problem, x, course.members.unstressed))
+    return largest_unseen(course, errors) if _overall(errors) > LARGER * _overall(training) else np.zeros(0, int)
+
+
+def _terms(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:
+    """Return the terms of the loss by name, each [N], of members [N] at x [m]."""
+    return {name: values[0] for name, values in problem.engine.terms(x[None], members).items()}
+
+
+def _rms_errors(terms: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the rms errors [N] of the members, relative to s_0; -inf for a member that is lost."""
+    return np.where(terms["survival"] > 0, -math.inf, np.sqrt(terms["tracking"]))
+
+
+def _overall(errors: np.ndarray) -> float:
+    """Return the rms over the members that are held; inf if all are lost."""
+    held = errors[np.isfinite(errors)]
+    return rms(held) if held.size else math.inf
 
 
 def joining(problem: TuningProblem, lost: np.ndarray, error: StepError, number: int) -> Members:
@@ -47,20 +102,7 @@ def joining(problem: TuningProblem, lost: np.ndarray, error: StepError, number: 
     the round, from 1.
     """
     budget = problem.tune.budget
-    those = problem.objective.chosen(seeds(budget)[1], lost[:MOST_JOINING], budget.validation)
+    those = problem.objective.chosen(seeds(budget)[1], lost[:MOST_LOST], budget.validation)
     those = those._replace(noise_factor=those.noise_factor * (1 + problem.tune.stress) / 2)
     these = error.unheld._replace(noise_factor=error.unheld.noise_factor * NOISE_GROWTH**number)
     return jax.tree.map(lambda a, b: np.concatenate([a, b]), those, these)
-
-
-def _lost(problem: TuningProblem, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers of the validation members that are lost at x [m], and of those with the largest peak error.
-
-    The lost members are in the order in which they are lost.
-    """
-    budget = problem.tune.budget
-    count = budget.validation
-    members = problem.objective.chosen(seeds(budget)[1], np.arange(count), count)
-    terms = problem.engine.terms(x[None], members)
-    share = terms["survival"][0]
-    return np.argsort(-share, kind="stable")[: int((share > 0).sum())], worst_of(terms["peak"][0])
