@@ -134,7 +134,7 @@ LAWS = [
     M(
         "the tuner takes the limits of the case instead of the other's",
         "tuning/config.py",
-        "return kept | {key: value for key, value in other.items() if key not in LAWS_OWN}",
+        "return kept | {key: value for key, value in other.items() if key not in KEYS_OF_LAWS}",
         "return other | own",
         "tests/test_tuning_config.py::test_settings_are_those_of_another_case_but_for_its_gains",
     ),
@@ -756,7 +756,7 @@ ENSEMBLE = [
 SEARCH = [
     M(
         "a steepness is tuned in continuous time too",
-        "tuning/config.py",
+        "tuning/gains_table.py",
         "    if cascade.processor is None:\n        return tunable(cascade, steepness=False)",
         "    if False:\n        return tunable(cascade, steepness=False)",
         "tests/test_tuning_space.py::test_a_processor_tunes_finite_steepnesses_by_default",
@@ -974,7 +974,7 @@ SEARCH = [
     M(
         "members of rare large errors do not join",
         "tuning/search/front.py",
-        "more = _rare(course, numbers, columns)",
+        "more = _members_to_join(course, numbers, columns)",
         "more = None",
         "tests/test_tuning_front.py::test_members_of_rare_large_errors_join_the_search",
     ),
@@ -1135,8 +1135,8 @@ SEARCH = [
     M(
         "CMA-ES goes on where a descent has converged",
         "tuning/search/optimise.py",
-        "((rise < STEEP) & ((rise < phase.rise) | ~ended))",
-        "((rise < STEEP) & ~ended)",
+        "((norm < STEEP) & ((norm < phase.gradient_limit) | ~ended))",
+        "((norm < STEEP) & ~ended)",
         "tests/test_tuning_evolution.py::test_a_descent_that_has_converged_is_left_alone",
     ),
     M(
@@ -1147,7 +1147,7 @@ SEARCH = [
         "tests/test_tuning_evolution.py::test_a_valley_is_followed_whichever_way_it_lies",
     ),
     M(
-        "the populations of a checkpoint are begun again",
+        "the populations of a checkpoint are not restored",
         "tuning/search/checkpoint.py",
         "cma_states=drawn)",
         "cma_states=idle_states(starts, m))",
@@ -1635,8 +1635,8 @@ SAMPLED = [
     M(
         "a step on a processor does not end at the edges of a disturbance",
         "ambjax/simulation/between.py",
-        "status, None, observed, SHOWN, edges=edges)",
-        "status, None, observed, SHOWN)",
+        "status, None, observed, INSTANT_TREE, edges=edges)",
+        "status, None, observed, INSTANT_TREE)",
         "tests/test_sampled.py::test_against_the_independent_simulator[edges between samples]",
     ),
     M(
@@ -1930,7 +1930,7 @@ CHECK = [
     ),
     M(
         "an implicit step is as steep as its sign",
-        "ambjax/theorem/sampled_report.py",
+        "ambjax/theorem/slopes.py",
         "relaxed = 1 / (1 + 1 / slope) if slope else 0.0",
         "relaxed = slope",
         "tests/test_check_processor.py::test_an_implicit_step_is_no_steeper_than_one",
@@ -1965,7 +1965,7 @@ CHECK = [
     ),
     M(
         "a law beyond its limit decides nothing",
-        "ambjax/theorem/sampled_report.py",
+        "ambjax/theorem/slopes.py",
         "return self.stepped < self.limit",
         "return True",
         "tests/test_check_processor.py::test_an_implicit_step_is_no_steeper_than_one",

@@ -18,7 +18,7 @@ from ambjax.ensemble.delays import DELAYS, delay_margin
 from ambjax.extend import InversionLaw, record
 from ambjax.simulation.rollout import Outcome
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Trajectory
-from ambjax.theorem import advice, sampled_report
+from ambjax.theorem import advice, sampled_report, slopes
 from ambjax.theorem.sampled_report import Delays, SampledReport
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
@@ -175,14 +175,14 @@ def test_an_implicit_step_is_no_steeper_than_one():
     """a/(1 + a): stable unless the sign itself is a sample late."""
     hard, soft = cascade_of(*HARD, delay=1.0), cascade_of(*SOFT, delay=1.0, predict=False)
     late = dataclasses.replace(hard, processor=Processor(1.0, predict=False))
-    assert [slope.stepped for slope in sampled_report.slope_checks(hard, CLOCK)] == [1.0, 1.0, 1.0]
-    assert [slope.holds for slope in sampled_report.slope_checks(hard, CLOCK)] == [True, True, True]
-    assert [slope.holds for slope in sampled_report.slope_checks(late, CLOCK)] == [False, True, False]
-    for slope in sampled_report.slope_checks(soft, CLOCK):
+    assert [slope.stepped for slope in slopes.slope_checks(hard, CLOCK)] == [1.0, 1.0, 1.0]
+    assert [slope.holds for slope in slopes.slope_checks(hard, CLOCK)] == [True, True, True]
+    assert [slope.holds for slope in slopes.slope_checks(late, CLOCK)] == [False, True, False]
+    for slope in slopes.slope_checks(soft, CLOCK):
         assert slope.holds
         assert slope.stepped == pytest.approx(slope.slope / (1 + slope.slope))
     # what stays explicit in the position law, c T, may be all that is steep
-    (position, *_) = sampled_report.slope_checks(cascade_of(3e4, 25.0, 2e6, 2000.0, 25.0), CLOCK)
+    (position, *_) = slopes.slope_checks(cascade_of(3e4, 25.0, 2e6, 2000.0, 25.0), CLOCK)
     assert position.stepped == pytest.approx(3.0)
     assert not position.holds
 

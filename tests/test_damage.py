@@ -459,7 +459,7 @@ def test_a_damaged_checkpoint_is_begun_again_with_one_line(kind, checkpoint, des
     assert checkpoint.load(descent, STARTS, GAINS) is None
     err = capsys.readouterr().err
     assert err.startswith(f"{checkpoint.path}: ")
-    assert err.endswith("; round 2 is begun again\n")
+    assert err.endswith("; round 2 restarts\n")
     assert err.count("\n") == 1
     checkpoint.save(search_of(descent))
     assert checkpoint.load(descent, STARTS, GAINS) is not None

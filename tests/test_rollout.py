@@ -32,7 +32,7 @@ from ambjax.compiler.fast_path import one_kernel
 from ambjax.numerics.records import record, static
 from ambjax.simulation.explicit import Euler
 from ambjax.simulation.folds import Driven, Lowest, Named, Peak, Reaching, Rms, Variation
-from ambjax.simulation.loop import SHOWN
+from ambjax.simulation.loop import INSTANT_TREE
 from ambjax.simulation.span import blank
 from ambjax.simulation.trajectory import DIVERGED, TOUCHED, Row
 
@@ -51,7 +51,7 @@ class Spans:
     samples: int = static()
 
     def init(self):
-        return jnp.zeros((), int), jax.tree.map(lambda x: jnp.zeros(self.samples) + x, blank(SHOWN))
+        return jnp.zeros((), int), jax.tree.map(lambda x: jnp.zeros(self.samples) + x, blank(INSTANT_TREE))
 
     def update(self, carry, row, span):
         n, kept = carry

@@ -8,7 +8,7 @@ import pytest
 from texts import case_and_tune
 
 from ambjax.cases.tune_table import NUMBERS, WEIGHTS, Budget
-from tuning.config import LIMIT, SHARES, read_tune
+from tuning.config import LIMIT_RANGE, OTHER_RANGES, read_tune
 from tuning.objective.loss import TERMS
 from tuning.objective.quantities import KINDS
 from tuning.problem import problem_of
@@ -21,7 +21,7 @@ def parsed(tune):
 
 
 ENDS = NUMBERS | {f"weights.{name}": WEIGHTS[name] for name in [*TERMS, "conditions"]}
-ENDS |= {f"limits.{name}": SHARES.get(name, LIMIT) for name in [*KINDS, "survival"]}
+ENDS |= {f"limits.{name}": OTHER_RANGES.get(name, LIMIT_RANGE) for name in [*KINDS, "survival"]}
 
 
 @pytest.mark.parametrize("path", ENDS)

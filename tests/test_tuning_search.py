@@ -24,10 +24,10 @@ from tuning.objective.loss import TERMS, loss_for, weigh
 from tuning.objective.members import Objective
 from tuning.objective.risk import CVaR, Mean
 from tuning.objective.shortfalls import bounds
-from tuning.optimisers import CLIFF, NAMES, SHORTER, bfgs, optimiser
+from tuning.optimisers import BACKTRACK, JUMP, NAMES, bfgs, optimiser
 from tuning.problem import problem_of
 from tuning.search.checkpoint import CheckpointFile, SearchState
-from tuning.search.course import GAIN, MOST_SEARCHES, should_restart
+from tuning.search.course import LEAST_IMPROVEMENT, MOST_SEARCHES, should_restart
 from tuning.search.descent import Descent
 from tuning.search.optimise import _begin_full_phase, best_of, search
 from tuning.search.screen import FAR, NEAR, around, initial_points, screen
@@ -183,11 +183,11 @@ def test_a_refused_trial_of_bfgs_teaches_curvature():
 
     trial, state = tried(method.init(start), start, 0.5)
     np.testing.assert_allclose(trial, -0.2)
-    again, after = tried(state, trial, 0.5 + 0.9 * CLIFF)
+    again, after = tried(state, trial, 0.5 + 0.9 * JUMP)
     np.testing.assert_allclose(again, 0.0, atol=1e-12)
     assert (float(after.best[0]), float(after.value)) == (0.1, 0.5)
-    # a trial beyond a cliff, or with a loss that is not finite, only shortens the step, to a quarter
-    for value in (0.5 + 1.1 * CLIFF, np.nan):
+    # a trial beyond a jump, or with a loss that is not finite, only shortens the step, to a quarter
+    for value in (0.5 + 1.1 * JUMP, np.nan):
         np.testing.assert_allclose(tried(state, trial, value)[0], 0.1 - 0.3 / 4)
 
 
@@ -201,7 +201,7 @@ def test_every_optimiser_descends_and_steps_back(name):
     _, state = method.update(jnp.ones(2), method.init(best), best, value=jnp.asarray(0.3))
     for gradient, value in ((jnp.ones(2), np.inf), (jnp.asarray([1.0, np.nan]), 0.1)):
         step, after = method.update(gradient, state, trial, value=jnp.asarray(value))
-        np.testing.assert_allclose(trial + step, best + 0.4 * SHORTER)
+        np.testing.assert_allclose(trial + step, best + 0.4 * BACKTRACK)
         assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), after, state))
 
 
@@ -264,10 +264,10 @@ def test_the_neighbourhoods_are_there_and_no_larger():
 
 def test_looks_end_when_two_in_a_row_gain_little_or_at_their_number():
     assert should_restart([0.0])
-    assert should_restart([0.0, -0.5 * GAIN])  # one that gains nothing may be chance
-    assert not should_restart([0.0, -0.5 * GAIN, -0.8 * GAIN])
-    assert not should_restart([0.0, 1.0, -0.5 * GAIN])  # worse than what there was
-    assert should_restart([0.0, 1.0, -2 * GAIN])
+    assert should_restart([0.0, -0.5 * LEAST_IMPROVEMENT])  # one that gains nothing may be chance
+    assert not should_restart([0.0, -0.5 * LEAST_IMPROVEMENT, -0.8 * LEAST_IMPROVEMENT])
+    assert not should_restart([0.0, 1.0, -0.5 * LEAST_IMPROVEMENT])  # worse than what there was
+    assert should_restart([0.0, 1.0, -2 * LEAST_IMPROVEMENT])
     assert should_restart([0.0, 1.0, -1.0, -1.0])
     assert not should_restart([0.0, -1.0, -1.0, -1.0])
     gaining = [-float(n) for n in range(MOST_SEARCHES)]
@@ -349,7 +349,7 @@ def test_a_search_whose_checkpoint_was_damaged_is_the_uninterrupted_one(small, t
     again = run(small, checkpoint_file=checkpoint_file, resume=True)
     said = capsys.readouterr().err
     assert said.startswith(f"{checkpoint_file.path}: ")
-    assert said.endswith("; round 3 is begun again\n")
+    assert said.endswith("; round 3 restarts\n")
     for a, b in zip(jax.tree.leaves(whole.starts), jax.tree.leaves(again.starts), strict=True):
         np.testing.assert_array_equal(a, b)
     assert run(small, checkpoint_file=checkpoint_file, resume=True).ended
@@ -542,7 +542,7 @@ def test_a_killed_tuning_goes_on_and_damage_is_found(tmp_path):
     first.write_bytes(first.read_bytes()[:-200])
     done = command(path, "--out", out, "--resume")
     assert done.returncode == 0, done.stderr
-    assert f"{first}: it is an incomplete archive; round 1 is begun again\n" in done.stderr
+    assert f"{first}: it is an incomplete archive; round 1 restarts\n" in done.stderr
     assert (out / "tuned.toml").read_bytes() == (whole / "tuned.toml").read_bytes()
     # a finished search is judged again, with a message; a different search is refused, with the difference
     again = command(path, "--out", whole, "--resume")
@@ -556,7 +556,7 @@ def test_a_killed_tuning_goes_on_and_damage_is_found(tmp_path):
     old = len(list(whole.glob("checkpoint-*.npz")))
     assert "--force" in command(path, "--out", whole).stderr
     fresh = command(path, "--out", whole, "--force")
-    assert f"{whole}: {old} checkpoints of an earlier search are removed\n" in fresh.stderr
+    assert f"{whole}: removed {old} checkpoints of an earlier search\n" in fresh.stderr
     assert command(path, "--out", whole, "--resume").returncode == fresh.returncode
 
 

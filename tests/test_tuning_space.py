@@ -27,7 +27,7 @@ from ambjax import (
 )
 from ambjax.cases.template_text import template
 from ambjax.simulation.folds import Rms
-from ambjax.simulation.loop import SHOWN, Densities
+from ambjax.simulation.loop import INSTANT_TREE, Densities
 from ambjax.simulation.span import blank
 from ambjax.theorem.conditions import delta_1_on_reference
 from tuning.config import read_tune
@@ -190,7 +190,9 @@ def test_tracking_is_the_settled_mean_square():
 def test_terms_have_no_dimension():
     """Lengths of another unit, with volts as they are: nothing but tracking's own ratio enters."""
     row, found = rollout(SMOOTH, TRACKING, CLOCK).trajectory.rows, []
-    span = blank(SHOWN)._replace(time=jnp.asarray(1e-4), densities=Densities(*map(jnp.asarray, (10.0, 400.0, 5.0))))
+    span = blank(INSTANT_TREE)._replace(
+        time=jnp.asarray(1e-4), densities=Densities(*map(jnp.asarray, (10.0, 400.0, 5.0)))
+    )
     for factor in (1.0, 1000.0):
         fold = Loss(0.01, 0.0, jnp.asarray(5e-3 * factor), 200.0, jnp.asarray(4.5e-3 * factor))
         scaled = row._replace(**{name: factor * getattr(row, name) for name in ("z", "z_dot", "r")})

@@ -16,7 +16,7 @@ import tuning.search.validation
 from ambjax.cases.reader import case_from
 from tuning.__main__ import main
 from tuning.judge import NEGLIGIBLE, StepError, comparison_members, describe, step_error, worst_of
-from tuning.optimisers import Retreat
+from tuning.optimisers import FirstOrderState
 from tuning.problem import REFERENCE_MEMBERS
 from tuning.search.checkpoint import SearchState
 from tuning.search.descent import Starts
@@ -152,7 +152,7 @@ def searched(engine, goal, members, points, **rest):
     """A replacement of a search: the first point is the answer, the others are earlier points."""
     count = min(len(points), 8)
     x, value = np.array(points[:count]), np.arange(float(count)) / 100
-    starts = Starts(x, Retreat(x, value, None), value, value)
+    starts = Starts(x, FirstOrderState(x, value, None), value, value)
     rows = {"x": [x], "value": [value], "lost": [np.zeros(count)], "members": [np.array(len(members.member))]}
     return SearchState(starts, np.zeros(count, bool), rows, iteration=1)
 

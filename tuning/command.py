@@ -32,12 +32,12 @@ from tuning.search.rounds import rounds
 from tuning.space import Gain, Space, tunable
 
 WRITTEN = ("tuned.toml", "history.npz", "report.html", "report.md", "report.json")
-# Written last: a search has ended if none of its checkpoints is newer than this file.
+# This file is written last: if none of the checkpoints is newer, the search has ended.
 REPORT = "report.json"
 
 
 class TuningPlan(NamedTuple):
-    """A tuning whose input is valid.
+    """The checked input of a tuning.
 
     `raw`: content of the case file. `problem`: the tuning problem. `start`: initial gains [m], SI units. `out`: output
     directory.
@@ -71,7 +71,7 @@ def _plan(args: argparse.Namespace) -> TuningPlan:
     if args.resume and not can_resume(pathlib.Path(args.out)):
         raise ValueError(f"--resume: --out {args.out} contains no search. Check --out, or leave out --resume.")
     print_warnings(case, args.case)
-    if args.page:  # refuse it before the search
+    if args.page:  # raises ValueError now, before the search, if the case cannot have a page
         sliders_page(case, (), args.case)
     try:
         problem = problem_of(case, tune, front=args.pareto)
@@ -117,14 +117,14 @@ def _clear(out: pathlib.Path, force: bool) -> None:
     """
     if not force and has_unfinished_search(out, REPORT):
         raise ValueError(
-            f"--out {out}: it holds a search that has not ended. Continue it with --resume, discard it with --force, "
-            "or choose another directory."
+            f"--out {out}: it contains a search that has not ended. Continue it with --resume, discard it with "
+            "--force, or choose another directory."
         )
     if not force:
         check_new(out, WRITTEN)
     left = remove_all(out)
     if left:
-        say(f"{out}: {left} checkpoints of an earlier search are removed")
+        say(f"{out}: removed {left} checkpoints of an earlier search")
 
 
 def _kept(out: pathlib.Path) -> str:
@@ -135,7 +135,7 @@ def _kept(out: pathlib.Path) -> str:
 
 
 def _write(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts, slices: Slices) -> None:
-    """Write all files into the temporary folder `part`, from which they move to `out`.
+    """Write all files into the temporary folder `part`. The caller moves them to `out`.
 
     The text of tuned.toml is read back first, to check that it is a valid case.
     """
@@ -200,7 +200,7 @@ def _laws(problem: TuningProblem, tuned: dict[str, float]) -> dict[str, float]:
 
 
 def _print(out: pathlib.Path, facts: TuningFacts, names: Sequence[str], *, quiet: bool) -> None:
-    """Print the verdict, the gains and the files (not if `quiet`), and the advice if a requirement is not met."""
+    """Print the verdict, the gains and the files unless `quiet`. If a requirement is not met, print the advice too."""
     if not quiet:
         print(facts.verdict)
         for row in facts.gains:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.reader import Case, case_from, load
-from ambjax.cases.table import Table, one_line, show
+from ambjax.cases.table import Table, one_line
 from ambjax.cases.tune_table import (
     ALPHA,
     BUDGET,
@@ -23,27 +23,28 @@ from ambjax.cases.tune_table import (
     WEIGHTS,
     Budget,
 )
-from ambjax.ensemble.spread import no_such_number
-from ambjax.extend import GAINS, leaf
+from ambjax.extend import leaf
+from tuning.gains_table import space_from
 from tuning.objective.limits import LEAST_MARGIN, Limit
 from tuning.objective.loss import TERMS
 from tuning.objective.quantities import KINDS
 from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.optimisers import NAMES
-from tuning.space import CLOSEST, Gain, Space, knots, read, tunable
+from tuning.space import Space
 
-WORDS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
+# Keys of [tune] that are neither in NUMBERS nor in BUDGET.
+OTHER_KEYS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
 # Keys of [tune] that depend on the laws of the case.
-LAWS_OWN = ("gains", "bounds")
-# Ranges of the limits: LIMIT, except for those in SHARES. LENGTH: range of settling_band_m.
-LIMIT: dataclasses.Field = leaf(at_least=1e-12, at_most=1e12, infinite=True)
-SHARES: dict[str, dataclasses.Field] = {
+KEYS_OF_LAWS = ("gains", "bounds")
+# Allowed range of each limit: that in OTHER_RANGES, or LIMIT_RANGE. BAND_RANGE: that of settling_band_m.
+LIMIT_RANGE: dataclasses.Field = leaf(at_least=1e-12, at_most=1e12, infinite=True)
+OTHER_RANGES: dict[str, dataclasses.Field] = {
     "clearance_used": leaf(above=0, at_most=1),
     "survival": SURVIVAL,
     "sensitivity": leaf(at_least=1, at_most=1e12, infinite=True),
     "delay_margin_s": leaf(above=0, at_most=1e6, unit="s"),
 }
-LENGTH: dataclasses.Field = leaf(at_least=1e-12, at_most=1.0, unit="m")
+BAND_RANGE: dataclasses.Field = leaf(at_least=1e-12, at_most=1.0, unit="m")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,8 +69,8 @@ class Tune:
 
     - `space`: the gains to tune, with their bounds.
     - `weights`: of the terms of the loss, in the order of TERMS. `conditions`: weight of the conditions of Theorem 1.
-    - `margin`: share by which each gain is to exceed its condition.
-    - `early`: weight of errors before run.settle, relative to 1 after it.
+    - `margin`: share by which each gain should exceed its condition of Theorem 1.
+    - `early`: weight of errors before run.settle. Errors after it have the weight 1.
     - `stress`, `gain_margin`: factors on the noise and on each gain of the stressed members.
     - `learning_rate`: step size of an optimiser of optax.
     """
@@ -95,7 +96,7 @@ def read_tune(
 ) -> tuple[Case, Tune, dict[str, Any]]:
     """Return the case, [tune] and the raw document of a case file.
 
-    `settings_of`: a case file whose [tune] applies instead of the case's own, except for its gains and bounds. Raises
+    `settings_of`: a case file whose [tune] replaces that of the case, except for the keys `gains` and `bounds`. Raises
     ValueError, one line, for an invalid file.
     """
     raw, text = load(path)
@@ -110,23 +111,23 @@ def read_tune(
 
 
 def _merged(own: Any, other: Any) -> Any:
-    """Return the table [tune] `other` with the gains and bounds of `own`; `own` if either is no table."""
+    """Return [tune] of `other` with the gains and bounds of `own`. If one of them is not a table, return `own`."""
     if not (isinstance(own, dict) and isinstance(other, dict)):
         return own
-    kept = {key: value for key, value in own.items() if key in LAWS_OWN}
-    return kept | {key: value for key, value in other.items() if key not in LAWS_OWN}
+    kept = {key: value for key, value in own.items() if key in KEYS_OF_LAWS}
+    return kept | {key: value for key, value in other.items() if key not in KEYS_OF_LAWS}
 
 
 def tune_from(table: Table, case: Case) -> Tune:
     """Return [tune] of a case. Missing keys have defaults. Raises ValueError for an invalid table."""
-    table.only([*WORDS, *NUMBERS, *BUDGET])
+    table.only([*OTHER_KEYS, *NUMBERS, *BUDGET])
     budget = Budget(**{name: table.whole(name, field) for name, field in BUDGET.items()})
     weights, conditions = _weights(table.table("weights"))
     optimiser = table.choice("optimiser", list(NAMES), OPTIMISER)
     numbers = {name: table.leaf(name, field, field.default) for name, field in NUMBERS.items()}
     return Tune(
         objective=table.choice("objective", list(OBJECTIVES), OBJECTIVES[0]),
-        space=_space(table, case),
+        space=space_from(table, case),
         weights=weights,
         limits=_limits(table.table("limits"), case),
         conditions=conditions,
@@ -136,60 +137,6 @@ def tune_from(table: Table, case: Case) -> Tune:
         budget=budget,
         **numbers,
     )
-
-
-def _space(table: Table, case: Case) -> Space:
-    known = tunable(case.cascade)
-    default = _default_gains(case) or known
-    paths = table.raw.get("gains", default)
-    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
-        raise ValueError(f'{table.at("gains")} = {show(paths)}: give a list of paths, as in ["controller.position.c"].')
-    bounds = _flat(table.table("bounds").raw)
-    stems = dict.fromkeys(path.rpartition(".")[0] for path in known if path.count(".") > 2)
-    whole = {stem: knots(case.cascade, stem) for stem in stems}  # the path of a scheduled gain names all of its knots
-    paths = [one for path in paths for one in whole.get(path, [path])]
-    bounds = {one: ends for path, ends in bounds.items() for one in whole.get(path, [path])}
-    for path in [*paths, *bounds]:
-        if path not in known:
-            key = "gains" if path in paths else "bounds"
-            raise ValueError(f"{table.at(key)}: '{path}': {no_such_number(path, known, 'to tune in this case')}")
-    for path in bounds:
-        if path not in paths:
-            raise ValueError(f"{table.at('bounds')}: {path} is not in tune.gains. Add it there or leave it out here.")
-    clash = [path for path in paths if path in case.spread.paths]
-    if clash:
-        raise ValueError(f"spread.{clash[0]} is in tune.gains too. Remove it from one of them.")
-    return Space(tuple(Gain(path, *_bound(bounds.get(path), path, table)) for path in paths))
-
-
-def _default_gains(case: Case) -> list[str]:
-    """Return the gains to tune if tune.gains is left out: all gains, and on a processor the finite steepnesses.
-
-    In continuous time a steeper sign makes the equations stiffer, and the steepness is not searched unless it is named.
-    """
-    cascade = case.cascade
-    if cascade.processor is None:
-        return tunable(cascade, steepness=False)
-    return [path for path in tunable(cascade) if math.isfinite(float(np.max(np.asarray(read(cascade, path)))))]
-
-
-def _flat(raw: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested tables with dotted keys, because TOML reads controller.position.c = [1, 2] as nested tables."""
-    flat: dict[str, Any] = {}
-    for key, value in raw.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return flat
-
-
-def _bound(raw: Any, path: str, table: Table) -> tuple[float, float]:
-    if raw is None:
-        return 0.0, math.inf
-    pair = isinstance(raw, list) and len(raw) == 2 and all(type(x) in (int, float) for x in raw)
-    ends = pair and 0 <= raw[0] <= GAINS[1] and (raw[1] <= GAINS[1] or raw[1] == math.inf)
-    if not ends or not (1 + CLOSEST) * raw[0] < raw[1]:
-        words = f"give [low, high] with 0 <= low < high <= {GAINS[1]:g} and high above {1 + CLOSEST:.7g} times low"
-        raise ValueError(f"{table.at('bounds')}.{path} = {show(raw)}: {words}; inf means no upper bound.")
-    return float(raw[0]), float(raw[1])
 
 
 def _weights(table: Table) -> tuple[tuple[float, ...], float]:
@@ -207,7 +154,7 @@ def _weights(table: Table) -> tuple[tuple[float, ...], float]:
 
 def _limits(table: Table, case: Case) -> LimitSettings:
     table.only([*KINDS, "survival", "margin", "settling_band_m"])
-    thresholds = {name: table.leaf(name, SHARES.get(name, LIMIT)) for name in KINDS if name in table.raw}
+    thresholds = {name: table.leaf(name, OTHER_RANGES.get(name, LIMIT_RANGE)) for name in KINDS if name in table.raw}
     u_max, source = float(np.max(np.asarray(case.scenario.u_max))), dict.fromkeys(thresholds, table.path)
     if "rms_u_V" not in thresholds and math.isfinite(u_max):
         thresholds["rms_u_V"], source["rms_u_V"] = (
@@ -217,7 +164,7 @@ def _limits(table: Table, case: Case) -> LimitSettings:
     if "sensitivity" not in thresholds:
         thresholds["sensitivity"], source["sensitivity"] = float(case.zones.zone_a), "default, zone A of [sensitivity]"
     clearance = float(np.min(np.asarray(case.scenario.touchdown)))
-    band = table.leaf("settling_band_m", LENGTH, SETTLING_BAND * clearance)
+    band = table.leaf("settling_band_m", BAND_RANGE, SETTLING_BAND * clearance)
     if "settling_band_m" in table.raw and "settling_s" not in thresholds:
         raise ValueError(f"{table.at('settling_band_m')} applies only with {table.at('settling_s')}. Give both.")
     if band >= clearance:
@@ -227,7 +174,7 @@ def _limits(table: Table, case: Case) -> LimitSettings:
         )
     share = f"from {LEAST_MARGIN:g} to below 0.5"
     if not LEAST_MARGIN <= table.number("margin", LEAST_MARGIN, f"a number {share}") < 0.5:
-        raise ValueError(f"{table.at('margin')} = {table.raw['margin']:g}: it must be {share}, of each limit.")
+        raise ValueError(f"{table.at('margin')} = {table.raw['margin']:g}: it must be a share of each limit, {share}.")
     each = tuple(
         Limit(name, thresholds[name], source[name], table.number("margin", KINDS[name].margin))
         for name in sorted(thresholds)

@@ -58,9 +58,10 @@ def rms(values: np.ndarray) -> float:
 class StepError(NamedTuple):
     """Comparison of coarse steps, those of the search or of the judge, with accurate ones.
 
-    `search_m`, `reference_m` (m): settled rms error by either, over the `members` held by both. `relative`: its
-    relative error, NaN without such members. `tried`: number of members compared. `lost`, `stalled`: number of members
-    that are held by coarse steps, but lost, or stalled, by accurate ones. `unheld`: these members.
+    `search_m`, `reference_m` (m): settled rms errors with coarse and with accurate steps, over the `members` that are
+    held with both. `relative`: relative difference of these errors, NaN without such members. `tried`: number of
+    members compared. `lost`, `stalled`: number of members that are held with coarse steps, but lost or stalled with
+    accurate ones. `unheld`: these members.
     """
 
     search_m: float
@@ -76,7 +77,7 @@ class StepError(NamedTuple):
 
     @property
     def unseen(self) -> int:
-        """Number of members that coarse steps hold and accurate steps do not."""
+        """Number of members that are held with coarse steps but not with accurate ones."""
         return self.lost + self.stalled
 
     @property
@@ -127,7 +128,7 @@ def worst_of(values: np.ndarray) -> np.ndarray:
 
 
 def step_error(problem: TuningProblem, x: np.ndarray, members: Members | None = None) -> StepError:
-    """Compare the search's steps with accurate ones at x [m], on `members` (default: those of `compared`)."""
+    """Compare the search's steps with accurate ones at x [m], on `members` (default: `comparison_members`)."""
     members = comparison_members(problem) if members is None else members
     ours, theirs = (metrics_of(engine, x, members) for engine in problem.steps)
     return compare_metrics(problem, ours, theirs, members)
@@ -163,9 +164,9 @@ def held(metrics: Mapping[str, np.ndarray]) -> np.ndarray:
 def summarise(metrics: dict[str, np.ndarray]) -> dict[str, Any]:
     """Return the statistics of an ensemble [N] for the report: statuses, survival, and metrics over members.
 
-    The status of a member whose integration stalled is unknown: it counts neither as lost nor as held, and not as a
-    survivor. Metrics include held members only, because the voltage and current of a lost rotor are 0. They are absent
-    if no member is held.
+    The status of a member whose integration stalled is unknown: the member counts neither as lost nor as held, and not
+    as a survivor. Metrics include only held members, because the voltage and current of a lost rotor are 0. If no
+    member is held, the summary has no metrics.
     """
     alive, n = held(metrics), len(metrics["lost_at_s"])
     survival = wilson(int(alive.sum()), n)

@@ -18,10 +18,11 @@ from ambjax.results.operating import one_period
 from tuning.objective.limits import PREFIX, Limit
 from tuning.problem import TuningProblem
 
-# Members of an ensemble, those with the largest peak, into which is injected; repetitions with other noise.
+# Number of members, those with the largest peaks, that are measured by injection, and number of repetitions of each
+# measurement with different noise.
 INJECTED, REPETITIONS = 3, 8
-# Members, the first ones, that are measured once to find those with the largest peak, if injections decide. Linear
-# peaks do not tell which these are. One call computes as many in the time of one.
+# If only injections decide, the linear peaks do not show which members have the largest peaks. The first SCREENED
+# members are then measured once each. One call measures all of them in the time of one member.
 SCREENED = 64
 # Limited quantities that an injection measures.
 MEASURED = {"sensitivity": "S", "complementary": "T", "control_sensitivity": "KS"}
@@ -58,12 +59,12 @@ class Sensitivity(NamedTuple):
 
 
 def injects(problem: TuningProblem) -> bool:
-    """Return whether the limits need an injection: they limit what it measures, and the laws run on a processor."""
+    """Return whether a limit concerns a quantity that injections measure. The laws must run on a processor."""
     return problem.sampled and any(limit.name in MEASURED for limit in problem.limits)
 
 
 def decides(problem: TuningProblem) -> bool:
-    """Return whether the injection decides alone: a sign is set-valued, so that no linear loop describes chattering."""
+    """Return whether only injections decide: if a sign is set-valued, no linear loop describes its chattering."""
     return injects(problem) and any(set_valued_signs(getattr(problem.case.cascade, stage)) for stage in USUAL)
 
 

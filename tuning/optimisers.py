@@ -1,7 +1,7 @@
 """Optimisers by name, as optax transformations: optax's first-order methods, and a BFGS for a few gains.
 
-`update(gradient, state, x, value=...)` receives the value at the trial x. The state holds the best point so far and its
-value. After a rejected trial the next one starts from the best point.
+`update(gradient, state, x, value=...)` receives the value and the gradient at x, the point of the last trial. The state
+contains the best point so far and its value. After a rejected trial, the next step starts at the best point.
 """
 
 from collections.abc import Callable
@@ -29,17 +29,19 @@ FIRST_ORDER: dict[str, Callable[[float], optax.GradientTransformation]] = {
 }
 NAMES = (BFGS, *FIRST_ORDER)
 
-# Longest step of the BFGS (1: a factor e of one gain), and the first step, taken before an estimate of the curvature.
-LONGEST, FIRST = 1.0, 0.3
-# A rejected trial reduces the trust radius to this share of its step: HALF, or QUARTER beyond a cliff.
-HALF, QUARTER = 0.5, 0.25
-# A trial is beyond a cliff if its value, a logarithm, exceeds the best by more than this.
-CLIFF = 1.0
-# A rejected step of a first-order optimiser is repeated at this share of its length.
-SHORTER = 0.25
+# Trust radius of the BFGS: the largest (1: a factor e of one gain), and that of the first step, which is taken without
+# an estimate of the curvature.
+LARGEST_RADIUS, FIRST_RADIUS = 1.0, 0.3
+# After a rejected trial, the trust radius is the length of its step times CONTRACTION, or times CONTRACTION_AT_JUMP if
+# the trial lies beyond a jump of the function.
+CONTRACTION, CONTRACTION_AT_JUMP = 0.5, 0.25
+# A trial lies beyond a jump if its value, a logarithm, exceeds the best value by more than this.
+JUMP = 1.0
+# A first-order optimiser repeats a rejected step with its length multiplied by this factor.
+BACKTRACK = 0.25
 
 
-class Curvature(NamedTuple):
+class BFGSState(NamedTuple):
     """State of the BFGS: best point [m], its value and gradient [m], inverse Hessian [m, m], trust radius, trials."""
 
     best: Array
@@ -49,48 +51,48 @@ class Curvature(NamedTuple):
     radius: Array
     trials: Array
 
-    def restarted(self, fresh: "Curvature") -> "Curvature":
-        """Return the state `fresh` with the inverse Hessian of this one, for a goal of the same curvature."""
-        return fresh._replace(inverse=self.inverse, radius=jnp.full_like(self.radius, LONGEST))
+    def restarted(self, fresh: "BFGSState") -> "BFGSState":
+        """Return the state `fresh` with the inverse Hessian of this state, for a function of similar curvature."""
+        return fresh._replace(inverse=self.inverse, radius=jnp.full_like(self.radius, LARGEST_RADIUS))
 
 
-class Retreat(NamedTuple):
-    """State of a first-order optimiser that steps back: best point [m], its value, and the state of optax (`inner`)."""
+class FirstOrderState(NamedTuple):
+    """State of a first-order optimiser with backtracking: best point [m], its value, and optax's state, `inner`."""
 
     best: Array
     value: Array
     inner: Any
 
-    def restarted(self, fresh: "Retreat") -> "Retreat":
+    def restarted(self, fresh: "FirstOrderState") -> "FirstOrderState":
         """Return the state `fresh`."""
         return fresh
 
 
 def optimiser(name: str, learning_rate: float) -> optax.GradientTransformationExtraArgs:
     """Return the optimiser of this name, one of NAMES. The BFGS does not use `learning_rate`."""
-    return bfgs() if name == BFGS else stepping_back(FIRST_ORDER[name](learning_rate))
+    return bfgs() if name == BFGS else backtracking(FIRST_ORDER[name](learning_rate))
 
 
 def bfgs() -> optax.GradientTransformationExtraArgs:
     """Return a dense BFGS (Nocedal and Wright, Numerical Optimization, 2006, 6.1) with a trust region.
 
-    A trial is rejected if it does not improve on the best point. It still updates the inverse Hessian, unless it lies
-    beyond a cliff (CLIFF). Values are logarithms.
+    A trial is rejected if its value is not below the best value. A rejected trial still updates the inverse Hessian,
+    unless it lies beyond a jump of the function (JUMP). Values are logarithms.
     """
 
-    def init(x: Array) -> Curvature:
-        never, radius = (jnp.asarray(number, x.dtype) for number in (jnp.inf, FIRST))
-        return Curvature(x, never, jnp.zeros_like(x), jnp.eye(len(x), dtype=x.dtype), radius, jnp.zeros((), int))
+    def init(x: Array) -> BFGSState:
+        never, radius = (jnp.asarray(number, x.dtype) for number in (jnp.inf, FIRST_RADIUS))
+        return BFGSState(x, never, jnp.zeros_like(x), jnp.eye(len(x), dtype=x.dtype), radius, jnp.zeros((), int))
 
-    def update(gradient: Array, state: Curvature, x: Array, *, value: Array, **_: object) -> tuple[Array, Curvature]:
+    def update(gradient: Array, state: BFGSState, x: Array, *, value: Array, **_: object) -> tuple[Array, BFGSState]:
         finite, gradient = _finite(gradient, value)
         accept = finite & (value < state.value)
-        smooth = finite & (value < state.value + CLIFF)
+        smooth = finite & (value < state.value + JUMP)
         s, y = x - state.best, gradient - state.gradient
         inverse = _updated_inverse(state, s, y, smooth)
         tried = jnp.sqrt(s @ s)
-        wider = jnp.minimum(jnp.maximum(state.radius, 2 * tried), LONGEST)
-        narrower = jnp.where(smooth, HALF, QUARTER) * tried
+        wider = jnp.minimum(jnp.maximum(state.radius, 2 * tried), LARGEST_RADIUS)
+        narrower = jnp.where(smooth, CONTRACTION, CONTRACTION_AT_JUMP) * tried
         radius = jnp.where(state.trials == 0, state.radius, jnp.where(accept, wider, narrower))
         best, slope = jnp.where(accept, x, state.best), jnp.where(accept, gradient, state.gradient)
         step = -inverse @ slope
@@ -98,40 +100,42 @@ def bfgs() -> optax.GradientTransformationExtraArgs:
         length = jnp.sqrt(step @ step)
         step = step * jnp.minimum(1.0, radius / jnp.where(length > 0, length, 1.0))
         value = jnp.where(accept, value, state.value)
-        return best + step - x, Curvature(best, value, slope, inverse, radius, state.trials + 1)
+        return best + step - x, BFGSState(best, value, slope, inverse, radius, state.trials + 1)
 
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
 
 
-def _updated_inverse(state: Curvature, s: Array, y: Array, smooth: Array) -> Array:
+def _updated_inverse(state: BFGSState, s: Array, y: Array, smooth: Array) -> Array:
     """Return the inverse Hessian [m, m] after an update with the step s [m] and the gradient's change y [m]."""
     curvature = s @ y
     usable = (state.trials > 0) & smooth & (curvature > 1e-10 * jnp.sqrt((s @ s) * (y @ y)))
     rho = 1 / jnp.where(usable, curvature, 1.0)
-    # the first pair sets the scale
+    # the first pair (s, y) sets the scale of the inverse Hessian
     scale = jnp.where(state.trials == 1, curvature / jnp.where(usable, y @ y, 1.0), 1.0)
     left = jnp.eye(len(s), dtype=s.dtype) - rho * jnp.outer(s, y)
     return jnp.where(usable, scale * left @ state.inverse @ left.T + rho * jnp.outer(s, s), state.inverse)
 
 
-def stepping_back(inner: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
+def backtracking(inner: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
     """Return an optimiser that rejects trials with a value or gradient that is not finite.
 
-    A rejected trial does not change the state of `inner`. The next trial is at the share SHORTER of the way from the
-    best point to the rejected one.
+    A rejected trial does not change the state of `inner`. The next trial lies between the best point and the rejected
+    one, at the fraction BACKTRACK of their distance.
     """
 
-    def init(x: Array) -> Retreat:
-        return Retreat(x, jnp.asarray(jnp.inf, x.dtype), inner.init(x))
+    def init(x: Array) -> FirstOrderState:
+        return FirstOrderState(x, jnp.asarray(jnp.inf, x.dtype), inner.init(x))
 
-    def update(gradient: Array, state: Retreat, x: Array, *, value: Array, **_: object) -> tuple[Array, Retreat]:
+    def update(
+        gradient: Array, state: FirstOrderState, x: Array, *, value: Array, **_: object
+    ) -> tuple[Array, FirstOrderState]:
         accept, gradient = _finite(gradient, value)
         better = accept & (value < state.value)
         step: Any
         step, after = inner.update(gradient, state.inner, x)
-        step = jnp.where(accept, step, state.best + SHORTER * (x - state.best) - x)
+        step = jnp.where(accept, step, state.best + BACKTRACK * (x - state.best) - x)
         after = jax.tree.map(lambda p, q: jnp.where(accept, p, q), after, state.inner)
-        return step, Retreat(jnp.where(better, x, state.best), jnp.where(better, value, state.value), after)
+        return step, FirstOrderState(jnp.where(better, x, state.best), jnp.where(better, value, state.value), after)
 
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
 

@@ -28,7 +28,7 @@ REFINEMENT = 8
 REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 10_000
 # Quantities that the front of error against voltage needs.
 TRACED = ("rms_error_m", "rms_u_V")
-# Initial multiplier of the limit on the error: with it, 1 % less error costs 1.5 % more voltage.
+# Initial multiplier of the limit on the error. It corresponds to 1.5 % more voltage for 1 % less error.
 EXCHANGE = 3.0
 # Largest number of gains for which forward mode is cheaper. On G20 a gradient of 24 gains takes 16 plain rollouts in
 # forward mode, 0.7 for each gain, and 39 in reverse mode (benchmarks/schedules.py).
@@ -76,9 +76,9 @@ class TuningProblem:
 
     @property
     def replays(self) -> bool:
-        """Whether the judge's steps are those of `ambjax ensemble` and `ambjax simulate`, so that its values are too.
+        """Whether the judge uses the steps, and so has the values, of `ambjax ensemble` and `ambjax simulate`.
 
-        This is so on a processor, unless the search found these steps too coarse.
+        It does on a processor, unless the search found these steps too coarse.
         """
         return self.sampled and self.finer == 1
 

@@ -16,7 +16,7 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare
 from ambjax.world.scenario import Scenario
 
-# The program runs once or a few times, so that most optimisations of XLA would cost more time than they save.
+# The program runs only a few times. Most optimisations of XLA would therefore cost more time than they save.
 _matrices = jax.jit(loop_matrices, compiler_options={"xla_backend_optimization_level": 0})
 
 

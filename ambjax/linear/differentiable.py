@@ -34,8 +34,8 @@ class LoopQuantities(NamedTuple):
 
     For a stable loop, the peaks are those of `analyse`, smoothly limited to MOST times their unit, which is 1 for |S|
     and |T| and `volts_per_metre` for |KS|. For an unstable loop they are MOST (1 + growth/pole) times their unit, so
-    that their derivatives point to a stable loop. The delay margin is treated in the same way by its inverse, in units
-    of the plant's pole.
+    that a descent leads to a stable loop. The inverse of the delay margin, in units of the plant's pole, is treated in
+    the same way.
     """
 
     sensitivity: Array

@@ -80,8 +80,8 @@ def at_rest(r: Scalar) -> Reference:
 def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Equilibrium:
     """Compute the equilibrium at the constant reference r (m) by damped Newton steps.
 
-    - `cascade`: of `Cascade.on_processor` if it has a processor, and without a guard.
-    - `scenario`: of `ideal`.
+    - `cascade`: without a guard; if it has a processor, a result of `Cascade.on_processor`.
+    - `scenario`: a result of `ideal`.
     - `period`: sample period, s; not used in continuous time.
 
     The derivatives with respect to gains and parameters are those of the implicit function. The function is pure and
@@ -117,7 +117,7 @@ def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar)
     first = _Newton(y, jnp.inf * one, jnp.eye(y.size, dtype=y.dtype), 0 * y, one, y, jnp.asarray(0))
     newton = lax.stop_gradient(lax.while_loop(unfinished, evaluate, first))
     found = newton.error <= TOLERANCE * jnp.finfo(y.dtype).eps
-    # one more step, differentiated with the Jacobian held: the derivative of the implicit function
+    # one more Newton step with a constant Jacobian: its derivative is that of the implicit function
     y = newton.y - jnp.where(found, jnp.linalg.solve(newton.J, residual(newton.y, cascade, scenario)), 0.0)
     return Equilibrium(restore(y * sizes), found)
 
@@ -146,7 +146,7 @@ def _size(G: Array) -> Array:
 
 
 def start_of(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Point:
-    """Return the start of the iteration: the plant at rest at r (m), and the initial states of the laws there."""
+    """Return the first point of the iteration: the plant at rest at r (m), and the initial states of the laws there."""
     plant, inversion = scenario.plant, cascade.inversion.started(cascade.model.equilibrium(r)[0])
     i, u = plant.equilibrium(r)
     zero = jnp.zeros_like(i)

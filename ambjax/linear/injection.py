@@ -1,9 +1,9 @@
 """Measurement of the sensitivity by injection into the nonlinear simulation, as on a machine.
 
-A periodic multi-sine e is added to the reading of the position or velocity sensor, after low-pass and converter. When
-the loop has settled, S at each frequency of the multi-sine is the quotient of the Fourier coefficients of the reading,
-e included, and of e, over whole periods (ISO 14839-3, as secondary sources cite it). The simulation includes converter,
-noise, limits and the true signs.
+A periodic multi-sine e is added to the reading of the position or velocity sensor, after low-pass and converter. After
+the loop has settled, the Fourier coefficients of e and of the sum (reading plus e) are computed over whole periods. At
+each frequency of the multi-sine, S is the coefficient of the sum divided by that of e (ISO 14839-3, as secondary
+sources cite it). The simulation includes converter, noise, limits and the true signs.
 """
 
 import dataclasses
@@ -93,8 +93,8 @@ def injected(
     - `settle`, `periods`: periods of the multi-sine before the measurement, and during it.
     - `confidence`: level of the confidence interval of the peak.
 
-    In continuous time e(t) is continuous. It is added to one reading only: e on the position does not change the
-    velocity reading. The Fourier sums are over samples.
+    In continuous time e(t) is continuous. It is added to one reading only: an e at the position sensor does not change
+    the velocity reading. The Fourier sums are over samples.
 
     Returns an `Injection`. Raises ValueError as `rollout` does, for a frequency that the period or the samples cannot
     resolve, and for `reading` = "z_dot" if the observer does not use the velocity reading.

@@ -31,8 +31,8 @@ class ResponsePeak(NamedTuple):
 class Margins(NamedTuple):
     """Margins of the loop transfer L = 1/S - 1, broken at the reading of the position sensor.
 
-    - `gain_low`, `gain_high`: the loop stays stable for every factor on L between these two (0, inf: no such end).
-    - `gain`: the one of these two that is nearer to 1 on a logarithmic scale.
+    - `gain_low`, `gain_high`: the loop stays stable for every factor on L between these two (0, inf: no such limit).
+    - `gain`: `gain_low` or `gain_high`, whichever is nearer to 1 on a logarithmic scale.
     - `phase_deg`: smallest phase change, lag or lead, that makes the loop unstable, degrees (inf: |L| is never 1).
     - `delay`: smallest additional delay that makes the loop unstable, s (inf: none).
     - `disk`: disk margin 1/max|S - 1/2| (P. Seiler, A. Packard and P. Gahinet, IEEE Control Systems 40:5 (2020)). The
@@ -71,7 +71,7 @@ def peak(system: StateSpace, magnitude: Magnitude, low: float, high: float) -> R
 
 
 def scan(system: StateSpace, low: float, high: float) -> np.ndarray:
-    """Return frequencies (Hz) from `low` to `high`, dense near those of poles, after one that stands for 0."""
+    """Return frequencies (Hz): STATIC * low, which stands for 0, then `low` to `high`, dense near those of poles."""
     grid = np.geomspace(low, high, POINTS)
     s = poles_in_s(system)
     own = np.abs(np.imag(s)) / (2 * np.pi)
@@ -90,7 +90,7 @@ def poles_in_s(system: StateSpace) -> np.ndarray:
 
 
 def margins_of(system: StateSpace) -> Margins:
-    """Return the margins of a stable loop, at frequencies up to half the sampling rate or far beyond all poles."""
+    """Return the margins of a stable loop. Frequencies end at half the sampling rate or far beyond all poles."""
     fastest = float(np.max(np.abs(poles_in_s(system)), initial=1.0)) / (2 * math.pi)
     high = 100 * fastest if system.period is None else 0.5 / float(system.period)
     low = min(1e-3, 1e-6 * high)

@@ -54,8 +54,8 @@ def member_responses(
 ) -> Responses:
     """Inject the same multi-sine into each member of an ensemble, whose varying leaves are arrays [N].
 
-    The arguments are those of `injected`, `channel` its `reading`. `scenario.member` [N] are the numbers of the
-    members. Raises ValueError as `injected` does.
+    The arguments are those of `injected`; `channel` is its argument `reading`. `scenario.member` [N] contains the
+    numbers of the members. Raises ValueError as `injected` does.
     """
     gap, pole = (float(np.mean(np.asarray(x))) for x in (scenario.plant.s_0, scenario.plant.pole))
     amplitude = AMPLITUDE * gap * (pole if channel == "z_dot" else 1.0) if amplitude is None else float(amplitude)

@@ -11,7 +11,7 @@ from ambjax.control.cascade_state import Command
 from ambjax.numerics.records import Scalar
 from ambjax.simulation.edges import NO_EDGES, Edges
 from ambjax.simulation.integrate import InitialValueProblem
-from ambjax.simulation.loop import SHOWN, ClosedLoop, Densities, ExternalInputs, Sizes
+from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, Densities, ExternalInputs, Sizes
 from ambjax.simulation.span import Instant
 from ambjax.world.amplifier import Amplifier, CurrentAmplifier
 from ambjax.world.coil_limits import difference
@@ -133,4 +133,4 @@ def _under(loop: ClosedLoop, state: object, command: Command, voltage: Voltage, 
         return plant_status(loop, x)
 
     scale = jax.tree.map(jnp.asarray, plant.scale())
-    return InitialValueProblem(inputs, rates, scale, status, None, observed, SHOWN, edges=edges)
+    return InitialValueProblem(inputs, rates, scale, status, None, observed, INSTANT_TREE, edges=edges)

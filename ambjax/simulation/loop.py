@@ -19,8 +19,8 @@ from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.signals import Reference, reference_at
 
-# A state that exceeds its scale by this factor counts as diverged: the model is not valid there, and no number has
-# overflowed yet.
+# A state that exceeds its scale by this factor counts as diverged. The model is not valid for such a state, and no
+# number has overflowed yet.
 DIVERGENCE = 1e6
 
 
@@ -56,8 +56,8 @@ class Densities(NamedTuple):
     heat: Array
 
 
-# An Instant with the same structure as those of the loop.
-SHOWN = Instant(Sizes(*[0.0] * 7), Densities(*[0.0] * 3))  # pyright: ignore[reportArgumentType]
+# An Instant with the structure of those that the loop records.
+INSTANT_TREE = Instant(Sizes(*[0.0] * 7), Densities(*[0.0] * 3))  # pyright: ignore[reportArgumentType]
 
 
 class LoopState(NamedTuple):
@@ -138,15 +138,15 @@ class ClosedLoop:
     def rates(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> LoopState:
         """Return the time derivative of the state: Eqs. (1), (2) and the laws."""
         _, control, u = self.command(inputs, state, errors)
-        return self.moved(inputs, state, control, u)
+        return self.derivative(inputs, state, control, u)
 
     def observed(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> tuple[LoopState, Instant]:
         """Return the rates of the state, and the signals to record at this instant."""
         command, control, u = self.command(inputs, state, errors)
-        shown = self.shown(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
-        return self.moved(inputs, state, control, u), shown
+        shown = self.instant(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
+        return self.derivative(inputs, state, control, u), shown
 
-    def shown(self, reference: Reference, plant: object, i_ref: Array, v_tilde: Array, u: Array) -> Instant:
+    def instant(self, reference: Reference, plant: object, i_ref: Array, v_tilde: Array, u: Array) -> Instant:
         """Return the signals to record at one instant.
 
         `plant`: state of the plant. `i_ref` (A), `v_tilde` (A^2/m^2): of the command. `u`: applied voltage, V.
@@ -156,7 +156,7 @@ class ClosedLoop:
         sizes = Sizes(motion.z, motion.z - reference.r, sigma, u, motion.i, motion.i - i_ref, v_tilde)
         return Instant(sizes, Densities(u, u * u, heat))
 
-    def moved(self, inputs: ExternalInputs, state: LoopState, control: CascadeState, u: Array) -> LoopState:
+    def derivative(self, inputs: ExternalInputs, state: LoopState, control: CascadeState, u: Array) -> LoopState:
         """Return the time derivative of the state. `control`: rates of the cascade. `u`: applied voltage, V."""
         plant = self.scenario.plant
         q_z = self.scenario.pushed(inputs.q_z, plant.measurement(state.plant))
@@ -195,7 +195,7 @@ class ClosedLoop:
         observed = lambda inputs, x: self.observed(inputs, x, errors)  # noqa: E731
         jumps = self.scenario.sensor is not None
         return InitialValueProblem(
-            self.inputs, rates, self.scale(), self.status, self.layer(), observed, SHOWN, jumps, step
+            self.inputs, rates, self.scale(), self.status, self.layer(), observed, INSTANT_TREE, jumps, step
         )
 
     def row(self, t: Scalar, state: LoopState, errors: Errors, alive: Array) -> Row:

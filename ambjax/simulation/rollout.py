@@ -50,7 +50,7 @@ class System(Protocol[S, E, R]):
     - `status(state)`: the status code of the rotor, an index of `trajectory.STATUSES`.
     - `rest(state, code)`: the state in which a rotor lost with this code is frozen.
     - `row(t, state, errors, alive)`: the row at time t (s).
-    - `completed(row, span)`: the row with the signals that are known at the end of the sample only.
+    - `completed(row, span)`: the row with the signals that are known only at the end of the sample.
     - `singularity(row)`: a number that is positive on the admissible side of the singular curve C. Eq. (9)
 
     A system whose state jumps at the start of a sample, such as a controller on a processor, also has
@@ -107,7 +107,7 @@ def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | 
 
 
 def prepare(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[ClosedLoop | Sampled, Clock]:
-    """Check a case, and return the system and the clock for `run`; a clock without a method gets one.
+    """Check a case. Return the system and the clock for `run`; a method is chosen if the clock has none.
 
     Raises ValueError as `rollout` does.
     """
@@ -195,8 +195,8 @@ def recorded_segment(
 ) -> tuple[RolloutState, Row]:
     """Simulate `count` samples from number `first` on, and record every row. Returns the new state and the rows.
 
-    Samples after the last one of the clock do not change the state, so that one compiled program with a fixed `count`
-    can simulate every part of a run.
+    Samples after the last one of the clock do not change the state. One compiled program with a fixed `count` can
+    therefore simulate every part of a run.
     """
     step = functools.partial(one_sample, system.realised(), clock, fold)
 
@@ -229,7 +229,8 @@ def one_sample(
 ) -> tuple[RolloutState, Row]:
     """Record the row at the start of sample k, then integrate to its end with the measurement errors held.
 
-    Reverse mode recomputes a sample (checkpoint), so that its memory grows with the samples, not with the substeps.
+    Reverse mode recomputes each sample (`jax.checkpoint`). Its memory then grows with the number of samples, not with
+    the number of substeps.
     """
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
@@ -239,7 +240,8 @@ def one_sample(
         t = k.astype(dtype) * clock.sample_period
         errors = system.sensor_errors(k)
         alive = ending.lost_code == ALIVE
-        # A signal that jumps at this instant has jumped in this sample, even if t was rounded to just before it.
+        # Signals are evaluated just after t. One that jumps at this instant then has its later value, even if t was
+        # rounded down.
         just_after = t * (1 + 4 * jnp.finfo(dtype).eps)
         if hasattr(system, "jump"):
             state = choose(alive, system.jump(just_after, state, errors), state)

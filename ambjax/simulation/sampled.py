@@ -35,7 +35,7 @@ class SampledState(NamedTuple):
     - `plant`, `control`: states of the plant and of the laws.
     - `command`: last command, with u within the limit of the supply.
     - `past`: the two voltages before that of `command`, V, the later one first.
-    - `finite`: 1, or 0 after a law has returned, or the sensor reported, a number that is not finite.
+    - `finite`: 1; 0 after a law or the sensor has returned a number that is not finite.
     - `z_filtered`: output of the low-pass of the position sensor, m.
     - `u_a`: output voltage of the amplifier, V.
     - `watch`: state of the guard.
@@ -61,7 +61,7 @@ class Sampled:
 
     - `loop`: the closed loop in continuous time.
     - `period`: sample period, s.
-    - `cuts`: largest number of edges of disturbances inside one sample; None: bounded by the number of all edges.
+    - `cuts`: largest number of edges of disturbances inside one sample; None: the number of all edges.
     """
 
     loop: ClosedLoop
@@ -130,7 +130,7 @@ class Sampled:
         return self.with_command(measured, self.reference(t), state)
 
     def read(self, state: SampledState, errors: Errors | FaultyErrors) -> tuple[SampledState, Measurement]:
-        """Return the state with that of the faulty sensor updated, and the readings of the sensors, faults included."""
+        """Return the state with the new state of the faulty sensor, and the readings of the sensors, with faults."""
         return self._with_faults(self.measured(state.plant, state.z_filtered, errors), state, errors)
 
     def reference(self, t: Scalar) -> Reference:
@@ -251,7 +251,7 @@ class Sampled:
     def row(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors, alive: Array) -> Row:
         """Return the signals of sample n: the plant's state, u_n, and i_ref before the step of the laws.
 
-        If the command is a current, u_n is the voltage by which the amplifier follows it in this state.
+        If the command is a current, u_n is the voltage with which the amplifier produces this current in this state.
         """
         measured = self.measured(state.plant, state.z_filtered, errors)
         if state.sensed:

@@ -90,9 +90,9 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     )
     # tau = 0: no slide, because w was within the boundary layer of the sign.
     instants = (
-        loop.shown(begin.reference, state.plant, i_ref_0, w, jnp.where(tau > 0, first.u, second.u)),
-        loop.shown(begin.reference, state.plant._replace(i=middle.i), i_ref - (h - tau) * slaved, w_1, second.u),
-        loop.shown(end.reference, plant, i_ref, w_2, second.end(scenario.u_max)),
+        loop.instant(begin.reference, state.plant, i_ref_0, w, jnp.where(tau > 0, first.u, second.u)),
+        loop.instant(begin.reference, state.plant._replace(i=middle.i), i_ref - (h - tau) * slaved, w_1, second.u),
+        loop.instant(end.reference, plant, i_ref, w_2, second.end(scenario.u_max)),
     )
     span = _with_step(span, instants, first.u, second, tau, h - tau)
     control = control._replace(

@@ -134,7 +134,7 @@ class Monitored:
         plant, motion = scenario.plant, self.motion(state)
         z, _, i = motion
         command, control, u = self.loop.command(inputs, state, errors)
-        moving = self.loop.moved(inputs, state, control, u)
+        moving = self.loop.derivative(inputs, state, control, u)
         v_tilde, e = command.v_tilde, i - command.i_ref
         sigma = cascade.sigma(motion, inputs.reference)
         q_z, q_i = scenario.pushed(inputs.q_z, motion), inputs.q_i

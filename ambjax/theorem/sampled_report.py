@@ -1,66 +1,42 @@
 """Checks of a cascade on a processor: slopes of laws times T, the distance to the singular curve C, the rotor's status.
 
-Theorem 1 applies in continuous time, where sigma, v_tilde and e reach 0. With steps of length T they reach a band
-around 0. Two quantities are measured along a run: W, the largest disturbance of the rate of the signal that a law
-computes, and the largest difference between this signal and that of the plant. W gives the band of the computed signal
-(`control.sampling.band`); the band plus the difference bounds the plant's signal.
+Theorem 1 applies in continuous time, where sigma, v_tilde and e reach 0. With steps of length T they only reach a band
+around 0. A law computes its signal from an estimate, so the computed signal differs from that of the plant. Along a
+run, two numbers are measured for each signal: W, the largest disturbance of the rate of the computed signal, and the
+largest difference between the computed signal and that of the plant. The band of the computed signal follows from W
+(`control.sampling.band`). The band plus the difference bounds the signal of the plant.
 """
 
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, SupportsFloat
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.control.base import with_infinite_steepness
 from ambjax.control.cascade import Cascade
-from ambjax.control.cascade_state import CascadeState
-from ambjax.control.sampling import Sampling, band, disturbance, slope_limits
-from ambjax.control.schedule import extremes, schedules
+from ambjax.control.sampling import band, disturbance
+from ambjax.control.schedule import schedules
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import Outcome, System, prepare, roll
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
+from ambjax.theorem.slopes import SlopeCheck, sampling_of, slope_checks
 from ambjax.theorem.watched import Watched
 from ambjax.world.bearing import Bearing
 from ambjax.world.scenario import Scenario
 
 # Samples whose distances to the singular curve are computed together.
 BATCH = 4096
-# Stages whose output acts after the delay. Observers and inversion laws act on states of their own, without delay.
-DELAYED = ("position", "current")
 # Signal that the law of each stage drives to zero, and its unit.
 SIGNALS = {"position": ("sigma", "m/s"), "inversion": ("v_tilde", "A^2/m^2"), "current": ("e", "A")}
-# A voltage counts as alternating if the rms of (u_{n+1} - 2 u_n + u_{n-1})/4 is more than this share of the rms of u.
-# An oscillation at a sixth of the sampling rate has this share; white noise has 0.61.
+# The voltage alternates if the rms of (u_{n+1} - 2 u_n + u_{n-1})/4 is more than this share of the rms of u. The share
+# is 0.25 for an oscillation at a sixth of the sampling rate, and 0.61 for white noise.
 ALTERNATING = 0.25
-
-
-@dataclasses.dataclass(frozen=True)
-class SlopeCheck:
-    """Slope of a law times T, and the limits for stability and for no oscillation.
-
-    `slope`: slope times T. `stepped`: its effective value in the discrete step of the law. An explicit step does not
-    change it; an implicit step of a sign changes a = slope T to a/(1 + a), which is below both limits unless the law is
-    delayed. `limit`: the law is stable below it. `quiet`: the law does not oscillate below it.
-    """
-
-    stage: str
-    slope: float
-    stepped: float
-    limit: float
-    quiet: float
-    implicit: bool
-
-    @property
-    def holds(self) -> bool:
-        """Whether the law alone is stable."""
-        return self.stepped < self.limit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +47,7 @@ class Band:
     from the estimate (with prediction: at the end of the delay). `seen`: largest magnitude of the plant's signal.
     `off`: largest difference of the two signals. `gain`: that of the law's sign. `disturbance`: W, the largest
     disturbance of the rate of the computed signal, per s. `band`: bound of `computed` for disturbances up to W; inf if
-    the gain does not exceed W. The last three are None for a law that is not a single sign.
+    the gain does not exceed W. `gain`, `disturbance` and `band` are None for a law that is not a single sign.
     """
 
     signal: str
@@ -95,11 +71,12 @@ class Band:
 class SampledReport:
     """Slopes and bands of a cascade on its processor, and the rotor's status under the case's noise.
 
-    `distance`: smallest distance of (z/s_0, i_ref/i_0) to the singular curve C at the samples (negative beyond C), and
-    its time (s). `alternating`: share of the voltage's rms that changes sign from sample to sample, without noise,
-    after `settle`; None if that run ends early. `bands`: of the runs that do not end early. `stalled`: whether the
-    integrator stalled at `lost_at`; the rotor's status is then unknown. `largest_z`: largest |z| (m) at the samples
-    after `settle`; None if the run ends early.
+    `bands`: of the runs that do not end early. `lost_at`: time at which the run with noise ends early, s; inf if it
+    does not. `lost_why`: the reason. `stalled`: whether the integrator stalled at `lost_at`; the rotor's status is then
+    unknown. `distance`: smallest distance of (z/s_0, i_ref/i_0) to the singular curve C at the samples (negative beyond
+    C), and its time (s). `alternating`: share of the voltage's rms that changes sign from sample to sample after
+    `settle`, in the run without noise; None if that run ends early. `largest_z`: largest |z| (m) at the samples after
+    `settle`, in the run with noise; None if that run ends early.
     """
 
     slopes: list[SlopeCheck]
@@ -123,11 +100,11 @@ class SampledReport:
 
 
 class Delays(NamedTuple):
-    """Result of runs with increasing delays (samples), `step` apart, from the delay of the case upwards.
+    """Result of runs whose delays increase in steps of `step` (samples), from the delay of the case on.
 
-    `held`: the rotor survives every delay up to this one. `lost`: it is lost at this delay; None if it survives every
-    delay. `undecided`: the smallest delay above `held` at which the integrator stalled, or None. If the rotor is lost
-    at the delay of the case, the delays start at 0; `held` is None if the rotor is lost there too.
+    `held`: the largest delay up to which the rotor survives every delay. `lost`: the delay at which it is lost first;
+    None if it survives every delay. `undecided`: the smallest delay above `held` at which the integrator stalled, or
+    None. If the rotor is lost at the delay of the case, the delays start at 0; if it is lost there too, `held` is None.
     """
 
     held: float | None
@@ -155,8 +132,8 @@ def check_sampled(
 ) -> SampledReport:
     """Return the report on a cascade with a processor, from two runs: without noise and with it.
 
-    `run` simulates a system; `ensemble.replay.record_system` has the rounding of `ambjax simulate`. `settle`: s.
-    Raises ValueError as `rollout` does.
+    `run`: function that simulates a system; `ensemble.replay.record_system` rounds as `ambjax simulate` does. `settle`:
+    s. Raises ValueError as `rollout` does.
     """
     loop, clock = prepare(cascade, scenario, clock)
     cascade, quiet = cascade.on_processor(), _without_noise(scenario)
@@ -209,36 +186,6 @@ def _without_noise(scenario: Scenario) -> Scenario:
     """Return the scenario without noise; the same object if it has none."""
     quiet = None if scenario.sensor is None else scenario.sensor.louder(0.0)
     return scenario if quiet in (None, scenario.sensor) else dataclasses.replace(scenario, sensor=quiet)
-
-
-def slope_checks(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
-    """Return slope times T and its limits for every law with a slope. `cascade`: of one member."""
-    sampling, lines = sampling_of(cascade, clock), []
-    for stage, law in zip(CascadeState._fields, map(with_infinite_steepness, cascade.laws), strict=True):
-        implicit = law.has_own_step(sampling.implicit)
-        ends = extremes(law)
-        slope = stepped = max(_steepest(one.slope(cascade.model)) for one in ends) * sampling.period
-        if implicit:
-            relaxed = 1 / (1 + 1 / slope) if slope else 0.0
-            rate = max(float(one.explicit_rate(cascade.model)) for one in ends)
-            stepped = max(relaxed, rate * sampling.period)
-        if slope:
-            lines.append(
-                SlopeCheck(stage, slope, stepped, *slope_limits(sampling.late if stage in DELAYED else 0.0), implicit)
-            )
-    return lines
-
-
-def _steepest(slope: SupportsFloat) -> float:
-    """Convert a slope to float; NaN, from infinities of a set-valued sign that cancel, becomes inf."""
-    return math.inf if math.isnan(float(slope)) else float(slope)
-
-
-def sampling_of(cascade: Cascade, clock: Clock) -> Sampling:
-    """Return the sampling of the laws of a cascade with a processor."""
-    processor: Any = cascade.on_processor().processor
-    late = float(processor.delay) - (float(processor.ahead) if processor.predicts else 0.0)
-    return Sampling(float(clock.sample_period), max(late, 0.0), processor.implicit)
 
 
 def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, rows: Any, noise: bool) -> list[Band]:

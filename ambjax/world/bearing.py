@@ -63,8 +63,8 @@ class Signals(NamedTuple):
 class Bearing(Generic[S]):
     """Parameters of rotor and magnets, Table 1, and the force of given currents. Scalars of one member, SI units.
 
-    A plant subclasses this record. Its state is a NamedTuple of scalars. It implements `start`, `rates`, `rest`,
-    `scale`, `measurement` and `signals`, and inherits all else.
+    A plant is a subclass of this record, and its state is a NamedTuple of scalars. The subclass implements `start`,
+    `rates`, `rest`, `scale`, `measurement` and `signals`; it inherits the other methods.
 
     Deviation: the paper prints k_z in N m; it is a stiffness, N/m, negative (restoring).
     """
@@ -134,7 +134,7 @@ class Bearing(Generic[S]):
         raise NotImplementedError
 
     def slope(self) -> Scalar:
-        """The fastest rate of the plant's motion, 1/s; the step size is chosen from it."""
+        """Return the fastest rate of the plant's motion, 1/s. The step size is chosen from it."""
         return self.pole
 
     def flux_slope(self) -> Scalar:
@@ -151,17 +151,18 @@ class Bearing(Generic[S]):
         i = self.measurement(state).i
         return self.i_0 + i, self.i_0 - i
 
-    def fluxing(self, state: S) -> tuple[Array, Array]:
-        """Return the currents (A) of the upper and lower coil that determine the fluxes: the delayed ones, if any."""
+    def flux_currents(self, state: S) -> tuple[Array, Array]:
+        """Return the currents (A) that determine the fluxes of the two coils; if there is a lag, delayed ones."""
         return self.currents(state)
 
-    def pull(self, fluxing: tuple[Array, Array], z: Scalar, gaps: Gaps | None = None) -> Array:
+    def pull(self, flux_currents: tuple[Array, Array], z: Scalar, gaps: Gaps | None = None) -> Array:
         """Return the scaled force of the two coils (A^2/m^2): the difference of (i/gap)^2, with saturation if any.
 
-        `fluxing`: result of the method `fluxing`, A. `z`: displacement, m. `gaps`: those at z; None: not computed yet.
+        `flux_currents`: result of the method of this name, A. `z`: displacement, m. `gaps`: those at z; None: not
+        computed yet.
         """
         pulls = []
-        for i, inverse in zip(fluxing, (gaps or self.gaps(z)).inverses, strict=True):
+        for i, inverse in zip(flux_currents, (gaps or self.gaps(z)).inverses, strict=True):
             share = 1.0 if self.iron is None else self.iron.share(self.iron.core(self, i, inverse))
             pulls.append((i * inverse * share) ** 2)
         return pulls[0] - pulls[1]
@@ -169,7 +170,7 @@ class Bearing(Generic[S]):
     def flux_density(self, state: S) -> Array:
         """Return the larger of the flux densities of the two cores, T."""
         iron, inverses = self.iron or Iron(), self.gaps(self.measurement(state).z).inverses
-        cores = [iron.core(self, i, inverse) for i, inverse in zip(self.fluxing(state), inverses, strict=True)]
+        cores = [iron.core(self, i, inverse) for i, inverse in zip(self.flux_currents(state), inverses, strict=True)]
         upper, lower = (jnp.abs(b * iron.share(b)) for b in cores)
         return jnp.maximum(upper, lower)
 
@@ -254,8 +255,8 @@ class Bearing(Generic[S]):
     def current_for(self, z: Scalar, v: Scalar) -> Array:
         """Return the current (A) with scaled force v at z: the root of Eq. (3) that is continuous at i = 0.
 
-        The formula has no cancellation, so it is smooth through z = 0, where the quadratic degenerates. If v has no
-        real root, the result is the point of C at that z, where v is nearest.
+        The formula has no cancellation, so it is smooth through z = 0, where the quadratic degenerates. If no current
+        gives the force v at z, the result is the current on C at this z: its force is the closest to v.
         """
         # Eq. (3) times the squared product of the gaps: difference i^2 + 2 total i - above = 0. The root is written
         # without cancellation.

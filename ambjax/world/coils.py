@@ -49,7 +49,7 @@ class TwoCoil(Bearing[Currents]):
         z, z_dot, i_1, i_2, delayed = state
         gaps = self.gaps(z)
         above, below = gaps.inverses
-        v = self.pull(self.fluxing(state), z, gaps)
+        v = self.pull(self.flux_currents(state), z, gaps)
         z_ddot = 2 * self.k_z / self.m * z + self.a * v - self.g + q_z
         upper, lower = u if isinstance(u, CoilVoltages) else (u, u)
         up, down = upper + self.R * (self.i_0 - i_1), self.R * (self.i_0 - i_2) - lower
@@ -85,9 +85,9 @@ class TwoCoil(Bearing[Currents]):
     def currents(self, state: Currents) -> tuple[Array, Array]:
         return state.i_1, state.i_2
 
-    def fluxing(self, state: Currents) -> tuple[Array, Array]:
+    def flux_currents(self, state: Currents) -> tuple[Array, Array]:
         return state.delayed or (state.i_1, state.i_2)
 
     def signals(self, state: Currents) -> Signals:
         heat = self.R * (state.i_1**2 + state.i_2**2)
-        return Signals(self.pull(self.fluxing(state), state.z), heat)
+        return Signals(self.pull(self.flux_currents(state), state.z), heat)

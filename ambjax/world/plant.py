@@ -49,7 +49,7 @@ class Plant(Bearing[State]):
         """
         z, z_dot, i, delayed = state
         gaps = self.gaps(z)
-        z_ddot = 2 * self.k_z / self.m * z + self.a * self.pull(self.fluxing(state), z, gaps) - self.g + q_z
+        z_ddot = 2 * self.k_z / self.m * z + self.a * self.pull(self.flux_currents(state), z, gaps) - self.g + q_z
         below = gaps.inverses[1]
         cores = (
             iron.core(self, current, inverse)
@@ -69,12 +69,12 @@ class Plant(Bearing[State]):
     def measurement(self, state: State) -> Measurement:
         return Measurement(*state[:3])
 
-    def fluxing(self, state: State) -> tuple[Array, Array]:
+    def flux_currents(self, state: State) -> tuple[Array, Array]:
         i = state.i if isinstance(state.delayed, tuple) else state.delayed
         return self.i_0 + i, self.i_0 - i
 
     def signals(self, state: State) -> Signals:
-        v = self.v(state.z, state.i) if self.iron is None else self.pull(self.fluxing(state), state.z)
+        v = self.v(state.z, state.i) if self.iron is None else self.pull(self.flux_currents(state), state.z)
         return Signals(v, self.copper_loss(state.i))
 
     def z_ddot(self, z: Scalar, i: Scalar, q_z: Scalar = 0.0) -> Array:

@@ -1,4 +1,4 @@
-"""Signals: pytrees that are functions of time. References and disturbances are one concept.
+"""Signals: pytrees that are functions of time. References and disturbances are signals.
 
 Call a signal with a time in seconds. Signals are right-continuous: at a jump the value is the later one. A random
 signal has a method `realised(key)`, which draws the function of time for one member of an ensemble.
@@ -95,11 +95,11 @@ class Pulse:
         return hull(np.where(on, self.amplitude, 0.0), np.where(off, 0.0, self.amplitude))
 
     def edges(self) -> tuple[Scalar, ...]:
-        """Return the time of the jump, s."""
+        """Return the times of the two jumps, s."""
         return (self.start, self.stop)
 
     def shifted(self, by: Scalar) -> "Pulse":
-        """Return the pulse `by` seconds later; it never ends before it starts."""
+        """Return the pulse, `by` seconds later. Both jumps shift together, so the pulse keeps its length."""
         return dataclasses.replace(self, start=self.start + by, stop=self.stop + by)
 
 

@@ -28,7 +28,8 @@ TINY = 1e-30
 class Typical:
     """Fold: the 16-norm over samples of |row.`of`| in units of `size`, a smooth maximum.
 
-    A saturated voltage has the derivative 0. The norm includes the unsaturated samples, which have another one.
+    The derivative of a saturated voltage is 0. The norm also includes the unsaturated samples, whose derivatives are
+    not.
     """
 
     of: str = static()

@@ -29,8 +29,9 @@ LEAF, PAST, ACTIVE = "leaf_", "history_", "active"
 class SearchState:
     """State of a search.
 
-    `active` [S]: starts that continue. `history`: one row per iteration. `since`: iteration after which the phase
-    began. `seconds`: duration so far; `earlier`: the part of it before a resume.
+    `active` [S]: whether each start continues. `history`: one row per iteration. `iteration`: number of iterations so
+    far; `since`: their number before the current phase. `seconds`: duration so far, s; `earlier`: the part of it before
+    the search was resumed.
     """
 
     starts: Starts
@@ -58,19 +59,19 @@ class SearchState:
         """Return the distribution of one start."""
         return CmaState(*(leaf[at] for leaf in self.cma_states))
 
-    def put(self, at: int | np.integer, state: CmaState) -> None:
+    def set_cma_state(self, at: int | np.integer, state: CmaState) -> None:
         """Set the distribution of one start."""
         for whole, part in zip(self.cma_states, state, strict=True):
             whole[at] = part
 
     @property
     def ended(self) -> bool:
-        """Whether the search was complete in its checkpoint, so that a resume adds nothing."""
+        """Whether the checkpoint contained the complete search, so that no iteration was left to do."""
         return self.earlier > 0 and self.seconds == self.earlier
 
 
 class CheckpointFile:
-    """Reads and writes the checkpoint of round number `round`. It is replaced atomically.
+    """Reads and writes the checkpoint of round number `round`. A new checkpoint replaces the old one atomically.
 
     `path`: of the file; None: no checkpoint. `facts`: nested settings that a checkpoint must match to be resumed.
     """
@@ -103,23 +104,23 @@ class CheckpointFile:
         try:
             arrays, facts = unseal(self.path)
             if facts.keys() != FACTS or facts["counts"].keys() != set(COUNTS):
-                raise DamagedError("it is no checkpoint")
+                raise DamagedError("it is not a checkpoint")
             differs = difference(facts["fingerprint"], self.fingerprint)
             if differs:
                 raise ValueError(
                     f"--resume: {self.path} belongs to another search: {differs}. "
-                    "Use another --out, or leave out --resume to begin anew."
+                    "Use another --out, or leave out --resume to start a new search."
                 )
             if facts["round"] != self.round:
-                raise DamagedError(f"it is that of round {facts['round']}")
+                raise DamagedError(f"it belongs to round {facts['round']}")
             return _progress(arrays, facts["counts"], descent, starts, m)
         except DamagedError as why:
-            say(f"{self.path}: {why}; round {self.round} is begun again")
+            say(f"{self.path}: {why}; round {self.round} restarts")
             return None
 
 
 def mark_directory(directory: pathlib.Path) -> None:
-    """Mark a directory as that of a search, so that the search can be resumed even before its first checkpoint.
+    """Mark a directory as that of a search. The search can then be resumed even before its first checkpoint.
 
     Raises ValueError if the mark cannot be written.
     """
@@ -143,7 +144,7 @@ def checkpoints(directory: pathlib.Path) -> list[pathlib.Path]:
 
 
 def has_unfinished_search(directory: pathlib.Path, report: str) -> bool:
-    """Return whether a directory holds a search that has not ended: checkpoints newer than the file `report`."""
+    """Return whether a directory contains an unfinished search, with checkpoints newer than the file `report`."""
     left, ended = checkpoints(directory), directory / report
     return bool(left) and not (
         ended.exists() and ended.stat().st_mtime_ns >= max(path.stat().st_mtime_ns for path in left)
@@ -161,7 +162,10 @@ def remove_all(directory: pathlib.Path) -> int:
 def _progress(
     arrays: dict[str, np.ndarray], counts: dict[str, Any], descent: Descent, starts: int, m: int
 ) -> SearchState:
-    """Return the search in these arrays. Raises DamagedError if their names, types or shapes do not fit."""
+    """Return the state of the search from the arrays of a checkpoint.
+
+    Raises DamagedError if their names, types or shapes do not fit.
+    """
     there = shapes(arrays)
     kinds = jax.eval_shape(descent.begin, jnp.zeros((starts, m))), idle_states(starts, m)
     leaves, tree = jax.tree.flatten(kinds)

@@ -1,7 +1,7 @@
 """A sequence of searches, each of which starts from the result of earlier ones, and restarts around the best point.
 
-A search may end at a jump of the goal although the goal is lower beyond it. A restart tries quasi-random points
-around the best point so far.
+A search can stop at a jump of the goal, although the goal is lower on the other side. A restart therefore tries
+quasi-random points around the best point so far.
 """
 
 import dataclasses
@@ -27,10 +27,10 @@ from tuning.search.screen import around, initial_points
 
 # Largest number of searches in `search_and_restart`.
 MOST_SEARCHES = 5
-# Restarts end after two searches in a row that lower the goal by less than this share. One such search is not enough,
-# because its points may have missed a better optimum by chance.
-GAIN = 0.01
-# Number of earlier points that are tried with accurate steps if these confirm none of the answers.
+# Restarts end after two searches in a row that each lower the goal, a logarithm, by less than this. One such search is
+# not enough, because its points may miss a better optimum by chance.
+LEAST_IMPROVEMENT = 0.01
+# Number of earlier points of the searches that are checked with accurate steps if these confirm none of the answers.
 FALLBACK_POINTS = 12
 
 
@@ -48,9 +48,9 @@ class SearchResult:
     error: StepError | None
     history: dict[str, np.ndarray]
     lost: int
-    """number of validation members that are lost, plus that of members that are lost with accurate steps"""
+    """number of lost validation members, plus the number of members that are lost with accurate steps"""
     seconds: float
-    """duration of all searches in s, the time before a resume included"""
+    """duration of all searches, s, including the time before the search was resumed"""
     validation_error: float = math.inf
     """rms error of the validation members that are held, relative to s_0; inf if it was not computed"""
     front: tuple[Any, ...] = ()
@@ -70,7 +70,7 @@ class SearchResult:
 
 @dataclasses.dataclass
 class Course:
-    """State of a sequence of searches. The functions that search change it.
+    """Mutable state of a sequence of searches.
 
     `problem`, `members`: the problem and the training ensemble of the next search. `seed`: of all random numbers.
     `out`: directory of the checkpoints; None: no checkpoints. `facts`: settings that a checkpoint must match.
@@ -95,9 +95,9 @@ class Course:
     def search(self, points: np.ndarray, *, at_optimum: bool = False) -> tuple[np.ndarray, float]:
         """Search from `points` [K, m] and append the search to `past`. Return the best point [m] and its goal.
 
-        `at_optimum`: whether an earlier search on all members ended at the first point; it is not refined again. Raises
-        KeyboardInterrupt if Ctrl-C ends the first search before its first iteration, and ValueError if the goal is not
-        finite at any point.
+        `at_optimum`: whether an earlier search on all members ended at the first point, so that this point need not be
+        refined again. Raises KeyboardInterrupt if Ctrl-C ends the first search before its first iteration, and
+        ValueError if the goal is not finite at any point.
         """
         tune, number = self.problem.tune, len(self.past) + 1
         path = self.out / checkpoint(number) if self.out else None
@@ -163,10 +163,10 @@ def search_and_restart(course: Course, start: np.ndarray) -> np.ndarray:
 def should_restart(goals: Sequence[float]) -> bool:
     """Return whether to restart after searches that ended at these goals, which are logarithms.
 
-    True if one of the last two searches lowered the goal by more than GAIN, up to MOST_SEARCHES searches.
+    True if one of the last two searches lowered the goal by more than LEAST_IMPROVEMENT, up to MOST_SEARCHES searches.
     """
     best = [math.inf, *itertools.accumulate(goals, min)]
-    gained = [before - after > GAIN for before, after in itertools.pairwise(best)]
+    gained = [before - after > LEAST_IMPROVEMENT for before, after in itertools.pairwise(best)]
     return len(goals) < MOST_SEARCHES and any(gained[-2:])
 
 
@@ -179,7 +179,7 @@ def training(problem: TuningProblem) -> Members:
 
 
 def points_of(past: list[SearchState]) -> np.ndarray:
-    """Return at most FALLBACK_POINTS points [K, m] of the searches' paths, best first, denser among the better ones."""
+    """Return at most FALLBACK_POINTS points [K, m] that the searches visited, best first, more of the better ones."""
     x = np.concatenate([np.asarray(one.history["x"]).reshape(-1, one.starts.best.shape[-1]) for one in past])
     value = np.concatenate([np.asarray(one.history["value"]).ravel() for one in past])
     _, first = np.unique(np.where(np.isfinite(value), value, np.inf), return_index=True)
@@ -199,7 +199,7 @@ def _best(progress: SearchState) -> tuple[np.ndarray, float]:
 
 
 def _joined(past: list[SearchState]) -> dict[str, np.ndarray]:
-    """Concatenate the histories of all searches by name. Columns of missing starts repeat the first start."""
+    """Concatenate the histories of all searches by name. If a search has fewer starts, its first start is repeated."""
     width = max(len(one.active) for one in past)
 
     def wide(rows: npt.ArrayLike) -> np.ndarray:

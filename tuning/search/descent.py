@@ -1,4 +1,4 @@
-"""Descent: the next trial of each start, from the losses and derivatives of the members at its last trial."""
+"""Descent: computes the next trial of each start from the members' losses and derivatives at the last trial."""
 
 import functools
 from typing import Any, NamedTuple
@@ -10,20 +10,20 @@ from jax import Array
 
 from ambjax.extend import record, static
 from tuning.objective.goal import Goal
-from tuning.optimisers import Curvature, Retreat, optimiser
+from tuning.optimisers import BFGSState, FirstOrderState, optimiser
 
 
 class Starts(NamedTuple):
     """State of all starts.
 
     `trial` [S, m]: next points. `state`: of the optimiser. `length` [S]: distance from the best point to the trial.
-    `rise` [S]: norm of the goal's gradient at the best point.
+    `gradient_norm` [S]: norm of the goal's gradient at the best point.
     """
 
     trial: Array
-    state: Curvature | Retreat
+    state: BFGSState | FirstOrderState
     length: Array
-    rise: Array
+    gradient_norm: Array
 
     @property
     def best(self) -> Array:
@@ -40,7 +40,7 @@ class Starts(NamedTuple):
 class Descent:
     """Independent descents of several starts by the optimiser `name` with the learning rate `rate`.
 
-    Its functions are compiled once for all goals of the same structure: the numbers of the limits are leaves.
+    The numbers of the limits are leaves, so its functions are compiled once for all goals of the same structure.
     """
 
     goal: Goal
@@ -67,10 +67,10 @@ class Descent:
 
     @functools.partial(jax.jit, static_argnums=1)
     def step(self, ordinary: int, starts: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
-        """Return the starts after one step of those that are `on` [S].
+        """Return the starts after one step. `on` [S]: whether each start makes the step.
 
-        `outcomes` [S, N, 1 + L] and `slopes` [S, N, 1 + L, m] are those at the trials. The first `ordinary` members are
-        not stressed.
+        `outcomes` [S, N, 1 + L]: the weighted loss and the limited quantities of each member at the trials. `slopes`
+        [S, N, 1 + L, m]: their derivatives. The first `ordinary` members are not stressed.
         """
         return jax.vmap(functools.partial(self._one, ordinary))(starts, outcomes, slopes, on)
 
@@ -80,6 +80,6 @@ class Descent:
         state: Any
         step, state = self.method.update(gradient, start.state, start.trial, value=value)
         trial: Any = optax.apply_updates(start.trial, step)
-        rise = jnp.where(state.value < start.value, jnp.linalg.norm(gradient), start.rise)
-        fresh = Starts(trial, state, jnp.linalg.norm(trial - state.best), rise)
+        gradient_norm = jnp.where(state.value < start.value, jnp.linalg.norm(gradient), start.gradient_norm)
+        fresh = Starts(trial, state, jnp.linalg.norm(trial - state.best), gradient_norm)
         return jax.tree.map(lambda p, q: jnp.where(on, p, q), fresh, start)

@@ -1,4 +1,4 @@
-"""CMA-ES: a derivative-free search, for goals whose derivatives do not lead to a minimum.
+"""CMA-ES: a derivative-free search for goals whose derivatives do not lead to a minimum.
 
 A population is drawn from a normal distribution. Its better half updates the mean, the covariance and the step size.
 The parameters are the defaults of N. Hansen, The CMA Evolution Strategy: A Tutorial, arXiv:1604.00772 (2023), Table 1,
@@ -12,7 +12,7 @@ import numpy as np
 
 # Standard deviation of the first population in each coordinate: a factor of e^0.3 of a gain.
 SIZE = 0.3
-# A search has converged if the level of PATIENCE populations in a row does not fall by the share STALL of the goal.
+# A search has converged if PATIENCE populations in a row do not lower `CmaState.level`, a logarithm, by STALL.
 STALL, PATIENCE = 0.01, 6
 
 
@@ -40,7 +40,7 @@ class CmaState(NamedTuple):
 
     @property
     def converged(self) -> bool:
-        """Whether the search stalls. Populations decide, since a single point may be better by chance."""
+        """Whether the search has converged. Whole populations decide, because one point may be better by chance."""
         return bool(self.stale >= PATIENCE)
 
 
@@ -97,7 +97,7 @@ def next_population(state: CmaState, seed: int) -> np.ndarray:
 
 
 def moved(state: CmaState, points: np.ndarray, values: np.ndarray) -> CmaState:
-    """Return the distribution updated with the values [n] at its last population `points` [n, m]."""
+    """Return the distribution after an update with the values [n] of its last population, `points` [n, m]."""
     m, now = len(state.mean), int(state.drawn) + 1
     r = rates(m)
     order = np.argsort(values, kind="stable")[: len(r.weights)]

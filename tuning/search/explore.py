@@ -14,7 +14,7 @@ REACH = np.linspace(-1.5, 1.5, 13)
 
 @dataclasses.dataclass(frozen=True)
 class Slices:
-    """Slices of the goal along each gain through the optimum: gains, goals (logs) and lost members, each [m, k]."""
+    """Slices of the goal along each gain through the optimum: gains, goals (logarithms), lost members; each [m, k]."""
 
     gains: np.ndarray
     goals: np.ndarray
@@ -23,25 +23,26 @@ class Slices:
     """logarithms of the risk of the errors, without the terms of the limits"""
 
     def sensitivity(self) -> np.ndarray:
-        """Return the growth of the risk in per cent when a gain is off by a factor e^0.25, the worse side, [m].
+        """Return the increase of the risk, in per cent, for each gain [m] that is off by a factor e^0.25.
 
-        It has no meaning for a gain with `more_lost` > 0: the loss of a rotor costs about 1e6 times an error.
+        The gain is multiplied or divided by this factor, whichever is worse. The number has no meaning if `more_lost`
+        is above 0: the loss of a rotor costs about 1e6 times as much as an error.
         """
         middle = len(REACH) // 2
         beside = np.maximum(self.risks[:, middle - 1], self.risks[:, middle + 1])
         return 100 * np.expm1(beside - self.risks[:, middle])
 
     def more_lost(self) -> np.ndarray:
-        """Return the number of additional lost members when a gain is off by a factor e^0.25, the worse side, [m]."""
+        """Return the number of additional lost members for each gain [m], off by e^0.25 as in `sensitivity`."""
         middle = len(REACH) // 2
         beside = np.maximum(self.lost[:, middle - 1], self.lost[:, middle + 1])
         return np.maximum(beside - self.lost[:, middle], 0)
 
     def lowest(self) -> tuple[int, int, float]:
-        """Return the gain and the point of its slice with the lowest goal, and the decrease of the goal there.
+        """Return the number of the gain and of the point on its slice with the lowest goal, and the decrease there.
 
-        The decrease is a logarithm, and 0 if no point is lower. Points that lose more members than the optimum do not
-        count.
+        The decrease of the goal is a logarithm; it is 0 if no point is lower. Points that lose more members than the
+        optimum do not count.
         """
         middle = len(REACH) // 2
         drop = np.where(self.lost <= self.lost[:, [middle]], self.goals[:, [middle]] - self.goals, 0.0)

@@ -1,8 +1,9 @@
-"""The front of error against voltage, and its knee: the least voltage of all answers nearly as good as the best.
+"""The front of error against voltage, and its knee: the answer of least voltage among those of nearly the least error.
 
-From the answer of least error e, searches minimise the rms voltage with the rms error limited to a factor times e; each
-begins at the best answer before. The factor of the knee is KNEE. At a low voltage the error of a few members may be
-many times that of the others. Such validation members join the training ensemble, and the search is repeated.
+After the search for the least error e, further searches minimise the rms voltage. Each limits the rms error to a factor
+times e, and starts at the best answer so far. The factor of the knee is KNEE. At a low voltage, a few members may have
+errors many times those of the others. Such members of the validation ensemble join the training ensemble, and the
+search is repeated.
 """
 
 import dataclasses
@@ -21,24 +22,26 @@ from tuning.search.course import Course, SearchResult
 from tuning.search.multipliers import holding, judged_members, judged_values, met, search_values
 from tuning.search.validation import largest_unseen, validated
 
-# Error limit of the knee, and those of the front in the order in which tune.front adds them, relative to the least.
+# Limits of the rms error relative to the least error: KNEE for the knee, FACTORS for the points of the front. The first
+# tune.front factors are used.
 KNEE = 1.25
 FACTORS = (KNEE, 1.1, 1.5, 1.05, 2.0)
-# Largest numbers of searches for a point, with an update of the multipliers or new members between two, and of answers
-# that are validated.
-UPDATES, TRIES = 6, 4
-# If the error of the judge exceeds the one that the search expects by more than this share, the training ensemble lacks
-# the members of large errors. The share is smaller than `validation.LARGER`, because the error is limited here.
-RARE = 0.1
+# Largest number of searches for a point of the front. Between two of them, the multipliers are updated or members join.
+# Largest number of answers that are validated.
+MOST_SEARCHES_PER_POINT, MOST_VALIDATIONS = 6, 4
+# If the judge's error exceeds the error that the search expects by more than the share UNEXPECTED, the training
+# ensemble lacks members of large errors. The share is smaller than `validation.LARGER`, because the error is limited
+# here.
+UNEXPECTED = 0.1
 
 
 class FrontPoint(NamedTuple):
     """An answer, judged on members of another seed than the training ensemble.
 
-    `factor`: limit of the rms error relative to the least; 1: the answer of least error. `x` [m]: coordinates.
-    `error_m`, `volts`: settled rms error (m) and voltage (V) of the members held, NaN without any. `sensitivity`:
-    peak of |S| as it is limited; None if it is not. `lost`, `stalled`: of `members` members. `within`: whether
-    all limits except that of the error are met.
+    `factor`: limit of the rms error relative to the least error; 1: the answer of least error. `x` [m]: coordinates.
+    `error_m`, `volts`: settled rms error (m) and settled rms voltage (V) of the members that are held; NaN if none is
+    held. `sensitivity`: the limited peak of |S|; None if it has no limit. `lost`, `stalled`: number of lost and of
+    stalled members among `members`. `within`: whether all limits except that of the error are met.
     """
 
     factor: float
@@ -55,14 +58,14 @@ class FrontPoint(NamedTuple):
 def trace_front(course: Course, answer: SearchResult) -> SearchResult:
     """Trace the front from the answer of least error. Return the answer that tune.objective selects.
 
-    The result holds the points of the front in order of the error limit: for each limit the judged answer of least
-    voltage. A search for less voltage may find a smaller error than the answer's; it is then the least error. Raises
-    ValueError as `Course.search` does.
+    The result contains the points of the front in the order of their limits of the error: for each limit, the judged
+    answer of least voltage. If a search for a lower voltage finds a smaller error than that of `answer`, this error is
+    taken as the least error. Raises ValueError as `Course.search` does.
     """
     course.problem, x = answer.problem, answer.x
     first, *_ = _judged(course, 1.0, x)
     if not (math.isfinite(first.error_m) and first.error_m > 0 and first.volts > 0):
-        say("no front: the answer of least error holds no member, or has no error or voltage")
+        say("no front: with the gains of least error, no member is held, or the error or the voltage is 0")
         return answer
     seen, factors = [first], sorted(FACTORS[: answer.problem.tune.budget.front])
     for factor in factors:
@@ -77,7 +80,7 @@ def trace_front(course: Course, answer: SearchResult) -> SearchResult:
         least, course.problem = least_of(seen), answer.problem
         if answer.problem.tune.objective == "knee":
             course.problem = answer.problem.towards_voltage(least.error_m, least.volts, KNEE)
-        taken = _valid(course, answer, seen)
+        taken = _validated_point(course, answer, seen)
     least = least_of(seen)
     points = [least._replace(factor=1.0), *(chosen(seen, factor)._replace(factor=factor) for factor in factors)]
     if not any(point.x is taken.x for point in points):
@@ -87,22 +90,19 @@ def trace_front(course: Course, answer: SearchResult) -> SearchResult:
 
 
 def least_of(seen: Sequence[FrontPoint]) -> FrontPoint:
-    """Return the point of least error of those that `_fit` returns."""
-    return min(_fit(seen), key=lambda point: point.error_m)
+    """Return the admissible point of least error."""
+    return min(_admissible(seen), key=lambda point: point.error_m)
 
 
 def chosen(seen: Sequence[FrontPoint], factor: float) -> FrontPoint:
-    """Return the point of least voltage of those with an error of at most `factor` times the least.
-
-    Only points that `_fit` returns count.
-    """
-    fit = _fit(seen)
+    """Return the admissible point of least voltage with an error of at most `factor` times the least."""
+    fit = _admissible(seen)
     least = min(point.error_m for point in fit)
     return min((point for point in fit if point.error_m <= factor * least), key=lambda point: point.volts)
 
 
-def _fit(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
-    """Return the points that lose no more members than the first, and that meet all limits if the first does."""
+def _admissible(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
+    """Return the points that lose no more members than the first point, and meet all limits if the first point does."""
     first = seen[0]
     return [
         point
@@ -114,13 +114,13 @@ def _fit(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
 
 
 def _search_least_voltage(course: Course, factor: float, seen: Sequence[FrontPoint]) -> list[FrontPoint]:
-    """Search for the least voltage within the limits from the best point in `seen`. Return the answer of each search.
+    """Search for the least voltage within the limits, from the best point in `seen`. Return the answer of each search.
 
-    After each search either the multipliers are updated, or members join the training ensemble; then the next search
-    begins at the best point so far.
+    After each search, either the multipliers are updated and the next search starts at the answer, or members join the
+    training ensemble and the next search starts at the best point so far.
     """
     points, x = list[FrontPoint](), chosen(seen, factor).x
-    for _ in range(UPDATES):
+    for _ in range(MOST_SEARCHES_PER_POINT):
         course.limit_searches += 1
         start = x
         x, _ = course.search(start[None])
@@ -136,7 +136,7 @@ def _search_least_voltage(course: Course, factor: float, seen: Sequence[FrontPoi
             break
         if np.array_equal(x, start) and holding(limits, numbers):
             break
-        more = _rare(course, numbers, columns)
+        more = _members_to_join(course, numbers, columns)
         if more is None:
             course.problem = course.problem.limited(limits)
         else:
@@ -146,8 +146,10 @@ def _search_least_voltage(course: Course, factor: float, seen: Sequence[FrontPoi
     return points
 
 
-def _rare(course: Course, numbers: Sequence[tuple[float, float]], columns: Mapping[str, np.ndarray]) -> Members | None:
-    """Return the validation members of the largest errors that are to join; None if the search expects such errors.
+def _members_to_join(
+    course: Course, numbers: Sequence[tuple[float, float]], columns: Mapping[str, np.ndarray]
+) -> Members | None:
+    """Return the validation members of the largest errors, which join the training ensemble; None if none should join.
 
     `numbers`: the values of the search and of the judge for each limit. `columns` [N]: metrics of the judged members.
     """
@@ -155,27 +157,27 @@ def _rare(course: Course, numbers: Sequence[tuple[float, float]], columns: Mappi
     limit, (tuned, judged) = next(
         (limit, pair) for limit, pair in zip(problem.limits, numbers, strict=True) if limit.name == "rms_error_m"
     )
-    if not budget.validation or limit.holds(judged) or judged <= (1 + RARE) * limit.ratio * tuned:
+    if not budget.validation or limit.holds(judged) or judged <= (1 + UNEXPECTED) * limit.ratio * tuned:
         return None
     errors = np.where(held(columns), columns["settled_rms_error_m"], -math.inf)
     worst = largest_unseen(course, errors)
     return problem.objective.chosen(seeds(budget)[1], worst, len(errors)) if worst.size else None
 
 
-def _valid(course: Course, answer: SearchResult, seen: list[FrontPoint]) -> SearchResult:
-    """Return the point that tune.objective selects if it is valid, else the next best; the given answer if none is.
+def _validated_point(course: Course, answer: SearchResult, seen: list[FrontPoint]) -> SearchResult:
+    """Return the best point that the validation confirms, or `answer` if it confirms none.
 
-    Points that are not valid are removed from `seen`.
+    tune.objective determines which point is the best. Points that are not confirmed are removed from `seen`.
     """
     knee = answer.problem.tune.objective == "knee"
-    for _ in range(TRIES):
+    for _ in range(MOST_VALIDATIONS):
         best = chosen(seen, KNEE) if knee else least_of(seen)
         if best is seen[0]:
             return answer
         found = validated(course, best.x).result
         if found.good:
             return found
-        say(f"the answer of {best.volts:.4g} V is not taken: it loses members, or accurate steps do not confirm it")
+        say(f"the answer of {best.volts:.4g} V is rejected: it loses members, or accurate steps do not confirm it")
         seen[:] = [point for point in seen if point is not best]
     return answer
 
@@ -183,9 +185,9 @@ def _valid(course: Course, answer: SearchResult, seen: list[FrontPoint]) -> Sear
 def _judged(
     course: Course, factor: float, x: np.ndarray
 ) -> tuple[FrontPoint, list[tuple[float, float]], dict[str, np.ndarray]]:
-    """Judge x [m] on members of the validation ensemble, or of the training ensemble without one.
+    """Judge x [m] on members of the validation ensemble, or of the training ensemble if tune.validation is 0.
 
-    Returns the point, each limit's value of the search and of the judge, and the metrics of the members judged.
+    Returns the point, the search's and the judge's value of each limit, and the metrics of the judged members.
     """
     problem, budget = course.problem, course.problem.tune.budget
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)

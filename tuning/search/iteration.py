@@ -78,7 +78,7 @@ def _evolved(
             better[int(at)] = {name: terms[name][row * len(values[row]) + first] for name in TERMS}
         cma = moved(own[row], points[row], values[row])
         length[at] = cma.reach
-        progress.put(at, cma)
+        progress.set_cma_state(at, cma)
     state = progress.starts.state._replace(best=jnp.asarray(best), value=jnp.asarray(value))
     progress.starts = progress.starts._replace(state=state, length=jnp.asarray(length))
     return better

@@ -1,7 +1,7 @@
 """The method of multipliers: update the limits' multipliers at an optimum and search again until all limits are met.
 
-The judge evaluates the limited quantities at each optimum, on members that the search does not use. There, g of a limit
-is about (required multiplier - multiplier) / penalty. The update of the multiplier reduces this excess.
+The judge evaluates the limited quantities at each optimum, on members that the search does not use. At an optimum, the
+excess g of a limit is about (required multiplier - multiplier) / penalty. An update of the multiplier reduces it.
 """
 
 import math
@@ -21,9 +21,10 @@ from tuning.search.course import Course
 MOST_UPDATES = 6
 # Smallest decrease of g that counts as progress towards a limit.
 LEAST_DECREASE = 1e-3
-# A limit with g below minus this number is clearly met and not judged again, because two ensembles differ by far less.
+# A limit with g below -CLEARLY_BELOW is clearly met and is not judged again: two ensembles differ by far less.
 CLEARLY_BELOW = 0.1
-# A linear value with g above minus this number is measured by an injection, which exceeds it by up to a fifth.
+# A quantity whose linear value has g above -INJECTED_FROM is also measured by injection, because the measured value may
+# exceed the linear one by up to a fifth.
 INJECTED_FROM = 0.2
 # Largest number of members on which averages are judged; limits of worst members need the whole ensemble.
 AVERAGING_MEMBERS = 256
@@ -32,9 +33,10 @@ AVERAGING_MEMBERS = 256
 def search_within_limits(course: Course, x: np.ndarray) -> np.ndarray:
     """Update the multipliers at x [m] and search again until every limit is met. Return the last optimum [m].
 
-    Returns x itself if no search was needed. There are at most MOST_UPDATES updates. They end early after Ctrl-C, if
-    the search does not leave an optimum that is within all limits, or if a larger penalty makes no progress towards a
-    limit; whether the limit holds is then judged on the held-out members. `course.problem` receives the updated limits.
+    Returns x itself if no search was needed. There are at most MOST_UPDATES updates. They end early after Ctrl-C, and
+    if a search ends where it began, within all limits. They also end early if a larger penalty makes no progress
+    towards a limit; the held-out members then show whether the limit holds. `course.problem` receives the updated
+    limits.
     """
     moved = True
     for _ in range(MOST_UPDATES):
@@ -69,7 +71,7 @@ def holding(limits: Sequence[Limit], numbers: Sequence[tuple[float, float]]) -> 
 
 
 def _stuck(limit: Limit, judged: float) -> bool:
-    """Return whether a limit is exceeded by no less than before its penalty grew. `judged`: the judge's value."""
+    """Return whether a larger penalty did not reduce the excess of a limit. `judged`: the judge's value."""
     excess = limit.log_excess(judged)
     return (
         limit.penalty > PENALTY
@@ -79,7 +81,7 @@ def _stuck(limit: Limit, judged: float) -> bool:
 
 
 def met(limit: Limit, judged: float) -> bool:
-    """Return whether the judge's value is at the bound `Limit.allowed` of an active limit.
+    """Return whether the judge's value is close to the bound `Limit.allowed`, as it should be for an active limit.
 
     g may lie between -TOLERANCE_BELOW and half of the margin.
     """
@@ -108,7 +110,7 @@ def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
 
 
 def judged_members(limits: Sequence[Limit], count: int) -> int:
-    """Return how many of `count` members the limits are judged on: all if one of them is on the worst member."""
+    """Return on how many of `count` members the limits are judged: on all, if a limit concerns the worst member."""
     return count if any(limit.kind.worst for limit in limits) else min(count, AVERAGING_MEMBERS)
 
 
@@ -125,9 +127,9 @@ def judged_values(
 
     `columns` [N]: result of `judge` for the ensemble with this `seed`. `tuned`: the search's value of each limit.
 
-    On a processor the member with the largest linear peak is measured by one injection if it may break a limit, because
-    the held-out members are measured in this way too. If injections decide alone (`measured_peaks.decides`), values
-    that an earlier injection has corrected, and that are clearly within their limits, replace another injection.
+    On a processor, the member with the largest linear peak may break a limit. It is then measured by one injection, as
+    the held-out members are. If only injections decide (`measured_peaks.decides`), there is no new injection while the
+    search's values, corrected by an earlier injection, are clearly within their limits.
     """
     if not injects(problem):
         return [limit.reached(columns) for limit in problem.limits]

@@ -1,4 +1,4 @@
-"""The search: a screen, then the simultaneous refinement of several starts. It can be interrupted and resumed."""
+"""The search: a screen, then the simultaneous refinement of several starts. A search can be interrupted and resumed."""
 
 import time
 from collections.abc import Callable
@@ -19,37 +19,37 @@ from tuning.search.evolution import idle_states, initial_state
 from tuning.search.iteration import append_history, iterate
 from tuning.search.screen import screen
 
-# A start has converged if its next step is shorter than this, in coordinates.
+# A start has converged if its next step, in coordinates, is shorter than this.
 SHORTEST = 1e-3
-# Iterations of a phase after which only the better half of the starts continues.
+# Numbers of iterations of a phase after which only the better half of the starts continues.
 HALVINGS = (4, 10)
-# Number of points of the first phase's path that are tried on all members.
-PATH = 12
+# Number of points that the first phase visited and that are then evaluated on all members.
+PATH_POINTS = 12
 
 
 class Phase(NamedTuple):
     """A phase of the search.
 
-    It simulates one in `part` of the ordinary members, and all stressed members, because the goal jumps where one of
-    these is lost. A descent has converged if the goal falls by less than `stall` over `patience` iterations. If the
-    norm of its gradient then exceeds `rise`, the start continues with CMA-ES.
+    It simulates one in `part` of the ordinary members. It simulates all stressed members, because the goal jumps where
+    one of these is lost. A descent has converged if the goal falls by less than `stall` over `patience` iterations. If
+    the norm of its gradient then exceeds `gradient_limit`, the start continues with CMA-ES.
     """
 
     part: int
     stall: float
     patience: int
-    rise: float
+    gradient_limit: float
 
 
-# A start with a larger gradient does not descend: such a gradient predicts that the goal changes by a factor e within
-# the shortest step.
+# A start with a gradient above STEEP uses CMA-ES at once. Such a gradient predicts that the goal changes by a factor e
+# within the shortest step.
 STEEP = 1 / SHORTEST
-# The first phase uses few members: their optimum is close to that of all, at less than half of the cost. The gradient
-# of the goal, a logarithm, vanishes at a minimum: converged descents of benchmarks/tasks end at norms of 0.001 to 0.02
-# per factor e of a gain, descents that stop early at 0.36 to 1e127.
+# The first phase uses few members: their optimum is close to that of all members, at less than half of the cost. The
+# gradient vanishes at a minimum of the goal, a logarithm. In benchmarks/tasks, converged descents end with norms of
+# 0.001 to 0.02 per factor e of a gain, and descents that stop early with norms of 0.36 to 1e127.
 FEW, ALL = Phase(4, 0.02, 3, STEEP), Phase(1, 1e-3, 4, 0.1)
 # Message at the first Ctrl-C.
-INTERRUPT_MESSAGE = "the search ends after this iteration; what it found is judged and written."
+INTERRUPT_MESSAGE = "the search ends after this iteration; its best gains are then judged and written."
 
 
 def search(
@@ -70,12 +70,14 @@ def search(
 ) -> SearchState:
     """Refine the best `keep` of these points, coordinates [K, m]. Ctrl-C ends the search early.
 
-    If there are more than `keep` points, they are screened and refined on a part of the members first. The best point
-    of their paths, or the first of `points`, is then refined on all members. Each phase takes at most `iterations`.
-    A start descends by the optimiser `name` with the learning rate `rate`, or uses CMA-ES if its derivatives mislead.
+    If there are more than `keep` points, they are first screened and refined on a part of the members. The best point
+    that this phase visited, or the first of `points` if it is better, is then refined on all members. Each phase has at
+    most `iterations`. A start descends by the optimiser `name` with the learning rate `rate`. If its gradient does not
+    lead to a minimum, it continues with CMA-ES.
 
-    `at_optimum`: an earlier search on all members ended at the first point, which is not refined again. `seed`: of the
-    populations. `on_iteration`: called after each iteration with the search and the duration of the iteration in s.
+    `at_optimum`: whether an earlier search on all members ended at the first point; the point is then not refined
+    again. `seed`: of the populations. `on_iteration`: called after each iteration with the search and the duration of
+    the iteration in s.
     """
     descent = Descent(goal, name, rate)
     checkpoint_file = checkpoint_file or CheckpointFile(None, {})
@@ -91,7 +93,7 @@ def search(
         progress = SearchState(starts, np.ones(len(points), bool))
     try:
         while True:
-            # Before the first iteration there is nothing to judge, so Ctrl-C ends the process.
+            # Before the first iteration, the search has no result to judge, so Ctrl-C ends the process.
             with deferred(INTERRUPT_MESSAGE if progress.history else ""):
                 raise_if_interrupted()
                 before = progress.seconds
@@ -119,20 +121,20 @@ def _switch(progress: SearchState, phase: Phase) -> None:
     do not describe the goal, and a descent stops early at a jump of the goal, beyond which members are lost.
     """
     starts, count = progress.starts, progress.iteration - progress.since
-    value, rise, active = np.asarray(starts.value), np.asarray(starts.rise), progress.active
+    value, norm, active = np.asarray(starts.value), np.asarray(starts.gradient_norm), progress.active
     evolving = progress.evolving
     ended = np.asarray(starts.length) <= SHORTEST
     converged = np.array([progress.cma_state(at).converged for at in range(len(active))])
-    # in the first phase populations only choose among starts
+    # in the first phase, CMA-ES only helps to choose among the starts, and ends with the last halving
     chosen = phase.part > 1 and count >= HALVINGS[-1]
     ended |= np.where(evolving, converged | chosen, _stalled(progress, phase.patience, phase.stall))
-    turns = active & ~evolving & ~((rise < STEEP) & ((rise < phase.rise) | ~ended))
+    turns = active & ~evolving & ~((norm < STEEP) & ((norm < phase.gradient_limit) | ~ended))
     active = active & (~ended | turns)
     if count in HALVINGS:
         order = np.argsort(np.where(active, value, np.inf), kind="stable")
         active[order[max((int(active.sum()) + 1) // 2, 1) :]] = False
     for at in np.flatnonzero(turns & active):
-        progress.put(at, initial_state(np.asarray(starts.best)[at]))
+        progress.set_cma_state(at, initial_state(np.asarray(starts.best)[at]))
     progress.active = active
 
 
@@ -153,17 +155,18 @@ def _begin_full_phase(
     given: np.ndarray,
     at_optimum: bool = False,
 ) -> None:
-    """Begin the next phase at the best point, for all members, of the paths of all starts and `given`.
+    """Begin the phase on all members.
 
-    The optimum for a part of the members may lose other members; then an earlier point of its path is better. If
-    `given` is the best point and `at_optimum`, the phase ends at once.
+    It starts at the best of `given` and some of the points that the first phase visited. The optimum of the first phase
+    may lose members that the phase did not simulate; an earlier point is then better. If `given` is the best point and
+    `at_optimum` is true, the phase ends at once.
     """
     x, value = (np.array(progress.history[name][progress.since :]) for name in ("x", "value"))
     starts = value.shape[1]
     x, value = x.reshape(-1, x.shape[-1]), value.ravel()
     _, first = np.unique(np.where(np.isfinite(value), value, np.inf), return_index=True)
     # denser among the better points
-    chosen = first[np.unique((np.linspace(0, np.sqrt(len(first) - 1), PATH).round(6) ** 2).astype(int))]
+    chosen = first[np.unique((np.linspace(0, np.sqrt(len(first) - 1), PATH_POINTS).round(6) ** 2).astype(int))]
     tried = np.concatenate([x[chosen], given[None]])
     terms = engine.terms(tried, members)
     values = goal.score(tried, terms, members)

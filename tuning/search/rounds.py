@@ -3,8 +3,8 @@
 The first round searches with restarts. If the error of the integration steps at the optimum is too large, the search
 continues with finer steps. If a limit is not met, it continues with other multipliers. The answer is then validated.
 These members join the training ensemble for the next round: validation members that are lost, members that are lost
-with accurate steps, and validation members with errors that the training members do not have. At the end the front of
-error against voltage is traced, if tune.objective or --pareto requires it.
+with accurate steps, and validation members with errors that the training members do not have. If tune.objective or
+--pareto requires it, the front of error against voltage is traced at the end.
 """
 
 import dataclasses
@@ -34,11 +34,12 @@ def rounds(
     """Tune from the gains `start` [m], SI units, and return the result.
 
     `out`: directory of the checkpoints. `facts`: settings that a checkpoint must match. `resume`: whether to continue
-    from the checkpoints. The result is the confirmed answer that loses the fewest members, and of several the one of
-    least error on the validation ensemble; without a confirmed answer,
-    an earlier point of the searches that accurate steps confirm, if there is one. If a front is traced, the result is
-    the answer that `trace_front` selects. Raises ValueError if the goal is not finite at any starting point, or if a
-    checkpoint belongs to another search.
+    from the checkpoints. The result is the confirmed answer that loses the fewest members; of several such answers, the
+    one of least error on the validation ensemble. If no answer is confirmed, the result is an earlier point of the
+    searches that accurate steps confirm, or, without such a point, the answer that loses the fewest members. If a front
+    is traced, the result is the answer that `trace_front` selects.
+
+    Raises ValueError if the goal is not finite at any starting point, or if a checkpoint belongs to another search.
     """
     budget, answers = problem.tune.budget, list[SearchResult]()
     course = Course(problem, training(problem), budget.seed, out, facts, resume)
@@ -52,7 +53,7 @@ def rounds(
             x, error = held, None
         answer, error, lost, large = validated(course, x, error)
         answers.append(answer)
-        if (answer.good and not large.size) or course.interrupted or _many(course):
+        if (answer.good and not large.size) or course.interrupted or _is_exhausted(course):
             break
         if answer.good:
             more = course.problem.objective.chosen(seeds(budget)[1], large, budget.validation)
@@ -73,7 +74,7 @@ def rounds(
     return dataclasses.replace(best, seconds=course.answer(x, None, 0).seconds)
 
 
-def _many(course: Course) -> bool:
+def _is_exhausted(course: Course) -> bool:
     """Return whether MOST_ROUNDS searches are done. Those after an update of the multipliers do not count."""
     return len(course.past) - course.limit_searches >= MOST_ROUNDS
 
@@ -82,7 +83,7 @@ def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepErro
     """Return coordinates [m] whose step error is small enough, and this error.
 
     The first candidate is `x`; the others are the results of searches that continue from it in finer steps. There are
-    at most MOST_HALVINGS such searches. The error of the last result is returned even if it is too large.
+    at most MOST_HALVINGS such searches. If the last step error is still too large, it is returned all the same.
     """
     while True:
         error = step_error(course.problem, x)
@@ -96,7 +97,7 @@ def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepErro
 
 
 def earlier_confirmed(course: Course, best: SearchResult) -> SearchResult:
-    """Return the first earlier point of the searches, best first, that is confirmed; `best` if there is none."""
+    """Return the best earlier point of the searches that is confirmed, or `best` if there is none."""
     say("accurate steps confirm none of the answers; earlier points of the searches are tried")
     for x in points_of(course.past):
         error = step_error(course.problem, x)

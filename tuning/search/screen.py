@@ -20,7 +20,7 @@ def initial_points(
 ) -> np.ndarray:
     """Return coordinates [count + 2, m]: the gains `start` [m], the middle of the ranges, and quasi-random points.
 
-    If `count` is 0, only the gains `start`, [1, m].
+    If `count` is 0, the result contains only the gains `start`, [1, m].
     """
     space = objective.space
     if not count:
@@ -33,7 +33,7 @@ def initial_points(
 
 
 def around(x: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Return coordinates [count + 1, m]: x [m], and quasi-random points within NEAR and FAR of it in turn."""
+    """Return coordinates [count + 1, m]: x [m], and quasi-random points, alternately within NEAR and FAR of x."""
     if not count:
         return x[None]
     cube = design_points("sobol", seed, len(x), np.arange(count), count)

@@ -18,16 +18,16 @@ MOST_LOST, MOST_LARGE = 16, 8
 # If the rms error of the validation members exceeds that of the training members by more than this factor, the training
 # ensemble lacks the members of large errors.
 LARGER = 1.5
-# Members that are lost with accurate steps join with the noise factor NOISE_GROWTH**number, because with their own
-# noise they are held in the steps of the search.
+# Members that are lost with accurate steps are held with the steps of the search. They therefore join with more noise,
+# by the factor NOISE_GROWTH**number in round number `number`.
 NOISE_GROWTH = 1.5
 
 
 class Validation(NamedTuple):
     """Result of `validated`.
 
-    `result`: the answer. `error`: its step error. `lost`, `large`: numbers of the validation members that are lost,
-    largest share of the run first, and of those that join the training ensemble because of their large errors.
+    `result`: the answer. `error`: its step error. `lost`: numbers of the validation members that are lost, the earliest
+    loss first. `large`: numbers of those that join the training ensemble because of their large errors.
     """
 
     result: SearchResult
@@ -98,7 +98,8 @@ def joining(problem: TuningProblem, lost: np.ndarray, error: StepError, number: 
     """Return the members that join the training ensemble.
 
     The first of the `lost` validation members join with half of the additional noise of stressed members, which leaves
-    a margin. Members that are lost with accurate steps join with NOISE_GROWTH**number times the noise.
+    a margin. Members that are lost with accurate steps join with NOISE_GROWTH**number times their noise. `number`: of
+    the round, from 1.
     """
     budget = problem.tune.budget
     those = problem.objective.chosen(seeds(budget)[1], lost[:MOST_LOST], budget.validation)

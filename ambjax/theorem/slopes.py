@@ -1,0 +1,68 @@
+"""Slope of each law times the sample period, and the limits below which the discrete step of the law is stable."""
+
+import dataclasses
+import math
+from typing import Any, SupportsFloat
+
+from ambjax.control.base import with_infinite_steepness
+from ambjax.control.cascade import Cascade
+from ambjax.control.cascade_state import CascadeState
+from ambjax.control.sampling import Sampling, slope_limits
+from ambjax.control.schedule import extremes
+from ambjax.simulation.clock import Clock
+
+# Stages whose output acts after the delay. Observers and inversion laws act on states of their own, without delay.
+DELAYED = ("position", "current")
+
+
+@dataclasses.dataclass(frozen=True)
+class SlopeCheck:
+    """Slope of a law times T, and the limits for stability and for no oscillation.
+
+    `slope`: slope times T. `stepped`: its effective value in the discrete step of the law. For an explicit step it
+    equals `slope`. For an implicit step of a sign it is a/(1 + a) with a = `slope`, which is below both limits unless
+    the law is delayed. `limit`: the law is stable if `stepped` is below it. `quiet`: the law does not oscillate if
+    `stepped` is below it.
+    """
+
+    stage: str
+    slope: float
+    stepped: float
+    limit: float
+    quiet: float
+    implicit: bool
+
+    @property
+    def holds(self) -> bool:
+        """Whether the law, without the other laws, is stable."""
+        return self.stepped < self.limit
+
+
+def slope_checks(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
+    """Return slope times T and its limits for every law with a slope. `cascade`: of one member."""
+    sampling, lines = sampling_of(cascade, clock), []
+    for stage, law in zip(CascadeState._fields, map(with_infinite_steepness, cascade.laws), strict=True):
+        implicit = law.has_own_step(sampling.implicit)
+        ends = extremes(law)
+        slope = stepped = max(_steepest(one.slope(cascade.model)) for one in ends) * sampling.period
+        if implicit:
+            relaxed = 1 / (1 + 1 / slope) if slope else 0.0
+            rate = max(float(one.explicit_rate(cascade.model)) for one in ends)
+            stepped = max(relaxed, rate * sampling.period)
+        if slope:
+            lines.append(
+                SlopeCheck(stage, slope, stepped, *slope_limits(sampling.late if stage in DELAYED else 0.0), implicit)
+            )
+    return lines
+
+
+def _steepest(slope: SupportsFloat) -> float:
+    """Convert a slope to float. NaN, which results if infinite slopes of set-valued signs cancel, becomes inf."""
+    return math.inf if math.isnan(float(slope)) else float(slope)
+
+
+def sampling_of(cascade: Cascade, clock: Clock) -> Sampling:
+    """Return the sampling of the laws of a cascade with a processor."""
+    processor: Any = cascade.on_processor().processor
+    late = float(processor.delay) - (float(processor.ahead) if processor.predicts else 0.0)
+    return Sampling(float(clock.sample_period), max(late, 0.0), processor.implicit)
