@@ -278,7 +278,9 @@ def sampled_tasks() -> list[str]:
         cells += [f"{row['settled_max_abs_error_m']:.1e}", f"{row['lost']} of {row['members']}"]
         cells += [f"{row['settled_rms_u_V']:.0f}", f"{row['chatter_V']:.1e}", f"{row['rollouts']:,}"]
         continuous = row.get("continuous", {}).get("processor_s")
-        cells += [f"{row['processor_s']:.0f}" + (f" ({continuous:.0f})" if continuous else ""), _gains(row)]
+        # None: the task ran on another machine than the others
+        seconds = "-" if row["processor_s"] is None else f"{row['processor_s']:.0f}"
+        cells += [seconds + (f" ({continuous:.0f})" if continuous else ""), _gains(row)]
         rows.append(cells)
     titles = "task | CMA-ES (m) | settled rms error (m) | largest (m) | lost | u rms (V) | variation of u (V) | "
     return lines + table(titles + "rollouts | processor (s) | gains", rows)
