@@ -116,7 +116,8 @@ def _currents(case: Case) -> Iterator[str]:
         yield f"initial.i = {scenario.initial.i:g} A is {beyond}"
     weight = plant.m * plant.g / plant.k_i  # v = 4 i_0 i / s_0^2 at z = 0
     if abs(weight) > plant.i_0:
-        yield f"plant: holding the rotor at z = 0 takes {abs(weight):.4g} A, {beyond} Check m, n, A, s_0 and i_0."
+        numbers = ", ".join(f"{name} = {getattr(plant, name):g}" for name in ("m", "n", "A", "s_0", "i_0"))
+        yield f"plant: holding the rotor at z = 0 takes {abs(weight):.4g} A, {beyond} Check {numbers}."
     if plant.R * abs(weight) > scenario.u_max:
         least = plant.R * abs(weight)
         yield f"actuator.u_max = {scenario.u_max:g} V is less than the {least:.4g} V that hold the rotor at z = 0."
