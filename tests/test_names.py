@@ -17,6 +17,10 @@ from ambjax.host.synonyms import OTHER_WORDS, meant
     ("tables", "said"),
     [
         ({"rotor": {"m": 1.0}}, "rotor = .*unknown key. Did you mean 'plant'"),
+        (
+            {"controller": {"position": {"k_p": 1.0, "k_d": 1.0, "w_f": 1.0}}},
+            "position.kind is left out, so the law is 'sliding-mode', .* These keys fit 'pid'",
+        ),
         ({"controller": {"position": {"kind": "lqr"}}}, "kind = \"lqr\": .* Did you mean 'state-feedback'"),
         ({"plant": {"mass": 1.0}}, "plant.mass = 1.0: unknown key. Did you mean 'm'"),
         ({"plant": {"gap": 1.0}}, "Did you mean 's_0'"),
