@@ -14,6 +14,8 @@ from tuning.problem import TuningProblem
 # The loss of one member as a formula. Costs are factors: they count relative to the error.
 FORMULA = f"{' + '.join(HELD)} + (tracking + peak) x (1 + {' + '.join(COSTS)})"
 Facts = dict[str, Any]
+# Largest exponent of a number that is shown: a limit that is far from being met would overflow.
+MOST_EXPONENT = 700.0
 
 
 def contributions(weights: Sequence[float], terms: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -52,7 +54,7 @@ def minimised(problem: TuningProblem, x: np.ndarray, members: Members) -> Facts:
         "survival_only": len(losses) - n,
         "held": float(losses[n:].mean()) if len(losses) > n else 0.0,
         "penalty": float(np.exp(goal.weight * penalty)),
-        "limits": float(np.exp(pull)),
+        "limits": float(np.exp(min(pull, MOST_EXPONENT))),
     }
     total = (parts["risk"] + parts["held"]) * parts["penalty"] * parts["limits"]
     return parts | {"total": total, "of": _of(goal)}
