@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from tuning.objective.goal import Goal
+from tuning.objective.goal import Goal, shown
 from tuning.objective.loss import COSTS, HELD, TERMS, outcomes, weigh
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
@@ -14,8 +14,6 @@ from tuning.problem import TuningProblem
 # The loss of one member as a formula. Costs are factors: they count relative to the error.
 FORMULA = f"{' + '.join(HELD)} + (tracking + peak) x (1 + {' + '.join(COSTS)})"
 Facts = dict[str, Any]
-# Largest exponent of a number that is shown: a limit that is far from being met would overflow.
-MOST_EXPONENT = 700.0
 
 
 def contributions(weights: Sequence[float], terms: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -54,7 +52,7 @@ def minimised(problem: TuningProblem, x: np.ndarray, members: Members) -> Facts:
         "survival_only": len(losses) - n,
         "held": float(losses[n:].mean()) if len(losses) > n else 0.0,
         "penalty": float(np.exp(goal.weight * penalty)),
-        "limits": float(np.exp(min(pull, MOST_EXPONENT))),
+        "limits": float(shown(pull)),
     }
     total = (parts["risk"] + parts["held"]) * parts["penalty"] * parts["limits"]
     return parts | {"total": total, "of": _of(goal)}

@@ -10,7 +10,7 @@ from ambjax.pictures.scales import digits, prefix_of
 from ambjax.pictures.style import own_style
 from ambjax.pictures.thinning import stretch_of, thin
 from ambjax.simulation.trajectory import STALLED, Trajectory
-from tuning.report.breakdown import MOST_EXPONENT
+from tuning.objective.goal import shown
 from tuning.report.front_table import letter
 from tuning.search.explore import Slices
 
@@ -146,8 +146,8 @@ def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
     left, right = figure.subplots(1, 2)
     steps, best = np.arange(1, len(value) + 1), np.argmin(value, axis=1)
     for s in range(value.shape[1]):
-        left.plot(steps, np.exp(np.minimum(value[:, s], MOST_EXPONENT)), "0.75", lw=1)
-    left.plot(steps, np.exp(np.minimum(value.min(axis=1), MOST_EXPONENT)), "C0", lw=1.8)
+        left.plot(steps, shown(value[:, s]), "0.75", lw=1)
+    left.plot(steps, shown(value.min(axis=1)), "C0", lw=1.8)
     title = "blue: the best start; dotted: the members change"
     left.set(xlabel="iteration", ylabel="what is minimised", yscale="log", title=title)
     for j, path in enumerate(paths):
