@@ -10,6 +10,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import TABLES, case_from
 from ambjax.commands.acceptance import forces
 from ambjax.commands.plausibility import implausible
+from ambjax.commands.warnings import read_with_warnings
 from ambjax.host.synonyms import OTHER_WORDS, meant
 
 
@@ -87,6 +88,13 @@ def graded(grade):
 
 def runout(amplitude):
     return {"sensor": {"runout": {"speed": 100.0, "harmonics": [{"number": 2, "amplitude": amplitude}]}}}
+
+
+def test_an_empty_file_is_doubted(tmp_path, capsys):
+    for text, said in ((" \n", True), ("[plant]\n", False)):
+        (tmp_path / "case.toml").write_text(text)
+        read_with_warnings(tmp_path / "case.toml")
+        assert ("the file is empty" in capsys.readouterr().err) == said
 
 
 @pytest.mark.parametrize(

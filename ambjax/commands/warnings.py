@@ -25,6 +25,8 @@ MOST_NOISE = 0.1
 def read_with_warnings(path: str | pathlib.Path) -> Case:
     """Read a case file and print its warnings on stderr. Raises ValueError as `read_case` does."""
     case = read_case(path)
+    if not case.text.strip():
+        say(one_line(f"{path}: the file is empty, so every number is the paper's. 'ambjax template' prints a case."))
     print_warnings(case, path)
     return case
 
