@@ -97,7 +97,7 @@ def parser() -> Parser:
         "--against", metavar="OTHER.toml", action="append", help="another case, mapped over the same grid (repeatable)"
     )
     _seed_option(grid)
-    summary = "check sensitivity, margins and the stability conditions of a case; exit code 1 if a condition fails"
+    summary = "check sensitivity, margins and the stability conditions of a case; exit code 1 if one that applies fails"
     command("check", summary, case=True)
     summary = "sensitivity peaks with ISO 14839-3 zones, margins, stiffness: sensitivity.json, sensitivity.png"
     sensitivity = command("sensitivity", summary, case=True, out=True)

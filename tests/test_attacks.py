@@ -401,6 +401,12 @@ def test_a_hostile_name_enters_nothing(capsys):
     assert read_case(write(SHORT, "\n.toml")).name == "_"
 
 
+def test_the_byte_order_mark_of_an_editor_is_ignored(tmp_path):
+    path = tmp_path / "marked.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + SHORT.encode())
+    assert read_case(path).clock == read_case(write(SHORT, tmp_path / "plain.toml")).clock
+
+
 @pytest.mark.parametrize("code", [*range(32), 0x7F, 0x85, 0x2028, 0xDCFF])
 def test_no_control_character_makes_toml_that_cannot_be_read(code):
     text = f"a{chr(code)}b"

@@ -427,6 +427,17 @@ def kept(monkeypatch):
     monkeypatch.setattr(tuned, "_png", lambda figure: figure)
 
 
+def test_the_whole_run_is_scaled_to_what_follows_settle(kept):
+    run = a_run(2000)
+    run.rows.z[:100] += 1.0
+    axes = np.reshape(tuned.before_after({"after": run}, settle=0.05).axes, (2, 3))
+    late = factor_of(axes[0, 0].get_ylabel()) * run.rows.e_z[run.rows.t >= 0.05]
+    low, high = axes[0, 0].get_ylim()
+    assert low < late.min()
+    assert late.max() < high < late.min() + 2 * np.ptp(late)
+    assert axes[0, 0].get_title() == "whole run, scaled to what follows 0.05 s"
+
+
 @pytest.mark.parametrize("n", [9600, 20_001, 200])
 def test_before_and_after_are_of_their_runs(n, kept):
     runs = {"before": a_run(n), "after": a_run(n, 0.7 * n * 1e-4)}

@@ -247,6 +247,8 @@ def test_no_file_and_no_period_are_one_clear_line(folder):
         position.LinearController.of(PID)
     with pytest.raises(ValueError, match=r"must end in \.npz"):
         save_controller("k.mat", K)
+    with pytest.raises(ValueError, match="system = ndarray has no A, B, C, D: it must be a state space"):
+        save_controller("k.npz", np.eye(2))
 
 
 @pytest.mark.slow

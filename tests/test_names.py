@@ -10,6 +10,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import TABLES, case_from
 from ambjax.commands.acceptance import forces
 from ambjax.commands.plausibility import implausible
+from ambjax.commands.warnings import read_with_warnings
 from ambjax.host.synonyms import OTHER_WORDS, meant
 
 
@@ -17,6 +18,11 @@ from ambjax.host.synonyms import OTHER_WORDS, meant
     ("tables", "said"),
     [
         ({"rotor": {"m": 1.0}}, "rotor = .*unknown key. Did you mean 'plant'"),
+        (
+            {"controller": {"position": {"k_p": 1.0, "k_d": 1.0, "w_f": 1.0}}},
+            "position.kind is left out, so the law is 'sliding-mode', .* These keys fit 'pid'",
+        ),
+        ({"controller": {"position": {"kind": "lqr"}}}, "kind = \"lqr\": .* Did you mean 'state-feedback'"),
         ({"plant": {"mass": 1.0}}, "plant.mass = 1.0: unknown key. Did you mean 'm'"),
         ({"plant": {"gap": 1.0}}, "Did you mean 's_0'"),
         ({"plant": {"s0": 1.0}}, "Did you mean 's_0'"),
@@ -84,6 +90,13 @@ def runout(amplitude):
     return {"sensor": {"runout": {"speed": 100.0, "harmonics": [{"number": 2, "amplitude": amplitude}]}}}
 
 
+def test_an_empty_file_is_doubted(tmp_path, capsys):
+    for text, said in ((" \n", True), ("[plant]\n", False)):
+        (tmp_path / "case.toml").write_text(text)
+        read_with_warnings(tmp_path / "case.toml")
+        assert ("the file is empty" in capsys.readouterr().err) == said
+
+
 @pytest.mark.parametrize(
     ("plant", "tables", "said"),
     [
@@ -91,6 +104,14 @@ def runout(amplitude):
         ({"m": 5e5}, {}, "plant.m = 500000 kg: usual values are 0.001 to 100000 kg. Is it in grams?"),
         ({"i_0": 2500.0}, {}, "plant.i_0 = 2500 A: .* Is it in milliamperes?"),
         ({"i_0": 5.0}, {}, "the bias flux density .* is 1.31 T; iron saturates above about 1.2 T"),
+        (
+            {},
+            {"processor": {}, "actuator": {"i_max": 2500.0}},
+            "actuator.i_max = 2500 A is 1000 times plant.i_0. Is it in milli",
+        ),
+        ({}, {"processor": {}, "actuator": {"i_max": 2.5}}, None),
+        ({"iron": {"saturation": 0.5}}, {}, "saturation = 0.5 T is less than the bias flux density .* = 0.653 T"),
+        ({"iron": {"saturation": 1.4}}, {}, None),
         ({}, sine(50.0, 350.0), "weight and loads reach 365.7 N, but the magnets pull with at most 364.2 N"),
         ({}, sine(50.0, 345.0), None),
         ({}, sine(6000.0), "disturbance.q_f: frequency gives 6000 Hz, above half the sampling rate, 5000 Hz"),

@@ -152,12 +152,15 @@ WRONG = {
     "a field that is no gain": (LAW.replace("@record", "@record", 1).replace(
         "    def init", "    name: str = 'x'\n\n    def init", 1), "mine.py:PD", ["PD.name: declare it by gain(...)"]),
     "the name kind": (LAW.replace("stiff", "kind"), "mine.py:PD", ["PD.kind", "Choose another"]),
-    "a syntax error": ("def f(:\n", "mine.py:PD", ["importing it raised SyntaxError: ", "(line 1)"]),
+    "a syntax error": ("def f(:\n", "mine.py:PD", ["importing it raised SyntaxError: invalid syntax (line 1)."]),
     "an error at import": ("x = 1\ny = 1 / 0\n", "mine.py:PD", ["raised ZeroDivisionError: division by zero (line 2)"]),
     "not in UTF-8": ('x = "\udcff"\n', "mine.py:PD", ["importing it raised SyntaxError"]),
     "no module": (LAW, "no_such_module:PD", ["raised ModuleNotFoundError: No module named", "Install it"]),
     "an error in a method": (LAW.replace("motion.z_dot", "motion.speed"), "mine.py:PD",
                              ["PD raised AttributeError", "no attribute 'speed' (line 25)"]),
+    "an if on a traced value": (LAW.replace("        return force_for", "        if motion.z > 0:\n            pass\n"
+                                            "        return force_for"), "mine.py:PD",
+                                ["raised TracerBoolConversionError", "jnp.where in place of `if`"]),
     "a rate of another shape": (LAW.replace("10 * self.stiff * (motion.z - reference.r)", "()"), "mine.py:PD",
                                 ["PD raised TypeError: the rate of the state must be like init(model)"]),
     "an output of another shape": (LAW.replace("return force_for", "return inputs or force_for"), "mine.py:PD",

@@ -25,6 +25,7 @@ from tuning.objective.limits import PENALTY, Limit, measures
 from tuning.objective.quantities import KINDS, LimitContext, largest
 from tuning.objective.risk import Mean
 from tuning.problem import REFINEMENT, problem_of
+from tuning.report import limit_table
 from tuning.report.limit_table import MORE
 from tuning.report.pictures import amplitudes
 from tuning.search.course import Course, training
@@ -367,3 +368,11 @@ def test_members_that_may_be_lost_are_counted_whole():
     """(1 - 0.9) 2000 is 199.99999999999997 in floating point."""
     assert [LimitSettings(survival=0.9).may_lose(n) for n in (2000, 1000, 19)] == [200, 100, 1]
     assert [LimitSettings(survival=s).may_lose(1000) for s in (1.0, 0.999, 0.9995)] == [0, 1, 0]
+
+
+def test_a_peak_that_was_measured_at_the_supply_is_said_to_be():
+    row = {"name": "sensitivity", "verdict": limit_table.BROKEN, "reached": 3.2, "threshold": 3.0, "source": "default"}
+    row |= {"at_least": False, "unit": ""}
+    for share, said in ((None, False), (0.01, False), (0.15, True)):
+        (line,) = limit_table.broken([row | {"saturated": share}])
+        assert ("the supply limits u in 15 % of the samples" in line) == said

@@ -23,6 +23,7 @@ from ambjax.simulation.trajectory import STALLED, TOUCHED
 from tuning.__main__ import main
 from tuning.config import seeds
 from tuning.judge import judge
+from tuning.objective.goal import shown
 from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS, weigh
 from tuning.report import accurate, breakdown, extras, gradient, held_out, pictures
@@ -444,3 +445,9 @@ WAYS = {
 def test_three_ways_to_a_derivative_are_judged(kind):
     *ways, words = WAYS[kind]
     assert gradient.agreement(*ways, floor=1e-7).startswith(words)
+
+
+def test_a_goal_far_from_its_limits_is_shown_without_overflow():
+    with np.errstate(over="raise"):
+        assert np.isfinite(shown(np.array([1.0, 5e3]))).all()
+    assert shown(2.0) == pytest.approx(math.e**2)

@@ -182,7 +182,7 @@ def _pictures(
     paths, runs = problem.objective.space.paths, {"before": problem.case.cascade, "after": tuned}
     shown = {name: accurate.nominal(problem, one) for name, one in runs.items()}
     drawn = {
-        "nominal.png": pictures.before_after(shown),
+        "nominal.png": pictures.before_after(shown, problem.case.settle),
         "spectrum.png": pictures.spectrum(shown, problem.case.settle),
         "convergence.png": pictures.convergence(history, paths),
         "slices.png": pictures.landscape(slices, paths),

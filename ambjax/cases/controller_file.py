@@ -94,6 +94,11 @@ def save_controller(path: str | pathlib.Path, system: Matrices) -> None:
 
     `system`: an object with the matrices A, B, C, D and the period dt (s). Raises ValueError as `realisation` does.
     """
+    if lacking := [name for name in NAMES if not hasattr(system, name)]:
+        raise ValueError(
+            f"save_controller: system = {type(system).__name__} has no {', '.join(lacking)}: it must be a state space "
+            "with the matrices A, B, C, D, such as control.ss(A, B, C, D, dt) or scipy.signal.StateSpace(A, B, C, D)."
+        )
     dt = getattr(system, OPTIONAL, None)
     arrays = {name: np.asarray(getattr(system, name)) for name in NAMES}
     realisation(**arrays, dt=dt)

@@ -8,7 +8,7 @@ from ambjax.cases.controller_file import ControllerFile, controller_file
 from ambjax.cases.gain_tables import law_from
 from ambjax.cases.own_laws import FORM, OwnLaw, is_own, own_law
 from ambjax.cases.scenario_tables import drive
-from ambjax.cases.table import Table
+from ambjax.cases.table import Table, quoted, show
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.base import Law, default_law
 from ambjax.control.cascade import Cascade
@@ -101,11 +101,29 @@ def cascade_from(
             kind = own[-1].law
         else:
             kind = kinds[law.choice("kind", list(kinds), _usual(kinds, laws.get("position"), command), FORM)]
+            _check_default(law, kind, kinds)
         if kind is position.LinearController:
             laws[stage], matrices = _linear(law, files)
         else:
             laws[stage] = law_from(_nominal(law, kind, actuator), kind, _defaults(law, kind, model, period))
     return Cascade(model=model, processor=processor, **laws), tuple(own), matrices
+
+
+def _check_default(law: Table, kind: type[Law], kinds: dict[str, type[Law]]) -> None:
+    """Raise ValueError if `kind` is left out and the keys are those of another law than the default, `kind`."""
+    others = [word for word, one in kinds.items() if law.raw.keys() <= _gains(one)]
+    unknown = next((key for key in law.raw if key not in _gains(kind)), None)
+    if "kind" not in law.raw and unknown is not None and others:
+        default = next(word for word, one in kinds.items() if one is kind)
+        raise ValueError(
+            f"{law.at(unknown)} = {show(law.raw[unknown])}: {law.at('kind')} is left out, so the law is '{default}', "
+            f"which has no such key. Set {law.at('kind')}. These keys fit {quoted(others)}."
+        )
+
+
+def _gains(kind: type[Law]) -> set[str]:
+    fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
+    return {field.name for field in fields if field.metadata.get("leaf")}
 
 
 def _usual(kinds: dict[str, type[Law]], demanding: Any, command: str) -> str:
@@ -138,8 +156,7 @@ def _linear(table: Table, files: Files) -> tuple[Law, ControllerFile]:
 
 def _defaults(table: Table, kind: type[Law], model: Plant, period: Scalar | None) -> Law | None:
     """Return the law of this kind with its default gains; None if the table gives every gain."""
-    fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
-    names = {field.name for field in fields if field.metadata.get("leaf")}
+    names = _gains(kind)
     if names <= set(table.raw):
         return None
     try:

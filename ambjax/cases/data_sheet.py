@@ -7,6 +7,7 @@ BEARING = """\
 # magnet is plausible: a bias flux of 0.75 T, a force of 15 times the weight, 23 mH. 'ambjax check' prints these.
 
 [plant]
+# kind = "two-coil"           # each coil has its own current: use it for your own machine, and tune the gains on it
 m = 2.4                       # kg; data sheet
 k_z = 0.0                     # N/m; no passive bearing
 mu_0 = 1.2566e-6              # N/A^2; air

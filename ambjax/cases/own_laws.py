@@ -112,7 +112,12 @@ def _module(source: str, file: pathlib.Path | None, refuse: Refuse) -> types.Mod
 def _said(error: BaseException, file: pathlib.Path | None) -> str:
     line = None if file is None else line_of(error, file)
     words = str(error).strip().partition("\n")[0] or "no message"
-    return f"raised {type(error).__name__}: {words.rstrip('.')}{'' if line is None else f' (line {line})'}"
+    if isinstance(error, SyntaxError) and line is not None:
+        words = error.msg  # str(error) contains the line too
+    fix = ""
+    if isinstance(error, (jax.errors.TracerBoolConversionError, jax.errors.TracerArrayConversionError)):
+        fix = ". A law computes with jax.numpy, and selects with jnp.where in place of `if`, `and`, `or`"
+    return f"raised {type(error).__name__}: {words.rstrip('.')}{'' if line is None else f' (line {line})'}{fix}"
 
 
 def _class(module: types.ModuleType, name: str, source: str, base: type[Law], refuse: Refuse) -> type[Law]:

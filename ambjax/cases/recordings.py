@@ -153,6 +153,8 @@ def _csv(file: pathlib.Path) -> dict[str, np.ndarray]:
         if len(row) != len(names):
             raise ValueError(f"line {line} has {len(row)} columns, but the first line has {len(names)}.")
         for k, cell in enumerate(row):
+            if not cell.strip():
+                raise ValueError(f"line {line}: the cell of column '{names[k]}' is empty. Give a number.")
             if (number := _float(cell)) is None:
                 raise ValueError(f"line {line}: {show(cell)} is not a number.")
             table[n, k] = number

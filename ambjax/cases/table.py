@@ -7,7 +7,7 @@ import re
 import tomllib
 from typing import Any
 
-from ambjax.host.synonyms import hint
+from ambjax.host.synonyms import hint, other_words
 from ambjax.host.words import one_line
 from ambjax.numerics.declared import check_number, numbers, within
 from ambjax.numerics.records import check_leaf
@@ -38,7 +38,7 @@ def load(path: str | pathlib.Path) -> tuple[dict[str, Any], str]:
     if len(content) > MOST_BYTES:
         raise refuse(f"a case file has at most {MOST_BYTES:,} bytes, and this file has more. See 'ambjax template'.")
     try:
-        text = content.decode("utf-8")
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise refuse("not a text file in UTF-8. A case file is TOML; see 'ambjax template'.") from None
     try:
@@ -146,7 +146,7 @@ class Table:
             raise ValueError(f"{self.at(key)} is missing: it must be one of {words}.")
         if value not in allowed:
             word = show(value).strip('"')
-            same = [name for name in allowed if name.lower() == word.lower()]
+            same = [name for name in allowed if name.lower() == word.lower() or word.lower() in other_words(name)]
             close = same or difflib.get_close_matches(word.lower(), allowed, n=1)
             other = f" Did you mean '{close[0]}'?" if close else ""
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be one of {words}.{other}")

@@ -24,6 +24,8 @@ RANGES = {
     "i_0": ((1e-3, 100.0), "A", "milliamperes"),
     "R": ((1e-4, 1e4), "ohm", "milliohms"),
 }
+# Largest plausible limit of a current, in bias currents.
+MOST_CURRENT = 100.0
 # Largest plausible length of a recorded signal, in lengths of the run.
 LONGEST_FILE = 100.0
 # Largest plausible runout, as a share of the clearance.
@@ -36,7 +38,7 @@ FREQUENCIES = {"frequency": 1.0, "frequency_end": 1.0, "f_high": 1.0, "speed": 1
 
 def implausible(case: Case) -> list[str]:
     """Return a warning, in one line, for each implausible number of a case and each implausible relation of two."""
-    machine = [*_ranges(case), *_forces(case), *_flux(case), *_rates(case), *_converter(case)]
+    machine = [*_ranges(case), *_forces(case), *_flux(case), *_limits(case), *_rates(case), *_converter(case)]
     return [*machine, *_delay(case), *_runout(case), *_aliases(case), *_loads(case)]
 
 
@@ -64,6 +66,20 @@ def _flux(case: Case) -> Iterator[str]:
             f"plant: the bias flux density mu_0 n i_0/(2 s_0) is {flux:.3g} T; iron saturates above about "
             f"{MOST_FLUX:g} T. Check n, i_0 and s_0, or give plant.iron.saturation."
         )
+    if iron is not None and iron.saturation is not None and flux > float(iron.saturation):
+        yield (
+            f"plant.iron.saturation = {float(iron.saturation):g} T is less than the bias flux density "
+            f"mu_0 n i_0/(2 s_0) = {flux:.3g} T: the iron saturates at rest. Check saturation, n, i_0 and s_0."
+        )
+
+
+def _limits(case: Case) -> Iterator[str]:
+    amplifier, bias = case.scenario.amplifier, float(case.scenario.plant.i_0)
+    for path, part in (("actuator", amplifier), ("actuator.coil", getattr(amplifier, "coil", None))):
+        limit = getattr(part, "i_max", None)
+        if limit is not None and float(limit) > MOST_CURRENT * bias:
+            times = f"{float(limit) / bias:.4g} times plant.i_0"
+            yield f"{path}.i_max = {float(limit):g} A is {times}. Is it in milliamperes?"
 
 
 def _rates(case: Case) -> Iterator[str]:

@@ -25,6 +25,8 @@ MOST_NOISE = 0.1
 def read_with_warnings(path: str | pathlib.Path) -> Case:
     """Read a case file and print its warnings on stderr. Raises ValueError as `read_case` does."""
     case = read_case(path)
+    if not case.text.strip():
+        say(one_line(f"{path}: the file is empty, so every number is the paper's. 'ambjax template' prints a case."))
     print_warnings(case, path)
     return case
 
@@ -116,7 +118,8 @@ def _currents(case: Case) -> Iterator[str]:
         yield f"initial.i = {scenario.initial.i:g} A is {beyond}"
     weight = plant.m * plant.g / plant.k_i  # v = 4 i_0 i / s_0^2 at z = 0
     if abs(weight) > plant.i_0:
-        yield f"plant: holding the rotor at z = 0 takes {abs(weight):.4g} A, {beyond} Check m, n, A, s_0 and i_0."
+        numbers = ", ".join(f"{name} = {getattr(plant, name):g}" for name in ("m", "n", "A", "s_0", "i_0"))
+        yield f"plant: holding the rotor at z = 0 takes {abs(weight):.4g} A, {beyond} Check {numbers}."
     if plant.R * abs(weight) > scenario.u_max:
         least = plant.R * abs(weight)
         yield f"actuator.u_max = {scenario.u_max:g} V is less than the {least:.4g} V that hold the rotor at z = 0."

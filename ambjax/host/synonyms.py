@@ -27,6 +27,7 @@ OTHER_WORDS = {
     "i_0": "bias biascurrent ibias",
     "R": "resistance coilresistance",
     "g": "gravity",
+    "state-feedback": "lqr lq fullstate poleplacement",
     "observer": "estimator filter kalman",
     "inversion": "linearisation linearization force",
     "position": "outer",
@@ -100,11 +101,16 @@ def meant(word: str, allowed: Iterable[str]) -> str | None:
     """Return the name that `word` probably means: one of `allowed`, or a name of another table; None if unknown."""
     names, plain = list(allowed), _plain(word)
     for name in names:
-        if _plain(name) == plain or plain in OTHER_WORDS.get(name, "").split():
+        if _plain(name) == plain or plain in other_words(name):
             return name
     elsewhere = (name for name, words in OTHER_WORDS.items() if "." in name and plain in words.split())
     close = difflib.get_close_matches(word, names, n=1)
     return next(elsewhere, close[0] if close else None)
+
+
+def other_words(name: str) -> list[str]:
+    """Return the other words for a name; none if the table has no row for it."""
+    return OTHER_WORDS.get(name, "").split()
 
 
 def hint(word: str, allowed: Iterable[str]) -> str:

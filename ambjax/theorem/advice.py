@@ -58,8 +58,8 @@ def advice(report: Report) -> list[str]:
     lines += [
         f"{line.requires} fails: {line.note}."
         if line.note
-        else f"{line.requires} fails at {line.at_s:.4g} s: choose a smaller reference, or an initial i_ref "
-        "([controller.inversion] i_ref) on the other side of the singular curve C."
+        else f"{line.requires} fails at {line.at_s:.4g} s: choose a smaller reference or initial.z, or an initial "
+        "i_ref ([controller.inversion] i_ref) on the other side of the singular curve C."
         for line in fails
         if not line.path
     ]

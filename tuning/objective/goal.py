@@ -16,6 +16,14 @@ from tuning.objective.risk import Risk
 from tuning.objective.shortfalls import Bound, shortfall
 from tuning.space import Space
 
+# Largest logarithm of a goal that is shown; larger ones overflow.
+MOST = 700.0
+
+
+def shown(goal: np.ndarray | float) -> np.ndarray:
+    """Return the number whose logarithm is `goal`, for a text or a picture. A limit far from met makes it huge."""
+    return np.exp(np.minimum(goal, MOST))
+
 
 @record
 class Goal:

@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from tuning.objective.goal import Goal
+from tuning.objective.goal import Goal, shown
 from tuning.objective.loss import COSTS, HELD, TERMS, outcomes, weigh
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
@@ -52,7 +52,7 @@ def minimised(problem: TuningProblem, x: np.ndarray, members: Members) -> Facts:
         "survival_only": len(losses) - n,
         "held": float(losses[n:].mean()) if len(losses) > n else 0.0,
         "penalty": float(np.exp(goal.weight * penalty)),
-        "limits": float(np.exp(pull)),
+        "limits": float(shown(pull)),
     }
     total = (parts["risk"] + parts["held"]) * parts["penalty"] * parts["limits"]
     return parts | {"total": total, "of": _of(goal)}

@@ -13,6 +13,8 @@ from tuning.problem import TuningProblem
 Facts = dict[str, Any]
 # Share by which a limit is loosened to compute the effect.
 MORE = 0.1
+# Share of saturated samples above which an injection describes the saturated loop.
+MOST_SATURATED = 0.02
 # Verdicts on a limit.
 HELD, BROKEN, UNVERIFIED, UNJUDGED = "held", "NOT HELD", "not verified", "not judged"
 EMPHASISED = (BROKEN, UNVERIFIED)
@@ -88,6 +90,7 @@ def _row(
         "at_least": limit.kind.at_least,
         "source": limit.source,
         "what": f"{limit.kind.words}; {limit.kind.over}" + _by_injection(limit, measured),
+        "saturated": _saturated(limit, reached, measured),
         "reached": reached,
         "worst": reached if limit.kind.fold is None or not judged else limit.worst(columns),
         "margin": limit.margin,
@@ -122,10 +125,28 @@ def _by_injection(limit: Limit, measured: Sensitivity | None) -> str:
     return f"; {those}" if measured.decides else f", or {those} if that is larger"
 
 
+def _saturated(limit: Limit, reached: float | None, measured: Sensitivity | None) -> float | None:
+    """Return the share of saturated samples of the injection whose value is `reached`; None if no injection gave it."""
+    peaks = () if measured is None else measured.peaks
+    return next((one.saturated for one in peaks if one.largest.get(limit.name, np.nan) == reached), None)
+
+
+def _at_the_supply(row: Facts) -> str:
+    """Return the words on a value that an injection measured while the supply limited u; '' if it did not."""
+    share = row.get("saturated")
+    if share is None or share <= MOST_SATURATED:
+        return ""
+    return (
+        f"; measured while the supply limits u in {100 * share:.2g} % of the samples, so gains with a smaller peak of "
+        "|KS| lower it: set tune.limits.control_sensitivity or a lower tune.limits.rms_u_V"
+    )
+
+
 def broken(rows: list[Facts]) -> list[str]:
     """Return a sentence for each limit that is not held, including survival."""
     return [
         f"tune.limits.{row['name']} is {BROKEN}: {_reached(row)}, {_side(row)} {row['threshold']:g} ({row['source']})"
+        f"{_at_the_supply(row)}"
         for row in rows
         if row["verdict"] == BROKEN
     ]

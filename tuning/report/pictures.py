@@ -10,6 +10,7 @@ from ambjax.pictures.scales import digits, prefix_of
 from ambjax.pictures.style import own_style
 from ambjax.pictures.thinning import stretch_of, thin
 from ambjax.simulation.trajectory import STALLED, Trajectory
+from tuning.objective.goal import shown
 from tuning.report.front_table import letter
 from tuning.search.explore import Slices
 
@@ -21,15 +22,18 @@ ZOOM = 0.02
 SHOWN_AFTER_LOSS = 0.15
 # Variations below this share of a signal's largest value are shown flat.
 FLAT = 1e-2
+# Margin above and below the values of a panel, as a share of their range.
+MARGIN = 0.12
 # Smallest amplitude shown, as a share of the largest; smallest number of samples for a spectrum.
 FAINTEST, FEWEST = 1e-5, 16
 
 
 @own_style
-def before_after(runs: dict[str, Trajectory]) -> bytes:
+def before_after(runs: dict[str, Trajectory], settle: float = 0.0) -> bytes:
     """Draw z - r and u (averaged over each sample) of runs by name, as PNG: columns are the whole run, start and end.
 
-    A lost run is cut shortly after the loss. A run "before" that is lost has one line of text and no panels.
+    A lost run is cut shortly after the loss. A run "before" that is lost has one line of text and no panels. In the
+    first column the scale of a run that is held is that of its values from `settle` (s) on.
     """
     from matplotlib.figure import Figure
 
@@ -49,14 +53,18 @@ def before_after(runs: dict[str, Trajectory]) -> bytes:
         last = min(ended, t[-1] + (t[1] - t[0] if len(t) > 1 else 0.0))
         near = max(min(ZOOM, last / 4), t[min(4, len(t) - 1)])
         after = SHOWN_AFTER_LOSS * np.isfinite(ended)
-        late = max(last - near, 0.0), max(last + after * near, near)
-        columns = (0.0, max(last + after * last, near)), (0.0, near), late
+        final = max(last - near, 0.0), max(last + after * near, near)
+        columns = (0.0, max(last + after * last, near)), (0.0, near), final
         for ax, (low, high) in zip(line, columns, strict=True):
             part = stretch_of(t, low, high)
             held = alive[part]
             ax.plot(*thin(t[part][held], values[part][held]), color=ORANGE if name == "before" else BLUE, lw=0.9)
             ax.set_xlim(low, high)
             ax.locator_params(axis="x", nbins=5)
+            late = values[alive & (t >= settle)]
+            if ax is line[0] and settle > 0 and late.size and np.isinf(ended) and np.ptp(late) > 0:
+                margin = MARGIN * np.ptp(late)
+                ax.set_ylim(late.min() - margin, late.max() + margin)
             bottom, top = ax.get_ylim()
             if top - bottom < least:  # what is smaller is rounding, or nothing to look at
                 ax.set_ylim((bottom + top - least) / 2, (bottom + top + least) / 2)
@@ -75,7 +83,8 @@ def before_after(runs: dict[str, Trajectory]) -> bytes:
             }  # a curve may run behind the words
             line[0].annotate(words, (0.04, 0.06), xycoords="axes fraction", fontsize=8, bbox=paper)
         line[0].set_ylabel(f"{name}\n{signal} ({unit})", fontsize=9)
-    for ax, words in zip(axes[0], ("whole run", "start", "end"), strict=True):
+    whole = f"whole run, scaled to what follows {settle:g} s" if settle > 0 else "whole run"
+    for ax, words in zip(axes[0], (whole, "start", "end"), strict=True):
         ax.set_title(words, fontsize=10)
     for ax in axes[-1]:
         ax.set_xlabel("time (s)", fontsize=9)
@@ -137,8 +146,8 @@ def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
     left, right = figure.subplots(1, 2)
     steps, best = np.arange(1, len(value) + 1), np.argmin(value, axis=1)
     for s in range(value.shape[1]):
-        left.plot(steps, np.exp(value[:, s]), "0.75", lw=1)
-    left.plot(steps, np.exp(value.min(axis=1)), "C0", lw=1.8)
+        left.plot(steps, shown(value[:, s]), "0.75", lw=1)
+    left.plot(steps, shown(value.min(axis=1)), "C0", lw=1.8)
     title = "blue: the best start; dotted: the members change"
     left.set(xlabel="iteration", ylabel="what is minimised", yscale="log", title=title)
     for j, path in enumerate(paths):

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from ambjax.commands.outputs import say
 from tuning.judge import StepError
+from tuning.objective.goal import shown
 from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
@@ -229,7 +230,7 @@ def _progress_line(problem: TuningProblem) -> Callable[[SearchState, float], Non
         named = ", ".join(f"{g.name} {v:.4g}" for g, v in zip(problem.objective.space.gains, gains, strict=True))
         error = scale * np.sqrt(last["terms"][best][TERMS.index("tracking")])
         say(
-            f"{done:3d}/{budget.iterations}  objective {np.exp(value):.3e}  rms error {error:.2e} m  "
+            f"{done:3d}/{budget.iterations}  objective {shown(value):.3e}  rms error {error:.2e} m  "
             f"held {count - int(last['lost'][best])}/{count}  {named}  (starts: {going}{wait})"
         )
 

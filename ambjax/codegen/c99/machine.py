@@ -25,15 +25,16 @@ SHARED = ["-shared", "-fPIC"]
 TIME_LIMIT = 60
 
 
-def compiler() -> str:
-    """Return the C compiler: $CC, or cc, gcc or clang. Raises ValueError if there is none."""
+def compiler(option: str = "--verify", fix: str = "Install one, set CC, or omit --verify") -> str:
+    """Return the C compiler: $CC, or cc, gcc or clang.
+
+    Raises ValueError, with the `option` that needs it and the `fix`, if there is none.
+    """
     requested = os.environ.get("CC")
     for name in [requested] if requested else ["cc", "gcc", "clang"]:
         if found := shutil.which(name):
             return found
-    raise ValueError(
-        f"--verify: there is no C compiler ({requested or 'cc, gcc or clang'}). Install one, set CC, or omit --verify."
-    )
+    raise ValueError(f"{option}: there is no C compiler ({requested or 'cc, gcc or clang'}). {fix}.")
 
 
 def build(sources: list[pathlib.Path], target: pathlib.Path, *flags: str) -> str:

@@ -91,6 +91,7 @@ def compiled(files: dict[str, str], identifier: str) -> bytes:
 
     Raises ValueError if there is no compiler, or if it reports an error.
     """
+    machine.compiler("--format fmu", "Install one, set CC, or use --format c")
     with machine.scratch() as folder:
         for name, text in files.items():
             (folder / name).write_text(text, encoding="utf-8")
