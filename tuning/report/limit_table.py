@@ -137,8 +137,9 @@ def _at_the_supply(row: Facts) -> str:
     if share is None or share <= MOST_SATURATED:
         return ""
     return (
-        f"; measured while the supply limits u in {100 * share:.2g} % of the samples, so gains with a smaller peak of "
-        "|KS| lower it: set tune.limits.control_sensitivity or a lower tune.limits.rms_u_V"
+        f"; measured while the supply limits u in {100 * share:.2g} % of the samples: set a smaller "
+        "sensitivity.amplitude, or ask for gains with a smaller peak of |KS| by tune.limits.control_sensitivity or a "
+        "lower tune.limits.rms_u_V"
     )
 
 
