@@ -20,6 +20,7 @@ from ambjax.numerics.records import is_traced
 from ambjax.simulation.folds import Named
 from ambjax.simulation.metrics import standard_for
 from tuning.config import LimitSettings, settings
+from tuning.measured_peaks import MeasuredPeak, Sensitivity
 from tuning.objective.lanes import Engine
 from tuning.objective.limits import PENALTY, Limit, measures
 from tuning.objective.quantities import KINDS, LimitContext, largest
@@ -376,3 +377,15 @@ def test_a_peak_that_was_measured_at_the_supply_is_said_to_be():
     for share, said in ((None, False), (0.01, False), (0.15, True)):
         (line,) = limit_table.broken([row | {"saturated": share}])
         assert ("the supply limits u in 15 % of the samples" in line) == said
+
+
+def test_the_saturation_is_that_of_the_injection_which_decides():
+    peak = dict.fromkeys(MeasuredPeak.__dataclass_fields__) | {"repetitions": 8}
+    peaks = [
+        MeasuredPeak(**peak | {"largest": {"sensitivity": size}, "saturated": share})
+        for size, share in ((2.5, 0.1), (3.2, 0.15))
+    ]
+    limit = SimpleNamespace(name="sensitivity")
+    assert limit_table._saturated(limit, 3.2, Sensitivity(tuple(peaks), False)) == 0.15
+    assert limit_table._saturated(limit, 3.3, Sensitivity(tuple(peaks), False)) is None  # a linear value decides
+    assert limit_table._saturated(limit, 3.2, None) is None
