@@ -92,7 +92,7 @@ def test_the_picture_shows_the_response(tmp_path):
         ("[processor]\n[sensitivity]\nf_high = 6e3\n", [], "at most half the sampling rate, 5000 Hz"),
         ("[sensitivity]\nzone = 3\n", [], "zone_"),
         ("[sensitivity]\namplitude = 0\n", [], "sensitivity.amplitude = 0: it must be a finite number above 0"),
-        ("", ["--members", "5"], "all members of this case are the same"),
+        ("[run]\n", ["--members", "5"], "all members of this case are the same"),
         ("[controller.position]\nk = 5.0\n[controller.model]\nm = 0.1\n", [], "no equilibrium at r = 0 m"),
     ],
 )
