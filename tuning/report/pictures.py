@@ -16,6 +16,8 @@ from tuning.search.explore import Slices
 
 # Upper end of the axis of the risk: a lost member costs about 1e6 times an error.
 HIGHEST = 30.0
+# Largest value of the goal in the picture, relative to the least; limits far from met give values above 1e300.
+LARGEST_GOAL = 1e9
 # Length (s) of the enlarged start and end of a run; at most a quarter of the run.
 ZOOM = 0.02
 # Time shown after a loss as a share of the time before it.
@@ -145,11 +147,13 @@ def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     steps, best = np.arange(1, len(value) + 1), np.argmin(value, axis=1)
-    for s in range(value.shape[1]):
-        left.plot(steps, shown(value[:, s]), "0.75", lw=1)
-    left.plot(steps, shown(value.min(axis=1)), "C0", lw=1.8)
+    cut = np.minimum(value, value.min() + np.log(LARGEST_GOAL))
+    for s in range(cut.shape[1]):
+        left.plot(steps, shown(cut[:, s]), "0.75", lw=1)
+    left.plot(steps, shown(cut.min(axis=1)), "C0", lw=1.8)
     title = "blue: the best start; dotted: the members change"
-    left.set(xlabel="iteration", ylabel="what is minimised", yscale="log", title=title)
+    label = "what is minimised" if (cut == value).all() else f"what is minimised (cut at {LARGEST_GOAL:g} x the least)"
+    left.set(xlabel="iteration", ylabel=label, yscale="log", title=title)
     for j, path in enumerate(paths):
         right.plot(steps, gains[steps - 1, best, j] / gains[-1, best[-1], j], label=path.removeprefix("controller."))
     right.set(xlabel="iteration", ylabel="gain / its final value", yscale="log", title="gains of the best start")
