@@ -16,6 +16,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.linear.analysis import Zones
 from ambjax.linear.member_responses import Responses, member_responses
 from ambjax.linear.multisine import Reading
+from ambjax.numerics.records import Scalar
 from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import Scenario
 
@@ -74,7 +75,7 @@ def injected(
     frequencies: Sequence[float] | np.ndarray,
     *,
     reading: Reading = "z",
-    amplitude: float | None = None,
+    amplitude: Scalar | None = None,
     members: int = 1,
     seed: int = 0,
     r: float = 0.0,
@@ -125,7 +126,7 @@ def injected_members(
     clock: Clock,
     frequencies: Sequence[float] | np.ndarray,
     *,
-    amplitude: float | None = None,
+    amplitude: Scalar | None = None,
     r: float = 0.0,
     periods: int = 4,
 ) -> MemberPeaks:

@@ -11,7 +11,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
 from ambjax.linear.equilibrium import ideal, reading
 from ambjax.linear.multisine import MultiSine, Reading, Response, multisine, with_wave
-from ambjax.numerics.records import canonical
+from ambjax.numerics.records import Scalar, canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare, run
 from ambjax.simulation.sliding import Slide
@@ -47,7 +47,7 @@ def member_responses(
     clock: Clock,
     frequencies: Sequence[float] | np.ndarray,
     channel: Reading = "z",
-    amplitude: float | None = None,
+    amplitude: Scalar | None = None,
     r: float = 0.0,
     settle: int = 1,
     periods: int = 1,
