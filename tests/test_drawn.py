@@ -501,6 +501,14 @@ def test_the_convergence_is_of_its_history(kept):
     ]
 
 
+def test_a_goal_far_beyond_its_limits_is_cut_in_the_convergence(kept):
+    value = np.array([[700.0, -3.0], [-5.0, -5.5]])
+    history = {"value": value, "gains": np.ones((2, 2, 1)), "members": np.array([4, 4])}
+    left = tuned.convergence(history, ["controller.position.c"]).axes[0]
+    np.testing.assert_allclose(left.lines[0].get_ydata(), np.exp([np.log(1e9) - 5.5, -5.0]), rtol=ROUNDING)
+    assert left.get_ylabel() == "what is minimised (cut at 1e+09 x the least)"
+
+
 def test_the_slices_are_those_that_were_computed(kept):
     gains = np.stack([np.geomspace(1, 9, 13), np.geomspace(100, 900, 13)])
     goals = np.stack([np.linspace(-1, 6, 13) ** 2 / 9, np.linspace(2, -1, 13)])

@@ -26,7 +26,7 @@ from tuning.objective.limits import PENALTY, Limit, measures
 from tuning.objective.quantities import KINDS, LimitContext, largest
 from tuning.objective.risk import Mean
 from tuning.problem import REFINEMENT, problem_of
-from tuning.report import limit_table
+from tuning.report import limit_table, sensitivity_table
 from tuning.report.limit_table import MORE
 from tuning.report.pictures import amplitudes
 from tuning.search.course import Course, training
@@ -389,3 +389,11 @@ def test_the_saturation_is_that_of_the_injection_which_decides():
     assert limit_table._saturated(limit, 3.2, Sensitivity(tuple(peaks), False)) == 0.15
     assert limit_table._saturated(limit, 3.3, Sensitivity(tuple(peaks), False)) is None  # a linear value decides
     assert limit_table._saturated(limit, 3.2, None) is None
+
+
+@pytest.mark.parametrize("saturated", [0.0, 0.15])
+def test_the_section_on_the_sensitivity_names_the_amplitude_where_the_supply_saturates(saturated):
+    row = {"member": 3, "linear": 2.0, "frequency_hz": 90.0, "zone": "A", "peak": 4.2, "low": 4.1, "high": 4.3}
+    row |= {"at_hz": 80.0, "injected_zone": "C", "saturated": saturated, "lost": 0, "repetitions": 8}
+    found = {"members": [row], "injected": True, "decides": False, "zones": [3.0, 4.0, 5.0]}
+    assert ("`sensitivity.amplitude`" in "\n".join(sensitivity_table.section(found))) == (saturated > 0)
