@@ -84,6 +84,19 @@ def _refined_reciprocal(x: Array) -> Array:
 RECIPROCAL = "_refined_reciprocal"
 
 
+@jax.custom_jvp
+@compiled_alone
+def reciprocal(x: Array) -> Array:
+    """Return `refined`, with a derivative that does not divide: a division per direction would dominate a gradient."""
+    return refined(x)
+
+
+@reciprocal.defjvp
+def _reciprocal_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    value = reciprocal(*primals)
+    return value, -(value * value) * tangents[0]
+
+
 def polynomial(u: Array, coefficients: Sequence[Scalar]) -> Scalar:
     """Evaluate a polynomial in u, coefficients in ascending order, by Estrin's scheme.
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.records import Scalar, record
+from ambjax.numerics.smooth import reciprocal
 from ambjax.world.bearing import Bearing, Signals
 from ambjax.world.coil_limits import CoilVoltages
 from ambjax.world.iron import Iron
@@ -70,7 +71,8 @@ class TwoCoil(Bearing[Currents]):
         """
         permeance = inverse + iron.beside(self)
         slope = iron.slope(iron.core(self, i, inverse))
-        return (2 / self.kappa) * voltage / (slope * permeance) - i * closing * inverse * inverse / permeance
+        gap = reciprocal(slope * permeance)
+        return gap * ((2 / self.kappa) * voltage - slope * (i * closing) * (inverse * inverse))
 
     def rest(self, state: Currents, z: Array) -> Currents:
         return state._replace(z=z, z_dot=jnp.zeros_like(z))

@@ -2,9 +2,11 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.compiler.barrier import compiled_alone
 from ambjax.numerics.records import Scalar, leaf, record
 
 # Smallest slope of the saturation curve: at large currents only the flux through the air still increases.
@@ -50,24 +52,42 @@ class Iron:
 
     def share(self, b: Array) -> Array:
         """Return the flux as a share of the flux without saturation, whose density is b (T)."""
-        return jnp.ones_like(b) if self.saturation is None else AIR + (1 - AIR) / _root(b / self.saturation)
+        return jnp.ones_like(b) if self.saturation is None else AIR + (1 - AIR) * _inverse_root(b * (1 / self.saturation))
 
     def slope(self, b: Array) -> Array:
         """Return the derivative of the flux density with respect to b (T), that without saturation. Dimensionless."""
         if self.saturation is None:
             return jnp.ones_like(b)
-        x = b / self.saturation
-        return AIR + (1 - AIR) / (_root(x) * (1 + x * x * x * x))
+        r = _inverse_root(b * (1 / self.saturation))
+        square = r * r
+        return AIR + (1 - AIR) * (square * square * r)
 
     def following(self, i: Array, late: Array) -> Array:
         """Return the rate (A/s) of the delayed current `late` (A), which follows the current i (A)."""
-        return jnp.zeros_like(i) if self.eddy is None else (i - late) / self.eddy
+        return jnp.zeros_like(i) if self.eddy is None else (i - late) * (1 / self.eddy)
 
     def fastest(self) -> Scalar:
         """Return the largest factor by which saturation increases the rate R/L of a coil's current."""
         return 1.0 if self.saturation is None else 1 / AIR
 
 
-def _root(x: Array) -> Array:
-    """Return (1 + x^4)^(1/4)."""
-    return jnp.sqrt(jnp.sqrt(1 + x * x * x * x))
+@jax.custom_jvp
+@compiled_alone
+def _inverse_root(x: Array) -> Array:
+    """Return (1 + x^4)^(-1/4)."""
+    square = x * x
+    y = 1 + square * square
+    if x.dtype == jnp.float64:
+        rough = jax.lax.rsqrt(jnp.sqrt(jnp.minimum(y, 1e36).astype(jnp.float32))).astype(jnp.float64)
+        rr = rough * rough
+        e = 1 - y * (rr * rr)
+        return rough + rough * (e * (0.25 + 0.15625 * e))
+    return jax.lax.rsqrt(jnp.sqrt(y))
+
+
+@_inverse_root.defjvp
+def _inverse_root_jvp(primals, tangents):
+    (x,), (dx,) = primals, tangents
+    r = _inverse_root(x)
+    s = x * r
+    return r, -(s * s * s) * (r * r) * dx
