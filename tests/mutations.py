@@ -1896,7 +1896,7 @@ CHECK = [
     M(
         "a bound leaves out what the estimate is off by",
         "ambjax/theorem/sampled_report.py",
-        "None if self.band is None else self.band + self.off",
+        "None if self.band is None else self.band + self.difference",
         "self.band",
         "tests/test_check_processor.py::test_no_bound_is_exceeded_by_what_stands_beside_it[estimated, two coils]",
     ),
@@ -1966,7 +1966,7 @@ CHECK = [
     M(
         "a law beyond its limit decides nothing",
         "ambjax/theorem/slopes.py",
-        "return self.stepped < self.limit",
+        "return self.effective_slope < self.limit",
         "return True",
         "tests/test_check_processor.py::test_an_implicit_step_is_no_steeper_than_one",
     ),

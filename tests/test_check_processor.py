@@ -143,7 +143,7 @@ def test_no_bound_is_exceeded_by_what_stands_beside_it(name):
         sampled = sampled_report.check_sampled(cascade, world, CLOCK, 0.02)
         for line in sampled.bands:
             assert line.computed <= line.band * (1 + 1e-12), line
-            assert line.seen <= line.bound * (1 + 1e-12), line
+            assert line.largest <= line.bound * (1 + 1e-12), line
             assert math.isinf(line.band) == (line.gain <= line.disturbance)
             bounds += not math.isinf(line.band)
         said = advice.processor_lines(sampled, Delays(2.0, None, None, 0.1), None)
@@ -158,8 +158,8 @@ def test_bounds_are_close_where_nothing_is_estimated():
         assert [line.signal for line in lines] == ["sigma", "v_tilde", "e"]
         for line in lines:
             # u is 0 before the first sample, so the sensors' signals are the plant's: nothing is off but i_ref's sample
-            assert line.off == 0.0
-            assert share * line.bound <= line.seen <= line.bound * (1 + 1e-12), line
+            assert line.difference == 0.0
+            assert share * line.bound <= line.largest <= line.bound * (1 + 1e-12), line
         # the theorem's own Delta_1 on this reference is 6.231e4, at 0.25 s
         assert lines[1].disturbance == pytest.approx(6.231e4, rel=0.05)
 
@@ -175,15 +175,15 @@ def test_an_implicit_step_is_no_steeper_than_one():
     """a/(1 + a): stable unless the sign itself is a sample late."""
     hard, soft = cascade_of(*HARD, delay=1.0), cascade_of(*SOFT, delay=1.0, predict=False)
     late = dataclasses.replace(hard, processor=Processor(1.0, predict=False))
-    assert [slope.stepped for slope in slopes.slope_checks(hard, CLOCK)] == [1.0, 1.0, 1.0]
+    assert [slope.effective_slope for slope in slopes.slope_checks(hard, CLOCK)] == [1.0, 1.0, 1.0]
     assert [slope.holds for slope in slopes.slope_checks(hard, CLOCK)] == [True, True, True]
     assert [slope.holds for slope in slopes.slope_checks(late, CLOCK)] == [False, True, False]
     for slope in slopes.slope_checks(soft, CLOCK):
         assert slope.holds
-        assert slope.stepped == pytest.approx(slope.slope / (1 + slope.slope))
+        assert slope.effective_slope == pytest.approx(slope.slope / (1 + slope.slope))
     # what stays explicit in the position law, c T, may be all that is steep
     (position, *_) = slopes.slope_checks(cascade_of(3e4, 25.0, 2e6, 2000.0, 25.0), CLOCK)
-    assert position.stepped == pytest.approx(3.0)
+    assert position.effective_slope == pytest.approx(3.0)
     assert not position.holds
 
 
@@ -192,7 +192,7 @@ def test_noise_disturbs_and_its_lines_stand_beside_those_without():
     lines = sampled_report.check_sampled(cascade_of(*HARD, delay=1.0), noisy, CLOCK, 0.02).bands
     assert [line.noise for line in lines] == [False] * 3 + [True] * 3
     for one, other in zip(lines[:3], lines[3:], strict=True):
-        assert other.seen > 5 * one.seen
+        assert other.largest > 5 * one.largest
         assert other.disturbance > 5 * one.disturbance
 
 

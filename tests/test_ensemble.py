@@ -345,7 +345,7 @@ def test_bands_at_few_instants_have_all_that_is_between_them(monkeypatch):
         bands = study.bands(3, 7 if samples == n else 6, until)
         np.testing.assert_array_equal(bands.t, t[at])
         edges = [*at[:-1], samples]  # of the blocks
-        for name, of in ensemble_study.SHOWN.items():
+        for name, of in ensemble_study.FAN_SIGNALS.items():
             values = np.where(alive, getattr(whole, of), np.nan)[:, :samples]
             np.testing.assert_array_equal(bands.signals[name], values[:, at])
             for k in range(len(at)):

@@ -73,10 +73,16 @@ class Sampled:
     def driven(self, u):
         """The plant alone under a constant voltage."""
         rates = lambda _, m: Motion(m.x_dot, W**2 * m.x + u)  # noqa: E731
-        shown = lambda inputs, m: (rates(inputs, m), Instant((), Effort(u)))  # noqa: E731
+        observed = lambda inputs, m: (rates(inputs, m), Instant((), Effort(u)))  # noqa: E731
         inputs = lambda t: t  # noqa: E731
         return InitialValueProblem(
-            inputs, rates, Motion(1e-3, 0.1), self._status, observed=shown, shown=Instant((), Effort(0.0)), jumps=True
+            inputs,
+            rates,
+            Motion(1e-3, 0.1),
+            self._status,
+            observed=observed,
+            instant_structure=Instant((), Effort(0.0)),
+            jumps=True,
         )
 
     def advance(self, method, errors, t, period, state, memory, code):

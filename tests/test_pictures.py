@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from ambjax.pictures import fans, heatmaps, histograms
-from ambjax.pictures.scales import LABELS, SHOWN, axis_of, edges, label_of, log_ticks, prefix_of, size_of
+from ambjax.pictures.scales import AXIS_UNITS, LABELS, axis_of, edges, label_of, log_ticks, prefix_of, size_of
 from ambjax.pictures.tornado import Bar, tornado
 from ambjax.simulation.metrics import UNITS, Standard
 
@@ -76,7 +76,7 @@ def test_prefix_brings_every_size_between_1_and_1000():
 def test_every_metric_has_its_unit():
     names = [*Standard()._folds().folds, "force_used", "lost_at_s", "singular_at_s"]
     assert set(names) == set(LABELS)
-    assert set(UNITS) | set(SHOWN) == {*names, "settle_s"}
+    assert set(UNITS) | set(AXIS_UNITS) == {*names, "settle_s"}
     for name, unit in UNITS.items():  # the name of a metric ends in its unit
         assert name.endswith("_" + unit.replace("/", "_per_").replace("^", "")), name
     for name in names:

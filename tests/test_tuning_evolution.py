@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bowl import World, study
 
-from tuning.search.evolution import PATIENCE, STALL, initial_state, moved, next_population, population, rates
+from tuning.search.evolution import PATIENCE, STALL, initial_state, next_population, population, rates, updated
 from tuning.search.rounds import rounds
 
 # Derivatives of a loop that is chaotic; those of a Bowl's loss are about 1e-4.
@@ -19,7 +19,7 @@ def least(f, m, populations, seed=0):
     for _ in range(populations):
         points = next_population(cloud, seed)
         values = f(points)
-        best, cloud = min(best, values.min()), moved(cloud, points, values)
+        best, cloud = min(best, values.min()), updated(cloud, points, values)
     return best, cloud
 
 
@@ -114,9 +114,9 @@ def test_it_has_converged_when_whole_populations_stall():
     for n, level in enumerate([0.0, -2 * STALL, *[-2.5 * STALL] * PATIENCE]):
         assert not cloud.converged
         values = np.full(6, level)
-        cloud = moved(cloud, next_population(cloud, n), values)
+        cloud = updated(cloud, next_population(cloud, n), values)
     assert cloud.converged
-    assert not moved(cloud, next_population(cloud, 0), np.full(6, -4 * STALL)).converged
+    assert not updated(cloud, next_population(cloud, 0), np.full(6, -4 * STALL)).converged
 
 
 def test_a_search_that_is_resumed_among_populations_ends_alike(monkeypatch, tmp_path):

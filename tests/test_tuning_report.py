@@ -28,7 +28,7 @@ from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS, weigh
 from tuning.report import accurate, breakdown, extras, gradient, held_out, pictures
 from tuning.report import document as report
-from tuning.report.facts import SHOWN
+from tuning.report.facts import SUMMARY_METRICS
 from tuning.search.explore import REACH, Slices, slices
 from tuning.search.rounds import training
 
@@ -199,7 +199,7 @@ def test_accurate_values_are_those_of_adaptive_rollouts():
     study.__dict__["judging"] = study.engine
     x = study.objective.space.encode(study.tune.space.values(study.case.cascade))
     seed = seeds(study.tune.budget)[2]
-    compared = accurate.compare_steps(study, x, seed, 12, SHOWN)
+    compared = accurate.compare_steps(study, x, seed, 12, SUMMARY_METRICS)
     assert (compared["members"], compared["held"]) == (accurate.COMPARED, accurate.COMPARED)
     assert abs(compared["metrics"]["settled_rms_error_m"]["relative"]) > 1e-3
     found = []
@@ -226,7 +226,7 @@ def test_accurate_steps_against_themselves_are_off_by_nothing(study, x):
     engine = Engine(objective, settle=study.case.settle, lanes=4)
     same = dataclasses.replace(study)
     same.__dict__["judging"] = engine
-    compared = accurate.compare_steps(same, x, 5, 3, SHOWN)
+    compared = accurate.compare_steps(same, x, 5, 3, SUMMARY_METRICS)
     assert compared["members"] == 3
     assert {row["relative"] for row in compared["metrics"].values()} == {0.0}
     assert compared["lost"] == {"report": 0, "accurate": 0}

@@ -113,7 +113,7 @@ def test_false_survival_is_refuted():
     assert not np.any(found.engine.terms(x[None], members)["survival"])
     error = step_error(found, x, members)
     assert error.refuted
-    assert error.unseen == error.tried == REFERENCE_MEMBERS
+    assert error.unconfirmed == error.tried == REFERENCE_MEMBERS
     np.testing.assert_array_equal(error.unheld.member, members.member)
 
 
@@ -122,8 +122,8 @@ def test_the_worst_are_the_largest():
 
 
 def test_members_that_accurate_steps_do_not_hold_join_louder(small):
-    unseen = small.objective.chosen(1, np.array([2, 3]), 4)
-    error = error_of(small, lost=1, stalled=1, members=2, unheld=unseen)
+    unconfirmed = small.objective.chosen(1, np.array([2, 3]), 4)
+    error = error_of(small, lost=1, stalled=1, members=2, unheld=unconfirmed)
     joined = joining(small, np.array([7, 5]), error, 2)
     assert joined.member.tolist() == [7, 5, 2, 3]
     np.testing.assert_allclose(joined.noise_factor, [1.1, 1.1, NOISE_GROWTH**2, NOISE_GROWTH**2])
@@ -186,8 +186,8 @@ def test_an_answer_is_confirmed_on_the_worst_members_too(run, small):
 
 
 def test_the_search_goes_on_with_members_that_are_not_confirmed(run, small):
-    unseen = small.objective.chosen(1, np.array([1]), 4)
-    answer, verdicts = run(error_of(small, stalled=1, members=3, unheld=unseen), error_of(small))
+    unconfirmed = small.objective.chosen(1, np.array([1]), 4)
+    answer, verdicts = run(error_of(small, stalled=1, members=3, unheld=unconfirmed), error_of(small))
     assert answer.good
     assert answer.members.member.size == small.tune.budget.members + small.tune.budget.stressed + 1
     assert answer.members.noise_factor.max() == NOISE_GROWTH

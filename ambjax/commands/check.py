@@ -164,9 +164,9 @@ def _print_sampled(sampled: SampledReport) -> None:
             slope.stage,
             f"{slope.slope:.4g}",
             "implicit" if slope.implicit else "explicit",
-            f"{slope.stepped:.4g}",
+            f"{slope.effective_slope:.4g}",
             f"{slope.limit:.4g}",
-            f"{slope.quiet:.4g}",
+            f"{slope.oscillation_limit:.4g}",
             "holds" if slope.holds else "FAILS",
         )
         for slope in sampled.slopes
@@ -182,7 +182,7 @@ def _print_sampled(sampled: SampledReport) -> None:
             b.signal,
             b.unit,
             "the case's" if b.noise else "none",
-            *map(number, (b.gain, b.disturbance, b.band, b.off, b.bound, b.seen)),
+            *map(number, (b.gain, b.disturbance, b.band, b.difference, b.bound, b.largest)),
             b.note,
         )
         for b in sampled.bands

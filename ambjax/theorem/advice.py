@@ -74,7 +74,7 @@ def processor_lines(sampled: SampledReport, margin: Delays, unknown: Delays | No
     the controller does not predict).
     """
     lines = [
-        f"- {slope.stage}: slope T of the step is {number(slope.stepped)} and must be less than "
+        f"- {slope.stage}: slope T of the step is {number(slope.effective_slope)} and must be less than "
         f"{number(slope.limit)}. Lower the gain or p, shorten clock.sample_period, or set "
         f"{'predict = true' if slope.implicit else IMPLICIT}."
         for slope in sampled.slopes

@@ -3,7 +3,7 @@
 import math
 
 from ambjax.host.web_page import markdown_table
-from tuning.report.facts import SHOWN, Row, TuningFacts
+from tuning.report.facts import SUMMARY_METRICS, Row, TuningFacts
 
 
 def number_text(x: float | None, form: str = ".5g") -> str:
@@ -22,7 +22,7 @@ def section(facts: TuningFacts) -> list[str]:
         head += [f"after, {again['held']} of them", "by accurate steps", "off by"]
     rows = [
         [f"`{name}`", number_text(before.get(name), ".4g"), number_text(after.get(name), ".4g"), *_again(again, name)]
-        for name in SHOWN
+        for name in SUMMARY_METRICS
         if name in after or name in before
     ]
     rows += [[name, str(before[name]), str(after[name]), *_statuses(again, name)] for name in ("lost", "stalled")]

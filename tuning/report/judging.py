@@ -16,7 +16,7 @@ from tuning.judge import StepError, describe, held, judge, step_error, summarise
 from tuning.measured_peaks import injections
 from tuning.problem import TuningProblem
 from tuning.report import accurate, breakdown, front_table, gradient, limit_table, outcome, sensitivity_table
-from tuning.report.facts import SHOWN, Row, TuningFacts
+from tuning.report.facts import SUMMARY_METRICS, Row, TuningFacts
 from tuning.search import explore
 from tuning.search.course import SearchResult
 
@@ -160,7 +160,7 @@ def _checked(
         error = _worst_checked(answer, judged, held_out) if answer.confirmed else None
         count = problem.tune.budget.held_out
         say(f"{min(accurate.COMPARED, count)} of them again by accurate steps ...")
-        again = accurate.compare_steps(problem, answer.x, held_out, count, SHOWN)
+        again = accurate.compare_steps(problem, answer.x, held_out, count, SUMMARY_METRICS)
     refuted = (error or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
     return error, again, refuted or (again["refuted"] if again else "")
 
