@@ -12,7 +12,7 @@ from profiles import examples
 ROOT = pathlib.Path(__file__).parent.parent
 
 
-@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: m.says)
+@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: m.fault)
 def test_every_mutation_fits_the_code(mutation):
     applied(mutation)
     path, _, name = mutation.test.partition("::")
@@ -21,7 +21,7 @@ def test_every_mutation_fits_the_code(mutation):
 
 
 def test_the_table_is_long_and_says_each_thing_once():
-    assert len({m.says for m in MUTATIONS}) == len({(m.file, m.old, m.new) for m in MUTATIONS}) == len(MUTATIONS) >= 25
+    assert len({m.fault for m in MUTATIONS}) == len({(m.file, m.old, m.new) for m in MUTATIONS}) == len(MUTATIONS) >= 25
 
 
 PROGRAM = "def double(x):\n    return 2 * x  # twice\n"
@@ -81,7 +81,7 @@ def test_a_test_that_fails_by_itself_kills_nothing(project):
 
 
 def test_a_sample_depends_on_the_text_of_the_program(project):
-    mutations = [BREAK._replace(says=str(number)) for number in range(1000)]
+    mutations = [BREAK._replace(fault=str(number)) for number in range(1000)]
     before = sample(mutations, 10, project)
     assert 60 <= len(before) <= 140  # binomial: 100 on average, four standard deviations of 9.5
     (project / BREAK.file).write_text(PROGRAM + "\n")

@@ -98,7 +98,7 @@ class StepError(NamedTuple):
 
     @property
     def difference_text(self) -> str:
-        """Difference of the two errors, as part of a sentence: in per cent, or both values if the reference error is 0."""
+        """Difference of the two errors as part of a sentence: in per cent, or both values if the reference is 0."""
         if math.isfinite(self.relative):
             return f"off by {100 * self.relative:.2g} %"
         found = (f"{x:.2g} m" if math.isfinite(x) else "no number" for x in (self.search_m, self.reference_m))
