@@ -286,7 +286,7 @@ def path(tmp_path):
     return pathlib.Path(tmp_path) / "case.toml"
 
 
-def test_three_hundred_files_are_read_or_refused(path):
+def test_three_hundred_changed_files_are_read_or_refused_in_one_line(path):
     tally = Tally()
 
     @settings(max_examples=300, **PROFILE)
@@ -300,7 +300,7 @@ def test_three_hundred_files_are_read_or_refused(path):
 
 
 @pytest.mark.slow
-def test_files_run_or_are_refused(path):
+def test_changed_files_are_simulated_or_refused(path):
     tally, count = Tally(), examples(1_200, 8_000)
 
     @settings(max_examples=count, **PROFILE)

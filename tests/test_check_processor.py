@@ -38,7 +38,7 @@ def roots(a, late):
 
 
 @pytest.mark.parametrize("late", LATE)
-def test_limits_are_where_the_recursion_turns_unstable_and_begins_to_oscillate(late):
+def test_slope_limits_are_the_stability_and_oscillation_limits_of_the_recursion(late):
     stable, quiet = slope_limits(late)
     assert np.abs(roots(0.999 * stable, late)).max() < 1 < np.abs(roots(1.001 * stable, late)).max()
     # of two roots that meet, what rounding leaves of their imaginary parts is its square root
@@ -49,7 +49,7 @@ def test_limits_are_where_the_recursion_turns_unstable_and_begins_to_oscillate(l
     assert (np.abs(after.imag) > 1e-4).any() or after.real.min() < 0
 
 
-def test_limits_in_round_numbers():
+def test_slope_limits_without_delay_and_with_one_sample():
     assert slope_limits(0.0) == (2.0, 1.0)
     assert slope_limits(1.0) == (1.0, 0.25)
 
@@ -77,7 +77,7 @@ def driven(implicit, T, k, p, w, x, steps=400):
 
 @pytest.mark.parametrize("p", [INF, 300.0, 30.0])
 @pytest.mark.parametrize("implicit", [True, False])
-def test_a_sign_law_stays_in_its_band_and_fills_it(implicit, p):
+def test_a_sign_law_stays_in_its_band_and_reaches_its_ends(implicit, p):
     k, W, T = 20.0, 6.0, 1e-3
     relay = Relay(k, None if math.isinf(p) else p)
     limit = band(relay, W, T, implicit)
@@ -95,7 +95,7 @@ def test_a_sign_law_stays_in_its_band_and_fills_it(implicit, p):
     assert max(np.abs(x[200:]).max() for x in runs) >= (0.999 if implicit else 0.3) * limit
 
 
-def test_no_band_where_the_gain_does_not_exceed_the_disturbance():
+def test_the_band_is_infinite_if_the_gain_does_not_exceed_the_disturbance():
     assert band(Relay(20.0, None), 20.0, 1e-3, implicit=True) == INF
 
 
@@ -135,7 +135,7 @@ def random_loop(name, draw):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["estimated, two coils", "late, amplifier", "explicit"])
-def test_no_bound_is_exceeded_by_what_stands_beside_it(name):
+def test_measured_signals_do_not_exceed_their_bounds(name):
     """And words and verdict are of one fact. What is measured and what is bounded differ by rounding: 1e-12."""
     draw, bounds = np.random.default_rng(7), 0
     for _ in range(10):
@@ -151,7 +151,7 @@ def test_no_bound_is_exceeded_by_what_stands_beside_it(name):
     assert bounds >= 5
 
 
-def test_bounds_are_close_where_nothing_is_estimated():
+def test_bounds_are_tight_without_an_estimate():
     """The sign itself, implicit: what is left is what disturbs it in a sample; of a smoothed one no less than half."""
     for gains, share in ((HARD, 0.999), (SOFT, 0.5)):
         lines = sampled_report.check_sampled(cascade_of(*gains, delay=0.0), WORLD, LONG, 0.1).bands
@@ -164,14 +164,14 @@ def test_bounds_are_close_where_nothing_is_estimated():
         assert lines[1].disturbance == pytest.approx(6.231e4, rel=0.05)
 
 
-def test_a_signal_that_has_not_reached_its_band_is_bounded_by_where_it_is():
+def test_a_signal_outside_its_band_is_bounded_by_its_value_at_settle():
     world = dataclasses.replace(WORLD, initial=amb.Initial(1e-3))
     (line, *_) = sampled_report.check_sampled(cascade_of(*HARD, delay=0.0), world, LONG, 0.004).bands
     assert "not reached" in line.note
     assert line.computed == line.band
 
 
-def test_an_implicit_step_is_no_steeper_than_one():
+def test_the_effective_slope_of_an_implicit_step_is_at_most_one():
     """a/(1 + a): stable unless the sign itself is a sample late."""
     hard, soft = cascade_of(*HARD, delay=1.0), cascade_of(*SOFT, delay=1.0, predict=False)
     late = dataclasses.replace(hard, processor=Processor(1.0, predict=False))
@@ -187,7 +187,7 @@ def test_an_implicit_step_is_no_steeper_than_one():
     assert not position.holds
 
 
-def test_noise_disturbs_and_its_lines_stand_beside_those_without():
+def test_the_bands_are_reported_without_noise_and_with_it():
     noisy = dataclasses.replace(WORLD, sensor=amb.Sensor(1e-6, 1e-4, 1e-4))
     lines = sampled_report.check_sampled(cascade_of(*HARD, delay=1.0), noisy, CLOCK, 0.02).bands
     assert [line.noise for line in lines] == [False] * 3 + [True] * 3
@@ -215,7 +215,7 @@ class Static(InversionLaw):
         return self.law(model, inputs, state)
 
 
-def test_a_voltage_that_alternates_is_remarked_on():
+def test_an_alternating_voltage_is_reported():
     world = dataclasses.replace(WORLD, u_max=200.0)
     laws = {"chatters": Static(), "steps": amb.inversion.ClosedForm()}
     found = {}
@@ -229,7 +229,7 @@ def test_a_voltage_that_alternates_is_remarked_on():
         assert ("The voltage alternates" in said) == (name == "chatters")
 
 
-def test_alternation_is_what_it_says():
+def test_alternation_is_1_for_an_alternating_voltage_and_sin_squared_for_a_sine():
     n = np.arange(1000)
     assert sampled_report.alternation((-1.0) ** n) == pytest.approx(1.0)
     for cycles in (10, 100, 250):  # a sine of f has sin(pi f T)^2, whole periods
@@ -242,7 +242,7 @@ def test_alternation_is_what_it_says():
 BEYOND = amb.Scenario(reference=amb.Constant(2e-3), initial=amb.Initial(2e-3, 0.0, -0.1), sensor=amb.Sensor(0.0, 1e-2))
 
 
-def test_the_singular_curve_is_judged_on_the_processor_s_run():
+def test_the_distance_to_the_singular_curve_is_that_of_the_sampled_run():
     clock, world = amb.Clock(300, 1e-4), dataclasses.replace(BEYOND, u_max=500.0)
     crossing = cascade_of(200.0, 1000.0, 1e8, 2000.0, INF, delay=0.0)
     sampled = sampled_report.check_sampled(crossing, world, clock, 0.005)
@@ -276,7 +276,7 @@ def test_the_margin_is_between_a_delay_that_holds_and_one_that_does_not():
     assert 0.5 < beyond.held < beyond.lost < 1.1
 
 
-def test_a_delay_that_the_prediction_does_not_know_has_a_margin_of_its_own():
+def test_the_delay_margin_without_a_known_delay_is_smaller():
     cascade, clock = cascade_of(*HARD, delay=1.0), amb.Clock(600, 1e-4, amb.RK4(1))
     margin = delay_margin(cascade, WORLD, clock, known=False)
     # a prediction that knows it holds the rotor up to 2 samples
@@ -285,7 +285,7 @@ def test_a_delay_that_the_prediction_does_not_know_has_a_margin_of_its_own():
     assert delay_margin(cascade, gone, clock, known=False).held is None
 
 
-def test_a_delay_that_is_assumed_right_is_the_delay():
+def test_an_assumed_delay_equal_to_the_delay_changes_nothing():
     rows = [
         amb.rollout(cascade_of(*HARD, delay=1.0, **more), WORLD, amb.Clock(100, 1e-4)).trajectory.rows.u
         for more in ({}, {"assumed": 1.0})
@@ -335,7 +335,7 @@ def delays(cascade, scenario, clock, *, fold):
     return Outcome(Trajectory(None, np.where(code == ALIVE, np.inf, 0.01), code, np.inf), None)
 
 
-def test_a_stalled_run_on_a_processor_decides_nothing():
+def test_a_stalled_run_on_a_processor_is_reported_as_undecided():
     sampled = SampledReport([], [], 0.01, "stalled: ...", stalled=True)
     assert not sampled.holds
     said = " ".join(advice.processor_lines(sampled, Delays(None, None, 0.0, 0.1), None))
@@ -369,7 +369,7 @@ settle = 0.01
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("elsewhere")
-def test_check_says_no_where_an_explicit_slope_is_beyond_its_limit(capsys):
+def test_check_fails_if_an_explicit_slope_exceeds_its_limit(capsys):
     # gamma 2 p/pi T is 318; nothing loses the rotor in this time, the theorem's conditions hold, and the answer is no
     assert main(["check", write(CASE + 'discretisation = "explicit"\npredict = false\n')]) == 1
     said, _, theorem = capsys.readouterr().out.partition("Theorem 1:")
@@ -384,7 +384,7 @@ def test_check_says_no_where_an_explicit_slope_is_beyond_its_limit(capsys):
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("elsewhere")
-def test_check_says_yes_on_a_processor(capsys):
+def test_check_passes_for_a_stable_cascade_on_a_processor(capsys):
     assert main(["check", write(CASE), "--json"]) == 0
     out, progress = capsys.readouterr()
     assert [progress.count(part) for part in ("Theorem 1", "on the processor", "delay margin")] == [1, 1, 2]

@@ -128,7 +128,7 @@ def test_a_case_that_loses_members_is_compared_too(run, capsys):
     assert "members lost" in capsys.readouterr().out
 
 
-def test_a_machine_that_differs_is_named(run, cases, capsys):
+def test_differences_other_than_the_laws_are_named(run, cases, capsys):
     (cases / "light.toml").write_text(CASE.format(c=200.0) + "[actuator]\nu_max = 300.0\n")
     code, summary, _ = run("stiff", "light", flags=["--json"])
     out, err = capsys.readouterr()

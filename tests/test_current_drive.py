@@ -144,7 +144,7 @@ def test_a_case_file_gives_the_amplifier_and_its_nominal_bandwidth():
         ({"u_max": 5.0}, {"kind": "amplifier"}, r"AmplifierCurrent commands a current\. Leave out"),
     ],
 )
-def test_what_does_not_fit_is_refused_in_one_line(actuator, laws, words):
+def test_a_law_and_an_amplifier_with_different_commands_are_refused_in_one_line(actuator, laws, words):
     with pytest.raises(ValueError, match=words):
         read(actuator, controller={"current": laws} if laws else {})
 

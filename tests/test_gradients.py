@@ -201,7 +201,7 @@ for f, leaves in zip(transforms, fast):
 
 
 @pytest.mark.slow
-def test_the_fast_path_differentiates():
+def test_the_fast_path_is_differentiable():
     # reverse mode through a marked call aborts XLA, and would take pytest with it
     code = IN_A_PROCESS_OF_ITS_OWN.replace("{transforms}", ", ".join(TRANSFORMS.values()))
     environment = os.environ | {"JAX_ENABLE_X64": "1"}
@@ -230,7 +230,7 @@ for name, function in functions.items():
 
 
 @pytest.mark.slow
-def test_the_fast_path_takes_whatever_is_closed_over():
+def test_the_fast_path_accepts_closures():
     """What XLA cannot compile as one function runs as usual, with a line that says so, once each."""
     environment = os.environ | {"JAX_ENABLE_X64": "1"}
     done = subprocess.run(

@@ -52,7 +52,7 @@ def both(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LOOPS)
-def test_costs_and_limits_are_those_of_a_dense_solution(name):
+def test_costs_and_limits_agree_with_a_dense_solution(name):
     ours, theirs = both(name)
     assert min(theirs.values()) > 0  # or nothing was compared
     for key, value in theirs.items():

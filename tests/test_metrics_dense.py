@@ -103,7 +103,7 @@ SLOW = {"adaptive": [name for name in LOOPS if name not in SLIDING], "sliding": 
         for said, method in (("adaptive", AdaptiveRodas3()), ("sliding", Slide(3 * REFINEMENT)))
     ],
 )
-def test_every_metric_is_what_a_dense_solution_says(name, method):
+def test_every_metric_agrees_with_a_dense_solution(name, method):
     found, expected = numbers(*LOOPS[name], SAMPLES, SETTLE, method)[0], dense(name)
     assert found.keys() == expected.keys()
     # of a fall in sliding steps: that it is one, and how far it goes; a report counts it, and averages over the others
@@ -142,7 +142,7 @@ TASKS = pathlib.Path(__file__).parents[1] / "benchmarks"
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", ["A", "C"])
-def test_tuned_gains_of_the_benchmarks_measure_so_once_settled(name):
+def test_settled_metrics_of_the_tuned_gains_of_the_benchmarks_agree_with_a_dense_solution(name):
     """The gains of results/tasks.json as they are, and where their tables begin to measure: from 0.2 s on."""
     gains = json.loads((TASKS / "results" / "tasks.json").read_text())["tasks"][name]["gains"]
     c, k, gamma, k_i, *pole = gains.values()
@@ -161,7 +161,7 @@ def test_tuned_gains_of_the_benchmarks_measure_so_once_settled(name):
     assert found["settled_rms_error_m"] == pytest.approx(expected["settled_rms_error_m"], abs=5e-9)
 
 
-def test_the_start_of_a_sample_says_nothing_of_the_voltage():
+def test_the_rms_voltage_includes_the_voltage_between_samples():
     """Metrics that are read only at the samples, where the noise has just jumped: u is always at the supply's limit."""
     world, std = LOOPS["stiff under noise, limited supply"]
     cascade, scenario, _ = in_ambjax(Case("", world, samples=200))

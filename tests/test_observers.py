@@ -57,7 +57,7 @@ def current_of(z, z_ddot, q=0.0):
 
 
 @EACH
-def test_no_measured_velocity_reaches_the_estimate(law):
+def test_the_estimate_does_not_depend_on_the_measured_velocity(law):
     assert law.estimates_velocity
     assert type(law).estimates_velocity
     measured = Measurement(1e-4, 0.02, 0.01)
@@ -71,12 +71,12 @@ def test_no_measured_velocity_reaches_the_estimate(law):
 
 
 @pytest.mark.parametrize("law", [Direct(), Complementary()])
-def test_the_others_need_it(law):
+def test_the_other_observers_read_the_measured_velocity(law):
     assert not law.estimates_velocity
 
 
 @EACH
-def test_odd_symmetry(law):
+def test_the_observers_have_odd_symmetry(law):
     level = dataclasses.replace(MODEL, g=0.0)
     rng = np.random.default_rng(1)
     z, i = np.cumsum(rng.normal(size=300)) * 1e-6, rng.normal(size=300) * 1e-2
@@ -89,7 +89,7 @@ def test_odd_symmetry(law):
 
 
 @pytest.mark.parametrize(("law", "degree"), [(Difference(), 1), (IRED1(), 1), (IRED2(), 2)])
-def test_exact_for_polynomials(law, degree):
+def test_the_estimates_are_exact_for_polynomials(law, degree):
     """From any start: the filter after some 20 of its time constants, the differentiators after finitely many steps."""
     t = np.arange(3000) * T
     z, z_dot = 1e-3 - 0.02 * t + (degree - 1) * 0.3 * t**2, -0.02 + (degree - 1) * 0.6 * t
@@ -124,7 +124,7 @@ def test_errors_of_the_differentiators(law, order, bound):
     assert errors[0] / errors[1] == pytest.approx(2**order, rel=0.1)
 
 
-def test_kalman_knows_a_constant_disturbance():
+def test_the_kalman_filter_estimates_a_constant_disturbance():
     """Where the acceleration is linear between samples, as it is along a cubic, nothing is left of any error."""
     t, q = np.arange(1500) * T, -0.7
     z, z_dot, z_ddot = 1e-3 - 0.02 * t + 0.3 * t**2 - t**3, -0.02 + 0.6 * t - 3 * t**2, 0.6 - 6 * t
@@ -170,7 +170,7 @@ def test_errors_of_the_kalman_filter_have_three_equal_poles(w, z):
     np.testing.assert_allclose(np.poly(continuous), np.poly([-w * T] * 3), rtol=0, atol=1e-12 * (1 + w * T) ** 3)
 
 
-def test_noise_of_the_kalman_filter_is_what_it_says():
+def test_the_noise_of_the_kalman_filter_agrees_with_its_formula():
     """7/4 (S_r w^3 + S_q / w^3), of a mass on its own, to the order w T."""
     w, period, std, S_q = 500.0, 1e-5, 1e-6, 1e3
     law = Kalman(w)
@@ -232,7 +232,7 @@ def test_gradients_of_the_differentiators(law):
 
 
 @pytest.mark.parametrize(("law", "order"), [(Difference(), 2), (Kalman(), 1)], ids=lambda x: type(x).__name__)
-def test_order_towards_continuous_time(law, order):
+def test_the_sampled_observers_converge_to_continuous_time(law, order):
     """The difference is late by half a sample, and its low-pass early by as much."""
     ends = np.arange(5, 21) * 1e-3
 
@@ -294,7 +294,7 @@ def right(law, z, z_dot, sampled):
 
 @EACH
 @pytest.mark.parametrize("law_i", [inversion.Adaptive(), inversion.ClosedForm()], ids=lambda x: type(x).__name__)
-def test_an_estimate_that_is_right_gives_the_command_of_a_measured_velocity(law, law_i):
+def test_an_exact_estimate_gives_the_command_of_a_measured_velocity(law, law_i):
     """i_ref' of the closed form among it: the estimate moves, not the velocity, which is not measured."""
     z, z_dot, i, reference = 1e-3, 0.03, 0.02, reference_at(Sine(2.5e-3, 2.0), 0.11)
     seen, blind = (Measurement(jnp.asarray(z), jnp.asarray(v), jnp.asarray(i)) for v in (z_dot, 0.0))
@@ -324,7 +324,7 @@ def test_an_estimate_that_is_right_gives_the_command_of_a_measured_velocity(law,
     "law",
     [pytest.param(x, id=type(x).__name__, marks=pytest.mark.thorough if n else ()) for n, x in enumerate(ESTIMATORS)],
 )
-def test_in_continuous_time_behind_sensors(law):
+def test_observers_in_continuous_time_with_sensor_noise_hold_the_rotor(law):
     """The compiler, which aborts where nothing reads a measurement, takes it; the rotor is held."""
     world = Scenario(reference=Sine(2.5e-3, 2.0), sensor=Sensor(1e-7, 0.0, 1e-5))
     trajectory = rollout(Cascade(law), world, Clock(300, 1e-4)).trajectory
@@ -333,7 +333,7 @@ def test_in_continuous_time_behind_sensors(law):
 
 
 @pytest.mark.parametrize("kind", ["ired-1", "ired-2"])
-def test_no_sliding_step_behind_a_differentiator(kind):
+def test_the_sliding_step_is_refused_with_a_differentiator(kind):
     """That would step it by Heun's method, far beyond its stability."""
     case = {"controller": {"observer": {"kind": kind}}, "clock": {"method": "sliding"}}
     with pytest.raises(ValueError, match=r"^clock.method = \"sliding\": .* an observer other than \"ired-1\""):

@@ -12,7 +12,7 @@ from ambjax.world.signals import reference_at
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", [inversion.Adaptive(), inversion.ClosedForm()], ids=lambda law: type(law).__name__)
-def test_the_laws_see_the_rotor_where_the_observer_says_it_is(law):
+def test_the_laws_use_the_estimate_of_the_observer(law):
     """Behind an observer with an estimate of its own the measured position changes nothing at once but rates."""
     cascade = Cascade(observer.Complementary(l=7.0), inversion=law)
     reference = reference_at(Sine(2.5e-3, 2.0), 0.013)

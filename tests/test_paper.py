@@ -37,7 +37,7 @@ def test_noise_scan_is_read_correctly():
     assert noise(0).std_for(6e-6) is None
 
 
-def test_verdicts_follow_the_evidence():
+def test_verdicts_depend_on_the_evidence():
     """Each verdict turns when its number crosses the criterion: nothing is typed in."""
     judges = {c.says: c.judge for c in claims.CLAIMS}
 
@@ -94,7 +94,7 @@ def test_a_stall_is_neither_held_nor_lost():
         assert judges[says] == findings.FAILS
 
 
-def test_what_is_held_ends_where_it_is_lost_or_not_known():
+def test_the_held_range_ends_before_the_first_loss_or_stall():
     tried, no = np.array([1.0, 2.0, 3.0]), np.zeros(3, bool)
     assert survival_of(tried, no, no) == (3.0, None)
     assert survival_of(tried, tried > 1, no) == (1.0, None)
@@ -158,7 +158,7 @@ def test_reproduce(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_step_of_the_tuned_reading_is_fine_enough():
+def test_the_step_of_the_tuned_reading_is_small_enough():
     cascade, scenario = paper.cascade("tuned"), paper.scenario("tracking", "tuned")
     runs = [
         rollout(cascade, scenario, paper.CLOCK.with_method(step)) for step in (STEPS["tuned"], AdaptiveRodas3(1e-8))

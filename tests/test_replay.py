@@ -138,7 +138,7 @@ def test_the_printed_command_replays_the_worst_member(printed, monkeypatch, caps
     belongs(metrics, "alone", 0.02)
 
 
-def test_a_last_bit_grows_in_that_loop_and_no_cut_of_the_ensemble_moves_it(printed):
+def test_results_of_a_chaotic_loop_do_not_depend_on_the_division_of_the_ensemble(printed):
     _, _, columns, _ = printed
     study = study_of(CASE)
     few = np.arange(40, 60)
@@ -182,7 +182,7 @@ class _Nothing:
         path.touch()
 
 
-def test_the_deviation_is_the_largest_of_any_metric():
+def test_the_reported_deviation_is_the_largest_over_the_metrics():
     relative = replaying._relative
     assert [relative(*pair) for pair in ((1.0, 1.0), (2.0, 1.0), (-1.0, 1.0))] == [0.0, 0.5, 2.0]
     assert [relative(*pair) for pair in ((np.inf, np.inf), (np.inf, 1.0), (True, False))] == [0.0, 1.0, 1.0]
@@ -213,7 +213,7 @@ def test_members_of_other_loops_are_replayed_bit_by_bit(loop):
 
 
 @pytest.mark.slow
-def test_rows_and_other_folds_leave_every_bit_of_the_loop():
+def test_recorded_rows_and_other_folds_do_not_change_a_bit_of_the_loop():
     study = study_of(CASE)
     columns = chunk(study, 0, 64, 64)
     cascade, scenario = study.batch(np.arange(8))
@@ -224,7 +224,7 @@ def test_rows_and_other_folds_leave_every_bit_of_the_loop():
 
 
 @pytest.mark.slow
-def test_processes_and_chunks_leave_every_bit_of_such_a_loop(printed, monkeypatch):
+def test_processes_and_chunks_do_not_change_a_bit_of_a_chaotic_loop(printed, monkeypatch):
     folder, *_ = printed
     no_pictures(monkeypatch)
     write(CASE)
@@ -251,7 +251,7 @@ assert found.deviation <= found.rounding < 1e-3
 
 
 @pytest.mark.slow
-def test_check_on_a_processor_sees_the_run_of_simulate(monkeypatch, capsys):
+def test_check_on_a_processor_uses_the_run_of_simulate(monkeypatch, capsys):
     no_pictures(monkeypatch)
     write(CASE)
     main(["check", "case.toml", "--json"])
@@ -283,7 +283,7 @@ held_out = 70
 
 
 @pytest.mark.slow
-def test_the_tuner_s_numbers_are_those_of_the_commands(monkeypatch, capsys):
+def test_the_numbers_of_the_tuner_equal_those_of_the_commands(monkeypatch, capsys):
     no_pictures(monkeypatch)
     write(CASE + TUNE)
     assert main(["tune", "case.toml", "--out", "tuned"]) in (0, 1)
@@ -352,7 +352,7 @@ PRINTED = {
 @pytest.mark.parametrize(
     "what", [pytest.param(x, marks=pytest.mark.slow if x == "a rotor is lost" else ()) for x in PRINTED]
 )
-def test_commands_in_messages_do_what_they_promise(what, monkeypatch, capsys):
+def test_commands_in_messages_work(what, monkeypatch, capsys):
     no_pictures(monkeypatch)
     monkeypatch.setattr("tuning.command.rounds", _stopped)
     words, code, promises = PRINTED[what]
@@ -385,7 +385,7 @@ def _code(call):
 
 
 @pytest.mark.parametrize("words", [["template"], ["template", "rig"], ["export"]])
-def test_commands_in_files_are_commands(words, capsys):
+def test_commands_in_printed_texts_and_files_are_valid(words, capsys):
     """Those that name no case lack it alone."""
     write(CASE)
     assert main(["export", "case.toml", "--out", "c"] if words == ["export"] else words) == 0
@@ -400,7 +400,7 @@ def test_commands_in_files_are_commands(words, capsys):
         parse.parse_args(words)
 
 
-def test_a_case_in_which_nothing_differs_is_replayed_as_it_is(capsys, monkeypatch):
+def test_a_case_without_noise_and_spread_is_replayed_unchanged(capsys, monkeypatch):
     no_pictures(monkeypatch)
     case = case_from({"clock": {"duration": 0.05}}, "case")
     study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, 3)

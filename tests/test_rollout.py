@@ -256,7 +256,7 @@ def test_a_row_has_the_voltage_s_average_over_its_sample(short, lost):
         assert np.all(np.asarray(out.trajectory.rows.u_mean)[~on] == 0)
 
 
-def test_a_span_lasts_as_long_as_the_drive_is_on(short, lost):
+def test_a_span_ends_when_the_rotor_is_lost(short, lost):
     time = np.asarray(short.measured["spans"].time)
     np.testing.assert_allclose(time, 1e-4, rtol=1e-12)  # a sum of some ten steps
     lost_at = float(lost.trajectory.lost_at)
@@ -339,7 +339,7 @@ def test_a_rotor_that_starts_against_the_stop_is_lost_at_once():
     assert out.measured["standard"]["lost"]
 
 
-def test_a_state_out_of_the_model_s_range_is_reported_as_such():
+def test_a_state_outside_the_range_of_the_model_is_reported():
     out = rollout(REPAIRED, dataclasses.replace(NOISY, initial=Initial(i=1e5)), SHORT, fold=FOLDS)
     assert int(out.trajectory.lost_code) == DIVERGED
     assert out.trajectory.lost_at == 0
@@ -446,7 +446,7 @@ def test_a_record_holds_arrays_and_traced_values_without_checks():
     assert jax.tree.map(lambda x: -x, Plant()).m == -Plant().m
 
 
-def test_the_help_of_a_law_is_that_of_its_declarations():
+def test_the_help_of_a_law_lists_its_declared_fields():
     lines = str(position.SlidingMode.__doc__).splitlines()
     assert "- `c`: decay rate on the sliding manifold (default 17; 1/s; above 1e-30 and at most 1e+30)" in lines
 
@@ -519,7 +519,7 @@ def test_the_fast_path_changes_nothing(transform, at, monkeypatch):
     near(fast, result(), 1e-12)
 
 
-def test_only_an_outermost_call_is_marked(monkeypatch):
+def test_only_the_outermost_call_is_marked(monkeypatch):
     if fast_path.options() is None:
         pytest.skip("the fast path is not supported here")
     marked, mark = [], fast_path._mark

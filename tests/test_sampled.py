@@ -206,7 +206,7 @@ def how_slow(name):
     "case",
     [pytest.param(case, id=case.name, marks=how_slow(case.name)) for case in CASES],
 )
-def test_against_the_independent_simulator(case):
+def test_sampled_loops_agree_with_the_independent_simulator(case):
     cascade, scenario, clock = loop_of(case.world, case.samples, case.std)
     rows = amb.rollout(cascade, scenario, clock).trajectory.rows
     run = simulate(case.world, case.samples, noise_of(scenario, case.samples))
@@ -234,7 +234,7 @@ SHORT = amb.Clock(300, 1e-4)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.4, 1.0, 1.6])
-def test_the_voltage_of_a_sample_acts_late(delay):
+def test_the_voltage_of_a_sample_acts_after_the_delay(delay):
     """u as folded over time is u_n shifted by the delay, and 0 before the first."""
     outcome = amb.rollout(cascade_of(delay=delay), NOISY, SHORT)
     u, mean = (np.asarray(getattr(outcome.trajectory.rows, name)) for name in ("u", "u_mean"))
@@ -252,7 +252,7 @@ def test_the_voltage_of_a_sample_acts_late(delay):
     [amb.inversion.Adaptive(8e5, INF), pytest.param(amb.inversion.ClosedForm(), marks=pytest.mark.thorough)],
     ids=lambda law: type(law).__name__,
 )
-def test_a_member_is_the_rollout_of_it_whatever_the_delays_of_others(inversion):
+def test_a_member_equals_its_rollout_for_any_delays_of_the_others(inversion):
     delays = np.array([0.0, 0.5, 2.0])
     scenario = dataclasses.replace(NOISY, member=np.arange(3))
     cascade = dataclasses.replace(cascade_of(delay=delays), inversion=inversion)
@@ -266,7 +266,7 @@ def test_a_member_is_the_rollout_of_it_whatever_the_delays_of_others(inversion):
         np.testing.assert_allclose(together[member], alone, rtol=1e-9)
 
 
-def test_a_part_of_an_ensemble_runs_the_program_of_the_whole():
+def test_a_part_of_an_ensemble_uses_the_program_of_the_whole():
     """Whether its own delays are whole or none: else a last digit would depend on how an ensemble is cut."""
     spread = cascade_of(delay=0.0).on_processor(0.5, 2.0)
     for delay in (0.0, 1.0, np.array([0.0, 0.7])):
@@ -341,7 +341,7 @@ def test_a_lost_rotor_is_frozen_with_its_drive_off():
     assert not np.asarray(rows.u)[after].any()
 
 
-def test_a_loop_that_leaves_the_numbers_is_a_loss_and_no_nan():
+def test_a_divergent_loop_is_a_loss_with_finite_values():
     scenario = dataclasses.replace(NOISY, initial=amb.Initial(1e-3), u_max=math.inf)
     wild = dataclasses.replace(cascade_of(), current=amb.current.ProportionalIntegral(1e30, 1e30, 1e30))
     trajectory = amb.rollout(wild, scenario, amb.Clock(20, 1e-4)).trajectory
@@ -350,7 +350,7 @@ def test_a_loop_that_leaves_the_numbers_is_a_loss_and_no_nan():
         assert np.isfinite(np.asarray(signal, float)).all(), name
 
 
-def test_a_gain_of_a_sign_without_a_layer_only_bounds():
+def test_a_large_gain_of_a_set_valued_sign_does_not_change_the_run():
     """An implicit step uses only the share of the gain that the error requires: 1e6 and 1e30 A/s give the same run."""
     scenario = dataclasses.replace(NOISY, u_max=math.inf)
     runs = [
@@ -361,7 +361,7 @@ def test_a_gain_of_a_sign_without_a_layer_only_bounds():
     np.testing.assert_allclose(*z, rtol=0, atol=1e-15)
 
 
-def test_a_law_that_gives_no_number_keeps_what_it_had():
+def test_a_law_whose_result_is_not_finite_keeps_its_state():
     system = system_of(cascade_of(), NOISY, SHORT).realised()
     start = system.start()
     lost = start._replace(plant=start.plant._replace(i=jnp.asarray(jnp.inf)))
@@ -386,7 +386,7 @@ def test_the_sampled_loop_converges_to_the_continuous_one(implicit):
     assert ((orders > 0.8) & (orders < 1.3)).all(), (errors, orders)
 
 
-def test_the_sign_itself_is_refused_in_continuous_time():
+def test_a_set_valued_sign_is_refused_in_continuous_time():
     hard_sign = amb.Cascade(position=amb.position.SlidingMode(17.0, 25.0, INF))
     with pytest.raises(ValueError, match=r"controller.position.p = inf: in continuous time a sign must be smoothed"):
         amb.rollout(hard_sign, NOISY, SHORT)
@@ -395,7 +395,7 @@ def test_the_sign_itself_is_refused_in_continuous_time():
         run_ensemble(mixed, dataclasses.replace(NOISY, member=np.arange(2)), SHORT, fold=None)
 
 
-def test_a_traced_delay_is_refused_where_nothing_was_settled():
+def test_a_traced_delay_is_refused_if_its_program_is_not_chosen():
     def run(delay):
         return amb.rollout(cascade_of(delay=delay), NOISY, amb.Clock(3, 1e-4, amb.RK4(1))).trajectory.lost_at
 

@@ -47,13 +47,13 @@ def test_relax_solves_its_equation(infinite):
             assert abs(y + h * sgn(y, p) - w) <= 4 * np.finfo(float).eps * (abs(w) + h + slope * abs(y))
 
 
-def test_relax_tends_to_the_clip_and_to_nothing():
+def test_relax_converges_to_clipping_and_is_the_identity_for_a_zero_gain():
     assert relax(0.3, 0.1, 1e12) == pytest.approx(relax(0.3, 0.1, math.inf), rel=1e-10)
     assert relax(0.3, 0.0, 25.0) == 0.3
 
 
 @pytest.mark.parametrize("name", ["lumped", "two-coil"])
-def test_a_rotor_at_rest_stays(name):
+def test_a_rotor_at_rest_stays_at_rest(name):
     """Scaled force against weight and spring, u = R i: no rate, at any height."""
     plant = (TwoCoil if name == "two-coil" else Lumped)(World())
     body = plant.body
@@ -88,7 +88,7 @@ def test_two_coils_conserve_energy_and_flux():
             assert flux_dot == pytest.approx(voltage - body.R * current, rel=1e-11, abs=1e-9)
 
 
-def test_where_two_coils_depart_from_the_lumped_plant():
+def test_the_difference_between_two_coils_and_the_lumped_plant_has_its_closed_form():
     """i_1 = i_0 + i, i_2 = i_0 - i: the same force; in di/dt the gap s_0 for s_0 + z, and other motion terms."""
     two, one = TwoCoil(World()), Lumped(World())
     body, rng = two.body, np.random.default_rng(3)
@@ -105,7 +105,7 @@ def test_where_two_coils_depart_from_the_lumped_plant():
     assert pushed == pytest.approx([0.0, 0.3, 0.7, -0.7], abs=1e-12)
 
 
-def test_two_coils_held_still_are_the_lumped_plant():
+def test_two_coils_with_a_fixed_rotor_equal_the_lumped_plant():
     """At z = 0 with 1e15 kg nothing moves, and i follows the same exponential."""
     heavy = {"m": 1e15, "g": 0.0, "k_z": 0.0}
     options = {"plant": heavy, "initial": (0.0, 0.0, 0.1), "u_max": 200.0}
@@ -115,7 +115,7 @@ def test_two_coils_held_still_are_the_lumped_plant():
 
 @pytest.mark.parametrize("fast", [False, True])
 @pytest.mark.parametrize("delay", [0.0, 0.5, 1.0, 1.5, 2.0])
-def test_the_voltage_switches_when_it_should(delay, fast):
+def test_the_voltage_switches_after_the_delay(delay, fast):
     """A coil alone under u_n = k_p (i_ref - i_n): between switchings i decays to u/R with rate 2 s_0 R / kappa."""
     k_p, i_ref, T = 1e5, 0.01, 1e-4
     world = World(
@@ -158,7 +158,7 @@ def field_of(world, u):
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.3, 0.5, 1.0, 1.5, 2.0])
-def test_the_plant_between_samples_and_its_prediction(delay):
+def test_the_prediction_agrees_with_the_plant_between_samples(delay):
     """Integrated apart, cut at switchings and pulse edges; `seen` is that solution delay T later."""
     world = World(
         delay=delay, reference=SINE, u_max=150.0,
@@ -244,7 +244,7 @@ ORDERS = [
 
 
 @pytest.mark.parametrize(("name", "discretisation"), ORDERS)
-def test_order_one_towards_continuous_time(name, discretisation):
+def test_the_sampled_loop_converges_to_continuous_time_with_order_one(name, discretisation):
     """So explicit and implicit laws meet as T -> 0, and so do delayed and prompt ones."""
     options = SMOOTH | CONFIGURATIONS[name] | {"discretisation": discretisation}
     names = set(oracle.World.__dataclass_fields__) & set(options)
@@ -262,7 +262,7 @@ def test_order_one_towards_continuous_time(name, discretisation):
     assert 1.7 < errors[0] / errors[1] < 2.3
 
 
-def test_true_signs_are_the_limit_of_steep_ones():
+def test_set_valued_signs_are_the_limit_of_steep_signs():
     laws = [
         {
             "position": ("sliding-mode", {"c": 17.0, "k": 25.0, "p": p}),
@@ -275,7 +275,7 @@ def test_true_signs_are_the_limit_of_steep_ones():
     assert np.abs(steep.z - true.z).max() < 1e-10  # of 1 mm
 
 
-def test_proper_super_twisting_keeps_its_band():
+def test_implicit_super_twisting_stays_in_its_band():
     """x+ = x + T (u + w), |w+ - w| <= L T: |x| <= L T^2 in the end; undisturbed, x is exactly 0 after finitely many."""
     T, k_1, k_2, L = 1e-3, 12.0, 40.0, 30.0
     rng = np.random.default_rng(4)
@@ -290,7 +290,7 @@ def test_proper_super_twisting_keeps_its_band():
         assert max(late) <= bound * T * T + 1e-15
 
 
-def test_a_converter_rounds_and_ends():
+def test_a_converter_rounds_and_saturates():
     lsb = 5e-3 / 2**11
     counts = np.array([0.4, 0.6, -0.6, 1.5, 2.5, 2047.4, 2047.6, 1e9, -2048.4, -1e9])
     codes = [conversion(x * lsb, 12, 5e-3) / lsb for x in counts]
@@ -301,7 +301,7 @@ def test_a_converter_rounds_and_ends():
     assert np.array_equal(run.seen[:, 1], run.z_dot)
 
 
-def test_errors_are_added_and_the_observer_steps():
+def test_sensor_errors_are_added_and_the_observer_is_stepped():
     noise = np.random.default_rng(5).normal(size=(200, 3)) * [1e-6, 1e-4, 1e-4]
     run = simulate(
         World(observer=("complementary", {"l": 300.0}), predict=False, reference=SINE), 200, noise, fast=True
@@ -328,7 +328,7 @@ def test_the_reference_is_that_of_the_instant_at_which_the_voltage_acts(delay, p
 
 @pytest.mark.parametrize("fast", [False, True])
 @pytest.mark.parametrize("T", [1e-4, 3.3e-3])
-def test_touch_down_between_samples(T, fast):
+def test_a_touchdown_between_samples_ends_the_run(T, fast):
     """Free fall from z = 0 to -0.9 s_0, magnets without a field, coils without a voltage: sqrt(2 0.9 s_0 / g)."""
     world = World(
         plant={"A": 1e-15, "R": 0.0, "k_z": 0.0}, period=T, predict=False,
@@ -341,7 +341,7 @@ def test_touch_down_between_samples(T, fast):
 
 
 @pytest.mark.parametrize("kind", ["lumped", "two-coil"])
-def test_fixed_steps_are_as_good(kind):
+def test_fixed_steps_agree_with_the_accurate_solution(kind):
     """RK4 with steps of at most 25 us: its error here, the tolerance of what it may be used for."""
     world = World(
         kind=kind, reference=SINE, delay=1.5, u_max=200.0,

@@ -37,7 +37,7 @@ def answered(tmp_path, capsys, text, *flags):
     return code, *capsys.readouterr(), path
 
 
-def test_the_summary_is_that_of_the_analysis(tmp_path, capsys):
+def test_the_summary_agrees_with_the_analysis(tmp_path, capsys):
     code, out, _, path = answered(tmp_path, capsys, CASE, "--json")
     summary = json.loads(out)
     assert code == 0
@@ -56,7 +56,7 @@ def test_the_summary_is_that_of_the_analysis(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_member_without_an_equilibrium_is_the_worst(tmp_path, capsys):
+def test_a_member_without_an_equilibrium_is_reported_as_the_worst(tmp_path, capsys):
     """A rotor of 1.5 kg needs 6 m/s^2 more than the model's, and k gives 5: exit code 1."""
     code, out, _, _ = answered(tmp_path, capsys, SPREAD, "--members", "8", "--seed", "1")
     assert code == 1
@@ -145,7 +145,7 @@ f_low = 20.0
 
 
 @pytest.mark.slow
-def test_the_injected_peak_stands_beside_the_linear_one(tmp_path, capsys):
+def test_the_injected_and_the_linear_peak_are_both_reported(tmp_path, capsys):
     """A smooth loop without noise: one member, whose interval is the value; 1 % of the gap is small for it."""
     code, out, _, _ = answered(tmp_path, capsys, PROCESSOR, "--json")
     summary = json.loads(out)

@@ -15,7 +15,7 @@ from ambjax.world.scenario import SLOTS
 MEMBERS = 40
 
 
-def test_the_noise_of_one_sensor_says_nothing_of_another_s():
+def test_the_noise_of_different_sensors_is_independent():
     """Neither its sign nor its size: no correlation of the numbers, nor of their squares, nor of large ones."""
     count = 40_000
     drawn = jax.jit(jax.vmap(lambda k: jnp.stack(normals(Scenario(seed=3).words(), k))))(jnp.arange(count))
@@ -26,7 +26,7 @@ def test_the_noise_of_one_sensor_says_nothing_of_another_s():
         assert np.abs(correlation).max() < 5 / np.sqrt(count), n
 
 
-def test_noise_is_not_made_of_the_words_that_keys_are_made_of():
+def test_noise_and_keys_use_different_random_words():
     """fold_in(key, n) is a pair of words, of which a signal's or a design's numbers are made: not those of sample n."""
     scenario = dataclasses.replace(Scenario(sensor=Sensor(1.0, 1.0, 1.0)), seed=9, member=4)
 

@@ -89,7 +89,7 @@ def carried(loops, exact, z_dot):
 
 
 @pytest.mark.slow
-def test_an_error_is_that_of_some_steps_carried_by_the_loop():
+def test_the_error_of_a_run_is_at_most_that_of_100_steps():
     exact, z_dot = motion(HARD, 1e-10)
     assert np.isfinite(exact).all()
     errors = [far(motion(HARD, tolerance)[0], exact) for tolerance in (1e-6, QUIET_TOLERANCE, 1e-8, 1e-9)]
@@ -104,7 +104,7 @@ def test_an_error_is_that_of_some_steps_carried_by_the_loop():
 
 
 @pytest.mark.slow
-def test_errors_of_many_loops():
+def test_the_errors_of_many_loops_are_bounded_by_those_of_a_step():
     loops = random_loops(examples(40, 300))
     exact, z_dot = motion(loops, 1e-9)
     errors = far(motion(loops, QUIET_TOLERANCE)[0], exact)

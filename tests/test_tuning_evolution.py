@@ -23,7 +23,7 @@ def least(f, m, populations, seed=0):
     return best, cloud
 
 
-def test_the_parameters_are_the_tutorial_s():
+def test_the_parameters_are_those_of_the_tutorial():
     """By hand from Table 1 of arXiv:1604.00772 for 5 dimensions: 8 points, 4 of them count."""
     assert population(5) == 8
     raw = [math.log(4.5) - math.log(i) for i in (1, 2, 3, 4)]
@@ -39,7 +39,7 @@ def test_the_parameters_are_the_tutorial_s():
     )
 
 
-def test_a_valley_is_followed_whichever_way_it_lies():
+def test_a_valley_in_any_direction_is_followed():
     """Curvatures from 1 to 1e4: without the covariance it stays at 1e-2, with it the best falls as that of a sphere."""
     scales, turn = 10 ** np.linspace(0, 4, 5), np.linalg.qr(np.random.default_rng(1).standard_normal((5, 5)))[0]
     for axes in (np.eye(5), turn):
@@ -57,7 +57,7 @@ def test_only_the_order_of_the_values_counts():
     np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
-def test_the_size_grows_on_a_slope_and_shrinks_in_a_pit():
+def test_the_step_size_grows_on_a_slope_and_decreases_at_a_minimum():
     assert least(lambda x: x[:, 0], 4, 30)[1].size > 1
     assert least(lambda x: (x**2).sum(axis=1), 4, 60)[1].size < 0.05
 
@@ -77,7 +77,7 @@ def found(monkeypatch, folder, world, **tune):
 
 
 @pytest.mark.parametrize("chaos", CHAOS)
-def test_a_minimum_is_found_where_derivatives_lead_elsewhere(monkeypatch, tmp_path, chaos):
+def test_a_minimum_is_found_in_spite_of_misleading_derivatives(monkeypatch, tmp_path, chaos):
     answer, gains = found(monkeypatch, tmp_path, World(chaos=CHAOS[chaos]))
     # the loss is flat to 1 %, at which populations stall, within a factor of e^0.1
     np.testing.assert_allclose(gains, World().best, rtol=0.1)
@@ -85,7 +85,7 @@ def test_a_minimum_is_found_where_derivatives_lead_elsewhere(monkeypatch, tmp_pa
 
 
 @pytest.mark.slow
-def test_three_limits_are_kept_where_derivatives_lead_elsewhere(monkeypatch, tmp_path):
+def test_three_limits_hold_in_spite_of_misleading_derivatives(monkeypatch, tmp_path):
     answer, (c, k) = found(monkeypatch, tmp_path, World(chaos=1e30), limits=LIMITS)
     limits = {limit.name: limit for limit in answer.problem.limits}
     assert set(limits) == set(LIMITS) - {"margin"}
@@ -100,7 +100,7 @@ def populations(world):
     return sum(kind == "terms" and points == population(2) for kind, _, _, points in world.calls)
 
 
-def test_a_descent_that_has_converged_is_left_alone(monkeypatch, tmp_path):
+def test_cma_es_does_not_start_after_a_converged_descent(monkeypatch, tmp_path):
     smooth, rough = World(), World(chaos=1e30)
     found(monkeypatch, tmp_path / "smooth", smooth)
     found(monkeypatch, tmp_path / "rough", rough)
@@ -108,7 +108,7 @@ def test_a_descent_that_has_converged_is_left_alone(monkeypatch, tmp_path):
     assert populations(rough) > PATIENCE
 
 
-def test_it_has_converged_when_whole_populations_stall():
+def test_cma_es_has_converged_if_whole_populations_do_not_improve():
     """One point far below all others, which is chance, changes nothing."""
     cloud = initial_state(np.zeros(2))
     for n, level in enumerate([0.0, -2 * STALL, *[-2.5 * STALL] * PATIENCE]):
@@ -119,7 +119,7 @@ def test_it_has_converged_when_whole_populations_stall():
     assert not updated(cloud, next_population(cloud, 0), np.full(6, -4 * STALL)).converged
 
 
-def test_a_search_that_is_resumed_among_populations_ends_alike(monkeypatch, tmp_path):
+def test_a_search_resumed_during_cma_es_gives_the_same_result(monkeypatch, tmp_path):
     """Ctrl-C in the third population."""
 
     class Counting(list):

@@ -97,7 +97,7 @@ def test_least_error_traces_no_front_without_pareto(ran):
     assert not list(folder.glob("tuned_*"))
 
 
-def test_the_front_of_least_error_leaves_the_answer(ran):
+def test_the_front_does_not_change_an_answer_of_least_error(ran):
     _, facts, out, folder = ran(pareto=True, front=1, bounds=BOUNDLESS)
     assert [(row["factor"], row["taken"]) for row in facts["front"]] == [(1, True), (1.25, False)]
     assert "This answer has the least error: " in out
@@ -105,7 +105,7 @@ def test_the_front_of_least_error_leaves_the_answer(ran):
 
 
 @pytest.mark.slow
-def test_the_rest_of_the_limits_stays(monkeypatch, tmp_path):
+def test_the_other_limits_stay_in_the_search_of_the_knee(monkeypatch, tmp_path):
     """A limit of 15 V is met by the answer of least error already, at a voltage below which the knee may not end."""
     study(monkeypatch, World(), objective="knee", bounds=BOUNDLESS, limits={"largest_error_m": 1.0})
     problem = problem_of(
@@ -131,7 +131,7 @@ def point(error, volts, lost=0, within=True):
     return FrontPoint(1.0, np.zeros(2), error, volts, None, lost, 0, 100, within)
 
 
-def test_the_point_chosen_holds_as_many_members_and_limits_as_the_least_error():
+def test_the_knee_holds_as_many_members_and_limits_as_the_point_of_least_error():
     seen = [point(1.0, 20.0), point(1.2, 10.0, lost=1), point(1.2, 11.0, within=False), point(1.26, 9.0)]
     assert chosen(seen, 1.25) is seen[0]
     assert chosen(seen, 1.3) is seen[3]

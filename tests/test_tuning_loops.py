@@ -51,7 +51,7 @@ def made():
 
 
 @pytest.mark.slow
-def test_the_derivative_of_a_limit_is_that_of_differences(made):
+def test_the_derivative_of_a_limit_agrees_with_differences(made):
     """Of each limit's term of the goal, along each gain."""
     problem, x, members = made
     some, step = members.searched, 1e-3
@@ -71,7 +71,7 @@ def test_the_derivative_of_a_limit_is_that_of_differences(made):
 
 
 @pytest.mark.slow
-def test_the_engine_puts_the_loops_among_the_limits_by_name(made, monkeypatch):
+def test_the_engine_adds_the_quantities_of_the_linear_loop_by_name(made, monkeypatch):
     """For 12 ordinary and 2 stressed members; the rollouts themselves are not simulated here."""
     problem, x, members = made
     count, m = len(members.member), len(x)
@@ -111,7 +111,7 @@ def test_an_unstable_loop_has_a_finite_value_whose_derivative_points_to_stabilit
     assert np.all(np.diff(values["delay_margin_s"][unstable, 0]) < 0)
 
 
-def test_a_lower_limit_holds_above_it():
+def test_a_lower_limit_holds_for_larger_values():
     _, tune = case_and_tune(DOCUMENT)
     limit = next(one for one in tune.limits.each if one.name == "delay_margin_s")
     assert KINDS["delay_margin_s"].at_least

@@ -76,7 +76,7 @@ def error_of(found, **changes):
     return right._replace(**changes)
 
 
-def test_what_refutes_an_answer(small):
+def test_the_reasons_that_refute_an_answer(small):
     right = error_of(small)
     assert right.refuted == ""
     assert right.resolved
@@ -96,7 +96,7 @@ def test_what_refutes_an_answer(small):
 
 
 @pytest.mark.slow
-def test_a_negligible_error_is_that_of_the_reference_for_its_gap(small):
+def test_a_negligible_error_is_that_of_the_reference_relative_to_the_gap(small):
     error = step_error(small, at(small))
     assert error.negligible_m == NEGLIGIBLE * 4e-4
     # these gains lose the rotor with both kinds of steps, so no member is held or lost in accurate steps alone
@@ -117,11 +117,11 @@ def test_false_survival_is_refuted():
     np.testing.assert_array_equal(error.unheld.member, members.member)
 
 
-def test_the_worst_are_the_largest():
+def test_worst_of_returns_the_largest_values():
     assert worst_of(np.array([1.0, 5.0, 3.0, 0.0, 4.0, 2.0])).tolist() == [1, 4, 2, 5]
 
 
-def test_members_that_accurate_steps_do_not_hold_join_louder(small):
+def test_members_that_accurate_steps_do_not_hold_join_with_more_noise(small):
     unconfirmed = small.objective.chosen(1, np.array([2, 3]), 4)
     error = error_of(small, lost=1, stalled=1, members=2, unheld=unconfirmed)
     joined = joining(small, np.array([7, 5]), error, 2)
@@ -129,7 +129,7 @@ def test_members_that_accurate_steps_do_not_hold_join_louder(small):
     np.testing.assert_allclose(joined.noise_factor, [1.1, 1.1, NOISE_GROWTH**2, NOISE_GROWTH**2])
 
 
-def test_steps_are_halved_so_often_and_no_more(small):
+def test_the_number_of_halvings_of_the_steps_is_limited(small):
     steps = []
     while small is not None:
         steps.append(small.objective.clock.method.substeps)
@@ -195,7 +195,7 @@ def test_the_search_goes_on_with_members_that_are_not_confirmed(run, small):
 
 
 @pytest.mark.slow
-def test_what_nothing_confirms_is_not_taken_for_an_answer(run, small):
+def test_an_answer_that_no_steps_confirm_is_not_confirmed(run, small):
     """The tuner tries finer steps, then earlier points of the search, and then states that no answer is confirmed."""
     nothing = error_of(small, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
     answer, verdicts = run(nothing)
@@ -254,7 +254,7 @@ def test_an_answer_confirmed_in_training_is_still_refuted_by_held_out_members(sm
 
 
 @pytest.mark.thorough
-def test_the_search_goes_on_to_where_it_is_confirmed(tmp_path, capsys):
+def test_the_search_continues_until_an_answer_is_confirmed(tmp_path, capsys):
     """A bearing with velocity noise, whose first answers survive only in the steps of the search."""
     path, out = tmp_path / "case.toml", tmp_path / "out"
     hard = FALSE.replace("duration = 0.02", "duration = 0.2").replace("[clock]", "[run]\nsettle = 0.05\n[clock]")
