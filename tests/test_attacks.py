@@ -130,7 +130,7 @@ def test_a_metric_that_is_not_a_number_is_refused(name, value, capsys, monkeypat
 
     monkeypatch.setattr(simulate, "_simulated", broken)
     assert main(["simulate", write(SHORT), "--out", "broken"]) == 2
-    assert f"case.toml: {name}: this run gave no finite number" in capsys.readouterr().err
+    assert f"case.toml: {name}: not finite in this run" in capsys.readouterr().err
     assert not pathlib.Path("broken/metrics.json").exists()
 
 

@@ -322,7 +322,7 @@ def test_a_delay_whose_run_stalls_is_neither_held_nor_lost(monkeypatch):
     delays.stalled, delays.lost = (0.0, 3.0), (3.0, INF)
     assert margin(0.0)[:3] == (None, None, 0.0)
     words = advice.processor_lines(SampledReport([], [], math.inf, ""), margin(0.0), None)[-1]
-    assert words.startswith("Delay margin: the rotor is not decided at 0, where the integrator stalled (tried")
+    assert words.startswith("Delay margin: the rotor is not decided at 0, where the integrator stalled (tested")
     words = advice.processor_lines(SampledReport([], [], math.inf, ""), Delays(0.5, 1.5, 0.75, 0.1), None)[-1]
     assert "held up to 0.5 samples, not decided at 0.75, where the integrator stalled, lost at 1.5" in words
 

@@ -16,8 +16,9 @@ from ambjax.theorem.sampled_report import Delays, SampledReport
 
 Summary = dict[str, object]
 CONTINUOUS = (
-    "The tables of Theorem 1 are for continuous time: without the case's [processor], converters and "
-    "amplifier, and with a boundary layer for each sign that has none. They do not affect the verdict on this case."
+    "The tables of Theorem 1 are computed in continuous time, without the case's [processor], converters and "
+    "amplifier; a set-valued sign is replaced by a sign with a boundary layer. These tables do not affect the verdict "
+    "on this case."
 )
 
 BAND = (
@@ -29,9 +30,10 @@ BAND = (
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
-    """Check a case and print the results, first those of the loop as it will run. Return the exit code and the summary.
+    """Check a case and print the results, first those of the loop with its processor.
 
-    The exit code is 1 if a condition fails or the magnets cannot carry the rotor.
+    Returns the exit code and the summary. The exit code is 1 if a condition fails or the magnets cannot carry the
+    rotor.
     """
     from ambjax.theorem import advice
 
@@ -85,7 +87,7 @@ def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
     say(f"finding the delay margin: simulating {DELAYS} delays, twice if the rotor is lost at one of them")
     margin, unknown = delay_margin(case.cascade, case.scenario, case.clock), None
     if (processor := case.cascade.processor) is not None and processor.predict is not False:
-        say("finding the delay margin once more, for delays that the prediction does not know")
+        say("finding the delay margin again: the prediction uses the delay of the case")
         unknown = delay_margin(case.cascade, case.scenario, case.clock, known=False)
     if not args.json:
         print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")

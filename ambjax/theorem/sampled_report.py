@@ -25,8 +25,8 @@ from ambjax.simulation.rollout import Outcome, System, prepare, roll
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
+from ambjax.theorem.law_signals import LawSignalsRecorder
 from ambjax.theorem.slopes import SlopeCheck, sampling_of, slope_checks
-from ambjax.theorem.watched import Watched
 from ambjax.world.bearing import Bearing
 from ambjax.world.scenario import Scenario
 
@@ -158,9 +158,9 @@ def check_sampled(
 
 
 def _simulated(loop: System, clock: Clock, run: Callable[[System, Clock], Outcome]) -> Trajectory:
-    """Simulate a loop on a processor and record the rows of `Watched`."""
+    """Simulate a loop on a processor and record the rows of `LawSignalsRecorder`."""
     assert isinstance(loop, Sampled)
-    return run(Watched(loop), clock).trajectory
+    return run(LawSignalsRecorder(loop), clock).trajectory
 
 
 def _smallest_distance(run: Trajectory, plant: Bearing) -> tuple[float, float]:
