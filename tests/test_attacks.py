@@ -267,7 +267,7 @@ DOUBTS = {
     "initial current": ("[initial]\ni = 0.3", "initial.i = 0.3 A", "plant.i_0 = 0.25 A"),
     "weight beyond the bias": ("[plant]\nm = 588.0", "takes 1.741 A", "plant.i_0 = 0.25 A"),
     "supply too weak": ("[actuator]\nu_max = 0.01", "actuator.u_max = 0.01 V", "0.07215 V that hold"),
-    "stiffness the wrong way": ("[plant]\nk_z = 754.0", "plant.k_z = 754", "restores"),
+    "stiffness the wrong way": ("[plant]\nk_z = 754.0", "plant.k_z = 754", "restoring"),
     "milliseconds": ("[sensor]\nstd = 1e-6\n[clock]\nsample_period = 0.1", "clock.sample_period = 0.1 s", "unstable"),
     "noise that may go far": (
         '[reference]\nkind = "band-noise"\nstd = 6e-4\nf_low = 1\nf_high = 99',

@@ -67,7 +67,7 @@ def test_the_knee_is_the_least_voltage_within_25_percent_of_the_least_error(ran)
     text = (folder / "report.md").read_text()
     assert sentence in text
     assert text.index("## Error against voltage") < text.index("## Limits")
-    assert text.count("**taken**") == 1
+    assert text.count("**selected**") == 1
     # the limit by which the front is traced is no requirement
     assert [row["name"] for row in facts["limits"]] == ["rms_u_V", "survival"]
     for row in facts["front"]:

@@ -119,7 +119,7 @@ def test_the_rows_of_the_loss_table_add_up_to_its_total(written):
     terms, total, risk = rows[: len(TERMS)], rows[len(TERMS)], rows[len(TERMS) + 1]
     assert [row[0] for row in terms] == list(TERMS)
     for when in ("before", "after"):
-        mean, adds = (head.index(f"{word} {when}") for word in ("mean", "adds"))
+        mean, adds = (head.index(f"{word} {when}") for word in ("mean", "contribution"))
         shown = sum(float(row[adds]) for row in terms)
         # of six numbers and their sum, each is rounded to five digits
         assert shown == pytest.approx(float(total[adds].strip("*")), rel=7 * 0.5e-4)
@@ -242,16 +242,16 @@ def test_large_differences_are_marked():
     assert held_out._again(again, "b") == ["1.47", "1", "**47 %**"]
     assert held_out._again(again, "c") == ["-"] * 3
     assert held_out._statuses(again, "lost") == ["0 of 8", "2 of 8", "-"]
-    assert "In bold: off by more than 5 %" in held_out._accurate(again)[0]
+    assert "Differences above 5 % are in bold." in held_out._accurate(again)[0]
     del again["metrics"]["b"]
-    assert "No number is off by more than 5 %" in held_out._accurate(again)[0]
+    assert "No difference exceeds 5 %" in held_out._accurate(again)[0]
     again["metrics"] = {}
-    assert "nothing in this table is confirmed" in held_out._accurate(again)[0]
+    assert "accurate steps confirm no number of this table" in held_out._accurate(again)[0]
 
 
 def test_the_columns_of_accurate_steps_are_in_the_report(written):
     head, *rows = cells((written / "report.md").read_text(), "12 held-out members")
-    assert head[3:] == ["after, 8 of them", "by accurate steps", "off by"]
+    assert head[3:] == ["after, 8 members", "with accurate steps", "difference"]
     facts = json.loads((written / "report.json").read_text())
     metrics = facts["accurate"]["metrics"]
     rows = [row for row in rows if row[0].strip("`") in metrics]
@@ -418,7 +418,7 @@ def test_the_section_on_gradients_has_three_complete_tables():
     shown = render_page("\n".join(extras.gradient(facts)), {}, "t")
     assert shown.count("<table>") == 3
     assert shown.count("<td") == 2 * 5 + 3 + 2 * 4
-    assert "The three agree on 1 of 2 gains" in shown
+    assert "The three derivatives agree for 1 of 2 gains" in shown
     assert "Differences compare two runs" in shown
     three["verdicts"] = [gradient.AGREED] * 2
     assert "Differences compare two runs" not in "".join(extras.gradient(facts))
@@ -434,10 +434,10 @@ WAYS = {
         0.4e-2,
         "differences are inconclusive: -2.31e-02 with",
     ),
-    "jumps": (-9.0, -9.0, -9.5, -9.5, "differences differ from both modes by 5.3 %, whatever their step"),
+    "jumps": (-9.0, -9.0, -9.5, -9.5, "differences differ from both modes by 5.3 % with both steps"),
     "modes apart": (1.0, 1.1, 1.0, 1.0, "forward and reverse mode differ by 9.1 %"),
     "all as good as 0": (1e-12, -3e-12, 2e-11, -4e-11, gradient.AGREED),
-    "no number": (math.nan, 1.0, 1.0, 1.0, "not every way gives a finite number"),
+    "no number": (math.nan, 1.0, 1.0, 1.0, "a derivative is not finite"),
 }
 
 

@@ -303,7 +303,7 @@ def test_the_gradient_report_compares_three_derivatives(everything):
     # h^4 of the extrapolated differences, of slopes that vanish at the optimum: of the size of the loss
     np.testing.assert_allclose(ways[2], ways[0], rtol=1e-6, atol=1e-9 * FLOOR)
     assert found["three_ways"]["agree"]
-    assert "The three agree on 2 of 2 gains" in (out / "report.md").read_text()
+    assert "The three derivatives agree for 2 of 2 gains" in (out / "report.md").read_text()
     assert len(found["horizons"]) > 1
     assert "gradient" in (out / "report.md").read_text().lower()
 

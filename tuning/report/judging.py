@@ -96,7 +96,7 @@ def _steps(answer: SearchResult, unlucky: StepError | None, again: Row | None, r
         "step_error": answer.error.facts() if answer.error else None,
         "worst_step_error": unlucky.facts() if unlucky else None,
         "accurate_steps": problem.accurate,
-        "nominal_steps": "in the steps of `ambjax simulate`" if problem.replays else "by accurate steps",
+        "nominal_steps": "with the steps of `ambjax simulate`" if problem.replays else "with accurate steps",
         "refuted": refuted,
         "verified": not refuted,
         "verified_reason": refuted or _confirmed(unlucky, answer.error),
@@ -159,7 +159,7 @@ def _checked(
     if judged and not problem.sampled:
         error = _worst_checked(answer, judged, held_out) if answer.confirmed else None
         count = problem.tune.budget.held_out
-        say(f"{min(accurate.COMPARED, count)} of them again by accurate steps ...")
+        say(f"{min(accurate.COMPARED, count)} of these members again with accurate steps ...")
         again = accurate.compare_steps(problem, answer.x, held_out, count, SUMMARY_METRICS)
     refuted = (error or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
     return error, again, refuted or (again["refuted"] if again else "")
