@@ -51,7 +51,10 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 def refusal(text, name="case.toml"):
-    """The message with which a file of this text is refused; it is one line and names the file."""
+    """Return the message with which a file of this text is refused.
+
+    Checks that the message is one line and names the file.
+    """
     with pytest.raises(ValueError, match=r"^case\.toml: ") as refused:
         read_case(write(text, name))
     assert str(refused.value).isprintable()
@@ -135,7 +138,7 @@ def test_a_metric_that_is_not_a_number_is_refused(name, value, capsys, monkeypat
 
 
 def records():
-    """Every record with numbers that there is, but for distributions: theirs have the ends of what they spread."""
+    """Return every record with numbers, except distributions, whose ranges are those of the spread numbers."""
     for package in (ambjax, tuning):
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             if not module.name.endswith("__main__"):
@@ -546,7 +549,7 @@ def test_closed_standard_streams_do_not_change_the_results():
 
 
 def uncommented(name):
-    """The template's table [tune] with every line of it in force, as tomllib reads it."""
+    """Return the template's table [tune] with all lines uncommented, as parsed by tomllib."""
     head, _, tail = template(name).partition("# [tune]")
     lines = ("[tune]" + tail).splitlines()
     return tomllib.loads(head + "\n".join(line.removeprefix("# ") for line in lines))

@@ -28,7 +28,7 @@ LATE = [0.0, 0.2, 0.25, 0.4, 0.5, 0.8, 1.0, 1.3, 1.5, 2.0]
 
 
 def roots(a, late):
-    """Of x_{n+1} = x_n - a x(n - late), x between samples on the straight line, by the polynomial written out."""
+    """Return the roots of x_{n+1} = x_n - a x(n - late), with x interpolated linearly, from the explicit polynomial."""
     whole, share = int(late), late - int(late)
     coefficients = np.zeros(whole + 3)
     coefficients[[0, 1]] = 1.0, -1.0
@@ -55,7 +55,7 @@ def test_slope_limits_without_delay_and_with_one_sample():
 
 
 def driven(implicit, T, k, p, w, x, steps=400):
-    """x of x_{n+1} = x_n - T k s_n + T w_n: the relay itself by a clip, the smoothed sign by bisection."""
+    """Return x of x_{n+1} = x_n - T k s_n + T w_n: the relay by clipping, the smoothed sign by bisection."""
     sign = lambda x: np.sign(x) if math.isinf(p) else 2 / np.pi * np.arctan(p * x)  # noqa: E731
 
     def used(x):
@@ -114,7 +114,10 @@ CLOCK, LONG = (amb.Clock(samples, 1e-4, amb.RK4(4)) for samples in (600, 3000))
 
 
 def random_loop(name, draw):
-    """A loop of one of three structures, so that a few programs serve all: cascade, scenario."""
+    """Return the cascade and the scenario of a random loop.
+
+    It has one of three structures, so that few programs are compiled.
+    """
     c, k, k_i = 10 ** draw.uniform(1.2, 3.0), 10 ** draw.uniform(0.5, 2.5), 10 ** draw.uniform(2.3, 3.5)
     gamma, p = 10 ** draw.uniform(5.0, 7.0), 10 ** draw.uniform(0.5, 2.0)
     world = {"reference": amb.Sine(draw.uniform(0.5e-3, 2.5e-3), 2.0), "u_max": draw.uniform(100.0, 2e3)}
@@ -136,7 +139,7 @@ def random_loop(name, draw):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["estimated, two coils", "late, amplifier", "explicit"])
 def test_measured_signals_do_not_exceed_their_bounds(name):
-    """And words and verdict are of one fact. What is measured and what is bounded differ by rounding: 1e-12."""
+    """The text and the verdict also agree. The tolerance 1e-12 is for rounding."""
     draw, bounds = np.random.default_rng(7), 0
     for _ in range(10):
         cascade, world = random_loop(name, draw)
@@ -152,7 +155,7 @@ def test_measured_signals_do_not_exceed_their_bounds(name):
 
 
 def test_bounds_are_tight_without_an_estimate():
-    """The sign itself, implicit: what is left is what disturbs it in a sample; of a smoothed one no less than half."""
+    """An implicit set-valued sign reaches its bound. With smoothed signs, the signal reaches at least half of it."""
     for gains, share in ((HARD, 0.999), (SOFT, 0.5)):
         lines = sampled_report.check_sampled(cascade_of(*gains, delay=0.0), WORLD, LONG, 0.1).bands
         assert [line.signal for line in lines] == ["sigma", "v_tilde", "e"]
@@ -172,7 +175,7 @@ def test_a_signal_outside_its_band_is_bounded_by_its_value_at_settle():
 
 
 def test_the_effective_slope_of_an_implicit_step_is_at_most_one():
-    """a/(1 + a): stable unless the sign itself is a sample late."""
+    """It is a/(1 + a), which is stable unless the sign acts one sample late."""
     hard, soft = cascade_of(*HARD, delay=1.0), cascade_of(*SOFT, delay=1.0, predict=False)
     late = dataclasses.replace(hard, processor=Processor(1.0, predict=False))
     assert [slope.effective_slope for slope in slopes.slope_checks(hard, CLOCK)] == [1.0, 1.0, 1.0]
@@ -295,7 +298,7 @@ def test_an_assumed_delay_equal_to_the_delay_changes_nothing():
 
 
 def test_a_loss_in_a_narrow_interval_of_delays_is_found(monkeypatch):
-    """A stand-in for the loop, lost from 0.704 to 0.716 samples alone, and a delay whose run stalls."""
+    """The loop is replaced by one that is lost from 0.704 to 0.716 samples only, and stalls at one delay."""
     monkeypatch.setattr(searched, "run_ensemble", delays)
     delays.stalled, delays.lost = (-1.0, -1.0), (0.704, 0.716)
     cascade, clock = cascade_of(*HARD, delay=0.0), amb.Clock(300, 1e-4, amb.RK4(1))
@@ -304,7 +307,7 @@ def test_a_loss_in_a_narrow_interval_of_delays_is_found(monkeypatch):
 
 
 def test_a_delay_whose_run_stalls_is_neither_held_nor_lost(monkeypatch):
-    """A stand-in for the loop, lost from 1.5 samples on and given up between 0.6 and 0.9: the margin says both."""
+    """The loop is replaced by one that is lost from 1.5 samples on and stalls between 0.6 and 0.9."""
     monkeypatch.setattr(searched, "run_ensemble", delays)
     delays.stalled, delays.lost = (0.6, 0.9), (1.5, INF)
 
@@ -328,7 +331,7 @@ def test_a_delay_whose_run_stalls_is_neither_held_nor_lost(monkeypatch):
 
 
 def delays(cascade, scenario, clock, *, fold):
-    """What `run_ensemble` says of each delay of a cascade."""
+    """Return the result of `run_ensemble` for each delay of a cascade."""
     late, (begin, end) = np.asarray(cascade.processor.delay), delays.stalled
     lost = (delays.lost[0] <= late) & (late <= delays.lost[1])
     code = np.where((begin <= late) & (late <= end), STALLED, np.where(lost, TOUCHED, ALIVE))

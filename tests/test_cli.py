@@ -258,7 +258,7 @@ def test_simulate_writes_what_is_documented(capsys):
 
 @pytest.mark.thorough
 def test_progress_bar_and_json_do_not_change_the_results(monkeypatch, capsys):
-    """Neither the stroke of the progress bar nor --json changes a bit of the result."""
+    """The results are equal bit by bit."""
     path = write(SHORT + "[sensor]\nstd = 1e-6\n")
     assert main(["simulate", path, "--out", "a", "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)

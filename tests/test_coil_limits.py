@@ -137,7 +137,10 @@ def test_the_current_reaches_its_limits_and_stays_within_one_step(i_max, unidire
 
 
 def test_gradients():
-    """Under a limited voltage, di/du_max = (1 - exp(-R t/L))/R; with all limits, of R, as a finite difference."""
+    """The derivative di/du_max is (1 - exp(-R t/L))/R.
+
+    With all limits, the derivative with respect to R agrees with a finite difference.
+    """
 
     def current(u_max):
         return driven(world(u_max=u_max), 60.0, at(STILL, 2.5, 2.5)).i_1

@@ -80,7 +80,7 @@ def test_other_numbers_never_recompile(what, warm, caplog):
 
 
 def test_a_change_of_structure_recompiles(caplog):
-    """What the tests around this one count is there to be counted."""
+    """This shows that the other tests of this module can detect a compilation."""
     before = Counting.traces
     assert compiled(caplog, Cascade(position=Counting()), NOISY, Clock(3, 1e-4, Slide(1)))
     assert Counting.traces > before
@@ -106,7 +106,7 @@ def test_integers_never_recompile(what, warm):
 
 
 def test_a_materialised_value_is_computed_once():
-    """Six rounds of two products, each product used twice in the next round."""
+    """Each of six rounds computes two products, and each product is used twice in the next round."""
 
     def chain(x, y):
         for _ in range(6):

@@ -28,7 +28,7 @@ def truncated(share):
 
 
 def flipped(share):
-    """One byte changed within the data of an entry: at this share of the entries."""
+    """Change one byte within the data of an entry, at this share of the entries."""
 
     def damage(path):
         with zipfile.ZipFile(path) as archive:
@@ -42,7 +42,7 @@ def flipped(share):
 
 
 def rewritten(change, again=False):
-    """Another program's file: arrays and facts changed; sealed anew, if `again`, by one who means it."""
+    """Rewrite the file with changed arrays and facts, as another program would; with `again`, with a valid seal."""
 
     def damage(path):
         arrays, facts = unseal(path)
@@ -120,7 +120,7 @@ def test_a_damaged_file_raises_damaged_error(kind, tmp_path):
 
 
 def test_a_change_of_any_byte_of_the_arrays_is_detected(tmp_path):
-    """Every byte in turn: what is read is what was written, or refused; bytes that no reader looks at may change."""
+    """Each byte is changed in turn. The file is then refused, or read unchanged if no reader uses the byte."""
     path = tmp_path / "a.npz"
     seal(path, {"x": np.linspace(0.1, 1, 4)}, FACTS)
     content, refused = path.read_bytes(), 0
@@ -175,7 +175,7 @@ def store_in(out, resume=True, chunk=CHUNK, facts=FACTS):
 
 
 def compute(store):
-    """What a run does: whatever is missing. Returns the spans and the remarks."""
+    """Compute all missing chunks, as a run does. Return the spans and the remarks."""
     missing, remarks = store.survey()
     for span in missing:
         store.put(span, rows(*span))
@@ -184,7 +184,7 @@ def compute(store):
 
 @pytest.fixture
 def whole(tmp_path):
-    """members.npz of a run that nothing happened to."""
+    """Return members.npz of an undisturbed run."""
     store = store_in(tmp_path / "whole", resume=False)
     assert compute(store) == ([(0, 20), (20, 40), (40, 50)], [])
     return store.finish().read_bytes()
@@ -192,7 +192,7 @@ def whole(tmp_path):
 
 @pytest.fixture
 def begun(tmp_path):
-    """A study of which all chunks are there, not yet put together."""
+    """A study whose chunks are all computed, but not yet put together."""
     store = store_in(tmp_path / "out", resume=False)
     compute(store)
     return tmp_path / "out"
@@ -203,7 +203,7 @@ def chunk_file(out, number):
 
 
 def rejoined(out, damaged, whole):
-    """The remarks of a run that goes on where chunk `damaged` is."""
+    """Return the remarks of a run that resumes a study whose chunk `damaged` is damaged."""
     store = store_in(out)
     missing, remarks = compute(store)
     assert missing == [store.spans()[damaged]]
@@ -273,7 +273,7 @@ def test_a_missing_chunk_is_computed_without_a_message(begun, whole):
 
 
 def test_chunks_are_kept_until_members_npz_is_verified(begun, whole, monkeypatch):
-    """A disk that gives back something else than what was written."""
+    """The disk returns other data than were written."""
     spoil = [truncated(0.5), flipped(0.7), rewritten_plainly(drop), rewritten_plainly(shorten)]
     spoil += [rewritten_plainly(renumbered), rewritten_plainly(alter)]
     for damage in spoil:
@@ -362,7 +362,7 @@ def test_the_chunk_size_of_the_directory_is_the_default(begun, whole):
 
 
 def test_a_study_that_ended_before_its_first_chunk_is_resumed(tmp_path, whole):
-    """Its directory is marked, and no chunk size recorded: any is accepted, and recorded then."""
+    """Its folder is marked, and records no chunk size. Any chunk size is accepted, and then recorded."""
     for chunk in (None, CHUNK):
         out = tmp_path / str(chunk)
         store_in(out, resume=False, chunk=None)
@@ -513,7 +513,7 @@ def test_the_manifest_of_a_study_is_plain_json(begun):
 
 @pytest.mark.parametrize("kind", CHUNK_STRANGE)
 def test_a_chunk_that_was_replaced_while_the_study_ran_is_refused_by_name(kind, begun, whole):
-    """A chunk of another study above all, of the same members: whoever copies one, or runs in the same folder."""
+    """For example by a chunk of another study of the same members, from another run in the same folder."""
     store = store_in(begun)
     assert compute(store) == ([], [])
     path = chunk_file(begun, 1)

@@ -36,14 +36,14 @@ ROUNDING = 1e-12
 
 @pytest.fixture(autouse=True)
 def drawn(monkeypatch):
-    """The figures that were to be saved; nothing is."""
+    """The figures that the test would save; no file is written."""
     kept = []
     monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: kept.append(self))
     return kept
 
 
 def factor_of(label):
-    """What SI is multiplied by for the unit in the brackets at the end of an axis' label."""
+    """Return the factor from SI to the unit in brackets at the end of an axis label."""
     unit = re.search(r"\(([^()]*)\)\s*$", label)[1]
     plain = re.fullmatch(r"([mµnkM]?)(m|s|V|A)(/s|/s²)?", unit)
     return PREFIX[plain[1]] if plain else {"%": 100.0}.get(unit, 1.0)
@@ -58,7 +58,7 @@ def a_signal(n, seed):
 
 
 def a_run(n, lost_at=np.inf, period=1e-4):
-    """A run in which every signal is another one, and frozen at a far value once the rotor is lost."""
+    """Return a run in which all signals differ. After the loss, each signal is frozen at a distant value."""
     t = period * np.arange(n)
     size = {"z": 1e-3, "r": 1e-3, "z_measured": 1e-3, "u_mean": 100.0}
     rows = {name: size.get(name, 1.0) * a_signal(n, k) for k, name in enumerate(Row._fields)}
@@ -146,7 +146,10 @@ def test_an_interval_includes_both_ends_in_spite_of_rounding():
 
 
 def check_curve(line, t, y, factor, span):
-    """A line against the signal y(t) within `span`: its ends, its extremes, and no point that the data do not have."""
+    """Check a line against the signal y(t) within `span`.
+
+    Checks its ends, its extremes, and that each of its points is in the data.
+    """
     x, v = line.get_data()
     inside = (t >= span[0]) & (t <= span[1])
     assert (x[0], x[-1]) == (t[inside][0], t[inside][-1])
@@ -371,7 +374,7 @@ def test_a_tornado_shows_the_shares_and_their_intervals(drawn):
 
 
 class _Case:
-    """Enough of a case to label a map."""
+    """The part of a case that is needed to label a map."""
 
     name = "the case"
     cascade = None
@@ -423,7 +426,7 @@ def test_the_outlines_of_a_map_follow_the_confidence_bounds(drawn):
 
 @pytest.fixture
 def kept(monkeypatch):
-    """The tuner's figures themselves in place of their PNG."""
+    """Keep the figures of the tuner instead of their PNG files."""
     monkeypatch.setattr(tuned, "_png", lambda figure: figure)
 
 

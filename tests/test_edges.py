@@ -54,7 +54,7 @@ def test_an_integral_is_exact_wherever_the_rate_jumps(method):
 
 
 def spread(**values):
-    """Arrays as the ends of a spread stand in a scenario: each number on an axis of its own."""
+    """Return arrays as a scenario contains them at the ends of a spread: each number on its own axis."""
     shape = [1] * len(values)
     return {k: np.reshape(x, [*shape[:n], 2, *shape[n + 1 :]]) for n, (k, x) in enumerate(values.items())}
 
@@ -87,7 +87,7 @@ def test_edges_of_several_periods():
 
 @pytest.mark.slow
 def test_edges_may_differ_between_members():
-    """Each moves as it does alone, and where the edges are traced."""
+    """Each member moves as in a run of its own, also if the edges are traced."""
     starts, clock = np.array([0.002, 0.00203, 0.00217]), amb.Clock(40, T, amb.RK4(1), cuts=1)
 
     def z(start):
@@ -102,7 +102,7 @@ def test_edges_may_differ_between_members():
 
 
 def test_derivatives_in_the_time_of_an_edge():
-    """y' = A - y from the edge on."""
+    """The equation is y' = A - y from the edge on."""
 
     def end(start):
         rates = lambda t, y: amb.Step(2.0, start)(t) - y  # noqa: E731

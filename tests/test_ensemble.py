@@ -53,7 +53,10 @@ def rounding():
 
 
 def same(a, b, rtol):
-    """Leaf by leaf; a metric of large terms that cancel, and their sum, to what rounding makes of it."""
+    """Check that all leaves agree.
+
+    Metrics that are differences of large terms, and sums of such metrics, may differ by rounding.
+    """
     absolute = rounding()
     for (path, x), y in zip(jax.tree.leaves_with_path(a), jax.tree.leaves(b), strict=True):
         name = getattr(path[-1], "key", None) if path else None
@@ -157,7 +160,7 @@ def test_lengths_that_differ_or_are_missing_are_named():
 
 @dataclasses.dataclass(frozen=True)
 class Scaled:
-    """A function of a member, equal to another of the same power."""
+    """A function of a member; two of these functions are equal if their powers are."""
 
     power: int
     traces = 0
@@ -192,7 +195,7 @@ def test_the_noise_of_each_member_is_independent_and_white():
 
 
 def test_settled_rms_agrees_with_the_lyapunov_equation():
-    """Held noise through the linearised loop: P = A P A' + B S B' at the samples."""
+    """Held noise in the linearised loop: P = A P A' + B S B' at the samples."""
     n, std, period = 200, 1e-8, 1e-4
     current = float(SMOOTH.model.equilibrium(0.0)[0])
     cascade = dataclasses.replace(SMOOTH, inversion=inversion.Adaptive(1e9, 25e-6, i_ref=current))
@@ -277,7 +280,10 @@ def test_resuming_another_study_is_refused_by_the_key_that_differs(change, key, 
 
 
 def test_the_fingerprint_of_a_study_contains_its_flags():
-    """Which discretisation, whether there is prediction, what is measured: members of two kinds are no ensemble."""
+    """Flags are, for example, the discretisation, the prediction and the measured signals.
+
+    They cannot differ between members.
+    """
     sampled = [dataclasses.replace(STUDY.cascade, processor=Processor(implicit=x)) for x in (True, False)]
     one, other = (dataclasses.replace(STUDY, cascade=cascade).fingerprint() for cascade in sampled)
     assert difference(one, other) == "controller.processor.implicit is True in the file and False in this run"
@@ -322,7 +328,7 @@ def test_the_variation_of_the_voltage_over_parts_of_the_run_adds_up():
 
 
 def test_bands_at_few_instants_include_the_extremes_between_them(monkeypatch):
-    """Of runs that are made up, the third of which is lost in the middle of a block."""
+    """The runs are constructed; the third one is lost in the middle of a block."""
     n, lost_at = 41, np.array([np.inf, np.inf, 16.5e-4])
     made = np.random.default_rng(0).normal(size=(len(Row._fields), 3, n))
     t = 1e-4 * np.arange(n)

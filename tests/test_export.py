@@ -79,7 +79,7 @@ class Layered(PositionLaw):
 
 
 def hard(**more):
-    """The paper's cascade with the sign itself, and an observer."""
+    """The paper's cascade with set-valued signs and an observer."""
     laws = {
         "observer": observer.Complementary(),
         "position": position.SlidingMode(1440.0, 2.3, INF),
@@ -164,7 +164,7 @@ def test_one_step_equals_jax(name, to):
 
 @functools.cache
 def stepping(cascade):
-    """A step of a controller of exact sensors, jitted, after one with every input 0."""
+    """Return the jitted step of a controller with exact sensors, after one step with all inputs 0."""
     controller = controller_of(cascade, 200.0, PERIOD)
     parameters, memory, inputs, period = arguments(controller)
     read = frozenset(StepInputs._fields)
@@ -176,7 +176,7 @@ def stepping(cascade):
 
 
 def wrong(limit):
-    """Values that a limit does not allow."""
+    """Return values that a limit does not allow."""
     return [np.nan, np.inf, -np.inf, 1.001 * limit, -1.001 * limit]
 
 
@@ -247,7 +247,10 @@ def test_without_a_guard_every_reading_is_used():
 
 @compiled
 def test_a_delay_beyond_the_exported_one_is_refused(tmp_path):
-    """The prediction's parts are fixed: of 1.5 samples it would carry 1 and say nothing."""
+    """The number of parts of the prediction is fixed at export.
+
+    Without the check, a delay of 1.5 samples would be predicted as 1.
+    """
     traced = trace(controller_of(hard(), 200.0, PERIOD), "double")
     made = text()
     for name in ("amb.h", "amb.c"):
@@ -332,7 +335,7 @@ def test_single_precision_uses_no_double():
 
 
 def test_double_precision_uses_no_float():
-    """A float32 quotient that the simulator refines would be slower in C, and overflow beyond 1e38."""
+    """A float32 quotient, as JAX refines it, would be slower in C and overflow beyond 1e38."""
     for cascade in (CASCADES["the paper's"], CASCADES["Kalman"]):
         source = re.sub(r"/\*.*?\*/", "", text(cascade=cascade, to="double")["amb.c"], flags=re.DOTALL)
         assert not re.search(r"\bfloat\b|\b\d+\.\d+(e[+-]?\d+)?f\b|\b(sqrt|fabs|atan)f\(", source)
@@ -360,7 +363,7 @@ STANDARDS = ["-std=c99", "-std=c11", *(f"-std=c++{year}" for year in (11, 14, 17
 
 
 def compiles(folder, file, *flags):
-    """What the compiler of a source's language says of it."""
+    """Return the messages of the compiler for the language of a source."""
     compiler = "g++" if file.endswith(".cpp") else "cc"
     command = [compiler, *FLAGS, *flags, "-c", file, "-o", "out.o"]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False).stderr
@@ -370,7 +373,7 @@ def compiles(folder, file, *flags):
 @pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler")
 @pytest.mark.parametrize("to", ["float", "double"])
 def test_the_header_compiles_alone_as_the_readme_states(tmp_path, to):
-    """In C and in every C++ since 2011, with its initialiser in the order of the struct."""
+    """It compiles as C and as C++11 or later, with the initialiser in the order of the struct."""
     made = text(to=to, u_max=INF, processor=Processor(1.0, predict=False))
     (use,) = re.findall(r"`(amb_params mine = AMB_DEFAULT;)`", made["README.md"])
     (tmp_path / "amb.h").write_text(made["amb.h"])
@@ -500,7 +503,7 @@ def test_an_export_has_the_record_of_its_verification(case, tmp_path, monkeypatc
 
 
 def contents(out):
-    """What a folder holds."""
+    """Return the contents of a folder."""
     return {x.name: x.read_bytes() if x.is_file() else None for x in out.iterdir()}
 
 
@@ -543,7 +546,7 @@ def test_a_case_from_a_pipe_is_read_once(elsewhere, tmp_path):
 
 
 def refused(capsys, *arguments):
-    """The one line on stderr, of a command that is refused."""
+    """Return the line on stderr of a command that is refused."""
     try:
         code = main(["export", *map(str, arguments)])
     except SystemExit as stop:

@@ -33,7 +33,7 @@ from ambjax.world.rotation import Runout
 
 
 def rig(**more):
-    """The laboratory's bearing: Kalman filter, hard signs, low-pass, converter, a limit of the current."""
+    """The laboratory bearing: Kalman filter, set-valued signs, low-pass, converter, current limit."""
     case = case_from(tomllib.loads(template("rig")))
     scenario = dataclasses.replace(case.scenario, **more)
     return case.cascade, scenario, Clock(400, case.clock.sample_period)
@@ -72,7 +72,7 @@ def test_the_steps_of_the_loop_equal_the_simulator(name):
 
 @functools.cache
 def stepping(sensor=None):
-    """The rig's plant, or the rig's with another sensor, and its step, compiled."""
+    """Return the plant of the rig, or of the rig with another sensor, and its compiled step."""
     block = blocks("rig")["plant"] if sensor is None else block_of("plant", *rig(sensor=sensor))
     parameters, memory, inputs, period = arguments(block)
     read = frozenset(block.inputs)

@@ -56,7 +56,7 @@ def listed():
 
 
 def compiled(function, to, folder, count):
-    """A function of two scalars that gives a tuple, as C: of rows of points."""
+    """Compile a function of two scalars that returns a tuple as C. The result maps rows of points."""
     dtype, program = np.dtype(PRECISIONS[to]), Program()
     with precision(to):
         refs = [program.input(Location("input", name), dtype) for name in "ab"]

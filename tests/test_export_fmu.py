@@ -71,7 +71,7 @@ def test_an_infinite_start_value_is_written_as_xml_allows():
 
 
 def test_every_input_of_the_reference_acts_in_the_step_from_its_time_on():
-    """The plant's reference repeated by hand: row k acts from t_k on, and its result is in row k + 1."""
+    """The reference of the plant is repeated by hand. Row k acts from t_k on, and its result is in row k + 1."""
     cascade, scenario, clock = rig()
     block = block_of("loop", cascade, scenario, clock)
     files = files_of(block, "amb", frozenset(block.inputs), cascade, scenario, clock)
@@ -96,7 +96,7 @@ def written(folder, block, version=3, name="amb"):
 
 
 class Unit:
-    """An instance of an FMU, with numbers by name."""
+    """An instance of an FMU, whose numbers are accessed by name."""
 
     def __init__(self, path, folder, name="one"):
         import fmpy
@@ -255,7 +255,7 @@ def test_a_changed_gain_a_reset_a_nan_and_a_second_instance(version, tmp_path):
 @compiled
 @pytest.mark.parametrize("version", [2, 3])
 def test_an_fmu_compiled_again_from_its_sources_gives_the_reference(version, tmp_path):
-    """What a real-time target does: the sources alone, with another build system."""
+    """As a real-time target does, the test compiles the sources alone, with another build system."""
     fmpy = pytest.importorskip("fmpy")
     from fmpy.build import build_platform_binary
     from fmpy.validation import validate_fmu

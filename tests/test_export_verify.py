@@ -44,13 +44,13 @@ FAULTS = {"outliers": Outliers(at=4e-3, size=9.9e-3), "dropouts": Dropouts(at=8e
 
 @pytest.fixture(scope="module")
 def made():
-    """The paper's laws with every sign smoothed but one, so that there are steepnesses and hard signs: double."""
+    """The paper's laws in double precision, with one set-valued sign; the other signs are smoothed."""
     cascade = hard(position=position.SlidingMode(1440.0, 2.3), processor=Processor(1.0))
     return drafts(cascade, ["double"], 4000)["double"]
 
 
 def library(source, one, folder, name):
-    """The exported C with this text as a library."""
+    """Compile the exported C with this text as a library."""
     (folder / name).mkdir()
     (folder / name / "amb.h").write_text(one.files["amb.h"])
     (folder / name / "amb.c").write_text(source)
@@ -85,7 +85,7 @@ def test_gains_or_limits_written_as_constants_in_the_c_are_found(made, tmp_path)
 
 
 def test_every_parameter_changes_the_result_at_some_point(made):
-    """A C in which this one parameter is a constant would give other numbers or bits at some point."""
+    """If the C contained this parameter as a constant, a number or a bit would differ at some point."""
     at, should = made.steps["parameters"]
     x = np.concatenate([at.parameters, at.state, at.inputs])
     trace = made.trace
@@ -200,9 +200,9 @@ def test_a_short_horizon_is_not_decisive():
 @pytest.mark.slow
 @compiled
 def test_a_loop_that_amplifies_rounding_is_compared_up_to_its_horizon(tmp_path):
-    """Correct C passes though rounding grows a thousandfold after the horizon, and C with another gain fails.
+    """Correct C passes although rounding grows a thousandfold after the horizon, and C with another gain fails.
 
-    With faults, so that the guard acts in the loop.
+    The case has faults, so that the guard acts in the loop.
     """
     world = dataclasses.replace(WORLD, sensor=dataclasses.replace(WORLD.sensor, **FAULTS))
     one = drafts(RESTLESS, ["double"], 100, scenario=world)["double"]

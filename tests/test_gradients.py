@@ -231,7 +231,7 @@ for name, function in functions.items():
 
 @pytest.mark.slow
 def test_the_fast_path_accepts_closures():
-    """What XLA cannot compile as one function runs as usual, with a line that says so, once each."""
+    """Functions that XLA cannot compile as one kernel run by the plain path, each with one message."""
     environment = os.environ | {"JAX_ENABLE_X64": "1"}
     done = subprocess.run(
         [sys.executable, "-c", WHATEVER_ONE_CLOSES_OVER], env=environment, capture_output=True, text=True

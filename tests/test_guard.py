@@ -70,7 +70,7 @@ EACH_WORLD = [pytest.param(x, marks=MARKS.get(x, pytest.mark.slow)) for x in WOR
 
 @pytest.mark.parametrize("name", EACH_WORLD)
 def test_guard_and_faults_agree_with_the_independent_simulator(name):
-    """An outlier, a dropout that is bridged, and one that lasts until the safe command."""
+    """The faults are an outlier, a short dropout, and a dropout that lasts until the safe command."""
     std = NOISE if "noise" in name else (0.0, 0.0, 0.0)
     dropouts = {"value": "nan", "duration": 5 * T, "at": 0.012}
     cascade, scenario, clock = loop_of(WORLDS[name], 200, std)

@@ -108,7 +108,10 @@ SLOW = Clock(1000, 1e-3)
     ids=["smooth", "at 1 mm", "repaired"],
 )
 def test_the_measured_peak_in_continuous_time_is_the_linear_peak(cascade, amplitude, r):
-    """All share a program. S: the size of the signs' arguments squared; u: the integration error in the stiff i."""
+    """All cases share one program.
+
+    The error of S is of second order in the signs' arguments; that of u is the integration error of the stiff i.
+    """
     found = injected(cascade, Scenario(), SLOW, [1.0, 2.0, 5.0, 17.0, 31.0, 100.0], amplitude=amplitude, r=r)
     system = linearise(cascade, Scenario(), SLOW, r)
     expected = system.response(found.frequency)
@@ -129,7 +132,7 @@ def test_the_measured_peak_in_continuous_time_is_the_linear_peak(cascade, amplit
     ids=["processor", "continuous"],
 )
 def test_the_sensitivity_at_the_velocity_sensor(processor, period):
-    """Errors as in continuous time above: S 1e-3, u 1e-2."""
+    """The tolerances are those of continuous time above: 1e-3 for S, 1e-2 for u."""
     cascade, clock, f = Cascade(**SMOOTH, processor=processor), Clock(1000, period), [20.0, 50.0, 100.0]
     found = injected(cascade, Scenario(), clock, f, reading="z_dot", amplitude=1e-5)
     H = linearise(cascade, Scenario(), clock).response(found.frequency)
@@ -144,7 +147,7 @@ def noisy(std, **more):
 
 @pytest.mark.slow
 def test_set_valued_signs_under_noise_and_a_lost_rotor():
-    """Within their bands the implicit signs act as linear gains, those of the linear analysis."""
+    """Within their bands, the implicit signs act as the linear gains of the linear analysis."""
     cascade = Cascade(**SIGNS, processor=Processor(0.0))
     clock, f = Clock(500, T), [20.0, 40.0, 80.0, 160.0]
     found = injected(cascade, noisy(1e-8), clock, f, amplitude=1e-7, members=8, settle=4)
@@ -164,7 +167,7 @@ def test_set_valued_signs_under_noise_and_a_lost_rotor():
 
 @pytest.mark.slow
 def test_each_member_of_a_spread_has_its_own_peak():
-    """Errors as in continuous time above. The last member has no voltage and loses the rotor."""
+    """The tolerances are those of continuous time above. The last member has no voltage, and its rotor is lost."""
     cascade, clock, f = Cascade(**SMOOTH, processor=Processor(0.0)), Clock(4000, T), [20.0, 50.0, 100.0]
     masses = np.array([0.5, 0.588, 0.7, 0.588])
     plants = [dataclasses.replace(Scenario().plant, m=m) for m in (masses, *masses[:3])]
@@ -180,7 +183,10 @@ def test_each_member_of_a_spread_has_its_own_peak():
 
 
 def test_a_slow_observer_starts_at_rest_under_noise():
-    """An estimate that starts at the first noisy reading is 0.3 mm off, and loses rotors in the reading `sampled`."""
+    """The estimate must not start at the first noisy reading.
+
+    It would then be wrong by 0.3 mm, which loses rotors of the reading `sampled`.
+    """
     world = paper.scenario("regulation", "sampled", pulse=False)
     found = injected(paper.cascade("sampled"), world, Clock(500, T), [20.0, 100.0], members=8)
     assert found.lost == 0

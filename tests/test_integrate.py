@@ -38,7 +38,7 @@ def curved(t, state):
 
 
 def curved_error(method, spans=1):
-    """In so many spans one after another, so that one program serves every length of the step."""
+    """Return the error after several consecutive spans, so that one program serves all step lengths."""
     p, end = 1 + math.sin(1.5), (jnp.asarray(1.0), jnp.asarray(1.0))
     for n in range(spans):
         end = end_of(method, curved, 1.5 * n / spans, 1.5 / spans, end)
@@ -64,7 +64,7 @@ def test_order_on_a_problem_with_known_solution(method, order):
 
 
 def test_different_types_with_equal_fields_have_different_pytree_structures():
-    """Else one's compiled program would be taken for the other's: JAX looks programs up by structure."""
+    """JAX finds compiled programs by structure, so equal structures would share a program."""
     methods = [kind(2) for kind in (amb.Euler, amb.RK4, amb.DOP853, amb.Rodas3, amb.Slide)]
     bare = [amb.observer.Direct(), amb.inversion.ClosedForm()]
     structures = [jax.tree.structure(x) for x in (*methods, *bare)]
@@ -130,7 +130,7 @@ def closed_loop_error(method, finer=1):
     ("name", "substeps"), [("Euler", 16), ("RK4", 3), pytest.param("Rodas3", 6, marks=pytest.mark.slow)]
 )
 def test_order_on_the_closed_loop(name, substeps):
-    """Without noise a sample period is only a step: halving it halves the step, and compiles nothing."""
+    """Without noise, the sample period only sets the step: half the period halves the step, without compilation."""
     method, order = FIXED[name]
     finer = np.array([1, 2, 4])
     errors = [closed_loop_error(method(substeps), n) for n in finer]
@@ -198,7 +198,7 @@ def test_the_stability_limit_separates_decay_from_growth(method, share, grows):
 
 @every_method
 def test_a_step_of_length_0_does_not_change_the_state(method):
-    """A lost rotor is frozen by a span of 0: the state is the same, to the bit."""
+    """The state of a lost rotor is frozen by steps of length 0. It is equal bit by bit."""
     state = (jnp.asarray(0.3), jnp.asarray(-0.7))
     assert end_of(method, curved, 0.2, 0.0, state) == state
 
@@ -334,7 +334,7 @@ def test_a_chosen_explicit_step_is_within_its_limit(gamma):
 
 @pytest.mark.parametrize("p", [1e3, 1e6, 1e9])
 def test_a_sign_as_steep_as_a_relay_does_not_stall_the_adaptive_method(p):
-    """The limit p -> infinity exists (the sliding mode), and the layer narrows as 1/p: from 1e-8 A to 1e-14 A."""
+    """The limit p -> infinity exists (the sliding mode). The layer narrows as 1/p, here from 1e-8 A to 1e-14 A."""
     noisy = dataclasses.replace(TRACKING, sensor=amb.Sensor(1e-6))
     cascade = amb.Cascade(inversion=amb.inversion.Adaptive(p=p))
     found = [amb.rollout(cascade, noisy, amb.Clock(300, 1e-4, step)) for step in (amb.AdaptiveRodas3(), amb.Slide(64))]

@@ -1,4 +1,4 @@
-"""Ctrl-C gives one line and exit code 130 in every command; it is deferred where a step has to be completed."""
+"""Ctrl-C gives one line and exit code 130 in every command; it is deferred where a step must be completed."""
 
 import subprocess
 import sys

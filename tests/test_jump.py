@@ -1,4 +1,7 @@
-"""Systems that jump at the start of each sample, and within it: a controller on a processor, against exact matrices."""
+"""Systems that jump at the start of each sample and within it, against exact matrices.
+
+An example of such a system is a controller on a processor.
+"""
 
 from typing import Any, NamedTuple
 
@@ -26,7 +29,7 @@ class Motion(NamedTuple):
 
 
 class Held(NamedTuple):
-    """The plant, the controller's own state, and the voltages of this sample, of the one before and of that before."""
+    """The plant, the state of the controller, and the voltages of this sample and of the two previous ones."""
 
     plant: Motion
     steps: Any
@@ -113,7 +116,7 @@ class Sampled:
 
 
 def exact(delay):
-    """x, u and the mean of what acts, at and over each sample: constant voltages through the matrix exponential."""
+    """Return x and u at each sample, and the mean of the acting voltage over it, from the matrix exponential."""
     A = np.array([[0.0, 1.0, 0.0], [W**2, 0.0, 1.0], [0.0, 0.0, 0.0]])
     x, past, found = np.array([1e-3, 0.0]), [0.0, 0.0, 0.0], []
     for n in range(SAMPLES):

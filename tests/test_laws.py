@@ -289,7 +289,10 @@ def pairwise(stages):
 
 
 def how_slow(combinations):
-    """Return the mark of each: two are fast, those with a law that no earlier one has are slow, the others thorough."""
+    """Return the mark of each combination.
+
+    Two combinations are fast; those with a law that no earlier one has are slow; the others are thorough.
+    """
     seen = set()
     for k, laws in enumerate(combinations):
         new = set(map(type, laws)) - seen
@@ -436,7 +439,10 @@ def test_the_rates_of_the_demand_are_derivatives_along_the_nominal_solution(watc
 
     @jax.jit
     def demand(s, x):
-        """At s seconds along the straight line through x: time, motion and law states move at their rates."""
+        """Return the demand after s seconds along the straight line through x.
+
+        Along this line, time, motion and states of the laws change at their rates.
+        """
         motion = Measurement(x[0], x[1], x[2])
         state = cascade.init(motion)._replace(
             observer=() if not has_state(watch) else x[3],

@@ -1,4 +1,4 @@
-"""Layers of the code: imports only point down, and heavy libraries are imported only where they are needed."""
+"""Layers of the code: modules import from lower layers only, and heavy packages only where they are needed."""
 
 import ast
 import collections
@@ -195,7 +195,7 @@ assert not xla_bridge._backends, "importing ambjax started a backend"
 
 
 def test_no_class_name_is_defined_twice():
-    """`position.SlidingMode` and `current.SlidingMode` are one algorithm, named with its stage."""
+    """An exception is a name of several stages, such as `position.SlidingMode` and `current.SlidingMode`."""
     homes = collections.defaultdict(list)
     for module in MODULES:
         for node in tree_of(module).body:

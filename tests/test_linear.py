@@ -129,7 +129,10 @@ def test_the_differentiable_quantities_agree_with_the_analysis(name):
 
 
 def test_the_repaired_gains_amplify_sensor_errors_41_times():
-    """In continuous time: at 0 the force per error, 2.8e5 1/s^2, against the loop's stiffness c k 2p/pi = 6.8e3."""
+    """In continuous time at frequency 0.
+
+    The factor is the force per error, 2.8e5 1/s^2, divided by the stiffness of the loop, c k 2p/pi = 6.8e3.
+    """
     analysis = analyse(linearise(Cascade(), Scenario(), CLOCK), Plant().m, T, velocity=True)
     k_s, stiffness = 2.817e5 - 1282.0 * 2, 17 * 25 * 2 * 25 / np.pi
     assert pytest.approx(41, rel=0.02) == analysis.S.height
@@ -178,7 +181,10 @@ def test_python_control_gets_the_same_system():
 
 
 def test_the_loop_becomes_unstable_at_the_delay_margin():
-    """Delay added at the sensor; up to the margin the Nyquist curve does not reach -1. At it, a pole is on the axis."""
+    """The delay is added at the sensor.
+
+    Below the margin the Nyquist curve does not reach -1; at the margin, a pole is on the axis.
+    """
     system = linearise(Cascade(**SMOOTH), Scenario(), CLOCK)
     found = margins_of(system)
     f = np.geomspace(1.0, 1e4, 20_001)
@@ -203,7 +209,7 @@ def test_a_narrow_peak_is_found_and_refined():
 
 
 def test_the_noise_gain_agrees_with_a_long_run():
-    """White noise through the matrices, sample by sample, for 200,000 samples: 3 of their standard errors."""
+    """White noise passes the matrices for 200,000 samples. The tolerance is three standard errors."""
     cascade, scenario, r = loop_of("true signs")
     system = linearise(cascade, scenario, CLOCK, r).scaled()
     e, x, z = np.random.default_rng(1).normal(size=200_000), np.zeros(len(system.A)), []
@@ -221,7 +227,10 @@ def peak_of(cascade, scenario):
 
 @pytest.mark.slow
 def test_the_peak_is_differentiable_in_the_gains_and_the_plant():
-    """Forward = reverse = central difference along one direction, the shift of the equilibrium (off the model) too."""
+    """Forward mode, reverse mode and central differences agree along one direction.
+
+    They include the shift of the equilibrium.
+    """
     cascade = Cascade(**SMOOTH, processor=Processor(1.0)).on_processor()
     scenario = Scenario(plant=Plant(m=0.6, A=0.12))
     x, restore = ravel_pytree(canonical((cascade.position, cascade.inversion.gamma, scenario.plant.A)))

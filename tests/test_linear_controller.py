@@ -57,7 +57,7 @@ def test_states_have_the_scale_of_the_input():
 
 
 def matrices(law, model, period=None):
-    """A, B, C, D of the law from z to i_star, by differentiation."""
+    """Return A, B, C, D of the law from z to i_star, by differentiation."""
 
     def f(x, z):
         inputs = Measurement(z, 0.0, 0.0), Reference(0.0, 0.0, 0.0)
@@ -79,7 +79,7 @@ def test_the_law_is_python_control_s_system_with_negative_feedback(T):
 
 
 def test_a_discrete_controller_keeps_its_own_matrices():
-    """Its step is x+ = A x + B w, y = C x + D w of the given matrices: the same outputs to any input."""
+    """Its step is x+ = A x + B w, y = C x + D w with the given matrices, so the outputs for any input are equal."""
     given = control.ss([[0.9, 0.2], [-0.3, 0.1]], [[1.0], [2.0]], [[0.4, -1.0]], [[0.1]], PERIOD)
     law, x, state = position.LinearController.of(given), np.zeros((2, 1)), None
     state = law.init(MODEL)

@@ -130,7 +130,7 @@ ROTATING = {
 
 
 def lines(rows, name, settled=1000):
-    """Complex amplitude of a signal at one and two times the speed, over whole turns."""
+    """Return the complex amplitudes of a signal at the speed and at twice the speed, over whole turns."""
     t, x = np.asarray(rows.t)[settled:], np.asarray(getattr(rows, name))[settled:]
     return np.array([2 * np.mean(x * np.exp(-1j * k * 3000 * RPM * t)) for k in (1, 2)])
 

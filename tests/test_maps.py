@@ -33,7 +33,7 @@ def basin(reading):
 @pytest.mark.slow
 @pytest.mark.parametrize("reading", ["literal", "repaired"])
 def test_the_basin_of_attraction_is_a_strip_of_known_width(reading):
-    """While v_tilde is saturated, z + z_dot/pole runs away unless gamma outweighs dv/dz pole |z + z_dot/pole|."""
+    """While v_tilde is saturated, z + z_dot/pole diverges unless gamma exceeds dv/dz pole |z + z_dot/pole|."""
     study = basin(reading)
     width = study.cascade.inversion.gamma / (PLANT.dv_dz(0.0, 0.0) * POLE)
     z = Axis("initial.z", np.linspace(-1.5, 1.5, 31) * width)
@@ -69,7 +69,7 @@ def test_a_cell_equals_an_ensemble_of_its_own_case():
 
 
 def test_one_member_is_the_nominal_case():
-    """A map of a case with [spread] shows the case, not a member at random, unless --members is given."""
+    """Without --members, a map of a case with [spread] shows the nominal case instead of a random member."""
     x, y = Axis("plant.m", np.array([0.5, 0.6])), Axis("sensor.std", np.array([1e-8, 1e-7]))
     wide = dataclasses.replace(SMALL, spread=Spread((("initial.z", Normal(1e-4)),)), members=1)
     bare = dataclasses.replace(wide, spread=Spread())
@@ -194,7 +194,7 @@ def test_a_whole_number_may_be_an_axis_of_whole_numbers():
 
 
 def made(survival, members, **changes):
-    """A map of these survivals [ny, nx]."""
+    """Return a map with these survivals [ny, nx]."""
     survival = np.asarray(survival, float)
     _, low, high = wilson(survival * members, members)
     y, x = (Axis(path, np.arange(float(n))) for path, n in zip(("initial.z", "plant.m"), survival.shape, strict=True))

@@ -40,7 +40,7 @@ BREAK = Mutation("once", "ambjax/program.py", "2 * x", "1 * x", "tests/test_it.p
 
 @pytest.fixture
 def project(tmp_path):
-    """A program of one line, and two tests of it: the first does not see what the second sees."""
+    """A program of one line with two tests, of which only the second detects the mutation."""
     for name, text in {"ambjax/program.py": PROGRAM, "tests/test_it.py": TESTS}.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
@@ -92,5 +92,5 @@ def test_a_sample_depends_on_the_text_of_the_program(project):
 
 @pytest.mark.slow
 def test_no_mutation_of_a_sample_survives(capsys):
-    """`python tests/mutate.py` makes all of them, in a quarter of an hour."""
+    """`python tests/mutate.py` tests all mutations in a quarter of an hour."""
     assert main(["--share", str(examples(48, 12))]) == 0, capsys.readouterr().out

@@ -153,7 +153,7 @@ def test_inconsistent_numbers_cause_a_warning(plant, tables, said):
 
 @pytest.mark.parametrize(("end", "doubted"), [(9.9, False), (10.1, True)])
 def test_a_file_in_milliseconds_causes_a_warning(tmp_path, end, doubted):
-    """A run of 0.1 s, and a file 100 times as long."""
+    """The run lasts 0.1 s, and the file is 100 times as long."""
     (tmp_path / "force.csv").write_text(f"0,1\n{end},2\n")
     load = {"kind": "table", "unit": "N", "file": str(tmp_path / "force.csv")}
     said = f"disturbance.q_f: the file lasts {end:g} s, the run 0.1 s. Are its times in milliseconds?"

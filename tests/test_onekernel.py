@@ -1,4 +1,4 @@
-"""The whole-rollout kernel against the rollout, in interpret mode; and its lowering for a GPU, without one."""
+"""The kernel of a whole rollout against the rollout, in interpret mode; its compilation for a GPU, without a GPU."""
 
 import dataclasses
 

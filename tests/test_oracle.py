@@ -64,7 +64,7 @@ def pi(k_p=3e5, k_int=1e8, k_aw=200.0):
 
 
 def drop(z, gamma, p, position, current, reference=REST, u_max=math.inf):
-    """From rest off centre: the rotor falls, and is caught by its gains."""
+    """The rotor starts at rest off centre, falls, and is caught by the controller."""
     return World(
         position=position, inversion=adaptive(gamma, p), current=current, reference=reference, initial=(z, 0.0, 0.0),
         u_max=u_max,
@@ -164,7 +164,7 @@ def in_ambjax(case):
 
 
 def noise_of(case, scenario):
-    """The errors that ambjax draws: data for the oracle."""
+    """Return the errors that ambjax draws, as data for the independent solution."""
     if scenario.sensor is None:
         return None
     errors = jax.vmap(lambda k: scenario.sensor.noise(scenario.words(), k))(np.arange(case.samples))

@@ -17,7 +17,7 @@ from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Row, Trajector
 
 @pytest.fixture(autouse=True)
 def drawn(monkeypatch):
-    """The figures saved, still open to questions."""
+    """The saved figures, which the tests can still inspect."""
     pages, save = [], Figure.savefig
 
     def keep(self, path, **options):
@@ -29,7 +29,7 @@ def drawn(monkeypatch):
 
 
 def a_run(samples=20_000, period=1e-4, lost_at=np.inf, code=ALIVE, **signals):
-    """A run whose errors fall with 1 ms, everything else at rest; `signals` replace some."""
+    """Return a run whose errors decay with 1 ms while all else is at rest; `signals` replace some."""
     t = period * np.arange(samples)
     rows = {name: np.zeros(samples) for name in Row._fields if name != "z_measured"}
     rows |= {"t": t, "alive": t < lost_at, "z": 1e-4 * np.exp(-t / 1e-3), "v_tilde": np.exp(-t / 1e-3)} | signals

@@ -67,7 +67,7 @@ class Coils(NamedTuple):
 
 @record
 class TwoCoils(Bearing):
-    """Each coil has a circuit of its own; the lower one's resistance is larger by a share `skew`."""
+    """Each coil has its own circuit. The resistance of the lower one is larger by a share `skew`."""
 
     skew: Any = leaf(default=0.05, unit="1", at_least=-0.5, at_most=0.5, doc="excess of the lower coil's resistance")
 

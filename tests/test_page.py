@@ -125,7 +125,7 @@ def in_browser(test):
 
 @pytest.fixture(scope="module")
 def tuned():
-    """A second preset, with other gains; its name and a comment try to break out of the page."""
+    """A second preset with other gains. Its name and a comment contain markup."""
     text = RIG.replace("c = 2900.0", "c = 2000.0").replace("[plant]", f"# {HOSTILE}\n[plant]", 1)
     return dataclasses.replace(rig(text), name=HOSTILE)
 

@@ -1,6 +1,6 @@
-"""Pictures of ensembles: numbers, units and edges against closed forms, and cases that are hard to draw.
+"""Pictures of ensembles: numbers, units and edges against closed forms, and special cases.
 
-Warnings are errors here, so a picture that is written was written without one.
+Warnings are errors here, so each picture is written without a warning.
 """
 
 import re
@@ -20,7 +20,10 @@ PERCENTS = (0, 5, 25, 50, 75, 95, 100)
 
 @pytest.fixture(autouse=True)
 def drawn(monkeypatch):
-    """The figures saved, still open to questions; the file is written as well, coarsely: that is faster."""
+    """The saved figures, which the tests can still inspect.
+
+    Each file is also written, with a low resolution to save time.
+    """
     figures, save = [], Figure.savefig
 
     def keep(self, path, **options):

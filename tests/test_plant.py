@@ -205,7 +205,7 @@ def test_distance_to_C_has_a_finite_derivative_on_C():
 
 
 def test_thresholds_follow_the_plant():
-    """The bands are the same share of the sizes of sigma, v and i for every plant; Table 1 has the defaults."""
+    """The bands are the same share of the sizes of sigma, v and i for every plant; the defaults are of Table 1."""
     paper = standard_for(0.5, Scenario(clearance=4.5e-3))
     assert dataclasses.replace(paper, largest_force=np.inf) == Standard()
     assert float(paper.largest_force) == pytest.approx(PLANT.k_i * PLANT.i_0, rel=1e-12)

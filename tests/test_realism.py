@@ -76,7 +76,7 @@ SHORTNESS = np.concatenate([[0.0], np.geomspace(1e-18, 1e3, 64), [0.999, 1.001]]
 
 
 def low_pass(y, before, after, h, bandwidth):
-    """Return the same with 150 digits, from the moments of exp(-b (1 - s)), b = w h."""
+    """Return the output of the low-pass with 150 digits, from the moments of exp(-b (1 - s)), b = w h."""
     exact = decimal.Context(prec=150)
     c_1, end, rise = (exact.create_decimal(x) for x in (h * before[1], h * after[1], after[0] - before[0]))
     b = exact.create_decimal(2 * np.pi * bandwidth * h)
@@ -91,7 +91,7 @@ def low_pass(y, before, after, h, bandwidth):
 
 @pytest.mark.parametrize("kind", ["float64", "float32"])
 def test_the_low_pass_is_exact_and_has_derivatives_over_any_time(kind):
-    """Times from 0 s on: 1e-15 s may remain of a sample after a ramp, or of a delay just below a whole number."""
+    """Times start at 0 s: after a ramp, or for a delay just below a whole number, a part may last 1e-15 s."""
     bandwidth, y, slope = 1e4, 2e-3, 2 * np.pi * 1e4
     with jax.enable_x64(kind == "float64"):
         h = (SHORTNESS / slope).astype(kind).astype(float)
@@ -287,7 +287,10 @@ def test_the_rig_holds_its_rotors_with_the_velocity_estimated():
 
 
 def test_the_bearing_of_the_data_sheet_is_plausible_and_without_warnings():
-    """The numbers of the sheet, a bias flux below 1.2 T, and a force of more than twice the weight."""
+    """The numbers are those of the data sheet.
+
+    The bias flux density is below 1.2 T, and the force is more than twice the weight.
+    """
     case = case_from(tomllib.loads(template("bearing")))
     plant, scenario = case.scenario.plant, case.scenario
     assert warnings_of(case) == []

@@ -54,7 +54,7 @@ def test_the_implicit_relay_is_the_limit_of_a_steep_sign():
 
 
 def test_the_hard_twist_is_the_published_controller():
-    """Its two cases as R. Seeber and B. Andritsch print them, with x, v, T, k_1, k_2."""
+    """The two cases are those that R. Seeber and B. Andritsch print, with x, v, T, k_1, k_2."""
     rng = np.random.default_rng(1)
     for x, v, T, k_1, k_2 in zip(*np.exp(rng.normal(size=(5, 200))), strict=True):
         x = x * rng.choice([-1, 1])
@@ -108,7 +108,10 @@ def test_float32_keeps_six_digits():
 
 
 def test_an_integrator_behind_the_relay_ends_at_the_disturbance():
-    """x+ = x + T (u + w), |w| < k: |x| <= T |w| after it was reached, whatever k, and u is -w of the sample before."""
+    """The system is x+ = x + T (u + w) with |w| < k.
+
+    Once the band is reached, |x| <= T |w| for every k, and u is -w of the previous sample.
+    """
     T, k, x, past = 1e-3, 50.0, 0.7, 0.0
     for n in range(100):
         w = 3 * np.sin(0.05 * n)

@@ -66,7 +66,7 @@ def no_pictures(patch):
 
 
 def commands(text):
-    """The commands of ours in a text: between backticks or quotes, or to the end of the line behind a colon."""
+    """Return the commands of ambjax in a text: between backticks or quotes, or after a colon to the end of the line."""
     found = re.findall(r"`(ambjax [^`\n]*)`|'(ambjax [^'\n]*)'|: (ambjax [^\n]+)$", text, re.M)
     return [next(filter(None, one)) for one in found]
 
@@ -80,7 +80,7 @@ def run(line):
 
 @pytest.fixture(scope="module")
 def printed(tmp_path_factory):
-    """Folder of an ensemble of the case in a file whose name has a space; what it printed; its columns and summary."""
+    """Folder, printed text, columns and summary of an ensemble of a case whose file name contains a space."""
     folder = tmp_path_factory.mktemp("printed")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -102,7 +102,7 @@ def printed(tmp_path_factory):
 
 
 def same_bits(metrics, columns, row):
-    """Every metric of metrics.json is that of this row, and there is a dozen of them."""
+    """Check that every metric of metrics.json, of which there are at least twelve, equals that of this row."""
     shared = [name for name in columns if name in metrics]
     assert len(shared) > 12
     for name in shared:
@@ -111,7 +111,7 @@ def same_bits(metrics, columns, row):
 
 
 def belongs(metrics, out, settle):
-    """The trajectory that was written is the one that was measured."""
+    """Check that the written trajectory is that of the metrics."""
     # sums of squares in another order: a unit in the last place for each sample
     with np.load(pathlib.Path(out, "trajectory.npz")) as rows:
         error, late = rows["z"] - rows["r"], rows["t"] >= settle
@@ -327,12 +327,12 @@ def fails(capsys):
 
 
 def searches(capsys):
-    """What `ambjax tune` promises: it starts to search from that case."""
+    """Check that `ambjax tune` starts a search from that case."""
     assert "tuning controller." in capsys.readouterr().err
 
 
 def shown(capsys):
-    """What a page of help or a case file promises: text on stdout."""
+    """Check that the command prints help or a case file on stdout."""
     assert len(capsys.readouterr().out) > 200
 
 
@@ -375,7 +375,7 @@ def _stopped(*_):
 
 
 def _code(call):
-    """An exit code, also of what raises it; a search that begins is as good as one that ends well."""
+    """Return the exit code of a command, also if it raises one; a search that starts counts as successful."""
     try:
         return call()
     except SystemExit as end:
@@ -386,7 +386,7 @@ def _code(call):
 
 @pytest.mark.parametrize("words", [["template"], ["template", "rig"], ["export"]])
 def test_commands_in_printed_texts_and_files_are_valid(words, capsys):
-    """Those that name no case lack it alone."""
+    """The only part that some of them lack is the name of the case."""
     write(CASE)
     assert main(["export", "case.toml", "--out", "c"] if words == ["export"] else words) == 0
     text = pathlib.Path("c/README.md").read_text() if words == ["export"] else capsys.readouterr().out

@@ -177,7 +177,7 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
 
 
 def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
-    """The search itself is that of the command, which tests/test_tuning_search.py runs."""
+    """The search itself is that of the command, which tests/test_tuning_search.py tests."""
     given = []
 
     def searched(args):
@@ -194,7 +194,7 @@ def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
 
 
 def test_messages_name_python_arguments_instead_of_options(path, tmp_path):
-    """Each message is that of the command, in which an option stands for each argument."""
+    """Each message is that of the command, with its options replaced by arguments."""
     case, folder = ambjax.read_case(path), tmp_path / "none"
     X, Y = "plant.m=0.5:0.6:2", "plant.R=1:2:2"
     for call, said in (
@@ -224,7 +224,7 @@ def test_tune_refuses_bad_input_by_name(tmp_path):
 
 @pytest.mark.slow
 def test_the_vector_field_gives_the_solution_of_simulate():
-    """SciPy's solution of the equations against our own adaptive steps: both to 1e-8 of the sizes of the states."""
+    """The solution by SciPy agrees with that by adaptive steps of ambjax to 1e-8 of the sizes of the states."""
     from scipy.integrate import solve_ivp
 
     case = case_from({"initial": {"z": 1e-4}, "clock": {"duration": 0.005, "method": "adaptive"}})

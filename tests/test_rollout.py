@@ -46,7 +46,7 @@ NOISY = dataclasses.replace(TRACKING, sensor=Sensor(1e-6, 1e-4, 1e-4))
 
 @record
 class Spans:
-    """A fold that keeps every span, [samples] each."""
+    """A fold that stores every span, [samples] each."""
 
     samples: int = static()
 
@@ -83,7 +83,7 @@ LIGHT = Clock(203, 5e-5, Euler(1))
 
 
 def light(scenario=None, clock=None, every=1):
-    """The cheap rollout."""
+    """A rollout with little computation."""
     return rollout(SMOOTH, scenario or NOISY, clock or LIGHT, fold=LIGHT_FOLDS, every=every)
 
 
@@ -95,7 +95,7 @@ def short():
 
 @pytest.fixture(scope="module")
 def lost():
-    """The printed gains: the same compiled rollout."""
+    """The printed gains, with the same compiled rollout."""
     return rollout(LITERAL, NOISY, SHORT, fold=FOLDS)
 
 
@@ -111,7 +111,7 @@ def same(a, b):
 
 
 def near(a, b, rtol, atol=0.0):
-    """Leaf by leaf, relative to the largest entry of each."""
+    """Check that all leaves agree, relative to the largest entry of each."""
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         x, y = np.asarray(x, float), np.asarray(y, float)
         finite = np.isfinite(y)
@@ -168,7 +168,7 @@ def test_no_rows_without_recording():
 
 
 def by_numpy(rows, spans, lost_at):
-    """Every fold of FOLDS from the recorded rows and spans."""
+    """Return every fold of FOLDS, computed from the recorded rows and spans."""
     t, on = np.asarray(rows.t), np.asarray(rows.alive)
     seen, time = jax.tree.map(np.asarray, spans), np.asarray(spans.time)
     u = seen.densities.u[on] / time[on]
@@ -439,7 +439,7 @@ def test_a_record_refuses_a_number_outside_its_range(build, message):
 
 
 def test_a_record_holds_arrays_and_traced_values_without_checks():
-    """JAX's transformations rebuild records with whatever they compute: masks, signs, batches."""
+    """JAX's transformations rebuild records with arbitrary values, such as masks or batches."""
     masses = jnp.array([-1.0, 1.0])
     assert jax.vmap(lambda m: Plant(m=m).m)(masses).tolist() == [-1.0, 1.0]
     assert Plant(m=masses).m is masses
@@ -491,7 +491,7 @@ def test_float32_is_within_20_nm_of_float64(tracking, tmp_path):
 
 
 def end_of(c):
-    """A number at the end of the cheap rollout as a function of one gain."""
+    """Return a number at the end of the light rollout as a function of one gain."""
     cascade = dataclasses.replace(SMOOTH, position=position.SlidingMode(c=c))
     return rollout(cascade, NOISY, LIGHT, fold=LIGHT_FOLDS, every=0).measured["rms"]
 

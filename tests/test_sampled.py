@@ -45,7 +45,7 @@ class Case:
 
 
 def hard(c=200.0, k=25.0, gamma=2e6, k_i=2000.0):
-    """Laws with the sign itself, with gains that hold the rotor at 10 kHz."""
+    """Laws with set-valued signs, and gains that hold the rotor at 10 kHz."""
     return {"position": smc(c, k, INF), "inversion": adaptive(gamma, INF), "current": current(k_i, INF)}
 
 
@@ -235,7 +235,7 @@ SHORT = amb.Clock(300, 1e-4)
 
 @pytest.mark.parametrize("delay", [0.0, 0.4, 1.0, 1.6])
 def test_the_voltage_of_a_sample_acts_after_the_delay(delay):
-    """u as folded over time is u_n shifted by the delay, and 0 before the first."""
+    """u averaged over time is u_n shifted by the delay, and 0 before the first command."""
     outcome = amb.rollout(cascade_of(delay=delay), NOISY, SHORT)
     u, mean = (np.asarray(getattr(outcome.trajectory.rows, name)) for name in ("u", "u_mean"))
     late = math.floor(delay)
@@ -267,7 +267,10 @@ def test_a_member_equals_its_rollout_for_any_delays_of_the_others(inversion):
 
 
 def test_a_part_of_an_ensemble_uses_the_program_of_the_whole():
-    """Whether its own delays are whole or none: else a last digit would depend on how an ensemble is cut."""
+    """This holds also if all delays of the part are whole numbers.
+
+    Otherwise results would depend on the division of an ensemble.
+    """
     spread = cascade_of(delay=0.0).on_processor(0.5, 2.0)
     for delay in (0.0, 1.0, np.array([0.0, 0.7])):
         part = dataclasses.replace(spread, processor=dataclasses.replace(spread.processor, delay=delay))
@@ -278,7 +281,7 @@ def test_a_part_of_an_ensemble_uses_the_program_of_the_whole():
 
 
 def test_a_delay_that_is_set_later_is_predicted():
-    """A map over the delay of a case without a delay."""
+    """An example is a map over the delay of a case without delay."""
     none = cascade_of(delay=0.0).on_processor()
     late = dataclasses.replace(none, processor=dataclasses.replace(none.processor, delay=1.0))
     fold = amb.simulation.folds.Rms("e_z")
@@ -312,7 +315,7 @@ def loss_of(clock, p, closed=False):
     ],
 )
 def test_gradients_three_ways_and_finite_over_six_decades_of_gains(p, closed):
-    """All cases share one program in reverse mode, because tracing a derivative takes longer than all the rest."""
+    """All cases share one program in reverse mode, because tracing takes most of the time."""
     loss, at, step = loss_of(amb.Clock(100, 1e-4, amb.RK4(2)), p, closed), np.array([0.1, -0.2, 0.05, 0.1]), 1e-5
     near = at + step * np.concatenate([0 * np.eye(4)[:1], np.eye(4), -np.eye(4)])
     points = np.concatenate([near, np.random.default_rng(4).uniform(-6.9, 6.9, (491, 4))])
@@ -373,7 +376,7 @@ def test_a_law_whose_result_is_not_finite_keeps_its_state():
 
 @pytest.mark.parametrize("implicit", [True, False])
 def test_the_sampled_loop_converges_to_the_continuous_one(implicit):
-    """With order 1 in the period: no delay, no noise, mild signs."""
+    """The order in the period is 1, without delay and noise, and with smooth signs."""
     laws = {"inversion": amb.inversion.Adaptive(7.5e4, 0.5)}
     scenario = amb.Scenario(reference=amb.Sine(1e-3, 2.0), initial=amb.Initial(1e-5))
     exact = amb.rollout(amb.Cascade(**laws), scenario, amb.Clock(50, 1e-3, amb.AdaptiveRodas3(1e-9))).trajectory.rows.z

@@ -40,7 +40,7 @@ CASES = [
 
 
 def cascade_of(laws, smooth):
-    """With one sample of delay, predicted; its signs smoothed, or not."""
+    """Return the cascade with one sample of delay and prediction, with smoothed or set-valued signs."""
     made = {stage: default_law(KINDS[stage][kind], amb.Plant()) for stage, kind in laws.items()}
     if not smooth:
         for stage, law in made.items():

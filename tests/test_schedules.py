@@ -111,7 +111,7 @@ ERRORS = jnp.array([4e-6, -1.2e-5, 2e-5])
 
 @pytest.mark.parametrize("more", ["", SAMPLED], ids=["continuous", "processor"])
 def test_a_constant_schedule_equals_the_plain_gain(more):
-    """One scheduled gain per stage, so that every stage evaluates its schedules."""
+    """Each stage has one scheduled gain."""
     plain, same = loop(more), loop(more, **{name: table(x, x) for name, x in GAINS.items()})
     moved = loop(more, **{name: table(x, 3 * x) for name, x in GAINS.items()})
     plain, same, moved = (
@@ -276,7 +276,7 @@ def test_the_theorem_uses_the_smallest_value_and_requires_a_constant_sigma():
 
 @pytest.mark.slow
 def test_the_linear_loop_at_rest_uses_the_first_value():
-    """The linear loop at z = r depends on the values at the error 0 only: the derivative of |z - r| is 0 there."""
+    """At z = r the derivative of |z - r| is 0, so the linear loop depends on the values at the error 0 only."""
     first = {name: x if name == "l" else table(x, 10 * x) for name, x in GAINS.items()}
     found = []
     for one in (loop(SAMPLED), loop(SAMPLED, **first)):

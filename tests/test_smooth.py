@@ -85,7 +85,7 @@ DTYPES = [np.float64, np.float32]
 
 
 def wide(function):
-    """As an ensemble compiles it: one kernel, 61 lanes at a time, so that vectors have a rest."""
+    """Compile a function as in an ensemble: one kernel with 61 lanes, so that the last vector is not full."""
     kernel = one_kernel(lambda *blocks: jax.lax.map(lambda x: jax.vmap(function)(*x), blocks))
 
     def run(*args):
@@ -113,7 +113,7 @@ def test_arctan_per_agrees_with_numpy(dtype):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_refined_is_one_over_x_to_the_last_bit_but_one(dtype):
-    """Over its whole range, and beside 1, where rounding of either operand shows most."""
+    """Over the whole range, and near 1, where rounding of either operand has the largest effect."""
     eps = np.finfo(dtype).eps
     near = 1 + np.linspace(-50, 50, 101) * eps
     x = np.concatenate([np.geomspace(1e-37, 1e37, 9973), near]).astype(dtype)

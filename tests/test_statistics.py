@@ -157,7 +157,10 @@ TAILS = {
     ],
 )
 def test_coverage_over_1000_repetitions(tail, n):
-    """95 %, to three times the binomial error of 1,000 repetitions, 0.7 %; and 1 % for what the method has left."""
+    """The coverage is 95 % within three binomial standard errors, and 1 % for the error of the method.
+
+    The standard error of 1,000 repetitions is 0.7 %.
+    """
     kind, covered = TAILS[tail]
     q = kind.ppf(0.95)
     truth = {"mean": kind.mean(), "std": kind.std(), "cvar": kind.expect(lambda x: x, lb=q) / 0.05}
@@ -185,7 +188,10 @@ def test_the_interval_of_the_cvar_of_a_heavy_tail_covers_it():
 
 @pytest.mark.parametrize("n", [50, 200])
 def test_the_interval_of_a_cvar_ends_at_most_at_the_largest_value(n):
-    """And still covers: a share of 400 samples is known to 1.1 %, three of which. Of 50 values the end is open."""
+    """It still covers: the coverage of 400 samples is known to 1.1 %, of which three are allowed.
+
+    For 50 values, the upper end is infinite.
+    """
     samples = np.random.default_rng(n).normal(size=(400, n))
     found, largest = bootstrap(list(samples), 0.95, 0.95, 1)["cvar"], samples.max(axis=1)
     assert np.all((found.high <= largest) | np.isinf(found.high))
@@ -353,7 +359,10 @@ def test_the_summary_names_the_drivers_and_the_worst_members():
 
 
 def test_lost_members_are_excluded_from_every_metric():
-    """A lost rotor's voltage is 0 from then on: the mean over all members would be lower than that of any survivor."""
+    """The voltage of a lost rotor is 0 after the loss.
+
+    The mean over all members would therefore be below that of any survivor.
+    """
     data = columns()
     ended = np.isfinite(data["lost_at"])
     data["settled_rms_u_V"] = np.where(ended, 0.0, 60.0 + data["spread.plant.m"])

@@ -276,7 +276,7 @@ def test_the_integral_sliding_variable_obeys_equation_12():
 
 @pytest.mark.parametrize("kind", ["sliding-mode", "integral-sliding-mode"])
 def test_a_constant_force_leaves_no_offset_with_the_integral(kind):
-    """q_z = 5 m/s^2 inside the layer of the sign. Without the integral: e = tan(pi q_z/2k)/(p c), by Eqs. (5), (12)."""
+    """q_z = 5 m/s^2 within the boundary layer. Without the integral, e = tan(pi q_z/2k)/(p c) by Eqs. (5), (12)."""
     raw = {
         "controller": {"position": {"kind": kind, "k": 25.0, "p": 25.0}, "inversion": {"gamma": 1e6, "p": 2.0}},
         "disturbance": {"q_z": {"kind": "constant", "value": 5.0}},

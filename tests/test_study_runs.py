@@ -69,14 +69,14 @@ sys.exit(main())
 
 
 def begin(out, *flags):
-    """A study in a process group of its own."""
+    """Start a study in a separate process group."""
     argv = [sys.executable, "-c", LISTENING, *RUN, "--out", out, *flags]
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     return subprocess.Popen(argv, text=True, start_new_session=True, **pipes)
 
 
 def wait_for(condition, running, patience=120.0):
-    """Until the condition holds; fails if the process ends first."""
+    """Wait until the condition holds; fail if the process ends first."""
     end = time.monotonic() + patience
     while not condition():
         assert running.poll() is None, running.stderr.read()
@@ -89,7 +89,7 @@ def finished_chunks(out):
 
 
 def group_ends(group, patience=20.0):
-    """Whether no process of the group is left."""
+    """Return whether no process of the group is left."""
     end = time.monotonic() + patience
     while time.monotonic() < end:
         try:
@@ -167,7 +167,7 @@ def test_ctrl_c_keeps_the_finished_chunks_and_prints_the_command_to_resume(flags
 @pytest.mark.parametrize("program", ["ambjax", "tuning"])
 @pytest.mark.parametrize("calls", [1, 100, 3000, 20_000])
 def test_ctrl_c_before_the_first_chunk_gives_one_line_and_exit_code_130(program, calls):
-    """While JAX is on its way in, for one, which made an error of its own of it."""
+    """For example during the import of JAX, which raises an error of its own."""
     write(LONGER)
     argv = ["case.toml", "--out", "out"] if program == "tuning" else [*RUN, "--out", "out"]
     code = EARLY.format(calls=calls, module=f"{program}.__main__")
@@ -347,7 +347,10 @@ def test_the_pilot_is_the_first_members(no_pictures):
 
 
 def test_the_command_takes_chunks_and_first_members_from_the_pilot(no_pictures, monkeypatch, capsys):
-    """128 members that took so long that there are 30 a second: 2 s of them are less than a call on both cores."""
+    """The pilot of 128 members gives a rate of 30 members per second.
+
+    2 s of this rate are less than one call on both cores.
+    """
     computed = []
 
     def pilot(study):
@@ -456,7 +459,7 @@ BAD = {
 
 
 def refused(argv, capsys):
-    """The one line of a refusal that writes nothing."""
+    """Return the line of a refusal, after a check that nothing is written."""
     before = sorted(pathlib.Path().rglob("*"))
     assert main(argv) == 2, argv
     out, err = capsys.readouterr()

@@ -37,7 +37,7 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 class Stuck(io.StringIO):
-    """A stream that takes nothing."""
+    """A stream that refuses every write."""
 
     def __init__(self, number):
         super().__init__()
@@ -93,7 +93,7 @@ def test_a_failing_stderr_does_not_stop_the_command(number, monkeypatch):
 
 
 def test_a_stream_that_failed_is_not_written_again(monkeypatch):
-    """Not as Python ends either: what it holds would fail once more, and become the exit code."""
+    """Python's flush at exit is also avoided: it would fail again and change the exit code."""
     stuck = Stuck(errno.ENOSPC)
     monkeypatch.setattr(sys, "stdout", stuck)
     with lenient() as stdout:

@@ -13,7 +13,7 @@ CLOCK = Clock(1000, 1e-4, AdaptiveRodas3(1e-8))
 
 
 def short(gamma=paper.REPAIRED_GAMMA, **changes):
-    """0.1 s of tracking with a pulse in it, one structure so that one compilation serves all."""
+    """0.1 s of tracking with a pulse; one structure, so that the tests share one compilation."""
     cascade = dataclasses.replace(paper.cascade("repaired"), inversion=inversion.Adaptive(gamma))
     scenario = dataclasses.replace(paper.scenario("tracking", "repaired"), q_v=Pulse(1.0, 0.05, 0.08))
     return cascade, dataclasses.replace(scenario, **changes)

@@ -54,7 +54,10 @@ def random_loops(n):
 
 
 def motion(loops, tolerance, start=0.0, speed=0.0):
-    """z and z_dot [n, samples], NaN for the lost, by the adaptive method; `speed` (m/s) added within a sample."""
+    """Return z and z_dot [n, samples] of the adaptive method, NaN for lost rotors.
+
+    `speed` (m/s) is added to the velocity within a sample.
+    """
     cascade = amb.Cascade(
         position=amb.position.SlidingMode(loops.c, loops.k, loops.p),
         inversion=amb.inversion.Adaptive(np.pi / 2 * loops.slope / loops.p_v, loops.p_v),
@@ -78,7 +81,7 @@ def far(z, exact):
 
 
 def carried(loops, exact, z_dot):
-    """How far the loops carry one allowed error of the velocity, m; and a kick of 1 m/s, m."""
+    """Return the displacements (m) caused by one allowed error of the velocity and by a change of 1 m/s."""
     n, tolerance = len(loops.z), 1e-9
     all_ = Loops(*(np.tile(x, len(KICKS)) for x in loops))
     kicked, _ = motion(all_, tolerance, np.repeat(KICKS * T, n), SPEED)

@@ -98,7 +98,10 @@ def test_settings_of_another_case_apply_except_its_gains(tmp_path):
 
 @pytest.mark.parametrize("kind", ["sliding-mode", "integral-sliding-mode", "super-twisting", "utkin-sliding-mode"])
 def test_the_gains_of_explicit_set_valued_signs_have_ranges(kind):
-    """A sign without a slope, on a processor that steps it explicitly; its gains are those of implicit signs."""
+    """The sign has no slope, and the processor steps it explicitly.
+
+    The ranges of its gains are those of implicit signs.
+    """
     laws = {"position": {"kind": kind, "p": math.inf}, "inversion": {"p": math.inf}, "current": {"p": math.inf}}
 
     def found(discretisation):

@@ -14,7 +14,7 @@ CHAOS = {"chaotic": 1e30, "of moderate size": 1e-2}
 
 
 def least(f, m, populations, seed=0):
-    """The least value of f on populations from the origin of m dimensions, and the last distribution."""
+    """Return the least f over populations that start at the origin of m dimensions, and the last distribution."""
     cloud, best = initial_state(np.zeros(m)), math.inf
     for _ in range(populations):
         points = next_population(cloud, seed)
@@ -24,7 +24,7 @@ def least(f, m, populations, seed=0):
 
 
 def test_the_parameters_are_those_of_the_tutorial():
-    """By hand from Table 1 of arXiv:1604.00772 for 5 dimensions: 8 points, 4 of them count."""
+    """By hand from Table 1 of arXiv:1604.00772 for 5 dimensions: 8 points, 4 of which have positive weights."""
     assert population(5) == 8
     raw = [math.log(4.5) - math.log(i) for i in (1, 2, 3, 4)]
     found = rates(5)
@@ -40,7 +40,10 @@ def test_the_parameters_are_those_of_the_tutorial():
 
 
 def test_a_valley_in_any_direction_is_followed():
-    """Curvatures from 1 to 1e4: without the covariance it stays at 1e-2, with it the best falls as that of a sphere."""
+    """The curvatures are 1 to 1e4.
+
+    Without the covariance the best value stays at 1e-2; with it, it decreases as on a sphere.
+    """
     scales, turn = 10 ** np.linspace(0, 4, 5), np.linalg.qr(np.random.default_rng(1).standard_normal((5, 5)))[0]
     for axes in (np.eye(5), turn):
         best, _ = least(lambda x, axes=axes: (x @ axes - 0.3) ** 2 @ scales, 5, 250)
@@ -96,7 +99,7 @@ def test_three_limits_hold_in_spite_of_misleading_derivatives(monkeypatch, tmp_p
 
 
 def populations(world):
-    """How many populations were drawn; no other call in two dimensions has as many points."""
+    """Return how many populations were drawn; no other call in two dimensions has the same number of points."""
     return sum(kind == "terms" and points == population(2) for kind, _, _, points in world.calls)
 
 
@@ -109,7 +112,7 @@ def test_cma_es_does_not_start_after_a_converged_descent(monkeypatch, tmp_path):
 
 
 def test_cma_es_has_converged_if_whole_populations_do_not_improve():
-    """One point far below all others, which is chance, changes nothing."""
+    """A single point far below all others may be chance and does not count."""
     cloud = initial_state(np.zeros(2))
     for n, level in enumerate([0.0, -2 * STALL, *[-2.5 * STALL] * PATIENCE]):
         assert not cloud.converged
@@ -120,7 +123,7 @@ def test_cma_es_has_converged_if_whole_populations_do_not_improve():
 
 
 def test_a_search_resumed_during_cma_es_gives_the_same_result(monkeypatch, tmp_path):
-    """Ctrl-C in the third population."""
+    """Ctrl-C interrupts the third population."""
 
     class Counting(list):
         interrupts = True

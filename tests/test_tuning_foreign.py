@@ -69,7 +69,10 @@ def gamma(name, **tune):
 
 
 def test_the_range_of_gamma_starts_at_delta_1_of_the_motion():
-    """From Delta_1 of a moving reference; at rest, from dv/dz z_dot of a rotor that falls from where it starts."""
+    """With a moving reference it starts at Delta_1 along the reference.
+
+    At rest, it starts at dv/dz z_dot of a rotor that falls from its initial position.
+    """
     moving, found = gamma("tracking")
     assert moving.low == next(b.value for b in found.goal.conditions if b.symbol == "Delta_1") > 0
     assert "Delta_1" in moving.source
@@ -109,7 +112,7 @@ def test_sources_name_the_pole_and_the_cap():
 
 @pytest.mark.parametrize("beside", [True, False], ids=["gains too", "p alone"])
 def test_on_a_processor_a_steepness_is_searched_by_its_slope(beside):
-    """2/pi gain p from w/3 to 10/T, whatever the gain beside it is: the screen's own draw, or the case's number."""
+    """2/pi gain p ranges from w/3 to 10/T for every value of the gain, drawn by the screen or given by the case."""
     names = ["position.k", "inversion.gamma", "current.k_i"]
     paths = [f"controller.{name}" for name in (names if beside else [])]
     paths += [f"controller.{name.partition('.')[0]}.p" for name in names]
@@ -237,7 +240,7 @@ def test_common_bearings_are_tuned_without_settings(name, tmp_path):
 
 @pytest.mark.thorough
 def test_a_search_from_the_gains_of_the_case_only(tmp_path):
-    """From gains that hold, as from those of an answer: with no screen it refines them."""
+    """The initial gains hold the rotor, as those of an answer do. Without a screen the search refines them."""
     first, second = tmp_path / "first", tmp_path / "second"
     write(tmp_path / "case.toml", BEARINGS["fan"], iterations=4)
     assert main([str(tmp_path / "case.toml"), "--out", str(first), "--json"]) == 0

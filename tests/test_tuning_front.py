@@ -41,7 +41,10 @@ def ran(monkeypatch, tmp_path, capsys):
 
 
 def least_voltage(factor):
-    """Of a Bowl: the error is S_0 sqrt(FLOOR (1 + a^2 + b^2)) and the voltage 20 e^b, a and b logarithms of gains."""
+    """Return the least voltage of a Bowl.
+
+    Its error is S_0 sqrt(FLOOR (1 + a^2 + b^2)) and its voltage 20 e^b, with the logarithms a and b of the gains.
+    """
     return 20 * math.exp(-math.sqrt(factor**2 - 1))
 
 
@@ -76,7 +79,7 @@ def test_the_knee_is_the_least_voltage_within_25_percent_of_the_least_error(ran)
 
 
 def test_members_of_rare_large_errors_join_the_search(monkeypatch, tmp_path):
-    """One of ten validation members limits the voltage, and none of the training members do."""
+    """One of ten validation members limits the voltage, and no training member does."""
     slope, validation = 100.0, seeds(case_and_tune(document())[1].budget)[1]
     world = World(rare=lambda seed, number: slope if (seed, number) == (validation, 3) else 0.0)
     problem = study(monkeypatch, world, objective="knee", front=1, bounds=BOUNDLESS)
@@ -106,7 +109,7 @@ def test_the_front_does_not_change_an_answer_of_least_error(ran):
 
 @pytest.mark.slow
 def test_the_other_limits_stay_in_the_search_of_the_knee(monkeypatch, tmp_path):
-    """A limit of 15 V is met by the answer of least error already, at a voltage below which the knee may not end."""
+    """The answer of least error already meets a limit of 15 V. The voltage of the knee must not exceed this limit."""
     study(monkeypatch, World(), objective="knee", bounds=BOUNDLESS, limits={"largest_error_m": 1.0})
     problem = problem_of(
         *case_and_tune(document(objective="knee", bounds=BOUNDLESS, limits={"rms_u_V": 15.0, "rms_error_m": 5.3e-5}))

@@ -242,7 +242,7 @@ class Counting(Mean):
 
 
 def test_changed_limits_do_not_trace_the_step_again(monkeypatch, tmp_path):
-    """Two tunings, each of several searches with different multipliers."""
+    """There are two tunings, each of several searches with different multipliers."""
     counts = []
     for volts in (10.0, 11.0):
         made = study(monkeypatch, World(), limits={"rms_u_V": volts, "margin": 0.002})
@@ -306,7 +306,10 @@ def test_the_judged_value_corrects_the_search(monkeypatch, tmp_path):
 
 
 def test_a_search_that_does_not_move_and_holds_the_limits_ends(monkeypatch):
-    """The judged voltage of 20 V is within the limit, but nearer than the margin; another search changes nothing."""
+    """The judged voltage of 20 V is within the limit but closer to it than the margin.
+
+    Another search would change nothing.
+    """
     problem = study(monkeypatch, World(), limits={"rms_u_V": 20 / 0.9995, "margin": 0.002})
     course, starts = Course(problem, training(problem), 1), []
     course.past.append(SimpleNamespace(interrupted=False))
@@ -366,7 +369,7 @@ def test_the_peak_of_the_spectrum_of_a_sine_is_its_amplitude():
 
 
 def test_the_allowed_number_of_lost_members_is_a_whole_number():
-    """(1 - 0.9) 2000 is 199.99999999999997 in floating point."""
+    """In floating point, (1 - 0.9) 2000 is 199.99999999999997."""
     assert [LimitSettings(survival=0.9).may_lose(n) for n in (2000, 1000, 19)] == [200, 100, 1]
     assert [LimitSettings(survival=s).may_lose(1000) for s in (1.0, 0.999, 0.9995)] == [0, 1, 0]
 

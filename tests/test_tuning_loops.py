@@ -52,7 +52,7 @@ def made():
 
 @pytest.mark.slow
 def test_the_derivative_of_a_limit_agrees_with_differences(made):
-    """Of each limit's term of the goal, along each gain."""
+    """The derivative of each limit's term of the goal is compared along each gain."""
     problem, x, members = made
     some, step = members.searched, 1e-3
     values, slopes = loops(problem.objective, x[None], some)
@@ -97,7 +97,7 @@ def test_the_engine_adds_the_quantities_of_the_linear_loop_by_name(made, monkeyp
 
 
 def test_an_unstable_loop_has_a_finite_value_whose_derivative_points_to_stability(made):
-    """The larger k, the faster the loop diverges."""
+    """The loop diverges faster for larger k."""
     problem, x, members = made
     far = x + np.linspace(0.0, 9.0, 10)[:, None] * (np.array(PATHS) == "controller.position.k")
     values, slopes = loops(problem.objective, far, members.searched)
@@ -127,7 +127,10 @@ def test_a_lower_limit_holds_for_larger_values():
 
 @pytest.mark.slow
 def test_injections_find_the_members_with_the_largest_measured_peak():
-    """Set-valued signs without noise: one measurement of each plant, whose order the linear peaks do not tell."""
+    """Set-valued signs without noise: one measurement of each plant.
+
+    The order of the linear peaks differs from that of the measured ones.
+    """
     signs = {"position": {"c": 200.0, "k": 30.0}, "inversion": {"gamma": 1e7}, "current": {"k_i": 2000.0}}
     document = DOCUMENT | {
         "controller": {stage: law | {"p": math.inf} for stage, law in signs.items()},

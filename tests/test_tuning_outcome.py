@@ -27,7 +27,7 @@ HELD_OUT = seeds(Budget())[2]
 
 
 def losing(*numbers, accurate=False):
-    """Return a world in which these held-out members are lost; with `accurate`, only in accurate steps."""
+    """Return a world in which these held-out members are lost; with `accurate`, only with accurate steps."""
     return World(
         limit=lambda seed, number, _, fine: (
             40.0 if seed == HELD_OUT and number in numbers and (fine or not accurate) else math.inf

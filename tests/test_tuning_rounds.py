@@ -91,7 +91,7 @@ def test_without_validation_there_are_no_validation_calls(monkeypatch, tmp_path)
 
 
 def test_the_answer_that_loses_the_fewest_members_is_returned(monkeypatch, tmp_path):
-    """Three rounds, after which 3, 1 and 2 members are lost, whatever the gains."""
+    """There are three rounds, after which 3, 1 and 2 members are lost for all gains."""
     monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 3)
     lost = iter([3, 1, 2])
 
@@ -105,7 +105,7 @@ def test_the_answer_that_loses_the_fewest_members_is_returned(monkeypatch, tmp_p
 
         @property
         def trial(self):
-            """Whether the last call was for the whole validation ensemble."""
+            """Return whether the last call was for the whole validation ensemble."""
             kind, seed, numbers, _ = self.calls[-1]
             return kind == "terms" and seed == seed_of(VALIDATION) and len(numbers) == 10
 
@@ -141,7 +141,7 @@ def test_steps_that_never_resolve_the_answer_are_reported(monkeypatch, tmp_path)
 
 
 def test_members_that_only_accurate_steps_lose_join_too(monkeypatch, tmp_path):
-    """The first four members of the training ensemble are run by accurate steps, which lose one above c = 40."""
+    """The first four training members are simulated with accurate steps, which lose one of them above c = 40."""
 
     def limit(seed, number, stressed, accurate):
         return 40.0 if (seed, number) == (1, 2) and (stressed or accurate) else math.inf
@@ -160,7 +160,7 @@ def test_a_search_that_loses_every_member_ends(monkeypatch, tmp_path):
 
 
 def test_an_interrupted_search_is_resumed_where_it_ended(monkeypatch, tmp_path):
-    """Ctrl-C in its second round; resumed, it ends at the gains of an uninterrupted one, to the bit."""
+    """Ctrl-C interrupts the second round. The resumed search gives the gains of an uninterrupted one, bit by bit."""
     stop = False
 
     def limit(seed, number, stressed, accurate):

@@ -1,4 +1,4 @@
-"""The tuner's gradients, three ways; its search: no recompilation, identical when resumed; its command."""
+"""The tuner's gradients in three ways, and its search: no recompilation, equal results if resumed, and the command."""
 
 import dataclasses
 import json

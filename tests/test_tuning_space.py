@@ -120,7 +120,7 @@ def test_gains_without_effect_are_left_out():
 
 
 def test_a_processor_tunes_finite_steepnesses_by_default():
-    """In continuous time no steepness, and on a processor no sign that has none."""
+    """In continuous time no steepness is tuned. On a processor, those of set-valued signs are not tuned."""
     text = {"controller": {"inversion": {"p": math.inf}}, "actuator": {"u_max": 200.0}}
     continuous = case_and_tune({"actuator": {"u_max": 200.0}})[1].space.paths
     assert not [path for path in continuous if path.endswith(".p")]
@@ -188,7 +188,7 @@ def test_tracking_is_the_settled_mean_square():
 
 
 def test_the_terms_of_the_loss_are_dimensionless():
-    """Lengths of another unit, with volts as they are: nothing but tracking's own ratio enters."""
+    """If the unit of length changes and that of voltage does not, no term changes."""
     row, found = rollout(SMOOTH, TRACKING, CLOCK).trajectory.rows, []
     span = blank(INSTANT_TREE)._replace(
         time=jnp.asarray(1e-4), densities=Densities(*map(jnp.asarray, (10.0, 400.0, 5.0)))
@@ -202,7 +202,7 @@ def test_the_terms_of_the_loss_are_dimensionless():
 
 
 def lost_late(gamma):
-    """Survival term of a loop whose gamma is too small to hold: the rotor is lost within the horizon."""
+    """Return the survival term of a loop whose gamma is too small: the rotor is lost within the horizon."""
     cascade = dataclasses.replace(SMOOTH, inversion=inversion.Adaptive(gamma, 25.0))
     return terms(cascade, dataclasses.replace(TRACKING, initial=Initial(1e-4)), loss_for(TRACKING, 0.01))["survival"]
 

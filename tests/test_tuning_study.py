@@ -81,7 +81,7 @@ def test_starts_cover_the_ranges_derived_from_the_plant(monkeypatch):
 
 
 def test_a_rotor_at_rest_has_starts(monkeypatch):
-    """Delta_1 is 0 there, and no range comes from a zero."""
+    """Delta_1 is 0 for a rotor at rest, but no range starts at 0."""
     found, _ = begins(monkeypatch, 16, {"reference": {"kind": "constant", "value": 0.0}})
     for name, gains in found.items():
         assert gains.max() > 3 * gains.min(), name
@@ -91,7 +91,7 @@ def test_a_rotor_at_rest_has_starts(monkeypatch):
 
 
 def test_the_judge_evaluates_every_held_out_member_once(monkeypatch):
-    """And in finer steps than the search's, 3, whose error is not the judge's."""
+    """The judge also uses finer steps than the search, whose 3 substeps have an error here."""
     world = World(limit=lambda seed, number, *_: 40.0 if number == 5 else math.inf)
     world.bias = lambda substeps: 0.5 if substeps == 3 else 0.0
     made = study(monkeypatch, world)
@@ -157,7 +157,7 @@ def test_members_that_only_accurate_steps_lose_are_named(monkeypatch):
 
 
 def test_an_error_without_a_relative_value_is_given_in_metres(monkeypatch):
-    """Where the accurate one is 0, and where there is none."""
+    """This is the case if the reference error is 0, or if there is none."""
     error = step_error(study(monkeypatch, World()), np.zeros(2))
     zero = error._replace(search_m=1e-6, reference_m=0.0, relative=math.nan)
     assert zero.refuted == "coarser steps give a settled rms error of 1e-06 m against 0 m"
@@ -227,7 +227,7 @@ def test_the_worse_half_of_the_starts_ends_early(monkeypatch):
 
 
 def test_the_path_of_bfgs_does_not_depend_on_the_unit_of_the_loss():
-    """The first pair of points gives the scale of the curvature: from then on f and 1000 f are descended alike."""
+    """The first pair of points sets the scale of the curvature. After it, the paths for f and 1000 f are equal."""
     hessian, centre = jnp.diag(jnp.asarray([4.0, 60.0, 900.0])), jnp.asarray([0.5, -0.3, 0.2])
 
     def way(unit):
@@ -310,7 +310,7 @@ def test_the_gradient_report_compares_three_derivatives(everything):
 
 @pytest.mark.parametrize(("samples", "horizons"), [(2, [1, 2]), (3, [1, 2, 3]), (40, [5, 10, 20, 40])])
 def test_each_horizon_of_the_gradient_report_has_settled_samples(monkeypatch, samples, horizons):
-    """Each once; and where the loss is 0 there is no logarithm of it."""
+    """Each horizon occurs once, and a horizon with loss 0 is omitted."""
     settle = (samples - 1) * 1e-4
     made = study(monkeypatch, World(), {"clock": {"duration": samples * 1e-4}, "run": {"settle": settle}})
     for count in horizons:
@@ -325,7 +325,7 @@ def test_each_horizon_of_the_gradient_report_has_settled_samples(monkeypatch, sa
 
 
 def test_gradients_of_a_knee_are_those_of_the_loss(monkeypatch):
-    """Near the knee the goal weighs clearance and survival only; both are 0 where no rotor is near its stop."""
+    """The goal of the knee weighs clearance and survival only; both are 0 if no rotor is near its stop."""
     made = study(monkeypatch, World(), objective="knee")
     x, members = at(made, 80.0, 40.0), made.objective.training(1, 4, 2, 1.2, 1.25)
     knee = made.towards_voltage(5e-5, 20.0, 1.25)
@@ -345,7 +345,7 @@ def test_the_front_is_in_the_report_and_has_a_picture(everything):
 
 
 def test_a_case_from_a_pipe_is_read_once(monkeypatch, tmp_path):
-    """The second time it is empty, and tuned.toml would be of gains alone: another case."""
+    """A second read would be empty, and tuned.toml would contain the gains only."""
     study(monkeypatch, World())
     monkeypatch.setattr(tuning.command, "_tune", lambda plan, args: (plan.raw, plan.problem.case.text))
     text = dumps(document())
@@ -355,7 +355,7 @@ def test_a_case_from_a_pipe_is_read_once(monkeypatch, tmp_path):
 
 
 def test_a_file_whose_gains_could_not_be_written_is_refused_at_the_start(monkeypatch, tmp_path):
-    """Not after hours of search."""
+    """The error occurs before the search."""
     broken = "[plant]\nm = 1.0\nx = 1.0\n"
     monkeypatch.setattr("tuning.report.tuned.tuned", lambda *_: broken)
     with pytest.raises(ValueError, match=r"case.toml: plant.x = 1.0: unknown key"):
@@ -409,7 +409,7 @@ HELD_OUT = seeds(Budget())[2]
 
 @pytest.mark.parametrize("status", ["lost", "stalled"])
 def test_a_member_that_accurate_steps_do_not_hold_is_not_a_survivor(monkeypatch, tmp_path, status):
-    """The last of those that are simulated again: the four that accurate steps try as the worst come before it."""
+    """The member is the last of those that are simulated again, after the four worst members."""
     mine = (HELD_OUT, 5)
     if status == "lost":
         world = World(limit=lambda seed, number, _, accurate: 40.0 if accurate and (seed, number) == mine else math.inf)
@@ -436,7 +436,7 @@ def test_a_refuted_survival_is_reported_without_held_out_members(monkeypatch, tm
 
 
 def test_gains_stay_within_the_documented_bounds(monkeypatch):
-    """And the report: where ranges come from, and the ends of each gain."""
+    """The report gives the source of each range and the bounds of each gain."""
     paths = [f"controller.{path}" for path in GAINS]
     made = study(monkeypatch, World(), gains=paths, bounds={})
     start = made.tune.space.values(made.case.cascade)

@@ -106,7 +106,7 @@ def test_a_negligible_error_is_that_of_the_reference_relative_to_the_gap(small):
 
 @pytest.mark.slow
 def test_false_survival_is_refuted():
-    """In the steps of the search every member is held; in accurate steps every member is lost."""
+    """With the steps of the search every member is held; with accurate steps every member is lost."""
     found = problem_from(FALSE)
     x = at(found)
     members = comparison_members(found)
@@ -255,7 +255,7 @@ def test_an_answer_confirmed_in_training_is_still_refuted_by_held_out_members(sm
 
 @pytest.mark.thorough
 def test_the_search_continues_until_an_answer_is_confirmed(tmp_path, capsys):
-    """A bearing with velocity noise, whose first answers survive only in the steps of the search."""
+    """The first answers hold this bearing with velocity noise only with the steps of the search."""
     path, out = tmp_path / "case.toml", tmp_path / "out"
     hard = FALSE.replace("duration = 0.02", "duration = 0.2").replace("[clock]", "[run]\nsettle = 0.05\n[clock]")
     # the limit by default, 60 % of the supply, is not tested here: such noise needs 1 % more

@@ -33,7 +33,7 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 def answered(text, capsys):
-    """Exit code and the answer: what stands below the tables."""
+    """Return the exit code and the text below the tables."""
     code = main(["check", write(text)])
     return code, capsys.readouterr().out.partition(advice.QUESTION)[2]
 
