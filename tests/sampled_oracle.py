@@ -384,7 +384,7 @@ class Controller:
         self.expected, self.left, self.refused, self.i_ref_shown = (0.0, 0.0, 0.0), 0, 0, 0.0
 
     def sample(self, n, measured):
-        """Call `step` with the readings that the guard accepts."""
+        """Apply the guard to the readings, and call `step` with the result."""
         guard, T, body = self.world.guard, self.world.period, self.model.body
         if guard is None:
             return self.step(n, measured)

@@ -66,9 +66,9 @@ def numbers(world, std, samples, settle, method):
 
 
 def assert_rectangular(ours, theirs, most, count):
-    """Errors are evaluated at the samples.
+    """Check a mean square of errors, which ambjax evaluates at the samples by the rectangular rule.
 
-    The error of this rectangular rule is half a sample times the values at the ends.
+    The error of this rule is half a sample times the values at the ends.
     """
     assert abs(ours**2 - theirs**2) <= float(most) ** 2 / 2 / count * 1.01 + 1e-3 * theirs**2
 

@@ -320,7 +320,7 @@ frequency = 2.0
 
 
 def fails(capsys):
-    """The table of `ambjax check`: each gain, the number that its condition requires, and the verdict."""
+    """Check that the table of `ambjax check` is printed and contains a condition that fails."""
     answer = capsys.readouterr().out
     assert "condition " in answer
     assert "FAILS" in answer
