@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.control.cascade import USUAL, Cascade
+from ambjax.control.cascade import DEFAULT_LAWS, Cascade
 from ambjax.control.laws import PositionLaw
 from ambjax.control.schedule import extremes, schedules
 from ambjax.numerics.records import canonical
@@ -181,9 +181,9 @@ def required(cascade: Cascade) -> list[Required]:
     """
     rows = []
     for stage in ("position", "current", "inversion", "observer"):
-        law, paper = getattr(cascade, stage), USUAL[stage].requirement
+        law, paper = getattr(cascade, stage), DEFAULT_LAWS[stage].requirement
         own = law.requirement
-        requirement, kind = (own, type(law)) if own else (paper, USUAL[stage])
+        requirement, kind = (own, type(law)) if own else (paper, DEFAULT_LAWS[stage])
         if requirement is None:
             continue
         if requirement.over not in SIDES:
