@@ -111,13 +111,13 @@ def test_a_figure_of_the_paper_distinguishes_a_loss_from_a_stall(tmp_path, drawn
 
 
 # each number of samples and each end once; the thorough tests combine them otherwise
-DEFAULT_LAWS = [(1, 0.0), (1, np.inf), (2, 1e-4), (3, 1.5e-4), (30, np.inf)]
+FAST_RUNS = [(1, 0.0), (1, np.inf), (2, 1e-4), (3, 1.5e-4), (30, np.inf)]
 
 
 @pytest.mark.parametrize(
     ("samples", "lost_at"),
     [
-        pytest.param(*both, marks=pytest.mark.slow if both in DEFAULT_LAWS else pytest.mark.thorough)
+        pytest.param(*both, marks=pytest.mark.slow if both in FAST_RUNS else pytest.mark.thorough)
         for both in itertools.product([1, 2, 3, 30], [np.inf, 0.0, 1e-4, 1.5e-4])
     ],
 )
