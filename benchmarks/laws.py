@@ -52,7 +52,15 @@ BUDGETS = {
 }
 SEEDS, JUDGED, JUDGED_SEED = 5, 500, 1000
 # Numbers of compare.json in the results; the median and the range over seeds of each.
-SHOWN = ("rms_error_median_m", "rms_error_worst_m", "max_error_m", "rms_u_V", "chatter_V_per_s", "peak", "worst_peak")
+SUMMARY_KEYS = (
+    "rms_error_median_m",
+    "rms_error_worst_m",
+    "max_error_m",
+    "rms_u_V",
+    "chatter_V_per_s",
+    "peak",
+    "worst_peak",
+)
 
 
 def main() -> None:
@@ -193,7 +201,7 @@ def summary(seeds: list[list[dict[str, Any]]]) -> dict[str, Any]:
     for rows in zip(*seeds, strict=True):
         row: dict[str, Any] = {"lost": [one["lost"] + one["stalled"] for one in rows], "flops": rows[0]["flops"]}
         row["unstable"] = [one["unstable"] for one in rows]
-        for key in SHOWN:
+        for key in SUMMARY_KEYS:
             values = [one[key] for one in rows]
             known = None not in values
             row[key] = [statistics.median(values), min(values), max(values)] if known else None

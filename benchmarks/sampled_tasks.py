@@ -14,7 +14,7 @@ import _measure
 import tasks
 
 SAMPLED = tasks.TASKS / "sampled"
-# Settled rms error, m. "-signs": by signs that are not smoothed.
+# Settled rms error, m. "-signs": with set-valued signs.
 BARS = {
     "A10": 9e-7,
     "A10-signs": 1.1e-6,

@@ -1,10 +1,10 @@
 """Twenty-four scheduled gains: the tuner's search against CMA-ES, and the cost of their gradient.
 
-The task is G20 (two coils, plant off by 10 %, 20 kHz, a sample late), cut to SECONDS s and to few members, so that a
-search takes less than a minute. Each of its eight gains is a schedule with three knots: those of the observer and of
-the position law over the error, the others over the reference. Both searches have the loss, the members, the
+The task is G20 (two coils, plant varied by 10 %, 20 kHz, one sample of delay), cut to SECONDS s and to few members, so
+that a search takes less than a minute. Each of its eight gains is a schedule with three knots: those of the observer
+and of the position law over the error, the others over the reference. Both searches have the loss, the members, the
 coordinates and the ranges of `search.py`. CMA-ES starts in the middle of the ranges; the tuner's search with a screen,
-in which every schedule is constant. The start of both is a loop that loses its rotor.
+in which every schedule is constant. Both start with gains that lose the rotor.
 
 Each search runs until it has used `--seconds` of processor time on one core, without compilation. Its trace gives the
 least loss of each method at equal processor seconds, and at equal rollouts. There a gradient counts as many rollouts as

@@ -173,7 +173,7 @@ def by_gradients(name: str, seeds: int) -> dict[str, Any]:
     goal = statistics.median(trace[-1][2] for trace in traces)
     budget = round(statistics.median(trace[-1][0] for trace in traces))
     within = [[step for step in trace if step[0] <= budget] for trace in traces]
-    rows = {"gradients": within, "gradients, to their own end": traces}
+    rows = {"gradients": within, "gradients, until the search ends": traces}
     return {"budget": budget, "goal": goal} | {
         name: [result_of(trace, goal)._asdict() for trace in each] for name, each in rows.items()
     }
@@ -224,7 +224,7 @@ def main() -> None:
         if given.times == 1:  # else the budget and the goal are those in the file
             for name, found in zip(given.tasks, pool.map(by_gradients, given.tasks, [given.seeds] * 5), strict=True):
                 tasks[name] = tasks.get(name, {}) | found
-                for method in ("gradients", "gradients, to their own end"):
+                for method in ("gradients", "gradients, until the search ends"):
                     show(name, method, found[method])
                 _measure.write("search", {"tasks": dict(sorted(tasks.items()))})
         jobs = {

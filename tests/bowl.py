@@ -55,7 +55,7 @@ class World:
 
 
 class Bowl:
-    """See above; `world` is set by `study`."""
+    """An engine whose losses are formulas; `world` is set by `study`."""
 
     world: World
 
@@ -165,7 +165,7 @@ def document(tables=None, **tune):
 
 
 def instead_of_engines(monkeypatch, world):
-    """Every engine made from now on is a Bowl in this world."""
+    """Replace every engine that is made from now on by a Bowl in this world."""
     import tuning.problem
     import tuning.report.gradient
 
@@ -175,7 +175,7 @@ def instead_of_engines(monkeypatch, world):
 
 
 def study(monkeypatch, world, tables=None, **tune):
-    """The problem of that case in a world, every engine of it a Bowl."""
+    """Return the tuning problem of the case in a world. Each of its engines is a Bowl."""
     import tuning.problem
 
     instead_of_engines(monkeypatch, world)

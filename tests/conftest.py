@@ -68,6 +68,6 @@ def _release_programs():
 
 @pytest.fixture
 def elsewhere(tmp_path, monkeypatch):
-    """A folder of the test's own, with the compilation cache beside it."""
+    """A separate folder for the test; the compilation cache is beside this folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / "cache"))

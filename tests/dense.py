@@ -1,6 +1,7 @@
-"""Every metric of metrics.json from the oracle's solution: at all its steps, integrals as states of their own.
+"""Every metric of metrics.json, computed from the independent solution (tests/oracle.py) at all of its steps.
 
-Shares no code with ambjax. Between samples nothing is left out: the solver's steps resolve whatever is fast.
+Integrals are additional states of the solution. This module shares no code with ambjax. The solver resolves the fast
+motion between samples.
 """
 
 import itertools
@@ -14,7 +15,10 @@ GAUSS, WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
 class Integrals(Loop):
-    """The loop with the integrals of u, u^2, the copper loss, i^2 and both squared coil currents behind its states."""
+    """The loop with integrals as additional states.
+
+    They are those of u, u^2, the copper loss, i^2 and the squares of both coil currents.
+    """
 
     def __init__(self, world):
         super().__init__(world)
@@ -31,9 +35,9 @@ class Integrals(Loop):
 
 
 def metrics(world, samples, period, settle, noise=None, rtol=1e-9, numbers=None):
-    """The metrics of `samples` sample periods from rest; `noise[k]`: errors of z, z_dot, i held over sample k.
+    """Return the metrics of `samples` sample periods from rest.
 
-    `numbers` makes others of the solution.
+    `noise[k]`: errors of z, z_dot, i, held over sample k. `numbers` computes other quantities from the solution.
     """
     numbers = numbers or _numbers
     t = np.arange(samples + 1) * period
@@ -83,12 +87,15 @@ def _sigma(world, t, x):
 
 
 def _singular(plant, z, i_ref):
-    """What Eq. (9) says is 0 on C; positive on the side of the origin."""
+    """Return the expression of Eq. (9): 0 on C, positive on the side of the origin."""
     return z * z + 2 * plant.s_0 * i_ref * z / plant.i_0 + plant.s_0 * plant.s_0
 
 
 def _magnet(plant, z, i):
-    """The larger flux density of the two cores (T), and the force (N): mu_0 n i/(2 gap), and A B^2/mu_0 of each."""
+    """Return the larger flux density of the two cores (T), and the force (N).
+
+    The flux density is mu_0 n i/(2 gap), and the force of each core A B^2/mu_0.
+    """
     densities = [
         plant.mu_0 * plant.n * current / (2 * gap)
         for current, gap in ((plant.i_0 + i, plant.s_0 - z), (plant.i_0 - i, plant.s_0 + z))
@@ -151,9 +158,10 @@ def _numbers(rows, squares, integrals, samples, settle, stop, lost_at, gone):
 
 
 def costs(rows, squares, integrals, samples, settle, stop, lost_at, gone, *, s_0, u_scale, near, band):
-    """What the tuner counts and limits, of a rotor that is held; clearance to a stop at `near`, settling in `band`.
+    """Return the terms of the loss and the limited quantities of the tuner, for a rotor that is held.
 
-    What it reads at the samples is read there; settling and overshoot, which it reads there too, at all steps.
+    The clearance is relative to a stop at `near`, and the settling to `band`. Quantities that the tuner evaluates at
+    the samples are evaluated at the samples here too, except settling and overshoot, which are evaluated at all steps.
     """
     assert gone is None
     t, z, e_z = rows.T[:3]

@@ -20,7 +20,7 @@ fs.writeFileSync(to, Buffer.from(Float64Array.from(found).buffer));
 
 
 def run_rows(text, rows, folder):
-    """What the function `run` of a script returns for each row [points, numbers]."""
+    """Return the results of the function `run` of a script for each row [points, numbers]."""
     assert NODE is not None
     (folder / "run.js").write_text('"use strict";\n' + text + HARNESS)
     np.ascontiguousarray(rows, np.float64).tofile(folder / "rows")

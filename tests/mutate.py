@@ -34,7 +34,7 @@ KILLED, SURVIVED = "killed", "SURVIVED"
 
 def mutated(mutation: Mutation, root: pathlib.Path = ROOT) -> str:
     """Return the text of the mutated file. Raises ValueError if the mutation does not fit the file."""
-    path, where = root / mutation.file, f"{mutation.file}: '{mutation.says}'"
+    path, where = root / mutation.file, f"{mutation.file}: '{mutation.fault}'"
     if not path.exists():
         raise ValueError(f"{where}: there is no such file. Adapt it in tests/mutations.py.")
     text = path.read_text(encoding="utf-8")
@@ -51,7 +51,7 @@ def mutated(mutation: Mutation, root: pathlib.Path = ROOT) -> str:
 def sample(mutations: Sequence[Mutation], share: int, root: pathlib.Path = ROOT) -> list[Mutation]:
     """Return one mutation in `share`, by checksums of their names and of the files that they change."""
     text = {name: (root / name).read_text(encoding="utf-8") for name in {m.file for m in mutations}}
-    return [m for m in mutations if zlib.crc32(f"{m.says}\n{text[m.file]}".encode()) % share == 0]
+    return [m for m in mutations if zlib.crc32(f"{m.fault}\n{text[m.file]}".encode()) % share == 0]
 
 
 def parent() -> Parent:
@@ -79,7 +79,7 @@ def run(forks: Parent, root: pathlib.Path, change: Mutation | None, *words: str)
 
 
 def verdict(mutation: Mutation, root: pathlib.Path, forks: Parent) -> str:
-    """Return KILLED, SURVIVED, or a text that says why the test gave no verdict."""
+    """Return KILLED, SURVIVED, or a text with the reason why the test gave no verdict."""
     code, output = run(forks, root, mutation, "-n", "0", mutation.test)
     if code in (PASSED, FAILED):
         return SURVIVED if code == PASSED else KILLED
@@ -124,14 +124,14 @@ def _hunt(
             found = verdict(mutation, root, forks)
         finally:
             free.put(forks)
-        say(f"{found}, {time.perf_counter() - began:.0f} s: {mutation.says} [{mutation.test}]")
+        say(f"{found}, {time.perf_counter() - began:.0f} s: {mutation.fault} [{mutation.test}]")
         return found
 
     # Mutants of one test file run next to each other: they share compiled programs.
     ordered = sorted(mutations, key=lambda mutation: mutation.test)
     with ThreadPoolExecutor(len(parents)) as pool:
         found = list(pool.map(one, ordered))
-    left = [mutation.says for mutation, what in zip(ordered, found, strict=True) if what != KILLED]
+    left = [mutation.fault for mutation, what in zip(ordered, found, strict=True) if what != KILLED]
     say(f"{len(ordered) - len(left)} of {len(ordered)} mutations were killed. {'; '.join(left)}".rstrip())
     return int(bool(left))
 
@@ -142,7 +142,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--share", type=int, default=1, metavar="K", help="one in K mutations only (default 1: all)")
     parser.add_argument("words", nargs="*", metavar="WORD", help="only mutations whose text has one of these")
     args = parser.parse_args(argv)
-    chosen = [m for m in MUTATIONS if not args.words or any(w in f"{m.says} {m.file} {m.test}" for w in args.words)]
+    chosen = [m for m in MUTATIONS if not args.words or any(w in f"{m.fault} {m.file} {m.test}" for w in args.words)]
     if not chosen:
         parser.error(f"no mutation has {' or '.join(args.words)} in its text.")
     return hunt(sample(chosen, max(args.share, 1)), jobs=args.jobs, say=lambda text: print(text, flush=True))

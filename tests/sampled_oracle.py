@@ -74,7 +74,10 @@ class World:
 
 @dataclass(frozen=True)
 class Run:
-    """Rows [samples] at t_n, NaN after the loss; `seen` [samples, 3]: z, z_dot, i as the laws took them; times in s."""
+    """Rows [samples] at t_n, NaN after the loss; times in s.
+
+    `seen` [samples, 3]: z, z_dot, i as the laws receive them.
+    """
 
     t: np.ndarray
     z: np.ndarray
@@ -115,7 +118,7 @@ def _measurement(world, output, errors):
 
 
 def conversion(x, bits, limit):
-    """What a converter of `bits` bits over +-limit gives for x; x itself without bits."""
+    """Return the output of a converter of `bits` bits over +-limit; x itself without bits."""
     if bits is None:
         return x
     code = round(x * 2 ** (bits - 1) / limit)
@@ -224,7 +227,10 @@ class TwoCoil:
 
 
 class Driven:
-    """A plant behind its amplifier and its position sensor's low-pass: its y, then those that there are of theirs."""
+    """A plant with an amplifier and the low-pass of its position sensor.
+
+    The state is that of the plant, then those of the other two, if present.
+    """
 
     def __init__(self, world, plant):
         self.plant, self.body, self.stop, self.u_max, given = (
@@ -270,7 +276,7 @@ def sgn(x, p):
 
 
 def relax(w, h, p):
-    """The w+ with w+ + h sgn_p(w+) = w, to rounding; for p = inf of the set-valued sign."""
+    """Return w+ with w+ + h sgn_p(w+) = w, to rounding; for p = inf with the set-valued sign."""
     y = max(abs(w) - h, 0.0)
     if p < math.inf and h < math.inf:
         # y + h sgn_p(y) - |w| rises and is concave: Newton's steps from the left never pass the root
@@ -294,7 +300,7 @@ def twist(x, state, k_1, k_2, T):
 
 
 def current_for(body, z, v):
-    """The current that gives v at z, of the two the one that continues that of z = 0. Eq. (3)."""
+    """Return the current that gives v at z, on the branch of the root that is continuous from z = 0. Eq. (3)."""
     upper, lower = (body.s_0 - z) ** -2, (body.s_0 + z) ** -2
     half, curve, rest = body.i_0 * (upper + lower), upper - lower, body.i_0**2 * (upper - lower) - v
     square = half * half - curve * rest
@@ -322,7 +328,7 @@ def robust_differentiator(f, x, L, T):
 
 
 class Velocity:
-    """What an observer without a measured velocity makes of the samples of z and i: z, z_dot."""
+    """An observer without a measured velocity: z and z_dot from the samples of z and i."""
 
     def __init__(self, world, acceleration):
         (self.kind, gains), self.T, self.acceleration = world.observer, world.period, acceleration
@@ -366,7 +372,7 @@ class Velocity:
 
 
 class Controller:
-    """The cascade: states of its laws, and the voltages that it gave."""
+    """The cascade: the states of its laws, and the voltages that it computed."""
 
     def __init__(self, world):
         self.world, self.model = world, Lumped(World(plant=world.plant | world.model))
@@ -378,7 +384,7 @@ class Controller:
         self.expected, self.left, self.refused, self.i_ref_shown = (0.0, 0.0, 0.0), 0, 0, 0.0
 
     def sample(self, n, measured):
-        """`step` behind the guard."""
+        """Apply the guard to the readings, and call `step` with the result."""
         guard, T, body = self.world.guard, self.world.period, self.model.body
         if guard is None:
             return self.step(n, measured)
@@ -409,7 +415,11 @@ class Controller:
         return self.voltages[n] if n >= 0 else 0.0
 
     def step(self, n, measured):
-        """i_ref before its step, u_n, v_star, whether the curve C is crossed, the (z, z_dot, i) that the laws took."""
+        """Return the result of one step of the laws.
+
+        It is i_ref before the step, u_n, v_star, whether the curve C is crossed, and the (z, z_dot, i) used by the
+        laws.
+        """
         world = self.world
         estimate = self._estimate(measured)
         self.velocity_now = estimate[1]
@@ -441,7 +451,7 @@ class Controller:
         return y
 
     def _share(self, w, h, p):
-        """(w - relax(w, h, p)) / h without its cancellation; sgn_p(w) where explicit."""
+        """Return (w - relax(w, h, p)) / h without cancellation; sgn_p(w) for explicit steps."""
         if not self.implicit or h == 0:
             return sgn(w, p)
         return min(max(w / h, -1.0), 1.0) if p == math.inf else sgn(relax(w, h, p), p)
@@ -460,7 +470,7 @@ class Controller:
         return (-body.stiffness * z - gains["c"] * (z_dot - r_dot) + r_ddot + body.g + robust) / body.a
 
     def _inversion(self, z, v_star):
-        """i_ref of the next sample."""
+        """Return i_ref of the next sample."""
         (kind, gains), T, body = self.world.inversion, self.world.period, self.model.body
         w, gamma, p = v_star - body.v(z, self.i_ref), gains.get("gamma", math.inf), gains.get("p", math.inf)
         if kind == "adaptive" and not self.implicit:

@@ -51,7 +51,10 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 def refusal(text, name="case.toml"):
-    """The message with which a file of this text is refused; it is one line and names the file."""
+    """Return the message with which a file of this text is refused.
+
+    Checks that the message is one line and names the file.
+    """
     with pytest.raises(ValueError, match=r"^case\.toml: ") as refused:
         read_case(write(text, name))
     assert str(refused.value).isprintable()
@@ -130,12 +133,12 @@ def test_a_metric_that_is_not_a_number_is_refused(name, value, capsys, monkeypat
 
     monkeypatch.setattr(simulate, "_simulated", broken)
     assert main(["simulate", write(SHORT), "--out", "broken"]) == 2
-    assert f"case.toml: {name}: this run gave no finite number" in capsys.readouterr().err
+    assert f"case.toml: {name}: not finite in this run" in capsys.readouterr().err
     assert not pathlib.Path("broken/metrics.json").exists()
 
 
 def records():
-    """Every record with numbers that there is, but for distributions: theirs have the ends of what they spread."""
+    """Return every record with numbers, except distributions, whose ranges are those of the spread numbers."""
     for package in (ambjax, tuning):
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             if not module.name.endswith("__main__"):
@@ -144,7 +147,7 @@ def records():
                 yield from (kind for kind in own if dataclasses.is_dataclass(kind) and not hasattr(kind, "quantile"))
 
 
-def test_every_number_has_both_ends():
+def test_every_number_has_a_lower_and_an_upper_bound():
     found = [(kind, field) for kind in records() for field in dataclasses.fields(kind) if field.metadata.get("leaf")]
     assert {Plant, TwoCoil, Amplifier, Sensor, Processor, Clock, Scenario, Step, Loss} < {kind for kind, _ in found}
     for kind, field in found:
@@ -217,7 +220,7 @@ def test_a_reference_beyond_the_clearance_is_refused(case):
 
 
 @pytest.mark.parametrize("case", NEAR)
-def test_a_reference_within_the_clearance_is_not(case):
+def test_a_reference_within_the_clearance_is_accepted(case):
     read_case(write(NEAR[case]))
 
 
@@ -241,7 +244,7 @@ def test_a_reference_within_the_clearance_is_not(case):
     ],
     ids=str,
 )
-def test_the_span_of_a_signal_is_what_it_takes(signal):
+def test_the_span_of_a_signal_contains_exactly_its_values(signal):
     values = np.asarray(signal(np.linspace(0.0, 1.0, 200_001)))
     low, high = signal.span(1.0)
     # the instants are 5e-6 s apart, and no signal here moves faster than 40 1/s: 1e-4 at jumps of none
@@ -250,7 +253,7 @@ def test_the_span_of_a_signal_is_what_it_takes(signal):
     assert values.max() - 1e-12 <= high
 
 
-def test_the_span_of_an_ensemble_holds_every_member():
+def test_the_span_of_an_ensemble_contains_every_member():
     amplitudes = np.array([1.0, 2.0, -3.0])
     assert Sine(amplitudes, 5.0).span(1.0) == (-3.0, 3.0)
     assert Sum((Step(amplitudes), Step(1.0))).span(1.0) == (-2.0, 3.0)
@@ -267,7 +270,7 @@ DOUBTS = {
     "initial current": ("[initial]\ni = 0.3", "initial.i = 0.3 A", "plant.i_0 = 0.25 A"),
     "weight beyond the bias": ("[plant]\nm = 588.0", "takes 1.741 A", "plant.i_0 = 0.25 A"),
     "supply too weak": ("[actuator]\nu_max = 0.01", "actuator.u_max = 0.01 V", "0.07215 V that hold"),
-    "stiffness the wrong way": ("[plant]\nk_z = 754.0", "plant.k_z = 754", "restores"),
+    "stiffness the wrong way": ("[plant]\nk_z = 754.0", "plant.k_z = 754", "restoring"),
     "milliseconds": ("[sensor]\nstd = 1e-6\n[clock]\nsample_period = 0.1", "clock.sample_period = 0.1 s", "unstable"),
     "noise that may go far": (
         '[reference]\nkind = "band-noise"\nstd = 6e-4\nf_low = 1\nf_high = 99',
@@ -278,7 +281,7 @@ DOUBTS = {
 
 
 @pytest.mark.parametrize("case", DOUBTS)
-def test_what_is_hardly_meant_is_said(case):
+def test_unlikely_values_cause_one_warning(case):
     text, *wanted = DOUBTS[case]
     found = warnings_of(read_case(write(text)))
     said = [line for line in found if wanted[0] in line]
@@ -287,7 +290,7 @@ def test_what_is_hardly_meant_is_said(case):
         assert part in said[0]
 
 
-def test_numbers_that_stay_the_paper_s_are_named():
+def test_warnings_list_plant_numbers_with_the_paper_s_value():
     given = "m = 0.4\ns_0 = 4e-4\ni_0 = 0.5\nn = 200\nk_z = -100.0\nR = 2.0\n"
     first, *_ = warnings_of(read_case(write(f"[plant]\n{given}")))
     assert first == (
@@ -301,7 +304,7 @@ def test_numbers_that_stay_the_paper_s_are_named():
         assert not any("the paper's values" in line for line in warnings_of(read_case(write(text))))
 
 
-def test_what_no_real_bearing_has_is_named():
+def test_a_warning_names_idealised_parts_of_the_case():
     coils, measured = (
         "[plant]\nkind = 'two-coil'\n",
         "[sensor]\nvelocity = false\n[controller.observer]\nkind = 'kalman'\n",
@@ -324,7 +327,7 @@ STOPS = {
 
 
 @pytest.mark.parametrize("command", STOPS)
-def test_every_command_names_what_stays_the_paper_s(command, capsys, monkeypatch):
+def test_every_command_warns_of_numbers_with_the_paper_s_value(command, capsys, monkeypatch):
     argv, stop = STOPS[command]
 
     def stopped(*_, **more):
@@ -347,7 +350,7 @@ def test_the_papers_cases_have_no_warnings(name):
 
 
 @pytest.mark.slow
-def test_a_run_whose_current_exceeds_the_bias_says_so_once(capsys):
+def test_a_current_above_the_bias_causes_one_warning(capsys):
     over, under = (
         write(SHORT + f"[initial]\ni = {i}\n", f"{name}.toml") for name, i in (("over", 0.26), ("under", 0.24))
     )
@@ -373,7 +376,7 @@ def test_a_logarithmic_spread_of_400_decades_does_not_overflow():
     np.testing.assert_allclose(np.log10(values), 400 * u - 200, atol=1e-9)
 
 
-def test_as_many_spreads_as_there_are_numbers_can_be_read():
+def test_every_number_can_have_a_spread():
     model, plant = (
         [f"{where}.{field.name}" for field in dataclasses.fields(Plant) if field.metadata.get("leaf")]
         for where in ("controller.model", "plant")
@@ -388,7 +391,7 @@ def test_as_many_spreads_as_there_are_numbers_can_be_read():
 # --- names ---
 
 
-def test_a_hostile_name_enters_nothing(capsys):
+def test_special_characters_of_a_file_name_are_removed_or_escaped(capsys):
     name = "a\n\x7f<b>|$x$&.toml"
     case = read_case(write(SHORT, name))
     assert case.name == "a_b_x_"
@@ -408,7 +411,7 @@ def test_the_byte_order_mark_of_an_editor_is_ignored(tmp_path):
 
 
 @pytest.mark.parametrize("code", [*range(32), 0x7F, 0x85, 0x2028, 0xDCFF])
-def test_no_control_character_makes_toml_that_cannot_be_read(code):
+def test_control_characters_are_escaped_in_the_written_toml(code):
     text = f"a{chr(code)}b"
     written = tuned("a = 1 # kept", {"b": 2.0}, text, f"first{text}\nsecond")
     assert tomllib.loads(written.encode("utf-8").decode("utf-8")) == {"a": 1, "b": 2.0}
@@ -436,7 +439,7 @@ MAPS = {
 
 
 @pytest.mark.parametrize("what", ARGUMENTS)
-def test_arguments_that_cannot_be_meant(what, capsys):
+def test_impossible_arguments_are_refused_in_one_line(what, capsys):
     argv, wanted = ARGUMENTS[what]
     write(SHORT)
     assert main(argv) == 2
@@ -449,7 +452,7 @@ def test_arguments_that_cannot_be_meant(what, capsys):
 
 
 @pytest.mark.parametrize("what", MAPS)
-def test_axes_that_cannot_be_meant(what, capsys):
+def test_impossible_axes_are_refused_in_one_line(what, capsys):
     axis, wanted = MAPS[what]
     path = write("[clock]\nduration = 2.0\n")
     for flags in (["--x", axis, "--y", "initial.z=-1e-4:1e-4:3"], ["--y", axis, "--x", "initial.z=-1e-4:1e-4:3"]):
@@ -473,7 +476,7 @@ def test_a_finished_study_is_not_mixed_with_a_simulation(capsys):
         assert [p.name for p in folder.iterdir()] == [kept]
 
 
-def test_a_member_of_noise_alone_is_a_member():
+def test_member_is_accepted_if_only_the_noise_varies():
     path = write(SHORT + "[sensor]\nstd = 1e-9\n")
     assert simulate._study(read_case(path), parser().parse_args(["simulate", path, "--member", "3"])) is not None
 
@@ -481,7 +484,7 @@ def test_a_member_of_noise_alone_is_a_member():
 # --- disks and streams ---
 
 
-def test_a_full_disk_leaves_nothing_that_looks_finished(monkeypatch, capsys):
+def test_a_full_disk_leaves_no_partial_results(monkeypatch, capsys):
     path = write(SHORT)
 
     def full(*args, **more):
@@ -495,7 +498,7 @@ def test_a_full_disk_leaves_nothing_that_looks_finished(monkeypatch, capsys):
     assert not pathlib.Path("there").exists()
 
 
-def test_files_are_there_together_or_not_at_all(tmp_path):
+def test_all_files_are_written_or_none(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "a").write_text("old")
@@ -525,7 +528,7 @@ def shell(command):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device of Linux")  # noqa: PTH110
-def test_a_stdout_that_takes_nothing_is_one_line():
+def test_a_failed_write_to_stdout_is_reported_in_one_line():
     done = shell("AMBJAX template > /dev/full")
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
@@ -533,7 +536,7 @@ def test_a_stdout_that_takes_nothing_is_one_line():
 
 
 @pytest.mark.slow
-def test_closed_streams_change_nothing():
+def test_closed_standard_streams_do_not_change_the_results():
     path = write(SHORT)
     assert main(["simulate", path, "--out", "a"]) == 0
     done = shell("AMBJAX simulate case.toml --out b --json <&- >&- 2>&-")
@@ -546,7 +549,7 @@ def test_closed_streams_change_nothing():
 
 
 def uncommented(name):
-    """The template's table [tune] with every line of it in force, as tomllib reads it."""
+    """Return the template's table [tune] with all lines uncommented, as parsed by tomllib."""
     head, _, tail = template(name).partition("# [tune]")
     lines = ("[tune]" + tail).splitlines()
     return tomllib.loads(head + "\n".join(line.removeprefix("# ") for line in lines))
@@ -574,7 +577,7 @@ def test_the_template_lists_every_key_of_tune_with_its_default(name):
     assert ours == left_out
 
 
-def test_the_tuner_names_the_file_in_one_line(capsys):
+def test_the_error_of_the_tuner_names_the_case_file(capsys):
     assert tune([write('[tune]\n"a\\nb" = 1\n')]) == 2
     err = capsys.readouterr().err
     assert err.startswith("ambjax-tune: case.toml: tune.a\\nb = 1: unknown key")

@@ -191,7 +191,7 @@ def nested(document):
 
 
 def spots(node, found):
-    """Every (table or list, key) of a document."""
+    """Return every (table or list, key) of a document."""
     items = node.items() if isinstance(node, dict) else enumerate(node)
     for key, value in items:
         found.append((node, key))
@@ -202,7 +202,10 @@ def spots(node, found):
 
 @st.composite
 def texts(draw_from):
-    """The text of a case file: a valid structure, in half of them with up to three wounds; now and then nonsense."""
+    """Return the text of a case file with a valid structure.
+
+    Half of the files have up to three random errors, and some are nonsense.
+    """
     if draw_from(st.integers(0, 30)) == 0:
         return draw_from(
             st.one_of(
@@ -234,7 +237,7 @@ def texts(draw_from):
 
 @dataclasses.dataclass
 class Tally:
-    """What became of the files, and the structures that have been compiled."""
+    """The number of files with each result, and the structures that have been compiled."""
 
     refused: int = 0
     read: int = 0
@@ -243,7 +246,10 @@ class Tally:
 
 
 def hold(text, path, tally, run):
-    """A file with this text is refused in one line that names it, or it is read, drawn from and, if `run`, run."""
+    """Check that a file with this text is refused in one line that names it, or is read and drawn from.
+
+    With `run`, a file that is read is also simulated.
+    """
     path.write_text(text, encoding="utf-8", errors="surrogatepass")
     try:
         case, tune, _ = read_tune(path) if "[tune" in text else (read_case(path), None, None)
@@ -286,7 +292,7 @@ def path(tmp_path):
     return pathlib.Path(tmp_path) / "case.toml"
 
 
-def test_three_hundred_files_are_read_or_refused(path):
+def test_three_hundred_changed_files_are_read_or_refused_in_one_line(path):
     tally = Tally()
 
     @settings(max_examples=300, **PROFILE)
@@ -300,7 +306,7 @@ def test_three_hundred_files_are_read_or_refused(path):
 
 
 @pytest.mark.slow
-def test_files_run_or_are_refused(path):
+def test_changed_files_are_simulated_or_refused(path):
     tally, count = Tally(), examples(1_200, 8_000)
 
     @settings(max_examples=count, **PROFILE)

@@ -28,7 +28,7 @@ LATE = [0.0, 0.2, 0.25, 0.4, 0.5, 0.8, 1.0, 1.3, 1.5, 2.0]
 
 
 def roots(a, late):
-    """Of x_{n+1} = x_n - a x(n - late), x between samples on the straight line, by the polynomial written out."""
+    """Return the roots of x_{n+1} = x_n - a x(n - late), with x interpolated linearly, from the explicit polynomial."""
     whole, share = int(late), late - int(late)
     coefficients = np.zeros(whole + 3)
     coefficients[[0, 1]] = 1.0, -1.0
@@ -38,7 +38,7 @@ def roots(a, late):
 
 
 @pytest.mark.parametrize("late", LATE)
-def test_limits_are_where_the_recursion_turns_unstable_and_begins_to_oscillate(late):
+def test_slope_limits_are_the_stability_and_oscillation_limits_of_the_recursion(late):
     stable, quiet = slope_limits(late)
     assert np.abs(roots(0.999 * stable, late)).max() < 1 < np.abs(roots(1.001 * stable, late)).max()
     # of two roots that meet, what rounding leaves of their imaginary parts is its square root
@@ -49,13 +49,13 @@ def test_limits_are_where_the_recursion_turns_unstable_and_begins_to_oscillate(l
     assert (np.abs(after.imag) > 1e-4).any() or after.real.min() < 0
 
 
-def test_limits_in_round_numbers():
+def test_slope_limits_without_delay_and_with_one_sample():
     assert slope_limits(0.0) == (2.0, 1.0)
     assert slope_limits(1.0) == (1.0, 0.25)
 
 
 def driven(implicit, T, k, p, w, x, steps=400):
-    """x of x_{n+1} = x_n - T k s_n + T w_n: the relay itself by a clip, the smoothed sign by bisection."""
+    """Return x of x_{n+1} = x_n - T k s_n + T w_n: the relay by clipping, the smoothed sign by bisection."""
     sign = lambda x: np.sign(x) if math.isinf(p) else 2 / np.pi * np.arctan(p * x)  # noqa: E731
 
     def used(x):
@@ -77,7 +77,7 @@ def driven(implicit, T, k, p, w, x, steps=400):
 
 @pytest.mark.parametrize("p", [INF, 300.0, 30.0])
 @pytest.mark.parametrize("implicit", [True, False])
-def test_a_sign_law_stays_in_its_band_and_fills_it(implicit, p):
+def test_a_sign_law_stays_in_its_band_and_reaches_its_ends(implicit, p):
     k, W, T = 20.0, 6.0, 1e-3
     relay = Relay(k, None if math.isinf(p) else p)
     limit = band(relay, W, T, implicit)
@@ -95,7 +95,7 @@ def test_a_sign_law_stays_in_its_band_and_fills_it(implicit, p):
     assert max(np.abs(x[200:]).max() for x in runs) >= (0.999 if implicit else 0.3) * limit
 
 
-def test_no_band_where_the_gain_does_not_exceed_the_disturbance():
+def test_the_band_is_infinite_if_the_gain_does_not_exceed_the_disturbance():
     assert band(Relay(20.0, None), 20.0, 1e-3, implicit=True) == INF
 
 
@@ -114,7 +114,10 @@ CLOCK, LONG = (amb.Clock(samples, 1e-4, amb.RK4(4)) for samples in (600, 3000))
 
 
 def random_loop(name, draw):
-    """A loop of one of three structures, so that a few programs serve all: cascade, scenario."""
+    """Return the cascade and the scenario of a random loop.
+
+    It has one of three structures, so that few programs are compiled.
+    """
     c, k, k_i = 10 ** draw.uniform(1.2, 3.0), 10 ** draw.uniform(0.5, 2.5), 10 ** draw.uniform(2.3, 3.5)
     gamma, p = 10 ** draw.uniform(5.0, 7.0), 10 ** draw.uniform(0.5, 2.0)
     world = {"reference": amb.Sine(draw.uniform(0.5e-3, 2.5e-3), 2.0), "u_max": draw.uniform(100.0, 2e3)}
@@ -135,15 +138,15 @@ def random_loop(name, draw):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["estimated, two coils", "late, amplifier", "explicit"])
-def test_no_bound_is_exceeded_by_what_stands_beside_it(name):
-    """And words and verdict are of one fact. What is measured and what is bounded differ by rounding: 1e-12."""
+def test_measured_signals_do_not_exceed_their_bounds(name):
+    """The text and the verdict also agree. The tolerance 1e-12 is for rounding."""
     draw, bounds = np.random.default_rng(7), 0
     for _ in range(10):
         cascade, world = random_loop(name, draw)
         sampled = sampled_report.check_sampled(cascade, world, CLOCK, 0.02)
         for line in sampled.bands:
             assert line.computed <= line.band * (1 + 1e-12), line
-            assert line.seen <= line.bound * (1 + 1e-12), line
+            assert line.largest <= line.bound * (1 + 1e-12), line
             assert math.isinf(line.band) == (line.gain <= line.disturbance)
             bounds += not math.isinf(line.band)
         said = advice.processor_lines(sampled, Delays(2.0, None, None, 0.1), None)
@@ -151,48 +154,48 @@ def test_no_bound_is_exceeded_by_what_stands_beside_it(name):
     assert bounds >= 5
 
 
-def test_bounds_are_close_where_nothing_is_estimated():
-    """The sign itself, implicit: what is left is what disturbs it in a sample; of a smoothed one no less than half."""
+def test_bounds_are_tight_without_an_estimate():
+    """An implicit set-valued sign reaches its bound. With smoothed signs, the signal reaches at least half of it."""
     for gains, share in ((HARD, 0.999), (SOFT, 0.5)):
         lines = sampled_report.check_sampled(cascade_of(*gains, delay=0.0), WORLD, LONG, 0.1).bands
         assert [line.signal for line in lines] == ["sigma", "v_tilde", "e"]
         for line in lines:
             # u is 0 before the first sample, so the sensors' signals are the plant's: nothing is off but i_ref's sample
-            assert line.off == 0.0
-            assert share * line.bound <= line.seen <= line.bound * (1 + 1e-12), line
+            assert line.difference == 0.0
+            assert share * line.bound <= line.largest <= line.bound * (1 + 1e-12), line
         # the theorem's own Delta_1 on this reference is 6.231e4, at 0.25 s
         assert lines[1].disturbance == pytest.approx(6.231e4, rel=0.05)
 
 
-def test_a_signal_that_has_not_reached_its_band_is_bounded_by_where_it_is():
+def test_a_signal_outside_its_band_is_bounded_by_its_value_at_settle():
     world = dataclasses.replace(WORLD, initial=amb.Initial(1e-3))
     (line, *_) = sampled_report.check_sampled(cascade_of(*HARD, delay=0.0), world, LONG, 0.004).bands
     assert "not reached" in line.note
     assert line.computed == line.band
 
 
-def test_an_implicit_step_is_no_steeper_than_one():
-    """a/(1 + a): stable unless the sign itself is a sample late."""
+def test_the_effective_slope_of_an_implicit_step_is_at_most_one():
+    """It is a/(1 + a), which is stable unless the sign acts one sample late."""
     hard, soft = cascade_of(*HARD, delay=1.0), cascade_of(*SOFT, delay=1.0, predict=False)
     late = dataclasses.replace(hard, processor=Processor(1.0, predict=False))
-    assert [slope.stepped for slope in slopes.slope_checks(hard, CLOCK)] == [1.0, 1.0, 1.0]
+    assert [slope.effective_slope for slope in slopes.slope_checks(hard, CLOCK)] == [1.0, 1.0, 1.0]
     assert [slope.holds for slope in slopes.slope_checks(hard, CLOCK)] == [True, True, True]
     assert [slope.holds for slope in slopes.slope_checks(late, CLOCK)] == [False, True, False]
     for slope in slopes.slope_checks(soft, CLOCK):
         assert slope.holds
-        assert slope.stepped == pytest.approx(slope.slope / (1 + slope.slope))
+        assert slope.effective_slope == pytest.approx(slope.slope / (1 + slope.slope))
     # what stays explicit in the position law, c T, may be all that is steep
     (position, *_) = slopes.slope_checks(cascade_of(3e4, 25.0, 2e6, 2000.0, 25.0), CLOCK)
-    assert position.stepped == pytest.approx(3.0)
+    assert position.effective_slope == pytest.approx(3.0)
     assert not position.holds
 
 
-def test_noise_disturbs_and_its_lines_stand_beside_those_without():
+def test_the_bands_are_reported_without_noise_and_with_it():
     noisy = dataclasses.replace(WORLD, sensor=amb.Sensor(1e-6, 1e-4, 1e-4))
     lines = sampled_report.check_sampled(cascade_of(*HARD, delay=1.0), noisy, CLOCK, 0.02).bands
     assert [line.noise for line in lines] == [False] * 3 + [True] * 3
     for one, other in zip(lines[:3], lines[3:], strict=True):
-        assert other.seen > 5 * one.seen
+        assert other.largest > 5 * one.largest
         assert other.disturbance > 5 * one.disturbance
 
 
@@ -215,7 +218,7 @@ class Static(InversionLaw):
         return self.law(model, inputs, state)
 
 
-def test_a_voltage_that_alternates_is_remarked_on():
+def test_an_alternating_voltage_is_reported():
     world = dataclasses.replace(WORLD, u_max=200.0)
     laws = {"chatters": Static(), "steps": amb.inversion.ClosedForm()}
     found = {}
@@ -229,7 +232,7 @@ def test_a_voltage_that_alternates_is_remarked_on():
         assert ("The voltage alternates" in said) == (name == "chatters")
 
 
-def test_alternation_is_what_it_says():
+def test_alternation_is_1_for_an_alternating_voltage_and_sin_squared_for_a_sine():
     n = np.arange(1000)
     assert sampled_report.alternation((-1.0) ** n) == pytest.approx(1.0)
     for cycles in (10, 100, 250):  # a sine of f has sin(pi f T)^2, whole periods
@@ -242,7 +245,7 @@ def test_alternation_is_what_it_says():
 BEYOND = amb.Scenario(reference=amb.Constant(2e-3), initial=amb.Initial(2e-3, 0.0, -0.1), sensor=amb.Sensor(0.0, 1e-2))
 
 
-def test_the_singular_curve_is_judged_on_the_processor_s_run():
+def test_the_distance_to_the_singular_curve_is_that_of_the_sampled_run():
     clock, world = amb.Clock(300, 1e-4), dataclasses.replace(BEYOND, u_max=500.0)
     crossing = cascade_of(200.0, 1000.0, 1e8, 2000.0, INF, delay=0.0)
     sampled = sampled_report.check_sampled(crossing, world, clock, 0.005)
@@ -276,7 +279,7 @@ def test_the_margin_is_between_a_delay_that_holds_and_one_that_does_not():
     assert 0.5 < beyond.held < beyond.lost < 1.1
 
 
-def test_a_delay_that_the_prediction_does_not_know_has_a_margin_of_its_own():
+def test_the_delay_margin_without_a_known_delay_is_smaller():
     cascade, clock = cascade_of(*HARD, delay=1.0), amb.Clock(600, 1e-4, amb.RK4(1))
     margin = delay_margin(cascade, WORLD, clock, known=False)
     # a prediction that knows it holds the rotor up to 2 samples
@@ -285,7 +288,7 @@ def test_a_delay_that_the_prediction_does_not_know_has_a_margin_of_its_own():
     assert delay_margin(cascade, gone, clock, known=False).held is None
 
 
-def test_a_delay_that_is_assumed_right_is_the_delay():
+def test_an_assumed_delay_equal_to_the_delay_changes_nothing():
     rows = [
         amb.rollout(cascade_of(*HARD, delay=1.0, **more), WORLD, amb.Clock(100, 1e-4)).trajectory.rows.u
         for more in ({}, {"assumed": 1.0})
@@ -295,7 +298,7 @@ def test_a_delay_that_is_assumed_right_is_the_delay():
 
 
 def test_a_loss_in_a_narrow_interval_of_delays_is_found(monkeypatch):
-    """A stand-in for the loop, lost from 0.704 to 0.716 samples alone, and a delay whose run stalls."""
+    """The loop is replaced by one that is lost from 0.704 to 0.716 samples only, and stalls at one delay."""
     monkeypatch.setattr(searched, "run_ensemble", delays)
     delays.stalled, delays.lost = (-1.0, -1.0), (0.704, 0.716)
     cascade, clock = cascade_of(*HARD, delay=0.0), amb.Clock(300, 1e-4, amb.RK4(1))
@@ -304,7 +307,7 @@ def test_a_loss_in_a_narrow_interval_of_delays_is_found(monkeypatch):
 
 
 def test_a_delay_whose_run_stalls_is_neither_held_nor_lost(monkeypatch):
-    """A stand-in for the loop, lost from 1.5 samples on and given up between 0.6 and 0.9: the margin says both."""
+    """The loop is replaced by one that is lost from 1.5 samples on and stalls between 0.6 and 0.9."""
     monkeypatch.setattr(searched, "run_ensemble", delays)
     delays.stalled, delays.lost = (0.6, 0.9), (1.5, INF)
 
@@ -322,20 +325,20 @@ def test_a_delay_whose_run_stalls_is_neither_held_nor_lost(monkeypatch):
     delays.stalled, delays.lost = (0.0, 3.0), (3.0, INF)
     assert margin(0.0)[:3] == (None, None, 0.0)
     words = advice.processor_lines(SampledReport([], [], math.inf, ""), margin(0.0), None)[-1]
-    assert words.startswith("Delay margin: the rotor is not decided at 0, where the integrator stalled (tried")
+    assert words.startswith("Delay margin: the rotor is not decided at 0, where the integrator stalled (tested")
     words = advice.processor_lines(SampledReport([], [], math.inf, ""), Delays(0.5, 1.5, 0.75, 0.1), None)[-1]
     assert "held up to 0.5 samples, not decided at 0.75, where the integrator stalled, lost at 1.5" in words
 
 
 def delays(cascade, scenario, clock, *, fold):
-    """What `run_ensemble` says of each delay of a cascade."""
+    """Return the result of `run_ensemble` for each delay of a cascade."""
     late, (begin, end) = np.asarray(cascade.processor.delay), delays.stalled
     lost = (delays.lost[0] <= late) & (late <= delays.lost[1])
     code = np.where((begin <= late) & (late <= end), STALLED, np.where(lost, TOUCHED, ALIVE))
     return Outcome(Trajectory(None, np.where(code == ALIVE, np.inf, 0.01), code, np.inf), None)
 
 
-def test_a_stalled_run_on_a_processor_decides_nothing():
+def test_a_stalled_run_on_a_processor_is_reported_as_undecided():
     sampled = SampledReport([], [], 0.01, "stalled: ...", stalled=True)
     assert not sampled.holds
     said = " ".join(advice.processor_lines(sampled, Delays(None, None, 0.0, 0.1), None))
@@ -369,7 +372,7 @@ settle = 0.01
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("elsewhere")
-def test_check_says_no_where_an_explicit_slope_is_beyond_its_limit(capsys):
+def test_check_fails_if_an_explicit_slope_exceeds_its_limit(capsys):
     # gamma 2 p/pi T is 318; nothing loses the rotor in this time, the theorem's conditions hold, and the answer is no
     assert main(["check", write(CASE + 'discretisation = "explicit"\npredict = false\n')]) == 1
     said, _, theorem = capsys.readouterr().out.partition("Theorem 1:")
@@ -384,7 +387,7 @@ def test_check_says_no_where_an_explicit_slope_is_beyond_its_limit(capsys):
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("elsewhere")
-def test_check_says_yes_on_a_processor(capsys):
+def test_check_passes_for_a_stable_cascade_on_a_processor(capsys):
     assert main(["check", write(CASE), "--json"]) == 0
     out, progress = capsys.readouterr()
     assert [progress.count(part) for part in ("Theorem 1", "on the processor", "delay margin")] == [1, 1, 2]

@@ -91,7 +91,7 @@ BAD = {
 
 @pytest.mark.parametrize("command", ["simulate", "check"])
 @pytest.mark.parametrize("wrong", BAD)
-def test_bad_case_file_is_one_clear_line(wrong, command, capsys):
+def test_a_bad_case_file_is_refused_in_one_line(wrong, command, capsys):
     text, wanted = BAD[wrong]
     path = write(text)
     before = sorted(pathlib.Path().iterdir())
@@ -144,13 +144,13 @@ def test_bad_flags(argv, words, capsys):
     assert err.count("\n") == 1
 
 
-def test_without_a_command_the_first_ones_are_listed_in_order(capsys):
+def test_without_a_command_the_help_lists_the_first_commands(capsys):
     assert main([]) == 0
     listed = re.findall(r"^  ambjax (\w+)", capsys.readouterr().out, re.MULTILINE)
     assert listed == ["template", "simulate", "check", "tune", "export", "page"]
 
 
-def test_the_tuner_is_a_command_of_its_own_package(capsys):
+def test_ambjax_finds_the_tuner_in_its_own_package(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["tune", "--help"])
     assert stop.value.code == 0
@@ -178,7 +178,7 @@ def test_empty_file_gives_the_documented_defaults():
     assert (case.clock.samples, case.clock.sample_period) == (20_000, 1e-4)
 
 
-def test_every_kind_can_be_written():
+def test_every_kind_can_be_given_in_a_case_file():
     np.savez("k.npz", A=-1.0, B=1.0, C=1.0, D=1.0)
     for stage, kinds in KINDS.items():
         for kind, law in kinds.items():
@@ -257,8 +257,8 @@ def test_simulate_writes_what_is_documented(capsys):
 
 
 @pytest.mark.thorough
-def test_simulate_in_strokes_is_simulate_at_once(monkeypatch, capsys):
-    """Neither the stroke of the progress bar nor --json changes a bit of the result."""
+def test_progress_bar_and_json_do_not_change_the_results(monkeypatch, capsys):
+    """The results are equal bit by bit."""
     path = write(SHORT + "[sensor]\nstd = 1e-6\n")
     assert main(["simulate", path, "--out", "a", "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
@@ -282,7 +282,7 @@ def test_files_of_an_earlier_run_are_overwritten_only_with_force(capsys, tmp_pat
     assert pathlib.Path("out/metrics.json").read_text() == "old"
 
 
-def test_lost_rotor_exits_1_and_says_so(capsys):
+def test_a_lost_rotor_is_reported_and_exits_with_1(capsys):
     path = write(SHORT + "[controller.inversion]\ngamma = 1000.0\n")
     assert main(["simulate", path]) == 1
     assert "lost at 0.01" in capsys.readouterr().err
@@ -295,7 +295,7 @@ def test_lost_rotor_exits_1_and_says_so(capsys):
         assert str(data["lost_why"]).startswith("touched down")
 
 
-def test_check_says_yes_and_no(capsys):
+def test_check_exits_with_0_if_the_conditions_hold_and_1_otherwise(capsys):
     sine = SHORT + '[reference]\nkind = "sine"\namplitude = 2.5e-3\nfrequency = 2.0\n'
     assert main(["check", write(sine), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["holds"] is True

@@ -103,7 +103,7 @@ def test_without_unidirectional_a_current_is_limited_in_both_directions():
     assert world(u_max=50.0).applied(u, state) == (u, u)
 
 
-def test_a_voltage_that_no_supply_has_is_limited():
+def test_a_voltage_beyond_the_supply_is_limited():
     # the gap of the upper coil closes at 1 m/s: keeping 4 A takes more than 10 V of back-EMF at L i v/s_0
     plant = TwoCoil(**RIG)
     state = at(plant, 4.0, 4.0, z_dot=-1.0)
@@ -137,7 +137,10 @@ def test_the_current_reaches_its_limits_and_stays_within_one_step(i_max, unidire
 
 
 def test_gradients():
-    """Under a limited voltage, di/du_max = (1 - exp(-R t/L))/R; with all limits, of R, as a finite difference."""
+    """The derivative di/du_max is (1 - exp(-R t/L))/R.
+
+    With all limits, the derivative with respect to R agrees with a finite difference.
+    """
 
     def current(u_max):
         return driven(world(u_max=u_max), 60.0, at(STILL, 2.5, 2.5)).i_1
@@ -165,7 +168,7 @@ def read(coil=None, actuator=None, **more):
     return case_from(raw)
 
 
-def test_in_a_loop_a_limit_acts_and_an_inactive_one_changes_nothing():
+def test_an_active_limit_acts_in_the_loop_and_an_inactive_one_does_not():
     plain, far = read(), read({"u_max": 1e4, "i_max": 1e3})
     near = read({"u_max": 48.0, "i_max": 2.55, "unidirectional": True})
     clock = dataclasses.replace(plain.clock, samples=30)
@@ -206,7 +209,7 @@ def test_force_and_voltage_reserves_follow_from_the_limits():
         assert float(case.scenario.voltage_limit) == min(48.0, reserve or 48.0)
 
 
-def test_the_limits_can_be_spread_and_are_numbers_of_the_exported_plant():
+def test_the_limits_can_be_spread_and_are_parameters_of_the_exported_plant():
     case = read({"u_max": 48.0, "i_max": 4.0}, spread={"actuator.coil.u_max": {"percent": 10}})
     assert "actuator.coil.u_max" in case.spread.paths
     names = [number.name for number in numbers_of(case.scenario.amplifier, "actuator.")]
@@ -235,7 +238,7 @@ def test_the_limits_can_be_spread_and_are_numbers_of_the_exported_plant():
         (4.0, {}, r"actuator\.coil = 4\.0: it must be a table"),
     ],
 )
-def test_what_does_not_fit_is_refused_in_one_line(coil, more, words):
+def test_limits_that_contradict_the_case_are_refused_in_one_line(coil, more, words):
     with pytest.raises(ValueError, match=words) as error:
         read(coil, **more)
     assert "\n" not in str(error.value)
@@ -249,7 +252,7 @@ def test_coil_limits_need_a_processor_and_a_voltage():
         case_from(laws | {"actuator": {"mode": "current", "bandwidth": 1e3, "coil": {"i_max": 1.0}}})
 
 
-def test_a_useless_voltage_is_warned_of():
+def test_a_useless_voltage_limit_causes_a_warning():
     def coil_warnings(**given):
         return [one for one in warnings_of(read(**given)) if "actuator" in one]
 

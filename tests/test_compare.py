@@ -117,7 +117,7 @@ def test_the_page_has_the_table_and_the_picture(two):
 
 
 def test_a_case_that_loses_members_is_compared_too(run, capsys):
-    """k = 0.01 m/s^2 does not hold a rotor whose weight is off by 10 %."""
+    """The gain k = 0.01 m/s^2 does not hold a rotor whose weight differs by 10 % from that of the model."""
     code, summary, _ = run("stiff", "loose")
     stiff, loose = summary["cases"]
     assert code == 1
@@ -128,7 +128,7 @@ def test_a_case_that_loses_members_is_compared_too(run, capsys):
     assert "members lost" in capsys.readouterr().out
 
 
-def test_a_machine_that_differs_is_named(run, cases, capsys):
+def test_differences_other_than_the_laws_are_named(run, cases, capsys):
     (cases / "light.toml").write_text(CASE.format(c=200.0) + "[actuator]\nu_max = 300.0\n")
     code, summary, _ = run("stiff", "light", flags=["--json"])
     out, err = capsys.readouterr()
@@ -171,7 +171,7 @@ def test_cases_of_one_name_get_different_names(cases, tmp_path):
 
 
 def test_each_case_is_tuned_with_the_settings_of_the_first(run, cases, monkeypatch, capsys):
-    """The tuner is replaced: what it is called with, and that its answer is what is compared."""
+    """The tuner is replaced. The test checks its arguments, and that its answer is compared."""
     called = []
 
     def tune(words, program):

@@ -79,8 +79,8 @@ def test_other_numbers_never_recompile(what, warm, caplog):
     assert not kernels, kernels
 
 
-def test_another_structure_is_seen_to_compile(caplog):
-    """What the tests around this one count is there to be counted."""
+def test_a_change_of_structure_recompiles(caplog):
+    """This shows that the other tests of this module can detect a compilation."""
     before = Counting.traces
     assert compiled(caplog, Cascade(position=Counting()), NOISY, Clock(3, 1e-4, Slide(1)))
     assert Counting.traces > before
@@ -105,8 +105,8 @@ def test_integers_never_recompile(what, warm):
     assert Counting.traces == before
 
 
-def test_what_is_stored_is_computed_once():
-    """Six rounds of two products, each product used twice in the next round."""
+def test_a_materialised_value_is_computed_once():
+    """Each of six rounds computes two products, and each product is used twice in the next round."""
 
     def chain(x, y):
         for _ in range(6):
@@ -117,7 +117,7 @@ def test_what_is_stored_is_computed_once():
     assert jax.jit(chain).lower(x, x).compile().as_text().count(" multiply(") == 12
 
 
-def test_storing_changes_neither_value_nor_derivative():
+def test_materialising_changes_neither_value_nor_derivative():
     x = jnp.linspace(0.1, 1.0, 8)
     plain, kept = (lambda x: jnp.sin(x) * x), (lambda x: materialised(jnp.sin(x)) * materialised(x))
     for way in (lambda f: f(x), lambda f: jax.vmap(f)(x), lambda f: jax.jvp(f, (x,), (x,)), lambda f: jax.jacrev(f)(x)):

@@ -1,4 +1,4 @@
-"""The amplifier that controls the current, `actuator.mode = "current"`: its closed forms, and the loops around it."""
+"""The amplifier that controls the current (`actuator.mode = "current"`) against closed forms, also in loops."""
 
 import dataclasses
 
@@ -39,7 +39,7 @@ def world(kind="lumped", i_max=None, **more):
 
 @EACH
 def test_the_current_follows_the_command_with_one_pole(kind):
-    """i' = w (c - i) in every state, with the motion and a disturbance; beyond the supply it is that of u_max."""
+    """i' = w (c - i) in every state, with motion and a disturbance; if the voltage is limited, i' is that of u_max."""
     random, plant = np.random.default_rng(1), PLANTS[kind]
     free, weak = world(kind), world(kind, u_max=5.0)
     for z, z_dot, i, c, q in random.uniform(-1, 1, (20, 5)) * [3e-4, 0.1, 1.5, 1.5, 1e3]:
@@ -52,7 +52,10 @@ def test_the_current_follows_the_command_with_one_pole(kind):
 
 @pytest.mark.slow
 def test_the_poles_in_continuous_time_are_those_of_the_textbook():
-    """State feedback of z, z_dot and int z with i' = w (i_star - i): the matrix written out, without the package."""
+    """State feedback of z, z_dot and the integral of z, with i' = w (i_star - i).
+
+    The matrix is written explicitly, without the package.
+    """
     law = cascade().position
     k_p, k_d, k_int, k_aw = (float(getattr(law, name)) for name in ("k_p", "k_d", "k_int", "k_aw"))
     a = (MODEL.k_s + 2 * MODEL.k_z) / MODEL.m
@@ -80,7 +83,7 @@ def sampled(**more):
 
 @EACH
 def test_a_held_command_is_followed_exactly_between_samples(kind):
-    """One sample late: i_{n+1} = c_{n-1} + (i_n - c_{n-1}) exp(-w T), and a row has c_{n-1} as its i_ref."""
+    """With one sample of delay, i_{n+1} = c_{n-1} + (i_n - c_{n-1}) exp(-w T), and i_ref of a row is c_{n-1}."""
     outcome = rollout(sampled(), world(kind, initial=Initial(5e-5)), Clock(160, PERIOD), every=1)
     rows = outcome.trajectory.rows
     assert np.isinf(outcome.trajectory.lost_at)
@@ -144,7 +147,7 @@ def test_a_case_file_gives_the_amplifier_and_its_nominal_bandwidth():
         ({"u_max": 5.0}, {"kind": "amplifier"}, r"AmplifierCurrent commands a current\. Leave out"),
     ],
 )
-def test_what_does_not_fit_is_refused_in_one_line(actuator, laws, words):
+def test_a_law_and_an_amplifier_with_different_commands_are_refused_in_one_line(actuator, laws, words):
     with pytest.raises(ValueError, match=words):
         read(actuator, controller={"current": laws} if laws else {})
 

@@ -28,7 +28,7 @@ def truncated(share):
 
 
 def flipped(share):
-    """One byte changed within the data of an entry: at this share of the entries."""
+    """Change one byte within the data of an entry, at this share of the entries."""
 
     def damage(path):
         with zipfile.ZipFile(path) as archive:
@@ -42,7 +42,7 @@ def flipped(share):
 
 
 def rewritten(change, again=False):
-    """Another program's file: arrays and facts changed; sealed anew, if `again`, by one who means it."""
+    """Rewrite the file with changed arrays and facts, as another program would; with `again`, with a valid seal."""
 
     def damage(path):
         arrays, facts = unseal(path)
@@ -105,7 +105,7 @@ STRANGE = {
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_a_damaged_file_is_no_file(kind, tmp_path):
+def test_a_damaged_file_raises_damaged_error(kind, tmp_path):
     path = tmp_path / "a.npz"
     arrays = {"index": np.arange(4), "x": np.linspace(0.1, 1, 4), "on": np.array([True, False, True, False])}
     seal(path, arrays, FACTS)
@@ -119,8 +119,8 @@ def test_a_damaged_file_is_no_file(kind, tmp_path):
     assert "\n" not in str(raised.value)
 
 
-def test_no_byte_of_the_arrays_can_change_unseen(tmp_path):
-    """Every byte in turn: what is read is what was written, or refused; bytes that no reader looks at may change."""
+def test_a_change_of_any_byte_of_the_arrays_is_detected(tmp_path):
+    """Each byte is changed in turn. The file is then refused, or read unchanged if no reader uses the byte."""
     path = tmp_path / "a.npz"
     seal(path, {"x": np.linspace(0.1, 1, 4)}, FACTS)
     content, refused = path.read_bytes(), 0
@@ -151,7 +151,7 @@ def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
-def test_fingerprints_name_what_differs():
+def test_the_difference_of_fingerprints_names_the_key():
     there, here = ({"case": {"plant": {"m": m}, "terms": [{"a": 1}]}, "round": 1} for m in (0.5, 0.6))
     assert difference(flat(there), flat(there)) == ""
     assert difference(flat(there), flat(here)) == "case.plant.m is 0.5 in the file and 0.6 in this run"
@@ -175,7 +175,7 @@ def store_in(out, resume=True, chunk=CHUNK, facts=FACTS):
 
 
 def compute(store):
-    """What a run does: whatever is missing. Returns the spans and the remarks."""
+    """Compute all missing chunks, as a run does. Return the spans and the remarks."""
     missing, remarks = store.survey()
     for span in missing:
         store.put(span, rows(*span))
@@ -184,7 +184,7 @@ def compute(store):
 
 @pytest.fixture
 def whole(tmp_path):
-    """members.npz of a run that nothing happened to."""
+    """Return members.npz of an undisturbed run."""
     store = store_in(tmp_path / "whole", resume=False)
     assert compute(store) == ([(0, 20), (20, 40), (40, 50)], [])
     return store.finish().read_bytes()
@@ -192,7 +192,7 @@ def whole(tmp_path):
 
 @pytest.fixture
 def begun(tmp_path):
-    """A study of which all chunks are there, not yet put together."""
+    """A study whose chunks are all computed, but not yet put together."""
     store = store_in(tmp_path / "out", resume=False)
     compute(store)
     return tmp_path / "out"
@@ -203,7 +203,7 @@ def chunk_file(out, number):
 
 
 def rejoined(out, damaged, whole):
-    """The remarks of a run that goes on where chunk `damaged` is."""
+    """Return the remarks of a run that resumes a study whose chunk `damaged` is damaged."""
     store = store_in(out)
     missing, remarks = compute(store)
     assert missing == [store.spans()[damaged]]
@@ -248,7 +248,7 @@ CHUNK_STRANGE = STRANGE | {
 
 
 @pytest.mark.parametrize("kind", CHUNK_STRANGE)
-def test_a_chunk_that_does_not_belong_there_is_computed_again(kind, begun, whole):
+def test_a_chunk_of_another_study_is_computed_again(kind, begun, whole):
     path = chunk_file(begun, 1)
     CHUNK_STRANGE[kind](path)
     (remark,) = rejoined(begun, 1, whole)
@@ -267,13 +267,13 @@ def test_a_folder_in_place_of_a_chunk_is_named_and_kept(begun):
     assert path.is_dir()
 
 
-def test_a_chunk_that_is_gone_is_computed_without_a_word(begun, whole):
+def test_a_missing_chunk_is_computed_without_a_message(begun, whole):
     chunk_file(begun, 2).unlink()
     assert rejoined(begun, 2, whole) == []
 
 
-def test_chunks_stay_until_the_whole_was_read_back(begun, whole, monkeypatch):
-    """A disk that gives back something else than what was written."""
+def test_chunks_are_kept_until_members_npz_is_verified(begun, whole, monkeypatch):
+    """The disk returns other data than were written."""
     spoil = [truncated(0.5), flipped(0.7), rewritten_plainly(drop), rewritten_plainly(shorten)]
     spoil += [rewritten_plainly(renumbered), rewritten_plainly(alter)]
     for damage in spoil:
@@ -306,7 +306,7 @@ def rewritten_plainly(change):
     return damage
 
 
-def test_a_chunk_that_goes_bad_before_the_end_stops_it(begun):
+def test_a_chunk_damaged_before_the_end_is_reported_and_no_result_is_written(begun):
     store = store_in(begun)
     compute(store)
     truncated(0.5)(chunk_file(begun, 1))
@@ -362,7 +362,7 @@ def test_the_chunk_size_of_the_directory_is_the_default(begun, whole):
 
 
 def test_a_study_that_ended_before_its_first_chunk_is_resumed(tmp_path, whole):
-    """Its directory is marked, and no chunk size recorded: any is accepted, and recorded then."""
+    """Its folder is marked, and records no chunk size. Any chunk size is accepted, and then recorded."""
     for chunk in (None, CHUNK):
         out = tmp_path / str(chunk)
         store_in(out, resume=False, chunk=None)
@@ -401,7 +401,7 @@ def checkpoint(tmp_path, descent):
     return checkpoint_file
 
 
-def test_a_checkpoint_is_the_search(checkpoint, descent):
+def test_a_loaded_checkpoint_equals_the_saved_search(checkpoint, descent):
     before, after = search_of(descent), checkpoint.load(descent, STARTS, GAINS)
     for a, b in zip(jax.tree.leaves(before.starts), jax.tree.leaves(after.starts), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -454,7 +454,7 @@ CHECKPOINT_STRANGE = STRANGE | {
 
 
 @pytest.mark.parametrize("kind", [*DAMAGE, *(f"sealed: {k}" for k in CHECKPOINT_STRANGE)])
-def test_a_damaged_checkpoint_is_begun_again_with_one_line(kind, checkpoint, descent, capsys):
+def test_a_search_with_a_damaged_checkpoint_starts_again_with_one_line(kind, checkpoint, descent, capsys):
     (DAMAGE | {f"sealed: {k}": damage for k, damage in CHECKPOINT_STRANGE.items()})[kind](checkpoint.path)
     assert checkpoint.load(descent, STARTS, GAINS) is None
     err = capsys.readouterr().err
@@ -488,14 +488,14 @@ def test_a_folder_in_place_of_a_checkpoint_is_named_and_kept(checkpoint, descent
         (SEARCH_FACTS | {"precision": "float32"}, "precision is float64 in the file and float32 in this run"),
     ],
 )
-def test_a_checkpoint_of_another_search_is_refused_in_words(other, words, checkpoint, descent):
+def test_a_checkpoint_of_another_search_is_refused_with_the_difference(other, words, checkpoint, descent):
     with pytest.raises(ValueError, match=r"checkpoint-2.npz belongs to another search") as raised:
         CheckpointFile(checkpoint.path, other, 2).load(descent, STARTS, GAINS)
     assert words in str(raised.value)
     assert checkpoint.path.exists()
 
 
-def test_old_checkpoints_are_removed_and_nothing_else(checkpoint, tmp_path):
+def test_only_old_checkpoints_are_removed(checkpoint, tmp_path):
     others = ["checkpoint-10", "checkpoint-2b.npz", "checkpoint-my-net.npz", "history.npz"]
     for name in others:
         (tmp_path / name).touch()
@@ -513,7 +513,7 @@ def test_the_manifest_of_a_study_is_plain_json(begun):
 
 @pytest.mark.parametrize("kind", CHUNK_STRANGE)
 def test_a_chunk_that_was_replaced_while_the_study_ran_is_refused_by_name(kind, begun, whole):
-    """A chunk of another study above all, of the same members: whoever copies one, or runs in the same folder."""
+    """For example by a chunk of another study of the same members, from another run in the same folder."""
     store = store_in(begun)
     assert compute(store) == ([], [])
     path = chunk_file(begun, 1)

@@ -70,13 +70,13 @@ def test_the_help_of_a_record_lists_its_fields():
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_link_into_the_code_leads_somewhere(page):
+def test_every_link_to_the_code_has_a_target(page):
     for _, target in ROLE.findall(page.read_text()):
         assert found(target) is not None
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_path_is_there(page):
+def test_every_path_in_the_pages_exists(page):
     for path in re.findall(r"`((?:ambjax|tuning|tests|benchmarks|docs)/[\w/.]*)`", page.read_text()):
         assert (ROOT / path).exists(), path
 
@@ -99,7 +99,7 @@ def record_of(table, kind):
 
 
 @pytest.mark.parametrize(("table", "beside"), ROWS, ids=lambda x: x if isinstance(x, str) else x.get("kind", "-"))
-def test_no_key_is_without_range_and_meaning(table, beside):
+def test_every_key_has_a_range_and_a_meaning(table, beside):
     rows = case_file.rows_of(table, record_of(table, beside.get("kind")), beside)
     assert [row.name for row in rows if row.name == "kind"] == ["kind"] * ("kind" in beside or table == "plant")
     for row in rows:
@@ -163,7 +163,7 @@ def functions(path):
     return {node.name for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)}
 
 
-def test_the_benchmark_pages_are_one():
+def test_the_readme_of_the_benchmarks_equals_the_generated_page():
     page = benchmarks.pages()["benchmarks.md"].replace(benchmarks.FROM_HERE, benchmarks.FROM_THERE)
     assert page == (ROOT / "benchmarks" / "README.md").read_text(), "run python benchmarks/report.py"
 
@@ -197,7 +197,7 @@ def test_the_readme_states_the_measured_errors_and_voltages_of_the_structures():
     assert f"{high / low:.0f}" == "11"
 
 
-def test_a_text_is_not_taken_for_markup():
+def test_text_is_escaped_in_markdown():
     assert markdown.escaped("|z| < s_0 [m] $ `a|b`") == r"\|z\| \< s_0 \[m\] \$ `a\|b`"
     assert markdown.table(("a", "b"), [("1", "2")], "keys")[2:5] == ["| a | b |", "|---|---|", "| 1 | 2 |"]
 
@@ -231,7 +231,7 @@ def test_the_committed_tables_are_current(name):
     assert path.read_text(encoding="utf-8") == site.tables()[name], "run: python docs/reference/site.py"
 
 
-def test_a_printed_table_is_read_back(monkeypatch):
+def test_a_printed_table_is_parsed_to_the_same_cells(monkeypatch):
     """A table printed with `outputs.table` has the same cells in the page; the text around it is kept."""
     pytest.importorskip("sphinx")
     monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))

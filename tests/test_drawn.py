@@ -36,14 +36,14 @@ ROUNDING = 1e-12
 
 @pytest.fixture(autouse=True)
 def drawn(monkeypatch):
-    """The figures that were to be saved; nothing is."""
+    """The figures that the test would save; no file is written."""
     kept = []
     monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: kept.append(self))
     return kept
 
 
 def factor_of(label):
-    """What SI is multiplied by for the unit in the brackets at the end of an axis' label."""
+    """Return the factor from SI to the unit in brackets at the end of an axis label."""
     unit = re.search(r"\(([^()]*)\)\s*$", label)[1]
     plain = re.fullmatch(r"([mµnkM]?)(m|s|V|A)(/s|/s²)?", unit)
     return PREFIX[plain[1]] if plain else {"%": 100.0}.get(unit, 1.0)
@@ -58,7 +58,7 @@ def a_signal(n, seed):
 
 
 def a_run(n, lost_at=np.inf, period=1e-4):
-    """A run in which every signal is another one, and frozen at a far value once the rotor is lost."""
+    """Return a run in which all signals differ. After the loss, each signal is frozen at a distant value."""
     t = period * np.arange(n)
     size = {"z": 1e-3, "r": 1e-3, "z_measured": 1e-3, "u_mean": 100.0}
     rows = {name: size.get(name, 1.0) * a_signal(n, k) for k, name in enumerate(Row._fields)}
@@ -133,7 +133,7 @@ def test_an_envelope_encloses_every_sample_from_the_first_to_the_last(n, bins):
         assert (lower is low, upper is high) == (True, True)
 
 
-def test_a_stretch_has_its_own_ends_however_they_are_rounded():
+def test_an_interval_includes_both_ends_in_spite_of_rounding():
     t = 1e-4 * np.arange(20_000)
     assert t[13] > 0.0013  # by rounding
     for low, high, first, last in ((0.0, 1.9999, 0, 19_999), (0.0005, 0.0013, 5, 13), (0.10003, 0.29997, 1000, 3000)):
@@ -146,7 +146,10 @@ def test_a_stretch_has_its_own_ends_however_they_are_rounded():
 
 
 def check_curve(line, t, y, factor, span):
-    """A line against the signal y(t) within `span`: its ends, its extremes, and no point that the data do not have."""
+    """Check a line against the signal y(t) within `span`.
+
+    Checks its ends, its extremes, and that each of its points is in the data.
+    """
     x, v = line.get_data()
     inside = (t >= span[0]) & (t <= span[1])
     assert (x[0], x[-1]) == (t[inside][0], t[inside][-1])
@@ -158,7 +161,7 @@ def check_curve(line, t, y, factor, span):
 
 @pytest.mark.parametrize("number", figures.PAPER_FIGURES)
 @pytest.mark.parametrize(("n", "lost_at"), [(9600, np.inf), (20_001, np.inf), (500, np.inf), (20_001, 0.95991)])
-def test_a_figure_of_the_paper_is_of_its_run(number, n, lost_at, drawn):
+def test_a_figure_of_the_paper_shows_the_signals_of_its_run(number, n, lost_at, drawn):
     run = a_run(n, lost_at)
     figures.paper_figure(number, run, "", NOWHERE)
     t = np.asarray(run.rows.t)
@@ -181,7 +184,7 @@ def test_a_loss_after_the_last_sample_is_within_the_figure(drawn):
     assert drawn[0].axes[0].get_xlim()[1] == 0.00995
 
 
-def test_readings_are_of_their_runs(drawn):
+def test_the_picture_of_the_readings_shows_their_runs(drawn):
     runs = {"one": a_run(9600), "other": a_run(20_001, 0.03335)}
     figures.readings(runs, "", 0.5, NOWHERE)
     axes = np.reshape(drawn[0].axes, (2, 2))
@@ -198,7 +201,7 @@ def test_readings_are_of_their_runs(drawn):
 
 @pytest.mark.parametrize("n", [9600, 20_001, 1500])
 @pytest.mark.parametrize("window", [None, (0.03, 0.1)])
-def test_an_overview_is_of_its_run(n, window, drawn):
+def test_an_overview_shows_the_signals_of_its_run(n, window, drawn):
     run = a_run(n)
     quiet = n == 9600
     if quiet:
@@ -251,7 +254,7 @@ def bands_of(n, seed=0):
 
 
 @pytest.mark.parametrize("n", [2, 500, 9601])
-def test_a_fan_is_of_its_quantiles(n, drawn):
+def test_a_fan_shows_the_quantiles_of_the_members(n, drawn):
     t, bands = np.linspace(0, 0.9, n), bands_of(n)
     fans.fan(t, {"z - r": bands}, {}, "", NOWHERE)
     (ax,) = drawn[0].axes
@@ -272,7 +275,7 @@ def test_a_fan_is_of_its_quantiles(n, drawn):
     np.testing.assert_allclose(y, factor * bands[50][np.searchsorted(t, x)], rtol=ROUNDING)
 
 
-def test_a_fan_ends_where_nobody_is_left(drawn):
+def test_a_fan_ends_when_the_last_member_is_lost(drawn):
     t, bands = np.linspace(0, 1, 101), bands_of(101)
     for values in bands.values():
         values[31:] = np.nan
@@ -297,7 +300,7 @@ def test_a_smoothed_median_reaches_from_the_first_to_the_last_instant(drawn):
 
 
 @pytest.mark.parametrize("members", [7, 20_000])
-def test_the_survivors_are_all_that_are_not_lost(members, drawn):
+def test_the_number_of_survivors_excludes_the_lost_members(members, drawn):
     t = np.linspace(0, 0.99, 100)
     lost_at = np.where(np.arange(members) % 2, np.inf, 0.999 * (1 + np.arange(members)) / members)
     lost_at[-1] = 0.9999  # between the last sample and the end of the run
@@ -324,7 +327,7 @@ def test_the_survivors_are_all_that_are_not_lost(members, drawn):
 
 
 @pytest.mark.parametrize("log", [False, True])
-def test_a_histogram_is_of_all_members(log, drawn):
+def test_a_histogram_counts_all_members(log, drawn):
     rng = np.random.default_rng(5)
     values = 1e-6 * (np.exp(3 * rng.normal(size=500)) if log else 1 + rng.uniform(size=500))
     lost = rng.uniform(size=500) < 0.3
@@ -351,7 +354,7 @@ def test_a_histogram_is_of_all_members(log, drawn):
     np.testing.assert_allclose([line.get_xdata()[0] for line in ax.lines], marked, rtol=ROUNDING)
 
 
-def test_a_tornado_has_its_shares_and_intervals(drawn):
+def test_a_tornado_shows_the_shares_and_their_intervals(drawn):
     bars = [Bar(f"plant.{k}", share, share / 2, min(1.3 * share, 1), 0.0) for k, share in enumerate((0.2, 1.0, 0.05))]
     tornado(bars, "rms_u_V", "", NOWHERE)
     (ax,) = drawn[0].axes
@@ -371,7 +374,7 @@ def test_a_tornado_has_its_shares_and_intervals(drawn):
 
 
 class _Case:
-    """Enough of a case to label a map."""
+    """The part of a case that is needed to label a map."""
 
     name = "the case"
     cascade = None
@@ -379,7 +382,7 @@ class _Case:
 
 
 @pytest.mark.parametrize("path", ["initial.z", PERIOD])
-def test_the_cells_of_a_map_are_where_they_were_run(path, drawn, monkeypatch):
+def test_the_cells_of_a_map_lie_at_their_coordinates(path, drawn, monkeypatch):
     monkeypatch.setattr(case_map, "unit_of", lambda _, axis: "s" if axis.path == PERIOD else "m")
     x, y = Axis(path, np.geomspace(1e-5, 1e-3, 3), True), Axis("initial.z_dot", np.array([1.0, 2.0, 3.0, 4.0]))
     survival = np.arange(12.0).reshape(4, 3) / 11
@@ -408,7 +411,7 @@ def test_the_cells_of_a_map_are_where_they_were_run(path, drawn, monkeypatch):
     np.testing.assert_allclose(bar.get_ylim(), 1e6 * np.array([np.nanmin(error), np.nanmax(error)]), rtol=ROUNDING)
 
 
-def test_the_outlines_of_a_map_are_those_of_the_bounds_of_its_interval(drawn):
+def test_the_outlines_of_a_map_follow_the_confidence_bounds(drawn):
     x, y = np.arange(4.0), np.arange(3.0)
     survival, low, high = (np.tile(np.arange(4) >= k, (3, 1)).astype(float) for k in (2, 3, 1))
     panel = heatmaps.MapPanel("", x, y, survival, low, high, None)
@@ -423,11 +426,11 @@ def test_the_outlines_of_a_map_are_those_of_the_bounds_of_its_interval(drawn):
 
 @pytest.fixture
 def kept(monkeypatch):
-    """The tuner's figures themselves in place of their PNG."""
+    """Keep the figures of the tuner instead of their PNG files."""
     monkeypatch.setattr(tuned, "_png", lambda figure: figure)
 
 
-def test_the_whole_run_is_scaled_to_what_follows_settle(kept):
+def test_the_panels_of_the_whole_run_are_scaled_to_the_values_after_settle(kept):
     run = a_run(2000)
     run.rows.z[:100] += 1.0
     axes = np.reshape(tuned.before_after({"after": run}, settle=0.05).axes, (2, 3))
@@ -439,7 +442,7 @@ def test_the_whole_run_is_scaled_to_what_follows_settle(kept):
 
 
 @pytest.mark.parametrize("n", [9600, 20_001, 200])
-def test_before_and_after_are_of_their_runs(n, kept):
+def test_the_panels_before_and_after_show_their_runs(n, kept):
     runs = {"before": a_run(n), "after": a_run(n, 0.7 * n * 1e-4)}
     axes = np.reshape(tuned.before_after(runs).axes, (4, 3))
     shown = [(name, signal) for signal in ("e_z", "u_mean") for name in runs]
@@ -479,7 +482,7 @@ def test_the_spectrum_has_the_amplitudes_of_its_sines(n, kept):
     assert frequency[-1] == pytest.approx(5000 if n % 2 == 0 else 5000 * (1 - 1 / n), rel=ROUNDING)
 
 
-def test_the_convergence_is_of_its_history(kept):
+def test_the_picture_of_the_convergence_shows_the_history_of_the_search(kept):
     rng = np.random.default_rng(2)
     value = np.minimum.accumulate(rng.normal(size=(9, 3)), axis=0)
     gains = np.exp(rng.normal(size=(9, 3, 2)))
@@ -509,7 +512,7 @@ def test_a_goal_far_beyond_its_limits_is_cut_in_the_convergence(kept):
     assert left.get_ylabel() == "what is minimised (cut at 1e+09 x the least)"
 
 
-def test_the_slices_are_those_that_were_computed(kept):
+def test_the_picture_of_the_slices_shows_the_computed_values(kept):
     gains = np.stack([np.geomspace(1, 9, 13), np.geomspace(100, 900, 13)])
     goals = np.stack([np.linspace(-1, 6, 13) ** 2 / 9, np.linspace(2, -1, 13)])
     goals[0, 12] = np.inf
@@ -527,7 +530,7 @@ def test_the_slices_are_those_that_were_computed(kept):
             np.testing.assert_array_equal(crosses.get_xdata(), gains[j, lost[j] > 0])
 
 
-def test_the_front_crosses_out_what_loses_members(kept):
+def test_points_of_the_front_that_lose_members_are_marked(kept):
     rows = [
         {"settled_rms_error_m": e, "settled_rms_u_V": u, "lost": lost, "stalled": 0, "taken": e == 2e-7}
         for e, u, lost in ((3e-6, 20.0, 0), (1e-6, 30.0, 4), (2e-7, 90.0, 0))
@@ -543,7 +546,7 @@ def test_the_front_crosses_out_what_loses_members(kept):
 # ---------------------------------------------------------------- benchmarks
 
 
-def test_the_picture_of_the_benchmark_is_of_its_results(drawn):
+def test_the_picture_of_the_benchmark_shows_its_results(drawn):
     import work_precision
 
     results = json.loads((ROOT / "benchmarks" / "results" / "work_precision.json").read_text())["cases"]

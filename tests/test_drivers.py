@@ -42,7 +42,7 @@ def test_indices_of_a_sum_are_its_parts_of_the_variance():
 
 
 @pytest.mark.parametrize("n", [64, 200, 5000])
-def test_a_v_is_seen(n):
+def test_a_symmetric_effect_without_correlation_is_found(n):
     x, other = RNG.uniform(-1, 1, (2, n))
     y = np.abs(x) * (1 + 0.05 * RNG.normal(size=n))
     ranked, explained = drivers({"plant.m": x, "plant.R": other}, {"error": y})
@@ -54,7 +54,7 @@ def test_a_v_is_seen(n):
     assert explained["error"]["says"].startswith("single quantities explain 9")
 
 
-def test_noise_is_called_noise():
+def test_an_effect_of_noise_only_is_reported_as_noise():
     said = []
     for _ in range(200):
         x = RNG.uniform(-1, 1, (5, 100))
@@ -64,7 +64,7 @@ def test_noise_is_called_noise():
     assert np.mean(said) > 0.95 - 0.047
 
 
-def test_what_two_do_together_is_seen():
+def test_the_interaction_of_two_quantities_is_found():
     x = RNG.uniform(-1, 1, (3, 300))
     _, explained = drivers(dict(zip("abc", x, strict=True)), {"error": x[0] * x[2]})
     found = explained["error"]
@@ -93,7 +93,7 @@ def test_lost_members_and_choices_and_constants():
     assert {row["share"] for row in ranked["same"]} == {0.0}
 
 
-def test_nothing_spread_and_few_members():
+def test_a_case_without_a_spread_and_an_ensemble_with_few_members():
     ranked, explained = drivers({}, {"error": np.ones(3)})
     assert ranked == {"error": []}
     assert explained["error"]["says"] == "the case has no spread"
@@ -105,6 +105,6 @@ def test_nothing_spread_and_few_members():
             assert 0 <= row["p"] <= 1
 
 
-def test_shares_refuse_what_is_infinite():
+def test_shares_refuse_infinite_values():
     with pytest.raises(ValueError, match="not finite"):
         shares([np.arange(9.0)], [np.array([np.inf] * 9)])

@@ -22,7 +22,7 @@ def world(start, stop, **more):
 
 
 @pytest.mark.parametrize("at", [(), (0.3,), (0.3, 0.35), (0.2, 0.6, 0.95), (0.0, 0.4, 1.0), (-1.0, 0.5, 3.0)])
-def test_steps_are_equal_ones_divided_at_the_edges_inside(at):
+def test_equal_steps_are_divided_at_the_edges_inside(at):
     t, h, count = 2.0, 0.25, 4
     edges, tolerance = Edges(tuple(t + x for x in at), len(at)), 1e-14
     begins, ends, lengths = np.array([edges.steps(t, h, count)(n) for n in range(count + len(at))]).T
@@ -33,7 +33,7 @@ def test_steps_are_equal_ones_divided_at_the_edges_inside(at):
     np.testing.assert_allclose(lengths, np.diff(grid), atol=tolerance)
 
 
-def test_more_edges_than_were_counted_leave_no_time_out():
+def test_steps_cover_the_whole_period_if_there_are_more_edges_than_counted():
     steps = Edges((0.1, 0.3, 0.6), 1).steps(0.0, 0.25, 4)
     spans = [steps(n)[:2] for n in range(5)]
     assert [float(x) for x in (spans[0][0], spans[-1][1])] == [0.0, 1.0]
@@ -54,7 +54,7 @@ def test_an_integral_is_exact_wherever_the_rate_jumps(method):
 
 
 def spread(**values):
-    """Arrays as the ends of a spread stand in a scenario: each number on an axis of its own."""
+    """Return arrays as a scenario contains them at the ends of a spread: each number on its own axis."""
     shape = [1] * len(values)
     return {k: np.reshape(x, [*shape[:n], 2, *shape[n + 1 :]]) for n, (k, x) in enumerate(values.items())}
 
@@ -73,7 +73,7 @@ def spread(**values):
         (amb.Scenario(q_v=amb.Step(1.0, 0.10003), q_i=amb.Sum((amb.Sine(1.0, 2.0), amb.Step(1.0, 0.10005)))), 2),
     ],
 )
-def test_how_many_edges_lie_inside_a_sample(scenario, most):
+def test_the_number_of_edges_inside_a_sample(scenario, most):
     assert most_inside(scenario, T) == most
     assert amb.with_method(amb.Clock(10, T), SOFT, scenario).cuts == most
     clock = amb.Clock(10, T, cuts=1)  # counted for the whole of which this is a part
@@ -86,8 +86,8 @@ def test_edges_of_several_periods():
 
 
 @pytest.mark.slow
-def test_members_with_edges_of_their_own():
-    """Each moves as it does alone, and where the edges are traced."""
+def test_edges_may_differ_between_members():
+    """Each member moves as in a run of its own, also if the edges are traced."""
     starts, clock = np.array([0.002, 0.00203, 0.00217]), amb.Clock(40, T, amb.RK4(1), cuts=1)
 
     def z(start):
@@ -102,7 +102,7 @@ def test_members_with_edges_of_their_own():
 
 
 def test_derivatives_in_the_time_of_an_edge():
-    """y' = A - y from the edge on."""
+    """The equation is y' = A - y from the edge on."""
 
     def end(start):
         rates = lambda t, y: amb.Step(2.0, start)(t) - y  # noqa: E731

@@ -53,7 +53,10 @@ def rounding():
 
 
 def same(a, b, rtol):
-    """Leaf by leaf; a metric of large terms that cancel, and their sum, to what rounding makes of it."""
+    """Check that all leaves agree.
+
+    Metrics that are differences of large terms, and sums of such metrics, may differ by rounding.
+    """
     absolute = rounding()
     for (path, x), y in zip(jax.tree.leaves_with_path(a), jax.tree.leaves(b), strict=True):
         name = getattr(path[-1], "key", None) if path else None
@@ -61,7 +64,7 @@ def same(a, b, rtol):
 
 
 @pytest.mark.slow
-def test_results_do_not_depend_on_calls_threads_or_who_runs_beside():
+def test_results_do_not_depend_on_calls_threads_or_other_members():
     n = 150  # no multiple of a block
     whole = run_ensemble(SMOOTH, members(n), SHORT, fold=FOLD, threads=1)
     assert whole.measured["rms_error_m"].shape == (n,)
@@ -81,7 +84,7 @@ def test_results_do_not_depend_on_calls_threads_or_who_runs_beside():
         pytest.param("AuthenticAMD avx2", marks=pytest.mark.thorough),
     ],
 )
-def test_results_do_not_depend_on_how_long_blocks_are_on_this_machine(cpu, monkeypatch):
+def test_results_do_not_depend_on_the_length_of_blocks(cpu, monkeypatch):
     expected = {"AuthenticAMD avx512f": 1024}.get(cpu, 512)
     here = run_ensemble(SMOOTH, members(300), SHORT, fold=FOLD, threads=1)
     monkeypatch.setattr(fast_path, "_cpuinfo", lambda: cpu)
@@ -90,7 +93,7 @@ def test_results_do_not_depend_on_how_long_blocks_are_on_this_machine(cpu, monke
 
 
 @pytest.mark.parametrize("method", [RK4(2), pytest.param(AdaptiveRodas3(), marks=pytest.mark.thorough)], ids=str)
-def test_a_member_is_the_rollout_of_that_member_alone(method):
+def test_a_member_of_an_ensemble_equals_its_own_rollout(method):
     clock = Clock(40, 1e-4, method)
     found = run_ensemble(SMOOTH, members(66), clock, fold=FOLD, every=10)
     for k in (0, 33, 65):
@@ -102,7 +105,7 @@ def test_a_member_is_the_rollout_of_that_member_alone(method):
         assert found.trajectory.rows.z[k].shape == (4,)
 
 
-def test_the_plain_path_gives_the_same_numbers_and_says_that_it_is_taken(monkeypatch, caplog):
+def test_the_plain_path_gives_the_same_numbers_and_logs_its_use(monkeypatch, caplog):
     if fast_path.options() is None:
         pytest.skip("the fast path is not supported here")
     fast = run_ensemble(SMOOTH, members(20), SHORT, fold=Rms("e_z"))
@@ -118,7 +121,7 @@ def test_the_plain_path_gives_the_same_numbers_and_says_that_it_is_taken(monkeyp
         fast_path.options.cache_clear()
 
 
-def test_a_probe_that_finds_a_wrong_lane_turns_the_fast_path_off(monkeypatch, caplog):
+def test_a_wrong_result_of_the_probe_disables_the_fast_path(monkeypatch, caplog):
     right = fast_path._step
     wrong = lambda y, lib: right(y, lib) if lib is np else jnp.where(y > 20, 0.0, right(y, lib))  # noqa: E731
     monkeypatch.setattr(fast_path, "_step", wrong)
@@ -133,7 +136,7 @@ def test_a_probe_that_finds_a_wrong_lane_turns_the_fast_path_off(monkeypatch, ca
 
 
 @pytest.mark.slow
-def test_several_devices_share_an_ensemble_and_change_nothing(tmp_path):
+def test_several_devices_give_the_results_of_one(tmp_path):
     code = """
 import sys, jax
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
@@ -157,7 +160,7 @@ def test_lengths_that_differ_or_are_missing_are_named():
 
 @dataclasses.dataclass(frozen=True)
 class Scaled:
-    """A function of a member, equal to another of the same power."""
+    """A function of a member; two of these functions are equal if their powers are."""
 
     power: int
     traces = 0
@@ -182,7 +185,7 @@ def test_any_function_of_a_member_is_mapped_over_all_and_compiled_once(plain):
         map_members(Scaled(2), {"x": x, "scale": np.arange(69.0)})
 
 
-def test_the_noise_of_a_member_is_its_own_and_white():
+def test_the_noise_of_each_member_is_independent_and_white():
     rows = run_ensemble(SMOOTH, members(200), SHORT, fold=None, every=1).trajectory.rows
     w = (rows.z_measured - rows.z) / 1e-7
     assert stats.kstest(w.ravel(), "norm").pvalue > 1e-3
@@ -192,7 +195,7 @@ def test_the_noise_of_a_member_is_its_own_and_white():
 
 
 def test_settled_rms_agrees_with_the_lyapunov_equation():
-    """Held noise through the linearised loop: P = A P A' + B S B' at the samples."""
+    """Held noise in the linearised loop: P = A P A' + B S B' at the samples."""
     n, std, period = 200, 1e-8, 1e-4
     current = float(SMOOTH.model.equilibrium(0.0)[0])
     cascade = dataclasses.replace(SMOOTH, inversion=inversion.Adaptive(1e9, 25e-6, i_ref=current))
@@ -276,14 +279,17 @@ def test_resuming_another_study_is_refused_by_the_key_that_differs(change, key, 
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_what_is_no_number_belongs_to_a_study():
-    """Which discretisation, whether there is prediction, what is measured: members of two kinds are no ensemble."""
+def test_the_fingerprint_of_a_study_contains_its_flags():
+    """Flags are, for example, the discretisation, the prediction and the measured signals.
+
+    They cannot differ between members.
+    """
     sampled = [dataclasses.replace(STUDY.cascade, processor=Processor(implicit=x)) for x in (True, False)]
     one, other = (dataclasses.replace(STUDY, cascade=cascade).fingerprint() for cascade in sampled)
     assert difference(one, other) == "controller.processor.implicit is True in the file and False in this run"
 
 
-def test_a_store_refuses_what_it_cannot_hold(tmp_path):
+def test_a_store_refuses_another_study_and_a_full_disk(tmp_path):
     run(STUDY, tmp_path, stop_after=1)
     with pytest.raises(ValueError, match=r"already holds a study\. Add --resume"):
         run(STUDY, tmp_path)
@@ -299,7 +305,7 @@ def test_a_store_refuses_what_it_cannot_hold(tmp_path):
         run(STUDY, tmp_path / "other", resume=True)
 
 
-def test_another_jax_resumes_only_what_it_began(tmp_path, monkeypatch):
+def test_a_study_is_not_resumed_with_another_version_of_jax(tmp_path, monkeypatch):
     run(STUDY, tmp_path, stop_after=1)
     monkeypatch.setattr(jax, "__version__", "0.0.0")
     with pytest.raises(ValueError, match="another study: jax is"):
@@ -321,8 +327,8 @@ def test_the_variation_of_the_voltage_over_parts_of_the_run_adds_up():
     assert np.isinf(bands.trajectory.lost_at).all()
 
 
-def test_bands_at_few_instants_have_all_that_is_between_them(monkeypatch):
-    """Of runs that are made up, the third of which is lost in the middle of a block."""
+def test_bands_at_few_instants_include_the_extremes_between_them(monkeypatch):
+    """The runs are constructed; the third one is lost in the middle of a block."""
     n, lost_at = 41, np.array([np.inf, np.inf, 16.5e-4])
     made = np.random.default_rng(0).normal(size=(len(Row._fields), 3, n))
     t = 1e-4 * np.arange(n)
@@ -345,7 +351,7 @@ def test_bands_at_few_instants_have_all_that_is_between_them(monkeypatch):
         bands = study.bands(3, 7 if samples == n else 6, until)
         np.testing.assert_array_equal(bands.t, t[at])
         edges = [*at[:-1], samples]  # of the blocks
-        for name, of in ensemble_study.SHOWN.items():
+        for name, of in ensemble_study.FAN_SIGNALS.items():
             values = np.where(alive, getattr(whole, of), np.nan)[:, :samples]
             np.testing.assert_array_equal(bands.signals[name], values[:, at])
             for k in range(len(at)):

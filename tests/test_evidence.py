@@ -8,8 +8,8 @@ from ambjax.paper import evidence
 
 
 @pytest.mark.parametrize("fragile", ["m -10 %", "m +10 %", "k_z -10 %", "R +10 %", "A -10 %"])
-def test_an_uncertain_plant_is_tried_off_to_either_side(monkeypatch, fragile):
-    """Each of m, k_z, R and A, 10 % below and 10 % above, one at a time: the one that is lost is named."""
+def test_the_uncertain_plant_is_tried_10_percent_below_and_above(monkeypatch, fragile):
+    """Each of m, k_z, R and A is changed by -10 % and +10 %. The result names the change that loses the rotor."""
     tried = []
 
     def rollout(cascade, scenario, clock, *, fold):

@@ -79,7 +79,7 @@ class Layered(PositionLaw):
 
 
 def hard(**more):
-    """The paper's cascade with the sign itself, and an observer."""
+    """The paper's cascade with set-valued signs and an observer."""
     laws = {
         "observer": observer.Complementary(),
         "position": position.SlidingMode(1440.0, 2.3, INF),
@@ -148,7 +148,7 @@ def failed(checks):
 
 @compiled
 @pytest.mark.parametrize(("name", "to"), FAST)
-def test_one_step_is_jaxs(name, to):
+def test_one_step_equals_jax(name, to):
     made = drafts(CASCADES[name], [to], 3000)
     checks = verify(made, None)
     rows = {"compiles", "test program", "library", "one step", "parameters"}
@@ -164,7 +164,7 @@ def test_one_step_is_jaxs(name, to):
 
 @functools.cache
 def stepping(cascade):
-    """A step of a controller of exact sensors, jitted, after one with every input 0."""
+    """Return the jitted step of a controller with exact sensors, after one step with all inputs 0."""
     controller = controller_of(cascade, 200.0, PERIOD)
     parameters, memory, inputs, period = arguments(controller)
     read = frozenset(StepInputs._fields)
@@ -176,12 +176,12 @@ def stepping(cascade):
 
 
 def wrong(limit):
-    """Values that a limit does not allow."""
+    """Return values that a limit does not allow."""
     return [np.nan, np.inf, -np.inf, 1.001 * limit, -1.001 * limit]
 
 
 @pytest.mark.slow
-def test_an_invalid_reference_leaves_no_trace():
+def test_an_invalid_reference_does_not_change_the_state():
     controller, step, memory, inputs, answer = stepping(hard())
     for name in StepInputs._fields[3:]:
         limit = getattr(controller.parameters.limits, name)
@@ -201,7 +201,7 @@ def test_an_invalid_reference_leaves_no_trace():
 
 
 @pytest.mark.parametrize("name", ["z", *(pytest.param(x, marks=pytest.mark.slow) for x in ("z_dot", "i"))])
-def test_a_refused_reading_is_as_if_the_expected_one_had_been_read(name):
+def test_a_refused_reading_is_replaced_by_the_expected_reading(name):
     controller, step, memory, inputs, _ = stepping(hard())
     guard = controller.parameters.controller.processor.guard
     instead = inputs._replace(**{name: getattr(memory.watch.expected, name)})
@@ -218,7 +218,7 @@ def test_a_refused_reading_is_as_if_the_expected_one_had_been_read(name):
         assert (first[0].started, first[1].u, first[2].safe) == (False, 0, True)
 
 
-def test_after_so_many_refused_samples_u_is_0_until_a_reading_is_accepted():
+def test_after_the_allowed_number_of_refused_samples_u_is_0_until_a_reading_is_accepted():
     _, step, memory, inputs, _ = stepping(hard(processor=Processor(1.0, guard=Guard(samples=3.0))))
     bad, good = inputs._replace(z=jnp.asarray(np.nan)), inputs._replace(z=jnp.asarray(1e-3))
     for n in range(6):
@@ -234,7 +234,7 @@ def test_after_so_many_refused_samples_u_is_0_until_a_reading_is_accepted():
     assert far.refused  # 2 mm in a sample
 
 
-def test_without_a_guard_a_reading_is_believed():
+def test_without_a_guard_every_reading_is_used():
     plain = hard(observer=observer.Direct(), processor=Processor(1.0, guard=None))
     _, step, memory, inputs, answer = stepping(plain)
     _, found, status = step(memory, inputs._replace(z=jnp.asarray(4e-3)))
@@ -247,7 +247,10 @@ def test_without_a_guard_a_reading_is_believed():
 
 @compiled
 def test_a_delay_beyond_the_exported_one_is_refused(tmp_path):
-    """The prediction's parts are fixed: of 1.5 samples it would carry 1 and say nothing."""
+    """The number of parts of the prediction is fixed at export.
+
+    Without the check, a delay of 1.5 samples would be predicted as 1.
+    """
     traced = trace(controller_of(hard(), 200.0, PERIOD), "double")
     made = text()
     for name in ("amb.h", "amb.c"):
@@ -273,7 +276,7 @@ def test_a_delay_beyond_the_exported_one_is_refused(tmp_path):
         (Processor(1.0, predict=False, guard=None), "not read"),
     ],
 )
-def test_the_header_says_what_delay_may_be_set(processor, allowed):
+def test_the_header_states_the_allowed_delays(processor, allowed):
     traced = trace(controller_of(hard(processor=processor), 200.0, PERIOD), "float")
     header = Writer(traced, "amb", ORIGIN).header()
     assert f"amb_real delay; /* [samples, {allowed}] " in header
@@ -295,7 +298,7 @@ def text(cascade=None, to="double", u_max=200.0, **more):
     return kept(cascade or hard(**more), to, u_max)
 
 
-def test_twice_the_same_bytes_and_a_gain_is_one_number():
+def test_an_export_is_reproducible_and_a_gain_changes_one_number():
     once, again = text(), written(hard(), "double", 200.0)
     assert once == again
     other = text(current=current.SlidingMode(871.0, INF))
@@ -323,7 +326,7 @@ def test_every_number_is_symbolic_and_declared():
     assert not numbers & {0.588, 754.0, 1480.0, 0.121, 41.44, 9.81}
 
 
-def test_float_is_float_throughout():
+def test_single_precision_uses_no_double():
     source = text(cascade=CASCADES["the paper's"], to="float")["amb.c"]
     source = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
     assert not re.search(r"\b\d+\.\d+(e[+-]?\d+)?\b(?!f)", source)
@@ -331,14 +334,14 @@ def test_float_is_float_throughout():
     assert not re.search(r"\b(sqrt|fabs)\(", source)
 
 
-def test_double_is_double_throughout():
-    """A float32 quotient that the simulator refines would be slower in C, and overflow beyond 1e38."""
+def test_double_precision_uses_no_float():
+    """A float32 quotient, as JAX refines it, would be slower in C and overflow beyond 1e38."""
     for cascade in (CASCADES["the paper's"], CASCADES["Kalman"]):
         source = re.sub(r"/\*.*?\*/", "", text(cascade=cascade, to="double")["amb.c"], flags=re.DOTALL)
         assert not re.search(r"\bfloat\b|\b\d+\.\d+(e[+-]?\d+)?f\b|\b(sqrt|fabs|atan)f\(", source)
 
 
-def test_neither_memory_nor_input_nor_output_of_c_is_used():
+def test_the_c_uses_neither_dynamic_memory_nor_input_or_output():
     made = text()
     for name in ("amb.c", "amb.h"):
         assert set(re.findall(r"#include [<\"](.*)[>\"]", made[name])) <= {"math.h", "stdint.h", "amb.h"}
@@ -360,7 +363,7 @@ STANDARDS = ["-std=c99", "-std=c11", *(f"-std=c++{year}" for year in (11, 14, 17
 
 
 def compiles(folder, file, *flags):
-    """What the compiler of a source's language says of it."""
+    """Return the messages of the compiler for the language of a source."""
     compiler = "g++" if file.endswith(".cpp") else "cc"
     command = [compiler, *FLAGS, *flags, "-c", file, "-o", "out.o"]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False).stderr
@@ -369,8 +372,8 @@ def compiles(folder, file, *flags):
 @compiled
 @pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler")
 @pytest.mark.parametrize("to", ["float", "double"])
-def test_the_header_compiles_by_itself_as_the_readme_says(tmp_path, to):
-    """In C and in every C++ since 2011, with its initialiser in the order of the struct."""
+def test_the_header_compiles_alone_as_the_readme_states(tmp_path, to):
+    """It compiles as C and as C++11 or later, with the initialiser in the order of the struct."""
     made = text(to=to, u_max=INF, processor=Processor(1.0, predict=False))
     (use,) = re.findall(r"`(amb_params mine = AMB_DEFAULT;)`", made["README.md"])
     (tmp_path / "amb.h").write_text(made["amb.h"])
@@ -382,7 +385,7 @@ def test_the_header_compiles_by_itself_as_the_readme_says(tmp_path, to):
 
 
 @compiled
-def test_a_compiler_that_takes_nan_for_a_number_is_refused(tmp_path):
+def test_a_compiler_without_nan_is_refused(tmp_path):
     made = text()
     for name in ("amb.h", "amb.c"):
         (tmp_path / name).write_text(made[name])
@@ -399,7 +402,7 @@ def test_a_compiler_that_takes_nan_for_a_number_is_refused(tmp_path):
         ("Kalman", ["z", "i", "r", "r_dot", "r_ddot"]),
     ],
 )
-def test_the_example_of_the_readme_compiles_and_reads_what_the_step_reads(tmp_path, name, reads):
+def test_the_example_of_the_readme_compiles_and_sets_the_inputs_of_the_step(tmp_path, name, reads):
     made = text(cascade=CASCADES[name])
     (example,) = re.findall(r"```c\n(.*?)```", made["README.md"], flags=re.DOTALL)
     assert re.findall(r"input\.(\w+) = \w+\(\);", example) == reads
@@ -408,7 +411,7 @@ def test_the_example_of_the_readme_compiles_and_reads_what_the_step_reads(tmp_pa
     assert not compiles(tmp_path, "example.c", "-std=c99", "-Wstrict-prototypes")
 
 
-def test_the_header_says_what_is_fixed_and_what_is_checked():
+def test_the_header_lists_the_fixed_numbers_and_the_checks():
     header = text(cascade=CASCADES["the paper's"])["amb.h"]
     for line in (
         "Fixed at export: T = 0.0001 s, the laws, which signs are set-valued, and whether the",
@@ -426,7 +429,7 @@ def test_the_header_says_what_is_fixed_and_what_is_checked():
 
 
 @compiled
-def test_the_stack_is_within_what_the_header_says(tmp_path):
+def test_the_stack_is_within_the_bound_of_the_header(tmp_path):
     for to in ("float", "double"):
         made = text(to=to)
         for name, content in made.items():
@@ -500,7 +503,7 @@ def test_an_export_has_the_record_of_its_verification(case, tmp_path, monkeypatc
 
 
 def contents(out):
-    """What a folder holds."""
+    """Return the contents of a folder."""
     return {x.name: x.read_bytes() if x.is_file() else None for x in out.iterdir()}
 
 
@@ -543,7 +546,7 @@ def test_a_case_from_a_pipe_is_read_once(elsewhere, tmp_path):
 
 
 def refused(capsys, *arguments):
-    """The one line on stderr, of a command that is refused."""
+    """Return the line on stderr of a command that is refused."""
     try:
         code = main(["export", *map(str, arguments)])
     except SystemExit as stop:
@@ -607,7 +610,7 @@ COMPILERS = {
         for k, (name, x) in enumerate(COMPILERS.items())
     ],
 )
-def test_a_compiler_that_does_not_work_is_reported(case, tmp_path, capsys, monkeypatch, does, message):
+def test_a_failing_compiler_is_reported(case, tmp_path, capsys, monkeypatch, does, message):
     (cc := tmp_path / "mycc").write_text(does)
     cc.chmod(0o755)
     monkeypatch.setenv("CC", str(cc))
@@ -616,7 +619,7 @@ def test_a_compiler_that_does_not_work_is_reported(case, tmp_path, capsys, monke
 
 
 @compiled
-def test_programs_that_do_not_end_or_find_no_room_decide_nothing(case, tmp_path, capsys, monkeypatch):
+def test_programs_that_do_not_end_or_have_no_temporary_folder_are_not_judged(case, tmp_path, capsys, monkeypatch):
     out = ("--out", tmp_path / "c", "--verify")
     monkeypatch.setattr(machine, "TIME_LIMIT", 1e-9)
     assert "did not end within 1e-09 s, so the check is not decided" in refused(capsys, case, *out)
@@ -627,7 +630,7 @@ def test_programs_that_do_not_end_or_find_no_room_decide_nothing(case, tmp_path,
     assert not (tmp_path / "c").exists()
 
 
-def test_a_law_that_is_no_scalar_code_is_named():
+def test_a_law_that_cannot_be_exported_is_named():
     @record
     class Table(position.SlidingMode):
         def __call__(self, model, inputs, state):
@@ -647,7 +650,7 @@ def test_a_law_that_is_no_scalar_code_is_named():
 @compiled
 @pytest.mark.thorough
 @pytest.mark.parametrize("reading", readings.READINGS)
-def test_the_readings_cascades(reading):
+def test_the_cascades_of_the_readings_are_exported(reading):
     cascade = dataclasses.replace(readings.cascade(reading), processor=Processor(1.0))
     scenario = readings.scenario("tracking", reading)
     case = LoopCase(cascade, scenario, Clock(5000, PERIOD, RK4(3)), 0.1)
@@ -656,7 +659,7 @@ def test_the_readings_cascades(reading):
 
 @compiled
 @pytest.mark.parametrize("name", EACH_CASCADE)
-def test_all_of_it(name):
+def test_every_kind_of_law_is_exported_and_verified(name):
     cascade, number = CASCADES[name], list(CASCADES).index(name)
     scenario = Scenario(reference=Sine(1e-3, 2.0), sensor=Sensor(1e-6, 1e-4, 1e-4), u_max=200.0)
     case = LoopCase(cascade, scenario, Clock(1000, PERIOD, RK4(3)), 0.02)
@@ -670,7 +673,7 @@ def test_all_of_it(name):
 @compiled
 @pytest.mark.thorough
 @pytest.mark.parametrize("to", ["float", "double"])
-def test_the_rig(tmp_path, to):
+def test_the_rig_is_exported_and_verified(tmp_path, to):
     path = tmp_path / "rig.toml"
     path.write_text(
         template("rig").replace("duration = 0.3 ", "duration = 0.1 ").replace("stop = 0.2 ", "stop = 0.15 ")
@@ -680,7 +683,7 @@ def test_the_rig(tmp_path, to):
 
 @compiled
 @pytest.mark.thorough
-def test_random_controllers():
+def test_random_controllers_are_exported_and_verified():
     random = np.random.default_rng(7)
 
     def decades(value, span=2.0):

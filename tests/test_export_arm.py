@@ -28,7 +28,7 @@ POWERS = ("a differentiator, explicit", "double")
         and (name, to) != POWERS
     ],
 )
-def test_the_vectors_on_a_small_processor(name, to, tmp_path):
+def test_the_test_vectors_pass_on_a_cortex_m(name, to, tmp_path):
     for file, content in text(cascade=CASCADES[name], to=to).items():
         (tmp_path / file).write_text(content)
     code, said = cortex.run([tmp_path / "amb.c", tmp_path / "amb_test.c"], tmp_path)
@@ -36,7 +36,7 @@ def test_the_vectors_on_a_small_processor(name, to, tmp_path):
     assert code == 0
 
 
-def test_a_vector_that_is_off_is_seen_there(tmp_path):
+def test_a_wrong_test_vector_fails_on_a_cortex_m(tmp_path):
     for file, content in text(to="float").items():
         (tmp_path / file).write_text(content.replace(".output.i_ref = ", ".output.i_ref = 1.0f + ", 3))
     code, said = cortex.run([tmp_path / "amb.c", tmp_path / "amb_test.c"], tmp_path)
@@ -44,7 +44,7 @@ def test_a_vector_that_is_off_is_seen_there(tmp_path):
     assert code == 1
 
 
-def test_the_code_is_some_kilobytes(tmp_path):
+def test_the_size_of_the_code_is_some_kilobytes(tmp_path):
     for file, content in text(to="float").items():
         (tmp_path / file).write_text(content)
     code, stack = cortex.size(tmp_path / "amb.c")

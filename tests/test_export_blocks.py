@@ -33,7 +33,7 @@ from ambjax.world.rotation import Runout
 
 
 def rig(**more):
-    """The laboratory's bearing: Kalman filter, hard signs, low-pass, converter, a limit of the current."""
+    """The laboratory bearing: Kalman filter, set-valued signs, low-pass, converter, current limit."""
     case = case_from(tomllib.loads(template("rig")))
     scenario = dataclasses.replace(case.scenario, **more)
     return case.cascade, scenario, Clock(400, case.clock.sample_period)
@@ -55,7 +55,7 @@ def blocks(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(CASES))
-def test_the_loops_steps_are_the_simulators(name):
+def test_the_steps_of_the_loop_equal_the_simulator(name):
     cascade, scenario, clock = CASES[name]
     block, count = blocks(name)["loop"], 100
     x = series(cascade, scenario, clock, count)
@@ -72,7 +72,7 @@ def test_the_loops_steps_are_the_simulators(name):
 
 @functools.cache
 def stepping(sensor=None):
-    """The rig's plant, or the rig's with another sensor, and its step, compiled."""
+    """Return the plant of the rig, or of the rig with another sensor, and its compiled step."""
     block = blocks("rig")["plant"] if sensor is None else block_of("plant", *rig(sensor=sensor))
     parameters, memory, inputs, period = arguments(block)
     read = frozenset(block.inputs)
@@ -87,7 +87,7 @@ def plant_step(machine=None, sensor=None, **inputs):
     return memory, first, step(parameters, memory, ports._replace(**{k: jnp.asarray(x) for k, x in inputs.items()}))
 
 
-def test_the_first_step_reads_the_initial_state_and_the_second_moves():
+def test_the_first_step_reads_the_initial_state_and_the_second_integrates():
     memory, (outputs, status), (after, later, _) = plant_step(u=10.0)
     assert outputs.z_true == memory.motion.z == 5e-5
     assert bool(memory.started)
@@ -99,7 +99,7 @@ def test_the_first_step_reads_the_initial_state_and_the_second_moves():
     assert without.i_true == later.i_true
 
 
-def test_a_rotor_beyond_the_clearance_is_lost_and_frozen_there():
+def test_a_rotor_beyond_the_clearance_is_lost_and_frozen():
     _, (_, first), (after, outputs, status) = plant_step({"clearance": 1e-5}, u=10.0)
     assert bool(first.touched)
     assert bool(status.touched)
@@ -109,7 +109,7 @@ def test_a_rotor_beyond_the_clearance_is_lost_and_frozen_there():
 
 
 @pytest.mark.parametrize("name", ["u", "q_z", "w_z"])
-def test_a_number_that_is_not_finite_is_reported_and_taken_as_0(name):
+def test_an_input_that_is_not_finite_is_reported_and_replaced_by_0(name):
     _, _, (_, outputs, status) = plant_step(**{name: np.nan})
     _, _, (_, plain, fine) = plant_step(**{name: 0.0})
     assert bool(status.invalid)
@@ -118,7 +118,7 @@ def test_a_number_that_is_not_finite_is_reported_and_taken_as_0(name):
     assert bool(plant_step({"delay": 3.0})[2][2].invalid)
 
 
-def test_a_disturbance_that_begins_with_a_sample_is_in_the_step_that_ends_it():
+def test_a_disturbance_acts_in_the_step_that_integrates_its_sample():
     cascade, scenario, clock = rig(q_z=Pulse(2.0, 3 * 5e-5, 5 * 5e-5), q_i=Constant(7.0), reference=Sine(1e-5, 50.0))
     x = series(cascade, scenario, clock, 8)
     np.testing.assert_array_equal(x["q_z"], [0, 0, 0, 0, 2, 2, 0, 0])
@@ -150,7 +150,7 @@ def test_noise_and_disturbances_are_in_their_units():
         ({"sensor": Sensor(runout=Runout(100.0))}, "sensor.runout: the exported plant"),
     ],
 )
-def test_what_a_plant_cannot_have_is_refused_in_one_line(change, says):
+def test_parts_that_an_exported_plant_lacks_are_refused_in_one_line(change, says):
     cascade, scenario, clock = rig(**change)
     for what in ("plant", "loop"):
         with pytest.raises(ValueError, match=says) as error:
@@ -179,7 +179,7 @@ def test_a_plant_needs_a_processor_and_fixed_steps():
         for name in CASES
     ],
 )
-def test_the_c_is_proven(what, name):
+def test_the_c_of_each_block_passes_all_checks(what, name):
     cascade, scenario, clock = CASES[name]
     block = blocks(name)[what]
     one = draft(block, "double", "amb", Origin("test", "0" * 64, block.described()), 2000)
@@ -197,7 +197,7 @@ def test_the_c_is_proven(what, name):
 
 
 @pytest.mark.slow
-def test_the_command_names_the_part(elsewhere, tmp_path):
+def test_the_written_files_name_the_exported_part(elsewhere, tmp_path):
     (tmp_path / "rig.toml").write_text(template("rig"))
     out = tmp_path / "c"
     assert main(["export", str(tmp_path / "rig.toml"), "--what", "plant", "--out", str(out), "--json"]) == 0

@@ -56,7 +56,7 @@ def listed():
 
 
 def compiled(function, to, folder, count):
-    """A function of two scalars that gives a tuple, as C: of rows of points."""
+    """Compile a function of two scalars that returns a tuple as C. The result maps rows of points."""
     dtype, program = np.dtype(PRECISIONS[to]), Program()
     with precision(to):
         refs = [program.input(Location("input", name), dtype) for name in "ab"]
@@ -84,7 +84,7 @@ def compiled(function, to, folder, count):
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 @pytest.mark.parametrize("to", ["double", "float"])
-def test_every_primitive_against_jax(to, tmp_path):
+def test_every_primitive_equals_jax(to, tmp_path):
     functions, dtype = listed(), np.dtype(PRECISIONS[to])
     run = compiled(lambda x, y: tuple(f(x, y) for f in functions.values()), to, tmp_path, len(functions))
     random = np.random.default_rng(1)
@@ -104,7 +104,7 @@ def test_every_primitive_against_jax(to, tmp_path):
             assert not wrong.any(), (name, x[at], found[at, k], should[at])
 
 
-def test_no_primitive_is_untested():
+def test_every_primitive_has_a_test():
     program, one = Program(), np.ones(())
     refs = [program.input(Location("input", name), float) for name in "xy"]
     traced(program, lambda x, y: tuple(f(x, y) for f in listed().values()), (one, one), refs)
@@ -140,7 +140,7 @@ NUMBERS = st.floats(-1e3, 1e3).filter(lambda x: x == 0 or abs(x) > 1e-30)
 @given(tree=TREES, x=NUMBERS, y=NUMBERS)
 @example(tree=("less", "x", "y"), x=1.0, y=2.0)
 @example(tree=("less", "x", "y"), x=2.0, y=1.0)
-def test_any_expression_is_what_jax_makes_of_it(tree, x, y):
+def test_random_expressions_equal_jax(tree, x, y):
     def value(tree, x, y):
         if not isinstance(tree, tuple):
             return {"x": x, "y": y}.get(tree, jnp.asarray(tree) if not isinstance(tree, str) else None)
@@ -169,7 +169,7 @@ def test_equal_expressions_are_shared_and_constants_folded():
     assert sorted(ops) == sorted(["add", "mul", "mul", "div", "div", "mul", "add", "add", "add"])
 
 
-def test_what_nothing_reads_is_not_written():
+def test_unused_values_are_not_written():
     program, results, ops = count(lambda x: (jnp.exp(x), x + 1)[1], ())
     assert ops == ["add"]
     assert {node.op for node in program.nodes} == {"input", "exp", "add"}
@@ -186,7 +186,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("says", REFUSED)
-def test_what_is_no_scalar_arithmetic_is_refused_by_name(says):
+def test_operations_other_than_scalar_arithmetic_are_refused_by_name(says):
     def step(x):
         with jax.named_scope("law:test.Mine"):
             return REFUSED[says](x)
@@ -201,6 +201,6 @@ def test_a_loop_too_long_is_refused():
         count(lambda x: lax.fori_loop(0, 30_000, lambda n, v: v * x + n, x), ())
 
 
-def test_what_passes_a_scalar_on_is_no_operation():
+def test_operations_that_only_pass_a_scalar_are_removed():
     assert count(lambda x: lax.optimization_barrier(lax.stop_gradient(jnp.reshape(x, ()))) + 1, ())[2] == ["add"]
     assert not set(SAME) & set(OPS)

@@ -43,7 +43,7 @@ def traced(what):
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_the_description_names_every_number_that_the_block_reads(version):
+def test_the_description_lists_every_number_that_the_block_reads(version):
     one = traced("controller")
     root = ET.fromstring(description(one, "amb", "rig", "{1}", ["amb.c"], version))
     assert root.get("fmiVersion") == f"{version}.0"
@@ -70,8 +70,8 @@ def test_an_infinite_start_value_is_written_as_xml_allows():
     assert 'start="1e300"' in description(one, "amb", "x", "{1}", [], 2)
 
 
-def test_every_input_of_the_reference_acts_in_the_step_that_begins_at_its_time():
-    """The plant's reference repeated by hand: row k acts from t_k on, and its result is in row k + 1."""
+def test_every_input_of_the_reference_acts_in_the_step_from_its_time_on():
+    """The reference of the plant is repeated by hand. Row k acts from t_k on, and its result is in row k + 1."""
     cascade, scenario, clock = rig()
     block = block_of("loop", cascade, scenario, clock)
     files = files_of(block, "amb", frozenset(block.inputs), cascade, scenario, clock)
@@ -96,7 +96,7 @@ def written(folder, block, version=3, name="amb"):
 
 
 class Unit:
-    """An instance of an FMU, with numbers by name."""
+    """An instance of an FMU, whose numbers are accessed by name."""
 
     def __init__(self, path, folder, name="one"):
         import fmpy
@@ -181,7 +181,7 @@ def looped(controller, plant, x, count, period, at_once=False):
         for version, name, usual in ((3, "F20", 0), (2, "F20", 1), (3, "rig", 0), (3, "rig, at once", 1))
     ],
 )
-def test_controller_and_plant_in_a_loop_are_simulates(version, name, tmp_path):
+def test_controller_and_plant_in_a_loop_equal_simulate(version, name, tmp_path):
     pytest.importorskip("fmpy")
     if name == "F20":
         case = read_case(F20)
@@ -207,7 +207,7 @@ def test_controller_and_plant_in_a_loop_are_simulates(version, name, tmp_path):
 @pytest.mark.slow
 @compiled
 @pytest.mark.parametrize("version", [2, 3])
-def test_a_gain_at_run_time_reset_nan_and_a_second_instance(version, tmp_path):
+def test_a_changed_gain_a_reset_a_nan_and_a_second_instance(version, tmp_path):
     pytest.importorskip("fmpy")
     block = block_of("controller", *rig())
     path, period = written(tmp_path, block, version), block.period
@@ -254,8 +254,8 @@ def test_a_gain_at_run_time_reset_nan_and_a_second_instance(version, tmp_path):
 @pytest.mark.slow
 @compiled
 @pytest.mark.parametrize("version", [2, 3])
-def test_compiled_again_from_its_sources_it_gives_the_reference(version, tmp_path):
-    """What a real-time target does: the sources alone, with another build system."""
+def test_an_fmu_compiled_again_from_its_sources_gives_the_reference(version, tmp_path):
+    """As a real-time target does, the test compiles the sources alone, with another build system."""
     fmpy = pytest.importorskip("fmpy")
     from fmpy.build import build_platform_binary
     from fmpy.validation import validate_fmu
@@ -304,7 +304,7 @@ def test_a_command_writes_the_fmu_and_its_reference(elsewhere, tmp_path, capsys,
     )
 
 
-def test_the_sources_are_the_same_twice_and_name_the_block():
+def test_the_sources_are_reproducible_and_name_the_block():
     one = traced("plant")
     files, guid = sources(one, "amb", ORIGIN, 3)
     again = sources(one, "amb", ORIGIN, 3)

@@ -49,7 +49,7 @@ class Functions(Block):
 LOOSER = {"erf": 32, "erfc": 512, "sinh": 64, "cosh": 64, "arctanh": 256, "logistic": 8, "exp2": 8, "arcsinh": 16}
 
 
-def test_every_primitive_against_jax(tmp_path):
+def test_every_primitive_equals_jax(tmp_path):
     random = np.random.default_rng(1)
     x = random.choice([-1.0, 1.0], (1500, 2)) * 10.0 ** random.uniform(-3, 1.5, (1500, 2))
     x = np.concatenate([x, [(a, b) for a in EDGES for b in EDGES]])
@@ -79,7 +79,7 @@ const run = row => {
 
 
 @pytest.mark.parametrize("what", ["controller", "plant", pytest.param("loop", marks=pytest.mark.slow)])
-def test_one_step_is_jaxs(what, tmp_path):
+def test_one_step_equals_jax(what, tmp_path):
     traced = trace(blocks_of(*CASES["rig"])[what], "double")
     at = verification_points(traced, 1000)
     found = run_rows(
@@ -102,7 +102,7 @@ const run = x => { const bits = block.step(p, s, x, y); return [...y, bits]; };
 
 
 @pytest.mark.parametrize("name", ["rig", pytest.param("two coils", marks=pytest.mark.slow)])
-def test_the_loop_is_the_simulators(name, tmp_path):
+def test_the_loop_equals_the_simulator(name, tmp_path):
     cascade, scenario, clock = CASES[name]
     block, count = blocks_of(cascade, scenario, clock)["loop"], 200
     x = series(cascade, scenario, clock, count)

@@ -44,13 +44,13 @@ FAULTS = {"outliers": Outliers(at=4e-3, size=9.9e-3), "dropouts": Dropouts(at=8e
 
 @pytest.fixture(scope="module")
 def made():
-    """The paper's laws with every sign smoothed but one, so that there are steepnesses and hard signs: double."""
+    """The paper's laws in double precision, with one set-valued sign; the other signs are smoothed."""
     cascade = hard(position=position.SlidingMode(1440.0, 2.3), processor=Processor(1.0))
     return drafts(cascade, ["double"], 4000)["double"]
 
 
 def library(source, one, folder, name):
-    """The exported C with this text as a library."""
+    """Compile the exported C with this text as a library."""
     (folder / name).mkdir()
     (folder / name / "amb.h").write_text(one.files["amb.h"])
     (folder / name / "amb.c").write_text(source)
@@ -71,7 +71,7 @@ def frozen(one, names):
 
 
 @compiled
-def test_gains_or_limits_that_are_constants_in_the_c_are_found(made, tmp_path):
+def test_gains_or_limits_written_as_constants_in_the_c_are_found(made, tmp_path):
     names = {x.name for x in made.trace.parameters}
     limits = {x for x in names if x.startswith("limits.")}
     model = {x for x in names if x.startswith("model.")}
@@ -84,8 +84,8 @@ def test_gains_or_limits_that_are_constants_in_the_c_are_found(made, tmp_path):
         assert {x.name.partition(",")[0] for x in failed(found)} == {"parameters"}, what
 
 
-def test_each_parameter_is_seen_by_the_points(made):
-    """A C in which this one parameter is a constant would give other numbers or bits at some point."""
+def test_every_parameter_changes_the_result_at_some_point(made):
+    """If the C contained this parameter as a constant, a number or a bit would differ at some point."""
     at, should = made.steps["parameters"]
     x = np.concatenate([at.parameters, at.state, at.inputs])
     trace = made.trace
@@ -108,7 +108,7 @@ def test_each_parameter_is_seen_by_the_points(made):
         assert not refused[at.parameters[k] == trace.parameters[k].value].all()
 
 
-def test_a_steepness_of_inf_is_refused_as_the_header_says(made):
+def test_a_steepness_of_inf_is_refused_as_the_header_states(made):
     controller = made.trace.block
     parameters, memory, inputs, period = arguments(controller)
     step = jax.jit(lambda p: controller.step(p, memory, inputs, period, frozenset(INPUTS)))
@@ -129,7 +129,7 @@ def test_a_steepness_of_inf_is_refused_as_the_header_says(made):
 
 
 @pytest.mark.slow
-def test_a_twin_without_a_unit_is_jaxs_loop_and_one_with_it_differs_in_every_state():
+def test_a_twin_without_a_change_equals_the_loop_and_a_changed_twin_differs_in_every_state():
     sensor = Sensor(1e-6, 0.0, 1e-4, velocity=False, bandwidth=2e3)  # a converter would hide a unit
     scenario = dataclasses.replace(WORLD, sensor=sensor, u_max=INF)
     system = Sampled(ClosedLoop(guarded(RESTLESS.on_processor(), scenario, PERIOD), scenario), PERIOD, 0).realised()
@@ -154,7 +154,7 @@ def test_a_twin_without_a_unit_is_jaxs_loop_and_one_with_it_differs_in_every_sta
         assert len({tuple(map(float, leaves(jumped(*x).plant))) for x in given}) > 2
 
 
-def test_the_horizon_ends_before_the_first_signal_that_parts():
+def test_the_horizon_ends_before_the_first_signal_diverges():
     grown = {"z": np.array([0, 1e-3, 2e-2, 1.0]), "u": np.array([0, 0, 1e-3, 1e-3])}
     assert _count(grown, {"z": 1.0, "u": 1.0}, 4) == 2
     assert _count(grown, {"z": 1e3, "u": 1.0}, 4) == 4
@@ -171,7 +171,7 @@ def horizon(samples, of=100):
     return Horizon(zeros, {name: np.linspace(0, 1e-6, of) for name in SIGNALS}, dict.fromkeys(SIGNALS, 1.0), samples)
 
 
-def test_a_loop_is_judged_against_its_twins_within_the_horizon_only():
+def test_a_loop_is_compared_with_its_twins_within_the_horizon_only():
     one, twins = horizon(50), np.linspace(0, 1e-6, 100)
     assert closed_loop.times_of(0.5 * twins, one) == pytest.approx(0.5, abs=1e-12)
     assert closed_loop.times_of(np.where(np.arange(100) < 50, twins, 1.0), one) == pytest.approx(1, abs=1e-12)
@@ -181,7 +181,7 @@ def test_a_loop_is_judged_against_its_twins_within_the_horizon_only():
     assert np.isnan(closed_loop.times_of(twins, horizon(LEAST - 1)))
 
 
-def test_a_horizon_too_short_decides_nothing():
+def test_a_short_horizon_is_not_decisive():
     good, bad = Check("a", "double", "", "", True), Check("b", "double", "", "", False)
     row = _looped("float", closed_loop.LoopComparison(horizon(LEAST - 1), np.nan))
     assert (row.ok, row.verdict) == (None, "not decisive")
@@ -199,10 +199,10 @@ def test_a_horizon_too_short_decides_nothing():
 
 @pytest.mark.slow
 @compiled
-def test_a_loop_that_amplifies_rounding_is_compared_until_it_does(tmp_path):
-    """Correct C passes though rounding grows a thousandfold after the horizon, and C with another gain fails.
+def test_a_loop_that_amplifies_rounding_is_compared_up_to_its_horizon(tmp_path):
+    """Correct C passes although rounding grows a thousandfold after the horizon, and C with another gain fails.
 
-    With faults, so that the guard acts in the loop.
+    The case has faults, so that the guard acts in the loop.
     """
     world = dataclasses.replace(WORLD, sensor=dataclasses.replace(WORLD.sensor, **FAULTS))
     one = drafts(RESTLESS, ["double"], 100, scenario=world)["double"]
@@ -282,7 +282,7 @@ ROWS = {
 
 @compiled
 @pytest.mark.slow
-def test_every_row_fails_for_a_program_made_for_it():
+def test_every_check_fails_for_a_program_with_its_fault():
     scenario = Scenario(reference=Sine(2.5e-3, 2.0), sensor=Sensor(1e-6, 1e-4, 1e-4), u_max=200.0)
     made = drafts(hard(), ["double"], 2000, scenario=scenario)["double"]
     case = LoopCase(hard(), scenario, Clock(200, PERIOD, RK4(1)), 0.005)
@@ -309,7 +309,7 @@ TUNED = {
 @pytest.mark.parametrize(
     "name", [pytest.param(x, marks=pytest.mark.slow if x == "F10-signs" else pytest.mark.thorough) for x in TUNED]
 )
-def test_correct_c_passes_whatever_the_seed(name, tmp_path):
+def test_correct_c_passes_for_every_seed(name, tmp_path):
     text = (TASKS / f"{name}.toml").read_text().partition("[tune]")[0]
     text = text.replace('kind = "kalman"', 'kind = "kalman"\nw = 393.7')
     for gain, value in TUNED[name].items():

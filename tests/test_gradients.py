@@ -201,7 +201,7 @@ for f, leaves in zip(transforms, fast):
 
 
 @pytest.mark.slow
-def test_the_fast_path_differentiates():
+def test_the_fast_path_is_differentiable():
     # reverse mode through a marked call aborts XLA, and would take pytest with it
     code = IN_A_PROCESS_OF_ITS_OWN.replace("{transforms}", ", ".join(TRANSFORMS.values()))
     environment = os.environ | {"JAX_ENABLE_X64": "1"}
@@ -230,8 +230,8 @@ for name, function in functions.items():
 
 
 @pytest.mark.slow
-def test_the_fast_path_takes_whatever_is_closed_over():
-    """What XLA cannot compile as one function runs as usual, with a line that says so, once each."""
+def test_the_fast_path_accepts_closures():
+    """Functions that XLA cannot compile as one kernel run by the plain path, each with one message."""
     environment = os.environ | {"JAX_ENABLE_X64": "1"}
     done = subprocess.run(
         [sys.executable, "-c", WHATEVER_ONE_CLOSES_OVER], env=environment, capture_output=True, text=True

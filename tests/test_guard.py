@@ -41,7 +41,7 @@ def struck(guard=Guard(), observer=None, **faults):
 
 
 @pytest.mark.parametrize("observer", [None, amb.observer.Kalman(500.0)], ids=["direct", "Kalman"])
-def test_one_impossible_reading_is_refused_and_survived(observer):
+def test_one_impossible_reading_is_refused_and_the_rotor_is_held(observer):
     """Outliers of both signs at several samples; without a guard, the same readings lose rotors."""
     found = {}
     for guard in (Guard(), None):
@@ -69,8 +69,8 @@ EACH_WORLD = [pytest.param(x, marks=MARKS.get(x, pytest.mark.slow)) for x in WOR
 
 
 @pytest.mark.parametrize("name", EACH_WORLD)
-def test_guard_and_faults_against_the_independent_simulator(name):
-    """An outlier, a dropout that is bridged, and one that lasts until the safe command."""
+def test_guard_and_faults_agree_with_the_independent_simulator(name):
+    """The faults are an outlier, a short dropout, and a dropout that lasts until the safe command."""
     std = NOISE if "noise" in name else (0.0, 0.0, 0.0)
     dropouts = {"value": "nan", "duration": 5 * T, "at": 0.012}
     cascade, scenario, clock = loop_of(WORLDS[name], 200, std)
@@ -99,7 +99,7 @@ def test_guard_and_faults_against_the_independent_simulator(name):
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.5, 1.0, 1.5, 2.0])
-def test_the_expected_current_follows_the_voltages_that_act_within_the_sample(delay):
+def test_the_expected_current_uses_the_voltages_that_act_within_the_sample(delay):
     """Eq. (2), written out, under the mean of u_n, which acts after the delay, and of the two voltages before it."""
     cascade, scenario, clock = loop_of(World(**TRACKING, delay=delay, **soft()), 5, (0.0, 0.0, 0.0))
     cascade = dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=Guard()))
@@ -118,7 +118,7 @@ def test_the_expected_current_follows_the_voltages_that_act_within_the_sample(de
     assert float(after.watch.expected.i) == pytest.approx(i + T * rate, rel=1e-12)
 
 
-def test_limits_left_out_admit_all_that_a_sensor_without_faults_reads():
+def test_default_limits_accept_every_reading_of_a_sensor_without_faults():
     rng = np.random.default_rng(2)
     for _ in range(200):
         bits, std = float(rng.integers(6, 20)), 10 ** rng.uniform(-8, -4)
@@ -134,7 +134,7 @@ def test_limits_left_out_admit_all_that_a_sensor_without_faults_reads():
         assert max(ends[1] - ends[0], ends[3] - ends[2]) <= guard.noise * (1 + 1e-9)
 
 
-def test_a_guard_that_cannot_act_is_no_part_of_the_program():
+def test_a_guard_that_cannot_act_is_removed():
     for faults, guard, acts in (
         ({}, Guard(), False),
         ({}, None, False),
@@ -149,7 +149,7 @@ def test_a_guard_that_cannot_act_is_no_part_of_the_program():
     assert len(jax.tree.leaves(settled)) == len(dataclasses.fields(Guard))
 
 
-def test_a_first_reading_that_is_none_is_waited_for():
+def test_the_laws_start_at_the_first_accepted_reading():
     cascade, scenario = struck(dropouts=Dropouts(at=0.0, duration=3 * T, value="nan"))
     scenario = dataclasses.replace(scenario, initial=amb.Initial(1e-4))
     rows = amb.rollout(cascade, scenario, CLOCK).trajectory.rows
@@ -159,7 +159,7 @@ def test_a_first_reading_that_is_none_is_waited_for():
     assert np.asarray(rows.alive).all()
 
 
-def test_faults_are_those_of_the_member_and_the_sample():
+def test_faults_depend_on_the_member_and_the_sample_only():
     """Rates within 5 standard deviations of a binomial; both signs; one at a given time; no effect of other members."""
     sensor = Sensor(outliers=Outliers(500.0, 1e-3, 0.0205), dropouts=Dropouts(200.0, 3e-4, 0.0305))
     _, scenario = struck()
@@ -181,7 +181,7 @@ def test_faults_are_those_of_the_member_and_the_sample():
 
 
 @pytest.mark.parametrize("value", VALUES)
-def test_what_is_read_in_a_dropout(value):
+def test_the_readings_during_a_dropout(value):
     cascade, scenario = struck(dropouts=Dropouts(at=5e-3, duration=4.4e-4, value=value))
     rows = amb.rollout(cascade, scenario, CLOCK).trajectory.rows
     seen, hold = np.asarray(rows.z_measured), np.asarray(rows.z_measured)[49]
@@ -195,7 +195,7 @@ def test_what_is_read_in_a_dropout(value):
 
 @pytest.mark.parametrize("guard", [Guard(), None], ids=["guard", "none"])
 @pytest.mark.slow
-def test_derivatives_are_finite_whatever_is_read(guard):
+def test_derivatives_are_finite_for_all_readings(guard):
     cascade, scenario = struck(guard, outliers=Outliers(at=1e-3, size=1e-3), dropouts=Dropouts(at=4e-3, value="nan"))
     cascade, clock = cascade.on_processor(), amb.Clock(60, T, amb.RK4(1))
 
@@ -213,7 +213,7 @@ def test_derivatives_are_finite_whatever_is_read(guard):
 CASE = {"processor": {}, "clock": {"duration": 0.01}, "sensor": {"outliers": {"rate": 3.0}}}
 
 
-def test_a_case_file_has_guard_and_faults():
+def test_a_case_file_sets_guard_and_faults():
     case = case_from(CASE | {"processor": {"guard": {"z": 4e-3, "samples": 7}}})
     assert case.cascade.processor.guard == Guard(z=4e-3, samples=7.0)
     assert case.scenario.sensor.outliers == Outliers(rate=3.0)
@@ -238,6 +238,6 @@ def test_a_case_file_has_guard_and_faults():
         (CASE | {"processor": {"guard": 3}}, r"processor\.guard = 3: it must be a table"),
     ],
 )
-def test_what_a_case_file_may_not_say_of_them(raw, message):
+def test_bad_guards_and_faults_are_refused(raw, message):
     with pytest.raises(ValueError, match=message):
         case_from(raw)

@@ -78,7 +78,7 @@ def measured_by_the_oracle(world, harmonics, samples, amplitude, monkeypatch):
 
 
 @pytest.mark.parametrize("name", [pytest.param(x, marks=MARKS.get(x, pytest.mark.slow)) for x in WORLDS])
-def test_the_peak_is_that_of_the_independent_simulator(name, monkeypatch):
+def test_the_peak_agrees_with_the_independent_simulator(name, monkeypatch):
     """Driven at nine lines around the peak. The parabola through three of them is within 0.2 % of the peak."""
     world = World(**LAWS, **WORLDS[name])
     cascade, scenario, _ = loop_of(world, 1, (0.0, 0.0, 0.0))
@@ -107,8 +107,11 @@ SLOW = Clock(1000, 1e-3)
     [(Cascade(**SMOOTH), 1e-6, 0.0), (Cascade(**SMOOTH), 1e-6, 1e-3), (Cascade(), 1e-7, 0.0)],
     ids=["smooth", "at 1 mm", "repaired"],
 )
-def test_continuous_time_is_the_linear_analysis(cascade, amplitude, r):
-    """All share a program. S: the size of the signs' arguments squared; u: the integration error in the stiff i."""
+def test_the_measured_peak_in_continuous_time_is_the_linear_peak(cascade, amplitude, r):
+    """All cases share one program.
+
+    The error of S is of second order in the signs' arguments; that of u is the integration error of the stiff i.
+    """
     found = injected(cascade, Scenario(), SLOW, [1.0, 2.0, 5.0, 17.0, 31.0, 100.0], amplitude=amplitude, r=r)
     system = linearise(cascade, Scenario(), SLOW, r)
     expected = system.response(found.frequency)
@@ -128,8 +131,8 @@ def test_continuous_time_is_the_linear_analysis(cascade, amplitude, r):
     [(Processor(0.0), T), pytest.param(None, 1e-3, marks=pytest.mark.thorough)],
     ids=["processor", "continuous"],
 )
-def test_the_velocity_sensor_has_a_sensitivity_of_its_own(processor, period):
-    """Errors as in continuous time above: S 1e-3, u 1e-2."""
+def test_the_sensitivity_at_the_velocity_sensor(processor, period):
+    """The tolerances are those of continuous time above: 1e-3 for S, 1e-2 for u."""
     cascade, clock, f = Cascade(**SMOOTH, processor=processor), Clock(1000, period), [20.0, 50.0, 100.0]
     found = injected(cascade, Scenario(), clock, f, reading="z_dot", amplitude=1e-5)
     H = linearise(cascade, Scenario(), clock).response(found.frequency)
@@ -143,8 +146,8 @@ def noisy(std, **more):
 
 
 @pytest.mark.slow
-def test_true_signs_under_noise_and_a_lost_rotor():
-    """Within their bands the implicit signs act as linear gains, those of the linear analysis."""
+def test_set_valued_signs_under_noise_and_a_lost_rotor():
+    """Within their bands, the implicit signs act as the linear gains of the linear analysis."""
     cascade = Cascade(**SIGNS, processor=Processor(0.0))
     clock, f = Clock(500, T), [20.0, 40.0, 80.0, 160.0]
     found = injected(cascade, noisy(1e-8), clock, f, amplitude=1e-7, members=8, settle=4)
@@ -164,7 +167,7 @@ def test_true_signs_under_noise_and_a_lost_rotor():
 
 @pytest.mark.slow
 def test_each_member_of_a_spread_has_its_own_peak():
-    """Errors as in continuous time above. The last member has no voltage and loses the rotor."""
+    """The tolerances are those of continuous time above. The last member has no voltage, and its rotor is lost."""
     cascade, clock, f = Cascade(**SMOOTH, processor=Processor(0.0)), Clock(4000, T), [20.0, 50.0, 100.0]
     masses = np.array([0.5, 0.588, 0.7, 0.588])
     plants = [dataclasses.replace(Scenario().plant, m=m) for m in (masses, *masses[:3])]
@@ -179,8 +182,11 @@ def test_each_member_of_a_spread_has_its_own_peak():
     assert np.ptp(found.peak[:3]) > 0.1
 
 
-def test_a_slow_observer_starts_at_rest_whatever_the_noise():
-    """An estimate that starts at the first noisy reading is 0.3 mm off, and loses rotors in the reading `sampled`."""
+def test_a_slow_observer_starts_at_rest_under_noise():
+    """The estimate must not start at the first noisy reading.
+
+    It would then be wrong by 0.3 mm, which loses rotors of the reading `sampled`.
+    """
     world = paper.scenario("regulation", "sampled", pulse=False)
     found = injected(paper.cascade("sampled"), world, Clock(500, T), [20.0, 100.0], members=8)
     assert found.lost == 0
@@ -196,7 +202,7 @@ def test_the_wave_repeats_exactly_and_has_the_stated_amplitude():
     assert float(wave(7 * T)) == pytest.approx(wave.size * every[7], abs=1e-16)
 
 
-def test_schroeder_phases_keep_the_wave_low():
+def test_schroeder_phases_lower_the_crest_of_the_wave():
     """The largest value of 30 lines is below 2.5 times the effective value; with equal phases it is 7.7 times."""
     wave = multisine(np.arange(1, 31), 1000, T, 1.0)
     assert 1 / (wave.size * np.sqrt(15)) < 2.5
@@ -213,7 +219,7 @@ def test_lines_are_dense_near_the_peak_and_whole_harmonics():
     assert len(frequency_lines(Zones(), clock)) < len(f) <= 41
 
 
-def test_what_cannot_be_measured_is_refused_in_one_line():
+def test_impossible_measurements_are_refused_in_one_line():
     clock = Clock(100, T)
     for f in ([20.0], [5000.0], [], [math.nan]):
         with pytest.raises(ValueError, match=r"injection.frequencies: .* at least 100 Hz, .* below 5000 Hz"):

@@ -62,7 +62,7 @@ def test_feed_forward_leaves_only_the_sign_in_equation_8():
         np.testing.assert_allclose(w_dot, -law.gamma * smooth_sign(w, law.p), atol=1e-7)
 
 
-def test_sampled_feed_forward_meets_the_force_of_the_next_sample():
+def test_sampled_feed_forward_reaches_the_force_of_the_next_sample():
     law, T = inversion.FeedForwardAdaptive(gamma=1e9, p=None), 1e-4
     for z, z_dot, i_ref, force, rate in points(MODEL, 50):
         v_star, v_star_dot = 3e3 * force, 1e3 * rate

@@ -38,7 +38,7 @@ def curved(t, state):
 
 
 def curved_error(method, spans=1):
-    """In so many spans one after another, so that one program serves every length of the step."""
+    """Return the error after several consecutive spans, so that one program serves all step lengths."""
     p, end = 1 + math.sin(1.5), (jnp.asarray(1.0), jnp.asarray(1.0))
     for n in range(spans):
         end = end_of(method, curved, 1.5 * n / spans, 1.5 / spans, end)
@@ -63,8 +63,8 @@ def test_order_on_a_problem_with_known_solution(method, order):
     assert slope(1 / substeps, errors) == pytest.approx(order, abs=0.15)
 
 
-def test_methods_and_laws_of_equal_fields_are_of_different_structure():
-    """Else one's compiled program would be taken for the other's: JAX looks programs up by structure."""
+def test_different_types_with_equal_fields_have_different_pytree_structures():
+    """JAX finds compiled programs by structure, so equal structures would share a program."""
     methods = [kind(2) for kind in (amb.Euler, amb.RK4, amb.DOP853, amb.Rodas3, amb.Slide)]
     bare = [amb.observer.Direct(), amb.inversion.ClosedForm()]
     structures = [jax.tree.structure(x) for x in (*methods, *bare)]
@@ -130,7 +130,7 @@ def closed_loop_error(method, finer=1):
     ("name", "substeps"), [("Euler", 16), ("RK4", 3), pytest.param("Rodas3", 6, marks=pytest.mark.slow)]
 )
 def test_order_on_the_closed_loop(name, substeps):
-    """Without noise a sample period is only a step: halving it halves the step, and compiles nothing."""
+    """Without noise, the sample period only sets the step: half the period halves the step, without compilation."""
     method, order = FIXED[name]
     finer = np.array([1, 2, 4])
     errors = [closed_loop_error(method(substeps), n) for n in finer]
@@ -177,7 +177,7 @@ def test_rodas3_damps_infinitely_fast_decay_in_one_step():
     assert abs(float(end_of(amb.Rodas3(1), decay, 0.0, 1.0, jnp.asarray(1.0)))) < 1e-11
 
 
-def test_rodas3_follows_a_slow_solution_through_stiffness():
+def test_rodas3_follows_a_slow_solution_of_a_stiff_problem():
     def prothero_robinson(t, y):
         return -1e8 * (y - jnp.sin(t)) + jnp.cos(t)
 
@@ -188,7 +188,7 @@ def test_rodas3_follows_a_slow_solution_through_stiffness():
 
 @pytest.mark.parametrize("method", [amb.Euler, amb.RK4], ids=lambda m: m.__name__)
 @pytest.mark.parametrize(("share", "grows"), [(0.97, False), (1.03, True)])
-def test_the_stability_limit_is_where_decay_turns_to_growth(method, share, grows):
+def test_the_stability_limit_separates_decay_from_growth(method, share, grows):
     def decay(t, y):
         return -y
 
@@ -197,8 +197,8 @@ def test_the_stability_limit_is_where_decay_turns_to_growth(method, share, grows
 
 
 @every_method
-def test_no_time_is_no_motion(method):
-    """A lost rotor is frozen by a span of 0: the state is the same, to the bit."""
+def test_a_step_of_length_0_does_not_change_the_state(method):
+    """The state of a lost rotor is frozen by steps of length 0. It is equal bit by bit."""
     state = (jnp.asarray(0.3), jnp.asarray(-0.7))
     assert end_of(method, curved, 0.2, 0.0, state) == state
 
@@ -211,7 +211,7 @@ def test_adaptive_error_falls_with_the_tolerance():
     assert all(errors < 10 * tolerances)
 
 
-def test_adaptive_step_carries_over():
+def test_the_adaptive_step_is_kept_for_the_next_sample():
     few = amb.AdaptiveRodas3(most_steps=8)
     one = (jnp.asarray(1.0), jnp.asarray(1.0))
     p = problem(curved, one)
@@ -220,7 +220,7 @@ def test_adaptive_step_carries_over():
     assert int(few.advance(p, 0.1, 0.1, first.state, 1e-7).code) == STALLED  # a first step grows 5 times per step
 
 
-def test_adaptive_that_may_not_take_enough_steps_stalls():
+def test_an_adaptive_method_with_too_few_steps_stalls():
     out = amb.AdaptiveRodas3(most_steps=2).advance(problem(lambda t, y: -y), 1.0, 1.0, jnp.asarray(1.0), 1e-3)
     assert int(out.code) == STALLED
     assert 1.0 < float(out.t) < 2.0
@@ -229,7 +229,7 @@ def test_adaptive_that_may_not_take_enough_steps_stalls():
     )  # where it got to, exactly there
 
 
-def test_a_stalled_rollout_says_so_and_stays_finite():
+def test_a_stalled_rollout_has_the_status_stalled_and_finite_values():
     clock = amb.Clock(50, 1e-4, amb.AdaptiveRodas3(tolerance=1e-12, most_steps=3))
     trajectory = amb.rollout(REPAIRED, TRACKING, clock).trajectory
     assert trajectory.lost_why.startswith("stalled")
@@ -238,7 +238,7 @@ def test_a_stalled_rollout_says_so_and_stays_finite():
 
 
 @pytest.mark.parametrize("method", [amb.Euler(10), amb.RK4(10), amb.Rodas3(10), amb.AdaptiveRodas3()], ids=str)
-def test_stops_at_the_first_bad_state_and_returns_the_last_good_one(method):
+def test_integration_stops_at_the_first_invalid_state_and_returns_the_last_valid_one(method):
     def status(y):
         return jnp.where(y < 0.55, 0, 2).astype(jnp.int32)
 
@@ -253,7 +253,7 @@ def test_stops_at_the_first_bad_state_and_returns_the_last_good_one(method):
 
 # Not Rodas3 with three steps: a fixed implicit step may leap over the pole and never see it.
 @pytest.mark.parametrize("method", [amb.Euler(3), amb.RK4(3), amb.AdaptiveRodas3()], ids=str)
-def test_blow_up_ends_in_a_code_and_a_finite_state(method):
+def test_a_divergent_solution_ends_with_a_status_and_a_finite_state(method):
     def status(y):
         return jnp.where(jnp.abs(y) < 1e3, 0, 2).astype(jnp.int32)
 
@@ -289,7 +289,7 @@ LIGHT = {"n": 50.0, "A": 1e-4, "mu_0": 1.2566e-6, "s_0": 5e-4, "i_0": 1.0, "m": 
 
 
 @pytest.mark.parametrize("kind", [amb.Plant, amb.TwoCoil])
-def test_coils_that_settle_within_a_sample_are_resolved(kind):
+def test_the_chosen_step_resolves_coils_that_settle_within_a_sample(kind):
     plant, period = kind(**LIGHT), 2e-4
     sampled, world = amb.Cascade(processor=amb.Processor()), amb.Scenario(plant=plant)
     at = lambda z: jax.jacfwd(plant.rates)(plant.start(amb.world.sensor.Measurement(z, 0.0, 0.0)), 0.0)  # noqa: E731
@@ -334,7 +334,7 @@ def test_a_chosen_explicit_step_is_within_its_limit(gamma):
 
 @pytest.mark.parametrize("p", [1e3, 1e6, 1e9])
 def test_a_sign_as_steep_as_a_relay_does_not_stall_the_adaptive_method(p):
-    """The limit p -> infinity exists (the sliding mode), and the layer narrows as 1/p: from 1e-8 A to 1e-14 A."""
+    """The limit p -> infinity exists (the sliding mode). The layer narrows as 1/p, here from 1e-8 A to 1e-14 A."""
     noisy = dataclasses.replace(TRACKING, sensor=amb.Sensor(1e-6))
     cascade = amb.Cascade(inversion=amb.inversion.Adaptive(p=p))
     found = [amb.rollout(cascade, noisy, amb.Clock(300, 1e-4, step)) for step in (amb.AdaptiveRodas3(), amb.Slide(64))]
@@ -344,7 +344,7 @@ def test_a_sign_as_steep_as_a_relay_does_not_stall_the_adaptive_method(p):
     np.testing.assert_allclose(z, expected, rtol=0, atol=2e-8)
 
 
-def test_traced_gains_cannot_choose_a_method():
+def test_traced_gains_are_refused_for_the_choice_of_a_method():
     def peak(gamma, clock):
         cascade = amb.Cascade(inversion=amb.inversion.Adaptive(gamma=gamma, p=25e-6))
         return jnp.abs(amb.rollout(cascade, TRACKING, clock).trajectory.rows.z).max()
@@ -356,7 +356,7 @@ def test_traced_gains_cannot_choose_a_method():
     assert jax.eval_shape(lambda gamma: peak(gamma, chosen), 1e9).shape == ()
 
 
-def test_a_traced_resistance_is_named_where_it_decides():
+def test_a_traced_resistance_is_named_if_the_method_depends_on_it():
     def peak(R):
         world, cascade = dataclasses.replace(TRACKING, plant=amb.Plant(R=R)), amb.Cascade(processor=amb.Processor())
         return jnp.abs(amb.rollout(cascade, world, amb.Clock(10)).trajectory.rows.z).max()
@@ -366,7 +366,7 @@ def test_a_traced_resistance_is_named_where_it_decides():
 
 
 @pytest.mark.parametrize("n", range(1, 9))
-def test_factor_and_solve_are_those_of_numpy(n):
+def test_factor_and_solve_agree_with_numpy(n):
     rng = np.random.default_rng(n)
     jac, right = rng.normal(size=(n, n)), rng.normal(size=n)
     jac -= 2 * n * np.eye(n)  # decaying, as a stiff loop is: no row exchanges needed
@@ -375,7 +375,7 @@ def test_factor_and_solve_are_those_of_numpy(n):
     np.testing.assert_allclose(found, np.linalg.solve(np.eye(n) - 0.3 * jac, right), rtol=1e-13, atol=1e-14)
 
 
-def test_factor_survives_a_pivot_of_zero():
+def test_factor_is_finite_for_a_pivot_of_zero():
     factors = linear.factor([[0.0, 1.0], [1.0, 1.0]], 1.0)  # the last diagonal of I - J is 0
     assert np.isfinite(linear.solve(factors, (1.0, 2.0))).all()
 

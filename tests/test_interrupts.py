@@ -1,4 +1,4 @@
-"""Ctrl-C gives one line and exit code 130 in every command; it is deferred where a step has to be completed."""
+"""Ctrl-C gives one line and exit code 130 in every command; it is deferred where a step must be completed."""
 
 import subprocess
 import sys
@@ -78,7 +78,7 @@ def run(code):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_it_ends_at_once_with_one_line(case):
+def test_ctrl_c_ends_the_program_at_once_with_one_line(case):
     code, said = CASES[case]
     done = run(code)
     assert done.returncode == 130, done.stderr
@@ -106,7 +106,7 @@ print("anew", signal.getsignal(signal.SIGINT) is signal.default_int_handler)
     assert done.stdout.split() == ["raised", "anew", "True"]
 
 
-def test_where_it_is_ignored_it_stays_ignored():
+def test_an_ignored_sigint_stays_ignored():
     code = "signal.signal(signal.SIGINT, signal.SIG_IGN)\nwith exit_on_interrupt('p'):\n interrupt()\n print('on')"
     done = run(code)
     assert (done.returncode, done.stdout, done.stderr) == (0, "on\n", "")

@@ -73,7 +73,7 @@ def test_the_voltage_of_a_coil_is_the_rate_of_its_flux_linkage():
 
 
 @PLANTS
-def test_leakage_lengthens_the_time_constant_and_leaves_the_force(kind):
+def test_leakage_increases_the_time_constant_but_not_the_force(kind):
     bare, leaky = kind(**RIG), made(kind, leakage=1.25)
     state = bare.start(Measurement(*map(jnp.asarray, (0.0, 0.0, 0.7))))
     ours, theirs = (jax.grad(lambda u, p=p: p.measurement(p.rates(state, u)).i)(3.0) for p in (leaky, bare))
@@ -120,13 +120,13 @@ def test_the_chosen_step_resolves_the_lag_of_the_flux(eddy, most):
     assert np.ptp(z) > 1e-6
 
 
-def test_a_very_short_lag_takes_a_stiff_method():
+def test_a_very_short_lag_selects_a_stiff_method():
     raw = tomllib.loads(template("rig"))
     raw["plant"]["iron"] = {"eddy": 1e-7}
     assert isinstance(case_from(raw).clock.method, AdaptiveRodas3)
 
 
-def test_a_case_reads_the_iron_and_its_controller_s_model_has_none():
+def test_the_iron_of_a_case_is_not_in_the_model_of_the_controller():
     raw = tomllib.loads("[plant.iron]\nsaturation = 1.2\n[spread]\nplant.iron.saturation = { percent = 5 }\n")
     case = case_from(raw)
     assert case.scenario.plant.iron == Iron(saturation=1.2)

@@ -1,4 +1,7 @@
-"""Systems that jump at the start of each sample, and within it: a controller on a processor, against exact matrices."""
+"""Systems that jump at the start of each sample and within it, against exact matrices.
+
+An example of such a system is a controller on a processor.
+"""
 
 from typing import Any, NamedTuple
 
@@ -26,7 +29,7 @@ class Motion(NamedTuple):
 
 
 class Held(NamedTuple):
-    """The plant, the controller's own state, and the voltages of this sample, of the one before and of that before."""
+    """The plant, the state of the controller, and the voltages of this sample and of the two previous ones."""
 
     plant: Motion
     steps: Any
@@ -73,10 +76,16 @@ class Sampled:
     def driven(self, u):
         """The plant alone under a constant voltage."""
         rates = lambda _, m: Motion(m.x_dot, W**2 * m.x + u)  # noqa: E731
-        shown = lambda inputs, m: (rates(inputs, m), Instant((), Effort(u)))  # noqa: E731
+        observed = lambda inputs, m: (rates(inputs, m), Instant((), Effort(u)))  # noqa: E731
         inputs = lambda t: t  # noqa: E731
         return InitialValueProblem(
-            inputs, rates, Motion(1e-3, 0.1), self._status, observed=shown, shown=Instant((), Effort(0.0)), jumps=True
+            inputs,
+            rates,
+            Motion(1e-3, 0.1),
+            self._status,
+            observed=observed,
+            instant_structure=Instant((), Effort(0.0)),
+            jumps=True,
         )
 
     def advance(self, method, errors, t, period, state, memory, code):
@@ -107,7 +116,7 @@ class Sampled:
 
 
 def exact(delay):
-    """x, u and the mean of what acts, at and over each sample: constant voltages through the matrix exponential."""
+    """Return x and u at each sample, and the mean of the acting voltage over it, from the matrix exponential."""
     A = np.array([[0.0, 1.0, 0.0], [W**2, 0.0, 1.0], [0.0, 0.0, 0.0]])
     x, past, found = np.array([1e-3, 0.0]), [0.0, 0.0, 0.0], []
     for n in range(SAMPLES):
@@ -126,7 +135,7 @@ def run(system, method, samples=SAMPLES, fold=None):
 
 @pytest.mark.parametrize("method", [RK4(4), AdaptiveRodas3(1e-9)], ids=str)
 @pytest.mark.parametrize("delay", [0.0, 0.3, 1.0, 1.7])
-def test_a_sampled_loop_is_that_of_the_matrix_exponential(delay, method):
+def test_a_sampled_loop_agrees_with_the_matrix_exponential(delay, method):
     found = run(Sampled(delay=delay), method, fold=Driven("u"))
     rows, want = found.trajectory.rows, exact(delay)
     # RK4: (w T/4)^4/120 a step; the adaptive method: its tolerance over some 1e3 steps, and the loop amplifies both
@@ -138,7 +147,7 @@ def test_a_sampled_loop_is_that_of_the_matrix_exponential(delay, method):
     np.testing.assert_array_equal(rows.steps, np.arange(1, SAMPLES + 1))  # the row is that after the jump
 
 
-def test_a_lost_state_jumps_no_more():
+def test_a_lost_state_does_not_jump():
     found = run(Sampled(gains=(0.0, 0.0), stop=2e-3), RK4(4)).trajectory
     lost = int(np.argmin(found.rows.alive))
     assert 0 < lost < SAMPLES
@@ -149,14 +158,14 @@ def test_a_lost_state_jumps_no_more():
         assert len(set(np.asarray(getattr(found.rows, name))[lost:])) == 1
 
 
-def test_the_time_of_a_loss_is_that_of_its_own_stretch():
+def test_the_time_of_a_loss_lies_in_its_own_part_of_the_sample():
     for share in (0.1, 0.9):  # lost at 0.46 of a sample: in its second stretch, then in its first
         found = run(Sampled(gains=(0.0, 0.0), stop=2e-3, delay=share), RK4(4)).trajectory
         # found at the end of a substep, 0.225 T later at most; the noise shifts it by 0.05 T
         assert float(found.lost_at) == pytest.approx(np.arccosh(2.0) / W, abs=0.3 * T)
 
 
-def test_derivatives_go_through_jumps_and_stretches():
+def test_derivatives_include_jumps_and_parts_of_samples():
     def end(delay):
         return run(Sampled(delay=delay), RK4(4)).trajectory.rows.x[-1]
 

@@ -132,7 +132,7 @@ def test_states_have_names(stage, law):
 
 
 @TABLE
-def test_slope_is_what_it_says(stage, law):
+def test_slope_is_finite_and_positive_if_the_law_has_positive_gains(stage, law):
     slope = law.slope(MODEL)
     assert np.isfinite(slope)
     assert slope >= 0
@@ -175,7 +175,7 @@ def test_derivatives_in_gains_inputs_and_state_are_finite_and_modes_agree(stage,
 
 
 @TABLE
-def test_output_and_derivatives_are_finite_for_wild_inputs(stage, law):
+def test_output_and_derivatives_are_finite_for_extreme_inputs(stage, law):
     state = jax.tree.map(jnp.asarray, start(stage, law))
 
     def everything(x):
@@ -186,7 +186,7 @@ def test_output_and_derivatives_are_finite_for_wild_inputs(stage, law):
 
 
 @TABLE
-def test_output_is_finite_for_wild_states(stage, law):
+def test_output_is_finite_for_extreme_states(stage, law):
     for size in (1e-12, 1.0, 1e6):
         state = jax.tree.map(lambda x, size=size: jnp.asarray(x) * 0 + size, start(stage, law))
         for sign in (1, -1):
@@ -206,7 +206,7 @@ ERRORS = jnp.asarray([-1e9, -1e-3, 0.0, 1e-3, 1e9])
 
 
 @TABLE
-def test_the_optional_methods_of_a_law(stage, law):
+def test_the_optional_methods_of_a_law_are_consistent(stage, law):
     assert jax.tree.structure(law.layer(MODEL)) == jax.tree.structure(law.scale(MODEL))
     assert all(x > 0 for x in jax.tree.leaves(law.layer(MODEL)))
     robust = np.asarray(law.robust(ERRORS))
@@ -289,7 +289,10 @@ def pairwise(stages):
 
 
 def how_slow(combinations):
-    """Return the mark of each: two are fast, those with a law that no earlier one has are slow, the others thorough."""
+    """Return the mark of each combination.
+
+    Two combinations are fast; those with a law that no earlier one has are slow; the others are thorough.
+    """
     seen = set()
     for k, laws in enumerate(combinations):
         new = set(map(type, laws)) - seen
@@ -306,7 +309,7 @@ TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.02, 0.04))
 
 
 @pytest.mark.parametrize("laws", COMBINATIONS)
-def test_any_law_of_a_stage_stands_with_any_of_the_others(laws):
+def test_every_law_works_with_every_law_of_the_other_stages(laws):
     cascade = Cascade(*laws)
     amplifier = CurrentAmplifier(1e4) if cascade.current.commands == "current" else None
     scenario = dataclasses.replace(TRACKING, amplifier=amplifier)
@@ -329,7 +332,7 @@ def test_any_law_of_a_stage_stands_with_any_of_the_others(laws):
     assert np.max(np.abs(rows.e_z[-100:])) < 1e-4
 
 
-def test_any_two_laws_are_composed():
+def test_every_pair_of_laws_can_be_combined():
     found = {pair for p in COMBINATIONS for pair in itertools.combinations([type(x) for x in p.values[0]], 2)}
     wanted = itertools.combinations([{type(law) for law in kinds} for kinds in LAWS_BY_STAGE], 2)
     assert found == {pair for a, b in wanted for pair in itertools.product(a, b)}
@@ -392,7 +395,7 @@ def test_equation_11_gives_the_error_dynamics_of_equation_10():
         close(e_dot, -law.k_i * smooth_sign(i - i_ref, law.p) + q_i, 200.0)
 
 
-def test_closed_form_inversion_leaves_no_error():
+def test_closed_form_inversion_has_no_error():
     law = inversion.ClosedForm()
     for z, z_dot, *_, w in samples(40):
         z, v_star, v_star_dot = z / 2, 5e3 * w, 1e5 * z_dot  # at 3 mm such forces are out of reach
@@ -431,12 +434,15 @@ def test_static_inversion_on_a_processor_commands_each_step_of_its_root_once(law
 
 @pytest.mark.parametrize("watch", [observer.Direct(), observer.Complementary()], ids=lambda x: type(x).__name__)
 @pytest.mark.parametrize("law", [position.SlidingMode(), position.SuperTwisting()], ids=lambda x: type(x).__name__)
-def test_the_demand_s_rates_are_derivatives_along_the_nominal_flow(watch, law):
+def test_the_rates_of_the_demand_are_derivatives_along_the_nominal_solution(watch, law):
     cascade, reference = Cascade(watch, law), Sine(2.5e-3, 2.0)
 
     @jax.jit
     def demand(s, x):
-        """At s seconds along the straight line through x: time, motion and law states move at their rates."""
+        """Return the demand after s seconds along the straight line through x.
+
+        Along this line, time, motion and states of the laws change at their rates.
+        """
         motion = Measurement(x[0], x[1], x[2])
         state = cascade.init(motion)._replace(
             observer=() if not has_state(watch) else x[3],
@@ -480,7 +486,7 @@ def test_pi_integral_is_bounded_while_the_supply_saturates():
     np.testing.assert_allclose(rate(0.0, 1e-6), law.k_int * 1e-6, rtol=1e-14)
 
 
-def test_complementary_observer_forgets_its_error_at_rate_l_and_integrates_velocity_noise():
+def test_the_error_of_the_complementary_observer_decays_at_rate_l_and_integrates_velocity_noise():
     law = observer.Complementary(l=7.0)
     z, z_dot, i = 1e-3, 0.02, 0.05
     for error in (-1e-3, 0.0, 2e-4):
@@ -512,7 +518,7 @@ def test_pid_places_the_poles_of_the_error_on_the_nominal_plant():
             close(law.sigma(motion, reference), z_dot - r_dot + law.k_p / law.k_d * (z - r), 1.0)
 
 
-def test_the_integral_of_a_pid_follows_the_force_while_the_current_cannot():
+def test_the_integral_of_a_pid_does_not_wind_up_while_the_current_is_limited():
     # the current stands still at i: x settles where v_star = v(z, i) - k_int e/(k_aw a), and does not run away
     law, z, i = position.PID(), 1e-4, -0.05
     inputs = Measurement(z, 0.0, i), Reference(0.0, 0.0, 0.0)
@@ -541,7 +547,7 @@ def test_a_pid_steps_its_filter_and_its_anti_windup_by_backward_euler():
         np.testing.assert_allclose((y - x) / T, d, rtol=1e-5)
 
 
-def test_super_twisting_takes_up_a_constant_disturbance():
+def test_super_twisting_rejects_a_constant_disturbance():
     # at rest on the manifold under q: sigma = 0 and w = -q, where both rates vanish
     law, q = position.SuperTwisting(), 0.7
     v_star, w_dot = law(MODEL, (Measurement(0.0, 0.0, 0.0), Reference(0.0, 0.0, 0.0)), -q)

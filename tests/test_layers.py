@@ -1,4 +1,4 @@
-"""Layers of the code: imports only point down, and heavy libraries are imported only where they are needed."""
+"""Layers of the code: modules import from lower layers only, and heavy packages only where they are needed."""
 
 import ast
 import collections
@@ -79,14 +79,14 @@ def test_every_module_has_a_layer(module):
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_imports_point_down(module):
+def test_modules_import_from_lower_layers_only(module):
     for target in ours(imports(module)) - {module}:
         assert target in MODULES, f"{module} imports {target}, which is no file of ours"
         here, there = layer_of(module), layer_of(target)
         assert there <= here, f"{module} (layer {here}) imports {target} (layer {there}): imports only point down"
 
 
-def test_no_cycles():
+def test_imports_have_no_cycles():
     graph = {module: ours(imports(module)) - {module} for module in MODULES}
     # CycleError names the cycle
     list(graphlib.TopologicalSorter(graph).static_order())
@@ -98,7 +98,7 @@ SCIPY += ("ambjax.control.realisation", "ambjax.cases.controller_file")
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if m.startswith("ambjax")])
-def test_ambjax_stands_alone(module):
+def test_ambjax_does_not_import_tuning(module):
     # optax belongs to tuning; diffrax to benchmarks; scipy is imported where it is used
     roots = {name.split(".")[0] for name in imports(module)}
     at_once = {name.split(".")[0] for name in imports(module, top_level=True)}
@@ -152,7 +152,7 @@ def own_gains():
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if not (m in MAKERS or m.startswith(MAKERS[:3]))])
-def test_laws_answer_for_themselves(module):
+def test_modules_outside_control_use_no_law_and_no_gain_by_name(module):
     # a module that does not import a law's class cannot test for it, but it could still read a gain by its name
     assert not imports(module) & set(LAWS), f"{module} knows a law: call a method of the law (ambjax/control/base.py)"
     used = set()
@@ -164,17 +164,17 @@ def test_laws_answer_for_themselves(module):
     assert not used & own_gains(), f"{module} uses a gain of a law: call a method of the law (ambjax/control/base.py)"
 
 
-def test_the_gains_of_laws_are_found():
+def test_the_test_finds_the_gains_of_the_laws():
     assert {"gamma", "c", "k", "k_1", "k_2", "k_p", "k_int", "k_aw", "l"} <= own_gains()
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_matplotlib_only_where_things_are_drawn(module):
+def test_only_modules_that_draw_import_matplotlib(module):
     used = any(name.split(".")[0] == "matplotlib" for name in imports(module))
     assert not used or module.startswith(DRAWING), f"{module} imports matplotlib: only {DRAWING} may"
 
 
-def test_import_is_light_and_leaves_the_configuration_alone():
+def test_the_import_is_fast_and_does_not_change_the_configuration():
     code = """
 import sys, jax
 before = dict(jax.config.values)
@@ -195,7 +195,7 @@ assert not xla_bridge._backends, "importing ambjax started a backend"
 
 
 def test_no_class_name_is_defined_twice():
-    """`position.SlidingMode` and `current.SlidingMode` are one algorithm, named with its stage."""
+    """An exception is a name of several stages, such as `position.SlidingMode` and `current.SlidingMode`."""
     homes = collections.defaultdict(list)
     for module in MODULES:
         for node in tree_of(module).body:

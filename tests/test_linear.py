@@ -100,7 +100,7 @@ NAMES = [
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_matrices_are_those_of_the_simulation(name):
+def test_the_matrices_agree_with_the_simulation(name):
     cascade, scenario, r = loop_of(name)
     f = np.geomspace(1.0, 0.45 / T, 40)
     expected = simulated_map(cascade, scenario, r).response(f)
@@ -112,7 +112,7 @@ def test_the_matrices_are_those_of_the_simulation(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_differentiable_quantities_are_those_of_the_analysis(name):
+def test_the_differentiable_quantities_agree_with_the_analysis(name):
     cascade, scenario, r = loop_of(name)
     system = linearise(cascade, scenario, CLOCK, r)
     expected = analyse(system, Plant().m, T)
@@ -129,7 +129,10 @@ def test_the_differentiable_quantities_are_those_of_the_analysis(name):
 
 
 def test_the_repaired_gains_amplify_sensor_errors_41_times():
-    """In continuous time: at 0 the force per error, 2.8e5 1/s^2, against the loop's stiffness c k 2p/pi = 6.8e3."""
+    """In continuous time at frequency 0.
+
+    The factor is the force per error, 2.8e5 1/s^2, divided by the stiffness of the loop, c k 2p/pi = 6.8e3.
+    """
     analysis = analyse(linearise(Cascade(), Scenario(), CLOCK), Plant().m, T, velocity=True)
     k_s, stiffness = 2.817e5 - 1282.0 * 2, 17 * 25 * 2 * 25 / np.pi
     assert pytest.approx(41, rel=0.02) == analysis.S.height
@@ -140,7 +143,7 @@ def test_the_repaired_gains_amplify_sensor_errors_41_times():
 
 
 @pytest.mark.parametrize("name", ["two coils off the model", "continuous"])
-def test_margins_are_those_of_python_control(name):
+def test_margins_agree_with_python_control(name):
     import control
 
     if name == "continuous":
@@ -177,8 +180,11 @@ def test_python_control_gets_the_same_system():
     assert response == pytest.approx(np.asarray(system.response(f)), rel=1e-8)
 
 
-def test_the_delay_margin_is_where_the_loop_turns_unstable():
-    """Delay added at the sensor; up to the margin the Nyquist curve does not reach -1. At it, a pole is on the axis."""
+def test_the_loop_becomes_unstable_at_the_delay_margin():
+    """The delay is added at the sensor.
+
+    Below the margin the Nyquist curve does not reach -1; at the margin, a pole is on the axis.
+    """
     system = linearise(Cascade(**SMOOTH), Scenario(), CLOCK)
     found = margins_of(system)
     f = np.geomspace(1.0, 1e4, 20_001)
@@ -202,8 +208,8 @@ def test_a_narrow_peak_is_found_and_refined():
     assert found.frequency == pytest.approx(123.4, rel=1e-4)
 
 
-def test_noise_gain_is_that_of_a_long_run():
-    """White noise through the matrices, sample by sample, for 200,000 samples: 3 of their standard errors."""
+def test_the_noise_gain_agrees_with_a_long_run():
+    """White noise passes the matrices for 200,000 samples. The tolerance is three standard errors."""
     cascade, scenario, r = loop_of("true signs")
     system = linearise(cascade, scenario, CLOCK, r).scaled()
     e, x, z = np.random.default_rng(1).normal(size=200_000), np.zeros(len(system.A)), []
@@ -221,7 +227,10 @@ def peak_of(cascade, scenario):
 
 @pytest.mark.slow
 def test_the_peak_is_differentiable_in_the_gains_and_the_plant():
-    """Forward = reverse = central difference along one direction, the shift of the equilibrium (off the model) too."""
+    """Forward mode, reverse mode and central differences agree along one direction.
+
+    They include the shift of the equilibrium.
+    """
     cascade = Cascade(**SMOOTH, processor=Processor(1.0)).on_processor()
     scenario = Scenario(plant=Plant(m=0.6, A=0.12))
     x, restore = ravel_pytree(canonical((cascade.position, cascade.inversion.gamma, scenario.plant.A)))
@@ -243,7 +252,7 @@ def test_the_peak_is_differentiable_in_the_gains_and_the_plant():
 
 
 @pytest.mark.slow
-def test_members_are_linearised_as_one_by_one():
+def test_an_ensemble_is_linearised_as_its_single_members():
     scenario = Scenario(plant=Plant(m=np.array([0.55, 0.65])))
     systems, found = linearise_members(Cascade(**SMOOTH), scenario, CLOCK)
     assert found.all()
@@ -253,7 +262,7 @@ def test_members_are_linearised_as_one_by_one():
             assert a[k] == pytest.approx(b, rel=1e-7, abs=1e-12)
 
 
-def test_no_equilibrium_is_said_in_one_line():
+def test_a_missing_equilibrium_is_reported_in_one_line():
     """The rotor is heavier than the model by 6 m/s^2 of force, and the switching gain gives 5."""
     heavy, laws = Scenario(plant=Plant(m=1.5)), SMOOTH | {"position": position.SlidingMode(c=200.0, k=5.0, p=5.0)}
     with pytest.raises(ValueError, match=r"no equilibrium at r = 0\.001 m"):

@@ -48,7 +48,7 @@ def test_a_realisation_has_the_response_of_the_state_space():
     np.testing.assert_allclose(found.response(np.imag(s))[:, 0], wanted(np.exp(1j * W * PERIOD)), rtol=1e-11)
 
 
-def test_states_are_of_the_size_of_the_input():
+def test_states_have_the_scale_of_the_input():
     found = of_k(K)
     A, B = np.array(found.A), np.array(found.B)
     s = (np.geomspace(10.0, 1e5, 81) * (1j + 0.05))[:, None, None]
@@ -57,7 +57,7 @@ def test_states_are_of_the_size_of_the_input():
 
 
 def matrices(law, model, period=None):
-    """A, B, C, D of the law from z to i_star, by differentiation."""
+    """Return A, B, C, D of the law from z to i_star, by differentiation."""
 
     def f(x, z):
         inputs = Measurement(z, 0.0, 0.0), Reference(0.0, 0.0, 0.0)
@@ -79,7 +79,7 @@ def test_the_law_is_python_control_s_system_with_negative_feedback(T):
 
 
 def test_a_discrete_controller_keeps_its_own_matrices():
-    """Its step is x+ = A x + B w, y = C x + D w of the given matrices: the same outputs to any input."""
+    """Its step is x+ = A x + B w, y = C x + D w with the given matrices, so the outputs for any input are equal."""
     given = control.ss([[0.9, 0.2], [-0.3, 0.1]], [[1.0], [2.0]], [[0.4, -1.0]], [[0.1]], PERIOD)
     law, x, state = position.LinearController.of(given), np.zeros((2, 1)), None
     state = law.init(MODEL)
@@ -90,7 +90,7 @@ def test_a_discrete_controller_keeps_its_own_matrices():
         x = given.A @ x + given.B * w
 
 
-def test_two_inputs_are_r_and_z():
+def test_a_controller_with_two_inputs_receives_r_and_z():
     law = position.LinearController.of(control.ss([], [], [], [[3.0, -5.0]]))
     inputs = Measurement(2e-4, 0.0, 0.0), Reference(1e-4, 0.0, 0.0)
     i_star = inversion.Linearised().inverse(MODEL, inputs[0].z, law(MODEL, inputs, ())[0])
@@ -110,7 +110,7 @@ P_U = control.ss(A_P, [[0], [0], [1 / float(FREE.L)]], [[1, 0, 0]], [[0]])  # fr
 
 
 @pytest.mark.slow
-def test_the_loop_of_a_voltage_is_python_control_s_feedback():
+def test_the_loop_with_a_voltage_output_is_python_control_s_feedback():
     law = position.LinearController.of(VOLTS, output="voltage")
     cascade = Cascade(position=law, inversion=inversion.Linearised(), current=current.OpenLoop(), model=FREE)
     found = linearise(cascade, Scenario(plant=FREE), Clock(10, PERIOD))
@@ -123,7 +123,7 @@ def test_the_loop_of_a_voltage_is_python_control_s_feedback():
     np.testing.assert_allclose(found.sensitivity(W / 2 / np.pi), 1 / (1 + held(z) * bilinear(z) / z), rtol=1e-8)
 
 
-def test_sampling_ever_faster_is_continuous_time():
+def test_the_sampled_law_converges_to_continuous_time():
     law = position.LinearController.of(K)
     error = []
     for T in (2e-5, 1e-5):
@@ -159,7 +159,7 @@ def read(text):
     return read_case("case.toml")
 
 
-def test_a_file_brings_the_python_object(folder):
+def test_a_controller_file_gives_the_same_law_as_python(folder):
     law = read_case("case.toml").cascade.position
     assert law == position.LinearController.of(K, gain=1.5)
     assert pickle.loads(pickle.dumps(law)) == law
@@ -170,7 +170,7 @@ def test_a_file_brings_the_python_object(folder):
     assert dict(kinds(law)) != dict(kinds(position.LinearController.of(2 * K, gain=1.5)))
 
 
-def test_a_voltage_passes_the_other_stages(folder):
+def test_a_law_with_a_voltage_output_selects_stages_that_pass_it(folder):
     text = CASE.partition("[controller.inversion]")[0].replace("gain", 'output = "voltage"\ngain')
     laws = read(text).cascade.laws
     assert [type(x) for x in laws[2:]] == [inversion.Linearised, current.OpenLoop]
@@ -214,7 +214,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_a_wrong_file_is_one_clear_line(wrong, folder, capsys):
+def test_a_wrong_file_is_refused_in_one_line(wrong, folder, capsys):
     arrays, wanted = WRONG[wrong]
     np.savez("k.npz", **arrays)
     assert main(["simulate", "case.toml"]) == 2
@@ -225,7 +225,7 @@ def test_a_wrong_file_is_one_clear_line(wrong, folder, capsys):
         assert part in err
 
 
-def test_no_file_and_no_period_are_one_clear_line(folder):
+def test_a_missing_file_or_period_is_refused_in_one_line(folder):
     for text, wanted in {
         CASE.replace("k.npz", "no.npz"): r"file = \"no\.npz\": .*cannot be read \(No such file.*relative to the folder",
         CASE.replace("k.npz", "k.txt"): r"file = \"k\.txt\": it must be the path of an \.npz or \.mat",
@@ -252,7 +252,7 @@ def test_no_file_and_no_period_are_one_clear_line(folder):
 
 
 @pytest.mark.slow
-def test_it_is_exported(folder):
+def test_a_linear_controller_is_exported(folder):
     text = CASE + "[processor]\n[clock]\nduration = 0.02\n"
     pathlib.Path("case.toml").write_text(text + '[controller.current]\nkind = "dead-beat"\n')
     assert main(["export", "case.toml", "--verify", "--out", "c"]) == 0

@@ -65,7 +65,7 @@ def test_paths_of_disturbances_in_one_unit_and_in_several():
         ({"force": STEP}, "disturbance.force"),
     ],
 )
-def test_wrong_disturbances_are_named(disturbance, said):
+def test_wrong_disturbances_are_refused(disturbance, said):
     with pytest.raises(ValueError, match=said):
         world(disturbance=disturbance)
 
@@ -81,7 +81,7 @@ RPM = 2 * np.pi / 60
         (amb.Trapezoid(2.0, 0.1, 0.05, 0.0, 0.2), [(0, 0), (0.1, 0), (0.15, 2), (0.35, 0), (9, 0)]),
     ],
 )
-def test_signals_of_straight_lines_go_through_their_corners(signal, knots):
+def test_piecewise_linear_signals_pass_through_their_corners(signal, knots):
     t = np.linspace(0, 0.6, 61)
     np.testing.assert_allclose(signal(t), np.interp(t, *np.array(knots).T), rtol=0, atol=1e-14)
     low, high = signal.span(0.6)
@@ -90,7 +90,7 @@ def test_signals_of_straight_lines_go_through_their_corners(signal, knots):
     np.testing.assert_allclose(signal.shifted(0.05)(t + 0.05), signal(t), rtol=0, atol=1e-13)
 
 
-def test_unbalance_by_hand():
+def test_the_force_of_an_unbalance_by_hand():
     # 120 g mm at 6000 rpm: 1.2e-4 kg m (628 1/s)^2 = 47.4 N
     t = np.linspace(0, 0.05, 40)
     force = amb.Unbalance(120.0, 6000.0, phase=0.4)(t)
@@ -130,12 +130,12 @@ ROTATING = {
 
 
 def lines(rows, name, settled=1000):
-    """Complex amplitude of a signal at one and two times the speed, over whole turns."""
+    """Return the complex amplitudes of a signal at the speed and at twice the speed, over whole turns."""
     t, x = np.asarray(rows.t)[settled:], np.asarray(getattr(rows, name))[settled:]
     return np.array([2 * np.mean(x * np.exp(-1j * k * 3000 * RPM * t)) for k in (1, 2)])
 
 
-def test_unbalance_and_runout_move_the_rotor_as_the_linear_loop_says():
+def test_the_response_to_unbalance_and_runout_agrees_with_the_linear_loop():
     """Amplitude and phase of z at the speed and at twice the speed, against the frequency responses of the loop."""
     case = case_from(ROTATING)
     start = amb.Initial(i=float(case.scenario.plant.equilibrium(0.0)[0]))
@@ -151,7 +151,7 @@ def test_unbalance_and_runout_move_the_rotor_as_the_linear_loop_says():
     np.testing.assert_allclose(lines(rows, "z_measured")[1], expected[1] + runout, rtol=1e-5)
 
 
-def test_a_slow_sensor_low_passes_the_runout():
+def test_the_low_pass_of_the_sensor_acts_on_the_runout():
     raw = ROTATING | {"processor": {"delay": 0.0}, "sensor": ROTATING["sensor"] | {"bandwidth": 200.0}}
     case = case_from(raw)
     rows = amb.rollout(case.cascade, case.scenario, case.clock).trajectory.rows
@@ -173,7 +173,7 @@ def write(tmp_path, name, t, value):
 
 
 @pytest.mark.parametrize("name", ["load.csv", "load.npz"])
-def test_a_table_is_the_signal_that_it_was_sampled_from(name, tmp_path):
+def test_a_table_reproduces_the_sampled_signal(name, tmp_path):
     knots = np.array([0.0, 0.1, 0.3, 0.4])
     write(tmp_path, name, knots, np.array([0.0, 0.0, 3.0, 3.0]))
     load = {"kind": "table", "file": name, "unit": "N", "scale": 2.0, "start": 0.5}
@@ -234,7 +234,7 @@ GOOD = "t,value\n0,1\n1,2\n"
         ("0,1\n1\n", {}, "line 2 has 1 columns, but the first line has 2"),
     ],
 )
-def test_wrong_tables_are_named(text, keys, said, tmp_path):
+def test_wrong_tables_are_refused(text, keys, said, tmp_path):
     if text is not None:
         (tmp_path / "x.csv").write_text(text)
     with pytest.raises(ValueError, match=r"disturbance\.q_z\..*") as error:
@@ -243,7 +243,7 @@ def test_wrong_tables_are_named(text, keys, said, tmp_path):
     assert "\n" not in str(error.value)
 
 
-def test_wrong_arrays_are_named(tmp_path):
+def test_wrong_arrays_are_refused(tmp_path):
     np.savez(tmp_path / "x.npz", t=np.zeros((2, 2)), value=np.zeros(2))
     table = {"disturbance": {"q_z": {"kind": "table", "file": "x.npz"}}}
     with pytest.raises(ValueError, match=r"two lists of equal length; their shapes are \(2, 2\), \(2,\)"):
@@ -291,6 +291,6 @@ def test_parquet_needs_its_extra(tmp_path):
         ),
     ],
 )
-def test_wrong_loads_of_a_rotor_that_turns_are_named(tables, said):
+def test_wrong_loads_of_a_turning_rotor_are_refused(tables, said):
     with pytest.raises(ValueError, match=said):
         world(**tables)

@@ -34,7 +34,10 @@ TOLERANCES = {"effort": 2e-3, "chatter": 0.01, "chatter_V_per_s": 0.01, "peak": 
 
 
 def both(name):
-    """What the folds measure, and what the dense solution says; a stop so near that nearness counts."""
+    """Return the quantities from the folds and from the dense solution.
+
+    The stop is so near that the clearance term is not 0.
+    """
     world, std, samples, near, band = LOOPS[name]
     case, settle = Case("", world, samples=samples), samples // 3 * PERIOD
     cascade, scenario, _ = in_ambjax(case)
@@ -52,7 +55,7 @@ def both(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LOOPS)
-def test_costs_and_limits_are_those_of_a_dense_solution(name):
+def test_costs_and_limits_agree_with_a_dense_solution(name):
     ours, theirs = both(name)
     assert min(theirs.values()) > 0  # or nothing was compared
     for key, value in theirs.items():

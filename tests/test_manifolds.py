@@ -22,7 +22,7 @@ MODEL, STILL = Plant(), Reference(0.0, 0.0, 0.0)
 
 
 def motion_of(law, e, e_dot, q, T, samples):
-    """Error and its rate at each sample under the stepped law: the demanded force acts at once and is held."""
+    """Return error and rate at each sample under the stepped law; the demanded force acts at once and is held."""
 
     def sample(carry, k):
         e, e_dot, state = carry

@@ -32,8 +32,8 @@ def basin(reading):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("reading", ["literal", "repaired"])
-def test_the_basin_is_a_strip_of_known_width(reading):
-    """While v_tilde is saturated, z + z_dot/pole runs away unless gamma outweighs dv/dz pole |z + z_dot/pole|."""
+def test_the_basin_of_attraction_is_a_strip_of_known_width(reading):
+    """While v_tilde is saturated, z + z_dot/pole diverges unless gamma exceeds dv/dz pole |z + z_dot/pole|."""
     study = basin(reading)
     width = study.cascade.inversion.gamma / (PLANT.dv_dz(0.0, 0.0) * POLE)
     z = Axis("initial.z", np.linspace(-1.5, 1.5, 31) * width)
@@ -52,7 +52,7 @@ NOISY = Scenario(sensor=Sensor(1e-7, 0.0, 0.0))
 SMALL = Study(SMOOTH, NOISY, Clock(50, 1e-4, RK4(5)), 1e-3, Spread((("initial.z", Normal(1e-6)),)), 5, 3)
 
 
-def test_a_cell_is_the_members_of_its_case_run_alone():
+def test_a_cell_equals_an_ensemble_of_its_own_case():
     x, y = Axis("plant.m", np.array([0.5, 0.6, 0.7])), Axis("sensor.std", np.array([1e-8, 1e-7]), True)
     found = grid(SMALL, x, y)
     errors = []
@@ -69,7 +69,7 @@ def test_a_cell_is_the_members_of_its_case_run_alone():
 
 
 def test_one_member_is_the_nominal_case():
-    """A map of a case with [spread] shows the case, not a member at random, unless --members is given."""
+    """Without --members, a map of a case with [spread] shows the nominal case instead of a random member."""
     x, y = Axis("plant.m", np.array([0.5, 0.6])), Axis("sensor.std", np.array([1e-8, 1e-7]))
     wide = dataclasses.replace(SMALL, spread=Spread((("initial.z", Normal(1e-4)),)), members=1)
     bare = dataclasses.replace(wide, spread=Spread())
@@ -81,7 +81,7 @@ def test_one_member_is_the_nominal_case():
     assert np.all(several.error > 10 * nominal.error)  # thrown off by 100 times what noise does
 
 
-def test_stalled_runs_are_counted_apart():
+def test_stalled_runs_are_counted_separately():
     # two trials a sample are too few for the transient from 10 um at these gains, and enough from the balance
     clock = Clock(20, 1e-4, AdaptiveRodas3(1e-8, 2))
     study = dataclasses.replace(basin("repaired"), clock=clock)
@@ -93,7 +93,7 @@ def test_stalled_runs_are_counted_apart():
 
 
 @pytest.mark.slow
-def test_the_sample_period_is_an_axis_either_way():
+def test_the_sample_period_can_be_either_axis():
     period, std = Axis(PERIOD, np.array([1e-4, 5e-4])), Axis("sensor.std", np.array([1e-8, 1e-7, 1e-6]))
     one, other = grid(SMALL, std, period), grid(SMALL, period, std)
     np.testing.assert_array_equal(one.survival, other.survival.T)
@@ -159,7 +159,7 @@ def test_bad_axes_are_refused_in_one_line(x, y, words, tmp_path, capsys, monkeyp
         (X, "reference.amplitude=0:1e-4", "--y reference.amplitude: there is no such number in this case"),
     ],
 )
-def test_every_case_must_take_the_axes_before_any_is_run(x, y, words, tmp_path, capsys, monkeypatch):
+def test_the_axes_are_checked_for_every_case_before_any_run(x, y, words, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(maps, "run_ensemble", None)
     rounded = CASE + "[processor]\n[sensor]\nbits = 12\n"
     sine = rounded + '[reference]\nkind = "sine"\namplitude = 1e-5\nfrequency = 2.0\n'
@@ -172,7 +172,7 @@ def test_every_case_must_take_the_axes_before_any_is_run(x, y, words, tmp_path, 
 
 
 @pytest.mark.parametrize("kind", ["a file", "a study"])
-def test_a_folder_that_cannot_take_a_map_is_refused_before_anything_is_run(kind, tmp_path, capsys, monkeypatch):
+def test_an_unusable_output_folder_is_refused_before_any_run(kind, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(maps, "run_ensemble", None)
     (tmp_path / "case.toml").write_text(CASE)
     out = tmp_path / "out"
@@ -194,7 +194,7 @@ def test_a_whole_number_may_be_an_axis_of_whole_numbers():
 
 
 def made(survival, members, **changes):
-    """A map of these survivals [ny, nx]."""
+    """Return a map with these survivals [ny, nx]."""
     survival = np.asarray(survival, float)
     _, low, high = wilson(survival * members, members)
     y, x = (Axis(path, np.arange(float(n))) for path, n in zip(("initial.z", "plant.m"), survival.shape, strict=True))
@@ -203,7 +203,7 @@ def made(survival, members, **changes):
 
 
 @pytest.mark.parametrize("members", [1, 72, 73])
-def test_confidence_is_stated_where_so_many_members_allow_it(members):
+def test_confidence_is_stated_if_the_number_of_members_allows_it(members):
     """Wilson's lower end for n of n is n / (n + 1.96^2): 0.95 from n = 73 on."""
     case = case_from({}, "one")
     one = made([[1, 1], [1, 0]], members)
@@ -220,7 +220,7 @@ def test_confidence_is_stated_where_so_many_members_allow_it(members):
     assert commands._summary(case, alike)["decisive"] is False
 
 
-def test_the_stretch_that_survives_is_unbroken():
+def test_the_reported_surviving_interval_has_no_gap():
     assert made([[1, 0, 1, 1, 1, 0]], 1).reach() == (2.0, 4.0)
     assert made([[0, 0.9]], 10).reach() is None
     assert made([[0, 0], [1, 1], [0, 0], [1, 1]], 1).reach() == (0.0, 1.0)  # of the two middle rows, the lower
@@ -252,7 +252,7 @@ def test_the_command_draws_and_prints_two_cases_side_by_side(tmp_path, capsys):
         ambjax.survival_map(found.case, "plant.m=2:1", Y)
 
 
-def test_the_command_says_what_is_drawn_and_what_is_not_decided(tmp_path, capsys, monkeypatch):
+def test_the_command_states_the_drawn_outlines_and_the_undecided_cells(tmp_path, capsys, monkeypatch):
     (tmp_path / "case.toml").write_text(CASE + "[spread]\nplant.m = { percent = 1 }\n")
     argv = ["map", str(tmp_path / "case.toml"), "--x", X, "--y", Y, "--out", str(tmp_path / "out"), "--force"]
     assert main(argv) == 0

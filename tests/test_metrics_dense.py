@@ -66,7 +66,10 @@ def numbers(world, std, samples, settle, method):
 
 
 def assert_rectangular(ours, theirs, most, count):
-    """Errors are read at the samples: the rectangular rule, whose error is half a sample's worth of its ends."""
+    """Check a mean square of errors, which ambjax evaluates at the samples by the rectangular rule.
+
+    The error of this rule is half a sample times the values at the ends.
+    """
     assert abs(ours**2 - theirs**2) <= float(most) ** 2 / 2 / count * 1.01 + 1e-3 * theirs**2
 
 
@@ -77,8 +80,11 @@ def dense(name):
 
 
 def least_tolerance(name, method):
-    """The step in which the rotor touches down is not looked into: what diverges ends up to 1.2 % earlier. The sliding
-    step is made for steep signs: 0.4 % of sigma seen there, 1.9 % with a smooth one."""
+    """Return the tolerance of a metric.
+
+    Within the step in which the rotor touches down, no substep is evaluated, so a diverging run ends up to 1.2 %
+    earlier. The sliding step is for steep signs: its error of sigma is 0.4 % there, and 1.9 % with a smooth sign.
+    """
     if name.startswith("lost"):
         return 0.03
     return 0.0 if isinstance(method, AdaptiveRodas3) else 0.03 if name.startswith("smooth") else 6e-3
@@ -103,7 +109,7 @@ SLOW = {"adaptive": [name for name in LOOPS if name not in SLIDING], "sliding": 
         for said, method in (("adaptive", AdaptiveRodas3()), ("sliding", Slide(3 * REFINEMENT)))
     ],
 )
-def test_every_metric_is_what_a_dense_solution_says(name, method):
+def test_every_metric_agrees_with_a_dense_solution(name, method):
     found, expected = numbers(*LOOPS[name], SAMPLES, SETTLE, method)[0], dense(name)
     assert found.keys() == expected.keys()
     # of a fall in sliding steps: that it is one, and how far it goes; a report counts it, and averages over the others
@@ -142,8 +148,11 @@ TASKS = pathlib.Path(__file__).parents[1] / "benchmarks"
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", ["A", "C"])
-def test_tuned_gains_of_the_benchmarks_measure_so_once_settled(name):
-    """The gains of results/tasks.json as they are, and where their tables begin to measure: from 0.2 s on."""
+def test_settled_metrics_of_the_tuned_gains_of_the_benchmarks_agree_with_a_dense_solution(name):
+    """The gains are those of results/tasks.json.
+
+    The metrics count from 0.2 s on, as in the tables of the benchmarks.
+    """
     gains = json.loads((TASKS / "results" / "tasks.json").read_text())["tasks"][name]["gains"]
     c, k, gamma, k_i, *pole = gains.values()
     observer = ("complementary", {"l": pole[0], "z_hat": 0.0}) if pole else None
@@ -161,8 +170,8 @@ def test_tuned_gains_of_the_benchmarks_measure_so_once_settled(name):
     assert found["settled_rms_error_m"] == pytest.approx(expected["settled_rms_error_m"], abs=5e-9)
 
 
-def test_the_start_of_a_sample_says_nothing_of_the_voltage():
-    """Metrics that are read only at the samples, where the noise has just jumped: u is always at the supply's limit."""
+def test_the_rms_voltage_includes_the_voltage_between_samples():
+    """At the samples, where the noise jumps, u is always at the limit of the supply; between samples it is lower."""
     world, std = LOOPS["stiff under noise, limited supply"]
     cascade, scenario, _ = in_ambjax(Case("", world, samples=200))
     scenario = dataclasses.replace(scenario, sensor=Sensor(*std))

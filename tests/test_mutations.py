@@ -12,7 +12,7 @@ from profiles import examples
 ROOT = pathlib.Path(__file__).parent.parent
 
 
-@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: m.says)
+@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: m.fault)
 def test_every_mutation_fits_the_code(mutation):
     applied(mutation)
     path, _, name = mutation.test.partition("::")
@@ -20,8 +20,8 @@ def test_every_mutation_fits_the_code(mutation):
     assert not name or f"def {name.partition('[')[0]}(" in text
 
 
-def test_the_table_is_long_and_says_each_thing_once():
-    assert len({m.says for m in MUTATIONS}) == len({(m.file, m.old, m.new) for m in MUTATIONS}) == len(MUTATIONS) >= 25
+def test_the_table_has_at_least_25_different_mutations():
+    assert len({m.fault for m in MUTATIONS}) == len({(m.file, m.old, m.new) for m in MUTATIONS}) == len(MUTATIONS) >= 25
 
 
 PROGRAM = "def double(x):\n    return 2 * x  # twice\n"
@@ -40,7 +40,7 @@ BREAK = Mutation("once", "ambjax/program.py", "2 * x", "1 * x", "tests/test_it.p
 
 @pytest.fixture
 def project(tmp_path):
-    """A program of one line, and two tests of it: the first does not see what the second sees."""
+    """A program of one line with two tests, of which only the second detects the mutation."""
     for name, text in {"ambjax/program.py": PROGRAM, "tests/test_it.py": TESTS}.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
@@ -66,14 +66,14 @@ def test_killed_and_surviving_mutants_are_distinguished(project):
         ({"file": "ambjax/none.py"}, "no such file"),
     ],
 )
-def test_a_mutation_that_no_longer_fits_is_named(project, change, says):
+def test_a_mutation_that_no_longer_fits_is_reported(project, change, says):
     said = []
     assert hunt([BREAK._replace(**change)], project, say=said.append) == 1
     assert says in said[-1]
 
 
 @pytest.mark.slow
-def test_a_test_that_fails_by_itself_kills_nothing(project):
+def test_a_test_that_fails_without_a_mutation_is_reported(project):
     said = []
     (project / "tests/test_it.py").write_text(TESTS.replace("== 2", "== 3"))
     assert hunt([BREAK], project, jobs=1, say=said.append) == 1
@@ -81,7 +81,7 @@ def test_a_test_that_fails_by_itself_kills_nothing(project):
 
 
 def test_a_sample_depends_on_the_text_of_the_program(project):
-    mutations = [BREAK._replace(says=str(number)) for number in range(1000)]
+    mutations = [BREAK._replace(fault=str(number)) for number in range(1000)]
     before = sample(mutations, 10, project)
     assert 60 <= len(before) <= 140  # binomial: 100 on average, four standard deviations of 9.5
     (project / BREAK.file).write_text(PROGRAM + "\n")
@@ -92,5 +92,5 @@ def test_a_sample_depends_on_the_text_of_the_program(project):
 
 @pytest.mark.slow
 def test_no_mutation_of_a_sample_survives(capsys):
-    """`python tests/mutate.py` makes all of them, in a quarter of an hour."""
+    """`python tests/mutate.py` tests all mutations in a quarter of an hour."""
     assert main(["--share", str(examples(48, 12))]) == 0, capsys.readouterr().out

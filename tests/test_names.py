@@ -57,7 +57,7 @@ def test_the_message_suggests_the_right_name(tables, said):
         case_from(tables)
 
 
-def test_every_word_leads_to_its_name():
+def test_every_synonym_gives_its_name():
     assert set(TABLES) - {"sensitivity"} <= set(OTHER_WORDS)
     for name, words in OTHER_WORDS.items():
         for word in words.split():
@@ -90,7 +90,7 @@ def runout(amplitude):
     return {"sensor": {"runout": {"speed": 100.0, "harmonics": [{"number": 2, "amplitude": amplitude}]}}}
 
 
-def test_an_empty_file_is_doubted(tmp_path, capsys):
+def test_an_empty_file_causes_a_warning(tmp_path, capsys):
     for text, said in ((" \n", True), ("[plant]\n", False)):
         (tmp_path / "case.toml").write_text(text)
         read_with_warnings(tmp_path / "case.toml")
@@ -143,7 +143,7 @@ def test_an_empty_file_is_doubted(tmp_path, capsys):
         ({}, graded(2.5), None),
     ],
 )
-def test_numbers_that_do_not_fit_together_are_doubted(plant, tables, said):
+def test_inconsistent_numbers_cause_a_warning(plant, tables, said):
     found = doubts(plant, **tables)
     if said is None:
         assert found == []
@@ -152,15 +152,15 @@ def test_numbers_that_do_not_fit_together_are_doubted(plant, tables, said):
 
 
 @pytest.mark.parametrize(("end", "doubted"), [(9.9, False), (10.1, True)])
-def test_a_file_in_milliseconds_is_doubted(tmp_path, end, doubted):
-    """A run of 0.1 s, and a file 100 times as long."""
+def test_a_file_in_milliseconds_causes_a_warning(tmp_path, end, doubted):
+    """The run lasts 0.1 s, and the file is 100 times as long."""
     (tmp_path / "force.csv").write_text(f"0,1\n{end},2\n")
     load = {"kind": "table", "unit": "N", "file": str(tmp_path / "force.csv")}
     said = f"disturbance.q_f: the file lasts {end:g} s, the run 0.1 s. Are its times in milliseconds?"
     assert (said in doubts(disturbance={"q_z": load})) == doubted
 
 
-def test_the_forces_are_those_of_the_formulas():
+def test_the_printed_forces_agree_with_the_formulas():
     case = case_from({"plant": GOOD, "clock": {"duration": 0.1}} | sine(50.0, 3.0))
     k_i = 1.2566e-6 * 208**2 * 2.68e-4 * 2.5 / 5e-4**2
     assert forces(case) == pytest.approx((k_i * 2.5, 1.6 * 9.81, 3.0))
@@ -169,7 +169,7 @@ def test_the_forces_are_those_of_the_formulas():
 
 
 @pytest.mark.slow
-def test_check_refuses_magnets_that_do_not_carry_the_rotor(capsys, tmp_path, monkeypatch):
+def test_check_fails_if_the_magnets_cannot_carry_the_rotor(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     heavy = "\n".join(f"{name} = {value}" for name, value in (GOOD | {"m": 40.0}).items())
     pathlib.Path("case.toml").write_text(f"[plant]\n{heavy}\n[clock]\nduration = 0.001\n")

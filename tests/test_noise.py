@@ -1,4 +1,4 @@
-"""Sensor noise: Gaussian, held, and the same for a member wherever it is drawn."""
+"""Sensor noise is Gaussian, held, and the same for a member in every computation."""
 
 import dataclasses
 
@@ -27,8 +27,11 @@ def test_noise_is_held_per_sample_and_gaussian():
     assert abs(np.mean(np.asarray(w.z) * np.asarray(w.i))) / 1e-10 < 0.036
 
 
-def test_words_are_those_of_jax_random():
-    """Threefry is written out, since kernels on accelerators cannot call jax.random; fold_in shows that it is it."""
+def test_the_random_words_are_those_of_jax_random():
+    """Threefry is implemented here, because kernels on accelerators cannot call jax.random.
+
+    The comparison uses fold_in.
+    """
     scenario = dataclasses.replace(NOISY, seed=5, member=2**31 + 9)
     for number in (0, 1, 77, 2**32 - 1):
         expected = jax.random.key_data(jax.random.fold_in(scenario.key(), np.uint32(number)))
@@ -36,8 +39,8 @@ def test_words_are_those_of_jax_random():
 
 
 @pytest.mark.parametrize("x64", [True, False])
-def test_normal_numbers_are_normal(x64):
-    """Against the distribution itself: Kolmogorov's and Smirnov's test, and the tail beyond 4."""
+def test_the_normal_numbers_have_a_normal_distribution(x64):
+    """The Kolmogorov-Smirnov test, and the tail beyond 4."""
     with jax.enable_x64(x64):
         drawn = jax.jit(jax.vmap(lambda k: normals(Scenario(seed=1).words(), k)))(jnp.arange(400_000))
         for w in map(np.asarray, drawn):

@@ -41,7 +41,7 @@ def estimates(law, z, i=None, model=MODEL, period=T, state=None):
 
 
 def motion(t, m=np):
-    """A motion in the bearing, with its rates: a reference, and a quiver of 50 Hz."""
+    """Return a motion of the rotor with its derivatives: a reference, and an oscillation of 50 Hz."""
     w, fast = 4 * np.pi, 100 * np.pi
     z = 1e-3 * m.sin(w * t) + 2e-5 * m.sin(fast * t)
     z_dot = 1e-3 * w * m.cos(w * t) + 2e-5 * fast * m.cos(fast * t)
@@ -49,7 +49,7 @@ def motion(t, m=np):
 
 
 def current_of(z, z_ddot, q=0.0):
-    """The current with which the model moves so under the disturbance q, m/s^2."""
+    """Return the current with which the model has this motion under the disturbance q, m/s^2."""
     return MODEL.current_for(z, (z_ddot - q + MODEL.g - 2 * MODEL.k_z / MODEL.m * z) / MODEL.a)
 
 
@@ -57,7 +57,7 @@ def current_of(z, z_ddot, q=0.0):
 
 
 @EACH
-def test_no_measured_velocity_reaches_the_estimate(law):
+def test_the_estimate_does_not_depend_on_the_measured_velocity(law):
     assert law.estimates_velocity
     assert type(law).estimates_velocity
     measured = Measurement(1e-4, 0.02, 0.01)
@@ -71,12 +71,12 @@ def test_no_measured_velocity_reaches_the_estimate(law):
 
 
 @pytest.mark.parametrize("law", [Direct(), Complementary()])
-def test_the_others_need_it(law):
+def test_the_other_observers_read_the_measured_velocity(law):
     assert not law.estimates_velocity
 
 
 @EACH
-def test_odd_symmetry(law):
+def test_the_observers_have_odd_symmetry(law):
     level = dataclasses.replace(MODEL, g=0.0)
     rng = np.random.default_rng(1)
     z, i = np.cumsum(rng.normal(size=300)) * 1e-6, rng.normal(size=300) * 1e-2
@@ -89,8 +89,11 @@ def test_odd_symmetry(law):
 
 
 @pytest.mark.parametrize(("law", "degree"), [(Difference(), 1), (IRED1(), 1), (IRED2(), 2)])
-def test_exact_for_polynomials(law, degree):
-    """From any start: the filter after some 20 of its time constants, the differentiators after finitely many steps."""
+def test_the_estimates_are_exact_for_polynomials(law, degree):
+    """They are exact from any start.
+
+    The filter needs about 20 time constants, the differentiators finitely many steps.
+    """
     t = np.arange(3000) * T
     z, z_dot = 1e-3 - 0.02 * t + (degree - 1) * 0.3 * t**2, -0.02 + (degree - 1) * 0.6 * t
     start = jax.tree.map(lambda x: x + 1e-4, law.init(MODEL, Measurement(1e-3, 0.0, 0.0)))
@@ -113,7 +116,7 @@ def test_difference_is_the_filtered_backward_difference():
 
 @pytest.mark.parametrize(("law", "order", "bound"), [(IRED1(30.0), 1, 1.0), (IRED2(1e4), 2, 1.0)])
 def test_errors_of_the_differentiators(law, order, bound):
-    """Without noise, of f'' and f''' below L: less than T L, T^2 L, and with T^order."""
+    """Without noise, for f'' and f''' below L, the errors are below T L and T^2 L, and of the stated order in T."""
     errors = []
     for period in (2e-4, 1e-4):
         t = np.arange(round(0.3 / period)) * period
@@ -124,8 +127,8 @@ def test_errors_of_the_differentiators(law, order, bound):
     assert errors[0] / errors[1] == pytest.approx(2**order, rel=0.1)
 
 
-def test_kalman_knows_a_constant_disturbance():
-    """Where the acceleration is linear between samples, as it is along a cubic, nothing is left of any error."""
+def test_the_kalman_filter_estimates_a_constant_disturbance():
+    """If the acceleration is linear between samples, as along a cubic, the error decays to 0."""
     t, q = np.arange(1500) * T, -0.7
     z, z_dot, z_ddot = 1e-3 - 0.02 * t + 0.3 * t**2 - t**3, -0.02 + 0.6 * t - 3 * t**2, 0.6 - 6 * t
     law = Kalman(800.0)
@@ -152,7 +155,10 @@ def flat(state):
 
 @pytest.mark.parametrize(("w", "z"), [(1.0, -3e-3), (800.0, 0.0), (3e4, 2e-3)])
 def test_errors_of_the_kalman_filter_have_three_equal_poles(w, z):
-    """Whatever the gap, whose negative stiffness is in the model: (x - q)^3, and (x + w)^3 in continuous time."""
+    """The characteristic polynomial does not depend on the position.
+
+    It is (x - q)^3 on a processor and (x + w)^3 in continuous time.
+    """
     law, measured = Kalman(w), Measurement(z, 0.0, 0.02)
 
     def of(x, form):
@@ -170,13 +176,16 @@ def test_errors_of_the_kalman_filter_have_three_equal_poles(w, z):
     np.testing.assert_allclose(np.poly(continuous), np.poly([-w * T] * 3), rtol=0, atol=1e-12 * (1 + w * T) ** 3)
 
 
-def test_noise_of_the_kalman_filter_is_what_it_says():
-    """7/4 (S_r w^3 + S_q / w^3), of a mass on its own, to the order w T."""
+def test_the_noise_of_the_kalman_filter_agrees_with_its_formula():
+    """For a free mass, the variance is 7/4 (S_r w^3 + S_q / w^3) to the order w T."""
     w, period, std, S_q = 500.0, 1e-5, 1e-6, 1e3
     law = Kalman(w)
 
     def error(x, noise, walk):
-        """Error of this estimate, and of the next state, in units of 1/w: the truth is 0 and its disturbance walks."""
+        """Return the errors of this estimate and of the next state, in units of 1/w.
+
+        The true state is 0, and its disturbance is a random walk.
+        """
         state = Predicted(x[0], x[1] * w, x[2] * w**2, 0.0)
         estimate, after = law.step(FREE, Measurement(noise, 0.0, 0.0), state, period)
         return estimate.z_dot, (flat(after) - jnp.stack([0.0, 0.0, walk])) / np.array([1.0, w, w**2])
@@ -206,7 +215,11 @@ def test_the_root_of_the_cubic_and_its_derivative():
 
 @pytest.mark.parametrize("law", [IRED1(), IRED2()], ids=lambda x: type(x).__name__)
 def test_gradients_of_the_differentiators(law):
-    """Forward = reverse = differences away from where the sign is taken up whole; finite there, and at 0."""
+    """Forward mode, reverse mode and differences agree.
+
+    At the ends of the interval in which the implicit sign is not +-1, and at 0, the derivatives are only checked to be
+    finite.
+    """
     order = len(law.init(MODEL, Measurement(0.0, 0.0, 0.0))) - 1
     unit = law.L * T ** (order + 1)
 
@@ -232,8 +245,8 @@ def test_gradients_of_the_differentiators(law):
 
 
 @pytest.mark.parametrize(("law", "order"), [(Difference(), 2), (Kalman(), 1)], ids=lambda x: type(x).__name__)
-def test_order_towards_continuous_time(law, order):
-    """The difference is late by half a sample, and its low-pass early by as much."""
+def test_the_sampled_observers_converge_to_continuous_time(law, order):
+    """The backward difference lags by half a sample, and its sampled low-pass leads by the same time."""
     ends = np.arange(5, 21) * 1e-3
 
     def state_of(x):
@@ -261,7 +274,7 @@ def test_order_towards_continuous_time(law, order):
 
 @pytest.mark.parametrize("law", [IRED1(10.0), IRED2(1e4)], ids=lambda x: type(x).__name__)
 def test_the_differentiators_in_continuous_time(law):
-    """Exact but for the width of the smoothed sign, (width/L)^(1/(m+1)) seconds late or so."""
+    """They are exact except for the smoothed sign, which delays them by about (width/L)^(1/(m+1)) seconds."""
     order = 1 if isinstance(law, IRED1) else 2
     late = (WIDTH * MODEL.s_0 / law.L) ** (1 / (order + 1))
     assert law.slope(MODEL) == pytest.approx(differentiator.LAM[order][0] / late)
@@ -282,7 +295,7 @@ def test_the_differentiators_in_continuous_time(law):
 
 
 def right(law, z, z_dot, sampled):
-    """A state with which the estimate is z and z_dot where z is measured."""
+    """Return a state for which the estimate is z and z_dot, where z is measured."""
     z, v, zero = jnp.asarray(z), jnp.asarray(z_dot), jnp.zeros(())
     back = T * v if sampled else 0.0
     if isinstance(law, Difference):
@@ -294,8 +307,11 @@ def right(law, z, z_dot, sampled):
 
 @EACH
 @pytest.mark.parametrize("law_i", [inversion.Adaptive(), inversion.ClosedForm()], ids=lambda x: type(x).__name__)
-def test_an_estimate_that_is_right_gives_the_command_of_a_measured_velocity(law, law_i):
-    """i_ref' of the closed form among it: the estimate moves, not the velocity, which is not measured."""
+def test_an_exact_estimate_gives_the_command_of_a_measured_velocity(law, law_i):
+    """This includes i_ref' of the closed form.
+
+    It uses the rate of the estimate, because the velocity is not measured.
+    """
     z, z_dot, i, reference = 1e-3, 0.03, 0.02, reference_at(Sine(2.5e-3, 2.0), 0.11)
     seen, blind = (Measurement(jnp.asarray(z), jnp.asarray(v), jnp.asarray(i)) for v in (z_dot, 0.0))
 
@@ -324,8 +340,8 @@ def test_an_estimate_that_is_right_gives_the_command_of_a_measured_velocity(law,
     "law",
     [pytest.param(x, id=type(x).__name__, marks=pytest.mark.thorough if n else ()) for n, x in enumerate(ESTIMATORS)],
 )
-def test_in_continuous_time_behind_sensors(law):
-    """The compiler, which aborts where nothing reads a measurement, takes it; the rotor is held."""
+def test_observers_in_continuous_time_with_sensor_noise_hold_the_rotor(law):
+    """The compiler aborts if no code reads a measurement; here it does not abort, and the rotor is held."""
     world = Scenario(reference=Sine(2.5e-3, 2.0), sensor=Sensor(1e-7, 0.0, 1e-5))
     trajectory = rollout(Cascade(law), world, Clock(300, 1e-4)).trajectory
     assert trajectory.lost_at == np.inf
@@ -333,8 +349,8 @@ def test_in_continuous_time_behind_sensors(law):
 
 
 @pytest.mark.parametrize("kind", ["ired-1", "ired-2"])
-def test_no_sliding_step_behind_a_differentiator(kind):
-    """That would step it by Heun's method, far beyond its stability."""
+def test_the_sliding_step_is_refused_with_a_differentiator(kind):
+    """The sliding step would integrate it by Heun's method, far beyond its stability limit."""
     case = {"controller": {"observer": {"kind": kind}}, "clock": {"method": "sliding"}}
     with pytest.raises(ValueError, match=r"^clock.method = \"sliding\": .* an observer other than \"ired-1\""):
         case_from(case)

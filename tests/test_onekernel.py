@@ -1,4 +1,4 @@
-"""The whole-rollout kernel against the rollout, in interpret mode; and its lowering for a GPU, without one."""
+"""The kernel of a whole rollout against the rollout, in interpret mode; its compilation for a GPU, without a GPU."""
 
 import dataclasses
 
@@ -40,7 +40,7 @@ SCENARIO = Scenario(
 )
 
 
-def test_kernel_is_the_rollout():
+def test_the_kernel_equals_the_rollout():
     fold = Named({"peak": Peak("e_z", 1e-4, timed=True), "chatter": Variation()})
     found = run_whole(CASCADE, SCENARIO, CLOCK, fold=fold, block=32, interpret=True)
     expected = run_ensemble(CASCADE, SCENARIO, CLOCK, fold=fold, threads=1)
@@ -63,7 +63,7 @@ LAWS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("laws", "x64"), [("paper", True), ("others", False)])
-def test_lowers_for_a_gpu(laws, x64, monkeypatch):
+def test_the_kernel_compiles_for_a_gpu(laws, x64, monkeypatch):
     # No GPU is needed to make its program: a primitive that kernels cannot have would raise here. What is done for
     # CPUs alone must be left out, as it is where JAX runs on a GPU.
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")

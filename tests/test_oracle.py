@@ -64,7 +64,7 @@ def pi(k_p=3e5, k_int=1e8, k_aw=200.0):
 
 
 def drop(z, gamma, p, position, current, reference=REST, u_max=math.inf):
-    """From rest off centre: the rotor falls, and is caught by its gains."""
+    """The rotor starts at rest off centre, falls, and is caught by the controller."""
     return World(
         position=position, inversion=adaptive(gamma, p), current=current, reference=reference, initial=(z, 0.0, 0.0),
         u_max=u_max,
@@ -164,7 +164,7 @@ def in_ambjax(case):
 
 
 def noise_of(case, scenario):
-    """The errors that ambjax draws: data for the oracle."""
+    """Return the errors that ambjax draws, as data for the independent solution."""
     if scenario.sensor is None:
         return None
     errors = jax.vmap(lambda k: scenario.sensor.noise(scenario.words(), k))(np.arange(case.samples))
@@ -172,7 +172,7 @@ def noise_of(case, scenario):
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_the_rotor_moves_as_the_oracle_says(case, record_property):
+def test_the_rotor_moves_as_in_the_independent_solution(case, record_property):
     cascade, scenario, clock = in_ambjax(case)
 
     def run(clock):
@@ -194,7 +194,7 @@ def test_the_rotor_moves_as_the_oracle_says(case, record_property):
     assert tight <= 1e-10
 
 
-def test_the_oracle_is_exact_enough_to_judge():
+def test_the_error_of_the_independent_solution_is_negligible():
     t = np.arange(400) * 1e-4
     stiff = World(reference=sine(), q_v=pulse(1.0, 0.01, 0.03))
     mild = World(inversion=adaptive(1e9, 25e-6), reference=sine(), q_v=pulse(1.0, 0.01, 0.03))

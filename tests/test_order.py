@@ -12,8 +12,11 @@ from ambjax.world.signals import reference_at
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", [inversion.Adaptive(), inversion.ClosedForm()], ids=lambda law: type(law).__name__)
-def test_the_laws_see_the_rotor_where_the_observer_says_it_is(law):
-    """Behind an observer with an estimate of its own the measured position changes nothing at once but rates."""
+def test_the_laws_use_the_estimate_of_the_observer(law):
+    """The observer has its own estimate of the position.
+
+    The measured position then changes rates only, not the commands at the same instant.
+    """
     cascade = Cascade(observer.Complementary(l=7.0), inversion=law)
     reference = reference_at(Sine(2.5e-3, 2.0), 0.013)
     state = cascade.init(Measurement(jnp.asarray(2e-4), jnp.asarray(0.0), jnp.asarray(0.0)))

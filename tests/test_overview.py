@@ -17,7 +17,7 @@ from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Row, Trajector
 
 @pytest.fixture(autouse=True)
 def drawn(monkeypatch):
-    """The figures saved, still open to questions."""
+    """The saved figures, which the tests can still inspect."""
     pages, save = [], Figure.savefig
 
     def keep(self, path, **options):
@@ -29,7 +29,7 @@ def drawn(monkeypatch):
 
 
 def a_run(samples=20_000, period=1e-4, lost_at=np.inf, code=ALIVE, **signals):
-    """A run whose errors fall with 1 ms, everything else at rest; `signals` replace some."""
+    """Return a run whose errors decay with 1 ms while all else is at rest; `signals` replace some."""
     t = period * np.arange(samples)
     rows = {name: np.zeros(samples) for name in Row._fields if name != "z_measured"}
     rows |= {"t": t, "alive": t < lost_at, "z": 1e-4 * np.exp(-t / 1e-3), "v_tilde": np.exp(-t / 1e-3)} | signals
@@ -61,13 +61,13 @@ def test_no_label_is_cut(tmp_path, drawn):
     assert drawn[0].get_tightbbox().x0 >= 0
 
 
-def test_the_start_is_a_twentieth_at_most(tmp_path, drawn):
+def test_the_enlarged_start_is_at_most_a_twentieth_of_the_run(tmp_path, drawn):
     t = 1e-4 * np.arange(20_000)
     overview(a_run(z=1e-4 * np.exp(-t / 0.2)), "slow", tmp_path / "o.png")
     assert columns(drawn[0])[0, 1].get_xlim()[1] == pytest.approx(1.9999 / 20)
 
 
-def test_chatter_is_a_band_with_its_mean_and_its_turns_can_be_followed(tmp_path, drawn):
+def test_chatter_is_drawn_as_a_band_with_its_mean_in_the_whole_run_and_as_a_line_at_the_end(tmp_path, drawn):
     t = 1e-4 * np.arange(20_000)
     u = 200.0 * (-1) ** np.arange(20_000) + 10 * np.sin(2 * np.pi * t)
     u[12_345] = 260.0
@@ -85,7 +85,7 @@ def test_chatter_is_a_band_with_its_mean_and_its_turns_can_be_followed(tmp_path,
     assert np.diff(end.get_xlim())[0] == pytest.approx(TURNS * 1e-4, rel=0.06)  # a turn a sample; two at the border
 
 
-def test_a_smooth_run_has_no_mean_in_place_of_itself(tmp_path, drawn):
+def test_a_smooth_run_is_drawn_without_a_mean(tmp_path, drawn):
     overview(a_run(samples=4 * PIXELS), "short", tmp_path / "o.png")
     assert not any(ax.collections for ax in drawn[0].axes)
     assert len(columns(drawn[0])[0, 0].lines[0].get_xdata()) == 4 * PIXELS
@@ -104,20 +104,20 @@ def test_a_loss_ends_the_picture_shortly_after(tmp_path, drawn, code, words):
 
 
 @pytest.mark.parametrize(("code", "words"), [(TOUCHED, "lost at 0.01 s"), (STALLED, "not decided from 0.01 s")])
-def test_a_figure_of_the_paper_says_which_of_both(tmp_path, drawn, code, words):
+def test_a_figure_of_the_paper_distinguishes_a_loss_from_a_stall(tmp_path, drawn, code, words):
     figures.paper_figure(3, a_run(lost_at=0.01, code=code), "regulation", tmp_path / "f.png")
     said = [text.get_text().split("\n")[0] for ax in drawn[0].axes for text in ax.texts]
     assert said == [words]
 
 
 # each number of samples and each end once; the thorough tests combine them otherwise
-USUAL = [(1, 0.0), (1, np.inf), (2, 1e-4), (3, 1.5e-4), (30, np.inf)]
+FAST_RUNS = [(1, 0.0), (1, np.inf), (2, 1e-4), (3, 1.5e-4), (30, np.inf)]
 
 
 @pytest.mark.parametrize(
     ("samples", "lost_at"),
     [
-        pytest.param(*both, marks=pytest.mark.slow if both in USUAL else pytest.mark.thorough)
+        pytest.param(*both, marks=pytest.mark.slow if both in FAST_RUNS else pytest.mark.thorough)
         for both in itertools.product([1, 2, 3, 30], [np.inf, 0.0, 1e-4, 1.5e-4])
     ],
 )
@@ -126,7 +126,7 @@ def test_runs_of_few_samples_are_drawn(tmp_path, samples, lost_at):
     assert (tmp_path / "o.png").stat().st_size > 1000
 
 
-def test_the_whole_run_has_the_scale_of_what_is_settled(tmp_path, drawn):
+def test_the_panels_of_the_whole_run_have_the_scale_of_the_settled_part(tmp_path, drawn):
     t = 1e-4 * np.arange(20_000)
     z = 1e-4 * np.exp(-t / 1e-3) + 2e-7 * np.sin(300 * t)
     overview(a_run(z=z), "lift-off", tmp_path / "o.png", settle=0.1)
@@ -139,7 +139,7 @@ def test_the_whole_run_has_the_scale_of_what_is_settled(tmp_path, drawn):
     assert columns(drawn[1])[0, 0].get_ylim()[1] > 99.0
 
 
-def test_what_is_settled_looks_settled(tmp_path, drawn):
+def test_a_settled_signal_is_not_magnified_to_its_rounding(tmp_path, drawn):
     overview(a_run(i=1.0 + 1e-12 * np.arange(20_000), i_ref=np.linspace(0, 1, 20_000)), "flat", tmp_path / "o.png")
     end = columns(drawn[0])[4, 2]
     assert np.diff(end.get_ylim())[0] >= 0.005
@@ -166,7 +166,7 @@ def test_the_command_draws_the_given_interval(case, drawn, capsys):
 @pytest.mark.parametrize(
     "flags", [["--from", "0.05"], ["--to", "0.051"], ["--from", "-1"], ["--from", "nan"], ["--to", "0"]]
 )
-def test_a_stretch_outside_the_run_is_refused(case, flags, capsys):
+def test_an_interval_outside_the_run_is_refused(case, flags, capsys):
     assert main(["simulate", case, *flags]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1

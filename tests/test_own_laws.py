@@ -98,7 +98,7 @@ def case(elsewhere):
         "export case.toml --json",
     ],
 )
-def test_every_command_takes_it_and_says_what_it_imports(command, case, capsys):
+def test_every_command_accepts_a_custom_law_and_prints_the_imported_file(command, case, capsys):
     assert main([*command.split(), "--out", "there"] if "check" not in command else command.split()) in (0, 1)
     out, err = capsys.readouterr()
     json.loads(out)  # what the file prints does not stand on stdout
@@ -170,7 +170,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_a_wrong_law_is_one_clear_line(wrong, case, capsys):
+def test_a_wrong_law_is_refused_in_one_line(wrong, case, capsys):
     text, kind, wanted = WRONG[wrong]
     pathlib.Path("mine.py").write_bytes(text.encode("utf-8", "surrogateescape"))
     pathlib.Path("folder.py").mkdir()
@@ -204,7 +204,7 @@ print(type(law).__qualname__, law.damp, type(pickle.loads(pickle.dumps(law))) is
 """
 
 
-def test_a_law_travels_to_a_process_that_has_no_such_file(case):
+def test_a_law_is_unpickled_in_a_process_without_its_file(case):
     law = read_case(case).cascade.position
     assert pickle.loads(pickle.dumps(law)) == law
     sent = pickle.dumps(law)
@@ -242,7 +242,7 @@ def test_a_study_is_not_resumed_with_another_law(case, capsys):
         ("{folder}/mine.py:PD", "there", "{folder}/mine.py:PD"),
     ],
 )
-def test_tuned_toml_finds_the_law_from_its_own_folder(kind, out, wanted, case):
+def test_tuned_toml_names_the_law_relative_to_its_own_folder(kind, out, wanted, case):
     here, folder = pathlib.Path.cwd(), pathlib.Path(out)
     pathlib.Path("below").mkdir()
     one = read_case(write(CASE.replace("mine.py:PD", kind.format(folder=here))))
@@ -263,7 +263,7 @@ def test_a_change_of_the_file_during_the_search_does_not_matter(case):
 
 
 @pytest.mark.thorough
-def test_it_is_tuned_and_a_search_is_not_resumed_with_another_law(case, monkeypatch, capsys):
+def test_a_custom_law_is_tuned_and_a_search_is_not_resumed_with_another_law(case, monkeypatch, capsys):
     small = "members = 2\nstressed = 1\nvalidation = 2\nheld_out = 2\nscreen = 2\nstarts = 1\niterations = 1\n"
     write(CASE + small)
     assert tune_main(["case.toml", "--out", "there"]) in (0, 1)

@@ -67,7 +67,7 @@ class Coils(NamedTuple):
 
 @record
 class TwoCoils(Bearing):
-    """Each coil has a circuit of its own; the lower one's resistance is larger by a share `skew`."""
+    """Each coil has its own circuit. The resistance of the lower one is larger by a share `skew`."""
 
     skew: Any = leaf(default=0.05, unit="1", at_least=-0.5, at_most=0.5, doc="excess of the lower coil's resistance")
 
@@ -143,7 +143,7 @@ METHOD = choose_method(CASCADE, NOISY, 1e-4, reverse=True)
 RHO, SKEW = "controller.position.rho", "plant.skew"
 
 
-def test_simulated():
+def test_a_custom_law_and_plant_are_simulated():
     rows = rollout(CASCADE, SCENARIO, Clock(600, 1e-4, AdaptiveRodas3(1e-9))).trajectory.rows
     assert rows.alive.all()
     # the plant of two circuits written out once more, by another integrator, under the same laws
@@ -178,7 +178,7 @@ def test_simulated():
 
 
 @pytest.mark.slow
-def test_a_lost_one_is_frozen():
+def test_a_lost_custom_plant_is_frozen():
     weak = dataclasses.replace(CASCADE, inversion=inversion.Adaptive(1e3, 25e-6))
     outcome = rollout(weak, SCENARIO, CLOCK.with_method(AdaptiveRodas3()), fold=standard_for(0.01, SCENARIO))
     assert bool(outcome.measured["lost"])
@@ -187,7 +187,7 @@ def test_a_lost_one_is_frozen():
 
 
 @pytest.mark.slow
-def test_checked():
+def test_a_custom_law_and_plant_are_checked():
     report = check(CASCADE, SCENARIO, CLOCK)
     assert report.holds
     line = next(line for line in report.conditions if line.path == RHO)
@@ -204,7 +204,7 @@ SPREAD = Spread(((SKEW, Normal(0.02)), (RHO, Percent(20.0)), ("plant.m", Percent
 
 
 @pytest.mark.slow
-def test_spread():
+def test_the_numbers_of_a_custom_law_and_plant_are_spread():
     study = Study(CASCADE, NOISY, Clock(200, 1e-4, METHOD), 0.01, SPREAD, seed=3, members=12)
     columns = study.columns(0, 12)
     assert not columns["lost"].any()
@@ -219,7 +219,7 @@ def test_spread():
 
 
 @pytest.mark.slow
-def test_mapped():
+def test_the_numbers_of_a_custom_law_and_plant_are_axes_of_a_map():
     study = Study(CASCADE, NOISY, Clock(200, 1e-4, METHOD), 0.01, Spread(), seed=3, members=1)
     found = grid(study, Axis(RHO, np.array([10.0, 40.0])), Axis(SKEW, np.array([-0.1, 0.0, 0.1])))
     assert found.survival.shape == (3, 2)
@@ -252,7 +252,7 @@ def tuning_problem():
     return problem_of(case, tune), tune, case
 
 
-def test_tuned():
+def test_the_gains_of_a_custom_law_have_paths_and_ranges():
     problem, tune, case = tuning_problem()
     every = tune_from(Table({}), case).space.paths
     assert every == [*tune.space.paths, "controller.inversion.gamma", "controller.current.k_i"]
@@ -267,7 +267,7 @@ def test_tuned():
 
 
 @pytest.mark.slow
-def test_searched(tmp_path):
+def test_a_search_improves_the_gains_of_a_custom_law(tmp_path):
     problem, tune, case = tuning_problem()
     start = tune.space.values(case.cascade)
     answer = rounds(problem, start, tmp_path, {"case": "own parts"}, False)

@@ -65,7 +65,7 @@ def test_every_number_reads_back_from_the_case_file(case):
         assert document == values[k], one.path
 
 
-def test_a_changed_plant_leaves_the_controller_s_model(case):
+def test_a_changed_plant_does_not_change_the_controller_s_model(case):
     (mass,) = (one for one in sliders(case, []) if one.path == "plant.m")
     lines, _ = editable_lines(case.text, [mass])
     document = tomllib.loads(filled(lines, [mass], [2.0]))
@@ -98,7 +98,7 @@ def test_a_signal_from_a_file_is_refused_in_one_line(tmp_path, capsys):
     assert 'disturbance.q_z: kind = "table": a page cannot contain a signal from a file.' in said
 
 
-def test_another_structure_is_no_preset(tmp_path, capsys):
+def test_a_case_with_another_structure_is_refused_as_a_preset(tmp_path, capsys):
     one, other = tmp_path / "rig.toml", tmp_path / "other.toml"
     one.write_text(RIG)
     other.write_text(RIG.replace('kind = "kalman"\nw = 1000.0', 'kind = "ired-1"'))
@@ -106,7 +106,7 @@ def test_another_structure_is_no_preset(tmp_path, capsys):
     assert "--also other: it differs from" in capsys.readouterr().err
 
 
-def test_the_file_of_the_page_is_named_and_not_overwritten(tmp_path, capsys):
+def test_an_unusable_path_of_the_page_is_refused_in_one_line(tmp_path, capsys):
     one, out = tmp_path / "rig.toml", tmp_path / "page.html"
     one.write_text(RIG)
     out.write_text("mine")
@@ -125,7 +125,7 @@ def in_browser(test):
 
 @pytest.fixture(scope="module")
 def tuned():
-    """A second preset, with other gains; its name and a comment try to break out of the page."""
+    """A second preset with other gains. Its name and a comment contain markup."""
     text = RIG.replace("c = 2900.0", "c = 2000.0").replace("[plant]", f"# {HOSTILE}\n[plant]", 1)
     return dataclasses.replace(rig(text), name=HOSTILE)
 
@@ -168,7 +168,7 @@ def typed(tab, path, text):
 
 
 @in_browser
-def test_the_trajectory_is_the_simulator_s_with_its_noise(fresh, case):
+def test_the_trajectory_with_noise_equals_the_simulator(fresh, case):
     rows = simulate(case).trajectory.rows
     # equal to the order of rounding; the issue of an error would be at least the noise, 5e-7 m
     for name, tolerance in (("z", 1e-13), ("z_measured", 1e-13), ("u", 1e-6), ("i", 1e-9), ("r", 0)):
@@ -178,7 +178,7 @@ def test_the_trajectory_is_the_simulator_s_with_its_noise(fresh, case):
 
 
 @in_browser
-def test_metrics_are_the_simulator_s(fresh, case):
+def test_the_metrics_equal_the_simulator(fresh, case):
     metrics = simulate(case).metrics
     found = fresh.run("ambjax.state.metrics")
     assert set(found) == set(metrics)
@@ -190,7 +190,7 @@ def test_metrics_are_the_simulator_s(fresh, case):
 
 
 @in_browser
-def test_members_are_those_of_the_ensemble(fresh, case):
+def test_the_members_equal_those_of_the_ensemble(fresh, case):
     study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, MEMBERS)
     errors = np.asarray(
         run_ensemble(*study.batch(np.arange(MEMBERS)), case.clock, fold=None, every=1).trajectory.rows.e_z
@@ -215,14 +215,14 @@ def test_sensitivity_is_that_of_the_linear_analysis(fresh, case):
 
 
 @in_browser
-def test_a_fractional_delay_is_the_simulator_s(fresh):
+def test_a_fractional_delay_equals_the_simulator(fresh):
     typed(fresh, "processor.delay", "0.5")
     other = rig(RIG.replace("delay = 1.0", "delay = 0.5"))
     np.testing.assert_allclose(signal(fresh, "z"), simulate(other).trajectory.rows.z, rtol=0, atol=1e-12)
 
 
 @in_browser
-def test_a_slider_moves_the_response_and_the_preset_restores_it(fresh):
+def test_a_slider_changes_the_response_and_the_preset_restores_it(fresh):
     before = signal(fresh, "z")
     fresh.run("document.querySelector('[data-path=\"controller.position.k\"]').focus()")
     for _ in range(50):
@@ -244,7 +244,7 @@ def test_the_second_preset_has_its_own_numbers(fresh, tuned):
 
 
 @in_browser
-def test_an_extreme_value_loses_the_rotor_and_says_so(fresh):
+def test_an_extreme_value_loses_the_rotor_and_the_page_reports_it(fresh):
     typed(fresh, "controller.position.k", "0.01")
     typed(fresh, "plant.m", "16")
     said = fresh.run("document.getElementById('status').textContent")
@@ -256,7 +256,7 @@ def test_an_extreme_value_loses_the_rotor_and_says_so(fresh):
 
 
 @in_browser
-def test_a_wrong_number_is_refused_in_words(fresh):
+def test_a_wrong_number_is_refused_with_a_message(fresh):
     before = fresh.run("ambjax.state.sent")
     box = "document.querySelector('[data-path=\"plant.m\"]').parentElement"
     for text, words in (("-1", "at least"), ("heavy", "Type a number"), ("", "Type a number"), ("1e99", "at most")):
@@ -281,14 +281,14 @@ def test_the_case_file_with_these_numbers_simulates_to_the_same_run(fresh):
 
 
 @in_browser
-def test_nothing_of_the_case_is_markup_and_nothing_is_loaded(fresh):
+def test_texts_of_the_case_are_escaped_and_the_page_loads_nothing(fresh):
     assert fresh.run("document.title") != "owned"
     assert fresh.run("document.querySelectorAll('img').length") == 0
     assert {url.partition(":")[0] for url in fresh.requests} <= {"file", "blob", "data"}
 
 
 @in_browser
-def test_the_machine_follows_the_time(fresh):
+def test_the_drawing_of_the_machine_shows_the_selected_time(fresh):
     drawing = "document.querySelector('#drawing svg').getAttribute('aria-label')"
     begin = fresh.run(drawing)
     fresh.run("document.getElementById('time').focus()")
@@ -325,7 +325,7 @@ def test_the_command_writes_the_page(tmp_path, capsys):
     assert pathlib.Path(found["out"]).stat().st_size == found["bytes"]
 
 
-def test_cases_that_differ_in_numbers_share_a_page(case, monkeypatch):
+def test_cases_with_different_numbers_share_a_page(case, monkeypatch):
     other = case_from(tomllib.loads(RIG.replace('kind = "kalman"\nw = 1000.0', 'kind = "ired-1"')), "other", RIG)
     louder = rig(RIG.replace("std = 5e-7", "std = 1e-6"), "louder")
     shown = lambda case, others, path: f"{path}: {[one.name for one in (case, *others)]}"  # noqa: E731
@@ -334,7 +334,7 @@ def test_cases_that_differ_in_numbers_share_a_page(case, monkeypatch):
     assert found == {"page.html": "a.toml: ['rig', 'louder']", "page-2.html": "b.toml: ['other']"}
 
 
-def test_a_member_has_no_page(tmp_path, capsys):
+def test_page_is_refused_with_a_member(tmp_path, capsys):
     path = tmp_path / "rig.toml"
     path.write_text(RIG)
     assert main(["simulate", str(path), "--page", "--member", "1", "--out", str(tmp_path / "out")]) == 2

@@ -21,7 +21,10 @@ DOCS = pathlib.Path(__file__).parents[1] / "docs"
 
 
 def noise(survived, radius_at_least=1e-8, stalled=False):
-    """A scan in which the first `survived` levels are survived, the rest lost, or stalled; sigma grows with std."""
+    """Return a scan in which the first `survived` levels are survived.
+
+    The others are lost, or stalled; sigma grows with std.
+    """
     ended = np.arange(len(NOISE_STDS)) >= survived
     statuses = ended & (not stalled), ended & stalled
     return Noise(1e-4, 0.6, *statuses, NOISE_STDS / NOISE_STDS[0] * radius_at_least)
@@ -37,8 +40,8 @@ def test_noise_scan_is_read_correctly():
     assert noise(0).std_for(6e-6) is None
 
 
-def test_verdicts_follow_the_evidence():
-    """Each verdict turns when its number crosses the criterion: nothing is typed in."""
+def test_verdicts_depend_on_the_evidence():
+    """Each verdict changes when its number crosses the criterion."""
     judges = {c.says: c.judge for c in claims.CLAIMS}
 
     def tracking(error, lost=False):
@@ -61,7 +64,7 @@ def test_verdicts_follow_the_evidence():
 
 
 def test_a_stall_is_neither_held_nor_lost():
-    """All claims, of runs that the integrator gave up: none holds, none fails, but what is arithmetic or the proof."""
+    """If all runs stall, no claim holds or fails, except those that follow from arithmetic or from the proof."""
     names = ["settled_max_abs_error_m", "settled_max_abs_v_tilde_A2_per_m2", "settled_max_abs_current_error_A"]
     metrics = {"lost_at_s": 0.01, "lost": 0.0, "stalled": 1.0, "v_tilde_reached_s": 1e-3, "settled_rms_u_V": 1.0}
     rows = Row(*[np.zeros(200)] * len(Row._fields))._replace(t=1e-2 * np.arange(200))
@@ -94,7 +97,7 @@ def test_a_stall_is_neither_held_nor_lost():
         assert judges[says] == findings.FAILS
 
 
-def test_what_is_held_ends_where_it_is_lost_or_not_known():
+def test_the_held_range_ends_before_the_first_loss_or_stall():
     tried, no = np.array([1.0, 2.0, 3.0]), np.zeros(3, bool)
     assert survival_of(tried, no, no) == (3.0, None)
     assert survival_of(tried, tried > 1, no) == (1.0, None)
@@ -158,7 +161,7 @@ def test_reproduce(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_step_of_the_tuned_reading_is_fine_enough():
+def test_the_step_of_the_tuned_reading_is_small_enough():
     cascade, scenario = paper.cascade("tuned"), paper.scenario("tracking", "tuned")
     runs = [
         rollout(cascade, scenario, paper.CLOCK.with_method(step)) for step in (STEPS["tuned"], AdaptiveRodas3(1e-8))

@@ -1,6 +1,6 @@
-"""Pictures of ensembles: numbers, units and edges against closed forms, and cases that are hard to draw.
+"""Pictures of ensembles: numbers, units and edges against closed forms, and special cases.
 
-Warnings are errors here, so a picture that is written was written without one.
+Warnings are errors here, so each picture is written without a warning.
 """
 
 import re
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from ambjax.pictures import fans, heatmaps, histograms
-from ambjax.pictures.scales import LABELS, SHOWN, axis_of, edges, label_of, log_ticks, prefix_of, size_of
+from ambjax.pictures.scales import AXIS_UNITS, LABELS, axis_of, edges, label_of, log_ticks, prefix_of, size_of
 from ambjax.pictures.tornado import Bar, tornado
 from ambjax.simulation.metrics import UNITS, Standard
 
@@ -20,7 +20,10 @@ PERCENTS = (0, 5, 25, 50, 75, 95, 100)
 
 @pytest.fixture(autouse=True)
 def drawn(monkeypatch):
-    """The figures saved, still open to questions; the file is written as well, coarsely: that is faster."""
+    """The saved figures, which the tests can still inspect.
+
+    Each file is also written, with a low resolution to save time.
+    """
     figures, save = [], Figure.savefig
 
     def keep(self, path, **options):
@@ -61,13 +64,13 @@ def texts(figure):
         ("s", 1e-14, (1e9, "ns")),
     ],
 )
-def test_prefix(unit, size, expected):
+def test_the_prefix_of_a_unit(unit, size, expected):
     factor, words = prefix_of(unit, size)
     assert words == expected[1]
     assert factor == pytest.approx(expected[0], rel=1e-15)  # one rounding of a reciprocal
 
 
-def test_prefix_brings_every_size_between_1_and_1000():
+def test_a_prefix_scales_every_size_to_between_1_and_1000():
     for size in np.geomspace(1e-9, 1e11, 301):
         # 0.9995: what prints as 1.00 may count as 1
         assert 0.9995 <= prefix_of("V", size)[0] * size < 1000
@@ -76,7 +79,7 @@ def test_prefix_brings_every_size_between_1_and_1000():
 def test_every_metric_has_its_unit():
     names = [*Standard()._folds().folds, "force_used", "lost_at_s", "singular_at_s"]
     assert set(names) == set(LABELS)
-    assert set(UNITS) | set(SHOWN) == {*names, "settle_s"}
+    assert set(UNITS) | set(AXIS_UNITS) == {*names, "settle_s"}
     for name, unit in UNITS.items():  # the name of a metric ends in its unit
         assert name.endswith("_" + unit.replace("/", "_per_").replace("^", "")), name
     for name in names:
@@ -88,7 +91,7 @@ def test_every_metric_has_its_unit():
     assert set(histograms.CHIEF) <= set(names)
 
 
-def test_labels_keep_what_is_no_unit():
+def test_labels_keep_text_that_is_not_a_unit():
     assert label_of("noise std on $z$ (m)", 2e-5) == (pytest.approx(1e6), "noise std on $z$ (µm)")
     assert label_of("share", 2e-5) == (1.0, "share")
     assert label_of("mass (kg)", 2e-5) == (1.0, "mass (kg)")
@@ -98,14 +101,14 @@ def test_labels_keep_what_is_no_unit():
     assert label_of("plant.n (1)", 900.0) == (1.0, "plant.n")
 
 
-def test_size_ignores_what_cannot_be_shown():
+def test_size_ignores_zeros_and_values_that_are_not_finite():
     assert size_of(np.array([np.nan, np.inf, -3.0, 0.0])) == 3.0
     assert size_of(np.array([1e-6, 1e-2]), log=True) == pytest.approx(1e-4, rel=1e-12)  # rounding of two roots
     assert size_of(np.array([np.nan])) == 0.0
 
 
 @pytest.mark.parametrize("log", [False, True])
-def test_edges_enclose_each_centre(log):
+def test_the_bounds_of_cells_enclose_each_centre(log):
     for centres in (np.geomspace(1e-6, 1e-2, 7), np.array([1.0, 2.0, 8.0]), np.array([3.0])):
         bounds = edges(centres, log)
         assert len(bounds) == len(centres) + 1
@@ -120,7 +123,7 @@ def test_log_edges_refuse_zero():
 
 
 @pytest.mark.parametrize(("low", "high"), [(1.0, 1.5), (3e-7, 9e-6), (0.2, 900.0), (2e-6, 3e9), (1e5, 1e9)])
-def test_log_ticks_say_their_values(low, high):
+def test_log_ticks_are_labelled_with_their_values(low, high):
     axis = Figure().subplots().xaxis
     log_ticks(axis, low, high)
     at = axis.get_majorticklocs()
@@ -223,7 +226,7 @@ def test_fan_refuses_unknown_quantity(tmp_path):
 
 @pytest.mark.parametrize("lost_at", [None, np.array([np.inf]), np.zeros(3)])
 @pytest.mark.parametrize("values", [np.zeros(9), np.full(9, -2.0), np.full(9, np.nan), np.r_[1.0, 2.0, [np.nan] * 7]])
-def test_fan_of_hard_cases(tmp_path, values, lost_at):
+def test_fan_charts_of_special_cases(tmp_path, values, lost_at):
     # one member: all bands alike; NaN: no member left
     bands = {"u": dict.fromkeys(PERCENTS, values)}
     fans.fan(np.linspace(0, 1, 9), bands, {"u": 2.0}, "hard", tmp_path / "fan.png", lost_at=lost_at)
@@ -280,7 +283,7 @@ def test_histogram_counts_every_member_once(tmp_path, drawn):
     ],
 )
 @pytest.mark.parametrize("all_lost", [False, True])
-def test_histograms_of_hard_cases(tmp_path, drawn, values, all_lost):
+def test_histograms_of_special_cases(tmp_path, drawn, values, all_lost):
     columns = {"lost_at": np.full(len(values), 0.1 if all_lost else np.inf), "rms_error_m": values}
     histograms.histograms(columns, tmp_path / "h.png")
     assert is_png(tmp_path / "h.png")
@@ -289,7 +292,7 @@ def test_histograms_of_hard_cases(tmp_path, drawn, values, all_lost):
     assert shown == in_range.sum()  # no value falls out of the last bin
 
 
-def test_histograms_refuse_nothing_to_draw(tmp_path):
+def test_histograms_refuse_empty_data(tmp_path):
     with pytest.raises(ValueError, match="none of"):
         histograms.histograms({"index": np.arange(3)}, tmp_path / "h.png")
 
@@ -318,7 +321,7 @@ def test_tornado_ranks_by_share_and_colours_by_trend(tmp_path, drawn):
     assert len({patch.get_facecolor() for patch in ax.patches[:3]}) == 3
 
 
-def test_tornado_of_hard_cases(tmp_path, drawn):
+def test_tornado_charts_of_special_cases(tmp_path, drawn):
     tornado([Bar("plant.m", 0.0, 0.0, 1.0, 0.0)], "rms_u_V", "nothing explains it", tmp_path / "a.png")
     tornado([Bar("plant.m", 1.0, 1.0, 1.0, -1.0)], "lost_at_s", "all", tmp_path / "b.png")
     assert "falls with it" in texts(drawn[1])
@@ -381,13 +384,13 @@ ALL = np.ones((3, 4))
         (np.eye(2), np.array([[1e-9, 1e3], [1.0, np.nan]])),
     ],
 )
-def test_maps_of_hard_cases(tmp_path, survival, error):
+def test_maps_of_special_cases(tmp_path, survival, error):
     panels = [a_panel(survival, error), a_panel(0.5 * survival, None)]
     heatmaps.maps(panels, "std (m)", "period (s)", True, False, tmp_path / "m.png", error_metric="rms_error_m")
     assert is_png(tmp_path / "m.png")
 
 
-def test_a_map_without_confidence_bounds_names_none(tmp_path, drawn):
+def test_a_map_without_confidence_bounds_has_no_legend_for_them(tmp_path, drawn):
     heatmaps.maps([a_panel(ALL)], "x", "y", False, False, tmp_path / "with.png")
     heatmaps.maps([a_panel(ALL)._replace(low=None, high=None)], "x", "y", False, False, tmp_path / "without.png")
     assert ["confidence interval" in texts(figure) for figure in drawn] == [True, False]
@@ -395,7 +398,7 @@ def test_a_map_without_confidence_bounds_names_none(tmp_path, drawn):
     assert ["95 %" in texts(figure) for figure in drawn] == [True, False]
 
 
-def test_maps_refuse(tmp_path):
+def test_maps_refuse_empty_panels_and_zeros_on_a_log_axis(tmp_path):
     with pytest.raises(ValueError, match="no panels"):
         heatmaps.maps([], "", "", False, False, tmp_path / "m.png")
     with pytest.raises(ValueError, match="log axis cannot show"):

@@ -52,7 +52,7 @@ def test_closed_form_derivatives_equal_autodiff(plant):
 
 @PLANTS
 @pytest.mark.parametrize("share", [-0.9, -0.5, -1e-6, 0.0, 1e-6, 0.3, 0.9])
-def test_equilibrium_holds_the_rotor_still(plant, share):
+def test_the_rates_are_0_at_the_equilibrium(plant, share):
     z = share * plant.s_0
     i, u = plant.equilibrium(z)
     # relative to the largest term: a v is about 1e4 m/s^2 per magnet at 0.9 s_0
@@ -109,7 +109,7 @@ def test_current_for_is_finite_where_v_is_out_of_reach():
 
 
 @pytest.mark.parametrize("share", [-0.5, -0.05, 0.05, 0.5])
-def test_out_of_reach_the_nearest_force_is_given(share):
+def test_an_unreachable_force_gives_the_current_of_the_nearest_force(share):
     z = share * PLANT.s_0
     on_C = -(share + 1 / share) / 2 * PLANT.i_0
     nearest = PLANT.v(z, on_C)
@@ -205,7 +205,7 @@ def test_distance_to_C_has_a_finite_derivative_on_C():
 
 
 def test_thresholds_follow_the_plant():
-    """The bands are the same share of the sizes of sigma, v and i for every plant; Table 1 has the defaults."""
+    """The bands are the same share of the sizes of sigma, v and i for every plant; the defaults are of Table 1."""
     paper = standard_for(0.5, Scenario(clearance=4.5e-3))
     assert dataclasses.replace(paper, largest_force=np.inf) == Standard()
     assert float(paper.largest_force) == pytest.approx(PLANT.k_i * PLANT.i_0, rel=1e-12)
@@ -221,7 +221,7 @@ def test_thresholds_follow_the_plant():
 
 
 @PLANTS
-def test_the_two_coils_in_half_their_difference_and_half_their_sum(plant):
+def test_the_equations_of_two_coils_in_half_their_difference_and_half_their_sum(plant):
     """The equations of docs/magnet.md for i = (i_1 - i_2)/2 and j = (i_1 + i_2)/2 - i_0."""
     coils = TwoCoil(**dataclasses.asdict(plant))
     z, i = points(plant)

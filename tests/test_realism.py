@@ -34,19 +34,19 @@ def motion(z=1e-3, z_dot=0.2, i=0.1):
     return Measurement(*(jnp.asarray(x) for x in (z, z_dot, i)))
 
 
-def test_a_converter_rounds_to_its_steps_and_ends_at_its_range():
+def test_a_converter_rounds_to_its_steps_and_saturates_at_its_range():
     x = np.concatenate([np.linspace(-1.3, 1.3, 997), [0.0, -0.0, 1 / 16, -1 / 16, 3 / 16, -1.0, 1.0]])
     got = np.asarray(converted(jnp.asarray(x), 4, 1.0))
     np.testing.assert_array_equal(got, [conversion(a, 4, 1.0) for a in x])  # powers of 2: exact
     assert set(got) == set(np.arange(-8, 8) / 8)
 
 
-def test_its_derivative_is_that_of_what_is_held():
+def test_the_derivative_of_a_converter_is_that_of_the_saturation():
     slope = jax.vmap(jax.grad(lambda x: converted(x, 6, 1.0)))
     np.testing.assert_array_equal(slope(jnp.array([-1.5, -0.5, 0.01, 0.9, 1.5])), [0.0, 1.0, 1.0, 1.0, 0.0])
 
 
-def test_ranges_left_out_are_those_of_the_plant():
+def test_default_ranges_of_converters_follow_from_the_plant():
     seen = Sensor(bits=8.0).converted(motion(z=1.0, i=1.0), 5e-3, 0.25)
     assert (float(seen.z), float(seen.i)) == (5e-3 * 127 / 128, 0.5 * 127 / 128)
     seen = Sensor(bits=8.0, range_z=1e-3, range_i=0.1).converted(motion(z=-1.0, i=-1.0), 5e-3, 0.25)
@@ -76,7 +76,7 @@ SHORTNESS = np.concatenate([[0.0], np.geomspace(1e-18, 1e3, 64), [0.999, 1.001]]
 
 
 def low_pass(y, before, after, h, bandwidth):
-    """Return the same with 150 digits, from the moments of exp(-b (1 - s)), b = w h."""
+    """Return the output of the low-pass with 150 digits, from the moments of exp(-b (1 - s)), b = w h."""
     exact = decimal.Context(prec=150)
     c_1, end, rise = (exact.create_decimal(x) for x in (h * before[1], h * after[1], after[0] - before[0]))
     b = exact.create_decimal(2 * np.pi * bandwidth * h)
@@ -91,7 +91,7 @@ def low_pass(y, before, after, h, bandwidth):
 
 @pytest.mark.parametrize("kind", ["float64", "float32"])
 def test_the_low_pass_is_exact_and_has_derivatives_over_any_time(kind):
-    """Times from 0 s on: 1e-15 s may remain of a sample after a ramp, or of a delay just below a whole number."""
+    """Times start at 0 s: after a ramp, or for a delay just below a whole number, a part may last 1e-15 s."""
     bandwidth, y, slope = 1e4, 2e-3, 2 * np.pi * 1e4
     with jax.enable_x64(kind == "float64"):
         h = (SHORTNESS / slope).astype(kind).astype(float)
@@ -120,7 +120,7 @@ FAST, SLOW = {"bandwidth": 5e3}, {"slew": 2e6}
 
 @pytest.mark.parametrize("given", [FAST, SLOW, FAST | SLOW], ids=["bandwidth", "slew", "both"])
 @pytest.mark.parametrize("ends", [(0.0, 100.0), (150.0, -30.0), (-5.0, -6.0), (7.0, 7.0)])
-def test_an_amplifier_follows_as_its_equation_says(given, ends):
+def test_the_voltage_of_an_amplifier_solves_its_equation(given, ends):
     u_a, u = ends
     w, slew = 2 * np.pi * given.get("bandwidth", 1e9), given.get("slew", math.inf)
     for time in (0.0, 1e-5, 1e-4):
@@ -190,7 +190,7 @@ def test_the_largest_voltage_is_that_at_the_coils_and_within_the_supply():
     np.testing.assert_allclose(found.measured["search"], np.mean(u_peak**16) ** (1 / 16), rtol=1e-12)
 
 
-def test_more_steps_of_the_plant_change_nothing_that_matters():
+def test_more_steps_per_sample_change_the_result_negligibly():
     """A step ends at the corner of the slew rate, and the voltage inside the step is exact."""
     amplifier = Amplifier(bandwidth=2e3, slew=4e6)
     steps = choose_method(laws().on_processor(), dataclasses.replace(WORLD, amplifier=amplifier), 1e-4).substeps
@@ -266,7 +266,7 @@ def test_a_wrong_key_is_refused_with_its_path(table, key, value, words):
 @pytest.mark.parametrize(
     ("table", "key", "value"), [("sensor", "bits", 12), ("sensor", "bandwidth", 1e4), ("actuator", "slew", 1e6)]
 )
-def test_what_is_for_a_processor_is_refused_without_one(table, key, value):
+def test_keys_that_need_a_processor_are_refused_without_one(table, key, value):
     with pytest.raises(ValueError, match=rf"^{table}\.{key} is for a controller on a processor"):
         case_from({table: {key: value}})
     assert case_from(CASE | {table: {key: value}}).scenario.on_processor == f"{table}.{key}"
@@ -287,7 +287,10 @@ def test_the_rig_holds_its_rotors_with_the_velocity_estimated():
 
 
 def test_the_bearing_of_the_data_sheet_is_plausible_and_without_warnings():
-    """The numbers of the sheet, a bias flux below 1.2 T, and a force of more than twice the weight."""
+    """The numbers are those of the data sheet.
+
+    The bias flux density is below 1.2 T, and the force is more than twice the weight.
+    """
     case = case_from(tomllib.loads(template("bearing")))
     plant, scenario = case.scenario.plant, case.scenario
     assert warnings_of(case) == []
@@ -318,7 +321,7 @@ def test_parts_can_be_spread():
     assert case_from(CASE | raw).spread.paths == ("actuator.bandwidth",)
 
 
-def test_the_step_holds_for_the_ends_of_an_amplifier_s_spread():
+def test_the_step_is_small_enough_for_the_ends_of_an_amplifier_s_spread():
     raw = CASE | {"actuator": {"bandwidth": 1e3}}
     wide = case_from(raw | {"spread": {"actuator": {"bandwidth": {"log-uniform": [500.0, 2e4]}}}}).clock.method
     assert wide == case_from(CASE | {"actuator": {"bandwidth": 2e4}}).clock.method == amb.RK4(26)
@@ -339,6 +342,6 @@ def test_the_step_holds_for_the_ends_of_an_amplifier_s_spread():
     ("table", "loud"),
     [({"std": 1e-6}, True), ({"std_z_dot": 1e-4}, False), (None, True)],
 )
-def test_a_perfect_velocity_is_said_loudly(table, loud):
+def test_a_velocity_measured_without_error_causes_a_warning(table, loud):
     raw = CASE | ({} if table is None else {"sensor": table})
     assert any("VELOCITY" in line for line in warnings_of(case_from(raw))) == loud

@@ -43,7 +43,7 @@ def test_twist_solves_its_equation_to_rounding(size, side, a, b, p):
     np.testing.assert_allclose(twist(x, a, b, p), (root(y, p), sign(y, p)), rtol=1e-14)
 
 
-def test_the_relay_is_the_limit_of_a_steep_sign():
+def test_the_implicit_relay_is_the_limit_of_a_steep_sign():
     w, h = jnp.linspace(-3.0, 3.0, 601), 1.0
     steep, hard = relax(w, h, 1e9), relax(w, h, None)
     np.testing.assert_allclose(hard, np.sign(w) * np.maximum(np.abs(w) - h, 0), atol=0)
@@ -54,7 +54,7 @@ def test_the_relay_is_the_limit_of_a_steep_sign():
 
 
 def test_the_hard_twist_is_the_published_controller():
-    """Its two cases as R. Seeber and B. Andritsch print them, with x, v, T, k_1, k_2."""
+    """The two cases are those that R. Seeber and B. Andritsch print, with x, v, T, k_1, k_2."""
     rng = np.random.default_rng(1)
     for x, v, T, k_1, k_2 in zip(*np.exp(rng.normal(size=(5, 200))), strict=True):
         x = x * rng.choice([-1, 1])
@@ -90,7 +90,7 @@ def test_derivatives_are_those_of_the_equation(function):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("p", [25.0, None])
-def test_odd_and_finite_at_the_edges(p):
+def test_relax_is_odd_and_its_derivatives_are_finite_for_extreme_values(p):
     values = jnp.array([0.0, 1e-300, 1.0, 1e12])
     for function in (lambda w: relax(w, 2.0, p), lambda w: share(w, 2.0, p), lambda w: twist(w, 2.0, 0.1, p)[0]):
         np.testing.assert_array_equal(function(-values), -function(values))
@@ -108,7 +108,10 @@ def test_float32_keeps_six_digits():
 
 
 def test_an_integrator_behind_the_relay_ends_at_the_disturbance():
-    """x+ = x + T (u + w), |w| < k: |x| <= T |w| after it was reached, whatever k, and u is -w of the sample before."""
+    """The system is x+ = x + T (u + w) with |w| < k.
+
+    Once the band is reached, |x| <= T |w| for every k, and u is -w of the previous sample.
+    """
     T, k, x, past = 1e-3, 50.0, 0.7, 0.0
     for n in range(100):
         w = 3 * np.sin(0.05 * n)

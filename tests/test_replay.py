@@ -66,7 +66,7 @@ def no_pictures(patch):
 
 
 def commands(text):
-    """The commands of ours in a text: between backticks or quotes, or to the end of the line behind a colon."""
+    """Return the commands of ambjax in a text: between backticks or quotes, or after a colon to the end of the line."""
     found = re.findall(r"`(ambjax [^`\n]*)`|'(ambjax [^'\n]*)'|: (ambjax [^\n]+)$", text, re.M)
     return [next(filter(None, one)) for one in found]
 
@@ -80,7 +80,7 @@ def run(line):
 
 @pytest.fixture(scope="module")
 def printed(tmp_path_factory):
-    """Folder of an ensemble of the case in a file whose name has a space; what it printed; its columns and summary."""
+    """Folder, printed text, columns and summary of an ensemble of a case whose file name contains a space."""
     folder = tmp_path_factory.mktemp("printed")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -102,7 +102,7 @@ def printed(tmp_path_factory):
 
 
 def same_bits(metrics, columns, row):
-    """Every metric of metrics.json is that of this row, and there is a dozen of them."""
+    """Check that every metric of metrics.json, of which there are at least twelve, equals that of this row."""
     shared = [name for name in columns if name in metrics]
     assert len(shared) > 12
     for name in shared:
@@ -111,7 +111,7 @@ def same_bits(metrics, columns, row):
 
 
 def belongs(metrics, out, settle):
-    """The trajectory that was written is the one that was measured."""
+    """Check that the written trajectory is that of the metrics."""
     # sums of squares in another order: a unit in the last place for each sample
     with np.load(pathlib.Path(out, "trajectory.npz")) as rows:
         error, late = rows["z"] - rows["r"], rows["t"] >= settle
@@ -138,7 +138,7 @@ def test_the_printed_command_replays_the_worst_member(printed, monkeypatch, caps
     belongs(metrics, "alone", 0.02)
 
 
-def test_a_last_bit_grows_in_that_loop_and_no_cut_of_the_ensemble_moves_it(printed):
+def test_results_of_a_chaotic_loop_do_not_depend_on_the_division_of_the_ensemble(printed):
     _, _, columns, _ = printed
     study = study_of(CASE)
     few = np.arange(40, 60)
@@ -182,7 +182,7 @@ class _Nothing:
         path.touch()
 
 
-def test_the_deviation_is_the_largest_of_any_metric():
+def test_the_reported_deviation_is_the_largest_over_the_metrics():
     relative = replaying._relative
     assert [relative(*pair) for pair in ((1.0, 1.0), (2.0, 1.0), (-1.0, 1.0))] == [0.0, 0.5, 2.0]
     assert [relative(*pair) for pair in ((np.inf, np.inf), (np.inf, 1.0), (True, False))] == [0.0, 1.0, 1.0]
@@ -213,7 +213,7 @@ def test_members_of_other_loops_are_replayed_bit_by_bit(loop):
 
 
 @pytest.mark.slow
-def test_rows_and_other_folds_leave_every_bit_of_the_loop():
+def test_recorded_rows_and_other_folds_do_not_change_a_bit_of_the_loop():
     study = study_of(CASE)
     columns = chunk(study, 0, 64, 64)
     cascade, scenario = study.batch(np.arange(8))
@@ -224,7 +224,7 @@ def test_rows_and_other_folds_leave_every_bit_of_the_loop():
 
 
 @pytest.mark.slow
-def test_processes_and_chunks_leave_every_bit_of_such_a_loop(printed, monkeypatch):
+def test_processes_and_chunks_do_not_change_a_bit_of_a_chaotic_loop(printed, monkeypatch):
     folder, *_ = printed
     no_pictures(monkeypatch)
     write(CASE)
@@ -251,7 +251,7 @@ assert found.deviation <= found.rounding < 1e-3
 
 
 @pytest.mark.slow
-def test_check_on_a_processor_sees_the_run_of_simulate(monkeypatch, capsys):
+def test_check_on_a_processor_uses_the_run_of_simulate(monkeypatch, capsys):
     no_pictures(monkeypatch)
     write(CASE)
     main(["check", "case.toml", "--json"])
@@ -262,7 +262,7 @@ def test_check_on_a_processor_sees_the_run_of_simulate(monkeypatch, capsys):
     assert main(["simulate", "case.toml", "--out", "out"]) == 0
     with np.load("out/trajectory.npz") as rows:
         largest = np.abs(rows["sigma"][rows["t"] >= 0.02]).max()
-    (found,) = [band["seen"] for band in bands if band["signal"] == "sigma" and band["noise"]]
+    (found,) = [band["largest"] for band in bands if band["signal"] == "sigma" and band["noise"]]
     # the same state at every sample, from which sigma is computed in another program
     assert found == pytest.approx(largest, rel=1e-12)
 
@@ -283,7 +283,7 @@ held_out = 70
 
 
 @pytest.mark.slow
-def test_the_tuner_s_numbers_are_those_of_the_commands(monkeypatch, capsys):
+def test_the_numbers_of_the_tuner_equal_those_of_the_commands(monkeypatch, capsys):
     no_pictures(monkeypatch)
     write(CASE + TUNE)
     assert main(["tune", "case.toml", "--out", "tuned"]) in (0, 1)
@@ -320,19 +320,19 @@ frequency = 2.0
 
 
 def fails(capsys):
-    """The table of `ambjax check`: each gain, the number that its condition requires, and the verdict."""
+    """Check that the table of `ambjax check` is printed and contains a condition that fails."""
     answer = capsys.readouterr().out
     assert "condition " in answer
     assert "FAILS" in answer
 
 
 def searches(capsys):
-    """What `ambjax tune` promises: it starts to search from that case."""
+    """Check that `ambjax tune` starts a search from that case."""
     assert "tuning controller." in capsys.readouterr().err
 
 
 def shown(capsys):
-    """What a page of help or a case file promises: text on stdout."""
+    """Check that the command prints help or a case file on stdout."""
     assert len(capsys.readouterr().out) > 200
 
 
@@ -352,7 +352,7 @@ PRINTED = {
 @pytest.mark.parametrize(
     "what", [pytest.param(x, marks=pytest.mark.slow if x == "a rotor is lost" else ()) for x in PRINTED]
 )
-def test_commands_in_messages_do_what_they_promise(what, monkeypatch, capsys):
+def test_commands_in_messages_work(what, monkeypatch, capsys):
     no_pictures(monkeypatch)
     monkeypatch.setattr("tuning.command.rounds", _stopped)
     words, code, promises = PRINTED[what]
@@ -375,7 +375,7 @@ def _stopped(*_):
 
 
 def _code(call):
-    """An exit code, also of what raises it; a search that begins is as good as one that ends well."""
+    """Return the exit code of a command, also if it raises one; a search that starts counts as successful."""
     try:
         return call()
     except SystemExit as end:
@@ -385,8 +385,8 @@ def _code(call):
 
 
 @pytest.mark.parametrize("words", [["template"], ["template", "rig"], ["export"]])
-def test_commands_in_files_are_commands(words, capsys):
-    """Those that name no case lack it alone."""
+def test_commands_in_printed_texts_and_files_are_valid(words, capsys):
+    """The only part that some of them lack is the name of the case."""
     write(CASE)
     assert main(["export", "case.toml", "--out", "c"] if words == ["export"] else words) == 0
     text = pathlib.Path("c/README.md").read_text() if words == ["export"] else capsys.readouterr().out
@@ -400,7 +400,7 @@ def test_commands_in_files_are_commands(words, capsys):
         parse.parse_args(words)
 
 
-def test_a_case_in_which_nothing_differs_is_replayed_as_it_is(capsys, monkeypatch):
+def test_a_case_without_noise_and_spread_is_replayed_unchanged(capsys, monkeypatch):
     no_pictures(monkeypatch)
     case = case_from({"clock": {"duration": 0.05}}, "case")
     study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, 3)

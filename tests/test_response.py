@@ -43,7 +43,7 @@ def test_settling_is_when_the_band_is_entered_for_good():
     assert float(measured(Settling(1e-5), decay(0.0), 0.0)) == pytest.approx(100 * SAMPLES * PERIOD)
 
 
-def test_settling_points_to_gains_that_settle_sooner():
+def test_the_derivative_of_the_settling_time_points_to_faster_settling():
     def time(rate):
         return measured(Settling(1e-5), decay(rate), 0.0)
 
@@ -54,7 +54,7 @@ def test_settling_points_to_gains_that_settle_sooner():
     assert float(slope) < 0
 
 
-def test_overshoot_of_a_step_is_the_textbook_s():
+def test_the_overshoot_of_a_step_is_that_of_the_textbook():
     damping, rate = 0.3, 20.0
     fast = rate * math.sqrt(1 - damping**2)
     z = 1e-3 * (1 - np.exp(-damping * rate * T) * (np.cos(fast * T) + damping * rate / fast * np.sin(fast * T)))

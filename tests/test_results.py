@@ -50,7 +50,7 @@ def members(path):
     return ambjax.simulate_members(ambjax.read_case(path), 8, seed=3)
 
 
-def test_a_run_is_that_of_the_command(path, run, tmp_path, capsys):
+def test_a_run_equals_that_of_the_command(path, run, tmp_path, capsys):
     main(["simulate", str(path), "--json", "--out", str(tmp_path / "out")])
     printed = json.loads(capsys.readouterr().out)
     finite = {name: value for name, value in run.metrics.items() if np.isfinite(value)}
@@ -81,7 +81,7 @@ def test_every_saved_signal_has_the_unit_of_its_description():
 
 
 @pytest.mark.slow
-def test_members_are_those_of_the_command(path, members, tmp_path):
+def test_members_equal_those_of_the_command(path, members, tmp_path):
     main(["ensemble", str(path), "--members", "8", "--seed", "3", "--json", "--out", str(tmp_path / "out")])
     frame = members.to_pandas()
     with np.load(tmp_path / "out" / "members.npz") as saved:
@@ -114,14 +114,14 @@ def test_a_notebook_shows_the_metrics(run):
     assert f"<td>rms_u_V</td><td>{run.metrics['rms_u_V']:.6g}</td><td>V</td>" in page
 
 
-def test_the_sensitivity_is_that_of_the_linear_analysis(path):
+def test_the_sensitivity_equals_the_linear_analysis(path):
     case = ambjax.read_case(path)
     at = ambjax.sensitivity(case)
     system = linearise(case.cascade, case.scenario, case.clock)
     assert at.S.height == pytest.approx(abs(system.sensitivity(np.array([at.S.frequency]))[0]))
 
 
-def test_bad_input_is_named(path, run, monkeypatch):
+def test_bad_input_is_refused_by_name(path, run, monkeypatch):
     case = ambjax.read_case(path)
     wrong: Any = "case.toml"
     members: tuple[tuple[Any, int, str], ...] = (
@@ -177,7 +177,7 @@ def test_bad_input_is_named(path, run, monkeypatch):
 
 
 def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
-    """The search itself is that of the command, which tests/test_tuning_search.py runs."""
+    """The search itself is that of the command, which tests/test_tuning_search.py tests."""
     given = []
 
     def searched(args):
@@ -193,8 +193,8 @@ def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
     assert vars(given[0]) == parsed
 
 
-def test_messages_name_arguments_and_not_options(path, tmp_path):
-    """Each message is that of the command, in which an option stands for each argument."""
+def test_messages_name_python_arguments_instead_of_options(path, tmp_path):
+    """Each message is that of the command, with its options replaced by arguments."""
     case, folder = ambjax.read_case(path), tmp_path / "none"
     X, Y = "plant.m=0.5:0.6:2", "plant.R=1:2:2"
     for call, said in (
@@ -217,14 +217,14 @@ def test_messages_name_arguments_and_not_options(path, tmp_path):
         assert str(refused.value).startswith(said)
 
 
-def test_tune_names_bad_input(tmp_path):
+def test_tune_refuses_bad_input_by_name(tmp_path):
     with pytest.raises(ValueError, match=r"no\.toml"):
         tuning.tune(tmp_path / "no.toml")
 
 
 @pytest.mark.slow
-def test_the_vector_field_is_the_loop_of_simulate():
-    """SciPy's solution of the equations against our own adaptive steps: both to 1e-8 of the sizes of the states."""
+def test_the_vector_field_gives_the_solution_of_simulate():
+    """The solution by SciPy agrees with that by adaptive steps of ambjax to 1e-8 of the sizes of the states."""
     from scipy.integrate import solve_ivp
 
     case = case_from({"initial": {"z": 1e-4}, "clock": {"duration": 0.005, "method": "adaptive"}})
@@ -295,6 +295,6 @@ def test_a_notebook_shows_the_members(members):
     assert f"<td>{largest:.6g}</td><td>V</td>" in page
 
 
-def test_the_metrics_of_a_case_are_those_of_its_scenario(path):
+def test_the_metrics_of_a_case_follow_from_its_scenario(path):
     case = ambjax.read_case(path)
     assert ambjax.Standard.for_case(case) == standard_for(case.settle, case.scenario)

@@ -46,7 +46,7 @@ NOISY = dataclasses.replace(TRACKING, sensor=Sensor(1e-6, 1e-4, 1e-4))
 
 @record
 class Spans:
-    """A fold that keeps every span, [samples] each."""
+    """A fold that stores every span, [samples] each."""
 
     samples: int = static()
 
@@ -83,7 +83,7 @@ LIGHT = Clock(203, 5e-5, Euler(1))
 
 
 def light(scenario=None, clock=None, every=1):
-    """The cheap rollout."""
+    """A rollout with little computation."""
     return rollout(SMOOTH, scenario or NOISY, clock or LIGHT, fold=LIGHT_FOLDS, every=every)
 
 
@@ -95,7 +95,7 @@ def short():
 
 @pytest.fixture(scope="module")
 def lost():
-    """The printed gains: the same compiled rollout."""
+    """The printed gains, with the same compiled rollout."""
     return rollout(LITERAL, NOISY, SHORT, fold=FOLDS)
 
 
@@ -111,7 +111,7 @@ def same(a, b):
 
 
 def near(a, b, rtol, atol=0.0):
-    """Leaf by leaf, relative to the largest entry of each."""
+    """Check that all leaves agree, relative to the largest entry of each."""
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         x, y = np.asarray(x, float), np.asarray(y, float)
         finite = np.isfinite(y)
@@ -168,7 +168,7 @@ def test_no_rows_without_recording():
 
 
 def by_numpy(rows, spans, lost_at):
-    """Every fold of FOLDS from the recorded rows and spans."""
+    """Return every fold of FOLDS, computed from the recorded rows and spans."""
     t, on = np.asarray(rows.t), np.asarray(rows.alive)
     seen, time = jax.tree.map(np.asarray, spans), np.asarray(spans.time)
     u = seen.densities.u[on] / time[on]
@@ -256,7 +256,7 @@ def test_a_row_has_the_voltage_s_average_over_its_sample(short, lost):
         assert np.all(np.asarray(out.trajectory.rows.u_mean)[~on] == 0)
 
 
-def test_a_span_lasts_as_long_as_the_drive_is_on(short, lost):
+def test_a_span_ends_when_the_rotor_is_lost(short, lost):
     time = np.asarray(short.measured["spans"].time)
     np.testing.assert_allclose(time, 1e-4, rtol=1e-12)  # a sum of some ten steps
     lost_at = float(lost.trajectory.lost_at)
@@ -339,7 +339,7 @@ def test_a_rotor_that_starts_against_the_stop_is_lost_at_once():
     assert out.measured["standard"]["lost"]
 
 
-def test_a_state_out_of_the_model_s_range_is_reported_as_such():
+def test_a_state_outside_the_range_of_the_model_is_reported():
     out = rollout(REPAIRED, dataclasses.replace(NOISY, initial=Initial(i=1e5)), SHORT, fold=FOLDS)
     assert int(out.trajectory.lost_code) == DIVERGED
     assert out.trajectory.lost_at == 0
@@ -439,14 +439,14 @@ def test_a_record_refuses_a_number_outside_its_range(build, message):
 
 
 def test_a_record_holds_arrays_and_traced_values_without_checks():
-    """JAX's transformations rebuild records with whatever they compute: masks, signs, batches."""
+    """JAX's transformations rebuild records with arbitrary values, such as masks or batches."""
     masses = jnp.array([-1.0, 1.0])
     assert jax.vmap(lambda m: Plant(m=m).m)(masses).tolist() == [-1.0, 1.0]
     assert Plant(m=masses).m is masses
     assert jax.tree.map(lambda x: -x, Plant()).m == -Plant().m
 
 
-def test_the_help_of_a_law_is_that_of_its_declarations():
+def test_the_help_of_a_law_lists_its_declared_fields():
     lines = str(position.SlidingMode.__doc__).splitlines()
     assert "- `c`: decay rate on the sliding manifold (default 17; 1/s; above 1e-30 and at most 1e+30)" in lines
 
@@ -491,7 +491,7 @@ def test_float32_is_within_20_nm_of_float64(tracking, tmp_path):
 
 
 def end_of(c):
-    """A number at the end of the cheap rollout as a function of one gain."""
+    """Return a number at the end of the light rollout as a function of one gain."""
     cascade = dataclasses.replace(SMOOTH, position=position.SlidingMode(c=c))
     return rollout(cascade, NOISY, LIGHT, fold=LIGHT_FOLDS, every=0).measured["rms"]
 
@@ -519,7 +519,7 @@ def test_the_fast_path_changes_nothing(transform, at, monkeypatch):
     near(fast, result(), 1e-12)
 
 
-def test_only_an_outermost_call_is_marked(monkeypatch):
+def test_only_the_outermost_call_is_marked(monkeypatch):
     if fast_path.options() is None:
         pytest.skip("the fast path is not supported here")
     marked, mark = [], fast_path._mark

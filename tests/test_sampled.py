@@ -45,7 +45,7 @@ class Case:
 
 
 def hard(c=200.0, k=25.0, gamma=2e6, k_i=2000.0):
-    """Laws with the sign itself, with gains that hold the rotor at 10 kHz."""
+    """Laws with set-valued signs, and gains that hold the rotor at 10 kHz."""
     return {"position": smc(c, k, INF), "inversion": adaptive(gamma, INF), "current": current(k_i, INF)}
 
 
@@ -206,7 +206,7 @@ def how_slow(name):
     "case",
     [pytest.param(case, id=case.name, marks=how_slow(case.name)) for case in CASES],
 )
-def test_against_the_independent_simulator(case):
+def test_sampled_loops_agree_with_the_independent_simulator(case):
     cascade, scenario, clock = loop_of(case.world, case.samples, case.std)
     rows = amb.rollout(cascade, scenario, clock).trajectory.rows
     run = simulate(case.world, case.samples, noise_of(scenario, case.samples))
@@ -234,8 +234,8 @@ SHORT = amb.Clock(300, 1e-4)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.4, 1.0, 1.6])
-def test_the_voltage_of_a_sample_acts_late(delay):
-    """u as folded over time is u_n shifted by the delay, and 0 before the first."""
+def test_the_voltage_of_a_sample_acts_after_the_delay(delay):
+    """u averaged over time is u_n shifted by the delay, and 0 before the first command."""
     outcome = amb.rollout(cascade_of(delay=delay), NOISY, SHORT)
     u, mean = (np.asarray(getattr(outcome.trajectory.rows, name)) for name in ("u", "u_mean"))
     late = math.floor(delay)
@@ -252,7 +252,7 @@ def test_the_voltage_of_a_sample_acts_late(delay):
     [amb.inversion.Adaptive(8e5, INF), pytest.param(amb.inversion.ClosedForm(), marks=pytest.mark.thorough)],
     ids=lambda law: type(law).__name__,
 )
-def test_a_member_is_the_rollout_of_it_whatever_the_delays_of_others(inversion):
+def test_a_member_equals_its_rollout_for_any_delays_of_the_others(inversion):
     delays = np.array([0.0, 0.5, 2.0])
     scenario = dataclasses.replace(NOISY, member=np.arange(3))
     cascade = dataclasses.replace(cascade_of(delay=delays), inversion=inversion)
@@ -266,8 +266,11 @@ def test_a_member_is_the_rollout_of_it_whatever_the_delays_of_others(inversion):
         np.testing.assert_allclose(together[member], alone, rtol=1e-9)
 
 
-def test_a_part_of_an_ensemble_runs_the_program_of_the_whole():
-    """Whether its own delays are whole or none: else a last digit would depend on how an ensemble is cut."""
+def test_a_part_of_an_ensemble_uses_the_program_of_the_whole():
+    """This holds also if all delays of the part are whole numbers.
+
+    Otherwise results would depend on the division of an ensemble.
+    """
     spread = cascade_of(delay=0.0).on_processor(0.5, 2.0)
     for delay in (0.0, 1.0, np.array([0.0, 0.7])):
         part = dataclasses.replace(spread, processor=dataclasses.replace(spread.processor, delay=delay))
@@ -278,7 +281,7 @@ def test_a_part_of_an_ensemble_runs_the_program_of_the_whole():
 
 
 def test_a_delay_that_is_set_later_is_predicted():
-    """A map over the delay of a case without a delay."""
+    """An example is a map over the delay of a case without delay."""
     none = cascade_of(delay=0.0).on_processor()
     late = dataclasses.replace(none, processor=dataclasses.replace(none.processor, delay=1.0))
     fold = amb.simulation.folds.Rms("e_z")
@@ -312,7 +315,7 @@ def loss_of(clock, p, closed=False):
     ],
 )
 def test_gradients_three_ways_and_finite_over_six_decades_of_gains(p, closed):
-    """All cases share one program in reverse mode, because tracing a derivative takes longer than all the rest."""
+    """All cases share one program in reverse mode, because tracing takes most of the time."""
     loss, at, step = loss_of(amb.Clock(100, 1e-4, amb.RK4(2)), p, closed), np.array([0.1, -0.2, 0.05, 0.1]), 1e-5
     near = at + step * np.concatenate([0 * np.eye(4)[:1], np.eye(4), -np.eye(4)])
     points = np.concatenate([near, np.random.default_rng(4).uniform(-6.9, 6.9, (491, 4))])
@@ -341,7 +344,7 @@ def test_a_lost_rotor_is_frozen_with_its_drive_off():
     assert not np.asarray(rows.u)[after].any()
 
 
-def test_a_loop_that_leaves_the_numbers_is_a_loss_and_no_nan():
+def test_a_divergent_loop_is_a_loss_with_finite_values():
     scenario = dataclasses.replace(NOISY, initial=amb.Initial(1e-3), u_max=math.inf)
     wild = dataclasses.replace(cascade_of(), current=amb.current.ProportionalIntegral(1e30, 1e30, 1e30))
     trajectory = amb.rollout(wild, scenario, amb.Clock(20, 1e-4)).trajectory
@@ -350,7 +353,7 @@ def test_a_loop_that_leaves_the_numbers_is_a_loss_and_no_nan():
         assert np.isfinite(np.asarray(signal, float)).all(), name
 
 
-def test_a_gain_of_a_sign_without_a_layer_only_bounds():
+def test_a_large_gain_of_a_set_valued_sign_does_not_change_the_run():
     """An implicit step uses only the share of the gain that the error requires: 1e6 and 1e30 A/s give the same run."""
     scenario = dataclasses.replace(NOISY, u_max=math.inf)
     runs = [
@@ -361,7 +364,7 @@ def test_a_gain_of_a_sign_without_a_layer_only_bounds():
     np.testing.assert_allclose(*z, rtol=0, atol=1e-15)
 
 
-def test_a_law_that_gives_no_number_keeps_what_it_had():
+def test_a_law_whose_result_is_not_finite_keeps_its_state():
     system = system_of(cascade_of(), NOISY, SHORT).realised()
     start = system.start()
     lost = start._replace(plant=start.plant._replace(i=jnp.asarray(jnp.inf)))
@@ -373,7 +376,7 @@ def test_a_law_that_gives_no_number_keeps_what_it_had():
 
 @pytest.mark.parametrize("implicit", [True, False])
 def test_the_sampled_loop_converges_to_the_continuous_one(implicit):
-    """With order 1 in the period: no delay, no noise, mild signs."""
+    """The order in the period is 1, without delay and noise, and with smooth signs."""
     laws = {"inversion": amb.inversion.Adaptive(7.5e4, 0.5)}
     scenario = amb.Scenario(reference=amb.Sine(1e-3, 2.0), initial=amb.Initial(1e-5))
     exact = amb.rollout(amb.Cascade(**laws), scenario, amb.Clock(50, 1e-3, amb.AdaptiveRodas3(1e-9))).trajectory.rows.z
@@ -386,7 +389,7 @@ def test_the_sampled_loop_converges_to_the_continuous_one(implicit):
     assert ((orders > 0.8) & (orders < 1.3)).all(), (errors, orders)
 
 
-def test_the_sign_itself_is_refused_in_continuous_time():
+def test_a_set_valued_sign_is_refused_in_continuous_time():
     hard_sign = amb.Cascade(position=amb.position.SlidingMode(17.0, 25.0, INF))
     with pytest.raises(ValueError, match=r"controller.position.p = inf: in continuous time a sign must be smoothed"):
         amb.rollout(hard_sign, NOISY, SHORT)
@@ -395,7 +398,7 @@ def test_the_sign_itself_is_refused_in_continuous_time():
         run_ensemble(mixed, dataclasses.replace(NOISY, member=np.arange(2)), SHORT, fold=None)
 
 
-def test_a_traced_delay_is_refused_where_nothing_was_settled():
+def test_a_traced_delay_is_refused_if_its_program_is_not_chosen():
     def run(delay):
         return amb.rollout(cascade_of(delay=delay), NOISY, amb.Clock(3, 1e-4, amb.RK4(1))).trajectory.lost_at
 

@@ -24,15 +24,18 @@ KINDS = {
     stage: {kind: law for kind, law in kinds.items() if "force" in getattr(law, "accepts", ("force",))}
     for stage, kinds in EVERY.items()
 }
-USUAL = {"observer": "direct", "position": "sliding-mode", "inversion": "adaptive", "current": "sliding-mode"}
-LAWS = [USUAL, *(USUAL | {stage: kind} for stage, kinds in KINDS.items() for kind in kinds if USUAL[stage] != kind)]
+DEFAULT_LAWS = {"observer": "direct", "position": "sliding-mode", "inversion": "adaptive", "current": "sliding-mode"}
+LAWS = [
+    DEFAULT_LAWS,
+    *(DEFAULT_LAWS | {stage: kind} for stage, kinds in KINDS.items() for kind in kinds if DEFAULT_LAWS[stage] != kind),
+]
 # Few loops with every law of every stage: the other laws of the stages, each stage's in turn, until all have been.
-OTHERS = {stage: [kind for kind in kinds if kind != USUAL[stage]] for stage, kinds in KINDS.items()}
+OTHERS = {stage: [kind for kind in kinds if kind != DEFAULT_LAWS[stage]] for stage, kinds in KINDS.items()}
 MIXED = [{s: kinds[n % len(kinds)] for s, kinds in OTHERS.items()} for n in range(max(map(len, OTHERS.values())))]
 CASES = [
     pytest.param(laws, smooth, id=f"{'-'.join(laws.values())}-{'smoothed' if smooth else 'signs'}", marks=marks)
     for marks, cases in (
-        (pytest.mark.slow, [(USUAL, True), *((laws, n % 2 == 1) for n, laws in enumerate(MIXED))]),
+        (pytest.mark.slow, [(DEFAULT_LAWS, True), *((laws, n % 2 == 1) for n, laws in enumerate(MIXED))]),
         (pytest.mark.thorough, [(laws, smooth) for laws in LAWS for smooth in (True, False)][1:]),
     )
     for laws, smooth in cases
@@ -40,7 +43,7 @@ CASES = [
 
 
 def cascade_of(laws, smooth):
-    """With one sample of delay, predicted; its signs smoothed, or not."""
+    """Return the cascade with one sample of delay and prediction, with smoothed or set-valued signs."""
     made = {stage: default_law(KINDS[stage][kind], amb.Plant()) for stage, kind in laws.items()}
     if not smooth:
         for stage, law in made.items():
@@ -71,7 +74,7 @@ def test_values_and_derivatives_are_finite_over_six_decades_of_every_gain(laws, 
         assert np.isfinite(values).all()
         assert np.isfinite(slopes).all()
         return
-    mode = jax.jacrev if laws is USUAL and smooth else jax.jacfwd  # the other, and the tuner's
+    mode = jax.jacrev if laws is DEFAULT_LAWS and smooth else jax.jacfwd  # the other, and the tuner's
     slopes, values = jax.jit(jax.vmap(mode(loss, has_aux=True)))(points)
     assert np.isfinite(values).all()
     assert np.isfinite(slopes).all()

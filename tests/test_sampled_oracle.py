@@ -47,14 +47,14 @@ def test_relax_solves_its_equation(infinite):
             assert abs(y + h * sgn(y, p) - w) <= 4 * np.finfo(float).eps * (abs(w) + h + slope * abs(y))
 
 
-def test_relax_tends_to_the_clip_and_to_nothing():
+def test_relax_converges_to_clipping_and_is_the_identity_for_a_zero_gain():
     assert relax(0.3, 0.1, 1e12) == pytest.approx(relax(0.3, 0.1, math.inf), rel=1e-10)
     assert relax(0.3, 0.0, 25.0) == 0.3
 
 
 @pytest.mark.parametrize("name", ["lumped", "two-coil"])
-def test_a_rotor_at_rest_stays(name):
-    """Scaled force against weight and spring, u = R i: no rate, at any height."""
+def test_a_rotor_at_rest_stays_at_rest(name):
+    """The scaled force balances weight and spring, and u = R i, so all rates are 0 at every height."""
     plant = (TwoCoil if name == "two-coil" else Lumped)(World())
     body = plant.body
     for z in (0.0, 1e-3, -3e-3):
@@ -66,7 +66,10 @@ def test_a_rotor_at_rest_stays(name):
 
 
 def test_two_coils_conserve_energy_and_flux():
-    """Energy: kinetic, spring, weight, kappa/4 (i_1^2/(s_0 - z) + i_2^2/(s_0 + z)); power in: voltages less copper."""
+    """The energy is kinetic, of the spring, of the weight, and kappa/4 (i_1^2/(s_0 - z) + i_2^2/(s_0 + z)).
+
+    The power is that of the voltages minus the copper loss.
+    """
     plant = TwoCoil(World())
     body, rng = plant.body, np.random.default_rng(2)
     for z, z_dot, i_1, i_2, u in rng.uniform(-1, 1, (50, 5)) * [4e-3, 1.0, 1.0, 1.0, 200.0]:
@@ -88,8 +91,11 @@ def test_two_coils_conserve_energy_and_flux():
             assert flux_dot == pytest.approx(voltage - body.R * current, rel=1e-11, abs=1e-9)
 
 
-def test_where_two_coils_depart_from_the_lumped_plant():
-    """i_1 = i_0 + i, i_2 = i_0 - i: the same force; in di/dt the gap s_0 for s_0 + z, and other motion terms."""
+def test_the_difference_between_two_coils_and_the_lumped_plant_has_its_closed_form():
+    """With i_1 = i_0 + i and i_2 = i_0 - i, the force is equal.
+
+    In di/dt, the gap is s_0 in place of s_0 + z, and the motional terms differ.
+    """
     two, one = TwoCoil(World()), Lumped(World())
     body, rng = two.body, np.random.default_rng(3)
     for z, z_dot, i, u in rng.uniform(-1, 1, (50, 4)) * [4e-3, 1.0, 0.2, 200.0]:
@@ -105,8 +111,8 @@ def test_where_two_coils_depart_from_the_lumped_plant():
     assert pushed == pytest.approx([0.0, 0.3, 0.7, -0.7], abs=1e-12)
 
 
-def test_two_coils_held_still_are_the_lumped_plant():
-    """At z = 0 with 1e15 kg nothing moves, and i follows the same exponential."""
+def test_two_coils_with_a_fixed_rotor_equal_the_lumped_plant():
+    """At z = 0 with a mass of 1e15 kg the rotor does not move, and i follows the same exponential."""
     heavy = {"m": 1e15, "g": 0.0, "k_z": 0.0}
     options = {"plant": heavy, "initial": (0.0, 0.0, 0.1), "u_max": 200.0}
     one, two = (simulate(World(kind=kind, **options), 300) for kind in ("lumped", "two-coil"))
@@ -115,8 +121,8 @@ def test_two_coils_held_still_are_the_lumped_plant():
 
 @pytest.mark.parametrize("fast", [False, True])
 @pytest.mark.parametrize("delay", [0.0, 0.5, 1.0, 1.5, 2.0])
-def test_the_voltage_switches_when_it_should(delay, fast):
-    """A coil alone under u_n = k_p (i_ref - i_n): between switchings i decays to u/R with rate 2 s_0 R / kappa."""
+def test_the_voltage_switches_after_the_delay(delay, fast):
+    """A single coil under u_n = k_p (i_ref - i_n). Between switchings i decays to u/R with the rate 2 s_0 R / kappa."""
     k_p, i_ref, T = 1e5, 0.01, 1e-4
     world = World(
         plant={"m": 1e12, "g": 0.0, "k_z": 0.0}, delay=delay, predict=False, period=T,
@@ -158,8 +164,11 @@ def field_of(world, u):
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.3, 0.5, 1.0, 1.5, 2.0])
-def test_the_plant_between_samples_and_its_prediction(delay):
-    """Integrated apart, cut at switchings and pulse edges; `seen` is that solution delay T later."""
+def test_the_prediction_agrees_with_the_plant_between_samples(delay):
+    """The motion is integrated separately, and divided at switchings and edges of pulses.
+
+    `seen` is this solution after the delay.
+    """
     world = World(
         delay=delay, reference=SINE, u_max=150.0,
         q_z=("pulse", {"amplitude": 0.1, "start": 1e-2 + 1.3e-5, "stop": 2e-2 + 7.7e-5}),
@@ -194,7 +203,7 @@ def test_the_plant_between_samples_and_its_prediction(delay):
 
 @pytest.mark.parametrize("delay", [1, 2])
 def test_prediction_is_of_fifth_order(delay):
-    """Before the first voltage acts the plant is on its own; the error of one RK4 step falls as T^5."""
+    """Before the first voltage acts, the error of one RK4 step of the plant decreases as T^5."""
     errors = []
     for T in (5e-5, 2.5e-5):
         run = simulate(World(period=T, delay=float(delay), initial=(1e-3, 0.05, 0.1)), delay + 1)
@@ -228,7 +237,7 @@ QUICK = {name for name, _ in FAST}
 
 
 def how_slow(name, discretisation):
-    """The mark of a case: each configuration is slow or fast in one of its discretisations at least."""
+    """Return the mark of a case. Each configuration is slow or fast in at least one of its discretisations."""
     if (name, discretisation) in FAST:
         return ()
     first = CONFIGURATIONS[name].get("discretisation", "implicit")
@@ -244,8 +253,8 @@ ORDERS = [
 
 
 @pytest.mark.parametrize(("name", "discretisation"), ORDERS)
-def test_order_one_towards_continuous_time(name, discretisation):
-    """So explicit and implicit laws meet as T -> 0, and so do delayed and prompt ones."""
+def test_the_sampled_loop_converges_to_continuous_time_with_order_one(name, discretisation):
+    """Explicit and implicit laws, with and without delay, have the same limit as T -> 0."""
     options = SMOOTH | CONFIGURATIONS[name] | {"discretisation": discretisation}
     names = set(oracle.World.__dataclass_fields__) & set(options)
     start = {}
@@ -262,7 +271,7 @@ def test_order_one_towards_continuous_time(name, discretisation):
     assert 1.7 < errors[0] / errors[1] < 2.3
 
 
-def test_true_signs_are_the_limit_of_steep_ones():
+def test_set_valued_signs_are_the_limit_of_steep_signs():
     laws = [
         {
             "position": ("sliding-mode", {"c": 17.0, "k": 25.0, "p": p}),
@@ -275,8 +284,11 @@ def test_true_signs_are_the_limit_of_steep_ones():
     assert np.abs(steep.z - true.z).max() < 1e-10  # of 1 mm
 
 
-def test_proper_super_twisting_keeps_its_band():
-    """x+ = x + T (u + w), |w+ - w| <= L T: |x| <= L T^2 in the end; undisturbed, x is exactly 0 after finitely many."""
+def test_implicit_super_twisting_stays_in_its_band():
+    """For x+ = x + T (u + w) with |w+ - w| <= L T, |x| ends at or below L T^2.
+
+    Without disturbance, x is exactly 0 after finitely many samples.
+    """
     T, k_1, k_2, L = 1e-3, 12.0, 40.0, 30.0
     rng = np.random.default_rng(4)
     for bound in (L, 0.0):
@@ -290,7 +302,7 @@ def test_proper_super_twisting_keeps_its_band():
         assert max(late) <= bound * T * T + 1e-15
 
 
-def test_a_converter_rounds_and_ends():
+def test_a_converter_rounds_and_saturates():
     lsb = 5e-3 / 2**11
     counts = np.array([0.4, 0.6, -0.6, 1.5, 2.5, 2047.4, 2047.6, 1e9, -2048.4, -1e9])
     codes = [conversion(x * lsb, 12, 5e-3) / lsb for x in counts]
@@ -301,7 +313,7 @@ def test_a_converter_rounds_and_ends():
     assert np.array_equal(run.seen[:, 1], run.z_dot)
 
 
-def test_errors_are_added_and_the_observer_steps():
+def test_sensor_errors_are_added_and_the_observer_is_stepped():
     noise = np.random.default_rng(5).normal(size=(200, 3)) * [1e-6, 1e-4, 1e-4]
     run = simulate(
         World(observer=("complementary", {"l": 300.0}), predict=False, reference=SINE), 200, noise, fast=True
@@ -315,7 +327,10 @@ def test_errors_are_added_and_the_observer_steps():
 
 @pytest.mark.parametrize(("delay", "predict"), [(0.0, True), (0.5, True), (1.5, True), (1.5, False)])
 def test_the_reference_is_that_of_the_instant_at_which_the_voltage_acts(delay, predict):
-    """With c = k = 0 the law demands spring, weight and r_ddot; without prediction, those at the sample itself."""
+    """With c = k = 0 the law demands the force of spring and weight, and r_ddot.
+
+    Without prediction, they are those at the sample.
+    """
     world = World(
         delay=delay, predict=predict, reference=SINE, position=("sliding-mode", {"c": 0.0, "k": 0.0, "p": 25.0})
     )
@@ -328,8 +343,8 @@ def test_the_reference_is_that_of_the_instant_at_which_the_voltage_acts(delay, p
 
 @pytest.mark.parametrize("fast", [False, True])
 @pytest.mark.parametrize("T", [1e-4, 3.3e-3])
-def test_touch_down_between_samples(T, fast):
-    """Free fall from z = 0 to -0.9 s_0, magnets without a field, coils without a voltage: sqrt(2 0.9 s_0 / g)."""
+def test_a_touchdown_between_samples_ends_the_run(T, fast):
+    """Free fall from z = 0 to -0.9 s_0 without magnetic field and voltage takes sqrt(2 0.9 s_0 / g)."""
     world = World(
         plant={"A": 1e-15, "R": 0.0, "k_z": 0.0}, period=T, predict=False,
         position=("sliding-mode", {"c": 0.0, "k": 0.0, "p": 1.0}),
@@ -341,8 +356,8 @@ def test_touch_down_between_samples(T, fast):
 
 
 @pytest.mark.parametrize("kind", ["lumped", "two-coil"])
-def test_fixed_steps_are_as_good(kind):
-    """RK4 with steps of at most 25 us: its error here, the tolerance of what it may be used for."""
+def test_fixed_steps_agree_with_the_accurate_solution(kind):
+    """The error of RK4 with steps of at most 25 us is below the tolerances of the tests that use these steps."""
     world = World(
         kind=kind, reference=SINE, delay=1.5, u_max=200.0,
         q_v=("pulse", {"amplitude": 1.0, "start": 0.01003, "stop": 0.02}),
@@ -363,7 +378,10 @@ def repaired(rate, **options):
 
 @pytest.mark.slow
 def test_known_errors_of_the_repaired_gains(monkeypatch):
-    """As another simulator found them, to its two digits; the position law explicit, the others implicit."""
+    """The errors are those of another simulator, to its two digits.
+
+    The position law is explicit, the others are implicit.
+    """
     explicit = {"discretisation": "explicit", "delay": 0.0}
     assert repaired(10_000, **explicit) == pytest.approx(8.4e-5, abs=0.05e-5)
     if THOROUGH:
@@ -387,7 +405,7 @@ def test_known_errors_of_the_repaired_gains(monkeypatch):
 
 @pytest.mark.parametrize("delay", [0.0, 1.0])
 def test_gains_tuned_in_continuous_time_lose_the_rotor_when_stepped_explicitly(delay):
-    """Task A's: lost at about 13 ms; stepped implicitly they hold."""
+    """The gains of task A lose the rotor at about 13 ms. With implicit steps they hold it."""
     gains = {
         "position": ("sliding-mode", {"c": 140.5, "k": 1158.0, "p": 25.0}),
         "inversion": ("adaptive", {"gamma": 1.869e7, "p": 25.0}),

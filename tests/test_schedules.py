@@ -67,7 +67,7 @@ def table(*values, over="error"):
 
 
 @pytest.mark.parametrize("over", OVER)
-def test_values_are_those_of_numpy_interp(over):
+def test_values_agree_with_numpy_interp(over):
     one, x = Schedule(VALUES, at=AT, over=over), np.linspace(-6e-5, 6e-5, 97)
     zero = np.zeros_like(x)
     z, r, r_dot = {"error": (x, zero, zero), "reference": (zero, x, zero), "reference-speed": (zero, zero, x)}[over]
@@ -110,8 +110,8 @@ ERRORS = jnp.array([4e-6, -1.2e-5, 2e-5])
 
 
 @pytest.mark.parametrize("more", ["", SAMPLED], ids=["continuous", "processor"])
-def test_a_constant_schedule_is_the_plain_gain(more):
-    """One scheduled gain per stage, so that every stage evaluates its schedules."""
+def test_a_constant_schedule_equals_the_plain_gain(more):
+    """Each stage has one scheduled gain."""
     plain, same = loop(more), loop(more, **{name: table(x, x) for name, x in GAINS.items()})
     moved = loop(more, **{name: table(x, 3 * x) for name, x in GAINS.items()})
     plain, same, moved = (
@@ -125,7 +125,7 @@ def test_a_constant_schedule_is_the_plain_gain(more):
     assert all(np.all(x != y) for x, y in zip(a[:1] + a[3:], b[:1] + b[3:], strict=True))
 
 
-def test_a_law_without_a_schedule_is_itself():
+def test_a_law_without_a_schedule_is_unchanged():
     law = loop().cascade.position
     assert with_gains_at(law, 0.0, Reference(*[jnp.zeros(())] * 3)) is law
     assert extremes(law) == (law,)
@@ -247,7 +247,7 @@ def test_knots_are_searched_in_the_range_of_their_gain():
 
 
 @pytest.mark.parametrize("spelled", ["inline", "table"])
-def test_a_tuned_file_reads_back(spelled):
+def test_a_tuned_file_gives_the_tuned_schedule(spelled):
     text = LOOP.format(more=SAMPLED, **SCHEDULED)
     if spelled == "table":
         text = text.replace(f"k = {SCHEDULED['k']}", "") + (
@@ -263,7 +263,7 @@ def test_a_tuned_file_reads_back(spelled):
     assert ("# first" if spelled == "table" else "# 1/s") in written
 
 
-def test_the_theorem_takes_the_smallest_value_and_a_constant_sigma():
+def test_the_theorem_uses_the_smallest_value_and_requires_a_constant_sigma():
     cascade = loop(k=table(25.0, 10.0, 60.0)).cascade
     assert {one.path: one.value for one in required(cascade)}["controller.position.k"] == 10.0
     assert constant_sigma(cascade.position) == []
@@ -275,8 +275,8 @@ def test_the_theorem_takes_the_smallest_value_and_a_constant_sigma():
 
 
 @pytest.mark.slow
-def test_the_linear_loop_at_rest_has_the_first_value():
-    """The linear loop at z = r depends on the values at the error 0 only: the derivative of |z - r| is 0 there."""
+def test_the_linear_loop_at_rest_uses_the_first_value():
+    """At z = r the derivative of |z - r| is 0, so the linear loop depends on the values at the error 0 only."""
     first = {name: x if name == "l" else table(x, 10 * x) for name, x in GAINS.items()}
     found = []
     for one in (loop(SAMPLED), loop(SAMPLED, **first)):
@@ -290,7 +290,7 @@ def test_the_linear_loop_at_rest_has_the_first_value():
 
 
 @pytest.mark.slow
-def test_the_exported_schedules_are_those_of_jax(tmp_path, capsys):
+def test_the_exported_schedules_agree_with_jax(tmp_path, capsys):
     path = tmp_path / "case.toml"
     path.write_text(LOOP.format(more=SAMPLED, **SCHEDULED))
     assert main(["export", str(path), "--out", str(tmp_path / "out"), "--verify", "--json"]) == 0

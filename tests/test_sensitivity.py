@@ -37,7 +37,7 @@ def answered(tmp_path, capsys, text, *flags):
     return code, *capsys.readouterr(), path
 
 
-def test_the_summary_is_that_of_the_analysis(tmp_path, capsys):
+def test_the_summary_agrees_with_the_analysis(tmp_path, capsys):
     code, out, _, path = answered(tmp_path, capsys, CASE, "--json")
     summary = json.loads(out)
     assert code == 0
@@ -56,8 +56,8 @@ def test_the_summary_is_that_of_the_analysis(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_member_without_an_equilibrium_is_the_worst(tmp_path, capsys):
-    """A rotor of 1.5 kg needs 6 m/s^2 more than the model's, and k gives 5: exit code 1."""
+def test_a_member_without_an_equilibrium_is_reported_as_the_worst(tmp_path, capsys):
+    """A rotor of 1.5 kg needs 6 m/s^2 more than the model, and k gives 5 m/s^2. The exit code is 1."""
     code, out, _, _ = answered(tmp_path, capsys, SPREAD, "--members", "8", "--seed", "1")
     assert code == 1
     counted = next(line for line in out.splitlines() if line.startswith("Of 8 members"))
@@ -145,8 +145,11 @@ f_low = 20.0
 
 
 @pytest.mark.slow
-def test_the_injected_peak_stands_beside_the_linear_one(tmp_path, capsys):
-    """A smooth loop without noise: one member, whose interval is the value; 1 % of the gap is small for it."""
+def test_the_injected_and_the_linear_peak_are_both_reported(tmp_path, capsys):
+    """A smooth loop without noise has one measured member, and its interval is one value.
+
+    1 % of the gap is a small amplitude for it.
+    """
     code, out, _, _ = answered(tmp_path, capsys, PROCESSOR, "--json")
     summary = json.loads(out)
     assert code == 0
@@ -165,7 +168,7 @@ def test_the_injected_peak_stands_beside_the_linear_one(tmp_path, capsys):
 
 
 def test_the_measured_members_are_counted_by_zone():
-    """A peak at the limit of zone A is not in it; a lost rotor is the worst member and has no peak."""
+    """A peak at the limit of zone A is in zone B. A lost rotor is the worst member and has no peak."""
     held = MemberPeaks(np.array([2.9, 3.0, 2.5]), np.full(3, 40.0), np.zeros(3, bool))
     assert _measured_numbers(held, Zones()) == {
         "injected_zone_a": 2,
@@ -183,7 +186,7 @@ def test_the_measured_members_are_counted_by_zone():
 
 
 def test_the_picture_shows_the_injected_points(tmp_path):
-    """A phase that is whole turns away from the curve's is drawn beside the curve."""
+    """A phase that differs by whole turns from that of the curve is drawn on the curve."""
     path = tmp_path / "case.toml"
     path.write_text(CASE)
     case = read_case(path)
@@ -208,7 +211,7 @@ def test_the_picture_shows_the_injected_points(tmp_path):
 
 
 def test_check_gives_the_zone_of_the_clearance(tmp_path, capsys):
-    """The reference moves the rotor by 1 mm of the 4.5 mm, 22 %: above clearance_b, below clearance_c."""
+    """The reference moves the rotor by 1 mm of 4.5 mm, which is 22 %: above clearance_b, below clearance_c."""
     path = tmp_path / "case.toml"
     limits = "clearance_a = 0.1\nclearance_b = 0.2\n"
     path.write_text(f"{CASE}{limits}[clock]\nduration = 0.4\n[run]\nsettle = 0.3\n")

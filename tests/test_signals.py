@@ -84,7 +84,7 @@ def test_derivatives_equal_central_differences(signal):
 
 
 @ALL
-def test_signals_are_pytrees_of_their_numbers_and_jit_vmap_grad_work(signal):
+def test_signals_are_pytrees_of_numbers_and_work_under_jit_vmap_and_grad(signal):
     leaves, tree = jax.tree.flatten(signal)
     assert jax.tree.unflatten(tree, leaves) == signal
     assert all(isinstance(x, float) for x in leaves)
@@ -97,7 +97,7 @@ def test_signals_are_pytrees_of_their_numbers_and_jit_vmap_grad_work(signal):
 
 
 @ALL
-def test_linear_in_the_amplitude(signal):
+def test_signals_are_linear_in_the_amplitude(signal):
     if not hasattr(signal, "amplitude"):
         return  # Constant has a value and Sum has terms: nothing to scale
     scaled = dataclasses.replace(signal, amplitude=3 * signal.amplitude)
@@ -139,7 +139,7 @@ def test_sum_is_linear_and_nests():
     np.testing.assert_array_equal(Sum(())(T), 0 * T)
 
 
-def test_chirp_sweeps_from_one_frequency_to_the_other_and_stays():
+def test_a_chirp_sweeps_between_two_frequencies_and_then_keeps_the_second():
     # frequency = phase rate / 2 pi, read off r and r_dot: for a sine of phase p, r_dot = p_dot cos p
     t = np.linspace(0.001, 0.9, 500)
     r, r_dot, *_ = jax.vmap(lambda t: reference_at(CHIRP, t))(t)
@@ -187,7 +187,7 @@ def test_band_noise_is_nearly_gaussian():
     assert abs(np.mean(x**3)) < 5 * (6 / 20_000) ** 0.5
 
 
-def test_band_noise_spreads_its_power_evenly_and_keeps_to_its_band():
+def test_band_noise_has_a_flat_spectrum_inside_its_band_only():
     # periodograms of 60 members over 4 s: 1/4 Hz apart, lines 1.25 Hz apart
     t = np.arange(4096) / 1024
     x = np.asarray(jax.vmap(lambda s: s(t))(members(60)))
@@ -204,7 +204,7 @@ def test_band_noise_spreads_its_power_evenly_and_keeps_to_its_band():
         np.testing.assert_allclose(np.sum(power[(f >= low) & (f < high)]), NOISE.std**2 / 8, rtol=0.1)
 
 
-def test_band_noise_is_drawn_by_seed_member_and_place():
+def test_band_noise_depends_on_seed_member_and_path():
     batch = members(4)
     for m in range(4):
         alone = Scenario(q_z=NOISE, member=m).realised().q_z
@@ -233,7 +233,7 @@ def test_band_noise_has_its_derivatives():
     assert jax.grad(lambda std: Scenario(q_z=BandNoise(std, 1.0, 2.0)).realised().q_z(0.3))(0.5) != 0
 
 
-def test_band_noise_is_no_function_of_time_before_it_is_drawn():
+def test_band_noise_that_is_not_drawn_cannot_be_evaluated():
     with pytest.raises(ValueError, match="realised"):
         NOISE(0.0)
 
@@ -241,7 +241,7 @@ def test_band_noise_is_no_function_of_time_before_it_is_drawn():
 SMOOTH = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
 
 
-def test_a_rollout_meets_its_own_member_s_noise():
+def test_a_rollout_uses_the_band_noise_of_its_member():
     scenario = Scenario(q_z=BandNoise(0.05, 20.0, 60.0), q_i=BandNoise(0.5, 5.0, 9.0), seed=4, member=2)
     rows = rollout(SMOOTH, scenario, Clock(50, 1e-4, RK4(2))).trajectory.rows
     drawn = scenario.realised()

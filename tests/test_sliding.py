@@ -63,7 +63,7 @@ def test_the_exponential_step_and_its_derivative():
     assert float(slope[0]) == pytest.approx(1 / 300.0**2, rel=1e-12)  # exp(-300) is nothing beside it
 
 
-def test_a_slide_reaches_its_end_and_no_further():
+def test_a_slide_ends_at_its_target():
     first, second, tau, path = relaxation(jnp.asarray(2.0), jnp.asarray(0.0), 1e6, 25.0, 1e-4)
     assert float(tau) == pytest.approx(2e-6, rel=0.02)
     # what is left of w after the step: it moved by exactly what there was
@@ -132,7 +132,7 @@ def test_values_and_derivatives_are_finite_over_six_decades_of_gains():
 
 
 @pytest.mark.slow
-def test_derivatives_are_slopes_and_not_those_of_cliffs():
+def test_derivatives_agree_with_differences_under_noise():
     """Forward derivatives of each member's log rms error agree with differences over 1e-4 in the log of each gain."""
     scenario = dataclasses.replace(TRACKING, sensor=Sensor(1e-6, 1e-4, 1e-4))
     named = jnp.log(jnp.asarray([134.5, 1171.0, 1.39e7, 103.9]))

@@ -23,7 +23,7 @@ P = [0.1, 25.0, 1e4]
 
 
 @pytest.mark.parametrize("p", P)
-def test_smooth_sign_is_odd_and_tends_to_the_sign_like_two_over_pi_p_x(p):
+def test_smooth_sign_is_odd_and_converges_to_the_sign_as_two_over_pi_p_x(p):
     x = np.array([1e3, 1e6, 1e9]) / p
     # 1 - S = 2/(pi p x) + O((p x)^-3): a relative 1e-6 at p x = 1e3; the rest is the cancellation in 1 - S
     np.testing.assert_allclose(1 - smooth_sign(x, p), TWO_OVER_PI / (p * x), rtol=1e-6, atol=2 * EPS)
@@ -32,7 +32,7 @@ def test_smooth_sign_is_odd_and_tends_to_the_sign_like_two_over_pi_p_x(p):
 
 
 @pytest.mark.parametrize("p", P)
-def test_smooth_root_is_odd_and_tends_to_the_root(p):
+def test_smooth_root_is_odd_and_converges_to_the_root(p):
     x = np.array([1e3, 1e6, 1e9]) / p
     # relative distance 1/(4 (p x)^2) <= 2.5e-7
     np.testing.assert_allclose(smooth_root(x, p), np.sqrt(x), rtol=3e-7)
@@ -62,7 +62,7 @@ def test_values_and_both_derivatives_are_finite_everywhere(x):
         assert np.all(np.isfinite([f(x), *derivatives]))
 
 
-def test_safe_sqrt_is_the_root_above_zero_and_flat_below():
+def test_safe_sqrt_is_the_root_above_zero_and_constant_below():
     x = np.logspace(-300, 300, 13)
     np.testing.assert_array_equal(safe_sqrt(x), np.sqrt(x))
     np.testing.assert_allclose(jax.vmap(jax.grad(safe_sqrt))(x), 0.5 / np.sqrt(x), rtol=2 * EPS)
@@ -71,7 +71,7 @@ def test_safe_sqrt_is_the_root_above_zero_and_flat_below():
     np.testing.assert_array_equal(jax.vmap(jax.grad(safe_sqrt))(below), 0.0)
 
 
-def test_away_from_zero_keeps_sign_and_leaves_the_rest_alone():
+def test_away_from_zero_keeps_the_sign_and_does_not_change_larger_values():
     x = np.array([-2.0, -0.5, -1e-9, 0.0, 1e-9, 0.5, 2.0])
     np.testing.assert_array_equal(away_from_zero(x, 0.5), [-2.0, -0.5, -0.5, 0.5, 0.5, 0.5, 2.0])
     np.testing.assert_array_equal(jax.vmap(jax.grad(away_from_zero), (0, None))(x, 0.5), [1, 1, 0, 0, 0, 1, 1])
@@ -85,7 +85,7 @@ DTYPES = [np.float64, np.float32]
 
 
 def wide(function):
-    """As an ensemble compiles it: one kernel, 61 lanes at a time, so that vectors have a rest."""
+    """Compile a function as in an ensemble: one kernel with 61 lanes, so that the last vector is not full."""
     kernel = one_kernel(lambda *blocks: jax.lax.map(lambda x: jax.vmap(function)(*x), blocks))
 
     def run(*args):
@@ -103,7 +103,7 @@ def exact_turns(x):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_arctan_per_is_numpys_arctan_over_per(dtype):
+def test_arctan_per_agrees_with_numpy(dtype):
     x = np.concatenate([-RATIOS, RATIOS, [0.0]]).astype(dtype)
     per = np.linspace(0.5, 7, x.size).astype(dtype)
     expected = np.arctan(x.astype(np.longdouble)) / per.astype(np.longdouble)
@@ -113,7 +113,7 @@ def test_arctan_per_is_numpys_arctan_over_per(dtype):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_refined_is_one_over_x_to_the_last_bit_but_one(dtype):
-    """Over its whole range, and beside 1, where rounding of either operand shows most."""
+    """Over the whole range, and near 1, where rounding of either operand has the largest effect."""
     eps = np.finfo(dtype).eps
     near = 1 + np.linspace(-50, 50, 101) * eps
     x = np.concatenate([np.geomspace(1e-37, 1e37, 9973), near]).astype(dtype)
@@ -124,7 +124,7 @@ def test_refined_is_one_over_x_to_the_last_bit_but_one(dtype):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_sine_and_cosine_of_turns_are_numpys(dtype):
+def test_sine_and_cosine_of_turns_agree_with_numpy(dtype):
     x = TURNS.astype(dtype)
     sin, cos = exact_turns(x)
     # relative where the sine is small, too: the reduced angle is exact; its polynomial rounds a few times.

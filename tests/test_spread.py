@@ -64,7 +64,7 @@ def drawn(design, members, total=1000, seed=3):
 
 
 @pytest.mark.parametrize("name", CONTINUOUS)
-def test_quantiles_are_scipy_s(name):
+def test_quantiles_agree_with_scipy(name):
     kind, nominal, theirs = CONTINUOUS[name]
     u = np.concatenate([np.linspace(0.001, 0.999, 99), [1e-7, 1 - 1e-7]])
     # five sizes of the spread's width times 1e-12: a few roundings, and near 1 those of u itself
@@ -93,7 +93,7 @@ def test_choices_are_equally_likely():
 
 
 @pytest.mark.parametrize("design", DESIGNS)
-def test_member_k_is_the_same_whatever_the_chunks(design):
+def test_member_k_is_the_same_for_all_chunks(design):
     whole = drawn(design, np.arange(1000))
     for size in (1, 7, 64, 999):
         picked = range(0, 1000, 100) if size == 1 else range(0, 1000, size)
@@ -107,14 +107,14 @@ def test_member_k_is_the_same_whatever_the_chunks(design):
 
 
 @pytest.mark.parametrize("design", ["random", "sobol"])
-def test_member_k_does_not_know_how_many_there_are(design):
+def test_member_k_does_not_depend_on_the_number_of_members(design):
     few, many = drawn(design, np.arange(50), 50), drawn(design, np.arange(50), 10**9)
     for path in few:
         np.testing.assert_array_equal(few[path], many[path])
 
 
 @pytest.mark.parametrize("design", DESIGNS)
-def test_seeds_differ_and_repeat(design):
+def test_different_seeds_differ_and_equal_seeds_repeat(design):
     first = drawn(design, np.arange(20), seed=1)
     for path, values in drawn(design, np.arange(20), seed=2).items():
         assert not np.any(values == first[path]) or path == "actuator.u_max"
@@ -146,7 +146,7 @@ def test_marginals_by_kolmogorov_and_smirnov(design, name):
 
 
 @pytest.mark.parametrize(("design", "total"), [("latin-hypercube", 1000), ("latin-hypercube", 7), ("sobol", 256)])
-def test_every_stratum_holds_exactly_one_member(design, total):
+def test_every_stratum_contains_exactly_one_member(design, total):
     u = design_points(design, 11, 5, np.arange(total), total)
     for column in u.T:
         np.testing.assert_array_equal(np.sort((column * total).astype(int)), np.arange(total))
@@ -192,7 +192,7 @@ def test_points_are_inside_the_open_cube(design):
         ({"design": "latin-hypercube", "total": MOST_LATIN}, "latin-hypercube.*sobol"),
     ],
 )
-def test_points_refuse(change, words):
+def test_points_refuse_bad_arguments(change, words):
     given = {"design": "random", "seed": 0, "dims": 2, "members": [0], "total": 10} | change
     with pytest.raises(ValueError, match=words):
         design_points(**given)
@@ -215,7 +215,7 @@ def test_an_ensemble_is_the_scenario_with_arrays_for_leaves():
     assert all(np.shape(x) == (32,) for x in moved)
 
 
-def test_the_nominal_model_moves_by_its_own_path():
+def test_the_nominal_model_is_spread_by_its_own_path_only():
     cascade, scenario = apply(CASCADE, SCENARIO, {"controller.model.m": np.ones(3)})
     np.testing.assert_array_equal(cascade.model.m, np.ones(3))
     assert scenario == SCENARIO
@@ -246,7 +246,7 @@ def test_disturbance_paths_follow_the_case_file():
     assert (changed.q_z.value, changed.q_v.amplitude) == (3.0, 2.0)
 
 
-def test_terms_of_sums_and_optional_numbers_have_paths():
+def test_terms_of_a_sum_and_optional_numbers_have_paths():
     scenario = dataclasses.replace(SCENARIO, reference=Sum((Constant(1e-3), Sine(1e-3, 2.0))))
     cascade = dataclasses.replace(CASCADE, observer=observer.Complementary())
     values = {"reference.terms.1.phase": 1.0, "controller.observer.z_hat": 1e-4, "run.clearance": 4e-3}
@@ -266,7 +266,7 @@ def test_every_number_but_seed_and_member_has_a_path():
     assert (scenario.q_z.value, scenario.seed, scenario.member) == (0.0, 0, 0)
 
 
-def test_a_member_of_an_ensemble_rolls_out_as_it_does_alone():
+def test_a_member_of_an_ensemble_equals_its_own_rollout():
     spread = Spread((("plant.m", Percent(10.0)), ("initial.z", Normal(1e-5)), ("sensor.std", LogUniform(1e-8, 1e-6))))
     clock = Clock(40, 5e-5, Euler(1))
     values = draw(spread, SMOOTH, SCENARIO, 0, np.arange(4), 4)
@@ -345,7 +345,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("wrong", BAD)
-def test_bad_spread_is_one_clear_line(wrong):
+def test_a_bad_spread_is_refused_in_one_line(wrong):
     lines, wanted = BAD[wrong]
     with pytest.raises(ValueError) as refused:  # noqa: PT011 (the words are in the table)
         case_from(tomllib.loads(f"{CASE}[spread]\n{lines}\n"))
@@ -394,19 +394,19 @@ def test_bad_spread_is_one_clear_line(wrong):
         "bits by choice",
     ],
 )
-def test_spreads_that_do_not_fit_the_case(text, wanted):
+def test_spreads_that_do_not_fit_the_case_are_refused(text, wanted):
     with pytest.raises(ValueError) as refused:  # noqa: PT011
         case_from(tomllib.loads(text))
     for part in wanted:
         assert part in str(refused.value)
 
 
-def test_whole_numbers_are_spread_by_choices_of_them():
+def test_whole_numbers_are_spread_by_choices():
     text = "processor = {}\nsensor.bits = 12\nspread.sensor.bits = { choices = [14, 8] }"
     assert case_from(tomllib.loads(text)).spread.paths == ("sensor.bits",)
 
 
-def test_a_case_says_how_it_is_spread():
+def test_a_case_has_its_spread_as_text():
     text = """
     [spread]
     design = "sobol"
@@ -423,14 +423,14 @@ def test_a_case_says_how_it_is_spread():
     assert case_from({}).spread == Spread()
 
 
-def test_spreads_print_as_they_are_written():
+def test_spreads_are_printed_as_in_the_case_file():
     for path, kind in SPREAD.entries:
         text = f"{CASE}[spread]\n{path} = {kind}\n"
         assert case_from(tomllib.loads(text)).spread == Spread(((path, kind),))
 
 
 @pytest.mark.parametrize("name", ["tracking", "regulation"])
-def test_the_template_s_spread_is_a_spread(name):
+def test_the_spread_of_the_template_is_valid(name):
     head, found, tail = template(name).partition("# [spread]")
     lines = [line for line in (found + tail).splitlines() if line]
     assert all(line.startswith("# ") for line in lines)
@@ -453,11 +453,11 @@ def test_spreads_made_in_python_are_checked_too(entries, words):
         draw(Spread(entries), CASCADE, SCENARIO, 0, np.arange(3), 3)
 
 
-def test_what_is_an_array_already_cannot_be_spread():
+def test_a_number_that_is_already_an_array_cannot_be_spread():
     scenario = dataclasses.replace(SCENARIO, u_max=np.array([100.0, 200.0]))
     with pytest.raises(ValueError, match="array of 2"):
         check_spread(Spread((("actuator.u_max", Percent(1.0)),)), CASCADE, scenario)
 
 
-def test_no_spread_draws_nothing():
+def test_without_a_spread_nothing_is_drawn():
     assert draw(Spread(), CASCADE, SCENARIO, 0, np.arange(5), 5) == {}

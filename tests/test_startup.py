@@ -27,7 +27,7 @@ def loaded(*words):
 
 @pytest.mark.parametrize("program", ["ambjax", "tuning"])
 @pytest.mark.parametrize("option", ["--version", "--help"])
-def test_a_word_about_the_program_needs_no_numerics(program, option):
+def test_help_and_version_import_no_numerical_package(program, option):
     assert not loaded(program, option) & {"jax", "numpy", "scipy", "matplotlib", "optax", "tqdm"}
 
 
@@ -35,7 +35,7 @@ def test_a_word_about_the_program_needs_no_numerics(program, option):
     ("check", {"matplotlib", "optax", "tuning", "ambjax.commands.ensemble", "ambjax.paper.evidence"}),
     ("simulate", {"scipy", "optax", "tuning", "ambjax.commands.ensemble", "ambjax.paper", "ambjax.theorem"}),
 ])  # fmt: skip
-def test_a_command_imports_what_it_needs(tmp_path, command, unneeded):
+def test_a_command_imports_only_the_packages_that_it_needs(tmp_path, command, unneeded):
     case = tmp_path / "short.toml"
     case.write_text(SHORT)
     out = ("--out", str(tmp_path)) if command == "simulate" else ()
@@ -52,7 +52,7 @@ def test_every_name_of_the_stub_is_public():
         assert getattr(ambjax, name) is own[name]
 
 
-def test_a_public_name_is_never_the_module_of_that_name():
+def test_a_public_name_is_not_replaced_by_the_module_of_that_name():
     code = """
 import ambjax.simulation.rollout, types
 from ambjax import rollout
@@ -62,6 +62,6 @@ assert isinstance(rollout, types.FunctionType) and ambjax.rollout is rollout
     assert isinstance(ambjax.rollout, types.FunctionType)
 
 
-def test_a_name_that_is_not_there():
+def test_an_unknown_public_name_raises_attribute_error():
     with pytest.raises(AttributeError, match="module 'ambjax' has no attribute 'Rolout'"):
         ambjax.Rolout  # noqa: B018

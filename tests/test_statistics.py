@@ -27,7 +27,7 @@ def test_wilson_solves_its_own_equation(n):
     assert high[-1] == 1
 
 
-def test_wilson_is_scipy_s():
+def test_wilson_agrees_with_scipy():
     for k, n, confidence in ((3, 10, 0.95), (999, 1000, 0.99), (0, 5, 0.9)):
         theirs = stats.binomtest(k, n).proportion_ci(confidence, method="wilson")
         np.testing.assert_allclose(wilson(k, n, confidence)[1:], (theirs.low, theirs.high), rtol=1e-9, atol=1e-12)
@@ -41,7 +41,7 @@ def test_wilson_coverage_by_simulation(p):
 
 
 @pytest.mark.parametrize(("k", "n"), [(1, 0), (-1, 5), (6, 5)])
-def test_wilson_refuses(k, n):
+def test_wilson_refuses_bad_arguments(k, n):
     with pytest.raises(ValueError, match="successes"):
         wilson(k, n)
 
@@ -50,12 +50,12 @@ def test_wilson_refuses(k, n):
 
 
 @pytest.mark.parametrize("n", [1, 2, 30, 1001])
-def test_quantile_is_the_value_of_its_rank(n):
+def test_a_quantile_is_the_value_of_its_rank(n):
     x, q = RNG.normal(size=n), np.array([0.05, 0.1, 0.5, 0.9, 0.95, 1.0])
     np.testing.assert_array_equal(quantile(x, q).value, np.quantile(x, q, method="inverted_cdf"))
 
 
-def test_quantile_interval_is_the_binomial_s():
+def test_the_interval_of_a_quantile_follows_from_the_binomial_distribution():
     # the largest rank that is above the true quantile with at most 2.5 %, and the smallest below it
     for n, q in ((200, 0.95), (200, 0.5), (30, 0.05), (1001, 0.95)):
         x = np.arange(1.0, n + 1)  # a value is its rank
@@ -69,7 +69,7 @@ def test_quantile_interval_is_the_binomial_s():
         assert 1 - above(n - 1 if np.isinf(high) else high - 2) > 0.025
 
 
-def test_quantile_interval_is_open_where_the_ensemble_is_too_small():
+def test_the_interval_of_a_quantile_is_infinite_if_the_ensemble_is_too_small():
     # all 72 lie below the 95 % quantile with 0.95^72 = 2.49 %, all 71 with 2.62 %
     assert quantile(np.arange(71.0), 0.95).high == np.inf
     assert quantile(np.arange(72.0), 0.95).high == 71
@@ -85,7 +85,7 @@ def test_quantile_coverage_is_at_least_nominal(n):
         assert 0.95 - 0.015 < np.mean(hits) < 0.99
 
 
-def test_quantiles_of_what_is_never_reached():
+def test_quantiles_of_infinite_values():
     x = np.array([1.0, 2.0, 3.0, np.inf])
     assert quantile(x, 0.5).value == 2
     assert quantile(x, 1.0).value == np.inf
@@ -94,7 +94,7 @@ def test_quantiles_of_what_is_never_reached():
 # --- mean, standard deviation, CVaR ---
 
 
-def test_cvar_of_a_normal():
+def test_the_cvar_of_a_normal_distribution():
     # E[X | X > q] = phi(z)/(1 - alpha) = 2.0627 at 95 %
     exact = stats.norm.pdf(stats.norm.ppf(0.95)) / 0.05
     found = cvar(RNG.normal(size=200_000), 0.95, seed=1)
@@ -103,14 +103,14 @@ def test_cvar_of_a_normal():
     assert abs((found.high - found.low) / (2 * 1.96 * 5.5e-3) - 1) < 0.15  # 1,000 resamples know it to 5 %
 
 
-def test_cvar_counts_the_value_at_the_edge_in_part():
+def test_cvar_weights_the_value_at_the_quantile():
     assert cvar(np.array([1.0, 2.0, 3.0, 4.0]), 0.5).value == 3.5
     np.testing.assert_allclose(cvar(np.array([1.0, 2.0, 3.0, 4.0]), 0.625).value, (4 + 0.5 * 3) / 1.5)
     np.testing.assert_allclose(cvar(np.array([1.0, 2.0, 6.0]), 0.0).value, 3.0)  # of everything: the mean
     assert cvar(np.full(40, 2.5)) == (2.5, 2.5, 2.5)
 
 
-def test_bootstrap_is_explicit_resampling():
+def test_the_bootstrap_agrees_with_explicit_resampling():
     # 400 exponentials; the oracle draws indices and has formulas of its own. Limits agree within the noise of
     # 1,000 resamples: 0.6 of a standard error (at 2.5 %, sqrt(0.025 0.975/1000) over the density there, 0.02 in the
     # long tail of t, is 0.25 of one, more than twice)
@@ -157,7 +157,10 @@ TAILS = {
     ],
 )
 def test_coverage_over_1000_repetitions(tail, n):
-    """95 %, to three times the binomial error of 1,000 repetitions, 0.7 %; and 1 % for what the method has left."""
+    """The coverage is 95 % within three binomial standard errors, and 1 % for the error of the method.
+
+    The standard error of 1,000 repetitions is 0.7 %.
+    """
     kind, covered = TAILS[tail]
     q = kind.ppf(0.95)
     truth = {"mean": kind.mean(), "std": kind.std(), "cvar": kind.expect(lambda x: x, lb=q) / 0.05}
@@ -174,7 +177,7 @@ def test_coverage_over_1000_repetitions(tail, n):
     assert 0.95 - 0.021 < np.mean(quantiles) < 0.99
 
 
-def test_the_interval_of_a_heavy_tail_s_cvar_covers():
+def test_the_interval_of_the_cvar_of_a_heavy_tail_covers_it():
     # 400 samples of 200 lognormals: a share known to 1.2 %, three of which below 94 %. Percentile intervals cover 83 %
     truth, hits = np.exp(0.5) * stats.norm.cdf(1 - stats.norm.ppf(0.95)) / 0.05, []
     for seed in range(8):
@@ -184,8 +187,12 @@ def test_the_interval_of_a_heavy_tail_s_cvar_covers():
 
 
 @pytest.mark.parametrize("n", [50, 200])
-def test_no_cvar_ends_above_the_largest_value(n):
-    """And still covers: a share of 400 samples is known to 1.1 %, three of which. Of 50 values the end is open."""
+def test_the_interval_of_a_cvar_ends_at_most_at_the_largest_value(n):
+    """The interval also covers the true value.
+
+    The standard error of the coverage over 400 samples is 1.1 %; the tolerance is three of them. For 50 values, the
+    upper end may be infinite.
+    """
     samples = np.random.default_rng(n).normal(size=(400, n))
     found, largest = bootstrap(list(samples), 0.95, 0.95, 1)["cvar"], samples.max(axis=1)
     assert np.all((found.high <= largest) | np.isinf(found.high))
@@ -196,13 +203,13 @@ def test_no_cvar_ends_above_the_largest_value(n):
     assert abs(np.mean(truth > largest) - stats.norm.cdf(truth) ** n) < 0.075
 
 
-def test_a_tail_that_is_one_value_is_known():
+def test_the_interval_of_a_constant_tail_has_zero_width():
     # a tenth of the members at the clearance: so are the worst 5 % of nearly every resample
     found = bootstrap([np.where(np.arange(500) < 50, 4.5e-3, 1e-6 * RNG.random(500))])["cvar"]
     np.testing.assert_allclose([found.low[0], found.value[0], found.high[0]], 4.5e-3, rtol=1e-12)  # rounding of a scale
 
 
-def test_the_interval_has_no_end_where_resamples_say_nothing():
+def test_the_interval_is_infinite_if_the_resamples_do_not_determine_it():
     for moments in bootstrap([np.array([1.0, 2.0, 4.0])]).values():
         assert np.all(moments.low <= moments.value)
         assert moments.high[0] == np.inf  # one resample in nine is one value thrice
@@ -213,7 +220,7 @@ def test_the_interval_has_no_end_where_resamples_say_nothing():
     assert summary(columns(202), [], seed=0)["notes"] == []
 
 
-def test_what_the_interval_of_a_heavy_tail_s_std_is_worth_is_said():
+def test_a_note_states_the_coverage_of_the_std_of_a_heavy_tail():
     rng = np.random.default_rng(2)
     data = columns(1200) | {"rms_u_V": rng.lognormal(size=1200), "max_abs_u_V": np.full(1200, 200.0)}
     assert summary(data, [], seed=0)["notes"] == [
@@ -233,7 +240,7 @@ def test_what_the_interval_of_a_heavy_tail_s_std_is_worth_is_said():
 @pytest.mark.parametrize(
     "n", [pytest.param(n, marks=pytest.mark.slow if n == 50 else pytest.mark.thorough) for n in (50, 200, 1000)]
 )
-def test_the_interval_of_a_heavy_tail_s_std_is_worth_what_is_said(n):
+def test_the_std_of_a_heavy_tail_has_the_stated_coverage(n):
     # 2,000 ensembles: a share known to 0.8 %, three of which
     true, hits = stats.lognorm(1).std(), []
     for seed in range(20):
@@ -242,7 +249,7 @@ def test_the_interval_of_a_heavy_tail_s_std_is_worth_what_is_said(n):
     assert abs(np.mean(hits) - statistics.COVERED[n] / 100) < 0.024
 
 
-def test_groups_cover_every_rank_once_and_stay_few():
+def test_groups_contain_every_rank_once_and_are_few():
     for n in (1, 2, 3, 1000, 2048, 10**6):
         edges = _group_edges(n)
         assert edges[0] == 0
@@ -271,12 +278,12 @@ def test_the_same_seed_gives_the_same_interval():
 
 
 @pytest.mark.parametrize("values", [[], [1.0, np.nan], [[1.0]], [1.0, np.inf]])
-def test_cvar_refuses_what_has_none(values):
+def test_cvar_refuses_what_is_not_a_column_of_numbers(values):
     with pytest.raises(ValueError, match="column"):
         cvar(np.array(values))
 
 
-def test_cvar_refuses_an_alpha_that_is_no_share():
+def test_cvar_refuses_an_alpha_outside_0_to_1():
     with pytest.raises(ValueError, match="alpha"):
         cvar(np.ones(3), 1.0)
 
@@ -302,7 +309,7 @@ def columns(n=200):
     }
 
 
-def test_summary_says_what_it_promises():
+def test_the_summary_contains_the_documented_numbers():
     data, names = columns(), ["plant.m", "disturbance.q_z.phase"]
     found = summary(data, names, seed=3)
     assert json.loads(json.dumps(found, allow_nan=False)) == found
@@ -322,7 +329,7 @@ def test_summary_says_what_it_promises():
         assert error[kind]["low"] <= error[kind]["estimate"] <= error[kind]["high"]
 
 
-def test_summary_of_a_time_that_some_never_reach():
+def test_the_summary_of_a_time_that_is_infinite_for_some_members():
     found = summary(columns(), ["plant.m"], seed=0)["metrics"]["sigma_reached_s"]
     assert found["finite"] == 194  # of 198 survivors, 4 never reach it
     assert found["max"] is None
@@ -330,7 +337,7 @@ def test_summary_of_a_time_that_some_never_reach():
     assert found["median"] == {"estimate": 0.1, "low": 0.1, "high": 0.1}
 
 
-def test_summary_names_the_drivers_and_the_worst():
+def test_the_summary_names_the_drivers_and_the_worst_members():
     data = columns()
     found = summary(data, ["disturbance.q_z.phase", "plant.m"], seed=0, worst=4)
     first, second = found["drivers"]["settled_max_abs_error_m"]
@@ -352,8 +359,11 @@ def test_summary_names_the_drivers_and_the_worst():
     assert found["worst"][2]["settled_max_abs_error_m"] == data["settled_max_abs_error_m"].max()
 
 
-def test_lost_members_count_in_no_metric():
-    """A lost rotor's voltage is 0 from then on: the mean over all members would be lower than that of any survivor."""
+def test_lost_members_are_excluded_from_every_metric():
+    """The voltage of a lost rotor is 0 after the loss.
+
+    The mean over all members would therefore be below that of any survivor.
+    """
     data = columns()
     ended = np.isfinite(data["lost_at"])
     data["settled_rms_u_V"] = np.where(ended, 0.0, 60.0 + data["spread.plant.m"])
@@ -372,7 +382,7 @@ def test_lost_members_count_in_no_metric():
     }
 
 
-def test_nobody_survives_and_nothing_is_said_of_metrics():
+def test_without_survivors_the_summary_has_no_metrics():
     data = columns() | {"lost_at": np.full(200, 0.1)}
     found = summary(data, ["plant.m"], seed=0)
     assert json.dumps(found, allow_nan=False)
@@ -393,6 +403,6 @@ def test_summary_without_spreads_or_with_one_member():
     assert found["metrics"]["settled_max_abs_error_m"]["std"]["estimate"] == 0
 
 
-def test_summary_refuses_columns_that_lack_the_deciding_metric():
+def test_the_summary_refuses_columns_without_the_deciding_metric():
     with pytest.raises(ValueError, match="no metric rms"):
         summary(columns(), [], seed=0, deciding="rms")

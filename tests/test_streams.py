@@ -15,8 +15,8 @@ from ambjax.world.scenario import SLOTS
 MEMBERS = 40
 
 
-def test_the_noise_of_one_sensor_says_nothing_of_another_s():
-    """Neither its sign nor its size: no correlation of the numbers, nor of their squares, nor of large ones."""
+def test_the_noise_of_different_sensors_is_independent():
+    """There is no correlation of the numbers, of their squares, or of large values."""
     count = 40_000
     drawn = jax.jit(jax.vmap(lambda k: jnp.stack(normals(Scenario(seed=3).words(), k))))(jnp.arange(count))
     for n, function in enumerate((lambda w: w, np.square, lambda w: np.abs(w) > 2, np.sign)):
@@ -26,8 +26,11 @@ def test_the_noise_of_one_sensor_says_nothing_of_another_s():
         assert np.abs(correlation).max() < 5 / np.sqrt(count), n
 
 
-def test_noise_is_not_made_of_the_words_that_keys_are_made_of():
-    """fold_in(key, n) is a pair of words, of which a signal's or a design's numbers are made: not those of sample n."""
+def test_noise_and_keys_use_different_random_words():
+    """fold_in(key, n) gives two words from which signals and designs draw.
+
+    The noise of sample n does not use these words.
+    """
     scenario = dataclasses.replace(Scenario(sensor=Sensor(1.0, 1.0, 1.0)), seed=9, member=4)
 
     def words(n):
@@ -41,7 +44,7 @@ def test_noise_is_not_made_of_the_words_that_keys_are_made_of():
 
 
 class Listening:
-    """A signal that keeps the key from which it is to draw."""
+    """A signal that stores the key from which it would draw."""
 
     def realised(self, key):
         return jax.random.key_data(key)
@@ -49,7 +52,7 @@ class Listening:
 
 @pytest.mark.parametrize("slot", SLOTS)
 def test_designs_and_signals_share_no_random_words(slot):
-    """What a signal's key would give as a coordinate of a design is no coordinate of the design of that member."""
+    """A number drawn with the key of a signal does not occur among the coordinates of the member in the design."""
     design = design_points("random", 5, len(SLOTS) + 2, np.arange(MEMBERS), MEMBERS)
     for member in range(MEMBERS):
         scenario = Scenario(seed=5, member=member, **{slot: Listening()})

@@ -51,7 +51,7 @@ def test_state_feedback_has_the_poles_of_the_symmetric_root_locus(model):
 
 
 @MODELS
-def test_sampled_state_feedback_has_the_least_cost(model):
+def test_sampled_state_feedback_minimises_the_cost(model):
     """The cost-to-go of the law's own map is that of value iteration, which needs no Riccati solver."""
     T = 5e-5 if model is RIG else 2e-4
     law = dataclasses.replace(
@@ -123,7 +123,7 @@ def test_the_default_current_loop_has_fifty_degrees_of_phase_margin_with_a_sampl
 SPRINGS = "[plant]\nmu_0 = 9.8e-6\nn = 359.0\nA = 1.7e-7\ni_0 = 1e-6\n"
 
 
-def test_a_case_without_optimal_gains_needs_gains():
+def test_a_case_without_optimal_gains_must_give_gains():
     case = SPRINGS + '[controller.position]\nkind = "state-feedback"\n'
     wanted = r"controller\.position: the model has no .*optimal gains.*Give all of k_aw, k_d, k_int, k_p\."
     with pytest.raises(ValueError, match=wanted):
@@ -132,7 +132,7 @@ def test_a_case_without_optimal_gains_needs_gains():
     assert given.cascade.position == position.StateFeedback(1.0, 1.0, 1.0, 1.0)
 
 
-def test_a_case_has_the_gains_of_its_own_period():
+def test_the_default_gains_depend_on_the_sample_period():
     case = '[controller.position]\nkind = "state-feedback"\nk_p = 200.0\n[clock]\nsample_period = 2e-4\n[processor]\n'
     found, wanted = case_from(tomllib.loads(case)).cascade.position, regulator.optimal_gains(Plant(), 2e-4)
     assert (found.k_int, found.k_p, found.k_d) == (wanted[0], 200.0, wanted[2])
@@ -235,7 +235,7 @@ def test_a_notch_beyond_the_nyquist_frequency_stays_stable():
     assert np.max(poles) < 1 + 1e-9
 
 
-def test_parts_of_the_chain_that_are_off_change_nothing():
+def test_inactive_parts_of_the_chain_change_nothing():
     chain = position.FilterChain()
     state = jax.tree.map(lambda x: x + 0.01, chain.init(Plant()))
     state = state._replace(lead_lag=(0.0, 0.0), notch_1=(0.0, 0.0), notch_2=(0.0, 0.0))
@@ -246,7 +246,7 @@ def test_parts_of_the_chain_that_are_off_change_nothing():
         np.testing.assert_allclose(moved.lead_lag, 0.0, atol=1e-12)
 
 
-def test_the_integral_of_the_chain_follows_the_current_while_the_supply_cannot():
+def test_the_integral_of_the_chain_does_not_wind_up_while_the_supply_is_limited():
     chain, far = position.FilterChain(k_aw=300.0), Measurement(1e-3, 0.0, 0.05)
     (_, state), T = chain.step(Plant(), (far, STILL), chain.init(Plant()), 1e-4), 1e-4
     step = jax.jit(lambda state: chain.step(Plant(), (far, STILL), state, T))
@@ -276,7 +276,7 @@ def test_the_integral_sliding_variable_obeys_equation_12():
 
 @pytest.mark.parametrize("kind", ["sliding-mode", "integral-sliding-mode"])
 def test_a_constant_force_leaves_no_offset_with_the_integral(kind):
-    """q_z = 5 m/s^2 inside the layer of the sign. Without the integral: e = tan(pi q_z/2k)/(p c), by Eqs. (5), (12)."""
+    """q_z = 5 m/s^2 within the boundary layer. Without the integral, e = tan(pi q_z/2k)/(p c) by Eqs. (5), (12)."""
     raw = {
         "controller": {"position": {"kind": kind, "k": 25.0, "p": 25.0}, "inversion": {"gamma": 1e6, "p": 2.0}},
         "disturbance": {"q_z": {"kind": "constant", "value": 5.0}},

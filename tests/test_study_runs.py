@@ -69,14 +69,14 @@ sys.exit(main())
 
 
 def begin(out, *flags):
-    """A study in a process group of its own."""
+    """Start a study in a separate process group."""
     argv = [sys.executable, "-c", LISTENING, *RUN, "--out", out, *flags]
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     return subprocess.Popen(argv, text=True, start_new_session=True, **pipes)
 
 
 def wait_for(condition, running, patience=120.0):
-    """Until the condition holds; fails if the process ends first."""
+    """Wait until the condition holds; fail if the process ends first."""
     end = time.monotonic() + patience
     while not condition():
         assert running.poll() is None, running.stderr.read()
@@ -89,7 +89,7 @@ def finished_chunks(out):
 
 
 def group_ends(group, patience=20.0):
-    """Whether no process of the group is left."""
+    """Return whether no process of the group is left."""
     end = time.monotonic() + patience
     while time.monotonic() < end:
         try:
@@ -108,7 +108,7 @@ def result(out):
 
 
 @pytest.mark.slow
-def test_processes_give_the_same_file(capsys, monkeypatch):
+def test_several_processes_give_the_same_file(capsys, monkeypatch):
     write(TINY)
     # a chunk is several calls of the compiled program, and the last one is no whole chunk
     argv = ["ensemble", "case.toml", "--members", "200", "--chunk", "128", "--seed", "3"]
@@ -125,7 +125,7 @@ def test_processes_give_the_same_file(capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_cluster_gives_the_same_file_though_a_worker_is_killed(no_pictures):
+def test_a_cluster_gives_the_same_file_if_a_worker_is_killed(no_pictures):
     distributed = pytest.importorskip("distributed")
     write(LONGER)
     assert main([*RUN, "--out", "here"]) == 0
@@ -144,7 +144,7 @@ def test_a_cluster_gives_the_same_file_though_a_worker_is_killed(no_pictures):
 
 
 @pytest.mark.parametrize("flags", [[], ["--processes", "2"]], ids=["here", "processes"])
-def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(flags):
+def test_ctrl_c_keeps_the_finished_chunks_and_prints_the_command_to_resume(flags):
     write(LONGER)
     many = 100_000  # so that no machine is done before it is interrupted
     running = begin("out", *flags, "--members", str(many))
@@ -166,8 +166,8 @@ def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(flags):
 
 @pytest.mark.parametrize("program", ["ambjax", "tuning"])
 @pytest.mark.parametrize("calls", [1, 100, 3000, 20_000])
-def test_ctrl_c_before_anything_runs_is_one_line_and_130(program, calls):
-    """While JAX is on its way in, for one, which made an error of its own of it."""
+def test_ctrl_c_before_the_first_chunk_gives_one_line_and_exit_code_130(program, calls):
+    """For example during the import of JAX, which raises an error of its own."""
     write(LONGER)
     argv = ["case.toml", "--out", "out"] if program == "tuning" else [*RUN, "--out", "out"]
     code = EARLY.format(calls=calls, module=f"{program}.__main__")
@@ -203,7 +203,7 @@ sys.exit(main())
 
 
 @pytest.mark.slow
-def test_killed_at_any_instant_and_resumed_it_is_the_same_file(no_pictures):
+def test_a_study_killed_at_any_instant_and_resumed_gives_the_same_file(no_pictures):
     write(LONGER)
     assert main([*RUN, "--out", "whole"]) == 0
     dice, early = random.Random(11), 0
@@ -260,7 +260,7 @@ def test_a_finished_study_is_not_run_again(no_pictures, monkeypatch, capsys):
 # --- damage ---
 
 
-def test_what_was_damaged_is_computed_again_with_a_line(no_pictures, capsys):
+def test_a_damaged_chunk_is_computed_again_with_a_message(no_pictures, capsys):
     write(TINY)
     argv = ["ensemble", "case.toml", "--members", "200", "--seed", "3"]
     assert main([*argv, "--out", "whole"]) == 0
@@ -308,7 +308,7 @@ def test_a_chunk_damaged_after_a_kill_is_computed_again(no_pictures, capsys):
 # --- how long it takes ---
 
 
-def test_chunks_take_a_beat_and_keep_every_worker_busy(monkeypatch):
+def test_chunks_take_about_two_seconds_and_keep_every_worker_busy(monkeypatch):
     monkeypatch.setattr(pace, "cores", lambda: 2)
     assert pace.Pace(1000.0, None).chunk(10**6) == 2048  # 2 s of it, in whole calls of 64 on each of two cores
     assert pace.Pace(2.6, None).chunk(2000) == 128  # no less than a call on each
@@ -319,7 +319,7 @@ def test_chunks_take_a_beat_and_keep_every_worker_busy(monkeypatch):
     assert pace.Pace(1000.0, 4).whole == 2000
 
 
-def test_a_long_run_is_announced_and_the_faster_step_named(capsys):
+def test_a_long_run_is_announced_with_the_faster_step(capsys):
     case = read_case(write(TINY))
     for name, words in (
         ("adaptive", 'about 13 min for 2,000 members (2.6 a second); clock.method = "sliding" would be faster'),
@@ -347,7 +347,10 @@ def test_the_pilot_is_the_first_members(no_pictures):
 
 
 def test_the_command_takes_chunks_and_first_members_from_the_pilot(no_pictures, monkeypatch, capsys):
-    """128 members that took so long that there are 30 a second: 2 s of them are less than a call on both cores."""
+    """The pilot of 128 members gives a rate of 30 members per second.
+
+    2 s of this rate are less than one call on both cores.
+    """
     computed = []
 
     def pilot(study):
@@ -392,7 +395,7 @@ def test_the_error_of_the_sliding_step_is_measured_and_printed(no_pictures, caps
     write(HARD.replace("dt = 5e-5", 'method = "adaptive"'))
     assert main(["ensemble", "case.toml", "--members", "20", "--seed", "3", "--out", "accurate"]) == 0
     with np.load("out/members.npz") as ours, np.load("accurate/members.npz") as theirs:
-        for name in pace.BY:
+        for name in pace.COMPARED:
             off = np.abs(ours[name] / theirs[name] - 1)[:16].max()
             assert error[name] == pytest.approx(off, rel=1e-9)  # the same numbers, divided otherwise
             assert f"{name} off by {100 * off:.2g} %" in err
@@ -456,7 +459,7 @@ BAD = {
 
 
 def refused(argv, capsys):
-    """The one line of a refusal that writes nothing."""
+    """Return the line of a refusal, after a check that nothing is written."""
     before = sorted(pathlib.Path().rglob("*"))
     assert main(argv) == 2, argv
     out, err = capsys.readouterr()
@@ -468,7 +471,7 @@ def refused(argv, capsys):
 
 
 @pytest.mark.parametrize("wrong", BAD)
-def test_bad_input_is_one_clear_line(wrong, capsys):
+def test_bad_input_is_refused_in_one_line(wrong, capsys):
     line, more, wanted = BAD[wrong]
     command, *flags = line.split()
     err = refused([command, write(TINY + more), *flags], capsys)
@@ -476,7 +479,7 @@ def test_bad_input_is_one_clear_line(wrong, capsys):
         assert part in err
 
 
-def test_an_absent_cluster_is_one_clear_line(monkeypatch, capsys):
+def test_a_missing_cluster_is_reported_in_one_line(monkeypatch, capsys):
     write(TINY)
     argv = ["ensemble", "case.toml", "--members", "9", "--out", "new", "--cluster", "tcp://127.0.0.1:9"]
     with monkeypatch.context() as without:
@@ -488,7 +491,7 @@ def test_an_absent_cluster_is_one_clear_line(monkeypatch, capsys):
     assert "--cluster nonsense://x: " in refused([*argv[:-1], "nonsense://x"], capsys)
 
 
-def test_another_study_is_refused_and_left_alone(no_pictures, capsys):
+def test_another_study_in_the_folder_is_refused_and_not_changed(no_pictures, capsys):
     write(TINY)
     argv = ["ensemble", "case.toml", "--members", "9", "--out", "out"]
     assert main(argv) == 0

@@ -37,7 +37,7 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 class Stuck(io.StringIO):
-    """A stream that takes nothing."""
+    """A stream that refuses every write."""
 
     def __init__(self, number):
         super().__init__()
@@ -56,7 +56,7 @@ def answered(words, run):
 
 @pytest.mark.parametrize(("number", "code"), [(None, 1), (errno.EPIPE, 1), (errno.ENOSPC, 2)])
 @pytest.mark.parametrize("flags", [[], ["--json"]])
-def test_a_no_stays_a_no_for_a_reader_who_leaves(number, code, flags, monkeypatch, capsys):
+def test_the_exit_code_does_not_change_if_the_reader_closes_stdout(number, code, flags, monkeypatch, capsys):
     if number is not None:
         monkeypatch.setattr(sys, "stdout", Stuck(number))
 
@@ -70,13 +70,13 @@ def test_a_no_stays_a_no_for_a_reader_who_leaves(number, code, flags, monkeypatc
 
 @pytest.mark.parametrize(("number", "code"), [(errno.EPIPE, 0), (errno.ENOSPC, 2)])
 @pytest.mark.parametrize("flag", ["--version", "--help"])
-def test_a_word_about_the_program_that_nobody_takes(number, code, flag, monkeypatch, capsys):
+def test_help_and_version_with_a_failing_stdout(number, code, flag, monkeypatch, capsys):
     monkeypatch.setattr(sys, "stdout", Stuck(number))
     assert main([flag]) == code
     assert capsys.readouterr().err.count("\n") == (code == 2)
 
 
-def test_a_broken_pipe_of_the_work_is_no_end_of_the_answer(capsys):
+def test_a_broken_pipe_of_the_computation_is_an_error(capsys):
     def run(args):
         raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
 
@@ -85,7 +85,7 @@ def test_a_broken_pipe_of_the_work_is_no_end_of_the_answer(capsys):
 
 
 @pytest.mark.parametrize("number", [errno.EPIPE, errno.ENOSPC])
-def test_a_stderr_that_takes_nothing_stops_no_work(number, monkeypatch):
+def test_a_failing_stderr_does_not_stop_the_command(number, monkeypatch):
     monkeypatch.setattr(sys, "stderr", Stuck(number))
     monkeypatch.setattr(simulate, "tqdm", lambda **options: tqdm(**options | {"delay": 0, "mininterval": 0}))
     assert main(["simulate", write(SHORT), "--out", "there"]) == 0
@@ -93,7 +93,7 @@ def test_a_stderr_that_takes_nothing_stops_no_work(number, monkeypatch):
 
 
 def test_a_stream_that_failed_is_not_written_again(monkeypatch):
-    """Not as Python ends either: what it holds would fail once more, and become the exit code."""
+    """Python's flush at exit is also avoided: it would fail again and change the exit code."""
     stuck = Stuck(errno.ENOSPC)
     monkeypatch.setattr(sys, "stdout", stuck)
     with lenient() as stdout:
@@ -104,7 +104,7 @@ def test_a_stream_that_failed_is_not_written_again(monkeypatch):
     sys.stdout.flush()
 
 
-def test_what_an_alphabet_lacks_is_an_escape(monkeypatch):
+def test_characters_that_the_encoding_lacks_are_escaped(monkeypatch):
     stream = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
     monkeypatch.setattr(sys, "stdout", stream)
     open_streams()
@@ -114,7 +114,7 @@ def test_what_an_alphabet_lacks_is_an_escape(monkeypatch):
 
 
 @pytest.mark.parametrize("said", ["out of memory\nmore", ""])
-def test_what_a_device_has_against_it_is_one_line(said, capsys):
+def test_an_error_of_the_device_is_reported_in_one_line(said, capsys):
     def run(args):
         raise RuntimeError(said)
 
@@ -122,7 +122,7 @@ def test_what_a_device_has_against_it_is_one_line(said, capsys):
     assert capsys.readouterr().err == f"ambjax: {said[:13] or 'RuntimeError'}\n"
 
 
-def test_a_fault_of_ours_keeps_its_traceback():
+def test_an_internal_error_keeps_its_traceback():
     def run(args):
         raise NotImplementedError
 
@@ -133,7 +133,7 @@ def test_a_fault_of_ours_keeps_its_traceback():
 # --- other runs ---
 
 
-def test_one_run_at_a_time():
+def test_a_folder_accepts_one_run_at_a_time():
     here = pathlib.Path()
     with locked(here):
         with pytest.raises(ValueError, match="another run is using this directory"), locked(here):
@@ -146,13 +146,13 @@ def test_one_run_at_a_time():
     assert os.listdir() == []  # noqa: PTH208
 
 
-def test_two_runs_without_a_folder_of_their_own_take_two(monkeypatch):
+def test_two_runs_without_a_given_folder_use_two_folders(monkeypatch):
     meant = iter([pathlib.Path("out/a"), pathlib.Path("out/a"), pathlib.Path("out/a-2")])  # both see that a is free
     monkeypatch.setattr(outputs, "target", lambda *_: next(meant))
     assert [outputs.directory(None, "a").name for _ in range(2)] == ["a", "a-2"]
 
 
-def test_a_study_whose_folder_is_at_work_is_refused(capsys):
+def test_a_study_in_a_folder_in_use_is_refused(capsys):
     argv = ["ensemble", write(STUDY), "--members", "2", "--out", "out"]
     out = pathlib.Path("out")
     out.mkdir()
@@ -162,7 +162,7 @@ def test_a_study_whose_folder_is_at_work_is_refused(capsys):
         assert os.listdir(out) == [LOCK]  # noqa: PTH208
 
 
-def test_a_search_whose_folder_is_at_work_is_refused_and_touches_nothing(capsys):
+def test_a_search_in_a_folder_in_use_is_refused_and_changes_nothing(capsys):
     out = pathlib.Path("out")
     out.mkdir()
     (out / "checkpoint-1.npz").touch()
@@ -173,7 +173,7 @@ def test_a_search_whose_folder_is_at_work_is_refused_and_touches_nothing(capsys)
     assert (out / "checkpoint-1.npz").exists()
 
 
-def test_a_study_that_another_run_began_meanwhile_is_refused(monkeypatch, capsys):
+def test_a_study_that_another_run_has_started_meanwhile_is_refused(monkeypatch, capsys):
     @contextlib.contextmanager
     def late(out):
         write("{}", "out/study.json")
@@ -186,7 +186,7 @@ def test_a_study_that_another_run_began_meanwhile_is_refused(monkeypatch, capsys
 
 
 @pytest.mark.slow
-def test_the_death_of_a_worker_is_one_line(monkeypatch, capsys):
+def test_a_killed_worker_is_reported_in_one_line(monkeypatch, capsys):
     class Dead:
         def submit(self, *_):
             future = concurrent.futures.Future()
@@ -208,14 +208,14 @@ def test_the_death_of_a_worker_is_one_line(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("name", simulate.WRITTEN)
-def test_a_folder_in_the_place_of_a_file_is_seen_before_the_work(name, monkeypatch, capsys):
+def test_a_folder_in_place_of_a_file_is_refused_before_the_computation(name, monkeypatch, capsys):
     monkeypatch.setattr(simulate, "simulate", None)
     pathlib.Path("out", name).mkdir(parents=True)
     assert main(["simulate", write(SHORT), "--out", "out"]) == 2
     assert f"--out out: {name} exists and is a folder. Move it, or choose" in capsys.readouterr().err
 
 
-def test_files_move_all_or_not_at_all(monkeypatch):
+def test_either_all_files_are_moved_or_none(monkeypatch):
     out, moved = pathlib.Path(), []
     replace = pathlib.Path.replace
     monkeypatch.setattr(
@@ -253,7 +253,7 @@ def test_nothing_is_written_through_a_link():
     assert len(list(inside.iterdir())) == 3
 
 
-def test_names_that_the_system_refuses_are_one_line(capsys):
+def test_names_that_the_system_refuses_are_reported_in_one_line(capsys):
     pathlib.Path("loop").symlink_to("loop")
     long = write(STUDY, chr(0x10400) * 62 + ".toml")
     for argv in (["ensemble", write(STUDY), "--members", "2", "--out", "loop"], ["simulate", long]):
@@ -267,7 +267,7 @@ def test_names_that_the_system_refuses_are_one_line(capsys):
 # --- what a process finds ---
 
 
-def test_without_a_home_nothing_is_kept_and_nothing_fails(monkeypatch):
+def test_without_a_home_folder_nothing_is_cached_and_nothing_fails(monkeypatch):
     def homeless(*_):
         raise RuntimeError("Could not determine home directory.")
 
@@ -276,14 +276,14 @@ def test_without_a_home_nothing_is_kept_and_nothing_fails(monkeypatch):
     worker.configure_jax()
 
 
-def test_a_cache_that_is_full_is_not_worth_a_word():
+def test_a_full_cache_causes_no_message():
     worker.configure_jax()
     for act in ("reading", "writing"):
         warnings.warn(f"Error {act} persistent compilation cache entry for 'jit_f': OSError: full", stacklevel=1)
 
 
 @pytest.mark.parametrize("error", [AssertionError(), RuntimeError("Unknown backend\nmore")])
-def test_a_device_that_is_not_there_is_one_line(error, monkeypatch, capsys):
+def test_a_missing_device_is_reported_in_one_line(error, monkeypatch, capsys):
     def backend():
         raise error
 
@@ -295,7 +295,7 @@ def test_a_device_that_is_not_there_is_one_line(error, monkeypatch, capsys):
     assert err.count("\n") == 1
 
 
-def test_pictures_look_the_same_whatever_a_matplotlibrc_says():
+def test_pictures_do_not_depend_on_a_matplotlibrc():
     bars = [tornado.Bar(**dict.fromkeys(tornado.Bar._fields, 0.5) | {"path": "plant.m"})]
     with matplotlib.rc_context({"text.usetex": True, "font.size": 30, "axes.facecolor": "red"}):
         tornado.tornado(bars, "rms_u_V", "all", pathlib.Path("theirs.png"))

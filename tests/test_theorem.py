@@ -13,7 +13,7 @@ CLOCK = Clock(1000, 1e-4, AdaptiveRodas3(1e-8))
 
 
 def short(gamma=paper.REPAIRED_GAMMA, **changes):
-    """0.1 s of tracking with a pulse in it, one structure so that one compilation serves all."""
+    """0.1 s of tracking with a pulse; one structure, so that the tests share one compilation."""
     cascade = dataclasses.replace(paper.cascade("repaired"), inversion=inversion.Adaptive(gamma))
     scenario = dataclasses.replace(paper.scenario("tracking", "repaired"), q_v=Pulse(1.0, 0.05, 0.08))
     return cascade, dataclasses.replace(scenario, **changes)
@@ -47,7 +47,7 @@ def test_suprema_and_their_times():
 
 
 @pytest.mark.slow
-def test_delta_1_is_the_derivative_seen_in_a_trajectory():
+def test_delta_1_is_the_derivative_of_a_trajectory():
     """d = v_star' - dv/dz z_dot, against central differences of the recorded v_star (error ~ h^2 v_star'''/6)."""
     cascade, scenario = short()
     fine = Clock(20_000, 5e-6, AdaptiveRodas3(1e-9))
@@ -92,7 +92,7 @@ def test_identities_hold_to_integration_error_and_tighten_with_tolerance():
     assert bound.against > -1e-9  # V' stays below its bound to rounding
 
 
-def test_identities_break_where_their_assumptions_do():
+def test_identities_fail_if_their_assumptions_fail():
     cascade, scenario = short()
     wrong = dataclasses.replace(cascade, model=Plant(m=0.6))
     assert check(wrong, scenario, CLOCK).proof[0].against > 1e-4

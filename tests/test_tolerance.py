@@ -54,7 +54,10 @@ def random_loops(n):
 
 
 def motion(loops, tolerance, start=0.0, speed=0.0):
-    """z and z_dot [n, samples], NaN for the lost, by the adaptive method; `speed` (m/s) added within a sample."""
+    """Return z and z_dot [n, samples] of the adaptive method, NaN for lost rotors.
+
+    `speed` (m/s) is added to the velocity within a sample.
+    """
     cascade = amb.Cascade(
         position=amb.position.SlidingMode(loops.c, loops.k, loops.p),
         inversion=amb.inversion.Adaptive(np.pi / 2 * loops.slope / loops.p_v, loops.p_v),
@@ -78,7 +81,7 @@ def far(z, exact):
 
 
 def carried(loops, exact, z_dot):
-    """How far the loops carry one allowed error of the velocity, m; and a kick of 1 m/s, m."""
+    """Return the displacements (m) caused by one allowed error of the velocity and by a change of 1 m/s."""
     n, tolerance = len(loops.z), 1e-9
     all_ = Loops(*(np.tile(x, len(KICKS)) for x in loops))
     kicked, _ = motion(all_, tolerance, np.repeat(KICKS * T, n), SPEED)
@@ -89,7 +92,7 @@ def carried(loops, exact, z_dot):
 
 
 @pytest.mark.slow
-def test_an_error_is_that_of_some_steps_carried_by_the_loop():
+def test_the_error_of_a_run_is_at_most_that_of_100_steps():
     exact, z_dot = motion(HARD, 1e-10)
     assert np.isfinite(exact).all()
     errors = [far(motion(HARD, tolerance)[0], exact) for tolerance in (1e-6, QUIET_TOLERANCE, 1e-8, 1e-9)]
@@ -104,7 +107,7 @@ def test_an_error_is_that_of_some_steps_carried_by_the_loop():
 
 
 @pytest.mark.slow
-def test_errors_of_many_loops():
+def test_the_errors_of_many_loops_are_bounded_by_those_of_a_step():
     loops = random_loops(examples(40, 300))
     exact, z_dot = motion(loops, 1e-9)
     errors = far(motion(loops, QUIET_TOLERANCE)[0], exact)

@@ -90,7 +90,7 @@ def test_the_step_resolves_the_contact():
     assert case_from({"processor": {}, "run": STOP | {"stop_stiffness": 1e8}}).clock.method.substeps >= 65
 
 
-def test_the_stop_has_paths():
+def test_the_numbers_of_the_stop_have_paths():
     case = case_from({"run": STOP, "spread": {"run": {"stop_stiffness": {"percent": 10}}}})
     assert case.spread.paths == ("run.stop_stiffness",)
     assert {"run.stop_stiffness", "run.stop_damping"} <= set(places(case.cascade, case.scenario))
@@ -106,12 +106,12 @@ def test_the_stop_has_paths():
         ({"run": STOP, "clock": {"method": "sliding"}}, "sliding.*does not resolve run.stop_stiffness"),
     ],
 )
-def test_wrong_stops_are_named(tables, said):
+def test_wrong_stops_are_refused(tables, said):
     with pytest.raises(ValueError, match=said):
         case_from(tables)
 
 
-def test_a_rotor_may_start_on_its_stop():
+def test_a_rotor_can_start_on_its_stop():
     assert case_from({"run": STOP, "initial": {"z": -GAP}}).scenario.initial.z == -GAP
     with pytest.raises(ValueError, match="the rotor would touch its stop at the start"):
         case_from({"run": {"clearance": GAP}, "initial": {"z": -GAP}})

@@ -25,7 +25,7 @@ ENDS |= {f"limits.{name}": OTHER_RANGES.get(name, LIMIT_RANGE) for name in [*KIN
 
 
 @pytest.mark.parametrize("path", ENDS)
-def test_every_number_of_tune_has_both_ends(path):
+def test_every_number_of_tune_has_a_lower_and_an_upper_bound(path):
     meta = ENDS[path].metadata
     table, _, name = path.rpartition(".")
     low = meta["above"] if meta["at_least"] is None else meta["at_least"]
@@ -49,7 +49,7 @@ def test_every_number_of_tune_has_both_ends(path):
 IN_MEMORY = ("members", "stressed", "validation", "held_out", "screen")
 
 
-def test_whole_numbers_and_bounds_of_tune_have_both_ends():
+def test_whole_numbers_and_bounds_of_tune_have_a_lower_and_an_upper_bound():
     def bounds(*ends):
         return {"gains": ["controller.position.c"], "bounds": {"controller": {"position": {"c": list(ends)}}}}
 
@@ -77,7 +77,7 @@ def test_whole_numbers_and_bounds_of_tune_have_both_ends():
             parsed(bounds(*ends))
 
 
-def test_settings_are_those_of_another_case_but_for_its_gains(tmp_path):
+def test_settings_of_another_case_apply_except_its_gains(tmp_path):
     """Gains and bounds come from the case; limits, loss and budget may come from another file."""
     own, other = tmp_path / "own.toml", tmp_path / "other.toml"
     own.write_text(
@@ -98,7 +98,10 @@ def test_settings_are_those_of_another_case_but_for_its_gains(tmp_path):
 
 @pytest.mark.parametrize("kind", ["sliding-mode", "integral-sliding-mode", "super-twisting", "utkin-sliding-mode"])
 def test_the_gains_of_explicit_set_valued_signs_have_ranges(kind):
-    """A sign without a slope, on a processor that steps it explicitly; its gains are those of implicit signs."""
+    """The sign has no slope, and the processor steps it explicitly.
+
+    The ranges of its gains are those of implicit signs.
+    """
     laws = {"position": {"kind": kind, "p": math.inf}, "inversion": {"p": math.inf}, "current": {"p": math.inf}}
 
     def found(discretisation):

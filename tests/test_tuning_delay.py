@@ -34,7 +34,7 @@ def problem(limit):
 
 
 @pytest.mark.slow
-def test_members_are_lost_beyond_the_linear_margin_and_not_below():
+def test_members_are_lost_above_the_linear_margin_only():
     made = problem(1e-4)
     case = made.case
     margin = analyse(linearise(case.cascade, case.scenario, case.clock), 2.4, PERIOD, case.zones).margins.delay

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bowl import World, study
 
-from tuning.search.evolution import PATIENCE, STALL, initial_state, moved, next_population, population, rates
+from tuning.search.evolution import PATIENCE, STALL, initial_state, next_population, population, rates, updated
 from tuning.search.rounds import rounds
 
 # Derivatives of a loop that is chaotic; those of a Bowl's loss are about 1e-4.
@@ -14,17 +14,17 @@ CHAOS = {"chaotic": 1e30, "of moderate size": 1e-2}
 
 
 def least(f, m, populations, seed=0):
-    """The least value of f on populations from the origin of m dimensions, and the last distribution."""
+    """Return the least f over populations that start at the origin of m dimensions, and the last distribution."""
     cloud, best = initial_state(np.zeros(m)), math.inf
     for _ in range(populations):
         points = next_population(cloud, seed)
         values = f(points)
-        best, cloud = min(best, values.min()), moved(cloud, points, values)
+        best, cloud = min(best, values.min()), updated(cloud, points, values)
     return best, cloud
 
 
-def test_the_parameters_are_the_tutorial_s():
-    """By hand from Table 1 of arXiv:1604.00772 for 5 dimensions: 8 points, 4 of them count."""
+def test_the_parameters_are_those_of_the_tutorial():
+    """By hand from Table 1 of arXiv:1604.00772 for 5 dimensions: 8 points, 4 of which have positive weights."""
     assert population(5) == 8
     raw = [math.log(4.5) - math.log(i) for i in (1, 2, 3, 4)]
     found = rates(5)
@@ -39,8 +39,11 @@ def test_the_parameters_are_the_tutorial_s():
     )
 
 
-def test_a_valley_is_followed_whichever_way_it_lies():
-    """Curvatures from 1 to 1e4: without the covariance it stays at 1e-2, with it the best falls as that of a sphere."""
+def test_a_valley_in_any_direction_is_followed():
+    """The curvatures are 1 to 1e4.
+
+    Without the covariance the best value stays at 1e-2; with it, it decreases as on a sphere.
+    """
     scales, turn = 10 ** np.linspace(0, 4, 5), np.linalg.qr(np.random.default_rng(1).standard_normal((5, 5)))[0]
     for axes in (np.eye(5), turn):
         best, _ = least(lambda x, axes=axes: (x @ axes - 0.3) ** 2 @ scales, 5, 250)
@@ -57,7 +60,7 @@ def test_only_the_order_of_the_values_counts():
     np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
-def test_the_size_grows_on_a_slope_and_shrinks_in_a_pit():
+def test_the_step_size_grows_on_a_slope_and_decreases_at_a_minimum():
     assert least(lambda x: x[:, 0], 4, 30)[1].size > 1
     assert least(lambda x: (x**2).sum(axis=1), 4, 60)[1].size < 0.05
 
@@ -77,7 +80,7 @@ def found(monkeypatch, folder, world, **tune):
 
 
 @pytest.mark.parametrize("chaos", CHAOS)
-def test_a_minimum_is_found_where_derivatives_lead_elsewhere(monkeypatch, tmp_path, chaos):
+def test_a_minimum_is_found_in_spite_of_misleading_derivatives(monkeypatch, tmp_path, chaos):
     answer, gains = found(monkeypatch, tmp_path, World(chaos=CHAOS[chaos]))
     # the loss is flat to 1 %, at which populations stall, within a factor of e^0.1
     np.testing.assert_allclose(gains, World().best, rtol=0.1)
@@ -85,7 +88,7 @@ def test_a_minimum_is_found_where_derivatives_lead_elsewhere(monkeypatch, tmp_pa
 
 
 @pytest.mark.slow
-def test_three_limits_are_kept_where_derivatives_lead_elsewhere(monkeypatch, tmp_path):
+def test_three_limits_hold_in_spite_of_misleading_derivatives(monkeypatch, tmp_path):
     answer, (c, k) = found(monkeypatch, tmp_path, World(chaos=1e30), limits=LIMITS)
     limits = {limit.name: limit for limit in answer.problem.limits}
     assert set(limits) == set(LIMITS) - {"margin"}
@@ -96,11 +99,11 @@ def test_three_limits_are_kept_where_derivatives_lead_elsewhere(monkeypatch, tmp
 
 
 def populations(world):
-    """How many populations were drawn; no other call in two dimensions has as many points."""
+    """Return how many populations were drawn; no other call in two dimensions has the same number of points."""
     return sum(kind == "terms" and points == population(2) for kind, _, _, points in world.calls)
 
 
-def test_a_descent_that_has_converged_is_left_alone(monkeypatch, tmp_path):
+def test_cma_es_does_not_start_after_a_converged_descent(monkeypatch, tmp_path):
     smooth, rough = World(), World(chaos=1e30)
     found(monkeypatch, tmp_path / "smooth", smooth)
     found(monkeypatch, tmp_path / "rough", rough)
@@ -108,19 +111,19 @@ def test_a_descent_that_has_converged_is_left_alone(monkeypatch, tmp_path):
     assert populations(rough) > PATIENCE
 
 
-def test_it_has_converged_when_whole_populations_stall():
-    """One point far below all others, which is chance, changes nothing."""
+def test_cma_es_has_converged_if_whole_populations_do_not_improve():
+    """A single point far below all others may be chance and does not count."""
     cloud = initial_state(np.zeros(2))
     for n, level in enumerate([0.0, -2 * STALL, *[-2.5 * STALL] * PATIENCE]):
         assert not cloud.converged
         values = np.full(6, level)
-        cloud = moved(cloud, next_population(cloud, n), values)
+        cloud = updated(cloud, next_population(cloud, n), values)
     assert cloud.converged
-    assert not moved(cloud, next_population(cloud, 0), np.full(6, -4 * STALL)).converged
+    assert not updated(cloud, next_population(cloud, 0), np.full(6, -4 * STALL)).converged
 
 
-def test_a_search_that_is_resumed_among_populations_ends_alike(monkeypatch, tmp_path):
-    """Ctrl-C in the third population."""
+def test_a_search_resumed_during_cma_es_gives_the_same_result(monkeypatch, tmp_path):
+    """Ctrl-C interrupts the third population."""
 
     class Counting(list):
         interrupts = True

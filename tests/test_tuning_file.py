@@ -67,7 +67,7 @@ def test_comments_order_and_format_are_kept():
     assert written(GIVEN.replace("\n", "\r\n")) == WRITTEN
 
 
-def test_a_tuned_file_that_is_tuned_again_says_so_once():
+def test_a_file_that_is_tuned_again_has_one_note_about_it():
     assert written(WRITTEN) == WRITTEN
     assert tuned(WRITTEN, GAINS, "hall", "One is lost.") == WRITTEN.replace("'fan'", "'hall'").replace("None", "One")
 
@@ -89,7 +89,7 @@ PLACES = {
 
 
 @pytest.mark.parametrize("text", PLACES.values(), ids=PLACES)
-def test_gains_are_written_wherever_the_laws_stand(text):
+def test_gains_are_written_wherever_their_tables_are(text):
     wanted = tomllib.loads(text)
     for path, value in GAINS.items():
         _, stage, name = path.split(".")
@@ -97,12 +97,12 @@ def test_gains_are_written_wherever_the_laws_stand(text):
     assert tomllib.loads(written(text)) == wanted
 
 
-def test_comments_about_the_next_table_stay_with_it():
+def test_comments_above_a_table_stay_above_it():
     text = "[controller.position]\nc = 17.0\n\n# 2 um, measured\n[sensor]\nstd = 2e-6\n"
     assert "\n\n# 2 um, measured\n[sensor]\nstd = 2e-6\n" in written(text)
 
 
-def test_what_cannot_be_written_is_refused(monkeypatch):
+def test_gains_that_cannot_be_written_are_refused(monkeypatch):
     with pytest.raises(ValueError, match="gains cannot be written"):
         written("controller = 3")
     dumps = tomlkit.dumps

@@ -42,7 +42,7 @@ SCALES = {
 }
 
 
-def test_the_bearings_are_there():
+def test_the_three_foreign_bearings_exist():
     assert set(BEARINGS) == {"rotor", "fan", "turbo"}
 
 
@@ -69,7 +69,10 @@ def gamma(name, **tune):
 
 
 def test_the_range_of_gamma_starts_at_delta_1_of_the_motion():
-    """From Delta_1 of a moving reference; at rest, from dv/dz z_dot of a rotor that falls from where it starts."""
+    """With a moving reference it starts at Delta_1 along the reference.
+
+    At rest, it starts at dv/dz z_dot of a rotor that falls from its initial position.
+    """
     moving, found = gamma("tracking")
     assert moving.low == next(b.value for b in found.goal.conditions if b.symbol == "Delta_1") > 0
     assert "Delta_1" in moving.source
@@ -84,7 +87,7 @@ def test_the_range_of_gamma_starts_at_delta_1_of_the_motion():
     assert slow.low == resting.low
 
 
-def test_bounds_that_miss_a_range_still_make_one():
+def test_bounds_outside_a_range_give_a_range_at_the_nearest_bound():
     where, _ = gamma("rotor", bounds={"controller": {"inversion": {"gamma": [1e20, float("inf")]}}})
     assert 1e20 < where.low < where.high <= where.most < np.inf
     where, _ = gamma("rotor", bounds={"controller": {"inversion": {"gamma": [0.0, 1.0]}}})
@@ -108,8 +111,8 @@ def test_sources_name_the_pole_and_the_cap():
 
 
 @pytest.mark.parametrize("beside", [True, False], ids=["gains too", "p alone"])
-def test_on_a_processor_a_steepness_is_looked_for_by_its_slope(beside):
-    """2/pi gain p from w/3 to 10/T, whatever the gain beside it is: the screen's own draw, or the case's number."""
+def test_on_a_processor_a_steepness_is_searched_by_its_slope(beside):
+    """2/pi gain p ranges from w/3 to 10/T for every value of the gain, drawn by the screen or given by the case."""
     names = ["position.k", "inversion.gamma", "current.k_i"]
     paths = [f"controller.{name}" for name in (names if beside else [])]
     paths += [f"controller.{name.partition('.')[0]}.p" for name in names]
@@ -140,7 +143,7 @@ def test_the_papers_p_is_25_bit_for_bit():
 
 
 @pytest.mark.parametrize("name", BEARINGS)
-def test_p_follows_the_plants_own_sigma_v_and_i(name):
+def test_the_default_p_follows_from_the_scales_of_the_plant(name):
     case = case_from(tomllib.loads(BEARINGS[name]))
     plant = case.scenario.plant
     for stage, scale in SCALES.items():
@@ -153,7 +156,7 @@ def test_p_follows_the_plants_own_sigma_v_and_i(name):
     assert given.inversion.p == 3.0
 
 
-def test_laws_are_made_once():
+def test_default_laws_are_made_once_from_the_first_model():
     cascade = Cascade(model=Plant(i_0=0.5))
     assert cascade.current.p == 12.5
     assert dataclasses.replace(cascade, model=Plant()).current.p == 12.5
@@ -163,7 +166,7 @@ def test_laws_are_made_once():
     assert Cascade(position=own, model=Plant(i_0=0.5)).position is own
 
 
-def test_what_the_template_leaves_out_of_p_follows_an_edited_plant():
+def test_the_default_p_of_the_template_follows_an_edited_plant():
     case = case_from(tomllib.loads(template("tracking")))
     assert case.cascade == Cascade(position=case.cascade.position)  # all as in Python
     assert case.cascade.inversion.p == 25.0
@@ -175,7 +178,7 @@ def test_what_the_template_leaves_out_of_p_follows_an_edited_plant():
 
 
 @pytest.mark.parametrize("laws", ["", OTHER_LAWS], ids=["usual laws", "other laws"])
-def test_reading_the_tuned_file_gives_the_tuned_cascade(laws):
+def test_the_tuned_file_gives_the_tuned_cascade(laws):
     found = problem_from(BEARINGS["fan"] + laws)
     space = found.objective.space
     x = space.encode(space.clip(found.tune.space.values(found.case.cascade))) + 0.1
@@ -187,7 +190,7 @@ def test_reading_the_tuned_file_gives_the_tuned_cascade(laws):
         assert tomllib.loads(text)["controller"]["inversion"]["p"] == found.case.cascade.inversion.p
 
 
-def test_without_a_screen_there_is_the_case_alone():
+def test_without_a_screen_the_search_starts_from_the_case_only():
     found = problem_from(BEARINGS["fan"], screen=0)
     start = found.tune.space.values(found.case.cascade)
     points = initial_points(found.objective, found.goal.conditions, start, 0, 1)
@@ -221,7 +224,7 @@ def report_of(out):
 @pytest.mark.parametrize(
     "name", [pytest.param(x, marks=pytest.mark.slow if x == "fan" else pytest.mark.thorough) for x in COMMON]
 )
-def test_common_bearings_tune_unattended(name, tmp_path):
+def test_common_bearings_are_tuned_without_settings(name, tmp_path):
     out = tmp_path / "out"
     assert main([str(write(tmp_path / "case.toml", COMMON[name])), "--out", str(out), "--json"]) == 0
     facts = report_of(out)
@@ -236,8 +239,8 @@ def test_common_bearings_tune_unattended(name, tmp_path):
 
 
 @pytest.mark.thorough
-def test_a_search_from_the_cases_gains_alone(tmp_path):
-    """From gains that hold, as from those of an answer: with no screen it refines them."""
+def test_a_search_from_the_gains_of_the_case_only(tmp_path):
+    """The initial gains hold the rotor, as those of an answer do. Without a screen the search refines them."""
     first, second = tmp_path / "first", tmp_path / "second"
     write(tmp_path / "case.toml", BEARINGS["fan"], iterations=4)
     assert main([str(tmp_path / "case.toml"), "--out", str(first), "--json"]) == 0

@@ -41,7 +41,10 @@ def ran(monkeypatch, tmp_path, capsys):
 
 
 def least_voltage(factor):
-    """Of a Bowl: the error is S_0 sqrt(FLOOR (1 + a^2 + b^2)) and the voltage 20 e^b, a and b logarithms of gains."""
+    """Return the least voltage of a Bowl.
+
+    Its error is S_0 sqrt(FLOOR (1 + a^2 + b^2)) and its voltage 20 e^b, with the logarithms a and b of the gains.
+    """
     return 20 * math.exp(-math.sqrt(factor**2 - 1))
 
 
@@ -67,7 +70,7 @@ def test_the_knee_is_the_least_voltage_within_25_percent_of_the_least_error(ran)
     text = (folder / "report.md").read_text()
     assert sentence in text
     assert text.index("## Error against voltage") < text.index("## Limits")
-    assert text.count("**taken**") == 1
+    assert text.count("**selected**") == 1
     # the limit by which the front is traced is no requirement
     assert [row["name"] for row in facts["limits"]] == ["rms_u_V", "survival"]
     for row in facts["front"]:
@@ -76,7 +79,7 @@ def test_the_knee_is_the_least_voltage_within_25_percent_of_the_least_error(ran)
 
 
 def test_members_of_rare_large_errors_join_the_search(monkeypatch, tmp_path):
-    """One of ten validation members limits the voltage, and none of the training members do."""
+    """One of ten validation members limits the voltage, and no training member does."""
     slope, validation = 100.0, seeds(case_and_tune(document())[1].budget)[1]
     world = World(rare=lambda seed, number: slope if (seed, number) == (validation, 3) else 0.0)
     problem = study(monkeypatch, world, objective="knee", front=1, bounds=BOUNDLESS)
@@ -97,7 +100,7 @@ def test_least_error_traces_no_front_without_pareto(ran):
     assert not list(folder.glob("tuned_*"))
 
 
-def test_the_front_of_least_error_leaves_the_answer(ran):
+def test_the_front_does_not_change_an_answer_of_least_error(ran):
     _, facts, out, folder = ran(pareto=True, front=1, bounds=BOUNDLESS)
     assert [(row["factor"], row["taken"]) for row in facts["front"]] == [(1, True), (1.25, False)]
     assert "This answer has the least error: " in out
@@ -105,8 +108,8 @@ def test_the_front_of_least_error_leaves_the_answer(ran):
 
 
 @pytest.mark.slow
-def test_the_rest_of_the_limits_stays(monkeypatch, tmp_path):
-    """A limit of 15 V is met by the answer of least error already, at a voltage below which the knee may not end."""
+def test_the_other_limits_stay_in_the_search_of_the_knee(monkeypatch, tmp_path):
+    """The answer of least error already meets a limit of 15 V. The voltage of the knee must not exceed this limit."""
     study(monkeypatch, World(), objective="knee", bounds=BOUNDLESS, limits={"largest_error_m": 1.0})
     problem = problem_of(
         *case_and_tune(document(objective="knee", bounds=BOUNDLESS, limits={"rms_u_V": 15.0, "rms_error_m": 5.3e-5}))
@@ -131,7 +134,7 @@ def point(error, volts, lost=0, within=True):
     return FrontPoint(1.0, np.zeros(2), error, volts, None, lost, 0, 100, within)
 
 
-def test_the_point_chosen_holds_as_many_members_and_limits_as_the_least_error():
+def test_the_knee_holds_as_many_members_and_limits_as_the_point_of_least_error():
     seen = [point(1.0, 20.0), point(1.2, 10.0, lost=1), point(1.2, 11.0, within=False), point(1.26, 9.0)]
     assert chosen(seen, 1.25) is seen[0]
     assert chosen(seen, 1.3) is seen[3]

@@ -99,7 +99,7 @@ ENDS = {
         ({"rms_u": 80.0}, "rms_u", "Did you mean 'rms_u_V'?"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(limits, path, words):
+def test_wrong_limits_are_refused_in_one_line(limits, path, words):
     with pytest.raises(ValueError, match=r".") as caught:
         limits_of(limits)
     message = str(caught.value)
@@ -108,7 +108,7 @@ def test_what_is_wrong_is_said_in_one_line(limits, path, words):
     assert message.isprintable()
 
 
-def test_limits_that_are_no_table_are_refused():
+def test_limits_that_are_not_a_table_are_refused():
     with pytest.raises(ValueError, match=r"tune\.limits = 80: it must be a table"):
         case_and_tune({"tune": {"limits": 80}})
 
@@ -156,7 +156,7 @@ clearance_used = 0.6
 """
 
 
-def test_the_search_measures_what_the_judge_does():
+def test_the_search_computes_the_quantities_of_the_judge():
     made = problem_from(SAMPLED)
     case = made.case
     context = LimitContext(case.settle, float(case.clock.duration), float(case.scenario.touchdown), 45e-6)
@@ -174,7 +174,7 @@ def test_the_search_measures_what_the_judge_does():
     assert theirs["max_abs_u_V"] / 1.4 < ours["max_u_V"] <= theirs["max_abs_u_V"] == 200.0
 
 
-def test_a_processor_s_steps_are_its_own():
+def test_the_steps_of_judge_and_reference_on_a_processor():
     made = problem_from(SAMPLED)
     assert made.sampled
     assert made.judging is made.engine
@@ -186,7 +186,7 @@ def test_a_processor_s_steps_are_its_own():
 
 
 @pytest.mark.slow
-def test_slopes_of_what_limits_hold_three_ways():
+def test_derivatives_of_limited_quantities_agree_in_three_ways():
     made = problem_from(SAMPLED)
     x, members = made.objective.space.encode(made.tune.space.values(made.case.cascade)), made.objective.members(1, 2)
     forward, reverse = (Engine(made.objective, settle=0.01, mode=mode, threads=1) for mode in ("forward", "reverse"))
@@ -198,7 +198,7 @@ def test_slopes_of_what_limits_hold_three_ways():
     np.testing.assert_allclose(slopes / size, back / size, atol=1e-9)
 
 
-def test_the_largest_over_members_is_smooth_and_no_less():
+def test_the_smooth_maximum_over_members_is_at_least_the_maximum():
     values = jnp.asarray([1.0, 2.0, 2.0])
     assert float(largest(values)) == pytest.approx(2 * (2 + 2**-16) ** (1 / 16))
     slopes = jax.grad(largest)(values)
@@ -209,7 +209,7 @@ def test_the_largest_over_members_is_smooth_and_no_less():
     assert np.isfinite(float(largest(1e200 * values)))
 
 
-def test_the_pull_is_that_of_an_augmented_lagrangian():
+def test_the_penalty_of_a_limit_is_that_of_an_augmented_lagrangian():
     limit, values = Limit("rms_u_V", 10.0), jnp.full(3, 10.0 * math.exp(0.1))
     assert float(limit.term(values)) == pytest.approx(PENALTY * 0.1**2 / 2)
     assert float(limit.term(0.5 * values)) == 0.0
@@ -241,8 +241,8 @@ class Counting(Mean):
         return super().__call__(losses)
 
 
-def test_other_limits_do_not_trace_the_step_again(monkeypatch, tmp_path):
-    """Two tunings, each of several searches with different multipliers."""
+def test_changed_limits_do_not_trace_the_step_again(monkeypatch, tmp_path):
+    """There are two tunings, each of several searches with different multipliers."""
     counts = []
     for volts in (10.0, 11.0):
         made = study(monkeypatch, World(), limits={"rms_u_V": volts, "margin": 0.002})
@@ -274,7 +274,7 @@ def test_a_limit_is_met_and_its_multiplier_is_the_price(monkeypatch, tmp_path):
     assert limit.error_reduction(MORE) == pytest.approx(1 - theirs / ours, rel=0.2)
 
 
-def test_the_price_falls_as_the_multiplier_does_on_the_way():
+def test_the_price_follows_from_the_interpolated_multiplier():
     """A multiplier that falls from 20 at 10 V to 0 at 11 V, linearly in ln b, gives half the price of a constant 20."""
     limit = Limit("rms_u_V", 10.0, multiplier=20.0, history=((11.0, 0.0), (10.0, 20.0)))
     # 200 segments of a straight line
@@ -284,14 +284,14 @@ def test_the_price_falls_as_the_multiplier_does_on_the_way():
     assert Limit("rms_u_V", 10.0).error_reduction(0.1) == 0.0
 
 
-def test_a_limit_is_active_where_it_pulls_and_is_reached():
+def test_a_limit_is_active_if_its_multiplier_is_positive_and_it_is_reached():
     """The limit 10 has a margin of 3 %. With a tolerance of 1 % plus the margin, it is active from 9.7 e^-0.04 on."""
     pulls = Limit("max_u_V", 10.0, margin=0.03, multiplier=0.2)
     assert [pulls.active(reached) for reached in (9.3, 9.35, 10.5, None)] == [False, True, True, True]
     assert not Limit("max_u_V", 10.0, margin=0.03).active(10.0)
 
 
-def test_a_limit_that_is_far_costs_nothing(monkeypatch, tmp_path):
+def test_a_limit_far_from_the_value_costs_nothing(monkeypatch, tmp_path):
     far, free = World(), World()
     first, _ = found(monkeypatch, tmp_path, far, limits={"rms_u_V": 30.0})
     second, _ = found(monkeypatch, tmp_path / "free", free, limits={"rms_u_V": math.inf})
@@ -300,13 +300,16 @@ def test_a_limit_that_is_far_costs_nothing(monkeypatch, tmp_path):
     assert len(far.calls) == len(free.calls) + 1  # the training members, once more
 
 
-def test_what_the_judge_finds_counts(monkeypatch, tmp_path):
+def test_the_judged_value_corrects_the_search(monkeypatch, tmp_path):
     _, (_, k) = found(monkeypatch, tmp_path, World(louder=1.25), **TEN)
     assert k == pytest.approx(30.0 / 1.25, rel=0.012)
 
 
-def test_a_search_that_stays_at_an_optimum_within_the_limits_ends(monkeypatch):
-    """The judged voltage of 20 V is within the limit, but nearer than the margin; another search changes nothing."""
+def test_a_search_that_does_not_move_and_holds_the_limits_ends(monkeypatch):
+    """The judged voltage of 20 V is within the limit but closer to it than the margin.
+
+    Another search would change nothing.
+    """
     problem = study(monkeypatch, World(), limits={"rms_u_V": 20 / 0.9995, "margin": 0.002})
     course, starts = Course(problem, training(problem), 1), []
     course.past.append(SimpleNamespace(interrupted=False))
@@ -316,7 +319,7 @@ def test_a_search_that_stays_at_an_optimum_within_the_limits_ends(monkeypatch):
     assert len(starts) == 1
 
 
-def test_a_limited_study_that_is_resumed_ends_alike(monkeypatch, tmp_path):
+def test_a_resumed_search_with_limits_gives_the_same_result(monkeypatch, tmp_path):
     made = study(monkeypatch, World(), **TEN)
     start = made.tune.space.values(made.case.cascade)
     whole = rounds(made, start, tmp_path, {"of": "ten"}, False)
@@ -340,7 +343,7 @@ def command(monkeypatch, tmp_path, world=None, **tune):
 
 
 @pytest.mark.slow
-def test_the_command_says_what_a_limit_costs(monkeypatch, tmp_path):
+def test_the_command_prints_the_price_of_a_limit(monkeypatch, tmp_path):
     code, summary, out = command(monkeypatch, tmp_path, limits={"rms_u_V": 10.0})
     assert code == 0
     row, survival = summary["limits"]
@@ -356,7 +359,7 @@ def test_the_command_says_what_a_limit_costs(monkeypatch, tmp_path):
     assert (out / "spectrum.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_sine_s_amplitude_is_its_peak_s():
+def test_the_peak_of_the_spectrum_of_a_sine_is_its_amplitude():
     t = 1e-4 * np.arange(8000)
     frequency, amplitude = amplitudes(3.0 + 5.0 * np.sin(2 * np.pi * 250 * t), 1e-4)
     assert frequency[np.argmax(amplitude)] == pytest.approx(250)
@@ -365,13 +368,13 @@ def test_a_sine_s_amplitude_is_its_peak_s():
     assert len(amplitudes(np.zeros(3), 1e-4)[0]) == 0
 
 
-def test_members_that_may_be_lost_are_counted_whole():
-    """(1 - 0.9) 2000 is 199.99999999999997 in floating point."""
+def test_the_allowed_number_of_lost_members_is_a_whole_number():
+    """In floating point, (1 - 0.9) 2000 is 199.99999999999997."""
     assert [LimitSettings(survival=0.9).may_lose(n) for n in (2000, 1000, 19)] == [200, 100, 1]
     assert [LimitSettings(survival=s).may_lose(1000) for s in (1.0, 0.999, 0.9995)] == [0, 1, 0]
 
 
-def test_a_peak_that_was_measured_at_the_supply_is_said_to_be():
+def test_a_peak_measured_with_a_saturated_supply_is_reported_as_such():
     row = {"name": "sensitivity", "verdict": limit_table.BROKEN, "reached": 3.2, "threshold": 3.0, "source": "default"}
     row |= {"at_least": False, "unit": ""}
     for share, said in ((None, False), (0.01, False), (0.15, True)):
@@ -379,7 +382,7 @@ def test_a_peak_that_was_measured_at_the_supply_is_said_to_be():
         assert ("the supply limits u in 15 % of the samples" in line) == said
 
 
-def test_the_saturation_is_that_of_the_injection_which_decides():
+def test_the_reported_saturation_is_that_of_the_deciding_injection():
     peak = dict.fromkeys(MeasuredPeak.__dataclass_fields__) | {"repetitions": 8}
     peaks = [
         MeasuredPeak(**peak | {"largest": {"sensitivity": size}, "saturated": share})

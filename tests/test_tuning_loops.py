@@ -51,8 +51,8 @@ def made():
 
 
 @pytest.mark.slow
-def test_the_derivative_of_a_limit_is_that_of_differences(made):
-    """Of each limit's term of the goal, along each gain."""
+def test_the_derivative_of_a_limit_agrees_with_differences(made):
+    """The derivative of each limit's term of the goal is compared along each gain."""
     problem, x, members = made
     some, step = members.searched, 1e-3
     values, slopes = loops(problem.objective, x[None], some)
@@ -71,7 +71,7 @@ def test_the_derivative_of_a_limit_is_that_of_differences(made):
 
 
 @pytest.mark.slow
-def test_the_engine_puts_the_loops_among_the_limits_by_name(made, monkeypatch):
+def test_the_engine_adds_the_quantities_of_the_linear_loop_by_name(made, monkeypatch):
     """For 12 ordinary and 2 stressed members; the rollouts themselves are not simulated here."""
     problem, x, members = made
     count, m = len(members.member), len(x)
@@ -97,7 +97,7 @@ def test_the_engine_puts_the_loops_among_the_limits_by_name(made, monkeypatch):
 
 
 def test_an_unstable_loop_has_a_finite_value_whose_derivative_points_to_stability(made):
-    """The larger k, the faster the loop diverges."""
+    """The loop diverges faster for larger k."""
     problem, x, members = made
     far = x + np.linspace(0.0, 9.0, 10)[:, None] * (np.array(PATHS) == "controller.position.k")
     values, slopes = loops(problem.objective, far, members.searched)
@@ -111,7 +111,7 @@ def test_an_unstable_loop_has_a_finite_value_whose_derivative_points_to_stabilit
     assert np.all(np.diff(values["delay_margin_s"][unstable, 0]) < 0)
 
 
-def test_a_lower_limit_holds_above_it():
+def test_a_lower_limit_holds_for_larger_values():
     _, tune = case_and_tune(DOCUMENT)
     limit = next(one for one in tune.limits.each if one.name == "delay_margin_s")
     assert KINDS["delay_margin_s"].at_least
@@ -127,7 +127,10 @@ def test_a_lower_limit_holds_above_it():
 
 @pytest.mark.slow
 def test_injections_find_the_members_with_the_largest_measured_peak():
-    """Set-valued signs without noise: one measurement of each plant, whose order the linear peaks do not tell."""
+    """Set-valued signs without noise: one measurement of each plant.
+
+    The order of the linear peaks differs from that of the measured ones.
+    """
     signs = {"position": {"c": 200.0, "k": 30.0}, "inversion": {"gamma": 1e7}, "current": {"k_i": 2000.0}}
     document = DOCUMENT | {
         "controller": {stage: law | {"p": math.inf} for stage, law in signs.items()},

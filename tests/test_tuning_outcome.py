@@ -27,7 +27,7 @@ HELD_OUT = seeds(Budget())[2]
 
 
 def losing(*numbers, accurate=False):
-    """Return a world in which these held-out members are lost; with `accurate`, only in accurate steps."""
+    """Return a world in which these held-out members are lost; with `accurate`, only with accurate steps."""
     return World(
         limit=lambda seed, number, _, fine: (
             40.0 if seed == HELD_OUT and number in numbers and (fine or not accurate) else math.inf
@@ -74,7 +74,7 @@ def ran(monkeypatch, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("kind", OUTCOMES)
-def test_every_place_says_the_same(kind, ran):
+def test_all_outputs_give_the_same_verdict(kind, ran):
     world, tune, survival, limit, good = OUTCOMES[kind]
     code, facts, out, err, folder = ran(world(), tune)
     # the fact
@@ -124,7 +124,7 @@ def test_every_place_says_the_same(kind, ran):
     assert not re.search(r"cannot be held|is held|not held", err.replace(facts["advice"], ""), re.IGNORECASE)
 
 
-def test_what_speaks_against_the_gains_decides_alone():
+def test_each_reason_against_the_gains_suffices():
     right = TuningOutcome(10, 0, 0, 1, {"rms_u_V": HELD, "survival": HELD}, "")
     assert right.good
     assert TuningOutcome(10, 1, 0, 1, right.limits, "").good
@@ -136,7 +136,7 @@ def test_what_speaks_against_the_gains_decides_alone():
     assert TuningOutcome(10, 0, 0, 1, right.limits, "steps").against == [UNVERIFIED]
 
 
-def test_a_lost_member_s_voltage_counts_in_no_limit():
+def test_the_voltage_of_a_lost_member_is_excluded_from_the_limits():
     """A lost rotor is frozen at 0 V: the mean square over all members would be half of that over the survivors."""
     columns = {"settled_rms_u_V": np.array([100.0, 0.0]), "lost_at_s": np.array([np.inf, 0.1])}
     columns |= {"lost": np.array([False, True]), "stalled": np.zeros(2, bool)}
@@ -151,7 +151,7 @@ def test_a_lost_member_s_voltage_counts_in_no_limit():
     assert (no_held["held"], "settled_rms_error_m" in no_held) == (0, False)
 
 
-def test_a_gain_that_loses_rotors_when_it_is_off_says_how_many():
+def test_the_number_of_members_lost_by_a_changed_gain_is_reported():
     middle = len(REACH) // 2
     goals, lost = np.zeros((3, len(REACH))), np.zeros((3, len(REACH)), int)
     goals[0, middle + 1], lost[0, middle + 1] = math.log(516.0), 2

@@ -28,7 +28,7 @@ from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS, weigh
 from tuning.report import accurate, breakdown, extras, gradient, held_out, pictures
 from tuning.report import document as report
-from tuning.report.facts import SHOWN
+from tuning.report.facts import SUMMARY_METRICS
 from tuning.search.explore import REACH, Slices, slices
 from tuning.search.rounds import training
 
@@ -100,7 +100,7 @@ def cells(text, heading):
 # --- what adds up --------------------------------------------------------------------------------------------------
 
 
-def test_what_the_terms_add_is_the_loss():
+def test_the_sum_of_the_terms_is_the_loss():
     rng = np.random.default_rng(0)
     for _ in range(20):
         weights = rng.uniform(0, 3, len(TERMS))
@@ -111,7 +111,7 @@ def test_what_the_terms_add_is_the_loss():
 
 
 @pytest.mark.slow
-def test_the_loss_table_can_be_added_up_by_hand(written):
+def test_the_rows_of_the_loss_table_add_up_to_its_total(written):
     text = (written / "report.md").read_text()
     facts = json.loads((written / "report.json").read_text())
     assert breakdown.FORMULA in text
@@ -119,7 +119,7 @@ def test_the_loss_table_can_be_added_up_by_hand(written):
     terms, total, risk = rows[: len(TERMS)], rows[len(TERMS)], rows[len(TERMS) + 1]
     assert [row[0] for row in terms] == list(TERMS)
     for when in ("before", "after"):
-        mean, adds = (head.index(f"{word} {when}") for word in ("mean", "adds"))
+        mean, adds = (head.index(f"{word} {when}") for word in ("mean", "contribution"))
         shown = sum(float(row[adds]) for row in terms)
         # of six numbers and their sum, each is rounded to five digits
         assert shown == pytest.approx(float(total[adds].strip("*")), rel=7 * 0.5e-4)
@@ -131,7 +131,7 @@ def test_the_loss_table_can_be_added_up_by_hand(written):
         assert facts["loss"][when]["risk"] >= facts["loss"][when]["loss"] * (1 - 1e-12)
 
 
-def test_the_table_is_of_the_members_that_were_judged(study, x):
+def test_the_loss_table_agrees_with_the_losses_of_the_judged_members(study, x):
     found = judge(study, x, seeds(study.tune.budget)[2], 12)
     terms = breakdown.loss_breakdown(study.goal, found)
     losses = weigh(study.goal.weights, {name: found[f"loss.{name}"] for name in TERMS}, np.zeros(12, bool))
@@ -144,7 +144,7 @@ def test_the_table_is_of_the_members_that_were_judged(study, x):
 
 
 @pytest.mark.parametrize("conditions", [0.0, 1.0])
-def test_what_was_minimised_is_the_goal(conditions):
+def test_the_minimised_value_in_the_report_is_the_goal(conditions):
     # gamma far below Delta_1 of this reference, so that the conditions' penalty counts
     few = problem_from(CASE.replace("3e5", "1e3").replace('["controller.position.c", "controller.position.k"]',
                                                         '["controller.inversion.gamma"]'),
@@ -160,7 +160,7 @@ def test_what_was_minimised_is_the_goal(conditions):
     assert (parts["penalty"] > 1) == (conditions > 0)
 
 
-def test_the_lowest_point_of_slices_loses_no_more():
+def test_the_lowest_point_of_the_slices_loses_no_more_members():
     middle = len(REACH) // 2
     goals = np.zeros((2, len(REACH)))
     goals[0, 3], goals[1, 9], goals[1, 2] = -0.5, -0.2, np.nan
@@ -174,7 +174,7 @@ def test_the_lowest_point_of_slices_loses_no_more():
     assert Slices(gains, np.abs(goals), lost, goals).lowest()[2] == 0
 
 
-def test_a_lower_point_beside_the_answer_is_said():
+def test_a_lower_point_on_a_slice_is_reported():
     beside = {"path": "controller.position.c", "gain": 12.5, "lower": 0.2}
     assert "20 % lower, at controller.position.c = 12.5" in report._lower_point(beside)
     assert "the search did not reach it" in report._lower_point(beside)
@@ -184,7 +184,7 @@ def test_a_lower_point_beside_the_answer_is_said():
     assert "No point of these slices has a lower objective" in report._lower_point(beside)
 
 
-def test_the_picture_begins_at_what_the_table_says_was_minimised(study, x):
+def test_the_picture_of_the_convergence_starts_at_the_minimised_value_of_the_table(study, x):
     members = training(study)
     found, parts = slices(study, x, members), breakdown.minimised(study, x, members)
     np.testing.assert_allclose(np.exp(found.goals[:, len(REACH) // 2]), parts["total"], rtol=1e-9)
@@ -194,12 +194,12 @@ def test_the_picture_begins_at_what_the_table_says_was_minimised(study, x):
 
 
 @pytest.mark.slow
-def test_accurate_values_are_those_of_adaptive_rollouts():
+def test_accurate_values_agree_with_adaptive_rollouts():
     study = problem_from(CASE, substeps=1)  # so coarse that the two differ
     study.__dict__["judging"] = study.engine
     x = study.objective.space.encode(study.tune.space.values(study.case.cascade))
     seed = seeds(study.tune.budget)[2]
-    compared = accurate.compare_steps(study, x, seed, 12, SHOWN)
+    compared = accurate.compare_steps(study, x, seed, 12, SUMMARY_METRICS)
     assert (compared["members"], compared["held"]) == (accurate.COMPARED, accurate.COMPARED)
     assert abs(compared["metrics"]["settled_rms_error_m"]["relative"]) > 1e-3
     found = []
@@ -220,19 +220,19 @@ def test_accurate_values_are_those_of_adaptive_rollouts():
         assert row["relative"] == pytest.approx(row["report"] / row["accurate"] - 1, abs=1e-12)
 
 
-def test_accurate_steps_against_themselves_are_off_by_nothing(study, x):
+def test_accurate_steps_compared_with_themselves_have_no_error(study, x):
     clock = dataclasses.replace(study.objective.clock, method=study.reference.objective.clock.method)
     objective = dataclasses.replace(study.objective, clock=clock)
     engine = Engine(objective, settle=study.case.settle, lanes=4)
     same = dataclasses.replace(study)
     same.__dict__["judging"] = engine
-    compared = accurate.compare_steps(same, x, 5, 3, SHOWN)
+    compared = accurate.compare_steps(same, x, 5, 3, SUMMARY_METRICS)
     assert compared["members"] == 3
     assert {row["relative"] for row in compared["metrics"].values()} == {0.0}
     assert compared["lost"] == {"report": 0, "accurate": 0}
 
 
-def test_what_is_off_by_much_is_marked():
+def test_large_differences_are_marked():
     again = {
         "members": 8, "held": 8, "marked_beyond": 0.05, "lost": {"report": 0, "accurate": 2},
         "metrics": {"a": {"report": 1.04, "accurate": 1.0, "relative": 0.04},
@@ -242,16 +242,16 @@ def test_what_is_off_by_much_is_marked():
     assert held_out._again(again, "b") == ["1.47", "1", "**47 %**"]
     assert held_out._again(again, "c") == ["-"] * 3
     assert held_out._statuses(again, "lost") == ["0 of 8", "2 of 8", "-"]
-    assert "In bold: off by more than 5 %" in held_out._accurate(again)[0]
+    assert "Differences above 5 % are in bold." in held_out._accurate(again)[0]
     del again["metrics"]["b"]
-    assert "No number is off by more than 5 %" in held_out._accurate(again)[0]
+    assert "No difference exceeds 5 %" in held_out._accurate(again)[0]
     again["metrics"] = {}
-    assert "nothing in this table is confirmed" in held_out._accurate(again)[0]
+    assert "accurate steps confirm no number of this table" in held_out._accurate(again)[0]
 
 
 def test_the_columns_of_accurate_steps_are_in_the_report(written):
     head, *rows = cells((written / "report.md").read_text(), "12 held-out members")
-    assert head[3:] == ["after, 8 of them", "by accurate steps", "off by"]
+    assert head[3:] == ["after, 8 members", "with accurate steps", "difference"]
     facts = json.loads((written / "report.json").read_text())
     metrics = facts["accurate"]["metrics"]
     rows = [row for row in rows if row[0].strip("`") in metrics]
@@ -265,7 +265,7 @@ def test_the_columns_of_accurate_steps_are_in_the_report(written):
 # --- pages ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_bar_in_a_condition_stays_in_its_cell(written):
+def test_a_vertical_bar_in_a_condition_is_escaped(written):
     rows = cells((written / "report.md").read_text(), "Conditions of Theorem 1")
     assert {len(row) for row in rows} == {6}
     shown = (written / "report.html").read_text()
@@ -274,7 +274,7 @@ def test_a_bar_in_a_condition_stays_in_its_cell(written):
     assert {row.count("</td>") + row.count("</th>") for row in table.split("<tr>")[1:]} == {6}
 
 
-def test_the_name_of_a_case_is_shown_as_it_is(written):
+def test_the_name_of_a_case_is_escaped(written):
     name = "<img src=x onerror=alert(1)> a|b *c* [d](e)"
     name, shown = safe_name(name), (written / "report.html").read_text()
     assert f"<h1>Tuning of {html.escape(name)}</h1>" in shown
@@ -284,7 +284,7 @@ def test_the_name_of_a_case_is_shown_as_it_is(written):
     assert not re.search(r"(?<!\\)<", (written / "report.md").read_text())
 
 
-def test_text_is_literal_in_every_place():
+def test_text_is_escaped_everywhere_in_the_report():
     text = "\\<b>x</b> & | *a* _b_ `c` ~d~ ![e](f) #g\n# h\x00"
     for frame in ("{}", "# {}", "| a |\n|---|\n| {} |", "- {}"):
         shown = render_page(frame.format(escape_markdown(text)), {}, "t").partition("</style>")[2]
@@ -292,13 +292,13 @@ def test_text_is_literal_in_every_place():
         assert words == "\\<b>x</b> & | *a* _b_ `c` ~d~ ![e](f) #g\ufffd# h\ufffd"
 
 
-def test_lists_are_lists(written):
+def test_lists_of_the_report_are_html_lists(written):
     shown = (written / "report.html").read_text()
     assert "<li>risk: CVaR(0.9)" in shown
     assert "<p>- " not in shown
 
 
-def test_what_is_wide_scrolls_in_its_own_box(written):
+def test_wide_content_scrolls_in_its_own_box(written):
     shown = (written / "report.html").read_text()
     assert '<meta name="viewport" content="width=device-width,initial-scale=1">' in shown
     assert re.search(r"\.wide\{[^}]*overflow-x:auto", shown)
@@ -308,7 +308,7 @@ def test_what_is_wide_scrolls_in_its_own_box(written):
     assert "http" not in shown  # needs nothing else
 
 
-def test_the_page_opens_with_the_answer_and_the_front_and_folds_the_rest(written):
+def test_the_page_shows_the_answer_and_the_front_and_folds_the_rest(written):
     shown = (written / "report.html").read_text()
     opened, *folded = shown.split("<details>")
     assert opened.partition("<ul>")[2].partition("</ul>")[0].count("<li>") == 5
@@ -343,14 +343,14 @@ def test_the_page_does_not_scroll_sideways(written, tmp_path, width):
     assert needed <= inner
 
 
-def test_pictures_that_the_report_shows_lie_beside_it(written):
+def test_the_pictures_of_the_report_are_in_its_folder(written):
     named = re.findall(r"!\[.*?\]\((.*?)\)", (written / "report.md").read_text())
     assert sorted(named) == ["convergence.png", "front.png", "nominal.png", "slices.png", "spectrum.png"]
     for name in named:
         assert (written / name).read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_picture_takes_lost_rotors(study):
+def test_the_picture_accepts_lost_rotors(study):
     run = accurate.nominal(study, study.case.cascade)
     assert not math.isfinite(float(run.lost_at))
     assert len(np.asarray(run.rows.t)) == study.case.clock.samples
@@ -360,7 +360,7 @@ def test_the_picture_takes_lost_rotors(study):
         assert pictures.before_after({"before": lost, "after": run}).startswith(b"\x89PNG")
 
 
-def test_a_run_lost_before_tuning_is_one_line(study, monkeypatch):
+def test_a_run_lost_before_tuning_is_reported_in_one_line(study, monkeypatch):
     run = accurate.nominal(study, study.case.cascade)
     held = dataclasses.replace(run, lost_at=math.inf, lost_code=0)
     lost = dataclasses.replace(run, lost_at=0.003, lost_code=TOUCHED)
@@ -372,7 +372,7 @@ def test_a_run_lost_before_tuning_is_one_line(study, monkeypatch):
     assert len(figure.axes) == 4 * 3
 
 
-def test_rows_of_the_picture_are_of_the_run_that_they_name(study, monkeypatch):
+def test_each_row_of_the_picture_shows_the_run_of_its_label(study, monkeypatch):
     before = accurate.nominal(study, study.case.cascade)
     rows = before.rows
     other = dataclasses.replace(
@@ -405,11 +405,11 @@ def test_ranges_and_their_sources_are_in_the_table():
     assert "- controller.position.c: w/30 to 10 w" in table
 
 
-def test_the_formula_names_every_term_once():
+def test_the_formula_contains_every_term_once():
     assert sorted(re.findall(r"[a-z]{2,}", breakdown.FORMULA)) == sorted(TERMS)
 
 
-def test_the_section_on_gradients_is_three_whole_tables():
+def test_the_section_on_gradients_has_three_complete_tables():
     three = {"samples": 5, **{way: [1.0, 2.0] for way in ("forward", "reverse", "differences")}}
     three["verdicts"] = [gradient.AGREED, "differences are inconclusive: 1 with a step of 0.001, -1 with 0.0005"]
     noise = {name: [1.0, 2.0] for name in ("gradient", "standard_error", "ratio")}
@@ -418,7 +418,7 @@ def test_the_section_on_gradients_is_three_whole_tables():
     shown = render_page("\n".join(extras.gradient(facts)), {}, "t")
     assert shown.count("<table>") == 3
     assert shown.count("<td") == 2 * 5 + 3 + 2 * 4
-    assert "The three agree on 1 of 2 gains" in shown
+    assert "The three derivatives agree for 1 of 2 gains" in shown
     assert "Differences compare two runs" in shown
     three["verdicts"] = [gradient.AGREED] * 2
     assert "Differences compare two runs" not in "".join(extras.gradient(facts))
@@ -434,15 +434,15 @@ WAYS = {
         0.4e-2,
         "differences are inconclusive: -2.31e-02 with",
     ),
-    "jumps": (-9.0, -9.0, -9.5, -9.5, "differences differ from both modes by 5.3 %, whatever their step"),
+    "jumps": (-9.0, -9.0, -9.5, -9.5, "differences differ from both modes by 5.3 % with both steps"),
     "modes apart": (1.0, 1.1, 1.0, 1.0, "forward and reverse mode differ by 9.1 %"),
     "all as good as 0": (1e-12, -3e-12, 2e-11, -4e-11, gradient.AGREED),
-    "no number": (math.nan, 1.0, 1.0, 1.0, "not every way gives a finite number"),
+    "no number": (math.nan, 1.0, 1.0, 1.0, "a derivative is not finite"),
 }
 
 
 @pytest.mark.parametrize("kind", WAYS)
-def test_three_ways_to_a_derivative_are_judged(kind):
+def test_the_agreement_of_three_derivatives_is_judged(kind):
     *ways, words = WAYS[kind]
     assert gradient.agreement(*ways, floor=1e-7).startswith(words)
 

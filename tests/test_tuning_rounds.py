@@ -31,14 +31,14 @@ def seed_of(which, seed=1):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2**31 - 1])
-def test_the_three_ensembles_have_seeds_of_their_own(seed):
+def test_the_three_ensembles_have_different_seeds(seed):
     assert len({seed_of(which, seed) for which in (TRAINING, VALIDATION, HELD_OUT)}) == 3
     assert seed_of(TRAINING, seed) == seed
     # and of no other study's nearby
     assert not {seed_of(VALIDATION, seed), seed_of(HELD_OUT, seed)} & set(range(seed, seed + 1000))
 
 
-def test_the_best_gains_are_found_and_nobody_is_lost(monkeypatch, tmp_path):
+def test_the_best_gains_are_found_and_no_member_is_lost(monkeypatch, tmp_path):
     world = World()
     found, gains = tuned(monkeypatch, tmp_path, world)
     # on a bowl: as near as the search's shortest step, 1e-3, and its stall, 1e-3 of the loss, allow: sqrt(1e-3)
@@ -50,7 +50,7 @@ def test_the_best_gains_are_found_and_nobody_is_lost(monkeypatch, tmp_path):
     assert seed_of(HELD_OUT) not in world.seeds("terms") | world.seeds("metrics")  # held-out members are unused
 
 
-def test_members_of_another_seed_that_are_lost_join_and_are_held(monkeypatch, tmp_path):
+def test_lost_validation_members_join_and_are_held(monkeypatch, tmp_path):
     fragile = {3, 7}
 
     def limit(seed, number, stressed, accurate):
@@ -68,7 +68,7 @@ def test_members_of_another_seed_that_are_lost_join_and_are_held(monkeypatch, tm
     np.testing.assert_allclose(found.members.noise_factor[joined], 1.1)
 
 
-def test_members_of_another_seed_with_large_errors_join_and_count(monkeypatch, tmp_path):
+def test_validation_members_with_large_errors_join_and_count(monkeypatch, tmp_path):
     """One of ten validation members has large errors at the gains that are best for the training members."""
     slope = 100.0
     world = World(rare=lambda seed, number: slope if (seed, number) == (seed_of(VALIDATION), 3) else 0.0)
@@ -90,8 +90,8 @@ def test_without_validation_there_are_no_validation_calls(monkeypatch, tmp_path)
     assert found.lost == 0
 
 
-def test_of_several_answers_that_lose_members_the_one_that_loses_least_is_returned(monkeypatch, tmp_path):
-    """Three rounds, after which 3, 1 and 2 members are lost, whatever the gains."""
+def test_the_answer_that_loses_the_fewest_members_is_returned(monkeypatch, tmp_path):
+    """There are three rounds, after which 3, 1 and 2 members are lost for all gains."""
     monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 3)
     lost = iter([3, 1, 2])
 
@@ -105,7 +105,7 @@ def test_of_several_answers_that_lose_members_the_one_that_loses_least_is_return
 
         @property
         def trial(self):
-            """Whether the last call was for the whole validation ensemble."""
+            """Return whether the last call was for the whole validation ensemble."""
             kind, seed, numbers, _ = self.calls[-1]
             return kind == "terms" and seed == seed_of(VALIDATION) and len(numbers) == 10
 
@@ -134,14 +134,14 @@ def test_steps_that_do_not_resolve_the_answer_are_halved(monkeypatch, tmp_path):
     assert found.problem.engine.rollouts > everyone
 
 
-def test_steps_that_never_resolve_it_are_said_to_be_so(monkeypatch, tmp_path):
+def test_steps_that_never_resolve_the_answer_are_reported(monkeypatch, tmp_path):
     found, _ = tuned(monkeypatch, tmp_path, World(bias=lambda substeps: 0.5))
     assert found.error.relative == pytest.approx(0.5)
     assert not found.error.resolved
 
 
 def test_members_that_only_accurate_steps_lose_join_too(monkeypatch, tmp_path):
-    """The first four members of the training ensemble are run by accurate steps, which lose one above c = 40."""
+    """The first four training members are simulated with accurate steps, which lose one of them above c = 40."""
 
     def limit(seed, number, stressed, accurate):
         return 40.0 if (seed, number) == (1, 2) and (stressed or accurate) else math.inf
@@ -153,14 +153,14 @@ def test_members_that_only_accurate_steps_lose_join_too(monkeypatch, tmp_path):
     assert found.lost == 0
 
 
-def test_where_every_member_is_lost_there_is_nothing_to_go_on_with(monkeypatch, tmp_path):
+def test_a_search_that_loses_every_member_ends(monkeypatch, tmp_path):
     found, _ = tuned(monkeypatch, tmp_path, World(limit=lambda seed, number, *_: 1e-3))
     assert found.lost == 10  # the whole validation ensemble
     assert found.error is None
 
 
-def test_an_interrupted_study_goes_on_where_it_was(monkeypatch, tmp_path):
-    """Ctrl-C in its second round; resumed, it ends at the gains of an uninterrupted one, to the bit."""
+def test_an_interrupted_search_is_resumed_where_it_ended(monkeypatch, tmp_path):
+    """Ctrl-C interrupts the second round. The resumed search gives the gains of an uninterrupted one, bit by bit."""
     stop = False
 
     def limit(seed, number, stressed, accurate):

@@ -1,4 +1,4 @@
-"""The tuner's gradients, three ways; its search: no recompilation, identical when resumed; its command."""
+"""The tuner's gradients in three ways, and its search: no recompilation, equal results if resumed, and the command."""
 
 import dataclasses
 import json
@@ -56,7 +56,7 @@ def engines():
 
 
 @pytest.mark.slow
-def test_gradient_three_ways(engines):
+def test_the_gradient_agrees_in_three_ways(engines):
     forward, reverse, members, x = engines
     value, slopes, _ = forward.gradient(x[None], members, WEIGHTS)
     other, back, _ = reverse.gradient(x[None], members, WEIGHTS)
@@ -74,7 +74,7 @@ def test_gradient_three_ways(engines):
     np.testing.assert_allclose(slopes[0, :, 0], differences.T, rtol=1e-6, atol=1e-6 * size)
 
 
-def test_lanes_are_rollouts(engines):
+def test_lanes_equal_rollouts(engines):
     """A lane, whose noise is drawn beforehand, equals the rollout of its member."""
     forward, _, members, x = engines
     problem = forward.objective
@@ -127,7 +127,7 @@ def test_members_do_not_depend_on_their_number():
     assert np.all(errors(problem.members(6, 2), 0) != errors(few, 0))
 
 
-def test_stressed_members_hear_more_and_count_by_being_held():
+def test_stressed_members_have_more_noise_and_only_their_survival_counts():
     problem = objective()
     members = problem.training(5, 2, 2, 1.5, 1.25)
     np.testing.assert_array_equal(members.noise_factor, [1.0, 1.0, 1.5, 1.5])
@@ -173,7 +173,7 @@ def test_bfgs_solves_a_quadratic_in_few_steps():
     assert last < 1e-8 * first
 
 
-def test_a_refused_trial_of_bfgs_teaches_curvature():
+def test_a_refused_trial_of_bfgs_updates_the_curvature():
     """On the parabola 50 x^2 the first step, 0.3, overshoots; from its gradient the next trial is the minimum."""
     method, start = bfgs(), jnp.asarray([0.1])
 
@@ -192,7 +192,7 @@ def test_a_refused_trial_of_bfgs_teaches_curvature():
 
 
 @pytest.mark.parametrize("name", [n for n in NAMES if n != "bfgs"])
-def test_every_optimiser_descends_and_steps_back(name):
+def test_every_optimiser_descends_and_backtracks_after_a_refused_trial(name):
     method = optimiser(name, 0.02)
     last, first = minimise(60, method)
     assert last < 0.9 * first
@@ -238,7 +238,7 @@ def test_the_search_descends_and_keeps_the_best(small):
     assert again == pytest.approx(best, rel=1e-9)
 
 
-def test_the_screen_keeps_the_best_of_all_that_hold(small):
+def test_the_screen_keeps_the_best_points_that_hold_the_rotor(small):
     """With this few points, only points that were worse on some members are discarded before all members are used."""
     engine, goal, members, start = small
     points = initial_points(engine.objective, goal.conditions, start, 8, seed=1)
@@ -251,7 +251,7 @@ def test_the_screen_keeps_the_best_of_all_that_hold(small):
     assert best[0] <= best[1]
 
 
-def test_the_neighbourhoods_are_there_and_no_larger():
+def test_the_points_around_the_start_fill_two_neighbourhoods():
     x = np.array([1.0, -2.0, 0.5])
     beside = around(x, 128, 3)
     np.testing.assert_array_equal(beside[0], x)
@@ -262,7 +262,7 @@ def test_the_neighbourhoods_are_there_and_no_larger():
         assert np.all(away.max(axis=0) > 0.9 * reach)
 
 
-def test_looks_end_when_two_in_a_row_gain_little_or_at_their_number():
+def test_repeated_searches_end_after_two_small_improvements_or_the_largest_number():
     assert should_restart([0.0])
     assert should_restart([0.0, -0.5 * LEAST_IMPROVEMENT])  # one that gains nothing may be chance
     assert not should_restart([0.0, -0.5 * LEAST_IMPROVEMENT, -0.8 * LEAST_IMPROVEMENT])
@@ -355,7 +355,7 @@ def test_a_search_whose_checkpoint_was_damaged_is_the_uninterrupted_one(small, t
     assert run(small, checkpoint_file=checkpoint_file, resume=True).ended
 
 
-def test_the_second_phase_goes_back_to_what_was_given_where_the_path_is_worse(small):
+def test_the_second_phase_restarts_from_its_start_if_its_path_is_worse(small):
     engine, goal, members, start = small
     descent = Descent(goal, "bfgs", 0.1)
     best, x = best_of(run(small))[0], initial_points(engine.objective, goal.conditions, start, 2, seed=1)[-2:]
@@ -368,7 +368,7 @@ def test_the_second_phase_goes_back_to_what_was_given_where_the_path_is_worse(sm
 
 
 @pytest.mark.parametrize("phase", [0, 1])
-def test_a_phase_goes_on_by_values_where_derivatives_are_no_numbers(small, phase):
+def test_a_phase_continues_by_values_if_derivatives_are_not_finite(small, phase):
     """If a loop chatters, losses are finite but derivatives overflow."""
     engine, goal, members, start = small
     whole = run(small)
@@ -394,7 +394,7 @@ def test_a_phase_goes_on_by_values_where_derivatives_are_no_numbers(small, phase
     assert found.phase == 1
 
 
-def test_ctrl_c_keeps_the_best(small):
+def test_ctrl_c_keeps_the_best_gains(small):
     def stop(kept, seconds):
         if kept.iteration == 3:
             raise KeyboardInterrupt
@@ -405,7 +405,7 @@ def test_ctrl_c_keeps_the_best(small):
     assert np.isfinite(best_of(found)[1])
 
 
-def test_steps_that_are_no_numbers_are_skipped(small):
+def test_steps_that_are_not_finite_are_skipped(small):
     _, goal, *_ = small
     descent = Descent(goal, "adam", 0.1)
     starts = descent.begin(jnp.zeros((1, 4)))
@@ -464,14 +464,14 @@ def test_everything_in_tune_has_a_default():
         ({"learning_rate": 0}, "tune.learning_rate = 0"),
     ],
 )
-def test_bad_settings_are_refused_in_words(tune, says):
+def test_bad_settings_are_refused_with_a_message(tune, says):
     with pytest.raises(ValueError, match="tune") as raised:
         parsed(tune)
     assert says in str(raised.value)
     assert "\n" not in str(raised.value)
 
 
-def test_a_gain_is_not_both_spread_and_tuned():
+def test_a_gain_that_is_both_spread_and_tuned_is_refused():
     with pytest.raises(ValueError, match=r"spread\.controller\.position\.c"):
         parsed({}, spread={"controller.position.c": {"percent": 5}})
 
@@ -527,7 +527,7 @@ def test_the_command_tunes_a_case_that_simulate_runs(tmp_path, capsys):
 
 
 @pytest.mark.thorough
-def test_a_killed_tuning_goes_on_and_damage_is_found(tmp_path):
+def test_a_killed_search_is_resumed_and_damage_is_detected(tmp_path):
     path, whole, out = tmp_path / "case.toml", tmp_path / "whole", tmp_path / "out"
     path.write_text(CASE)
     assert command(path, "--out", whole).returncode == 0
@@ -560,7 +560,7 @@ def test_a_killed_tuning_goes_on_and_damage_is_found(tmp_path):
     assert command(path, "--out", whole, "--resume").returncode == fresh.returncode
 
 
-def test_bad_input_ends_with_2_and_writes_nothing(tmp_path, capsys):
+def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, capsys):
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(CASE + 'optimiser = "best"\n')
     assert main([str(path), "--out", str(out)]) == 2

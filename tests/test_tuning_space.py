@@ -80,7 +80,7 @@ def test_every_interval_has_gains_well_within_and_their_coordinates(low, way, sh
     assert low <= float(gain.decode(jnp.asarray(-700.0))) <= float(gain.decode(jnp.asarray(700.0))) <= gain.high
 
 
-def test_gains_outside_the_space_are_the_same_objects():
+def test_gains_outside_the_space_are_not_copied():
     cascade = Cascade(position=position.SlidingMode(17.0, 25.0, 25.0))
     space = Space((Gain(C),))
     decoded = space.decode(jnp.asarray([1.0]), cascade)
@@ -94,7 +94,7 @@ def test_gains_outside_the_space_are_the_same_objects():
     ("gains", "says"),
     [((), "empty"), ((Gain(C), Gain(C)), "twice"), ((Gain(C, 5.0, 2.0),), "low < high")],
 )
-def test_a_space_that_makes_no_sense_is_refused(gains, says):
+def test_an_impossible_space_is_refused(gains, says):
     with pytest.raises(ValueError, match=says):
         Space(gains)
 
@@ -104,7 +104,7 @@ def test_a_start_outside_the_bounds_is_refused_by_its_path():
         Space((Gain(C, 100.0),)).encode([17.0])
 
 
-def test_tunable_gains_are_the_positive_ones():
+def test_only_positive_gains_are_tunable():
     found = tunable(Cascade())
     assert {"controller.position.c", "controller.inversion.gamma", "controller.current.k_i"} <= set(found)
     assert "controller.inversion.i_ref" not in found
@@ -120,7 +120,7 @@ def test_gains_without_effect_are_left_out():
 
 
 def test_a_processor_tunes_finite_steepnesses_by_default():
-    """In continuous time no steepness, and on a processor no sign that has none."""
+    """In continuous time no steepness is tuned. On a processor, those of set-valued signs are not tuned."""
     text = {"controller": {"inversion": {"p": math.inf}}, "actuator": {"u_max": 200.0}}
     continuous = case_and_tune({"actuator": {"u_max": 200.0}})[1].space.paths
     assert not [path for path in continuous if path.endswith(".p")]
@@ -130,7 +130,7 @@ def test_a_processor_tunes_finite_steepnesses_by_default():
 
 
 @pytest.mark.parametrize("name", ["tracking", "regulation"])
-def test_what_the_template_says_of_tuning_can_be_uncommented(name, tmp_path):
+def test_the_commented_tune_table_of_the_template_is_valid(name, tmp_path):
     head, heading, tail = template(name).partition("# [tune]")
     path = tmp_path / "mine.toml"
     path.write_text(head + "\n".join(line.removeprefix("# ") for line in (heading + tail).splitlines()))
@@ -157,7 +157,7 @@ def test_the_gradient_of_cvar_is_that_of_the_worst_members():
     np.testing.assert_allclose(jax.grad(CVaR(0.7))(jnp.asarray([5.0, 1.0, 4.0, 2.0, 3.0])).sum(), 1.0)
 
 
-def test_risks_are_ordered_and_scale():
+def test_risks_are_ordered_and_homogeneous():
     losses = jnp.asarray(np.random.default_rng(0).exponential(size=40))
     mean, soft, tail = (float(risk(losses)) for risk in (Mean(), SoftWorst(), CVaR(0.9)))
     assert mean < soft < float(losses.max())
@@ -187,8 +187,8 @@ def test_tracking_is_the_settled_mean_square():
     assert float(found["survival"]) == float(found["clearance"]) == 0.0
 
 
-def test_terms_have_no_dimension():
-    """Lengths of another unit, with volts as they are: nothing but tracking's own ratio enters."""
+def test_the_terms_of_the_loss_are_dimensionless():
+    """If the unit of length changes and that of voltage does not, no term changes."""
     row, found = rollout(SMOOTH, TRACKING, CLOCK).trajectory.rows, []
     span = blank(INSTANT_TREE)._replace(
         time=jnp.asarray(1e-4), densities=Densities(*map(jnp.asarray, (10.0, 400.0, 5.0)))
@@ -202,12 +202,12 @@ def test_terms_have_no_dimension():
 
 
 def lost_late(gamma):
-    """Survival term of a loop whose gamma is too small to hold: the rotor is lost within the horizon."""
+    """Return the survival term of a loop whose gamma is too small: the rotor is lost within the horizon."""
     cascade = dataclasses.replace(SMOOTH, inversion=inversion.Adaptive(gamma, 25.0))
     return terms(cascade, dataclasses.replace(TRACKING, initial=Initial(1e-4)), loss_for(TRACKING, 0.01))["survival"]
 
 
-def test_survival_points_to_gains_that_keep_the_rotor_longer():
+def test_the_derivative_of_the_survival_points_to_longer_survival():
     value, slope = jax.jvp(lost_late, (3e4,), (3e4,))
     assert 0 < float(value) < 1
     assert float(slope) < 0
@@ -220,7 +220,7 @@ def test_survival_points_to_gains_that_keep_the_rotor_longer():
 # --- conditions ---
 
 
-def test_bounds_are_the_theorems():
+def test_the_bounds_are_those_of_the_theorem():
     found = {b.symbol: b.value for b in bounds(SMOOTH, TRACKING, CLOCK)}
     assert found["Q_z"] == pytest.approx(float(TRACKING.plant.a))
     assert found["Q_i"] == 0.0

@@ -62,7 +62,7 @@ def begins(monkeypatch, count, tables=None, **tune):
     return dict(zip(GAINS, gains[1:].T, strict=True)), made
 
 
-def test_starts_reach_as_far_as_the_theory_suggests(monkeypatch):
+def test_starts_cover_the_ranges_derived_from_the_plant(monkeypatch):
     given = {"bounds": {"controller": {"position": {"p": [2.0, 90.0]}}}}
     found, made = begins(monkeypatch, 64, **given)
     for name, gains in found.items():
@@ -80,8 +80,8 @@ def test_starts_reach_as_far_as_the_theory_suggests(monkeypatch):
     assert 2.0 < found["position.p"].min() < 2.5 < 80.0 < found["position.p"].max() < 90.0  # bounds that are given hold
 
 
-def test_a_rotor_that_stands_still_has_starts_too(monkeypatch):
-    """Delta_1 is 0 there, and no range comes from a zero."""
+def test_a_rotor_at_rest_has_starts(monkeypatch):
+    """Delta_1 is 0 for a rotor at rest, but no range starts at 0."""
     found, _ = begins(monkeypatch, 16, {"reference": {"kind": "constant", "value": 0.0}})
     for name, gains in found.items():
         assert gains.max() > 3 * gains.min(), name
@@ -90,8 +90,8 @@ def test_a_rotor_that_stands_still_has_starts_too(monkeypatch):
 # --- the judge ---
 
 
-def test_the_judge_sees_every_member_of_its_own_ensemble_once(monkeypatch):
-    """And in finer steps than the search's, 3, whose error is not the judge's."""
+def test_the_judge_evaluates_every_held_out_member_once(monkeypatch):
+    """The judge also uses finer steps than the search, whose 3 substeps have an error here."""
     world = World(limit=lambda seed, number, *_: 40.0 if number == 5 else math.inf)
     world.bias = lambda substeps: 0.5 if substeps == 3 else 0.0
     made = study(monkeypatch, world)
@@ -157,7 +157,7 @@ def test_members_that_only_accurate_steps_lose_are_named(monkeypatch):
 
 
 def test_an_error_without_a_relative_value_is_given_in_metres(monkeypatch):
-    """Where the accurate one is 0, and where there is none."""
+    """This is the case if the reference error is 0, or if there is none."""
     error = step_error(study(monkeypatch, World()), np.zeros(2))
     zero = error._replace(search_m=1e-6, reference_m=0.0, relative=math.nan)
     assert zero.refuted == "coarser steps give a settled rms error of 1e-06 m against 0 m"
@@ -165,7 +165,7 @@ def test_an_error_without_a_relative_value_is_given_in_metres(monkeypatch):
     assert "of 1e-06 m against no number" in describe(zero._replace(reference_m=math.nan))
 
 
-def test_where_nobody_is_held_by_both_nothing_is_said_of_the_step(monkeypatch):
+def test_without_members_held_by_both_steps_there_is_no_step_error(monkeypatch):
     made = study(monkeypatch, World(limit=lambda *_: 1e-3))
     error = step_error(made, at(made, 80.0, 60.0))
     assert math.isnan(error.relative)
@@ -197,7 +197,7 @@ def test_slices_run_along_each_gain_through_the_optimum(monkeypatch):
 # --- descent ---
 
 
-def test_the_theorem_s_conditions_pull_where_the_losses_are_flat():
+def test_the_penalty_of_the_conditions_acts_where_the_loss_is_constant():
     space = Space(tuple(Gain(path) for path in PATHS))
     conditions = (Bound("controller.position.k", 50.0, "Q_z", "m/s^2"),)
     goal = Goal(space, (1.0,) * 6, Mean(), conditions, 2.0, 0.1)
@@ -210,7 +210,7 @@ def test_the_theorem_s_conditions_pull_where_the_losses_are_flat():
     assert float(flat.trial[0, 1]) > float(x[0, 1])
 
 
-def test_the_worse_half_of_the_starts_is_left_behind(monkeypatch):
+def test_the_worse_half_of_the_starts_ends_early(monkeypatch):
     world = World()
     made = study(monkeypatch, world)
     begins = np.stack([at(made, c, k) for c, k in ((3.0, 3.0), (6.0, 500.0), (900.0, 2.0), (2.0, 700.0))])
@@ -226,8 +226,8 @@ def test_the_worse_half_of_the_starts_is_left_behind(monkeypatch):
     np.testing.assert_array_equal(value[-1, worse], value[HALVINGS[0] - 1, worse])
 
 
-def test_bfgs_takes_the_same_way_whatever_the_unit_of_the_loss():
-    """The first pair of points gives the scale of the curvature: from then on f and 1000 f are descended alike."""
+def test_the_path_of_bfgs_does_not_depend_on_the_unit_of_the_loss():
+    """The first pair of points sets the scale of the curvature. After it, the paths for f and 1000 f are equal."""
     hessian, centre = jnp.diag(jnp.asarray([4.0, 60.0, 900.0])), jnp.asarray([0.5, -0.3, 0.2])
 
     def way(unit):
@@ -271,7 +271,7 @@ def everything(tmp_path_factory):
     return world, code, summary, out, made
 
 
-def test_tuned_gains_are_evaluated_on_members_that_nothing_else_used(everything):
+def test_tuned_gains_are_evaluated_on_members_that_the_search_did_not_use(everything):
     world, code, summary, _, made = everything
     training, validation, held_out = seeds(made.tune.budget)
     assert summary["held_out_seed"] == held_out
@@ -285,7 +285,7 @@ def test_tuned_gains_are_evaluated_on_members_that_nothing_else_used(everything)
     assert summary["after"]["settled_rms_error_m"] < summary["before"]["settled_rms_error_m"]
 
 
-def test_tuned_toml_holds_the_gains_and_can_be_read(everything):
+def test_tuned_toml_contains_the_gains_and_can_be_read(everything):
     world, _, summary, out, _ = everything
     written = tomllib.loads((out / "tuned.toml").read_text())
     tuned = [written["controller"]["position"][name] for name in ("c", "k")]
@@ -294,23 +294,23 @@ def test_tuned_toml_holds_the_gains_and_can_be_read(everything):
     case_from(written)
 
 
-def test_gradients_reports_three_ways_to_the_same_number(everything):
+def test_the_gradient_report_compares_three_derivatives(everything):
     _, _, summary, out, _ = everything
     found = summary["gradient"]
     ways = [np.array(found["three_ways"][name]) for name in ("forward", "reverse", "differences")]
-    # of both modes; that those of a real engine agree: test_tuning_search.py::test_gradient_three_ways
+    # of both modes; that those of a real engine agree: test_tuning_search.py::test_the_gradient_agrees_in_three_ways
     np.testing.assert_allclose(ways[1], (1 + REVERSE) * ways[0], rtol=1e-12)
     # h^4 of the extrapolated differences, of slopes that vanish at the optimum: of the size of the loss
     np.testing.assert_allclose(ways[2], ways[0], rtol=1e-6, atol=1e-9 * FLOOR)
     assert found["three_ways"]["agree"]
-    assert "The three agree on 2 of 2 gains" in (out / "report.md").read_text()
+    assert "The three derivatives agree for 2 of 2 gains" in (out / "report.md").read_text()
     assert len(found["horizons"]) > 1
     assert "gradient" in (out / "report.md").read_text().lower()
 
 
 @pytest.mark.parametrize(("samples", "horizons"), [(2, [1, 2]), (3, [1, 2, 3]), (40, [5, 10, 20, 40])])
-def test_horizons_have_samples_and_settled_ones_among_them(monkeypatch, samples, horizons):
-    """Each once; and where the loss is 0 there is no logarithm of it."""
+def test_each_horizon_of_the_gradient_report_has_settled_samples(monkeypatch, samples, horizons):
+    """Each horizon occurs once, and a horizon with loss 0 is omitted."""
     settle = (samples - 1) * 1e-4
     made = study(monkeypatch, World(), {"clock": {"duration": samples * 1e-4}, "run": {"settle": settle}})
     for count in horizons:
@@ -325,7 +325,7 @@ def test_horizons_have_samples_and_settled_ones_among_them(monkeypatch, samples,
 
 
 def test_gradients_of_a_knee_are_those_of_the_loss(monkeypatch):
-    """Near the knee the goal weighs clearance and survival only; both are 0 where no rotor is near its stop."""
+    """The goal of the knee weighs clearance and survival only; both are 0 if no rotor is near its stop."""
     made = study(monkeypatch, World(), objective="knee")
     x, members = at(made, 80.0, 40.0), made.objective.training(1, 4, 2, 1.2, 1.25)
     knee = made.towards_voltage(5e-5, 20.0, 1.25)
@@ -336,7 +336,7 @@ def test_gradients_of_a_knee_are_those_of_the_loss(monkeypatch):
     assert np.isfinite(np.array(gradient.signal_to_noise(knee, x, members)["gradient"])).all()
 
 
-def test_pareto_is_in_the_report_and_has_a_picture(everything):
+def test_the_front_is_in_the_report_and_has_a_picture(everything):
     _, _, summary, out, _ = everything
     assert len(summary["front"]) > 1
     assert "| lost | answer | case file |" in (out / "report.md").read_text()
@@ -345,7 +345,7 @@ def test_pareto_is_in_the_report_and_has_a_picture(everything):
 
 
 def test_a_case_from_a_pipe_is_read_once(monkeypatch, tmp_path):
-    """The second time it is empty, and tuned.toml would be of gains alone: another case."""
+    """A second read would be empty, and tuned.toml would contain the gains only."""
     study(monkeypatch, World())
     monkeypatch.setattr(tuning.command, "_tune", lambda plan, args: (plan.raw, plan.problem.case.text))
     text = dumps(document())
@@ -355,7 +355,7 @@ def test_a_case_from_a_pipe_is_read_once(monkeypatch, tmp_path):
 
 
 def test_a_file_whose_gains_could_not_be_written_is_refused_at_the_start(monkeypatch, tmp_path):
-    """Not after hours of search."""
+    """The error occurs before the search."""
     broken = "[plant]\nm = 1.0\nx = 1.0\n"
     monkeypatch.setattr("tuning.report.tuned.tuned", lambda *_: broken)
     with pytest.raises(ValueError, match=r"case.toml: plant.x = 1.0: unknown key"):
@@ -363,7 +363,7 @@ def test_a_file_whose_gains_could_not_be_written_is_refused_at_the_start(monkeyp
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unfinished_search_is_neither_lost_nor_resumed_without_resume(monkeypatch, tmp_path):
+def test_an_unfinished_search_is_kept_and_only_resumed_with_resume(monkeypatch, tmp_path):
     *_, out, _ = command(monkeypatch, tmp_path, World())
     left = {path.name for path in out.glob("checkpoint-*.npz")}
     mine = out / "checkpoint-my-net.npz"
@@ -408,8 +408,8 @@ HELD_OUT = seeds(Budget())[2]
 
 
 @pytest.mark.parametrize("status", ["lost", "stalled"])
-def test_a_member_that_accurate_steps_alone_do_not_hold_is_no_survivor(monkeypatch, tmp_path, status):
-    """The last of those that are simulated again: the four that accurate steps try as the worst come before it."""
+def test_a_member_that_accurate_steps_do_not_hold_is_not_a_survivor(monkeypatch, tmp_path, status):
+    """The member is the last of those that are simulated again, after the four worst members."""
     mine = (HELD_OUT, 5)
     if status == "lost":
         world = World(limit=lambda seed, number, _, accurate: 40.0 if accurate and (seed, number) == mine else math.inf)
@@ -424,7 +424,7 @@ def test_a_member_that_accurate_steps_alone_do_not_hold_is_no_survivor(monkeypat
     assert f"| {status} | 0 | 0 | 0 of 6 | 1 of 6 | - |" in (out / "report.md").read_text()
 
 
-def test_a_survival_that_accurate_steps_refute_is_reported_without_held_out_members(monkeypatch, tmp_path):
+def test_a_refuted_survival_is_reported_without_held_out_members(monkeypatch, tmp_path):
     world = World(limit=lambda seed, number, _, accurate: 1e-3 if accurate else math.inf)
     monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 1)
     code, summary, out, _ = command(monkeypatch, tmp_path, world, held_out=0)
@@ -435,8 +435,8 @@ def test_a_survival_that_accurate_steps_refute_is_reported_without_held_out_memb
         assert "NOT VERIFIED" in (out / name).read_text()
 
 
-def test_gains_end_where_the_template_says(monkeypatch):
-    """And the report: where ranges come from, and the ends of each gain."""
+def test_gains_stay_within_the_documented_bounds(monkeypatch):
+    """The report gives the source of each range and the bounds of each gain."""
     paths = [f"controller.{path}" for path in GAINS]
     made = study(monkeypatch, World(), gains=paths, bounds={})
     start = made.tune.space.values(made.case.cascade)
@@ -455,7 +455,7 @@ def test_gains_end_where_the_template_says(monkeypatch):
     assert f"c is then at most a fifth of the sampling rate, others {END_FACTOR:g} times their range or start" in words
 
 
-def test_the_pictures_are_of_the_case_and_of_the_tuned_laws(monkeypatch):
+def test_the_pictures_show_the_case_and_the_tuned_laws(monkeypatch):
     made = study(monkeypatch, World())
     tuned = made.objective.space.decode(jnp.asarray(at(made, 80.0, 40.0)), made.case.cascade)
     monkeypatch.setattr(tuning.command.accurate, "nominal", lambda _, cascade: float(cascade.position.c))

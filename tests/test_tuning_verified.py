@@ -76,7 +76,7 @@ def error_of(found, **changes):
     return right._replace(**changes)
 
 
-def test_what_refutes_an_answer(small):
+def test_the_reasons_that_refute_an_answer(small):
     right = error_of(small)
     assert right.refuted == ""
     assert right.resolved
@@ -96,7 +96,7 @@ def test_what_refutes_an_answer(small):
 
 
 @pytest.mark.slow
-def test_a_negligible_error_is_that_of_the_reference_for_its_gap(small):
+def test_a_negligible_error_is_that_of_the_reference_relative_to_the_gap(small):
     error = step_error(small, at(small))
     assert error.negligible_m == NEGLIGIBLE * 4e-4
     # these gains lose the rotor with both kinds of steps, so no member is held or lost in accurate steps alone
@@ -106,30 +106,30 @@ def test_a_negligible_error_is_that_of_the_reference_for_its_gap(small):
 
 @pytest.mark.slow
 def test_false_survival_is_refuted():
-    """In the steps of the search every member is held; in accurate steps every member is lost."""
+    """With the steps of the search every member is held; with accurate steps every member is lost."""
     found = problem_from(FALSE)
     x = at(found)
     members = comparison_members(found)
     assert not np.any(found.engine.terms(x[None], members)["survival"])
     error = step_error(found, x, members)
     assert error.refuted
-    assert error.unseen == error.tried == REFERENCE_MEMBERS
+    assert error.unconfirmed == error.tried == REFERENCE_MEMBERS
     np.testing.assert_array_equal(error.unheld.member, members.member)
 
 
-def test_the_worst_are_the_largest():
+def test_worst_of_returns_the_largest_values():
     assert worst_of(np.array([1.0, 5.0, 3.0, 0.0, 4.0, 2.0])).tolist() == [1, 4, 2, 5]
 
 
-def test_members_that_accurate_steps_do_not_hold_join_louder(small):
-    unseen = small.objective.chosen(1, np.array([2, 3]), 4)
-    error = error_of(small, lost=1, stalled=1, members=2, unheld=unseen)
+def test_members_that_accurate_steps_do_not_hold_join_with_more_noise(small):
+    unconfirmed = small.objective.chosen(1, np.array([2, 3]), 4)
+    error = error_of(small, lost=1, stalled=1, members=2, unheld=unconfirmed)
     joined = joining(small, np.array([7, 5]), error, 2)
     assert joined.member.tolist() == [7, 5, 2, 3]
     np.testing.assert_allclose(joined.noise_factor, [1.1, 1.1, NOISE_GROWTH**2, NOISE_GROWTH**2])
 
 
-def test_steps_are_halved_so_often_and_no_more(small):
+def test_the_number_of_halvings_of_the_steps_is_limited(small):
     steps = []
     while small is not None:
         steps.append(small.objective.clock.method.substeps)
@@ -186,8 +186,8 @@ def test_an_answer_is_confirmed_on_the_worst_members_too(run, small):
 
 
 def test_the_search_goes_on_with_members_that_are_not_confirmed(run, small):
-    unseen = small.objective.chosen(1, np.array([1]), 4)
-    answer, verdicts = run(error_of(small, stalled=1, members=3, unheld=unseen), error_of(small))
+    unconfirmed = small.objective.chosen(1, np.array([1]), 4)
+    answer, verdicts = run(error_of(small, stalled=1, members=3, unheld=unconfirmed), error_of(small))
     assert answer.good
     assert answer.members.member.size == small.tune.budget.members + small.tune.budget.stressed + 1
     assert answer.members.noise_factor.max() == NOISE_GROWTH
@@ -195,7 +195,7 @@ def test_the_search_goes_on_with_members_that_are_not_confirmed(run, small):
 
 
 @pytest.mark.slow
-def test_what_nothing_confirms_is_not_taken_for_an_answer(run, small):
+def test_an_answer_that_no_steps_confirm_is_not_confirmed(run, small):
     """The tuner tries finer steps, then earlier points of the search, and then states that no answer is confirmed."""
     nothing = error_of(small, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
     answer, verdicts = run(nothing)
@@ -254,8 +254,8 @@ def test_an_answer_confirmed_in_training_is_still_refuted_by_held_out_members(sm
 
 
 @pytest.mark.thorough
-def test_the_search_goes_on_to_where_it_is_confirmed(tmp_path, capsys):
-    """A bearing with velocity noise, whose first answers survive only in the steps of the search."""
+def test_the_search_continues_until_an_answer_is_confirmed(tmp_path, capsys):
+    """The first answers hold this bearing with velocity noise only with the steps of the search."""
     path, out = tmp_path / "case.toml", tmp_path / "out"
     hard = FALSE.replace("duration = 0.02", "duration = 0.2").replace("[clock]", "[run]\nsettle = 0.05\n[clock]")
     # the limit by default, 60 % of the supply, is not tested here: such noise needs 1 % more

@@ -33,7 +33,7 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 def answered(text, capsys):
-    """Exit code and the answer: what stands below the tables."""
+    """Return the exit code and the text below the tables."""
     code = main(["check", write(text)])
     return code, capsys.readouterr().out.partition(advice.QUESTION)[2]
 
@@ -63,7 +63,7 @@ def test_following_the_advice_ends_in_a_held_rotor_and_conditions_that_hold(caps
     assert "The rotor is held." in answer
 
 
-def test_a_held_rotor_that_fails_a_condition_is_said_to_be_held(capsys):
+def test_a_held_rotor_that_fails_a_condition_is_reported_as_held(capsys):
     code, answer = answered(SHORT + PUSHED, capsys)
     assert code == 1
     assert "1 of 5 does not" in answer
@@ -76,7 +76,7 @@ def test_a_held_rotor_that_fails_a_condition_is_said_to_be_held(capsys):
     assert answered((SHORT + PUSHED).replace("k_i = 152.0", "k_i = 220.1"), capsys)[0] == 0
 
 
-def test_a_pulse_that_breaks_the_loop_is_what_a_gain_is_set_by(capsys):
+def test_the_advised_gain_is_set_by_the_pulse_that_breaks_the_loop(capsys):
     # with the printed 7.5e4 the same pulse loses the rotor; Delta_1 of its fall is no reason to touch gamma
     code, answer = answered((SHORT + PUSHED).replace("gamma = 1e6", "gamma = 7.5e4"), capsys)
     assert code == 1
@@ -90,7 +90,7 @@ def condition(gain, against, path="controller.inversion.gamma", ideal=False, at=
     return Condition("x", f"gamma > {over}", gain, against, at, "u", gain > against, "", path, over, ideal)
 
 
-def test_no_gain_is_set_by_what_a_falling_rotor_does():
+def test_no_gain_is_advised_from_the_motion_of_a_falling_rotor():
     missed = Report([condition(1.0, 1e9), condition(1.0, 10.0, ideal=True)], [], 0.1, "touched down", "")
     assert advised(advice.advice(missed)[0]) == [("controller.inversion", "gamma", "11")]
     met = Report([condition(100.0, 1e9), condition(100.0, 10.0, ideal=True)], [], 0.1, "touched down", "")
@@ -106,13 +106,13 @@ def test_no_gain_is_set_by_what_a_falling_rotor_does():
 
 
 @pytest.mark.parametrize("against", [math.nan, math.inf])
-def test_what_is_no_number_is_said_to_be_none(against):
+def test_a_value_that_is_not_finite_is_reported_without_advice(against):
     (words,) = advice.advice(Report([condition(1.0, against)], [], math.inf, "", ""))
     assert "not finite" in words
     assert not advised(words)
 
 
-def test_a_stalled_run_decides_nothing(capsys, monkeypatch):
+def test_a_stalled_run_gives_no_verdict_on_the_rotor(capsys, monkeypatch):
     case = read_case(write(SHORT))
     report = check(case.cascade, case.scenario, case.clock)
     assert not report.stalled
@@ -128,7 +128,7 @@ def test_a_stalled_run_decides_nothing(capsys, monkeypatch):
         assert word in said
 
 
-def test_simulate_says_where_to_look(capsys):
+def test_simulate_names_the_commands_to_use_after_a_loss(capsys):
     lost = write(SHORT + "[controller.inversion]\ngamma = 1000.0\n")
     assert main(["simulate", lost]) == 1
     said = capsys.readouterr().err
@@ -146,7 +146,7 @@ WORDS = {
 
 
 @pytest.mark.parametrize("kind", STATUSES)
-def test_every_command_says_the_same_of_a_rotor(kind, capsys, monkeypatch):
+def test_every_command_reports_the_same_status_of_a_rotor(kind, capsys, monkeypatch):
     lost_at, stalled = STATUSES[kind]
     others = [words for other, words in WORDS.items() if other != kind]
     report = Report([condition(2.0, 1.0)], [], lost_at, "touched down", "", stalled)
@@ -173,7 +173,7 @@ def test_every_command_says_the_same_of_a_rotor(kind, capsys, monkeypatch):
         assert not [other for other in others if other in words], place
 
 
-def test_the_fall_is_the_last_tenth():
+def test_the_last_tenth_of_a_lost_run_is_its_fall():
     early = Report([condition(1.0, 30.0, at=0.05), condition(5.0, 4.0, ideal=True)], [], 0.1, "touched down", "")
     assert advised(advice.advice(early)[0]) == [("controller.inversion", "gamma", "33")]
 

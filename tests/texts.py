@@ -17,7 +17,7 @@ def write(text, name="case.toml"):
 
 
 def piped(text):
-    """The name of a pipe that holds this text, once."""
+    """Return the name of a pipe from which this text can be read once."""
     there, here = os.pipe()
     os.write(here, text.encode())
     os.close(here)

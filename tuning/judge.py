@@ -76,8 +76,8 @@ class StepError(NamedTuple):
     """difference of the errors (m) below which the steps count as resolved"""
 
     @property
-    def unseen(self) -> int:
-        """Number of members that are held with coarse steps but not with accurate ones."""
+    def unconfirmed(self) -> int:
+        """Number of members that are held with coarse steps but lost or stalled with accurate ones."""
         return self.lost + self.stalled
 
     @property
@@ -94,11 +94,11 @@ class StepError(NamedTuple):
             return f"accurate steps cannot decide {self.stalled} of {self.tried} members tried (they stall)"
         if not self.members:
             return "no member compared is held by both"
-        return "" if self.resolved else f"coarser steps give a settled rms error {self.off}"
+        return "" if self.resolved else f"coarser steps give a settled rms error {self.difference_text}"
 
     @property
-    def off(self) -> str:
-        """The error of the coarse steps, for a sentence: relative, or both values if the reference is 0."""
+    def difference_text(self) -> str:
+        """Difference of the two errors as part of a sentence: in per cent, or both values if the reference is 0."""
         if math.isfinite(self.relative):
             return f"off by {100 * self.relative:.2g} %"
         found = (f"{x:.2g} m" if math.isfinite(x) else "no number" for x in (self.search_m, self.reference_m))
@@ -112,8 +112,8 @@ class StepError(NamedTuple):
 
 def describe(error: StepError) -> str:
     """Return the result of the comparison as a phrase."""
-    described = error.members and not error.unseen
-    return f"settled rms error {error.off} on {error.members} members" if described else error.refuted
+    described = error.members and not error.unconfirmed
+    return f"settled rms error {error.difference_text} on {error.members} members" if described else error.refuted
 
 
 def comparison_members(problem: TuningProblem) -> Members:
@@ -144,16 +144,16 @@ def compare_metrics(
 ) -> StepError:
     """Compare the members' metrics [n] by coarse steps (`ours`) with those by accurate steps (`theirs`)."""
     ended = [np.isfinite(metrics["lost_at_s"]) for metrics in (ours, theirs)]
-    held, unseen = ~(ended[0] | ended[1]), ended[1] & ~ended[0]
-    stalled = unseen & theirs["stalled"]
+    held, unconfirmed = ~(ended[0] | ended[1]), ended[1] & ~ended[0]
+    stalled = unconfirmed & theirs["stalled"]
     search_m, reference_m = (
         rms(metrics["settled_rms_error_m"][held]) if held.any() else math.nan for metrics in (ours, theirs)
     )
     relative = search_m / reference_m - 1 if reference_m > 0 else math.nan
-    those: Members = jax.tree.map(lambda a: a[unseen], members)
+    unheld: Members = jax.tree.map(lambda a: a[unconfirmed], members)
     negligible = NEGLIGIBLE * float(np.asarray(problem.objective.loss.s_0))
-    both, lost = int(held.sum()), int((unseen & ~stalled).sum())
-    return StepError(search_m, reference_m, relative, both, len(held), lost, int(stalled.sum()), those, negligible)
+    both, lost = int(held.sum()), int((unconfirmed & ~stalled).sum())
+    return StepError(search_m, reference_m, relative, both, len(held), lost, int(stalled.sum()), unheld, negligible)
 
 
 def held(metrics: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.control.base import set_valued_signs
-from ambjax.control.cascade import USUAL
+from ambjax.control.cascade import DEFAULT_LAWS
 from ambjax.linear import Analysis, Injection, analyse, frequency_lines, linearise
 from ambjax.linear.injection import injection_of
 from ambjax.linear.member_responses import Responses, member_responses
@@ -65,7 +65,7 @@ def injects(problem: TuningProblem) -> bool:
 
 def decides(problem: TuningProblem) -> bool:
     """Return whether only injections decide: if a sign is set-valued, no linear loop describes its chattering."""
-    return injects(problem) and any(set_valued_signs(getattr(problem.case.cascade, stage)) for stage in USUAL)
+    return injects(problem) and any(set_valued_signs(getattr(problem.case.cascade, stage)) for stage in DEFAULT_LAWS)
 
 
 def injections(

@@ -72,7 +72,7 @@ def outputs_of(commands: str) -> dict[str, tuple[str, str]]:
 BITS = {
     "saturated": "u is at its limit",
     "refused": "a reading is NaN, beyond its limit or too far from the prediction, which replaces it",
-    "failed": "a law returned no finite number: its state is kept, u is held",
+    "failed": "a law returned a value that is not finite: its state is kept, u is held",
     "singular": "(z, i_ref) is near the singular curve of Eq. (9)",
     "safe": "u is 0, the laws keep their states: more than guard.samples readings in a row, or all so far, are refused",
     "invalid": "the reference, params->processor.delay or a steepness p is NaN or out of range: u is held",

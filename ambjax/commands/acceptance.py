@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from ambjax.cases.reader import Case
 from ambjax.commands.outputs import table
 from ambjax.control.base import set_valued_signs
-from ambjax.control.cascade import USUAL
+from ambjax.control.cascade import DEFAULT_LAWS
 from ambjax.linear import Analysis, analyse, linearise
 from ambjax.world.coil_limits import difference
 
@@ -66,7 +66,7 @@ def acceptance(case: Case) -> tuple[dict[str, object], str]:
 def _verdict(case: Case, loop: Analysis) -> str:
     if not loop.stable:
         return "The linearised loop is not stable at r = 0."
-    signs = any(set_valued_signs(getattr(case.cascade, stage)) for stage in USUAL)
+    signs = any(set_valued_signs(getattr(case.cascade, stage)) for stage in DEFAULT_LAWS)
     inside = " while the set-valued signs stay inside their bands" if signs else ""
     return f"Sensitivity: zone {loop.zone}, a peak of {loop.S.height:.4g} at {loop.S.frequency:.4g} Hz{inside}."
 

@@ -16,8 +16,9 @@ from ambjax.theorem.sampled_report import Delays, SampledReport
 
 Summary = dict[str, object]
 CONTINUOUS = (
-    "The tables of Theorem 1 are for continuous time: without the case's [processor], converters and "
-    "amplifier, and with a boundary layer for each sign that has none. They do not affect the verdict on this case."
+    "The tables of Theorem 1 are computed in continuous time, without the case's [processor], converters and "
+    "amplifier; a set-valued sign is replaced by a sign with a boundary layer. These tables do not affect the verdict "
+    "on this case."
 )
 
 BAND = (
@@ -29,9 +30,10 @@ BAND = (
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
-    """Check a case and print the results, first those of the loop as it will run. Return the exit code and the summary.
+    """Check a case and print the results, first those of the loop with its processor.
 
-    The exit code is 1 if a condition fails or the magnets cannot carry the rotor.
+    Returns the exit code and the summary. The exit code is 1 if a condition fails or the magnets cannot carry the
+    rotor.
     """
     from ambjax.theorem import advice
 
@@ -85,7 +87,7 @@ def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
     say(f"finding the delay margin: simulating {DELAYS} delays, twice if the rotor is lost at one of them")
     margin, unknown = delay_margin(case.cascade, case.scenario, case.clock), None
     if (processor := case.cascade.processor) is not None and processor.predict is not False:
-        say("finding the delay margin once more, for delays that the prediction does not know")
+        say("finding the delay margin again: the prediction uses the delay of the case")
         unknown = delay_margin(case.cascade, case.scenario, case.clock, known=False)
     if not args.json:
         print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")
@@ -164,9 +166,9 @@ def _print_sampled(sampled: SampledReport) -> None:
             slope.stage,
             f"{slope.slope:.4g}",
             "implicit" if slope.implicit else "explicit",
-            f"{slope.stepped:.4g}",
+            f"{slope.effective_slope:.4g}",
             f"{slope.limit:.4g}",
-            f"{slope.quiet:.4g}",
+            f"{slope.oscillation_limit:.4g}",
             "holds" if slope.holds else "FAILS",
         )
         for slope in sampled.slopes
@@ -182,7 +184,7 @@ def _print_sampled(sampled: SampledReport) -> None:
             b.signal,
             b.unit,
             "the case's" if b.noise else "none",
-            *map(number, (b.gain, b.disturbance, b.band, b.off, b.bound, b.seen)),
+            *map(number, (b.gain, b.disturbance, b.band, b.difference, b.bound, b.largest)),
             b.note,
         )
         for b in sampled.bands

@@ -17,14 +17,14 @@ from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.sliding import slides
 
 # Target duration of a chunk, s: the work lost by an interruption, and the interval of the progress bar.
-BEAT = 2.0
+CHUNK_SECONDS = 2.0
 MOST_CHUNK = 65_536
 # Members per chunk and in the pilot on an accelerator.
-BESIDE_CPU = 1024
+ACCELERATOR_CHUNK = 1024
 # The expected duration is printed above SHORT, and a faster method suggested above LONG, both in s.
 SHORT, LONG = 3.0, 60.0
 # Number of members, and metrics, in the comparison of the sliding step with adaptive steps.
-COMPARISON, BY = 16, ("settled_rms_error_m", "rms_u_V", "chatter_V")
+COMPARISON, COMPARED = 16, ("settled_rms_error_m", "rms_u_V", "chatter_V")
 
 
 class Pace(NamedTuple):
@@ -39,22 +39,25 @@ class Pace(NamedTuple):
         return self.rate if self.workers is None else self.rate / cores() * self.workers
 
     def chunk(self, members: int) -> int:
-        """Return the members per chunk: a multiple of a call, about BEAT seconds, at least two chunks per worker."""
+        """Return the members per chunk: a multiple of a call, and about CHUNK_SECONDS of work.
+
+        There are at least two chunks per worker.
+        """
         if jax.default_backend() != "cpu":
-            return min(BESIDE_CPU, members)
+            return min(ACCELERATOR_CHUNK, members)
         unit, rate = (CALL * cores(), self.rate) if self.workers is None else (CALL, self.rate / cores())
         fair = members if self.workers is None else -(-members // (2 * self.workers))
-        count = min(round(BEAT * rate), fair, MOST_CHUNK)
+        count = min(round(CHUNK_SECONDS * rate), fair, MOST_CHUNK)
         return min(max(-(-count // unit), 1) * unit, members)
 
 
 def pilot(study: Study) -> tuple[dict[str, np.ndarray], float]:
     """Simulate the first members, one call on all cores. Return their columns and the duration in s.
 
-    A run with rotors that are lost at the start compiles the program first, at little cost. A remark is printed before
-    the timing, as one call of slow members may take a minute.
+    A first run, in which all rotors are lost at the start, compiles the program at little cost. A message is printed
+    before the timed run, because one call of slow members may take a minute.
     """
-    first = min(CALL * cores() if jax.default_backend() == "cpu" else BESIDE_CPU, study.members)
+    first = min(CALL * cores() if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK, study.members)
     chunk(study, 0, first, first, lost=True)
     if first < study.members:
         say(f"timing the first {first} members ...")
@@ -88,10 +91,10 @@ def duration(seconds: float) -> str:
 
 
 def sliding_error(study: Study) -> dict[str, Any]:
-    """Compute the largest relative difference of each metric in BY between this study's steps and adaptive steps.
+    """Compute the largest relative difference of each metric in COMPARED between this study's steps and adaptive steps.
 
-    Compared are those of the first members whose rotor survives with both (None: no such member). `lost_by_one` counts
-    members that are lost or not decided with exactly one of the two.
+    The comparison uses those of the first COMPARISON members whose rotor survives with both (None: no such member).
+    `lost_by_one` counts members that are lost or not decided with exactly one of the two.
     """
     tolerance = max(TOLERANCE, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps))
     accurate = dataclasses.replace(study, clock=dataclasses.replace(study.clock, method=AdaptiveRodas3(tolerance)))
@@ -100,7 +103,7 @@ def sliding_error(study: Study) -> dict[str, Any]:
     ends = [~np.isfinite(columns["lost_at"]) for columns in (ours, theirs)]
     both = ends[0] & ends[1]
     error: dict[str, Any] = {"members": count, "lost_by_one": int((ends[0] != ends[1]).sum())}
-    for name in BY:
+    for name in COMPARED:
         a, b = (np.asarray(columns[name])[both] for columns in (ours, theirs))
         size = np.maximum(np.abs(b), np.finfo(float).tiny)  # avoids 0 / 0
         error[name] = float(np.max(np.abs(a - b) / size)) if both.any() else None
@@ -110,8 +113,8 @@ def sliding_error(study: Study) -> dict[str, Any]:
 def error_words(error: dict[str, Any]) -> str:
     """Return the error of the sliding step as text."""
     words = f"sliding step against adaptive steps, {error['members']} members: "
-    if error[BY[0]] is None:
+    if error[COMPARED[0]] is None:
         words += "none survives with both"
     else:
-        words += ", ".join(f"{name} off by {100 * error[name]:.2g} %" for name in BY) + " at most"
+        words += ", ".join(f"{name} off by {100 * error[name]:.2g} %" for name in COMPARED) + " at most"
     return f"{words}; {error['lost_by_one']} survive with only one"

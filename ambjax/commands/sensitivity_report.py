@@ -7,7 +7,7 @@ import numpy as np
 from ambjax.cases.reader import Case
 from ambjax.commands.outputs import table
 from ambjax.control.base import set_valued_signs
-from ambjax.control.cascade import USUAL
+from ambjax.control.cascade import DEFAULT_LAWS
 from ambjax.linear import Injection, MemberPeaks, Zones
 from ambjax.results.operating import OperatingPoint, SpreadPeaks, analysis_summary
 
@@ -23,7 +23,7 @@ def set_valued(case: Case) -> list[str]:
     """Return the tables of the laws with set-valued signs on a processor, whose linear loops do not describe them."""
     if case.cascade.processor is None:
         return []
-    return [f"controller.{stage}" for stage in USUAL if set_valued_signs(getattr(case.cascade, stage))]
+    return [f"controller.{stage}" for stage in DEFAULT_LAWS if set_valued_signs(getattr(case.cascade, stage))]
 
 
 def sensitivity_summary(

@@ -95,7 +95,7 @@ def _check(numbers: dict[str, Any], path: str) -> None:
     wrong = [name for name, x in numbers.items() if not (np.isfinite(x) or (UNITS.get(name) == "s" and x == math.inf))]
     if wrong:
         raise ValueError(
-            f"{path}: {', '.join(wrong)}: this run gave no finite number, so nothing is written. This is a defect of "
+            f"{path}: {', '.join(wrong)}: not finite in this run, so nothing is written. This is a defect of "
             "ambjax, not of the case: please report it with the case file."
         )
 

@@ -64,7 +64,7 @@ def _sizes(case: Case) -> Iterator[str]:
         if not low <= value <= high:
             yield f"plant.{name} = {value:g} {usual}. Is it in {slip}?"
     if plant.k_z > 0:
-        yield f"plant.k_z = {plant.k_z:g} N/m pushes the rotor away from z = 0; a bearing that restores has k_z < 0."
+        yield f"plant.k_z = {plant.k_z:g} N/m pushes the rotor away from z = 0; a restoring bearing has k_z < 0."
 
 
 def _noise(case: Case) -> Iterator[str]:
@@ -79,7 +79,7 @@ def _velocity(case: Case) -> Iterator[str]:
     perfect = sensor is None or (sensor.velocity and sensor.std_z_dot == 0)
     if perfect and not (sensor is None and case.cascade.processor is None):
         yield (
-            "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ANY ERROR, which no real sensor does. Set "
+            "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ERROR, unlike by any real sensor. Set "
             "sensor.std_z_dot, or set sensor.velocity = false and use an observer that estimates the velocity."
         )
 
@@ -91,7 +91,7 @@ def idealised(case: Case) -> str:
         parts.append("one current for both coils (plant.kind = 'two-coil' gives each its own)")
     if sensor is None or sensor.velocity:
         parts.append("a measured velocity (sensor.velocity = false, and an observer that estimates it)")
-    return f"Idealised, unlike a real bearing: {' and '.join(parts)}." if parts else ""
+    return f"Idealisations of this case, unlike a real bearing: {' and '.join(parts)}." if parts else ""
 
 
 def reversal(case: Case, most_i: float) -> Iterator[str]:
@@ -127,7 +127,11 @@ def _currents(case: Case) -> Iterator[str]:
 
 
 def _coil_voltage(scenario: Scenario, least: float) -> Iterator[str]:
-    """Yield a warning for a limit of a coil's voltage below what holds the rotor, `least` in V, or of no use."""
+    """Yield warnings about the voltage limit of the coils.
+
+    They are that the limit is below the voltage that holds the rotor, `least` (V), and that the command may exceed the
+    voltage at which the coils reach the limit.
+    """
     coil = None if scenario.amplifier is None else scenario.amplifier.coil
     if coil is None or coil.u_max is None:
         return

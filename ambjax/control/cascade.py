@@ -37,7 +37,7 @@ from ambjax.world.signals import Reference
 # Marks a law that is not given. `Cascade.__post_init__` replaces it by the default law.
 _LEFT_OUT: Any = None
 # The default law of each stage.
-USUAL = {
+DEFAULT_LAWS = {
     "observer": observer.Direct,
     "position": position.SlidingMode,
     "inversion": inversion.Adaptive,
@@ -63,7 +63,7 @@ class Cascade:
     processor: Processor | None = part(default=None, doc="processor of the controller; None: continuous time")
 
     def __post_init__(self) -> None:
-        for stage, kind in USUAL.items():
+        for stage, kind in DEFAULT_LAWS.items():
             if getattr(self, stage) is _LEFT_OUT:
                 object.__setattr__(self, stage, default_law(kind, self.model))
 
@@ -161,12 +161,12 @@ class Cascade:
         `between` is true, every delay between them. Raises ValueError as `Processor.resolved` does.
         """
         assert self.processor is not None
-        laws = {stage: with_set_valued_signs(getattr(self, stage)) for stage in USUAL}
+        laws = {stage: with_set_valued_signs(getattr(self, stage)) for stage in DEFAULT_LAWS}
         return dataclasses.replace(self, **laws, processor=self.processor.resolved(*delays, between=between))
 
     def check_smooth(self) -> None:
         """Raise ValueError for a law with a steepness of inf: in continuous time a sign must be smoothed."""
-        for stage in USUAL:
+        for stage in DEFAULT_LAWS:
             law = getattr(self, stage)
             for name in set_valued_signs(law):
                 raise ValueError(
@@ -176,7 +176,10 @@ class Cascade:
 
     def in_continuous_time(self) -> "Cascade":
         """Return the cascade without its processor. A steepness of inf becomes the default steepness for the model."""
-        laws = {stage: with_default_steepness(getattr(self, stage), self.model).in_continuous_time() for stage in USUAL}
+        laws = {
+            stage: with_default_steepness(getattr(self, stage), self.model).in_continuous_time()
+            for stage in DEFAULT_LAWS
+        }
         return dataclasses.replace(self, **laws, processor=None)
 
     def _advance(self, sample: Sample) -> Callable[..., Any]:

@@ -54,7 +54,7 @@ class GuardResult(NamedTuple):
 
 @record
 class Guard:
-    """Refuse a reading that is NaN, beyond its limit, or farther from the prediction than the rotor can be.
+    """Refuse a reading that is NaN, beyond its limit, or farther from the prediction than the rotor can have moved.
 
     The nominal model's prediction replaces a refused reading for up to `samples` successive samples. After that u = 0
     until a reading is within its limits. `with_limits` derives each number that is left out (None).
@@ -104,13 +104,13 @@ class Guard:
         step = 0.0 if sensor.bits is None else 2 * sensor.ends(scenario.plant.s_0) / 2.0**sensor.bits
         runout = 0.0 if sensor.runout is None else sum(abs(one.amplitude) for one in sensor.runout.harmonics)
         error, fall = LARGEST_NORMAL * sensor.std + step / 2 + sensor.gain * runout, model.pole * clearance
-        off = 1.0 if estimated or sensor.bandwidth is not None else abs(sensor.gain - 1)
+        velocity_error = 1.0 if estimated or sensor.bandwidth is not None else abs(sensor.gain - 1)
         values = {
             "z": sensor.gain * limit + abs(sensor.offset) + error,
             "z_dot": GAPS * model.s_0 / period,
             "i": CURRENTS * model.i_0,
             "noise": 2 * error,
-            "speed": LARGEST_NORMAL * sensor.std_z_dot + off * fall,
+            "speed": LARGEST_NORMAL * sensor.std_z_dot + velocity_error * fall,
             "samples": jnp.maximum(1 / (model.pole * period) // 1, 1.0),
         }
         own = {name: getattr(self, name) for name in values}

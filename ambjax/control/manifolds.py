@@ -1,4 +1,7 @@
-"""Sliding modes on other manifolds than the paper's: one from the start (Utkin), and a non-singular terminal one."""
+"""Position laws with other sliding manifolds than the paper's.
+
+They are Utkin's integral sliding mode, which starts on its manifold, and a non-singular terminal sliding mode.
+"""
 
 import dataclasses
 from typing import NamedTuple
@@ -52,7 +55,7 @@ class UtkinSlidingMode(PositionLaw[Array]):
         return jnp.zeros(())
 
     def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> Array:
-        """Return the x with s = 0."""
+        """Return the integral x for which s = 0."""
         return -sliding_variable(self.k_d, *inputs)
 
     def init_sampled(self, model: Plant) -> UtkinState:
@@ -85,7 +88,7 @@ class UtkinSlidingMode(PositionLaw[Array]):
         return force_for(0.0, model, motion, reference, -self.k_d * self.sigma(motion, reference) - self.k * sign)
 
     def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of k_d and sqrt(k_p): the demanded force is that at the start of the sample."""
+        """Return the larger of k_d and sqrt(k_p), 1/s, because their terms are evaluated at the start of a sample."""
         return jnp.maximum(self.k_d, jnp.sqrt(self.k_p))
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
@@ -112,9 +115,10 @@ class TerminalSlidingMode(PositionLaw[tuple[()]]):
     """v_star = (-2 k_z z/m + r_ddot + g - 2/3 c^2 l |y|^(1/2) sgn(y) - k sgn(sigma))/a, y = e_dot/(c l).
 
     Non-singular terminal sliding mode (Y. Feng, X. Yu and Z. Man, Automatica 38 (2002) 2159-2167) with the exponent
-    3/2: sigma = c (e + l |y|^(3/2) sgn(y)). On sigma = 0 the rate of the error is -c l |e/l|^(2/3) sgn(e): the error
-    e_0 ends in the finite time 3 |e_0/l|^(1/3)/c. At |e| = l the error decays as on the manifold of Eq. (4), nearer to
-    the reference faster. The root is smoothed below |y| = 0.01, and the sign with p. There is no integral.
+    3/2: sigma = c (e + l |y|^(3/2) sgn(y)). On sigma = 0 the rate of the error is -c l |e/l|^(2/3) sgn(e), so an
+    error e_0 reaches 0 in the finite time 3 |e_0/l|^(1/3)/c. At |e| = l the error decays at the same rate as on the
+    manifold of Eq. (4), and faster if it is smaller. The root is smoothed below |y| = 0.01, and the sign with p. The
+    law has no integral.
     """
 
     c: Scalar = gain(default=530.0, unit="1/s", doc="decay rate on the manifold where |e| = l; left out: w")
@@ -160,7 +164,7 @@ class TerminalSlidingMode(PositionLaw[tuple[()]]):
         return force_for(0.0, model, *inputs, -2 / 3 * self.c**2 * self.l * root - self.k * sign)
 
     def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the slope of the smoothed root at 0: the demanded force is that at the start of the sample."""
+        """Return the slope of the smoothed root at 0, 1/s, because the root is evaluated at the start of a sample."""
         return 2 / 3 * self.c * WIDTH**-0.5
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:

@@ -25,10 +25,13 @@ class Sampling(NamedTuple):
 
 
 class SlopeLimits(NamedTuple):
-    """Largest slope times T of an explicitly stepped law: for stability (`stable`), without oscillation (`quiet`)."""
+    """Limits of slope times T of a law with explicit steps.
+
+    Below `stable` the law is stable. Below `non_oscillating` it does not oscillate.
+    """
 
     stable: float
-    quiet: float
+    non_oscillating: float
 
 
 def slope_limits(late: float) -> SlopeLimits:
@@ -42,9 +45,9 @@ def slope_limits(late: float) -> SlopeLimits:
     rest = late - 1
     # characteristic polynomial r^2 (r - 1) + a ((1 - rest) r + rest): at the limit its real root r is double
     r = np.linspace(1e-6, 1.0, 20_001)
-    quiet = float(np.max(r * r * (1 - r) / ((1 - rest) * r + rest)))
+    non_oscillating = float(np.max(r * r * (1 - r) / ((1 - rest) * r + rest)))
     # Jury: a^2 rest^2 + a < 1
-    return SlopeLimits(2 / (1 + math.sqrt(1 + 4 * rest**2)), quiet)
+    return SlopeLimits(2 / (1 + math.sqrt(1 + 4 * rest**2)), non_oscillating)
 
 
 class Relay(NamedTuple):

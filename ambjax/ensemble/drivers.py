@@ -1,17 +1,17 @@
 """Sensitivity of a metric: the share of its variation that each spread quantity explains.
 
 The share is Sobol's first-order index Var(E[y | x])/Var(y), where y is the rank of the metric. The relation may have
-any shape, a V as well as a line. Ranks limit the influence of a few lost rotors and of times that are never reached
-(+inf).
+any shape, for example that of a line or of a V. Ranks limit the influence of a few lost rotors and of times that are
+never reached (+inf).
 
 E[y | x] is a least-squares fit of cosines of the rank of x, as in Plischke's EASI (Reliab. Eng. Syst. Saf. 95, 2010,
 354-360). Its bias is removed as in Tissot and Prieur (Reliab. Eng. Syst. Saf. 107, 2012, 205-213). Spearman's rank
 correlation gives the sign of the trend.
 
-Existing implementations do not fit. SALib's `rbd_fast` is the same estimator, but it ranks ties in member order, so
-that a choice of two values becomes a ramp and a constant appears to have an influence. It resamples half the members
-for its intervals, and computes neither p-values nor shares of pairs. SciPy's `sobol_indices` evaluates the model at its
-own points.
+Existing implementations are not suitable. SALib's `rbd_fast` is the same estimator, but it ranks ties in member order,
+so that a choice of two values becomes a ramp and a constant appears to have an influence. `rbd_fast` computes its
+intervals from half the members, and computes neither p-values nor shares of pairs. SciPy's `sobol_indices` evaluates
+the model at its own points.
 """
 
 import itertools
@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-# Number of cosines fitted to a metric. Six explain a V-shaped relation, or one period of a sine, to 1 %.
+# Number of cosines fitted to a metric. Six of them explain a V-shaped relation, or one period of a sine, to 1 %.
 TERMS = 6
 # Minimum number of members per cosine, not counting those that have the commonest value.
 PER_TERM = 4

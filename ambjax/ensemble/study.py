@@ -25,7 +25,7 @@ COLUMNS = 34
 # Number of equal parts of a run in each of which the variation of the voltage is computed.
 WINDOWS = 25
 # Signals of a fan chart, and the corresponding fields of a Row.
-SHOWN = {"z - r": "e_z", "u": "u_mean", "sigma": "sigma"}
+FAN_SIGNALS = {"z - r": "e_z", "u": "u_mean", "sigma": "sigma"}
 
 
 class Bands(NamedTuple):
@@ -122,7 +122,7 @@ class Study:
         every = -(-samples // times)
         count = -(-samples // every)
         cascade, scenario = self.batch(np.arange(min(members, self.members)))
-        fold = Blocks(tuple(SHOWN.values()), every, count, period)
+        fold = Blocks(tuple(FAN_SIGNALS.values()), every, count, period)
         clock = dataclasses.replace(self.clock, samples=samples)
         outcome = run_ensemble(cascade, scenario, clock, fold=fold, every=every)
         rows, folded = outcome.trajectory.rows, outcome.measured
@@ -130,7 +130,7 @@ class Study:
         ends = [(samples - 1) * period] if (samples - 1) % every else []
         t = np.append(np.asarray(rows.t[0]), ends)
         signals, extremes = {}, {}
-        for name, of in SHOWN.items():
+        for name, of in FAN_SIGNALS.items():
             values = np.where(rows.alive, getattr(rows, of), np.nan)
             signals[name] = np.concatenate([values, folded.last[of][:, None][:, : len(ends)]], axis=1)
             low, high = folded.low[of].min(axis=0), folded.high[of].max(axis=0)

@@ -49,7 +49,7 @@ LABELS = {
     "singular_at_s": "singular at",
 }
 # Metrics that an axis shows in another unit than `UNITS`: the factor and this unit.
-SHOWN = {
+AXIS_UNITS = {
     "clearance_used": (100.0, "%"),
     "settled_clearance_used": (100.0, "%"),
     "force_used": (100.0, "%"),
@@ -89,7 +89,7 @@ def size_of(values: np.ndarray, log: bool = False) -> float:
 
 def axis_of(metric: str, size: float) -> tuple[float, str, str]:
     """Return factor, label and unit of a metric's axis: (1e6, "rms error", "µm") for rms_error_m of size 2e-5."""
-    factor, unit = SHOWN[metric] if metric in SHOWN else prefix_of(_typeset(UNITS.get(metric, "")), size)
+    factor, unit = AXIS_UNITS[metric] if metric in AXIS_UNITS else prefix_of(_typeset(UNITS.get(metric, "")), size)
     return factor, LABELS.get(metric, metric), unit
 
 

@@ -46,7 +46,7 @@ def amplified(
     """Return the amplifier's voltage as functions of time with their durations (s), and the voltage at the end.
 
     `commanded`: voltages (V) from t on, each with its duration (s). With a slew-rate limit each is divided at the end
-    of its ramp, where the voltage has a corner.
+    of its ramp, where the slope of the voltage jumps.
     """
     if not isinstance(amplifier, Amplifier) or not amplifier.slow:
         return [(lambda _, u=u: u, time) for u, time in commanded], u_a

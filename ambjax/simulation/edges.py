@@ -1,7 +1,7 @@
 """Edges: instants at which the rates of a problem jump. Integrators end a step at each edge.
 
-A method has its order only on steps in which the rates are smooth. A jump inside a step causes an error of first order
-in the step length for every method.
+A method has its nominal order only on steps in which the rates are smooth. A jump inside a step causes an error of
+first order in the step length for every method.
 """
 
 import itertools
@@ -86,8 +86,8 @@ def most_inside(scenario: Scenario, period: Scalar) -> int | None:
     """Return the largest number of edges of the disturbances strictly inside one sample; None if one is traced.
 
     `period`: one sample period or several, s. The number is an upper bound for an ensemble. An edge that differs
-    between members counts as inside a sample. Two edges count as in the same sample if their distance may be shorter
-    than the period for a member within the range of those given.
+    between members counts as inside a sample. Two edges count as inside the same sample if the distance between them
+    may be shorter than the period, for any member whose edges lie between those of the given members.
     """
     edges = scenario.edges()
     if any(map(is_traced, (*edges, period))):

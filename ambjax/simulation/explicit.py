@@ -60,7 +60,7 @@ class _Explicit(FixedSteps):
         inputs = {share: problem.inputs(at(share)) for share in self.TIMES}
         x, stages, h = state, [], jnp.asarray(h)
         for share, row, weight in zip(self.TIMES, self.ROWS, self.ROWS[-1], strict=True):
-            rates, instant = problem.watched(inputs[share], x)
+            rates, instant = problem.rates_and_signals(inputs[share], x)
             stages.append(materialised(rates, x))
             combination = _combination(row)
             x = jax.tree.map(lambda x, *ks, combination=combination: combination(x, h, ks), state, *stages)

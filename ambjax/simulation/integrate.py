@@ -41,7 +41,7 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
     - `layer`: a state with the largest error of each component that keeps it inside the boundary layer of a smoothed
       sign; None: no such signs.
     - `observed`: observed(inputs, state) -> (rates, Instant), the rates and the signals to record; None: no signals.
-    - `shown`: any Instant, which defines the structure of those signals.
+    - `instant_structure`: any Instant, which defines the structure of those signals.
     - `jumps`: whether the rates jump at the start of a sample.
     - `slide`: slide(inputs(t_0), inputs(t_1), h, state, span) -> (state, span), a step for this particular system;
       None: there is none.
@@ -54,12 +54,12 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
     status: Callable[[State], Array]
     layer: State | None = None
     observed: Callable[[Inputs, State], tuple[State, Instant]] | None = None
-    shown: Instant = NOTHING
+    instant_structure: Instant = NOTHING
     jumps: bool = False
     slide: Callable[[Inputs, Inputs, Scalar, State, Span], tuple[State, Span]] | None = None
     edges: Edges = NO_EDGES
 
-    def watched(self, inputs: Inputs, state: State) -> tuple[State, Instant]:
+    def rates_and_signals(self, inputs: Inputs, state: State) -> tuple[State, Instant]:
         """Return the rates, and the signals to record."""
         return (self.rates(inputs, state), NOTHING) if self.observed is None else self.observed(inputs, state)
 
@@ -187,6 +187,6 @@ class FixedSteps:
             x = choose(code == ALIVE, new, x)
             return x, code, jnp.where(alive, stop, end), choose(alive, after, span)
 
-        begin = (state, jnp.asarray(code, jnp.int32), jnp.asarray(t, h.dtype), blank(problem.shown))
+        begin = (state, jnp.asarray(code, jnp.int32), jnp.asarray(t, h.dtype), blank(problem.instant_structure))
         x, last, end, span = lax.fori_loop(0, self.substeps + problem.edges.most, body, begin)
         return Advanced(x, last, end, memory, span)

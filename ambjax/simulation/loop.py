@@ -143,8 +143,8 @@ class ClosedLoop:
     def observed(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> tuple[LoopState, Instant]:
         """Return the rates of the state, and the signals to record at this instant."""
         command, control, u = self.command(inputs, state, errors)
-        shown = self.instant(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
-        return self.derivative(inputs, state, control, u), shown
+        signals = self.instant(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
+        return self.derivative(inputs, state, control, u), signals
 
     def instant(self, reference: Reference, plant: object, i_ref: Array, v_tilde: Array, u: Array) -> Instant:
         """Return the signals to record at one instant.

@@ -37,7 +37,7 @@ def rodas3_step(
     rates = jax.jit(problem.rates)  # traced once here, not once per column of the Jacobian
     inputs, inputs_t = jax.jvp(problem.inputs, (t_0,), (jnp.ones_like(t_0),))
     factors = linear.factor(linear.jacobian(lambda x: rates(inputs, x), state), h / 2)
-    f_0, f_t, here = jax.jvp(lambda s: problem.watched(s, state), (inputs,), (inputs_t,), has_aux=True)
+    f_0, f_t, here = jax.jvp(lambda s: problem.rates_and_signals(s, state), (inputs,), (inputs_t,), has_aux=True)
     inputs = problem.inputs(at(1.0))
 
     def stage(f: State, *couplings: tuple[Scalar, State]) -> State:
@@ -63,7 +63,7 @@ class Rodas3(FixedSteps):
         self, problem: InitialValueProblem[Inputs, State], at: Times, h: Scalar, state: State, span: Span
     ) -> tuple[State, Span]:
         new, _, here = rodas3_step(problem, at, h, state)
-        there = problem.watched(problem.inputs(at(1.0)), new)[1]
+        there = problem.rates_and_signals(problem.inputs(at(1.0)), new)[1]
         return new, span.with_instant(here, h / 2, h).with_instant(there, h / 2)
 
     def __str__(self) -> str:
@@ -138,9 +138,17 @@ class AdaptiveRodas3:
             return choose(accept & (verdict == ALIVE), new, x), h, elapsed, verdict, trials + 1, before, span
 
         zero, code = jnp.zeros_like(period), jnp.asarray(code, jnp.int32)
-        begin = (state, cast(Array, lax.stop_gradient(memory)), zero, code, jnp.int32(0), zero, blank(problem.shown))
+        begin = (
+            state,
+            cast(Array, lax.stop_gradient(memory)),
+            zero,
+            code,
+            jnp.int32(0),
+            zero,
+            blank(problem.instant_structure),
+        )
         x, h, elapsed, code, _, before, span = lax.while_loop(unfinished, trial, begin)
-        end = problem.watched(problem.inputs(stage_times(t, elapsed)(1.0)), x)[1]
+        end = problem.rates_and_signals(problem.inputs(stage_times(t, elapsed)(1.0)), x)[1]
         span = choose(elapsed > 0, span.with_instant(end, before / 2), span)
         stalled = (code == ALIVE) & (elapsed < period)
         return Advanced(x, jnp.where(stalled, STALLED, code), t + elapsed, h, span)

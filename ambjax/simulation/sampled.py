@@ -169,7 +169,7 @@ class Sampled:
         sample = Sample(reference, self.period, jnp.asarray(self.loop.scenario.command_limit), past)
         command, control, estimate = cascade.step(measured, laws, sample)
         command = command._replace(u=limited(command.u, sample.u_max))
-        new = materialised((control, command, self._watched(checked, estimate, (command.u, *past))))
+        new = materialised((control, command, self._next_guard_state(checked, estimate, (command.u, *past))))
         # The sum is 0 only if every number is finite: 0 times NaN or infinity is NaN.
         finite = materialised(sum(0.0 * x for x in jax.tree.leaves(new))) == 0
         keeps = finite if checked is None else finite & checked.steps
@@ -185,7 +185,7 @@ class Sampled:
         finite = jnp.where(finite, state.finite, 0.0)
         return state._replace(control=control, command=command, past=past, finite=finite, watch=watch, started=started)
 
-    def _watched(
+    def _next_guard_state(
         self, checked: GuardResult | None, estimate: Measurement, voltages: tuple[Array, ...]
     ) -> Watch | tuple[()]:
         """Return the guard's state for the next sample. `voltages`: of this sample and of the two before it, V."""

@@ -105,22 +105,22 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
 
 
 class _Voltage(NamedTuple):
-    """Voltage over one part of a step, from the exponential step: u + off (1 - exp(x s)), s from 0 to 1."""
+    """Voltage over one part of a step, from the exponential step: u + amplitude (1 - exp(x s)), s from 0 to 1."""
 
     u: Array
-    off: Array
+    amplitude: Array
     x: Array
     phi: Array
     """(exp(x) - 1) / x"""
 
     def end(self, u_max: Scalar) -> Array:
         """Return u at the end, V."""
-        return limited(self.u - self.off * self.x * self.phi, u_max)
+        return limited(self.u - self.amplitude * self.x * self.phi, u_max)
 
     def moments(self) -> tuple[Array, Array]:
         """Return the means of u, V, and of u^2, V^2."""
-        rest, once, twice = self.u + self.off, self.off * self.phi, self.phi * (1 + self.x * self.phi / 2)
-        return rest - once, rest * (rest - 2 * once) + self.off * self.off * twice
+        rest, once, twice = self.u + self.amplitude, self.amplitude * self.phi, self.phi * (1 + self.x * self.phi / 2)
+        return rest - once, rest * (rest - 2 * once) + self.amplitude * self.amplitude * twice
 
 
 def _with_step(span: Span, instants: tuple[Instant, ...], u: Array, rest: _Voltage, tau: Array, left: Array) -> Span:

@@ -44,8 +44,8 @@ def theorem_lines(report: Report, case: str) -> list[str]:
 def advice(report: Report) -> list[str]:
     """Return, for each failing gain, the number that it must exceed and a value to set; then the other failures.
 
-    While a rotor falls, its motion drives Delta_1 beyond any gain. So a worst value in the last tenth of a lost run is
-    not used to advise a gain, and is reported only if nothing else fails.
+    While a rotor falls, its motion increases Delta_1 beyond any gain. Therefore a worst value in the last tenth of a
+    lost run is not used to advise a gain, and is reported only if nothing else fails.
     """
     fails = [line for line in report.conditions if line.holds is False]
     fall = FALL_SHARE * report.lost_at if report.lost else math.inf
@@ -74,7 +74,7 @@ def processor_lines(sampled: SampledReport, margin: Delays, unknown: Delays | No
     the controller does not predict).
     """
     lines = [
-        f"- {slope.stage}: slope T of the step is {number(slope.stepped)} and must be less than "
+        f"- {slope.stage}: slope T of the step is {number(slope.effective_slope)} and must be less than "
         f"{number(slope.limit)}. Lower the gain or p, shorten clock.sample_period, or set "
         f"{'predict = true' if slope.implicit else IMPLICIT}."
         for slope in sampled.slopes
@@ -108,14 +108,15 @@ def _curve(distance: float, at: float) -> str:
 def _alternates(share: float) -> str:
     return (
         f"The voltage alternates: without noise, {100 * share:.0f} % of its rms value changes sign from sample to "
-        "sample. A law corrects more than its error in one sample, or its output acts later than it assumes: lower its "
-        f"gain or p, set {IMPLICIT} or predict = true, or shorten clock.sample_period."
+        "sample. A law corrects more than its whole error in one sample, or its output acts with a delay that it does "
+        "not include. Lower "
+        f"the gain or p of this law, set {IMPLICIT} or predict = true, or shorten clock.sample_period."
     )
 
 
 def _margin(name: str, margin: Delays) -> str:
     held, lost, undecided = margin.held, margin.lost, margin.undecided
-    tried = f"tried every {margin.step:.2g} samples"
+    tried = f"tested in steps of {margin.step:.2g} samples"
     if undecided is not None:
         parts = [] if held is None else [f"held up to {_samples(held)} samples"]
         parts += [f"not decided at {_samples(undecided)}, where the integrator stalled"]

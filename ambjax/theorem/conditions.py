@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.control.cascade import USUAL, Cascade
+from ambjax.control.cascade import DEFAULT_LAWS, Cascade
 from ambjax.control.laws import PositionLaw
 from ambjax.control.schedule import extremes, schedules
 from ambjax.numerics.records import canonical
@@ -117,7 +117,7 @@ class Required(NamedTuple):
     value: Any
 
 
-PEAKS = ("q_z", "q_i", "d", "q_z_plus_h", "sigma_off", "v_tilde_off", "e_off")
+PEAKS = ("q_z", "q_i", "d", "q_z_plus_h", "sigma_residual", "v_tilde_residual", "e_residual")
 
 
 def _monitors(settle: float) -> Named:
@@ -181,9 +181,9 @@ def required(cascade: Cascade) -> list[Required]:
     """
     rows = []
     for stage in ("position", "current", "inversion", "observer"):
-        law, paper = getattr(cascade, stage), USUAL[stage].requirement
+        law, paper = getattr(cascade, stage), DEFAULT_LAWS[stage].requirement
         own = law.requirement
-        requirement, kind = (own, type(law)) if own else (paper, USUAL[stage])
+        requirement, kind = (own, type(law)) if own else (paper, DEFAULT_LAWS[stage])
         if requirement is None:
             continue
         if requirement.over not in SIDES:
@@ -216,7 +216,7 @@ def _conditions(
         dataclasses.replace(
             line(one, "remark 3", "sup |q_z + h|", worst["q_z_plus_h"]),
             holds=None,
-            note=f"optional in the paper: {one.gain} would then dominate the transients of the inversion",
+            note=f"optional in the paper: if it holds, {one.gain} exceeds the effect of transients of the inversion",
         )
         for one in requirements
         if one.over == "Q_z"
@@ -243,9 +243,9 @@ def constant_sigma(law: PositionLaw) -> list[Condition]:
 
 def _proof(worst: dict[str, tuple[float, float]]) -> list[Condition]:
     lines = [
-        ("Eq. (12)", "sigma follows -k sgn(sigma) + q_z + h", "sigma_off", "m/s"),
-        ("Eq. (14a)", "v_tilde follows -gamma sgn(v_tilde) + d", "v_tilde_off", "A^2/m^2"),
-        ("Eq. (14b)", "e follows -k_i sgn(e) + q_i", "e_off", "A"),
+        ("Eq. (12)", "sigma follows -k sgn(sigma) + q_z + h", "sigma_residual", "m/s"),
+        ("Eq. (14a)", "v_tilde follows -gamma sgn(v_tilde) + d", "v_tilde_residual", "A^2/m^2"),
+        ("Eq. (14b)", "e follows -k_i sgn(e) + q_i", "e_residual", "A"),
     ]
     rows = [Condition(name, says, None, *worst[key], unit, None, "largest residual") for name, says, key, unit in lines]
     margin, at = worst["V_margin"]

@@ -51,8 +51,9 @@ class Terms(NamedTuple):
 class TheoremRow(NamedTuple):
     """One sample of the monitored loop.
 
-    `distance`: signed distance of (z/s_0, i_ref/i_0) to the singular curve C. `*_off`: the signal of the loop minus the
-    integral of its right-hand side in the proof. `V_margin`: bound on V' minus V', m^2/s^3; positive where it holds.
+    `distance`: signed distance of (z/s_0, i_ref/i_0) to the singular curve C. `*_residual`: the signal of the loop
+    minus the integral of its right-hand side in the proof. `V_margin`: bound on V' minus V', m^2/s^3; positive where it
+    holds.
     """
 
     t: Array
@@ -64,9 +65,9 @@ class TheoremRow(NamedTuple):
     d: Array
     q_z_plus_h: Array
     distance: Array
-    sigma_off: Array
-    v_tilde_off: Array
-    e_off: Array
+    sigma_residual: Array
+    v_tilde_residual: Array
+    e_residual: Array
     V_margin: Array
 
 
@@ -183,9 +184,9 @@ class Monitored:
             d=jnp.where(alive, terms.d, 0.0),
             q_z_plus_h=jnp.where(alive, terms.q_z + terms.h, 0.0),
             distance=self.loop.scenario.plant.signed_distance_to_C(z, i_ref),
-            sigma_off=jnp.where(alive, off.sigma, 0.0),
-            v_tilde_off=jnp.where(alive, off.v_tilde, 0.0),
-            e_off=jnp.where(alive, off.e, 0.0),
+            sigma_residual=jnp.where(alive, off.sigma, 0.0),
+            v_tilde_residual=jnp.where(alive, off.v_tilde, 0.0),
+            e_residual=jnp.where(alive, off.e, 0.0),
             V_margin=terms.bound - 2 * terms.values.sigma * sigma_dot,
         )
 

@@ -25,8 +25,8 @@ from ambjax.simulation.rollout import Outcome, System, prepare, roll
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
+from ambjax.theorem.law_signals import LawSignalsRecorder
 from ambjax.theorem.slopes import SlopeCheck, sampling_of, slope_checks
-from ambjax.theorem.watched import Watched
 from ambjax.world.bearing import Bearing
 from ambjax.world.scenario import Scenario
 
@@ -44,8 +44,8 @@ class Band:
     """Measurements of a signal at the samples of a run after `settle`, and the bounds derived from them.
 
     `noise`: whether the run has the case's noise. `computed`: largest magnitude of the signal that the law computes,
-    from the estimate (with prediction: at the end of the delay). `seen`: largest magnitude of the plant's signal.
-    `off`: largest difference of the two signals. `gain`: that of the law's sign. `disturbance`: W, the largest
+    from the estimate (with prediction: at the end of the delay). `largest`: largest magnitude of the plant's signal.
+    `difference`: largest difference of the two signals. `gain`: that of the law's sign. `disturbance`: W, the largest
     disturbance of the rate of the computed signal, per s. `band`: bound of `computed` for disturbances up to W; inf if
     the gain does not exceed W. `gain`, `disturbance` and `band` are None for a law that is not a single sign.
     """
@@ -57,14 +57,14 @@ class Band:
     disturbance: float | None
     band: float | None
     computed: float
-    off: float
-    seen: float
+    difference: float
+    largest: float
     note: str
 
     @property
     def bound(self) -> float | None:
-        """Bound of `seen`."""
-        return None if self.band is None else self.band + self.off
+        """Bound of `largest`."""
+        return None if self.band is None else self.band + self.difference
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,8 +137,8 @@ def check_sampled(
     """
     loop, clock = prepare(cascade, scenario, clock)
     cascade, quiet = cascade.on_processor(), _without_noise(scenario)
-    outcome = _watched(loop, clock, run)
-    calm = outcome if quiet is scenario else _watched(system_of(cascade, quiet, clock), clock, run)
+    outcome = _simulated(loop, clock, run)
+    calm = outcome if quiet is scenario else _simulated(system_of(cascade, quiet, clock), clock, run)
     runs = [(calm, False)] if calm is outcome else [(calm, False), (outcome, True)]
     settled = min(round(settle / float(clock.sample_period)), max(clock.samples - 2, 0))
     lasting = [(one.rows, noise) for one, noise in runs if np.isinf(one.lost_at)]
@@ -157,10 +157,10 @@ def check_sampled(
     )
 
 
-def _watched(loop: System, clock: Clock, run: Callable[[System, Clock], Outcome]) -> Trajectory:
-    """Simulate a loop on a processor and record the rows of `Watched`."""
+def _simulated(loop: System, clock: Clock, run: Callable[[System, Clock], Outcome]) -> Trajectory:
+    """Simulate a loop on a processor and record the rows of `LawSignalsRecorder`."""
     assert isinstance(loop, Sampled)
-    return run(Watched(loop), clock).trajectory
+    return run(LawSignalsRecorder(loop), clock).trajectory
 
 
 def _smallest_distance(run: Trajectory, plant: Bearing) -> tuple[float, float]:

@@ -19,23 +19,23 @@ DELAYED = ("position", "current")
 class SlopeCheck:
     """Slope of a law times T, and the limits for stability and for no oscillation.
 
-    `slope`: slope times T. `stepped`: its effective value in the discrete step of the law. For an explicit step it
-    equals `slope`. For an implicit step of a sign it is a/(1 + a) with a = `slope`, which is below both limits unless
-    the law is delayed. `limit`: the law is stable if `stepped` is below it. `quiet`: the law does not oscillate if
-    `stepped` is below it.
+    `slope`: slope times T. `effective_slope`: its effective value in the discrete step of the law. For an explicit step
+    it equals `slope`. For an implicit step of a sign it is a/(1 + a) with a = `slope`, which is below both limits
+    unless the law is delayed. `limit`: the law is stable if `effective_slope` is below it. `oscillation_limit`: the law
+    does not oscillate if `effective_slope` is below it.
     """
 
     stage: str
     slope: float
-    stepped: float
+    effective_slope: float
     limit: float
-    quiet: float
+    oscillation_limit: float
     implicit: bool
 
     @property
     def holds(self) -> bool:
         """Whether the law, without the other laws, is stable."""
-        return self.stepped < self.limit
+        return self.effective_slope < self.limit
 
 
 def slope_checks(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
@@ -44,15 +44,14 @@ def slope_checks(cascade: Cascade, clock: Clock) -> list[SlopeCheck]:
     for stage, law in zip(CascadeState._fields, map(with_infinite_steepness, cascade.laws), strict=True):
         implicit = law.has_own_step(sampling.implicit)
         ends = extremes(law)
-        slope = stepped = max(_steepest(one.slope(cascade.model)) for one in ends) * sampling.period
+        slope = effective_slope = max(_steepest(one.slope(cascade.model)) for one in ends) * sampling.period
         if implicit:
             relaxed = 1 / (1 + 1 / slope) if slope else 0.0
             rate = max(float(one.explicit_rate(cascade.model)) for one in ends)
-            stepped = max(relaxed, rate * sampling.period)
+            effective_slope = max(relaxed, rate * sampling.period)
         if slope:
-            lines.append(
-                SlopeCheck(stage, slope, stepped, *slope_limits(sampling.late if stage in DELAYED else 0.0), implicit)
-            )
+            limits = slope_limits(sampling.late if stage in DELAYED else 0.0)
+            lines.append(SlopeCheck(stage, slope, effective_slope, *limits, implicit))
     return lines
 
 

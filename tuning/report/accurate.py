@@ -38,7 +38,7 @@ def compare_steps(
     held = np.logical_and.reduce([~np.isfinite(metrics["lost_at_s"]) for metrics in both])
     ways = ("report", "accurate")
     facts: dict[str, Any] = {"members": len(numbers), "held": int(held.sum()), "marked_beyond": MARKED}
-    facts["refuted"] = error.refuted if error.members + error.unseen else ""
+    facts["refuted"] = error.refuted if error.members + error.unconfirmed else ""
     for status in ("lost", "stalled"):
         facts[status] = {way: int(metrics[status].sum()) for way, metrics in zip(ways, both, strict=True)}
     facts["metrics"] = {}

@@ -1,4 +1,4 @@
-"""The answer of a search in five lines, with which the report begins."""
+"""The answer of a search in five lines, at the beginning of the report."""
 
 import math
 
@@ -75,7 +75,7 @@ def _limiting(facts: TuningFacts) -> str:
     if ends := [row["path"] for row in facts.gains if row["at_bound"]]:
         words.append(f"gains at a bound of `[tune.bounds]`: {', '.join(ends)}")
     if not words:
-        front = "the exchange of error for voltage below; " if len(facts.front or ()) > 1 else ""
+        front = "the trade-off between error and voltage (table below); " if len(facts.front or ()) > 1 else ""
         words = [f"{front}no limit of `[tune.limits]` is active, and no gain is at a bound"]
     return f"**Limited by:** {'; '.join(words)}."
 

@@ -76,7 +76,7 @@ def _gains(facts: TuningFacts) -> list[str]:
 
 
 def _sensitivity(row: Row, facts: TuningFacts) -> str:
-    """Return the increase of the risk, or the number of members lost, if a gain is off by a factor of 1.28."""
+    """Return the increase of the risk, or the number of members lost, if a gain changes by a factor of 1.28."""
     if row.get("sensitivity_lost"):
         return f"**{row['sensitivity_lost']} of {facts.trained_on} training members are lost**"
     return "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
@@ -92,6 +92,7 @@ def _loss(facts: TuningFacts) -> list[str]:
         + [f"{x[what][name]:.4e}" for x in (before, after) for what in ("mean", "adds")]
         for name, weight in zip(TERMS, facts.weights, strict=True)
     ]  # fmt: skip
+    head = ["term", "weight", "mean before", "contribution before", "mean after", "contribution after"]
     rows.append(["**loss, the sum**", "", "", f"{before['loss']:.4e}", "", f"**{after['loss']:.4e}**"])
     risk = facts.search["risk"]
     if risk != "mean":
@@ -103,7 +104,7 @@ def _loss(facts: TuningFacts) -> list[str]:
         "peak, clearance and survival add weight x mean to the loss. Effort and chatter multiply the error of each "
         "member: they add the mean of weight x term x (tracking + peak), which is not the product of the means shown.",
         "",
-        *markdown_table(["term", "weight", "mean before", "adds before", "mean after", "adds after"], rows),
+        *markdown_table(head, rows),
         "",
     ]
 
@@ -125,7 +126,7 @@ def _minimised(facts: TuningFacts) -> list[str]:
     return [
         "## Objective of the search",
         "",
-        "Stressed members have more noise, and gains that are off by a factor. Members that were lost in the "
+        "Stressed members have more noise, and gains that are changed by a factor. Members that were lost in the "
         "validation or with accurate steps have joined them. All of these must be held, but their error does not "
         "count. The objective therefore differs from the loss of the held-out members above. The picture shows the "
         "objective.",

@@ -34,16 +34,17 @@ def _verdict(ways: Facts) -> list[str]:
     """Describe for how many gains the three ways agree, the tolerances, and causes of disagreement."""
     count, agreed = len(ways["verdicts"]), ways["verdicts"].count(AGREED)
     lines = [
-        f"**The three agree on {agreed} of {count} gains**: forward and reverse mode to {MODES:g} of the derivative, "
-        f"differences of the steps {STEP:g} and {STEP / 2:g} (of the gain's logarithm) to {100 * STEADY:g} %, and "
-        f"their extrapolation with the modes to {100 * AGREE:g} %."
+        f"**The three derivatives agree for {agreed} of {count} gains.** Relative tolerances: {MODES:g} between "
+        f"forward and reverse mode; {100 * STEADY:g} % between central differences with the steps {STEP:g} "
+        f"and {STEP / 2:g} in the logarithm of the gain; {100 * AGREE:g} % between the extrapolated "
+        "difference and both modes."
     ]
     if agreed < count:
         lines += [
             "",
-            "Both modes differentiate the simulated steps exactly. Differences compare two runs: where a converter "
-            "rounds, a sign switches or a chaotic loop amplifies rounding, these part, and what they show depends on "
-            "the step. A derivative does not see jumps of the loss: there it is not the slope of the mean over many "
-            "members.",
+            "Both modes differentiate the simulated steps exactly. Differences compare two runs. If a converter "
+            "rounds, a sign switches, or a chaotic loop amplifies rounding errors, the two runs separate, and the "
+            "difference depends on the step. A derivative does not include jumps of the loss. If there are "
+            "jumps, it is not the slope of the mean loss over many members.",
         ]
     return lines

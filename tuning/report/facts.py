@@ -6,7 +6,7 @@ from typing import Any
 # A row, or a nested table, of report.json.
 Row = dict[str, Any]
 # Metrics shown before and after; all others are in report.json.
-SHOWN = (
+SUMMARY_METRICS = (
     "settled_rms_error_m",
     "settled_rms_error_worst_member_m",
     "settled_max_abs_error_m",

@@ -1,4 +1,4 @@
-"""The front of error against voltage in the report: its points, the answer taken, and the case file of each point."""
+"""The front of error against voltage in the report: its points, the selected answer, and the case files."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ TITLE = "Error against voltage"
 
 
 def facts(answer: SearchResult) -> list[Facts]:
-    """Return a row for each point of the front, in order of its error limit; `taken` marks the answer."""
+    """Return a row for each point of the front, in order of its error limit; `taken`: whether it is the answer."""
     space = answer.problem.objective.space
     names = _names(answer.front)
     return [
@@ -44,7 +44,7 @@ def _names(points: tuple[FrontPoint, ...]) -> list[str]:
 
 
 def sentence(rows: list[Facts]) -> str:
-    """Return which point is taken, for the verdict; '' without a front."""
+    """Return which point is the answer, for the verdict; '' without a front."""
     taken = next((row for row in rows if row["taken"]), None)
     if taken is None or len(rows) < 2:
         return ""
@@ -76,7 +76,7 @@ def section(rows: list[Facts] | None, written: bool) -> list[str]:
             f"{row['settled_rms_u_V']:.4g}",
             "-" if row["sensitivity"] is None else f"{row['sensitivity']:.3g}",
             f"{row['lost'] + row['stalled']} of {row['members']}",
-            "**taken**" if row["taken"] else "-",
+            "**selected**" if row["taken"] else "-",
             *([f"`{row['file']}`"] if written else []),
         ]
         for n, row in enumerate(rows)
@@ -94,7 +94,7 @@ def section(rows: list[Facts] | None, written: bool) -> list[str]:
     words = (
         "The least rms voltage for each limit of the settled rms error, within the other limits. The values are those "
         "of members of the validation ensemble. If a sign is set-valued, the peak is measured by injection. Only the "
-        "answer taken is judged on the held-out members."
+        "selected answer is judged on the held-out members."
     )
-    picture = "![Error against voltage; the answer taken is filled](front.png)"
+    picture = "![Error against voltage; the selected answer is the filled point](front.png)"
     return [f"## {TITLE}", "", *markdown_table(head, cells), "", words, "", picture, ""]

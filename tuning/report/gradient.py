@@ -81,14 +81,14 @@ def agreement(forward: float, reverse: float, coarse: float, fine: float, floor:
         return max(abs(a - b) - floor, 0.0) / max(abs(a), abs(b), floor)
 
     if not np.isfinite([forward, reverse, coarse, fine]).all():
-        return "not every way gives a finite number"
+        return "a derivative is not finite"
     if apart(forward, reverse) > MODES:
         return f"forward and reverse mode differ by {100 * apart(forward, reverse):.2g} %: rounding grows along the run"
     if apart(coarse, fine) > STEADY:
         return f"differences are inconclusive: {coarse:.2e} with a step of {STEP:g}, {fine:.2e} with {STEP / 2:g}"
     found = extrapolated(coarse, fine)
     if apart(found, forward) > AGREE:
-        return f"differences differ from both modes by {100 * apart(found, forward):.2g} %, whatever their step"
+        return f"differences differ from both modes by {100 * apart(found, forward):.2g} % with both steps"
     return AGREED
 
 

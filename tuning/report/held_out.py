@@ -1,9 +1,9 @@
-"""The held-out members in the report: metrics before and after, by accurate steps too, and the worst member."""
+"""The held-out members in the report: metrics before and after, also with accurate steps, and the worst member."""
 
 import math
 
 from ambjax.host.web_page import markdown_table
-from tuning.report.facts import SHOWN, Row, TuningFacts
+from tuning.report.facts import SUMMARY_METRICS, Row, TuningFacts
 
 
 def number_text(x: float | None, form: str = ".5g") -> str:
@@ -19,10 +19,10 @@ def section(facts: TuningFacts) -> list[str]:
     again = facts.accurate
     head = ["", "before", "after"]
     if again:
-        head += [f"after, {again['held']} of them", "by accurate steps", "off by"]
+        head += [f"after, {again['held']} members", "with accurate steps", "difference"]
     rows = [
         [f"`{name}`", number_text(before.get(name), ".4g"), number_text(after.get(name), ".4g"), *_again(again, name)]
-        for name in SHOWN
+        for name in SUMMARY_METRICS
         if name in after or name in before
     ]
     rows += [[name, str(before[name]), str(after[name]), *_statuses(again, name)] for name in ("lost", "stalled")]
@@ -33,7 +33,7 @@ def section(facts: TuningFacts) -> list[str]:
         *markdown_table(head, rows),
         "",
     ]
-    words = ["Metrics are of the members that are held.", *_accurate(again), *_worst(facts.worst_member), ""]
+    words = ["The metrics include only the members that are held.", *_accurate(again), *_worst(facts.worst_member), ""]
     return [*lines, *words]
 
 
@@ -49,7 +49,7 @@ def _worst(worst: Row | None) -> list[str]:
 
 
 def _again(again: Row | None, name: str) -> list[str]:
-    """Return the cells of a metric with either steps and the relative error, in bold if it is large."""
+    """Return the cells of a metric: its values with both steps, and the relative difference, in bold if it is large."""
     if again is None:
         return []
     pair = again["metrics"].get(name)
@@ -70,14 +70,14 @@ def _accurate(again: Row | None) -> list[str]:
     if again is None:
         return []
     if not again["metrics"]:
-        return ["No member is held by accurate steps too: nothing in this table is confirmed."]
+        return ["No member is held with both steps: accurate steps confirm no number of this table."]
     marked = [name for name, pair in again["metrics"].items() if abs(pair["relative"]) > again["marked_beyond"]]
-    words = f"The last columns: {again['held']} members once more, by adaptive RODAS3. "
+    words = f"The last three columns compare {again['held']} members with simulations by adaptive RODAS3. "
     if not marked:
-        return [f"{words}No number is off by more than {100 * again['marked_beyond']:g} %."]
+        return [f"{words}No difference exceeds {100 * again['marked_beyond']:g} %."]
     return [
-        f"{words}In bold: off by more than {100 * again['marked_beyond']:g} %; there believe the accurate steps, and "
-        "raise tune.substeps for the others."
+        f"{words}Differences above {100 * again['marked_beyond']:g} % are in bold. For these metrics, use the values "
+        "with accurate steps, and raise tune.substeps."
     ]
 
 

@@ -16,7 +16,7 @@ from tuning.judge import StepError, describe, held, judge, step_error, summarise
 from tuning.measured_peaks import injections
 from tuning.problem import TuningProblem
 from tuning.report import accurate, breakdown, front_table, gradient, limit_table, outcome, sensitivity_table
-from tuning.report.facts import SHOWN, Row, TuningFacts
+from tuning.report.facts import SUMMARY_METRICS, Row, TuningFacts
 from tuning.search import explore
 from tuning.search.course import SearchResult
 
@@ -96,7 +96,7 @@ def _steps(answer: SearchResult, unlucky: StepError | None, again: Row | None, r
         "step_error": answer.error.facts() if answer.error else None,
         "worst_step_error": unlucky.facts() if unlucky else None,
         "accurate_steps": problem.accurate,
-        "nominal_steps": "in the steps of `ambjax simulate`" if problem.replays else "by accurate steps",
+        "nominal_steps": "with the steps of `ambjax simulate`" if problem.replays else "with accurate steps",
         "refuted": refuted,
         "verified": not refuted,
         "verified_reason": refuted or _confirmed(unlucky, answer.error),
@@ -159,8 +159,8 @@ def _checked(
     if judged and not problem.sampled:
         error = _worst_checked(answer, judged, held_out) if answer.confirmed else None
         count = problem.tune.budget.held_out
-        say(f"{min(accurate.COMPARED, count)} of them again by accurate steps ...")
-        again = accurate.compare_steps(problem, answer.x, held_out, count, SHOWN)
+        say(f"{min(accurate.COMPARED, count)} of these members again with accurate steps ...")
+        again = accurate.compare_steps(problem, answer.x, held_out, count, SUMMARY_METRICS)
     refuted = (error or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
     return error, again, refuted or (again["refuted"] if again else "")
 

@@ -94,9 +94,9 @@ def outcome_text(facts: TuningFacts, outcome: TuningOutcome) -> str:
 
 
 def _sensitive(facts: TuningFacts) -> list[str]:
-    """Return a sentence for each gain that loses training members if it is off by a factor of 1.28."""
+    """Return a sentence for each gain that loses training members if it changes by a factor of 1.28."""
     return [
-        f"If {row['path']} is off by a factor of 1.28, {row['sensitivity_lost']} of {facts.trained_on} training "
+        f"If {row['path']} changes by a factor of 1.28, {row['sensitivity_lost']} of {facts.trained_on} training "
         "members are lost"
         for row in facts.gains
         if row.get("sensitivity_lost")

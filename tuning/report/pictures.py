@@ -213,7 +213,7 @@ def front(rows: list[dict[str, Any]]) -> bytes:
         ax.annotate(words, (x, y), (6, 6), textcoords="offset points", fontsize=8)
     marks = (
         ("C3x", "members lost or not decided", lambda r: r["lost"] or r["stalled"]),
-        ("C0o", "answer taken", lambda r: r["taken"]),
+        ("C0o", "selected answer", lambda r: r["taken"]),
     )
     for style, label, chosen in marks:
         if those := [r for r in rows if chosen(r)]:

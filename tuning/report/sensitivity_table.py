@@ -46,7 +46,7 @@ def section(found: Facts | None) -> list[str]:
     a, b, c = found["zones"]
     which = "The held-out members with the largest linear peaks."
     if found["decides"]:
-        which = f"Of up to {SCREENED} held-out members, those with the largest peak of one injection each."
+        which = f"The members with the largest peaks, measured by one injection into each of up to {SCREENED} members."
     words = [f"{which} Zone A is below {a:g}, B below {b:g}, C below {c:g}."]
     if found["decides"]:
         words.append("A sign is set-valued: the injected peak decides, because no linear loop describes chattering.")

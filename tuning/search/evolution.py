@@ -96,7 +96,7 @@ def next_population(state: CmaState, seed: int) -> np.ndarray:
     return state.mean + state.size * normal @ _root(state.covariance).T
 
 
-def moved(state: CmaState, points: np.ndarray, values: np.ndarray) -> CmaState:
+def updated(state: CmaState, points: np.ndarray, values: np.ndarray) -> CmaState:
     """Return the distribution after an update with the values [n] of its last population, `points` [n, m]."""
     m, now = len(state.mean), int(state.drawn) + 1
     r = rates(m)

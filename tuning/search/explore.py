@@ -23,7 +23,7 @@ class Slices:
     """logarithms of the risk of the errors, without the terms of the limits"""
 
     def sensitivity(self) -> np.ndarray:
-        """Return the increase of the risk, in per cent, for each gain [m] that is off by a factor e^0.25.
+        """Return the increase of the risk, in per cent, if one gain changes by a factor of e^0.25, for each gain [m].
 
         The gain is multiplied or divided by this factor, whichever is worse. The number has no meaning if `more_lost`
         is above 0: the loss of a rotor costs about 1e6 times as much as an error.
@@ -33,7 +33,7 @@ class Slices:
         return 100 * np.expm1(beside - self.risks[:, middle])
 
     def more_lost(self) -> np.ndarray:
-        """Return the number of additional lost members for each gain [m], off by e^0.25 as in `sensitivity`."""
+        """Return the number of additional lost members if one gain changes as in `sensitivity`, for each gain [m]."""
         middle = len(REACH) // 2
         beside = np.maximum(self.lost[:, middle - 1], self.lost[:, middle + 1])
         return np.maximum(beside - self.lost[:, middle], 0)

@@ -1,4 +1,4 @@
-"""The front of error against voltage, and its knee: the answer of least voltage among those of nearly the least error.
+"""The front of error against voltage, and its knee: the answer of least voltage whose error is near the least error.
 
 After the search for the least error e, further searches minimise the rms voltage. Each limits the rms error to a factor
 times e, and starts at the best answer so far. The factor of the knee is KNEE. At a low voltage, a few members may have
@@ -26,11 +26,11 @@ from tuning.search.validation import largest_unseen, validated
 # tune.front factors are used.
 KNEE = 1.25
 FACTORS = (KNEE, 1.1, 1.5, 1.05, 2.0)
-# Largest number of searches for a point of the front. Between two of them, the multipliers are updated or members join.
-# Largest number of answers that are validated.
+# MOST_SEARCHES_PER_POINT: largest number of searches for a point of the front. Between two searches, the multipliers
+# are updated or members join. MOST_VALIDATIONS: largest number of answers that are validated.
 MOST_SEARCHES_PER_POINT, MOST_VALIDATIONS = 6, 4
 # If the judge's error exceeds the error that the search expects by more than the share UNEXPECTED, the training
-# ensemble lacks members of large errors. The share is smaller than `validation.LARGER`, because the error is limited
+# ensemble lacks members with large errors. The share is smaller than `validation.LARGER`, because the error is limited
 # here.
 UNEXPECTED = 0.1
 

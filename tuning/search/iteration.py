@@ -10,7 +10,7 @@ from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
 from tuning.search.checkpoint import SearchState
 from tuning.search.descent import Descent
-from tuning.search.evolution import moved, next_population
+from tuning.search.evolution import next_population, updated
 
 
 def iterate(
@@ -76,7 +76,7 @@ def _evolved(
         if values[row, first] < value[at]:
             best[at], value[at] = points[row][first], values[row, first]
             better[int(at)] = {name: terms[name][row * len(values[row]) + first] for name in TERMS}
-        cma = moved(own[row], points[row], values[row])
+        cma = updated(own[row], points[row], values[row])
         length[at] = cma.reach
         progress.set_cma_state(at, cma)
     state = progress.starts.state._replace(best=jnp.asarray(best), value=jnp.asarray(value))

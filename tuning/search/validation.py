@@ -44,7 +44,7 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
     problem, budget = course.problem, course.problem.tune.budget
     error = step_error(problem, x) if error is None else error
     if course.interrupted or not budget.validation:
-        return Validation(course.answer(x, error, error.unseen), error, np.zeros(0, int), np.zeros(0, int))
+        return Validation(course.answer(x, error, error.unconfirmed), error, np.zeros(0, int), np.zeros(0, int))
     count = budget.validation
     terms = _terms(problem, x, problem.objective.chosen(seeds(budget)[1], np.arange(count), count))
     share = terms["survival"]
@@ -56,7 +56,7 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
     if lost.size:
         say(f"{lost.size} of {count} validation members are lost")
     errors = _rms_errors(terms)
-    found = course.answer(x, error, lost.size + error.unseen, _overall(errors))
+    found = course.answer(x, error, lost.size + error.unconfirmed, _overall(errors))
     return Validation(found, error, lost, _large(course, x, errors))
 
 

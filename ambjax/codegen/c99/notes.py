@@ -123,7 +123,7 @@ def fixed(trace: Trace) -> list[str]:
         lines += [f"params->{word(x.name)}: finite, else every step is invalid."]
     return [
         *lines,
-        "No other parameter is checked. A law that returns no finite number sets the bit FAILED.",
+        "No other parameter is checked. If a law returns a value that is not finite, the bit FAILED is set.",
         "An invalid or failed step holds u. There is no timeout: the caller decides for how many steps u may be held.",
     ]
 

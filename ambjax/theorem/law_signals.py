@@ -13,7 +13,7 @@ from ambjax.simulation.span import Span
 from ambjax.world.sensor import Errors, FaultyErrors
 
 
-class WatchedSignals(NamedTuple):
+class LawSignals(NamedTuple):
     """sigma (m/s), v_tilde (A^2/m^2) and e = i - i_ref (A)."""
 
     sigma: Array
@@ -21,7 +21,7 @@ class WatchedSignals(NamedTuple):
     e: Array
 
 
-class WatchedRow(NamedTuple):
+class LawSignalsRow(NamedTuple):
     """One sample: time (s), limited voltage (V), z (m), i_ref (A), and signals.
 
     `computed`: signals that the laws compute from the estimate (with prediction: at the end of the delay). `true`:
@@ -32,33 +32,33 @@ class WatchedRow(NamedTuple):
     u: Array
     z: Array
     i_ref: Array
-    computed: WatchedSignals
-    true: WatchedSignals
+    computed: LawSignals
+    true: LawSignals
 
 
-class WatchedState(NamedTuple):
+class LawSignalsState(NamedTuple):
     """State of the loop, and the signals that its laws computed at the last sample."""
 
     loop: SampledState
-    computed: WatchedSignals
+    computed: LawSignals
 
 
 @record
-class Watched:
+class LawSignalsRecorder:
     """System of a loop on a processor whose rows record the signals that its laws compute."""
 
     loop: Sampled
 
-    def realised(self) -> "Watched":
-        return Watched(self.loop.realised())
+    def realised(self) -> "LawSignalsRecorder":
+        return LawSignalsRecorder(self.loop.realised())
 
     def sensor_errors(self, sample: Scalar) -> Errors | FaultyErrors:
         return self.loop.sensor_errors(sample)
 
-    def start(self) -> WatchedState:
-        return WatchedState(self.loop.start(), WatchedSignals(*[jnp.zeros(())] * 3))
+    def start(self) -> LawSignalsState:
+        return LawSignalsState(self.loop.start(), LawSignals(*[jnp.zeros(())] * 3))
 
-    def jump(self, t: Scalar, state: WatchedState, errors: Errors | FaultyErrors) -> WatchedState:
+    def jump(self, t: Scalar, state: LawSignalsState, errors: Errors | FaultyErrors) -> LawSignalsState:
         """Step the laws and store the signals that they computed."""
         loop, before = self.loop, state.loop
         cascade, after = loop.loop.cascade, loop.jump(t, before, errors)
@@ -67,7 +67,7 @@ class Watched:
         measured = loop.measured(before.plant, before.z_filtered, errors)
         estimate, *_ = cascade.estimate(measured, before.control.observer, sample)
         sigma, command = cascade.sigma(estimate, reference), after.command
-        return WatchedState(after, WatchedSignals(sigma, command.v_tilde, estimate.i - command.i_ref))
+        return LawSignalsState(after, LawSignals(sigma, command.v_tilde, estimate.i - command.i_ref))
 
     def advance(
         self,
@@ -75,26 +75,26 @@ class Watched:
         errors: Errors | FaultyErrors,
         t: Scalar,
         period: Scalar,
-        state: WatchedState,
+        state: LawSignalsState,
         memory: object,
         code: Array,
     ) -> Advanced:
         after = self.loop.advance(method, errors, t, period, state.loop, memory, code)
         return after._replace(state=state._replace(loop=after.state))
 
-    def status(self, state: WatchedState) -> Array:
+    def status(self, state: LawSignalsState) -> Array:
         return self.loop.status(state.loop)
 
-    def rest(self, state: WatchedState, code: Array) -> WatchedState:
+    def rest(self, state: LawSignalsState, code: Array) -> LawSignalsState:
         return state._replace(loop=self.loop.rest(state.loop, code))
 
-    def row(self, t: Scalar, state: WatchedState, errors: Errors | FaultyErrors, alive: Array) -> WatchedRow:
+    def row(self, t: Scalar, state: LawSignalsState, errors: Errors | FaultyErrors, alive: Array) -> LawSignalsRow:
         row = self.loop.row(t, state.loop, errors, alive)
-        true = WatchedSignals(row.sigma, row.v_tilde, row.e)
-        return WatchedRow(row.t, row.u, row.z, row.i_ref, state.computed, true)
+        true = LawSignals(row.sigma, row.v_tilde, row.e)
+        return LawSignalsRow(row.t, row.u, row.z, row.i_ref, state.computed, true)
 
-    def completed(self, row: WatchedRow, span: Span) -> WatchedRow:
+    def completed(self, row: LawSignalsRow, span: Span) -> LawSignalsRow:
         return row
 
-    def singularity(self, row: WatchedRow) -> Array:
+    def singularity(self, row: LawSignalsRow) -> Array:
         return self.loop.loop.scenario.plant.singularity(row.z, row.i_ref)
