@@ -1401,9 +1401,23 @@ SEARCH = [
     M(
         "the inductance omits the slope of the saturated core",
         "ambjax/world/coils.py",
-        "voltage / (slope * permeance)",
-        "voltage / permeance",
+        "reciprocal(slope * permeance)",
+        "reciprocal(permeance)",
         "tests/test_iron.py::test_the_voltage_of_a_coil_is_the_rate_of_its_flux_linkage",
+    ),
+    M(
+        "the derivative of the saturated flux has the wrong power of the root",
+        "ambjax/world/iron.py",
+        "-(x * x * x) * (value * value)",
+        "-(x * x * x) * value",
+        "tests/test_iron.py::test_the_derivatives_of_saturation_are_those_of_its_formula",
+    ),
+    M(
+        "the step of a stop is twice as long",
+        "ambjax/simulation/method.py",
+        "TOUCHED = 0.05",
+        "TOUCHED = 0.1",
+        "tests/test_touchdown.py::test_the_step_of_a_stop_resolves_its_contact[0.0-0.00011]",
     ),
     M(
         "the leakage permeance is computed with `leakage` instead of `leakage - 1`",
@@ -1749,7 +1763,7 @@ SAMPLED = [
         "ambjax/simulation/method.py",
         "named[FLUX] / LAGGED",
         "0.0",
-        "tests/test_iron.py::test_the_chosen_step_resolves_the_lag_of_the_flux[1e-05-20]",
+        "tests/test_iron.py::test_the_chosen_step_resolves_the_lag_of_the_flux[1e-05-10]",
     ),
     M(
         "with a spread of the amplifier, the step is that of the nominal amplifier",

@@ -24,9 +24,12 @@ SAMPLED = 0.02
 # The coils may be stiff. SETTLED: product of step and R/L at which the error of RK4 is below 1e-11 m and 1e-6 A in a
 # sample in which the current settles. MOST_SETTLED: number of substeps above which an L-stable method is cheaper.
 SETTLED, MOST_SETTLED = 0.5, 64
-# The same for the lag of the flux by eddy currents. The force depends on it, so the error of z limits the step: 4e-13 m
-# after 20 samples of random voltages up to 40 V, a sample as long as the lag.
-LAGGED = 0.25
+# The same for the lag of the flux by eddy currents. The force depends on it, so the error of z limits the step:
+# 1.3e-11 m in the first 30 samples of the rig.
+LAGGED = 0.5
+# The same for the slope of the stop. A contact begins and ends inside a step, which changes the velocity after an
+# elastic contact by up to 1.1e-4 of its value, and by up to 1.2e-3 with damping (tests/test_touchdown.py).
+TOUCHED = 0.05
 # Product of step and amplifier rate at which RK4 integrates the amplifier's voltage, a known function of time, to 1e-9
 # A.
 DRIVEN = 0.5
@@ -85,8 +88,8 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
         amplifier = scenario.amplifier
         slow = amplifier is not None and amplifier.slow
         rate = float(np.max(np.asarray(amplifier.slope()))) if amplifier is not None and slow else 0.0
-        fastest = max(named[PLANT], named.get(STOP, 0.0))
-        driven = math.ceil(sample_period * max(fastest / SAMPLED, rate / DRIVEN))
+        touched = named.get(STOP, 0.0) / TOUCHED
+        driven = math.ceil(sample_period * max(named[PLANT] / SAMPLED, touched, rate / DRIVEN))
         substeps, fixed = max(driven, settled, 1), max(driven, MOST_SETTLED)
         explicit = settled <= MOST_SETTLED
     else:

@@ -71,8 +71,8 @@ class TwoCoil(Bearing[Currents]):
         """
         permeance = inverse + iron.beside(self)
         slope = iron.slope(iron.core(self, i, inverse))
-        gap = reciprocal(slope * permeance)
-        return gap * ((2 / self.kappa) * voltage - slope * (i * closing) * (inverse * inverse))
+        per_inductance = reciprocal(slope * permeance)  # in units of 2 / kappa
+        return per_inductance * ((2 / self.kappa) * voltage - slope * (i * closing) * (inverse * inverse))
 
     def rest(self, state: Currents, z: Array) -> Currents:
         return state._replace(z=z, z_dot=jnp.zeros_like(z))

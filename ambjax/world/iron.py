@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.compiler.barrier import compiled_alone
+from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.smooth import refined
 
 # Smallest slope of the saturation curve: at large currents only the flux through the air still increases.
 AIR = 0.02
@@ -52,7 +53,9 @@ class Iron:
 
     def share(self, b: Array) -> Array:
         """Return the flux as a share of the flux without saturation, whose density is b (T)."""
-        return jnp.ones_like(b) if self.saturation is None else AIR + (1 - AIR) * _inverse_root(b * (1 / self.saturation))
+        return (
+            jnp.ones_like(b) if self.saturation is None else AIR + (1 - AIR) * _inverse_root(b * (1 / self.saturation))
+        )
 
     def slope(self, b: Array) -> Array:
         """Return the derivative of the flux density with respect to b (T), that without saturation. Dimensionless."""
@@ -76,18 +79,12 @@ class Iron:
 def _inverse_root(x: Array) -> Array:
     """Return (1 + x^4)^(-1/4)."""
     square = x * x
-    y = 1 + square * square
-    if x.dtype == jnp.float64:
-        rough = jax.lax.rsqrt(jnp.sqrt(jnp.minimum(y, 1e36).astype(jnp.float32))).astype(jnp.float64)
-        rr = rough * rough
-        e = 1 - y * (rr * rr)
-        return rough + rough * (e * (0.25 + 0.15625 * e))
-    return jax.lax.rsqrt(jnp.sqrt(y))
+    return refined(jnp.sqrt(jnp.sqrt(1 + square * square)))
 
 
 @_inverse_root.defjvp
-def _inverse_root_jvp(primals, tangents):
-    (x,), (dx,) = primals, tangents
-    r = _inverse_root(x)
-    s = x * r
-    return r, -(s * s * s) * (r * r) * dx
+def _inverse_root_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    # all directions of a gradient share the slope, so it is computed once
+    value = _inverse_root(*primals)
+    x = primals[0] * value
+    return value, materialised(-(x * x * x) * (value * value)) * tangents[0]

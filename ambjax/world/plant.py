@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.records import Scalar, record
+from ambjax.numerics.smooth import reciprocal
 from ambjax.world.bearing import Bearing, Signals
 from ambjax.world.iron import Iron
 from ambjax.world.sensor import Measurement
@@ -57,7 +58,8 @@ class Plant(Bearing[State]):
         )
         slope = sum(iron.slope(b) for b in cores) / 2
         motional = self.kappa * z_dot * i * below * below
-        i_dot = (motional + u - self.R * i) / (self.kappa / 2 * slope * (below + iron.beside(self))) + q_i
+        per_inductance = (2 / self.kappa) * reciprocal(slope * (below + iron.beside(self)))
+        i_dot = per_inductance * (motional + u - self.R * i) + q_i
         return State(z_dot, z_ddot, i_dot, () if isinstance(delayed, tuple) else iron.following(i, delayed))
 
     def rest(self, state: State, z: Array) -> State:
