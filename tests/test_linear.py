@@ -1,6 +1,7 @@
 """Linear analysis: matrices against the simulation, margins against python-control, gradients, equilibria."""
 
 import dataclasses
+import tomllib
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,8 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from ambjax import Cascade, Clock, Plant, Scenario, Sensor
+from ambjax.cases.reader import case_from
+from ambjax.cases.template_text import template
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.processor import Processor
 from ambjax.linear import (
@@ -178,6 +181,21 @@ def test_python_control_gets_the_same_system():
     assert exported.dt == T
     response = exported(np.exp(2j * np.pi * f * T)).transpose(2, 0, 1)
     assert response == pytest.approx(np.asarray(system.response(f)), rel=1e-8)
+
+
+@pytest.mark.parametrize("delay", [0.0, 1.0])
+def test_the_static_stiffness_of_an_integrating_law(delay):
+    """Infinite, or 2 m / T^2 if the law integrates a prediction, which is off by T^2/2 times a constant acceleration.
+
+    Tolerance: the magnets' acceleration over the prediction, (pole T)^2 / 6.
+    """
+    raw = tomllib.loads(template("bearing"))
+    raw["processor"]["delay"] = delay
+    case = case_from(raw)
+    T, plant = float(case.clock.sample_period), case.scenario.plant
+    found = analyse(linearise(case.cascade, case.scenario, case.clock), plant.m, T).stiffness
+    expected = 2 * plant.m / T**2 if delay else np.inf
+    assert found == pytest.approx(expected, rel=(plant.pole * T) ** 2 / 6)
 
 
 def test_the_loop_becomes_unstable_at_the_delay_margin():

@@ -113,10 +113,11 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
     margins = ("phase margin (deg)", "delay margin (s)", "disk margin")
     rows = [table((*head, *margins), [_row(point) for point in [*points, *worst]]), ""]
     one, zones = points[0].analysis, case.zones
+    stiffness = f"{_number(one.stiffness)} N/m" if np.isfinite(one.stiffness) else "infinite"
     rows += [
         f"Zones of the peak of |S|: A below {zones.zone_a:g}, B below {zones.zone_b:g}, C below {zones.zone_c:g}, D "
         "above.",
-        f"Static stiffness: {_number(one.stiffness)} N/m. Rms of z per rms of position noise: {_number(one.noise)}. "
+        f"Static stiffness: {stiffness}. Rms of z per rms of position noise: {_number(one.noise)}. "
         f"Largest real part of the poles: {_number(one.poles[0].real)} 1/s.",
     ]
     if not one.stable:

@@ -98,6 +98,15 @@ class Zones:
         return low, high
 
 
+def _stiffness(system: StateSpace, m: float, f: float) -> float:
+    """Return the static stiffness, N/m. `f`: a frequency (Hz) that stands for 0.
+
+    It is infinite if the response is proportional to the frequency, as with integral action.
+    """
+    static, above = np.abs(system.response(np.array([f, 10 * f]))[:, 3, 2])
+    return m / float(static) if static > 0.5 * above else np.inf
+
+
 def _zone(x: float, a: Scalar, b: Scalar, c: Scalar) -> str:
     return next((name for name, limit in zip("ABC", (a, b, c), strict=True) if x < float(limit)), "D")
 
@@ -110,7 +119,8 @@ class Analysis(NamedTuple):
     - `zone`: zone of the peak of |S|; D if the loop is unstable.
     - `S_velocity`: peak of |S| for a test signal on the velocity reading; None if the velocity is not measured.
     - `margins`: see `Margins`; all are 0 if the loop is unstable.
-    - `stiffness`: static stiffness, N/m; inf with integral action.
+    - `stiffness`: static stiffness, N/m; inf if the law integrates the measured position. If it integrates a prediction
+      over the delay T, the stiffness is finite, about 2 m / T^2, because the prediction does not know the force.
     - `noise`: rms of z per rms of white noise on the reading of z, one value per sample; inf if the loop is unstable.
     - `poles`: poles in 1/s, in the order of decreasing real part.
     """
@@ -189,7 +199,6 @@ def analyse(
 
     stable, S = system.stable, largest(0, 0)
     poles = poles_in_s(system)
-    static = float(np.abs(system.response(np.array([STATIC * low]))[0, 3, 2]))
     return Analysis(
         stable,
         S,
@@ -198,7 +207,7 @@ def analyse(
         zones.zone(S.height) if stable else "D",
         largest(1, 1) if velocity else None,
         margins_of(system) if stable else Margins(*[0.0] * 6),
-        float(m) / static if static > 0 else np.inf,
+        _stiffness(system, float(m), STATIC * low),
         noise_gain(system, float(period)) if stable else np.inf,
         poles[np.argsort(-np.real(poles))],
     )

@@ -140,8 +140,8 @@ def remedies(
             "bounds of the gains that end at them (tune.bounds)."
         )
     if outcome.broken:
-        lines = broken([row for row in facts.limits if row["name"] != "survival"])
-        words.append(f"{'. '.join(lines)}. Loosen these limits, tune more gains (also each p), or raise tune.screen.")
+        keys = ", ".join(f"tune.limits.{name}" for name in outcome.broken)
+        words.append(f"Not held: {keys}. Loosen these limits, tune more gains (also each p), or raise tune.screen.")
     if outcome.stalled:
         words.append(f"Not decided: {outcome.stalled} held-out members, whose integration stalls. Raise tune.substeps.")
     return " ".join(

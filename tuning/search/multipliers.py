@@ -4,6 +4,7 @@ The judge evaluates the limited quantities at each optimum, on members that the 
 excess g of a limit is about (required multiplier - multiplier) / penalty. An update of the multiplier reduces it.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -35,13 +36,16 @@ def search_within_limits(course: Course, x: np.ndarray) -> np.ndarray:
 
     Returns x itself if no search was needed. There are at most MOST_UPDATES updates. They end early after Ctrl-C, and
     if a search ends where it began, within all limits. They also end early if a larger penalty makes no progress
-    towards a limit; the held-out members then show whether the limit holds. `course.problem` receives the updated
-    limits.
+    towards a limit; the held-out members then show whether the limit holds. If the last optimum is not within all
+    limits and earlier ones are, the one of them with the least goal is returned: the goal may have two minima, one on
+    either side of a limit, between which the searches alternate. `course.problem` receives the updated limits.
     """
-    moved = True
-    for _ in range(MOST_UPDATES):
+    within, holds, moved = list[np.ndarray](), False, True
+    for update in range(MOST_UPDATES + 1):
         before = course.problem.limits
         numbers = _numbers(course, x)
+        if holds := holding(before, numbers):
+            within.append(x)
         limits = tuple(limit.updated(*found) for limit, found in zip(before, numbers, strict=True))
         stuck = [limit for limit, (_, judged) in zip(before, numbers, strict=True) if _stuck(limit, judged)]
         if stuck:
@@ -49,20 +53,35 @@ def search_within_limits(course: Course, x: np.ndarray) -> np.ndarray:
             say(f"a larger penalty makes no progress towards the limit of {names}; its multiplier is no longer updated")
             break
         course.problem = course.problem.limited(limits)
-        done = []
-        for old, after, (_, judged) in zip(before, limits, numbers, strict=True):
-            idle = old.multiplier == after.multiplier == 0
-            done.append(met(after, judged) or (idle and after.log_excess(judged) <= 0))
-            if not (idle and done[-1]):
-                limit = f"limit {after.name} = {after.threshold:g} {after.kind.unit}"
-                say(f"{limit}: judged {judged:.4g}")
-        if course.interrupted or all(done) or (not moved and holding(limits, numbers)):
+        if _all_met(before, limits, numbers) or course.interrupted or (not moved and holds) or update == MOST_UPDATES:
             break
         course.limit_searches += 1
         start = x
         x, _ = course.search(start[None])
         moved = not np.array_equal(x, start)
-    return x
+    return x if holds or not within else _least(course, within)
+
+
+def _all_met(before: Sequence[Limit], after: Sequence[Limit], numbers: Sequence[tuple[float, float]]) -> bool:
+    """Return whether all limits are met, and print a line for each limit that is active or not met.
+
+    `before`, `after`: the limits before and after the update of their multipliers. `numbers`: as of `_numbers`.
+    """
+    done = []
+    for old, new, (_, judged) in zip(before, after, numbers, strict=True):
+        idle = old.multiplier == new.multiplier == 0
+        done.append(met(new, judged) or (idle and new.log_excess(judged) <= 0))
+        if not (idle and done[-1]):
+            say(f"limit {new.name} = {new.threshold:g} {new.kind.unit}: judged {judged:.4g}")
+    return all(done)
+
+
+def _least(course: Course, points: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the point [m] with the least goal on the training ensemble, without the terms of the limits."""
+    say("the last answer is not within all limits; the best earlier one within them is taken")
+    both = np.array(points)
+    goal = dataclasses.replace(course.problem.goal, limits=())
+    return points[int(np.argmin(goal.score(both, course.problem.engine.terms(both, course.members), course.members)))]
 
 
 def holding(limits: Sequence[Limit], numbers: Sequence[tuple[float, float]]) -> bool:
