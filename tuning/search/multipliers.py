@@ -147,8 +147,9 @@ def judged_values(
     `columns` [N]: result of `judge` for the ensemble with this `seed`. `tuned`: the search's value of each limit.
 
     On a processor, the member with the largest linear peak may break a limit. It is then measured by one injection, as
-    the held-out members are. If only injections decide (`measured_peaks.decides`), there is no new injection while the
-    search's values, corrected by an earlier injection, are clearly within their limits.
+    the held-out members are. So it is if the search's value, corrected by an earlier injection, may break the limit. If
+    only injections decide (`measured_peaks.decides`), there is no new injection while these corrected values are
+    clearly within their limits.
     """
     if not injects(problem):
         return [limit.reached(columns) for limit in problem.limits]
@@ -159,7 +160,10 @@ def judged_values(
         )
         known = {limit.name: limit.ratio * ours for limit, ours in pairs}
     else:
-        near = any(limit.log_excess(limit.reached(columns)) > -INJECTED_FROM for limit, _ in pairs)
+        # the ratio of an earlier injection counts too, or the searches alternate between a measured and a linear value
+        near = any(
+            limit.log_excess(max(limit.reached(columns), limit.ratio * ours)) > -INJECTED_FROM for limit, ours in pairs
+        )
         known = {}
     if near:
         measured = injections(problem, x, seed, columns, most=1)
