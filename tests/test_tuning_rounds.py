@@ -9,6 +9,7 @@ from bowl import RARE_FROM, World, study
 import tuning.search.rounds
 from ambjax import Slide
 from tuning.config import seeds
+from tuning.search import course
 from tuning.search.rounds import rounds
 
 TRAINING, VALIDATION, HELD_OUT = 0, 1, 2
@@ -48,6 +49,14 @@ def test_the_best_gains_are_found_and_no_member_is_lost(monkeypatch, tmp_path):
     assert found.error.resolved
     assert world.seeds("gradient") == {seed_of(TRAINING)}  # nothing else is descended
     assert seed_of(HELD_OUT) not in world.seeds("terms") | world.seeds("metrics")  # held-out members are unused
+
+
+def test_the_time_of_all_searches_is_estimated_once(monkeypatch, tmp_path, capsys):
+    """20 and 450 iterations of 6 s take 2 and 45 minutes."""
+    tuned(monkeypatch, tmp_path, World())
+    assert capsys.readouterr().err.count("all searches together usually take 20 to 450 iterations") == 1
+    assert "an iteration takes 6 s" in course._pace(6.0)
+    assert "here 2 to 45 min" in course._pace(6.0)
 
 
 def test_lost_validation_members_join_and_are_held(monkeypatch, tmp_path):

@@ -33,6 +33,9 @@ MOST_SEARCHES = 5
 LEAST_IMPROVEMENT = 0.01
 # Number of earlier points of the searches that are checked with accurate steps if these confirm none of the answers.
 FALLBACK_POINTS = 12
+# After PACED iterations of the first search, the time of all searches is estimated from the usual number of iterations:
+# 22 to 120 in benchmarks/tasks; more if a limit of |S| is measured while the supply limits.
+PACED, USUAL_ITERATIONS = 4, (20, 450)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +110,7 @@ class Course:
             iterations=tune.budget.iterations, name=tune.optimiser, rate=tune.learning_rate,
             seed=self.seed + len(self.past), at_optimum=at_optimum,
             checkpoint_file=CheckpointFile(path, self.facts, number), resume=self.resume,
-            on_iteration=self.on_iteration or _progress_line(self.problem),
+            on_iteration=self.on_iteration or _progress_line(self.problem, first=not self.past),
         )  # fmt: skip
         if progress.ended:
             say(f"round {number}: the search is complete; its result is read from {path}")
@@ -211,8 +214,18 @@ def _joined(past: list[SearchState]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([wide(one.history[name]) for one in past if one.history]) for name in names}
 
 
-def _progress_line(problem: TuningProblem) -> Callable[[SearchState, float], None]:
-    """Return the callback that prints a line after each iteration."""
+def _pace(each: float) -> str:
+    """Return an estimate of the time of all searches. `each`: duration of an iteration, s."""
+    few, many = (f"{each * count / 60:.2g}" for count in USUAL_ITERATIONS)
+    return (
+        f"an iteration takes {each:.2g} s; all searches together usually take {USUAL_ITERATIONS[0]} to "
+        f"{USUAL_ITERATIONS[1]} iterations, here {few} to {many} min. A smaller tune.front, tune.members or "
+        "clock.duration takes less time."
+    )
+
+
+def _progress_line(problem: TuningProblem, first: bool) -> Callable[[SearchState, float], None]:
+    """Return the callback that prints a line after each iteration. `first`: whether it is the first search."""
     scale = float(np.asarray(problem.objective.loss.s_0))
     budget, spent = problem.tune.budget, []
 
@@ -227,6 +240,8 @@ def _progress_line(problem: TuningProblem) -> Callable[[SearchState, float], Non
         each = float(np.median(spent[1:])) if len(spent) > 1 else math.nan
         left = (budget.iterations - done) * each * going / len(progress.active)
         wait = f", at most {left:.0f} s left in this phase" if math.isfinite(left) else ""
+        if first and len(spent) == PACED:
+            say(_pace(sum(spent[1:]) / len(spent[1:])))
         named = ", ".join(f"{g.name} {v:.4g}" for g, v in zip(problem.objective.space.gains, gains, strict=True))
         error = scale * np.sqrt(last["terms"][best][TERMS.index("tracking")])
         say(
