@@ -918,16 +918,16 @@ SEARCH = [
     M(
         "the last answer is taken although an earlier one is within the limits",
         "tuning/search/multipliers.py",
-        "return x if holds or not within else _least(course, within)",
+        "return _least(course, within) if within else x",
         "return x",
-        "tests/test_tuning_limits.py::test_the_best_answer_within_the_limits_is_taken_if_the_last_one_is_not",
+        "tests/test_tuning_limits.py::test_the_best_answer_within_the_limits_is_taken_if_the_multipliers_do_not_converge",
     ),
     M(
         "the first answer within the limits is taken, not the best one",
         "tuning/search/multipliers.py",
         "points[int(np.argmin(goal.score",
         "points[0 * int(np.argmin(goal.score",
-        "tests/test_tuning_limits.py::test_the_best_answer_within_the_limits_is_taken_if_the_last_one_is_not",
+        "tests/test_tuning_limits.py::test_the_best_answer_within_the_limits_is_taken_if_the_multipliers_do_not_converge",
     ),
     M(
         "a search that does not move and holds the limits is repeated",

@@ -319,16 +319,25 @@ def test_a_search_that_does_not_move_and_holds_the_limits_ends(monkeypatch):
     assert len(starts) == 1
 
 
-def test_the_best_answer_within_the_limits_is_taken_if_the_last_one_is_not(monkeypatch):
-    """Searches that alternate between 20 V, the least goal, and less than the limit of 10 V: k = 20, 25 and 22."""
+@pytest.mark.parametrize(
+    "ends", [(60.0, 20.0, 60.0, 25.0, 60.0, 22.0, 60.0), (60.0, 20.0, 60.0, 45.0, 25.0, 60.0, 22.0)]
+)
+def test_the_best_answer_within_the_limits_is_taken_if_the_multipliers_do_not_converge(monkeypatch, ends):
+    """Searches that alternate between 20 V, the least goal, and less than the limit of 10 V: k = 20, 22 and 25.
+
+    `ends`: k of the start and of the answers. The last one is within the limit or not.
+    """
     problem = study(monkeypatch, World(), **TEN)
     course = Course(problem, training(problem), 1)
     course.past.append(SimpleNamespace(interrupted=False))
-    at = {k: np.asarray(problem.objective.space.encode(np.array([World.best[0], k]))) for k in (20.0, 22.0, 25.0, 60.0)}
-    ends = iter([20.0, 60.0, 25.0, 60.0, 22.0, 60.0])
-    monkeypatch.setattr(course, "search", lambda points: (at[next(ends)], 0.0))
-    np.testing.assert_array_equal(search_within_limits(course, at[60.0]), at[25.0])
-    assert next(ends, None) is None
+    at = {
+        k: np.asarray(problem.objective.space.encode(np.array([World.best[0], k])))
+        for k in (20.0, 22.0, 25.0, 45.0, 60.0)
+    }
+    found = iter(ends[1:])
+    monkeypatch.setattr(course, "search", lambda points: (at[next(found)], 0.0))
+    np.testing.assert_array_equal(search_within_limits(course, at[ends[0]]), at[25.0])
+    assert next(found, None) is None
 
 
 def test_a_resumed_search_with_limits_gives_the_same_result(monkeypatch, tmp_path):

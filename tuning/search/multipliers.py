@@ -36,11 +36,11 @@ def search_within_limits(course: Course, x: np.ndarray) -> np.ndarray:
 
     Returns x itself if no search was needed. There are at most MOST_UPDATES updates. They end early after Ctrl-C, and
     if a search ends where it began, within all limits. They also end early if a larger penalty makes no progress
-    towards a limit; the held-out members then show whether the limit holds. If the last optimum is not within all
-    limits and earlier ones are, the one of them with the least goal is returned: the goal may have two minima, one on
-    either side of a limit, between which the searches alternate. `course.problem` receives the updated limits.
+    towards a limit; the held-out members then show whether the limit holds. If the updates do not converge, the optimum
+    of least goal within all limits is returned, if there is one: the judge may measure very different values on either
+    side of a limit, and the searches then alternate between them. `course.problem` receives the updated limits.
     """
-    within, holds, moved = list[np.ndarray](), False, True
+    within, moved = list[np.ndarray](), True
     for update in range(MOST_UPDATES + 1):
         before = course.problem.limits
         numbers = _numbers(course, x)
@@ -53,13 +53,15 @@ def search_within_limits(course: Course, x: np.ndarray) -> np.ndarray:
             say(f"a larger penalty makes no progress towards the limit of {names}; its multiplier is no longer updated")
             break
         course.problem = course.problem.limited(limits)
-        if _all_met(before, limits, numbers) or course.interrupted or (not moved and holds) or update == MOST_UPDATES:
+        if _all_met(before, limits, numbers) or course.interrupted or (not moved and holds):
+            return x
+        if update == MOST_UPDATES:
             break
         course.limit_searches += 1
         start = x
         x, _ = course.search(start[None])
         moved = not np.array_equal(x, start)
-    return x if holds or not within else _least(course, within)
+    return _least(course, within) if within else x
 
 
 def _all_met(before: Sequence[Limit], after: Sequence[Limit], numbers: Sequence[tuple[float, float]]) -> bool:
@@ -78,7 +80,7 @@ def _all_met(before: Sequence[Limit], after: Sequence[Limit], numbers: Sequence[
 
 def _least(course: Course, points: Sequence[np.ndarray]) -> np.ndarray:
     """Return the point [m] with the least goal on the training ensemble, without the terms of the limits."""
-    say("the last answer is not within all limits; the best earlier one within them is taken")
+    say("the multipliers of the limits do not converge; the best answer within the limits is taken")
     both = np.array(points)
     goal = dataclasses.replace(course.problem.goal, limits=())
     return points[int(np.argmin(goal.score(both, course.problem.engine.terms(both, course.members), course.members)))]
