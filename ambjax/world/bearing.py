@@ -2,11 +2,13 @@
 
 from typing import ClassVar, Generic, NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.compiler.barrier import compiled_alone
 from ambjax.numerics.records import Scalar, leaf, part, record
-from ambjax.numerics.smooth import reciprocal, safe_sqrt
+from ambjax.numerics.smooth import refined, safe_sqrt
 from ambjax.world.iron import Iron
 from ambjax.world.sensor import Measurement
 
@@ -35,6 +37,19 @@ def _product(z: Array, s_0: Array) -> Array:
     """Return the product of the gaps (m^2), at least that for which one gap is about GAP_FLOOR s_0."""
     product, least = s_0 * s_0 - z * z, 2 * GAP_FLOOR * s_0 * s_0
     return jnp.where(product > least, product, least)
+
+
+@jax.custom_jvp
+@compiled_alone
+def _inverse(z: Array, s_0: Array) -> Array:
+    """Return 1 / (upper lower), 1/m^2, with the lower bound of `_product`."""
+    return refined(_product(z, s_0))
+
+
+@_inverse.defjvp
+def _inverse_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    value = _inverse(*primals)
+    return value, jax.jvp(_product, primals, tangents)[1] * -(value * value)
 
 
 class Signals(NamedTuple):
@@ -212,7 +227,7 @@ class Bearing(Generic[S]):
     def gaps(self, z: Scalar) -> Gaps:
         """Return the gaps s_0 - z and s_0 + z (m). Only their inverses are bounded (GAP_FLOOR)."""
         z, s_0 = jnp.asarray(z), jnp.asarray(self.s_0)
-        return Gaps(s_0 - z, s_0 + z, reciprocal(_product(z, s_0)))
+        return Gaps(s_0 - z, s_0 + z, _inverse(z, s_0))
 
     def v(self, z: Scalar, i: Scalar) -> Array:
         """Scaled magnetic force, in A^2/m^2: ((i_0+i)/(s_0-z))^2 - ((i_0-i)/(s_0+z))^2. Eq. (3)."""
