@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.pictures.figures import BLUE, ORANGE, RED
-from ambjax.pictures.scales import digits, prefix_of
+from ambjax.pictures.scales import digits, log_ticks, prefix_of
 from ambjax.pictures.style import own_style
 from ambjax.pictures.thinning import stretch_of, thin
 from ambjax.simulation.trajectory import STALLED, Trajectory
@@ -205,25 +205,25 @@ def front(rows: list[dict[str, Any]]) -> bytes:
 
     figure = Figure(figsize=(6.4, 3.8), layout="constrained")
     ax = figure.subplots()
-    errors, volts = [r["settled_rms_error_m"] for r in rows], [r["settled_rms_u_V"] for r in rows]
+    factor, unit = prefix_of("m", min(r["settled_rms_error_m"] for r in rows))
+    errors, volts = [factor * r["settled_rms_error_m"] for r in rows], [r["settled_rms_u_V"] for r in rows]
     ax.plot(*zip(*sorted(zip(volts, errors, strict=True)), strict=True), "C0o-", ms=5, mfc="white")
-    factor, unit = prefix_of("m", min(errors))
     for n, (x, y) in enumerate(zip(volts, errors, strict=True)):
-        words = f"{letter(n)}: {digits(factor * y)} {unit}, {digits(x)} V"
+        words = f"{letter(n)}: {digits(y)} {unit}, {digits(x)} V"
         ax.annotate(words, (x, y), (6, 6), textcoords="offset points", fontsize=8)
     marks = (
         ("C3x", "members lost or not decided", lambda r: r["lost"] or r["stalled"]),
         ("C0o", "selected answer", lambda r: r["taken"]),
     )
     for style, label, chosen in marks:
-        if those := [r for r in rows if chosen(r)]:
-            x, y = ([r[name] for r in those] for name in ("settled_rms_u_V", "settled_rms_error_m"))
-            ax.plot(x, y, style, ms=8, label=label)
+        if those := [n for n, row in enumerate(rows) if chosen(row)]:
+            ax.plot([volts[n] for n in those], [errors[n] for n in those], style, ms=8, label=label)
     if ax.get_legend_handles_labels()[0]:
         ax.legend(fontsize=8)
     # at least half a decade, for a front of a single point
-    ax.set_ylim(min(min(errors) / 1.2, max(errors) / 2), max(max(errors) * 1.2, min(errors) * 2))
-    ax.set(xlabel="settled rms voltage (V)", ylabel="settled rms error (m)", yscale="log")
+    ends = min(min(errors) / 1.2, max(errors) / 2), max(max(errors) * 1.2, min(errors) * 2)
+    ax.set(xlabel="settled rms voltage (V)", ylabel=f"settled rms error ({unit})", yscale="log", ylim=ends)
+    log_ticks(ax.yaxis, *ends)
     low, high = ax.get_xlim()
     ax.set_xlim(low, high + 0.3 * (high - low))  # space for the text next to the last point
     ax.grid(alpha=0.3, which="both")
