@@ -438,7 +438,7 @@ def test_the_panels_of_the_whole_run_are_scaled_to_the_values_after_settle(kept)
     low, high = axes[0, 0].get_ylim()
     assert low < late.min()
     assert late.max() < high < late.min() + 2 * np.ptp(late)
-    assert axes[0, 0].get_title() == "whole run, scaled to what follows 0.05 s"
+    assert axes[0, 0].get_title() == "whole run (axis: values after 0.05 s)"
 
 
 @pytest.mark.parametrize("n", [9600, 20_001, 200])
@@ -509,7 +509,7 @@ def test_a_goal_far_beyond_its_limits_is_cut_in_the_convergence(kept):
     history = {"value": value, "gains": np.ones((2, 2, 1)), "members": np.array([4, 4])}
     left = tuned.convergence(history, ["controller.position.c"]).axes[0]
     np.testing.assert_allclose(left.lines[0].get_ydata(), np.exp([np.log(1e9) - 5.5, -5.0]), rtol=ROUNDING)
-    assert left.get_ylabel() == "what is minimised (cut at 1e+09 x the least)"
+    assert left.get_ylabel() == "objective (cut at 1e+09 times the least)"
 
 
 def test_the_picture_of_the_slices_shows_the_computed_values(kept):
@@ -528,6 +528,15 @@ def test_the_picture_of_the_slices_shows_the_computed_values(kept):
         assert middle.get_xdata()[0] == gains[j, 6]
         if crosses is not None:
             np.testing.assert_array_equal(crosses.get_xdata(), gains[j, lost[j] > 0])
+
+
+def test_the_panels_of_many_gains_stand_in_rows_of_at_most_five(kept):
+    values = np.geomspace(1, 4, 13) * np.ones((7, 1))
+    figure = tuned.landscape(
+        Slices(values, values, np.zeros((7, 13), int), values), [f"controller.{x}" for x in "abcdefg"]
+    )
+    assert [ax.get_xlabel() for ax in figure.axes] == list("abcdefg")
+    assert {ax.get_subplotspec().get_gridspec().get_geometry() for ax in figure.axes} == {(2, 4)}
 
 
 def test_points_of_the_front_that_lose_members_are_marked(kept):

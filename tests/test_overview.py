@@ -131,7 +131,7 @@ def test_the_panels_of_the_whole_run_have_the_scale_of_the_settled_part(tmp_path
     z = 1e-4 * np.exp(-t / 1e-3) + 2e-7 * np.sin(300 * t)
     overview(a_run(z=z), "lift-off", tmp_path / "o.png", settle=0.1)
     whole, start, _ = columns(drawn[0])[0]
-    assert whole.get_title(loc="left") == "the whole run, scaled to what follows 0.1 s"
+    assert whole.get_title(loc="left") == "whole run (axis: values after 0.1 s)"
     assert whole.get_ylim() == (pytest.approx(-0.2 * 1.24, rel=1e-3), pytest.approx(0.2 * 1.24, rel=1e-3))  # um
     assert start.get_ylim()[1] > 99.0
     lost = a_run(z=z, lost_at=1.0, code=TOUCHED)

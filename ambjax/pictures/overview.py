@@ -142,7 +142,7 @@ def _stretches(trajectory: Trajectory, settle: float) -> list[tuple[str, float, 
 
 
 def _scale_words(trajectory: Trajectory, settle: float) -> str:
-    return f"the whole run, scaled to what follows {settle:g} s" if _scales_late(trajectory, settle) else ""
+    return f"whole run (axis: values after {settle:g} s)" if _scales_late(trajectory, settle) else ""
 
 
 def _status(trajectory: Trajectory) -> str:

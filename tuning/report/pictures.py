@@ -16,6 +16,8 @@ from tuning.search.explore import Slices
 
 # Upper end of the axis of the risk: a lost member costs about 1e6 times an error.
 HIGHEST = 30.0
+# Largest number of panels in a row of the picture of the objective along each gain.
+GAINS_PER_ROW = 5
 # Largest value of the goal in the picture, relative to the least; limits far from met give values above 1e300.
 LARGEST_GOAL = 1e9
 # Length (s) of the enlarged start and end of a run; at most a quarter of the run.
@@ -85,7 +87,7 @@ def before_after(runs: dict[str, Trajectory], settle: float = 0.0) -> bytes:
             }  # a curve may run behind the words
             line[0].annotate(words, (0.04, 0.06), xycoords="axes fraction", fontsize=8, bbox=paper)
         line[0].set_ylabel(f"{name}\n{signal} ({unit})", fontsize=9)
-    whole = f"whole run, scaled to what follows {settle:g} s" if settle > 0 else "whole run"
+    whole = f"whole run (axis: values after {settle:g} s)" if settle > 0 else "whole run"
     for ax, words in zip(axes[0], (whole, "start", "end"), strict=True):
         ax.set_title(words, fontsize=10)
     for ax in axes[-1]:
@@ -151,13 +153,13 @@ def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
     for s in range(cut.shape[1]):
         left.plot(steps, shown(cut[:, s]), "0.75", lw=1)
     left.plot(steps, shown(cut.min(axis=1)), "C0", lw=1.8)
-    title = "blue: the best start; dotted: the members change"
-    label = "what is minimised" if (cut == value).all() else f"what is minimised (cut at {LARGEST_GOAL:g} x the least)"
+    title = "blue: best start; dotted: other members"
+    label = "objective" if (cut == value).all() else f"objective (cut at {LARGEST_GOAL:.0e} times the least)"
     left.set(xlabel="iteration", ylabel=label, yscale="log", title=title)
     for j, path in enumerate(paths):
         right.plot(steps, gains[steps - 1, best, j] / gains[-1, best[-1], j], label=path.removeprefix("controller."))
     right.set(xlabel="iteration", ylabel="gain / its final value", yscale="log", title="gains of the best start")
-    right.legend(fontsize=8)
+    right.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))  # beside the curves
     for at in np.flatnonzero(np.diff(members)):
         for ax in (left, right):
             ax.axvline(at + 1.5, color="0.5", ls=":", lw=1)
@@ -172,8 +174,13 @@ def landscape(slices: Slices, paths: list[str]) -> bytes:
     from matplotlib.figure import Figure
 
     m = len(paths)
-    figure = Figure(figsize=(2.4 * m + 1, 3.2), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(1, m, sharey=True))
+    lines = -(-m // GAINS_PER_ROW)
+    columns = -(-m // lines)
+    figure = Figure(figsize=(2.4 * columns + 1, 2.6 * lines + 0.6), layout="constrained")
+    grid = figure.subplots(lines, columns, sharey=True, squeeze=False)
+    axes = grid.flat[:m]
+    for ax in grid.flat[m:]:
+        ax.remove()
     middle = slices.goals.shape[1] // 2
     for ax, gains, goals, lost, path in zip(axes, slices.gains, slices.goals, slices.lost, paths, strict=True):
         risk = np.exp(np.minimum(goals - goals[middle], np.log(HIGHEST)))
@@ -189,7 +196,8 @@ def landscape(slices: Slices, paths: list[str]) -> bytes:
         ends = [end for end in (gains[0], gains[-1]) if abs(np.log(end / gains[middle])) > span / 4]
         ax.set_xticks([*ends, gains[middle]], [digits(tick) for tick in (*ends, gains[middle])], fontsize=8)
         ax.grid(alpha=0.3)
-    axes[0].set_ylabel(f"relative to the answer (cut at {HIGHEST:g})")
+    for ax in grid[:, 0]:
+        ax.set_ylabel(f"objective / that of the answer\n(cut at {HIGHEST:g})", fontsize=9)
     handles = {label: h for ax in axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2, fontsize=8, frameon=False)
     return _png(figure)
