@@ -305,7 +305,8 @@ def test_wide_content_scrolls_in_its_own_box(written):
     assert shown.count("<table>") == shown.count('<div class="wide"><table>') > 4
     assert shown.count("<img ") == shown.count('<span class="wide"><img ') == 5
     assert 'src="data:image/png;base64,' in shown
-    assert "http" not in shown  # needs nothing else
+    # the page needs no other file; the data of a picture may contain these letters by chance
+    assert "http" not in re.sub(r"base64,[^\"]*", "", shown)
 
 
 def test_the_page_shows_the_answer_and_the_front_and_folds_the_rest(written):
