@@ -1413,6 +1413,13 @@ SEARCH = [
         "tests/test_iron.py::test_the_force_follows_the_flux_densities",
     ),
     M(
+        "the derivative of a largest value is that of the smaller argument",
+        "ambjax/numerics/smooth.py",
+        "jnp.where(a >= b, da, db)",
+        "jnp.where(a <= b, da, db)",
+        "tests/test_smooth.py::test_the_derivative_of_an_extreme_is_that_of_the_argument_that_is_taken",
+    ),
+    M(
         "the inductance omits the slope of the saturated core",
         "ambjax/world/coils.py",
         "reciprocal(slope * permeance)",

@@ -11,9 +11,11 @@ from ambjax.numerics.smooth import (
     arctan_per,
     away_from_zero,
     cosine,
+    larger,
     refined,
     safe_sqrt,
     sine,
+    smaller,
     smooth_root,
     smooth_sign,
 )
@@ -132,6 +134,14 @@ def test_sine_and_cosine_of_turns_agree_with_numpy(dtype):
     eps = np.finfo(dtype).eps
     np.testing.assert_allclose(wide(sine)(x), sin, rtol=4 * eps, atol=1e-18)
     np.testing.assert_allclose(wide(cosine)(x), cos, rtol=4 * eps, atol=2 * eps)
+
+
+@pytest.mark.parametrize(("f", "sign"), [(larger, 1.0), (smaller, -1.0)])
+def test_the_derivative_of_an_extreme_is_that_of_the_argument_that_is_taken(f, sign):
+    a, b = jnp.asarray([1.0, 2.0, 2.0, jnp.nan, 1.0]), jnp.asarray([2.0, 1.0, 2.0, 1.0, jnp.nan])
+    values, slopes = jax.vmap(jax.value_and_grad(lambda x: sign * f(sign * x[0], sign * x[1])))(jnp.stack([a, b], 1))
+    np.testing.assert_array_equal(values, [2.0, 2.0, 2.0, np.nan, np.nan])
+    np.testing.assert_array_equal(slopes[:3], [[0.0, 1.0], [1.0, 0.0], [1.0, 0.0]])  # the first, if both are equal
 
 
 def test_derivatives_of_elementary_functions_are_exact():

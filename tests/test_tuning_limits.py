@@ -186,8 +186,9 @@ def test_the_steps_of_judge_and_reference_on_a_processor():
 
 
 @pytest.mark.slow
-def test_derivatives_of_limited_quantities_agree_in_three_ways():
-    made = problem_from(SAMPLED)
+@pytest.mark.parametrize("iron", ["", "[plant.iron]\nsaturation = 1.2\nleakage = 1.1\neddy = 1e-4\n"])
+def test_derivatives_of_limited_quantities_agree_in_both_modes(iron):
+    made = problem_from(SAMPLED + iron)
     x, members = made.objective.space.encode(made.tune.space.values(made.case.cascade)), made.objective.members(1, 2)
     forward, reverse = (Engine(made.objective, settle=0.01, mode=mode, threads=1) for mode in ("forward", "reverse"))
     value, slopes, _ = forward.gradient(x[None], members, made.goal.weights)

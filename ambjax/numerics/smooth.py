@@ -97,6 +97,34 @@ def _reciprocal_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Arra
     return value, -(value * value) * tangents[0]
 
 
+@jax.custom_jvp
+def larger(a: Scalar, b: Scalar) -> Array:
+    """Return `jnp.maximum(a, b)`, with the derivative of a where a >= b, otherwise that of b.
+
+    JAX's rule compares the result with a and b. If XLA computes an argument twice with different rounding, the result
+    equals neither, and reverse mode returns 0.
+    """
+    return jnp.maximum(a, b)
+
+
+@larger.defjvp
+def _larger_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    (a, b), (da, db) = primals, tangents
+    return larger(a, b), jnp.where(a >= b, da, db)
+
+
+@jax.custom_jvp
+def smaller(a: Scalar, b: Scalar) -> Array:
+    """Return `jnp.minimum(a, b)`, with the derivative of a where a <= b, otherwise that of b; see `larger`."""
+    return jnp.minimum(a, b)
+
+
+@smaller.defjvp
+def _smaller_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    (a, b), (da, db) = primals, tangents
+    return smaller(a, b), jnp.where(a <= b, da, db)
+
+
 def polynomial(u: Array, coefficients: Sequence[Scalar]) -> Scalar:
     """Evaluate a polynomial in u, coefficients in ascending order, by Estrin's scheme.
 

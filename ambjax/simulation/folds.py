@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record, static
-from ambjax.numerics.smooth import safe_sqrt
+from ambjax.numerics.smooth import larger, safe_sqrt, smaller
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import Row, first_time
 
@@ -63,9 +63,9 @@ class Peak:
         peak, when = carry
         value = jnp.abs(getattr(row, self.of))
         if self.of in getattr(span.most, "_fields", ()):
-            value = jnp.maximum(value, getattr(span.most, self.of))
-        larger = (value > peak) & (row.t >= self.after)
-        return jnp.where(larger, value, peak), jnp.where(larger, row.t, when)
+            value = larger(value, getattr(span.most, self.of))
+        new = (value > peak) & (row.t >= self.after)
+        return jnp.where(new, value, peak), jnp.where(new, row.t, when)
 
     def result(self, carry: tuple[Array, Array], ending: Ending) -> Array | tuple[Array, Array]:
         return carry if self.timed else carry[0]
@@ -83,8 +83,8 @@ class Lowest:
     def update(self, carry: tuple[Array, Array], row: Row, span: Span) -> tuple[Array, Array]:
         least, when = carry
         value = getattr(row, self.of)
-        smaller = (value < least) & row.alive
-        return jnp.where(smaller, value, least), jnp.where(smaller, row.t, when)
+        new = (value < least) & row.alive
+        return jnp.where(new, value, least), jnp.where(new, row.t, when)
 
     def result(self, carry: tuple[Array, Array], ending: Ending) -> tuple[Array, Array]:
         return carry
@@ -187,7 +187,7 @@ class Reaching:
     def update(self, carry: Array, row: Row, span: Span) -> Array:
         value = jnp.abs(getattr(row, self.of))
         if self.of in getattr(span.least, "_fields", ()):
-            value = jnp.minimum(value, getattr(span.least, self.of))
+            value = smaller(value, getattr(span.least, self.of))
         return first_time((value <= self.band) & row.alive, row.t, carry)
 
     def result(self, carry: Array, ending: Ending) -> Array:

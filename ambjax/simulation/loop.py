@@ -10,7 +10,7 @@ from jax import Array
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
 from ambjax.numerics.records import Scalar, record
-from ambjax.numerics.smooth import limited
+from ambjax.numerics.smooth import larger, limited
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.sliding import slide, slides
 from ambjax.simulation.span import Instant, Span
@@ -243,7 +243,7 @@ class ClosedLoop:
     def completed(self, row: Row, span: Span) -> Row:
         """Return the row of a sample with mean and peak voltage, which are known only at the end of the sample."""
         mean = span.densities.u / jnp.where(span.time > 0, span.time, 1.0)
-        return row._replace(u_mean=mean, u_peak=jnp.maximum(jnp.abs(row.u), span.most.u))
+        return row._replace(u_mean=mean, u_peak=larger(jnp.abs(row.u), span.most.u))
 
     def singularity(self, row: Row) -> Array:
         """Return a number that is 0 on the singular curve C and positive on its admissible side. Eq. (9)."""

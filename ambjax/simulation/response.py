@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.smooth import larger, smaller
 from ambjax.simulation.folds import Ending
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import Row
@@ -77,9 +78,9 @@ class Overshoot:
 
     def update(self, carry: Reach, row: Row, span: Span) -> Reach:
         began = jnp.where(row.t <= 0, row.z, row.r)
-        low = jnp.minimum(carry.low, jnp.minimum(began, row.r))
-        high = jnp.maximum(carry.high, jnp.maximum(began, row.r))
-        return Reach(low, high, jnp.maximum(carry.beyond, jnp.maximum(row.z - high, low - row.z)))
+        low = smaller(carry.low, smaller(began, row.r))
+        high = larger(carry.high, larger(began, row.r))
+        return Reach(low, high, larger(carry.beyond, larger(row.z - high, low - row.z)))
 
     def result(self, carry: Reach, ending: Ending) -> Array:
         return carry.beyond

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.records import Scalar
+from ambjax.numerics.smooth import larger, smaller
 
 
 class Instant(NamedTuple):
@@ -44,8 +45,8 @@ class Span(NamedTuple):
     def with_instant(self, instant: Instant, weight: Scalar, time: Scalar = 0.0) -> "Span":
         """Add an instant to the extremes, and to the integrals with `weight` (s). Add `time` (s) to the length."""
         sizes = jax.tree.map(jnp.abs, instant.sizes)
-        most = jax.tree.map(jnp.maximum, self.most, sizes)
-        least = jax.tree.map(jnp.minimum, self.least, sizes)
+        most = jax.tree.map(larger, self.most, sizes)
+        least = jax.tree.map(smaller, self.least, sizes)
         return Span(self.time + time, most, least, self.densities).with_densities(instant, weight)
 
     def with_densities(self, instant: Instant, weight: Scalar) -> "Span":
@@ -55,8 +56,8 @@ class Span(NamedTuple):
 
     def joined(self, after: "Span") -> "Span":
         """Return the union of this interval and the next one."""
-        most = jax.tree.map(jnp.maximum, self.most, after.most)
-        least = jax.tree.map(jnp.minimum, self.least, after.least)
+        most = jax.tree.map(larger, self.most, after.most)
+        least = jax.tree.map(smaller, self.least, after.least)
         more = jax.tree.map(lambda x, y: x + y, self.densities, after.densities)
         return Span(self.time + after.time, most, least, more)
 
