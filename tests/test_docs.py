@@ -231,6 +231,7 @@ def test_the_committed_tables_are_current(name):
     assert path.read_text(encoding="utf-8") == site.tables()[name], "run: python docs/reference/site.py"
 
 
+@pytest.mark.slow  # the slow tests run with Sphinx installed
 def test_a_printed_table_is_parsed_to_the_same_cells(monkeypatch):
     """A table printed with `outputs.table` has the same cells in the page; the text around it is kept."""
     pytest.importorskip("sphinx")

@@ -479,16 +479,24 @@ def test_bad_input_is_refused_in_one_line(wrong, capsys):
         assert part in err
 
 
-def test_a_missing_cluster_is_reported_in_one_line(monkeypatch, capsys):
+ON_A_CLUSTER = ["ensemble", "case.toml", "--members", "9", "--out", "new", "--cluster"]
+
+
+def test_a_missing_package_for_clusters_is_reported_in_one_line(monkeypatch, capsys):
     write(TINY)
-    argv = ["ensemble", "case.toml", "--members", "9", "--out", "new", "--cluster", "tcp://127.0.0.1:9"]
-    with monkeypatch.context() as without:
-        without.setitem(sys.modules, "distributed", None)
-        assert "pip install 'ambjax[cluster]'" in refused(argv, capsys)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert "pip install 'ambjax[cluster]'" in refused([*ON_A_CLUSTER, "tcp://127.0.0.1:9"], capsys)
+
+
+@pytest.mark.slow  # the slow tests run with the optional packages installed
+def test_a_cluster_that_does_not_answer_is_reported_in_one_line(monkeypatch, capsys):
     pytest.importorskip("distributed")
+    write(TINY)
     monkeypatch.setattr(workers, "PATIENCE", "0.5s")
-    assert "--cluster tcp://127.0.0.1:9: no scheduler answers there" in refused(argv, capsys)
-    assert "--cluster nonsense://x: " in refused([*argv[:-1], "nonsense://x"], capsys)
+    assert "--cluster tcp://127.0.0.1:9: no scheduler answers there" in refused(
+        [*ON_A_CLUSTER, "tcp://127.0.0.1:9"], capsys
+    )
+    assert "--cluster nonsense://x: " in refused([*ON_A_CLUSTER, "nonsense://x"], capsys)
 
 
 def test_another_study_in_the_folder_is_refused_and_not_changed(no_pictures, capsys):
