@@ -396,7 +396,8 @@ def search_of(descent, starts=STARTS, gains=GAINS):
 
 @pytest.fixture
 def checkpoint(tmp_path, descent):
-    checkpoint_file = CheckpointFile(tmp_path / "checkpoint-2.npz", SEARCH_FACTS, 2)
+    (tmp_path / "checkpoints").mkdir()
+    checkpoint_file = CheckpointFile(tmp_path / "checkpoints" / "round-2.npz", SEARCH_FACTS, 2)
     checkpoint_file.save(search_of(descent))
     return checkpoint_file
 
@@ -470,9 +471,9 @@ def test_a_folder_in_place_of_a_checkpoint_is_named_and_kept(checkpoint, descent
     checkpoint.path.mkdir()
     assert checkpoint.load(descent, STARTS, GAINS) is None
     assert capsys.readouterr().err.startswith(f"{checkpoint.path}: it is an incomplete archive")
-    with pytest.raises(ValueError, match=r"checkpoint-2.npz: cannot be written \(Is a directory\)"):
+    with pytest.raises(ValueError, match=r"round-2.npz: cannot be written \(Is a directory\)"):
         checkpoint.save(search_of(descent))
-    assert [path.name for path in checkpoint.path.parent.iterdir()] == ["checkpoint-2.npz"]
+    assert [path.name for path in checkpoint.path.parent.iterdir()] == ["round-2.npz"]
 
 
 @pytest.mark.parametrize(
@@ -489,19 +490,19 @@ def test_a_folder_in_place_of_a_checkpoint_is_named_and_kept(checkpoint, descent
     ],
 )
 def test_a_checkpoint_of_another_search_is_refused_with_the_difference(other, words, checkpoint, descent):
-    with pytest.raises(ValueError, match=r"checkpoint-2.npz belongs to another search") as raised:
+    with pytest.raises(ValueError, match=r"round-2.npz belongs to another search") as raised:
         CheckpointFile(checkpoint.path, other, 2).load(descent, STARTS, GAINS)
     assert words in str(raised.value)
     assert checkpoint.path.exists()
 
 
 def test_only_old_checkpoints_are_removed(checkpoint, tmp_path):
-    others = ["checkpoint-10", "checkpoint-2b.npz", "checkpoint-my-net.npz", "history.npz"]
+    others, folder = ["round-10", "round-2b.npz", "round-my-net.npz", "history.npz"], checkpoint.path.parent
     for name in others:
-        (tmp_path / name).touch()
-    (tmp_path / "checkpoint-7.npz").mkdir()
+        (folder / name).touch()
+    (folder / "round-7.npz").mkdir()
     assert remove_all(tmp_path) == 1
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([*others, "checkpoint-7.npz"])
+    assert sorted(p.name for p in folder.iterdir()) == sorted([*others, "round-7.npz"])
     assert remove_all(pathlib.Path(tmp_path, "nowhere")) == 0
 
 

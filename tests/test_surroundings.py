@@ -164,13 +164,13 @@ def test_a_study_in_a_folder_in_use_is_refused(capsys):
 
 def test_a_search_in_a_folder_in_use_is_refused_and_changes_nothing(capsys):
     out = pathlib.Path("out")
-    out.mkdir()
-    (out / "checkpoint-1.npz").touch()
+    (out / "checkpoints").mkdir(parents=True)
+    (out / "checkpoints" / "round-1.npz").touch()
     (out / "report.json").touch()
     with locked(out):
         assert tune([write(STUDY), "--out", "out"]) == 2
     assert "--out out: another run is using this directory" in capsys.readouterr().err
-    assert (out / "checkpoint-1.npz").exists()
+    assert (out / "checkpoints" / "round-1.npz").exists()
 
 
 def test_a_study_that_another_run_has_started_meanwhile_is_refused(monkeypatch, capsys):

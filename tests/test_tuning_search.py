@@ -533,12 +533,12 @@ def test_a_killed_search_is_resumed_and_damage_is_detected(tmp_path):
     assert command(path, "--out", whole).returncode == 0
     words = [sys.executable, "-m", "tuning", str(path), "--out", str(out)]
     running = subprocess.Popen(words, cwd=pathlib.Path(__file__).parent.parent, stderr=subprocess.DEVNULL)
-    while not (out / "checkpoint-2.npz").exists():
+    while not (out / "checkpoints" / "round-2.npz").exists():
         assert running.poll() is None
         time.sleep(0.01)
     running.kill()
     running.wait()
-    first = out / "checkpoint-1.npz"
+    first = out / "checkpoints" / "round-1.npz"
     first.write_bytes(first.read_bytes()[:-200])
     done = command(path, "--out", out, "--resume")
     assert done.returncode == 0, done.stderr
@@ -553,7 +553,7 @@ def test_a_killed_search_is_resumed_and_damage_is_detected(tmp_path):
     assert other.returncode == 2
     assert "belongs to another search: case.actuator.u_max is 400.0 in the file and 300.0 in this run" in other.stderr
     # a new search in the same directory removes the checkpoints of the old one
-    old = len(list(whole.glob("checkpoint-*.npz")))
+    old = len(list((whole / "checkpoints").glob("round-*.npz")))
     assert "--force" in command(path, "--out", whole).stderr
     fresh = command(path, "--out", whole, "--force")
     assert f"{whole}: removed {old} checkpoints of an earlier search\n" in fresh.stderr

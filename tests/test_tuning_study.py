@@ -365,12 +365,12 @@ def test_a_file_whose_gains_could_not_be_written_is_refused_at_the_start(monkeyp
 
 def test_an_unfinished_search_is_kept_and_only_resumed_with_resume(monkeypatch, tmp_path):
     *_, out, _ = command(monkeypatch, tmp_path, World())
-    left = {path.name for path in out.glob("checkpoint-*.npz")}
-    mine = out / "checkpoint-my-net.npz"
+    left = {path.name for path in (out / "checkpoints").glob("*.npz")}
+    mine = out / "checkpoints" / "round-my-net.npz"
     mine.touch()
     with pytest.raises(ValueError, match=r"it has tuned.toml, .* of an earlier run. .* overwrite them with --force"):
         command(monkeypatch, tmp_path, World())
-    assert {path.name for path in out.glob("checkpoint-*.npz")} == left | {mine.name}
+    assert {path.name for path in (out / "checkpoints").glob("*.npz")} == left | {mine.name}
     command(monkeypatch, tmp_path, World(), force=True)  # it has ended: its checkpoints go
     os.utime(out / "report.json", (0, 0))  # of the search before the one whose checkpoints these are
     with pytest.raises(ValueError, match=r"not ended. Continue it with --resume, discard it with --force"):
@@ -378,10 +378,10 @@ def test_an_unfinished_search_is_kept_and_only_resumed_with_resume(monkeypatch, 
     (out / "report.json").unlink()
     with pytest.raises(ValueError, match=r"not ended. Continue it with --resume, discard it with --force"):
         command(monkeypatch, tmp_path, World())
-    assert {path.name for path in out.glob("checkpoint-*.npz")} == left | {mine.name}
-    (out / "checkpoint-99.npz").touch()
+    assert {path.name for path in (out / "checkpoints").glob("*.npz")} == left | {mine.name}
+    (out / "checkpoints" / "round-99.npz").touch()
     command(monkeypatch, tmp_path, World(), force=True)
-    assert {path.name for path in out.glob("checkpoint-*.npz")} == left | {mine.name}
+    assert {path.name for path in (out / "checkpoints").glob("*.npz")} == left | {mine.name}
 
 
 def test_a_search_killed_before_its_first_checkpoint_is_resumed(monkeypatch, tmp_path):

@@ -19,9 +19,9 @@ from tuning.search.evolution import CmaState, idle_states
 # Scalar fields of SearchState in a checkpoint.
 COUNTS = ("iteration", "phase", "since", "seconds")
 FACTS = {"fingerprint", "round", "counts"}
-NAME = re.compile(r"checkpoint-[0-9]+\.npz")
-# File that marks the directory of a search before its first checkpoint.
-MARK = "search.json"
+NAME = re.compile(r"round-[0-9]+\.npz")
+# Subfolder of the output directory, and the file in it that marks a search before its first checkpoint.
+FOLDER, MARK = "checkpoints", "search.json"
 LEAF, PAST, ACTIVE = "leaf_", "history_", "active"
 
 
@@ -124,23 +124,28 @@ def mark_directory(directory: pathlib.Path) -> None:
 
     Raises ValueError if the mark cannot be written.
     """
-    text = json.dumps(provenance(), indent=2) + "\n"
-    write_whole(directory / MARK, lambda file: file.write(text.encode()))
+    text, folder = json.dumps(provenance(), indent=2) + "\n", directory / FOLDER
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{folder}: cannot be made ({error.strerror}). Choose another --out.") from None
+    write_whole(folder / MARK, lambda file: file.write(text.encode()))
 
 
 def can_resume(directory: pathlib.Path) -> bool:
     """Return whether a search has begun in this directory and can be resumed."""
-    return (directory / MARK).exists()
+    return (directory / FOLDER / MARK).exists()
 
 
 def checkpoint(number: int) -> str:
-    """Return the file name of the checkpoint of this round."""
-    return f"checkpoint-{number}.npz"
+    """Return the path of the checkpoint of this round, relative to the output directory."""
+    return f"{FOLDER}/round-{number}.npz"
 
 
 def checkpoints(directory: pathlib.Path) -> list[pathlib.Path]:
-    """Return the checkpoint files of a search in this directory."""
-    return sorted(path for path in directory.glob("checkpoint-*.npz") if NAME.fullmatch(path.name) and path.is_file())
+    """Return the checkpoint files of a search in this output directory."""
+    found = (directory / FOLDER).glob("round-*.npz")
+    return sorted(path for path in found if NAME.fullmatch(path.name) and path.is_file())
 
 
 def has_unfinished_search(directory: pathlib.Path, report: str) -> bool:
