@@ -207,7 +207,7 @@ def test_a_study_killed_at_any_instant_and_resumed_gives_the_same_file(no_pictur
     write(LONGER)
     assert main([*RUN, "--out", "whole"]) == 0
     dice, early = random.Random(11), 0
-    count = examples(4, 10)
+    count = examples(2, 10)
     for n in range(count):
         out, flags = f"cut-{n}", [[], ["--processes", "2"]][n % 2]
         running = begin(out, *flags)

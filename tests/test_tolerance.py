@@ -108,7 +108,7 @@ def test_the_error_of_a_run_is_at_most_that_of_100_steps():
 
 @pytest.mark.slow
 def test_the_errors_of_many_loops_are_bounded_by_those_of_a_step():
-    loops = random_loops(examples(40, 300))
+    loops = random_loops(examples(20, 300))
     exact, z_dot = motion(loops, 1e-9)
     errors = far(motion(loops, QUIET_TOLERANCE)[0], exact)
     held = np.isfinite(exact).all(axis=1)

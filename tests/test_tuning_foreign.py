@@ -207,6 +207,7 @@ def write(path, text, **tune):
         "held_out": 100,
         "validation": 100,
         "screen": 32,
+        "iterations": 8,
         "limits": {"sensitivity": math.inf},
     } | tune
     document["clock"] = {"duration": 0.2}
