@@ -396,7 +396,6 @@ def search_of(descent, starts=STARTS, gains=GAINS):
 
 @pytest.fixture
 def checkpoint(tmp_path, descent):
-    (tmp_path / "checkpoints").mkdir()
     checkpoint_file = CheckpointFile(tmp_path / "checkpoints" / "round-2.npz", SEARCH_FACTS, 2)
     checkpoint_file.save(search_of(descent))
     return checkpoint_file
@@ -494,6 +493,12 @@ def test_a_checkpoint_of_another_search_is_refused_with_the_difference(other, wo
         CheckpointFile(checkpoint.path, other, 2).load(descent, STARTS, GAINS)
     assert words in str(raised.value)
     assert checkpoint.path.exists()
+
+
+def test_a_file_in_place_of_the_folder_of_checkpoints_is_named(tmp_path, descent):
+    (tmp_path / "checkpoints").touch()
+    with pytest.raises(ValueError, match=r"checkpoints: cannot be made \(File exists\). Choose another --out"):
+        CheckpointFile(tmp_path / "checkpoints" / "round-1.npz", SEARCH_FACTS).save(search_of(descent))
 
 
 def test_only_old_checkpoints_are_removed(checkpoint, tmp_path):

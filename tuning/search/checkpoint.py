@@ -84,6 +84,7 @@ class CheckpointFile:
         """Write this state to the checkpoint. Raises ValueError if it cannot be written."""
         if self.path is None:
             return
+        _make(self.path.parent)
         leaves = {
             f"{LEAF}{n}": np.asarray(leaf)
             for n, leaf in enumerate(jax.tree.leaves((progress.starts, progress.cma_states)))
@@ -124,12 +125,17 @@ def mark_directory(directory: pathlib.Path) -> None:
 
     Raises ValueError if the mark cannot be written.
     """
-    text, folder = json.dumps(provenance(), indent=2) + "\n", directory / FOLDER
+    text = json.dumps(provenance(), indent=2) + "\n"
+    _make(directory / FOLDER)
+    write_whole(directory / FOLDER / MARK, lambda file: file.write(text.encode()))
+
+
+def _make(folder: pathlib.Path) -> None:
+    """Make the subfolder of the checkpoints if it does not exist. Raises ValueError if it cannot be made."""
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise ValueError(f"{folder}: cannot be made ({error.strerror}). Choose another --out.") from None
-    write_whole(folder / MARK, lambda file: file.write(text.encode()))
 
 
 def can_resume(directory: pathlib.Path) -> bool:
