@@ -2,11 +2,14 @@
 
 import argparse
 import contextlib
+import difflib
 import importlib
 import json
+import re
 import sys
-from collections.abc import Callable
-from typing import NoReturn
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
+from typing import Any, NoReturn
 
 from ambjax._version import __version__
 from ambjax.host.interrupts import exit_on_interrupt
@@ -27,10 +30,32 @@ ambjax simulates, checks, tunes and exports the controller of a rotor in an acti
 
 
 class Parser(argparse.ArgumentParser):
-    """Argument parser that prints an error on one line and exits with code 2."""
+    """Argument parser that prints an error on one line and exits with code 2. `commands`: parsers of its commands."""
+
+    commands: Mapping[str, argparse.ArgumentParser] = MappingProxyType({})
 
     def error(self, message: str) -> NoReturn:
-        sys.exit(complain(f"{message}. See '{self.prog} --help'.", self.prog.split()[0]))
+        end = "" if message.endswith("?") else "."
+        sys.exit(complain(f"{message}{end} See '{self.prog} --help'.", self.prog.split()[0]))
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Parse the arguments. For an unknown command or option, the error names the most similar one."""
+        words = list(sys.argv[1:] if args is None else args)
+        if self.commands and words and not words[0].startswith("-") and words[0] not in self.commands:
+            known = f"It must be one of {', '.join(self.commands)}"
+            self.error(f"{words[0]!r} is no command. {known}.{_similar(words[0], self.commands)}".rstrip("."))
+        parsed, unknown = self.parse_known_args(words, namespace)
+        if unknown:
+            used = self.commands.get(getattr(parsed, "command", ""), self)
+            options = re.findall(r"--[a-z-]+", used.format_usage())
+            used.error(f"unrecognized arguments: {' '.join(unknown)}.{_similar(unknown[0], options)}".rstrip("."))
+        return parsed
+
+
+def _similar(word: str, names: Iterable[str]) -> str:
+    """Return a question with the most similar name, or nothing."""
+    close = difflib.get_close_matches(word.partition("=")[0], list(names), n=1, cutoff=0.7)
+    return f" Did you mean {close[0]!r}?" if close else ""
 
 
 def complain(message: str, program: str = "ambjax") -> int:
@@ -134,6 +159,7 @@ def parser() -> Parser:
     page.add_argument("--force", action="store_true", help="overwrite the file of an earlier run")
     # Listed for --help only; main passes the arguments of `tune` to the tuner's own parser.
     command("tune", "tune the gains of a case on an ensemble of rotors: tuned.toml, report.html")
+    top.commands = commands.choices
     return top
 
 

@@ -86,6 +86,15 @@ BAD = {
     ),
     "a kind in capitals": ("[controller.position]\nkind = 'PD'\n", ["controller.position.kind", "mean 'pid'"]),
     "not TOML": ("[plant\nm = 1\n", ["not valid TOML", "line 1"]),
+    "a second load in double brackets": (
+        "[disturbance.q_z]\nkind = 'step'\n[[disturbance.q_z]]\nkind = 'sine'\n",
+        ["The line is: [[disturbance.q_z]]. ", "write [[disturbance.q_z]] above each, the first too."],
+    ),
+    "a second load in single brackets": (
+        "[disturbance.q_z]\nkind = 'step'\n[disturbance.q_z]\nkind = 'sine'\n",
+        ["write [[disturbance.q_z]] above each, the first too."],
+    ),
+    "a number twice": ("[plant]\nm = 1\nm = 2\n", ["The line is: m = 2. Write each key once."]),
 }  # fmt: skip
 
 
@@ -128,7 +137,10 @@ def test_bad_files_and_folders(capsys):
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
-        (["simulat"], "invalid choice"),
+        (["simulat"], "page, tune. Did you mean 'simulate'? See 'ambjax --help'.\n"),
+        (["levitate"], "'levitate' is no command. It must be one of reproduce, "),
+        (["simulate", "case.toml", "--ouput=x"], ": --ouput=x. Did you mean '--out'? See 'ambjax simulate --help'.\n"),
+        (["export", "case.toml", "--to", "x"], "unrecognized arguments: --to x. See 'ambjax export --help'.\n"),
         (["simulate"], "CASE.toml"),
         (["simulate", "case.toml", "--outt", "x"], "--outt"),
         (["template", "levitation"], "invalid choice"),

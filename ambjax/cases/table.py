@@ -60,8 +60,8 @@ def _place(text: str, error: str) -> str:
     shown = f" The line is: {cut(line.strip())}."
     if re.match(r"[^#\[\"']*=\s*[-+]?\d+,\d", line):
         return f"{shown} Write a decimal number with a point."
-    if "twice" in error:
-        return f"{shown} Write each table once; for several loads, write [[disturbance.q_z]] above each."
+    if "twice" in error or ("overwrite" in error and line.lstrip().startswith("[")):
+        return f"{shown} Write each table once; for several loads, write [[disturbance.q_z]] above each, the first too."
     if "overwrite" in error:
         return f"{shown} Write each key once."
     return f"{shown} See 'ambjax template' for a file to start from."

@@ -147,6 +147,11 @@ def _refusal(out: pathlib.Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        for above in (out, *out.parents):
+            if os.path.isfile(above):  # noqa: PTH113 - it never raises an error
+                raise ValueError(
+                    f"--out {out}: cannot write there, because {above} is a file. Choose a directory."
+                ) from None
         why = error.strerror or str(error)
         raise ValueError(f"--out {out}: cannot write there ({why}). Free space, or choose another directory.") from None
 
