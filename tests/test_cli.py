@@ -124,8 +124,8 @@ def test_bad_files_and_folders(capsys):
         (["simulate", "missing.toml"], "cannot be read (No such file"),
         (["simulate", "folder.toml"], "cannot be read (Is a directory"),
         (["simulate", "binary.toml"], "not a text file"),
-        (["simulate", "case.toml", "--out", "file"], "--out file: cannot write there, because file is a file. Choose a directory."),
-        (["simulate", "case.toml", "--out", "file/below"], "--out file/below: cannot write there, because file is a file."),
+        (["simulate", "case.toml", "--out", "file"], "--out file: cannot write there, because file is a file."),
+        (["simulate", "case.toml", "--out", "file/below"], "below: cannot write there, because file is a file."),
         (["reproduce", "--out", "/proc/nowhere"], "cannot write"),
     ):
         assert main(argv) == 2, argv
