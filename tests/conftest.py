@@ -23,7 +23,7 @@ os.environ.setdefault("JAX_ENABLE_X64", "1")
 # The position in the source of every operation would be collected in each lowering.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 
 # Tracing allocates millions of long-lived objects, which the garbage collector would visit repeatedly.

@@ -5,13 +5,15 @@ of the set-valued sign give |x| <= T (k + W), implicit steps |x| <= T W (V. Acar
 59 (2010) 284-293). A smoothed sign adds the x at which it balances W.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
+from jax import Array
 
-from ambjax.numerics.records import Scalar
+from ambjax.numerics.records import Scalar, canonical
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
 
@@ -66,9 +68,13 @@ def disturbance(relay: Relay, x: np.ndarray, period: float, implicit: bool) -> f
     s_n in -1..1 is the value of the relay's sign at sample n.
     """
     k, p = relay
-    before = jnp.asarray(x[:-1])
-    used = share(before, period * k, p) if implicit else smooth_sign(before, p)
+    used = _sign(*canonical((x[:-1], period * k, p)), implicit)
     return float(np.max(np.abs(np.diff(x) / period + k * np.asarray(used)), initial=0.0))
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _sign(x: Array, h: Array, p: Array | None, implicit: bool) -> Array:
+    return share(x, h, p) if implicit else smooth_sign(x, p)
 
 
 def band(relay: Relay, W: float, period: float, implicit: bool) -> float:

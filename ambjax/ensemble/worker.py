@@ -41,7 +41,7 @@ def configure_jax() -> None:
             cache.mkdir(parents=True, exist_ok=True)
             jax.config.update("jax_compilation_cache_dir", str(cache))
             jax.config.update("jax_compilation_cache_max_size", CACHE_SIZE)
-            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if platforms := os.environ.get("JAX_PLATFORMS"):
         try:
             jax.default_backend()

@@ -26,7 +26,7 @@ from ambjax.theorem.proof import Monitored
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Constant, Signal, reference_at
+from ambjax.world.signals import Reference, Signal, reference_at
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,8 +153,9 @@ def delta_1_on_reference(cascade: Cascade, scenario: Scenario, clock: Clock) -> 
 
     This is Eq. (7) without disturbance and transients: the lower bound of gamma for following the reference.
     """
-    times = jnp.arange(min(clock.samples, 20_000)) * (clock.duration / min(clock.samples, 20_000))
-    values = np.asarray(_drift(*canonical((cascade.model, scenario.realised().reference)), times))
+    count = min(clock.samples, 20_000)
+    times = np.arange(count) * (float(clock.duration) / count)
+    values = np.asarray(_drift(*canonical((cascade.model, scenario.realised().reference, times))))
     worst = int(np.argmax(values))
     return float(values[worst]), float(times[worst])
 
@@ -229,8 +230,10 @@ def _conditions(
 def constant_sigma(law: PositionLaw) -> list[Condition]:
     """Return a condition for each schedule that changes the sliding variable, which the theorem takes as fixed."""
     plain: Any
-    rows, plain = [], extremes(law)[0]
-    motion, reference = Measurement(*map(jnp.asarray, (1.0, 1.0, 0.0))), reference_at(Constant(), 0.0)
+    one: Any
+    zero: Any
+    rows, plain, one, zero = [], extremes(law)[0], np.ones(()), np.zeros(())
+    motion, reference = Measurement(one, one, zero), Reference(zero, zero, zero)
     for name, schedule in schedules(law).items():
         low, high = (dataclasses.replace(plain, **{name: x}) for x in (1.0, 2.0))
         if low.sigma(motion, reference) != high.sigma(motion, reference):

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ambjax.control.cascade import Cascade
@@ -169,11 +168,15 @@ def _smallest_distance(run: Trajectory, plant: Bearing) -> tuple[float, float]:
     It is computed after the run, because XLA does not compile it within the loop as one kernel.
     """
     rows: Any = run.rows
-    t, points = np.asarray(rows.t), (jnp.asarray(rows.z), jnp.asarray(rows.i_ref))
-    far = jax.lax.map(lambda at: plant.signed_distance_to_C(*at), points, batch_size=BATCH)
-    distance = np.asarray(far)
+    t, distance = np.asarray(rows.t), np.asarray(_distances(*canonical((plant, rows.z, rows.i_ref))))
     worst = int(np.argmin(np.where(t <= float(run.lost_at), distance, np.inf)))
     return float(distance[worst]), float(t[worst])
+
+
+@jax.jit
+def _distances(plant: Bearing, z: jax.Array, i_ref: jax.Array) -> jax.Array:
+    """Return the signed distances to the singular curve C at displacements z [N], m, and currents i_ref [N], A."""
+    return jax.lax.map(lambda at: plant.signed_distance_to_C(*at), (z, i_ref), batch_size=BATCH)
 
 
 def alternation(u: np.ndarray) -> float:

@@ -128,6 +128,7 @@ class Scenario:
         return jnp.minimum(self.u_max, self.amplifier.coil.reserve(self.plant.R * self.plant.i_0))
 
     @property
+    @jax.jit  # compiles one program instead of one for each operation
     def largest_force(self) -> Scalar:
         """The magnetic force (N) at z = 0 for i = i_0, where one coil is off, or for the limit of |i| if it is less."""
         return self.plant.largest_force(self.amplifier and self.amplifier.current_limit(self.plant.i_0))
