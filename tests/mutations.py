@@ -678,8 +678,8 @@ ENSEMBLE = [
     M(
         "a member that runs alone uses another number of lanes",
         "ambjax/ensemble/replay.py",
+        "(*tree, progress, first), threads=1, call=CALL)",
         "(*tree, progress, first), threads=1, call=1)",
-        "(*tree, progress, first), threads=1, call=1, block=1)",
         "tests/test_replay.py::test_the_printed_command_replays_the_worst_member",
     ),
     M(

@@ -109,7 +109,7 @@ def test_hostile_files_are_refused_in_one_line(wrong):
         assert part in message
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_steep_but_possible_gains_run(capsys):
     # 2/pi k p = 6e59 1/s: no step resolves it, which is no fault of the file; the run says what came of it
     path = write(SHORT + "[controller.position]\nk = 1e30\np = 1e30\n")
@@ -123,6 +123,7 @@ def test_steep_but_possible_gains_run(capsys):
         assert not any(np.isnan(kept[name]).any() for name in kept if kept[name].dtype == float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "value"), [("rms_error_m", math.nan), ("lost_at_s", math.nan), ("rms_u_V", math.inf)])
 def test_a_metric_that_is_not_a_number_is_refused(name, value, capsys, monkeypatch):
     run = simulate._simulated
@@ -349,7 +350,7 @@ def test_the_papers_cases_have_no_warnings(name):
     assert warnings_of(read_case(write(template(name) + sensor + "std_z_dot = 1e-4\n"))) == []
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_current_above_the_bias_causes_one_warning(capsys):
     over, under = (
         write(SHORT + f"[initial]\ni = {i}\n", f"{name}.toml") for name, i in (("over", 0.26), ("under", 0.24))
@@ -535,7 +536,7 @@ def test_a_failed_write_to_stdout_is_reported_in_one_line():
     assert "No space left on device" in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_closed_standard_streams_do_not_change_the_results():
     path = write(SHORT)
     assert main(["simulate", path, "--out", "a"]) == 0

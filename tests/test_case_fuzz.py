@@ -307,7 +307,7 @@ def test_three_hundred_changed_files_are_read_or_refused_in_one_line(path):
 
 @pytest.mark.slow
 def test_changed_files_are_simulated_or_refused(path):
-    tally, count = Tally(), examples(600, 8_000)
+    tally, count = Tally(), examples(300, 8_000)
 
     @settings(max_examples=count, **PROFILE)
     @given(texts())

@@ -279,6 +279,7 @@ def test_the_margin_is_between_a_delay_that_holds_and_one_that_does_not():
     assert 0.5 < beyond.held < beyond.lost < 1.1
 
 
+@pytest.mark.slow
 def test_the_delay_margin_without_a_known_delay_is_smaller():
     cascade, clock = cascade_of(*HARD, delay=1.0), amb.Clock(600, 1e-4, amb.RK4(1))
     margin = delay_margin(cascade, WORLD, clock, known=False)
@@ -338,6 +339,7 @@ def delays(cascade, scenario, clock, *, fold):
     return Outcome(Trajectory(None, np.where(code == ALIVE, np.inf, 0.01), code, np.inf), None)
 
 
+@pytest.mark.slow
 def test_a_stalled_run_on_a_processor_is_reported_as_undecided():
     sampled = SampledReport([], [], 0.01, "stalled: ...", stalled=True)
     assert not sampled.holds

@@ -136,6 +136,7 @@ def test_the_current_reaches_its_limits_and_stays_within_one_step(i_max, unidire
         assert float(longer.i_2) == pytest.approx(float(after.i_2), abs=step)
 
 
+@pytest.mark.slow
 def test_gradients():
     """The derivative di/du_max is (1 - exp(-R t/L))/R.
 

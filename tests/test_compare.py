@@ -72,6 +72,7 @@ def two(run):
     return run("soft", "stiff")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [0, 1])
 def test_the_numbers_are_those_of_the_study_and_of_the_analysis(two, cases, k):
     row = two[1]["cases"][k]
@@ -96,6 +97,7 @@ def test_the_numbers_are_those_of_the_study_and_of_the_analysis(two, cases, k):
     assert row["laws"]["position"] == {"kind": "SlidingMode", "c": [150.0, 200.0][k], "k": 63.0, "p": 5.0}
 
 
+@pytest.mark.slow
 def test_members_are_compared_one_by_one(two, cases):
     errors = []
     for name in ("soft", "stiff"):
@@ -109,6 +111,7 @@ def test_members_are_compared_one_by_one(two, cases):
     assert two[1]["differences"] == []
 
 
+@pytest.mark.slow
 def test_the_page_has_the_table_and_the_picture(two):
     html = (two[2] / "compare.html").read_text()
     assert html.count("data:image/png;base64,") == 1
@@ -116,6 +119,7 @@ def test_the_page_has_the_table_and_the_picture(two):
     assert '<td class="short">settled rms error, median</td>' in html
 
 
+@pytest.mark.slow
 def test_a_case_that_loses_members_is_compared_too(run, capsys):
     """The gain k = 0.01 m/s^2 does not hold a rotor whose weight differs by 10 % from that of the model."""
     code, summary, _ = run("stiff", "loose")
@@ -199,7 +203,7 @@ def test_each_case_is_tuned_with_the_settings_of_the_first(run, cases, monkeypat
     assert "could not be tuned" in capsys.readouterr().err
 
 
-def test_the_picture_counts_every_member(two, cases):
+def test_the_picture_counts_every_member(cases):
     case = read_case(cases / "soft.toml")
     system = linearise(case.cascade, case.scenario, case.clock)
     error, held = np.array([3e-6, 1e-6, 9.0, 2e-6]), np.array([True, True, False, True])

@@ -85,13 +85,22 @@ def test_results_do_not_depend_on_calls_threads_or_other_members():
     ],
 )
 def test_results_do_not_depend_on_the_length_of_blocks(cpu, monkeypatch):
-    expected = {"AuthenticAMD avx512f": 1024}.get(cpu, 512)
+    expected = {"AuthenticAMD avx512f": 128}.get(cpu, 64)
     here = run_ensemble(SMOOTH, members(300), SHORT, fold=FOLD, threads=1)
     monkeypatch.setattr(fast_path, "_cpuinfo", lambda: cpu)
-    assert [fast_path.block_bytes(n) for n in (1, 255, 256, 4096)] == [512, 512, expected, expected]
+    assert [fast_path.block_length(n) for n in (1, 16, 17, 64, 255, 256, 4096)] == [
+        16,
+        16,
+        32,
+        64,
+        64,
+        expected,
+        expected,
+    ]
     same(run_ensemble(SMOOTH, members(300), SHORT, fold=FOLD, threads=1), here, 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [RK4(2), pytest.param(AdaptiveRodas3(), marks=pytest.mark.thorough)], ids=str)
 def test_a_member_of_an_ensemble_equals_its_own_rollout(method):
     clock = Clock(40, 1e-4, method)
@@ -194,6 +203,7 @@ def test_the_noise_of_each_member_is_independent_and_white():
     assert abs((w[:, 1:] * w[:, :-1]).mean()) < 5 / np.sqrt(w.size)
 
 
+@pytest.mark.slow
 def test_settled_rms_agrees_with_the_lyapunov_equation():
     """Held noise in the linearised loop: P = A P A' + B S B' at the samples."""
     n, std, period = 200, 1e-8, 1e-4

@@ -70,6 +70,7 @@ def frozen(one, names):
 # --- other parameters ---
 
 
+@pytest.mark.slow
 @compiled
 def test_gains_or_limits_written_as_constants_in_the_c_are_found(made, tmp_path):
     names = {x.name for x in made.trace.parameters}
@@ -84,6 +85,7 @@ def test_gains_or_limits_written_as_constants_in_the_c_are_found(made, tmp_path)
         assert {x.name.partition(",")[0] for x in failed(found)} == {"parameters"}, what
 
 
+@pytest.mark.slow
 def test_every_parameter_changes_the_result_at_some_point(made):
     """If the C contained this parameter as a constant, a number or a bit would differ at some point."""
     at, should = made.steps["parameters"]
@@ -197,7 +199,7 @@ def test_a_short_horizon_is_not_decisive():
     assert _looped("float", closed_loop.LoopComparison(horizon(LEAST), 1.001 * closed_loop.TIMES)).verdict == "FAILS"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @compiled
 def test_a_loop_that_amplifies_rounding_is_compared_up_to_its_horizon(tmp_path):
     """Correct C passes although rounding grows a thousandfold after the horizon, and C with another gain fails.
@@ -245,7 +247,7 @@ MUTANTS = {
 
 
 @compiled
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_every_mutant_is_found():
     made = drafts(hard(processor=Processor(1.0, predict=False)), ["double"])
     for says, (old, new) in MUTANTS.items():

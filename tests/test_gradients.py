@@ -105,7 +105,7 @@ def test_derivatives_equal_differences(three_ways):
     assert abs(differences[0][3]) < 1e-9 * np.max(np.abs(quiet))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("case", "method", "rtol"),
     [
@@ -229,7 +229,7 @@ for name, function in functions.items():
 """
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_fast_path_accepts_closures():
     """Functions that XLA cannot compile as one kernel run by the plain path, each with one message."""
     environment = os.environ | {"JAX_ENABLE_X64": "1"}

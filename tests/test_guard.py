@@ -40,7 +40,13 @@ def struck(guard=Guard(), observer=None, **faults):
     return cascade, amb.Scenario(reference=amb.Sine(2.5e-3, 2.0), sensor=sensor, u_max=200.0, seed=3)
 
 
-@pytest.mark.parametrize("observer", [None, amb.observer.Kalman(500.0)], ids=["direct", "Kalman"])
+@pytest.mark.parametrize(
+    "observer",
+    [
+        pytest.param(None, id="direct"),
+        pytest.param(amb.observer.Kalman(500.0), id="Kalman", marks=pytest.mark.thorough),
+    ],
+)
 def test_one_impossible_reading_is_refused_and_the_rotor_is_held(observer):
     """Outliers of both signs at several samples; without a guard, the same readings lose rotors."""
     found = {}
@@ -68,6 +74,7 @@ MARKS = {"delay 1": (), "difference, no delay": pytest.mark.thorough}
 EACH_WORLD = [pytest.param(x, marks=MARKS.get(x, pytest.mark.slow)) for x in WORLDS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EACH_WORLD)
 def test_guard_and_faults_agree_with_the_independent_simulator(name):
     """The faults are an outlier, a short dropout, and a dropout that lasts until the safe command."""

@@ -42,8 +42,8 @@ WORLDS = {
     "slow amplifier": {"amplifier": {"bandwidth": 3e3}, "delay": 1.0},
 }
 INJECTED = ("complementary", "slow amplifier")  # each is another program to compile
-# The matrices of the thorough two are compared with the simulation in tests/test_linear.py.
-MARKS = {"complementary": ()} | dict.fromkeys(("two coils", "slow sensor"), pytest.mark.thorough)
+# The matrices of the first two thorough ones are compared with the simulation in tests/test_linear.py.
+MARKS = dict.fromkeys(("two coils", "slow sensor", "slow amplifier", "Kalman"), pytest.mark.thorough)
 
 
 def largest(system):
@@ -182,6 +182,7 @@ def test_each_member_of_a_spread_has_its_own_peak():
     assert np.ptp(found.peak[:3]) > 0.1
 
 
+@pytest.mark.slow
 def test_a_slow_observer_starts_at_rest_under_noise():
     """The estimate must not start at the first noisy reading.
 

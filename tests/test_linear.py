@@ -42,7 +42,7 @@ SMOOTH = {
     "inversion": inversion.Adaptive(gamma=2e6, p=1e-3),
     "current": current.SlidingMode(k_i=600.0, p=20.0),
 }
-SLOW = Sensor(bandwidth=2000.0, gain=1.05, offset=1e-5)
+SLUGGISH = Sensor(bandwidth=2000.0, gain=1.05, offset=1e-5)
 # name: cascade's processor and laws, scenario, reference (m)
 LOOPS = {
     "true signs": (Processor(0.0), {"position": position.SlidingMode(c=200.0, k=30.0, p=np.inf)}, Scenario(), 0.0),
@@ -51,7 +51,7 @@ LOOPS = {
     "not predicted": (Processor(1.5, predict=False), {"observer": observer.Complementary(l=300.0, z_hat=0.0)},
                       Scenario(sensor=Sensor()), -1e-3),
     "lags": (Processor(1.0), {"observer": observer.Kalman(w=1000.0)},
-             Scenario(sensor=SLOW, amplifier=Amplifier(bandwidth=1500.0, slew=1e6, dead_band=0.1)), 5e-4),
+             Scenario(sensor=SLUGGISH, amplifier=Amplifier(bandwidth=1500.0, slew=1e6, dead_band=0.1)), 5e-4),
 }  # fmt: skip
 
 
@@ -94,12 +94,7 @@ def simulated_map(cascade, scenario, r):
     return StateSpace(*(np.asarray(m) for m in (A, B[:, None], C, D[:, None], jnp.ones_like(x))), np.asarray(T))
 
 
-# the others of LOOPS with the slow and thorough tests
-FIRST, SECOND = "two coils off the model", "lags"
-NAMES = [
-    pytest.param(x, marks=() if x == FIRST else pytest.mark.slow if x == SECOND else pytest.mark.thorough)
-    for x in LOOPS
-]
+NAMES = [pytest.param(x, marks=pytest.mark.slow if x == "lags" else pytest.mark.thorough) for x in LOOPS]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -145,7 +140,7 @@ def test_the_repaired_gains_amplify_sensor_errors_41_times():
     assert analysis.stiffness == pytest.approx(Plant().m * stiffness, rel=1e-6)
 
 
-@pytest.mark.parametrize("name", ["two coils off the model", "continuous"])
+@pytest.mark.parametrize("name", [pytest.param("two coils off the model", marks=pytest.mark.slow), "continuous"])
 def test_margins_agree_with_python_control(name):
     import control
 
@@ -173,6 +168,7 @@ def test_margins_agree_with_python_control(name):
         assert found.phase_deg == pytest.approx(abs(phase), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_python_control_gets_the_same_system():
     cascade, scenario, r = loop_of("true signs")
     system = linearise(cascade, scenario, CLOCK, r)
@@ -183,7 +179,7 @@ def test_python_control_gets_the_same_system():
     assert response == pytest.approx(np.asarray(system.response(f)), rel=1e-8)
 
 
-@pytest.mark.parametrize("delay", [0.0, 1.0])
+@pytest.mark.parametrize("delay", [0.0, pytest.param(1.0, marks=pytest.mark.thorough)])
 def test_the_static_stiffness_of_an_integrating_law(delay):
     """Infinite, or 2 m / T^2 if the law integrates a prediction, which is off by T^2/2 times a constant acceleration.
 

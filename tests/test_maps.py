@@ -52,6 +52,7 @@ NOISY = Scenario(sensor=Sensor(1e-7, 0.0, 0.0))
 SMALL = Study(SMOOTH, NOISY, Clock(50, 1e-4, RK4(5)), 1e-3, Spread((("initial.z", Normal(1e-6)),)), 5, 3)
 
 
+@pytest.mark.slow
 def test_a_cell_equals_an_ensemble_of_its_own_case():
     x, y = Axis("plant.m", np.array([0.5, 0.6, 0.7])), Axis("sensor.std", np.array([1e-8, 1e-7]), True)
     found = grid(SMALL, x, y)
@@ -68,6 +69,7 @@ def test_a_cell_equals_an_ensemble_of_its_own_case():
     np.testing.assert_allclose(found.low, 3 / (3 + 1.959964**2))  # Wilson's bound for 3 of 3
 
 
+@pytest.mark.slow
 def test_one_member_is_the_nominal_case():
     """Without --members, a map of a case with [spread] shows the nominal case instead of a random member."""
     x, y = Axis("plant.m", np.array([0.5, 0.6])), Axis("sensor.std", np.array([1e-8, 1e-7]))
@@ -81,6 +83,7 @@ def test_one_member_is_the_nominal_case():
     assert np.all(several.error > 10 * nominal.error)  # thrown off by 100 times what noise does
 
 
+@pytest.mark.slow
 def test_stalled_runs_are_counted_separately():
     # two trials a sample are too few for the transient from 10 um at these gains, and enough from the balance
     clock = Clock(20, 1e-4, AdaptiveRodas3(1e-8, 2))
@@ -92,7 +95,7 @@ def test_stalled_runs_are_counted_separately():
     assert found.lost.sum() == 0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_sample_period_can_be_either_axis():
     period, std = Axis(PERIOD, np.array([1e-4, 5e-4])), Axis("sensor.std", np.array([1e-8, 1e-7, 1e-6]))
     one, other = grid(SMALL, std, period), grid(SMALL, period, std)
@@ -226,6 +229,7 @@ def test_the_reported_surviving_interval_has_no_gap():
     assert made([[0, 0], [1, 1], [0, 0], [1, 1]], 1).reach() == (0.0, 1.0)  # of the two middle rows, the lower
 
 
+@pytest.mark.slow
 def test_the_command_draws_and_prints_two_cases_side_by_side(tmp_path, capsys):
     for name, gamma in (("one", "1e9"), ("two", "5e8")):
         (tmp_path / f"{name}.toml").write_text(CASE.replace("1e9", gamma))
@@ -252,6 +256,7 @@ def test_the_command_draws_and_prints_two_cases_side_by_side(tmp_path, capsys):
         ambjax.survival_map(found.case, "plant.m=2:1", Y)
 
 
+@pytest.mark.slow
 def test_the_command_states_the_drawn_outlines_and_the_undecided_cells(tmp_path, capsys, monkeypatch):
     (tmp_path / "case.toml").write_text(CASE + "[spread]\nplant.m = { percent = 1 }\n")
     argv = ["map", str(tmp_path / "case.toml"), "--x", X, "--y", Y, "--out", str(tmp_path / "out"), "--force"]

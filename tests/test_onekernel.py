@@ -40,6 +40,7 @@ SCENARIO = Scenario(
 )
 
 
+@pytest.mark.slow
 def test_the_kernel_equals_the_rollout():
     fold = Named({"peak": Peak("e_z", 1e-4, timed=True), "chatter": Variation()})
     found = run_whole(CASCADE, SCENARIO, CLOCK, fold=fold, block=32, interpret=True)

@@ -86,32 +86,34 @@ CASES = [
     COMBINED(Case("repaired tracking, 2 s", World(reference=sine(), q_v=pulse(1.0, 0.7, 1.2)), samples=20_000)),
     COMBINED(Case("repaired regulation", World(q_v=BUMP))),
     Case("smooth gains", World(inversion=adaptive(1e9, 25e-6), reference=sine(), q_v=BUMP)),
-    Case("smooth gains, edges between samples", World(inversion=adaptive(1e9, 25e-6), reference=sine(), q_v=SHIFTED)),
-    Case("edges between samples, q_z and q_i", World(
+    SLOW(Case("smooth gains, edges between samples", World(
+        inversion=adaptive(1e9, 25e-6), reference=sine(), q_v=SHIFTED
+    ))),
+    SLOW(Case("edges between samples, q_z and q_i", World(
         inversion=adaptive(2e5), reference=sine(), q_z=pulse(1.0, 0.10003, 0.20007), q_i=pulse(-2.0, 0.15001, 0.23456)
-    )),
+    ))),
     Case("stiff", World(inversion=adaptive(1e6, 100.0), reference=sine(), q_v=BUMP)),
-    Case("other plant, other gains", World(
+    SLOW(Case("other plant, other gains", World(
         plant=OTHER, position=smc(30.0, 40.0, 15.0), inversion=adaptive(8e5, 10.0), current=current(300.0, 10.0),
         reference=sine(1e-3, 5.0),
-    )),
+    ))),
     COMBINED(Case("light plant, weak gravity, smooth step", World(
         plant=LIGHT, position=smc(25.0, 30.0, 40.0), inversion=adaptive(5e5, 10.0), current=current(200.0, 40.0),
         reference=smoothstep(1e-3, 0.05, 0.1),
     ))),
     Case("all initial values", World(initial=(2e-4, -5e-3, 0.02), inversion=adaptive(1e6, i_ref=0.015))),
-    Case("model off by 10 %", World(model=WRONG, inversion=adaptive(2e5), reference=sine())),
+    SLOW(Case("model off by 10 %", World(model=WRONG, inversion=adaptive(2e5), reference=sine()))),
     Case("supply limited at the start", World(u_max=45.0)),
-    Case("supply limited on the way", World(u_max=108.0, reference=sine())),
+    SLOW(Case("supply limited on the way", World(u_max=108.0, reference=sine()))),
     Case("held noise", World(reference=sine()), samples=200, std=1e-6, solver="DOP853"),
     Case("super-twisting", World(position=twisting(), reference=sine(), q_v=BUMP)),
     Case("closed form", World(inversion=CLOSED, reference=sine(), q_v=BUMP), tight=amb.RK4(4)),
     COMBINED(Case("PI current", World(current=pi(), reference=sine(), q_v=BUMP))),
     SLOW(Case("PI current, wound up at the start", World(current=pi(k_aw=2000.0), u_max=45.0), samples=1000)),
-    Case("complementary observer", World(
+    SLOW(Case("complementary observer", World(
         observer=("complementary", {"l": 10.0}), initial=(1e-4, 0.0, 0.0), inversion=adaptive(2e5), reference=sine(),
         q_v=BUMP,
-    )),
+    ))),
     SLOW(Case("super-twisting, closed form and PI", World(
         position=twisting(), inversion=CLOSED, current=pi(), reference=smoothstep(1e-3, 0.05, 0.1), q_v=BUMP
     ))),

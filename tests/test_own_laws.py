@@ -87,7 +87,7 @@ def case(elsewhere):
 @pytest.mark.parametrize(
     "command",
     [
-        "simulate case.toml --json",
+        pytest.param("simulate case.toml --json", marks=pytest.mark.slow),
         pytest.param("ensemble case.toml --members 3 --json", marks=pytest.mark.thorough),
         pytest.param("check case.toml --json", marks=pytest.mark.slow),
         pytest.param("sensitivity case.toml --json", marks=pytest.mark.thorough),
@@ -222,7 +222,7 @@ def test_workers_compute_what_this_process_computes(case):
     assert here["rms_error_m"].tolist() == there["rms_error_m"].tolist()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_study_is_not_resumed_with_another_law(case, capsys):
     ensemble = ["ensemble", "case.toml", "--members", "3", "--out", "there"]
     facts = study_of(read_case(case), None, 3).fingerprint()

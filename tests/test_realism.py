@@ -190,6 +190,7 @@ def test_the_largest_voltage_is_that_at_the_coils_and_within_the_supply():
     np.testing.assert_allclose(found.measured["search"], np.mean(u_peak**16) ** (1 / 16), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_more_steps_per_sample_change_the_result_negligibly():
     """A step ends at the corner of the slew rate, and the voltage inside the step is exact."""
     amplifier = Amplifier(bandwidth=2e3, slew=4e6)
@@ -209,10 +210,8 @@ PARTS = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "delay"), [pytest.param("sensor", 1.0, marks=pytest.mark.thorough), ("amplifier", 0.5)]
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize(("name", "delay"), [("sensor", 1.0), ("amplifier", 0.5)])
 def test_gradients_forward_and_reverse(name, delay):
     sensor, amplifier = PARTS[name]
     scenario = dataclasses.replace(

@@ -199,6 +199,7 @@ LOOPS = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "loop",
     [pytest.param(x, marks=pytest.mark.slow if x.startswith("two-coil") else pytest.mark.thorough) for x in LOOPS],
@@ -233,7 +234,7 @@ def test_processes_and_chunks_do_not_change_a_bit_of_a_chaotic_loop(printed, mon
     assert pathlib.Path("cut/members.npz").read_bytes() == (folder / "out/members.npz").read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_single_precision_replays_too():
     code = """
 import numpy as np
@@ -250,7 +251,7 @@ assert found.deviation <= found.rounding < 1e-3
     subprocess.run([sys.executable, "-c", code], env=env, check=True)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_check_on_a_processor_uses_the_run_of_simulate(monkeypatch, capsys):
     no_pictures(monkeypatch)
     write(CASE)
@@ -282,7 +283,7 @@ held_out = 70
 """
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_numbers_of_the_tuner_equal_those_of_the_commands(monkeypatch, capsys):
     no_pictures(monkeypatch)
     write(CASE + TUNE)

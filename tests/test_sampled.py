@@ -126,12 +126,8 @@ CASES = [
 ]
 # Each law, part and delay stands in a case of the fast or slow tests; these combine them otherwise.
 FAST = {
-    "edges between samples",
-    "half a sample",
     "explicit",
-    "two coils",
     "a real position sensor",
-    "a real amplifier",
     "Kalman under noise",
     "closed form, explicit",
 }
@@ -374,6 +370,7 @@ def test_a_law_whose_result_is_not_finite_keeps_its_state():
     assert system.advance(amb.RK4(1), system.sensor_errors(0), 0.0, 1e-4, after, (), jnp.asarray(0)).code == DIVERGED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("implicit", [True, False])
 def test_the_sampled_loop_converges_to_the_continuous_one(implicit):
     """The order in the period is 1, without delay and noise, and with smooth signs."""

@@ -274,7 +274,7 @@ def test_the_theorem_uses_the_smallest_value_and_requires_a_constant_sigma():
     assert line.holds
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_linear_loop_at_rest_uses_the_first_value():
     """At z = r the derivative of |z - r| is 0, so the linear loop depends on the values at the error 0 only."""
     first = {name: x if name == "l" else table(x, 10 * x) for name, x in GAINS.items()}
@@ -289,7 +289,7 @@ def test_the_linear_loop_at_rest_uses_the_first_value():
         np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-7 * np.max(np.abs(a)))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_exported_schedules_agree_with_jax(tmp_path, capsys):
     path = tmp_path / "case.toml"
     path.write_text(LOOP.format(more=SAMPLED, **SCHEDULED))

@@ -210,6 +210,7 @@ def test_the_picture_shows_the_injected_points(tmp_path):
     assert shown["phase of L, degrees"][:, 1] == pytest.approx(np.interp(f, *curve.T), abs=0.01)
 
 
+@pytest.mark.slow
 def test_check_gives_the_zone_of_the_clearance(tmp_path, capsys):
     """The reference moves the rotor by 1 mm of 4.5 mm, which is 22 %: above clearance_b, below clearance_c."""
     path = tmp_path / "case.toml"

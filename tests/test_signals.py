@@ -241,6 +241,7 @@ def test_band_noise_that_is_not_drawn_cannot_be_evaluated():
 SMOOTH = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
 
 
+@pytest.mark.slow
 def test_a_rollout_uses_the_band_noise_of_its_member():
     scenario = Scenario(q_z=BandNoise(0.05, 20.0, 60.0), q_i=BandNoise(0.5, 5.0, 9.0), seed=4, member=2)
     rows = rollout(SMOOTH, scenario, Clock(50, 1e-4, RK4(2))).trajectory.rows
@@ -255,6 +256,7 @@ def test_a_rollout_uses_the_band_noise_of_its_member():
     assert np.all(np.std(batch.trajectory.rows.q_z, axis=0) > 0)
 
 
+@pytest.mark.slow
 def test_integrators_keep_their_order_under_band_noise():
     scenario = Scenario(q_z=BandNoise(0.1, 200.0, 600.0))
     first, second, reference = (
@@ -264,6 +266,7 @@ def test_integrators_keep_their_order_under_band_noise():
     assert abs(np.log2(abs(first - reference) / abs(second - reference)) - 4) < 0.3
 
 
+@pytest.mark.slow
 def test_the_theorem_is_checked_under_band_noise():
     clock = Clock(100, 1e-4, RK4(2))
     noise = BandNoise(0.5, 5.0, 50.0)

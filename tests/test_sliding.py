@@ -85,8 +85,9 @@ NOISY = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", NOISY)
+@pytest.mark.parametrize(
+    "case", [pytest.param(x, marks=pytest.mark.slow if x == "direct" else pytest.mark.thorough) for x in NOISY]
+)
 def test_stiff_gains_under_held_noise_agree_with_error_control(case):
     gains, sensor, u_max = NOISY[case]
     scenario = dataclasses.replace(TRACKING, sensor=sensor, u_max=u_max, member=np.arange(32))

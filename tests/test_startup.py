@@ -31,6 +31,7 @@ def test_help_and_version_import_no_numerical_package(program, option):
     assert not loaded(program, option) & {"jax", "numpy", "scipy", "matplotlib", "optax", "tqdm"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("command", "unneeded"), [
     ("check", {"matplotlib", "optax", "tuning", "ambjax.commands.ensemble", "ambjax.paper.evidence"}),
     ("simulate", {"scipy", "optax", "tuning", "ambjax.commands.ensemble", "ambjax.paper", "ambjax.theorem"}),

@@ -97,7 +97,7 @@ def test_the_written_gains_of_linear_laws_are_those_designed_for_the_paper_s_pla
         assert getattr(written, field.name) == pytest.approx(getattr(designed, field.name), rel=5e-3)
 
 
-@pytest.mark.parametrize("name", ["rig", "bearing"])
+@pytest.mark.parametrize("name", ["rig", pytest.param("bearing", marks=pytest.mark.thorough)])
 def test_a_pid_with_default_gains_holds_the_machines_of_the_templates(name):
     raw = tomllib.loads(template(name))
     drive = {"inversion": {"kind": "linearised"}, "current": {"kind": "pi"}}

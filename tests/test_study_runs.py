@@ -124,7 +124,7 @@ def test_several_processes_give_the_same_file(capsys, monkeypatch):
     assert not list(pathlib.Path("there").glob("chunks"))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_cluster_gives_the_same_file_if_a_worker_is_killed(no_pictures):
     distributed = pytest.importorskip("distributed")
     write(LONGER)
@@ -143,7 +143,11 @@ def test_a_cluster_gives_the_same_file_if_a_worker_is_killed(no_pictures):
 # --- interruptions ---
 
 
-@pytest.mark.parametrize("flags", [[], ["--processes", "2"]], ids=["here", "processes"])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "flags",
+    [pytest.param([], id="here"), pytest.param(["--processes", "2"], id="processes", marks=pytest.mark.thorough)],
+)
 def test_ctrl_c_keeps_the_finished_chunks_and_prints_the_command_to_resume(flags):
     write(LONGER)
     many = 100_000  # so that no machine is done before it is interrupted
@@ -207,7 +211,7 @@ def test_a_study_killed_at_any_instant_and_resumed_gives_the_same_file(no_pictur
     write(LONGER)
     assert main([*RUN, "--out", "whole"]) == 0
     dice, early = random.Random(11), 0
-    count = examples(2, 10)
+    count = examples(1, 10)
     for n in range(count):
         out, flags = f"cut-{n}", [[], ["--processes", "2"]][n % 2]
         running = begin(out, *flags)
@@ -276,7 +280,7 @@ def test_a_damaged_chunk_is_computed_again_with_a_message(no_pictures, capsys):
     assert result("out") == result("whole")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_chunk_damaged_after_a_kill_is_computed_again(no_pictures, capsys):
     write(LONGER)
     assert main([*RUN, "--out", "whole"]) == 0

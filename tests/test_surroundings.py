@@ -84,7 +84,7 @@ def test_a_broken_pipe_of_the_computation_is_an_error(capsys):
     assert "Broken pipe" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("number", [errno.EPIPE, errno.ENOSPC])
+@pytest.mark.parametrize("number", [pytest.param(errno.EPIPE, marks=pytest.mark.slow), errno.ENOSPC])
 def test_a_failing_stderr_does_not_stop_the_command(number, monkeypatch):
     monkeypatch.setattr(sys, "stderr", Stuck(number))
     monkeypatch.setattr(simulate, "tqdm", lambda **options: tqdm(**options | {"delay": 0, "mininterval": 0}))

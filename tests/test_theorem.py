@@ -77,6 +77,7 @@ def test_delta_1_on_reference_by_hand():
     assert value == pytest.approx(by_hand, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_identities_hold_to_integration_error_and_tighten_with_tolerance():
     cascade, scenario = short(q_i=Pulse(0.05, 0.02, 0.03))
 

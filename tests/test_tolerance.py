@@ -91,7 +91,7 @@ def carried(loops, exact, z_dot):
     return (gain * allowed).max(axis=0), gain.max(axis=0)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_error_of_a_run_is_at_most_that_of_100_steps():
     exact, z_dot = motion(HARD, 1e-10)
     assert np.isfinite(exact).all()
@@ -108,7 +108,7 @@ def test_the_error_of_a_run_is_at_most_that_of_100_steps():
 
 @pytest.mark.slow
 def test_the_errors_of_many_loops_are_bounded_by_those_of_a_step():
-    loops = random_loops(examples(20, 300))
+    loops = random_loops(examples(10, 300))
     exact, z_dot = motion(loops, 1e-9)
     errors = far(motion(loops, QUIET_TOLERANCE)[0], exact)
     held = np.isfinite(exact).all(axis=1)

@@ -33,7 +33,7 @@ def problem(limit):
     return problem_of(*case_and_tune(CASE | {"tune": {"limits": {DELAY_MARGIN: limit}, "members": 4}}))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_members_are_lost_above_the_linear_margin_only():
     made = problem(1e-4)
     case = made.case

@@ -222,9 +222,8 @@ def report_of(out):
     return json.loads((out / "report.json").read_text())
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=pytest.mark.slow if x == "fan" else pytest.mark.thorough) for x in COMMON]
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", COMMON)
 def test_common_bearings_are_tuned_without_settings(name, tmp_path):
     out = tmp_path / "out"
     assert main([str(write(tmp_path / "case.toml", COMMON[name])), "--out", str(out), "--json"]) == 0

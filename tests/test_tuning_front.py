@@ -48,6 +48,7 @@ def least_voltage(factor):
     return 20 * math.exp(-math.sqrt(factor**2 - 1))
 
 
+@pytest.mark.slow
 def test_the_knee_is_the_least_voltage_within_25_percent_of_the_least_error(ran):
     code, facts, out, folder = ran(objective="knee", front=3, bounds=BOUNDLESS)
     rows = {row["factor"]: row for row in facts["front"]}
@@ -93,6 +94,7 @@ def test_members_of_rare_large_errors_join_the_search(monkeypatch, tmp_path):
     assert knee.error_m <= KNEE * answer.front[0].error_m
 
 
+@pytest.mark.slow
 def test_least_error_traces_no_front_without_pareto(ran):
     code, facts, _, folder = ran(pareto=False)
     assert code == 0

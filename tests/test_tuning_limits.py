@@ -185,8 +185,13 @@ def test_the_steps_of_judge_and_reference_on_a_processor():
     assert other.judging.objective.clock.method.substeps == REFINEMENT * other.engine.objective.clock.method.substeps
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("iron", ["", "[plant.iron]\nsaturation = 1.2\nleakage = 1.1\neddy = 1e-4\n"])
+@pytest.mark.parametrize(
+    "iron",
+    [
+        pytest.param("", marks=pytest.mark.thorough),
+        pytest.param("[plant.iron]\nsaturation = 1.2\nleakage = 1.1\neddy = 1e-4\n", marks=pytest.mark.slow),
+    ],
+)
 def test_derivatives_of_limited_quantities_agree_in_both_modes(iron):
     made = problem_from(SAMPLED + iron)
     x, members = made.objective.space.encode(made.tune.space.values(made.case.cascade)), made.objective.members(1, 2)

@@ -96,6 +96,7 @@ def test_the_engine_adds_the_quantities_of_the_linear_loop_by_name(made, monkeyp
     assert np.all(slopes[..., 0, :] == 8)
 
 
+@pytest.mark.slow
 def test_an_unstable_loop_has_a_finite_value_whose_derivative_points_to_stability(made):
     """The loop diverges faster for larger k."""
     problem, x, members = made

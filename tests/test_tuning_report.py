@@ -131,6 +131,7 @@ def test_the_rows_of_the_loss_table_add_up_to_its_total(written):
         assert facts["loss"][when]["risk"] >= facts["loss"][when]["loss"] * (1 - 1e-12)
 
 
+@pytest.mark.slow
 def test_the_loss_table_agrees_with_the_losses_of_the_judged_members(study, x):
     found = judge(study, x, seeds(study.tune.budget)[2], 12)
     terms = breakdown.loss_breakdown(study.goal, found)
@@ -143,6 +144,7 @@ def test_the_loss_table_agrees_with_the_losses_of_the_judged_members(study, x):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("conditions", [0.0, 1.0])
 def test_the_minimised_value_in_the_report_is_the_goal(conditions):
     # gamma far below Delta_1 of this reference, so that the conditions' penalty counts
@@ -220,6 +222,7 @@ def test_accurate_values_agree_with_adaptive_rollouts():
         assert row["relative"] == pytest.approx(row["report"] / row["accurate"] - 1, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_accurate_steps_compared_with_themselves_have_no_error(study, x):
     clock = dataclasses.replace(study.objective.clock, method=study.reference.objective.clock.method)
     objective = dataclasses.replace(study.objective, clock=clock)
@@ -249,6 +252,7 @@ def test_large_differences_are_marked():
     assert "accurate steps confirm no number of this table" in held_out._accurate(again)[0]
 
 
+@pytest.mark.slow
 def test_the_columns_of_accurate_steps_are_in_the_report(written):
     head, *rows = cells((written / "report.md").read_text(), "12 held-out members")
     assert head[3:] == ["after, 8 members", "with accurate steps", "difference"]

@@ -95,7 +95,7 @@ LATE = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("delays", [[0.5, 1.5], pytest.param([1.0, 2.0], marks=pytest.mark.slow)])
 def test_a_lane_has_the_delay_of_its_member(delays):
     """Spread delays are not rounded to whole samples and not limited to the nominal delay."""
@@ -316,6 +316,7 @@ def test_nothing_is_compiled_after_the_first_iteration(small, caplog, logged_com
         assert len(kernels()) == 1
 
 
+@pytest.mark.slow
 def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):
     whole = run(small)
     facts = {"case": 1}
@@ -510,7 +511,7 @@ def command(*words):
     return subprocess.run(words, cwd=pathlib.Path(__file__).parent.parent, capture_output=True, text=True)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_command_tunes_a_case_that_simulate_runs(tmp_path, capsys):
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(CASE)

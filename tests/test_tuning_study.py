@@ -271,6 +271,7 @@ def everything(tmp_path_factory):
     return world, code, summary, out, made
 
 
+@pytest.mark.slow
 def test_tuned_gains_are_evaluated_on_members_that_the_search_did_not_use(everything):
     world, code, summary, _, made = everything
     training, validation, held_out = seeds(made.tune.budget)
@@ -285,6 +286,7 @@ def test_tuned_gains_are_evaluated_on_members_that_the_search_did_not_use(everyt
     assert summary["after"]["settled_rms_error_m"] < summary["before"]["settled_rms_error_m"]
 
 
+@pytest.mark.slow
 def test_tuned_toml_contains_the_gains_and_can_be_read(everything):
     world, _, summary, out, _ = everything
     written = tomllib.loads((out / "tuned.toml").read_text())
@@ -294,6 +296,7 @@ def test_tuned_toml_contains_the_gains_and_can_be_read(everything):
     case_from(written)
 
 
+@pytest.mark.slow
 def test_the_gradient_report_compares_three_derivatives(everything):
     _, _, summary, out, _ = everything
     found = summary["gradient"]
@@ -336,6 +339,7 @@ def test_gradients_of_a_knee_are_those_of_the_loss(monkeypatch):
     assert np.isfinite(np.array(gradient.signal_to_noise(knee, x, members)["gradient"])).all()
 
 
+@pytest.mark.slow
 def test_the_front_is_in_the_report_and_has_a_picture(everything):
     _, _, summary, out, _ = everything
     assert len(summary["front"]) > 1
@@ -363,6 +367,7 @@ def test_a_file_whose_gains_could_not_be_written_is_refused_at_the_start(monkeyp
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_an_unfinished_search_is_kept_and_only_resumed_with_resume(monkeypatch, tmp_path):
     *_, out, _ = command(monkeypatch, tmp_path, World())
     left = {path.name for path in (out / "checkpoints").glob("*.npz")}
@@ -407,7 +412,7 @@ def test_a_search_killed_before_its_first_checkpoint_is_resumed(monkeypatch, tmp
 HELD_OUT = seeds(Budget())[2]
 
 
-@pytest.mark.parametrize("status", ["lost", "stalled"])
+@pytest.mark.parametrize("status", ["lost", pytest.param("stalled", marks=pytest.mark.slow)])
 def test_a_member_that_accurate_steps_do_not_hold_is_not_a_survivor(monkeypatch, tmp_path, status):
     """The member is the last of those that are simulated again, after the four worst members."""
     mine = (HELD_OUT, 5)
@@ -424,6 +429,7 @@ def test_a_member_that_accurate_steps_do_not_hold_is_not_a_survivor(monkeypatch,
     assert f"| {status} | 0 | 0 | 0 of 6 | 1 of 6 | - |" in (out / "report.md").read_text()
 
 
+@pytest.mark.slow
 def test_a_refuted_survival_is_reported_without_held_out_members(monkeypatch, tmp_path):
     world = World(limit=lambda seed, number, _, accurate: 1e-3 if accurate else math.inf)
     monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 1)

@@ -213,7 +213,7 @@ def test_an_earlier_point_that_is_confirmed_is_an_answer(run, small):
     np.testing.assert_array_equal(answer.x, verdicts.calls[-1][0])
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_refuted_answer_is_a_failure_in_every_file(small, monkeypatch, tmp_path, capsys):
     refuted = Verdicts(
         error_of(small, stalled=4, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
@@ -237,7 +237,7 @@ def test_a_refuted_answer_is_a_failure_in_every_file(small, monkeypatch, tmp_pat
     assert case_from(tomllib.loads((out / "tuned.toml").read_text())).cascade.current.p > 0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_an_answer_confirmed_in_training_is_still_refuted_by_held_out_members(small, monkeypatch, tmp_path):
     right = error_of(small)
     for place in (tuning.search.rounds, tuning.search.validation):

@@ -63,6 +63,7 @@ def test_following_the_advice_ends_in_a_held_rotor_and_conditions_that_hold(caps
     assert "The rotor is held." in answer
 
 
+@pytest.mark.slow
 def test_a_held_rotor_that_fails_a_condition_is_reported_as_held(capsys):
     code, answer = answered(SHORT + PUSHED, capsys)
     assert code == 1
@@ -76,6 +77,7 @@ def test_a_held_rotor_that_fails_a_condition_is_reported_as_held(capsys):
     assert answered((SHORT + PUSHED).replace("k_i = 152.0", "k_i = 220.1"), capsys)[0] == 0
 
 
+@pytest.mark.slow
 def test_the_advised_gain_is_set_by_the_pulse_that_breaks_the_loop(capsys):
     # with the printed 7.5e4 the same pulse loses the rotor; Delta_1 of its fall is no reason to touch gamma
     code, answer = answered((SHORT + PUSHED).replace("gamma = 1e6", "gamma = 7.5e4"), capsys)
@@ -112,6 +114,7 @@ def test_a_value_that_is_not_finite_is_reported_without_advice(against):
     assert not advised(words)
 
 
+@pytest.mark.slow
 def test_a_stalled_run_gives_no_verdict_on_the_rotor(capsys, monkeypatch):
     case = read_case(write(SHORT))
     report = check(case.cascade, case.scenario, case.clock)

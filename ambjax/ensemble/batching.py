@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from ambjax.compiler.fast_path import block_bytes, one_kernel
+from ambjax.compiler.fast_path import block_length, one_kernel
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
@@ -25,6 +25,9 @@ from ambjax.world.scenario import Scenario
 
 # Largest number of members in one call of the compiled program, unless the caller gives it.
 MOST_CALL = 4096
+# Least size of one number's array in each of several calls (bytes). Two shorter calls on two cores are not faster than
+# one call on one core.
+LEAST_BYTES = 256
 # Name of the mesh axis over which members are distributed.
 MEMBERS = "members"
 
@@ -96,7 +99,8 @@ def map_members(
     - `call`: members in one call of the compiled program, rounded up to whole blocks (None: equal shares for all cores,
       at most 4096 members each). Memory grows with `call`, not with N. Another value of `call` compiles again. If there
       are fewer blocks than cores, some cores are idle.
-    - `block`: members that run together in vector instructions (None: as many as fit the first-level cache).
+    - `block`: members that run together in vector instructions (None: as many as fit the first-level cache,
+      fewer in a small ensemble).
     - `plain`: compile without the fast path, which does not support reverse-mode differentiation.
 
     Returns NumPy arrays in member order, every leaf with a leading axis [N].
@@ -142,8 +146,9 @@ class _Engine(Generic[Tree, Result]):
         self.workers = (threads or cores()) if single_cpu else 1
         # All calls have the same length; the last call may hold fewer members than its length.
         calls = max(-(-self.members // (MOST_CALL * self.workers)), 1) * self.workers
-        per_call = call or -(-self.members // calls)
-        self.block = block or block_bytes(per_call) // jnp.result_type(float).itemsize
+        share = max(-(-self.members // calls), LEAST_BYTES // jnp.result_type(float).itemsize)
+        per_call = call or min(share, self.members)
+        self.block = block or block_length(per_call)
         multiple = self.block * len(self.devices)
         self.call = -(-per_call // multiple) * multiple
         self.program = _program(len(self.devices), plain)
@@ -151,8 +156,12 @@ class _Engine(Generic[Tree, Result]):
     def results(self) -> Result:
         """Run all calls and concatenate their results in member order."""
         starts = range(0, self.members, self.call)
-        with ThreadPoolExecutor(min(self.workers, len(starts))) as pool:
-            parts = list(pool.map(self._one, starts))
+        workers = min(self.workers, len(starts))
+        if workers == 1:  # a thread would cost more than a short run
+            parts = [self._one(start) for start in starts]
+        else:
+            with ThreadPoolExecutor(workers) as pool:
+                parts = list(pool.map(self._one, starts))
         whole = jax.tree.map(lambda *xs: np.concatenate(xs), *parts)
         return jax.tree.map(lambda x: x[: self.members], whole)
 

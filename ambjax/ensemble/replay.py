@@ -78,9 +78,9 @@ def record_system(
     """Do the work of `record_member` for a `rollout.System`, without checks. At least one leaf must be an array [1]."""
     tree = canonical((system, clock, fold))
     count = min(SEGMENT, clock.samples)
-    progress, rows, outcomes = map_members(_begun, tree, threads=1, call=1), [], list[Outcome]()
+    progress, rows, outcomes = map_members(_begun, tree, threads=1, call=CALL), [], list[Outcome]()
     for first in range(0, clock.samples, count):
-        progress, outcome = map_members(_recorded_segment(count), (*tree, progress, first), threads=1, call=1)
+        progress, outcome = map_members(_recorded_segment(count), (*tree, progress, first), threads=1, call=CALL)
         outcomes = [jax.tree.map(lambda x: x[0], outcome)]
         left = min(count, clock.samples - first)
         # Copy, because the slice would keep the rows of all lanes in memory.

@@ -59,7 +59,7 @@ def chunk(
     """
     import jax
 
-    call = min(size, CALL) if jax.default_backend() == "cpu" else size
+    call = CALL if jax.default_backend() == "cpu" else size
     return study.columns(start, stop, call=call, threads=threads, lost=lost)
 
 
