@@ -113,7 +113,7 @@ def throughput() -> list[str]:
     data = load("throughput")
     lines = ["## Ensembles against the machine's limit (`throughput.py`)", "", facts(data["machine"])]
     lines += [
-        f"RK4 with steps of 10 us, {data['samples']} samples of 10 steps, or {data['samples_of_few']:,} samples for fewer",
+        f"RK4 with steps of 10 us, {data['samples']} samples of 10 steps, or {data['samples_of_few']:,} for fewer",
         "than 256 members. Times are in ns per member and step, without compilation. The limit is a C program with",
         "SIMD (`limit.c`); the two programs run alternately. A single member is a `rollout`. Speed-up: speed relative",
         "to one core, in brackets that of the limit.",

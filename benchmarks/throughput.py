@@ -21,8 +21,8 @@ import workload
 
 MEMBERS = (1, 16, 64, 256, 1024, 4096)
 THREADS = (1, 2)
-# Samples of a run, and of a run of fewer than 256 members. Besides the simulation a call takes 1 to 2 ms, which would be
-# a large part of a short run.
+# Samples of a run, and of a run of fewer than 256 members. A call takes 1 to 2 ms besides the simulation, which would
+# be a large part of a short run.
 SAMPLES, LONG = 500, 5_000
 REPEATS = 15
 
