@@ -132,8 +132,8 @@ def test_the_other_limits_stay_in_the_search_of_the_knee(monkeypatch, tmp_path):
     assert all(one.volts <= 15.0 for one in answer.front)
 
 
-def point(error, volts, lost=0, within=True):
-    return FrontPoint(1.0, np.zeros(2), error, volts, None, lost, 0, 100, within)
+def point(error, volts, lost=0, within=True, reserve=True):
+    return FrontPoint(1.0, np.zeros(2), error, volts, None, lost, 0, 100, within, reserve)
 
 
 def test_the_knee_holds_as_many_members_and_limits_as_the_point_of_least_error():
@@ -145,6 +145,11 @@ def test_the_knee_holds_as_many_members_and_limits_as_the_point_of_least_error()
     assert chosen([*seen[:3], point(math.nan, math.nan)], 1.25) is seen[0]
     loses = [point(1.0, 20.0, lost=1, within=False), *seen[1:]]
     assert chosen(loses, 1.25) is loses[1]
+    # half of the margin is a reserve for the held-out members, unless the point of least error has no reserve either
+    tight = [point(1.0, 20.0), point(1.2, 10.0, reserve=False), point(1.2, 12.0)]
+    assert chosen(tight, 1.25) is tight[2]
+    tight[0] = point(1.0, 20.0, reserve=False)
+    assert chosen(tight, 1.25) is tight[1]
     # a search for less voltage has found a smaller error than the first answer's
     better = [point(2.0, 20.0), point(0.5, 15.0, lost=1), point(1.0, 15.0), point(1.2, 10.0), point(2.4, 5.0)]
     assert least_of(better) is better[2]

@@ -215,6 +215,16 @@ def test_the_smooth_maximum_over_members_is_at_least_the_maximum():
     assert np.isfinite(float(largest(1e200 * values)))
 
 
+@pytest.mark.parametrize(("name", "sign"), [("rms_u_V", 1), ("delay_margin_s", -1)])
+def test_the_reserve_of_a_limit_is_half_of_its_margin(name, sign):
+    limit = Limit(name, 10.0, margin=0.04)
+    # in logarithms the reserve is log(1 - sign margin) + margin / 2
+    boundary = math.log(10.0 * (1 - sign * 0.04)) + sign * 0.02
+    assert limit.has_reserve(math.exp(boundary - sign * 1e-9))
+    assert not limit.has_reserve(math.exp(boundary + sign * 1e-9))
+    assert limit.holds(math.exp(boundary))
+
+
 def test_the_penalty_of_a_limit_is_that_of_an_augmented_lagrangian():
     limit, values = Limit("rms_u_V", 10.0), jnp.full(3, 10.0 * math.exp(0.1))
     assert float(limit.term(values)) == pytest.approx(PENALTY * 0.1**2 / 2)

@@ -104,6 +104,10 @@ class Limit:
         """Return whether the value `reached` is within the limit, without a margin."""
         return reached >= self.threshold if self.kind.at_least else reached <= self.threshold
 
+    def has_reserve(self, reached: float) -> bool:
+        """Return whether the value `reached` is within the limit by at least half of the margin."""
+        return self.log_excess(reached) <= self.margin / 2
+
     @property
     def term(self) -> LimitTerm:
         """The limit's term in the goal."""

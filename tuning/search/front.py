@@ -41,7 +41,8 @@ class FrontPoint(NamedTuple):
     `factor`: limit of the rms error relative to the least error; 1: the answer of least error. `x` [m]: coordinates.
     `error_m`, `volts`: settled rms error (m) and settled rms voltage (V) of the members that are held; NaN if none is
     held. `sensitivity`: the limited peak of |S|; None if it has no limit. `lost`, `stalled`: number of lost and of
-    stalled members among `members`. `within`: whether all limits except that of the error are met.
+    stalled members among `members`. `within`, `reserve`: whether all limits except that of the error are met; whether
+    they are met with half of their margins.
     """
 
     factor: float
@@ -53,6 +54,7 @@ class FrontPoint(NamedTuple):
     stalled: int
     members: int
     within: bool
+    reserve: bool
 
 
 def trace_front(course: Course, answer: SearchResult) -> SearchResult:
@@ -102,7 +104,11 @@ def chosen(seen: Sequence[FrontPoint], factor: float) -> FrontPoint:
 
 
 def _admissible(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
-    """Return the points that lose no more members than the first point, and meet all limits if the first point does."""
+    """Return the points that lose no more members than the first point, and meet all limits if the first point does.
+
+    If the first point meets the limits with half of their margins, so do they: the held-out members may exceed the
+    values of the judged members by a few percent.
+    """
     first = seen[0]
     return [
         point
@@ -110,6 +116,7 @@ def _admissible(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
         if math.isfinite(point.error_m)
         and point.lost + point.stalled <= first.lost + first.stalled
         and (point.within or not first.within)
+        and (point.reserve or not first.reserve)
     ]
 
 
@@ -198,7 +205,9 @@ def _judged(
         rms(columns[name][alive]) if alive.any() else math.nan for name in ("settled_rms_error_m", "settled_rms_u_V")
     )
     each = dict(zip((limit.name for limit in problem.limits), values, strict=True))
-    within = all(limit.holds(each[limit.name]) for limit in problem.limits if limit.source != FRONT)
+    others = [limit for limit in problem.limits if limit.source != FRONT]
+    within = all(limit.holds(each[limit.name]) for limit in others)
+    reserve = all(limit.has_reserve(each[limit.name]) for limit in others)
     lost, stalled = (int(columns[name].sum()) for name in ("lost", "stalled"))
-    point = FrontPoint(factor, x, error, volts, each.get("sensitivity"), lost, stalled, len(alive), within)
+    point = FrontPoint(factor, x, error, volts, each.get("sensitivity"), lost, stalled, len(alive), within, reserve)
     return point, list(zip(tuned, values, strict=True)), columns

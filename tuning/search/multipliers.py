@@ -106,7 +106,7 @@ def met(limit: Limit, judged: float) -> bool:
 
     g may lie between -TOLERANCE_BELOW and half of the margin.
     """
-    return -TOLERANCE_BELOW <= limit.log_excess(judged) <= limit.margin / 2
+    return limit.log_excess(judged) >= -TOLERANCE_BELOW and limit.has_reserve(judged)
 
 
 def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
